@@ -1,0 +1,107 @@
+"""What every peer reports: time per step, the final state, its energies; and the command line they share."""
+
+import json
+import statistics
+import sys
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from benchmarks.peers import open_tree, spacecraft
+
+MODELS = {module.NAME: module for module in (spacecraft, open_tree)}
+
+
+def times_per_call(call: Callable[[], object], repeats: int) -> list[float]:
+    """Wall time of each of `repeats` calls [s], after one call that is not counted."""
+    call()
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        call()
+        times.append(time.perf_counter() - start)
+    return times
+
+
+def per_step(times: list[float], steps: int) -> dict:
+    """Median, smallest and largest time per step [us]."""
+    us = [1e6 * t / steps for t in times]
+    return {"us_per_step": statistics.median(us), "us_per_step_range": [min(us), max(us)], "repeats": len(us)}
+
+
+def _relative_angle(body: dict, rotation: np.ndarray, parent_rotation: np.ndarray) -> float:
+    """Angle of a revolute joint [rad], in (-pi, pi]."""
+    turn, axis = parent_rotation.T @ rotation, np.asarray(body["axes"][0])
+    skew = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
+    return float(np.arctan2(axis @ skew, np.trace(turn) - 1.0))
+
+
+def potential_energy(model, position: np.ndarray, rotation: np.ndarray) -> float:
+    """Gravity, torsional and point springs [J].
+
+    Args:
+        model: a module of data, `open_tree` or `spacecraft`.
+        position: centres of mass (bodies, 3) [m].
+        rotation: rotation of each body from the pose of the data (bodies, 3, 3).
+    """
+    def place(body, point):
+        if body is None:
+            return np.asarray(point)
+        return position[body] + rotation[body] @ np.subtract(point, model.BODIES[body]["com"])
+
+    energy = 0.0
+    for i, body in enumerate(model.BODIES):
+        energy -= body["mass"] * np.dot(model.GRAVITY, position[i])
+        if body["stiffness"]:
+            parent = np.eye(3) if body["parent"] is None else rotation[body["parent"]]
+            energy += 0.5 * body["stiffness"] * _relative_angle(body, rotation[i], parent) ** 2
+    for s in model.POINT_SPRINGS:
+        length = np.linalg.norm(place(s["body_b"], s["point_b"]) - place(s["body_a"], s["point_a"]))
+        energy += 0.5 * s["stiffness"] * (length - s["length"]) ** 2
+    return float(energy)
+
+
+def kinetic_energy(model, rotation: np.ndarray, velocity: np.ndarray, angular_velocity: np.ndarray) -> float:
+    """Kinetic energy [J] from the velocities of the centres of mass [m/s] and the angular velocities [rad/s], world axes."""
+    energy = 0.0
+    for body, turn, v, w in zip(model.BODIES, rotation, velocity, angular_velocity, strict=True):
+        energy += 0.5 * body["mass"] * (v @ v) + 0.5 * np.dot(body["inertia"], (turn.T @ w) ** 2)
+    return float(energy)
+
+
+def final_state(model, position, rotation, velocity, angular_velocity) -> dict:
+    """The quantities that errors are measured in.
+
+    Args:
+        model: a module of data, `open_tree` or `spacecraft`.
+        position, velocity: of the centres of mass (bodies, 3) [m], [m/s], world axes.
+        rotation: from the pose of the data (bodies, 3, 3).
+        angular_velocity: world axes (bodies, 3) [rad/s].
+
+    Returns:
+        positions [m], kinetic_energy [J], energy (kinetic and potential) [J], base_rotation, base_angular_velocity [rad/s].
+    """
+    x, turn, v, w = (np.asarray(a, dtype=float) for a in (position, rotation, velocity, angular_velocity))
+    kinetic = kinetic_energy(model, turn, v, w)
+    return {
+        "positions": x.tolist(),
+        "kinetic_energy": kinetic,
+        "energy": kinetic + potential_energy(model, x, turn),
+        "base_rotation": turn[0].tolist(),
+        "base_angular_velocity": w[0].tolist(),
+    }
+
+
+def command_line(run: Callable[..., dict]) -> None:
+    """`python -m benchmarks.peers.<peer>_models MODEL STEPS [key=value ...]` prints one JSON line."""
+    if len(sys.argv) < 3 or sys.argv[1] not in MODELS:
+        sys.exit(f"usage: MODEL STEPS [key=value ...], MODEL one of {', '.join(MODELS)}")
+    settings = {}
+    for pair in sys.argv[3:]:
+        key, _, value = pair.partition("=")
+        try:
+            settings[key] = json.loads(value)
+        except json.JSONDecodeError:
+            settings[key] = value
+    print(json.dumps(run(sys.argv[1], int(sys.argv[2]), **settings)))

@@ -1,0 +1,1 @@
+"""From effects to equations: groups of equal kinds, numbering of unknowns, sweeps along the tree."""

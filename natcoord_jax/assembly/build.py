@@ -1,0 +1,279 @@
+"""Compilation: from named parts to a system and its initial state."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from natcoord_jax.assembly.graph import Edge, make_tree, spanning_tree
+from natcoord_jax.assembly.grouping import Instance, bare, stack
+from natcoord_jax.assembly.system import CoordinateGroup, Group, Structure, System
+from natcoord_jax.core.bodies import Body
+from natcoord_jax.core.coordinate import Coordinate, CoordinateEffect
+from natcoord_jax.core.effect import Effect, replace_fields
+from natcoord_jax.core.force import Field
+from natcoord_jax.core.handles import Handle
+from natcoord_jax.core.joint import Joint, frames_at
+from natcoord_jax.core.markers import Marker
+from natcoord_jax.core.state import State
+from natcoord_jax.maths.rotations import frame_from_axis
+
+JOINT_FIELDS = ("parent", "child", "point", "axis", "second", "name", "parent_point")
+
+
+class Poses:
+    """Assembled poses of all bodies and the ground, in scene order."""
+
+    def __init__(self, bodies: dict[str, Body]):
+        self.names = list(bodies)
+        self.number = {name: i for i, name in enumerate(self.names)} | {"ground": len(bodies)}
+        self.position = [b.position for b in bodies.values()] + [jnp.zeros(3)]
+        self.rotation = [b.rotation for b in bodies.values()] + [jnp.eye(3)]
+
+    def of(self, handle: Handle) -> int:
+        """Number of a body; the number of bodies for the ground."""
+        return self.number[handle.name]
+
+    def point(self, body: int, position: Array) -> Float[Array, "4"]:
+        """Weights of the material point at a world position."""
+        local = self.rotation[body].T @ (jnp.asarray(position, float) - self.position[body])
+        return jnp.concatenate([jnp.ones(1), local])
+
+    def direction(self, body: int, vector: Array) -> Float[Array, "4"]:
+        """Weights of the direction along a world vector."""
+        return jnp.concatenate([jnp.zeros(1), self.rotation[body].T @ jnp.asarray(vector, float)])
+
+    def weights(self, marker: Marker) -> Float[Array, "4"]:
+        """Weights of a marker."""
+        vector = jnp.asarray(marker.vector, float)
+        if marker.local:
+            return jnp.concatenate([jnp.array([1.0 if marker.is_point else 0.0]), vector])
+        body = self.of(marker.body)
+        return self.point(body, vector) if marker.is_point else self.direction(body, vector)
+
+
+def joint_triad(joint: Joint) -> Float[Array, "3 3"]:
+    """The triad of the joint in the assembled pose, one vector a row."""
+    return frame_from_axis(joint.axis, joint.second)
+
+
+def joint_frames(joint: Joint, poses: Poses) -> Float[Array, "2 4 4"]:
+    """Weights of point and triad on parent and child (44-47)."""
+    parent, child = poses.of(joint.parent), poses.of(joint.child)
+    triad = joint_triad(joint)
+    at_parent, at_child = joint.anchors()
+    at_parent = poses.position[child] if at_parent is None else at_parent
+    at_child = poses.position[child] if at_child is None else at_child
+    frames = []
+    for body, point in ((parent, at_parent), (child, at_child)):
+        frames.append(jnp.stack([poses.point(body, point), *(poses.direction(body, a) for a in triad)]))
+    return jnp.stack(frames)
+
+
+def _edge(joint: Joint, poses: Poses) -> Edge:
+    return Edge(
+        poses.of(joint.parent),
+        poses.of(joint.child),
+        joint.rotations,
+        joint.translations,
+        joint.child_rotation,
+        joint.free,
+    )
+
+
+class Layout:
+    """Numbers of everything: bodies along the tree, joints with those of the tree first, channels."""
+
+    def __init__(self, bodies: dict[str, Body], joints: dict[str, Joint]):
+        self.bodies, self.joints = bodies, joints
+        self.poses = Poses(bodies)
+        self.names = list(joints)
+        self.edges = [_edge(j, self.poses) for j in joints.values()]
+        self.spanning = spanning_tree(len(bodies), self.edges)
+        self.body_number = {old: new for new, old in enumerate(self.spanning.order)}
+        self.body_number[len(bodies)] = len(bodies)
+        carriers = self.spanning.carrier
+        loops = [j for j in range(len(self.names)) if j not in carriers]
+        self.joint_order = [*carriers, *loops]
+        self.joint_number = {self.names[j]: i for i, j in enumerate(self.joint_order) if j >= 0}
+        self.coordinates: list[tuple[str, int, Coordinate]] = []
+        for name, joint in joints.items():
+            self.coordinates += [(name, k, axis) for k, axis in enumerate(joint.coordinates)]
+        self.coordinate_number = {(name, k): i for i, (name, k, _) in enumerate(self.coordinates)}
+        self.inputs: list[str] = []
+        self.works: list[str] = []
+        self.rotors: list[int] = []
+
+    def body(self, handle: Handle) -> int:
+        """Number of a body in the system."""
+        return self.body_number[self.poses.of(handle)]
+
+    def ordered_bodies(self) -> list[Body]:
+        """Bodies in the order of the system."""
+        listed = list(self.bodies.values())
+        return [listed[i] for i in self.spanning.order]
+
+    def motions(self) -> list[Edge]:
+        """Free motion of each body relative to its parent in the tree."""
+        motions = []
+        for body, carrier in zip(self.ordered_bodies(), self.spanning.carrier):
+            every = tuple(range(3))
+            edge = self.edges[carrier] if carrier >= 0 else Edge(0, 0, every, every, False, True)
+            if not body.oriented:
+                edge = Edge(edge.parent, edge.child, (), edge.translations, False, True)
+            motions.append(edge)
+        return motions
+
+    def frames(self) -> Float[Array, "joints 2 4 4"]:
+        """Frames of all joints; a free body's coincide with its reference frame and the ground's."""
+        free = jnp.stack([jnp.eye(4)] * 2)
+        listed = list(self.joints.values())
+        return jnp.stack([joint_frames(listed[j], self.poses) if j >= 0 else free for j in self.joint_order])
+
+    def joint_bodies(self) -> np.ndarray:
+        """Parent and child of every joint, as the scene names them."""
+        rows = []
+        for number, j in enumerate(self.joint_order):
+            if j >= 0:
+                edge = self.edges[j]
+                rows.append([self.body_number[edge.parent], self.body_number[edge.child]])
+            else:
+                rows.append([len(self.bodies), number])
+        return np.array(rows, np.int32).reshape(-1, 2)
+
+    def joint_instances(self) -> list[Instance]:
+        """Constraints of all joints."""
+        instances = []
+        for name, joint in self.joints.items():
+            frames = frames_at(joint_frames(joint, self.poses), self._rows(joint))
+            ready = joint.initialise(*frames)
+            instances.append(
+                Instance(
+                    name,
+                    bare(ready, JOINT_FIELDS, f"joint {name!r}"),
+                    "joint",
+                    [self.body(joint.parent), self.body(joint.child)],
+                    joints=[self.joint_number[name]],
+                    in_tree=self.joint_number[name] < len(self.bodies),
+                )
+            )
+        return instances
+
+    def _rows(self, joint: Joint) -> Float[Array, "2 4 3"]:
+        poses = self.poses
+        pair = [poses.of(joint.parent), poses.of(joint.child)]
+        return jnp.stack([jnp.concatenate([poses.position[b][None], poses.rotation[b].T]) for b in pair])
+
+    def effect_instance(self, name: str, effect: Effect) -> Instance:
+        """Where an effect sits, and its channels."""
+        label = f"effect {name!r}"
+        if isinstance(effect, Field):
+            instance = Instance(name, bare(effect, ("name",), label), "mass", [])
+        elif isinstance(effect, CoordinateEffect):
+            instance = self._on_coordinates(name, effect, label)
+        else:
+            instance = self._on_markers(name, effect, label)
+        count = effect.inputs
+        instance.inputs = list(range(len(self.inputs), len(self.inputs) + count))
+        self.inputs += [name] if count == 1 else [f"{name}[{k}]" for k in range(count)]
+        if effect.works:
+            instance.works = [len(self.works)]
+            self.works.append(name)
+        if effect.rotors:
+            instance.rotors = [len(self.rotors)]
+            self.rotors += instance.coordinates
+        return instance
+
+    def _on_markers(self, name: str, effect: Any, label: str) -> Instance:
+        markers = effect.attach(lambda handle: (self.joints[handle.name], joint_triad(self.joints[handle.name])))
+        if not isinstance(markers, tuple | list) or not all(isinstance(m, Marker) for m in markers):
+            raise ValueError(f"{label}: markers must be a tuple of nc.Point and nc.Direction, not {markers!r}")
+        weights = jnp.stack([self.poses.weights(m) for m in markers])
+        drop = [f for f in ("markers", "name", "joint") if f in type(effect).__dataclass_fields__]
+        bodies = [self.body(m.body) for m in markers]
+        return Instance(name, bare(effect, drop, label), "markers", bodies, weights=weights)
+
+    def _on_coordinates(self, name: str, effect: CoordinateEffect, label: str) -> Instance:
+        many = isinstance(effect.joint, tuple)
+        handles = effect.joint if many else (effect.joint,)
+        indices = effect.coordinate if many else (effect.coordinate,)
+        numbers, bodies, axes = [], [], []
+        for handle, index in zip(handles, indices, strict=True):
+            joint = self.joints[handle.name]
+            if not 0 <= index < len(joint.coordinates):
+                raise ValueError(
+                    f"{label}: joint {handle.name!r} has {len(joint.coordinates)} coordinates, "
+                    f"no number {index}; a {type(joint).__name__} joint counts them from 0"
+                )
+            numbers.append(self.coordinate_number[(handle.name, index)])
+            bodies += [self.body(joint.parent), self.body(joint.child)]
+            axes.append(joint.coordinates[index])
+        stripped = bare(replace_fields(effect, axes=tuple(axes)), ("joint", "coordinate", "name"), label)
+        joints = [self.joint_number[h.name] for h in handles]
+        return Instance(name, stripped, "coordinates", bodies, joints=joints, coordinates=numbers)
+
+    def coordinate_groups(self) -> tuple[CoordinateGroup, ...]:
+        """Joint coordinates by description."""
+        families: dict[Coordinate, list[int]] = {}
+        for i, (_, _, axis) in enumerate(self.coordinates):
+            families.setdefault(axis, []).append(i)
+        groups = []
+        for axis, members in families.items():
+            joints = [self.joint_number[self.coordinates[i][0]] for i in members]
+            groups.append(CoordinateGroup(axis, np.array(joints, np.int32), np.array(members, np.int32)))
+        return tuple(groups)
+
+    def state(self) -> State:
+        """Initial state: coordinates count from the assembled pose."""
+        bodies = self.ordered_bodies()
+        return State(
+            jnp.zeros(()),
+            jnp.concatenate([b.rows() for b in bodies]),
+            jnp.concatenate([b.row_velocities() for b in bodies]),
+            jnp.zeros(len(self.coordinates)),
+            jnp.zeros(len(self.rotors)),
+            jnp.zeros(len(self.works)),
+        )
+
+
+def build(
+    bodies: dict[str, Body], joints: dict[str, Joint], effects: dict[str, Effect], solver: str | None
+) -> tuple[System, State]:
+    """Number bodies along the spanning tree, group equal kinds, and lay out the state."""
+    layout = Layout(bodies, joints)
+    instances = [layout.effect_instance(name, effect) for name, effect in effects.items()]
+    joint_groups = stack(layout.joint_instances(), len(bodies))
+    groups = stack(instances, len(bodies))
+    tree = make_tree(layout.spanning, layout.motions())
+    multipliers = sum(g.count * g.effect.multipliers for g in groups)
+    relations = multipliers
+    multipliers += sum(g.count * g.effect.rows for g in joint_groups if not g.in_tree)
+    internal = 6 * sum(b.oriented for b in bodies.values())
+    ordered = [list(bodies)[i] for i in layout.spanning.order]
+    structure = Structure(
+        bodies=tuple(ordered),
+        joints=tuple(layout.names[j] if j >= 0 else "" for j in layout.joint_order),
+        inputs=tuple(layout.inputs),
+        works=tuple(layout.works),
+        coordinates=tuple((name, k) for name, k, _ in layout.coordinates),
+        rotors=len(layout.rotors),
+        unknowns=len(tree.slot_of),
+        multipliers=multipliers,
+        solver=solver or "reduced",
+        constraints=internal + relations + sum(g.count * g.effect.rows for g in joint_groups),
+        redundant=0,
+        notes=(),
+    )
+    system = System(
+        jnp.stack([b.mass_block for b in layout.ordered_bodies()]),
+        layout.frames(),
+        layout.joint_bodies(),
+        tree,
+        joint_groups,
+        groups,
+        layout.coordinate_groups(),
+        structure,
+    )
+    return jax.tree.map(jnp.asarray, system), layout.state()

@@ -1,0 +1,128 @@
+"""Spanning tree of the joints: which joint carries which body, and in which order bodies are numbered."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from natcoord_jax.assembly.tree import SLOTS, Level, Tree
+
+
+@dataclass(frozen=True)
+class Edge:
+    """A joint as seen by the graph: body numbers (the number of bodies is the ground) and free motions."""
+
+    parent: int
+    child: int
+    rotations: tuple[int, ...]
+    translations: tuple[int, ...]
+    child_rotation: bool
+    free: bool
+
+    @property
+    def slots(self) -> tuple[int, ...]:
+        """Slots of the free motion."""
+        last = (6,) if self.child_rotation else ()
+        return (*self.rotations, *(3 + k for k in self.translations), *last)
+
+
+@dataclass(frozen=True)
+class Spanning:
+    """Outcome of the search.
+
+    Attributes:
+        order: bodies in their new numbering, level by level.
+        carrier: joint of each body in `order`; -1 for a free body.
+        reverse: joints used from child to parent.
+        depth: level of each body in `order`.
+        parent: parent of each body in `order`, in the new numbering; the number of bodies is the ground.
+    """
+
+    order: list[int]
+    carrier: list[int]
+    reverse: list[bool]
+    depth: list[int]
+    parent: list[int]
+
+
+def spanning_tree(bodies: int, edges: list[Edge]) -> Spanning:
+    """Breadth-first tree from the ground, then from every body not yet reached.
+
+    A joint goes into the tree only if it describes its free motion; what it is used for in reverse is
+    told, so that its frames can be exchanged. Free bodies that are nobody's child become roots first.
+    """
+    usable: list[list[tuple[int, int, bool]]] = [[] for _ in range(bodies + 1)]
+    for number, edge in enumerate(edges):
+        if edge.free:
+            usable[edge.parent].append((number, edge.child, False))
+            usable[edge.child].append((number, edge.parent, True))
+    children = {edge.child for edge in edges if edge.free}
+    roots = [b for b in range(bodies) if b not in children] + [b for b in range(bodies) if b in children]
+    found: dict[int, tuple[int, bool, int, int]] = {}
+
+    def grow(front: list[int], level: int) -> None:
+        while front:
+            following = []
+            for body in front:
+                for joint, other, backward in usable[body]:
+                    if other not in found and other != bodies:
+                        found[other] = (joint, backward, level, body)
+                        following.append(other)
+            front, level = following, level + 1
+
+    grow([bodies], 0)
+    for root in roots:
+        if root not in found:
+            found[root] = (-1, False, 0, bodies)
+            grow([root], 1)
+    order = sorted(found, key=lambda b: found[b][2])
+    number = {body: i for i, body in enumerate(order)} | {bodies: bodies}
+    entries = [found[b] for b in order]
+    return Spanning(
+        order,
+        [e[0] for e in entries],
+        [e[1] for e in entries],
+        [e[2] for e in entries],
+        [number[e[3]] for e in entries],
+    )
+
+
+def make_tree(spanning: Spanning, motions: list[Edge]) -> Tree:
+    """Arrays of the tree from the free motions of the bodies in their new order."""
+    bodies = len(spanning.order)
+    slot_index = np.zeros((bodies, SLOTS), np.int32)
+    slot_of = []
+    for body, motion in enumerate(motions):
+        for slot in range(SLOTS):
+            if slot in motion.slots:
+                slot_index[body, slot] = len(slot_of)
+                slot_of.append(body * SLOTS + slot)
+            else:
+                slot_index[body, slot] = -1
+    slot_index[slot_index < 0] = len(slot_of)
+    levels, local = [], np.zeros(bodies, np.int32)
+    depth = np.array(spanning.depth, int)
+    parent = np.array(spanning.parent, np.int32)
+    for level in range(depth.max() + 1 if bodies else 0):
+        here = np.flatnonzero(depth == level)
+        start, stop = int(here[0]), int(here[-1]) + 1
+        these = [motions[b] for b in here]
+        levels.append(
+            Level(
+                start,
+                stop,
+                tuple(sorted({k for m in these for k in m.rotations})),
+                tuple(sorted({k for m in these for k in m.translations})),
+                any(m.child_rotation for m in these),
+                level == 0,
+            )
+        )
+        local[here] = 0 if level == 0 else parent[here] - levels[-2].start
+    side = np.tile(np.array([0, 1], np.int32), (bodies, 1))
+    order = np.tile(np.arange(4, dtype=np.int32), (bodies, 1))
+    for body, (motion, backward) in enumerate(zip(motions, spanning.reverse)):
+        if backward:
+            side[body] = (1, 0)
+            if motion.child_rotation:
+                order[body] = (0, 3, 2, 1)  # the child's axis becomes the parent's
+    slots = np.array(slot_of, np.int32)
+    return Tree(parent, local, slot_index, slots, side, order, tuple(levels), any(spanning.reverse))

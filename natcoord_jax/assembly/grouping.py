@@ -1,0 +1,103 @@
+"""Stacking of equal kinds: one group for all instances that share class, structure and shapes."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from natcoord_jax.assembly.system import Group
+from natcoord_jax.core.effect import Effect, replace_fields
+
+
+class CompiledFunction(eqx.Module):
+    """A plain function as a static part of an effect: compiled in, compared by identity."""
+
+    function: Callable = eqx.field(static=True)
+
+    def __call__(self, *args: Any) -> Any:
+        """The function's value."""
+        return self.function(*args)
+
+
+@dataclass
+class Instance:
+    """One effect ready for stacking: its bare module and where it sits."""
+
+    name: str
+    effect: Effect
+    source: str
+    bodies: list[int]
+    weights: Any = None
+    joints: list[int] = field(default_factory=list)
+    inputs: list[int] = field(default_factory=list)
+    coordinates: list[int] = field(default_factory=list)
+    rotors: list[int] = field(default_factory=list)
+    works: list[int] = field(default_factory=list)
+    in_tree: bool = False
+
+
+def bare(effect: Effect, drop: Sequence[str], label: str) -> Effect:
+    """The effect with numbers as arrays and without what only the scene needs.
+
+    Raises:
+        ValueError: if a field is neither number nor function.
+    """
+    effect = replace_fields(effect, **dict.fromkeys(drop))
+
+    def leaf(value: Any) -> Any:
+        if isinstance(value, jax.Array | np.ndarray):
+            return jnp.asarray(value, float) if jnp.issubdtype(value.dtype, jnp.floating) else value
+        if isinstance(value, bool | str):
+            raise ValueError(
+                f"{label}: the field value {value!r} is no number; declare the field "
+                "`eqx.field(static=True)` to keep it as structure"
+            )
+        if isinstance(value, int | float | np.number):
+            return jnp.asarray(value, float)
+        if callable(value):
+            return CompiledFunction(value)
+        raise ValueError(f"{label}: cannot use {value!r} as a parameter; pass numbers, arrays or functions")
+
+    return jax.tree.map(leaf, effect)
+
+
+def stack(instances: list[Instance], bodies: int) -> tuple[Group, ...]:
+    """Groups of instances with equal class, static fields and shapes, in order of first appearance.
+
+    A field sits on all bodies by itself and is a group of its own.
+    """
+    families: dict[Any, list[Instance]] = {}
+    for instance in instances:
+        leaves, structure = jax.tree.flatten(instance.effect)
+        shapes = tuple((jnp.shape(x), str(jnp.result_type(x))) for x in leaves)
+        own = instance.name if instance.source == "mass" else ""
+        key = (structure, shapes, len(instance.bodies), instance.source, instance.in_tree, own)
+        families.setdefault(key, []).append(instance)
+    return tuple(_group(members, bodies) for members in families.values())
+
+
+def _group(members: list[Instance], bodies: int) -> Group:
+    first = members[0]
+    field_like = first.source == "mass"
+    count = bodies if field_like else len(members)
+
+    def table(name: str) -> np.ndarray:
+        if field_like:
+            every = np.arange(bodies, dtype=np.int32)[:, None]
+            return every if name == "bodies" else every[:, :0]
+        return np.array([getattr(m, name) for m in members], np.int32).reshape(count, -1)
+
+    effects = [m.effect for m in members]
+    return Group(
+        first.effect if field_like else jax.tree.map(lambda *x: jnp.stack(x), *effects),
+        jnp.stack([m.weights for m in members]) if first.weights is not None else None,
+        *(table(name) for name in ("bodies", "joints", "inputs", "coordinates", "rotors", "works")),
+        count=count,
+        names=tuple(m.name for m in members),
+        source=first.source,
+        in_tree=first.in_tree,
+    )

@@ -1,0 +1,120 @@
+"""Evaluation of all effects on a given motion: gather, respond (vmapped over equal kinds), scatter."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from natcoord_jax.assembly.system import Group, System
+from natcoord_jax.core.effect import Motion, Now
+from natcoord_jax.core.state import State
+from natcoord_jax.maths.collocation import Tableau
+from natcoord_jax.maths.vectors import cross
+
+
+def ground_rows(like: Array) -> Float[Array, "1 4 3"]:
+    """Rows of the ground: the origin and the world axes."""
+    return jnp.concatenate([jnp.zeros((1, 3)), jnp.eye(3)]).astype(like.dtype)[None]
+
+
+def body_rows(q: Float[Array, "*s rows 3"]) -> Float[Array, "*s bodies 4 3"]:
+    """Rows by body."""
+    return q.reshape(*q.shape[:-2], q.shape[-2] // 4, 4, 3)
+
+
+class Stations(eqx.Module):
+    """Motion of all bodies and, last, the ground."""
+
+    start: Float[Array, "bodies_and_ground 4 3"]
+    rows: Float[Array, "s bodies_and_ground 4 3"]
+    rates: Float[Array, "s bodies_and_ground 4 3"]
+    spin: Float[Array, "s bodies_and_ground 3"]
+
+
+def stations(
+    start: Float[Array, "bodies 4 3"],
+    points: Float[Array, "s bodies 3"],
+    directors: Float[Array, "s bodies 3 3"],
+    velocity: Float[Array, "s bodies 3"],
+    spin: Float[Array, "s bodies 3"],
+) -> Stations:
+    """Motion with the ground appended; director rates are spin x director."""
+    ground = ground_rows(start)
+    stages = points.shape[0]
+    rows = jnp.concatenate([points[:, :, None], directors], axis=2)
+    rates = jnp.concatenate([velocity[:, :, None], cross(spin[:, :, None], directors)], axis=2)
+    still = jnp.zeros((stages, 1, 4, 3), start.dtype)
+    return Stations(
+        jnp.concatenate([start, ground]),
+        jnp.concatenate([rows, jnp.broadcast_to(ground, still.shape)], axis=1),
+        jnp.concatenate([rates, still], axis=1),
+        jnp.concatenate([spin, still[:, :, 0]], axis=1),
+    )
+
+
+def places(system: System, group: Group) -> Array:
+    """How the instances of a group sit on their bodies: weights, joint frames or mass blocks."""
+    if group.source == "mass":
+        return system.mass
+    if group.source == "markers":
+        assert group.weights is not None
+        return group.weights
+    frames = system.frames[group.joints]
+    return frames[:, 0] if group.source == "joint" else frames
+
+
+class Situation(eqx.Module):
+    """What a group needs besides the motion: places, inputs, coordinates, rates, time and step."""
+
+    place: Array
+    inputs: Array
+    coordinates: Array
+    rates: Array
+    t: Float[Array, ""]
+    h: Float[Array, ""]
+
+
+def situation(system: System, group: Group, state: State, u: Array, h: Array) -> Situation:
+    """Gather what a group needs at the start of a step."""
+    return Situation(
+        places(system, group),
+        u[group.inputs],
+        state.coordinates[group.coordinates],
+        state.rates[group.rotors],
+        state.t,
+        h,
+    )
+
+
+def respond(group: Group, where: Situation, motion: Motion, lam: Float[Array, "n s m"], tableau: Tableau):
+    """Responses of all instances of a group; leading axis `n`."""
+
+    def one(effect, place, inputs, coordinates, rates, start, rows, row_rates, spin, multiplier):
+        now = Now(where.t, where.h, inputs, coordinates, rates, tableau)
+        return effect.respond(place, Motion(start, rows, row_rates, spin), now, multiplier)
+
+    axes = (None if group.source == "mass" else 0, 0, 0, 0, 0, 0, 1, 1, 1, 0)
+    with jax.named_scope(group.effect.kind.replace(" ", "_")):
+        return jax.vmap(one, in_axes=axes)(
+            group.effect,
+            where.place,
+            where.inputs,
+            where.coordinates,
+            where.rates,
+            motion.start,
+            motion.rows,
+            motion.rates,
+            motion.spin,
+            lam,
+        )
+
+
+def gather(group: Group, at: Stations) -> Motion:
+    """Motion of the bodies of a group: start (n, k, ...), stage quantities (s, n, k, ...)."""
+    index = group.bodies
+    return Motion(at.start[index], at.rows[:, index], at.rates[:, index], at.spin[:, index])
+
+
+def no_multipliers(group: Group, tableau: Tableau, dtype) -> Array:
+    """Multipliers of a group that has none."""
+    return jnp.zeros((group.count, tableau.stages, group.effect.multipliers), dtype)

@@ -1,0 +1,260 @@
+"""The joint null space: sweeps along the spanning tree, forward for motion and backward for forces.
+
+Every body hangs on exactly one joint, free bodies on a free motion relative to the ground. The unknowns
+are the mean rates of the joints' free motions; with mid-point (stage) vectors, a the parent's axis and u
+the vector between the joint's points,
+
+    omega_c = omega_p + sum_k w_k a_k        (rotations about the parent's axes)
+            + w_6 b                          (about the child's own first axis, for universal joints)
+    u'      = omega_p x u + sum_k w_3+k t_k  (t_k = a_i x a_j, cross products of the parent's axes)
+
+so that constraint rates vanish identically (47-50). Stage vectors come from `rotate_stages`. Bodies are
+numbered level by level; levels are unrolled, the bodies of one level are handled together.
+"""
+
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from natcoord_jax.maths.collocation import Tableau, rotate_stages
+from natcoord_jax.maths.vectors import cross, dot
+
+SLOTS = 7
+"""Free motions a joint can have: 3 rotations about parent axes, 3 translations, 1 rotation about a child axis."""
+
+
+@dataclass(frozen=True)
+class Level:
+    """Bodies `start` to `stop` at one depth, and the union of their joints' free motions."""
+
+    start: int
+    stop: int
+    rotations: tuple[int, ...]
+    translations: tuple[int, ...]
+    child_rotation: bool
+    grounded: bool
+
+    @property
+    def slots(self) -> tuple[int, ...]:
+        """Slots in use."""
+        last = (6,) if self.child_rotation else ()
+        return (*self.rotations, *(3 + k for k in self.translations), *last)
+
+
+class Tree(eqx.Module):
+    """Spanning tree of the bodies: body b is the child of joint b.
+
+    Attributes:
+        parent: parent body of each body; the number of bodies stands for the ground.
+        parent_in_level: the same, counted within the previous level.
+        slot_index: unknown of each body's slots; the number of unknowns where a slot is absent.
+        slot_of: body * 7 + slot of each unknown.
+        side: (parent, child) frame of each joint as the tree uses it, exchanged where it is used backwards.
+        order: rows (point, axis 1, 2, 3) of those frames as the tree uses them.
+        levels: shapes of the levels.
+        backwards: whether any joint is used from child to parent.
+    """
+
+    parent: Int[Array, " bodies"]
+    parent_in_level: Int[Array, " bodies"]
+    slot_index: Int[Array, "bodies 7"]
+    slot_of: Int[Array, " unknowns"]
+    side: Int[Array, "bodies 2"]
+    order: Int[Array, "bodies 4"]
+    levels: tuple[Level, ...] = eqx.field(static=True)
+    backwards: bool = eqx.field(static=True)
+
+    def frames(self, frames: Float[Array, "joints 2 4 4"]) -> Float[Array, "bodies 2 4 4"]:
+        """Frames of the tree's joints, in the direction of the tree."""
+        own = frames[: self.parent.shape[0]]
+        if not self.backwards:
+            return own
+        body = jnp.arange(own.shape[0])[:, None, None]
+        return own[body, self.side[:, :, None], self.order[:, None, :]]
+
+
+class JointGeometry(eqx.Module):
+    """Stage geometry of the joints of one level, all in world components.
+
+    Attributes:
+        axes: directions of the slots in use: rotation axes, then translations, then the child axis.
+        parent_arm: from the parent's reference point to the joint [m].
+        child_arm: from the child's reference point to the joint [m].
+        gap: from the joint's point on the parent to that on the child [m].
+    """
+
+    axes: Float[Array, "s n slots 3"]
+    parent_arm: Float[Array, "s n 3"]
+    child_arm: Float[Array, "s n 3"]
+    gap: Float[Array, "s n 3"]
+
+
+class TreeMotion(eqx.Module):
+    """Stage motion of all bodies: angular velocities, velocities of points, stage directors."""
+
+    spin: Float[Array, "s bodies 3"]
+    velocity: Float[Array, "s bodies 3"]
+    directors: Float[Array, "s bodies 3 3"]
+
+
+def gather_slots(tree: Tree, w: Float[Array, "s unknowns"]) -> Float[Array, "s bodies 7"]:
+    """Rates by body and slot, zero where a slot is absent."""
+    padded = jnp.concatenate([w, jnp.zeros_like(w[:, :1])], axis=1)
+    return padded[:, tree.slot_index]
+
+
+def _combine(coefficients: Float[Array, "n m"], vectors: Float[Array, "s n m 3"]) -> Float[Array, "s n 3"]:
+    return jnp.sum(coefficients[..., None] * vectors, axis=-2)
+
+
+def _frame_axes(coefficients: Float[Array, "n k 3"], directors: Float[Array, "s n 3 3"]) -> Array:
+    return jnp.sum(coefficients[..., None] * directors[:, :, None], axis=-2)
+
+
+def _translations(level: Level, axes: Float[Array, "s n 3 3"]) -> list[Array]:
+    return [cross(axes[:, :, (k + 1) % 3], axes[:, :, (k + 2) % 3]) for k in level.translations]
+
+
+def sweep_motion(
+    tree: Tree,
+    frames: Float[Array, "bodies 2 4 4"],
+    rows: Float[Array, "bodies 4 3"],
+    slots: Float[Array, "s bodies 7"],
+    h: Float[Array, ""],
+    tableau: Tableau,
+) -> tuple[TreeMotion, list[JointGeometry]]:
+    """Motion of all bodies from the rates of the joints, root to leaves.
+
+    Args:
+        tree: the spanning tree.
+        frames: weights of the joints' frames, joint b belonging to body b.
+        rows: rows of all bodies at the start of the step.
+        slots: mean rates by body and slot.
+        h: step [s].
+        tableau: the collocation method.
+    """
+    stages = jnp.asarray(tableau.a, rows.dtype)
+    spins, velocities, triads, geometry = [], [], [], []
+    for level in tree.levels:
+        here = slice(level.start, level.stop)
+        place, own, rate = frames[here], rows[here], slots[:, here]
+        d0 = own[None, :, 1:]
+        if level.grounded:
+            shape = (tableau.stages, level.stop - level.start, 3)
+            spin_p = velocity_p = jnp.zeros(shape, rows.dtype)
+            d_p = jnp.broadcast_to(jnp.eye(3, dtype=rows.dtype), (*shape, 3))
+            point_p, start_d_p = jnp.zeros_like(own[:, 0]), jnp.broadcast_to(jnp.eye(3), own[:, 1:].shape)
+        else:
+            up = tree.parent_in_level[here]
+            spin_p, velocity_p, d_p = spins[-1][:, up], velocities[-1][:, up], triads[-1][:, up]
+            parent_rows = rows[tree.parent[here]]
+            point_p, start_d_p = parent_rows[:, 0], parent_rows[:, 1:]
+        needs = bool(level.rotations or level.translations)
+        parent_axes = _frame_axes(place[:, 0, 1:, 1:], d_p) if needs else None
+        axes = [parent_axes[:, :, k] for k in level.rotations]
+        spin = spin_p
+        for k, axis in zip(level.rotations, axes):
+            spin = spin + rate[:, :, k, None] * axis
+        slides = _translations(level, parent_axes) if level.translations else []
+        child_axis = []
+        if level.child_rotation:
+            start = _combine(place[:, 1, 1, 1:], d0)
+            child_axis = [rotate_stages(h * spin, start, tableau)]
+            spin = spin + rate[:, :, 6, None] * child_axis[0]
+        d = rotate_stages(h * spin[:, :, None], d0, tableau)
+        parent_arm = _combine(place[:, 0, 0, 1:], d_p)
+        child_arm = _combine(place[:, 1, 0, 1:], d)
+        velocity = velocity_p - cross(spin, child_arm)
+        if not level.grounded:
+            velocity = velocity + cross(spin_p, parent_arm)
+        gap = jnp.zeros_like(child_arm)
+        if level.translations:
+            sliding = sum(rate[:, :, 3 + k, None] * t for k, t in zip(level.translations, slides))
+            velocity = velocity + sliding
+            if not level.grounded:
+                child_point = own[:, 0] + _combine(place[:, 1, 0, 1:], d0[0])
+                start = child_point - point_p - _combine(place[:, 0, 0, 1:], start_d_p)
+                start = start + h * jnp.einsum("ij,jnc->inc", stages, sliding)
+                gap = rotate_stages(h * spin_p, start, tableau)
+                velocity = velocity + cross(spin_p, gap)
+        geometry.append(
+            JointGeometry(_stack(axes + slides + child_axis, child_arm), parent_arm, child_arm, gap)
+        )
+        spins.append(spin)
+        velocities.append(velocity)
+        triads.append(d)
+    motion = TreeMotion(*(jnp.concatenate(x, axis=1) for x in (spins, velocities, triads)))
+    return motion, geometry
+
+
+def _stack(vectors: list[Array], like: Array) -> Array:
+    if not vectors:
+        return jnp.zeros((*like.shape[:2], 0, 3), like.dtype)
+    return jnp.stack(vectors, axis=2)
+
+
+def tangent(
+    tree: Tree, geometry: list[JointGeometry], slots: Float[Array, "s bodies 7"]
+) -> tuple[Float[Array, "s bodies 3"], Float[Array, "s bodies 3"]]:
+    """Linear map P: velocities of points and angular velocities of all bodies, at fixed geometry."""
+    spins, velocities = [], []
+    for level, joint in zip(tree.levels, geometry):
+        here = slice(level.start, level.stop)
+        rate = slots[:, here][:, :, jnp.array(level.slots, int), None] * joint.axes
+        slides = len(level.translations)
+        turning = jnp.concatenate(
+            [rate[:, :, : len(level.rotations)], rate[:, :, len(level.rotations) + slides :]], axis=2
+        )
+        spin = jnp.sum(turning, axis=2)
+        velocity = jnp.sum(rate[:, :, len(level.rotations) : len(level.rotations) + slides], axis=2)
+        if not level.grounded:
+            up = tree.parent_in_level[here]
+            spin_p = spins[-1][:, up]
+            velocity = velocity + velocities[-1][:, up] + cross(spin_p, joint.parent_arm + joint.gap)
+            spin = spin + spin_p
+        velocity = velocity - cross(spin, joint.child_arm)
+        spins.append(spin)
+        velocities.append(velocity)
+    return jnp.concatenate(velocities, axis=1), jnp.concatenate(spins, axis=1)
+
+
+def project(
+    tree: Tree,
+    geometry: list[JointGeometry],
+    forces: Float[Array, "s bodies 3"],
+    torques: Float[Array, "s bodies 3"],
+) -> tuple[Float[Array, "s unknowns"], Float[Array, "s bodies 3"], Float[Array, "s bodies 3"]]:
+    """Transposed map P^T: generalised forces from forces and torques at the reference points, leaves to root.
+
+    Returns:
+        Generalised forces of the unknowns, and the force and torque that each body's joint transmits to
+        its child's subtree, the torque about the joint's point on the child.
+    """
+    slots, through_f, through_n = [], [], []
+    carried_f = carried_n = None
+    for level, joint in zip(reversed(tree.levels), reversed(geometry)):
+        here = slice(level.start, level.stop)
+        f, n = forces[:, here], torques[:, here]
+        if carried_f is not None:
+            f, n = f + carried_f, n + carried_n
+        about = n - cross(joint.child_arm, f)
+        rotations, slides = len(level.rotations), len(level.translations)
+        vectors = [about] * rotations + [f] * slides + [about] * level.child_rotation
+        columns = {slot: dot(v, joint.axes[:, :, i]) for i, (slot, v) in enumerate(zip(level.slots, vectors))}
+        zero = jnp.zeros_like(f[..., 0])
+        slots.append(jnp.stack([columns.get(slot, zero) for slot in range(SLOTS)], axis=-1))
+        through_f.append(f)
+        through_n.append(about)
+        if not level.grounded:
+            onto = tree.parent_in_level[here]
+            width = tree.levels[len(tree.levels) - len(slots) - 1]
+            pick = (jnp.arange(width.stop - width.start)[:, None] == onto[None, :]).astype(f.dtype)
+            moved = about + cross(joint.parent_arm + joint.gap, f)
+            carried_f = jnp.sum(pick[:, :, None] * f[:, None], axis=2)
+            carried_n = jnp.sum(pick[:, :, None] * moved[:, None], axis=2)
+    joined = [jnp.concatenate(x[::-1], axis=1) for x in (slots, through_f, through_n)]
+    stages, bodies = joined[0].shape[:2]
+    generalised = joined[0].reshape(stages, bodies * SLOTS)[:, tree.slot_of]
+    return generalised, joined[1], joined[2]

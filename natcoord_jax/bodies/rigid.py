@@ -1,0 +1,199 @@
+"""Rigid bodies and point masses from the usual data."""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from natcoord_jax.bodies.shapes import Shape
+from natcoord_jax.core.bodies import Body
+from natcoord_jax.core.checks import is_concrete, numbers, positive, require_double
+from natcoord_jax.maths.rotations import from_axis_angle, from_quaternion
+
+SYMMETRY_TOLERANCE = 1e-9
+"""Relative asymmetry and relative negative eigenvalue allowed in an inertia: round-off of printed data."""
+
+
+def orientation(value: Any, label: str) -> Float[Array, "3 3"]:
+    """Rotation matrix from a matrix, a quaternion (w, x, y, z) or a pair (axis, angle [rad]).
+
+    Raises:
+        ValueError: if it is none of these, a matrix that is no rotation, or a zero quaternion or axis.
+    """
+    what = f"{label}: orientation"
+    if value is None:
+        return jnp.eye(3)
+    if isinstance(value, tuple) and len(value) == 2 and np.ndim(value[1]) == 0 and np.shape(value[0]) == (3,):
+        axis = numbers(value[0], (3,), f"{what} axis", "-")
+        if is_concrete(axis) and not float(jnp.sum(axis**2)) > 0:
+            raise ValueError(f"{what} axis [-] is zero; pass a direction")
+        return from_axis_angle(axis, numbers(value[1], (), f"{what} angle", "rad"))
+    if jnp.shape(value) == (4,):
+        quaternion = numbers(value, (4,), f"{what} quaternion", "-")
+        if is_concrete(quaternion) and not float(jnp.sum(quaternion**2)) > 0:
+            raise ValueError(f"{what} quaternion [-] is zero; pass (w, x, y, z) with a length")
+        return from_quaternion(quaternion)
+    matrix = numbers(value, (3, 3), f"{what} matrix", "-")
+    if is_concrete(matrix):
+        concrete = np.asarray(matrix)
+        gap = np.max(np.abs(concrete @ concrete.T - np.eye(3)))
+        if gap > 1e-8 or np.linalg.det(concrete) < 0:
+            raise ValueError(
+                f"{what} matrix [-] is no rotation (R R^T differs from 1 by {gap:.1e}, "
+                f"determinant {np.linalg.det(concrete):+.3f}); pass a quaternion or an orthonormal matrix"
+            )
+    return matrix
+
+
+def _full_inertia(value: Any, what: str, unit: str) -> Float[Array, "3 3"]:
+    if jnp.shape(value) == (3,):
+        return jnp.diag(numbers(value, (3,), what, unit))
+    matrix = numbers(value, (3, 3), what, unit)
+    if is_concrete(matrix):
+        gap = float(jnp.max(jnp.abs(matrix - matrix.T)))
+        if gap > SYMMETRY_TOLERANCE * float(jnp.max(jnp.abs(matrix))):
+            raise ValueError(f"{what} [{unit}] is not symmetric (by {gap:.2e}); pass a symmetric matrix")
+    return matrix
+
+
+def _check_central(central: Array, label: str, given: str) -> None:
+    """A body exists only if its central second moment is positive semidefinite."""
+    if not is_concrete(central):
+        return
+    values = np.linalg.eigvalsh(np.asarray(central))
+    if values[0] < -SYMMETRY_TOLERANCE * max(values[2], 0.0) or values[2] <= 0:
+        raise ValueError(
+            f"{label}: {given} belongs to no body: the principal second moments about the centre of mass "
+            f"would be {values} kg m^2, and none may be negative (a principal inertia may not exceed the sum "
+            "of the other two); check units, and whether the inertia is about the centre of mass "
+            '(inertia_at="com") or the reference point (inertia_at="reference")'
+        )
+
+
+def to_second_moment(inertia: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
+    """E = tr(J)/2 1 - J, about the same point as the inertia tensor J [kg m^2]."""
+    return 0.5 * jnp.trace(inertia) * jnp.eye(3) - inertia
+
+
+def RigidBody(
+    *,
+    mass: Any = None,
+    inertia: Any = None,
+    second_moment: Any = None,
+    com: Any = (0.0, 0.0, 0.0),
+    inertia_at: str = "com",
+    shape: Shape | None = None,
+    density: Any = None,
+    position: Any = (0.0, 0.0, 0.0),
+    orientation: Any = None,
+    velocity: Any = (0.0, 0.0, 0.0),
+    angular_velocity: Any = (0.0, 0.0, 0.0),
+    name: str | None = None,
+) -> Body:
+    """Rigid body.
+
+    Give mass with `inertia` or `second_moment`, or a `shape` with `density`.
+
+    Args:
+        mass: [kg].
+        inertia: inertia tensor (3, 3) or its diagonal (3,), in body axes [kg m^2]. Zero along one axis: an
+            ideal rod, which needs joints that fix its spin.
+        second_moment: E^ij (3, 3) or its diagonal about the reference point, instead of
+            `inertia` (14) [kg m^2].
+        com: centre of mass, from the reference point in body axes [m].
+        inertia_at: the point `inertia` refers to: "com" or "reference".
+        shape: a solid of uniform density centred at `com`; gives mass and inertia, and is drawn.
+        density: of the shape [kg/m^3].
+        position: of the reference point in the world [m].
+        orientation: of the body axes: rotation matrix, quaternion (w, x, y, z) or (axis, angle [rad]).
+        velocity: of the reference point [m/s].
+        angular_velocity: world components [rad/s].
+        name: unique name; default "body 1", "body 2", ...
+
+    Raises:
+        ValueError: for single precision, a non-positive mass, an inertia that no body can have, numbers
+            that are not finite, or contradicting data; naming body, quantity, unit and remedy.
+
+    Example:
+        >>> import natcoord_jax as nc
+        >>> body = nc.RigidBody(mass=2.0, inertia=(0.1, 0.2, 0.25), com=(0, 0, 0.3), name="arm")
+        >>> body.mass_block.shape
+        (4, 4)
+    """
+    label = f"rigid body {name!r}" if name else "rigid body"
+    require_double(label)
+    centre = numbers(com, (3,), f"{label}: com", "m")
+    if shape is not None and density is not None:
+        if mass is not None or inertia is not None or second_moment is not None:
+            raise ValueError(f"{label}: give either shape and density [kg/m^3], or mass [kg] and inertia")
+        mass, about_com = shape.mass_properties(positive(density, f"{label}: density", "kg/m^3"))
+        central = to_second_moment(about_com)
+        moment = central + mass * jnp.outer(centre, centre)
+    else:
+        if mass is None or (inertia is None) == (second_moment is None):
+            raise ValueError(
+                f"{label}: give mass [kg] with one of inertia and second_moment [kg m^2], "
+                "or shape and density [kg/m^3]"
+            )
+        mass = positive(mass, f"{label}: mass", "kg")
+        if inertia_at not in ("com", "reference"):
+            raise ValueError(f'{label}: inertia_at is {inertia_at!r}; pass "com" or "reference"')
+        offset = mass * jnp.outer(centre, centre)
+        if inertia is not None:
+            moment = to_second_moment(_full_inertia(inertia, f"{label}: inertia", "kg m^2"))
+            moment = moment + offset if inertia_at == "com" else moment
+        else:
+            moment = _full_inertia(second_moment, f"{label}: second_moment", "kg m^2")
+        _check_central(moment - offset, label, "inertia" if inertia is not None else "second_moment")
+    first = mass * centre
+    block = jnp.block([[mass[None, None], first[None]], [first[:, None], moment]])
+    return Body(
+        block,
+        numbers(position, (3,), f"{label}: position", "m"),
+        _orientation(orientation, label),
+        numbers(velocity, (3,), f"{label}: velocity", "m/s"),
+        numbers(angular_velocity, (3,), f"{label}: angular velocity", "rad/s"),
+        True,
+        shape,
+        name,
+    )
+
+
+_orientation = orientation
+
+
+def PointMass(
+    *, mass: Any, position: Any = (0.0, 0.0, 0.0), velocity: Any = (0.0, 0.0, 0.0), name: str | None = None
+) -> Body:
+    """Point mass: three degrees of freedom; joins others by spherical and distance joints and springs.
+
+    Its directors are carried along without mass and do not turn.
+
+    Args:
+        mass: [kg].
+        position: [m].
+        velocity: [m/s].
+        name: unique name.
+
+    Raises:
+        ValueError: for a non-positive mass or numbers that are not finite.
+
+    Example:
+        >>> import natcoord_jax as nc
+        >>> nc.PointMass(mass=1.0, position=(1, 0, 0)).oriented
+        False
+    """
+    label = f"point mass {name!r}" if name else "point mass"
+    require_double(label)
+    block = jnp.zeros((4, 4)).at[0, 0].set(positive(mass, f"{label}: mass", "kg"))
+    return Body(
+        block,
+        numbers(position, (3,), f"{label}: position", "m"),
+        jnp.eye(3),
+        numbers(velocity, (3,), f"{label}: velocity", "m/s"),
+        jnp.zeros(3),
+        False,
+        None,
+        name,
+    )

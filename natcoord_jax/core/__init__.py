@@ -1,0 +1,1 @@
+"""The vocabulary: handles, markers, the kinds of effect, state, trajectory and results."""

@@ -1,0 +1,205 @@
+"""Joint coordinates (angles, displacements) and the kinds of effect that act on them.
+
+A coordinate gives, over a step, its exact increment and the loads on the two frames that do unit work
+on it. With that pair any scalar law acts on the coordinate with an exact energy balance, whatever the
+joint, in the spanning tree or closing a loop.
+"""
+
+import abc
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from natcoord_jax.core.effect import Effect, Motion, Now, Response
+from natcoord_jax.core.gradient import averaged_gradient
+from natcoord_jax.core.joint import Frame, frames_at
+
+
+class PairMotion(eqx.Module):
+    """Motion of the two frames of a joint over a step: frames at the start, at the stages, rates, spins."""
+
+    parent_start: Frame
+    child_start: Frame
+    parent: Frame
+    child: Frame
+    parent_rate: Frame
+    child_rate: Frame
+    parent_spin: Float[Array, "s 3"]
+    child_spin: Float[Array, "s 3"]
+
+
+class UnitLoad(eqx.Module):
+    """Rate of a coordinate and the load that does unit work on it, at the stages.
+
+    Attributes:
+        rate: [rad/s or m/s], with h sum b_i rate_i the exact increment.
+        forces: on (point, axis 1, 2, 3) of parent and child, per unit of generalised force.
+        torques: on parent and child, per unit of generalised force.
+    """
+
+    rate: Float[Array, " s"]
+    forces: Float[Array, "s 2 4 3"]
+    torques: Float[Array, "s 2 3"]
+
+
+@dataclass(frozen=True)
+class Coordinate(abc.ABC):
+    """Base of joint coordinates; final classes are frozen dataclasses, hashable descriptions without arrays."""
+
+    unit: ClassVar[str] = "rad"
+
+    @abc.abstractmethod
+    def unit_load(self, pair: PairMotion, h: Float[Array, ""]) -> UnitLoad:
+        """Rate and unit load over a step."""
+
+    @abc.abstractmethod
+    def value(self, parent: Frame, child: Frame) -> Float[Array, ""]:
+        """Value [rad, in (-pi, pi], or m] from frames at one time."""
+
+    @abc.abstractmethod
+    def rate(
+        self, parent: Frame, child: Frame, parent_rate: Frame, child_rate: Frame, relative_spin: Array
+    ) -> Float[Array, ""]:
+        """Rate [rad/s or m/s] from frames at one time, their rates and the relative angular velocity."""
+
+
+def pair_motion(place: Float[Array, "2 4 4"], motion: Motion, first: int) -> PairMotion:
+    """Motion of the joint frames of bodies `first` and `first + 1` of an effect."""
+    both = slice(first, first + 2)
+    parent_start, child_start = frames_at(place, motion.start[both])
+    parent, child = frames_at(place, motion.rows[:, both])
+    parent_rate, child_rate = frames_at(place, motion.rates[:, both])
+    spins = motion.spin[:, first], motion.spin[:, first + 1]
+    return PairMotion(parent_start, child_start, parent, child, parent_rate, child_rate, *spins)
+
+
+class CoordinateEffect(Effect):
+    """Base of effects on the coordinates of joints.
+
+    Attributes:
+        joint: handle of the joint, or a tuple of handles.
+        coordinate: index of the coordinate in the joint's list, or a tuple of indices.
+        name: optional name.
+        axes: the coordinates' descriptions, filled in at compile.
+    """
+
+    joint: Any
+    coordinate: Any = eqx.field(default=0, kw_only=True)
+    name: Any = eqx.field(default=None, kw_only=True)
+    axes: tuple[Coordinate, ...] = eqx.field(default=(), kw_only=True, static=True)
+
+    kind: ClassVar[str] = "coordinate effect"
+
+    @abc.abstractmethod
+    def generalised(
+        self, rates: Float[Array, "s c"], now: Now, lam: Float[Array, "s m"]
+    ) -> tuple[Float[Array, "s c"], Float[Array, "s m"], Float[Array, " s"]]:
+        """Generalised forces [N m or N], constraint rates and power, from the rates of the coordinates."""
+
+    def respond(self, place: Array, motion: Motion, now: Now, lam: Array) -> Response:
+        """Unit loads of the coordinates times the generalised forces."""
+        loads = [
+            axis.unit_load(pair_motion(place[k], motion, 2 * k), now.h) for k, axis in enumerate(self.axes)
+        ]
+        rates = jnp.stack([load.rate for load in loads], axis=-1)
+        forces, rows, power = self.generalised(rates, now, lam)
+        on_rows, torques = [], []
+        for k, load in enumerate(loads):
+            factor = forces[:, k, None, None, None]
+            on_rows.append(factor * jnp.einsum("bma,sbmc->sbac", place[k], load.forces))
+            torques.append(factor[..., 0] * load.torques)
+        return Response(jnp.concatenate(on_rows, 1), jnp.concatenate(torques, 1), rows, power)
+
+
+class CoordinatePotential(CoordinateEffect):
+    """Base of elastic laws on one joint coordinate: subclass it and give `energy`."""
+
+    kind: ClassVar[str] = "coordinate potential"
+    stores: ClassVar[bool] = True
+    degree: ClassVar[int | None] = None
+
+    @abc.abstractmethod
+    def energy(self, coordinate: Float[Array, ""]) -> Float[Array, ""]:
+        """Energy [J] of the continuous coordinate [rad or m]."""
+
+    def generalised(self, rates: Array, now: Now, lam: Array) -> tuple[Array, Array, Array]:
+        """Averaged gradient of the energy along the step."""
+        gradient = averaged_gradient(
+            lambda c: self.energy(c[0]), now.coordinates, now.h * rates, now.tableau, self.degree
+        )
+        stages = now.tableau.stages
+        return -gradient, jnp.zeros((stages, 0)), jnp.sum(-gradient * rates, axis=-1)
+
+    def stored(self, place: Array, rows: Array, coordinates: Array, rates: Array) -> Array:
+        """Energy [J]."""
+        return self.energy(coordinates[0])
+
+
+class CoordinateForce(CoordinateEffect):
+    """Base of non-potential laws on one joint coordinate: subclass it and give `force`."""
+
+    kind: ClassVar[str] = "coordinate force"
+    works: ClassVar[bool] = True
+
+    @abc.abstractmethod
+    def force(self, rate: Float[Array, ""], inputs: Array, t: Float[Array, ""]) -> Float[Array, ""]:
+        """Generalised force [N m or N] on the child, its opposite on the parent."""
+
+    def generalised(self, rates: Array, now: Now, lam: Array) -> tuple[Array, Array, Array]:
+        """The force at every stage; its power is force times rate, exactly."""
+        times = now.times
+        forces = jnp.stack([self.force(rates[i, 0], now.inputs, times[i]) for i in range(len(now.tableau.b))])
+        return forces[:, None], jnp.zeros((len(now.tableau.b), 0)), forces * rates[:, 0]
+
+
+class CoordinateInertia(CoordinateEffect):
+    """Base of rotors: inertia that only a joint coordinate sees; subclass it and give `inertia_of`."""
+
+    kind: ClassVar[str] = "coordinate inertia"
+    stores: ClassVar[bool] = True
+    rotors: ClassVar[int] = 1
+
+    @abc.abstractmethod
+    def inertia_of(self) -> Float[Array, ""]:
+        """Inertia [kg m^2 or kg] along the coordinate."""
+
+    def generalised(self, rates: Array, now: Now, lam: Array) -> tuple[Array, Array, Array]:
+        """Inertia force -I sum_j (A^-1)_ij (r_j - r_0) / h with the stored rate r_0."""
+        coefficients = jnp.asarray(now.tableau.a_inverse)
+        forces = -self.inertia_of() / now.h * (coefficients @ (rates - now.rates))
+        return forces, jnp.zeros((forces.shape[0], 0)), jnp.zeros(forces.shape[0])
+
+    def stored(self, place: Array, rows: Array, coordinates: Array, rates: Array) -> Array:
+        """Kinetic energy [J] of the rotor."""
+        return 0.5 * self.inertia_of() * rates[0] ** 2
+
+
+class CoordinateConstraint(CoordinateEffect):
+    """Base of relations sum_k a_k c_k = f(t) between joint coordinates; one multiplier each.
+
+    The multiplier is the generalised force; with a constant right-hand side it does no work, with a
+    prescribed one its work is booked in the work account.
+    """
+
+    kind: ClassVar[str] = "coordinate constraint"
+    multipliers: ClassVar[int] = 1
+    works: ClassVar[bool] = True
+
+    @abc.abstractmethod
+    def coefficients(self) -> Float[Array, " c"]:
+        """Factors a_k."""
+
+    @abc.abstractmethod
+    def target(self, t: Float[Array, ""]) -> Float[Array, ""]:
+        """Right-hand side f(t)."""
+
+    def generalised(self, rates: Array, now: Now, lam: Array) -> tuple[Array, Array, Array]:
+        """Forces a lambda / h; the row asks the coordinates at the end of the step to obey the relation."""
+        factors = self.coefficients()
+        forces = lam * factors / now.h
+        wanted = (self.target(now.t + now.h) - factors @ now.coordinates) / now.h
+        rows = rates @ factors - wanted
+        return forces, rows[:, None], lam[:, 0] / now.h * (rates @ factors)

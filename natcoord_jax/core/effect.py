@@ -1,0 +1,123 @@
+"""The protocol between the core and an effect: what it sees of the motion, what it answers.
+
+An effect sees the rows of the bodies it touches at the start of the step and at the stages, and answers
+with forces on those rows, torques, constraint rates and power. It never sees the system.
+"""
+
+import abc
+import dataclasses
+from typing import Any, ClassVar, TypeVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from natcoord_jax.maths.collocation import Tableau
+
+
+M = TypeVar("M", bound=eqx.Module)
+
+
+def replace_fields(module: M, **fields: Any) -> M:
+    """Copy of a module with other values in some fields, whatever its constructor takes."""
+    fresh = object.__new__(type(module))
+    for field in dataclasses.fields(module):
+        object.__setattr__(fresh, field.name, fields.get(field.name, getattr(module, field.name)))
+    return fresh
+
+
+class Motion(eqx.Module):
+    """Motion of the `k` bodies of one effect over a step.
+
+    Attributes:
+        start: rows at the start of the step [m for points, - for directors].
+        rows: rows at the stages.
+        rates: their velocities at the stages [1/s times that].
+        spin: angular velocities at the stages [rad/s].
+    """
+
+    start: Float[Array, "k 4 3"]
+    rows: Float[Array, "s k 4 3"]
+    rates: Float[Array, "s k 4 3"]
+    spin: Float[Array, "s k 3"]
+
+
+class Now(eqx.Module):
+    """What else an effect may depend on during a step.
+
+    Attributes:
+        t: start time [s].
+        h: step [s].
+        inputs: the input channels of the effect, held over the step.
+        coordinates: values of the joint coordinates of the effect at the start [rad or m].
+        rates: their stored rates (rotors only) [rad/s or m/s].
+        tableau: the collocation method.
+    """
+
+    t: Float[Array, ""]
+    h: Float[Array, ""]
+    inputs: Float[Array, " inputs"]
+    coordinates: Float[Array, " c"]
+    rates: Float[Array, " r"]
+    tableau: Tableau = eqx.field(static=True)
+
+    @property
+    def times(self) -> Float[Array, " s"]:
+        """Times of the stages [s]."""
+        return self.t + self.h * jnp.asarray(self.tableau.c)
+
+
+class Response(eqx.Module):
+    """What an effect answers for the stages of a step.
+
+    Attributes:
+        forces: forces on the rows of its bodies [N for points, N m for directors].
+        torques: torques on its bodies [N m]; in the rows these are the contravariant forces (61).
+        rows: rates of its constraints, which the step sets to zero.
+        power: power delivered to the bodies [W], for work accounts.
+    """
+
+    forces: Float[Array, "s k 4 3"]
+    torques: Float[Array, "s k 3"]
+    rows: Float[Array, "s m"]
+    power: Float[Array, " s"]
+
+
+class Effect(eqx.Module):
+    """Base of everything that acts on bodies.
+
+    Class attributes:
+        kind: name of the scope its operations carry in the compiled program.
+        multipliers: number of Lagrange multipliers per instance and stage.
+        inputs: number of input channels per instance.
+        works: whether its power enters the work account of the state (non-potential effects).
+        stores: whether it stores potential energy.
+        rotors: number of stored coordinate rates per instance.
+    """
+
+    kind: ClassVar[str] = "effect"
+    multipliers: ClassVar[int] = 0
+    inputs: ClassVar[int] = 0
+    works: ClassVar[bool] = False
+    stores: ClassVar[bool] = False
+    rotors: ClassVar[int] = 0
+
+    @abc.abstractmethod
+    def respond(
+        self, place: Array, motion: Motion, now: Now, lam: Float[Array, "s m"]
+    ) -> Response:
+        """Forces, torques, constraint rates and power over a step.
+
+        Args:
+            place: how the effect sits on its bodies, constant weights made at compile.
+            motion: of its bodies.
+            now: time, step, inputs, joint coordinates.
+            lam: its multipliers times the step [N s or N m s].
+        """
+
+    def stored(
+        self, place: Array, rows: Float[Array, "k 4 3"], coordinates: Float[Array, " c"],
+        rates: Float[Array, " r"],
+    ) -> Float[Array, ""]:
+        """Energy stored [J] at given rows, joint coordinates and rotor rates."""
+        return jnp.zeros(())

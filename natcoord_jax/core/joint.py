@@ -1,0 +1,115 @@
+"""Joints: constraints between a frame of a parent body and a frame of a child body.
+
+At assembly both frames coincide (44-47): the point of the joint and a triad whose third axis is the axis
+of the joint. A joint gives the residual of its constraints, at most quadratic in the frames; joints of
+the library also say which relative motions stay free, so that a spanning tree of them needs no multipliers.
+"""
+
+import abc
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from natcoord_jax.core.effect import Effect, Motion, Now, Response
+from natcoord_jax.core.handles import Handle
+
+
+class Frame(eqx.Module):
+    """A joint's point and triad as carried by one body.
+
+    Attributes:
+        point: [m].
+        axes: the three vectors, one a row; orthonormal at the ends of a step, not in between.
+    """
+
+    point: Float[Array, "*s 3"]
+    axes: Float[Array, "*s 3 3"]
+
+
+def frames_at(place: Float[Array, "2 4 4"], rows: Float[Array, "*s 2 4 3"]) -> tuple[Frame, Frame]:
+    """Frames of parent and child from their rows; place[b] = weights of (point, axis 1, 2, 3) of body b."""
+    vectors = jnp.einsum("bma,...bac->...bmc", place, rows)
+    parent, child = vectors[..., 0, :, :], vectors[..., 1, :, :]
+    return (
+        Frame(parent[..., 0, :], parent[..., 1:, :]),
+        Frame(child[..., 0, :], child[..., 1:, :]),
+    )
+
+
+class Joint(Effect):
+    """Base of joints: subclass it and give `residual` (and `rows`, its length).
+
+    Attributes:
+        parent: body handle, or `ground`.
+        child: body handle, or `ground`.
+        point: shape (3,) [m], world coordinates of the assembled pose; default the child's reference point.
+        axis: shape (3,) [-], world coordinates of the assembled pose: the third axis of both frames.
+        second: shape (3,) [-], where the first axis of both frames points; default: any perpendicular.
+        name: optional name.
+
+    Class attributes:
+        rows: number of constraints.
+        rotations: axes of the parent's frame about which the child may turn freely.
+        child_rotation: the child may also turn about the first axis of its own frame.
+        translations: axes of the parent's frame along which the child may slide freely.
+        free: whether `rotations` and `translations` describe the free motion completely, so that the
+            joint may be part of the spanning tree; False keeps its multipliers.
+        coordinates: the joint's coordinates, in the order sensors and drives count them.
+
+    Example:
+        A joint of one's own, a point that stays in a plane through the joint:
+
+        >>> import natcoord_jax as nc
+        >>> class PointInPlane(nc.Joint):
+        ...     rows = 1
+        ...     def residual(self, parent, child):
+        ...         return (parent.axes[2] @ (child.point - parent.point))[None]
+    """
+
+    parent: Any
+    child: Any
+    point: Any = None
+    axis: Any = (0.0, 0.0, 1.0)
+    second: Any = eqx.field(default=None, kw_only=True)
+    name: Any = eqx.field(default=None, kw_only=True)
+
+    kind: ClassVar[str] = "joint"
+    rows: ClassVar[int] = 0
+    rotations: ClassVar[tuple[int, ...]] = ()
+    child_rotation: ClassVar[bool] = False
+    translations: ClassVar[tuple[int, ...]] = ()
+    free: ClassVar[bool] = False
+    coordinates: ClassVar[tuple[Any, ...]] = ()
+    needs_axis: ClassVar[bool] = True
+
+    @abc.abstractmethod
+    def residual(self, parent: Frame, child: Frame) -> Float[Array, " rows"]:
+        """Constraints g, at most quadratic in the vectors of the two frames."""
+
+    def anchors(self) -> tuple[Any, Any]:
+        """Points of parent and child [m], world coordinates of the assembled pose; None: the child's origin."""
+        return self.point, self.point
+
+    def initialise(self, parent: Frame, child: Frame) -> "Joint":
+        """This joint with the numbers it takes from the assembled pose."""
+        return self
+
+    def companions(self, handle: Handle) -> list[Effect]:
+        """Effects that come with the joint, such as the pitch relation of a screw."""
+        return []
+
+    def respond(self, place: Array, motion: Motion, now: Now, lam: Array) -> Response:
+        """Rates G(Q_i) V_i and forces G(Q_i)^T lambda_i: for quadratic g the discrete derivative (57)."""
+
+        def constraint(rows: Float[Array, "2 4 3"]) -> Float[Array, " m"]:
+            return self.residual(*frames_at(place, rows))
+
+        def stage(rows, rates, multiplier):
+            g_rate = jax.jvp(constraint, (rows,), (rates,))[1]
+            return g_rate, jax.vjp(constraint, rows)[1](multiplier)[0]
+
+        g_rates, forces = jax.vmap(stage)(motion.rows, motion.rates, lam)
+        return Response(forces, jnp.zeros_like(motion.spin), g_rates, jnp.zeros(now.tableau.stages))

@@ -1,0 +1,56 @@
+"""Result codes that travel through compiled programs, and the error raised from them at the outermost call."""
+
+from enum import IntEnum
+
+
+class Result(IntEnum):
+    """How a step or a rollout ended."""
+
+    SUCCESSFUL = 0
+    EVENT = 1
+    MAX_ITERATIONS = 2
+    DIVERGED = 3
+    NONFINITE = 4
+    SINGULAR = 5
+    MAX_SUBSTEPS = 6
+    BAD_STEP = 7
+
+    @property
+    def ok(self) -> bool:
+        """Whether the trajectory is valid to its end."""
+        return self in (Result.SUCCESSFUL, Result.EVENT)
+
+
+REASONS = {
+    Result.SUCCESSFUL: "successful",
+    Result.EVENT: "a terminal event ended the run",
+    Result.MAX_ITERATIONS: "Newton's iteration did not converge within its maximum of iterations",
+    Result.DIVERGED: "Newton's iteration diverged",
+    Result.NONFINITE: "a number became infinite or not a number",
+    Result.SINGULAR: "the equations of motion are singular",
+    Result.MAX_SUBSTEPS: "more substeps were needed than `extra_substeps` allows",
+    Result.BAD_STEP: "the step dt is not a positive finite number [s]",
+}
+
+REMEDIES = {
+    Result.MAX_ITERATIONS: "use a smaller dt or allow more `extra_substeps`",
+    Result.DIVERGED: "use a smaller dt or allow more `extra_substeps`",
+    Result.NONFINITE: "check inputs, parameters and user-defined effects for undefined operations",
+    Result.SINGULAR: "check for bodies without inertia along a free motion, and for conflicting drives",
+    Result.MAX_SUBSTEPS: "use a smaller dt or allow more `extra_substeps`",
+    Result.BAD_STEP: "pass dt > 0",
+}
+
+
+class SimulationError(RuntimeError):
+    """A simulation that failed, raised once, outermost.
+
+    Attributes:
+        result: the result code.
+        trajectory: what was computed; the states after the failure repeat the last valid one.
+    """
+
+    def __init__(self, message: str, result: Result, trajectory):
+        super().__init__(message)
+        self.result = result
+        self.trajectory = trajectory

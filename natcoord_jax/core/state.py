@@ -1,0 +1,68 @@
+"""State of a system and trajectory of a rollout: plain data."""
+
+import equinox as eqx
+from jaxtyping import Array, Float, Int
+
+
+class State(eqx.Module):
+    """State of a system at one time.
+
+    Attributes:
+        t: time [s].
+        q: rows of all bodies: reference points [m] and directors [-], four rows a body.
+        v: their velocities [1/s times that].
+        coordinates: joint coordinates, angles counted on over many turns [rad, m].
+        rates: stored rates of rotors (armature) [rad/s, m/s].
+        work: work done so far by each input, load, damper and drive [J].
+    """
+
+    t: Float[Array, "*batch"]
+    q: Float[Array, "*batch rows 3"]
+    v: Float[Array, "*batch rows 3"]
+    coordinates: Float[Array, "*batch coordinates"]
+    rates: Float[Array, "*batch rotors"]
+    work: Float[Array, "*batch works"]
+
+
+class Trajectory(eqx.Module):
+    """States at the saved times, and what happened on the way.
+
+    Attributes:
+        states: saved states, the initial one first; leading axis `saved`.
+        inputs: inputs of the steps before each saved state, shape (saved - 1, inputs); with `save_every`
+            larger than one, those of the last step of each interval.
+        result: result code (see `Result`); 0 is successful.
+        failed_step: index of the step that failed or ended the run, or the number of steps.
+        failed_time: time [s] at the start of that step, or the end time.
+        failed_part: index of the body with the worst residual when a step failed; -1 if none did.
+        residual: size of that residual, or the largest accepted one (relative).
+        steps_taken: accepted (sub)steps.
+        iterations: Newton iterations summed over all attempts.
+        iterations_max: largest number in one attempt.
+    """
+
+    states: State
+    inputs: Float[Array, "*batch saved inputs"]
+    result: Int[Array, "*batch"]
+    failed_step: Int[Array, "*batch"]
+    failed_time: Float[Array, "*batch"]
+    failed_part: Int[Array, "*batch"]
+    residual: Float[Array, "*batch"]
+    steps_taken: Int[Array, "*batch"]
+    iterations: Int[Array, "*batch"]
+    iterations_max: Int[Array, "*batch"]
+
+    @property
+    def t(self) -> Float[Array, "*batch saved"]:
+        """Saved times [s]."""
+        return self.states.t
+
+    @property
+    def q(self) -> Float[Array, "*batch saved rows 3"]:
+        """Saved rows."""
+        return self.states.q
+
+    @property
+    def v(self) -> Float[Array, "*batch saved rows 3"]:
+        """Saved velocities of the rows."""
+        return self.states.v

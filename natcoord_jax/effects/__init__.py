@@ -1,0 +1,1 @@
+"""The effects: one small file each. The core knows their kinds, not their names."""

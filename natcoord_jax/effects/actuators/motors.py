@@ -1,0 +1,102 @@
+"""Motors, thrusters and torquers: forces and torques that are inputs of the system."""
+
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from natcoord_jax.core.coordinate import CoordinateForce
+from natcoord_jax.core.force import Force, Load
+from natcoord_jax.core.handles import Handle
+from natcoord_jax.core.joint import Joint
+from natcoord_jax.core.markers import Marker
+
+
+class JointTorque(Force):
+    """Motor torque on a joint: u times the parent's mid-point axis on the child, its opposite on the
+    parent (67, 68), through the contravariant directors (61). One input [N m].
+
+    Attributes:
+        joint: handle of a joint with an axis.
+        gear: factor on the input.
+        axis: which axis of the joint's frame, 0, 1 or 2.
+
+    Example:
+        >>> import natcoord_jax as nc
+        >>> scene = nc.Scene()
+        >>> arm = scene.add(nc.RigidBody(mass=1.0, inertia=(1.0, 1.0, 1.0)))
+        >>> hinge = scene.add(nc.Revolute(nc.ground, arm))
+        >>> motor = scene.add(nc.JointTorque(hinge, name="motor"))
+    """
+
+    markers: Any = eqx.field(default=None, init=False)
+    name: Any = eqx.field(default=None, kw_only=True)
+    joint: Any = None
+    gear: Any = eqx.field(default=1.0, kw_only=True)
+    axis: int = eqx.field(default=2, kw_only=True, static=True)
+
+    kind: ClassVar[str] = "joint torque"
+    inputs: ClassVar[int] = 1
+
+    def attach(self, find: Callable[[Handle], tuple[Joint, Array]]) -> tuple[Marker, ...]:
+        """The joint's axis as carried by parent and child."""
+        joint, triad = find(self.joint)
+        axis = triad[self.axis]
+        return (Marker(joint.parent, axis, False), Marker(joint.child, axis, False))
+
+    def load(self, x: Array, rate: Array, inputs: Array, t: Array) -> Load:
+        """Torque along the parent's mid-point axis."""
+        torque = self.gear * inputs[0] * x[0]
+        return Load(jnp.zeros_like(x), jnp.stack([-torque, torque]))
+
+
+class JointForce(CoordinateForce):
+    """Motor on a joint coordinate: one input [N on displacements, N m on angles], work exactly u times the
+    increment of the coordinate.
+
+    Attributes:
+        joint: handle of the joint.
+        coordinate: which coordinate of the joint.
+        gear: factor on the input.
+    """
+
+    gear: Any = eqx.field(default=1.0, kw_only=True)
+
+    kind: ClassVar[str] = "joint force"
+    inputs: ClassVar[int] = 1
+
+    def force(self, rate: Array, inputs: Array, t: Array) -> Array:
+        """The input times the gear."""
+        return self.gear * inputs[0]
+
+
+class BodyTorqueInput(Force):
+    """Torque on a body with three inputs, its components [N m] along three directions of the body (61).
+
+    Attributes:
+        markers: three directions of the body (for example its principal axes).
+    """
+
+    kind: ClassVar[str] = "body torque input"
+    inputs: ClassVar[int] = 3
+
+    def load(self, x: Array, rate: Array, inputs: Array, t: Array) -> Load:
+        """Components along the mid-point directions."""
+        return Load(jnp.zeros_like(x), jnp.zeros_like(x).at[0].set(inputs @ x))
+
+
+class BodyForceInput(Force):
+    """Thruster: one input [N] along a direction of the body, at a point of it.
+
+    Attributes:
+        markers: the point and the direction.
+    """
+
+    kind: ClassVar[str] = "body force input"
+    inputs: ClassVar[int] = 1
+
+    def load(self, x: Array, rate: Array, inputs: Array, t: Array) -> Load:
+        """Force along the mid-point direction."""
+        return Load(jnp.zeros_like(x).at[0].set(inputs[0] * x[1]), jnp.zeros_like(x))

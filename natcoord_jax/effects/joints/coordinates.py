@@ -1,0 +1,173 @@
+"""The coordinates of joints: angles counted over many turns, displacements, lengths."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from natcoord_jax.core.coordinate import Coordinate, PairMotion, UnitLoad
+from natcoord_jax.core.joint import Frame
+from natcoord_jax.maths.rotations import arctan_quotient
+from natcoord_jax.maths.vectors import cross, dot, safe_divide, safe_norm
+
+
+def _no_load(pair: PairMotion) -> tuple[Array, Array]:
+    stages = pair.parent_spin.shape[0]
+    return jnp.zeros((stages, 2, 4, 3)), jnp.zeros((stages, 2, 3))
+
+
+def _turn(carrier_turn: Array, axis: Array, increment: Array) -> tuple[Array, Array]:
+    """Angle turned in a mid-point step and its quotient by the Cayley increment along the mid-point axis.
+
+    The carrier of the axis turns by Cayley's vector g = carrier_turn / 2, the other body by
+    g + increment/2 times the mid-point axis. Composing the two, the relative half-angle tangent is
+    t = (increment/2) / (1 + |g|^2 + (increment/2) g.a), a the unit axis at the start.
+
+    Args:
+        carrier_turn: h times the angular velocity of the carrier, shape (3,) [rad].
+        axis: unit axis at the start of the step.
+        increment: Cayley increment along the mid-point axis.
+
+    Returns:
+        Angle [rad], and angle / (|mid-point axis|^2 increment), smooth at zero.
+    """
+    g = 0.5 * carrier_turn
+    along = dot(g, axis)
+    square = 1.0 + dot(g, g)
+    denominator = square + 0.5 * increment * along
+    t = 0.5 * increment / denominator
+    quotient = arctan_quotient(t) * square / ((1.0 + along**2) * denominator)
+    return 2.0 * t * arctan_quotient(t), quotient
+
+
+def _single_stage(pair: PairMotion) -> None:
+    if pair.parent_spin.shape[0] != 1:
+        raise NotImplementedError("angles of joints are formulated for one stage; use stages=1")
+
+
+@dataclass(frozen=True)
+class Angle(Coordinate):
+    """Rotation of the child relative to the parent about the parent's axis number `axis` [rad]."""
+
+    axis: int = 2
+
+    def unit_load(self, pair: PairMotion, h: Array) -> UnitLoad:
+        """Torque along the mid-point axis, scaled so that its work per radian turned is one."""
+        _single_stage(pair)
+        start, middle = pair.parent_start.axes[self.axis], pair.parent.axes[0, self.axis]
+        relative = pair.child_spin[0] - pair.parent_spin[0]
+        increment = h * dot(middle, relative) / dot(middle, middle)
+        angle, quotient = _turn(h * pair.parent_spin[0], start, increment)
+        forces, torques = _no_load(pair)
+        torque = quotient * middle
+        return UnitLoad((angle / h)[None], forces, torques.at[0, 0].set(-torque).at[0, 1].set(torque))
+
+    def value(self, parent: Frame, child: Frame) -> Array:
+        """Angle in (-pi, pi]."""
+        first, second = parent.axes[(self.axis + 1) % 3], parent.axes[(self.axis + 2) % 3]
+        moving = child.axes[(self.axis + 1) % 3]
+        return jnp.arctan2(dot(second, moving), dot(first, moving))
+
+    def rate(self, parent: Frame, child: Frame, parent_rate: Frame, child_rate: Frame, relative_spin) -> Array:
+        """Relative angular velocity along the axis."""
+        return dot(parent.axes[self.axis], relative_spin)
+
+
+@dataclass(frozen=True)
+class UniversalAngle(Coordinate):
+    """One of the two angles of a universal joint [rad].
+
+    The cross turns by the first angle about the parent's third axis a, the child by the second about its
+    own first axis b relative to the cross.
+    """
+
+    second: bool = False
+
+    def unit_load(self, pair: PairMotion, h: Array) -> UnitLoad:
+        """Torque along the reciprocal of the mid-point axis, scaled to unit work."""
+        _single_stage(pair)
+        a0, a = pair.parent_start.axes[2], pair.parent.axes[0, 2]
+        b0, b = pair.child_start.axes[0], pair.child.axes[0, 0]
+        relative = h * (pair.child_spin[0] - pair.parent_spin[0])
+        n = cross(a, b)
+        reciprocal_a, reciprocal_b = cross(b, n) / dot(n, n), cross(n, a) / dot(n, n)
+        if self.second:
+            cross_turn = h * pair.parent_spin[0] + dot(reciprocal_a, relative) * a
+            angle, quotient = _turn(cross_turn, b0, dot(reciprocal_b, relative))
+            torque = quotient * dot(b, b) * reciprocal_b
+        else:
+            angle, quotient = _turn(h * pair.parent_spin[0], a0, dot(reciprocal_a, relative))
+            torque = quotient * dot(a, a) * reciprocal_a
+        forces, torques = _no_load(pair)
+        return UnitLoad((angle / h)[None], forces, torques.at[0, 0].set(-torque).at[0, 1].set(torque))
+
+    def value(self, parent: Frame, child: Frame) -> Array:
+        """Angle in (-pi, pi]."""
+        if self.second:
+            along = parent.axes[2]
+            return jnp.arctan2(dot(child.axes[1], along), dot(child.axes[2], along))
+        moving = child.axes[0]
+        return jnp.arctan2(dot(parent.axes[1], moving), dot(parent.axes[0], moving))
+
+    def rate(self, parent: Frame, child: Frame, parent_rate: Frame, child_rate: Frame, relative_spin) -> Array:
+        """Component of the relative angular velocity along the axis."""
+        a, b = parent.axes[2], child.axes[0]
+        n = cross(a, b)
+        reciprocal = cross(n, a) if self.second else cross(b, n)
+        return safe_divide(dot(reciprocal, relative_spin), dot(n, n))
+
+
+@dataclass(frozen=True)
+class Displacement(Coordinate):
+    """Displacement of the child's point along the parent's axis number `axis` [m]: quadratic, hence exact."""
+
+    axis: int = 2
+
+    unit: ClassVar[str] = "m"
+
+    def unit_load(self, pair: PairMotion, h: Array) -> UnitLoad:
+        """Unit force along the axis, and the arm on the parent's axis."""
+        u = pair.child.point - pair.parent.point
+        rate_u = pair.child_rate.point - pair.parent_rate.point
+        a, rate_a = pair.parent.axes[:, self.axis], pair.parent_rate.axes[:, self.axis]
+        forces, torques = _no_load(pair)
+        forces = forces.at[:, 0, 0].set(-a).at[:, 1, 0].set(a).at[:, 0, 1 + self.axis].set(u)
+        return UnitLoad(dot(a, rate_u) + dot(rate_a, u), forces, torques)
+
+    def value(self, parent: Frame, child: Frame) -> Array:
+        """Displacement [m]."""
+        return dot(parent.axes[self.axis], child.point - parent.point)
+
+    def rate(self, parent: Frame, child: Frame, parent_rate: Frame, child_rate: Frame, relative_spin) -> Array:
+        """Rate of the displacement [m/s]."""
+        u, rate_u = child.point - parent.point, child_rate.point - parent_rate.point
+        return dot(parent.axes[self.axis], rate_u) + dot(parent_rate.axes[self.axis], u)
+
+
+@dataclass(frozen=True)
+class Separation(Coordinate):
+    """Distance between the two points of a joint [m], from the exact discrete gradient of the root."""
+
+    unit: ClassVar[str] = "m"
+
+    def unit_load(self, pair: PairMotion, h: Array) -> UnitLoad:
+        """Forces along the mid-point line, divided by the mean of the two lengths."""
+        _single_stage(pair)
+        start = safe_norm(pair.child_start.point - pair.parent_start.point)
+        u = (pair.child.point - pair.parent.point)[0]
+        rate_u = (pair.child_rate.point - pair.parent_rate.point)[0]
+        end = safe_norm(u + 0.5 * h * rate_u)
+        direction = 2.0 * safe_divide(u, (start + end)[None])
+        forces, torques = _no_load(pair)
+        forces = forces.at[0, 0, 0].set(-direction).at[0, 1, 0].set(direction)
+        return UnitLoad(dot(direction, rate_u)[None], forces, torques)
+
+    def value(self, parent: Frame, child: Frame) -> Array:
+        """Distance [m]."""
+        return safe_norm(child.point - parent.point)
+
+    def rate(self, parent: Frame, child: Frame, parent_rate: Frame, child_rate: Frame, relative_spin) -> Array:
+        """Rate of the distance [m/s]."""
+        u = child.point - parent.point
+        return safe_divide(dot(u, child_rate.point - parent_rate.point), safe_norm(u))

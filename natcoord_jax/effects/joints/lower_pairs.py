@@ -1,0 +1,195 @@
+"""The joints of the library: lower pairs, universal, screw and distance (44-51)."""
+
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from natcoord_jax.core.coordinate import Coordinate
+from natcoord_jax.core.effect import Effect, replace_fields
+from natcoord_jax.core.handles import Handle
+from natcoord_jax.core.joint import Frame, Joint
+from natcoord_jax.effects.joints.coordinates import Angle, Displacement, Separation, UniversalAngle
+from natcoord_jax.effects.joints.relations import Coupling
+from natcoord_jax.maths.vectors import dot
+
+
+def _axis_parallel(parent: Frame, child: Frame) -> list[Array]:
+    """Two conditions that keep the child's third axis parallel to the parent's."""
+    return [dot(parent.axes[0], child.axes[2]), dot(parent.axes[1], child.axes[2])]
+
+
+def _orientation(parent: Frame, child: Frame) -> list[Array]:
+    """Three conditions that keep the two triads parallel."""
+    return [*_axis_parallel(parent, child), dot(parent.axes[0], child.axes[1])]
+
+
+class Fixed(Joint):
+    """Child fixed in the parent: 6 constraints, no free motion.
+
+    Example:
+        >>> import natcoord_jax as nc
+        >>> nc.Fixed(nc.ground, nc.ground).rows
+        6
+    """
+
+    rows: ClassVar[int] = 6
+    free: ClassVar[bool] = True
+    needs_axis: ClassVar[bool] = False
+
+    def residual(self, parent: Frame, child: Frame) -> Array:
+        """Coincident points [m], parallel triads [-]."""
+        return jnp.concatenate([child.point - parent.point, jnp.stack(_orientation(parent, child))])
+
+
+class Spherical(Joint):
+    """Ball joint: 3 constraints x_c - x_p = 0; all rotations free."""
+
+    rows: ClassVar[int] = 3
+    rotations: ClassVar[tuple[int, ...]] = (0, 1, 2)
+    free: ClassVar[bool] = True
+    needs_axis: ClassVar[bool] = False
+
+    def residual(self, parent: Frame, child: Frame) -> Array:
+        """Coincident points [m]."""
+        return child.point - parent.point
+
+
+class Revolute(Joint):
+    """Hinge about `axis` through `point`: 5 constraints; coordinate 0 is the angle [rad]."""
+
+    rows: ClassVar[int] = 5
+    rotations: ClassVar[tuple[int, ...]] = (2,)
+    free: ClassVar[bool] = True
+    coordinates: ClassVar[tuple[Coordinate, ...]] = (Angle(),)
+
+    def residual(self, parent: Frame, child: Frame) -> Array:
+        """Coincident points [m], parallel axes [-]."""
+        return jnp.concatenate([child.point - parent.point, jnp.stack(_axis_parallel(parent, child))])
+
+
+class Universal(Joint):
+    """Cardan joint: `axis` is fixed in the parent, `second` in the child; 4 constraints.
+
+    Coordinates: 0 the angle about the parent's axis, 1 the angle about the child's axis [rad].
+    """
+
+    rows: ClassVar[int] = 4
+    rotations: ClassVar[tuple[int, ...]] = (2,)
+    child_rotation: ClassVar[bool] = True
+    free: ClassVar[bool] = True
+    coordinates: ClassVar[tuple[Coordinate, ...]] = (UniversalAngle(), UniversalAngle(second=True))
+
+    def residual(self, parent: Frame, child: Frame) -> Array:
+        """Coincident points [m], perpendicular axes [-]."""
+        angle = dot(parent.axes[2], child.axes[0])
+        return jnp.concatenate([child.point - parent.point, angle[None]])
+
+
+class Cylindrical(Joint):
+    """Turning and sliding along `axis` (48, 49): 4 constraints; coordinates: angle [rad], displacement [m]."""
+
+    rows: ClassVar[int] = 4
+    rotations: ClassVar[tuple[int, ...]] = (2,)
+    translations: ClassVar[tuple[int, ...]] = (2,)
+    free: ClassVar[bool] = True
+    coordinates: ClassVar[tuple[Coordinate, ...]] = (Angle(), Displacement())
+
+    def residual(self, parent: Frame, child: Frame) -> Array:
+        """No offset across the axis [m], parallel axes [-]."""
+        u = child.point - parent.point
+        return jnp.stack([dot(parent.axes[0], u), dot(parent.axes[1], u), *_axis_parallel(parent, child)])
+
+
+class Prismatic(Joint):
+    """Sliding along `axis`: 5 constraints; coordinate 0 is the displacement [m]."""
+
+    rows: ClassVar[int] = 5
+    translations: ClassVar[tuple[int, ...]] = (2,)
+    free: ClassVar[bool] = True
+    coordinates: ClassVar[tuple[Coordinate, ...]] = (Displacement(),)
+
+    def residual(self, parent: Frame, child: Frame) -> Array:
+        """No offset across the axis [m], parallel triads [-]."""
+        u = child.point - parent.point
+        return jnp.stack([dot(parent.axes[0], u), dot(parent.axes[1], u), *_orientation(parent, child)])
+
+
+class Planar(Joint):
+    """Sliding in the plane normal to `axis` and turning about it: 3 constraints.
+
+    Coordinates: 0, 1 displacements along the first and second axis [m], 2 the angle [rad].
+    """
+
+    rows: ClassVar[int] = 3
+    rotations: ClassVar[tuple[int, ...]] = (2,)
+    translations: ClassVar[tuple[int, ...]] = (0, 1)
+    free: ClassVar[bool] = True
+    coordinates: ClassVar[tuple[Coordinate, ...]] = (Displacement(axis=0), Displacement(axis=1), Angle())
+
+    def residual(self, parent: Frame, child: Frame) -> Array:
+        """Points in the plane [m], parallel normals [-]."""
+        u = child.point - parent.point
+        return jnp.stack([dot(parent.axes[2], u), *_axis_parallel(parent, child)])
+
+
+class Screw(Joint):
+    """Helical joint: a cylindrical joint that advances by `pitch` [m] per turn; 4 + 1 constraints.
+
+    The pitch relation involves the angle and keeps its multiplier.
+    Coordinates: 0 the angle [rad], 1 the displacement [m].
+    """
+
+    pitch: Any = eqx.field(default=0.01, kw_only=True)
+
+    rows: ClassVar[int] = 4
+    rotations: ClassVar[tuple[int, ...]] = (2,)
+    translations: ClassVar[tuple[int, ...]] = (2,)
+    free: ClassVar[bool] = True
+    coordinates: ClassVar[tuple[Coordinate, ...]] = (Angle(), Displacement())
+
+    def residual(self, parent: Frame, child: Frame) -> Array:
+        """Those of the cylindrical joint."""
+        u = child.point - parent.point
+        return jnp.stack([dot(parent.axes[0], u), dot(parent.axes[1], u), *_axis_parallel(parent, child)])
+
+    def companions(self, handle: Handle) -> list[Effect]:
+        """The pitch relation: displacement - pitch / (2 pi) angle = 0."""
+        factors = jnp.stack([-jnp.asarray(self.pitch, float) / (2 * jnp.pi), jnp.asarray(1.0)])
+        return [Coupling((handle, handle), factors, coordinate=(0, 1), name=f"{handle.name} pitch")]
+
+
+class Distance(Joint):
+    """Massless rod between two points: 1 constraint, |x_c - x_p|^2 = length^2; keeps its multiplier.
+
+    Attributes:
+        point: point of the child, world coordinates of the assembled pose [m].
+        parent_point: point of the parent [m].
+        length: length [m]; default that of the assembled pose.
+
+    Coordinate 0 is the distance [m].
+    """
+
+    parent_point: Any = eqx.field(default=(0.0, 0.0, 0.0), kw_only=True)
+    length: Any = eqx.field(default=None, kw_only=True)
+
+    rows: ClassVar[int] = 1
+    needs_axis: ClassVar[bool] = False
+    coordinates: ClassVar[tuple[Coordinate, ...]] = (Separation(),)
+
+    def anchors(self) -> tuple[Any, Any]:
+        """Points of parent and child, which are not the same here."""
+        return self.parent_point, self.point
+
+    def initialise(self, parent: Frame, child: Frame) -> "Distance":
+        """With the length of the assembled pose where none was given."""
+        if self.length is not None:
+            return self
+        u = child.point - parent.point
+        return replace_fields(self, length=jnp.sqrt(dot(u, u)))
+
+    def residual(self, parent: Frame, child: Frame) -> Array:
+        """Half the difference of the squared lengths over the length [m]: scaled like a length."""
+        u = child.point - parent.point
+        return ((dot(u, u) - self.length**2) / (2.0 * self.length))[None]

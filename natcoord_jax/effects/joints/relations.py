@@ -1,0 +1,52 @@
+"""Relations between joint coordinates: prescribed motion and couplings (gears, pitch of a screw)."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from natcoord_jax.core.coordinate import CoordinateConstraint
+
+
+class Drive(CoordinateConstraint):
+    """Joint coordinate prescribed as a function of time; the drive's work is in the work account.
+
+    Attributes:
+        joint: handle of the joint.
+        function: function of time [s] to the coordinate [rad or m], in jax.numpy. An `eqx.Module` with
+            array fields has its numbers as leaves; a plain function is compiled in.
+        coordinate: which coordinate of the joint.
+    """
+
+    function: Any = eqx.field(kw_only=True, default=None)
+
+    def coefficients(self) -> Array:
+        """One."""
+        return jnp.ones(1)
+
+    def target(self, t: Array) -> Array:
+        """The prescribed value."""
+        return jnp.asarray(self.function(t), float)
+
+
+class Coupling(CoordinateConstraint):
+    """Linear relation sum_k factor_k coordinate_k = offset between joint coordinates, as gears give.
+
+    Attributes:
+        joint: tuple of joint handles.
+        factors: shape (c,), one a coordinate.
+        coordinate: tuple of indices, which coordinate of each joint.
+        offset: right-hand side.
+    """
+
+    factors: Any = (1.0, -1.0)
+    offset: Any = eqx.field(default=0.0, kw_only=True)
+
+    def coefficients(self) -> Array:
+        """The factors."""
+        return jnp.asarray(self.factors, float)
+
+    def target(self, t: Array) -> Array:
+        """The constant offset."""
+        return jnp.asarray(self.offset, float)

@@ -1,0 +1,81 @@
+"""Forces at points and torques on bodies: constant, following, or functions of time."""
+
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from natcoord_jax.core.force import Force, Load
+
+
+def _at(value: Any, t: Array) -> Array:
+    return jnp.asarray(value(t) if callable(value) else value, float)
+
+
+class PointForce(Force):
+    """Force at a point, dead (world components) or following (components along given directions).
+
+    Attributes:
+        markers: the point, and for a following force three directions of the body.
+        force: shape (3,) [N], or a function of time [s] to it.
+        following: take the components along the three directions.
+
+    Example:
+        >>> import natcoord_jax as nc
+        >>> load = nc.PointForce((nc.Point(nc.ground),), force=(0.0, 0.0, -1.0))
+    """
+
+    force: Any = eqx.field(kw_only=True)
+    following: bool = eqx.field(default=False, kw_only=True, static=True)
+
+    kind: ClassVar[str] = "point force"
+
+    def load(self, x: Array, rate: Array, inputs: Array, t: Array) -> Load:
+        """The force on the first marker."""
+        force = _at(self.force, t)
+        if self.following:
+            force = force @ x[1:4]
+        forces = jnp.zeros_like(x).at[0].set(force)
+        return Load(forces, jnp.zeros_like(x))
+
+
+class BodyTorque(Force):
+    """Torque on a body, through the contravariant directors (61): momentum balance exact at any step.
+
+    Attributes:
+        markers: one direction of the body, or three for a following torque.
+        torque: shape (3,) [N m], or a function of time [s] to it.
+        following: take the components along the three directions.
+    """
+
+    torque: Any = eqx.field(kw_only=True)
+    following: bool = eqx.field(default=False, kw_only=True, static=True)
+
+    kind: ClassVar[str] = "body torque"
+
+    def load(self, x: Array, rate: Array, inputs: Array, t: Array) -> Load:
+        """The torque on the body of the first marker."""
+        torque = _at(self.torque, t)
+        if self.following:
+            torque = torque @ x[0:3]
+        torques = jnp.zeros_like(x).at[0].set(torque)
+        return Load(jnp.zeros_like(x), torques)
+
+
+class PairTorque(Force):
+    """Torque on the body of the second marker, its opposite on that of the first (68).
+
+    Attributes:
+        markers: two directions; the torque is along the first, fixed in the first body.
+        torque: [N m], scalar or a function of time [s] to it.
+    """
+
+    torque: Any = eqx.field(kw_only=True)
+
+    kind: ClassVar[str] = "pair torque"
+
+    def load(self, x: Array, rate: Array, inputs: Array, t: Array) -> Load:
+        """Torque along the mid-point direction of the first body."""
+        torque = _at(self.torque, t) * x[0]
+        return Load(jnp.zeros_like(x), jnp.stack([-torque, torque]))

@@ -1,0 +1,107 @@
+"""Springs, dampers, stops and rotor inertia on joint coordinates."""
+
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from natcoord_jax.core.coordinate import CoordinateForce, CoordinateInertia, CoordinatePotential
+
+
+class JointSpring(CoordinatePotential):
+    """Linear spring on a joint coordinate: energy k (c - rest)^2 / 2, exact over many turns.
+
+    Attributes:
+        joint: handle of the joint.
+        stiffness: k [N m/rad or N/m].
+        rest: unstretched coordinate [rad or m].
+        coordinate: which coordinate of the joint.
+
+    Example:
+        >>> import natcoord_jax as nc
+        >>> scene = nc.Scene()
+        >>> arm = scene.add(nc.RigidBody(mass=1.0, inertia=(1.0, 1.0, 1.0)))
+        >>> hinge = scene.add(nc.Revolute(nc.ground, arm))
+        >>> spring = scene.add(nc.JointSpring(hinge, stiffness=3.0))
+    """
+
+    stiffness: Any = eqx.field(kw_only=True)
+    rest: Any = eqx.field(default=0.0, kw_only=True)
+
+    kind: ClassVar[str] = "joint spring"
+    degree: ClassVar[int | None] = 2
+
+    def energy(self, coordinate: Array) -> Array:
+        """Energy [J]."""
+        return 0.5 * self.stiffness * (coordinate - self.rest) ** 2
+
+
+class JointPotential(CoordinatePotential):
+    """Spring on a joint coordinate with any energy.
+
+    Attributes:
+        law: function of the coordinate [rad or m] to the energy [J], in jax.numpy.
+    """
+
+    law: Any = eqx.field(kw_only=True)
+
+    kind: ClassVar[str] = "joint potential"
+
+    def energy(self, coordinate: Array) -> Array:
+        """Energy [J]."""
+        return self.law(coordinate)
+
+
+class JointStops(CoordinatePotential):
+    """Stiff elastic stops: energy k s^2 / 2 of the excess s beyond `lower` or `upper`; conserves energy.
+
+    Attributes:
+        lower: lower stop [rad or m].
+        upper: upper stop [rad or m].
+        stiffness: k [N m/rad or N/m].
+    """
+
+    stiffness: Any = eqx.field(kw_only=True)
+    lower: Any = eqx.field(default=-jnp.inf, kw_only=True)
+    upper: Any = eqx.field(default=jnp.inf, kw_only=True)
+
+    kind: ClassVar[str] = "joint stops"
+
+    def energy(self, coordinate: Array) -> Array:
+        """Energy [J]."""
+        below = jnp.maximum(self.lower - coordinate, 0.0)
+        above = jnp.maximum(coordinate - self.upper, 0.0)
+        return 0.5 * self.stiffness * (below**2 + above**2)
+
+
+class JointDamper(CoordinateForce):
+    """Viscous damper on a joint coordinate: dissipates exactly c (increment)^2 / h in a step.
+
+    Attributes:
+        damping: c [N m s/rad or N s/m].
+    """
+
+    damping: Any = eqx.field(kw_only=True)
+
+    kind: ClassVar[str] = "joint damper"
+
+    def force(self, rate: Array, inputs: Array, t: Array) -> Array:
+        """Generalised force against the rate."""
+        return -self.damping * rate
+
+
+class Armature(CoordinateInertia):
+    """Rotor inertia reflected to a joint coordinate, seen by that coordinate only.
+
+    Attributes:
+        inertia: [kg m^2 or kg].
+    """
+
+    inertia: Any = eqx.field(kw_only=True)
+
+    kind: ClassVar[str] = "armature"
+
+    def inertia_of(self) -> Array:
+        """The inertia."""
+        return jnp.asarray(self.inertia)

@@ -1,0 +1,102 @@
+"""Rotation matrices, quaternions, axis-angle, the polar factor and the series of the arc tangent.
+
+A rotation matrix R maps body components to world components: its columns are the directors d_1, d_2, d_3.
+"""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from natcoord_jax.maths.vectors import dot, safe_divide, safe_norm, skew
+
+
+def from_quaternion(quaternion: Float[Array, "4"]) -> Float[Array, "3 3"]:
+    """Rotation matrix of a quaternion (w, x, y, z), scalar first; it is normalised first."""
+    w, x, y, z = quaternion / jnp.sqrt(jnp.sum(quaternion**2))
+    return jnp.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def to_quaternion(rotation: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 4"]:
+    """Quaternion (w, x, y, z) of a rotation matrix, with w >= 0; differentiable away from half turns.
+
+    The four candidates of Shepperd's method are formed and the one with the largest pivot is taken.
+    """
+    r = rotation
+    r00, r11, r22 = r[..., 0, 0], r[..., 1, 1], r[..., 2, 2]
+    s01, s02, s12 = r[..., 0, 1] + r[..., 1, 0], r[..., 0, 2] + r[..., 2, 0], r[..., 1, 2] + r[..., 2, 1]
+    a0, a1, a2 = r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]
+    pivots = [1 + r00 + r11 + r22, 1 + r00 - r11 - r22, 1 - r00 + r11 - r22, 1 - r00 - r11 + r22]
+    rows = [
+        [pivots[0], a0, a1, a2],
+        [a0, pivots[1], s01, s02],
+        [a1, s01, pivots[2], s12],
+        [a2, s02, s12, pivots[3]],
+    ]
+    candidates = jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+    best = jnp.argmax(jnp.stack(pivots, axis=-1), axis=-1)
+    chosen = jnp.take_along_axis(candidates, best[..., None, None], axis=-2)[..., 0, :]
+    chosen = chosen / jnp.sqrt(jnp.sum(chosen**2, axis=-1, keepdims=True))
+    return jnp.where(chosen[..., :1] < 0, -chosen, chosen)
+
+
+def from_axis_angle(axis: Float[Array, "3"], angle: Float[Array, ""]) -> Float[Array, "3 3"]:
+    """Rotation matrix of a turn by `angle` [rad] about `axis` (any length but zero)."""
+    k = skew(axis / jnp.sqrt(jnp.sum(axis**2)))
+    return jnp.eye(3) + jnp.sin(angle) * k + (1 - jnp.cos(angle)) * (k @ k)
+
+
+def from_rotation_vector(vector: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3 3"]:
+    """Rotation matrix of a rotation vector [rad], smooth at zero."""
+    angle = safe_norm(vector)[..., None, None]
+    small = angle < 1e-4
+    guarded = jnp.where(small, 1.0, angle)
+    first = jnp.where(small, 1 - angle**2 / 6, jnp.sin(guarded) / guarded)
+    second = jnp.where(small, 0.5 - angle**2 / 24, (1 - jnp.cos(guarded)) / guarded**2)
+    k = skew(vector)
+    return jnp.eye(3) + first * k + second * (k @ k)
+
+
+def frame_from_axis(axis, second=None) -> Float[Array, "3 3"]:
+    """Right-handed orthonormal triad, one vector a row, whose third vector points along `axis`.
+
+    The first points along `second` as far as it is perpendicular to `axis`; without `second`, along the
+    world axis that is least aligned with `axis` (chosen on concrete numbers when there are any).
+    """
+    axis = jnp.asarray(axis, float)
+    third = axis / jnp.sqrt(jnp.sum(axis**2))
+    if second is None:
+        helper = jnp.asarray(np.eye(3))[jnp.argmin(jnp.abs(third))]
+    else:
+        helper = jnp.asarray(second, float)
+    first = helper - dot(helper, third) * third
+    first = first / jnp.sqrt(jnp.sum(first**2))
+    return jnp.stack([first, jnp.cross(third, first), third])
+
+
+def orthonormalise(directors: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 3"]:
+    """Nearest orthonormal triad (polar factor) of a triad close to one, by Newton-Schulz iteration."""
+    for _ in range(6):
+        gram = jnp.einsum("...ik,...jk->...ij", directors, directors)
+        directors = 1.5 * directors - 0.5 * jnp.einsum("...ij,...jk->...ik", gram, directors)
+    return directors
+
+
+def arctan_quotient(t: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """atan(t) / t, smooth at zero, where it is 1."""
+    small = jnp.abs(t) < 1e-2
+    square = jnp.where(small, t, 0.0) ** 2
+    series = 1 - square * (1 / 3 - square * (1 / 5 - square * (1 / 7 - square * (1 / 9 - square / 11))))
+    return jnp.where(small, series, safe_divide(jnp.arctan(t), jnp.where(small, 1.0, t)))
+
+
+def angular_velocity(
+    directors: Float[Array, "*batch 3 3"], rates: Float[Array, "*batch 3 3"]
+) -> Float[Array, "*batch 3"]:
+    """World angular velocity [rad/s] of orthonormal directors (rows) with rates: 1/2 sum d_i x v_i (39)."""
+    return 0.5 * jnp.sum(jnp.cross(directors, rates), axis=-2)

@@ -1,0 +1,47 @@
+"""Products and norms of 3-vectors that stay finite under every derivative."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+
+def cross(a: Float[Array, "*batch 3"], b: Float[Array, "*other 3"]) -> Float[Array, "*out 3"]:
+    """Cross product over the last axis, with broadcasting.
+
+    Written out in components: it fuses with its neighbours, which `jnp.cross` does not.
+    """
+    a0, a1, a2 = a[..., 0], a[..., 1], a[..., 2]
+    b0, b1, b2 = b[..., 0], b[..., 1], b[..., 2]
+    return jnp.stack([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0], axis=-1)
+
+
+def dot(a: Float[Array, "*batch k"], b: Float[Array, "*other k"]) -> Float[Array, "*out"]:
+    """Scalar product over the last axis, with broadcasting."""
+    return jnp.sum(a * b, axis=-1)
+
+
+def skew(a: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3 3"]:
+    """Matrix of the map b -> a x b."""
+    zero = jnp.zeros_like(a[..., 0])
+    rows = [
+        jnp.stack([zero, -a[..., 2], a[..., 1]], axis=-1),
+        jnp.stack([a[..., 2], zero, -a[..., 0]], axis=-1),
+        jnp.stack([-a[..., 1], a[..., 0], zero], axis=-1),
+    ]
+    return jnp.stack(rows, axis=-2)
+
+
+def safe_sqrt(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """Square root whose value and derivatives are zero where x <= 0."""
+    positive = x > 0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
+
+
+def safe_norm(a: Float[Array, "*batch k"]) -> Float[Array, "*batch"]:
+    """Euclidean norm over the last axis; its derivative at the origin is zero, not NaN."""
+    return safe_sqrt(jnp.sum(a * a, axis=-1))
+
+
+def safe_divide(a: Float[Array, "*shape"], b: Float[Array, "*other"]) -> Float[Array, "*out"]:
+    """Quotient a / b, zero (with zero derivatives) where b == 0."""
+    zero = b == 0
+    return jnp.where(zero, 0.0, a / jnp.where(zero, 1.0, b))

@@ -1,0 +1,140 @@
+"""The scene: bodies, joints and effects by name, and their compilation to a system and a state."""
+
+import itertools
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from natcoord_jax.assembly.build import build
+from natcoord_jax.assembly.system import System
+from natcoord_jax.core.bodies import Body
+from natcoord_jax.core.checks import numbers, require_double
+from natcoord_jax.core.effect import Effect
+from natcoord_jax.core.handles import Handle, ground
+from natcoord_jax.core.joint import Joint
+from natcoord_jax.core.state import State
+
+_scene_numbers = itertools.count(1)
+
+
+class Scene:
+    """A list of bodies, joints and effects with names; host Python, compiled once.
+
+    There is no gravity unless it is added.
+
+    Example:
+        >>> import natcoord_jax as nc
+        >>> scene = nc.Scene()
+        >>> base = scene.add(nc.RigidBody(mass=1.0, inertia=(1.0, 1.0, 1.0), name="base"))
+        >>> system, state = scene.compile()
+        >>> system.structure.bodies
+        ('base',)
+    """
+
+    def __init__(self):
+        require_double("scene")
+        self._number = next(_scene_numbers)
+        self.bodies: dict[str, Body] = {}
+        self.joints: dict[str, Joint] = {}
+        self.effects: dict[str, Effect] = {}
+
+    def add(self, part: Body | Joint | Effect) -> Handle:
+        """Add a body, a joint or another effect.
+
+        Args:
+            part: what to add.
+
+        Returns:
+            The handle that joints, effects and sensors refer to it with.
+
+        Raises:
+            ValueError: for a duplicate name, a part of another scene, or a joint of a body with itself.
+        """
+        if isinstance(part, Body):
+            store, kind, label = self.bodies, "body", "body"
+        elif isinstance(part, Joint):
+            store, kind, label = self.joints, "joint", type(part).__name__.lower()
+        elif isinstance(part, Effect):
+            store, kind, label = self.effects, "effect", type(part).kind
+        else:
+            raise ValueError(f"cannot add {part!r} to a scene; add bodies, joints and effects")
+        name = part.name or self._free_name(label)
+        if name in self.bodies or name in self.joints or name in self.effects or name == ground.name:
+            raise ValueError(f"the name {name!r} is taken in this scene; pass another `name`")
+        self._check(part, name)
+        store[name] = part
+        handle = Handle(kind, name, self._number)
+        if isinstance(part, Joint):
+            for companion in part.companions(handle):
+                self.add(companion)
+        return handle
+
+    def _free_name(self, label: str) -> str:
+        taken = (self.bodies, self.joints, self.effects)
+        numbered = (f"{label} {k}" for k in itertools.count(1))
+        return next(name for name in numbered if not any(name in store for store in taken))
+
+    def _check(self, part: Body | Joint | Effect, name: str) -> None:
+        """Every handle in the part must be of this scene."""
+        if isinstance(part, Body):
+            return
+        if isinstance(part, Joint):
+            if part.parent == part.child:
+                raise ValueError(f"joint {name!r} joins body {part.child.name!r} with itself; pass two bodies")
+            self._check_joint_numbers(part, name)
+        flat = jax.tree.leaves(part, is_leaf=lambda x: isinstance(x, Handle | eqx.Module) and x is not part)
+        for leaf in flat:
+            handle = leaf if isinstance(leaf, Handle) else getattr(leaf, "body", None)
+            if isinstance(handle, Handle):
+                self.find(handle, f"{name!r}")
+
+    def _check_joint_numbers(self, joint: Joint, name: str) -> None:
+        for body in (joint.parent, joint.child):
+            if not isinstance(body, Handle) or body.kind != "body":
+                raise ValueError(f"joint {name!r}: {body!r} is no body; pass handles returned by Scene.add")
+        for vector, what, unit in (
+            (joint.axis, "axis", "-"),
+            (joint.second, "second", "-"),
+            (joint.point, "point", "m"),
+        ):
+            if vector is not None:
+                array = numbers(vector, (3,), f"joint {name!r}: {what}", unit)
+                if unit == "-" and not isinstance(array, jax.core.Tracer) and not np.any(np.asarray(array)):
+                    raise ValueError(f"joint {name!r}: {what} [-] is zero; pass a direction")
+
+    def find(self, handle: Handle, user: str = "a request") -> Body | Joint | Effect | None:
+        """The part behind a handle; None for the ground.
+
+        Raises:
+            ValueError: if the handle is not of this scene.
+        """
+        if handle == ground:
+            return None
+        store = {"body": self.bodies, "joint": self.joints, "effect": self.effects}[handle.kind]
+        if handle.scene != self._number or handle.name not in store:
+            raise ValueError(
+                f"{user} refers to {handle!r}, which is not part of this scene; "
+                "pass handles that this scene's `add` returned"
+            )
+        return store[handle.name]
+
+    def compile(self, *, assemble: bool = False, solver: str | None = None) -> tuple[System, State]:
+        """Compile to a system (parameters and structure) and its initial state.
+
+        Args:
+            assemble: project positions and velocities onto the constraints (see `nc.assemble`); without it
+                a gap is refused and inconsistent velocities are projected with a warning.
+            solver: "reduced", "recursive" or "full"; default chosen from the structure (see `System.report`).
+
+        Raises:
+            ValueError: for an empty scene, a gap in a joint (with its name and size), a body without inertia
+                along a free motion, or a solver that cannot handle the scene.
+        """
+        if not self.bodies:
+            raise ValueError("the scene has no bodies; add one before compiling")
+        system, state = build(self.bodies, self.joints, self.effects, solver)
+        return system, state

@@ -1,0 +1,239 @@
+"""The floors of the package: who may import whom, read from the source without running it.
+
+Every import counts, also those inside functions and under ``TYPE_CHECKING``: knowledge is knowledge, whenever
+it is loaded. Only ``natcoord_jax/__init__.py``, which gathers the public names, is free of the floors.
+"""
+
+import ast
+import importlib
+import inspect
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+PACKAGE = "natcoord_jax"
+ROOT = Path(__file__).resolve().parents[1]
+SOURCE = ROOT / PACKAGE
+
+# From the ground up. A module imports from its own floor and from those below it.
+FLOORS = (
+    "maths",
+    "core",
+    "effects",
+    "assembly",
+    "linsolve",
+    "bodies",
+    "stepping",
+    "scene",
+    "analysis",
+    "control",
+    "viz",
+    "gallery",
+    "cli",
+)
+# What a floor must not see although it lies below: the machinery knows kinds and blocks, no effect by name.
+BLIND = {
+    "assembly": {"effects", "bodies"},
+    "linsolve": {"core", "effects", "assembly"},
+    "stepping": {"effects", "bodies"},
+}
+# ``import natcoord_jax`` reaches every floor at once, so it is left to those above all others.
+THROUGH_THE_ROOF = {"gallery", "cli"}
+# Third parties that linsolve may use beside the standard library.
+LINSOLVE_TOOLS = {"jax", "jaxlib", "equinox", "jaxtyping", "numpy"}
+PLOTTING = {"matplotlib", "mpl_toolkits"}
+HEAVY = ("matplotlib", "optax", "scipy.optimize")
+
+FILES = sorted(SOURCE.rglob("*.py"))
+
+
+def module_name(file: Path) -> str:
+    """Dotted name of a source file; a folder's ``__init__.py`` bears the name of the folder."""
+    parts = file.relative_to(ROOT).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def floor_of(module: str) -> str:
+    """Name below the package, empty for the package itself; ``python -m natcoord_jax`` is the cli."""
+    parts = module.split(".")
+    name = parts[1] if len(parts) > 1 else ""
+    return "cli" if name == "__main__" else name
+
+
+def effect_folder(module: str) -> str:
+    """``joints`` of ``natcoord_jax.effects.joints.revolute``; empty for their root and outside of it."""
+    parts = module.split(".")
+    return parts[2] if len(parts) > 2 and parts[1] == "effects" else ""
+
+
+def imports(tree: ast.AST, package: str) -> Iterator[tuple[int, str]]:
+    """Line and dotted target of every import; ``from a import b`` counts as ``a.b``.
+
+    Args:
+        tree: the parsed source.
+        package: the package that relative imports start from.
+    """
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from ((node.lineno, alias.name) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = _absolute("." * node.level + (node.module or ""), package)
+            yield from ((node.lineno, base if a.name == "*" else f"{base}.{a.name}") for a in node.names)
+        elif isinstance(node, ast.Call) and node.args and isinstance(node.args[0], ast.Constant):
+            name, target = ast.unparse(node.func).rpartition(".")[2], node.args[0].value
+            if name in {"import_module", "__import__"} and isinstance(target, str):
+                yield node.lineno, _absolute(target, package)
+
+
+def _absolute(target: str, package: str) -> str:
+    level = len(target) - len(target.lstrip("."))
+    if level == 0:
+        return target
+    parts = package.split(".")
+    return ".".join([*parts[: len(parts) - level + 1], *filter(None, [target[level:]])])
+
+
+def breaches(module: str, source: str, *, is_package: bool = False) -> list[str]:
+    """Every rule that a module breaks, in words.
+
+    Args:
+        module: dotted name of the module.
+        source: its text.
+        is_package: whether it is the ``__init__.py`` of a folder.
+    """
+    tree = ast.parse(source)
+    found = [
+        f"line {node.lineno}: hasattr; an effect declares what it is, so ask for that"
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Name) and node.id == "hasattr"
+    ]
+    floor = floor_of(module)
+    if floor and floor not in FLOORS:
+        return [*found, f"'{floor}' is on no floor; the floors are {' < '.join(FLOORS)}"]
+    package = module if is_package else module.rpartition(".")[0]
+    for line, target in imports(tree, package):
+        ours = target.split(".")[0] == PACKAGE
+        reason = _inside(module, floor, target) if ours else _outside(floor, target.split(".")[0])
+        if reason:
+            found.append(f"line {line}: imports {target}, but {reason}")
+    return found
+
+
+def _inside(module: str, floor: str, target: str) -> str:
+    """Why a module may not import this target of our own; empty if it may."""
+    if not floor:
+        return ""
+    other = floor_of(target)
+    if other not in FLOORS:
+        whole = f"{floor} must name the module it needs, not the whole package"
+        return "" if floor in THROUGH_THE_ROOF else whole
+    if FLOORS.index(other) > FLOORS.index(floor):
+        return f"{other} lies above {floor}"
+    if other in BLIND.get(floor, ()):
+        return f"{floor} must not know {other}"
+    own, theirs = effect_folder(module), effect_folder(target)
+    shared = (SOURCE / "effects" / f"{theirs}.py").is_file()
+    if own and other == "effects" and theirs != own and not shared:
+        return f"effects/{own} must not import other effects; what is shared belongs in core or maths"
+    return ""
+
+
+def _outside(floor: str, library: str) -> str:
+    """Why a floor may not import this library; empty if it may."""
+    if library in PLOTTING and floor != "viz":
+        return "matplotlib lives in viz and nowhere else"
+    if floor == "linsolve" and library not in LINSOLVE_TOOLS | sys.stdlib_module_names:
+        return f"linsolve uses {', '.join(sorted(LINSOLVE_TOOLS))} and nothing else"
+    return ""
+
+
+def test_the_package_is_there():
+    assert FILES, f"no source found under {PACKAGE}/"
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda file: file.relative_to(ROOT).as_posix())
+def test_floors(file: Path):
+    found = breaches(module_name(file), file.read_text("utf-8"), is_package=file.name == "__init__.py")
+    if found:
+        pytest.fail(f"{file.relative_to(ROOT).as_posix()}\n  " + "\n  ".join(found), pytrace=False)
+
+
+@pytest.mark.parametrize(
+    ("module", "source", "fragment"),
+    [
+        ("core.marker", "from natcoord_jax.effects.joints import Revolute", "effects lies above core"),
+        ("core.marker", "from ..scene import Scene", "scene lies above core"),
+        ("core.marker", "def f():\n    from .. import viz", "viz lies above core"),
+        ("core.marker", "importlib.import_module('natcoord_jax.viz')", "viz lies above core"),
+        ("core.marker", "importlib.import_module('..viz', __package__)", "viz lies above core"),
+        ("core.marker", "import natcoord_jax as nc", "not the whole package"),
+        ("core.marker", "from natcoord_jax import Scene", "not the whole package"),
+        ("core.marker", "hasattr(object, 'x')", "hasattr"),
+        ("effects.joints.screw", "from ..springs import linear", "must not import other effects"),
+        ("effects.joints.screw", "from natcoord_jax.effects import Spring", "must not import other effects"),
+        ("assembly.groups", "from natcoord_jax.effects.joints import Revolute", "must not know effects"),
+        ("stepping.newton", "from ..bodies import rigid", "must not know bodies"),
+        ("linsolve.dense", "from ..core import state", "must not know core"),
+        ("linsolve.dense", "import scipy.linalg", "nothing else"),
+        ("analysis.energy", "import matplotlib.pyplot as plt", "lives in viz"),
+        ("helpers", "", "is on no floor"),
+    ],
+)
+def test_a_breach_is_seen(module: str, source: str, fragment: str):
+    found = breaches(f"{PACKAGE}.{module}", source)
+    assert len(found) == 1 and fragment in found[0], found
+
+
+@pytest.mark.parametrize(
+    ("module", "source"),
+    [
+        ("core.marker", "from ..maths import rotations\nfrom .state import State"),
+        ("effects.joints.screw", "from .revolute import Revolute\nfrom ...core.marker import Marker"),
+        ("linsolve.dense", "import math\nimport jax.numpy as jnp\nfrom natcoord_jax.maths import norms"),
+        ("stepping.newton", "from natcoord_jax.linsolve.dense import solve"),
+        ("scene", "from . import bodies, effects, stepping"),
+        ("viz.plot", "import matplotlib.pyplot as plt\nimport natcoord_jax.analysis.energy"),
+        ("gallery.spacecraft", "import natcoord_jax as nc"),
+        ("__main__", "from natcoord_jax.cli import main"),
+    ],
+)
+def test_what_is_allowed_passes(module: str, source: str):
+    assert breaches(f"{PACKAGE}.{module}", source) == []
+
+
+def test_import_is_light_and_changes_no_setting():
+    program = (
+        "import json, sys, jax\n"
+        "before = dict(jax.config.values)\n"
+        f"import {PACKAGE}\n"
+        "after = dict(jax.config.values)\n"
+        "changed = sorted(k for k in after if k in before and before[k] != after[k])\n"
+        f"print(json.dumps([changed, [m for m in {HEAVY!r} if m in sys.modules]]))\n"
+    )
+    env = {key: value for key, value in os.environ.items() if key != "JAX_ENABLE_X64"}
+    run = subprocess.run([sys.executable, "-c", program], cwd=ROOT, env=env, capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
+    changed, heavy = json.loads(run.stdout.splitlines()[-1])
+    assert not changed, f"import {PACKAGE} changes settings of JAX: {', '.join(changed)}"
+    assert not heavy, f"import {PACKAGE} loads {', '.join(heavy)}; import them where they are used"
+
+
+def test_public_names_have_docstrings():
+    package = importlib.import_module(PACKAGE)
+    assert getattr(package, "__all__", ()), f"{PACKAGE} names nothing in __all__"
+    bare = [name for name in package.__all__ if not _documented(getattr(package, name))]
+    assert not bare, f"public names without a docstring of their own: {', '.join(bare)}"
+
+
+def _documented(thing: object) -> bool:
+    """Whether a module, class or function has a docstring that somebody wrote; plain values need none."""
+    if not (callable(thing) or inspect.ismodule(thing)):
+        return True
+    doc = (thing.__doc__ or "").strip()
+    # A dataclass without a docstring is given its signature for one.
+    return bool(doc) and not (inspect.isclass(thing) and doc.startswith(f"{thing.__name__}("))
