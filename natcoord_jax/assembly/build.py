@@ -247,9 +247,9 @@ def build(
     joint_groups = stack(layout.joint_instances(), len(bodies))
     groups = stack(instances, len(bodies))
     tree = make_tree(layout.spanning, layout.motions())
-    multipliers = sum(g.count * g.effect.multipliers for g in groups)
+    multipliers = sum(g.count * g.multipliers for g in groups)
     relations = multipliers
-    multipliers += sum(g.count * g.effect.rows for g in joint_groups if not g.in_tree)
+    multipliers += sum(g.count * g.multipliers for g in joint_groups if not g.in_tree)
     internal = 6 * sum(b.oriented for b in bodies.values())
     ordered = [list(bodies)[i] for i in layout.spanning.order]
     structure = Structure(
@@ -262,7 +262,7 @@ def build(
         unknowns=len(tree.slot_of),
         multipliers=multipliers,
         solver=solver or "reduced",
-        constraints=internal + relations + sum(g.count * g.effect.rows for g in joint_groups),
+        constraints=internal + relations + sum(g.count * g.multipliers for g in joint_groups),
         redundant=0,
         notes=(),
     )

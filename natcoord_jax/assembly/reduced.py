@@ -7,6 +7,8 @@ then the rates of the constraints. Working with rates and multipliers times h ke
 size as h goes to zero.
 """
 
+from typing import Self
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -14,6 +16,7 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.response import (
     Situation,
+    Stations,
     body_rows,
     gather,
     respond,
@@ -21,8 +24,18 @@ from natcoord_jax.assembly.response import (
     stations,
 )
 from natcoord_jax.assembly.system import Group, System
-from natcoord_jax.assembly.tree import gather_slots, project, sweep_motion, tangent
+from natcoord_jax.assembly.tree import (
+    JointGeometry,
+    TreeMotion,
+    gather_slots,
+    joint_rates,
+    project,
+    sweep_motion,
+    tangent,
+)
+from natcoord_jax.core.effect import Response
 from natcoord_jax.core.state import State
+from natcoord_jax.linsolve.dense import apply, saddle_inverse
 from natcoord_jax.maths.collocation import Tableau, gauss
 from natcoord_jax.maths.vectors import cross
 
@@ -32,57 +45,11 @@ def active_groups(system: System) -> tuple[Group, ...]:
     return (*system.effects, *(g for g in system.joints if not g.in_tree))
 
 
-class ReducedStep(eqx.Module):
-    """Everything about one step that does not depend on the unknowns."""
-
-    system: System
-    start: Float[Array, "bodies 4 3"]
-    velocity: Float[Array, "bodies 4 3"]
-    frames: Float[Array, "bodies 2 4 4"]
-    situations: tuple[Situation, ...]
-    h: Float[Array, ""]
-    tableau: Tableau = eqx.field(static=True)
-
-
-def prepare(system: System, state: State, u: Array, h: Array, tableau: Tableau) -> ReducedStep:
-    """Gather what the step needs, once."""
-    start = body_rows(state.q)
-    return ReducedStep(
-        system,
-        start,
-        body_rows(state.v),
-        system.tree.frames(system.frames),
-        tuple(situation(system, g, state, u, h) for g in active_groups(system)),
-        h,
-        tableau,
-    )
-
-
-def split(step: ReducedStep, y: Float[Array, " unknowns"]) -> tuple[Array, list[Array]]:
-    """Rates (s, unknowns) and multipliers of each active group (n, s, m)."""
-    s = step.tableau.stages
-    count = step.system.structure.unknowns * s
-    w = y[:count].reshape(s, step.system.structure.unknowns)
-    multipliers, position = [], count
-    for group in active_groups(step.system):
-        size = group.count * s * group.effect.multipliers
-        shape = (group.count, s, group.effect.multipliers)
-        multipliers.append(y[position : position + size].reshape(shape))
-        position += size
-    return w, multipliers
-
-
 def inertia(
-    mass: Float[Array, "bodies 4 4"], rates: Float[Array, "s bodies 4 3"]
-) -> Float[Array, "s bodies 4 3"]:
+    mass: Float[Array, "bodies 4 4"], rates: Float[Array, "*s bodies 4 3"]
+) -> Float[Array, "*s bodies 4 3"]:
     """Rows of m v."""
-    return jnp.sum(mass[:, :, :, None] * rates[:, :, None], axis=3)
-
-
-def stage_points(step: ReducedStep, velocity: Float[Array, "s bodies 3"]) -> Float[Array, "s bodies 3"]:
-    """Reference points at the stages."""
-    coefficients = step.h * jnp.asarray(step.tableau.a, velocity.dtype)
-    return step.start[:, 0] + jnp.sum(coefficients[:, :, None, None] * velocity, axis=1)
+    return jnp.sum(mass[:, :, :, None] * rates[..., None, :, :], axis=-2)
 
 
 def wrench(
@@ -92,76 +59,172 @@ def wrench(
     return rows[:, :, 0], jnp.sum(cross(directors, rows[:, :, 1:]), axis=2)
 
 
-def residual(step: ReducedStep, y: Float[Array, " unknowns"]) -> Float[Array, " unknowns"]:
-    """Residual of the step [N s, N m s; m/s, 1/s for constraints]."""
-    system, tableau, h = step.system, step.tableau, step.h
-    w, multipliers = split(step, y)
-    motion, geometry = sweep_motion(
-        system.tree, step.frames, step.start, gather_slots(system.tree, w), h, tableau
-    )
-    rates = jnp.concatenate(
-        [motion.velocity[:, :, None], cross(motion.spin[:, :, None], motion.directors)], axis=2
-    )
-    difference = rates - step.velocity
-    if tableau.stages == 1:
-        change = tableau.a_inverse[0][0] * difference
-    else:
-        change = jnp.einsum("ij,jbrc->ibrc", jnp.asarray(tableau.a_inverse), difference)
-    momentum = inertia(system.mass, change)
-    torque = jnp.zeros_like(motion.spin)
-    rows = []
-    groups = active_groups(system)
-    if groups:
-        points = stage_points(step, motion.velocity)
-        at = stations(step.start, points, motion.directors, motion.velocity, motion.spin)
-        bodies = step.start.shape[0]
-        for group, where, lam in zip(groups, step.situations, multipliers):
+def row_weights(mass: Float[Array, "bodies 4 4"]) -> Float[Array, "bodies 4"]:
+    """Reciprocal mass of each row, so that weight times impulse squared is an energy; 0 for massless rows."""
+    turning = jnp.trace(mass[:, 1:, 1:], axis1=1, axis2=2)
+    sizes = jnp.stack([mass[:, 0, 0], turning, turning, turning], axis=1)
+    return jnp.where(sizes > 0, 1.0 / jnp.where(sizes > 0, sizes, 1.0), 0.0)
+
+
+class ReducedStep(eqx.Module):
+    """One step in the joint null space: all that does not depend on the unknowns, and the equations."""
+
+    system: System
+    state: State
+    start: Float[Array, "bodies 4 3"]
+    velocity: Float[Array, "bodies 4 3"]
+    frames: Float[Array, "bodies 2 4 4"]
+    situations: tuple[Situation, ...]
+    h: Float[Array, ""]
+    tableau: Tableau = eqx.field(static=True)
+
+    @classmethod
+    def prepare(cls, system: System, state: State, u: Array, h: Array, tableau: Tableau) -> Self:
+        """Gather what the step needs, once."""
+        start = body_rows(state.q)
+        return cls(
+            system,
+            state,
+            start,
+            body_rows(state.v),
+            system.tree.frames(system.frames),
+            tuple(situation(system, g, state, u, h) for g in active_groups(system)),
+            h,
+            tableau,
+        )
+
+    @property
+    def balances(self) -> int:
+        """Number of balance equations; the rest are constraints."""
+        return self.system.structure.unknowns * self.tableau.stages
+
+    def split(self, y: Float[Array, " unknowns"]) -> tuple[Array, list[Array]]:
+        """Rates (s, unknowns) and multipliers of each active group (n, s, m)."""
+        s, position = self.tableau.stages, self.balances
+        w, multipliers = y[:position].reshape(s, -1), []
+        if position == 0:
+            w = y[:0].reshape(s, 0)
+        for group in active_groups(self.system):
+            shape = (group.count, s, group.multipliers)
+            size = group.count * s * group.multipliers
+            multipliers.append(y[position : position + size].reshape(shape))
+            position += size
+        return w, multipliers
+
+    def motion(self, w: Float[Array, "s unknowns"]) -> tuple[TreeMotion, list[JointGeometry]]:
+        """Stage motion of the bodies at given rates."""
+        slots = gather_slots(self.system.tree, w)
+        return sweep_motion(self.system.tree, self.frames, self.start, slots, self.h, self.tableau)
+
+    def stations(self, motion: TreeMotion) -> Stations:
+        """Motion as the effects see it."""
+        a = self.h * jnp.asarray(self.tableau.a, motion.velocity.dtype)
+        points = self.start[:, 0] + jnp.sum(a[:, :, None, None] * motion.velocity, axis=1)
+        return stations(self.start, points, motion.directors, motion.velocity, motion.spin)
+
+    def residual(self, y: Float[Array, " unknowns"]) -> tuple[Float[Array, " unknowns"], Float[Array, ""]]:
+        """Residual [N s, N m s; m/s, 1/s for constraints] and the size of its terms [sqrt(J)]."""
+        system, tableau = self.system, self.tableau
+        w, multipliers = self.split(y)
+        motion, geometry = self.motion(w)
+        rates = jnp.concatenate(
+            [motion.velocity[:, :, None], cross(motion.spin[:, :, None], motion.directors)], axis=2
+        )
+        momentum = stage_momentum(system.mass, rates - self.velocity, tableau)
+        weights = row_weights(system.mass)[..., None]
+        size = jnp.sum(weights * (momentum**2 + 4 * inertia(system.mass, self.velocity) ** 2))
+        torque = jnp.zeros_like(motion.spin)
+        rows = []
+        groups = active_groups(system)
+        at = self.stations(motion) if groups else None
+        for group, where, lam in zip(groups, self.situations, multipliers):
             answer = respond(group, where, gather(group, at), lam, tableau)
-            forces = jnp.moveaxis(answer.forces, 1, 0)
-            turning = jnp.moveaxis(answer.torques, 1, 0)
-            impulse = lam.shape[-1] > 0 and group.source == "joint"
-            scale = 1.0 if impulse else h
-            total = jnp.zeros((tableau.stages, bodies + 1, 4, 3), w.dtype).at[:, group.bodies].add(forces)
-            spun = jnp.zeros((tableau.stages, bodies + 1, 3), w.dtype).at[:, group.bodies].add(turning)
-            momentum = momentum - scale * total[:, :bodies]
-            torque = torque - scale * spun[:, :bodies]
+            forces, turning = self._scatter(group, answer)
+            momentum = momentum - forces
+            torque = torque - turning
+            size = size + jnp.sum(weights * forces**2) + jnp.sum(weights[:, 1] * turning**2)
             rows.append(answer.rows.reshape(-1))
-    force, moment = wrench(momentum, motion.directors)
-    generalised = project(system.tree, geometry, force, moment + torque)[0]
-    return jnp.concatenate([generalised.reshape(-1), *rows])
+        force, moment = wrench(momentum, motion.directors)
+        generalised = project(system.tree, geometry, force, moment + torque)[0]
+        return jnp.concatenate([generalised.reshape(-1), *rows]), jnp.sqrt(size)
+
+    def _scatter(self, group: Group, answer: Response) -> tuple[Array, Array]:
+        """Impulses on rows and angular impulses on bodies; multipliers of joints are impulses already."""
+        scale = 1.0 if group.source == "joint" else self.h
+        forces = scale * jnp.moveaxis(answer.forces, 1, 0)
+        turning = scale * jnp.moveaxis(answer.torques, 1, 0)
+        if group.source == "mass":
+            return forces[:, :, 0], turning[:, :, 0]
+        bodies, stages = self.start.shape[0], self.tableau.stages
+        rows = jnp.zeros((stages, bodies + 1, 4, 3), forces.dtype).at[:, group.bodies].add(forces)
+        turns = jnp.zeros((stages, bodies + 1, 3), forces.dtype).at[:, group.bodies].add(turning)
+        return rows[:, :bodies], turns[:, :bodies]
+
+    def _start_geometry(self) -> list[JointGeometry]:
+        zero = jnp.zeros((1, self.system.structure.unknowns), self.start.dtype)
+        slots = gather_slots(self.system.tree, zero)
+        return sweep_motion(self.system.tree, self.frames, self.start, slots, 0.0 * self.h, gauss(1))[1]
+
+    def guess(self) -> Float[Array, " unknowns"]:
+        """Rates of the velocities at the start, repeated for every stage; multipliers zero."""
+        spin = 0.5 * jnp.sum(cross(self.start[:, 1:], self.velocity[:, 1:]), axis=1)[None]
+        w = joint_rates(self.system.tree, self._start_geometry(), self.velocity[None, :, 0], spin)
+        w = jnp.tile(w.reshape(-1), self.tableau.stages)
+        return jnp.concatenate([w, jnp.zeros(self.system.structure.multipliers * self.tableau.stages)])
+
+    def inertia_matrix(self) -> Float[Array, "unknowns unknowns"]:
+        """P^T M P at the start of the step."""
+        system, geometry = self.system, self._start_geometry()
+        directors = self.start[None, :, 1:]
+
+        def column(unit: Array) -> Array:
+            velocity, spin = tangent(system.tree, geometry, gather_slots(system.tree, unit[None]))
+            rates = jnp.concatenate([velocity[:, :, None], cross(spin[:, :, None], directors)], axis=2)
+            force, moment = wrench(inertia(system.mass, rates), directors)
+            return project(system.tree, geometry, force, moment)[0][0]
+
+        return jax.vmap(column)(jnp.eye(system.structure.unknowns, dtype=self.start.dtype))
+
+    def jacobian(self, y: Float[Array, " unknowns"]) -> Float[Array, "unknowns unknowns"]:
+        """Exact Jacobian of the residual."""
+        return jax.jacfwd(lambda x: self.residual(x)[0])(y)
+
+    def approximate(self, y: Float[Array, " unknowns"]) -> tuple[Array, Array]:
+        """Inverse for the first iterations and the inertias of the unknowns (0 for multipliers).
+
+        Without springs, dampers and loops the inertia matrix will do; with them the exact Jacobian.
+        """
+        if self.tableau.stages == 1 and not any(stiff(g) for g in active_groups(self.system)):
+            matrix = 2.0 * self.inertia_matrix()
+        else:
+            matrix = self.jacobian(y)
+        weights = jnp.abs(jnp.diagonal(matrix))
+        return saddle_inverse(matrix, self.balances), weights.at[self.balances :].set(0.0)
+
+    def exact(self, y: Float[Array, " unknowns"]) -> Array:
+        """Inverse of the exact Jacobian."""
+        return saddle_inverse(self.jacobian(y), self.balances)
+
+    @staticmethod
+    def solve(factors: Array, right: Float[Array, " unknowns"]) -> Float[Array, " unknowns"]:
+        """Apply an inverse."""
+        return apply(factors, right)
+
+    def end_motion(self, y: Float[Array, " unknowns"]) -> tuple[Stations, list[Array]]:
+        """Stage motion of all bodies and the multipliers, for the end of the step."""
+        w, multipliers = self.split(y)
+        return self.stations(self.motion(w)[0]), multipliers
 
 
-def inertia_matrix(step: ReducedStep) -> Float[Array, "unknowns unknowns"]:
-    """P^T M P of the tree at the start of the step: the Jacobian's leading part is twice that."""
-    system = step.system
-    one = gauss(1)
-    count = system.structure.unknowns
-    zero = jnp.zeros((1, count), step.start.dtype)
-    _, geometry = sweep_motion(
-        system.tree, step.frames, step.start, gather_slots(system.tree, zero), 0.0 * step.h, one
-    )
-    directors = step.start[None, :, 1:]
-
-    def column(unit):
-        velocity, spin = tangent(system.tree, geometry, gather_slots(system.tree, unit[None]))
-        rates = jnp.concatenate([velocity[:, :, None], cross(spin[:, :, None], directors)], axis=2)
-        force, moment = wrench(inertia(system.mass, rates), directors)
-        return project(system.tree, geometry, force, moment)[0][0]
-
-    return jax.vmap(column)(jnp.eye(count, dtype=step.start.dtype))
+def stiff(group: Group) -> bool:
+    """Whether an effect belongs into the Jacobian of the first iterations."""
+    return not (group.source == "mass" or group.effect.inputs > 0) or group.multipliers > 0
 
 
-def increment(step: ReducedStep, y: Float[Array, " unknowns"]):
-    """Stage velocities of all rows, and the motion with the ground: what the end of the step is made of."""
-    w, multipliers = split(step, y)
-    motion, geometry = sweep_motion(
-        step.system.tree,
-        step.frames,
-        step.start,
-        gather_slots(step.system.tree, w),
-        step.h,
-        step.tableau,
-    )
-    points = stage_points(step, motion.velocity)
-    at = stations(step.start, points, motion.directors, motion.velocity, motion.spin)
-    return at, multipliers
+def stage_momentum(
+    mass: Float[Array, "bodies 4 4"], difference: Float[Array, "s bodies 4 3"], tableau: Tableau
+) -> Float[Array, "s bodies 4 3"]:
+    """M sum_j (A^-1)_ij (V_j - v_0)."""
+    if tableau.stages == 1:
+        return inertia(mass, tableau.a_inverse[0][0] * difference)
+    return inertia(mass, jnp.einsum("ij,jbrc->ibrc", jnp.asarray(tableau.a_inverse), difference))

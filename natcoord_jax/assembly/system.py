@@ -41,6 +41,11 @@ class Group(eqx.Module):
     source: str = eqx.field(static=True)
     in_tree: bool = eqx.field(static=True, default=False)
 
+    @property
+    def multipliers(self) -> int:
+        """Multipliers of one instance and stage."""
+        return self.effect.multipliers
+
 
 class CoordinateGroup(eqx.Module):
     """Joint coordinates of one description: joints, their bodies and places in the state."""

@@ -258,3 +258,34 @@ def project(
     stages, bodies = joined[0].shape[:2]
     generalised = joined[0].reshape(stages, bodies * SLOTS)[:, tree.slot_of]
     return generalised, joined[1], joined[2]
+
+
+def joint_rates(
+    tree: Tree,
+    geometry: list[JointGeometry],
+    velocity: Float[Array, "s bodies 3"],
+    spin: Float[Array, "s bodies 3"],
+) -> Float[Array, "s unknowns"]:
+    """Rates of the free motions of given body velocities: the left inverse of `tangent` where axes are
+    orthonormal, that is, at the ends of a step.
+    """
+    columns, spins, velocities = [], [], []
+    for level, joint in zip(tree.levels, geometry):
+        here = slice(level.start, level.stop)
+        own_spin, own_velocity = spin[:, here], velocity[:, here]
+        relative = own_spin
+        gap_rate = own_velocity + cross(own_spin, joint.child_arm)
+        if not level.grounded:
+            up = tree.parent_in_level[here]
+            relative = own_spin - spins[-1][:, up]
+            gap_rate = gap_rate - velocities[-1][:, up]
+            gap_rate = gap_rate - cross(spins[-1][:, up], joint.parent_arm + joint.gap)
+        spins.append(own_spin)
+        velocities.append(own_velocity)
+        sources = [relative] * len(level.rotations) + [gap_rate] * len(level.translations)
+        sources += [relative] * level.child_rotation
+        rates = {slot: dot(x, joint.axes[:, :, i]) for i, (slot, x) in enumerate(zip(level.slots, sources))}
+        zero = jnp.zeros_like(own_spin[..., 0])
+        columns.append(jnp.stack([rates.get(slot, zero) for slot in range(SLOTS)], axis=-1))
+    slots = jnp.concatenate(columns, axis=1)
+    return slots.reshape(slots.shape[0], -1)[:, tree.slot_of]

@@ -40,7 +40,7 @@ def frames_at(place: Float[Array, "2 4 4"], rows: Float[Array, "*s 2 4 3"]) -> t
 
 
 class Joint(Effect):
-    """Base of joints: subclass it and give `residual` (and `rows`, its length).
+    """Base of joints: subclass it and give `residual` (and `multipliers`, its length).
 
     Attributes:
         parent: body handle, or `ground`.
@@ -51,7 +51,7 @@ class Joint(Effect):
         name: optional name.
 
     Class attributes:
-        rows: number of constraints.
+        multipliers: number of constraints.
         rotations: axes of the parent's frame about which the child may turn freely.
         child_rotation: the child may also turn about the first axis of its own frame.
         translations: axes of the parent's frame along which the child may slide freely.
@@ -64,7 +64,7 @@ class Joint(Effect):
 
         >>> import natcoord_jax as nc
         >>> class PointInPlane(nc.Joint):
-        ...     rows = 1
+        ...     multipliers = 1
         ...     def residual(self, parent, child):
         ...         return (parent.axes[2] @ (child.point - parent.point))[None]
     """
@@ -77,7 +77,7 @@ class Joint(Effect):
     name: Any = eqx.field(default=None, kw_only=True)
 
     kind: ClassVar[str] = "joint"
-    rows: ClassVar[int] = 0
+    multipliers: ClassVar[int] = 0
     rotations: ClassVar[tuple[int, ...]] = ()
     child_rotation: ClassVar[bool] = False
     translations: ClassVar[tuple[int, ...]] = ()
@@ -86,7 +86,7 @@ class Joint(Effect):
     needs_axis: ClassVar[bool] = True
 
     @abc.abstractmethod
-    def residual(self, parent: Frame, child: Frame) -> Float[Array, " rows"]:
+    def residual(self, parent: Frame, child: Frame) -> Float[Array, " m"]:
         """Constraints g, at most quadratic in the vectors of the two frames."""
 
     def anchors(self) -> tuple[Any, Any]:

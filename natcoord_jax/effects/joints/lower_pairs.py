@@ -30,11 +30,11 @@ class Fixed(Joint):
 
     Example:
         >>> import natcoord_jax as nc
-        >>> nc.Fixed(nc.ground, nc.ground).rows
+        >>> nc.Fixed(nc.ground, nc.ground).multipliers
         6
     """
 
-    rows: ClassVar[int] = 6
+    multipliers: ClassVar[int] = 6
     free: ClassVar[bool] = True
     needs_axis: ClassVar[bool] = False
 
@@ -46,7 +46,7 @@ class Fixed(Joint):
 class Spherical(Joint):
     """Ball joint: 3 constraints x_c - x_p = 0; all rotations free."""
 
-    rows: ClassVar[int] = 3
+    multipliers: ClassVar[int] = 3
     rotations: ClassVar[tuple[int, ...]] = (0, 1, 2)
     free: ClassVar[bool] = True
     needs_axis: ClassVar[bool] = False
@@ -59,7 +59,7 @@ class Spherical(Joint):
 class Revolute(Joint):
     """Hinge about `axis` through `point`: 5 constraints; coordinate 0 is the angle [rad]."""
 
-    rows: ClassVar[int] = 5
+    multipliers: ClassVar[int] = 5
     rotations: ClassVar[tuple[int, ...]] = (2,)
     free: ClassVar[bool] = True
     coordinates: ClassVar[tuple[Coordinate, ...]] = (Angle(),)
@@ -75,7 +75,7 @@ class Universal(Joint):
     Coordinates: 0 the angle about the parent's axis, 1 the angle about the child's axis [rad].
     """
 
-    rows: ClassVar[int] = 4
+    multipliers: ClassVar[int] = 4
     rotations: ClassVar[tuple[int, ...]] = (2,)
     child_rotation: ClassVar[bool] = True
     free: ClassVar[bool] = True
@@ -90,7 +90,7 @@ class Universal(Joint):
 class Cylindrical(Joint):
     """Turning and sliding along `axis` (48, 49): 4 constraints; coordinates: angle [rad], displacement [m]."""
 
-    rows: ClassVar[int] = 4
+    multipliers: ClassVar[int] = 4
     rotations: ClassVar[tuple[int, ...]] = (2,)
     translations: ClassVar[tuple[int, ...]] = (2,)
     free: ClassVar[bool] = True
@@ -105,7 +105,7 @@ class Cylindrical(Joint):
 class Prismatic(Joint):
     """Sliding along `axis`: 5 constraints; coordinate 0 is the displacement [m]."""
 
-    rows: ClassVar[int] = 5
+    multipliers: ClassVar[int] = 5
     translations: ClassVar[tuple[int, ...]] = (2,)
     free: ClassVar[bool] = True
     coordinates: ClassVar[tuple[Coordinate, ...]] = (Displacement(),)
@@ -122,7 +122,7 @@ class Planar(Joint):
     Coordinates: 0, 1 displacements along the first and second axis [m], 2 the angle [rad].
     """
 
-    rows: ClassVar[int] = 3
+    multipliers: ClassVar[int] = 3
     rotations: ClassVar[tuple[int, ...]] = (2,)
     translations: ClassVar[tuple[int, ...]] = (0, 1)
     free: ClassVar[bool] = True
@@ -143,7 +143,7 @@ class Screw(Joint):
 
     pitch: Any = eqx.field(default=0.01, kw_only=True)
 
-    rows: ClassVar[int] = 4
+    multipliers: ClassVar[int] = 4
     rotations: ClassVar[tuple[int, ...]] = (2,)
     translations: ClassVar[tuple[int, ...]] = (2,)
     free: ClassVar[bool] = True
@@ -174,7 +174,7 @@ class Distance(Joint):
     parent_point: Any = eqx.field(default=(0.0, 0.0, 0.0), kw_only=True)
     length: Any = eqx.field(default=None, kw_only=True)
 
-    rows: ClassVar[int] = 1
+    multipliers: ClassVar[int] = 1
     needs_axis: ClassVar[bool] = False
     coordinates: ClassVar[tuple[Coordinate, ...]] = (Separation(),)
 

@@ -1,0 +1,1 @@
+"""Linear solvers inside the Newton step; they know matrices and blocks, nothing else."""

@@ -1,0 +1,1 @@
+"""Steps, Newton's iteration, implicit derivatives and rollouts; no effect is known here."""
