@@ -14,3 +14,4 @@ from natcoord_jax.effects.joints import *
 from natcoord_jax.effects.loads import *
 from natcoord_jax.effects.springs import *
 from natcoord_jax.scene import Scene as Scene
+from natcoord_jax.stepping.simulate import linearise as linearise, simulate as simulate, step as step

@@ -1,13 +1,14 @@
 """The benchmark models in Exudyn (written for Exudyn 1.13).
 
-Two formulations: "redundant" is rigid bodies with joints as constraints (implicit solvers), "tree" is the minimal-coordinate
-`ObjectKinematicTree`, free of constraints and therefore open to explicit Runge-Kutta methods. The settings follow the speed-up
-list of Exudyn's documentation: module without range checks, dense linear solver, modified Newton, Lie-group nodes with constant
-mass matrix, no files and no output. Among the settings left open, the defaults of `run` are the fastest on both models.
+Two formulations: "redundant" is rigid bodies with joints as constraints (implicit solvers), "tree" is the
+minimal-coordinate `ObjectKinematicTree`, free of constraints and so open to explicit Runge-Kutta methods. The
+settings follow the speed-up list of Exudyn's documentation: module without range checks, modified Newton,
+Lie-group nodes with constant mass matrix, no files, no output. Where it leaves a choice (dense linear solver,
+when to refresh the Jacobian), the defaults of `run` are what was fastest on both models together.
 
-usage: python -m benchmarks.peers.exudyn_models MODEL STEPS [formulation=redundant|tree] [solver=GeneralizedAlpha|RK44|...]
-       [spectral_radius=0.9] [node=RotationRotationVector|RotationEulerParameters|RotationRxyz] [linear_solver=EigenDense]
-       [jacobian_per_step=true]
+usage: python -m benchmarks.peers.exudyn_models MODEL STEPS [formulation=redundant|tree] [solver=RK44|...]
+       [spectral_radius=0.9] [node=RotationRotationVector|RotationEulerParameters|RotationRxyz]
+       [linear_solver=EigenDense] [jacobian_per_step=true]
 """
 
 import contextlib
@@ -19,15 +20,16 @@ import numpy as np
 
 from benchmarks.peers.measure import MODELS, command_line, final_state, per_step, times_per_call
 
-sys.exudynFast = True  # the documented switch to the module without range checks; it announces itself on stdout
+sys.exudynFast = True  # the documented switch to the module without range checks; it prints a line
 with contextlib.redirect_stdout(io.StringIO()):
     import exudyn as exu
-    from exudyn import itemInterface as items
+    from exudyn import itemInterface as items  # noqa: N813
     from exudyn.rigidBodyUtilities import RigidBodyInertia
 
 _OUT = exu.OutputVariableType
-_GLOBAL_AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-# The one-coordinate links of a kinematic tree that make up a joint: kind, and the axis (None: the three global ones).
+# Three single turns make a free rotation; this order stays clear of gimbal lock in both models.
+_GLOBAL_AXES = ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+# The one-coordinate links of a kinematic tree that make up a joint: kind, axis (None: the three global ones).
 _LINKS = {
     "free": [("PrismaticZ", None), ("RevoluteZ", None)],
     "revolute": [("RevoluteZ", 0)],
@@ -60,34 +62,59 @@ def _add_joint(mbs, body: dict, parent: int, child: int) -> None:
         frame = np.column_stack([np.cross(axes[0], axes[1]), axes[0], axes[1]])
         mbs.CreateGenericJoint(rotationMatrixAxes=frame, constrainedAxes=[1, 1, 1, 1, 0, 0], **common)
     elif kind == "cylindrical":
-        mbs.CreateGenericJoint(rotationMatrixAxes=_frame(axes[0]), constrainedAxes=[1, 1, 0, 1, 1, 0], **common)
+        mbs.CreateGenericJoint(
+            rotationMatrixAxes=_frame(axes[0]), constrainedAxes=[1, 1, 0, 1, 1, 0], **common
+        )
     if body["stiffness"] or body["damping"]:
-        mbs.CreateTorsionalSpringDamper(axis=axes[0], stiffness=body["stiffness"], damping=body["damping"],
-                                        unlimitedRotations=False, **common)
+        mbs.CreateTorsionalSpringDamper(
+            axis=axes[0],
+            stiffness=body["stiffness"],
+            damping=body["damping"],
+            unlimitedRotations=False,
+            **common,
+        )
 
 
 def _build_redundant(model, mbs, node: str):
-    """Rigid bodies and constraints; returns a function that reads position, rotation, velocity, angular velocity."""
+    """Rigid bodies and constraints; returns a function that reads the state as `final_state` wants it."""
     ground = mbs.CreateGround()
     bodies = []
     for body in model.BODIES:
         inertia = RigidBodyInertia(mass=body["mass"], inertiaTensor=np.diag(body["inertia"]))
-        bodies.append(mbs.CreateRigidBody(inertia=inertia, referencePosition=list(body["com"]), show=False,
-                                          gravity=list(model.GRAVITY), nodeType=getattr(exu.NodeType, node)))
+        bodies.append(
+            mbs.CreateRigidBody(
+                inertia=inertia,
+                referencePosition=list(body["com"]),
+                show=False,
+                gravity=list(model.GRAVITY),
+                nodeType=getattr(exu.NodeType, node),
+            )
+        )
         if body["joint"] != "free":
             _add_joint(mbs, body, ground if body["parent"] is None else bodies[body["parent"]], bodies[-1])
     for index, torque in model.MOTORS:
         body = model.BODIES[index]
         for sign, item in ((1.0, index), (-1.0, body["parent"])):
-            mbs.CreateTorque(itemNumber=bodies[item], loadVector=list(sign * torque * np.asarray(body["axes"][0])),
-                             bodyFixed=True)
+            mbs.CreateTorque(
+                itemNumber=bodies[item],
+                loadVector=list(sign * torque * np.asarray(body["axes"][0])),
+                bodyFixed=True,
+            )
     for spring in model.POINT_SPRINGS:
         ends = [spring["body_a"], spring["body_b"]]
-        local = [np.subtract(spring[p], model.BODIES[b]["com"] if b is not None else np.zeros(3))
-                 for p, b in zip(("point_a", "point_b"), ends, strict=True)]
-        mbs.CreateSpringDamper(itemNumbers=[ground if b is None else bodies[b] for b in ends], localPosition0=local[0],
-                               localPosition1=local[1], referenceLength=spring["length"], stiffness=spring["stiffness"],
-                               damping=spring["damping"], show=False)
+        local = [
+            np.subtract(spring[p], model.BODIES[b]["com"] if b is not None else np.zeros(3))
+            for p, b in zip(("point_a", "point_b"), ends, strict=True)
+        ]
+        mbs.CreateSpringDamper(
+            itemNumbers=[ground if b is None else bodies[b] for b in ends],
+            localPosition0=local[0],
+            localPosition1=local[1],
+            referenceLength=spring["length"],
+            stiffness=spring["stiffness"],
+            damping=spring["damping"],
+            show=False,
+        )
 
     def read():
         outputs = (_OUT.Position, _OUT.RotationMatrix, _OUT.Velocity, _OUT.AngularVelocity)
@@ -102,16 +129,35 @@ def _tree_links(model) -> tuple[list[dict], list[int]]:
     links, carrier = [], []
     for body in model.BODIES:
         parent = -1 if body["parent"] is None else carrier[body["parent"]]
-        moves = [(kind, axis) for kind, which in _LINKS[body["joint"]]
-                 for axis in (_GLOBAL_AXES if which is None else (body["axes"][which],))]
+        moves = [
+            (kind, axis)
+            for kind, which in _LINKS[body["joint"]]
+            for axis in (_GLOBAL_AXES if which is None else (body["axes"][which],))
+        ]
         for kind, axis in moves:
-            links.append(dict(kind=kind, parent=parent, frame=_frame(axis), point=np.asarray(body["point"]), mass=0.0,
-                              inertia=np.zeros((3, 3)), com=np.zeros(3), stiffness=0.0, damping=0.0, force=0.0))
+            links.append(
+                dict(
+                    kind=kind,
+                    parent=parent,
+                    frame=_frame(axis),
+                    point=np.asarray(body["point"]),
+                    mass=0.0,
+                    inertia=np.zeros((3, 3)),
+                    com=np.zeros(3),
+                    stiffness=0.0,
+                    damping=0.0,
+                    force=0.0,
+                )
+            )
             parent = len(links) - 1
         frame = links[-1]["frame"]  # the massless links before only carry coordinates
-        links[-1] |= dict(mass=body["mass"], inertia=frame.T @ np.diag(body["inertia"]) @ frame,
-                          com=frame.T @ np.subtract(body["com"], body["point"]),
-                          stiffness=body["stiffness"], damping=body["damping"])
+        links[-1] |= dict(
+            mass=body["mass"],
+            inertia=frame.T @ np.diag(body["inertia"]) @ frame,
+            com=frame.T @ np.subtract(body["com"], body["point"]),
+            stiffness=body["stiffness"],
+            damping=body["damping"],
+        )
         carrier.append(parent)
     for body, torque in model.MOTORS:
         links[carrier[body]]["force"] = torque
@@ -119,50 +165,93 @@ def _tree_links(model) -> tuple[list[dict], list[int]]:
 
 
 def _build_tree(model, mbs):
-    """One kinematic tree; returns a function that reads position, rotation, velocity, angular velocity."""
+    """One kinematic tree; returns a function that reads the state as `final_state` wants it."""
     links, carrier = _tree_links(model)
     frames = [link["frame"] for link in links]
     parent_frames = [np.eye(3) if k["parent"] < 0 else frames[k["parent"]] for k in links]
     parent_points = [np.zeros(3) if k["parent"] < 0 else links[k["parent"]]["point"] for k in links]
-    column = lambda key: [link[key] for link in links]  # noqa: E731
+
+    def column(key):
+        return [link[key] for link in links]
+
     zeros, springs = [0.0] * len(links), {}
     if any(column("stiffness")) or any(column("damping")):
-        springs = dict(jointPControlVector=column("stiffness"), jointDControlVector=column("damping"),
-                       jointPositionOffsetVector=zeros, jointVelocityOffsetVector=zeros)
-    node = mbs.AddNode(items.NodeGenericODE2(
-        referenceCoordinates=zeros, initialCoordinates=zeros, initialCoordinates_t=zeros, numberOfODE2Coordinates=len(links)))
-    tree = mbs.AddObject(items.ObjectKinematicTree(
-        nodeNumber=node, gravity=list(model.GRAVITY), jointTypes=[getattr(exu.JointType, k) for k in column("kind")],
-        linkParents=column("parent"),
-        jointTransformations=exu.Matrix3DList([p.T @ f for p, f in zip(parent_frames, frames, strict=True)]),
-        jointOffsets=exu.Vector3DList([f.T @ (k["point"] - p)
-                                       for f, k, p in zip(parent_frames, links, parent_points, strict=True)]),
-        linkInertiasCOM=exu.Matrix3DList(column("inertia")), linkCOMs=exu.Vector3DList(column("com")),
-        linkMasses=column("mass"), jointForceVector=column("force"), **springs))
+        springs = dict(
+            jointPControlVector=column("stiffness"),
+            jointDControlVector=column("damping"),
+            jointPositionOffsetVector=zeros,
+            jointVelocityOffsetVector=zeros,
+        )
+    node = mbs.AddNode(
+        items.NodeGenericODE2(
+            referenceCoordinates=zeros,
+            initialCoordinates=zeros,
+            initialCoordinates_t=zeros,
+            numberOfODE2Coordinates=len(links),
+        )
+    )
+    tree = mbs.AddObject(
+        items.ObjectKinematicTree(
+            nodeNumber=node,
+            gravity=list(model.GRAVITY),
+            jointTypes=[getattr(exu.JointType, k) for k in column("kind")],
+            linkParents=column("parent"),
+            jointTransformations=exu.Matrix3DList(
+                [p.T @ f for p, f in zip(parent_frames, frames, strict=True)]
+            ),
+            jointOffsets=exu.Vector3DList(
+                [f.T @ (k["point"] - p) for f, k, p in zip(parent_frames, links, parent_points, strict=True)]
+            ),
+            linkInertiasCOM=exu.Matrix3DList(column("inertia")),
+            linkCOMs=exu.Vector3DList(column("com")),
+            linkMasses=column("mass"),
+            jointForceVector=column("force"),
+            **springs,
+        )
+    )
 
     def marker(body, point):
         link = links[carrier[body]]
         local = link["frame"].T @ np.subtract(point, link["point"])
-        return mbs.AddMarker(items.MarkerKinematicTreeRigid(objectNumber=tree, linkNumber=carrier[body], localPosition=local))
+        return mbs.AddMarker(
+            items.MarkerKinematicTreeRigid(objectNumber=tree, linkNumber=carrier[body], localPosition=local)
+        )
 
     for s in model.POINT_SPRINGS:
-        ends = [mbs.AddMarker(items.MarkerBodyPosition(bodyNumber=mbs.CreateGround(), localPosition=list(s[p])))
-                if s[b] is None else marker(s[b], s[p]) for b, p in (("body_a", "point_a"), ("body_b", "point_b"))]
-        mbs.AddObject(items.ObjectConnectorSpringDamper(markerNumbers=ends, referenceLength=s["length"],
-                                                        stiffness=s["stiffness"], damping=s["damping"]))
+        ends = [
+            mbs.AddMarker(items.MarkerBodyPosition(bodyNumber=mbs.CreateGround(), localPosition=list(s[p])))
+            if s[b] is None
+            else marker(s[b], s[p])
+            for b, p in (("body_a", "point_a"), ("body_b", "point_b"))
+        ]
+        mbs.AddObject(
+            items.ObjectConnectorSpringDamper(
+                markerNumbers=ends,
+                referenceLength=s["length"],
+                stiffness=s["stiffness"],
+                damping=s["damping"],
+            )
+        )
     centres = [marker(i, body["com"]) for i, body in enumerate(model.BODIES)]
 
     def read():
-        position, velocity = ([mbs.GetMarkerOutput(m, output) for m in centres] for output in (_OUT.Position, _OUT.Velocity))
+        position, velocity = (
+            [mbs.GetMarkerOutput(m, output) for m in centres] for output in (_OUT.Position, _OUT.Velocity)
+        )
         turns = [np.reshape(mbs.GetMarkerOutput(m, _OUT.RotationMatrix), (3, 3)) for m in centres]
-        spin = [turn @ mbs.GetMarkerOutput(m, _OUT.AngularVelocityLocal) for turn, m in zip(turns, centres, strict=True)]
+        spin = [
+            turn @ mbs.GetMarkerOutput(m, _OUT.AngularVelocityLocal)
+            for turn, m in zip(turns, centres, strict=True)
+        ]
         rotation = [turn @ frames[link].T for turn, link in zip(turns, carrier, strict=True)]
         return position, rotation, velocity, spin
 
     return read
 
 
-def _settings(model, steps: int, solver: str, *, spectral_radius: float, linear_solver: str, jacobian_per_step: bool):
+def _settings(
+    model, steps: int, solver: str, *, spectral_radius: float, linear_solver: str, jacobian_per_step: bool
+):
     """Exudyn's simulation settings for speed."""
     settings = exu.SimulationSettings()
     time = settings.timeIntegration
@@ -178,9 +267,18 @@ def _settings(model, steps: int, solver: str, *, spectral_radius: float, linear_
     return settings
 
 
-def run(model: str, steps: int, *, formulation: str = "redundant", solver: str | None = None, spectral_radius: float = 0.9,
-        node: str = "RotationRotationVector", linear_solver: str = "EigenDense", jacobian_per_step: bool = True,
-        repeats: int = 7) -> dict:
+def run(
+    model: str,
+    steps: int,
+    *,
+    formulation: str = "redundant",
+    solver: str | None = None,
+    spectral_radius: float = 0.9,
+    node: str = "RotationRotationVector",
+    linear_solver: str = "EigenDense",
+    jacobian_per_step: bool = True,
+    repeats: int = 7,
+) -> dict:
     """Times `steps` steps over [0, T_END] and returns times and final state.
 
     Args:
@@ -189,10 +287,11 @@ def run(model: str, steps: int, *, formulation: str = "redundant", solver: str |
         formulation: "redundant" or "tree".
         solver: a name in exudyn.DynamicSolverType; default GeneralizedAlpha for "redundant", RK44 for "tree".
         spectral_radius: of generalised alpha at infinite frequency; below 1 where there are constraints.
-        node: rotation parameters of a rigid body in the redundant formulation; the Lie-group node, which is the default,
-            has a constant mass matrix, and that is then reused.
+        node: rotation parameters of a rigid body in the redundant formulation; the default, a Lie-group node,
+            has a constant mass matrix, which is then reused.
         linear_solver: a name in exudyn.LinearSolverType.
-        jacobian_per_step: one Jacobian per step in the modified Newton method; else (Exudyn's default) one when needed.
+        jacobian_per_step: one Jacobian per step in the modified Newton method; false, Exudyn's default: when
+            convergence asks for one.
         repeats: timed repetitions.
     """
     source = MODELS[model]
@@ -201,15 +300,31 @@ def run(model: str, steps: int, *, formulation: str = "redundant", solver: str |
     mbs = container.AddSystem()
     read = _build_tree(source, mbs) if formulation == "tree" else _build_redundant(source, mbs, node)
     mbs.Assemble()
-    options = {"spectral_radius": spectral_radius, "linear_solver": linear_solver, "jacobian_per_step": jacobian_per_step}
+    options = {
+        "spectral_radius": spectral_radius,
+        "linear_solver": linear_solver,
+        "jacobian_per_step": jacobian_per_step,
+    }
     settings = _settings(source, steps, solver, **options)
-    settings.timeIntegration.reuseConstantMassMatrix = formulation == "redundant" and node == "RotationRotationVector"
+    settings.timeIntegration.reuseConstantMassMatrix = (
+        formulation == "redundant" and node == "RotationRotationVector"
+    )
     timing = per_step(times_per_call(lambda: mbs.SolveDynamic(settings), repeats), steps)
     if solver not in ("GeneralizedAlpha", "TrapezoidalIndex2"):
         options = {"linear_solver": linear_solver}
-    options |= {"formulation": formulation, "solver": solver} | ({"node": node} if formulation == "redundant" else {})
-    return {"peer": "exudyn", "version": version("exudyn"), "model": model, "steps": steps, "h": source.T_END / steps,
-            "settings": options, **timing, **final_state(source, *read())}
+    options |= {"formulation": formulation, "solver": solver} | (
+        {"node": node} if formulation == "redundant" else {}
+    )
+    return {
+        "peer": "exudyn",
+        "version": version("exudyn"),
+        "model": model,
+        "steps": steps,
+        "h": source.T_END / steps,
+        "settings": options,
+        **timing,
+        **final_state(source, *read()),
+    }
 
 
 if __name__ == "__main__":

@@ -45,6 +45,7 @@ def potential_energy(model, position: np.ndarray, rotation: np.ndarray) -> float
         position: centres of mass (bodies, 3) [m].
         rotation: rotation of each body from the pose of the data (bodies, 3, 3).
     """
+
     def place(body, point):
         if body is None:
             return np.asarray(point)
@@ -63,7 +64,7 @@ def potential_energy(model, position: np.ndarray, rotation: np.ndarray) -> float
 
 
 def kinetic_energy(model, rotation: np.ndarray, velocity: np.ndarray, angular_velocity: np.ndarray) -> float:
-    """Kinetic energy [J] from the velocities of the centres of mass [m/s] and the angular velocities [rad/s], world axes."""
+    """Kinetic energy [J]; arguments as in `final_state`."""
     energy = 0.0
     for body, turn, v, w in zip(model.BODIES, rotation, velocity, angular_velocity, strict=True):
         energy += 0.5 * body["mass"] * (v @ v) + 0.5 * np.dot(body["inertia"], (turn.T @ w) ** 2)
@@ -75,12 +76,14 @@ def final_state(model, position, rotation, velocity, angular_velocity) -> dict:
 
     Args:
         model: a module of data, `open_tree` or `spacecraft`.
-        position, velocity: of the centres of mass (bodies, 3) [m], [m/s], world axes.
-        rotation: from the pose of the data (bodies, 3, 3).
+        position: centres of mass (bodies, 3) [m].
+        rotation: rotation of each body from the pose of the data (bodies, 3, 3).
+        velocity: of the centres of mass, world axes (bodies, 3) [m/s].
         angular_velocity: world axes (bodies, 3) [rad/s].
 
     Returns:
-        positions [m], kinetic_energy [J], energy (kinetic and potential) [J], base_rotation, base_angular_velocity [rad/s].
+        positions [m], kinetic_energy [J], energy (kinetic and potential) [J], base_rotation and
+        base_angular_velocity [rad/s] of the first body.
     """
     x, turn, v, w = (np.asarray(a, dtype=float) for a in (position, rotation, velocity, angular_velocity))
     kinetic = kinetic_energy(model, turn, v, w)

@@ -1,8 +1,10 @@
-"""The benchmark models in MJX, MuJoCo in JAX (written for mujoco-mjx 3.17 on MuJoCo 4, JAX 0.10), in double precision.
+"""The benchmark models in MJX, MuJoCo in JAX (written for mujoco-mjx 3.17 and JAX 0.10), in double precision.
 
-usage: python -m benchmarks.peers.mjx_models MODEL STEPS [integrator=Euler|RK4|implicitfast] [lanes=1000] [gradient_steps=100]
+usage: python -m benchmarks.peers.mjx_models MODEL STEPS [integrator=Euler|RK4|implicitfast]
+       [lanes=1000] [batch_steps=100] [gradient_steps=100]
 
-`lanes=0` and `gradient_steps=0` leave out the batch and the gradient, which take most of the time to compile.
+`lanes=0` and `gradient_steps=0` leave out the batch and the gradient, which take longest to compile. RK4 of
+this version is of order two, not four, on models with ball joints (as MuJoCo's own was in 3.17).
 """
 
 import contextlib
@@ -24,8 +26,9 @@ with contextlib.redirect_stdout(io.StringIO()):  # names the optional modules th
 def _rollout(mjx_model, start, steps: int):
     """A function from controls (steps, motors) and initial velocity to the final positions and velocities.
 
-    Only positions and velocities are carried: for these models, twice as fast as carrying the whole `mjx.Data`.
+    Only positions and velocities are carried: faster here, by up to two, than to carry the whole `mjx.Data`.
     """
+
     def rollout(controls, velocity):
         def step(state, control):
             data = mjx.step(mjx_model, start.replace(qpos=state[0], qvel=state[1], ctrl=control))
@@ -53,20 +56,35 @@ def _batch(rollout, controls, velocity, steps: int, lanes: int, repeats: int) ->
 
 
 def _gradient(rollout, controls, velocity, steps: int, repeats: int) -> dict:
-    """Value and gradient of the sum of squares of the final velocities, by all controls and initial velocities."""
+    """Value and gradient of the summed squares of the final velocities by controls and initial velocities."""
+
     def loss(parameters):
         return jnp.sum(rollout(*parameters)[1] ** 2)
 
     parameters = (controls[:steps], velocity)
     forward, _ = _timed(loss, (parameters,), steps, repeats)
     both, (_, gradient) = _timed(jax.value_and_grad(loss), (parameters,), steps, repeats)
-    return {"steps": steps, **both, "over_forward": both["us_per_step"] / forward["us_per_step"],
-            "finite": all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in gradient)}
+    return {
+        "steps": steps,
+        **both,
+        "over_forward": both["us_per_step"] / forward["us_per_step"],
+        "finite": all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in gradient),
+    }
 
 
-def run(model: str, steps: int, *, integrator: str = "Euler", lanes: int = 1000, batch_steps: int = 100,
-        gradient_steps: int = 100, repeats: int = 5) -> dict:
-    """Times `steps` steps over [0, T_END], a batch and a gradient; returns times, compile times and the final state.
+def run(
+    model: str,
+    steps: int,
+    *,
+    integrator: str = "Euler",
+    lanes: int = 1000,
+    batch_steps: int = 100,
+    gradient_steps: int = 100,
+    repeats: int = 5,
+) -> dict:
+    """Times `steps` steps over [0, T_END], a batch and a gradient.
+
+    Returns times, compile times and the final state.
 
     Args:
         model: "spacecraft" or "open_tree".
@@ -86,9 +104,17 @@ def run(model: str, steps: int, *, integrator: str = "Euler", lanes: int = 1000,
     rollout = _rollout(mjx_model, start, steps)
     timing, final = _timed(rollout, (controls[:steps], velocity), steps, repeats)
     data.qpos[:], data.qvel[:] = (np.asarray(x) for x in final)
-    result = {"peer": "mjx", "version": version("mujoco-mjx"), "jax": jax.__version__, "model": model, "steps": steps,
-              "h": source.T_END / steps, "settings": {"integrator": integrator}, **timing,
-              **read_state(source, mj_model, data)}
+    result = {
+        "peer": "mjx",
+        "version": version("mujoco-mjx"),
+        "jax": jax.__version__,
+        "model": model,
+        "steps": steps,
+        "h": source.T_END / steps,
+        "settings": {"integrator": integrator},
+        **timing,
+        **read_state(source, mj_model, data),
+    }
     if lanes:
         short = _rollout(mjx_model, start, batch_steps)
         result["batch"] = _batch(short, controls[:batch_steps], velocity, batch_steps, lanes, repeats)

@@ -43,20 +43,25 @@ def _joints(body: dict, number: int) -> str:
             return f'<freejoint name="{number}"/>'
         axis = "" if which is None else f'axis="{_text(body["axes"][which])}"'
         name = f'name="{number}"' if body["joint"] == "revolute" else ""
-        text += (f'<joint {name} type="{kind}" pos="{_text(np.subtract(body["point"], body["com"]))}" {axis} '
-                 f'stiffness="{body["stiffness"]}" damping="{body["damping"]}"/>')
+        text += (
+            f'<joint {name} type="{kind}" pos="{_text(np.subtract(body["point"], body["com"]))}" {axis} '
+            f'stiffness="{body["stiffness"]}" damping="{body["damping"]}"/>'
+        )
     return text
 
 
 def _bodies(model, parent) -> str:
-    """All bodies that hang on `parent`, each with its own children; frames at the centres of mass, along the world axes."""
+    """The bodies that hang on `parent`, with their children; frames at the centres of mass, in world axes."""
     origin = (0.0, 0.0, 0.0) if parent is None else model.BODIES[parent]["com"]
     text = ""
     for i, body in enumerate(model.BODIES):
         if body["parent"] == parent:
-            text += (f'<body name="{body["name"]}" pos="{_text(np.subtract(body["com"], origin))}">{_joints(body, i)}'
-                     f'<inertial pos="0 0 0" mass="{body["mass"]}" diaginertia="{_text(body["inertia"])}"/>'
-                     f'{_sites(model, i)}{_bodies(model, i)}</body>')
+            place = _text(np.subtract(body["com"], origin))
+            text += (
+                f'<body name="{body["name"]}" pos="{place}">{_joints(body, i)}'
+                f'<inertial pos="0 0 0" mass="{body["mass"]}" diaginertia="{_text(body["inertia"])}"/>'
+                f"{_sites(model, i)}{_bodies(model, i)}</body>"
+            )
     return text
 
 
@@ -74,10 +79,12 @@ def mjcf(model, timestep: float, integrator: str) -> str:
         for k, s in enumerate(model.POINT_SPRINGS)
     )
     motors = "".join(f'<motor joint="{body}"/>' for body, _ in model.MOTORS)
-    return (f'<mujoco><option gravity="{_text(model.GRAVITY)}" timestep="{timestep!r}" integrator="{integrator}">'
-            f'<flag contact="disable" constraint="disable"/></option>'
-            f"<worldbody>{_sites(model, None)}{_bodies(model, None)}</worldbody>"
-            f"<tendon>{tendons}</tendon><actuator>{motors}</actuator></mujoco>")
+    return (
+        f'<mujoco><option gravity="{_text(model.GRAVITY)}" timestep="{timestep!r}" integrator="{integrator}">'
+        f'<flag contact="disable" constraint="disable"/></option>'
+        f"<worldbody>{_sites(model, None)}{_bodies(model, None)}</worldbody>"
+        f"<tendon>{tendons}</tendon><actuator>{motors}</actuator></mujoco>"
+    )
 
 
 def build(model, steps: int, integrator: str) -> tuple[mujoco.MjModel, mujoco.MjData]:
@@ -94,7 +101,9 @@ def read_state(model, mj_model: mujoco.MjModel, data: mujoco.MjData) -> dict:
     count = len(model.BODIES)
     velocity = np.zeros((count, 6))  # angular, linear
     for i, body in enumerate(model.BODIES):
-        mujoco.mj_objectVelocity(mj_model, data, mujoco.mjtObj.mjOBJ_BODY, mj_model.body(body["name"]).id, velocity[i], 0)
+        mujoco.mj_objectVelocity(
+            mj_model, data, mujoco.mjtObj.mjOBJ_BODY, mj_model.body(body["name"]).id, velocity[i], 0
+        )
     order = [mj_model.body(body["name"]).id for body in model.BODIES]
     rotation = data.xmat.reshape(-1, 3, 3)[order]
     return final_state(model, data.xipos[order], rotation, velocity[:, 3:], velocity[:, :3])
@@ -118,8 +127,16 @@ def run(model: str, steps: int, *, integrator: str = "Euler", repeats: int = 7) 
         mujoco.mj_step(mj_model, data, nstep=steps)
 
     timing = per_step(times_per_call(rollout, repeats), steps)
-    return {"peer": "mujoco", "version": mujoco.__version__, "model": model, "steps": steps, "h": source.T_END / steps,
-            "settings": {"integrator": integrator}, **timing, **read_state(source, mj_model, data)}
+    return {
+        "peer": "mujoco",
+        "version": mujoco.__version__,
+        "model": model,
+        "steps": steps,
+        "h": source.T_END / steps,
+        "settings": {"integrator": integrator},
+        **timing,
+        **read_state(source, mj_model, data),
+    }
 
 
 if __name__ == "__main__":

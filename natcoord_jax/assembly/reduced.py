@@ -35,7 +35,7 @@ from natcoord_jax.assembly.tree import (
 )
 from natcoord_jax.core.effect import Response
 from natcoord_jax.core.state import State
-from natcoord_jax.linsolve.dense import apply, saddle_inverse
+from natcoord_jax.linsolve.dense import DenseSolver, apply, saddle_inverse
 from natcoord_jax.maths.collocation import Tableau, gauss
 from natcoord_jax.maths.vectors import cross
 
@@ -92,6 +92,11 @@ class ReducedStep(eqx.Module):
             h,
             tableau,
         )
+
+    @property
+    def groups(self) -> tuple[Group, ...]:
+        """Groups with a part in the equations, in the order of their multipliers."""
+        return active_groups(self.system)
 
     @property
     def balances(self) -> int:
@@ -204,6 +209,11 @@ class ReducedStep(eqx.Module):
     def exact(self, y: Float[Array, " unknowns"]) -> Array:
         """Inverse of the exact Jacobian."""
         return saddle_inverse(self.jacobian(y), self.balances)
+
+    def linear_solver(self, y: Float[Array, " unknowns"]) -> DenseSolver:
+        """The exact Jacobian with its inverse, for derivatives of the solution."""
+        matrix = self.jacobian(y)
+        return DenseSolver(matrix, saddle_inverse(matrix, self.balances), self.balances)
 
     @staticmethod
     def solve(factors: Array, right: Float[Array, " unknowns"]) -> Float[Array, " unknowns"]:

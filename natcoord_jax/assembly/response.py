@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from natcoord_jax.assembly.diagnostics import group_places
 from natcoord_jax.assembly.system import Group, System
 from natcoord_jax.core.effect import Motion, Now
 from natcoord_jax.core.state import State
@@ -52,17 +53,6 @@ def stations(
     )
 
 
-def places(system: System, group: Group) -> Array:
-    """How the instances of a group sit on their bodies: weights, joint frames or mass blocks."""
-    if group.source == "mass":
-        return system.mass
-    if group.source == "markers":
-        assert group.weights is not None
-        return group.weights
-    frames = system.frames[group.joints]
-    return frames[:, 0] if group.source == "joint" else frames
-
-
 class Situation(eqx.Module):
     """What a group needs besides the motion: places, inputs, coordinates, rates, time and step."""
 
@@ -77,7 +67,7 @@ class Situation(eqx.Module):
 def situation(system: System, group: Group, state: State, u: Array, h: Array) -> Situation:
     """Gather what a group needs at the start of a step."""
     return Situation(
-        places(system, group),
+        group_places(system, group),
         u[group.inputs],
         state.coordinates[group.coordinates],
         state.rates[group.rotors],

@@ -8,6 +8,8 @@ from jaxtyping import Array, Float, Int
 from natcoord_jax.assembly.tree import Tree
 from natcoord_jax.core.coordinate import Coordinate
 from natcoord_jax.core.effect import Effect
+from natcoord_jax.core.handles import Handle
+from natcoord_jax.core.state import State, Trajectory
 
 
 class Group(eqx.Module):
@@ -109,3 +111,67 @@ class System(eqx.Module):
     effects: tuple[Group, ...]
     coordinates: tuple[CoordinateGroup, ...]
     structure: Structure = eqx.field(static=True)
+
+    def energy(self, motion: State | Trajectory) -> "diagnostics.Energy":
+        """Kinetic energy and stored energies [J]; see `Energy`."""
+        return diagnostics.energy(self, motion)
+
+    def momentum(self, motion: State | Trajectory) -> Float[Array, "*t 3"]:
+        """Momentum L [kg m/s]."""
+        return diagnostics.momentum(self, motion)
+
+    def angular_momentum(self, motion: State | Trajectory) -> Float[Array, "*t 3"]:
+        """Angular momentum J about the origin [kg m^2/s] (55)."""
+        return diagnostics.angular_momentum(self, motion)
+
+    def constraint_errors(self, motion: State | Trajectory) -> "diagnostics.ConstraintErrors":
+        """Largest violations of the constraints and of their rates."""
+        return diagnostics.constraint_errors(self, motion)
+
+    def work(self, motion: State | Trajectory) -> dict[str, Float[Array, "*t"]]:
+        """Work done so far [J] by each input, load, damper and drive, by name."""
+        states = diagnostics.states_of(motion)
+        return {name: states.work[..., k] for k, name in enumerate(self.structure.works)}
+
+    def body_index(self, body: Handle | str) -> int:
+        """Number of a body in the rows of the state.
+
+        Raises:
+            ValueError: for a name that is no body of this system.
+        """
+        return _index(self.structure.bodies, body, "body")
+
+    def joint_index(self, joint: Handle | str) -> int:
+        """Number of a joint.
+
+        Raises:
+            ValueError: for a name that is no joint of this system.
+        """
+        return _index(self.structure.joints, joint, "joint")
+
+    def input_index(self, name: Handle | str) -> int:
+        """Number of an input channel.
+
+        Raises:
+            ValueError: for a name that is no input of this system.
+        """
+        return _index(self.structure.inputs, name, "input")
+
+    def explain(self, trajectory: Trajectory) -> str:
+        """How a run ended, in words, with the part of the worst residual by name."""
+        return diagnostics.explain(self, trajectory)
+
+    def raise_on_failure(self, trajectory: Trajectory) -> None:
+        """Raise `SimulationError` for a concrete trajectory that failed."""
+        diagnostics.raise_on_failure(self, trajectory)
+
+
+def _index(names: tuple[str, ...], part: Handle | str, kind: str) -> int:
+    name = part.name if isinstance(part, Handle) else part
+    if name not in names or not name:
+        known = [n for n in names if n]
+        raise ValueError(f"this system has no {kind} {name!r}; it has {known}")
+    return names.index(name)
+
+
+from natcoord_jax.assembly import diagnostics  # noqa: E402  (needs System)

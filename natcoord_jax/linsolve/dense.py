@@ -1,5 +1,7 @@
 """Inverses of small dense matrices, made once and applied often."""
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -51,3 +53,35 @@ def apply(inverse: Float[Array, "n n"], right: Float[Array, " n"]) -> Float[Arra
     if right.shape[-1] > 32:
         return inverse @ right
     return jnp.sum(inverse * right[None, :], axis=1)
+
+
+class DenseSolver(eqx.Module):
+    """A matrix with its (possibly regularised) inverse; solves are refined and differentiable in every mode.
+
+    Attributes:
+        matrix: the exact matrix.
+        inverse: its approximate inverse, not differentiated.
+        definite: number of balance rows; below them refinement is needed.
+    """
+
+    matrix: Float[Array, "n n"]
+    inverse: Float[Array, "n n"]
+    definite: int = eqx.field(static=True)
+
+    def solve(self, right: Float[Array, " n"]) -> Float[Array, " n"]:
+        """Solution x of matrix x = right."""
+        rounds = 0 if self.definite == right.shape[-1] else 2
+        inverse = jax.lax.stop_gradient(self.inverse)
+
+        def refined(approximate: Array, multiply, b: Array) -> Array:
+            x = apply(approximate, b)
+            for _ in range(rounds):
+                x = x + apply(approximate, b - multiply(x))
+            return x
+
+        return jax.lax.custom_linear_solve(
+            lambda x: apply(self.matrix, x),
+            right,
+            solve=lambda multiply, b: refined(inverse, multiply, b),
+            transpose_solve=lambda multiply, b: refined(inverse.T, multiply, b),
+        )

@@ -1,0 +1,225 @@
+"""Energies, momenta and constraint errors of a state or of a whole trajectory, and how a run ended."""
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from natcoord_jax.core.joint import frames_at
+from natcoord_jax.core.results import REASONS, REMEDIES, Result, SimulationError
+from natcoord_jax.core.state import State, Trajectory
+from natcoord_jax.maths.vectors import cross
+
+if TYPE_CHECKING:
+    from natcoord_jax.assembly.system import Group, System
+
+
+class Energy(eqx.Module):
+    """Energies of a state, or along a trajectory [J].
+
+    Attributes:
+        kinetic: of the bodies (1).
+        stores: stored energy by name of the effect: springs, gravity, rotors.
+    """
+
+    kinetic: Float[Array, "*t"]
+    stores: dict[str, Float[Array, "*t"]]
+
+    @property
+    def potential(self) -> Float[Array, "*t"]:
+        """Sum of the stores."""
+        return sum(self.stores.values(), jnp.zeros_like(self.kinetic))
+
+    @property
+    def total(self) -> Float[Array, "*t"]:
+        """Kinetic energy and stores."""
+        return self.kinetic + self.potential
+
+
+class ConstraintErrors(eqx.Module):
+    """Largest violations at each time.
+
+    Attributes:
+        directors: of d_i . d_j = delta_ij [-].
+        joints: of the joints' constraints [m, -].
+        director_rates: of their time derivatives [1/s].
+        joint_rates: of those of the joints [m/s, 1/s].
+    """
+
+    directors: Float[Array, "*t"]
+    joints: Float[Array, "*t"]
+    director_rates: Float[Array, "*t"]
+    joint_rates: Float[Array, "*t"]
+
+    @property
+    def position(self) -> Float[Array, "*t"]:
+        """Largest violation of any constraint."""
+        return jnp.maximum(self.directors, self.joints)
+
+    @property
+    def velocity(self) -> Float[Array, "*t"]:
+        """Largest violation of any constraint rate."""
+        return jnp.maximum(self.director_rates, self.joint_rates)
+
+
+def states_of(motion: State | Trajectory) -> State:
+    """The states of a trajectory, or the state itself."""
+    return motion.states if isinstance(motion, Trajectory) else motion
+
+
+def over_states(function: Callable[[State], Any], motion: State | Trajectory) -> Any:
+    """Apply a function of one state along all leading axes."""
+    states = states_of(motion)
+    for _ in range(states.q.ndim - 2):
+        function = jax.vmap(function)
+    return function(states)
+
+
+def rows_with_ground(rows: Float[Array, "bodies4 3"]) -> Float[Array, "bodies_and_ground 4 3"]:
+    """Rows by body, with those of the ground last."""
+    ground = jnp.concatenate([jnp.zeros((1, 3)), jnp.eye(3)]).astype(rows.dtype)
+    return jnp.concatenate([rows.reshape(-1, 4, 3), ground[None]])
+
+
+def group_places(system: "System", group: "Group") -> Array:
+    """How the instances of a group sit on their bodies: weights, joint frames or mass blocks."""
+    if group.source == "mass":
+        return system.mass
+    if group.source == "markers":
+        assert group.weights is not None
+        return group.weights
+    frames = system.frames[group.joints]
+    return frames[:, 0] if group.source == "joint" else frames
+
+
+def group_energies(system: "System", group: "Group", state: State) -> Float[Array, " n"]:
+    """Stored energy of every instance of a group."""
+    rows = rows_with_ground(state.q)[group.bodies]
+
+    def one(effect, place, rows, coordinates, rates):
+        return effect.stored(place, rows, coordinates, rates)
+
+    axes = (None if group.source == "mass" else 0, 0, 0, 0, 0)
+    with jax.named_scope(group.effect.kind.replace(" ", "_")):
+        return jax.vmap(one, in_axes=axes)(
+            group.effect,
+            group_places(system, group),
+            rows,
+            state.coordinates[group.coordinates],
+            state.rates[group.rotors],
+        )
+
+
+def energy(system: "System", motion: State | Trajectory) -> Energy:
+    """Energies (1) and stores."""
+
+    def one(state: State) -> Energy:
+        v = state.v.reshape(-1, 4, 3)
+        kinetic = 0.5 * jnp.sum(system.mass[..., None] * v[:, :, None] * v[:, None])
+        stores = {}
+        for group in system.effects:
+            if group.effect.stores:
+                values = group_energies(system, group, state)
+                if group.source == "mass":
+                    values = jnp.sum(values)[None]
+                stores |= dict(zip(group.names, values))
+        return Energy(kinetic, stores)
+
+    return over_states(one, motion)
+
+
+def body_momenta(system: "System", state: State) -> tuple[Float[Array, "bodies 3"], Float[Array, "bodies 3"]]:
+    """Momentum and angular momentum about the origin of every body (24, 32)."""
+    q, v = state.q.reshape(-1, 4, 3), state.v.reshape(-1, 4, 3)
+    impulse = jnp.sum(system.mass[..., None] * v[:, None], axis=2)
+    return impulse[:, 0], jnp.sum(cross(q, impulse), axis=1)
+
+
+def momentum(system: "System", motion: State | Trajectory) -> Array:
+    """Momentum."""
+    return over_states(lambda s: jnp.sum(body_momenta(system, s)[0], axis=0), motion)
+
+
+def angular_momentum(system: "System", motion: State | Trajectory) -> Array:
+    """Angular momentum about the origin (55)."""
+    return over_states(lambda s: jnp.sum(body_momenta(system, s)[1], axis=0), motion)
+
+
+def joint_residuals(system: "System", state: State) -> list[tuple["Group", Array, Array]]:
+    """Residual and rate of every joint's constraints, by group."""
+    q, v = rows_with_ground(state.q), rows_with_ground(state.v).at[-1].set(0.0)
+    found = []
+    for group in system.joints:
+
+        def one(effect, place, rows, rates):
+            return jax.jvp(lambda x: effect.residual(*frames_at(place, x)), (rows,), (rates,))
+
+        value, rate = jax.vmap(one)(
+            group.effect, group_places(system, group), q[group.bodies], v[group.bodies]
+        )
+        found.append((group, value, rate))
+    return found
+
+
+def constraint_errors(system: "System", motion: State | Trajectory) -> ConstraintErrors:
+    """Largest violations of internal and joint constraints and of their rates."""
+
+    def one(state: State) -> ConstraintErrors:
+        d, rates = state.q.reshape(-1, 4, 3)[:, 1:], state.v.reshape(-1, 4, 3)[:, 1:]
+        gram = jnp.einsum("bik,bjk->bij", d, d) - jnp.eye(3)
+        mixed = jnp.einsum("bik,bjk->bij", d, rates)
+        joints = joint_rates = jnp.zeros((), state.q.dtype)
+        for _, value, rate in joint_residuals(system, state):
+            joints = jnp.maximum(joints, jnp.max(jnp.abs(value), initial=0.0))
+            joint_rates = jnp.maximum(joint_rates, jnp.max(jnp.abs(rate), initial=0.0))
+        turning = mixed + jnp.swapaxes(mixed, 1, 2)
+        return ConstraintErrors(jnp.max(jnp.abs(gram)), joints, jnp.max(jnp.abs(turning)), joint_rates)
+
+    return over_states(one, motion)
+
+
+def unknown_name(system: "System", index: int) -> str:
+    """Name of the part that an unknown of the equations belongs to."""
+    structure = system.structure
+    if index < structure.unknowns:
+        body = int(np.asarray(system.tree.slot_of)[index]) // 7
+        joint = structure.joints[body]
+        return f"joint {joint!r}" if joint else f"body {structure.bodies[body]!r}"
+    index -= structure.unknowns
+    for group in (*system.effects, *(g for g in system.joints if not g.in_tree)):
+        size = group.count * group.multipliers
+        if index < size:
+            return f"{group.effect.kind} {group.names[index // group.multipliers]!r}"
+        index -= size
+    return "an unknown"
+
+
+def explain(system: "System", trajectory: Trajectory) -> str:
+    """How a run ended, in words: result, step, time, and the part with the worst residual by name."""
+    if np.ndim(trajectory.result):
+        lanes = [jax.tree.map(lambda x, k=k: x[k], trajectory) for k in range(trajectory.result.shape[0])]
+        return "\n".join(f"lane {k}: {explain(system, lane)}" for k, lane in enumerate(lanes))
+    result = Result(int(trajectory.result))
+    text = REASONS[result]
+    if result == Result.SUCCESSFUL:
+        return text
+    text += f" in step {int(trajectory.failed_step)} at t = {float(trajectory.failed_time):.6g} s"
+    if int(trajectory.failed_part) >= 0:
+        text += f"; worst residual at {unknown_name(system, int(trajectory.failed_part))}"
+    return text + (f"; {REMEDIES[result]}" if result in REMEDIES else "")
+
+
+def raise_on_failure(system: "System", trajectory: Trajectory) -> None:
+    """Raise for a concrete trajectory that failed.
+
+    Raises:
+        SimulationError: with step, time, the worst part by name and the remedy.
+    """
+    codes = np.asarray(trajectory.result)
+    bad = [int(c) for c in codes.reshape(-1) if not Result(int(c)).ok]
+    if bad:
+        raise SimulationError(explain(system, trajectory), Result(bad[0]), trajectory)

@@ -1,0 +1,17 @@
+"""The forms in which the equations of a step can be solved; all give the same trajectory."""
+
+from typing import Any
+
+from jaxtyping import Array
+
+from natcoord_jax.assembly.reduced import ReducedStep
+from natcoord_jax.assembly.system import System
+from natcoord_jax.core.state import State
+from natcoord_jax.maths.collocation import Tableau
+
+FORMS: dict[str, Any] = {"reduced": ReducedStep}
+
+
+def prepare(system: System, state: State, u: Array, h: Array, tableau: Tableau) -> Any:
+    """The equations of one step, in the form chosen at compile."""
+    return FORMS[system.structure.solver].prepare(system, state, u, h, tableau)

@@ -1,0 +1,239 @@
+"""The rollout: steps, retries in substeps, events, and its derivative.
+
+A rollout is a sequence of slots; one slot is one attempt at one (sub)step. As long as every attempt
+succeeds, slots are steps. A failed attempt is repeated with half the substep; a while loop after the scan
+provides the extra slots this takes, and makes no trip otherwise.
+
+The derivative (`custom_jvp`) runs along the recorded slots: their states and solutions are outputs, so all
+Jacobians are formed at once, vmapped over the slots, and only the recursion from state to state is a scan.
+Newton's iteration is never differentiated. The recorded outputs are differentiated by the same rule, so
+second derivatives (forward over reverse, forward over forward) are exact. Substep fractions are constants.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from natcoord_jax.assembly.system import System
+from natcoord_jax.core.results import Result
+from natcoord_jax.core.state import State
+from natcoord_jax.maths.collocation import gauss
+from natcoord_jax.stepping.step import advance, linear_solver, solve
+
+SMALLEST_FRACTION = 1.0 / 64
+"""A step is given up when a substep of this fraction of it fails."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is static about a rollout.
+
+    Attributes:
+        steps: number of steps.
+        extra: slots available for retries.
+        tolerance: of Newton's iteration.
+        control: function (parameters, step index, t, state) to inputs.
+        event: function of the state whose change of sign ends the run, or None.
+        stages: stages of the collocation method.
+    """
+
+    steps: int
+    extra: int
+    tolerance: float
+    control: Callable[[Any, Array, Array, State], Array]
+    event: Callable[[State], Array] | None = None
+    stages: int = 1
+
+
+class Slots(eqx.Module):
+    """Record of all slots.
+
+    Attributes:
+        states: state after each slot (unchanged if the attempt failed).
+        y: unknowns of each attempt.
+        step: step each slot belongs to.
+        fraction: its part of the step.
+        accepted: whether the attempt succeeded.
+        finished: steps completed after the slot.
+    """
+
+    states: State
+    y: Float[Array, "slots unknowns"]
+    step: Int[Array, " slots"]
+    fraction: Float[Array, " slots"]
+    accepted: Bool[Array, " slots"]
+    finished: Int[Array, " slots"]
+
+
+class Course(eqx.Module):
+    """Where a rollout stands: carried from slot to slot."""
+
+    state: State
+    step: Int[Array, ""]
+    done: Float[Array, ""]
+    fraction: Float[Array, ""]
+    code: Int[Array, ""]
+    stopped: Bool[Array, ""]
+    taken: Int[Array, ""]
+    iterations: Int[Array, ""]
+    iterations_max: Int[Array, ""]
+    residual: Float[Array, ""]
+
+
+def _start(state: State, dt: Float[Array, ""]) -> Course:
+    zero = jnp.array(0)
+    bad = ~(jnp.isfinite(dt) & (dt > 0))
+    code = jnp.where(bad, int(Result.BAD_STEP), int(Result.SUCCESSFUL))
+    nought = jnp.zeros((), state.q.dtype)
+    return Course(state, zero, nought, nought + 1.0, code, bad, zero, zero, zero, nought)
+
+
+def _slot(plan: Plan, system: System, parameters: Any, dt: Array, course: Course) -> tuple[Course, Slots]:
+    """One attempt at one (sub)step."""
+    tableau = gauss(plan.stages)
+    state, idle = course.state, course.stopped | (course.step >= plan.steps)
+    h = course.fraction * dt
+    h = jnp.where(idle, jnp.ones_like(h) * 1e-3, h)
+    index = jnp.minimum(course.step, plan.steps - 1)
+    u = plan.control(parameters, index, state.t, state)
+    solution = solve(system, state, u, h, tableau, plan.tolerance)
+    new = advance(system, state, u, h, solution.y, tableau)[1]
+    sound = (solution.code == int(Result.SUCCESSFUL)) & jnp.all(jnp.isfinite(new.q)) & jnp.all(jnp.isfinite(new.v))
+    accepted = sound & ~idle
+    code = jnp.where(
+        (solution.code == int(Result.SUCCESSFUL)) & ~sound, int(Result.NONFINITE), solution.code
+    )
+    new = jax.tree.map(partial(jnp.where, accepted), new, state)
+    done = course.done + jnp.where(accepted, course.fraction, 0.0)
+    complete = accepted & (done > 1.0 - 1e-9)
+    halved = 0.5 * course.fraction
+    hopeless = ~accepted & ~idle & (halved < SMALLEST_FRACTION)
+    stopped = course.stopped | hopeless
+    result = jnp.where(hopeless, code, course.code)
+    if plan.event is not None:
+        crossed = accepted & (plan.event(state) * plan.event(new) <= 0) & (plan.event(state) != 0)
+        stopped, result = stopped | crossed, jnp.where(crossed, int(Result.EVENT), result)
+    fraction = jnp.where(complete, 1.0, jnp.where(accepted | idle, course.fraction, halved))
+    done = jnp.where(complete, 0.0, done)
+    worked = jnp.where(idle, 0, solution.iterations)
+    following = Course(
+        new,
+        course.step + complete,
+        done,
+        fraction,
+        result,
+        stopped,
+        course.taken + accepted,
+        course.iterations + worked,
+        jnp.maximum(course.iterations_max, worked),
+        jnp.where(accepted, jnp.maximum(course.residual, solution.error), course.residual),
+    )
+    record = Slots(new, solution.y, index, course.fraction, accepted, following.step)
+    return following, record
+
+
+def _run(plan: Plan, system: System, state: State, parameters: Any, dt: Array) -> tuple[Slots, Course]:
+    attempt = partial(_slot, plan, system, parameters, dt)
+    course, slots = jax.lax.scan(lambda c, _: attempt(c), _start(state, dt), length=plan.steps)
+    if plan.extra == 0:
+        return slots, course
+
+    def unfinished(carry: tuple[Array, Course, Slots]) -> Array:
+        count, course, _ = carry
+        return (count < plan.extra) & ~course.stopped & (course.step < plan.steps)
+
+    def more(carry: tuple[Array, Course, Slots]) -> tuple[Array, Course, Slots]:
+        count, course, buffer = carry
+        course, record = attempt(course)
+        buffer = jax.tree.map(lambda b, r: b.at[count].set(r), buffer, record)
+        return count + 1, course, buffer
+
+    def blank(x: Array) -> Array:
+        return jnp.broadcast_to(x[-1], (plan.extra, *x.shape[1:]))
+
+    buffer = jax.tree.map(blank, slots)
+    buffer = eqx.tree_at(lambda s: s.accepted, buffer, jnp.zeros(plan.extra, bool))
+    count, course, buffer = jax.lax.while_loop(unfinished, more, (jnp.array(0), course, buffer))
+    last = jax.tree.map(lambda x: x[jnp.maximum(count - 1, 0)], buffer.states)
+    unused = jnp.arange(plan.extra) >= count
+    filled = jax.tree.map(
+        lambda b, x: jnp.where(unused.reshape(-1, *(1,) * (b.ndim - 1)), x, b), buffer.states, last
+    )
+    steps = jnp.where(unused, course.step, buffer.finished)
+    buffer = eqx.tree_at(lambda s: (s.states, s.finished), buffer, (filled, steps))
+    slots = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), slots, buffer)
+    short = (course.step < plan.steps) & ~course.stopped
+    code = jnp.where(short, int(Result.MAX_SUBSTEPS), course.code)
+    return slots, eqx.tree_at(lambda c: c.code, course, code)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def run_slots(
+    plan: Plan, system: System, state: State, parameters: Any, dt: Array
+) -> tuple[Slots, Course]:
+    """All slots of a rollout and where it ended; see the module for its derivative."""
+    return _run(plan, system, state, parameters, dt)
+
+
+def _zero_tangent(x: Array) -> Array:
+    import numpy as np
+
+    if jnp.issubdtype(jnp.result_type(x), jnp.inexact):
+        return jnp.zeros_like(x)
+    return np.zeros(jnp.shape(x), jax.dtypes.float0)
+
+
+@run_slots.defjvp
+def _run_slots_jvp(plan: Plan, primals: tuple, tangents: tuple):
+    system, state, parameters, dt = primals
+    system_dot, state_dot, parameters_dot, dt_dot = tangents
+    slots, course = run_slots(plan, *primals)
+    tableau = gauss(plan.stages)
+    before = jax.tree.map(lambda first, after: jnp.concatenate([first[None], after[:-1]]), state, slots.states)
+
+    def equations(system, state, parameters, dt, y, step, fraction):
+        u = plan.control(parameters, step, state.t, state)
+        return advance(system, state, u, fraction * dt, y, tableau)
+
+    def solver(state, y, step, fraction):
+        u = plan.control(parameters, step, state.t, state)
+        return linear_solver(system, state, u, fraction * dt, y, tableau)
+
+    def by_parameters(state, y, step, fraction):
+        def f(system, parameters, dt):
+            return equations(system, state, parameters, dt, y, step, fraction)
+
+        return jax.jvp(f, (system, parameters, dt), (system_dot, parameters_dot, dt_dot))[1]
+
+    along = (before, slots.y, slots.step, slots.fraction)
+    solvers = jax.vmap(solver)(*along)
+    forcing = jax.vmap(by_parameters)(*along)
+
+    def body(state_dot, xs):
+        (state, y, step, fraction), solver, (residual_dot, end_dot), accepted = xs
+
+        def by_state(state):
+            return equations(system, state, parameters, dt, y, step, fraction)
+
+        def by_unknowns(y):
+            return equations(system, state, parameters, dt, y, step, fraction)[1]
+
+        residual_by_state, end_by_state = jax.jvp(by_state, (state,), (state_dot,))[1]
+        y_dot = -solver.solve(residual_dot + residual_by_state)
+        end_by_unknowns = jax.jvp(by_unknowns, (y,), (y_dot,))[1]
+        end = jax.tree.map(lambda a, b, c: a + b + c, end_dot, end_by_state, end_by_unknowns)
+        end = jax.tree.map(partial(jnp.where, accepted), end, state_dot)
+        return end, (end, jnp.where(accepted, y_dot, 0.0))
+
+    last_dot, (states_dot, y_dot) = jax.lax.scan(body, state_dot, (along, solvers, forcing, slots.accepted))
+    slots_dot = jax.tree.map(_zero_tangent, slots)
+    slots_dot = eqx.tree_at(lambda s: (s.states, s.y), slots_dot, (states_dot, y_dot))
+    course_dot = jax.tree.map(_zero_tangent, course)
+    course_dot = eqx.tree_at(lambda c: c.state, course_dot, last_dot)
+    return (slots, course), (slots_dot, course_dot)

@@ -1,0 +1,74 @@
+"""One step: solve its equations, then advance the state."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from natcoord_jax.assembly.equations import prepare
+from natcoord_jax.assembly.response import Stations, gather, respond, situation
+from natcoord_jax.assembly.system import CoordinateGroup, System
+from natcoord_jax.core.coordinate import pair_motion
+from natcoord_jax.core.effect import Motion
+from natcoord_jax.core.state import State
+from natcoord_jax.maths.collocation import Tableau
+from natcoord_jax.stepping.newton import Solution, newton
+
+
+def solve(
+    system: System, state: State, u: Array, h: Array, tableau: Tableau, tolerance: float
+) -> Solution:
+    """Unknowns of one step; no derivatives pass (see `advance` and the rollout)."""
+    return newton(prepare(system, state, u, h, tableau), tolerance)
+
+
+def _coordinate_rates(group: CoordinateGroup, system: System, at: Stations, h: Array) -> Float[Array, "s n"]:
+    """Rates of joint coordinates whose sum over the stages is the exact increment over h."""
+    bodies = system.joint_bodies[group.joints]
+
+    def one(place, start, rows, rates, spin):
+        return group.axis.unit_load(pair_motion(place, Motion(start, rows, rates, spin), 0), h).rate
+
+    motion = at.start[bodies], at.rows[:, bodies], at.rates[:, bodies], at.spin[:, bodies]
+    with jax.named_scope("joint_coordinates"):
+        return jax.vmap(one, in_axes=(0, 0, 1, 1, 1), out_axes=1)(system.frames[group.joints], *motion)
+
+
+def advance(
+    system: System, state: State, u: Array, h: Array, y: Float[Array, " unknowns"], tableau: Tableau
+) -> tuple[Float[Array, " unknowns"], State]:
+    """Residual of the step's equations at `y`, and the state at its end; differentiable in everything.
+
+    Positions and velocities are advanced by increments (section 6 of the paper, written for stages):
+    q_1 = q_0 + h sum b_i V_i and v_1 = v_0 + sum beta_i (V_i - v_0).
+    """
+    equations = prepare(system, state, u, h, tableau)
+    at, multipliers = equations.end_motion(y)
+    bodies = len(system.structure.bodies)
+    rates = at.rates[:, :bodies].reshape(tableau.stages, 4 * bodies, 3)
+    b, beta = jnp.asarray(tableau.b), jnp.asarray(tableau.beta)
+    q = state.q + h * jnp.tensordot(b, rates, 1)
+    v = state.v + jnp.tensordot(beta, rates - state.v, 1)
+    coordinates = state.coordinates
+    stage_rates = jnp.zeros((tableau.stages, coordinates.shape[0]), q.dtype)
+    for group in system.coordinates:
+        found = _coordinate_rates(group, system, at, h)
+        stage_rates = stage_rates.at[:, group.index].set(found)
+    if system.coordinates:
+        coordinates = coordinates + h * (b @ stage_rates)
+    rotors, work = state.rates, state.work
+    for group, lam in zip(equations.groups, multipliers):
+        if group.effect.rotors:
+            inner = stage_rates[:, group.coordinates[:, 0]] - rotors[group.rotors[:, 0]]
+            rotors = rotors.at[group.rotors[:, 0]].add(beta @ inner)
+        if group.effect.works:
+            answer = respond(group, situation(system, group, state, u, h), gather(group, at), lam, tableau)
+            work = work.at[group.works[:, 0]].add(h * (answer.power @ b))
+    after = State(state.t + h, q, v, coordinates, rotors, work)
+    return equations.residual(y)[0], after
+
+
+def linear_solver(
+    system: System, state: State, u: Array, h: Array, y: Array, tableau: Tableau
+):
+    """Jacobian of the step's equations at `y`, ready to solve with it and with its transpose."""
+    return prepare(system, state, u, h, tableau).linear_solver(y)
