@@ -14,4 +14,5 @@ from natcoord_jax.effects.joints import *
 from natcoord_jax.effects.loads import *
 from natcoord_jax.effects.springs import *
 from natcoord_jax.scene import Scene as Scene
+from natcoord_jax.stepping.assemble import assemble as assemble
 from natcoord_jax.stepping.simulate import linearise as linearise, simulate as simulate, step as step

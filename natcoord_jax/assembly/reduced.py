@@ -7,7 +7,6 @@ then the rates of the constraints. Working with rates and multipliers times h ke
 size as h goes to zero.
 """
 
-from typing import Self
 
 import equinox as eqx
 import jax
@@ -35,7 +34,6 @@ from natcoord_jax.assembly.tree import (
 )
 from natcoord_jax.core.effect import Response
 from natcoord_jax.core.state import State
-from natcoord_jax.linsolve.dense import DenseSolver, apply, saddle_inverse
 from natcoord_jax.maths.collocation import Tableau, gauss
 from natcoord_jax.maths.vectors import cross
 
@@ -79,7 +77,7 @@ class ReducedStep(eqx.Module):
     tableau: Tableau = eqx.field(static=True)
 
     @classmethod
-    def prepare(cls, system: System, state: State, u: Array, h: Array, tableau: Tableau) -> Self:
+    def prepare(cls, system: System, state: State, u: Array, h: Array, tableau: Tableau) -> "ReducedStep":
         """Gather what the step needs, once."""
         start = body_rows(state.q)
         return cls(
@@ -154,8 +152,8 @@ class ReducedStep(eqx.Module):
         return jnp.concatenate([generalised.reshape(-1), *rows]), jnp.sqrt(size)
 
     def _scatter(self, group: Group, answer: Response) -> tuple[Array, Array]:
-        """Impulses on rows and angular impulses on bodies; multipliers of joints are impulses already."""
-        scale = 1.0 if group.source == "joint" else self.h
+        """Impulses on rows and angular impulses on bodies; some effects answer with impulses already."""
+        scale = 1.0 if group.effect.impulsive else self.h
         forces = scale * jnp.moveaxis(answer.forces, 1, 0)
         turning = scale * jnp.moveaxis(answer.torques, 1, 0)
         if group.source == "mass":
@@ -194,31 +192,13 @@ class ReducedStep(eqx.Module):
         """Exact Jacobian of the residual."""
         return jax.jacfwd(lambda x: self.residual(x)[0])(y)
 
-    def approximate(self, y: Float[Array, " unknowns"]) -> tuple[Array, Array]:
-        """Inverse for the first iterations and the inertias of the unknowns (0 for multipliers).
-
-        Without springs, dampers and loops the inertia matrix will do; with them the exact Jacobian.
+    def approximate(self, y: Float[Array, " unknowns"]) -> Float[Array, "unknowns unknowns"]:
+        """Matrix for the first iterations: the inertia matrix, or with springs, dampers and loops the
+        exact Jacobian at the guess.
         """
-        if self.tableau.stages == 1 and not any(stiff(g) for g in active_groups(self.system)):
-            matrix = 2.0 * self.inertia_matrix()
-        else:
-            matrix = self.jacobian(y)
-        weights = jnp.abs(jnp.diagonal(matrix))
-        return saddle_inverse(matrix, self.balances), weights.at[self.balances :].set(0.0)
-
-    def exact(self, y: Float[Array, " unknowns"]) -> Array:
-        """Inverse of the exact Jacobian."""
-        return saddle_inverse(self.jacobian(y), self.balances)
-
-    def linear_solver(self, y: Float[Array, " unknowns"]) -> DenseSolver:
-        """The exact Jacobian with its inverse, for derivatives of the solution."""
-        matrix = self.jacobian(y)
-        return DenseSolver(matrix, saddle_inverse(matrix, self.balances), self.balances)
-
-    @staticmethod
-    def solve(factors: Array, right: Float[Array, " unknowns"]) -> Float[Array, " unknowns"]:
-        """Apply an inverse."""
-        return apply(factors, right)
+        if self.tableau.stages == 1 and not any(stiff(g) for g in self.groups):
+            return 2.0 * self.inertia_matrix()
+        return self.jacobian(y)
 
     def end_motion(self, y: Float[Array, " unknowns"]) -> tuple[Stations, list[Array]]:
         """Stage motion of all bodies and the multipliers, for the end of the step."""

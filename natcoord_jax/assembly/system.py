@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import equinox as eqx
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from natcoord_jax.assembly.tree import Tree
@@ -32,12 +33,12 @@ class Group(eqx.Module):
 
     effect: Effect
     weights: Float[Array, "n k 4"] | None
-    bodies: Int[Array, "n k"]
-    joints: Int[Array, "n j"]
-    inputs: Int[Array, "n i"]
-    coordinates: Int[Array, "n c"]
-    rotors: Int[Array, "n r"]
-    works: Int[Array, "n w"]
+    bodies: Int[Array | np.ndarray, "n k"]
+    joints: Int[Array | np.ndarray, "n j"]
+    inputs: Int[Array | np.ndarray, "n i"]
+    coordinates: Int[Array | np.ndarray, "n c"]
+    rotors: Int[Array | np.ndarray, "n r"]
+    works: Int[Array | np.ndarray, "n w"]
     count: int = eqx.field(static=True)
     names: tuple[str, ...] = eqx.field(static=True)
     source: str = eqx.field(static=True)
@@ -53,8 +54,8 @@ class CoordinateGroup(eqx.Module):
     """Joint coordinates of one description: joints, their bodies and places in the state."""
 
     axis: Coordinate = eqx.field(static=True)
-    joints: Int[Array, " n"]
-    index: Int[Array, " n"]
+    joints: Int[Array | np.ndarray, " n"]
+    index: Int[Array | np.ndarray, " n"]
 
 
 @dataclass(frozen=True)
@@ -105,7 +106,7 @@ class System(eqx.Module):
 
     mass: Float[Array, "bodies 4 4"]
     frames: Float[Array, "joints 2 4 4"]
-    joint_bodies: Int[Array, "joints 2"]
+    joint_bodies: Int[Array | np.ndarray, "joints 2"]
     tree: Tree
     joints: tuple[Group, ...]
     effects: tuple[Group, ...]

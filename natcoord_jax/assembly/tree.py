@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from natcoord_jax.maths.collocation import Tableau, rotate_stages
@@ -57,12 +58,12 @@ class Tree(eqx.Module):
         backwards: whether any joint is used from child to parent.
     """
 
-    parent: Int[Array, " bodies"]
-    parent_in_level: Int[Array, " bodies"]
-    slot_index: Int[Array, "bodies 7"]
-    slot_of: Int[Array, " unknowns"]
-    side: Int[Array, "bodies 2"]
-    order: Int[Array, "bodies 4"]
+    parent: Int[Array | np.ndarray, " bodies"]
+    parent_in_level: Int[Array | np.ndarray, " bodies"]
+    slot_index: Int[Array | np.ndarray, "bodies 7"]
+    slot_of: Int[Array | np.ndarray, " unknowns"]
+    side: Int[Array | np.ndarray, "bodies 2"]
+    order: Int[Array | np.ndarray, "bodies 4"]
     levels: tuple[Level, ...] = eqx.field(static=True)
     backwards: bool = eqx.field(static=True)
 
@@ -105,7 +106,7 @@ def gather_slots(tree: Tree, w: Float[Array, "s unknowns"]) -> Float[Array, "s b
     return padded[:, tree.slot_index]
 
 
-def _combine(coefficients: Float[Array, "n m"], vectors: Float[Array, "s n m 3"]) -> Float[Array, "s n 3"]:
+def _combine(coefficients: Float[Array, "n m"], vectors: Float[Array, "*s n m 3"]) -> Float[Array, "*s n 3"]:
     return jnp.sum(coefficients[..., None] * vectors, axis=-2)
 
 

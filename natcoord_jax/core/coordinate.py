@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -161,15 +162,16 @@ class CoordinateInertia(CoordinateEffect):
     kind: ClassVar[str] = "coordinate inertia"
     stores: ClassVar[bool] = True
     rotors: ClassVar[int] = 1
+    impulsive: ClassVar[bool] = True
 
     @abc.abstractmethod
     def inertia_of(self) -> Float[Array, ""]:
         """Inertia [kg m^2 or kg] along the coordinate."""
 
     def generalised(self, rates: Array, now: Now, lam: Array) -> tuple[Array, Array, Array]:
-        """Inertia force -I sum_j (A^-1)_ij (r_j - r_0) / h with the stored rate r_0."""
+        """Inertia impulse -I sum_j (A^-1)_ij (r_j - r_0) with the stored rate r_0."""
         coefficients = jnp.asarray(now.tableau.a_inverse)
-        forces = -self.inertia_of() / now.h * (coefficients @ (rates - now.rates))
+        forces = -self.inertia_of() * (coefficients @ (rates - now.rates))
         return forces, jnp.zeros((forces.shape[0], 0)), jnp.zeros(forces.shape[0])
 
     def stored(self, place: Array, rows: Array, coordinates: Array, rates: Array) -> Array:
@@ -186,6 +188,7 @@ class CoordinateConstraint(CoordinateEffect):
 
     kind: ClassVar[str] = "coordinate constraint"
     multipliers: ClassVar[int] = 1
+    impulsive: ClassVar[bool] = True
     works: ClassVar[bool] = True
 
     @abc.abstractmethod
@@ -197,9 +200,14 @@ class CoordinateConstraint(CoordinateEffect):
         """Right-hand side f(t)."""
 
     def generalised(self, rates: Array, now: Now, lam: Array) -> tuple[Array, Array, Array]:
-        """Forces a lambda / h; the row asks the coordinates at the end of the step to obey the relation."""
+        """Impulses a lambda; the row asks the coordinates at the end of the step to obey the relation.
+
+        Without a step (h = 0, the projection of velocities) it asks for the rate of the relation.
+        """
         factors = self.coefficients()
-        forces = lam * factors / now.h
-        wanted = (self.target(now.t + now.h) - factors @ now.coordinates) / now.h
-        rows = rates @ factors - wanted
-        return forces, rows[:, None], lam[:, 0] / now.h * (rates @ factors)
+        resting = now.h == 0
+        step = jnp.where(resting, 1.0, now.h)
+        reached = (self.target(now.t + now.h) - factors @ now.coordinates) / step
+        rate = jax.jvp(self.target, (now.t,), (jnp.ones_like(now.t),))[1]
+        rows = rates @ factors - jnp.where(resting, rate, reached)
+        return lam * factors, rows[:, None], lam[:, 0] * (rates @ factors)

@@ -27,7 +27,7 @@ def replace_fields(module: M, **fields: Any) -> M:
 
 
 class Motion(eqx.Module):
-    """Motion of the `k` bodies of one effect over a step.
+    """Motion of the `k` bodies of one effect (or of `n` equal ones) over a step.
 
     Attributes:
         start: rows at the start of the step [m for points, - for directors].
@@ -36,10 +36,10 @@ class Motion(eqx.Module):
         spin: angular velocities at the stages [rad/s].
     """
 
-    start: Float[Array, "k 4 3"]
-    rows: Float[Array, "s k 4 3"]
-    rates: Float[Array, "s k 4 3"]
-    spin: Float[Array, "s k 3"]
+    start: Float[Array, "*n k 4 3"]
+    rows: Float[Array, "s *n k 4 3"]
+    rates: Float[Array, "s *n k 4 3"]
+    spin: Float[Array, "s *n k 3"]
 
 
 class Now(eqx.Module):
@@ -90,6 +90,7 @@ class Effect(eqx.Module):
         kind: name of the scope its operations carry in the compiled program.
         multipliers: number of Lagrange multipliers per instance and stage.
         inputs: number of input channels per instance.
+        impulsive: whether forces, torques and power of its response are times the step (impulses, work).
         works: whether its power enters the work account of the state (non-potential effects).
         stores: whether it stores potential energy.
         rotors: number of stored coordinate rates per instance.
@@ -98,6 +99,7 @@ class Effect(eqx.Module):
     kind: ClassVar[str] = "effect"
     multipliers: ClassVar[int] = 0
     inputs: ClassVar[int] = 0
+    impulsive: ClassVar[bool] = False
     works: ClassVar[bool] = False
     stores: ClassVar[bool] = False
     rotors: ClassVar[int] = 0

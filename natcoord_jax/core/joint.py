@@ -77,6 +77,7 @@ class Joint(Effect):
     name: Any = eqx.field(default=None, kw_only=True)
 
     kind: ClassVar[str] = "joint"
+    impulsive: ClassVar[bool] = True
     multipliers: ClassVar[int] = 0
     rotations: ClassVar[tuple[int, ...]] = ()
     child_rotation: ClassVar[bool] = False

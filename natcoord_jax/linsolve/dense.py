@@ -55,6 +55,16 @@ def apply(inverse: Float[Array, "n n"], right: Float[Array, " n"]) -> Float[Arra
     return jnp.sum(inverse * right[None, :], axis=1)
 
 
+class Inverse(eqx.Module):
+    """An approximate inverse, to be applied in an iteration."""
+
+    inverse: Float[Array, "n n"]
+
+    def solve(self, right: Float[Array, " n"]) -> Float[Array, " n"]:
+        """Product with the inverse."""
+        return apply(self.inverse, right)
+
+
 class DenseSolver(eqx.Module):
     """A matrix with its (possibly regularised) inverse; solves are refined and differentiable in every mode.
 

@@ -55,7 +55,8 @@ def gauss(stages: int) -> Tableau:
         return tuple(tuple(float(x) for x in row) for row in matrix)
 
     beta = b @ a_inverse
-    return Tableau(stages, rows(a), tuple(b), tuple(c), rows(a_inverse), tuple(float(x) for x in beta))
+    b, c, beta = (tuple(float(x) for x in vector) for vector in (b, c, beta))
+    return Tableau(stages, rows(a), b, c, rows(a_inverse), beta)
 
 
 @lru_cache
@@ -79,8 +80,8 @@ def invariant_quadrature(stages: int, points: int) -> tuple[np.ndarray, np.ndarr
 
 
 def rotate_stages(
-    turn: Float[Array, "stages *batch 3"], start: Float[Array, "stages *batch 3"], tableau: Tableau
-) -> Float[Array, "stages *batch 3"]:
+    turn: Float[Array, "#stages *#batch 3"], start: Float[Array, "#stages *#batch 3"], tableau: Tableau
+) -> Float[Array, "stages *out 3"]:
     """Stage values X_i of vectors that turn with the stages: X_i - sum_j a_ij turn_j x X_j = start_i.
 
     For one stage this is the mid-point vector of Cayley's rotation with half turn a = turn/2,

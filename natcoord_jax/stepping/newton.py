@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from natcoord_jax.core.results import Result
+from natcoord_jax.stepping.factorise import FACTORISATIONS
 
 TOLERANCE = 5e-15
 """Predicted error after the last correction, relative to the terms of the equations (energy norm)."""
@@ -51,9 +52,9 @@ class _Iterate(eqx.Module):
     failed: Array
 
 
-def _iterate(equations: Any, it: _Iterate, inverse: Any, weights: Array, tolerance: Array, slowest: float):
+def _iterate(equations: Any, it: _Iterate, factors: Any, weights: Array, tolerance: Array | float, slowest: float):
     residual, size = equations.residual(it.y)
-    change = equations.solve(inverse, residual)
+    change = factors.solve(residual)
     correction = jnp.sqrt(jnp.sum(weights * change**2))
     ratio = correction / jnp.where(it.correction > 0, it.correction, 1.0)
     first = it.count == 0
@@ -73,18 +74,20 @@ def _iterate(equations: Any, it: _Iterate, inverse: Any, weights: Array, toleran
     )
 
 
-def newton(equations: Any, tolerance: Float[Array, ""] | float) -> Solution:
+def newton(equations: Any, tolerance: Float[Array, ""] | float, form: str) -> Solution:
     """Solve the equations of one step.
 
     Args:
-        equations: a prepared step (`residual`, `guess`, `approximate`, `exact`, `solve`).
+        equations: a prepared step (`residual`, `guess`, `approximate`, `jacobian`).
         tolerance: see `TOLERANCE`.
+        form: form of the equations, which decides the factorisation.
 
     Returns:
         The solution; its code is successful, max_iterations, diverged or nonfinite, never an exception.
     """
     guess = equations.guess()
-    inverse, weights = equations.approximate(guess)
+    factorise = FACTORISATIONS[form]
+    inverse, weights = factorise(equations, equations.approximate(guess))
     zero, no = jnp.zeros((), guess.dtype), jnp.array(False)
     start = _Iterate(guess, zero, zero, jnp.array(0), no, no)
 
@@ -98,7 +101,7 @@ def newton(equations: Any, tolerance: Float[Array, ""] | float) -> Solution:
 
     def body(carry: tuple[_Iterate, Array]) -> tuple[_Iterate, Array]:
         it, largest = carry
-        after = _iterate(equations, it, equations.exact(it.y), weights, tolerance, jnp.inf)
+        after = _iterate(equations, it, factorise(equations, equations.jacobian(it.y))[0], weights, tolerance, jnp.inf)
         diverged = after.correction > 1e6 * largest
         failed = after.failed | (diverged & (it.count > 0))
         after = eqx.tree_at(lambda x: x.failed, after, failed)

@@ -18,6 +18,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from natcoord_jax.assembly.system import System
@@ -64,11 +65,11 @@ class Slots(eqx.Module):
     """
 
     states: State
-    y: Float[Array, "slots unknowns"]
-    step: Int[Array, " slots"]
-    fraction: Float[Array, " slots"]
-    accepted: Bool[Array, " slots"]
-    finished: Int[Array, " slots"]
+    y: Float[Array, "*slots unknowns"]
+    step: Int[Array, "*slots"]
+    fraction: Float[Array, "*slots"]
+    accepted: Bool[Array, "*slots"]
+    finished: Int[Array, "*slots"]
 
 
 class Course(eqx.Module):
@@ -181,9 +182,7 @@ def run_slots(
     return _run(plan, system, state, parameters, dt)
 
 
-def _zero_tangent(x: Array) -> Array:
-    import numpy as np
-
+def _zero_tangent(x: Array) -> Array | np.ndarray:
     if jnp.issubdtype(jnp.result_type(x), jnp.inexact):
         return jnp.zeros_like(x)
     return np.zeros(jnp.shape(x), jax.dtypes.float0)

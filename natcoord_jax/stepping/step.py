@@ -1,5 +1,7 @@
 """One step: solve its equations, then advance the state."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -11,6 +13,7 @@ from natcoord_jax.core.coordinate import pair_motion
 from natcoord_jax.core.effect import Motion
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import Tableau
+from natcoord_jax.stepping.factorise import differentiable_solver
 from natcoord_jax.stepping.newton import Solution, newton
 
 
@@ -18,7 +21,7 @@ def solve(
     system: System, state: State, u: Array, h: Array, tableau: Tableau, tolerance: float
 ) -> Solution:
     """Unknowns of one step; no derivatives pass (see `advance` and the rollout)."""
-    return newton(prepare(system, state, u, h, tableau), tolerance)
+    return newton(prepare(system, state, u, h, tableau), tolerance, system.structure.solver)
 
 
 def _coordinate_rates(group: CoordinateGroup, system: System, at: Stations, h: Array) -> Float[Array, "s n"]:
@@ -62,13 +65,14 @@ def advance(
             rotors = rotors.at[group.rotors[:, 0]].add(beta @ inner)
         if group.effect.works:
             answer = respond(group, situation(system, group, state, u, h), gather(group, at), lam, tableau)
-            work = work.at[group.works[:, 0]].add(h * (answer.power @ b))
+            work = work.at[group.works[:, 0]].add((1.0 if group.effect.impulsive else h) * (answer.power @ b))
     after = State(state.t + h, q, v, coordinates, rotors, work)
     return equations.residual(y)[0], after
 
 
 def linear_solver(
     system: System, state: State, u: Array, h: Array, y: Array, tableau: Tableau
-):
+) -> Any:
     """Jacobian of the step's equations at `y`, ready to solve with it and with its transpose."""
-    return prepare(system, state, u, h, tableau).linear_solver(y)
+    equations = prepare(system, state, u, h, tableau)
+    return differentiable_solver(equations, equations.jacobian(y))

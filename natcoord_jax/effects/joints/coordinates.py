@@ -17,28 +17,28 @@ def _no_load(pair: PairMotion) -> tuple[Array, Array]:
     return jnp.zeros((stages, 2, 4, 3)), jnp.zeros((stages, 2, 3))
 
 
-def _turn(carrier_turn: Array, axis: Array, increment: Array) -> tuple[Array, Array]:
-    """Angle turned in a mid-point step and its quotient by the Cayley increment along the mid-point axis.
+def _turn(carrier_spin: Array, axis: Array, rate: Array, h: Array) -> tuple[Array, Array]:
+    """Mean rate of an angle over a mid-point step, and its quotient by the rate along the mid-point axis.
 
-    The carrier of the axis turns by Cayley's vector g = carrier_turn / 2, the other body by
-    g + increment/2 times the mid-point axis. Composing the two, the relative half-angle tangent is
-    t = (increment/2) / (1 + |g|^2 + (increment/2) g.a), a the unit axis at the start.
+    The carrier of the axis turns by Cayley's vector g = h carrier_spin / 2, the other body by g + h rate/2
+    times the mid-point axis. Composing the two, the tangent of half the angle turned is
+    t = (h rate/2) / (1 + |g|^2 + (h rate/2) g.a), a the unit axis at the start.
 
     Args:
-        carrier_turn: h times the angular velocity of the carrier, shape (3,) [rad].
+        carrier_spin: angular velocity of the carrier, shape (3,) [rad/s].
         axis: unit axis at the start of the step.
-        increment: Cayley increment along the mid-point axis.
+        rate: relative angular velocity along the mid-point axis, in units of that axis.
+        h: step [s]; zero is allowed.
 
     Returns:
-        Angle [rad], and angle / (|mid-point axis|^2 increment), smooth at zero.
+        Angle turned over h [rad/s], and the same over (|mid-point axis|^2 rate), smooth at zero.
     """
-    g = 0.5 * carrier_turn
+    g = 0.5 * h * carrier_spin
     along = dot(g, axis)
     square = 1.0 + dot(g, g)
-    denominator = square + 0.5 * increment * along
-    t = 0.5 * increment / denominator
-    quotient = arctan_quotient(t) * square / ((1.0 + along**2) * denominator)
-    return 2.0 * t * arctan_quotient(t), quotient
+    denominator = square + 0.5 * h * rate * along
+    quotient = arctan_quotient(0.5 * h * rate / denominator) / denominator
+    return quotient * rate, quotient * square / (1.0 + along**2)
 
 
 def _single_stage(pair: PairMotion) -> None:
@@ -57,11 +57,11 @@ class Angle(Coordinate):
         _single_stage(pair)
         start, middle = pair.parent_start.axes[self.axis], pair.parent.axes[0, self.axis]
         relative = pair.child_spin[0] - pair.parent_spin[0]
-        increment = h * dot(middle, relative) / dot(middle, middle)
-        angle, quotient = _turn(h * pair.parent_spin[0], start, increment)
+        along = dot(middle, relative) / dot(middle, middle)
+        rate, quotient = _turn(pair.parent_spin[0], start, along, h)
         forces, torques = _no_load(pair)
         torque = quotient * middle
-        return UnitLoad((angle / h)[None], forces, torques.at[0, 0].set(-torque).at[0, 1].set(torque))
+        return UnitLoad(rate[None], forces, torques.at[0, 0].set(-torque).at[0, 1].set(torque))
 
     def value(self, parent: Frame, child: Frame) -> Array:
         """Angle in (-pi, pi]."""
@@ -89,18 +89,18 @@ class UniversalAngle(Coordinate):
         _single_stage(pair)
         a0, a = pair.parent_start.axes[2], pair.parent.axes[0, 2]
         b0, b = pair.child_start.axes[0], pair.child.axes[0, 0]
-        relative = h * (pair.child_spin[0] - pair.parent_spin[0])
+        relative = pair.child_spin[0] - pair.parent_spin[0]
         n = cross(a, b)
         reciprocal_a, reciprocal_b = cross(b, n) / dot(n, n), cross(n, a) / dot(n, n)
         if self.second:
-            cross_turn = h * pair.parent_spin[0] + dot(reciprocal_a, relative) * a
-            angle, quotient = _turn(cross_turn, b0, dot(reciprocal_b, relative))
+            cross_spin = pair.parent_spin[0] + dot(reciprocal_a, relative) * a
+            rate, quotient = _turn(cross_spin, b0, dot(reciprocal_b, relative), h)
             torque = quotient * dot(b, b) * reciprocal_b
         else:
-            angle, quotient = _turn(h * pair.parent_spin[0], a0, dot(reciprocal_a, relative))
+            rate, quotient = _turn(pair.parent_spin[0], a0, dot(reciprocal_a, relative), h)
             torque = quotient * dot(a, a) * reciprocal_a
         forces, torques = _no_load(pair)
-        return UnitLoad((angle / h)[None], forces, torques.at[0, 0].set(-torque).at[0, 1].set(torque))
+        return UnitLoad(rate[None], forces, torques.at[0, 0].set(-torque).at[0, 1].set(torque))
 
     def value(self, parent: Frame, child: Frame) -> Array:
         """Angle in (-pi, pi]."""

@@ -1,0 +1,175 @@
+"""Balances along a trajectory: change of energy less work, change of momenta less impulses.
+
+Impulses of gravity, loads and springs to the ground are those of the discrete equations: the effects are
+evaluated once more at the mid-points of the steps, where their quadrature is exact. Reactions of the ground
+are unknown, so momenta are judged along those rigid motions of everything on which no reaction can work:
+all six of a free system, turning about the axis of a hinge on the ground, none of a closed loop on the
+ground. They are found from the constraints themselves, as the common null space of all reactions.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from natcoord_jax.assembly.diagnostics import body_momenta
+from natcoord_jax.assembly.response import Stations, body_rows, gather, respond, situation, stations
+from natcoord_jax.assembly.system import Group, System
+from natcoord_jax.core.effect import Motion, Response
+from natcoord_jax.core.state import State, Trajectory
+from natcoord_jax.maths.collocation import gauss
+from natcoord_jax.maths.vectors import cross
+
+REACTION_FREE = 1e-16
+"""A rigid motion counts as free of reactions when their mean square power is below this share (1e-8 in
+amplitude: far above round-off, far below any real constraint)."""
+
+
+class Balance(eqx.Module):
+    """Errors of the balances at each saved time, relative to fixed scales.
+
+    Attributes:
+        energy: |E - E_0 - (W - W_0)| / scale; the scale is the largest T + sum |V_store| + sum |W| [-].
+        momentum: the same for momentum and impulse, along the directions free of ground reactions; the
+            scale is the largest sum over the bodies of |p_b| [-]. None if there is no such direction.
+        angular_momentum: the same for turning about the axes free of reactions; the scale is the largest
+            sum over the bodies of |J_b| plus sum_k integral |u_k| dt [-]. None if there is no such axis.
+        directions: number of directions `momentum` counts, 0 to 3.
+        axes: number of axes `angular_momentum` counts, 0 to 3.
+        note: why something is missing, or "".
+    """
+
+    energy: Float[np.ndarray, " saved"]
+    momentum: Float[np.ndarray, " saved"] | None
+    angular_momentum: Float[np.ndarray, " saved"] | None
+    directions: int
+    axes: int
+    note: str
+
+
+def _midpoint(before: State, after: State, h: Array) -> Stations:
+    """Motion over a step as the effects saw it: mid-point rows, mean velocities, spins of the mid-points."""
+    start, rates = body_rows(before.q), body_rows(0.5 * (before.v + after.v))
+    middle = (start + 0.5 * h * rates)[:, 1:]
+    d1, d2, d3 = middle[:, 0], middle[:, 1], middle[:, 2]
+    dual = jnp.stack([cross(d2, d3), cross(d3, d1), cross(d1, d2)], axis=1)
+    volume = jnp.sum(d1 * dual[:, 0], axis=-1)
+    spin = 0.5 * jnp.sum(cross(dual, rates[:, 1:]), axis=1) / volume[:, None]
+    points = (start + 0.5 * h * rates)[:, 0]
+    return stations(start, points[None], middle[None], rates[None, :, 0], spin[None])
+
+
+def _resultants(bodies: int, group: Group, motion: Motion, answer: Response) -> Float[Array, "n 6"]:
+    """Force and torque about the origin that each instance of a group puts on the bodies; not on the ground."""
+    moving = (group.bodies < bodies)[..., None]
+    forces = answer.forces[:, 0]
+    turning = jnp.sum(cross(motion.rows[0], forces), axis=2) + answer.torques[:, 0]
+    parts = jnp.where(moving, jnp.concatenate([forces[:, :, 0], turning], axis=-1), 0.0)
+    return jnp.sum(parts, axis=1)
+
+
+def _step(system: System, before: State, after: State, u: Array) -> tuple[Array, Array]:
+    """Impulse (6,) of all that is known in a step, and Gram matrix (6, 6) of the reactions."""
+    bodies, tableau = len(system.structure.bodies), gauss(1)
+    h = after.t - before.t
+    at = _midpoint(before, after, h)
+    impulse, gram = jnp.zeros(6), jnp.zeros((6, 6))
+    for group in (*system.effects, *system.joints):
+        where, motion = situation(system, group, before, u, h), gather(group, at)
+        lam = jnp.zeros((group.count, 1, group.multipliers))
+        known = respond(group, where, motion, lam, tableau)
+        impulse = impulse + h * jnp.sum(_resultants(bodies, group, motion, known), axis=0)
+        for number in range(group.multipliers):
+            unit = lam.at[:, :, number].set(1.0 if group.source == "joint" else h)
+            found = respond(group, where, motion, unit, tableau)
+            reaction = jax.tree.map(jnp.subtract, found, known)
+            columns = _resultants(bodies, group, motion, reaction)
+            gram = gram + columns.T @ columns
+    return impulse, gram
+
+
+@eqx.filter_jit
+def _account(system: System, trajectory: Trajectory) -> dict[str, Any]:
+    """All that is needed of the trajectory, at the saved times."""
+    states = trajectory.states
+    before, after = jax.tree.map(lambda x: x[:-1], states), jax.tree.map(lambda x: x[1:], states)
+    impulses, grams = jax.vmap(_step, in_axes=(None, 0, 0, 0))(system, before, after, trajectory.inputs)
+    linear, angular = jax.vmap(lambda s: body_momenta(system, s))(states)
+    energy, work = system.energy(trajectory), states.work
+    stores = sum((jnp.abs(v) for v in energy.stores.values()), jnp.zeros_like(energy.kinetic))
+    steps = (after.t - before.t)[:, None]
+    return {
+        "energy": energy.total - energy.total[0] - jnp.sum(work - work[0], axis=-1),
+        "energy_scale": energy.kinetic + stores + jnp.sum(jnp.abs(work), axis=-1),
+        "momenta": jnp.concatenate([jnp.sum(linear, axis=1), jnp.sum(angular, axis=1)], axis=-1),
+        "momentum_scale": jnp.sum(jnp.linalg.norm(linear, axis=-1), axis=-1),
+        "angular_scale": jnp.sum(jnp.linalg.norm(angular, axis=-1), axis=-1),
+        "torque_scale": jnp.sum(jnp.abs(trajectory.inputs) * steps),
+        "impulses": impulses,
+        "gram": jnp.mean(grams, axis=0),
+        "reach": 1.0 + jnp.max(jnp.abs(states.q)) ** 2,
+    }
+
+
+def _free_motions(gram: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
+    """Rigid motions free of reactions: directions of translation (k, 6), and turns of unit rate (l, 6)."""
+    values, vectors = np.linalg.eigh(gram)
+    free = vectors[:, values <= REACTION_FREE * max(values[-1], reach)].T
+    mix, sizes, _ = np.linalg.svd(free[:, 3:])
+    rates = np.zeros(len(free))
+    rates[: len(sizes)] = sizes
+    turning = rates > 1e-8
+    return mix.T[~turning] @ free, (mix.T[turning] @ free) / rates[turning, None]
+
+
+def _relative(error: np.ndarray, scale: float) -> np.ndarray:
+    return error / scale if scale > 0 else np.zeros_like(error)
+
+
+def balance(system: System, trajectory: Trajectory) -> Balance:
+    """Errors of the balances of energy, momentum and angular momentum along a trajectory.
+
+    Args:
+        system: compiled system.
+        trajectory: of one lane, computed with it, every step saved.
+
+    Returns:
+        The relative errors; see `Balance` for their scales. Momenta are left out, with a note, where the
+        trajectory does not hold every step (`save_every`, steps repeated in substeps): their impulses are then
+        unknown.
+
+    Raises:
+        ValueError: for a trajectory of a batch.
+
+    Example:
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import natcoord_jax as nc
+        >>> scene = nc.Scene()
+        >>> ball = scene.add(nc.RigidBody(mass=1.0, inertia=(1.0, 2.0, 3.0), angular_velocity=(0, 1, 0.1)))
+        >>> system, state = scene.compile()
+        >>> errors = nc.balance(system, nc.simulate(system, state, dt=0.1, steps=10))
+        >>> errors.axes, bool(errors.angular_momentum.max() < 1e-13)
+        (3, True)
+    """
+    if trajectory.t.ndim != 1:
+        raise ValueError(f"balance takes one lane, not a batch of shape {trajectory.t.shape[:-1]}; use a loop")
+    saved = trajectory.t.shape[0]
+    if saved == 1:
+        return Balance(np.zeros(1), np.zeros(1), np.zeros(1), 3, 3, "no step was made")
+    account = jax.tree.map(np.asarray, _account(system, trajectory))
+    energy = _relative(np.abs(account["energy"]), np.max(account["energy_scale"]))
+    if int(trajectory.steps_taken) > saved - 1 and np.any(account["impulses"]):
+        return Balance(energy, None, None, 0, 0, "momenta: not every step is in the trajectory")
+    impulse = np.concatenate([np.zeros((1, 6)), np.cumsum(account["impulses"], axis=0)])
+    change = account["momenta"] - account["momenta"][0] - impulse
+    along, about = _free_motions(account["gram"], float(account["reach"]))
+    linear = _relative(np.linalg.norm(change @ along.T, axis=-1), np.max(account["momentum_scale"]))
+    scale = np.max(account["angular_scale"]) + account["torque_scale"]
+    angular = _relative(np.linalg.norm(change @ about.T, axis=-1), float(scale))
+    missing = [name for name, found in (("momentum", along), ("angular momentum", about)) if not len(found)]
+    note = f"{' and '.join(missing)}: every component feels reactions of the ground" if missing else ""
+    parts = (linear if len(along) else None, angular if len(about) else None)
+    return Balance(energy, *parts, len(along), len(about), note)

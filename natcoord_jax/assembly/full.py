@@ -1,0 +1,172 @@
+"""Equations of a step in the local null space: six rates a body, multipliers for every joint.
+
+The most general form: any joint, any loop, any coupling. The Jacobian is assembled from those of single
+bodies and effects. Systems that are no tree and too large for the reduced form are solved so, densely; for
+all others it is an independent way to the same trajectory.
+"""
+
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from natcoord_jax.assembly.diagnostics import rows_with_ground
+from natcoord_jax.assembly.local import body_balance, body_motion, over_instances
+from natcoord_jax.assembly.reduced import row_weights
+from natcoord_jax.assembly.response import Situation, Stations, body_rows, situation, stations
+from natcoord_jax.assembly.system import Group, System
+from natcoord_jax.core.state import State
+from natcoord_jax.maths.collocation import Tableau
+from natcoord_jax.maths.vectors import cross
+
+
+class FullStep(eqx.Module):
+    """One step with multipliers for every joint: all that does not depend on the unknowns."""
+
+    system: System
+    state: State
+    start: Float[Array, "bodies_and_ground 4 3"]
+    velocity: Float[Array, "bodies 4 3"]
+    situations: tuple[Situation, ...]
+    h: Float[Array, ""]
+    tableau: Tableau = eqx.field(static=True)
+
+    @classmethod
+    def prepare(cls, system: System, state: State, u: Array, h: Array, tableau: Tableau) -> "FullStep":
+        """Gather what the step needs, once."""
+        groups = (*system.effects, *system.joints)
+        return cls(
+            system,
+            state,
+            rows_with_ground(state.q),
+            body_rows(state.v),
+            tuple(situation(system, g, state, u, h) for g in groups),
+            h,
+            tableau,
+        )
+
+    @property
+    def groups(self) -> tuple[Group, ...]:
+        """All groups, in the order of their multipliers."""
+        return (*self.system.effects, *self.system.joints)
+
+    @property
+    def bodies(self) -> int:
+        """Number of bodies."""
+        return self.velocity.shape[0]
+
+    @property
+    def balances(self) -> int:
+        """Number of balance equations."""
+        return 6 * self.bodies * self.tableau.stages
+
+    def _blocks(self) -> list[tuple[int, int]]:
+        """First unknown and size of the multipliers of each group."""
+        blocks, position = [], self.balances
+        for group in self.groups:
+            size = group.count * self.tableau.stages * group.multipliers
+            blocks.append((position, size))
+            position += size
+        return blocks
+
+    @property
+    def unknowns(self) -> int:
+        """Number of unknowns."""
+        last = self._blocks()[-1] if self.groups else (self.balances, 0)
+        return sum(last)
+
+    def split(self, y: Float[Array, " unknowns"]) -> tuple[Array, list[Array]]:
+        """Twists (bodies, s, 6) and multipliers of each group (n, s, m)."""
+        s = self.tableau.stages
+        twists = y[: self.balances].reshape(self.bodies, s, 6)
+        multipliers = [
+            y[first : first + size].reshape(group.count, s, group.multipliers)
+            for group, (first, size) in zip(self.groups, self._blocks())
+        ]
+        return twists, multipliers
+
+    def _with_ground(self, twists: Array) -> Array:
+        return jnp.concatenate([twists, jnp.zeros_like(twists[:1])])
+
+    def residual(self, y: Float[Array, " unknowns"]) -> tuple[Float[Array, " unknowns"], Float[Array, ""]]:
+        """Residual [N s, N m s; m/s, 1/s for constraints] and the size of its terms [sqrt(J)]."""
+        twists, multipliers = self.split(y)
+        balance = jax.vmap(body_balance, in_axes=(0, 0, 0, 0, None, None))
+        total = balance(self.system.mass, self.start[:-1], self.velocity, twists, self.h, self.tableau)
+        total = self._with_ground(total)
+        weights = row_weights(self.system.mass)
+        scale = jnp.stack([weights[:, 0]] * 3 + [weights[:, 1]] * 3, axis=1)[:, None]
+        rest = balance(
+            self.system.mass, self.start[:-1], self.velocity, jnp.zeros_like(twists), self.h, self.tableau
+        )
+        size = jnp.sum(scale * (total[:-1] ** 2 + 2 * rest**2))
+        every, rows = self._with_ground(twists), []
+        for group, where, lam in zip(self.groups, self.situations, multipliers):
+            evaluate, _ = over_instances(group, where, self.tableau)
+            wrench, g_rates, *_ = evaluate(self.start[group.bodies], every[group.bodies], lam)
+            added = jnp.zeros_like(total).at[group.bodies].add(wrench)
+            size = size + jnp.sum(scale * added[:-1] ** 2)
+            total = total - added
+            rows.append(g_rates.reshape(-1))
+        return jnp.concatenate([total[:-1].reshape(-1), *rows]), jnp.sqrt(size)
+
+    def jacobian(self, y: Float[Array, " unknowns"]) -> Float[Array, "unknowns unknowns"]:
+        """Exact Jacobian, assembled from local ones."""
+        twists, multipliers = self.split(y)
+        s, bodies, size = self.tableau.stages, self.bodies, self.unknowns
+        width = 6 * s
+        own = jax.vmap(jax.jacfwd(body_balance, argnums=3), in_axes=(0, 0, 0, 0, None, None))(
+            self.system.mass, self.start[:-1], self.velocity, twists, self.h, self.tableau
+        ).reshape(bodies, width, width)
+        columns = np.arange(bodies)[:, None] * width + np.arange(width)
+        matrix = jnp.zeros((size + width, size + width), y.dtype)
+        matrix = matrix.at[columns[:, :, None], columns[:, None, :]].add(own)
+        every = self._with_ground(twists)
+        for group, where, lam, (first, _) in zip(self.groups, self.situations, multipliers, self._blocks()):
+            _, jacobians = over_instances(group, where, self.tableau)
+            (by_twist, by_lam), (g_by_twist, _) = jacobians(
+                self.start[group.bodies], every[group.bodies], lam
+            )
+            n, k = group.bodies.shape
+            m = s * group.multipliers
+            # ground columns and rows go beyond the matrix and are cut off at the end
+            base = jnp.where(group.bodies == bodies, size, group.bodies * width)
+            touched = (base[:, :, None] + jnp.arange(width)).reshape(n, k * width)
+            local = by_twist.reshape(n, k * width, k * width)
+            matrix = matrix.at[touched[:, :, None], touched[:, None, :]].add(-local)
+            if m:
+                lams = first + jnp.arange(n)[:, None] * m + jnp.arange(m)
+                matrix = matrix.at[touched[:, :, None], lams[:, None, :]].add(
+                    -by_lam.reshape(n, k * width, m)
+                )
+                matrix = matrix.at[lams[:, :, None], touched[:, None, :]].add(
+                    g_by_twist.reshape(n, m, k * width)
+                )
+        return matrix[:size, :size]
+
+    def guess(self) -> Float[Array, " unknowns"]:
+        """Twists at the start, repeated for every stage; multipliers zero."""
+        start = self.start[:-1]
+        spin = 0.5 * jnp.sum(cross(start[:, 1:], self.velocity[:, 1:]), axis=1)
+        twist = jnp.concatenate([self.velocity[:, 0], spin], axis=1)[:, None]
+        twists = jnp.broadcast_to(twist, (self.bodies, self.tableau.stages, 6)).reshape(-1)
+        return jnp.concatenate([twists, jnp.zeros(self.unknowns - self.balances, twists.dtype)])
+
+    def approximate(self, y: Float[Array, " unknowns"]) -> Float[Array, "unknowns unknowns"]:
+        """Matrix for the first iterations: the exact Jacobian at the guess."""
+        return self.jacobian(y)
+
+    def end_motion(self, y: Float[Array, " unknowns"]) -> tuple[Stations, list[Array]]:
+        """Stage motion of all bodies and the multipliers, for the end of the step."""
+        twists, multipliers = self.split(y)
+        motion = body_motion(self.start[:-1], twists, self.h, self.tableau)
+        at = stations(
+            self.start[:-1],
+            motion.rows[:, :, 0],
+            motion.rows[:, :, 1:],
+            motion.rates[:, :, 0],
+            motion.spin,
+        )
+        return at, multipliers

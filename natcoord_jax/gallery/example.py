@@ -1,0 +1,63 @@
+"""What a scene of the gallery consists of."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+import natcoord_jax as nc
+from natcoord_jax.assembly.system import System
+from natcoord_jax.core.state import State, Trajectory
+
+
+@dataclass(frozen=True)
+class Example:
+    """A ready scene with a sensible run.
+
+    Attributes:
+        name: name in the gallery.
+        description: one line.
+        system: compiled system.
+        state: initial state.
+        dt: step of the suggested run [s].
+        steps: number of steps of the suggested run.
+        control: inputs as a function of the mid-times (steps,) [s] of the steps, shape (steps, inputs)
+            [N, N m]; None: no inputs, or all zero.
+        facts: what is known of the scene, by name: exact values, published numbers, useful handles.
+
+    Example:
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> from natcoord_jax import gallery
+        >>> example = gallery.load("pendulum")
+        >>> trajectory = example.simulate(steps=10, dt=0.01)
+        >>> trajectory.q.shape
+        (11, 4, 3)
+    """
+
+    name: str
+    description: str
+    system: System
+    state: State
+    dt: float
+    steps: int
+    control: Callable[[Float[Array, " steps"]], Float[Array, "steps inputs"]] | None = None
+    facts: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def t_end(self) -> float:
+        """End time of the suggested run [s]."""
+        return self.steps * self.dt
+
+    def inputs(self, steps: int | None = None, dt: Any = None) -> Float[Array, "steps inputs"]:
+        """Inputs of a run with other steps; default the suggested one."""
+        steps, dt = steps or self.steps, self.dt if dt is None else dt
+        if self.control is None:
+            return jnp.zeros((steps, len(self.system.structure.inputs)))
+        return self.control((jnp.arange(steps) + 0.5) * dt)
+
+    def simulate(self, *, steps: int | None = None, dt: Any = None, **options: Any) -> Trajectory:
+        """Run the scene; `options` go to `nc.simulate`."""
+        steps, dt = steps or self.steps, self.dt if dt is None else dt
+        return nc.simulate(self.system, self.state, dt=dt, inputs=self.inputs(steps, dt), **options)

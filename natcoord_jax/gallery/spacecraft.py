@@ -1,0 +1,149 @@
+"""The spacecraft of the paper (8.1): a free base with three motor-driven wheels, and its two torque formulas."""
+
+from typing import Any, ClassVar, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+import natcoord_jax as nc
+from natcoord_jax.core.handles import Handle
+from natcoord_jax.core.markers import Marker
+from natcoord_jax.gallery.example import Example
+
+# Table 1 of the paper: mass [kg], diagonal of E [kg m^2], distance of the wheel from the base's centre [m].
+BASE = (1005.3096, (89.3609, 201.0619, 357.4434))
+WHEELS = (
+    (424.1150, (8.8357, 106.0288, 106.0288), 0.9167),
+    (424.1150, (106.0288, 8.8357, 106.0288), 1.25),
+    (424.1150, (106.0288, 106.0288, 8.8357), 1.5833),
+)
+TORQUE = 200.0
+"""Torque of every motor [N m]."""
+T_END = 5.0
+"""End of the manoeuvre [s]."""
+
+# T(5) [J] with (61), T(5) with (70), J_3(5) [kg m^2/s] with (70), by the number of steps.
+TABLE = {
+    5: (7208.728, 3103.4, -336.0),
+    10: (7626.4, 4926.3, -212.0),
+    20: (7788.9, 6584.6, -91.3),
+    40: (7825.0, 7443.3, -28.6),
+    80: (7833.428, 7730.8, -7.65),
+}
+
+
+class CovariantJointTorque(nc.Force):
+    """Motor torque through the covariant directors, f^i = m x d_i / 2 (70): not balanced at finite steps.
+
+    It is here to show what goes wrong with it; `nc.JointTorque` uses the contravariant directors (61).
+
+    Attributes:
+        markers: the axis in the parent, three directions of the parent, three of the child.
+    """
+
+    kind: ClassVar[str] = "covariant joint torque"
+    inputs: ClassVar[int] = 1
+
+    def load(self, x: Array, rate: Array, inputs: Array, t: Array) -> nc.Load:
+        """Forces m x d_i / 2 on the directors of the child, their opposite on those of the parent."""
+        half = 0.5 * inputs[0] * x[0]
+        forces = jnp.concatenate([jnp.zeros((1, 3)), -jnp.cross(half, x[1:4]), jnp.cross(half, x[4:7])])
+        return nc.Load(forces, jnp.zeros_like(x))
+
+
+def _axes(body: Handle) -> tuple[Marker, ...]:
+    return tuple(nc.Direction(body, axis, local=True) for axis in np.eye(3))
+
+
+def _craft() -> tuple[nc.Scene, list[tuple[Handle, Handle, Handle]]]:
+    """The scene without motors, and (base, wheel, hinge) of each wheel."""
+    scene = nc.Scene()
+    base = scene.add(nc.RigidBody(mass=BASE[0], second_moment=BASE[1], name="base"))
+    parts = []
+    for number, (mass, moment, distance) in enumerate(WHEELS):
+        axis = np.eye(3)[number]
+        place = distance * axis
+        body = nc.RigidBody(mass=mass, second_moment=moment, position=place, name=f"wheel {number + 1}")
+        wheel = scene.add(body)
+        hinge = scene.add(nc.Revolute(base, wheel, point=place, axis=axis, name=f"hinge {number + 1}"))
+        parts.append((base, wheel, hinge))
+    return scene, parts
+
+
+def spacecraft() -> Example:
+    """Free base with three motor-driven wheels, 200 N m each, from rest over 5 s (8.1 of the paper)."""
+    scene, parts = _craft()
+    for number, (_, _, hinge) in enumerate(parts):
+        scene.add(nc.JointTorque(hinge, name=f"motor {number + 1}"))
+    system, state = scene.compile()
+    return Example(
+        name="spacecraft",
+        description="free base with three motor-driven wheels (8.1 of the paper)",
+        system=system,
+        state=state,
+        dt=T_END / 100,
+        steps=100,
+        control=lambda t: jnp.full((t.shape[0], 3), TORQUE),
+        facts={"dofs": 9, "constraints": 39, "table": TABLE, "converged_energy": 7836.18288},
+    )
+
+
+class Comparison(NamedTuple):
+    """One rollout of the comparison of torque formulas.
+
+    Attributes:
+        formula: "contravariant" (61) or "covariant" (70).
+        steps: number of steps N.
+        t: times (N + 1,) [s].
+        angular_momentum: third component of J (N + 1,) [kg m^2/s].
+        energy: kinetic energy (N + 1,) [J].
+    """
+
+    formula: str
+    steps: int
+    t: np.ndarray
+    angular_momentum: np.ndarray
+    energy: np.ndarray
+
+
+def compare_torques(numbers: tuple[int, ...] = tuple(TABLE)) -> list[Comparison]:
+    """Rollouts with both torque formulas and several numbers of steps, figures 4 and 5 of the paper.
+
+    The craft carries motors of both kinds, with inputs of their own; a lane drives one kind and leaves the
+    other idle. So all lanes differ in numbers only and share one compiled program: every lane makes as many
+    steps as the longest, the shorter ones coast after the end of their manoeuvre, and that is cut off.
+
+    Args:
+        numbers: numbers of steps over [0, 5] s.
+
+    Returns:
+        One entry for each formula and number.
+    """
+    scene, parts = _craft()
+    for number, (base, wheel, hinge) in enumerate(parts):
+        scene.add(nc.JointTorque(hinge, name=f"motor {number + 1}"))
+        markers = (nc.Direction(base, np.eye(3)[number]), *_axes(base), *_axes(wheel))
+        scene.add(CovariantJointTorque(markers, f"covariant motor {number + 1}"))
+    system, state = scene.compile()
+    longest = max(numbers)
+    kinds = {"contravariant": [1.0, 0.0] * 3, "covariant": [0.0, 1.0] * 3}
+    lanes = [(formula, n) for formula in kinds for n in numbers]
+
+    def drive(formula: str, n: int) -> Array:
+        return TORQUE * (jnp.arange(longest) < n)[:, None] * jnp.asarray(kinds[formula])
+
+    @eqx.filter_jit
+    def run(dt: Float[Array, ""], inputs: Float[Array, "steps 6"]) -> tuple[Any, ...]:
+        trajectory = nc.simulate(system, state, dt=dt, inputs=inputs)
+        return system.angular_momentum(trajectory)[:, 2], system.energy(trajectory).kinetic
+
+    steps = jnp.array([T_END / n for _, n in lanes])
+    results = jax.vmap(run)(steps, jnp.stack([drive(*lane) for lane in lanes]))
+    found = []
+    for (formula, n), momentum, energy in zip(lanes, *map(np.asarray, results)):
+        t = np.linspace(0.0, T_END, n + 1)
+        found.append(Comparison(formula, n, t, momentum[: n + 1], energy[: n + 1]))
+    return found

@@ -1,0 +1,130 @@
+"""Assembly of a state: positions and velocities projected onto the constraints."""
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from natcoord_jax.assembly.diagnostics import rows_with_ground
+from natcoord_jax.assembly.projection import Projection
+from natcoord_jax.assembly.system import System
+from natcoord_jax.core.effect import replace_fields
+from natcoord_jax.core.joint import frames_at
+from natcoord_jax.core.results import REASONS, Result, SimulationError
+from natcoord_jax.core.checks import is_concrete
+from natcoord_jax.core.state import State
+from natcoord_jax.maths.rotations import orthonormalise
+from natcoord_jax.stepping.factorise import dense_differentiable
+from natcoord_jax.stepping.newton import newton
+
+TOLERANCE = 1e-14
+"""Accuracy of the projection relative to the extent of the system."""
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _solve(make: Any, system: System, state: State) -> tuple[Array, Array]:
+    """Unknowns and result code of a projection, differentiated implicitly."""
+    solution = newton(make(system, state), TOLERANCE, form="full")
+    return solution.y, solution.code
+
+
+@_solve.defjvp
+def _solve_jvp(make: Any, primals: tuple, tangents: tuple):
+    y, code = _solve(make, *primals)
+    moved = jax.jvp(lambda *args: make(*args).residual(y)[0], primals, tangents)[1]
+    equations = make(*primals)
+    y_dot = -dense_differentiable(equations, equations.jacobian(y)).solve(moved)
+    return (y, code), (y_dot, jnp.zeros(code.shape, jax.dtypes.float0))
+
+
+def _coordinates(system: System, state: State) -> Array:
+    """Joint coordinates of the positions, each angle taken in the turn nearest to the stored one."""
+    rows = rows_with_ground(state.q)
+    coordinates = state.coordinates
+    for group in system.coordinates:
+        parent, child = frames_at_many(system, group.joints, rows)
+        value = jax.vmap(group.axis.value)(parent, child)
+        if group.axis.unit == "rad":
+            turns = jnp.round((coordinates[group.index] - value) / (2 * jnp.pi))
+            value = value + 2 * jnp.pi * turns
+        coordinates = coordinates.at[group.index].set(value)
+    return coordinates
+
+
+def frames_at_many(system: System, joints: Array, rows: Array):
+    """Frames of parent and child of several joints."""
+    return jax.vmap(frames_at)(system.frames[joints], rows[system.joint_bodies[joints]])
+
+
+@jax.jit
+def _assembled(system: System, state: State) -> tuple[State, Array]:
+    rows = state.q.reshape(-1, 4, 3)
+    squared = jnp.concatenate([rows[:, :1], orthonormalise(rows[:, 1:])], axis=1).reshape(-1, 3)
+    state = replace_fields(state, q=squared)
+    y, code = _solve(Projection.of_positions, system, state)
+    state = replace_fields(state, q=state.q + Projection.of_positions(system, state).moved(y))
+    state = replace_fields(state, coordinates=_coordinates(system, state))
+    w, rate_code = _solve(Projection.of_velocities, system, state)
+    state = replace_fields(state, v=Projection.of_velocities(system, state).moved(w))
+    return replace_fields(state, rates=_rotor_rates(system, state)), jnp.maximum(code, rate_code)
+
+
+def _rotor_rates(system: System, state: State) -> Array:
+    """Rates of the joint coordinates that carry rotors."""
+    rates = state.rates
+    rows, speeds = rows_with_ground(state.q), rows_with_ground(state.v).at[-1].set(0.0)
+    spin = 0.5 * jnp.sum(jnp.cross(rows[:, 1:], speeds[:, 1:]), axis=1)
+    every = jnp.zeros_like(state.coordinates)
+    for group in system.coordinates:
+        bodies = system.joint_bodies[group.joints]
+        parent, child = frames_at_many(system, group.joints, rows)
+        parent_rate, child_rate = frames_at_many(system, group.joints, speeds)
+        relative = spin[bodies[:, 1]] - spin[bodies[:, 0]]
+        values = jax.vmap(group.axis.rate)(parent, child, parent_rate, child_rate, relative)
+        every = every.at[group.index].set(values)
+    for group in system.effects:
+        if group.effect.rotors:
+            rates = rates.at[group.rotors[:, 0]].set(every[group.coordinates[:, 0]])
+    return rates
+
+
+def assemble(system: System, state: State) -> State:
+    """Project positions and velocities onto the constraints.
+
+    Directors are made orthonormal, positions move along the constraint normals, velocities are projected in
+    the metric of the mass, drives and relations between coordinates included; coordinates and rotor rates
+    follow. Pure, jittable and implicitly differentiable, with respect to the state and to every parameter
+    that moves geometry.
+
+    Args:
+        system: compiled system.
+        state: any state near an admissible one.
+
+    Returns:
+        The assembled state; where no admissible state is found, all NaN inside jit.
+
+    Raises:
+        SimulationError: in an eager call, if no admissible state is found nearby.
+
+    Example:
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import natcoord_jax as nc
+        >>> scene = nc.Scene()
+        >>> arm = scene.add(nc.RigidBody(mass=1.0, inertia=(1.0, 1.0, 1.0), angular_velocity=(0, 0, 1)))
+        >>> hinge = scene.add(nc.Revolute(nc.ground, arm, axis=(0, 0, 1)))
+        >>> system, state = scene.compile()
+        >>> state = nc.assemble(system, state)
+    """
+    assembled, code = _assembled(system, state)
+    if is_concrete(code):
+        result = Result(int(code))
+        if result != Result.SUCCESSFUL:
+            raise SimulationError(
+                f"no admissible state was found near this one ({REASONS[result]}); start closer to one",
+                result,
+                assembled,
+            )
+        return assembled
+    return jax.tree.map(lambda x: jnp.where(code == 0, x, jnp.nan), assembled)
