@@ -4,8 +4,6 @@ Positions: a step of unit size from rest, 2 M V = G(q_mid)^T lambda with g(q_0) 
 quadratic constraints is g(q_1) = 0. Velocities: a step of size zero, 2 M (V - v_0) = G^T lambda, G V = 0.
 """
 
-from typing import Self
-
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -38,7 +36,7 @@ class Projection(eqx.Module):
     extent: Float[Array, ""]
 
     @classmethod
-    def of_positions(cls, system: System, state: State) -> Self:
+    def of_positions(cls, system: System, state: State) -> "Projection":
         """Positions of `state` with orthonormal directors; its velocities play no part."""
         bare = constraints_only(system)
         resting = replace_fields(
@@ -53,7 +51,7 @@ class Projection(eqx.Module):
         return cls(step, jnp.concatenate(gaps) if gaps else jnp.zeros(0), extent)
 
     @classmethod
-    def of_velocities(cls, system: System, state: State) -> Self:
+    def of_velocities(cls, system: System, state: State) -> "Projection":
         """Velocities of `state` at its positions."""
         bare = constraints_only(system)
         inputs = jnp.zeros(len(system.structure.inputs))

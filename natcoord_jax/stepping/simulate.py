@@ -291,7 +291,9 @@ def step(
     return jax.tree.map(lambda x: jnp.where(code == 0, x, jnp.nan), after)
 
 
-def linearise(system: System, state: State, u: Any = None, dt: Any = None) -> tuple[State, Array]:
+def linearise(
+    system: System, state: State, u: Any = None, dt: Any = None
+) -> tuple[Float[Array, "n n"], Float[Array, "n inputs"]]:
     """Derivatives of one step with respect to state and inputs.
 
     Args:
