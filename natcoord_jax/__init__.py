@@ -1,18 +1,115 @@
 """natcoord_jax: differentiable simulation of flexible multibody systems in natural coordinates."""
 
-from natcoord_jax.bodies import (
-    Box as Box, Cylinder as Cylinder, Ellipsoid as Ellipsoid, PointMass as PointMass, RigidBody as RigidBody,
-    Sphere as Sphere,
+from typing import TYPE_CHECKING, Any
+
+from natcoord_jax.analysis import Balance, balance
+from natcoord_jax.assembly.system import System
+from natcoord_jax.bodies import Box, Cylinder, Ellipsoid, PointMass, RigidBody, Sphere
+from natcoord_jax.core.force import Field, Force, Load
+from natcoord_jax.core.handles import ground
+from natcoord_jax.core.joint import Frame, Joint
+from natcoord_jax.core.markers import Direction, Point
+from natcoord_jax.core.potential import Potential
+from natcoord_jax.core.results import Result, SimulationError
+from natcoord_jax.core.state import State, Trajectory
+from natcoord_jax.effects.actuators import BodyForceInput, BodyTorqueInput, JointForce, JointTorque
+from natcoord_jax.effects.joints import (
+    Coupling,
+    Cylindrical,
+    Distance,
+    Drive,
+    Fixed,
+    Planar,
+    Prismatic,
+    Revolute,
+    Screw,
+    Spherical,
+    Universal,
 )
-from natcoord_jax.core.force import Field as Field, Force as Force, Load as Load
-from natcoord_jax.core.handles import ground as ground
-from natcoord_jax.core.joint import Joint as Joint
-from natcoord_jax.core.markers import Direction as Direction, Point as Point
-from natcoord_jax.core.potential import Potential as Potential
-from natcoord_jax.effects.actuators import *
-from natcoord_jax.effects.joints import *
-from natcoord_jax.effects.loads import *
-from natcoord_jax.effects.springs import *
-from natcoord_jax.scene import Scene as Scene
-from natcoord_jax.stepping.assemble import assemble as assemble
-from natcoord_jax.stepping.simulate import linearise as linearise, simulate as simulate, step as step
+from natcoord_jax.effects.loads import BodyTorque, Gravity, PairTorque, PointForce
+from natcoord_jax.effects.springs import (
+    Armature,
+    Damper,
+    JointDamper,
+    JointPotential,
+    JointSpring,
+    JointStops,
+    NonlinearSpring,
+    QuadraticSpring,
+    Spring,
+)
+from natcoord_jax.scene import Scene
+from natcoord_jax.stepping.assemble import assemble
+from natcoord_jax.stepping.simulate import linearise, simulate, step
+
+if TYPE_CHECKING:
+    from natcoord_jax.viz import animate, plot
+
+__all__ = [
+    "Armature",
+    "Balance",
+    "BodyForceInput",
+    "BodyTorque",
+    "BodyTorqueInput",
+    "Box",
+    "Coupling",
+    "Cylinder",
+    "Cylindrical",
+    "Damper",
+    "Direction",
+    "Distance",
+    "Drive",
+    "Ellipsoid",
+    "Field",
+    "Fixed",
+    "Force",
+    "Frame",
+    "Gravity",
+    "Joint",
+    "JointDamper",
+    "JointForce",
+    "JointPotential",
+    "JointSpring",
+    "JointStops",
+    "JointTorque",
+    "Load",
+    "NonlinearSpring",
+    "PairTorque",
+    "Planar",
+    "Point",
+    "PointForce",
+    "PointMass",
+    "Potential",
+    "Prismatic",
+    "QuadraticSpring",
+    "Result",
+    "Revolute",
+    "RigidBody",
+    "Scene",
+    "Screw",
+    "SimulationError",
+    "Sphere",
+    "Spherical",
+    "Spring",
+    "State",
+    "System",
+    "Trajectory",
+    "Universal",
+    "animate",
+    "assemble",
+    "balance",
+    "ground",
+    "linearise",
+    "plot",
+    "simulate",
+    "step",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """Pictures are loaded when first asked for, and matplotlib with them."""
+    if name in ("animate", "plot"):
+        from natcoord_jax import viz
+
+        return getattr(viz, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,22 +1,30 @@
 """The scene: bodies, joints and effects by name, and their compilation to a system and a state."""
 
+import dataclasses
 import itertools
+import warnings
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
 from natcoord_jax.assembly.build import build
 from natcoord_jax.assembly.system import System
 from natcoord_jax.core.bodies import Body
-from natcoord_jax.core.checks import numbers, require_double
-from natcoord_jax.core.effect import Effect
+from natcoord_jax.core.checks import is_concrete, numbers, require_double
+from natcoord_jax.core.effect import Effect, replace_fields
 from natcoord_jax.core.handles import Handle, ground
 from natcoord_jax.core.joint import Joint
 from natcoord_jax.core.state import State
+from natcoord_jax.stepping.admissibility import (
+    check_gaps,
+    check_inertia,
+    find_redundancy,
+    project_velocities,
+)
+from natcoord_jax.stepping.assemble import assemble as assemble_state
 
 _scene_numbers = itertools.count(1)
 
@@ -136,5 +144,38 @@ class Scene:
         """
         if not self.bodies:
             raise ValueError("the scene has no bodies; add one before compiling")
+        if solver not in (None, "reduced", "recursive", "full"):
+            raise ValueError(f'solver is {solver!r}; pass "reduced", "recursive", "full" or None')
         system, state = build(self.bodies, self.joints, self.effects, solver)
-        return system, state
+        if assemble:
+            state = assemble_state(system, state)
+        if not is_concrete(system, state):
+            return system, state
+        check_inertia(system, state)
+        if not assemble:
+            check_gaps(system, state)
+            state = project_velocities(system, state)
+        rank, redundant = find_redundancy(system, state)
+        notes = size_notes(system)
+        for note in notes:
+            warnings.warn(note, stacklevel=2)
+        structure = dataclasses.replace(
+            system.structure, dofs=system.structure.unknowns - rank, redundant=redundant, notes=notes
+        )
+        return replace_fields(system, structure=structure), state
+
+
+DENSE_LIMIT = 300
+"""Unknowns beyond which a dense solution is worth a warning."""
+
+
+def size_notes(system: System) -> tuple[str, ...]:
+    """Warnings about the cost of a system."""
+    structure = system.structure
+    unknowns = 6 * len(structure.bodies) + sum(g.count * g.multipliers for g in system.joints)
+    if structure.solver == "full" and unknowns > DENSE_LIMIT:
+        return (
+            f"{unknowns} unknowns in loops or couplings across the tree are solved densely: time per step "
+            "grows with the third power of their number",
+        )
+    return ()

@@ -23,9 +23,9 @@ from natcoord_jax.core.state import State, Trajectory
 from natcoord_jax.maths.collocation import gauss
 from natcoord_jax.maths.vectors import cross
 
-REACTION_FREE = 1e-16
-"""A rigid motion counts as free of reactions when their mean square power is below this share (1e-8 in
-amplitude: far above round-off, far below any real constraint)."""
+REACTION_FREE = 1e-12
+"""A rigid motion counts as free of reactions when their mean square power is below this share: far above the
+round-off of the eigenvalues, and with 1e-6 in amplitude far below any real constraint."""
 
 
 class Balance(eqx.Module):
@@ -63,7 +63,7 @@ def _midpoint(before: State, after: State, h: Array) -> Stations:
 
 
 def _resultants(bodies: int, group: Group, motion: Motion, answer: Response) -> Float[Array, "n 6"]:
-    """Force and torque about the origin that each instance of a group puts on the bodies; not on the ground."""
+    """Force and torque about the origin that each instance of a group puts on the bodies (not the ground)."""
     moving = (group.bodies < bodies)[..., None]
     forces = answer.forces[:, 0]
     turning = jnp.sum(cross(motion.rows[0], forces), axis=2) + answer.torques[:, 0]
@@ -138,8 +138,8 @@ def balance(system: System, trajectory: Trajectory) -> Balance:
 
     Returns:
         The relative errors; see `Balance` for their scales. Momenta are left out, with a note, where the
-        trajectory does not hold every step (`save_every`, steps repeated in substeps): their impulses are then
-        unknown.
+        trajectory does not hold every step (`save_every`, steps repeated in substeps) and impulses act,
+        because these are then unknown.
 
     Raises:
         ValueError: for a trajectory of a batch.
@@ -155,7 +155,7 @@ def balance(system: System, trajectory: Trajectory) -> Balance:
         (3, True)
     """
     if trajectory.t.ndim != 1:
-        raise ValueError(f"balance takes one lane, not a batch of shape {trajectory.t.shape[:-1]}; use a loop")
+        raise ValueError(f"balance takes one lane, not a batch of shape {trajectory.t.shape[:-1]}")
     saved = trajectory.t.shape[0]
     if saved == 1:
         return Balance(np.zeros(1), np.zeros(1), np.zeros(1), 3, 3, "no step was made")

@@ -18,6 +18,7 @@ from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.joint import Joint, frames_at
 from natcoord_jax.core.markers import Marker
 from natcoord_jax.core.state import State
+from natcoord_jax.assembly.tree import Tree
 from natcoord_jax.maths.rotations import frame_from_axis
 
 JOINT_FIELDS = ("parent", "child", "point", "axis", "second", "name", "parent_point")
@@ -238,6 +239,41 @@ class Layout:
         )
 
 
+REDUCED_LIMIT = 32
+"""Unknowns up to which a tree is solved densely in one piece."""
+
+LOOP_LIMIT = 40
+"""Unknowns up to which a system with loops is solved in the joint null space."""
+
+DEPTH_LIMIT = 12
+"""Levels of the tree up to which its sweeps are unrolled."""
+
+
+def adjacent(group: Group, parent: np.ndarray) -> bool:
+    """Whether a group couples at most a body with its parent in the tree (the ground aside)."""
+    for members in group.bodies:
+        real = sorted({int(b) for b in members if b < len(parent)})
+        if len(real) > 2:
+            return False
+        if len(real) == 2 and parent[real[1]] != real[0] and parent[real[0]] != real[1]:
+            return False
+    return True
+
+
+def choose_solver(
+    tree: Tree, multipliers: int, joints: tuple[Group, ...], effects: tuple[Group, ...], bodies: int
+) -> str:
+    """Form of the equations: small systems reduced, large trees recursive, everything else full."""
+    unknowns, depth = len(tree.slot_of), len(tree.levels)
+    if unknowns + multipliers <= REDUCED_LIMIT and depth <= DEPTH_LIMIT:
+        return "reduced"
+    parent = np.asarray(tree.parent)
+    open_tree = multipliers == 0 and all(g.in_tree for g in joints)
+    if open_tree and all(adjacent(g, parent) for g in effects):
+        return "recursive"
+    return "reduced" if unknowns + multipliers <= LOOP_LIMIT and depth <= DEPTH_LIMIT else "full"
+
+
 def build(
     bodies: dict[str, Body], joints: dict[str, Joint], effects: dict[str, Effect], solver: str | None
 ) -> tuple[System, State]:
@@ -261,10 +297,9 @@ def build(
         rotors=len(layout.rotors),
         unknowns=len(tree.slot_of),
         multipliers=multipliers,
-        solver=solver or "reduced",
+        solver=solver or choose_solver(tree, multipliers, joint_groups, groups, len(bodies)),
         constraints=internal + relations + sum(g.count * g.multipliers for g in joint_groups),
-        redundant=0,
-        notes=(),
+        dofs=len(tree.slot_of) - multipliers,
     )
     system = System(
         jnp.stack([b.mass_block for b in layout.ordered_bodies()]),

@@ -154,9 +154,9 @@ class FullStep(eqx.Module):
         twists = jnp.broadcast_to(twist, (self.bodies, self.tableau.stages, 6)).reshape(-1)
         return jnp.concatenate([twists, jnp.zeros(self.unknowns - self.balances, twists.dtype)])
 
-    def approximate(self, y: Float[Array, " unknowns"]) -> Float[Array, "unknowns unknowns"]:
-        """Matrix for the first iterations: the exact Jacobian at the guess."""
-        return self.jacobian(y)
+    def approximate(self) -> None:
+        """No cheaper matrix than the Jacobian."""
+        return None
 
     def end_motion(self, y: Float[Array, " unknowns"]) -> tuple[Stations, list[Array]]:
         """Stage motion of all bodies and the multipliers, for the end of the step."""

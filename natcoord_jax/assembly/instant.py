@@ -1,35 +1,27 @@
-"""The equations of motion at one instant (2): accelerations, reactions and multipliers of a state.
+"""Accelerations and reactions of a state: the solution of the equations of motion at one instant.
 
-Unknowns are the rates w' of the tree's free motions and the multipliers of loops and relations, with
-row velocities V = P(q) w and their constraints c(q, w, t) = 0:
-
-    P^T [M (P w)' - F - (dc/dV)^T lambda] = 0,    c' = 0.
-
-Effects are asked what they do in a step of length zero. Reactions of the tree's joints are what the
-balance of each subtree leaves to its joint. Velocities are first projected on the constraints, which the
-energy-momentum step keeps in position only.
+Redundant joints and relations are allowed: accelerations do not depend on how they share the load, and
+of all possible reactions those with the least sum of squares of forces and torques are taken. Velocities
+are projected on the constraints first, because the energy-momentum step keeps them in position only.
 """
+
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from natcoord_jax.assembly.coordinates import coordinate_rates
-from natcoord_jax.assembly.diagnostics import rows_with_ground, states_of
-from natcoord_jax.assembly.reduced import inertia, wrench
-from natcoord_jax.assembly.redundant import least_reactions
-from natcoord_jax.assembly.response import gather, no_multipliers, respond, situation, stations
-from natcoord_jax.assembly.system import Group, System
-from natcoord_jax.assembly.tree import JointGeometry, gather_slots, joint_rates, project, sweep_motion, tangent
-from natcoord_jax.core.joint import frames_at
+from natcoord_jax.assembly.balances import Balances, Gains, loads
+from natcoord_jax.assembly.diagnostics import states_of
+from natcoord_jax.assembly.rates import Twists, tree_rates
+from natcoord_jax.assembly.system import System
 from natcoord_jax.core.state import State, Trajectory
-from natcoord_jax.maths.collocation import gauss
-from natcoord_jax.maths.rotations import angular_velocity
-from natcoord_jax.maths.vectors import cross
 
-Twists = tuple[Float[Array, "bodies 3"], Float[Array, "bodies 3"]]
-"""Velocities of the reference points [m/s] and angular velocities [rad/s]; or forces [N] and torques [N m]."""
+SHIFT = 1e-7
+"""Regularisation of redundant constraints, relative; refined away: `ROUNDS` corrections leave
+(SHIFT / relative compliance)^ROUNDS of it, and round-off amplified by 1/SHIFT in the shares of the load."""
+ROUNDS = 6
 
 
 class Instant(eqx.Module):
@@ -37,10 +29,11 @@ class Instant(eqx.Module):
 
     Attributes:
         accelerations: second time derivatives of the rows [m/s^2 for points, 1/s^2 for directors].
-        forces: reaction force of each joint on its child [N], world components.
-        torques: reaction torque of each joint on its child about the joint's point on the child [N m].
-        multipliers: generalised forces of relations between coordinates [N m or N] and multipliers of the
-            joints that close loops, by name.
+        forces: force of each joint on its child [N], world components, in the order of
+            `system.structure.joints`.
+        torques: torque of each joint on its child about the joint's point on the child [N m].
+        multipliers: of relations between coordinates (generalised force [N m or N]) and of joints that
+            close loops, by name.
     """
 
     accelerations: Float[Array, "*t rows 3"]
@@ -49,150 +42,181 @@ class Instant(eqx.Module):
     multipliers: dict[str, Float[Array, "*t m"]]
 
 
-def geometry_at(system: System, rows: Float[Array, "bodies 4 3"]) -> list[JointGeometry]:
-    """Axes and arms of the tree's joints at given rows."""
-    slots = gather_slots(system.tree, jnp.zeros((1, system.structure.unknowns), rows.dtype))
-    frames = system.tree.frames(system.frames)
-    return sweep_motion(system.tree, frames, rows, slots, jnp.zeros((), rows.dtype), gauss(1))[1]
+class Saddle(eqx.Module):
+    """[[A, -C^T], [C, 0]] with redundant rows of C, solved for least reactions.
 
-
-def twists(system: System, rows: Float[Array, "bodies 4 3"], w: Float[Array, " unknowns"]) -> Twists:
-    """Velocities and angular velocities of all bodies from the rates of the tree's free motions."""
-    velocity, spin = tangent(system.tree, geometry_at(system, rows), gather_slots(system.tree, w[None]))
-    return velocity[0], spin[0]
-
-
-def tree_rates(system: System, state: State) -> Float[Array, " unknowns"]:
-    """Rates of the tree's free motions of a state."""
-    rows, rates = state.q.reshape(-1, 4, 3), state.v.reshape(-1, 4, 3)
-    spin = angular_velocity(rows[:, 1:], rates[:, 1:])
-    return joint_rates(system.tree, geometry_at(system, rows), rates[None, :, 0], spin[None])[0]
-
-
-def row_rates(rows: Float[Array, "bodies 4 3"], velocity: Array, spin: Array) -> Float[Array, "bodies 4 3"]:
-    """Velocities of the rows of bodies with given velocities and angular velocities."""
-    return jnp.concatenate([velocity[:, None], cross(spin[:, None], rows[:, 1:])], axis=1)
-
-
-def _with_ground(x: Float[Array, "bodies *k"]) -> Float[Array, "bodies_and_ground *k"]:
-    return jnp.concatenate([x, jnp.zeros_like(x[:1])])
-
-
-class Equations(eqx.Module):
-    """The equations of one instant: applied loads, inertia and constraints as functions of the unknowns.
+    A is completed by C^T C, which changes no solution, so that bodies without inertia along a motion that
+    only loops forbid do no harm.
 
     Attributes:
-        rows: rows of the bodies, with the ground last.
-        applied: forces and torques of the effects about the reference points.
+        matrix: A + weight C^T C.
+        rows: C.
+        weight: [kg].
+        spread: (A + weight C^T C)^-1 C^T.
+        compliance: C (A + weight C^T C)^-1 C^T.
+        metric: what measures reactions.
+        shift: of the compliance, times the metric.
     """
 
-    system: System
-    rows: Float[Array, "bodies_and_ground 4 3"]
-    w: Float[Array, " unknowns"]
-    t: Float[Array, ""]
+    matrix: Float[Array, "n n"]
+    rows: Float[Array, "m n"]
+    weight: Float[Array, ""]
+    spread: Float[Array, "n m"]
+    compliance: Float[Array, "m m"]
+    metric: Float[Array, "m m"]
+    shift: Float[Array, ""]
 
-    @property
-    def relations(self) -> list[Group]:
-        """Relations between joint coordinates, the first of the constraints."""
-        return [g for g in self.system.effects if g.multipliers]
+    @classmethod
+    def of(cls, inertia: Array, rows: Array, metric: Array, weight: Array) -> "Saddle":
+        """From A, C, the metric of the reactions and the mass of a typical body [kg]."""
+        matrix = inertia + weight * rows.T @ rows
+        spread = jnp.linalg.solve(matrix, rows.T) if matrix.size else rows.T
+        return cls(matrix, rows, weight, spread, rows @ spread, metric, SHIFT / weight)
 
-    @property
-    def loops(self) -> list[Group]:
-        """Joints that close loops."""
-        return [g for g in self.system.joints if not g.in_tree]
+    def shares(self, right: Float[Array, " m"], pull: Float[Array, " m"]) -> Float[Array, " m"]:
+        """Multipliers with S lambda = right that minimise lambda H lambda / 2 + pull lambda."""
+        inverse = jnp.linalg.inv(self.compliance + self.shift * self.metric)
+        lam = inverse @ (right - self.shift * pull)
+        for _ in range(ROUNDS):
+            lam = lam + inverse @ (right - self.compliance @ lam)
+        return lam
 
-    def constraint_rates(self, rows: Array, velocity: Array, spin: Array, t: Array) -> Float[Array, " m"]:
-        """Rates c of relations and loops; affine in the velocities."""
-        extended = rows_with_ground(rows.reshape(-1, 3))
-        moving = _with_ground(row_rates(rows, velocity, spin))
-        along = coordinate_rates(self.system, extended, moving, _with_ground(spin))
-        found = [jnp.zeros(0, rows.dtype)]
-        for group in self.relations:
+    def solve(self, force: Float[Array, " n"], rates: Float[Array, " m"]) -> tuple[Array, Array]:
+        """x with A x - C^T lambda = force, C x = rates, and S lambda = right for the right-hand side."""
+        free = force + self.weight * self.rows.T @ rates
+        x = jnp.linalg.solve(self.matrix, free) if self.matrix.size else free
+        right = rates - self.rows @ x
+        return x + self.spread @ self.shares(right, jnp.zeros_like(right)), right
 
-            def one(effect, index, along=along):
-                wanted = jax.jvp(effect.target, (t,), (jnp.ones_like(t),))[1]
-                return effect.coefficients() @ along[index] - wanted
 
-            found.append(jax.vmap(one)(group.effect, group.coordinates))
-        for group in self.loops:
-            pair = group.bodies
-            frames = self.system.frames[group.joints[:, 0]]
-            rate = jax.vmap(_joint_rate)(group.effect, frames, extended[pair], moving[pair])
-            found.append(rate.reshape(-1))
-        return jnp.concatenate(found)
+def scales(system: System) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Mass of a typical body [kg], and its squared radius of gyration [m^2] (1 for point masses)."""
+    masses = system.mass[:, 0, 0]
+    moment = jnp.sum(jnp.trace(system.mass[:, 1:, 1:], axis1=1, axis2=2))
+    radius = moment / jnp.sum(masses)
+    return jnp.mean(masses), jnp.where(radius > 0, radius, 1.0)
 
-    def rotor_rates(self, rows: Array, velocity: Array, spin: Array) -> tuple[Array, Array]:
-        """Rates of the coordinates that carry rotors, and the rotors' inertias."""
-        groups = [g for g in self.system.effects if g.effect.rotors]
-        moving = _with_ground(row_rates(rows, velocity, spin))
-        extended = rows_with_ground(rows.reshape(-1, 3))
-        along = coordinate_rates(self.system, extended, moving, _with_ground(spin))
-        rates = jnp.concatenate([along[g.coordinates[:, 0]] for g in groups])
-        return rates, jnp.concatenate([jax.vmap(lambda e: e.inertia_of())(g.effect) for g in groups])
 
-    def _along(self, function, w_dot: Array) -> tuple[Array, Array]:
-        """Value and time derivative of a function of rows, velocities, spins and time along the motion."""
-        bodies = self.rows[:-1]
+def _accelerated(balances: Balances, columns: Gains, applied: Twists, bias: Gains) -> tuple[Array, Array]:
+    """Matrix and right-hand side P^T (F - M bias) of the balances."""
+    matrix = jax.vmap(lambda gains: balances.project(*balances.inertial(gains))[0])(columns).T
+    force, torque = balances.inertial(bias)
+    return matrix, balances.project(applied[0] - force, applied[1] - torque)[0]
 
-        def composed(rows, w, t):
-            return function(rows, *twists(self.system, rows, w), t)
 
-        moving = row_rates(bodies, *twists(self.system, bodies, self.w))
-        unit = jnp.ones_like(self.t)
-        return jax.jvp(composed, (bodies, self.w, self.t), (moving, w_dot, unit))
+def _combined(bias: Gains, columns: Gains, w_dot: Array) -> Gains:
+    return jax.tree.map(lambda b, c: b + jnp.tensordot(w_dot, c, 1), bias, columns)
 
-    def accelerations(self, w_dot: Float[Array, " unknowns"]) -> Float[Array, "bodies 4 3"]:
-        """Accelerations of the rows."""
-        return self._along(lambda rows, velocity, spin, t: row_rates(rows, velocity, spin), w_dot)[1]
 
-    def inertial(self, w_dot: Float[Array, " unknowns"]) -> Twists:
-        """Forces and torques that accelerate bodies and rotors."""
-        rows = self.rows[None, :-1]
-        force, torque = wrench(
-            inertia(self.system.mass, self.accelerations(w_dot))[None], rows[:, :, 1:]
+def _reactions(balances: Balances, gains: Gains, applied: Twists, lam: Array) -> Twists:
+    pulled = balances.constrained(lam) if lam.size else (0.0, 0.0)
+    force, torque = (a - b - c for a, b, c in zip(balances.inertial(gains), applied, pulled))
+    return balances.reactions(force, torque, lam)
+
+
+def _measured(balances: Balances, radius: Array, gains: Gains, applied: Twists, lam: Array) -> Array:
+    """All reactions as one vector [N], torques divided by the radius of gyration."""
+    forces, torques = _reactions(balances, gains, applied, lam)
+    related = lam[: sum(g.count for g in balances.relations)]
+    scale = jnp.sqrt(radius)
+    return jnp.concatenate([forces.reshape(-1), torques.reshape(-1) / scale, related / scale])
+
+
+def _with_constraints(
+    system: System, state: State, u: Array, balances: Balances, w: Array
+) -> tuple[Gains, Twists, Array]:
+    """Accelerations, loads and multipliers of a system with relations or loops."""
+    mass, radius = scales(system)
+    columns = balances.columns()
+    nothing = jax.tree.map(lambda x: jnp.zeros_like(x[0]), columns)
+    still = jnp.zeros_like(balances.rows[:, 0])
+    lam0 = nothing.constraints
+    matrix, zero = _accelerated(balances, columns, (still, still), nothing)
+    share = jax.jacfwd(lambda lam: _measured(balances, radius, nothing, (still, still), lam))(lam0)
+    saddle = Saddle.of(matrix, columns.constraints.T, share.T @ share, mass)
+    violation = balances.rates(balances.rows, *balances.twists(w), state.t).constraints
+    w = w + saddle.solve(zero, -violation)[0]
+    applied = loads(system, state, u, *balances.twists(w))
+    bias = balances.bias(w)
+    free = _accelerated(balances, columns, applied, bias)[1]
+    w_dot, right = saddle.solve(free, -bias.constraints)
+    gains = _combined(bias, columns, w_dot)
+    pull = share.T @ _measured(balances, radius, gains, applied, lam0)
+    return gains, applied, saddle.shares(right, pull)
+
+
+def _without_constraints(
+    system: System, state: State, u: Array, balances: Balances, w: Array
+) -> tuple[Gains, Twists, Array]:
+    """Accelerations, loads and no multipliers of a tree."""
+    applied = loads(system, state, u, *balances.twists(w))
+    bias = balances.bias(w)
+    if w.size:
+        columns = balances.columns()
+        matrix, right = _accelerated(balances, columns, applied, bias)
+        bias = _combined(bias, columns, jnp.linalg.solve(matrix, right))
+    return bias, applied, bias.constraints
+
+
+def _named(balances: Balances, lam: Array) -> dict[str, Array]:
+    found, position = {}, 0
+    for group in (*balances.relations, *balances.loops):
+        for name in group.names:
+            found[name] = lam[position : position + group.multipliers]
+            position += group.multipliers
+    return found
+
+
+def instant_of(system: System, state: State, u: Float[Array, " inputs"]) -> Instant:
+    """Accelerations and reactions of one state."""
+    balances = Balances.at(system, state)
+    w = tree_rates(system, balances.geometry, state)
+    solve = _with_constraints if balances.relations or balances.loops else _without_constraints
+    gains, applied, lam = solve(system, state, u, balances, w)
+    forces, torques = _reactions(balances, gains, applied, lam)
+    return Instant(gains.rows.reshape(-1, 3), forces, torques, _named(balances, lam))
+
+
+def inputs_along(system: System, motion: State | Trajectory, inputs: Any) -> Float[Array, "*t inputs"]:
+    """Inputs at every state: given ones, those of the steps that start there, or zero.
+
+    Raises:
+        ValueError: for a wrong shape.
+    """
+    states = states_of(motion)
+    count, leading = len(system.structure.inputs), states.t.shape
+    if inputs is None and isinstance(motion, Trajectory):
+        inputs = jnp.concatenate([motion.inputs, motion.inputs[..., -1:, :]], axis=-2)
+    given = jnp.zeros(count) if inputs is None else jnp.asarray(inputs, float)
+    if given.shape[-1:] != (count,) or given.shape[:-1] not in ((), leading):
+        raise ValueError(
+            f"inputs has shape {given.shape}; this system has the input channels "
+            f"{list(system.structure.inputs)}: pass shape {(count,)} or {(*leading, count)}"
         )
-        force, torque = force[0], torque[0]
-        if self.system.structure.rotors:
-
-            def rates(velocity, spin):
-                return self.rotor_rates(self.rows[:-1], velocity, spin)
-
-            gained = self._along(lambda rows, velocity, spin, t: self.rotor_rates(rows, velocity, spin)[0], w_dot)
-            _, inertias = rates(force, torque)
-            pull = jax.vjp(lambda *x: rates(*x)[0], force, torque)[1](inertias * gained[1])
-            force, torque = force + pull[0], torque + pull[1]
-        return force, torque
-
-    def constraint_accelerations(self, w_dot: Float[Array, " unknowns"]) -> Float[Array, " m"]:
-        """Time derivatives c' of the constraint rates."""
-        return self._along(self.constraint_rates, w_dot)[1]
-
-    def constrained(self, lam: Float[Array, " m"]) -> Twists:
-        """Forces and torques of relations and loops on the bodies."""
-        still = jnp.zeros_like(self.rows[:-1, 0])
-
-        def rates(velocity, spin):
-            return self.constraint_rates(self.rows[:-1], velocity, spin, self.t)
-
-        return jax.vjp(rates, still, still)[1](lam)
+    return jnp.broadcast_to(given, (*leading, count))
 
 
-def _joint_rate(effect, frames: Array, rows: Float[Array, "2 4 3"], rates: Float[Array, "2 4 3"]) -> Array:
-    return jax.jvp(lambda x: effect.residual(*frames_at(frames, x)), (rows,), (rates,))[1]
+@eqx.filter_jit
+def _instants(system: System, states: State, inputs: Array) -> Instant:
+    def function(state, u):
+        return instant_of(system, state, u)
+
+    for _ in range(states.t.ndim):
+        function = jax.vmap(function)
+    return function(states, inputs)
 
 
-def _loads(system: System, state: State, u: Array, velocity: Array, spin: Array) -> Twists:
-    """Forces and torques of all effects but rotors and relations, in a step of length zero."""
-    rows, tableau = state.q.reshape(-1, 4, 3), gauss(1)
-    at = stations(rows, rows[None, :, 0], rows[None, :, 1:], velocity[None], spin[None])
-    on_rows = jnp.zeros((rows.shape[0] + 1, 4, 3), rows.dtype)
-    torques = jnp.zeros((rows.shape[0] + 1, 3), rows.dtype)
-    for group in system.effects:
-        if not group.effect.impulsive:
-            where = situation(system, group, state, u, jnp.zeros((), rows.dtype))
-            lam = no_multipliers(group, tableau, rows.dtype)
-            answer = respond(group, where, gather(group, at), lam, tableau)
-            on_rows = on_rows.at[group.bodies].add(answer.forces[:, 0])
-            torques = torques.at[group.bodies].add(answer.torques[:, 0])
-    force, torque = wrench(on_rows[None, :-1], rows[None, :, 1:])
-    return force[0], torque[0] + torques[:-1]
+def instant(system: System, motion: State | Trajectory, inputs: Any = None) -> Instant:
+    """Accelerations and reactions of a state, or of all states of a trajectory.
+
+    Args:
+        system: compiled system.
+        motion: state or trajectory, with any leading axes.
+        inputs: shape (inputs,) or (*leading, inputs) [N, N m]. Default: of a trajectory, at every saved
+            state those of the step that starts there (with `save_every`, of the last step of the interval
+            that starts there), and at the last state those of the last step; of a state, zero.
+
+    Raises:
+        ValueError: for a wrong shape of the inputs.
+    """
+    return _instants(system, states_of(motion), inputs_along(system, motion, inputs))

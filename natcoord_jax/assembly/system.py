@@ -1,6 +1,7 @@
 """The compiled system: arrays as leaves, structure static and hashable."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -10,6 +11,7 @@ from natcoord_jax.assembly.tree import Tree
 from natcoord_jax.core.coordinate import Coordinate
 from natcoord_jax.core.effect import Effect
 from natcoord_jax.core.handles import Handle
+from natcoord_jax.core.markers import Marker
 from natcoord_jax.core.state import State, Trajectory
 
 
@@ -72,7 +74,9 @@ class Structure:
         unknowns: number of tree unknowns (degrees of freedom of the spanning tree).
         multipliers: number of Lagrange multipliers that are solved for.
         solver: "reduced", "recursive" or "full".
-        adjacent: whether all couplings are between a body and its parent, or a single body.
+        constraints: number of constraints, internal ones of rigid bodies included.
+        dofs: degrees of freedom: unknowns less the structural rank of the remaining constraints.
+        redundant: names of joints and relations whose constraints depend on the others.
         notes: findings of the compilation for the report.
     """
 
@@ -86,8 +90,9 @@ class Structure:
     multipliers: int
     solver: str
     constraints: int
-    redundant: int
-    notes: tuple[str, ...]
+    dofs: int = field(default=0, compare=False)
+    redundant: tuple[str, ...] = field(default=(), compare=False)
+    notes: tuple[str, ...] = field(default=(), compare=False)
 
 
 class System(eqx.Module):
@@ -134,6 +139,96 @@ class System(eqx.Module):
         states = diagnostics.states_of(motion)
         return {name: states.work[..., k] for k, name in enumerate(self.structure.works)}
 
+    def instant(self, motion: State | Trajectory, inputs: Any = None) -> "instant.Instant":
+        """Accelerations and reactions from the equations of motion at one instant, or along a trajectory.
+
+        Args:
+            motion: state or trajectory, with any leading axes.
+            inputs: shape (inputs,) or (*leading, inputs) [N, N m]. Default: of a trajectory, at every saved
+                state those of the step that starts there (with `save_every`, of the last step of the
+                interval that starts there), and at the last state those of the last step; of a state, zero.
+
+        Raises:
+            ValueError: for a wrong shape of the inputs.
+        """
+        return instant.instant(self, motion, inputs)
+
+    def sense(
+        self,
+        motion: State | Trajectory,
+        part: Handle | Marker | str,
+        *,
+        inputs: Any = None,
+        state: State | None = None,
+    ) -> Any:
+        """Sensor of a body, a joint or a marker.
+
+        Args:
+            motion: state or trajectory, with any leading axes.
+            part: handle or name of a body (gives a `BodySensor`: position, rotation, quaternion, velocity,
+                angular_velocity, com, ...) or joint (`JointSensor`: angle, displacement, coordinates, rates,
+                force, torque), or a point or direction (`MarkerSensor`: position, velocity, acceleration).
+            inputs: for accelerations and reactions, as in `instant`.
+            state: the assembled pose that a marker in world coordinates refers to.
+
+        Raises:
+            ValueError: for a part that is not in the system, or a marker in world coordinates without `state`.
+
+        Example:
+            >>> import jax; jax.config.update("jax_enable_x64", True)
+            >>> import natcoord_jax as nc
+            >>> scene = nc.Scene()
+            >>> arm = scene.add(nc.RigidBody(mass=2.0, inertia=(1.0, 1.0, 1.0), com=(1.0, 0.0, 0.0)))
+            >>> hinge = scene.add(nc.Revolute(nc.ground, arm, axis=(0, 1, 0)))
+            >>> gravity = scene.add(nc.Gravity(vector=(0.0, 0.0, -9.0)))
+            >>> system, state = scene.compile()
+            >>> float(system.sense(state, hinge).angle)
+            0.0
+            >>> float(system.sense(state, hinge).force[2].round(9))
+            6.0
+        """
+        return sensors.sense(self, motion, part, inputs=inputs, state=state)
+
+    def coordinate(
+        self, motion: State | Trajectory, joint: Handle | str, index: int = 0
+    ) -> Float[Array, "*t"]:
+        """Coordinate number `index` of a joint [rad, counted on over many turns, or m].
+
+        Raises:
+            ValueError: for a joint that is not in the system or has no such coordinate.
+        """
+        return posing.coordinate(self, motion, joint, index)
+
+    def rate(self, motion: State | Trajectory, joint: Handle | str, index: int = 0) -> Float[Array, "*t"]:
+        """Rate of coordinate number `index` of a joint [rad/s or m/s].
+
+        Raises:
+            ValueError: for a joint that is not in the system or has no such coordinate.
+        """
+        return posing.rate(self, motion, joint, index)
+
+    def with_coordinate(
+        self, state: State, joint: Handle | str, value: Any, *, rate: Any = None, index: int = 0
+    ) -> State:
+        """State with one joint coordinate set, and on request its rate.
+
+        Everything that hangs on the joint is turned or moved along rigidly and keeps its motion relative to
+        the joint; the coordinate counts on, so that 4 pi are two turns. A relation among the coordinates of
+        the joint (the pitch of a screw) is kept; loops, drives and couplings of several joints are not: use
+        `nc.assemble` afterwards where there are any. Pure, jittable and differentiable.
+
+        Args:
+            state: one state.
+            joint: handle or name of a joint of the spanning tree.
+            value: new value [rad or m].
+            rate: new rate [rad/s or m/s]; default: kept.
+            index: which coordinate of the joint.
+
+        Raises:
+            ValueError: for a joint that closes a loop, is not in the system or has no such coordinate.
+        """
+        return posing.with_coordinate(self, state, joint, value, rate=rate, index=index)
+
     def body_index(self, body: Handle | str) -> int:
         """Number of a body in the rows of the state.
 
@@ -175,4 +270,4 @@ def _index(names: tuple[str, ...], part: Handle | str, kind: str) -> int:
     return names.index(name)
 
 
-from natcoord_jax.assembly import diagnostics  # noqa: E402  (needs System)
+from natcoord_jax.assembly import diagnostics, instant, posing, sensors  # noqa: E402  (need System)

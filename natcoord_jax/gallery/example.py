@@ -26,6 +26,7 @@ class Example:
         control: inputs as a function of the mid-times (steps,) [s] of the steps, shape (steps, inputs)
             [N, N m]; None: no inputs, or all zero.
         facts: what is known of the scene, by name: exact values, published numbers, useful handles.
+        figure: draws the scene's own figure, which the command line writes unasked; None: it has none.
 
     Example:
         >>> import jax; jax.config.update("jax_enable_x64", True)
@@ -44,6 +45,7 @@ class Example:
     steps: int
     control: Callable[[Float[Array, " steps"]], Float[Array, "steps inputs"]] | None = None
     facts: Mapping[str, Any] = field(default_factory=dict)
+    figure: Callable[[], Any] | None = None
 
     @property
     def t_end(self) -> float:

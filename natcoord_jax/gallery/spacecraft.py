@@ -1,4 +1,4 @@
-"""The spacecraft of the paper (8.1): a free base with three motor-driven wheels, and its two torque formulas."""
+"""The spacecraft of the paper (8.1): a free base with three motor-driven wheels, with two torque formulas."""
 
 from typing import Any, ClassVar, NamedTuple
 
@@ -88,6 +88,7 @@ def spacecraft() -> Example:
         steps=100,
         control=lambda t: jnp.full((t.shape[0], 3), TORQUE),
         facts={"dofs": 9, "constraints": 39, "table": TABLE, "converged_energy": 7836.18288},
+        figure=torque_figure,
     )
 
 
@@ -121,6 +122,9 @@ def compare_torques(numbers: tuple[int, ...] = tuple(TABLE)) -> list[Comparison]
 
     Returns:
         One entry for each formula and number.
+
+    Raises:
+        RuntimeError: if a manoeuvre does not converge.
     """
     scene, parts = _craft()
     for number, (base, wheel, hinge) in enumerate(parts):
@@ -138,12 +142,33 @@ def compare_torques(numbers: tuple[int, ...] = tuple(TABLE)) -> list[Comparison]
     @eqx.filter_jit
     def run(dt: Float[Array, ""], inputs: Float[Array, "steps 6"]) -> tuple[Any, ...]:
         trajectory = nc.simulate(system, state, dt=dt, inputs=inputs)
-        return system.angular_momentum(trajectory)[:, 2], system.energy(trajectory).kinetic
+        third = system.angular_momentum(trajectory)[:, 2]
+        return trajectory.failed_step, third, system.energy(trajectory).kinetic
 
     steps = jnp.array([T_END / n for _, n in lanes])
     results = jax.vmap(run)(steps, jnp.stack([drive(*lane) for lane in lanes]))
     found = []
-    for (formula, n), momentum, energy in zip(lanes, *map(np.asarray, results)):
+    for (formula, n), failed, momentum, energy in zip(lanes, *map(np.asarray, results), strict=True):
+        if failed < n:
+            raise RuntimeError(f"{n} steps with the {formula} torque failed in step {failed}")
         t = np.linspace(0.0, T_END, n + 1)
         found.append(Comparison(formula, n, t, momentum[: n + 1], energy[: n + 1]))
     return found
+
+
+def torque_figure() -> Any:
+    """Figures 4 and 5 of the paper: J_3 and T over time with both torque formulas, N = 5 ... 80."""
+    from natcoord_jax.viz import Curve, Panel, plot_panels
+
+    comparisons = compare_torques()
+    panels = []
+    for title, ordinate, field in (
+        ("angular momentum", "J₃ [kg m²/s]", "angular_momentum"),
+        ("kinetic energy", "T [J]", "energy"),
+    ):
+        for formula, number in (("covariant", 70), ("contravariant", 61)):
+            curves = [
+                Curve(f"N = {c.steps}", c.t, getattr(c, field)) for c in comparisons if c.formula == formula
+            ]
+            panels.append(Panel(f"{title}, {formula} torque ({number})", ordinate, curves))
+    return plot_panels(panels)

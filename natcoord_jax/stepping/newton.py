@@ -1,10 +1,11 @@
-"""Newton's iteration to the round-off floor, in two loops that compile to while loops.
+"""Newton's iteration to the round-off floor, in while loops.
 
-The first loop applies one approximate inverse (of the inertia matrix, or of the Jacobian at the guess) and
-watches its contraction. Where that is poor, the second loop takes over with exact Jacobians; in the usual
-case it makes no trip, which costs nothing, also under vmap.
+One factorisation serves as long as the corrections shrink quickly; then the Jacobian is formed anew. Where
+the inertia matrix alone will do (no springs, dampers or loops), it serves first, and the loop over exact
+Jacobians makes no trip in the usual case, which costs nothing, also under vmap.
 """
 
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -22,9 +23,13 @@ STALL = 2000.0
 """Corrections that stop shrinking below STALL * tolerance have reached the floor of round-off."""
 
 CHORD_ITERATIONS = 16
-NEWTON_ITERATIONS = 25
+"""Corrections with one factorisation."""
+
+NEWTON_ROUNDS = 25
+"""Factorisations of exact Jacobians."""
+
 CONTRACTION = 0.35
-"""Slowest contraction at which the first loop goes on."""
+"""Slowest contraction at which a factorisation is kept."""
 
 
 class Solution(eqx.Module):
@@ -48,30 +53,41 @@ class _Iterate(eqx.Module):
     correction: Array
     size: Array
     count: Array
+    total: Array
     converged: Array
-    failed: Array
+    slow: Array
+    finite: Array
 
 
-def _iterate(equations: Any, it: _Iterate, factors: Any, weights: Array, tolerance: Array | float, slowest: float):
+def _iterate(equations: Any, factors: Any, inertias: Array, tolerance: Any, it: _Iterate) -> _Iterate:
+    """One correction with given factors; a correction that shrinks too slowly is not applied."""
     residual, size = equations.residual(it.y)
     change = factors.solve(residual)
-    correction = jnp.sqrt(jnp.sum(weights * change**2))
+    correction = jnp.sqrt(jnp.sum(inertias * change**2))
     ratio = correction / jnp.where(it.correction > 0, it.correction, 1.0)
     first = it.count == 0
-    predicted = jnp.where(first, correction, correction * ratio / jnp.maximum(1.0 - ratio, 1e-3))
-    small = jnp.where(ratio < 1.0, predicted, correction) <= tolerance * size
+    predicted = correction * jnp.where(first, 1.0, ratio / jnp.maximum(1.0 - ratio, 1e-3))
+    small = predicted <= tolerance * size
     stalled = ~first & (ratio > 0.5) & (correction <= STALL * tolerance * size)
-    converged = small | stalled
     finite = jnp.isfinite(correction) & jnp.isfinite(size)
-    slow = ~first & (ratio > slowest)
-    return _Iterate(
-        jnp.where(finite, it.y - change, it.y),
-        correction,
-        size,
-        it.count + 1,
-        converged & finite,
-        ~finite | (slow & ~converged),
+    converged = (small | stalled) & finite
+    slow = ~first & (ratio > CONTRACTION) & ~converged
+    y = jnp.where(finite & ~slow, it.y - change, it.y)
+    return _Iterate(y, correction, size, it.count + 1, it.total + 1, converged, slow, finite)
+
+
+def _chord(equations: Any, factors: Any, inertias: Array, tolerance: Any, start: _Iterate) -> _Iterate:
+    """Corrections with one factorisation until they converge or shrink too slowly."""
+
+    def go_on(it: _Iterate) -> Array:
+        return ~it.converged & ~it.slow & it.finite & (it.count < CHORD_ITERATIONS)
+
+    restart = eqx.tree_at(
+        lambda it: (it.count, it.slow, it.correction),
+        start,
+        (jnp.array(0), jnp.array(False), jnp.zeros_like(start.correction)),
     )
+    return jax.lax.while_loop(go_on, partial(_iterate, equations, factors, inertias, tolerance), restart)
 
 
 def newton(equations: Any, tolerance: Float[Array, ""] | float, form: str) -> Solution:
@@ -85,44 +101,29 @@ def newton(equations: Any, tolerance: Float[Array, ""] | float, form: str) -> So
     Returns:
         The solution; its code is successful, max_iterations, diverged or nonfinite, never an exception.
     """
-    guess = equations.guess()
     factorise = FACTORISATIONS[form]
-    inverse, weights = factorise(equations, equations.approximate(guess))
-    zero, no = jnp.zeros((), guess.dtype), jnp.array(False)
-    start = _Iterate(guess, zero, zero, jnp.array(0), no, no)
+    guess = equations.guess()
+    zero, no, nought = jnp.zeros((), guess.dtype), jnp.array(False), jnp.array(0)
+    it = _Iterate(guess, zero, zero, nought, nought, no, no, jnp.array(True))
+    cheap = equations.approximate()
+    if cheap is not None:
+        with jax.named_scope("chord"):
+            it = _chord(equations, *factorise(equations, cheap), tolerance, it)
+        lost = ~it.finite
+        it = eqx.tree_at(lambda x: (x.y, x.finite), it, (jnp.where(lost, guess, it.y), jnp.array(True)))
 
-    def go_on(it: _Iterate) -> Array:
-        return ~it.converged & ~it.failed & (it.count < CHORD_ITERATIONS)
+    def refactor(carry: tuple[_Iterate, Array]) -> tuple[_Iterate, Array]:
+        it, rounds = carry
+        factors, inertias = factorise(equations, equations.jacobian(it.y))
+        return _chord(equations, factors, inertias, tolerance, it), rounds + 1
 
-    with jax.named_scope("chord"):
-        first = jax.lax.while_loop(
-            go_on, lambda it: _iterate(equations, it, inverse, weights, tolerance, CONTRACTION), start
-        )
+    def unsolved(carry: tuple[_Iterate, Array]) -> Array:
+        it, rounds = carry
+        return ~it.converged & it.finite & (rounds < NEWTON_ROUNDS)
 
-    def body(carry: tuple[_Iterate, Array]) -> tuple[_Iterate, Array]:
-        it, largest = carry
-        after = _iterate(equations, it, factorise(equations, equations.jacobian(it.y))[0], weights, tolerance, jnp.inf)
-        diverged = after.correction > 1e6 * largest
-        failed = after.failed | (diverged & (it.count > 0))
-        after = eqx.tree_at(lambda x: x.failed, after, failed)
-        return after, jnp.where(it.count == 0, after.correction, largest)
-
-    def newton_on(carry: tuple[_Iterate, Array]) -> Array:
-        it, _ = carry
-        return ~it.converged & ~it.failed & (it.count < NEWTON_ITERATIONS)
-
-    restart = _Iterate(guess, zero, zero, jnp.array(0), first.converged, no)
-    restart = eqx.tree_at(lambda x: x.y, restart, jnp.where(first.converged, first.y, guess))
     with jax.named_scope("newton"):
-        second, _ = jax.lax.while_loop(newton_on, body, (restart, jnp.asarray(jnp.inf, guess.dtype)))
-    done = first.converged
-    y = jnp.where(done, first.y, second.y)
-    correction = jnp.where(done, first.correction, second.correction)
-    size = jnp.where(done, first.size, second.size)
-    failed_code = jnp.where(
-        ~jnp.isfinite(correction) | ~jnp.all(jnp.isfinite(y)),
-        int(Result.NONFINITE),
-        jnp.where(second.failed, int(Result.DIVERGED), int(Result.MAX_ITERATIONS)),
-    )
-    code = jnp.where(done | second.converged, int(Result.SUCCESSFUL), failed_code)
-    return Solution(y, code, first.count + second.count, correction / jnp.where(size > 0, size, 1.0))
+        it, rounds = jax.lax.while_loop(unsolved, refactor, (it, nought))
+    failed = jnp.where(it.finite, int(Result.MAX_ITERATIONS), int(Result.NONFINITE))
+    code = jnp.where(it.converged, int(Result.SUCCESSFUL), failed)
+    error = it.correction / jnp.where(it.size > 0, it.size, 1.0)
+    return Solution(it.y, code, it.total, error)

@@ -1,8 +1,8 @@
 """The rollout: steps, retries in substeps, events, and its derivative.
 
-A rollout is a sequence of slots; one slot is one attempt at one (sub)step. As long as every attempt
-succeeds, slots are steps. A failed attempt is repeated with half the substep; a while loop after the scan
-provides the extra slots this takes, and makes no trip otherwise.
+A rollout is a loop over slots; one slot is one attempt at one (sub)step. As long as every attempt succeeds,
+slots are steps. A failed attempt is repeated with half the substep in the next slot; spare slots at the end
+make up for it, and are not entered otherwise.
 
 The derivative (`custom_jvp`) runs along the recorded slots: their states and solutions are outputs, so all
 Jacobians are formed at once, vmapped over the slots, and only the recursion from state to state is a scan.
@@ -18,6 +18,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
@@ -139,36 +140,49 @@ def _slot(plan: Plan, system: System, parameters: Any, dt: Array, course: Course
     return following, record
 
 
+@jax.custom_batching.custom_vmap
+def any_lane(x: Bool[Array, ""]) -> Bool[Array, ""]:
+    """Whether it holds in any lane of a vmap: keeps the condition of a loop the same for all lanes.
+
+    A loop whose condition differs between lanes would copy all that it carries, the whole record, in
+    every trip.
+    """
+    return x
+
+
+@any_lane.def_vmap
+def _any_lane_rule(axis_size: int, in_batched: list[bool], x: Array) -> tuple[Array, bool]:
+    return any_lane(jnp.any(x, axis=0)), False
+
+
 def _run(plan: Plan, system: System, state: State, parameters: Any, dt: Array) -> tuple[Slots, Course]:
     attempt = partial(_slot, plan, system, parameters, dt)
-    course, slots = jax.lax.scan(lambda c, _: attempt(c), _start(state, dt), length=plan.steps)
-    if plan.extra == 0:
-        return slots, course
+    length = plan.steps + plan.extra
+    start = _start(state, dt)
+    shapes = jax.eval_shape(attempt, start)[1]
+    buffer = jax.tree.map(lambda x: jnp.zeros((length, *x.shape), x.dtype), shapes)
 
     def unfinished(carry: tuple[Array, Course, Slots]) -> Array:
         count, course, _ = carry
-        return (count < plan.extra) & ~course.stopped & (course.step < plan.steps)
+        return (count < length) & any_lane(~course.stopped & (course.step < plan.steps))
 
-    def more(carry: tuple[Array, Course, Slots]) -> tuple[Array, Course, Slots]:
+    def body(carry: tuple[Array, Course, Slots]) -> tuple[Array, Course, Slots]:
         count, course, buffer = carry
         course, record = attempt(course)
-        buffer = jax.tree.map(lambda b, r: b.at[count].set(r), buffer, record)
+        buffer = jax.tree.map(lambda b, r: jax.lax.dynamic_update_index_in_dim(b, r, count, 0), buffer, record)
         return count + 1, course, buffer
 
-    def blank(x: Array) -> Array:
-        return jnp.broadcast_to(x[-1], (plan.extra, *x.shape[1:]))
+    count, course, slots = jax.lax.while_loop(unfinished, body, (jnp.array(0), start, buffer))
+    unused = jnp.arange(length) >= count
 
-    buffer = jax.tree.map(blank, slots)
-    buffer = eqx.tree_at(lambda s: s.accepted, buffer, jnp.zeros(plan.extra, bool))
-    count, course, buffer = jax.lax.while_loop(unfinished, more, (jnp.array(0), course, buffer))
-    last = jax.tree.map(lambda x: x[jnp.maximum(count - 1, 0)], buffer.states)
-    unused = jnp.arange(plan.extra) >= count
-    filled = jax.tree.map(
-        lambda b, x: jnp.where(unused.reshape(-1, *(1,) * (b.ndim - 1)), x, b), buffer.states, last
+    def fill(x: Array, last: Array) -> Array:
+        return jnp.where(unused.reshape(-1, *(1,) * (x.ndim - 1)), last, x)
+
+    slots = eqx.tree_at(
+        lambda s: (s.states, s.finished, s.fraction),
+        slots,
+        (jax.tree.map(fill, slots.states, course.state), fill(slots.finished, course.step), fill(slots.fraction, 1.0)),
     )
-    steps = jnp.where(unused, course.step, buffer.finished)
-    buffer = eqx.tree_at(lambda s: (s.states, s.finished), buffer, (filled, steps))
-    slots = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), slots, buffer)
     short = (course.step < plan.steps) & ~course.stopped
     code = jnp.where(short, int(Result.MAX_SUBSTEPS), course.code)
     return slots, eqx.tree_at(lambda c: c.code, course, code)
@@ -200,15 +214,15 @@ def _run_slots_jvp(plan: Plan, primals: tuple, tangents: tuple):
         u = plan.control(parameters, step, state.t, state)
         return advance(system, state, u, fraction * dt, y, tableau)
 
-    def solver(state, y, step, fraction):
-        u = plan.control(parameters, step, state.t, state)
-        return linear_solver(system, state, u, fraction * dt, y, tableau)
-
     def by_parameters(state, y, step, fraction):
         def f(system, parameters, dt):
             return equations(system, state, parameters, dt, y, step, fraction)
 
         return jax.jvp(f, (system, parameters, dt), (system_dot, parameters_dot, dt_dot))[1]
+
+    def solver(state, y, step, fraction):
+        u = plan.control(parameters, step, state.t, state)
+        return linear_solver(system, state, u, fraction * dt, y, tableau)
 
     along = (before, slots.y, slots.step, slots.fraction)
     solvers = jax.vmap(solver)(*along)
@@ -216,16 +230,12 @@ def _run_slots_jvp(plan: Plan, primals: tuple, tangents: tuple):
 
     def body(state_dot, xs):
         (state, y, step, fraction), solver, (residual_dot, end_dot), accepted = xs
-
-        def by_state(state):
-            return equations(system, state, parameters, dt, y, step, fraction)
-
-        def by_unknowns(y):
-            return equations(system, state, parameters, dt, y, step, fraction)[1]
-
-        residual_by_state, end_by_state = jax.jvp(by_state, (state,), (state_dot,))[1]
+        _, along_state_and_y = jax.linearize(
+            lambda state, y: equations(system, state, parameters, dt, y, step, fraction), state, y
+        )
+        residual_by_state, end_by_state = along_state_and_y(state_dot, jnp.zeros_like(y))
         y_dot = -solver.solve(residual_dot + residual_by_state)
-        end_by_unknowns = jax.jvp(by_unknowns, (y,), (y_dot,))[1]
+        _, end_by_unknowns = along_state_and_y(jax.tree.map(jnp.zeros_like, state), y_dot)
         end = jax.tree.map(lambda a, b, c: a + b + c, end_dot, end_by_state, end_by_unknowns)
         end = jax.tree.map(partial(jnp.where, accepted), end, state_dot)
         return end, (end, jnp.where(accepted, y_dot, 0.0))

@@ -1,0 +1,288 @@
+"""Sensors: what bodies, joints and points do, at one time or along a trajectory.
+
+Kinematic quantities are read when the sensor is made; accelerations and reactions solve the equations of
+motion and are computed when they are asked for.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from natcoord_jax.assembly.coordinates import state_rates
+from natcoord_jax.assembly.diagnostics import over_states, states_of
+from natcoord_jax.assembly.instant import Instant, inputs_along, instant_of
+from natcoord_jax.assembly.system import System
+from natcoord_jax.core.handles import Handle, ground
+from natcoord_jax.core.markers import Marker
+from natcoord_jax.core.state import State, Trajectory
+from natcoord_jax.maths.rotations import angular_velocity, to_quaternion
+
+
+class Source(eqx.Module):
+    """What a sensor looks at: the system, the states and the inputs at each of them."""
+
+    system: System
+    states: State
+    inputs: Float[Array, "*t inputs"]
+
+
+@eqx.filter_jit
+def _instants(source: Source) -> Instant:
+    """Accelerations and reactions; a source that went through `jax.vmap` has a batched system, too."""
+    lanes = source.system.mass.ndim - 3
+    function = instant_of
+    for axis in range(source.states.t.ndim):
+        function = jax.vmap(function, in_axes=(0 if axis >= source.states.t.ndim - lanes else None, 0, 0))
+    return function(source.system, source.states, source.inputs)
+
+
+class BodySensor(eqx.Module):
+    """Pose and motion of a body.
+
+    Attributes:
+        position: of the reference point [m].
+        rotation: rotation matrix, body to world; its columns are the directors [-].
+        quaternion: (w, x, y, z) of it; with w >= 0 for a state, of continuous sign along a trajectory.
+        velocity: of the reference point [m/s].
+        angular_velocity: world components [rad/s].
+        com: centre of mass [m].
+        com_velocity: its velocity [m/s].
+        index: number of the body.
+        source: what the sensor looks at.
+    """
+
+    position: Float[Array, "*t 3"]
+    rotation: Float[Array, "*t 3 3"]
+    quaternion: Float[Array, "*t 4"]
+    velocity: Float[Array, "*t 3"]
+    angular_velocity: Float[Array, "*t 3"]
+    com: Float[Array, "*t 3"]
+    com_velocity: Float[Array, "*t 3"]
+    index: int = eqx.field(static=True)
+    source: Source
+
+    @property
+    def acceleration(self) -> Float[Array, "*t 3"]:
+        """Acceleration of the reference point [m/s^2]."""
+        return _instants(self.source).accelerations[..., 4 * self.index, :]
+
+    @property
+    def angular_acceleration(self) -> Float[Array, "*t 3"]:
+        """Angular acceleration, world components [rad/s^2]."""
+        first = 4 * self.index + 1
+        return angular_velocity(
+            jnp.swapaxes(self.rotation, -1, -2), _instants(self.source).accelerations[..., first : first + 3, :]
+        )
+
+
+class JointSensor(eqx.Module):
+    """Coordinates, rates and reactions of a joint.
+
+    Attributes:
+        coordinates: all coordinates of the joint in its order, angles counted on over many turns [rad or m].
+        rates: their rates [rad/s or m/s].
+        units: "rad" or "m" of each coordinate.
+        name: of the joint.
+        index: number of the joint.
+        source: what the sensor looks at.
+    """
+
+    coordinates: Float[Array, "*t n"]
+    rates: Float[Array, "*t n"]
+    units: tuple[str, ...] = eqx.field(static=True)
+    name: str = eqx.field(static=True)
+    index: int = eqx.field(static=True)
+    source: Source
+
+    def _all(self, values: Array, unit: str) -> Array:
+        return values[..., np.array([k for k, u in enumerate(self.units) if u == unit], int)]
+
+    def _only(self, values: Array, unit: str) -> Array:
+        found = self._all(values, unit)
+        if found.shape[-1] != 1:
+            raise ValueError(
+                f"joint {self.name!r} has {found.shape[-1]} coordinates in {unit}, not one; "
+                f"its coordinates are in {list(self.units)}: use `angles`, `displacements` or `coordinates`"
+            )
+        return found[..., 0]
+
+    @property
+    def angles(self) -> Float[Array, "*t a"]:
+        """All angles [rad]."""
+        return self._all(self.coordinates, "rad")
+
+    @property
+    def angle(self) -> Float[Array, "*t"]:
+        """The angle [rad] of a joint that has one; raises `ValueError` for others."""
+        return self._only(self.coordinates, "rad")
+
+    @property
+    def angle_rate(self) -> Float[Array, "*t"]:
+        """Rate of the angle [rad/s]."""
+        return self._only(self.rates, "rad")
+
+    @property
+    def displacements(self) -> Float[Array, "*t d"]:
+        """All displacements [m]."""
+        return self._all(self.coordinates, "m")
+
+    @property
+    def displacement(self) -> Float[Array, "*t"]:
+        """The displacement [m] of a joint that has one; raises `ValueError` for others."""
+        return self._only(self.coordinates, "m")
+
+    @property
+    def displacement_rate(self) -> Float[Array, "*t"]:
+        """Rate of the displacement [m/s]."""
+        return self._only(self.rates, "m")
+
+    @property
+    def distance(self) -> Float[Array, "*t"]:
+        """The distance [m] of a distance joint."""
+        return self._only(self.coordinates, "m")
+
+    @property
+    def force(self) -> Float[Array, "*t 3"]:
+        """Reaction force on the child at the joint's point [N], world components.
+
+        The force of the constraints: motors, springs and dampers of the joint are not part of it. Along a
+        trajectory with the inputs of the step that starts at each saved state (see `System.instant`).
+        """
+        return _instants(self.source).forces[..., self.index, :]
+
+    @property
+    def torque(self) -> Float[Array, "*t 3"]:
+        """Reaction torque on the child about the joint's point on the child [N m], world components."""
+        return _instants(self.source).torques[..., self.index, :]
+
+
+class MarkerSensor(eqx.Module):
+    """Motion of a material point, or of a direction fixed in a body.
+
+    Attributes:
+        position: of the point [m], or the direction itself [-].
+        velocity: its time derivative [m/s, 1/s].
+        weights: of the rows of the body (7, 46).
+        body: number of the body; the number of bodies is the ground.
+        source: what the sensor looks at.
+    """
+
+    position: Float[Array, "*t 3"]
+    velocity: Float[Array, "*t 3"]
+    weights: Float[Array, "4"]
+    body: int = eqx.field(static=True)
+    source: Source
+
+    @property
+    def acceleration(self) -> Float[Array, "*t 3"]:
+        """Second time derivative [m/s^2, 1/s^2]."""
+        return _weighted(self.weights, _instants(self.source).accelerations, self.body)
+
+
+def _weighted(weights: Float[Array, "*l 4"], rows: Float[Array, "*t rows 3"], body: int) -> Float[Array, "*t 3"]:
+    """Marker vector sum_a w_a q_a; zero on the ground, whose rows do not move."""
+    if 4 * body >= rows.shape[-2]:
+        return jnp.zeros_like(rows[..., 0, :])
+    own = rows[..., 4 * body : 4 * body + 4, :]
+    missing = own.ndim - 1 - weights.ndim
+    weights = weights.reshape(*weights.shape[:-1], *(1,) * missing, 4)
+    return jnp.sum(weights[..., None] * own, axis=-2)
+
+
+def _continuous(quaternions: Float[Array, "*t 4"], along: bool) -> Float[Array, "*t 4"]:
+    """Signs chosen so that neighbours along the last leading axis are close to each other."""
+    if not along:
+        return quaternions
+    products = jnp.sum(quaternions[..., 1:, :] * quaternions[..., :-1, :], axis=-1)
+    flips = jnp.cumprod(jnp.where(products < 0, -1.0, 1.0), axis=-1)
+    return quaternions.at[..., 1:, :].multiply(flips[..., None])
+
+
+@eqx.filter_jit
+def _body_motion(system: System, states: State, index: Array, along: bool) -> tuple[Array, ...]:
+    shape = (*states.t.shape, len(system.structure.bodies), 4, 3)
+    rows, rates = states.q.reshape(shape)[..., index, :, :], states.v.reshape(shape)[..., index, :, :]
+    rotation = jnp.swapaxes(rows[..., 1:, :], -1, -2)
+    mass = system.mass[index, 0] / system.mass[index, 0, 0]
+    com, com_velocity = (jnp.sum(mass[:, None] * x, axis=-2) for x in (rows, rates))
+    spin = angular_velocity(rows[..., 1:, :], rates[..., 1:, :])
+    quaternion = _continuous(to_quaternion(rotation), along)
+    return rows[..., 0, :], rotation, quaternion, rates[..., 0, :], spin, com, com_velocity
+
+
+@eqx.filter_jit
+def _all_rates(system: System, states: State) -> Array:
+    return over_states(lambda state: state_rates(system, state), states)
+
+
+def joint_coordinates(system: System, joint: Handle | str) -> tuple[int, list[int], tuple[str, ...]]:
+    """Number of a joint, the places of its coordinates in the state, and their units.
+
+    Raises:
+        ValueError: for a name that is no joint of this system.
+    """
+    index = system.joint_index(joint)
+    name = system.structure.joints[index]
+    places = [i for i, (owner, _) in enumerate(system.structure.coordinates) if owner == name]
+    group = next(g for g in system.joints if name in g.names)
+    return index, places, tuple(axis.unit for axis in group.effect.coordinates)
+
+
+def marker_weights(system: System, marker: Marker, state: State | None) -> tuple[Float[Array, "4"], int]:
+    """Weights of a marker and the number of its body; the number of bodies is the ground.
+
+    Raises:
+        ValueError: for a marker in world coordinates without the state they refer to.
+    """
+    vector = jnp.asarray(marker.vector, float)
+    head = jnp.ones(1) if marker.is_point else jnp.zeros(1)
+    if marker.body == ground:
+        return jnp.concatenate([head, vector]), len(system.structure.bodies)
+    body = system.body_index(marker.body)
+    if not marker.local:
+        if state is None:
+            raise ValueError(
+                f"the marker on {marker.body!r} is in world coordinates of the assembled pose: pass that pose "
+                "as `state=` (the initial state), or the marker with local=True"
+            )
+        rows = state.q[4 * body : 4 * body + 4]
+        vector = rows[1:] @ (vector - rows[0] if marker.is_point else vector)
+    return jnp.concatenate([head, vector]), body
+
+
+def sense(
+    system: System,
+    motion: State | Trajectory,
+    part: Handle | Marker | str,
+    *,
+    inputs: Any = None,
+    state: State | None = None,
+) -> Any:
+    """Sensor of a body, a joint or a marker; see `System.sense`."""
+    states = states_of(motion)
+    source = Source(system, states, inputs_along(system, motion, inputs))
+    if isinstance(part, Marker):
+        weights, body = marker_weights(system, part, state)
+        if body == len(system.structure.bodies):
+            still = jnp.broadcast_to(weights[1:], (*states.t.shape, 3))
+            return MarkerSensor(still, jnp.zeros_like(still), weights, body, source)
+        position, velocity = _weighted(weights, states.q, body), _weighted(weights, states.v, body)
+        return MarkerSensor(position, velocity, weights, body, source)
+    name = part.name if isinstance(part, Handle) else part
+    if name in system.structure.bodies:
+        index = system.body_index(part)
+        found = _body_motion(system, states, jnp.asarray(index), isinstance(motion, Trajectory))
+        return BodySensor(*found, index, source)
+    if name and name in system.structure.joints:
+        index, places, units = joint_coordinates(system, part)
+        chosen = np.array(places, int)
+        rates = _all_rates(system, states)[..., chosen]
+        return JointSensor(states.coordinates[..., chosen], rates, units, name, index, source)
+    raise ValueError(
+        f"cannot sense {part!r}: pass a body ({list(system.structure.bodies)}), a joint "
+        f"({[n for n in system.structure.joints if n]}), nc.Point or nc.Direction"
+    )

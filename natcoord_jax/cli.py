@@ -1,0 +1,227 @@
+"""The command line: `natcoord-jax scenes` and `natcoord-jax run SCENE`."""
+
+import argparse
+import json
+import math
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+import jax
+import numpy as np
+
+import natcoord_jax as nc
+from natcoord_jax import gallery
+from natcoord_jax.core.results import Result
+from natcoord_jax.core.state import Trajectory
+
+WHOLE = 1e-9
+"""How far the number of steps may be from a whole number, relatively."""
+
+
+class BadOptionError(ValueError):
+    """An option that cannot be meant."""
+
+
+class Parser(argparse.ArgumentParser):
+    """Says what is wrong in one line and ends with code 2."""
+
+    def error(self, message: str) -> NoReturn:
+        """One line on stderr, exit code 2."""
+        self.exit(2, f"{self.prog}: {message}\n")
+
+
+def _parser() -> Parser:
+    parser = Parser(prog="natcoord-jax", description="Differentiable multibody simulation: ready scenes.")
+    commands = parser.add_subparsers(dest="command", required=True, parser_class=Parser)
+    commands.add_parser("scenes", help="list the scenes of the gallery")
+    run = commands.add_parser("run", help="simulate a scene and report its balances")
+    run.add_argument("scene", metavar="SCENE", help="a name that `natcoord-jax scenes` lists")
+    run.add_argument("--steps", type=int, help="number of steps; alone, it keeps the scene's end time")
+    run.add_argument("--dt", type=float, help="step [s]; alone, it must divide the scene's end time")
+    run.add_argument("--json", type=Path, metavar="FILE", help="write the report as JSON")
+    run.add_argument("--plot", type=Path, metavar="FILE", help="write a figure")
+    return parser
+
+
+def choose_steps(example: gallery.Example, steps: int | None, dt: float | None) -> tuple[int, float]:
+    """Number of steps and step [s] of a run.
+
+    Raises:
+        BadOptionError: for numbers that are not positive, or a step that does not divide the end time.
+    """
+    if steps is not None and steps < 1:
+        raise BadOptionError(f"--steps is {steps}; pass a positive integer")
+    if dt is not None and not (math.isfinite(dt) and dt > 0):
+        raise BadOptionError(f"--dt [s] is {dt:g}; pass a positive number")
+    if dt is None:
+        return (example.steps, example.dt) if steps is None else (steps, example.t_end / steps)
+    if steps is not None:
+        return steps, dt
+    ratio = example.t_end / dt
+    if round(ratio) < 1 or abs(ratio - round(ratio)) > WHOLE * ratio:
+        raise BadOptionError(
+            f"--dt {dt:g} s does not divide the end time {example.t_end:g} s of {example.name}; "
+            "pass another step, or --steps as well"
+        )
+    return round(ratio), dt
+
+
+def _timed(run: Any) -> tuple[Trajectory, float]:
+    start = time.perf_counter()
+    trajectory = jax.block_until_ready(run())
+    return trajectory, time.perf_counter() - start
+
+
+def _completed(trajectory: Trajectory) -> Trajectory:
+    """The part of a trajectory before the step that failed."""
+    steps = trajectory.t.shape[0] - 1
+    done = steps if Result(int(trajectory.result)).ok else min(int(trajectory.failed_step), steps)
+    states = jax.tree.map(lambda x: x[: done + 1], trajectory.states)
+    return nc.Trajectory(**(vars(trajectory) | {"states": states, "inputs": trajectory.inputs[:done]}))
+
+
+def _largest(values: Any) -> float | None:
+    return None if values is None else float(np.max(values))
+
+
+def measure(example: gallery.Example, steps: int, dt: float) -> tuple[dict[str, Any], Trajectory]:
+    """Run a scene twice, the first time with compilation, and judge the run.
+
+    Args:
+        example: the scene.
+        steps: number of steps.
+        dt: step [s].
+
+    Returns:
+        The report, and the trajectory.
+    """
+    system = example.system
+    structure = system.structure
+    options = {"steps": steps, "dt": dt, "throw": False}
+    _, first = _timed(lambda: example.simulate(**options))
+    trajectory, wall = _timed(lambda: example.simulate(**options))
+    valid = _completed(trajectory)
+    energy, errors = np.asarray(system.energy(valid).total), system.constraint_errors(valid)
+    balance = nc.balance(system, valid)
+    result = Result(int(trajectory.result))
+    report = {
+        "scene": example.name,
+        "steps": steps,
+        "dt": dt,
+        "t_end": steps * dt,
+        "dofs": structure.dofs,
+        "unknowns": structure.unknowns + structure.multipliers,
+        "constraints": structure.constraints,
+        "newton_iterations_mean": int(trajectory.iterations) / max(int(trajectory.steps_taken), 1),
+        "newton_iterations_max": int(trajectory.iterations_max),
+        "compile_s": first - wall,
+        "wall_s": wall,
+        "energy_initial": float(energy[0]),
+        "energy_final": float(energy[-1]),
+        "energy_error_max": _largest(balance.energy),
+        "momentum_error_max": _largest(balance.momentum),
+        "momentum_components": balance.directions,
+        "angular_momentum_error_max": _largest(balance.angular_momentum),
+        "angular_momentum_components": balance.axes,
+        "momentum_note": balance.note,
+        "constraint_error_max": _largest(errors.position),
+        "velocity_constraint_error_max": _largest(errors.velocity),
+        "steps_completed": valid.t.shape[0] - 1,
+        "result": "successful" if result == Result.SUCCESSFUL else system.explain(trajectory),
+    }
+    return report, trajectory
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3g}"
+
+
+def _table(report: dict[str, Any]) -> str:
+    """The report as aligned plain text."""
+    r = report
+    most = f"a step, at most {r['newton_iterations_max']}"
+    parts = f"largest error, relative, of {r['momentum_components']} components"
+    turns = f"largest error, relative, of {r['angular_momentum_components']} components"
+    lines = [
+        ("scene", r["scene"], ""),
+        ("steps", f"{r['steps']}", f"of {r['dt']:.6g} s, to t = {r['t_end']:.6g} s"),
+        ("degrees of freedom", f"{r['dofs']}", f"{r['unknowns']} unknowns, {r['constraints']} constraints"),
+        ("Newton iterations", _number(r["newton_iterations_mean"]), most),
+        ("wall time", f"{1e3 * r['wall_s']:.3g} ms", f"{1e6 * r['wall_s'] / r['steps']:.3g} µs a step"),
+        ("compile time", f"{r['compile_s']:.3g} s", ""),
+        ("energy", f"{r['energy_final']:.8g} J", f"from {r['energy_initial']:.8g} J"),
+        ("energy balance", _number(r["energy_error_max"]), "largest error, relative"),
+        ("momentum balance", _number(r["momentum_error_max"]), parts),
+        ("angular momentum balance", _number(r["angular_momentum_error_max"]), turns),
+        ("constraints", _number(r["constraint_error_max"]), "largest error [m, -]"),
+        ("constraint velocities", _number(r["velocity_constraint_error_max"]), "largest error [m/s, 1/s]"),
+        ("result", r["result"], ""),
+    ]
+    width, middle = max(len(a) for a, _, _ in lines), max(len(b) for _, b, _ in lines[:-1])
+    text = [f"{a:<{width}}  {b:>{middle}}  {c}".rstrip() for a, b, c in lines[:-1]]
+    text.append(f"{lines[-1][0]:<{width}}  {lines[-1][1]}")
+    return "\n".join([*text, f"({r['momentum_note']})"] if r["momentum_note"] else text)
+
+
+def _json_ready(value: Any) -> Any:
+    """JSON has no infinities and no NaN: they become null."""
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _plot(example: gallery.Example, trajectory: Trajectory, file: Path | None) -> Path | None:
+    """Write the scene's own figure, or the curves of the run if a file is asked for."""
+    if example.figure is not None:
+        figure, file = example.figure(), file or Path(f"{example.name}.png")
+    elif file is not None:
+        figure = nc.plot(example.system, trajectory)
+    else:
+        return None
+    figure.savefig(file, dpi=150)
+    return file
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    if arguments.scene not in gallery.SCENES:
+        raise BadOptionError(f"no scene {arguments.scene!r}; there are {', '.join(gallery.SCENES)}")
+    for file in (arguments.json, arguments.plot):
+        if file is not None and not file.resolve().parent.is_dir():
+            raise BadOptionError(f"cannot write {file}: no such folder")
+    example = gallery.load(arguments.scene)
+    steps, dt = choose_steps(example, arguments.steps, arguments.dt)
+    report, trajectory = measure(example, steps, dt)
+    print(_table(report))
+    if arguments.json is not None:
+        ready = {key: _json_ready(value) for key, value in report.items()}
+        arguments.json.write_text(json.dumps(ready, indent=2, ensure_ascii=False) + "\n", "utf-8")
+    if not Result(int(trajectory.result)).ok:
+        print(f"natcoord-jax: {example.name}: {report['result']}", file=sys.stderr)
+        return 1
+    written = _plot(example, trajectory, arguments.plot)
+    if written is not None:
+        print(f"wrote {written}")
+    return 0
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Args:
+        arguments: those after the program's name; None: those of the process.
+
+    Returns:
+        The exit code: 0; 1 for a run that fails; 2 for an unknown scene or a bad option.
+    """
+    jax.config.update("jax_enable_x64", True)
+    parsed = _parser().parse_args(arguments)
+    if parsed.command == "scenes":
+        width = max(map(len, gallery.SCENES))
+        print("\n".join(f"{name:<{width}}  {gallery.describe(name)}" for name in gallery.SCENES))
+        return 0
+    try:
+        return _run(parsed)
+    except BadOptionError as problem:
+        print(f"natcoord-jax: {problem}", file=sys.stderr)
+        return 2

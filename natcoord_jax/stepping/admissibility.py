@@ -1,0 +1,151 @@
+"""What a fresh system is checked for: gaps, velocities across constraints, missing inertia, redundancy."""
+
+import warnings
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from natcoord_jax.assembly.diagnostics import joint_residuals, unknown_name
+from natcoord_jax.assembly.reduced import ReducedStep
+from natcoord_jax.assembly.system import System
+from natcoord_jax.core.effect import replace_fields
+from natcoord_jax.core.state import State
+from natcoord_jax.maths.collocation import gauss
+from natcoord_jax.stepping.assemble import assemble
+
+GAP = 1e-9
+"""Largest gap [m, -] and constraint rate [m/s, 1/s] taken for round-off of printed data, per unit of size."""
+
+_residuals = jax.jit(lambda system, state: [(value, rate) for _, value, rate in joint_residuals(system, state)])
+
+
+def check_gaps(system: System, state: State) -> None:
+    """Refuse a joint that does not close.
+
+    Raises:
+        ValueError: with the joint's name and the gap.
+    """
+    if not system.joints:
+        return
+    size = 1.0 + float(jnp.max(jnp.abs(state.q)))
+    for group, (value, _) in zip(system.joints, _residuals(system, state)):
+        gaps = np.max(np.abs(np.asarray(value)), axis=1, initial=0.0)
+        worst = int(np.argmax(gaps))
+        if gaps[worst] > GAP * size:
+            raise ValueError(
+                f"joint {group.names[worst]!r} does not close: its constraints are violated by "
+                f"{gaps[worst]:.3g} m; move the bodies, or pass assemble=True to compile"
+            )
+
+
+def project_velocities(system: System, state: State) -> State:
+    """State with velocities that obey the joints, with a warning that says by how much they changed."""
+    if not system.joints:
+        return state
+    speed = 1.0 + float(jnp.max(jnp.abs(state.v)))
+    worst = 0.0
+    for _, rate in _residuals(system, state):
+        worst = max(worst, float(np.max(np.abs(np.asarray(rate)), initial=0.0)))
+    if worst <= GAP * speed:
+        return state
+    projected = assemble(system, state)
+    change = float(jnp.max(jnp.abs(projected.v - state.v)))
+    warnings.warn(
+        f"initial velocities violate the joints by {worst:.3g} m/s (or 1/s); they were projected onto them, "
+        f"which changed row velocities by up to {change:.3g} m/s",
+        stacklevel=4,
+    )
+    return projected
+
+
+def _tiny_step(system: System, state: State) -> ReducedStep:
+    inputs = jnp.zeros(len(system.structure.inputs))
+    return ReducedStep.prepare(system, state, inputs, jnp.asarray(1e-9), gauss(1))
+
+
+@jax.jit
+def _jacobian(system: System, state: State):
+    step = _tiny_step(system, state)
+    return step.jacobian(step.guess())
+
+
+def check_inertia(system: System, state: State) -> None:
+    """Refuse a free motion that moves no mass.
+
+    Raises:
+        ValueError: naming the body or joint of the motion.
+    """
+    moments = np.asarray(system.mass)
+    central = moments[:, 1:, 1:] - moments[:, :1, 1:] * moments[:, 1:, :1] / moments[:, :1, :1]
+    values = np.linalg.eigvalsh(central)
+    thin = (values[:, 1] <= 1e-12 * values[:, 2]) & (values[:, 2] > 0)
+    if not thin.any() or system.structure.unknowns > 200:
+        return
+    count = system.structure.unknowns
+    matrix = np.asarray(_jacobian(system, state))
+    balance, rows = matrix[:count, :count], matrix[count:, :count]
+    free = np.eye(count)
+    if len(rows):
+        _, sizes, vectors = np.linalg.svd(rows)
+        free = vectors[int(np.sum(sizes > 1e-9 * max(sizes[0], 1e-300))) :].T
+    values, vectors = np.linalg.eigh(free.T @ (balance + balance.T) @ free)
+    if len(values) and values[0] <= 1e-11 * values[-1]:
+        part = unknown_name(system, int(np.argmax(np.abs(free @ vectors[:, 0]))))
+        raise ValueError(
+            f"the motion of {part} moves no mass (an ideal rod has no inertia [kg m^2] about its axis); "
+            "give the body a small inertia there, or a joint that fixes that rotation"
+        )
+
+
+def find_redundancy(system: System, state: State) -> tuple[int, tuple[str, ...]]:
+    """Structural rank of the constraints outside the tree, and the parts that are redundant.
+
+    The rank is the largest over the start and two perturbed admissible configurations: a deficiency at the
+    start only (a flat parallelogram) is no redundancy.
+    """
+    count = system.structure.unknowns
+    if system.structure.multipliers == 0:
+        return 0, ()
+    best, names = -1, ()
+    key = jax.random.PRNGKey(0)
+    for attempt in range(3):
+        if attempt:
+            try:
+                state_now = assemble(system, _disturbed(system, state, jax.random.fold_in(key, attempt)))
+            except RuntimeError:
+                continue
+        else:
+            state_now = state
+        rows = np.asarray(_jacobian(system, state_now))[count:, :count]
+        rank, dependent = _rank(rows)
+        if rank > best:
+            best = rank
+            names = tuple(dict.fromkeys(unknown_name(system, count + r) for r in dependent))
+    return best, names
+
+
+def _disturbed(system: System, state: State, key) -> State:
+    points = state.q.reshape(-1, 4, 3)[:, 0]
+    extent = jnp.maximum(jnp.max(jnp.abs(points)), 1e-3)
+    noise = 0.05 * jax.random.normal(key, state.q.shape).reshape(-1, 4, 3)
+    scaled = noise.at[:, 0].multiply(extent).reshape(-1, 3)
+    return replace_fields(state, q=state.q + scaled, v=jnp.zeros_like(state.v))
+
+
+def _rank(rows: np.ndarray) -> tuple[int, list[int]]:
+    """Rank, and rows that depend on earlier ones (pivoted in order, so that later joints are named)."""
+    scales = np.linalg.norm(rows, axis=1)
+    rows = rows / np.where(scales > 0, scales, 1.0)[:, None]
+    basis: list[np.ndarray] = []
+    dependent = []
+    for number, row in enumerate(rows):
+        rest = row.copy()
+        for _ in range(2):
+            for b in basis:
+                rest = rest - (rest @ b) * b
+        if np.linalg.norm(rest) > 1e-6:
+            basis.append(rest / np.linalg.norm(rest))
+        else:
+            dependent.append(number)
+    return len(basis), dependent

@@ -1,0 +1,6 @@
+"""Pictures. matplotlib is imported here and nowhere else, and only when this package is."""
+
+from natcoord_jax.viz.animate import animate
+from natcoord_jax.viz.plot import Curve, Panel, plot, plot_panels
+
+__all__ = ["Curve", "Panel", "animate", "plot", "plot_panels"]

@@ -1,0 +1,149 @@
+"""Curves over time: energies, momenta, constraint errors, work and joint coordinates of a trajectory."""
+
+import math
+from typing import NamedTuple
+
+import matplotlib
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from natcoord_jax.assembly.system import System
+from natcoord_jax.core.state import Trajectory
+
+AXES = "xyz"
+LEGEND_ENTRIES = 10
+"""More curves than this in one panel go without a legend."""
+
+
+class Curve(NamedTuple):
+    """One curve: its label, times [s] and values; `dashed` sets it apart."""
+
+    label: str
+    t: np.ndarray
+    values: np.ndarray
+    dashed: bool = False
+
+
+class Panel(NamedTuple):
+    """One diagram over time: title, label of the ordinate with its unit, curves."""
+
+    title: str
+    ordinate: str
+    curves: list[Curve]
+    logarithmic: bool = False
+
+
+def _draw(axes: Axes, panel: Panel) -> None:
+    for curve in panel.curves:
+        style = "--" if curve.dashed else "-"
+        axes.plot(curve.t, curve.values, style, label=curve.label, linewidth=1.2)
+    if panel.logarithmic:
+        axes.set_yscale("log")
+    axes.set(title=panel.title, xlabel="t [s]", ylabel=panel.ordinate)
+    axes.grid(alpha=0.3)
+    if 1 < len(panel.curves) <= LEGEND_ENTRIES:
+        axes.legend(fontsize="small")
+
+
+def plot_panels(panels: list[Panel], *, columns: int = 2) -> Figure:
+    """Draw diagrams side by side.
+
+    Args:
+        panels: the diagrams.
+        columns: how many in a row.
+
+    Returns:
+        The figure; a notebook shows it once, a script shows it with `plt.show()`.
+    """
+    rows = math.ceil(len(panels) / columns)
+    figure, grid = plt.subplots(
+        rows, columns, figsize=(5.2 * columns, 3.4 * rows), layout="constrained", squeeze=False
+    )
+    for axes, panel in zip(grid.flat, panels, strict=False):
+        _draw(axes, panel)
+    for axes in grid.flat[len(panels) :]:
+        axes.set_visible(False)
+    if "inline" in matplotlib.get_backend():
+        plt.close(figure)  # the returned figure is shown by the notebook, not a second time by pyplot
+    return figure
+
+
+def _components(label: str, t: np.ndarray, vectors: np.ndarray) -> list[Curve]:
+    return [Curve(f"{label}{AXES[k]}", t, vectors[:, k]) for k in range(3)]
+
+
+def _energies(system: System, trajectory: Trajectory, t: np.ndarray) -> Panel:
+    energy, work = system.energy(trajectory), system.work(trajectory)
+    curves = [Curve("kinetic", t, np.asarray(energy.kinetic))]
+    curves += [Curve(name, t, np.asarray(values)) for name, values in energy.stores.items()]
+    if energy.stores:
+        curves.append(Curve("total", t, np.asarray(energy.total), dashed=True))
+    if work:
+        total = np.sum([np.asarray(w) for w in work.values()], axis=0)
+        curves.append(Curve("work", t, total, dashed=True))
+    return Panel("energy by store", "[J]", curves)
+
+
+def _coordinates(system: System, trajectory: Trajectory, t: np.ndarray) -> list[Panel]:
+    values, names = np.asarray(trajectory.states.coordinates), system.structure.coordinates
+    units = {int(i): group.axis.unit for group in system.coordinates for i in np.asarray(group.index)}
+    panels = []
+    for title, unit in (("joint angles", "rad"), ("joint displacements", "m")):
+        curves = [
+            Curve(name if k == 0 else f"{name} [{k}]", t, values[:, i])
+            for i, (name, k) in enumerate(names)
+            if units[i] == unit
+        ]
+        panels += [Panel(title, f"[{unit}]", curves)] if curves else []
+    return panels
+
+
+def plot(system: System, trajectory: Trajectory) -> Figure:
+    """Energies by store, momenta, constraint errors, work and joint coordinates over time.
+
+    Args:
+        system: compiled system.
+        trajectory: of one lane, computed with it.
+
+    Returns:
+        The figure.
+
+    Raises:
+        ValueError: for a trajectory of a batch.
+
+    Example:
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import natcoord_jax as nc
+        >>> scene = nc.Scene()
+        >>> ball = scene.add(nc.RigidBody(mass=1.0, inertia=(1.0, 2.0, 3.0), angular_velocity=(0, 1, 0.1)))
+        >>> system, state = scene.compile()
+        >>> figure = nc.plot(system, nc.simulate(system, state, dt=0.1, steps=10))
+    """
+    if trajectory.t.ndim != 1:
+        raise ValueError(f"plot takes one lane, not a batch of shape {trajectory.t.shape[:-1]}")
+    t = np.asarray(trajectory.t)
+    errors = system.constraint_errors(trajectory)
+    floor = np.finfo(float).tiny
+    constraints = [
+        Curve("positions [m, -]", t, np.maximum(errors.position, floor)),
+        Curve("velocities [m/s, 1/s]", t, np.maximum(errors.velocity, floor)),
+    ]
+    shown = [c for c in constraints if np.any(c.values > floor)]
+    panels = [
+        _energies(system, trajectory, t),
+        Panel("momentum", "L [kg m/s]", _components("L", t, np.asarray(system.momentum(trajectory)))),
+        Panel(
+            "angular momentum about the origin",
+            "J [kg m²/s]",
+            _components("J", t, np.asarray(system.angular_momentum(trajectory))),
+        ),
+        Panel("largest constraint errors", "", shown, logarithmic=bool(shown)),
+        *_coordinates(system, trajectory, t),
+    ]
+    work = system.work(trajectory)
+    if work:
+        curves = [Curve(name, t, np.asarray(values)) for name, values in work.items()]
+        panels.append(Panel("work of inputs, loads, dampers, drives", "[J]", curves))
+    return plot_panels(panels)
