@@ -3,6 +3,7 @@
 from typing import TYPE_CHECKING, Any
 
 from natcoord_jax.analysis import Balance, balance
+from natcoord_jax.assembly.posing import random_state
 from natcoord_jax.assembly.system import System
 from natcoord_jax.bodies import Box, Cylinder, Ellipsoid, PointMass, RigidBody, Sphere
 from natcoord_jax.core.force import Field, Force, Load
@@ -101,6 +102,7 @@ __all__ = [
     "ground",
     "linearise",
     "plot",
+    "random_state",
     "simulate",
     "step",
 ]
