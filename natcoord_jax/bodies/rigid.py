@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.bodies.shapes import Shape
 from natcoord_jax.core.bodies import Body
-from natcoord_jax.core.checks import is_concrete, numbers, positive, require_double
+from natcoord_jax.core.checks import is_concrete, numbers, positive, require_double, shape_of
 from natcoord_jax.maths.rotations import from_axis_angle, from_quaternion
 
 SYMMETRY_TOLERANCE = 1e-9
@@ -24,12 +24,12 @@ def orientation(value: Any, label: str) -> Float[Array, "3 3"]:
     what = f"{label}: orientation"
     if value is None:
         return jnp.eye(3)
-    if isinstance(value, tuple) and len(value) == 2 and np.ndim(value[1]) == 0 and np.shape(value[0]) == (3,):
+    if isinstance(value, tuple) and len(value) == 2 and shape_of(value[0]) == (3,):
         axis = numbers(value[0], (3,), f"{what} axis", "-")
         if is_concrete(axis) and not float(jnp.sum(axis**2)) > 0:
             raise ValueError(f"{what} axis [-] is zero; pass a direction")
         return from_axis_angle(axis, numbers(value[1], (), f"{what} angle", "rad"))
-    if jnp.shape(value) == (4,):
+    if shape_of(value) == (4,):
         quaternion = numbers(value, (4,), f"{what} quaternion", "-")
         if is_concrete(quaternion) and not float(jnp.sum(quaternion**2)) > 0:
             raise ValueError(f"{what} quaternion [-] is zero; pass (w, x, y, z) with a length")
@@ -47,7 +47,7 @@ def orientation(value: Any, label: str) -> Float[Array, "3 3"]:
 
 
 def _full_inertia(value: Any, what: str, unit: str) -> Float[Array, "3 3"]:
-    if jnp.shape(value) == (3,):
+    if shape_of(value) == (3,):
         return jnp.diag(numbers(value, (3,), what, unit))
     matrix = numbers(value, (3, 3), what, unit)
     if is_concrete(matrix):

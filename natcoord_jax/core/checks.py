@@ -26,6 +26,14 @@ def require_double(where: str) -> None:
         )
 
 
+def shape_of(value: Any) -> tuple[int, ...] | None:
+    """Shape of anything `jnp.asarray` takes; None for what is no array of numbers."""
+    try:
+        return jnp.asarray(value, float).shape
+    except (TypeError, ValueError):
+        return None
+
+
 def numbers(value: Any, shape: tuple[int, ...], what: str, unit: str) -> Array:
     """Value as a float array of the given shape, finite if concrete.
 
