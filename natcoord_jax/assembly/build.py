@@ -37,12 +37,12 @@ class Poses:
         """Number of a body; the number of bodies for the ground."""
         return self.number[handle.name]
 
-    def point(self, body: int, position: Array) -> Float[Array, "4"]:
+    def point(self, body: int, position: Any) -> Float[Array, "4"]:
         """Weights of the material point at a world position."""
         local = self.rotation[body].T @ (jnp.asarray(position, float) - self.position[body])
         return jnp.concatenate([jnp.ones(1), local])
 
-    def direction(self, body: int, vector: Array) -> Float[Array, "4"]:
+    def direction(self, body: int, vector: Any) -> Float[Array, "4"]:
         """Weights of the direction along a world vector."""
         return jnp.concatenate([jnp.zeros(1), self.rotation[body].T @ jnp.asarray(vector, float)])
 

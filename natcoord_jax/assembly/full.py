@@ -105,7 +105,7 @@ class FullStep(eqx.Module):
         every, rows = self._with_ground(twists), []
         for group, where, lam in zip(self.groups, self.situations, multipliers):
             evaluate, _ = over_instances(group, where, self.tableau)
-            wrench, g_rates, *_ = evaluate(self.start[group.bodies], every[group.bodies], lam)
+            wrench, g_rates = evaluate(self.start[group.bodies], every[group.bodies], lam)
             added = jnp.zeros_like(total).at[group.bodies].add(wrench)
             size = size + jnp.sum(scale * added[:-1] ** 2)
             total = total - added
@@ -153,10 +153,6 @@ class FullStep(eqx.Module):
         twist = jnp.concatenate([self.velocity[:, 0], spin], axis=1)[:, None]
         twists = jnp.broadcast_to(twist, (self.bodies, self.tableau.stages, 6)).reshape(-1)
         return jnp.concatenate([twists, jnp.zeros(self.unknowns - self.balances, twists.dtype)])
-
-    def approximate(self) -> None:
-        """No cheaper matrix than the Jacobian."""
-        return None
 
     def end_motion(self, y: Float[Array, " unknowns"]) -> tuple[Stations, list[Array]]:
         """Stage motion of all bodies and the multipliers, for the end of the step."""

@@ -114,6 +114,7 @@ def make_tree(spanning: Spanning, motions: list[Edge]) -> Tree:
                 tuple(sorted({k for m in these for k in m.translations})),
                 any(m.child_rotation for m in these),
                 level == 0,
+                any(len(m.rotations) == 3 for m in these),
             )
         )
         local[here] = 0 if level == 0 else parent[here] - levels[-2].start
@@ -125,4 +126,5 @@ def make_tree(spanning: Spanning, motions: list[Edge]) -> Tree:
             if motion.child_rotation:
                 order[body] = (0, 3, 2, 1)  # the child's axis becomes the parent's
     slots = np.array(slot_of, np.int32)
-    return Tree(parent, local, slot_index, slots, side, order, tuple(levels), any(spanning.reverse))
+    ball = np.array([len(m.rotations) == 3 for m in motions])
+    return Tree(parent, local, slot_index, slots, side, order, ball, tuple(levels), any(spanning.reverse))

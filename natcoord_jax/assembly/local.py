@@ -65,13 +65,14 @@ def effect_balance(
     lam: Float[Array, "s m"],
     where: Situation,
     tableau: Tableau,
-) -> tuple[Float[Array, "k s 6"], Float[Array, "s m"], Float[Array, "s k 4 3"], Float[Array, "s k 3"]]:
-    """Impulsive wrench of one effect on its bodies, its constraint rates, and the impulses on rows."""
+) -> tuple[Float[Array, "k s 6"], Float[Array, "s m"]]:
+    """Impulsive wrench of one effect on its bodies, and its constraint rates."""
     motion = body_motion(start, twists, where.h, tableau)
     answer = effect.respond(place, motion, Now(where.t, where.h, inputs, coordinates, rates, tableau), lam)
     scale = 1.0 if group.effect.impulsive else where.h
-    forces, torques = scale * answer.forces, scale * answer.torques
-    return wrenches(forces, torques, motion), answer.rows, forces, torques
+    forces = jnp.zeros_like(motion.rows) if answer.forces is None else scale * answer.forces
+    torques = jnp.zeros_like(motion.spin) if answer.torques is None else scale * answer.torques
+    return wrenches(forces, torques, motion), answer.rows
 
 
 def over_instances(group: Group, where: Situation, tableau: Tableau):
@@ -92,7 +93,7 @@ def over_instances(group: Group, where: Situation, tableau: Tableau):
     def all_jacobians(start, twists, lam):
         def jacobian(effect, place, inputs, coordinates, rates, start, twists, lam):
             def f(twists, lam):
-                return one(effect, place, inputs, coordinates, rates, start, twists, lam)[:2]
+                return one(effect, place, inputs, coordinates, rates, start, twists, lam)
 
             return jax.jacfwd(f, argnums=(0, 1))(twists, lam)
 

@@ -86,10 +86,6 @@ class Projection(eqx.Module):
         """That of the step."""
         return self.step.jacobian(y)
 
-    def approximate(self) -> None:
-        """No cheaper matrix than the Jacobian."""
-        return None
-
     def moved(self, y: Float[Array, " unknowns"]) -> Float[Array, "rows 3"]:
         """Mean velocities of all rows: the displacement of positions, or the projected velocities."""
         at, _ = self.step.end_motion(y)

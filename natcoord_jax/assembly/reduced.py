@@ -30,9 +30,7 @@ from natcoord_jax.assembly.tree import (
     joint_rates,
     project,
     sweep_motion,
-    tangent,
 )
-from natcoord_jax.core.effect import Response
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import Tableau, gauss
 from natcoord_jax.maths.vectors import cross
@@ -136,32 +134,35 @@ class ReducedStep(eqx.Module):
         momentum = stage_momentum(system.mass, rates - self.velocity, tableau)
         weights = row_weights(system.mass)[..., None]
         size = jnp.sum(weights * (momentum**2 + 4 * inertia(system.mass, self.velocity) ** 2))
-        torque = jnp.zeros_like(motion.spin)
+        torque = None
         rows = []
         groups = active_groups(system)
         at = self.stations(motion) if groups else None
         for group, where, lam in zip(groups, self.situations, multipliers):
             answer = respond(group, where, gather(group, at), lam, tableau)
-            forces, turning = self._scatter(group, answer)
-            momentum = momentum - forces
-            torque = torque - turning
-            size = size + jnp.sum(weights * forces**2) + jnp.sum(weights[:, 1] * turning**2)
+            scale = 1.0 if group.effect.impulsive else self.h
+            if answer.forces is not None:
+                forces = self._scatter(group, scale * answer.forces)
+                momentum = momentum - forces
+                size = size + jnp.sum(weights * forces**2)
+            if answer.torques is not None:
+                turning = self._scatter(group, scale * answer.torques)
+                torque = turning if torque is None else torque + turning
+                size = size + jnp.sum(weights[:, 1] * turning**2)
             rows.append(answer.rows.reshape(-1))
         force, moment = wrench(momentum, motion.directors)
-        generalised = project(system.tree, geometry, force, moment + torque)[0]
+        moment = moment if torque is None else moment - torque
+        generalised = project(system.tree, geometry, force, moment)[0]
         return jnp.concatenate([generalised.reshape(-1), *rows]), jnp.sqrt(size)
 
-    def _scatter(self, group: Group, answer: Response) -> tuple[Array, Array]:
-        """Impulses on rows and angular impulses on bodies; some effects answer with impulses already."""
-        scale = 1.0 if group.effect.impulsive else self.h
-        forces = scale * jnp.moveaxis(answer.forces, 1, 0)
-        turning = scale * jnp.moveaxis(answer.torques, 1, 0)
+    def _scatter(self, group: Group, loads: Float[Array, "n s k *rest"]) -> Float[Array, "s bodies *rest"]:
+        """Sum of the loads of all instances by body; those on the ground fall away."""
+        loads = jnp.moveaxis(loads, 1, 0)
         if group.source == "mass":
-            return forces[:, :, 0], turning[:, :, 0]
-        bodies, stages = self.start.shape[0], self.tableau.stages
-        rows = jnp.zeros((stages, bodies + 1, 4, 3), forces.dtype).at[:, group.bodies].add(forces)
-        turns = jnp.zeros((stages, bodies + 1, 3), forces.dtype).at[:, group.bodies].add(turning)
-        return rows[:, :bodies], turns[:, :bodies]
+            return loads[:, :, 0]
+        bodies = self.start.shape[0]
+        total = jnp.zeros((self.tableau.stages, bodies + 1, *loads.shape[3:]), loads.dtype)
+        return total.at[:, group.bodies].add(loads)[:, :bodies]
 
     def _start_geometry(self) -> list[JointGeometry]:
         zero = jnp.zeros((1, self.system.structure.unknowns), self.start.dtype)
@@ -175,38 +176,14 @@ class ReducedStep(eqx.Module):
         w = jnp.tile(w.reshape(-1), self.tableau.stages)
         return jnp.concatenate([w, jnp.zeros(self.system.structure.multipliers * self.tableau.stages)])
 
-    def inertia_matrix(self) -> Float[Array, "unknowns unknowns"]:
-        """P^T M P at the start of the step."""
-        system, geometry = self.system, self._start_geometry()
-        directors = self.start[None, :, 1:]
-
-        def column(unit: Array) -> Array:
-            velocity, spin = tangent(system.tree, geometry, gather_slots(system.tree, unit[None]))
-            rates = jnp.concatenate([velocity[:, :, None], cross(spin[:, :, None], directors)], axis=2)
-            force, moment = wrench(inertia(system.mass, rates), directors)
-            return project(system.tree, geometry, force, moment)[0][0]
-
-        return jax.vmap(column)(jnp.eye(system.structure.unknowns, dtype=self.start.dtype))
-
     def jacobian(self, y: Float[Array, " unknowns"]) -> Float[Array, "unknowns unknowns"]:
         """Exact Jacobian of the residual."""
         return jax.jacfwd(lambda x: self.residual(x)[0])(y)
-
-    def approximate(self) -> Float[Array, "unknowns unknowns"] | None:
-        """Twice the inertia matrix where it will do: one stage, no springs, dampers or loops."""
-        if self.tableau.stages > 1 or any(stiff(g) for g in self.groups):
-            return None
-        return 2.0 * self.inertia_matrix()
 
     def end_motion(self, y: Float[Array, " unknowns"]) -> tuple[Stations, list[Array]]:
         """Stage motion of all bodies and the multipliers, for the end of the step."""
         w, multipliers = self.split(y)
         return self.stations(self.motion(w)[0]), multipliers
-
-
-def stiff(group: Group) -> bool:
-    """Whether an effect belongs into the Jacobian of the first iterations."""
-    return not (group.source == "mass" or group.effect.inputs > 0) or group.multipliers > 0
 
 
 def stage_momentum(

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from natcoord_jax.maths.collocation import Tableau, rotate_stages
 from natcoord_jax.maths.vectors import cross, dot
@@ -28,7 +28,10 @@ SLOTS = 7
 
 @dataclass(frozen=True)
 class Level:
-    """Bodies `start` to `stop` at one depth, and the union of their joints' free motions."""
+    """Bodies `start` to `stop` at one depth, and the union of their joints' free motions.
+
+    `grounded`: all parents are the ground; `balls`: some joints leave all rotations free.
+    """
 
     start: int
     stop: int
@@ -36,6 +39,7 @@ class Level:
     translations: tuple[int, ...]
     child_rotation: bool
     grounded: bool
+    balls: bool
 
     @property
     def slots(self) -> tuple[int, ...]:
@@ -54,6 +58,8 @@ class Tree(eqx.Module):
         slot_of: body * 7 + slot of each unknown.
         side: (parent, child) frame of each joint as the tree uses it, exchanged where it is used backwards.
         order: rows (point, axis 1, 2, 3) of those frames as the tree uses them.
+        ball: bodies whose joint leaves all rotations free; their rates are components along the child's
+            axes at the start of the step, in which the inertia matrix changes least.
         levels: shapes of the levels.
         backwards: whether any joint is used from child to parent.
     """
@@ -64,6 +70,7 @@ class Tree(eqx.Module):
     slot_of: Int[Array | np.ndarray, " unknowns"]
     side: Int[Array | np.ndarray, "bodies 2"]
     order: Int[Array | np.ndarray, "bodies 4"]
+    ball: Bool[Array | np.ndarray, " bodies"]
     levels: tuple[Level, ...] = eqx.field(static=True)
     backwards: bool = eqx.field(static=True)
 
@@ -154,11 +161,16 @@ def sweep_motion(
             point_p, start_d_p = parent_rows[:, 0], parent_rows[:, 1:]
         needs = bool(level.rotations or level.translations)
         parent_axes = _frame_axes(place[:, 0, 1:, 1:], d_p) if needs else None
+        slides = _translations(level, parent_axes) if level.translations else []
         axes = [parent_axes[:, :, k] for k in level.rotations]
+        if level.balls:
+            own_axes = _frame_axes(place[:, 1, 1:, 1:], d0)
+            ball = tree.ball[here][:, None]
+            axes = [jnp.where(ball, own_axes[:, :, k], a) for k, a in zip(level.rotations, axes)]
+            slides = [jnp.where(ball, own_axes[:, :, k], t) for k, t in zip(level.translations, slides)]
         spin = spin_p
         for k, axis in zip(level.rotations, axes):
             spin = spin + rate[:, :, k, None] * axis
-        slides = _translations(level, parent_axes) if level.translations else []
         child_axis = []
         if level.child_rotation:
             start = _combine(place[:, 1, 1, 1:], d0)

@@ -42,8 +42,8 @@ class UnitLoad(eqx.Module):
     """
 
     rate: Float[Array, " s"]
-    forces: Float[Array, "s 2 4 3"]
-    torques: Float[Array, "s 2 3"]
+    forces: Float[Array, "s 2 4 3"] | None
+    torques: Float[Array, "s 2 3"] | None
 
 
 @dataclass(frozen=True)
@@ -109,10 +109,21 @@ class CoordinateEffect(Effect):
         forces, rows, power = self.generalised(rates, now, lam)
         on_rows, torques = [], []
         for k, load in enumerate(loads):
-            factor = forces[:, k, None, None, None]
-            on_rows.append(factor * jnp.einsum("bma,sbmc->sbac", place[k], load.forces))
-            torques.append(factor[..., 0] * load.torques)
-        return Response(jnp.concatenate(on_rows, 1), jnp.concatenate(torques, 1), rows, power)
+            factor = forces[:, k, None, None]
+            if load.forces is not None:
+                on_rows.append((k, factor[..., None] * jnp.einsum("bma,sbmc->sbac", place[k], load.forces)))
+            if load.torques is not None:
+                torques.append((k, factor * load.torques))
+        return Response(_joined(on_rows, len(loads)), _joined(torques, len(loads)), rows, power)
+
+
+def _joined(parts: list[tuple[int, Array]], count: int) -> Array | None:
+    """Loads of all coordinates along the axis of bodies, zero where a coordinate has none; None without any."""
+    if not parts:
+        return None
+    given = dict(parts)
+    nothing = jnp.zeros_like(parts[0][1])
+    return jnp.concatenate([given.get(k, nothing) for k in range(count)], axis=1)
 
 
 class CoordinatePotential(CoordinateEffect):

@@ -71,14 +71,14 @@ class Response(eqx.Module):
     """What an effect answers for the stages of a step.
 
     Attributes:
-        forces: forces on the rows of its bodies [N for points, N m for directors].
-        torques: torques on its bodies [N m]; in the rows these are the contravariant forces (61).
+        forces: forces on the rows of its bodies [N for points, N m for directors]; None: there are none.
+        torques: torques on its bodies [N m], in the rows the contravariant forces (61); None: there are none.
         rows: rates of its constraints, which the step sets to zero.
         power: power delivered to the bodies [W], for work accounts.
     """
 
-    forces: Float[Array, "s k 4 3"]
-    torques: Float[Array, "s k 3"]
+    forces: Float[Array, "s k 4 3"] | None
+    torques: Float[Array, "s k 3"] | None
     rows: Float[Array, "s m"]
     power: Float[Array, " s"]
 

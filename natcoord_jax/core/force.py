@@ -20,12 +20,12 @@ class Load(eqx.Module):
     """What a force puts on its markers.
 
     Attributes:
-        forces: on the marker vectors: [N] on points, [N m] on directions.
-        torques: on the bodies of the markers [N m].
+        forces: on the marker vectors: [N] on points, [N m] on directions; None: there are none.
+        torques: on the bodies of the markers [N m]; None: there are none.
     """
 
-    forces: Float[Array, "k 3"]
-    torques: Float[Array, "k 3"]
+    forces: Float[Array, "k 3"] | None
+    torques: Float[Array, "k 3"] | None
 
 
 class Force(Effect):
@@ -43,7 +43,7 @@ class Force(Effect):
         >>> class Drag(nc.Force):
         ...     coefficient: float = 0.1
         ...     def load(self, x, rate, inputs, t):
-        ...         return nc.Load(-self.coefficient * rate, 0 * rate)
+        ...         return nc.Load(-self.coefficient * rate, None)
     """
 
     markers: Any
@@ -102,7 +102,7 @@ class Field(Effect):
         stages = now.tableau.stages
         forces = jnp.broadcast_to(forces, (stages, 1, 4, 3))
         power = jnp.sum(forces * motion.rates, axis=(1, 2, 3))
-        return Response(forces, jnp.zeros((stages, 1, 3)), jnp.zeros((stages, 0)), power)
+        return Response(forces, None, jnp.zeros((stages, 0)), power)
 
     def stored(self, place: Array, rows: Array, coordinates: Array, rates: Array) -> Array:
         """Potential energy [J], zero where all rows with mass are at the origin."""

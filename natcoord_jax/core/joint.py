@@ -113,4 +113,4 @@ class Joint(Effect):
             return g_rate, jax.vjp(constraint, rows)[1](multiplier)[0]
 
         g_rates, forces = jax.vmap(stage)(motion.rows, motion.rates, lam)
-        return Response(forces, jnp.zeros_like(motion.spin), g_rates, jnp.zeros(now.tableau.stages))
+        return Response(forces, None, g_rates, jnp.zeros(now.tableau.stages))

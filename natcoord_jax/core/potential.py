@@ -70,7 +70,7 @@ class Potential(Effect):
         steps = jax.vmap(lambda xi, vi: jax.jvp(self.invariants, (xi,), (vi,))[1])(x, now.h * rates)
         gradient = averaged_gradient(self.energy, start, steps, now.tableau, self.degree)
         forces = jax.vmap(lambda xi, gi: jax.vjp(self.invariants, xi)[1](-gi)[0])(x, gradient)
-        return marker_response(place, forces, jnp.zeros_like(motion.spin), rates, motion)
+        return marker_response(place, forces, None, rates, motion)
 
     def stored(self, place: Array, rows: Array, coordinates: Array, rates: Array) -> Array:
         """Energy [J]."""
@@ -79,12 +79,17 @@ class Potential(Effect):
 
 def marker_response(
     place: Float[Array, "k 4"],
-    forces: Float[Array, "s k 3"],
-    torques: Float[Array, "s k 3"],
+    forces: Float[Array, "s k 3"] | None,
+    torques: Float[Array, "s k 3"] | None,
     rates: Float[Array, "s k 3"],
     motion: Motion,
 ) -> Response:
     """Response of forces [N] on markers and torques [N m] on their bodies."""
-    power = jnp.sum(forces * rates, axis=(-1, -2)) + jnp.sum(torques * motion.spin, axis=(-1, -2))
-    on_rows = place[:, :, None] * forces[:, :, None, :]
-    return Response(on_rows, torques, jnp.zeros((forces.shape[0], 0)), power)
+    stages = rates.shape[0]
+    power, on_rows = jnp.zeros(stages, rates.dtype), None
+    if forces is not None:
+        power = power + jnp.sum(forces * rates, axis=(-1, -2))
+        on_rows = place[:, :, None] * forces[:, :, None, :]
+    if torques is not None:
+        power = power + jnp.sum(torques * motion.spin, axis=(-1, -2))
+    return Response(on_rows, torques, jnp.zeros((stages, 0)), power)

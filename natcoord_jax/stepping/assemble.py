@@ -17,7 +17,7 @@ from natcoord_jax.core.checks import is_concrete
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.rotations import orthonormalise
 from natcoord_jax.stepping.factorise import dense_differentiable
-from natcoord_jax.stepping.newton import newton
+from natcoord_jax.stepping.newton import cold, newton
 
 TOLERANCE = 1e-14
 """Accuracy of the projection relative to the extent of the system."""
@@ -26,7 +26,8 @@ TOLERANCE = 1e-14
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _solve(make: Any, system: System, state: State) -> tuple[Array, Array]:
     """Unknowns and result code of a projection, differentiated implicitly."""
-    solution = newton(make(system, state), TOLERANCE, form="full")
+    equations = make(system, state)
+    solution = newton(equations, TOLERANCE, "full", cold(equations, "full"))
     return solution.y, solution.code
 
 

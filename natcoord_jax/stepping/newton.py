@@ -1,8 +1,8 @@
 """Newton's iteration to the round-off floor, in while loops.
 
-One factorisation serves as long as the corrections shrink quickly; then the Jacobian is formed anew. Where
-the inertia matrix alone will do (no springs, dampers or loops), it serves first, and the loop over exact
-Jacobians makes no trip in the usual case, which costs nothing, also under vmap.
+One factorisation serves, over many steps, as long as the corrections shrink quickly; then the Jacobian is
+formed anew. Rates along body axes make it change little. The loop that forms Jacobians makes no trip in the
+usual case, which costs nothing; under vmap all lanes form theirs together when one needs to.
 """
 
 from functools import partial
@@ -11,7 +11,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from natcoord_jax.core.results import Result
 from natcoord_jax.stepping.factorise import FACTORISATIONS
@@ -22,7 +22,7 @@ TOLERANCE = 5e-15
 STALL = 2000.0
 """Corrections that stop shrinking below STALL * tolerance have reached the floor of round-off."""
 
-CHORD_ITERATIONS = 16
+CHORD_ITERATIONS = 10
 """Corrections with one factorisation."""
 
 NEWTON_ROUNDS = 25
@@ -30,6 +30,20 @@ NEWTON_ROUNDS = 25
 
 CONTRACTION = 0.35
 """Slowest contraction at which a factorisation is kept."""
+
+
+@jax.custom_batching.custom_vmap
+def any_lane(x: Bool[Array, ""]) -> Bool[Array, ""]:
+    """Whether it holds in any lane of a vmap: keeps the condition of a loop the same for all lanes.
+
+    A loop whose condition differs between lanes would copy all that it carries, in every trip.
+    """
+    return x
+
+
+@any_lane.def_vmap
+def _any_lane_rule(axis_size: int, in_batched: list[bool], x: Array) -> tuple[Array, bool]:
+    return any_lane(jnp.any(x, axis=0)), False
 
 
 class Solution(eqx.Module):
@@ -40,12 +54,14 @@ class Solution(eqx.Module):
         code: result code.
         iterations: evaluations of the residual.
         error: size of the last correction relative to the terms of the equations.
+        warm: the start of the next step.
     """
 
     y: Float[Array, " unknowns"]
     code: Int[Array, ""]
     iterations: Int[Array, ""]
     error: Float[Array, ""]
+    warm: Any
 
 
 class _Iterate(eqx.Module):
@@ -82,48 +98,70 @@ def _chord(equations: Any, factors: Any, inertias: Array, tolerance: Any, start:
     def go_on(it: _Iterate) -> Array:
         return ~it.converged & ~it.slow & it.finite & (it.count < CHORD_ITERATIONS)
 
-    restart = eqx.tree_at(
-        lambda it: (it.count, it.slow, it.correction),
-        start,
-        (jnp.array(0), jnp.array(False), jnp.zeros_like(start.correction)),
-    )
+    fresh = (jnp.array(0), jnp.zeros_like(start.correction))
+    restart = eqx.tree_at(lambda it: (it.count, it.correction), start, fresh)
     return jax.lax.while_loop(go_on, partial(_iterate, equations, factors, inertias, tolerance), restart)
 
 
-def newton(equations: Any, tolerance: Float[Array, ""] | float, form: str) -> Solution:
+class Warm(eqx.Module):
+    """What one step leaves to the next: where to start, and factors that may still serve.
+
+    Attributes:
+        y: guess of the unknowns.
+        factors: factors of an earlier Jacobian.
+        inertias: inertias of the unknowns that came with them.
+        valid: whether the factors are any good.
+    """
+
+    y: Float[Array, " unknowns"]
+    factors: Any
+    inertias: Float[Array, " unknowns"]
+    valid: Bool[Array, ""]
+
+
+def cold(equations: Any, form: str) -> Warm:
+    """A start without factors."""
+    y = equations.guess()
+    shapes = jax.eval_shape(lambda y: FACTORISATIONS[form](equations, equations.jacobian(y)), y)
+    factors, inertias = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+    return Warm(y, factors, inertias, jnp.array(False))
+
+
+def newton(equations: Any, tolerance: Float[Array, ""] | float, form: str, warm: Warm) -> Solution:
     """Solve the equations of one step.
 
     Args:
-        equations: a prepared step (`residual`, `guess`, `approximate`, `jacobian`).
+        equations: a prepared step (`residual`, `guess`, `jacobian`).
         tolerance: see `TOLERANCE`.
         form: form of the equations, which decides the factorisation.
+        warm: where to start.
 
     Returns:
-        The solution; its code is successful, max_iterations, diverged or nonfinite, never an exception.
+        The solution; its code is successful, max_iterations or nonfinite, never an exception.
     """
     factorise = FACTORISATIONS[form]
-    guess = equations.guess()
-    zero, no, nought = jnp.zeros((), guess.dtype), jnp.array(False), jnp.array(0)
-    it = _Iterate(guess, zero, zero, nought, nought, no, no, jnp.array(True))
-    cheap = equations.approximate()
-    if cheap is not None:
-        with jax.named_scope("chord"):
-            it = _chord(equations, *factorise(equations, cheap), tolerance, it)
-        lost = ~it.finite
-        it = eqx.tree_at(lambda x: (x.y, x.finite), it, (jnp.where(lost, guess, it.y), jnp.array(True)))
+    zero, no, nought = jnp.zeros((), warm.y.dtype), jnp.array(False), jnp.array(0)
+    start = _Iterate(warm.y, zero, zero, nought, nought, no, ~warm.valid, jnp.array(True))
+    with jax.named_scope("chord"):
+        it = _chord(equations, warm.factors, warm.inertias, tolerance, start)
+    usable = it.finite
+    it = eqx.tree_at(lambda x: (x.y, x.finite), it, (jnp.where(usable, it.y, warm.y), jnp.array(True)))
 
-    def refactor(carry: tuple[_Iterate, Array]) -> tuple[_Iterate, Array]:
-        it, rounds = carry
+    def refactor(carry: tuple) -> tuple:
+        it, _, _, rounds = carry
         factors, inertias = factorise(equations, equations.jacobian(it.y))
-        return _chord(equations, factors, inertias, tolerance, it), rounds + 1
+        again = eqx.tree_at(lambda x: x.slow, it, it.converged)
+        return _chord(equations, factors, inertias, tolerance, again), factors, inertias, rounds + 1
 
-    def unsolved(carry: tuple[_Iterate, Array]) -> Array:
-        it, rounds = carry
-        return ~it.converged & it.finite & (rounds < NEWTON_ROUNDS)
+    def unsolved(carry: tuple) -> Array:
+        it, _, _, rounds = carry
+        return any_lane(~it.converged & it.finite & (rounds < NEWTON_ROUNDS))
 
     with jax.named_scope("newton"):
-        it, rounds = jax.lax.while_loop(unsolved, refactor, (it, nought))
+        carry = (it, warm.factors, warm.inertias, nought)
+        it, factors, inertias, rounds = jax.lax.while_loop(unsolved, refactor, carry)
     failed = jnp.where(it.finite, int(Result.MAX_ITERATIONS), int(Result.NONFINITE))
     code = jnp.where(it.converged, int(Result.SUCCESSFUL), failed)
     error = it.correction / jnp.where(it.size > 0, it.size, 1.0)
-    return Solution(it.y, code, it.total, error)
+    left = Warm(it.y, factors, inertias, it.converged)
+    return Solution(it.y, code, it.total, error, left)

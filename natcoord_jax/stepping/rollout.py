@@ -26,7 +26,8 @@ from natcoord_jax.assembly.system import System
 from natcoord_jax.core.results import Result
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import gauss
-from natcoord_jax.stepping.step import advance, linear_solver, solve
+from natcoord_jax.stepping.newton import Warm, any_lane
+from natcoord_jax.stepping.step import advance, linear_solver, solve, start_cold
 
 SMALLEST_FRACTION = 1.0 / 64
 """A step is given up when a substep of this fraction of it fails."""
@@ -74,9 +75,14 @@ class Slots(eqx.Module):
 
 
 class Course(eqx.Module):
-    """Where a rollout stands: carried from slot to slot."""
+    """Where a rollout stands: carried from slot to slot.
+
+    `warm` is what the last step left to the next, `before` the unknowns of the last accepted step.
+    """
 
     state: State
+    warm: Warm
+    before: Float[Array, " unknowns"]
     step: Int[Array, ""]
     done: Float[Array, ""]
     fraction: Float[Array, ""]
@@ -88,12 +94,14 @@ class Course(eqx.Module):
     residual: Float[Array, ""]
 
 
-def _start(state: State, dt: Float[Array, ""]) -> Course:
+def _start(plan: Plan, system: System, state: State, parameters: Any, dt: Float[Array, ""]) -> Course:
+    u = plan.control(parameters, jnp.array(0), state.t, state)
+    warm = start_cold(system, state, u, dt, gauss(plan.stages))
     zero = jnp.array(0)
     bad = ~(jnp.isfinite(dt) & (dt > 0))
     code = jnp.where(bad, int(Result.BAD_STEP), int(Result.SUCCESSFUL))
     nought = jnp.zeros((), state.q.dtype)
-    return Course(state, zero, nought, nought + 1.0, code, bad, zero, zero, zero, nought)
+    return Course(state, warm, warm.y, zero, nought, nought + 1.0, code, bad, zero, zero, zero, nought)
 
 
 def _slot(plan: Plan, system: System, parameters: Any, dt: Array, course: Course) -> tuple[Course, Slots]:
@@ -104,7 +112,7 @@ def _slot(plan: Plan, system: System, parameters: Any, dt: Array, course: Course
     h = jnp.where(idle, jnp.ones_like(h) * 1e-3, h)
     index = jnp.minimum(course.step, plan.steps - 1)
     u = plan.control(parameters, index, state.t, state)
-    solution = solve(system, state, u, h, tableau, plan.tolerance)
+    solution = solve(system, state, u, h, tableau, plan.tolerance, course.warm)
     new = advance(system, state, u, h, solution.y, tableau)[1]
     sound = (solution.code == int(Result.SUCCESSFUL)) & jnp.all(jnp.isfinite(new.q)) & jnp.all(jnp.isfinite(new.v))
     accepted = sound & ~idle
@@ -124,8 +132,12 @@ def _slot(plan: Plan, system: System, parameters: Any, dt: Array, course: Course
     fraction = jnp.where(complete, 1.0, jnp.where(accepted | idle, course.fraction, halved))
     done = jnp.where(complete, 0.0, done)
     worked = jnp.where(idle, 0, solution.iterations)
+    ahead = jnp.where(accepted, 2 * solution.y - course.before, course.warm.y)
+    sane = jnp.where(jnp.all(jnp.isfinite(ahead)), ahead, course.before)
     following = Course(
         new,
+        eqx.tree_at(lambda w: (w.y, w.valid), solution.warm, (sane, accepted & solution.warm.valid)),
+        jnp.where(accepted, solution.y, course.before),
         course.step + complete,
         done,
         fraction,
@@ -140,25 +152,10 @@ def _slot(plan: Plan, system: System, parameters: Any, dt: Array, course: Course
     return following, record
 
 
-@jax.custom_batching.custom_vmap
-def any_lane(x: Bool[Array, ""]) -> Bool[Array, ""]:
-    """Whether it holds in any lane of a vmap: keeps the condition of a loop the same for all lanes.
-
-    A loop whose condition differs between lanes would copy all that it carries, the whole record, in
-    every trip.
-    """
-    return x
-
-
-@any_lane.def_vmap
-def _any_lane_rule(axis_size: int, in_batched: list[bool], x: Array) -> tuple[Array, bool]:
-    return any_lane(jnp.any(x, axis=0)), False
-
-
 def _run(plan: Plan, system: System, state: State, parameters: Any, dt: Array) -> tuple[Slots, Course]:
     attempt = partial(_slot, plan, system, parameters, dt)
     length = plan.steps + plan.extra
-    start = _start(state, dt)
+    start = _start(plan, system, state, parameters, dt)
     shapes = jax.eval_shape(attempt, start)[1]
     buffer = jax.tree.map(lambda x: jnp.zeros((length, *x.shape), x.dtype), shapes)
 
@@ -175,7 +172,7 @@ def _run(plan: Plan, system: System, state: State, parameters: Any, dt: Array) -
     count, course, slots = jax.lax.while_loop(unfinished, body, (jnp.array(0), start, buffer))
     unused = jnp.arange(length) >= count
 
-    def fill(x: Array, last: Array) -> Array:
+    def fill(x: Array, last: Array | float) -> Array:
         return jnp.where(unused.reshape(-1, *(1,) * (x.ndim - 1)), last, x)
 
     slots = eqx.tree_at(

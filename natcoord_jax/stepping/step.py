@@ -14,14 +14,19 @@ from natcoord_jax.core.effect import Motion
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import Tableau
 from natcoord_jax.stepping.factorise import differentiable_solver
-from natcoord_jax.stepping.newton import Solution, newton
+from natcoord_jax.stepping.newton import Solution, Warm, cold, newton
+
+
+def start_cold(system: System, state: State, u: Array, h: Array, tableau: Tableau) -> Warm:
+    """Start of the first step of a rollout."""
+    return cold(prepare(system, state, u, h, tableau), system.structure.solver)
 
 
 def solve(
-    system: System, state: State, u: Array, h: Array, tableau: Tableau, tolerance: float
+    system: System, state: State, u: Array, h: Array, tableau: Tableau, tolerance: float, warm: Warm
 ) -> Solution:
     """Unknowns of one step; no derivatives pass (see `advance` and the rollout)."""
-    return newton(prepare(system, state, u, h, tableau), tolerance, system.structure.solver)
+    return newton(prepare(system, state, u, h, tableau), tolerance, system.structure.solver, warm)
 
 
 def _coordinate_rates(group: CoordinateGroup, system: System, at: Stations, h: Array) -> Float[Array, "s n"]:

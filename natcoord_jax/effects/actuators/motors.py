@@ -49,7 +49,7 @@ class JointTorque(Force):
     def load(self, x: Array, rate: Array, inputs: Array, t: Array) -> Load:
         """Torque along the parent's mid-point axis."""
         torque = self.gear * inputs[0] * x[0]
-        return Load(jnp.zeros_like(x), jnp.stack([-torque, torque]))
+        return Load(None, jnp.stack([-torque, torque]))
 
 
 class JointForce(CoordinateForce):
@@ -84,7 +84,7 @@ class BodyTorqueInput(Force):
 
     def load(self, x: Array, rate: Array, inputs: Array, t: Array) -> Load:
         """Components along the mid-point directions."""
-        return Load(jnp.zeros_like(x), jnp.zeros_like(x).at[0].set(inputs @ x))
+        return Load(None, jnp.zeros_like(x).at[0].set(inputs @ x))
 
 
 class BodyForceInput(Force):
@@ -99,4 +99,4 @@ class BodyForceInput(Force):
 
     def load(self, x: Array, rate: Array, inputs: Array, t: Array) -> Load:
         """Force along the mid-point direction."""
-        return Load(jnp.zeros_like(x).at[0].set(inputs[0] * x[1]), jnp.zeros_like(x))
+        return Load(jnp.zeros_like(x).at[0].set(inputs[0] * x[1]), None)

@@ -12,9 +12,9 @@ from natcoord_jax.maths.rotations import arctan_quotient
 from natcoord_jax.maths.vectors import cross, dot, safe_divide, safe_norm
 
 
-def _no_load(pair: PairMotion) -> tuple[Array, Array]:
-    stages = pair.parent_spin.shape[0]
-    return jnp.zeros((stages, 2, 4, 3)), jnp.zeros((stages, 2, 3))
+def _pair(torque: Array) -> Array:
+    """A torque on the child and its opposite on the parent, for the one stage there is."""
+    return jnp.stack([-torque, torque])[None]
 
 
 def _turn(carrier_spin: Array, axis: Array, rate: Array, h: Array) -> tuple[Array, Array]:
@@ -59,9 +59,7 @@ class Angle(Coordinate):
         relative = pair.child_spin[0] - pair.parent_spin[0]
         along = dot(middle, relative) / dot(middle, middle)
         rate, quotient = _turn(pair.parent_spin[0], start, along, h)
-        forces, torques = _no_load(pair)
-        torque = quotient * middle
-        return UnitLoad(rate[None], forces, torques.at[0, 0].set(-torque).at[0, 1].set(torque))
+        return UnitLoad(rate[None], None, _pair(quotient * middle))
 
     def value(self, parent: Frame, child: Frame) -> Array:
         """Angle in (-pi, pi]."""
@@ -99,8 +97,7 @@ class UniversalAngle(Coordinate):
         else:
             rate, quotient = _turn(pair.parent_spin[0], a0, dot(reciprocal_a, relative), h)
             torque = quotient * dot(a, a) * reciprocal_a
-        forces, torques = _no_load(pair)
-        return UnitLoad(rate[None], forces, torques.at[0, 0].set(-torque).at[0, 1].set(torque))
+        return UnitLoad(rate[None], None, _pair(torque))
 
     def value(self, parent: Frame, child: Frame) -> Array:
         """Angle in (-pi, pi]."""
@@ -131,9 +128,9 @@ class Displacement(Coordinate):
         u = pair.child.point - pair.parent.point
         rate_u = pair.child_rate.point - pair.parent_rate.point
         a, rate_a = pair.parent.axes[:, self.axis], pair.parent_rate.axes[:, self.axis]
-        forces, torques = _no_load(pair)
+        forces = jnp.zeros((a.shape[0], 2, 4, 3), a.dtype)
         forces = forces.at[:, 0, 0].set(-a).at[:, 1, 0].set(a).at[:, 0, 1 + self.axis].set(u)
-        return UnitLoad(dot(a, rate_u) + dot(rate_a, u), forces, torques)
+        return UnitLoad(dot(a, rate_u) + dot(rate_a, u), forces, None)
 
     def value(self, parent: Frame, child: Frame) -> Array:
         """Displacement [m]."""
@@ -159,9 +156,9 @@ class Separation(Coordinate):
         rate_u = (pair.child_rate.point - pair.parent_rate.point)[0]
         end = safe_norm(u + 0.5 * h * rate_u)
         direction = 2.0 * safe_divide(u, (start + end)[None])
-        forces, torques = _no_load(pair)
+        forces = jnp.zeros((1, 2, 4, 3), direction.dtype)
         forces = forces.at[0, 0, 0].set(-direction).at[0, 1, 0].set(direction)
-        return UnitLoad(dot(direction, rate_u)[None], forces, torques)
+        return UnitLoad(dot(direction, rate_u)[None], forces, None)
 
     def value(self, parent: Frame, child: Frame) -> Array:
         """Distance [m]."""

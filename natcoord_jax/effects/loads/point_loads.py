@@ -37,7 +37,7 @@ class PointForce(Force):
         if self.following:
             force = force @ x[1:4]
         forces = jnp.zeros_like(x).at[0].set(force)
-        return Load(forces, jnp.zeros_like(x))
+        return Load(forces, None)
 
 
 class BodyTorque(Force):
@@ -60,7 +60,7 @@ class BodyTorque(Force):
         if self.following:
             torque = torque @ x[0:3]
         torques = jnp.zeros_like(x).at[0].set(torque)
-        return Load(jnp.zeros_like(x), torques)
+        return Load(None, torques)
 
 
 class PairTorque(Force):
@@ -78,4 +78,4 @@ class PairTorque(Force):
     def load(self, x: Array, rate: Array, inputs: Array, t: Array) -> Load:
         """Torque along the mid-point direction of the first body."""
         torque = _at(self.torque, t) * x[0]
-        return Load(jnp.zeros_like(x), jnp.stack([-torque, torque]))
+        return Load(None, jnp.stack([-torque, torque]))

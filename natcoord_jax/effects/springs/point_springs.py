@@ -106,4 +106,4 @@ class Damper(Force):
         u = x[1] - x[0]
         direction = safe_divide(u, safe_norm(u)[None])
         force = self.damping * dot(direction, rate[1] - rate[0]) * direction
-        return Load(jnp.stack([force, -force]), jnp.zeros((2, 3)))
+        return Load(jnp.stack([force, -force]), None)
