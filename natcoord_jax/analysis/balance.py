@@ -65,10 +65,13 @@ def _midpoint(before: State, after: State, h: Array) -> Stations:
 def _resultants(bodies: int, group: Group, motion: Motion, answer: Response) -> Float[Array, "n 6"]:
     """Force and torque about the origin that each instance of a group puts on the bodies (not the ground)."""
     moving = (group.bodies < bodies)[..., None]
-    forces = answer.forces[:, 0]
-    turning = jnp.sum(cross(motion.rows[0], forces), axis=2) + answer.torques[:, 0]
-    parts = jnp.where(moving, jnp.concatenate([forces[:, :, 0], turning], axis=-1), 0.0)
-    return jnp.sum(parts, axis=1)
+    force = turning = jnp.zeros((*group.bodies.shape, 3))
+    if answer.forces is not None:
+        rows = answer.forces[:, 0]
+        force, turning = rows[:, :, 0], jnp.sum(cross(motion.rows[0], rows), axis=2)
+    if answer.torques is not None:
+        turning = turning + answer.torques[:, 0]
+    return jnp.sum(jnp.where(moving, jnp.concatenate([force, turning], axis=-1), 0.0), axis=1)
 
 
 def _step(system: System, before: State, after: State, u: Array) -> tuple[Array, Array]:
@@ -80,13 +83,12 @@ def _step(system: System, before: State, after: State, u: Array) -> tuple[Array,
     for group in (*system.effects, *system.joints):
         where, motion = situation(system, group, before, u, h), gather(group, at)
         lam = jnp.zeros((group.count, 1, group.multipliers))
-        known = respond(group, where, motion, lam, tableau)
-        impulse = impulse + h * jnp.sum(_resultants(bodies, group, motion, known), axis=0)
+        scale = 1.0 if group.effect.impulsive else h
+        known = scale * _resultants(bodies, group, motion, respond(group, where, motion, lam, tableau))
+        impulse = impulse + jnp.sum(known, axis=0)
         for number in range(group.multipliers):
-            unit = lam.at[:, :, number].set(1.0 if group.source == "joint" else h)
-            found = respond(group, where, motion, unit, tableau)
-            reaction = jax.tree.map(jnp.subtract, found, known)
-            columns = _resultants(bodies, group, motion, reaction)
+            answer = respond(group, where, motion, lam.at[:, :, number].set(1.0), tableau)
+            columns = scale * _resultants(bodies, group, motion, answer) - known
             gram = gram + columns.T @ columns
     return impulse, gram
 

@@ -5,13 +5,34 @@ of its docstring says what it is.
 """
 
 from collections.abc import Callable, Mapping
+from typing import Any
 
-from natcoord_jax.gallery.example import Example as Example
-from natcoord_jax.gallery.spacecraft import spacecraft as spacecraft
+from natcoord_jax.gallery.example import Example
+from natcoord_jax.gallery.loops import bricard, four_bar, slider_crank
+from natcoord_jax.gallery.open_tree import open_tree
+from natcoord_jax.gallery.pendulums import double_pendulum, pendulum, torsion_spring
+from natcoord_jax.gallery.spacecraft import spacecraft
+from natcoord_jax.gallery.tops import dzhanibekov, free_body, heavy_top
+from natcoord_jax.gallery.trees import binary_tree, chain, robot_arm
 
-SCENES: Mapping[str, Callable[[], Example]] = {
+SCENES: Mapping[str, Callable[..., Example]] = {
     "spacecraft": spacecraft,
+    "pendulum": pendulum,
+    "double_pendulum": double_pendulum,
+    "torsion_spring": torsion_spring,
+    "heavy_top": heavy_top,
+    "free_body": free_body,
+    "dzhanibekov": dzhanibekov,
+    "four_bar": four_bar,
+    "bricard": bricard,
+    "slider_crank": slider_crank,
+    "open_tree": open_tree,
+    "chain": chain,
+    "binary_tree": binary_tree,
+    "robot_arm": robot_arm,
 }
+
+__all__ = ["SCENES", "Example", "describe", "load"]
 
 
 def describe(name: str) -> str:
@@ -19,8 +40,8 @@ def describe(name: str) -> str:
     return (SCENES[name].__doc__ or "").partition("\n")[0]
 
 
-def load(name: str) -> Example:
-    """Build a scene by name.
+def load(name: str, **options: Any) -> Example:
+    """Build a scene by name; `options` go to its function.
 
     Raises:
         ValueError: for a name that is not in the gallery.
@@ -33,4 +54,4 @@ def load(name: str) -> Example:
     """
     if name not in SCENES:
         raise ValueError(f"the gallery has no scene {name!r}; it has {', '.join(SCENES)}")
-    return SCENES[name]()
+    return SCENES[name](**options)

@@ -7,6 +7,7 @@ import matplotlib
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.animation import FuncAnimation, PillowWriter
+from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 
 from natcoord_jax.assembly.system import System
@@ -25,13 +26,13 @@ class Inline(str):
         return str(self)
 
 
-def _frame_indices(t: np.ndarray, fps: float) -> np.ndarray:
+def _frame_indices(t: np.ndarray, fps: int) -> np.ndarray:
     """Saved states closest to an even rate of pictures per second of simulated time."""
     wanted = max(2, min(MOST_FRAMES, int((t[-1] - t[0]) * fps) + 1))
     return np.searchsorted(t, np.linspace(t[0], t[-1], wanted)).clip(0, len(t) - 1)
 
 
-def _stage(points: np.ndarray) -> tuple[Any, Any, float]:
+def _stage(points: np.ndarray) -> tuple[Figure, Any, float]:
     """Figure and axes with equal scales around all points, and the length to draw axes with."""
     figure = plt.figure(figsize=(5.5, 5.5))
     axes = figure.add_subplot(projection="3d")
@@ -44,16 +45,16 @@ def _stage(points: np.ndarray) -> tuple[Any, Any, float]:
     return figure, axes, 0.16 * half
 
 
-def _film(system: System, t: np.ndarray, q: np.ndarray, fps: float) -> FuncAnimation:
+def _film(system: System, t: np.ndarray, q: np.ndarray, fps: int) -> tuple[FuncAnimation, Figure]:
     rows = with_ground(q)
     bodies = len(system.structure.bodies)
     corners = np.einsum("bka,tbac->tbkc", inertia_boxes(system), rows[:, :bodies])
     points, directions = joint_places(system, rows)
     figure, axes, length = _stage(np.concatenate([corners.reshape(-1, 3), points.reshape(-1, 3)]))
-    colours = plt.get_cmap("tab10").colors
+    colours = matplotlib.colormaps["tab10"]
     boxes = []
     for body, name in enumerate(system.structure.bodies):
-        box = Poly3DCollection(corners[0, body][FACES], facecolor=colours[body % 10], edgecolor="k")
+        box = Poly3DCollection(corners[0, body][FACES], facecolor=colours(body % 10), edgecolor="k")
         box.set(alpha=0.45, linewidth=0.5, label=name)
         boxes.append(axes.add_collection3d(box))
     ends = np.stack([points - length * directions, points + length * directions], axis=2)
@@ -68,11 +69,11 @@ def _film(system: System, t: np.ndarray, q: np.ndarray, fps: float) -> FuncAnima
         axes.set_title(f"t = {t[frame]:.2f} s")
         return [*boxes, pins, dots]
 
-    return FuncAnimation(figure, show, frames=len(t), interval=1e3 / fps)
+    return FuncAnimation(figure, show, frames=len(t), interval=1000 // fps), figure
 
 
 def animate(
-    system: System, trajectory: Trajectory, *, file: str | Path | None = None, fps: float = 25.0
+    system: System, trajectory: Trajectory, *, file: str | Path | None = None, fps: int = 25
 ) -> Inline | Path:
     """Animate a trajectory in real time.
 
@@ -94,12 +95,12 @@ def animate(
         raise ValueError(f"animate writes gif files, not {str(file)!r}; pass a name that ends in .gif")
     t = np.asarray(trajectory.t)
     picked = _frame_indices(t, fps)
-    film = _film(system, t[picked], np.asarray(trajectory.q)[picked], fps)
+    film, figure = _film(system, t[picked], np.asarray(trajectory.q)[picked], fps)
     try:
         if file is None:
             with matplotlib.rc_context({"animation.embed_limit": 100.0}):
                 return Inline(film.to_jshtml(fps=fps))
-        film.save(str(file), writer=PillowWriter(fps=round(fps)))
+        film.save(str(file), writer=PillowWriter(fps=fps))
         return Path(file)
     finally:
-        plt.close(film._fig)
+        plt.close(figure)

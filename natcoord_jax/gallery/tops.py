@@ -1,0 +1,61 @@
+"""Single bodies that spin."""
+
+import natcoord_jax as nc
+from natcoord_jax.gallery.example import Example
+
+
+def heavy_top() -> Example:
+    """A fast top on a ball joint under gravity (reference case R01)."""
+    scene = nc.Scene()
+    scene.add(nc.Gravity(vector=(0, 0, -9.81)))
+    top = nc.RigidBody(
+        mass=15.0,
+        inertia=(0.234375, 0.46875, 0.234375),
+        com=(0, 1, 0),
+        angular_velocity=(0, 150, -4.61538),
+        name="top",
+    )
+    scene.add(nc.Spherical(nc.ground, scene.add(top), point=(0, 0, 0), name="tip"))
+    system, state = scene.compile()
+    facts = {
+        "dofs": 3,
+        "energy": 5435.6967908655,
+        "centre of mass": {
+            0.2: (0.60555056, 0.59895768, -0.52398303),
+            2.0: (-0.15041682, -0.72416559, -0.67302227),
+        },
+    }
+    return Example("heavy_top", "a fast top under gravity", system, state, 0.001, 2000, facts=facts)
+
+
+def free_body() -> Example:
+    """A body spinning freely, without symmetry (reference case R10)."""
+    scene = nc.Scene()
+    scene.add(nc.RigidBody(mass=1.0, inertia=(6, 8, 3), angular_velocity=(10, 20, 20), name="body"))
+    system, state = scene.compile()
+    facts = {
+        "dofs": 6,
+        "angular momentum": (60.0, 160.0, 60.0),
+        "body rates": {
+            0.45: (-7.721113013, 20.449278379, 20.792006422),
+            1.0: (11.407086549, 19.658211246, 19.388210365),
+        },
+    }
+    return Example("free_body", "a freely spinning body", system, state, 0.005, 200, facts=facts)
+
+
+def dzhanibekov() -> Example:
+    """A body spinning about its middle axis, which turns over again and again (reference case R12)."""
+    scene = nc.Scene()
+    scene.add(nc.RigidBody(mass=1.0, inertia=(1, 2, 3), angular_velocity=(1e-3, 5, 1e-3), name="body"))
+    system, state = scene.compile()
+    facts = {
+        "dofs": 6,
+        "body rates": {
+            3.0: (-2.021466641, 4.573147015, 1.167094595),
+            5.0: (-0.147191765, -4.997833089, 0.084985128),
+        },
+    }
+    return Example(
+        "dzhanibekov", "unstable spin about the middle axis", system, state, 0.01, 1000, facts=facts
+    )

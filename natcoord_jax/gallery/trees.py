@@ -1,0 +1,109 @@
+"""Open trees of any size, for measurements of how time grows with the number of bodies, and a robot arm."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+import natcoord_jax as nc
+from natcoord_jax.core.handles import Handle
+from natcoord_jax.gallery.example import Example
+
+LINK = 0.5
+"""Length of a link of the chain [m]."""
+
+
+def _link(scene: nc.Scene, name: str, start: np.ndarray, end: np.ndarray) -> Handle:
+    """Link of 1 kg between two points, a rod of the inertia of a sphere: the same in every direction."""
+    size = float(np.linalg.norm(end - start))
+    inertia = np.full(3, size**2 / 12)
+    body = nc.RigidBody(mass=1.0, inertia=inertia, com=0.5 * (end - start), position=start, name=name)
+    return scene.add(body)
+
+
+def chain(bodies: int = 8) -> Example:
+    """A chain of links on hinges that point across and up in turns, released horizontally.
+
+    Args:
+        bodies: number of links.
+    """
+    scene = nc.Scene()
+    scene.add(nc.Gravity(vector=(0, 0, -9.81)))
+    carrier, step = nc.ground, np.array([LINK, 0, 0])
+    for k in range(bodies):
+        body = _link(scene, f"link {k + 1}", k * step, (k + 1) * step)
+        axis = (0, 0.8, 0.6) if k % 2 else (0, 0.8, -0.6)
+        scene.add(nc.Revolute(carrier, body, point=k * step, axis=axis, name=f"hinge {k + 1}"))
+        carrier = body
+    system, state = scene.compile()
+    return Example("chain", f"a chain of {bodies} links", system, state, 0.005, 200, facts={"dofs": bodies})
+
+
+def binary_tree(bodies: int = 15) -> Example:
+    """A binary tree of links on hinges, swinging under gravity.
+
+    Args:
+        bodies: number of links; full levels need 2^k - 1.
+    """
+    scene = nc.Scene()
+    scene.add(nc.Gravity(vector=(0, 0, -9.81)))
+    handles, ends = [], []
+    for k in range(bodies):
+        level = int(np.log2(k + 1))
+        start = ends[(k - 1) // 2] if k else np.zeros(3)
+        side = (1 if k % 2 else -1) * 2.0 ** (-level) if k else 0.0
+        sideways = np.array([side, 0, 0]) if level % 2 else np.array([0, side, 0])
+        end = start + sideways + np.array([0.2, 0.1, -0.4])
+        body = _link(scene, f"link {k + 1}", start, end)
+        axis = (1, 0, 0) if level % 2 else (0, 1, 0)
+        carrier = handles[(k - 1) // 2] if k else nc.ground
+        scene.add(nc.Revolute(carrier, body, point=start, axis=axis, name=f"hinge {k + 1}"))
+        handles.append(body)
+        ends.append(end)
+    system, state = scene.compile()
+    return Example(
+        "binary_tree", f"a tree of {bodies} links", system, state, 0.005, 200, facts={"dofs": bodies}
+    )
+
+
+class Swing(eqx.Module):
+    """Smooth way to and from `amplitude` [rad] with period `period` [s]; numbers are leaves."""
+
+    amplitude: Array = eqx.field(converter=lambda x: jnp.asarray(x, float))
+    period: Array = eqx.field(converter=lambda x: jnp.asarray(x, float))
+
+    def __call__(self, t: Array) -> Array:
+        """Angle at time t [s]."""
+        return 0.5 * self.amplitude * (1 - jnp.cos(2 * jnp.pi * t / self.period))
+
+
+# Denavit-Hartenberg rows of the robot of the paper (8.2) at zero angles: alpha [deg], d [m]; all a are zero.
+ROBOT = ((90, 0.31), (-90, 0.0), (-90, 0.4), (90, 0.0), (90, 0.39), (-90, 0.0), (0, 0.0))
+MASSES = (3.0, 3.0, 2.5, 2.5, 2.0, 1.5, 0.5)
+"""Masses of the links [kg]: round numbers of our own, not those of a real robot."""
+AMPLITUDES = (1.2, -0.8, 0.9, 1.1, -1.0, 0.7, 1.5)
+
+
+def robot_arm() -> Example:
+    """A robot arm with seven hinges, every angle prescribed; the drives' work is in the balance (8.2)."""
+    scene = nc.Scene()
+    scene.add(nc.Gravity(vector=(0, 0, -9.81)))
+    carrier, origin, frame = nc.ground, np.zeros(3), np.eye(3)
+    for k, (alpha, d) in enumerate(ROBOT):
+        axis = frame[:, 2]
+        following = origin + d * axis
+        angle = np.deg2rad(alpha)
+        turn = [[1, 0, 0], [0, np.cos(angle), -np.sin(angle)], [0, np.sin(angle), np.cos(angle)]]
+        link = nc.RigidBody(
+            mass=MASSES[k],
+            inertia=np.full(3, 0.02 * MASSES[k]),
+            com=0.5 * (following - origin),
+            position=origin,
+            name=f"link {k + 1}",
+        )
+        body = scene.add(link)
+        hinge = scene.add(nc.Revolute(carrier, body, point=origin, axis=axis, name=f"hinge {k + 1}"))
+        scene.add(nc.Drive(hinge, function=Swing(AMPLITUDES[k], 4.0), name=f"drive {k + 1}"))
+        carrier, origin, frame = body, following, frame @ np.array(turn)
+    system, state = scene.compile()
+    return Example("robot_arm", "seven hinges, all driven", system, state, 0.01, 400, facts={"dofs": 0})
