@@ -212,7 +212,9 @@ def loads(system: System, state: State, u: Array, velocity: Array, spin: Array) 
             where = situation(system, group, state, u, jnp.zeros((), rows.dtype))
             lam = no_multipliers(group, tableau, rows.dtype)
             answer = respond(group, where, gather(group, at), lam, tableau)
-            on_rows = on_rows.at[group.bodies].add(answer.forces[:, 0])
-            torques = torques.at[group.bodies].add(answer.torques[:, 0])
+            if answer.forces is not None:
+                on_rows = on_rows.at[group.bodies].add(answer.forces[:, 0])
+            if answer.torques is not None:
+                torques = torques.at[group.bodies].add(answer.torques[:, 0])
     force, torque = wrench(on_rows[None, :-1], rows[None, :, 1:])
     return force[0], torque[0] + torques[:-1]
