@@ -1,0 +1,24 @@
+"""Settings of the test-suite: double precision, a cache of compiled programs, types checked at run time."""
+
+import os
+from pathlib import Path
+
+import jax
+import pytest
+from jaxtyping import install_import_hook
+
+ROOT = Path(__file__).resolve().parents[1]
+CACHE = os.environ.get("JAX_COMPILATION_CACHE_DIR") or str(ROOT / ".pytest_cache" / "jax")
+
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_compilation_cache_dir", CACHE)
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+
+# Shapes and types of every annotated function are checked from the first import on.
+_hook = install_import_hook("natcoord_jax", "beartype.beartype")
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _checked_types():
+    yield
+    _hook.uninstall()

@@ -1,0 +1,47 @@
+"""Every tolerance of the physics tests, named and reasoned in one place.
+
+Conservation is tested against round-off, accuracy against the digits of a reference, derivatives against
+what differences can show. A test never has a tolerance of its own.
+"""
+
+# Conservation over 1000 steps, relative to the scales of `accounts.scales`. Newton stops at the floor of
+# round-off, so that errors of steps add like a random walk: 1e-15 sqrt(1000) is 3e-14. The bounds leave room
+# for stiff springs, loops and the cancellation in differences of energies, none for a systematic error: one
+# that is left by a step of size h is at least h^3, above 1e-6 here.
+ENERGY = 1e-10
+MOMENTUM = 1e-11
+ANGULAR_MOMENTUM = 1e-11
+CONSTRAINT = 1e-11  # [m] and [-], absolute: all scenes are of the size of a metre
+
+# Free spacecraft over 20 000 steps: no springs, no loops; increments keep errors far below 1e-12.
+LONG_ENERGY = 1e-12
+LONG_DIRECTORS = 1e-13
+
+# One step: balances of single steps, exact up to a few roundings of the largest term.
+STEP_BALANCE = 1e-12
+
+# Identities that hold exactly in exact arithmetic and take a handful of operations: G(q_mid) P = 0 at a
+# random step of one radian, frame indifference, third differences of a quadratic.
+IDENTITY = 1e-13
+INDIFFERENCE = 1e-12
+
+# Two forms of the same equations (tree, loop, multipliers for all joints), solved to the floor of round-off,
+# after 100 steps of a motion that is not chaotic.
+SAME_TRAJECTORY = 1e-10
+
+# Automatic against exact derivatives: the implicit rule solves a linear system, conditioned like the step.
+EXACT_GRADIENT = 1e-9
+# Automatic derivatives against each other (modes, batches): the same numbers in another order.
+SAME_GRADIENT = 1e-9
+# Central differences with steps 10^-1 ... 10^-9: truncation falls with the square of the step until round-off
+# grows with its inverse; at the best step an O(1) derivative of a smooth function agrees to about eps^(2/3).
+DIFFERENCE_BEST = 1e-7
+# ... and on the falling branch a step ten times smaller must be at least this much better (100 in the limit).
+DIFFERENCE_FALL = 20.0
+
+# Observed order of the energy-momentum step.
+ORDER = 2.0
+ORDER_TOLERANCE = 0.1
+
+# Work of torques is 200 N m; with (61) angular momentum stays at round-off of the integral of the torques.
+SPACECRAFT_MOMENTUM = 1e-9 * 3000.0  # [N m s]
