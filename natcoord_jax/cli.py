@@ -19,6 +19,7 @@ from natcoord_jax.core.state import Trajectory
 
 WHOLE = 1e-9
 """How far the number of steps may be from a whole number, relatively."""
+FIGURES = (".png", ".pdf", ".svg")
 
 
 class BadOptionError(ValueError):
@@ -33,9 +34,10 @@ class Parser(argparse.ArgumentParser):
         self.exit(2, f"{self.prog}: {message}\n")
 
 
-def _parser() -> Parser:
-    parser = Parser(prog="natcoord-jax", description="Differentiable multibody simulation: ready scenes.")
-    commands = parser.add_subparsers(dest="command", required=True, parser_class=Parser)
+def parser() -> Parser:
+    """The command line's options."""
+    whole = Parser(prog="natcoord-jax", description="Differentiable multibody simulation: ready scenes.")
+    commands = whole.add_subparsers(dest="command", required=True, parser_class=Parser)
     commands.add_parser("scenes", help="list the scenes of the gallery")
     run = commands.add_parser("run", help="simulate a scene and report its balances")
     run.add_argument("scene", metavar="SCENE", help="a name that `natcoord-jax scenes` lists")
@@ -43,7 +45,7 @@ def _parser() -> Parser:
     run.add_argument("--dt", type=float, help="step [s]; alone, it must divide the scene's end time")
     run.add_argument("--json", type=Path, metavar="FILE", help="write the report as JSON")
     run.add_argument("--plot", type=Path, metavar="FILE", help="write a figure")
-    return parser
+    return whole
 
 
 def choose_steps(example: gallery.Example, steps: int | None, dt: float | None) -> tuple[int, float]:
@@ -189,6 +191,8 @@ def _run(arguments: argparse.Namespace) -> int:
     for file in (arguments.json, arguments.plot):
         if file is not None and not file.resolve().parent.is_dir():
             raise BadOptionError(f"cannot write {file}: no such folder")
+    if arguments.plot is not None and arguments.plot.suffix.lower() not in FIGURES:
+        raise BadOptionError(f"cannot write {arguments.plot}; a figure ends in {', '.join(FIGURES)}")
     example = gallery.load(arguments.scene)
     steps, dt = choose_steps(example, arguments.steps, arguments.dt)
     report, trajectory = measure(example, steps, dt)
@@ -215,7 +219,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         The exit code: 0; 1 for a run that fails; 2 for an unknown scene or a bad option.
     """
     jax.config.update("jax_enable_x64", True)
-    parsed = _parser().parse_args(arguments)
+    parsed = parser().parse_args(arguments)
     if parsed.command == "scenes":
         width = max(map(len, gallery.SCENES))
         print("\n".join(f"{name:<{width}}  {gallery.describe(name)}" for name in gallery.SCENES))
