@@ -162,7 +162,9 @@ class Balances(eqx.Module):
         """Generalised forces of the unknowns; force and torque that each tree joint passes on."""
         return tuple(x[0] for x in project(self.system.tree, self.geometry, force[None], torque[None]))
 
-    def reactions(self, force: Array, torque: Array, lam: Float[Array, " constraints"]) -> Twists:
+    def reactions(
+        self, force: Array, torque: Array, lam: Float[Array, " constraints"]
+    ) -> tuple[Float[Array, "joints 3"], Float[Array, "joints 3"]]:
         """Reactions of all joints on their children about the joints' points.
 
         Args:

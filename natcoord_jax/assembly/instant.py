@@ -108,7 +108,7 @@ def _combined(bias: Gains, columns: Gains, w_dot: Array) -> Gains:
     return jax.tree.map(lambda b, c: b + jnp.tensordot(w_dot, c, 1), bias, columns)
 
 
-def _reactions(balances: Balances, gains: Gains, applied: Twists, lam: Array) -> Twists:
+def _reactions(balances: Balances, gains: Gains, applied: Twists, lam: Array) -> tuple[Array, Array]:
     pulled = balances.constrained(lam) if lam.size else (0.0, 0.0)
     force, torque = (a - b - c for a, b, c in zip(balances.inertial(gains), applied, pulled))
     return balances.reactions(force, torque, lam)

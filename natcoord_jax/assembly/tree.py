@@ -109,7 +109,7 @@ class TreeMotion(eqx.Module):
 
 def gather_slots(tree: Tree, w: Float[Array, "s unknowns"]) -> Float[Array, "s bodies 7"]:
     """Rates by body and slot, zero where a slot is absent."""
-    padded = jnp.concatenate([w, jnp.zeros_like(w[:, :1])], axis=1)
+    padded = jnp.concatenate([w, jnp.zeros((w.shape[0], 1), w.dtype)], axis=1)
     return padded[:, tree.slot_index]
 
 
