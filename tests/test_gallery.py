@@ -1,0 +1,88 @@
+"""Scenes of the gallery: each runs, keeps its balances, and meets the numbers that are known of it."""
+
+import numpy as np
+import pytest
+
+from natcoord_jax import gallery
+from natcoord_jax.analysis import balance
+from natcoord_jax.gallery.spacecraft import TABLE, TORQUE, compare_torques
+
+# Compiling takes all the time: the small scenes by default, the rest with the slow tests.
+QUICK = ("spacecraft", "double_pendulum", "heavy_top")
+# Balances after a few steps of round-off, relative; loops and drives are solved a little less sharply.
+BALANCE = 1e-11
+# Second-order error of the suggested step in the quantities below [m, rad/s, relative].
+ACCURACY = 5e-3
+# Half a unit of the last digit that the table of the paper's manoeuvre prints.
+DIGITS = {5: (5e-4, 0.05, 0.5), 10: (0.05, 0.05, 0.5), 20: (0.05, 0.05, 0.05), 40: (0.05, 0.05, 0.05)}
+DIGITS |= {80: (5e-4, 0.05, 0.005)}
+
+
+def scenes(*, quick: bool):
+    return [name for name in gallery.SCENES if (name in QUICK) == quick]
+
+
+def check(name: str):
+    example = gallery.load(name)
+    assert example.name == name
+    assert gallery.describe(name).endswith(".")
+    trajectory = example.simulate(steps=20)
+    errors = balance(example.system, trajectory)
+    assert errors.energy.max() <= BALANCE
+    assert errors.momentum is None or errors.momentum.max() <= BALANCE
+    assert errors.angular_momentum is None or errors.angular_momentum.max() <= BALANCE
+    assert float(example.system.constraint_errors(trajectory).position.max()) <= BALANCE
+    if "dofs" in example.facts:
+        assert example.system.structure.dofs == example.facts["dofs"]
+
+
+@pytest.mark.parametrize("name", scenes(quick=True))
+def test_scene(name: str):
+    check(name)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", scenes(quick=False))
+def test_other_scene(name: str):
+    check(name)
+
+
+def test_an_unknown_scene_is_refused():
+    with pytest.raises(ValueError, match="no scene 'merry_go_round'"):
+        gallery.load("merry_go_round")
+
+
+def test_double_pendulum_meets_its_reference():
+    example = gallery.load("double_pendulum")
+    trajectory = example.simulate(steps=500, dt=0.001)
+    last = np.asarray(trajectory.q)[-1].reshape(-1, 4, 3)[1]
+    tip = last[0] + last[1]
+    assert tip == pytest.approx(np.array(example.facts["tip"][0.5]), abs=1e-4)
+
+
+@pytest.mark.parametrize(("name", "time"), [("free_body", 1.0), ("dzhanibekov", 3.0)])
+def test_spinning_bodies_meet_their_references(name: str, time: float):
+    example = gallery.load(name)
+    steps = 4000
+    trajectory = example.simulate(steps=steps, dt=time / steps)
+    q, v = (np.asarray(x)[-1].reshape(4, 3)[1:] for x in (trajectory.q, trajectory.v))
+    spin = 0.5 * np.sum(np.cross(q, v), axis=0)
+    assert q @ spin == pytest.approx(np.array(example.facts["body rates"][time]), abs=ACCURACY)
+
+
+def test_heavy_top_has_the_energy_of_its_reference():
+    example = gallery.load("heavy_top")
+    energy = float(example.system.energy(example.state).total)
+    assert energy == pytest.approx(example.facts["energy"], abs=1e-8)
+
+
+def test_torque_formulas_give_the_table_of_the_paper():
+    comparisons = {(c.formula, c.steps): c for c in compare_torques()}
+    for steps, (energy, wrong_energy, wrong_momentum) in TABLE.items():
+        digits = DIGITS[steps]
+        right, wrong = comparisons["contravariant", steps], comparisons["covariant", steps]
+        assert right.energy[-1] == pytest.approx(energy, abs=digits[0])
+        assert wrong.energy[-1] == pytest.approx(wrong_energy, abs=digits[1])
+        assert wrong.angular_momentum[-1] == pytest.approx(wrong_momentum, abs=digits[2])
+        assert np.abs(right.angular_momentum).max() <= 1e-9 * 3 * TORQUE * 5.0
+        assert right.t.shape == right.energy.shape == (steps + 1,)
