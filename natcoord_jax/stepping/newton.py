@@ -16,11 +16,14 @@ from jaxtyping import Array, Bool, Float, Int
 from natcoord_jax.core.results import Result
 from natcoord_jax.stepping.factorise import FACTORISATIONS
 
-TOLERANCE = 5e-15
+TOLERANCE = 1e-15
 """Predicted error after the last correction, relative to the terms of the equations (energy norm)."""
 
-STALL = 2000.0
+STALL = 1e4
 """Corrections that stop shrinking below STALL * tolerance have reached the floor of round-off."""
+
+STALL_OLD = 20.0
+"""The same with factors of an earlier step, where a stall may be the factors' fault."""
 
 CHORD_ITERATIONS = 10
 """Corrections with one factorisation."""
@@ -28,8 +31,11 @@ CHORD_ITERATIONS = 10
 NEWTON_ROUNDS = 25
 """Factorisations of exact Jacobians."""
 
-CONTRACTION = 0.35
-"""Slowest contraction at which a factorisation is kept."""
+SLOWEST_UNSEEN = 0.02
+"""Contraction assumed at least: a slow part of the error may hide behind fast ones in the first ratio."""
+
+PATIENCE = 6
+"""Corrections that are cheaper than a new Jacobian."""
 
 
 @jax.custom_batching.custom_vmap
@@ -75,24 +81,29 @@ class _Iterate(eqx.Module):
     finite: Array
 
 
-def _iterate(equations: Any, factors: Any, inertias: Array, tolerance: Any, it: _Iterate) -> _Iterate:
+def _iterate(
+    equations: Any, factors: Any, inertias: Array, tolerance: Any, floor: float, it: _Iterate
+) -> _Iterate:
     """One correction with given factors; a correction that shrinks too slowly is not applied."""
     residual, size = equations.residual(it.y)
     change = factors.solve(residual)
     correction = jnp.sqrt(jnp.sum(inertias * change**2))
     ratio = correction / jnp.where(it.correction > 0, it.correction, 1.0)
     first = it.count == 0
-    predicted = correction * jnp.where(first, 1.0, ratio / jnp.maximum(1.0 - ratio, 1e-3))
+    trusted = jnp.maximum(ratio, SLOWEST_UNSEEN)
+    predicted = correction * jnp.where(first, 1.0, trusted / jnp.maximum(1.0 - trusted, 1e-3))
     small = predicted <= tolerance * size
-    stalled = ~first & (ratio > 0.5) & (correction <= STALL * tolerance * size)
+    stalled = ~first & (ratio > 0.5) & (correction <= floor * tolerance * size)
     finite = jnp.isfinite(correction) & jnp.isfinite(size)
     converged = (small | stalled) & finite
-    slow = ~first & (ratio > CONTRACTION) & ~converged
+    slow = ~first & ~converged & ((ratio > 0.5) | (correction * ratio**PATIENCE > tolerance * size))
     y = jnp.where(finite & ~slow, it.y - change, it.y)
     return _Iterate(y, correction, size, it.count + 1, it.total + 1, converged, slow, finite)
 
 
-def _chord(equations: Any, factors: Any, inertias: Array, tolerance: Any, start: _Iterate) -> _Iterate:
+def _chord(
+    equations: Any, factors: Any, inertias: Array, tolerance: Any, floor: float, start: _Iterate
+) -> _Iterate:
     """Corrections with one factorisation until they converge or shrink too slowly."""
 
     def go_on(it: _Iterate) -> Array:
@@ -100,7 +111,8 @@ def _chord(equations: Any, factors: Any, inertias: Array, tolerance: Any, start:
 
     fresh = (jnp.array(0), jnp.zeros_like(start.correction))
     restart = eqx.tree_at(lambda it: (it.count, it.correction), start, fresh)
-    return jax.lax.while_loop(go_on, partial(_iterate, equations, factors, inertias, tolerance), restart)
+    correct = partial(_iterate, equations, factors, inertias, tolerance, floor)
+    return jax.lax.while_loop(go_on, correct, restart)
 
 
 class Warm(eqx.Module):
@@ -143,7 +155,7 @@ def newton(equations: Any, tolerance: Float[Array, ""] | float, form: str, warm:
     zero, no, nought = jnp.zeros((), warm.y.dtype), jnp.array(False), jnp.array(0)
     start = _Iterate(warm.y, zero, zero, nought, nought, no, ~warm.valid, jnp.array(True))
     with jax.named_scope("chord"):
-        it = _chord(equations, warm.factors, warm.inertias, tolerance, start)
+        it = _chord(equations, warm.factors, warm.inertias, tolerance, STALL_OLD, start)
     usable = it.finite
     it = eqx.tree_at(lambda x: (x.y, x.finite), it, (jnp.where(usable, it.y, warm.y), jnp.array(True)))
 
@@ -151,7 +163,7 @@ def newton(equations: Any, tolerance: Float[Array, ""] | float, form: str, warm:
         it, _, _, rounds = carry
         factors, inertias = factorise(equations, equations.jacobian(it.y))
         again = eqx.tree_at(lambda x: x.slow, it, it.converged)
-        return _chord(equations, factors, inertias, tolerance, again), factors, inertias, rounds + 1
+        return _chord(equations, factors, inertias, tolerance, STALL, again), factors, inertias, rounds + 1
 
     def unsolved(carry: tuple) -> Array:
         it, _, _, rounds = carry
