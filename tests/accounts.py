@@ -59,13 +59,13 @@ class Account:
         return relative(np.max(np.abs(total - total[0])), np.max(np.sum(_norm(self.momenta), axis=1)))
 
     def spin_error(self, axes: Any = (0, 1, 2), impulse: float = 0.0) -> float:
-        """The same for components of the angular momentum; `impulse` = integral of |u| belongs to the scale."""
+        """The same for components of the angular momentum; `impulse`: integral of |u|, part of the scale."""
         total = self.spins.sum(axis=1)[:, list(axes)]
         scale = np.max(np.sum(_norm(self.spins), axis=1)) + impulse
         return relative(np.max(np.abs(total - total[0])), scale)
 
     def exchanged(self) -> dict[str, float]:
-        """Share of each store in the energy that moves: its range over the largest sum above the lowest levels."""
+        """Range of each store in terms of the energy that moves: the largest sum above the lowest levels."""
         parts = {"kinetic": self.kinetic, **self.stores}
         above = sum(np.abs(values - np.min(values)) for values in parts.values())
         return {name: float(np.ptp(values) / np.max(above)) for name, values in parts.items()}

@@ -45,9 +45,10 @@ def pair(
 ) -> tuple[Any, Any]:
     """Two unsymmetric bodies with a joint, hung by a spring at the origin, with a spring between them.
 
-    Every coordinate of the joint has a spring of its own, `coil`. The second body's start twist is that of the first, so that velocities obey any joint; the spring
-    between them is stretched and starts their relative motion. Without `gravity` and `hanging` all momenta
-    are conserved; with them, angular momentum about the vertical axis through the origin.
+    Every coordinate of the joint has a spring of its own, `coil`. The second body's start twist is that of
+    the first, so that velocities obey any joint; the stretched springs start their relative motion. Without
+    `gravity` and `hanging` all momenta are conserved; with them, angular momentum about the vertical axis
+    through the origin.
     """
     spin = jnp.asarray(spin, float)
     place = np.array([0.0, 0.0, -1.0]), np.array([0.5, 0.3, -1.6])

@@ -24,7 +24,7 @@ def test_readme_runs():
     names: dict = {"__name__": "readme"}
     for number, block in enumerate(BLOCKS):
         exec(compile(block, f"README.md, block {number + 1}", "exec"), names)
-    assert names["energies"].shape == (3,) and names["slope"] != 0
+    assert names["energies"].shape == (3,) and names["slower"] != 0
     assert names["gradient"].shape == names["torques"].shape
 
 

@@ -1,0 +1,416 @@
+"""What one reads from a state, and sets in it, against exact values and independent equations."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+jax.config.update("jax_enable_x64", True)
+
+import natcoord_jax as nc  # noqa: E402
+from natcoord_jax.assembly.balances import loads  # noqa: E402
+from natcoord_jax.assembly.diagnostics import rows_with_ground  # noqa: E402
+from natcoord_jax.core.joint import frames_at  # noqa: E402
+
+ROUND_OFF = 1e-13
+EQUATIONS = 1e-9  # accelerations and reactions relative to their size: one dense solve
+AXIS = (0.3, -0.5, 0.8)
+KINDS = {
+    "revolute": nc.Revolute,
+    "prismatic": nc.Prismatic,
+    "cylindrical": nc.Cylindrical,
+    "planar": nc.Planar,
+    "universal": nc.Universal,
+    "spherical": nc.Spherical,
+    "fixed": nc.Fixed,
+    "screw": nc.Screw,
+}
+
+
+def body(name, position, **more):
+    return nc.RigidBody(
+        mass=1.3, inertia=(0.2, 0.3, 0.4), com=(0.1, 0.05, -0.1), position=position, name=name, **more
+    )
+
+
+def chain(kind, backwards=False, gravity=True):
+    """A body on a ball joint, then the joint, then a body on a hinge; motors and springs on the way."""
+    scene = nc.Scene()
+    a = scene.add(body("a", (0.5, 0.0, 0.0)))
+    b = scene.add(body("b", (1.0, 0.4, 0.0), orientation=((1, 2, 3), 0.7)))
+    c = scene.add(body("c", (1.4, 0.4, 0.3), orientation=((0, 1, 3), -0.4)))
+    scene.add(nc.Spherical(nc.ground, a, point=(0, 0, 0), name="ball"))
+    pair = (b, a) if backwards else (a, b)
+    joint = scene.add(KINDS[kind](*pair, point=(0.8, 0.2, 0.1), axis=AXIS, name="joint"))
+    hinge = scene.add(nc.Revolute(b, c, point=(1.2, 0.4, 0.1), axis=(0, 1, 1), name="hinge"))
+    scene.add(nc.JointTorque(hinge, name="motor"))
+    scene.add(nc.JointDamper(hinge, damping=0.3))
+    scene.add(nc.Armature(hinge, inertia=0.2))
+    scene.add(nc.Spring((nc.Point(nc.ground, (2, 2, 0)), nc.Point(c, (1.4, 0.5, 0.3))), stiffness=7.0, length=0.3))
+    for index in range(len(KINDS[kind].coordinates)):
+        scene.add(nc.JointSpring(joint, stiffness=3.0, rest=0.2, coordinate=index))
+    if gravity:
+        scene.add(nc.Gravity())
+    return scene.compile()
+
+
+def loop():
+    """A planar four-bar of hinges: 5 of its constraints say nothing new, 3 of them are redundant."""
+    scene = nc.Scene()
+    points = [(0.0, 0.0, 0.0), (0.0, 0.0, 1.0), (1.5, 0.0, 1.2), (1.5, 0.0, 0.0)]
+    bodies = [scene.add(body(f"bar {k}", points[k])) for k in range(3)]
+    line = [nc.ground, *bodies, nc.ground]
+    for k in range(4):
+        scene.add(nc.Revolute(line[k], line[k + 1], point=points[k], axis=(0, 1, 0), name=f"hinge {k}"))
+    scene.add(nc.Gravity())
+    return scene.compile()
+
+
+def instant_by_bodies(system, state, u):
+    """Accelerations and wrenches of all joints from six unknowns a body and all constraints, by numpy."""
+    rows, rates = state.q.reshape(-1, 4, 3), state.v.reshape(-1, 4, 3)
+    count = rows.shape[0]
+    spin = 0.5 * jnp.sum(jnp.cross(rows[:, 1:], rates[:, 1:]), axis=1)
+
+    def row_accelerations(x):
+        a, alpha = x.reshape(2, count, 3)
+        turning = jnp.cross(alpha[:, None], rows[:, 1:])
+        turning += jnp.cross(spin[:, None], jnp.cross(spin[:, None], rows[:, 1:]))
+        return jnp.concatenate([a[:, None], turning], axis=1).reshape(-1, 3)
+
+    def residual(q):
+        extended = rows_with_ground(q)
+        return jnp.concatenate(
+            [
+                jax.vmap(lambda e, f, r: e.residual(*frames_at(f, r)))(
+                    g.effect, system.frames[g.joints[:, 0]], extended[g.bodies]
+                ).reshape(-1)
+                for g in system.joints
+            ]
+        )
+
+    def rate(q, v):
+        return jax.jvp(residual, (q,), (v,))[1]
+
+    def constraint(x):
+        return jax.jvp(rate, (state.q, state.v), (state.v, row_accelerations(x)))[1]
+
+    def inertial(x):
+        impulse = jnp.einsum("bij,bjc->bic", system.mass, row_accelerations(x).reshape(-1, 4, 3))
+        return jnp.concatenate([impulse[:, 0], jnp.sum(jnp.cross(rows[:, 1:], impulse[:, 1:]), axis=1)]).reshape(-1)
+
+    zero = jnp.zeros(6 * count)
+    mass, jacobian = jax.jacfwd(inertial)(zero), jax.jacfwd(constraint)(zero)
+    applied = jnp.concatenate(loads(system, state, u, rates[:, 0], spin)).reshape(-1)
+    size = jacobian.shape[0]
+    matrix = np.block([[mass, -jacobian.T], [jacobian, np.zeros((size, size))]])
+    right = np.concatenate([applied - inertial(zero), -constraint(zero)])
+    solution = np.linalg.lstsq(matrix, right, rcond=1e-11)[0]
+    return np.asarray(row_accelerations(solution[: 6 * count])), np.asarray(jacobian.T @ solution[6 * count :])
+
+
+def wrenches_on_bodies(system, state, found):
+    """Forces and torques about the reference points that the joints' reactions put on the bodies."""
+    rows = rows_with_ground(state.q)
+    count = len(system.structure.bodies)
+    force, torque = jnp.zeros((count + 1, 3)), jnp.zeros((count + 1, 3))
+    for k, name in enumerate(system.structure.joints):
+        if name:
+            p, c = (int(x) for x in system.joint_bodies[k])
+            point = frames_at(system.frames[k], rows[jnp.array([p, c])])[1].point
+            for b, sign in ((p, -1.0), (c, 1.0)):
+                f, n = sign * found.forces[k], sign * found.torques[k]
+                force, torque = force.at[b].add(f), torque.at[b].add(n + jnp.cross(point - rows[b, 0], f))
+    return np.concatenate([force[:-1], torque[:-1]]).reshape(-1)
+
+
+def close(a, b, tolerance):
+    np.testing.assert_allclose(a, b, rtol=0, atol=tolerance * (1 + float(np.max(np.abs(b)))))
+
+
+def test_heavy_top_starts_with_the_published_acceleration():
+    scene = nc.Scene()
+    top = scene.add(
+        nc.RigidBody(
+            mass=15, inertia=(0.234375, 0.46875, 0.234375), com=(0, 1, 0), angular_velocity=(0, 150, -4.61538)
+        )
+    )
+    scene.add(nc.Spherical(nc.ground, top, point=(0, 0, 0)))
+    scene.add(nc.Gravity(vector=(0, 0, -9.81)))
+    system, state = scene.compile()
+    com = system.sense(state, nc.Point(top, (0, 1, 0), local=True))
+    np.testing.assert_allclose(com.acceleration, (0, -21.3017325444, -30.9608307692308), atol=1e-9)
+    joint = system.sense(state, system.structure.joints[0])
+    np.testing.assert_allclose(joint.force, 15 * (com.acceleration + jnp.array([0, 0, 9.81])), atol=1e-9)
+    np.testing.assert_allclose(joint.torque, 0, atol=1e-9)
+
+
+def pendulum():
+    """R16 of the reference cases: hinge axis y, centre of mass 2 m from it along +x."""
+    scene = nc.Scene()
+    bar = scene.add(nc.RigidBody(mass=1, inertia=(0.04, 0.1, 0.1), position=(2, 0, 0), name="bar"))
+    pin = scene.add(nc.Revolute(nc.ground, bar, point=(0, 0, 0), axis=(0, 1, 0), name="pin"))
+    scene.add(nc.Gravity(vector=(0, 0, -9.80665)))
+    return (*scene.compile(), bar, pin)
+
+
+def test_pendulum_reaction_after_one_second():
+    system, state, bar, pin = pendulum()
+
+    def force(steps):
+        trajectory = nc.simulate(system, state, dt=1 / steps, steps=steps, save_every=steps)
+        return system.sense(trajectory, pin).force[-1]
+
+    coarse, fine = force(500), force(1000)
+    np.testing.assert_allclose((4 * fine - coarse) / 3, (11.461237566925, 0, 23.227327629495), atol=1e-7)
+
+
+def test_hanging_chain_carries_its_weight():
+    scene = nc.Scene()
+    upper = scene.add(nc.RigidBody(mass=2.0, inertia=(0.1, 0.1, 0.1), position=(0.3, 0, 0)))
+    lower = scene.add(nc.RigidBody(mass=3.0, inertia=(0.1, 0.1, 0.1), position=(0.5, 0, 0)))
+    top = scene.add(nc.Fixed(nc.ground, upper, point=(0, 0, 0)))
+    backwards = scene.add(nc.Fixed(lower, upper, point=(0.3, 0, 0)))
+    scene.add(nc.Gravity(vector=(0, 0, -10.0)))
+    system, state = scene.compile()
+    np.testing.assert_allclose(system.sense(state, top).force, (0, 0, 50), atol=1e-12)
+    np.testing.assert_allclose(system.sense(state, top).torque, (0, -2 * 10 * 0.3 - 3 * 10 * 0.5, 0), atol=1e-12)
+    np.testing.assert_allclose(system.sense(state, backwards).force, (0, 0, -30), atol=1e-12)
+    np.testing.assert_allclose(system.sense(state, backwards).torque, (0, 3 * 10 * 0.2, 0), atol=1e-12)
+
+
+@pytest.mark.parametrize("backwards", [False, True])
+@pytest.mark.parametrize("kind", [k for k in KINDS if k != "screw"])
+def test_equations_agree_with_those_of_bodies_and_multipliers(kind, backwards):
+    system, state = chain(kind, backwards)
+    system = drop_rotors(system)
+    state = nc.random_state(system, state, jax.random.key(3))
+    u = jnp.array([0.8])
+    found = system.instant(state, u)
+    accelerations, wrenches = instant_by_bodies(system, state, u)
+    close(found.accelerations, accelerations, EQUATIONS)
+    close(wrenches_on_bodies(system, state, found), wrenches, EQUATIONS)
+
+
+def drop_rotors(system):
+    """The system without armature, which the equations of bodies do not know."""
+    kept = tuple(g for g in system.effects if not g.effect.rotors)
+    return nc.System(
+        system.mass, system.frames, system.joint_bodies, system.tree, system.joints, kept,
+        system.coordinates, system.structure,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", ["universal", "screw", "loop"])
+def test_acceleration_is_the_limit_of_short_steps(kind):
+    system, state = loop() if kind == "loop" else chain(kind)
+    u = jnp.full(len(system.structure.inputs), 0.8)
+    if kind == "universal":
+        state = nc.random_state(system, state, jax.random.key(4))
+
+    def quotient(h):
+        return (nc.step(system, state, u, h).v - state.v) / h
+
+    h = 1e-3
+    a, b, c = quotient(h), quotient(h / 2), quotient(h / 4)
+    limit = (8 * c - 6 * b + a) / 3
+    close(system.instant(state, u).accelerations, limit, 1e-5)
+
+
+def test_door_on_two_hinges_shares_its_weight():
+    scene = nc.Scene()
+    door = scene.add(nc.RigidBody(mass=4.0, inertia=(1.0, 1.0, 0.5), position=(0.5, 0, 0), name="door"))
+    hinges = [
+        scene.add(nc.Revolute(nc.ground, door, point=(0, 0, z), axis=(0, 0, 1), name=f"hinge {z}")) for z in (-1, 1)
+    ]
+    scene.add(nc.Gravity(vector=(0, 0, -10.0)))
+    system, state = scene.compile()
+    low, high = (system.sense(state, hinge) for hinge in hinges)
+    np.testing.assert_allclose(low.force[2], 20, atol=1e-6)
+    np.testing.assert_allclose(high.force[2], 20, atol=1e-6)
+    np.testing.assert_allclose(low.force[0], -high.force[0], atol=1e-6)
+    np.testing.assert_allclose(low.force + high.force, (0, 0, 40), atol=1e-9)
+    close(wrenches_on_bodies(system, state, system.instant(state)), (0, 0, 40, 0, -20 + 20, 0), 1e-9)
+
+
+def test_redundant_loop_has_finite_reactions():
+    system, state = loop()
+    state = nc.simulate(system, state, dt=0.01, steps=20).states
+    end = jax.tree.map(lambda x: x[-1], state)
+    found = system.instant(end)
+    accelerations, wrenches = instant_by_bodies(system, end, jnp.zeros(0))
+    close(found.accelerations, accelerations, 1e-3)  # the step leaves velocities off the constraints
+    projected = nc.assemble(system, end)
+    accelerations, wrenches = instant_by_bodies(system, projected, jnp.zeros(0))
+    found = system.instant(projected)
+    close(found.accelerations, accelerations, 1e-8)
+    close(wrenches_on_bodies(system, projected, found), wrenches, 1e-8)
+    assert np.all(np.isfinite(found.forces)) and np.max(np.abs(found.forces)) < 200
+
+
+def test_drive_needs_the_torque_of_its_acceleration():
+    scene = nc.Scene()
+    rotor = scene.add(nc.RigidBody(mass=1.0, inertia=(0.3, 0.3, 0.4)))
+    hinge = scene.add(nc.Revolute(nc.ground, rotor, axis=(0, 0, 1)))
+    scene.add(nc.Drive(hinge, function=lambda t: 3.0 * t**2, name="drive"))
+    scene.add(nc.Armature(hinge, inertia=0.1))
+    system, state = scene.compile()
+    found = system.instant(state)
+    np.testing.assert_allclose(found.multipliers["drive"], 6.0 * 0.5, atol=1e-9)
+    np.testing.assert_allclose(system.sense(state, rotor).angular_acceleration, (0, 0, 6), atol=1e-9)
+    np.testing.assert_allclose(found.torques, 0, atol=1e-9)
+
+
+def test_wheel_counts_its_turns():
+    scene = nc.Scene()
+    wheel = scene.add(nc.RigidBody(mass=1, inertia=(1, 1, 1), angular_velocity=(0, 0, 10 * math.pi), name="wheel"))
+    axle = scene.add(nc.Revolute(nc.ground, wheel, axis=(0, 0, 1)))
+    system, state = scene.compile()
+    # The free wheel turns by 2 atan(h omega / 2) in each step.
+    h = 2 * math.tan(math.pi / 100) / (10 * math.pi)
+    trajectory = nc.simulate(system, state, dt=h, steps=250)
+    sensor = system.sense(trajectory, axle)
+    np.testing.assert_allclose(sensor.angle[-1], 10 * math.pi, atol=1e-11)
+    np.testing.assert_allclose(sensor.angle_rate, 10 * math.pi, atol=1e-11)
+    quaternion = system.sense(trajectory, "wheel").quaternion
+    assert jnp.max(jnp.abs(jnp.diff(quaternion, axis=0))) < 0.1
+    np.testing.assert_allclose(quaternion[-1], (-1, 0, 0, 0), atol=1e-11)
+
+
+@pytest.mark.parametrize("kind", ["cylindrical", "planar", "universal", "screw"])
+def test_rates_are_derivatives_of_coordinates(kind):
+    system, state = chain(kind)
+    state = system.with_coordinate(state, "joint", 0.3, rate=0.7)
+    h = 1e-3
+    trajectory = nc.simulate(system, state, dt=h, steps=8)
+    sensor = system.sense(trajectory, "joint")
+    c = sensor.coordinates
+    derivative = (8 * (c[5] - c[3]) - (c[6] - c[2])) / (12 * h)
+    np.testing.assert_allclose(derivative, sensor.rates[4], atol=2e-4)
+    np.testing.assert_array_equal(system.rate(trajectory, "joint", 1), sensor.rates[:, 1])
+
+
+@pytest.mark.parametrize("backwards", [False, True])
+@pytest.mark.parametrize("kind", [k for k, joint in KINDS.items() if joint.coordinates])
+def test_setters_move_one_coordinate_and_keep_the_rest(kind, backwards):
+    system, state = chain(kind, backwards)
+    if kind != "screw":
+        state = nc.random_state(system, state, jax.random.key(5))
+    sensor = system.sense(state, "joint")
+    for index in range(len(KINDS[kind].coordinates)):
+        setter = jax.jit(lambda s, c, r, k=index: system.with_coordinate(s, "joint", c, rate=r, index=k))
+        moved = setter(state, 7.5, -1.2)
+        errors = system.constraint_errors(moved)
+        assert errors.position < ROUND_OFF and errors.velocity < 10 * ROUND_OFF
+        after = system.sense(moved, "joint")
+        wanted, rates = sensor.coordinates.at[index].set(7.5), sensor.rates.at[index].set(-1.2)
+        if kind == "screw":
+            slope = 0.01 / (2 * math.pi)
+            ratio = jnp.array([1.0, slope]) if index == 0 else jnp.array([1 / slope, 1.0])
+            wanted, rates = 7.5 * ratio, -1.2 * ratio
+        close(after.coordinates, wanted, ROUND_OFF)
+        close(after.rates, rates, 10 * ROUND_OFF)
+        close(readings(system, moved), wrapped(system, after.coordinates), 10 * ROUND_OFF)
+        np.testing.assert_array_equal(system.sense(moved, "a").position, system.sense(state, "a").position)
+        close(system.coordinate(moved, "hinge"), system.coordinate(state, "hinge"), ROUND_OFF)
+        close(system.rate(moved, "hinge"), system.rate(state, "hinge"), 10 * ROUND_OFF)
+
+
+def readings(system, state):
+    """Values of the joint's coordinates read from the rows."""
+    k = system.joint_index("joint")
+    frames = frames_at(system.frames[k], rows_with_ground(state.q)[system.joint_bodies[k]])
+    axes = next(g for g in system.joints if "joint" in g.names).effect.coordinates
+    values = jnp.stack([axis.value(*frames) for axis in axes])
+    return jnp.where(jnp.array([axis.unit == "rad" for axis in axes]), jnp.exp(1j * values), values)
+
+
+def wrapped(system, coordinates):
+    axes = next(g for g in system.joints if "joint" in g.names).effect.coordinates
+    return jnp.where(jnp.array([axis.unit == "rad" for axis in axes]), jnp.exp(1j * coordinates), coordinates)
+
+
+@pytest.mark.parametrize("kind", [k for k in KINDS if k != "screw"])
+def test_random_states_are_valid(kind):
+    system, state = chain(kind)
+    found = jax.vmap(lambda key: nc.random_state(system, state, key))(jax.random.split(jax.random.key(6), 5))
+    errors = system.constraint_errors(found)
+    assert jnp.max(errors.position) < ROUND_OFF and jnp.max(errors.velocity) < 10 * ROUND_OFF
+    np.testing.assert_allclose(found.rates[:, 0], system.rate(found, "hinge"), atol=ROUND_OFF)
+    if KINDS[kind].coordinates:
+        one = jax.tree.map(lambda x: x[0], found)
+        close(readings(system, one), wrapped(system, system.sense(one, "joint").coordinates), ROUND_OFF * 10)
+
+
+def test_reactions_differentiate_and_batch():
+    system, state, bar, pin = pendulum()
+
+    def force(rate, mass):
+        changed = system.__class__(mass * system.mass, *(getattr(system, n) for n in (
+            "frames", "joint_bodies", "tree", "joints", "effects", "coordinates", "structure")))  # fmt: skip
+        moved = system.with_coordinate(state, pin, 0.4, rate=rate)
+        return changed.sense(moved, pin).force[0]
+
+    rates, masses = jnp.array([0.5, 1.5]), jnp.array([1.0, 2.0])
+    gradients = jax.jit(jax.vmap(jax.grad(force, argnums=(0, 1))))(rates, masses)
+    h = 1e-5
+    for k in range(2):
+        by_rate = (force(rates[k] + h, masses[k]) - force(rates[k] - h, masses[k])) / (2 * h)
+        by_mass = (force(rates[k], masses[k] + h) - force(rates[k], masses[k] - h)) / (2 * h)
+        np.testing.assert_allclose([g[k] for g in gradients], (by_rate, by_mass), rtol=1e-7)
+    batch = jax.vmap(lambda rate: system.sense(system.with_coordinate(state, pin, 0.4, rate=rate), pin))(rates)
+    np.testing.assert_allclose(batch.force[:, 0], [force(rate, 1.0) for rate in rates], rtol=1e-12)
+
+
+def test_gradient_of_a_redundant_loop_is_finite():
+    system, state = loop()
+
+    def force(q):
+        moved = nc.State(state.t, q, state.v, state.coordinates, state.rates, state.work)
+        return system.instant(moved).forces[-1, 2]
+
+    direction = jnp.zeros_like(state.q)
+    direction = state.v.at[0].set(0.0) + direction  # at rest: no motion, but the derivative must exist
+    assert jnp.all(jnp.isfinite(jax.grad(force)(state.q)))
+    assert jnp.isfinite(jax.jvp(force, (state.q,), (direction,))[1])
+
+
+def test_markers_and_bodies_agree():
+    system, state = chain("universal")
+    moved = nc.random_state(system, state, jax.random.key(8))
+    sensed = system.sense(moved, "b", inputs=jnp.array([0.3]))
+    local = nc.Point(nc.core.handles.Handle("body", "b", 0), (0.2, -0.1, 0.3), local=True)
+    point = system.sense(moved, local, inputs=jnp.array([0.3]))
+    arm = sensed.rotation @ jnp.array([0.2, -0.1, 0.3])
+    spin, alpha = sensed.angular_velocity, sensed.angular_acceleration
+    close(point.position, sensed.position + arm, ROUND_OFF)
+    close(point.velocity, sensed.velocity + jnp.cross(spin, arm), ROUND_OFF)
+    acceleration = sensed.acceleration + jnp.cross(alpha, arm) + jnp.cross(spin, jnp.cross(spin, arm))
+    close(point.acceleration, acceleration, 1e-12)
+    close(sensed.com, sensed.position + sensed.rotation @ jnp.array([0.1, 0.05, -0.1]), ROUND_OFF)
+    world = nc.Point(local.body, system.sense(state, local).position)
+    close(system.sense(moved, world, state=state).position, point.position, ROUND_OFF)
+    with pytest.raises(ValueError, match="assembled pose"):
+        system.sense(moved, world)
+    still = system.sense(moved, nc.Point(nc.ground, (1, 2, 3)))
+    np.testing.assert_array_equal(still.position, (1, 2, 3))
+    np.testing.assert_array_equal(still.acceleration, 0)
+
+
+def test_requests_that_cannot_be_met_say_why():
+    system, state = loop()
+    closing = system.structure.joints[-1]
+    with pytest.raises(ValueError, match="assemble"):
+        system.with_coordinate(state, closing, 0.1)
+    with pytest.raises(ValueError, match="loops"):
+        nc.random_state(system, state, jax.random.key(0))
+    with pytest.raises(ValueError, match="no number 1"):
+        system.coordinate(state, closing, 1)
+    with pytest.raises(ValueError, match="cannot sense"):
+        system.sense(state, "nobody")
+    with pytest.raises(ValueError, match="0 coordinates in m"):
+        _ = system.sense(state, closing).displacement
+    with pytest.raises(ValueError, match="inputs has shape"):
+        system.instant(state, jnp.zeros(2))
