@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.graph import Edge, make_tree, spanning_tree
 from natcoord_jax.assembly.grouping import Instance, bare, stack
-from natcoord_jax.assembly.system import CoordinateGroup, Group, Structure, System
+from natcoord_jax.assembly.system import CoordinateGroup, Elimination, Group, Structure, System
 from natcoord_jax.core.bodies import Body
 from natcoord_jax.core.coordinate import Coordinate, CoordinateEffect
 from natcoord_jax.core.effect import Effect, replace_fields
@@ -274,6 +274,50 @@ def choose_solver(
     return "reduced" if unknowns + multipliers <= LOOP_LIMIT and depth <= DEPTH_LIMIT else "full"
 
 
+def elimination_order(layout: Layout, effects: tuple[Group, ...], joints: tuple[Group, ...]) -> Elimination:
+    """Nodes of the tree in order of elimination, and where their multipliers sit.
+
+    Raises:
+        ValueError: if the system is no open tree with couplings between neighbours.
+    """
+    parent, bodies = np.array(layout.spanning.parent), len(layout.bodies)
+    if not all(g.in_tree for g in joints) or not all(adjacent(g, parent) for g in effects):
+        raise ValueError(
+            'solver="recursive" needs an open tree whose effects couple a body with its parent at most; '
+            'use solver="full" or None'
+        )
+    owned: list[list[int]] = [[] for _ in range(bodies)]
+    offsets, total = [], 0
+    for group in (*effects, *joints):
+        first = []
+        for members in np.asarray(group.bodies):
+            node = max((int(b) for b in members if b < bodies), default=0)
+            first.append(len(owned[node]))
+            owned[node] += range(total, total + group.multipliers)
+            total += group.multipliers
+        offsets.append(np.array(first, np.int32))
+    most = max((len(o) for o in owned), default=0)
+    slots = np.array([o + [total] * (most - len(o)) for o in owned], np.int32).reshape(bodies, most)
+    schedule = elimination_schedule(np.array(layout.spanning.depth))
+    return Elimination(schedule, slots, tuple(offsets))
+
+
+def elimination_schedule(depth: np.ndarray, lanes: int = 8) -> np.ndarray:
+    """Rows of independent nodes, deepest level first, cut to at most `lanes` nodes and padded.
+
+    Cutting wide levels keeps the padding of the narrow ones small, whatever the shape of the tree.
+    """
+    nodes = len(depth)
+    levels = [np.flatnonzero(depth == d) for d in range(int(depth.max()), -1, -1)]
+    width = min(lanes, max(len(level) for level in levels))
+    rows = []
+    for level in levels:
+        for start in range(0, len(level), width):
+            row = level[start : start + width]
+            rows.append(np.concatenate([row, np.full(width - len(row), nodes)]))
+    return np.array(rows, np.int32)
+
+
 def build(
     bodies: dict[str, Body], joints: dict[str, Joint], effects: dict[str, Effect], solver: str | None
 ) -> tuple[System, State]:
@@ -309,6 +353,7 @@ def build(
         joint_groups,
         groups,
         layout.coordinate_groups(),
+        elimination_order(layout, groups, joint_groups) if structure.solver == "recursive" else None,
         structure,
     )
     return jax.tree.map(jnp.asarray, system), layout.state()

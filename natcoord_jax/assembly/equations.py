@@ -5,12 +5,13 @@ from typing import Any
 from jaxtyping import Array
 
 from natcoord_jax.assembly.full import FullStep
+from natcoord_jax.assembly.recursive import RecursiveStep
 from natcoord_jax.assembly.reduced import ReducedStep
 from natcoord_jax.assembly.system import System
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import Tableau
 
-FORMS: dict[str, Any] = {"reduced": ReducedStep, "full": FullStep}
+FORMS: dict[str, Any] = {"reduced": ReducedStep, "full": FullStep, "recursive": RecursiveStep}
 
 
 def prepare(system: System, state: State, u: Array, h: Array, tableau: Tableau) -> Any:

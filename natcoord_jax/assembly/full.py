@@ -112,14 +112,19 @@ class FullStep(eqx.Module):
             rows.append(g_rates.reshape(-1))
         return jnp.concatenate([total[:-1].reshape(-1), *rows]), jnp.sqrt(size)
 
+    def body_jacobians(self, twists: Float[Array, "bodies s 6"]) -> Float[Array, "bodies n n"]:
+        """Jacobians of the bodies' own balances."""
+        width = 6 * self.tableau.stages
+        local = jax.vmap(jax.jacfwd(body_balance, argnums=3), in_axes=(0, 0, 0, 0, None, None))
+        found = local(self.system.mass, self.start[:-1], self.velocity, twists, self.h, self.tableau)
+        return found.reshape(self.bodies, width, width)
+
     def jacobian(self, y: Float[Array, " unknowns"]) -> Float[Array, "unknowns unknowns"]:
         """Exact Jacobian, assembled from local ones."""
         twists, multipliers = self.split(y)
         s, bodies, size = self.tableau.stages, self.bodies, self.unknowns
         width = 6 * s
-        own = jax.vmap(jax.jacfwd(body_balance, argnums=3), in_axes=(0, 0, 0, 0, None, None))(
-            self.system.mass, self.start[:-1], self.velocity, twists, self.h, self.tableau
-        ).reshape(bodies, width, width)
+        own = self.body_jacobians(twists)
         columns = np.arange(bodies)[:, None] * width + np.arange(width)
         matrix = jnp.zeros((size + width, size + width), y.dtype)
         matrix = matrix.at[columns[:, :, None], columns[:, None, :]].add(own)

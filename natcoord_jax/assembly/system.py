@@ -60,6 +60,20 @@ class CoordinateGroup(eqx.Module):
     index: Int[Array | np.ndarray, " n"]
 
 
+class Elimination(eqx.Module):
+    """Order of recursive elimination and places of the multipliers in the nodes of the tree.
+
+    Attributes:
+        schedule: nodes row by row, leaves first (see `linsolve.tree`).
+        slots: multipliers of each node, padded with their total number.
+        offsets: first slot of each instance, by group (effects, then joints); one array a group.
+    """
+
+    schedule: Int[Array | np.ndarray, "rows lanes"]
+    slots: Int[Array | np.ndarray, "bodies m"]
+    offsets: tuple[Int[Array | np.ndarray, " n"], ...]
+
+
 @dataclass(frozen=True)
 class Structure:
     """What is static about a system; hashable, so that equal structures share compiled programs.
@@ -106,6 +120,7 @@ class System(eqx.Module):
         joints: constraint groups of all joints; a group is in the tree or closes loops, never both.
         effects: all other groups.
         coordinates: joint coordinates.
+        elimination: order of recursive elimination, only where it is the solver.
         structure: what is static.
     """
 
@@ -116,6 +131,7 @@ class System(eqx.Module):
     joints: tuple[Group, ...]
     effects: tuple[Group, ...]
     coordinates: tuple[CoordinateGroup, ...]
+    elimination: Elimination | None
     structure: Structure = eqx.field(static=True)
 
     def energy(self, motion: State | Trajectory) -> "diagnostics.Energy":
