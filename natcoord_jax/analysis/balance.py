@@ -112,14 +112,13 @@ def _account(system: System, trajectory: Trajectory) -> dict[str, Any]:
         "torque_scale": jnp.sum(jnp.abs(trajectory.inputs) * steps),
         "impulses": impulses,
         "gram": jnp.mean(grams, axis=0),
-        "reach": 1.0 + jnp.max(jnp.abs(states.q)) ** 2,
     }
 
 
-def _free_motions(gram: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
+def _free_motions(gram: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rigid motions free of reactions: directions of translation (k, 6), and turns of unit rate (l, 6)."""
     values, vectors = np.linalg.eigh(gram)
-    free = vectors[:, values <= REACTION_FREE * max(values[-1], reach)].T
+    free = vectors[:, values <= REACTION_FREE * max(values[-1], 1.0)].T
     mix, sizes, _ = np.linalg.svd(free[:, 3:])
     rates = np.zeros(len(free))
     rates[: len(sizes)] = sizes
@@ -167,7 +166,7 @@ def balance(system: System, trajectory: Trajectory) -> Balance:
         return Balance(energy, None, None, 0, 0, "momenta: not every step is in the trajectory")
     impulse = np.concatenate([np.zeros((1, 6)), np.cumsum(account["impulses"], axis=0)])
     change = account["momenta"] - account["momenta"][0] - impulse
-    along, about = _free_motions(account["gram"], float(account["reach"]))
+    along, about = _free_motions(account["gram"])
     linear = _relative(np.linalg.norm(change @ along.T, axis=-1), np.max(account["momentum_scale"]))
     scale = np.max(account["angular_scale"]) + account["torque_scale"]
     angular = _relative(np.linalg.norm(change @ about.T, axis=-1), float(scale))

@@ -15,6 +15,10 @@ from natcoord_jax.core.state import Trajectory
 AXES = "xyz"
 LEGEND_ENTRIES = 10
 """More curves than this in one panel go without a legend."""
+MOST_STORES = 6
+"""More stores of energy than this are summed by kind."""
+ROUND_OFF = 1e-17
+"""Errors below it are drawn as if they were as large, on the logarithmic scale."""
 
 
 class Curve(NamedTuple):
@@ -74,10 +78,24 @@ def _components(label: str, t: np.ndarray, vectors: np.ndarray) -> list[Curve]:
     return [Curve(f"{label}{AXES[k]}", t, vectors[:, k]) for k in range(3)]
 
 
+def _stores(system: System, trajectory: Trajectory) -> dict[str, np.ndarray]:
+    """Stored energies by name, or by kind of effect if there are many."""
+    stores = {name: np.asarray(values) for name, values in system.energy(trajectory).stores.items()}
+    if len(stores) <= MOST_STORES:
+        return stores
+    kinds: dict[str, np.ndarray] = {}
+    for group in system.effects:
+        for name in group.names:
+            if name in stores:
+                kind = group.effect.kind
+                kinds[kind] = kinds.get(kind, 0.0) + stores[name]
+    return kinds
+
+
 def _energies(system: System, trajectory: Trajectory, t: np.ndarray) -> Panel:
     energy, work = system.energy(trajectory), system.work(trajectory)
     curves = [Curve("kinetic", t, np.asarray(energy.kinetic))]
-    curves += [Curve(name, t, np.asarray(values)) for name, values in energy.stores.items()]
+    curves += [Curve(name, t, values) for name, values in _stores(system, trajectory).items()]
     if energy.stores:
         curves.append(Curve("total", t, np.asarray(energy.total), dashed=True))
     if work:
@@ -125,12 +143,10 @@ def plot(system: System, trajectory: Trajectory) -> Figure:
         raise ValueError(f"plot takes one lane, not a batch of shape {trajectory.t.shape[:-1]}")
     t = np.asarray(trajectory.t)
     errors = system.constraint_errors(trajectory)
-    floor = np.finfo(float).tiny
     constraints = [
-        Curve("positions [m, -]", t, np.maximum(errors.position, floor)),
-        Curve("velocities [m/s, 1/s]", t, np.maximum(errors.velocity, floor)),
+        Curve("positions [m, -]", t, np.maximum(errors.position, ROUND_OFF)),
+        Curve("velocities [m/s, 1/s]", t, np.maximum(errors.velocity, ROUND_OFF)),
     ]
-    shown = [c for c in constraints if np.any(c.values > floor)]
     panels = [
         _energies(system, trajectory, t),
         Panel("momentum", "L [kg m/s]", _components("L", t, np.asarray(system.momentum(trajectory)))),
@@ -139,7 +155,7 @@ def plot(system: System, trajectory: Trajectory) -> Figure:
             "J [kg m²/s]",
             _components("J", t, np.asarray(system.angular_momentum(trajectory))),
         ),
-        Panel("largest constraint errors", "", shown, logarithmic=bool(shown)),
+        Panel("largest constraint errors", "", constraints, logarithmic=True),
         *_coordinates(system, trajectory, t),
     ]
     work = system.work(trajectory)
