@@ -26,7 +26,7 @@ def _orientation(parent: Frame, child: Frame) -> list[Array]:
 
 
 class Fixed(Joint):
-    """Child fixed in the parent: 6 constraints, no free motion.
+    """Child fixed in the parent at `point` [m]: 6 constraints, no free motion.
 
     Example:
         >>> import natcoord_jax as nc
@@ -34,6 +34,7 @@ class Fixed(Joint):
         6
     """
 
+    kind: ClassVar[str] = "fixed joint"
     multipliers: ClassVar[int] = 6
     free: ClassVar[bool] = True
     needs_axis: ClassVar[bool] = False
@@ -44,8 +45,9 @@ class Fixed(Joint):
 
 
 class Spherical(Joint):
-    """Ball joint: 3 constraints x_c - x_p = 0; all rotations free."""
+    """Ball joint at `point` [m]: 3 constraints x_c - x_p = 0; all rotations free."""
 
+    kind: ClassVar[str] = "spherical joint"
     multipliers: ClassVar[int] = 3
     rotations: ClassVar[tuple[int, ...]] = (0, 1, 2)
     free: ClassVar[bool] = True
@@ -59,6 +61,7 @@ class Spherical(Joint):
 class Revolute(Joint):
     """Hinge about `axis` through `point`: 5 constraints; coordinate 0 is the angle [rad]."""
 
+    kind: ClassVar[str] = "revolute joint"
     multipliers: ClassVar[int] = 5
     rotations: ClassVar[tuple[int, ...]] = (2,)
     free: ClassVar[bool] = True
@@ -75,6 +78,7 @@ class Universal(Joint):
     Coordinates: 0 the angle about the parent's axis, 1 the angle about the child's axis [rad].
     """
 
+    kind: ClassVar[str] = "universal joint"
     multipliers: ClassVar[int] = 4
     rotations: ClassVar[tuple[int, ...]] = (2,)
     child_rotation: ClassVar[bool] = True
@@ -90,6 +94,7 @@ class Universal(Joint):
 class Cylindrical(Joint):
     """Turning and sliding along `axis` (48, 49): 4 constraints; coordinates: angle [rad], displacement [m]."""
 
+    kind: ClassVar[str] = "cylindrical joint"
     multipliers: ClassVar[int] = 4
     rotations: ClassVar[tuple[int, ...]] = (2,)
     translations: ClassVar[tuple[int, ...]] = (2,)
@@ -105,6 +110,7 @@ class Cylindrical(Joint):
 class Prismatic(Joint):
     """Sliding along `axis`: 5 constraints; coordinate 0 is the displacement [m]."""
 
+    kind: ClassVar[str] = "prismatic joint"
     multipliers: ClassVar[int] = 5
     translations: ClassVar[tuple[int, ...]] = (2,)
     free: ClassVar[bool] = True
@@ -122,6 +128,7 @@ class Planar(Joint):
     Coordinates: 0, 1 displacements along the first and second axis [m], 2 the angle [rad].
     """
 
+    kind: ClassVar[str] = "planar joint"
     multipliers: ClassVar[int] = 3
     rotations: ClassVar[tuple[int, ...]] = (2,)
     translations: ClassVar[tuple[int, ...]] = (0, 1)
@@ -143,6 +150,7 @@ class Screw(Joint):
 
     pitch: Any = eqx.field(default=0.01, kw_only=True)
 
+    kind: ClassVar[str] = "screw joint"
     multipliers: ClassVar[int] = 4
     rotations: ClassVar[tuple[int, ...]] = (2,)
     translations: ClassVar[tuple[int, ...]] = (2,)
@@ -174,6 +182,7 @@ class Distance(Joint):
     parent_point: Any = eqx.field(default=(0.0, 0.0, 0.0), kw_only=True)
     length: Any = eqx.field(default=None, kw_only=True)
 
+    kind: ClassVar[str] = "distance joint"
     multipliers: ClassVar[int] = 1
     needs_axis: ClassVar[bool] = False
     coordinates: ClassVar[tuple[Coordinate, ...]] = (Separation(),)

@@ -1,6 +1,6 @@
 """Relations between joint coordinates: prescribed motion and couplings (gears, pitch of a screw)."""
 
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -21,6 +21,8 @@ class Drive(CoordinateConstraint):
 
     function: Any = eqx.field(kw_only=True, default=None)
 
+    kind: ClassVar[str] = "drive"
+
     def coefficients(self) -> Array:
         """One."""
         return jnp.ones(1)
@@ -37,11 +39,13 @@ class Coupling(CoordinateConstraint):
         joint: tuple of joint handles.
         factors: shape (c,), one a coordinate.
         coordinate: tuple of indices, which coordinate of each joint.
-        offset: right-hand side.
+        offset: right-hand side, in the unit of factor times coordinate [rad or m].
     """
 
     factors: Any = (1.0, -1.0)
     offset: Any = eqx.field(default=0.0, kw_only=True)
+
+    kind: ClassVar[str] = "coupling"
 
     def coefficients(self) -> Array:
         """The factors."""
