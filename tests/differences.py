@@ -52,7 +52,7 @@ def assert_v_shaped(
     """
     errors = difference_errors(f, x, direction, derivative, steps)
     best = int(np.argmin(errors))
-    report = "\n".join(f"  step {s:.0e}: error {e:.1e}" for s, e in zip(steps, errors))
+    report = "\n".join(f"  step {s:.0e}: error {e:.1e}" for s, e in zip(steps, errors, strict=True))
     assert errors[best] <= tol.DIFFERENCE_BEST, f"differences disagree with the derivative:\n{report}"
     assert errors[-1] > 5 * errors[best], f"the error does not grow with round-off:\n{report}"
     if not polynomial:

@@ -45,3 +45,8 @@ ORDER_TOLERANCE = 0.1
 
 # Work of torques is 200 N m; with (61) angular momentum stays at round-off of the integral of the torques.
 SPACECRAFT_MOMENTUM = 1e-9 * 3000.0  # [N m s]
+
+# Against exact solutions, by Richardson's formula from two steps: what the fourth order leaves.
+EXACT_SOLUTION = 1e-6
+# Positions made by another scheme of order two at the same step differ by the square of the step.
+OTHER_SCHEME = 5e-5

@@ -1,0 +1,454 @@
+"""Contracts that every effect of the library keeps, over one table of all of them.
+
+Each effect is put into a pair of bodies and shown a random motion of about one radian, as a step would show
+it. What it answers must be consistent with itself: power with forces, energy with power, constraint forces
+with constraint rates, and nothing may push or turn the pair as a whole that acts within it.
+"""
+
+import importlib
+import inspect
+import pkgutil
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import tolerances as tol
+from differences import assert_v_shaped
+from scenes import AXIS, JOINTS, SECOND, SPECIAL, with_multipliers
+
+import natcoord_jax as nc
+import natcoord_jax.effects
+from natcoord_jax.assembly.build import build
+from natcoord_jax.assembly.reduced import ReducedStep
+from natcoord_jax.assembly.response import gather, respond, situation
+from natcoord_jax.core.effect import Effect, replace_fields
+from natcoord_jax.core.joint import frames_at
+from natcoord_jax.maths.collocation import gauss
+from natcoord_jax.maths.rotations import from_rotation_vector
+from natcoord_jax.stepping.step import advance
+
+TABLEAU = gauss(1)
+SEEDS = (0, 1, 2)
+
+
+@dataclass
+class Parts:
+    """What an effect of the table can be attached to."""
+
+    one: Any
+    two: Any
+    joint: Any
+
+    @property
+    def ends(self):
+        """A point on each body."""
+        return nc.Point(self.one, (0.0, -0.4, -1.2)), nc.Point(self.two, (0.8, 0.4, -1.9))
+
+    @property
+    def triad(self):
+        """The axes of the first body's start, carried by it."""
+        return tuple(nc.Direction(self.one, axis) for axis in np.eye(3))
+
+
+@dataclass(frozen=True)
+class Entry:
+    """How to make an effect, and what to expect of it.
+
+    Attributes:
+        make: from the parts of the pair.
+        joint: of the pair.
+        inside: it acts between the two bodies, so it neither pushes nor turns the pair.
+        constraints: of a joint.
+    """
+
+    make: Callable[[Parts], Effect] | None = None
+    joint: type = nc.Spherical
+    inside: bool = True
+    constraints: int | None = None
+
+
+def _law(x):
+    return jnp.cosh(x) + 0.3 * x**3
+
+
+def _wave(t):
+    return jnp.stack([jnp.sin(t), jnp.cos(t), t])
+
+
+TABLE = {
+    nc.Fixed: Entry(joint=nc.Fixed, constraints=6),
+    nc.Spherical: Entry(joint=nc.Spherical, constraints=3),
+    nc.Revolute: Entry(joint=nc.Revolute, constraints=5),
+    nc.Universal: Entry(joint=nc.Universal, constraints=4),
+    nc.Cylindrical: Entry(joint=nc.Cylindrical, constraints=4),
+    nc.Prismatic: Entry(joint=nc.Prismatic, constraints=5),
+    nc.Planar: Entry(joint=nc.Planar, constraints=3),
+    nc.Screw: Entry(joint=nc.Screw, constraints=4),
+    nc.Distance: Entry(joint=nc.Distance, constraints=1),
+    nc.Drive: Entry(lambda p: nc.Drive(p.joint, function=jnp.sin, coordinate=1), nc.Universal),
+    nc.Coupling: Entry(lambda p: nc.Coupling((p.joint,) * 2, (1.0, -0.7), coordinate=(0, 1)), nc.Cylindrical),
+    nc.Gravity: Entry(lambda p: nc.Gravity(vector=(1.0, -2.0, 3.0)), inside=False),
+    nc.PointForce: Entry(
+        lambda p: nc.PointForce((p.ends[0], *p.triad), force=_wave, following=True), inside=False
+    ),
+    nc.BodyTorque: Entry(lambda p: nc.BodyTorque(p.triad, torque=_wave, following=True), inside=False),
+    nc.PairTorque: Entry(lambda p: nc.PairTorque((p.triad[0], nc.Direction(p.two, AXIS)), torque=0.7)),
+    nc.JointTorque: Entry(lambda p: nc.JointTorque(p.joint, gear=2.0), nc.Planar),
+    nc.JointForce: Entry(lambda p: nc.JointForce(p.joint, coordinate=1, gear=2.0), nc.Cylindrical),
+    nc.BodyTorqueInput: Entry(lambda p: nc.BodyTorqueInput(p.triad), inside=False),
+    nc.BodyForceInput: Entry(lambda p: nc.BodyForceInput((p.ends[0], p.triad[1])), inside=False),
+    nc.Spring: Entry(lambda p: nc.Spring(p.ends, stiffness=5.0, length=0.3)),
+    nc.QuadraticSpring: Entry(lambda p: nc.QuadraticSpring(p.ends, stiffness=5.0, length=0.3)),
+    nc.NonlinearSpring: Entry(lambda p: nc.NonlinearSpring(p.ends, law=_law)),
+    nc.Damper: Entry(lambda p: nc.Damper(p.ends, damping=5.0)),
+    nc.JointSpring: Entry(
+        lambda p: nc.JointSpring(p.joint, stiffness=5.0, rest=0.3, coordinate=1), nc.Universal
+    ),
+    nc.JointPotential: Entry(lambda p: nc.JointPotential(p.joint, law=_law), nc.Revolute),
+    nc.JointStops: Entry(lambda p: nc.JointStops(p.joint, stiffness=9.0, lower=-0.1, upper=0.1), nc.Planar),
+    nc.JointDamper: Entry(lambda p: nc.JointDamper(p.joint, damping=5.0), nc.Distance),
+    nc.Armature: Entry(lambda p: nc.Armature(p.joint, inertia=5.0), nc.Revolute),
+}
+EFFECTS = pytest.mark.parametrize("effect", TABLE, ids=lambda effect: effect.__name__)
+JOINT_TYPES = pytest.mark.parametrize("joint", JOINTS.values(), ids=list(JOINTS))
+STORING = [e for e in TABLE if e.stores]
+
+
+def exported() -> set[type]:
+    """Every effect class that a module of `natcoord_jax.effects` exports."""
+    found = set()
+    for module in pkgutil.walk_packages(natcoord_jax.effects.__path__, "natcoord_jax.effects."):
+        if module.ispkg:
+            names = vars(importlib.import_module(module.name)).values()
+            found |= {x for x in names if inspect.isclass(x) and issubclass(x, Effect)}
+    return found
+
+
+# --- the table and the names ------------------------------------------------------------------------------
+
+
+def test_every_effect_is_in_the_table():
+    missing = {e.__name__ for e in exported() - set(TABLE)}
+    assert not missing, f"add these effects to the table of contracts: {sorted(missing)}"
+
+
+def test_every_effect_is_public():
+    hidden = {e.__name__ for e in exported() if getattr(nc, e.__name__, None) is not e}
+    assert not hidden, f"these effects are not reachable as nc.…: {sorted(hidden)}"
+
+
+def test_kinds_tell_effects_apart():
+    """The kind names the scope of an effect's operations and the part in messages."""
+    kinds = [e.kind for e in TABLE]
+    assert all(re.fullmatch(r"[a-z]+( [a-z]+)*", kind) for kind in kinds)
+    shared = sorted({kind for kind in kinds if kinds.count(kind) > 1})
+    assert not shared, f"several effects share the kinds {shared}"
+
+
+@EFFECTS
+def test_docstrings_say_units(effect):
+    """A unit in brackets; numbers without any are marked [-]."""
+    assert re.search(r"\[[^\]]*\b(m|rad|s|kg|N|J)\b[^\]]*\]", effect.__doc__ or ""), effect.__doc__
+
+
+@pytest.mark.parametrize("effect", [e for e in TABLE if issubclass(e, nc.Joint)], ids=lambda e: e.__name__)
+def test_joints_document_their_residual(effect):
+    assert re.search(r"\[(m|-)", effect.residual.__doc__ or "") or effect is nc.Screw
+
+
+# --- what an effect answers to a motion -------------------------------------------------------------------
+
+
+@cache
+def stage(effect: type, in_tree: bool = False):
+    """A pair with an effect: system (not checked, which would cost a compilation), state and group.
+
+    A joint under test keeps its multipliers, so that it may be shown motions that it would not allow; or it
+    is `in_tree`, and all motions are free ones.
+    """
+    entry = TABLE[effect]
+    scene = nc.Scene()
+    one = nc.RigidBody(mass=2.0, inertia=(0.3, 0.4, 0.5), com=(0.05, -0.03, 0.1), position=(0.0, 0.0, -1.0))
+    two = nc.RigidBody(
+        mass=1.5, inertia=(0.2, 0.12, 0.25), position=(0.5, 0.3, -1.6), orientation=(AXIS, 0.7), name="two"
+    )
+    parts = Parts(scene.add(one), scene.add(two), None)
+    kind = entry.joint if entry.make or in_tree else with_multipliers(entry.joint)
+    options = SPECIAL.get(entry.joint, {})
+    parts.joint = scene.add(
+        kind(parts.one, parts.two, (0.2, 0.1, -1.3), AXIS, second=SECOND, name="joint", **options)
+    )
+    if entry.make:
+        scene.add(entry.make(parts))
+    system, state = build(scene.bodies, scene.joints, scene.effects, None)
+    group = next(g for g in (*system.effects, *system.joints) if isinstance(g.effect, effect))
+    return system, state, group
+
+
+def inputs_of(system):
+    return 0.5 + jnp.arange(len(system.structure.inputs))
+
+
+@cache
+def answering(effect: type, in_tree: bool = False):
+    """Compiled: from rates of the free motions and multipliers to the answer and the motion."""
+    system, state, group = stage(effect, in_tree)
+    u, h = inputs_of(system), jnp.ones(())
+    step = ReducedStep.prepare(system, state, u, h, TABLEAU)
+    where = situation(system, group, state, u, h)
+
+    def answer(w, lam):
+        at = step.stations(step.motion(w[None])[0])
+        motion = gather(group, at)
+        multipliers = jnp.broadcast_to(lam, (group.count, 1, group.multipliers))
+        return respond(group, where, motion, multipliers, TABLEAU), motion
+
+    return jax.jit(answer), group
+
+
+def random_motion(effect: type, seed: int, in_tree: bool = False):
+    """Rates of about one radian and one metre in the step, and random multipliers."""
+    system, _, group = stage(effect, in_tree)
+    rng = np.random.default_rng(seed)
+    w = rng.normal(size=system.structure.unknowns)
+    w *= 1.2 / np.linalg.norm(w[:6])
+    return jnp.asarray(w), jnp.asarray(rng.normal(size=group.multipliers))
+
+
+def impulses(answer, motion):
+    """Impulses on rows and angular impulses of the first instance over the step of one second."""
+    forces = answer.forces if answer.forces is not None else jnp.zeros_like(motion.rows)
+    forces = forces.reshape(motion.start.shape[0], -1, 4, 3)[0]
+    torques = jnp.zeros_like(forces[:, 0]) if answer.torques is None else answer.torques[0, 0]
+    return np.asarray(forces), np.asarray(torques)
+
+
+@EFFECTS
+def test_power_is_force_times_velocity(effect):
+    """What goes into the work account, or the constraints' multipliers times their rates."""
+    respond_to, _ = answering(effect)
+    for seed in SEEDS:
+        answer, motion = respond_to(*random_motion(effect, seed))
+        forces, torques = impulses(answer, motion)
+        power = np.sum(forces * motion.rates[0, 0]) + np.sum(torques * motion.spin[0, 0])
+        scale = np.sum(np.abs(forces)) + np.sum(np.abs(torques))
+        assert scale > 0.01, "the effect does nothing here"
+        if effect.rotors:  # what a rotor takes is not lost: it is stored
+            continue
+        if effect.works or effect.stores:
+            assert abs(power - float(answer.power[0, 0])) <= tol.INDIFFERENCE * scale
+        else:
+            lam = random_motion(effect, seed)[1]
+            assert abs(power - float(lam @ answer.rows[0, 0])) <= tol.INDIFFERENCE * scale
+
+
+@pytest.mark.parametrize("effect", [e for e in TABLE if TABLE[e].inside], ids=lambda e: e.__name__)
+def test_what_acts_inside_moves_nothing_as_a_whole(effect):
+    """No resultant force, no resultant torque about any point."""
+    in_tree = issubclass(effect, nc.Joint) and effect.free  # its points must coincide
+    respond_to, _ = answering(effect, in_tree)
+    for seed in SEEDS:
+        answer, motion = respond_to(*random_motion(effect, seed, in_tree))
+        forces, torques = impulses(answer, motion)
+        rows = np.asarray(motion.rows)[0, 0]
+        scale = np.sum(np.abs(forces)) + np.sum(np.abs(torques))
+        assert np.max(np.abs(forces[:, 0].sum(0))) <= tol.INDIFFERENCE * scale
+        turning = np.cross(rows, forces).sum((0, 1)) + torques.sum(0)
+        assert np.max(np.abs(turning)) <= tol.INDIFFERENCE * scale * (1 + np.max(np.abs(rows)))
+
+
+@pytest.mark.parametrize("effect", STORING, ids=lambda e: e.__name__)
+def test_stores_give_what_they_lose(effect):
+    """Over a step of one radian: minus the work on the bodies is the change of the stored energy, exactly."""
+    system, state, _ = stage(effect)
+    respond_to, _ = answering(effect)
+    total = jax.jit(lambda s: system.energy(s).potential)
+    for seed in SEEDS:
+        w, lam = random_motion(effect, seed)
+        answer, motion = respond_to(w, lam)
+        forces, torques = impulses(answer, motion)
+        if issubclass(effect, nc.Field):  # an instance for every body
+            work = np.sum(np.asarray(answer.forces)[:, 0] * motion.rates[0])
+        else:
+            work = np.sum(forces * motion.rates[0, 0]) + np.sum(torques * motion.spin[0, 0])
+        before, after = float(total(state)), float(total(after_step(effect, w)))
+        assert abs(after - before) > 1e-3
+        assert abs(after - before + work) <= tol.STEP_BALANCE * (1 + abs(after) + abs(before))
+
+
+def after_step(effect: type, w):
+    """The state at the end of the step."""
+    system, state, _ = stage(effect)
+    y = jnp.zeros(system.structure.unknowns + system.structure.multipliers).at[: len(w)].set(w)
+    return advance(system, state, inputs_of(system), jnp.ones(()), y, TABLEAU)[1]
+
+
+@EFFECTS
+def test_batch_equals_loop(effect):
+    respond_to, _ = answering(effect)
+    motions = [random_motion(effect, seed) for seed in SEEDS]
+    batch = jax.vmap(respond_to)(*(jnp.stack(x) for x in zip(*motions, strict=True)))
+    loop = [respond_to(*motion) for motion in motions]
+    for one, many in zip(jax.tree.leaves(loop[1]), jax.tree.leaves(batch), strict=True):
+        assert np.allclose(one, many[1], rtol=1e-12, atol=1e-12)
+
+
+@EFFECTS
+def test_derivatives_equal_differences(effect):
+    """Of forces, torques and constraint rates with respect to the motion, forward and reverse."""
+    respond_to, _ = answering(effect)
+    w, lam = random_motion(effect, 3)
+
+    def f(w):
+        answer, motion = respond_to(w, lam)
+        return answer.forces, answer.torques, answer.rows, motion.rates
+
+    direction = jnp.asarray(np.random.default_rng(4).normal(size=w.shape))
+    derivative = jax.jvp(f, (w,), (direction,))[1]
+    assert_v_shaped(f, w, direction, derivative)
+    weights = jax.tree.map(jnp.cos, derivative)
+    back = jax.vjp(f, w)[1](weights)[0] @ direction
+    ahead = sum(jnp.vdot(a, b) for a, b in zip(*map(jax.tree.leaves, (weights, derivative)), strict=True))
+    assert abs(back - ahead) <= tol.SAME_GRADIENT * abs(ahead)
+
+
+# --- joints -----------------------------------------------------------------------------------------------
+
+
+@cache
+def constraint(joint: type):
+    """Compiled residual of a joint over the rows (2, 4, 3) of its bodies, and rows that obey it."""
+    system, state, group = stage(joint)
+    effect = jax.tree.map(lambda x: x[0], group.effect)
+    place = system.frames[group.joints[0, 0]]
+    rows = jnp.concatenate([state.q.reshape(-1, 4, 3), jnp.zeros((1, 4, 3))])[group.bodies[0]]
+    return jax.jit(lambda x: effect.residual(*frames_at(place, x))), rows
+
+
+@JOINT_TYPES
+def test_number_of_constraints(joint):
+    residual, rows = constraint(joint)
+    assert residual(rows).shape == (TABLE[joint].constraints,) == (joint.multipliers,)
+    if joint.free:
+        motions = len(joint.rotations) + len(joint.translations) + joint.child_rotation
+        assert motions == 6 - joint.multipliers
+
+
+@JOINT_TYPES
+def test_residual_vanishes_in_the_assembled_pose(joint):
+    residual, rows = constraint(joint)
+    assert np.max(np.abs(residual(rows))) <= tol.IDENTITY
+
+
+@JOINT_TYPES
+def test_residual_is_at_most_quadratic(joint):
+    """Third differences vanish along any direction, second ones along some do not."""
+    residual, rows = constraint(joint)
+    for seed in SEEDS:
+        step = jnp.asarray(np.random.default_rng(seed).normal(size=rows.shape))
+        g = [residual(rows + k * step) for k in range(4)]
+        scale = max(float(jnp.max(jnp.abs(x))) for x in g)
+        assert np.max(np.abs(g[3] - 3 * g[2] + 3 * g[1] - g[0])) <= tol.IDENTITY * scale
+    assert joint is nc.Spherical or np.max(np.abs(g[2] - 2 * g[1] + g[0])) > 1e-3
+
+
+@JOINT_TYPES
+def test_residual_does_not_see_rigid_motions(joint):
+    """A common rotation of all rows and a common translation of the points change nothing."""
+    residual, rows = constraint(joint)
+    rng = np.random.default_rng(5)
+    rows = rows + jnp.asarray(0.1 * rng.normal(size=rows.shape))
+    turn = from_rotation_vector(jnp.asarray(rng.normal(size=3)))
+    moved = (rows @ turn.T).at[:, 0].add(jnp.asarray(rng.normal(size=3)))
+    seen, unseen = residual(moved), residual(rows)
+    if joint in (nc.Fixed, nc.Spherical, nc.Revolute, nc.Universal):  # the gap is a vector of the world
+        unseen = unseen.at[:3].set(turn @ unseen[:3])
+    assert np.max(np.abs(seen - unseen)) <= tol.INDIFFERENCE
+
+
+@JOINT_TYPES
+def test_central_differences_of_the_residual_are_exact(joint):
+    """For a quadratic a central difference has no truncation at any step."""
+    residual, rows = constraint(joint)
+    step = jnp.asarray(np.random.default_rng(6).normal(size=rows.shape))
+    derivative = jax.jvp(residual, (rows,), (step,))[1]
+    assert_v_shaped(residual, rows, step, derivative, polynomial=True)
+    whole = 0.5 * (residual(rows + step) - residual(rows - step))
+    assert np.max(np.abs(whole - derivative)) <= tol.INDIFFERENCE
+
+
+@pytest.mark.parametrize("joint", [j for j in JOINTS.values() if j.free], ids=lambda j: j.__name__)
+def test_free_motions_do_not_see_the_constraints(joint):
+    """max |G(q_mid) P| at random steps of one radian, and g = 0 at their ends, step after step."""
+    system, state, group = stage(joint, in_tree=True)
+    assert group.in_tree
+    effect, place = jax.tree.map(lambda x: x[0], group.effect), system.frames[group.joints[0, 0]]
+
+    def residual(rows):
+        return effect.residual(*frames_at(place, rows))
+
+    @jax.jit
+    def look(state, w):
+        step = ReducedStep.prepare(system, state, inputs_of(system), jnp.ones(()), TABLEAU)
+
+        def mean(w):
+            motion = gather(group, step.stations(step.motion(w[None])[0]))
+            return motion.rows[0, 0], motion.rates[0, 0]
+
+        rows, rates = mean(w)
+        g_rate = jax.jvp(residual, (rows,), (rates,))[1]
+        everything = step.stations(step.motion(w[None])[0]).rates[0, :-1].reshape(-1, 3)
+        return g_rate, residual(rows + 0.5 * rates), replace_fields(state, q=state.q + everything)
+
+    rng = np.random.default_rng(7)
+    for _ in range(5):
+        w = rng.normal(size=system.structure.unknowns)
+        w[3:6] *= 0.2  # drift of the first body
+        w *= 1.0 / np.linalg.norm(w[:3])
+        g_rate, g, state = look(state, jnp.asarray(w))
+        size = 1.0 + np.max(np.abs(w))
+        assert np.max(np.abs(g_rate), initial=0.0) <= tol.IDENTITY * size**2
+        assert np.max(np.abs(g), initial=0.0) <= tol.IDENTITY * size**2
+
+
+# --- potentials -------------------------------------------------------------------------------------------
+
+POTENTIALS = [e for e in TABLE if issubclass(e, nc.Potential)]
+EVERY_POTENTIAL = pytest.mark.parametrize("potential", POTENTIALS, ids=lambda e: e.__name__)
+
+
+@cache
+def potential_of(effect: type):
+    """Compiled invariants and energy over the marker vectors, and their values at the start."""
+    _, state, group = stage(effect)
+    law = jax.tree.map(lambda x: x[0], group.effect)
+    rows = state.q.reshape(-1, 4, 3)[group.bodies[0]]
+    x = jnp.einsum("ka,kac->kc", group.weights[0], rows)
+    points = group.weights[0][:, 0] > 0
+    return jax.jit(lambda x: law.invariants(x)), jax.jit(lambda x: law.energy(law.invariants(x))), x, points
+
+
+@EVERY_POTENTIAL
+def test_invariants_are_invariant_and_at_most_quadratic(potential):
+    invariants, energy, x, points = potential_of(potential)
+    rng = np.random.default_rng(8)
+    turn = from_rotation_vector(jnp.asarray(rng.normal(size=3)))
+    moved = x @ turn.T + jnp.where(points[:, None], jnp.asarray(rng.normal(size=3)), 0.0)
+    assert np.allclose(invariants(moved), invariants(x), rtol=tol.INDIFFERENCE)
+    assert np.allclose(energy(moved), energy(x), rtol=tol.INDIFFERENCE)
+    step = jnp.asarray(rng.normal(size=x.shape))
+    p = [invariants(x + k * step) for k in range(4)]
+    assert np.max(np.abs(p[3] - 3 * p[2] + 3 * p[1] - p[0])) <= tol.IDENTITY * np.max(np.abs(p[3]))
+
+
+@EVERY_POTENTIAL
+def test_gradient_of_the_energy(potential):
+    _, energy, x, _ = potential_of(potential)
+    step = jnp.asarray(np.random.default_rng(9).normal(size=x.shape))
+    assert_v_shaped(energy, x, step, jnp.vdot(jax.grad(energy)(x), step))
