@@ -1,18 +1,19 @@
 """What one reads from a state, and sets in it, against exact values and independent equations."""
 
+import itertools
 import math
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-jax.config.update("jax_enable_x64", True)
-
-import natcoord_jax as nc  # noqa: E402
-from natcoord_jax.assembly.balances import loads  # noqa: E402
-from natcoord_jax.assembly.diagnostics import rows_with_ground  # noqa: E402
-from natcoord_jax.core.joint import frames_at  # noqa: E402
+import natcoord_jax as nc
+from natcoord_jax.assembly.balances import loads
+from natcoord_jax.assembly.coordinates import coordinate_values
+from natcoord_jax.assembly.diagnostics import rows_with_ground
+from natcoord_jax.core.joint import frames_at
 
 ROUND_OFF = 1e-13
 EQUATIONS = 1e-9  # accelerations and reactions relative to their size: one dense solve
@@ -28,6 +29,8 @@ KINDS = {
     "screw": nc.Screw,
 }
 
+TREE_KINDS = [kind for kind in KINDS if kind != "screw"]
+
 
 def body(name, position, **more):
     return nc.RigidBody(
@@ -35,24 +38,42 @@ def body(name, position, **more):
     )
 
 
-def chain(kind, backwards=False, gravity=True):
-    """A body on a ball joint, then the joint, then a body on a hinge; motors and springs on the way."""
+def chain(*kinds, backwards=False):
+    """Bodies in a row: a ball joint, the joints asked for, a hinge; motors and springs on the way."""
     scene = nc.Scene()
-    a = scene.add(body("a", (0.5, 0.0, 0.0)))
-    b = scene.add(body("b", (1.0, 0.4, 0.0), orientation=((1, 2, 3), 0.7)))
-    c = scene.add(body("c", (1.4, 0.4, 0.3), orientation=((0, 1, 3), -0.4)))
-    scene.add(nc.Spherical(nc.ground, a, point=(0, 0, 0), name="ball"))
-    pair = (b, a) if backwards else (a, b)
-    joint = scene.add(KINDS[kind](*pair, point=(0.8, 0.2, 0.1), axis=AXIS, name="joint"))
-    hinge = scene.add(nc.Revolute(b, c, point=(1.2, 0.4, 0.1), axis=(0, 1, 1), name="hinge"))
+    bodies = [scene.add(body("a", (0.5, 0.0, 0.0)))]
+    scene.add(nc.Spherical(nc.ground, bodies[0], point=(0, 0, 0), name="ball"))
+    for k, kind in enumerate(kinds):
+        bodies.append(scene.add(body(f"b{k}", (1.0 + k, 0.4, 0.0), orientation=((1, 2, 3), 0.7 + k))))
+        pair = bodies[-2:][::-1] if backwards else bodies[-2:]
+        joint = scene.add(KINDS[kind](*pair, point=(0.8 + k, 0.2, 0.1), axis=AXIS, name=kind))
+        for index in range(len(KINDS[kind].coordinates)):
+            scene.add(nc.JointSpring(joint, stiffness=3.0, rest=0.2, coordinate=index))
+    last = scene.add(body("c", (1.4 + k, 0.4, 0.3), orientation=((0, 1, 3), -0.4)))
+    hinge = scene.add(nc.Revolute(bodies[-1], last, point=(1.2 + k, 0.4, 0.1), axis=(0, 1, 1), name="hinge"))
     scene.add(nc.JointTorque(hinge, name="motor"))
     scene.add(nc.JointDamper(hinge, damping=0.3))
     scene.add(nc.Armature(hinge, inertia=0.2))
-    scene.add(nc.Spring((nc.Point(nc.ground, (2, 2, 0)), nc.Point(c, (1.4, 0.5, 0.3))), stiffness=7.0, length=0.3))
-    for index in range(len(KINDS[kind].coordinates)):
-        scene.add(nc.JointSpring(joint, stiffness=3.0, rest=0.2, coordinate=index))
-    if gravity:
-        scene.add(nc.Gravity())
+    ends = (nc.Point(nc.ground, (2, 2, 0)), nc.Point(last, (1.4 + k, 0.5, 0.3)))
+    scene.add(nc.Spring(ends, stiffness=7.0, length=0.3))
+    scene.add(nc.Gravity())
+    return scene.compile()
+
+
+def menagerie():
+    """Every joint that describes its free motion, in both directions, each between two moving bodies."""
+    scene = nc.Scene()
+    for k, (kind, backwards) in enumerate(itertools.product(TREE_KINDS, (False, True))):
+        y = 3.0 * k
+        a = scene.add(body(f"a{k}", (0.5, y, 0.0)))
+        b = scene.add(body(f"b{k}", (1.0, y + 0.4, 0.0), orientation=((1, 2, 3), 0.7)))
+        scene.add(nc.Spherical(nc.ground, a, point=(0, y, 0)))
+        pair = (b, a) if backwards else (a, b)
+        joint = scene.add(KINDS[kind](*pair, point=(0.8, y + 0.2, 0.1), axis=AXIS, name=f"{kind} of pair {k}"))
+        if KINDS[kind].coordinates:
+            scene.add(nc.JointSpring(joint, stiffness=3.0, rest=0.2))
+            scene.add(nc.JointForce(joint))
+    scene.add(nc.Gravity())
     return scene.compile()
 
 
@@ -181,34 +202,21 @@ def test_hanging_chain_carries_its_weight():
     np.testing.assert_allclose(system.sense(state, backwards).torque, (0, 3 * 10 * 0.2, 0), atol=1e-12)
 
 
-@pytest.mark.parametrize("backwards", [False, True])
-@pytest.mark.parametrize("kind", [k for k in KINDS if k != "screw"])
-def test_equations_agree_with_those_of_bodies_and_multipliers(kind, backwards):
-    system, state = chain(kind, backwards)
-    system = drop_rotors(system)
+def test_equations_agree_with_those_of_bodies_and_multipliers():
+    system, state = menagerie()
     state = nc.random_state(system, state, jax.random.key(3))
-    u = jnp.array([0.8])
+    u = jnp.linspace(-1.0, 1.0, len(system.structure.inputs))
     found = system.instant(state, u)
     accelerations, wrenches = instant_by_bodies(system, state, u)
     close(found.accelerations, accelerations, EQUATIONS)
     close(wrenches_on_bodies(system, state, found), wrenches, EQUATIONS)
 
 
-def drop_rotors(system):
-    """The system without armature, which the equations of bodies do not know."""
-    kept = tuple(g for g in system.effects if not g.effect.rotors)
-    return nc.System(
-        system.mass, system.frames, system.joint_bodies, system.tree, system.joints, kept,
-        system.coordinates, system.structure,
-    )  # fmt: skip
-
-
-@pytest.mark.parametrize("kind", ["universal", "screw", "loop"])
-def test_acceleration_is_the_limit_of_short_steps(kind):
-    system, state = loop() if kind == "loop" else chain(kind)
-    u = jnp.full(len(system.structure.inputs), 0.8)
-    if kind == "universal":
-        state = nc.random_state(system, state, jax.random.key(4))
+def test_acceleration_is_the_limit_of_short_steps():
+    system, state = chain("screw")
+    u = jnp.array([0.8])
+    state = jax.jit(lambda s: system.with_coordinate(s, "screw", 0.4, rate=1.5))(state)
+    state = jax.jit(lambda s: system.with_coordinate(s, "hinge", -0.3, rate=0.9))(state)
 
     def quotient(h):
         return (nc.step(system, state, u, h).v - state.v) / h
@@ -216,7 +224,7 @@ def test_acceleration_is_the_limit_of_short_steps(kind):
     h = 1e-3
     a, b, c = quotient(h), quotient(h / 2), quotient(h / 4)
     limit = (8 * c - 6 * b + a) / 3
-    close(system.instant(state, u).accelerations, limit, 1e-5)
+    close(system.instant(state, u).accelerations, limit, 1e-6)
 
 
 def test_door_on_two_hinges_shares_its_weight():
@@ -270,7 +278,7 @@ def test_wheel_counts_its_turns():
     system, state = scene.compile()
     # The free wheel turns by 2 atan(h omega / 2) in each step.
     h = 2 * math.tan(math.pi / 100) / (10 * math.pi)
-    trajectory = nc.simulate(system, state, dt=h, steps=250)
+    trajectory = nc.simulate(system, state, dt=h, steps=500)
     sensor = system.sense(trajectory, axle)
     np.testing.assert_allclose(sensor.angle[-1], 10 * math.pi, atol=1e-11)
     np.testing.assert_allclose(sensor.angle_rate, 10 * math.pi, atol=1e-11)
@@ -279,32 +287,33 @@ def test_wheel_counts_its_turns():
     np.testing.assert_allclose(quaternion[-1], (-1, 0, 0, 0), atol=1e-11)
 
 
-@pytest.mark.parametrize("kind", ["cylindrical", "planar", "universal", "screw"])
-def test_rates_are_derivatives_of_coordinates(kind):
-    system, state = chain(kind)
-    state = system.with_coordinate(state, "joint", 0.3, rate=0.7)
-    h = 1e-3
-    trajectory = nc.simulate(system, state, dt=h, steps=8)
-    sensor = system.sense(trajectory, "joint")
-    c = sensor.coordinates
-    derivative = (8 * (c[5] - c[3]) - (c[6] - c[2])) / (12 * h)
-    np.testing.assert_allclose(derivative, sensor.rates[4], atol=2e-4)
-    np.testing.assert_array_equal(system.rate(trajectory, "joint", 1), sensor.rates[:, 1])
+def test_rates_are_derivatives_of_coordinates():
+    system, state = menagerie()
+    state = nc.random_state(system, state, jax.random.key(2))
+    found, derivative = jax.jit(
+        lambda q, v: jax.jvp(lambda q: coordinate_values(system, rows_with_ground(q)), (q,), (v,))
+    )(state.q, state.v)
+    for k, (joint, index) in enumerate(system.structure.coordinates):
+        close(system.rate(state, joint, index), derivative[k], 1e-12)
+        turns = (system.coordinate(state, joint, index) - found[k]) / (2 * math.pi)
+        close(turns, jnp.round(turns), 1e-12)
 
 
-@pytest.mark.parametrize("backwards", [False, True])
-@pytest.mark.parametrize("kind", [k for k, joint in KINDS.items() if joint.coordinates])
+SETTERS = [("revolute", True), ("planar", False), ("planar", True), ("universal", True), ("screw", False)]
+
+
+@pytest.mark.parametrize(("kind", "backwards"), SETTERS)
 def test_setters_move_one_coordinate_and_keep_the_rest(kind, backwards):
-    system, state = chain(kind, backwards)
+    system, state = chain(kind, backwards=backwards)
     if kind != "screw":
         state = nc.random_state(system, state, jax.random.key(5))
-    sensor = system.sense(state, "joint")
+    sensor = system.sense(state, kind)
     for index in range(len(KINDS[kind].coordinates)):
-        setter = jax.jit(lambda s, c, r, k=index: system.with_coordinate(s, "joint", c, rate=r, index=k))
+        setter = jax.jit(lambda s, c, r, k=index: system.with_coordinate(s, kind, c, rate=r, index=k))
         moved = setter(state, 7.5, -1.2)
         errors = system.constraint_errors(moved)
         assert errors.position < ROUND_OFF and errors.velocity < 10 * ROUND_OFF
-        after = system.sense(moved, "joint")
+        after = system.sense(moved, kind)
         wanted, rates = sensor.coordinates.at[index].set(7.5), sensor.rates.at[index].set(-1.2)
         if kind == "screw":
             slope = 0.01 / (2 * math.pi)
@@ -312,44 +321,49 @@ def test_setters_move_one_coordinate_and_keep_the_rest(kind, backwards):
             wanted, rates = 7.5 * ratio, -1.2 * ratio
         close(after.coordinates, wanted, ROUND_OFF)
         close(after.rates, rates, 10 * ROUND_OFF)
-        close(readings(system, moved), wrapped(system, after.coordinates), 10 * ROUND_OFF)
+        close(readings(system, moved, kind), wrapped(system, after.coordinates, kind), 10 * ROUND_OFF)
         np.testing.assert_array_equal(system.sense(moved, "a").position, system.sense(state, "a").position)
         close(system.coordinate(moved, "hinge"), system.coordinate(state, "hinge"), ROUND_OFF)
         close(system.rate(moved, "hinge"), system.rate(state, "hinge"), 10 * ROUND_OFF)
 
 
-def readings(system, state):
-    """Values of the joint's coordinates read from the rows."""
-    k = system.joint_index("joint")
+def axes_of(system, joint):
+    return next(g for g in system.joints if joint in g.names).effect.coordinates
+
+
+def readings(system, state, joint):
+    """Values of the joint's coordinates read from the rows, angles as points of the unit circle."""
+    k = system.joint_index(joint)
     frames = frames_at(system.frames[k], rows_with_ground(state.q)[system.joint_bodies[k]])
-    axes = next(g for g in system.joints if "joint" in g.names).effect.coordinates
-    values = jnp.stack([axis.value(*frames) for axis in axes])
-    return jnp.where(jnp.array([axis.unit == "rad" for axis in axes]), jnp.exp(1j * values), values)
+    return wrapped(system, jnp.stack([axis.value(*frames) for axis in axes_of(system, joint)]), joint)
 
 
-def wrapped(system, coordinates):
-    axes = next(g for g in system.joints if "joint" in g.names).effect.coordinates
-    return jnp.where(jnp.array([axis.unit == "rad" for axis in axes]), jnp.exp(1j * coordinates), coordinates)
+def wrapped(system, coordinates, joint):
+    angles = jnp.array([axis.unit == "rad" for axis in axes_of(system, joint)])
+    return jnp.where(angles, jnp.exp(1j * coordinates), coordinates)
 
 
-@pytest.mark.parametrize("kind", [k for k in KINDS if k != "screw"])
-def test_random_states_are_valid(kind):
-    system, state = chain(kind)
-    found = jax.vmap(lambda key: nc.random_state(system, state, key))(jax.random.split(jax.random.key(6), 5))
+def test_random_states_are_valid():
+    system, state = menagerie()
+    found = jax.jit(jax.vmap(lambda key: nc.random_state(system, state, key)))(jax.random.split(jax.random.key(6), 5))
     errors = system.constraint_errors(found)
     assert jnp.max(errors.position) < ROUND_OFF and jnp.max(errors.velocity) < 10 * ROUND_OFF
-    np.testing.assert_allclose(found.rates[:, 0], system.rate(found, "hinge"), atol=ROUND_OFF)
-    if KINDS[kind].coordinates:
-        one = jax.tree.map(lambda x: x[0], found)
-        close(readings(system, one), wrapped(system, system.sense(one, "joint").coordinates), ROUND_OFF * 10)
+    one = jax.tree.map(lambda x: x[0], found)
+    for joint in dict.fromkeys(name for name, _ in system.structure.coordinates):
+        close(readings(system, one, joint), wrapped(system, system.sense(one, joint).coordinates, joint), ROUND_OFF * 10)
+
+
+def test_random_states_turn_rotors_along():
+    system, state = chain("universal")
+    found = nc.random_state(system, state, jax.random.key(6))
+    np.testing.assert_allclose(found.rates[0], system.rate(found, "hinge"), atol=ROUND_OFF)
 
 
 def test_reactions_differentiate_and_batch():
     system, state, bar, pin = pendulum()
 
     def force(rate, mass):
-        changed = system.__class__(mass * system.mass, *(getattr(system, n) for n in (
-            "frames", "joint_bodies", "tree", "joints", "effects", "coordinates", "structure")))  # fmt: skip
+        changed = eqx.tree_at(lambda s: s.mass, system, mass * system.mass)
         moved = system.with_coordinate(state, pin, 0.4, rate=rate)
         return changed.sense(moved, pin).force[0]
 
@@ -371,17 +385,14 @@ def test_gradient_of_a_redundant_loop_is_finite():
         moved = nc.State(state.t, q, state.v, state.coordinates, state.rates, state.work)
         return system.instant(moved).forces[-1, 2]
 
-    direction = jnp.zeros_like(state.q)
-    direction = state.v.at[0].set(0.0) + direction  # at rest: no motion, but the derivative must exist
     assert jnp.all(jnp.isfinite(jax.grad(force)(state.q)))
-    assert jnp.isfinite(jax.jvp(force, (state.q,), (direction,))[1])
 
 
 def test_markers_and_bodies_agree():
     system, state = chain("universal")
     moved = nc.random_state(system, state, jax.random.key(8))
-    sensed = system.sense(moved, "b", inputs=jnp.array([0.3]))
-    local = nc.Point(nc.core.handles.Handle("body", "b", 0), (0.2, -0.1, 0.3), local=True)
+    sensed = system.sense(moved, "b0", inputs=jnp.array([0.3]))
+    local = nc.Point(nc.core.handles.Handle("body", "b0", 0), (0.2, -0.1, 0.3), local=True)
     point = system.sense(moved, local, inputs=jnp.array([0.3]))
     arm = sensed.rotation @ jnp.array([0.2, -0.1, 0.3])
     spin, alpha = sensed.angular_velocity, sensed.angular_acceleration

@@ -6,8 +6,6 @@ coordinates and of joints that close loops. With row velocities V = P(q) w and c
     P^T [M (P w)' - F - (dc/dV)^T lambda] = 0,    c' = 0.
 """
 
-from collections.abc import Callable
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -15,11 +13,10 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.coordinates import coordinate_rates, frames_of
 from natcoord_jax.assembly.diagnostics import rows_with_ground
-from natcoord_jax.assembly.rates import Twists, geometry_at, row_rates, twists
+from natcoord_jax.assembly.rates import Twists, null_space, passed_on, row_rates, twists
 from natcoord_jax.assembly.reduced import inertia, wrench
 from natcoord_jax.assembly.response import gather, no_multipliers, respond, situation, stations
 from natcoord_jax.assembly.system import Group, System
-from natcoord_jax.assembly.tree import JointGeometry, project
 from natcoord_jax.core.joint import frames_at
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import gauss
@@ -39,6 +36,49 @@ def joint_constraint_rates(
     return jax.jvp(lambda x: effect.residual(*frames_at(frames, x)), (rows,), (rates,))[1]
 
 
+def relations_of(system: System) -> list[Group]:
+    """Relations between joint coordinates, the first of the constraints."""
+    return [g for g in system.effects if g.multipliers]
+
+
+def loops_of(system: System) -> list[Group]:
+    """Joints that close loops, the last of the constraints."""
+    return [g for g in system.joints if not g.in_tree]
+
+
+def rotors_of(system: System) -> list[Group]:
+    """Rotors on joint coordinates."""
+    return [g for g in system.effects if g.effect.rotors]
+
+
+def relative_rates(
+    system: System,
+    rows: Float[Array, "bodies 4 3"],
+    velocity: Float[Array, "bodies_and_ground 3"],
+    spin: Float[Array, "bodies_and_ground 3"],
+    t: Float[Array, ""],
+) -> tuple[Float[Array, " rotors"], Float[Array, " c"]]:
+    """Rates of rotors and of the constraints of relations and loops, affine in the velocities."""
+    relations, rotors = relations_of(system), rotors_of(system)
+    extended = rows_with_ground(rows.reshape(-1, 3))
+    along = jnp.zeros(0, rows.dtype)
+    if relations or rotors:
+        along = coordinate_rates(system, extended, row_rates(extended, velocity, spin), spin)
+    turning = [along[g.coordinates[:, 0]] for g in rotors]
+
+    def relation(effect, index):
+        wanted = jax.jvp(effect.target, (t,), (jnp.ones_like(t),))[1]
+        return effect.coefficients() @ along[index] - wanted
+
+    found = [jax.vmap(relation)(g.effect, g.coordinates) for g in relations]
+    for group in loops_of(system):
+        pairs = [x[group.bodies] for x in (extended, velocity, spin)]
+        frames = system.frames[group.joints[:, 0]]
+        found.append(jax.vmap(joint_constraint_rates)(group.effect, frames, *pairs).reshape(-1))
+    none = [along[:0]]
+    return jnp.concatenate(none + turning), jnp.concatenate(none + found)
+
+
 class Gains(eqx.Module):
     """What belongs to a motion, either as rates or, one derivative higher, as accelerations.
 
@@ -48,9 +88,9 @@ class Gains(eqx.Module):
         constraints: of relations between coordinates, then of joints that close loops.
     """
 
-    rows: Float[Array, "bodies 4 3"]
-    rotors: Float[Array, " rotors"]
-    constraints: Float[Array, " constraints"]
+    rows: Float[Array, "*u bodies 4 3"]
+    rotors: Float[Array, "*u rotors"]
+    constraints: Float[Array, "*u constraints"]
 
 
 class Balances(eqx.Module):
@@ -59,111 +99,87 @@ class Balances(eqx.Module):
     Attributes:
         system: compiled system.
         rows: rows of all bodies.
-        geometry: axes and arms of the tree's joints there.
         t: time [s].
+        free: velocities and angular velocities of the bodies per unit rate of each free motion.
+        rotors: derivatives of the rotors' rates with respect to them, and to those of the ground.
+        constraints: the same of the constraints' rates: forces and torques of unit multipliers.
     """
 
     system: System
     rows: Float[Array, "bodies 4 3"]
-    geometry: list[JointGeometry]
     t: Float[Array, ""]
+    free: tuple[Float[Array, "bodies unknowns 3"], Float[Array, "bodies unknowns 3"]]
+    rotors: tuple[Float[Array, "rotors bodies_and_ground 3"], Float[Array, "rotors bodies_and_ground 3"]]
+    constraints: tuple[Float[Array, "c bodies_and_ground 3"], Float[Array, "c bodies_and_ground 3"]]
 
     @classmethod
     def at(cls, system: System, state: State) -> "Balances":
         """The balances of a state."""
         rows = state.q.reshape(-1, 4, 3)
-        return cls(system, rows, geometry_at(system, rows), state.t)
+        still = jnp.zeros((rows.shape[0] + 1, 3), rows.dtype)
 
-    @property
-    def relations(self) -> list[Group]:
-        """Relations between joint coordinates, the first of the constraints."""
-        return [g for g in self.system.effects if g.multipliers]
+        def rates(velocity, spin):
+            return relative_rates(system, rows, velocity, spin, state.t)
 
-    @property
-    def loops(self) -> list[Group]:
-        """Joints that close loops, the last of the constraints."""
-        return [g for g in self.system.joints if not g.in_tree]
-
-    @property
-    def rotors(self) -> list[Group]:
-        """Rotors on joint coordinates."""
-        return [g for g in self.system.effects if g.effect.rotors]
+        rotors, constraints = jax.jacfwd(rates, argnums=(0, 1))(still, still)
+        return cls(system, rows, state.t, null_space(system, rows), rotors, constraints)
 
     def twists(self, w: Float[Array, " unknowns"]) -> Twists:
         """Velocities and angular velocities of all bodies from the rates of the tree's free motions."""
-        return twists(self.system, self.geometry, w)
+        velocity, spin = self.free
+        return jnp.einsum("buc,u->bc", velocity, w), jnp.einsum("buc,u->bc", spin, w)
 
-    def rates(self, rows: Array, velocity: Array, spin: Array, t: Array) -> Gains:
-        """Rates of everything, affine in the velocities."""
-        moving = row_rates(rows, velocity, spin)
-        along = jnp.zeros(0, rows.dtype)
-        extended = rows_with_ground(rows.reshape(-1, 3))
-        if self.relations or self.rotors:
-            along = coordinate_rates(self.system, extended, with_rest(moving), with_rest(spin))
-        turning = [along[g.coordinates[:, 0]] for g in self.rotors]
-
-        def relation(effect, index):
-            wanted = jax.jvp(effect.target, (t,), (jnp.ones_like(t),))[1]
-            return effect.coefficients() @ along[index] - wanted
-
-        found = [jax.vmap(relation)(g.effect, g.coordinates) for g in self.relations]
-        everywhere = extended, with_rest(velocity), with_rest(spin)
-        for group in self.loops:
-            pairs = [x[group.bodies] for x in everywhere]
-            frames = self.system.frames[group.joints[:, 0]]
-            found.append(jax.vmap(joint_constraint_rates)(group.effect, frames, *pairs).reshape(-1))
-        none = [along[:0]]
-        return Gains(moving, jnp.concatenate(none + turning), jnp.concatenate(none + found))
+    def rates(self, w: Float[Array, " unknowns"]) -> Gains:
+        """Rates of everything."""
+        velocity, spin = self.twists(w)
+        moving = row_rates(self.rows, velocity, spin)
+        relative = relative_rates(self.system, self.rows, with_rest(velocity), with_rest(spin), self.t)
+        return Gains(moving, *relative)
 
     def bias(self, w: Float[Array, " unknowns"]) -> Gains:
         """Accelerations of everything while the rates of the free motions stay as they are."""
 
         def composed(rows, t):
-            return self.rates(rows, *twists(self.system, geometry_at(self.system, rows), w), t)
+            velocity, spin = twists(self.system, rows, w)
+            relative = relative_rates(self.system, rows, with_rest(velocity), with_rest(spin), t)
+            return Gains(row_rates(rows, velocity, spin), *relative)
 
         moving = row_rates(self.rows, *self.twists(w))
         return jax.jvp(composed, (self.rows, self.t), (moving, jnp.ones_like(self.t)))[1]
 
     def columns(self) -> Gains:
         """Accelerations of everything per unit of w', leading axis the unknowns."""
-        still = jnp.zeros_like(self.rows[:, 0])
-        rest = self.rates(self.rows, still, still, self.t)
+        velocity, spin = self.free
+        rows = jax.vmap(lambda v, s: row_rates(self.rows, v, s), in_axes=1)(velocity, spin)
 
-        def column(unit: Array) -> Gains:
-            gains = self.rates(self.rows, *self.twists(unit), self.t)
-            return jax.tree.map(jnp.subtract, gains, rest)
+        def along(part):
+            on_velocity, on_spin = (x[:, :-1] for x in part)
+            return jnp.einsum("kbc,buc->uk", on_velocity, velocity) + jnp.einsum("kbc,buc->uk", on_spin, spin)
 
-        return jax.vmap(column)(jnp.eye(self.system.structure.unknowns, dtype=self.rows.dtype))
+        return Gains(rows, along(self.rotors), along(self.constraints))
 
     def inertial(self, gains: Gains) -> Twists:
         """Forces and torques that give bodies and rotors their accelerations."""
         impulses = inertia(self.system.mass, gains.rows)
         force, torque = (x[0] for x in wrench(impulses[None], self.rows[None, :, 1:]))
-        if self.rotors:
-            inertias = jnp.concatenate([jax.vmap(lambda e: e.inertia_of())(g.effect) for g in self.rotors])
-            pulled = self._pull(lambda g: g.rotors, inertias * gains.rotors)
+        groups = rotors_of(self.system)
+        if groups:
+            inertias = jnp.concatenate([jax.vmap(lambda e: e.inertia_of())(g.effect) for g in groups])
+            pulled = _weighted(inertias * gains.rotors, self.rotors)
             force, torque = force + pulled[0], torque + pulled[1]
         return force, torque
 
-    def constrained(self, lam: Float[Array, " constraints"]) -> Twists:
+    def constrained(self, lam: Float[Array, " c"]) -> Twists:
         """Forces and torques of relations and loops on the bodies."""
-        return self._pull(lambda g: g.constraints, lam)
+        return _weighted(lam, self.constraints)
 
-    def _pull(self, part: Callable[[Gains], Array], load: Array) -> Twists:
-        """Forces and torques on the bodies with the power of a load on some of the rates."""
-        still = jnp.zeros_like(self.rows[:, 0])
-
-        def rates(velocity, spin):
-            return part(self.rates(self.rows, velocity, spin, self.t))
-
-        return jax.vjp(rates, still, still)[1](load)
-
-    def project(self, force: Array, torque: Array) -> tuple[Array, Array, Array]:
-        """Generalised forces of the unknowns; force and torque that each tree joint passes on."""
-        return tuple(x[0] for x in project(self.system.tree, self.geometry, force[None], torque[None]))
+    def project(self, force: Array, torque: Array) -> Float[Array, " unknowns"]:
+        """Generalised forces of the free motions from forces and torques at the reference points."""
+        velocity, spin = self.free
+        return jnp.einsum("buc,bc->u", velocity, force) + jnp.einsum("buc,bc->u", spin, torque)
 
     def reactions(
-        self, force: Array, torque: Array, lam: Float[Array, " constraints"]
+        self, force: Array, torque: Array, lam: Float[Array, " c"]
     ) -> tuple[Float[Array, "joints 3"], Float[Array, "joints 3"]]:
         """Reactions of all joints on their children about the joints' points.
 
@@ -176,31 +192,31 @@ class Balances(eqx.Module):
         count = len(system.structure.joints)
         extended = rows_with_ground(self.rows.reshape(-1, 3))
         parent, child = frames_of(system, jnp.arange(count), extended)
-        _, forces, torques = self.project(force, torque)
-        backwards = (system.tree.side[:, :1] == 1)
+        forces, torques = passed_on(system, self.rows, force, torque)
+        backwards = system.tree.side[:, :1] == 1
         gap = parent.point[:bodies] - child.point[:bodies]
         torques = jnp.where(backwards, -(torques + cross(gap, forces)), torques)
         forces = jnp.where(backwards, -forces, forces)
         rest = jnp.zeros((count - bodies, 3), forces.dtype)
         forces, torques = jnp.concatenate([forces, rest]), jnp.concatenate([torques, rest])
-        position = sum(g.count for g in self.relations)
-        for group in self.loops:
+        position = sum(g.count * g.multipliers for g in relations_of(system))
+        for group in loops_of(system):
             size = group.count * group.multipliers
-            own = lam[position : position + size].reshape(group.count, group.multipliers)
+            here = slice(position, position + size)
             position += size
-            index, still = group.joints[:, 0], jnp.zeros((2, 3), lam.dtype)
-
-            def one(effect, frames, rows, multipliers, still=still):
-                def rate(v, spin):
-                    return joint_constraint_rates(effect, frames, rows, v, spin)
-
-                return jax.vjp(rate, still, still)[1](multipliers)
-
-            f, n = jax.vmap(one)(group.effect, system.frames[index], extended[group.bodies], own)
+            body = jnp.repeat(group.bodies[:, 1], group.multipliers)
+            shares = [lam[here, None] * x[here][jnp.arange(size), body] for x in self.constraints]
+            f, n = (x.reshape(group.count, group.multipliers, 3).sum(1) for x in shares)
+            index = group.joints[:, 0]
             arm = child.point[index] - extended[group.bodies[:, 1], 0]
-            forces = forces.at[index].set(f[:, 1])
-            torques = torques.at[index].set(n[:, 1] - cross(arm, f[:, 1]))
+            forces = forces.at[index].set(f)
+            torques = torques.at[index].set(n - cross(arm, f))
         return forces, torques
+
+
+def _weighted(lam: Array, loads: tuple[Array, Array]) -> Twists:
+    """Sum of unit loads on the bodies, without the ground."""
+    return jnp.tensordot(lam, loads[0][:, :-1], 1), jnp.tensordot(lam, loads[1][:, :-1], 1)
 
 
 def loads(system: System, state: State, u: Array, velocity: Array, spin: Array) -> Twists:

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from natcoord_jax.assembly.balances import Balances, Gains, loads
+from natcoord_jax.assembly.balances import Balances, Gains, loads, loops_of, relations_of
 from natcoord_jax.assembly.diagnostics import states_of
 from natcoord_jax.assembly.rates import Twists, tree_rates
 from natcoord_jax.assembly.system import System
@@ -49,42 +49,48 @@ class Saddle(eqx.Module):
     only loops forbid do no harm.
 
     Attributes:
-        matrix: A + weight C^T C.
+        matrix: K = A + weight C^T C.
+        inverse: K^-1.
         rows: C.
         weight: [kg].
-        spread: (A + weight C^T C)^-1 C^T.
-        compliance: C (A + weight C^T C)^-1 C^T.
-        metric: what measures reactions.
-        shift: of the compliance, times the metric.
+        spread: K^-1 C^T.
+        compliance: S = C K^-1 C^T.
+        shift: what S is shifted by: the metric of the reactions, scaled.
+        shifted: inverse of S + shift.
     """
 
     matrix: Float[Array, "n n"]
+    inverse: Float[Array, "n n"]
     rows: Float[Array, "m n"]
     weight: Float[Array, ""]
     spread: Float[Array, "n m"]
     compliance: Float[Array, "m m"]
-    metric: Float[Array, "m m"]
-    shift: Float[Array, ""]
+    shift: Float[Array, "m m"]
+    shifted: Float[Array, "m m"]
 
     @classmethod
     def of(cls, inertia: Array, rows: Array, metric: Array, weight: Array) -> "Saddle":
-        """From A, C, the metric of the reactions and the mass of a typical body [kg]."""
+        """From A, C, the metric H of the reactions and the mass of a typical body [kg]."""
         matrix = inertia + weight * rows.T @ rows
-        spread = jnp.linalg.solve(matrix, rows.T) if matrix.size else rows.T
-        return cls(matrix, rows, weight, spread, rows @ spread, metric, SHIFT / weight)
+        inverse = jnp.linalg.inv(matrix) if matrix.size else matrix
+        spread = inverse @ rows.T
+        spread = spread + inverse @ (rows.T - matrix @ spread)
+        compliance, shift = rows @ spread, SHIFT / weight * metric
+        shifted = jnp.linalg.inv(compliance + shift)
+        return cls(matrix, inverse, rows, weight, spread, compliance, shift, shifted)
 
     def shares(self, right: Float[Array, " m"], pull: Float[Array, " m"]) -> Float[Array, " m"]:
         """Multipliers with S lambda = right that minimise lambda H lambda / 2 + pull lambda."""
-        inverse = jnp.linalg.inv(self.compliance + self.shift * self.metric)
-        lam = inverse @ (right - self.shift * pull)
+        lam = self.shifted @ (right - SHIFT / self.weight * pull)
         for _ in range(ROUNDS):
-            lam = lam + inverse @ (right - self.compliance @ lam)
+            lam = lam + self.shifted @ (right - self.compliance @ lam)
         return lam
 
     def solve(self, force: Float[Array, " n"], rates: Float[Array, " m"]) -> tuple[Array, Array]:
-        """x with A x - C^T lambda = force, C x = rates, and S lambda = right for the right-hand side."""
-        free = force + self.weight * self.rows.T @ rates
-        x = jnp.linalg.solve(self.matrix, free) if self.matrix.size else free
+        """x with A x - C^T lambda = force and C x = rates, and the right-hand side of S lambda = right."""
+        force = force + self.weight * self.rows.T @ rates
+        x = self.inverse @ force
+        x = x + self.inverse @ (force - self.matrix @ x)
         right = rates - self.rows @ x
         return x + self.spread @ self.shares(right, jnp.zeros_like(right)), right
 
@@ -99,9 +105,9 @@ def scales(system: System) -> tuple[Float[Array, ""], Float[Array, ""]]:
 
 def _accelerated(balances: Balances, columns: Gains, applied: Twists, bias: Gains) -> tuple[Array, Array]:
     """Matrix and right-hand side P^T (F - M bias) of the balances."""
-    matrix = jax.vmap(lambda gains: balances.project(*balances.inertial(gains))[0])(columns).T
+    matrix = jax.vmap(lambda gains: balances.project(*balances.inertial(gains)))(columns).T
     force, torque = balances.inertial(bias)
-    return matrix, balances.project(applied[0] - force, applied[1] - torque)[0]
+    return matrix, balances.project(applied[0] - force, applied[1] - torque)
 
 
 def _combined(bias: Gains, columns: Gains, w_dot: Array) -> Gains:
@@ -117,7 +123,7 @@ def _reactions(balances: Balances, gains: Gains, applied: Twists, lam: Array) ->
 def _measured(balances: Balances, radius: Array, gains: Gains, applied: Twists, lam: Array) -> Array:
     """All reactions as one vector [N], torques divided by the radius of gyration."""
     forces, torques = _reactions(balances, gains, applied, lam)
-    related = lam[: sum(g.count for g in balances.relations)]
+    related = lam[: sum(g.count for g in relations_of(balances.system))]
     scale = jnp.sqrt(radius)
     return jnp.concatenate([forces.reshape(-1), torques.reshape(-1) / scale, related / scale])
 
@@ -132,10 +138,10 @@ def _with_constraints(
     still = jnp.zeros_like(balances.rows[:, 0])
     lam0 = nothing.constraints
     matrix, zero = _accelerated(balances, columns, (still, still), nothing)
-    share = jax.jacfwd(lambda lam: _measured(balances, radius, nothing, (still, still), lam))(lam0)
+    units = jnp.eye(lam0.shape[0], dtype=lam0.dtype)
+    share = jax.vmap(lambda lam: _measured(balances, radius, nothing, (still, still), lam))(units).T
     saddle = Saddle.of(matrix, columns.constraints.T, share.T @ share, mass)
-    violation = balances.rates(balances.rows, *balances.twists(w), state.t).constraints
-    w = w + saddle.solve(zero, -violation)[0]
+    w = w + saddle.solve(zero, -balances.rates(w).constraints)[0]
     applied = loads(system, state, u, *balances.twists(w))
     bias = balances.bias(w)
     free = _accelerated(balances, columns, applied, bias)[1]
@@ -160,7 +166,7 @@ def _without_constraints(
 
 def _named(balances: Balances, lam: Array) -> dict[str, Array]:
     found, position = {}, 0
-    for group in (*balances.relations, *balances.loops):
+    for group in (*relations_of(balances.system), *loops_of(balances.system)):
         for name in group.names:
             found[name] = lam[position : position + group.multipliers]
             position += group.multipliers
@@ -170,8 +176,8 @@ def _named(balances: Balances, lam: Array) -> dict[str, Array]:
 def instant_of(system: System, state: State, u: Float[Array, " inputs"]) -> Instant:
     """Accelerations and reactions of one state."""
     balances = Balances.at(system, state)
-    w = tree_rates(system, balances.geometry, state)
-    solve = _with_constraints if balances.relations or balances.loops else _without_constraints
+    w = tree_rates(system, state)
+    solve = _with_constraints if system.structure.multipliers else _without_constraints
     gains, applied, lam = solve(system, state, u, balances, w)
     forces, torques = _reactions(balances, gains, applied, lam)
     return Instant(gains.rows.reshape(-1, 3), forces, torques, _named(balances, lam))

@@ -9,11 +9,11 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.coordinates import coordinate_rates, coordinate_values, frames_of, state_rates
 from natcoord_jax.assembly.diagnostics import over_states, rows_with_ground, states_of
-from natcoord_jax.assembly.rates import geometry_at, row_rates, tree_rates, twists
+from natcoord_jax.assembly.rates import carried, null_space, row_rates, tree_rates, twists
 from natcoord_jax.assembly.response import stations
 from natcoord_jax.assembly.sensors import joint_coordinates
 from natcoord_jax.assembly.system import System
-from natcoord_jax.assembly.tree import SLOTS, gather_slots, sweep_motion
+from natcoord_jax.assembly.tree import gather_slots, sweep_motion
 from natcoord_jax.core.coordinate import pair_motion
 from natcoord_jax.core.effect import Motion, replace_fields
 from natcoord_jax.core.handles import Handle
@@ -46,16 +46,6 @@ def rate(system: System, motion: State | Trajectory, joint: Handle | str, index:
     return over_states(lambda state: state_rates(system, state), motion)[..., int(places[index])]
 
 
-def _subtree(system: System, body: int) -> Array:
-    """Which bodies hang on the tree joint of a body, itself included; shape (bodies,)."""
-    tree = system.tree
-    own = jnp.arange(len(system.structure.bodies)) == body
-    inside = own
-    for _ in tree.levels[1:]:
-        inside = own | jnp.concatenate([inside, jnp.zeros(1, bool)])[tree.parent]
-    return inside
-
-
 def _joint_motions(
     system: System, rows: Float[Array, "bodies 4 3"], body: int, places: np.ndarray
 ) -> tuple[Array, Array, Array, Array]:
@@ -65,15 +55,13 @@ def _joint_motions(
         Rates of the joint's coordinates (n, 7), velocity and angular velocity of the body (7, 3) each, and
         the place of each slot among the unknowns (7,).
     """
-    geometry = geometry_at(system, rows)
+    velocities, spins = null_space(system, rows)
     slots = jnp.asarray(system.tree.slot_index)[body]
-    still = jnp.zeros((1, 3), rows.dtype)
+    extended, still = rows_with_ground(rows.reshape(-1, 3)), jnp.zeros((1, 3), rows.dtype)
 
     def unit(slot):
-        w = jnp.zeros(system.structure.unknowns, rows.dtype).at[slot].set(1.0, mode="drop")
-        velocity, spin = twists(system, geometry, w)
+        velocity, spin = (x.at[:, slot].get(mode="fill", fill_value=0.0) for x in (velocities, spins))
         moving = jnp.concatenate([row_rates(rows, velocity, spin), jnp.zeros((1, 4, 3), rows.dtype)])
-        extended = rows_with_ground(rows.reshape(-1, 3))
         rates = coordinate_rates(system, extended, moving, jnp.concatenate([spin, still]))
         return rates[places], velocity[body], spin[body]
 
@@ -145,7 +133,7 @@ def _moved(
     rotation = from_rotation_vector(turn)
     turned = jnp.einsum("ij,brj->bri", rotation, rows.at[:, 0].add(-pivot))
     moved = turned.at[:, 0].add(pivot + shift)
-    return jnp.where(_subtree(system, body)[:, None, None], moved, rows)
+    return jnp.where((carried(system)[:, body] > 0)[:, None, None], moved, rows)
 
 
 def with_coordinate(
@@ -160,19 +148,19 @@ def with_coordinate(
             "coordinates of the other joints of the loop and project with nc.assemble(system, state)"
         )
     value = jnp.asarray(value, float)
-    w = tree_rates(system, geometry_at(system, state.q.reshape(-1, 4, 3)), state)
+    w = tree_rates(system, state)
     change = _with_relations(system, places, index, value - state.coordinates[places[index]])
     rows = _moved(system, state, body, places, change)
     coordinates = state.coordinates.at[places].add(change).at[places[index]].set(value)
     coordinates = _moved_coordinates(system, state.q, rows, coordinates, places)
+    wanted = state_rates(system, state)[places]
     if rate is not None:
-        rates, _, _, slots = _joint_motions(system, rows, body, places)
-        own = jnp.concatenate([w, jnp.zeros(1)])[slots]
-        difference = jnp.asarray(rate, float) - (rates @ own)[index]
-        wanted = _with_relations(system, places, index, difference)
-        w = w.at[slots].add(_slot_rates(rates, wanted), mode="drop")
-    moving = row_rates(rows, *twists(system, geometry_at(system, rows), w))
-    inside = _subtree(system, body)[:, None, None]
+        wanted = wanted + _with_relations(system, places, index, jnp.asarray(rate, float) - wanted[index])
+    rates, _, _, slots = _joint_motions(system, rows, body, places)
+    own = jnp.concatenate([w, jnp.zeros(1)])[slots]
+    w = w.at[slots].add(_slot_rates(rates, wanted - rates @ own), mode="drop")
+    moving = row_rates(rows, *twists(system, rows, w))
+    inside = (carried(system)[:, body] > 0)[:, None, None]
     v = jnp.where(inside, moving, state.v.reshape(-1, 4, 3))
     found = replace_fields(state, q=rows.reshape(-1, 3), v=v.reshape(-1, 3), coordinates=coordinates)
     if rate is None:
@@ -233,7 +221,7 @@ def random_state(
         found = jax.vmap(increment, in_axes=(0, 0, 1, 1, 1))(system.frames[group.joints], *pairs)
         counted = counted.at[group.index].add(found)
     w = rates * jax.random.normal(second, (size,), rows.dtype)
-    v = row_rates(after, *twists(system, geometry_at(system, after), w))
+    v = row_rates(after, *twists(system, after, w))
     moved = replace_fields(state, q=after.reshape(-1, 3), v=v.reshape(-1, 3), coordinates=counted)
     every = np.arange(counted.shape[0])
     return replace_fields(moved, rates=_rotors(system, state_rates(system, moved), moved, every))

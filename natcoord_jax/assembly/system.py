@@ -71,7 +71,7 @@ class Elimination(eqx.Module):
 
     schedule: Int[Array | np.ndarray, "rows lanes"]
     slots: Int[Array | np.ndarray, "bodies m"]
-    offsets: tuple[Int[Array | np.ndarray, " n"], ...]
+    offsets: tuple[Int[Array | np.ndarray, " _"], ...]
 
 
 @dataclass(frozen=True)
