@@ -160,7 +160,11 @@ class Scene:
         for note in notes:
             warnings.warn(note, stacklevel=2)
         structure = dataclasses.replace(
-            system.structure, dofs=system.structure.unknowns - rank, redundant=redundant, notes=notes
+            system.structure,
+            dofs=system.structure.unknowns - rank,
+            redundant=redundant,
+            notes=notes,
+            rank=rank if redundant else None,
         )
         return replace_fields(system, structure=structure), state
 

@@ -7,6 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from natcoord_jax.assembly.coordinates import coordinate_values, state_rates
+from natcoord_jax.assembly.diagnostics import rows_with_ground
 from natcoord_jax.assembly.graph import Edge, make_tree, spanning_tree
 from natcoord_jax.assembly.grouping import Instance, bare, stack
 from natcoord_jax.assembly.system import CoordinateGroup, Elimination, Group, Structure, System
@@ -188,9 +190,13 @@ class Layout:
         return instance
 
     def _on_markers(self, name: str, effect: Any, label: str) -> Instance:
-        markers = effect.attach(lambda handle: (self.joints[handle.name], joint_triad(self.joints[handle.name])))
+        markers = effect.attach(
+            lambda handle: (self.joints[handle.name], joint_triad(self.joints[handle.name]))
+        )
         if not isinstance(markers, tuple | list) or not all(isinstance(m, Marker) for m in markers):
-            raise ValueError(f"{label}: markers must be a tuple of nc.Point and nc.Direction, not {markers!r}")
+            raise ValueError(
+                f"{label}: markers must be a tuple of nc.Point and nc.Direction, not {markers!r}"
+            )
         weights = jnp.stack([self.poses.weights(m) for m in markers])
         drop = [f for f in ("markers", "name", "joint") if f in type(effect).__dataclass_fields__]
         bodies = [self.body(m.body) for m in markers]
@@ -356,4 +362,20 @@ def build(
         elimination_order(layout, groups, joint_groups) if structure.solver == "recursive" else None,
         structure,
     )
-    return jax.tree.map(jnp.asarray, system), layout.state()
+    system = jax.tree.map(jnp.asarray, system)
+    return system, with_readings(system, layout.state())
+
+
+def with_readings(system: System, state: State) -> State:
+    """The state with lengths as they are, and rotors turning with their joints; angles count from zero."""
+    if not system.coordinates:
+        return state
+    values, rates = coordinate_values(system, rows_with_ground(state.q)), state_rates(system, state)
+    coordinates, rotors = state.coordinates, state.rates
+    for group in system.coordinates:
+        if group.axis.unit != "rad":
+            coordinates = coordinates.at[group.index].set(values[group.index])
+    for group in system.effects:
+        if group.effect.rotors:
+            rotors = rotors.at[group.rotors[:, 0]].set(rates[group.coordinates[:, 0]])
+    return replace_fields(state, coordinates=coordinates, rates=rotors)

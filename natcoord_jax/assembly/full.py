@@ -14,11 +14,13 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.diagnostics import rows_with_ground
 from natcoord_jax.assembly.local import body_balance, body_motion, over_instances
-from natcoord_jax.assembly.reduced import row_weights
+from natcoord_jax.assembly.reduced import project_multipliers, project_rows, row_weights
 from natcoord_jax.assembly.response import Situation, Stations, body_rows, situation, stations
 from natcoord_jax.assembly.system import Group, System
+from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import Tableau
+from natcoord_jax.maths.projectors import range_projector
 from natcoord_jax.maths.vectors import cross
 
 
@@ -31,21 +33,32 @@ class FullStep(eqx.Module):
     velocity: Float[Array, "bodies 4 3"]
     situations: tuple[Situation, ...]
     h: Float[Array, ""]
+    projector: Float[Array, "m m"] | None
     tableau: Tableau = eqx.field(static=True)
 
     @classmethod
     def prepare(cls, system: System, state: State, u: Array, h: Array, tableau: Tableau) -> "FullStep":
         """Gather what the step needs, once."""
         groups = (*system.effects, *system.joints)
-        return cls(
+        plain = cls(
             system,
             state,
             rows_with_ground(state.q),
             body_rows(state.v),
             tuple(situation(system, g, state, u, h) for g in groups),
             h,
+            None,
             tableau,
         )
+        rank = system.structure.rank
+        if rank is None or tableau.stages > 1:
+            return plain
+        at_rest = replace_fields(plain, h=jnp.zeros_like(h))
+        matrix = at_rest.jacobian(jnp.zeros(plain.unknowns, state.q.dtype))
+        rows = matrix[plain.balances :, : plain.balances]
+        in_tree = sum(g.count * g.multipliers for g in system.joints if g.in_tree)
+        projector = range_projector(rows, rank + in_tree)
+        return eqx.tree_at(lambda s: s.projector, plain, projector, is_leaf=lambda x: x is None)
 
     @property
     def groups(self) -> tuple[Group, ...]:
@@ -92,7 +105,7 @@ class FullStep(eqx.Module):
 
     def residual(self, y: Float[Array, " unknowns"]) -> tuple[Float[Array, " unknowns"], Float[Array, ""]]:
         """Residual [N s, N m s; m/s, 1/s for constraints] and the size of its terms [sqrt(J)]."""
-        twists, multipliers = self.split(y)
+        twists, multipliers = self.split(project_multipliers(y, self.balances, self.projector))
         balance = jax.vmap(body_balance, in_axes=(0, 0, 0, 0, None, None))
         total = balance(self.system.mass, self.start[:-1], self.velocity, twists, self.h, self.tableau)
         total = self._with_ground(total)
@@ -110,7 +123,8 @@ class FullStep(eqx.Module):
             size = size + jnp.sum(scale * added[:-1] ** 2)
             total = total - added
             rows.append(g_rates.reshape(-1))
-        return jnp.concatenate([total[:-1].reshape(-1), *rows]), jnp.sqrt(size)
+        rows = project_rows(jnp.concatenate([jnp.zeros(0), *rows]), y, self.balances, self.projector)
+        return jnp.concatenate([total[:-1].reshape(-1), rows]), jnp.sqrt(size)
 
     def body_jacobians(self, twists: Float[Array, "bodies s 6"]) -> Float[Array, "bodies n n"]:
         """Jacobians of the bodies' own balances."""
@@ -121,7 +135,7 @@ class FullStep(eqx.Module):
 
     def jacobian(self, y: Float[Array, " unknowns"]) -> Float[Array, "unknowns unknowns"]:
         """Exact Jacobian, assembled from local ones."""
-        twists, multipliers = self.split(y)
+        twists, multipliers = self.split(project_multipliers(y, self.balances, self.projector))
         s, bodies, size = self.tableau.stages, self.bodies, self.unknowns
         width = 6 * s
         own = self.body_jacobians(twists)
@@ -149,7 +163,18 @@ class FullStep(eqx.Module):
                 matrix = matrix.at[lams[:, :, None], touched[:, None, :]].add(
                     g_by_twist.reshape(n, m, k * width)
                 )
-        return matrix[:size, :size]
+        return self._projected(matrix[:size, :size])
+
+    def _projected(self, matrix: Array) -> Array:
+        """Columns of multipliers and rows of constraints in the range of the constraints."""
+        if self.projector is None:
+            return matrix
+        first = self.balances
+        count = matrix.shape[0] - first
+        idle = (jnp.eye(count, dtype=matrix.dtype) - self.projector) / (1.0 + count)
+        matrix = matrix.at[:first, first:].set(matrix[:first, first:] @ self.projector)
+        matrix = matrix.at[first:, :first].set(self.projector @ matrix[first:, :first])
+        return matrix.at[first:, first:].set(idle)
 
     def guess(self) -> Float[Array, " unknowns"]:
         """Twists at the start, repeated for every stage; multipliers zero."""
@@ -161,7 +186,7 @@ class FullStep(eqx.Module):
 
     def end_motion(self, y: Float[Array, " unknowns"]) -> tuple[Stations, list[Array]]:
         """Stage motion of all bodies and the multipliers, for the end of the step."""
-        twists, multipliers = self.split(y)
+        twists, multipliers = self.split(project_multipliers(y, self.balances, self.projector))
         motion = body_motion(self.start[:-1], twists, self.h, self.tableau)
         at = stations(
             self.start[:-1],

@@ -87,7 +87,7 @@ class Saddle(eqx.Module):
         return lam
 
     def solve(self, force: Float[Array, " n"], rates: Float[Array, " m"]) -> tuple[Array, Array]:
-        """x with A x - C^T lambda = force and C x = rates, and the right-hand side of S lambda = right."""
+        """Solution x of A x - C^T lambda = force and C x = rates, and the right-hand side of S lambda = right."""
         force = force + self.weight * self.rows.T @ rates
         x = self.inverse @ force
         x = x + self.inverse @ (force - self.matrix @ x)
@@ -116,7 +116,7 @@ def _combined(bias: Gains, columns: Gains, w_dot: Array) -> Gains:
 
 def _reactions(balances: Balances, gains: Gains, applied: Twists, lam: Array) -> tuple[Array, Array]:
     pulled = balances.constrained(lam) if lam.size else (0.0, 0.0)
-    force, torque = (a - b - c for a, b, c in zip(balances.inertial(gains), applied, pulled))
+    force, torque = (a - b - c for a, b, c in zip(balances.inertial(gains), applied, pulled, strict=True))
     return balances.reactions(force, torque, lam)
 
 

@@ -28,7 +28,8 @@ def _place(system: System, joint: Handle | str, index: int) -> tuple[int, np.nda
     number, places, _ = joint_coordinates(system, joint)
     if not 0 <= index < len(places):
         name = system.structure.joints[number]
-        raise ValueError(f"joint {name!r} has {len(places)} coordinates, no number {index}; they count from 0")
+        known = f"{len(places)} coordinates, no number {index}"
+        raise ValueError(f"joint {name!r} has {known}; they count from 0")
     return number, np.array(places)
 
 
@@ -40,7 +41,9 @@ def coordinate(
     return states_of(motion).coordinates[..., int(places[index])]
 
 
-def rate(system: System, motion: State | Trajectory, joint: Handle | str, index: int = 0) -> Float[Array, "*t"]:
+def rate(
+    system: System, motion: State | Trajectory, joint: Handle | str, index: int = 0
+) -> Float[Array, "*t"]:
     """Rate of a joint coordinate [rad/s or m/s]; see `System.rate`."""
     _, places = _place(system, joint, index)
     return over_states(lambda state: state_rates(system, state), motion)[..., int(places[index])]
@@ -94,7 +97,9 @@ def _slot_rates(rates: Float[Array, "n 7"], wanted: Float[Array, " n"]) -> Float
     return rates.T @ jnp.linalg.solve(rates @ rates.T, wanted)
 
 
-def _moved_coordinates(system: System, before: Array, after: Array, coordinates: Array, places: np.ndarray) -> Array:
+def _moved_coordinates(
+    system: System, before: Array, after: Array, coordinates: Array, places: np.ndarray
+) -> Array:
     """Coordinates of other joints (those that close loops) follow, angles by less than half a turn."""
     start, end = (coordinate_values(system, rows_with_ground(x.reshape(-1, 3))) for x in (before, after))
     change = end - start
@@ -144,8 +149,8 @@ def with_coordinate(
     bodies = len(system.structure.bodies)
     if body >= bodies:
         raise ValueError(
-            f"joint {system.structure.joints[body]!r} closes a loop: its coordinates follow from the others. Set "
-            "coordinates of the other joints of the loop and project with nc.assemble(system, state)"
+            f"joint {system.structure.joints[body]!r} closes a loop: its coordinates follow from the "
+            "others. Set those of the other joints of the loop and project with nc.assemble(system, state)"
         )
     value = jnp.asarray(value, float)
     w = tree_rates(system, state)
@@ -199,8 +204,8 @@ def random_state(
     """
     if system.structure.multipliers:
         raise ValueError(
-            "random_state needs a system without loops, drives and couplings; move the state of this one with "
-            "with_coordinate and project it with nc.assemble"
+            "random_state needs a system without loops, drives and couplings; move the state of this one "
+            "with with_coordinate and project it with nc.assemble"
         )
     first, second = jax.random.split(key)
     size, tableau, h = system.structure.unknowns, gauss(1), jnp.ones(())

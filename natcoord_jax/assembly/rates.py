@@ -18,7 +18,7 @@ from natcoord_jax.core.state import State
 from natcoord_jax.maths.vectors import cross, dot
 
 Twists = tuple[Float[Array, "bodies 3"], Float[Array, "bodies 3"]]
-"""Velocities of the reference points [m/s] and angular velocities [rad/s]; or forces [N] and torques [N m]."""
+"""Velocities of reference points [m/s] and angular velocities [rad/s]; or forces [N] and torques [N m]."""
 
 
 def row_rates(rows: Float[Array, "bodies 4 3"], velocity: Array, spin: Array) -> Float[Array, "bodies 4 3"]:

@@ -31,9 +31,30 @@ from natcoord_jax.assembly.tree import (
     project,
     sweep_motion,
 )
+from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import Tableau, gauss
+from natcoord_jax.maths.projectors import range_projector
 from natcoord_jax.maths.vectors import cross
+
+
+def project_multipliers(y: Array, balances: int, projector: Array | None) -> Array:
+    """Unknowns with their multipliers in the range of the constraints: reactions of minimum norm.
+
+    At the mid-point of a step, off the manifold, redundant constraints are not quite dependent; multipliers
+    outside of the range would then push along the free motion.
+    """
+    if projector is None:
+        return y
+    return jnp.concatenate([y[:balances], projector @ y[balances:]])
+
+
+def project_rows(rows: Array, y: Array, balances: int, projector: Array | None) -> Array:
+    """Constraint rates in the range of the constraints; the rest of the rows sets idle multipliers to zero."""
+    if projector is None:
+        return rows
+    idle = y[balances:] - projector @ y[balances:]
+    return projector @ rows + idle / (1.0 + rows.shape[0])
 
 
 def active_groups(system: System) -> tuple[Group, ...]:
@@ -72,13 +93,14 @@ class ReducedStep(eqx.Module):
     frames: Float[Array, "bodies 2 4 4"]
     situations: tuple[Situation, ...]
     h: Float[Array, ""]
+    projector: Float[Array, "m m"] | None
     tableau: Tableau = eqx.field(static=True)
 
     @classmethod
     def prepare(cls, system: System, state: State, u: Array, h: Array, tableau: Tableau) -> "ReducedStep":
         """Gather what the step needs, once."""
         start = body_rows(state.q)
-        return cls(
+        plain = cls(
             system,
             state,
             start,
@@ -86,8 +108,24 @@ class ReducedStep(eqx.Module):
             system.tree.frames(system.frames),
             tuple(situation(system, g, state, u, h) for g in active_groups(system)),
             h,
+            None,
             tableau,
         )
+        if system.structure.rank is None or tableau.stages > 1:
+            return plain
+        projector = range_projector(plain.constraint_matrix(), system.structure.rank)
+        return eqx.tree_at(lambda s: s.projector, plain, projector, is_leaf=lambda x: x is None)
+
+    def constraint_matrix(self) -> Float[Array, "m unknowns"]:
+        """Rates of all constraints per rate of the free motions, at the start of the step."""
+        resting = replace_fields(self, h=jnp.zeros_like(self.h))
+        count = self.system.structure.unknowns
+        rest = jnp.zeros(self.system.structure.multipliers, self.start.dtype)
+
+        def rows(w: Array) -> Array:
+            return resting.residual(jnp.concatenate([w, rest]))[0][count:]
+
+        return jax.jacfwd(rows)(jnp.zeros(count, self.start.dtype))
 
     @property
     def groups(self) -> tuple[Group, ...]:
@@ -126,7 +164,7 @@ class ReducedStep(eqx.Module):
     def residual(self, y: Float[Array, " unknowns"]) -> tuple[Float[Array, " unknowns"], Float[Array, ""]]:
         """Residual [N s, N m s; m/s, 1/s for constraints] and the size of its terms [sqrt(J)]."""
         system, tableau = self.system, self.tableau
-        w, multipliers = self.split(y)
+        w, multipliers = self.split(project_multipliers(y, self.balances, self.projector))
         motion, geometry = self.motion(w)
         rates = jnp.concatenate(
             [motion.velocity[:, :, None], cross(motion.spin[:, :, None], motion.directors)], axis=2
@@ -153,7 +191,8 @@ class ReducedStep(eqx.Module):
         force, moment = wrench(momentum, motion.directors)
         moment = moment if torque is None else moment - torque
         generalised = project(system.tree, geometry, force, moment)[0]
-        return jnp.concatenate([generalised.reshape(-1), *rows]), jnp.sqrt(size)
+        rows = project_rows(jnp.concatenate([jnp.zeros(0), *rows]), y, self.balances, self.projector)
+        return jnp.concatenate([generalised.reshape(-1), rows]), jnp.sqrt(size)
 
     def _scatter(self, group: Group, loads: Float[Array, "n s k *rest"]) -> Float[Array, "s bodies *rest"]:
         """Sum of the loads of all instances by body; those on the ground fall away."""
@@ -182,7 +221,7 @@ class ReducedStep(eqx.Module):
 
     def end_motion(self, y: Float[Array, " unknowns"]) -> tuple[Stations, list[Array]]:
         """Stage motion of all bodies and the multipliers, for the end of the step."""
-        w, multipliers = self.split(y)
+        w, multipliers = self.split(project_multipliers(y, self.balances, self.projector))
         return self.stations(self.motion(w)[0]), multipliers
 
 

@@ -74,9 +74,8 @@ class BodySensor(eqx.Module):
     def angular_acceleration(self) -> Float[Array, "*t 3"]:
         """Angular acceleration, world components [rad/s^2]."""
         first = 4 * self.index + 1
-        return angular_velocity(
-            jnp.swapaxes(self.rotation, -1, -2), _instants(self.source).accelerations[..., first : first + 3, :]
-        )
+        directors = jnp.swapaxes(self.rotation, -1, -2)
+        return angular_velocity(directors, _instants(self.source).accelerations[..., first : first + 3, :])
 
 
 class JointSensor(eqx.Module):
@@ -183,7 +182,9 @@ class MarkerSensor(eqx.Module):
         return _weighted(self.weights, _instants(self.source).accelerations, self.body)
 
 
-def _weighted(weights: Float[Array, "*l 4"], rows: Float[Array, "*t rows 3"], body: int) -> Float[Array, "*t 3"]:
+def _weighted(
+    weights: Float[Array, "*l 4"], rows: Float[Array, "*t rows 3"], body: int
+) -> Float[Array, "*t 3"]:
     """Marker vector sum_a w_a q_a; zero on the ground, whose rows do not move."""
     if 4 * body >= rows.shape[-2]:
         return jnp.zeros_like(rows[..., 0, :])
@@ -246,8 +247,8 @@ def marker_weights(system: System, marker: Marker, state: State | None) -> tuple
     if not marker.local:
         if state is None:
             raise ValueError(
-                f"the marker on {marker.body!r} is in world coordinates of the assembled pose: pass that pose "
-                "as `state=` (the initial state), or the marker with local=True"
+                f"the marker on {marker.body!r} is in world coordinates of the assembled pose: pass that "
+                "pose as `state=` (the initial state), or the marker with local=True"
             )
         rows = state.q[4 * body : 4 * body + 4]
         vector = rows[1:] @ (vector - rows[0] if marker.is_point else vector)

@@ -90,6 +90,7 @@ class Structure:
         solver: "reduced", "recursive" or "full".
         constraints: number of constraints, internal ones of rigid bodies included.
         dofs: degrees of freedom: unknowns less the structural rank of the remaining constraints.
+        rank: structural rank of the constraints outside the tree where some are redundant, else None.
         redundant: names of joints and relations whose constraints depend on the others.
         notes: findings of the compilation for the report.
     """
@@ -104,6 +105,7 @@ class Structure:
     multipliers: int
     solver: str
     constraints: int
+    rank: int | None = None
     dofs: int = field(default=0, compare=False)
     redundant: tuple[str, ...] = field(default=(), compare=False)
     notes: tuple[str, ...] = field(default=(), compare=False)

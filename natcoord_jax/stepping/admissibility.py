@@ -134,18 +134,20 @@ def _disturbed(system: System, state: State, key) -> State:
 
 
 def _rank(rows: np.ndarray) -> tuple[int, list[int]]:
-    """Rank, and rows that depend on earlier ones (pivoted in order, so that later joints are named)."""
-    scales = np.linalg.norm(rows, axis=1)
-    rows = rows / np.where(scales > 0, scales, 1.0)[:, None]
+    """Rank, and rows that depend on earlier ones, so that later joints are named."""
+    sizes = np.linalg.svd(rows, compute_uv=False)
+    rank = int(np.sum(sizes > 1e-9 * max(sizes[0], 1e-300))) if sizes.size else 0
+    largest = np.max(np.linalg.norm(rows, axis=1), initial=1e-300)
     basis: list[np.ndarray] = []
     dependent = []
     for number, row in enumerate(rows):
-        rest = row.copy()
+        rest = row / largest
         for _ in range(2):
             for b in basis:
                 rest = rest - (rest @ b) * b
-        if np.linalg.norm(rest) > 1e-6:
-            basis.append(rest / np.linalg.norm(rest))
+        size = np.linalg.norm(rest)
+        if size > 1e-8 and len(basis) < rank:
+            basis.append(rest / size)
         else:
             dependent.append(number)
-    return len(basis), dependent
+    return rank, dependent
