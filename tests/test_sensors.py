@@ -69,7 +69,9 @@ def menagerie():
         b = scene.add(body(f"b{k}", (1.0, y + 0.4, 0.0), orientation=((1, 2, 3), 0.7)))
         scene.add(nc.Spherical(nc.ground, a, point=(0, y, 0)))
         pair = (b, a) if backwards else (a, b)
-        joint = scene.add(KINDS[kind](*pair, point=(0.8, y + 0.2, 0.1), axis=AXIS, name=f"{kind} of pair {k}"))
+        joint = scene.add(
+            KINDS[kind](*pair, point=(0.8, y + 0.2, 0.1), axis=AXIS, name=f"{kind} of pair {k}")
+        )
         if KINDS[kind].coordinates:
             scene.add(nc.JointSpring(joint, stiffness=3.0, rest=0.2))
             scene.add(nc.JointForce(joint))
@@ -120,7 +122,9 @@ def instant_by_bodies(system, state, u):
 
     def inertial(x):
         impulse = jnp.einsum("bij,bjc->bic", system.mass, row_accelerations(x).reshape(-1, 4, 3))
-        return jnp.concatenate([impulse[:, 0], jnp.sum(jnp.cross(rows[:, 1:], impulse[:, 1:]), axis=1)]).reshape(-1)
+        return jnp.concatenate(
+            [impulse[:, 0], jnp.sum(jnp.cross(rows[:, 1:], impulse[:, 1:]), axis=1)]
+        ).reshape(-1)
 
     zero = jnp.zeros(6 * count)
     mass, jacobian = jax.jacfwd(inertial)(zero), jax.jacfwd(constraint)(zero)
@@ -129,7 +133,9 @@ def instant_by_bodies(system, state, u):
     matrix = np.block([[mass, -jacobian.T], [jacobian, np.zeros((size, size))]])
     right = np.concatenate([applied - inertial(zero), -constraint(zero)])
     solution = np.linalg.lstsq(matrix, right, rcond=1e-11)[0]
-    return np.asarray(row_accelerations(solution[: 6 * count])), np.asarray(jacobian.T @ solution[6 * count :])
+    return np.asarray(row_accelerations(solution[: 6 * count])), np.asarray(
+        jacobian.T @ solution[6 * count :]
+    )
 
 
 def wrenches_on_bodies(system, state, found):
@@ -197,7 +203,9 @@ def test_hanging_chain_carries_its_weight():
     scene.add(nc.Gravity(vector=(0, 0, -10.0)))
     system, state = scene.compile()
     np.testing.assert_allclose(system.sense(state, top).force, (0, 0, 50), atol=1e-12)
-    np.testing.assert_allclose(system.sense(state, top).torque, (0, -2 * 10 * 0.3 - 3 * 10 * 0.5, 0), atol=1e-12)
+    np.testing.assert_allclose(
+        system.sense(state, top).torque, (0, -2 * 10 * 0.3 - 3 * 10 * 0.5, 0), atol=1e-12
+    )
     np.testing.assert_allclose(system.sense(state, backwards).force, (0, 0, -30), atol=1e-12)
     np.testing.assert_allclose(system.sense(state, backwards).torque, (0, 3 * 10 * 0.2, 0), atol=1e-12)
 
@@ -231,7 +239,8 @@ def test_door_on_two_hinges_shares_its_weight():
     scene = nc.Scene()
     door = scene.add(nc.RigidBody(mass=4.0, inertia=(1.0, 1.0, 0.5), position=(0.5, 0, 0), name="door"))
     hinges = [
-        scene.add(nc.Revolute(nc.ground, door, point=(0, 0, z), axis=(0, 0, 1), name=f"hinge {z}")) for z in (-1, 1)
+        scene.add(nc.Revolute(nc.ground, door, point=(0, 0, z), axis=(0, 0, 1), name=f"hinge {z}"))
+        for z in (-1, 1)
     ]
     scene.add(nc.Gravity(vector=(0, 0, -10.0)))
     system, state = scene.compile()
@@ -273,7 +282,9 @@ def test_drive_needs_the_torque_of_its_acceleration():
 
 def test_wheel_counts_its_turns():
     scene = nc.Scene()
-    wheel = scene.add(nc.RigidBody(mass=1, inertia=(1, 1, 1), angular_velocity=(0, 0, 10 * math.pi), name="wheel"))
+    wheel = scene.add(
+        nc.RigidBody(mass=1, inertia=(1, 1, 1), angular_velocity=(0, 0, 10 * math.pi), name="wheel")
+    )
     axle = scene.add(nc.Revolute(nc.ground, wheel, axis=(0, 0, 1)))
     system, state = scene.compile()
     # The free wheel turns by 2 atan(h omega / 2) in each step.
@@ -345,12 +356,18 @@ def wrapped(system, coordinates, joint):
 
 def test_random_states_are_valid():
     system, state = menagerie()
-    found = jax.jit(jax.vmap(lambda key: nc.random_state(system, state, key)))(jax.random.split(jax.random.key(6), 5))
+    found = jax.jit(jax.vmap(lambda key: nc.random_state(system, state, key)))(
+        jax.random.split(jax.random.key(6), 5)
+    )
     errors = system.constraint_errors(found)
     assert jnp.max(errors.position) < ROUND_OFF and jnp.max(errors.velocity) < 10 * ROUND_OFF
     one = jax.tree.map(lambda x: x[0], found)
     for joint in dict.fromkeys(name for name, _ in system.structure.coordinates):
-        close(readings(system, one, joint), wrapped(system, system.sense(one, joint).coordinates, joint), ROUND_OFF * 10)
+        close(
+            readings(system, one, joint),
+            wrapped(system, system.sense(one, joint).coordinates, joint),
+            ROUND_OFF * 10,
+        )
 
 
 def test_random_states_turn_rotors_along():
@@ -374,7 +391,9 @@ def test_reactions_differentiate_and_batch():
         by_rate = (force(rates[k] + h, masses[k]) - force(rates[k] - h, masses[k])) / (2 * h)
         by_mass = (force(rates[k], masses[k] + h) - force(rates[k], masses[k] - h)) / (2 * h)
         np.testing.assert_allclose([g[k] for g in gradients], (by_rate, by_mass), rtol=1e-7)
-    batch = jax.vmap(lambda rate: system.sense(system.with_coordinate(state, pin, 0.4, rate=rate), pin))(rates)
+    batch = jax.vmap(lambda rate: system.sense(system.with_coordinate(state, pin, 0.4, rate=rate), pin))(
+        rates
+    )
     np.testing.assert_allclose(batch.force[:, 0], [force(rate, 1.0) for rate in rates], rtol=1e-12)
 
 
@@ -386,6 +405,43 @@ def test_gradient_of_a_redundant_loop_is_finite():
         return system.instant(moved).forces[-1, 2]
 
     assert jnp.all(jnp.isfinite(jax.grad(force)(state.q)))
+
+
+def test_batches_of_trajectories_are_sensed_at_once():
+    system, state, bar, pin = pendulum()
+    steps = jnp.array([0.01, 0.02])
+    batch = jax.jit(jax.vmap(lambda h: nc.simulate(system, state, dt=h, steps=4)))(steps)
+    sensed = system.sense(batch, pin)
+    assert sensed.angle.shape == (2, 5) and sensed.force.shape == (2, 5, 3)
+    lane = jax.tree.map(lambda x: x[1], batch)
+    close(sensed.force[1], system.sense(lane, pin).force, ROUND_OFF)
+    body = system.sense(batch, bar)
+    assert body.quaternion.shape == (2, 5, 4) and body.acceleration.shape == (2, 5, 3)
+
+
+def test_rods_between_point_masses_know_their_length_and_pull():
+    scene = nc.Scene()
+    a = scene.add(nc.PointMass(mass=2.0, position=(1, 0, 0), velocity=(0, 0, 1.5)))
+    b = scene.add(nc.PointMass(mass=3.0, position=(1, 0, -2), velocity=(0, 0, 1.5)))
+    rods = [
+        scene.add(nc.Distance(nc.ground, a, point=(1, 0, 0), parent_point=(0, 0, 0))),
+        scene.add(nc.Distance(a, b, point=(1, 0, -2), parent_point=(1, 0, 0))),
+    ]
+    scene.add(nc.Gravity(vector=(0, 0, -10.0)))
+    system, state = scene.compile()
+    first, second = (system.sense(state, rod) for rod in rods)
+    np.testing.assert_allclose([first.distance, second.distance], [1, 2], atol=ROUND_OFF)
+    np.testing.assert_allclose(first.force, (-2 * 1.5**2, 0, 0), atol=EQUATIONS)
+    np.testing.assert_allclose(second.force, 0, atol=EQUATIONS)
+
+
+def test_rotors_start_with_the_rate_of_their_joint():
+    scene = nc.Scene()
+    wheel = scene.add(nc.RigidBody(mass=1, inertia=(1, 1, 1), angular_velocity=(0, 0, 3)))
+    axle = scene.add(nc.Revolute(nc.ground, wheel, axis=(0, 0, 1)))
+    scene.add(nc.Armature(axle, inertia=2.0, name="rotor"))
+    system, state = scene.compile()
+    np.testing.assert_allclose(system.energy(state).stores["rotor"], 9.0, atol=1e-12)
 
 
 def test_markers_and_bodies_agree():

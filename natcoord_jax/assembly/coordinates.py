@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.diagnostics import rows_with_ground
@@ -12,7 +13,7 @@ from natcoord_jax.maths.rotations import angular_velocity
 
 
 def frames_of(
-    system: System, joints: Array, rows: Float[Array, "bodies_and_ground 4 3"]
+    system: System, joints: Array | np.ndarray, rows: Float[Array, "bodies_and_ground 4 3"]
 ) -> tuple[Frame, Frame]:
     """Frames of parent and child of several joints, as the scene names them; leading axis the joints."""
     return jax.vmap(frames_at)(system.frames[joints], rows[system.joint_bodies[joints]])

@@ -87,7 +87,7 @@ class Saddle(eqx.Module):
         return lam
 
     def solve(self, force: Float[Array, " n"], rates: Float[Array, " m"]) -> tuple[Array, Array]:
-        """Solution x of A x - C^T lambda = force and C x = rates, and the right-hand side of S lambda = right."""
+        """Solution x of A x - C^T lambda = force, C x = rates; and the right-hand side of S lambda."""
         force = force + self.weight * self.rows.T @ rates
         x = self.inverse @ force
         x = x + self.inverse @ (force - self.matrix @ x)

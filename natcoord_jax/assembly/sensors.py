@@ -230,7 +230,8 @@ def joint_coordinates(system: System, joint: Handle | str) -> tuple[int, list[in
     name = system.structure.joints[index]
     places = [i for i, (owner, _) in enumerate(system.structure.coordinates) if owner == name]
     group = next(g for g in system.joints if name in g.names)
-    return index, places, tuple(axis.unit for axis in group.effect.coordinates)
+    kind: Any = group.effect
+    return index, places, tuple(axis.unit for axis in kind.coordinates)
 
 
 def marker_weights(system: System, marker: Marker, state: State | None) -> tuple[Float[Array, "4"], int]:
@@ -277,7 +278,10 @@ def sense(
     if name in system.structure.bodies:
         index = system.body_index(part)
         found = _body_motion(system, states, jnp.asarray(index), isinstance(motion, Trajectory))
-        return BodySensor(*found, index, source)
+        position, rotation, quaternion, velocity, spin, com, com_velocity = found
+        return BodySensor(
+            position, rotation, quaternion, velocity, spin, com, com_velocity, index=index, source=source
+        )
     if name and name in system.structure.joints:
         index, places, units = joint_coordinates(system, part)
         chosen = np.array(places, int)
