@@ -82,7 +82,7 @@ class _Iterate(eqx.Module):
 
 
 def _iterate(
-    equations: Any, factors: Any, inertias: Array, tolerance: Any, floor: float, it: _Iterate
+    equations: Any, factors: Any, inertias: Array, tolerance: Any, floor: Any, it: _Iterate
 ) -> _Iterate:
     """One correction with given factors; a correction that shrinks too slowly is not applied."""
     residual, size = equations.residual(it.y)
@@ -102,15 +102,15 @@ def _iterate(
 
 
 def _chord(
-    equations: Any, factors: Any, inertias: Array, tolerance: Any, floor: float, start: _Iterate
+    equations: Any, factors: Any, inertias: Array, tolerance: Any, floor: Any, start: _Iterate
 ) -> _Iterate:
     """Corrections with one factorisation until they converge or shrink too slowly."""
 
     def go_on(it: _Iterate) -> Array:
         return ~it.converged & ~it.slow & it.finite & (it.count < CHORD_ITERATIONS)
 
-    fresh = (jnp.array(0), jnp.zeros_like(start.correction))
-    restart = eqx.tree_at(lambda it: (it.count, it.correction), start, fresh)
+    again = (jnp.array(0), jnp.zeros_like(start.correction), start.converged)
+    restart = eqx.tree_at(lambda it: (it.count, it.correction, it.slow), start, again)
     correct = partial(_iterate, equations, factors, inertias, tolerance, floor)
     return jax.lax.while_loop(go_on, correct, restart)
 
@@ -151,27 +151,34 @@ def newton(equations: Any, tolerance: Float[Array, ""] | float, form: str, warm:
     Returns:
         The solution; its code is successful, max_iterations or nonfinite, never an exception.
     """
-    factorise = FACTORISATIONS[form]
     zero, no, nought = jnp.zeros((), warm.y.dtype), jnp.array(False), jnp.array(0)
-    start = _Iterate(warm.y, zero, zero, nought, nought, no, ~warm.valid, jnp.array(True))
-    with jax.named_scope("chord"):
-        it = _chord(equations, warm.factors, warm.inertias, tolerance, STALL_OLD, start)
-    usable = it.finite
-    it = eqx.tree_at(lambda x: (x.y, x.finite), it, (jnp.where(usable, it.y, warm.y), jnp.array(True)))
+    start = _Iterate(warm.y, zero, zero, nought, nought, no, no, jnp.array(True))
 
-    def refactor(carry: tuple) -> tuple:
-        it, _, _, rounds = carry
-        factors, inertias = factorise(equations, equations.jacobian(it.y))
-        again = eqx.tree_at(lambda x: x.slow, it, it.converged)
-        return _chord(equations, factors, inertias, tolerance, STALL, again), factors, inertias, rounds + 1
+    def fresh(it: _Iterate, factors: Any, inertias: Array) -> tuple[Any, Array]:
+        return FACTORISATIONS[form](equations, equations.jacobian(it.y))
+
+    def kept(it: _Iterate, factors: Any, inertias: Array) -> tuple[Any, Array]:
+        return factors, inertias
+
+    def round_of_corrections(carry: tuple) -> tuple:
+        it, factors, inertias, rounds = carry
+        needed = any_lane(~it.converged & ((rounds > 0) | ~warm.valid))
+        factors, inertias = jax.lax.cond(needed, fresh, kept, it, factors, inertias)
+        floor = jnp.where(needed, STALL, STALL_OLD)
+        after = _chord(equations, factors, inertias, tolerance, floor, it)
+        lost = ~after.finite & (rounds == 0) & ~needed
+        after = eqx.tree_at(
+            lambda x: (x.y, x.finite), after, (jnp.where(lost, warm.y, after.y), after.finite | lost)
+        )
+        return after, factors, inertias, rounds + 1
 
     def unsolved(carry: tuple) -> Array:
         it, _, _, rounds = carry
-        return any_lane(~it.converged & it.finite & (rounds < NEWTON_ROUNDS))
+        return any_lane(~it.converged & it.finite) & (rounds < NEWTON_ROUNDS)
 
     with jax.named_scope("newton"):
-        carry = (it, warm.factors, warm.inertias, nought)
-        it, factors, inertias, rounds = jax.lax.while_loop(unsolved, refactor, carry)
+        carry = (start, warm.factors, warm.inertias, nought)
+        it, factors, inertias, _ = jax.lax.while_loop(unsolved, round_of_corrections, carry)
     failed = jnp.where(it.finite, int(Result.MAX_ITERATIONS), int(Result.NONFINITE))
     code = jnp.where(it.converged, int(Result.SUCCESSFUL), failed)
     error = it.correction / jnp.where(it.size > 0, it.size, 1.0)

@@ -33,6 +33,13 @@ SMALLEST_FRACTION = 1.0 / 64
 """A step is given up when a substep of this fraction of it fails."""
 
 
+CHUNK = 32
+"""Slots whose Jacobians are formed together."""
+
+LARGEST_HALF_TURN = 10.0
+"""Tangent of half the largest rotation of a body in one (sub)step, 169 degrees: beyond lies the pole."""
+
+
 @dataclass(frozen=True)
 class Plan:
     """What is static about a rollout.
@@ -113,12 +120,11 @@ def _slot(plan: Plan, system: System, parameters: Any, dt: Array, course: Course
     index = jnp.minimum(course.step, plan.steps - 1)
     u = plan.control(parameters, index, state.t, state)
     solution = solve(system, state, u, h, tableau, plan.tolerance, course.warm)
-    new = advance(system, state, u, h, solution.y, tableau)[1]
-    sound = (solution.code == int(Result.SUCCESSFUL)) & jnp.all(jnp.isfinite(new.q)) & jnp.all(jnp.isfinite(new.v))
-    accepted = sound & ~idle
-    code = jnp.where(
-        (solution.code == int(Result.SUCCESSFUL)) & ~sound, int(Result.NONFINITE), solution.code
-    )
+    _, new, half_turn = advance(system, state, u, h, solution.y, tableau)
+    finite = jnp.all(jnp.isfinite(new.q)) & jnp.all(jnp.isfinite(new.v))
+    code = jnp.where(solution.code == int(Result.SUCCESSFUL), jnp.where(finite, 0, int(Result.NONFINITE)), solution.code)
+    code = jnp.where((code == 0) & (half_turn > LARGEST_HALF_TURN), int(Result.DIVERGED), code)
+    accepted = (code == int(Result.SUCCESSFUL)) & ~idle
     new = jax.tree.map(partial(jnp.where, accepted), new, state)
     done = course.done + jnp.where(accepted, course.fraction, 0.0)
     complete = accepted & (done > 1.0 - 1e-9)
@@ -199,6 +205,22 @@ def _zero_tangent(x: Array) -> Array | np.ndarray:
     return np.zeros(jnp.shape(x), jax.dtypes.float0)
 
 
+def _in_chunks(function: Callable, slots: tuple) -> Any:
+    """The function of every slot, vmapped in chunks whose temporaries stay in the cache."""
+    every = jax.vmap(lambda x: function(*x))
+    length = slots[1].shape[0]
+    if length <= CHUNK:
+        return every(slots)
+    chunks = -(-length // CHUNK)
+    padding = jnp.minimum(jnp.arange(chunks * CHUNK), length - 1)
+
+    def chunked(x: Array) -> Array:
+        return x[padding].reshape(chunks, CHUNK, *x.shape[1:])
+
+    found = jax.lax.map(every, jax.tree.map(chunked, slots))
+    return jax.tree.map(lambda x: x.reshape(chunks * CHUNK, *x.shape[2:])[:length], found)
+
+
 @run_slots.defjvp
 def _run_slots_jvp(plan: Plan, primals: tuple, tangents: tuple):
     system, state, parameters, dt = primals
@@ -207,37 +229,34 @@ def _run_slots_jvp(plan: Plan, primals: tuple, tangents: tuple):
     tableau = gauss(plan.stages)
     before = jax.tree.map(lambda first, after: jnp.concatenate([first[None], after[:-1]]), state, slots.states)
 
-    def equations(system, state, parameters, dt, y, step, fraction):
+    def outcome(system, state, parameters, dt, y, step, fraction):
         u = plan.control(parameters, step, state.t, state)
-        return advance(system, state, u, fraction * dt, y, tableau)
+        return advance(system, state, u, fraction * dt, y, tableau)[:2]
 
-    def by_parameters(state, y, step, fraction):
-        def f(system, parameters, dt):
-            return equations(system, state, parameters, dt, y, step, fraction)
-
-        return jax.jvp(f, (system, parameters, dt), (system_dot, parameters_dot, dt_dot))[1]
-
-    def solver(state, y, step, fraction):
+    def prepared(state, y, step, fraction):
+        """Linear maps of one slot: from (state, unknowns), of the parameters' change, and the solver."""
+        _, along = jax.linearize(
+            lambda state, y: outcome(system, state, parameters, dt, y, step, fraction), state, y
+        )
+        forcing = jax.jvp(
+            lambda system, parameters, dt: outcome(system, state, parameters, dt, y, step, fraction),
+            (system, parameters, dt),
+            (system_dot, parameters_dot, dt_dot),
+        )[1]
         u = plan.control(parameters, step, state.t, state)
-        return linear_solver(system, state, u, fraction * dt, y, tableau)
-
-    along = (before, slots.y, slots.step, slots.fraction)
-    solvers = jax.vmap(solver)(*along)
-    forcing = jax.vmap(by_parameters)(*along)
+        solver = linear_solver(system, state, u, fraction * dt, y, tableau, along)
+        return along, solver, forcing
 
     def body(state_dot, xs):
-        (state, y, step, fraction), solver, (residual_dot, end_dot), accepted = xs
-        _, along_state_and_y = jax.linearize(
-            lambda state, y: equations(system, state, parameters, dt, y, step, fraction), state, y
-        )
-        residual_by_state, end_by_state = along_state_and_y(state_dot, jnp.zeros_like(y))
-        y_dot = -solver.solve(residual_dot + residual_by_state)
-        _, end_by_unknowns = along_state_and_y(jax.tree.map(jnp.zeros_like, state), y_dot)
-        end = jax.tree.map(lambda a, b, c: a + b + c, end_dot, end_by_state, end_by_unknowns)
+        (along, solver, (residual_dot, end_dot)), accepted = xs
+        resting = jnp.zeros(slots.y.shape[1:], slots.y.dtype)
+        y_dot = -solver.solve(residual_dot + along(state_dot, resting)[0])
+        end = jax.tree.map(jnp.add, end_dot, along(state_dot, y_dot)[1])
         end = jax.tree.map(partial(jnp.where, accepted), end, state_dot)
         return end, (end, jnp.where(accepted, y_dot, 0.0))
 
-    last_dot, (states_dot, y_dot) = jax.lax.scan(body, state_dot, (along, solvers, forcing, slots.accepted))
+    maps = _in_chunks(prepared, (before, slots.y, slots.step, slots.fraction))
+    last_dot, (states_dot, y_dot) = jax.lax.scan(body, state_dot, (maps, slots.accepted))
     slots_dot = jax.tree.map(_zero_tangent, slots)
     slots_dot = eqx.tree_at(lambda s: (s.states, s.y), slots_dot, (states_dot, y_dot))
     course_dot = jax.tree.map(_zero_tangent, course)

@@ -1,5 +1,6 @@
 """One step: solve its equations, then advance the state."""
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -43,8 +44,11 @@ def _coordinate_rates(group: CoordinateGroup, system: System, at: Stations, h: A
 
 def advance(
     system: System, state: State, u: Array, h: Array, y: Float[Array, " unknowns"], tableau: Tableau
-) -> tuple[Float[Array, " unknowns"], State]:
-    """Residual of the step's equations at `y`, and the state at its end; differentiable in everything.
+) -> tuple[Float[Array, " unknowns"], State, Float[Array, ""]]:
+    """Residual of the step's equations at `y`, the state at its end, and the largest half turn.
+
+    Differentiable in everything. The half turn |h omega / 2| of a body is the tangent of half the angle it
+    turned: it grows without bound towards half a turn a step, the pole of Cayley's rotation.
 
     Positions and velocities are advanced by increments (section 6 of the paper, written for stages):
     q_1 = q_0 + h sum b_i V_i and v_1 = v_0 + sum beta_i (V_i - v_0).
@@ -72,12 +76,27 @@ def advance(
             answer = respond(group, situation(system, group, state, u, h), gather(group, at), lam, tableau)
             work = work.at[group.works[:, 0]].add((1.0 if group.effect.impulsive else h) * (answer.power @ b))
     after = State(state.t + h, q, v, coordinates, rotors, work)
-    return equations.residual(y)[0], after
+    half_turn = 0.5 * h * jnp.sqrt(jnp.max(jnp.sum(at.spin[:, :bodies] ** 2, axis=-1)))
+    return equations.residual(y)[0], after, half_turn
 
 
 def linear_solver(
-    system: System, state: State, u: Array, h: Array, y: Array, tableau: Tableau
+    system: System, state: State, u: Array, h: Array, y: Array, tableau: Tableau, along: Callable
 ) -> Any:
-    """Jacobian of the step's equations at `y`, ready to solve with it and with its transpose."""
+    """Jacobian of the step's equations at `y`, ready to solve with it and with its transpose.
+
+    Args:
+        system: compiled system.
+        state: state at the start.
+        u: inputs.
+        h: step [s].
+        y: solution of the equations.
+        tableau: the collocation method.
+        along: linear map of (state, unknowns) to (residual, state at the end), for dense Jacobians.
+    """
     equations = prepare(system, state, u, h, tableau)
-    return differentiable_solver(equations, equations.jacobian(y))
+    if system.structure.solver == "recursive":
+        return differentiable_solver(equations, equations.jacobian(y))
+    at_rest = jax.tree.map(jnp.zeros_like, state)
+    columns = jax.vmap(lambda unit: along(at_rest, unit)[0], out_axes=1)(jnp.eye(y.shape[0], dtype=y.dtype))
+    return differentiable_solver(equations, columns)
