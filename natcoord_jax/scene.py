@@ -7,7 +7,6 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from natcoord_jax.assembly.build import build
@@ -62,6 +61,7 @@ class Scene:
         Raises:
             ValueError: for a duplicate name, a part of another scene, or a joint of a body with itself.
         """
+        store: dict[str, Any]
         if isinstance(part, Body):
             store, kind, label = self.bodies, "body", "body"
         elif isinstance(part, Joint):
@@ -70,7 +70,8 @@ class Scene:
             store, kind, label = self.effects, "effect", type(part).kind
         else:
             raise ValueError(f"cannot add {part!r} to a scene; add bodies, joints and effects")
-        name = part.name or self._free_name(label)
+        given: str | None = getattr(part, "name", None)
+        name = given or self._free_name(label)
         if name in self.bodies or name in self.joints or name in self.effects or name == ground.name:
             raise ValueError(f"the name {name!r} is taken in this scene; pass another `name`")
         self._check(part, name)
@@ -92,7 +93,9 @@ class Scene:
             return
         if isinstance(part, Joint):
             if part.parent == part.child:
-                raise ValueError(f"joint {name!r} joins body {part.child.name!r} with itself; pass two bodies")
+                raise ValueError(
+                    f"joint {name!r} joins body {part.child.name!r} with itself; pass two bodies"
+                )
             self._check_joint_numbers(part, name)
         flat = jax.tree.leaves(part, is_leaf=lambda x: isinstance(x, Handle | eqx.Module) and x is not part)
         for leaf in flat:
@@ -111,8 +114,12 @@ class Scene:
         ):
             if vector is not None:
                 array = numbers(vector, (3,), f"joint {name!r}: {what}", unit)
-                if unit == "-" and not isinstance(array, jax.core.Tracer) and not np.any(np.asarray(array)):
+                if unit == "-" and is_concrete(array) and not np.any(np.asarray(array)):
                     raise ValueError(f"joint {name!r}: {what} [-] is zero; pass a direction")
+        if joint.second is not None and is_concrete(joint.axis, joint.second):
+            axis, second = np.asarray(joint.axis, float), np.asarray(joint.second, float)
+            if np.linalg.norm(np.cross(axis, second)) <= 1e-9 * np.linalg.norm(axis) * np.linalg.norm(second):
+                raise ValueError(f"joint {name!r}: second [-] points along the axis; pass another direction")
 
     def find(self, handle: Handle, user: str = "a request") -> Body | Joint | Effect | None:
         """The part behind a handle; None for the ground.

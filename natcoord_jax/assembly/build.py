@@ -12,6 +12,7 @@ from natcoord_jax.assembly.diagnostics import rows_with_ground
 from natcoord_jax.assembly.graph import Edge, make_tree, spanning_tree
 from natcoord_jax.assembly.grouping import Instance, bare, stack
 from natcoord_jax.assembly.system import CoordinateGroup, Elimination, Group, Structure, System
+from natcoord_jax.assembly.tree import Tree
 from natcoord_jax.core.bodies import Body
 from natcoord_jax.core.coordinate import Coordinate, CoordinateEffect
 from natcoord_jax.core.effect import Effect, replace_fields
@@ -20,7 +21,6 @@ from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.joint import Joint, frames_at
 from natcoord_jax.core.markers import Marker
 from natcoord_jax.core.state import State
-from natcoord_jax.assembly.tree import Tree
 from natcoord_jax.maths.rotations import frame_from_axis
 
 JOINT_FIELDS = ("parent", "child", "point", "axis", "second", "name", "parent_point")

@@ -5,7 +5,6 @@ bodies and effects. Systems that are no tree and too large for the reduced form 
 all others it is an independent way to the same trajectory.
 """
 
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp

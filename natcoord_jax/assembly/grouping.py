@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from natcoord_jax.assembly.system import Group
+from natcoord_jax.core.checks import check_fields
 from natcoord_jax.core.effect import Effect, replace_fields
 
 
@@ -44,9 +45,10 @@ def bare(effect: Effect, drop: Sequence[str], label: str) -> Effect:
     """The effect with numbers as arrays and without what only the scene needs.
 
     Raises:
-        ValueError: if a field is neither number nor function.
+        ValueError: if a field is neither number nor function, or not finite.
     """
     effect = replace_fields(effect, **dict.fromkeys(drop))
+    check_fields(effect, label)
 
     def leaf(value: Any) -> Any:
         if isinstance(value, jax.Array | np.ndarray):

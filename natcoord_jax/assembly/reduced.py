@@ -7,7 +7,6 @@ then the rates of the constraints. Working with rates and multipliers times h ke
 size as h goes to zero.
 """
 
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -50,7 +49,7 @@ def project_multipliers(y: Array, balances: int, projector: Array | None) -> Arr
 
 
 def project_rows(rows: Array, y: Array, balances: int, projector: Array | None) -> Array:
-    """Constraint rates in the range of the constraints; the rest of the rows sets idle multipliers to zero."""
+    """Constraint rates in the range of the constraints; the other rows set idle multipliers to zero."""
     if projector is None:
         return rows
     idle = y[balances:] - projector @ y[balances:]
@@ -175,7 +174,7 @@ class ReducedStep(eqx.Module):
         torque = None
         rows = []
         groups = active_groups(system)
-        at = self.stations(motion) if groups else None
+        at = self.stations(motion)
         for group, where, lam in zip(groups, self.situations, multipliers):
             answer = respond(group, where, gather(group, at), lam, tableau)
             scale = 1.0 if group.effect.impulsive else self.h

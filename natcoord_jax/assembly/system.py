@@ -190,7 +190,8 @@ class System(eqx.Module):
             state: the assembled pose that a marker in world coordinates refers to.
 
         Raises:
-            ValueError: for a part that is not in the system, or a marker in world coordinates without `state`.
+            ValueError: for a part that is not in the system, or a marker in world coordinates without
+                `state`.
 
         Example:
             >>> import jax; jax.config.update("jax_enable_x64", True)
@@ -271,6 +272,10 @@ class System(eqx.Module):
         """
         return _index(self.structure.inputs, name, "input")
 
+    def report(self) -> str:
+        """Contents, unknowns before and after reduction, the solver and why, in words."""
+        return reporting.report(self)
+
     def explain(self, trajectory: Trajectory) -> str:
         """How a run ended, in words, with the part of the worst residual by name."""
         return diagnostics.explain(self, trajectory)
@@ -288,4 +293,4 @@ def _index(names: tuple[str, ...], part: Handle | str, kind: str) -> int:
     return names.index(name)
 
 
-from natcoord_jax.assembly import diagnostics, instant, posing, sensors  # noqa: E402  (need System)
+from natcoord_jax.assembly import diagnostics, instant, posing, reporting, sensors  # noqa: E402  (need System)

@@ -23,7 +23,8 @@ from natcoord_jax.maths.collocation import Tableau, rotate_stages
 from natcoord_jax.maths.vectors import cross, dot
 
 SLOTS = 7
-"""Free motions a joint can have: 3 rotations about parent axes, 3 translations, 1 rotation about a child axis."""
+"""Free motions a joint can have: 3 rotations and 3 translations along parent axes, 1 rotation about a child
+axis."""
 
 
 @dataclass(frozen=True)
@@ -159,8 +160,7 @@ def sweep_motion(
             spin_p, velocity_p, d_p = spins[-1][:, up], velocities[-1][:, up], triads[-1][:, up]
             parent_rows = rows[tree.parent[here]]
             point_p, start_d_p = parent_rows[:, 0], parent_rows[:, 1:]
-        needs = bool(level.rotations or level.translations)
-        parent_axes = _frame_axes(place[:, 0, 1:, 1:], d_p) if needs else None
+        parent_axes = _frame_axes(place[:, 0, 1:, 1:], d_p)
         slides = _translations(level, parent_axes) if level.translations else []
         axes = [parent_axes[:, :, k] for k in level.rotations]
         if level.balls:
@@ -246,12 +246,12 @@ def project(
         its child's subtree, the torque about the joint's point on the child.
     """
     slots, through_f, through_n = [], [], []
-    carried_f = carried_n = None
+    carried: tuple[Array, Array] | None = None
     for level, joint in zip(reversed(tree.levels), reversed(geometry)):
         here = slice(level.start, level.stop)
         f, n = forces[:, here], torques[:, here]
-        if carried_f is not None:
-            f, n = f + carried_f, n + carried_n
+        if carried is not None:
+            f, n = f + carried[0], n + carried[1]
         about = n - cross(joint.child_arm, f)
         rotations, slides = len(level.rotations), len(level.translations)
         vectors = [about] * rotations + [f] * slides + [about] * level.child_rotation
@@ -265,8 +265,10 @@ def project(
             width = tree.levels[len(tree.levels) - len(slots) - 1]
             pick = (jnp.arange(width.stop - width.start)[:, None] == onto[None, :]).astype(f.dtype)
             moved = about + cross(joint.parent_arm + joint.gap, f)
-            carried_f = jnp.sum(pick[:, :, None] * f[:, None], axis=2)
-            carried_n = jnp.sum(pick[:, :, None] * moved[:, None], axis=2)
+            carried = (
+                jnp.sum(pick[:, :, None] * f[:, None], axis=2),
+                jnp.sum(pick[:, :, None] * moved[:, None], axis=2),
+            )
     joined = [jnp.concatenate(x[::-1], axis=1) for x in (slots, through_f, through_n)]
     stages, bodies = joined[0].shape[:2]
     generalised = joined[0].reshape(stages, bodies * SLOTS)[:, tree.slot_of]
@@ -279,8 +281,9 @@ def joint_rates(
     velocity: Float[Array, "s bodies 3"],
     spin: Float[Array, "s bodies 3"],
 ) -> Float[Array, "s unknowns"]:
-    """Rates of the free motions of given body velocities: the left inverse of `tangent` where axes are
-    orthonormal, that is, at the ends of a step.
+    """Rates of the free motions of given body velocities.
+
+    The left inverse of `tangent` where axes are orthonormal, that is, at the ends of a step.
     """
     columns, spins, velocities = [], [], []
     for level, joint in zip(tree.levels, geometry):

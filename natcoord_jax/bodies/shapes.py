@@ -51,7 +51,7 @@ class Cylinder(Shape):
     length: Array = eqx.field(converter=lambda x: jnp.asarray(x, float))
 
     def volume(self) -> Array:
-        """pi r^2 l."""
+        """Pi r^2 l."""
         return jnp.pi * self.radius**2 * self.length
 
     def gyration(self) -> Array:

@@ -1,16 +1,27 @@
 """Checks of concrete numbers; traced ones pass, because they have no values yet."""
 
+import dataclasses
+import re
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array
+
+NUMERIC = (int, float, np.ndarray, np.number, jax.Array)
+"""Types of concrete numbers."""
 
 
 def is_concrete(*values: Any) -> bool:
     """Whether none of the values is being traced."""
-    return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values))
+    return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(values))
+
+
+def at_top_level(*values: Any) -> bool:
+    """Whether nothing is being traced: neither the values nor the function around them."""
+    return is_concrete(jnp.zeros(()), *values)
 
 
 def require_double(where: str) -> None:
@@ -49,12 +60,33 @@ def numbers(value: Any, shape: tuple[int, ...], what: str, unit: str) -> Array:
     try:
         array = jnp.asarray(value, float)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{what} [{unit}] must be numbers of shape {shape}, not {value!r}") from error
+        raise ValueError(f"{what} [{unit}] is {value!r}; pass numbers of shape {shape}") from error
     if array.shape != shape:
         raise ValueError(f"{what} [{unit}] has shape {array.shape}; pass shape {shape}")
     if is_concrete(array) and not np.all(np.isfinite(np.asarray(array))):
         raise ValueError(f"{what} [{unit}] is not finite: {np.asarray(array)}; pass finite numbers")
     return array
+
+
+def check_fields(module: Any, label: str) -> None:
+    """Refuse numbers of a module that are not finite; infinity passes where it is the field's default.
+
+    Args:
+        module: an effect; units are read from the list of attributes in its docstring.
+        label: what it is, for the message.
+
+    Raises:
+        ValueError: naming part, quantity, unit and remedy.
+    """
+    for field in dataclasses.fields(module):
+        leaves = [x for x in jax.tree.leaves(getattr(module, field.name)) if isinstance(x, NUMERIC)]
+        values = [np.asarray(x, float) for x in leaves if is_concrete(x)]
+        unbounded = isinstance(field.default, float) and np.isinf(field.default)
+        fine = [~np.isnan(x) if unbounded else np.isfinite(x) for x in values]
+        if not all(np.all(x) for x in fine):
+            unit = re.search(rf"^\s*{field.name}:.*?(\[.+?\])", type(module).__doc__ or "", re.MULTILINE)
+            what = f"{label}: {field.name}" + (f" {unit[1]}" if unit else "")
+            raise ValueError(f"{what} is not finite: {getattr(module, field.name)}; pass finite numbers")
 
 
 def positive(value: Any, what: str, unit: str) -> Array:

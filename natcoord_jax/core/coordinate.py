@@ -48,7 +48,7 @@ class UnitLoad(eqx.Module):
 
 @dataclass(frozen=True)
 class Coordinate(abc.ABC):
-    """Base of joint coordinates; final classes are frozen dataclasses, hashable descriptions without arrays."""
+    """Base of joint coordinates; final classes are frozen dataclasses: hashable, without arrays."""
 
     unit: ClassVar[str] = "rad"
 
@@ -118,7 +118,7 @@ class CoordinateEffect(Effect):
 
 
 def _joined(parts: list[tuple[int, Array]], count: int) -> Array | None:
-    """Loads of all coordinates along the axis of bodies, zero where a coordinate has none; None without any."""
+    """Loads of all coordinates along the axis of bodies, zero where one has none; None without any."""
     if not parts:
         return None
     given = dict(parts)

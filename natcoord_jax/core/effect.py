@@ -14,7 +14,6 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.maths.collocation import Tableau
 
-
 M = TypeVar("M", bound=eqx.Module)
 
 
@@ -105,9 +104,7 @@ class Effect(eqx.Module):
     rotors: ClassVar[int] = 0
 
     @abc.abstractmethod
-    def respond(
-        self, place: Array, motion: Motion, now: Now, lam: Float[Array, "s m"]
-    ) -> Response:
+    def respond(self, place: Array, motion: Motion, now: Now, lam: Float[Array, "s m"]) -> Response:
         """Forces, torques, constraint rates and power over a step.
 
         Args:
@@ -118,7 +115,10 @@ class Effect(eqx.Module):
         """
 
     def stored(
-        self, place: Array, rows: Float[Array, "k 4 3"], coordinates: Float[Array, " c"],
+        self,
+        place: Array,
+        rows: Float[Array, "k 4 3"],
+        coordinates: Float[Array, " c"],
         rates: Float[Array, " r"],
     ) -> Float[Array, ""]:
         """Energy stored [J] at given rows, joint coordinates and rotor rates."""

@@ -91,7 +91,7 @@ class Joint(Effect):
         """Constraints g, at most quadratic in the vectors of the two frames."""
 
     def anchors(self) -> tuple[Any, Any]:
-        """Points of parent and child [m], world coordinates of the assembled pose; None: the child's origin."""
+        """Points of parent and child [m] in the assembled pose; None: the child's reference point."""
         return self.point, self.point
 
     def initialise(self, parent: Frame, child: Frame) -> "Joint":

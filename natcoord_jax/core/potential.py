@@ -9,10 +9,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from natcoord_jax.core.effect import Effect, Motion, Now, Response
+from natcoord_jax.core.gradient import averaged_gradient
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.joint import Joint
 from natcoord_jax.core.markers import Marker
-from natcoord_jax.core.gradient import averaged_gradient
 
 
 def place_markers(place: Float[Array, "k 4"], rows: Float[Array, "*s k 4 3"]) -> Float[Array, "*s k 3"]:

@@ -1,4 +1,4 @@
-"""Result codes that travel through compiled programs, and the error raised from them at the outermost call."""
+"""Result codes that travel through compiled programs, and the error raised from them, outermost."""
 
 from enum import IntEnum
 

@@ -21,7 +21,8 @@ def definite_inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
         row, column = matrix[k] * pivot, matrix[:, k]
         eliminated = matrix - column[:, None] * row
         on_row, on_column = unit[k][:, None], unit[k][None, :]
-        replaced = jnp.where(on_row > 0, row[None, :], jnp.where(on_column > 0, -column[:, None] * pivot, eliminated))
+        beside = jnp.where(on_column > 0, -column[:, None] * pivot, eliminated)
+        replaced = jnp.where(on_row > 0, row[None, :], beside)
         matrix = jnp.where((on_row > 0) & (on_column > 0), pivot, replaced)
     return matrix
 

@@ -143,4 +143,3 @@ class TreeSolver(eqx.Module):
             solve=lambda multiply, b: refined(factors, multiply, b),
             transpose_solve=lambda multiply, b: refined(factors.transpose(), multiply, b),
         )
-

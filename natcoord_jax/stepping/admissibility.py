@@ -17,7 +17,10 @@ from natcoord_jax.stepping.assemble import assemble
 GAP = 1e-9
 """Largest gap [m, -] and constraint rate [m/s, 1/s] taken for round-off of printed data, per unit of size."""
 
-_residuals = jax.jit(lambda system, state: [(value, rate) for _, value, rate in joint_residuals(system, state)])
+
+@jax.jit
+def _residuals(system: System, state: State) -> list:
+    return [(value, rate) for _, value, rate in joint_residuals(system, state)]
 
 
 def check_gaps(system: System, state: State) -> None:

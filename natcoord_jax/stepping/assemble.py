@@ -7,13 +7,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from natcoord_jax.assembly.coordinates import coordinate_values, state_rates
 from natcoord_jax.assembly.diagnostics import rows_with_ground
 from natcoord_jax.assembly.projection import Projection
 from natcoord_jax.assembly.system import System
-from natcoord_jax.core.effect import replace_fields
-from natcoord_jax.core.joint import frames_at
-from natcoord_jax.core.results import REASONS, Result, SimulationError
 from natcoord_jax.core.checks import is_concrete
+from natcoord_jax.core.effect import replace_fields
+from natcoord_jax.core.results import REASONS, Result, SimulationError
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.rotations import orthonormalise
 from natcoord_jax.stepping.factorise import dense_differentiable
@@ -42,21 +42,12 @@ def _solve_jvp(make: Any, primals: tuple, tangents: tuple):
 
 def _coordinates(system: System, state: State) -> Array:
     """Joint coordinates of the positions, each angle taken in the turn nearest to the stored one."""
-    rows = rows_with_ground(state.q)
-    coordinates = state.coordinates
+    values = coordinate_values(system, rows_with_ground(state.q))
     for group in system.coordinates:
-        parent, child = frames_at_many(system, group.joints, rows)
-        value = jax.vmap(group.axis.value)(parent, child)
         if group.axis.unit == "rad":
-            turns = jnp.round((coordinates[group.index] - value) / (2 * jnp.pi))
-            value = value + 2 * jnp.pi * turns
-        coordinates = coordinates.at[group.index].set(value)
-    return coordinates
-
-
-def frames_at_many(system: System, joints: Array, rows: Array):
-    """Frames of parent and child of several joints."""
-    return jax.vmap(frames_at)(system.frames[joints], rows[system.joint_bodies[joints]])
+            turns = jnp.round((state.coordinates - values)[group.index] / (2 * jnp.pi))
+            values = values.at[group.index].add(2 * jnp.pi * turns)
+    return values
 
 
 @jax.jit
@@ -74,17 +65,9 @@ def _assembled(system: System, state: State) -> tuple[State, Array]:
 
 def _rotor_rates(system: System, state: State) -> Array:
     """Rates of the joint coordinates that carry rotors."""
-    rates = state.rates
-    rows, speeds = rows_with_ground(state.q), rows_with_ground(state.v).at[-1].set(0.0)
-    spin = 0.5 * jnp.sum(jnp.cross(rows[:, 1:], speeds[:, 1:]), axis=1)
-    every = jnp.zeros_like(state.coordinates)
-    for group in system.coordinates:
-        bodies = system.joint_bodies[group.joints]
-        parent, child = frames_at_many(system, group.joints, rows)
-        parent_rate, child_rate = frames_at_many(system, group.joints, speeds)
-        relative = spin[bodies[:, 1]] - spin[bodies[:, 0]]
-        values = jax.vmap(group.axis.rate)(parent, child, parent_rate, child_rate, relative)
-        every = every.at[group.index].set(values)
+    if not state.rates.shape[0]:
+        return state.rates
+    every, rates = state_rates(system, state), state.rates
     for group in system.effects:
         if group.effect.rotors:
             rates = rates.at[group.rotors[:, 0]].set(every[group.coordinates[:, 0]])

@@ -60,7 +60,8 @@ def _tree_layout(equations: Any) -> _TreeLayout:
 
 def _tree_blocks(equations: Any, blocks: tuple) -> TreeBlocks:
     system = equations.system
-    return TreeBlocks(*blocks, system.tree.parent, system.elimination.schedule)
+    diagonal, up, down = blocks
+    return TreeBlocks(diagonal, up, down, system.tree.parent, system.elimination.schedule)
 
 
 def _recursive(equations: Any, blocks: tuple) -> tuple[_ByNode, Array]:

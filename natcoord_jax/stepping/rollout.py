@@ -19,7 +19,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from natcoord_jax.assembly.system import System
@@ -122,7 +121,7 @@ def _slot(plan: Plan, system: System, parameters: Any, dt: Array, course: Course
     solution = solve(system, state, u, h, tableau, plan.tolerance, course.warm)
     _, new, half_turn = advance(system, state, u, h, solution.y, tableau)
     finite = jnp.all(jnp.isfinite(new.q)) & jnp.all(jnp.isfinite(new.v))
-    code = jnp.where(solution.code == int(Result.SUCCESSFUL), jnp.where(finite, 0, int(Result.NONFINITE)), solution.code)
+    code = jnp.where((solution.code == 0) & ~finite, int(Result.NONFINITE), solution.code)
     code = jnp.where((code == 0) & (half_turn > LARGEST_HALF_TURN), int(Result.DIVERGED), code)
     accepted = (code == int(Result.SUCCESSFUL)) & ~idle
     new = jax.tree.map(partial(jnp.where, accepted), new, state)
@@ -172,7 +171,9 @@ def _run(plan: Plan, system: System, state: State, parameters: Any, dt: Array) -
     def body(carry: tuple[Array, Course, Slots]) -> tuple[Array, Course, Slots]:
         count, course, buffer = carry
         course, record = attempt(course)
-        buffer = jax.tree.map(lambda b, r: jax.lax.dynamic_update_index_in_dim(b, r, count, 0), buffer, record)
+        buffer = jax.tree.map(
+            lambda b, r: jax.lax.dynamic_update_index_in_dim(b, r, count, 0), buffer, record
+        )
         return count + 1, course, buffer
 
     count, course, slots = jax.lax.while_loop(unfinished, body, (jnp.array(0), start, buffer))
@@ -184,7 +185,11 @@ def _run(plan: Plan, system: System, state: State, parameters: Any, dt: Array) -
     slots = eqx.tree_at(
         lambda s: (s.states, s.finished, s.fraction),
         slots,
-        (jax.tree.map(fill, slots.states, course.state), fill(slots.finished, course.step), fill(slots.fraction, 1.0)),
+        (
+            jax.tree.map(fill, slots.states, course.state),
+            fill(slots.finished, course.step),
+            fill(slots.fraction, jnp.ones(())),
+        ),
     )
     short = (course.step < plan.steps) & ~course.stopped
     code = jnp.where(short, int(Result.MAX_SUBSTEPS), course.code)
@@ -192,9 +197,7 @@ def _run(plan: Plan, system: System, state: State, parameters: Any, dt: Array) -
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def run_slots(
-    plan: Plan, system: System, state: State, parameters: Any, dt: Array
-) -> tuple[Slots, Course]:
+def run_slots(plan: Plan, system: System, state: State, parameters: Any, dt: Array) -> tuple[Slots, Course]:
     """All slots of a rollout and where it ended; see the module for its derivative."""
     return _run(plan, system, state, parameters, dt)
 
@@ -227,7 +230,9 @@ def _run_slots_jvp(plan: Plan, primals: tuple, tangents: tuple):
     system_dot, state_dot, parameters_dot, dt_dot = tangents
     slots, course = run_slots(plan, *primals)
     tableau = gauss(plan.stages)
-    before = jax.tree.map(lambda first, after: jnp.concatenate([first[None], after[:-1]]), state, slots.states)
+    before = jax.tree.map(
+        lambda first, after: jnp.concatenate([first[None], after[:-1]]), state, slots.states
+    )
 
     def outcome(system, state, parameters, dt, y, step, fraction):
         u = plan.control(parameters, step, state.t, state)

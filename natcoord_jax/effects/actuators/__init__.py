@@ -2,7 +2,13 @@
 
 from natcoord_jax.effects.actuators.motors import (
     BodyForceInput as BodyForceInput,
+)
+from natcoord_jax.effects.actuators.motors import (
     BodyTorqueInput as BodyTorqueInput,
+)
+from natcoord_jax.effects.actuators.motors import (
     JointForce as JointForce,
+)
+from natcoord_jax.effects.actuators.motors import (
     JointTorque as JointTorque,
 )

@@ -15,8 +15,10 @@ from natcoord_jax.core.markers import Marker
 
 
 class JointTorque(Force):
-    """Motor torque on a joint: u times the parent's mid-point axis on the child, its opposite on the
-    parent (67, 68), through the contravariant directors (61). One input [N m].
+    """Motor torque on a joint; one input u [N m].
+
+    u times the parent's mid-point axis acts on the child, its opposite on the parent (67, 68), through the
+    contravariant directors (61).
 
     Attributes:
         joint: handle of a joint with an axis.
@@ -53,8 +55,9 @@ class JointTorque(Force):
 
 
 class JointForce(CoordinateForce):
-    """Motor on a joint coordinate: one input [N on displacements, N m on angles], work exactly u times the
-    increment of the coordinate.
+    """Motor on a joint coordinate; one input u [N on displacements, N m on angles].
+
+    Its work is exactly u times the increment of the coordinate.
 
     Attributes:
         joint: handle of the joint.

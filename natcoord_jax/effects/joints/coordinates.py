@@ -67,7 +67,9 @@ class Angle(Coordinate):
         moving = child.axes[(self.axis + 1) % 3]
         return jnp.arctan2(dot(second, moving), dot(first, moving))
 
-    def rate(self, parent: Frame, child: Frame, parent_rate: Frame, child_rate: Frame, relative_spin) -> Array:
+    def rate(
+        self, parent: Frame, child: Frame, parent_rate: Frame, child_rate: Frame, relative_spin: Array
+    ) -> Array:
         """Relative angular velocity along the axis."""
         return dot(parent.axes[self.axis], relative_spin)
 
@@ -107,7 +109,9 @@ class UniversalAngle(Coordinate):
         moving = child.axes[0]
         return jnp.arctan2(dot(parent.axes[1], moving), dot(parent.axes[0], moving))
 
-    def rate(self, parent: Frame, child: Frame, parent_rate: Frame, child_rate: Frame, relative_spin) -> Array:
+    def rate(
+        self, parent: Frame, child: Frame, parent_rate: Frame, child_rate: Frame, relative_spin: Array
+    ) -> Array:
         """Component of the relative angular velocity along the axis."""
         a, b = parent.axes[2], child.axes[0]
         n = cross(a, b)
@@ -136,7 +140,9 @@ class Displacement(Coordinate):
         """Displacement [m]."""
         return dot(parent.axes[self.axis], child.point - parent.point)
 
-    def rate(self, parent: Frame, child: Frame, parent_rate: Frame, child_rate: Frame, relative_spin) -> Array:
+    def rate(
+        self, parent: Frame, child: Frame, parent_rate: Frame, child_rate: Frame, relative_spin: Array
+    ) -> Array:
         """Rate of the displacement [m/s]."""
         u, rate_u = child.point - parent.point, child_rate.point - parent_rate.point
         return dot(parent.axes[self.axis], rate_u) + dot(parent_rate.axes[self.axis], u)
@@ -164,7 +170,9 @@ class Separation(Coordinate):
         """Distance [m]."""
         return safe_norm(child.point - parent.point)
 
-    def rate(self, parent: Frame, child: Frame, parent_rate: Frame, child_rate: Frame, relative_spin) -> Array:
+    def rate(
+        self, parent: Frame, child: Frame, parent_rate: Frame, child_rate: Frame, relative_spin: Array
+    ) -> Array:
         """Rate of the distance [m/s]."""
         u = child.point - parent.point
         return safe_divide(dot(u, child_rate.point - parent_rate.point), safe_norm(u))

@@ -92,7 +92,10 @@ class Universal(Joint):
 
 
 class Cylindrical(Joint):
-    """Turning and sliding along `axis` (48, 49): 4 constraints; coordinates: angle [rad], displacement [m]."""
+    """Turning and sliding along `axis` (48, 49): 4 constraints.
+
+    Coordinates: 0 the angle [rad], 1 the displacement [m].
+    """
 
     kind: ClassVar[str] = "cylindrical joint"
     multipliers: ClassVar[int] = 4

@@ -3,6 +3,10 @@
 from natcoord_jax.effects.loads.gravity import Gravity as Gravity
 from natcoord_jax.effects.loads.point_loads import (
     BodyTorque as BodyTorque,
+)
+from natcoord_jax.effects.loads.point_loads import (
     PairTorque as PairTorque,
+)
+from natcoord_jax.effects.loads.point_loads import (
     PointForce as PointForce,
 )
