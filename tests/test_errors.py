@@ -1,0 +1,306 @@
+"""Bad input: one ValueError each, naming the part, the quantity with its unit, and the remedy."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import natcoord_jax as nc
+from natcoord_jax.core.results import Result, SimulationError
+
+ROOT = Path(__file__).resolve().parents[1]
+REMEDY = r"(pass|use|add|check|give|move|declare|make|allow)\b"
+
+
+def body(**changes):
+    return nc.RigidBody(**({"mass": 1.0, "inertia": (1.0, 1.0, 1.0), "name": "arm"} | changes))
+
+
+def rejected(action, *words: str) -> None:
+    """The action raises a ValueError with all the words and a remedy."""
+    with pytest.raises(ValueError, match=REMEDY) as caught:
+        action()
+    message = str(caught.value)
+    missing = [word for word in words if word not in message]
+    assert not missing, f"{missing} missing in: {message}"
+
+
+# --- bodies -----------------------------------------------------------------------------------------------
+
+BODIES = {
+    "zero mass": (dict(mass=0.0), "mass", "[kg]"),
+    "negative mass": (dict(mass=-1.0), "mass", "[kg]"),
+    "mass not finite": (dict(mass=np.nan), "mass", "[kg]"),
+    "mass of wrong shape": (dict(mass=(1.0, 2.0)), "mass", "[kg]"),
+    "triangle inequality": (dict(inertia=(1.0, 1.0, 3.0)), "inertia", "kg m^2"),
+    "negative inertia": (dict(inertia=(-1.0, 1.0, 1.0)), "inertia", "kg m^2"),
+    "no inertia": (dict(inertia=(0.0, 0.0, 0.0)), "inertia", "kg m^2"),
+    "unsymmetric inertia": (dict(inertia=((1, 0.5, 0), (0, 1, 0), (0, 0, 1))), "inertia", "[kg m^2]"),
+    "inertia not finite": (dict(inertia=(1.0, np.inf, 1.0)), "inertia", "[kg m^2]"),
+    "inertia at the wrong point": (
+        dict(inertia=(1.0, 1.0, 1.0), com=(0.0, 0.0, 5.0), inertia_at="reference"), "inertia", "kg m^2"
+    ),
+    "inertia at nowhere": (dict(inertia_at="tip"), "inertia_at"),
+    "negative second moment": (dict(inertia=None, second_moment=(1.0, -1.0, 1.0)), "second_moment", "kg m^2"),
+    "no inertia given": (dict(inertia=None), "inertia", "kg m^2"),
+    "no mass given": (dict(mass=None), "mass", "kg"),
+    "shape and mass": (dict(shape=nc.Box((1.0, 1.0, 1.0)), density=1.0), "mass", "density"),
+    "shape without density": (
+        dict(mass=None, inertia=None, shape=nc.Box((1.0, 1.0, 1.0))), "density", "kg/m^3"
+    ),
+    "position not finite": (dict(position=(0.0, np.nan, 0.0)), "position", "[m]"),
+    "position of wrong shape": (dict(position=(0.0, 0.0)), "position", "[m]"),
+    "position no numbers": (dict(position="here"), "position", "[m]"),
+    "velocity not finite": (dict(velocity=(0.0, np.inf, 0.0)), "velocity", "[m/s]"),
+    "angular velocity of wrong shape": (dict(angular_velocity=1.0), "angular velocity", "[rad/s]"),
+    "com not finite": (dict(com=(np.nan, 0.0, 0.0)), "com", "[m]"),
+    "no rotation": (dict(orientation=2 * np.eye(3)), "orientation", "[-]"),
+    "reflection": (dict(orientation=np.diag([1.0, 1.0, -1.0])), "orientation", "[-]"),
+    "zero quaternion": (dict(orientation=(0.0, 0.0, 0.0, 0.0)), "orientation", "[-]"),
+    "zero axis": (dict(orientation=((0.0, 0.0, 0.0), 1.0)), "orientation", "[-]"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", BODIES)
+def test_bodies(case):
+    changes, *words = BODIES[case]
+    rejected(lambda: body(**changes), "'arm'", *words)
+
+
+def test_point_mass():
+    rejected(lambda: nc.PointMass(mass=-2.0, name="ball"), "'ball'", "mass", "[kg]")
+
+
+# --- scenes and joints ------------------------------------------------------------------------------------
+
+
+def test_joint_of_a_body_with_itself():
+    scene = nc.Scene()
+    arm = scene.add(body())
+    rejected(lambda: scene.add(nc.Revolute(arm, arm, name="hinge")), "'hinge'", "'arm'")
+
+
+def test_body_of_another_scene():
+    arm = nc.Scene().add(body())
+    scene = nc.Scene()
+    other = scene.add(body(name="other"))
+    rejected(lambda: scene.add(nc.Revolute(other, arm, name="hinge")), "'hinge'", "'arm'")
+    spring = nc.Spring((nc.Point(other), nc.Point(arm)), "coil", stiffness=1.0)
+    rejected(lambda: scene.add(spring), "'coil'", "'arm'")
+
+
+def test_joint_of_another_scene():
+    other = nc.Scene()
+    hinge = other.add(nc.Revolute(nc.ground, other.add(body()), name="hinge"))
+    scene = nc.Scene()
+    scene.add(body(name="here"))
+    rejected(lambda: scene.add(nc.JointTorque(hinge, name="motor")), "'motor'", "'hinge'")
+
+
+def test_duplicate_names():
+    scene = nc.Scene()
+    arm = scene.add(body())
+    rejected(lambda: scene.add(body()), "'arm'", "name")
+    rejected(lambda: scene.add(nc.Revolute(nc.ground, arm, name="arm")), "'arm'", "name")
+    rejected(lambda: scene.add(body(name="ground")), "'ground'", "name")
+
+
+def test_things_that_are_no_parts():
+    scene = nc.Scene()
+    arm = scene.add(body())
+    hinge = scene.add(nc.Revolute(nc.ground, arm, name="hinge"))
+    rejected(lambda: scene.add(nc.Revolute(hinge, arm, name="other")), "'other'", "'hinge'")
+    rejected(lambda: scene.add(nc.Revolute(nc.ground, "arm", name="third")), "'third'")
+
+
+JOINTS = {
+    "zero axis": (dict(axis=(0.0, 0.0, 0.0)), "axis", "[-]"),
+    "axis of wrong shape": (dict(axis=(1.0, 0.0)), "axis", "[-]"),
+    "axis not finite": (dict(axis=(1.0, np.nan, 0.0)), "axis", "[-]"),
+    "point not finite": (dict(point=(1.0, np.nan, 0.0)), "point", "[m]"),
+    "point of wrong shape": (dict(point=1.0), "point", "[m]"),
+    "second along the axis": (dict(axis=(0.0, 0.0, 2.0), second=(0.0, 0.0, 1.0)), "second", "[-]"),
+}
+
+
+@pytest.mark.parametrize("case", JOINTS)
+def test_joints(case):
+    changes, *words = JOINTS[case]
+    scene = nc.Scene()
+    arm = scene.add(body())
+    rejected(lambda: scene.add(nc.Revolute(nc.ground, arm, name="hinge", **changes)), "'hinge'", *words)
+
+
+def test_coordinates_that_a_joint_does_not_have():
+    scene = nc.Scene()
+    hinge = scene.add(nc.Revolute(nc.ground, scene.add(body()), name="hinge"))
+    scene.add(nc.JointSpring(hinge, stiffness=1.0, coordinate=1, name="coil"))
+    with pytest.raises(ValueError, match=r"'coil'.*'hinge'.*1 coordinate"):
+        scene.compile()
+
+
+NUMBERS = {
+    "stiffness": (lambda p, j: nc.Spring(p, "part", stiffness=np.nan), "stiffness", "[N/m]"),
+    "coil": (lambda p, j: nc.JointSpring(j, stiffness=np.inf, name="part"), "stiffness"),
+    "damping": (lambda p, j: nc.Damper(p, "part", damping=np.nan), "damping", "[N s/m]"),
+    "gravity": (lambda p, j: nc.Gravity(vector=(0.0, np.nan, 0.0), name="part"), "vector", "[m/s^2]"),
+    "force": (lambda p, j: nc.PointForce(p[:1], "part", force=(np.inf, 0.0, 0.0)), "force", "[N]"),
+    "armature": (lambda p, j: nc.Armature(j, inertia=np.nan, name="part"), "inertia"),
+}
+
+
+@pytest.mark.parametrize("case", NUMBERS)
+def test_numbers_of_effects_must_be_finite(case):
+    make, *words = NUMBERS[case]
+    scene = nc.Scene()
+    arm = scene.add(body())
+    hinge = scene.add(nc.Revolute(nc.ground, arm, name="hinge"))
+    points = nc.Point(nc.ground, (1.0, 0.0, 0.0)), nc.Point(arm)
+
+    def build():
+        scene.add(make(points, hinge))
+        scene.compile()
+
+    rejected(build, "'part'", *words)
+
+
+def test_empty_scene():
+    rejected(lambda: nc.Scene().compile(), "bodies")
+
+
+def test_gap_is_refused_with_its_size():
+    scene = nc.Scene()
+    arm = scene.add(body(position=(0.0, 0.0, 1.0)))
+    rod = nc.Distance(nc.ground, arm, (0.0, 0.0, 1.0), length=0.75, name="rod")
+    scene.add(rod)
+    rejected(scene.compile, "'rod'", " m")
+    state = scene.compile(assemble=True)[1]
+    assert float(jnp.linalg.norm(state.q[0])) == pytest.approx(0.75)
+
+
+def test_velocities_are_projected_with_a_warning():
+    scene = nc.Scene()
+    arm = scene.add(body(com=(0.0, 0.0, 1.0), velocity=(1.0, 0.0, 0.0)))
+    scene.add(nc.Revolute(nc.ground, arm, (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), name="hinge"))
+    with pytest.warns(UserWarning, match=r"m/s"):
+        system, state = scene.compile()
+    assert float(system.constraint_errors(state).velocity) <= 1e-12
+
+
+def test_ideal_rod_that_spins_freely():
+    scene = nc.Scene()
+    rod = scene.add(body(inertia=(1.0, 1.0, 0.0), name="rod"))
+    scene.add(nc.Spherical(nc.ground, rod, (0.0, 0.0, 0.0)))
+    with pytest.raises(ValueError, match=r"inertia \[kg m\^2\]"):
+        scene.compile()
+
+
+# --- running ----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def pendulum():
+    scene = nc.Scene()
+    scene.add(nc.Gravity())
+    arm = scene.add(body(com=(0.3, 0.0, 0.0)))
+    hinge = scene.add(nc.Revolute(nc.ground, arm, (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), name="hinge"))
+    scene.add(nc.JointTorque(hinge, name="motor"))
+    return scene.compile()
+
+
+@pytest.mark.parametrize("dt", [0.0, -0.1, np.nan, np.inf])
+def test_steps_must_be_positive(pendulum, dt):
+    rejected(lambda: nc.simulate(*pendulum, dt=dt, steps=2), "dt", "[s]")
+    rejected(lambda: nc.step(*pendulum, dt=dt), "dt", "[s]")
+
+
+@pytest.mark.parametrize("shape", [(3,), (3, 2), (4, 3, 1), (0, 1)])
+def test_inputs_of_wrong_shape(pendulum, shape):
+    rejected(lambda: nc.simulate(*pendulum, dt=0.1, inputs=jnp.zeros(shape)), "inputs", "shape", "motor")
+
+
+def test_other_bad_arguments(pendulum):
+    rejected(lambda: nc.simulate(*pendulum, dt=0.1), "steps")
+    rejected(lambda: nc.simulate(*pendulum, dt=0.1, steps=0), "steps")
+    rejected(lambda: nc.simulate(*pendulum, dt=0.1, steps=3, inputs=jnp.zeros((2, 1))), "inputs")
+    rejected(lambda: nc.simulate(*pendulum, dt=0.1, steps=3, save_every=2), "save_every")
+    rejected(lambda: nc.simulate(*pendulum, dt=0.1, inputs=jnp.full((2, 1), jnp.nan)), "inputs", "[N m]")
+    rejected(lambda: nc.simulate(*pendulum, dt=jnp.ones(3), steps=3), "dt", "[s]")
+    system, state = pendulum
+    batch = jax.tree.map(lambda x: jnp.stack([x, x]), state)
+    rejected(lambda: nc.simulate(system, batch, dt=0.1, steps=3), "state", "shape")
+
+
+def test_unknown_names(pendulum):
+    system, _ = pendulum
+    for ask in (system.body_index, system.joint_index, system.input_index):
+        with pytest.raises(ValueError, match="'nothing'"):
+            ask("nothing")
+
+
+def test_single_precision_unasked():
+    """The message holds the line to add."""
+    program = (
+        "import natcoord_jax as nc\n"
+        "for make in (nc.Scene, lambda: nc.RigidBody(mass=1.0, inertia=(1.0, 1.0, 1.0))):\n"
+        "    try:\n"
+        "        make()\n"
+        "    except ValueError as error:\n"
+        "        assert 'jax.config.update(\"jax_enable_x64\", True)' in str(error), error\n"
+        "    else:\n"
+        "        raise SystemExit('accepted')\n"
+    )
+    run = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr + run.stdout
+
+
+# --- inside a run: result codes, never a silent NaN -------------------------------------------------------
+
+
+class Breaking(nc.Force):
+    """A force [N] that is undefined after a time [s]."""
+
+    def load(self, x, rate, inputs, t):
+        """The root of the time left."""
+        return nc.Load(jnp.sqrt(0.24 - t) * jnp.ones_like(x), None)
+
+
+@pytest.fixture(scope="module")
+def breaking():
+    scene = nc.Scene()
+    ball = scene.add(nc.PointMass(mass=1.0, name="ball"))
+    scene.add(Breaking((nc.Point(ball),), "breaking"))
+    return scene.compile()
+
+
+def test_undefined_force_is_reported(breaking):
+    with pytest.raises(SimulationError, match=r"step 2 at t = 0.2.*'ball'") as caught:
+        nc.simulate(*breaking, dt=0.1, steps=10)
+    assert caught.value.result is Result.NONFINITE
+    trajectory = caught.value.trajectory
+    assert bool(jnp.all(jnp.isfinite(trajectory.q))), "what was computed must be sound, the last state held"
+    assert int(trajectory.failed_step) == 2
+
+
+def test_nothing_is_raised_inside_transformations(breaking):
+    """Codes travel; a failed lane does not touch the others."""
+    system, state = breaking
+    runs = jax.vmap(lambda dt: nc.simulate(system, state, dt=dt, steps=10))(jnp.array([0.01, 0.1]))
+    assert list(np.asarray(runs.result)) == [int(Result.SUCCESSFUL), int(Result.NONFINITE)]
+    assert bool(jnp.all(jnp.isfinite(runs.q)))
+    alone = nc.simulate(system, state, dt=0.01, steps=10)
+    assert np.allclose(runs.q[0], alone.q, atol=1e-14)
+    inside = jax.jit(lambda dt: nc.simulate(system, state, dt=dt, steps=10).result)(0.1)
+    assert int(inside) == int(Result.NONFINITE)
+    words = system.explain(runs)
+    assert "lane 1" in words and "'ball'" in words and "t = 0.2" in words
+
+
+def test_traced_step_that_is_not_positive(breaking):
+    system, state = breaking
+    result = jax.jit(lambda dt: nc.simulate(system, state, dt=dt, steps=2).result)(-0.1)
+    assert int(result) == int(Result.BAD_STEP)
