@@ -3,6 +3,9 @@
 import os
 from pathlib import Path
 
+# A third less time to compile, for programs that run as fast; read when the first program is compiled.
+os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_use_fusion_emitters=false"
+
 import jax
 import pytest
 from jaxtyping import install_import_hook

@@ -31,7 +31,7 @@ class Frame(eqx.Module):
 
 def frames_at(place: Float[Array, "2 4 4"], rows: Float[Array, "*s 2 4 3"]) -> tuple[Frame, Frame]:
     """Frames of parent and child from their rows; place[b] = weights of (point, axis 1, 2, 3) of body b."""
-    vectors = jnp.einsum("bma,...bac->...bmc", place, rows)
+    vectors = jnp.sum(place[..., None] * rows[..., None, :, :], axis=-2)
     parent, child = vectors[..., 0, :, :], vectors[..., 1, :, :]
     return (
         Frame(parent[..., 0, :], parent[..., 1:, :]),

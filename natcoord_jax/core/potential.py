@@ -17,7 +17,7 @@ from natcoord_jax.core.markers import Marker
 
 def place_markers(place: Float[Array, "k 4"], rows: Float[Array, "*s k 4 3"]) -> Float[Array, "*s k 3"]:
     """Marker vectors x_k = sum_a w_ka q_a, one marker to a body slot."""
-    return jnp.einsum("ka,...kac->...kc", place, rows)
+    return jnp.sum(place[..., None] * rows, axis=-2)
 
 
 class Potential(Effect):

@@ -19,6 +19,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
 from natcoord_jax.assembly.system import System
@@ -157,26 +158,46 @@ def _slot(plan: Plan, system: System, parameters: Any, dt: Array, course: Course
     return following, record
 
 
+def _is_none(x: Any) -> bool:
+    return x is None
+
+
+def _without_state(course: Course) -> Course:
+    return eqx.tree_at(lambda c: c.state, course, None)
+
+
 def _run(plan: Plan, system: System, state: State, parameters: Any, dt: Array) -> tuple[Slots, Course]:
     attempt = partial(_slot, plan, system, parameters, dt)
     length = plan.steps + plan.extra
     start = _start(plan, system, state, parameters, dt)
-    shapes = jax.eval_shape(attempt, start)[1]
+    # One array instead of one for every field: fewer operations in every trip.
+    packed, unpack = ravel_pytree(state)
+
+    def packed_attempt(carried: tuple[Course, Array]) -> tuple[tuple[Course, Array], tuple[Slots, Array]]:
+        course, x = carried
+        after, record = attempt(eqx.tree_at(lambda c: c.state, course, unpack(x), is_leaf=_is_none))
+        x = ravel_pytree(after.state)[0]
+        return (_without_state(after), x), (eqx.tree_at(lambda s: s.states, record, None), x)
+
+    first = (_without_state(start), packed)
+    shapes = jax.eval_shape(packed_attempt, first)[1]
     buffer = jax.tree.map(lambda x: jnp.zeros((length, *x.shape), x.dtype), shapes)
 
-    def unfinished(carry: tuple[Array, Course, Slots]) -> Array:
-        count, course, _ = carry
+    def unfinished(carry: tuple) -> Array:
+        count, (course, _), _ = carry
         return (count < length) & any_lane(~course.stopped & (course.step < plan.steps))
 
-    def body(carry: tuple[Array, Course, Slots]) -> tuple[Array, Course, Slots]:
-        count, course, buffer = carry
-        course, record = attempt(course)
+    def body(carry: tuple) -> tuple:
+        count, carried, buffer = carry
+        carried, record = packed_attempt(carried)
         buffer = jax.tree.map(
             lambda b, r: jax.lax.dynamic_update_index_in_dim(b, r, count, 0), buffer, record
         )
-        return count + 1, course, buffer
+        return count + 1, carried, buffer
 
-    count, course, slots = jax.lax.while_loop(unfinished, body, (jnp.array(0), start, buffer))
+    count, (course, x), (slots, states) = jax.lax.while_loop(unfinished, body, (jnp.array(0), first, buffer))
+    course = eqx.tree_at(lambda c: c.state, course, unpack(x), is_leaf=_is_none)
+    slots = eqx.tree_at(lambda s: s.states, slots, jax.vmap(unpack)(states), is_leaf=_is_none)
     unused = jnp.arange(length) >= count
 
     def fill(x: Array, last: Array | float) -> Array:

@@ -182,7 +182,7 @@ QUICK = {"xla_cpu_use_fusion_emitters": False}
 """Option of the CPU compiler: a third less time to compile, for programs that run as fast. JAX accepts
 options at the outermost call only."""
 
-_compiled_quickly = eqx.filter_jit(_compiled, compiler_options=QUICK)
+_compiled_quickly = eqx.filter_jit(_compiled, compiler_options=QUICK)  # pyright: ignore[reportCallIssue]
 _compiled_within = eqx.filter_jit(_compiled)
 
 
