@@ -1,0 +1,289 @@
+"""Structure of programs: what is absent costs nothing, what is equal is stacked, numbers are leaves."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import tolerances as tol
+from test_contracts import TABLE, answering, inputs_of, random_motion, stage
+
+import natcoord_jax as nc
+from natcoord_jax.assembly.reduced import ReducedStep
+from natcoord_jax.maths.collocation import gauss
+
+ROOT = Path(__file__).resolve().parents[1]
+FOLDER = ROOT / "natcoord_jax" / "effects"
+LEAVES = sorted(
+    "natcoord_jax.effects." + ".".join(f.relative_to(FOLDER).with_suffix("").parts)
+    for f in FOLDER.rglob("*.py")
+    if f.name != "__init__.py"
+)
+
+# --- absent effects ---------------------------------------------------------------------------------------
+
+# Scenes and the effect modules that they need; each module is needless in at least one of them.
+SCENES = {
+    "free bodies": (
+        "",
+        [],
+    ),
+    "hinge and motor": (
+        "hinge = scene.add(nc.Revolute(one, two, (0.5, 0.0, 0.0)))\nscene.add(nc.JointTorque(hinge))",
+        ["joints.coordinates", "joints.lower_pairs", "joints.relations", "actuators.motors"],
+    ),
+    "springs": (
+        "scene.add(nc.Gravity())\n"
+        "ends = nc.Point(one), nc.Point(two, (1.0, 0.0, 0.0))\n"
+        "scene.add(nc.Spring(ends, stiffness=2.0))\n"
+        "scene.add(nc.PointForce(ends[:1], force=(1.0, 0.0, 0.0)))",
+        ["loads.gravity", "loads.point_loads", "springs.point_springs"],
+    ),
+    "coil": (
+        "hinge = scene.add(nc.Revolute(one, two, (0.5, 0.0, 0.0)))\n"
+        "scene.add(nc.JointSpring(hinge, stiffness=2.0))",
+        ["joints.coordinates", "joints.lower_pairs", "joints.relations", "springs.joint_springs"],
+    ),
+}
+
+PROGRAM = '''
+import hashlib, importlib.abc, importlib.machinery, json, sys, types
+blocked = set({blocked!r})
+
+class Stub(types.ModuleType):
+    def __getattr__(self, name):
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return type(name, (), {{}})
+
+class Blocker(importlib.abc.MetaPathFinder, importlib.abc.Loader):
+    def find_spec(self, name, path=None, target=None):
+        return importlib.machinery.ModuleSpec(name, self) if name in blocked else None
+    def create_module(self, spec):
+        return Stub(spec.name)
+    def exec_module(self, module):
+        pass
+
+sys.meta_path.insert(0, Blocker())
+import jax
+jax.config.update("jax_enable_x64", True)
+import natcoord_jax as nc
+
+found = {{}}
+for name, code in {scenes!r}.items():
+    scene = nc.Scene()
+    one = scene.add(nc.RigidBody(mass=1.0, inertia=(0.1, 0.2, 0.25), name="one"))
+    two = scene.add(nc.RigidBody(mass=2.0, inertia=(0.3, 0.2, 0.25), position=(1.0, 0.0, 0.0), name="two"))
+    exec(code)
+    system, state = scene.compile()
+    run = jax.jit(lambda system, state, dt: nc.simulate(system, state, dt=dt, steps=3))
+    text = run.lower(system, state, 0.1).as_text()
+    found[name] = [hashlib.sha256(text.encode()).hexdigest(), len(text.splitlines())]
+loaded = [name for name in blocked if name in sys.modules and not isinstance(sys.modules[name], Stub)]
+print(json.dumps([found, loaded]))
+'''
+
+
+def lowered(scenes: dict[str, str], blocked: list[str]):
+    program = PROGRAM.format(scenes=scenes, blocked=blocked)
+    env = {k: v for k, v in os.environ.items() if k != "JAX_ENABLE_X64"}
+    run = subprocess.run([sys.executable, "-c", program], cwd=ROOT, env=env, capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr[-2000:]
+    return json.loads(run.stdout.splitlines()[-1])
+
+
+@pytest.fixture(scope="module")
+def everything_imported():
+    return lowered({name: code for name, (code, _) in SCENES.items()}, [])[0]
+
+
+def test_every_effect_module_is_needless_somewhere():
+    assert not set(LEAVES) - set.union(*(set(LEAVES) - _needed(name) for name in SCENES))
+
+
+def _needed(scene: str) -> set[str]:
+    return {"natcoord_jax.effects." + module for module in SCENES[scene][1]}
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_absent_effects_leave_nothing(everything_imported, name):
+    """The lowered program, without locations, is the same byte for byte with their modules blocked."""
+    blocked = sorted(set(LEAVES) - _needed(name))
+    found, loaded = lowered({name: SCENES[name][0]}, blocked)
+    assert blocked and not loaded, f"not blocked: {loaded}"
+    assert found[name] == everything_imported[name]
+
+
+def scopes(text: str) -> set[str]:
+    """Kinds of the table whose scope occurs in a program with locations."""
+    return {e.kind for e in TABLE if re.search(rf'[/"(]{e.kind.replace(" ", "_")}[/")]', text)}
+
+
+@pytest.mark.parametrize("effect", TABLE, ids=lambda e: e.__name__)
+def test_scopes_in_the_equations(effect):
+    """In the equations of a scene with one effect its scope is there, and no other one is."""
+    system, state, _ = stage(effect)
+    y = jnp.zeros(system.structure.unknowns + system.structure.multipliers)
+
+    def residual(system, state, y):
+        return ReducedStep.prepare(system, state, inputs_of(system), jnp.ones(()), gauss(1)).residual(y)
+
+    text = jax.jit(residual).lower(system, state, y).as_text(debug_info=True)
+    companions = {nc.Screw: {"coupling"}}
+    expected = {effect.kind} | companions.get(effect, set())
+    if TABLE[effect].joint is nc.Distance:  # keeps its multiplier wherever it is
+        expected.add(nc.Distance.kind)
+    assert scopes(text) == expected
+
+
+def test_scopes_in_the_rollout():
+    """None without effects; those of the effects with them, and joints of the tree never."""
+    scene = nc.Scene()
+    one = scene.add(nc.RigidBody(mass=1.0, inertia=(0.1, 0.2, 0.25)))
+    hinge = scene.add(nc.Revolute(nc.ground, one))
+    bare = scene.compile()
+    scene.add(nc.JointSpring(hinge, stiffness=1.0))
+    scene.add(nc.Gravity())
+    run = jax.jit(lambda system, state: nc.simulate(system, state, dt=0.1, steps=2))
+    assert scopes(run.lower(*bare).as_text(debug_info=True)) == set()
+    assert scopes(run.lower(*scene.compile()).as_text(debug_info=True)) == {"joint spring", "gravity"}
+
+
+# --- equal kinds ------------------------------------------------------------------------------------------
+
+
+def star(arms: int, solver: str):
+    """A free hub with equal arms on hinges, coils and motors on all of them."""
+    scene = nc.Scene()
+    scene.add(nc.Gravity())
+    hub = scene.add(nc.RigidBody(mass=5.0, inertia=(1.0, 1.2, 1.4), name="hub"))
+    for k in range(arms):
+        angle = 2 * np.pi * k / arms
+        out = np.array([np.cos(angle), np.sin(angle), 0.0])
+        arm = scene.add(nc.RigidBody(mass=1.0, inertia=(0.1, 0.2, 0.25), position=2 * out))
+        hinge = scene.add(nc.Revolute(hub, arm, out, np.cross(out, (0.0, 0.0, 1.0))))
+        scene.add(nc.JointSpring(hinge, stiffness=3.0 + k))
+        scene.add(nc.JointTorque(hinge))
+    return scene.compile(solver=solver)
+
+
+def program(arms: int, solver: str):
+    run = jax.jit(lambda s, x, u: nc.simulate(s, x, dt=0.01, inputs=u))
+    return run.lower(*star(arms, solver), jnp.zeros((5, arms)))
+
+
+# Small matrices are eliminated written out; beyond that the reduced form has one call of LAPACK.
+SIZES = {"recursive": (4, 48), "full": (4, 48), "reduced": (8, 48)}
+
+
+@pytest.mark.filterwarnings("ignore:.*solved densely")
+@pytest.mark.parametrize("solver", SIZES)
+def test_program_size_does_not_grow_with_bodies(solver):
+    lines = {n: len(program(n, solver).as_text().splitlines()) for n in SIZES[solver]}
+    assert np.ptp(list(lines.values())) <= 0.01 * min(lines.values()), f"lines by number of arms: {lines}"
+
+
+@pytest.mark.slow
+def test_compile_time_does_not_grow_with_bodies():
+    jax.config.update("jax_enable_compilation_cache", False)
+    try:
+        seconds = {}
+        for arms in (4, 48):
+            text = program(arms, "recursive")
+            start = time.perf_counter()
+            text.compile()
+            seconds[arms] = time.perf_counter() - start
+    finally:
+        jax.config.update("jax_enable_compilation_cache", True)
+    assert seconds[48] <= 1.5 * seconds[4] + 1.0, f"seconds of compilation by number of arms: {seconds}"
+
+
+@pytest.mark.parametrize("solver", ["recursive", "full"])
+def test_solvers_give_one_trajectory(solver):
+    one, other = star(5, "reduced"), star(5, solver)
+    inputs = jnp.sin(jnp.arange(100.0))[:, None] * jnp.arange(1.0, 6.0)
+    a, b = (nc.simulate(*s, dt=0.02, inputs=inputs) for s in (one, other))
+    order = [one[0].body_index(name) for name in other[0].structure.bodies]
+    q = np.asarray(a.q).reshape(101, -1, 4, 3)[:, order]
+    assert np.max(np.abs(q - np.asarray(b.q).reshape(q.shape))) <= tol.SAME_TRAJECTORY
+
+
+# --- numbers are leaves -----------------------------------------------------------------------------------
+
+
+class Counting(nc.Force):
+    """A force [N] that counts how often its law is traced."""
+
+    traced = []
+
+    def load(self, x, rate, inputs, t):
+        """Nothing, but noted."""
+        Counting.traced.append(1)
+        return nc.Load(0.0 * rate, None)
+
+
+def test_a_changed_number_never_retraces():
+    """Every leaf of system and state, the step, the inputs; a scene built anew with other numbers."""
+
+    def scene(mass=1.0, stiffness=2.0, place=0.5):
+        made = nc.Scene()
+        made.add(nc.Gravity(vector=(0.0, 0.1 * mass, -9.81)))
+        one = made.add(nc.RigidBody(mass=mass, inertia=(0.1, 0.2, 0.25), name="one"))
+        hinge = made.add(nc.Revolute(nc.ground, one, (place, 0.0, 0.0)))
+        made.add(nc.JointSpring(hinge, stiffness=stiffness))
+        made.add(nc.JointTorque(hinge))
+        made.add(Counting((nc.Point(one),)))
+        return made.compile()
+
+    system, state = scene()
+    first = nc.simulate(system, state, dt=0.1, inputs=jnp.zeros((4, 1)))
+    traces = len(Counting.traced)
+    assert traces > 0
+    others = [scene(mass=2.0), scene(stiffness=5.0), scene(place=0.3)]
+    seen = len(Counting.traced)  # compiling a scene evaluates it
+    found = [nc.simulate(*s, dt=0.1, inputs=jnp.zeros((4, 1))) for s in others]
+    found.append(nc.simulate(system, state, dt=0.05, inputs=jnp.zeros((4, 1))))
+    found.append(nc.simulate(system, state, dt=0.1, inputs=jnp.ones((4, 1))))
+    floats, rest = eqx.partition(system, eqx.is_inexact_array)
+    moved = eqx.combine(jax.tree.map(lambda x: x * 1.01, floats), rest)
+    found.append(nc.simulate(moved, state, dt=0.1, inputs=jnp.zeros((4, 1)), throw=False))
+    later = eqx.tree_at(lambda s: s.t, state, state.t + 1.0)
+    found.append(nc.simulate(system, later, dt=0.1, inputs=jnp.zeros((4, 1))))
+    assert len(Counting.traced) == seen, "a program was traced again"
+    assert all(float(jnp.max(jnp.abs(x.q - first.q))) > 0 for x in found[:-1])
+
+
+def test_a_scene_of_traced_numbers():
+    """Building inside jit gives the numbers of building outside."""
+
+    def build(mass, place):
+        scene = nc.Scene()
+        body = scene.add(nc.RigidBody(mass=mass, inertia=(0.1, 0.2, 0.25), com=(0.1, 0.0, 0.0)))
+        scene.add(nc.Revolute(nc.ground, body, place, (0.0, 1.0, 0.0)))
+        scene.add(nc.Gravity())
+        return scene.compile()
+
+    mass, place = jnp.array(1.7), jnp.array([0.3, 0.0, 0.1])
+    outside, inside = build(mass, place), jax.jit(lambda m, p: build(m, p)[1])(mass, place)
+    assert jax.tree.all(jax.tree.map(lambda a, b: jnp.allclose(a, b), outside[1], inside))
+    answer = jax.jit(lambda m, p: nc.simulate(*build(m, p), dt=0.05, steps=10).q)(mass, place)
+    assert np.allclose(answer, nc.simulate(*outside, dt=0.05, steps=10).q, atol=tol.INDIFFERENCE)
+
+
+def test_batch_of_motions_shares_one_program():
+    """vmap over seeds of an effect's answer lowers to a program of the size of one."""
+    respond_to, _ = answering(nc.Spring)
+    w, lam = random_motion(nc.Spring, 0)
+    sizes = []
+    for lanes in (2, 64):
+        batch = jax.jit(jax.vmap(respond_to)).lower(jnp.stack([w] * lanes), jnp.stack([lam] * lanes))
+        sizes.append(len(batch.as_text().splitlines()))
+    assert sizes[0] == sizes[1]
