@@ -95,6 +95,7 @@ class Course(eqx.Module):
     fraction: Float[Array, ""]
     code: Int[Array, ""]
     stopped: Bool[Array, ""]
+    attempts: Int[Array, ""]
     taken: Int[Array, ""]
     iterations: Int[Array, ""]
     iterations_max: Int[Array, ""]
@@ -108,7 +109,7 @@ def _start(plan: Plan, system: System, state: State, parameters: Any, dt: Float[
     bad = ~(jnp.isfinite(dt) & (dt > 0))
     code = jnp.where(bad, int(Result.BAD_STEP), int(Result.SUCCESSFUL))
     nought = jnp.zeros((), state.q.dtype)
-    return Course(state, warm, warm.y, zero, nought, nought + 1.0, code, bad, zero, zero, zero, nought)
+    return Course(state, warm, warm.y, zero, nought, nought + 1.0, code, bad, zero, zero, zero, zero, nought)
 
 
 def _slot(plan: Plan, system: System, parameters: Any, dt: Array, course: Course) -> tuple[Course, Slots]:
@@ -149,6 +150,7 @@ def _slot(plan: Plan, system: System, parameters: Any, dt: Array, course: Course
         fraction,
         result,
         stopped,
+        course.attempts + ~idle,
         course.taken + accepted,
         course.iterations + worked,
         jnp.maximum(course.iterations_max, worked),
@@ -281,7 +283,9 @@ def _run_slots_jvp(plan: Plan, primals: tuple, tangents: tuple):
         end = jax.tree.map(partial(jnp.where, accepted), end, state_dot)
         return end, (end, jnp.where(accepted, y_dot, 0.0))
 
-    maps = _in_chunks(prepared, (before, slots.y, slots.step, slots.fraction))
+    # Attempts that failed may hold anything: their maps are formed at rest, and then not used.
+    sound = jnp.where(slots.accepted[:, None], slots.y, 0.0)
+    maps = _in_chunks(prepared, (before, sound, slots.step, slots.fraction))
     last_dot, (states_dot, y_dot) = jax.lax.scan(body, state_dot, (maps, slots.accepted))
     slots_dot = jax.tree.map(_zero_tangent, slots)
     slots_dot = eqx.tree_at(lambda s: (s.states, s.y), slots_dot, (states_dot, y_dot))

@@ -91,7 +91,7 @@ def _ends(slots: Slots, every: int, steps: int) -> Array:
 
 def _failure(system: System, plan: Plan, course: Course, slots: Slots, parameters: Any, dt: Array) -> Array:
     """Unknown with the largest share in the residual of the last attempt; -1 if nothing failed."""
-    last = jnp.maximum(jnp.argmax(jnp.cumsum(~slots.accepted)), 0)
+    last = jnp.maximum(course.attempts - 1, 0)
     state = jax.tree.map(lambda x: x[last], slots.states)
     u = plan.control(parameters, slots.step[last], state.t, state)
     equations = prepare(system, state, u, slots.fraction[last] * dt, gauss(plan.stages))
@@ -216,7 +216,7 @@ def simulate(
         throw: raise on failure when called eagerly; inside jit, vmap or grad nothing is raised, see
             `Trajectory.result` and `System.explain`.
         until: terminal event, a function of the state; the run stops after the step in which its sign
-            changes, and later states repeat the last one.
+            changes, and later states repeat the last one. Derivatives hold that step fixed.
         checkpoint: recompute in the backward pass: memory of a gradient grows with the root of `steps`.
         newton_tol: accuracy of Newton's iteration relative to the terms of the equations. The default is
             the floor of round-off; larger values are faster and let energy and momentum drift in proportion.
