@@ -71,6 +71,17 @@ def kinetic_energy(model, rotation: np.ndarray, velocity: np.ndarray, angular_ve
     return float(energy)
 
 
+def angular_momentum(
+    model, position: np.ndarray, rotation: np.ndarray, velocity: np.ndarray, angular_velocity: np.ndarray
+) -> np.ndarray:
+    """Angular momentum about the origin (3,) [kg m2/s]; arguments as in `final_state`."""
+    total = np.zeros(3)
+    states = zip(model.BODIES, position, rotation, velocity, angular_velocity, strict=True)
+    for body, x, turn, v, w in states:
+        total += body["mass"] * np.cross(x, v) + turn @ (np.asarray(body["inertia"]) * (turn.T @ w))
+    return total
+
+
 def final_state(model, position, rotation, velocity, angular_velocity) -> dict:
     """The quantities that errors are measured in.
 
@@ -82,8 +93,8 @@ def final_state(model, position, rotation, velocity, angular_velocity) -> dict:
         angular_velocity: world axes (bodies, 3) [rad/s].
 
     Returns:
-        positions [m], kinetic_energy [J], energy (kinetic and potential) [J], base_rotation and
-        base_angular_velocity [rad/s] of the first body.
+        positions [m], kinetic_energy [J], energy (kinetic and potential) [J], angular_momentum [kg m2/s],
+        base_rotation and base_angular_velocity [rad/s] of the first body.
     """
     x, turn, v, w = (np.asarray(a, dtype=float) for a in (position, rotation, velocity, angular_velocity))
     kinetic = kinetic_energy(model, turn, v, w)
@@ -91,6 +102,7 @@ def final_state(model, position, rotation, velocity, angular_velocity) -> dict:
         "positions": x.tolist(),
         "kinetic_energy": kinetic,
         "energy": kinetic + potential_energy(model, x, turn),
+        "angular_momentum": angular_momentum(model, x, turn, v, w).tolist(),
         "base_rotation": turn[0].tolist(),
         "base_angular_velocity": w[0].tolist(),
     }
