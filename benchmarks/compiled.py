@@ -1,0 +1,97 @@
+"""Rollouts of a system as compiled programs, so that a timed call runs the program and little else.
+
+The arrays of system, state, inputs and step are arguments of the program, never constants in it: what is
+timed is what runs again after any number has changed. Checks of arguments and errors, which an eager
+`nc.simulate` does in Python at each call, are not in the times.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+import natcoord_jax as nc
+
+PARTS = ("system", "state", "inputs", "dt")
+
+
+class Rollout:
+    """A rollout, each of its programs compiled at its first call.
+
+    A selection of arrays is one of `PARTS` or "all"; it means the floating ones.
+
+    Args:
+        system: compiled system.
+        state: initial state.
+        inputs: inputs of every step (steps, inputs).
+        dt: step [s].
+    """
+
+    def __init__(self, system: nc.System, state: nc.State, inputs: Array, dt: float):
+        whole = (system, state, jnp.asarray(inputs), jnp.asarray(dt, float))
+        self._leaves, self._structure = jax.tree.flatten(whole)
+        owners = [part for part, tree in zip(PARTS, whole, strict=True) for _ in jax.tree.leaves(tree)]
+        self._places = [k for k, x in enumerate(self._leaves) if isinstance(x, jax.Array | np.ndarray)]
+        self._owners = [owners[k] for k in self._places]
+        self._arguments = [jnp.asarray(self._leaves[k]) for k in self._places]
+        self._program = jax.jit(self._simulate)
+
+    def _simulate(self, arguments: list[Array]) -> nc.Trajectory:
+        leaves = list(self._leaves)
+        for place, array in zip(self._places, arguments, strict=True):
+            leaves[place] = array
+        system, state, inputs, dt = jax.tree.unflatten(self._structure, leaves)
+        return nc.simulate(system, state, dt=dt, inputs=inputs)
+
+    def _selected(self, part: str) -> list[int]:
+        return [
+            k
+            for k, (owner, x) in enumerate(zip(self._owners, self._arguments, strict=True))
+            if part in (owner, "all") and jnp.issubdtype(x.dtype, jnp.floating)
+        ]
+
+    def run(self) -> nc.Trajectory:
+        """Run to the end; the trajectory holds every step."""
+        return jax.block_until_ready(self._program(self._arguments))
+
+    def batch(self, part: str, lanes: Any) -> Callable[[], nc.Trajectory]:
+        """A call that runs many lanes at once.
+
+        Args:
+            part: what differs from lane to lane, "state" or "inputs".
+            lanes: the same with a leading axis of lanes.
+        """
+        chosen, arguments = self._selected(part), list(self._arguments)
+        for k, x in zip(chosen, jax.tree.leaves(lanes), strict=True):
+            arguments[k] = x
+        axes = [0 if k in chosen else None for k in range(len(arguments))]
+        program = jax.jit(jax.vmap(self._simulate, in_axes=(axes,)))
+        return lambda: jax.block_until_ready(program(arguments))
+
+    def loss(self, part: str) -> tuple[Callable[[], Array], Callable[[], Any], int]:
+        """Sum of squares of the final velocities, and the same with its gradient.
+
+        Args:
+            part: what the gradient is with respect to.
+
+        Returns:
+            Calls of the value and of value and gradient, and the number of parameters.
+        """
+        chosen = self._selected(part)
+
+        def loss(values: list[Array], arguments: list[Array]) -> Array:
+            arguments = list(arguments)
+            for k, value in zip(chosen, values, strict=True):
+                arguments[k] = value
+            return jnp.sum(self._simulate(arguments).v[-1] ** 2)
+
+        values = [self._arguments[k] for k in chosen]
+        value, both = jax.jit(loss), jax.jit(jax.value_and_grad(loss))
+        return (
+            lambda: jax.block_until_ready(value(values, self._arguments)),
+            lambda: jax.block_until_ready(both(values, self._arguments)),
+            sum(x.size for x in values),
+        )
