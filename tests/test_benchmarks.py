@@ -1,0 +1,56 @@
+"""The benchmarks run and write what their figures and readers need; what they measure is not judged here."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+CIRCUMSTANCES = {"benchmark", "quick", "date", "commit", "machine", "versions", "targets"}
+TIMES = {"us_per_step", "us_per_step_range", "repeats", "compile_s"}
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not (ROOT / "benchmarks").is_dir(), reason="only a checkout has the benchmarks"),
+]
+
+
+def _results(name, folder, *options):
+    command = [sys.executable, "-m", f"benchmarks.{name}", "--quick", "--output", str(folder), *options]
+    run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stderr
+    assert (folder / f"{name}.png").stat().st_size > 10_000
+    results = json.loads((folder / f"{name}.json").read_text("utf-8"))
+    assert results.keys() >= CIRCUMSTANCES
+    assert results["machine"].keys() >= {"processor", "cores", "cores_used"}
+    for target in results["targets"]:
+        assert target.keys() == {"name", "measured", "target", "unit", "reached"}
+    return results, run.stdout
+
+
+def test_scaling(tmp_path):
+    results, text = _results("scaling", tmp_path)
+    assert {run["scene"] for run in results["runs"]} == {"chain", "binary_tree"} == set(results["exponents"])
+    for run in results["runs"]:
+        assert run.keys() >= TIMES | {"bodies", "unknowns", "solver", "energy_balance", "build_s"}
+        assert run["result"] == "successful" and run["energy_balance"] < 1e-11
+    assert "exponent" in text
+
+
+def test_spacecraft_alone(tmp_path):
+    results, text = _results("spacecraft", tmp_path, "--no-peers")
+    assert set(results["models"]) == {"spacecraft", "open_tree"}
+    for found in results["models"].values():
+        errors = []
+        for run in found["runs"]:
+            assert run.keys() >= TIMES | {"code", "steps", "h", "error", "energy_error", "energy_balance"}
+            assert run["result"] == "successful" and run["energy_balance"] < 1e-11
+            errors.append(run["error"])
+        assert 3 < errors[0] / errors[1] < 5  # twice the steps, order two
+        for gradient in found["gradients"]:
+            assert gradient.keys() >= TIMES | {"over_forward", "forward_us_per_step"} and gradient["finite"]
+        assert found["batches"][0]["failed_lanes"] == 0
+    assert all(r["angular_momentum_error"] < 1e-11 for r in results["models"]["spacecraft"]["runs"])
+    assert "natcoord_jax" in text
