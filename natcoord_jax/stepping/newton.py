@@ -60,6 +60,7 @@ class Solution(eqx.Module):
         code: result code.
         iterations: evaluations of the residual.
         error: size of the last correction relative to the terms of the equations.
+        worst: unknown with the largest last correction.
         warm: the start of the next step.
     """
 
@@ -67,11 +68,13 @@ class Solution(eqx.Module):
     code: Int[Array, ""]
     iterations: Int[Array, ""]
     error: Float[Array, ""]
+    worst: Int[Array, ""]
     warm: Any
 
 
 class _Iterate(eqx.Module):
     y: Array
+    worst: Array
     correction: Array
     size: Array
     count: Array
@@ -98,7 +101,8 @@ def _iterate(
     converged = (small | stalled) & finite
     slow = ~first & ~converged & ((ratio > 0.5) | (correction * ratio**PATIENCE > tolerance * size))
     y = jnp.where(finite & ~slow, it.y - change, it.y)
-    return _Iterate(y, correction, size, it.count + 1, it.total + 1, converged, slow, finite)
+    worst = jnp.argmax(inertias * change**2)
+    return _Iterate(y, worst, correction, size, it.count + 1, it.total + 1, converged, slow, finite)
 
 
 def _chord(
@@ -152,7 +156,7 @@ def newton(equations: Any, tolerance: Float[Array, ""] | float, form: str, warm:
         The solution; its code is successful, max_iterations or nonfinite, never an exception.
     """
     zero, no, nought = jnp.zeros((), warm.y.dtype), jnp.array(False), jnp.array(0)
-    start = _Iterate(warm.y, zero, zero, nought, nought, no, no, jnp.array(True))
+    start = _Iterate(warm.y, nought, zero, zero, nought, nought, no, no, jnp.array(True))
 
     def fresh(it: _Iterate, factors: Any, inertias: Array) -> tuple[Any, Array]:
         return FACTORISATIONS[form](equations, equations.jacobian(it.y))
@@ -183,4 +187,4 @@ def newton(equations: Any, tolerance: Float[Array, ""] | float, form: str, warm:
     code = jnp.where(it.converged, int(Result.SUCCESSFUL), failed)
     error = it.correction / jnp.where(it.size > 0, it.size, 1.0)
     left = Warm(it.y, factors, inertias, it.converged)
-    return Solution(it.y, code, it.total, error, left)
+    return Solution(it.y, code, it.total, error, it.worst, left)

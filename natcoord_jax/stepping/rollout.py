@@ -84,6 +84,7 @@ class Slots(eqx.Module):
 class Course(eqx.Module):
     """Where a rollout stands: carried from slot to slot.
 
+    `worst` is the unknown with the largest correction in the attempt that ended the run, -1 without one;
     `warm` is what the last step left to the next, `before` the unknowns of the last accepted step.
     """
 
@@ -95,7 +96,7 @@ class Course(eqx.Module):
     fraction: Float[Array, ""]
     code: Int[Array, ""]
     stopped: Bool[Array, ""]
-    attempts: Int[Array, ""]
+    worst: Int[Array, ""]
     taken: Int[Array, ""]
     iterations: Int[Array, ""]
     iterations_max: Int[Array, ""]
@@ -109,7 +110,9 @@ def _start(plan: Plan, system: System, state: State, parameters: Any, dt: Float[
     bad = ~(jnp.isfinite(dt) & (dt > 0))
     code = jnp.where(bad, int(Result.BAD_STEP), int(Result.SUCCESSFUL))
     nought = jnp.zeros((), state.q.dtype)
-    return Course(state, warm, warm.y, zero, nought, nought + 1.0, code, bad, zero, zero, zero, zero, nought)
+    return Course(
+        state, warm, warm.y, zero, nought, nought + 1.0, code, bad, zero - 1, zero, zero, zero, nought
+    )
 
 
 def _slot(plan: Plan, system: System, parameters: Any, dt: Array, course: Course) -> tuple[Course, Slots]:
@@ -150,7 +153,7 @@ def _slot(plan: Plan, system: System, parameters: Any, dt: Array, course: Course
         fraction,
         result,
         stopped,
-        course.attempts + ~idle,
+        jnp.where(hopeless, solution.worst, course.worst),
         course.taken + accepted,
         course.iterations + worked,
         jnp.maximum(course.iterations_max, worked),
@@ -247,10 +250,38 @@ def _in_chunks(function: Callable, slots: tuple) -> Any:
     return jax.tree.map(lambda x: x.reshape(chunks * CHUNK, *x.shape[2:])[:length], found)
 
 
-@run_slots.defjvp
+def _is_zero(x: Any) -> bool:
+    return isinstance(x, jax.custom_derivatives.SymbolicZero)
+
+
+def _some_tangents(tree: Any, tangents: Any) -> tuple[list, Callable, list]:
+    """The leaves that are differentiated, the way back to the tree, and their tangents."""
+    leaves, structure = jax.tree.flatten(tree)
+    changes = jax.tree.leaves(tangents, is_leaf=_is_zero)
+    chosen = [i for i, change in enumerate(changes) if not _is_zero(change)]
+
+    def whole(some: list) -> Any:
+        every = list(leaves)
+        for i, leaf in zip(chosen, some):
+            every[i] = leaf
+        return jax.tree.unflatten(structure, every)
+
+    return [leaves[i] for i in chosen], whole, [changes[i] for i in chosen]
+
+
+def _instantiated(tangents: Any, primals: Any) -> Any:
+    """Tangents with arrays for symbolic zeros."""
+    return jax.tree.map(
+        lambda t, p: _zero_tangent(p) if _is_zero(t) else t, tangents, primals, is_leaf=_is_zero
+    )
+
+
+@partial(run_slots.defjvp, symbolic_zeros=True)
 def _run_slots_jvp(plan: Plan, primals: tuple, tangents: tuple):
     system, state, parameters, dt = primals
     system_dot, state_dot, parameters_dot, dt_dot = tangents
+    state_dot = _instantiated(state_dot, state)
+    some, whole, some_dot = _some_tangents((system, parameters, dt), (system_dot, parameters_dot, dt_dot))
     slots, course = run_slots(plan, *primals)
     tableau = gauss(plan.stages)
     before = jax.tree.map(
@@ -266,11 +297,12 @@ def _run_slots_jvp(plan: Plan, primals: tuple, tangents: tuple):
         _, along = jax.linearize(
             lambda state, y: outcome(system, state, parameters, dt, y, step, fraction), state, y
         )
-        forcing = jax.jvp(
-            lambda system, parameters, dt: outcome(system, state, parameters, dt, y, step, fraction),
-            (system, parameters, dt),
-            (system_dot, parameters_dot, dt_dot),
-        )[1]
+
+        def by_numbers(some: list) -> tuple[Array, State]:
+            system, parameters, dt = whole(some)
+            return outcome(system, state, parameters, dt, y, step, fraction)
+
+        forcing = jax.jvp(by_numbers, (some,), (some_dot,))[1]
         u = plan.control(parameters, step, state.t, state)
         solver = linear_solver(system, state, u, fraction * dt, y, tableau, along)
         return along, solver, forcing

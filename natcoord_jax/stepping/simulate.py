@@ -11,14 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from natcoord_jax.assembly.equations import prepare
 from natcoord_jax.assembly.system import System
 from natcoord_jax.core.checks import at_top_level, is_concrete
 from natcoord_jax.core.results import REASONS, REMEDIES, Result, SimulationError
 from natcoord_jax.core.state import State, Trajectory
-from natcoord_jax.maths.collocation import gauss
 from natcoord_jax.stepping.newton import TOLERANCE
-from natcoord_jax.stepping.rollout import Course, Plan, Slots, run_slots
+from natcoord_jax.stepping.rollout import Plan, Slots, run_slots
 
 SEGMENT = 512
 """Longest segment of a rollout that does not save every step, or that is checkpointed."""
@@ -89,17 +87,6 @@ def _ends(slots: Slots, every: int, steps: int) -> Array:
     return jnp.minimum(jnp.searchsorted(slots.finished, wanted), slots.finished.shape[0] - 1)
 
 
-def _failure(system: System, plan: Plan, course: Course, slots: Slots, parameters: Any, dt: Array) -> Array:
-    """Unknown with the largest share in the residual of the last attempt; -1 if nothing failed."""
-    last = jnp.maximum(course.attempts - 1, 0)
-    state = jax.tree.map(lambda x: x[last], slots.states)
-    u = plan.control(parameters, slots.step[last], state.t, state)
-    equations = prepare(system, state, u, slots.fraction[last] * dt, gauss(plan.stages))
-    residual = jnp.abs(equations.residual(slots.y[last])[0])
-    worst = jnp.argmax(jnp.where(jnp.isfinite(residual), residual, jnp.inf))
-    return jnp.where(course.code >= int(Result.MAX_ITERATIONS), worst, -1)
-
-
 def _rollout(
     system: System,
     state: State,
@@ -134,7 +121,7 @@ def _rollout(
         starts = jax.tree.map(lambda x: x[jnp.maximum(picked - 1, 0)], slots.states)
         used = jax.vmap(lambda k, s: plan.control(parameters, slots.step[k], s.t, s))(picked, starts)
         code = keep(course.code, code)
-        worst = keep(_failure(system, plan, course, slots, parameters, dt), failed[2])
+        worst = keep(course.worst, failed[2])
         failed = (failed[0] + jnp.where(running, course.step, 0), keep(course.state.t, failed[1]), worst)
         counts = (course.residual, course.taken, course.iterations, course.iterations_max)
         counts = jax.tree.map(lambda x: jnp.where(running, x, jnp.zeros_like(x)), counts)
