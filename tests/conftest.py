@@ -13,6 +13,8 @@ from jaxtyping import install_import_hook
 ROOT = Path(__file__).resolve().parents[1]
 CACHE = os.environ.get("JAX_COMPILATION_CACHE_DIR") or str(ROOT / ".pytest_cache" / "jax")
 
+# Notebooks and command lines run in processes of their own and share the cache through the environment.
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", CACHE)
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_compilation_cache_dir", CACHE)
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)

@@ -35,7 +35,7 @@ def report(system: "System") -> str:
         f"joints, loops     {_count(loops)}",
         f"effects           {_count(effects)}",
         f"inputs            {', '.join(structure.inputs) or 'none'}",
-        f"degrees of freedom {structure.dofs}",
+        f"freedom           {structure.dofs} degrees of freedom",
         f"coordinates       {12 * bodies} natural coordinates, {structure.constraints} constraints",
         f"unknowns          {12 * bodies + structure.constraints} in full; {6 * bodies + tree} + "
         f"{structure.multipliers} multipliers in the local null space; {structure.unknowns} + "
