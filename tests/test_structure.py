@@ -54,7 +54,7 @@ SCENES = {
     ),
 }
 
-PROGRAM = '''
+PROGRAM = """
 import hashlib, importlib.abc, importlib.machinery, json, sys, types
 blocked = set({blocked!r})
 
@@ -89,7 +89,7 @@ for name, code in {scenes!r}.items():
     found[name] = [hashlib.sha256(text.encode()).hexdigest(), len(text.splitlines())]
 loaded = [name for name in blocked if name in sys.modules and not isinstance(sys.modules[name], Stub)]
 print(json.dumps([found, loaded]))
-'''
+"""
 
 
 def lowered(scenes: dict[str, str], blocked: list[str]):
