@@ -13,8 +13,8 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.coordinates import coordinate_rates, frames_of
 from natcoord_jax.assembly.diagnostics import rows_with_ground
+from natcoord_jax.assembly.momentum import inertia, wrench
 from natcoord_jax.assembly.rates import Twists, null_space, passed_on, row_rates, twists
-from natcoord_jax.assembly.reduced import inertia, wrench
 from natcoord_jax.assembly.response import gather, no_multipliers, respond, situation, stations
 from natcoord_jax.assembly.system import Group, System
 from natcoord_jax.core.joint import frames_at

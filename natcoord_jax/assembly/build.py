@@ -7,11 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from natcoord_jax.assembly.collection import Collection
 from natcoord_jax.assembly.coordinates import coordinate_values, state_rates
 from natcoord_jax.assembly.diagnostics import rows_with_ground
 from natcoord_jax.assembly.graph import Edge, make_tree, spanning_tree
-from natcoord_jax.assembly.grouping import Instance, bare, stack
-from natcoord_jax.assembly.system import CoordinateGroup, Elimination, Group, Structure, System
+from natcoord_jax.assembly.grouping import Instance, bare, families, stack
+from natcoord_jax.assembly.system import CoordinateGroup, Elimination, Group, Seats, Structure, System
 from natcoord_jax.assembly.tree import Tree
 from natcoord_jax.core.bodies import Body
 from natcoord_jax.core.coordinate import Coordinate, CoordinateEffect
@@ -181,13 +182,17 @@ class Layout:
         count = effect.inputs
         instance.inputs = list(range(len(self.inputs), len(self.inputs) + count))
         self.inputs += [name] if count == 1 else [f"{name}[{k}]" for k in range(count)]
-        if effect.works:
-            instance.works = [len(self.works)]
-            self.works.append(name)
-        if effect.rotors:
-            instance.rotors = [len(self.rotors)]
-            self.rotors += instance.coordinates
         return instance
+
+    def number_accounts(self, instances: list[Instance]) -> None:
+        """Places in the work account and among the stored rates: one piece of the state for each group."""
+        for instance in (x for family in families(instances) for x in family):
+            if instance.effect.works:
+                instance.works = [len(self.works)]
+                self.works.append(instance.name)
+            if instance.effect.rotors:
+                instance.rotors = [len(self.rotors)]
+                self.rotors += instance.coordinates
 
     def _on_markers(self, name: str, effect: Any, label: str) -> Instance:
         markers = effect.attach(
@@ -231,6 +236,11 @@ class Layout:
             joints = [self.joint_number[self.coordinates[i][0]] for i in members]
             groups.append(CoordinateGroup(axis, np.array(joints, np.int32), np.array(members, np.int32)))
         return tuple(groups)
+
+    def coordinate_order(self) -> np.ndarray:
+        """Place of each coordinate among those of all groups, one group after the other."""
+        listed = [group.index for group in self.coordinate_groups()]
+        return np.argsort(np.concatenate([np.zeros(0, np.int32), *listed])).astype(np.int32)
 
     def state(self) -> State:
         """Initial state: coordinates count from the assembled pose."""
@@ -281,7 +291,7 @@ def choose_solver(
 
 
 def elimination_order(layout: Layout, effects: tuple[Group, ...], joints: tuple[Group, ...]) -> Elimination:
-    """Nodes of the tree in order of elimination, and where their multipliers sit.
+    """Where multipliers and blocks sit in the nodes of the tree.
 
     Raises:
         ValueError: if the system is no open tree with couplings between neighbours.
@@ -293,35 +303,21 @@ def elimination_order(layout: Layout, effects: tuple[Group, ...], joints: tuple[
             'use solver="full" or None'
         )
     owned: list[list[int]] = [[] for _ in range(bodies)]
-    offsets, total = [], 0
+    seats, total = [], 0
     for group in (*effects, *joints):
-        first = []
-        for members in np.asarray(group.bodies):
-            node = max((int(b) for b in members if b < bodies), default=0)
-            first.append(len(owned[node]))
-            owned[node] += range(total, total + group.multipliers)
+        table = np.asarray(group.bodies)
+        # Bodies are numbered from the root: the deeper one has the larger number.
+        nodes = np.where(table < bodies, table, -1).max(axis=1)
+        others = np.where((table < bodies) & (table != nodes[:, None]), table, -1).max(axis=1)
+        nodes, others = (np.where(x < 0, bodies, x) for x in (nodes, others))
+        seats.append(Seats(Collection.of(nodes, bodies), Collection.of(others, bodies)))
+        for node in nodes:
+            owned[min(node, bodies - 1)] += range(total, total + group.multipliers)
             total += group.multipliers
-        offsets.append(np.array(first, np.int32))
     most = max((len(o) for o in owned), default=0)
     slots = np.array([o + [total] * (most - len(o)) for o in owned], np.int32).reshape(bodies, most)
-    schedule = elimination_schedule(np.array(layout.spanning.depth))
-    return Elimination(schedule, slots, tuple(offsets))
-
-
-def elimination_schedule(depth: np.ndarray, lanes: int = 8) -> np.ndarray:
-    """Rows of independent nodes, deepest level first, cut to at most `lanes` nodes and padded.
-
-    Cutting wide levels keeps the padding of the narrow ones small, whatever the shape of the tree.
-    """
-    nodes = len(depth)
-    levels = [np.flatnonzero(depth == d) for d in range(int(depth.max()), -1, -1)]
-    width = min(lanes, max(len(level) for level in levels))
-    rows = []
-    for level in levels:
-        for start in range(0, len(level), width):
-            row = level[start : start + width]
-            rows.append(np.concatenate([row, np.full(width - len(row), nodes)]))
-    return np.array(rows, np.int32)
+    places = np.argsort(slots.reshape(-1), kind="stable")[:total].astype(np.int32)
+    return Elimination(slots, places, tuple(seats))
 
 
 def build(
@@ -330,6 +326,7 @@ def build(
     """Number bodies along the spanning tree, group equal kinds, and lay out the state."""
     layout = Layout(bodies, joints)
     instances = [layout.effect_instance(name, effect) for name, effect in effects.items()]
+    layout.number_accounts(instances)
     joint_groups = stack(layout.joint_instances(), len(bodies))
     groups = stack(instances, len(bodies))
     tree = make_tree(layout.spanning, layout.motions())
@@ -359,6 +356,7 @@ def build(
         joint_groups,
         groups,
         layout.coordinate_groups(),
+        layout.coordinate_order(),
         elimination_order(layout, groups, joint_groups) if structure.solver == "recursive" else None,
         structure,
     )

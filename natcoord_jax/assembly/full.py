@@ -12,9 +12,17 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.diagnostics import rows_with_ground
-from natcoord_jax.assembly.local import body_balance, body_motion, over_instances
-from natcoord_jax.assembly.reduced import project_multipliers, project_rows, row_weights
-from natcoord_jax.assembly.response import Situation, Stations, body_rows, situation, stations
+from natcoord_jax.assembly.local import body_balance, body_motion, jacobians
+from natcoord_jax.assembly.momentum import momentum_balance
+from natcoord_jax.assembly.reduced import project_multipliers, project_rows
+from natcoord_jax.assembly.response import (
+    Evaluation,
+    Situation,
+    Stations,
+    body_rows,
+    situation,
+    stations,
+)
 from natcoord_jax.assembly.system import Group, System
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
@@ -104,26 +112,22 @@ class FullStep(eqx.Module):
 
     def residual(self, y: Float[Array, " unknowns"]) -> tuple[Float[Array, " unknowns"], Float[Array, ""]]:
         """Residual [N s, N m s; m/s, 1/s for constraints] and the size of its terms [sqrt(J)]."""
+        found = self.evaluate(y)
+        return found.residual, found.size
+
+    def evaluate(self, y: Float[Array, " unknowns"]) -> Evaluation:
+        """Residual, and what the end of the step needs."""
         twists, multipliers = self.split(project_multipliers(y, self.balances, self.projector))
-        balance = jax.vmap(body_balance, in_axes=(0, 0, 0, 0, None, None))
-        total = balance(self.system.mass, self.start[:-1], self.velocity, twists, self.h, self.tableau)
-        total = self._with_ground(total)
-        weights = row_weights(self.system.mass)
-        scale = jnp.stack([weights[:, 0]] * 3 + [weights[:, 1]] * 3, axis=1)[:, None]
-        rest = balance(
-            self.system.mass, self.start[:-1], self.velocity, jnp.zeros_like(twists), self.h, self.tableau
-        )
-        size = jnp.sum(scale * (total[:-1] ** 2 + 2 * rest**2))
-        every, rows = self._with_ground(twists), []
-        for group, where, lam in zip(self.groups, self.situations, multipliers):
-            evaluate, _ = over_instances(group, where, self.tableau)
-            wrench, g_rates = evaluate(self.start[group.bodies], every[group.bodies], lam)
-            added = jnp.zeros_like(total).at[group.bodies].add(wrench)
-            size = size + jnp.sum(scale * added[:-1] ** 2)
-            total = total - added
-            rows.append(g_rates.reshape(-1))
-        rows = project_rows(jnp.concatenate([jnp.zeros(0), *rows]), y, self.balances, self.projector)
-        return jnp.concatenate([total[:-1].reshape(-1), rows]), jnp.sqrt(size)
+        at = self._stations(twists)
+        given = self.system, self.groups, self.situations, at, self.velocity
+        found = momentum_balance(*given, multipliers, self.h, self.tableau)
+        massless = jnp.trace(self.system.mass[:, 1:, 1:], axis1=1, axis2=2) <= 0
+        # A point mass keeps its directors by a unit inertia, as in `body_balance`.
+        torque = found.torque + jnp.where(massless[:, None], at.spin[:, :-1], 0.0)
+        wrenches = jnp.moveaxis(jnp.concatenate([found.force, torque], axis=-1), 0, 1)
+        rows = project_rows(found.rows, y, self.balances, self.projector)
+        residual = jnp.concatenate([wrenches.reshape(-1), rows])
+        return Evaluation(residual, found.size, at, found.power)
 
     def body_jacobians(self, twists: Float[Array, "bodies s 6"]) -> Float[Array, "bodies n n"]:
         """Jacobians of the bodies' own balances."""
@@ -143,9 +147,8 @@ class FullStep(eqx.Module):
         matrix = matrix.at[columns[:, :, None], columns[:, None, :]].add(own)
         every = self._with_ground(twists)
         for group, where, lam, (first, _) in zip(self.groups, self.situations, multipliers, self._blocks()):
-            _, jacobians = over_instances(group, where, self.tableau)
             (by_twist, by_lam), (g_by_twist, _) = jacobians(
-                self.start[group.bodies], every[group.bodies], lam
+                group, where, self.tableau, self.start[group.bodies], every[group.bodies], lam
             )
             n, k = group.bodies.shape
             m = s * group.multipliers
@@ -183,15 +186,16 @@ class FullStep(eqx.Module):
         twists = jnp.broadcast_to(twist, (self.bodies, self.tableau.stages, 6)).reshape(-1)
         return jnp.concatenate([twists, jnp.zeros(self.unknowns - self.balances, twists.dtype)])
 
-    def end_motion(self, y: Float[Array, " unknowns"]) -> tuple[Stations, list[Array]]:
-        """Stage motion of all bodies and the multipliers, for the end of the step."""
-        twists, multipliers = self.split(project_multipliers(y, self.balances, self.projector))
+    def motion_of(self, y: Float[Array, " unknowns"]) -> Stations:
+        """Stage motion of all bodies."""
+        return self._stations(self.split(y)[0])
+
+    def _stations(self, twists: Float[Array, "bodies s 6"]) -> Stations:
         motion = body_motion(self.start[:-1], twists, self.h, self.tableau)
-        at = stations(
+        return stations(
             self.start[:-1],
             motion.rows[:, :, 0],
             motion.rows[:, :, 1:],
             motion.rates[:, :, 0],
             motion.spin,
         )
-        return at, multipliers

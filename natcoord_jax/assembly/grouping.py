@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from natcoord_jax.assembly.collection import Collection
 from natcoord_jax.assembly.system import Group
 from natcoord_jax.core.checks import check_fields
 from natcoord_jax.core.effect import Effect, replace_fields
@@ -67,19 +68,24 @@ def bare(effect: Effect, drop: Sequence[str], label: str) -> Effect:
     return jax.tree.map(leaf, effect)
 
 
-def stack(instances: list[Instance], bodies: int) -> tuple[Group, ...]:
-    """Groups of instances with equal class, static fields and shapes, in order of first appearance.
+def families(instances: list[Instance]) -> list[list[Instance]]:
+    """Instances with equal class, static fields and shapes, in order of first appearance.
 
-    A field sits on all bodies by itself and is a group of its own.
+    A field sits on all bodies by itself and is a family of its own.
     """
-    families: dict[Any, list[Instance]] = {}
+    found: dict[Any, list[Instance]] = {}
     for instance in instances:
         leaves, structure = jax.tree.flatten(instance.effect)
         shapes = tuple((jnp.shape(x), str(jnp.result_type(x))) for x in leaves)
         own = instance.name if instance.source == "mass" else ""
         key = (structure, shapes, len(instance.bodies), instance.source, instance.in_tree, own)
-        families.setdefault(key, []).append(instance)
-    return tuple(_group(members, bodies) for members in families.values())
+        found.setdefault(key, []).append(instance)
+    return list(found.values())
+
+
+def stack(instances: list[Instance], bodies: int) -> tuple[Group, ...]:
+    """Groups of equal instances."""
+    return tuple(_group(members, bodies) for members in families(instances))
 
 
 def _group(members: list[Instance], bodies: int) -> Group:
@@ -98,6 +104,7 @@ def _group(members: list[Instance], bodies: int) -> Group:
         first.effect if field_like else jax.tree.map(lambda *x: jnp.stack(x), *effects),
         jnp.stack([m.weights for m in members]) if first.weights is not None else None,
         *(table(name) for name in ("bodies", "joints", "inputs", "coordinates", "rotors", "works")),
+        acting=Collection.of(table("bodies"), bodies),
         count=count,
         names=tuple(m.name for m in members),
         source=first.source,

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from natcoord_jax.assembly.reduced import stage_momentum
+from natcoord_jax.assembly.momentum import stage_momentum
 from natcoord_jax.assembly.response import Situation
 from natcoord_jax.assembly.system import Group
 from natcoord_jax.core.effect import Motion, Now
@@ -75,29 +75,20 @@ def effect_balance(
     return wrenches(forces, torques, motion), answer.rows
 
 
-def over_instances(group: Group, where: Situation, tableau: Tableau):
-    """`effect_balance` over all instances: function of start rows, twists and multipliers, leading axis n."""
+def jacobians(
+    group: Group, where: Situation, tableau: Tableau, start: Array, twists: Array, lam: Array
+) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    """Derivatives of `effect_balance` by twists and multipliers, of all instances; leading axis n."""
 
     def one(effect, place, inputs, coordinates, rates, start, twists, lam):
-        return effect_balance(
-            group, effect, place, inputs, coordinates, rates, start, twists, lam, where, tableau
-        )
+        def f(twists, lam):
+            return effect_balance(
+                group, effect, place, inputs, coordinates, rates, start, twists, lam, where, tableau
+            )
+
+        return jax.jacfwd(f, argnums=(0, 1))(twists, lam)
 
     numbers = (group.effect, where.place, where.inputs, where.coordinates, where.rates)
     axes = (None if group.source == "mass" else 0, 0, 0, 0, 0, 0, 0, 0)
-
-    def all_instances(start, twists, lam):
-        with jax.named_scope(group.effect.kind.replace(" ", "_")):
-            return jax.vmap(one, in_axes=axes)(*numbers, start, twists, lam)
-
-    def all_jacobians(start, twists, lam):
-        def jacobian(effect, place, inputs, coordinates, rates, start, twists, lam):
-            def f(twists, lam):
-                return one(effect, place, inputs, coordinates, rates, start, twists, lam)
-
-            return jax.jacfwd(f, argnums=(0, 1))(twists, lam)
-
-        with jax.named_scope(group.effect.kind.replace(" ", "_")):
-            return jax.vmap(jacobian, in_axes=axes)(*numbers, start, twists, lam)
-
-    return all_instances, all_jacobians
+    with jax.named_scope(group.effect.kind.replace(" ", "_")):
+        return jax.vmap(one, in_axes=axes)(*numbers, start, twists, lam)

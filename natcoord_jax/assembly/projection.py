@@ -88,5 +88,4 @@ class Projection(eqx.Module):
 
     def moved(self, y: Float[Array, " unknowns"]) -> Float[Array, "rows 3"]:
         """Mean velocities of all rows: the displacement of positions, or the projected velocities."""
-        at, _ = self.step.end_motion(y)
-        return at.rates[0, :-1].reshape(-1, 3)
+        return self.step.motion_of(y).rates[0, :-1].reshape(-1, 3)

@@ -5,11 +5,10 @@ of multipliers alone would have a zero pivot. Every effect couples a body with i
 """
 
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.full import FullStep
-from natcoord_jax.assembly.local import over_instances
+from natcoord_jax.assembly.local import jacobians
 from natcoord_jax.assembly.system import Elimination, Group
 
 
@@ -25,72 +24,70 @@ class RecursiveStep(FullStep):
     def jacobian(self, y: Float[Array, " unknowns"]) -> tuple[Array, Array, Array]:
         """Blocks of the exact Jacobian: diagonal, up, down (see `linsolve.tree.TreeBlocks`)."""
         twists, multipliers = self.split(y)
-        width, bodies = 6 * self.tableau.stages, self.bodies
-        slots = jnp.asarray(self.elimination.slots)
-        size = width + slots.shape[1]
-        diagonal = jnp.zeros((bodies + 1, size, size), y.dtype)
-        diagonal = diagonal.at[:-1, :width, :width].set(self.body_jacobians(twists))
-        unused = (slots == self.unknowns - self.balances)[:, :, None] * jnp.eye(slots.shape[1])
-        diagonal = diagonal.at[:-1, width:, width:].add(unused)
-        up = jnp.zeros((bodies + 1, size, width), y.dtype)
-        blocks = diagonal, up, jnp.swapaxes(up, 1, 2)
+        own = self.body_jacobians(twists)
+        up, down = jnp.zeros_like(own), jnp.zeros_like(own)
         every = self._with_ground(twists)
-        offsets = self.elimination.offsets
-        for group, where, lam, offset in zip(self.groups, self.situations, multipliers, offsets):
-            _, jacobians = over_instances(group, where, self.tableau)
+        # Of each multiplier: its forces on the node and on the parent, and the rates of its constraint.
+        borders = []
+        for group, where, lam, seats in zip(
+            self.groups, self.situations, multipliers, self.elimination.seats
+        ):
             (by_twist, by_lam), (g_by_twist, _) = jacobians(
-                self.start[group.bodies], every[group.bodies], lam
+                group, where, self.tableau, self.start[group.bodies], every[group.bodies], lam
             )
-            blocks = self._add_couplings(blocks, group, by_twist)
+            at_node, at_parent = self._places(group)
+            blocks = self._by_place(by_twist, at_node, at_parent)
+            own = own - seats.nodes.collect(blocks[0]) - seats.parents.collect(blocks[3])
+            up, down = up - seats.nodes.collect(blocks[1]), down - seats.nodes.collect(blocks[2])
             if group.multipliers:
-                blocks = self._add_multipliers(blocks, group, by_lam, g_by_twist, offset)
-        diagonal, up, down = blocks
-        return diagonal[:-1], up[:-1], down[:-1]
+                borders.append(self._borders(by_lam, g_by_twist, at_node, at_parent))
+        return self._bordered(own, up, down, borders)
 
-    def _node(self, touched: Array | np.ndarray) -> Array:
-        """The deeper body of each instance; bodies are numbered from the root."""
-        return jnp.max(jnp.where(touched < self.bodies, touched, -1), axis=1)
+    def _places(self, group: Group) -> tuple[Array, Array]:
+        """Which bodies of each instance are its node, the deeper one, and which the node's parent."""
+        touched = jnp.asarray(group.bodies)
+        real = touched < self.bodies
+        # Bodies are numbered from the root.
+        node = jnp.max(jnp.where(real, touched, -1), axis=1, keepdims=True)
+        at_node = real & (touched == node)
+        return at_node, real & ~at_node
 
-    def _add_couplings(self, blocks: tuple, group: Group, by_twist: Array) -> tuple:
-        """Blocks between the bodies of each instance; what falls on the ground goes to a spare block."""
-        diagonal, up, down = blocks
-        touched, bodies, width = group.bodies, self.bodies, 6 * self.tableau.stages
-        count, k = touched.shape
-        local = -by_twist.reshape(count, k, width, k, width)
-        node = self._node(touched)
-        for a in range(k):
-            for b in range(k):
-                same, deep = touched[:, a] == touched[:, b], touched[:, b] == node
-                real = (touched[:, a] < bodies) & (touched[:, b] < bodies)
-                block = local[:, a, :, b]
-                diagonal = diagonal.at[jnp.where(real & same, touched[:, a], bodies), :width, :width].add(
-                    block
-                )
-                up = up.at[jnp.where(real & ~same & ~deep, node, bodies), :width].add(block)
-                down = down.at[jnp.where(real & ~same & deep, node, bodies), :, :width].add(block)
-        return diagonal, up, down
+    def _by_place(self, by_twist: Array, at_node: Array, at_parent: Array) -> list[Array]:
+        """Blocks (node, node), (node, parent), (parent, node), (parent, parent) of each instance."""
+        count, k = at_node.shape
+        width = 6 * self.tableau.stages
+        local = by_twist.reshape(count, k, width, k, width)
+        places = (at_node, at_node), (at_node, at_parent), (at_parent, at_node), (at_parent, at_parent)
+        return [
+            jnp.sum(jnp.where((a[:, :, None] & b[:, None, :])[:, :, None, :, None], local, 0.0), axis=(1, 3))
+            for a, b in places
+        ]
 
-    def _add_multipliers(
-        self, blocks: tuple, group: Group, by_lam: Array, g_by_twist: Array, offset: Array | np.ndarray
-    ) -> tuple:
-        """Columns of the multipliers of each instance and rows of its constraints."""
-        diagonal, up, down = blocks
-        touched, bodies, width = group.bodies, self.bodies, 6 * self.tableau.stages
-        count, k = touched.shape
-        m = self.tableau.stages * group.multipliers
-        by_lam, g_by_twist = -by_lam.reshape(count, k, width, m), g_by_twist.reshape(count, m, k, width)
-        node = self._node(touched)
-        inside = jnp.arange(width)
-        columns = width + offset[:, None] + jnp.arange(m)
-        wide, tall = (
-            (inside[None, :, None], columns[:, None, :]),
-            (columns[:, :, None], inside[None, None, :]),
+    def _borders(self, by_lam: Array, g_by_twist: Array, at_node: Array, at_parent: Array) -> Array:
+        """Columns on node and parent and rows on node and parent of the multipliers (n m, 4, width)."""
+        count, k = at_node.shape
+        width = 6 * self.tableau.stages
+        columns = jnp.swapaxes(-by_lam.reshape(count, k, width, -1), 2, 3)
+        rows = jnp.swapaxes(g_by_twist.reshape(count, -1, k, width), 1, 2)
+        parts = [
+            jnp.sum(jnp.where(at[:, :, None, None], x, 0.0), axis=1)
+            for x, at in ((columns, at_node), (columns, at_parent), (rows, at_node), (rows, at_parent))
+        ]
+        return jnp.stack(parts, axis=2).reshape(-1, 4, width)
+
+    def _bordered(
+        self, own: Array, up: Array, down: Array, borders: list[Array]
+    ) -> tuple[Array, Array, Array]:
+        """Blocks with the multipliers of each node; a slot without one keeps its unknown at zero."""
+        slots, width = self.elimination.slots, own.shape[-1]
+        empty = jnp.zeros((1, 4, width), own.dtype)
+        columns, lifted, rows, hung = jnp.moveaxis(jnp.concatenate([*borders, empty])[slots], 2, 0)
+        unused = slots == self.unknowns - self.balances
+        corner = unused[:, :, None] * jnp.eye(slots.shape[1])
+        upper = jnp.concatenate([own, jnp.swapaxes(columns, 1, 2)], axis=2)
+        lower = jnp.concatenate([rows, corner], axis=2)
+        return (
+            jnp.concatenate([upper, lower], axis=1),
+            jnp.concatenate([up, hung], axis=1),
+            jnp.concatenate([down, jnp.swapaxes(lifted, 1, 2)], axis=2),
         )
-        for a in range(k):
-            mine, real = touched[:, a] == node, touched[:, a] < bodies
-            at = jnp.where(mine, node, bodies)[:, None, None]
-            diagonal = diagonal.at[at, *wide].add(by_lam[:, a]).at[at, *tall].add(g_by_twist[:, :, a])
-            at = jnp.where(~mine & real, node, bodies)[:, None, None]
-            down = down.at[at, *wide].add(by_lam[:, a])
-            up = up.at[at, *tall].add(g_by_twist[:, :, a])
-        return diagonal, up, down

@@ -12,12 +12,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from natcoord_jax.assembly.momentum import momentum_balance
 from natcoord_jax.assembly.response import (
+    Evaluation,
     Situation,
     Stations,
     body_rows,
-    gather,
-    respond,
     situation,
     stations,
 )
@@ -35,6 +35,9 @@ from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import Tableau, gauss
 from natcoord_jax.maths.projectors import range_projector
 from natcoord_jax.maths.vectors import cross
+
+PROBE = 1e-6
+"""Change of a rotation [rad] that gives a column of the Jacobian."""
 
 
 def project_multipliers(y: Array, balances: int, projector: Array | None) -> Array:
@@ -59,27 +62,6 @@ def project_rows(rows: Array, y: Array, balances: int, projector: Array | None) 
 def active_groups(system: System) -> tuple[Group, ...]:
     """Groups that take part in the equations: all effects and the joints that close loops."""
     return (*system.effects, *(g for g in system.joints if not g.in_tree))
-
-
-def inertia(
-    mass: Float[Array, "bodies 4 4"], rates: Float[Array, "*s bodies 4 3"]
-) -> Float[Array, "*s bodies 4 3"]:
-    """Rows of m v."""
-    return jnp.sum(mass[:, :, :, None] * rates[..., None, :, :], axis=-2)
-
-
-def wrench(
-    rows: Float[Array, "s bodies 4 3"], directors: Float[Array, "s bodies 3 3"]
-) -> tuple[Float[Array, "s bodies 3"], Float[Array, "s bodies 3"]]:
-    """Force and torque about the reference point of forces on rows: r_phi and sum d_i x r_i (26, 31)."""
-    return rows[:, :, 0], jnp.sum(cross(directors, rows[:, :, 1:]), axis=2)
-
-
-def row_weights(mass: Float[Array, "bodies 4 4"]) -> Float[Array, "bodies 4"]:
-    """Reciprocal mass of each row, so that weight times impulse squared is an energy; 0 for massless rows."""
-    turning = jnp.trace(mass[:, 1:, 1:], axis1=1, axis2=2)
-    sizes = jnp.stack([mass[:, 0, 0], turning, turning, turning], axis=1)
-    return jnp.where(sizes > 0, 1.0 / jnp.where(sizes > 0, sizes, 1.0), 0.0)
 
 
 class ReducedStep(eqx.Module):
@@ -162,45 +144,21 @@ class ReducedStep(eqx.Module):
 
     def residual(self, y: Float[Array, " unknowns"]) -> tuple[Float[Array, " unknowns"], Float[Array, ""]]:
         """Residual [N s, N m s; m/s, 1/s for constraints] and the size of its terms [sqrt(J)]."""
-        system, tableau = self.system, self.tableau
+        found = self.evaluate(y)
+        return found.residual, found.size
+
+    def evaluate(self, y: Float[Array, " unknowns"]) -> Evaluation:
+        """Residual, and what the end of the step needs."""
+        system = self.system
         w, multipliers = self.split(project_multipliers(y, self.balances, self.projector))
         motion, geometry = self.motion(w)
-        rates = jnp.concatenate(
-            [motion.velocity[:, :, None], cross(motion.spin[:, :, None], motion.directors)], axis=2
-        )
-        momentum = stage_momentum(system.mass, rates - self.velocity, tableau)
-        weights = row_weights(system.mass)[..., None]
-        size = jnp.sum(weights * (momentum**2 + 4 * inertia(system.mass, self.velocity) ** 2))
-        torque = None
-        rows = []
-        groups = active_groups(system)
         at = self.stations(motion)
-        for group, where, lam in zip(groups, self.situations, multipliers):
-            answer = respond(group, where, gather(group, at), lam, tableau)
-            scale = 1.0 if group.effect.impulsive else self.h
-            if answer.forces is not None:
-                forces = self._scatter(group, scale * answer.forces)
-                momentum = momentum - forces
-                size = size + jnp.sum(weights * forces**2)
-            if answer.torques is not None:
-                turning = self._scatter(group, scale * answer.torques)
-                torque = turning if torque is None else torque + turning
-                size = size + jnp.sum(weights[:, 1] * turning**2)
-            rows.append(answer.rows.reshape(-1))
-        force, moment = wrench(momentum, motion.directors)
-        moment = moment if torque is None else moment - torque
-        generalised = project(system.tree, geometry, force, moment)[0]
-        rows = project_rows(jnp.concatenate([jnp.zeros(0), *rows]), y, self.balances, self.projector)
-        return jnp.concatenate([generalised.reshape(-1), rows]), jnp.sqrt(size)
-
-    def _scatter(self, group: Group, loads: Float[Array, "n s k *rest"]) -> Float[Array, "s bodies *rest"]:
-        """Sum of the loads of all instances by body; those on the ground fall away."""
-        loads = jnp.moveaxis(loads, 1, 0)
-        if group.source == "mass":
-            return loads[:, :, 0]
-        bodies = self.start.shape[0]
-        total = jnp.zeros((self.tableau.stages, bodies + 1, *loads.shape[3:]), loads.dtype)
-        return total.at[:, group.bodies].add(loads)[:, :bodies]
+        given = system, self.groups, self.situations, at, self.velocity
+        found = momentum_balance(*given, multipliers, self.h, self.tableau)
+        generalised = project(system.tree, geometry, found.force, found.torque)[0]
+        rows = project_rows(found.rows, y, self.balances, self.projector)
+        residual = jnp.concatenate([generalised.reshape(-1), rows])
+        return Evaluation(residual, found.size, at, found.power)
 
     def _start_geometry(self) -> list[JointGeometry]:
         zero = jnp.zeros((1, self.system.structure.unknowns), self.start.dtype)
@@ -218,16 +176,19 @@ class ReducedStep(eqx.Module):
         """Exact Jacobian of the residual."""
         return jax.jacfwd(lambda x: self.residual(x)[0])(y)
 
-    def end_motion(self, y: Float[Array, " unknowns"]) -> tuple[Stations, list[Array]]:
-        """Stage motion of all bodies and the multipliers, for the end of the step."""
-        w, multipliers = self.split(project_multipliers(y, self.balances, self.projector))
-        return self.stations(self.motion(w)[0]), multipliers
+    def probes(self) -> Float[Array, " unknowns"]:
+        """Changes of the unknowns that give columns of the Jacobian as quotients of differences.
 
-
-def stage_momentum(
-    mass: Float[Array, "bodies 4 4"], difference: Float[Array, "s bodies 4 3"], tableau: Tableau
-) -> Float[Array, "s bodies 4 3"]:
-    """M sum_j (A^-1)_ij (V_j - v_0)."""
-    if tableau.stages == 1:
-        return inertia(mass, tableau.a_inverse[0][0] * difference)
-    return inertia(mass, jnp.einsum("ij,jbrc->ibrc", jnp.asarray(tableau.a_inverse), difference))
+        Small against a radian and against the extent of the system, so that the equations are
+        nearly linear in them; in multipliers they are linear exactly.
+        """
+        mass = self.system.mass
+        gyration = jnp.trace(mass[:, 1:, 1:], axis1=1, axis2=2) / mass[:, 0, 0]
+        apart = jnp.max(jnp.abs(self.start[:, 0] - self.start[0, 0]))
+        extent = jnp.sqrt(jnp.max(gyration)) + jnp.max(jnp.abs(self.frames[:, :, 0, 1:])) + apart
+        extent = jnp.where(extent > 0, extent, 1.0)
+        turning = jnp.ones((self.start.shape[0], 3), mass.dtype)
+        scales = jnp.concatenate([turning, extent * turning, turning[:, :1]], axis=1)
+        rates = PROBE / self.h * scales.reshape(-1)[self.system.tree.slot_of]
+        count = self.system.structure.multipliers * self.tableau.stages
+        return jnp.concatenate([jnp.tile(rates, self.tableau.stages), jnp.ones(count, mass.dtype)])

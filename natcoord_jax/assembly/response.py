@@ -105,6 +105,30 @@ def gather(group: Group, at: Stations) -> Motion:
     return Motion(at.start[index], at.rows[:, index], at.rates[:, index], at.spin[:, index])
 
 
+class Evaluation(eqx.Module):
+    """The equations of a step at given unknowns, and the motion that goes with them.
+
+    Attributes:
+        residual: [N s, N m s; m/s, 1/s for constraints].
+        size: of the terms of the residual [sqrt(J)].
+        at: stage motion of all bodies.
+        power: power of each group, for work accounts (instances, s).
+    """
+
+    residual: Float[Array, " unknowns"]
+    size: Float[Array, ""]
+    at: Stations
+    power: list[Float[Array, "_ s"]]
+
+
+def collect(group: Group, loads: Float[Array, "n s k *rest"]) -> Float[Array, "bodies s *rest"]:
+    """Sum of the loads of all instances by body; those on the ground fall away."""
+    if group.source == "mass":
+        return loads[:, :, 0]
+    by_place = jnp.moveaxis(loads, 2, 1)
+    return group.acting.collect(by_place.reshape(-1, *by_place.shape[2:]))
+
+
 def no_multipliers(group: Group, tableau: Tableau, dtype) -> Array:
     """Multipliers of a group that has none."""
     return jnp.zeros((group.count, tableau.stages, group.effect.multipliers), dtype)

@@ -7,6 +7,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from natcoord_jax.assembly.collection import Collection
 from natcoord_jax.assembly.tree import Tree
 from natcoord_jax.core.coordinate import Coordinate
 from natcoord_jax.core.effect import Effect
@@ -27,6 +28,7 @@ class Group(eqx.Module):
         coordinates: joint coordinates in the state.
         rotors: stored rates in the state.
         works: entries of the work account.
+        acting: how bodies collect what acts on them.
         count: number of instances.
         names: of the instances.
         in_tree: joints of the spanning tree, whose multipliers are not needed.
@@ -41,6 +43,7 @@ class Group(eqx.Module):
     coordinates: Int[Array | np.ndarray, "n c"]
     rotors: Int[Array | np.ndarray, "n r"]
     works: Int[Array | np.ndarray, "n w"]
+    acting: Collection
     count: int = eqx.field(static=True)
     names: tuple[str, ...] = eqx.field(static=True)
     source: str = eqx.field(static=True)
@@ -60,18 +63,25 @@ class CoordinateGroup(eqx.Module):
     index: Int[Array | np.ndarray, " n"]
 
 
+class Seats(eqx.Module):
+    """Nodes and parents of the instances of a group, whose blocks they collect."""
+
+    nodes: Collection
+    parents: Collection
+
+
 class Elimination(eqx.Module):
-    """Order of recursive elimination and places of the multipliers in the nodes of the tree.
+    """Places in the nodes of the tree for recursive elimination.
 
     Attributes:
-        schedule: nodes row by row, leaves first (see `linsolve.tree`).
         slots: multipliers of each node, padded with their total number.
-        offsets: first slot of each instance, by group (effects, then joints); one array a group.
+        places: of each multiplier, in the flattened slots.
+        seats: of the instances of each group (effects, then joints).
     """
 
-    schedule: Int[Array | np.ndarray, "rows lanes"]
     slots: Int[Array | np.ndarray, "bodies m"]
-    offsets: tuple[Int[Array | np.ndarray, " _"], ...]
+    places: Int[Array | np.ndarray, " multipliers"]
+    seats: tuple[Seats, ...]
 
 
 @dataclass(frozen=True)
@@ -122,6 +132,7 @@ class System(eqx.Module):
         joints: constraint groups of all joints; a group is in the tree or closes loops, never both.
         effects: all other groups.
         coordinates: joint coordinates.
+        coordinate_order: place of each coordinate among those of all groups, one group after the other.
         elimination: order of recursive elimination, only where it is the solver.
         structure: what is static.
     """
@@ -133,6 +144,7 @@ class System(eqx.Module):
     joints: tuple[Group, ...]
     effects: tuple[Group, ...]
     coordinates: tuple[CoordinateGroup, ...]
+    coordinate_order: Int[Array | np.ndarray, " coordinates"]
     elimination: Elimination | None
     structure: Structure = eqx.field(static=True)
 

@@ -5,26 +5,66 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-UNROLLED = 12
-"""Largest size for elimination without pivoting, written out: nine fused rank-one updates cost less than a
-call of LAPACK and run in lanes when batched. Only for matrices close to positive definite."""
+LOOPED = 48
+"""Largest size for elimination written as a loop of rank-one updates, which compiles into one kernel and runs
+in lanes when batched; a call of LAPACK does neither, but wins for large matrices."""
 
 
 def definite_inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """Inverse of a matrix whose symmetric part is positive definite (no pivoting needed when small)."""
+    """Inverse of a matrix whose symmetric part is positive definite, or of a quasi-definite one."""
     size = matrix.shape[-1]
-    if size > UNROLLED:
+    if size > LOOPED:
         return jnp.linalg.inv(matrix)
+    number = jnp.arange(size)
+
+    def eliminate(k: Array, matrix: Array) -> Array:
+        row, column = matrix[k], matrix[:, k]
+        pivot = 1.0 / row[k]
+        on = number == k
+        scaled = jnp.where(on, pivot, row * pivot)
+        kept = jnp.where(on[None, :], 0.0, matrix)
+        return jnp.where(on[:, None], scaled[None, :], kept - column[:, None] * scaled[None, :])
+
+    return jax.lax.fori_loop(0, size, eliminate, matrix)
+
+
+def pivoted_inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """Inverse of any regular matrix, by elimination with row pivoting."""
+    size = matrix.shape[-1]
+    if size > LOOPED:
+        return jnp.linalg.inv(matrix)
+    number = jnp.arange(size)
+
+    def eliminate(k: Array, both: Array) -> Array:
+        column = jnp.where(number < k, 0.0, jnp.abs(both[:, k]))
+        best = jnp.argmax(column)
+        mine, other = both[k], both[best]
+        row = other / other[k]
+        both = jnp.where((number == best)[:, None], mine[None, :], both)
+        column = jnp.where(number == k, 0.0, both[:, k])
+        return jnp.where((number == k)[:, None], row[None, :], both - column[:, None] * row[None, :])
+
     unit = jnp.eye(size, dtype=matrix.dtype)
-    for k in range(size):
-        pivot = 1.0 / matrix[k, k]
-        row, column = matrix[k] * pivot, matrix[:, k]
-        eliminated = matrix - column[:, None] * row
-        on_row, on_column = unit[k][:, None], unit[k][None, :]
-        beside = jnp.where(on_column > 0, -column[:, None] * pivot, eliminated)
-        replaced = jnp.where(on_row > 0, row[None, :], beside)
-        matrix = jnp.where((on_row > 0) & (on_column > 0), pivot, replaced)
-    return matrix
+    return jax.lax.fori_loop(0, size, eliminate, jnp.concatenate([matrix, unit], axis=1))[:, size:]
+
+
+def bordered_inverse(matrix: Float[Array, "n n"], visible: int) -> Float[Array, "n n"]:
+    """Inverse of [[A, -B^T], [C, E]] with a positive definite A, or one that the constraints make definite.
+
+    Constraint rows, scaled, are first added to the balances: A + s C^T C is definite even for a body without
+    inertia about an axis along which C holds it. E is zero, or one on the diagonal of unused rows.
+    """
+    size = matrix.shape[-1]
+    if size == visible:
+        return definite_inverse(matrix)
+    inertia, rows = matrix[:visible, :visible], matrix[visible:, :visible]
+    most = jnp.sum(rows**2)
+    scale = jnp.trace(inertia) / jnp.where(most > 0, most, 1.0)
+    mix = scale * rows.T
+    added = jnp.sum(mix[:, :, None] * matrix[None, visible:, :], axis=1)
+    inverse = definite_inverse(jnp.concatenate([matrix[:visible] + added, matrix[visible:]]))
+    spread = jnp.sum(inverse[:, :visible, None] * mix[None, :, :], axis=1)
+    return jnp.concatenate([inverse[:, :visible], inverse[:, visible:] + spread], axis=1)
 
 
 def saddle_inverse(matrix: Float[Array, "n n"], definite: int) -> Float[Array, "n n"]:
@@ -46,7 +86,7 @@ def saddle_inverse(matrix: Float[Array, "n n"], definite: int) -> Float[Array, "
     scale = jnp.max(coupling**2 / jnp.where(stiffness > 0, stiffness, 1.0), axis=1)
     shift = 1e-10 * jnp.maximum(jnp.max(scale), jnp.finfo(matrix.dtype).tiny)
     diagonal = jnp.concatenate([jnp.zeros(definite, matrix.dtype), jnp.full(size - definite, shift)])
-    return jnp.linalg.inv(matrix + jnp.diag(diagonal))
+    return pivoted_inverse(matrix + jnp.diag(diagonal))
 
 
 def apply(inverse: Float[Array, "n n"], right: Float[Array, " n"]) -> Float[Array, " n"]:

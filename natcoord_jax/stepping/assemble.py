@@ -17,7 +17,7 @@ from natcoord_jax.core.results import REASONS, Result, SimulationError
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.rotations import orthonormalise
 from natcoord_jax.stepping.factorise import dense_differentiable
-from natcoord_jax.stepping.newton import cold, newton
+from natcoord_jax.stepping.newton import newton
 
 TOLERANCE = 1e-14
 """Accuracy of the projection relative to the extent of the system."""
@@ -26,9 +26,7 @@ TOLERANCE = 1e-14
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _solve(make: Any, system: System, state: State) -> tuple[Array, Array]:
     """Unknowns and result code of a projection, differentiated implicitly."""
-    equations = make(system, state)
-    solution = newton(equations, TOLERANCE, "full", cold(equations, "full"))
-    return solution.y, solution.code
+    return newton(make(system, state), TOLERANCE, "full")
 
 
 @_solve.defjvp

@@ -37,7 +37,7 @@ class _TreeLayout(eqx.Module):
     """The part of the equations that knows where unknowns sit; numbers of the step are left out."""
 
     slots: Array
-    count: int = eqx.field(static=True)
+    places: Array
     width: int = eqx.field(static=True)
 
     def nodes(self, y: Array) -> Array:
@@ -49,19 +49,19 @@ class _TreeLayout(eqx.Module):
 
     def flat(self, nodes: Array) -> Array:
         """The inverse of `nodes`."""
-        multipliers = jnp.zeros(self.count + 1, nodes.dtype).at[self.slots].add(nodes[:, self.width :])
-        return jnp.concatenate([nodes[:, : self.width].reshape(-1), multipliers[:-1]])
+        multipliers = nodes[:, self.width :].reshape(-1)[self.places]
+        return jnp.concatenate([nodes[:, : self.width].reshape(-1), multipliers])
 
 
 def _tree_layout(equations: Any) -> _TreeLayout:
-    count = equations.unknowns - equations.balances
-    return _TreeLayout(equations.system.elimination.slots, count, 6 * equations.tableau.stages)
+    elimination = equations.system.elimination
+    return _TreeLayout(elimination.slots, elimination.places, 6 * equations.tableau.stages)
 
 
 def _tree_blocks(equations: Any, blocks: tuple) -> TreeBlocks:
     system = equations.system
     diagonal, up, down = blocks
-    return TreeBlocks(diagonal, up, down, system.tree.parent, system.elimination.schedule)
+    return TreeBlocks(diagonal, up, down, system.tree.parent)
 
 
 def _recursive(equations: Any, blocks: tuple) -> tuple[_ByNode, Array]:

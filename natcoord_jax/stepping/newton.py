@@ -1,17 +1,20 @@
-"""Newton's iteration to the round-off floor, in while loops.
+"""Newton's iteration to the round-off floor, one evaluation of the equations at a time.
 
-One factorisation serves, over many steps, as long as the corrections shrink quickly; then the Jacobian is
-formed anew. Rates along body axes make it change little. The loop that forms Jacobians makes no trip in the
-usual case, which costs nothing; under vmap all lanes form theirs together when one needs to.
+One factorisation serves, over many steps, as long as the corrections shrink quickly; rates along body axes
+make the Jacobian change little. Otherwise it is formed anew: from formulas where these are local, else by
+differences, one evaluation a column. Differences are exact to a few parts in 10^6, which is all that an
+iteration needs that is carried to the floor anyway; and a second, larger program for the exact Jacobian would
+take longer to compile than everything else. (Derivatives of trajectories use the exact one.)
+
+All lanes of a vmap are judged together: they form Jacobians when one needs to, and end a step when all can.
 """
 
-from functools import partial
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from natcoord_jax.core.results import Result
 from natcoord_jax.stepping.factorise import FACTORISATIONS
@@ -25,11 +28,11 @@ STALL = 1e4
 STALL_OLD = 20.0
 """The same with factors of an earlier step, where a stall may be the factors' fault."""
 
-CHORD_ITERATIONS = 10
+CHORD_ITERATIONS = 14
 """Corrections with one factorisation."""
 
 NEWTON_ROUNDS = 25
-"""Factorisations of exact Jacobians."""
+"""Factorisations in one step."""
 
 SLOWEST_UNSEEN = 0.02
 """Contraction assumed at least: a slow part of the error may hide behind fast ones in the first ratio."""
@@ -39,8 +42,8 @@ PATIENCE = 6
 
 
 @jax.custom_batching.custom_vmap
-def any_lane(x: Bool[Array, ""]) -> Bool[Array, ""]:
-    """Whether it holds in any lane of a vmap: keeps the condition of a loop the same for all lanes.
+def any_lane(x: Shaped[Array, ""]) -> Shaped[Array, ""]:
+    """Whether it holds in any lane of a vmap, or the largest number: the same for all lanes.
 
     A loop whose condition differs between lanes would copy all that it carries, in every trip.
     """
@@ -49,142 +52,177 @@ def any_lane(x: Bool[Array, ""]) -> Bool[Array, ""]:
 
 @any_lane.def_vmap
 def _any_lane_rule(axis_size: int, in_batched: list[bool], x: Array) -> tuple[Array, bool]:
-    return any_lane(jnp.any(x, axis=0)), False
+    return any_lane(jnp.max(x, axis=0)), False
 
 
-class Solution(eqx.Module):
-    """Outcome of the iteration.
-
-    Attributes:
-        y: unknowns.
-        code: result code.
-        iterations: evaluations of the residual.
-        error: size of the last correction relative to the terms of the equations.
-        worst: unknown with the largest last correction.
-        warm: the start of the next step.
-    """
-
-    y: Float[Array, " unknowns"]
-    code: Int[Array, ""]
-    iterations: Int[Array, ""]
-    error: Float[Array, ""]
-    worst: Int[Array, ""]
-    warm: Any
-
-
-class _Iterate(eqx.Module):
-    y: Array
-    worst: Array
-    correction: Array
-    size: Array
-    count: Array
-    total: Array
-    converged: Array
-    slow: Array
-    finite: Array
-
-
-def _iterate(
-    equations: Any, factors: Any, inertias: Array, tolerance: Any, floor: Any, it: _Iterate
-) -> _Iterate:
-    """One correction with given factors; a correction that shrinks too slowly is not applied."""
-    residual, size = equations.residual(it.y)
-    change = factors.solve(residual)
-    correction = jnp.sqrt(jnp.sum(inertias * change**2))
-    ratio = correction / jnp.where(it.correction > 0, it.correction, 1.0)
-    first = it.count == 0
-    trusted = jnp.maximum(ratio, SLOWEST_UNSEEN)
-    predicted = correction * jnp.where(first, 1.0, trusted / jnp.maximum(1.0 - trusted, 1e-3))
-    small = predicted <= tolerance * size
-    stalled = ~first & (ratio > 0.5) & (correction <= floor * tolerance * size)
-    finite = jnp.isfinite(correction) & jnp.isfinite(size)
-    converged = (small | stalled) & finite
-    slow = ~first & ~converged & ((ratio > 0.5) | (correction * ratio**PATIENCE > tolerance * size))
-    y = jnp.where(finite & ~slow, it.y - change, it.y)
-    worst = jnp.argmax(inertias * change**2)
-    return _Iterate(y, worst, correction, size, it.count + 1, it.total + 1, converged, slow, finite)
-
-
-def _chord(
-    equations: Any, factors: Any, inertias: Array, tolerance: Any, floor: Any, start: _Iterate
-) -> _Iterate:
-    """Corrections with one factorisation until they converge or shrink too slowly."""
-
-    def go_on(it: _Iterate) -> Array:
-        return ~it.converged & ~it.slow & it.finite & (it.count < CHORD_ITERATIONS)
-
-    again = (jnp.array(0), jnp.zeros_like(start.correction), start.converged)
-    restart = eqx.tree_at(lambda it: (it.count, it.correction, it.slow), start, again)
-    correct = partial(_iterate, equations, factors, inertias, tolerance, floor)
-    return jax.lax.while_loop(go_on, correct, restart)
-
-
-class Warm(eqx.Module):
-    """What one step leaves to the next: where to start, and factors that may still serve.
+class Factors(eqx.Module):
+    """Factors of a Jacobian.
 
     Attributes:
-        y: guess of the unknowns.
-        factors: factors of an earlier Jacobian.
-        inertias: inertias of the unknowns that came with them.
-        valid: whether the factors are any good.
+        solver: `solve(right)` applies them.
+        inertias: inertias of the unknowns, 0 for multipliers.
+        usable: whether there are any.
+        fresh: whether they belong to the step that is being solved.
     """
 
-    y: Float[Array, " unknowns"]
-    factors: Any
+    solver: Any
     inertias: Float[Array, " unknowns"]
-    valid: Bool[Array, ""]
+    usable: Bool[Array, ""]
+    fresh: Bool[Array, ""]
 
 
-def cold(equations: Any, form: str) -> Warm:
-    """A start without factors."""
+class Iterate(eqx.Module):
+    """Where the iteration of one step stands.
+
+    Attributes:
+        start: unknowns that it began with.
+        y: unknowns to be evaluated next.
+        worst: unknown with the largest last correction.
+        correction: size of the last correction (energy norm); 0 before the first with these factors.
+        error: that size relative to the terms of the equations.
+        count: corrections with these factors.
+        total: all corrections.
+        rounds: factorisations in this step.
+        last: whether the next evaluation is expected to be at the solution.
+        converged: whether the step is solved.
+        wanting: whether it cannot go on without new factors.
+        finite: whether all numbers are.
+    """
+
+    start: Float[Array, " unknowns"]
+    y: Float[Array, " unknowns"]
+    worst: Int[Array, ""]
+    correction: Float[Array, ""]
+    error: Float[Array, ""]
+    count: Int[Array, ""]
+    total: Int[Array, ""]
+    rounds: Int[Array, ""]
+    last: Bool[Array, ""]
+    converged: Bool[Array, ""]
+    wanting: Bool[Array, ""]
+    finite: Bool[Array, ""]
+
+    @property
+    def unsolved(self) -> Bool[Array, ""]:
+        """Whether to go on."""
+        exhausted = self.wanting & (self.rounds >= NEWTON_ROUNDS)
+        return ~self.converged & self.finite & ~exhausted
+
+    @property
+    def code(self) -> Int[Array, ""]:
+        """Result code: successful, max_iterations or nonfinite, never an exception."""
+        failed = jnp.where(self.finite, int(Result.MAX_ITERATIONS), int(Result.NONFINITE))
+        return jnp.where(self.converged, int(Result.SUCCESSFUL), failed)
+
+
+def begin(y: Float[Array, " unknowns"]) -> Iterate:
+    """The iteration before its first evaluation."""
+    zero, no, nought = jnp.zeros((), y.dtype), jnp.array(False), jnp.array(0)
+    return Iterate(y, y, nought, zero, zero, nought, nought, nought, no, no, no, jnp.array(True))
+
+
+def no_factors(equations: Any, form: str) -> Factors:
+    """The shapes of factors, and none usable."""
     y = equations.guess()
     shapes = jax.eval_shape(lambda y: FACTORISATIONS[form](equations, equations.jacobian(y)), y)
-    factors, inertias = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-    return Warm(y, factors, inertias, jnp.array(False))
+    solver, inertias = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+    return Factors(solver, inertias, jnp.array(False), jnp.array(False))
 
 
-def newton(equations: Any, tolerance: Float[Array, ""] | float, form: str, warm: Warm) -> Solution:
-    """Solve the equations of one step.
+def factors_of(equations: Any, form: str, matrix: Any) -> Factors:
+    """Factors of a Jacobian."""
+    solver, inertias = FACTORISATIONS[form](equations, matrix)
+    return Factors(solver, inertias, jnp.array(True), jnp.array(True))
+
+
+def refreshed(it: Iterate) -> Iterate:
+    """The iteration with new factors."""
+    zero, nought, no = jnp.zeros_like(it.correction), jnp.zeros_like(it.count), jnp.zeros_like(it.last)
+    return eqx.tree_at(
+        lambda x: (x.correction, x.count, x.rounds, x.last, x.wanting),
+        it,
+        (jnp.where(it.converged, it.correction, zero), nought, it.rounds + 1, no, no),
+    )
+
+
+def judge(factors: Factors, tolerance: Any, it: Iterate, residual: Array, size: Array) -> Iterate:
+    """What follows from one evaluation of the equations at `it.y`.
 
     Args:
-        equations: a prepared step (`residual`, `guess`, `jacobian`).
+        factors: at hand.
         tolerance: see `TOLERANCE`.
-        form: form of the equations, which decides the factorisation.
-        warm: where to start.
+        it: where the iteration stands.
+        residual: of the equations.
+        size: of their terms.
 
     Returns:
-        The solution; its code is successful, max_iterations or nonfinite, never an exception.
+        Converged; or moved by one correction; or in want of new factors, when corrections shrink too slowly
+        (then not moved).
     """
-    zero, no, nought = jnp.zeros((), warm.y.dtype), jnp.array(False), jnp.array(0)
-    start = _Iterate(warm.y, nought, zero, zero, nought, nought, no, no, jnp.array(True))
+    change = factors.solver.solve(residual)
+    energies = factors.inertias * change**2
+    correction = jnp.sqrt(jnp.sum(energies))
+    first = it.count == 0
+    ratio = correction / jnp.where(it.correction > 0, it.correction, 1.0)
+    trusted = jnp.maximum(ratio, SLOWEST_UNSEEN)
+    predicted = correction * jnp.where(first, 1.0, trusted / jnp.maximum(1.0 - trusted, 1e-3))
+    floor = jnp.where(factors.fresh, STALL, STALL_OLD) * tolerance * size
+    finite = jnp.isfinite(correction) & jnp.isfinite(size)
+    stalled = ~first & (ratio > 0.5) & (correction <= floor)
+    solved = (
+        (correction <= tolerance * size) | stalled | (it.last & (correction <= STALL_OLD * tolerance * size))
+    )
+    slow = ~first & ((ratio > 0.5) | (correction * ratio**PATIENCE > tolerance * size))
+    slow = slow | (it.count >= CHORD_ITERATIONS) | ~factors.usable
+    # Old factors may have led astray: new ones begin where the first did.
+    lost = ~finite & ~factors.fresh
+    solved, slow = solved & finite & factors.usable, (slow & finite) | lost
+    y = jnp.where(solved | slow | ~finite, it.y, it.y - change)
+    following = Iterate(
+        it.start,
+        jnp.where(lost, it.start, y),
+        jnp.argmax(energies) if energies.shape[0] else it.worst,
+        correction,
+        correction / jnp.where(size > 0, size, 1.0),
+        it.count + 1,
+        it.total + ~solved,
+        it.rounds,
+        predicted <= tolerance * size,
+        solved,
+        slow & ~solved,
+        finite | lost,
+    )
+    # Lanes that are done, or that wait for factors, stay as they are.
+    done = it.converged | it.wanting | ~it.finite
+    return jax.tree.map(lambda old, new: jnp.where(done, old, new), it, following)
 
-    def fresh(it: _Iterate, factors: Any, inertias: Array) -> tuple[Any, Array]:
-        return FACTORISATIONS[form](equations, equations.jacobian(it.y))
 
-    def kept(it: _Iterate, factors: Any, inertias: Array) -> tuple[Any, Array]:
-        return factors, inertias
+def newton(equations: Any, tolerance: float, form: str) -> tuple[Float[Array, " unknowns"], Int[Array, ""]]:
+    """Solve equations from their own guess, with their Jacobian formed anew whenever it is needed.
 
-    def round_of_corrections(carry: tuple) -> tuple:
-        it, factors, inertias, rounds = carry
-        needed = any_lane(~it.converged & ((rounds > 0) | ~warm.valid))
-        factors, inertias = jax.lax.cond(needed, fresh, kept, it, factors, inertias)
-        floor = jnp.where(needed, STALL, STALL_OLD)
-        after = _chord(equations, factors, inertias, tolerance, floor, it)
-        lost = ~after.finite & (rounds == 0) & ~needed
-        after = eqx.tree_at(
-            lambda x: (x.y, x.finite), after, (jnp.where(lost, warm.y, after.y), after.finite | lost)
-        )
-        return after, factors, inertias, rounds + 1
+    Args:
+        equations: with `guess`, `residual` and `jacobian`.
+        tolerance: see `TOLERANCE`.
+        form: form of the equations, which decides the factorisation.
 
-    def unsolved(carry: tuple) -> Array:
-        it, _, _, rounds = carry
-        return any_lane(~it.converged & it.finite) & (rounds < NEWTON_ROUNDS)
+    Returns:
+        The unknowns and the result code.
+    """
+
+    def renew(it: Iterate, factors: Factors) -> tuple[Iterate, Factors]:
+        return refreshed(it), factors_of(equations, form, equations.jacobian(it.y))
+
+    def keep(it: Iterate, factors: Factors) -> tuple[Iterate, Factors]:
+        return it, factors
+
+    def trip(carry: tuple[Iterate, Factors]) -> tuple[Iterate, Factors]:
+        it, factors = jax.lax.cond(any_lane(carry[0].wanting), renew, keep, *carry)
+        return judge(factors, tolerance, it, *equations.residual(it.y)), factors
 
     with jax.named_scope("newton"):
-        carry = (start, warm.factors, warm.inertias, nought)
-        it, factors, inertias, _ = jax.lax.while_loop(unsolved, round_of_corrections, carry)
-    failed = jnp.where(it.finite, int(Result.MAX_ITERATIONS), int(Result.NONFINITE))
-    code = jnp.where(it.converged, int(Result.SUCCESSFUL), failed)
-    error = it.correction / jnp.where(it.size > 0, it.size, 1.0)
-    left = Warm(it.y, factors, inertias, it.converged)
-    return Solution(it.y, code, it.total, error, it.worst, left)
+        start = begin(equations.guess())
+        start = eqx.tree_at(lambda it: it.wanting, start, jnp.array(True))
+        it, _ = jax.lax.while_loop(
+            lambda c: any_lane(c[0].unsolved), trip, (start, no_factors(equations, form))
+        )
+    return it.y, it.code

@@ -22,16 +22,30 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
+from natcoord_jax.assembly.equations import prepare
 from natcoord_jax.assembly.system import System
 from natcoord_jax.core.results import Result
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import gauss
-from natcoord_jax.stepping.newton import Warm, any_lane
-from natcoord_jax.stepping.step import advance, linear_solver, solve, start_cold
+from natcoord_jax.stepping.newton import (
+    Factors,
+    Iterate,
+    any_lane,
+    begin,
+    factors_of,
+    judge,
+    no_factors,
+    refreshed,
+)
+from natcoord_jax.stepping.one_kernel import as_one_kernel, in_groups
+from natcoord_jax.stepping.step import advance, end_of_step, linear_solver
 
 SMALLEST_FRACTION = 1.0 / 64
 """A step is given up when a substep of this fraction of it fails."""
 
+
+BY_DIFFERENCES = ("reduced",)
+"""Forms whose Jacobian is formed by differences; others have formulas for it."""
 
 CHUNK = 32
 """Slots whose Jacobians are formed together."""
@@ -81,16 +95,57 @@ class Slots(eqx.Module):
     finished: Int[Array, "*slots"]
 
 
+class Past(eqx.Module):
+    """Solutions of the last steps, as backward differences, from which the next is guessed.
+
+    The sum of the differences up to an order extrapolates by a polynomial of that order; what it misses is
+    the next difference.
+
+    Attributes:
+        differences: of order 0 (the last solution), 1, ...
+        known: how many of them there are.
+        order: of the polynomial that would have guessed the last solution best.
+    """
+
+    differences: tuple[Float[Array, " unknowns"], ...]
+    known: Int[Array, ""]
+    order: Int[Array, ""]
+
+    @classmethod
+    def of(cls, y: Float[Array, " unknowns"]) -> "Past":
+        """One solution."""
+        rest = (jnp.zeros_like(y),) * ORDER
+        return cls((y, *rest), jnp.array(1), jnp.array(0))
+
+    @property
+    def guess(self) -> Float[Array, " unknowns"]:
+        """Extrapolated by the polynomial that was best last time."""
+        terms = [jnp.where(k <= self.order, d, 0.0) for k, d in enumerate(self.differences)]
+        return sum(terms[1:], terms[0])
+
+    def followed_by(self, y: Float[Array, " unknowns"], inertias: Float[Array, " unknowns"]) -> "Past":
+        """The past after a step with the solution `y`."""
+        found = [y]
+        for difference in self.differences:
+            found.append(found[-1] - difference)
+        errors = jnp.stack([jnp.sum(inertias * d**2) for d in found[1:]])
+        errors = jnp.where(jnp.arange(ORDER + 1) < self.known, errors, jnp.inf)
+        return Past(tuple(found[:-1]), jnp.minimum(self.known + 1, ORDER + 1), jnp.argmin(errors))
+
+
+ORDER = 3
+"""Largest order of the polynomials that guess the next solution."""
+
+
 class Course(eqx.Module):
     """Where a rollout stands: carried from slot to slot.
 
-    `worst` is the unknown with the largest correction in the attempt that ended the run, -1 without one;
-    `warm` is what the last step left to the next, `before` the unknowns of the last accepted step.
+    `worst` is the unknown with the largest correction in the attempt that ended the run, -1 without one.
     """
 
     state: State
-    warm: Warm
-    before: Float[Array, " unknowns"]
+    it: Iterate
+    past: Past
     step: Int[Array, ""]
     done: Float[Array, ""]
     fraction: Float[Array, ""]
@@ -103,64 +158,174 @@ class Course(eqx.Module):
     residual: Float[Array, ""]
 
 
-def _start(plan: Plan, system: System, state: State, parameters: Any, dt: Float[Array, ""]) -> Course:
-    u = plan.control(parameters, jnp.array(0), state.t, state)
-    warm = start_cold(system, state, u, dt, gauss(plan.stages))
-    zero = jnp.array(0)
+class Probe(eqx.Module):
+    """A Jacobian in the making, by differences; the same in all lanes but for its numbers.
+
+    Attributes:
+        at: -1: none in the making; 0: the residual itself is evaluated; k: column k.
+        residual: at the unknowns.
+        columns: found so far, one a row; what is evaluated at other times goes to the last row.
+    """
+
+    at: Int[Array, ""]
+    residual: Float[Array, " unknowns"]
+    columns: Float[Array, "rows unknowns"]
+
+    @classmethod
+    def first(cls, size: int, dtype: Any) -> "Probe":
+        """Before the first Jacobian."""
+        return cls(jnp.array(0), jnp.zeros(size, dtype), jnp.zeros((size + 1, size), dtype))
+
+    def moved(self, y: Float[Array, " unknowns"], equations: Any) -> Float[Array, " unknowns"]:
+        """Where the equations are evaluated next."""
+        return y + jnp.where(jnp.arange(y.shape[0]) == self.at - 1, equations.probes(), 0.0)
+
+    def with_column(
+        self, residual: Float[Array, " unknowns"], equations: Any, wanting: Bool[Array, ""]
+    ) -> tuple["Probe", Bool[Array, ""]]:
+        """After an evaluation: the next state, and whether the Jacobian is complete.
+
+        Args:
+            residual: found.
+            equations: of the step.
+            wanting: whether a Jacobian is wanted; never while one is in the making.
+        """
+        size = residual.shape[0]
+        base = jnp.where(self.at == 0, residual, self.residual)
+        steps = jnp.append(equations.probes(), 1.0)
+        row = jnp.where(self.at > 0, self.at - 1, size)
+        quotient = (residual - base) / steps[row]
+        columns = jax.lax.dynamic_update_index_in_dim(self.columns, quotient, row, 0)
+        complete = self.at == size
+        further = jnp.where((self.at >= 0) & ~complete, self.at + 1, -1)
+        return Probe(jnp.where(wanting, 0, further), base, columns), complete
+
+
+class Setting(eqx.Module):
+    """What stays the same over a rollout."""
+
+    system: System
+    parameters: Any
+    dt: Float[Array, ""]
+    plan: Plan = eqx.field(static=True)
+
+    def over(self, course: Course) -> Bool[Array, ""]:
+        """Whether the rollout has ended."""
+        return course.stopped | (course.step >= self.plan.steps)
+
+    def situation(self, course: Course) -> tuple[Array, Array, Array]:
+        """Inputs, length and number of the (sub)step at hand."""
+        h = jnp.where(self.over(course), 1e-3, course.fraction * self.dt)
+        index = jnp.minimum(course.step, self.plan.steps - 1)
+        return self.plan.control(self.parameters, index, course.state.t, course.state), h, index
+
+    def equations(self, course: Course) -> Any:
+        """The equations of the (sub)step at hand."""
+        u, h, _ = self.situation(course)
+        return prepare(self.system, course.state, u, h, gauss(self.plan.stages))
+
+    @property
+    def form(self) -> str:
+        """Form of the equations."""
+        return self.system.structure.solver
+
+
+def _start(setting: Setting, state: State) -> tuple[Course, Factors]:
+    dt, plan = setting.dt, setting.plan
+    u = plan.control(setting.parameters, jnp.array(0), state.t, state)
+    equations = prepare(setting.system, state, u, dt, gauss(plan.stages))
+    it, factors = begin(equations.guess()), no_factors(equations, setting.form)
+    zero, nought = jnp.array(0), jnp.zeros((), state.q.dtype)
     bad = ~(jnp.isfinite(dt) & (dt > 0))
     code = jnp.where(bad, int(Result.BAD_STEP), int(Result.SUCCESSFUL))
-    nought = jnp.zeros((), state.q.dtype)
-    return Course(
-        state, warm, warm.y, zero, nought, nought + 1.0, code, bad, zero - 1, zero, zero, zero, nought
+    course = Course(
+        state, it, Past.of(it.y), zero, nought, nought + 1.0, code, bad, zero - 1, zero, zero, zero, nought
     )
+    return course, factors
 
 
-def _slot(plan: Plan, system: System, parameters: Any, dt: Array, course: Course) -> tuple[Course, Slots]:
-    """One attempt at one (sub)step."""
-    tableau = gauss(plan.stages)
-    state, idle = course.state, course.stopped | (course.step >= plan.steps)
-    h = course.fraction * dt
-    h = jnp.where(idle, jnp.ones_like(h) * 1e-3, h)
-    index = jnp.minimum(course.step, plan.steps - 1)
-    u = plan.control(parameters, index, state.t, state)
-    solution = solve(system, state, u, h, tableau, plan.tolerance, course.warm)
-    _, new, half_turn = advance(system, state, u, h, solution.y, tableau)
+def _end(setting: Setting, course: Course, inertias: Array, found: tuple[State, Array]) -> Course:
+    """The end of an attempt: the new state, or the same with half the substep."""
+    plan, state, it, over = setting.plan, course.state, course.it, setting.over(course)
+    new, half_turn = found
     finite = jnp.all(jnp.isfinite(new.q)) & jnp.all(jnp.isfinite(new.v))
-    code = jnp.where((solution.code == 0) & ~finite, int(Result.NONFINITE), solution.code)
+    code = jnp.where((it.code == 0) & ~finite, int(Result.NONFINITE), it.code)
     code = jnp.where((code == 0) & (half_turn > LARGEST_HALF_TURN), int(Result.DIVERGED), code)
-    accepted = (code == int(Result.SUCCESSFUL)) & ~idle
+    accepted = (code == int(Result.SUCCESSFUL)) & ~over
     new = jax.tree.map(partial(jnp.where, accepted), new, state)
     done = course.done + jnp.where(accepted, course.fraction, 0.0)
     complete = accepted & (done > 1.0 - 1e-9)
     halved = 0.5 * course.fraction
-    hopeless = ~accepted & ~idle & (halved < SMALLEST_FRACTION)
+    hopeless = ~accepted & ~over & (halved < SMALLEST_FRACTION)
     stopped = course.stopped | hopeless
     result = jnp.where(hopeless, code, course.code)
     if plan.event is not None:
         crossed = accepted & (plan.event(state) * plan.event(new) <= 0) & (plan.event(state) != 0)
         stopped, result = stopped | crossed, jnp.where(crossed, int(Result.EVENT), result)
-    fraction = jnp.where(complete, 1.0, jnp.where(accepted | idle, course.fraction, halved))
-    done = jnp.where(complete, 0.0, done)
-    worked = jnp.where(idle, 0, solution.iterations)
-    ahead = jnp.where(accepted, 2 * solution.y - course.before, course.warm.y)
-    sane = jnp.where(jnp.all(jnp.isfinite(ahead)), ahead, course.before)
-    following = Course(
+    fraction = jnp.where(complete, 1.0, jnp.where(accepted | over, course.fraction, halved))
+    worked = jnp.where(over, 0, it.total)
+    # Guesses hold for steps of one length: another length begins anew from the last solution.
+    alone = Past(course.past.differences, jnp.ones_like(course.past.known), jnp.zeros_like(course.past.order))
+    past = jax.tree.map(partial(jnp.where, accepted), course.past.followed_by(it.y, inertias), alone)
+    same = fraction == course.fraction
+    past = Past(past.differences, jnp.where(same, past.known, 1), jnp.where(same, past.order, 0))
+    guess = jnp.where(jnp.all(jnp.isfinite(past.guess)), past.guess, it.start)
+    return Course(
         new,
-        eqx.tree_at(lambda w: (w.y, w.valid), solution.warm, (sane, accepted & solution.warm.valid)),
-        jnp.where(accepted, solution.y, course.before),
+        begin(guess),
+        past,
         course.step + complete,
-        done,
+        jnp.where(complete, 0.0, done),
         fraction,
         result,
         stopped,
-        jnp.where(hopeless, solution.worst, course.worst),
+        jnp.where(hopeless, it.worst, course.worst),
         course.taken + accepted,
         course.iterations + worked,
         jnp.maximum(course.iterations_max, worked),
-        jnp.where(accepted, jnp.maximum(course.residual, solution.error), course.residual),
+        jnp.where(accepted, jnp.maximum(course.residual, it.error), course.residual),
     )
-    record = Slots(new, solution.y, index, course.fraction, accepted, following.step)
-    return following, record
+
+
+def _trip(setting: Setting, course: Course, factors: Factors, probe: Probe | None) -> tuple:
+    """One evaluation of the equations, and what follows from it.
+
+    Returns:
+        Where the rollout stands, its factors, the Jacobian in the making, the record of the slot, and whether
+        the slot is complete: else the record is void.
+    """
+    plan, it, over = setting.plan, course.it, setting.over(course)
+    u, h, index = setting.situation(course)
+    equations = prepare(setting.system, course.state, u, h, gauss(plan.stages))
+    found = equations.evaluate(it.y if probe is None else probe.moved(it.y, equations))
+    probing = jnp.array(False) if probe is None else probe.at >= 0
+    judged = judge(factors, plan.tolerance, it, found.residual, found.size)
+    it = jax.tree.map(partial(jnp.where, probing), it, judged)
+    ending = ~probing & ~any_lane(it.unsolved & ~over)
+    wanting = ~probing & ~ending & any_lane(it.wanting & it.unsolved & ~over)
+    before = eqx.tree_at(lambda c: c.it, course, it)
+
+    def ended(course: Course) -> Course:
+        groups, tableau = equations.groups, gauss(plan.stages)
+        ends = end_of_step(setting.system, course.state, h, groups, found, tableau)
+        return _end(setting, course, factors.inertias, ends)
+
+    after = jax.lax.cond(ending, ended, lambda course: course, before)
+    accepted = after.taken > before.taken
+    record = Slots(after.state, it.y, index, course.fraction, accepted, after.step)
+    usable = jnp.where(ending, (accepted | over) & factors.usable, factors.usable)
+    factors = Factors(factors.solver, factors.inertias, usable, factors.fresh & ~ending)
+    if probe is not None:
+        probe, wanting = probe.with_column(found.residual, equations, wanting)
+
+    def renewed(carry: tuple) -> tuple:
+        _, it, _ = carry
+        matrix = equations.jacobian(it.y) if probe is None else probe.columns[:-1].T
+        return jnp.array(False), refreshed(it), factors_of(equations, setting.form, matrix)
+
+    # A loop of no or one trip leaves the factors where they are; a conditional would copy them.
+    _, it, factors = jax.lax.while_loop(lambda carry: carry[0], renewed, (wanting, after.it, factors))
+    return eqx.tree_at(lambda c: c.it, after, it), factors, probe, record, ending
 
 
 def _is_none(x: Any) -> bool:
@@ -172,49 +337,57 @@ def _without_state(course: Course) -> Course:
 
 
 def _run(plan: Plan, system: System, state: State, parameters: Any, dt: Array) -> tuple[Slots, Course]:
-    attempt = partial(_slot, plan, system, parameters, dt)
+    setting = Setting(system, parameters, dt, plan)
     length = plan.steps + plan.extra
-    start = _start(plan, system, state, parameters, dt)
     # One array instead of one for every field: fewer operations in every trip.
     packed, unpack = ravel_pytree(state)
 
-    def packed_attempt(carried: tuple[Course, Array]) -> tuple[tuple[Course, Array], tuple[Slots, Array]]:
-        course, x = carried
-        after, record = attempt(eqx.tree_at(lambda c: c.state, course, unpack(x), is_leaf=_is_none))
-        x = ravel_pytree(after.state)[0]
-        return (_without_state(after), x), (eqx.tree_at(lambda s: s.states, record, None), x)
-
-    first = (_without_state(start), packed)
-    shapes = jax.eval_shape(packed_attempt, first)[1]
-    buffer = jax.tree.map(lambda x: jnp.zeros((length, *x.shape), x.dtype), shapes)
+    def packed_trip(course: Course, factors: Factors, probe: Probe | None, x: Array) -> tuple:
+        whole = eqx.tree_at(lambda c: c.state, course, unpack(x), is_leaf=_is_none)
+        after, factors, probe, record, complete = _trip(setting, whole, factors, probe)
+        states = ravel_pytree(record.states)[0]
+        record = (eqx.tree_at(lambda s: s.states, record, None), states)
+        return (_without_state(after), factors, probe, ravel_pytree(after.state)[0]), record, complete
 
     def unfinished(carry: tuple) -> Array:
-        count, (course, _), _ = carry
+        count, (course, *_), _ = carry
         return (count < length) & any_lane(~course.stopped & (course.step < plan.steps))
 
     def body(carry: tuple) -> tuple:
         count, carried, buffer = carry
-        carried, record = packed_attempt(carried)
+        carried, record, complete = packed_trip(*carried)
+        # A void record is overwritten by the next one.
         buffer = jax.tree.map(
             lambda b, r: jax.lax.dynamic_update_index_in_dim(b, r, count, 0), buffer, record
         )
-        return count + 1, carried, buffer
+        return count + complete, carried, buffer
 
-    count, (course, x), (slots, states) = jax.lax.while_loop(unfinished, body, (jnp.array(0), first, buffer))
+    def every_slot(course: Course, factors: Factors, x: Array) -> tuple:
+        probe = Probe.first(course.it.y.shape[0], x.dtype) if setting.form in BY_DIFFERENCES else None
+        carried = (course, factors, probe, x)
+        shapes = jax.eval_shape(packed_trip, *carried)[1]
+        buffer = jax.tree.map(lambda x: jnp.zeros((length, *x.shape), x.dtype), shapes)
+        count, carried, buffer = jax.lax.while_loop(unfinished, body, (jnp.array(0), carried, buffer))
+        return count, carried[0], carried[3], buffer
+
+    course, factors = _start(setting, state)
+    found = as_one_kernel(every_slot, _without_state(course), factors, packed)
+    count, course, x, (slots, states) = found
     course = eqx.tree_at(lambda c: c.state, course, unpack(x), is_leaf=_is_none)
     slots = eqx.tree_at(lambda s: s.states, slots, jax.vmap(unpack)(states), is_leaf=_is_none)
-    unused = jnp.arange(length) >= count
+    unused = jnp.arange(length) >= any_lane(count)
 
     def fill(x: Array, last: Array | float) -> Array:
         return jnp.where(unused.reshape(-1, *(1,) * (x.ndim - 1)), last, x)
 
     slots = eqx.tree_at(
-        lambda s: (s.states, s.finished, s.fraction),
+        lambda s: (s.states, s.finished, s.fraction, s.accepted),
         slots,
         (
             jax.tree.map(fill, slots.states, course.state),
             fill(slots.finished, course.step),
             fill(slots.fraction, jnp.ones(())),
+            slots.accepted & ~unused,
         ),
     )
     short = (course.step < plan.steps) & ~course.stopped
@@ -225,7 +398,7 @@ def _run(plan: Plan, system: System, state: State, parameters: Any, dt: Array) -
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def run_slots(plan: Plan, system: System, state: State, parameters: Any, dt: Array) -> tuple[Slots, Course]:
     """All slots of a rollout and where it ended; see the module for its derivative."""
-    return _run(plan, system, state, parameters, dt)
+    return in_groups(partial(_run, plan), system, state, parameters, dt)
 
 
 def _zero_tangent(x: Array) -> Array | np.ndarray:

@@ -1,6 +1,6 @@
 """One step: solve its equations, then advance the state."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -8,26 +8,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.equations import prepare
-from natcoord_jax.assembly.response import Stations, gather, respond, situation
-from natcoord_jax.assembly.system import CoordinateGroup, System
+from natcoord_jax.assembly.response import Evaluation, Stations
+from natcoord_jax.assembly.system import CoordinateGroup, Group, System
 from natcoord_jax.core.coordinate import pair_motion
 from natcoord_jax.core.effect import Motion
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import Tableau
 from natcoord_jax.stepping.factorise import differentiable_solver
-from natcoord_jax.stepping.newton import Solution, Warm, cold, newton
-
-
-def start_cold(system: System, state: State, u: Array, h: Array, tableau: Tableau) -> Warm:
-    """Start of the first step of a rollout."""
-    return cold(prepare(system, state, u, h, tableau), system.structure.solver)
-
-
-def solve(
-    system: System, state: State, u: Array, h: Array, tableau: Tableau, tolerance: float, warm: Warm
-) -> Solution:
-    """Unknowns of one step; no derivatives pass (see `advance` and the rollout)."""
-    return newton(prepare(system, state, u, h, tableau), tolerance, system.structure.solver, warm)
 
 
 def _coordinate_rates(group: CoordinateGroup, system: System, at: Stations, h: Array) -> Float[Array, "s n"]:
@@ -49,35 +36,46 @@ def advance(
 
     Differentiable in everything. The half turn |h omega / 2| of a body is the tangent of half the angle it
     turned: it grows without bound towards half a turn a step, the pole of Cayley's rotation.
+    """
+    equations = prepare(system, state, u, h, tableau)
+    found = equations.evaluate(y)
+    after, half_turn = end_of_step(system, state, h, equations.groups, found, tableau)
+    return found.residual, after, half_turn
+
+
+def end_of_step(
+    system: System, state: State, h: Array, groups: Sequence[Group], found: Evaluation, tableau: Tableau
+) -> tuple[State, Float[Array, ""]]:
+    """State at the end of a step from its solved equations, and the largest half turn.
 
     Positions and velocities are advanced by increments (section 6 of the paper, written for stages):
     q_1 = q_0 + h sum b_i V_i and v_1 = v_0 + sum beta_i (V_i - v_0).
     """
-    equations = prepare(system, state, u, h, tableau)
-    at, multipliers = equations.end_motion(y)
+    at = found.at
     bodies = len(system.structure.bodies)
     rates = at.rates[:, :bodies].reshape(tableau.stages, 4 * bodies, 3)
     b, beta = jnp.asarray(tableau.b), jnp.asarray(tableau.beta)
     q = state.q + h * jnp.tensordot(b, rates, 1)
     v = state.v + jnp.tensordot(beta, rates - state.v, 1)
-    coordinates = state.coordinates
-    stage_rates = jnp.zeros((tableau.stages, coordinates.shape[0]), q.dtype)
-    for group in system.coordinates:
-        found = _coordinate_rates(group, system, at, h)
-        stage_rates = stage_rates.at[:, group.index].set(found)
+    coordinates, rotors, work = state.coordinates, state.rates, state.work
+    # Groups own consecutive pieces of the stored rates and of the work account, in order.
+    stage_rates = jnp.zeros((tableau.stages, 0), q.dtype)
     if system.coordinates:
+        every = [_coordinate_rates(group, system, at, h) for group in system.coordinates]
+        stage_rates = jnp.concatenate(every, axis=1)[:, system.coordinate_order]
         coordinates = coordinates + h * (b @ stage_rates)
-    rotors, work = state.rates, state.work
-    for group, lam in zip(equations.groups, multipliers):
+    turning, working = [], []
+    for group, power in zip(groups, found.power):
         if group.effect.rotors:
             inner = stage_rates[:, group.coordinates[:, 0]] - rotors[group.rotors[:, 0]]
-            rotors = rotors.at[group.rotors[:, 0]].add(beta @ inner)
+            turning.append(beta @ inner)
         if group.effect.works:
-            answer = respond(group, situation(system, group, state, u, h), gather(group, at), lam, tableau)
-            work = work.at[group.works[:, 0]].add((1.0 if group.effect.impulsive else h) * (answer.power @ b))
+            working.append((1.0 if group.effect.impulsive else h) * (power @ b))
+    rotors = rotors + jnp.concatenate(turning) if turning else rotors
+    work = work + jnp.concatenate(working) if working else work
     after = State(state.t + h, q, v, coordinates, rotors, work)
     half_turn = 0.5 * h * jnp.sqrt(jnp.max(jnp.sum(at.spin[:, :bodies] ** 2, axis=-1)))
-    return equations.residual(y)[0], after, half_turn
+    return after, half_turn
 
 
 def linear_solver(

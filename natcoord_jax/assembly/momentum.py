@@ -1,0 +1,104 @@
+"""The balances of momentum and angular momentum of all bodies, from a given motion."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from natcoord_jax.assembly.response import Situation, Stations, collect, gather, respond
+from natcoord_jax.assembly.system import Group, System
+from natcoord_jax.maths.collocation import Tableau
+from natcoord_jax.maths.vectors import cross
+
+
+def inertia(
+    mass: Float[Array, "bodies 4 4"], rates: Float[Array, "*s bodies 4 3"]
+) -> Float[Array, "*s bodies 4 3"]:
+    """Rows of m v."""
+    return jnp.sum(mass[:, :, :, None] * rates[..., None, :, :], axis=-2)
+
+
+def wrench(
+    rows: Float[Array, "s bodies 4 3"], directors: Float[Array, "s bodies 3 3"]
+) -> tuple[Float[Array, "s bodies 3"], Float[Array, "s bodies 3"]]:
+    """Force and torque about the reference point of forces on rows: r_phi and sum d_i x r_i (26, 31)."""
+    return rows[:, :, 0], jnp.sum(cross(directors, rows[:, :, 1:]), axis=2)
+
+
+def row_weights(mass: Float[Array, "bodies 4 4"]) -> Float[Array, "bodies 4"]:
+    """Reciprocal mass of each row, so that weight times impulse squared is an energy; 0 for massless rows."""
+    turning = jnp.trace(mass[:, 1:, 1:], axis1=1, axis2=2)
+    sizes = jnp.stack([mass[:, 0, 0], turning, turning, turning], axis=1)
+    return jnp.where(sizes > 0, 1.0 / jnp.where(sizes > 0, sizes, 1.0), 0.0)
+
+
+def stage_momentum(
+    mass: Float[Array, "bodies 4 4"], difference: Float[Array, "s bodies 4 3"], tableau: Tableau
+) -> Float[Array, "s bodies 4 3"]:
+    """M sum_j (A^-1)_ij (V_j - v_0)."""
+    if tableau.stages == 1:
+        return inertia(mass, tableau.a_inverse[0][0] * difference)
+    return inertia(mass, jnp.einsum("ij,jbrc->ibrc", jnp.asarray(tableau.a_inverse), difference))
+
+
+class Balance(eqx.Module):
+    """What is missing in the balances of a step, and the constraints.
+
+    Attributes:
+        force: change of momentum less impulses, by stage and body [N s].
+        torque: the same about the reference points [N m s].
+        size: of the terms [sqrt(J)].
+        rows: rates of all constraints.
+        power: of each group (instances, s) [W].
+    """
+
+    force: Float[Array, "s bodies 3"]
+    torque: Float[Array, "s bodies 3"]
+    size: Float[Array, ""]
+    rows: Float[Array, " rows"]
+    power: list[Float[Array, "_ s"]]
+
+
+def momentum_balance(
+    system: System,
+    groups: Sequence[Group],
+    situations: Sequence[Situation],
+    at: Stations,
+    velocity: Float[Array, "bodies 4 3"],
+    multipliers: Sequence[Array],
+    h: Float[Array, ""],
+    tableau: Tableau,
+) -> Balance:
+    """Balances of the step (57) for a given motion, M sum_j (A^-1)_ij (V_j - v_0) - h F_i - G_i^T lambda_i.
+
+    Args:
+        system: compiled system.
+        groups: that act, with their situations and multipliers.
+        situations: of the groups.
+        at: stage motion.
+        velocity: of the rows at the start of the step.
+        multipliers: of the groups, times the step (n, s, m).
+        h: step [s].
+        tableau: the collocation method.
+    """
+    momentum = stage_momentum(system.mass, at.rates[:, :-1] - velocity, tableau)
+    weights = row_weights(system.mass)[..., None]
+    size = jnp.sum(weights * (momentum**2 + 4 * inertia(system.mass, velocity) ** 2))
+    torque, rows, power = None, [jnp.zeros(0, velocity.dtype)], []
+    for group, where, lam in zip(groups, situations, multipliers):
+        answer = respond(group, where, gather(group, at), lam, tableau)
+        scale = 1.0 if group.effect.impulsive else h
+        if answer.forces is not None:
+            forces = jnp.moveaxis(collect(group, scale * answer.forces), 1, 0)
+            momentum = momentum - forces
+            size = size + jnp.sum(weights * forces**2)
+        if answer.torques is not None:
+            turning = jnp.moveaxis(collect(group, scale * answer.torques), 1, 0)
+            torque = turning if torque is None else torque + turning
+            size = size + jnp.sum(weights[:, 1] * turning**2)
+        rows.append(answer.rows.reshape(-1))
+        power.append(answer.power)
+    force, moment = wrench(momentum, at.rows[:, :-1, 1:])
+    moment = moment if torque is None else moment - torque
+    return Balance(force, moment, jnp.sqrt(size), jnp.concatenate(rows), power)

@@ -1,0 +1,329 @@
+"""Run a loop of small operations as one function of machine code, on the CPU.
+
+XLA's CPU backend calls a kernel for every fusion, at some forty nanoseconds each. A step of a small system
+is a few hundred kernels of a few dozen numbers: the calls cost several times what the arithmetic does. A
+call that carries the attribute `xla_cpu_small_call` is compiled into one function instead, loops included
+(the compiler's own pass does so with tiny loops). That works for programs without calls into libraries,
+and only if every argument is used; so
+
+- small products and single-window scatters are rewritten as sums and as updates of slices,
+- a program that holds anything else than the operations known to work is left as it is,
+- all arguments travel in one array.
+
+Other backends, and programs left as they are, compute the same, at the price of the calls.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.extend import core as jex
+from jaxtyping import Array, Float
+
+try:
+    from jax.experimental.scheduling_groups import xla_metadata_call as _attributed
+except ImportError:  # an experimental module of JAX: without it everything runs, only slower
+    _attributed = None
+
+ATTRIBUTES = {"xla_cpu_small_call": "true", "inlineable": "false"}
+"""Compiled as one function; kept as a call until then."""
+
+LANES = 16
+"""Lanes of a batch that are worked on together, so that what they need stays in the fastest cache."""
+
+PRODUCT_LIMIT = 1 << 15
+"""Multiplications up to which a product of matrices is written as a sum."""
+
+KNOWN = frozenset(
+    "abs acos acosh add add_any and argmax argmin asin asinh atan atan2 atanh bitcast_convert_type "
+    "broadcast_in_dim cbrt ceil clamp concatenate cond convert_element_type copy copy_p cos cosh "
+    "cumsum custom_vmap_call div dynamic_slice dynamic_update_slice eq erf erf_inv erfc exp exp2 "
+    "expand_dims expm1 floor gather ge gt integer_pow iota is_finite jit le log log1p logistic lt max "
+    "min mul ne neg nextafter not optimization_barrier or pad pjit platform_index pow reduce_and "
+    "reduce_max reduce_min reduce_or reduce_prod reduce_sum rem reshape rev round rsqrt scan select_n "
+    "shift_left shift_right_arithmetic shift_right_logical sign sin sinh slice split sqrt square "
+    "squeeze stack stop_gradient sub tan tanh tile transpose unstack while xor".split()
+)
+"""Primitives that are compiled in place, without a call into a library."""
+
+INLINED = {
+    "custom_jvp_call": "call_jaxpr",
+    "custom_vjp_call": "call_jaxpr",
+    "closed_call": "call_jaxpr",
+    "jit": "jaxpr",
+    "pjit": "jaxpr",
+}
+"""Calls that are written out, as their names and rules for derivatives are of no use here: where their
+programs are."""
+
+REDUCTION_LIMIT = 3000
+"""Numbers from which on the compiler hands a reduction to a library (seen: 4096)."""
+
+REDUCTIONS = {"reduce_sum": jnp.add, "reduce_max": jnp.maximum, "reduce_min": jnp.minimum}
+"""Reductions that are written as pairwise operations."""
+
+REWRITTEN = frozenset(("dot_general", "scatter", "scatter-add", *INLINED))
+"""Primitives that may be rewritten in terms of those."""
+
+
+def as_one_kernel(function: Callable, *arguments: Any) -> Any:
+    """The value of a function, computed in one kernel where that is possible.
+
+    Not differentiable by itself.
+
+    Args:
+        function: of the arguments; it may close over traced values.
+        arguments: pytrees of arrays.
+    """
+    if not _on_cpu():
+        return function(*arguments)
+    return _flat(_kernel, function, arguments)
+
+
+def in_groups(function: Callable, *arguments: Any) -> Any:
+    """The value of a function; under vmap on the CPU, lanes are worked through in groups of `LANES`."""
+    if not _on_cpu():
+        return function(*arguments)
+    return _flat(_grouped, function, arguments)
+
+
+def _on_cpu() -> bool:
+    return jax.default_backend() == "cpu" and _attributed is not None
+
+
+def _flat(transform: Callable, function: Callable, arguments: tuple) -> Any:
+    """A transformed function of flat arguments, among them what it closes over."""
+    program, shapes = jax.make_jaxpr(function, return_shape=True)(*arguments)
+    flat = _with_constants(program)
+    outputs = transform(flat)(*program.consts, *jax.tree.leaves(arguments))
+    return jax.tree.unflatten(jax.tree.structure(shapes), outputs)
+
+
+def _kernel(function: Callable) -> Callable:
+    """A flat function as one kernel, whatever the number of lanes."""
+
+    @jax.custom_batching.custom_vmap
+    def call(*flat: Any) -> list[Array]:
+        return _in_one_kernel(function, flat)
+
+    @call.def_vmap
+    def by_lanes(axis_size: int, in_batched: Sequence[bool], *flat: Any) -> tuple[list[Array], list[bool]]:
+        axes = [0 if batched else None for batched in in_batched]
+        outputs = _kernel(jax.vmap(function, in_axes=axes, axis_size=axis_size))(*flat)
+        return outputs, [True] * len(outputs)
+
+    return call
+
+
+def _grouped(function: Callable) -> Callable:
+    """A flat function that works through lanes in groups."""
+
+    @jax.custom_batching.custom_vmap
+    def call(*flat: Any) -> list[Array]:
+        return function(*flat)
+
+    @call.def_vmap
+    def by_lanes(axis_size: int, in_batched: Sequence[bool], *flat: Any) -> tuple[list[Array], list[bool]]:
+        axes = [0 if batched else None for batched in in_batched]
+        every = jax.vmap(function, in_axes=axes, axis_size=axis_size)
+        if axis_size > LANES:
+            every = partial(_group_by_group, function, axes, axis_size)
+        outputs = _grouped(every)(*flat)
+        return outputs, [True] * len(outputs)
+
+    return call
+
+
+def _group_by_group(function: Callable, axes: list[int | None], lanes: int, *flat: Any) -> list[Array]:
+    """The function of all lanes; the last lane fills up the last group."""
+    groups = -(-lanes // LANES)
+    padding = jnp.minimum(jnp.arange(groups * LANES), lanes - 1).reshape(groups, LANES)
+    varied = [x for x, axis in zip(flat, axes) if axis == 0]
+
+    def group(rows: Array) -> list[Array]:
+        own = iter([x[rows] for x in varied])
+        return jax.vmap(function, in_axes=axes)(*(x if a is None else next(own) for x, a in zip(flat, axes)))
+
+    outputs = jax.lax.map(group, padding)
+    return [x.reshape(groups * LANES, *x.shape[2:])[:lanes] for x in outputs]
+
+
+def _in_one_kernel(function: Callable, flat: Sequence[Any]) -> list[Array]:
+    kinds = [(jnp.shape(x), jnp.result_type(x)) for x in flat]
+    program = jax.make_jaxpr(function)(*flat)
+    if known(program.jaxpr, KNOWN | REWRITTEN):
+        # After vmap, since small reductions of one lane are large ones of many.
+        program = jax.make_jaxpr(partial(_evaluate_closed, program))(*flat)
+    packable = all(jnp.issubdtype(dtype, jnp.number) or dtype == jnp.bool for _, dtype in kinds)
+    empty = all(math.prod(shape) == 0 for shape, _ in kinds)
+    if _attributed is None or not packable or empty or not known(program.jaxpr):
+        return jex.jaxpr_as_fun(program)(*flat)
+
+    def unpacked(packed: Float[Array, " _"]) -> list[Array]:
+        values, position = [], 0
+        for shape, dtype in kinds:
+            size = math.prod(shape)
+            values.append(_from_double(packed[position : position + size], dtype).reshape(shape))
+            position += size
+        return jex.jaxpr_as_fun(program)(*values)
+
+    packed = jnp.concatenate([_to_double(jnp.asarray(x)).reshape(-1) for x in flat])
+    kernel: Callable = _attributed(unpacked, **ATTRIBUTES)  # pyright: ignore[reportAssignmentType]
+    return kernel(packed)
+
+
+def _to_double(x: Array) -> Array:
+    """The same numbers, or the same bits where doubles cannot hold all of them."""
+    if x.dtype != jnp.float64 and x.dtype.itemsize == 8:
+        return jax.lax.bitcast_convert_type(x, jnp.float64)
+    return x.astype(jnp.float64)
+
+
+def _from_double(x: Array, dtype: Any) -> Array:
+    if dtype != jnp.float64 and dtype.itemsize == 8:
+        return jax.lax.bitcast_convert_type(x, dtype)
+    return x.astype(dtype)
+
+
+def _inner_programs(equation: Any) -> list[Any]:
+    """Programs among the parameters of an equation."""
+    found = []
+    for value in equation.params.values():
+        for x in value if isinstance(value, tuple | list) else (value,):
+            if isinstance(x, jex.ClosedJaxpr):
+                found.append(x.jaxpr)
+            elif isinstance(x, jex.Jaxpr):
+                found.append(x)
+    return found
+
+
+def known(program: Any, names: frozenset[str] = KNOWN) -> bool:
+    """Whether a program holds nothing but the operations of these names."""
+    return all(
+        equation.primitive.name in names and all(known(inner, names) for inner in _inner_programs(equation))
+        for equation in program.eqns
+    )
+
+
+def _with_constants(program: Any) -> Callable:
+    """The program, with its constants first."""
+
+    def function(*values: Any) -> list[Array]:
+        consts, rest = values[: len(program.consts)], values[len(program.consts) :]
+        return jex.jaxpr_as_fun(jex.ClosedJaxpr(program.jaxpr, consts))(*rest)
+
+    return function
+
+
+def _evaluate(program: Any, consts: Sequence[Any], arguments: Sequence[Any]) -> list[Any]:
+    values: dict[Any, Any] = dict(zip(program.constvars, consts)) | dict(zip(program.invars, arguments))
+
+    def read(x: Any) -> Any:
+        return x.val if isinstance(x, jex.Literal) else values[x]
+
+    for equation in program.eqns:
+        given = [read(x) for x in equation.invars]
+        scope = str(equation.source_info.name_stack)
+        if scope:
+            with jax.named_scope(scope):
+                found = _apply(equation, given)
+        else:
+            found = _apply(equation, given)
+        values.update(zip(equation.outvars, found))
+    return [read(x) for x in program.outvars]
+
+
+def _apply(equation: Any, given: list[Any]) -> list[Any]:
+    """Outputs of one equation."""
+    name, params = equation.primitive.name, equation.params
+    if name == "dot_general":
+        found = _product(given, params, equation.outvars[0].aval)
+        if found is not None:
+            return [found]
+    if name in ("scatter", "scatter-add"):
+        found = _update(name, given, params)
+        if found is not None:
+            return [found]
+    if name in REDUCTIONS and math.prod(given[0].shape) >= REDUCTION_LIMIT:
+        return [_reduced(REDUCTIONS[name], given[0], params["axes"])]
+    if name in INLINED and isinstance(params.get(INLINED[name]), jex.ClosedJaxpr):
+        inner = params[INLINED[name]]
+        return _evaluate(inner.jaxpr, inner.consts, given)
+    if name != "custom_vmap_call":
+        params = {key: _inside(value) for key, value in params.items()}
+    found = equation.primitive.bind(*given, **params)
+    return list(found) if equation.primitive.multiple_results else [found]
+
+
+def _inside(value: Any) -> Any:
+    """A parameter with the programs it holds rewritten."""
+    if isinstance(value, jex.ClosedJaxpr):
+        return jax.make_jaxpr(partial(_evaluate_closed, value))(*value.in_avals)
+    if isinstance(value, tuple) and value and all(isinstance(x, jex.ClosedJaxpr) for x in value):
+        return tuple(_inside(x) for x in value)
+    return value
+
+
+def _evaluate_closed(program: Any, *arguments: Any) -> list[Any]:
+    return _evaluate(program.jaxpr, program.consts, arguments)
+
+
+def _product(given: list[Any], params: dict[str, Any], out: Any) -> Array | None:
+    """A small product of arrays as a sum; None for a large one."""
+    left, right = given
+    (sum_left, sum_right), (batch_left, batch_right) = params["dimension_numbers"]
+    terms = math.prod(out.shape) * math.prod(left.shape[k] for k in sum_left)
+    if terms > PRODUCT_LIMIT or left.dtype != out.dtype or right.dtype != out.dtype:
+        return None
+    free_left = [k for k in range(left.ndim) if k not in (*sum_left, *batch_left)]
+    free_right = [k for k in range(right.ndim) if k not in (*sum_right, *batch_right)]
+    shared, summed = len(batch_left), len(sum_left)
+    left = jnp.transpose(left, (*batch_left, *free_left, *sum_left))
+    right = jnp.transpose(right, (*batch_right, *free_right, *sum_right))
+    left = jnp.expand_dims(left, range(shared + len(free_left), shared + len(free_left) + len(free_right)))
+    right = jnp.expand_dims(right, range(shared, shared + len(free_left)))
+    return jnp.sum(left * right, axis=tuple(range(left.ndim - summed, left.ndim)))
+
+
+def _reduced(operation: Callable, x: Array, axes: Sequence[Any]) -> Array:
+    """A large reduction as loops, which the compiler does not hand to a library."""
+    for axis in sorted(axes, reverse=True):
+
+        def add(k: Array, total: Array, x: Array = x, axis: int = axis) -> Array:
+            return operation(total, jax.lax.dynamic_index_in_dim(x, k, axis, keepdims=False))
+
+        first = jax.lax.index_in_dim(x, 0, axis, keepdims=False)
+        x = jax.lax.fori_loop(1, x.shape[axis], add, first)
+    return x
+
+
+def _update(name: str, given: list[Any], params: dict[str, Any]) -> Array | None:
+    """A scatter of one window as the update of a slice; None for several windows."""
+    operand, indices, updates = given
+    numbers = params["dimension_numbers"]
+    batched = numbers.operand_batching_dims or numbers.scatter_indices_batching_dims
+    if (
+        batched
+        or math.prod(indices.shape[:-1]) != 1
+        or indices.shape[-1] != len(numbers.scatter_dims_to_operand_dims)
+    ):
+        return None
+    window = [updates.shape[k] for k in numbers.update_window_dims]
+    sizes = iter(window)
+    shape = [1 if k in numbers.inserted_window_dims else next(sizes) for k in range(operand.ndim)]
+    index = indices.reshape(-1)
+    starts = [jnp.zeros((), index.dtype)] * operand.ndim
+    for k, dim in enumerate(numbers.scatter_dims_to_operand_dims):
+        starts[dim] = index[k]
+    inside = jnp.array(True)
+    for start, size, extent in zip(starts, shape, operand.shape):
+        inside = inside & (start >= 0) & (start + size <= extent)
+    updates = updates.reshape(shape).astype(operand.dtype)
+    if name == "scatter-add":
+        updates = updates + jax.lax.dynamic_slice(operand, starts, shape)
+    if params["mode"] == jax.lax.GatherScatterMode.CLIP:
+        return jax.lax.dynamic_update_slice(operand, updates, starts)
+    return jnp.where(inside, jax.lax.dynamic_update_slice(operand, updates, starts), operand)
