@@ -105,6 +105,10 @@ class Inverse(eqx.Module):
         """Product with the inverse."""
         return apply(self.inverse, right)
 
+    def transpose(self) -> "Inverse":
+        """Inverse of the transposed matrix."""
+        return Inverse(self.inverse.T)
+
 
 class DenseSolver(eqx.Module):
     """A matrix with its (possibly regularised) inverse; solves are refined and differentiable in every mode.

@@ -1,26 +1,41 @@
 """Projection onto the range of a matrix of known rank, differentiable as long as the rank holds."""
 
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from natcoord_jax.maths.vectors import safe_norm
+
 
 @partial(jax.custom_jvp, nondiff_argnums=(1,))
 def range_projector(matrix: Float[Array, "m n"], rank: int) -> Float[Array, "m m"]:
-    """Orthogonal projector U U^T on the `rank` leading left singular vectors.
+    """Orthogonal projector on the range, by Gram-Schmidt orthogonalisation of the columns, largest first.
 
-    Its derivative is that of the projector on the range of a matrix of constant rank,
-    N + N^T with N = (1 - P) dA A^+ (Golub & Pereyra 1973); single singular vectors, which need not be
-    differentiable, do not enter.
+    Unlike singular vectors it compiles into one kernel. Its derivative is that of the projector on the range
+    of a matrix of constant rank, N + N^T with N = (1 - P) dA A^+ (Golub & Pereyra 1973); single basis
+    vectors, which need not be differentiable, do not enter.
 
     Args:
         matrix: A.
         rank: its rank.
     """
-    vectors = jnp.linalg.svd(matrix, full_matrices=False)[0][:, :rank]
-    return vectors @ vectors.T
+
+    def with_column(_: Any, carry: tuple[Array, Array]) -> tuple[Array, Array]:
+        rest, projector = carry
+        sizes = jnp.sum(rest**2, axis=0)
+        vector = rest[:, jnp.argmax(sizes)]
+        # Twice is enough: what is left is orthogonal to round-off.
+        vector = vector / safe_norm(vector)
+        vector = vector - projector @ vector
+        vector = vector / safe_norm(vector)
+        rest = rest - vector[:, None] * (vector @ rest)[None, :]
+        return rest, projector + vector[:, None] * vector[None, :]
+
+    nothing = jnp.zeros((matrix.shape[0], matrix.shape[0]), matrix.dtype)
+    return jax.lax.fori_loop(0, rank, with_column, (matrix, nothing))[1]
 
 
 @range_projector.defjvp

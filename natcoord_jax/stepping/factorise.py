@@ -32,6 +32,10 @@ class _ByNode(eqx.Module):
         """Solution for a flat right-hand side."""
         return self.layout.flat(self.solver.solve(self.layout.nodes(right)))
 
+    def transpose(self) -> "_ByNode":
+        """Solver of the transposed matrix."""
+        return _ByNode(self.layout, self.solver.transpose())
+
 
 class _TreeLayout(eqx.Module):
     """The part of the equations that knows where unknowns sit; numbers of the step are left out."""

@@ -28,6 +28,9 @@ try:
 except ImportError:  # an experimental module of JAX: without it everything runs, only slower
     _attributed = None
 
+LARGEST = 5000
+"""Operations of a program that still compiles quickly in one piece: the time grows faster than the size."""
+
 ATTRIBUTES = {"xla_cpu_small_call": "true", "inlineable": "false"}
 """Compiled as one function; kept as a call until then."""
 
@@ -69,7 +72,7 @@ REWRITTEN = frozenset(("dot_general", "scatter", "scatter-add", *INLINED))
 """Primitives that may be rewritten in terms of those."""
 
 
-def as_one_kernel(function: Callable, *arguments: Any) -> Any:
+def as_one_kernel(function: Callable, *arguments: Any, too_large: Callable | None = None) -> Any:
     """The value of a function, computed in one kernel where that is possible.
 
     Not differentiable by itself.
@@ -77,26 +80,29 @@ def as_one_kernel(function: Callable, *arguments: Any) -> Any:
     Args:
         function: of the arguments; it may close over traced values.
         arguments: pytrees of arrays.
+        too_large: what to call instead if the program has more than `LARGEST` operations.
     """
     if not _on_cpu():
         return function(*arguments)
-    return _flat(_kernel, function, arguments)
+    program, shapes = jax.make_jaxpr(function, return_shape=True)(*arguments)
+    if too_large is not None and operations(program.jaxpr) > LARGEST:
+        return too_large(*arguments)
+    return _flat(_kernel, program, shapes, arguments)
 
 
 def in_groups(function: Callable, *arguments: Any) -> Any:
     """The value of a function; under vmap on the CPU, lanes are worked through in groups of `LANES`."""
     if not _on_cpu():
         return function(*arguments)
-    return _flat(_grouped, function, arguments)
+    return _flat(_grouped, *jax.make_jaxpr(function, return_shape=True)(*arguments), arguments)
 
 
 def _on_cpu() -> bool:
     return jax.default_backend() == "cpu" and _attributed is not None
 
 
-def _flat(transform: Callable, function: Callable, arguments: tuple) -> Any:
+def _flat(transform: Callable, program: Any, shapes: Any, arguments: tuple) -> Any:
     """A transformed function of flat arguments, among them what it closes over."""
-    program, shapes = jax.make_jaxpr(function, return_shape=True)(*arguments)
     flat = _with_constants(program)
     outputs = transform(flat)(*program.consts, *jax.tree.leaves(arguments))
     return jax.tree.unflatten(jax.tree.structure(shapes), outputs)
@@ -106,11 +112,11 @@ def _kernel(function: Callable) -> Callable:
     """A flat function as one kernel, whatever the number of lanes."""
 
     @jax.custom_batching.custom_vmap
-    def call(*flat: Any) -> list[Array]:
+    def call(*flat: Any) -> list[Any]:
         return _in_one_kernel(function, flat)
 
     @call.def_vmap
-    def by_lanes(axis_size: int, in_batched: Sequence[bool], *flat: Any) -> tuple[list[Array], list[bool]]:
+    def by_lanes(axis_size: int, in_batched: Sequence[bool], *flat: Any) -> tuple[list[Any], list[bool]]:
         axes = [0 if batched else None for batched in in_batched]
         outputs = _kernel(jax.vmap(function, in_axes=axes, axis_size=axis_size))(*flat)
         return outputs, [True] * len(outputs)
@@ -122,11 +128,11 @@ def _grouped(function: Callable) -> Callable:
     """A flat function that works through lanes in groups."""
 
     @jax.custom_batching.custom_vmap
-    def call(*flat: Any) -> list[Array]:
+    def call(*flat: Any) -> list[Any]:
         return function(*flat)
 
     @call.def_vmap
-    def by_lanes(axis_size: int, in_batched: Sequence[bool], *flat: Any) -> tuple[list[Array], list[bool]]:
+    def by_lanes(axis_size: int, in_batched: Sequence[bool], *flat: Any) -> tuple[list[Any], list[bool]]:
         axes = [0 if batched else None for batched in in_batched]
         every = jax.vmap(function, in_axes=axes, axis_size=axis_size)
         if axis_size > LANES:
@@ -137,13 +143,13 @@ def _grouped(function: Callable) -> Callable:
     return call
 
 
-def _group_by_group(function: Callable, axes: list[int | None], lanes: int, *flat: Any) -> list[Array]:
+def _group_by_group(function: Callable, axes: list[int | None], lanes: int, *flat: Any) -> list[Any]:
     """The function of all lanes; the last lane fills up the last group."""
     groups = -(-lanes // LANES)
     padding = jnp.minimum(jnp.arange(groups * LANES), lanes - 1).reshape(groups, LANES)
     varied = [x for x, axis in zip(flat, axes) if axis == 0]
 
-    def group(rows: Array) -> list[Array]:
+    def group(rows: Array) -> list[Any]:
         own = iter([x[rows] for x in varied])
         return jax.vmap(function, in_axes=axes)(*(x if a is None else next(own) for x, a in zip(flat, axes)))
 
@@ -151,7 +157,7 @@ def _group_by_group(function: Callable, axes: list[int | None], lanes: int, *fla
     return [x.reshape(groups * LANES, *x.shape[2:])[:lanes] for x in outputs]
 
 
-def _in_one_kernel(function: Callable, flat: Sequence[Any]) -> list[Array]:
+def _in_one_kernel(function: Callable, flat: Sequence[Any]) -> list[Any]:
     kinds = [(jnp.shape(x), jnp.result_type(x)) for x in flat]
     program = jax.make_jaxpr(function)(*flat)
     if known(program.jaxpr, KNOWN | REWRITTEN):
@@ -162,17 +168,30 @@ def _in_one_kernel(function: Callable, flat: Sequence[Any]) -> list[Array]:
     if _attributed is None or not packable or empty or not known(program.jaxpr):
         return jex.jaxpr_as_fun(program)(*flat)
 
-    def unpacked(packed: Float[Array, " _"]) -> list[Array]:
+    packed, unpack = in_one_array(list(flat))
+
+    def unpacked(packed: Float[Array, " _"]) -> list[Any]:
+        return jex.jaxpr_as_fun(program)(*unpack(packed))
+
+    kernel: Callable = _attributed(unpacked, **ATTRIBUTES)  # pyright: ignore[reportAssignmentType]
+    return kernel(packed)
+
+
+def in_one_array(tree: Any) -> tuple[Float[Array, " _"], Callable[[Array], Any]]:
+    """All arrays of a pytree in one, and the way back."""
+    leaves, structure = jax.tree.flatten(tree)
+    kinds = [(jnp.shape(x), jnp.result_type(x)) for x in leaves]
+
+    def unpack(packed: Float[Array, " _"]) -> Any:
         values, position = [], 0
         for shape, dtype in kinds:
             size = math.prod(shape)
             values.append(_from_double(packed[position : position + size], dtype).reshape(shape))
             position += size
-        return jex.jaxpr_as_fun(program)(*values)
+        return jax.tree.unflatten(structure, values)
 
-    packed = jnp.concatenate([_to_double(jnp.asarray(x)).reshape(-1) for x in flat])
-    kernel: Callable = _attributed(unpacked, **ATTRIBUTES)  # pyright: ignore[reportAssignmentType]
-    return kernel(packed)
+    parts = [_to_double(jnp.asarray(x)).reshape(-1) for x in leaves]
+    return jnp.concatenate([jnp.zeros(0), *parts]), unpack
 
 
 def _to_double(x: Array) -> Array:
@@ -200,6 +219,11 @@ def _inner_programs(equation: Any) -> list[Any]:
     return found
 
 
+def operations(program: Any) -> int:
+    """Number of operations of a program and of all programs in it."""
+    return sum(1 + sum(map(operations, _inner_programs(equation))) for equation in program.eqns)
+
+
 def known(program: Any, names: frozenset[str] = KNOWN) -> bool:
     """Whether a program holds nothing but the operations of these names."""
     return all(
@@ -211,7 +235,7 @@ def known(program: Any, names: frozenset[str] = KNOWN) -> bool:
 def _with_constants(program: Any) -> Callable:
     """The program, with its constants first."""
 
-    def function(*values: Any) -> list[Array]:
+    def function(*values: Any) -> list[Any]:
         consts, rest = values[: len(program.consts)], values[len(program.consts) :]
         return jex.jaxpr_as_fun(jex.ClosedJaxpr(program.jaxpr, consts))(*rest)
 
@@ -301,29 +325,33 @@ def _reduced(operation: Callable, x: Array, axes: Sequence[Any]) -> Array:
 
 
 def _update(name: str, given: list[Any], params: dict[str, Any]) -> Array | None:
-    """A scatter of one window as the update of a slice; None for several windows."""
+    """A scatter as updates of slices, one window after the other; None for one with batch dimensions."""
     operand, indices, updates = given
     numbers = params["dimension_numbers"]
-    batched = numbers.operand_batching_dims or numbers.scatter_indices_batching_dims
-    if (
-        batched
-        or math.prod(indices.shape[:-1]) != 1
-        or indices.shape[-1] != len(numbers.scatter_dims_to_operand_dims)
-    ):
+    if numbers.operand_batching_dims or numbers.scatter_indices_batching_dims:
         return None
-    window = [updates.shape[k] for k in numbers.update_window_dims]
-    sizes = iter(window)
+    windows = numbers.update_window_dims
+    others = [k for k in range(updates.ndim) if k not in windows]
+    updates = jnp.transpose(updates, (*others, *windows)).astype(operand.dtype)
+    sizes = iter(updates.shape[len(others) :])
     shape = [1 if k in numbers.inserted_window_dims else next(sizes) for k in range(operand.ndim)]
-    index = indices.reshape(-1)
-    starts = [jnp.zeros((), index.dtype)] * operand.ndim
-    for k, dim in enumerate(numbers.scatter_dims_to_operand_dims):
-        starts[dim] = index[k]
-    inside = jnp.array(True)
-    for start, size, extent in zip(starts, shape, operand.shape):
-        inside = inside & (start >= 0) & (start + size <= extent)
-    updates = updates.reshape(shape).astype(operand.dtype)
-    if name == "scatter-add":
-        updates = updates + jax.lax.dynamic_slice(operand, starts, shape)
-    if params["mode"] == jax.lax.GatherScatterMode.CLIP:
-        return jax.lax.dynamic_update_slice(operand, updates, starts)
-    return jnp.where(inside, jax.lax.dynamic_update_slice(operand, updates, starts), operand)
+    count = math.prod(updates.shape[: len(others)])
+    updates, places = updates.reshape(count, *shape), indices.reshape(count, -1)
+    if 0 in updates.shape or 0 in operand.shape:
+        return operand
+
+    def one(k: Any, total: Array) -> Array:
+        window, place = updates[k], places[k]
+        starts = [jnp.zeros((), place.dtype)] * operand.ndim
+        for n, dim in enumerate(numbers.scatter_dims_to_operand_dims):
+            starts[dim] = place[n]
+        now = jax.lax.dynamic_slice(total, starts, shape)
+        if name == "scatter-add":
+            window = now + window
+        if params["mode"] == jax.lax.GatherScatterMode.FILL_OR_DROP:
+            limits = zip(starts, shape, operand.shape)
+            inside = jnp.all(jnp.stack([(at >= 0) & (at + size <= end) for at, size, end in limits]))
+            window = jnp.where(inside, window, now)
+        return jax.lax.dynamic_update_slice(total, window, starts)
+
+    return one(0, operand) if count == 1 else jax.lax.fori_loop(0, count, one, operand)

@@ -4,10 +4,7 @@ A rollout is a loop over slots; one slot is one attempt at one (sub)step. As lon
 slots are steps. A failed attempt is repeated with half the substep in the next slot; spare slots at the end
 make up for it, and are not entered otherwise.
 
-The derivative (`custom_jvp`) runs along the recorded slots: their states and solutions are outputs, so all
-Jacobians are formed at once, vmapped over the slots, and only the recursion from state to state is a scan.
-Newton's iteration is never differentiated. The recorded outputs are differentiated by the same rule, so
-second derivatives (forward over reverse, forward over forward) are exact. Substep fractions are constants.
+The derivative of a rollout runs along its recorded slots, see `derivative`.
 """
 
 from collections.abc import Callable
@@ -18,7 +15,6 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
@@ -37,8 +33,8 @@ from natcoord_jax.stepping.newton import (
     no_factors,
     refreshed,
 )
-from natcoord_jax.stepping.one_kernel import as_one_kernel, in_groups
-from natcoord_jax.stepping.step import advance, end_of_step, linear_solver
+from natcoord_jax.stepping.one_kernel import as_one_kernel
+from natcoord_jax.stepping.step import end_of_step
 
 SMALLEST_FRACTION = 1.0 / 64
 """A step is given up when a substep of this fraction of it fails."""
@@ -46,9 +42,6 @@ SMALLEST_FRACTION = 1.0 / 64
 
 BY_DIFFERENCES = ("reduced",)
 """Forms whose Jacobian is formed by differences; others have formulas for it."""
-
-CHUNK = 32
-"""Slots whose Jacobians are formed together."""
 
 LARGEST_HALF_TURN = 10.0
 """Tangent of half the largest rotation of a body in one (sub)step, 169 degrees: beyond lies the pole."""
@@ -62,7 +55,7 @@ class Plan:
         steps: number of steps.
         extra: slots available for retries.
         tolerance: of Newton's iteration.
-        control: function (parameters, step index, t, state) to inputs.
+        control: function (parameters, step index, t, state) to inputs; None: they are parameters[step].
         event: function of the state whose change of sign ends the run, or None.
         stages: stages of the collocation method.
     """
@@ -70,9 +63,15 @@ class Plan:
     steps: int
     extra: int
     tolerance: float
-    control: Callable[[Any, Array, Array, State], Array]
+    control: Callable[[Any, Array, Array, State], Array] | None
     event: Callable[[State], Array] | None = None
     stages: int = 1
+
+    def inputs(self, parameters: Any, step: Array, state: State) -> Float[Array, " inputs"]:
+        """Inputs of a (sub)step that starts at a state."""
+        if self.control is None:
+            return parameters[step]
+        return self.control(parameters, step, state.t, state)
 
 
 class Slots(eqx.Module):
@@ -217,7 +216,7 @@ class Setting(eqx.Module):
         """Inputs, length and number of the (sub)step at hand."""
         h = jnp.where(self.over(course), 1e-3, course.fraction * self.dt)
         index = jnp.minimum(course.step, self.plan.steps - 1)
-        return self.plan.control(self.parameters, index, course.state.t, course.state), h, index
+        return self.plan.inputs(self.parameters, index, course.state), h, index
 
     def equations(self, course: Course) -> Any:
         """The equations of the (sub)step at hand."""
@@ -232,7 +231,7 @@ class Setting(eqx.Module):
 
 def _start(setting: Setting, state: State) -> tuple[Course, Factors]:
     dt, plan = setting.dt, setting.plan
-    u = plan.control(setting.parameters, jnp.array(0), state.t, state)
+    u = plan.inputs(setting.parameters, jnp.array(0), state)
     equations = prepare(setting.system, state, u, dt, gauss(plan.stages))
     it, factors = begin(equations.guess()), no_factors(equations, setting.form)
     zero, nought = jnp.array(0), jnp.zeros((), state.q.dtype)
@@ -336,7 +335,15 @@ def _without_state(course: Course) -> Course:
     return eqx.tree_at(lambda c: c.state, course, None)
 
 
-def _run(plan: Plan, system: System, state: State, parameters: Any, dt: Array) -> tuple[Slots, Course]:
+class Ending(eqx.Module):
+    """Where a rollout ended, and the factors it ended with."""
+
+    course: Course
+    factors: Factors
+
+
+def run(plan: Plan, system: System, state: State, parameters: Any, dt: Array) -> tuple[Slots, Ending]:
+    """All slots of a rollout and where it ended; without derivatives (see `derivative`)."""
     setting = Setting(system, parameters, dt, plan)
     length = plan.steps + plan.extra
     # One array instead of one for every field: fewer operations in every trip.
@@ -368,11 +375,11 @@ def _run(plan: Plan, system: System, state: State, parameters: Any, dt: Array) -
         shapes = jax.eval_shape(packed_trip, *carried)[1]
         buffer = jax.tree.map(lambda x: jnp.zeros((length, *x.shape), x.dtype), shapes)
         count, carried, buffer = jax.lax.while_loop(unfinished, body, (jnp.array(0), carried, buffer))
-        return count, carried[0], carried[3], buffer
+        return count, carried[0], carried[1], carried[3], buffer
 
     course, factors = _start(setting, state)
     found = as_one_kernel(every_slot, _without_state(course), factors, packed)
-    count, course, x, (slots, states) = found
+    count, course, factors, x, (slots, states) = found
     course = eqx.tree_at(lambda c: c.state, course, unpack(x), is_leaf=_is_none)
     slots = eqx.tree_at(lambda s: s.states, slots, jax.vmap(unpack)(states), is_leaf=_is_none)
     unused = jnp.arange(length) >= any_lane(count)
@@ -392,108 +399,4 @@ def _run(plan: Plan, system: System, state: State, parameters: Any, dt: Array) -
     )
     short = (course.step < plan.steps) & ~course.stopped
     code = jnp.where(short, int(Result.MAX_SUBSTEPS), course.code)
-    return slots, eqx.tree_at(lambda c: c.code, course, code)
-
-
-@partial(jax.custom_jvp, nondiff_argnums=(0,))
-def run_slots(plan: Plan, system: System, state: State, parameters: Any, dt: Array) -> tuple[Slots, Course]:
-    """All slots of a rollout and where it ended; see the module for its derivative."""
-    return in_groups(partial(_run, plan), system, state, parameters, dt)
-
-
-def _zero_tangent(x: Array) -> Array | np.ndarray:
-    if jnp.issubdtype(jnp.result_type(x), jnp.inexact):
-        return jnp.zeros_like(x)
-    return np.zeros(jnp.shape(x), jax.dtypes.float0)
-
-
-def _in_chunks(function: Callable, slots: tuple) -> Any:
-    """The function of every slot, vmapped in chunks whose temporaries stay in the cache."""
-    every = jax.vmap(lambda x: function(*x))
-    length = slots[1].shape[0]
-    if length <= CHUNK:
-        return every(slots)
-    chunks = -(-length // CHUNK)
-    padding = jnp.minimum(jnp.arange(chunks * CHUNK), length - 1)
-
-    def chunked(x: Array) -> Array:
-        return x[padding].reshape(chunks, CHUNK, *x.shape[1:])
-
-    found = jax.lax.map(every, jax.tree.map(chunked, slots))
-    return jax.tree.map(lambda x: x.reshape(chunks * CHUNK, *x.shape[2:])[:length], found)
-
-
-def _is_zero(x: Any) -> bool:
-    return isinstance(x, jax.custom_derivatives.SymbolicZero)
-
-
-def _some_tangents(tree: Any, tangents: Any) -> tuple[list, Callable, list]:
-    """The leaves that are differentiated, the way back to the tree, and their tangents."""
-    leaves, structure = jax.tree.flatten(tree)
-    changes = jax.tree.leaves(tangents, is_leaf=_is_zero)
-    chosen = [i for i, change in enumerate(changes) if not _is_zero(change)]
-
-    def whole(some: list) -> Any:
-        every = list(leaves)
-        for i, leaf in zip(chosen, some):
-            every[i] = leaf
-        return jax.tree.unflatten(structure, every)
-
-    return [leaves[i] for i in chosen], whole, [changes[i] for i in chosen]
-
-
-def _instantiated(tangents: Any, primals: Any) -> Any:
-    """Tangents with arrays for symbolic zeros."""
-    return jax.tree.map(
-        lambda t, p: _zero_tangent(p) if _is_zero(t) else t, tangents, primals, is_leaf=_is_zero
-    )
-
-
-@partial(run_slots.defjvp, symbolic_zeros=True)
-def _run_slots_jvp(plan: Plan, primals: tuple, tangents: tuple):
-    system, state, parameters, dt = primals
-    system_dot, state_dot, parameters_dot, dt_dot = tangents
-    state_dot = _instantiated(state_dot, state)
-    some, whole, some_dot = _some_tangents((system, parameters, dt), (system_dot, parameters_dot, dt_dot))
-    slots, course = run_slots(plan, *primals)
-    tableau = gauss(plan.stages)
-    before = jax.tree.map(
-        lambda first, after: jnp.concatenate([first[None], after[:-1]]), state, slots.states
-    )
-
-    def outcome(system, state, parameters, dt, y, step, fraction):
-        u = plan.control(parameters, step, state.t, state)
-        return advance(system, state, u, fraction * dt, y, tableau)[:2]
-
-    def prepared(state, y, step, fraction):
-        """Linear maps of one slot: from (state, unknowns), of the parameters' change, and the solver."""
-        _, along = jax.linearize(
-            lambda state, y: outcome(system, state, parameters, dt, y, step, fraction), state, y
-        )
-
-        def by_numbers(some: list) -> tuple[Array, State]:
-            system, parameters, dt = whole(some)
-            return outcome(system, state, parameters, dt, y, step, fraction)
-
-        forcing = jax.jvp(by_numbers, (some,), (some_dot,))[1]
-        u = plan.control(parameters, step, state.t, state)
-        solver = linear_solver(system, state, u, fraction * dt, y, tableau, along)
-        return along, solver, forcing
-
-    def body(state_dot, xs):
-        (along, solver, (residual_dot, end_dot)), accepted = xs
-        resting = jnp.zeros(slots.y.shape[1:], slots.y.dtype)
-        y_dot = -solver.solve(residual_dot + along(state_dot, resting)[0])
-        end = jax.tree.map(jnp.add, end_dot, along(state_dot, y_dot)[1])
-        end = jax.tree.map(partial(jnp.where, accepted), end, state_dot)
-        return end, (end, jnp.where(accepted, y_dot, 0.0))
-
-    # Attempts that failed may hold anything: their maps are formed at rest, and then not used.
-    sound = jnp.where(slots.accepted[:, None], slots.y, 0.0)
-    maps = _in_chunks(prepared, (before, sound, slots.step, slots.fraction))
-    last_dot, (states_dot, y_dot) = jax.lax.scan(body, state_dot, (maps, slots.accepted))
-    slots_dot = jax.tree.map(_zero_tangent, slots)
-    slots_dot = eqx.tree_at(lambda s: (s.states, s.y), slots_dot, (states_dot, y_dot))
-    course_dot = jax.tree.map(_zero_tangent, course)
-    course_dot = eqx.tree_at(lambda c: c.state, course_dot, last_dot)
-    return (slots, course), (slots_dot, course_dot)
+    return slots, Ending(eqx.tree_at(lambda c: c.code, course, code), factors)

@@ -15,15 +15,12 @@ from natcoord_jax.assembly.system import System
 from natcoord_jax.core.checks import at_top_level, is_concrete
 from natcoord_jax.core.results import REASONS, REMEDIES, Result, SimulationError
 from natcoord_jax.core.state import State, Trajectory
+from natcoord_jax.stepping.derivative import run_slots
 from natcoord_jax.stepping.newton import TOLERANCE
-from natcoord_jax.stepping.rollout import Plan, Slots, run_slots
+from natcoord_jax.stepping.rollout import Plan, Slots
 
 SEGMENT = 512
 """Longest segment of a rollout that does not save every step, or that is checkpointed."""
-
-
-def _held(parameters: Array, step: Array, t: Array, state: State) -> Array:
-    return parameters[step]
 
 
 def _checked_step(dt: Any) -> Float[Array, ""]:
@@ -105,12 +102,13 @@ def _rollout(
         control, every_segment = partial(_by_policy, policy), constants
         pieces = jax.tree.map(lambda x: jnp.broadcast_to(x, (steps // length, *x.shape)), every_segment)
     else:
-        control, pieces = _held, inputs.reshape(steps // length, length, inputs.shape[1])
+        control, pieces = None, inputs.reshape(steps // length, length, inputs.shape[1])
     plan = Plan(length, extra_substeps, tolerance, control, until)
 
     def segment(carry, parameters):
         state, code, failed = carry
-        slots, course = run_slots(plan, system, state, parameters, dt)
+        slots, ending = run_slots(plan, system, state, parameters, dt)
+        course = ending.course
         running = code == int(Result.SUCCESSFUL)
         keep = partial(jnp.where, running)
         picked = _ends(slots, save_every, length)
@@ -119,7 +117,7 @@ def _rollout(
             saved = jax.tree.map(lambda x, s: jnp.where(running, x, s), saved, state)
         after = jax.tree.map(keep, course.state, state)
         starts = jax.tree.map(lambda x: x[jnp.maximum(picked - 1, 0)], slots.states)
-        used = jax.vmap(lambda k, s: plan.control(parameters, slots.step[k], s.t, s))(picked, starts)
+        used = jax.vmap(lambda k, s: plan.inputs(parameters, slots.step[k], s))(picked, starts)
         code = keep(course.code, code)
         worst = keep(course.worst, failed[2])
         failed = (failed[0] + jnp.where(running, course.step, 0), keep(course.state.t, failed[1]), worst)
@@ -244,8 +242,8 @@ def simulate(
 
 @eqx.filter_jit
 def _one_step(system, state, u, dt, tolerance, extra):
-    plan = Plan(1, extra, tolerance, _held)
-    slots, course = run_slots(plan, system, state, u[None], dt)
+    plan = Plan(1, extra, tolerance, None)
+    course = run_slots(plan, system, state, u[None], dt)[1].course
     return course.state, course.code
 
 

@@ -1,0 +1,364 @@
+"""The derivative of a rollout, along its recorded slots.
+
+States and solutions of all slots are known, so Newton's iteration is never differentiated: the step's
+equations are, once for every slot (implicit function theorem). Substep fractions are constants.
+
+Forward, all Jacobians are formed at once, vmapped over the slots, and only the recursion from state to state
+is a scan. Backward, a loop goes from the last slot to the first; each transposed system is solved by
+corrections with factors carried from slot to slot, as the step itself is, and nothing is stored but the
+states. Recorded outputs are differentiated by the same rule, so second derivatives (forward over reverse,
+forward over forward) are exact.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from natcoord_jax.assembly.equations import prepare
+from natcoord_jax.assembly.system import System
+from natcoord_jax.core.state import State
+from natcoord_jax.maths.collocation import gauss
+from natcoord_jax.stepping import linear_pair
+from natcoord_jax.stepping.newton import PATIENCE, Factors, any_lane, factors_of
+from natcoord_jax.stepping.one_kernel import as_one_kernel, in_groups
+from natcoord_jax.stepping.rollout import BY_DIFFERENCES, Ending, Past, Plan, Slots, run
+from natcoord_jax.stepping.step import advance, linear_solver
+
+CHUNK = 32
+"""Slots whose Jacobians are formed together."""
+
+CLOSE = 1e-12
+"""Last correction of a transposed system relative to its solution."""
+
+STALL = 1e-10
+"""Corrections that stop shrinking below this have reached the floor of round-off."""
+
+CORRECTIONS = 30
+"""Corrections with one factorisation."""
+
+ROUNDS = 4
+"""Factorisations for one transposed system."""
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def run_slots(plan: Plan, system: System, state: State, parameters: Any, dt: Array) -> tuple[Slots, Ending]:
+    """All slots of a rollout and where it ended; differentiable in every mode."""
+    return _traced_once(plan, system, state, parameters, dt)
+
+
+@partial(jax.jit, static_argnums=0)
+def _traced_once(plan: Plan, *numbers: Any) -> tuple[Slots, Ending]:
+    """JAX evaluates the function and the rule for its derivative; jit remembers the program."""
+    return in_groups(partial(run, plan), *numbers)
+
+
+def _zero_tangent(x: Array) -> Array | np.ndarray:
+    if jnp.issubdtype(jnp.result_type(x), jnp.inexact):
+        return jnp.zeros_like(x)
+    return np.zeros(jnp.shape(x), jax.dtypes.float0)
+
+
+def _is_zero(x: Any) -> bool:
+    return isinstance(x, jax.custom_derivatives.SymbolicZero)
+
+
+def _instantiated(tangents: Any, primals: Any) -> Any:
+    """Tangents with arrays for symbolic zeros."""
+    return jax.tree.map(
+        lambda t, p: _zero_tangent(p) if _is_zero(t) else t, tangents, primals, is_leaf=_is_zero
+    )
+
+
+class Numbers(eqx.Module):
+    """What a rollout depends on besides its first state, apart into what varies and what does not.
+
+    Attributes:
+        varied: leaves that are differentiated.
+        fixed: all others.
+        chosen: which leaves vary.
+        structure: of (system, parameters, dt).
+    """
+
+    varied: list[Array]
+    fixed: list[Array]
+    chosen: tuple[int, ...] = eqx.field(static=True)
+    structure: Any = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, numbers: tuple, tangents: tuple) -> tuple["Numbers", list[Array]]:
+        """Split by the tangents, and the tangents of what varies."""
+        leaves, structure = jax.tree.flatten(numbers)
+        changes = jax.tree.leaves(tangents, is_leaf=_is_zero)
+        chosen = tuple(i for i, change in enumerate(changes) if not _is_zero(change))
+        fixed = [x for i, x in enumerate(leaves) if i not in chosen]
+        return cls([leaves[i] for i in chosen], fixed, chosen, structure), [changes[i] for i in chosen]
+
+    def whole(self, varied: list[Array]) -> tuple[System, Any, Array]:
+        """System, parameters and step with other values of what varies."""
+        some, rest = iter(varied), iter(self.fixed)
+        count = len(self.varied) + len(self.fixed)
+        return jax.tree.unflatten(
+            self.structure, [next(some) if i in self.chosen else next(rest) for i in range(count)]
+        )
+
+
+class Slot(eqx.Module):
+    """Where one slot began, its solution and its inputs (None where a control decides)."""
+
+    before: State
+    y: Float[Array, "*slots unknowns"]
+    u: Float[Array, "*slots inputs"] | None
+    step: Int[Array, "*slots"]
+    fraction: Float[Array, "*slots"]
+    accepted: Bool[Array, "*slots"]
+
+
+class Record(eqx.Module):
+    """All that the derivative is taken at."""
+
+    numbers: Numbers
+    slots: Slot
+    factors: Factors
+
+
+class Rule:
+    """The tangents of a rollout and their transpose; hashable, without traced values."""
+
+    def __init__(self, plan: Plan):
+        self.plan = plan
+        self.tableau = gauss(plan.stages)
+
+    def outcome(
+        self, numbers: Numbers, varied: list[Array], slot: Slot, state: State, u: Any, y: Array
+    ) -> tuple[Array, State]:
+        """Residual of the slot's equations and the state at its end."""
+        system, parameters, dt = numbers.whole(varied)
+        u = self.plan.inputs(parameters, slot.step, state) if u is None else u
+        return advance(system, state, u, slot.fraction * dt, y, self.tableau)[:2]
+
+    def prepared(self, numbers: Numbers, varied_dot: list[Array], slot: Slot, u_dot: Any) -> tuple:
+        """Linear maps of one slot: from (state, unknowns), of everything else's change, and the solver."""
+        at = partial(self.outcome, numbers)
+        _, along = jax.linearize(
+            lambda state, y: at(numbers.varied, slot, state, slot.u, y), slot.before, slot.y
+        )
+        given, given_dot = (numbers.varied, slot.u), (varied_dot, u_dot)
+        forcing = jax.jvp(lambda varied, u: at(varied, slot, slot.before, u, slot.y), given, given_dot)[1]
+        system, parameters, dt = numbers.whole(numbers.varied)
+        u = self.plan.inputs(parameters, slot.step, slot.before) if slot.u is None else slot.u
+        h = slot.fraction * dt
+        return along, linear_solver(system, slot.before, u, h, slot.y, self.tableau, along), forcing
+
+    def tangents(self, record: Record, changes: tuple) -> tuple[State, Array]:
+        """Tangents of the states after all slots and of their unknowns.
+
+        Args:
+            record: where.
+            changes: of what varies, of the slots' inputs, and of the first state.
+        """
+        varied_dot, u_dot, state_dot = changes
+        slots = record.slots
+
+        def body(state_dot: State, xs: tuple) -> tuple:
+            (along, solver, (residual_dot, end_dot)), accepted = xs
+            resting = jnp.zeros(slots.y.shape[1:], slots.y.dtype)
+            y_dot = -solver.solve(residual_dot + along(state_dot, resting)[0])
+            end = jax.tree.map(jnp.add, end_dot, along(state_dot, y_dot)[1])
+            end = jax.tree.map(partial(jnp.where, accepted), end, state_dot)
+            return end, (end, jnp.where(accepted, y_dot, 0.0))
+
+        each = partial(self.prepared, record.numbers, varied_dot)
+        maps = _in_chunks(each, (slots, u_dot), slots.y.shape[0])
+        return jax.lax.scan(body, state_dot, (maps, slots.accepted))[1]
+
+    def cotangents(self, record: Record, given: tuple[State, Array]) -> tuple:
+        """The transpose of `tangents`."""
+        return in_groups(self._in_kernels, record, given)
+
+    def _in_kernels(self, record: Record, given: tuple[State, Array]) -> tuple:
+        """One kernel for all slots; only for new factors if that would take too long to compile."""
+        several = partial(self._backward, as_one_kernel)
+        return as_one_kernel(partial(self._backward, _plainly), record, given, too_large=several)
+
+    def _backward(self, kernel: Callable, record: Record, given: tuple[State, Array]) -> tuple:
+        numbers, slots = record.numbers, record.slots
+
+        def body(carry: tuple, xs: tuple) -> tuple:
+            state_bar, varied_bar, past, factors = carry
+            slot, (end_bar, y_bar) = xs
+            end_bar = jax.tree.map(jnp.add, state_bar, end_bar)
+            bars, lam, factors = self._pulled(kernel, numbers, slot, end_bar, y_bar, past.guess, factors)
+            keep = partial(jnp.where, slot.accepted)
+            past = jax.tree.map(keep, past.followed_by(lam, factors.inertias), past)
+            more, before_bar, u_bar = bars
+            state_bar = jax.tree.map(keep, before_bar, end_bar)
+            varied_bar = jax.tree.map(lambda total, x: total + keep(x, jnp.zeros_like(x)), varied_bar, more)
+            u_bar = jax.tree.map(lambda x: keep(x, jnp.zeros_like(x)), u_bar)
+            return (state_bar, varied_bar, past, factors), u_bar
+
+        resting = jax.tree.map(lambda x: jnp.zeros_like(x[0]), slots.before)
+        start = resting, jax.tree.map(jnp.zeros_like, numbers.varied), Past.of(jnp.zeros_like(slots.y[0]))
+        (state_bar, varied_bar, *_), u_bar = jax.lax.scan(
+            body, (*start, record.factors), (slots, given), reverse=True
+        )
+        return varied_bar, u_bar, state_bar
+
+    def _pulled(
+        self,
+        kernel: Callable,
+        numbers: Numbers,
+        slot: Slot,
+        end_bar: State,
+        y_bar: Array,
+        guess: Array,
+        factors: Factors,
+    ) -> tuple[tuple, Array, Factors]:
+        """Cotangents of one slot: of what varies, of the state before it and of its inputs.
+
+        The multipliers of its equations solve J^T lam = -(cotangent of the unknowns); their guess is
+        extrapolated from those of the slots after it.
+        """
+        _, pull = jax.vjp(
+            lambda varied, state, u, y: self.outcome(numbers, varied, slot, state, u, y),
+            numbers.varied, slot.before, slot.u, slot.y,
+        )  # fmt: skip
+
+        def trip(carry: tuple) -> tuple:
+            lam, _, factors, at = carry
+            refresh = partial(self._refreshed, kernel, numbers, slot)
+            _, factors, at = jax.lax.while_loop(lambda c: c[0], refresh, (any_lane(at.wanting), factors, at))
+            *bars, gap = pull((lam, end_bar))
+            change = factors.solver.transpose().solve(gap + y_bar)
+            at = at.judged(factors, lam, change)
+            return jnp.where(at.moving, lam - change, lam), tuple(bars), factors, at
+
+        lam = jnp.where(jnp.all(jnp.isfinite(guess)), guess, 0.0)
+        nothing = jax.tree.map(jnp.zeros_like, (numbers.varied, slot.before, slot.u))
+        at = Correcting.first(slot.accepted, lam.dtype)
+        lam, bars, factors, at = jax.lax.while_loop(
+            lambda carry: any_lane(carry[-1].open), trip, (lam, nothing, factors, at)
+        )
+        lost = slot.accepted & ~at.done
+        bars = jax.tree.map(lambda x: jnp.where(lost, jnp.nan, x), bars)
+        return bars, lam, factors
+
+    def _refreshed(self, kernel: Callable, numbers: Numbers, slot: Slot, carry: tuple) -> tuple:
+        """New factors, for this slot."""
+
+        def renewed(numbers: Numbers, slot: Slot) -> Factors:
+            system, parameters, dt = numbers.whole(numbers.varied)
+            u = self.plan.inputs(parameters, slot.step, slot.before) if slot.u is None else slot.u
+            equations = prepare(system, slot.before, u, slot.fraction * dt, self.tableau)
+            form = system.structure.solver
+            if form not in BY_DIFFERENCES:
+                return factors_of(equations, form, equations.jacobian(slot.y))
+            steps = equations.probes()
+            points = jnp.concatenate([slot.y[None], slot.y + jnp.diag(steps)])
+            found = jax.lax.map(lambda y: equations.residual(y)[0], points)
+            return factors_of(equations, form, ((found[1:] - found[:1]) / steps[:, None]).T)
+
+        return jnp.array(False), kernel(renewed, numbers, slot), carry[2].refreshed()
+
+
+class Correcting(eqx.Module):
+    """Where the solution of a transposed system stands."""
+
+    correction: Float[Array, ""]
+    count: Int[Array, ""]
+    rounds: Int[Array, ""]
+    done: Bool[Array, ""]
+    wanting: Bool[Array, ""]
+    moving: Bool[Array, ""]
+    idle: Bool[Array, ""]
+
+    @classmethod
+    def first(cls, accepted: Bool[Array, ""], dtype: Any) -> "Correcting":
+        """Before the first correction; there is nothing to do for an attempt that failed."""
+        nought, no = jnp.array(0), jnp.array(False)
+        return cls(jnp.zeros((), dtype), nought, nought, ~accepted, no, no, ~accepted)
+
+    @property
+    def open(self) -> Bool[Array, ""]:
+        """Whether to go on."""
+        return ~self.done & ((self.rounds < ROUNDS) | ~self.wanting)
+
+    def refreshed(self) -> "Correcting":
+        """With new factors."""
+        nought = jnp.zeros_like(self.count)
+        return eqx.tree_at(
+            lambda c: (c.count, c.rounds, c.wanting),
+            self,
+            (nought, self.rounds + 1, jnp.zeros_like(self.wanting)),
+        )
+
+    def judged(self, factors: Factors, lam: Array, change: Array) -> "Correcting":
+        """After a correction has been found: done, or moving on by it, or in want of new factors."""
+        size, correction = (jnp.sqrt(jnp.sum(factors.inertias * x**2)) for x in (lam, change))
+        ratio = correction / jnp.where(self.correction > 0, self.correction, 1.0)
+        first = self.count == 0
+        finite = jnp.isfinite(correction) & jnp.isfinite(size)
+        stalled = ~first & (ratio > 0.5) & (correction <= STALL * size)
+        done = ((correction <= CLOSE * size) | stalled) & finite
+        late = correction * ratio**PATIENCE > CLOSE * size
+        slow = (~first & ((ratio > 0.5) | late)) | (self.count >= CORRECTIONS) | ~finite | ~factors.usable
+        slow = slow & ~done
+        found = Correcting(correction, self.count + 1, self.rounds, done, slow, ~done & ~slow, self.idle)
+        stay = eqx.tree_at(lambda c: c.moving, self, jnp.zeros_like(self.moving))
+        return jax.tree.map(partial(jnp.where, self.done), stay, found)
+
+
+def _plainly(function: Callable, *arguments: Any) -> Any:
+    return function(*arguments)
+
+
+def _in_chunks(function: Callable, slots: tuple, length: int) -> Any:
+    """The function of every slot, vmapped in chunks whose temporaries stay in the cache."""
+    every = jax.vmap(lambda x: function(*x))
+    if length <= CHUNK:
+        return every(slots)
+    chunks = -(-length // CHUNK)
+    padding = jnp.minimum(jnp.arange(chunks * CHUNK), length - 1)
+
+    def chunked(x: Array) -> Array:
+        return x[padding].reshape(chunks, CHUNK, *x.shape[1:])
+
+    found = jax.lax.map(every, jax.tree.map(chunked, slots))
+    return jax.tree.map(lambda x: x.reshape(chunks * CHUNK, *x.shape[2:])[:length], found)
+
+
+@partial(run_slots.defjvp, symbolic_zeros=True)
+def _run_slots_jvp(plan: Plan, primals: tuple, tangents: tuple):
+    system, state, parameters, dt = primals
+    system_dot, state_dot, parameters_dot, dt_dot = tangents
+    slots, ending = run_slots(plan, *primals)
+    state_dot = _instantiated(state_dot, state)
+    u = u_dot = None
+    if plan.control is None:
+        # Inputs are those of the slots, so that no slot sees all of them.
+        u, u_dot = (x[slots.step] for x in (parameters, _instantiated(parameters_dot, parameters)))
+        numbers, varied_dot = Numbers.of((system, None, dt), (system_dot, None, dt_dot))
+    else:
+        numbers, varied_dot = Numbers.of((system, parameters, dt), (system_dot, parameters_dot, dt_dot))
+    before = jax.tree.map(
+        lambda first, after: jnp.concatenate([first[None], after[:-1]]), state, slots.states
+    )
+    # Attempts that failed may hold anything: their maps are formed at rest, and then not used.
+    sound = jnp.where(slots.accepted[:, None], slots.y, 0.0)
+    record = Record(
+        numbers, Slot(before, sound, u, slots.step, slots.fraction, slots.accepted), ending.factors
+    )
+    rule = Rule(plan)
+    changes, outputs = (varied_dot, u_dot, state_dot), (slots.states, slots.y)
+    states_dot, y_dot = linear_pair.apply(rule.tangents, rule.cotangents, record, changes, outputs)
+    last_dot = jax.tree.map(lambda x: x[-1], states_dot)
+    slots_dot = jax.tree.map(_zero_tangent, slots)
+    slots_dot = eqx.tree_at(lambda s: (s.states, s.y), slots_dot, (states_dot, y_dot))
+    ending_dot = jax.tree.map(_zero_tangent, ending)
+    ending_dot = eqx.tree_at(lambda e: e.course.state, ending_dot, last_dot)
+    return (slots, ending), (slots_dot, ending_dot)

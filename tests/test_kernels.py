@@ -1,0 +1,150 @@
+"""Loops compiled into one kernel compute what they compute otherwise; what does not fit is left as it is."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import tolerances as tol
+
+import natcoord_jax as nc
+from natcoord_jax import gallery
+from natcoord_jax.maths.projectors import range_projector
+from natcoord_jax.stepping import linear_pair
+from natcoord_jax.stepping.one_kernel import LANES, as_one_kernel, in_groups
+
+MARK = "xla_cpu_small_call"
+MATRIX = np.random.default_rng(1).normal(size=(6, 6))
+INDEX = np.array([[4, 0], [1, 1], [0, 5], [1, 1]])
+
+
+def _looped(body):
+    return lambda x: jax.lax.fori_loop(0, 3, lambda i, x: body(x), x)
+
+
+def _bits(x):
+    """A number of 64 bits that no double holds."""
+    large = jnp.array(2**62 + 1)
+    return x + jax.lax.fori_loop(0, 2, lambda i, k: k - i, large) % 7
+
+
+BODIES = {
+    "product": lambda x: jnp.tanh(MATRIX @ x @ MATRIX),
+    "batched product": lambda x: jnp.tanh(jnp.einsum("ij,jk,jl->jkl", x, x, x).sum(0)),
+    "long sum": lambda x: jnp.tanh(x + jnp.sum(jnp.broadcast_to(x, (200, 6, 6)) * 0.01, axis=0)),
+    "update": lambda x: x.at[2, 1].set(0.5).at[1:3].add(x[3:5]),
+    "updates at equal places": lambda x: x.at[INDEX[:, 0], INDEX[:, 1]].add(0.1 * x[0, :4]),
+    "beyond the end": lambda x: x.at[jnp.array([2, 9])].add(1.0),
+    "rows": lambda x: x.at[jnp.array([3, 3, 1])].add(0.1 * x[:3]),
+    "branch": lambda x: jax.lax.cond(x[0, 0] > 0, lambda x: 0.5 * x, lambda x: x + 1.0, x),
+    "projector": lambda x: range_projector(x[:, :3], 2),
+    "integers": _bits,
+}
+
+
+@pytest.mark.parametrize("name", BODIES)
+def test_one_kernel_computes_the_same(name):
+    x = jnp.asarray(np.random.default_rng(0).normal(size=(6, 6)))
+    plain = _looped(BODIES[name])
+    kernel = jax.jit(lambda x: as_one_kernel(plain, x))
+    assert MARK in kernel.lower(x).as_text(), "not compiled into one kernel"
+    np.testing.assert_allclose(kernel(x), jax.jit(plain)(x), rtol=1e-13, atol=1e-13)
+    lanes = x[None] * jnp.linspace(0.5, 1.5, 2 * LANES + 3)[:, None, None]
+    several = jax.jit(jax.vmap(lambda x: in_groups(lambda x: as_one_kernel(plain, x), x)))
+    assert MARK in several.lower(lanes).as_text(), "lanes are not compiled into one kernel"
+    np.testing.assert_allclose(several(lanes), jax.vmap(plain)(lanes), rtol=1e-13, atol=1e-13)
+
+
+def test_what_calls_a_library_is_left_as_it_is():
+    x = jnp.asarray(MATRIX)
+    run = jax.jit(lambda x: as_one_kernel(_looped(jnp.linalg.inv), x))
+    assert MARK not in run.lower(x).as_text()
+    np.testing.assert_allclose(run(x), jnp.linalg.inv(x), rtol=1e-10)
+
+
+class Solved(nc.Force):
+    """A force that asks LAPACK."""
+
+    strength: float = 1.0
+
+    def load(self, x, rates, inputs, t):
+        return nc.Load(self.strength * jnp.linalg.solve(MATRIX[:3, :3], -rates[0])[None], None)
+
+
+def test_own_effect_that_calls_a_library():
+    scene = nc.Scene()
+    body = scene.add(nc.RigidBody(mass=1.0, inertia=(1.0, 2.0, 3.0), velocity=(1.0, 0.5, 0.2)))
+    scene.add(Solved((nc.Point(body),), strength=0.1))
+    system, state = scene.compile()
+    trajectory = nc.simulate(system, state, dt=0.01, steps=20)
+    matrix = np.linalg.inv(MATRIX[:3, :3]) * 0.1
+    wanted = np.array([1.0, 0.5, 0.2])
+    for _ in range(20):
+        wanted = np.linalg.solve(np.eye(3) + 0.005 * matrix, (np.eye(3) - 0.005 * matrix) @ wanted)
+    np.testing.assert_allclose(trajectory.v[-1, 0], wanted, rtol=1e-12)
+
+
+@pytest.mark.parametrize("name", list(gallery.SCENES))
+def test_every_scene_of_the_gallery_runs_in_one_kernel(name):
+    example = gallery.load(name)
+    inputs = example.inputs(4)
+    run = jax.jit(lambda s, x: nc.simulate(s, x, dt=example.dt, steps=4, inputs=inputs))
+    assert MARK in run.lower(example.system, example.state).as_text()
+
+
+def _forward(residuals, x):
+    """x -> sin(a) x, summed over a second copy."""
+    (a,) = residuals
+    return jnp.sin(a) * x, jnp.sum(a * x)
+
+
+def _backward(residuals, given):
+    (a,) = residuals
+    return jnp.sin(a) * given[0] + a * given[1]
+
+
+def test_linear_pair_in_every_mode():
+    a, x = jnp.array([0.3, 0.7, 1.1]), jnp.array([1.0, -2.0, 0.5])
+    shapes = jax.eval_shape(_forward, (a,), x)
+
+    def paired(a, x):
+        return linear_pair.apply(_forward, _backward, (a,), x, shapes)
+
+    def plain(a, x):
+        return _forward((a,), x)
+
+    def loss(f):
+        def value(a, x):
+            vector, number = f(a, x)
+            return jnp.sum(vector**3) + number**2
+
+        return value
+
+    for make in (
+        lambda f: f(a, x),
+        lambda f: jax.grad(loss(f), argnums=(0, 1))(a, x),
+        lambda f: jax.hessian(loss(f), argnums=(0, 1))(a, x),
+        lambda f: jax.jacrev(jax.jacrev(loss(f)))(a, x),
+        lambda f: jax.jit(jax.vmap(jax.grad(loss(f), argnums=(0, 1)), in_axes=(None, 0)))(
+            a, jnp.stack([x, 2 * x])
+        ),
+        lambda f: jax.vmap(jax.grad(loss(f), argnums=(0, 1)), in_axes=(0, None))(jnp.stack([a, 2 * a]), x),
+    ):
+        found, wanted = make(paired), make(plain)
+        assert eqx.tree_equal(found, wanted, rtol=1e-12, atol=1e-12), (found, wanted)
+
+
+def test_gradients_of_stiff_and_coarse_steps_are_solved_to_the_end():
+    """Factors of other steps serve badly here: the transposed systems need their own."""
+    example = gallery.load("open_tree")
+
+    def end(scale):
+        state = eqx.tree_at(lambda s: s.v, example.state, scale * example.state.v)
+        return jnp.sum(nc.simulate(example.system, state, dt=0.1, steps=12).q[-1] ** 2)
+
+    one = jnp.array(1.0)
+    step = 1e-4
+    difference = (end(one + step) - end(one - step)) / (2 * step)
+    forward = jax.jvp(end, (one,), (one,))[1]
+    np.testing.assert_allclose(jax.grad(end)(one), forward, rtol=tol.EXACT_GRADIENT)
+    np.testing.assert_allclose(forward, difference, rtol=1e-5)
