@@ -10,7 +10,7 @@ import tolerances as tol
 import natcoord_jax as nc
 from natcoord_jax import gallery
 from natcoord_jax.maths.projectors import range_projector
-from natcoord_jax.stepping import linear_pair
+from natcoord_jax.stepping import linear_pair, one_kernel
 from natcoord_jax.stepping.one_kernel import LANES, as_one_kernel, in_groups
 
 MARK = "xla_cpu_small_call"
@@ -81,6 +81,27 @@ def test_own_effect_that_calls_a_library():
     wanted = np.array([1.0, 0.5, 0.2])
     for _ in range(20):
         wanted = np.linalg.solve(np.eye(3) + 0.005 * matrix, (np.eye(3) - 0.005 * matrix) @ wanted)
+    np.testing.assert_allclose(trajectory.v[-1, 0], wanted, rtol=1e-12)
+
+
+class Sorted(nc.Force):
+    """A force that sorts, which does not compile into one kernel."""
+
+    def load(self, x, rates, inputs, t):
+        return nc.Load(-jnp.sort(rates), None)
+
+
+def test_goes_on_when_the_compiler_refuses(monkeypatch):
+    monkeypatch.setattr(one_kernel, "KNOWN", one_kernel.KNOWN | {"sort"})
+    monkeypatch.setattr(one_kernel, "_refused", [])
+    jax.clear_caches()
+    scene = nc.Scene()
+    body = scene.add(nc.RigidBody(mass=1.0, inertia=(1.0, 2.0, 3.0), velocity=(0.2, 0.2, 0.2)))
+    scene.add(Sorted((nc.Point(body),)))
+    system, state = scene.compile()
+    with pytest.warns(UserWarning, match="goes on with many"):
+        trajectory = nc.simulate(system, state, dt=0.01, steps=20)
+    wanted = 0.2 * ((1 - 0.005) / (1 + 0.005)) ** 20
     np.testing.assert_allclose(trajectory.v[-1, 0], wanted, rtol=1e-12)
 
 

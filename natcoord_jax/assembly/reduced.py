@@ -26,15 +26,14 @@ from natcoord_jax.assembly.tree import (
     JointGeometry,
     TreeMotion,
     gather_slots,
-    joint_rates,
     project,
+    start_rates,
     sweep_motion,
 )
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
-from natcoord_jax.maths.collocation import Tableau, gauss
+from natcoord_jax.maths.collocation import Tableau
 from natcoord_jax.maths.projectors import range_projector
-from natcoord_jax.maths.vectors import cross
 
 PROBE = 1e-6
 """Change of a rotation [rad] that gives a column of the Jacobian."""
@@ -160,16 +159,10 @@ class ReducedStep(eqx.Module):
         residual = jnp.concatenate([generalised.reshape(-1), rows])
         return Evaluation(residual, found.size, at, found.power)
 
-    def _start_geometry(self) -> list[JointGeometry]:
-        zero = jnp.zeros((1, self.system.structure.unknowns), self.start.dtype)
-        slots = gather_slots(self.system.tree, zero)
-        return sweep_motion(self.system.tree, self.frames, self.start, slots, 0.0 * self.h, gauss(1))[1]
-
     def guess(self) -> Float[Array, " unknowns"]:
         """Rates of the velocities at the start, repeated for every stage; multipliers zero."""
-        spin = 0.5 * jnp.sum(cross(self.start[:, 1:], self.velocity[:, 1:]), axis=1)[None]
-        w = joint_rates(self.system.tree, self._start_geometry(), self.velocity[None, :, 0], spin)
-        w = jnp.tile(w.reshape(-1), self.tableau.stages)
+        w = start_rates(self.system.tree, self.frames, self.start, self.velocity)
+        w = jnp.tile(w, self.tableau.stages)
         return jnp.concatenate([w, jnp.zeros(self.system.structure.multipliers * self.tableau.stages)])
 
     def jacobian(self, y: Float[Array, " unknowns"]) -> Float[Array, "unknowns unknowns"]:

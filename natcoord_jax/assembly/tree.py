@@ -275,33 +275,27 @@ def project(
     return generalised, joined[1], joined[2]
 
 
-def joint_rates(
+def start_rates(
     tree: Tree,
-    geometry: list[JointGeometry],
-    velocity: Float[Array, "s bodies 3"],
-    spin: Float[Array, "s bodies 3"],
-) -> Float[Array, "s unknowns"]:
-    """Rates of the free motions of given body velocities.
+    frames: Float[Array, "bodies 2 4 4"],
+    rows: Float[Array, "bodies 4 3"],
+    velocity: Float[Array, "bodies 4 3"],
+) -> Float[Array, " unknowns"]:
+    """Rates of the free motions of given rows and velocities, of all bodies at once.
 
-    The left inverse of `tangent` where axes are orthonormal, that is, at the ends of a step.
+    The left inverse of the map from rates to velocities where axes are orthonormal, that is, between steps.
     """
-    columns, spins, velocities = [], [], []
-    for level, joint in zip(tree.levels, geometry):
-        here = slice(level.start, level.stop)
-        own_spin, own_velocity = spin[:, here], velocity[:, here]
-        relative = own_spin
-        gap_rate = own_velocity + cross(own_spin, joint.child_arm)
-        if not level.grounded:
-            up = tree.parent_in_level[here]
-            relative = own_spin - spins[-1][:, up]
-            gap_rate = gap_rate - velocities[-1][:, up]
-            gap_rate = gap_rate - cross(spins[-1][:, up], joint.parent_arm + joint.gap)
-        spins.append(own_spin)
-        velocities.append(own_velocity)
-        sources = [relative] * len(level.rotations) + [gap_rate] * len(level.translations)
-        sources += [relative] * level.child_rotation
-        rates = {slot: dot(x, joint.axes[:, :, i]) for i, (slot, x) in enumerate(zip(level.slots, sources))}
-        zero = jnp.zeros_like(own_spin[..., 0])
-        columns.append(jnp.stack([rates.get(slot, zero) for slot in range(SLOTS)], axis=-1))
-    slots = jnp.concatenate(columns, axis=1)
-    return slots.reshape(slots.shape[0], -1)[:, tree.slot_of]
+    ground = jnp.concatenate([jnp.zeros((1, 3)), jnp.eye(3)]).astype(rows.dtype)[None]
+    every, moving = jnp.concatenate([rows, ground]), jnp.concatenate([velocity, jnp.zeros_like(ground)])
+    spin = 0.5 * jnp.sum(cross(every[:, 1:], moving[:, 1:]), axis=1)
+    parent, spin_p = every[tree.parent], spin[tree.parent]
+    parent_axes = _frame_axes(frames[:, 0, 1:, 1:], parent[None, :, 1:])[0]
+    own_axes = _frame_axes(frames[:, 1, 1:, 1:], rows[None, :, 1:])[0]
+    child_arm = _combine(frames[:, 1, 0, 1:], rows[:, 1:])
+    apart = rows[:, 0] + child_arm - parent[:, 0]
+    relative = spin[:-1] - spin_p
+    gap_rate = velocity[:, 0] + cross(spin[:-1], child_arm) - moving[tree.parent][:, 0] - cross(spin_p, apart)
+    axes = jnp.where(tree.ball[:, None, None], own_axes, parent_axes)
+    turning, sliding = dot(relative[:, None], axes), dot(gap_rate[:, None], axes)
+    slots = jnp.concatenate([turning, sliding, dot(relative, own_axes[:, 0])[:, None]], axis=1)
+    return slots.reshape(-1)[tree.slot_of]

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from natcoord_jax.maths.vectors import safe_norm
+from natcoord_jax.maths.vectors import safe_divide, safe_norm
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(1,))
@@ -28,9 +28,9 @@ def range_projector(matrix: Float[Array, "m n"], rank: int) -> Float[Array, "m m
         sizes = jnp.sum(rest**2, axis=0)
         vector = rest[:, jnp.argmax(sizes)]
         # Twice is enough: what is left is orthogonal to round-off.
-        vector = vector / safe_norm(vector)
+        vector = safe_divide(vector, safe_norm(vector))
         vector = vector - projector @ vector
-        vector = vector / safe_norm(vector)
+        vector = safe_divide(vector, safe_norm(vector))
         rest = rest - vector[:, None] * (vector @ rest)[None, :]
         return rest, projector + vector[:, None] * vector[None, :]
 

@@ -145,7 +145,9 @@ def refreshed(it: Iterate) -> Iterate:
     )
 
 
-def judge(factors: Factors, tolerance: Any, it: Iterate, residual: Array, size: Array) -> Iterate:
+def judge(
+    factors: Factors, tolerance: Any, it: Iterate, residual: Array, size: Array, *, balances: bool
+) -> Iterate:
     """What follows from one evaluation of the equations at `it.y`.
 
     Args:
@@ -154,6 +156,8 @@ def judge(factors: Factors, tolerance: Any, it: Iterate, residual: Array, size: 
         it: where the iteration stands.
         residual: of the equations.
         size: of their terms.
+        balances: whether the residual itself counts, too. An error of multipliers alone moves nothing, but
+            shows in the balances, and in the work of drives.
 
     Returns:
         Converged; or moved by one correction; or in want of new factors, when corrections shrink too slowly
@@ -161,6 +165,9 @@ def judge(factors: Factors, tolerance: Any, it: Iterate, residual: Array, size: 
     """
     change = factors.solver.solve(residual)
     energies = factors.inertias * change**2
+    if balances:
+        real = factors.inertias > 0
+        energies = energies + jnp.where(real, residual**2 / jnp.where(real, factors.inertias, 1.0), 0.0)
     correction = jnp.sqrt(jnp.sum(energies))
     first = it.count == 0
     ratio = correction / jnp.where(it.correction > 0, it.correction, 1.0)
@@ -217,7 +224,7 @@ def newton(equations: Any, tolerance: float, form: str) -> tuple[Float[Array, " 
 
     def trip(carry: tuple[Iterate, Factors]) -> tuple[Iterate, Factors]:
         it, factors = jax.lax.cond(any_lane(carry[0].wanting), renew, keep, *carry)
-        return judge(factors, tolerance, it, *equations.residual(it.y)), factors
+        return judge(factors, tolerance, it, *equations.residual(it.y), balances=True), factors
 
     with jax.named_scope("newton"):
         start = begin(equations.guess())

@@ -97,8 +97,31 @@ def in_groups(function: Callable, *arguments: Any) -> Any:
     return _flat(_grouped, *jax.make_jaxpr(function, return_shape=True)(*arguments), arguments)
 
 
+REFUSALS = ("UNIMPLEMENTED", "Failed to materialize symbols")
+"""What the compiler says when it cannot make one kernel of a program."""
+
+_refused: list[str] = []
+"""What the compiler said when it could not do it, see `give_up`."""
+
+
+def give_up(reason: str) -> bool:
+    """Compile as usual from now on, in this process, if that is what the compiler could not do.
+
+    Args:
+        reason: what the compiler said.
+
+    Returns:
+        Whether anything has changed, so that it is worth to try again.
+    """
+    if _refused or not any(words in reason for words in REFUSALS):
+        return False
+    _refused.append(reason)
+    jax.clear_caches()
+    return True
+
+
 def _on_cpu() -> bool:
-    return jax.default_backend() == "cpu" and _attributed is not None
+    return jax.default_backend() == "cpu" and _attributed is not None and not _refused
 
 
 def _flat(transform: Callable, program: Any, shapes: Any, arguments: tuple) -> Any:
@@ -224,8 +247,9 @@ def operations(program: Any) -> int:
     return sum(1 + sum(map(operations, _inner_programs(equation))) for equation in program.eqns)
 
 
-def known(program: Any, names: frozenset[str] = KNOWN) -> bool:
-    """Whether a program holds nothing but the operations of these names."""
+def known(program: Any, names: frozenset[str] | None = None) -> bool:
+    """Whether a program holds nothing but the operations of these names, by default `KNOWN`."""
+    names = KNOWN if names is None else names
     return all(
         equation.primitive.name in names and all(known(inner, names) for inner in _inner_programs(equation))
         for equation in program.eqns

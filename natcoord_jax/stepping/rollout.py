@@ -298,7 +298,8 @@ def _trip(setting: Setting, course: Course, factors: Factors, probe: Probe | Non
     equations = prepare(setting.system, course.state, u, h, gauss(plan.stages))
     found = equations.evaluate(it.y if probe is None else probe.moved(it.y, equations))
     probing = jnp.array(False) if probe is None else probe.at >= 0
-    judged = judge(factors, plan.tolerance, it, found.residual, found.size)
+    driven = any(group.multipliers and group.effect.works for group in equations.groups)
+    judged = judge(factors, plan.tolerance, it, found.residual, found.size, balances=driven)
     it = jax.tree.map(partial(jnp.where, probing), it, judged)
     ending = ~probing & ~any_lane(it.unsolved & ~over)
     wanting = ~probing & ~ending & any_lane(it.wanting & it.unsolved & ~over)

@@ -1,6 +1,7 @@
 """The public entrances: one step, and a rollout."""
 
 import math
+import warnings
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -15,6 +16,7 @@ from natcoord_jax.assembly.system import System
 from natcoord_jax.core.checks import at_top_level, is_concrete
 from natcoord_jax.core.results import REASONS, REMEDIES, Result, SimulationError
 from natcoord_jax.core.state import State, Trajectory
+from natcoord_jax.stepping import one_kernel
 from natcoord_jax.stepping.derivative import run_slots
 from natcoord_jax.stepping.newton import TOLERANCE
 from natcoord_jax.stepping.rollout import Plan, Slots
@@ -234,7 +236,18 @@ def simulate(
     arrays = eqx.filter((system, state, checked, step), eqx.is_array)
     outermost = at_top_level(arrays) and jax.default_backend() == "cpu"
     compiled = _compiled_quickly if outermost else _compiled_within
-    trajectory = compiled(system, state, checked, step, static)
+    try:
+        trajectory = compiled(system, state, checked, step, static)
+    except jax.errors.JaxRuntimeError as error:
+        # Another version of the compiler may lack what one kernel needs.
+        if not one_kernel.give_up(str(error)):
+            raise
+        warnings.warn(
+            "the compiler cannot make one kernel of this rollout and goes on with many, which is slower: "
+            f"{str(error).splitlines()[0]}; please report it with your version of jax, {jax.__version__}",
+            stacklevel=2,
+        )
+        trajectory = compiled(system, state, checked, step, static)
     if throw and is_concrete(trajectory.result):
         system.raise_on_failure(trajectory)
     return trajectory
