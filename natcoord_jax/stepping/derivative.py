@@ -229,13 +229,15 @@ class Rule:
             numbers.varied, slot.before, slot.u, slot.y,
         )  # fmt: skip
 
+        patience = PATIENCE[numbers.whole(numbers.varied)[0].structure.solver]
+
         def trip(carry: tuple) -> tuple:
             lam, _, factors, at = carry
             refresh = partial(self._refreshed, kernel, numbers, slot)
             _, factors, at = jax.lax.while_loop(lambda c: c[0], refresh, (any_lane(at.wanting), factors, at))
             *bars, gap = pull((lam, end_bar))
             change = factors.solver.transpose().solve(gap + y_bar)
-            at = at.judged(factors, lam, change)
+            at = at.judged(factors, lam, change, patience)
             return jnp.where(at.moving, lam - change, lam), tuple(bars), factors, at
 
         lam = jnp.where(jnp.all(jnp.isfinite(guess)), guess, 0.0)
@@ -297,7 +299,7 @@ class Correcting(eqx.Module):
             (nought, self.rounds + 1, jnp.zeros_like(self.wanting)),
         )
 
-    def judged(self, factors: Factors, lam: Array, change: Array) -> "Correcting":
+    def judged(self, factors: Factors, lam: Array, change: Array, patience: int) -> "Correcting":
         """After a correction has been found: done, or moving on by it, or in want of new factors."""
         size, correction = (jnp.sqrt(jnp.sum(factors.inertias * x**2)) for x in (lam, change))
         ratio = correction / jnp.where(self.correction > 0, self.correction, 1.0)
@@ -305,7 +307,7 @@ class Correcting(eqx.Module):
         finite = jnp.isfinite(correction) & jnp.isfinite(size)
         stalled = ~first & (ratio > 0.5) & (correction <= STALL * size)
         done = ((correction <= CLOSE * size) | stalled) & finite
-        late = correction * ratio**PATIENCE > CLOSE * size
+        late = correction * ratio**patience > CLOSE * size
         slow = (~first & ((ratio > 0.5) | late)) | (self.count >= CORRECTIONS) | ~finite | ~factors.usable
         slow = slow & ~done
         found = Correcting(correction, self.count + 1, self.rounds, done, slow, ~done & ~slow, self.idle)

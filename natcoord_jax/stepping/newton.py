@@ -37,8 +37,8 @@ NEWTON_ROUNDS = 25
 SLOWEST_UNSEEN = 0.02
 """Contraction assumed at least: a slow part of the error may hide behind fast ones in the first ratio."""
 
-PATIENCE = 6
-"""Corrections that are cheaper than a new Jacobian."""
+PATIENCE = {"reduced": 6, "full": 6, "recursive": 10}
+"""Corrections that are cheaper than a new Jacobian, by form of the equations."""
 
 
 @jax.custom_batching.custom_vmap
@@ -146,7 +146,14 @@ def refreshed(it: Iterate) -> Iterate:
 
 
 def judge(
-    factors: Factors, tolerance: Any, it: Iterate, residual: Array, size: Array, *, balances: bool
+    factors: Factors,
+    tolerance: Any,
+    it: Iterate,
+    residual: Array,
+    size: Array,
+    *,
+    balances: bool,
+    patience: int,
 ) -> Iterate:
     """What follows from one evaluation of the equations at `it.y`.
 
@@ -158,6 +165,7 @@ def judge(
         size: of their terms.
         balances: whether the residual itself counts, too. An error of multipliers alone moves nothing, but
             shows in the balances, and in the work of drives.
+        patience: see `PATIENCE`.
 
     Returns:
         Converged; or moved by one correction; or in want of new factors, when corrections shrink too slowly
@@ -179,7 +187,7 @@ def judge(
     solved = (
         (correction <= tolerance * size) | stalled | (it.last & (correction <= STALL_OLD * tolerance * size))
     )
-    slow = ~first & ((ratio > 0.5) | (correction * ratio**PATIENCE > tolerance * size))
+    slow = ~first & ((ratio > 0.5) | (correction * ratio**patience > tolerance * size))
     slow = slow | (it.count >= CHORD_ITERATIONS) | ~factors.usable
     # Old factors may have led astray: new ones begin where the first did.
     lost = ~finite & ~factors.fresh
@@ -224,7 +232,9 @@ def newton(equations: Any, tolerance: float, form: str) -> tuple[Float[Array, " 
 
     def trip(carry: tuple[Iterate, Factors]) -> tuple[Iterate, Factors]:
         it, factors = jax.lax.cond(any_lane(carry[0].wanting), renew, keep, *carry)
-        return judge(factors, tolerance, it, *equations.residual(it.y), balances=True), factors
+        return judge(
+            factors, tolerance, it, *equations.residual(it.y), balances=True, patience=PATIENCE[form]
+        ), factors
 
     with jax.named_scope("newton"):
         start = begin(equations.guess())

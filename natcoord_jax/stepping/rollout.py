@@ -24,6 +24,7 @@ from natcoord_jax.core.results import Result
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import gauss
 from natcoord_jax.stepping.newton import (
+    PATIENCE,
     Factors,
     Iterate,
     any_lane,
@@ -299,7 +300,8 @@ def _trip(setting: Setting, course: Course, factors: Factors, probe: Probe | Non
     found = equations.evaluate(it.y if probe is None else probe.moved(it.y, equations))
     probing = jnp.array(False) if probe is None else probe.at >= 0
     driven = any(group.multipliers and group.effect.works for group in equations.groups)
-    judged = judge(factors, plan.tolerance, it, found.residual, found.size, balances=driven)
+    options = {"balances": driven, "patience": PATIENCE[setting.form]}
+    judged = judge(factors, plan.tolerance, it, found.residual, found.size, **options)
     it = jax.tree.map(partial(jnp.where, probing), it, judged)
     ending = ~probing & ~any_lane(it.unsolved & ~over)
     wanting = ~probing & ~ending & any_lane(it.wanting & it.unsolved & ~over)
