@@ -218,7 +218,12 @@ def test_reverse_over_reverse_is_exact_or_refused():
     assert abs(found - second("forward over reverse")(p, d)) <= tol.SAME_GRADIENT * abs(found)
 
 
-@pytest.mark.parametrize("mode", ["value", "tangent", "gradient", *SECOND])
+USUAL = ("value", "tangent", "gradient", "forward over reverse")
+
+
+@pytest.mark.parametrize(
+    "mode", [*USUAL, *(pytest.param(m, marks=pytest.mark.slow) for m in SECOND if m not in USUAL)]
+)
 def test_batches(mode):
     """vmap of each equals the loop."""
     singles = {

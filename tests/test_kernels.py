@@ -105,7 +105,12 @@ def test_goes_on_when_the_compiler_refuses(monkeypatch):
     np.testing.assert_allclose(trajectory.v[-1, 0], wanted, rtol=1e-12)
 
 
-@pytest.mark.parametrize("name", list(gallery.SCENES))
+USUAL = ("spacecraft", "four_bar", "chain")
+
+
+@pytest.mark.parametrize(
+    "name", [n if n in USUAL else pytest.param(n, marks=pytest.mark.slow) for n in gallery.SCENES]
+)
 def test_every_scene_of_the_gallery_runs_in_one_kernel(name):
     example = gallery.load(name)
     inputs = example.inputs(4)
@@ -155,6 +160,7 @@ def test_linear_pair_in_every_mode():
         assert eqx.tree_equal(found, wanted, rtol=1e-12, atol=1e-12), (found, wanted)
 
 
+@pytest.mark.slow
 def test_gradients_of_stiff_and_coarse_steps_are_solved_to_the_end():
     """Factors of other steps serve badly here: the transposed systems need their own."""
     example = gallery.load("open_tree")
