@@ -27,7 +27,9 @@ from natcoord_jax.maths.collocation import gauss
 from natcoord_jax.stepping import linear_pair
 from natcoord_jax.stepping.newton import PATIENCE, Factors, any_lane, factors_of
 from natcoord_jax.stepping.one_kernel import as_one_kernel, in_groups
-from natcoord_jax.stepping.rollout import BY_DIFFERENCES, Ending, Past, Plan, Slots, run
+from natcoord_jax.stepping.past import Past
+from natcoord_jax.stepping.probe import BY_DIFFERENCES, jacobian_by_differences
+from natcoord_jax.stepping.rollout import Ending, Plan, Slots, run
 from natcoord_jax.stepping.step import advance, linear_solver
 
 CHUNK = 32
@@ -260,10 +262,7 @@ class Rule:
             form = system.structure.solver
             if form not in BY_DIFFERENCES:
                 return factors_of(equations, form, equations.jacobian(slot.y))
-            steps = equations.probes()
-            points = jnp.concatenate([slot.y[None], slot.y + jnp.diag(steps)])
-            found = jax.lax.map(lambda y: equations.residual(y)[0], points)
-            return factors_of(equations, form, ((found[1:] - found[:1]) / steps[:, None]).T)
+            return factors_of(equations, form, jacobian_by_differences(equations, slot.y))
 
         return jnp.array(False), kernel(renewed, numbers, slot), carry[2].refreshed()
 
@@ -277,13 +276,12 @@ class Correcting(eqx.Module):
     done: Bool[Array, ""]
     wanting: Bool[Array, ""]
     moving: Bool[Array, ""]
-    idle: Bool[Array, ""]
 
     @classmethod
     def first(cls, accepted: Bool[Array, ""], dtype: Any) -> "Correcting":
         """Before the first correction; there is nothing to do for an attempt that failed."""
         nought, no = jnp.array(0), jnp.array(False)
-        return cls(jnp.zeros((), dtype), nought, nought, ~accepted, no, no, ~accepted)
+        return cls(jnp.zeros((), dtype), nought, nought, ~accepted, no, no)
 
     @property
     def open(self) -> Bool[Array, ""]:
@@ -310,7 +308,7 @@ class Correcting(eqx.Module):
         late = correction * ratio**patience > CLOSE * size
         slow = (~first & ((ratio > 0.5) | late)) | (self.count >= CORRECTIONS) | ~finite | ~factors.usable
         slow = slow & ~done
-        found = Correcting(correction, self.count + 1, self.rounds, done, slow, ~done & ~slow, self.idle)
+        found = Correcting(correction, self.count + 1, self.rounds, done, slow, ~done & ~slow)
         stay = eqx.tree_at(lambda c: c.moving, self, jnp.zeros_like(self.moving))
         return jax.tree.map(partial(jnp.where, self.done), stay, found)
 

@@ -6,7 +6,7 @@ call that carries the attribute `xla_cpu_small_call` is compiled into one functi
 (the compiler's own pass does so with tiny loops). That works for programs without calls into libraries,
 and only if every argument is used; so
 
-- small products and single-window scatters are rewritten as sums and as updates of slices,
+- small products are rewritten as sums, scatters as updates of slices, long reductions as loops,
 - a program that holds anything else than the operations known to work is left as it is,
 - all arguments travel in one array.
 
@@ -66,7 +66,7 @@ REDUCTION_LIMIT = 3000
 """Numbers from which on the compiler hands a reduction to a library (seen: 4096)."""
 
 REDUCTIONS = {"reduce_sum": jnp.add, "reduce_max": jnp.maximum, "reduce_min": jnp.minimum}
-"""Reductions that are written as pairwise operations."""
+"""Reductions that are written as loops where they are long."""
 
 REWRITTEN = frozenset(("dot_general", "scatter", "scatter-add", *INLINED))
 """Primitives that may be rewritten in terms of those."""

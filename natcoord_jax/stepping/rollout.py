@@ -1,4 +1,4 @@
-"""The rollout: steps, retries in substeps, events, and its derivative.
+"""The rollout: steps, retries in substeps and events.
 
 A rollout is a loop over slots; one slot is one attempt at one (sub)step. As long as every attempt succeeds,
 slots are steps. A failed attempt is repeated with half the substep in the next slot; spare slots at the end
@@ -35,14 +35,12 @@ from natcoord_jax.stepping.newton import (
     refreshed,
 )
 from natcoord_jax.stepping.one_kernel import as_one_kernel
+from natcoord_jax.stepping.past import Past
+from natcoord_jax.stepping.probe import BY_DIFFERENCES, Probe
 from natcoord_jax.stepping.step import end_of_step
 
 SMALLEST_FRACTION = 1.0 / 64
 """A step is given up when a substep of this fraction of it fails."""
-
-
-BY_DIFFERENCES = ("reduced",)
-"""Forms whose Jacobian is formed by differences; others have formulas for it."""
 
 LARGEST_HALF_TURN = 10.0
 """Tangent of half the largest rotation of a body in one (sub)step, 169 degrees: beyond lies the pole."""
@@ -95,48 +93,6 @@ class Slots(eqx.Module):
     finished: Int[Array, "*slots"]
 
 
-class Past(eqx.Module):
-    """Solutions of the last steps, as backward differences, from which the next is guessed.
-
-    The sum of the differences up to an order extrapolates by a polynomial of that order; what it misses is
-    the next difference.
-
-    Attributes:
-        differences: of order 0 (the last solution), 1, ...
-        known: how many of them there are.
-        order: of the polynomial that would have guessed the last solution best.
-    """
-
-    differences: tuple[Float[Array, " unknowns"], ...]
-    known: Int[Array, ""]
-    order: Int[Array, ""]
-
-    @classmethod
-    def of(cls, y: Float[Array, " unknowns"]) -> "Past":
-        """One solution."""
-        rest = (jnp.zeros_like(y),) * ORDER
-        return cls((y, *rest), jnp.array(1), jnp.array(0))
-
-    @property
-    def guess(self) -> Float[Array, " unknowns"]:
-        """Extrapolated by the polynomial that was best last time."""
-        terms = [jnp.where(k <= self.order, d, 0.0) for k, d in enumerate(self.differences)]
-        return sum(terms[1:], terms[0])
-
-    def followed_by(self, y: Float[Array, " unknowns"], inertias: Float[Array, " unknowns"]) -> "Past":
-        """The past after a step with the solution `y`."""
-        found = [y]
-        for difference in self.differences:
-            found.append(found[-1] - difference)
-        errors = jnp.stack([jnp.sum(inertias * d**2) for d in found[1:]])
-        errors = jnp.where(jnp.arange(ORDER + 1) < self.known, errors, jnp.inf)
-        return Past(tuple(found[:-1]), jnp.minimum(self.known + 1, ORDER + 1), jnp.argmin(errors))
-
-
-ORDER = 3
-"""Largest order of the polynomials that guess the next solution."""
-
-
 class Course(eqx.Module):
     """Where a rollout stands: carried from slot to slot.
 
@@ -158,49 +114,6 @@ class Course(eqx.Module):
     residual: Float[Array, ""]
 
 
-class Probe(eqx.Module):
-    """A Jacobian in the making, by differences; the same in all lanes but for its numbers.
-
-    Attributes:
-        at: -1: none in the making; 0: the residual itself is evaluated; k: column k.
-        residual: at the unknowns.
-        columns: found so far, one a row; what is evaluated at other times goes to the last row.
-    """
-
-    at: Int[Array, ""]
-    residual: Float[Array, " unknowns"]
-    columns: Float[Array, "rows unknowns"]
-
-    @classmethod
-    def first(cls, size: int, dtype: Any) -> "Probe":
-        """Before the first Jacobian."""
-        return cls(jnp.array(0), jnp.zeros(size, dtype), jnp.zeros((size + 1, size), dtype))
-
-    def moved(self, y: Float[Array, " unknowns"], equations: Any) -> Float[Array, " unknowns"]:
-        """Where the equations are evaluated next."""
-        return y + jnp.where(jnp.arange(y.shape[0]) == self.at - 1, equations.probes(), 0.0)
-
-    def with_column(
-        self, residual: Float[Array, " unknowns"], equations: Any, wanting: Bool[Array, ""]
-    ) -> tuple["Probe", Bool[Array, ""]]:
-        """After an evaluation: the next state, and whether the Jacobian is complete.
-
-        Args:
-            residual: found.
-            equations: of the step.
-            wanting: whether a Jacobian is wanted; never while one is in the making.
-        """
-        size = residual.shape[0]
-        base = jnp.where(self.at == 0, residual, self.residual)
-        steps = jnp.append(equations.probes(), 1.0)
-        row = jnp.where(self.at > 0, self.at - 1, size)
-        quotient = (residual - base) / steps[row]
-        columns = jax.lax.dynamic_update_index_in_dim(self.columns, quotient, row, 0)
-        complete = self.at == size
-        further = jnp.where((self.at >= 0) & ~complete, self.at + 1, -1)
-        return Probe(jnp.where(wanting, 0, further), base, columns), complete
-
-
 class Setting(eqx.Module):
     """What stays the same over a rollout."""
 
@@ -218,11 +131,6 @@ class Setting(eqx.Module):
         h = jnp.where(self.over(course), 1e-3, course.fraction * self.dt)
         index = jnp.minimum(course.step, self.plan.steps - 1)
         return self.plan.inputs(self.parameters, index, course.state), h, index
-
-    def equations(self, course: Course) -> Any:
-        """The equations of the (sub)step at hand."""
-        u, h, _ = self.situation(course)
-        return prepare(self.system, course.state, u, h, gauss(self.plan.stages))
 
     @property
     def form(self) -> str:

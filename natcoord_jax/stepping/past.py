@@ -1,0 +1,46 @@
+"""Guesses of the next solution from those of the last steps."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+ORDER = 3
+"""Largest order of the polynomials that guess the next solution."""
+
+
+class Past(eqx.Module):
+    """Solutions of the last steps, as backward differences, from which the next is guessed.
+
+    The sum of the differences up to an order extrapolates by a polynomial of that order; what it misses is
+    the next difference.
+
+    Attributes:
+        differences: of order 0 (the last solution), 1, ...
+        known: how many of them there are.
+        order: of the polynomial that would have guessed the last solution best.
+    """
+
+    differences: tuple[Float[Array, " unknowns"], ...]
+    known: Int[Array, ""]
+    order: Int[Array, ""]
+
+    @classmethod
+    def of(cls, y: Float[Array, " unknowns"]) -> "Past":
+        """One solution."""
+        rest = (jnp.zeros_like(y),) * ORDER
+        return cls((y, *rest), jnp.array(1), jnp.array(0))
+
+    @property
+    def guess(self) -> Float[Array, " unknowns"]:
+        """Extrapolated by the polynomial that was best last time."""
+        terms = [jnp.where(k <= self.order, d, 0.0) for k, d in enumerate(self.differences)]
+        return sum(terms[1:], terms[0])
+
+    def followed_by(self, y: Float[Array, " unknowns"], inertias: Float[Array, " unknowns"]) -> "Past":
+        """The past after a step with the solution `y`."""
+        found = [y]
+        for difference in self.differences:
+            found.append(found[-1] - difference)
+        errors = jnp.stack([jnp.sum(inertias * d**2) for d in found[1:]])
+        errors = jnp.where(jnp.arange(ORDER + 1) < self.known, errors, jnp.inf)
+        return Past(tuple(found[:-1]), jnp.minimum(self.known + 1, ORDER + 1), jnp.argmin(errors))
