@@ -6,6 +6,21 @@ from natcoord_jax.analysis import Balance, balance
 from natcoord_jax.assembly.posing import random_state
 from natcoord_jax.assembly.system import System
 from natcoord_jax.bodies import Box, Cylinder, Ellipsoid, PointMass, RigidBody, Sphere
+from natcoord_jax.control import (
+    Guess,
+    OptimalControl,
+    Outcome,
+    Parameter,
+    Solution,
+    bounds,
+    cost,
+    goal,
+    inputs,
+    load_guess,
+    multi_start,
+    optimise,
+    optimise_jit,
+)
 from natcoord_jax.core.force import Field, Force, Load
 from natcoord_jax.core.handles import ground
 from natcoord_jax.core.joint import Frame, Joint
@@ -66,6 +81,7 @@ __all__ = [
     "Force",
     "Frame",
     "Gravity",
+    "Guess",
     "Joint",
     "JointDamper",
     "JointForce",
@@ -75,7 +91,10 @@ __all__ = [
     "JointTorque",
     "Load",
     "NonlinearSpring",
+    "OptimalControl",
+    "Outcome",
     "PairTorque",
+    "Parameter",
     "Planar",
     "Point",
     "PointForce",
@@ -89,6 +108,7 @@ __all__ = [
     "Scene",
     "Screw",
     "SimulationError",
+    "Solution",
     "Sphere",
     "Spherical",
     "Spring",
@@ -99,8 +119,16 @@ __all__ = [
     "animate",
     "assemble",
     "balance",
+    "bounds",
+    "cost",
+    "goal",
     "ground",
+    "inputs",
     "linearise",
+    "load_guess",
+    "multi_start",
+    "optimise",
+    "optimise_jit",
     "plot",
     "random_state",
     "simulate",

@@ -1,0 +1,228 @@
+"""What an optimal control problem must respect on its way: path inequalities, joined with `&`.
+
+Every bound says how much of it is used up: values below zero are allowed. They are taken at the end of every
+step, with the inputs of the step, and measured in a natural unit of the bound (half its range).
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from natcoord_jax.assembly.system import System
+from natcoord_jax.core.checks import is_concrete
+from natcoord_jax.core.handles import Handle
+from natcoord_jax.core.state import State
+
+
+class Bound(eqx.Module):
+    """Base of all bounds."""
+
+    def excess(
+        self, system: System, state: State, u: Float[Array, " inputs"], t: Float[Array, ""]
+    ) -> Float[Array, " n"]:
+        """By how much each bound is exceeded; negative inside."""
+        return jnp.zeros(0)
+
+    def labels(self, system: System) -> tuple[str, ...]:
+        """Name of each bound."""
+        return ()
+
+    def __and__(self, other: "Bound") -> "Bound":
+        return All((*_parts(self), *_parts(other)))
+
+
+class All(Bound):
+    """Several bounds at once."""
+
+    parts: tuple[Bound, ...]
+
+    def excess(self, system: System, state: State, u: Array, t: Array) -> Float[Array, " n"]:
+        """Excesses of all parts."""
+        return jnp.concatenate([part.excess(system, state, u, t) for part in self.parts])
+
+    def labels(self, system: System) -> tuple[str, ...]:
+        """Labels of all parts."""
+        return tuple(label for part in self.parts for label in part.labels(system))
+
+
+def _parts(bound: Bound) -> tuple[Bound, ...]:
+    return bound.parts if isinstance(bound, All) else (bound,)
+
+
+def _name(part: Any) -> str:
+    return part.name if isinstance(part, Handle) else str(part)
+
+
+class Range(Bound):
+    """Values between two limits; an infinite limit is none.
+
+    Attributes:
+        lower: one number or one for each value.
+        upper: one number or one for each value.
+        limited: which of the limits are finite.
+    """
+
+    lower: Any
+    upper: Any
+    limited: tuple[tuple[bool, ...], tuple[bool, ...]] = eqx.field(init=False, static=True)
+
+    def __post_init__(self):
+        """Convert, and refuse limits that leave no room."""
+        self.lower, self.upper = (jnp.asarray(x, float) for x in (self.lower, self.upper))
+        known = is_concrete(self.lower, self.upper)
+        if known and not np.all(np.asarray(self.lower) < np.asarray(self.upper)):
+            raise ValueError(
+                f"{type(self).__name__}: the lower bound {np.asarray(self.lower)} is not below the upper "
+                f"bound {np.asarray(self.upper)}; pass (lower, upper) with room between them"
+            )
+        # Which limits there are is structure: it stays fixed when the numbers are traced.
+        limits = (np.isfinite(x) if known else np.ones(x.shape, bool) for x in (self.lower, self.upper))
+        below, above = (tuple(bool(x) for x in np.ravel(limit)) for limit in limits)
+        self.limited = (below, above)
+
+    def values(self, system: System, state: State, u: Array) -> Float[Array, " n"]:
+        """What is bounded."""
+        raise NotImplementedError
+
+    def names(self, system: System) -> tuple[str, ...]:
+        """Name and unit of what is bounded."""
+        raise NotImplementedError
+
+    def excess(self, system: System, state: State, u: Array, t: Array) -> Float[Array, " n"]:
+        """Excess over both limits, in units of half the range."""
+        values = self.values(system, state, u)
+        lower, upper = (jnp.broadcast_to(x, values.shape) for x in (self.lower, self.upper))
+        both = jnp.isfinite(upper - lower)
+        unit = jnp.where(both, 0.5 * jnp.where(both, upper - lower, 2.0), 1.0)
+        below, above = self._sides(values.shape[0])
+        found = [((lower - values) / unit)[below], ((values - upper) / unit)[above]]
+        return jnp.concatenate(found)
+
+    def _sides(self, count: int) -> tuple[np.ndarray, np.ndarray]:
+        below, above = (np.flatnonzero(np.broadcast_to(limits, count)) for limits in self.limited)
+        return below, above
+
+    def labels(self, system: System) -> tuple[str, ...]:
+        """Name of what is bounded, and which limit."""
+        names = self.names(system)
+        below, above = self._sides(len(names))
+        lower = tuple(f"{names[k]} above its lower bound" for k in below)
+        return lower + tuple(f"{names[k]} below its upper bound" for k in above)
+
+
+class Input(Range):
+    """Limits of input channels [N, N m].
+
+    Attributes:
+        lower: one number or one for each channel.
+        upper: one number or one for each channel.
+        channel: name or handle of one channel; None: all.
+    """
+
+    channel: Handle | str | None = eqx.field(default=None, kw_only=True, static=True)
+
+    def values(self, system: System, state: State, u: Array) -> Float[Array, " n"]:
+        """The inputs."""
+        return u if self.channel is None else u[system.input_index(self.channel)][None]
+
+    def names(self, system: System) -> tuple[str, ...]:
+        """Names of the channels."""
+        channels = system.structure.inputs if self.channel is None else (_name(self.channel),)
+        return tuple(f"input {name!r}" for name in channels)
+
+
+class Coordinate(Range):
+    """Limits of a joint coordinate [rad, counted on over many turns, or m].
+
+    Attributes:
+        joint: handle or name.
+        lower: [rad or m].
+        upper: [rad or m].
+        index: which coordinate of the joint.
+    """
+
+    joint: Handle | str = eqx.field(kw_only=True, static=True)
+    index: int = eqx.field(default=0, kw_only=True, static=True)
+
+    def values(self, system: System, state: State, u: Array) -> Float[Array, " n"]:
+        """The coordinate."""
+        return system.coordinate(state, self.joint, self.index)[None]
+
+    def names(self, system: System) -> tuple[str, ...]:
+        """The joint."""
+        return (f"coordinate {self.index} of {_name(self.joint)!r}",)
+
+
+class Rate(Range):
+    """Limits of the rate of a joint coordinate [rad/s or m/s].
+
+    Attributes:
+        joint: handle or name.
+        lower: [rad/s or m/s].
+        upper: [rad/s or m/s].
+        index: which coordinate of the joint.
+    """
+
+    joint: Handle | str = eqx.field(kw_only=True, static=True)
+    index: int = eqx.field(default=0, kw_only=True, static=True)
+
+    def values(self, system: System, state: State, u: Array) -> Float[Array, " n"]:
+        """The rate."""
+        return system.rate(state, self.joint, self.index)[None]
+
+    def names(self, system: System) -> tuple[str, ...]:
+        """The joint."""
+        return (f"rate {self.index} of {_name(self.joint)!r}",)
+
+
+class KeepOut(Bound):
+    """A direction fixed in a body must stay out of a cone about a direction in space (a sensor and the sun).
+
+    Attributes:
+        body: handle or name.
+        axis: direction in components of the body.
+        cone: axis of the cone in space.
+        angle: half the opening of the cone [rad].
+    """
+
+    body: Handle | str = eqx.field(static=True)
+    axis: Any
+    cone: Any
+    angle: Any
+
+    def excess(self, system: System, state: State, u: Array, t: Array) -> Float[Array, " n"]:
+        """Cosine of the angle between the directions, less that of the cone."""
+        first = 4 * system.body_index(self.body) + 1
+        axis, cone = (jnp.asarray(x, float) for x in (self.axis, self.cone))
+        pointing = (axis / jnp.linalg.norm(axis)) @ state.q[first : first + 3]
+        return (pointing @ (cone / jnp.linalg.norm(cone)) - jnp.cos(self.angle))[None]
+
+    def labels(self, system: System) -> tuple[str, ...]:
+        """The body."""
+        return (f"keep-out cone of {_name(self.body)!r}",)
+
+
+class Path(Bound):
+    """Any smooth function of (state, u, t) that must not become positive.
+
+    Attributes:
+        function: (state, u, t) -> number or vector.
+        name: for reports.
+        count: how many numbers the function returns.
+    """
+
+    function: Callable[[State, Array, Array], Any] = eqx.field(static=True)
+    name: str = eqx.field(default="own bound", static=True)
+    count: int = eqx.field(default=1, kw_only=True, static=True)
+
+    def excess(self, system: System, state: State, u: Array, t: Array) -> Float[Array, " n"]:
+        """Value of the function."""
+        return jnp.atleast_1d(jnp.asarray(self.function(state, u, t), float)).reshape(self.count)
+
+    def labels(self, system: System) -> tuple[str, ...]:
+        """The name, numbered if there are several."""
+        return (self.name,) if self.count == 1 else tuple(f"{self.name} [{k}]" for k in range(self.count))

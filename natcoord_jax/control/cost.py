@@ -1,0 +1,136 @@
+"""What an optimal control problem makes small: running and terminal costs, added with `+`."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from natcoord_jax.assembly.system import System
+from natcoord_jax.core.state import State
+
+
+class Cost(eqx.Module):
+    """Base of all costs: an integral over time and a value at the end.
+
+    The integral is taken by the trapezoidal rule over every step, with the inputs held over it. A cost of
+    one's own that needs the system, for its sensors, is a subclass that overrides one of the methods.
+    """
+
+    def running(
+        self, system: System, state: State, u: Float[Array, " inputs"], t: Float[Array, ""]
+    ) -> Float[Array, ""]:
+        """Cost per second at one time."""
+        return jnp.zeros(())
+
+    def terminal(self, system: System, state: State) -> Float[Array, ""]:
+        """Cost of the final state."""
+        return jnp.zeros(())
+
+    def __add__(self, other: "Cost") -> "Cost":
+        return Sum((*_terms(self), *_terms(other)))
+
+
+class Sum(Cost):
+    """A sum of costs."""
+
+    terms: tuple[Cost, ...]
+
+    def running(self, system: System, state: State, u: Array, t: Array) -> Float[Array, ""]:
+        """Sum of the running costs."""
+        return sum((c.running(system, state, u, t) for c in self.terms), jnp.zeros(()))
+
+    def terminal(self, system: System, state: State) -> Float[Array, ""]:
+        """Sum of the terminal costs."""
+        return sum((c.terminal(system, state) for c in self.terms), jnp.zeros(()))
+
+
+def _terms(cost: Cost) -> tuple[Cost, ...]:
+    return cost.terms if isinstance(cost, Sum) else (cost,)
+
+
+class Effort(Cost):
+    """Integral of weight |u|^2; its unit is that of weight times [N^2 s] or [N^2 m^2 s].
+
+    Attributes:
+        weight: one number, or one for each input channel.
+
+    Example:
+        >>> import natcoord_jax as nc
+        >>> cost = nc.cost.Effort(weight=2.0) + nc.cost.Duration()
+    """
+
+    weight: Any = 1.0
+
+    def running(self, system: System, state: State, u: Array, t: Array) -> Float[Array, ""]:
+        """Weighted sum of squares."""
+        return jnp.sum(self.weight * u**2)
+
+
+class Duration(Cost):
+    """The time that passes [s], times a weight; for problems with a free final time.
+
+    Attributes:
+        weight: [1/s].
+    """
+
+    weight: Any = 1.0
+
+    def running(self, system: System, state: State, u: Array, t: Array) -> Float[Array, ""]:
+        """The weight."""
+        return jnp.asarray(self.weight, float)
+
+
+class Running(Cost):
+    """Integral of any smooth function of (state, u, t).
+
+    Attributes:
+        function: (state, u, t) -> cost per second.
+        weight: factor.
+    """
+
+    function: Callable[[State, Array, Array], Any] = eqx.field(static=True)
+    weight: Any = 1.0
+
+    def running(self, system: System, state: State, u: Array, t: Array) -> Float[Array, ""]:
+        """Value of the function."""
+        return jnp.asarray(self.weight * self.function(state, u, t), float)
+
+
+class Terminal(Cost):
+    """Any smooth function of the final state.
+
+    Attributes:
+        function: (state) -> cost.
+        weight: factor.
+    """
+
+    function: Callable[[State], Any] = eqx.field(static=True)
+    weight: Any = 1.0
+
+    def terminal(self, system: System, state: State) -> Float[Array, ""]:
+        """Value of the function."""
+        return jnp.asarray(self.weight * self.function(state), float)
+
+
+class Missed(Cost):
+    """Integral or final value of weight |residual of a goal|^2: a goal to come near to, not to reach.
+
+    Attributes:
+        goal: see `natcoord_jax.control.goal`.
+        weight: at the end.
+        rate: weight of the integral [1/s].
+    """
+
+    goal: Any
+    weight: Any = 1.0
+    rate: Any = 0.0
+
+    def running(self, system: System, state: State, u: Array, t: Array) -> Float[Array, ""]:
+        """Weighted square of what is missing."""
+        return self.rate * jnp.sum(self.goal.residual(system, state) ** 2)
+
+    def terminal(self, system: System, state: State) -> Float[Array, ""]:
+        """Weighted square of what is missing."""
+        return self.weight * jnp.sum(self.goal.residual(system, state) ** 2)

@@ -1,0 +1,219 @@
+"""Where an optimal control problem ends: terminal equalities, joined with `&`.
+
+A goal counts independent numbers: three of an attitude, and as many rates as there are free motions. Rates
+are those with the momenta of the state: the step (57) also carries a little velocity normal to the
+constraints, and goals must not contradict the conservation laws by as much.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from natcoord_jax.assembly.system import System
+from natcoord_jax.control.tangent import steadied, steady_rates
+from natcoord_jax.core.handles import Handle
+from natcoord_jax.core.state import State
+from natcoord_jax.maths.rotations import angular_velocity, from_quaternion, to_quaternion
+
+
+class Goal(eqx.Module):
+    """Base of all goals: equations that the final state has to fulfil."""
+
+    def residual(self, system: System, state: State) -> Float[Array, " n"]:
+        """What is missing; zero where the goal is reached."""
+        return jnp.zeros(0)
+
+    def labels(self, system: System) -> tuple[str, ...]:
+        """Name and unit of each number of the residual."""
+        return ()
+
+    def __and__(self, other: "Goal") -> "Goal":
+        return All((*_parts(self), *_parts(other)))
+
+
+class All(Goal):
+    """Several goals at once."""
+
+    parts: tuple[Goal, ...]
+
+    def residual(self, system: System, state: State) -> Float[Array, " n"]:
+        """Residuals of all parts."""
+        return jnp.concatenate([part.residual(system, state) for part in self.parts])
+
+    def labels(self, system: System) -> tuple[str, ...]:
+        """Labels of all parts."""
+        return tuple(label for part in self.parts for label in part.labels(system))
+
+
+def _parts(goal: Goal) -> tuple[Goal, ...]:
+    return goal.parts if isinstance(goal, All) else (goal,)
+
+
+def _name(part: Any) -> str:
+    return part.name if isinstance(part, Handle) else str(part)
+
+
+class Attitude(Goal):
+    """Attitude of a body: three numbers, twice the vector part of the quaternion that is missing.
+
+    For small errors that is the rotation vector [rad]; at half a turn its length is 2, and it is nowhere
+    zero but at the goal.
+
+    Attributes:
+        body: handle or name.
+        rotation: unit quaternion (w, x, y, z) or rotation matrix, body to world.
+    """
+
+    body: Handle | str = eqx.field(static=True)
+    rotation: Any
+
+    def residual(self, system: System, state: State) -> Float[Array, " n"]:
+        """Twice the vector part of the error, in world components."""
+        given = jnp.asarray(self.rotation, float)
+        wanted = from_quaternion(given) if given.shape == (4,) else given
+        first = 4 * system.body_index(self.body) + 1
+        now = state.q[first : first + 3].T
+        return 2.0 * to_quaternion(now @ wanted.T)[1:]
+
+    def labels(self, system: System) -> tuple[str, ...]:
+        """Three components of the rotation that is missing."""
+        return tuple(f"attitude of {_name(self.body)!r}, {axis} [rad]" for axis in "xyz")
+
+
+class Position(Goal):
+    """Position of a point of a body: three numbers [m].
+
+    Attributes:
+        body: handle or name.
+        position: in space [m].
+        point: in coordinates of the body [m]; its reference point if none is given.
+    """
+
+    body: Handle | str = eqx.field(static=True)
+    position: Any
+    point: Any = eqx.field(default=(0.0, 0.0, 0.0), kw_only=True)
+
+    def residual(self, system: System, state: State) -> Float[Array, " n"]:
+        """Position less the wanted one."""
+        first = 4 * system.body_index(self.body)
+        weights = jnp.concatenate([jnp.ones(1), jnp.asarray(self.point, float)])
+        return weights @ state.q[first : first + 4] - jnp.asarray(self.position, float)
+
+    def labels(self, system: System) -> tuple[str, ...]:
+        """Three components."""
+        return tuple(f"position on {_name(self.body)!r}, {axis} [m]" for axis in "xyz")
+
+
+class Motion(Goal):
+    """Velocity and angular velocity of a body: six numbers [m/s, rad/s].
+
+    Attributes:
+        body: handle or name.
+        velocity: of the reference point [m/s].
+        angular_velocity: in world components [rad/s].
+    """
+
+    body: Handle | str = eqx.field(static=True)
+    velocity: Any = (0.0, 0.0, 0.0)
+    angular_velocity: Any = (0.0, 0.0, 0.0)
+
+    def residual(self, system: System, state: State) -> Float[Array, " n"]:
+        """Motion less the wanted one."""
+        first = 4 * system.body_index(self.body)
+        rows, rates = state.q[first : first + 4], steadied(system, state).v[first : first + 4]
+        spin = angular_velocity(rows[1:], rates[1:])
+        return jnp.concatenate(
+            [rates[0] - jnp.asarray(self.velocity), spin - jnp.asarray(self.angular_velocity)]
+        )
+
+    def labels(self, system: System) -> tuple[str, ...]:
+        """Three components of each."""
+        kinds = (("velocity", "m/s"), ("angular velocity", "rad/s"))
+        return tuple(
+            f"{kind} of {_name(self.body)!r}, {axis} [{unit}]" for kind, unit in kinds for axis in "xyz"
+        )
+
+
+class Coordinate(Goal):
+    """Value of a joint coordinate: one number [rad, counted on over many turns, or m].
+
+    Attributes:
+        joint: handle or name.
+        value: [rad or m].
+        index: which coordinate of the joint.
+    """
+
+    joint: Handle | str = eqx.field(static=True)
+    value: Any
+    index: int = eqx.field(default=0, kw_only=True, static=True)
+
+    def residual(self, system: System, state: State) -> Float[Array, " n"]:
+        """Coordinate less the wanted value."""
+        return (system.coordinate(state, self.joint, self.index) - self.value)[None]
+
+    def labels(self, system: System) -> tuple[str, ...]:
+        """The coordinate."""
+        return (f"coordinate {self.index} of {_name(self.joint)!r} [rad or m]",)
+
+
+class Rate(Goal):
+    """Rate of a joint coordinate: one number [rad/s or m/s].
+
+    Attributes:
+        joint: handle or name.
+        value: [rad/s or m/s].
+        index: which coordinate of the joint.
+    """
+
+    joint: Handle | str = eqx.field(static=True)
+    value: Any = 0.0
+    index: int = eqx.field(default=0, kw_only=True, static=True)
+
+    def residual(self, system: System, state: State) -> Float[Array, " n"]:
+        """Rate less the wanted one."""
+        return (system.rate(steadied(system, state), self.joint, self.index) - self.value)[None]
+
+    def labels(self, system: System) -> tuple[str, ...]:
+        """The rate."""
+        return (f"rate {self.index} of {_name(self.joint)!r} [rad/s or m/s]",)
+
+
+class Rest(Goal):
+    """No motion at all: the rates of all free motions of the spanning tree are zero.
+
+    That is six numbers of a free body and one of a hinge, not twelve a body. Some may follow from others,
+    as the base of a spacecraft rests when its wheels do and there is no momentum; the solver sees that.
+    """
+
+    def residual(self, system: System, state: State) -> Float[Array, " n"]:
+        """Rates of the free motions."""
+        return steady_rates(system, state)
+
+    def labels(self, system: System) -> tuple[str, ...]:
+        """The body each free motion belongs to."""
+        owners = [int(i) for i in system.tree.slot_of // 7]
+        return tuple(f"rest of {system.structure.bodies[b]!r} [m/s or rad/s]" for b in owners)
+
+
+class Equal(Goal):
+    """Any smooth function of the final state that has to vanish.
+
+    Attributes:
+        function: (state) -> number or vector.
+        name: for reports.
+    """
+
+    function: Callable[[State], Any] = eqx.field(static=True)
+    name: str = eqx.field(default="own goal", static=True)
+    count: int = eqx.field(default=1, kw_only=True, static=True)
+
+    def residual(self, system: System, state: State) -> Float[Array, " n"]:
+        """Value of the function."""
+        return jnp.atleast_1d(jnp.asarray(self.function(state), float)).reshape(self.count)
+
+    def labels(self, system: System) -> tuple[str, ...]:
+        """The name, numbered if there are several."""
+        return (self.name,) if self.count == 1 else tuple(f"{self.name} [{k}]" for k in range(self.count))

@@ -1,0 +1,137 @@
+"""Where an optimisation starts: from inputs, rates, an earlier solution, or from nothing."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from natcoord_jax.control.problem import OptimalControl
+from natcoord_jax.control.transcription import Unknowns, end, roll
+
+ROUNDS = 12
+"""Gauss-Newton corrections of the constant rates that lead to the goal."""
+LONGEST = 2.0
+"""Largest turn of a body in one step of a guess [rad]."""
+
+
+class Guess(eqx.Module):
+    """A first guess.
+
+    Attributes:
+        inputs: of all steps (steps, inputs) [N, N m]; None: zero.
+        rates: mean rates of the free motions in all steps (steps, n) or constant (n,) [rad/s, m/s], for the
+            lifted method, which needs no motion to start from; None: constant ones that lead to the goal.
+        free: final time [s] and parameters in the order of `problem.free`; None: those of the problem.
+
+    Example:
+        >>> import natcoord_jax as nc
+        >>> guess = nc.Guess(rates=(0.5, 1.57))
+    """
+
+    inputs: Any = None
+    rates: Any = None
+    free: Any = None
+
+
+def unknowns_of(problem: OptimalControl, guess: Any, lifted: bool) -> Unknowns:
+    """Unknowns to start from.
+
+    Args:
+        problem: the problem.
+        guess: None, inputs (steps, inputs), or a `Guess`.
+        lifted: whether rates are wanted as well.
+
+    Raises:
+        ValueError: for a wrong shape, or numbers that are not finite.
+    """
+    guess = guess if isinstance(guess, Guess) else Guess(inputs=guess)
+    reference, scale = problem.references()
+    free = jnp.zeros_like(reference)
+    if guess.free is not None:
+        free = (_shaped(guess.free, reference.shape, "free") - reference) / scale
+    shape = (problem.steps, problem.channels)
+    inputs = jnp.zeros(shape) if guess.inputs is None else _shaped(guess.inputs, shape, "inputs")
+    structure = problem.system.structure
+    y = jnp.zeros((problem.steps, structure.unknowns + structure.multipliers))
+    unknowns = Unknowns(problem.inputs.fitted(inputs), free, y)
+    if not lifted or structure.solver != "reduced":
+        return unknowns
+    if guess.rates is None:
+        rates = _leading_to_goal(problem, unknowns)
+    else:
+        given = jnp.asarray(guess.rates, float)
+        constant = given.shape == (structure.unknowns,)
+        rates = jnp.broadcast_to(given, (problem.steps, structure.unknowns)) if constant else given
+        rates = _shaped(rates, (problem.steps, structure.unknowns), "rates")
+    return with_rates(unknowns, rates)
+
+
+def with_rates(unknowns: Unknowns, rates: Float[Array, "steps n"]) -> Unknowns:
+    """Unknowns with given mean rates and multipliers zero."""
+    y = jnp.zeros_like(unknowns.y).at[:, : rates.shape[1]].set(rates)
+    return eqx.tree_at(lambda u: u.y, unknowns, y)
+
+
+def _shaped(value: Any, shape: tuple[int, ...], what: str) -> Array:
+    try:
+        array = jnp.asarray(value, float)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"guess: {what} is {value!r}; pass numbers of shape {shape}") from error
+    if array.shape != shape:
+        raise ValueError(f"guess: {what} has shape {array.shape}; this problem needs {shape}")
+    if not np.all(np.isfinite(np.asarray(array))):
+        raise ValueError(f"guess: {what} has numbers that are not finite; pass finite ones")
+    return array
+
+
+@eqx.filter_jit
+def _leading_to_goal(problem: OptimalControl, unknowns: Unknowns) -> Float[Array, "steps n"]:
+    """Constant rates that lead the configuration to the goal, as near as they can; forces play no part."""
+    count = problem.system.structure.unknowns
+    _, dt = problem.applied(unknowns.free)
+    size = problem.state.q.size
+
+    def missing(w: Array) -> Array:
+        moving = with_rates(unknowns, jnp.broadcast_to(w, (problem.steps, count)))
+        last = jax.tree.map(lambda x: x[-1], roll(problem, moving).nodes)
+        # Only the configuration counts: rates at the end are left to the method.
+        still = last.x.at[size : 2 * size].set(0.0)
+        return end(problem, eqx.tree_at(lambda n: n.x, last, still)).missing
+
+    def body(_: Any, w: Array) -> Array:
+        jacobian, residual = jax.jacfwd(missing)(w), missing(w)
+        change = -jnp.linalg.pinv(jacobian, rtol=1e-6) @ residual if residual.size else jnp.zeros_like(w)
+        change = jnp.nan_to_num(change)
+        longest = jnp.max(jnp.abs(change)) * problem.steps * dt
+        return w + change * jnp.minimum(1.0, LONGEST / jnp.where(longest > 0, longest, 1.0))
+
+    w = jax.lax.fori_loop(0, ROUNDS, body, jnp.zeros(count))
+    return jnp.broadcast_to(w, (problem.steps, count))
+
+
+def scattered(problem: OptimalControl, unknowns: Unknowns, key: Array, spread: Any, rates: Any) -> Unknowns:
+    """A guess with random smooth changes of inputs and of rates, for starts from many places.
+
+    Args:
+        problem: the problem.
+        unknowns: in the middle.
+        key: random key.
+        spread: standard deviation of the inputs [N, N m].
+        rates: standard deviation of the rates [rad/s, m/s].
+    """
+    first, second, third = jax.random.split(key, 3)
+    steps, modes = problem.steps, jnp.arange(1, 4)
+    waves = jnp.sin(jnp.pi * (jnp.arange(steps)[:, None] + 0.5) / steps * modes) / modes
+    count = (
+        unknowns.y.shape[1]
+        if problem.system.structure.solver != "reduced"
+        else problem.system.structure.unknowns
+    )
+    inputs = spread * waves @ jax.random.normal(first, (3, problem.channels))
+    changes = rates * (jax.random.normal(second, (1, count)) + waves @ jax.random.normal(third, (3, count)))
+    coefficients = unknowns.coefficients + problem.inputs.fitted(inputs)
+    y = unknowns.y.at[:, :count].add(changes)
+    return Unknowns(coefficients, unknowns.free, y)

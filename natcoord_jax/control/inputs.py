@@ -1,0 +1,123 @@
+"""How a torque history is made of a few numbers: splines of the input channels, held over each step."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+
+class Shaping(NamedTuple):
+    """A spline as a linear machine with a small register, one step after the other.
+
+    register_k+1 = shift_k register_k + load_k w_k and u_k = read_k register_k + direct_k w_k, for every input
+    channel alike. New coefficients w enter where an interval of the spline begins, those of the first
+    interval but one are in the register at the start.
+
+    Attributes:
+        shift: (steps, d, d).
+        load: (steps, d).
+        read: (steps, d).
+        direct: (steps,).
+        enters: whether a coefficient enters in a step, (steps,).
+        start: places of the first coefficients in the register, (d, degree).
+    """
+
+    shift: Float[np.ndarray, "steps d d"]
+    load: Float[np.ndarray, "steps d"]
+    read: Float[np.ndarray, "steps d"]
+    direct: Float[np.ndarray, " steps"]
+    enters: Bool[np.ndarray, " steps"]
+    start: Float[np.ndarray, "d degree"]
+
+
+def _basis(degree: int, place: float) -> np.ndarray:
+    """Values of the degree + 1 uniform B-splines that are not zero at a place in [0, 1) of an interval."""
+    values = np.ones(1)
+    for order in range(1, degree + 1):
+        before = np.arange(order)
+        right = (before + 1 - place) / order * values
+        left = (place + order - 1 - before) / order * values
+        values = np.concatenate([right, [0.0]]) + np.concatenate([[0.0], left])
+    return values
+
+
+class Spline(eqx.Module):
+    """Inputs as uniform B-splines over intervals of some steps, taken at the middle of each step.
+
+    Attributes:
+        degree: 0 holds a value over each interval, 1 is piecewise linear, 3 a cubic spline.
+        every: steps of an interval.
+
+    Example:
+        >>> import natcoord_jax as nc
+        >>> nc.inputs.Spline(degree=1, every=5).coefficients(100)
+        21
+    """
+
+    degree: int = eqx.field(default=0, kw_only=True, static=True)
+    every: int = eqx.field(default=1, kw_only=True, static=True)
+
+    def __check_init__(self):
+        """Refuse what is no spline."""
+        if self.degree < 0 or self.every < 1:
+            raise ValueError(
+                f"a spline of degree {self.degree} over intervals of {self.every} steps; "
+                "pass degree >= 0 and every >= 1"
+            )
+
+    def coefficients(self, steps: int) -> int:
+        """Number of coefficients of each input channel."""
+        return -(-steps // self.every) + self.degree
+
+    def matrix(self, steps: int) -> Float[np.ndarray, "steps coefficients"]:
+        """Inputs of the steps per coefficient."""
+        found = np.zeros((steps, self.coefficients(steps)))
+        for k in range(steps):
+            interval, rest = divmod(k, self.every)
+            place = (rest + 0.5) / self.every
+            found[k, interval : interval + self.degree + 1] = _basis(self.degree, place)
+        return found
+
+    def fitted(self, inputs: Any) -> Float[Array, "coefficients inputs"]:
+        """Coefficients nearest to the inputs (steps, inputs) of all steps."""
+        inputs = jnp.asarray(inputs, float)
+        if self.degree == 0 and self.every == 1:
+            return inputs
+        return jnp.asarray(np.linalg.pinv(self.matrix(inputs.shape[0]))) @ inputs
+
+    def shaping(self, steps: int) -> Shaping:
+        """The spline as a machine with a register; one that holds each value over one step has none."""
+        size = self.degree + (self.every > 1)
+        shift, load = np.zeros((steps, size, size)), np.zeros((steps, size))
+        read, direct = np.zeros((steps, size)), np.zeros(steps)
+        numbers = np.arange(steps)
+        enters = numbers % self.every == 0
+        for k in range(steps):
+            values = _basis(self.degree, (k % self.every + 0.5) / self.every)
+            if not size:
+                direct[k] = 1.0
+            elif enters[k]:
+                shift[k], load[k, -1] = np.eye(size, k=1), 1.0
+                read[k] = np.concatenate([[0.0] * (size - self.degree), values[:-1]])
+                direct[k] = values[-1]
+            else:
+                shift[k], read[k] = np.eye(size), values
+        start = np.eye(size)[:, size - self.degree :]
+        return Shaping(shift, load, read, direct, enters, start)
+
+
+def held() -> Spline:
+    """Inputs held over each step, free in every step."""
+    return Spline()
+
+
+def piecewise_linear(every: int = 1) -> Spline:
+    """Inputs that are linear over intervals of `every` steps and continuous."""
+    return Spline(degree=1, every=every)
+
+
+def cubic(every: int = 10) -> Spline:
+    """Inputs as cubic B-splines, twice continuously differentiable, over intervals of `every` steps."""
+    return Spline(degree=3, every=every)

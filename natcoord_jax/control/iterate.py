@@ -1,0 +1,130 @@
+"""Where the second-order method stands: plain data."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from natcoord_jax.control.quadratic import Charts, Costates, Multipliers
+from natcoord_jax.control.transcription import Path, Unknowns
+
+
+class Options(eqx.Module):
+    """Settings of the second-order method.
+
+    Attributes:
+        lifted: whether residuals of the steps vanish at the end only.
+        max_iterations: of the method.
+        tol: largest gradient of the Lagrangian and complementarity, relative.
+        goal_tol: largest residual of the goal, in its units, of the bounds, in theirs, and of the steps.
+        barrier: barrier parameter at the start, relative to the cost.
+    """
+
+    lifted: bool = eqx.field(default=False, static=True)
+    max_iterations: int = eqx.field(default=100, static=True)
+    tol: float = eqx.field(default=1e-8, static=True)
+    goal_tol: float = eqx.field(default=1e-10, static=True)
+    barrier: float = eqx.field(default=0.1, static=True)
+
+
+class Slacks(eqx.Module):
+    """Room left to the bounds at every step and to those of what is free; positive."""
+
+    path: Float[Array, "*batch steps h"]
+    end: Float[Array, "*batch e"]
+
+
+class Errors(eqx.Module):
+    """What is missing to the conditions of optimality.
+
+    Attributes:
+        stationarity: gradient of the Lagrangian, relative to the gradient of the cost or of the bounds.
+        motion: residual of the steps, as relative change of their unknowns.
+        goal: largest residual of the goal.
+        bounds: largest violation of a bound.
+        complementarity: multiplier times room, relative to the cost.
+    """
+
+    stationarity: Float[Array, "*batch"]
+    motion: Float[Array, "*batch"]
+    goal: Float[Array, "*batch"]
+    bounds: Float[Array, "*batch"]
+    complementarity: Float[Array, "*batch"]
+
+
+class Derivatives(eqx.Module):
+    """First derivatives at a motion.
+
+    Attributes:
+        inverses: of the Jacobians of the steps in their own unknowns.
+        maps: small numbers of the nodes.
+        worth: costates.
+        bent: costates of projected steps, for the curvature.
+        by_w: gradient of the Lagrangian in the entering coefficients.
+        by_first: gradient in what is free and the leading coefficients.
+        errors: what is missing.
+    """
+
+    inverses: Float[Array, "*batch steps n n"]
+    maps: Charts
+    worth: Costates
+    bent: Costates
+    by_w: Float[Array, "*batch steps m"]
+    by_first: Float[Array, "*batch f"]
+    errors: Errors
+
+
+class Iterate(eqx.Module):
+    """Where the method stands.
+
+    Attributes:
+        unknowns: what is solved for.
+        multipliers: of goal and bounds.
+        slacks: room left.
+        path: the motion.
+        derivatives: first derivatives there.
+        barrier: barrier parameter.
+        unit: of the cost.
+        shift: last increase of the curvature.
+        penalty: weight of the goal's square in the model.
+        previous: path and slacks of the iterate before.
+        step: length of the last step.
+        moved: size of the last step, relative.
+        unreachable: part of the goal that nothing could change.
+        iteration: number of steps made.
+        newton: Newton iterations of all simulations.
+        failures: steps given up in a row.
+        code: see `Outcome`.
+    """
+
+    unknowns: Unknowns
+    multipliers: Multipliers
+    slacks: Slacks
+    path: Path
+    derivatives: Derivatives
+    barrier: Float[Array, "*batch"]
+    unit: Float[Array, "*batch"]
+    shift: Float[Array, "*batch"]
+    penalty: Float[Array, "*batch c"]
+    previous: tuple[Path, Slacks]
+    step: Float[Array, "*batch"]
+    moved: Float[Array, "*batch"]
+    unreachable: Float[Array, "*batch c"]
+    iteration: Int[Array, "*batch"]
+    newton: Int[Array, "*batch"]
+    failures: Int[Array, "*batch"]
+    code: Int[Array, "*batch"]
+
+    @property
+    def errors(self) -> Errors:
+        """What is missing to the conditions of optimality."""
+        return self.derivatives.errors
+
+    @property
+    def running(self) -> Bool[Array, "*batch"]:
+        """Whether the method goes on."""
+        return self.code == 1
+
+
+def largest(*arrays: Array) -> Array:
+    """Largest magnitude of all entries; zero if there are none."""
+    return jnp.max(jnp.concatenate([jnp.zeros(1), *(jnp.abs(x).reshape(-1) for x in arrays)]))

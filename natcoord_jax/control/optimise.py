@@ -1,0 +1,225 @@
+"""The entrances: an optimisation with progress and a way out, and one that compiles into other programs."""
+
+import sys
+import time
+from collections.abc import Sequence
+from operator import itemgetter
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from natcoord_jax.control import sequential
+from natcoord_jax.control.guess import Guess, scattered, unknowns_of
+from natcoord_jax.control.iterate import Iterate, Options
+from natcoord_jax.control.problem import OptimalControl
+from natcoord_jax.control.results import Outcome
+from natcoord_jax.control.solution import Row, Solution, solution_of, worst_condition
+from natcoord_jax.control.transcription import Unknowns
+
+METHODS = ("auto", "shooting", "lifted")
+HEADER = (
+    f"{'iter':>4} {'cost':>14} {'gradient':>9} {'violation':>9} {'step':>7} {'newton':>7} {'s':>7}  worst"
+)
+DEFAULT = Options()
+SAME = 1e-6
+"""Relative difference of costs below which two optima are taken for one."""
+
+
+def numeric(problem: OptimalControl) -> OptimalControl:
+    """The problem with all its numbers as arrays, so that a changed number never compiles anew."""
+    return jax.tree.map(lambda x: jnp.asarray(x, float) if isinstance(x, int | float) else x, problem)
+
+
+def _chosen(problem: OptimalControl, method: str) -> bool:
+    """Whether to lift: where time or parameters are free or the path is bounded, simulations lead astray."""
+    if method not in METHODS:
+        raise ValueError(f"method is {method!r}; pass one of {METHODS}")
+    if method != "auto":
+        return method == "lifted"
+    inputs = all(label.startswith("input ") for label in problem.bounds.labels(problem.system))
+    return bool(problem.free) or not inputs
+
+
+def _row(problem: OptimalControl, iterate: Iterate, start: float) -> Row:
+    violation, worst = worst_condition(problem, iterate)
+    return Row(
+        int(iterate.iteration),
+        float(iterate.path.cost),
+        float(iterate.errors.stationarity),
+        violation,
+        worst,
+        float(iterate.step),
+        int(iterate.newton),
+        time.perf_counter() - start,
+    )
+
+
+def _printed(row: Row) -> str:
+    return (
+        f"{row.iteration:>4} {row.cost:>14.8g} {row.stationarity:>9.1e} {row.violation:>9.1e} "
+        f"{row.step:>7.2g} {row.newton:>7} {row.seconds:>7.2f}  {row.worst}"
+    )
+
+
+def _run(
+    problem: OptimalControl, options: Options, unknowns: Unknowns, progress: bool, time_limit: float
+) -> tuple[Iterate, list[Row], Outcome]:
+    """The method's loop in Python: a line for each iteration, and a way out."""
+    start = time.perf_counter()
+    history: list[Row] = []
+    iterate = sequential.init(problem, options, unknowns)
+    outcome = Outcome.RUNNING
+    if progress:
+        print(HEADER, file=sys.stderr)
+    try:
+        while not sequential.done(iterate):
+            if time.perf_counter() - start > time_limit:
+                outcome = Outcome.TIME_LIMIT
+                break
+            iterate = sequential.step(problem, options, iterate)
+            history.append(_row(problem, iterate, start))
+            if progress:
+                print(_printed(history[-1]), file=sys.stderr, flush=True)
+    except KeyboardInterrupt:
+        outcome = Outcome.STOPPED
+    if outcome is Outcome.RUNNING:
+        outcome = Outcome(int(iterate.code))
+    return iterate, history, outcome
+
+
+def optimise(
+    problem: OptimalControl,
+    guess: Any = None,
+    *,
+    method: str = "auto",
+    progress: bool = True,
+    max_iterations: int = 100,
+    tol: float = 1e-8,
+    goal_tol: float = 1e-10,
+    time_limit: float = 600.0,
+) -> Solution:
+    """Solve an optimal control problem by the second-order method.
+
+    Sequential quadratic programming on the discrete motion with exact gradients, an interior point for the
+    bounds and linear algebra that is linear in the number of steps. "shooting" simulates every iterate;
+    "lifted" takes the equations of all steps as constraints (as in discrete mechanics and optimal control),
+    for swing-ups, minimum time and bounded paths. For any smooth loss without these, see `nc.descend`.
+
+    Args:
+        problem: the problem.
+        guess: inputs (steps, inputs), a `Guess`, an earlier `Solution`, or None.
+        method: "auto" (lifted if time or parameters are free or more than inputs is bounded), "shooting" or
+            "lifted".
+        progress: print a line for each iteration to stderr.
+        max_iterations: limit of iterations.
+        tol: largest gradient of the Lagrangian and complementarity, relative.
+        goal_tol: largest violation of goal, bounds and equations.
+        time_limit: limit of time [s]; checked between iterations.
+
+    Returns:
+        The solution; `outcome` and `explain()` say how it ended. An interruption by the keyboard returns
+        what was reached.
+
+    Raises:
+        ValueError: for a guess of the wrong shape or an unknown method.
+    """
+    problem = numeric(problem)
+    lifted = _chosen(problem, method)
+    options = Options(lifted, max_iterations, tol, goal_tol)
+    if isinstance(guess, Solution):
+        guess = guess.guess(problem.steps)
+    start = unknowns_of(problem, guess, lifted)
+    found = _run(problem, options, start, progress, time_limit)
+    if method == "auto" and not lifted and found[2] in (Outcome.SIMULATION_FAILED, Outcome.STALLED):
+        lifted, options = True, Options(True, max_iterations, tol, goal_tol)
+        found = _run(problem, options, unknowns_of(problem, guess, True), progress, time_limit)
+    iterate, history, outcome = found
+    name = "lifted" if lifted else "shooting"
+    return solution_of(problem, iterate, f"{name} sequential quadratic programming", history, outcome)
+
+
+@eqx.filter_jit
+def optimise_jit(problem: OptimalControl, unknowns: Unknowns, options: Options = DEFAULT) -> Iterate:
+    """The method as one program, for `jax.vmap`, receding horizons and other programs around it.
+
+    Args:
+        problem: the problem; every number of it may be traced.
+        unknowns: where to start; see `unknowns_of`.
+        options: settings.
+
+    Returns:
+        The last iterate; its `code` says how it ended.
+    """
+    first = sequential.init(problem, options, unknowns)
+    return jax.lax.while_loop(
+        lambda iterate: iterate.running, lambda iterate: sequential.step(problem, options, iterate), first
+    )
+
+
+def multi_start(
+    problem: OptimalControl,
+    guess: Any = None,
+    *,
+    starts: int = 16,
+    spread: Any = 1.0,
+    rates: Any = 1.0,
+    seed: int = 0,
+    method: str = "auto",
+    max_iterations: int = 100,
+    tol: float = 1e-8,
+    goal_tol: float = 1e-10,
+) -> list[Solution]:
+    """Solve from many guesses at once, and list all optima that are found.
+
+    Args:
+        problem: the problem.
+        guess: in the middle of the guesses, or a sequence of guesses, which are then taken as they are.
+        starts: number of random guesses; the one in the middle is the first.
+        spread: standard deviation of the inputs of the guesses [N, N m], a number or one for each channel.
+        rates: standard deviation of the rates of the guesses [rad/s, m/s], for the lifted method.
+        seed: of the random numbers.
+        method: as in `optimise`.
+        max_iterations: as in `optimise`.
+        tol: as in `optimise`.
+        goal_tol: as in `optimise`.
+
+    Returns:
+        The different optima by cost, or, if there are none, the one that came nearest.
+    """
+    problem = numeric(problem)
+    lifted = _chosen(problem, method)
+    options = Options(lifted, max_iterations, tol, goal_tol)
+    if isinstance(guess, Sequence) and guess and isinstance(guess[0], Guess | Solution):
+        plain = [g.guess(problem.steps) if isinstance(g, Solution) else g for g in guess]
+        every = [unknowns_of(problem, g, lifted) for g in plain]
+        many = jax.tree.map(lambda *x: jnp.stack(x), *every)
+    else:
+        middle = unknowns_of(problem, guess, lifted)
+        keys = jax.random.split(jax.random.key(seed), starts)
+        sizes = jnp.ones(starts).at[0].set(0.0)
+        many = jax.vmap(lambda key, size: scattered(problem, middle, key, size * spread, size * rates))(
+            keys, sizes
+        )
+    found = eqx.filter_jit(jax.vmap(lambda unknowns: optimise_jit(problem, unknowns, options)))(many)
+    return _distinct(problem, found, lifted)
+
+
+def _distinct(problem: OptimalControl, found: Iterate, lifted: bool) -> list[Solution]:
+    """Different optima of a batch, by cost."""
+    codes, costs = np.asarray(found.code), np.asarray(found.path.cost)
+    optimal = [int(k) for k in np.argsort(costs) if Outcome(int(codes[k])).ok]
+    kept: list[int] = []
+    for k in optimal:
+        if not kept or abs(costs[k] - costs[kept[-1]]) > SAME * max(abs(costs[k]), 1e-300):
+            kept.append(k)
+    kept = kept or [int(np.nanargmin(np.asarray(found.errors.goal)))]
+    name = f"{'lifted' if lifted else 'shooting'} sequential quadratic programming, start"
+    solutions = []
+    for k in kept:
+        iterate = jax.tree.map(itemgetter(k), found)
+        row = _row(problem, iterate, time.perf_counter())
+        solutions.append(solution_of(problem, iterate, f"{name} {k}", [row], Outcome(int(codes[k]))))
+    return solutions

@@ -1,0 +1,62 @@
+"""Numbers of the system that are optimised together with the inputs."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from natcoord_jax.assembly.system import System
+
+
+class Parameter(eqx.Module):
+    """A number of the system that is free: a stiffness, a mass, a length.
+
+    Attributes:
+        name: for reports.
+        where: which leaf of the system, as for `eqx.tree_at`: system -> array. For more than one place,
+            pass `apply` instead.
+        index: place in the leaf; equal effects and bodies are stacked.
+        lower: lower bound; None: none.
+        upper: upper bound; None: none.
+        apply: (system, value) -> system, for numbers that act in several places; needs `value`.
+        value: initial value, where it cannot be read from the leaf.
+        moves: whether it moves geometry, so that the initial state is assembled anew.
+
+    Example:
+        >>> import natcoord_jax as nc
+        >>> mass = nc.Parameter("mass", where=lambda system: system.mass, index=(0, 0, 0), lower=1.0)
+    """
+
+    name: str = eqx.field(static=True)
+    where: Callable[[System], Array] | None = eqx.field(default=None, kw_only=True, static=True)
+    index: Any = eqx.field(default=(), kw_only=True, static=True)
+    lower: float | None = eqx.field(default=None, kw_only=True, static=True)
+    upper: float | None = eqx.field(default=None, kw_only=True, static=True)
+    apply: Callable[[System, Array], System] | None = eqx.field(default=None, kw_only=True, static=True)
+    value: Any = eqx.field(default=None, kw_only=True)
+    moves: bool = eqx.field(default=False, kw_only=True, static=True)
+
+    def __check_init__(self):
+        """Refuse a parameter that is nowhere, or has no room."""
+        if (self.where is None) == (self.apply is None) or (self.where is None and self.value is None):
+            raise ValueError(f"parameter {self.name!r}: pass `where`, or `apply` together with `value`")
+        if self.lower is not None and self.upper is not None and not self.lower < self.upper:
+            raise ValueError(
+                f"parameter {self.name!r}: the lower bound {self.lower:g} is not below the upper bound "
+                f"{self.upper:g}; pass bounds with room between them"
+            )
+
+    def initial(self, system: System) -> Float[Array, ""]:
+        """Value at the start of the optimisation."""
+        if self.value is not None or self.where is None:
+            return jnp.asarray(self.value, float)
+        return jnp.asarray(self.where(system))[self.index]
+
+    def applied(self, system: System, value: Float[Array, ""]) -> System:
+        """The system with another value."""
+        if self.where is None:
+            assert self.apply is not None
+            return self.apply(system, value)
+        return eqx.tree_at(self.where, system, jnp.asarray(self.where(system)).at[self.index].set(value))

@@ -1,0 +1,153 @@
+"""An optimal control problem: a system, a horizon, what to make small, where to end, what to respect."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from natcoord_jax.assembly.system import System
+from natcoord_jax.control.bounds import Bound
+from natcoord_jax.control.cost import Cost
+from natcoord_jax.control.goal import Goal
+from natcoord_jax.control.inputs import Spline
+from natcoord_jax.control.parameter import Parameter
+from natcoord_jax.core.checks import is_concrete, positive
+from natcoord_jax.core.state import State
+from natcoord_jax.stepping.assemble import assemble
+
+
+class OptimalControl(eqx.Module):
+    """Inputs, and free parameters, that make a cost small over a horizon of steps of the discrete motion.
+
+    The motion is that of `nc.simulate`, step for step: what is found is optimal for the energy-momentum
+    scheme (57) at this step, not for an approximation of it.
+
+    Attributes:
+        system: compiled system with input channels.
+        state: initial state.
+        dt: step [s]; with `free_time` its first guess.
+        steps: number of steps.
+        cost: what to make small.
+        goal: what the final state has to fulfil.
+        bounds: what has to hold at the end of every step.
+        inputs: how inputs are made of coefficients; default: held over each step.
+        parameters: numbers of the system that are free as well.
+        free_time: whether the step, and so the final time, is free; or (lower, upper) of the final time [s].
+
+    Raises:
+        ValueError: for a horizon without steps, a system without inputs, shapes that do not fit.
+
+    Example:
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import natcoord_jax as nc
+        >>> scene = nc.Scene()
+        >>> disc = scene.add(nc.RigidBody(mass=1.0, inertia=(1.0, 1.0, 2.0), name="disc"))
+        >>> hinge = scene.add(nc.Revolute(nc.ground, disc, name="hinge"))
+        >>> motor = scene.add(nc.JointTorque(hinge, name="motor"))
+        >>> system, state = scene.compile()
+        >>> problem = nc.OptimalControl(
+        ...     system, state, dt=0.05, steps=20, cost=nc.cost.Effort(),
+        ...     goal=nc.goal.Coordinate(hinge, 1.0) & nc.goal.Rest(),
+        ... )
+        >>> solution = nc.optimise(problem, progress=False)
+        >>> round(float(solution.cost), 2)  # 12 I^2 angle^2 / T^3, and O(dt^2)
+        48.12
+    """
+
+    system: System
+    state: State
+    dt: Any = eqx.field(kw_only=True)
+    steps: int = eqx.field(kw_only=True, static=True)
+    cost: Cost = eqx.field(default_factory=Cost, kw_only=True)
+    goal: Goal = eqx.field(default_factory=Goal, kw_only=True)
+    bounds: Bound = eqx.field(default_factory=Bound, kw_only=True)
+    inputs: Spline = eqx.field(default_factory=Spline, kw_only=True)
+    parameters: tuple[Parameter, ...] = eqx.field(default=(), kw_only=True, converter=tuple)
+    free_time: Any = eqx.field(default=False, kw_only=True, static=True)
+
+    def __check_init__(self):
+        """Refuse what is no problem."""
+        if isinstance(self.steps, bool) or not isinstance(self.steps, int | np.integer) or self.steps < 1:
+            raise ValueError(f"the horizon has {self.steps!r} steps; pass steps >= 1")
+        positive(self.dt, "optimal control: dt", "s")
+        channels = self.system.structure.inputs
+        if not channels:
+            raise ValueError(
+                "the system has no input channels; add a JointTorque or another actuator to the scene"
+            )
+        if self.free_time is not False and self.free_time is not True:
+            lower, upper = self.free_time
+            if not 0 < lower < upper:
+                raise ValueError(f"free_time is ({lower}, {upper}) s; pass 0 < lower < upper, or True")
+        names = [parameter.name for parameter in self.parameters]
+        if len(set(names)) != len(names):
+            raise ValueError(f"parameters have the names {names}; give each its own")
+        if is_concrete(self.state.q):
+            self._check_shapes()
+
+    def _check_shapes(self) -> None:
+        u, t = jnp.zeros(len(self.system.structure.inputs)), jnp.zeros(())
+        cost = jax.eval_shape(lambda s: self.cost.running(self.system, s, u, t), self.state)
+        end = jax.eval_shape(lambda s: self.cost.terminal(self.system, s), self.state)
+        if cost.shape != () or end.shape != ():
+            raise ValueError(f"the cost has shape {cost.shape} and at the end {end.shape}; return a scalar")
+        missing = jax.eval_shape(lambda s: self.goal.residual(self.system, s), self.state)
+        excess = jax.eval_shape(lambda s: self.bounds.excess(self.system, s, u, t), self.state)
+        for what, found, names in (
+            ("goal", missing, self.goal.labels(self.system)),
+            ("bounds", excess, self.bounds.labels(self.system)),
+        ):
+            if found.shape != (len(names),):
+                raise ValueError(
+                    f"the {what} returns shape {found.shape} for the labels {names}; make them agree"
+                )
+
+    @property
+    def channels(self) -> int:
+        """Number of input channels."""
+        return len(self.system.structure.inputs)
+
+    @property
+    def free(self) -> tuple[str, ...]:
+        """Names of what is free besides the inputs."""
+        times = ("final time [s]",) if self.free_time else ()
+        return (*times, *(parameter.name for parameter in self.parameters))
+
+    def references(self) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
+        """Initial values of what is free besides the inputs, and the scale of each."""
+        found = [parameter.initial(self.system) for parameter in self.parameters]
+        if self.free_time:
+            found = [self.steps * jnp.asarray(self.dt, float), *found]
+        values = jnp.stack(found) if found else jnp.zeros(0)
+        return values, jnp.where(values == 0, 1.0, jnp.abs(values))
+
+    def limits(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper bounds of what is free besides the inputs."""
+        sides = [(p.lower, p.upper) for p in self.parameters]
+        if self.free_time:
+            sides = [(0.0, None) if self.free_time is True else tuple(self.free_time), *sides]
+        lower = np.array([-np.inf if a is None else a for a, _ in sides], float)
+        upper = np.array([np.inf if b is None else b for _, b in sides], float)
+        return lower, upper
+
+    def values(self, scaled: Float[Array, " p"]) -> Float[Array, " p"]:
+        """Values of what is free from the solver's unknowns: changes in units of the scale."""
+        reference, scale = self.references()
+        return reference + scale * scaled
+
+    def applied(self, scaled: Float[Array, " p"]) -> tuple[System, Float[Array, ""]]:
+        """The system and the step [s] at given values of what is free."""
+        values, system = self.values(scaled), self.system
+        dt = values[0] / self.steps if self.free_time else jnp.asarray(self.dt, float)
+        for parameter, value in zip(self.parameters, values[1 if self.free_time else 0 :]):
+            system = parameter.applied(system, value)
+        return system, dt
+
+    def start(self, scaled: Float[Array, " p"]) -> State:
+        """Initial state at given values of what is free."""
+        if not any(parameter.moves for parameter in self.parameters):
+            return self.state
+        return assemble(self.applied(scaled)[0], self.state)

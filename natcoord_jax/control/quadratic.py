@@ -1,0 +1,299 @@
+"""The quadratic model of a problem around a motion: exact gradients, curvature of the Lagrangian, by step."""
+
+from functools import partial
+from operator import itemgetter
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
+
+from natcoord_jax.control.problem import OptimalControl
+from natcoord_jax.control.tangent import projected, tangent_maps
+from natcoord_jax.control.transcription import (
+    Node,
+    Path,
+    Slice,
+    Stage,
+    Unknowns,
+    end,
+    entering,
+    first_node,
+    packed,
+    slices,
+    stage,
+    unpacked,
+)
+
+
+class Multipliers(eqx.Module):
+    """Multipliers of the goal, of the bounds at every step, and of the bounds of what is free."""
+
+    goal: Float[Array, "*batch c"]
+    path: Float[Array, "*batch steps h"]
+    end: Float[Array, "*batch e"]
+
+
+class Costates(eqx.Module):
+    """What a change of a node, or of a step's residual, is worth.
+
+    Attributes:
+        nodes: of all nodes, the structure of a node, leading axis steps + 1.
+        residuals: of the residuals of all steps (steps, n).
+    """
+
+    nodes: Node
+    residuals: Float[Array, "steps n"]
+
+
+class Model(eqx.Module):
+    """Linear dynamics and quadratic costs in small numbers z (see `tangent`), w and what is free.
+
+    z holds changes of the state, of what is free and of the register; w those of entering coefficients.
+
+    Attributes:
+        forward: z_k+1 = forward [z_k, w_k] + offset, (steps, z, z + m).
+        offset: from the residuals (steps, z).
+        hessian: of the Lagrangian in [z, w] (steps, z + m, z + m).
+        gradient: linear terms in [z, w] (steps, z + m).
+        excess: derivative of the excesses (steps, h, z + m).
+        excess_offset: from the residuals (steps, h).
+        last_hessian: of the terminal Lagrangian (z, z).
+        goal: derivative of the goal (c, z).
+        last_excess: derivative of the terminal excesses (e, z).
+        first: z_0 per what is free and leading coefficients (z, f).
+        first_hessian: (f, f).
+        first_gradient: (f,).
+    """
+
+    forward: Float[Array, "steps z zm"]
+    offset: Float[Array, "steps z"]
+    hessian: Float[Array, "steps zm zm"]
+    gradient: Float[Array, "steps zm"]
+    excess: Float[Array, "steps h zm"]
+    excess_offset: Float[Array, "steps h"]
+    last_hessian: Float[Array, "z z"]
+    goal: Float[Array, "c z"]
+    last_excess: Float[Array, "e z"]
+    first: Float[Array, "z f"]
+    first_hessian: Float[Array, "f f"]
+    first_gradient: Float[Array, " f"]
+
+
+class Charts(NamedTuple):
+    """Small numbers of nodes, forth from them and back to them, and inverse inertias; leading axis steps + 1."""
+
+    forth: Float[Array, "k x z"]
+    back: Float[Array, "k z x"]
+    flexibility: Float[Array, "k n n"]
+
+
+def charts(problem: OptimalControl, nodes: Node) -> Charts:
+    """Tangent maps of all nodes, what is free and the register added unchanged."""
+
+    def one(node: Node) -> tuple[Array, Array, Array]:
+        system, _ = problem.applied(node.free)
+        forth, back, flexibility = tangent_maps(system, unpacked(problem.state, node.x, problem.state.t))
+        others = jnp.eye(node.free.size + node.register.size, dtype=forth.dtype)
+        block = jax.scipy.linalg.block_diag
+        return block(forth, others), block(back, others), flexibility
+
+    return Charts(*jax.vmap(one)(nodes))
+
+
+def step_inverses(problem: OptimalControl, path: Path, unknowns: Unknowns) -> Float[Array, "steps n n"]:
+    """Inverse of the Jacobian of every step's equations in its own unknowns."""
+
+    def one(at: Slice, node: Node, w: Array, y: Array) -> Array:
+        return jnp.linalg.inv(jax.jacfwd(lambda y: stage(problem, at, node, w, y).residual)(y))
+
+    before = jax.tree.map(lambda x: x[:-1], path.nodes)
+    return jax.vmap(one)(slices(problem), before, entering(problem, unknowns.coefficients), unknowns.y)
+
+
+def _projected(problem: OptimalControl, node: Node, flexibility: Array) -> Node:
+    """Node with projected velocities."""
+    system, _ = problem.applied(node.free)
+    state = projected(system, unpacked(problem.state, node.x, problem.state.t), flexibility)
+    return eqx.tree_at(lambda n: n.x, node, packed(state))
+
+
+def _scored(
+    problem: OptimalControl, at: Slice, node: Node, w: Array, y: Array, worth: tuple, flexibility: Array
+) -> Array:
+    """Lagrangian of one step whose velocities are projected at the end."""
+    found = stage(problem, at, node, w, y)
+    after, residual, path = worth
+    reached = _projected(problem, found.after, flexibility)
+    carried = sum(jnp.sum(a * b) for a, b in zip(jax.tree.leaves(after), jax.tree.leaves(reached)))
+    return found.cost + carried + residual @ found.residual + path @ found.excess
+
+
+def _scored_end(problem: OptimalControl, multipliers: Multipliers, node: Node) -> Array:
+    """Lagrangian of the end."""
+    found = end(problem, node)
+    return found.cost + multipliers.goal @ found.missing + multipliers.end @ found.excess
+
+
+def costates(
+    problem: OptimalControl,
+    path: Path,
+    unknowns: Unknowns,
+    multipliers: Multipliers,
+    inverses: Array,
+    maps: Charts,
+) -> tuple[Costates, Costates, Float[Array, "steps m"]]:
+    """Worth of nodes and residuals, such that the Lagrangian is stationary in all states and unknowns y.
+
+    Returns:
+        Costates, exact; those of steps with projected velocities, for the curvature; and the gradient of the
+        Lagrangian in the entering coefficients, exact.
+    """
+    last = jax.grad(partial(_scored_end, problem, multipliers))(jax.tree.map(lambda x: x[-1], path.nodes))
+    like = jax.tree.map(lambda x: x[0], path.stages)
+
+    def worths(residual: Array, excess: Array, after: Node, cost: float) -> Stage:
+        weight = jnp.full_like(like.cost, cost)
+        return Stage(residual, weight, excess, after)
+
+    def body(after: tuple[Node, Node], given: tuple) -> tuple[tuple[Node, Node], tuple]:
+        at, node, w, y, sigma, inverse, following, flexibility = given
+        back = jax.vjp(lambda n: _projected(problem, n, flexibility), following)[1]
+        both = jax.tree.map(lambda a, b: jnp.stack([a, b]), after[0], back(after[1])[0])
+        pull = jax.vjp(lambda *x: stage(problem, at, *x), node, w, y)[1]
+
+        def through(after: Node) -> tuple[Node, Array, Array]:
+            before, by_w, by_y = pull(worths(jnp.zeros_like(like.residual), sigma, after, 1.0))
+            worth = -(by_y @ inverse)
+            no_sigma, no_after = jax.tree.map(jnp.zeros_like, (sigma, after))
+            again = pull(worths(worth, no_sigma, no_after, 0.0))
+            return jax.tree.map(jnp.add, before, again[0]), by_w + again[1], worth
+
+        before, by_w, worth = jax.vmap(through)(both)
+        exact, model = (jax.tree.map(itemgetter(k), before) for k in range(2))
+        return (exact, model), ((exact, worth[0]), (model, worth[1]), by_w[0])
+
+    before, after = (jax.tree.map(itemgetter(s), path.nodes) for s in (slice(None, -1), slice(1, None)))
+    w = entering(problem, unknowns.coefficients)
+    given = (slices(problem), before, w, unknowns.y, multipliers.path, inverses, after, maps.flexibility[1:])
+    _, (exact, model, by_w) = jax.lax.scan(body, (last, last), given, reverse=True)
+
+    def whole(nodes: Node, residuals: Array) -> Costates:
+        return Costates(jax.tree.map(lambda x, x1: jnp.concatenate([x, x1[None]]), nodes, last), residuals)
+
+    return whole(*exact), whole(*model), by_w
+
+
+def _stage_model(
+    problem: OptimalControl,
+    at: Slice,
+    node: Node,
+    w: Array,
+    y: Array,
+    worth: tuple,
+    inverse: Array,
+    residual: Array,
+    forth: Array,
+    back: Array,
+    flexibility: Array,
+) -> tuple[Array, ...]:
+    """Derivatives of one step in small numbers: dynamics, curvature, excesses; last column the offset."""
+    flat, unflat = ravel_pytree(node)
+    size, channels = flat.size, w.size
+
+    def values(chi: Array, w: Array, y: Array) -> tuple[Array, Array, Array]:
+        found = stage(problem, at, unflat(chi), w, y)
+        return found.residual, ravel_pytree(found.after)[0], found.excess
+
+    def slopes(chi: Array, w: Array, y: Array) -> tuple[Array, Array, Array]:
+        def scored(chi: Array, w: Array, y: Array) -> Array:
+            return _scored(problem, at, unflat(chi), w, y, worth, flexibility)
+
+        return jax.grad(scored, argnums=(0, 1, 2))(chi, w, y)
+
+    count = forth.shape[1] + channels
+    directions = jax.scipy.linalg.block_diag(forth, jnp.eye(channels, dtype=flat.dtype))
+    chi_dirs, w_dirs = directions[:size], directions[size:]
+    still = jnp.zeros_like(y)
+    moved = jax.vmap(
+        lambda dc, dw: jax.jvp(values, (flat, w, y), (dc, dw, still))[1][0], in_axes=1, out_axes=1
+    )(chi_dirs, w_dirs)
+    y_dirs = -inverse @ jnp.concatenate([moved, residual[:, None]], axis=1)
+    chi_dirs, w_dirs = (jnp.pad(x, ((0, 0), (0, 1))) for x in (chi_dirs, w_dirs))
+
+    def both(dc: Array, dw: Array, dy: Array) -> tuple:
+        _, after, excess = jax.jvp(values, (flat, w, y), (dc, dw, dy))[1]
+        return after, excess, *jax.jvp(slopes, (flat, w, y), (dc, dw, dy))[1]
+
+    after, excess, by_chi, by_w, by_y = jax.vmap(both, in_axes=1, out_axes=1)(chi_dirs, w_dirs, y_dirs)
+    hessian = chi_dirs.T @ by_chi + w_dirs.T @ by_w + y_dirs.T @ by_y
+    forward = back @ after
+    return forward[:, :count], forward[:, count], hessian[:count, :count], hessian[:count, count], excess
+
+
+def model(
+    problem: OptimalControl,
+    path: Path,
+    unknowns: Unknowns,
+    multipliers: Multipliers,
+    bent: Costates,
+    by_w: Float[Array, "steps m"],
+    by_first: Float[Array, " f"],
+    inverses: Float[Array, "steps n n"],
+    maps: Charts,
+) -> Model:
+    """The quadratic model around a motion, all steps at once."""
+    before = jax.tree.map(lambda x: x[:-1], path.nodes)
+    after = jax.tree.map(lambda x: x[1:], bent.nodes)
+    w = entering(problem, unknowns.coefficients)
+    given = (slices(problem), before, w, unknowns.y, (after, bent.residuals, multipliers.path), inverses)
+    each = jax.vmap(partial(_stage_model, problem))(
+        *given, path.stages.residual, maps.forth[:-1], maps.back[1:], maps.flexibility[1:]
+    )
+    forward, offset, hessian, shift, excess = each
+    gradient = shift.at[:, -w.shape[1] :].add(by_w)
+    last, unflat = ravel_pytree(jax.tree.map(lambda x: x[-1], path.nodes))
+    forth = maps.forth[-1]
+
+    def scored(chi: Array) -> Array:
+        return jax.grad(lambda c: _scored_end(problem, multipliers, unflat(c)))(chi)
+
+    def reached(chi: Array) -> tuple[Array, Array]:
+        found = end(problem, unflat(chi))
+        return found.missing, found.excess
+
+    curved = jax.vmap(lambda d: jax.jvp(scored, (last,), (d,))[1], in_axes=1, out_axes=1)(forth)
+    goal, last_excess = jax.vmap(lambda d: jax.jvp(reached, (last,), (d,))[1], in_axes=1, out_axes=1)(forth)
+    first, first_hessian = _first_model(problem, unknowns, bent, maps)
+    return Model(
+        forward,
+        offset,
+        hessian,
+        gradient,
+        excess[:, :, :-1],
+        excess[:, :, -1],
+        forth.T @ curved,
+        goal,
+        last_excess,
+        first,
+        first_hessian,
+        by_first,
+    )
+
+
+def _first_model(
+    problem: OptimalControl, unknowns: Unknowns, bent: Costates, maps: Charts
+) -> tuple[Array, Array]:
+    """How the first node depends on what is free and on the leading coefficients, and how bent that is."""
+    flat, unflat = ravel_pytree((unknowns.free, unknowns.coefficients[: problem.inputs.degree]))
+    if not flat.size:
+        return jnp.zeros((maps.back.shape[1], 0)), jnp.zeros((0, 0))
+    value = ravel_pytree(jax.tree.map(lambda x: x[0], bent.nodes))[0]
+
+    def node(given: Array) -> Array:
+        return ravel_pytree(first_node(problem, *unflat(given)))[0]
+
+    curved = jax.jacfwd(jax.grad(lambda given: value @ node(given)))(flat)
+    return maps.back[0] @ jax.jacfwd(node)(flat), curved

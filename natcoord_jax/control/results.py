@@ -1,0 +1,44 @@
+"""How an optimisation ended."""
+
+from enum import IntEnum
+
+
+class Outcome(IntEnum):
+    """How an optimisation ended."""
+
+    OPTIMAL = 0
+    RUNNING = 1
+    MAX_ITERATIONS = 2
+    UNREACHABLE = 3
+    STALLED = 4
+    SIMULATION_FAILED = 5
+    NONFINITE = 6
+    STOPPED = 7
+    TIME_LIMIT = 8
+
+    @property
+    def ok(self) -> bool:
+        """Whether the solution fulfils the conditions of optimality."""
+        return self is Outcome.OPTIMAL
+
+
+OUTCOMES = {
+    Outcome.OPTIMAL: "optimal",
+    Outcome.RUNNING: "still running",
+    Outcome.MAX_ITERATIONS: "the maximum of iterations was reached",
+    Outcome.UNREACHABLE: "the goal cannot be reached with these inputs and bounds",
+    Outcome.STALLED: "no step along the search direction made progress",
+    Outcome.SIMULATION_FAILED: "the motion of the guess could not be simulated",
+    Outcome.NONFINITE: "a number became infinite or not a number",
+    Outcome.STOPPED: "stopped by the user",
+    Outcome.TIME_LIMIT: "the time limit was reached",
+}
+
+ADVICE = {
+    Outcome.MAX_ITERATIONS: "allow more iterations, or start from a better guess",
+    Outcome.UNREACHABLE: "check for conditions that contradict each other or the conservation laws, and for "
+    "inputs that cannot move what the goal asks for; start from another guess",
+    Outcome.STALLED: "start from another guess, or look for cost, goal or bounds that are not smooth",
+    Outcome.SIMULATION_FAILED: "start from a milder guess or with a smaller dt, or use method='lifted'",
+    Outcome.NONFINITE: "check cost, goal and bounds for undefined operations",
+}

@@ -1,0 +1,402 @@
+"""The second-order method: sequential quadratic programming with an interior point for the bounds.
+
+Every iteration solves a quadratic model with the exact gradients and the curvature of the Lagrangian by a
+Riccati recursion. `lifted`: residuals of the steps are constraints like the others and vanish at the end
+only, so that a guess need not be a motion. `shooting`: every iterate is simulated.
+
+A solver is three pure functions: `init`, `step` and `done`.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float, Int
+
+from natcoord_jax.control.iterate import Derivatives, Errors, Iterate, Options, Slacks, largest
+from natcoord_jax.control.merit import Direction, Found, Violations, moved, room, search, slope_and_weights
+from natcoord_jax.control.problem import OptimalControl
+from natcoord_jax.control.quadratic import (
+    Costates,
+    Model,
+    Multipliers,
+    charts,
+    costates,
+    model,
+    step_inverses,
+)
+from natcoord_jax.control.results import Outcome
+from natcoord_jax.control.riccati import REACH, Move, Weighted, solve
+from natcoord_jax.control.transcription import (
+    Path,
+    Unknowns,
+    entering,
+    first_node,
+    roll,
+    simulated,
+    slices,
+    stage,
+)
+
+SHIFT = 1e-4
+"""First increase of the curvature where the model is not convex."""
+LARGEST_SHIFT = 1e8
+STIFFEST = 1e3
+"""Largest penalty on the goal, in units of its stiffness."""
+ROOM = 0.01
+"""Least room left to a bound at the start."""
+LEAST_BARRIER = 1e-10
+"""Barrier parameter at the end, relative to the cost."""
+AT_REST = 1e-7
+"""Relative size of a step that moves nothing any more."""
+
+
+class Proposal(eqx.Module):
+    """The step that the quadratic model proposes."""
+
+    direction: Direction
+    slope: Float[Array, ""]
+    weights: Violations
+    barrier: Float[Array, ""]
+    shift: Float[Array, ""]
+    penalty: Float[Array, " c"]
+    unreachable: Float[Array, " c"]
+    convex: Bool[Array, ""]
+
+
+def _before(path: Path) -> object:
+    return jax.tree.map(lambda x: x[:-1], path.nodes)
+
+
+def _first_gradient(problem: OptimalControl, unknowns: Unknowns, worth: Costates) -> Array:
+    """Gradient in what is free and in the leading coefficients."""
+    leading = unknowns.coefficients[: problem.inputs.degree]
+    flat, unflat = ravel_pytree((unknowns.free, leading))
+    if not flat.size:
+        return jnp.zeros(0)
+    value = ravel_pytree(jax.tree.map(lambda x: x[0], worth.nodes))[0]
+    return jax.grad(lambda x: value @ ravel_pytree(first_node(problem, *unflat(x)))[0])(flat)
+
+
+def _gradient_scale(problem: OptimalControl, unknowns: Unknowns, path: Path, sigma: Array) -> Array:
+    """Largest derivative of cost and bounds by a coefficient that enters: what their sum must cancel."""
+    w = entering(problem, unknowns.coefficients)
+
+    def direct(at, node, w, y, sigma):
+        def values(w: Array) -> tuple[Array, Array]:
+            found = stage(problem, at, node, w, y)
+            return found.cost, found.excess
+
+        by_cost, by_excess = jax.jacfwd(values)(w)
+        return jnp.abs(by_cost) + sigma @ jnp.abs(by_excess)
+
+    sizes = jax.vmap(direct)(slices(problem), _before(path), w, unknowns.y, sigma)
+    scale = jnp.max(sizes)
+    return jnp.where(scale > 0, scale, 1.0)
+
+
+@eqx.filter_jit
+def linearised(
+    problem: OptimalControl,
+    unknowns: Unknowns,
+    multipliers: Multipliers,
+    slacks: Slacks,
+    path: Path,
+    unit: Array,
+) -> Derivatives:
+    """First derivatives at a motion, and what is missing to the conditions of optimality."""
+    inverses = step_inverses(problem, path, unknowns)
+    maps = charts(problem, path.nodes)
+    worth, bent, by_w = costates(problem, path, unknowns, multipliers, inverses, maps)
+    by_first = _first_gradient(problem, unknowns, worth)
+    count = unknowns.free.size
+    scale = _gradient_scale(problem, unknowns, path, multipliers.path)
+    by_coefficients = largest(by_w[:: problem.inputs.every], by_first[count:]) / scale
+    stationarity = jnp.maximum(by_coefficients, largest(by_first[:count]) / unit)
+    corrections = largest(jnp.einsum("kij,kj->ki", inverses, path.stages.residual))
+    size = largest(unknowns.y)
+    errors = Errors(
+        stationarity,
+        corrections / jnp.where(size > 0, size, 1.0),
+        largest(path.end.missing),
+        largest(path.stages.excess + slacks.path, path.end.excess + slacks.end),
+        largest(slacks.path * multipliers.path, slacks.end * multipliers.end) / unit,
+    )
+    return Derivatives(inverses, maps, worth, bent, by_w, by_first, errors)
+
+
+def _unit(problem: OptimalControl, unknowns: Unknowns, path: Path) -> Array:
+    """Unit of the cost: its value, or that of inputs at half their range."""
+    w = entering(problem, unknowns.coefficients)
+
+    def curvature(at, node, w, y):
+        cost = jax.hessian(lambda w: stage(problem, at, node, w, y).cost)(w)
+        steep = jax.jacfwd(lambda w: stage(problem, at, node, w, y).excess)(w)
+        return jnp.max(jnp.abs(jnp.diagonal(cost))), steep
+
+    bent, steep = jax.vmap(curvature)(slices(problem), _before(path), w, unknowns.y)
+    slopes = largest(steep)
+    whole_range = 0.5 * jnp.sum(bent) / jnp.where(slopes > 0, slopes, 1.0) ** 2
+    unit = jnp.maximum(jnp.abs(path.cost), jnp.where(slopes > 0, whole_range, 0.0))
+    return jnp.where(unit > 0, unit, 1.0)
+
+
+@eqx.filter_jit
+def _begun(problem: OptimalControl, options: Options, unknowns: Unknowns) -> tuple:
+    newton, whole = jnp.array(0), jnp.array(True)
+    if not options.lifted:
+        unknowns, whole, newton = simulated(problem, unknowns)
+    path = roll(problem, unknowns)
+    slacks = Slacks(jnp.maximum(-path.stages.excess, ROOM), jnp.maximum(-path.end.excess, ROOM))
+    unit = _unit(problem, unknowns, path)
+    barrier = options.barrier * unit / max(1, slacks.path.size + slacks.end.size)
+    goal = jnp.zeros_like(path.end.missing)
+    multipliers = Multipliers(goal, barrier / slacks.path, barrier / slacks.end)
+    return unknowns, multipliers, slacks, path, unit, barrier, whole, newton
+
+
+def init(problem: OptimalControl, options: Options, unknowns: Unknowns) -> Iterate:
+    """First iterate from a guess.
+
+    Args:
+        problem: the problem.
+        options: settings.
+        unknowns: coefficients and what is free; `y` is replaced by a simulation unless the method is lifted.
+    """
+    unknowns, multipliers, slacks, path, unit, barrier, whole, newton = _begun(problem, options, unknowns)
+    derivatives = linearised(problem, unknowns, multipliers, slacks, path, unit)
+    nothing, infinite = jnp.zeros(()), jnp.full((), jnp.inf)
+    goal = multipliers.goal
+    finite = jnp.isfinite(path.cost) & jnp.isfinite(derivatives.errors.stationarity)
+    code = jnp.where(finite, int(Outcome.RUNNING), int(Outcome.NONFINITE))
+    code = jnp.where(whole, code, int(Outcome.SIMULATION_FAILED))
+    return Iterate(
+        unknowns,
+        multipliers,
+        slacks,
+        path,
+        derivatives,
+        barrier,
+        unit,
+        nothing,
+        goal,
+        (path, slacks),
+        nothing,
+        infinite,
+        goal,
+        jnp.array(0),
+        newton,
+        jnp.array(0),
+        code,
+    )
+
+
+def _weighted(iterate: Iterate) -> Weighted:
+    """Slacks and multipliers of bounds eliminated from the model."""
+    m, s, mu = iterate.multipliers, iterate.slacks, iterate.barrier
+    path, end = m.path / s.path, m.end / s.end
+    gap, last = iterate.path.stages.excess + s.path, iterate.path.end.excess + s.end
+    return Weighted(path, mu / s.path - m.path + path * gap, end, mu / s.end - m.end + end * last)
+
+
+def _convex_move(problem: OptimalControl, iterate: Iterate, found: Model) -> tuple[Move, Array]:
+    """The solution of the model, its curvature increased until it is convex."""
+    bounds = _weighted(iterate)
+    idle = (jnp.arange(problem.steps) % problem.inputs.every != 0).astype(float)
+    idle = jnp.broadcast_to(idle[:, None], (problem.steps, problem.channels))
+    reach = jnp.clip(30.0 * iterate.errors.motion, *REACH)
+
+    def attempt(stiffness: Array, shift: Array) -> Move:
+        penalty = stiffness * iterate.penalty
+        missing, goal = iterate.path.end.missing, iterate.multipliers.goal
+        return solve(found, missing, bounds, idle, shift, penalty, goal, reach)
+
+    def unfinished(carry: tuple) -> Array:
+        move, _, shift, begun = carry
+        return ~begun | (~move.convex & (shift < LARGEST_SHIFT))
+
+    def body(carry: tuple) -> tuple:
+        # A penalty on the goal bends the model only where the goal forbids a change; it is tried first.
+        _, stiffness, shift, begun = carry
+        exhausted = begun & (stiffness >= STIFFEST)
+        shift = jnp.where(exhausted, jnp.maximum(10.0 * shift, SHIFT), shift)
+        stiffness = jnp.where(begun & ~exhausted, 10.0 * stiffness, stiffness)
+        return attempt(stiffness, shift), stiffness, shift, jnp.array(True)
+
+    start = jnp.where(iterate.failures > 0, jnp.maximum(10.0 * iterate.shift, SHIFT), 0.1 * iterate.shift)
+    start = jnp.where(start < SHIFT, 0.0, start)
+    shapes = jax.eval_shape(attempt, start, start)
+    nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+    move, _, shift, _ = jax.lax.while_loop(unfinished, body, (nothing, jnp.ones(()), start, jnp.array(False)))
+    return move, shift
+
+
+def _penalty(iterate: Iterate, move: Move) -> Array:
+    """Penalties on the goal, from its compliance in the first model."""
+    compliance = jnp.diagonal(move.compliance)
+    reached = compliance > 1e-12 * jnp.max(compliance, initial=0.0)
+    found = jnp.where(reached, 1.0 / jnp.where(reached, compliance, 1.0), 0.0)
+    return jnp.where(iterate.iteration == 0, found, iterate.penalty)
+
+
+def _linear_motion(problem: OptimalControl, iterate: Iterate, change: Unknowns) -> Float[Array, "steps n"]:
+    """Changes of the steps' unknowns that make the linearised residuals vanish, exactly."""
+    unknowns, path = iterate.unknowns, iterate.path
+    leading = problem.inputs.degree
+    given = (unknowns.free, unknowns.coefficients[:leading])
+    start = jax.jvp(lambda *x: first_node(problem, *x), given, (change.free, change.coefficients[:leading]))[
+        1
+    ]
+    w, dw = entering(problem, unknowns.coefficients), entering(problem, change.coefficients)
+
+    def body(dn, given):
+        at, node, w, dw, y, inverse, residual = given
+        point = (node, w, y)
+        first = jax.jvp(lambda *x: stage(problem, at, *x).residual, point, (dn, dw, jnp.zeros_like(y)))[1]
+        dy = -inverse @ (residual + first)
+        return jax.jvp(lambda *x: stage(problem, at, *x).after, point, (dn, dw, dy))[1], dy
+
+    inverses, residual = iterate.derivatives.inverses, path.stages.residual
+    given = (slices(problem), _before(path), w, dw, unknowns.y, inverses, residual)
+    return jax.lax.scan(body, start, given)[1]
+
+
+def _direction(
+    problem: OptimalControl, options: Options, iterate: Iterate, found: Model, move: Move
+) -> Direction:
+    """Directions of coefficients, of what is free, of the unknowns of the steps, slacks and multipliers."""
+    count = iterate.unknowns.free.size
+    head = move.first[count:].reshape(problem.inputs.degree, problem.channels)
+    coefficients = jnp.concatenate([head, move.w[:: problem.inputs.every]])
+    unknowns = Unknowns(coefficients, move.first[:count], jnp.zeros_like(iterate.unknowns.y))
+    if options.lifted:
+        unknowns = eqx.tree_at(lambda u: u.y, unknowns, _linear_motion(problem, iterate, unknowns))
+    s, m, mu = iterate.slacks, iterate.multipliers, iterate.barrier
+    changes = jnp.concatenate([move.z[:-1], move.w], axis=1)
+    tightened = jnp.einsum("khz,kz->kh", found.excess, changes) + found.excess_offset
+    slack = -(iterate.path.stages.excess + s.path) - tightened
+    last = -(iterate.path.end.excess + s.end) - found.last_excess @ move.z[-1]
+    path = (mu - m.path * slack) / s.path - m.path
+    end = (mu - m.end * last) / s.end - m.end
+    return Direction(unknowns, Multipliers(move.goal, path, end), Slacks(slack, last))
+
+
+def _lowered(iterate: Iterate) -> Array:
+    """The barrier parameter of the next iteration: lower where the present one is nearly solved."""
+    s, m, mu, e = iterate.slacks, iterate.multipliers, iterate.barrier, iterate.errors
+    count = max(1, s.path.size + s.end.size)
+    unit = iterate.unit / count
+    relative = mu / unit
+    central = largest(s.path * m.path - mu, s.end * m.end - mu) / unit
+    missing = jnp.maximum(jnp.maximum(e.stationarity, central), jnp.maximum(e.bounds, e.goal))
+    lower = unit * jnp.maximum(LEAST_BARRIER, jnp.minimum(0.2 * relative, relative**1.5))
+    return jnp.where(missing < 10.0 * relative, jnp.minimum(lower, mu), mu)
+
+
+@eqx.filter_jit
+def propose(problem: OptimalControl, options: Options, iterate: Iterate) -> Proposal:
+    """The next step, from the quadratic model."""
+    iterate = eqx.tree_at(lambda i: i.barrier, iterate, _lowered(iterate))
+    d = iterate.derivatives
+    found = model(
+        problem,
+        iterate.path,
+        iterate.unknowns,
+        iterate.multipliers,
+        d.bent,
+        d.by_w,
+        d.by_first,
+        d.inverses,
+        d.maps,
+    )
+    move, shift = _convex_move(problem, iterate, found)
+    direction = _direction(problem, options, iterate, found, move)
+    slope, weights = slope_and_weights(iterate, direction, problem.inputs.every)
+    penalty = _penalty(iterate, move)
+    return Proposal(direction, slope, weights, iterate.barrier, shift, penalty, move.unreachable, move.convex)
+
+
+@eqx.filter_jit
+def tried(
+    problem: OptimalControl, options: Options, iterate: Iterate, proposal: Proposal
+) -> tuple[Found, Multipliers]:
+    """The step as far as it makes the merit smaller, and the multipliers there."""
+    iterate = eqx.tree_at(lambda i: i.barrier, iterate, proposal.barrier)
+    found = search(problem, options, iterate, proposal.direction, proposal.slope, proposal.weights)
+    m, dm = iterate.multipliers, proposal.direction.multipliers
+    dual = room([(m.path, dm.path), (m.end, dm.end)])
+    goal = moved(m.goal, dm.goal, found.length)
+    return found, Multipliers(goal, moved(m.path, dm.path, dual), moved(m.end, dm.end, dual))
+
+
+@eqx.filter_jit
+def concluded(
+    options: Options,
+    iterate: Iterate,
+    proposal: Proposal,
+    found: Found,
+    multipliers: Multipliers,
+    derivatives: Derivatives,
+) -> Iterate:
+    """The next iterate: the step, or the old one with a sign of failure."""
+    d = proposal.direction.unknowns
+    size = largest(found.unknowns.coefficients, found.unknowns.free)
+    change = found.length * largest(d.coefficients, d.free) / jnp.where(size > 0, size, 1.0)
+    accepted = Iterate(
+        found.unknowns,
+        multipliers,
+        found.slacks,
+        found.path,
+        derivatives,
+        proposal.barrier,
+        iterate.unit,
+        proposal.shift,
+        proposal.penalty,
+        (iterate.path, iterate.slacks),
+        found.length,
+        change,
+        proposal.unreachable,
+        iterate.iteration,
+        iterate.newton,
+        jnp.zeros_like(iterate.failures),
+        iterate.code,
+    )
+    kept = eqx.tree_at(
+        lambda i: (i.failures, i.shift, i.step, i.unreachable),
+        iterate,
+        (iterate.failures + 1, proposal.shift, jnp.zeros_like(found.length), proposal.unreachable),
+    )
+    after = jax.tree.map(lambda x, x0: jnp.where(found.fine & proposal.convex, x, x0), accepted, kept)
+    counts = (iterate.iteration + 1, iterate.newton + found.newton)
+    after = eqx.tree_at(lambda i: (i.iteration, i.newton), after, counts)
+    return eqx.tree_at(lambda i: i.code, after, _judged(options, after))
+
+
+def step(problem: OptimalControl, options: Options, iterate: Iterate) -> Iterate:
+    """One iteration; four programs, or parts of one under `jax.jit`."""
+    proposal = propose(problem, options, iterate)
+    found, multipliers = tried(problem, options, iterate, proposal)
+    derivatives = linearised(problem, found.unknowns, multipliers, found.slacks, found.path, iterate.unit)
+    return concluded(options, iterate, proposal, found, multipliers, derivatives)
+
+
+def _judged(options: Options, it: Iterate) -> Int[Array, ""]:
+    """Outcome of an iteration."""
+    e = it.errors
+    fulfilled = (e.goal <= options.goal_tol) & (e.bounds <= options.goal_tol) & (e.motion <= options.goal_tol)
+    optimal = fulfilled & (e.stationarity <= options.tol) & (e.complementarity <= options.tol)
+    finite = jnp.isfinite(e.stationarity) & jnp.isfinite(e.goal)
+    resting = (it.moved < AT_REST) | (it.failures >= 3)
+    unreachable = (e.goal > options.goal_tol) & (largest(it.unreachable) > 0.5 * e.goal) & resting
+    code = jnp.where(
+        it.iteration >= options.max_iterations, int(Outcome.MAX_ITERATIONS), int(Outcome.RUNNING)
+    )
+    code = jnp.where(it.failures >= 5, int(Outcome.STALLED), code)
+    code = jnp.where(unreachable, int(Outcome.UNREACHABLE), code)
+    code = jnp.where(finite, code, int(Outcome.NONFINITE))
+    return jnp.where(optimal, int(Outcome.OPTIMAL), code)
+
+
+def done(iterate: Iterate) -> Bool[Array, ""]:
+    """Whether the method has ended."""
+    return ~iterate.running

@@ -1,0 +1,241 @@
+"""What an optimisation returns, and files of it."""
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from natcoord_jax.assembly.system import System
+from natcoord_jax.control.guess import Guess
+from natcoord_jax.control.iterate import Iterate
+from natcoord_jax.control.problem import OptimalControl
+from natcoord_jax.control.results import ADVICE, OUTCOMES, Outcome
+from natcoord_jax.control.transcription import held_inputs
+from natcoord_jax.core.state import State, Trajectory
+from natcoord_jax.stepping.simulate import simulate
+
+NAMED = 3
+"""How many violated conditions a message names."""
+
+
+class Row(NamedTuple):
+    """One line of the history.
+
+    Attributes:
+        iteration: number.
+        cost: whole cost.
+        stationarity: gradient of the Lagrangian, relative.
+        violation: largest violation of goal, bounds and equations.
+        worst: what violates it.
+        step: length of the step.
+        newton: Newton iterations of the simulations so far.
+        seconds: since the start.
+    """
+
+    iteration: int
+    cost: float
+    stationarity: float
+    violation: float
+    worst: str
+    step: float
+    newton: int
+    seconds: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Solution:
+    """The end of an optimisation, reached or not.
+
+    Attributes:
+        problem: the problem.
+        inputs: of all steps (steps, inputs) [N, N m].
+        free: values of final time [s] and parameters by name.
+        dt: step [s].
+        cost: whole cost.
+        outcome: how it ended.
+        method: how it was found: "shooting", "lifted" or "first-order", and with what.
+        history: one row for each iteration.
+        iterate: where the second-order method ended, for warm starts, feedback and sensitivities.
+        unreachable: part of the goal's residual that no input changes.
+    """
+
+    problem: OptimalControl
+    inputs: Float[Array, "steps inputs"]
+    free: dict[str, float]
+    dt: float
+    cost: float
+    outcome: Outcome
+    method: str
+    history: list[Row]
+    iterate: Iterate | None = None
+    unreachable: Any = None
+
+    @property
+    def ok(self) -> bool:
+        """Whether the conditions of optimality are fulfilled."""
+        return self.outcome.ok
+
+    @property
+    def system(self) -> System:
+        """The system with the parameters found."""
+        return self.problem.applied(self._scaled())[0]
+
+    @property
+    def start(self) -> State:
+        """The initial state, assembled anew if a parameter moves geometry."""
+        return self.problem.start(self._scaled())
+
+    def _scaled(self) -> Array:
+        reference, scale = self.problem.references()
+        values = jnp.asarray([self.free[name] for name in self.problem.free])
+        return (values - reference) / scale if values.size else jnp.zeros(0)
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """The motion, simulated with the inputs found.
+
+        Raises:
+            SimulationError: if it cannot be simulated.
+        """
+        return simulate(self.system, self.start, dt=self.dt, inputs=self.inputs)
+
+    @property
+    def missing(self) -> dict[str, float]:
+        """Residual of the goal at the end of the simulated motion, by name."""
+        final = State(
+            *(x[-1] for x in (getattr(self.trajectory.states, f.name) for f in dataclasses.fields(State)))
+        )
+        names = self.problem.goal.labels(self.problem.system)
+        return dict(zip(_unique(names), np.asarray(self.problem.goal.residual(self.system, final)).tolist()))
+
+    @property
+    def multipliers(self) -> dict[str, Any]:
+        """Multipliers of the goal by name, and of the bounds by name, one for each step."""
+        if self.iterate is None:
+            return {}
+        m = self.iterate.multipliers
+        goal = _unique(self.problem.goal.labels(self.problem.system))
+        bounds = _unique(self.problem.bounds.labels(self.problem.system))
+        found: dict[str, Any] = dict(zip(goal, np.asarray(m.goal).tolist()))
+        return found | {name: np.asarray(m.path)[:, k] for k, name in enumerate(bounds)}
+
+    def explain(self) -> str:
+        """How it ended, in words, with the conditions that are violated most."""
+        text = f"{OUTCOMES[self.outcome]} after {len(self.history)} iterations by {self.method}"
+        if self.history:
+            last = self.history[-1]
+            text += (
+                f": cost {last.cost:.8g}, gradient {last.stationarity:.1e}, violation {last.violation:.1e}"
+            )
+        if self.ok:
+            return text
+        if self.outcome is Outcome.UNREACHABLE:
+            names = self.problem.goal.labels(self.problem.system)
+            sizes = np.abs(np.asarray(self.unreachable))
+            order = np.argsort(-sizes)[:NAMED]
+            text += "; what no input changes: " + ", ".join(
+                f"{names[k]} {sizes[k]:.2e}" for k in order if sizes[k] > 1e-3 * sizes.max()
+            )
+        elif self.history and self.history[-1].violation > 0:
+            text += f"; worst: {self.history[-1].worst}"
+        return text + (f"; {ADVICE[self.outcome]}" if self.outcome in ADVICE else "")
+
+    def guess(self, steps: int | None = None) -> Guess:
+        """A guess for another problem, with the inputs resampled in time to another number of steps."""
+        rates = None
+        structure = self.problem.system.structure
+        if self.iterate is not None and structure.solver == "reduced":
+            rates = np.asarray(self.iterate.unknowns.y)[:, : structure.unknowns]
+        free = [self.free[name] for name in self.problem.free] or None
+        steps = steps or self.problem.steps
+        rates = None if rates is None else _resampled(rates, steps)
+        return Guess(_resampled(np.asarray(self.inputs), steps), rates, free)
+
+    def save(self, file: str | Path) -> None:
+        """Write inputs, rates and what is free as JSON; `nc.load_guess` reads it for a warm start."""
+        guess = self.guess()
+        content = {
+            "inputs": np.asarray(guess.inputs).tolist(),
+            "rates": None if guess.rates is None else np.asarray(guess.rates).tolist(),
+            "free": guess.free,
+            "channels": list(self.problem.system.structure.inputs),
+            "dt": self.dt,
+            "cost": self.cost,
+            "outcome": OUTCOMES[self.outcome],
+            "method": self.method,
+        }
+        Path(file).write_text(json.dumps(content) + "\n", "utf-8")
+
+
+def load_guess(file: str | Path, steps: int | None = None) -> Guess:
+    """Read what `Solution.save` wrote, as a guess.
+
+    Args:
+        file: the file.
+        steps: number of steps to resample to; None: as saved.
+
+    Raises:
+        ValueError: for a file that is not such a one.
+    """
+    try:
+        content = json.loads(Path(file).read_text("utf-8"))
+        inputs = np.asarray(content["inputs"], float)
+        rates = None if content["rates"] is None else np.asarray(content["rates"], float)
+    except (json.JSONDecodeError, KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{file} is not a solution that `Solution.save` wrote: {error}") from error
+    count = inputs.shape[0] if steps is None else steps
+    return Guess(
+        _resampled(inputs, count), None if rates is None else _resampled(rates, count), content["free"]
+    )
+
+
+def _resampled(values: np.ndarray, steps: int) -> np.ndarray:
+    """Means of a history held over steps, over as many other steps of the same duration."""
+    count = values.shape[0]
+    if count == steps:
+        return values
+    ends = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
+    at = np.linspace(0.0, count, steps + 1)
+    total = np.stack([np.interp(at, np.arange(count + 1), column) for column in ends.T], axis=1)
+    return np.diff(total, axis=0) * steps / count
+
+
+def _unique(names: tuple[str, ...]) -> list[str]:
+    """Names with numbers where they occur more than once."""
+    return [
+        name if names.count(name) == 1 else f"{name} #{names[:k].count(name) + 1}"
+        for k, name in enumerate(names)
+    ]
+
+
+def solution_of(
+    problem: OptimalControl, iterate: Iterate, method: str, history: list[Row], outcome: Outcome
+) -> Solution:
+    """What the user sees of an iterate."""
+    free = problem.values(iterate.unknowns.free)
+    dt = float(problem.applied(iterate.unknowns.free)[1])
+    names = dict(zip(problem.free, np.asarray(free).tolist()))
+    inputs = held_inputs(problem, iterate.unknowns.coefficients)
+    cost = float(iterate.path.cost)
+    return Solution(
+        problem, inputs, names, dt, cost, outcome, method, history, iterate, np.asarray(iterate.unreachable)
+    )
+
+
+def worst_condition(problem: OptimalControl, iterate: Iterate) -> tuple[float, str]:
+    """Largest violation of an iterate, and the name of what violates it."""
+    found: list[tuple[float, str]] = [(float(iterate.errors.motion), "equations of motion")]
+    missing = np.abs(np.asarray(iterate.path.end.missing))
+    if missing.size:
+        k = int(np.argmax(missing))
+        found.append((float(missing[k]), problem.goal.labels(problem.system)[k]))
+    excess = np.asarray(iterate.path.stages.excess)
+    if excess.size:
+        at, k = np.unravel_index(int(np.argmax(excess)), excess.shape)
+        name = problem.bounds.labels(problem.system)[int(k)]
+        found.append((max(float(excess[at, k]), 0.0), f"{name}, step {int(at)}"))
+    return max(found)
