@@ -208,10 +208,14 @@ def test_compile_time_does_not_grow_with_bodies():
     try:
         seconds = {}
         for arms in (4, 48):
-            text = program(arms, "recursive")
-            start = time.perf_counter()
-            text.compile()
-            seconds[arms] = time.perf_counter() - start
+            spent = []
+            for _ in range(2):
+                text = program(arms, "recursive")
+                # Processor time: what else runs on the machine must not decide.
+                start = time.process_time()
+                text.compile()
+                spent.append(time.process_time() - start)
+            seconds[arms] = min(spent)
     finally:
         jax.config.update("jax_enable_compilation_cache", True)
     assert seconds[48] <= 1.5 * seconds[4] + 1.0, f"seconds of compilation by number of arms: {seconds}"

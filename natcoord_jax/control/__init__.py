@@ -5,11 +5,11 @@ from natcoord_jax.control import cost as cost
 from natcoord_jax.control import goal as goal
 from natcoord_jax.control import inputs as inputs
 from natcoord_jax.control.guess import Guess as Guess
-from natcoord_jax.control.optimise import multi_start as multi_start
-from natcoord_jax.control.optimise import optimise as optimise
-from natcoord_jax.control.optimise import optimise_jit as optimise_jit
 from natcoord_jax.control.parameter import Parameter as Parameter
 from natcoord_jax.control.problem import OptimalControl as OptimalControl
 from natcoord_jax.control.results import Outcome as Outcome
+from natcoord_jax.control.run import multi_start as multi_start
+from natcoord_jax.control.run import optimise as optimise
+from natcoord_jax.control.run import optimise_jit as optimise_jit
 from natcoord_jax.control.solution import Solution as Solution
 from natcoord_jax.control.solution import load_guess as load_guess

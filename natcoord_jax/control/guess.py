@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from natcoord_jax.control.compiled import quickly
 from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.control.transcription import Unknowns, end, roll
 
@@ -87,7 +88,7 @@ def _shaped(value: Any, shape: tuple[int, ...], what: str) -> Array:
     return array
 
 
-@eqx.filter_jit
+@quickly
 def _leading_to_goal(problem: OptimalControl, unknowns: Unknowns) -> Float[Array, "steps n"]:
     """Constant rates that lead the configuration to the goal, as near as they can; forces play no part."""
     count = problem.system.structure.unknowns

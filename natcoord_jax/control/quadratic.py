@@ -2,7 +2,7 @@
 
 from functools import partial
 from operator import itemgetter
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -26,6 +26,9 @@ from natcoord_jax.control.transcription import (
     stage,
     unpacked,
 )
+
+TOGETHER = 5
+"""Steps whose models are formed together."""
 
 
 class Multipliers(eqx.Module):
@@ -120,15 +123,46 @@ def _projected(problem: OptimalControl, node: Node, flexibility: Array) -> Node:
     return eqx.tree_at(lambda n: n.x, node, packed(state))
 
 
-def _scored(
-    problem: OptimalControl, at: Slice, node: Node, w: Array, y: Array, worth: tuple, flexibility: Array
-) -> Array:
-    """Lagrangian of one step whose velocities are projected at the end."""
+def _scored(problem: OptimalControl, at: Slice, node: Node, w: Array, y: Array, worth: tuple) -> Array:
+    """Lagrangian of one step."""
     found = stage(problem, at, node, w, y)
     after, residual, path = worth
-    reached = _projected(problem, found.after, flexibility)
-    carried = sum(jnp.sum(a * b) for a, b in zip(jax.tree.leaves(after), jax.tree.leaves(reached)))
+    carried = sum(jnp.sum(a * b) for a, b in zip(jax.tree.leaves(after), jax.tree.leaves(found.after)))
     return found.cost + carried + residual @ found.residual + path @ found.excess
+
+
+def _projection_model(
+    problem: OptimalControl, node: Node, worth: Node, flexibility: Array, forth: Array
+) -> tuple[Node, Array, Array]:
+    """Worth of a node before its velocities are projected, and the curvature of the projection.
+
+    The projection is linear in velocities, so that only displacements and what is free bend it.
+
+    Args:
+        problem: the problem.
+        node: the node.
+        worth: of the projected node.
+        flexibility: see `projected`.
+        forth: from small numbers to the node.
+
+    Returns:
+        The worth; the displacements D and unit changes of what is free; and H D with the second derivative H.
+    """
+    flat, unflat = ravel_pytree((node.x, node.free))
+
+    def value(given: Array) -> Array:
+        x, free = unflat(given)
+        reached = _projected(problem, Node(x, free, node.register), flexibility)
+        return worth.x @ reached.x
+
+    count, size = flexibility.shape[0], node.x.size
+    displaced = jnp.pad(forth[:size, :count], ((0, flat.size - size), (0, 0)))
+    units = jnp.eye(flat.size, dtype=flat.dtype)[:, size:]
+    along = jnp.concatenate([displaced, units], axis=1)
+    slope = jax.grad(value)(flat)
+    curved = jax.vmap(lambda d: jax.jvp(jax.grad(value), (flat,), (d,))[1], in_axes=1, out_axes=1)(along)
+    by_x, by_free = unflat(slope)
+    return Node(by_x, worth.free + by_free, worth.register), along, curved
 
 
 def _scored_end(problem: OptimalControl, multipliers: Multipliers, node: Node) -> Array:
@@ -197,11 +231,16 @@ def _stage_model(
     residual: Array,
     forth: Array,
     back: Array,
+    following: Node,
+    forth_after: Array,
     flexibility: Array,
 ) -> tuple[Array, ...]:
     """Derivatives of one step in small numbers: dynamics, curvature, excesses; last column the offset."""
     flat, unflat = ravel_pytree(node)
     size, channels = flat.size, w.size
+    before_projection, bending, curved = _projection_model(
+        problem, following, worth[0], flexibility, forth_after
+    )
 
     def values(chi: Array, w: Array, y: Array) -> tuple[Array, Array, Array]:
         found = stage(problem, at, unflat(chi), w, y)
@@ -209,7 +248,7 @@ def _stage_model(
 
     def slopes(chi: Array, w: Array, y: Array) -> tuple[Array, Array, Array]:
         def scored(chi: Array, w: Array, y: Array) -> Array:
-            return _scored(problem, at, unflat(chi), w, y, worth, flexibility)
+            return _scored(problem, at, unflat(chi), w, y, (before_projection, *worth[1:]))
 
         return jax.grad(scored, argnums=(0, 1, 2))(chi, w, y)
 
@@ -230,6 +269,10 @@ def _stage_model(
     after, excess, by_chi, by_w, by_y = jax.vmap(both, in_axes=1, out_axes=1)(chi_dirs, w_dirs, y_dirs)
     hessian = chi_dirs.T @ by_chi + w_dirs.T @ by_w + y_dirs.T @ by_y
     forward = back @ after
+    motions, loose = flexibility.shape[0], node.free.size
+    amounts = jnp.concatenate([forward[:motions], forward[2 * motions : 2 * motions + loose]])
+    mixed = (curved.T @ after[: curved.shape[0]]).T @ amounts
+    hessian = hessian + mixed + mixed.T - amounts.T @ (bending.T @ curved) @ amounts
     return forward[:, :count], forward[:, count], hessian[:count, :count], hessian[:count, count], excess
 
 
@@ -249,9 +292,10 @@ def model(
     after = jax.tree.map(lambda x: x[1:], bent.nodes)
     w = entering(problem, unknowns.coefficients)
     given = (slices(problem), before, w, unknowns.y, (after, bent.residuals, multipliers.path), inverses)
-    each = jax.vmap(partial(_stage_model, problem))(
-        *given, path.stages.residual, maps.forth[:-1], maps.back[1:], maps.flexibility[1:]
-    )
+    following = jax.tree.map(itemgetter(slice(1, None)), path.nodes)
+    given = (*given, path.stages.residual, maps.forth[:-1], maps.back[1:], following)
+    given = (*given, maps.forth[1:], maps.flexibility[1:])
+    each = _some_together(lambda x: _stage_model(problem, *x), given, problem.steps)
     forward, offset, hessian, shift, excess = each
     gradient = shift.at[:, -w.shape[1] :].add(by_w)
     last, unflat = ravel_pytree(jax.tree.map(lambda x: x[-1], path.nodes))
@@ -281,6 +325,14 @@ def model(
         first_hessian,
         by_first,
     )
+
+
+def _some_together(function: Any, given: Any, steps: int) -> Any:
+    """Function of all steps, a few of them at a time: what is in between stays in the cache."""
+    size = max(k for k in range(1, TOGETHER + 1) if steps % k == 0)
+    pieces = jax.tree.map(lambda x: x.reshape(steps // size, size, *x.shape[1:]), given)
+    found = jax.lax.map(jax.vmap(function), pieces)
+    return jax.tree.map(lambda x: x.reshape(steps, *x.shape[2:]), found)
 
 
 def _first_model(

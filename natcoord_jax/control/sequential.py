@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
+from natcoord_jax.control.compiled import quickly
 from natcoord_jax.control.iterate import Derivatives, Errors, Iterate, Options, Slacks, largest
 from natcoord_jax.control.merit import Direction, Found, Violations, moved, room, search, slope_and_weights
 from natcoord_jax.control.problem import OptimalControl
@@ -95,7 +96,7 @@ def _gradient_scale(problem: OptimalControl, unknowns: Unknowns, path: Path, sig
     return jnp.where(scale > 0, scale, 1.0)
 
 
-@eqx.filter_jit
+@quickly
 def linearised(
     problem: OptimalControl,
     unknowns: Unknowns,
@@ -141,7 +142,7 @@ def _unit(problem: OptimalControl, unknowns: Unknowns, path: Path) -> Array:
     return jnp.where(unit > 0, unit, 1.0)
 
 
-@eqx.filter_jit
+@quickly
 def _begun(problem: OptimalControl, options: Options, unknowns: Unknowns) -> tuple:
     newton, whole = jnp.array(0), jnp.array(True)
     if not options.lifted:
@@ -165,7 +166,7 @@ def init(problem: OptimalControl, options: Options, unknowns: Unknowns) -> Itera
     """
     unknowns, multipliers, slacks, path, unit, barrier, whole, newton = _begun(problem, options, unknowns)
     derivatives = linearised(problem, unknowns, multipliers, slacks, path, unit)
-    nothing, infinite = jnp.zeros(()), jnp.full((), jnp.inf)
+    nothing, infinite = jnp.zeros(()), jnp.full((), jnp.inf, float)
     goal = multipliers.goal
     finite = jnp.isfinite(path.cost) & jnp.isfinite(derivatives.errors.stationarity)
     code = jnp.where(finite, int(Outcome.RUNNING), int(Outcome.NONFINITE))
@@ -293,7 +294,7 @@ def _lowered(iterate: Iterate) -> Array:
     return jnp.where(missing < 10.0 * relative, jnp.minimum(lower, mu), mu)
 
 
-@eqx.filter_jit
+@quickly
 def propose(problem: OptimalControl, options: Options, iterate: Iterate) -> Proposal:
     """The next step, from the quadratic model."""
     iterate = eqx.tree_at(lambda i: i.barrier, iterate, _lowered(iterate))
@@ -316,7 +317,7 @@ def propose(problem: OptimalControl, options: Options, iterate: Iterate) -> Prop
     return Proposal(direction, slope, weights, iterate.barrier, shift, penalty, move.unreachable, move.convex)
 
 
-@eqx.filter_jit
+@quickly
 def tried(
     problem: OptimalControl, options: Options, iterate: Iterate, proposal: Proposal
 ) -> tuple[Found, Multipliers]:
@@ -329,7 +330,7 @@ def tried(
     return found, Multipliers(goal, moved(m.path, dm.path, dual), moved(m.end, dm.end, dual))
 
 
-@eqx.filter_jit
+@quickly
 def concluded(
     options: Options,
     iterate: Iterate,

@@ -79,7 +79,9 @@ def reorientation(
     )
 
 
-def beanie(steps: int = 40, *, inertias: tuple[float, float] = (1.0, 3.0), angle: float = 1.0, t_end: float = 1.0):
+def beanie(
+    steps: int = 40, *, inertias: tuple[float, float] = (1.0, 3.0), angle: float = 1.0, t_end: float = 1.0
+):
     """Two bodies at zero momentum joined by one hinge (Elroy's beanie): least effort to a relative angle.
 
     The least integral of u^2 is 12 J^2 angle^2 / T^3 with J = I1 I2 / (I1 + I2).
@@ -116,7 +118,9 @@ def two_masses(steps: int = 60, *, fastest: bool = False, t_end: float = 6.0) ->
     system, state = scene.compile()
     goal = nc.goal.Coordinate(slides[0], 1.0) & nc.goal.Coordinate(slides[1], 1.0) & nc.goal.Rest()
     if not fastest:
-        return nc.OptimalControl(system, state, dt=t_end / steps, steps=steps, cost=nc.cost.Effort(), goal=goal)
+        return nc.OptimalControl(
+            system, state, dt=t_end / steps, steps=steps, cost=nc.cost.Effort(), goal=goal
+        )
     return nc.OptimalControl(
         system,
         state,

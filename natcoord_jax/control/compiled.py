@@ -1,0 +1,26 @@
+"""Compilation of the solver's parts: quicker where they are called from Python."""
+
+from collections.abc import Callable
+from functools import wraps
+from typing import Any, TypeVar
+
+import equinox as eqx
+import jax
+
+from natcoord_jax.core.checks import at_top_level
+from natcoord_jax.stepping.simulate import QUICK
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def quickly(function: F) -> F:
+    """`eqx.filter_jit` with the options for quick compilation, which JAX accepts at the outermost call only."""
+    outermost = eqx.filter_jit(function, compiler_options=QUICK)  # pyright: ignore[reportCallIssue]
+    within = eqx.filter_jit(function)
+
+    @wraps(function)
+    def call(*arguments: Any) -> Any:
+        quick = at_top_level(eqx.filter(arguments, eqx.is_array)) and jax.default_backend() == "cpu"
+        return (outermost if quick else within)(*arguments)
+
+    return call  # pyright: ignore[reportReturnType]
