@@ -20,6 +20,10 @@ REACH = (1e-8, 1e-3)
 obeys its equations, and of one that does not by far."""
 
 
+FELT = 1e-5
+"""Conditions of the goal that inputs move less than this, relative to the others, count as out of reach."""
+
+
 class Weighted(NamedTuple):
     """Bounds in the quadratic model: the diagonal that slacks add, and their linear terms."""
 
@@ -123,7 +127,7 @@ def _first(
     if not T.size:
         return step, t, convex, t, T
     scale = jnp.sqrt(jnp.maximum(jnp.diagonal(T), 1e-300))
-    scale = jnp.where(scale > REACH[0] * jnp.max(scale), 1.0 / scale, 0.0)
+    scale = jnp.where(scale > FELT * jnp.max(scale), 1.0 / scale, 0.0)
     values, vectors = jnp.linalg.eigh(scale[:, None] * _symmetric(T) * scale)
     reached = values > reach
     inverse = jnp.where(reached, 1.0 / jnp.where(reached, values, 1.0), 0.0)

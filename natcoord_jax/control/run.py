@@ -24,6 +24,10 @@ HEADER = (
     f"{'iter':>4} {'cost':>14} {'gradient':>9} {'violation':>9} {'step':>7} {'newton':>7} {'s':>7}  worst"
 )
 DEFAULT = Options()
+NAMES = {True: "lifted", False: "shooting"}
+METHOD = "sequential quadratic programming"
+FOR_THE_OTHER = (Outcome.SIMULATION_FAILED, Outcome.STALLED, Outcome.MAX_ITERATIONS, Outcome.NONFINITE)
+"""Outcomes after which the other form of the method is tried, if the choice was ours."""
 SAME = 1e-6
 """Relative difference of costs below which two optima are taken for one."""
 
@@ -33,14 +37,15 @@ def numeric(problem: OptimalControl) -> OptimalControl:
     return jax.tree.map(lambda x: jnp.asarray(x, float) if isinstance(x, int | float) else x, problem)
 
 
-def _chosen(problem: OptimalControl, method: str) -> bool:
+def _chosen(problem: OptimalControl, method: str, guess: Any = None) -> bool:
     """Whether to lift: where time or parameters are free or the path is bounded, simulations lead astray."""
     if method not in METHODS:
         raise ValueError(f"method is {method!r}; pass one of {METHODS}")
     if method != "auto":
         return method == "lifted"
     inputs = all(label.startswith("input ") for label in problem.bounds.labels(problem.system))
-    return bool(problem.free) or not inputs
+    # An earlier solution is a motion already.
+    return not isinstance(guess, Solution) and (bool(problem.free) or not inputs)
 
 
 def _row(problem: OptimalControl, iterate: Iterate, start: float) -> Row:
@@ -127,18 +132,22 @@ def optimise(
         ValueError: for a guess of the wrong shape or an unknown method.
     """
     problem = numeric(problem)
-    lifted = _chosen(problem, method)
-    options = Options(lifted, max_iterations, tol, goal_tol)
+    lifted = _chosen(problem, method, guess)
     if isinstance(guess, Solution):
         guess = guess.guess(problem.steps)
-    start = unknowns_of(problem, guess, lifted)
-    found = _run(problem, options, start, progress, time_limit)
-    if method == "auto" and not lifted and found[2] in (Outcome.SIMULATION_FAILED, Outcome.STALLED):
-        lifted, options = True, Options(True, max_iterations, tol, goal_tol)
-        found = _run(problem, options, unknowns_of(problem, guess, True), progress, time_limit)
-    iterate, history, outcome = found
-    name = "lifted" if lifted else "shooting"
-    return solution_of(problem, iterate, f"{name} sequential quadratic programming", history, outcome)
+
+    def solved(lifted: bool, guess: Any) -> Solution:
+        options = Options(lifted, max_iterations, tol, goal_tol)
+        start = unknowns_of(problem, guess, lifted)
+        iterate, history, outcome = _run(problem, options, start, progress, time_limit)
+        return solution_of(problem, iterate, f"{NAMES[lifted]} {METHOD}", history, outcome)
+
+    found = solved(lifted, guess)
+    if method == "auto" and found.outcome in FOR_THE_OTHER:
+        # A motion that nearly is one is a start for simulations; a failed simulation is one for neither.
+        other = solved(not lifted, Guess(found.inputs, None, found.guess().free) if lifted else guess)
+        found = other if other.ok or not found.ok and other.outcome not in FOR_THE_OTHER else found
+    return found
 
 
 @eqx.filter_jit
@@ -216,7 +225,7 @@ def _distinct(problem: OptimalControl, found: Iterate, lifted: bool) -> list[Sol
         if not kept or abs(costs[k] - costs[kept[-1]]) > SAME * max(abs(costs[k]), 1e-300):
             kept.append(k)
     kept = kept or [int(np.nanargmin(np.asarray(found.errors.goal)))]
-    name = f"{'lifted' if lifted else 'shooting'} sequential quadratic programming, start"
+    name = f"{NAMES[lifted]} {METHOD}, start"
     solutions = []
     for k in kept:
         iterate = jax.tree.map(itemgetter(k), found)

@@ -31,6 +31,7 @@ from natcoord_jax.control.riccati import REACH, Move, Weighted, solve
 from natcoord_jax.control.transcription import (
     Path,
     Unknowns,
+    end,
     entering,
     first_node,
     roll,
@@ -48,8 +49,14 @@ ROOM = 0.01
 """Least room left to a bound at the start."""
 LEAST_BARRIER = 1e-10
 """Barrier parameter at the end, relative to the cost."""
+REFINEMENTS = 2
+"""Corrections of a step, so that the goal is met to first order of the exact motion."""
 AT_REST = 1e-7
 """Relative size of a step that moves nothing any more."""
+
+
+NEARLY = 1e-6
+"""Residual of the steps, relative, of a motion that nearly obeys its equations."""
 
 
 class Proposal(eqx.Module):
@@ -200,17 +207,29 @@ def _weighted(iterate: Iterate) -> Weighted:
     return Weighted(path, mu / s.path - m.path + path * gap, end, mu / s.end - m.end + end * last)
 
 
-def _convex_move(problem: OptimalControl, iterate: Iterate, found: Model) -> tuple[Move, Array]:
+class Weights(eqx.Module):
+    """What makes the model convex: penalty on the goal, shift of the curvature, and what counts as reach."""
+
+    penalty: Float[Array, " c"]
+    shift: Float[Array, ""]
+    reach: Float[Array, ""]
+    idle: Float[Array, "steps m"]
+
+
+def _convex(problem: OptimalControl, iterate: Iterate, found: Model) -> tuple[Move, Weights]:
     """The solution of the model, its curvature increased until it is convex."""
     bounds = _weighted(iterate)
     idle = (jnp.arange(problem.steps) % problem.inputs.every != 0).astype(float)
     idle = jnp.broadcast_to(idle[:, None], (problem.steps, problem.channels))
     reach = jnp.clip(30.0 * iterate.errors.motion, *REACH)
 
+    def with_weights(stiffness: Array, shift: Array) -> Weights:
+        return Weights(stiffness * iterate.penalty, shift, reach, idle)
+
     def attempt(stiffness: Array, shift: Array) -> Move:
-        penalty = stiffness * iterate.penalty
+        w = with_weights(stiffness, shift)
         missing, goal = iterate.path.end.missing, iterate.multipliers.goal
-        return solve(found, missing, bounds, idle, shift, penalty, goal, reach)
+        return solve(found, missing, bounds, w.idle, w.shift, w.penalty, goal, w.reach)
 
     def unfinished(carry: tuple) -> Array:
         move, _, shift, begun = carry
@@ -228,8 +247,9 @@ def _convex_move(problem: OptimalControl, iterate: Iterate, found: Model) -> tup
     start = jnp.where(start < SHIFT, 0.0, start)
     shapes = jax.eval_shape(attempt, start, start)
     nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-    move, _, shift, _ = jax.lax.while_loop(unfinished, body, (nothing, jnp.ones(()), start, jnp.array(False)))
-    return move, shift
+    first = (nothing, jnp.ones(()), start, jnp.array(False))
+    move, stiffness, shift, _ = jax.lax.while_loop(unfinished, body, first)
+    return move, with_weights(stiffness, shift)
 
 
 def _penalty(iterate: Iterate, move: Move) -> Array:
@@ -240,14 +260,22 @@ def _penalty(iterate: Iterate, move: Move) -> Array:
     return jnp.where(iterate.iteration == 0, found, iterate.penalty)
 
 
-def _linear_motion(problem: OptimalControl, iterate: Iterate, change: Unknowns) -> Float[Array, "steps n"]:
-    """Changes of the steps' unknowns that make the linearised residuals vanish, exactly."""
+class Sweep(eqx.Module):
+    """First-order changes along a direction, exact: of the steps' unknowns, excesses, and the goal."""
+
+    y: Float[Array, "steps n"]
+    excess: Float[Array, "steps h"]
+    missing: Float[Array, " c"]
+    end_excess: Float[Array, " e"]
+
+
+def _swept(problem: OptimalControl, iterate: Iterate, change: Unknowns) -> Sweep:
+    """Changes that make the linearised residuals of all steps vanish."""
     unknowns, path = iterate.unknowns, iterate.path
     leading = problem.inputs.degree
     given = (unknowns.free, unknowns.coefficients[:leading])
-    start = jax.jvp(lambda *x: first_node(problem, *x), given, (change.free, change.coefficients[:leading]))[
-        1
-    ]
+    given_change = (change.free, change.coefficients[:leading])
+    start = jax.jvp(lambda *x: first_node(problem, *x), given, given_change)[1]
     w, dw = entering(problem, unknowns.coefficients), entering(problem, change.coefficients)
 
     def body(dn, given):
@@ -255,31 +283,68 @@ def _linear_motion(problem: OptimalControl, iterate: Iterate, change: Unknowns) 
         point = (node, w, y)
         first = jax.jvp(lambda *x: stage(problem, at, *x).residual, point, (dn, dw, jnp.zeros_like(y)))[1]
         dy = -inverse @ (residual + first)
-        return jax.jvp(lambda *x: stage(problem, at, *x).after, point, (dn, dw, dy))[1], dy
+        moved = jax.jvp(lambda *x: stage(problem, at, *x), point, (dn, dw, dy))[1]
+        return moved.after, (dy, moved.excess)
 
     inverses, residual = iterate.derivatives.inverses, path.stages.residual
     given = (slices(problem), _before(path), w, dw, unknowns.y, inverses, residual)
-    return jax.lax.scan(body, start, given)[1]
+    last, (y, excess) = jax.lax.scan(body, start, given)
+    final = jax.tree.map(lambda x: x[-1], path.nodes)
+    reached = jax.jvp(lambda node: end(problem, node), (final,), (last,))[1]
+    return Sweep(y, excess, reached.missing, reached.excess)
+
+
+def _refined(
+    problem: OptimalControl, iterate: Iterate, found: Model, move: Move, weights: Weights
+) -> tuple[Unknowns, Array, Sweep]:
+    """The move of the model, corrected until the goal is met to first order exactly.
+
+    Returns:
+        Changes of coefficients and of what is free, of the goal's multipliers, and the exact sweep.
+    """
+    count = iterate.unknowns.free.size
+    every, leading = problem.inputs.every, problem.inputs.degree
+    still = jax.tree.map(jnp.zeros_like, (found.gradient, found.offset, found.first_gradient))
+    flat = eqx.tree_at(lambda m: (m.gradient, m.offset, m.first_gradient), found, still)
+    bounds = _weighted(iterate)
+    level = Weighted(bounds.path, jnp.zeros_like(bounds.path), bounds.end, jnp.zeros_like(bounds.end))
+    flat = eqx.tree_at(lambda m: m.excess_offset, flat, jnp.zeros_like(flat.excess_offset))
+
+    def changed(first: Array, w: Array) -> Unknowns:
+        head = first[count:].reshape(leading, problem.channels)
+        return Unknowns(
+            jnp.concatenate([head, w[::every]]), first[:count], jnp.zeros_like(iterate.unknowns.y)
+        )
+
+    def body(_: Array, carry: tuple) -> tuple:
+        first, w, goal, sweep = carry
+        missing = iterate.path.end.missing + sweep.missing
+        none = jnp.zeros_like(goal)
+        more = solve(flat, missing, level, weights.idle, weights.shift, weights.penalty, none, weights.reach)
+        usable = more.convex & jnp.all(jnp.isfinite(more.w))
+        first, w, goal = (
+            x + jnp.where(usable, dx, 0.0) for x, dx in ((first, more.first), (w, more.w), (goal, more.goal))
+        )
+        return first, w, goal, _swept(problem, iterate, changed(first, w))
+
+    begun = (move.first, move.w, move.goal, _swept(problem, iterate, changed(move.first, move.w)))
+    first, w, goal, sweep = jax.lax.fori_loop(0, REFINEMENTS, body, begun)
+    return changed(first, w), goal, sweep
 
 
 def _direction(
-    problem: OptimalControl, options: Options, iterate: Iterate, found: Model, move: Move
+    problem: OptimalControl, options: Options, iterate: Iterate, found: Model, move: Move, weights: Weights
 ) -> Direction:
     """Directions of coefficients, of what is free, of the unknowns of the steps, slacks and multipliers."""
-    count = iterate.unknowns.free.size
-    head = move.first[count:].reshape(problem.inputs.degree, problem.channels)
-    coefficients = jnp.concatenate([head, move.w[:: problem.inputs.every]])
-    unknowns = Unknowns(coefficients, move.first[:count], jnp.zeros_like(iterate.unknowns.y))
+    unknowns, goal, sweep = _refined(problem, iterate, found, move, weights)
     if options.lifted:
-        unknowns = eqx.tree_at(lambda u: u.y, unknowns, _linear_motion(problem, iterate, unknowns))
+        unknowns = eqx.tree_at(lambda u: u.y, unknowns, sweep.y)
     s, m, mu = iterate.slacks, iterate.multipliers, iterate.barrier
-    changes = jnp.concatenate([move.z[:-1], move.w], axis=1)
-    tightened = jnp.einsum("khz,kz->kh", found.excess, changes) + found.excess_offset
-    slack = -(iterate.path.stages.excess + s.path) - tightened
-    last = -(iterate.path.end.excess + s.end) - found.last_excess @ move.z[-1]
+    slack = -(iterate.path.stages.excess + s.path) - sweep.excess
+    last = -(iterate.path.end.excess + s.end) - sweep.end_excess
     path = (mu - m.path * slack) / s.path - m.path
-    end = (mu - m.end * last) / s.end - m.end
-    return Direction(unknowns, Multipliers(move.goal, path, end), Slacks(slack, last))
+    ends = (mu - m.end * last) / s.end - m.end
+    return Direction(unknowns, Multipliers(goal, path, ends), Slacks(slack, last))
 
 
 def _lowered(iterate: Iterate) -> Array:
@@ -310,11 +375,13 @@ def propose(problem: OptimalControl, options: Options, iterate: Iterate) -> Prop
         d.inverses,
         d.maps,
     )
-    move, shift = _convex_move(problem, iterate, found)
-    direction = _direction(problem, options, iterate, found, move)
+    move, made = _convex(problem, iterate, found)
+    direction = _direction(problem, options, iterate, found, move, made)
     slope, weights = slope_and_weights(iterate, direction, problem.inputs.every)
     penalty = _penalty(iterate, move)
-    return Proposal(direction, slope, weights, iterate.barrier, shift, penalty, move.unreachable, move.convex)
+    return Proposal(
+        direction, slope, weights, iterate.barrier, made.shift, penalty, move.unreachable, move.convex
+    )
 
 
 @quickly
@@ -388,7 +455,9 @@ def _judged(options: Options, it: Iterate) -> Int[Array, ""]:
     optimal = fulfilled & (e.stationarity <= options.tol) & (e.complementarity <= options.tol)
     finite = jnp.isfinite(e.stationarity) & jnp.isfinite(e.goal)
     resting = (it.moved < AT_REST) | (it.failures >= 3)
-    unreachable = (e.goal > options.goal_tol) & (largest(it.unreachable) > 0.5 * e.goal) & resting
+    # What is out of reach is known only where the motion obeys its equations.
+    known = (e.motion < NEARLY) & (largest(it.unreachable) > 0.5 * e.goal)
+    unreachable = (e.goal > options.goal_tol) & known & resting
     code = jnp.where(
         it.iteration >= options.max_iterations, int(Outcome.MAX_ITERATIONS), int(Outcome.RUNNING)
     )

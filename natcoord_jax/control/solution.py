@@ -152,7 +152,7 @@ class Solution:
             rates = np.asarray(self.iterate.unknowns.y)[:, : structure.unknowns]
         free = [self.free[name] for name in self.problem.free] or None
         steps = steps or self.problem.steps
-        rates = None if rates is None else _resampled(rates, steps)
+        rates = None if rates is None else _interpolated(rates, steps)
         return Guess(_resampled(np.asarray(self.inputs), steps), rates, free)
 
     def save(self, file: str | Path) -> None:
@@ -189,7 +189,7 @@ def load_guess(file: str | Path, steps: int | None = None) -> Guess:
         raise ValueError(f"{file} is not a solution that `Solution.save` wrote: {error}") from error
     count = inputs.shape[0] if steps is None else steps
     return Guess(
-        _resampled(inputs, count), None if rates is None else _resampled(rates, count), content["free"]
+        _resampled(inputs, count), None if rates is None else _interpolated(rates, count), content["free"]
     )
 
 
@@ -202,6 +202,13 @@ def _resampled(values: np.ndarray, steps: int) -> np.ndarray:
     at = np.linspace(0.0, count, steps + 1)
     total = np.stack([np.interp(at, np.arange(count + 1), column) for column in ends.T], axis=1)
     return np.diff(total, axis=0) * steps / count
+
+
+def _interpolated(values: np.ndarray, steps: int) -> np.ndarray:
+    """Values of the middles of steps at the middles of others; steps of a staircase would shake the motion."""
+    count = values.shape[0]
+    at, old = (np.arange(steps) + 0.5) / steps, (np.arange(count) + 0.5) / count
+    return np.stack([np.interp(at, old, column) for column in values.T], axis=1)
 
 
 def _unique(names: tuple[str, ...]) -> list[str]:

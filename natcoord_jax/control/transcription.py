@@ -79,7 +79,7 @@ class End(eqx.Module):
         excess: over the bounds of what is free.
     """
 
-    cost: Float[Array, ""]
+    cost: Float[Array, "*batch"]
     missing: Float[Array, " c"]
     excess: Float[Array, " e"]
 
@@ -92,9 +92,9 @@ class Path(eqx.Module):
     end: End
 
     @property
-    def cost(self) -> Float[Array, ""]:
+    def cost(self) -> Float[Array, "*batch"]:
         """Whole cost."""
-        return jnp.sum(self.stages.cost) + self.end.cost
+        return jnp.sum(self.stages.cost, axis=-1) + self.end.cost
 
 
 class Slice(NamedTuple):

@@ -11,6 +11,8 @@ from natcoord_jax.gallery.spacecraft import spacecraft
 
 GRAVITY = 9.81
 """[m/s^2]"""
+POINT = (1e-9, 1e-9, 1e-9)
+"""Inertia of a bob [kg m^2]."""
 DISC = 0.1
 """Spin inertia of the wheels that turn a body [kg m^2]."""
 
@@ -174,7 +176,7 @@ def cart_pole(steps: int = 100, *, t_end: float = 2.0, turn: float = np.pi) -> n
     scene = nc.Scene()
     scene.add(nc.Gravity(vector=(0.0, 0.0, -GRAVITY)))
     cart = scene.add(nc.RigidBody(mass=1.0, inertia=(1.0, 1.0, 1.0), name="cart"))
-    pole = scene.add(nc.RigidBody(mass=0.3, inertia=(0.0, 0.0, 0.0), com=(0.0, 0.0, -0.5), name="pole"))
+    pole = scene.add(nc.RigidBody(mass=0.3, inertia=POINT, com=(0.0, 0.0, -0.5), name="pole"))
     rail = scene.add(nc.Prismatic(nc.ground, cart, axis=(1, 0, 0), name="rail"))
     hinge = scene.add(nc.Revolute(cart, pole, axis=(0, -1, 0), name="hinge"))
     scene.add(nc.JointForce(rail, name="push"))
