@@ -89,7 +89,17 @@ def _largest(values: Any) -> float | None:
     return None if values is None else float(np.max(values))
 
 
-def measure(example: gallery.Example, steps: int, dt: float) -> tuple[dict[str, Any], Trajectory]:
+def _solved(example: gallery.Example, steps: int, dt: float) -> tuple[nc.Solution | None, Any]:
+    """The solution of an optimal control problem, if the scene is one, and the inputs of the run."""
+    if example.problem is None:
+        return None, example.inputs(steps, dt)
+    solution = nc.optimise(example.problem(steps, dt))
+    return solution, solution.inputs
+
+
+def measure(
+    example: gallery.Example, steps: int, dt: float
+) -> tuple[dict[str, Any], Trajectory, nc.Solution | None]:
     """Run a scene twice, the first time with compilation, and judge the run.
 
     Args:
@@ -98,13 +108,14 @@ def measure(example: gallery.Example, steps: int, dt: float) -> tuple[dict[str, 
         dt: step [s].
 
     Returns:
-        The report, and the trajectory.
+        The report, the trajectory, and the solution of an optimal control problem.
     """
     system = example.system
     structure = system.structure
-    options = {"steps": steps, "dt": dt, "throw": False}
-    _, first = _timed(lambda: example.simulate(**options))
-    trajectory, wall = _timed(lambda: example.simulate(**options))
+    solution, inputs = _solved(example, steps, dt)
+    options = {"dt": dt, "inputs": inputs, "throw": False}
+    _, first = _timed(lambda: nc.simulate(system, example.state, **options))
+    trajectory, wall = _timed(lambda: nc.simulate(system, example.state, **options))
     valid = _completed(trajectory)
     energy, errors = np.asarray(system.energy(valid).total), system.constraint_errors(valid)
     balance = nc.balance(system, valid)
@@ -134,7 +145,14 @@ def measure(example: gallery.Example, steps: int, dt: float) -> tuple[dict[str, 
         "steps_completed": valid.t.shape[0] - 1,
         "result": "successful" if result == Result.SUCCESSFUL else system.explain(trajectory),
     }
-    return report, trajectory
+    if solution is None:
+        return report, trajectory, None
+    report["cost"] = solution.cost
+    report["iterations"] = len(solution.history)
+    report["goal_error_max"] = max((abs(x) for x in solution.missing.values()), default=0.0)
+    if not solution.ok and result.ok:
+        report["result"] = solution.explain()
+    return report, trajectory, solution
 
 
 def _number(value: float | None) -> str:
@@ -160,6 +178,7 @@ def _table(report: dict[str, Any]) -> str:
         ("angular momentum balance", _number(r["angular_momentum_error_max"]), turns),
         ("constraints", _number(r["constraint_error_max"]), "largest error [m, -]"),
         ("constraint velocities", _number(r["velocity_constraint_error_max"]), "largest error [m/s, 1/s]"),
+        *_solution_lines(r),
         ("result", r["result"], ""),
     ]
     width, middle = max(len(a) for a, _, _ in lines), max(len(b) for _, b, _ in lines[:-1])
@@ -168,14 +187,28 @@ def _table(report: dict[str, Any]) -> str:
     return "\n".join([*text, f"({r['momentum_note']})"] if r["momentum_note"] else text)
 
 
+def _solution_lines(report: dict[str, Any]) -> list[tuple[str, str, str]]:
+    """What a solved problem adds to the table."""
+    if "cost" not in report:
+        return []
+    return [
+        ("cost", f"{report['cost']:.8g}", f"optimal control, {report['iterations']} iterations"),
+        ("goal", _number(report["goal_error_max"]), "largest residual"),
+    ]
+
+
 def _json_ready(value: Any) -> Any:
     """JSON has no infinities and no NaN: they become null."""
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _plot(example: gallery.Example, trajectory: Trajectory, file: Path | None) -> Path | None:
+def _plot(
+    example: gallery.Example, trajectory: Trajectory, solution: nc.Solution | None, file: Path | None
+) -> Path | None:
     """Write the scene's own figure, or the curves of the run if a file is asked for."""
-    if example.figure is not None:
+    if solution is not None:
+        figure, file = nc.plot(solution), file or Path(f"{example.name}.png")
+    elif example.figure is not None:
         figure, file = example.figure(), file or Path(f"{example.name}.png")
     elif file is not None:
         figure = nc.plot(example.system, trajectory)
@@ -195,15 +228,15 @@ def _run(arguments: argparse.Namespace) -> int:
         raise BadOptionError(f"cannot write {arguments.plot}; a figure ends in {', '.join(FIGURES)}")
     example = gallery.load(arguments.scene)
     steps, dt = choose_steps(example, arguments.steps, arguments.dt)
-    report, trajectory = measure(example, steps, dt)
+    report, trajectory, solution = measure(example, steps, dt)
     print(_table(report))
     if arguments.json is not None:
         ready = {key: _json_ready(value) for key, value in report.items()}
         arguments.json.write_text(json.dumps(ready, indent=2, ensure_ascii=False) + "\n", "utf-8")
-    if not Result(int(trajectory.result)).ok:
+    if not Result(int(trajectory.result)).ok or (solution is not None and not solution.ok):
         print(f"natcoord-jax: {example.name}: {report['result']}", file=sys.stderr)
         return 1
-    written = _plot(example, trajectory, arguments.plot)
+    written = _plot(example, trajectory, solution, arguments.plot)
     if written is not None:
         print(f"wrote {written}")
     return 0

@@ -14,7 +14,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 
 def quickly(function: F) -> F:
-    """`eqx.filter_jit` with the options for quick compilation, which JAX accepts at the outermost call only."""
+    """`eqx.filter_jit` that compiles quicker at the outermost call; JAX accepts options only there."""
     outermost = eqx.filter_jit(function, compiler_options=QUICK)  # pyright: ignore[reportCallIssue]
     within = eqx.filter_jit(function)
 

@@ -86,7 +86,7 @@ class Model(eqx.Module):
 
 
 class Charts(NamedTuple):
-    """Small numbers of nodes, forth from them and back to them, and inverse inertias; leading axis steps + 1."""
+    """Small numbers of nodes, forth from them and back, and inverse inertias; leading axis steps + 1."""
 
     forth: Float[Array, "k x z"]
     back: Float[Array, "k z x"]

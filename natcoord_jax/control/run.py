@@ -62,7 +62,8 @@ def _row(problem: OptimalControl, iterate: Iterate, start: float) -> Row:
     )
 
 
-def _printed(row: Row) -> str:
+def printed(row: Row) -> str:
+    """One line of the progress table."""
     return (
         f"{row.iteration:>4} {row.cost:>14.8g} {row.stationarity:>9.1e} {row.violation:>9.1e} "
         f"{row.step:>7.2g} {row.newton:>7} {row.seconds:>7.2f}  {row.worst}"
@@ -87,7 +88,7 @@ def _run(
             iterate = sequential.step(problem, options, iterate)
             history.append(_row(problem, iterate, start))
             if progress:
-                print(_printed(history[-1]), file=sys.stderr, flush=True)
+                print(printed(history[-1]), file=sys.stderr, flush=True)
     except KeyboardInterrupt:
         outcome = Outcome.STOPPED
     if outcome is Outcome.RUNNING:

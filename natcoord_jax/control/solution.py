@@ -205,7 +205,7 @@ def _resampled(values: np.ndarray, steps: int) -> np.ndarray:
 
 
 def _interpolated(values: np.ndarray, steps: int) -> np.ndarray:
-    """Values of the middles of steps at the middles of others; steps of a staircase would shake the motion."""
+    """Values at the middles of steps, at those of others; a staircase would shake the motion."""
     count = values.shape[0]
     at, old = (np.arange(steps) + 0.5) / steps, (np.arange(count) + 0.5) / count
     return np.stack([np.interp(at, old, column) for column in values.T], axis=1)

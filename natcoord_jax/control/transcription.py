@@ -7,7 +7,7 @@ constraints. Where the residuals vanish, the motion is that of `nc.simulate`.
 """
 
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -141,12 +141,18 @@ def first_node(problem: OptimalControl, free: Float[Array, " p"], leading: Float
 
 
 def stage(
-    problem: OptimalControl, at: Slice, node: Node, w: Float[Array, " m"], y: Float[Array, " n"]
+    problem: OptimalControl,
+    at: Slice,
+    node: Node,
+    w: Float[Array, " m"],
+    y: Float[Array, " n"],
+    stretch: Any = 1.0,
 ) -> Stage:
-    """One step from its unknowns: explicit, and smooth in everything."""
+    """One step from its unknowns: explicit, and smooth in everything; `stretch` makes this step longer."""
     system, dt = problem.applied(node.free)
-    u = at.read @ node.register + at.direct * w
     begin = problem.state.t + at.number * dt
+    dt = stretch * dt
+    u = at.read @ node.register + at.direct * w
     before = unpacked(problem.state, node.x, begin)
     residual, after, _ = advance(system, before, u, dt, y, gauss(1))
     # The account of work plays no part.

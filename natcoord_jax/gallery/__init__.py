@@ -9,6 +9,7 @@ from typing import Any
 
 from natcoord_jax.gallery.example import Example
 from natcoord_jax.gallery.loops import bricard, four_bar, slider_crank
+from natcoord_jax.gallery.manoeuvres import reorientation_example
 from natcoord_jax.gallery.open_tree import open_tree
 from natcoord_jax.gallery.pendulums import double_pendulum, pendulum, torsion_spring
 from natcoord_jax.gallery.spacecraft import spacecraft
@@ -17,6 +18,7 @@ from natcoord_jax.gallery.trees import binary_tree, chain, robot_arm
 
 SCENES: Mapping[str, Callable[..., Example]] = {
     "spacecraft": spacecraft,
+    "reorientation": reorientation_example,
     "pendulum": pendulum,
     "double_pendulum": double_pendulum,
     "torsion_spring": torsion_spring,

@@ -27,6 +27,8 @@ class Example:
             [N, N m]; None: no inputs, or all zero.
         facts: what is known of the scene, by name: exact values, published numbers, useful handles.
         figure: draws the scene's own figure, which the command line writes unasked; None: it has none.
+        problem: the optimal control problem, for (steps, dt), whose solution are the inputs; None: they are
+            given by `control`.
 
     Example:
         >>> import jax; jax.config.update("jax_enable_x64", True)
@@ -46,6 +48,7 @@ class Example:
     control: Callable[[Float[Array, " steps"]], Float[Array, "steps inputs"]] | None = None
     facts: Mapping[str, Any] = field(default_factory=dict)
     figure: Callable[[], Any] | None = None
+    problem: Callable[[int, float], nc.OptimalControl] | None = None
 
     @property
     def t_end(self) -> float:
@@ -53,8 +56,17 @@ class Example:
         return self.steps * self.dt
 
     def inputs(self, steps: int | None = None, dt: Any = None) -> Float[Array, "steps inputs"]:
-        """Inputs of a run with other steps; default the suggested one."""
+        """Inputs of a run with other steps; default the suggested one.
+
+        Raises:
+            RuntimeError: for an optimal control problem that is not solved.
+        """
         steps, dt = steps or self.steps, self.dt if dt is None else dt
+        if self.problem is not None:
+            solution = nc.optimise(self.problem(steps, float(dt)), progress=False)
+            if not solution.ok:
+                raise RuntimeError(f"{self.name}: {solution.explain()}")
+            return solution.inputs
         if self.control is None:
             return jnp.zeros((steps, len(self.system.structure.inputs)))
         return self.control((jnp.arange(steps) + 0.5) * dt)

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Array
 
 import natcoord_jax as nc
+from natcoord_jax.gallery.example import Example
 from natcoord_jax.gallery.spacecraft import spacecraft
 
 GRAVITY = 9.81
@@ -78,6 +79,21 @@ def reorientation(
         cost=nc.cost.Effort(),
         goal=goal,
         bounds=nc.bounds.Input(-limit, limit),
+    )
+
+
+def reorientation_example() -> Example:
+    """Rest-to-rest reorientation of the paper's spacecraft by its three wheels, with least effort."""
+    problem = reorientation()
+    return Example(
+        name="reorientation",
+        description="least-effort reorientation of the spacecraft by its wheels",
+        system=problem.system,
+        state=problem.state,
+        dt=float(problem.dt),
+        steps=problem.steps,
+        facts={"dofs": 9, "constraints": 39},
+        problem=lambda steps, dt: reorientation(steps, t_end=steps * dt),
     )
 
 
@@ -153,7 +169,7 @@ class TangentialForce(nc.Force):
 def point_pendulum(steps: int = 60, *, t_end: float = 3.0) -> nc.OptimalControl:
     """A pendulum as a point on a massless rod, with its multiplier (example 10.103 of Betts' collection).
 
-    x'' = -2 lam x + u y, y'' = -g - 2 lam y - u x, x^2 + y^2 = 1, from (1, 0) at rest to x = 0, x' = 0 at 3 s;
+    x'' = -2 lam x + u y, y'' = -g - 2 lam y - u x, x^2 + y^2 = 1, from (1, 0) at rest to x = x' = 0 at 3 s;
     the least integral of u^2 is 12.8738850, other extremals have 76.552 and 94.119.
     """
     scene = nc.Scene()

@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from natcoord_jax.assembly.system import System
+from natcoord_jax.control.solution import Solution
 from natcoord_jax.core.state import Trajectory
 
 AXES = "xyz"
@@ -37,6 +38,7 @@ class Panel(NamedTuple):
     ordinate: str
     curves: list[Curve]
     logarithmic: bool = False
+    abscissa: str = "t [s]"
 
 
 def _draw(axes: Axes, panel: Panel) -> None:
@@ -45,7 +47,7 @@ def _draw(axes: Axes, panel: Panel) -> None:
         axes.plot(curve.t, curve.values, style, label=curve.label, linewidth=1.2)
     if panel.logarithmic:
         axes.set_yscale("log")
-    axes.set(title=panel.title, xlabel="t [s]", ylabel=panel.ordinate)
+    axes.set(title=panel.title, xlabel=panel.abscissa, ylabel=panel.ordinate)
     axes.grid(alpha=0.3)
     if 1 < len(panel.curves) <= LEGEND_ENTRIES:
         axes.legend(fontsize="small")
@@ -118,18 +120,62 @@ def _coordinates(system: System, trajectory: Trajectory, t: np.ndarray) -> list[
     return panels
 
 
-def plot(system: System, trajectory: Trajectory) -> Figure:
+def _held(label: str, t: np.ndarray, values: np.ndarray) -> Curve:
+    """Values held over steps, as a staircase."""
+    return Curve(label, np.repeat(t, 2)[1:-1], np.repeat(values, 2))
+
+
+def plot_solution(solution: Solution) -> Figure:
+    """Inputs, joint rates, attitudes of free bodies, angular momentum, and how the method converged."""
+    system, trajectory = solution.system, solution.trajectory
+    t, inputs = np.asarray(trajectory.t), np.asarray(solution.inputs)
+    channels = system.structure.inputs
+    panels = [Panel("inputs", "[N, N m]", [_held(name, t, inputs[:, k]) for k, name in enumerate(channels)])]
+    rates: list[Curve] = []
+    for name in dict.fromkeys(joint for joint, _ in system.structure.coordinates):
+        sensed = np.asarray(system.sense(trajectory, name).rates)
+        rates += [Curve(name, t, sensed[:, k]) for k in range(sensed.shape[1])]
+    if rates:
+        panels.append(Panel("joint rates", "[rad/s, m/s]", rates))
+    roots = [name for k, name in enumerate(system.structure.bodies) if _is_free(system, k)]
+    for name in roots[:1]:
+        sensed = np.asarray(system.sense(trajectory, name).quaternion)
+        curves = [Curve(f"q{k}", t, sensed[:, k]) for k in range(4)]
+        panels.append(Panel(f"attitude of {name!r}, quaternion (w, x, y, z)", "[-]", curves))
+        spin = np.asarray(system.sense(trajectory, name).angular_velocity)
+        panels.append(Panel(f"angular velocity of {name!r}", "[rad/s]", _components("ω", t, spin)))
+    if not rates and not roots:
+        panels += _coordinates(system, trajectory, t)
+    momentum = np.asarray(system.angular_momentum(trajectory))
+    panels.append(Panel("angular momentum about the origin", "J [kg m²/s]", _components("J", t, momentum)))
+    numbers = np.array([row.iteration for row in solution.history], float)
+    if numbers.size:
+        gradient = np.maximum([row.stationarity for row in solution.history], ROUND_OFF)
+        violation = np.maximum([row.violation for row in solution.history], ROUND_OFF)
+        curves = [Curve("gradient, relative", numbers, gradient), Curve("violation", numbers, violation)]
+        panels.append(Panel("convergence", "", curves, logarithmic=True, abscissa="iteration"))
+    return plot_panels(panels)
+
+
+def _is_free(system: System, body: int) -> bool:
+    """Whether a body hangs on the ground with six free motions."""
+    parent = int(np.asarray(system.tree.parent)[body])
+    own = np.asarray(system.tree.slot_of) // 7 == body
+    return parent == len(system.structure.bodies) and int(own.sum()) == 6
+
+
+def plot(system: System | Solution, trajectory: Trajectory | None = None) -> Figure:
     """Energies by store, momenta, constraint errors, work and joint coordinates over time.
 
     Args:
-        system: compiled system.
+        system: compiled system; or a solution of an optimal control problem, which needs no trajectory.
         trajectory: of one lane, computed with it.
 
     Returns:
         The figure.
 
     Raises:
-        ValueError: for a trajectory of a batch.
+        ValueError: for a trajectory of a batch, or none.
 
     Example:
         >>> import jax; jax.config.update("jax_enable_x64", True)
@@ -139,6 +185,10 @@ def plot(system: System, trajectory: Trajectory) -> Figure:
         >>> system, state = scene.compile()
         >>> figure = nc.plot(system, nc.simulate(system, state, dt=0.1, steps=10))
     """
+    if isinstance(system, Solution):
+        return plot_solution(system)
+    if trajectory is None:
+        raise ValueError("plot needs the system and a trajectory, or a solution")
     if trajectory.t.ndim != 1:
         raise ValueError(f"plot takes one lane, not a batch of shape {trajectory.t.shape[:-1]}")
     t = np.asarray(trajectory.t)

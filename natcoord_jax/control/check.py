@@ -1,0 +1,176 @@
+"""Whether a solution is one: conditions of optimality, refinement, conservation, the Hamiltonian."""
+
+import dataclasses
+import math
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from natcoord_jax.analysis import balance
+from natcoord_jax.control.compiled import quickly
+from natcoord_jax.control.iterate import Iterate
+from natcoord_jax.control.problem import OptimalControl
+from natcoord_jax.control.run import optimise
+from natcoord_jax.control.solution import Solution
+from natcoord_jax.control.transcription import entering, slices, stage
+
+
+@dataclasses.dataclass(frozen=True)
+class Check:
+    """What a check of a solution found.
+
+    Attributes:
+        stationarity: gradient of the Lagrangian, relative.
+        complementarity: multiplier times room of the bounds, relative to the cost.
+        missing: residual of the goal by name, of the simulated motion.
+        exceeded: largest excess of each bound by name; negative inside.
+        costs: cost by number of steps, with the steps halved and doubled.
+        order: observed order of the cost; None if it was not asked for or cannot be seen.
+        extrapolated: cost at vanishing step by Richardson's extrapolation, with order two.
+        angular_momentum: largest error of the balance of angular momentum, relative; None if nothing turns.
+        energy: largest error of the balance of energy, relative.
+        hamiltonian: mean over the steps; None for a problem that depends on time.
+        hamiltonian_spread: largest deviation from the mean, relative to the largest of its two parts.
+    """
+
+    stationarity: float
+    complementarity: float
+    missing: dict[str, float]
+    exceeded: dict[str, float]
+    costs: dict[int, float]
+    order: float | None
+    extrapolated: float | None
+    angular_momentum: float | None
+    energy: float | None
+    hamiltonian: float | None
+    hamiltonian_spread: float | None
+
+    def __str__(self) -> str:
+        """The findings, one a line."""
+        lines = [
+            f"gradient of the Lagrangian  {self.stationarity:.2e}",
+            f"complementarity             {self.complementarity:.2e}",
+        ]
+        lines += [f"goal: {name}  {value:+.2e}" for name, value in self.missing.items()]
+        lines += [f"bound: {name}  {value:+.2e}" for name, value in self.exceeded.items()]
+        lines += [f"cost with {steps} steps  {cost:.10g}" for steps, cost in sorted(self.costs.items())]
+        for label, value in (
+            ("observed order", self.order),
+            ("cost at vanishing step", self.extrapolated),
+            ("angular momentum, relative error", self.angular_momentum),
+            ("energy balance, relative error", self.energy),
+            ("Hamiltonian", self.hamiltonian),
+            ("its spread, relative", self.hamiltonian_spread),
+        ):
+            if value is not None:
+                lines.append(f"{label}  {value:.6g}")
+        return "\n".join(lines)
+
+
+@quickly
+def _hamiltonians(
+    problem: OptimalControl, iterate: Iterate
+) -> tuple[Float[Array, " steps"], Float[Array, " steps"]]:
+    """Change of the Lagrangian per second that a step lasts longer, and the part of the cost in it."""
+    before = jax.tree.map(lambda x: x[:-1], iterate.path.nodes)
+    worth = iterate.derivatives.worth
+    after = jax.tree.map(lambda x: x[1:], worth.nodes)
+    _, dt = problem.applied(iterate.unknowns.free)
+    w = entering(problem, iterate.unknowns.coefficients)
+
+    def one(at, node, w, y, after, residual):
+        def value(stretch: Array) -> tuple[Array, Array]:
+            found = stage(problem, at, node, w, y, stretch)
+            carried = sum(
+                jnp.sum(a * b) for a, b in zip(jax.tree.leaves(after), jax.tree.leaves(found.after))
+            )
+            return found.cost + carried + residual @ found.residual, found.cost
+
+        whole, cost = jax.jvp(value, (jnp.ones(()),), (jnp.ones(()),))[1]
+        return whole / dt, cost / dt
+
+    return jax.vmap(one)(slices(problem), before, w, iterate.unknowns.y, after, worth.residuals)
+
+
+def _hamiltonian(solution: Solution) -> tuple[float | None, float | None]:
+    """Mean and relative spread of the Hamiltonian; alternate steps are averaged, as the scheme alternates."""
+    if solution.iterate is None:
+        return None, None
+    whole, cost = (np.asarray(x) for x in _hamiltonians(solution.problem, solution.iterate))
+    smooth = 0.5 * (whole[1:] + whole[:-1]) if whole.size > 1 else whole
+    size = max(np.max(np.abs(cost)), np.max(np.abs(whole - cost)), 1e-300)
+    return float(np.mean(smooth)), float(np.max(np.abs(smooth - np.mean(smooth))) / size)
+
+
+def check(
+    solution: Solution,
+    *,
+    refine: bool = True,
+    autonomous: bool = True,
+    make: Callable[[int], OptimalControl] | None = None,
+) -> Check:
+    """Check a solution.
+
+    Args:
+        solution: what `optimise` returned.
+        refine: solve again with half and with twice the number of steps, starting from the solution.
+        autonomous: whether neither cost nor bounds nor loads depend on time; then the Hamiltonian is constant
+            up to the order of the scheme.
+        make: makes the problem for a number of steps, where it cannot be had by changing steps and dt.
+
+    Returns:
+        The findings; `print` shows them.
+    """
+    problem, iterate = solution.problem, solution.iterate
+    trajectory, system = solution.trajectory, solution.system
+    excess = [] if iterate is None else np.asarray(iterate.path.stages.excess).max(axis=0, initial=-np.inf)
+    exceeded = dict(zip(problem.bounds.labels(problem.system), np.asarray(excess).tolist()))
+    costs = {problem.steps: solution.cost}
+    order = extrapolated = None
+    if refine:
+        for steps in (problem.steps // 2, 2 * problem.steps):
+            if steps >= 1 and (make is not None or steps % problem.inputs.every == 0):
+                again = optimise(
+                    make(steps) if make else _with_steps(problem, steps), solution, progress=False
+                )
+                if again.ok:
+                    costs[steps] = again.cost
+        order, extrapolated = _refinement(costs)
+    found = balance(system, trajectory)
+    errors = [None if x is None else float(np.max(x)) for x in (found.angular_momentum, found.energy)]
+    hamiltonian = _hamiltonian(solution) if autonomous else (None, None)
+    return Check(
+        float(iterate.errors.stationarity) if iterate is not None else math.nan,
+        float(iterate.errors.complementarity) if iterate is not None else math.nan,
+        solution.missing,
+        exceeded,
+        costs,
+        order,
+        extrapolated,
+        errors[0],
+        errors[1],
+        *hamiltonian,
+    )
+
+
+def _with_steps(problem: OptimalControl, steps: int) -> OptimalControl:
+    """The problem with another number of steps over the same time."""
+    dt = problem.dt * problem.steps / steps
+    fields = {f.name: getattr(problem, f.name) for f in dataclasses.fields(problem)}
+    return OptimalControl(**{**fields, "dt": dt, "steps": steps})
+
+
+def _refinement(costs: dict[int, float]) -> tuple[float | None, float | None]:
+    """Observed order and extrapolated cost from the costs at some numbers of steps."""
+    steps = sorted(costs)
+    if len(steps) < 2:
+        return None, None
+    fine, coarse = costs[steps[-1]], costs[steps[-2]]
+    ratio = (steps[-1] / steps[-2]) ** 2
+    extrapolated = (ratio * fine - coarse) / (ratio - 1)
+    if len(steps) < 3 or fine == coarse or (costs[steps[0]] - coarse) / (coarse - fine) <= 0:
+        return None, extrapolated
+    return math.log2((costs[steps[0]] - coarse) / (coarse - fine)), extrapolated

@@ -1,0 +1,145 @@
+"""First-order optimisation by single shooting, with the optimisers of optax."""
+
+import sys
+import time
+from operator import itemgetter
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from natcoord_jax.control.compiled import quickly
+from natcoord_jax.control.guess import unknowns_of
+from natcoord_jax.control.problem import OptimalControl
+from natcoord_jax.control.results import Outcome
+from natcoord_jax.control.run import HEADER, numeric, printed
+from natcoord_jax.control.solution import Row, Solution
+from natcoord_jax.control.transcription import Unknowns, end, first_node, held_inputs, packed
+from natcoord_jax.stepping.simulate import simulate
+
+
+def _constraints(
+    problem: OptimalControl, variables: tuple[Array, Array]
+) -> tuple[Array, Array, Array, Array]:
+    """Cost, residual of the goal, excesses, and the result code of the simulation."""
+    coefficients, free = variables
+    system, dt = problem.applied(free)
+    inputs = held_inputs(problem, coefficients)
+    trajectory = simulate(system, problem.start(free), dt=dt, inputs=inputs, throw=False)
+    states = trajectory.states
+    before, after = (jax.tree.map(itemgetter(s), states) for s in (slice(None, -1), slice(1, None)))
+
+    def running(state: Any, u: Array) -> Array:
+        return problem.cost.running(system, state, u, state.t)
+
+    rates = jax.vmap(running)(before, inputs) + jax.vmap(running)(after, inputs)
+    excess = jax.vmap(lambda s, u: problem.bounds.excess(system, s, u, s.t))(after, inputs)
+    leading = coefficients[: problem.inputs.degree]
+    last = first_node(problem, free, leading)
+    last = type(last)(packed(jax.tree.map(lambda x: x[-1], states)), free, last.register)
+    found = end(problem, last)
+    cost = 0.5 * dt * jnp.sum(rates) + found.cost
+    return cost, found.missing, jnp.concatenate([excess.reshape(-1), found.excess]), trajectory.result
+
+
+def _augmented(variables: tuple[Array, Array], problem: OptimalControl, multipliers: tuple, penalty: Array):
+    """Augmented Lagrangian of goal and bounds."""
+    cost, missing, excess, code = _constraints(problem, variables)
+    nu, sigma = multipliers
+    equal = nu @ missing + 0.5 * penalty * jnp.sum(missing**2)
+    pressed = jnp.maximum(0.0, sigma + penalty * excess)
+    bound = 0.5 / penalty * jnp.sum(pressed**2 - sigma**2)
+    return cost + equal + bound, (cost, missing, excess, code)
+
+
+def descend(
+    problem: OptimalControl,
+    guess: Any = None,
+    *,
+    optimiser: Any = None,
+    iterations: int = 500,
+    rounds: int = 6,
+    penalty: float = 10.0,
+    growth: float = 4.0,
+    tol: float = 1e-4,
+    progress: bool = True,
+    time_limit: float = 600.0,
+) -> Solution:
+    """Single shooting with a first-order optimiser, for any smooth loss.
+
+    Goals and bounds, if there are any, enter by an augmented Lagrangian; the cost may be any smooth function
+    (`nc.cost.Running`, `nc.cost.Terminal`). For precise solutions see `optimise`.
+
+    Args:
+        problem: the problem.
+        guess: inputs (steps, inputs), a `Guess`, or None.
+        optimiser: an optax gradient transformation; default Adam with a learning rate of 0.05 that decays.
+        iterations: in each round.
+        rounds: updates of the multipliers; one if there is neither goal nor bound.
+        penalty: first weight of squared violations.
+        growth: factor on it from round to round.
+        tol: violation of goal and bounds at which it ends.
+        progress: print a line for each round to stderr.
+        time_limit: limit of time [s], checked after each round.
+
+    Returns:
+        The solution; `outcome` is MAX_ITERATIONS if goal or bounds are violated by more than `tol`.
+
+    Raises:
+        ValueError: for a guess of the wrong shape.
+    """
+    import optax
+
+    problem = numeric(problem)
+    start = unknowns_of(problem, guess, False)
+    variables = (start.coefficients, start.free)
+    if optimiser is None:
+        optimiser = optax.adam(optax.cosine_decay_schedule(0.05, iterations, alpha=0.01))
+    cost, missing, excess, code = quickly(_constraints)(problem, variables)
+    multipliers = (jnp.zeros_like(missing), jnp.zeros_like(excess))
+    constrained = bool(missing.size or excess.size)
+
+    @quickly
+    def one_round(variables: Any, multipliers: Any, penalty: Array) -> Any:
+        def body(carry: tuple, _: Any) -> tuple:
+            variables, memory = carry
+            slope = jax.grad(_augmented, has_aux=True)(variables, problem, multipliers, penalty)[0]
+            change, memory = optimiser.update(slope, memory, variables)
+            return (optax.apply_updates(variables, change), memory), None
+
+        (variables, _), _ = jax.lax.scan(body, (variables, optimiser.init(variables)), None, iterations)
+        slope, found = jax.grad(_augmented, has_aux=True)(variables, problem, multipliers, penalty)
+        return variables, slope, found
+
+    began, history, outcome = time.perf_counter(), [], Outcome.MAX_ITERATIONS
+    if progress:
+        print(HEADER, file=sys.stderr)
+    for k in range(rounds if constrained else 1):
+        variables, slope, (cost, missing, excess, code) = one_round(
+            variables, multipliers, jnp.asarray(penalty)
+        )
+        nu, sigma = multipliers
+        multipliers = (nu + penalty * missing, jnp.maximum(0.0, sigma + penalty * excess))
+        violation = jnp.max(jnp.concatenate([jnp.zeros(1), jnp.abs(missing), excess]))
+        size = max(float(jnp.max(jnp.abs(x), initial=0.0)) for x in slope)
+        row = Row((k + 1) * iterations, float(cost), size, float(violation), "", 1.0, 0, 0.0)
+        row = row._replace(seconds=time.perf_counter() - began)
+        history.append(row)
+        if progress:
+            print(printed(row), file=sys.stderr, flush=True)
+        penalty = growth * penalty
+        if not jnp.isfinite(cost) or int(code) != 0:
+            outcome = Outcome.SIMULATION_FAILED if int(code) else Outcome.NONFINITE
+            break
+        if constrained and violation <= tol or not constrained:
+            outcome = Outcome.OPTIMAL if constrained else Outcome.MAX_ITERATIONS
+            break
+        if time.perf_counter() - began > time_limit:
+            outcome = Outcome.TIME_LIMIT
+            break
+    unknowns = Unknowns(variables[0], variables[1], start.y)
+    free = dict(zip(problem.free, jnp.asarray(problem.values(unknowns.free)).tolist()))
+    dt = float(problem.applied(unknowns.free)[1])
+    inputs = held_inputs(problem, unknowns.coefficients)
+    return Solution(problem, inputs, free, dt, float(cost), outcome, "first-order descent (optax)", history)

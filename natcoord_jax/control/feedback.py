@@ -1,0 +1,196 @@
+"""Feedback around a solution: time-varying linear-quadratic regulation, and receding horizons."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from natcoord_jax.assembly.system import System
+from natcoord_jax.control.compiled import quickly
+from natcoord_jax.control.guess import unknowns_of
+from natcoord_jax.control.iterate import Iterate, Options
+from natcoord_jax.control.problem import OptimalControl
+from natcoord_jax.control.quadratic import model
+from natcoord_jax.control.run import numeric, optimise_jit
+from natcoord_jax.control.solution import Solution
+from natcoord_jax.control.transcription import held_inputs, packed
+from natcoord_jax.core.state import State, Trajectory
+from natcoord_jax.stepping.simulate import simulate
+
+
+class Feedback(eqx.Module):
+    """Inputs of a solution plus gains times the deviation from its motion; a policy for `nc.simulate`.
+
+    Attributes:
+        inputs: of the solution (steps, inputs).
+        gains: (steps, inputs, z) on small numbers z of the deviation: displacements and rates.
+        back: from deviations of state vectors to small numbers (steps, z, x).
+        nodes: state vectors of the solution (steps, x).
+        dt: step [s].
+        start: time at which it begins [s].
+        limits: lower and upper bound of the inputs.
+    """
+
+    inputs: Float[Array, "steps m"]
+    gains: Float[Array, "steps m z"]
+    back: Float[Array, "steps z x"]
+    nodes: Float[Array, "steps x"]
+    dt: Float[Array, ""]
+    start: Float[Array, ""]
+    limits: tuple[Any, Any]
+
+    def __call__(self, t: Float[Array, ""], state: State) -> Float[Array, " m"]:
+        """Inputs at one time, for the step that begins there."""
+        # The small part keeps a time that is a step's start in its step.
+        number = jnp.floor((t - self.start) / self.dt + 1e-6).astype(int)
+        k = jnp.clip(number, 0, self.inputs.shape[0] - 1)
+        deviation = self.back[k] @ (packed(state) - self.nodes[k])
+        return jnp.clip(self.inputs[k] - self.gains[k] @ deviation, *self.limits)
+
+
+@quickly
+def _gains(problem: OptimalControl, iterate: Iterate, weights: tuple) -> tuple[Array, Array]:
+    """Gains of the regulator, and what they act on."""
+    d = iterate.derivatives
+    given = (problem, iterate.path, iterate.unknowns, iterate.multipliers)
+    found = model(*given, d.bent, d.by_w, d.by_first, d.inverses, d.maps)
+    count = problem.system.structure.unknowns
+    size = problem.state.q.size * 2 + problem.state.coordinates.size + problem.state.rates.size
+    A, B = found.forward[:, : 2 * count, : 2 * count], found.forward[:, : 2 * count, -problem.channels :]
+    displaced, quick, cost, final = weights
+    Q = jnp.concatenate([jnp.full(count, displaced), jnp.full(count, quick)])
+    R = jnp.broadcast_to(cost, (problem.channels,))
+
+    def body(P: Array, given: tuple) -> tuple[Array, Array]:
+        A, B = given
+        K = jnp.linalg.solve(jnp.diag(R) + B.T @ P @ B, B.T @ P @ A)
+        P = jnp.diag(Q) + A.T @ P @ (A - B @ K)
+        return 0.5 * (P + P.T), K
+
+    gains = jax.lax.scan(body, final * jnp.diag(Q), (A, B), reverse=True)[1]
+    return gains, d.maps.back[:-1, : 2 * count, :size]
+
+
+def regulator(
+    solution: Solution,
+    *,
+    displacement: Any = 1.0,
+    rate: Any = 1.0,
+    effort: Any = 1.0,
+    final: Any = 10.0,
+    limits: tuple[Any, Any] = (-jnp.inf, jnp.inf),
+) -> Feedback:
+    """Time-varying linear-quadratic regulator around a solution, from the derivatives of the discrete motion.
+
+    It makes the sum over the steps of displacement |dq|^2 + rate |dw|^2 + effort |du|^2 small, with dq and dw
+    the deviations of the free motions and their rates.
+
+    Args:
+        solution: what `optimise` returned, with inputs held over the steps.
+        displacement: weight of displacements [1/rad^2, 1/m^2].
+        rate: weight of rates [s^2/rad^2, s^2/m^2].
+        effort: weight of inputs, one number or one for each channel [1/(N m)^2].
+        final: factor on the weights at the end.
+        limits: lower and upper bound of the inputs.
+
+    Returns:
+        A policy (t, state) -> inputs for `nc.simulate(..., inputs=policy, steps=...)`.
+
+    Raises:
+        ValueError: for a solution without an iterate or with splines as inputs.
+    """
+    problem, iterate = solution.problem, solution.iterate
+    if iterate is None or problem.inputs.degree or problem.inputs.every > 1:
+        raise ValueError("the regulator needs a solution of `optimise` with inputs held over each step")
+    weights = tuple(jnp.asarray(x, float) for x in (displacement, rate, effort, final))
+    gains, back = _gains(problem, iterate, weights)
+    dt, nodes = jnp.asarray(solution.dt), iterate.path.nodes.x[:-1]
+    return Feedback(jnp.asarray(solution.inputs), gains, back, nodes, dt, problem.state.t, limits)
+
+
+class Horizons(NamedTuple):
+    """A closed loop of receding horizons.
+
+    Attributes:
+        trajectory: motion of the plant, all steps.
+        codes: outcome of each optimisation, see `Outcome`.
+        iterations: of each.
+    """
+
+    trajectory: Trajectory
+    codes: Float[Array, " updates"]
+    iterations: Float[Array, " updates"]
+
+
+def receding_horizon(
+    problem: OptimalControl,
+    plant: System,
+    *,
+    updates: int,
+    steps_each: int,
+    guess: Any = None,
+    options: Options | None = None,
+) -> Horizons:
+    """Solve again and again from where the plant is, over the time that is left, in one compiled program.
+
+    The problem keeps its number of steps and its final time, so that dt shrinks; a changed number does not
+    compile anew. The last update looks one period ahead.
+
+    Args:
+        problem: the problem from the start, with inputs held over each step and a fixed final time.
+        plant: the system that really moves, of the same structure (other masses, for example).
+        updates: number of optimisations over the whole time.
+        steps_each: steps of the plant between two of them.
+        guess: for the first optimisation.
+        options: settings of the method.
+
+    Returns:
+        The motion of the plant, and how each optimisation ended.
+
+    Raises:
+        ValueError: for a problem with free time or splines, or a plant of another structure.
+    """
+    if problem.free_time or problem.inputs.degree or problem.inputs.every > 1:
+        raise ValueError("receding_horizon needs a fixed final time and inputs held over each step")
+    if plant.structure != problem.system.structure:
+        raise ValueError("the plant has another structure than the system of the problem")
+    problem = numeric(problem)
+    options = options or Options(False, 50, 1e-6, 1e-8)
+    period = problem.steps * problem.dt / updates
+    unknowns, state = unknowns_of(problem, guess, options.lifted), problem.state
+    pieces, codes, iterations = [], [], []
+    for k in range(updates):
+        left = (updates - k) * period
+        now = eqx.tree_at(lambda p: (p.dt, p.state), problem, (left / problem.steps, state))
+        found = optimise_jit(now, unknowns, options)
+        inputs = held_inputs(problem, found.unknowns.coefficients)
+        at = (jnp.arange(steps_each) + 0.5) * period / steps_each
+        held = inputs[jnp.minimum((at / now.dt).astype(int), problem.steps - 1)]
+        piece = simulate(plant, state, dt=period / steps_each, inputs=held)
+        state = jax.tree.map(lambda x: x[-1], piece.states)
+        unknowns = _shifted(found, updates - k)
+        pieces.append(piece)
+        codes.append(found.code)
+        iterations.append(found.iteration)
+    return Horizons(_joined(pieces), jnp.stack(codes), jnp.stack(iterations))
+
+
+def _shifted(found: Iterate, left: int) -> Any:
+    """A guess for the time that is left after one of `left` periods."""
+    steps = found.unknowns.coefficients.shape[0]
+    at = 1.0 / left + (jnp.arange(steps) + 0.5) / steps * (1.0 - 1.0 / left)
+    k = jnp.clip((at * steps).astype(int), 0, steps - 1)
+    unknowns = found.unknowns
+    return eqx.tree_at(lambda u: (u.coefficients, u.y), unknowns, (unknowns.coefficients[k], unknowns.y[k]))
+
+
+def _joined(pieces: list[Trajectory]) -> Trajectory:
+    """Trajectories one after the other."""
+    states = [pieces[0].states, *(jax.tree.map(lambda x: x[1:], p.states) for p in pieces[1:])]
+    whole = jax.tree.map(lambda *x: jnp.concatenate(x), *states)
+    inputs = jnp.concatenate([p.inputs for p in pieces])
+    last = pieces[-1]
+    worst = jnp.max(jnp.stack([p.result for p in pieces]))
+    return eqx.tree_at(lambda t: (t.states, t.inputs, t.result), last, (whole, inputs, worst))
