@@ -143,39 +143,27 @@ def factor(blocks: TreeBlocks) -> tuple[TreeFactors, Float[Array, "nodes n"]]:
     """Eliminate all nodes, leaves to root; also the diagonal of the matrix, by node."""
     nodes, width = blocks.own.shape[:2]
 
-    def equations(inertia: Array, spread: Array, gather: Array, rest: Array) -> tuple[Array, Array, Array]:
-        # Subtrees as they are after elimination, and as if their unknowns were fixed: for the diagonal.
-        both = _product(gather[None], _product(inertia, spread[None])) + rest
-        inverse = bordered_inverse(both[0, width:, width:], blocks.definite)
-        return both, inverse, _product(both[0, :width, width:], inverse)
-
-    def eliminate(inertia: Array, node: tuple) -> tuple[Array, None]:
+    def eliminate(inertia: Array, node: tuple) -> tuple[Array, tuple]:
         spread, gather, rest, index, parent = node
-        (free, fixed), _, to_parent = equations(row(inertia, index), spread, gather, rest)
+        # The subtree as it is after elimination, and as if its unknowns were fixed: for the diagonal.
+        both = _product(gather[None], _product(row(inertia, index), spread[None])) + rest
+        free, fixed = both[0], both[1]
+        inverse = bordered_inverse(free[width:, width:], blocks.definite)
+        to_parent = _product(free[:width, width:], inverse)
+        from_parent = _product(inverse, free[width:, :width])
         eliminated = free[:width, :width] - _product(to_parent, free[width:, :width])
-        return add_at(inertia, parent, jnp.stack([eliminated, fixed[:width, :width]])), None
+        lift = gather[:width] - _product(to_parent, gather[width:])
+        drop = spread[:, :width] - _product(spread[:, width:], from_parent)
+        handed = jnp.stack([eliminated, fixed[:width, :width]])
+        found = inverse, to_parent, from_parent, lift, drop, jnp.diagonal(fixed)[width:]
+        return add_at(inertia, parent, handed), found
 
     start = jnp.concatenate([blocks.own, jnp.zeros((1, width, width), blocks.own.dtype)])
     start = jnp.broadcast_to(start[:, None], (nodes + 1, 2, width, width))
-    given = blocks.spread, blocks.gather, blocks.rest
-    inertia, _ = jax.lax.scan(
-        eliminate, start, (*given, jnp.arange(nodes), blocks.parent), reverse=True
-    )
-    both, inverse, to_parent = jax.vmap(equations)(inertia[:-1], *given)
-    from_parent = _product(inverse, both[:, 0, width:, :width])
-    upward, inward = blocks.gather[:, :width], blocks.gather[:, width:]
-    across, own = blocks.spread[:, :, :width], blocks.spread[:, :, width:]
-    factors = TreeFactors(
-        inverse,
-        to_parent,
-        from_parent,
-        upward - _product(to_parent, inward),
-        across - _product(own, from_parent),
-        inward,
-        own,
-        blocks.parent,
-    )
-    return factors, jnp.diagonal(both[:, 1, width:, width:], axis1=1, axis2=2)
+    rows = (blocks.spread, blocks.gather, blocks.rest, jnp.arange(nodes), blocks.parent)
+    *found, diagonal = jax.lax.scan(eliminate, start, rows, reverse=True)[1]
+    rims = blocks.gather[:, width:], blocks.spread[:, :, width:]
+    return TreeFactors(*found, *rims, blocks.parent), diagonal
 
 
 class TreeSolver(eqx.Module):
