@@ -5,6 +5,7 @@ couples a body with its parent at most, so that the Jacobian is kept as blocks, 
 are passed down, forces and torques are handed up.
 """
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -16,14 +17,15 @@ from natcoord_jax.assembly.effect_blocks import (
     with_multipliers,
 )
 from natcoord_jax.assembly.joint_blocks import joint_blocks
-from natcoord_jax.assembly.local import body_jacobians, jacobians
+from natcoord_jax.assembly.local import jacobians
 from natcoord_jax.assembly.momentum import momentum_balance
 from natcoord_jax.assembly.node_layout import NodeLayout, unknowns_of_slots
 from natcoord_jax.assembly.node_sweeps import hinging, load_nodes, on_slots, sweep_nodes, united
 from natcoord_jax.assembly.reduced import ReducedStep
-from natcoord_jax.assembly.response import Stations
+from natcoord_jax.assembly.response import Stations, no_multipliers
 from natcoord_jax.assembly.system import Elimination
 from natcoord_jax.assembly.tree import JointGeometry, TreeMotion, gather_slots
+from natcoord_jax.maths.collocation import rotate_stages
 
 Blocks = tuple[Array, Array, Array, Array]
 
@@ -86,20 +88,17 @@ class RecursiveStep(ReducedStep):
 
     def _with_effects(self, at: Stations, multipliers: list[Array], joints: tuple) -> Blocks:
         """Blocks with those of bodies and effects, and with the multipliers of each node."""
-        every = jnp.moveaxis(jnp.concatenate([at.rates[:, :, 0], at.spin], axis=-1), 0, 1)
-        own = body_jacobians(
-            self.system.mass, self.start, self.velocity, every[:-1], self.h, self.tableau
-        )
+        twists = jnp.concatenate([at.rates[:, :, 0], at.spin], axis=-1)
+        own, every = self._own(twists[:, :-1]), jnp.moveaxis(twists, 0, 1)
         coupled, bordered = [], []
         for group, where, lam, seats in zip(
             self.groups, self.situations, multipliers, self.elimination.seats
         ):
+            if group.source == "mass":
+                continue
             (by_twist, by_lam), (g_by_twist, _) = jacobians(
                 group, where, self.tableau, at.start[group.bodies], every[group.bodies], lam
             )
-            if group.bodies.shape[1] == 1 and not group.multipliers:
-                own = own - seats.nodes.collect(by_twist.reshape(group.count, *own.shape[1:]))
-                continue
             places = seated(group.bodies, own.shape[0])
             both, upward, downward, above = by_place(by_twist, places)
             own = own - seats.nodes.collect(both) - seats.parents.collect(above)
@@ -111,3 +110,24 @@ class RecursiveStep(ReducedStep):
         if bordered:
             joints = with_multipliers(joints, self.layout, bordered)
         return own, *joints
+
+    def _own(self, twists: Float[Array, "s bodies 6"]) -> Float[Array, "bodies n n"]:
+        """Derivatives of the balances of single bodies under fields, by their own twists."""
+        s, bodies, _ = twists.shape
+        fields = [pair for pair in zip(self.groups, self.situations) if pair[0].source == "mass"]
+        groups, situations = [g for g, _ in fields], [where for _, where in fields]
+        multipliers = [no_multipliers(g, self.tableau, twists.dtype) for g in groups]
+
+        def balance(twists: Array) -> Array:
+            velocity, spin = jnp.split(twists, 2, axis=-1)
+            directors = rotate_stages(self.h * spin[:, :, None], self.start[None, :, 1:], self.tableau)
+            at = self.stations(TreeMotion(spin, velocity, directors))
+            given = self.system, groups, situations, at, self.velocity
+            found = momentum_balance(*given, multipliers, self.h, self.tableau)
+            return jnp.concatenate([found.force, found.torque], axis=-1)
+
+        def along(unit: Array) -> Array:
+            return jax.jvp(balance, (twists,), (jnp.broadcast_to(unit[:, None], twists.shape),))[1]
+
+        columns = jax.vmap(along)(jnp.eye(6 * s).reshape(-1, s, 6))
+        return jnp.transpose(columns, (2, 1, 3, 0)).reshape(bodies, 6 * s, 6 * s)

@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-ORDER = 3
+ORDER = 7
 """Largest order of the polynomials that guess the next solution."""
 
 
