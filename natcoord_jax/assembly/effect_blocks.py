@@ -3,13 +3,17 @@
 from collections.abc import Sequence
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from natcoord_jax.assembly.node_layout import NodeLayout
 
 
-def seated(bodies: Int[Array, "n k"], ground: int) -> tuple[Bool[Array, "n k"], Bool[Array, "n k"]]:
+def seated(
+    bodies: Int[Array | np.ndarray, "n k"], ground: int
+) -> tuple[Bool[Array, "n k"], Bool[Array, "n k"]]:
     """Which bodies of each instance are its node, the deeper one, and which the node's parent."""
+    bodies = jnp.asarray(bodies)
     real = bodies < ground
     # Bodies are numbered from the root.
     node = jnp.max(jnp.where(real, bodies, -1), axis=1, keepdims=True)
@@ -36,7 +40,9 @@ def borders(
     loads = jnp.moveaxis(by_lam.reshape(n, k, 6 * s, s, -1), 4, 2)
     rates = jnp.moveaxis(by_twist.reshape(n, s, -1, k, 6 * s), (1, 3), (3, 1))
     return [
-        jnp.sum(jnp.where(at[:, :, None, None, None], x, 0.0), axis=1) for x in (loads, rates) for at in places
+        jnp.sum(jnp.where(at[:, :, None, None, None], x, 0.0), axis=1)
+        for x in (loads, rates)
+        for at in places
     ]
 
 
@@ -65,7 +71,9 @@ def with_multipliers(
     on_node, on_parent = (
         jnp.moveaxis(x, 1, 2).reshape(bodies, width, count * s) for x in (-on_node, -on_parent)
     )
-    by_node, by_parent = (jnp.moveaxis(x, 2, 3).reshape(bodies, count * s, width) for x in (by_node, by_parent))
+    by_node, by_parent = (
+        jnp.moveaxis(x, 2, 3).reshape(bodies, count * s, width) for x in (by_node, by_parent)
+    )
     unused = jnp.repeat(layout.slots == layout.places.shape[0], s, axis=1)
     by_parent = jnp.concatenate([by_parent, jnp.zeros((bodies, count * s, rest.shape[2] - width))], axis=2)
     columns = gather @ on_node

@@ -9,10 +9,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.diagnostics import rows_with_ground
-from natcoord_jax.assembly.local import body_jacobians, body_motion, jacobians
+from natcoord_jax.assembly.local import body_balance, body_motion, jacobians
 from natcoord_jax.assembly.momentum import momentum_balance
 from natcoord_jax.assembly.reduced import project_multipliers, project_rows
 from natcoord_jax.assembly.response import (
@@ -121,31 +121,27 @@ class FullStep(eqx.Module):
         at = self._stations(twists)
         given = self.system, self.groups, self.situations, at, self.velocity
         found = momentum_balance(*given, multipliers, self.h, self.tableau)
-        torque = found.torque + jnp.where(self.massless[:, None], at.spin[:, :-1], 0.0)
+        massless = jnp.trace(self.system.mass[:, 1:, 1:], axis1=1, axis2=2) <= 0
+        # A point mass keeps its directors by a unit inertia, as in `body_balance`.
+        torque = found.torque + jnp.where(massless[:, None], at.spin[:, :-1], 0.0)
         wrenches = jnp.moveaxis(jnp.concatenate([found.force, torque], axis=-1), 0, 1)
         rows = project_rows(found.rows, y, self.balances, self.projector)
         residual = jnp.concatenate([wrenches.reshape(-1), rows])
         return Evaluation(residual, found.size, at, found.power)
 
-    @property
-    def massless(self) -> Bool[Array, " bodies"]:
-        """Point masses, which keep their directors by a unit inertia."""
-        return jnp.trace(self.system.mass[:, 1:, 1:], axis1=1, axis2=2) <= 0
-
-    def _own(self, twists: Float[Array, "bodies s 6"]) -> Float[Array, "bodies n n"]:
+    def body_jacobians(self, twists: Float[Array, "bodies s 6"]) -> Float[Array, "bodies n n"]:
         """Jacobians of the bodies' own balances."""
-        found = body_jacobians(
-            self.system.mass, self.start[:-1], self.velocity, twists, self.h, self.tableau
-        )
-        spins = jnp.tile(jnp.array([0.0, 0.0, 0.0, 1.0, 1.0, 1.0]), self.tableau.stages)
-        return found + jnp.where(self.massless[:, None, None], jnp.diag(spins), 0.0)
+        width = 6 * self.tableau.stages
+        local = jax.vmap(jax.jacfwd(body_balance, argnums=3), in_axes=(0, 0, 0, 0, None, None))
+        found = local(self.system.mass, self.start[:-1], self.velocity, twists, self.h, self.tableau)
+        return found.reshape(self.bodies, width, width)
 
     def jacobian(self, y: Float[Array, " unknowns"]) -> Float[Array, "unknowns unknowns"]:
         """Exact Jacobian, assembled from local ones."""
         twists, multipliers = self.split(project_multipliers(y, self.balances, self.projector))
         s, bodies, size = self.tableau.stages, self.bodies, self.unknowns
         width = 6 * s
-        own = self._own(twists)
+        own = self.body_jacobians(twists)
         columns = np.arange(bodies)[:, None] * width + np.arange(width)
         matrix = jnp.zeros((size + width, size + width), y.dtype)
         matrix = matrix.at[columns[:, :, None], columns[:, None, :]].add(own)

@@ -1,7 +1,8 @@
-"""Derivatives of what one joint does: it passes motion from parent to child, and loads from child to parent."""
+"""Derivatives of what one joint does: motion goes from parent to child, loads from child to parent."""
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from natcoord_jax.assembly.node_sweeps import Through, on_slots, slot_arms
@@ -24,9 +25,12 @@ def _derivatives(
     through: Through,
     h: Array,
     tableau: Tableau,
-) -> Float[Array, "n s 9_k s 6_k"]:
-    """Of velocity, angular velocity, torque handed to the parent and forces of the slots, with given loads;
-    by the velocity and angular velocity of the parent and the rates."""
+) -> Float[Array, "n s 9+k s 6+k"]:
+    """Derivatives of what each joint passes on, at given loads.
+
+    Of velocity and angular velocity of the child, torque on the parent and forces of the slots; by velocity
+    and angular velocity of the parent and the rates.
+    """
     s, bodies, k = rates.shape
 
     def local(spin_p: Array, rates: Array) -> Array:
@@ -47,7 +51,7 @@ def _derivatives(
     return jnp.concatenate([jnp.broadcast_to(moving, (bodies, *moving.shape)), found], axis=-1)
 
 
-def _handed_up(level: Level, geometry: JointGeometry) -> Float[Array, "n s 6_k s 6"]:
+def _handed_up(level: Level, geometry: JointGeometry) -> Float[Array, "n s rows s 6"]:
     """What force and torque of a node are for its parent and for its slots."""
     s, bodies, _ = geometry.child_arm.shape
     unit = jnp.broadcast_to(jnp.eye(3), (s, bodies, 3, 3))
@@ -65,7 +69,7 @@ def _handed_up(level: Level, geometry: JointGeometry) -> Float[Array, "n s 6_k s
 def joint_blocks(
     level: Level,
     these: Hinging,
-    present: Bool[Array, "n k"],
+    present: Bool[Array | np.ndarray, "n k"],
     spin_p: Float[Array, "s n 3"],
     rates: Float[Array, "s n k"],
     geometry: JointGeometry,

@@ -45,24 +45,12 @@ def body_balance(
     h: Array,
     tableau: Tableau,
 ) -> Float[Array, "s 6"]:
-    """Change of momentum of one body as a wrench."""
+    """Change of momentum of one body as a wrench; a point mass keeps its directors by a unit inertia."""
     motion = body_motion(start[None], twist[None], h, tableau)
     momentum = stage_momentum(mass[None], motion.rates - velocity[None, None], tableau)
-    return wrenches(momentum, jnp.zeros_like(motion.spin), motion)[0]
-
-
-def body_jacobians(
-    mass: Float[Array, "bodies 4 4"],
-    start: Float[Array, "bodies 4 3"],
-    velocity: Float[Array, "bodies 4 3"],
-    twists: Float[Array, "bodies s 6"],
-    h: Array,
-    tableau: Tableau,
-) -> Float[Array, "bodies n n"]:
-    """Jacobians of the bodies' own balances."""
-    width = 6 * tableau.stages
-    found = jax.vmap(jax.jacfwd(body_balance, argnums=3), in_axes=(0, 0, 0, 0, None, None))
-    return found(mass, start, velocity, twists, h, tableau).reshape(-1, width, width)
+    massless = jnp.trace(mass[1:, 1:]) <= 0
+    idle = jnp.where(massless, motion.spin, 0.0)
+    return wrenches(momentum, idle, motion)[0]
 
 
 def effect_balance(

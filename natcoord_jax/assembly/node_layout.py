@@ -36,8 +36,8 @@ class NodeLayout(eqx.Module):
     """
 
     tree: Tree
-    slots: Int[Array, "bodies m"]
-    places: Int[Array, " multipliers"]
+    slots: Int[Array | np.ndarray, "bodies m"]
+    places: Int[Array | np.ndarray, " multipliers"]
     level: Level = eqx.field(static=True)
     groups: tuple[tuple[int, int], ...] = eqx.field(static=True)
     stages: int = eqx.field(static=True)

@@ -1,8 +1,9 @@
 """Sweeps along the tree node by node, in loops whose programs do not grow with the depth of the tree.
 
-Only what hands on from body to body is in the loops: angular velocities and sums of velocities down the tree,
-sums of loads up. All else is done for all bodies at once, as if they were one level. Loops carry one array and
-put out nothing else: an output read from what is carried would make the compiler copy all of it for every node.
+Only what is handed on from body to body is in the loops: angular velocities and sums of velocities down the
+tree, sums of loads up. All else is done for all bodies at once, as if they were one level. Loops carry one
+array and put out nothing else: an output read from what is carried would make the compiler copy all of it
+for every node.
 """
 
 from typing import NamedTuple

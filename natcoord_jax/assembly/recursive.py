@@ -106,7 +106,8 @@ class RecursiveStep(ReducedStep):
             if group.multipliers:
                 bordered.append(borders(by_lam, g_by_twist, places))
         if coupled:
-            joints = with_coupling(joints, *(-sum(x[1:], x[0]) for x in zip(*coupled)))
+            upward, downward = (-jnp.sum(jnp.stack(blocks), axis=0) for blocks in zip(*coupled))
+            joints = with_coupling(joints, upward, downward)
         if bordered:
             joints = with_multipliers(joints, self.layout, bordered)
         return own, *joints

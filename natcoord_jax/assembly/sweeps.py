@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from natcoord_jax.assembly.tree import JointGeometry, Level, Tree, TreeMotion, combine, frame_axes
@@ -23,7 +24,7 @@ class Hinging(eqx.Module):
 
     frames: Float[Array, "n 2 4 4"]
     rows: Float[Array, "n 4 3"]
-    ball: Bool[Array, " n"]
+    ball: Bool[Array | np.ndarray, " n"]
     parent_rows: Float[Array, "n 4 3"]
 
 
@@ -83,7 +84,9 @@ def relative_motion(
     d0 = rows[None, :, 1:]
     parent_axes = frame_axes(place[:, 0, 1:, 1:], d_p)
     axes = [parent_axes[:, :, k] for k in level.rotations]
-    slides = [cross(parent_axes[:, :, (k + 1) % 3], parent_axes[:, :, (k + 2) % 3]) for k in level.translations]
+    slides = [
+        cross(parent_axes[:, :, (k + 1) % 3], parent_axes[:, :, (k + 2) % 3]) for k in level.translations
+    ]
     if level.balls:
         own_axes, ball = frame_axes(place[:, 1, 1:, 1:], d0), these.ball[:, None]
         axes = [jnp.where(ball, own_axes[:, :, k], a) for k, a in zip(level.rotations, axes)]

@@ -24,6 +24,10 @@ def _apply(matrix: Array, vector: Array) -> Array:
     return jnp.sum(matrix * vector, axis=-1)
 
 
+def _transposed(matrices: Array) -> Array:
+    return jnp.swapaxes(matrices, -1, -2)
+
+
 def _product(a: Array, b: Array) -> Array:
     return jnp.sum(a[..., :, :, None] * b[..., None, :, :], axis=-2)
 
@@ -126,15 +130,14 @@ class TreeFactors(eqx.Module):
 
     def transpose(self) -> "TreeFactors":
         """Factors of the transposed matrix: what is passed down and what is handed up change places."""
-        swap = lambda x: jnp.swapaxes(x, -1, -2)  # noqa: E731
         return TreeFactors(
-            swap(self.inverse),
-            swap(self.from_parent),
-            swap(self.to_parent),
-            swap(self.drop),
-            swap(self.lift),
-            swap(self.spread),
-            swap(self.gather),
+            _transposed(self.inverse),
+            _transposed(self.from_parent),
+            _transposed(self.to_parent),
+            _transposed(self.drop),
+            _transposed(self.lift),
+            _transposed(self.spread),
+            _transposed(self.gather),
             self.parent,
         )
 
@@ -161,9 +164,10 @@ def factor(blocks: TreeBlocks) -> tuple[TreeFactors, Float[Array, "nodes n"]]:
     start = jnp.concatenate([blocks.own, jnp.zeros((1, width, width), blocks.own.dtype)])
     start = jnp.broadcast_to(start[:, None], (nodes + 1, 2, width, width))
     rows = (blocks.spread, blocks.gather, blocks.rest, jnp.arange(nodes), blocks.parent)
-    *found, diagonal = jax.lax.scan(eliminate, start, rows, reverse=True)[1]
+    found = jax.lax.scan(eliminate, start, rows, reverse=True)[1]
+    inverse, to_parent, from_parent, lift, drop, diagonal = found
     rims = blocks.gather[:, width:], blocks.spread[:, :, width:]
-    return TreeFactors(*found, *rims, blocks.parent), diagonal
+    return TreeFactors(inverse, to_parent, from_parent, lift, drop, *rims, blocks.parent), diagonal
 
 
 class TreeSolver(eqx.Module):

@@ -37,8 +37,10 @@ class _ByNode(eqx.Module):
         return _ByNode(self.layout, self.solver.transpose())
 
 
-def _tree_blocks(equations: Any, blocks: tuple) -> TreeBlocks:
-    return TreeBlocks(*blocks, equations.system.tree.parent, equations.layout.rates)
+def _tree_blocks(equations: Any, blocks: tuple[Array, Array, Array, Array]) -> TreeBlocks:
+    own, spread, gather, rest = blocks
+    parent, definite = equations.system.tree.parent, equations.layout.rates
+    return TreeBlocks(own, spread, gather, rest, parent, definite)
 
 
 def _recursive(equations: Any, blocks: tuple) -> tuple[_ByNode, Array]:

@@ -23,6 +23,7 @@ from natcoord_jax.assembly.system import System
 from natcoord_jax.core.results import Result
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import gauss
+from natcoord_jax.maths.rows import with_row
 from natcoord_jax.stepping.newton import (
     PATIENCE,
     Factors,
@@ -204,7 +205,7 @@ class Carried(eqx.Module):
         state: the state in one array: fewer operations than one for every field.
         factors: of a Jacobian.
         probe: the Jacobian in the making.
-        record: of all slots, the states in one array.
+        record: fields of `Slots`, for every slot; the states in one array.
     """
 
     count: Int[Array, ""]
@@ -212,7 +213,7 @@ class Carried(eqx.Module):
     state: Float[Array, " numbers"]
     factors: Factors
     probe: Probe | None
-    record: tuple[Slots, Float[Array, "slots numbers"]]
+    record: tuple[Array, ...]
 
 
 def _trip(setting: Setting, unpack: Callable[[Array], State], carried: Carried) -> Carried:
@@ -238,11 +239,9 @@ def _trip(setting: Setting, unpack: Callable[[Array], State], carried: Carried) 
         ends = end_of_step(setting.system, before.state, h, groups, found, tableau)
         after = _end(setting, before, factors.inertias, ends)
         accepted = after.taken > before.taken
-        slot = Slots(None, before.it.y, index, before.fraction, accepted, after.step)  # pyright: ignore
         x = ravel_pytree(after.state)[0]
-        record = jax.tree.map(
-            lambda b, r: jax.lax.dynamic_update_index_in_dim(b, r, carried.count, 0), record, (slot, x)
-        )
+        slot = x, before.it.y, index, before.fraction, accepted, after.step
+        record = tuple(with_row(b, carried.count, r) for b, r in zip(record, slot))
         return jnp.array(False), _with_state(after, None), x, record
 
     # Loops of no or one trip leave what they carry where it is; a conditional would copy it.
@@ -292,16 +291,15 @@ def run(plan: Plan, system: System, state: State, parameters: Any, dt: Array) ->
     def every_slot(course: Course, factors: Factors, x: Array) -> Carried:
         it = course.it
         probe = Probe.first(it.y.shape[0], x.dtype) if setting.form in BY_DIFFERENCES else None
-        slot = Slots(None, it.y, course.step, course.fraction, course.stopped, course.step)  # pyright: ignore
-        record = jax.tree.map(lambda x: jnp.zeros((length, *x.shape), x.dtype), (slot, x))
+        slot = x, it.y, course.step, course.fraction, course.stopped, course.step
+        record = tuple(jnp.zeros((length, *x.shape), x.dtype) for x in slot)
         start = Carried(jnp.array(0), course, x, factors, probe, record)
         return jax.lax.while_loop(unfinished, partial(_trip, setting, unpack), start)
 
     course, factors = _start(setting, state)
     found = as_one_kernel(every_slot, _with_state(course, None), factors, packed)
-    course, (slots, states) = _with_state(found.course, unpack(found.state)), found.record
-    count, factors = found.count, found.factors
-    slots = eqx.tree_at(lambda s: s.states, slots, jax.vmap(unpack)(states), is_leaf=_is_none)
+    course, (states, *rest) = _with_state(found.course, unpack(found.state)), found.record
+    count, factors, slots = found.count, found.factors, Slots(jax.vmap(unpack)(states), *rest)
     unused = jnp.arange(length) >= any_lane(count)
 
     def fill(x: Array, last: Array | float) -> Array:
