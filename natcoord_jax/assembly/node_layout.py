@@ -47,8 +47,8 @@ class NodeLayout(eqx.Module):
         """Rates of a node."""
         return self.stages * len(self.level.slots)
 
-    def by_multiplier(self, parts: Sequence[Float[Array, "n m *rest"]]) -> Float[Array, "multipliers *rest"]:
-        """What belongs to the multipliers of all groups, in one array."""
+    def by_multiplier(self, parts: Sequence[Array]) -> Array:
+        """What belongs to the multipliers of all groups (n, m, ...), in one array."""
         return jnp.concatenate([x.reshape(-1, *x.shape[2:]) for x in parts])
 
     def by_node(self, of_multipliers: Float[Array, "multipliers *rest"]) -> Float[Array, "bodies m *rest"]:
