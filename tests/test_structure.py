@@ -229,6 +229,7 @@ def test_solvers_give_one_trajectory(solver):
     assert np.max(np.abs(q - np.asarray(b.q).reshape(q.shape))) <= tol.SAME_TRAJECTORY
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", ["recursive", "full"])
 def test_solvers_give_one_gradient(solver):
     """Reverse, and forward over reverse, with respect to the inputs."""
@@ -281,7 +282,9 @@ def test_blocks_along_the_tree_are_the_jacobian(stages):
     factors, inertias = FACTORISATIONS["recursive"](equations, equations.jacobian(y))
     assert jnp.max(jnp.abs(factors.transpose().solve(exact.T @ y) - y)) <= tol.SAME_GRADIENT
     real = inertias > 0
-    assert jnp.max(jnp.abs(jnp.where(real, jnp.abs(jnp.diagonal(exact)) - inertias, 0.0))) <= tol.SAME_GRADIENT
+    assert (
+        jnp.max(jnp.abs(jnp.where(real, jnp.abs(jnp.diagonal(exact)) - inertias, 0.0))) <= tol.SAME_GRADIENT
+    )
 
 
 # --- numbers are leaves -----------------------------------------------------------------------------------
