@@ -5,7 +5,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 ORDER = 7
-"""Largest order of the polynomials that guess the next solution."""
+"""Largest order of the polynomials that guess the next solution. Orders above three save up to two of six
+corrections a step where motion is smooth; elsewhere a lower one is chosen."""
 
 
 class Past(eqx.Module):
