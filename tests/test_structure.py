@@ -17,9 +17,11 @@ import tolerances as tol
 from test_contracts import TABLE, answering, inputs_of, random_motion, stage
 
 import natcoord_jax as nc
+from natcoord_jax.assembly.equations import prepare
 from natcoord_jax.assembly.reduced import ReducedStep
 from natcoord_jax.maths.collocation import gauss
 from natcoord_jax.stepping import one_kernel
+from natcoord_jax.stepping.factorise import FACTORISATIONS, differentiable_solver
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "natcoord_jax" / "effects"
@@ -229,6 +231,71 @@ def test_solvers_give_one_trajectory(solver):
     order = [one[0].body_index(name) for name in other[0].structure.bodies]
     q = np.asarray(a.q).reshape(101, -1, 4, 3)[:, order]
     assert np.max(np.abs(q - np.asarray(b.q).reshape(q.shape))) <= tol.SAME_TRAJECTORY
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("solver", ["recursive", "full"])
+def test_solvers_give_one_gradient(solver):
+    """Reverse, and forward over reverse, with respect to the inputs."""
+    inputs = jnp.sin(jnp.arange(10.0))[:, None] * jnp.arange(1.0, 4.0)
+    found = []
+    for system, state in (star(3, "reduced"), star(3, solver)):
+
+        def loss(u, system=system, state=state):
+            after = nc.simulate(system, state, dt=0.02, inputs=u)
+            return jnp.sum(after.v[-1] ** 2) + jnp.sum(jnp.sin(after.q[-1]))
+
+        both = jax.jit(lambda u, loss=loss: jax.jvp(jax.grad(loss), (u,), (jnp.cos(u),)))
+        found.append(both(inputs))
+    for a, b in zip(*found):
+        assert jnp.max(jnp.abs(a - b)) <= tol.SAME_GRADIENT * jnp.max(jnp.abs(a))
+
+
+def mixed(stages: int):
+    """A tree with joints of most kinds, springs along it and, for one stage, a drive in it."""
+    scene, random = nc.Scene(), np.random.default_rng(1)
+    scene.add(nc.Gravity())
+    bodies = [scene.add(nc.RigidBody(mass=3.0, inertia=(1.0, 1.2, 1.4), position=(0.1, 0.2, 0.3)))]
+    for kind in (nc.Revolute, nc.Spherical, nc.Universal, nc.Cylindrical, nc.Prismatic, nc.Planar):
+        place, parent = random.normal(size=3), bodies[random.integers(len(bodies))]
+        body = nc.RigidBody(mass=1.0, inertia=(0.3, 0.2, 0.25), position=place, com=(0.1, 0.05, 0.02))
+        bodies.append(scene.add(body))
+        axes = {"axis": (1.0, 0.0, 0.0), "second": (0.0, 1.0, 0.0)} if kind is nc.Universal else {}
+        axes = {"axis": random.normal(size=3)} if kind not in (nc.Universal, nc.Spherical) else axes
+        pair = (bodies[-1], parent) if kind is nc.Cylindrical else (parent, bodies[-1])
+        joint = scene.add(kind(*pair, random.normal(size=3), **axes))
+        scene.add(nc.Spring((nc.Point(parent, 0.5 * place), nc.Point(bodies[-1], place)), stiffness=5.0))
+        if stages == 1 and kind is nc.Revolute:
+            scene.add(nc.JointSpring(joint, stiffness=3.0))
+            scene.add(nc.Drive(joint, function=jnp.sin))
+    return scene
+
+
+@pytest.mark.parametrize("stages", [1, 2])
+def test_blocks_along_the_tree_are_the_jacobian(stages):
+    """Of the same residual as the reduced form's; their factors solve with it and its transpose."""
+
+    def numbers(system, state):
+        form = system.structure.solver
+        equations = prepare(system, state, inputs_of(system), jnp.asarray(0.1), gauss(stages))
+        guess = equations.guess()
+        y = guess + 0.3 * jnp.sin(jnp.arange(guess.shape[0]))
+        exact = jax.jacfwd(lambda y: equations.residual(y)[0])(y)
+        same = equations.residual(y)[0], exact
+        if form == "reduced":
+            return same, []
+        matrix = equations.jacobian(y)
+        factors, inertias = FACTORISATIONS[form](equations, matrix)
+        diagonal = jnp.where(inertias > 0, jnp.abs(jnp.diagonal(exact)), 0.0)
+        solved = differentiable_solver(equations, matrix).solve(exact @ y)
+        errors = solved - y, factors.transpose().solve(exact.T @ y) - y, diagonal - inertias
+        return same, errors
+
+    found = [jax.jit(numbers)(*mixed(stages).compile(solver=s)) for s in ("reduced", "recursive")]
+    for a, b in zip(found[0][0], found[1][0]):
+        assert jnp.max(jnp.abs(a - b)) <= tol.IDENTITY * jnp.max(jnp.abs(a))
+    for error in found[1][1]:
+        assert jnp.max(jnp.abs(error)) <= tol.EXACT_GRADIENT
 
 
 # --- numbers are leaves -----------------------------------------------------------------------------------

@@ -304,7 +304,7 @@ def elimination_order(layout: Layout, effects: tuple[Group, ...], joints: tuple[
         )
     owned: list[list[int]] = [[] for _ in range(bodies)]
     seats, total = [], 0
-    for group in (*effects, *joints):
+    for group in effects:
         table = np.asarray(group.bodies)
         # Bodies are numbered from the root: the deeper one has the larger number.
         nodes = np.where(table < bodies, table, -1).max(axis=1)

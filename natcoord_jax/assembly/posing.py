@@ -12,8 +12,9 @@ from natcoord_jax.assembly.diagnostics import over_states, rows_with_ground, sta
 from natcoord_jax.assembly.rates import carried, null_space, row_rates, tree_rates, twists
 from natcoord_jax.assembly.response import stations
 from natcoord_jax.assembly.sensors import joint_coordinates
+from natcoord_jax.assembly.sweeps import sweep_motion
 from natcoord_jax.assembly.system import System
-from natcoord_jax.assembly.tree import gather_slots, sweep_motion
+from natcoord_jax.assembly.tree import gather_slots
 from natcoord_jax.core.coordinate import pair_motion
 from natcoord_jax.core.effect import Motion, replace_fields
 from natcoord_jax.core.handles import Handle

@@ -1,18 +1,36 @@
-"""Equations of a step on an open tree: those of `FullStep`, with the Jacobian kept as blocks along the tree.
+"""Equations of a step on an open tree: those of `ReducedStep`, with loops along the tree node by node.
 
-A node is a body together with the multipliers of its own joint (and of drives and couplings on it); nodes
-of multipliers alone would have a zero pivot. Every effect couples a body with its parent at most.
+A node is a body with the rates of its joint (and multipliers of drives and couplings on it). Every effect
+couples a body with its parent at most, so that the Jacobian is kept as blocks, see `linsolve.tree`: twists
+are passed down, forces and torques are handed up.
 """
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from natcoord_jax.assembly.full import FullStep
+from natcoord_jax.assembly.effect_blocks import (
+    borders,
+    by_place,
+    seated,
+    with_coupling,
+    with_multipliers,
+)
+from natcoord_jax.assembly.joint_blocks import joint_blocks
 from natcoord_jax.assembly.local import jacobians
-from natcoord_jax.assembly.system import Elimination, Group
+from natcoord_jax.assembly.momentum import momentum_balance
+from natcoord_jax.assembly.node_layout import NodeLayout, unknowns_of_slots
+from natcoord_jax.assembly.node_sweeps import hinging, load_nodes, on_slots, sweep_nodes, united
+from natcoord_jax.assembly.reduced import ReducedStep
+from natcoord_jax.assembly.response import Stations, no_multipliers
+from natcoord_jax.assembly.system import Elimination
+from natcoord_jax.assembly.tree import JointGeometry, TreeMotion, gather_slots
+from natcoord_jax.maths.collocation import rotate_stages
+
+Blocks = tuple[Array, Array, Array, Array]
 
 
-class RecursiveStep(FullStep):
+class RecursiveStep(ReducedStep):
     """One step on an open tree of bodies."""
 
     @property
@@ -21,73 +39,96 @@ class RecursiveStep(FullStep):
         assert self.system.elimination is not None
         return self.system.elimination
 
-    def jacobian(self, y: Float[Array, " unknowns"]) -> tuple[Array, Array, Array]:
-        """Blocks of the exact Jacobian: diagonal, up, down (see `linsolve.tree.TreeBlocks`)."""
-        twists, multipliers = self.split(y)
-        own = self.body_jacobians(twists)
-        up, down = jnp.zeros_like(own), jnp.zeros_like(own)
-        every = self._with_ground(twists)
-        # Of each multiplier: its forces on the node and on the parent, and the rates of its constraint.
-        borders = []
+    @property
+    def layout(self) -> NodeLayout:
+        """Where the unknowns sit in the nodes."""
+        return NodeLayout(
+            self.system.tree,
+            self.elimination.slots,
+            self.elimination.places,
+            united(self.system.tree),
+            tuple((g.count, g.multipliers) for g in self.groups),
+            self.tableau.stages,
+        )
+
+    def motion(self, w: Float[Array, "s unknowns"]) -> tuple[TreeMotion, JointGeometry]:
+        """Stage motion of the bodies at given rates."""
+        slots = gather_slots(self.system.tree, w)
+        return sweep_nodes(self.system.tree, self.frames, self.start, slots, self.h, self.tableau)
+
+    def generalised(
+        self, geometry: JointGeometry, force: Float[Array, "s bodies 3"], torque: Float[Array, "s bodies 3"]
+    ) -> Float[Array, "s unknowns"]:
+        """Generalised forces of the free motions."""
+        tree, level = self.system.tree, united(self.system.tree)
+        through = load_nodes(tree, geometry, force, torque)
+        return unknowns_of_slots(tree, level, on_slots(level, geometry, through))
+
+    def jacobian(self, y: Float[Array, " unknowns"]) -> Blocks:
+        """Blocks A, (X, Z), (T, S) and N of the exact Jacobian, see `linsolve.tree`."""
+        tree, level = self.system.tree, united(self.system.tree)
+        w, multipliers = self.split(y)
+        motion, geometry = self.motion(w)
+        at = self.stations(motion)
+        given = self.system, self.groups, self.situations, at, self.velocity
+        found = momentum_balance(*given, multipliers, self.h, self.tableau)
+        picked = jnp.array(level.slots, int)
+        joints = joint_blocks(
+            level,
+            hinging(tree, self.frames, self.start),
+            tree.slot_index[:, picked] < tree.slot_of.shape[0],
+            at.spin[:, tree.parent],
+            gather_slots(tree, w)[:, :, picked],
+            geometry,
+            load_nodes(tree, geometry, found.force, found.torque),
+            self.h,
+            self.tableau,
+        )
+        return self._with_effects(at, multipliers, joints)
+
+    def _with_effects(self, at: Stations, multipliers: list[Array], joints: tuple) -> Blocks:
+        """Blocks with those of bodies and effects, and with the multipliers of each node."""
+        twists = jnp.concatenate([at.rates[:, :, 0], at.spin], axis=-1)
+        own, every = self._own(twists[:, :-1]), jnp.moveaxis(twists, 0, 1)
+        coupled, bordered = [], []
         for group, where, lam, seats in zip(
             self.groups, self.situations, multipliers, self.elimination.seats
         ):
+            if group.source == "mass":
+                continue
             (by_twist, by_lam), (g_by_twist, _) = jacobians(
-                group, where, self.tableau, self.start[group.bodies], every[group.bodies], lam
+                group, where, self.tableau, at.start[group.bodies], every[group.bodies], lam
             )
-            at_node, at_parent = self._places(group)
-            blocks = self._by_place(by_twist, at_node, at_parent)
-            own = own - seats.nodes.collect(blocks[0]) - seats.parents.collect(blocks[3])
-            up, down = up - seats.nodes.collect(blocks[1]), down - seats.nodes.collect(blocks[2])
+            places = seated(group.bodies, own.shape[0])
+            both, upward, downward, above = by_place(by_twist, places)
+            own = own - seats.nodes.collect(both) - seats.parents.collect(above)
+            coupled.append((seats.nodes.collect(upward), seats.nodes.collect(downward)))
             if group.multipliers:
-                borders.append(self._borders(by_lam, g_by_twist, at_node, at_parent))
-        return self._bordered(own, up, down, borders)
+                bordered.append(borders(by_lam, g_by_twist, places))
+        if coupled:
+            upward, downward = (-jnp.sum(jnp.stack(blocks), axis=0) for blocks in zip(*coupled))
+            joints = with_coupling(joints, upward, downward)
+        if bordered:
+            joints = with_multipliers(joints, self.layout, bordered)
+        return own, *joints
 
-    def _places(self, group: Group) -> tuple[Array, Array]:
-        """Which bodies of each instance are its node, the deeper one, and which the node's parent."""
-        touched = jnp.asarray(group.bodies)
-        real = touched < self.bodies
-        # Bodies are numbered from the root.
-        node = jnp.max(jnp.where(real, touched, -1), axis=1, keepdims=True)
-        at_node = real & (touched == node)
-        return at_node, real & ~at_node
+    def _own(self, twists: Float[Array, "s bodies 6"]) -> Float[Array, "bodies n n"]:
+        """Derivatives of the balances of single bodies under fields, by their own twists."""
+        s, bodies, _ = twists.shape
+        fields = [pair for pair in zip(self.groups, self.situations) if pair[0].source == "mass"]
+        groups, situations = [g for g, _ in fields], [where for _, where in fields]
+        multipliers = [no_multipliers(g, self.tableau, twists.dtype) for g in groups]
 
-    def _by_place(self, by_twist: Array, at_node: Array, at_parent: Array) -> list[Array]:
-        """Blocks (node, node), (node, parent), (parent, node), (parent, parent) of each instance."""
-        count, k = at_node.shape
-        width = 6 * self.tableau.stages
-        local = by_twist.reshape(count, k, width, k, width)
-        places = (at_node, at_node), (at_node, at_parent), (at_parent, at_node), (at_parent, at_parent)
-        return [
-            jnp.sum(jnp.where((a[:, :, None] & b[:, None, :])[:, :, None, :, None], local, 0.0), axis=(1, 3))
-            for a, b in places
-        ]
+        def balance(twists: Array) -> Array:
+            velocity, spin = jnp.split(twists, 2, axis=-1)
+            directors = rotate_stages(self.h * spin[:, :, None], self.start[None, :, 1:], self.tableau)
+            at = self.stations(TreeMotion(spin, velocity, directors))
+            given = self.system, groups, situations, at, self.velocity
+            found = momentum_balance(*given, multipliers, self.h, self.tableau)
+            return jnp.concatenate([found.force, found.torque], axis=-1)
 
-    def _borders(self, by_lam: Array, g_by_twist: Array, at_node: Array, at_parent: Array) -> Array:
-        """Columns on node and parent and rows on node and parent of the multipliers (n m, 4, width)."""
-        count, k = at_node.shape
-        width = 6 * self.tableau.stages
-        columns = jnp.swapaxes(-by_lam.reshape(count, k, width, -1), 2, 3)
-        rows = jnp.swapaxes(g_by_twist.reshape(count, -1, k, width), 1, 2)
-        parts = [
-            jnp.sum(jnp.where(at[:, :, None, None], x, 0.0), axis=1)
-            for x, at in ((columns, at_node), (columns, at_parent), (rows, at_node), (rows, at_parent))
-        ]
-        return jnp.stack(parts, axis=2).reshape(-1, 4, width)
+        def along(unit: Array) -> Array:
+            return jax.jvp(balance, (twists,), (jnp.broadcast_to(unit[:, None], twists.shape),))[1]
 
-    def _bordered(
-        self, own: Array, up: Array, down: Array, borders: list[Array]
-    ) -> tuple[Array, Array, Array]:
-        """Blocks with the multipliers of each node; a slot without one keeps its unknown at zero."""
-        slots, width = self.elimination.slots, own.shape[-1]
-        empty = jnp.zeros((1, 4, width), own.dtype)
-        columns, lifted, rows, hung = jnp.moveaxis(jnp.concatenate([*borders, empty])[slots], 2, 0)
-        unused = slots == self.unknowns - self.balances
-        corner = unused[:, :, None] * jnp.eye(slots.shape[1])
-        upper = jnp.concatenate([own, jnp.swapaxes(columns, 1, 2)], axis=2)
-        lower = jnp.concatenate([rows, corner], axis=2)
-        return (
-            jnp.concatenate([upper, lower], axis=1),
-            jnp.concatenate([up, hung], axis=1),
-            jnp.concatenate([down, jnp.swapaxes(lifted, 1, 2)], axis=2),
-        )
+        columns = jax.vmap(along)(jnp.eye(6 * s).reshape(-1, s, 6))
+        return jnp.transpose(columns, (2, 1, 3, 0)).reshape(bodies, 6 * s, 6 * s)

@@ -7,6 +7,8 @@ then the rates of the constraints. Working with rates and multipliers times h ke
 size as h goes to zero.
 """
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -21,14 +23,13 @@ from natcoord_jax.assembly.response import (
     situation,
     stations,
 )
+from natcoord_jax.assembly.sweeps import sweep_motion
 from natcoord_jax.assembly.system import Group, System
 from natcoord_jax.assembly.tree import (
-    JointGeometry,
     TreeMotion,
     gather_slots,
     project,
     start_rates,
-    sweep_motion,
 )
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
@@ -130,10 +131,16 @@ class ReducedStep(eqx.Module):
             position += size
         return w, multipliers
 
-    def motion(self, w: Float[Array, "s unknowns"]) -> tuple[TreeMotion, list[JointGeometry]]:
-        """Stage motion of the bodies at given rates."""
+    def motion(self, w: Float[Array, "s unknowns"]) -> tuple[TreeMotion, Any]:
+        """Stage motion of the bodies at given rates, and the geometry of the joints."""
         slots = gather_slots(self.system.tree, w)
         return sweep_motion(self.system.tree, self.frames, self.start, slots, self.h, self.tableau)
+
+    def generalised(
+        self, geometry: Any, force: Float[Array, "s bodies 3"], torque: Float[Array, "s bodies 3"]
+    ) -> Float[Array, "s unknowns"]:
+        """Generalised forces of the free motions from forces and torques at the reference points."""
+        return project(self.system.tree, geometry, force, torque)[0]
 
     def stations(self, motion: TreeMotion) -> Stations:
         """Motion as the effects see it."""
@@ -154,7 +161,7 @@ class ReducedStep(eqx.Module):
         at = self.stations(motion)
         given = system, self.groups, self.situations, at, self.velocity
         found = momentum_balance(*given, multipliers, self.h, self.tableau)
-        generalised = project(system.tree, geometry, found.force, found.torque)[0]
+        generalised = self.generalised(geometry, found.force, found.torque)
         rows = project_rows(found.rows, y, self.balances, self.projector)
         residual = jnp.concatenate([generalised.reshape(-1), rows])
         return Evaluation(residual, found.size, at, found.power)

@@ -76,7 +76,7 @@ class Elimination(eqx.Module):
     Attributes:
         slots: multipliers of each node, padded with their total number.
         places: of each multiplier, in the flattened slots.
-        seats: of the instances of each group (effects, then joints).
+        seats: of the instances of each effect group.
     """
 
     slots: Int[Array | np.ndarray, "bodies m"]

@@ -19,7 +19,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from natcoord_jax.maths.collocation import Tableau, rotate_stages
 from natcoord_jax.maths.vectors import cross, dot
 
 SLOTS = 7
@@ -114,98 +113,14 @@ def gather_slots(tree: Tree, w: Float[Array, "s unknowns"]) -> Float[Array, "s b
     return padded[:, tree.slot_index]
 
 
-def _combine(coefficients: Float[Array, "n m"], vectors: Float[Array, "*s n m 3"]) -> Float[Array, "*s n 3"]:
+def combine(coefficients: Float[Array, "n m"], vectors: Float[Array, "*s n m 3"]) -> Float[Array, "*s n 3"]:
+    """Sums of vectors of each body."""
     return jnp.sum(coefficients[..., None] * vectors, axis=-2)
 
 
-def _frame_axes(coefficients: Float[Array, "n k 3"], directors: Float[Array, "s n 3 3"]) -> Array:
+def frame_axes(coefficients: Float[Array, "n k 3"], directors: Float[Array, "s n 3 3"]) -> Array:
+    """Axes of frames from the directors of the bodies that they are fixed to."""
     return jnp.sum(coefficients[..., None] * directors[:, :, None], axis=-2)
-
-
-def _translations(level: Level, axes: Float[Array, "s n 3 3"]) -> list[Array]:
-    return [cross(axes[:, :, (k + 1) % 3], axes[:, :, (k + 2) % 3]) for k in level.translations]
-
-
-def sweep_motion(
-    tree: Tree,
-    frames: Float[Array, "bodies 2 4 4"],
-    rows: Float[Array, "bodies 4 3"],
-    slots: Float[Array, "s bodies 7"],
-    h: Float[Array, ""],
-    tableau: Tableau,
-) -> tuple[TreeMotion, list[JointGeometry]]:
-    """Motion of all bodies from the rates of the joints, root to leaves.
-
-    Args:
-        tree: the spanning tree.
-        frames: weights of the joints' frames, joint b belonging to body b.
-        rows: rows of all bodies at the start of the step.
-        slots: mean rates by body and slot.
-        h: step [s].
-        tableau: the collocation method.
-    """
-    stages = jnp.asarray(tableau.a, rows.dtype)
-    spins, velocities, triads, geometry = [], [], [], []
-    for level in tree.levels:
-        here = slice(level.start, level.stop)
-        place, own, rate = frames[here], rows[here], slots[:, here]
-        d0 = own[None, :, 1:]
-        if level.grounded:
-            shape = (tableau.stages, level.stop - level.start, 3)
-            spin_p = velocity_p = jnp.zeros(shape, rows.dtype)
-            d_p = jnp.broadcast_to(jnp.eye(3, dtype=rows.dtype), (*shape, 3))
-            point_p, start_d_p = jnp.zeros_like(own[:, 0]), jnp.broadcast_to(jnp.eye(3), own[:, 1:].shape)
-        else:
-            up = tree.parent_in_level[here]
-            spin_p, velocity_p, d_p = spins[-1][:, up], velocities[-1][:, up], triads[-1][:, up]
-            parent_rows = rows[tree.parent[here]]
-            point_p, start_d_p = parent_rows[:, 0], parent_rows[:, 1:]
-        parent_axes = _frame_axes(place[:, 0, 1:, 1:], d_p)
-        slides = _translations(level, parent_axes) if level.translations else []
-        axes = [parent_axes[:, :, k] for k in level.rotations]
-        if level.balls:
-            own_axes = _frame_axes(place[:, 1, 1:, 1:], d0)
-            ball = tree.ball[here][:, None]
-            axes = [jnp.where(ball, own_axes[:, :, k], a) for k, a in zip(level.rotations, axes)]
-            slides = [jnp.where(ball, own_axes[:, :, k], t) for k, t in zip(level.translations, slides)]
-        spin = spin_p
-        for k, axis in zip(level.rotations, axes):
-            spin = spin + rate[:, :, k, None] * axis
-        child_axis = []
-        if level.child_rotation:
-            start = _combine(place[:, 1, 1, 1:], d0)
-            child_axis = [rotate_stages(h * spin, start, tableau)]
-            spin = spin + rate[:, :, 6, None] * child_axis[0]
-        d = rotate_stages(h * spin[:, :, None], d0, tableau)
-        parent_arm = _combine(place[:, 0, 0, 1:], d_p)
-        child_arm = _combine(place[:, 1, 0, 1:], d)
-        velocity = velocity_p - cross(spin, child_arm)
-        if not level.grounded:
-            velocity = velocity + cross(spin_p, parent_arm)
-        gap = jnp.zeros_like(child_arm)
-        if level.translations:
-            sliding = sum(rate[:, :, 3 + k, None] * t for k, t in zip(level.translations, slides))
-            velocity = velocity + sliding
-            if not level.grounded:
-                child_point = own[:, 0] + _combine(place[:, 1, 0, 1:], d0[0])
-                start = child_point - point_p - _combine(place[:, 0, 0, 1:], start_d_p)
-                start = start + h * jnp.einsum("ij,jnc->inc", stages, sliding)
-                gap = rotate_stages(h * spin_p, start, tableau)
-                velocity = velocity + cross(spin_p, gap)
-        geometry.append(
-            JointGeometry(_stack(axes + slides + child_axis, child_arm), parent_arm, child_arm, gap)
-        )
-        spins.append(spin)
-        velocities.append(velocity)
-        triads.append(d)
-    motion = TreeMotion(*(jnp.concatenate(x, axis=1) for x in (spins, velocities, triads)))
-    return motion, geometry
-
-
-def _stack(vectors: list[Array], like: Array) -> Array:
-    if not vectors:
-        return jnp.zeros((*like.shape[:2], 0, 3), like.dtype)
-    return jnp.stack(vectors, axis=2)
 
 
 def tangent(
@@ -289,9 +204,9 @@ def start_rates(
     every, moving = jnp.concatenate([rows, ground]), jnp.concatenate([velocity, jnp.zeros_like(ground)])
     spin = 0.5 * jnp.sum(cross(every[:, 1:], moving[:, 1:]), axis=1)
     parent, spin_p = every[tree.parent], spin[tree.parent]
-    parent_axes = _frame_axes(frames[:, 0, 1:, 1:], parent[None, :, 1:])[0]
-    own_axes = _frame_axes(frames[:, 1, 1:, 1:], rows[None, :, 1:])[0]
-    child_arm = _combine(frames[:, 1, 0, 1:], rows[:, 1:])
+    parent_axes = frame_axes(frames[:, 0, 1:, 1:], parent[None, :, 1:])[0]
+    own_axes = frame_axes(frames[:, 1, 1:, 1:], rows[None, :, 1:])[0]
+    child_arm = combine(frames[:, 1, 0, 1:], rows[:, 1:])
     apart = rows[:, 0] + child_arm - parent[:, 0]
     relative = spin[:-1] - spin_p
     gap_rate = velocity[:, 0] + cross(spin[:-1], child_arm) - moving[tree.parent][:, 0] - cross(spin_p, apart)

@@ -1,10 +1,14 @@
-"""Recursive elimination on a tree of blocks, leaves to root, one node after the other.
+"""Recursive elimination on a tree, leaves to root, one node after the other.
 
-Node i has its own unknowns z_i, the first `width` of which its children see. Equation i reads
-D_i z_i + U_i x_p + sum over children c of L_c z_c = b_i, where x_p are the parent's visible unknowns and L_c
-acts on the visible rows. Nodes are numbered from the root, so that descending numbers go from the leaves to
-the root. Eliminating a node changes only its parent's visible block: the cost is linear in the number of
-nodes, whatever the shape of the tree, and the loops compile into one kernel.
+Node i has own unknowns z_i; it sees its parent p through a passed quantity x_p (in mechanics: a twist), and
+its children through what they hand up, q_c (loads):
+
+    x_i        = (X, Z)_i (x_p, z_i)                                passed down
+    (q_i, r_i) = (T, S)_i (A_i x_i + sum of q_c) + N_i (x_p, z_i)   handed up, and the node's own equations
+
+Nodes are numbered from the root, so that descending numbers go from the leaves to the root. An eliminated
+subtree hands up a linear function of x_p, as the articulated bodies of rigid-body dynamics do: the cost is
+linear in the number of nodes, whatever the shape of the tree, and the loops compile into one kernel.
 """
 
 import equinox as eqx
@@ -13,108 +17,157 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from natcoord_jax.linsolve.dense import bordered_inverse
-
-
-def _add_at(x: Array, index: Array, change: Array) -> Array:
-    """Rows of x with one of them changed; unlike a scatter, this compiles in place."""
-    row = jax.lax.dynamic_index_in_dim(x, index, keepdims=False)
-    return jax.lax.dynamic_update_index_in_dim(x, row + change, index, 0)
+from natcoord_jax.maths.rows import add_at, row
 
 
 def _apply(matrix: Array, vector: Array) -> Array:
     return jnp.sum(matrix * vector, axis=-1)
 
 
+def _transposed(matrices: Array) -> Array:
+    return jnp.swapaxes(matrices, -1, -2)
+
+
 def _product(a: Array, b: Array) -> Array:
-    return jnp.sum(a[:, :, None] * b[None, :, :], axis=1)
+    return jnp.sum(a[..., :, :, None] * b[..., None, :, :], axis=-2)
+
+
+def passed_down(
+    across: Float[Array, "nodes width width"], own: Float[Array, "nodes width"], parent: Int[Array, " nodes"]
+) -> Float[Array, "nodes_and_rest width"]:
+    """Sums x_i = across_i x_p + own_i, roots to leaves; last, the zero that roots see.
+
+    The loop carries one array and puts out nothing else: an output read from what is carried would make the
+    compiler copy all of it for every node.
+    """
+
+    def down(seen: Array, node: tuple) -> tuple[Array, None]:
+        across, index, parent = node
+        return add_at(seen, index, _apply(across, row(seen, parent))), None
+
+    start = jnp.concatenate([own, jnp.zeros_like(own[:1])])
+    return jax.lax.scan(down, start, (across, jnp.arange(own.shape[0]), parent))[0]
+
+
+def handed_up(
+    lift: Float[Array, "nodes width width"], own: Float[Array, "nodes width"], parent: Int[Array, " nodes"]
+) -> Float[Array, "nodes width"]:
+    """Sums over children s_i = sum of (lift_c s_c + own_c), leaves to roots."""
+
+    def up(sums: Array, node: tuple) -> tuple[Array, None]:
+        lift, own, index, parent = node
+        return add_at(sums, parent, _apply(lift, row(sums, index)) + own), None
+
+    start = jnp.zeros((own.shape[0] + 1, own.shape[1]), own.dtype)
+    every = (lift, own, jnp.arange(own.shape[0]), parent)
+    return jax.lax.scan(up, start, every, reverse=True)[0][:-1]
 
 
 class TreeBlocks(eqx.Module):
-    """A matrix with tree structure.
+    """A matrix with tree structure, from the unknowns z to the equations r of all nodes.
 
     Attributes:
-        diagonal: D, own blocks; below the visible rows they are zero or one on their own diagonal.
-        up: U, columns of the parent's visible unknowns; zero for roots.
-        down: L, rows of the parent's visible equations; zero for roots.
-        parent: parent of each node, of lower number; the number of nodes for roots.
+        own: A.
+        spread: X and Z, side by side.
+        gather: T and S, one below the other.
+        rest: N.
+        parent: parent of each node, of lower number; the number of nodes for roots, which see zero.
+        definite: unknowns of a node that come first; the others are multipliers of constraints.
     """
 
-    diagonal: Float[Array, "nodes n n"]
-    up: Float[Array, "nodes n width"]
-    down: Float[Array, "nodes width n"]
+    own: Float[Array, "nodes width width"]
+    spread: Float[Array, "nodes width all"]
+    gather: Float[Array, "nodes all width"]
+    rest: Float[Array, "nodes all all"]
     parent: Int[Array, " nodes"]
+    definite: int = eqx.field(static=True)
 
-    def multiply(self, x: Float[Array, "nodes n"]) -> Float[Array, "nodes n"]:
+    def multiply(self, z: Float[Array, "nodes n"]) -> Float[Array, "nodes n"]:
         """Product with a vector."""
-        width = self.up.shape[-1]
-        seen = jnp.concatenate([x[:, :width], jnp.zeros_like(x[:1, :width])])[self.parent]
-        own = jnp.einsum("nij,nj->ni", self.diagonal, x) + jnp.einsum("nij,nj->ni", self.up, seen)
-        lifted = jnp.einsum("nij,nj->ni", self.down, x)
-        onto = jnp.zeros((x.shape[0] + 1, width), x.dtype).at[self.parent].add(lifted)
-        return own.at[:, :width].add(onto[:-1])
+        width = self.own.shape[1]
+        across, own = self.spread[:, :, :width], self.spread[:, :, width:]
+        seen = passed_down(across, jnp.einsum("nij,nj->ni", own, z), self.parent)
+        both = jnp.concatenate([seen[self.parent], z], axis=1)
+        further = jnp.einsum("nij,nj->ni", self.rest, both)
+        loads = jnp.einsum("nij,nj->ni", self.own, seen[:-1])
+        upward, inward = self.gather[:, :width], self.gather[:, width:]
+        handed = jnp.einsum("nij,nj->ni", upward, loads) + further[:, :width]
+        loads = loads + handed_up(upward, handed, self.parent)
+        return jnp.einsum("nij,nj->ni", inward, loads) + further[:, width:]
 
 
 class TreeFactors(eqx.Module):
     """Factors of a `TreeBlocks`.
 
     Attributes:
-        inverse: inverses of the eliminated diagonal blocks.
-        to_parent: L D^-1.
-        from_parent: D^-1 U.
+        inverse: of the own equations of each node, its subtree eliminated.
+        to_parent: what is handed up by a unit of the own right-hand sides.
+        from_parent: what the own unknowns lose by a unit of what is seen of the parent.
+        lift: what is handed up by a unit of what the children hand up.
+        drop: what is passed down by a unit of what is seen of the parent.
+        gather: S.
+        spread: Z.
         parent: parent of each node.
     """
 
     inverse: Float[Array, "nodes n n"]
     to_parent: Float[Array, "nodes width n"]
     from_parent: Float[Array, "nodes n width"]
+    lift: Float[Array, "nodes width width"]
+    drop: Float[Array, "nodes width width"]
+    gather: Float[Array, "nodes n width"]
+    spread: Float[Array, "nodes width n"]
     parent: Int[Array, " nodes"]
 
     def solve(self, right: Float[Array, "nodes n"]) -> Float[Array, "nodes n"]:
         """Solution for a right-hand side: one loop up, one loop down."""
-        nodes, width = right.shape[0], self.from_parent.shape[-1]
-        spare = jnp.zeros((1, width), right.dtype)
-
-        def up(added: Array, node: tuple) -> tuple[Array, Array]:
-            to_parent, own, index, parent = node
-            b = jnp.concatenate([own[:width] + added[index], own[width:]])
-            return _add_at(added, parent, -_apply(to_parent, b)), b
-
-        added = jnp.zeros((nodes + 1, width), right.dtype)
-        _, loads = jax.lax.scan(
-            up, added, (self.to_parent, right, jnp.arange(nodes), self.parent), reverse=True
-        )
-
-        def down(seen: Array, node: tuple) -> tuple[Array, Array]:
-            inverse, from_parent, b, index, parent = node
-            x = _apply(inverse, b) - _apply(from_parent, seen[parent])
-            return jax.lax.dynamic_update_index_in_dim(seen, x[:width], index, 0), x
-
-        seen = jnp.concatenate([jnp.zeros((nodes, width), right.dtype), spare])
-        rows = (self.inverse, self.from_parent, loads, jnp.arange(nodes), self.parent)
-        return jax.lax.scan(down, seen, rows)[1]
+        handed = _apply(self.to_parent, right[:, None, :])
+        left = right - _apply(self.gather, handed_up(self.lift, handed, self.parent)[:, None, :])
+        alone = _apply(self.inverse, left[:, None, :])
+        moved = _apply(self.spread, alone[:, None, :])
+        seen = passed_down(self.drop, moved, self.parent)
+        return alone - _apply(self.from_parent, seen[self.parent][:, None, :])
 
     def transpose(self) -> "TreeFactors":
-        """Factors of the transposed matrix."""
-        swap = lambda x: jnp.swapaxes(x, -1, -2)  # noqa: E731
-        return TreeFactors(swap(self.inverse), swap(self.from_parent), swap(self.to_parent), self.parent)
+        """Factors of the transposed matrix: what is passed down and what is handed up change places."""
+        return TreeFactors(
+            _transposed(self.inverse),
+            _transposed(self.from_parent),
+            _transposed(self.to_parent),
+            _transposed(self.drop),
+            _transposed(self.lift),
+            _transposed(self.spread),
+            _transposed(self.gather),
+            self.parent,
+        )
 
 
-def factor(blocks: TreeBlocks) -> TreeFactors:
-    """Eliminate all nodes, leaves to root."""
-    nodes, width = blocks.diagonal.shape[0], blocks.up.shape[-1]
+def factor(blocks: TreeBlocks) -> tuple[TreeFactors, Float[Array, "nodes n"]]:
+    """Eliminate all nodes, leaves to root; also the diagonal of the matrix, by node."""
+    nodes, width = blocks.own.shape[:2]
 
-    def eliminate(added: Array, node: tuple) -> tuple[Array, tuple]:
-        own, up, down, index, parent = node
-        visible = own[:width, :width] + added[index]
-        own = jnp.concatenate([jnp.concatenate([visible, own[:width, width:]], axis=1), own[width:]])
-        inverse = bordered_inverse(own, width)
-        to_parent, from_parent = _product(down, inverse), _product(inverse, up)
-        return _add_at(added, parent, -_product(to_parent, up)), (inverse, to_parent, from_parent)
+    def eliminate(inertia: Array, node: tuple) -> tuple[Array, tuple]:
+        spread, gather, rest, index, parent = node
+        # The subtree as it is after elimination, and as if its unknowns were fixed: for the diagonal.
+        both = _product(gather[None], _product(row(inertia, index), spread[None])) + rest
+        free, fixed = both[0], both[1]
+        inverse = bordered_inverse(free[width:, width:], blocks.definite)
+        to_parent = _product(free[:width, width:], inverse)
+        from_parent = _product(inverse, free[width:, :width])
+        eliminated = free[:width, :width] - _product(to_parent, free[width:, :width])
+        lift = gather[:width] - _product(to_parent, gather[width:])
+        drop = spread[:, :width] - _product(spread[:, width:], from_parent)
+        handed = jnp.stack([eliminated, fixed[:width, :width]])
+        found = inverse, to_parent, from_parent, lift, drop, jnp.diagonal(fixed)[width:]
+        return add_at(inertia, parent, handed), found
 
-    start = jnp.zeros((nodes + 1, width, width), blocks.diagonal.dtype)
-    rows = (blocks.diagonal, blocks.up, blocks.down, jnp.arange(nodes), blocks.parent)
-    _, (inverse, to_parent, from_parent) = jax.lax.scan(eliminate, start, rows, reverse=True)
-    return TreeFactors(inverse, to_parent, from_parent, blocks.parent)
+    start = jnp.concatenate([blocks.own, jnp.zeros((1, width, width), blocks.own.dtype)])
+    start = jnp.broadcast_to(start[:, None], (nodes + 1, 2, width, width))
+    rows = (blocks.spread, blocks.gather, blocks.rest, jnp.arange(nodes), blocks.parent)
+    found = jax.lax.scan(eliminate, start, rows, reverse=True)[1]
+    inverse, to_parent, from_parent, lift, drop, diagonal = found
+    rims = blocks.gather[:, width:], blocks.spread[:, :, width:]
+    return TreeFactors(inverse, to_parent, from_parent, lift, drop, *rims, blocks.parent), diagonal
 
 
 class TreeSolver(eqx.Module):

@@ -231,15 +231,13 @@ class Rule:
             numbers.varied, slot.before, slot.u, slot.y,
         )  # fmt: skip
 
-        patience = PATIENCE[numbers.whole(numbers.varied)[0].structure.solver]
-
         def trip(carry: tuple) -> tuple:
             lam, _, factors, at = carry
             refresh = partial(self._refreshed, kernel, numbers, slot)
             _, factors, at = jax.lax.while_loop(lambda c: c[0], refresh, (any_lane(at.wanting), factors, at))
             *bars, gap = pull((lam, end_bar))
             change = factors.solver.transpose().solve(gap + y_bar)
-            at = at.judged(factors, lam, change, patience)
+            at = at.judged(factors, lam, change, PATIENCE)
             return jnp.where(at.moving, lam - change, lam), tuple(bars), factors, at
 
         lam = jnp.where(jnp.all(jnp.isfinite(guess)), guess, 0.0)

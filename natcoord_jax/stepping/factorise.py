@@ -37,48 +37,23 @@ class _ByNode(eqx.Module):
         return _ByNode(self.layout, self.solver.transpose())
 
 
-class _TreeLayout(eqx.Module):
-    """The part of the equations that knows where unknowns sit; numbers of the step are left out."""
-
-    slots: Array
-    places: Array
-    width: int = eqx.field(static=True)
-
-    def nodes(self, y: Array) -> Array:
-        """Flat vector by node."""
-        bodies = self.slots.shape[0]
-        twists = y[: bodies * self.width].reshape(bodies, self.width)
-        padded = jnp.concatenate([y[bodies * self.width :], jnp.zeros(1, y.dtype)])
-        return jnp.concatenate([twists, padded[self.slots]], axis=1)
-
-    def flat(self, nodes: Array) -> Array:
-        """The inverse of `nodes`."""
-        multipliers = nodes[:, self.width :].reshape(-1)[self.places]
-        return jnp.concatenate([nodes[:, : self.width].reshape(-1), multipliers])
-
-
-def _tree_layout(equations: Any) -> _TreeLayout:
-    elimination = equations.system.elimination
-    return _TreeLayout(elimination.slots, elimination.places, 6 * equations.tableau.stages)
-
-
-def _tree_blocks(equations: Any, blocks: tuple) -> TreeBlocks:
-    system = equations.system
-    diagonal, up, down = blocks
-    return TreeBlocks(diagonal, up, down, system.tree.parent)
+def _tree_blocks(equations: Any, blocks: tuple[Array, Array, Array, Array]) -> TreeBlocks:
+    own, spread, gather, rest = blocks
+    parent, definite = equations.system.tree.parent, equations.layout.rates
+    return TreeBlocks(own, spread, gather, rest, parent, definite)
 
 
 def _recursive(equations: Any, blocks: tuple) -> tuple[_ByNode, Array]:
     """Factors along the tree, and the inertias of the unknowns (0 for multipliers)."""
-    layout = _tree_layout(equations)
-    inertias = jnp.abs(jnp.diagonal(blocks[0], axis1=1, axis2=2))
-    flat = layout.flat(inertias).at[equations.balances :].set(0.0)
-    return _ByNode(layout, factor(_tree_blocks(equations, blocks))), flat
+    layout = equations.layout
+    factors, diagonal = factor(_tree_blocks(equations, blocks))
+    inertias = layout.flat(jnp.abs(diagonal)).at[equations.balances :].set(0.0)
+    return _ByNode(layout, factors), inertias
 
 
 def _recursive_differentiable(equations: Any, blocks: tuple) -> _ByNode:
     matrix = _tree_blocks(equations, blocks)
-    return _ByNode(_tree_layout(equations), TreeSolver(matrix, factor(matrix)))
+    return _ByNode(equations.layout, TreeSolver(matrix, factor(matrix)[0]))
 
 
 FACTORISATIONS: dict[str, Callable[[Any, Any], tuple[Any, Array]]] = {

@@ -37,8 +37,8 @@ NEWTON_ROUNDS = 25
 SLOWEST_UNSEEN = 0.02
 """Contraction assumed at least: a slow part of the error may hide behind fast ones in the first ratio."""
 
-PATIENCE = {"reduced": 6, "full": 6, "recursive": 10}
-"""Corrections that are cheaper than a new Jacobian, by form of the equations."""
+PATIENCE = 6
+"""Corrections that are cheaper than a new Jacobian."""
 
 
 @jax.custom_batching.custom_vmap
@@ -233,7 +233,7 @@ def newton(equations: Any, tolerance: float, form: str) -> tuple[Float[Array, " 
     def trip(carry: tuple[Iterate, Factors]) -> tuple[Iterate, Factors]:
         it, factors = jax.lax.cond(any_lane(carry[0].wanting), renew, keep, *carry)
         return judge(
-            factors, tolerance, it, *equations.residual(it.y), balances=True, patience=PATIENCE[form]
+            factors, tolerance, it, *equations.residual(it.y), balances=True, patience=PATIENCE
         ), factors
 
     with jax.named_scope("newton"):

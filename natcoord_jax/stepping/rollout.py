@@ -23,6 +23,7 @@ from natcoord_jax.assembly.system import System
 from natcoord_jax.core.results import Result
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import gauss
+from natcoord_jax.maths.rows import with_row
 from natcoord_jax.stepping.newton import (
     PATIENCE,
     Factors,
@@ -195,34 +196,58 @@ def _end(setting: Setting, course: Course, inertias: Array, found: tuple[State, 
     )
 
 
-def _trip(setting: Setting, course: Course, factors: Factors, probe: Probe | None) -> tuple:
-    """One evaluation of the equations, and what follows from it.
+class Carried(eqx.Module):
+    """What goes from one evaluation of the equations to the next.
 
-    Returns:
-        Where the rollout stands, its factors, the Jacobian in the making, the record of the slot, and whether
-        the slot is complete: else the record is void.
+    Attributes:
+        count: complete slots.
+        course: where the rollout stands, its state left out.
+        state: the state in one array: fewer operations than one for every field.
+        factors: of a Jacobian.
+        probe: the Jacobian in the making.
+        record: fields of `Slots`, for every slot; the states in one array.
     """
-    plan, it, over = setting.plan, course.it, setting.over(course)
+
+    count: Int[Array, ""]
+    course: Course
+    state: Float[Array, " numbers"]
+    factors: Factors
+    probe: Probe | None
+    record: tuple[Array, ...]
+
+
+def _trip(setting: Setting, unpack: Callable[[Array], State], carried: Carried) -> Carried:
+    """One evaluation of the equations, and what follows from it."""
+    plan, factors, probe = setting.plan, carried.factors, carried.probe
+    course = _with_state(carried.course, unpack(carried.state))
+    it, over = course.it, setting.over(course)
     u, h, index = setting.situation(course)
     equations = prepare(setting.system, course.state, u, h, gauss(plan.stages))
     found = equations.evaluate(it.y if probe is None else probe.moved(it.y, equations))
     probing = jnp.array(False) if probe is None else probe.at >= 0
     driven = any(group.multipliers and group.effect.works for group in equations.groups)
-    options = {"balances": driven, "patience": PATIENCE[setting.form]}
+    options = {"balances": driven, "patience": PATIENCE}
     judged = judge(factors, plan.tolerance, it, found.residual, found.size, **options)
     it = jax.tree.map(partial(jnp.where, probing), it, judged)
     ending = ~probing & ~any_lane(it.unsolved & ~over)
     wanting = ~probing & ~ending & any_lane(it.wanting & it.unsolved & ~over)
-    before = eqx.tree_at(lambda c: c.it, course, it)
 
-    def ended(course: Course) -> Course:
+    def ended(carry: tuple) -> tuple:
+        _, before, x, record = carry
+        before = _with_state(before, unpack(x))
         groups, tableau = equations.groups, gauss(plan.stages)
-        ends = end_of_step(setting.system, course.state, h, groups, found, tableau)
-        return _end(setting, course, factors.inertias, ends)
+        ends = end_of_step(setting.system, before.state, h, groups, found, tableau)
+        after = _end(setting, before, factors.inertias, ends)
+        accepted = after.taken > before.taken
+        x = ravel_pytree(after.state)[0]
+        slot = x, before.it.y, index, before.fraction, accepted, after.step
+        record = tuple(with_row(b, carried.count, r) for b, r in zip(record, slot))
+        return jnp.array(False), _with_state(after, None), x, record
 
-    after = jax.lax.cond(ending, ended, lambda course: course, before)
-    accepted = after.taken > before.taken
-    record = Slots(after.state, it.y, index, course.fraction, accepted, after.step)
+    # Loops of no or one trip leave what they carry where it is; a conditional would copy it.
+    start = ending, eqx.tree_at(lambda c: c.it, carried.course, it), carried.state, carried.record
+    _, after, x, record = jax.lax.while_loop(lambda carry: carry[0], ended, start)
+    accepted = after.taken > course.taken
     usable = jnp.where(ending, (accepted | over) & factors.usable, factors.usable)
     factors = Factors(factors.solver, factors.inertias, usable, factors.fresh & ~ending)
     if probe is not None:
@@ -233,17 +258,17 @@ def _trip(setting: Setting, course: Course, factors: Factors, probe: Probe | Non
         matrix = equations.jacobian(it.y) if probe is None else probe.columns[:-1].T
         return jnp.array(False), refreshed(it), factors_of(equations, setting.form, matrix)
 
-    # A loop of no or one trip leaves the factors where they are; a conditional would copy them.
     _, it, factors = jax.lax.while_loop(lambda carry: carry[0], renewed, (wanting, after.it, factors))
-    return eqx.tree_at(lambda c: c.it, after, it), factors, probe, record, ending
+    after = eqx.tree_at(lambda c: c.it, after, it)
+    return Carried(carried.count + ending, after, x, factors, probe, record)
 
 
 def _is_none(x: Any) -> bool:
     return x is None
 
 
-def _without_state(course: Course) -> Course:
-    return eqx.tree_at(lambda c: c.state, course, None)
+def _with_state(course: Course, state: State | None) -> Course:
+    return eqx.tree_at(lambda c: c.state, course, state, is_leaf=_is_none)
 
 
 class Ending(eqx.Module):
@@ -257,42 +282,24 @@ def run(plan: Plan, system: System, state: State, parameters: Any, dt: Array) ->
     """All slots of a rollout and where it ended; without derivatives (see `derivative`)."""
     setting = Setting(system, parameters, dt, plan)
     length = plan.steps + plan.extra
-    # One array instead of one for every field: fewer operations in every trip.
     packed, unpack = ravel_pytree(state)
 
-    def packed_trip(course: Course, factors: Factors, probe: Probe | None, x: Array) -> tuple:
-        whole = eqx.tree_at(lambda c: c.state, course, unpack(x), is_leaf=_is_none)
-        after, factors, probe, record, complete = _trip(setting, whole, factors, probe)
-        states = ravel_pytree(record.states)[0]
-        record = (eqx.tree_at(lambda s: s.states, record, None), states)
-        return (_without_state(after), factors, probe, ravel_pytree(after.state)[0]), record, complete
+    def unfinished(carried: Carried) -> Array:
+        course = carried.course
+        return (carried.count < length) & any_lane(~course.stopped & (course.step < plan.steps))
 
-    def unfinished(carry: tuple) -> Array:
-        count, (course, *_), _ = carry
-        return (count < length) & any_lane(~course.stopped & (course.step < plan.steps))
-
-    def body(carry: tuple) -> tuple:
-        count, carried, buffer = carry
-        carried, record, complete = packed_trip(*carried)
-        # A void record is overwritten by the next one.
-        buffer = jax.tree.map(
-            lambda b, r: jax.lax.dynamic_update_index_in_dim(b, r, count, 0), buffer, record
-        )
-        return count + complete, carried, buffer
-
-    def every_slot(course: Course, factors: Factors, x: Array) -> tuple:
-        probe = Probe.first(course.it.y.shape[0], x.dtype) if setting.form in BY_DIFFERENCES else None
-        carried = (course, factors, probe, x)
-        shapes = jax.eval_shape(packed_trip, *carried)[1]
-        buffer = jax.tree.map(lambda x: jnp.zeros((length, *x.shape), x.dtype), shapes)
-        count, carried, buffer = jax.lax.while_loop(unfinished, body, (jnp.array(0), carried, buffer))
-        return count, carried[0], carried[1], carried[3], buffer
+    def every_slot(course: Course, factors: Factors, x: Array) -> Carried:
+        it = course.it
+        probe = Probe.first(it.y.shape[0], x.dtype) if setting.form in BY_DIFFERENCES else None
+        slot = x, it.y, course.step, course.fraction, course.stopped, course.step
+        record = tuple(jnp.zeros((length, *x.shape), x.dtype) for x in slot)
+        start = Carried(jnp.array(0), course, x, factors, probe, record)
+        return jax.lax.while_loop(unfinished, partial(_trip, setting, unpack), start)
 
     course, factors = _start(setting, state)
-    found = as_one_kernel(every_slot, _without_state(course), factors, packed)
-    count, course, factors, x, (slots, states) = found
-    course = eqx.tree_at(lambda c: c.state, course, unpack(x), is_leaf=_is_none)
-    slots = eqx.tree_at(lambda s: s.states, slots, jax.vmap(unpack)(states), is_leaf=_is_none)
+    found = as_one_kernel(every_slot, _with_state(course, None), factors, packed)
+    course, (states, *rest) = _with_state(found.course, unpack(found.state)), found.record
+    count, factors, slots = found.count, found.factors, Slots(jax.vmap(unpack)(states), *rest)
     unused = jnp.arange(length) >= any_lane(count)
 
     def fill(x: Array, last: Array | float) -> Array:

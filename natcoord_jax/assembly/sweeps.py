@@ -1,0 +1,160 @@
+"""Forward sweep of the joint null space: from the rates of the joints to the motion of all bodies."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from natcoord_jax.assembly.tree import JointGeometry, Level, Tree, TreeMotion, combine, frame_axes
+from natcoord_jax.maths.collocation import Tableau, rotate_stages
+from natcoord_jax.maths.vectors import cross
+
+
+class Hinging(eqx.Module):
+    """Bodies of one level, and what they hang on.
+
+    Attributes:
+        frames: weights of the joints' frames.
+        rows: of the bodies at the start of the step.
+        ball: whether the joints leave all rotations free.
+        parent_rows: rows of the parents at the start of the step.
+    """
+
+    frames: Float[Array, "n 2 4 4"]
+    rows: Float[Array, "n 4 3"]
+    ball: Bool[Array | np.ndarray, " n"]
+    parent_rows: Float[Array, "n 4 3"]
+
+
+def turning(
+    level: Level,
+    axes: Sequence[Array],
+    child_axis: Array | None,
+    spin_p: Float[Array, "s n 3"],
+    rate: Float[Array, "s n 7"],
+    h: Float[Array, ""],
+    tableau: Tableau,
+) -> tuple[Float[Array, "s n 3"], list[Array]]:
+    """Angular velocities from those of the parents, and the child axis if there is one.
+
+    Args:
+        level: the bodies.
+        axes: stage axes of their rotations.
+        child_axis: start of the axis that is fixed to the child.
+        spin_p: angular velocities of the parents.
+        rate: mean rates by slot.
+        h: step [s].
+        tableau: the collocation method.
+    """
+    spin = spin_p
+    for k, axis in zip(level.rotations, axes):
+        spin = spin + rate[:, :, k, None] * axis
+    if child_axis is None:
+        return spin, []
+    turned = rotate_stages(h * spin, child_axis, tableau)
+    return spin + rate[:, :, 6, None] * turned, [turned]
+
+
+def relative_motion(
+    level: Level,
+    these: Hinging,
+    spin_p: Float[Array, "s n 3"],
+    d_p: Float[Array, "s n 3 3"],
+    rate: Float[Array, "s n 7"],
+    h: Float[Array, ""],
+    tableau: Tableau,
+) -> tuple[Array, Array, Array, JointGeometry]:
+    """Motion of the bodies of one level on parents whose reference points rest.
+
+    Args:
+        level: the bodies.
+        these: their numbers.
+        spin_p: angular velocities of the parents.
+        d_p: stage directors of the parents.
+        rate: mean rates by slot.
+        h: step [s].
+        tableau: the collocation method.
+
+    Returns:
+        Angular velocities, velocities relative to those of the parents' points, stage directors, geometry.
+    """
+    place, rows = these.frames, these.rows
+    d0 = rows[None, :, 1:]
+    parent_axes = frame_axes(place[:, 0, 1:, 1:], d_p)
+    axes = [parent_axes[:, :, k] for k in level.rotations]
+    slides = [
+        cross(parent_axes[:, :, (k + 1) % 3], parent_axes[:, :, (k + 2) % 3]) for k in level.translations
+    ]
+    if level.balls:
+        own_axes, ball = frame_axes(place[:, 1, 1:, 1:], d0), these.ball[:, None]
+        axes = [jnp.where(ball, own_axes[:, :, k], a) for k, a in zip(level.rotations, axes)]
+        slides = [jnp.where(ball, own_axes[:, :, k], t) for k, t in zip(level.translations, slides)]
+    start = combine(place[:, 1, 1, 1:], d0) if level.child_rotation else None
+    spin, child_axis = turning(level, axes, start, spin_p, rate, h, tableau)
+    d = rotate_stages(h * spin[:, :, None], d0, tableau)
+    parent_arm = combine(place[:, 0, 0, 1:], d_p)
+    child_arm = combine(place[:, 1, 0, 1:], d)
+    velocity = -cross(spin, child_arm)
+    if not level.grounded:
+        velocity = velocity + cross(spin_p, parent_arm)
+    gap = jnp.zeros_like(child_arm)
+    if level.translations:
+        sliding = sum(rate[:, :, 3 + k, None] * t for k, t in zip(level.translations, slides))
+        velocity = velocity + sliding
+        if not level.grounded:
+            above = these.parent_rows
+            child_point = rows[:, 0] + combine(place[:, 1, 0, 1:], d0[0])
+            apart = child_point - above[:, 0] - combine(place[:, 0, 0, 1:], above[:, 1:])
+            stages = jnp.asarray(tableau.a, rows.dtype)
+            apart = apart + h * jnp.einsum("ij,jnc->inc", stages, sliding)
+            gap = rotate_stages(h * spin_p, apart, tableau)
+            velocity = velocity + cross(spin_p, gap)
+    geometry = JointGeometry(_stack(axes + slides + child_axis, child_arm), parent_arm, child_arm, gap)
+    return spin, velocity, d, geometry
+
+
+def _stack(vectors: list[Array], like: Array) -> Array:
+    if not vectors:
+        return jnp.zeros((*like.shape[:2], 0, 3), like.dtype)
+    return jnp.stack(vectors, axis=2)
+
+
+def sweep_motion(
+    tree: Tree,
+    frames: Float[Array, "bodies 2 4 4"],
+    rows: Float[Array, "bodies 4 3"],
+    slots: Float[Array, "s bodies 7"],
+    h: Float[Array, ""],
+    tableau: Tableau,
+) -> tuple[TreeMotion, list[JointGeometry]]:
+    """Motion of all bodies from the rates of the joints, root to leaves, level by level.
+
+    Args:
+        tree: the spanning tree.
+        frames: weights of the joints' frames, joint b belonging to body b.
+        rows: rows of all bodies at the start of the step.
+        slots: mean rates by body and slot.
+        h: step [s].
+        tableau: the collocation method.
+    """
+    unit = jnp.eye(3, dtype=rows.dtype)
+    spins, velocities, triads, geometry = [], [], [], []
+    for level in tree.levels:
+        here = slice(level.start, level.stop)
+        if level.grounded:
+            shape = (tableau.stages, level.stop - level.start, 3)
+            spin_p = velocity_p = jnp.zeros(shape, rows.dtype)
+            d_p, parent_rows = jnp.broadcast_to(unit, (*shape, 3)), rows[here]
+        else:
+            up = tree.parent_in_level[here]
+            spin_p, velocity_p, d_p = spins[-1][:, up], velocities[-1][:, up], triads[-1][:, up]
+            parent_rows = rows[tree.parent[here]]
+        these = Hinging(frames[here], rows[here], tree.ball[here], parent_rows)
+        spin, relative, d, joint = relative_motion(level, these, spin_p, d_p, slots[:, here], h, tableau)
+        geometry.append(joint)
+        spins.append(spin)
+        velocities.append(velocity_p + relative)
+        triads.append(d)
+    return TreeMotion(*(jnp.concatenate(x, axis=1) for x in (spins, velocities, triads))), geometry
