@@ -393,8 +393,8 @@ def tried(
     found = search(problem, options, iterate, proposal.direction, proposal.slope, proposal.weights)
     m, dm = iterate.multipliers, proposal.direction.multipliers
     dual = room([(m.path, dm.path), (m.end, dm.end)])
-    goal = moved(m.goal, dm.goal, found.length)
-    return found, Multipliers(goal, moved(m.path, dm.path, dual), moved(m.end, dm.end, dual))
+    # Multipliers of the goal are those of the model, however short the step.
+    return found, Multipliers(m.goal + dm.goal, moved(m.path, dm.path, dual), moved(m.end, dm.end, dual))
 
 
 @quickly

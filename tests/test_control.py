@@ -1,0 +1,420 @@
+"""Optimal control: what is known of solutions, conditions of optimality, feedback, bad input."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import natcoord_jax as nc
+from natcoord_jax.control import sequential
+from natcoord_jax.control.guess import unknowns_of
+from natcoord_jax.control.inputs import Spline
+from natcoord_jax.control.iterate import Options
+from natcoord_jax.control.quadratic import Multipliers
+from natcoord_jax.control.run import numeric
+from natcoord_jax.control.transcription import Unknowns, roll, simulated
+from natcoord_jax.gallery import manoeuvres
+
+FOUR_DIGITS = 1e-4
+
+
+def solved(problem, guess=None, **options):
+    solution = nc.optimise(problem, guess, progress=False, **options)
+    assert solution.ok, solution.explain()
+    return solution
+
+
+def extrapolated(coarse, fine):
+    """Cost at vanishing step from two solutions, the second with twice the steps."""
+    return (4.0 * fine.cost - coarse.cost) / 3.0
+
+
+@pytest.fixture(scope="module")
+def hinged():
+    """A disc on a hinge with a motor: 12 I^2 angle^2 / T^3."""
+    scene = nc.Scene()
+    disc = scene.add(nc.RigidBody(mass=1.0, inertia=(1.0, 1.0, 2.0), name="disc"))
+    hinge = scene.add(nc.Revolute(nc.ground, disc, name="hinge"))
+    scene.add(nc.JointTorque(hinge, name="motor"))
+    return scene.compile()
+
+
+def rest_to_rest(hinged, steps=20, angle=1.0, **options):
+    system, state = hinged
+    goal = nc.goal.Coordinate("hinge", angle) & nc.goal.Rest()
+    given = {"dt": 1.0 / max(steps, 1), "steps": steps, "cost": nc.cost.Effort(), "goal": goal} | options
+    return nc.OptimalControl(system, state, **given)
+
+
+@pytest.fixture(scope="module")
+def solution(hinged):
+    return solved(rest_to_rest(hinged))
+
+
+# What a user gets
+
+
+def test_solution_reports_what_it_is(solution):
+    assert solution.inputs.shape == (20, 1)
+    # 12 I^2 angle^2 / T^3 for vanishing steps; held inputs and angles by tangents add some h^2 to it.
+    assert solution.cost == pytest.approx(48.0, rel=2 * 0.05**2)
+    assert max(abs(x) for x in solution.missing.values()) < 1e-10
+    assert solution.history[-1].stationarity < 1e-8
+    assert set(solution.multipliers) == set(solution.missing)
+    assert "optimal after" in solution.explain() and "shooting" in solution.method
+    assert float(solution.trajectory.states.coordinates[-1, 0]) == pytest.approx(1.0, abs=1e-10)
+
+
+def test_multiplier_of_the_goal_is_the_price_of_the_angle(solution):
+    # d cost / d angle = 24 I^2 angle / T^3 with the discrete T^3; the multiplier is its opposite.
+    price = 2.0 * solution.cost
+    assert solution.multipliers["coordinate 0 of 'hinge' [rad or m]"] == pytest.approx(-price, rel=5e-3)
+
+
+def test_check_finds_a_constant_hamiltonian(solution):
+    found = nc.check(solution, refine=False)
+    assert found.stationarity < 1e-8
+    assert found.angular_momentum is None or found.angular_momentum < 1e-10
+    assert found.energy < 1e-10
+    assert found.hamiltonian_spread < 0.02
+    assert "Hamiltonian" in str(found)
+
+
+def test_warm_start_from_solution_and_file(solution, tmp_path):
+    again = solved(solution.problem, solution)
+    assert len(again.history) <= 2
+    file = tmp_path / "solution.json"
+    solution.save(file)
+    guess = nc.load_guess(file)
+    np.testing.assert_allclose(guess.inputs, solution.inputs)
+    assert len(solved(solution.problem, guess).history) <= 2
+    assert nc.load_guess(file, steps=40).inputs.shape == (40, 1)
+    with pytest.raises(ValueError, match="not a solution"):
+        file.write_text("{}")
+        nc.load_guess(file)
+
+
+def test_a_changed_number_does_not_compile_anew(solution, hinged, monkeypatch):
+    other = rest_to_rest(hinged, angle=2.0)
+    traced = []
+    monkeypatch.setattr(sequential, "model", lambda *given: traced.append(given))
+    found = nc.optimise(other, solution.inputs, progress=False)
+    assert found.cost == pytest.approx(4.0 * solution.cost, rel=1e-2)
+    assert not traced
+
+
+def test_limits_of_iterations_and_time(solution):
+    stopped = nc.optimise(solution.problem, progress=False, max_iterations=1, tol=1e-300)
+    assert stopped.outcome is nc.Outcome.MAX_ITERATIONS and "more iterations" in stopped.explain()
+    late = nc.optimise(solution.problem, progress=False, time_limit=0.0)
+    assert late.outcome is nc.Outcome.TIME_LIMIT and late.inputs.shape == (20, 1)
+
+
+def test_interruption_returns_what_was_reached(solution, monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(sequential, "step", interrupted)
+    stopped = nc.optimise(solution.problem, progress=False)
+    assert stopped.outcome is nc.Outcome.STOPPED and not stopped.ok
+
+
+def test_progress_names_the_worst_condition(solution, capsys):
+    nc.optimise(solution.problem)
+    shown = capsys.readouterr().err
+    assert "violation" in shown and "hinge" in shown
+
+
+def test_contradictory_goal_is_reported_by_name(hinged):
+    goal = nc.goal.Coordinate("hinge", 1.0) & nc.goal.Coordinate("hinge", 2.0) & nc.goal.Rest()
+    found = nc.optimise(rest_to_rest(hinged, goal=goal), progress=False)
+    assert found.outcome is nc.Outcome.UNREACHABLE
+    assert "hinge" in found.explain() and "contradict" in found.explain()
+
+
+# Bad input
+
+
+def test_bad_problems_are_refused(hinged):
+    system, state = hinged
+    for options, words in (
+        ({"steps": 0}, "steps"),
+        ({"dt": -0.1}, "dt"),
+        ({"free_time": (2.0, 1.0)}, "free_time"),
+        ({"cost": nc.cost.Running(lambda s, u, t: u * jnp.ones(2))}, "scalar|Type-check"),
+        ({"goal": nc.goal.Equal(lambda s: s.q[0], "own", count=3) & nc.goal.Coordinate("none", 1.0)}, "none"),
+        ({"parameters": (nc.Parameter("a", where=lambda s: s.mass, index=(0, 0, 0)),) * 2}, "names"),
+    ):
+        with pytest.raises((ValueError, TypeError), match=words):
+            rest_to_rest(hinged, **options)
+    with pytest.raises(ValueError, match="not below"):
+        nc.bounds.Input(1.0, -1.0)
+    with pytest.raises(ValueError, match="where"):
+        nc.Parameter("nowhere")
+    scene = nc.Scene()
+    scene.add(nc.RigidBody(mass=1.0, inertia=(1.0, 1.0, 1.0)))
+    with pytest.raises(ValueError, match="no input channels"):
+        nc.OptimalControl(*scene.compile(), dt=0.1, steps=2)
+
+
+def test_bad_guesses_are_refused(hinged):
+    problem = rest_to_rest(hinged)
+    with pytest.raises(ValueError, match="shape"):
+        nc.optimise(problem, jnp.zeros((3, 1)), progress=False)
+    with pytest.raises(ValueError, match="finite"):
+        nc.optimise(problem, jnp.full((20, 1), jnp.nan), progress=False)
+    with pytest.raises(ValueError, match="method"):
+        nc.optimise(problem, method="magic", progress=False)
+
+
+# Parts
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3])
+@pytest.mark.parametrize("every", [1, 4])
+def test_register_of_a_spline_gives_its_inputs(degree, every):
+    spline, steps = Spline(degree=degree, every=every), 13
+    matrix, machine = spline.matrix(steps), spline.shaping(steps)
+    np.testing.assert_allclose(matrix.sum(axis=1), 1.0, atol=1e-14)
+    values = np.random.default_rng(0).normal(size=spline.coefficients(steps))
+    register, entered = machine.start @ values[:degree], degree
+    for k in range(steps):
+        w = 0.0
+        if machine.enters[k]:
+            w, entered = values[entered], entered + 1
+        u = machine.read[k] @ register + machine.direct[k] * w
+        assert u == pytest.approx(matrix[k] @ values, abs=1e-14)
+        register = machine.shift[k] @ register + machine.load[k] * w
+    assert entered == values.size
+
+
+def test_range_keeps_its_structure_when_traced():
+    bound = nc.bounds.Input(-1.0, np.inf)
+    assert bound.limited == ((True,), (False,))
+    traced = jax.eval_shape(lambda b: b, bound)
+    assert traced.limited == bound.limited
+
+
+def test_costs_add_up(hinged):
+    system, state = hinged
+    u, t = jnp.array([2.0]), jnp.array(0.5)
+    total = nc.cost.Effort(3.0) + nc.cost.Duration(2.0) + nc.cost.Running(lambda s, u, t: t, weight=4.0)
+    assert float(total.running(system, state, u, t)) == 12.0 + 2.0 + 2.0
+    end = nc.cost.Terminal(lambda s: 5.0) + nc.cost.Missed(nc.goal.Coordinate("hinge", 2.0), weight=0.5)
+    assert float(end.terminal(system, state)) == 5.0 + 2.0
+
+
+def test_inverse_dynamics_reproduces_the_path():
+    example = nc_gallery("double_pendulum_motors")
+    system, state = example
+    steps, dt = 30, 0.02
+    s = np.linspace(0.0, 1.0, steps + 1)[1:, None]
+    path = jnp.asarray(
+        np.asarray(state.coordinates) + (10 * s**3 - 15 * s**4 + 6 * s**5) * np.array([1.5, -2.0])
+    )
+    inputs, states = nc.inverse_dynamics(system, state, path, dt=dt)
+    trajectory = nc.simulate(system, state, dt=dt, inputs=inputs)
+    assert float(jnp.abs(trajectory.states.coordinates[1:] - path).max()) < 1e-11
+    np.testing.assert_allclose(states.q[-1], trajectory.q[-1], atol=1e-11)
+    with pytest.raises(ValueError, match="shape"):
+        nc.inverse_dynamics(system, state, path[:, :1], dt=dt)
+
+
+def nc_gallery(name):
+    """Two rods on motor-driven hinges under gravity."""
+    assert name == "double_pendulum_motors"
+    scene = nc.Scene()
+    scene.add(nc.Gravity(vector=(0, 0, -9.81)))
+    carrier = nc.ground
+    for k in range(2):
+        place = (float(k), 0.0, 0.0)
+        rod = nc.RigidBody(mass=1.0, inertia=(0.01, 1 / 12, 1 / 12), com=(0.5, 0, 0), position=place)
+        rod = scene.add(rod)
+        hinge = scene.add(nc.Revolute(carrier, rod, point=place, axis=(0, 1, 0), name=f"hinge {k + 1}"))
+        scene.add(nc.JointTorque(hinge, name=f"motor {k + 1}"))
+        carrier = rod
+    return scene.compile()
+
+
+# The solver's derivatives
+
+
+@pytest.mark.slow
+def test_costates_are_the_gradient_of_the_simulation():
+    problem = numeric(manoeuvres.turn(8))
+    coefficients = jnp.asarray(np.random.default_rng(1).normal(size=(8, 3)) * 5.0)
+    unknowns, whole, _ = simulated(problem, Unknowns(coefficients, jnp.zeros(0), jnp.zeros((8, 6))))
+    assert bool(whole)
+    path = roll(problem, unknowns)
+    multipliers = Multipliers(jnp.arange(1.0, 10.0), jnp.zeros((8, 0)), jnp.zeros(0))
+    iterate = sequential.init(problem, Options(), unknowns)
+    slacks = iterate.slacks
+    found = sequential.linearised(problem, unknowns, multipliers, slacks, path, jnp.ones(()))
+
+    def lagrangian(c):
+        moved, _, _ = simulated(problem, Unknowns(c, jnp.zeros(0), unknowns.y))
+        path = roll(problem, moved)
+        return path.cost + multipliers.goal @ path.end.missing
+
+    np.testing.assert_allclose(found.by_w, jax.grad(lagrangian)(coefficients), rtol=1e-9, atol=1e-8)
+
+
+# Known solutions
+
+
+@pytest.mark.slow
+def test_least_effort_about_a_principal_axis():
+    pair = [solved(manoeuvres.turn(n, axis=(0, 0, 1), angle=1.0)) for n in (10, 20)]
+    assert extrapolated(*pair) == pytest.approx(12 * 9.0, rel=FOUR_DIGITS)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("wheels", "known"), [(False, 120.852118), (True, 129.028096)])
+def test_least_effort_about_a_skew_axis(wheels, known):
+    pair = [solved(manoeuvres.turn(n, wheels=wheels)) for n in (20, 40)]
+    assert extrapolated(*pair) == pytest.approx(known, rel=FOUR_DIGITS)
+    assert all(len(s.history) <= 30 for s in pair)
+
+
+@pytest.mark.slow
+def test_beanie():
+    pair = [solved(manoeuvres.beanie(n)) for n in (10, 20)]
+    assert extrapolated(*pair) == pytest.approx(12 * (3 / 4) ** 2, rel=FOUR_DIGITS)
+
+
+@pytest.mark.slow
+def test_two_masses_on_a_spring():
+    pair = [solved(manoeuvres.two_masses(n)) for n in (40, 80)]
+    assert extrapolated(*pair) == pytest.approx(0.2271424, rel=FOUR_DIGITS)
+    fast = solved(manoeuvres.two_masses(160, fastest=True))
+    assert fast.cost == pytest.approx(4.21786651, rel=2e-4)
+    assert fast.free["final time [s]"] == pytest.approx(fast.cost)
+    u, dt = np.asarray(fast.inputs)[:, 0], fast.dt
+    # A switch within a step shows as a mean between the bounds.
+    ends = np.concatenate([[0.0], np.cumsum(u) * dt])
+    assert np.all(np.abs(u) <= 1.0 + 1e-9)
+    turns = np.flatnonzero(np.abs(np.diff(np.sign(u))) > 0) * dt + dt
+    np.testing.assert_allclose(turns, [1.00268, 2.10893, 3.21519], atol=1.5 * dt)
+    assert ends[0] == 0.0
+
+
+@pytest.mark.slow
+def test_pendulum_as_a_point_with_multiplier():
+    coarse = nc.multi_start(manoeuvres.point_pendulum(60), starts=12, rates=4.0, spread=10.0, method="lifted")
+    known = [s for s in coarse if abs(s.cost - 13.0) < 0.5]
+    assert known, [s.cost for s in coarse]
+    fine = solved(manoeuvres.point_pendulum(120), known[0])
+    assert extrapolated(known[0], fine) == pytest.approx(12.8738850, rel=FOUR_DIGITS)
+
+
+@pytest.mark.slow
+def test_cart_pole_swing_up():
+    found = nc.multi_start(manoeuvres.cart_pole(50), starts=16, rates=3.0, spread=5.0, method="lifted")
+    assert found[0].ok and len(found) >= 2
+    middle = solved(manoeuvres.cart_pole(100), found[0])
+    fine = solved(manoeuvres.cart_pole(200), middle)
+    assert extrapolated(middle, fine) == pytest.approx(57.9448, rel=FOUR_DIGITS)
+
+
+@pytest.fixture(scope="module")
+def reoriented():
+    return solved(manoeuvres.reorientation(100))
+
+
+@pytest.mark.slow
+def test_reorientation_of_the_spacecraft(reoriented):
+    assert len(reoriented.history) <= 30
+    assert max(abs(x) for x in reoriented.missing.values()) < 1e-10
+    assert reoriented.history[-1].stationarity < 1e-8
+    found = nc.check(reoriented, refine=False)
+    assert found.angular_momentum < 1e-9
+    assert found.hamiltonian_spread < 0.02
+
+
+@pytest.mark.slow
+def test_reorientation_with_failed_wheels():
+    two = solved(manoeuvres.reorientation(100, working=(1, 2)))
+    assert max(abs(x) for x in two.missing.values()) < 1e-10
+    one = nc.optimise(manoeuvres.reorientation(100, working=(2,)), progress=False)
+    assert one.outcome is nc.Outcome.UNREACHABLE
+    assert "attitude of 'base'" in one.explain()
+
+
+@pytest.mark.slow
+def test_feedback_brings_a_disturbed_spacecraft_home(reoriented):
+    problem = reoriented.problem
+    mass = problem.system.mass.at[0, 1:, 1:].multiply(1.1)
+    plant = dataclasses.replace(problem.system, mass=mass)
+    still = nc.goal.Attitude("base", problem.goal.parts[0].rotation)
+
+    def missed(trajectory):
+        final = jax.tree.map(lambda x: x[-1], trajectory.states)
+        return float(jnp.max(jnp.abs(still.residual(plant, final))))
+
+    open_loop = nc.simulate(plant, problem.state, dt=problem.dt, inputs=reoriented.inputs)
+    regulator = nc.regulator(reoriented, displacement=1e3, rate=1e5, effort=1e-3, limits=(-200.0, 200.0))
+    closed = nc.simulate(plant, problem.state, dt=problem.dt, steps=problem.steps, inputs=regulator)
+    assert missed(closed) < 0.2 * missed(open_loop)
+    horizons = nc.receding_horizon(problem, plant, updates=6, steps_each=17, guess=reoriented.inputs)
+    assert np.all(np.asarray(horizons.codes) == 0)
+    assert missed(horizons.trajectory) < 0.1 * missed(open_loop)
+
+
+@pytest.mark.slow
+def test_derivative_of_the_optimum_by_a_parameter(hinged):
+    system, state = hinged
+
+    def make(value):
+        heavier = dataclasses.replace(system, mass=system.mass.at[0, 1:3, 1:3].multiply(value))
+        return numeric(rest_to_rest((heavier, state), bounds=nc.bounds.Input(-9.0, 9.0)))
+
+    start = unknowns_of(make(1.0), None, False)
+    optimum = nc.optimum(make, start)
+    one = jnp.ones(())
+
+    def loss(value):
+        found = optimum(value)
+        return jnp.sum(found.coefficients[:5] ** 3) + found.cost
+
+    slope = jax.grad(loss)(one)
+    h = 1e-4
+    differences = (loss(one + h) - loss(one - h)) / (2 * h)
+    assert float(slope) == pytest.approx(float(differences), rel=1e-5)
+
+
+@pytest.mark.slow
+def test_parameters_and_splines_are_optimised_together(hinged):
+    # A heavier disc costs effort, a lighter one is fined: the optimum of both is between the bounds.
+    parameter = nc.Parameter(
+        "scale of inertia",
+        apply=lambda system, value: dataclasses.replace(
+            system, mass=system.mass.at[0, 1:3, 1:3].multiply(value)
+        ),
+        value=1.0,
+        lower=0.2,
+        upper=3.0,
+    )
+    problem = rest_to_rest(
+        hinged,
+        parameters=(parameter,),
+        inputs=nc.inputs.cubic(5),
+        bounds=nc.bounds.Input(-50.0, 50.0),
+    )
+    found = solved(problem)
+    # Nothing but effort counts: the lightest disc is best.
+    assert found.free["scale of inertia"] == pytest.approx(0.2, abs=1e-6)
+    assert found.cost == pytest.approx(0.04 * 48.0, rel=2e-2)
+
+
+@pytest.mark.slow
+def test_first_order_descent_comes_near(hinged, solution):
+    found = nc.descend(rest_to_rest(hinged), iterations=400, rounds=8, progress=False)
+    assert found.ok, found.explain()
+    assert found.cost == pytest.approx(solution.cost, rel=2e-2)
+    free = rest_to_rest(
+        hinged, goal=nc.goal.Goal(), cost=nc.cost.Terminal(lambda s: (s.coordinates[0] - 1.0) ** 2)
+    )
+    plain = nc.descend(free, iterations=200, progress=False)
+    assert plain.cost < 1e-4
