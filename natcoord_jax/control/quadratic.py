@@ -123,9 +123,8 @@ def _projected(problem: OptimalControl, node: Node, flexibility: Array) -> Node:
     return eqx.tree_at(lambda n: n.x, node, packed(state))
 
 
-def _scored(problem: OptimalControl, at: Slice, node: Node, w: Array, y: Array, worth: tuple) -> Array:
+def _scored(found: Stage, worth: tuple) -> Array:
     """Lagrangian of one step."""
-    found = stage(problem, at, node, w, y)
     after, residual, path = worth
     carried = sum(jnp.sum(a * b) for a, b in zip(jax.tree.leaves(after), jax.tree.leaves(found.after)))
     return found.cost + carried + residual @ found.residual + path @ found.excess
@@ -186,23 +185,23 @@ def costates(
         Lagrangian in the entering coefficients, exact.
     """
     last = jax.grad(partial(_scored_end, problem, multipliers))(jax.tree.map(lambda x: x[-1], path.nodes))
-    like = jax.tree.map(lambda x: x[0], path.stages)
-
-    def worths(residual: Array, excess: Array, after: Node, cost: float) -> Stage:
-        weight = jnp.full_like(like.cost, cost)
-        return Stage(residual, weight, excess, after)
 
     def body(after: tuple[Node, Node], given: tuple) -> tuple[tuple[Node, Node], tuple]:
         at, node, w, y, sigma, inverse, following, flexibility = given
         back = jax.vjp(lambda n: _projected(problem, n, flexibility), following)[1]
         both = jax.tree.map(lambda a, b: jnp.stack([a, b]), after[0], back(after[1])[0])
-        pull = jax.vjp(lambda *x: stage(problem, at, *x), node, w, y)[1]
+
+        def rest(node: Node, w: Array, y: Array) -> tuple[Array, Array, Node]:
+            found = stage(problem, at, node, w, y)
+            return found.cost, found.excess, found.after
+
+        pull = jax.vjp(rest, node, w, y)[1]
+        pull_residual = jax.vjp(lambda *x: stage(problem, at, *x).residual, node, w, y)[1]
 
         def through(after: Node) -> tuple[Node, Array, Array]:
-            before, by_w, by_y = pull(worths(jnp.zeros_like(like.residual), sigma, after, 1.0))
+            before, by_w, by_y = pull((jnp.ones(()), sigma, after))
             worth = -(by_y @ inverse)
-            no_sigma, no_after = jax.tree.map(jnp.zeros_like, (sigma, after))
-            again = pull(worths(worth, no_sigma, no_after, 0.0))
+            again = pull_residual(worth)
             return jax.tree.map(jnp.add, before, again[0]), by_w + again[1], worth
 
         before, by_w, worth = jax.vmap(through)(both)
@@ -242,31 +241,34 @@ def _stage_model(
         problem, following, worth[0], flexibility, forth_after
     )
 
-    def values(chi: Array, w: Array, y: Array) -> tuple[Array, Array, Array]:
-        found = stage(problem, at, unflat(chi), w, y)
-        return found.residual, ravel_pytree(found.after)[0], found.excess
+    def residuals(chi: Array, w: Array, y: Array) -> Array:
+        return stage(problem, at, unflat(chi), w, y).residual
 
-    def slopes(chi: Array, w: Array, y: Array) -> tuple[Array, Array, Array]:
-        def scored(chi: Array, w: Array, y: Array) -> Array:
-            return _scored(problem, at, unflat(chi), w, y, (before_projection, *worth[1:]))
+    def slopes(chi: Array, w: Array, y: Array) -> tuple[tuple[Array, Array, Array], tuple[Array, Array]]:
+        """Slopes of the Lagrangian of the step, and its node and excesses at the end."""
 
-        return jax.grad(scored, argnums=(0, 1, 2))(chi, w, y)
+        def scored(chi: Array, w: Array, y: Array) -> tuple[Array, tuple[Array, Array]]:
+            found = stage(problem, at, unflat(chi), w, y)
+            value = _scored(found, (before_projection, *worth[1:]))
+            return value, (ravel_pytree(found.after)[0], found.excess)
+
+        return jax.grad(scored, argnums=(0, 1, 2), has_aux=True)(chi, w, y)
 
     count = forth.shape[1] + channels
     directions = jax.scipy.linalg.block_diag(forth, jnp.eye(channels, dtype=flat.dtype))
     chi_dirs, w_dirs = directions[:size], directions[size:]
     still = jnp.zeros_like(y)
     moved = jax.vmap(
-        lambda dc, dw: jax.jvp(values, (flat, w, y), (dc, dw, still))[1][0], in_axes=1, out_axes=1
+        lambda dc, dw: jax.jvp(residuals, (flat, w, y), (dc, dw, still))[1], in_axes=1, out_axes=1
     )(chi_dirs, w_dirs)
     y_dirs = -inverse @ jnp.concatenate([moved, residual[:, None]], axis=1)
     chi_dirs, w_dirs = (jnp.pad(x, ((0, 0), (0, 1))) for x in (chi_dirs, w_dirs))
 
-    def both(dc: Array, dw: Array, dy: Array) -> tuple:
-        _, after, excess = jax.jvp(values, (flat, w, y), (dc, dw, dy))[1]
-        return after, excess, *jax.jvp(slopes, (flat, w, y), (dc, dw, dy))[1]
+    def along(dc: Array, dw: Array, dy: Array) -> tuple:
+        by, ends = jax.jvp(slopes, (flat, w, y), (dc, dw, dy))[1]
+        return *ends, *by
 
-    after, excess, by_chi, by_w, by_y = jax.vmap(both, in_axes=1, out_axes=1)(chi_dirs, w_dirs, y_dirs)
+    after, excess, by_chi, by_w, by_y = jax.vmap(along, in_axes=1, out_axes=1)(chi_dirs, w_dirs, y_dirs)
     hessian = chi_dirs.T @ by_chi + w_dirs.T @ by_w + y_dirs.T @ by_y
     forward = back @ after
     motions, loose = flexibility.shape[0], node.free.size

@@ -280,11 +280,10 @@ def _swept(problem: OptimalControl, iterate: Iterate, change: Unknowns) -> Sweep
 
     def body(dn, given):
         at, node, w, dw, y, inverse, residual = given
-        point = (node, w, y)
-        first = jax.jvp(lambda *x: stage(problem, at, *x).residual, point, (dn, dw, jnp.zeros_like(y)))[1]
-        dy = -inverse @ (residual + first)
-        moved = jax.jvp(lambda *x: stage(problem, at, *x), point, (dn, dw, dy))[1]
-        return moved.after, (dy, moved.excess)
+        _, linear = jax.linearize(lambda *x: stage(problem, at, *x), node, w, y)
+        dy = -inverse @ (residual + linear(dn, dw, jnp.zeros_like(y)).residual)
+        changed = linear(dn, dw, dy)
+        return changed.after, (dy, changed.excess)
 
     inverses, residual = iterate.derivatives.inverses, path.stages.residual
     given = (slices(problem), _before(path), w, dw, unknowns.y, inverses, residual)
@@ -304,10 +303,10 @@ def _refined(
     """
     count = iterate.unknowns.free.size
     every, leading = problem.inputs.every, problem.inputs.degree
-    still = jax.tree.map(jnp.zeros_like, (found.gradient, found.offset, found.first_gradient))
-    flat = eqx.tree_at(lambda m: (m.gradient, m.offset, m.first_gradient), found, still)
+    level = jax.tree.map(jnp.zeros_like, (found.gradient, found.offset, found.first_gradient))
+    flat = eqx.tree_at(lambda m: (m.gradient, m.offset, m.first_gradient), found, level)
     bounds = _weighted(iterate)
-    level = Weighted(bounds.path, jnp.zeros_like(bounds.path), bounds.end, jnp.zeros_like(bounds.end))
+    eased = Weighted(bounds.path, jnp.zeros_like(bounds.path), bounds.end, jnp.zeros_like(bounds.end))
     flat = eqx.tree_at(lambda m: m.excess_offset, flat, jnp.zeros_like(flat.excess_offset))
 
     def changed(first: Array, w: Array) -> Unknowns:
@@ -316,19 +315,27 @@ def _refined(
             jnp.concatenate([head, w[::every]]), first[:count], jnp.zeros_like(iterate.unknowns.y)
         )
 
-    def body(_: Array, carry: tuple) -> tuple:
+    def body(k: Array, carry: tuple) -> tuple:
         first, w, goal, sweep = carry
         missing = iterate.path.end.missing + sweep.missing
         none = jnp.zeros_like(goal)
-        more = solve(flat, missing, level, weights.idle, weights.shift, weights.penalty, none, weights.reach)
-        usable = more.convex & jnp.all(jnp.isfinite(more.w))
+        more = solve(flat, missing, eased, weights.idle, weights.shift, weights.penalty, none, weights.reach)
+        # The first turn only sweeps: so everything is compiled once.
+        usable = (k > 0) & more.convex & jnp.all(jnp.isfinite(more.w))
         first, w, goal = (
             x + jnp.where(usable, dx, 0.0) for x, dx in ((first, more.first), (w, more.w), (goal, more.goal))
         )
         return first, w, goal, _swept(problem, iterate, changed(first, w))
 
-    begun = (move.first, move.w, move.goal, _swept(problem, iterate, changed(move.first, move.w)))
-    first, w, goal, sweep = jax.lax.fori_loop(0, REFINEMENTS, body, begun)
+    path = iterate.path
+    still = Sweep(
+        *(
+            jnp.zeros_like(x)
+            for x in (iterate.unknowns.y, path.stages.excess, path.end.missing, path.end.excess)
+        )
+    )
+    begun = (move.first, move.w, move.goal, still)
+    first, w, goal, sweep = jax.lax.fori_loop(0, REFINEMENTS + 1, body, begun)
     return changed(first, w), goal, sweep
 
 
