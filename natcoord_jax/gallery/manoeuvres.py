@@ -1,5 +1,6 @@
 """Ready problems of optimal control, with what is known of their solutions."""
 
+import dataclasses
 from typing import Any
 
 import jax.numpy as jnp
@@ -14,7 +15,7 @@ GRAVITY = 9.81
 """[m/s^2]"""
 POINT = (1e-9, 1e-9, 1e-9)
 """Inertia of a bob [kg m^2]."""
-DISC = 0.1
+DISC = 1.0
 """Spin inertia of the wheels that turn a body [kg m^2]."""
 
 
@@ -43,11 +44,10 @@ def turn(
     momentum, the inertia then being that without the spin inertia of the wheels.
     """
     scene = nc.Scene()
-    own = np.asarray(inertia, float) - (DISC if wheels else 0.0)
-    body = scene.add(nc.RigidBody(mass=10.0, inertia=own, name="body"))
+    body = scene.add(nc.RigidBody(mass=10.0, inertia=inertia, name="body"))
     if wheels:
         for k, direction in enumerate(np.eye(3)):
-            # Thin discs; what they add about the other axes is taken from the body above.
+            # Thin discs; what they add about the other axes is taken from the body below.
             moments = DISC / 2 * (1.0 + direction)
             wheel = scene.add(nc.RigidBody(mass=1.0, inertia=moments, name=f"wheel {k + 1}"))
             hinge = scene.add(nc.Revolute(body, wheel, axis=direction, name=f"hinge {k + 1}"))
@@ -55,6 +55,10 @@ def turn(
     else:
         scene.add(nc.BodyTorqueInput(_triad(body), name="torque"))
     system, state = scene.compile()
+    if wheels:
+        # Half of DISC in every second moment: what is left of the body is none by itself, the craft is one.
+        rest = system.mass[0, 1:, 1:] - DISC / 2 * jnp.eye(3)
+        system = dataclasses.replace(system, mass=system.mass.at[0, 1:, 1:].set(rest))
     goal = nc.goal.Attitude(body, _quaternion(axis, angle)) & nc.goal.Rest()
     return nc.OptimalControl(system, state, dt=t_end / steps, steps=steps, cost=nc.cost.Effort(), goal=goal)
 
