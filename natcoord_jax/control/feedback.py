@@ -60,7 +60,7 @@ def _gains(problem: OptimalControl, iterate: Iterate, weights: tuple) -> tuple[A
     size = problem.state.q.size * 2 + problem.state.coordinates.size + problem.state.rates.size
     A, B = found.forward[:, : 2 * count, : 2 * count], found.forward[:, : 2 * count, -problem.channels :]
     displaced, quick, cost, final = weights
-    Q = jnp.concatenate([jnp.full(count, displaced), jnp.full(count, quick)])
+    Q = jnp.concatenate([jnp.broadcast_to(x, (count,)) for x in (displaced, quick)])
     R = jnp.broadcast_to(cost, (problem.channels,))
 
     def body(P: Array, given: tuple) -> tuple[Array, Array]:
@@ -89,8 +89,10 @@ def regulator(
 
     Args:
         solution: what `optimise` returned, with inputs held over the steps.
-        displacement: weight of displacements [1/rad^2, 1/m^2].
-        rate: weight of rates [s^2/rad^2, s^2/m^2].
+        displacement: weight of displacements [1/rad^2, 1/m^2], one number or one for each free motion (see
+            `goal.Rest.labels` for their order). Where momentum binds motions together, as base and wheels of
+            a spacecraft, weigh those that matter.
+        rate: weight of rates [s^2/rad^2, s^2/m^2], likewise.
         effort: weight of inputs, one number or one for each channel [1/(N m)^2].
         final: factor on the weights at the end.
         limits: lower and upper bound of the inputs.

@@ -85,7 +85,7 @@ class OptimalControl(eqx.Module):
         names = [parameter.name for parameter in self.parameters]
         if len(set(names)) != len(names):
             raise ValueError(f"parameters have the names {names}; give each its own")
-        if is_concrete(self.state.q):
+        if is_concrete(eqx.filter((self.system, self.state), eqx.is_array)):
             self._check_shapes()
 
     def _check_shapes(self) -> None:

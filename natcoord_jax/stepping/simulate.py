@@ -100,7 +100,8 @@ def _rollout(
 ) -> Trajectory:
     length = _segments(steps, save_every, checkpoint)
     if callable(inputs):
-        policy, constants = jax.closure_convert(inputs, state.t, state)
+        # A policy may be a module with numbers of its own, which has no hash while it is traced.
+        policy, constants = jax.closure_convert(lambda t, state: inputs(t, state), state.t, state)
         control, every_segment = partial(_by_policy, policy), constants
         pieces = jax.tree.map(lambda x: jnp.broadcast_to(x, (steps // length, *x.shape)), every_segment)
     else:
