@@ -54,7 +54,7 @@ class OptimalControl(eqx.Module):
         ... )
         >>> solution = nc.optimise(problem, progress=False)
         >>> round(float(solution.cost), 2)  # 12 I^2 angle^2 / T^3, and O(dt^2)
-        48.12
+        48.15
     """
 
     system: System

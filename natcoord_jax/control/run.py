@@ -44,6 +44,8 @@ def _chosen(problem: OptimalControl, method: str, guess: Any = None) -> bool:
     if method != "auto":
         return method == "lifted"
     inputs = all(label.startswith("input ") for label in problem.bounds.labels(problem.system))
+    if problem.free_time:
+        return True
     # An earlier solution is a motion already.
     return not isinstance(guess, Solution) and (bool(problem.free) or not inputs)
 
