@@ -9,11 +9,11 @@ import optax
 import pytest
 
 import natcoord_jax as nc
-from natcoord_jax.control import sequential
+from natcoord_jax.control import proposal, sequential
+from natcoord_jax.control.costates import Multipliers
 from natcoord_jax.control.guess import unknowns_of
 from natcoord_jax.control.inputs import Spline
 from natcoord_jax.control.iterate import Options
-from natcoord_jax.control.quadratic import Multipliers
 from natcoord_jax.control.run import numeric
 from natcoord_jax.control.transcription import Unknowns, roll, simulated
 from natcoord_jax.gallery import manoeuvres
@@ -100,7 +100,7 @@ def test_warm_start_from_solution_and_file(solution, tmp_path):
 def test_a_changed_number_does_not_compile_anew(solution, hinged, monkeypatch):
     other = rest_to_rest(hinged, angle=2.0)
     traced = []
-    monkeypatch.setattr(sequential, "model", lambda *given: traced.append(given))
+    monkeypatch.setattr(proposal, "model", lambda *given: traced.append(given))
     found = nc.optimise(other, solution.inputs, progress=False)
     assert found.cost == pytest.approx(4.0 * solution.cost, rel=1e-2)
     assert not traced

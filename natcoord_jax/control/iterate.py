@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from natcoord_jax.control.quadratic import Charts, Costates, Multipliers
+from natcoord_jax.control.costates import Charts, Costates, Multipliers
 from natcoord_jax.control.transcription import Path, Unknowns
 
 

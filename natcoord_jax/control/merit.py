@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from natcoord_jax.control.costates import Multipliers
 from natcoord_jax.control.iterate import Iterate, Options, Slacks
 from natcoord_jax.control.problem import OptimalControl
-from natcoord_jax.control.quadratic import Multipliers
 from natcoord_jax.control.transcription import Path, Unknowns, roll, simulated
 
 BOUNDARY = 0.99

@@ -10,143 +10,28 @@ A solver is three pure functions: `init`, `step` and `done`.
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Int
 
 from natcoord_jax.control.compiled import quickly
-from natcoord_jax.control.iterate import Derivatives, Errors, Iterate, Options, Slacks, largest
-from natcoord_jax.control.merit import Direction, Found, Violations, moved, room, search, slope_and_weights
+from natcoord_jax.control.costates import Multipliers
+from natcoord_jax.control.iterate import Derivatives, Iterate, Options, Slacks, largest
+from natcoord_jax.control.linearisation import cost_unit, linearised
+from natcoord_jax.control.merit import Found, moved, room, search
 from natcoord_jax.control.problem import OptimalControl
-from natcoord_jax.control.quadratic import (
-    Costates,
-    Model,
-    Multipliers,
-    charts,
-    costates,
-    model,
-    step_inverses,
-)
+from natcoord_jax.control.proposal import Proposal, propose
 from natcoord_jax.control.results import Outcome
-from natcoord_jax.control.riccati import REACH, Move, Weighted, solve
 from natcoord_jax.control.transcription import (
-    Path,
     Unknowns,
-    end,
-    entering,
-    first_node,
     roll,
     simulated,
-    slices,
-    stage,
 )
 
-SHIFT = 1e-4
-"""First increase of the curvature where the model is not convex."""
-LARGEST_SHIFT = 1e8
-STIFFEST = 1e3
-"""Largest penalty on the goal, in units of its stiffness."""
 ROOM = 0.01
 """Least room left to a bound at the start."""
-LEAST_BARRIER = 1e-10
-"""Barrier parameter at the end, relative to the cost."""
-REFINEMENTS = 2
-"""Corrections of a step, so that the goal is met to first order of the exact motion."""
 AT_REST = 1e-7
 """Relative size of a step that moves nothing any more."""
-
-
 NEARLY = 1e-6
 """Residual of the steps, relative, of a motion that nearly obeys its equations."""
-
-
-class Proposal(eqx.Module):
-    """The step that the quadratic model proposes."""
-
-    direction: Direction
-    slope: Float[Array, ""]
-    weights: Violations
-    barrier: Float[Array, ""]
-    shift: Float[Array, ""]
-    penalty: Float[Array, " c"]
-    unreachable: Float[Array, " c"]
-    convex: Bool[Array, ""]
-
-
-def _before(path: Path) -> object:
-    return jax.tree.map(lambda x: x[:-1], path.nodes)
-
-
-def _first_gradient(problem: OptimalControl, unknowns: Unknowns, worth: Costates) -> Array:
-    """Gradient in what is free and in the leading coefficients."""
-    leading = unknowns.coefficients[: problem.inputs.degree]
-    flat, unflat = ravel_pytree((unknowns.free, leading))
-    if not flat.size:
-        return jnp.zeros(0)
-    value = ravel_pytree(jax.tree.map(lambda x: x[0], worth.nodes))[0]
-    return jax.grad(lambda x: value @ ravel_pytree(first_node(problem, *unflat(x)))[0])(flat)
-
-
-def _gradient_scale(problem: OptimalControl, unknowns: Unknowns, path: Path, sigma: Array) -> Array:
-    """Largest derivative of cost and bounds by a coefficient that enters: what their sum must cancel."""
-    w = entering(problem, unknowns.coefficients)
-
-    def direct(at, node, w, y, sigma):
-        def values(w: Array) -> tuple[Array, Array]:
-            found = stage(problem, at, node, w, y)
-            return found.cost, found.excess
-
-        by_cost, by_excess = jax.jacfwd(values)(w)
-        return jnp.abs(by_cost) + sigma @ jnp.abs(by_excess)
-
-    sizes = jax.vmap(direct)(slices(problem), _before(path), w, unknowns.y, sigma)
-    scale = jnp.max(sizes)
-    return jnp.where(scale > 0, scale, 1.0)
-
-
-@quickly
-def linearised(
-    problem: OptimalControl,
-    unknowns: Unknowns,
-    multipliers: Multipliers,
-    slacks: Slacks,
-    path: Path,
-    unit: Array,
-) -> Derivatives:
-    """First derivatives at a motion, and what is missing to the conditions of optimality."""
-    inverses = step_inverses(problem, path, unknowns)
-    maps = charts(problem, path.nodes)
-    worth, bent, by_w = costates(problem, path, unknowns, multipliers, inverses, maps)
-    by_first = _first_gradient(problem, unknowns, worth)
-    count = unknowns.free.size
-    scale = _gradient_scale(problem, unknowns, path, multipliers.path)
-    by_coefficients = largest(by_w[:: problem.inputs.every], by_first[count:]) / scale
-    stationarity = jnp.maximum(by_coefficients, largest(by_first[:count]) / unit)
-    corrections = largest(jnp.einsum("kij,kj->ki", inverses, path.stages.residual))
-    size = largest(unknowns.y)
-    errors = Errors(
-        stationarity,
-        corrections / jnp.where(size > 0, size, 1.0),
-        largest(path.end.missing),
-        largest(path.stages.excess + slacks.path, path.end.excess + slacks.end),
-        largest(slacks.path * multipliers.path, slacks.end * multipliers.end) / unit,
-    )
-    return Derivatives(inverses, maps, worth, bent, by_w, by_first, errors)
-
-
-def _unit(problem: OptimalControl, unknowns: Unknowns, path: Path) -> Array:
-    """Unit of the cost: its value, or that of inputs at half their range."""
-    w = entering(problem, unknowns.coefficients)
-
-    def curvature(at, node, w, y):
-        cost = jax.hessian(lambda w: stage(problem, at, node, w, y).cost)(w)
-        steep = jax.jacfwd(lambda w: stage(problem, at, node, w, y).excess)(w)
-        return jnp.max(jnp.abs(jnp.diagonal(cost))), steep
-
-    bent, steep = jax.vmap(curvature)(slices(problem), _before(path), w, unknowns.y)
-    slopes = largest(steep)
-    whole_range = 0.5 * jnp.sum(bent) / jnp.where(slopes > 0, slopes, 1.0) ** 2
-    unit = jnp.maximum(jnp.abs(path.cost), jnp.where(slopes > 0, whole_range, 0.0))
-    return jnp.where(unit > 0, unit, 1.0)
 
 
 @quickly
@@ -156,7 +41,7 @@ def _begun(problem: OptimalControl, options: Options, unknowns: Unknowns) -> tup
         unknowns, whole, newton = simulated(problem, unknowns)
     path = roll(problem, unknowns)
     slacks = Slacks(jnp.maximum(-path.stages.excess, ROOM), jnp.maximum(-path.end.excess, ROOM))
-    unit = _unit(problem, unknowns, path)
+    unit = cost_unit(problem, unknowns, path)
     barrier = options.barrier * unit / max(1, slacks.path.size + slacks.end.size)
     goal = jnp.zeros_like(path.end.missing)
     multipliers = Multipliers(goal, barrier / slacks.path, barrier / slacks.end)
@@ -196,198 +81,6 @@ def init(problem: OptimalControl, options: Options, unknowns: Unknowns) -> Itera
         newton,
         jnp.array(0),
         code,
-    )
-
-
-def _weighted(iterate: Iterate) -> Weighted:
-    """Slacks and multipliers of bounds eliminated from the model."""
-    m, s, mu = iterate.multipliers, iterate.slacks, iterate.barrier
-    path, end = m.path / s.path, m.end / s.end
-    gap, last = iterate.path.stages.excess + s.path, iterate.path.end.excess + s.end
-    return Weighted(path, mu / s.path - m.path + path * gap, end, mu / s.end - m.end + end * last)
-
-
-class Weights(eqx.Module):
-    """What makes the model convex: penalty on the goal, shift of the curvature, and what counts as reach."""
-
-    penalty: Float[Array, " c"]
-    shift: Float[Array, ""]
-    reach: Float[Array, ""]
-    idle: Float[Array, "steps m"]
-
-
-def _convex(problem: OptimalControl, iterate: Iterate, found: Model) -> tuple[Move, Weights]:
-    """The solution of the model, its curvature increased until it is convex."""
-    bounds = _weighted(iterate)
-    idle = (jnp.arange(problem.steps) % problem.inputs.every != 0).astype(float)
-    idle = jnp.broadcast_to(idle[:, None], (problem.steps, problem.channels))
-    reach = jnp.clip(30.0 * iterate.errors.motion, *REACH)
-
-    def with_weights(stiffness: Array, shift: Array) -> Weights:
-        return Weights(stiffness * iterate.penalty, shift, reach, idle)
-
-    def attempt(stiffness: Array, shift: Array) -> Move:
-        w = with_weights(stiffness, shift)
-        missing, goal = iterate.path.end.missing, iterate.multipliers.goal
-        return solve(found, missing, bounds, w.idle, w.shift, w.penalty, goal, w.reach)
-
-    def unfinished(carry: tuple) -> Array:
-        move, _, shift, begun = carry
-        return ~begun | (~move.convex & (shift < LARGEST_SHIFT))
-
-    def body(carry: tuple) -> tuple:
-        # A penalty on the goal bends the model only where the goal forbids a change; it is tried first.
-        _, stiffness, shift, begun = carry
-        exhausted = begun & (stiffness >= STIFFEST)
-        shift = jnp.where(exhausted, jnp.maximum(10.0 * shift, SHIFT), shift)
-        stiffness = jnp.where(begun & ~exhausted, 10.0 * stiffness, stiffness)
-        return attempt(stiffness, shift), stiffness, shift, jnp.array(True)
-
-    start = jnp.where(iterate.failures > 0, jnp.maximum(10.0 * iterate.shift, SHIFT), 0.1 * iterate.shift)
-    start = jnp.where(start < SHIFT, 0.0, start)
-    shapes = jax.eval_shape(attempt, start, start)
-    nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-    first = (nothing, jnp.ones(()), start, jnp.array(False))
-    move, stiffness, shift, _ = jax.lax.while_loop(unfinished, body, first)
-    return move, with_weights(stiffness, shift)
-
-
-def _penalty(iterate: Iterate, move: Move) -> Array:
-    """Penalties on the goal, from its compliance in the first model."""
-    compliance = jnp.diagonal(move.compliance)
-    reached = compliance > 1e-12 * jnp.max(compliance, initial=0.0)
-    found = jnp.where(reached, 1.0 / jnp.where(reached, compliance, 1.0), 0.0)
-    return jnp.where(iterate.iteration == 0, found, iterate.penalty)
-
-
-class Sweep(eqx.Module):
-    """First-order changes along a direction, exact: of the steps' unknowns, excesses, and the goal."""
-
-    y: Float[Array, "steps n"]
-    excess: Float[Array, "steps h"]
-    missing: Float[Array, " c"]
-    end_excess: Float[Array, " e"]
-
-
-def _swept(problem: OptimalControl, iterate: Iterate, change: Unknowns) -> Sweep:
-    """Changes that make the linearised residuals of all steps vanish."""
-    unknowns, path = iterate.unknowns, iterate.path
-    leading = problem.inputs.degree
-    given = (unknowns.free, unknowns.coefficients[:leading])
-    given_change = (change.free, change.coefficients[:leading])
-    start = jax.jvp(lambda *x: first_node(problem, *x), given, given_change)[1]
-    w, dw = entering(problem, unknowns.coefficients), entering(problem, change.coefficients)
-
-    def body(dn, given):
-        at, node, w, dw, y, inverse, residual = given
-        _, linear = jax.linearize(lambda *x: stage(problem, at, *x), node, w, y)
-        dy = -inverse @ (residual + linear(dn, dw, jnp.zeros_like(y)).residual)
-        changed = linear(dn, dw, dy)
-        return changed.after, (dy, changed.excess)
-
-    inverses, residual = iterate.derivatives.inverses, path.stages.residual
-    given = (slices(problem), _before(path), w, dw, unknowns.y, inverses, residual)
-    last, (y, excess) = jax.lax.scan(body, start, given)
-    final = jax.tree.map(lambda x: x[-1], path.nodes)
-    reached = jax.jvp(lambda node: end(problem, node), (final,), (last,))[1]
-    return Sweep(y, excess, reached.missing, reached.excess)
-
-
-def _refined(
-    problem: OptimalControl, iterate: Iterate, found: Model, move: Move, weights: Weights
-) -> tuple[Unknowns, Array, Sweep]:
-    """The move of the model, corrected until the goal is met to first order exactly.
-
-    Returns:
-        Changes of coefficients and of what is free, of the goal's multipliers, and the exact sweep.
-    """
-    count = iterate.unknowns.free.size
-    every, leading = problem.inputs.every, problem.inputs.degree
-    level = jax.tree.map(jnp.zeros_like, (found.gradient, found.offset, found.first_gradient))
-    flat = eqx.tree_at(lambda m: (m.gradient, m.offset, m.first_gradient), found, level)
-    bounds = _weighted(iterate)
-    eased = Weighted(bounds.path, jnp.zeros_like(bounds.path), bounds.end, jnp.zeros_like(bounds.end))
-    flat = eqx.tree_at(lambda m: m.excess_offset, flat, jnp.zeros_like(flat.excess_offset))
-
-    def changed(first: Array, w: Array) -> Unknowns:
-        head = first[count:].reshape(leading, problem.channels)
-        return Unknowns(
-            jnp.concatenate([head, w[::every]]), first[:count], jnp.zeros_like(iterate.unknowns.y)
-        )
-
-    def body(k: Array, carry: tuple) -> tuple:
-        first, w, goal, sweep = carry
-        missing = iterate.path.end.missing + sweep.missing
-        none = jnp.zeros_like(goal)
-        more = solve(flat, missing, eased, weights.idle, weights.shift, weights.penalty, none, weights.reach)
-        # The first turn only sweeps: so everything is compiled once.
-        usable = (k > 0) & more.convex & jnp.all(jnp.isfinite(more.w))
-        first, w, goal = (
-            x + jnp.where(usable, dx, 0.0) for x, dx in ((first, more.first), (w, more.w), (goal, more.goal))
-        )
-        return first, w, goal, _swept(problem, iterate, changed(first, w))
-
-    path = iterate.path
-    still = Sweep(
-        *(
-            jnp.zeros_like(x)
-            for x in (iterate.unknowns.y, path.stages.excess, path.end.missing, path.end.excess)
-        )
-    )
-    begun = (move.first, move.w, move.goal, still)
-    first, w, goal, sweep = jax.lax.fori_loop(0, REFINEMENTS + 1, body, begun)
-    return changed(first, w), goal, sweep
-
-
-def _direction(
-    problem: OptimalControl, options: Options, iterate: Iterate, found: Model, move: Move, weights: Weights
-) -> Direction:
-    """Directions of coefficients, of what is free, of the unknowns of the steps, slacks and multipliers."""
-    unknowns, goal, sweep = _refined(problem, iterate, found, move, weights)
-    if options.lifted:
-        unknowns = eqx.tree_at(lambda u: u.y, unknowns, sweep.y)
-    s, m, mu = iterate.slacks, iterate.multipliers, iterate.barrier
-    slack = -(iterate.path.stages.excess + s.path) - sweep.excess
-    last = -(iterate.path.end.excess + s.end) - sweep.end_excess
-    path = (mu - m.path * slack) / s.path - m.path
-    ends = (mu - m.end * last) / s.end - m.end
-    return Direction(unknowns, Multipliers(goal, path, ends), Slacks(slack, last))
-
-
-def _lowered(iterate: Iterate) -> Array:
-    """The barrier parameter of the next iteration: lower where the present one is nearly solved."""
-    s, m, mu, e = iterate.slacks, iterate.multipliers, iterate.barrier, iterate.errors
-    count = max(1, s.path.size + s.end.size)
-    unit = iterate.unit / count
-    relative = mu / unit
-    central = largest(s.path * m.path - mu, s.end * m.end - mu) / unit
-    missing = jnp.maximum(jnp.maximum(e.stationarity, central), jnp.maximum(e.bounds, e.goal))
-    lower = unit * jnp.maximum(LEAST_BARRIER, jnp.minimum(0.2 * relative, relative**1.5))
-    return jnp.where(missing < 10.0 * relative, jnp.minimum(lower, mu), mu)
-
-
-@quickly
-def propose(problem: OptimalControl, options: Options, iterate: Iterate) -> Proposal:
-    """The next step, from the quadratic model."""
-    iterate = eqx.tree_at(lambda i: i.barrier, iterate, _lowered(iterate))
-    d = iterate.derivatives
-    found = model(
-        problem,
-        iterate.path,
-        iterate.unknowns,
-        iterate.multipliers,
-        d.bent,
-        d.by_w,
-        d.by_first,
-        d.inverses,
-        d.maps,
-    )
-    move, made = _convex(problem, iterate, found)
-    direction = _direction(problem, options, iterate, found, move, made)
-    slope, weights = slope_and_weights(iterate, direction, problem.inputs.every)
-    penalty = _penalty(iterate, move)
-    return Proposal(
-        direction, slope, weights, iterate.barrier, made.shift, penalty, move.unreachable, move.convex
     )
 
 
