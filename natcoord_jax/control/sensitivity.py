@@ -72,7 +72,7 @@ def optimum(
         A function of the numbers, for `jax.grad`, `jax.jvp` and `jax.jit`; all NaN where the method fails.
 
     Example:
-        See notebook 08, where a stiffness is chosen together with the inputs.
+        See `tests/test_control.py`, where the mass of an arm is a number of the problem.
     """
     start = guess.unknowns if isinstance(guess, Iterate) else guess
 
