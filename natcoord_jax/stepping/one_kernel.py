@@ -333,7 +333,10 @@ def _product(given: list[Any], params: dict[str, Any], out: Any) -> Array | None
     right = jnp.transpose(right, (*batch_right, *free_right, *sum_right))
     left = jnp.expand_dims(left, range(shared + len(free_left), shared + len(free_left) + len(free_right)))
     right = jnp.expand_dims(right, range(shared, shared + len(free_left)))
-    return jnp.sum(left * right, axis=tuple(range(left.ndim - summed, left.ndim)))
+    axes = tuple(range(left.ndim - summed, left.ndim))
+    if terms < REDUCTION_LIMIT:
+        return jnp.sum(left * right, axis=axes)
+    return _reduced(jnp.add, left * right, axes)
 
 
 def _reduced(operation: Callable, x: Array, axes: Sequence[Any]) -> Array:
