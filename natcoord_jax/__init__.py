@@ -64,6 +64,7 @@ from natcoord_jax.effects.springs import (
 )
 from natcoord_jax.scene import Scene
 from natcoord_jax.stepping.assemble import assemble
+from natcoord_jax.stepping.scheme import EnergyMomentum
 from natcoord_jax.stepping.simulate import linearise, simulate, step
 
 if TYPE_CHECKING:
@@ -86,6 +87,7 @@ __all__ = [
     "Drive",
     "Ellipsoid",
     "Feedback",
+    "EnergyMomentum",
     "Field",
     "Fixed",
     "Force",

@@ -43,6 +43,11 @@ DIFFERENCE_FALL = 20.0
 ORDER = 2.0
 ORDER_TOLERANCE = 0.1
 
+# Schemes of order four to ten: the observed order, relatively; errors near round-off spoil the highest.
+HIGH_ORDER_TOLERANCE = 0.16
+# ... and constraint velocities, absolute [m/s, 1/s], of motions at some ten of those.
+TANGENT = 1e-10
+
 # Work of torques is 200 N m; with (61) angular momentum stays at round-off of the integral of the torques.
 SPACECRAFT_MOMENTUM = 1e-9 * 3000.0  # [N m s]
 

@@ -7,6 +7,7 @@ all six of a free system, turning about the axis of a hinge on the ground, none 
 ground. They are found from the constraints themselves, as the common null space of all reactions.
 """
 
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -21,7 +22,7 @@ from natcoord_jax.assembly.system import Group, System
 from natcoord_jax.core.effect import Motion, Response
 from natcoord_jax.core.state import State, Trajectory
 from natcoord_jax.maths.collocation import gauss
-from natcoord_jax.maths.vectors import cross
+from natcoord_jax.maths.vectors import cross, safe_divide
 
 REACTION_FREE = 1e-12
 """A rigid motion counts as free of reactions when their mean square power is below this share: far above the
@@ -74,7 +75,7 @@ def _resultants(bodies: int, group: Group, motion: Motion, answer: Response) -> 
     return jnp.sum(jnp.where(moving, jnp.concatenate([force, turning], axis=-1), 0.0), axis=1)
 
 
-def _step(system: System, before: State, after: State, u: Array) -> tuple[Array, Array]:
+def _step(system: System, midpoint: bool, before: State, after: State, u: Array) -> tuple[Array, Array]:
     """Impulse (6,) of all that is known in a step, and Gram matrix (6, 6) of the reactions."""
     bodies, tableau = len(system.structure.bodies), gauss(1)
     h = after.t - before.t
@@ -84,8 +85,15 @@ def _step(system: System, before: State, after: State, u: Array) -> tuple[Array,
         where, motion = situation(system, group, before, u, h), gather(group, at)
         lam = jnp.zeros((group.count, 1, group.multipliers))
         scale = 1.0 if group.effect.impulsive else h
-        known = scale * _resultants(bodies, group, motion, respond(group, where, motion, lam, tableau))
-        impulse = impulse + jnp.sum(known, axis=0)
+        answer = respond(group, where, motion, lam, tableau)
+        known = scale * _resultants(bodies, group, motion, answer)
+        if midpoint:
+            impulse = impulse + jnp.sum(known, axis=0)
+        else:
+            # Impulses over several stages are not in the trajectory: they count as reactions do.
+            parts = [x for x in (answer.forces, answer.torques) if x is not None]
+            size = scale * sum((jnp.sum(jnp.abs(x)) for x in parts), jnp.zeros(()))
+            gram = gram + safe_divide(known.T @ known, size**2)
         for number in range(group.multipliers):
             answer = respond(group, where, motion, lam.at[:, :, number].set(1.0), tableau)
             columns = scale * _resultants(bodies, group, motion, answer) - known
@@ -98,7 +106,9 @@ def _account(system: System, trajectory: Trajectory) -> dict[str, Any]:
     """All that is needed of the trajectory, at the saved times."""
     states = trajectory.states
     before, after = jax.tree.map(lambda x: x[:-1], states), jax.tree.map(lambda x: x[1:], states)
-    impulses, grams = jax.vmap(_step, in_axes=(None, 0, 0, 0))(system, before, after, trajectory.inputs)
+    midpoint = trajectory.scheme is None or trajectory.scheme.tableau == gauss(1)
+    each = partial(_step, system, midpoint)
+    impulses, grams = jax.vmap(each)(before, after, trajectory.inputs)
     linear, angular = jax.vmap(lambda s: body_momenta(system, s))(states)
     energy, work = system.energy(trajectory), states.work
     stores = sum((jnp.abs(v) for v in energy.stores.values()), jnp.zeros_like(energy.kinetic))

@@ -6,7 +6,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.diagnostics import rows_with_ground
-from natcoord_jax.assembly.system import System
+from natcoord_jax.assembly.response import Stations
+from natcoord_jax.assembly.system import CoordinateGroup, System
+from natcoord_jax.core.coordinate import pair_motion
+from natcoord_jax.core.effect import Motion
 from natcoord_jax.core.joint import Frame, frames_at
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.rotations import angular_velocity
@@ -59,3 +62,22 @@ def state_rates(system: System, state: State) -> Float[Array, " coordinates"]:
     """Rates [rad/s or m/s] of all joint coordinates of one state."""
     rows = rows_with_ground(state.q)
     return coordinate_rates(system, rows, *velocities_with_ground(state.v, rows))
+
+
+def _rates_of_group(group: CoordinateGroup, system: System, at: Stations, h: Array) -> Float[Array, "s n"]:
+    bodies = system.joint_bodies[group.joints]
+
+    def one(place, start, rows, rates, spin):
+        return group.axis.unit_load(pair_motion(place, Motion(start, rows, rates, spin), 0), h).rate
+
+    motion = at.start[bodies], at.rows[:, bodies], at.rates[:, bodies], at.spin[:, bodies]
+    with jax.named_scope("joint_coordinates"):
+        return jax.vmap(one, in_axes=(0, 0, 1, 1, 1), out_axes=1)(system.frames[group.joints], *motion)
+
+
+def stage_rates(system: System, at: Stations, h: Array) -> Float[Array, "s coordinates"]:
+    """Rates of joint coordinates whose weighted sum over the stages is the exact increment over h."""
+    if not system.coordinates:
+        return jnp.zeros((at.rates.shape[0], 0), at.rates.dtype)
+    every = [_rates_of_group(group, system, at, h) for group in system.coordinates]
+    return jnp.concatenate(every, axis=1)[:, system.coordinate_order]

@@ -12,9 +12,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.diagnostics import rows_with_ground
+from natcoord_jax.assembly.kick import TangentSpace, with_kicks
 from natcoord_jax.assembly.local import body_balance, body_motion, jacobians
 from natcoord_jax.assembly.momentum import momentum_balance
-from natcoord_jax.assembly.reduced import project_multipliers, project_rows
+from natcoord_jax.assembly.reduced import at_every_stage, project_multipliers, project_rows
 from natcoord_jax.assembly.response import (
     Evaluation,
     Situation,
@@ -26,7 +27,7 @@ from natcoord_jax.assembly.response import (
 from natcoord_jax.assembly.system import Group, System
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
-from natcoord_jax.maths.collocation import Tableau
+from natcoord_jax.maths.collocation import Tableau, gauss
 from natcoord_jax.maths.projectors import range_projector
 from natcoord_jax.maths.vectors import cross
 
@@ -41,6 +42,7 @@ class FullStep(eqx.Module):
     situations: tuple[Situation, ...]
     h: Float[Array, ""]
     projector: Float[Array, "m m"] | None
+    tangents: TangentSpace | None
     tableau: Tableau = eqx.field(static=True)
 
     @classmethod
@@ -55,17 +57,20 @@ class FullStep(eqx.Module):
             tuple(situation(system, g, state, u, h) for g in groups),
             h,
             None,
+            None,
             tableau,
         )
+        tangents = TangentSpace.at(system, state) if tableau.kick else None
         rank = system.structure.rank
-        if rank is None or tableau.stages > 1:
-            return plain
-        at_rest = replace_fields(plain, h=jnp.zeros_like(h))
-        matrix = at_rest.jacobian(jnp.zeros(plain.unknowns, state.q.dtype))
-        rows = matrix[plain.balances :, : plain.balances]
+        if rank is None:
+            return replace_fields(plain, tangents=tangents)
+        at_rest = replace_fields(plain, h=jnp.zeros_like(h), tableau=gauss(1))
+        matrix = at_rest.jacobian(jnp.zeros(at_rest.unknowns, state.q.dtype))
+        rows = matrix[at_rest.balances :, : at_rest.balances]
         in_tree = sum(g.count * g.multipliers for g in system.joints if g.in_tree)
         projector = range_projector(rows, rank + in_tree)
-        return eqx.tree_at(lambda s: s.projector, plain, projector, is_leaf=lambda x: x is None)
+        projector = at_every_stage(projector, plain.groups, tableau.stages)
+        return replace_fields(plain, projector=projector, tangents=tangents)
 
     @property
     def groups(self) -> tuple[Group, ...]:
@@ -119,7 +124,10 @@ class FullStep(eqx.Module):
         """Residual, and what the end of the step needs."""
         twists, multipliers = self.split(project_multipliers(y, self.balances, self.projector))
         at = self._stations(twists)
-        given = self.system, self.groups, self.situations, at, self.velocity
+        velocity, situations, ends = with_kicks(
+            self.tangents, self.state, self.groups, self.situations, at, self.h, self.tableau
+        )
+        given = self.system, self.groups, situations, at, velocity
         found = momentum_balance(*given, multipliers, self.h, self.tableau)
         massless = jnp.trace(self.system.mass[:, 1:, 1:], axis1=1, axis2=2) <= 0
         # A point mass keeps its directors by a unit inertia, as in `body_balance`.
@@ -127,7 +135,7 @@ class FullStep(eqx.Module):
         wrenches = jnp.moveaxis(jnp.concatenate([found.force, torque], axis=-1), 0, 1)
         rows = project_rows(found.rows, y, self.balances, self.projector)
         residual = jnp.concatenate([wrenches.reshape(-1), rows])
-        return Evaluation(residual, found.size, at, found.power)
+        return Evaluation(residual, found.size, at, found.power, ends)
 
     def body_jacobians(self, twists: Float[Array, "bodies s 6"]) -> Float[Array, "bodies n n"]:
         """Jacobians of the bodies' own balances."""

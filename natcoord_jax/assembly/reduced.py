@@ -7,13 +7,17 @@ then the rates of the constraints. Working with rates and multipliers times h ke
 size as h goes to zero.
 """
 
+import math
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
+from natcoord_jax.assembly.kick import TangentSpace, with_kicks
 from natcoord_jax.assembly.momentum import momentum_balance
 from natcoord_jax.assembly.response import (
     Evaluation,
@@ -33,7 +37,7 @@ from natcoord_jax.assembly.tree import (
 )
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
-from natcoord_jax.maths.collocation import Tableau
+from natcoord_jax.maths.collocation import Tableau, gauss
 from natcoord_jax.maths.projectors import range_projector
 
 PROBE = 1e-6
@@ -59,6 +63,21 @@ def project_rows(rows: Array, y: Array, balances: int, projector: Array | None) 
     return projector @ rows + idle / (1.0 + rows.shape[0])
 
 
+def at_every_stage(projector: Float[Array, "m m"], groups: Sequence[Group], stages: int) -> Array:
+    """A projector of one stage for the multipliers of all, which go group by group, then by stage."""
+    if stages == 1:
+        return projector
+    places, position = [], 0
+    for group in groups:
+        shape = group.count, stages, group.multipliers
+        here = position + np.arange(math.prod(shape)).reshape(shape)
+        places.append(np.moveaxis(here, 1, 0).reshape(stages, -1))
+        position += here.size
+    every = np.concatenate(places, axis=1)
+    full = jnp.zeros((position, position), projector.dtype)
+    return full.at[every[:, :, None], every[:, None, :]].set(projector)
+
+
 def active_groups(system: System) -> tuple[Group, ...]:
     """Groups that take part in the equations: all effects and the joints that close loops."""
     return (*system.effects, *(g for g in system.joints if not g.in_tree))
@@ -75,6 +94,7 @@ class ReducedStep(eqx.Module):
     situations: tuple[Situation, ...]
     h: Float[Array, ""]
     projector: Float[Array, "m m"] | None
+    tangents: TangentSpace | None
     tableau: Tableau = eqx.field(static=True)
 
     @classmethod
@@ -90,16 +110,19 @@ class ReducedStep(eqx.Module):
             tuple(situation(system, g, state, u, h) for g in active_groups(system)),
             h,
             None,
+            None,
             tableau,
         )
-        if system.structure.rank is None or tableau.stages > 1:
-            return plain
+        tangents = TangentSpace.at(system, state) if tableau.kick else None
+        if system.structure.rank is None:
+            return replace_fields(plain, tangents=tangents)
         projector = range_projector(plain.constraint_matrix(), system.structure.rank)
-        return eqx.tree_at(lambda s: s.projector, plain, projector, is_leaf=lambda x: x is None)
+        projector = at_every_stage(projector, plain.groups, tableau.stages)
+        return replace_fields(plain, projector=projector, tangents=tangents)
 
     def constraint_matrix(self) -> Float[Array, "m unknowns"]:
         """Rates of all constraints per rate of the free motions, at the start of the step."""
-        resting = replace_fields(self, h=jnp.zeros_like(self.h))
+        resting = replace_fields(self, h=jnp.zeros_like(self.h), tableau=gauss(1))
         count = self.system.structure.unknowns
         rest = jnp.zeros(self.system.structure.multipliers, self.start.dtype)
 
@@ -159,12 +182,15 @@ class ReducedStep(eqx.Module):
         w, multipliers = self.split(project_multipliers(y, self.balances, self.projector))
         motion, geometry = self.motion(w)
         at = self.stations(motion)
-        given = system, self.groups, self.situations, at, self.velocity
+        velocity, situations, ends = with_kicks(
+            self.tangents, self.state, self.groups, self.situations, at, self.h, self.tableau
+        )
+        given = system, self.groups, situations, at, velocity
         found = momentum_balance(*given, multipliers, self.h, self.tableau)
         generalised = self.generalised(geometry, found.force, found.torque)
         rows = project_rows(found.rows, y, self.balances, self.projector)
         residual = jnp.concatenate([generalised.reshape(-1), rows])
-        return Evaluation(residual, found.size, at, found.power)
+        return Evaluation(residual, found.size, at, found.power, ends)
 
     def guess(self) -> Float[Array, " unknowns"]:
         """Rates of the velocities at the start, repeated for every stage; multipliers zero."""

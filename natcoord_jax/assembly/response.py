@@ -1,5 +1,7 @@
 """Evaluation of all effects on a given motion: gather, respond (vmapped over equal kinds), scatter."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -68,7 +70,7 @@ def situation(system: System, group: Group, state: State, u: Array, h: Array) ->
     """Gather what a group needs at the start of a step."""
     return Situation(
         group_places(system, group),
-        u[group.inputs],
+        jnp.moveaxis(u[..., group.inputs], -2, 0),
         state.coordinates[group.coordinates],
         state.rates[group.rotors],
         state.t,
@@ -113,12 +115,14 @@ class Evaluation(eqx.Module):
         size: of the terms of the residual [sqrt(J)].
         at: stage motion of all bodies.
         power: power of each group, for work accounts (instances, s).
+        kicked: velocities at the ends, if the method has kicks.
     """
 
     residual: Float[Array, " unknowns"]
     size: Float[Array, ""]
     at: Stations
     power: list[Float[Array, "_ s"]]
+    kicked: Any = None
 
 
 def collect(group: Group, loads: Float[Array, "n s k *rest"]) -> Float[Array, "bodies s *rest"]:

@@ -6,6 +6,7 @@ joint, in the spanning tree or closing a loop.
 """
 
 import abc
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -17,6 +18,7 @@ from jaxtyping import Array, Float
 from natcoord_jax.core.effect import Effect, Motion, Now, Response
 from natcoord_jax.core.gradient import averaged_gradient
 from natcoord_jax.core.joint import Frame, frames_at
+from natcoord_jax.maths.collocation import gauss
 
 
 class PairMotion(eqx.Module):
@@ -44,6 +46,30 @@ class UnitLoad(eqx.Module):
     rate: Float[Array, " s"]
     forces: Float[Array, "s 2 4 3"] | None
     torques: Float[Array, "s 2 3"] | None
+
+
+def unit_load_of(
+    invariants: Callable[[Frame, Frame], Float[Array, " p"]],
+    function: Callable[[Float[Array, " p"]], Float[Array, ""]],
+    pair: PairMotion,
+    h: Float[Array, ""],
+) -> UnitLoad:
+    """Unit load of a coordinate that is a function of quadratic invariants of its two frames, for any stages.
+
+    The averaged gradients S_i of the function along the collocated path of the invariants give the rates
+    S_i . Pi'_i, whose sum is the exact increment, and the loads D pi(Q_i)^T S_i.
+    """
+    tableau = gauss(pair.parent_spin.shape[0])
+    now, moving = (pair.parent, pair.child), (pair.parent_rate, pair.child_rate)
+    rates = jax.vmap(lambda x, dx: jax.jvp(invariants, x, dx)[1])(now, moving)
+    start = invariants(pair.parent_start, pair.child_start)
+    resting = h == 0
+    step = jnp.where(resting, 1.0, h)
+    steps = jnp.where(resting, 0.0, step * rates)
+    gradients = averaged_gradient(function, start, steps, tableau, None)
+    loads = jax.vmap(lambda x, g: jax.vjp(invariants, *x)[1](g))(now, gradients)
+    forces = [jnp.concatenate([x.point[:, None], x.axes], axis=1) for x in loads]
+    return UnitLoad(jnp.sum(gradients * rates, axis=-1), jnp.stack(forces, axis=1), None)
 
 
 @dataclass(frozen=True)
@@ -162,8 +188,7 @@ class CoordinateForce(CoordinateEffect):
 
     def generalised(self, rates: Array, now: Now, lam: Array) -> tuple[Array, Array, Array]:
         """The force at every stage; its power is force times rate, exactly."""
-        times = now.times
-        forces = jnp.stack([self.force(rates[i, 0], now.inputs, times[i]) for i in range(len(now.tableau.b))])
+        forces = jax.vmap(self.force)(rates[:, 0], now.stage_inputs, now.times)
         return forces[:, None], jnp.zeros((len(now.tableau.b), 0)), forces * rates[:, 0]
 
 
@@ -219,6 +244,9 @@ class CoordinateConstraint(CoordinateEffect):
         resting = now.h == 0
         step = jnp.where(resting, 1.0, now.h)
         reached = (self.target(now.t + now.h) - factors @ now.coordinates) / step
-        rate = jax.jvp(self.target, (now.t,), (jnp.ones_like(now.t),))[1]
+        rate = jax.vmap(lambda t: jax.jvp(self.target, (t,), (jnp.ones_like(t),))[1])(now.times)
+        if now.tableau.stages > 1:
+            # Stage by stage the rate prescribed, moved by what the sum of these misses.
+            reached = rate + (reached - jnp.asarray(now.tableau.b) @ rate)
         rows = rates @ factors - jnp.where(resting, rate, reached)
         return lam * factors, rows[:, None], lam[:, 0] * (rates @ factors)

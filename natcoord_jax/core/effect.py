@@ -47,7 +47,7 @@ class Now(eqx.Module):
     Attributes:
         t: start time [s].
         h: step [s].
-        inputs: the input channels of the effect, held over the step.
+        inputs: the input channels of the effect, held over the step, or given at every stage.
         coordinates: values of the joint coordinates of the effect at the start [rad or m].
         rates: their stored rates (rotors only) [rad/s or m/s].
         tableau: the collocation method.
@@ -55,7 +55,7 @@ class Now(eqx.Module):
 
     t: Float[Array, ""]
     h: Float[Array, ""]
-    inputs: Float[Array, " inputs"]
+    inputs: Float[Array, " inputs"] | Float[Array, "s inputs"]
     coordinates: Float[Array, " c"]
     rates: Float[Array, " r"]
     tableau: Tableau = eqx.field(static=True)
@@ -64,6 +64,11 @@ class Now(eqx.Module):
     def times(self) -> Float[Array, " s"]:
         """Times of the stages [s]."""
         return self.t + self.h * jnp.asarray(self.tableau.c)
+
+    @property
+    def stage_inputs(self) -> Float[Array, "s inputs"]:
+        """Inputs at the stages."""
+        return jnp.broadcast_to(self.inputs, (self.tableau.stages, self.inputs.shape[-1]))
 
 
 class Response(eqx.Module):

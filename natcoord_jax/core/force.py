@@ -76,7 +76,7 @@ class Force(Effect):
     def respond(self, place: Array, motion: Motion, now: Now, lam: Array) -> Response:
         """The load at every stage."""
         x, rates = place_markers(place, motion.rows), place_markers(place, motion.rates)
-        load = jax.vmap(lambda xi, vi, ti: self.load(xi, vi, now.inputs, ti))(x, rates, now.times)
+        load = jax.vmap(self.load)(x, rates, now.stage_inputs, now.times)
         return marker_response(place, load.forces, load.torques, rates, motion)
 
 

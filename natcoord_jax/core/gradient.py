@@ -26,7 +26,9 @@ def averaged_gradient(
         tableau: the collocation method.
         degree: polynomial degree of `energy`, or None if it is no polynomial.
     """
-    points = 4 if degree is None else max(tableau.stages, -(-degree * tableau.stages // 2))
+    points = (
+        2 + 2 * tableau.stages if degree is None else max(tableau.stages, -(-degree * tableau.stages // 2))
+    )
     integrals, averages = invariant_quadrature(tableau.stages, points)
     path = start + jnp.asarray(integrals) @ steps
     gradient = jnp.asarray(averages) @ jax.vmap(jax.grad(energy))(path)

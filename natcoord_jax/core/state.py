@@ -1,5 +1,7 @@
 """State of a system and trajectory of a rollout: plain data."""
 
+from typing import Any
+
 import equinox as eqx
 from jaxtyping import Array, Float, Int
 
@@ -30,7 +32,7 @@ class Trajectory(eqx.Module):
     Attributes:
         states: saved states, the initial one first; leading axis `saved`.
         inputs: inputs of the steps before each saved state, shape (saved - 1, inputs); with `save_every`
-            larger than one, those of the last step of each interval.
+            larger than one, those of the last step of each interval. The mean of inputs given at stages.
         result: result code (see `Result`); 0 is successful.
         failed_step: index of the step that failed or ended the run, or the number of steps.
         failed_time: time [s] at the start of that step, or the end time.
@@ -39,6 +41,7 @@ class Trajectory(eqx.Module):
         steps_taken: accepted (sub)steps.
         iterations: Newton iterations summed over all attempts.
         iterations_max: largest number in one attempt.
+        scheme: that made it (static).
     """
 
     states: State
@@ -51,6 +54,7 @@ class Trajectory(eqx.Module):
     steps_taken: Int[Array, "*batch"]
     iterations: Int[Array, "*batch"]
     iterations_max: Int[Array, "*batch"]
+    scheme: Any = eqx.field(static=True, default=None)
 
     @property
     def t(self) -> Float[Array, "*batch saved"]:

@@ -25,6 +25,13 @@ class Tableau:
     a_inverse: tuple[tuple[float, ...], ...]
     beta: tuple[float, ...]
     """b^T A^-1: the end velocity is v_0 + sum beta_i (V_i - v_0)."""
+    kick: bool = False
+    """Whether velocities are kept tangent to the constraints by isometric kicks along their normals."""
+
+    @property
+    def reflection(self) -> float:
+        """-R(infinity), the sign with which a kick is taken back at the end of the step."""
+        return 1.0 if self.stages % 2 else -1.0
 
 
 def _gauss_points(count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -45,8 +52,8 @@ def _integrals(nodes: np.ndarray, upper: np.ndarray) -> np.ndarray:
 
 
 @lru_cache
-def gauss(stages: int) -> Tableau:
-    """Tableau of Gauss collocation; one stage gives the energy-momentum step (57)."""
+def gauss(stages: int, kick: bool = False) -> Tableau:
+    """Tableau of Gauss collocation; one stage without kick gives the energy-momentum step (57)."""
     c, b = _gauss_points(stages)
     a = _integrals(c, c)
     a_inverse = np.linalg.inv(a)
@@ -56,7 +63,7 @@ def gauss(stages: int) -> Tableau:
 
     beta = b @ a_inverse
     b, c, beta = (tuple(float(x) for x in vector) for vector in (b, c, beta))
-    return Tableau(stages, rows(a), b, c, rows(a_inverse), beta)
+    return Tableau(stages, rows(a), b, c, rows(a_inverse), beta, kick)
 
 
 @lru_cache
@@ -96,12 +103,48 @@ def rotate_stages(
         a = 0.5 * turn
         scale = 1.0 / (1.0 + dot(a, a))
         return (start + cross(a, start) + a * dot(a, start)[..., None]) * scale[..., None]
+    return _block_solve(turn, start, tableau)
+
+
+def _times(a: Float[Array, "*batch 3 3"], b: Float[Array, "*other 3 3"]) -> Float[Array, "*out 3 3"]:
+    """Products of 3 x 3 matrices as sums, which fuse with their neighbours."""
+    return jnp.sum(a[..., :, :, None] * b[..., None, :, :], axis=-2)
+
+
+def _on(a: Float[Array, "*batch 3 3"], x: Float[Array, "*other 3"]) -> Float[Array, "*out 3"]:
+    return jnp.sum(a * x[..., None, :], axis=-1)
+
+
+def _inverse(a: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 3"]:
+    """Inverses of 3 x 3 matrices by cofactors."""
+    first, second, third = a[..., 0, :], a[..., 1, :], a[..., 2, :]
+    cofactors = jnp.stack([cross(second, third), cross(third, first), cross(first, second)], axis=-1)
+    return cofactors / dot(first, cofactors[..., 0])[..., None, None]
+
+
+def _block_solve(
+    turn: Float[Array, "stages *#batch 3"], start: Float[Array, "#stages *#batch 3"], tableau: Tableau
+) -> Float[Array, "stages *out 3"]:
+    """Elimination stage by stage; the pivots, 1 less a skew matrix in the main, are regular."""
     s = tableau.stages
-    turn, start = jnp.broadcast_arrays(turn, start)
-    blocks = jnp.asarray(tableau.a)
-    matrix = jnp.eye(3 * s) - jnp.einsum("ij,j...kl->...ikjl", blocks, skew(turn)).reshape(
-        *turn.shape[1:-1], 3 * s, 3 * s
-    )
-    right = jnp.moveaxis(start, 0, -2).reshape(*start.shape[1:-1], 3 * s, 1)
-    solution = jnp.linalg.solve(matrix, right)[..., 0].reshape(*start.shape[1:-1], s, 3)
-    return jnp.moveaxis(solution, -2, 0)
+    x = jnp.broadcast_to(start, jnp.broadcast_shapes(turn.shape, start.shape))
+    spin = skew(turn).reshape(s, *(1,) * (x.ndim - turn.ndim), *turn.shape[1:], 3)
+    by_stages = (s, s, *(1,) * x.ndim)
+    a, unit = jnp.asarray(tableau.a, turn.dtype), jnp.eye(s, dtype=turn.dtype)
+    blocks = unit.reshape(by_stages) * jnp.eye(3, dtype=turn.dtype) - a.reshape(by_stages) * spin[None]
+    pivots, rows, rights = [], [], []
+    for k in range(s):
+        # What is left of the matrix and of the right-hand sides, from stage k on.
+        pivots.append(_inverse(blocks[0, 0]))
+        rows.append(blocks[0, 1:])
+        rights.append(x[0])
+        if k + 1 < s:
+            factors = _times(blocks[1:, 0], pivots[-1][None])
+            blocks = blocks[1:, 1:] - _times(factors[:, None], blocks[0, 1:][None])
+            x = x[1:] - _on(factors, x[0])
+    found: list[Array] = []
+    for pivot, row, right in zip(reversed(pivots), reversed(rows), reversed(rights)):
+        for block, known in zip(row, found):
+            right = right - _on(block, known)
+        found.insert(0, _on(pivot, right))
+    return jnp.stack(found)

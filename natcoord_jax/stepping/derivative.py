@@ -23,7 +23,6 @@ from jaxtyping import Array, Bool, Float, Int
 from natcoord_jax.assembly.equations import prepare
 from natcoord_jax.assembly.system import System
 from natcoord_jax.core.state import State
-from natcoord_jax.maths.collocation import gauss
 from natcoord_jax.stepping import linear_pair
 from natcoord_jax.stepping.newton import PATIENCE, Factors, any_lane, factors_of
 from natcoord_jax.stepping.one_kernel import as_one_kernel, in_groups
@@ -118,6 +117,7 @@ class Slot(eqx.Module):
     u: Float[Array, "*slots inputs"] | None
     step: Int[Array, "*slots"]
     fraction: Float[Array, "*slots"]
+    done: Float[Array, "*slots"]
     accepted: Bool[Array, "*slots"]
 
 
@@ -134,14 +134,18 @@ class Rule:
 
     def __init__(self, plan: Plan):
         self.plan = plan
-        self.tableau = gauss(plan.stages)
+        self.tableau = plan.tableau
+
+    def _inputs(self, parameters: Any, slot: Slot, state: State) -> Array:
+        """Inputs that a control decides."""
+        return self.plan.inputs(parameters, slot.step, state, slot.done, slot.fraction)
 
     def outcome(
         self, numbers: Numbers, varied: list[Array], slot: Slot, state: State, u: Any, y: Array
     ) -> tuple[Array, State]:
         """Residual of the slot's equations and the state at its end."""
         system, parameters, dt = numbers.whole(varied)
-        u = self.plan.inputs(parameters, slot.step, state) if u is None else u
+        u = self._inputs(parameters, slot, state) if u is None else u
         return advance(system, state, u, slot.fraction * dt, y, self.tableau)[:2]
 
     def prepared(self, numbers: Numbers, varied_dot: list[Array], slot: Slot, u_dot: Any) -> tuple:
@@ -153,7 +157,7 @@ class Rule:
         given, given_dot = (numbers.varied, slot.u), (varied_dot, u_dot)
         forcing = jax.jvp(lambda varied, u: at(varied, slot, slot.before, u, slot.y), given, given_dot)[1]
         system, parameters, dt = numbers.whole(numbers.varied)
-        u = self.plan.inputs(parameters, slot.step, slot.before) if slot.u is None else slot.u
+        u = self._inputs(parameters, slot, slot.before) if slot.u is None else slot.u
         h = slot.fraction * dt
         return along, linear_solver(system, slot.before, u, h, slot.y, self.tableau, along), forcing
 
@@ -255,7 +259,7 @@ class Rule:
 
         def renewed(numbers: Numbers, slot: Slot) -> Factors:
             system, parameters, dt = numbers.whole(numbers.varied)
-            u = self.plan.inputs(parameters, slot.step, slot.before) if slot.u is None else slot.u
+            u = self._inputs(parameters, slot, slot.before) if slot.u is None else slot.u
             equations = prepare(system, slot.before, u, slot.fraction * dt, self.tableau)
             form = system.structure.solver
             if form not in BY_DIFFERENCES:
@@ -339,7 +343,11 @@ def _run_slots_jvp(plan: Plan, primals: tuple, tangents: tuple):
     u = u_dot = None
     if plan.control is None:
         # Inputs are those of the slots, so that no slot sees all of them.
-        u, u_dot = (x[slots.step] for x in (parameters, _instantiated(parameters_dot, parameters)))
+        within = jax.vmap(plan.within_step)
+        u, u_dot = (
+            within(x[slots.step], slots.done, slots.fraction)
+            for x in (parameters, _instantiated(parameters_dot, parameters))
+        )
         numbers, varied_dot = Numbers.of((system, None, dt), (system_dot, None, dt_dot))
     else:
         numbers, varied_dot = Numbers.of((system, parameters, dt), (system_dot, parameters_dot, dt_dot))
@@ -349,7 +357,9 @@ def _run_slots_jvp(plan: Plan, primals: tuple, tangents: tuple):
     # Attempts that failed may hold anything: their maps are formed at rest, and then not used.
     sound = jnp.where(slots.accepted[:, None], slots.y, 0.0)
     record = Record(
-        numbers, Slot(before, sound, u, slots.step, slots.fraction, slots.accepted), ending.factors
+        numbers,
+        Slot(before, sound, u, slots.step, slots.fraction, slots.done, slots.accepted),
+        ending.factors,
     )
     rule = Rule(plan)
     changes, outputs = (varied_dot, u_dot, state_dot), (slots.states, slots.y)

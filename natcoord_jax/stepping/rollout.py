@@ -9,7 +9,7 @@ The derivative of a rollout runs along its recorded slots, see `derivative`.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import partial, reduce
 from typing import Any
 
 import equinox as eqx
@@ -22,7 +22,7 @@ from natcoord_jax.assembly.equations import prepare
 from natcoord_jax.assembly.system import System
 from natcoord_jax.core.results import Result
 from natcoord_jax.core.state import State
-from natcoord_jax.maths.collocation import gauss
+from natcoord_jax.maths.collocation import Tableau, gauss
 from natcoord_jax.maths.rows import with_row
 from natcoord_jax.stepping.newton import (
     PATIENCE,
@@ -57,7 +57,7 @@ class Plan:
         tolerance: of Newton's iteration.
         control: function (parameters, step index, t, state) to inputs; None: they are parameters[step].
         event: function of the state whose change of sign ends the run, or None.
-        stages: stages of the collocation method.
+        tableau: of the collocation method.
     """
 
     steps: int
@@ -65,13 +65,28 @@ class Plan:
     tolerance: float
     control: Callable[[Any, Array, Array, State], Array] | None
     event: Callable[[State], Array] | None = None
-    stages: int = 1
+    tableau: Tableau = gauss(1)
 
-    def inputs(self, parameters: Any, step: Array, state: State) -> Float[Array, " inputs"]:
-        """Inputs of a (sub)step that starts at a state."""
+    def inputs(
+        self, parameters: Any, step: Array, state: State, done: Array, fraction: Array
+    ) -> Float[Array, " inputs"] | Float[Array, "s inputs"]:
+        """Inputs of a (sub)step that starts at a state, after a part `done` of its step."""
         if self.control is None:
-            return parameters[step]
+            return self.within_step(parameters[step], done, fraction)
         return self.control(parameters, step, state.t, state)
+
+    def within_step(self, inputs: Array, done: Array, fraction: Array) -> Array:
+        """Inputs of a part of a step from those of the whole one: held, or interpolated from its stages."""
+        if inputs.ndim == 1:
+            return inputs
+        nodes = self.tableau.c
+        times = done + fraction * jnp.asarray(nodes)
+        columns = []
+        for j, node in enumerate(nodes):
+            others = [(times - other) / (node - other) for k, other in enumerate(nodes) if k != j]
+            columns.append(reduce(jnp.multiply, others, jnp.ones_like(times)))
+        weights = jnp.where(fraction == 1.0, jnp.eye(len(nodes)), jnp.stack(columns, axis=1))
+        return weights @ inputs
 
 
 class Slots(eqx.Module):
@@ -82,6 +97,7 @@ class Slots(eqx.Module):
         y: unknowns of each attempt.
         step: step each slot belongs to.
         fraction: its part of the step.
+        done: the part of the step before it.
         accepted: whether the attempt succeeded.
         finished: steps completed after the slot.
     """
@@ -90,6 +106,7 @@ class Slots(eqx.Module):
     y: Float[Array, "*slots unknowns"]
     step: Int[Array, "*slots"]
     fraction: Float[Array, "*slots"]
+    done: Float[Array, "*slots"]
     accepted: Bool[Array, "*slots"]
     finished: Int[Array, "*slots"]
 
@@ -131,7 +148,8 @@ class Setting(eqx.Module):
         """Inputs, length and number of the (sub)step at hand."""
         h = jnp.where(self.over(course), 1e-3, course.fraction * self.dt)
         index = jnp.minimum(course.step, self.plan.steps - 1)
-        return self.plan.inputs(self.parameters, index, course.state), h, index
+        u = self.plan.inputs(self.parameters, index, course.state, course.done, course.fraction)
+        return u, h, index
 
     @property
     def form(self) -> str:
@@ -141,8 +159,8 @@ class Setting(eqx.Module):
 
 def _start(setting: Setting, state: State) -> tuple[Course, Factors]:
     dt, plan = setting.dt, setting.plan
-    u = plan.inputs(setting.parameters, jnp.array(0), state)
-    equations = prepare(setting.system, state, u, dt, gauss(plan.stages))
+    u = plan.inputs(setting.parameters, jnp.array(0), state, jnp.zeros(()), jnp.ones(()))
+    equations = prepare(setting.system, state, u, dt, plan.tableau)
     it, factors = begin(equations.guess()), no_factors(equations, setting.form)
     zero, nought = jnp.array(0), jnp.zeros((), state.q.dtype)
     bad = ~(jnp.isfinite(dt) & (dt > 0))
@@ -222,7 +240,7 @@ def _trip(setting: Setting, unpack: Callable[[Array], State], carried: Carried) 
     course = _with_state(carried.course, unpack(carried.state))
     it, over = course.it, setting.over(course)
     u, h, index = setting.situation(course)
-    equations = prepare(setting.system, course.state, u, h, gauss(plan.stages))
+    equations = prepare(setting.system, course.state, u, h, plan.tableau)
     found = equations.evaluate(it.y if probe is None else probe.moved(it.y, equations))
     probing = jnp.array(False) if probe is None else probe.at >= 0
     driven = any(group.multipliers and group.effect.works for group in equations.groups)
@@ -235,12 +253,12 @@ def _trip(setting: Setting, unpack: Callable[[Array], State], carried: Carried) 
     def ended(carry: tuple) -> tuple:
         _, before, x, record = carry
         before = _with_state(before, unpack(x))
-        groups, tableau = equations.groups, gauss(plan.stages)
+        groups, tableau = equations.groups, plan.tableau
         ends = end_of_step(setting.system, before.state, h, groups, found, tableau)
         after = _end(setting, before, factors.inertias, ends)
         accepted = after.taken > before.taken
         x = ravel_pytree(after.state)[0]
-        slot = x, before.it.y, index, before.fraction, accepted, after.step
+        slot = x, before.it.y, index, before.fraction, before.done, accepted, after.step
         record = tuple(with_row(b, carried.count, r) for b, r in zip(record, slot))
         return jnp.array(False), _with_state(after, None), x, record
 
@@ -291,7 +309,7 @@ def run(plan: Plan, system: System, state: State, parameters: Any, dt: Array) ->
     def every_slot(course: Course, factors: Factors, x: Array) -> Carried:
         it = course.it
         probe = Probe.first(it.y.shape[0], x.dtype) if setting.form in BY_DIFFERENCES else None
-        slot = x, it.y, course.step, course.fraction, course.stopped, course.step
+        slot = x, it.y, course.step, course.fraction, course.done, course.stopped, course.step
         record = tuple(jnp.zeros((length, *x.shape), x.dtype) for x in slot)
         start = Carried(jnp.array(0), course, x, factors, probe, record)
         return jax.lax.while_loop(unfinished, partial(_trip, setting, unpack), start)

@@ -20,6 +20,7 @@ from natcoord_jax.stepping import one_kernel
 from natcoord_jax.stepping.derivative import run_slots
 from natcoord_jax.stepping.newton import TOLERANCE
 from natcoord_jax.stepping.rollout import Plan, Slots
+from natcoord_jax.stepping.scheme import SECOND_ORDER, EnergyMomentum
 
 SEGMENT = 512
 """Longest segment of a rollout that does not save every step, or that is checkpointed."""
@@ -34,8 +35,8 @@ def _checked_step(dt: Any) -> Float[Array, ""]:
     return step
 
 
-def _checked_inputs(system: System, inputs: Any, steps: int | None) -> tuple[Any, int]:
-    """Inputs as an array (steps, inputs) or a callable, and the number of steps."""
+def _checked_inputs(system: System, inputs: Any, steps: int | None, stages: int = 1) -> tuple[Any, int]:
+    """Inputs as an array (steps, [stages,] inputs) or a callable, and the number of steps."""
     names = system.structure.inputs
     if steps is not None and (not isinstance(steps, int | np.integer) or steps < 1):
         raise ValueError(f"steps is {steps!r}; pass a positive integer")
@@ -51,8 +52,10 @@ def _checked_inputs(system: System, inputs: Any, steps: int | None) -> tuple[Any
     if array.shape == (len(names),) and steps is not None:
         array = jnp.broadcast_to(array, (steps, len(names)))
     counted = array.shape[0] if array.ndim else 0
-    if array.ndim != 2 or array.shape[1] != len(names) or counted != (steps or counted) or counted == 0:
-        wanted = f"({steps if steps is not None else 'steps'}, {len(names)})"
+    shapes = (len(names),), (stages, len(names))
+    if array.shape[1:] not in shapes or counted != (steps or counted) or counted == 0:
+        first = steps if steps is not None else "steps"
+        wanted = f"({first}, {len(names)})" + f" or ({first}, {stages}, {len(names)})" * (stages > 1)
         raise ValueError(
             f"inputs has shape {array.shape}; this system has the input channels {list(names)}: pass shape "
             f"{wanted}, or a function (t, state) -> ({len(names)},)"
@@ -97,7 +100,9 @@ def _rollout(
     tolerance: float,
     extra_substeps: int,
     until: Callable | None,
+    scheme: EnergyMomentum,
 ) -> Trajectory:
+    tableau = scheme.tableau
     length = _segments(steps, save_every, checkpoint)
     if callable(inputs):
         # A policy may be a module with numbers of its own, which has no hash while it is traced.
@@ -105,8 +110,8 @@ def _rollout(
         control, every_segment = partial(_by_policy, policy), constants
         pieces = jax.tree.map(lambda x: jnp.broadcast_to(x, (steps // length, *x.shape)), every_segment)
     else:
-        control, pieces = None, inputs.reshape(steps // length, length, inputs.shape[1])
-    plan = Plan(length, extra_substeps, tolerance, control, until)
+        control, pieces = None, inputs.reshape(steps // length, length, *inputs.shape[1:])
+    plan = Plan(length, extra_substeps, tolerance, control, until, tableau)
 
     def segment(carry, parameters):
         state, code, failed = carry
@@ -120,7 +125,10 @@ def _rollout(
             saved = jax.tree.map(lambda x, s: jnp.where(running, x, s), saved, state)
         after = jax.tree.map(keep, course.state, state)
         starts = jax.tree.map(lambda x: x[jnp.maximum(picked - 1, 0)], slots.states)
-        used = jax.vmap(lambda k, s: plan.inputs(parameters, slots.step[k], s))(picked, starts)
+        whole = jnp.zeros(()), jnp.ones(())
+        used = jax.vmap(lambda k, s: plan.inputs(parameters, slots.step[k], s, *whole))(picked, starts)
+        if used.ndim == 3:
+            used = jnp.einsum("j,kji->ki", jnp.asarray(tableau.b), used)
         code = keep(course.code, code)
         worst = keep(course.worst, failed[2])
         failed = (failed[0] + jnp.where(running, course.step, 0), keep(course.state.t, failed[1]), worst)
@@ -155,6 +163,7 @@ def _rollout(
         jnp.sum(taken),
         jnp.sum(iterations),
         jnp.max(iterations_max),
+        scheme,
     )
 
 
@@ -187,8 +196,9 @@ def simulate(
     checkpoint: bool = False,
     newton_tol: float = TOLERANCE,
     extra_substeps: int = 16,
+    scheme: EnergyMomentum = SECOND_ORDER,
 ) -> Trajectory:
-    """Simulate with the energy-momentum step (57).
+    """Simulate with the energy-momentum step (57), or with its relatives of higher order.
 
     Works under `jit`, `vmap`, `grad`, `jvp` and their compositions up to one reverse mode; `dt` and every
     floating leaf of `system`, `state` and `inputs` can be differentiated.
@@ -199,7 +209,9 @@ def simulate(
         dt: step [s].
         steps: number of steps; may be left out when `inputs` is an array.
         inputs: array (steps, inputs) [N, N m], held over each step; (inputs,) for constant ones; or a
-            function (t, state) -> (inputs,), evaluated at the start of each (sub)step. None: zero.
+            function (t, state) -> (inputs,), evaluated at the start of each (sub)step. None: zero. Held
+            inputs that stand for smooth ones limit the order to two: give an array (steps, stages, inputs)
+            at the times `scheme.times` instead.
         save_every: save every so many steps; must divide `steps`.
         throw: raise on failure when called eagerly; inside jit, vmap or grad nothing is raised, see
             `Trajectory.result` and `System.explain`.
@@ -210,6 +222,7 @@ def simulate(
             the floor of round-off; larger values are faster and let energy and momentum drift in proportion.
         extra_substeps: how many substeps may be spent on steps that fail and are repeated with half the
             substep (per segment of at most 512 steps where not every step is saved).
+        scheme: the scheme, by default that of order two.
 
     Returns:
         Trajectory with `steps / save_every + 1` saved states.
@@ -230,10 +243,10 @@ def simulate(
     """
     _check_state(system, state)
     step = _checked_step(dt)
-    checked, count = _checked_inputs(system, inputs, steps)
+    checked, count = _checked_inputs(system, inputs, steps, scheme.stages)
     if save_every < 1 or count % save_every:
         raise ValueError(f"save_every is {save_every}; pass a positive divisor of steps = {count}")
-    static = (count, int(save_every), checkpoint, newton_tol, int(extra_substeps), until)
+    static = (count, int(save_every), checkpoint, newton_tol, int(extra_substeps), until, scheme)
     arrays = eqx.filter((system, state, checked, step), eqx.is_array)
     outermost = at_top_level(arrays) and jax.default_backend() == "cpu"
     compiled = _compiled_quickly if outermost else _compiled_within
@@ -255,14 +268,20 @@ def simulate(
 
 
 @eqx.filter_jit
-def _one_step(system, state, u, dt, tolerance, extra):
-    plan = Plan(1, extra, tolerance, None)
+def _one_step(system, state, u, dt, tolerance, extra, tableau):
+    plan = Plan(1, extra, tolerance, None, None, tableau)
     course = run_slots(plan, system, state, u[None], dt)[1].course
     return course.state, course.code
 
 
 def step(
-    system: System, state: State, u: Any = None, dt: Any = None, *, newton_tol: float = TOLERANCE
+    system: System,
+    state: State,
+    u: Any = None,
+    dt: Any = None,
+    *,
+    newton_tol: float = TOLERANCE,
+    scheme: EnergyMomentum = SECOND_ORDER,
 ) -> State:
     """One energy-momentum step (57), differentiable in everything.
 
@@ -272,6 +291,7 @@ def step(
         u: inputs held over the step, shape (inputs,) [N, N m]; None: zero.
         dt: step [s].
         newton_tol: see `simulate`.
+        scheme: see `simulate`.
 
     Returns:
         State at the end; all NaN if the step failed (an eager call raises instead).
@@ -292,7 +312,7 @@ def step(
     _check_state(system, state)
     h = _checked_step(dt)
     inputs, _ = _checked_inputs(system, None if u is None else jnp.asarray(u, float)[None], 1)
-    after, code = _one_step(system, state, inputs[0], h, newton_tol, 16)
+    after, code = _one_step(system, state, inputs[0], h, newton_tol, 16, scheme.tableau)
     if is_concrete(code):
         result = Result(int(code))
         if not result.ok:

@@ -7,26 +7,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from natcoord_jax.assembly.coordinates import stage_rates
 from natcoord_jax.assembly.equations import prepare
-from natcoord_jax.assembly.response import Evaluation, Stations
-from natcoord_jax.assembly.system import CoordinateGroup, Group, System
-from natcoord_jax.core.coordinate import pair_motion
-from natcoord_jax.core.effect import Motion
+from natcoord_jax.assembly.response import Evaluation
+from natcoord_jax.assembly.system import Group, System
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import Tableau
-from natcoord_jax.stepping.factorise import differentiable_solver
-
-
-def _coordinate_rates(group: CoordinateGroup, system: System, at: Stations, h: Array) -> Float[Array, "s n"]:
-    """Rates of joint coordinates whose sum over the stages is the exact increment over h."""
-    bodies = system.joint_bodies[group.joints]
-
-    def one(place, start, rows, rates, spin):
-        return group.axis.unit_load(pair_motion(place, Motion(start, rows, rates, spin), 0), h).rate
-
-    motion = at.start[bodies], at.rows[:, bodies], at.rates[:, bodies], at.spin[:, bodies]
-    with jax.named_scope("joint_coordinates"):
-        return jax.vmap(one, in_axes=(0, 0, 1, 1, 1), out_axes=1)(system.frames[group.joints], *motion)
+from natcoord_jax.stepping.factorise import dense_differentiable, differentiable_solver
 
 
 def advance(
@@ -49,33 +36,54 @@ def end_of_step(
     """State at the end of a step from its solved equations, and the largest half turn.
 
     Positions and velocities are advanced by increments (section 6 of the paper, written for stages):
-    q_1 = q_0 + h sum b_i V_i and v_1 = v_0 + sum beta_i (V_i - v_0).
+    q_1 = q_0 + h sum b_i V_i and v_1 = v_0 + sum beta_i (V_i - v_0), the latter without kicks.
     """
     at = found.at
     bodies = len(system.structure.bodies)
     rates = at.rates[:, :bodies].reshape(tableau.stages, 4 * bodies, 3)
     b, beta = jnp.asarray(tableau.b), jnp.asarray(tableau.beta)
     q = state.q + h * jnp.tensordot(b, rates, 1)
-    v = state.v + jnp.tensordot(beta, rates - state.v, 1)
-    coordinates, rotors, work = state.coordinates, state.rates, state.work
-    # Groups own consecutive pieces of the stored rates and of the work account, in order.
-    stage_rates = jnp.zeros((tableau.stages, 0), q.dtype)
+    coordinates, work = state.coordinates, state.work
+    turning = stage_rates(system, at, h)
     if system.coordinates:
-        every = [_coordinate_rates(group, system, at, h) for group in system.coordinates]
-        stage_rates = jnp.concatenate(every, axis=1)[:, system.coordinate_order]
-        coordinates = coordinates + h * (b @ stage_rates)
-    turning, working = [], []
+        coordinates = coordinates + h * (b @ turning)
+    if found.kicked is None:
+        v = state.v + jnp.tensordot(beta, rates - state.v, 1)
+        rotors = state.rates
+        carrying = [g.coordinates[:, 0] for g in groups if g.effect.rotors]
+        if carrying:
+            # Groups own consecutive pieces of the stored rates, in order.
+            rotors = rotors + beta @ (turning[:, jnp.concatenate(carrying)] - rotors)
+    else:
+        v, rotors = found.kicked.end.rows.reshape(state.v.shape), found.kicked.end.rotors
+    working, relation = [], 0
     for group, power in zip(groups, found.power):
-        if group.effect.rotors:
-            inner = stage_rates[:, group.coordinates[:, 0]] - rotors[group.rotors[:, 0]]
-            turning.append(beta @ inner)
         if group.effect.works:
-            working.append((1.0 if group.effect.impulsive else h) * (power @ b))
-    rotors = rotors + jnp.concatenate(turning) if turning else rotors
+            done = (1.0 if group.effect.impulsive else h) * (power @ b)
+            if group.multipliers and found.kicked is not None:
+                done = done + found.kicked.work[relation : relation + group.count]
+            working.append(done)
+        if group.multipliers and group.source != "joint":
+            relation += group.count * group.multipliers
+    # The same of the work account.
     work = work + jnp.concatenate(working) if working else work
     after = State(state.t + h, q, v, coordinates, rotors, work)
-    half_turn = 0.5 * h * jnp.sqrt(jnp.max(jnp.sum(at.spin[:, :bodies] ** 2, axis=-1)))
+    half_turn = _half_turn(at.spin[:, :bodies], h, tableau)
+    if found.kicked is not None:
+        half_turn = jnp.where(found.kicked.sound, half_turn, jnp.inf)
     return after, half_turn
+
+
+def _half_turn(spin: Float[Array, "s bodies 3"], h: Array, tableau: Tableau) -> Float[Array, ""]:
+    """Tangent of half the largest angle that a body turns by, infinite from half a turn on.
+
+    Cayley's rotation has |h omega / 2| itself for it; stages sum up to the angle nearly.
+    """
+    rates = jnp.sqrt(jnp.sum(spin**2, axis=-1))
+    if tableau.stages == 1:
+        return 0.5 * h * jnp.max(rates)
+    half = 0.5 * h * jnp.max(jnp.asarray(tableau.b) @ rates)
+    return jnp.where(half < 0.5 * jnp.pi, jnp.tan(half), jnp.inf)
 
 
 def linear_solver(
@@ -93,8 +101,8 @@ def linear_solver(
         along: linear map of (state, unknowns) to (residual, state at the end), for dense Jacobians.
     """
     equations = prepare(system, state, u, h, tableau)
-    if system.structure.solver == "recursive":
+    if system.structure.solver == "recursive" and not tableau.kick:
         return differentiable_solver(equations, equations.jacobian(y))
     at_rest = jax.tree.map(jnp.zeros_like, state)
     columns = jax.vmap(lambda unit: along(at_rest, unit)[0], out_axes=1)(jnp.eye(y.shape[0], dtype=y.dtype))
-    return differentiable_solver(equations, columns)
+    return dense_differentiable(equations, columns)

@@ -1,15 +1,16 @@
 """The coordinates of joints: angles counted over many turns, displacements, lengths."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from natcoord_jax.core.coordinate import Coordinate, PairMotion, UnitLoad
+from natcoord_jax.core.coordinate import Coordinate, PairMotion, UnitLoad, unit_load_of
 from natcoord_jax.core.joint import Frame
 from natcoord_jax.maths.rotations import arctan_quotient
-from natcoord_jax.maths.vectors import cross, dot, safe_divide, safe_norm
+from natcoord_jax.maths.vectors import cross, dot, safe_divide, safe_norm, safe_sqrt
 
 
 def _pair(torque: Array) -> Array:
@@ -41,9 +42,15 @@ def _turn(carrier_spin: Array, axis: Array, rate: Array, h: Array) -> tuple[Arra
     return quotient * rate, quotient * square / (1.0 + along**2)
 
 
-def _single_stage(pair: PairMotion) -> None:
-    if pair.parent_spin.shape[0] != 1:
-        raise NotImplementedError("angles of joints are formulated for one stage; use stages=1")
+def _stages(pair: PairMotion) -> int:
+    return pair.parent_spin.shape[0]
+
+
+def _turned(invariants: Callable[[Frame, Frame], Array], pair: PairMotion, h: Array) -> UnitLoad:
+    """Unit load of an angle with the given (cosine, sine), for several stages; at most half a turn a step."""
+    c, s = invariants(pair.parent_start, pair.child_start)
+    # From the start on, so that the angle never jumps.
+    return unit_load_of(invariants, lambda x: jnp.arctan2(c * x[1] - s * x[0], c * x[0] + s * x[1]), pair, h)
 
 
 @dataclass(frozen=True)
@@ -54,18 +61,23 @@ class Angle(Coordinate):
 
     def unit_load(self, pair: PairMotion, h: Array) -> UnitLoad:
         """Torque along the mid-point axis, scaled so that its work per radian turned is one."""
-        _single_stage(pair)
+        if _stages(pair) > 1:
+            return _turned(self._cosine_sine, pair, h)
         start, middle = pair.parent_start.axes[self.axis], pair.parent.axes[0, self.axis]
         relative = pair.child_spin[0] - pair.parent_spin[0]
         along = dot(middle, relative) / dot(middle, middle)
         rate, quotient = _turn(pair.parent_spin[0], start, along, h)
         return UnitLoad(rate[None], None, _pair(quotient * middle))
 
-    def value(self, parent: Frame, child: Frame) -> Array:
-        """Angle in (-pi, pi]."""
+    def _cosine_sine(self, parent: Frame, child: Frame) -> Array:
         first, second = parent.axes[(self.axis + 1) % 3], parent.axes[(self.axis + 2) % 3]
         moving = child.axes[(self.axis + 1) % 3]
-        return jnp.arctan2(dot(second, moving), dot(first, moving))
+        return jnp.stack([dot(first, moving), dot(second, moving)])
+
+    def value(self, parent: Frame, child: Frame) -> Array:
+        """Angle in (-pi, pi]."""
+        cosine, sine = self._cosine_sine(parent, child)
+        return jnp.arctan2(sine, cosine)
 
     def rate(
         self, parent: Frame, child: Frame, parent_rate: Frame, child_rate: Frame, relative_spin: Array
@@ -86,7 +98,8 @@ class UniversalAngle(Coordinate):
 
     def unit_load(self, pair: PairMotion, h: Array) -> UnitLoad:
         """Torque along the reciprocal of the mid-point axis, scaled to unit work."""
-        _single_stage(pair)
+        if _stages(pair) > 1:
+            return _turned(self._cosine_sine, pair, h)
         a0, a = pair.parent_start.axes[2], pair.parent.axes[0, 2]
         b0, b = pair.child_start.axes[0], pair.child.axes[0, 0]
         relative = pair.child_spin[0] - pair.parent_spin[0]
@@ -101,13 +114,17 @@ class UniversalAngle(Coordinate):
             torque = quotient * dot(a, a) * reciprocal_a
         return UnitLoad(rate[None], None, _pair(torque))
 
-    def value(self, parent: Frame, child: Frame) -> Array:
-        """Angle in (-pi, pi]."""
+    def _cosine_sine(self, parent: Frame, child: Frame) -> Array:
         if self.second:
             along = parent.axes[2]
-            return jnp.arctan2(dot(child.axes[1], along), dot(child.axes[2], along))
+            return jnp.stack([dot(child.axes[2], along), dot(child.axes[1], along)])
         moving = child.axes[0]
-        return jnp.arctan2(dot(parent.axes[1], moving), dot(parent.axes[0], moving))
+        return jnp.stack([dot(parent.axes[0], moving), dot(parent.axes[1], moving)])
+
+    def value(self, parent: Frame, child: Frame) -> Array:
+        """Angle in (-pi, pi]."""
+        cosine, sine = self._cosine_sine(parent, child)
+        return jnp.arctan2(sine, cosine)
 
     def rate(
         self, parent: Frame, child: Frame, parent_rate: Frame, child_rate: Frame, relative_spin: Array
@@ -148,6 +165,11 @@ class Displacement(Coordinate):
         return dot(parent.axes[self.axis], rate_u) + dot(parent_rate.axes[self.axis], u)
 
 
+def _squared_length(parent: Frame, child: Frame) -> Array:
+    u = child.point - parent.point
+    return dot(u, u)[None]
+
+
 @dataclass(frozen=True)
 class Separation(Coordinate):
     """Distance between the two points of a joint [m], from the exact discrete gradient of the root."""
@@ -156,7 +178,8 @@ class Separation(Coordinate):
 
     def unit_load(self, pair: PairMotion, h: Array) -> UnitLoad:
         """Forces along the mid-point line, divided by the mean of the two lengths."""
-        _single_stage(pair)
+        if _stages(pair) > 1:
+            return unit_load_of(_squared_length, lambda x: safe_sqrt(x[0]), pair, h)
         start = safe_norm(pair.child_start.point - pair.parent_start.point)
         u = (pair.child.point - pair.parent.point)[0]
         rate_u = (pair.child_rate.point - pair.parent_rate.point)[0]

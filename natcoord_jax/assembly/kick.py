@@ -1,0 +1,293 @@
+"""Isometric kicks along the normals of the constraints, which keep velocities tangent at any order.
+
+Collocation keeps positions on the constraints, not velocities. Before the stages the velocity v_0 gets a
+normal part n_0, after them it gives it back:
+
+    v_+ = v_0 + n_0,    v_1 = v_- - sigma U n_0,    sigma = -R(infinity),
+
+with U an isometry (in the metric of the mass) from the normals at q_0 to those at q_1, and n_0 such that v_1
+is tangent. |U n_0| = |n_0|, so the energy is untouched; normals carry neither momentum nor angular momentum.
+With frames P^ of the tangents that are orthonormal in the metric, and K = P^_0^T M P^_1,
+
+    U n = n - (P^_0 + P^_1) (1 + K^T)^-1 P^_1^T M n,
+
+whose inverse is the same with the ends exchanged. n_0 follows without iteration from c = sum beta_i V_i,
+d = sigma c - v_0, b_0 = P^_0^T M d and b_1 = P^_1^T M d:
+
+    (1 + 2 K + K K^T) u = K b_1 - b_0,    n_0 = 1/2 (d - P^_1 (b_1 - 2 u - K^T u) + P^_0 u).
+
+Frames are functions of the configuration: P X^T with the null space P of the spanning tree and X its inverse
+Cholesky factor, X P^T M P X^T = 1. Where constraints close loops, the tangents are a subspace of that; its
+basis at q_1 is that at q_0 moved by the direct rotation between the two subspaces, so that no basis has to be
+chosen, and redundant constraints are no special case.
+"""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from natcoord_jax.assembly.balances import Balances, with_rest
+from natcoord_jax.assembly.coordinates import stage_rates
+from natcoord_jax.assembly.momentum import inertia, wrench
+from natcoord_jax.assembly.rates import row_rates
+from natcoord_jax.assembly.response import Situation, Stations
+from natcoord_jax.assembly.system import Group, System
+from natcoord_jax.core.effect import replace_fields
+from natcoord_jax.core.state import State
+from natcoord_jax.maths.collocation import Tableau
+from natcoord_jax.maths.elimination import definite_inverse, inverse_cholesky
+from natcoord_jax.maths.projectors import range_projector
+
+POLISHING = 9
+"""Newton-Schulz iterations for the direct rotation of subspaces: enough for cosines from 0.4 on."""
+
+
+LARGEST = 0.5
+"""Kinetic energy of a kick in terms of that of the motion, twice, beyond which a step is refused."""
+
+UNSOUND = 1e-11
+"""Energy made by kicks in terms of that of the motion, beyond which a step is refused."""
+
+
+class Velocity(eqx.Module):
+    """Velocities of all rows, and rates of the joint coordinates that carry rotors (or impulses on both)."""
+
+    rows: Float[Array, "*u bodies 4 3"]
+    rotors: Float[Array, "*u rotors"]
+
+
+class TangentSpace(eqx.Module):
+    """Velocities that the constraints admit at one configuration.
+
+    Attributes:
+        balances: inertia and constraints there; the null space P of the tree.
+        columns: P, one free motion after the other.
+        impulses: M P.
+        inertias: of the rotors.
+        frame: X, with X P^T M P X^T = 1.
+        subspace: projector on what the constraints outside the tree admit, in the frame; None: everything.
+        lift: rates of the smallest energy per unit rate of the constraints.
+        prescribed: rates that drives prescribe, zero for all other constraints.
+    """
+
+    balances: Balances
+    columns: Velocity
+    impulses: Velocity
+    inertias: Float[Array, " rotors"]
+    frame: Float[Array, "u u"]
+    subspace: Float[Array, "u u"] | None
+    lift: Float[Array, "u c"]
+    prescribed: Float[Array, " c"]
+
+    @classmethod
+    def at(cls, system: System, state: State) -> "TangentSpace":
+        """The tangent space of a state; its velocities play no part."""
+        balances, inertias = Balances.at(system, state), rotor_inertias(system)
+        gains = balances.columns()
+        columns = Velocity(gains.rows, gains.rotors)
+        impulses = Velocity(inertia(system.mass, gains.rows), inertias * gains.rotors)
+        frame = jnp.eye(gains.rows.shape[0], dtype=state.q.dtype)
+        lift = jnp.zeros((frame.shape[0], gains.constraints.shape[1]), frame.dtype)
+        plain = cls(balances, columns, impulses, inertias, frame, None, lift, jnp.zeros(lift.shape[1]))
+        plain = replace_fields(plain, frame=inverse_cholesky(plain.pulled(impulses) + _idle(balances)))
+        return _constrained(plain, gains.constraints.T) if gains.constraints.shape[1] else plain
+
+    def within(self, y: Float[Array, " u"]) -> Float[Array, " u"]:
+        """The part of a vector in the frame that the constraints admit."""
+        return y if self.subspace is None else self.subspace @ y
+
+    def framed(self, v: Velocity) -> Float[Array, " u"]:
+        """Components of a velocity along the frame, X P^T M v."""
+        return self.frame @ self.pulled(self.impulse(v))
+
+    def along(self, y: Float[Array, " u"]) -> Velocity:
+        """Velocity with given components along the frame."""
+        return self.spread(self.frame.T @ y)
+
+    def spread(self, w: Float[Array, " u"]) -> Velocity:
+        """P w."""
+        velocity, spin = self.balances.twists(w)
+        along = self.balances.rotors
+        turning = jnp.sum(along[0] * with_rest(velocity), (1, 2)) + jnp.sum(
+            along[1] * with_rest(spin), (1, 2)
+        )
+        return Velocity(row_rates(self.balances.rows, velocity, spin), turning)
+
+    def impulse(self, v: Velocity) -> Velocity:
+        """M v."""
+        return Velocity(inertia(self.balances.system.mass, v.rows), self.inertias * v.rotors)
+
+    def energy(self, v: Velocity) -> Float[Array, ""]:
+        """Kinetic energy [J]."""
+        impulse = self.impulse(v)
+        return 0.5 * (jnp.sum(impulse.rows * v.rows) + jnp.sum(impulse.rotors * v.rotors))
+
+    def pulled(self, impulse: Velocity) -> Float[Array, "u *k"]:
+        """P^T of impulses (with a leading axis: of several, to columns)."""
+        rows = impulse.rows.reshape(-1, *impulse.rows.shape[-3:])
+        force, torque = wrench(rows, self.balances.rows[None, :, 1:])
+        velocity, spin = self.balances.free
+        found = jnp.einsum("buc,kbc->uk", velocity, force) + jnp.einsum("buc,kbc->uk", spin, torque)
+        if self.inertias.shape[0]:
+            found = found + self.columns.rotors @ impulse.rotors.reshape(rows.shape[0], -1).T
+        return found if impulse.rows.ndim == 4 else found[:, 0]
+
+    @property
+    def drift(self) -> Float[Array, " u"]:
+        """Rates that drives prescribe, orthogonal to all admissible ones."""
+        return self.lift @ self.prescribed
+
+    def projected(self, v: Velocity) -> Velocity:
+        """Nearest velocity that the constraints admit."""
+        return self.spread(self.frame.T @ self.within(self.framed(v)) + self.drift)
+
+
+def rotor_inertias(system: System) -> Float[Array, " rotors"]:
+    """Inertias of all rotors."""
+    groups = [g for g in system.effects if g.effect.rotors]
+    parts = [jax.vmap(lambda e: e.inertia_of())(g.effect) for g in groups]
+    return jnp.concatenate([jnp.zeros(0, system.mass.dtype), *parts])
+
+
+def _idle(balances: Balances) -> Float[Array, "u u"]:
+    """A unit inertia for turns of point masses, which nothing else sees."""
+    massless = jnp.trace(balances.system.mass[:, 1:, 1:], axis1=1, axis2=2) <= 0
+    spin = jnp.where(massless[:, None, None], balances.free[1], 0.0)
+    return jnp.einsum("buc,bwc->uw", spin, spin)
+
+
+def _constrained(space: TangentSpace, matrix: Float[Array, "c u"]) -> TangentSpace:
+    """With the constraints of loops and relations, whose rates are the matrix times those of the tree."""
+    balances, structure = space.balances, space.balances.system.structure
+    prescribed = -balances.rates(jnp.zeros(matrix.shape[1], matrix.dtype)).constraints
+    framed = matrix @ space.frame.T
+    coupling = framed @ framed.T
+    if structure.rank is None:
+        inverse = definite_inverse(coupling)
+    else:
+        # What redundant rows never reach gets a unit matrix.
+        onto = range_projector(matrix, structure.rank)
+        idle = jnp.eye(matrix.shape[0], dtype=matrix.dtype) - onto
+        filled = onto @ coupling @ onto + idle * jnp.trace(coupling) / matrix.shape[0]
+        inverse = onto @ definite_inverse(filled) @ onto
+    back = framed.T @ inverse
+    subspace = jnp.eye(framed.shape[1], dtype=matrix.dtype) - back @ framed
+    subspace = 0.5 * (subspace + subspace.T)
+    return replace_fields(space, subspace=subspace, lift=space.frame.T @ back, prescribed=prescribed)
+
+
+class Kicked(eqx.Module):
+    """Velocities of a step with kicks.
+
+    Attributes:
+        start: v_+, what the stages begin with.
+        end: v_1.
+        work: work of the constraints in the two kicks, drives being the only ones that do any [J].
+        sound: whether the kicks are small against the motion and leave the energy alone. Far off, where the
+            tangents at the two ends are nearly orthogonal, the equations have solutions that are neither.
+    """
+
+    start: Velocity
+    end: Velocity
+    work: Float[Array, " c"]
+    sound: Bool[Array, ""]
+
+
+def kicked(
+    before: TangentSpace, state: State, at: Stations, turning: Array, h: Array, tableau: Tableau
+) -> Kicked:
+    """Velocities after the first kick and after the last.
+
+    Args:
+        before: tangent space at the start of the step.
+        state: at the start.
+        at: stage motion.
+        turning: stage rates of the rotors (s, rotors).
+        h: step [s].
+        tableau: the collocation method.
+    """
+    system = before.balances.system
+    rates = at.rates[:, :-1]
+    b, beta, sigma = jnp.asarray(tableau.b), jnp.asarray(tableau.beta), tableau.reflection
+    rows = before.balances.rows + h * jnp.tensordot(b, rates, 1)
+    q_end, t_end = rows.reshape(-1, 3), state.t + h
+    after = TangentSpace.at(system, State(t_end, q_end, q_end, state.coordinates, state.rates, state.work))
+    v = Velocity(state.v.reshape(-1, 4, 3), state.rates)
+    carried = Velocity(jnp.tensordot(beta, rates, 1), beta @ turning)
+    drift = after.spread(after.drift)
+    d = Velocity(
+        sigma * (carried.rows - drift.rows) - v.rows, sigma * (carried.rotors - drift.rotors) - v.rotors
+    )
+    kick = _kick(before, after, d)
+    start = Velocity(v.rows + kick.rows, v.rotors + kick.rotors)
+    last = Velocity(
+        start.rows + jnp.tensordot(beta, rates - start.rows, 1),
+        start.rotors + beta @ (turning - start.rotors),
+    )
+    end = after.projected(last)
+    work = before.prescribed * (before.lift.T @ before.pulled(before.impulse(kick)))
+    back = Velocity(end.rows - last.rows, end.rotors - last.rotors)
+    work = work + after.prescribed * (after.lift.T @ after.pulled(after.impulse(back)))
+    given, taken = (2.0 * space.energy(x) for space, x in ((before, kick), (after, back)))
+    moving = jnp.maximum(before.energy(start), after.energy(end))
+    missing = before.energy(start) - before.energy(v) + after.energy(end) - after.energy(last) - jnp.sum(work)
+    sound = (given <= LARGEST * moving) & (jnp.abs(missing) <= UNSOUND * (moving + taken))
+    return Kicked(start, end, work, sound)
+
+
+def _kick(before: TangentSpace, after: TangentSpace, d: Velocity) -> Velocity:
+    """n_0, see the head of the module."""
+    cosines = before.frame @ before.pulled(after.impulses) @ after.frame.T
+    b0, b1 = before.within(before.framed(d)), after.within(after.framed(d))
+    size = b0.shape[0]
+    moved = None
+    if before.subspace is not None and after.subspace is not None:
+        moved = _direct_rotation(before.subspace, after.subspace)
+        cosines, b1 = before.subspace @ cosines @ moved @ before.subspace, moved.T @ b1
+    matrix = jnp.eye(size, dtype=b0.dtype) + 2.0 * cosines + cosines @ cosines.T
+    u = definite_inverse(matrix) @ (cosines @ b1 - b0)
+    first, second = before.along(u), b1 - 2.0 * u - cosines.T @ u
+    last = after.along(second if moved is None else moved @ second)
+    return Velocity(0.5 * (d.rows + first.rows - last.rows), 0.5 * (d.rotors + first.rotors - last.rotors))
+
+
+def _direct_rotation(start: Float[Array, "u u"], end: Float[Array, "u u"]) -> Float[Array, "u u"]:
+    """The smallest rotation that takes one subspace to another, from their projectors."""
+    unit = jnp.eye(start.shape[0], dtype=start.dtype)
+    x = end @ start + (unit - end) @ (unit - start)
+    for _ in range(POLISHING):
+        x = 1.5 * x - 0.5 * x @ (x.T @ x)
+    return x
+
+
+def with_kicks(
+    before: TangentSpace | None,
+    state: State,
+    groups: Sequence[Group],
+    situations: Sequence[Situation],
+    at: Stations,
+    h: Array,
+    tableau: Tableau,
+) -> tuple[Array, Sequence[Situation], Kicked | None]:
+    """What the stages begin with: velocities of the rows, situations with rates of rotors; and both ends.
+
+    Without `before` there are no kicks.
+    """
+    velocity = state.v.reshape(-1, 4, 3)
+    if before is None:
+        return velocity, situations, None
+    carrying = [g.coordinates[:, 0] for g in groups if g.effect.rotors]
+    turning = jnp.zeros((tableau.stages, 0), velocity.dtype)
+    if carrying:
+        turning = stage_rates(before.balances.system, at, h)[:, jnp.concatenate(carrying)]
+    ends = kicked(before, state, at, turning, h, tableau)
+    situations = [
+        eqx.tree_at(lambda s: s.rates, where, ends.start.rotors[group.rotors])
+        if group.effect.rotors
+        else where
+        for group, where in zip(groups, situations)
+    ]
+    return ends.start.rows, situations, ends

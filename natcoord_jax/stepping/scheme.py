@@ -1,0 +1,72 @@
+"""The schemes that `simulate` and `step` can use."""
+
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from natcoord_jax.maths.collocation import Tableau, gauss
+
+LARGEST = 10
+"""Largest order of the energy-momentum family."""
+
+
+@dataclass(frozen=True)
+class EnergyMomentum:
+    """The energy-momentum family: Gauss collocation in the null space of the constraints.
+
+    Order two is the one-stage step (57) of the paper. With s stages the order is 2 s, in positions and,
+    thanks to kicks along the normals of the constraints, in velocities; energy, momenta and constraints of
+    positions and of velocities hold to round-off at every order. Without kicks energy, momenta and
+    constraints of positions still do, but velocities obey their constraints only as accurately as the
+    scheme is, and lose orders.
+
+    Attributes:
+        order: 2, 4, 6, 8 or 10.
+        kick: whether velocities are kept tangent; None: from order four on.
+
+    Raises:
+        ValueError: for another order.
+
+    Example:
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import natcoord_jax as nc
+        >>> scene = nc.Scene()
+        >>> ball = scene.add(nc.RigidBody(mass=1.0, inertia=(1.0, 2.0, 3.0), angular_velocity=(0, 1, 0.1)))
+        >>> system, state = scene.compile()
+        >>> trajectory = nc.simulate(system, state, dt=0.1, steps=10, scheme=nc.EnergyMomentum(order=6))
+    """
+
+    order: int = 2
+    kick: bool | None = None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.order, int | np.integer) or self.order not in range(2, LARGEST + 1, 2):
+            raise ValueError(f"order is {self.order!r}; pass an even number from 2 to {LARGEST}")
+
+    @property
+    def tableau(self) -> Tableau:
+        """Coefficients of the method."""
+        return gauss(int(self.order) // 2, self.order > 2 if self.kick is None else bool(self.kick))
+
+    @property
+    def stages(self) -> int:
+        """Number of stages s."""
+        return int(self.order) // 2
+
+    def times(
+        self, dt: Float[Array, ""] | float, steps: int, start: float = 0.0
+    ) -> Float[Array, "steps stages"]:
+        """Times of the stages [s], where `simulate` takes inputs of shape (steps, stages, inputs).
+
+        Args:
+            dt: step [s].
+            steps: number of steps.
+            start: start time [s].
+        """
+        return start + dt * (jnp.arange(steps)[:, None] + jnp.asarray(self.tableau.c))
+
+
+SECOND_ORDER = EnergyMomentum()
+"""The step of the paper (57)."""

@@ -1,0 +1,212 @@
+"""The schemes of order four to ten: what is kept, and how fast errors fall."""
+
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import tolerances as tol
+from accounts import account
+from scenes import JOINTS, pair, with_multipliers
+
+import natcoord_jax as nc
+from natcoord_jax import gallery
+from natcoord_jax.maths.collocation import gauss, rotate_stages
+
+ORDERS = (2, 4, 6, 8, 10)
+USUAL = {
+    (4, "universal", "tree"),
+    (6, "screw", "tree"),
+    (6, "revolute", "multipliers"),
+    (4, "distance", "tree"),
+}
+EVERY_PAIR = [
+    pytest.param(order, joint, form, marks=[] if (order, joint, form) in USUAL else pytest.mark.slow)
+    for order in (4, 6)
+    for joint in JOINTS
+    for form in ("tree", "multipliers")
+    if order == 4 or (order, joint, form) in USUAL
+]
+
+
+def scheme(order: int) -> nc.EnergyMomentum:
+    return nc.EnergyMomentum(order=order)
+
+
+@pytest.mark.parametrize(("order", "joint", "form"), EVERY_PAIR)
+def test_everything_is_kept(order, joint, form):
+    kind = JOINTS[joint] if form == "tree" else with_multipliers(JOINTS[joint])
+    system, state = pair(kind)
+    trajectory = nc.simulate(system, state, dt=0.04, steps=250, scheme=scheme(order), extra_substeps=300)
+    found = account(system, trajectory)
+    assert found.turned >= 1.0
+    assert found.energy_error <= tol.ENERGY
+    assert found.spin_error(axes=[2]) <= tol.ANGULAR_MOMENTUM
+    assert max(found.directors, found.joints) <= tol.CONSTRAINT
+    errors = system.constraint_errors(trajectory)
+    assert max(float(jnp.max(x)) for x in jax.tree.leaves(errors)) <= tol.TANGENT
+
+
+def forced(order: int, steps: int):
+    """The paper's spacecraft under torques that change smoothly."""
+    example = craft()
+    method, dt = scheme(order), 2.0 / steps
+    times = method.times(dt, steps)
+    inputs = 300.0 * jnp.sin(jnp.stack([3 * times, 2 * times + 1, times - 1], axis=-1))
+    return nc.simulate(example.system, example.state, dt=dt, inputs=inputs, scheme=method)
+
+
+@cache
+def craft():
+    return gallery.load("spacecraft")
+
+
+@cache
+def reference():
+    return forced(10, 64)
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_order_of_a_forced_spacecraft(order):
+    wanted = reference()
+    steps = {2: 64, 4: 32, 6: 16, 8: 12, 10: 8}[order]
+    errors = []
+    for count in (steps, 2 * steps):
+        found = forced(order, count)
+        errors.append(
+            [float(jnp.max(jnp.abs(x[-1] - y[-1]))) for x, y in ((found.q, wanted.q), (found.v, wanted.v))]
+        )
+    observed = np.log2(np.divide(*errors))
+    assert np.all(np.abs(observed - order) <= tol.HIGH_ORDER_TOLERANCE * order), observed
+
+
+def swinging(stiffness, order=4, steps=20, **options):
+    """A pendulum with a torsion spring and a tether of large strain, as a function of the stiffness."""
+    scene = nc.Scene()
+    scene.add(nc.Gravity())
+    arm = scene.add(
+        nc.RigidBody(
+            mass=1.0, inertia=(0.1, 0.2, 0.3), com=(0.1, 0, 0), position=(0.5, 0, 0), name="arm",
+            angular_velocity=(0, 1.0, 0.2), velocity=(0, 0.1, -0.5),
+        )
+    )  # fmt: skip
+    hinge = scene.add(nc.Universal(nc.ground, arm, axis=(0, 1, 0), second=(0, 0, 1), name="hinge"))
+    scene.add(nc.JointSpring(hinge, coordinate=0, stiffness=stiffness, rest=0.3))
+    tether = (nc.Point(nc.ground, (0, 0.3, -0.4)), nc.Point(arm, (0.8, 0, 0)))
+    scene.add(nc.Spring(tether, stiffness=5.0 * stiffness, length=0.1))
+    scene.add(nc.JointDamper(hinge, coordinate=1, damping=0.1))
+    system, state = scene.compile()
+    return system, nc.simulate(system, state, dt=1.0 / steps, steps=steps, scheme=scheme(order), **options)
+
+
+@pytest.mark.parametrize("order", [4, 6])
+def test_order_with_springs_at_large_strain(order):
+    best = swinging(30.0, 8, 160)[1]
+    errors = [
+        [float(jnp.max(jnp.abs(x[-1] - y[-1]))) for x, y in ((found.q, best.q), (found.v, best.v))]
+        for found in (swinging(30.0, order, steps)[1] for steps in (40, 80))
+    ]
+    observed = np.log2(np.divide(*errors))
+    assert np.all(np.abs(observed - order) <= tol.HIGH_ORDER_TOLERANCE * order), observed
+
+
+def loss(stiffness, order=4):
+    trajectory = swinging(stiffness, order, throw=False)[1]
+    return jnp.sum(trajectory.q[-1, 0] ** 2) + 0.1 * jnp.sum(trajectory.v[-1] ** 3)
+
+
+AT, STEP = 8.0, 1e-3
+
+
+def fourth_order_difference(f):
+    """Derivative at `AT` by differences whose error falls with the fourth power of the step."""
+    values = [float(f(AT + k * STEP)) for k in (-2, -1, 1, 2)]
+    return (8 * (values[2] - values[1]) - (values[3] - values[0])) / (12 * STEP)
+
+
+def test_gradient_against_differences():
+    slope = float(jax.jit(jax.grad(loss))(AT))
+    assert slope == pytest.approx(fourth_order_difference(jax.jit(loss)), rel=tol.DIFFERENCE_BEST)
+
+
+@pytest.mark.slow
+def test_derivatives_in_every_mode():
+    gradient = jax.jit(jax.grad(loss))
+    slope = float(gradient(AT))
+    forward = jax.jit(lambda x: jax.jvp(loss, (x,), (1.0,))[1])
+    assert float(forward(AT)) == pytest.approx(slope, rel=tol.SAME_GRADIENT)
+    curvature = float(jax.jit(lambda x: jax.jvp(jax.grad(loss), (x,), (1.0,))[1])(AT))
+    assert curvature == pytest.approx(fourth_order_difference(gradient), rel=10 * tol.DIFFERENCE_BEST)
+    both = jax.jit(jax.vmap(jax.value_and_grad(loss)))(jnp.array([AT, AT + STEP]))
+    np.testing.assert_allclose(both[1], [slope, float(gradient(AT + STEP))], rtol=tol.SAME_GRADIENT)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["four_bar", "bricard", "robot_arm"])
+def test_derivatives_with_loops_and_drives(name):
+    example = gallery.load(name)
+
+    def last(scale, order=4):
+        system = example.system
+        system = system.__class__(**(vars(system) | {"mass": system.mass.at[0].multiply(scale)}))
+        found = nc.simulate(system, example.state, dt=0.02, steps=10, scheme=scheme(order), throw=False)
+        return jnp.sum(found.q[-1] ** 3) + 0.1 * jnp.sum(found.v[-1] ** 2)
+
+    h = 1e-3
+    values = [float(jax.jit(last)(1.0 + k * h)) for k in (-2, -1, 1, 2)]
+    difference = (8 * (values[2] - values[1]) - (values[3] - values[0])) / (12 * h)
+    scale = max(abs(difference), 1e-3)
+    for slope in (jax.grad(last)(1.0), jax.jvp(last, (1.0,), (1.0,))[1]):
+        assert abs(float(slope) - difference) <= tol.DIFFERENCE_BEST * 10 * scale
+
+
+def test_one_stage_with_kicks():
+    """The scheme of order two whose velocities are tangent, from a spin."""
+    example = craft()
+    system, start = example.system, nc.assemble(example.system, example.state)
+    spin = jnp.array([0.3, -0.2, 0.5])
+    rows = start.q.reshape(-1, 4, 3)
+    v = jnp.concatenate([jnp.cross(spin, rows[:, :1]), jnp.cross(spin, rows[:, 1:])], axis=1)
+    start = nc.State(start.t, start.q, v.reshape(start.v.shape), start.coordinates, start.rates, start.work)
+    torque = jnp.full(3, 50.0)
+    one = nc.EnergyMomentum(order=2, kick=True)
+    wanted = nc.simulate(system, start, dt=0.02, steps=50, inputs=jnp.tile(torque, (50, 1)), scheme=scheme(8))
+    errors = []
+    for steps in (25, 50):
+        found = nc.simulate(
+            system, start, dt=1 / steps, steps=steps, inputs=jnp.tile(torque, (steps, 1)), scheme=one
+        )
+        errors.append(float(jnp.max(jnp.abs(found.v[-1] - wanted.v[-1]))))
+        assert float(jnp.max(system.constraint_errors(found).velocity)) <= tol.TANGENT
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(2.0, abs=tol.ORDER_TOLERANCE)
+
+
+@pytest.mark.parametrize("stages", [1, 2, 3, 5])
+def test_stage_vectors_solve_their_equations(stages):
+    tableau = gauss(stages)
+    keys = jax.random.split(jax.random.key(stages))
+    turn = jax.random.normal(keys[0], (stages, 4, 1, 3))
+    start = jax.random.normal(keys[1], (1, 4, 3, 3))
+    found = rotate_stages(turn, start, tableau)
+    back = found - jnp.einsum("ij,j...->i...", jnp.asarray(tableau.a), jnp.cross(turn, found))
+    np.testing.assert_allclose(back, jnp.broadcast_to(start, back.shape), atol=1e-14)
+
+
+@pytest.mark.parametrize("order", [3, 0, 12])
+def test_other_orders_are_refused(order):
+    with pytest.raises(ValueError, match="even number from 2 to 10"):
+        nc.EnergyMomentum(order=order)
+
+
+@pytest.mark.parametrize("turn", [0.5, 1.0, 2.0])
+def test_large_steps_keep_energy(turn):
+    """A free body that turns by up to two radians a step."""
+    scene = nc.Scene()
+    scene.add(nc.RigidBody(mass=1.0, inertia=(1.0, 2.0, 2.5), angular_velocity=(0.1, 1.0, 0.1), name="body"))
+    system, state = scene.compile()
+    trajectory = nc.simulate(system, state, dt=turn, steps=200, scheme=scheme(6), extra_substeps=400)
+    found = account(system, trajectory)
+    assert found.energy_error <= tol.ENERGY
+    assert found.spin_error() <= tol.ANGULAR_MOMENTUM
+    assert found.directors <= tol.CONSTRAINT
