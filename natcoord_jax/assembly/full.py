@@ -15,7 +15,7 @@ from natcoord_jax.assembly.diagnostics import rows_with_ground
 from natcoord_jax.assembly.kick import TangentSpace, with_kicks
 from natcoord_jax.assembly.local import body_balance, body_motion, jacobians
 from natcoord_jax.assembly.momentum import momentum_balance
-from natcoord_jax.assembly.reduced import at_every_stage, project_multipliers, project_rows
+from natcoord_jax.assembly.reduced import at_every_stage, at_rest, project_multipliers, project_rows
 from natcoord_jax.assembly.response import (
     Evaluation,
     Situation,
@@ -27,7 +27,7 @@ from natcoord_jax.assembly.response import (
 from natcoord_jax.assembly.system import Group, System
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
-from natcoord_jax.maths.collocation import Tableau, gauss
+from natcoord_jax.maths.collocation import Tableau
 from natcoord_jax.maths.projectors import range_projector
 from natcoord_jax.maths.vectors import cross
 
@@ -64,9 +64,9 @@ class FullStep(eqx.Module):
         rank = system.structure.rank
         if rank is None:
             return replace_fields(plain, tangents=tangents)
-        at_rest = replace_fields(plain, h=jnp.zeros_like(h), tableau=gauss(1))
-        matrix = at_rest.jacobian(jnp.zeros(at_rest.unknowns, state.q.dtype))
-        rows = matrix[at_rest.balances :, : at_rest.balances]
+        resting = at_rest(plain)
+        matrix = resting.jacobian(jnp.zeros(resting.unknowns, state.q.dtype))
+        rows = matrix[resting.balances :, : resting.balances]
         in_tree = sum(g.count * g.multipliers for g in system.joints if g.in_tree)
         projector = range_projector(rows, rank + in_tree)
         projector = at_every_stage(projector, plain.groups, tableau.stages)

@@ -64,23 +64,44 @@ def project_rows(rows: Array, y: Array, balances: int, projector: Array | None) 
 
 
 def at_every_stage(projector: Float[Array, "m m"], groups: Sequence[Group], stages: int) -> Array:
-    """A projector of one stage for the multipliers of all, which go group by group, then by stage."""
+    """A projector of one stage for the multipliers of all."""
     if stages == 1:
         return projector
-    places, position = [], 0
+    every = places_by_stage(groups, stages)
+    full = jnp.zeros((every.size, every.size), projector.dtype)
+    return full.at[every[:, :, None], every[:, None, :]].set(projector)
+
+
+def places_by_stage(groups: Sequence[Group], stages: int) -> np.ndarray:
+    """Places (stages, m) of the multipliers of each stage; they go group by group, then by stage."""
+    places, position = [np.zeros((stages, 0), int)], 0
     for group in groups:
         shape = group.count, stages, group.multipliers
         here = position + np.arange(math.prod(shape)).reshape(shape)
         places.append(np.moveaxis(here, 1, 0).reshape(stages, -1))
         position += here.size
-    every = np.concatenate(places, axis=1)
-    full = jnp.zeros((position, position), projector.dtype)
-    return full.at[every[:, :, None], every[:, None, :]].set(projector)
+    return np.concatenate(places, axis=1)
 
 
 def active_groups(system: System) -> tuple[Group, ...]:
     """Groups that take part in the equations: all effects and the joints that close loops."""
     return (*system.effects, *(g for g in system.joints if not g.in_tree))
+
+
+def at_rest(step: Any) -> Any:
+    """The same equations for a step of length zero and one stage, where they are linear."""
+    situations = [
+        replace_fields(where, inputs=where.inputs[:, 0]) if where.inputs.ndim == 3 else where
+        for where in step.situations
+    ]
+    return replace_fields(
+        step,
+        h=jnp.zeros_like(step.h),
+        situations=tuple(situations),
+        projector=None,
+        tangents=None,
+        tableau=gauss(1),
+    )
 
 
 class ReducedStep(eqx.Module):
@@ -122,7 +143,7 @@ class ReducedStep(eqx.Module):
 
     def constraint_matrix(self) -> Float[Array, "m unknowns"]:
         """Rates of all constraints per rate of the free motions, at the start of the step."""
-        resting = replace_fields(self, h=jnp.zeros_like(self.h), tableau=gauss(1))
+        resting = at_rest(self)
         count = self.system.structure.unknowns
         rest = jnp.zeros(self.system.structure.multipliers, self.start.dtype)
 
@@ -201,6 +222,33 @@ class ReducedStep(eqx.Module):
     def jacobian(self, y: Float[Array, " unknowns"]) -> Float[Array, "unknowns unknowns"]:
         """Exact Jacobian of the residual."""
         return jax.jacfwd(lambda x: self.residual(x)[0])(y)
+
+    def inertial_jacobian(self) -> Float[Array, "unknowns unknowns"]:
+        """Jacobian for steps of length zero: inertia and constraints at the start, one stage like the other.
+
+        Cheap for several stages, and good enough to start with where the motion is not stiff.
+        """
+        resting = at_rest(self)
+        count, stages = self.system.structure.unknowns, self.tableau.stages
+        unit = jnp.eye(count + self.system.structure.multipliers, dtype=self.start.dtype)
+        base = resting.residual(jnp.zeros_like(unit[0]))[0]
+        one = jax.lax.map(lambda y: resting.residual(y)[0] - base, unit).T
+        places = np.concatenate(
+            [
+                np.arange(stages * count).reshape(stages, count),
+                self.balances + places_by_stage(self.groups, stages),
+            ],
+            axis=1,
+        )
+        inverse = jnp.asarray(self.tableau.a_inverse) / gauss(1).a_inverse[0][0]
+        bodies = jnp.arange(unit.shape[0]) < count
+        inertia, rest = (
+            jnp.where(bodies[:, None] & bodies, one, 0.0),
+            jnp.where(bodies[:, None] & bodies, 0.0, one),
+        )
+        blocks = inverse[:, :, None, None] * inertia + jnp.eye(stages)[:, :, None, None] * rest
+        matrix = jnp.zeros((places.size, places.size), one.dtype)
+        return matrix.at[places[:, None, :, None], places[None, :, None, :]].set(blocks)
 
     def probes(self) -> Float[Array, " unknowns"]:
         """Changes of the unknowns that give columns of the Jacobian as quotients of differences.

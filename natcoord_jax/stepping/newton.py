@@ -63,12 +63,26 @@ class Factors(eqx.Module):
         inertias: inertias of the unknowns, 0 for multipliers.
         usable: whether there are any.
         fresh: whether they belong to the step that is being solved.
+        extra: corrections beyond one a step that steps have needed with them.
     """
 
     solver: Any
     inertias: Float[Array, " unknowns"]
     usable: Bool[Array, ""]
     fresh: Bool[Array, ""]
+    extra: Int[Array, ""]
+
+    def after_step(self, corrections: Int[Array, ""], usable: Bool[Array, ""], cost: int) -> "Factors":
+        """Factors for the next step: given up once they have cost more corrections than new ones would.
+
+        Args:
+            corrections: of the step.
+            usable: whether it was solved.
+            cost: of new factors, in corrections.
+        """
+        extra = self.extra + jnp.maximum(corrections - 1, 0)
+        keep = usable & self.usable & (extra <= cost)
+        return Factors(self.solver, self.inertias, keep, jnp.zeros_like(self.fresh), extra)
 
 
 class Iterate(eqx.Module):
@@ -126,13 +140,13 @@ def no_factors(equations: Any, form: str) -> Factors:
     y = equations.guess()
     shapes = jax.eval_shape(lambda y: FACTORISATIONS[form](equations, equations.jacobian(y)), y)
     solver, inertias = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-    return Factors(solver, inertias, jnp.array(False), jnp.array(False))
+    return Factors(solver, inertias, jnp.array(False), jnp.array(False), jnp.array(0))
 
 
 def factors_of(equations: Any, form: str, matrix: Any) -> Factors:
     """Factors of a Jacobian."""
     solver, inertias = FACTORISATIONS[form](equations, matrix)
-    return Factors(solver, inertias, jnp.array(True), jnp.array(True))
+    return Factors(solver, inertias, jnp.array(True), jnp.array(True), jnp.array(0))
 
 
 def refreshed(it: Iterate) -> Iterate:
@@ -188,7 +202,7 @@ def judge(
         (correction <= tolerance * size) | stalled | (it.last & (correction <= STALL_OLD * tolerance * size))
     )
     slow = ~first & ((ratio > 0.5) | (correction * ratio**patience > tolerance * size))
-    slow = slow | (it.count >= CHORD_ITERATIONS) | ~factors.usable
+    slow = slow | (it.count >= max(CHORD_ITERATIONS, 2 * patience)) | ~factors.usable
     # Old factors may have led astray: new ones begin where the first did.
     lost = ~finite & ~factors.fresh
     solved, slow = solved & finite & factors.usable, (slow & finite) | lost

@@ -58,6 +58,7 @@ class Plan:
         control: function (parameters, step index, t, state) to inputs; None: they are parameters[step].
         event: function of the state whose change of sign ends the run, or None.
         tableau: of the collocation method.
+        recorded: whether every slot is; else only the last is kept.
     """
 
     steps: int
@@ -66,6 +67,7 @@ class Plan:
     control: Callable[[Any, Array, Array, State], Array] | None
     event: Callable[[State], Array] | None = None
     tableau: Tableau = gauss(1)
+    recorded: bool = True
 
     def inputs(
         self, parameters: Any, step: Array, state: State, done: Array, fraction: Array
@@ -139,15 +141,16 @@ class Setting(eqx.Module):
     parameters: Any
     dt: Float[Array, ""]
     plan: Plan = eqx.field(static=True)
+    steps: Int[Array, ""] | int
 
     def over(self, course: Course) -> Bool[Array, ""]:
         """Whether the rollout has ended."""
-        return course.stopped | (course.step >= self.plan.steps)
+        return course.stopped | (course.step >= self.steps)
 
     def situation(self, course: Course) -> tuple[Array, Array, Array]:
         """Inputs, length and number of the (sub)step at hand."""
         h = jnp.where(self.over(course), 1e-3, course.fraction * self.dt)
-        index = jnp.minimum(course.step, self.plan.steps - 1)
+        index = jnp.minimum(course.step, self.steps - 1)
         u = self.plan.inputs(self.parameters, index, course.state, course.done, course.fraction)
         return u, h, index
 
@@ -244,7 +247,8 @@ def _trip(setting: Setting, unpack: Callable[[Array], State], carried: Carried) 
     found = equations.evaluate(it.y if probe is None else probe.moved(it.y, equations))
     probing = jnp.array(False) if probe is None else probe.at >= 0
     driven = any(group.multipliers and group.effect.works for group in equations.groups)
-    options = {"balances": driven, "patience": PATIENCE}
+    cost = PATIENCE if probe is None else max(PATIENCE, it.y.shape[0] // 2)
+    options = {"balances": driven, "patience": cost}
     judged = judge(factors, plan.tolerance, it, found.residual, found.size, **options)
     it = jax.tree.map(partial(jnp.where, probing), it, judged)
     ending = ~probing & ~any_lane(it.unsolved & ~over)
@@ -266,8 +270,19 @@ def _trip(setting: Setting, unpack: Callable[[Array], State], carried: Carried) 
     start = ending, eqx.tree_at(lambda c: c.it, carried.course, it), carried.state, carried.record
     _, after, x, record = jax.lax.while_loop(lambda carry: carry[0], ended, start)
     accepted = after.taken > course.taken
-    usable = jnp.where(ending, (accepted | over) & factors.usable, factors.usable)
-    factors = Factors(factors.solver, factors.inertias, usable, factors.fresh & ~ending)
+    kept = factors.after_step(it.total, accepted | over, 2 * cost)
+    factors = eqx.tree_at(
+        lambda f: (f.usable, f.fresh, f.extra),
+        factors,
+        tuple(
+            jnp.where(ending, a, b)
+            for a, b in (
+                (kept.usable, factors.usable),
+                (kept.fresh, factors.fresh),
+                (kept.extra, factors.extra),
+            )
+        ),
+    )
     if probe is not None:
         probe, wanting = probe.with_column(found.residual, equations, wanting)
 
@@ -298,27 +313,10 @@ class Ending(eqx.Module):
 
 def run(plan: Plan, system: System, state: State, parameters: Any, dt: Array) -> tuple[Slots, Ending]:
     """All slots of a rollout and where it ended; without derivatives (see `derivative`)."""
-    setting = Setting(system, parameters, dt, plan)
-    length = plan.steps + plan.extra
-    packed, unpack = ravel_pytree(state)
-
-    def unfinished(carried: Carried) -> Array:
-        course = carried.course
-        return (carried.count < length) & any_lane(~course.stopped & (course.step < plan.steps))
-
-    def every_slot(course: Course, factors: Factors, x: Array) -> Carried:
-        it = course.it
-        probe = Probe.first(it.y.shape[0], x.dtype) if setting.form in BY_DIFFERENCES else None
-        slot = x, it.y, course.step, course.fraction, course.done, course.stopped, course.step
-        record = tuple(jnp.zeros((length, *x.shape), x.dtype) for x in slot)
-        start = Carried(jnp.array(0), course, x, factors, probe, record)
-        return jax.lax.while_loop(unfinished, partial(_trip, setting, unpack), start)
-
-    course, factors = _start(setting, state)
-    found = as_one_kernel(every_slot, _with_state(course, None), factors, packed)
+    found, unpack = _run(Setting(system, parameters, dt, plan, plan.steps), state)
     course, (states, *rest) = _with_state(found.course, unpack(found.state)), found.record
     count, factors, slots = found.count, found.factors, Slots(jax.vmap(unpack)(states), *rest)
-    unused = jnp.arange(length) >= any_lane(count)
+    unused = jnp.arange(plan.steps + plan.extra) >= any_lane(count)
 
     def fill(x: Array, last: Array | float) -> Array:
         return jnp.where(unused.reshape(-1, *(1,) * (x.ndim - 1)), last, x)
@@ -333,6 +331,51 @@ def run(plan: Plan, system: System, state: State, parameters: Any, dt: Array) ->
             slots.accepted & ~unused,
         ),
     )
-    short = (course.step < plan.steps) & ~course.stopped
+    return slots, Ending(_judged(course, plan.steps), factors)
+
+
+def run_to_the_end(
+    plan: Plan, system: System, state: State, parameters: Any, dt: Array, steps: Int[Array, ""]
+) -> Course:
+    """Where a rollout of any number of steps ends: one program for all numbers, and nothing recorded.
+
+    Without derivatives. At most `plan.steps` steps are made.
+    """
+    found, unpack = _run(Setting(system, parameters, dt, plan, steps), state)
+    return _judged(_with_state(found.course, unpack(found.state)), steps)
+
+
+def _judged(course: Course, steps: Any) -> Course:
+    """With the code of a run that used up its substeps."""
+    short = (course.step < steps) & ~course.stopped
     code = jnp.where(short, int(Result.MAX_SUBSTEPS), course.code)
-    return slots, Ending(eqx.tree_at(lambda c: c.code, course, code), factors)
+    return eqx.tree_at(lambda c: c.code, course, code)
+
+
+def _run(setting: Setting, state: State) -> tuple[Carried, Callable[[Array], State]]:
+    """The loop over all evaluations of the equations."""
+    plan = setting.plan
+    length = plan.steps + plan.extra
+    packed, unpack = ravel_pytree(state)
+
+    def unfinished(carried: Carried) -> Array:
+        course = carried.course
+        return (carried.count < length) & any_lane(~setting.over(course))
+
+    def every_slot(course: Course, factors: Factors, x: Array) -> Carried:
+        it = course.it
+        probe = Probe.first(it.y.shape[0], x.dtype) if setting.form in BY_DIFFERENCES else None
+        slot = x, it.y, course.step, course.fraction, course.done, course.stopped, course.step
+        # A row beyond the last goes to the last.
+        rows = length if plan.recorded else 1
+        record = tuple(jnp.zeros((rows, *x.shape), x.dtype) for x in slot)
+        if plan.tableau.stages > 1 and setting.form in BY_DIFFERENCES:
+            u, h, _ = setting.situation(_with_state(course, unpack(x)))
+            equations = prepare(setting.system, unpack(x), u, h, plan.tableau)
+            factors = factors_of(equations, setting.form, equations.inertial_jacobian())
+            factors = eqx.tree_at(lambda f: f.fresh, factors, jnp.array(False))
+        start = Carried(jnp.array(0), course, x, factors, probe, record)
+        return jax.lax.while_loop(unfinished, partial(_trip, setting, unpack), start)
+
+    course, factors = _start(setting, state)
+    return as_one_kernel(every_slot, _with_state(course, None), factors, packed), unpack
