@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING, Any
 
-from natcoord_jax.analysis import Balance, balance
+from natcoord_jax.analysis import Accuracy, Balance, accuracy, balance
 from natcoord_jax.assembly.posing import random_state
 from natcoord_jax.assembly.system import System
 from natcoord_jax.bodies import Box, Cylinder, Ellipsoid, PointMass, RigidBody, Sphere
@@ -71,6 +71,7 @@ if TYPE_CHECKING:
     from natcoord_jax.viz import animate, plot
 
 __all__ = [
+    "Accuracy",
     "Armature",
     "Balance",
     "BodyForceInput",
@@ -128,6 +129,7 @@ __all__ = [
     "System",
     "Trajectory",
     "Universal",
+    "accuracy",
     "animate",
     "assemble",
     "balance",

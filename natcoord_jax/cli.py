@@ -1,4 +1,4 @@
-"""The command line: `natcoord-jax scenes` and `natcoord-jax run SCENE`."""
+"""The command line: `natcoord-jax scenes`, `natcoord-jax run SCENE` and `natcoord-jax accuracy SCENE`."""
 
 import argparse
 import json
@@ -43,8 +43,16 @@ def parser() -> Parser:
     run.add_argument("scene", metavar="SCENE", help="a name that `natcoord-jax scenes` lists")
     run.add_argument("--steps", type=int, help="number of steps; alone, it keeps the scene's end time")
     run.add_argument("--dt", type=float, help="step [s]; alone, it must divide the scene's end time")
-    run.add_argument("--json", type=Path, metavar="FILE", help="write the report as JSON")
-    run.add_argument("--plot", type=Path, metavar="FILE", help="write a figure")
+    run.add_argument("--order", type=int, default=2, metavar="P", help="order of the scheme, 2 to 10")
+    costs = commands.add_parser("accuracy", help="show what accuracy costs in time, over steps and orders")
+    costs.add_argument("scene", metavar="SCENE", help="a name that `natcoord-jax scenes` lists")
+    costs.add_argument("--time", type=float, metavar="T", help="end time [s]; by default that of the scene")
+    costs.add_argument(
+        "--orders", default="2,4,6,8,10", metavar="P,P", help="orders to compare, by default all from 2 to 10"
+    )
+    for command in (run, costs):
+        command.add_argument("--json", type=Path, metavar="FILE", help="write the report as JSON")
+        command.add_argument("--plot", type=Path, metavar="FILE", help="write a figure")
     return whole
 
 
@@ -89,16 +97,18 @@ def _largest(values: Any) -> float | None:
     return None if values is None else float(np.max(values))
 
 
-def _solved(example: gallery.Example, steps: int, dt: float) -> tuple[nc.Solution | None, Any]:
+def _solved(
+    example: gallery.Example, steps: int, dt: float, scheme: nc.EnergyMomentum
+) -> tuple[nc.Solution | None, Any]:
     """The solution of an optimal control problem, if the scene is one, and the inputs of the run."""
     if example.problem is None:
-        return None, example.inputs(steps, dt)
+        return None, example.inputs(steps, dt, scheme)
     solution = nc.optimise(example.problem(steps, dt))
     return solution, solution.inputs
 
 
 def measure(
-    example: gallery.Example, steps: int, dt: float
+    example: gallery.Example, steps: int, dt: float, scheme: nc.EnergyMomentum
 ) -> tuple[dict[str, Any], Trajectory, nc.Solution | None]:
     """Run a scene twice, the first time with compilation, and judge the run.
 
@@ -106,14 +116,15 @@ def measure(
         example: the scene.
         steps: number of steps.
         dt: step [s].
+        scheme: the scheme.
 
     Returns:
         The report, the trajectory, and the solution of an optimal control problem.
     """
     system = example.system
     structure = system.structure
-    solution, inputs = _solved(example, steps, dt)
-    options = {"dt": dt, "inputs": inputs, "throw": False}
+    solution, inputs = _solved(example, steps, dt, scheme)
+    options = {"dt": dt, "inputs": inputs, "throw": False, "scheme": scheme}
     _, first = _timed(lambda: nc.simulate(system, example.state, **options))
     trajectory, wall = _timed(lambda: nc.simulate(system, example.state, **options))
     valid = _completed(trajectory)
@@ -124,6 +135,7 @@ def measure(
         "scene": example.name,
         "steps": steps,
         "dt": dt,
+        "order": scheme.order,
         "t_end": steps * dt,
         "dofs": structure.dofs,
         "unknowns": structure.unknowns + structure.multipliers,
@@ -167,7 +179,7 @@ def _table(report: dict[str, Any]) -> str:
     turns = f"largest error, relative, of {r['angular_momentum_components']} components"
     lines = [
         ("scene", r["scene"], ""),
-        ("steps", f"{r['steps']}", f"of {r['dt']:.6g} s, to t = {r['t_end']:.6g} s"),
+        ("steps", f"{r['steps']}", f"of {r['dt']:.6g} s, to t = {r['t_end']:.6g} s, order {r['order']}"),
         ("degrees of freedom", f"{r['dofs']}", f"{r['unknowns']} unknowns, {r['constraints']} constraints"),
         ("Newton iterations", _number(r["newton_iterations_mean"]), most),
         ("wall time", f"{1e3 * r['wall_s']:.3g} ms", f"{1e6 * r['wall_s'] / r['steps']:.3g} µs a step"),
@@ -218,7 +230,8 @@ def _plot(
     return file
 
 
-def _run(arguments: argparse.Namespace) -> int:
+def _checked(arguments: argparse.Namespace) -> gallery.Example:
+    """The scene, after a look at the files to write."""
     if arguments.scene not in gallery.SCENES:
         raise BadOptionError(f"no scene {arguments.scene!r}; there are {', '.join(gallery.SCENES)}")
     for file in (arguments.json, arguments.plot):
@@ -226,9 +239,47 @@ def _run(arguments: argparse.Namespace) -> int:
             raise BadOptionError(f"cannot write {file}: no such folder")
     if arguments.plot is not None and arguments.plot.suffix.lower() not in FIGURES:
         raise BadOptionError(f"cannot write {arguments.plot}; a figure ends in {', '.join(FIGURES)}")
-    example = gallery.load(arguments.scene)
+    return gallery.load(arguments.scene)
+
+
+def _scheme(order: int) -> nc.EnergyMomentum:
+    try:
+        return nc.EnergyMomentum(order=order)
+    except ValueError as problem:
+        raise BadOptionError(f"--order: {problem}") from None
+
+
+def _accuracy(arguments: argparse.Namespace) -> int:
+    try:
+        orders = [_scheme(int(part)).order for part in arguments.orders.split(",")]
+    except ValueError as problem:
+        raise BadOptionError(f"--orders is {arguments.orders!r}: {problem}") from None
+    example = _checked(arguments)
+    if example.problem is not None:
+        raise BadOptionError(f"{example.name} is a problem of optimal control; pass another scene")
+    t_end = example.t_end if arguments.time is None else arguments.time
+    if not (math.isfinite(t_end) and t_end > 0):
+        raise BadOptionError(f"--time [s] is {t_end:g}; pass a positive number")
+    try:
+        found = nc.accuracy(example.system, example.state, t_end, inputs=example.torques, orders=orders)
+    except RuntimeError as problem:
+        print(f"natcoord-jax: {example.name}: {problem}", file=sys.stderr)
+        return 1
+    print(f"{example.name}: {example.description}, to t = {t_end:g} s\n{found}")
+    if arguments.json is not None:
+        report = {"scene": example.name, **found.to_dict()}
+        arguments.json.write_text(json.dumps(report, indent=2, ensure_ascii=False) + "\n", "utf-8")
+    if arguments.plot is not None:
+        nc.plot(found).savefig(arguments.plot, dpi=150)
+        print(f"wrote {arguments.plot}")
+    return 0
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    scheme = _scheme(arguments.order)
+    example = _checked(arguments)
     steps, dt = choose_steps(example, arguments.steps, arguments.dt)
-    report, trajectory, solution = measure(example, steps, dt)
+    report, trajectory, solution = measure(example, steps, dt, scheme)
     print(_table(report))
     if arguments.json is not None:
         ready = {key: _json_ready(value) for key, value in report.items()}
@@ -258,7 +309,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print("\n".join(f"{name:<{width}}  {gallery.describe(name)}" for name in gallery.SCENES))
         return 0
     try:
-        return _run(parsed)
+        return _accuracy(parsed) if parsed.command == "accuracy" else _run(parsed)
     except BadOptionError as problem:
         print(f"natcoord-jax: {problem}", file=sys.stderr)
         return 2

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.diagnostics import rows_with_ground
-from natcoord_jax.assembly.kick import TangentSpace, with_kicks
+from natcoord_jax.assembly.kick import kicked
 from natcoord_jax.assembly.local import body_balance, body_motion, jacobians
 from natcoord_jax.assembly.momentum import momentum_balance
 from natcoord_jax.assembly.reduced import at_every_stage, at_rest, project_multipliers, project_rows
@@ -42,7 +42,6 @@ class FullStep(eqx.Module):
     situations: tuple[Situation, ...]
     h: Float[Array, ""]
     projector: Float[Array, "m m"] | None
-    tangents: TangentSpace | None
     tableau: Tableau = eqx.field(static=True)
 
     @classmethod
@@ -57,20 +56,18 @@ class FullStep(eqx.Module):
             tuple(situation(system, g, state, u, h) for g in groups),
             h,
             None,
-            None,
             tableau,
         )
-        tangents = TangentSpace.at(system, state) if tableau.kick else None
         rank = system.structure.rank
         if rank is None:
-            return replace_fields(plain, tangents=tangents)
+            return plain
         resting = at_rest(plain)
         matrix = resting.jacobian(jnp.zeros(resting.unknowns, state.q.dtype))
         rows = matrix[resting.balances :, : resting.balances]
         in_tree = sum(g.count * g.multipliers for g in system.joints if g.in_tree)
         projector = range_projector(rows, rank + in_tree)
         projector = at_every_stage(projector, plain.groups, tableau.stages)
-        return replace_fields(plain, projector=projector, tangents=tangents)
+        return replace_fields(plain, projector=projector)
 
     @property
     def groups(self) -> tuple[Group, ...]:
@@ -124,8 +121,8 @@ class FullStep(eqx.Module):
         """Residual, and what the end of the step needs."""
         twists, multipliers = self.split(project_multipliers(y, self.balances, self.projector))
         at = self._stations(twists)
-        velocity, situations, ends = with_kicks(
-            self.tangents, self.state, self.groups, self.situations, at, self.h, self.tableau
+        velocity, situations, kick = kicked(
+            self.system, self.state, self.groups, self.situations, at, self.h, self.tableau
         )
         given = self.system, self.groups, situations, at, velocity
         found = momentum_balance(*given, multipliers, self.h, self.tableau)
@@ -135,7 +132,7 @@ class FullStep(eqx.Module):
         wrenches = jnp.moveaxis(jnp.concatenate([found.force, torque], axis=-1), 0, 1)
         rows = project_rows(found.rows, y, self.balances, self.projector)
         residual = jnp.concatenate([wrenches.reshape(-1), rows])
-        return Evaluation(residual, found.size, at, found.power, ends)
+        return Evaluation(residual, found.size, at, found.power, kick)
 
     def body_jacobians(self, twists: Float[Array, "bodies s 6"]) -> Float[Array, "bodies n n"]:
         """Jacobians of the bodies' own balances."""

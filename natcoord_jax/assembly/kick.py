@@ -59,6 +59,26 @@ class Velocity(eqx.Module):
     rotors: Float[Array, "*u rotors"]
 
 
+class Admissible(eqx.Module):
+    """What the constraints admit at one configuration, in the rates of the spanning tree.
+
+    Attributes:
+        frame: X, with X P^T M P X^T = 1.
+        subspace: projector on what the constraints outside the tree admit, in the frame; None: everything.
+        lift: rates of the smallest energy per unit rate of the constraints.
+        prescribed: rates that drives prescribe, zero for all other constraints.
+    """
+
+    frame: Float[Array, "u u"]
+    subspace: Float[Array, "u u"] | None
+    lift: Float[Array, "u c"]
+    prescribed: Float[Array, " c"]
+
+    def within(self, y: Float[Array, " u"]) -> Float[Array, " u"]:
+        """The part of a vector in the frame that the constraints admit."""
+        return y if self.subspace is None else self.subspace @ y
+
+
 class TangentSpace(eqx.Module):
     """Velocities that the constraints admit at one configuration.
 
@@ -67,45 +87,40 @@ class TangentSpace(eqx.Module):
         columns: P, one free motion after the other.
         impulses: M P.
         inertias: of the rotors.
-        frame: X, with X P^T M P X^T = 1.
-        subspace: projector on what the constraints outside the tree admit, in the frame; None: everything.
-        lift: rates of the smallest energy per unit rate of the constraints.
-        prescribed: rates that drives prescribe, zero for all other constraints.
+        admissible: what the constraints admit.
     """
 
     balances: Balances
     columns: Velocity
     impulses: Velocity
     inertias: Float[Array, " rotors"]
-    frame: Float[Array, "u u"]
-    subspace: Float[Array, "u u"] | None
-    lift: Float[Array, "u c"]
-    prescribed: Float[Array, " c"]
+    admissible: Admissible
 
     @classmethod
-    def at(cls, system: System, state: State) -> "TangentSpace":
+    def at(cls, system: System, state: State, known: Admissible | None = None) -> "TangentSpace":
         """The tangent space of a state; its velocities play no part."""
         balances, inertias = Balances.at(system, state), rotor_inertias(system)
         gains = balances.columns()
         columns = Velocity(gains.rows, gains.rotors)
         impulses = Velocity(inertia(system.mass, gains.rows), inertias * gains.rotors)
-        frame = jnp.eye(gains.rows.shape[0], dtype=state.q.dtype)
-        lift = jnp.zeros((frame.shape[0], gains.constraints.shape[1]), frame.dtype)
-        plain = cls(balances, columns, impulses, inertias, frame, None, lift, jnp.zeros(lift.shape[1]))
-        plain = replace_fields(plain, frame=inverse_cholesky(plain.pulled(impulses) + _idle(balances)))
-        return _constrained(plain, gains.constraints.T) if gains.constraints.shape[1] else plain
-
-    def within(self, y: Float[Array, " u"]) -> Float[Array, " u"]:
-        """The part of a vector in the frame that the constraints admit."""
-        return y if self.subspace is None else self.subspace @ y
+        unit = jnp.eye(gains.rows.shape[0], dtype=state.q.dtype)
+        lift = jnp.zeros((unit.shape[0], gains.constraints.shape[1]), unit.dtype)
+        plain = Admissible(unit, None, lift, jnp.zeros(lift.shape[1], unit.dtype))
+        space = cls(balances, columns, impulses, inertias, plain if known is None else known)
+        if known is not None:
+            return space
+        plain = replace_fields(plain, frame=inverse_cholesky(space.pulled(impulses) + _idle(balances)))
+        if gains.constraints.shape[1]:
+            plain = _constrained(balances, plain.frame, gains.constraints.T)
+        return replace_fields(space, admissible=plain)
 
     def framed(self, v: Velocity) -> Float[Array, " u"]:
         """Components of a velocity along the frame, X P^T M v."""
-        return self.frame @ self.pulled(self.impulse(v))
+        return self.admissible.frame @ self.pulled(self.impulse(v))
 
     def along(self, y: Float[Array, " u"]) -> Velocity:
         """Velocity with given components along the frame."""
-        return self.spread(self.frame.T @ y)
+        return self.spread(self.admissible.frame.T @ y)
 
     def spread(self, w: Float[Array, " u"]) -> Velocity:
         """P w."""
@@ -138,11 +153,12 @@ class TangentSpace(eqx.Module):
     @property
     def drift(self) -> Float[Array, " u"]:
         """Rates that drives prescribe, orthogonal to all admissible ones."""
-        return self.lift @ self.prescribed
+        return self.admissible.lift @ self.admissible.prescribed
 
     def projected(self, v: Velocity) -> Velocity:
         """Nearest velocity that the constraints admit."""
-        return self.spread(self.frame.T @ self.within(self.framed(v)) + self.drift)
+        known = self.admissible
+        return self.spread(known.frame.T @ known.within(self.framed(v)) + self.drift)
 
 
 def rotor_inertias(system: System) -> Float[Array, " rotors"]:
@@ -159,11 +175,11 @@ def _idle(balances: Balances) -> Float[Array, "u u"]:
     return jnp.einsum("buc,bwc->uw", spin, spin)
 
 
-def _constrained(space: TangentSpace, matrix: Float[Array, "c u"]) -> TangentSpace:
+def _constrained(balances: Balances, frame: Array, matrix: Float[Array, "c u"]) -> Admissible:
     """With the constraints of loops and relations, whose rates are the matrix times those of the tree."""
-    balances, structure = space.balances, space.balances.system.structure
+    structure = balances.system.structure
     prescribed = -balances.rates(jnp.zeros(matrix.shape[1], matrix.dtype)).constraints
-    framed = matrix @ space.frame.T
+    framed = matrix @ frame.T
     coupling = framed @ framed.T
     if structure.rank is None:
         inverse = definite_inverse(coupling)
@@ -176,77 +192,116 @@ def _constrained(space: TangentSpace, matrix: Float[Array, "c u"]) -> TangentSpa
     back = framed.T @ inverse
     subspace = jnp.eye(framed.shape[1], dtype=matrix.dtype) - back @ framed
     subspace = 0.5 * (subspace + subspace.T)
-    return replace_fields(space, subspace=subspace, lift=space.frame.T @ back, prescribed=prescribed)
+    return Admissible(frame, subspace, frame.T @ back, prescribed)
 
 
-class Kicked(eqx.Module):
-    """Velocities of a step with kicks.
+class Kick(eqx.Module):
+    """The kick of a step, and what is admitted at its ends."""
+
+    kick: Velocity
+    before: Admissible
+    after: Admissible
+
+
+class Ends(eqx.Module):
+    """The end of a step with kicks.
 
     Attributes:
-        start: v_+, what the stages begin with.
-        end: v_1.
+        velocity: v_1.
         work: work of the constraints in the two kicks, drives being the only ones that do any [J].
         sound: whether the kicks are small against the motion and leave the energy alone. Far off, where the
             tangents at the two ends are nearly orthogonal, the equations have solutions that are neither.
     """
 
-    start: Velocity
-    end: Velocity
+    velocity: Velocity
     work: Float[Array, " c"]
     sound: Bool[Array, ""]
 
 
-def kicked(
-    before: TangentSpace, state: State, at: Stations, turning: Array, h: Array, tableau: Tableau
-) -> Kicked:
-    """Velocities after the first kick and after the last.
+def _end_of(state: State, at: Stations, h: Array, tableau: Tableau) -> State:
+    """Positions and time at the end of a step; nothing else of it is of use."""
+    rows = at.start[:-1] + h * jnp.tensordot(jnp.asarray(tableau.b), at.rates[:, :-1], 1)
+    q = rows.reshape(-1, 3)
+    return State(state.t + h, q, q, state.coordinates, state.rates, state.work)
+
+
+def rotor_rates(system: System, groups: Sequence[Group], at: Stations, h: Array) -> Float[Array, "s rotors"]:
+    """Rates at the stages of the joint coordinates that carry rotors."""
+    carrying = [g.coordinates[:, 0] for g in groups if g.effect.rotors]
+    if not carrying:
+        return jnp.zeros((at.rates.shape[0], 0), at.rates.dtype)
+    return stage_rates(system, at, h)[:, jnp.concatenate(carrying)]
+
+
+def kick_of(
+    system: System, state: State, groups: Sequence[Group], at: Stations, h: Array, tableau: Tableau
+) -> Kick:
+    """The kick that belongs to given stages.
 
     Args:
-        before: tangent space at the start of the step.
-        state: at the start.
+        system: compiled system.
+        state: at the start of the step.
+        groups: that act.
         at: stage motion.
-        turning: stage rates of the rotors (s, rotors).
         h: step [s].
         tableau: the collocation method.
     """
-    system = before.balances.system
-    rates = at.rates[:, :-1]
-    b, beta, sigma = jnp.asarray(tableau.b), jnp.asarray(tableau.beta), tableau.reflection
-    rows = before.balances.rows + h * jnp.tensordot(b, rates, 1)
-    q_end, t_end = rows.reshape(-1, 3), state.t + h
-    after = TangentSpace.at(system, State(t_end, q_end, q_end, state.coordinates, state.rates, state.work))
-    v = Velocity(state.v.reshape(-1, 4, 3), state.rates)
-    carried = Velocity(jnp.tensordot(beta, rates, 1), beta @ turning)
+    beta, sigma = jnp.asarray(tableau.beta), tableau.reflection
+    before = TangentSpace.at(system, state)
+    after = TangentSpace.at(system, _end_of(state, at, h, tableau))
     drift = after.spread(after.drift)
+    carried = jnp.tensordot(beta, at.rates[:, :-1], 1), beta @ rotor_rates(system, groups, at, h)
     d = Velocity(
-        sigma * (carried.rows - drift.rows) - v.rows, sigma * (carried.rotors - drift.rotors) - v.rotors
+        sigma * (carried[0] - drift.rows) - state.v.reshape(-1, 4, 3),
+        sigma * (carried[1] - drift.rotors) - state.rates,
     )
-    kick = _kick(before, after, d)
-    start = Velocity(v.rows + kick.rows, v.rotors + kick.rotors)
+    return Kick(_kick(before, after, d), before.admissible, after.admissible)
+
+
+def ends_of(
+    system: System,
+    state: State,
+    groups: Sequence[Group],
+    at: Stations,
+    kick: Kick,
+    h: Array,
+    tableau: Tableau,
+) -> Ends:
+    """The velocity at the end of a step: that of its stages, less the kick taken back."""
+    beta, rates, turning = jnp.asarray(tableau.beta), at.rates[:, :-1], rotor_rates(system, groups, at, h)
+    before = TangentSpace.at(system, state, kick.before)
+    after = TangentSpace.at(system, _end_of(state, at, h, tableau), kick.after)
+    v = Velocity(state.v.reshape(-1, 4, 3), state.rates)
+    start = Velocity(v.rows + kick.kick.rows, v.rotors + kick.kick.rotors)
     last = Velocity(
         start.rows + jnp.tensordot(beta, rates - start.rows, 1),
         start.rotors + beta @ (turning - start.rotors),
     )
     end = after.projected(last)
-    work = before.prescribed * (before.lift.T @ before.pulled(before.impulse(kick)))
     back = Velocity(end.rows - last.rows, end.rotors - last.rotors)
-    work = work + after.prescribed * (after.lift.T @ after.pulled(after.impulse(back)))
-    given, taken = (2.0 * space.energy(x) for space, x in ((before, kick), (after, back)))
+    work = _work(before, kick.kick) + _work(after, back)
     moving = jnp.maximum(before.energy(start), after.energy(end))
     missing = before.energy(start) - before.energy(v) + after.energy(end) - after.energy(last) - jnp.sum(work)
-    sound = (given <= LARGEST * moving) & (jnp.abs(missing) <= UNSOUND * (moving + taken))
-    return Kicked(start, end, work, sound)
+    small = 2.0 * before.energy(kick.kick) <= LARGEST * moving
+    return Ends(end, work, small & (jnp.abs(missing) <= UNSOUND * moving))
+
+
+def _work(space: TangentSpace, kick: Velocity) -> Float[Array, " c"]:
+    """Work of the constraints in a kick."""
+    known = space.admissible
+    return known.prescribed * (known.lift.T @ space.pulled(space.impulse(kick)))
 
 
 def _kick(before: TangentSpace, after: TangentSpace, d: Velocity) -> Velocity:
     """n_0, see the head of the module."""
-    cosines = before.frame @ before.pulled(after.impulses) @ after.frame.T
-    b0, b1 = before.within(before.framed(d)), after.within(after.framed(d))
+    start, end = before.admissible, after.admissible
+    cosines = start.frame @ before.pulled(after.impulses) @ end.frame.T
+    b0, b1 = start.within(before.framed(d)), end.within(after.framed(d))
     size = b0.shape[0]
     moved = None
-    if before.subspace is not None and after.subspace is not None:
-        moved = _direct_rotation(before.subspace, after.subspace)
-        cosines, b1 = before.subspace @ cosines @ moved @ before.subspace, moved.T @ b1
+    if start.subspace is not None and end.subspace is not None:
+        moved = _direct_rotation(start.subspace, end.subspace)
+        cosines, b1 = start.subspace @ cosines @ moved @ start.subspace, moved.T @ b1
     matrix = jnp.eye(size, dtype=b0.dtype) + 2.0 * cosines + cosines @ cosines.T
     u = definite_inverse(matrix) @ (cosines @ b1 - b0)
     first, second = before.along(u), b1 - 2.0 * u - cosines.T @ u
@@ -263,31 +318,23 @@ def _direct_rotation(start: Float[Array, "u u"], end: Float[Array, "u u"]) -> Fl
     return x
 
 
-def with_kicks(
-    before: TangentSpace | None,
+def kicked(
+    system: System,
     state: State,
     groups: Sequence[Group],
     situations: Sequence[Situation],
     at: Stations,
     h: Array,
     tableau: Tableau,
-) -> tuple[Array, Sequence[Situation], Kicked | None]:
-    """What the stages begin with: velocities of the rows, situations with rates of rotors; and both ends.
-
-    Without `before` there are no kicks.
-    """
+) -> tuple[Array, Sequence[Situation], Kick | None]:
+    """What the stages begin with: velocities of rows, situations with rates of rotors; and the kick."""
     velocity = state.v.reshape(-1, 4, 3)
-    if before is None:
+    if not tableau.kick:
         return velocity, situations, None
-    carrying = [g.coordinates[:, 0] for g in groups if g.effect.rotors]
-    turning = jnp.zeros((tableau.stages, 0), velocity.dtype)
-    if carrying:
-        turning = stage_rates(before.balances.system, at, h)[:, jnp.concatenate(carrying)]
-    ends = kicked(before, state, at, turning, h, tableau)
-    situations = [
-        eqx.tree_at(lambda s: s.rates, where, ends.start.rotors[group.rotors])
-        if group.effect.rotors
-        else where
+    found = kick_of(system, state, groups, at, h, tableau)
+    rotors = state.rates + found.kick.rotors
+    moved = [
+        replace_fields(where, rates=rotors[group.rotors]) if group.effect.rotors else where
         for group, where in zip(groups, situations)
     ]
-    return ends.start.rows, situations, ends
+    return velocity + found.kick.rows, moved, found

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from natcoord_jax.assembly.kick import TangentSpace, with_kicks
+from natcoord_jax.assembly.kick import kicked
 from natcoord_jax.assembly.momentum import momentum_balance
 from natcoord_jax.assembly.response import (
     Evaluation,
@@ -99,7 +99,6 @@ def at_rest(step: Any) -> Any:
         h=jnp.zeros_like(step.h),
         situations=tuple(situations),
         projector=None,
-        tangents=None,
         tableau=gauss(1),
     )
 
@@ -115,7 +114,6 @@ class ReducedStep(eqx.Module):
     situations: tuple[Situation, ...]
     h: Float[Array, ""]
     projector: Float[Array, "m m"] | None
-    tangents: TangentSpace | None
     tableau: Tableau = eqx.field(static=True)
 
     @classmethod
@@ -131,15 +129,13 @@ class ReducedStep(eqx.Module):
             tuple(situation(system, g, state, u, h) for g in active_groups(system)),
             h,
             None,
-            None,
             tableau,
         )
-        tangents = TangentSpace.at(system, state) if tableau.kick else None
         if system.structure.rank is None:
-            return replace_fields(plain, tangents=tangents)
+            return plain
         projector = range_projector(plain.constraint_matrix(), system.structure.rank)
         projector = at_every_stage(projector, plain.groups, tableau.stages)
-        return replace_fields(plain, projector=projector, tangents=tangents)
+        return replace_fields(plain, projector=projector)
 
     def constraint_matrix(self) -> Float[Array, "m unknowns"]:
         """Rates of all constraints per rate of the free motions, at the start of the step."""
@@ -203,15 +199,15 @@ class ReducedStep(eqx.Module):
         w, multipliers = self.split(project_multipliers(y, self.balances, self.projector))
         motion, geometry = self.motion(w)
         at = self.stations(motion)
-        velocity, situations, ends = with_kicks(
-            self.tangents, self.state, self.groups, self.situations, at, self.h, self.tableau
+        velocity, situations, kick = kicked(
+            self.system, self.state, self.groups, self.situations, at, self.h, self.tableau
         )
         given = system, self.groups, situations, at, velocity
         found = momentum_balance(*given, multipliers, self.h, self.tableau)
         generalised = self.generalised(geometry, found.force, found.torque)
         rows = project_rows(found.rows, y, self.balances, self.projector)
         residual = jnp.concatenate([generalised.reshape(-1), rows])
-        return Evaluation(residual, found.size, at, found.power, ends)
+        return Evaluation(residual, found.size, at, found.power, kick)
 
     def guess(self) -> Float[Array, " unknowns"]:
         """Rates of the velocities at the start, repeated for every stage; multipliers zero."""

@@ -115,14 +115,14 @@ class Evaluation(eqx.Module):
         size: of the terms of the residual [sqrt(J)].
         at: stage motion of all bodies.
         power: power of each group, for work accounts (instances, s).
-        kicked: velocities at the ends, if the method has kicks.
+        kick: of the step, if the method has any.
     """
 
     residual: Float[Array, " unknowns"]
     size: Float[Array, ""]
     at: Stations
     power: list[Float[Array, "_ s"]]
-    kicked: Any = None
+    kick: Any = None
 
 
 def collect(group: Group, loads: Float[Array, "n s k *rest"]) -> Float[Array, "bodies s *rest"]:

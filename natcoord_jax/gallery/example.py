@@ -55,8 +55,21 @@ class Example:
         """End time of the suggested run [s]."""
         return self.steps * self.dt
 
-    def inputs(self, steps: int | None = None, dt: Any = None) -> Float[Array, "steps inputs"]:
+    @property
+    def torques(self) -> Callable[[Array], Array] | None:
+        """Inputs as a function of one time [s], None where there are none."""
+        return None if self.control is None else self._at
+
+    def _at(self, t: Float[Array, ""]) -> Float[Array, " inputs"]:
+        assert self.control is not None
+        return self.control(t[None])[0]
+
+    def inputs(
+        self, steps: int | None = None, dt: Any = None, scheme: nc.EnergyMomentum | None = None
+    ) -> Float[Array, "steps inputs"] | Float[Array, "steps stages inputs"]:
         """Inputs of a run with other steps; default the suggested one.
+
+        They are those at mid-steps, held; with a scheme of several stages, those at its stages.
 
         Raises:
             RuntimeError: for an optimal control problem that is not solved.
@@ -69,6 +82,9 @@ class Example:
             return solution.inputs
         if self.control is None:
             return jnp.zeros((steps, len(self.system.structure.inputs)))
+        if scheme is not None and scheme.stages > 1:
+            times = scheme.times(dt, steps)
+            return self.control(times.reshape(-1)).reshape(*times.shape, -1)
         return self.control((jnp.arange(steps) + 0.5) * dt)
 
     def simulate(self, *, steps: int | None = None, dt: Any = None, **options: Any) -> Trajectory:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import equinox as eqx
@@ -17,6 +18,8 @@ from natcoord_jax.stepping.scheme import EnergyMomentum
 
 MOST = 1 << 30
 """Steps that one program can make."""
+
+QUICK = {"xla_cpu_use_fusion_emitters": False}
 
 
 class Endpoint(eqx.Module):
@@ -52,43 +55,49 @@ class Sampled:
     fractions: tuple[float, ...]
 
     def __call__(self, parameters: Any, step: Array, t: Array, state: State) -> Float[Array, "s inputs"]:
-        """At the stages of a step of length `parameters` that starts at t."""
+        """At the stages of a (sub)step that starts at t; its length is the parameter."""
         if self.function is None:
             return jnp.zeros((len(self.fractions), self.channels), state.q.dtype)
         return jax.vmap(self.function)(t + parameters * jnp.asarray(self.fractions))
 
 
-def _endpoint(system, state, dt, steps, inputs, scheme, tolerance):
-    tableau = scheme.tableau
-    control = Sampled(inputs, len(system.structure.inputs), tableau.c)
-    plan = Plan(MOST, 0, tolerance, control, None, tableau, recorded=False)
-    course = run_to_the_end(plan, system, state, dt, dt, steps)
-    return Endpoint(course.state, course.code, course.step, course.iterations, course.taken)
+@lru_cache(maxsize=64)
+def _program(structure: Any, inputs: Callable | None, scheme: EnergyMomentum, tolerance: float) -> Callable:
+    """The compiled program for all systems and states of one structure."""
+
+    def run(leaves: list[Array], dt: Array, steps: Array) -> Endpoint:
+        system, state = jax.tree.unflatten(structure, leaves)
+        tableau = scheme.tableau
+        control = Sampled(inputs, len(system.structure.inputs), tableau.c)
+        plan = Plan(MOST, 0, tolerance, control, None, tableau, recorded=False)
+        course = run_to_the_end(plan, system, state, dt, dt, steps)
+        return Endpoint(course.state, course.code, course.step, course.iterations, course.taken)
+
+    return jax.jit(run, compiler_options=QUICK if jax.default_backend() == "cpu" else None)
 
 
-_compiled = eqx.filter_jit(_endpoint, compiler_options={"xla_cpu_use_fusion_emitters": False})  # pyright: ignore[reportCallIssue]
-
-
-def endpoint(
+def endpoints(
     system: System,
     state: State,
     *,
-    dt: Any,
-    steps: Any,
     inputs: Callable[[Array], Array] | None = None,
     scheme: EnergyMomentum,
     newton_tol: float = TOLERANCE,
-) -> Endpoint:
-    """Run a system and keep nothing but the end; without derivatives.
+) -> Callable[[Any, int], Endpoint]:
+    """Runs of a system of which nothing is kept but the end; without derivatives.
 
     Args:
         system: compiled system.
         state: initial state.
-        dt: step [s].
-        steps: number of steps; another number does not compile anew.
         inputs: function of time [s] to (inputs,) [N, N m], evaluated at the stages; None: zero.
         scheme: the scheme.
         newton_tol: see `simulate`.
+
+    Returns:
+        A function of step [s] and number of steps; another number does not compile anew. A step that fails
+        ends the run, without repetition in smaller ones.
     """
-    numbers = jnp.asarray(dt, float), jnp.asarray(steps)
-    return _compiled(system, state, *numbers, inputs, scheme, newton_tol)
+    leaves, structure = jax.tree.flatten((system, state))
+    program = _program(structure, inputs, scheme, newton_tol)
+    placed = [jnp.asarray(x) for x in leaves]
+    return lambda dt, steps: program(placed, jnp.asarray(dt, float), jnp.asarray(steps))

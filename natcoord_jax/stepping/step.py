@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.coordinates import stage_rates
 from natcoord_jax.assembly.equations import prepare
+from natcoord_jax.assembly.kick import ends_of
 from natcoord_jax.assembly.response import Evaluation
 from natcoord_jax.assembly.system import Group, System
 from natcoord_jax.core.state import State
@@ -44,10 +45,12 @@ def end_of_step(
     b, beta = jnp.asarray(tableau.b), jnp.asarray(tableau.beta)
     q = state.q + h * jnp.tensordot(b, rates, 1)
     coordinates, work = state.coordinates, state.work
-    turning = stage_rates(system, at, h)
+    turning, ends = stage_rates(system, at, h), None
+    if found.kick is not None:
+        ends = ends_of(system, state, groups, at, found.kick, h, tableau)
     if system.coordinates:
         coordinates = coordinates + h * (b @ turning)
-    if found.kicked is None:
+    if ends is None:
         v = state.v + jnp.tensordot(beta, rates - state.v, 1)
         rotors = state.rates
         carrying = [g.coordinates[:, 0] for g in groups if g.effect.rotors]
@@ -55,13 +58,13 @@ def end_of_step(
             # Groups own consecutive pieces of the stored rates, in order.
             rotors = rotors + beta @ (turning[:, jnp.concatenate(carrying)] - rotors)
     else:
-        v, rotors = found.kicked.end.rows.reshape(state.v.shape), found.kicked.end.rotors
+        v, rotors = ends.velocity.rows.reshape(state.v.shape), ends.velocity.rotors
     working, relation = [], 0
     for group, power in zip(groups, found.power):
         if group.effect.works:
             done = (1.0 if group.effect.impulsive else h) * (power @ b)
-            if group.multipliers and found.kicked is not None:
-                done = done + found.kicked.work[relation : relation + group.count]
+            if group.multipliers and ends is not None:
+                done = done + ends.work[relation : relation + group.count]
             working.append(done)
         if group.multipliers and group.source != "joint":
             relation += group.count * group.multipliers
@@ -69,8 +72,8 @@ def end_of_step(
     work = work + jnp.concatenate(working) if working else work
     after = State(state.t + h, q, v, coordinates, rotors, work)
     half_turn = _half_turn(at.spin[:, :bodies], h, tableau)
-    if found.kicked is not None:
-        half_turn = jnp.where(found.kicked.sound, half_turn, jnp.inf)
+    if ends is not None:
+        half_turn = jnp.where(ends.sound, half_turn, jnp.inf)
     return after, half_turn
 
 

@@ -9,9 +9,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from natcoord_jax.analysis.accuracy import Accuracy
 from natcoord_jax.assembly.system import System
 from natcoord_jax.control.solution import Solution
 from natcoord_jax.core.state import Trajectory
+from natcoord_jax.viz.work_precision import plot_accuracy
 
 AXES = "xyz"
 LEGEND_ENTRIES = 10
@@ -164,11 +166,12 @@ def _is_free(system: System, body: int) -> bool:
     return parent == len(system.structure.bodies) and int(own.sum()) == 6
 
 
-def plot(system: System | Solution, trajectory: Trajectory | None = None) -> Figure:
+def plot(system: System | Solution | Accuracy, trajectory: Trajectory | None = None) -> Figure:
     """Energies by store, momenta, constraint errors, work and joint coordinates over time.
 
     Args:
-        system: compiled system; or a solution of an optimal control problem, which needs no trajectory.
+        system: compiled system; or a solution of an optimal control problem, or what `accuracy` found,
+            which need no trajectory.
         trajectory: of one lane, computed with it.
 
     Returns:
@@ -187,8 +190,10 @@ def plot(system: System | Solution, trajectory: Trajectory | None = None) -> Fig
     """
     if isinstance(system, Solution):
         return plot_solution(system)
+    if isinstance(system, Accuracy):
+        return plot_accuracy(system)
     if trajectory is None:
-        raise ValueError("plot needs the system and a trajectory, or a solution")
+        raise ValueError("plot needs the system and a trajectory, a solution, or what accuracy found")
     if trajectory.t.ndim != 1:
         raise ValueError(f"plot takes one lane, not a batch of shape {trajectory.t.shape[:-1]}")
     t = np.asarray(trajectory.t)
