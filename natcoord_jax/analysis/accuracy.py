@@ -178,12 +178,18 @@ def _reference(runs: _Runs, quantities: Quantities, orders: Sequence[int]) -> tu
         steps *= 2
     # The run before the differences stopped falling is the one with the least round-off.
     best, steps = (before, steps // 2) if before is not None and last < math.inf else (found.state, steps)
-    errors = [last if last < math.inf else max(_difference(quantities, found.state, best).values())]
+    error = last if last < math.inf else max(_difference(quantities, found.state, best).values())
     others = [k for k in sorted(orders) if k < order]
     if others:
-        other = runs(others[-1], 4 * steps)
-        errors.append(max(_difference(quantities, other.state, best).values()))
-    return best, min(errors) if len(errors) == 1 else max(errors[0], errors[1]), (order, steps)
+        other = _extrapolated(runs, others[-1], min(2 * steps, FINEST // 2))
+        error = max(error, *_difference(quantities, other, best).values())
+    return best, error, (order, steps)
+
+
+def _extrapolated(runs: _Runs, order: int, steps: int) -> State:
+    """End of two runs by Richardson's formula, so that a lower order can judge a higher one."""
+    coarse, fine = runs(order, steps).state, runs(order, 2 * steps).state
+    return jax.tree.map(lambda x, y: y + (y - x) / (2.0**order - 1.0), coarse, fine)
 
 
 def accuracy(
@@ -202,7 +208,7 @@ def accuracy(
     """What accuracy costs in time: run a scene over a range of steps and orders.
 
     The reference is made by the highest order: steps are halved until the end state changes no more, and
-    the run is compared with one of the next lower order.
+    the run is compared with the next lower order, extrapolated by Richardson's formula.
 
     Args:
         system: compiled system.
