@@ -138,10 +138,9 @@ def errors(model: str, state: dict[str, Any]) -> dict[str, float | None]:
     return {key: x if x is not None and math.isfinite(x) else None for key, x in found.items()}
 
 
-def _own_state(model: str, system: nc.System, trajectory: nc.Trajectory) -> dict[str, Any]:
+def own_state(model: str, system: nc.System, last: nc.State) -> dict[str, Any]:
     """Final state in the words of the peers."""
     source = peer_measure.MODELS[model]
-    last = jax.tree.map(lambda x: x[-1], trajectory.states)
     bodies = [system.sense(last, name) for name in system.structure.bodies]
     known = [body["name"].replace("_", " ") for body in source.BODIES]
     order = [known.index(name.replace("_", " ")) for name in system.structure.bodies]
@@ -168,7 +167,7 @@ def own_run(model: str, example: gallery.Example, steps: int, repeats: int) -> d
         "h": example.t_end / steps,
         "settings": {"scheme": "energy-momentum (57)", "solver": system.structure.solver},
         **timing,
-        **errors(model, _own_state(model, system, trajectory)),
+        **errors(model, own_state(model, system, jax.tree.map(lambda x: x[-1], trajectory.states))),
         "energy_balance": float(np.max(nc.balance(system, trajectory).energy)),
         "constraint_error": float(np.max(constraints.position)),
         "velocity_constraint_error": float(np.max(constraints.velocity)),
@@ -281,16 +280,19 @@ def measure(model: str, plan: Plan, peers: tuple[Peer, ...], python: str) -> dic
     }
 
 
-def equal_error(model: str, runs: list[dict[str, Any]]) -> dict[str, dict[str, float | None]]:
+def equal_error(
+    model: str | None, runs: list[dict[str, Any]], wanted_errors: tuple[float, ...] | None = None
+) -> dict[str, dict[str, float | None]]:
     """Time [ms] of the whole manoeuvre at given errors, by code; None where no two runs bracket the error.
 
     Interpolated linearly between the logarithms of time and error of neighbouring numbers of steps.
     """
     table: dict[str, dict[str, float | None]] = {}
+    levels = ERRORS[model or ""] if wanted_errors is None else wanted_errors
     for code in dict.fromkeys(run["code"] for run in runs):
         own = sorted((r for r in runs if r["code"] == code and r["error"]), key=lambda r: r["steps"])
         points = [(math.log(r["error"]), math.log(1e-3 * r["us_per_step"] * r["steps"])) for r in own]
-        table[code] = {f"{wanted:g}": _time_at(points, math.log(wanted)) for wanted in ERRORS[model]}
+        table[code] = {f"{wanted:g}": _time_at(points, math.log(wanted)) for wanted in levels}
     return table
 
 

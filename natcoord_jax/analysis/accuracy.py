@@ -125,7 +125,8 @@ def _difference(quantities: Quantities, one: State, other: State) -> dict[str, f
     return {name: float(x) if np.isfinite(float(x)) else math.inf for name, x in found.items()}
 
 
-def _drift(system: System, start: State, end: State) -> float:
+def drift(system: System, start: State, end: State) -> float:
+    """Energy at the end less energy at the start and work, relative to the energies involved."""
     before, after = system.energy(start), system.energy(end)
     work = end.work - start.work
     scale = max(
@@ -273,7 +274,7 @@ def accuracy(
                 Row(
                     order, count, error, errors, wall,
                     int(found.iterations) / max(int(found.substeps), 1),
-                    _drift(system, state, found.state),
+                    drift(system, state, found.state),
                     "successful" if code == Result.SUCCESSFUL else code.name.lower(),
                     note,
                 )
