@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from natcoord_jax.control.costates import Charts, Costates, Multipliers
+from natcoord_jax.control.costates import Charts, Costates, Jacobians, Multipliers
 from natcoord_jax.control.transcription import Path, Unknowns
 
 
@@ -55,7 +55,7 @@ class Derivatives(eqx.Module):
     """First derivatives at a motion.
 
     Attributes:
-        inverses: of the Jacobians of the steps in their own unknowns.
+        jacobians: of the equations of the steps.
         maps: small numbers of the nodes.
         worth: costates.
         bent: costates of projected steps, for the curvature.
@@ -64,7 +64,7 @@ class Derivatives(eqx.Module):
         errors: what is missing.
     """
 
-    inverses: Float[Array, "*batch steps n n"]
+    jacobians: Jacobians
     maps: Charts
     worth: Costates
     bent: Costates

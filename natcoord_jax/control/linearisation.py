@@ -6,7 +6,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from natcoord_jax.control.compiled import quickly
-from natcoord_jax.control.costates import Costates, Multipliers, charts, costates, step_inverses
+from natcoord_jax.control.costates import Costates, Multipliers, charts, costates, step_jacobians
 from natcoord_jax.control.iterate import Derivatives, Errors, Slacks, largest
 from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.control.transcription import (
@@ -62,15 +62,15 @@ def linearised(
     unit: Array,
 ) -> Derivatives:
     """First derivatives at a motion, and what is missing to the conditions of optimality."""
-    inverses = step_inverses(problem, path, unknowns)
+    jacobians = step_jacobians(problem, path, unknowns)
     maps = charts(problem, path.nodes)
-    worth, bent, by_w = costates(problem, path, unknowns, multipliers, inverses, maps)
+    worth, bent, by_w = costates(problem, path, unknowns, multipliers, jacobians, maps)
     by_first = _first_gradient(problem, unknowns, worth)
     count = unknowns.free.size
     scale = _gradient_scale(problem, unknowns, path, multipliers.path)
     by_coefficients = largest(by_w[:: problem.inputs.every], by_first[count:]) / scale
     stationarity = jnp.maximum(by_coefficients, largest(by_first[:count]) / unit)
-    corrections = largest(jnp.einsum("kij,kj->ki", inverses, path.stages.residual))
+    corrections = largest(jnp.einsum("kij,kj->ki", jacobians.inverses, path.stages.residual))
     size = largest(unknowns.y)
     errors = Errors(
         stationarity,
@@ -79,7 +79,7 @@ def linearised(
         largest(path.stages.excess + slacks.path, path.end.excess + slacks.end),
         largest(slacks.path * multipliers.path, slacks.end * multipliers.end) / unit,
     )
-    return Derivatives(inverses, maps, worth, bent, by_w, by_first, errors)
+    return Derivatives(jacobians, maps, worth, bent, by_w, by_first, errors)
 
 
 def cost_unit(problem: OptimalControl, unknowns: Unknowns, path: Path) -> Array:

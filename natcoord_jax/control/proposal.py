@@ -3,6 +3,7 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
 
 from natcoord_jax.control.compiled import quickly
@@ -14,6 +15,7 @@ from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.control.quadratic import Model, model
 from natcoord_jax.control.riccati import REACH, Move, Weighted, solve
 from natcoord_jax.control.transcription import (
+    Node,
     Unknowns,
     end,
     entering,
@@ -126,14 +128,19 @@ def _swept(problem: OptimalControl, iterate: Iterate, change: Unknowns) -> Sweep
     w, dw = entering(problem, unknowns.coefficients), entering(problem, change.coefficients)
 
     def body(dn, given):
-        at, node, w, dw, y, inverse, residual = given
-        _, linear = jax.linearize(lambda *x: stage(problem, at, *x), node, w, y)
-        dy = -inverse @ (residual + linear(dn, dw, jnp.zeros_like(y)).residual)
-        changed = linear(dn, dw, dy)
-        return changed.after, (dy, changed.excess)
+        at, node, w, dw, y, jacobian, residual = given
+        moved = residual + jacobian.by_node @ ravel_pytree(dn)[0] + jacobian.by_w @ dw
+        dy = -(jacobian.inverses @ moved)
 
-    inverses, residual = iterate.derivatives.inverses, path.stages.residual
-    given = (slices(problem), nodes_before(path), w, dw, unknowns.y, inverses, residual)
+        def rest(node: Node, w: Array, y: Array) -> tuple[Node, Array]:
+            found = stage(problem, at, node, w, y)
+            return found.after, found.excess
+
+        after, excess = jax.jvp(rest, (node, w, y), (dn, dw, dy))[1]
+        return after, (dy, excess)
+
+    jacobians, residual = iterate.derivatives.jacobians, path.stages.residual
+    given = (slices(problem), nodes_before(path), w, dw, unknowns.y, jacobians, residual)
     last, (y, excess) = jax.lax.scan(body, start, given)
     final = jax.tree.map(lambda x: x[-1], path.nodes)
     reached = jax.jvp(lambda node: end(problem, node), (final,), (last,))[1]
@@ -217,18 +224,7 @@ def _lowered(iterate: Iterate) -> Array:
 def propose(problem: OptimalControl, options: Options, iterate: Iterate) -> Proposal:
     """The next step, from the quadratic model."""
     iterate = eqx.tree_at(lambda i: i.barrier, iterate, _lowered(iterate))
-    d = iterate.derivatives
-    found = model(
-        problem,
-        iterate.path,
-        iterate.unknowns,
-        iterate.multipliers,
-        d.bent,
-        d.by_w,
-        d.by_first,
-        d.inverses,
-        d.maps,
-    )
+    found = model(problem, iterate.path, iterate.unknowns, iterate.multipliers, iterate.derivatives)
     move, made = _convex(problem, iterate, found)
     direction = _direction(problem, options, iterate, found, move, made)
     slope, weights = slope_and_weights(iterate, direction, problem.inputs.every)
