@@ -97,10 +97,10 @@ def step_jacobians(problem: OptimalControl, path: Path, unknowns: Unknowns) -> J
     return jax.vmap(one)(slices(problem), before, entering(problem, unknowns.coefficients), unknowns.y)
 
 
-def split_node(problem: OptimalControl, node: Node, rates: Array) -> tuple[Node, Array]:
-    """Node with given rates of its free motions, and the momenta that they leave out."""
+def split_node(problem: OptimalControl, node: Node, rates: Array, worth: Array) -> tuple[Node, Array]:
+    """Node with given rates of its free motions, and what the momenta are worth that they leave out."""
     system, _ = problem.applied(node.free)
-    state, left = split(system, unpacked(problem.state, node.x, problem.state.t), rates)
+    state, left = split(system, unpacked(problem.state, node.x, problem.state.t), rates, worth)
     return eqx.tree_at(lambda n: n.x, node, packed(state)), left
 
 
@@ -143,8 +143,10 @@ def costates(
     def body(after: tuple[Array, Array], given: tuple) -> tuple[tuple[Array, Array], tuple]:
         at, node, w, y, sigma, jacobian, following, rates, forth, flexibility = given
 
-        def projected(after: Array) -> tuple[Array, Array]:
-            reached, left = split_node(problem, unflat(after), rates)
+        worth_left = worth_of_left(unflat(after[1]), forth, flexibility)
+
+        def projected(node: Array) -> tuple[Array, Array]:
+            reached, left = split_node(problem, unflat(node), rates, worth_left)
             return ravel_pytree(reached)[0], left
 
         def rest(node: Array, w: Array, y: Array) -> tuple[Array, Array, Array]:
@@ -152,7 +154,7 @@ def costates(
             return found.cost, found.excess, ravel_pytree(found.after)[0]
 
         back = jax.vjp(projected, ravel_pytree(following)[0])[1]
-        unprojected = back((after[1], worth_of_left(unflat(after[1]), forth, flexibility)))[0]
+        unprojected = back((after[1], jnp.ones(())))[0]
         pull = jax.vjp(rest, ravel_pytree(node)[0], w, y)[1]
 
         def through(after: Array) -> tuple[Array, Array, Array]:

@@ -111,16 +111,16 @@ def _stage_model(problem: OptimalControl, step: Step) -> tuple[Array, ...]:
     momenta that they leave out as their residual. The Lagrangian is linear in them.
     """
     flat, unflat = ravel_pytree(step.node)
-    point = (flat, step.w, step.y, step.rates)
+    point = (flat, step.w, step.y, step.rates, step.left)
 
-    def lagrangian(chi: Array, w: Array, y: Array, rates: Array) -> tuple[Array, tuple]:
+    def lagrangian(chi: Array, w: Array, y: Array, rates: Array, left: Array) -> tuple[Array, tuple]:
         found = stage(problem, step.at, unflat(chi), w, y)
-        after, left = split_node(problem, found.after, rates)
+        after, momenta = split_node(problem, found.after, rates, left)
         pairs = zip(jax.tree.leaves(step.worth), jax.tree.leaves(after))
-        carried = sum(jnp.sum(a * b) for a, b in pairs) + step.left @ left
+        carried = sum(jnp.sum(a * b) for a, b in pairs) + momenta
         by_residual, by_excess = step.multipliers
         value = found.cost + carried + by_residual @ found.residual + by_excess @ found.excess
-        return value, (ravel_pytree(found.after)[0], found.excess, left)
+        return value, (ravel_pytree(found.after)[0], found.excess)
 
     size, channels = flat.size, step.w.size
     count = step.forth.shape[1] + channels
@@ -129,13 +129,13 @@ def _stage_model(problem: OptimalControl, step: Step) -> tuple[Array, ...]:
     dchi, dw = directions[:size], directions[size:]
     moved = step.jacobian.by_node @ dchi + step.jacobian.by_w @ dw
     dy = -step.jacobian.inverses @ moved.at[:, -1].add(step.residual)
-    slopes = jax.grad(lagrangian, argnums=(0, 1, 2, 3), has_aux=True)
+    slopes = jax.grad(lagrangian, argnums=(0, 1, 2, 3, 4), has_aux=True)
 
     def along(*d: Array) -> tuple:
-        return jax.jvp(slopes, point, (*d, jnp.zeros_like(step.rates)))[1]
+        return jax.jvp(slopes, point, (*d, jnp.zeros_like(step.rates), jnp.zeros_like(step.left)))[1]
 
-    bent, (after, excess, left) = jax.vmap(along, in_axes=1, out_axes=1)(dchi, dw, dy)
-    mixed = (step.flexibility @ left).T @ bent[3]
+    bent, (after, excess) = jax.vmap(along, in_axes=1, out_axes=1)(dchi, dw, dy)
+    mixed = (step.flexibility @ bent[4]).T @ bent[3]
     hessian = dchi.T @ bent[0] + dw.T @ bent[1] + dy.T @ bent[2] + mixed + mixed.T
     # The momenta of the step itself: what it carries on normal to the constraints is no part of them.
     forward = step.back @ after

@@ -79,15 +79,20 @@ def steadied(system: System, state: State) -> State:
     return replace_fields(state, v=moving.reshape(-1, 3))
 
 
-def split(system: System, state: State, w: Float[Array, " n"]) -> tuple[State, Float[Array, " n"]]:
-    """State with given rates of the free motions, and the momenta of a state that they leave out.
+def split(
+    system: System, state: State, w: Float[Array, " n"], worth: Float[Array, " n"]
+) -> tuple[State, Float[Array, ""]]:
+    """State with given rates of the free motions, and what the momenta are worth that they leave out.
 
-    Where these vanish, the rates are those of `steady_rates`: the projection as an equation for its result.
+    Where these momenta vanish, the rates are those of `steady_rates`: the projection as an equation for its
+    result.
     """
-    rates_of, along = _free_motions(system, state.q.reshape(-1, 4, 3))
-    moving = rates_of(w).reshape(-1, 3)
-    left = along(_with_mass(system, state.v - moving))
-    still, places = replace_fields(state, v=moving), _rotor_places(system)
+    rows = state.q.reshape(-1, 4, 3)
+    both = jnp.stack([w, worth])
+    velocity, spin = (jnp.einsum("bnc,kn->kbc", x, both) for x in null_space(system, rows))
+    moving, virtual = jax.vmap(row_rates, in_axes=(None, 0, 0))(rows, velocity, spin)
+    left = jnp.sum(virtual * _with_mass(system, state.v - moving.reshape(-1, 3)))
+    still, places = replace_fields(state, v=moving.reshape(-1, 3)), _rotor_places(system)
     return (replace_fields(still, rates=state_rates(system, still)[places]) if places.size else still), left
 
 
