@@ -4,15 +4,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from natcoord_jax.control.compiled import quickly
 from natcoord_jax.control.costates import Multipliers
-from natcoord_jax.control.iterate import Iterate, Options, Slacks, largest
+from natcoord_jax.control.iterate import Derivatives, Iterate, Model, Options, Slacks, largest
 from natcoord_jax.control.linearisation import nodes_before
 from natcoord_jax.control.merit import Direction, Violations, slope_and_weights
 from natcoord_jax.control.problem import OptimalControl
-from natcoord_jax.control.quadratic import Model, model
+from natcoord_jax.control.quadratic import model
 from natcoord_jax.control.riccati import REACH, Move, Weighted, solve
 from natcoord_jax.control.transcription import (
     Node,
@@ -31,13 +31,21 @@ STIFFEST = 1e3
 """Largest penalty on the goal, in units of its stiffness."""
 LEAST_BARRIER = 1e-10
 """Barrier parameter at the end, relative to the cost."""
-REFINEMENTS = 2
+REFINEMENTS = 1
 """Corrections of a step, so that the goal is met to first order of the exact motion."""
 
 
-class Proposal(eqx.Module):
-    """The step that the quadratic model proposes."""
+NEAR = 0.1
+"""Relative size of a step after which the model it came from may serve another one."""
+GAIN = 0.2
+"""Part of the errors that a step of an old model may leave, for the model to serve on."""
 
+
+class Proposal(eqx.Module):
+    """The step that the quadratic model proposes, the model, and how many steps that has served."""
+
+    model: Model | None
+    kept: Int[Array, ""]
     direction: Direction
     slope: Float[Array, ""]
     weights: Violations
@@ -220,15 +228,66 @@ def _lowered(iterate: Iterate) -> Array:
     return jnp.where(missing < 10.0 * relative, jnp.minimum(lower, mu), mu)
 
 
+def no_model(derivatives: Derivatives, multipliers: Multipliers) -> Model:
+    """A place for a model."""
+    forth, steps = derivatives.maps.forth, derivatives.by_w.shape[0]
+    z, m, f = forth.shape[2], derivatives.by_w.shape[1], derivatives.by_first.shape[0]
+    h, c, e = multipliers.path.shape[1], multipliers.goal.shape[0], multipliers.end.shape[0]
+    stages = (
+        (steps, z, z + m),
+        (steps, z),
+        (steps, z + m, z + m),
+        (steps, z + m),
+        (steps, h, z + m),
+        (steps, h),
+    )
+    ends = ((z, z), (c, z), (e, z), (z, f), (f, f), (f,))
+    return Model(*(jnp.zeros(shape) for shape in stages + ends))
+
+
+def _modelled(problem: OptimalControl, options: Options, iterate: Iterate) -> tuple[Model, Array]:
+    """The quadratic model: formed here, or the last one with the gradient from here where that will do.
+
+    Near the end the curvature hardly changes from step to step, and it is most of the work. A motion that
+    obeys its equations has no offsets, so that only the gradient has to be new.
+    """
+
+    def formed() -> tuple[Model, Array]:
+        found = model(problem, iterate.path, iterate.unknowns, iterate.multipliers, iterate.derivatives)
+        return found, jnp.zeros_like(iterate.kept)
+
+    last = iterate.model
+    if last is None:
+        return formed()
+
+    def kept() -> tuple[Model, Array]:
+        by_w, by_first = iterate.derivatives.by_w, iterate.derivatives.by_first
+        gradient = jnp.zeros_like(last.gradient).at[:, -by_w.shape[1] :].set(by_w)
+        found = eqx.tree_at(lambda m: (m.gradient, m.first_gradient), last, (gradient, by_first))
+        return found, iterate.kept + 1
+
+    near = (iterate.step >= 1.0) & (iterate.moved < NEAR) & (iterate.failures == 0)
+    return jax.lax.cond(near & ((iterate.kept == 0) | (iterate.gain < GAIN)), kept, formed)
+
+
 @quickly
 def propose(problem: OptimalControl, options: Options, iterate: Iterate) -> Proposal:
     """The next step, from the quadratic model."""
     iterate = eqx.tree_at(lambda i: i.barrier, iterate, _lowered(iterate))
-    found = model(problem, iterate.path, iterate.unknowns, iterate.multipliers, iterate.derivatives)
+    found, kept = _modelled(problem, options, iterate)
     move, made = _convex(problem, iterate, found)
     direction = _direction(problem, options, iterate, found, move, made)
     slope, weights = slope_and_weights(iterate, direction, problem.inputs.every)
     penalty = _penalty(iterate, move)
     return Proposal(
-        direction, slope, weights, iterate.barrier, made.shift, penalty, move.unreachable, move.convex
+        None if options.lifted else found,
+        kept,
+        direction,
+        slope,
+        weights,
+        iterate.barrier,
+        made.shift,
+        penalty,
+        move.unreachable,
+        move.convex,
     )

@@ -2,11 +2,10 @@
 
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from natcoord_jax.control.costates import (
     Charts,
@@ -18,7 +17,7 @@ from natcoord_jax.control.costates import (
     split_node,
     worth_of_left,
 )
-from natcoord_jax.control.iterate import Derivatives
+from natcoord_jax.control.iterate import Derivatives, Model
 from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.control.transcription import (
     Node,
@@ -34,40 +33,6 @@ from natcoord_jax.control.transcription import (
 
 TOGETHER = 5
 """Steps whose models are formed together."""
-
-
-class Model(eqx.Module):
-    """Linear dynamics and quadratic costs in small numbers z (see `tangent`), w and what is free.
-
-    z holds changes of the state, of what is free and of the register; w those of entering coefficients.
-
-    Attributes:
-        forward: z_k+1 = forward [z_k, w_k] + offset, (steps, z, z + m).
-        offset: from the residuals (steps, z).
-        hessian: of the Lagrangian in [z, w] (steps, z + m, z + m).
-        gradient: linear terms in [z, w] (steps, z + m).
-        excess: derivative of the excesses (steps, h, z + m).
-        excess_offset: from the residuals (steps, h).
-        last_hessian: of the terminal Lagrangian (z, z).
-        goal: derivative of the goal (c, z).
-        last_excess: derivative of the terminal excesses (e, z).
-        first: z_0 per what is free and leading coefficients (z, f).
-        first_hessian: (f, f).
-        first_gradient: (f,).
-    """
-
-    forward: Float[Array, "steps z zm"]
-    offset: Float[Array, "steps z"]
-    hessian: Float[Array, "steps zm zm"]
-    gradient: Float[Array, "steps zm"]
-    excess: Float[Array, "steps h zm"]
-    excess_offset: Float[Array, "steps h"]
-    last_hessian: Float[Array, "z z"]
-    goal: Float[Array, "c z"]
-    last_excess: Float[Array, "e z"]
-    first: Float[Array, "z f"]
-    first_hessian: Float[Array, "f f"]
-    first_gradient: Float[Array, " f"]
 
 
 class Step(NamedTuple):

@@ -44,11 +44,13 @@ def _chosen(problem: OptimalControl, method: str, guess: Any = None) -> bool:
         raise ValueError(f"method is {method!r}; pass one of {METHODS}")
     if method != "auto":
         return method == "lifted"
-    inputs = all(label.startswith("input ") for label in problem.bounds.labels(problem.system))
     if problem.free_time:
         return True
-    # An earlier solution is a motion already.
-    return not isinstance(guess, Solution) and (bool(problem.free) or not inputs)
+    if isinstance(guess, Solution) and guess.iterate is not None:
+        # What it was found by has been compiled, and led to it.
+        return guess.method.startswith(NAMES[True])
+    inputs = all(label.startswith("input ") for label in problem.bounds.labels(problem.system))
+    return bool(problem.free) or not inputs
 
 
 def _row(problem: OptimalControl, iterate: Iterate, start: float) -> Row:
@@ -120,8 +122,8 @@ def optimise(
     Args:
         problem: the problem.
         guess: inputs (steps, inputs), a `Guess`, an earlier `Solution`, or None.
-        method: "auto" (lifted if time or parameters are free or more than inputs is bounded), "shooting" or
-            "lifted".
+        method: "shooting", "lifted" or "auto": that of an earlier solution as guess, else lifted if parameters
+            are free or more than inputs is bounded; with free time always lifted.
         progress: print a line for each iteration to stderr.
         max_iterations: limit of iterations.
         tol: largest gradient of the Lagrangian and complementarity, relative.
