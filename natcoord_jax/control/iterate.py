@@ -16,14 +16,15 @@ class Options(eqx.Module):
         max_iterations: of the method.
         tol: largest gradient of the Lagrangian and complementarity, relative.
         goal_tol: largest residual of the goal, in its units, of the bounds, in theirs, and of the steps.
-        barrier: barrier parameter at the start, relative to the cost.
+        barrier: barrier parameter at the start, all bounds together, relative to the cost; a small one lets
+            the first steps, which know no multipliers yet, run into bounds.
     """
 
     lifted: bool = eqx.field(default=False, static=True)
     max_iterations: int = eqx.field(default=100, static=True)
     tol: float = eqx.field(default=1e-8, static=True)
     goal_tol: float = eqx.field(default=1e-10, static=True)
-    barrier: float = eqx.field(default=0.1, static=True)
+    barrier: float = eqx.field(default=3.0, static=True)
 
 
 class Slacks(eqx.Module):

@@ -122,8 +122,8 @@ def optimise(
     Args:
         problem: the problem.
         guess: inputs (steps, inputs), a `Guess`, an earlier `Solution`, or None.
-        method: "shooting", "lifted" or "auto": that of an earlier solution as guess, else lifted if parameters
-            are free or more than inputs is bounded; with free time always lifted.
+        method: "shooting", "lifted" or "auto": that of an earlier solution as guess, else lifted if
+            parameters are free or more than inputs is bounded; with free time always lifted.
         progress: print a line for each iteration to stderr.
         max_iterations: limit of iterations.
         tol: largest gradient of the Lagrangian and complementarity, relative.
