@@ -1,5 +1,6 @@
 """What changes of nodes and residuals are worth: the adjoint equations of a motion."""
 
+from collections.abc import Callable
 from functools import partial
 from operator import itemgetter
 from typing import NamedTuple
@@ -123,6 +124,33 @@ def scored_end(problem: OptimalControl, multipliers: Multipliers, node: Node) ->
     return found.cost + multipliers.goal @ found.missing + multipliers.end @ found.excess
 
 
+Through = Callable[[Array], tuple[Array, Array, Array]]
+
+
+def backward(
+    problem: OptimalControl, at: Slice, node: Node, w: Array, y: Array, sigma: Array, jacobian: Jacobians
+) -> Through:
+    """One step back, from the worth of the node after it as one vector.
+
+    Returns:
+        A function to the worth of the node before it, the gradient in what enters, and the residual's worth.
+    """
+    flat, unflat = ravel_pytree(node)
+
+    def rest(node: Array, w: Array, y: Array) -> tuple[Array, Array, Array]:
+        found = stage(problem, at, unflat(node), w, y)
+        return found.cost, found.excess, ravel_pytree(found.after)[0]
+
+    pull = jax.vjp(rest, flat, w, y)[1]
+
+    def through(after: Array) -> tuple[Array, Array, Array]:
+        before, by_w, by_y = pull((jnp.ones(()), sigma, after))
+        worth = -(by_y @ jacobian.inverses)
+        return before + worth @ jacobian.by_node, by_w + worth @ jacobian.by_w, worth
+
+    return through
+
+
 def costates(
     problem: OptimalControl,
     path: Path,
@@ -149,19 +177,9 @@ def costates(
             reached, left = split_node(problem, unflat(node), rates, worth_left)
             return ravel_pytree(reached)[0], left
 
-        def rest(node: Array, w: Array, y: Array) -> tuple[Array, Array, Array]:
-            found = stage(problem, at, unflat(node), w, y)
-            return found.cost, found.excess, ravel_pytree(found.after)[0]
-
         back = jax.vjp(projected, ravel_pytree(following)[0])[1]
         unprojected = back((after[1], jnp.ones(())))[0]
-        pull = jax.vjp(rest, ravel_pytree(node)[0], w, y)[1]
-
-        def through(after: Array) -> tuple[Array, Array, Array]:
-            before, by_w, by_y = pull((jnp.ones(()), sigma, after))
-            worth = -(by_y @ jacobian.inverses)
-            return before + worth @ jacobian.by_node, by_w + worth @ jacobian.by_w, worth
-
+        through = backward(problem, at, node, w, y, sigma, jacobian)
         both, by_w, worth = jax.vmap(through)(jnp.stack([after[0], unprojected]))
         return (both[0], both[1]), (both, worth, by_w[0])
 

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from operator import itemgetter
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -156,7 +155,7 @@ def optimise(
     return found
 
 
-@eqx.filter_jit
+@quickly
 def optimise_jit(problem: OptimalControl, unknowns: Unknowns, options: Options = DEFAULT) -> Iterate:
     """The method as one program, for `jax.vmap`, receding horizons and other programs around it.
 

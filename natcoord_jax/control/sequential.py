@@ -35,7 +35,7 @@ NEARLY = 1e-6
 
 
 @quickly
-def _begun(problem: OptimalControl, options: Options, unknowns: Unknowns) -> tuple:
+def _begun(problem: OptimalControl, options: Options, unknowns: Unknowns) -> tuple[tuple, tuple]:
     newton, whole = jnp.array(0), jnp.array(True)
     if not options.lifted:
         unknowns, whole, newton = simulated(problem, unknowns)
@@ -45,7 +45,7 @@ def _begun(problem: OptimalControl, options: Options, unknowns: Unknowns) -> tup
     barrier = options.barrier * unit / max(1, slacks.path.size + slacks.end.size)
     goal = jnp.zeros_like(path.end.missing)
     multipliers = Multipliers(goal, barrier / slacks.path, barrier / slacks.end)
-    return unknowns, multipliers, slacks, path, unit, barrier, whole, newton
+    return (unknowns, multipliers, slacks, path, unit), (barrier, whole, newton)
 
 
 def init(problem: OptimalControl, options: Options, unknowns: Unknowns) -> Iterate:
@@ -57,8 +57,18 @@ def init(problem: OptimalControl, options: Options, unknowns: Unknowns) -> Itera
         unknowns: coefficients and what is free; `y` is replaced by a simulation unless the method is lifted.
     """
     begin = Options(options.lifted, barrier=options.barrier)
-    unknowns, multipliers, slacks, path, unit, barrier, whole, newton = _begun(problem, begin, unknowns)
+    begun, rest = _begun(problem, begin, unknowns)
+    unknowns, multipliers, slacks, path, unit = begun
     derivatives = linearised(problem, unknowns, multipliers, slacks, path, unit)
+    return _first(begin, begun, derivatives, *rest)
+
+
+@quickly
+def _first(
+    options: Options, begun: tuple, derivatives: Derivatives, barrier: Array, whole: Array, newton: Array
+) -> Iterate:
+    """The first iterate; compiled, so that its constants are numbers also where derivatives are traced."""
+    unknowns, multipliers, slacks, path, unit = begun
     nothing, infinite = jnp.zeros(()), jnp.full((), jnp.inf, float)
     goal = multipliers.goal
     finite = jnp.isfinite(path.cost) & jnp.isfinite(derivatives.errors.stationarity)
@@ -104,7 +114,7 @@ def tried(
     reached = (found.unknowns, found.slacks, found.path)
     stayed = (iterate.unknowns, iterate.slacks, iterate.path)
     reached = jax.tree.map(lambda x, x0: jnp.where(fine, x, x0), reached, stayed)
-    found = Found(found.length, *reached, fine, found.newton)
+    found = Found(found.length, reached[0], reached[1], reached[2], fine, found.newton)
     m, dm = iterate.multipliers, proposal.direction.multipliers
     dual = room([(m.path, dm.path), (m.end, dm.end)])
     # Multipliers of the goal are those of the model, however short the step, even if there is none: without
