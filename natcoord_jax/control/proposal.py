@@ -157,11 +157,12 @@ def _swept(problem: OptimalControl, iterate: Iterate, change: Unknowns) -> Sweep
 
 def _refined(
     problem: OptimalControl, iterate: Iterate, found: Model, move: Move, weights: Weights
-) -> tuple[Unknowns, Array, Sweep]:
+) -> tuple[Unknowns, Array, Sweep, tuple[Array, Array]]:
     """The move of the model, corrected until the goal is met to first order exactly.
 
     Returns:
-        Changes of coefficients and of what is free, of the goal's multipliers, and the exact sweep.
+        Changes of coefficients and of what is free, of the goal's multipliers, the exact sweep, and the
+        changes of the excesses in the model.
     """
     count = iterate.unknowns.free.size
     every, leading = problem.inputs.every, problem.inputs.degree
@@ -178,16 +179,15 @@ def _refined(
         )
 
     def body(k: Array, carry: tuple) -> tuple:
-        first, w, goal, sweep = carry
+        first, w, goal, z, sweep = carry
         missing = iterate.path.end.missing + sweep.missing
         none = jnp.zeros_like(goal)
         more = solve(flat, missing, eased, weights.idle, weights.shift, weights.penalty, none, weights.reach)
         # The first turn only sweeps: so everything is compiled once.
         usable = (k > 0) & more.convex & jnp.all(jnp.isfinite(more.w))
-        first, w, goal = (
-            x + jnp.where(usable, dx, 0.0) for x, dx in ((first, more.first), (w, more.w), (goal, more.goal))
-        )
-        return first, w, goal, _swept(problem, iterate, changed(first, w))
+        pairs = ((first, more.first), (w, more.w), (goal, more.goal), (z, more.z))
+        first, w, goal, z = (x + jnp.where(usable, dx, 0.0) for x, dx in pairs)
+        return first, w, goal, z, _swept(problem, iterate, changed(first, w))
 
     path = iterate.path
     still = Sweep(
@@ -196,23 +196,29 @@ def _refined(
             for x in (iterate.unknowns.y, path.stages.excess, path.end.missing, path.end.excess)
         )
     )
-    begun = (move.first, move.w, move.goal, still)
-    first, w, goal, sweep = jax.lax.fori_loop(0, REFINEMENTS + 1, body, begun)
-    return changed(first, w), goal, sweep
+    begun = (move.first, move.w, move.goal, move.z, still)
+    first, w, goal, z, sweep = jax.lax.fori_loop(0, REFINEMENTS + 1, body, begun)
+    both = jnp.concatenate([z[:-1], w], axis=1)
+    excess = jnp.einsum("khz,kz->kh", found.excess, both) + found.excess_offset
+    return changed(first, w), goal, sweep, (excess, found.last_excess @ z[-1])
 
 
 def _direction(
     problem: OptimalControl, options: Options, iterate: Iterate, found: Model, move: Move, weights: Weights
 ) -> Direction:
     """Directions of coefficients, of what is free, of the unknowns of the steps, slacks and multipliers."""
-    unknowns, goal, sweep = _refined(problem, iterate, found, move, weights)
+    unknowns, goal, sweep, excess = _refined(problem, iterate, found, move, weights)
     if options.lifted:
         unknowns = eqx.tree_at(lambda u: u.y, unknowns, sweep.y)
     s, m, mu = iterate.slacks, iterate.multipliers, iterate.barrier
     slack = -(iterate.path.stages.excess + s.path) - sweep.excess
     last = -(iterate.path.end.excess + s.end) - sweep.end_excess
-    path = (mu - m.path * slack) / s.path - m.path
-    ends = (mu - m.end * last) / s.end - m.end
+    # Multipliers are those of the model: where a bound is stiff, the little by which its excess differs from
+    # the exact one would be a force.
+    felt = -(iterate.path.stages.excess + s.path) - excess[0]
+    felt_last = -(iterate.path.end.excess + s.end) - excess[1]
+    path = (mu - m.path * felt) / s.path - m.path
+    ends = (mu - m.end * felt_last) / s.end - m.end
     return Direction(unknowns, Multipliers(goal, path, ends), Slacks(slack, last))
 
 
