@@ -107,7 +107,8 @@ def test_a_changed_number_does_not_compile_anew(solution, hinged, monkeypatch):
 
 
 def test_limits_of_iterations_and_time(solution):
-    stopped = nc.optimise(solution.problem, progress=False, max_iterations=1, tol=1e-300)
+    few = {"method": "shooting", "max_iterations": 1, "tol": 1e-300}
+    stopped = nc.optimise(solution.problem, progress=False, **few)
     assert stopped.outcome is nc.Outcome.MAX_ITERATIONS and "more iterations" in stopped.explain()
     late = nc.optimise(solution.problem, progress=False, time_limit=0.0)
     assert late.outcome is nc.Outcome.TIME_LIMIT and late.inputs.shape == (20, 1)
