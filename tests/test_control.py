@@ -107,7 +107,8 @@ def test_a_changed_number_does_not_compile_anew(solution, hinged, monkeypatch):
 
 
 def test_limits_of_iterations_and_time(solution):
-    stopped = nc.optimise(solution.problem, progress=False, max_iterations=1, tol=1e-300)
+    few = {"method": "shooting", "max_iterations": 1, "tol": 1e-300}
+    stopped = nc.optimise(solution.problem, progress=False, **few)
     assert stopped.outcome is nc.Outcome.MAX_ITERATIONS and "more iterations" in stopped.explain()
     late = nc.optimise(solution.problem, progress=False, time_limit=0.0)
     assert late.outcome is nc.Outcome.TIME_LIMIT and late.inputs.shape == (20, 1)
@@ -205,6 +206,17 @@ def test_costs_add_up(hinged):
     assert float(total.running(system, state, u, t)) == 12.0 + 2.0 + 2.0
     end = nc.cost.Terminal(lambda s: 5.0) + nc.cost.Missed(nc.goal.Coordinate("hinge", 2.0), weight=0.5)
     assert float(end.terminal(system, state)) == 5.0 + 2.0
+
+
+def test_a_problem_with_rest_is_posed_inside_of_jit(hinged):
+    system, state = hinged
+
+    def missing(scale):
+        heavier = dataclasses.replace(system, mass=scale * system.mass)
+        problem = numeric(rest_to_rest((heavier, state), angle=scale))
+        return problem.goal.residual(problem.system, problem.state)
+
+    np.testing.assert_allclose(jax.jit(jax.vmap(missing))(jnp.array([1.0, 2.0])), [[-1.0, 0.0], [-2.0, 0.0]])
 
 
 def test_inverse_dynamics_reproduces_the_path():
@@ -437,3 +449,62 @@ def test_first_order_descent_comes_near(hinged, solution):
     )
     plain = nc.descend(free, iterations=300, optimiser=optax.adam(0.1), progress=False)
     assert plain.cost < 1e-4
+
+
+@pytest.mark.slow
+def test_first_order_descent_respects_bounds_of_inputs(hinged):
+    problem = rest_to_rest(hinged, bounds=nc.bounds.Input(-10.0, 10.0))
+    known = solved(problem)
+    found = nc.descend(problem, iterations=400, rounds=10, progress=False)
+    assert found.ok, found.explain()
+    assert float(jnp.max(jnp.abs(found.inputs))) <= 10.0 * (1 + 1e-3)
+    assert found.cost == pytest.approx(known.cost, rel=2e-2)
+
+
+@pytest.mark.slow
+def test_mirror_images_are_two_optima(hinged):
+    either = nc.goal.Equal(lambda s: s.coordinates[0] ** 2 - 1.0, "one radian, either way") & nc.goal.Rest()
+    problem = rest_to_rest(hinged, steps=10, goal=either)
+    found = nc.multi_start(problem, starts=6, rates=2.0, spread=3.0, method="lifted")
+    assert [s.outcome for s in found] == [nc.Outcome.OPTIMAL] * 2
+    assert found[0].cost == pytest.approx(found[1].cost, rel=1e-9)
+    np.testing.assert_allclose(found[0].inputs, -found[1].inputs, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_piecewise_linear_inputs_hold_the_optimum(hinged, solution):
+    # The optimum falls linearly with time: splines of degree one contain it.
+    found = solved(rest_to_rest(hinged, inputs=nc.inputs.piecewise_linear(5)))
+    assert found.cost == pytest.approx(solution.cost, rel=1e-3)
+    slopes = np.diff(np.asarray(found.inputs)[:, 0])
+    np.testing.assert_allclose(slopes, slopes.mean(), rtol=0.05)
+
+
+@pytest.mark.slow
+def test_limit_of_a_joint_is_kept_and_felt(hinged):
+    system, state = hinged
+    # Moving at 3 rad/s at first, it would overshoot what it has to come to rest at.
+    rows = state.q.reshape(-1, 4, 3)
+    spinning = jnp.concatenate([jnp.zeros((1, 3)), jnp.cross(jnp.array([0.0, 0.0, 3.0]), rows[0, 1:])])
+    moving = dataclasses.replace(state, v=spinning)
+    free = solved(rest_to_rest((system, moving), angle=0.2))
+    limit = nc.bounds.Coordinate(-1.0, 0.35, joint="hinge")
+    kept = solved(rest_to_rest((system, moving), angle=0.2, bounds=limit))
+    highest = [float(s.trajectory.states.coordinates.max()) for s in (free, kept)]
+    assert highest[0] > 0.4
+    assert highest[1] == pytest.approx(0.35, abs=1e-5)
+    assert kept.cost > 1.05 * free.cost
+    pressing = kept.multipliers["coordinate 0 of 'hinge' below its upper bound"]
+    assert pressing.max() > 1e-3
+
+
+@pytest.mark.slow
+def test_keep_out_cone_is_gone_around():
+    plain = manoeuvres.turn(20, axis=(0, 0, 1))
+    sun = np.array([1.0, 1.0, 0.1]) / np.sqrt(2.01)
+    cone = nc.bounds.KeepOut("body", axis=(1.0, 0.0, 0.0), cone=sun, angle=0.3)
+    fields = {f.name: getattr(plain, f.name) for f in dataclasses.fields(plain)}
+    found = solved(nc.OptimalControl(**{**fields, "bounds": cone}))
+    nearest = np.max(np.asarray(found.trajectory.q)[1:, 1] @ sun)
+    assert nearest == pytest.approx(np.cos(0.3), abs=1e-6)
+    assert found.cost > 1.05 * 12 * 9.0 * (np.pi / 2) ** 2

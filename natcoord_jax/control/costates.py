@@ -1,5 +1,6 @@
 """What changes of nodes and residuals are worth: the adjoint equations of a motion."""
 
+from collections.abc import Callable
 from functools import partial
 from operator import itemgetter
 from typing import NamedTuple
@@ -7,10 +8,11 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from natcoord_jax.control.problem import OptimalControl
-from natcoord_jax.control.tangent import projected, tangent_maps
+from natcoord_jax.control.tangent import split, tangent_maps
 from natcoord_jax.control.transcription import (
     Node,
     Path,
@@ -66,21 +68,54 @@ def charts(problem: OptimalControl, nodes: Node) -> Charts:
     return Charts(*jax.vmap(one)(nodes))
 
 
-def step_inverses(problem: OptimalControl, path: Path, unknowns: Unknowns) -> Float[Array, "steps n n"]:
-    """Inverse of the Jacobian of every step's equations in its own unknowns."""
+class Jacobians(NamedTuple):
+    """How the equations of every step depend on what they are solved for and on what is given.
 
-    def one(at: Slice, node: Node, w: Array, y: Array) -> Array:
-        return jnp.linalg.inv(jax.jacfwd(lambda y: stage(problem, at, node, w, y).residual)(y))
+    Attributes:
+        inverses: of the Jacobians in the step's own unknowns.
+        by_node: in the node before the step, as one vector.
+        by_w: in the coefficients that enter.
+    """
+
+    inverses: Float[Array, "steps n n"]
+    by_node: Float[Array, "steps n x"]
+    by_w: Float[Array, "steps n m"]
+
+
+def step_jacobians(problem: OptimalControl, path: Path, unknowns: Unknowns) -> Jacobians:
+    """Jacobians of the equations of all steps."""
+
+    def one(at: Slice, node: Node, w: Array, y: Array) -> Jacobians:
+        flat, unflat = ravel_pytree(node)
+
+        def residual(flat: Array, w: Array, y: Array) -> Array:
+            return stage(problem, at, unflat(flat), w, y).residual
+
+        by_node, by_w, by_y = jax.jacrev(residual, argnums=(0, 1, 2))(flat, w, y)
+        return Jacobians(jnp.linalg.inv(by_y), by_node, by_w)
 
     before = jax.tree.map(lambda x: x[:-1], path.nodes)
     return jax.vmap(one)(slices(problem), before, entering(problem, unknowns.coefficients), unknowns.y)
 
 
-def node_projected(problem: OptimalControl, node: Node, flexibility: Array) -> Node:
-    """Node with projected velocities."""
+def split_node(problem: OptimalControl, node: Node, rates: Array, worth: Array) -> tuple[Node, Array]:
+    """Node with given rates of its free motions, and what the momenta are worth that they leave out."""
     system, _ = problem.applied(node.free)
-    state = projected(system, unpacked(problem.state, node.x, problem.state.t), flexibility)
-    return eqx.tree_at(lambda n: n.x, node, packed(state))
+    state, left = split(system, unpacked(problem.state, node.x, problem.state.t), rates, worth)
+    return eqx.tree_at(lambda n: n.x, node, packed(state)), left
+
+
+def projections(problem: OptimalControl, nodes: Node, maps: Charts) -> Float[Array, "k n"]:
+    """Rates of the free motions of nodes, with their momenta."""
+    count, size = maps.flexibility.shape[1], problem.state.q.size
+    project = maps.back[:, count : 2 * count, size : 2 * size]
+    return jnp.einsum("kij,kj->ki", project, nodes.x[:, size : 2 * size])
+
+
+def worth_of_left(worth: Node, forth: Array, flexibility: Array) -> Float[Array, " n"]:
+    """What momenta left out by a projection are worth, so that its result is stationary."""
+    count = flexibility.shape[0]
+    return flexibility @ (forth[: worth.x.shape[0], count : 2 * count].T @ worth.x)
 
 
 def scored_end(problem: OptimalControl, multipliers: Multipliers, node: Node) -> Array:
@@ -89,12 +124,39 @@ def scored_end(problem: OptimalControl, multipliers: Multipliers, node: Node) ->
     return found.cost + multipliers.goal @ found.missing + multipliers.end @ found.excess
 
 
+Through = Callable[[Array], tuple[Array, Array, Array]]
+
+
+def backward(
+    problem: OptimalControl, at: Slice, node: Node, w: Array, y: Array, sigma: Array, jacobian: Jacobians
+) -> Through:
+    """One step back, from the worth of the node after it as one vector.
+
+    Returns:
+        A function to the worth of the node before it, the gradient in what enters, and the residual's worth.
+    """
+    flat, unflat = ravel_pytree(node)
+
+    def rest(node: Array, w: Array, y: Array) -> tuple[Array, Array, Array]:
+        found = stage(problem, at, unflat(node), w, y)
+        return found.cost, found.excess, ravel_pytree(found.after)[0]
+
+    pull = jax.vjp(rest, flat, w, y)[1]
+
+    def through(after: Array) -> tuple[Array, Array, Array]:
+        before, by_w, by_y = pull((jnp.ones(()), sigma, after))
+        worth = -(by_y @ jacobian.inverses)
+        return before + worth @ jacobian.by_node, by_w + worth @ jacobian.by_w, worth
+
+    return through
+
+
 def costates(
     problem: OptimalControl,
     path: Path,
     unknowns: Unknowns,
     multipliers: Multipliers,
-    inverses: Array,
+    jacobians: Jacobians,
     maps: Charts,
 ) -> tuple[Costates, Costates, Float[Array, "steps m"]]:
     """Worth of nodes and residuals, such that the Lagrangian is stationary in all states and unknowns y.
@@ -103,36 +165,30 @@ def costates(
         Costates, exact; those of steps with projected velocities, for the curvature; and the gradient of the
         Lagrangian in the entering coefficients, exact.
     """
-    last = jax.grad(partial(scored_end, problem, multipliers))(jax.tree.map(lambda x: x[-1], path.nodes))
+    final = jax.grad(partial(scored_end, problem, multipliers))(jax.tree.map(lambda x: x[-1], path.nodes))
+    last, unflat = ravel_pytree(final)
 
-    def body(after: tuple[Node, Node], given: tuple) -> tuple[tuple[Node, Node], tuple]:
-        at, node, w, y, sigma, inverse, following, flexibility = given
-        back = jax.vjp(lambda n: node_projected(problem, n, flexibility), following)[1]
-        both = jax.tree.map(lambda a, b: jnp.stack([a, b]), after[0], back(after[1])[0])
+    def body(after: tuple[Array, Array], given: tuple) -> tuple[tuple[Array, Array], tuple]:
+        at, node, w, y, sigma, jacobian, following, rates, forth, flexibility = given
 
-        def rest(node: Node, w: Array, y: Array) -> tuple[Array, Array, Node]:
-            found = stage(problem, at, node, w, y)
-            return found.cost, found.excess, found.after
+        worth_left = worth_of_left(unflat(after[1]), forth, flexibility)
 
-        pull = jax.vjp(rest, node, w, y)[1]
-        pull_residual = jax.vjp(lambda *x: stage(problem, at, *x).residual, node, w, y)[1]
+        def projected(node: Array) -> tuple[Array, Array]:
+            reached, left = split_node(problem, unflat(node), rates, worth_left)
+            return ravel_pytree(reached)[0], left
 
-        def through(after: Node) -> tuple[Node, Array, Array]:
-            before, by_w, by_y = pull((jnp.ones(()), sigma, after))
-            worth = -(by_y @ inverse)
-            again = pull_residual(worth)
-            return jax.tree.map(jnp.add, before, again[0]), by_w + again[1], worth
-
-        before, by_w, worth = jax.vmap(through)(both)
-        exact, model = (jax.tree.map(itemgetter(k), before) for k in range(2))
-        return (exact, model), ((exact, worth[0]), (model, worth[1]), by_w[0])
+        back = jax.vjp(projected, ravel_pytree(following)[0])[1]
+        unprojected = back((after[1], jnp.ones(())))[0]
+        through = backward(problem, at, node, w, y, sigma, jacobian)
+        both, by_w, worth = jax.vmap(through)(jnp.stack([after[0], unprojected]))
+        return (both[0], both[1]), (both, worth, by_w[0])
 
     before, after = (jax.tree.map(itemgetter(s), path.nodes) for s in (slice(None, -1), slice(1, None)))
     w = entering(problem, unknowns.coefficients)
-    given = (slices(problem), before, w, unknowns.y, multipliers.path, inverses, after, maps.flexibility[1:])
-    _, (exact, model, by_w) = jax.lax.scan(body, (last, last), given, reverse=True)
-
-    def whole(nodes: Node, residuals: Array) -> Costates:
-        return Costates(jax.tree.map(lambda x, x1: jnp.concatenate([x, x1[None]]), nodes, last), residuals)
-
-    return whole(*exact), whole(*model), by_w
+    given = (slices(problem), before, w, unknowns.y, multipliers.path, jacobians, after)
+    rates = projections(problem, path.nodes, maps)[1:]
+    given = (*given, rates, maps.forth[1:], maps.flexibility[1:])
+    _, (nodes, residuals, by_w) = jax.lax.scan(body, (last, last), given, reverse=True)
+    nodes = jnp.concatenate([nodes, jnp.broadcast_to(last, (1, 2, last.size))])
+    exact, model = (Costates(jax.vmap(unflat)(nodes[:, k]), residuals[:, k]) for k in range(2))
+    return exact, model, by_w

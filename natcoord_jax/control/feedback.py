@@ -55,7 +55,7 @@ def _gains(problem: OptimalControl, iterate: Iterate, weights: tuple) -> tuple[A
     """Gains of the regulator, and what they act on."""
     d = iterate.derivatives
     given = (problem, iterate.path, iterate.unknowns, iterate.multipliers)
-    found = model(*given, d.bent, d.by_w, d.by_first, d.inverses, d.maps)
+    found = model(*given, d)
     count = problem.system.structure.unknowns
     size = problem.state.q.size * 2 + problem.state.coordinates.size + problem.state.rates.size
     A, B = found.forward[:, : 2 * count, : 2 * count], found.forward[:, : 2 * count, -problem.channels :]

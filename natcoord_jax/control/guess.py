@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.control.compiled import quickly
 from natcoord_jax.control.problem import OptimalControl
+from natcoord_jax.control.tangent import steady_rates
 from natcoord_jax.control.transcription import Unknowns, end, roll
 
 ROUNDS = 12
@@ -23,8 +24,9 @@ class Guess(eqx.Module):
 
     Attributes:
         inputs: of all steps (steps, inputs) [N, N m]; None: zero.
-        rates: mean rates of the free motions in all steps (steps, n) or constant (n,) [rad/s, m/s], for the
-            lifted method, which needs no motion to start from; None: constant ones that lead to the goal.
+        rates: mean rates of the free motions in all steps (steps, n), or constant ones (n,) [rad/s, m/s] that
+            are taken up from the initial ones, for the lifted method, which needs no motion to start from;
+            None: constant ones that lead to the goal.
         free: final time [s] and parameters in the order of `problem.free`; None: those of the problem.
 
     Example:
@@ -61,13 +63,30 @@ def unknowns_of(problem: OptimalControl, guess: Any, lifted: bool) -> Unknowns:
     if not lifted or structure.solver != "reduced":
         return unknowns
     if guess.rates is None:
-        rates = _leading_to_goal(problem, unknowns)
-    else:
-        given = jnp.asarray(guess.rates, float)
-        constant = given.shape == (structure.unknowns,)
-        rates = jnp.broadcast_to(given, (problem.steps, structure.unknowns)) if constant else given
-        rates = _shaped(rates, (problem.steps, structure.unknowns), "rates")
-    return with_rates(unknowns, rates)
+        return with_rates(unknowns, taken_up(problem, _leading_to_goal(problem, unknowns)))
+    given = jnp.asarray(guess.rates, float)
+    if given.shape == (structure.unknowns,):
+        steady = jnp.broadcast_to(given, (problem.steps, structure.unknowns))
+        return with_rates(unknowns, taken_up(problem, _shaped(steady, steady.shape, "rates")))
+    return with_rates(unknowns, _shaped(given, (problem.steps, structure.unknowns), "rates"))
+
+
+def taken_up(problem: OptimalControl, rates: Float[Array, "steps n"]) -> Float[Array, "steps n"]:
+    """Mean rates of steps near given ones that the initial rates lead to without a jerk.
+
+    The rates at the end of a step are twice the mean less those at its start: a mean that jumps makes them
+    swing about the mean from step to step, for ever.
+    """
+    first = steady_rates(problem.system, problem.state)[None]
+    return free_of_swings(jnp, first, rates)
+
+
+def free_of_swings(xp: Any, first: Any, rates: Any) -> Any:
+    """Means of rates at the ends of steps that are themselves means of the given ones, by JAX or NumPy."""
+    inner = 0.5 * (rates[1:] + rates[:-1])
+    last = rates[-1:] if len(rates) < 2 else 1.5 * rates[-1:] - 0.5 * rates[-2:-1]
+    ends = xp.concatenate([first, inner, last])
+    return 0.5 * (ends[1:] + ends[:-1])
 
 
 def with_rates(unknowns: Unknowns, rates: Float[Array, "steps n"]) -> Unknowns:
@@ -133,6 +152,7 @@ def scattered(problem: OptimalControl, unknowns: Unknowns, key: Array, spread: A
     )
     inputs = spread * waves @ jax.random.normal(first, (3, problem.channels))
     changes = rates * (jax.random.normal(second, (1, count)) + waves @ jax.random.normal(third, (3, count)))
+    changes = free_of_swings(jnp, jnp.zeros((1, count)), changes)
     coefficients = unknowns.coefficients + problem.inputs.fitted(inputs)
     y = unknowns.y.at[:, :count].add(changes)
     return Unknowns(coefficients, unknowns.free, y)

@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from natcoord_jax.control.costates import Charts, Costates, Multipliers
+from natcoord_jax.control.costates import Charts, Costates, Jacobians, Multipliers
 from natcoord_jax.control.transcription import Path, Unknowns
 
 
@@ -16,14 +16,15 @@ class Options(eqx.Module):
         max_iterations: of the method.
         tol: largest gradient of the Lagrangian and complementarity, relative.
         goal_tol: largest residual of the goal, in its units, of the bounds, in theirs, and of the steps.
-        barrier: barrier parameter at the start, relative to the cost.
+        barrier: barrier parameter at the start, all bounds together, relative to the cost; a small one lets
+            the first steps, which know no multipliers yet, run into bounds.
     """
 
     lifted: bool = eqx.field(default=False, static=True)
     max_iterations: int = eqx.field(default=100, static=True)
     tol: float = eqx.field(default=1e-8, static=True)
     goal_tol: float = eqx.field(default=1e-10, static=True)
-    barrier: float = eqx.field(default=0.1, static=True)
+    barrier: float = eqx.field(default=3.0, static=True)
 
 
 class Slacks(eqx.Module):
@@ -55,7 +56,7 @@ class Derivatives(eqx.Module):
     """First derivatives at a motion.
 
     Attributes:
-        inverses: of the Jacobians of the steps in their own unknowns.
+        jacobians: of the equations of the steps.
         maps: small numbers of the nodes.
         worth: costates.
         bent: costates of projected steps, for the curvature.
@@ -64,13 +65,47 @@ class Derivatives(eqx.Module):
         errors: what is missing.
     """
 
-    inverses: Float[Array, "*batch steps n n"]
+    jacobians: Jacobians
     maps: Charts
     worth: Costates
     bent: Costates
     by_w: Float[Array, "*batch steps m"]
     by_first: Float[Array, "*batch f"]
     errors: Errors
+
+
+class Model(eqx.Module):
+    """Linear dynamics and quadratic costs in small numbers z (see `tangent`), w and what is free.
+
+    z holds changes of the state, of what is free and of the register; w those of entering coefficients.
+
+    Attributes:
+        forward: z_k+1 = forward [z_k, w_k] + offset, (steps, z, z + m).
+        offset: from the residuals (steps, z).
+        hessian: of the Lagrangian in [z, w] (steps, z + m, z + m).
+        gradient: linear terms in [z, w] (steps, z + m).
+        excess: derivative of the excesses (steps, h, z + m).
+        excess_offset: from the residuals (steps, h).
+        last_hessian: of the terminal Lagrangian (z, z).
+        goal: derivative of the goal (c, z).
+        last_excess: derivative of the terminal excesses (e, z).
+        first: z_0 per what is free and leading coefficients (z, f).
+        first_hessian: (f, f).
+        first_gradient: (f,).
+    """
+
+    forward: Float[Array, "*batch steps z zm"]
+    offset: Float[Array, "*batch steps z"]
+    hessian: Float[Array, "*batch steps zm zm"]
+    gradient: Float[Array, "*batch steps zm"]
+    excess: Float[Array, "*batch steps h zm"]
+    excess_offset: Float[Array, "*batch steps h"]
+    last_hessian: Float[Array, "*batch z z"]
+    goal: Float[Array, "*batch c z"]
+    last_excess: Float[Array, "*batch e z"]
+    first: Float[Array, "*batch z f"]
+    first_hessian: Float[Array, "*batch f f"]
+    first_gradient: Float[Array, "*batch f"]
 
 
 class Iterate(eqx.Module):
@@ -82,6 +117,8 @@ class Iterate(eqx.Module):
         slacks: room left.
         path: the motion.
         derivatives: first derivatives there.
+        model: the last quadratic model, not necessarily formed there; None: formed anew for every step.
+        kept: how many steps it has served.
         barrier: barrier parameter.
         unit: of the cost.
         shift: last increase of the curvature.
@@ -89,6 +126,7 @@ class Iterate(eqx.Module):
         previous: path and slacks of the iterate before.
         step: length of the last step.
         moved: size of the last step, relative.
+        gain: what the last step left of the errors.
         unreachable: part of the goal that nothing could change.
         iteration: number of steps made.
         newton: Newton iterations of all simulations.
@@ -101,6 +139,8 @@ class Iterate(eqx.Module):
     slacks: Slacks
     path: Path
     derivatives: Derivatives
+    model: Model | None
+    kept: Int[Array, "*batch"]
     barrier: Float[Array, "*batch"]
     unit: Float[Array, "*batch"]
     shift: Float[Array, "*batch"]
@@ -108,6 +148,7 @@ class Iterate(eqx.Module):
     previous: tuple[Path, Slacks]
     step: Float[Array, "*batch"]
     moved: Float[Array, "*batch"]
+    gain: Float[Array, "*batch"]
     unreachable: Float[Array, "*batch c"]
     iteration: Int[Array, "*batch"]
     newton: Int[Array, "*batch"]

@@ -6,7 +6,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from natcoord_jax.control.compiled import quickly
-from natcoord_jax.control.costates import Costates, Multipliers, charts, costates, step_inverses
+from natcoord_jax.control.costates import Multipliers, charts, costates, step_jacobians
 from natcoord_jax.control.iterate import Derivatives, Errors, Slacks, largest
 from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.control.transcription import (
@@ -25,14 +25,13 @@ def nodes_before(path: Path) -> Node:
     return jax.tree.map(lambda x: x[:-1], path.nodes)
 
 
-def _first_gradient(problem: OptimalControl, unknowns: Unknowns, worth: Costates) -> Array:
-    """Gradient in what is free and in the leading coefficients."""
+def first_gradient(problem: OptimalControl, unknowns: Unknowns, worth: Array) -> Array:
+    """Gradient in what is free and in the leading coefficients, from the worth of the first node."""
     leading = unknowns.coefficients[: problem.inputs.degree]
     flat, unflat = ravel_pytree((unknowns.free, leading))
     if not flat.size:
         return jnp.zeros(0)
-    value = ravel_pytree(jax.tree.map(lambda x: x[0], worth.nodes))[0]
-    return jax.grad(lambda x: value @ ravel_pytree(first_node(problem, *unflat(x)))[0])(flat)
+    return jax.grad(lambda x: worth @ ravel_pytree(first_node(problem, *unflat(x)))[0])(flat)
 
 
 def _gradient_scale(problem: OptimalControl, unknowns: Unknowns, path: Path, sigma: Array) -> Array:
@@ -62,15 +61,15 @@ def linearised(
     unit: Array,
 ) -> Derivatives:
     """First derivatives at a motion, and what is missing to the conditions of optimality."""
-    inverses = step_inverses(problem, path, unknowns)
+    jacobians = step_jacobians(problem, path, unknowns)
     maps = charts(problem, path.nodes)
-    worth, bent, by_w = costates(problem, path, unknowns, multipliers, inverses, maps)
-    by_first = _first_gradient(problem, unknowns, worth)
+    worth, bent, by_w = costates(problem, path, unknowns, multipliers, jacobians, maps)
+    by_first = first_gradient(problem, unknowns, ravel_pytree(jax.tree.map(lambda x: x[0], worth.nodes))[0])
     count = unknowns.free.size
     scale = _gradient_scale(problem, unknowns, path, multipliers.path)
     by_coefficients = largest(by_w[:: problem.inputs.every], by_first[count:]) / scale
     stationarity = jnp.maximum(by_coefficients, largest(by_first[:count]) / unit)
-    corrections = largest(jnp.einsum("kij,kj->ki", inverses, path.stages.residual))
+    corrections = largest(jnp.einsum("kij,kj->ki", jacobians.inverses, path.stages.residual))
     size = largest(unknowns.y)
     errors = Errors(
         stationarity,
@@ -79,7 +78,7 @@ def linearised(
         largest(path.stages.excess + slacks.path, path.end.excess + slacks.end),
         largest(slacks.path * multipliers.path, slacks.end * multipliers.end) / unit,
     )
-    return Derivatives(inverses, maps, worth, bent, by_w, by_first, errors)
+    return Derivatives(jacobians, maps, worth, bent, by_w, by_first, errors)
 
 
 def cost_unit(problem: OptimalControl, unknowns: Unknowns, path: Path) -> Array:

@@ -3,17 +3,19 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float, Int
 
 from natcoord_jax.control.compiled import quickly
 from natcoord_jax.control.costates import Multipliers
-from natcoord_jax.control.iterate import Iterate, Options, Slacks, largest
+from natcoord_jax.control.iterate import Derivatives, Iterate, Model, Options, Slacks, largest
 from natcoord_jax.control.linearisation import nodes_before
 from natcoord_jax.control.merit import Direction, Violations, slope_and_weights
 from natcoord_jax.control.problem import OptimalControl
-from natcoord_jax.control.quadratic import Model, model
+from natcoord_jax.control.quadratic import model
 from natcoord_jax.control.riccati import REACH, Move, Weighted, solve
 from natcoord_jax.control.transcription import (
+    Node,
     Unknowns,
     end,
     entering,
@@ -29,13 +31,21 @@ STIFFEST = 1e3
 """Largest penalty on the goal, in units of its stiffness."""
 LEAST_BARRIER = 1e-10
 """Barrier parameter at the end, relative to the cost."""
-REFINEMENTS = 2
+REFINEMENTS = 1
 """Corrections of a step, so that the goal is met to first order of the exact motion."""
 
 
-class Proposal(eqx.Module):
-    """The step that the quadratic model proposes."""
+NEAR = 0.1
+"""Relative size of a step after which the model it came from may serve another one."""
+GAIN = 0.2
+"""Part of the errors that a step of an old model may leave, for the model to serve on."""
 
+
+class Proposal(eqx.Module):
+    """The step that the quadratic model proposes, the model, and how many steps that has served."""
+
+    model: Model | None
+    kept: Int[Array, ""]
     direction: Direction
     slope: Float[Array, ""]
     weights: Violations
@@ -126,14 +136,19 @@ def _swept(problem: OptimalControl, iterate: Iterate, change: Unknowns) -> Sweep
     w, dw = entering(problem, unknowns.coefficients), entering(problem, change.coefficients)
 
     def body(dn, given):
-        at, node, w, dw, y, inverse, residual = given
-        _, linear = jax.linearize(lambda *x: stage(problem, at, *x), node, w, y)
-        dy = -inverse @ (residual + linear(dn, dw, jnp.zeros_like(y)).residual)
-        changed = linear(dn, dw, dy)
-        return changed.after, (dy, changed.excess)
+        at, node, w, dw, y, jacobian, residual = given
+        moved = residual + jacobian.by_node @ ravel_pytree(dn)[0] + jacobian.by_w @ dw
+        dy = -(jacobian.inverses @ moved)
 
-    inverses, residual = iterate.derivatives.inverses, path.stages.residual
-    given = (slices(problem), nodes_before(path), w, dw, unknowns.y, inverses, residual)
+        def rest(node: Node, w: Array, y: Array) -> tuple[Node, Array]:
+            found = stage(problem, at, node, w, y)
+            return found.after, found.excess
+
+        after, excess = jax.jvp(rest, (node, w, y), (dn, dw, dy))[1]
+        return after, (dy, excess)
+
+    jacobians, residual = iterate.derivatives.jacobians, path.stages.residual
+    given = (slices(problem), nodes_before(path), w, dw, unknowns.y, jacobians, residual)
     last, (y, excess) = jax.lax.scan(body, start, given)
     final = jax.tree.map(lambda x: x[-1], path.nodes)
     reached = jax.jvp(lambda node: end(problem, node), (final,), (last,))[1]
@@ -142,11 +157,12 @@ def _swept(problem: OptimalControl, iterate: Iterate, change: Unknowns) -> Sweep
 
 def _refined(
     problem: OptimalControl, iterate: Iterate, found: Model, move: Move, weights: Weights
-) -> tuple[Unknowns, Array, Sweep]:
+) -> tuple[Unknowns, Array, Sweep, tuple[Array, Array]]:
     """The move of the model, corrected until the goal is met to first order exactly.
 
     Returns:
-        Changes of coefficients and of what is free, of the goal's multipliers, and the exact sweep.
+        Changes of coefficients and of what is free, of the goal's multipliers, the exact sweep, and the
+        changes of the excesses in the model.
     """
     count = iterate.unknowns.free.size
     every, leading = problem.inputs.every, problem.inputs.degree
@@ -163,16 +179,15 @@ def _refined(
         )
 
     def body(k: Array, carry: tuple) -> tuple:
-        first, w, goal, sweep = carry
+        first, w, goal, z, sweep = carry
         missing = iterate.path.end.missing + sweep.missing
         none = jnp.zeros_like(goal)
         more = solve(flat, missing, eased, weights.idle, weights.shift, weights.penalty, none, weights.reach)
         # The first turn only sweeps: so everything is compiled once.
         usable = (k > 0) & more.convex & jnp.all(jnp.isfinite(more.w))
-        first, w, goal = (
-            x + jnp.where(usable, dx, 0.0) for x, dx in ((first, more.first), (w, more.w), (goal, more.goal))
-        )
-        return first, w, goal, _swept(problem, iterate, changed(first, w))
+        pairs = ((first, more.first), (w, more.w), (goal, more.goal), (z, more.z))
+        first, w, goal, z = (x + jnp.where(usable, dx, 0.0) for x, dx in pairs)
+        return first, w, goal, z, _swept(problem, iterate, changed(first, w))
 
     path = iterate.path
     still = Sweep(
@@ -181,23 +196,29 @@ def _refined(
             for x in (iterate.unknowns.y, path.stages.excess, path.end.missing, path.end.excess)
         )
     )
-    begun = (move.first, move.w, move.goal, still)
-    first, w, goal, sweep = jax.lax.fori_loop(0, REFINEMENTS + 1, body, begun)
-    return changed(first, w), goal, sweep
+    begun = (move.first, move.w, move.goal, move.z, still)
+    first, w, goal, z, sweep = jax.lax.fori_loop(0, REFINEMENTS + 1, body, begun)
+    both = jnp.concatenate([z[:-1], w], axis=1)
+    excess = jnp.einsum("khz,kz->kh", found.excess, both) + found.excess_offset
+    return changed(first, w), goal, sweep, (excess, found.last_excess @ z[-1])
 
 
 def _direction(
     problem: OptimalControl, options: Options, iterate: Iterate, found: Model, move: Move, weights: Weights
 ) -> Direction:
     """Directions of coefficients, of what is free, of the unknowns of the steps, slacks and multipliers."""
-    unknowns, goal, sweep = _refined(problem, iterate, found, move, weights)
+    unknowns, goal, sweep, excess = _refined(problem, iterate, found, move, weights)
     if options.lifted:
         unknowns = eqx.tree_at(lambda u: u.y, unknowns, sweep.y)
     s, m, mu = iterate.slacks, iterate.multipliers, iterate.barrier
     slack = -(iterate.path.stages.excess + s.path) - sweep.excess
     last = -(iterate.path.end.excess + s.end) - sweep.end_excess
-    path = (mu - m.path * slack) / s.path - m.path
-    ends = (mu - m.end * last) / s.end - m.end
+    # Multipliers are those of the model: where a bound is stiff, the little by which its excess differs from
+    # the exact one would be a force.
+    felt = -(iterate.path.stages.excess + s.path) - excess[0]
+    felt_last = -(iterate.path.end.excess + s.end) - excess[1]
+    path = (mu - m.path * felt) / s.path - m.path
+    ends = (mu - m.end * felt_last) / s.end - m.end
     return Direction(unknowns, Multipliers(goal, path, ends), Slacks(slack, last))
 
 
@@ -213,26 +234,66 @@ def _lowered(iterate: Iterate) -> Array:
     return jnp.where(missing < 10.0 * relative, jnp.minimum(lower, mu), mu)
 
 
+def no_model(derivatives: Derivatives, multipliers: Multipliers) -> Model:
+    """A place for a model."""
+    forth, steps = derivatives.maps.forth, derivatives.by_w.shape[0]
+    z, m, f = forth.shape[2], derivatives.by_w.shape[1], derivatives.by_first.shape[0]
+    h, c, e = multipliers.path.shape[1], multipliers.goal.shape[0], multipliers.end.shape[0]
+    stages = (
+        (steps, z, z + m),
+        (steps, z),
+        (steps, z + m, z + m),
+        (steps, z + m),
+        (steps, h, z + m),
+        (steps, h),
+    )
+    ends = ((z, z), (c, z), (e, z), (z, f), (f, f), (f,))
+    return Model(*(jnp.zeros(shape) for shape in stages + ends))
+
+
+def _modelled(problem: OptimalControl, options: Options, iterate: Iterate) -> tuple[Model, Array]:
+    """The quadratic model: formed here, or the last one with the gradient from here where that will do.
+
+    Near the end the curvature hardly changes from step to step, and it is most of the work. A motion that
+    obeys its equations has no offsets, so that only the gradient has to be new.
+    """
+
+    def formed() -> tuple[Model, Array]:
+        found = model(problem, iterate.path, iterate.unknowns, iterate.multipliers, iterate.derivatives)
+        return found, jnp.zeros_like(iterate.kept)
+
+    last = iterate.model
+    if last is None:
+        return formed()
+
+    def kept() -> tuple[Model, Array]:
+        by_w, by_first = iterate.derivatives.by_w, iterate.derivatives.by_first
+        gradient = jnp.zeros_like(last.gradient).at[:, -by_w.shape[1] :].set(by_w)
+        found = eqx.tree_at(lambda m: (m.gradient, m.first_gradient), last, (gradient, by_first))
+        return found, iterate.kept + 1
+
+    near = (iterate.step >= 1.0) & (iterate.moved < NEAR) & (iterate.failures == 0)
+    return jax.lax.cond(near & ((iterate.kept == 0) | (iterate.gain < GAIN)), kept, formed)
+
+
 @quickly
 def propose(problem: OptimalControl, options: Options, iterate: Iterate) -> Proposal:
     """The next step, from the quadratic model."""
     iterate = eqx.tree_at(lambda i: i.barrier, iterate, _lowered(iterate))
-    d = iterate.derivatives
-    found = model(
-        problem,
-        iterate.path,
-        iterate.unknowns,
-        iterate.multipliers,
-        d.bent,
-        d.by_w,
-        d.by_first,
-        d.inverses,
-        d.maps,
-    )
+    found, kept = _modelled(problem, options, iterate)
     move, made = _convex(problem, iterate, found)
     direction = _direction(problem, options, iterate, found, move, made)
     slope, weights = slope_and_weights(iterate, direction, problem.inputs.every)
     penalty = _penalty(iterate, move)
     return Proposal(
-        direction, slope, weights, iterate.barrier, made.shift, penalty, move.unreachable, move.convex
+        None if options.lifted else found,
+        kept,
+        direction,
+        slope,
+        weights,
+        iterate.barrier,
+        made.shift,
+        penalty,
+        move.unreachable,
+        move.convex,
     )

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from natcoord_jax.control.quadratic import Model
+from natcoord_jax.control.iterate import Model
 
 REACH = (1e-8, 1e-3)
 """Eigenvalues of the goal's compliance below this fraction of the largest count as zero: of a motion that

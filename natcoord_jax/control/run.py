@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from operator import itemgetter
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from natcoord_jax.control import sequential
+from natcoord_jax.control.compiled import quickly
 from natcoord_jax.control.guess import Guess, scattered, unknowns_of
 from natcoord_jax.control.iterate import Iterate, Options
 from natcoord_jax.control.problem import OptimalControl
@@ -28,8 +28,8 @@ NAMES = {True: "lifted", False: "shooting"}
 METHOD = "sequential quadratic programming"
 FOR_THE_OTHER = (Outcome.SIMULATION_FAILED, Outcome.STALLED, Outcome.MAX_ITERATIONS, Outcome.NONFINITE)
 """Outcomes after which the other form of the method is tried, if the choice was ours."""
-SAME = 1e-6
-"""Relative difference of costs below which two optima are taken for one."""
+SAME = 1e-3
+"""Difference of inputs, relative to the largest, below which two optima are taken for one."""
 
 
 def numeric(problem: OptimalControl) -> OptimalControl:
@@ -43,11 +43,13 @@ def _chosen(problem: OptimalControl, method: str, guess: Any = None) -> bool:
         raise ValueError(f"method is {method!r}; pass one of {METHODS}")
     if method != "auto":
         return method == "lifted"
-    inputs = all(label.startswith("input ") for label in problem.bounds.labels(problem.system))
     if problem.free_time:
         return True
-    # An earlier solution is a motion already.
-    return not isinstance(guess, Solution) and (bool(problem.free) or not inputs)
+    if isinstance(guess, Solution) and guess.iterate is not None:
+        # What it was found by has been compiled, and led to it.
+        return guess.method.startswith(NAMES[True])
+    inputs = all(label.startswith("input ") for label in problem.bounds.labels(problem.system))
+    return bool(problem.free) or not inputs
 
 
 def _row(problem: OptimalControl, iterate: Iterate, start: float) -> Row:
@@ -119,8 +121,8 @@ def optimise(
     Args:
         problem: the problem.
         guess: inputs (steps, inputs), a `Guess`, an earlier `Solution`, or None.
-        method: "auto" (lifted if time or parameters are free or more than inputs is bounded), "shooting" or
-            "lifted".
+        method: "shooting", "lifted" or "auto": that of an earlier solution as guess, else lifted if
+            parameters are free or more than inputs is bounded; with free time always lifted.
         progress: print a line for each iteration to stderr.
         max_iterations: limit of iterations.
         tol: largest gradient of the Lagrangian and complementarity, relative.
@@ -153,7 +155,7 @@ def optimise(
     return found
 
 
-@eqx.filter_jit
+@quickly
 def optimise_jit(problem: OptimalControl, unknowns: Unknowns, options: Options = DEFAULT) -> Iterate:
     """The method as one program, for `jax.vmap`, receding horizons and other programs around it.
 
@@ -215,17 +217,29 @@ def multi_start(
         many = jax.vmap(lambda key, size: scattered(problem, middle, key, size * spread, size * rates))(
             keys, sizes
         )
-    found = eqx.filter_jit(jax.vmap(lambda unknowns: optimise_jit(problem, unknowns, options)))(many)
-    return _distinct(problem, found, lifted)
+    return _distinct(problem, _all_solved(problem, many, options), lifted)
+
+
+@quickly
+def _all_solved(problem: OptimalControl, many: Unknowns, options: Options) -> Iterate:
+    """The method from many guesses at once; one program for all calls of the same structure."""
+    return jax.vmap(lambda unknowns: optimise_jit(problem, unknowns, options))(many)
 
 
 def _distinct(problem: OptimalControl, found: Iterate, lifted: bool) -> list[Solution]:
-    """Different optima of a batch, by cost."""
+    """Different optima of a batch, by cost.
+
+    Two are the same if what is solved for is: mirror images cost the same and are two.
+    """
     codes, costs = np.asarray(found.code), np.asarray(found.path.cost)
-    optimal = [int(k) for k in np.argsort(costs) if Outcome(int(codes[k])).ok]
+    solved = [np.asarray(x) for x in (found.unknowns.coefficients, found.unknowns.free)]
+
+    def same(k: int, n: int) -> bool:
+        return all(np.all(np.abs(x[k] - x[n]) <= SAME * np.max(np.abs(x[n]), initial=0.0)) for x in solved)
+
     kept: list[int] = []
-    for k in optimal:
-        if not kept or abs(costs[k] - costs[kept[-1]]) > SAME * max(abs(costs[k]), 1e-300):
+    for k in (int(k) for k in np.argsort(costs) if Outcome(int(codes[k])).ok):
+        if not any(same(k, n) for n in kept):
             kept.append(k)
     kept = kept or [int(np.nanargmin(np.asarray(found.errors.goal)))]
     name = f"{NAMES[lifted]} {METHOD}, start"

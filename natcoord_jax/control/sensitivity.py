@@ -1,6 +1,7 @@
 """Derivatives of an optimum with respect to numbers of the problem, by the implicit function theorem."""
 
 from collections.abc import Callable
+from operator import itemgetter
 from typing import Any
 
 import equinox as eqx
@@ -9,10 +10,24 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from natcoord_jax.control import sequential
+from natcoord_jax.control.compiled import quickly
+from natcoord_jax.control.costates import Multipliers, backward, scored_end, step_jacobians
 from natcoord_jax.control.iterate import Iterate, Options
+from natcoord_jax.control.linearisation import first_gradient
 from natcoord_jax.control.problem import OptimalControl
-from natcoord_jax.control.run import DEFAULT, optimise_jit
-from natcoord_jax.control.transcription import Unknowns, roll, simulated
+from natcoord_jax.control.run import DEFAULT, numeric, optimise_jit
+from natcoord_jax.control.transcription import (
+    Node,
+    Path,
+    Unknowns,
+    end,
+    entering,
+    first_node,
+    slices,
+    stage,
+)
+from natcoord_jax.core.checks import at_top_level
 
 CUT = 1e-12
 """Singular values of the conditions of optimality below this fraction of the largest are left out."""
@@ -32,26 +47,87 @@ class Optimum(eqx.Module):
     cost: Float[Array, ""]
 
 
-def _motion(problem: OptimalControl, variables: Any, like: Unknowns) -> Any:
-    coefficients, free = variables
-    unknowns, _, _ = simulated(problem, Unknowns(coefficients, free, like.y))
-    return roll(problem, unknowns)
+class Conditions(eqx.Module):
+    """What vanishes or is balanced at an optimum, and its cost."""
+
+    gradient: Float[Array, " x"]
+    constraints: Float[Array, " c"]
+    cost: Float[Array, ""]
+
+
+def _followed(problem: OptimalControl, unknowns: Unknowns, inverses: Array) -> tuple[Path, Unknowns]:
+    """A motion that obeys its equations, and its unknowns, as functions of inputs and of what is free.
+
+    One Newton correction with a given Jacobian changes nothing at a motion, and has the derivatives of the
+    solution.
+    """
+    w = entering(problem, unknowns.coefficients)
+    first = first_node(problem, unknowns.free, unknowns.coefficients[: problem.inputs.degree])
+
+    def body(node: Node, given: tuple) -> tuple[Node, tuple]:
+        at, w, y, inverse = given
+        y = y - inverse @ stage(problem, at, node, w, y).residual
+        found = stage(problem, at, node, w, y)
+        return found.after, (node, found, y)
+
+    given = (slices(problem), w, unknowns.y, inverses)
+    last, (nodes, stages, y) = jax.lax.scan(body, first, given)
+    nodes = jax.tree.map(lambda x, x1: jnp.concatenate([x, x1[None]]), nodes, last)
+    return Path(nodes, stages, end(problem, last)), eqx.tree_at(lambda u: u.y, unknowns, y)
 
 
 def _conditions(
-    problem: OptimalControl, variables: Any, multipliers: Any, like: Unknowns
-) -> tuple[Array, Array]:
-    """Gradient of the Lagrangian, and all constraints (goal, bounds of steps and of what is free)."""
+    problem: OptimalControl, unknowns: Unknowns, multipliers: Multipliers, inverses: Array
+) -> Conditions:
+    """Gradient of the Lagrangian by costates, and goal, bounds of steps and bounds of what is free."""
+    path, unknowns = _followed(problem, unknowns, inverses)
+    jacobians = step_jacobians(problem, path, unknowns)
+    before, last = (jax.tree.map(itemgetter(s), path.nodes) for s in (slice(None, -1), -1))
+    worth = ravel_pytree(jax.grad(lambda node: scored_end(problem, multipliers, node))(last))[0]
 
-    def lagrangian(variables: Any) -> tuple[Array, Array]:
-        path = _motion(problem, variables, like)
-        found = (path.end.missing, path.stages.excess, path.end.excess)
-        flat = jnp.concatenate([x.reshape(-1) for x in found])
-        nu = jnp.concatenate([x.reshape(-1) for x in multipliers])
-        return path.cost + nu @ flat, flat
+    def body(after: Array, given: tuple) -> tuple[Array, Array]:
+        worth, by_w, _ = backward(problem, *given)(after)
+        return worth, by_w
 
-    gradient, constraints = jax.grad(lagrangian, has_aux=True)(variables)
-    return ravel_pytree(gradient)[0], constraints
+    w = entering(problem, unknowns.coefficients)
+    given = (slices(problem), before, w, unknowns.y, multipliers.path, jacobians)
+    worth, by_w = jax.lax.scan(body, worth, given, reverse=True)
+    by_first, count = first_gradient(problem, unknowns, worth), unknowns.free.size
+    pieces = (by_first[count:], by_w[:: problem.inputs.every].reshape(-1), by_first[:count])
+    constraints = (path.end.missing, path.stages.excess.reshape(-1), path.end.excess)
+    return Conditions(jnp.concatenate(pieces), jnp.concatenate(constraints), path.cost)
+
+
+@quickly
+def _jacobian(make: Callable[[Any], OptimalControl], numbers: Any, found: Iterate) -> Float[Array, "o p"]:
+    """How coefficients, what is free and the cost change with the numbers, one column each."""
+    given, unflat_numbers = ravel_pytree(numbers)
+    point, unflat = ravel_pytree((found.unknowns.coefficients, found.unknowns.free))
+    m, s = found.multipliers, found.slacks
+    inverses = found.derivatives.jacobians.inverses
+
+    def conditions(both: Array) -> Conditions:
+        coefficients, free = unflat(both[given.size :])
+        unknowns = Unknowns(coefficients, free, found.unknowns.y)
+        return _conditions(make(unflat_numbers(both[: given.size])), unknowns, m, inverses)
+
+    both = jnp.concatenate([given, point])
+    slopes = jax.lax.map(lambda d: jax.jvp(conditions, (both,), (d,))[1], jnp.eye(both.size))
+    by_numbers, by_point = (jax.tree.map(itemgetter(s), slopes) for s in _halves(given.size))
+    hessian, jacobian = by_point.gradient, by_point.constraints.T
+    # A bound acts as far as it presses: sigma (h + s) = 0 linearised.
+    room = jnp.concatenate([jnp.zeros(m.goal.size), s.path.reshape(-1), s.end])
+    press = jnp.concatenate([jnp.ones(m.goal.size), m.path.reshape(-1), m.end])
+    matrix = jnp.block([[hessian, jacobian.T], [press[:, None] * jacobian, -jnp.diag(room)]])
+    right = -jnp.concatenate([by_numbers.gradient, press * by_numbers.constraints], axis=1).T
+    scale = jnp.sqrt(jnp.maximum(jnp.max(jnp.abs(matrix), axis=1), 1e-300))[:, None]
+    moved = jnp.linalg.lstsq(matrix / scale / scale.T, right / scale, rcond=CUT)[0] / scale
+    moved = moved[: point.size]
+    return jnp.concatenate([moved, by_numbers.cost[None] + by_point.cost[None] @ moved])
+
+
+def _halves(size: int) -> tuple[slice, slice]:
+    return slice(None, size), slice(size, None)
 
 
 def optimum(
@@ -77,7 +153,7 @@ def optimum(
     start = guess.unknowns if isinstance(guess, Iterate) else guess
 
     def solved(numbers: Any) -> tuple[Optimum, Iterate]:
-        found = optimise_jit(make(numbers), start, options)
+        found = _solved(numeric(make(numbers)), start, options)
         failed = found.code != 0
         value = Optimum(found.unknowns.coefficients, found.unknowns.free, found.path.cost)
         return jax.tree.map(lambda x: jnp.where(failed, jnp.nan, x), value), found
@@ -89,34 +165,17 @@ def optimum(
     @function.defjvp
     def _(primals: tuple, tangents: tuple) -> tuple[Optimum, Optimum]:
         value, found = solved(*primals)
-        variables = (found.unknowns.coefficients, found.unknowns.free)
-        flat, unflat = ravel_pytree(variables)
-        m, s = found.multipliers, found.slacks
-        multipliers = (m.goal, m.path, m.end)
-
-        def conditions(numbers: Any, flat: Array) -> tuple[Array, Array]:
-            return _conditions(make(numbers), unflat(flat), multipliers, found.unknowns)
-
-        by_numbers = jax.jvp(lambda n: conditions(n, flat), primals, tangents)[1]
-        columns = jax.lax.map(
-            lambda d: jax.jvp(lambda x: conditions(primals[0], x), (flat,), (d,))[1], jnp.eye(flat.size)
-        )
-        hessian, jacobian = columns[0], columns[1].T
-        # A bound acts as far as it presses: sigma (h + s) = 0 linearised.
-        room = jnp.concatenate([jnp.zeros(m.goal.size), s.path.reshape(-1), s.end])
-        press = jnp.concatenate([jnp.ones(m.goal.size), m.path.reshape(-1), m.end])
-        matrix = jnp.block([[hessian, jacobian.T], [press[:, None] * jacobian, -jnp.diag(room)]])
-        right = -jnp.concatenate([by_numbers[0], press * by_numbers[1]])
-        scale = jnp.sqrt(jnp.maximum(jnp.max(jnp.abs(matrix), axis=1), 1e-300))
-        scaled = matrix / scale[:, None] / scale[None, :]
-        moved = jnp.linalg.lstsq(scaled, right / scale, rcond=CUT)[0] / scale
-        change = unflat(moved[: flat.size])
-
-        def cost(numbers: Any, flat: Array) -> Array:
-            return _motion(make(numbers), unflat(flat), found.unknowns).cost
-
-        point, direction = (primals[0], flat), (tangents[0], moved[: flat.size])
-        by_cost = jax.jvp(cost, point, direction)[1]
-        return value, Optimum(change[0], change[1], by_cost)
+        changes = _jacobian(make, primals[0], found) @ ravel_pytree(tangents[0])[0]
+        return value, ravel_pytree(value)[1](changes)
 
     return function
+
+
+def _solved(problem: OptimalControl, start: Unknowns, options: Options) -> Iterate:
+    """The last iterate; outside of other programs by those that `nc.optimise` has compiled."""
+    if not at_top_level(eqx.filter((problem, start), eqx.is_array)):
+        return optimise_jit(problem, start, options)
+    iterate = sequential.init(problem, options, start)
+    while not sequential.done(iterate):
+        iterate = sequential.step(problem, options, iterate)
+    return iterate

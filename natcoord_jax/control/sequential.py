@@ -14,11 +14,11 @@ from jaxtyping import Array, Bool, Int
 
 from natcoord_jax.control.compiled import quickly
 from natcoord_jax.control.costates import Multipliers
-from natcoord_jax.control.iterate import Derivatives, Iterate, Options, Slacks, largest
+from natcoord_jax.control.iterate import Derivatives, Errors, Iterate, Options, Slacks, largest
 from natcoord_jax.control.linearisation import cost_unit, linearised
 from natcoord_jax.control.merit import Found, moved, room, search
 from natcoord_jax.control.problem import OptimalControl
-from natcoord_jax.control.proposal import Proposal, propose
+from natcoord_jax.control.proposal import Proposal, no_model, propose
 from natcoord_jax.control.results import Outcome
 from natcoord_jax.control.transcription import (
     Unknowns,
@@ -35,7 +35,7 @@ NEARLY = 1e-6
 
 
 @quickly
-def _begun(problem: OptimalControl, options: Options, unknowns: Unknowns) -> tuple:
+def _begun(problem: OptimalControl, options: Options, unknowns: Unknowns) -> tuple[tuple, tuple]:
     newton, whole = jnp.array(0), jnp.array(True)
     if not options.lifted:
         unknowns, whole, newton = simulated(problem, unknowns)
@@ -45,7 +45,7 @@ def _begun(problem: OptimalControl, options: Options, unknowns: Unknowns) -> tup
     barrier = options.barrier * unit / max(1, slacks.path.size + slacks.end.size)
     goal = jnp.zeros_like(path.end.missing)
     multipliers = Multipliers(goal, barrier / slacks.path, barrier / slacks.end)
-    return unknowns, multipliers, slacks, path, unit, barrier, whole, newton
+    return (unknowns, multipliers, slacks, path, unit), (barrier, whole, newton)
 
 
 def init(problem: OptimalControl, options: Options, unknowns: Unknowns) -> Iterate:
@@ -56,8 +56,19 @@ def init(problem: OptimalControl, options: Options, unknowns: Unknowns) -> Itera
         options: settings.
         unknowns: coefficients and what is free; `y` is replaced by a simulation unless the method is lifted.
     """
-    unknowns, multipliers, slacks, path, unit, barrier, whole, newton = _begun(problem, options, unknowns)
+    begin = Options(options.lifted, barrier=options.barrier)
+    begun, rest = _begun(problem, begin, unknowns)
+    unknowns, multipliers, slacks, path, unit = begun
     derivatives = linearised(problem, unknowns, multipliers, slacks, path, unit)
+    return _first(begin, begun, derivatives, *rest)
+
+
+@quickly
+def _first(
+    options: Options, begun: tuple, derivatives: Derivatives, barrier: Array, whole: Array, newton: Array
+) -> Iterate:
+    """The first iterate; compiled, so that its constants are numbers also where derivatives are traced."""
+    unknowns, multipliers, slacks, path, unit = begun
     nothing, infinite = jnp.zeros(()), jnp.full((), jnp.inf, float)
     goal = multipliers.goal
     finite = jnp.isfinite(path.cost) & jnp.isfinite(derivatives.errors.stationarity)
@@ -69,12 +80,15 @@ def init(problem: OptimalControl, options: Options, unknowns: Unknowns) -> Itera
         slacks,
         path,
         derivatives,
+        None if options.lifted else no_model(derivatives, multipliers),
+        jnp.array(0),
         barrier,
         unit,
         nothing,
         goal,
         (path, slacks),
         nothing,
+        infinite,
         infinite,
         goal,
         jnp.array(0),
@@ -84,6 +98,11 @@ def init(problem: OptimalControl, options: Options, unknowns: Unknowns) -> Itera
     )
 
 
+def _whole(errors: Errors) -> Array:
+    """All that is missing, without units."""
+    return largest(*jax.tree.leaves(errors))
+
+
 @quickly
 def tried(
     problem: OptimalControl, options: Options, iterate: Iterate, proposal: Proposal
@@ -91,10 +110,18 @@ def tried(
     """The step as far as it makes the merit smaller, and the multipliers there."""
     iterate = eqx.tree_at(lambda i: i.barrier, iterate, proposal.barrier)
     found = search(problem, options, iterate, proposal.direction, proposal.slope, proposal.weights)
+    fine = found.fine & proposal.convex
+    reached = (found.unknowns, found.slacks, found.path)
+    stayed = (iterate.unknowns, iterate.slacks, iterate.path)
+    reached = jax.tree.map(lambda x, x0: jnp.where(fine, x, x0), reached, stayed)
+    found = Found(found.length, reached[0], reached[1], reached[2], fine, found.newton)
     m, dm = iterate.multipliers, proposal.direction.multipliers
     dual = room([(m.path, dm.path), (m.end, dm.end)])
-    # Multipliers of the goal are those of the model, however short the step.
-    return found, Multipliers(m.goal + dm.goal, moved(m.path, dm.path, dual), moved(m.end, dm.end, dual))
+    # Multipliers of the goal are those of the model, however short the step, even if there is none: without
+    # them the merit of the next attempt is misjudged as that of this one was.
+    goal = jnp.where(proposal.convex & jnp.all(jnp.isfinite(dm.goal)), m.goal + dm.goal, m.goal)
+    path, end = moved(m.path, dm.path, dual), moved(m.end, dm.end, dual)
+    return found, Multipliers(goal, jnp.where(fine, path, m.path), jnp.where(fine, end, m.end))
 
 
 @quickly
@@ -116,6 +143,8 @@ def concluded(
         found.slacks,
         found.path,
         derivatives,
+        proposal.model,
+        proposal.kept,
         proposal.barrier,
         iterate.unit,
         proposal.shift,
@@ -123,6 +152,7 @@ def concluded(
         (iterate.path, iterate.slacks),
         found.length,
         change,
+        _whole(derivatives.errors) / jnp.maximum(_whole(iterate.errors), 1e-300),
         proposal.unreachable,
         iterate.iteration,
         iterate.newton,
@@ -130,11 +160,18 @@ def concluded(
         iterate.code,
     )
     kept = eqx.tree_at(
-        lambda i: (i.failures, i.shift, i.step, i.unreachable),
+        lambda i: (i.failures, i.shift, i.step, i.unreachable, i.multipliers, i.derivatives),
         iterate,
-        (iterate.failures + 1, proposal.shift, jnp.zeros_like(found.length), proposal.unreachable),
+        (
+            iterate.failures + 1,
+            proposal.shift,
+            jnp.zeros_like(found.length),
+            proposal.unreachable,
+            multipliers,
+            derivatives,
+        ),
     )
-    after = jax.tree.map(lambda x, x0: jnp.where(found.fine & proposal.convex, x, x0), accepted, kept)
+    after = jax.tree.map(lambda x, x0: jnp.where(found.fine, x, x0), accepted, kept)
     counts = (iterate.iteration + 1, iterate.newton + found.newton)
     after = eqx.tree_at(lambda i: (i.iteration, i.newton), after, counts)
     return eqx.tree_at(lambda i: i.code, after, _judged(options, after))
@@ -142,8 +179,10 @@ def concluded(
 
 def step(problem: OptimalControl, options: Options, iterate: Iterate) -> Iterate:
     """One iteration; four programs, or parts of one under `jax.jit`."""
-    proposal = propose(problem, options, iterate)
-    found, multipliers = tried(problem, options, iterate, proposal)
+    # The large programs know nothing of tolerances, which may change without compiling them anew.
+    form = Options(options.lifted)
+    proposal = propose(problem, form, iterate)
+    found, multipliers = tried(problem, form, iterate, proposal)
     derivatives = linearised(problem, found.unknowns, multipliers, found.slacks, found.path, iterate.unit)
     return concluded(options, iterate, proposal, found, multipliers, derivatives)
 

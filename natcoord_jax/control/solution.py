@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.system import System
-from natcoord_jax.control.guess import Guess
+from natcoord_jax.control.guess import Guess, free_of_swings
 from natcoord_jax.control.iterate import Iterate
 from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.control.results import ADVICE, OUTCOMES, Outcome
@@ -207,8 +207,13 @@ def _resampled(values: np.ndarray, steps: int) -> np.ndarray:
 def _interpolated(values: np.ndarray, steps: int) -> np.ndarray:
     """Values at the middles of steps, at those of others; a staircase would shake the motion."""
     count = values.shape[0]
+    if count == steps:
+        return values
     at, old = (np.arange(steps) + 0.5) / steps, (np.arange(count) + 0.5) / count
-    return np.stack([np.interp(at, old, column) for column in values.T], axis=1)
+    found = np.stack([np.interp(at, old, column) for column in values.T], axis=1)
+    # The kinks between the old middles excite swings from step to step.
+    first = 1.5 * found[:1] - 0.5 * found[1:2] if steps > 1 else found
+    return free_of_swings(np, first, found)
 
 
 def _unique(names: tuple[str, ...]) -> list[str]:

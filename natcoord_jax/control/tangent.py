@@ -79,25 +79,21 @@ def steadied(system: System, state: State) -> State:
     return replace_fields(state, v=moving.reshape(-1, 3))
 
 
-def projected(system: System, state: State, flexibility: Float[Array, "n n"]) -> State:
-    """State with velocities projected on the free motions in the metric of the mass, momenta kept.
+def split(
+    system: System, state: State, w: Float[Array, " n"], worth: Float[Array, " n"]
+) -> tuple[State, Float[Array, ""]]:
+    """State with given rates of the free motions, and what the momenta are worth that they leave out.
 
-    Exact, derivatives of second order included, at the state whose flexibility is given.
-
-    Args:
-        system: compiled system.
-        state: any state nearby.
-        flexibility: inverse inertia of the free motions at the state in question, see `tangent_maps`.
+    Where these momenta vanish, the rates are those of `steady_rates`: the projection as an equation for its
+    result.
     """
-    rates_of, along = _free_motions(system, state.q.reshape(-1, 4, 3))
-    wanted = along(_with_mass(system, state.v))
-    w = flexibility @ wanted
-    # Each correction takes the error of the frozen flexibility one order further away.
-    for _ in range(2):
-        w = w + flexibility @ (wanted - along(_with_mass(system, rates_of(w).reshape(-1, 3))))
-    still = replace_fields(state, v=rates_of(w).reshape(-1, 3))
-    places = _rotor_places(system)
-    return replace_fields(still, rates=state_rates(system, still)[places]) if places.size else still
+    rows = state.q.reshape(-1, 4, 3)
+    both = jnp.stack([w, worth])
+    velocity, spin = (jnp.einsum("bnc,kn->kbc", x, both) for x in null_space(system, rows))
+    moving, virtual = jax.vmap(row_rates, in_axes=(None, 0, 0))(rows, velocity, spin)
+    left = jnp.sum(virtual * _with_mass(system, state.v - moving.reshape(-1, 3)))
+    still, places = replace_fields(state, v=moving.reshape(-1, 3)), _rotor_places(system)
+    return (replace_fields(still, rates=state_rates(system, still)[places]) if places.size else still), left
 
 
 def tangent_maps(

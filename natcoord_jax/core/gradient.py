@@ -13,6 +13,9 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.maths.collocation import Tableau, invariant_quadrature
 
+LEAST = 1e-12
+"""Relative change of the invariants below which nothing can be missing but round-off."""
+
 
 def averaged_gradient(
     energy, start: Float[Array, " p"], steps: Float[Array, "s p"], tableau: Tableau, degree: int | None
@@ -42,7 +45,10 @@ def averaged_gradient(
     scale = jnp.abs(start) + jnp.abs(increment)
     scale = jnp.where(scale > 0, scale, 1.0)
     measure = jnp.sum(weights[:, None] * (steps / scale) ** 2)
-    noise = 16 * jnp.finfo(start.dtype).eps * (jnp.abs(before) + jnp.abs(after) + jnp.abs(captured))
-    relevant = (jnp.abs(missing) > noise) & (measure > 0)
+    # Near its minimum an energy is less certain than its digits say: invariants are rounded before it.
+    rounded = jnp.max(jnp.abs(gradient) @ scale)
+    sizes = jnp.abs(before) + jnp.abs(after) + jnp.abs(captured) + rounded
+    noise = 16 * jnp.finfo(start.dtype).eps * sizes
+    relevant = (jnp.abs(missing) > noise) & (measure > LEAST**2)
     factor = jnp.where(relevant, missing / jnp.where(relevant, measure, 1.0), 0.0)
     return gradient + factor * steps / scale**2
