@@ -13,6 +13,7 @@ from scenes import JOINTS, pair, with_multipliers
 import natcoord_jax as nc
 from natcoord_jax import gallery
 from natcoord_jax.maths.collocation import gauss, rotate_stages
+from natcoord_jax.stepping.rollout import Plan
 
 ORDERS = (2, 4, 6, 8, 10)
 USUAL = {(4, "universal", "tree"), (6, "revolute", "multipliers")}
@@ -187,6 +188,19 @@ def test_stage_vectors_solve_their_equations(stages):
     found = rotate_stages(turn, start, tableau)
     back = found - jnp.einsum("ij,j...->i...", jnp.asarray(tableau.a), jnp.cross(turn, found))
     np.testing.assert_allclose(back, jnp.broadcast_to(start, back.shape), atol=1e-14)
+
+
+def test_inputs_of_substeps_lie_on_those_of_the_step():
+    """A step that is repeated in parts sees the same torque history: exactly, for a polynomial of it."""
+    method = scheme(6)
+    plan = Plan(1, 0, 1e-15, None, None, method.tableau)
+    history = lambda t: jnp.stack([1 + t - 3 * t**2, 2 * t], axis=-1)  # noqa: E731
+    whole = history(jnp.asarray(method.tableau.c))
+    for done, fraction in ((0.0, 0.5), (0.5, 0.25), (0.75, 0.25)):
+        found = plan.within_step(whole, jnp.asarray(done), jnp.asarray(fraction))
+        times = done + fraction * jnp.asarray(method.tableau.c)
+        np.testing.assert_allclose(found, history(times), atol=1e-14)
+    np.testing.assert_array_equal(plan.within_step(whole, jnp.zeros(()), jnp.ones(())), whole)
 
 
 @pytest.mark.parametrize("order", [3, 0, 12])

@@ -54,11 +54,13 @@ class Sampled:
     channels: int
     fractions: tuple[float, ...]
 
-    def __call__(self, parameters: Any, step: Array, t: Array, state: State) -> Float[Array, "s inputs"]:
-        """At the stages of a (sub)step that starts at t; its length is the parameter."""
+    def __call__(
+        self, parameters: Any, step: Array, t: Array, state: State, fraction: Array
+    ) -> Float[Array, "s inputs"]:
+        """At the stages of a (sub)step that starts at t; the length of the step is the parameter."""
         if self.function is None:
             return jnp.zeros((len(self.fractions), self.channels), state.q.dtype)
-        return jax.vmap(self.function)(t + parameters * jnp.asarray(self.fractions))
+        return jax.vmap(self.function)(t + fraction * parameters * jnp.asarray(self.fractions))
 
 
 @lru_cache(maxsize=64)
@@ -94,8 +96,8 @@ def endpoints(
         newton_tol: see `simulate`.
 
     Returns:
-        A function of step [s] and number of steps; another number does not compile anew. A step that fails
-        ends the run, without repetition in smaller ones.
+        A function of step [s] and number of steps; another number does not compile anew. Steps that fail are
+        repeated in parts, as in `simulate`, without a limit.
     """
     leaves, structure = jax.tree.flatten((system, state))
     program = _program(structure, inputs, scheme, newton_tol)

@@ -55,7 +55,8 @@ class Plan:
         steps: number of steps.
         extra: slots available for retries.
         tolerance: of Newton's iteration.
-        control: function (parameters, step index, t, state) to inputs; None: they are parameters[step].
+        control: function (parameters, step index, t, state, fraction of the step) to inputs; None: they are
+            parameters[step].
         event: function of the state whose change of sign ends the run, or None.
         tableau: of the collocation method.
         recorded: whether every slot is; else only the last is kept.
@@ -64,7 +65,7 @@ class Plan:
     steps: int
     extra: int
     tolerance: float
-    control: Callable[[Any, Array, Array, State], Array] | None
+    control: Callable[[Any, Array, Array, State, Array], Array] | None
     event: Callable[[State], Array] | None = None
     tableau: Tableau = gauss(1)
     recorded: bool = True
@@ -75,7 +76,7 @@ class Plan:
         """Inputs of a (sub)step that starts at a state, after a part `done` of its step."""
         if self.control is None:
             return self.within_step(parameters[step], done, fraction)
-        return self.control(parameters, step, state.t, state)
+        return self.control(parameters, step, state.t, state, fraction)
 
     def within_step(self, inputs: Array, done: Array, fraction: Array) -> Array:
         """Inputs of a part of a step from those of the whole one: held, or interpolated from its stages."""

@@ -167,7 +167,9 @@ def _rollout(
     )
 
 
-def _by_policy(policy: Callable, constants: Any, step: Array, t: Array, state: State) -> Array:
+def _by_policy(
+    policy: Callable, constants: Any, step: Array, t: Array, state: State, fraction: Array
+) -> Array:
     return jnp.asarray(policy(t, state, *constants), float)
 
 
