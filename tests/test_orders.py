@@ -96,7 +96,8 @@ def swinging(stiffness, order=4, steps=20, **options):
     return system, nc.simulate(system, state, dt=1.0 / steps, steps=steps, scheme=scheme(order), **options)
 
 
-@pytest.mark.parametrize("order", [4, pytest.param(6, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("order", [4, 6])
 def test_order_with_springs_at_large_strain(order):
     best = swinging(30.0, 8, 160)[1]
     errors = [
