@@ -141,8 +141,15 @@ class TangentSpace(eqx.Module):
         return self.lift @ self.prescribed
 
     def projected(self, v: Velocity) -> Velocity:
-        """Nearest velocity that the constraints admit."""
-        return self.spread(self.frame.T @ self.within(self.framed(v)) + self.drift)
+        """Nearest velocity that the constraints admit.
+
+        The frame is orthonormal to round-off, and its error nearly the same in every step: momenta would
+        change steadily. What the first projection lost is projected once more.
+        """
+        w = self.frame.T @ self.within(self.framed(v)) + self.drift
+        found = self.spread(w)
+        lost = Velocity(v.rows - found.rows, v.rotors - found.rotors)
+        return self.spread(w + self.frame.T @ self.within(self.framed(lost)))
 
 
 def rotor_inertias(system: System) -> Float[Array, " rotors"]:
