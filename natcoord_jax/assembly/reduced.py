@@ -202,6 +202,19 @@ class ReducedStep(eqx.Module):
         """Exact Jacobian of the residual."""
         return jax.jacfwd(lambda x: self.residual(x)[0])(y)
 
+    def inertias(self, matrix: Float[Array, "unknowns unknowns"]) -> Float[Array, " balances"]:
+        """Inertias of the rates, from the Jacobian and from the mass.
+
+        Kicks take up what moves against constraints: in the Jacobian the inertia of a rate that is
+        prescribed, or that loops forbid, is missing.
+        """
+        found = jnp.abs(jnp.diagonal(matrix))[: self.balances]
+        if self.tangents is None:
+            return found
+        own = jnp.diagonal(self.tangents.pulled(self.tangents.impulses))
+        stages = jnp.diagonal(jnp.asarray(self.tableau.a_inverse, matrix.dtype))
+        return jnp.maximum(found, (stages[:, None] * own).reshape(-1))
+
     def probes(self) -> Float[Array, " unknowns"]:
         """Changes of the unknowns that give columns of the Jacobian as quotients of differences.
 
