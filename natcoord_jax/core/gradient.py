@@ -42,7 +42,11 @@ def averaged_gradient(
     scale = jnp.abs(start) + jnp.abs(increment)
     scale = jnp.where(scale > 0, scale, 1.0)
     measure = jnp.sum(weights[:, None] * (steps / scale) ** 2)
-    noise = 16 * jnp.finfo(start.dtype).eps * (jnp.abs(before) + jnp.abs(after) + jnp.abs(captured))
+    # Also what rounding of the invariants makes of an energy that is itself nearly zero, as an angle is that
+    # counts from the start of the step.
+    passed_on = jnp.max(jnp.abs(gradient) @ (jnp.abs(start) + jnp.abs(increment)))
+    size = jnp.abs(before) + jnp.abs(after) + jnp.abs(captured) + passed_on
+    noise = 16 * jnp.finfo(start.dtype).eps * size
     relevant = (jnp.abs(missing) > noise) & (measure > 0)
     factor = jnp.where(relevant, missing / jnp.where(relevant, measure, 1.0), 0.0)
     return gradient + factor * steps / scale**2
