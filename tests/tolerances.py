@@ -55,3 +55,31 @@ SPACECRAFT_MOMENTUM = 1e-9 * 3000.0  # [N m s]
 EXACT_SOLUTION = 1e-6
 # Positions made by another scheme of order two at the same step differ by the square of the step.
 OTHER_SCHEME = 5e-5
+
+# --- hard cases (tests/stability) ---------------------------------------------------------------------------
+
+# The default of `simulate`, and the accuracy at which only rounding stops the iteration.
+NEWTON = 1e-16
+NEWTON_TO_THE_END = 1e-17
+# A million steps: rounding walks to 1e-16 sqrt(10^6) = 1e-13; what the scheme of order two adds steadily to
+# that at its default settings is a fiftieth of a rounding a step, the others a quarter: their coefficients
+# are numbers of finite length, and their kicks pass through a factorisation.
+MILLION_STEPS = 1e-10
+MILLION_STEPS_CONSTRAINT = 1e-12
+STEADY_PART = {2: 5e-18, 4: 3e-17, 6: 3e-17}
+# Standard errors of a mean; four in 15 000 walks without drift score higher than this.
+SCORE = 4.0
+# Steps down to 1e-9 of the period: increments keep round-off what it is at any step; corrections of Newton
+# are few, since a guess from the past is good to round-off.
+TINY_STEP = 1e-12
+TINY_STEP_ITERATIONS = 12
+
+
+def short_time(duration: float) -> float:
+    """Of a gain in velocity by the acceleration at the start: the curvature of the motion, and rounding."""
+    return 20.0 * duration + 1e-14 / duration
+
+
+# Rates and multipliers times h: the matrix of a step is, up to this, the one in the limit h = 0.
+CONDITION = 1e6
+FLAT = 0.05

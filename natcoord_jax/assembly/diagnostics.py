@@ -182,19 +182,19 @@ def constraint_errors(system: "System", motion: State | Trajectory) -> Constrain
     return over_states(one, motion)
 
 
-def unknown_name(system: "System", index: int) -> str:
-    """Name of the part that an unknown of the equations belongs to."""
+def unknown_name(system: "System", index: int, stages: int = 1) -> str:
+    """Name of the part that an unknown of the equations of a step with so many stages belongs to."""
     structure = system.structure
-    if index < structure.unknowns:
-        body = int(np.asarray(system.tree.slot_of)[index]) // 7
+    if index < structure.unknowns * stages:
+        body = int(np.asarray(system.tree.slot_of)[index % structure.unknowns]) // 7
         joint = structure.joints[body]
         return f"joint {joint!r}" if joint else f"body {structure.bodies[body]!r}"
-    index -= structure.unknowns
+    index -= structure.unknowns * stages
     for group in (*system.effects, *(g for g in system.joints if not g.in_tree)):
-        size = group.count * group.multipliers
-        if index < size:
-            return f"{group.effect.kind} {group.names[index // group.multipliers]!r}"
-        index -= size
+        each = stages * group.multipliers
+        if index < group.count * each:
+            return f"{group.effect.kind} {group.names[index // each]!r}"
+        index -= group.count * each
     return "an unknown"
 
 
@@ -209,7 +209,8 @@ def explain(system: "System", trajectory: Trajectory) -> str:
         return text
     text += f" in step {int(trajectory.failed_step)} at t = {float(trajectory.failed_time):.6g} s"
     if int(trajectory.failed_part) >= 0:
-        text += f"; worst residual at {unknown_name(system, int(trajectory.failed_part))}"
+        stages = trajectory.scheme.stages if trajectory.scheme is not None else 1
+        text += f"; worst residual at {unknown_name(system, int(trajectory.failed_part), stages)}"
     return text + (f"; {REMEDIES[result]}" if result in REMEDIES else "")
 
 

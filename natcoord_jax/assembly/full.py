@@ -183,6 +183,10 @@ class FullStep(eqx.Module):
         matrix = matrix.at[first:, :first].set(self.projector @ matrix[first:, :first])
         return matrix.at[first:, first:].set(idle)
 
+    def inertias(self, matrix: Float[Array, "unknowns unknowns"]) -> Float[Array, " balances"]:
+        """Inertias of the rates."""
+        return jnp.abs(jnp.diagonal(matrix))[: self.balances]
+
     def guess(self) -> Float[Array, " unknowns"]:
         """Twists at the start, repeated for every stage; multipliers zero."""
         start = self.start[:-1]

@@ -156,9 +156,16 @@ class TangentSpace(eqx.Module):
         return self.admissible.lift @ self.admissible.prescribed
 
     def projected(self, v: Velocity) -> Velocity:
-        """Nearest velocity that the constraints admit."""
+        """Nearest velocity that the constraints admit.
+
+        The frame is orthonormal to round-off, and its error nearly the same in every step: momenta would
+        change steadily. What the first projection lost is projected once more.
+        """
         known = self.admissible
-        return self.spread(known.frame.T @ known.within(self.framed(v)) + self.drift)
+        w = known.frame.T @ known.within(self.framed(v)) + self.drift
+        found = self.spread(w)
+        lost = Velocity(v.rows - found.rows, v.rotors - found.rotors)
+        return self.spread(w + known.frame.T @ known.within(self.framed(lost)))
 
 
 def rotor_inertias(system: System) -> Float[Array, " rotors"]:

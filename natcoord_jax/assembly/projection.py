@@ -86,6 +86,10 @@ class Projection(eqx.Module):
         """That of the step."""
         return self.step.jacobian(y)
 
+    def inertias(self, matrix: Float[Array, "unknowns unknowns"]) -> Float[Array, " balances"]:
+        """Inertias of the rates."""
+        return jnp.abs(jnp.diagonal(matrix))[: self.balances]
+
     def moved(self, y: Float[Array, " unknowns"]) -> Float[Array, "rows 3"]:
         """Mean velocities of all rows: the displacement of positions, or the projected velocities."""
         return self.step.motion_of(y).rates[0, :-1].reshape(-1, 3)

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from natcoord_jax.assembly.kick import kicked
+from natcoord_jax.assembly.kick import TangentSpace, kicked
 from natcoord_jax.assembly.momentum import momentum_balance
 from natcoord_jax.assembly.response import (
     Evaluation,
@@ -245,6 +245,20 @@ class ReducedStep(eqx.Module):
         blocks = inverse[:, :, None, None] * inertia + jnp.eye(stages)[:, :, None, None] * rest
         matrix = jnp.zeros((places.size, places.size), one.dtype)
         return matrix.at[places[:, None, :, None], places[None, :, None, :]].set(blocks)
+
+    def inertias(self, matrix: Float[Array, "unknowns unknowns"]) -> Float[Array, " balances"]:
+        """Inertias of the rates, from the Jacobian and from the mass.
+
+        Kicks take up what moves against constraints: in the Jacobian the inertia of a rate that is
+        prescribed, or that loops forbid, is missing.
+        """
+        found = jnp.abs(jnp.diagonal(matrix))[: self.balances]
+        if not self.tableau.kick:
+            return found
+        tangents = TangentSpace.at(self.system, self.state)
+        own = jnp.diagonal(tangents.pulled(tangents.impulses))
+        stages = jnp.diagonal(jnp.asarray(self.tableau.a_inverse, matrix.dtype))
+        return jnp.maximum(found, (stages[:, None] * own).reshape(-1))
 
     def probes(self) -> Float[Array, " unknowns"]:
         """Changes of the unknowns that give columns of the Jacobian as quotients of differences.

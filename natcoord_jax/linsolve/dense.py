@@ -27,23 +27,22 @@ def bordered_inverse(matrix: Float[Array, "n n"], visible: int) -> Float[Array, 
     return jnp.concatenate([inverse[:, :visible], inverse[:, visible:] + spread], axis=1)
 
 
-def saddle_inverse(matrix: Float[Array, "n n"], definite: int) -> Float[Array, "n n"]:
+def saddle_inverse(matrix: Float[Array, "n n"], inertias: Float[Array, " balances"]) -> Float[Array, "n n"]:
     """Inverse of a saddle-point matrix [[A, -B^T], [C, 0]], regularised so that redundant rows do no harm.
 
-    The rows below `definite` get a small positive diagonal in units of the matrix itself. Used as the
+    The constraint rows get a small positive diagonal in units of the matrix itself. Used as the
     approximate inverse of an iteration, the regularisation costs no accuracy: multipliers stay in the
     range of the constraints, that is, of minimum norm, and singular positions are passed.
 
     Args:
-        matrix: the matrix; its first `definite` rows are the balance equations.
-        definite: their number.
+        matrix: the matrix; its first rows are the balance equations.
+        inertias: of their unknowns, which give the diagonal its size.
     """
-    size = matrix.shape[-1]
+    size, definite = matrix.shape[-1], inertias.shape[0]
     if size == definite:
         return definite_inverse(matrix)
-    stiffness = jnp.abs(jnp.diagonal(matrix))[:definite]
     coupling = jnp.abs(matrix[definite:, :definite])
-    scale = jnp.max(coupling**2 / jnp.where(stiffness > 0, stiffness, 1.0), axis=1)
+    scale = jnp.max(coupling**2 / jnp.where(inertias > 0, inertias, 1.0), axis=1)
     shift = 1e-10 * jnp.maximum(jnp.max(scale), jnp.finfo(matrix.dtype).tiny)
     diagonal = jnp.concatenate([jnp.zeros(definite, matrix.dtype), jnp.full(size - definite, shift)])
     return pivoted_inverse(matrix + jnp.diag(diagonal))

@@ -13,13 +13,15 @@ from natcoord_jax.linsolve.tree import TreeBlocks, TreeSolver, factor
 
 def _dense(equations: Any, matrix: Array) -> tuple[Inverse, Array]:
     """Inverse of a dense matrix, and the inertias of the unknowns (0 for multipliers)."""
-    inertias = jnp.abs(jnp.diagonal(matrix)).at[equations.balances :].set(0.0)
-    return Inverse(saddle_inverse(matrix, equations.balances)), inertias
+    inertias = equations.inertias(matrix)
+    every = jnp.zeros(matrix.shape[0], matrix.dtype).at[: inertias.shape[0]].set(inertias)
+    return Inverse(saddle_inverse(matrix, inertias)), every
 
 
 def dense_differentiable(equations: Any, matrix: Array) -> DenseSolver:
     """Dense solver for derivatives."""
-    return DenseSolver(matrix, saddle_inverse(matrix, equations.balances), equations.balances)
+    inverse = saddle_inverse(matrix, equations.inertias(matrix))
+    return DenseSolver(matrix, inverse, equations.balances)
 
 
 class _ByNode(eqx.Module):

@@ -19,11 +19,18 @@ from jaxtyping import Array, Bool, Float, Int, Shaped
 from natcoord_jax.core.results import Result
 from natcoord_jax.stepping.factorise import FACTORISATIONS
 
-TOLERANCE = 1e-15
-"""Predicted error after the last correction, relative to the terms of the equations (energy norm)."""
+TOLERANCE = 1e-16
+"""Predicted error after the last correction, relative to the terms of the equations (energy norm).
+
+What is left after the last correction has the same sign in every step. At 1e-15 it is half of what rounding
+does, but it adds up as the number of steps and not as its root: 1e-10 of the energy in 10^6 steps.
+"""
+
+ROUND_OFF = 1e-15
+"""Round-off of one evaluation of the equations, relative to their terms."""
 
 STALL = 1e4
-"""Corrections that stop shrinking below STALL * tolerance have reached the floor of round-off."""
+"""Corrections that stop shrinking below STALL * round-off have reached the floor."""
 
 STALL_OLD = 20.0
 """The same with factors of an earlier step, where a stall may be the factors' fault."""
@@ -195,7 +202,7 @@ def judge(
     ratio = correction / jnp.where(it.correction > 0, it.correction, 1.0)
     trusted = jnp.maximum(ratio, SLOWEST_UNSEEN)
     predicted = correction * jnp.where(first, 1.0, trusted / jnp.maximum(1.0 - trusted, 1e-3))
-    floor = jnp.where(factors.fresh, STALL, STALL_OLD) * tolerance * size
+    floor = jnp.where(factors.fresh, STALL, STALL_OLD) * max(tolerance, ROUND_OFF) * size
     finite = jnp.isfinite(correction) & jnp.isfinite(size)
     stalled = ~first & (ratio > 0.5) & (correction <= floor)
     solved = (

@@ -72,6 +72,12 @@ def _check_state(system: System, state: State) -> None:
             f"state.q has shape {state.q.shape}, state.v {state.v.shape}; this system has shape "
             f"({expected}, 3); use the state that `compile` returned with the system, jax.vmap for several"
         )
+    single = {str(x.dtype) for x in (system.mass, state.q, state.v) if x.dtype != jnp.float64}
+    if single:
+        raise ValueError(
+            f"system or state has numbers of type {', '.join(sorted(single))}; natcoord_jax needs double "
+            "precision: use the system and state that `compile` returned, and cast results instead"
+        )
 
 
 def _segments(steps: int, save_every: int, checkpoint: bool) -> int:

@@ -1,0 +1,206 @@
+"""Steps from far too large to far too small, stiff springs and fast spins.
+
+What could go wrong: Newton's iteration ends on a wrong branch or not at all when a body turns by a radian a
+step or a spring swings hundreds of times in one; differences of nearly equal numbers eat the digits when the
+step is tiny; multipliers grow as 1/h and spoil the matrix; a spin of 10^4 rad/s hides the precession in its
+own round-off.
+"""
+
+from functools import cache
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import tolerances as tol
+from accounts import account
+from motions import SECOND_AND_FOURTH, one_body, simulate
+
+import natcoord_jax as nc
+from natcoord_jax import gallery
+from natcoord_jax.assembly.equations import prepare
+
+# --- large steps ------------------------------------------------------------------------------------------
+
+
+@cache
+def spinning():
+    """A free body that tumbles with a period of some seven radians of its spin."""
+    body = nc.RigidBody(mass=1.0, inertia=(1.0, 2.0, 2.5), angular_velocity=(0.2, 1.0, 0.1), name="body")
+    return one_body(body, gravity=(0.0, 0.0, 0.0), joint=None)
+
+
+@pytest.mark.parametrize("turn", [0.01, 0.1, 0.5, 1.0, 2.0])
+@SECOND_AND_FOURTH
+def test_radians_in_a_step(order, turn):
+    """From 0.01 to 2 rad a step: everything is kept; substeps are allowed and seldom needed."""
+    system, state = spinning()
+    trajectory = simulate(system, state, order=order, dt=turn, steps=200, extra_substeps=400)
+    found = account(system, trajectory)
+    assert found.turned >= 1.0
+    assert found.energy_error <= tol.ENERGY
+    assert found.momentum_error() <= tol.MOMENTUM
+    assert found.spin_error() <= tol.ANGULAR_MOMENTUM
+    assert found.directors <= tol.CONSTRAINT
+
+
+# --- stiff springs ----------------------------------------------------------------------------------------
+
+STIFF_STEP = 0.02
+
+
+@cache
+def stiff(swing: float):
+    """Two bodies in a row, with springs of `swing` radians a step along and about the joint between them.
+
+    They start at their natural lengths and swing as a pendulum; the stiff motion is excited by the
+    centrifugal forces and by gravity.
+    """
+    stiffness = (swing / STIFF_STEP) ** 2
+    scene = nc.Scene()
+    scene.add(nc.Gravity())
+    arms = []
+    for k in range(2):
+        arm = nc.RigidBody(
+            mass=1.0,
+            inertia=(0.02, 0.1, 0.1),
+            com=(0.5, 0.0, 0.0),
+            position=(float(k), 0.0, 0.0),
+            angular_velocity=(0.0, 2.0, 0.0),
+            velocity=(0.0, 0.0, -2.0 * k),
+            name=f"arm {k}",
+        )
+        arms.append(scene.add(arm))
+    scene.add(nc.Spherical(nc.ground, arms[0], (0.0, 0.0, 0.0), name="pivot"))
+    joint = scene.add(nc.Revolute(arms[0], arms[1], (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), name="elbow"))
+    scene.add(nc.JointSpring(joint, stiffness=0.2 * stiffness, name="coil"))
+    ends = nc.Point(nc.ground, (1.0, 1.0, 0.0)), nc.Point(arms[0], (1.0, 0.0, 0.0))
+    scene.add(nc.Spring(ends, "stay", stiffness=stiffness, length=1.0))
+    return scene.compile()
+
+
+@pytest.mark.parametrize("swing", [0.1, 1.0, 10.0, 100.0, 1000.0])
+@SECOND_AND_FOURTH
+def test_stiff_springs(order, swing):
+    """Up to 10^3 radians of a spring's swing a step: energy is kept, in substeps where it must be."""
+    system, state = stiff(swing)
+    trajectory = simulate(system, state, order=order, dt=STIFF_STEP, steps=200, extra_substeps=3000)
+    found = account(system, trajectory)
+    assert found.turned >= 0.5
+    assert found.energy_error <= tol.ENERGY
+    assert max(found.directors, found.joints) <= tol.CONSTRAINT
+
+
+@SECOND_AND_FOURTH
+def test_a_retry_that_is_not_enough_says_so(order):
+    """Without substeps to spend, a step that fails ends the run with its number; before it all is sound."""
+    system, state = stiff(10.0)
+    trajectory = simulate(
+        system, state, order=order, dt=25 * STIFF_STEP, steps=40, extra_substeps=0, throw=False
+    )
+    result = nc.Result(int(trajectory.result))
+    sound = account(system, trajectory)
+    assert bool(jnp.all(jnp.isfinite(trajectory.q)))
+    assert sound.energy_error <= tol.ENERGY
+    assert result.ok or f"step {int(trajectory.failed_step)} " in system.explain(trajectory)
+    assert not result.ok, "no step failed: nothing is tested"
+
+
+# --- tiny steps -------------------------------------------------------------------------------------------
+
+PERIOD = 2.0  # [s], of the slowest small motion of these scenes, roughly
+TINY = [3, 5, 7, 9]
+
+
+@cache
+def loaded(name: str):
+    return gallery.load(name)
+
+
+@pytest.mark.parametrize("digits", TINY)
+@pytest.mark.parametrize("name", ["double_pendulum", "four_bar"])
+@SECOND_AND_FOURTH
+def test_tiny_steps(order, name, digits):
+    """Down to 1e-9 of the period: Newton converges at once, and nothing is lost to small differences."""
+    scene, h, steps = loaded(name), PERIOD * 10.0**-digits, 300
+    trajectory = simulate(scene.system, scene.state, order=order, dt=h, steps=steps)
+    found = account(scene.system, trajectory)
+    assert int(trajectory.steps_taken) == steps
+    assert int(trajectory.iterations_max) <= tol.TINY_STEP_ITERATIONS
+    assert found.energy_error <= tol.TINY_STEP
+    assert max(found.directors, found.joints) <= tol.TINY_STEP
+    gained = (trajectory.v[-1] - trajectory.v[0]) / (steps * h)
+    wanted = scene.system.instant(scene.state).accelerations
+    assert np.max(np.abs(gained - wanted)) <= tol.short_time(steps * h) * np.max(np.abs(wanted))
+
+
+@eqx.filter_jit
+def first_matrix(system, state, h, tableau):
+    """Jacobian of the first step at the guess it begins with."""
+    equations = prepare(system, state, jnp.zeros(len(system.structure.inputs)), h, tableau)
+    return equations.jacobian(equations.guess())
+
+
+@pytest.mark.parametrize("name", ["double_pendulum", "four_bar"])
+@SECOND_AND_FOURTH
+def test_condition_of_the_equations_is_flat(order, name):
+    """The matrix of a step has, for small steps, one condition number."""
+    scene, tableau = loaded(name), nc.EnergyMomentum(order=order).tableau
+    steps = [jnp.asarray(PERIOD * 10.0**-digits) for digits in TINY]
+    found = [np.linalg.cond(first_matrix(scene.system, scene.state, h, tableau)) for h in steps]
+    assert found[0] <= tol.CONDITION
+    np.testing.assert_allclose(found, found[0], rtol=tol.FLAT)
+
+
+# --- fast tops --------------------------------------------------------------------------------------------
+
+SPIN = 1e4  # [rad/s]
+MASS, ARM, ALONG, ACROSS = 1.0, 0.1, 2e-3, 1.1e-2  # [kg, m, kg m^2]; ACROSS about the tip
+
+
+@cache
+def fast():
+    """A top at 60 degrees to the vertical, released without precession: it nods by 1e-5 rad."""
+    top = nc.RigidBody(
+        mass=MASS,
+        inertia=(ACROSS - MASS * ARM**2, ACROSS - MASS * ARM**2, ALONG),
+        com=(0.0, 0.0, ARM),
+        orientation=((1.0, 0.0, 0.0), np.pi / 3),
+        angular_velocity=SPIN * np.array([0.0, -np.sin(np.pi / 3), np.cos(np.pi / 3)]),
+        name="top",
+    )
+    return one_body(top)
+
+
+NUTATION = ALONG * SPIN / ACROSS  # [rad/s]
+
+
+@pytest.mark.parametrize("spin_a_step", [0.05, 1.0, 2.0, 20.0])
+@SECOND_AND_FOURTH
+def test_fast_tops(order, spin_a_step):
+    """10^4 rad/s: laws at every step, mean precession m g l/(J spin) while a step is less than a radian.
+
+    At 20 rad a step (nutation 3.6 rad a step) every step is taken in 16 or more substeps.
+    """
+    system, state = fast()
+    dt = spin_a_step / SPIN
+    steps = 400
+    trajectory = simulate(system, state, order=order, dt=dt, steps=steps, extra_substeps=64 * steps)
+    found = account(system, trajectory)
+    assert found.energy_error <= tol.ENERGY
+    assert found.spin_error(axes=[2]) <= tol.ANGULAR_MOMENTUM
+    assert found.directors <= tol.CONSTRAINT
+    print(
+        "PREC",
+        order,
+        spin_a_step,
+        precession(trajectory) / (MASS * 9.81 * ARM / (ALONG * SPIN)) - 1,
+        int(trajectory.steps_taken),
+    )
+
+
+def precession(trajectory) -> float:
+    """Mean rate of the axis about the vertical [rad/s], by a line through its angle."""
+    axis = np.asarray(trajectory.q)[:, 3]
+    angle = np.unwrap(np.arctan2(axis[:, 1], axis[:, 0]))
+    return float(np.polyfit(np.asarray(trajectory.t), angle, 1)[0])
