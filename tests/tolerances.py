@@ -61,8 +61,8 @@ OTHER_SCHEME = 5e-5
 # The accuracy at which only rounding stops Newton's iteration.
 NEWTON_TO_THE_END = 1e-17
 # A million steps: rounding walks to 1e-16 sqrt(10^6) = 1e-13; what the scheme of order two adds steadily to
-# that at its default settings is a fiftieth of a rounding a step, the others up to half of one: their coefficients
-# are numbers of finite length, and their kicks pass through a factorisation.
+# that at its default settings is a fiftieth of a rounding a step, the others up to half of one: their
+# coefficients are numbers of finite length, and their kicks pass through a factorisation.
 MILLION_STEPS = 1e-10
 MILLION_STEPS_CONSTRAINT = 1e-12
 STEADY_PART = {2: 5e-18, 4: 3e-17, 6: 5e-17}
