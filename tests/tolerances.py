@@ -58,15 +58,14 @@ OTHER_SCHEME = 5e-5
 
 # --- hard cases (tests/stability) ---------------------------------------------------------------------------
 
-# The default of `simulate`, and the accuracy at which only rounding stops the iteration.
-NEWTON = 1e-16
+# The accuracy at which only rounding stops Newton's iteration.
 NEWTON_TO_THE_END = 1e-17
 # A million steps: rounding walks to 1e-16 sqrt(10^6) = 1e-13; what the scheme of order two adds steadily to
-# that at its default settings is a fiftieth of a rounding a step, the others a quarter: their coefficients
-# are numbers of finite length, and their kicks pass through a factorisation.
+# that at its default settings is a fiftieth of a rounding a step, the others up to half of one: their
+# coefficients are numbers of finite length, and their kicks pass through a factorisation.
 MILLION_STEPS = 1e-10
 MILLION_STEPS_CONSTRAINT = 1e-12
-STEADY_PART = {2: 5e-18, 4: 3e-17, 6: 3e-17}
+STEADY_PART = {2: 5e-18, 4: 3e-17, 6: 5e-17}
 # Standard errors of a mean; four in 15 000 walks without drift score higher than this.
 SCORE = 4.0
 # Steps down to 1e-9 of the period: increments keep round-off what it is at any step; corrections of Newton
@@ -80,6 +79,9 @@ def short_time(duration: float) -> float:
     return 20.0 * duration + 1e-14 / duration
 
 
+# Formulas of the fast top leave out the square of precession over spin, 2e-7; means over a few nutations
+# leave their phase.
+FAST_TOP = 2e-3
 # Rates and multipliers times h: the matrix of a step is, up to this, the one in the limit h = 0.
 CONDITION = 1e6
 FLAT = 0.05

@@ -13,7 +13,7 @@ from natcoord_jax.gallery.manoeuvres import reorientation_example
 from natcoord_jax.gallery.open_tree import open_tree
 from natcoord_jax.gallery.pendulums import double_pendulum, pendulum, torsion_spring
 from natcoord_jax.gallery.spacecraft import spacecraft
-from natcoord_jax.gallery.tops import dzhanibekov, free_body, heavy_top
+from natcoord_jax.gallery.tops import dzhanibekov, fast_top, free_body, heavy_top
 from natcoord_jax.gallery.trees import binary_tree, chain, robot_arm
 
 SCENES: Mapping[str, Callable[..., Example]] = {
@@ -23,6 +23,7 @@ SCENES: Mapping[str, Callable[..., Example]] = {
     "double_pendulum": double_pendulum,
     "torsion_spring": torsion_spring,
     "heavy_top": heavy_top,
+    "fast_top": fast_top,
     "free_body": free_body,
     "dzhanibekov": dzhanibekov,
     "four_bar": four_bar,

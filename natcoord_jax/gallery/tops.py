@@ -1,5 +1,7 @@
 """Single bodies that spin."""
 
+import numpy as np
+
 import natcoord_jax as nc
 from natcoord_jax.gallery.example import Example
 
@@ -26,6 +28,32 @@ def heavy_top() -> Example:
         },
     }
     return Example("heavy_top", "a fast top under gravity", system, state, 0.001, 2000, facts=facts)
+
+
+def fast_top() -> Example:
+    """A top at 10 000 rad/s, released without precession: it nods by hundred-thousandths of a radian."""
+    mass, arm, along, across, tilt, spin = 1.0, 0.1, 2e-3, 1.1e-2, np.pi / 3, 1e4
+    scene = nc.Scene()
+    scene.add(nc.Gravity(vector=(0, 0, -9.81)))
+    top = nc.RigidBody(
+        mass=mass,
+        inertia=(across - mass * arm**2, across - mass * arm**2, along),
+        com=(0, 0, arm),
+        orientation=((1.0, 0.0, 0.0), tilt),
+        angular_velocity=(0, -spin * np.sin(tilt), spin * np.cos(tilt)),
+        name="top",
+    )
+    scene.add(nc.Spherical(nc.ground, scene.add(top), point=(0, 0, 0), name="tip"))
+    system, state = scene.compile()
+    nutation, precession = along * spin / across, mass * 9.81 * arm / (along * spin)
+    facts = {
+        "dofs": 3,
+        "spin": spin,  # [rad/s]
+        "nutation": nutation,  # [rad/s]
+        "precession": precession,  # [rad/s], the mean
+        "nodding": 2.0 * precession * np.sin(tilt) / nutation,  # [rad], from end to end
+    }
+    return Example("fast_top", "a top at 10 000 rad/s", system, state, 5e-6, 1000, facts=facts)
 
 
 def free_body() -> Example:

@@ -22,7 +22,6 @@ def one_body(
     part: Any,
     gravity: Any = (0.0, 0.0, -9.81),
     joint: Any = nc.Spherical,
-    solver: str | None = None,
 ) -> Any:
     """A body on a joint at the origin (None: free); equal structure, hence a shared program."""
     scene = nc.Scene()
@@ -30,7 +29,7 @@ def one_body(
     body = scene.add(part)
     if joint is not None:
         scene.add(joint(nc.ground, body, (0.0, 0.0, 0.0), name="hinge"))
-    return scene.compile(solver=solver)
+    return scene.compile()
 
 
 @dataclass(frozen=True)

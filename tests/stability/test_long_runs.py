@@ -34,9 +34,9 @@ def example(name: str):
 
 
 @cache
-def long_run(name: str, order: int, newton_tol: float = tol.NEWTON):
+def long_run(name: str, order: int, **options):
     scene = example(name)
-    options = dict(dt=STEP[name], steps=MILLION, save_every=MILLION // SAVED, newton_tol=newton_tol)
+    options |= dict(dt=STEP[name], steps=MILLION, save_every=MILLION // SAVED)
     return account(scene.system, simulate(scene.system, scene.state, order=order, **options))
 
 
@@ -68,7 +68,7 @@ def test_a_million_steps(name, order):
 @EVERY_TOP
 def test_no_trend(name):
     """With Newton's iteration carried to where rounding stops it, drifts are walks without direction."""
-    for what, drift in drifts(name, long_run(name, 2, tol.NEWTON_TO_THE_END)).items():
+    for what, drift in drifts(name, long_run(name, 2, newton_tol=tol.NEWTON_TO_THE_END)).items():
         assert abs(drift.score) <= tol.SCORE, (what, drift)
 
 
