@@ -17,6 +17,8 @@ from motions import simulate
 import natcoord_jax as nc
 from natcoord_jax import gallery
 
+pytestmark = pytest.mark.slow
+
 ORDERS = pytest.mark.parametrize("order", [2, pytest.param(4, marks=pytest.mark.slow)])
 STEP, STEPS = 0.01, 300
 

@@ -57,6 +57,8 @@ REGULARISED = pytest.mark.xfail(
     reason="all constraints get the regularisation of the lightest body, which swamps the heaviest one's",
 )
 
+pytestmark = pytest.mark.slow
+
 
 def extreme(form: str, ratio: float):
     """Marks of a case: what keeps its multipliers is slow, and ends at a ratio of some 1e4."""

@@ -15,6 +15,8 @@ from motions import SECOND_AND_FOURTH, simulate
 
 import natcoord_jax as nc
 
+pytestmark = pytest.mark.slow
+
 
 @cache
 def still():

@@ -20,6 +20,8 @@ import natcoord_jax as nc
 from natcoord_jax import gallery
 from natcoord_jax.assembly.equations import prepare
 
+pytestmark = pytest.mark.slow
+
 # --- large steps ------------------------------------------------------------------------------------------
 
 

@@ -16,6 +16,8 @@ from motions import SECOND_AND_FOURTH, simulate
 
 import natcoord_jax as nc
 
+pytestmark = pytest.mark.slow
+
 STEP, STEPS = 0.01, 200
 
 
