@@ -260,11 +260,12 @@ class ReducedStep(eqx.Module):
         stages = jnp.diagonal(jnp.asarray(self.tableau.a_inverse, matrix.dtype))
         return jnp.maximum(found, (stages[:, None] * own).reshape(-1))
 
-    def probes(self) -> Float[Array, " unknowns"]:
+    def probes(self, y: Float[Array, " unknowns"]) -> Float[Array, " unknowns"]:
         """Changes of the unknowns that give columns of the Jacobian as quotients of differences.
 
         Small against a radian and against the extent of the system, so that the equations are
-        nearly linear in them; in multipliers they are linear exactly.
+        nearly linear in them. In multipliers they are linear exactly; there a change as large as the
+        multiplier itself loses no digits, which constraints on a light part between heavy ones cannot spare.
         """
         mass = self.system.mass
         gyration = jnp.trace(mass[:, 1:, 1:], axis1=1, axis2=2) / mass[:, 0, 0]
@@ -274,5 +275,4 @@ class ReducedStep(eqx.Module):
         turning = jnp.ones((self.start.shape[0], 3), mass.dtype)
         scales = jnp.concatenate([turning, extent * turning, turning[:, :1]], axis=1)
         rates = PROBE / self.h * scales.reshape(-1)[self.system.tree.slot_of]
-        count = self.system.structure.multipliers * self.tableau.stages
-        return jnp.concatenate([jnp.tile(rates, self.tableau.stages), jnp.ones(count, mass.dtype)])
+        return jnp.concatenate([jnp.tile(rates, self.tableau.stages), 1.0 + jnp.abs(y[self.balances :])])

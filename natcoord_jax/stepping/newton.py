@@ -30,7 +30,14 @@ ROUND_OFF = 1e-15
 """Round-off of one evaluation of the equations, relative to their terms."""
 
 STALL = 1e4
-"""Corrections that stop shrinking below STALL * round-off have reached the floor."""
+"""Corrections that stop shrinking below STALL * round-off have reached the floor.
+
+Where new factors change nothing, ten times more each time: rounding is worse than assumed, as it is about the
+axis of a thin rod, whose balance is rounded like that of the other axes.
+"""
+
+STALLS = 3
+"""Times that the floor is raised."""
 
 STALL_OLD = 20.0
 """The same with factors of an earlier step, where a stall may be the factors' fault."""
@@ -202,7 +209,8 @@ def judge(
     ratio = correction / jnp.where(it.correction > 0, it.correction, 1.0)
     trusted = jnp.maximum(ratio, SLOWEST_UNSEEN)
     predicted = correction * jnp.where(first, 1.0, trusted / jnp.maximum(1.0 - trusted, 1e-3))
-    floor = jnp.where(factors.fresh, STALL, STALL_OLD) * max(tolerance, ROUND_OFF) * size
+    raised = STALL * 10.0 ** jnp.clip(it.rounds - 1, 0, STALLS)
+    floor = jnp.where(factors.fresh, raised, STALL_OLD) * max(tolerance, ROUND_OFF) * size
     finite = jnp.isfinite(correction) & jnp.isfinite(size)
     stalled = ~first & (ratio > 0.5) & (correction <= floor)
     solved = (

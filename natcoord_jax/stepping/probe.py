@@ -31,21 +31,26 @@ class Probe(eqx.Module):
 
     def moved(self, y: Float[Array, " unknowns"], equations: Any) -> Float[Array, " unknowns"]:
         """Where the equations are evaluated next."""
-        return y + jnp.where(jnp.arange(y.shape[0]) == self.at - 1, equations.probes(), 0.0)
+        return y + jnp.where(jnp.arange(y.shape[0]) == self.at - 1, equations.probes(y), 0.0)
 
     def with_column(
-        self, residual: Float[Array, " unknowns"], equations: Any, wanting: Bool[Array, ""]
+        self,
+        y: Float[Array, " unknowns"],
+        residual: Float[Array, " unknowns"],
+        equations: Any,
+        wanting: Bool[Array, ""],
     ) -> tuple["Probe", Bool[Array, ""]]:
         """After an evaluation: the next state, and whether the Jacobian is complete.
 
         Args:
+            y: where the Jacobian is wanted.
             residual: found.
             equations: of the step.
             wanting: whether a Jacobian is wanted; never while one is in the making.
         """
         size = residual.shape[0]
         base = jnp.where(self.at == 0, residual, self.residual)
-        steps = jnp.append(equations.probes(), 1.0)
+        steps = jnp.append(equations.probes(y), 1.0)
         row = jnp.where(self.at > 0, self.at - 1, size)
         quotient = (residual - base) / steps[row]
         columns = jax.lax.dynamic_update_index_in_dim(self.columns, quotient, row, 0)
@@ -58,7 +63,7 @@ def jacobian_by_differences(
     equations: Any, y: Float[Array, " unknowns"]
 ) -> Float[Array, "unknowns unknowns"]:
     """The same in one go, where the residual is not evaluated for anything else."""
-    steps = equations.probes()
+    steps = equations.probes(y)
     points = jnp.concatenate([y[None], y + jnp.diag(steps)])
     found = jax.lax.map(lambda y: equations.residual(y)[0], points)
     return ((found[1:] - found[:1]) / steps[:, None]).T

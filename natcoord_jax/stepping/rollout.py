@@ -40,8 +40,8 @@ from natcoord_jax.stepping.past import Past
 from natcoord_jax.stepping.probe import BY_DIFFERENCES, Probe
 from natcoord_jax.stepping.step import end_of_step
 
-SMALLEST_FRACTION = 1.0 / 64
-"""A step is given up when a substep of this fraction of it fails."""
+SMALLEST_FRACTION = 1.0 / 4096
+"""A step is given up when a substep of this fraction of it fails, if slots have not run out before."""
 
 LARGEST_HALF_TURN = 10.0
 """Tangent of half the largest rotation of a body in one (sub)step, 169 degrees: beyond lies the pole."""
@@ -285,7 +285,7 @@ def _trip(setting: Setting, unpack: Callable[[Array], State], carried: Carried) 
         ),
     )
     if probe is not None:
-        probe, wanting = probe.with_column(found.residual, equations, wanting)
+        probe, wanting = probe.with_column(it.y, found.residual, equations, wanting)
 
     def renewed(carry: tuple) -> tuple:
         _, it, _ = carry

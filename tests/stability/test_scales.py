@@ -154,9 +154,12 @@ def beads(ratio: float):
 @pytest.mark.parametrize("ratio", [1e-8, 1.0, 1e8])
 @SECOND_AND_FOURTH
 def test_point_masses(order, ratio):
-    """Three beads on strings with masses up to 1e8 apart; angular momentum about the vertical is kept."""
+    """Three beads on strings with masses up to 1e8 apart; angular momentum about the vertical is kept.
+
+    The light bead between heavy ones snaps at 1e4 rad/s when they pull it straight: substeps of 1/500 see it.
+    """
     system, state = beads(ratio)
-    found = account(system, simulate(system, state, order=order, dt=0.005, steps=200, extra_substeps=200))
+    found = account(system, simulate(system, state, order=order, dt=1e-3, steps=1000, extra_substeps=2000))
     assert found.exchanged()["kinetic"] >= 0.2
     assert found.energy_error <= tol.ENERGY
     assert found.spin_error(axes=[2]) <= tol.ANGULAR_MOMENTUM
