@@ -64,8 +64,9 @@ from natcoord_jax.effects.springs import (
 )
 from natcoord_jax.scene import Scene
 from natcoord_jax.stepping.assemble import assemble
+from natcoord_jax.stepping.one_step import linearise, step
 from natcoord_jax.stepping.scheme import EnergyMomentum
-from natcoord_jax.stepping.simulate import linearise, simulate, step
+from natcoord_jax.stepping.simulate import simulate
 
 if TYPE_CHECKING:
     from natcoord_jax.viz import animate, plot

@@ -4,18 +4,18 @@ import argparse
 import json
 import math
 import sys
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
 import jax
-import numpy as np
 
 import natcoord_jax as nc
 from natcoord_jax import gallery
 from natcoord_jax.core.results import Result
 from natcoord_jax.core.state import Trajectory
+from natcoord_jax.gallery.report import measure, table
+from natcoord_jax.stepping.error_control import Tolerance
 
 WHOLE = 1e-9
 """How far the number of steps may be from a whole number, relatively."""
@@ -44,6 +44,8 @@ def parser() -> Parser:
     run.add_argument("--steps", type=int, help="number of steps; alone, it keeps the scene's end time")
     run.add_argument("--dt", type=float, help="step [s]; alone, it must divide the scene's end time")
     run.add_argument("--order", type=int, default=2, metavar="P", help="order of the scheme, 2 to 10")
+    run.add_argument("--rtol", type=float, metavar="R", help="error tolerated in a substep, relative")
+    run.add_argument("--atol", type=float, metavar="A", help="the same in metres; by default as --rtol")
     costs = commands.add_parser("accuracy", help="show what accuracy costs in time, over steps and orders")
     costs.add_argument("scene", metavar="SCENE", help="a name that `natcoord-jax scenes` lists")
     costs.add_argument("--time", type=float, metavar="T", help="end time [s]; by default that of the scene")
@@ -77,136 +79,6 @@ def choose_steps(example: gallery.Example, steps: int | None, dt: float | None) 
             "pass another step, or --steps as well"
         )
     return round(ratio), dt
-
-
-def _timed(run: Any) -> tuple[Trajectory, float]:
-    start = time.perf_counter()
-    trajectory = jax.block_until_ready(run())
-    return trajectory, time.perf_counter() - start
-
-
-def _completed(trajectory: Trajectory) -> Trajectory:
-    """The part of a trajectory before the step that failed."""
-    steps = trajectory.t.shape[0] - 1
-    done = steps if Result(int(trajectory.result)).ok else min(int(trajectory.failed_step), steps)
-    states = jax.tree.map(lambda x: x[: done + 1], trajectory.states)
-    return nc.Trajectory(**(vars(trajectory) | {"states": states, "inputs": trajectory.inputs[:done]}))
-
-
-def _largest(values: Any) -> float | None:
-    return None if values is None else float(np.max(values))
-
-
-def _solved(
-    example: gallery.Example, steps: int, dt: float, scheme: nc.EnergyMomentum
-) -> tuple[nc.Solution | None, Any]:
-    """The solution of an optimal control problem, if the scene is one, and the inputs of the run."""
-    if example.problem is None:
-        return None, example.inputs(steps, dt, scheme)
-    solution = nc.optimise(example.problem(steps, dt))
-    return solution, solution.inputs
-
-
-def measure(
-    example: gallery.Example, steps: int, dt: float, scheme: nc.EnergyMomentum
-) -> tuple[dict[str, Any], Trajectory, nc.Solution | None]:
-    """Run a scene twice, the first time with compilation, and judge the run.
-
-    Args:
-        example: the scene.
-        steps: number of steps.
-        dt: step [s].
-        scheme: the scheme.
-
-    Returns:
-        The report, the trajectory, and the solution of an optimal control problem.
-    """
-    system = example.system
-    structure = system.structure
-    solution, inputs = _solved(example, steps, dt, scheme)
-    options = {"dt": dt, "inputs": inputs, "throw": False, "scheme": scheme}
-    _, first = _timed(lambda: nc.simulate(system, example.state, **options))
-    trajectory, wall = _timed(lambda: nc.simulate(system, example.state, **options))
-    valid = _completed(trajectory)
-    energy, errors = np.asarray(system.energy(valid).total), system.constraint_errors(valid)
-    balance = nc.balance(system, valid)
-    result = Result(int(trajectory.result))
-    report = {
-        "scene": example.name,
-        "steps": steps,
-        "dt": dt,
-        "order": scheme.order,
-        "t_end": steps * dt,
-        "dofs": structure.dofs,
-        "unknowns": structure.unknowns + structure.multipliers,
-        "constraints": structure.constraints,
-        "newton_iterations_mean": int(trajectory.iterations) / max(int(trajectory.steps_taken), 1),
-        "newton_iterations_max": int(trajectory.iterations_max),
-        "compile_s": first - wall,
-        "wall_s": wall,
-        "energy_initial": float(energy[0]),
-        "energy_final": float(energy[-1]),
-        "energy_error_max": _largest(balance.energy),
-        "momentum_error_max": _largest(balance.momentum),
-        "momentum_components": balance.directions,
-        "angular_momentum_error_max": _largest(balance.angular_momentum),
-        "angular_momentum_components": balance.axes,
-        "momentum_note": balance.note,
-        "constraint_error_max": _largest(errors.position),
-        "velocity_constraint_error_max": _largest(errors.velocity),
-        "steps_completed": valid.t.shape[0] - 1,
-        "result": "successful" if result == Result.SUCCESSFUL else system.explain(trajectory),
-    }
-    if solution is None:
-        return report, trajectory, None
-    report["cost"] = solution.cost
-    report["iterations"] = len(solution.history)
-    report["goal_error_max"] = max((abs(x) for x in solution.missing.values()), default=0.0)
-    if not solution.ok and result.ok:
-        report["result"] = solution.explain()
-    return report, trajectory, solution
-
-
-def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.3g}"
-
-
-def _table(report: dict[str, Any]) -> str:
-    """The report as aligned plain text."""
-    r = report
-    most = f"a step, at most {r['newton_iterations_max']}"
-    parts = f"largest error, relative, of {r['momentum_components']} components"
-    turns = f"largest error, relative, of {r['angular_momentum_components']} components"
-    lines = [
-        ("scene", r["scene"], ""),
-        ("steps", f"{r['steps']}", f"of {r['dt']:.6g} s, to t = {r['t_end']:.6g} s, order {r['order']}"),
-        ("degrees of freedom", f"{r['dofs']}", f"{r['unknowns']} unknowns, {r['constraints']} constraints"),
-        ("Newton iterations", _number(r["newton_iterations_mean"]), most),
-        ("wall time", f"{1e3 * r['wall_s']:.3g} ms", f"{1e6 * r['wall_s'] / r['steps']:.3g} µs a step"),
-        ("compile time", f"{r['compile_s']:.3g} s", ""),
-        ("energy", f"{r['energy_final']:.8g} J", f"from {r['energy_initial']:.8g} J"),
-        ("energy balance", _number(r["energy_error_max"]), "largest error, relative"),
-        ("momentum balance", _number(r["momentum_error_max"]), parts),
-        ("angular momentum balance", _number(r["angular_momentum_error_max"]), turns),
-        ("constraints", _number(r["constraint_error_max"]), "largest error [m, -]"),
-        ("constraint velocities", _number(r["velocity_constraint_error_max"]), "largest error [m/s, 1/s]"),
-        *_solution_lines(r),
-        ("result", r["result"], ""),
-    ]
-    width, middle = max(len(a) for a, _, _ in lines), max(len(b) for _, b, _ in lines[:-1])
-    text = [f"{a:<{width}}  {b:>{middle}}  {c}".rstrip() for a, b, c in lines[:-1]]
-    text.append(f"{lines[-1][0]:<{width}}  {lines[-1][1]}")
-    return "\n".join([*text, f"({r['momentum_note']})"] if r["momentum_note"] else text)
-
-
-def _solution_lines(report: dict[str, Any]) -> list[tuple[str, str, str]]:
-    """What a solved problem adds to the table."""
-    if "cost" not in report:
-        return []
-    return [
-        ("cost", f"{report['cost']:.8g}", f"optimal control, {report['iterations']} iterations"),
-        ("goal", _number(report["goal_error_max"]), "largest residual"),
-    ]
 
 
 def _json_ready(value: Any) -> Any:
@@ -279,8 +151,12 @@ def _run(arguments: argparse.Namespace) -> int:
     scheme = _scheme(arguments.order)
     example = _checked(arguments)
     steps, dt = choose_steps(example, arguments.steps, arguments.dt)
-    report, trajectory, solution = measure(example, steps, dt, scheme)
-    print(_table(report))
+    try:
+        tolerance = Tolerance.of(arguments.rtol, arguments.atol)
+    except ValueError as problem:
+        raise BadOptionError(str(problem)) from None
+    report, trajectory, solution = measure(example, steps, dt, scheme, tolerance)
+    print(table(report))
     if arguments.json is not None:
         ready = {key: _json_ready(value) for key, value in report.items()}
         arguments.json.write_text(json.dumps(ready, indent=2, ensure_ascii=False) + "\n", "utf-8")

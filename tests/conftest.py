@@ -19,6 +19,13 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_compilation_cache_dir", CACHE)
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
 
+MAPS = Path("/proc/self/maps")
+MOST_MAPS = 20_000
+"""Regions of memory of one process at which its compiled programs are given up; Linux ends it at 65 530.
+
+Every program takes a few hundred, and a process that runs out of them crashes in the compiler.
+"""
+
 # Shapes and types of every annotated function are checked from the first import on.
 _hook = install_import_hook("natcoord_jax", "beartype.beartype")
 
@@ -27,3 +34,10 @@ _hook = install_import_hook("natcoord_jax", "beartype.beartype")
 def _checked_types():
     yield
     _hook.uninstall()
+
+
+@pytest.fixture(autouse=True)
+def _room_for_programs():
+    yield
+    if MAPS.exists() and MAPS.read_bytes().count(b"\n") > MOST_MAPS:
+        jax.clear_caches()

@@ -55,6 +55,15 @@ def test_run_of_the_spacecraft(tmp_path, capsys):
     assert report["wall_s"] < report["compile_s"]
 
 
+def test_run_with_a_tolerance(tmp_path, capsys):
+    options = ["--dt", "0.5", "--steps", "2", "--rtol", "1e-4", "--json", "report.json"]
+    assert cli.main(["run", "double_pendulum", *options]) == 0
+    assert "attempts repeated in shorter ones" in capsys.readouterr().out
+    report = json.loads((tmp_path / "report.json").read_text("utf-8"))
+    assert report["substeps"] > 20 and report["steps"] == 2
+    assert report["energy_error_max"] <= 1e-11
+
+
 @pytest.mark.parametrize(
     ("options", "steps", "dt"),
     [
@@ -83,6 +92,8 @@ def test_steps_and_dt(options, steps, dt):
         ["run", "pendulum", "--json", "no_such_folder/report.json"],
         ["run", "pendulum", "--plot", "figure.xyz"],
         ["run", "pendulum", "--speed", "3"],
+        ["run", "pendulum", "--rtol", "-1e-3"],
+        ["run", "pendulum", "--atol", "1e-3"],
         ["run"],
         [],
     ],

@@ -13,7 +13,7 @@ from scenes import JOINTS, pair, with_multipliers
 import natcoord_jax as nc
 from natcoord_jax import gallery
 from natcoord_jax.maths.collocation import gauss, rotate_stages
-from natcoord_jax.stepping.rollout import Plan
+from natcoord_jax.stepping.plan import Plan
 
 ORDERS = (2, 4, 6, 8, 10)
 USUAL = {(4, "universal", "tree"), (6, "revolute", "multipliers")}

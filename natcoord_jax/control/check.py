@@ -10,12 +10,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.analysis import balance
-from natcoord_jax.control.compiled import quickly
 from natcoord_jax.control.iterate import Iterate
 from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.control.run import optimise
 from natcoord_jax.control.solution import Solution
 from natcoord_jax.control.transcription import entering, slices, stage
+from natcoord_jax.core.compiled import quickly
 
 
 @dataclasses.dataclass(frozen=True)

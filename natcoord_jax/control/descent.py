@@ -9,13 +9,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from natcoord_jax.control.compiled import quickly
 from natcoord_jax.control.guess import unknowns_of
 from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.control.results import Outcome
 from natcoord_jax.control.run import HEADER, numeric, printed
 from natcoord_jax.control.solution import Row, Solution
 from natcoord_jax.control.transcription import Unknowns, end, first_node, held_inputs, packed
+from natcoord_jax.core.compiled import quickly
 from natcoord_jax.stepping.simulate import simulate
 
 

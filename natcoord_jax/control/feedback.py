@@ -8,7 +8,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.system import System
-from natcoord_jax.control.compiled import quickly
 from natcoord_jax.control.guess import unknowns_of
 from natcoord_jax.control.iterate import Iterate, Options
 from natcoord_jax.control.problem import OptimalControl
@@ -16,6 +15,7 @@ from natcoord_jax.control.quadratic import model
 from natcoord_jax.control.run import numeric, optimise_jit
 from natcoord_jax.control.solution import Solution
 from natcoord_jax.control.transcription import held_inputs, packed
+from natcoord_jax.core.compiled import quickly
 from natcoord_jax.core.state import State, Trajectory
 from natcoord_jax.stepping.simulate import simulate
 

@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from natcoord_jax.control.compiled import quickly
 from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.control.tangent import steady_rates
 from natcoord_jax.control.transcription import Unknowns, end, roll
+from natcoord_jax.core.compiled import quickly
 
 ROUNDS = 12
 """Gauss-Newton corrections of the constant rates that lead to the goal."""

@@ -5,7 +5,6 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
-from natcoord_jax.control.compiled import quickly
 from natcoord_jax.control.costates import Multipliers, charts, costates, step_jacobians
 from natcoord_jax.control.iterate import Derivatives, Errors, Slacks, largest
 from natcoord_jax.control.problem import OptimalControl
@@ -18,6 +17,7 @@ from natcoord_jax.control.transcription import (
     slices,
     stage,
 )
+from natcoord_jax.core.compiled import quickly
 
 
 def nodes_before(path: Path) -> Node:

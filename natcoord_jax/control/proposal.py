@@ -6,7 +6,6 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
-from natcoord_jax.control.compiled import quickly
 from natcoord_jax.control.costates import Multipliers
 from natcoord_jax.control.iterate import Derivatives, Iterate, Model, Options, Slacks, largest
 from natcoord_jax.control.linearisation import nodes_before
@@ -23,6 +22,7 @@ from natcoord_jax.control.transcription import (
     slices,
     stage,
 )
+from natcoord_jax.core.compiled import quickly
 
 SHIFT = 1e-4
 """First increase of the curvature where the model is not convex."""

@@ -11,13 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from natcoord_jax.control import sequential
-from natcoord_jax.control.compiled import quickly
 from natcoord_jax.control.guess import Guess, scattered, unknowns_of
 from natcoord_jax.control.iterate import Iterate, Options
 from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.control.results import Outcome
 from natcoord_jax.control.solution import Row, Solution, solution_of, worst_condition
 from natcoord_jax.control.transcription import Unknowns
+from natcoord_jax.core.compiled import quickly
 
 METHODS = ("auto", "shooting", "lifted")
 HEADER = (

@@ -11,7 +11,6 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from natcoord_jax.control import sequential
-from natcoord_jax.control.compiled import quickly
 from natcoord_jax.control.costates import Multipliers, backward, scored_end, step_jacobians
 from natcoord_jax.control.iterate import Iterate, Options
 from natcoord_jax.control.linearisation import first_gradient
@@ -28,6 +27,7 @@ from natcoord_jax.control.transcription import (
     stage,
 )
 from natcoord_jax.core.checks import at_top_level
+from natcoord_jax.core.compiled import quickly
 
 CUT = 1e-12
 """Singular values of the conditions of optimality below this fraction of the largest are left out."""

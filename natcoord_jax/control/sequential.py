@@ -12,7 +12,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from natcoord_jax.control.compiled import quickly
 from natcoord_jax.control.costates import Multipliers
 from natcoord_jax.control.iterate import Derivatives, Errors, Iterate, Options, Slacks, largest
 from natcoord_jax.control.linearisation import cost_unit, linearised
@@ -25,6 +24,7 @@ from natcoord_jax.control.transcription import (
     roll,
     simulated,
 )
+from natcoord_jax.core.compiled import quickly
 
 ROOM = 0.01
 """Least room left to a bound at the start."""

@@ -22,7 +22,7 @@ from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import gauss
 from natcoord_jax.stepping.derivative import run_slots
 from natcoord_jax.stepping.newton import TOLERANCE
-from natcoord_jax.stepping.rollout import Plan
+from natcoord_jax.stepping.plan import Plan
 from natcoord_jax.stepping.step import advance
 
 

@@ -14,6 +14,7 @@ class Result(IntEnum):
     SINGULAR = 5
     MAX_SUBSTEPS = 6
     BAD_STEP = 7
+    TOLERANCE_NOT_MET = 8
 
     @property
     def ok(self) -> bool:
@@ -30,6 +31,7 @@ REASONS = {
     Result.SINGULAR: "the equations of motion are singular",
     Result.MAX_SUBSTEPS: "more substeps were needed than `extra_substeps` allows",
     Result.BAD_STEP: "the step dt is not a positive finite number [s]",
+    Result.TOLERANCE_NOT_MET: "no substep is short enough for the error that `rtol` and `atol` tolerate",
 }
 
 REMEDIES = {
@@ -39,6 +41,7 @@ REMEDIES = {
     Result.SINGULAR: "check for bodies without inertia along a free motion, and for conflicting drives",
     Result.MAX_SUBSTEPS: "use a smaller dt or allow more `extra_substeps`",
     Result.BAD_STEP: "pass dt > 0",
+    Result.TOLERANCE_NOT_MET: "use a larger `rtol` or `atol`; 1e-13 of the motion is round-off",
 }
 
 

@@ -39,6 +39,7 @@ class Trajectory(eqx.Module):
         failed_part: index of the body with the worst residual when a step failed; -1 if none did.
         residual: size of that residual, or the largest accepted one (relative).
         steps_taken: accepted (sub)steps.
+        steps_rejected: (sub)steps that were repeated in shorter ones.
         iterations: Newton iterations summed over all attempts.
         iterations_max: largest number in one attempt.
         scheme: that made it (static).
@@ -52,6 +53,7 @@ class Trajectory(eqx.Module):
     failed_part: Int[Array, "*batch"]
     residual: Float[Array, "*batch"]
     steps_taken: Int[Array, "*batch"]
+    steps_rejected: Int[Array, "*batch"]
     iterations: Int[Array, "*batch"]
     iterations_max: Int[Array, "*batch"]
     scheme: Any = eqx.field(static=True, default=None)

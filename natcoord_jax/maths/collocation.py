@@ -32,6 +32,11 @@ class Tableau:
     """Whether velocities are kept tangent to the constraints by isometric kicks along their normals."""
 
     @property
+    def order(self) -> int:
+        """Order of the method."""
+        return 2 * self.stages
+
+    @property
     def reflection(self) -> float:
         """-R(infinity), the sign with which a kick is taken back at the end of the step."""
         return 1.0 if self.stages % 2 else -1.0

@@ -24,11 +24,13 @@ from natcoord_jax.assembly.equations import prepare
 from natcoord_jax.assembly.system import System
 from natcoord_jax.core.state import State
 from natcoord_jax.stepping import linear_pair
+from natcoord_jax.stepping.error_control import Tolerance
 from natcoord_jax.stepping.newton import PATIENCE, Factors, any_lane, factors_of
 from natcoord_jax.stepping.one_kernel import as_one_kernel, in_groups
 from natcoord_jax.stepping.past import Past
+from natcoord_jax.stepping.plan import Plan, Slots
 from natcoord_jax.stepping.probe import BY_DIFFERENCES, jacobian_by_differences
-from natcoord_jax.stepping.rollout import Ending, Plan, Slots, run
+from natcoord_jax.stepping.rollout import Ending, run
 from natcoord_jax.stepping.step import advance, linear_solver
 
 CHUNK = 32
@@ -48,9 +50,16 @@ ROUNDS = 4
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def run_slots(plan: Plan, system: System, state: State, parameters: Any, dt: Array) -> tuple[Slots, Ending]:
+def run_slots(
+    plan: Plan,
+    system: System,
+    state: State,
+    parameters: Any,
+    dt: Array,
+    tolerance: Tolerance | None = None,
+) -> tuple[Slots, Ending]:
     """All slots of a rollout and where it ended; differentiable in every mode."""
-    return _traced_once(plan, system, state, parameters, dt)
+    return _traced_once(plan, system, state, parameters, dt, tolerance)
 
 
 @partial(jax.jit, static_argnums=0)
@@ -336,8 +345,8 @@ def _in_chunks(function: Callable, slots: tuple, length: int) -> Any:
 
 @partial(run_slots.defjvp, symbolic_zeros=True)
 def _run_slots_jvp(plan: Plan, primals: tuple, tangents: tuple):
-    system, state, parameters, dt = primals
-    system_dot, state_dot, parameters_dot, dt_dot = tangents
+    system, state, parameters, dt, _ = primals
+    system_dot, state_dot, parameters_dot, dt_dot, _ = tangents
     slots, ending = run_slots(plan, *primals)
     state_dot = _instantiated(state_dot, state)
     u = u_dot = None

@@ -11,15 +11,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from natcoord_jax.assembly.system import System
+from natcoord_jax.core.compiled import QUICK
 from natcoord_jax.core.state import State
 from natcoord_jax.stepping.newton import TOLERANCE
-from natcoord_jax.stepping.rollout import Plan, run_to_the_end
+from natcoord_jax.stepping.plan import Plan
+from natcoord_jax.stepping.rollout import run_to_the_end
 from natcoord_jax.stepping.scheme import EnergyMomentum
 
 MOST = 1 << 30
 """Steps that one program can make."""
-
-QUICK = {"xla_cpu_use_fusion_emitters": False}
 
 
 class Endpoint(eqx.Module):

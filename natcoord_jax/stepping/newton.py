@@ -48,6 +48,9 @@ CHORD_ITERATIONS = 14
 NEWTON_ROUNDS = 25
 """Factorisations in one step."""
 
+FEW_ROUNDS = 4
+"""The same where a shorter substep is an answer: at the right length, one or two do."""
+
 SLOWEST_UNSEEN = 0.02
 """Contraction assumed at least: a slow part of the error may hide behind fast ones in the first ratio."""
 
@@ -111,6 +114,7 @@ class Iterate(eqx.Module):
         count: corrections with these factors.
         total: all corrections.
         rounds: factorisations in this step.
+        most: factorisations that are allowed.
         last: whether the next evaluation is expected to be at the solution.
         converged: whether the step is solved.
         wanting: whether it cannot go on without new factors.
@@ -125,6 +129,7 @@ class Iterate(eqx.Module):
     count: Int[Array, ""]
     total: Int[Array, ""]
     rounds: Int[Array, ""]
+    most: Int[Array, ""]
     last: Bool[Array, ""]
     converged: Bool[Array, ""]
     wanting: Bool[Array, ""]
@@ -133,7 +138,7 @@ class Iterate(eqx.Module):
     @property
     def unsolved(self) -> Bool[Array, ""]:
         """Whether to go on."""
-        exhausted = self.wanting & (self.rounds >= NEWTON_ROUNDS)
+        exhausted = self.wanting & (self.rounds >= self.most)
         return ~self.converged & self.finite & ~exhausted
 
     @property
@@ -143,10 +148,11 @@ class Iterate(eqx.Module):
         return jnp.where(self.converged, int(Result.SUCCESSFUL), failed)
 
 
-def begin(y: Float[Array, " unknowns"]) -> Iterate:
-    """The iteration before its first evaluation."""
+def begin(y: Float[Array, " unknowns"], few: bool = False) -> Iterate:
+    """The iteration before its first evaluation, with few factorisations if a shorter step is an answer."""
+    most = jnp.array(FEW_ROUNDS if few else NEWTON_ROUNDS)
     zero, no, nought = jnp.zeros((), y.dtype), jnp.array(False), jnp.array(0)
-    return Iterate(y, y, nought, zero, zero, nought, nought, nought, no, no, no, jnp.array(True))
+    return Iterate(y, y, nought, zero, zero, nought, nought, nought, most, no, no, no, jnp.array(True))
 
 
 def no_factors(equations: Any, form: str) -> Factors:
@@ -231,6 +237,7 @@ def judge(
         it.count + 1,
         it.total + ~solved,
         it.rounds,
+        it.most,
         predicted <= tolerance * size,
         solved,
         slow & ~solved,

@@ -2,7 +2,7 @@
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 ORDER = 7
 """Largest order of the polynomials that guess the next solution. Orders above three save up to two of six
@@ -30,6 +30,11 @@ class Past(eqx.Module):
         """One solution."""
         rest = (jnp.zeros_like(y),) * ORDER
         return cls((y, *rest), jnp.array(1), jnp.array(0))
+
+    def beginning_with(self, y: Float[Array, " unknowns"], solved: Bool[Array, ""]) -> "Past":
+        """With the solution of an attempt that was made for comparison, if there is one."""
+        first, *rest = self.differences
+        return Past((jnp.where(solved, y, first), *rest), self.known, self.order)
 
     @property
     def guess(self) -> Float[Array, " unknowns"]:

@@ -103,12 +103,12 @@ def test_a_feedback_that_breaks():
 @SECOND_AND_FOURTH
 def test_newton_starved(order, monkeypatch):
     """With one factorisation and no patience the iteration cannot converge, and says so at the first step."""
-    from natcoord_jax.stepping import newton, rollout
+    from natcoord_jax.stepping import course, newton
 
     system, state = arms()
     monkeypatch.setattr(newton, "NEWTON_ROUNDS", 1)
     monkeypatch.setattr(newton, "CHORD_ITERATIONS", 1)
-    monkeypatch.setattr(rollout, "SMALLEST_FRACTION", 1.0)
+    monkeypatch.setattr(course, "SMALLEST_FRACTION", 1.0)
     jax.clear_caches()
     try:
         with pytest.raises(

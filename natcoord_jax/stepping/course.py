@@ -1,0 +1,212 @@
+"""Where a rollout stands, and what an attempt at a (sub)step makes of it."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from natcoord_jax.assembly.equations import prepare
+from natcoord_jax.assembly.system import System
+from natcoord_jax.core.results import Result
+from natcoord_jax.core.state import State
+from natcoord_jax.stepping.error_control import Tolerance, Trial, Verdict, follow
+from natcoord_jax.stepping.newton import Factors, Iterate, begin, no_factors
+from natcoord_jax.stepping.past import Past
+from natcoord_jax.stepping.plan import Plan
+
+SMALLEST_FRACTION = 1.0 / 4096
+"""A step is given up when a substep of this fraction of it fails, if slots have not run out before."""
+
+LARGEST_HALF_TURN = 10.0
+"""Tangent of half the largest rotation of a body in one (sub)step, 169 degrees: beyond lies the pole."""
+
+
+class Course(eqx.Module):
+    """Where a rollout stands: carried from slot to slot.
+
+    Attributes:
+        state: at the start of the attempt at hand.
+        it: its iteration.
+        past: solutions of earlier attempts.
+        step: steps completed.
+        done: part of the step at hand that is done.
+        fraction: part of it that is attempted.
+        code: result.
+        stopped: whether the run has ended before its time.
+        worst: unknown with the largest correction in the attempt that ended the run, -1 without one.
+        taken: accepted (sub)steps.
+        rejected: (sub)steps that were repeated in parts.
+        iterations: corrections in all attempts.
+        iterations_max: in one of them.
+        residual: largest accepted.
+        trial: where a substep with error control stands.
+    """
+
+    state: State
+    it: Iterate
+    past: Past
+    step: Int[Array, ""]
+    done: Float[Array, ""]
+    fraction: Float[Array, ""]
+    code: Int[Array, ""]
+    stopped: Bool[Array, ""]
+    worst: Int[Array, ""]
+    taken: Int[Array, ""]
+    rejected: Int[Array, ""]
+    iterations: Int[Array, ""]
+    iterations_max: Int[Array, ""]
+    residual: Float[Array, ""]
+    trial: Trial | None
+
+
+class Setting(eqx.Module):
+    """What stays the same over a rollout.
+
+    Attributes:
+        system: compiled system.
+        parameters: of the inputs.
+        dt: step [s].
+        tolerance: of the error of substeps; None: steps are made as they are given.
+        plan: what is static.
+        steps: number of steps.
+    """
+
+    system: System
+    parameters: Any
+    dt: Float[Array, ""]
+    tolerance: Tolerance | None
+    plan: Plan = eqx.field(static=True)
+    steps: Int[Array, ""] | int
+
+    def over(self, course: Course) -> Bool[Array, ""]:
+        """Whether the rollout has ended."""
+        over = course.stopped | (course.step >= self.steps)
+        if self.tolerance is None:
+            return over
+        return over | (course.taken >= self.plan.steps + self.plan.extra)
+
+    def situation(self, course: Course) -> tuple[Array, Array, Array]:
+        """Inputs, length and number of the (sub)step at hand."""
+        h = jnp.where(self.over(course), 1e-3, course.fraction * self.dt)
+        index = jnp.minimum(course.step, self.steps - 1)
+        u = self.plan.inputs(self.parameters, index, course.state, course.done, course.fraction)
+        return u, h, index
+
+    @property
+    def form(self) -> str:
+        """Form of the equations."""
+        return self.system.structure.solver
+
+
+def start_of(setting: Setting, state: State) -> tuple[Course, Factors]:
+    """The first attempt, and factors that are none."""
+    dt, plan = setting.dt, setting.plan
+    u = plan.inputs(setting.parameters, jnp.array(0), state, jnp.zeros(()), jnp.ones(()))
+    equations = prepare(setting.system, state, u, dt, plan.tableau)
+    few = setting.tolerance is not None
+    it, factors = begin(equations.guess(), few), no_factors(equations, setting.form)
+    zero, nought = jnp.array(0), jnp.zeros((), state.q.dtype)
+    bad = ~(jnp.isfinite(dt) & (dt > 0))
+    course = Course(
+        state=state,
+        it=it,
+        past=Past.of(it.y),
+        step=zero,
+        done=nought,
+        fraction=nought + 1.0,
+        code=jnp.where(bad, int(Result.BAD_STEP), int(Result.SUCCESSFUL)),
+        stopped=bad,
+        worst=zero - 1,
+        taken=zero,
+        rejected=zero,
+        iterations=zero,
+        iterations_max=zero,
+        residual=nought,
+        trial=None if setting.tolerance is None else Trial.first(state),
+    )
+    return course, factors
+
+
+def _halve(course: Course, after: State, solved: Array, over: Array) -> Verdict:
+    """Substeps without error control: a failed attempt is repeated with half its length."""
+    accepted = solved & ~over
+    state = jax.tree.map(lambda x, y: jnp.where(accepted, x, y), after, course.state)
+    done = course.done + jnp.where(accepted, course.fraction, 0.0)
+    halved = 0.5 * course.fraction
+    return Verdict(
+        trial=None,
+        state=state,
+        done=done,
+        fraction=jnp.where(accepted | over, course.fraction, halved),
+        change=jnp.where(accepted, 1, 0),
+        accepted=accepted,
+        failed=~solved & ~over,
+        hopeless=~solved & ~over & (halved < SMALLEST_FRACTION),
+    )
+
+
+def after_attempt(setting: Setting, course: Course, inertias: Array, found: tuple[State, Array]) -> Course:
+    """The end of an attempt: what is attempted next, and from where.
+
+    Args:
+        setting: of the rollout.
+        course: with the solved iteration.
+        inertias: of the unknowns.
+        found: state at the end of the attempt, and its largest half turn.
+    """
+    plan, it, over = setting.plan, course.it, setting.over(course)
+    new, half_turn = found
+    finite = jnp.all(jnp.isfinite(new.q)) & jnp.all(jnp.isfinite(new.v))
+    code = jnp.where((it.code == 0) & ~finite, int(Result.NONFINITE), it.code)
+    code = jnp.where((code == 0) & (half_turn > LARGEST_HALF_TURN), int(Result.DIVERGED), code)
+    solved = code == int(Result.SUCCESSFUL)
+    origin = course.state
+    if course.trial is None or setting.tolerance is None:
+        verdict = _halve(course, new, solved, over)
+    else:
+        origin = course.trial.origin
+        verdict = follow(setting.tolerance, course.trial, course.state, new, solved, over, plan.tableau)
+        code = jnp.where(solved, int(Result.TOLERANCE_NOT_MET), code)
+    complete = verdict.accepted & (verdict.done > 1.0 - 1e-9)
+    stopped = course.stopped | verdict.hopeless
+    result = jnp.where(verdict.hopeless, code, course.code)
+    if plan.event is not None:
+        before, after = plan.event(origin), plan.event(verdict.state)
+        crossed = verdict.accepted & (before * after <= 0) & (before != 0)
+        stopped, result = stopped | crossed, jnp.where(crossed, int(Result.EVENT), result)
+    done, fraction, trial = verdict.done, verdict.fraction, verdict.trial
+    done = jnp.where(complete, 0.0, done)
+    if trial is None:
+        fraction = jnp.where(complete, 1.0, fraction)
+    else:
+        trial = trial.beginning(done, complete)
+        fraction = jnp.where(complete, trial.length, fraction)
+    kept, worked = verdict.change > 0, jnp.where(over, 0, it.total)
+    # Guesses hold for steps of one length: another length begins anew from the last solution.
+    alone = Past(course.past.differences, jnp.ones_like(course.past.known), jnp.zeros_like(course.past.order))
+    if trial is not None:
+        alone = alone.beginning_with(it.y, solved)
+    followed = course.past.followed_by(it.y, inertias)
+    past = jax.tree.map(lambda x, y: jnp.where(kept, x, y), followed, alone)
+    same = fraction == course.fraction
+    past = Past(past.differences, jnp.where(same, past.known, 1), jnp.where(same, past.order, 0))
+    guess = jnp.where(jnp.all(jnp.isfinite(past.guess)), past.guess, it.start)
+    return Course(
+        state=verdict.state,
+        it=begin(guess, few=trial is not None),
+        past=past,
+        step=course.step + complete,
+        done=done,
+        fraction=fraction,
+        code=result,
+        stopped=stopped,
+        worst=jnp.where(verdict.hopeless, it.worst, course.worst),
+        taken=course.taken + verdict.change,
+        rejected=course.rejected + verdict.failed,
+        iterations=course.iterations + worked,
+        iterations_max=jnp.maximum(course.iterations_max, worked),
+        residual=jnp.where(kept, jnp.maximum(course.residual, it.error), course.residual),
+        trial=trial,
+    )

@@ -1,0 +1,113 @@
+"""A single step, and its derivatives."""
+
+import math
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from natcoord_jax.assembly.system import System
+from natcoord_jax.core.checks import is_concrete
+from natcoord_jax.core.results import REASONS, REMEDIES, Result, SimulationError
+from natcoord_jax.core.state import State
+from natcoord_jax.stepping.checked import check_state, checked_inputs, checked_step
+from natcoord_jax.stepping.derivative import run_slots
+from natcoord_jax.stepping.newton import TOLERANCE
+from natcoord_jax.stepping.plan import Plan
+from natcoord_jax.stepping.scheme import SECOND_ORDER, EnergyMomentum
+
+
+@eqx.filter_jit
+def _one_step(system, state, u, dt, tolerance, extra, tableau):
+    plan = Plan(1, extra, tolerance, None, None, tableau)
+    course = run_slots(plan, system, state, u[None], dt)[1].course
+    return course.state, course.code
+
+
+def step(
+    system: System,
+    state: State,
+    u: Any = None,
+    dt: Any = None,
+    *,
+    newton_tol: float = TOLERANCE,
+    scheme: EnergyMomentum = SECOND_ORDER,
+) -> State:
+    """One energy-momentum step (57), differentiable in everything.
+
+    Args:
+        system: compiled system.
+        state: state at the start.
+        u: inputs held over the step, shape (inputs,) [N, N m]; None: zero.
+        dt: step [s].
+        newton_tol: see `simulate`.
+        scheme: see `simulate`.
+
+    Returns:
+        State at the end; all NaN if the step failed (an eager call raises instead).
+
+    Raises:
+        ValueError: for a wrong dt or shape.
+        SimulationError: if the step fails in an eager call.
+
+    Example:
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import natcoord_jax as nc
+        >>> scene = nc.Scene()
+        >>> ball = scene.add(nc.RigidBody(mass=1.0, inertia=(1.0, 2.0, 3.0), velocity=(1.0, 0, 0)))
+        >>> system, state = scene.compile()
+        >>> float(nc.step(system, state, dt=0.5).q[0, 0])
+        0.5
+    """
+    check_state(system, state)
+    h = checked_step(dt)
+    inputs, _ = checked_inputs(system, None if u is None else jnp.asarray(u, float)[None], 1)
+    after, code = _one_step(system, state, inputs[0], h, newton_tol, 16, scheme.tableau)
+    if is_concrete(code):
+        result = Result(int(code))
+        if not result.ok:
+            raise SimulationError(f"step failed: {REASONS[result]}; {REMEDIES[result]}", result, after)
+        return after
+    return jax.tree.map(lambda x: jnp.where(code == 0, x, jnp.nan), after)
+
+
+def linearise(
+    system: System, state: State, u: Any = None, dt: Any = None
+) -> tuple[Float[Array, "n n"], Float[Array, "n inputs"]]:
+    """Derivatives of one step with respect to state and inputs.
+
+    Args:
+        system: compiled system.
+        state: state at the start.
+        u: inputs held over the step, shape (inputs,).
+        dt: step [s].
+
+    Returns:
+        A and B: A is a matrix over the flattened (q, v, coordinates) of the state, shape (n, n); B has shape
+        (n, inputs). Rows and columns are redundant coordinates; only tangent directions are meaningful.
+
+    Example:
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import natcoord_jax as nc
+        >>> scene = nc.Scene()
+        >>> ball = scene.add(nc.RigidBody(mass=1.0, inertia=(1.0, 2.0, 3.0)))
+        >>> system, state = scene.compile()
+        >>> A, B = nc.linearise(system, state, dt=0.5)
+        >>> A.shape, B.shape
+        ((24, 24), (24, 0))
+    """
+    inputs, _ = checked_inputs(system, None if u is None else jnp.asarray(u, float)[None], 1)
+    shapes = [x.shape for x in (state.q, state.v, state.coordinates)]
+    sizes = np.cumsum([math.prod(s) for s in shapes])[:-1]
+
+    def flat(x: Array, u: Array) -> Array:
+        parts = [p.reshape(s) for p, s in zip(jnp.split(x, sizes), shapes)]
+        moved = eqx.tree_at(lambda s: (s.q, s.v, s.coordinates), state, tuple(parts))
+        after = step(system, moved, u, dt)
+        return jnp.concatenate([after.q.reshape(-1), after.v.reshape(-1), after.coordinates])
+
+    x = jnp.concatenate([state.q.reshape(-1), state.v.reshape(-1), state.coordinates])
+    return jax.jacfwd(flat, argnums=(0, 1))(x, inputs[0])

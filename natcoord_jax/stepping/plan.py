@@ -1,0 +1,86 @@
+"""What is static about a rollout, and the record of its slots."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import reduce
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from natcoord_jax.core.state import State
+from natcoord_jax.maths.collocation import Tableau, gauss
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is static about a rollout.
+
+    Attributes:
+        steps: number of steps.
+        extra: slots available for retries.
+        tolerance: of Newton's iteration.
+        control: function (parameters, step index, t, state, fraction of the step) to inputs; None: they are
+            parameters[step].
+        event: function of the state whose change of sign ends the run, or None.
+        tableau: of the collocation method.
+        recorded: whether every slot is; else only the last is kept.
+    """
+
+    steps: int
+    extra: int
+    tolerance: float
+    control: Callable[[Any, Array, Array, State, Array], Array] | None
+    event: Callable[[State], Array] | None = None
+    tableau: Tableau = gauss(1)
+    recorded: bool = True
+
+    def inputs(
+        self, parameters: Any, step: Array, state: State, done: Array, fraction: Array
+    ) -> Float[Array, " inputs"] | Float[Array, "s inputs"]:
+        """Inputs of a (sub)step that starts at a state, after a part `done` of its step."""
+        if self.control is None:
+            return self.within_step(parameters[step], done, fraction)
+        return self.control(parameters, step, state.t, state, fraction)
+
+    def within_step(self, inputs: Array, done: Array, fraction: Array) -> Array:
+        """Inputs of a part of a step from those of the whole one: held, or interpolated from its stages."""
+        if inputs.ndim == 1:
+            return inputs
+        nodes = self.tableau.c
+        times = done + fraction * jnp.asarray(nodes)
+        columns = []
+        for j, node in enumerate(nodes):
+            others = [(times - other) / (node - other) for k, other in enumerate(nodes) if k != j]
+            columns.append(reduce(jnp.multiply, others, jnp.ones_like(times)))
+        weights = jnp.where(fraction == 1.0, jnp.eye(len(nodes)), jnp.stack(columns, axis=1))
+        return weights @ inputs
+
+
+class Slots(eqx.Module):
+    """Record of all slots.
+
+    Attributes:
+        states: state after each slot (unchanged if the attempt failed).
+        y: unknowns of each attempt.
+        step: step each slot belongs to.
+        fraction: its part of the step.
+        done: the part of the step before it.
+        accepted: whether the attempt succeeded.
+        finished: steps completed after the slot.
+    """
+
+    states: State
+    y: Float[Array, "*slots unknowns"]
+    step: Int[Array, "*slots"]
+    fraction: Float[Array, "*slots"]
+    done: Float[Array, "*slots"]
+    accepted: Bool[Array, "*slots"]
+    finished: Int[Array, "*slots"]
+
+    def accepted_first(self, most: int) -> tuple["Slots", Int[Array, ""]]:
+        """The accepted slots only, filled up to `most`, and how many they are."""
+        order = jnp.argsort(~self.accepted, stable=True)[:most]
+        return jax.tree.map(lambda x: x[order], self), jnp.sum(self.accepted)
