@@ -97,7 +97,7 @@ class TangentSpace(eqx.Module):
     admissible: Admissible
 
     @classmethod
-    def at(cls, system: System, state: State, known: Admissible | None = None) -> "TangentSpace":
+    def at(cls, system: System, state: State) -> "TangentSpace":
         """The tangent space of a state; its velocities play no part."""
         balances, inertias = Balances.at(system, state), rotor_inertias(system)
         gains = balances.columns()
@@ -106,9 +106,7 @@ class TangentSpace(eqx.Module):
         unit = jnp.eye(gains.rows.shape[0], dtype=state.q.dtype)
         lift = jnp.zeros((unit.shape[0], gains.constraints.shape[1]), unit.dtype)
         plain = Admissible(unit, None, lift, jnp.zeros(lift.shape[1], unit.dtype))
-        space = cls(balances, columns, impulses, inertias, plain if known is None else known)
-        if known is not None:
-            return space
+        space = cls(balances, columns, impulses, inertias, plain)
         plain = replace_fields(plain, frame=inverse_cholesky(space.pulled(impulses) + _idle(balances)))
         if gains.constraints.shape[1]:
             plain = _constrained(balances, plain.frame, gains.constraints.T)
@@ -206,8 +204,8 @@ class Kick(eqx.Module):
     """The kick of a step, and what is admitted at its ends."""
 
     kick: Velocity
-    before: Admissible
-    after: Admissible
+    before: TangentSpace
+    after: TangentSpace
 
 
 class Ends(eqx.Module):
@@ -262,7 +260,7 @@ def kick_of(
         sigma * (carried[0] - drift.rows) - state.v.reshape(-1, 4, 3),
         sigma * (carried[1] - drift.rotors) - state.rates,
     )
-    return Kick(_kick(before, after, d), before.admissible, after.admissible)
+    return Kick(_kick(before, after, d), before, after)
 
 
 def ends_of(
@@ -276,8 +274,7 @@ def ends_of(
 ) -> Ends:
     """The velocity at the end of a step: that of its stages, less the kick taken back."""
     beta, rates, turning = jnp.asarray(tableau.beta), at.rates[:, :-1], rotor_rates(system, groups, at, h)
-    before = TangentSpace.at(system, state, kick.before)
-    after = TangentSpace.at(system, _end_of(state, at, h, tableau), kick.after)
+    before, after = kick.before, kick.after
     v = Velocity(state.v.reshape(-1, 4, 3), state.rates)
     start = Velocity(v.rows + kick.kick.rows, v.rotors + kick.kick.rotors)
     last = Velocity(
