@@ -5,6 +5,8 @@ from typing import Any
 from jaxtyping import Array
 
 from natcoord_jax.assembly.full import FullStep
+from natcoord_jax.assembly.kick import TangentSpace
+from natcoord_jax.assembly.outset import Outset
 from natcoord_jax.assembly.recursive import RecursiveStep
 from natcoord_jax.assembly.reduced import ReducedStep
 from natcoord_jax.assembly.system import System
@@ -14,6 +16,13 @@ from natcoord_jax.maths.collocation import Tableau
 FORMS: dict[str, Any] = {"reduced": ReducedStep, "full": FullStep, "recursive": RecursiveStep}
 
 
-def prepare(system: System, state: State, u: Array, h: Array, tableau: Tableau) -> Any:
-    """The equations of one step, in the form chosen at compile."""
-    return FORMS[system.structure.solver].prepare(system, state, u, h, tableau)
+def prepare(
+    system: System, state: State, u: Array, h: Array, tableau: Tableau, outset: Outset | None = None
+) -> Any:
+    """The equations of one step, in the form chosen at compile; what is known of its start may be given."""
+    return FORMS[system.structure.solver].prepare(system, state, u, h, tableau, outset)
+
+
+def starting(system: System, state: State, tableau: Tableau, tangents: TangentSpace | None = None) -> Outset:
+    """What the equations of a step that starts from a state need of it."""
+    return FORMS[system.structure.solver].starting(system, state, tableau, tangents)

@@ -12,10 +12,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.diagnostics import rows_with_ground
-from natcoord_jax.assembly.kick import kicked
+from natcoord_jax.assembly.kick import TangentSpace, kicked
 from natcoord_jax.assembly.local import body_balance, body_motion, jacobians
 from natcoord_jax.assembly.momentum import momentum_balance
-from natcoord_jax.assembly.reduced import at_every_stage, at_rest, project_multipliers, project_rows
+from natcoord_jax.assembly.outset import Outset
+from natcoord_jax.assembly.reduced import NOTHING, at_every_stage, project_multipliers, project_rows
 from natcoord_jax.assembly.response import (
     Evaluation,
     Situation,
@@ -25,9 +26,8 @@ from natcoord_jax.assembly.response import (
     stations,
 )
 from natcoord_jax.assembly.system import Group, System
-from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
-from natcoord_jax.maths.collocation import Tableau
+from natcoord_jax.maths.collocation import Tableau, gauss
 from natcoord_jax.maths.projectors import range_projector
 from natcoord_jax.maths.vectors import cross
 
@@ -41,33 +41,47 @@ class FullStep(eqx.Module):
     velocity: Float[Array, "bodies 4 3"]
     situations: tuple[Situation, ...]
     h: Float[Array, ""]
-    projector: Float[Array, "m m"] | None
+    outset: Outset
     tableau: Tableau = eqx.field(static=True)
 
     @classmethod
-    def prepare(cls, system: System, state: State, u: Array, h: Array, tableau: Tableau) -> "FullStep":
-        """Gather what the step needs, once."""
+    def prepare(
+        cls,
+        system: System,
+        state: State,
+        u: Array,
+        h: Array,
+        tableau: Tableau,
+        outset: Outset | None = None,
+    ) -> "FullStep":
+        """Gather what the step needs, once; see `ReducedStep.prepare`."""
         groups = (*system.effects, *system.joints)
-        plain = cls(
+        return cls(
             system,
             state,
             rows_with_ground(state.q),
             body_rows(state.v),
             tuple(situation(system, g, state, u, h) for g in groups),
             h,
-            None,
+            cls.starting(system, state, tableau) if outset is None else outset,
             tableau,
         )
-        rank = system.structure.rank
-        if rank is None:
-            return plain
-        resting = at_rest(plain)
-        matrix = resting.jacobian(jnp.zeros(resting.unknowns, state.q.dtype))
-        rows = matrix[resting.balances :, : resting.balances]
-        in_tree = sum(g.count * g.multipliers for g in system.joints if g.in_tree)
-        projector = range_projector(rows, rank + in_tree)
-        projector = at_every_stage(projector, plain.groups, tableau.stages)
-        return replace_fields(plain, projector=projector)
+
+    @classmethod
+    def starting(
+        cls, system: System, state: State, tableau: Tableau, tangents: TangentSpace | None = None
+    ) -> Outset:
+        """What a step needs of its start."""
+        projector, rank = None, system.structure.rank
+        if rank is not None:
+            no_inputs = jnp.zeros(len(system.structure.inputs), state.q.dtype)
+            resting = cls.prepare(system, state, no_inputs, jnp.zeros((), state.q.dtype), gauss(1), NOTHING)
+            matrix = resting.jacobian(jnp.zeros(resting.unknowns, state.q.dtype))
+            rows = matrix[resting.balances :, : resting.balances]
+            in_tree = sum(g.count * g.multipliers for g in system.joints if g.in_tree)
+            projector = range_projector(rows, rank + in_tree)
+            projector = at_every_stage(projector, resting.groups, tableau.stages)
+        return Outset.of(system, state, tableau, projector, tangents)
 
     @property
     def groups(self) -> tuple[Group, ...]:
@@ -119,10 +133,17 @@ class FullStep(eqx.Module):
 
     def evaluate(self, y: Float[Array, " unknowns"]) -> Evaluation:
         """Residual, and what the end of the step needs."""
-        twists, multipliers = self.split(project_multipliers(y, self.balances, self.projector))
+        twists, multipliers = self.split(project_multipliers(y, self.balances, self.outset.projector))
         at = self._stations(twists)
         velocity, situations, kick = kicked(
-            self.system, self.state, self.groups, self.situations, at, self.h, self.tableau
+            self.system,
+            self.state,
+            self.outset.tangents,
+            self.groups,
+            self.situations,
+            at,
+            self.h,
+            self.tableau,
         )
         given = self.system, self.groups, situations, at, velocity
         found = momentum_balance(*given, multipliers, self.h, self.tableau)
@@ -130,7 +151,7 @@ class FullStep(eqx.Module):
         # A point mass keeps its directors by a unit inertia, as in `body_balance`.
         torque = found.torque + jnp.where(massless[:, None], at.spin[:, :-1], 0.0)
         wrenches = jnp.moveaxis(jnp.concatenate([found.force, torque], axis=-1), 0, 1)
-        rows = project_rows(found.rows, y, self.balances, self.projector)
+        rows = project_rows(found.rows, y, self.balances, self.outset.projector)
         residual = jnp.concatenate([wrenches.reshape(-1), rows])
         return Evaluation(residual, found.size, at, found.power, kick)
 
@@ -143,7 +164,7 @@ class FullStep(eqx.Module):
 
     def jacobian(self, y: Float[Array, " unknowns"]) -> Float[Array, "unknowns unknowns"]:
         """Exact Jacobian, assembled from local ones."""
-        twists, multipliers = self.split(project_multipliers(y, self.balances, self.projector))
+        twists, multipliers = self.split(project_multipliers(y, self.balances, self.outset.projector))
         s, bodies, size = self.tableau.stages, self.bodies, self.unknowns
         width = 6 * s
         own = self.body_jacobians(twists)
@@ -174,13 +195,13 @@ class FullStep(eqx.Module):
 
     def _projected(self, matrix: Array) -> Array:
         """Columns of multipliers and rows of constraints in the range of the constraints."""
-        if self.projector is None:
+        if self.outset.projector is None:
             return matrix
         first = self.balances
         count = matrix.shape[0] - first
-        idle = (jnp.eye(count, dtype=matrix.dtype) - self.projector) / (1.0 + count)
-        matrix = matrix.at[:first, first:].set(matrix[:first, first:] @ self.projector)
-        matrix = matrix.at[first:, :first].set(self.projector @ matrix[first:, :first])
+        idle = (jnp.eye(count, dtype=matrix.dtype) - self.outset.projector) / (1.0 + count)
+        matrix = matrix.at[:first, first:].set(matrix[:first, first:] @ self.outset.projector)
+        matrix = matrix.at[first:, :first].set(self.outset.projector @ matrix[first:, :first])
         return matrix.at[first:, first:].set(idle)
 
     def inertias(self, matrix: Float[Array, "unknowns unknowns"]) -> Float[Array, " balances"]:

@@ -112,6 +112,14 @@ class TangentSpace(eqx.Module):
             plain = _constrained(balances, plain.frame, gains.constraints.T)
         return replace_fields(space, admissible=plain)
 
+    def without_system(self) -> "TangentSpace":
+        """What belongs to the configuration alone; `with_system` puts the rest back."""
+        return eqx.tree_at(lambda space: space.balances.system, self, None)
+
+    def with_system(self, system: System) -> "TangentSpace":
+        """Ready for use."""
+        return eqx.tree_at(lambda space: space.balances.system, self, system, is_leaf=lambda x: x is None)
+
     def framed(self, v: Velocity) -> Float[Array, " u"]:
         """Components of a velocity along the frame, X P^T M v."""
         return self.admissible.frame @ self.pulled(self.impulse(v))
@@ -239,20 +247,26 @@ def rotor_rates(system: System, groups: Sequence[Group], at: Stations, h: Array)
 
 
 def kick_of(
-    system: System, state: State, groups: Sequence[Group], at: Stations, h: Array, tableau: Tableau
+    system: System,
+    state: State,
+    before: TangentSpace,
+    groups: Sequence[Group],
+    at: Stations,
+    h: Array,
+    tableau: Tableau,
 ) -> Kick:
     """The kick that belongs to given stages.
 
     Args:
         system: compiled system.
         state: at the start of the step.
+        before: tangent space there.
         groups: that act.
         at: stage motion.
         h: step [s].
         tableau: the collocation method.
     """
     beta, sigma = jnp.asarray(tableau.beta), tableau.reflection
-    before = TangentSpace.at(system, state)
     after = TangentSpace.at(system, _end_of(state, at, h, tableau))
     drift = after.spread(after.drift)
     carried = jnp.tensordot(beta, at.rates[:, :-1], 1), beta @ rotor_rates(system, groups, at, h)
@@ -325,6 +339,7 @@ def _direct_rotation(start: Float[Array, "u u"], end: Float[Array, "u u"]) -> Fl
 def kicked(
     system: System,
     state: State,
+    tangents: TangentSpace | None,
     groups: Sequence[Group],
     situations: Sequence[Situation],
     at: Stations,
@@ -333,9 +348,9 @@ def kicked(
 ) -> tuple[Array, Sequence[Situation], Kick | None]:
     """What the stages begin with: velocities of rows, situations with rates of rotors; and the kick."""
     velocity = state.v.reshape(-1, 4, 3)
-    if not tableau.kick:
+    if tangents is None:
         return velocity, situations, None
-    found = kick_of(system, state, groups, at, h, tableau)
+    found = kick_of(system, state, tangents.with_system(system), groups, at, h, tableau)
     rotors = state.rates + found.kick.rotors
     moved = [
         replace_fields(where, rates=rotors[group.rotors]) if group.effect.rotors else where

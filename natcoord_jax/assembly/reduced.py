@@ -19,6 +19,7 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.kick import TangentSpace, kicked
 from natcoord_jax.assembly.momentum import momentum_balance
+from natcoord_jax.assembly.outset import Outset
 from natcoord_jax.assembly.response import (
     Evaluation,
     Situation,
@@ -39,6 +40,9 @@ from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import Tableau, gauss
 from natcoord_jax.maths.projectors import range_projector
+
+NOTHING = Outset(None, None)
+"""Of the start of a step that is used for its constraints alone."""
 
 PROBE = 1e-6
 """Change of a rotation [rad] that gives a column of the Jacobian."""
@@ -98,7 +102,7 @@ def at_rest(step: Any) -> Any:
         step,
         h=jnp.zeros_like(step.h),
         situations=tuple(situations),
-        projector=None,
+        outset=NOTHING,
         tableau=gauss(1),
     )
 
@@ -113,29 +117,53 @@ class ReducedStep(eqx.Module):
     frames: Float[Array, "bodies 2 4 4"]
     situations: tuple[Situation, ...]
     h: Float[Array, ""]
-    projector: Float[Array, "m m"] | None
+    outset: Outset
     tableau: Tableau = eqx.field(static=True)
 
     @classmethod
-    def prepare(cls, system: System, state: State, u: Array, h: Array, tableau: Tableau) -> "ReducedStep":
-        """Gather what the step needs, once."""
-        start = body_rows(state.q)
-        plain = cls(
+    def prepare(
+        cls,
+        system: System,
+        state: State,
+        u: Array,
+        h: Array,
+        tableau: Tableau,
+        outset: Outset | None = None,
+    ) -> "ReducedStep":
+        """Gather what the step needs, once.
+
+        Args:
+            system: compiled system.
+            state: at the start.
+            u: inputs.
+            h: step [s].
+            tableau: the collocation method.
+            outset: what is known of the start, see `starting`; None: found here.
+        """
+        return cls(
             system,
             state,
-            start,
+            body_rows(state.q),
             body_rows(state.v),
             system.tree.frames(system.frames),
             tuple(situation(system, g, state, u, h) for g in active_groups(system)),
             h,
-            None,
+            cls.starting(system, state, tableau) if outset is None else outset,
             tableau,
         )
-        if system.structure.rank is None:
-            return plain
-        projector = range_projector(plain.constraint_matrix(), system.structure.rank)
-        projector = at_every_stage(projector, plain.groups, tableau.stages)
-        return replace_fields(plain, projector=projector)
+
+    @classmethod
+    def starting(
+        cls, system: System, state: State, tableau: Tableau, tangents: TangentSpace | None = None
+    ) -> Outset:
+        """What a step needs of its start."""
+        projector = None
+        if system.structure.rank is not None:
+            no_inputs = jnp.zeros(len(system.structure.inputs), state.q.dtype)
+            plain = cls.prepare(system, state, no_inputs, jnp.zeros((), state.q.dtype), gauss(1), NOTHING)
+            projector = range_projector(plain.constraint_matrix(), system.structure.rank)
+            projector = at_every_stage(projector, plain.groups, tableau.stages)
+        return Outset.of(system, state, tableau, projector, tangents)
 
     def constraint_matrix(self) -> Float[Array, "m unknowns"]:
         """Rates of all constraints per rate of the free motions, at the start of the step."""
@@ -196,16 +224,23 @@ class ReducedStep(eqx.Module):
     def evaluate(self, y: Float[Array, " unknowns"]) -> Evaluation:
         """Residual, and what the end of the step needs."""
         system = self.system
-        w, multipliers = self.split(project_multipliers(y, self.balances, self.projector))
+        w, multipliers = self.split(project_multipliers(y, self.balances, self.outset.projector))
         motion, geometry = self.motion(w)
         at = self.stations(motion)
         velocity, situations, kick = kicked(
-            self.system, self.state, self.groups, self.situations, at, self.h, self.tableau
+            self.system,
+            self.state,
+            self.outset.tangents,
+            self.groups,
+            self.situations,
+            at,
+            self.h,
+            self.tableau,
         )
         given = system, self.groups, situations, at, velocity
         found = momentum_balance(*given, multipliers, self.h, self.tableau)
         generalised = self.generalised(geometry, found.force, found.torque)
-        rows = project_rows(found.rows, y, self.balances, self.projector)
+        rows = project_rows(found.rows, y, self.balances, self.outset.projector)
         residual = jnp.concatenate([generalised.reshape(-1), rows])
         return Evaluation(residual, found.size, at, found.power, kick)
 
@@ -253,9 +288,9 @@ class ReducedStep(eqx.Module):
         prescribed, or that loops forbid, is missing.
         """
         found = jnp.abs(jnp.diagonal(matrix))[: self.balances]
-        if not self.tableau.kick:
+        if self.outset.tangents is None:
             return found
-        tangents = TangentSpace.at(self.system, self.state)
+        tangents = self.outset.tangents.with_system(self.system)
         own = jnp.diagonal(tangents.pulled(tangents.impulses))
         stages = jnp.diagonal(jnp.asarray(self.tableau.a_inverse, matrix.dtype))
         return jnp.maximum(found, (stages[:, None] * own).reshape(-1))

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from natcoord_jax.assembly.equations import prepare
+from natcoord_jax.assembly.outset import Outset
 from natcoord_jax.assembly.system import System
 from natcoord_jax.core.results import Result
 from natcoord_jax.core.state import State
@@ -100,8 +101,8 @@ class Setting(eqx.Module):
         return self.system.structure.solver
 
 
-def start_of(setting: Setting, state: State) -> tuple[Course, Factors]:
-    """The first attempt, and factors that are none."""
+def start_of(setting: Setting, state: State) -> tuple[Course, Factors, Outset]:
+    """The first attempt, factors that are none, and what is known of the first state."""
     dt, plan = setting.dt, setting.plan
     u = plan.inputs(setting.parameters, jnp.array(0), state, jnp.zeros(()), jnp.ones(()))
     equations = prepare(setting.system, state, u, dt, plan.tableau)
@@ -126,7 +127,7 @@ def start_of(setting: Setting, state: State) -> tuple[Course, Factors]:
         residual=nought,
         trial=None if setting.tolerance is None else Trial.first(state),
     )
-    return course, factors
+    return course, factors, equations.outset
 
 
 def _halve(course: Course, after: State, solved: Array, over: Array) -> Verdict:

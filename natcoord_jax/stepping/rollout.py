@@ -17,7 +17,9 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
-from natcoord_jax.assembly.equations import prepare
+from natcoord_jax.assembly.equations import prepare, starting
+from natcoord_jax.assembly.kick import Kick
+from natcoord_jax.assembly.outset import Outset
 from natcoord_jax.assembly.system import System
 from natcoord_jax.core.results import Result
 from natcoord_jax.core.state import State
@@ -41,6 +43,7 @@ class Carried(eqx.Module):
         count: complete slots.
         course: where the rollout stands, its state left out.
         state: the state in one array: fewer operations than one for every field.
+        outset: what the equations need of that state.
         factors: of a Jacobian.
         probe: the Jacobian in the making.
         record: fields of `Slots`, for every slot; the states in one array.
@@ -49,6 +52,7 @@ class Carried(eqx.Module):
     count: Int[Array, ""]
     course: Course
     state: Float[Array, " numbers"]
+    outset: Outset
     factors: Factors
     probe: Probe | None
     record: tuple[Array, ...]
@@ -60,7 +64,7 @@ def _trip(setting: Setting, unpack: Callable[[Array], State], carried: Carried) 
     course = _with_state(carried.course, unpack(carried.state))
     it, over = course.it, setting.over(course)
     u, h, index = setting.situation(course)
-    equations = prepare(setting.system, course.state, u, h, plan.tableau)
+    equations = prepare(setting.system, course.state, u, h, plan.tableau, carried.outset)
     found = equations.evaluate(it.y if probe is None else probe.moved(it.y, equations))
     probing = jnp.array(False) if probe is None else probe.at >= 0
     driven = any(group.multipliers and group.effect.works for group in equations.groups)
@@ -72,7 +76,7 @@ def _trip(setting: Setting, unpack: Callable[[Array], State], carried: Carried) 
     wanting = ~probing & ~ending & any_lane(it.wanting & it.unsolved & ~over)
 
     def ended(carry: tuple) -> tuple:
-        _, before, x, record = carry
+        _, before, x, _, record = carry
         before = _with_state(before, unpack(x))
         groups, tableau = equations.groups, plan.tableau
         ends = end_of_step(setting.system, before.state, h, groups, found, tableau)
@@ -83,11 +87,18 @@ def _trip(setting: Setting, unpack: Callable[[Array], State], carried: Carried) 
         if after.trial is not None:
             record = _taken_back(record, carried.count - 1, after.trial.undone, x)
         record = tuple(with_row(b, carried.count, r) for b, r in zip(record, slot))
-        return jnp.array(False), _with_state(after, None), x, record
+        outset = _outset_after(setting, after, accepted, carried.outset, found.kick)
+        return jnp.array(False), _with_state(after, None), x, outset, record
 
     # Loops of no or one trip leave what they carry where it is; a conditional would copy it.
-    start = ending, eqx.tree_at(lambda c: c.it, carried.course, it), carried.state, carried.record
-    _, after, x, record = jax.lax.while_loop(lambda carry: carry[0], ended, start)
+    start = (
+        ending,
+        eqx.tree_at(lambda c: c.it, carried.course, it),
+        carried.state,
+        carried.outset,
+        carried.record,
+    )
+    _, after, x, outset, record = jax.lax.while_loop(lambda carry: carry[0], ended, start)
     # An attempt for comparison leaves the run where it is, and factors that serve.
     solved = after.taken > course.taken if setting.tolerance is None else it.converged
     kept = factors.after_step(it.total, solved | over, 2 * cost)
@@ -113,7 +124,19 @@ def _trip(setting: Setting, unpack: Callable[[Array], State], carried: Carried) 
 
     _, it, factors = jax.lax.while_loop(lambda carry: carry[0], renewed, (wanting, after.it, factors))
     after = eqx.tree_at(lambda c: c.it, after, it)
-    return Carried(carried.count + ending, after, x, factors, probe, record)
+    return Carried(carried.count + ending, after, x, outset, factors, probe, record)
+
+
+def _outset_after(
+    setting: Setting, after: Course, accepted: Array, known: Outset, kick: Kick | None
+) -> Outset:
+    """What is known of the state that the next attempt starts from."""
+    tangents = None
+    if kick is not None and known.tangents is not None and setting.tolerance is None:
+        # The end of this step is the start of the next one. (With error control it may be neither.)
+        reached = kick.after.without_system()
+        tangents = jax.tree.map(lambda x, y: jnp.where(accepted, x, y), reached, known.tangents)
+    return starting(setting.system, after.state, setting.plan.tableau, tangents)
 
 
 def _taken_back(record: tuple, index: Array, undone: Array, x: Array) -> tuple:
@@ -199,7 +222,7 @@ def _run(setting: Setting, state: State) -> tuple[Carried, Callable[[Array], Sta
         course = carried.course
         return (carried.count < length) & any_lane(~setting.over(course))
 
-    def every_slot(course: Course, factors: Factors, x: Array) -> Carried:
+    def every_slot(course: Course, factors: Factors, outset: Outset, x: Array) -> Carried:
         it = course.it
         probe = Probe.first(it.y.shape[0], x.dtype) if setting.form in BY_DIFFERENCES else None
         slot = x, it.y, course.step, course.fraction, course.done, course.stopped, course.step
@@ -208,11 +231,11 @@ def _run(setting: Setting, state: State) -> tuple[Carried, Callable[[Array], Sta
         record = tuple(jnp.zeros((rows, *x.shape), x.dtype) for x in slot)
         if plan.tableau.stages > 1 and setting.form in BY_DIFFERENCES:
             u, h, _ = setting.situation(_with_state(course, unpack(x)))
-            equations = prepare(setting.system, unpack(x), u, h, plan.tableau)
+            equations = prepare(setting.system, unpack(x), u, h, plan.tableau, outset)
             factors = factors_of(equations, setting.form, equations.inertial_jacobian())
             factors = eqx.tree_at(lambda f: f.fresh, factors, jnp.array(False))
-        start = Carried(jnp.array(0), course, x, factors, probe, record)
+        start = Carried(jnp.array(0), course, x, outset, factors, probe, record)
         return jax.lax.while_loop(unfinished, partial(_trip, setting, unpack), start)
 
-    course, factors = start_of(setting, state)
-    return as_one_kernel(every_slot, _with_state(course, None), factors, packed), unpack
+    course, factors, outset = start_of(setting, state)
+    return as_one_kernel(every_slot, _with_state(course, None), factors, outset, packed), unpack

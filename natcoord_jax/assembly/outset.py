@@ -1,0 +1,38 @@
+"""What the equations of a step need of the state it starts from, whatever its length and inputs."""
+
+import equinox as eqx
+from jaxtyping import Array, Float
+
+from natcoord_jax.assembly.kick import TangentSpace
+from natcoord_jax.assembly.system import System
+from natcoord_jax.core.state import State
+from natcoord_jax.maths.collocation import Tableau
+
+
+class Outset(eqx.Module):
+    """Found once a step, and carried along while its equations are solved.
+
+    Attributes:
+        projector: on the range of the constraints, for the multipliers of all stages; None: they are
+            independent.
+        tangents: tangent space, without the system; None for schemes without kicks.
+    """
+
+    projector: Float[Array, "m m"] | None
+    tangents: TangentSpace | None
+
+    @classmethod
+    def of(
+        cls,
+        system: System,
+        state: State,
+        tableau: Tableau,
+        projector: Array | None,
+        tangents: TangentSpace | None = None,
+    ) -> "Outset":
+        """With the tangent space of a state, unless it is known from the end of the last step."""
+        if not tableau.kick:
+            return cls(projector, None)
+        if tangents is None:
+            tangents = TangentSpace.at(system, state).without_system()
+        return cls(projector, tangents)
