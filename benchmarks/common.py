@@ -55,6 +55,19 @@ def parser(description: str, figure: str) -> argparse.ArgumentParser:
     return options
 
 
+def peer_parser(description: str, figure: str) -> argparse.ArgumentParser:
+    """The same with those of benchmarks that run other codes, too."""
+    options = parser(description, figure)
+    options.add_argument(
+        "--peers-python",
+        default=sys.executable,
+        metavar="PATH",
+        help="interpreter that has the peers; default this one, with the extra [benchmarks]",
+    )
+    options.add_argument("--no-peers", action="store_true", help="natcoord_jax alone")
+    return options
+
+
 def seconds(call: Callable[[], object]) -> float:
     """Wall time of one call [s]."""
     start = time.perf_counter()
@@ -99,6 +112,17 @@ def show_targets(targets: Sequence[dict[str, Any]]) -> str:
         measured = "-" if t["measured"] is None else f"{t['measured']:.3g}"
         rows.append((t["name"], f"{t['target']:.3g} {t['unit']}".strip(), measured, words[t["reached"]]))
     return aligned(rows)
+
+
+def columns(runs: Sequence[dict[str, Any]], heads: dict[str, tuple[str, str]]) -> str:
+    """Runs as plain text, one a line.
+
+    Args:
+        runs: with the keys of `heads`.
+        heads: by key the head of its column and the format of its values.
+    """
+    rows = [[format(run[key], form) for key, (_, form) in heads.items()] for run in runs]
+    return aligned([[head for head, _ in heads.values()], *rows])
 
 
 def aligned(rows: Sequence[Sequence[str]]) -> str:

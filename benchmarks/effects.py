@@ -108,22 +108,16 @@ def measure(name: str, system: nc.System, state: nc.State, steps: int, repeats: 
     }
 
 
-def table(runs: list[dict[str, Any]]) -> str:
-    """All scenes as plain text."""
-    rows = [("scene", "µs/step", "over base", "unknowns", "multipliers", "Newton", "program", "compile s")]
-    for r in runs:
-        sizes = f"{r['unknowns']}", f"{r['multipliers']}", f"{r['newton_iterations_mean']:.1f}"
-        rows.append(
-            (
-                r["effect"],
-                f"{r['us_per_step']:.2f}",
-                f"{r['over_base']:.2f}",
-                *sizes,
-                f"{r['program']}",
-                f"{r['compile_s']:.1f}",
-            )
-        )
-    return common.aligned(rows)
+COLUMNS = {
+    "effect": ("scene", ""),
+    "us_per_step": ("µs/step", ".2f"),
+    "over_base": ("over base", ".2f"),
+    "unknowns": ("unknowns", "d"),
+    "multipliers": ("multipliers", "d"),
+    "newton_iterations_mean": ("Newton", ".1f"),
+    "program": ("program", "d"),
+    "compile_s": ("compile s", ".1f"),
+}
 
 
 def draw(results: dict[str, Any]) -> Any:
@@ -161,7 +155,7 @@ def main() -> None:
         runs.append(measure(name, system, state, steps, repeats))
         runs[-1]["over_base"] = runs[-1]["us_per_step"] / runs[0]["us_per_step"]
     results["runs"] = runs
-    print(f"{common.environment_line(results)}\n{table(runs)}")
+    print(f"{common.environment_line(results)}\n{common.columns(runs, COLUMNS)}")
     common.write(results, draw, common.folder(chosen))
 
 

@@ -73,24 +73,17 @@ def targets(runs: list[dict[str, Any]], exponents: dict[str, float | None]) -> l
     return lines
 
 
-def table(runs: list[dict[str, Any]]) -> str:
-    """All runs as plain text."""
-    head = ("scene", "bodies", "solver", "µs/step", "µs/step/body", "Newton", "compile s", "energy", "result")
-    rows = [
-        (
-            r["scene"],
-            f"{r['bodies']}",
-            r["solver"],
-            f"{r['us_per_step']:.1f}",
-            f"{r['us_per_step_and_body']:.2f}",
-            f"{r['newton_iterations_mean']:.1f}",
-            f"{r['compile_s']:.2f}",
-            f"{r['energy_balance']:.0e}",
-            r["result"],
-        )
-        for r in runs
-    ]
-    return common.aligned([head, *rows])
+COLUMNS = {
+    "scene": ("scene", ""),
+    "bodies": ("bodies", "d"),
+    "solver": ("solver", ""),
+    "us_per_step": ("µs/step", ".1f"),
+    "us_per_step_and_body": ("µs/step/body", ".2f"),
+    "newton_iterations_mean": ("Newton", ".1f"),
+    "compile_s": ("compile s", ".2f"),
+    "energy_balance": ("energy", ".0e"),
+    "result": ("result", ""),
+}
 
 
 def draw(results: dict[str, Any]) -> Any:
@@ -139,7 +132,7 @@ def main() -> None:
             print(f"{scene} {bodies}: {runs[-1]['us_per_step']:.1f} µs a step", flush=True)
     exponents = {scene: exponent(runs, scene) for scene in SCENES}
     results |= {"runs": runs, "exponents": exponents, "targets": targets(runs, exponents)}
-    print(f"\n{common.environment_line(results)}\n\n{table(runs)}\n")
+    print(f"\n{common.environment_line(results)}\n\n{common.columns(runs, COLUMNS)}\n")
     print(common.show_targets(results["targets"]))
     common.write(results, draw, common.folder(options))
 

@@ -20,11 +20,10 @@ constraints. Its energy and J are those of its rows and their velocities, which 
 velocities obey the constraints to second order only, see `velocity_constraint_error`.
 """
 
-import argparse
 import json
 import math
 import subprocess
-import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -228,8 +227,24 @@ def available(peers: tuple[Peer, ...], python: str) -> tuple[Peer, ...]:
     return tuple(peer for peer in peers if peer.needs not in missing)
 
 
-def peer_run(peer: Peer, python: str, model: str, steps: int, plan: Plan) -> dict[str, Any] | None:
-    """Times and errors of a peer in a process of its own; None, with a line, if it fails."""
+def peer_run(
+    peer: Peer,
+    python: str,
+    model: str,
+    steps: int,
+    plan: Plan,
+    judge: Callable[[dict[str, Any]], dict[str, float | None]] | None = None,
+) -> dict[str, Any] | None:
+    """Times and errors of a peer in a process of its own; None, with a line, if it fails.
+
+    Args:
+        peer: the code.
+        python: its interpreter.
+        model: name of the model.
+        steps: number of steps.
+        plan: sizes of the run.
+        judge: function of the final state to errors; None: `errors`.
+    """
     settings = peer.settings | {"repeats": plan.repeats}
     if peer.needs == "mujoco.mjx":
         extra = steps == COMPARED[0] and peer.settings["integrator"] == "Euler"
@@ -247,7 +262,7 @@ def peer_run(peer: Peer, python: str, model: str, steps: int, plan: Plan) -> dic
     kept = ("steps", "h", "settings", "us_per_step", "us_per_step_range", "repeats", "version")
     optional = ("compile_s", "batch", "value_and_gradient")
     found = {key: answer[key] for key in kept} | {key: answer[key] for key in optional if key in answer}
-    return {"code": peer.name} | found | errors(model, answer)
+    return {"code": peer.name} | found | (errors(model, answer) if judge is None else judge(answer))
 
 
 def measure(model: str, plan: Plan, peers: tuple[Peer, ...], python: str) -> dict[str, Any]:
@@ -398,22 +413,9 @@ def draw(results: dict[str, Any]) -> Any:
     return figure
 
 
-def options() -> argparse.Namespace:
-    """Options of the command line."""
-    parser = common.parser("Error against time beside other codes.", "the figure")
-    parser.add_argument(
-        "--peers-python",
-        default=sys.executable,
-        metavar="PATH",
-        help="interpreter that has the peers; default this one, with the extra [benchmarks]",
-    )
-    parser.add_argument("--no-peers", action="store_true", help="natcoord_jax alone")
-    return parser.parse_args()
-
-
 def main() -> None:
     """Run the benchmark."""
-    chosen = options()
+    chosen = common.peer_parser("Error against time beside other codes.", "the figure").parse_args()
     if chosen.redraw:
         common.redraw(chosen.redraw, draw)
         return

@@ -18,7 +18,7 @@ from importlib.metadata import version
 
 import numpy as np
 
-from benchmarks.peers.measure import MODELS, command_line, final_state, per_step, times_per_call
+from benchmarks.peers.measure import MODELS, command_line, final_state, per_step, times_per_call, turning
 
 sys.exudynFast = True  # the documented switch to the module without range checks; it prints a line
 with contextlib.redirect_stdout(io.StringIO()):
@@ -85,6 +85,8 @@ def _build_redundant(model, mbs, node: str):
             mbs.CreateRigidBody(
                 inertia=inertia,
                 referencePosition=list(body["com"]),
+                initialVelocity=list(np.cross(turning(body), np.subtract(body["com"], body["point"]))),
+                initialAngularVelocity=list(turning(body)),
                 show=False,
                 gravity=list(model.GRAVITY),
                 nodeType=getattr(exu.NodeType, node),
@@ -147,6 +149,7 @@ def _tree_links(model) -> tuple[list[dict], list[int]]:
                     stiffness=0.0,
                     damping=0.0,
                     force=0.0,
+                    rate=float(np.dot(axis, turning(body))),
                 )
             )
             parent = len(links) - 1
@@ -186,7 +189,7 @@ def _build_tree(model, mbs):
         items.NodeGenericODE2(
             referenceCoordinates=zeros,
             initialCoordinates=zeros,
-            initialCoordinates_t=zeros,
+            initialCoordinates_t=column("rate"),
             numberOfODE2Coordinates=len(links),
         )
     )
@@ -282,7 +285,7 @@ def run(
     """Times `steps` steps over [0, T_END] and returns times and final state.
 
     Args:
-        model: "spacecraft" or "open_tree".
+        model: a name in `MODELS`.
         steps: number of steps.
         formulation: "redundant" or "tree".
         solver: a name in exudyn.DynamicSolverType; default GeneralizedAlpha for "redundant", RK44 for "tree".

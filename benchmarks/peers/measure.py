@@ -8,9 +8,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from benchmarks.peers import open_tree, spacecraft
+from benchmarks.peers import double_pendulum, heavy_top, open_tree, spacecraft
 
-MODELS = {module.NAME: module for module in (spacecraft, open_tree)}
+MODELS = {module.NAME: module for module in (spacecraft, open_tree, heavy_top, double_pendulum)}
 
 
 def times_per_call(call: Callable[[], object], repeats: int) -> list[float]:
@@ -28,6 +28,11 @@ def per_step(times: list[float], steps: int) -> dict:
     """Median, smallest and largest time per step [us]."""
     us = [1e6 * t / steps for t in times]
     return {"us_per_step": statistics.median(us), "us_per_step_range": [min(us), max(us)], "repeats": len(us)}
+
+
+def turning(body: dict) -> np.ndarray:
+    """Angular velocity of a body at the start [rad/s]; only bodies on the ground are given one."""
+    return np.array(body.get("angular_velocity", (0.0, 0.0, 0.0)))
 
 
 def _relative_angle(body: dict, rotation: np.ndarray, parent_rotation: np.ndarray) -> float:

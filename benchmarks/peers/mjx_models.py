@@ -87,7 +87,7 @@ def run(
     Returns times, compile times and the final state.
 
     Args:
-        model: "spacecraft" or "open_tree".
+        model: a name in `MODELS`.
         steps: number of steps.
         integrator: Euler, RK4 or implicitfast.
         lanes: number of rollouts in the batch; 0: no batch.

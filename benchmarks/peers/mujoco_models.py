@@ -6,7 +6,7 @@ usage: python -m benchmarks.peers.mujoco_models MODEL STEPS [integrator=Euler|im
 import mujoco
 import numpy as np
 
-from benchmarks.peers.measure import MODELS, command_line, final_state, per_step, times_per_call
+from benchmarks.peers.measure import MODELS, command_line, final_state, per_step, times_per_call, turning
 
 # The joints of MuJoCo that make up one joint of the data, and which of its axes each one uses.
 _JOINTS = {
@@ -92,6 +92,10 @@ def build(model, steps: int, integrator: str) -> tuple[mujoco.MjModel, mujoco.Mj
     mj_model = mujoco.MjModel.from_xml_string(mjcf(model, model.T_END / steps, integrator))
     data = mujoco.MjData(mj_model)
     data.ctrl[:] = [torque for _, torque in model.MOTORS]
+    for body in model.BODIES:
+        if body["joint"] == "spherical":
+            first = mj_model.body(body["name"]).dofadr[0]
+            data.qvel[first : first + 3] = turning(body)
     return mj_model, data
 
 
@@ -113,17 +117,17 @@ def run(model: str, steps: int, *, integrator: str = "Euler", repeats: int = 7) 
     """Times `steps` steps over [0, T_END] and returns times and final state.
 
     Args:
-        model: "spacecraft" or "open_tree".
+        model: a name in `MODELS`.
         steps: number of steps.
         integrator: Euler (semi-implicit, the default of MuJoCo), implicitfast, implicit or RK4.
         repeats: timed repetitions.
     """
     source = MODELS[model]
     mj_model, data = build(source, steps, integrator)
-    start = data.qpos.copy()
+    start, velocity = data.qpos.copy(), data.qvel.copy()
 
     def rollout():
-        data.qpos[:], data.qvel[:], data.time = start, 0.0, 0.0
+        data.qpos[:], data.qvel[:], data.time = start, velocity, 0.0
         mujoco.mj_step(mj_model, data, nstep=steps)
 
     timing = per_step(times_per_call(rollout, repeats), steps)
