@@ -10,7 +10,7 @@ import tolerances as tol
 import natcoord_jax as nc
 from natcoord_jax import gallery
 from natcoord_jax.maths.projectors import range_projector
-from natcoord_jax.stepping import linear_pair, one_kernel
+from natcoord_jax.stepping import linear_pair, one_kernel, rewriting
 from natcoord_jax.stepping.one_kernel import LANES, as_one_kernel, in_groups
 
 MARK = "xla_cpu_small_call"
@@ -92,7 +92,7 @@ class Sorted(nc.Force):
 
 
 def test_goes_on_when_the_compiler_refuses(monkeypatch):
-    monkeypatch.setattr(one_kernel, "KNOWN", one_kernel.KNOWN | {"sort"})
+    monkeypatch.setattr(rewriting, "KNOWN", rewriting.KNOWN | {"sort"})
     monkeypatch.setattr(one_kernel, "_refused", [])
     jax.clear_caches()
     scene = nc.Scene()

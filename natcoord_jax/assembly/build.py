@@ -12,6 +12,7 @@ from natcoord_jax.assembly.coordinates import coordinate_values, state_rates
 from natcoord_jax.assembly.diagnostics import rows_with_ground
 from natcoord_jax.assembly.graph import Edge, make_tree, spanning_tree
 from natcoord_jax.assembly.grouping import Instance, bare, families, stack
+from natcoord_jax.assembly.poses import Poses, joint_frames, joint_triad
 from natcoord_jax.assembly.system import CoordinateGroup, Elimination, Group, Seats, Structure, System
 from natcoord_jax.assembly.tree import Tree
 from natcoord_jax.core.bodies import Body
@@ -22,58 +23,8 @@ from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.joint import Joint, frames_at
 from natcoord_jax.core.markers import Marker
 from natcoord_jax.core.state import State
-from natcoord_jax.maths.rotations import frame_from_axis
 
 JOINT_FIELDS = ("parent", "child", "point", "axis", "second", "name", "parent_point")
-
-
-class Poses:
-    """Assembled poses of all bodies and the ground, in scene order."""
-
-    def __init__(self, bodies: dict[str, Body]):
-        self.names = list(bodies)
-        self.number = {name: i for i, name in enumerate(self.names)} | {"ground": len(bodies)}
-        self.position = [b.position for b in bodies.values()] + [jnp.zeros(3)]
-        self.rotation = [b.rotation for b in bodies.values()] + [jnp.eye(3)]
-
-    def of(self, handle: Handle) -> int:
-        """Number of a body; the number of bodies for the ground."""
-        return self.number[handle.name]
-
-    def point(self, body: int, position: Any) -> Float[Array, "4"]:
-        """Weights of the material point at a world position."""
-        local = self.rotation[body].T @ (jnp.asarray(position, float) - self.position[body])
-        return jnp.concatenate([jnp.ones(1), local])
-
-    def direction(self, body: int, vector: Any) -> Float[Array, "4"]:
-        """Weights of the direction along a world vector."""
-        return jnp.concatenate([jnp.zeros(1), self.rotation[body].T @ jnp.asarray(vector, float)])
-
-    def weights(self, marker: Marker) -> Float[Array, "4"]:
-        """Weights of a marker."""
-        vector = jnp.asarray(marker.vector, float)
-        if marker.local:
-            return jnp.concatenate([jnp.array([1.0 if marker.is_point else 0.0]), vector])
-        body = self.of(marker.body)
-        return self.point(body, vector) if marker.is_point else self.direction(body, vector)
-
-
-def joint_triad(joint: Joint) -> Float[Array, "3 3"]:
-    """The triad of the joint in the assembled pose, one vector a row."""
-    return frame_from_axis(joint.axis, joint.second)
-
-
-def joint_frames(joint: Joint, poses: Poses) -> Float[Array, "2 4 4"]:
-    """Weights of point and triad on parent and child (44-47)."""
-    parent, child = poses.of(joint.parent), poses.of(joint.child)
-    triad = joint_triad(joint)
-    at_parent, at_child = joint.anchors()
-    at_parent = poses.position[child] if at_parent is None else at_parent
-    at_child = poses.position[child] if at_child is None else at_child
-    frames = []
-    for body, point in ((parent, at_parent), (child, at_child)):
-        frames.append(jnp.stack([poses.point(body, point), *(poses.direction(body, a) for a in triad)]))
-    return jnp.stack(frames)
 
 
 def _edge(joint: Joint, poses: Poses) -> Edge:

@@ -5,11 +5,11 @@ from typing import Any
 from jaxtyping import Array
 
 from natcoord_jax.assembly.full import FullStep
-from natcoord_jax.assembly.kick import TangentSpace
 from natcoord_jax.assembly.outset import Outset
 from natcoord_jax.assembly.recursive import RecursiveStep
 from natcoord_jax.assembly.reduced import ReducedStep
 from natcoord_jax.assembly.system import System
+from natcoord_jax.assembly.tangent_space import TangentSpace
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import Tableau
 

@@ -12,11 +12,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.diagnostics import rows_with_ground
-from natcoord_jax.assembly.kick import TangentSpace, kicked
+from natcoord_jax.assembly.kick import kicked
 from natcoord_jax.assembly.local import body_balance, body_motion, jacobians
 from natcoord_jax.assembly.momentum import momentum_balance
 from natcoord_jax.assembly.outset import Outset
-from natcoord_jax.assembly.reduced import NOTHING, at_every_stage, project_multipliers, project_rows
+from natcoord_jax.assembly.reduced import NOTHING
+from natcoord_jax.assembly.redundancy import at_every_stage, project_multipliers, project_rows
 from natcoord_jax.assembly.response import (
     Evaluation,
     Situation,
@@ -26,6 +27,7 @@ from natcoord_jax.assembly.response import (
     stations,
 )
 from natcoord_jax.assembly.system import Group, System
+from natcoord_jax.assembly.tangent_space import TangentSpace
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import Tableau, gauss
 from natcoord_jax.maths.projectors import range_projector

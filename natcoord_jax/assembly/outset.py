@@ -3,8 +3,8 @@
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from natcoord_jax.assembly.kick import TangentSpace
 from natcoord_jax.assembly.system import System
+from natcoord_jax.assembly.tangent_space import TangentSpace
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import Tableau
 

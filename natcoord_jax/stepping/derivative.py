@@ -24,6 +24,7 @@ from natcoord_jax.assembly.equations import prepare
 from natcoord_jax.assembly.system import System
 from natcoord_jax.core.state import State
 from natcoord_jax.stepping import linear_pair
+from natcoord_jax.stepping.correcting import Correcting
 from natcoord_jax.stepping.error_control import Tolerance
 from natcoord_jax.stepping.newton import PATIENCE, Factors, any_lane, factors_of
 from natcoord_jax.stepping.one_kernel import as_one_kernel, in_groups
@@ -35,18 +36,6 @@ from natcoord_jax.stepping.step import advance, linear_solver
 
 CHUNK = 32
 """Slots whose Jacobians are formed together."""
-
-CLOSE = 1e-12
-"""Last correction of a transposed system relative to its solution."""
-
-STALL = 1e-10
-"""Corrections that stop shrinking below this have reached the floor of round-off."""
-
-CORRECTIONS = 30
-"""Corrections with one factorisation."""
-
-ROUNDS = 4
-"""Factorisations for one transposed system."""
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
@@ -276,52 +265,6 @@ class Rule:
             return factors_of(equations, form, jacobian_by_differences(equations, slot.y))
 
         return jnp.array(False), kernel(renewed, numbers, slot), carry[2].refreshed()
-
-
-class Correcting(eqx.Module):
-    """Where the solution of a transposed system stands."""
-
-    correction: Float[Array, ""]
-    count: Int[Array, ""]
-    rounds: Int[Array, ""]
-    done: Bool[Array, ""]
-    wanting: Bool[Array, ""]
-    moving: Bool[Array, ""]
-
-    @classmethod
-    def first(cls, accepted: Bool[Array, ""], dtype: Any) -> "Correcting":
-        """Before the first correction; there is nothing to do for an attempt that failed."""
-        nought, no = jnp.array(0), jnp.array(False)
-        return cls(jnp.zeros((), dtype), nought, nought, ~accepted, no, no)
-
-    @property
-    def open(self) -> Bool[Array, ""]:
-        """Whether to go on."""
-        return ~self.done & ((self.rounds < ROUNDS) | ~self.wanting)
-
-    def refreshed(self) -> "Correcting":
-        """With new factors."""
-        nought = jnp.zeros_like(self.count)
-        return eqx.tree_at(
-            lambda c: (c.count, c.rounds, c.wanting),
-            self,
-            (nought, self.rounds + 1, jnp.zeros_like(self.wanting)),
-        )
-
-    def judged(self, factors: Factors, lam: Array, change: Array, patience: int) -> "Correcting":
-        """After a correction has been found: done, or moving on by it, or in want of new factors."""
-        size, correction = (jnp.sqrt(jnp.sum(factors.inertias * x**2)) for x in (lam, change))
-        ratio = correction / jnp.where(self.correction > 0, self.correction, 1.0)
-        first = self.count == 0
-        finite = jnp.isfinite(correction) & jnp.isfinite(size)
-        stalled = ~first & (ratio > 0.5) & (correction <= STALL * size)
-        done = ((correction <= CLOSE * size) | stalled) & finite
-        late = correction * ratio**patience > CLOSE * size
-        slow = (~first & ((ratio > 0.5) | late)) | (self.count >= CORRECTIONS) | ~finite | ~factors.usable
-        slow = slow & ~done
-        found = Correcting(correction, self.count + 1, self.rounds, done, slow, ~done & ~slow)
-        stay = eqx.tree_at(lambda c: c.moving, self, jnp.zeros_like(self.moving))
-        return jax.tree.map(partial(jnp.where, self.done), stay, found)
 
 
 def _plainly(function: Callable, *arguments: Any) -> Any:

@@ -23,6 +23,14 @@ import jax.numpy as jnp
 from jax.extend import core as jex
 from jaxtyping import Array, Float
 
+from natcoord_jax.stepping import rewriting
+from natcoord_jax.stepping.rewriting import (
+    evaluate_closed,
+    known,
+    operations,
+    with_constants,
+)
+
 try:
     from jax.experimental.scheduling_groups import xla_metadata_call as _attributed
 except ImportError:  # an experimental module of JAX: without it everything runs, only slower
@@ -36,40 +44,6 @@ ATTRIBUTES = {"xla_cpu_small_call": "true", "inlineable": "false"}
 
 LANES = 16
 """Lanes of a batch that are worked on together, so that what they need stays in the fastest cache."""
-
-PRODUCT_LIMIT = 1 << 15
-"""Multiplications up to which a product of matrices is written as a sum."""
-
-KNOWN = frozenset(
-    "abs acos acosh add add_any and argmax argmin asin asinh atan atan2 atanh bitcast_convert_type "
-    "broadcast_in_dim cbrt ceil clamp concatenate cond convert_element_type copy copy_p cos cosh "
-    "cumsum custom_vmap_call div dynamic_slice dynamic_update_slice eq erf erf_inv erfc exp exp2 "
-    "expand_dims expm1 floor gather ge gt integer_pow iota is_finite jit le log log1p logistic lt max "
-    "min mul ne neg nextafter not optimization_barrier or pad pjit platform_index pow reduce_and "
-    "reduce_max reduce_min reduce_or reduce_prod reduce_sum rem reshape rev round rsqrt scan select_n "
-    "shift_left shift_right_arithmetic shift_right_logical sign sin sinh slice split sqrt square "
-    "squeeze stack stop_gradient sub tan tanh tile transpose unstack while xor".split()
-)
-"""Primitives that are compiled in place, without a call into a library."""
-
-INLINED = {
-    "custom_jvp_call": "call_jaxpr",
-    "custom_vjp_call": "call_jaxpr",
-    "closed_call": "call_jaxpr",
-    "jit": "jaxpr",
-    "pjit": "jaxpr",
-}
-"""Calls that are written out, as their names and rules for derivatives are of no use here: where their
-programs are."""
-
-REDUCTION_LIMIT = 3000
-"""Numbers from which on the compiler hands a reduction to a library (seen: 4096)."""
-
-REDUCTIONS = {"reduce_sum": jnp.add, "reduce_max": jnp.maximum, "reduce_min": jnp.minimum}
-"""Reductions that are written as loops where they are long."""
-
-REWRITTEN = frozenset(("dot_general", "scatter", "scatter-add", *INLINED))
-"""Primitives that may be rewritten in terms of those."""
 
 
 def as_one_kernel(function: Callable, *arguments: Any, too_large: Callable | None = None) -> Any:
@@ -126,7 +100,7 @@ def _on_cpu() -> bool:
 
 def _flat(transform: Callable, program: Any, shapes: Any, arguments: tuple) -> Any:
     """A transformed function of flat arguments, among them what it closes over."""
-    flat = _with_constants(program)
+    flat = with_constants(program)
     outputs = transform(flat)(*program.consts, *jax.tree.leaves(arguments))
     return jax.tree.unflatten(jax.tree.structure(shapes), outputs)
 
@@ -183,9 +157,9 @@ def _group_by_group(function: Callable, axes: list[int | None], lanes: int, *fla
 def _in_one_kernel(function: Callable, flat: Sequence[Any]) -> list[Any]:
     kinds = [(jnp.shape(x), jnp.result_type(x)) for x in flat]
     program = jax.make_jaxpr(function)(*flat)
-    if known(program.jaxpr, KNOWN | REWRITTEN):
+    if known(program.jaxpr, rewriting.KNOWN | rewriting.REWRITTEN):
         # After vmap, since small reductions of one lane are large ones of many.
-        program = jax.make_jaxpr(partial(_evaluate_closed, program))(*flat)
+        program = jax.make_jaxpr(partial(evaluate_closed, program))(*flat)
     packable = all(jnp.issubdtype(dtype, jnp.number) or dtype == jnp.bool for _, dtype in kinds)
     empty = all(math.prod(shape) == 0 for shape, _ in kinds)
     if _attributed is None or not packable or empty or not known(program.jaxpr):
@@ -228,157 +202,3 @@ def _from_double(x: Array, dtype: Any) -> Array:
     if dtype != jnp.float64 and dtype.itemsize == 8:
         return jax.lax.bitcast_convert_type(x, dtype)
     return x.astype(dtype)
-
-
-def _inner_programs(equation: Any) -> list[Any]:
-    """Programs among the parameters of an equation."""
-    found = []
-    for value in equation.params.values():
-        for x in value if isinstance(value, tuple | list) else (value,):
-            if isinstance(x, jex.ClosedJaxpr):
-                found.append(x.jaxpr)
-            elif isinstance(x, jex.Jaxpr):
-                found.append(x)
-    return found
-
-
-def operations(program: Any) -> int:
-    """Number of operations of a program and of all programs in it."""
-    return sum(1 + sum(map(operations, _inner_programs(equation))) for equation in program.eqns)
-
-
-def known(program: Any, names: frozenset[str] | None = None) -> bool:
-    """Whether a program holds nothing but the operations of these names, by default `KNOWN`."""
-    names = KNOWN if names is None else names
-    return all(
-        equation.primitive.name in names and all(known(inner, names) for inner in _inner_programs(equation))
-        for equation in program.eqns
-    )
-
-
-def _with_constants(program: Any) -> Callable:
-    """The program, with its constants first."""
-
-    def function(*values: Any) -> list[Any]:
-        consts, rest = values[: len(program.consts)], values[len(program.consts) :]
-        return jex.jaxpr_as_fun(jex.ClosedJaxpr(program.jaxpr, consts))(*rest)
-
-    return function
-
-
-def _evaluate(program: Any, consts: Sequence[Any], arguments: Sequence[Any]) -> list[Any]:
-    values: dict[Any, Any] = dict(zip(program.constvars, consts)) | dict(zip(program.invars, arguments))
-
-    def read(x: Any) -> Any:
-        return x.val if isinstance(x, jex.Literal) else values[x]
-
-    for equation in program.eqns:
-        given = [read(x) for x in equation.invars]
-        scope = str(equation.source_info.name_stack)
-        if scope:
-            with jax.named_scope(scope):
-                found = _apply(equation, given)
-        else:
-            found = _apply(equation, given)
-        values.update(zip(equation.outvars, found))
-    return [read(x) for x in program.outvars]
-
-
-def _apply(equation: Any, given: list[Any]) -> list[Any]:
-    """Outputs of one equation."""
-    name, params = equation.primitive.name, equation.params
-    if name == "dot_general":
-        found = _product(given, params, equation.outvars[0].aval)
-        if found is not None:
-            return [found]
-    if name in ("scatter", "scatter-add"):
-        found = _update(name, given, params)
-        if found is not None:
-            return [found]
-    if name in REDUCTIONS and math.prod(given[0].shape) >= REDUCTION_LIMIT:
-        return [_reduced(REDUCTIONS[name], given[0], params["axes"])]
-    if name in INLINED and isinstance(params.get(INLINED[name]), jex.ClosedJaxpr):
-        inner = params[INLINED[name]]
-        return _evaluate(inner.jaxpr, inner.consts, given)
-    if name != "custom_vmap_call":
-        params = {key: _inside(value) for key, value in params.items()}
-    found = equation.primitive.bind(*given, **params)
-    return list(found) if equation.primitive.multiple_results else [found]
-
-
-def _inside(value: Any) -> Any:
-    """A parameter with the programs it holds rewritten."""
-    if isinstance(value, jex.ClosedJaxpr):
-        return jax.make_jaxpr(partial(_evaluate_closed, value))(*value.in_avals)
-    if isinstance(value, tuple) and value and all(isinstance(x, jex.ClosedJaxpr) for x in value):
-        return tuple(_inside(x) for x in value)
-    return value
-
-
-def _evaluate_closed(program: Any, *arguments: Any) -> list[Any]:
-    return _evaluate(program.jaxpr, program.consts, arguments)
-
-
-def _product(given: list[Any], params: dict[str, Any], out: Any) -> Array | None:
-    """A small product of arrays as a sum; None for a large one."""
-    left, right = given
-    (sum_left, sum_right), (batch_left, batch_right) = params["dimension_numbers"]
-    terms = math.prod(out.shape) * math.prod(left.shape[k] for k in sum_left)
-    if terms > PRODUCT_LIMIT or left.dtype != out.dtype or right.dtype != out.dtype:
-        return None
-    free_left = [k for k in range(left.ndim) if k not in (*sum_left, *batch_left)]
-    free_right = [k for k in range(right.ndim) if k not in (*sum_right, *batch_right)]
-    shared, summed = len(batch_left), len(sum_left)
-    left = jnp.transpose(left, (*batch_left, *free_left, *sum_left))
-    right = jnp.transpose(right, (*batch_right, *free_right, *sum_right))
-    left = jnp.expand_dims(left, range(shared + len(free_left), shared + len(free_left) + len(free_right)))
-    right = jnp.expand_dims(right, range(shared, shared + len(free_left)))
-    axes = tuple(range(left.ndim - summed, left.ndim))
-    if terms < REDUCTION_LIMIT:
-        return jnp.sum(left * right, axis=axes)
-    return _reduced(jnp.add, left * right, axes)
-
-
-def _reduced(operation: Callable, x: Array, axes: Sequence[Any]) -> Array:
-    """A large reduction as loops, which the compiler does not hand to a library."""
-    for axis in sorted(axes, reverse=True):
-
-        def add(k: Array, total: Array, x: Array = x, axis: int = axis) -> Array:
-            return operation(total, jax.lax.dynamic_index_in_dim(x, k, axis, keepdims=False))
-
-        first = jax.lax.index_in_dim(x, 0, axis, keepdims=False)
-        x = jax.lax.fori_loop(1, x.shape[axis], add, first)
-    return x
-
-
-def _update(name: str, given: list[Any], params: dict[str, Any]) -> Array | None:
-    """A scatter as updates of slices, one window after the other; None for one with batch dimensions."""
-    operand, indices, updates = given
-    numbers = params["dimension_numbers"]
-    if numbers.operand_batching_dims or numbers.scatter_indices_batching_dims:
-        return None
-    windows = numbers.update_window_dims
-    others = [k for k in range(updates.ndim) if k not in windows]
-    updates = jnp.transpose(updates, (*others, *windows)).astype(operand.dtype)
-    sizes = iter(updates.shape[len(others) :])
-    shape = [1 if k in numbers.inserted_window_dims else next(sizes) for k in range(operand.ndim)]
-    count = math.prod(updates.shape[: len(others)])
-    updates, places = updates.reshape(count, *shape), indices.reshape(count, -1)
-    if 0 in updates.shape or 0 in operand.shape:
-        return operand
-
-    def one(k: Any, total: Array) -> Array:
-        window, place = updates[k], places[k]
-        starts = [jnp.zeros((), place.dtype)] * operand.ndim
-        for n, dim in enumerate(numbers.scatter_dims_to_operand_dims):
-            starts[dim] = place[n]
-        now = jax.lax.dynamic_slice(total, starts, shape)
-        if name == "scatter-add":
-            window = now + window
-        if params["mode"] == jax.lax.GatherScatterMode.FILL_OR_DROP:
-            limits = zip(starts, shape, operand.shape)
-            inside = jnp.all(jnp.stack([(at >= 0) & (at + size <= end) for at, size, end in limits]))
-            window = jnp.where(inside, window, now)
-        return jax.lax.dynamic_update_slice(total, window, starts)
-
-    return one(0, operand) if count == 1 else jax.lax.fori_loop(0, count, one, operand)
