@@ -79,7 +79,7 @@ def own_runs(model: str, plan: Plan) -> list[dict[str, Any]]:
     system, start = example.system, example.state
     shared = model in SHARED
     t_end = peer_measure.MODELS[model].T_END if shared else ALONE[model]
-    judge = judge_of(model)
+    judge = judge_of(model) if shared else None
     exact = None if shared else _reference(example, t_end).q
     found = []
     for order in ORDERS:
@@ -94,7 +94,7 @@ def own_runs(model: str, plan: Plan) -> list[dict[str, Any]]:
             if int(end.result) != 0:
                 continue
             timing = common.timed(call, steps, plan.repeats) | {"compile_s": compile_s}
-            if shared:
+            if judge is not None:
                 errors = judge(beside.own_state(model, system, end.state))
             else:
                 errors = {"error": float(np.max(np.abs(end.state.q - exact)))}
