@@ -23,6 +23,12 @@ def prepare(
     return FORMS[system.structure.solver].prepare(system, state, u, h, tableau, outset)
 
 
-def starting(system: System, state: State, tableau: Tableau, tangents: TangentSpace | None = None) -> Outset:
-    """What the equations of a step that starts from a state need of it."""
-    return FORMS[system.structure.solver].starting(system, state, tableau, tangents)
+def starting(
+    system: System,
+    state: State,
+    tableau: Tableau,
+    tangents: TangentSpace | None = None,
+    later: bool = False,
+) -> Outset:
+    """What the equations of a step that starts from a state need of it, see `Outset.of`."""
+    return FORMS[system.structure.solver].starting(system, state, tableau, tangents, later)

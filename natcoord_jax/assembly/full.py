@@ -71,9 +71,14 @@ class FullStep(eqx.Module):
 
     @classmethod
     def starting(
-        cls, system: System, state: State, tableau: Tableau, tangents: TangentSpace | None = None
+        cls,
+        system: System,
+        state: State,
+        tableau: Tableau,
+        tangents: TangentSpace | None = None,
+        later: bool = False,
     ) -> Outset:
-        """What a step needs of its start."""
+        """What a step needs of its start, see `Outset.of`."""
         projector, rank = None, system.structure.rank
         if rank is not None:
             no_inputs = jnp.zeros(len(system.structure.inputs), state.q.dtype)
@@ -83,7 +88,7 @@ class FullStep(eqx.Module):
             in_tree = sum(g.count * g.multipliers for g in system.joints if g.in_tree)
             projector = range_projector(rows, rank + in_tree)
             projector = at_every_stage(projector, resting.groups, tableau.stages)
-        return Outset.of(system, state, tableau, projector, tangents)
+        return Outset.of(system, state, tableau, projector, tangents, later)
 
     @property
     def groups(self) -> tuple[Group, ...]:

@@ -25,6 +25,7 @@ chosen, and redundant constraints are no special case.
 from collections.abc import Sequence
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
@@ -89,7 +90,7 @@ def rotor_rates(system: System, groups: Sequence[Group], at: Stations, h: Array)
 def kick_of(
     system: System,
     state: State,
-    before: TangentSpace,
+    before: TangentSpace | None,
     groups: Sequence[Group],
     at: Stations,
     h: Array,
@@ -100,14 +101,18 @@ def kick_of(
     Args:
         system: compiled system.
         state: at the start of the step.
-        before: tangent space there.
+        before: tangent space there; None: found together with that at the end.
         groups: that act.
         at: stage motion.
         h: step [s].
         tableau: the collocation method.
     """
     beta, sigma = jnp.asarray(tableau.beta), tableau.reflection
-    after = TangentSpace.at(system, _end_of(state, at, h, tableau))
+    end = _end_of(state, at, h, tableau)
+    if before is None:
+        before, after = _both(system, state, end)
+    else:
+        after = TangentSpace.at(system, end)
     drift = after.spread(after.drift)
     carried = jnp.tensordot(beta, at.rates[:, :-1], 1), beta @ rotor_rates(system, groups, at, h)
     d = Velocity(
@@ -115,6 +120,17 @@ def kick_of(
         sigma * (carried[1] - drift.rotors) - state.rates,
     )
     return Kick(_kick(before, after, d), before, after)
+
+
+def _both(system: System, start: State, end: State) -> tuple[TangentSpace, TangentSpace]:
+    """The tangent spaces of two states by one program for both, half as long as two."""
+
+    def at(q: Array, t: Array) -> TangentSpace:
+        return TangentSpace.at(system, replace_fields(end, q=q, v=q, t=t)).without_system()
+
+    found = jax.vmap(at)(jnp.stack([start.q, end.q]), jnp.stack([start.t, end.t]))
+    before, after = jax.tree.map(lambda x: x[0], found), jax.tree.map(lambda x: x[1], found)
+    return before.with_system(system), after.with_system(system)
 
 
 def ends_of(
@@ -188,9 +204,10 @@ def kicked(
 ) -> tuple[Array, Sequence[Situation], Kick | None]:
     """What the stages begin with: velocities of rows, situations with rates of rotors; and the kick."""
     velocity = state.v.reshape(-1, 4, 3)
-    if tangents is None:
+    if not tableau.kick:
         return velocity, situations, None
-    found = kick_of(system, state, tangents.with_system(system), groups, at, h, tableau)
+    before = None if tangents is None else tangents.with_system(system)
+    found = kick_of(system, state, before, groups, at, h, tableau)
     rotors = state.rates + found.kick.rotors
     moved = [
         replace_fields(where, rates=rotors[group.rotors]) if group.effect.rotors else where

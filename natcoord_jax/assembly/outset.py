@@ -15,7 +15,7 @@ class Outset(eqx.Module):
     Attributes:
         projector: on the range of the constraints, for the multipliers of all stages; None: they are
             independent.
-        tangents: tangent space, without the system; None for schemes without kicks.
+        tangents: tangent space, without the system; None for schemes without kicks, or if found later.
     """
 
     projector: Float[Array, "m m"] | None
@@ -29,9 +29,19 @@ class Outset(eqx.Module):
         tableau: Tableau,
         projector: Array | None,
         tangents: TangentSpace | None = None,
+        later: bool = False,
     ) -> "Outset":
-        """With the tangent space of a state, unless it is known from the end of the last step."""
-        if not tableau.kick:
+        """With the tangent space of a state.
+
+        Args:
+            system: compiled system.
+            state: at the start.
+            tableau: of the scheme.
+            projector: of the multipliers.
+            tangents: known from the end of the last step; None: found here.
+            later: leave it to the evaluation, which finds it with that at the end of the step.
+        """
+        if not tableau.kick or later:
             return cls(projector, None)
         if tangents is None:
             tangents = TangentSpace.at(system, state).without_system()

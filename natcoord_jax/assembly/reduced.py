@@ -120,16 +120,21 @@ class ReducedStep(eqx.Module):
 
     @classmethod
     def starting(
-        cls, system: System, state: State, tableau: Tableau, tangents: TangentSpace | None = None
+        cls,
+        system: System,
+        state: State,
+        tableau: Tableau,
+        tangents: TangentSpace | None = None,
+        later: bool = False,
     ) -> Outset:
-        """What a step needs of its start."""
+        """What a step needs of its start, see `Outset.of`."""
         projector = None
         if system.structure.rank is not None:
             no_inputs = jnp.zeros(len(system.structure.inputs), state.q.dtype)
             plain = cls.prepare(system, state, no_inputs, jnp.zeros((), state.q.dtype), gauss(1), NOTHING)
             projector = range_projector(plain.constraint_matrix(), system.structure.rank)
             projector = at_every_stage(projector, plain.groups, tableau.stages)
-        return Outset.of(system, state, tableau, projector, tangents)
+        return Outset.of(system, state, tableau, projector, tangents, later)
 
     def constraint_matrix(self) -> Float[Array, "m unknowns"]:
         """Rates of all constraints per rate of the free motions, at the start of the step."""

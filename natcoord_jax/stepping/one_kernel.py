@@ -36,7 +36,7 @@ try:
 except ImportError:  # an experimental module of JAX: without it everything runs, only slower
     _attributed = None
 
-LARGEST = 5000
+LARGEST = 6800
 """Operations of a program that still compiles quickly in one piece: the time grows faster than the size."""
 
 ATTRIBUTES = {"xla_cpu_small_call": "true", "inlineable": "false"}

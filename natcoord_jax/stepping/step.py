@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.coordinates import stage_rates
-from natcoord_jax.assembly.equations import prepare
+from natcoord_jax.assembly.equations import prepare, starting
 from natcoord_jax.assembly.kick import ends_of
 from natcoord_jax.assembly.response import Evaluation
 from natcoord_jax.assembly.system import Group, System
@@ -25,7 +25,8 @@ def advance(
     Differentiable in everything. The half turn |h omega / 2| of a body is the tangent of half the angle it
     turned: it grows without bound towards half a turn a step, the pole of Cayley's rotation.
     """
-    equations = prepare(system, state, u, h, tableau)
+    outset = starting(system, state, tableau, later=True)
+    equations = prepare(system, state, u, h, tableau, outset)
     found = equations.evaluate(y)
     after, half_turn = end_of_step(system, state, h, equations.groups, found, tableau)
     return found.residual, after, half_turn
