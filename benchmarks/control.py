@@ -417,6 +417,8 @@ def main() -> None:
         results["parts"][part] = {key: now[key] for key in ("date", "commit", "uncommitted_changes")}
         print(f"{part} done", flush=True)
         _write(results, chosen.json)
+        # Every program takes regions of memory, of which a process on Linux has 65 530.
+        jax.clear_caches()
     versions = {run["version"] for run in results["runs"] if "version" in run}
     results["versions"] |= {"peers": {"casadi": ", ".join(sorted(versions))} if versions else {}}
     print(f"\n{common.environment_line(results)}\n\n{tables(results)}\n")
