@@ -85,6 +85,7 @@ def own_runs(model: str, plan: Plan) -> list[dict[str, Any]]:
     for order in ORDERS:
         scheme = nc.EnergyMomentum(order=order)
         run = endpoints(system, start, inputs=example.torques, scheme=scheme)
+        jax.clear_caches()  # the reference may have compiled this order already
         compile_s = common.seconds(lambda run=run: jax.block_until_ready(run(t_end / 64, 2)))
         for steps in plan.own:
             if order > 2 and steps > 2048:
@@ -200,29 +201,28 @@ def draw(results: dict[str, Any]) -> Any:
     """Error over wall time, one panel a scene."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(13, 8), layout="constrained")
+    figure = Figure(figsize=(13, 9), layout="constrained")
     axes = figure.subplots(2, 3).reshape(-1)
+    codes = list(dict.fromkeys(r["code"] for found in results["models"].values() for r in found["runs"]))
+    own = [code for code in codes if code.startswith(OWN)]
+    looks = {code: ("o-", 1.8, f"C{k}") for k, code in enumerate(own)}
+    looks |= {
+        code: ("s--", 1.0, f"C{len(own) + k}" if len(own) + k < 10 else "black")
+        for k, code in enumerate(code for code in codes if code not in own)
+    }
+    shown = {}
     for panel, (model, found) in zip(axes, results["models"].items()):
-        codes = dict.fromkeys(r["code"] for r in found["runs"])
-        for number, code in enumerate(codes):
+        for code, (style, width, colour) in looks.items():
             runs = sorted(
                 (r for r in found["runs"] if r["code"] == code and r["error"]), key=lambda r: r["steps"]
             )
-            x = [1e-3 * r["us_per_step"] * r["steps"] for r in runs]
-            own = code.startswith(OWN)
-            style = "o-" if own else "s--"
-            panel.loglog(
-                x,
-                [r["error"] for r in runs],
-                style,
-                ms=3,
-                lw=1.6 if own else 1,
-                color=f"C{number}",
-                label=code,
-            )
+            if not runs:
+                continue
+            x, y = [1e-3 * r["us_per_step"] * r["steps"] for r in runs], [r["error"] for r in runs]
+            (shown[code],) = panel.loglog(x, y, style, ms=3, lw=width, color=colour)
         panel.set(title=model, xlabel="wall time [ms]", ylabel="error of the end state [rad or m]")
         panel.grid(alpha=0.3)
-        panel.legend(fontsize=6)
+    figure.legend(shown.values(), shown.keys(), loc="outside lower center", ncols=4, fontsize=8)
     figure.suptitle(common.environment_line(results), fontsize=9)
     return figure
 
