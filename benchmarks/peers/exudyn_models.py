@@ -85,7 +85,7 @@ def _build_redundant(model, mbs, node: str):
             mbs.CreateRigidBody(
                 inertia=inertia,
                 referencePosition=list(body["com"]),
-                initialVelocity=list(np.cross(turning(body), np.subtract(body["com"], body["point"]))),
+                initialVelocity=list(np.cross(turning(body), body["com"])),
                 initialAngularVelocity=list(turning(body)),
                 show=False,
                 gravity=list(model.GRAVITY),
@@ -130,7 +130,8 @@ def _tree_links(model) -> tuple[list[dict], list[int]]:
     """The links of the kinematic tree, and the index of the link that carries each body."""
     links, carrier = [], []
     for body in model.BODIES:
-        parent = -1 if body["parent"] is None else carrier[body["parent"]]
+        root = body["parent"] is None
+        parent = -1 if root else carrier[body["parent"]]
         moves = [
             (kind, axis)
             for kind, which in _LINKS[body["joint"]]
@@ -149,7 +150,7 @@ def _tree_links(model) -> tuple[list[dict], list[int]]:
                     stiffness=0.0,
                     damping=0.0,
                     force=0.0,
-                    rate=float(np.dot(axis, turning(body))),
+                    rate=float(np.dot(axis, turning(body))) if kind == "RevoluteZ" and root else 0.0,
                 )
             )
             parent = len(links) - 1

@@ -8,9 +8,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from benchmarks.peers import double_pendulum, heavy_top, open_tree, spacecraft
+from benchmarks.peers import double_pendulum, heavy_top, open_tree, spacecraft, spinning_spacecraft
 
-MODELS = {module.NAME: module for module in (spacecraft, open_tree, heavy_top, double_pendulum)}
+_MODULES = (spacecraft, spinning_spacecraft, open_tree, heavy_top, double_pendulum)
+MODELS = {module.NAME: module for module in _MODULES}
 
 
 def times_per_call(call: Callable[[], object], repeats: int) -> list[float]:
@@ -31,7 +32,7 @@ def per_step(times: list[float], steps: int) -> dict:
 
 
 def turning(body: dict) -> np.ndarray:
-    """Angular velocity of a body at the start [rad/s]; only bodies on the ground are given one."""
+    """Angular velocity of a body at the start [rad/s]: of everything as a whole, about the origin."""
     return np.array(body.get("angular_velocity", (0.0, 0.0, 0.0)))
 
 

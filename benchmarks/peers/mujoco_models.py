@@ -93,9 +93,9 @@ def build(model, steps: int, integrator: str) -> tuple[mujoco.MjModel, mujoco.Mj
     data = mujoco.MjData(mj_model)
     data.ctrl[:] = [torque for _, torque in model.MOTORS]
     for body in model.BODIES:
-        if body["joint"] == "spherical":
-            first = mj_model.body(body["name"]).dofadr[0]
-            data.qvel[first : first + 3] = turning(body)
+        if body["joint"] in ("spherical", "free"):
+            last = mj_model.body(body["name"]).dofadr[0] + (3 if body["joint"] == "spherical" else 6)
+            data.qvel[last - 3 : last] = turning(body)
     return mj_model, data
 
 
