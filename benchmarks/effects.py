@@ -154,7 +154,7 @@ def main() -> None:
     for name, (system, state) in scenes.items():
         runs.append(measure(name, system, state, steps, repeats))
         runs[-1]["over_base"] = runs[-1]["us_per_step"] / runs[0]["us_per_step"]
-    results["runs"] = runs
+    results |= {"runs": runs, "targets": []}
     print(f"{common.environment_line(results)}\n{common.columns(runs, COLUMNS)}")
     common.write(results, draw, common.folder(chosen))
 

@@ -1,7 +1,7 @@
 """What accuracy costs in time, by order, beside MuJoCo, MJX and Exudyn: one run, one core.
 
 usage: python -m benchmarks.work_precision [--quick] [--output FOLDER] [--peers-python PATH] [--no-peers]
-       [--redraw JSON]
+       [--models NAME ...] [--redraw JSON]
 
 Spacecraft (from rest, and spinning), open tree, heavy top and double pendulum are run beside the peers at the
 settings that `benchmarks.peers` documents; the loops by natcoord_jax alone. Times are those of compiled runs
@@ -191,7 +191,7 @@ def _fastest(rows: list[dict[str, float | None]]) -> dict[str, float | None]:
 def targets(models: dict[str, Any]) -> list[dict[str, Any]]:
     """What is aimed at next to what was measured."""
     lines = []
-    for model in SHARED:
+    for model in (m for m in SHARED if m in models):
         table = models[model]["time_to_error"]
         best = table[f"{OWN}, best order"]
         rk4 = table.get("MuJoCo RK4")
@@ -203,7 +203,18 @@ def targets(models: dict[str, Any]) -> list[dict[str, Any]]:
         lines.append(
             common.target(f"{model}: over Exudyn, implicit, at 0.001", _ratio(best, implicit, "0.001"), 1.0)
         )
+        name = f"{model}: over Exudyn, implicit, at 1e-08, there extrapolated by its order two"
+        lines.append(common.target(name, _ratio(best, _extrapolated(implicit), "1e-08"), 1 / 500))
     return lines
+
+
+def _extrapolated(times: dict[str, float | None]) -> dict[str, float | None]:
+    """Time of a method of order two to an error of 1e-8, from that to the smallest error it was run to."""
+    known = [(float(error), t) for error, t in times.items() if t is not None]
+    if not known:
+        return {}
+    error, t = min(known)
+    return {"1e-08": t * math.sqrt(error / 1e-8)}
 
 
 def _ratio(own: dict, other: dict | None, error: str) -> float | None:
@@ -245,7 +256,10 @@ def draw(results: dict[str, Any]) -> Any:
 
 def main() -> None:
     """Run the benchmark."""
-    chosen = common.peer_parser("What accuracy costs in time, beside other codes.", "the figure").parse_args()
+    parser = common.peer_parser("What accuracy costs in time, beside other codes.", "the figure")
+    every = (*SHARED, *ALONE)
+    parser.add_argument("--models", nargs="+", choices=every, default=every, help="only these scenes")
+    chosen = parser.parse_args()
     if chosen.redraw:
         common.redraw(chosen.redraw, draw)
         return
@@ -256,7 +270,7 @@ def main() -> None:
     peers = () if chosen.no_peers else beside.available(plan.peers, chosen.peers_python)
     bare = beside.QUICK._replace(repeats=plan.repeats, lanes=0)
     models: dict[str, Any] = {}
-    for model in (*SHARED, *ALONE):
+    for model in chosen.models:
         runs = own_runs(model, plan)
         for peer in peers if model in SHARED else ():
             for steps in peer.only or plan.theirs:

@@ -39,6 +39,22 @@ def test_scaling(tmp_path):
     assert "exponent" in text
 
 
+def test_effects(tmp_path):
+    results, _ = _results("effects", tmp_path)
+    assert [run["effect"] for run in results["runs"]][:2] == ["base", "base without gravity"]
+    for run in results["runs"]:
+        assert run.keys() >= TIMES | {"over_base", "unknowns", "multipliers", "program"}
+
+
+def test_work_precision_of_one_scene_alone(tmp_path):
+    results, text = _results("work_precision", tmp_path, "--no-peers", "--models", "double_pendulum")
+    (found,) = results["models"].values()
+    assert {run["code"][-1] for run in found["runs"]} == {"2", "4", "6", "8", "0"}
+    for run in found["runs"]:
+        assert run.keys() >= TIMES | {"steps", "error", "drift"} and run["drift"] < 1e-11
+    assert "double_pendulum" in text
+
+
 def test_spacecraft_alone(tmp_path):
     results, text = _results("spacecraft", tmp_path, "--no-peers")
     assert set(results["models"]) == {"spacecraft", "open_tree"}
