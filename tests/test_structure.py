@@ -20,7 +20,7 @@ import natcoord_jax as nc
 from natcoord_jax.assembly.equations import prepare
 from natcoord_jax.assembly.reduced import ReducedStep
 from natcoord_jax.maths.collocation import gauss
-from natcoord_jax.stepping import one_kernel
+from natcoord_jax.stepping import rewriting
 from natcoord_jax.stepping.factorise import FACTORISATIONS, differentiable_solver
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -191,7 +191,7 @@ def test_program_size_does_not_grow_with_bodies(solver, monkeypatch):
 
     # Long sums are written as loops, a few lines each, see `test_program_size_of_large_scenes`.
     jax.clear_caches()
-    monkeypatch.setattr(one_kernel, "REDUCTION_LIMIT", np.inf)
+    monkeypatch.setattr(rewriting, "REDUCTION_LIMIT", np.inf)
     lines = sizes((8, 40))
     assert abs(lines[40] - lines[8]) <= 0.01 * lines[8], f"lines by number of arms: {lines}"
 
