@@ -1,0 +1,14 @@
+"""Notebooks are run as tests; those that compile much are slow ones."""
+
+import pytest
+
+SLOW = ("06", "07", "08", "09", "10")
+"""Numbers of the notebooks on optimal control and on accuracy: some forty seconds each."""
+
+
+@pytest.hookimpl(tryfirst=True)  # before tests are chosen by their marks
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the slow ones."""
+    for item in items:
+        if item.path.suffix == ".ipynb" and item.path.name.startswith(SLOW):
+            item.add_marker(pytest.mark.slow)
