@@ -183,8 +183,9 @@ def simulate(
         scheme: the scheme, by default that of order two.
         rtol: error that a substep may have, relative: steps are made in as few substeps as keep to it, of
             lengths found on the way. Inputs change at the ends of steps, states are saved there, and what
-            the scheme conserves is conserved. The error is that of any row (a position or a director) and of
-            its velocity, by comparison with a substep twice as long. None: as many substeps as steps.
+            the scheme conserves is conserved. The error is that of any row (a position or a director), with
+            kicks (from order four on) also that of its velocity, by comparison with a substep twice as long.
+            None: as many substeps as steps.
         atol: the same in metres (directors: 1; velocities: per second); as large as `rtol` by default.
             Derivatives hold the lengths of the substeps fixed.
 
