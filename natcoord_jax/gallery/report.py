@@ -117,7 +117,7 @@ def _number(value: float | None) -> str:
 def table(report: dict[str, Any]) -> str:
     """The report as aligned plain text."""
     r = report
-    most = f"a step, at most {r['newton_iterations_max']}"
+    most = f"a step in all attempts, at most {r['newton_iterations_max']} in one"
     parts = f"largest error, relative, of {r['momentum_components']} components"
     turns = f"largest error, relative, of {r['angular_momentum_components']} components"
     parts_made = f"{r['substeps_rejected']} attempts repeated in shorter ones"
