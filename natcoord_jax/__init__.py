@@ -5,7 +5,21 @@ from typing import TYPE_CHECKING, Any
 from natcoord_jax.analysis import Accuracy, Balance, accuracy, balance
 from natcoord_jax.assembly.posing import random_state
 from natcoord_jax.assembly.system import System
-from natcoord_jax.bodies import Box, Cylinder, Ellipsoid, PointMass, RigidBody, Sphere
+from natcoord_jax.bodies import (
+    Beam,
+    BeamHandle,
+    Box,
+    CircularSection,
+    Cylinder,
+    Ellipsoid,
+    PointMass,
+    RectangularSection,
+    RelativeMotion,
+    RigidBody,
+    Section,
+    Sphere,
+    TubularSection,
+)
 from natcoord_jax.control import (
     Check,
     Feedback,
@@ -32,11 +46,12 @@ from natcoord_jax.control import (
 from natcoord_jax.core.force import Field, Force, Load
 from natcoord_jax.core.handles import ground
 from natcoord_jax.core.joint import Frame, Joint
-from natcoord_jax.core.markers import Direction, Point
+from natcoord_jax.core.markers import Attachment, Direction, Point
 from natcoord_jax.core.potential import Potential
 from natcoord_jax.core.results import Result, SimulationError
 from natcoord_jax.core.state import State, Trajectory
 from natcoord_jax.effects.actuators import BodyForceInput, BodyTorqueInput, JointForce, JointTorque
+from natcoord_jax.effects.beams import BeamDamping, BeamElement, NonlinearBeamElement
 from natcoord_jax.effects.joints import (
     Coupling,
     Cylindrical,
@@ -74,12 +89,18 @@ if TYPE_CHECKING:
 __all__ = [
     "Accuracy",
     "Armature",
+    "Attachment",
     "Balance",
+    "Beam",
+    "BeamDamping",
+    "BeamElement",
+    "BeamHandle",
     "BodyForceInput",
     "BodyTorque",
     "BodyTorqueInput",
     "Box",
     "Check",
+    "CircularSection",
     "Coupling",
     "Cylinder",
     "Cylindrical",
@@ -88,8 +109,8 @@ __all__ = [
     "Distance",
     "Drive",
     "Ellipsoid",
-    "Feedback",
     "EnergyMomentum",
+    "Feedback",
     "Field",
     "Fixed",
     "Force",
@@ -104,6 +125,7 @@ __all__ = [
     "JointStops",
     "JointTorque",
     "Load",
+    "NonlinearBeamElement",
     "NonlinearSpring",
     "OptimalControl",
     "Outcome",
@@ -116,11 +138,14 @@ __all__ = [
     "Potential",
     "Prismatic",
     "QuadraticSpring",
+    "RectangularSection",
+    "RelativeMotion",
     "Result",
     "Revolute",
     "RigidBody",
     "Scene",
     "Screw",
+    "Section",
     "SimulationError",
     "Solution",
     "Sphere",
@@ -129,6 +154,7 @@ __all__ = [
     "State",
     "System",
     "Trajectory",
+    "TubularSection",
     "Universal",
     "accuracy",
     "animate",

@@ -16,6 +16,7 @@ from natcoord_jax.core.checks import is_concrete, numbers, require_double
 from natcoord_jax.core.effect import Effect, replace_fields
 from natcoord_jax.core.handles import Handle, ground
 from natcoord_jax.core.joint import Joint
+from natcoord_jax.core.recipe import Recipe
 from natcoord_jax.core.state import State
 from natcoord_jax.stepping.admissibility import (
     check_gaps,
@@ -48,15 +49,16 @@ class Scene:
         self.bodies: dict[str, Body] = {}
         self.joints: dict[str, Joint] = {}
         self.effects: dict[str, Effect] = {}
+        self.recipes: dict[str, Recipe] = {}
 
-    def add(self, part: Body | Joint | Effect) -> Handle:
-        """Add a body, a joint or another effect.
+    def add(self, part: Body | Joint | Effect | Recipe) -> Any:
+        """Add a body, a joint, another effect, or a recipe of several of them (a beam).
 
         Args:
             part: what to add.
 
         Returns:
-            The handle that joints, effects and sensors refer to it with.
+            The handle that joints, effects and sensors refer to it with; of a recipe, what it returns.
 
         Raises:
             ValueError: for a duplicate name, a part of another scene, or a joint of a body with itself.
@@ -68,12 +70,18 @@ class Scene:
             store, kind, label = self.joints, "joint", type(part).__name__.lower()
         elif isinstance(part, Effect):
             store, kind, label = self.effects, "effect", type(part).kind
+        elif isinstance(part, Recipe):
+            store, kind, label = self.recipes, "recipe", part.kind
         else:
-            raise ValueError(f"cannot add {part!r} to a scene; add bodies, joints and effects")
+            raise ValueError(f"cannot add {part!r} to a scene; add bodies, joints, effects and beams")
         given: str | None = getattr(part, "name", None)
         name = given or self._free_name(label)
-        if name in self.bodies or name in self.joints or name in self.effects or name == ground.name:
+        if name == ground.name or any(name in taken for taken in self._stores()):
             raise ValueError(f"the name {name!r} is taken in this scene; pass another `name`")
+        if isinstance(part, Recipe):
+            made = part.add_to(self, name)
+            store[name] = part
+            return made
         self._check(part, name)
         store[name] = part
         handle = Handle(kind, name, self._number)
@@ -82,10 +90,24 @@ class Scene:
                 self.add(companion)
         return handle
 
+    def _stores(self) -> tuple[dict[str, Any], ...]:
+        return self.bodies, self.joints, self.effects, self.recipes
+
     def _free_name(self, label: str) -> str:
-        taken = (self.bodies, self.joints, self.effects)
         numbered = (f"{label} {k}" for k in itertools.count(1))
-        return next(name for name in numbered if not any(name in store for store in taken))
+        return next(name for name in numbered if not any(name in store for store in self._stores()))
+
+    def add_mass(self, handle: Handle, block: Any) -> None:
+        """Add mass to a body: a mass block m (4, 4) (15) in its own frame [kg, kg m, kg m^2].
+
+        Raises:
+            ValueError: if the handle is no body of this scene.
+        """
+        body = self.find(handle, "added mass")
+        if not isinstance(body, Body):
+            raise ValueError(f"added mass: {handle!r} is no body that can carry mass")
+        block = numbers(block, (4, 4), f"body {handle.name!r}: added mass", "kg, kg m, kg m^2")
+        self.bodies[handle.name] = replace_fields(body, mass_block=body.mass_block + block)
 
     def _check(self, part: Body | Joint | Effect, name: str) -> None:
         """Every handle in the part must be of this scene."""

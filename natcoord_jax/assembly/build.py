@@ -1,5 +1,6 @@
 """Compilation: from named parts to a system and its initial state."""
 
+from itertools import pairwise
 from typing import Any
 
 import jax
@@ -21,7 +22,7 @@ from natcoord_jax.core.effect import Effect, replace_fields
 from natcoord_jax.core.force import Field
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.joint import Joint, frames_at
-from natcoord_jax.core.markers import Marker
+from natcoord_jax.core.markers import Attachment, Marker
 from natcoord_jax.core.state import State
 
 JOINT_FIELDS = ("parent", "child", "point", "axis", "second", "name", "parent_point")
@@ -38,15 +39,26 @@ def _edge(joint: Joint, poses: Poses) -> Edge:
     )
 
 
+def _couplings(effects: dict[str, Effect], poses: Poses) -> list[tuple[int, int]]:
+    """Pairs of neighbouring bodies of the effects that make neighbours of them."""
+    found = []
+    for effect in effects.values():
+        if effect.couples:
+            markers: Any = getattr(effect, "markers", ())
+            listed = [poses.of(m.body) for m in markers]
+            found += list(pairwise(listed))
+    return found
+
+
 class Layout:
     """Numbers of everything: bodies along the tree, joints with those of the tree first, channels."""
 
-    def __init__(self, bodies: dict[str, Body], joints: dict[str, Joint]):
+    def __init__(self, bodies: dict[str, Body], joints: dict[str, Joint], effects: dict[str, Effect]):
         self.bodies, self.joints = bodies, joints
         self.poses = Poses(bodies)
         self.names = list(joints)
         self.edges = [_edge(j, self.poses) for j in joints.values()]
-        self.spanning = spanning_tree(len(bodies), self.edges)
+        self.spanning = spanning_tree(len(bodies), self.edges, _couplings(effects, self.poses))
         self.body_number = {old: new for new, old in enumerate(self.spanning.order)}
         self.body_number[len(bodies)] = len(bodies)
         carriers = self.spanning.carrier
@@ -149,9 +161,13 @@ class Layout:
         markers = effect.attach(
             lambda handle: (self.joints[handle.name], joint_triad(self.joints[handle.name]))
         )
-        if not isinstance(markers, tuple | list) or not all(isinstance(m, Marker) for m in markers):
+        kinds = Marker, Attachment
+        if not isinstance(markers, tuple | list) or not any(
+            all(isinstance(m, kind) for m in markers) for kind in kinds
+        ):
             raise ValueError(
-                f"{label}: markers must be a tuple of nc.Point and nc.Direction, not {markers!r}"
+                f"{label}: markers must be a tuple of nc.Point and nc.Direction, or one of nc.Attachment, "
+                f"not {markers!r}"
             )
         weights = jnp.stack([self.poses.weights(m) for m in markers])
         drop = [f for f in ("markers", "name", "joint") if f in type(effect).__dataclass_fields__]
@@ -275,7 +291,7 @@ def build(
     bodies: dict[str, Body], joints: dict[str, Joint], effects: dict[str, Effect], solver: str | None
 ) -> tuple[System, State]:
     """Number bodies along the spanning tree, group equal kinds, and lay out the state."""
-    layout = Layout(bodies, joints)
+    layout = Layout(bodies, joints, effects)
     instances = [layout.effect_instance(name, effect) for name, effect in effects.items()]
     layout.number_accounts(instances)
     joint_groups = stack(layout.joint_instances(), len(bodies))

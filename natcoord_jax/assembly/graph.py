@@ -1,5 +1,7 @@
 """Spanning tree of the joints: which joint carries which body, and in which order bodies are numbered."""
 
+from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -44,22 +46,30 @@ class Spanning:
     parent: list[int]
 
 
-def spanning_tree(bodies: int, edges: list[Edge]) -> Spanning:
-    """Breadth-first tree from the ground, then from every body not yet reached.
+def spanning_tree(bodies: int, edges: list[Edge], couplings: Sequence[tuple[int, int]] = ()) -> Spanning:
+    """Tree from the ground along joints, then along couplings, then from bodies not yet reached.
 
     A joint goes into the tree only if it describes its free motion; what it is used for in reverse is
-    told, so that its frames can be exchanged. Free bodies that are nobody's child become roots first.
+    told, so that its frames can be exchanged. A coupling, an effect between two bodies that no joint
+    connects to the tree otherwise, makes one the parent of the other in all six motions: neighbours of a
+    beam follow each other along it. Free bodies that are nobody's child become roots first.
     """
     usable: list[list[tuple[int, int, bool]]] = [[] for _ in range(bodies + 1)]
     for number, edge in enumerate(edges):
         if edge.free:
             usable[edge.parent].append((number, edge.child, False))
             usable[edge.child].append((number, edge.parent, True))
+    coupled: list[list[int]] = [[] for _ in range(bodies + 1)]
+    for one, other in couplings:
+        coupled[one].append(other)
+        coupled[other].append(one)
     children = {edge.child for edge in edges if edge.free}
     roots = [b for b in range(bodies) if b not in children] + [b for b in range(bodies) if b in children]
     found: dict[int, tuple[int, bool, int, int]] = {}
+    waiting: deque[int] = deque()
 
     def grow(front: list[int], level: int) -> None:
+        waiting.extend(front)
         while front:
             following = []
             for body in front:
@@ -68,12 +78,25 @@ def spanning_tree(bodies: int, edges: list[Edge]) -> Spanning:
                         found[other] = (joint, backward, level, body)
                         following.append(other)
             front, level = following, level + 1
+            waiting.extend(front)
+
+    def along_couplings() -> None:
+        while waiting:
+            body = waiting.popleft()
+            level = found[body][2] + 1
+            for other in coupled[body]:
+                if other not in found and other != bodies:
+                    found[other] = (-1, False, level, body)
+                    grow([other], level + 1)
 
     grow([bodies], 0)
+    waiting.remove(bodies)
+    along_couplings()
     for root in roots:
         if root not in found:
             found[root] = (-1, False, 0, bodies)
             grow([root], 1)
+            along_couplings()
     order = sorted(found, key=lambda b: found[b][2])
     number = {body: i for i, body in enumerate(order)} | {bodies: bodies}
     entries = [found[b] for b in order]

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 from natcoord_jax.core.bodies import Body
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.joint import Joint
-from natcoord_jax.core.markers import Marker
+from natcoord_jax.core.markers import Attachment, Marker
 from natcoord_jax.maths.rotations import frame_from_axis
 
 
@@ -34,8 +34,13 @@ class Poses:
         """Weights of the direction along a world vector."""
         return jnp.concatenate([jnp.zeros(1), self.rotation[body].T @ jnp.asarray(vector, float)])
 
-    def weights(self, marker: Marker) -> Float[Array, "4"]:
-        """Weights of a marker."""
+    def weights(self, marker: Marker | Attachment) -> Float[Array, "*m 4"]:
+        """Weights of a marker: (4,) of a point or a direction, (4, 4) of an attachment."""
+        if isinstance(marker, Attachment):
+            point = Marker(marker.body, marker.point, True, marker.local)
+            axes = jnp.asarray(marker.axes, float).T
+            parts = [point, *(Marker(marker.body, axis, False, marker.local) for axis in axes)]
+            return jnp.stack([self.weights(part) for part in parts])
         vector = jnp.asarray(marker.vector, float)
         if marker.local:
             return jnp.concatenate([jnp.array([1.0 if marker.is_point else 0.0]), vector])

@@ -21,7 +21,7 @@ class Group(eqx.Module):
 
     Attributes:
         effect: the effect with stacked numbers.
-        weights: marker weights (n, k, 4) of effects on markers, else None.
+        weights: marker weights (n, k, 4), or (n, k, 4, 4) of attachments, of effects on markers, else None.
         bodies: bodies of each instance; the number of bodies stands for the ground.
         joints: joints of effects that sit on joints.
         inputs: input channels.
@@ -36,7 +36,7 @@ class Group(eqx.Module):
     """
 
     effect: Effect
-    weights: Float[Array, "n k 4"] | None
+    weights: Float[Array, "n k *m 4"] | None
     bodies: Int[Array | np.ndarray, "n k"]
     joints: Int[Array | np.ndarray, "n j"]
     inputs: Int[Array | np.ndarray, "n i"]

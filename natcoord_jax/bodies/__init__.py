@@ -1,7 +1,22 @@
 """Bodies: recipes that give rows and mass."""
 
+from natcoord_jax.bodies.beam import Beam as Beam
+from natcoord_jax.bodies.beam import BeamHandle as BeamHandle
+from natcoord_jax.bodies.interpolation import RelativeMotion as RelativeMotion
 from natcoord_jax.bodies.rigid import PointMass as PointMass
 from natcoord_jax.bodies.rigid import RigidBody as RigidBody
+from natcoord_jax.bodies.sections import (
+    CircularSection as CircularSection,
+)
+from natcoord_jax.bodies.sections import (
+    RectangularSection as RectangularSection,
+)
+from natcoord_jax.bodies.sections import (
+    Section as Section,
+)
+from natcoord_jax.bodies.sections import (
+    TubularSection as TubularSection,
+)
 from natcoord_jax.bodies.shapes import (
     Box as Box,
 )

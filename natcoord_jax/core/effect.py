@@ -98,6 +98,8 @@ class Effect(eqx.Module):
         works: whether its power enters the work account of the state (non-potential effects).
         stores: whether it stores potential energy.
         rotors: number of stored coordinate rates per instance.
+        couples: whether bodies of neighbouring markers become neighbours in the spanning tree where no joint
+            makes them so: elements of beams do, of which a chain then is a chain of bodies.
     """
 
     kind: ClassVar[str] = "effect"
@@ -107,6 +109,7 @@ class Effect(eqx.Module):
     works: ClassVar[bool] = False
     stores: ClassVar[bool] = False
     rotors: ClassVar[int] = 0
+    couples: ClassVar[bool] = False
 
     @abc.abstractmethod
     def respond(self, place: Array, motion: Motion, now: Now, lam: Float[Array, "s m"]) -> Response:

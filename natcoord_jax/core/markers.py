@@ -2,7 +2,7 @@
 
 The rows q_a of a body are its reference point and its three directors, so a point has weights
 (1, theta^1, theta^2, theta^3) (7) and a direction (0, c^1, c^2, c^3) (46). One effect class therefore
-joins whatever has rows: rigid bodies, the ground, later nodes of beams and shells.
+joins whatever has rows: rigid bodies, the ground, nodes of beams. An attachment is a point with a triad.
 """
 
 from typing import Any
@@ -58,3 +58,24 @@ def Direction(body: Handle, vector, *, local: bool = False) -> Marker:
         False
     """
     return Marker(body, vector, False, local)
+
+
+class Attachment(eqx.Module):
+    """A point with a triad, both fixed in a body, given in the assembled pose: four vectors in one marker.
+
+    Attributes:
+        body: handle of the body.
+        point: shape (3,) [m].
+        axes: shape (3, 3) [-], the triad as columns: a rotation matrix.
+        local: both in the body's reference frame instead of the world's.
+
+    Example:
+        >>> import natcoord_jax as nc
+        >>> import numpy as np
+        >>> clamp = nc.Attachment(nc.ground, (0, 0, 1), np.eye(3))
+    """
+
+    body: Handle = eqx.field(static=True)
+    point: Any
+    axes: Any
+    local: bool = eqx.field(static=True, default=False)

@@ -15,8 +15,10 @@ from natcoord_jax.core.joint import Joint
 from natcoord_jax.core.markers import Marker
 
 
-def place_markers(place: Float[Array, "k 4"], rows: Float[Array, "*s k 4 3"]) -> Float[Array, "*s k 3"]:
-    """Marker vectors x_k = sum_a w_ka q_a, one marker to a body slot."""
+def place_markers(place: Float[Array, "k *m 4"], rows: Float[Array, "*s k 4 3"]) -> Float[Array, "*out"]:
+    """Marker vectors x_k = sum_a w_ka q_a, one marker to a body slot; of attachments, four vectors each."""
+    if place.ndim == 3:
+        rows = rows[..., None, :, :]
     return jnp.sum(place[..., None] * rows, axis=-2)
 
 
@@ -27,7 +29,8 @@ class Potential(Effect):
     rotated (and, for points, moved) together: then energy, momentum and angular momentum are kept exactly.
 
     Attributes:
-        markers: points and directions the energy depends on, in the order `invariants` receives them.
+        markers: points and directions, or attachments, that the energy depends on, in the order
+            `invariants` receives them: a point or a direction as (3,), an attachment as (4, 3).
         name: optional name.
 
     Class attributes:
@@ -56,7 +59,7 @@ class Potential(Effect):
         return self.markers
 
     @abc.abstractmethod
-    def invariants(self, x: Float[Array, "k 3"]) -> Float[Array, " p"]:
+    def invariants(self, x: Float[Array, "k *m 3"]) -> Float[Array, " p"]:
         """Invariants of the marker vectors, at most quadratic."""
 
     @abc.abstractmethod
@@ -78,18 +81,20 @@ class Potential(Effect):
 
 
 def marker_response(
-    place: Float[Array, "k 4"],
-    forces: Float[Array, "s k 3"] | None,
+    place: Float[Array, "k *m 4"],
+    forces: Float[Array, "s k *m 3"] | None,
     torques: Float[Array, "s k 3"] | None,
-    rates: Float[Array, "s k 3"],
+    rates: Float[Array, "s k *m 3"],
     motion: Motion,
 ) -> Response:
     """Response of forces [N] on markers and torques [N m] on their bodies."""
     stages = rates.shape[0]
     power, on_rows = jnp.zeros(stages, rates.dtype), None
     if forces is not None:
-        power = power + jnp.sum(forces * rates, axis=(-1, -2))
-        on_rows = place[:, :, None] * forces[:, :, None, :]
+        power = power + jnp.sum(forces * rates, axis=tuple(range(1, forces.ndim)))
+        on_rows = place[..., None] * forces[..., None, :]
+        if place.ndim == 3:
+            on_rows = jnp.sum(on_rows, axis=-3)
     if torques is not None:
         power = power + jnp.sum(torques * motion.spin, axis=(-1, -2))
     return Response(on_rows, torques, jnp.zeros((stages, 0)), power)

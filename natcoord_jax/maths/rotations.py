@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from natcoord_jax.maths.vectors import dot, safe_divide, safe_norm, skew
+from natcoord_jax.maths.vectors import cross, dot, safe_divide, safe_norm, skew
 
 
 def from_quaternion(quaternion: Float[Array, "4"]) -> Float[Array, "3 3"]:
@@ -100,3 +100,37 @@ def angular_velocity(
 ) -> Float[Array, "*batch 3"]:
     """World angular velocity [rad/s] of orthonormal directors (rows) with rates: 1/2 sum d_i x v_i (39)."""
     return 0.5 * jnp.sum(jnp.cross(directors, rates), axis=-2)
+
+
+def _arctan_coefficients(x: Float[Array, "*shape"]) -> tuple[Array, Array]:
+    """A = atan(sqrt x) / sqrt x and b = (1 - a) / (4 x), smooth at zero, where they are 1 and 1/12."""
+    small = x < 0.02
+    guarded = jnp.where(small, 1.0, x)
+    root = jnp.sqrt(guarded)
+    far = jnp.arctan(root) / root
+    near = jnp.where(small, x, 0.0)
+    # 4 b = 1/3 - x/5 + x^2/7 - ..., a = 1 - 4 b x; eight terms leave less than 1e-16 at the limit.
+    series = jnp.zeros_like(x)
+    for n in range(8, 0, -1):
+        series = 1 / (2 * n + 1) - near * series
+    return jnp.where(small, 1 - near * series, far), 0.25 * jnp.where(small, series, (1 - far) / guarded)
+
+
+def logarithm_of_motion(
+    rotation: Float[Array, "3 3"], place: Float[Array, "3"]
+) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+    """Logarithm of a rigid motion: rotation vector [rad] and T(rotation vector)^-1 place [m].
+
+    Smooth for rotations of less than half a turn, at zero too. Defined for matrices near rotations as well:
+    through k = 2 tan(angle/2) n = 2 axial(R - R^T) / (1 + tr R), without square roots near zero.
+
+    Args:
+        rotation: R.
+        place: in the frame that R turns from.
+    """
+    r = rotation
+    axial = jnp.stack([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])
+    k = safe_divide(2.0 * axial, (1.0 + r[0, 0] + r[1, 1] + r[2, 2])[None])
+    a, b = _arctan_coefficients(0.25 * jnp.sum(k * k))
+    across = cross(k, place)
+    return a * k, place - 0.5 * a * across + b * cross(k, across)

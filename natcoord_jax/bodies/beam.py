@@ -1,0 +1,196 @@
+"""Beams: nodes with three directors, elements between them, and what they are attached to."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from natcoord_jax.bodies.interpolation import Interpolation, Material, RelativeMotion, apart
+from natcoord_jax.bodies.reference_curve import ReferenceCurve, node_fractions, reference_curve
+from natcoord_jax.bodies.sections import Section
+from natcoord_jax.core.bodies import Body
+from natcoord_jax.core.checks import is_concrete, numbers, require_double
+from natcoord_jax.core.handles import Handle
+from natcoord_jax.core.markers import Attachment
+from natcoord_jax.core.recipe import Builder, Recipe, pose_of
+
+FIT = 1e-9
+"""Largest distance between a fraction and its node."""
+
+
+@dataclass(frozen=True)
+class BeamHandle:
+    """A reference to a beam in a scene.
+
+    Attributes:
+        name: of the beam.
+        nodes: handles of its nodes, in order: bodies like any other, for joints, loads, springs and sensors.
+            An attached end is the body it is attached to.
+        fractions: of the length, where the nodes are.
+        elements: handles of its elements.
+    """
+
+    name: str
+    nodes: tuple[Handle, ...]
+    fractions: tuple[float, ...]
+    elements: tuple[Handle, ...]
+
+    @property
+    def start(self) -> Handle:
+        """The first node."""
+        return self.nodes[0]
+
+    @property
+    def end(self) -> Handle:
+        """The last node."""
+        return self.nodes[-1]
+
+    def at(self, fraction: float) -> Handle:
+        """The node at a fraction of the length.
+
+        Raises:
+            ValueError: if there is none, with the remedy.
+        """
+        gaps = np.abs(np.asarray(self.fractions) - fraction)
+        nearest = int(np.argmin(gaps))
+        if gaps[nearest] > FIT:
+            raise ValueError(
+                f"beam {self.name!r} has no node at the fraction {fraction} [-] of its length; the nearest is "
+                f"at {self.fractions[nearest]:.6g}: pass stations=({fraction},) to nc.Beam"
+            )
+        return self.nodes[nearest]
+
+
+class Beam(Recipe):
+    """Geometrically exact beam (Simo-Reissner) along a curve, unstressed as it is given.
+
+    Attributes:
+        section: `Section`, d_1 and d_2 across, d_3 along the tangent.
+        curve: points (k, 3) [m] that straight lines join, or a function of arc length [m] to position.
+        elements: number of elements; stations may add some.
+        length: [m], of a curve given as a function.
+        second: where d_1 points at the start, as far as it is perpendicular to the tangent [-].
+        twist: angle by which the section is turned about the tangent at the end [rad], growing linearly, or
+            a function of arc length.
+        start: handle of a body, or `ground`, that the first node is rigidly part of; None: a node of its own.
+        end: the same of the last node.
+        stations: fractions of the length at which nodes are wanted, to attach something to.
+        damping: time t [s] of internal damping C_v = t C (Kelvin-Voigt); None: none.
+        law: energy per length [J/m] as a function of the strains (6,), on top of the section's; None: none.
+        interpolation: how it is made of elements; default `RelativeMotion()`.
+        velocity: of the start [m/s].
+        angular_velocity: of the beam as a rigid body [rad/s].
+        name: unique name; nodes are called "name/node 0", elements "name/element 0" and so on.
+
+    Example:
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import natcoord_jax as nc
+        >>> scene = nc.Scene()
+        >>> rope = nc.CircularSection(radius=0.01, E=1e6, density=1000.0)
+        >>> cable = scene.add(nc.Beam(rope, [(0, 0, 0), (1, 0, 0)], elements=4, start=nc.ground))
+        >>> gravity = scene.add(nc.Gravity())
+        >>> system, state = scene.compile()
+        >>> system.structure.dofs
+        24
+    """
+
+    section: Section
+    curve: Any
+    elements: int = eqx.field(static=True)
+    length: Any = eqx.field(default=None, kw_only=True)
+    second: Any = eqx.field(default=None, kw_only=True)
+    twist: Any = eqx.field(default=0.0, kw_only=True)
+    start: Any = eqx.field(default=None, kw_only=True)
+    end: Any = eqx.field(default=None, kw_only=True)
+    stations: Sequence[float] = eqx.field(default=(), kw_only=True)
+    damping: Any = eqx.field(default=None, kw_only=True)
+    law: Any = eqx.field(default=None, kw_only=True)
+    interpolation: Interpolation = eqx.field(default=RelativeMotion(), kw_only=True)
+    velocity: Any = eqx.field(default=(0.0, 0.0, 0.0), kw_only=True)
+    angular_velocity: Any = eqx.field(default=(0.0, 0.0, 0.0), kw_only=True)
+    name: str | None = eqx.field(default=None, kw_only=True, static=True)
+
+    kind = "beam"
+
+    def add_to(self, scene: Builder, name: str) -> BeamHandle:
+        """Add nodes and elements.
+
+        Raises:
+            ValueError: for single precision, or for contradicting data, by name.
+        """
+        label = f"beam {name!r}"
+        require_double(label)
+        if not isinstance(self.section, Section):
+            raise ValueError(
+                f"{label}: section is {self.section!r}; pass nc.Section, nc.CircularSection, ..."
+            )
+        ends = node_fractions(self.elements, self.stations, label)
+        fractions, spans = self.interpolation.refine(ends)
+        curve = reference_curve(self.curve, fractions, self.length, self.second, self.twist, label)
+        lumps = self.interpolation.lumps(curve.arc, spans)
+        nodes = self._nodes(scene, curve, lumps, name, label)
+        places = zip(nodes, apart(curve.points, len(nodes)), apart(curve.frames, len(nodes)))
+        attachments = [Attachment(*place) for place in places]
+        material = Material(self.section, self.law, self._damping(label))
+        elements, others = self.interpolation.effects(material, attachments, curve, spans, name)
+        handles = tuple(scene.add(element) for element in elements)
+        for effect in others:
+            scene.add(effect)
+        return BeamHandle(name, tuple(nodes), tuple(float(x) for x in fractions), handles)
+
+    def _damping(self, label: str) -> Any:
+        if self.damping is None:
+            return None
+        time = numbers(self.damping, (), f"{label}: damping", "s")
+        if is_concrete(time) and float(time) < 0:
+            raise ValueError(f"{label}: damping [s] is {float(time):g}; pass a time that is not negative")
+        return time
+
+    def _nodes(
+        self, scene: Builder, curve: ReferenceCurve, lumps: Array, name: str, label: str
+    ) -> list[Handle]:
+        """Nodes of the beam's own, and the bodies that the ends are part of."""
+        count = len(lumps)
+        blocks = lumps[:, None, None] * self.section.lump(jnp.ones(()))
+        spin = numbers(self.angular_velocity, (3,), f"{label}: angular_velocity", "rad/s")
+        drift = numbers(self.velocity, (3,), f"{label}: velocity", "m/s")
+        velocities = drift + jnp.cross(spin[None], curve.points - curve.points[0])
+        columns = (blocks, curve.points, curve.frames, velocities)
+        held = {0: self.start, count - 1: self.end}
+        nodes = []
+        for i, (block, point, frame, velocity) in enumerate(zip(*(apart(x, count) for x in columns))):
+            holder = held.get(i)
+            if holder is None:
+                node = Body(block, point, frame, velocity, spin, True, None, f"{name}/node {i}")
+                nodes.append(scene.add(node))
+            else:
+                nodes.append(_hold(scene, holder, block, point, frame, label))
+        return nodes
+
+
+def _hold(
+    scene: Builder,
+    holder: Handle,
+    block: Float[Array, "4 4"],
+    point: Float[Array, "3"],
+    frame: Float[Array, "3 3"],
+    label: str,
+) -> Handle:
+    """The body that an end is rigidly part of, now with the mass of the end."""
+    body = pose_of(scene, holder, label)
+    if body is None:
+        return holder
+    if not body.oriented:
+        raise ValueError(
+            f"{label}: an end cannot be rigidly part of the point mass {holder.name!r}, which has no "
+            "orientation; join the end node to it by nc.Spherical"
+        )
+    turned = body.rotation.T @ frame
+    weights = jnp.zeros((4, 4)).at[0, 0].set(1.0).at[1:, 1:].set(turned.T)
+    weights = weights.at[0, 1:].set(body.rotation.T @ (point - body.position))
+    scene.add_mass(holder, weights.T @ block @ weights)
+    return holder

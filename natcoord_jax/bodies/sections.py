@@ -1,0 +1,210 @@
+"""Cross-sections of beams: stiffness and inertia per length, from shapes or from numbers.
+
+Axes: d_1 and d_2 span the section, d_3 is the tangent. Strains are (Gamma_1, Gamma_2, Gamma_3, K_1, K_2, K_3):
+shear along d_1 and d_2, stretch, bending about d_1 and d_2, torsion.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from natcoord_jax.core.checks import is_concrete, numbers, positive, require_double
+
+
+class Section(eqx.Module):
+    """A cross-section by its numbers.
+
+    Attributes:
+        stiffness: C, shape (6, 6) [N, N m, N m^2].
+        inertia: integrals of density times (1, theta^1, theta^2) products, shape (3, 3)
+            [kg/m, kg, kg m]: mass per length, first and second moments; the second moment M^11 of theta^1 is
+            the inertia about d_2.
+        outline: points of the rim in the section, shape (n, 2) [m], for pictures.
+
+    Example:
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import natcoord_jax as nc
+        >>> section = nc.Section.of_numbers(EA=1e4, GA=1e4, EI=100.0, GJ=100.0, density=1.0, rotary=10.0)
+        >>> [float(x) for x in section.stiffness.diagonal()]
+        [10000.0, 10000.0, 10000.0, 100.0, 100.0, 100.0]
+    """
+
+    stiffness: Float[Array, "6 6"]
+    inertia: Float[Array, "3 3"]
+    outline: Any = None
+
+    @classmethod
+    def of_numbers(
+        cls,
+        *,
+        EA: Any,
+        GA: Any,
+        EI: Any,
+        GJ: Any,
+        density: Any,
+        rotary: Any = 0.0,
+        centre: Any = (0.0, 0.0),
+        outline: Any = None,
+    ) -> "Section":
+        """Section from its stiffnesses.
+
+        Args:
+            EA: along d_3 [N].
+            GA: along d_1 and d_2 [N], shear coefficients included; one number for both.
+            EI: about d_1 and d_2 [N m^2]; one number for both.
+            GJ: about d_3 [N m^2].
+            density: mass per length [kg/m].
+            rotary: inertia per length about d_1 and d_2 through the centre of mass [kg m]; one number for
+                both. That about d_3 is their sum.
+            centre: centre of mass in the section (theta^1, theta^2) [m].
+            outline: rim of the section (n, 2) [m], for pictures.
+
+        Raises:
+            ValueError: for a stiffness or density that is not positive, or a negative rotary inertia.
+        """
+        require_double("section")
+        shear, bending = (_pair(v, f"section: {n}", u) for v, n, u in ((GA, "GA", "N"), (EI, "EI", "N m^2")))
+        stretch, torsion = positive(EA, "section: EA", "N"), positive(GJ, "section: GJ", "N m^2")
+        stiffness = jnp.diag(jnp.concatenate([shear, stretch[None], bending, torsion[None]]))
+        mass = positive(density, "section: density", "kg/m")
+        about = numbers(jnp.broadcast_to(jnp.asarray(rotary, float), (2,)), (2,), "section: rotary", "kg m")
+        if is_concrete(about) and np.any(np.asarray(about) < 0):
+            raise ValueError(f"section: rotary [kg m] is {np.asarray(about)}; pass no negative inertia")
+        offset = numbers(centre, (2,), "section: centre", "m")
+        second = jnp.diag(about[::-1]) + mass * jnp.outer(offset, offset)
+        first = mass * offset
+        inertia = jnp.block([[mass[None, None], first[None]], [first[:, None], second]])
+        return cls(stiffness, inertia, outline)
+
+    @classmethod
+    def of_axis_along_first(cls, stiffness: Any, inertia: Any, outline: Any = None) -> "Section":
+        """Section from data with axis 1 along the beam and axes 2 and 3 across, as many codes have them.
+
+        The axes (1, 2, 3) of the data are d_3, d_1, d_2 here: a cyclic exchange, which keeps hands.
+
+        Args:
+            stiffness: shape (6, 6), for (stretch, shear 2, shear 3, torsion, bending 2, bending 3).
+            inertia: shape (3, 3), for (1, x_2, x_3) [kg/m, kg, kg m].
+        """
+        given = numbers(stiffness, (6, 6), "section: stiffness", "N, N m, N m^2")
+        places = np.array([1, 2, 0, 4, 5, 3])
+        return cls(
+            given[np.ix_(places, places)], numbers(inertia, (3, 3), "section: inertia", "kg m"), outline
+        )
+
+    def lump(self, length: Float[Array, ""]) -> Float[Array, "4 4"]:
+        """Mass block (15) of a node that carries a length [m] of the beam; d_3 is massless."""
+        return jnp.zeros((4, 4)).at[:3, :3].set(length * self.inertia)
+
+
+def _pair(value: Any, what: str, unit: str) -> Float[Array, "2"]:
+    pair = numbers(jnp.broadcast_to(jnp.asarray(value, float), (2,)), (2,), what, unit)
+    if is_concrete(pair) and not np.all(np.asarray(pair) > 0):
+        raise ValueError(f"{what} [{unit}] is {np.asarray(pair)}; pass positive numbers")
+    return pair
+
+
+def _elastic(
+    area: Array,
+    second: Array,
+    torsion: Array,
+    shear: Array,
+    young: Any,
+    poisson: Any,
+    density: Any,
+    outline: Any,
+) -> Section:
+    young, density = positive(young, "section: E", "Pa"), positive(density, "section: density", "kg/m^3")
+    poisson = jnp.asarray(poisson, float)
+    rigidity = young / (2 * (1 + poisson))
+    return Section.of_numbers(
+        EA=young * area,
+        GA=shear * rigidity * area,
+        EI=young * second,
+        GJ=rigidity * torsion,
+        density=density * area,
+        rotary=density * second,
+        outline=outline,
+    )
+
+
+def _ellipse(first: Any, second: Any, points: int = 24) -> Array:
+    angle = jnp.linspace(0.0, 2 * jnp.pi, points, endpoint=False)
+    return jnp.stack([first * jnp.cos(angle), second * jnp.sin(angle)], axis=1)
+
+
+def CircularSection(*, radius: Any, E: Any, nu: Any = 0.3, density: Any, shear: Any = None) -> Section:
+    """Full circle.
+
+    Args:
+        radius: [m].
+        E: Young's modulus [Pa].
+        nu: Poisson's ratio [-].
+        density: [kg/m^3].
+        shear: shear coefficient [-]; default 6 (1 + nu) / (7 + 6 nu) (Cowper 1966).
+
+    Raises:
+        ValueError: for numbers that are not positive.
+
+    Example:
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import natcoord_jax as nc
+        >>> rope = nc.CircularSection(radius=0.01, E=1e6, density=1000.0)
+    """
+    require_double("section")
+    r, nu = positive(radius, "section: radius", "m"), jnp.asarray(nu, float)
+    area, second = jnp.pi * r**2, jnp.pi * r**4 / 4
+    k = 6 * (1 + nu) / (7 + 6 * nu) if shear is None else jnp.asarray(shear, float)
+    return _elastic(area, second, 2 * second, k, E, nu, density, _ellipse(r, r))
+
+
+def TubularSection(
+    *, radius: Any, thickness: Any, E: Any, nu: Any = 0.3, density: Any, shear: Any = None
+) -> Section:
+    """Circular tube of outer `radius` and wall `thickness` [m]; otherwise as `CircularSection`.
+
+    The default shear coefficient is Cowper's, 6 (1 + nu)(1 + m^2)^2 / ((7 + 6 nu)(1 + m^2)^2 + (20 + 12 nu) m^2)
+    with the ratio m of inner and outer radius.
+
+    Raises:
+        ValueError: for numbers that are not positive, or a wall thicker than the radius.
+    """
+    require_double("section")
+    r, t = positive(radius, "section: radius", "m"), positive(thickness, "section: thickness", "m")
+    if is_concrete(r, t) and float(t) > float(r):
+        raise ValueError(f"section: thickness [m] is {float(t):g}, more than the radius {float(r):g}")
+    inner, nu = r - t, jnp.asarray(nu, float)
+    ratio = (inner / r) ** 2
+    area, second = jnp.pi * (r**2 - inner**2), jnp.pi * (r**4 - inner**4) / 4
+    part = (1 + ratio) ** 2
+    cowper = 6 * (1 + nu) * part / ((7 + 6 * nu) * part + (20 + 12 * nu) * ratio)
+    k = cowper if shear is None else jnp.asarray(shear, float)
+    return _elastic(area, second, 2 * second, k, E, nu, density, _ellipse(r, r))
+
+
+def RectangularSection(
+    *, width: Any, height: Any, E: Any, nu: Any = 0.3, density: Any, shear: Any = None
+) -> Section:
+    """Rectangle, `width` along d_1 and `height` along d_2 [m]; otherwise as `CircularSection`.
+
+    The default shear coefficient is 10 (1 + nu) / (12 + 11 nu) (Cowper 1966); torsion is Saint-Venant's
+    series.
+
+    Raises:
+        ValueError: for numbers that are not positive.
+    """
+    require_double("section")
+    b, h = positive(width, "section: width", "m"), positive(height, "section: height", "m")
+    nu = jnp.asarray(nu, float)
+    area = b * h
+    second = jnp.stack([b * h**3, b**3 * h]) / 12
+    long, short = jnp.maximum(b, h), jnp.minimum(b, h)
+    odd = jnp.arange(1.0, 40.0, 2.0)
+    series = jnp.sum(jnp.tanh(0.5 * odd * jnp.pi * long / short) / odd**5)
+    torsion = long * short**3 / 3 * (1 - 192 / jnp.pi**5 * short / long * series)
+    k = 10 * (1 + nu) / (12 + 11 * nu) if shear is None else jnp.asarray(shear, float)
+    corners = jnp.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
+    return _elastic(area, second, torsion, k, E, nu, density, 0.5 * corners * jnp.stack([b, h]))

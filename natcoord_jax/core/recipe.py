@@ -1,0 +1,48 @@
+"""Recipes: parts of a scene that consist of several bodies, joints and effects."""
+
+import abc
+from typing import Any, Protocol
+
+import equinox as eqx
+from jaxtyping import Array, Float
+
+from natcoord_jax.core.bodies import Body
+from natcoord_jax.core.handles import Handle
+
+
+class Builder(Protocol):
+    """What a recipe may do to the scene that it is added to."""
+
+    def add(self, part: Any) -> Any:
+        """Add a part; its handle."""
+        ...
+
+    def find(self, handle: Handle, user: str = ...) -> Any:
+        """The part behind a handle; None for the ground."""
+        ...
+
+    def add_mass(self, handle: Handle, block: Float[Array, "4 4"]) -> None:
+        """Add a mass block (15), in the body's own frame, to that of a body."""
+        ...
+
+
+class Recipe(eqx.Module):
+    """Base of parts that add bodies, joints and effects to a scene."""
+
+    kind = "recipe"
+
+    @abc.abstractmethod
+    def add_to(self, scene: Builder, name: str) -> Any:
+        """Add everything under names that start with `name`; returns what refers to it."""
+
+
+def pose_of(scene: Builder, handle: Handle, user: str) -> Body | None:
+    """The body behind a handle, None for the ground.
+
+    Raises:
+        ValueError: for a handle of another scene or of something else.
+    """
+    part = scene.find(handle, user)
+    if part is not None and not isinstance(part, Body):
+        raise ValueError(f"{user}: {handle!r} is no body; pass the handle of a body or nc.ground")
+    return part
