@@ -169,8 +169,14 @@ class FullStep(eqx.Module):
         found = local(self.system.mass, self.start[:-1], self.velocity, twists, self.h, self.tableau)
         return found.reshape(self.bodies, width, width)
 
-    def jacobian(self, y: Float[Array, " unknowns"]) -> Float[Array, "unknowns unknowns"]:
-        """Exact Jacobian, assembled from local ones."""
+    def tangent(self, y: Float[Array, " unknowns"]) -> Float[Array, "unknowns unknowns"]:
+        """The Jacobian nearly, from linearised effects: what Newton's iteration needs."""
+        return self.jacobian(y, exact=False)
+
+    def jacobian(
+        self, y: Float[Array, " unknowns"], *, exact: bool = True
+    ) -> Float[Array, "unknowns unknowns"]:
+        """Jacobian, assembled from local ones."""
         twists, multipliers = self.split(project_multipliers(y, self.balances, self.outset.projector))
         s, bodies, size = self.tableau.stages, self.bodies, self.unknowns
         width = 6 * s
@@ -181,7 +187,13 @@ class FullStep(eqx.Module):
         every = self._with_ground(twists)
         for group, where, lam, (first, _) in zip(self.groups, self.situations, multipliers, self._blocks()):
             (by_twist, by_lam), (g_by_twist, _) = jacobians(
-                group, where, self.tableau, self.start[group.bodies], every[group.bodies], lam
+                group,
+                where,
+                self.tableau,
+                self.start[group.bodies],
+                every[group.bodies],
+                lam,
+                exact=exact,
             )
             n, k = group.bodies.shape
             m = s * group.multipliers

@@ -76,11 +76,25 @@ def effect_balance(
 
 
 def jacobians(
-    group: Group, where: Situation, tableau: Tableau, start: Array, twists: Array, lam: Array
+    group: Group,
+    where: Situation,
+    tableau: Tableau,
+    start: Array,
+    twists: Array,
+    lam: Array,
+    *,
+    exact: bool = True,
 ) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-    """Derivatives of `effect_balance` by twists and multipliers, of all instances; leading axis n."""
+    """Derivatives of `effect_balance` by twists and multipliers, of all instances; leading axis n.
+
+    With `exact` False, those of what effects give for their linearisation.
+    """
 
     def one(effect, place, inputs, coordinates, rates, start, twists, lam):
+        if not exact:
+            now = Now(where.t, where.h, inputs, coordinates, rates, tableau)
+            effect = effect.linearised(place, body_motion(start, twists, where.h, tableau), now, lam)
+
         def f(twists, lam):
             return effect_balance(
                 group, effect, place, inputs, coordinates, rates, start, twists, lam, where, tableau

@@ -86,6 +86,10 @@ class Projection(eqx.Module):
         """That of the step."""
         return self.step.jacobian(y)
 
+    def tangent(self, y: Float[Array, " unknowns"]) -> Array:
+        """The same."""
+        return self.step.jacobian(y)
+
     def inertias(self, matrix: Float[Array, "unknowns unknowns"]) -> Float[Array, " balances"]:
         """Inertias of the rates."""
         return jnp.abs(jnp.diagonal(matrix))[: self.balances]

@@ -64,8 +64,8 @@ class RecursiveStep(ReducedStep):
         through = load_nodes(tree, geometry, force, torque)
         return unknowns_of_slots(tree, level, on_slots(level, geometry, through))
 
-    def jacobian(self, y: Float[Array, " unknowns"]) -> Blocks:
-        """Blocks A, (X, Z), (T, S) and N of the exact Jacobian, see `linsolve.tree`."""
+    def jacobian(self, y: Float[Array, " unknowns"], *, exact: bool = True) -> Blocks:
+        """Blocks A, (X, Z), (T, S) and N of the Jacobian, see `linsolve.tree`."""
         tree, level = self.system.tree, united(self.system.tree)
         w, multipliers = self.split(y)
         motion, geometry = self.motion(w)
@@ -84,9 +84,13 @@ class RecursiveStep(ReducedStep):
             self.h,
             self.tableau,
         )
-        return self._with_effects(at, multipliers, joints)
+        return self._with_effects(at, multipliers, joints, exact)
 
-    def _with_effects(self, at: Stations, multipliers: list[Array], joints: tuple) -> Blocks:
+    def tangent(self, y: Float[Array, " unknowns"]) -> Blocks:
+        """The Jacobian nearly, from linearised effects: what Newton's iteration needs."""
+        return self.jacobian(y, exact=False)
+
+    def _with_effects(self, at: Stations, multipliers: list[Array], joints: tuple, exact: bool) -> Blocks:
         """Blocks with those of bodies and effects, and with the multipliers of each node."""
         twists = jnp.concatenate([at.rates[:, :, 0], at.spin], axis=-1)
         own, every = self._own(twists[:, :-1]), jnp.moveaxis(twists, 0, 1)
@@ -97,7 +101,7 @@ class RecursiveStep(ReducedStep):
             if group.source == "mass":
                 continue
             (by_twist, by_lam), (g_by_twist, _) = jacobians(
-                group, where, self.tableau, at.start[group.bodies], every[group.bodies], lam
+                group, where, self.tableau, at.start[group.bodies], every[group.bodies], lam, exact=exact
             )
             places = seated(group.bodies, own.shape[0])
             both, upward, downward, above = by_place(by_twist, places)

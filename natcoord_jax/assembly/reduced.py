@@ -225,6 +225,10 @@ class ReducedStep(eqx.Module):
         """Exact Jacobian of the residual."""
         return jax.jacfwd(lambda x: self.residual(x)[0])(y)
 
+    def tangent(self, y: Float[Array, " unknowns"]) -> Any:
+        """What Newton's iteration takes for the Jacobian where it does not form it by differences."""
+        return self.jacobian(y)
+
     def inertial_jacobian(self) -> Float[Array, "unknowns unknowns"]:
         """Jacobian for steps of length zero: inertia and constraints at the start, one stage like the other.
 

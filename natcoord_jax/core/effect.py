@@ -122,6 +122,14 @@ class Effect(eqx.Module):
             lam: its multipliers times the step [N s or N m s].
         """
 
+    def linearised(self, place: Array, motion: Motion, now: Now, lam: Float[Array, "s m"]) -> Any:
+        """Something with a `respond` that is nearly this effect's, and nearly its derivative, at this motion.
+
+        Newton's iteration takes its Jacobian from it; an effect that is expensive to differentiate can
+        answer with something cheaper.
+        """
+        return self
+
     def stored(
         self,
         place: Array,

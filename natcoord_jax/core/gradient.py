@@ -7,8 +7,11 @@ balance; what remains for other energies is removed along the increment, as in G
 only while it exceeds round-off: there is no quotient near rest, hence no wrong second derivative.
 """
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.maths.collocation import Tableau, invariant_quadrature
@@ -18,7 +21,12 @@ LEAST = 1e-12
 
 
 def averaged_gradient(
-    energy, start: Float[Array, " p"], steps: Float[Array, "s p"], tableau: Tableau, degree: int | None
+    energy: Callable[[Float[Array, " p"]], Float[Array, ""]],
+    start: Float[Array, " p"],
+    steps: Float[Array, "s p"],
+    tableau: Tableau,
+    degree: int | None,
+    points: int | None = None,
 ) -> Float[Array, "s p"]:
     """Gradients S_i [J per unit of invariant] with sum_i b_i S_i . steps_i = E(end) - E(start).
 
@@ -28,10 +36,12 @@ def averaged_gradient(
         steps: h times their rates at the stages.
         tableau: the collocation method.
         degree: polynomial degree of `energy`, or None if it is no polynomial.
+        points: of the quadrature if it is no polynomial; default two more than twice the stages.
     """
-    points = (
-        2 + 2 * tableau.stages if degree is None else max(tableau.stages, -(-degree * tableau.stages // 2))
-    )
+    if degree is not None:
+        points = max(tableau.stages, -(-degree * tableau.stages // 2))
+    elif points is None:
+        points = 2 + 2 * tableau.stages
     integrals, averages = invariant_quadrature(tableau.stages, points)
     path = start + jnp.asarray(integrals) @ steps
     gradient = jnp.asarray(averages) @ jax.vmap(jax.grad(energy))(path)
@@ -52,3 +62,9 @@ def averaged_gradient(
     relevant = (jnp.abs(missing) > noise) & (measure > LEAST**2)
     factor = jnp.where(relevant, missing / jnp.where(relevant, measure, 1.0), 0.0)
     return gradient + factor * steps / scale**2
+
+
+def averaged_coupling(stages: int) -> np.ndarray:
+    """How the averaged gradients of an energy of constant curvature H follow the steps: H (coupling steps)."""
+    integrals, averages = invariant_quadrature(stages, 2 * stages)
+    return averages @ integrals

@@ -4,12 +4,13 @@ import abc
 from collections.abc import Callable
 from typing import Any, ClassVar
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from natcoord_jax.core.effect import Effect, Motion, Now, Response
-from natcoord_jax.core.gradient import averaged_gradient
+from natcoord_jax.core.gradient import averaged_coupling, averaged_gradient
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.joint import Joint
 from natcoord_jax.core.markers import Marker
@@ -35,6 +36,8 @@ class Potential(Effect):
 
     Class attributes:
         degree: polynomial degree of `energy` in the invariants, if it is a polynomial; saves work.
+        points: of the quadrature along a step, if it is none; more make the force a better average, energy is
+            exact with any number. Default: two more than twice the stages.
 
     Example:
         >>> import natcoord_jax as nc
@@ -53,6 +56,7 @@ class Potential(Effect):
     kind: ClassVar[str] = "potential"
     stores: ClassVar[bool] = True
     degree: ClassVar[int | None] = None
+    points: ClassVar[int | None] = None
 
     def attach(self, find: Callable[[Handle], tuple[Joint, Array]]) -> tuple[Marker, ...]:
         """Markers of the effect; effects on a joint look it up with `find`: handle to (joint, triad)."""
@@ -66,18 +70,72 @@ class Potential(Effect):
     def energy(self, invariants: Float[Array, " p"]) -> Float[Array, ""]:
         """Energy [J]."""
 
+    def curvature(self, invariants: Float[Array, " p"]) -> Float[Array, "p p"]:
+        """Second derivatives of the energy by the invariants; for Newton's Jacobian."""
+        return jax.hessian(self.energy)(invariants)
+
     def respond(self, place: Array, motion: Motion, now: Now, lam: Array) -> Response:
         """Forces -D pi(Q_i)^T S_i with the averaged gradients S_i."""
         start = self.invariants(place_markers(place, motion.start))
-        x, rates = place_markers(place, motion.rows), place_markers(place, motion.rates)
-        steps = jax.vmap(lambda xi, vi: jax.jvp(self.invariants, (xi,), (vi,))[1])(x, now.h * rates)
-        gradient = averaged_gradient(self.energy, start, steps, now.tableau, self.degree)
-        forces = jax.vmap(lambda xi, gi: jax.vjp(self.invariants, xi)[1](-gi)[0])(x, gradient)
-        return marker_response(place, forces, None, rates, motion)
+
+        def gradient(steps: Float[Array, "s p"]) -> Float[Array, "s p"]:
+            return averaged_gradient(self.energy, start, steps, now.tableau, self.degree, self.points)
+
+        return _response(self, gradient, place, motion, now)
+
+    def linearised(self, place: Array, motion: Motion, now: Now, lam: Array) -> "LinearisedPotential":
+        """The potential with gradients that are linear in the steps of the invariants."""
+        start = self.invariants(place_markers(place, motion.start))
+        steps = _steps(self, place, motion, now)
+        gradient = averaged_gradient(self.energy, start, steps, now.tableau, self.degree, self.points)
+        middle = start + 0.5 * jnp.asarray(now.tableau.b) @ steps
+        return LinearisedPotential(self, steps, gradient, self.curvature(middle))
 
     def stored(self, place: Array, rows: Array, coordinates: Array, rates: Array) -> Array:
         """Energy [J]."""
         return self.energy(self.invariants(place_markers(place, rows)))
+
+
+class LinearisedPotential(eqx.Module):
+    """A potential near one motion, see `Effect.linearised`.
+
+    Attributes:
+        potential: it gives the invariants.
+        steps: of the invariants at that motion.
+        gradient: averaged gradients there.
+        curvature: second derivatives of the energy at the middle of the step.
+    """
+
+    potential: Potential
+    steps: Float[Array, "s p"]
+    gradient: Float[Array, "s p"]
+    curvature: Float[Array, "p p"]
+
+    def respond(self, place: Array, motion: Motion, now: Now, lam: Array) -> Response:
+        """The response with linear gradients."""
+        coupling = averaged_coupling(now.tableau.stages)
+
+        def gradient(steps: Float[Array, "s p"]) -> Float[Array, "s p"]:
+            moved = coupling @ (steps - self.steps)
+            return self.gradient + jnp.sum(self.curvature * moved[:, None], axis=-1)
+
+        return _response(self.potential, gradient, place, motion, now)
+
+
+def _steps(potential: Potential, place: Array, motion: Motion, now: Now) -> Float[Array, "s p"]:
+    """Step times the rates of the invariants at the stages."""
+    x, rates = place_markers(place, motion.rows), place_markers(place, motion.rates)
+    return jax.vmap(lambda xi, vi: jax.jvp(potential.invariants, (xi,), (vi,))[1])(x, now.h * rates)
+
+
+def _response(
+    potential: Potential, gradient: Callable[[Array], Array], place: Array, motion: Motion, now: Now
+) -> Response:
+    """Forces -D pi(Q_i)^T S_i with gradients S_i, a function of the steps of the invariants."""
+    x, rates = place_markers(place, motion.rows), place_markers(place, motion.rates)
+    given = gradient(_steps(potential, place, motion, now))
+    forces = jax.vmap(lambda xi, gi: jax.vjp(potential.invariants, xi)[1](-gi)[0])(x, given)
+    return marker_response(place, forces, None, rates, motion)
 
 
 def marker_response(

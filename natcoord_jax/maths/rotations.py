@@ -117,20 +117,19 @@ def _arctan_coefficients(x: Float[Array, "*shape"]) -> tuple[Array, Array]:
 
 
 def logarithm_of_motion(
-    rotation: Float[Array, "3 3"], place: Float[Array, "3"]
+    axial: Float[Array, "3"], trace: Float[Array, ""], place: Float[Array, "3"]
 ) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
-    """Logarithm of a rigid motion: rotation vector [rad] and T(rotation vector)^-1 place [m].
+    """Logarithm of a rigid motion: rotation vector psi [rad] and T(psi)^-1 place [m].
 
     Smooth for rotations of less than half a turn, at zero too. Defined for matrices near rotations as well:
-    through k = 2 tan(angle/2) n = 2 axial(R - R^T) / (1 + tr R), without square roots near zero.
+    through k = 2 tan(angle/2) n = 2 axial / (1 + trace), without square roots near zero.
 
     Args:
-        rotation: R.
+        axial: (R_32 - R_23, R_13 - R_31, R_21 - R_12) of the rotation R.
+        trace: of R.
         place: in the frame that R turns from.
     """
-    r = rotation
-    axial = jnp.stack([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])
-    k = safe_divide(2.0 * axial, (1.0 + r[0, 0] + r[1, 1] + r[2, 2])[None])
+    k = safe_divide(2.0 * axial, (1.0 + trace)[None])
     a, b = _arctan_coefficients(0.25 * jnp.sum(k * k))
     across = cross(k, place)
     return a * k, place - 0.5 * a * across + b * cross(k, across)

@@ -261,7 +261,7 @@ class Rule:
             equations = prepare(system, slot.before, u, slot.fraction * dt, self.tableau)
             form = system.structure.solver
             if form not in BY_DIFFERENCES:
-                return factors_of(equations, form, equations.jacobian(slot.y))
+                return factors_of(equations, form, equations.tangent(slot.y))
             return factors_of(equations, form, jacobian_by_differences(equations, slot.y))
 
         return jnp.array(False), kernel(renewed, numbers, slot), carry[2].refreshed()

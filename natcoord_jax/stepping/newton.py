@@ -158,7 +158,7 @@ def begin(y: Float[Array, " unknowns"], few: bool = False) -> Iterate:
 def no_factors(equations: Any, form: str) -> Factors:
     """The shapes of factors, and none usable."""
     y = equations.guess()
-    shapes = jax.eval_shape(lambda y: FACTORISATIONS[form](equations, equations.jacobian(y)), y)
+    shapes = jax.eval_shape(lambda y: FACTORISATIONS[form](equations, equations.tangent(y)), y)
     solver, inertias = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
     return Factors(solver, inertias, jnp.array(False), jnp.array(False), jnp.array(0))
 
@@ -252,7 +252,7 @@ def newton(equations: Any, tolerance: float, form: str) -> tuple[Float[Array, " 
     """Solve equations from their own guess, with their Jacobian formed anew whenever it is needed.
 
     Args:
-        equations: with `guess`, `residual` and `jacobian`.
+        equations: with `guess`, `residual` and `tangent`.
         tolerance: see `TOLERANCE`.
         form: form of the equations, which decides the factorisation.
 
@@ -261,7 +261,7 @@ def newton(equations: Any, tolerance: float, form: str) -> tuple[Float[Array, " 
     """
 
     def renew(it: Iterate, factors: Factors) -> tuple[Iterate, Factors]:
-        return refreshed(it), factors_of(equations, form, equations.jacobian(it.y))
+        return refreshed(it), factors_of(equations, form, equations.tangent(it.y))
 
     def keep(it: Iterate, factors: Factors) -> tuple[Iterate, Factors]:
         return it, factors

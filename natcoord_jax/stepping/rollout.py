@@ -119,7 +119,7 @@ def _trip(setting: Setting, unpack: Callable[[Array], State], carried: Carried) 
 
     def renewed(carry: tuple) -> tuple:
         _, it, _ = carry
-        matrix = equations.jacobian(it.y) if probe is None else probe.columns[:-1].T
+        matrix = equations.tangent(it.y) if probe is None else probe.columns[:-1].T
         return jnp.array(False), refreshed(it), factors_of(equations, setting.form, matrix)
 
     _, it, factors = jax.lax.while_loop(lambda carry: carry[0], renewed, (wanting, after.it, factors))

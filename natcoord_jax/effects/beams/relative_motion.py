@@ -1,7 +1,7 @@
 """The two-node beam element: strains from the relative motion of its end frames.
 
-The frames (x, d_1, d_2, d_3) at both ends, d_3 along the tangent, give twelve invariants, all quadratic and
-frame-indifferent: the relative rotation R_ij = d_i^A . d_j^B and the relative place s_i = d_i^A . (x^B - x^A).
+The frames (x, d_1, d_2, d_3) at both ends, d_3 along the tangent, give invariants that are quadratic and
+frame-indifferent: of the relative rotation R_ij = d_i^A . d_j^B and the relative place d_i^A . (x^B - x^A).
 Their logarithm as a rigid motion is the strain of a piece of constant strain (a helix), so that pure
 bending, torsion, stretch and shear are exact with any number of elements and none of them locks another.
 """
@@ -19,21 +19,27 @@ from natcoord_jax.core.potential import Potential
 from natcoord_jax.maths.rotations import logarithm_of_motion
 
 
-def relative_motion(x: Float[Array, "2 4 3"]) -> Float[Array, "12"]:
-    """Relative rotation R_ij = d_i^A . d_j^B, row by row, and place s_i = d_i^A . (x^B - x^A) [m]."""
+def relative_motion(x: Float[Array, "2 4 3"]) -> Float[Array, "7"]:
+    """Of the relative rotation R_ij = d_i^A . d_j^B the axial part 2 sin(angle) n and the trace, and the place.
+
+    The place is s_i = d_i^A . (x^B - x^A) [m].
+    """
     first, second = x[0], x[1]
-    rotation = jnp.sum(first[1:, None] * second[None, 1:], axis=-1)
+    # The axial part is that of the sum of cross products, sum_i d_i^A x d_i^B, in the axes of the first frame.
+    turned = jnp.sum(first[1:, None] * second[None, 1:], axis=-1)
+    axial = jnp.stack([turned[2, 1] - turned[1, 2], turned[0, 2] - turned[2, 0], turned[1, 0] - turned[0, 1]])
+    trace = turned[0, 0] + turned[1, 1] + turned[2, 2]
     place = jnp.sum(first[1:] * (second[0] - first[0]), axis=-1)
-    return jnp.concatenate([rotation.reshape(-1), place])
+    return jnp.concatenate([axial, trace[None], place])
 
 
-def strains_of(invariants: Float[Array, "12"], length: Float[Array, ""]) -> Float[Array, "6"]:
+def strains_of(invariants: Float[Array, "7"], length: Float[Array, ""]) -> Float[Array, "6"]:
     """Stretch and shear (1 + strain along d_3) [-] and curvature [1/m] from the relative motion.
 
     From the helicoidal interpolation of Sonneville, Cardona & Bruls, Geometrically exact beam finite element
     formulated on the special Euclidean group SE(3) (2014), written in invariants.
     """
-    turn, shift = logarithm_of_motion(invariants[:9].reshape(3, 3), invariants[9:])
+    turn, shift = logarithm_of_motion(invariants[:3], invariants[3], invariants[4:])
     return jnp.concatenate([shift, turn]) / length
 
 
@@ -65,7 +71,7 @@ class BeamElement(Potential):
         """Relative rotation [-] and place [m] of the second frame in the first."""
         return relative_motion(x)
 
-    def strains(self, invariants: Float[Array, "12"]) -> Float[Array, "6"]:
+    def strains(self, invariants: Float[Array, "7"]) -> Float[Array, "6"]:
         """Strains Gamma [-] and K [1/m], zero in the unstressed shape."""
         return strains_of(invariants, self.length) - self.reference
 
