@@ -59,8 +59,8 @@ class BeamHandle:
         nearest = int(np.argmin(gaps))
         if gaps[nearest] > FIT:
             raise ValueError(
-                f"beam {self.name!r} has no node at the fraction {fraction} [-] of its length; the nearest is "
-                f"at {self.fractions[nearest]:.6g}: pass stations=({fraction},) to nc.Beam"
+                f"beam {self.name!r} has no node at the fraction {fraction} [-] of its length; the nearest "
+                f"is at {self.fractions[nearest]:.6g}: pass stations=({fraction},) to nc.Beam"
             )
         return self.nodes[nearest]
 

@@ -1,4 +1,4 @@
-"""How a beam is made of elements: which nodes they join, what inertia the nodes carry, which effects they are."""
+"""How a beam is made of elements: which nodes they join, what inertia nodes carry, which effects they are."""
 
 import abc
 from collections.abc import Sequence

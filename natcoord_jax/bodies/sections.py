@@ -1,7 +1,7 @@
 """Cross-sections of beams: stiffness and inertia per length, from shapes or from numbers.
 
-Axes: d_1 and d_2 span the section, d_3 is the tangent. Strains are (Gamma_1, Gamma_2, Gamma_3, K_1, K_2, K_3):
-shear along d_1 and d_2, stretch, bending about d_1 and d_2, torsion.
+Axes: d_1 and d_2 span the section, d_3 is the tangent. The strains (Gamma_1, Gamma_2, Gamma_3, K_1, K_2, K_3)
+are shear along d_1 and d_2, stretch, bending about d_1 and d_2, torsion.
 """
 
 from typing import Any
@@ -88,6 +88,7 @@ class Section(eqx.Module):
         Args:
             stiffness: shape (6, 6), for (stretch, shear 2, shear 3, torsion, bending 2, bending 3).
             inertia: shape (3, 3), for (1, x_2, x_3) [kg/m, kg, kg m].
+            outline: rim of the section (n, 2) [m], for pictures.
         """
         given = numbers(stiffness, (6, 6), "section: stiffness", "N, N m, N m^2")
         places = np.array([1, 2, 0, 4, 5, 3])
@@ -166,8 +167,8 @@ def TubularSection(
 ) -> Section:
     """Circular tube of outer `radius` and wall `thickness` [m]; otherwise as `CircularSection`.
 
-    The default shear coefficient is Cowper's, 6 (1 + nu)(1 + m^2)^2 / ((7 + 6 nu)(1 + m^2)^2 + (20 + 12 nu) m^2)
-    with the ratio m of inner and outer radius.
+    The default shear coefficient is Cowper's (1966), 6 (1 + nu) p / ((7 + 6 nu) p + (20 + 12 nu) m^2) with
+    p = (1 + m^2)^2 and the ratio m of inner and outer radius.
 
     Raises:
         ValueError: for numbers that are not positive, or a wall thicker than the radius.

@@ -65,6 +65,6 @@ def averaged_gradient(
 
 
 def averaged_coupling(stages: int) -> np.ndarray:
-    """How the averaged gradients of an energy of constant curvature H follow the steps: H (coupling steps)."""
+    """How averaged gradients of an energy of constant curvature H follow the steps: H (coupling steps)."""
     integrals, averages = invariant_quadrature(stages, 2 * stages)
     return averages @ integrals

@@ -20,12 +20,11 @@ from natcoord_jax.maths.rotations import logarithm_of_motion
 
 
 def relative_motion(x: Float[Array, "2 4 3"]) -> Float[Array, "7"]:
-    """Of the relative rotation R_ij = d_i^A . d_j^B the axial part 2 sin(angle) n and the trace, and the place.
+    """Relative rotation and place of two frames.
 
-    The place is s_i = d_i^A . (x^B - x^A) [m].
+    Of R_ij = d_i^A . d_j^B the axial part 2 sin(angle) n and the trace, and s_i = d_i^A . (x^B - x^A) [m].
     """
     first, second = x[0], x[1]
-    # The axial part is that of the sum of cross products, sum_i d_i^A x d_i^B, in the axes of the first frame.
     turned = jnp.sum(first[1:, None] * second[None, 1:], axis=-1)
     axial = jnp.stack([turned[2, 1] - turned[1, 2], turned[0, 2] - turned[2, 0], turned[1, 0] - turned[0, 1]])
     trace = turned[0, 0] + turned[1, 1] + turned[2, 2]
@@ -56,8 +55,9 @@ class BeamElement(Potential):
     Example:
         >>> import natcoord_jax as nc
         >>> import numpy as np
-        >>> ends = nc.Attachment(nc.ground, (0, 0, 0), np.eye(3)), nc.Attachment(nc.ground, (0, 0, 1), np.eye(3))
-        >>> element = nc.BeamElement(ends, length=1.0, stiffness=np.diag([1e4, 1e4, 1e5, 10.0, 10.0, 8.0]))
+        >>> ends = [nc.Attachment(nc.ground, (0, 0, z), np.eye(3)) for z in (0.0, 1.0)]
+        >>> stiffness = np.diag([1e4, 1e4, 1e5, 10.0, 10.0, 8.0])
+        >>> element = nc.BeamElement(ends, length=1.0, stiffness=stiffness)
     """
 
     length: Any = eqx.field(kw_only=True)
