@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING, Any
 
-from natcoord_jax.analysis import Accuracy, Balance, accuracy, balance
+from natcoord_jax.analysis import Accuracy, Balance, Equilibrium, accuracy, balance, equilibrium
 from natcoord_jax.assembly.posing import random_state
 from natcoord_jax.assembly.system import System
 from natcoord_jax.bodies import (
@@ -109,6 +109,7 @@ __all__ = [
     "Distance",
     "Drive",
     "Ellipsoid",
+    "Equilibrium",
     "EnergyMomentum",
     "Feedback",
     "Field",
@@ -164,6 +165,7 @@ __all__ = [
     "check",
     "cost",
     "descend",
+    "equilibrium",
     "goal",
     "ground",
     "inputs",

@@ -3,4 +3,6 @@
 from natcoord_jax.analysis.accuracy import Accuracy, accuracy
 from natcoord_jax.analysis.balance import Balance, balance
 
-__all__ = ["Accuracy", "Balance", "accuracy", "balance"]
+from natcoord_jax.analysis.statics import Equilibrium, equilibrium
+
+__all__ = ["Accuracy", "Balance", "Equilibrium", "accuracy", "balance", "equilibrium"]

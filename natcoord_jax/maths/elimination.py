@@ -2,11 +2,14 @@
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 LOOPED = 48
 """Largest size for elimination written as a loop of rank-one updates, which compiles into one kernel and runs
-in lanes when batched; a call of LAPACK does neither, but wins for large matrices."""
+in lanes when batched; products of blocks do neither, but win for large matrices."""
+
+BLOCK = 32
+"""Columns that are eliminated together in a large matrix."""
 
 
 def definite_inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
@@ -44,10 +47,14 @@ def inverse_cholesky(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
 
 def pivoted_inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """Inverse of any regular matrix, by elimination with row pivoting."""
+    """Inverse of any regular matrix, by elimination with row pivoting.
+
+    Without calls of LAPACK at any size: XLA's CPU backend makes one function of loops that it finds small
+    (more of them where it has a single core), and then cannot compile such calls.
+    """
     size = matrix.shape[-1]
     if size > LOOPED:
-        return jnp.linalg.inv(matrix)
+        return _inverse_by_blocks(matrix)
     number = jnp.arange(size)
 
     def eliminate(k: Array, both: Array) -> Array:
@@ -61,3 +68,49 @@ def pivoted_inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
     unit = jnp.eye(size, dtype=matrix.dtype)
     return jax.lax.fori_loop(0, size, eliminate, jnp.concatenate([matrix, unit], axis=1))[:, size:]
+
+
+def _pivots(panel: Float[Array, "n b"], first: Array) -> Int[Array, " n"]:
+    """Order of the rows that brings the pivots of some columns to the rows from `first` on."""
+    number = jnp.arange(panel.shape[0])
+
+    def eliminate(j: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
+        panel, order = carry
+        k = first + j
+        best = jnp.argmax(jnp.where(number < k, -1.0, jnp.abs(panel[:, j])))
+        swapped = jnp.where(number == k, best, jnp.where(number == best, k, number))
+        panel, order = panel[swapped], order[swapped]
+        factors = jnp.where(number > k, panel[:, j] / panel[k, j], 0.0)
+        return panel - factors[:, None] * panel[k][None, :], order
+
+    return jax.lax.fori_loop(0, panel.shape[1], eliminate, (panel, number))[1]
+
+
+def _inverse_by_blocks(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """Inverse in place by Gauss-Jordan elimination, a block of columns at a time."""
+    size = matrix.shape[0]
+    padded = -(-size // BLOCK) * BLOCK
+    extra = padded - size
+    matrix = jnp.pad(matrix, ((0, extra), (0, extra))) + jnp.diag(
+        jnp.concatenate([jnp.zeros(size, matrix.dtype), jnp.ones(extra, matrix.dtype)])
+    )
+    number = jnp.arange(padded)
+
+    def eliminate(block: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
+        matrix, order = carry
+        first = block * BLOCK
+        moved = _pivots(jax.lax.dynamic_slice_in_dim(matrix, first, BLOCK, 1), first)
+        matrix, order = matrix[moved], order[moved]
+        columns = jax.lax.dynamic_slice_in_dim(matrix, first, BLOCK, 1)
+        rows = jax.lax.dynamic_slice_in_dim(matrix, first, BLOCK, 0)
+        inverse = pivoted_inverse(jax.lax.dynamic_slice_in_dim(columns, first, BLOCK, 0))
+        inside = (number >= first) & (number < first + BLOCK)
+        rows = inverse @ jnp.where(inside[None, :], 0.0, rows)
+        rows = jax.lax.dynamic_update_slice_in_dim(rows, inverse, first, 1)
+        others = jnp.where(inside[:, None], 0.0, columns)
+        kept = jnp.where(inside[None, :], 0.0, matrix)
+        matrix = jax.lax.dynamic_update_slice_in_dim(kept - others @ rows, rows, first, 0)
+        return matrix, order
+
+    found, order = jax.lax.fori_loop(0, padded // BLOCK, eliminate, (matrix, number))
+    return jnp.zeros_like(found).at[:, order].set(found)[:size, :size]

@@ -38,7 +38,7 @@ def _solve_jvp(make: Any, primals: tuple, tangents: tuple):
     return (y, code), (y_dot, jnp.zeros(code.shape, jax.dtypes.float0))
 
 
-def _coordinates(system: System, state: State) -> Array:
+def nearest_coordinates(system: System, state: State) -> Array:
     """Joint coordinates of the positions, each angle taken in the turn nearest to the stored one."""
     values = coordinate_values(system, rows_with_ground(state.q))
     for group in system.coordinates:
@@ -55,7 +55,7 @@ def _assembled(system: System, state: State) -> tuple[State, Array]:
     state = replace_fields(state, q=squared)
     y, code = _solve(Projection.of_positions, system, state)
     state = replace_fields(state, q=state.q + Projection.of_positions(system, state).moved(y))
-    state = replace_fields(state, coordinates=_coordinates(system, state))
+    state = replace_fields(state, coordinates=nearest_coordinates(system, state))
     w, rate_code = _solve(Projection.of_velocities, system, state)
     state = replace_fields(state, v=Projection.of_velocities(system, state).moved(w))
     return replace_fields(state, rates=_rotor_rates(system, state)), jnp.maximum(code, rate_code)

@@ -1,0 +1,167 @@
+"""The equations of equilibrium: no resultant force or torque on any body, no gap in any joint.
+
+Unknowns are the displacements and rotations of all bodies (six a body, Cayley's vectors) from a given
+configuration, and the multipliers of all joints and of relations between coordinates. The time of the state
+is the parameter of the load: forces, drives and inputs that are functions of time follow it.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from natcoord_jax.assembly.balances import loads
+from natcoord_jax.assembly.diagnostics import joint_residuals
+from natcoord_jax.assembly.full import FullStep
+from natcoord_jax.assembly.local import body_motion
+from natcoord_jax.assembly.momentum import wrench
+from natcoord_jax.assembly.node_sweeps import sweep_nodes
+from natcoord_jax.assembly.outset import Outset
+from natcoord_jax.assembly.rates import row_rates
+from natcoord_jax.assembly.response import gather, respond, situation, stations
+from natcoord_jax.assembly.system import Group, System
+from natcoord_jax.assembly.tree import gather_slots, start_rates
+from natcoord_jax.core.effect import replace_fields
+from natcoord_jax.core.state import State
+from natcoord_jax.maths.collocation import gauss
+from natcoord_jax.maths.elimination import pivoted_inverse
+from natcoord_jax.stepping.assemble import nearest_coordinates
+
+NO_MASS = 1e-30
+"""Factor on masses that leaves them no weight in the equations, but tells bodies from point masses."""
+
+SHIFT = 1e-10
+"""Compliance given to constraints, relative to that of the structure: redundant ones share their load."""
+
+
+class Static(eqx.Module):
+    """Equations of equilibrium near one configuration.
+
+    Attributes:
+        system: compiled system.
+        state: the configuration that displacements count from; its time is the load parameter.
+        inputs: [N, N m].
+    """
+
+    system: System
+    state: State
+    inputs: Float[Array, " inputs"]
+
+    @property
+    def balances(self) -> int:
+        """Number of balances: three of forces and three of torques a body."""
+        return 6 * len(self.system.structure.bodies)
+
+    @property
+    def groups(self) -> tuple[Group, ...]:
+        """Groups with multipliers, relations between coordinates first."""
+        return tuple(g for g in (*self.system.effects, *self.system.joints) if g.multipliers)
+
+    @property
+    def unknowns(self) -> int:
+        """Number of unknowns."""
+        return self.balances + sum(g.count * g.multipliers for g in self.groups)
+
+    def displaced(self, y: Float[Array, " unknowns"]) -> State:
+        """The state at rest after the displacements in `y`."""
+        rows = self.state.q.reshape(-1, 4, 3)
+        twists = y[: self.balances].reshape(-1, 1, 6)
+        return self._at(rows + body_motion(rows, twists, jnp.ones((), rows.dtype), gauss(1)).rates[0])
+
+    def moved_along_tree(self, y: Float[Array, " unknowns"]) -> State:
+        """The same to first order, but every body is carried along by its parent in the tree.
+
+        Neighbours that turn far together stay together, so that Newton's method does not stretch a stiff
+        beam that it bends; the joints of the tree stay closed.
+        """
+        system, rows = self.system, self.state.q.reshape(-1, 4, 3)
+        velocity, spin = jnp.split(y[: self.balances].reshape(-1, 6), 2, axis=1)
+        tree, frames, h = system.tree, system.tree.frames(system.frames), jnp.ones((), rows.dtype)
+        w = start_rates(tree, frames, rows, row_rates(rows, velocity, spin))[None]
+        motion, _ = sweep_nodes(tree, frames, rows, gather_slots(tree, w), h, gauss(1))
+        points = rows[:, 0] + 0.5 * motion.velocity
+        at = stations(rows, points, motion.directors, motion.velocity, motion.spin)
+        return self._at(rows + at.rates[0, :-1])
+
+    def _at(self, rows: Float[Array, "bodies 4 3"]) -> State:
+        still = {name: jnp.zeros_like(getattr(self.state, name)) for name in ("v", "rates")}
+        state = replace_fields(self.state, q=rows.reshape(-1, 3), **still)
+        return replace_fields(state, coordinates=nearest_coordinates(self.system, state))
+
+    def residual(self, y: Float[Array, " unknowns"]) -> Float[Array, " unknowns"]:
+        """Unbalanced forces [N] and torques [N m], with opposite sign, and gaps [m, -]."""
+        state = self.displaced(y)
+        rows = state.q.reshape(-1, 4, 3)
+        still = jnp.zeros_like(rows[:, 0])
+        force, torque = loads(self.system, state, self.inputs, still, still)
+        pulled = self._constraint_loads(state, y)
+        sums = -(jnp.concatenate([force, torque], axis=1) + jnp.concatenate(pulled, axis=1))
+        # The directors of a point mass are held where they are.
+        sums = sums.at[:, 3:].add(
+            jnp.where(self._massless[:, None], y[: self.balances].reshape(-1, 6)[:, 3:], 0.0)
+        )
+        return jnp.concatenate([sums.reshape(-1), self._gaps(state)])
+
+    @property
+    def _massless(self) -> Array:
+        return jnp.trace(self.system.mass[:, 1:, 1:], axis1=1, axis2=2) <= 0
+
+    def _constraint_loads(self, state: State, y: Array) -> tuple[Array, Array]:
+        """Forces and torques of the multipliers on all bodies."""
+        rows, tableau = state.q.reshape(-1, 4, 3), gauss(1)
+        still = jnp.zeros((1, rows.shape[0], 3), rows.dtype)
+        at = stations(rows, rows[None, :, 0], rows[None, :, 1:], still, still)
+        on_rows = jnp.zeros((rows.shape[0] + 1, 4, 3), rows.dtype)
+        torques = jnp.zeros((rows.shape[0] + 1, 3), rows.dtype)
+        position = self.balances
+        for group in self.groups:
+            size = group.count * group.multipliers
+            lam = y[position : position + size].reshape(group.count, 1, group.multipliers)
+            position += size
+            where = situation(self.system, group, state, self.inputs, jnp.zeros((), rows.dtype))
+            answer = respond(group, where, gather(group, at), lam, tableau)
+            if answer.forces is not None:
+                on_rows = on_rows.at[group.bodies].add(answer.forces[:, 0])
+            if answer.torques is not None:
+                torques = torques.at[group.bodies].add(answer.torques[:, 0])
+        force, torque = wrench(on_rows[None, :-1], rows[None, :, 1:])
+        return force[0], torque[0] + torques[:-1]
+
+    def _gaps(self, state: State) -> Array:
+        """What relations between coordinates and joints miss."""
+        found = [jnp.zeros(0, state.q.dtype)]
+        for group in self.system.effects:
+            if group.multipliers:
+
+                def missing(effect, index):
+                    return effect.coefficients() @ state.coordinates[index] - effect.target(state.t)
+
+                found.append(jax.vmap(missing)(group.effect, group.coordinates).reshape(-1))
+        found += [value.reshape(-1) for _, value, _ in joint_residuals(self.system, state)]
+        return jnp.concatenate(found)
+
+    def matrix(self, y: Float[Array, " unknowns"]) -> Float[Array, "unknowns unknowns"]:
+        """Jacobian of the residual at displacements zero, assembled from those of single effects.
+
+        It is that of a step of the body system without mass: a step's forces are those of its middle, which
+        moves by half the displacement.
+        """
+        system = replace_fields(self.system, mass=NO_MASS * self.system.mass)
+        resting = self.displaced(jnp.zeros_like(y))
+        step = FullStep.prepare(
+            system, resting, self.inputs, jnp.ones((), y.dtype), gauss(1), Outset(None, None)
+        )
+        # Times of a step of length one, shifted to that of the load.
+        situations = tuple(eqx.tree_at(lambda s: s.t, where, where.t - 0.5) for where in step.situations)
+        step = eqx.tree_at(lambda s: s.situations, step, situations)
+        matrix = step.jacobian(y.at[: self.balances].set(0.0), exact=False)
+        return matrix.at[: self.balances, : self.balances].multiply(2.0)
+
+    def inverse(self, y: Float[Array, " unknowns"]) -> Float[Array, "unknowns unknowns"]:
+        """Inverse of the matrix, slightly regularised."""
+        matrix, count = self.matrix(y), self.balances
+        stiffness = jnp.max(jnp.abs(jnp.diagonal(matrix)[:count]), initial=0.0)
+        arms = jnp.max(jnp.abs(matrix[count:, :count]), initial=1e-300)
+        shift = SHIFT * arms**2 / jnp.where(stiffness > 0, stiffness, 1.0)
+        diagonal = jnp.where(jnp.arange(matrix.shape[0]) < count, 0.0, shift)
+        return pivoted_inverse(matrix + jnp.diag(diagonal))

@@ -1,0 +1,222 @@
+"""Equilibrium under loads: by steps of the load, or along its path through limit points."""
+
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from natcoord_jax.analysis.static_equations import Static
+from natcoord_jax.assembly.system import System
+from natcoord_jax.core.checks import is_concrete
+from natcoord_jax.core.effect import replace_fields
+from natcoord_jax.core.results import REASONS, Result, SimulationError
+from natcoord_jax.core.state import State
+
+ITERATIONS = 40
+"""Newton iterations for one load."""
+
+LARGEST_TURN = 0.5
+"""Largest Cayley vector of a body in one iteration: about one radian."""
+
+TOLERANCE = 1e-11
+"""Last correction, relative to the extent of the system and to one radian; the error is its square."""
+
+FLOOR = 1e-7
+"""Corrections that stop shrinking below this have reached the floor of round-off of a stiff system."""
+
+
+class Equilibrium(eqx.Module):
+    """Configurations of equilibrium at a series of loads.
+
+    Attributes:
+        states: at rest, leading axis the loads; `states.t` is the load parameter.
+        multipliers: of relations between coordinates and of all joints [N, N m], by load.
+        result: result code (see `nc.Result`), by load.
+        iterations: of Newton's method, by load.
+    """
+
+    states: State
+    multipliers: Float[Array, "loads m"]
+    result: Int[Array, " loads"]
+    iterations: Int[Array, " loads"]
+
+    @property
+    def state(self) -> State:
+        """The last state."""
+        return jax.tree.map(lambda x: x[-1], self.states)
+
+
+class _Search(eqx.Module):
+    """Where Newton's iteration stands."""
+
+    state: State
+    lam: Array
+    correction: Array
+    count: Array
+    done: Array
+    finite: Array
+
+
+def _extent(system: System, state: State) -> Array:
+    """Size of the system with the ground's origin [m]; never zero."""
+    points = jnp.max(jnp.abs(state.q.reshape(-1, 4, 3)[:, 0]), initial=0.0)
+    moment = jnp.sum(jnp.trace(system.mass[:, 1:, 1:], axis1=1, axis2=2)) / jnp.sum(system.mass[:, 0, 0])
+    return points + jnp.where(moment > 0, jnp.sqrt(jnp.where(moment > 0, moment, 1.0)), 1e-300)
+
+
+def _size(change: Float[Array, " balances"], extent: Array) -> tuple[Array, Array]:
+    """Largest displacement relative to the extent, and largest rotation."""
+    moved = jnp.abs(change.reshape(-1, 6))
+    return jnp.max(moved[:, :3], initial=0.0) / extent, jnp.max(moved[:, 3:], initial=0.0)
+
+
+def _solve(system: System, state: State, lam: Array, inputs: Array) -> _Search:
+    """Newton's method from a configuration and multipliers; every iteration counts from where it is."""
+    extent = _extent(system, state)
+
+    def trip(search: _Search) -> _Search:
+        static = Static(system, search.state, inputs)
+        y = jnp.concatenate([jnp.zeros(static.balances), search.lam])
+        change = -static.inverse(y) @ static.residual(y)
+        moved, turned = _size(change[: static.balances], extent)
+        # No body moves or turns too far at once.
+        short = jnp.minimum(1.0, jnp.minimum(2 * LARGEST_TURN / jnp.maximum(turned, 1e-300), 1 / moved))
+        short = jnp.where(moved > 0, short, 1.0)
+        correction = jnp.maximum(moved, turned)
+        stalled = (search.count > 0) & (correction > 0.5 * search.correction) & (correction <= FLOOR)
+        finite = jnp.all(jnp.isfinite(change))
+        after = static.moved_along_tree(short * change)
+        lam = search.lam + short * change[static.balances :]
+        done = ((correction <= TOLERANCE) | stalled) & (short == 1.0) & finite
+        kept = jax.tree.map(lambda a, b: jnp.where(finite, a, b), (after, lam), (search.state, search.lam))
+        return _Search(*kept, correction, search.count + 1, done, finite)
+
+    start = _Search(state, lam, jnp.zeros(()), jnp.array(0), jnp.array(False), jnp.array(True))
+    return jax.lax.while_loop(lambda s: ~s.done & s.finite & (s.count < ITERATIONS), trip, start)
+
+
+def _code(search: _Search) -> Array:
+    failed = jnp.where(search.finite, int(Result.MAX_ITERATIONS), int(Result.NONFINITE))
+    return jnp.where(search.done, int(Result.SUCCESSFUL), failed)
+
+
+def _differentiable(system: System, state: State, lam: Array, inputs: Array) -> tuple[State, Array]:
+    """A solution as a function of system, load and inputs, by the implicit function theorem, to any order."""
+    fixed = jax.lax.stop_gradient(replace_fields(state, t=jnp.zeros_like(state.t)))
+    static = Static(system, replace_fields(fixed, t=state.t), inputs)
+    at = jax.lax.stop_gradient(jnp.concatenate([jnp.zeros(static.balances), lam]))
+    inverse = jax.lax.stop_gradient(static.inverse(at))
+
+    def tangent_solve(linear: Any, right: Array) -> Array:
+        def refined(inverse: Array, multiply: Any, b: Array) -> Array:
+            x = inverse @ b
+            for _ in range(3):
+                x = x + inverse @ (b - multiply(x))
+            return x
+
+        return jax.lax.custom_linear_solve(
+            linear, right, solve=partial(refined, inverse), transpose_solve=partial(refined, inverse.T)
+        )
+
+    y = jax.lax.custom_root(lambda y: static.residual(y), at, lambda f, start: start, tangent_solve)
+    return static.displaced(y), y[static.balances :]
+
+
+def equilibrium(
+    system: System,
+    state: State,
+    loads: Any = 1.0,
+    *,
+    inputs: Any = None,
+    steps: int = 10,
+    throw: bool = True,
+) -> Equilibrium:
+    """Equilibrium at a series of loads, each found by Newton's method from the one before.
+
+    The load parameter is the time of the state: forces, torques and drives that are functions of time are
+    taken at it. Loads that are constant (gravity, say) act in full from the first load on.
+
+    Args:
+        system: compiled system.
+        state: start configuration; velocities play no part.
+        loads: values of the load parameter, increasing or not; one number: `steps` equal parts of it.
+        inputs: function of the load parameter to the input channels, or their values [N, N m]; default zero.
+        steps: number of loads where one number is given.
+        throw: raise in an eager call if there is no convergence.
+
+    Returns:
+        States at all loads. Differentiable with respect to the system's numbers, to the loads and to the
+        inputs, by the implicit function theorem, in every mode and order; pure and jittable. Where Newton's
+        method fails the code says so, and later states repeat the last one.
+
+    Raises:
+        SimulationError: in an eager call, if Newton's method fails, with the load.
+
+    Example:
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import natcoord_jax as nc
+        >>> scene = nc.Scene()
+        >>> section = nc.Section.of_numbers(EA=1e4, GA=1e4, EI=2.0, GJ=1.0, density=1.0, rotary=0.1)
+        >>> beam = scene.add(nc.Beam(section, [(0, 0, 0), (1, 0, 0)], elements=4, start=nc.ground))
+        >>> tip = nc.Point(beam.end, (1, 0, 0))
+        >>> load = scene.add(nc.PointForce((tip,), force=lambda t: jax.numpy.array([0.0, 0.0, 0.01]) * t))
+        >>> system, state = scene.compile()
+        >>> found = nc.equilibrium(system, state)
+        >>> float(system.sense(found.state, beam.end).position[2].round(5))
+        0.00167
+    """
+    values = jnp.asarray(loads, float)
+    if values.ndim == 0:
+        values = values * jnp.arange(1, steps + 1) / steps
+    found = _equilibria(system, state, values, _inputs_at(system, inputs, values))
+    if throw and is_concrete(found.result):
+        for number, code in enumerate(found.result):
+            if int(code) != Result.SUCCESSFUL:
+                raise SimulationError(
+                    f"no equilibrium found at the load parameter {float(values[number]):.6g} (load "
+                    f"{number + 1} of {len(values)}): {REASONS[Result(int(code))]}; take more steps, or follow the path "
+                    "through a limit point with nc.load_path",
+                    Result(int(code)),
+                    found,
+                )
+    return found
+
+
+def _inputs_at(system: System, inputs: Any, values: Array) -> Float[Array, "loads inputs"]:
+    count = len(system.structure.inputs)
+    if callable(inputs):
+        return jax.vmap(inputs)(values)
+    given = jnp.zeros(count) if inputs is None else jnp.asarray(inputs, float)
+    if given.shape not in ((count,), (len(values), count)):
+        raise ValueError(
+            f"inputs has shape {given.shape}; this system has the input channels "
+            f"{list(system.structure.inputs)}: pass shape {(count,)} or {(len(values), count)}, or a function"
+        )
+    return jnp.broadcast_to(given, (len(values), count))
+
+
+@jax.jit
+def _equilibria(system: System, state: State, values: Array, inputs: Array) -> Equilibrium:
+    static = Static(system, state, inputs[0])
+    still = jax.lax.stop_gradient((system, state))
+
+    def one(carry: tuple, load: tuple) -> tuple[tuple, tuple]:
+        now, lam, alive = carry
+        value, u = load
+        begin = replace_fields(now, t=jax.lax.stop_gradient(value))
+        search = _solve(still[0], begin, lam, jax.lax.stop_gradient(u))
+        code = jnp.where(alive, _code(search), int(Result.DIVERGED))
+        good = code == int(Result.SUCCESSFUL)
+        reached = jax.tree.map(lambda a, b: jnp.where(good, a, b), (search.state, search.lam), (now, lam))
+        return (*reached, good), (*reached, code, search.count)
+
+    start = replace_fields(still[1], v=jnp.zeros_like(state.v), rates=jnp.zeros_like(state.rates))
+    lam = jnp.zeros(static.unknowns - static.balances)
+    _, (states, lams, codes, counts) = jax.lax.scan(one, (start, lam, jnp.array(True)), (values, inputs))
+    states, lams = jax.lax.stop_gradient((states, lams))
+    states = replace_fields(states, t=values)
+    states, lams = jax.vmap(lambda s, lam, u: _differentiable(system, s, lam, u))(states, lams, inputs)
+    return Equilibrium(states, lams, codes, counts)
