@@ -2,7 +2,17 @@
 
 from typing import TYPE_CHECKING, Any
 
-from natcoord_jax.analysis import Accuracy, Balance, Equilibrium, accuracy, balance, equilibrium
+from natcoord_jax.analysis import (
+    Accuracy,
+    Balance,
+    Equilibrium,
+    Modes,
+    accuracy,
+    balance,
+    equilibrium,
+    load_path,
+    modes,
+)
 from natcoord_jax.assembly.posing import random_state
 from natcoord_jax.assembly.system import System
 from natcoord_jax.bodies import (
@@ -11,6 +21,7 @@ from natcoord_jax.bodies import (
     Box,
     CircularSection,
     Cylinder,
+    DirectorInterpolation,
     Ellipsoid,
     PointMass,
     RectangularSection,
@@ -51,7 +62,13 @@ from natcoord_jax.core.potential import Potential
 from natcoord_jax.core.results import Result, SimulationError
 from natcoord_jax.core.state import State, Trajectory
 from natcoord_jax.effects.actuators import BodyForceInput, BodyTorqueInput, JointForce, JointTorque
-from natcoord_jax.effects.beams import BeamDamping, BeamElement, NonlinearBeamElement
+from natcoord_jax.effects.beams import (
+    BeamDamping,
+    BeamElement,
+    DirectorDamping,
+    DirectorElement,
+    NonlinearBeamElement,
+)
 from natcoord_jax.effects.joints import (
     Coupling,
     Cylindrical,
@@ -106,6 +123,9 @@ __all__ = [
     "Cylindrical",
     "Damper",
     "Direction",
+    "DirectorDamping",
+    "DirectorElement",
+    "DirectorInterpolation",
     "Distance",
     "Drive",
     "Ellipsoid",
@@ -126,6 +146,7 @@ __all__ = [
     "JointStops",
     "JointTorque",
     "Load",
+    "Modes",
     "NonlinearBeamElement",
     "NonlinearSpring",
     "OptimalControl",
@@ -172,6 +193,8 @@ __all__ = [
     "inverse_dynamics",
     "linearise",
     "load_guess",
+    "load_path",
+    "modes",
     "multi_start",
     "optimise",
     "optimise_jit",

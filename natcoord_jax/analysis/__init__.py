@@ -2,7 +2,18 @@
 
 from natcoord_jax.analysis.accuracy import Accuracy, accuracy
 from natcoord_jax.analysis.balance import Balance, balance
-
+from natcoord_jax.analysis.load_path import load_path
+from natcoord_jax.analysis.modes import Modes, modes
 from natcoord_jax.analysis.statics import Equilibrium, equilibrium
 
-__all__ = ["Accuracy", "Balance", "Equilibrium", "accuracy", "balance", "equilibrium"]
+__all__ = [
+    "Accuracy",
+    "Balance",
+    "Equilibrium",
+    "Modes",
+    "accuracy",
+    "balance",
+    "equilibrium",
+    "load_path",
+    "modes",
+]

@@ -94,19 +94,19 @@ class Static(eqx.Module):
         rows = state.q.reshape(-1, 4, 3)
         still = jnp.zeros_like(rows[:, 0])
         force, torque = loads(self.system, state, self.inputs, still, still)
-        pulled = self._constraint_loads(state, y)
+        pulled = self.constraint_loads(state, y)
         sums = -(jnp.concatenate([force, torque], axis=1) + jnp.concatenate(pulled, axis=1))
         # The directors of a point mass are held where they are.
         sums = sums.at[:, 3:].add(
             jnp.where(self._massless[:, None], y[: self.balances].reshape(-1, 6)[:, 3:], 0.0)
         )
-        return jnp.concatenate([sums.reshape(-1), self._gaps(state)])
+        return jnp.concatenate([sums.reshape(-1), self.gaps(state)])
 
     @property
     def _massless(self) -> Array:
         return jnp.trace(self.system.mass[:, 1:, 1:], axis1=1, axis2=2) <= 0
 
-    def _constraint_loads(self, state: State, y: Array) -> tuple[Array, Array]:
+    def constraint_loads(self, state: State, y: Array) -> tuple[Array, Array]:
         """Forces and torques of the multipliers on all bodies."""
         rows, tableau = state.q.reshape(-1, 4, 3), gauss(1)
         still = jnp.zeros((1, rows.shape[0], 3), rows.dtype)
@@ -127,7 +127,7 @@ class Static(eqx.Module):
         force, torque = wrench(on_rows[None, :-1], rows[None, :, 1:])
         return force[0], torque[0] + torques[:-1]
 
-    def _gaps(self, state: State) -> Array:
+    def gaps(self, state: State) -> Array:
         """What relations between coordinates and joints miss."""
         found = [jnp.zeros(0, state.q.dtype)]
         for group in self.system.effects:

@@ -60,14 +60,14 @@ class _Search(eqx.Module):
     finite: Array
 
 
-def _extent(system: System, state: State) -> Array:
-    """Size of the system with the ground's origin [m]; never zero."""
+def extent_of(system: System, state: State) -> Array:
+    """Extent of the system with the ground's origin [m]; never zero."""
     points = jnp.max(jnp.abs(state.q.reshape(-1, 4, 3)[:, 0]), initial=0.0)
     moment = jnp.sum(jnp.trace(system.mass[:, 1:, 1:], axis1=1, axis2=2)) / jnp.sum(system.mass[:, 0, 0])
     return points + jnp.where(moment > 0, jnp.sqrt(jnp.where(moment > 0, moment, 1.0)), 1e-300)
 
 
-def _size(change: Float[Array, " balances"], extent: Array) -> tuple[Array, Array]:
+def largest(change: Float[Array, " balances"], extent: Array) -> tuple[Array, Array]:
     """Largest displacement relative to the extent, and largest rotation."""
     moved = jnp.abs(change.reshape(-1, 6))
     return jnp.max(moved[:, :3], initial=0.0) / extent, jnp.max(moved[:, 3:], initial=0.0)
@@ -75,13 +75,13 @@ def _size(change: Float[Array, " balances"], extent: Array) -> tuple[Array, Arra
 
 def _solve(system: System, state: State, lam: Array, inputs: Array) -> _Search:
     """Newton's method from a configuration and multipliers; every iteration counts from where it is."""
-    extent = _extent(system, state)
+    extent = extent_of(system, state)
 
     def trip(search: _Search) -> _Search:
         static = Static(system, search.state, inputs)
         y = jnp.concatenate([jnp.zeros(static.balances), search.lam])
         change = -static.inverse(y) @ static.residual(y)
-        moved, turned = _size(change[: static.balances], extent)
+        moved, turned = largest(change[: static.balances], extent)
         # No body moves or turns too far at once.
         short = jnp.minimum(1.0, jnp.minimum(2 * LARGEST_TURN / jnp.maximum(turned, 1e-300), 1 / moved))
         short = jnp.where(moved > 0, short, 1.0)
@@ -103,7 +103,7 @@ def _code(search: _Search) -> Array:
     return jnp.where(search.done, int(Result.SUCCESSFUL), failed)
 
 
-def _differentiable(system: System, state: State, lam: Array, inputs: Array) -> tuple[State, Array]:
+def differentiable(system: System, state: State, lam: Array, inputs: Array) -> tuple[State, Array]:
     """A solution as a function of system, load and inputs, by the implicit function theorem, to any order."""
     fixed = jax.lax.stop_gradient(replace_fields(state, t=jnp.zeros_like(state.t)))
     static = Static(system, replace_fields(fixed, t=state.t), inputs)
@@ -177,8 +177,8 @@ def equilibrium(
             if int(code) != Result.SUCCESSFUL:
                 raise SimulationError(
                     f"no equilibrium found at the load parameter {float(values[number]):.6g} (load "
-                    f"{number + 1} of {len(values)}): {REASONS[Result(int(code))]}; take more steps, or follow the path "
-                    "through a limit point with nc.load_path",
+                    f"{number + 1} of {len(values)}): {REASONS[Result(int(code))]}; take more "
+                    "steps, or follow the path through a limit point with nc.load_path",
                     Result(int(code)),
                     found,
                 )
@@ -218,5 +218,5 @@ def _equilibria(system: System, state: State, values: Array, inputs: Array) -> E
     _, (states, lams, codes, counts) = jax.lax.scan(one, (start, lam, jnp.array(True)), (values, inputs))
     states, lams = jax.lax.stop_gradient((states, lams))
     states = replace_fields(states, t=values)
-    states, lams = jax.vmap(lambda s, lam, u: _differentiable(system, s, lam, u))(states, lams, inputs)
+    states, lams = jax.vmap(lambda s, lam, u: differentiable(system, s, lam, u))(states, lams, inputs)
     return Equilibrium(states, lams, codes, counts)

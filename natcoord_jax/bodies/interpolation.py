@@ -15,8 +15,16 @@ from natcoord_jax.bodies.sections import Section
 from natcoord_jax.core.checks import is_concrete
 from natcoord_jax.core.effect import Effect
 from natcoord_jax.core.markers import Attachment
-from natcoord_jax.effects.beams import BeamDamping, BeamElement, NonlinearBeamElement
+from natcoord_jax.effects.beams import (
+    BeamDamping,
+    BeamElement,
+    DirectorDamping,
+    DirectorElement,
+    NonlinearBeamElement,
+)
+from natcoord_jax.effects.beams.directors import director_strains
 from natcoord_jax.effects.beams.relative_motion import relative_motion, strains_of
+from natcoord_jax.maths.lagrange import LOBATTO, gauss_legendre, lagrange, lobatto
 
 Span = tuple[int, ...]
 """Nodes of an element, in order."""
@@ -115,4 +123,80 @@ class RelativeMotion(Interpolation):
             if material.damping is not None:
                 damper = {"length": length, "viscosity": material.damping * stiffness}
                 dampings.append(BeamDamping((nodes[a], nodes[b]), f"{name}/damping {number}", **damper))
+        return elements, dampings
+
+
+class DirectorInterpolation(Interpolation):
+    """Elements over two to four nodes that interpolate points and directors; see `DirectorElement`.
+
+    Nodes are at Gauss-Lobatto points of the elements, and the mass is lumped there with the weights of that
+    rule, which keeps the order of convergence of the elements.
+
+    Attributes:
+        order: of the Lagrange functions: 1, 2 or 3.
+
+    Raises:
+        ValueError: for another order.
+
+    Example:
+        >>> import natcoord_jax as nc
+        >>> nc.DirectorInterpolation(order=2).order
+        2
+    """
+
+    order: int = eqx.field(default=1, static=True)
+
+    def __check_init__(self) -> None:
+        if self.order not in LOBATTO:
+            raise ValueError(f"director interpolation: order is {self.order!r}; pass one of {list(LOBATTO)}")
+
+    def refine(self, ends: np.ndarray) -> tuple[np.ndarray, list[Span]]:
+        """Nodes at the Gauss-Lobatto points of the elements."""
+        inner = lobatto(self.order)[0][:-1]
+        pieces = [a + (b - a) * inner for a, b in zip(ends, ends[1:])]
+        p = self.order
+        spans = [tuple(range(p * e, p * e + p + 1)) for e in range(len(pieces))]
+        return np.concatenate([*pieces, ends[-1:]]), spans
+
+    def _lengths(self, arc: Array) -> Array:
+        return jnp.diff(arc[:: self.order])
+
+    def lumps(self, arc: Array, spans: list[Span]) -> Array:
+        """Gauss-Lobatto weights times the lengths of the elements."""
+        shares = self._lengths(arc)[:, None] * jnp.asarray(lobatto(self.order)[1])
+        return jnp.zeros_like(arc).at[jnp.asarray(spans)].add(shares)
+
+    def effects(
+        self,
+        material: Material,
+        nodes: Sequence[Attachment],
+        curve: ReferenceCurve,
+        spans: list[Span],
+        name: str,
+    ) -> tuple[list[Effect], list[Effect]]:
+        """One element over each span, and its damping if there is any.
+
+        Raises:
+            ValueError: for an energy law of the strains, which only `RelativeMotion` takes.
+        """
+        if material.law is not None:
+            raise ValueError(f"beam {name!r}: law= needs interpolation=nc.RelativeMotion()")
+        points, shares = gauss_legendre(self.order)
+        values, unit_slopes = lagrange(lobatto(self.order)[0], points)
+        lengths, frames = self._lengths(curve.arc), frames_of(curve)
+        slopes = jnp.asarray(unit_slopes) / lengths[:, None, None]
+        weights = lengths[:, None] * jnp.asarray(shares)
+        every = frames[jnp.asarray(spans)]
+        references = jax.vmap(lambda x, b: director_strains(x, jnp.asarray(values), b))(every, slopes)
+        stiffness, elements, dampings = material.section.stiffness, [], []
+        rows = zip(spans, *(apart(x, len(spans)) for x in (slopes, weights, references)))
+        for number, (span, slope, weight, reference) in enumerate(rows):
+            markers = tuple(nodes[i] for i in span)
+            shape = {"values": values, "slopes": slope, "weights": weight}
+            made = {"name": f"{name}/element {number}", "stiffness": stiffness, "reference": reference}
+            elements.append(DirectorElement(markers, **shape, **made))
+            if material.damping is not None:
+                viscosity = material.damping * stiffness
+                damper = DirectorDamping(markers, f"{name}/damping {number}", **shape, viscosity=viscosity)
+                dampings.append(damper)
         return elements, dampings
