@@ -29,6 +29,7 @@ from natcoord_jax.assembly.reduced import ReducedStep
 from natcoord_jax.assembly.response import gather, respond, situation
 from natcoord_jax.core.effect import Effect, replace_fields
 from natcoord_jax.core.joint import frames_at
+from natcoord_jax.core.potential import place_markers
 from natcoord_jax.maths.collocation import gauss
 from natcoord_jax.maths.rotations import from_rotation_vector
 from natcoord_jax.stepping.step import advance
@@ -55,6 +56,21 @@ class Parts:
         """The axes of the first body's start, carried by it."""
         return tuple(nc.Direction(self.one, axis) for axis in np.eye(3))
 
+    @property
+    def attached(self):
+        """An attachment on each body, with an arm and axes of its own."""
+        turned = from_rotation_vector(jnp.array([0.3, -0.2, 0.5]))
+        first = nc.Attachment(self.one, (0.1, 0.0, -1.2), turned)
+        return first, nc.Attachment(
+            self.two, (0.4, 0.4, -1.9), from_rotation_vector(jnp.array([0.1, 0.4, 0.2]))
+        )
+
+    @property
+    def three(self):
+        """Two attachments on the first body and one on the second."""
+        middle = nc.Attachment(self.one, (0.2, 0.2, -1.5), np.eye(3))
+        return self.attached[0], middle, self.attached[1]
+
 
 @dataclass(frozen=True)
 class Entry:
@@ -79,6 +95,15 @@ def _law(x):
 
 def _wave(t):
     return jnp.stack([jnp.sin(t), jnp.cos(t), t])
+
+
+STIFFNESS = np.diag([30.0, 40.0, 50.0, 2.0, 3.0, 4.0]) + 0.5
+# Of three nodes at two Gauss points.
+SHAPES = {
+    "values": np.array([[0.5, 0.6, -0.1], [-0.1, 0.6, 0.5]]),
+    "slopes": np.array([[-2.0, 2.2, -0.2], [0.2, -2.2, 2.0]]),
+    "weights": np.array([0.4, 0.5]),
+}
 
 
 TABLE = {
@@ -114,6 +139,17 @@ TABLE = {
     nc.JointStops: Entry(lambda p: nc.JointStops(p.joint, stiffness=9.0, lower=-0.1, upper=0.1), nc.Planar),
     nc.JointDamper: Entry(lambda p: nc.JointDamper(p.joint, damping=5.0), nc.Distance),
     nc.Armature: Entry(lambda p: nc.Armature(p.joint, inertia=5.0), nc.Revolute),
+    nc.BeamElement: Entry(lambda p: nc.BeamElement(p.attached, length=0.8, stiffness=STIFFNESS)),
+    nc.NonlinearBeamElement: Entry(
+        lambda p: nc.NonlinearBeamElement(
+            p.attached, length=0.8, stiffness=STIFFNESS, law=lambda e: jnp.sum(jnp.cosh(e))
+        )
+    ),
+    nc.BeamDamping: Entry(lambda p: nc.BeamDamping(p.attached, length=0.8, viscosity=STIFFNESS)),
+    nc.DirectorElement: Entry(
+        lambda p: nc.DirectorElement(p.three, stiffness=STIFFNESS, reference=np.full((2, 6), 0.1), **SHAPES)
+    ),
+    nc.DirectorDamping: Entry(lambda p: nc.DirectorDamping(p.three, viscosity=STIFFNESS, **SHAPES)),
 }
 EFFECTS = pytest.mark.parametrize("effect", TABLE, ids=lambda effect: effect.__name__)
 JOINT_TYPES = pytest.mark.parametrize("joint", JOINTS.values(), ids=list(JOINTS))
@@ -429,8 +465,8 @@ def potential_of(effect: type):
     _, state, group = stage(effect)
     law = jax.tree.map(lambda x: x[0], group.effect)
     rows = state.q.reshape(-1, 4, 3)[group.bodies[0]]
-    x = jnp.einsum("ka,kac->kc", group.weights[0], rows)
-    points = group.weights[0][:, 0] > 0
+    x = place_markers(group.weights[0], rows)
+    points = group.weights[0][..., 0] > 0
     return jax.jit(lambda x: law.invariants(x)), jax.jit(lambda x: law.energy(law.invariants(x))), x, points
 
 
@@ -439,7 +475,7 @@ def test_invariants_are_invariant_and_at_most_quadratic(potential):
     invariants, energy, x, points = potential_of(potential)
     rng = np.random.default_rng(8)
     turn = from_rotation_vector(jnp.asarray(rng.normal(size=3)))
-    moved = x @ turn.T + jnp.where(points[:, None], jnp.asarray(rng.normal(size=3)), 0.0)
+    moved = x @ turn.T + jnp.where(points[..., None], jnp.asarray(rng.normal(size=3)), 0.0)
     assert np.allclose(invariants(moved), invariants(x), rtol=tol.INDIFFERENCE)
     assert np.allclose(energy(moved), energy(x), rtol=tol.INDIFFERENCE)
     step = jnp.asarray(rng.normal(size=x.shape))

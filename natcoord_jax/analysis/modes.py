@@ -63,7 +63,7 @@ class _Steady(eqx.Module):
     lam: Array
 
     def forces(self, x: Array, rates: Array) -> Array:
-        """Inertia less loads and reactions [N, N m], for displacements and for rates in the rotating frame."""
+        """Inertia less loads and reactions [N, N m], for displacements and rates in the rotating frame."""
         static = Static(self.system, self.state, self.inputs)
         y = jnp.concatenate([x, self.lam])
         state = static.displaced(y)

@@ -81,7 +81,8 @@ class Beam(Recipe):
         stations: fractions of the length at which nodes are wanted, to attach something to.
         damping: time t [s] of internal damping C_v = t C (Kelvin-Voigt); None: none.
         law: energy per length [J/m] as a function of the strains (6,), on top of the section's; None: none.
-        interpolation: how it is made of elements; `RelativeMotion()` (default), `DirectorInterpolation(order)`.
+        interpolation: of which elements it is made; default `RelativeMotion()`, else
+            `DirectorInterpolation(order)`.
         velocity: of the start [m/s].
         angular_velocity: of the beam as a rigid body [rad/s].
         name: unique name; nodes are called "name/node 0", elements "name/element 0" and so on.

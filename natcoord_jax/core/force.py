@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from natcoord_jax.core.effect import Effect, Motion, Now, Response
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.joint import Joint
-from natcoord_jax.core.markers import Marker
+from natcoord_jax.core.markers import Attachment, Marker
 from natcoord_jax.core.potential import marker_response, place_markers
 
 
@@ -24,7 +24,7 @@ class Load(eqx.Module):
         torques: on the bodies of the markers [N m]; None: there are none.
     """
 
-    forces: Float[Array, "k 3"] | None
+    forces: Float[Array, "k *m 3"] | None
     torques: Float[Array, "k 3"] | None
 
 
@@ -52,15 +52,15 @@ class Force(Effect):
     kind: ClassVar[str] = "force"
     works: ClassVar[bool] = True
 
-    def attach(self, find: Callable[[Handle], tuple[Joint, Array]]) -> tuple[Marker, ...]:
+    def attach(self, find: Callable[[Handle], tuple[Joint, Array]]) -> tuple[Marker | Attachment, ...]:
         """Markers of the effect; effects on a joint look it up with `find`: handle to (joint, triad)."""
         return self.markers
 
     @abc.abstractmethod
     def load(
         self,
-        x: Float[Array, "k 3"],
-        rate: Float[Array, "k 3"],
+        x: Float[Array, "k *m 3"],
+        rate: Float[Array, "k *m 3"],
         inputs: Float[Array, " inputs"],
         t: Float[Array, ""],
     ) -> Load:

@@ -13,7 +13,7 @@ from natcoord_jax.core.effect import Effect, Motion, Now, Response
 from natcoord_jax.core.gradient import averaged_coupling, averaged_gradient
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.joint import Joint
-from natcoord_jax.core.markers import Marker
+from natcoord_jax.core.markers import Attachment, Marker
 
 
 def place_markers(place: Float[Array, "k *m 4"], rows: Float[Array, "*s k 4 3"]) -> Float[Array, "*out"]:
@@ -58,7 +58,7 @@ class Potential(Effect):
     degree: ClassVar[int | None] = None
     points: ClassVar[int | None] = None
 
-    def attach(self, find: Callable[[Handle], tuple[Joint, Array]]) -> tuple[Marker, ...]:
+    def attach(self, find: Callable[[Handle], tuple[Joint, Array]]) -> tuple[Marker | Attachment, ...]:
         """Markers of the effect; effects on a joint look it up with `find`: handle to (joint, triad)."""
         return self.markers
 

@@ -1,0 +1,310 @@
+"""Beams at rest: strains, equilibria against exact solutions and reference values, modes, derivatives.
+
+Cases B01, B02 and B05 are those of the collected reference values; sources are named there: pure bending (exact),
+the 45 degree bend (Bathe & Bolourchi 1979; boundary-value solution with the stiffnesses given here) and the
+cantilever of Nachbagauer (2011) as Exudyn's test models have it.
+"""
+
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import tolerances as tol
+from scipy.linalg import expm
+
+import natcoord_jax as nc
+from natcoord_jax.core.effect import replace_fields
+from natcoord_jax.effects.beams.relative_motion import relative_motion, strains_of
+from natcoord_jax.maths.rotations import from_rotation_vector
+
+NUMBERS = {"EA": 1e4, "GA": 5e3, "EI": (1.0, 2.0), "GJ": 1.5, "density": 2.0, "rotary": 0.01}
+
+
+def cantilever(section, curve, elements, *, load=None, torque=None, following=False, **options):
+    """A beam clamped at its start with a force and a torque at its end, both times the load parameter."""
+    scene = nc.Scene()
+    beam = scene.add(nc.Beam(section, curve, elements=elements, start=nc.ground, name="beam", **options))
+    axes = tuple(nc.Direction(beam.end, e) for e in np.eye(3))
+    if load is not None:
+        end = curve(jnp.asarray(options["length"])) if callable(curve) else curve[-1]
+        markers = (nc.Point(beam.end, end), *(axes if following else ()))
+        scene.add(nc.PointForce(markers, force=lambda t: jnp.asarray(load) * t, following=following))
+    if torque is not None:
+        scene.add(nc.BodyTorque(axes, torque=lambda t: jnp.asarray(torque) * t))
+    return *scene.compile(), beam
+
+
+def tip(system, state, beam):
+    return np.asarray(system.sense(state, beam.end).position)
+
+
+def frames_along(strain, length):
+    """Point and directors at both ends of a piece of constant strain: the exponential of its twist."""
+    gamma, curvature = strain[:3] + np.array([0, 0, 1.0]), strain[3:]
+    twist = np.zeros((4, 4))
+    k = curvature
+    twist[:3, :3] = [[0, -k[2], k[1]], [k[2], 0, -k[0]], [-k[1], k[0], 0]]
+    twist[:3, 3] = gamma
+    motion = expm(length * twist)
+    end = np.concatenate([motion[:3, 3][None], motion[:3, :3].T])
+    return jnp.asarray(np.stack([np.concatenate([np.zeros((1, 3)), np.eye(3)]), end]))
+
+
+@pytest.mark.parametrize("size", [1e-8, 1e-3, 0.3, 2.0])
+def test_constant_strains_are_exact(size):
+    """Every state of constant strain, shear and torsion included, is seen as what it is."""
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        strain, length = size * rng.normal(size=6) / np.sqrt(6), 0.7
+        found = strains_of(relative_motion(frames_along(strain, length)), jnp.asarray(length))
+        assert np.allclose(found - jnp.array([0, 0, 1.0, 0, 0, 0]), strain, rtol=1e-12, atol=1e-15 / length)
+
+
+def test_rigid_motions_do_not_strain():
+    """Objectivity: strains of a bent piece are those of the piece turned and moved by anything."""
+    rng = np.random.default_rng(1)
+    x = frames_along(rng.normal(size=6), 0.7)
+    before = strains_of(relative_motion(x), jnp.asarray(0.7))
+    for _ in range(5):
+        turn = from_rotation_vector(jnp.asarray(3 * rng.normal(size=3)))
+        moved = (x @ turn.T).at[:, 0].add(jnp.asarray(rng.normal(size=3)))
+        assert np.allclose(strains_of(relative_motion(moved), jnp.asarray(0.7)), before, atol=1e-12)
+
+
+def test_pure_bending_rolls_up_to_a_circle():
+    """B01: with three elements, to round-off, all the way."""
+    length, bending = 10.0, 86900.0
+    section = nc.Section.of_numbers(
+        EA=1.77e6, GA=1.77e6, EI=(bending, 215000.0), GJ=8160.0, density=1.0, rotary=1.0
+    )
+    moment = 2 * np.pi * bending / length
+    # d_1 along y: bending about d_1 takes the beam from x to z.
+    options = {"torque": (0.0, -moment, 0.0), "second": (0.0, 1.0, 0.0)}
+    system, state, beam = cantilever(section, [(0, 0, 0), (length, 0, 0)], 3, **options)
+    found = nc.equilibrium(system, state, steps=8)
+    angle = 2 * np.pi * np.asarray(found.states.t)
+    exact = length * np.stack([np.sin(angle), 0 * angle, 1 - np.cos(angle)], axis=1) / angle[:, None]
+    assert np.allclose(tip(system, found.states, beam), exact, atol=1e-10 * length)
+
+
+def test_stretch_and_torsion_are_exact():
+    section = nc.Section.of_numbers(**NUMBERS)
+    options = {"load": (0, 0, 30.0), "torque": (0, 0, 0.9), "stations": (0.2, 0.35)}
+    system, state, beam = cantilever(section, [(0, 0, 0), (0, 0, 1.0)], 3, **options)
+    found = nc.equilibrium(system, state, steps=2)
+    sensed = system.sense(found.state, beam.end)
+    assert np.allclose(sensed.position, [0, 0, 1.003], atol=1e-12)
+    assert np.allclose(sensed.rotation, from_rotation_vector(jnp.array([0, 0, 0.6])), atol=1e-11)
+
+
+@cache
+def loaded():
+    """A cantilever with load enough to bend it by a radian."""
+    return cantilever(nc.Section.of_numbers(**NUMBERS), [(0, 0, 0), (1.0, 0, 0)], 4, load=(0.5, 2.0, 1.0))
+
+
+def test_equilibria_do_not_depend_on_the_path():
+    system, state, beam = loaded()
+    direct = nc.equilibrium(system, state, steps=2).state
+    around = nc.equilibrium(system, state, jnp.array([-1.0, 1.0])).state
+    assert np.allclose(direct.q, around.q, atol=1e-10)
+    assert abs(tip(system, direct, beam)[1]) > 0.4
+
+
+def test_derivatives_of_equilibria():
+    """With respect to stiffness, length, load and unstressed curvature; forward, reverse, second."""
+    system, state, beam = loaded()
+    body = system.body_index(beam.end)
+
+    def place(p):
+        group = system.effects[0]
+        effect = group.effect
+        changed = replace_fields(
+            effect,
+            stiffness=effect.stiffness * p[0],
+            length=effect.length * p[1],
+            reference=effect.reference + p[3] * jnp.array([0, 0, 0, 1.0, 0.5, 0]),
+        )
+        changed_system = replace_fields(
+            system, effects=(replace_fields(group, effect=changed), *system.effects[1:])
+        )
+        return nc.equilibrium(changed_system, state, p[2] * jnp.array([0.5, 1.0])).state.q[4 * body, 1]
+
+    p = jnp.array([1.0, 1.0, 1.0, 0.1])
+    place = jax.jit(place)
+    gradient = jax.grad(place)(p)
+    h = 1e-4
+    units = jnp.eye(4)
+    differences = [(place(p + h * e) - place(p - h * e)) / (2 * h) for e in units]
+    assert np.allclose(gradient, differences, rtol=1e-6, atol=1e-8)
+    assert np.allclose(jax.jvp(place, (p,), (units[1],))[1], gradient[1], rtol=1e-9)
+    curvature = jax.jvp(jax.grad(place), (p,), (units[2],))[1]
+    near = [jax.grad(place)(p + s * h * units[2]) for s in (1, -1)]
+    assert np.allclose(curvature, (near[0] - near[1]) / (2 * h), rtol=1e-5, atol=1e-7)
+
+
+def richardson(coarse, fine):
+    """From results of order two at h and h/2."""
+    return (4 * np.asarray(fine) - np.asarray(coarse)) / 3
+
+
+@pytest.mark.slow
+def test_bend_of_45_degrees():
+    """B02, with kGA = 4166670 N."""
+    radius = 100.0
+    section = nc.Section.of_numbers(EA=1e7, GA=4166670.0, EI=833300.0, GJ=833300.0, density=1.0, rotary=1.0)
+    length = radius * np.pi / 4
+
+    def curve(s):
+        return jnp.stack([radius * jnp.sin(s / radius), radius * (1 - jnp.cos(s / radius)), 0 * s])
+
+    found = []
+    for elements in (8, 16):
+        system, state, beam = cantilever(section, curve, elements, load=(0, 0, 600.0), length=length)
+        state = nc.equilibrium(system, state, steps=6).state
+        found.append(tip(system, state, beam) - np.asarray(curve(length)))
+    assert np.allclose(richardson(*found), [-23.5613, -13.60502, 53.47611], atol=2e-4)
+
+
+@pytest.mark.slow
+def test_cantilever_by_number_of_elements():
+    """B05: order two, and the converged values; one element is nearer to them than Exudyn's."""
+    section = nc.RectangularSection(width=0.1, height=0.5, E=2.07e11, nu=0.3, density=7800.0)
+    options = {"load": (0.0, 6.25e7, 0.0), "second": (0.0, 0.0, 1.0)}
+    reference = np.array([-0.15097103, 0.71056837])
+    found = []
+    for elements in (1, 8, 16):
+        system, state, beam = cantilever(section, [(0, 0, 0), (2.0, 0, 0)], elements, **options)
+        found.append(tip(system, nc.equilibrium(system, state, steps=5).state, beam)[:2] - [2.0, 0])
+    errors = [np.max(np.abs(x - reference)) for x in found]
+    assert errors[0] < np.max(np.abs([-0.07140274, 0.54225823] - reference))
+    assert 3.8 < errors[1] / errors[2] < 4.2
+    assert np.allclose(richardson(*found[1:]), reference, atol=2e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("order", [1, 2, 3])
+def test_order_of_director_interpolation(order):
+    """Displacements converge with order 2 p."""
+    section = nc.Section.of_numbers(**NUMBERS)
+    found = []
+    for elements in (2, 4, 8):
+        options = {"interpolation": nc.DirectorInterpolation(order=order), "load": (0.0, 1.0, 0.5)}
+        system, state, beam = cantilever(section, [(0, 0, 0), (1.0, 0, 0)], elements, **options)
+        found.append(tip(system, nc.equilibrium(system, state, steps=2).state, beam))
+    steps = [np.max(np.abs(a - b)) for a, b in zip(found, found[1:])]
+    assert abs(np.log2(steps[0] / steps[1]) - 2 * order) < 0.6
+
+
+# --- modes ------------------------------------------------------------------------------------------------
+
+STEEL = {"radius": 0.01, "E": 2e11, "density": 7800.0}
+ROOTS = {True: (1.87510407, 4.69409113), False: (4.73004074, 7.85320462)}
+
+
+@pytest.mark.parametrize("clamped", [True, pytest.param(False, marks=pytest.mark.slow)])
+def test_frequencies(clamped):
+    """Of a slender cantilever and of a free beam, by Richardson's formula, against Euler-Bernoulli's roots.
+
+    Shear and rotary inertia, which the roots leave out, lower the frequencies of this rod (radius of gyration
+    over length 1/200) by less than 0.3 %.
+    """
+    section = nc.CircularSection(**STEEL)
+    unit = np.sqrt(float(section.stiffness[3, 3] / section.inertia[0, 0]))
+    found = []
+    for elements in (8, 16):
+        scene = nc.Scene()
+        start = nc.ground if clamped else None
+        scene.add(nc.Beam(section, [(0, 0, 0), (1.0, 0, 0)], elements=elements, start=start))
+        system, state = scene.compile()
+        frequencies = np.asarray(nc.modes(system, state).frequencies)
+        found.append(frequencies[0 if clamped else 6 :: 2][:2])
+        if not clamped:
+            assert np.all(frequencies[:6] < 1e-3 * frequencies[6])
+    exact = unit * np.array(ROOTS[clamped]) ** 2
+    ratio = richardson(*found) / exact
+    assert np.all(ratio < 1.0005) and np.all(ratio > 0.997)
+
+
+@pytest.mark.slow
+def test_lateral_buckling():
+    """A narrow cantilever under a tip load across its strong side gives way at 4.013 sqrt(EI GJ) / L^2."""
+    weak, torsion, length = 1.0, 1.5, 1.0
+    section = nc.Section.of_numbers(EA=1e7, GA=1e7, EI=(1e4, weak), GJ=torsion, density=1.0, rotary=1e-3)
+    critical = 4.013 * np.sqrt(weak * torsion) / length**2
+    # d_1 along y: bending about it, in the plane of the load, is stiff.
+    options = {"load": (0.0, 0.0, -critical), "second": (0.0, 1.0, 0.0)}
+    system, state, _ = cantilever(section, [(0, 0, 0), (length, 0, 0)], 16, **options)
+    found = nc.equilibrium(system, state, jnp.array([0.5, 0.97, 1.03]))
+    slowest = [
+        nc.modes(system, jax.tree.map(lambda x, k=k: x[k], found.states), count=1).s[0] for k in (1, 2)
+    ]
+    assert abs(slowest[0].real) < 1e-9 and slowest[0].imag > 0
+    assert slowest[1].real > 0
+
+
+@pytest.mark.slow
+def test_snap_through():
+    """A shallow arch: the path goes through the limit point and back, symmetric about the flat shape."""
+    section = nc.Section.of_numbers(EA=1e4, GA=5e3, EI=1.0, GJ=1.0, density=1.0, rotary=0.01)
+    places = np.linspace(0, 1, 9)
+    points = np.stack([places - 0.5, 0 * places, 0.1 * np.sin(np.pi * places)], axis=1)
+    scene = nc.Scene()
+    arch = scene.add(nc.Beam(section, points, elements=8, second=(0, 1, 0)))
+    for end, point in ((arch.start, points[0]), (arch.end, points[-1])):
+        scene.add(nc.Revolute(nc.ground, end, point=point, axis=(0, 1, 0)))
+    top = arch.nodes[4]
+    scene.add(nc.PointForce((nc.Point(top, points[4]),), force=lambda t: jnp.array([0, 0, -1.0]) * t))
+    system, state = scene.compile()
+    with pytest.raises(nc.SimulationError, match="load_path"):
+        nc.equilibrium(system, state, 25.0, steps=1)
+    path = nc.load_path(system, state, arc=0.05, steps=30, scale=100.0)
+    loads, height = np.asarray(path.states.t), np.asarray(system.sense(path.states, top).position[:, 2])
+    most = int(np.argmax(loads))
+    assert 0 < most < 29 and loads.min() < 0 and np.all(np.diff(height[: most + 3]) < 0)
+
+
+# --- errors -----------------------------------------------------------------------------------------------
+
+
+def test_wrong_input_is_named():
+    section = nc.Section.of_numbers(**NUMBERS)
+    scene = nc.Scene()
+    with pytest.raises(ValueError, match="EA"):
+        nc.Section.of_numbers(**NUMBERS | {"EA": -1.0})
+    with pytest.raises(ValueError, match=r"curve \[m\] has shape"):
+        scene.add(nc.Beam(section, [(0, 0, 0)], elements=2))
+    with pytest.raises(ValueError, match="coincide"):
+        scene.add(nc.Beam(section, [(0, 0, 0), (0, 0, 0)], elements=2))
+    with pytest.raises(ValueError, match="elements is 0"):
+        scene.add(nc.Beam(section, [(0, 0, 0), (1, 0, 0)], elements=0))
+    with pytest.raises(ValueError, match="length"):
+        scene.add(nc.Beam(section, lambda s: jnp.stack([s, 0 * s, 0 * s]), elements=2))
+    with pytest.raises(ValueError, match="order is 4"):
+        nc.DirectorInterpolation(order=4)
+    beam = scene.add(nc.Beam(section, [(0, 0, 0), (1, 0, 0)], elements=2, stations=(0.3,)))
+    assert beam.at(0.3) in beam.nodes
+    with pytest.raises(ValueError, match="stations="):
+        beam.at(0.4)
+    mass = scene.add(nc.PointMass(mass=1.0))
+    with pytest.raises(ValueError, match="point mass"):
+        scene.add(nc.Beam(section, [(0, 0, 0), (1, 0, 0)], elements=2, start=mass))
+
+
+def test_mass_properties_of_a_beam_with_a_body_at_its_end():
+    """The end of a beam is rigidly part of a body: total mass, centre and inertia are those of both."""
+    section = nc.Section.of_numbers(**NUMBERS)
+    scene = nc.Scene()
+    plug = scene.add(
+        nc.RigidBody(mass=3.0, inertia=(0.1, 0.1, 0.1), position=(1, 0, 0.2), orientation=((0, 1, 0), 0.4))
+    )
+    beam = scene.add(nc.Beam(section, [(0, 0, 0), (1, 0, 0)], elements=4, end=plug))
+    system, state = scene.compile()
+    assert beam.end == plug and len(system.structure.bodies) == 5
+    spinning = replace_fields(
+        state, v=jnp.zeros_like(state.v).reshape(-1, 4, 3).at[:, 0].set(1.0).reshape(-1, 3)
+    )
+    assert np.allclose(system.momentum(spinning), 5.0)
+    assert np.allclose(system.energy(state).kinetic, 0.0, atol=tol.IDENTITY)
