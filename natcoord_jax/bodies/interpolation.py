@@ -73,8 +73,10 @@ def frames_of(curve: ReferenceCurve) -> Float[Array, "n 4 3"]:
 
 
 def apart(stacked: Any, count: int) -> list[Any]:
-    """Items of a stacked array; concrete ones without a call for each."""
-    return list(np.asarray(stacked)) if is_concrete(stacked) else [stacked[i] for i in range(count)]
+    """Items of a stacked array; concrete ones without compiled calls."""
+    if is_concrete(stacked):
+        return [jnp.asarray(x) for x in np.asarray(stacked)]
+    return [stacked[i] for i in range(count)]
 
 
 class RelativeMotion(Interpolation):
