@@ -67,6 +67,7 @@ from natcoord_jax.stepping.assemble import assemble
 from natcoord_jax.stepping.one_step import linearise, step
 from natcoord_jax.stepping.scheme import EnergyMomentum
 from natcoord_jax.stepping.simulate import simulate
+from natcoord_jax.stepping.variational import VariationalMidpoint
 
 if TYPE_CHECKING:
     from natcoord_jax.viz import animate, plot
@@ -130,6 +131,7 @@ __all__ = [
     "System",
     "Trajectory",
     "Universal",
+    "VariationalMidpoint",
     "accuracy",
     "animate",
     "assemble",

@@ -72,7 +72,7 @@ class Ends(eqx.Module):
     sound: Bool[Array, ""]
 
 
-def _end_of(state: State, at: Stations, h: Array, tableau: Tableau) -> State:
+def end_of(state: State, at: Stations, h: Array, tableau: Tableau) -> State:
     """Positions and time at the end of a step; nothing else of it is of use."""
     rows = at.start[:-1] + h * jnp.tensordot(jnp.asarray(tableau.b), at.rates[:, :-1], 1)
     q = rows.reshape(-1, 3)
@@ -108,7 +108,7 @@ def kick_of(
         tableau: the collocation method.
     """
     beta, sigma = jnp.asarray(tableau.beta), tableau.reflection
-    end = _end_of(state, at, h, tableau)
+    end = end_of(state, at, h, tableau)
     if before is None:
         before, after = _both(system, state, end)
     else:

@@ -198,6 +198,8 @@ class ReducedStep(eqx.Module):
         w, multipliers = self.split(project_multipliers(y, self.balances, self.outset.projector))
         motion, geometry = self.motion(w)
         at = self.stations(motion)
+        if self.tableau.variational:
+            at, geometry = replace_fields(at, levers=at.start[None]), at_rest(self).motion(w)[1]
         velocity, situations, kick = kicked(
             self.system,
             self.state,
@@ -213,7 +215,8 @@ class ReducedStep(eqx.Module):
         generalised = self.generalised(geometry, found.force, found.torque)
         rows = project_rows(found.rows, y, self.balances, self.outset.projector)
         residual = jnp.concatenate([generalised.reshape(-1), rows])
-        return Evaluation(residual, found.size, at, found.power, kick)
+        asked = (situations, multipliers) if self.tableau.variational else None
+        return Evaluation(residual, found.size, at, found.power, kick, asked)
 
     def guess(self) -> Float[Array, " unknowns"]:
         """Rates of the velocities at the start, repeated for every stage; multipliers zero."""

@@ -33,12 +33,21 @@ class Motion(eqx.Module):
         rows: rows at the stages.
         rates: their velocities at the stages [1/s times that].
         spin: angular velocities at the stages [rad/s].
+        levers: rows on which forces of potentials and constraints take hold; None: those at the stages.
     """
 
     start: Float[Array, "*n k 4 3"]
     rows: Float[Array, "s *n k 4 3"]
     rates: Float[Array, "s *n k 4 3"]
     spin: Float[Array, "s *n k 3"]
+    levers: Float[Array, "s *n k 4 3"] | None = None
+
+    @property
+    def held(self) -> "Motion":
+        """The motion with all rows where forces take hold."""
+        if self.levers is None:
+            return self
+        return Motion(self.levers[0], self.levers, self.rates, self.spin)
 
 
 class Now(eqx.Module):

@@ -64,12 +64,13 @@ class Potential(Effect):
         """Energy [J]."""
 
     def respond(self, place: Array, motion: Motion, now: Now, lam: Array) -> Response:
-        """Forces -D pi(Q_i)^T S_i with the averaged gradients S_i."""
+        """Forces -D pi^T S_i with the averaged gradients S_i, D pi where forces take hold."""
         start = self.invariants(place_markers(place, motion.start))
         x, rates = place_markers(place, motion.rows), place_markers(place, motion.rates)
         steps = jax.vmap(lambda xi, vi: jax.jvp(self.invariants, (xi,), (vi,))[1])(x, now.h * rates)
         gradient = averaged_gradient(self.energy, start, steps, now.tableau, self.degree)
-        forces = jax.vmap(lambda xi, gi: jax.vjp(self.invariants, xi)[1](-gi)[0])(x, gradient)
+        held = x if motion.levers is None else place_markers(place, motion.levers)
+        forces = jax.vmap(lambda xi, gi: jax.vjp(self.invariants, xi)[1](-gi)[0])(held, gradient)
         return marker_response(place, forces, None, rates, motion)
 
     def stored(self, place: Array, rows: Array, coordinates: Array, rates: Array) -> Array:

@@ -30,6 +30,18 @@ class Tableau:
     """b^T A^-1: the end velocity is v_0 + sum beta_i (V_i - v_0)."""
     kick: bool = False
     """Whether velocities are kept tangent to the constraints by isometric kicks along their normals."""
+    variational: bool = False
+    """Whether forces take hold at both ends of the step instead of at its mid-point, see `Tableau.tangent`."""
+
+    @property
+    def tangent(self) -> bool:
+        """Whether velocities at the end of a step obey the constraints."""
+        return self.kick or self.variational
+
+    @property
+    def separable(self) -> bool:
+        """Whether the equations of a step couple a body with its neighbours only."""
+        return not self.variational
 
     @property
     def order(self) -> int:

@@ -17,7 +17,7 @@ from natcoord_jax.stepping.checked import check_state, checked_inputs, checked_s
 from natcoord_jax.stepping.derivative import run_slots
 from natcoord_jax.stepping.newton import TOLERANCE
 from natcoord_jax.stepping.plan import Plan
-from natcoord_jax.stepping.scheme import SECOND_ORDER, EnergyMomentum
+from natcoord_jax.stepping.scheme import SECOND_ORDER, Scheme
 
 
 @eqx.filter_jit
@@ -34,7 +34,7 @@ def step(
     dt: Any = None,
     *,
     newton_tol: float = TOLERANCE,
-    scheme: EnergyMomentum = SECOND_ORDER,
+    scheme: Scheme = SECOND_ORDER,
 ) -> State:
     """One energy-momentum step (57), differentiable in everything.
 

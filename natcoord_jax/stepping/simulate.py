@@ -21,7 +21,7 @@ from natcoord_jax.stepping.derivative import run_slots
 from natcoord_jax.stepping.error_control import Tolerance
 from natcoord_jax.stepping.newton import TOLERANCE
 from natcoord_jax.stepping.plan import Plan, Slots
-from natcoord_jax.stepping.scheme import SECOND_ORDER, EnergyMomentum
+from natcoord_jax.stepping.scheme import SECOND_ORDER, Scheme
 
 SEGMENT = 512
 """Longest segment of a rollout that does not save every step, or that is checkpointed."""
@@ -53,7 +53,7 @@ def _rollout(
     tolerance: float,
     extra_substeps: int,
     until: Callable | None,
-    scheme: EnergyMomentum,
+    scheme: Scheme,
     *,
     allowed: Tolerance | None,
 ) -> Trajectory:
@@ -151,7 +151,7 @@ def simulate(
     checkpoint: bool = False,
     newton_tol: float = TOLERANCE,
     extra_substeps: int | None = None,
-    scheme: EnergyMomentum = SECOND_ORDER,
+    scheme: Scheme = SECOND_ORDER,
     rtol: Any = None,
     atol: Any = None,
 ) -> Trajectory:

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.coordinates import stage_rates
-from natcoord_jax.assembly.equations import prepare, starting
+from natcoord_jax.assembly.equations import form_of, prepare, starting
+from natcoord_jax.assembly.end_impulses import released
 from natcoord_jax.assembly.kick import ends_of
 from natcoord_jax.assembly.response import Evaluation
 from natcoord_jax.assembly.system import Group, System
@@ -49,6 +50,8 @@ def end_of_step(
     turning, ends = stage_rates(system, at, h), None
     if found.kick is not None:
         ends = ends_of(system, state, groups, at, found.kick, h, tableau)
+    elif tableau.variational:
+        ends = released(system, state, groups, found, turning, h, tableau)
     if system.coordinates:
         coordinates = coordinates + h * (b @ turning)
     if ends is None:
@@ -105,7 +108,7 @@ def linear_solver(
         along: linear map of (state, unknowns) to (residual, state at the end), for dense Jacobians.
     """
     equations = prepare(system, state, u, h, tableau)
-    if system.structure.solver == "recursive" and not tableau.kick:
+    if form_of(system, tableau) == "recursive" and not tableau.kick:
         return differentiable_solver(equations, equations.jacobian(y))
     at_rest = jax.tree.map(jnp.zeros_like, state)
     columns = jax.vmap(lambda unit: along(at_rest, unit)[0], out_axes=1)(jnp.eye(y.shape[0], dtype=y.dtype))
