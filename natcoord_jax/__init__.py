@@ -64,6 +64,7 @@ from natcoord_jax.effects.springs import (
 )
 from natcoord_jax.scene import Scene
 from natcoord_jax.stepping.assemble import assemble
+from natcoord_jax.stepping.dissipative import Dissipative
 from natcoord_jax.stepping.one_step import linearise, step
 from natcoord_jax.stepping.scheme import EnergyMomentum
 from natcoord_jax.stepping.simulate import simulate
@@ -86,6 +87,7 @@ __all__ = [
     "Cylindrical",
     "Damper",
     "Direction",
+    "Dissipative",
     "Distance",
     "Drive",
     "Ellipsoid",

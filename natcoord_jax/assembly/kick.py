@@ -208,9 +208,15 @@ def kicked(
         return velocity, situations, None
     before = None if tangents is None else tangents.with_system(system)
     found = kick_of(system, state, before, groups, at, h, tableau)
-    rotors = state.rates + found.kick.rotors
-    moved = [
+    moved = with_rotors(groups, situations, state.rates + found.kick.rotors)
+    return velocity + found.kick.rows, moved, found
+
+
+def with_rotors(
+    groups: Sequence[Group], situations: Sequence[Situation], rotors: Float[Array, " rotors"]
+) -> list[Situation]:
+    """Situations with other rates of the rotors at the start of the step."""
+    return [
         replace_fields(where, rates=rotors[group.rotors]) if group.effect.rotors else where
         for group, where in zip(groups, situations)
     ]
-    return velocity + found.kick.rows, moved, found

@@ -62,7 +62,7 @@ def stations(
 
 
 class Situation(eqx.Module):
-    """What a group needs besides the motion: places, inputs, coordinates, rates, time and step."""
+    """What a group needs besides the motion: places, inputs, coordinates, rates, time, step, extra stress."""
 
     place: Array
     inputs: Array
@@ -70,6 +70,7 @@ class Situation(eqx.Module):
     rates: Array
     t: Float[Array, ""]
     h: Float[Array, ""]
+    stress: Float[Array, "n s p"] | None = None
 
 
 def situation(system: System, group: Group, state: State, u: Array, h: Array) -> Situation:
@@ -87,11 +88,11 @@ def situation(system: System, group: Group, state: State, u: Array, h: Array) ->
 def respond(group: Group, where: Situation, motion: Motion, lam: Float[Array, "n s m"], tableau: Tableau):
     """Responses of all instances of a group; leading axis `n`."""
 
-    def one(effect, place, inputs, coordinates, rates, start, rows, row_rates, spin, levers, multiplier):
-        now = Now(where.t, where.h, inputs, coordinates, rates, tableau)
+    def one(effect, place, inputs, coordinates, rates, start, rows, row_rates, spin, levers, stress, multiplier):
+        now = Now(where.t, where.h, inputs, coordinates, rates, tableau, stress)
         return effect.respond(place, Motion(start, rows, row_rates, spin, levers), now, multiplier)
 
-    axes = (None if group.source == "mass" else 0, 0, 0, 0, 0, 0, 1, 1, 1, 1, 0)
+    axes = (None if group.source == "mass" else 0, 0, 0, 0, 0, 0, 1, 1, 1, 1, 0, 0)
     with jax.named_scope(group.effect.kind.replace(" ", "_")):
         return jax.vmap(one, in_axes=axes)(
             group.effect,
@@ -104,6 +105,7 @@ def respond(group: Group, where: Situation, motion: Motion, lam: Float[Array, "n
             motion.rates,
             motion.spin,
             motion.levers,
+            where.stress,
             lam,
         )
 
@@ -124,7 +126,8 @@ class Evaluation(eqx.Module):
         at: stage motion of all bodies.
         power: power of each group, for work accounts (instances, s).
         kick: of the step, if the method has any.
-        given: situations and multipliers of the groups, if the end of the step asks for them.
+        given: what else the end of the step asks for: situations and multipliers of the groups for the
+            variational scheme, what is damped for a dissipative one.
     """
 
     residual: Float[Array, " unknowns"]

@@ -60,6 +60,7 @@ class Now(eqx.Module):
         coordinates: values of the joint coordinates of the effect at the start [rad or m].
         rates: their stored rates (rotors only) [rad/s or m/s].
         tableau: the collocation method.
+        stress: what numerical dissipation adds to the gradients of an elastic effect; None: nothing.
     """
 
     t: Float[Array, ""]
@@ -68,6 +69,7 @@ class Now(eqx.Module):
     coordinates: Float[Array, " c"]
     rates: Float[Array, " r"]
     tableau: Tableau = eqx.field(static=True)
+    stress: Float[Array, "s p"] | None = None
 
     @property
     def times(self) -> Float[Array, " s"]:
@@ -106,6 +108,8 @@ class Effect(eqx.Module):
         impulsive: whether forces, torques and power of its response are times the step (impulses, work).
         works: whether its power enters the work account of the state (non-potential effects).
         stores: whether it stores potential energy.
+        elastic: whether its oscillations can be damped numerically: it gives `strain_rates` and `curvature`,
+            and adds `Now.stress` to its gradients.
         rotors: number of stored coordinate rates per instance.
     """
 
@@ -115,6 +119,7 @@ class Effect(eqx.Module):
     impulsive: ClassVar[bool] = False
     works: ClassVar[bool] = False
     stores: ClassVar[bool] = False
+    elastic: ClassVar[bool] = False
     rotors: ClassVar[int] = 0
 
     @abc.abstractmethod
@@ -127,6 +132,16 @@ class Effect(eqx.Module):
             now: time, step, inputs, joint coordinates.
             lam: its multipliers times the step [N s or N m s].
         """
+
+    def strain_rates(self, place: Array, motion: Motion, h: Float[Array, ""]) -> Float[Array, "s p"]:
+        """Rates of the invariants that an elastic effect is a function of; h = 0: at one instant."""
+        return jnp.zeros((motion.rows.shape[0], 0))
+
+    def curvature(
+        self, place: Array, rows: Float[Array, "k 4 3"], coordinates: Float[Array, " c"]
+    ) -> Float[Array, "p p"]:
+        """Second derivatives of the energy of an elastic effect by its invariants."""
+        return jnp.zeros((0, 0))
 
     def stored(
         self,

@@ -49,6 +49,7 @@ class Potential(Effect):
 
     kind: ClassVar[str] = "potential"
     stores: ClassVar[bool] = True
+    elastic: ClassVar[bool] = True
     degree: ClassVar[int | None] = None
 
     def attach(self, find: Callable[[Handle], tuple[Joint, Array]]) -> tuple[Marker, ...]:
@@ -69,9 +70,20 @@ class Potential(Effect):
         x, rates = place_markers(place, motion.rows), place_markers(place, motion.rates)
         steps = jax.vmap(lambda xi, vi: jax.jvp(self.invariants, (xi,), (vi,))[1])(x, now.h * rates)
         gradient = averaged_gradient(self.energy, start, steps, now.tableau, self.degree)
+        if now.stress is not None:
+            gradient = gradient + now.stress
         held = x if motion.levers is None else place_markers(place, motion.levers)
         forces = jax.vmap(lambda xi, gi: jax.vjp(self.invariants, xi)[1](-gi)[0])(held, gradient)
         return marker_response(place, forces, None, rates, motion)
+
+    def strain_rates(self, place: Array, motion: Motion, h: Array) -> Array:
+        """Rates of the invariants at the stages: h times them are the increments."""
+        x, rates = place_markers(place, motion.rows), place_markers(place, motion.rates)
+        return jax.vmap(lambda xi, vi: jax.jvp(self.invariants, (xi,), (vi,))[1])(x, rates)
+
+    def curvature(self, place: Array, rows: Array, coordinates: Array) -> Array:
+        """Second derivatives of the energy [J per squared unit of invariant]."""
+        return jax.hessian(self.energy)(self.invariants(place_markers(place, rows)))
 
     def stored(self, place: Array, rows: Array, coordinates: Array, rates: Array) -> Array:
         """Energy [J]."""

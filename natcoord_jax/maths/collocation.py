@@ -31,7 +31,9 @@ class Tableau:
     kick: bool = False
     """Whether velocities are kept tangent to the constraints by isometric kicks along their normals."""
     variational: bool = False
-    """Whether forces take hold at both ends of the step instead of at its mid-point, see `Tableau.tangent`."""
+    """Whether forces take hold at both ends of the step instead of at its mid-point."""
+    spectral_radius: float = 1.0
+    """What is left of an infinitely fast oscillation after a step; below 1, fast oscillations are damped."""
 
     @property
     def tangent(self) -> bool:
@@ -41,7 +43,12 @@ class Tableau:
     @property
     def separable(self) -> bool:
         """Whether the equations of a step couple a body with its neighbours only."""
-        return not self.variational
+        return not self.variational and not self.dissipative
+
+    @property
+    def dissipative(self) -> bool:
+        """Whether fast oscillations are damped numerically."""
+        return self.spectral_radius < 1.0
 
     @property
     def order(self) -> int:

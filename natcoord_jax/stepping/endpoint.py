@@ -99,7 +99,7 @@ def endpoints(
         A function of step [s] and number of steps; another number does not compile anew. Steps that fail are
         repeated in parts, as in `simulate`, without a limit.
     """
-    leaves, structure = jax.tree.flatten((system, state))
+    leaves, structure = jax.tree.flatten((system, scheme.started(state)))
     program = _program(structure, inputs, scheme, newton_tol)
     placed = [jnp.asarray(x) for x in leaves]
     return lambda dt, steps: program(placed, jnp.asarray(dt, float), jnp.asarray(steps))

@@ -63,6 +63,7 @@ def step(
         0.5
     """
     check_state(system, state)
+    state = scheme.started(state)
     h = checked_step(dt)
     inputs, _ = checked_inputs(system, None if u is None else jnp.asarray(u, float)[None], 1)
     after, code = _one_step(system, state, inputs[0], h, newton_tol, 16, scheme.tableau)

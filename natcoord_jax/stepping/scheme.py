@@ -7,6 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from natcoord_jax.core.effect import replace_fields
+from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import Tableau, gauss
 
 LARGEST = 10
@@ -42,6 +44,12 @@ class Scheme(abc.ABC):
             start: start time [s].
         """
         return start + dt * (jnp.arange(steps)[:, None] + jnp.asarray(self.tableau.c))
+
+    def started(self, state: State) -> State:
+        """The state with all that the scheme keeps account of."""
+        if not self.tableau.dissipative or state.dissipated is not None:
+            return state
+        return replace_fields(state, dissipated=jnp.zeros_like(state.t))
 
 
 @dataclass(frozen=True)

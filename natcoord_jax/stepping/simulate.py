@@ -207,6 +207,7 @@ def simulate(
         (11, 4, 3)
     """
     check_state(system, state)
+    state = scheme.started(state)
     step = checked_step(dt)
     checked, count = checked_inputs(system, inputs, steps, scheme.stages)
     if save_every < 1 or count % save_every:
