@@ -1,4 +1,4 @@
-"""The end of a variational step: half of its forces take hold there, and constraints keep the velocity tangent.
+"""The end of a variational step: half of its forces take hold there, constraints keep the velocity tangent.
 
 The mid-point rule as a discrete variational principle (Marsden & West 2001, 1.5 and 3.4; with constraints in
 the null space Leyendecker, Marsden & Ortiz 2008): with the mean velocity V = (q_1 - q_0)/h of a step and the
@@ -23,7 +23,7 @@ from natcoord_jax.assembly.kick import Ends, end_of, rotor_rates
 from natcoord_jax.assembly.momentum import momentum_balance
 from natcoord_jax.assembly.response import Evaluation, no_multipliers
 from natcoord_jax.assembly.system import Group, System
-from natcoord_jax.assembly.tangent_space import TangentSpace, Velocity
+from natcoord_jax.assembly.tangent_space import TangentSpace
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import Tableau
@@ -90,8 +90,8 @@ def _work(
     found: Evaluation,
     turning: Float[Array, " coordinates"],
     impulses: Float[Array, " c"],
-) -> Float[Array, " c"]:
-    """Of relations between coordinates: half of what the step has booked is done at its end, by new impulses."""
+) -> Float[Array, " relations"]:
+    """Of relations: half of what the step has booked is done at its end instead, by the impulses there."""
     if not relations_of(system):
         return jnp.zeros(0, turning.dtype)
 

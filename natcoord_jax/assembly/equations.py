@@ -17,7 +17,7 @@ FORMS: dict[str, Any] = {"reduced": ReducedStep, "full": FullStep, "recursive": 
 
 
 def form_of(system: System, tableau: Tableau) -> str:
-    """The form in which a step of a scheme is solved: that chosen at compile, if its equations are separable."""
+    """The form in which a scheme is solved: that chosen at compile, if its equations are separable."""
     return system.structure.solver if tableau.separable else "reduced"
 
 

@@ -62,7 +62,7 @@ class Ends(eqx.Module):
 
     Attributes:
         velocity: v_1.
-        work: work of the constraints in the two kicks, drives being the only ones that do any [J].
+        work: of the constraints at the ends of the step, drives being the only ones that do any [J].
         sound: whether the kicks are small against the motion and leave the energy alone. Far off, where the
             tangents at the two ends are nearly orthogonal, the equations have solutions that are neither.
     """

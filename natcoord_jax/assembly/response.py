@@ -88,7 +88,9 @@ def situation(system: System, group: Group, state: State, u: Array, h: Array) ->
 def respond(group: Group, where: Situation, motion: Motion, lam: Float[Array, "n s m"], tableau: Tableau):
     """Responses of all instances of a group; leading axis `n`."""
 
-    def one(effect, place, inputs, coordinates, rates, start, rows, row_rates, spin, levers, stress, multiplier):
+    def one(
+        effect, place, inputs, coordinates, rates, start, rows, row_rates, spin, levers, stress, multiplier
+    ):
         now = Now(where.t, where.h, inputs, coordinates, rates, tableau, stress)
         return effect.respond(place, Motion(start, rows, row_rates, spin, levers), now, multiplier)
 

@@ -141,7 +141,7 @@ class TangentSpace(eqx.Module):
         return self.spread(w + known.frame.T @ known.within(self.framed(lost)))
 
     def with_momentum(self, momentum: Float[Array, " u"]) -> Velocity:
-        """The velocity that the constraints admit with generalised momenta P^T M v; projected twice as well."""
+        """The admissible velocity with given momenta P^T M v; projected twice, as above."""
         known = self.admissible
 
         def rates(momentum: Array) -> Array:

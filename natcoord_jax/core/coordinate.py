@@ -135,7 +135,9 @@ class CoordinateEffect(Effect):
         forces, rows, power = self.generalised(rates, now, lam)
         if motion.levers is not None:
             held, still = motion.held, jnp.zeros_like(now.h)
-            loads = [axis.unit_load(pair_motion(place[k], held, 2 * k), still) for k, axis in enumerate(self.axes)]
+            loads = [
+                axis.unit_load(pair_motion(place[k], held, 2 * k), still) for k, axis in enumerate(self.axes)
+            ]
         on_rows, torques = [], []
         for k, load in enumerate(loads):
             factor = forces[:, k, None, None]

@@ -17,8 +17,9 @@ class Dissipative(Scheme):
 
     exactly, with momentum and angular momentum conserved and constraints at round-off; rigid motions and
     steady deformation are not damped. A linear oscillation of frequency omega is multiplied by -rho in a step
-    as omega h grows beyond all bounds and hardly damped while it has more than some thirty steps a period;
-    the damping ratio is of third order in omega h, the scheme of order two. With rho = 1 it is (57).
+    as omega h grows beyond all bounds; with the default, by 0.84 at omega h = 10, by 0.998 at six steps a
+    period and by 1 - 3e-7 at sixty. The damping is of third order in omega h, the scheme of order two; with
+    rho = 1 it is (57). Velocities obey their constraints as accurately as the scheme is, as those of (57) do.
     The equations are in `natcoord_jax.assembly.dissipation`.
 
     What is dissipated is in `State.dissipated` [J] and, as "numerical dissipation", in `System.work`.
@@ -48,7 +49,8 @@ class Dissipative(Scheme):
         >>> hinge = scene.add(nc.Revolute(nc.ground, arm, axis=(0, 0, 1)))
         >>> spring = scene.add(nc.JointSpring(hinge, stiffness=1e8))
         >>> system, state = scene.compile()
-        >>> trajectory = nc.simulate(system, state, dt=0.1, steps=10, scheme=nc.Dissipative(spectral_radius=0.5))
+        >>> damped = nc.Dissipative(spectral_radius=0.5)
+        >>> trajectory = nc.simulate(system, state, dt=0.1, steps=10, scheme=damped)
         >>> bool(system.energy(trajectory).total[-1] < 1e-5)
         True
     """

@@ -36,7 +36,7 @@ def step(
     newton_tol: float = TOLERANCE,
     scheme: Scheme = SECOND_ORDER,
 ) -> State:
-    """One energy-momentum step (57), differentiable in everything.
+    """One step, by default the energy-momentum step (57), differentiable in everything.
 
     Args:
         system: compiled system.

@@ -155,7 +155,7 @@ def simulate(
     rtol: Any = None,
     atol: Any = None,
 ) -> Trajectory:
-    """Simulate with the energy-momentum step (57), or with its relatives of higher order.
+    """Simulate with the energy-momentum step (57), its relatives of higher order, or another scheme.
 
     Works under `jit`, `vmap`, `grad`, `jvp` and their compositions up to one reverse mode; `dt` and every
     floating leaf of `system`, `state` and `inputs` can be differentiated.
@@ -180,7 +180,7 @@ def simulate(
         extra_substeps: how many substeps may be made beyond one a step (per segment of at most 512 steps
             where not every step is saved); by default 16, for steps that fail and are repeated in parts, and
             with error control 256 or eight a step. A gradient takes time for all of them.
-        scheme: the scheme, by default that of order two.
+        scheme: `EnergyMomentum`, by default that of order two; `VariationalMidpoint`; `Dissipative`.
         rtol: error that a substep may have, relative: steps are made in as few substeps as keep to it, of
             lengths found on the way. Inputs change at the ends of steps, states are saved there, and what
             the scheme conserves is conserved. The error is that of any row (a position or a director), with

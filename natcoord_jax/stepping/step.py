@@ -8,8 +8,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.coordinates import stage_rates
-from natcoord_jax.assembly.equations import form_of, prepare, starting
 from natcoord_jax.assembly.end_impulses import released
+from natcoord_jax.assembly.equations import form_of, prepare, starting
 from natcoord_jax.assembly.kick import ends_of
 from natcoord_jax.assembly.response import Evaluation
 from natcoord_jax.assembly.system import Group, System
