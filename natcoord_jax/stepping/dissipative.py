@@ -27,7 +27,8 @@ class Dissipative(Scheme):
     Damped are oscillations of springs through the curvature of their energy in its invariants at the start
     of the step: the squared length for springs between points, the coordinate for springs on joints. What is
     stiff by tension alone has none: a spring between points of no natural length, or a taut string across its
-    line, is not damped but conserves energy; give it a length, or use a spring on a joint.
+    line, is not damped but conserves energy; give it a length, or use a spring on a joint. The same holds
+    where an energy is not convex in its invariants, and for effects with a `respond` of their own.
 
     Whatever solver a system was compiled for, the step is solved densely in the joint null space: large trees
     run, but slowly.

@@ -25,9 +25,12 @@ class VariationalMidpoint(Scheme):
     solved in the null space of the constraints at either end (the discrete null space method). The map from
     (q_0, p_0) to (q_1, p_1) preserves the canonical form dq ^ M dv on the constraint manifold exactly;
     velocities obey the constraints to round-off. Energy oscillates with the square of the step without a
-    trend over times that are exponentially long in 1/h; where it has to be exact, use `EnergyMomentum`.
+    trend over times that are exponentially long in 1/h, as long as steps resolve the motion and are equal
+    (with `rtol`, or where steps had to be repeated in parts, they are not); where energy has to be exact,
+    use `EnergyMomentum`.
     Loads, dampers and inputs are taken at mid-steps and enter both ends by halves (Lagrange-d'Alembert).
-    Rotors, drives, loops and redundant constraints are treated alike.
+    Rotors, drives, loops and redundant constraints are treated alike; an effect with a `respond` of its own
+    enters as a load.
 
     Whatever solver a system was compiled for, the step is solved densely in the joint null space, and the
     velocity at its end by a Cholesky factorisation of the inertia: large trees run, but slowly.
