@@ -96,9 +96,11 @@ from natcoord_jax.effects.springs import (
 )
 from natcoord_jax.scene import Scene
 from natcoord_jax.stepping.assemble import assemble
+from natcoord_jax.stepping.dissipative import Dissipative
 from natcoord_jax.stepping.one_step import linearise, step
 from natcoord_jax.stepping.scheme import EnergyMomentum
 from natcoord_jax.stepping.simulate import simulate
+from natcoord_jax.stepping.variational import VariationalMidpoint
 
 if TYPE_CHECKING:
     from natcoord_jax.viz import animate, plot
@@ -126,6 +128,7 @@ __all__ = [
     "DirectorDamping",
     "DirectorElement",
     "DirectorInterpolation",
+    "Dissipative",
     "Distance",
     "Drive",
     "Ellipsoid",
@@ -178,6 +181,7 @@ __all__ = [
     "Trajectory",
     "TubularSection",
     "Universal",
+    "VariationalMidpoint",
     "accuracy",
     "animate",
     "assemble",

@@ -16,9 +16,11 @@ from natcoord_jax.core.results import Result
 from natcoord_jax.core.state import Trajectory
 from natcoord_jax.gallery.report import measure, table
 from natcoord_jax.stepping.error_control import Tolerance
+from natcoord_jax.stepping.scheme import Scheme
 
 WHOLE = 1e-9
 """How far the number of steps may be from a whole number, relatively."""
+SCHEMES = ("energy-momentum", "variational", "dissipative")
 FIGURES = (".png", ".pdf", ".svg")
 
 
@@ -43,7 +45,11 @@ def parser() -> Parser:
     run.add_argument("scene", metavar="SCENE", help="a name that `natcoord-jax scenes` lists")
     run.add_argument("--steps", type=int, help="number of steps; alone, it keeps the scene's end time")
     run.add_argument("--dt", type=float, help="step [s]; alone, it must divide the scene's end time")
-    run.add_argument("--order", type=int, default=2, metavar="P", help="order of the scheme, 2 to 10")
+    run.add_argument("--scheme", choices=SCHEMES, default=SCHEMES[0], metavar="NAME", help=", ".join(SCHEMES))
+    run.add_argument("--order", type=int, metavar="P", help="order of energy-momentum, 2 to 10; by default 2")
+    run.add_argument(
+        "--spectral-radius", type=float, metavar="R", help="of the dissipative scheme, 0 to 1; by default 0.8"
+    )
     run.add_argument("--rtol", type=float, metavar="R", help="error tolerated in a substep, relative")
     run.add_argument("--atol", type=float, metavar="A", help="the same in metres; by default as --rtol")
     costs = commands.add_parser("accuracy", help="show what accuracy costs in time, over steps and orders")
@@ -121,6 +127,28 @@ def _scheme(order: int) -> nc.EnergyMomentum:
         raise BadOptionError(f"--order: {problem}") from None
 
 
+def choose_scheme(name: str, order: int | None, spectral_radius: float | None) -> Scheme:
+    """The scheme of a run.
+
+    Raises:
+        BadOptionError: for a number that the scheme does not take.
+    """
+    if order is not None and name != "energy-momentum":
+        raise BadOptionError(f"--order is {order}, but the {name} scheme is of order 2; leave it out")
+    if spectral_radius is not None and name != "dissipative":
+        raise BadOptionError("--spectral-radius belongs to the dissipative scheme; pass --scheme dissipative")
+    if name == "variational":
+        return nc.VariationalMidpoint()
+    if name == "energy-momentum":
+        return _scheme(2 if order is None else order)
+    if spectral_radius is None:
+        return nc.Dissipative()
+    try:
+        return nc.Dissipative(spectral_radius=spectral_radius)
+    except ValueError as problem:
+        raise BadOptionError(f"--spectral-radius: {problem}") from None
+
+
 def _accuracy(arguments: argparse.Namespace) -> int:
     try:
         orders = [_scheme(int(part)).order for part in arguments.orders.split(",")]
@@ -148,7 +176,7 @@ def _accuracy(arguments: argparse.Namespace) -> int:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    scheme = _scheme(arguments.order)
+    scheme = choose_scheme(arguments.scheme, arguments.order, arguments.spectral_radius)
     example = _checked(arguments)
     steps, dt = choose_steps(example, arguments.steps, arguments.dt)
     try:

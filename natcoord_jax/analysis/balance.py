@@ -111,6 +111,8 @@ def _account(system: System, trajectory: Trajectory) -> dict[str, Any]:
     impulses, grams = jax.vmap(each)(before, after, trajectory.inputs)
     linear, angular = jax.vmap(lambda s: body_momenta(system, s))(states)
     energy, work = system.energy(trajectory), states.work
+    if states.dissipated is not None:
+        work = jnp.concatenate([work, -states.dissipated[:, None]], axis=1)
     stores = sum((jnp.abs(v) for v in energy.stores.values()), jnp.zeros_like(energy.kinetic))
     steps = (after.t - before.t)[:, None]
     return {

@@ -16,11 +16,16 @@ from natcoord_jax.maths.collocation import Tableau
 FORMS: dict[str, Any] = {"reduced": ReducedStep, "full": FullStep, "recursive": RecursiveStep}
 
 
+def form_of(system: System, tableau: Tableau) -> str:
+    """The form in which a scheme is solved: that chosen at compile, if its equations are separable."""
+    return system.structure.solver if tableau.separable else "reduced"
+
+
 def prepare(
     system: System, state: State, u: Array, h: Array, tableau: Tableau, outset: Outset | None = None
 ) -> Any:
-    """The equations of one step, in the form chosen at compile; what is known of its start may be given."""
-    return FORMS[system.structure.solver].prepare(system, state, u, h, tableau, outset)
+    """The equations of one step, in the form of the scheme; what is known of its start may be given."""
+    return FORMS[form_of(system, tableau)].prepare(system, state, u, h, tableau, outset)
 
 
 def starting(
@@ -31,4 +36,4 @@ def starting(
     later: bool = False,
 ) -> Outset:
     """What the equations of a step that starts from a state need of it, see `Outset.of`."""
-    return FORMS[system.structure.solver].starting(system, state, tableau, tangents, later)
+    return FORMS[form_of(system, tableau)].starting(system, state, tableau, tangents, later)

@@ -62,7 +62,7 @@ class Ends(eqx.Module):
 
     Attributes:
         velocity: v_1.
-        work: work of the constraints in the two kicks, drives being the only ones that do any [J].
+        work: of the constraints at the ends of the step, drives being the only ones that do any [J].
         sound: whether the kicks are small against the motion and leave the energy alone. Far off, where the
             tangents at the two ends are nearly orthogonal, the equations have solutions that are neither.
     """
@@ -72,7 +72,7 @@ class Ends(eqx.Module):
     sound: Bool[Array, ""]
 
 
-def _end_of(state: State, at: Stations, h: Array, tableau: Tableau) -> State:
+def end_of(state: State, at: Stations, h: Array, tableau: Tableau) -> State:
     """Positions and time at the end of a step; nothing else of it is of use."""
     rows = at.start[:-1] + h * jnp.tensordot(jnp.asarray(tableau.b), at.rates[:, :-1], 1)
     q = rows.reshape(-1, 3)
@@ -108,7 +108,7 @@ def kick_of(
         tableau: the collocation method.
     """
     beta, sigma = jnp.asarray(tableau.beta), tableau.reflection
-    end = _end_of(state, at, h, tableau)
+    end = end_of(state, at, h, tableau)
     if before is None:
         before, after = _both(system, state, end)
     else:
@@ -208,9 +208,15 @@ def kicked(
         return velocity, situations, None
     before = None if tangents is None else tangents.with_system(system)
     found = kick_of(system, state, before, groups, at, h, tableau)
-    rotors = state.rates + found.kick.rotors
-    moved = [
+    moved = with_rotors(groups, situations, state.rates + found.kick.rotors)
+    return velocity + found.kick.rows, moved, found
+
+
+def with_rotors(
+    groups: Sequence[Group], situations: Sequence[Situation], rotors: Float[Array, " rotors"]
+) -> list[Situation]:
+    """Situations with other rates of the rotors at the start of the step."""
+    return [
         replace_fields(where, rates=rotors[group.rotors]) if group.effect.rotors else where
         for group, where in zip(groups, situations)
     ]
-    return velocity + found.kick.rows, moved, found

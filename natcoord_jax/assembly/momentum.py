@@ -99,6 +99,6 @@ def momentum_balance(
             size = size + jnp.sum(weights[:, 1] * turning**2)
         rows.append(answer.rows.reshape(-1))
         power.append(answer.power)
-    force, moment = wrench(momentum, at.rows[:, :-1, 1:])
+    force, moment = wrench(momentum, at.held[:, :-1, 1:])
     moment = moment if torque is None else moment - torque
     return Balance(force, moment, jnp.sqrt(size), jnp.concatenate(rows), power)

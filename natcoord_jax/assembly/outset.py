@@ -3,6 +3,7 @@
 import equinox as eqx
 from jaxtyping import Array, Float
 
+from natcoord_jax.assembly.dissipation import Damping
 from natcoord_jax.assembly.system import System
 from natcoord_jax.assembly.tangent_space import TangentSpace
 from natcoord_jax.core.state import State
@@ -16,10 +17,12 @@ class Outset(eqx.Module):
         projector: on the range of the constraints, for the multipliers of all stages; None: they are
             independent.
         tangents: tangent space, without the system; None for schemes without kicks, or if found later.
+        damping: what can be damped; None for schemes that do not dissipate, or if found later.
     """
 
     projector: Float[Array, "m m"] | None
     tangents: TangentSpace | None
+    damping: Damping | None = None
 
     @classmethod
     def of(
@@ -41,6 +44,8 @@ class Outset(eqx.Module):
             tangents: known from the end of the last step; None: found here.
             later: leave it to the evaluation, which finds it with that at the end of the step.
         """
+        if tableau.dissipative and not later:
+            return cls(projector, None, Damping.at(system, state).without_system())
         if not tableau.kick or later:
             return cls(projector, None)
         if tangents is None:

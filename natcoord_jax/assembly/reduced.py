@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from natcoord_jax.assembly.dissipation import Damped, Damping
 from natcoord_jax.assembly.kick import kicked
 from natcoord_jax.assembly.momentum import momentum_balance
 from natcoord_jax.assembly.outset import Outset
@@ -198,6 +199,8 @@ class ReducedStep(eqx.Module):
         w, multipliers = self.split(project_multipliers(y, self.balances, self.outset.projector))
         motion, geometry = self.motion(w)
         at = self.stations(motion)
+        if self.tableau.variational:
+            at, geometry = replace_fields(at, levers=at.start[None]), at_rest(self).motion(w)[1]
         velocity, situations, kick = kicked(
             self.system,
             self.state,
@@ -208,12 +211,23 @@ class ReducedStep(eqx.Module):
             self.h,
             self.tableau,
         )
+        damped = None
+        if self.tableau.dissipative:
+            damped = self.damped(at)
+            velocity, situations = damped.started(self.groups, situations)
         given = system, self.groups, situations, at, velocity
         found = momentum_balance(*given, multipliers, self.h, self.tableau)
         generalised = self.generalised(geometry, found.force, found.torque)
         rows = project_rows(found.rows, y, self.balances, self.outset.projector)
         residual = jnp.concatenate([generalised.reshape(-1), rows])
-        return Evaluation(residual, found.size, at, found.power, kick)
+        asked = (situations, multipliers) if self.tableau.variational else damped
+        return Evaluation(residual, found.size, at, found.power, kick, asked)
+
+    def damped(self, at: Stations) -> Damped:
+        """What numerical dissipation does in the step."""
+        damping = self.outset.damping
+        damping = Damping.at(self.system, self.state) if damping is None else damping.with_system(self.system)
+        return damping.over(self.state, self.groups, at, self.h, self.tableau)
 
     def guess(self) -> Float[Array, " unknowns"]:
         """Rates of the velocities at the start, repeated for every stage; multipliers zero."""

@@ -26,12 +26,18 @@ def body_rows(q: Float[Array, "*s rows 3"]) -> Float[Array, "*s bodies 4 3"]:
 
 
 class Stations(eqx.Module):
-    """Motion of all bodies and, last, the ground."""
+    """Motion of all bodies and, last, the ground; `levers` as in `Motion`."""
 
     start: Float[Array, "bodies_and_ground 4 3"]
     rows: Float[Array, "s bodies_and_ground 4 3"]
     rates: Float[Array, "s bodies_and_ground 4 3"]
     spin: Float[Array, "s bodies_and_ground 3"]
+    levers: Float[Array, "s bodies_and_ground 4 3"] | None = None
+
+    @property
+    def held(self) -> Float[Array, "s bodies_and_ground 4 3"]:
+        """Rows on which forces take hold."""
+        return self.rows if self.levers is None else self.levers
 
 
 def stations(
@@ -56,7 +62,7 @@ def stations(
 
 
 class Situation(eqx.Module):
-    """What a group needs besides the motion: places, inputs, coordinates, rates, time and step."""
+    """What a group needs besides the motion: places, inputs, coordinates, rates, time, step, extra stress."""
 
     place: Array
     inputs: Array
@@ -64,6 +70,7 @@ class Situation(eqx.Module):
     rates: Array
     t: Float[Array, ""]
     h: Float[Array, ""]
+    stress: Float[Array, "n s p"] | None = None
 
 
 def situation(system: System, group: Group, state: State, u: Array, h: Array) -> Situation:
@@ -81,11 +88,13 @@ def situation(system: System, group: Group, state: State, u: Array, h: Array) ->
 def respond(group: Group, where: Situation, motion: Motion, lam: Float[Array, "n s m"], tableau: Tableau):
     """Responses of all instances of a group; leading axis `n`."""
 
-    def one(effect, place, inputs, coordinates, rates, start, rows, row_rates, spin, multiplier):
-        now = Now(where.t, where.h, inputs, coordinates, rates, tableau)
-        return effect.respond(place, Motion(start, rows, row_rates, spin), now, multiplier)
+    def one(
+        effect, place, inputs, coordinates, rates, start, rows, row_rates, spin, levers, stress, multiplier
+    ):
+        now = Now(where.t, where.h, inputs, coordinates, rates, tableau, stress)
+        return effect.respond(place, Motion(start, rows, row_rates, spin, levers), now, multiplier)
 
-    axes = (None if group.source == "mass" else 0, 0, 0, 0, 0, 0, 1, 1, 1, 0)
+    axes = (None if group.source == "mass" else 0, 0, 0, 0, 0, 0, 1, 1, 1, 1, 0, 0)
     with jax.named_scope(group.effect.kind.replace(" ", "_")):
         return jax.vmap(one, in_axes=axes)(
             group.effect,
@@ -97,6 +106,8 @@ def respond(group: Group, where: Situation, motion: Motion, lam: Float[Array, "n
             motion.rows,
             motion.rates,
             motion.spin,
+            motion.levers,
+            where.stress,
             lam,
         )
 
@@ -104,7 +115,8 @@ def respond(group: Group, where: Situation, motion: Motion, lam: Float[Array, "n
 def gather(group: Group, at: Stations) -> Motion:
     """Motion of the bodies of a group: start (n, k, ...), stage quantities (s, n, k, ...)."""
     index = group.bodies
-    return Motion(at.start[index], at.rows[:, index], at.rates[:, index], at.spin[:, index])
+    levers = None if at.levers is None else at.levers[:, index]
+    return Motion(at.start[index], at.rows[:, index], at.rates[:, index], at.spin[:, index], levers)
 
 
 class Evaluation(eqx.Module):
@@ -116,6 +128,8 @@ class Evaluation(eqx.Module):
         at: stage motion of all bodies.
         power: power of each group, for work accounts (instances, s).
         kick: of the step, if the method has any.
+        given: what else the end of the step asks for: situations and multipliers of the groups for the
+            variational scheme, what is damped for a dissipative one.
     """
 
     residual: Float[Array, " unknowns"]
@@ -123,6 +137,7 @@ class Evaluation(eqx.Module):
     at: Stations
     power: list[Float[Array, "_ s"]]
     kick: Any = None
+    given: Any = None
 
 
 def collect(group: Group, loads: Float[Array, "n s k *rest"]) -> Float[Array, "bodies s *rest"]:

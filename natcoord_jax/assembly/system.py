@@ -165,9 +165,15 @@ class System(eqx.Module):
         return diagnostics.constraint_errors(self, motion)
 
     def work(self, motion: State | Trajectory) -> dict[str, Float[Array, "*t"]]:
-        """Work done so far [J] by each input, load, damper and drive, by name."""
+        """Work done so far [J] by each input, load, damper and drive, by name.
+
+        After a dissipative scheme also "numerical dissipation", which is negative.
+        """
         states = diagnostics.states_of(motion)
-        return {name: states.work[..., k] for k, name in enumerate(self.structure.works)}
+        works = {name: states.work[..., k] for k, name in enumerate(self.structure.works)}
+        if states.dissipated is not None:
+            works["numerical dissipation"] = -states.dissipated
+        return works
 
     def instant(self, motion: State | Trajectory, inputs: Any = None) -> "instant.Instant":
         """Accelerations and reactions from the equations of motion at one instant, or along a trajectory.

@@ -140,6 +140,16 @@ class TangentSpace(eqx.Module):
         lost = Velocity(v.rows - found.rows, v.rotors - found.rotors)
         return self.spread(w + known.frame.T @ known.within(self.framed(lost)))
 
+    def with_momentum(self, momentum: Float[Array, " u"]) -> Velocity:
+        """The admissible velocity with given momenta P^T M v; projected twice, as above."""
+        known = self.admissible
+
+        def rates(momentum: Array) -> Array:
+            return known.frame.T @ known.within(known.frame @ momentum)
+
+        w = rates(momentum) + self.drift
+        return self.spread(w + rates(momentum - self.pulled(self.impulse(self.spread(w)))))
+
 
 def rotor_inertias(system: System) -> Float[Array, " rotors"]:
     """Inertias of all rotors."""

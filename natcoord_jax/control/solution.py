@@ -5,6 +5,7 @@ import json
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -106,9 +107,7 @@ class Solution:
     @property
     def missing(self) -> dict[str, float]:
         """Residual of the goal at the end of the simulated motion, by name."""
-        final = State(
-            *(x[-1] for x in (getattr(self.trajectory.states, f.name) for f in dataclasses.fields(State)))
-        )
+        final = jax.tree.map(lambda x: x[-1], self.trajectory.states)
         names = self.problem.goal.labels(self.problem.system)
         return dict(zip(_unique(names), np.asarray(self.problem.goal.residual(self.system, final)).tolist()))
 

@@ -133,6 +133,11 @@ class CoordinateEffect(Effect):
         ]
         rates = jnp.stack([load.rate for load in loads], axis=-1)
         forces, rows, power = self.generalised(rates, now, lam)
+        if motion.levers is not None:
+            held, still = motion.held, jnp.zeros_like(now.h)
+            loads = [
+                axis.unit_load(pair_motion(place[k], held, 2 * k), still) for k, axis in enumerate(self.axes)
+            ]
         on_rows, torques = [], []
         for k, load in enumerate(loads):
             factor = forces[:, k, None, None]
@@ -157,6 +162,7 @@ class CoordinatePotential(CoordinateEffect):
 
     kind: ClassVar[str] = "coordinate potential"
     stores: ClassVar[bool] = True
+    elastic: ClassVar[bool] = True
     degree: ClassVar[int | None] = None
 
     @abc.abstractmethod
@@ -168,8 +174,18 @@ class CoordinatePotential(CoordinateEffect):
         gradient = averaged_gradient(
             lambda c: self.energy(c[0]), now.coordinates, now.h * rates, now.tableau, self.degree
         )
+        if now.stress is not None:
+            gradient = gradient + now.stress
         stages = now.tableau.stages
         return -gradient, jnp.zeros((stages, 0)), jnp.sum(-gradient * rates, axis=-1)
+
+    def strain_rates(self, place: Array, motion: Motion, h: Array) -> Array:
+        """Mean rate of the coordinate over the step."""
+        return self.axes[0].unit_load(pair_motion(place[0], motion, 0), h).rate[:, None]
+
+    def curvature(self, place: Array, rows: Array, coordinates: Array) -> Array:
+        """Second derivative of the energy [N m/rad or N/m]."""
+        return jax.hessian(lambda c: self.energy(c[0]))(coordinates)
 
     def stored(self, place: Array, rows: Array, coordinates: Array, rates: Array) -> Array:
         """Energy [J]."""

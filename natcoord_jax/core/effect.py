@@ -33,12 +33,21 @@ class Motion(eqx.Module):
         rows: rows at the stages.
         rates: their velocities at the stages [1/s times that].
         spin: angular velocities at the stages [rad/s].
+        levers: rows on which forces of potentials and constraints take hold; None: those at the stages.
     """
 
     start: Float[Array, "*n k 4 3"]
     rows: Float[Array, "s *n k 4 3"]
     rates: Float[Array, "s *n k 4 3"]
     spin: Float[Array, "s *n k 3"]
+    levers: Float[Array, "s *n k 4 3"] | None = None
+
+    @property
+    def held(self) -> "Motion":
+        """The motion with all rows where forces take hold."""
+        if self.levers is None:
+            return self
+        return Motion(self.levers[0], self.levers, self.rates, self.spin)
 
 
 class Now(eqx.Module):
@@ -51,6 +60,7 @@ class Now(eqx.Module):
         coordinates: values of the joint coordinates of the effect at the start [rad or m].
         rates: their stored rates (rotors only) [rad/s or m/s].
         tableau: the collocation method.
+        stress: what numerical dissipation adds to the gradients of an elastic effect; None: nothing.
     """
 
     t: Float[Array, ""]
@@ -59,6 +69,7 @@ class Now(eqx.Module):
     coordinates: Float[Array, " c"]
     rates: Float[Array, " r"]
     tableau: Tableau = eqx.field(static=True)
+    stress: Float[Array, "s p"] | None = None
 
     @property
     def times(self) -> Float[Array, " s"]:
@@ -97,6 +108,8 @@ class Effect(eqx.Module):
         impulsive: whether forces, torques and power of its response are times the step (impulses, work).
         works: whether its power enters the work account of the state (non-potential effects).
         stores: whether it stores potential energy.
+        elastic: whether its oscillations can be damped numerically: it gives `strain_rates` and `curvature`,
+            and adds `Now.stress` to its gradients.
         rotors: number of stored coordinate rates per instance.
         couples: whether bodies of neighbouring markers become neighbours in the spanning tree where no joint
             makes them so: elements of beams do, of which a chain then is a chain of bodies.
@@ -108,6 +121,7 @@ class Effect(eqx.Module):
     impulsive: ClassVar[bool] = False
     works: ClassVar[bool] = False
     stores: ClassVar[bool] = False
+    elastic: ClassVar[bool] = False
     rotors: ClassVar[int] = 0
     couples: ClassVar[bool] = False
 
@@ -129,6 +143,16 @@ class Effect(eqx.Module):
         answer with something cheaper.
         """
         return self
+
+    def strain_rates(self, place: Array, motion: Motion, h: Float[Array, ""]) -> Float[Array, "s p"]:
+        """Rates of the invariants that an elastic effect is a function of; h = 0: at one instant."""
+        return jnp.zeros((motion.rows.shape[0], 0))
+
+    def curvature(
+        self, place: Array, rows: Float[Array, "k 4 3"], coordinates: Float[Array, " c"]
+    ) -> Float[Array, "p p"]:
+        """Second derivatives of the energy of an elastic effect by its invariants."""
+        return jnp.zeros((0, 0))
 
     def stored(
         self,

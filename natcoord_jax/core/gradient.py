@@ -30,6 +30,9 @@ def averaged_gradient(
 ) -> Float[Array, "s p"]:
     """Gradients S_i [J per unit of invariant] with sum_i b_i S_i . steps_i = E(end) - E(start).
 
+    For the variational mid-point rule the gradient at the mean of the invariants, whose work is the change of
+    energy up to terms of third order in the steps.
+
     Args:
         energy: function of the invariants, shape (p,) to scalar [J].
         start: invariants at the start of the step.
@@ -38,6 +41,8 @@ def averaged_gradient(
         degree: polynomial degree of `energy`, or None if it is no polynomial.
         points: of the quadrature if it is no polynomial; default two more than twice the stages.
     """
+    if tableau.variational:
+        return jax.grad(energy)(start + 0.5 * steps[0])[None]
     if degree is not None:
         points = max(tableau.stages, -(-degree * tableau.stages // 2))
     elif points is None:

@@ -103,14 +103,14 @@ class Joint(Effect):
         return []
 
     def respond(self, place: Array, motion: Motion, now: Now, lam: Array) -> Response:
-        """Rates G(Q_i) V_i and forces G(Q_i)^T lambda_i: for quadratic g the discrete derivative (57)."""
+        """Rates G(Q_i) V_i: for quadratic g the discrete derivative (57); and forces G^T lambda_i."""
 
         def constraint(rows: Float[Array, "2 4 3"]) -> Float[Array, " m"]:
             return self.residual(*frames_at(place, rows))
 
-        def stage(rows, rates, multiplier):
+        def stage(rows, rates, held, multiplier):
             g_rate = jax.jvp(constraint, (rows,), (rates,))[1]
-            return g_rate, jax.vjp(constraint, rows)[1](multiplier)[0]
+            return g_rate, jax.vjp(constraint, held)[1](multiplier)[0]
 
-        g_rates, forces = jax.vmap(stage)(motion.rows, motion.rates, lam)
+        g_rates, forces = jax.vmap(stage)(motion.rows, motion.rates, motion.held.rows, lam)
         return Response(forces, None, g_rates, jnp.zeros(now.tableau.stages))

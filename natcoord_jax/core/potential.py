@@ -55,6 +55,7 @@ class Potential(Effect):
 
     kind: ClassVar[str] = "potential"
     stores: ClassVar[bool] = True
+    elastic: ClassVar[bool] = True
     degree: ClassVar[int | None] = None
     points: ClassVar[int | None] = None
 
@@ -70,16 +71,17 @@ class Potential(Effect):
     def energy(self, invariants: Float[Array, " p"]) -> Float[Array, ""]:
         """Energy [J]."""
 
-    def curvature(self, invariants: Float[Array, " p"]) -> Float[Array, "p p"]:
+    def energy_curvature(self, invariants: Float[Array, " p"]) -> Float[Array, "p p"]:
         """Second derivatives of the energy by the invariants; for Newton's Jacobian."""
         return jax.hessian(self.energy)(invariants)
 
     def respond(self, place: Array, motion: Motion, now: Now, lam: Array) -> Response:
-        """Forces -D pi(Q_i)^T S_i with the averaged gradients S_i."""
+        """Forces -D pi^T S_i with the averaged gradients S_i, D pi where forces take hold."""
         start = self.invariants(place_markers(place, motion.start))
 
         def gradient(steps: Float[Array, "s p"]) -> Float[Array, "s p"]:
-            return averaged_gradient(self.energy, start, steps, now.tableau, self.degree, self.points)
+            found = averaged_gradient(self.energy, start, steps, now.tableau, self.degree, self.points)
+            return found if now.stress is None else found + now.stress
 
         return _response(self, gradient, place, motion, now)
 
@@ -89,7 +91,18 @@ class Potential(Effect):
         steps = _steps(self, place, motion, now)
         gradient = averaged_gradient(self.energy, start, steps, now.tableau, self.degree, self.points)
         middle = start + 0.5 * jnp.asarray(now.tableau.b) @ steps
-        return LinearisedPotential(self, steps, gradient, self.curvature(middle))
+        if now.stress is not None:
+            gradient = gradient + now.stress
+        return LinearisedPotential(self, steps, gradient, self.energy_curvature(middle))
+
+    def strain_rates(self, place: Array, motion: Motion, h: Array) -> Array:
+        """Rates of the invariants at the stages: h times them are the increments."""
+        x, rates = place_markers(place, motion.rows), place_markers(place, motion.rates)
+        return jax.vmap(lambda xi, vi: jax.jvp(self.invariants, (xi,), (vi,))[1])(x, rates)
+
+    def curvature(self, place: Array, rows: Array, coordinates: Array) -> Array:
+        """Second derivatives of the energy [J per squared unit of invariant]."""
+        return self.energy_curvature(self.invariants(place_markers(place, rows)))
 
     def stored(self, place: Array, rows: Array, coordinates: Array, rates: Array) -> Array:
         """Energy [J]."""
@@ -131,10 +144,11 @@ def _steps(potential: Potential, place: Array, motion: Motion, now: Now) -> Floa
 def _response(
     potential: Potential, gradient: Callable[[Array], Array], place: Array, motion: Motion, now: Now
 ) -> Response:
-    """Forces -D pi(Q_i)^T S_i with gradients S_i, a function of the steps of the invariants."""
+    """Forces -D pi^T S_i with gradients S_i of the steps of the invariants, D pi where forces take hold."""
     x, rates = place_markers(place, motion.rows), place_markers(place, motion.rates)
     given = gradient(_steps(potential, place, motion, now))
-    forces = jax.vmap(lambda xi, gi: jax.vjp(potential.invariants, xi)[1](-gi)[0])(x, given)
+    held = x if motion.levers is None else place_markers(place, motion.levers)
+    forces = jax.vmap(lambda xi, gi: jax.vjp(potential.invariants, xi)[1](-gi)[0])(held, given)
     return marker_response(place, forces, None, rates, motion)
 
 

@@ -16,6 +16,7 @@ class State(eqx.Module):
         coordinates: joint coordinates, angles counted on over many turns [rad, m].
         rates: stored rates of rotors (armature) [rad/s, m/s].
         work: work done so far by each input, load, damper and drive [J].
+        dissipated: energy that a dissipative scheme has taken out so far [J]; None before it is used.
     """
 
     t: Float[Array, "*batch"]
@@ -24,6 +25,7 @@ class State(eqx.Module):
     coordinates: Float[Array, "*batch coordinates"]
     rates: Float[Array, "*batch rotors"]
     work: Float[Array, "*batch works"]
+    dissipated: Float[Array, "*batch"] | None = None
 
 
 class Trajectory(eqx.Module):

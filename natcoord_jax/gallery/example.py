@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 import natcoord_jax as nc
 from natcoord_jax.assembly.system import System
 from natcoord_jax.core.state import State, Trajectory
+from natcoord_jax.stepping.scheme import Scheme
 
 
 @dataclass(frozen=True)
@@ -65,7 +66,7 @@ class Example:
         return self.control(t[None])[0]
 
     def inputs(
-        self, steps: int | None = None, dt: Any = None, scheme: nc.EnergyMomentum | None = None
+        self, steps: int | None = None, dt: Any = None, scheme: Scheme | None = None
     ) -> Float[Array, "steps inputs"] | Float[Array, "steps stages inputs"]:
         """Inputs of a run with other steps; default the suggested one.
 

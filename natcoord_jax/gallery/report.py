@@ -11,6 +11,7 @@ from natcoord_jax.core.results import Result
 from natcoord_jax.core.state import Trajectory
 from natcoord_jax.gallery.example import Example
 from natcoord_jax.stepping.error_control import Tolerance
+from natcoord_jax.stepping.scheme import Scheme
 
 
 def _timed(run: Any) -> tuple[Trajectory, float]:
@@ -31,9 +32,7 @@ def _largest(values: Any) -> float | None:
     return None if values is None else float(np.max(values))
 
 
-def _solved(
-    example: Example, steps: int, dt: float, scheme: nc.EnergyMomentum
-) -> tuple[nc.Solution | None, Any]:
+def _solved(example: Example, steps: int, dt: float, scheme: Scheme) -> tuple[nc.Solution | None, Any]:
     """The solution of an optimal control problem, if the scene is one, and the inputs of the run."""
     if example.problem is None:
         return None, example.inputs(steps, dt, scheme)
@@ -45,7 +44,7 @@ def measure(
     example: Example,
     steps: int,
     dt: float,
-    scheme: nc.EnergyMomentum,
+    scheme: Scheme,
     tolerance: Tolerance | None = None,
 ) -> tuple[dict[str, Any], Trajectory, nc.Solution | None]:
     """Run a scene twice, the first time with compilation, and judge the run.
@@ -76,6 +75,7 @@ def measure(
         "scene": example.name,
         "steps": steps,
         "dt": dt,
+        "scheme": type(scheme).__name__,
         "order": scheme.order,
         "t_end": steps * dt,
         "dofs": structure.dofs,
@@ -87,6 +87,7 @@ def measure(
         "wall_s": wall,
         "energy_initial": float(energy[0]),
         "energy_final": float(energy[-1]),
+        "dissipated": None if valid.states.dissipated is None else float(valid.states.dissipated[-1]),
         "energy_error_max": _largest(balance.energy),
         "momentum_error_max": _largest(balance.momentum),
         "momentum_components": balance.directions,
@@ -130,6 +131,7 @@ def table(report: dict[str, Any]) -> str:
         ("wall time", f"{1e3 * r['wall_s']:.3g} ms", f"{1e6 * r['wall_s'] / r['steps']:.3g} µs a step"),
         ("compile time", f"{r['compile_s']:.3g} s", ""),
         ("energy", f"{r['energy_final']:.8g} J", f"from {r['energy_initial']:.8g} J"),
+        *[("dissipated", _number(r["dissipated"]), "J, numerically")] * (r["dissipated"] is not None),
         ("energy balance", _number(r["energy_error_max"]), "largest error, relative"),
         ("momentum balance", _number(r["momentum_error_max"]), parts),
         ("angular momentum balance", _number(r["angular_momentum_error_max"]), turns),

@@ -30,6 +30,25 @@ class Tableau:
     """b^T A^-1: the end velocity is v_0 + sum beta_i (V_i - v_0)."""
     kick: bool = False
     """Whether velocities are kept tangent to the constraints by isometric kicks along their normals."""
+    variational: bool = False
+    """Whether forces take hold at both ends of the step instead of at its mid-point."""
+    spectral_radius: float = 1.0
+    """What is left of an infinitely fast oscillation after a step; below 1, fast oscillations are damped."""
+
+    @property
+    def tangent(self) -> bool:
+        """Whether velocities at the end of a step obey the constraints."""
+        return self.kick or self.variational
+
+    @property
+    def separable(self) -> bool:
+        """Whether the equations of a step couple a body with its neighbours only."""
+        return not self.variational and not self.dissipative
+
+    @property
+    def dissipative(self) -> bool:
+        """Whether fast oscillations are damped numerically."""
+        return self.spectral_radius < 1.0
 
     @property
     def order(self) -> int:

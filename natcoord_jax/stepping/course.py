@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from natcoord_jax.assembly.equations import prepare
+from natcoord_jax.assembly.equations import form_of, prepare
 from natcoord_jax.assembly.outset import Outset
 from natcoord_jax.assembly.system import System
 from natcoord_jax.core.results import Result
@@ -98,7 +98,7 @@ class Setting(eqx.Module):
     @property
     def form(self) -> str:
         """Form of the equations."""
-        return self.system.structure.solver
+        return form_of(self.system, self.plan.tableau)
 
 
 def start_of(setting: Setting, state: State) -> tuple[Course, Factors, Outset]:

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from natcoord_jax.assembly.equations import prepare
+from natcoord_jax.assembly.equations import form_of, prepare
 from natcoord_jax.assembly.system import System
 from natcoord_jax.core.state import State
 from natcoord_jax.stepping import linear_pair
@@ -259,7 +259,7 @@ class Rule:
             system, parameters, dt = numbers.whole(numbers.varied)
             u = self._inputs(parameters, slot, slot.before) if slot.u is None else slot.u
             equations = prepare(system, slot.before, u, slot.fraction * dt, self.tableau)
-            form = system.structure.solver
+            form = form_of(system, self.tableau)
             if form not in BY_DIFFERENCES:
                 return factors_of(equations, form, equations.tangent(slot.y))
             return factors_of(equations, form, jacobian_by_differences(equations, slot.y))

@@ -16,7 +16,7 @@ from natcoord_jax.core.state import State
 from natcoord_jax.stepping.newton import TOLERANCE
 from natcoord_jax.stepping.plan import Plan
 from natcoord_jax.stepping.rollout import run_to_the_end
-from natcoord_jax.stepping.scheme import EnergyMomentum
+from natcoord_jax.stepping.scheme import Scheme
 
 MOST = 1 << 30
 """Steps that one program can make."""
@@ -64,7 +64,7 @@ class Sampled:
 
 
 @lru_cache(maxsize=64)
-def _program(structure: Any, inputs: Callable | None, scheme: EnergyMomentum, tolerance: float) -> Callable:
+def _program(structure: Any, inputs: Callable | None, scheme: Scheme, tolerance: float) -> Callable:
     """The compiled program for all systems and states of one structure."""
 
     def run(leaves: list[Array], dt: Array, steps: Array) -> Endpoint:
@@ -83,7 +83,7 @@ def endpoints(
     state: State,
     *,
     inputs: Callable[[Array], Array] | None = None,
-    scheme: EnergyMomentum,
+    scheme: Scheme,
     newton_tol: float = TOLERANCE,
 ) -> Callable[[Any, int], Endpoint]:
     """Runs of a system of which nothing is kept but the end; without derivatives.
@@ -99,7 +99,7 @@ def endpoints(
         A function of step [s] and number of steps; another number does not compile anew. Steps that fail are
         repeated in parts, as in `simulate`, without a limit.
     """
-    leaves, structure = jax.tree.flatten((system, state))
+    leaves, structure = jax.tree.flatten((system, scheme.started(state)))
     program = _program(structure, inputs, scheme, newton_tol)
     placed = [jnp.asarray(x) for x in leaves]
     return lambda dt, steps: program(placed, jnp.asarray(dt, float), jnp.asarray(steps))

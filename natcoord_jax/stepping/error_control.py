@@ -69,7 +69,7 @@ class Tolerance(eqx.Module):
             tableau: of the scheme.
         """
         largest = jnp.zeros(())
-        compared = [(start.q, one.q, other.q)] + [(start.v, one.v, other.v)] * tableau.kick
+        compared = [(start.q, one.q, other.q)] + [(start.v, one.v, other.v)] * tableau.tangent
         for x0, x, y in compared:
             error = jnp.sqrt(jnp.sum((x - y) ** 2, axis=-1)) / (2.0**tableau.order - 1.0)
             size = jnp.sqrt(jnp.maximum(jnp.sum(x0**2, axis=-1), jnp.sum(x**2, axis=-1)))

@@ -17,7 +17,7 @@ from natcoord_jax.stepping.checked import check_state, checked_inputs, checked_s
 from natcoord_jax.stepping.derivative import run_slots
 from natcoord_jax.stepping.newton import TOLERANCE
 from natcoord_jax.stepping.plan import Plan
-from natcoord_jax.stepping.scheme import SECOND_ORDER, EnergyMomentum
+from natcoord_jax.stepping.scheme import SECOND_ORDER, Scheme
 
 
 @eqx.filter_jit
@@ -34,9 +34,9 @@ def step(
     dt: Any = None,
     *,
     newton_tol: float = TOLERANCE,
-    scheme: EnergyMomentum = SECOND_ORDER,
+    scheme: Scheme = SECOND_ORDER,
 ) -> State:
-    """One energy-momentum step (57), differentiable in everything.
+    """One step, by default the energy-momentum step (57), differentiable in everything.
 
     Args:
         system: compiled system.
@@ -63,6 +63,7 @@ def step(
         0.5
     """
     check_state(system, state)
+    state = scheme.started(state)
     h = checked_step(dt)
     inputs, _ = checked_inputs(system, None if u is None else jnp.asarray(u, float)[None], 1)
     after, code = _one_step(system, state, inputs[0], h, newton_tol, 16, scheme.tableau)

@@ -1,19 +1,59 @@
-"""The schemes that `simulate` and `step` can use."""
+"""What a scheme is, and the energy-momentum family."""
 
+import abc
 from dataclasses import dataclass
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from natcoord_jax.core.effect import replace_fields
+from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import Tableau, gauss
 
 LARGEST = 10
 """Largest order of the energy-momentum family."""
 
 
+class Scheme(abc.ABC):
+    """Base of the schemes that `simulate` and `step` can use: hashable, without arrays."""
+
+    @property
+    @abc.abstractmethod
+    def tableau(self) -> Tableau:
+        """Coefficients of the method."""
+
+    @property
+    def stages(self) -> int:
+        """Number of stages s."""
+        return self.tableau.stages
+
+    @property
+    def order(self) -> int:
+        """Order of accuracy of positions."""
+        return self.tableau.order
+
+    def times(
+        self, dt: Float[Array, ""] | float, steps: int, start: float = 0.0
+    ) -> Float[Array, "steps stages"]:
+        """Times of the stages [s], where `simulate` takes inputs of shape (steps, stages, inputs).
+
+        Args:
+            dt: step [s].
+            steps: number of steps.
+            start: start time [s].
+        """
+        return start + dt * (jnp.arange(steps)[:, None] + jnp.asarray(self.tableau.c))
+
+    def started(self, state: State) -> State:
+        """The state with all that the scheme keeps account of."""
+        if not self.tableau.dissipative or state.dissipated is not None:
+            return state
+        return replace_fields(state, dissipated=jnp.zeros_like(state.t))
+
+
 @dataclass(frozen=True)
-class EnergyMomentum:
+class EnergyMomentum(Scheme):
     """The energy-momentum family: Gauss collocation in the null space of the constraints.
 
     Order two is the one-stage step (57) of the paper. With s stages the order is 2 s, in positions and,
@@ -49,23 +89,6 @@ class EnergyMomentum:
     def tableau(self) -> Tableau:
         """Coefficients of the method."""
         return gauss(int(self.order) // 2, self.order > 2 if self.kick is None else bool(self.kick))
-
-    @property
-    def stages(self) -> int:
-        """Number of stages s."""
-        return int(self.order) // 2
-
-    def times(
-        self, dt: Float[Array, ""] | float, steps: int, start: float = 0.0
-    ) -> Float[Array, "steps stages"]:
-        """Times of the stages [s], where `simulate` takes inputs of shape (steps, stages, inputs).
-
-        Args:
-            dt: step [s].
-            steps: number of steps.
-            start: start time [s].
-        """
-        return start + dt * (jnp.arange(steps)[:, None] + jnp.asarray(self.tableau.c))
 
 
 SECOND_ORDER = EnergyMomentum()

@@ -21,7 +21,7 @@ from natcoord_jax.stepping.derivative import run_slots
 from natcoord_jax.stepping.error_control import Tolerance
 from natcoord_jax.stepping.newton import TOLERANCE
 from natcoord_jax.stepping.plan import Plan, Slots
-from natcoord_jax.stepping.scheme import SECOND_ORDER, EnergyMomentum
+from natcoord_jax.stepping.scheme import SECOND_ORDER, Scheme
 
 SEGMENT = 512
 """Longest segment of a rollout that does not save every step, or that is checkpointed."""
@@ -53,7 +53,7 @@ def _rollout(
     tolerance: float,
     extra_substeps: int,
     until: Callable | None,
-    scheme: EnergyMomentum,
+    scheme: Scheme,
     *,
     allowed: Tolerance | None,
 ) -> Trajectory:
@@ -151,11 +151,11 @@ def simulate(
     checkpoint: bool = False,
     newton_tol: float = TOLERANCE,
     extra_substeps: int | None = None,
-    scheme: EnergyMomentum = SECOND_ORDER,
+    scheme: Scheme = SECOND_ORDER,
     rtol: Any = None,
     atol: Any = None,
 ) -> Trajectory:
-    """Simulate with the energy-momentum step (57), or with its relatives of higher order.
+    """Simulate with the energy-momentum step (57), its relatives of higher order, or another scheme.
 
     Works under `jit`, `vmap`, `grad`, `jvp` and their compositions up to one reverse mode; `dt` and every
     floating leaf of `system`, `state` and `inputs` can be differentiated.
@@ -180,7 +180,7 @@ def simulate(
         extra_substeps: how many substeps may be made beyond one a step (per segment of at most 512 steps
             where not every step is saved); by default 16, for steps that fail and are repeated in parts, and
             with error control 256 or eight a step. A gradient takes time for all of them.
-        scheme: the scheme, by default that of order two.
+        scheme: `EnergyMomentum`, by default that of order two; `VariationalMidpoint`; `Dissipative`.
         rtol: error that a substep may have, relative: steps are made in as few substeps as keep to it, of
             lengths found on the way. Inputs change at the ends of steps, states are saved there, and what
             the scheme conserves is conserved. The error is that of any row (a position or a director), with
@@ -207,6 +207,7 @@ def simulate(
         (11, 4, 3)
     """
     check_state(system, state)
+    state = scheme.started(state)
     step = checked_step(dt)
     checked, count = checked_inputs(system, inputs, steps, scheme.stages)
     if save_every < 1 or count % save_every:

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.coordinates import stage_rates
-from natcoord_jax.assembly.equations import prepare, starting
+from natcoord_jax.assembly.end_impulses import released
+from natcoord_jax.assembly.equations import form_of, prepare, starting
 from natcoord_jax.assembly.kick import ends_of
 from natcoord_jax.assembly.response import Evaluation
 from natcoord_jax.assembly.system import Group, System
@@ -49,11 +50,16 @@ def end_of_step(
     turning, ends = stage_rates(system, at, h), None
     if found.kick is not None:
         ends = ends_of(system, state, groups, at, found.kick, h, tableau)
+    elif tableau.variational:
+        ends = released(system, state, groups, found, turning, h, tableau)
     if system.coordinates:
         coordinates = coordinates + h * (b @ turning)
+    start, rotors, extra = state.v, state.rates, None if ends is None else ends.work
+    if tableau.dissipative:
+        jumped = found.given.velocity
+        start, rotors, extra = jumped.rows.reshape(state.v.shape), jumped.rotors, found.given.work
     if ends is None:
-        v = state.v + jnp.tensordot(beta, rates - state.v, 1)
-        rotors = state.rates
+        v = start + jnp.tensordot(beta, rates - start, 1)
         carrying = [g.coordinates[:, 0] for g in groups if g.effect.rotors]
         if carrying:
             # Groups own consecutive pieces of the stored rates, in order.
@@ -64,14 +70,17 @@ def end_of_step(
     for group, power in zip(groups, found.power):
         if group.effect.works:
             done = (1.0 if group.effect.impulsive else h) * (power @ b)
-            if group.multipliers and ends is not None:
-                done = done + ends.work[relation : relation + group.count]
+            if group.multipliers and extra is not None:
+                done = done + extra[relation : relation + group.count]
             working.append(done)
         if group.multipliers and group.source != "joint":
             relation += group.count * group.multipliers
     # The same of the work account.
     work = work + jnp.concatenate(working) if working else work
-    after = State(state.t + h, q, v, coordinates, rotors, work)
+    dissipated = state.dissipated
+    if tableau.dissipative:
+        dissipated = found.given.loss + (0.0 if dissipated is None else dissipated)
+    after = State(state.t + h, q, v, coordinates, rotors, work, dissipated)
     half_turn = _half_turn(at.spin[:, :bodies], h, tableau)
     if ends is not None:
         half_turn = jnp.where(ends.sound, half_turn, jnp.inf)
@@ -105,7 +114,7 @@ def linear_solver(
         along: linear map of (state, unknowns) to (residual, state at the end), for dense Jacobians.
     """
     equations = prepare(system, state, u, h, tableau)
-    if system.structure.solver == "recursive" and not tableau.kick:
+    if form_of(system, tableau) == "recursive" and not tableau.kick:
         return differentiable_solver(equations, equations.jacobian(y))
     at_rest = jax.tree.map(jnp.zeros_like, state)
     columns = jax.vmap(lambda unit: along(at_rest, unit)[0], out_axes=1)(jnp.eye(y.shape[0], dtype=y.dtype))
