@@ -90,7 +90,8 @@ class _Steady(eqx.Module):
         return jnp.concatenate(parts, axis=1).reshape(-1)
 
     def _apart(self, x: Array) -> tuple[Array, Array]:
-        return tuple(jnp.split(x.reshape(-1, 6), 2, axis=1))
+        every = x.reshape(-1, 6)
+        return every[:, :3], every[:, 3:]
 
     def _steady_velocity(self, points: Array) -> Array:
         v = self.state.v.reshape(-1, 4, 3)[:, 0]
@@ -143,9 +144,9 @@ def _matrices(steady: _Steady, rows: Array, size: int) -> tuple[Array, Array, Ar
     if rows.shape[0]:
         vectors = jnp.linalg.svd(rows, full_matrices=True)[2]
         free = vectors[size - steady.system.structure.dofs :].T
-    parts = [free.T @ x @ free for x in (steady.mass_matrix(), damping, stiffness)]
+    mass, damping, reduced = (free.T @ x @ free for x in (steady.mass_matrix(), damping, stiffness))
     scale = jnp.maximum(jnp.max(jnp.abs(stiffness)) * 1e-6, 1e-300)
-    return *parts, free, jnp.max(jnp.abs(free.T @ left)), scale
+    return mass, damping, reduced, free, jnp.max(jnp.abs(free.T @ left)), scale
 
 
 def _undamped(mass: Array, stiffness: Array) -> tuple[Array, Array]:

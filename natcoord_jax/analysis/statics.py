@@ -91,8 +91,9 @@ def _solve(system: System, state: State, lam: Array, inputs: Array) -> _Search:
         after = static.moved_along_tree(short * change)
         lam = search.lam + short * change[static.balances :]
         done = ((correction <= TOLERANCE) | stalled) & (short == 1.0) & finite
-        kept = jax.tree.map(lambda a, b: jnp.where(finite, a, b), (after, lam), (search.state, search.lam))
-        return _Search(*kept, correction, search.count + 1, done, finite)
+        state = jax.tree.map(lambda a, b: jnp.where(finite, a, b), after, search.state)
+        lam = jnp.where(finite, lam, search.lam)
+        return _Search(state, lam, correction, search.count + 1, done, finite)
 
     start = _Search(state, lam, jnp.zeros(()), jnp.array(0), jnp.array(False), jnp.array(True))
     return jax.lax.while_loop(lambda s: ~s.done & s.finite & (s.count < ITERATIONS), trip, start)
@@ -188,7 +189,8 @@ def equilibrium(
 def _inputs_at(system: System, inputs: Any, values: Array) -> Float[Array, "loads inputs"]:
     count = len(system.structure.inputs)
     if callable(inputs):
-        return jax.vmap(inputs)(values)
+        function: Any = inputs
+        return jax.vmap(function)(values)
     given = jnp.zeros(count) if inputs is None else jnp.asarray(inputs, float)
     if given.shape not in ((count,), (len(values), count)):
         raise ValueError(

@@ -69,8 +69,9 @@ def reference_curve(
             raise ValueError(f"{label}: a curve given as a function needs its length [m]; pass length=")
         total = numbers(length, (), f"{label}: length", "m")
         arc = jnp.asarray(fractions) * total
-        points = jax.vmap(curve)(arc)
-        tangents = jax.vmap(jax.jacfwd(curve))(arc)
+        along: Any = curve
+        points = jax.vmap(along)(arc)
+        tangents = jax.vmap(jax.jacfwd(along))(arc)
     else:
         given = np.shape(curve)
         if len(given) != 2 or given[0] < 2 or given[1] != 3:
@@ -87,7 +88,8 @@ def reference_curve(
         arc, points, tangents = _along_polyline(corners, fractions)
     tangents = tangents / jnp.sqrt(jnp.sum(tangents**2, axis=1, keepdims=True))
     frames = _transported(tangents, second)
-    angles = jax.vmap(twist)(arc) if callable(twist) else jnp.asarray(twist, float) * jnp.asarray(fractions)
+    turning: Any = twist
+    angles = jax.vmap(turning)(arc) if callable(twist) else jnp.asarray(twist, float) * jnp.asarray(fractions)
     return ReferenceCurve(arc, points, _turned(frames, angles))
 
 
