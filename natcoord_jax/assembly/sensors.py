@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.coordinates import state_rates
-from natcoord_jax.assembly.diagnostics import over_states, states_of
+from natcoord_jax.assembly.diagnostics import group_places, over_states, rows_with_ground, states_of
 from natcoord_jax.assembly.instant import Instant, inputs_along, instant_of
 from natcoord_jax.assembly.system import System
 from natcoord_jax.core.handles import Handle, ground
@@ -256,15 +256,44 @@ def marker_weights(system: System, marker: Marker, state: State | None) -> tuple
     return jnp.concatenate([head, vector]), body
 
 
+def _readings(system: System, states: State, names: tuple[str, ...]) -> Any:
+    """What effects of one kind tell of themselves, stacked along an axis before that of the quantities.
+
+    Raises:
+        ValueError: for effects of several kinds, or of one that tells nothing.
+    """
+    number, group = next((k, g) for k, g in enumerate(system.effects) if names[0] in g.names)
+    missing = [name for name in names if name not in group.names]
+    if missing:
+        raise ValueError(f"{missing[0]!r} is of another kind than {names[0]!r}: sense them one by one")
+    if group.effect.silent:
+        raise ValueError(f"the {group.effect.kind} {names[0]!r} has no sensor; elements of beams do")
+    chosen = jnp.array([group.names.index(name) for name in names])
+    return _all_readings(system, states, number, chosen)
+
+
+@eqx.filter_jit
+def _all_readings(system: System, states: State, number: int, chosen: Array) -> Any:
+    group = system.effects[number]
+    places = group_places(system, group)[chosen]
+    effects = jax.tree.map(lambda x: x[chosen], group.effect)
+
+    def one(state: State) -> Any:
+        rows = rows_with_ground(state.q)[group.bodies[chosen]]
+        return jax.vmap(lambda effect, place, rows: effect.readings(place, rows))(effects, places, rows)
+
+    return over_states(one, states)
+
+
 def sense(
     system: System,
     motion: State | Trajectory,
-    part: Handle | Marker | str,
+    part: Handle | Marker | str | tuple[Handle | str, ...],
     *,
     inputs: Any = None,
     state: State | None = None,
 ) -> Any:
-    """Sensor of a body, a joint or a marker; see `System.sense`."""
+    """Sensor of a body, a joint, a marker or elements of beams; see `System.sense`."""
     states = states_of(motion)
     source = Source(system, states, inputs_along(system, motion, inputs))
     if isinstance(part, Marker):
@@ -274,7 +303,15 @@ def sense(
             return MarkerSensor(still, jnp.zeros_like(still), weights, body, source)
         position, velocity = _weighted(weights, states.q, body), _weighted(weights, states.v, body)
         return MarkerSensor(position, velocity, weights, body, source)
-    name = part.name if isinstance(part, Handle) else part
+    if isinstance(part, tuple) and not part:
+        raise ValueError("cannot sense nothing: the tuple of elements is empty")
+    listed = part if isinstance(part, tuple) else (part,)
+    names = tuple(x.name if isinstance(x, Handle) else x for x in listed)
+    if any(names[0] in g.names for g in system.effects):
+        found = _readings(system, states, names)
+        axis = states.t.ndim
+        return found if isinstance(part, tuple) else jax.tree.map(lambda x: jnp.take(x, 0, axis), found)
+    name = names[0]
     if name in system.structure.bodies:
         index = system.body_index(part)
         found = _body_motion(system, states, jnp.asarray(index), isinstance(motion, Trajectory))

@@ -192,18 +192,20 @@ class System(eqx.Module):
     def sense(
         self,
         motion: State | Trajectory,
-        part: Handle | Marker | str,
+        part: Handle | Marker | str | tuple[Handle | str, ...],
         *,
         inputs: Any = None,
         state: State | None = None,
     ) -> Any:
-        """Sensor of a body, a joint or a marker.
+        """Sensor of a body, a joint, a marker or elements of a beam.
 
         Args:
             motion: state or trajectory, with any leading axes.
             part: handle or name of a body (gives a `BodySensor`: position, rotation, quaternion, velocity,
                 angular_velocity, com, ...) or joint (`JointSensor`: angle, displacement, coordinates, rates,
-                force, torque), or a point or direction (`MarkerSensor`: position, velocity, acceleration).
+                force, torque), a point or direction (`MarkerSensor`: position, velocity, acceleration), or an
+                element of a beam or several of them, `beam.elements` (`BeamReadings`: strain, resultant,
+                energy).
             inputs: for accelerations and reactions, as in `instant`.
             state: the assembled pose that a marker in world coordinates refers to.
 

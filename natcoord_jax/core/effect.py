@@ -113,6 +113,7 @@ class Effect(eqx.Module):
         rotors: number of stored coordinate rates per instance.
         couples: whether bodies of neighbouring markers become neighbours in the spanning tree where no joint
             makes them so: elements of beams do, of which a chain then is a chain of bodies.
+        silent: whether it has no sensor.
     """
 
     kind: ClassVar[str] = "effect"
@@ -124,6 +125,7 @@ class Effect(eqx.Module):
     elastic: ClassVar[bool] = False
     rotors: ClassVar[int] = 0
     couples: ClassVar[bool] = False
+    silent: ClassVar[bool] = True
 
     @abc.abstractmethod
     def respond(self, place: Array, motion: Motion, now: Now, lam: Float[Array, "s m"]) -> Response:
@@ -153,6 +155,10 @@ class Effect(eqx.Module):
     ) -> Float[Array, "p p"]:
         """Second derivatives of the energy of an elastic effect by its invariants."""
         return jnp.zeros((0, 0))
+
+    def readings(self, place: Array, rows: Float[Array, "k 4 3"]) -> Any:
+        """What its sensor shows: a pytree of arrays; for effects that are not `silent`."""
+        return None
 
     def stored(
         self,

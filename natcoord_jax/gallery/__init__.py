@@ -7,6 +7,7 @@ of its docstring says what it is.
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from natcoord_jax.gallery.beams import cantilever, flying_spaghetti, rope
 from natcoord_jax.gallery.example import Example
 from natcoord_jax.gallery.loops import bricard, four_bar, slider_crank
 from natcoord_jax.gallery.manoeuvres import reorientation_example
@@ -33,6 +34,9 @@ SCENES: Mapping[str, Callable[..., Example]] = {
     "chain": chain,
     "binary_tree": binary_tree,
     "robot_arm": robot_arm,
+    "rope": rope,
+    "cantilever": cantilever,
+    "flying_spaghetti": flying_spaghetti,
 }
 
 __all__ = ["SCENES", "Example", "describe", "load"]
