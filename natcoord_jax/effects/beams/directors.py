@@ -17,7 +17,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from natcoord_jax.core.force import Force, Load
-from natcoord_jax.core.potential import Potential
+from natcoord_jax.core.potential import Potential, place_markers
+from natcoord_jax.effects.beams.readings import BeamReadings
 from natcoord_jax.maths.vectors import dot
 
 
@@ -53,7 +54,14 @@ class DirectorElement(Potential):
 
     kind: ClassVar[str] = "director element"
     couples: ClassVar[bool] = True
+    silent: ClassVar[bool] = False
     degree: ClassVar[int | None] = 2
+
+    def readings(self, place: Array, rows: Array) -> BeamReadings:
+        """Strains and section forces at the Gauss points."""
+        invariants = self.invariants(place_markers(place, rows))
+        strains = self.strains(invariants)
+        return BeamReadings(strains, self.resultants(strains), self.energy(invariants))
 
     def invariants(self, x: Array) -> Array:
         """Strains at the Gauss points before those of the unstressed shape are taken off [-, 1/m]."""
