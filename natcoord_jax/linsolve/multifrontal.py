@@ -21,7 +21,7 @@ from natcoord_jax.linsolve.graph import Graph
 from natcoord_jax.linsolve.inverse import inverses
 from natcoord_jax.linsolve.ordering import Groups, dissection, rounds
 from natcoord_jax.linsolve.rehearsal import natural, rehearse
-from natcoord_jax.linsolve.schedule import Level, schedule
+from natcoord_jax.linsolve.schedule import Bucket, Level, schedule
 from natcoord_jax.linsolve.symbolic import Front, Sizes, amalgamated, estimate, fronts_of, top_merged
 
 LEAVES = (1, 24, 48, 96)  # unknowns in a piece that is not dissected further: what is tried
@@ -57,13 +57,13 @@ class Multifrontal(eqx.Module):
         tiles = matrix.tiles.reshape(-1)
         pool = jnp.concatenate([tiles, jnp.ones_like(tiles[:1])])
         found: list[tuple[FrontFactors, ...]] = []
-        handed: list[tuple[Array, Array]] = []
+        handed: list[tuple[Bucket, Array]] = []
         for level in reversed(self.levels):
             work = jnp.zeros(level.work, tiles.dtype)
             given = pool.at[level.source].get(mode="promise_in_bounds")
             work = work.at[level.target].set(given, mode="promise_in_bounds", unique_indices=True)
-            for targets, schur in handed:
-                work = work.at[targets].add(schur, mode="promise_in_bounds")
+            for child, schur in handed:
+                work = child.hand_up(work, schur)
             handed, factors = [], []
             for bucket in level.buckets:
                 count, p, b = bucket.shape
@@ -74,7 +74,7 @@ class Multifrontal(eqx.Module):
                 factors.append(FrontFactors(inverse, lower, upper))
                 if b:
                     schur = fronts[:, p:, p:] - lower @ fronts[:, :p, p:]
-                    handed.append((bucket.targets(), schur))
+                    handed.append((bucket, schur))
             found.append(tuple(factors))
         return found[::-1]
 

@@ -1,11 +1,13 @@
 """From fronts to index arrays: what goes where, bucket by bucket, level by level; on the host, once."""
 
+import math
 from dataclasses import dataclass
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int
+from jaxtyping import Array, Float, Int
 
 from natcoord_jax.linsolve import cost
 from natcoord_jax.linsolve.blocks import Entries
@@ -24,8 +26,9 @@ class Bucket(eqx.Module):
         base: place of the parent's front in the work of its level; 0 at the roots.
         stride: width of the parent's front.
         row_place: rows of the boundary in the parent's front. Beyond the last: zero, where zeros are added.
-        column_place: the same for columns.
+        column_place: the same for columns, of the first of every `run` of them.
         first: place of the first front in the work of the level.
+        run: columns that stay side by side in the parent's front.
     """
 
     rows: Int[Array, "fronts p"]
@@ -34,8 +37,9 @@ class Bucket(eqx.Module):
     base: Int[Array, " fronts"]
     stride: Int[Array, " fronts"]
     row_place: Int[Array, "fronts b"]
-    column_place: Int[Array, "fronts b"]
+    column_place: Int[Array, "fronts runs"]
     first: int = eqx.field(static=True)
+    run: int = eqx.field(static=True)
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -43,10 +47,17 @@ class Bucket(eqx.Module):
         fronts, pivots = self.columns.shape
         return fronts, pivots, self.boundary.shape[1]
 
-    def targets(self) -> Int[Array, "fronts b b"]:
-        """Places of what is handed to the parents."""
+    def hand_up(self, work: Float[Array, " w"], schur: Float[Array, "fronts b b"]) -> Float[Array, " w"]:
+        """Add what is left of the fronts to the fronts of their parents."""
         across = self.base[:, None] + self.row_place * self.stride[:, None]
-        return across[:, :, None] + self.column_place[:, None, :]
+        targets = across[:, :, None] + self.column_place[:, None, :]
+        if self.run == 1:
+            return work.at[targets].add(schur, mode="promise_in_bounds")
+        windows = jax.lax.ScatterDimensionNumbers(
+            update_window_dims=(1,), inserted_window_dims=(), scatter_dims_to_operand_dims=(0,)
+        )
+        targets, runs = targets.reshape(-1, 1), schur.reshape(-1, self.run)
+        return jax.lax.scatter_add(work, targets, runs, windows, mode="promise_in_bounds")
 
 
 class Level(eqx.Module):
@@ -110,7 +121,7 @@ def schedule(
     levels = []
     for level, own in enumerate(buckets):
         source, target = _entries_of(level, own, pieces, entries, maps, ones)
-        found = tuple(_bucket(members, fronts, maps) for members in own)
+        found = tuple(_bucket(members, fronts, maps, _run(graph, fronts, members)) for members in own)
         levels.append(Level(found, _indices(source), _indices(target), works[level]))
     return tuple(levels)
 
@@ -176,7 +187,12 @@ def _entries_of(
     return np.concatenate(sources), np.concatenate(targets)
 
 
-def _bucket(members: list[int], fronts: list[Front], maps: _Maps) -> Bucket:
+def _run(graph: Graph, fronts: list[Front], members: list[int]) -> int:
+    """Columns that stay side by side: what divides the sizes of all atoms in the boundaries."""
+    return math.gcd(*(len(graph.atoms[a]) for k in members for a in fronts[k].boundary)) or 1
+
+
+def _bucket(members: list[int], fronts: list[Front], maps: _Maps, run: int) -> Bucket:
     first = maps.places[members[0]]
     p, b, n = first.pivots, first.stride - first.pivots, maps.size
     table = {name: np.full((len(members), p), n) for name in ("rows", "columns")}
@@ -192,8 +208,9 @@ def _bucket(members: list[int], fronts: list[Front], maps: _Maps) -> Bucket:
             base[i], stride[i] = maps.places[parent].base, maps.places[parent].stride
             zero["row_place"][i, : len(left)] = maps.within(parent, left, rows=True)
             zero["column_place"][i, : len(left)] = maps.within(parent, left, rows=False)
+    zero["column_place"] = zero["column_place"][:, ::run]
     tables = {name: _indices(x) for name, x in (table | zero).items()}
-    return Bucket(base=_indices(base), stride=_indices(stride), first=first.base, **tables)
+    return Bucket(base=_indices(base), stride=_indices(stride), first=first.base, run=run, **tables)
 
 
 def _indices(array: np.ndarray) -> Int[Array, "..."]:
