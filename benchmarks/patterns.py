@@ -6,6 +6,7 @@ to the node of the body that the joint carries. Numbers are random but kind: ine
 independent; nothing is symmetric.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -206,3 +207,33 @@ def _mesh(
         nodes.append(np.repeat(held, 3))
     place = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1).reshape(-1, 2)
     return SparseSystem(name, np.concatenate(nodes), tuple(elements), tuple(matrices), place.astype(float))
+
+
+KINDS: dict[str, Callable[..., SparseSystem]] = {
+    "ring": ring,
+    "chain": chain,
+    "body_chain": body_chain,
+    "body_tree": body_tree,
+    "ladder": ladder,
+    "frame": frame,
+    "shell": shell,
+}
+
+
+def named(name: str) -> SparseSystem:
+    """The system that a name such as `shell:16,16` calls for."""
+    kind, _, sizes = name.partition(":")
+    return KINDS[kind](*(float(x) if "e" in x else int(x) for x in sizes.split(",")))
+
+
+def right_hand_side(system: SparseSystem) -> np.ndarray:
+    """A right-hand side (n,)."""
+    return np.random.default_rng(1).standard_normal(system.size)
+
+
+def backward_error(system: SparseSystem, x: np.ndarray) -> float:
+    """Largest residual of a solution relative to the sum of the absolute terms of its row."""
+    right = right_hand_side(system)
+    rows, columns, values = system.triplets()
+    terms = np.bincount(rows, np.abs(values * x[columns]), system.size) + np.abs(right)
+    return float(np.max(np.abs(system.times(x) - right) / terms))

@@ -55,11 +55,11 @@ class BlockPattern(eqx.Module):
 
     rows: Int[Array, "tiles r"]
     columns: Int[Array, "tiles c"]
-    slots: tuple[Int[Array, "count w w"], ...]
+    slots: tuple[Int[Array, "_ _ _"], ...]
     size: int = eqx.field(static=True)
     digest: str = eqx.field(static=True)
 
-    def assemble(self, *locals_: Float[Array, "count w w"]) -> "BlockMatrix":
+    def assemble(self, *locals_: Float[Array, "_ _ _"]) -> "BlockMatrix":
         """The matrix with these element matrices, one array for each kind of element."""
         shape = (*self.rows.shape, self.columns.shape[1])
         dtype = jnp.result_type(*locals_)

@@ -5,13 +5,15 @@ matter: another machine gets a correct, perhaps not the best, plan.
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
+Number = int | float | np.number | np.ndarray
 BUCKET = 20.0  # one bucket: the calls of its kernels, and a share of what it takes to compile them
 
 
-def front(pivots: float | np.ndarray, boundary: float | np.ndarray) -> np.ndarray:
+def front(pivots: Number, boundary: Number) -> Any:
     """Time to eliminate a front with so many pivots and so many unknowns left."""
     p, b = np.asarray(pivots, float), np.asarray(boundary, float)
     inverse = 0.2 + 2 * p**3 / np.minimum(20000.0, 370.0 * np.maximum(p, 1))

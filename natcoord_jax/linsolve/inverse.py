@@ -77,7 +77,7 @@ def pivoted(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
     def step(k: Array, carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         left, free, chosen = carry
         column, on = left[:, k], number == k
-        best = jnp.argmax(jnp.where(free, jnp.abs(column), -1.0))
+        best = jnp.argmax(jnp.where(free, jnp.abs(column), -1.0)).astype(jnp.int32)
         row, at = left[best], number == best
         pivot = 1.0 / row[k]
         scaled = jnp.where(on, pivot, row * pivot)

@@ -1,4 +1,4 @@
-"""Solvers of sparse linear equations, chosen from static structure; solutions differentiable in every mode."""
+"""Solvers of sparse linear equations, chosen by static structure, differentiable in every mode."""
 
 from typing import Any
 
