@@ -13,6 +13,7 @@ The peer runs in a process of its own: `pip install klujax` for the interpreter 
 
 import json
 import subprocess
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -148,7 +149,7 @@ def targets(runs: list[dict[str, Any]]) -> list[dict[str, Any]]:
 def show(runs: list[dict[str, Any]]) -> str:
     """Runs as plain text, times in ms."""
     heads = "system,n,solver,ms,refined,KLU full,refactor,dense,ratio,compile s,residual"
-    rows = [heads.split(",")]
+    rows: list[Sequence[str]] = [heads.split(",")]
     for run in runs:
 
         def ms(*keys: str, run: Any = run) -> str:

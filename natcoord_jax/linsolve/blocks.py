@@ -49,6 +49,7 @@ class BlockPattern(eqx.Module):
         columns: of the tiles; n beyond their last one.
         slots: places of the entries of the element matrices among those of the tiles, by kind of element;
             what lies beyond is dropped.
+        diagonal: places of the diagonal entries.
         size: number of unknowns n.
         digest: of the indices, so that two structures are told apart without comparing arrays.
     """
@@ -56,6 +57,7 @@ class BlockPattern(eqx.Module):
     rows: Int[Array, "tiles r"]
     columns: Int[Array, "tiles c"]
     slots: tuple[Int[Array, "_ _ _"], ...]
+    diagonal: Int[Array, " n"]
     size: int = eqx.field(static=True)
     digest: str = eqx.field(static=True)
 
@@ -102,6 +104,15 @@ class BlockMatrix(eqx.Module):
         parts = jnp.einsum(how, self.tiles, extended[seen])
         return jnp.zeros_like(extended, parts.dtype).at[given].add(parts)[:-1]
 
+    def diagonal(self) -> Float[Array, " n"]:
+        """Entries of the diagonal; zero where there is none."""
+        return self.tiles.reshape(-1).at[self.pattern.diagonal].get(mode="fill", fill_value=0.0)
+
+    def with_diagonal(self, added: Float[Array, " n"]) -> "BlockMatrix":
+        """The matrix with numbers added to the entries of its diagonal."""
+        flat = self.tiles.reshape(-1).at[self.pattern.diagonal].add(added, mode="drop")
+        return BlockMatrix(self.pattern, flat.reshape(self.tiles.shape))
+
     def to_dense(self) -> Float[Array, "n n"]:
         """The matrix as a dense array."""
         n = self.pattern.size
@@ -140,6 +151,8 @@ def block_pattern(nodes: np.ndarray, elements: list[np.ndarray]) -> tuple[BlockP
     for key in keys:
         found = np.minimum(np.searchsorted(unique, key), max(len(unique) - 1, 0))
         slots.append(np.where(unique[found] == key, places[found], total).astype(np.int32))
+    diagonal = np.full(n, total)
+    diagonal[rows[rows == columns]] = places[rows == columns]
     digest = hashlib.sha256()
     for array in (nodes, tiles_rows, tiles_columns, *slots):
         digest.update(np.ascontiguousarray(array, np.int32).tobytes() + str(array.shape).encode())
@@ -147,6 +160,7 @@ def block_pattern(nodes: np.ndarray, elements: list[np.ndarray]) -> tuple[BlockP
         jnp.asarray(tiles_rows, jnp.int32),
         jnp.asarray(tiles_columns, jnp.int32),
         tuple(jnp.asarray(s) for s in slots),
+        jnp.asarray(diagonal, jnp.int32),
         n,
         digest.hexdigest()[:16],
     )
