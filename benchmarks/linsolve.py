@@ -4,9 +4,10 @@ usage: python -m benchmarks.linsolve [--quick] [--output FOLDER] [--redraw JSON]
                                      [--peers-python PATH] [--no-peers]
 
 Synthetic systems with the patterns of chains, trees, loops, frames and shells (benchmarks/patterns.py). Times
-are medians, in seconds of the processor, of a compiled loop that factorises and solves again and again, numbers of the matrix given. The
-target compares with KLU's full factorisation and solution; its refactorisation, which keeps the order of the
-pivots, is reported beside it. Ours are quoted without and with one step of refinement.
+are medians, in seconds of the processor, of a compiled loop that factorises and solves again and again, with
+the numbers of the matrix given. The target compares with KLU's full factorisation and solution; its
+refactorisation, which keeps the order of the pivots, is reported beside it. Ours are quoted without and with
+one step of refinement.
 
 The peer runs in a process of its own: `pip install klujax` for the interpreter given by --peers-python.
 """

@@ -1,6 +1,6 @@
 """What the work on fronts costs, as measured on one core; decides orders, merging and buckets.
 
-The figures are times in microseconds on a core of 2024 with AVX-512, double precision. Only their ratios
+The figures are times in microseconds on one core with AVX-512, in double precision. Only their ratios
 matter: another machine gets a correct, perhaps not the best, plan.
 """
 
