@@ -25,6 +25,7 @@ from natcoord_jax.stepping.admissibility import (
     project_velocities,
 )
 from natcoord_jax.stepping.assemble import assemble as assemble_state
+from natcoord_jax.stepping.sparsity import with_sparsity
 
 _scene_numbers = itertools.count(1)
 
@@ -165,7 +166,8 @@ class Scene:
         Args:
             assemble: project positions and velocities onto the constraints (see `nc.assemble`); without it
                 a gap is refused and inconsistent velocities are projected with a warning.
-            solver: "reduced", "recursive" or "full"; default chosen from the structure (see `System.report`).
+            solver: "reduced", "recursive", "sparse" or "full"; default chosen from the structure (see
+                `System.report`).
 
         Raises:
             ValueError: for an empty scene, a gap in a joint (with its name and size), a body without inertia
@@ -173,18 +175,22 @@ class Scene:
         """
         if not self.bodies:
             raise ValueError("the scene has no bodies; add one before compiling")
-        if solver not in (None, "reduced", "recursive", "full"):
-            raise ValueError(f'solver is {solver!r}; pass "reduced", "recursive", "full" or None')
+        if solver not in (None, "reduced", "recursive", "sparse", "full"):
+            raise ValueError(f'solver is {solver!r}; pass "reduced", "recursive", "sparse", "full" or None')
         system, state = build(self.bodies, self.joints, self.effects, solver)
         if assemble:
             state = assemble_state(system, state)
         if not is_concrete(system, state):
-            return system, state
+            return with_sparsity(system, state) if system.structure.solver == "sparse" else system, state
         check_inertia(system, state)
         if not assemble:
             check_gaps(system, state)
             state = project_velocities(system, state)
         rank, redundant = find_redundancy(system, state)
+        if redundant and system.structure.solver == "sparse":
+            # Dependent constraints are projected out of a dense matrix.
+            dense = dataclasses.replace(system.structure, solver="full")
+            system = replace_fields(system, structure=dense)
         notes = size_notes(system)
         for note in notes:
             warnings.warn(note, stacklevel=2)
@@ -195,7 +201,8 @@ class Scene:
             notes=notes,
             rank=rank if redundant else None,
         )
-        return replace_fields(system, structure=structure), state
+        system = replace_fields(system, structure=structure)
+        return with_sparsity(system, state) if structure.solver == "sparse" else system, state
 
 
 DENSE_LIMIT = 300

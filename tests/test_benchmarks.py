@@ -70,3 +70,13 @@ def test_spacecraft_alone(tmp_path):
         assert found["batches"][0]["failed_lanes"] == 0
     assert all(r["angular_momentum_error"] < 1e-11 for r in results["models"]["spacecraft"]["runs"])
     assert "natcoord_jax" in text
+
+
+def test_linsolve_alone(tmp_path):
+    results, text = _results("linsolve", tmp_path, "--no-peers")
+    for run in results["runs"]:
+        assert run.keys() >= {"system", "unknowns", "solver", "analysis_s", "entries"}
+        for key in ("plain", "refined"):
+            assert run[key].keys() >= TIMES and run[key]["residual"] < 1e-12
+        assert run["klu"] is None
+    assert "multifrontal" in text

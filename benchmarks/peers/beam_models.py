@@ -1,11 +1,11 @@
-"""A rope and a cantilever in Exudyn (geometrically exact beam, implicit) and PyElastica (Cosserat rod, explicit).
+"""A rope and a cantilever in Exudyn (geometrically exact beam, implicit) and PyElastica (explicit).
 
 Both are a metre long along x, released horizontally under gravity, the rope from a spherical joint, the
 cantilever from a clamp; data in `ROPE` and `CANTILEVER`. Written for Exudyn 1.13 and PyElastica 1.0.
 
-Exudyn: nodes with Euler parameters, sparse solver, modified Newton, generalised-alpha with spectral radius 0.9,
-no files. PyElastica: position Verlet, and the shear factor that its rods have for circles, 27/28 for a
-Poisson's ratio of 0.3 or so; the rope is pinned by holding the position of its first node.
+Exudyn: nodes with Euler parameters, sparse solver, modified Newton, generalised-alpha with spectral radius
+0.9, no files. PyElastica: position Verlet and its own shear factor for circles; the rope is pinned by holding
+the position of its first node.
 
 usage: python -m benchmarks.peers.beam_models exudyn|elastica rope|cantilever ELEMENTS STEPS T_END [REPEATS]
 """

@@ -228,6 +228,9 @@ REDUCED_LIMIT = 32
 LOOP_LIMIT = 40
 """Unknowns up to which a system with loops is solved in the joint null space."""
 
+FULL_LIMIT = 100
+"""Unknowns of the form with all multipliers up to which its matrix is dense."""
+
 DEPTH_LIMIT = 12
 """Levels of the tree up to which its sweeps are unrolled."""
 
@@ -254,7 +257,10 @@ def choose_solver(
     open_tree = multipliers == 0 and all(g.in_tree for g in joints)
     if open_tree and all(adjacent(g, parent) for g in effects):
         return "recursive"
-    return "reduced" if unknowns + multipliers <= LOOP_LIMIT and depth <= DEPTH_LIMIT else "full"
+    if unknowns + multipliers <= LOOP_LIMIT and depth <= DEPTH_LIMIT:
+        return "reduced"
+    every = 6 * bodies + sum(g.count * g.multipliers for g in (*effects, *joints))
+    return "full" if every <= FULL_LIMIT else "sparse"
 
 
 def elimination_order(layout: Layout, effects: tuple[Group, ...], joints: tuple[Group, ...]) -> Elimination:

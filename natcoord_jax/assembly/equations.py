@@ -8,12 +8,18 @@ from natcoord_jax.assembly.full import FullStep
 from natcoord_jax.assembly.outset import Outset
 from natcoord_jax.assembly.recursive import RecursiveStep
 from natcoord_jax.assembly.reduced import ReducedStep
+from natcoord_jax.assembly.sparse import SparseStep
 from natcoord_jax.assembly.system import System
 from natcoord_jax.assembly.tangent_space import TangentSpace
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import Tableau
 
-FORMS: dict[str, Any] = {"reduced": ReducedStep, "full": FullStep, "recursive": RecursiveStep}
+FORMS: dict[str, Any] = {
+    "reduced": ReducedStep,
+    "full": FullStep,
+    "recursive": RecursiveStep,
+    "sparse": SparseStep,
+}
 
 
 def form_of(system: System, tableau: Tableau) -> str:

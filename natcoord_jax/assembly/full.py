@@ -1,8 +1,8 @@
 """Equations of a step in the local null space: six rates a body, multipliers for every joint.
 
 The most general form: any joint, any loop, any coupling. The Jacobian is assembled from those of single
-bodies and effects. Systems that are no tree and too large for the reduced form are solved so, densely; for
-all others it is an independent way to the same trajectory.
+bodies and effects. Systems that are no tree, too large for the reduced form and too small for the sparse one
+are solved so, densely; for all others it is an independent way to the same trajectory.
 """
 
 import equinox as eqx

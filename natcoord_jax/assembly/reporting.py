@@ -9,6 +9,7 @@ if TYPE_CHECKING:
 REASONS = {
     "reduced": "few unknowns: joint null space along the tree, one dense matrix kept over many steps",
     "recursive": "a large open tree: joint null space, eliminated recursively from leaves to root",
+    "sparse": "many loops or couplings: six rates a body, all multipliers, one sparse matrix",
     "full": "loops or couplings across a large tree: six rates a body, all multipliers, one dense matrix",
 }
 

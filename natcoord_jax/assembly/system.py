@@ -97,7 +97,7 @@ class Structure:
         rotors: number of stored rates.
         unknowns: number of tree unknowns (degrees of freedom of the spanning tree).
         multipliers: number of Lagrange multipliers that are solved for.
-        solver: "reduced", "recursive" or "full".
+        solver: "reduced", "recursive", "sparse" or "full".
         constraints: number of constraints, internal ones of rigid bodies included.
         dofs: degrees of freedom: unknowns less the structural rank of the remaining constraints.
         rank: structural rank of the constraints outside the tree where some are redundant, else None.
@@ -135,6 +135,7 @@ class System(eqx.Module):
         coordinate_order: place of each coordinate among those of all groups, one group after the other.
         elimination: order of recursive elimination, only where it is the solver.
         structure: what is static.
+        sparsity: pattern and plan of the sparse Jacobian, only where it is the solver.
     """
 
     mass: Float[Array, "bodies 4 4"]
@@ -147,6 +148,7 @@ class System(eqx.Module):
     coordinate_order: Int[Array | np.ndarray, " coordinates"]
     elimination: Elimination | None
     structure: Structure = eqx.field(static=True)
+    sparsity: Any = None
 
     def energy(self, motion: State | Trajectory) -> "diagnostics.Energy":
         """Kinetic energy and stored energies [J]; see `Energy`."""

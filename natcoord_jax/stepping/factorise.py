@@ -4,11 +4,14 @@ from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
 from natcoord_jax.linsolve.dense import DenseSolver, Inverse, saddle_inverse
+from natcoord_jax.linsolve.sparse import SparseSolver, factorised
 from natcoord_jax.linsolve.tree import TreeBlocks, TreeSolver, factor
+from natcoord_jax.stepping.sparsity import assembled, inertias_of, regularised
 
 
 def _dense(equations: Any, matrix: Array) -> tuple[Inverse, Array]:
@@ -58,10 +61,27 @@ def _recursive_differentiable(equations: Any, blocks: tuple) -> _ByNode:
     return _ByNode(equations.layout, TreeSolver(matrix, factor(matrix)[0]))
 
 
+def _sparse(equations: Any, matrix: Any) -> tuple[Any, Array]:
+    """Factors of a sparse matrix, and the inertias of the unknowns; of a dense one with several stages."""
+    if equations.tableau.stages > 1:
+        return _dense(equations, matrix)
+    whole = assembled(equations, matrix)
+    inertias = inertias_of(whole, equations.balances)
+    return factorised(equations.system.sparsity.plan, regularised(whole, inertias)), inertias
+
+
+def _sparse_differentiable(equations: Any, matrix: Any) -> Any:
+    if equations.tableau.stages > 1:
+        return dense_differentiable(equations, matrix)
+    whole = assembled(equations, matrix)
+    return SparseSolver(whole, jax.lax.stop_gradient(_sparse(equations, matrix)[0]), rounds=2)
+
+
 FACTORISATIONS: dict[str, Callable[[Any, Any], tuple[Any, Array]]] = {
     "reduced": _dense,
     "full": _dense,
     "recursive": _recursive,
+    "sparse": _sparse,
 }
 """Factorisations for Newton's iteration, by form of the equations."""
 
@@ -69,6 +89,7 @@ DIFFERENTIABLE: dict[str, Callable[[Any, Any], Any]] = {
     "reduced": dense_differentiable,
     "full": dense_differentiable,
     "recursive": _recursive_differentiable,
+    "sparse": _sparse_differentiable,
 }
 """Solvers whose solutions are differentiable in every mode, by form of the equations."""
 

@@ -17,6 +17,9 @@ from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import Tableau
 from natcoord_jax.stepping.factorise import dense_differentiable, differentiable_solver
 
+EXACT_JACOBIAN = ("recursive", "sparse")
+"""Forms whose own Jacobian is taken for derivatives, too; those of others are dense anyway."""
+
 
 def advance(
     system: System, state: State, u: Array, h: Array, y: Float[Array, " unknowns"], tableau: Tableau
@@ -114,7 +117,7 @@ def linear_solver(
         along: linear map of (state, unknowns) to (residual, state at the end), for dense Jacobians.
     """
     equations = prepare(system, state, u, h, tableau)
-    if form_of(system, tableau) == "recursive" and not tableau.kick:
+    if form_of(system, tableau) in EXACT_JACOBIAN and not tableau.kick:
         return differentiable_solver(equations, equations.jacobian(y))
     at_rest = jax.tree.map(jnp.zeros_like, state)
     columns = jax.vmap(lambda unit: along(at_rest, unit)[0], out_axes=1)(jnp.eye(y.shape[0], dtype=y.dtype))

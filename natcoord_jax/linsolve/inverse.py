@@ -1,0 +1,90 @@
+"""Inverses of small and medium matrices: of many at once, or of one with pivoting."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+UNBLOCKED = 16
+SMALL = 8
+LARGE = 32
+MANY = 24  # matrices that fill the vector registers when they are stored side by side
+
+
+def inverses(matrices: Float[Array, "count n n"]) -> Float[Array, "count n n"]:
+    """Inverses by Gauss-Jordan elimination in place; large matrices by blocks, with n a multiple of 8.
+
+    Loops instead of unrolled code: it takes a tenth of the time to compile, and runs as fast.
+    """
+    count, n = matrices.shape[:2]
+    if n > 3 * LARGE and n % LARGE == 0:
+        return _blocked(matrices, LARGE)
+    if n > UNBLOCKED:
+        return _blocked(matrices, SMALL)
+    if count < MANY:
+        return _eliminated(matrices)
+    return jnp.moveaxis(_side_by_side(jnp.moveaxis(matrices, 0, -1)), -1, 0)
+
+
+def _eliminated(matrices: Array) -> Array:
+    n = matrices.shape[-1]
+    number = jnp.arange(n)
+
+    def step(k: Array, left: Array) -> Array:
+        row, column, on = left[:, k], left[:, :, k], number == k
+        pivot = 1.0 / row[:, k, None]
+        scaled = jnp.where(on, pivot, row * pivot)
+        kept = jnp.where(on, 0.0, left)
+        return jnp.where(on[:, None], scaled[:, None, :], kept - column[:, :, None] * scaled[:, None, :])
+
+    return jax.lax.fori_loop(0, n, step, matrices)
+
+
+def _side_by_side(matrices: Array) -> Array:
+    """The same with the matrices along the last axis."""
+    n = matrices.shape[0]
+    number = jnp.arange(n)
+
+    def step(k: Array, left: Array) -> Array:
+        row, column, on = left[k], left[:, k], (number == k)[:, None]
+        pivot = 1.0 / row[k]
+        scaled = jnp.where(on, pivot, row * pivot)
+        kept = jnp.where(on, 0.0, left)
+        return jnp.where(on[:, None], scaled[None], kept - column[:, None] * scaled[None])
+
+    return jax.lax.fori_loop(0, n, step, matrices)
+
+
+def _blocked(matrices: Array, size: int) -> Array:
+    """The same by blocks: rows and columns of a block at once, as products."""
+
+    def step(k: Array, left: Array) -> Array:
+        first = k * size
+        rows = jax.lax.dynamic_slice_in_dim(left, first, size, 1)
+        pivot = inverses(jax.lax.dynamic_slice_in_dim(rows, first, size, 2))
+        columns = jax.lax.dynamic_slice_in_dim(left, first, size, 2)
+        scaled = jax.lax.dynamic_update_slice_in_dim(pivot @ rows, pivot, first, 2)
+        left = jax.lax.dynamic_update_slice_in_dim(left, jnp.zeros_like(columns), first, 2)
+        return jax.lax.dynamic_update_slice_in_dim(left - columns @ scaled, scaled, first, 1)
+
+    return jax.lax.fori_loop(0, matrices.shape[-1] // size, step, matrices)
+
+
+def pivoted(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """Inverse of one small matrix by Gauss-Jordan elimination in place, rows chosen by their pivots."""
+    n = matrix.shape[0]
+    number = jnp.arange(n)
+
+    def step(k: Array, carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        left, free, chosen = carry
+        column, on = left[:, k], number == k
+        best = jnp.argmax(jnp.where(free, jnp.abs(column), -1.0)).astype(jnp.int32)
+        row, at = left[best], number == best
+        pivot = 1.0 / row[k]
+        scaled = jnp.where(on, pivot, row * pivot)
+        kept = jnp.where(on, 0.0, left)
+        left = jnp.where(at[:, None], scaled[None], kept - column[:, None] * scaled[None])
+        return left, free & ~at, jnp.where(on, best, chosen)
+
+    start = matrix, jnp.ones(n, bool), jnp.zeros(n, jnp.int32)
+    found, _, chosen = jax.lax.fori_loop(0, n, step, start)
+    return jnp.zeros_like(found).at[:, chosen].set(found[chosen])

@@ -1,0 +1,83 @@
+"""The form of the equations with a sparse Jacobian: same trajectory and derivatives as the dense one."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import tolerances as tol
+
+import natcoord_jax as nc
+
+
+def ladder(length: int, solver: str | None, *, rods: int = 1):
+    """Two chains of bodies on ball joints, side by side, with rods across that close loops."""
+    scene = nc.Scene()
+    scene.add(nc.Gravity(vector=(0.0, 0.0, -9.81)))
+    bodies = [
+        [
+            scene.add(nc.RigidBody(mass=1.0, inertia=(0.02, 0.1, 0.1), position=(k + 0.5, float(j), 0.0)))
+            for k in range(length)
+        ]
+        for j in range(2)
+    ]
+    for j, row in enumerate(bodies):
+        for k, body in enumerate(row):
+            before = row[k - 1] if k else nc.ground
+            scene.add(nc.Spherical(before, body, (float(k), float(j), 0.0)))
+    for k in range(1, length, 2):
+        for _ in range(rods):
+            near, far = (row[k] for row in bodies)
+            rod = nc.Distance(near, far, parent_point=(k + 0.7, 0.0, 0.0), point=(k + 0.6, 1.0, 0.0))
+            scene.add(rod)
+    return scene.compile(solver=solver)
+
+
+pytestmark = pytest.mark.slow  # two forms, and both derivatives of each, take a minute to compile
+
+
+@pytest.fixture(scope="module")
+def forms():
+    return {solver: ladder(4, solver) for solver in ("full", "sparse")}
+
+
+@pytest.fixture(scope="module")
+def outcomes(forms):
+    """Trajectory, gradient and second derivative by a factor of all masses."""
+
+    def of(system, state):
+        def run(scale):
+            heavier = eqx.tree_at(lambda s: s.mass, system, system.mass * scale)
+            return nc.simulate(heavier, state, dt=0.02, steps=8)
+
+        def loss(scale):
+            return jnp.sum(jnp.sin(scale * run(scale).q[-1]))
+
+        gradient = jax.grad(loss)
+        return jax.jit(lambda x: (run(x).q, gradient(x), jax.jvp(gradient, (x,), (1.0,))[1]))(1.3)
+
+    return {solver: of(*given) for solver, given in forms.items()}
+
+
+def test_one_trajectory(outcomes):
+    dense, sparse = (np.asarray(outcomes[s][0]) for s in ("full", "sparse"))
+    assert np.max(np.abs(dense[-1] - dense[0])) > 0.05
+    assert np.max(np.abs(dense - sparse)) <= tol.SAME_TRAJECTORY
+
+
+def test_one_gradient_forward_over_reverse_too(outcomes):
+    for k in (1, 2):
+        dense, sparse = (float(outcomes[s][k]) for s in ("full", "sparse"))
+        assert abs(dense - sparse) <= tol.SAME_GRADIENT * abs(dense)
+
+
+def test_the_report_names_it(forms):
+    system, _ = forms["sparse"]
+    assert "sparse" in system.report() and system.sparsity is not None
+    assert forms["full"][0].sparsity is None
+
+
+def test_large_loops_are_sparse_unless_constraints_depend_on_each_other():
+    assert ladder(8, None)[0].structure.solver == "sparse"
+    doubled, _ = ladder(8, None, rods=2)
+    assert doubled.structure.solver == "full" and doubled.structure.redundant
