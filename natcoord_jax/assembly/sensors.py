@@ -313,14 +313,14 @@ def sense(
         return found if isinstance(part, tuple) else jax.tree.map(lambda x: jnp.take(x, 0, axis), found)
     name = names[0]
     if name in system.structure.bodies:
-        index = system.body_index(part)
+        index = system.body_index(name)
         found = _body_motion(system, states, jnp.asarray(index), isinstance(motion, Trajectory))
         position, rotation, quaternion, velocity, spin, com, com_velocity = found
         return BodySensor(
             position, rotation, quaternion, velocity, spin, com, com_velocity, index=index, source=source
         )
     if name and name in system.structure.joints:
-        index, places, units = joint_coordinates(system, part)
+        index, places, units = joint_coordinates(system, name)
         chosen = np.array(places, int)
         rates = _all_rates(system, states)[..., chosen]
         return JointSensor(states.coordinates[..., chosen], rates, units, name, index, source)
