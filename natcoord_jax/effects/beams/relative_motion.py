@@ -15,7 +15,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from natcoord_jax.core.force import Force, Load
-from natcoord_jax.core.potential import Potential
+from natcoord_jax.core.potential import Potential, place_markers
+from natcoord_jax.effects.beams.readings import BeamReadings
 from natcoord_jax.maths.rotations import logarithm_of_motion
 
 
@@ -66,10 +67,17 @@ class BeamElement(Potential):
 
     kind: ClassVar[str] = "beam element"
     couples: ClassVar[bool] = True
+    silent: ClassVar[bool] = False
 
     def invariants(self, x: Array) -> Array:
         """Relative rotation [-] and place [m] of the second frame in the first."""
         return relative_motion(x)
+
+    def readings(self, place: Array, rows: Array) -> BeamReadings:
+        """Strains and section forces."""
+        invariants = self.invariants(place_markers(place, rows))
+        strains = self.strains(invariants)
+        return BeamReadings(strains, self.resultants(strains), self.energy(invariants))
 
     def strains(self, invariants: Float[Array, "7"]) -> Float[Array, "6"]:
         """Strains Gamma [-] and K [1/m], zero in the unstressed shape."""
