@@ -24,7 +24,7 @@ from natcoord_jax import gallery
 
 SCENES = ("rope", "cantilever")
 SIZES = (8, 16, 32, 64, 128, 256, 512)
-QUICK_SIZES = (8, 16)
+QUICK_SIZES = (8,)
 FIT_FROM = 32
 DT = {"rope": 1e-3, "cantilever": 2e-3}  # [s]
 T_END = {"rope": 0.5, "cantilever": 1.0}  # [s]

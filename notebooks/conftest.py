@@ -2,8 +2,8 @@
 
 import pytest
 
-SLOW = ("06", "07", "08", "09", "10")
-"""Numbers of the notebooks on optimal control and on accuracy: some forty seconds each."""
+SLOW = ("06", "07", "08", "09", "10", "11")
+"""Numbers of the notebooks on optimal control, accuracy and beams: some forty seconds each."""
 
 
 @pytest.hookimpl(tryfirst=True)  # before tests are chosen by their marks

@@ -80,3 +80,11 @@ def test_linsolve_alone(tmp_path):
             assert run[key].keys() >= TIMES and run[key]["residual"] < 1e-12
         assert run["klu"] is None
     assert "multifrontal" in text
+
+
+def test_beams_alone(tmp_path):
+    results, _ = _results("beams", tmp_path, "--no-peers")
+    assert {run["scene"] for run in results["runs"]} == {"rope", "cantilever"}
+    for run in results["runs"]:
+        assert run.keys() >= TIMES | {"elements", "solver", "us_per_step_and_element"}
+        assert run["result"] == "successful" and run["energy_balance"] < 1e-11

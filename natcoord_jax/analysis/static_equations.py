@@ -140,13 +140,16 @@ class Static(eqx.Module):
         found += [value.reshape(-1) for _, value, _ in joint_residuals(self.system, state)]
         return jnp.concatenate(found)
 
-    def matrix(self, y: Float[Array, " unknowns"]) -> Float[Array, "unknowns unknowns"]:
+    def matrix(
+        self, y: Float[Array, " unknowns"], weight: Array | float = 0.0
+    ) -> Float[Array, "unknowns unknowns"]:
         """Jacobian of the residual at displacements zero, assembled from those of single effects.
 
         It is that of a step of the body system without mass: a step's forces are those of its middle, which
-        moves by half the displacement.
+        moves by half the displacement. With a `weight` [1/s^2] that times the inertia is added to it (four
+        times, to be exact), as of a short step.
         """
-        system = replace_fields(self.system, mass=NO_MASS * self.system.mass)
+        system = replace_fields(self.system, mass=(NO_MASS + weight) * self.system.mass)
         resting = self.displaced(jnp.zeros_like(y))
         step = FullStep.prepare(
             system, resting, self.inputs, jnp.ones((), y.dtype), gauss(1), Outset(None, None)
@@ -157,9 +160,11 @@ class Static(eqx.Module):
         matrix = step.jacobian(y.at[: self.balances].set(0.0), exact=False)
         return matrix.at[: self.balances, : self.balances].multiply(2.0)
 
-    def inverse(self, y: Float[Array, " unknowns"]) -> Float[Array, "unknowns unknowns"]:
+    def inverse(
+        self, y: Float[Array, " unknowns"], weight: Array | float = 0.0
+    ) -> Float[Array, "unknowns unknowns"]:
         """Inverse of the matrix, slightly regularised."""
-        matrix, count = self.matrix(y), self.balances
+        matrix, count = self.matrix(y, weight), self.balances
         stiffness = jnp.max(jnp.abs(jnp.diagonal(matrix)[:count]), initial=0.0)
         arms = jnp.max(jnp.abs(matrix[count:, :count]), initial=1e-300)
         shift = SHIFT * arms**2 / jnp.where(stiffness > 0, stiffness, 1.0)

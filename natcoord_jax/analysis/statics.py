@@ -18,6 +18,15 @@ from natcoord_jax.core.state import State
 ITERATIONS = 40
 """Newton iterations for one load."""
 
+DOWNHILL = 400
+"""Further iterations with inertia where those have failed."""
+
+SHORT, LONG = 0.1, 0.4
+"""Corrections (relative to the extent; radians) below which inertia fades, and above which it grows."""
+
+NO_WEIGHT = 1e-9
+"""Part of the first inertia that no longer slows Newton's method."""
+
 LARGEST_TURN = 0.5
 """Largest Cayley vector of a body in one iteration: about one radian."""
 
@@ -50,14 +59,14 @@ class Equilibrium(eqx.Module):
 
 
 class _Search(eqx.Module):
-    """Where Newton's iteration stands."""
+    """Where Newton's iteration stands; `weight` [1/s^2] is that of the inertia added to the stiffness."""
 
     state: State
     lam: Array
+    weight: Array
     correction: Array
     count: Array
     done: Array
-    finite: Array
 
 
 def extent_of(system: System, state: State) -> Array:
@@ -74,34 +83,46 @@ def largest(change: Float[Array, " balances"], extent: Array) -> tuple[Array, Ar
 
 
 def _solve(system: System, state: State, lam: Array, inputs: Array) -> _Search:
-    """Newton's method from a configuration and multipliers; every iteration counts from where it is."""
+    """Newton's method from a configuration and multipliers; every iteration counts from where it is.
+
+    Where it fails, it begins again with inertia added to the stiffness, which keeps corrections short and
+    leads downhill, to a stable equilibrium, as time steps with all velocities forgotten would; the inertia
+    fades as corrections do (pseudo-transient continuation).
+    """
     extent = extent_of(system, state)
+    first = jnp.concatenate([jnp.zeros(6 * len(system.structure.bodies)), lam])
+    pull = jnp.max(jnp.abs(Static(system, state, inputs).residual(first)[: first.shape[0] - lam.shape[0]]))
+    heaviest = pull / (jnp.mean(system.mass[:, 0, 0]) * SHORT * extent)
 
     def trip(search: _Search) -> _Search:
-        static = Static(system, search.state, inputs)
+        static, slowed = Static(system, search.state, inputs), search.weight > 0
         y = jnp.concatenate([jnp.zeros(static.balances), search.lam])
-        change = -static.inverse(y) @ static.residual(y)
+        change = -static.inverse(y, search.weight) @ static.residual(y)
         moved, turned = largest(change[: static.balances], extent)
-        # No body moves or turns too far at once.
-        short = jnp.minimum(1.0, jnp.minimum(2 * LARGEST_TURN / jnp.maximum(turned, 1e-300), 1 / moved))
-        short = jnp.where(moved > 0, short, 1.0)
         correction = jnp.maximum(moved, turned)
-        stalled = (search.count > 0) & (correction > 0.5 * search.correction) & (correction <= FLOOR)
         finite = jnp.all(jnp.isfinite(change))
-        after = static.moved_along_tree(short * change)
-        lam = search.lam + short * change[static.balances :]
-        done = ((correction <= TOLERANCE) | stalled) & (short == 1.0) & finite
-        state = jax.tree.map(lambda a, b: jnp.where(finite, a, b), after, search.state)
-        lam = jnp.where(finite, lam, search.lam)
-        return _Search(state, lam, correction, search.count + 1, done, finite)
+        # No body moves or turns too far at once: shortened, or repeated with more inertia.
+        too_far = ~finite | (slowed & (correction > LONG))
+        allowed = jnp.minimum(2 * LARGEST_TURN / jnp.maximum(turned, 1e-300), 1 / jnp.maximum(moved, 1e-300))
+        short = jnp.where(slowed, 1.0, jnp.minimum(1.0, allowed))
+        stalled = (search.count > 0) & (correction > 0.5 * search.correction) & (correction <= FLOOR)
+        free = search.weight <= NO_WEIGHT * heaviest
+        done = ((correction <= TOLERANCE) | stalled) & (short == 1.0) & finite & free
+        after = static.moved_along_tree(short * change), search.lam + short * change[static.balances :]
+        after = jax.tree.map(lambda a, b: jnp.where(too_far, a, b), (search.state, search.lam), after)
+        lighter = jnp.where(correction < SHORT, 0.25, 1.0)
+        weight = search.weight * jnp.where(too_far, 4.0, lighter)
+        lost = ~slowed & ~done & (~finite | (search.count + 1 >= ITERATIONS))
+        after = jax.tree.map(lambda a, b: jnp.where(lost, a, b), (state, lam), after)
+        return _Search(*after, jnp.where(lost, heaviest, weight), correction, search.count + 1, done)
 
-    start = _Search(state, lam, jnp.zeros(()), jnp.array(0), jnp.array(False), jnp.array(True))
-    return jax.lax.while_loop(lambda s: ~s.done & s.finite & (s.count < ITERATIONS), trip, start)
+    nought = jnp.zeros(())
+    start = _Search(state, lam, nought, nought, jnp.array(0), jnp.array(False))
+    return jax.lax.while_loop(lambda s: ~s.done & (s.count < ITERATIONS + DOWNHILL), trip, start)
 
 
 def _code(search: _Search) -> Array:
-    failed = jnp.where(search.finite, int(Result.MAX_ITERATIONS), int(Result.NONFINITE))
-    return jnp.where(search.done, int(Result.SUCCESSFUL), failed)
+    return jnp.where(search.done, int(Result.SUCCESSFUL), int(Result.MAX_ITERATIONS))
 
 
 def differentiable(system: System, state: State, lam: Array, inputs: Array) -> tuple[State, Array]:
@@ -136,6 +157,9 @@ def equilibrium(
     throw: bool = True,
 ) -> Equilibrium:
     """Equilibrium at a series of loads, each found by Newton's method from the one before.
+
+    Where Newton's method fails, the configuration is let downhill to a stable equilibrium, which may be far
+    away: a shallow arch snaps through, a cable falls into its sag.
 
     The load parameter is the time of the state: forces, torques and drives that are functions of time are
     taken at it. Loads that are constant (gravity, say) act in full from the first load on.
