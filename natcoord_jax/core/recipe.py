@@ -1,7 +1,7 @@
 """Recipes: parts of a scene that consist of several bodies, joints and effects."""
 
 import abc
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import equinox as eqx
 from jaxtyping import Array, Float
@@ -10,6 +10,7 @@ from natcoord_jax.core.bodies import Body
 from natcoord_jax.core.handles import Handle
 
 
+@runtime_checkable
 class Builder(Protocol):
     """What a recipe may do to the scene that it is added to."""
 
