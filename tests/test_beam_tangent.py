@@ -14,7 +14,7 @@ from natcoord_jax.assembly.local import jacobians
 from natcoord_jax.assembly.response import body_rows, ground_rows, situation
 from natcoord_jax.core.effect import Effect, Motion, Now, replace_fields
 from natcoord_jax.core.gradient import gradient_of
-from natcoord_jax.core.potential import Potential
+from natcoord_jax.core.potential import Potential, place_markers
 from natcoord_jax.maths.collocation import gauss
 from natcoord_jax.maths.rotations import arctan_coefficients, from_rotation_vector
 
@@ -103,6 +103,14 @@ class Alone(nc.BeamElement):
     curvature = Potential.curvature
     pulled_back = Potential.pulled_back
     tangents = Effect.tangents
+
+    def linearised(self, place, motion, now, lam):
+        """With the gradient of the middle of the step."""
+        found = super().linearised(place, motion, now, lam)
+        if now.tableau.stages > 1:
+            return found
+        middle = self.invariants(place_markers(place, motion.start)) + 0.5 * found.steps[0]
+        return replace_fields(found, gradient=self.slope(middle)[None])
 
 
 def differentiated(stages, exact):

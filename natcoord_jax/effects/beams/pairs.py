@@ -5,6 +5,7 @@ velocity of the second point for an observer who turns with the first frame, and
 velocities. Its forces are a pair, opposite to each other: six numbers instead of twelve.
 """
 
+import abc
 from typing import Any
 
 import jax
@@ -25,6 +26,14 @@ BY_TWIST = np.repeat([-1.0, 1.0, 1.0, 1.0], 3)
 
 OF_WRENCH = np.repeat([1.0, 1.0, -1.0, 1.0], 3)
 """Signs of the rows: forces are opposite."""
+
+
+class Expanded(Potential):
+    """A potential between two attachments that gives gradient and curvature of its energy together."""
+
+    @abc.abstractmethod
+    def expansion(self, invariants: Float[Array, "7 *n"]) -> tuple[Array, Array]:
+        """Gradient (7, n) and second derivatives (7, 7, n) of the energy by `relative_motion`."""
 
 
 class Pair:
@@ -80,44 +89,36 @@ class Pair:
 
 
 def tangents_of_pairs(
-    potential: Potential, place: Array, motion: Motion, now: Now
+    potential: Expanded, place: Array, motion: Motion, now: Now
 ) -> Float[Array, "n 2 1 6 2 1 6"]:
     """Derivatives of the wrenches of a potential between two attachments by the twists, for one stage.
 
-    Exact in the geometry; the gradient of the energy is taken as linear in the steps of its invariants.
+    Exact in the geometry; the gradient of the energy is that in the middle of the step, and linear in the
+    steps of the invariants.
     """
     potential, place, start = instances_last((potential, place, motion.start))
     x, rows = place_together(place, start), instances_last((motion.rows, motion.rates), 1)
     begun = potential.invariants(x)
     steps = steps_together(potential, *(place_together(place, r) for r in (rows[0], now.h * rows[1])))
-    begun, steps = settled((begun, steps))
-    middle = settled(potential.averaged(begun, steps, now.tableau)[0])
-    half = settled(0.5 * potential.curvature(begun + 0.5 * steps[0]))
+    steps = settled(steps[0])
+    middle, curvature = settled(potential.expansion(begun + 0.5 * steps))
     pair = Pair(x, start, now.h)
     drift = Triple.of(rows[1][0, 1, 0] - rows[1][0, 0, 0])
     spin = jnp.moveaxis(motion.spin[0], 0, -1)
 
     def gradient(moved: Float[Array, "7 n"]) -> Float[Array, "7 n"]:
-        return middle + jnp.sum(half * (moved - steps[0]), axis=1)
+        return middle + 0.5 * jnp.sum(curvature * (moved - steps), axis=1)
 
-    def wrenches(drift: Triple, first: Triple, second: Triple) -> Float[Array, "9 n"]:
-        return pair.wrenches(drift, (first, second), gradient)
+    like = jnp.zeros_like(spin[0, 0])
+    given = drift, (Triple.of(spin[0]), Triple.of(spin[1]))
 
-    given = drift, Triple.of(spin[0]), Triple.of(spin[1])
-    found = jnp.concatenate([_derivative(wrenches, given, k) for k in range(3)])
+    def along(unit: Float[Array, "9"]) -> Float[Array, "9 n"]:
+        moved = (Triple.of(unit[k : k + 3, None] + like) for k in (0, 3, 6))
+        drift, *spins = moved
+        return jax.jvp(lambda *x: pair.wrenches(*x, gradient), given, (drift, tuple(spins)))[1]
+
+    # One program for all nine columns, though a velocity turns nothing: three times the size would compile
+    # for longer than it saves.
+    found = jax.vmap(along)(jnp.eye(9, dtype=like.dtype))
     every = found[PLACES][:, PLACES] * BY_TWIST[:, None, None] * OF_WRENCH[:, None]
     return jnp.moveaxis(every, (2, 1, 0), (0, 1, 2)).reshape(-1, 2, 1, 6, 2, 1, 6)
-
-
-def _derivative(function: Any, given: tuple[Triple, ...], number: int) -> Float[Array, "3 9 n"]:
-    """Derivatives by the three components of one argument, leading axis."""
-
-    def alone(x: Triple) -> Float[Array, "9 n"]:
-        return function(*given[:number], x, *given[number + 1 :])
-
-    like = jnp.zeros_like(given[number].x)
-
-    def along(unit: Array) -> Array:
-        return jax.jvp(alone, (given[number],), (Triple.of(unit[:, None] + like),))[1]
-
-    return jax.vmap(along)(jnp.eye(3, dtype=like.dtype))

@@ -16,9 +16,8 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.core.effect import Motion, Now
 from natcoord_jax.core.force import Force, Load
-from natcoord_jax.core.potential import Potential
 from natcoord_jax.effects.beams.logarithm import Logarithm
-from natcoord_jax.effects.beams.pairs import tangents_of_pairs
+from natcoord_jax.effects.beams.pairs import Expanded, tangents_of_pairs
 from natcoord_jax.maths.components import Triple, combination, rows_of
 from natcoord_jax.maths.rotations import logarithm_of_motion
 from natcoord_jax.maths.settled import settled
@@ -67,7 +66,7 @@ def strains_of(invariants: Float[Array, "7 *n"], length: Float[Array, "*n"]) -> 
     return rows_of(shift, turn) / length
 
 
-class BeamElement(Potential):
+class BeamElement(Expanded):
     """Linearly elastic beam between two frames: energy l e . C e / 2 of the strains e = (Gamma, K).
 
     Attributes:
@@ -129,9 +128,14 @@ class BeamElement(Potential):
 
     def curvature(self, invariants: Float[Array, "7 *n"]) -> Float[Array, "7 7 *n"]:
         """Second derivatives of the energy by the invariants."""
+        return self.expansion(invariants)[1]
+
+    def expansion(self, invariants: Float[Array, "7 *n"]) -> tuple[Array, Array]:
+        """Gradient and second derivatives of the energy by the invariants."""
         motion = Logarithm.of(invariants)
+        resultants = self._resultants_at(motion)
         moduli = self.moduli(self._strains_at(motion)) / self.length
-        return motion.hessian(self._resultants_at(motion), moduli)
+        return motion.gradient(resultants), motion.hessian(resultants, moduli)
 
     def _strains_at(self, motion: Logarithm) -> Float[Array, "6 *n"]:
         return rows_of(motion.shift, motion.turn) / self.length - self.reference
