@@ -113,8 +113,9 @@ def _solve(system: System, state: State, lam: Array, inputs: Array) -> _Search:
         lighter = jnp.where(correction < SHORT, 0.25, 1.0)
         weight = search.weight * jnp.where(too_far, 4.0, lighter)
         lost = ~slowed & ~done & (~finite | (search.count + 1 >= ITERATIONS))
-        after = jax.tree.map(lambda a, b: jnp.where(lost, a, b), (state, lam), after)
-        return _Search(*after, jnp.where(lost, heaviest, weight), correction, search.count + 1, done)
+        now, pulls = jax.tree.map(lambda a, b: jnp.where(lost, a, b), (state, lam), after)
+        weight = jnp.where(lost, heaviest, weight)
+        return _Search(now, pulls, weight, correction, search.count + 1, done)
 
     nought = jnp.zeros(())
     start = _Search(state, lam, nought, nought, jnp.array(0), jnp.array(False))
