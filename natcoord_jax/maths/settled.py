@@ -4,7 +4,6 @@ The CPU compiler merges chains of elementwise operations into the loops of all t
 them share is then computed again for each, and the program grows accordingly.
 """
 
-from collections.abc import Callable
 from typing import TypeVar
 
 import jax
@@ -25,5 +24,5 @@ def settled(x: T) -> T:
     if _attributed is None or jax.default_backend() != "cpu":
         return x
     leaves, structure = jax.tree.flatten(x)
-    call: Callable = _attributed(lambda *leaves: leaves, inlineable="false")  # pyright: ignore[reportAssignmentType]
+    call = _attributed(lambda *leaves: leaves, inlineable="false")
     return jax.tree.unflatten(structure, call(*leaves))
