@@ -15,6 +15,7 @@ from natcoord_jax.analysis import (
 )
 from natcoord_jax.assembly.posing import random_state
 from natcoord_jax.assembly.system import System
+from natcoord_jax.assembly.transfer import transfer
 from natcoord_jax.bodies import (
     Beam,
     BeamHandle,
@@ -209,6 +210,7 @@ __all__ = [
     "regulator",
     "simulate",
     "step",
+    "transfer",
 ]
 
 
