@@ -79,7 +79,7 @@ def transfer(
         >>> train, state = nc.transfer(system, meeting, cars(True)[0])
         >>> state.v[::4, 0].round(12).tolist()
         [2.0, 2.0]
-        >>> float(state.q[4, 0] - state.q[0, 0])
+        >>> float((state.q[4, 0] - state.q[0, 0]).round(12))
         0.5
     """
     check_bodies(system, into, onto)
