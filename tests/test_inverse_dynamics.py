@@ -62,3 +62,38 @@ def test_a_passive_joint_moves_as_it_must():
         nc.inverse_dynamics(system, state, both, dt=0.02)
     with pytest.raises(ValueError, match=r"shape \(40, 2\).*'rail \[0\]'"):
         nc.inverse_dynamics(system, state, both, dt=0.02, joints=["rail"])
+
+
+def test_computed_torque_holds_an_unstable_path(flexible_arm):
+    system, state, _ = flexible_arm
+    steps, dt = 50, 0.01
+    path = -1.4 * smooth(np.linspace(0.0, 1.0, steps + 1)[1:, None])  # up, where gravity pulls it down
+    control = nc.computed_torque(system, state, path, dt=dt, bandwidth=40.0)
+    run = nc.simulate(system, state, dt=dt, steps=steps, inputs=control)
+    np.testing.assert_allclose(run.states.coordinates[1:], path, atol=1e-10)
+    pushed = system.with_coordinate(state, "hinge", 0.05)
+    run = nc.simulate(system, pushed, dt=dt, steps=steps, inputs=control)
+    error = run.states.coordinates[1:] - path
+    # What is left is the beam, which the push has set swinging.
+    assert float(abs(error[0, 0])) > 0.03 and float(abs(error[-1, 0])) < 0.01
+
+
+def test_errors_decay_at_the_bandwidth():
+    """On a disc the error is that of the formulas, with a double pole."""
+    scene = nc.Scene()
+    disc = scene.add(nc.RigidBody(mass=1.0, inertia=(1.0, 1.0, 2.0)))
+    hinge = scene.add(nc.Revolute(nc.ground, disc))
+    scene.add(nc.JointTorque(hinge, name="motor"))
+    system, state = scene.compile()
+    dt, bandwidth, steps = 0.1, 3.0, 40
+    control = nc.computed_torque(system, state, np.zeros((steps, 1)), dt=dt, bandwidth=bandwidth)
+    # So small that the angle of a step is its tangent.
+    push = 1e-4
+    pushed = system.with_coordinate(state, hinge, push)
+    run = nc.simulate(system, pushed, dt=dt, steps=steps, inputs=control)
+    p = np.exp(-bandwidth * dt)
+    alpha, beta = (1 - p) ** 2 / 2, (1 - p) * (3 + p) / 4
+    matrix = np.array([[1 - alpha, 1 - beta], [-2 * alpha, 1 - 2 * beta]])
+    np.testing.assert_allclose(np.linalg.eigvals(matrix), p, atol=1e-7)
+    expected = [(np.linalg.matrix_power(matrix, k) @ [push, 0.0])[0] for k in range(steps + 1)]
+    np.testing.assert_allclose(run.states.coordinates[:, 0], expected, atol=1e-14)

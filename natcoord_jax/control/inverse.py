@@ -34,6 +34,7 @@ class _Search(eqx.Module):
         correction: the last one.
         before: the one before it.
         left: residual before the last correction relative to its terms, in the norm of the energy.
+        reach: change of the coordinates at the end of the step per input.
         count: corrections so far.
     """
 
@@ -42,6 +43,7 @@ class _Search(eqx.Module):
     correction: Float[Array, ""]
     before: Float[Array, ""]
     left: Float[Array, ""]
+    reach: Float[Array, "c inputs"]
     count: Int[Array, ""]
 
     @property
@@ -97,13 +99,32 @@ class _Step(eqx.Module):
         moved = answers[:, 0] + answers[:, 1:] @ change
         left = jnp.sqrt(jnp.abs(residual @ answers[:, 0])) / jnp.where(size > 0, size, 1.0)
         correction = jnp.max(jnp.abs(moved), initial=0.0)
-        return _Search(y - moved, u + change, correction, search.correction, left, search.count + 1)
+        sizes = correction, search.correction, left
+        return _Search(y - moved, u + change, *sizes, -reach[:, 1:], search.count + 1)
+
+
+class Followed(eqx.Module):
+    """A path that was followed, step by step.
+
+    Attributes:
+        inputs: of the steps.
+        states: at their ends.
+        reach: change of the coordinates at the end of a step per input.
+        left: what stays unbalanced, relative.
+        missed: by how much the coordinates miss the path [rad or m].
+    """
+
+    inputs: Float[Array, "*steps inputs"]
+    states: State
+    reach: Float[Array, "*steps c inputs"]
+    left: Float[Array, "*steps"]
+    missed: Float[Array, "*steps"]
 
 
 @quickly
 def _followed(
-    system: System, state: State, path: Float[Array, "steps c"], places: Array, dt: Array
-) -> tuple[Array, State, Array, Array]:
+    system: System, state: State, path: Float[Array, "steps c"], places: Any, dt: Array
+) -> Followed:
     channels = len(system.structure.inputs)
     big, nought = jnp.asarray(jnp.inf), jnp.array(0)
 
@@ -111,17 +132,17 @@ def _followed(
         outset = starting(system, state, MIDPOINT, later=True)
         step = _Step(system, state, dt, wanted, places, outset)
         u = jnp.zeros(channels)
-        start = _Search(step.equations(u).guess(), u, big, big, big, nought)
+        reach = jnp.zeros((len(places), channels))
+        start = _Search(step.equations(u).guess(), u, big, big, big, reach, nought)
         found = jax.lax.while_loop(lambda s: s.unfinished, lambda s: step.trip(s), start)
         following = step.end(found.y, found.u)[2]
         missed = jnp.max(jnp.abs(following.coordinates[places] - wanted), initial=0.0)
-        return following, (found.u, following, found.left, missed)
+        return following, Followed(found.u, following, found.reach, found.left, missed)
 
-    _, (inputs, states, rest, missed) = jax.lax.scan(body, state, path)
-    return inputs, states, rest, missed
+    return jax.lax.scan(body, state, path)[1]
 
 
-def _places(system: System, joints: Sequence[Handle | str] | None) -> np.ndarray:
+def places_of(system: System, joints: Sequence[Handle | str] | None) -> np.ndarray:
     """Coordinates of some joints, in their order, or of all."""
     every = system.structure.coordinates
     if joints is None:
@@ -141,8 +162,8 @@ def inverse_dynamics(
     """Inputs that make joint coordinates follow a path, exactly for the energy-momentum step (57).
 
     `nc.simulate` with these inputs reproduces the path to round-off, as long as the motion itself does not
-    amplify round-off; over many seconds of an unstable one (a robot that carries its arm upright) add
-    feedback, `inputs=` being a function of time and state.
+    amplify round-off; over many seconds of an unstable one (a robot that carries its arm upright) it takes
+    feedback, see `nc.computed_torque`.
 
     Parts without inputs (beams, passive joints, free bodies) move as they must: inputs and motion are found
     together, step by step. A path of coordinates that inputs act on directly is always possible; what
@@ -177,18 +198,28 @@ def inverse_dynamics(
         >>> bool(abs(trajectory.states.coordinates[1:] - path).max() < 1e-12)
         True
     """
-    path, places = jnp.asarray(coordinates, float), _places(system, joints)
+    found = followed(system, state, coordinates, dt, places_of(system, joints))
+    return found.inputs, found.states
+
+
+def followed(system: System, state: State, coordinates: Any, dt: Any, places: np.ndarray) -> Followed:
+    """A path of the coordinates at given places in the state, followed; see `inverse_dynamics`.
+
+    Raises:
+        ValueError: for a wrong shape, or a path that the inputs cannot bring about.
+    """
+    path = jnp.asarray(coordinates, float)
     if path.ndim != 2 or path.shape[1] != len(places) or path.shape[0] == 0:
         names = ["{} [{}]".format(*system.structure.coordinates[i]) for i in places]
         raise ValueError(f"coordinates has shape {path.shape}; pass (steps, {len(places)}) for {names}")
-    inputs, states, rest, missed = _followed(system, state, path, places, jnp.asarray(dt, float))
-    worst, off = float(np.max(rest)), float(np.max(missed))
-    if not (worst < ACCURACY and off < ACCURACY):
-        wrong = ~((np.asarray(rest) < ACCURACY) & (np.asarray(missed) < ACCURACY))
+    found = _followed(system, state, path, places, jnp.asarray(dt, float))
+    left, missed = np.asarray(found.left), np.asarray(found.missed)
+    fine = (left < ACCURACY) & (missed < ACCURACY)
+    if not np.all(fine):
         raise ValueError(
             f"the inputs {list(system.structure.inputs)} cannot bring about the path in step "
-            f"{int(np.argmax(wrong))}: {worst:.1e} of the loads stay unbalanced and the coordinates miss it "
-            f"by {off:.1e} rad or m; every coordinate of the path needs an input that acts on it (leave out "
-            "others by joints=), and the path must obey the constraints"
+            f"{int(np.argmin(fine))}: {np.max(left):.1e} of the loads stay unbalanced and the coordinates "
+            f"miss it by {np.max(missed):.1e} rad or m; every coordinate of the path needs an input that "
+            "acts on it (leave out others by joints=), and the path must obey the constraints"
         )
-    return inputs, states
+    return found
