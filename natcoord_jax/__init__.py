@@ -7,6 +7,7 @@ from natcoord_jax.analysis import (
     Balance,
     Equilibrium,
     Modes,
+    Phases,
     accuracy,
     balance,
     equilibrium,
@@ -15,6 +16,7 @@ from natcoord_jax.analysis import (
 )
 from natcoord_jax.assembly.posing import random_state
 from natcoord_jax.assembly.system import System
+from natcoord_jax.assembly.transfer import transfer
 from natcoord_jax.bodies import (
     Beam,
     BeamHandle,
@@ -33,6 +35,7 @@ from natcoord_jax.bodies import (
 )
 from natcoord_jax.control import (
     Check,
+    ComputedTorque,
     Feedback,
     Guess,
     OptimalControl,
@@ -41,6 +44,7 @@ from natcoord_jax.control import (
     Solution,
     bounds,
     check,
+    computed_torque,
     cost,
     descend,
     goal,
@@ -120,6 +124,7 @@ __all__ = [
     "Box",
     "Check",
     "CircularSection",
+    "ComputedTorque",
     "Coupling",
     "Cylinder",
     "Cylindrical",
@@ -156,6 +161,7 @@ __all__ = [
     "Outcome",
     "PairTorque",
     "Parameter",
+    "Phases",
     "Planar",
     "Point",
     "PointForce",
@@ -188,6 +194,7 @@ __all__ = [
     "balance",
     "bounds",
     "check",
+    "computed_torque",
     "cost",
     "descend",
     "equilibrium",
@@ -209,6 +216,7 @@ __all__ = [
     "regulator",
     "simulate",
     "step",
+    "transfer",
 ]
 
 

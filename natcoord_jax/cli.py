@@ -13,7 +13,6 @@ import jax
 import natcoord_jax as nc
 from natcoord_jax import gallery
 from natcoord_jax.core.results import Result
-from natcoord_jax.core.state import Trajectory
 from natcoord_jax.gallery.report import measure, table
 from natcoord_jax.stepping.error_control import Tolerance
 from natcoord_jax.stepping.scheme import Scheme
@@ -52,6 +51,7 @@ def parser() -> Parser:
     )
     run.add_argument("--rtol", type=float, metavar="R", help="error tolerated in a substep, relative")
     run.add_argument("--atol", type=float, metavar="A", help="the same in metres; by default as --rtol")
+    run.add_argument("--film", type=Path, metavar="FILE", help="write an animation, a gif")
     costs = commands.add_parser("accuracy", help="show what accuracy costs in time, over steps and orders")
     costs.add_argument("scene", metavar="SCENE", help="a name that `natcoord-jax scenes` lists")
     costs.add_argument("--time", type=float, metavar="T", help="end time [s]; by default that of the scene")
@@ -93,15 +93,15 @@ def _json_ready(value: Any) -> Any:
 
 
 def _plot(
-    example: gallery.Example, trajectory: Trajectory, solution: nc.Solution | None, file: Path | None
+    example: gallery.Example, phases: nc.Phases, solution: nc.Solution | None, file: Path | None
 ) -> Path | None:
     """Write the scene's own figure, or the curves of the run if a file is asked for."""
     if solution is not None:
         figure, file = nc.plot(solution), file or Path(f"{example.name}.png")
     elif example.figure is not None:
-        figure, file = example.figure(), file or Path(f"{example.name}.png")
+        figure, file = example.figure(phases), file or Path(f"{example.name}.png")
     elif file is not None:
-        figure = nc.plot(example.system, trajectory)
+        figure = nc.plot(phases)
     else:
         return None
     figure.savefig(file, dpi=150)
@@ -110,14 +110,18 @@ def _plot(
 
 def _checked(arguments: argparse.Namespace) -> gallery.Example:
     """The scene, after a look at the files to write."""
-    if arguments.scene not in gallery.SCENES:
+    scene = arguments.scene.replace("-", "_")
+    if scene not in gallery.SCENES:
         raise BadOptionError(f"no scene {arguments.scene!r}; there are {', '.join(gallery.SCENES)}")
-    for file in (arguments.json, arguments.plot):
+    film = getattr(arguments, "film", None)
+    if film is not None and film.suffix.lower() != ".gif":
+        raise BadOptionError(f"cannot write {film}; an animation ends in .gif")
+    for file in (arguments.json, arguments.plot, film):
         if file is not None and not file.resolve().parent.is_dir():
             raise BadOptionError(f"cannot write {file}: no such folder")
     if arguments.plot is not None and arguments.plot.suffix.lower() not in FIGURES:
         raise BadOptionError(f"cannot write {arguments.plot}; a figure ends in {', '.join(FIGURES)}")
-    return gallery.load(arguments.scene)
+    return gallery.load(scene)
 
 
 def _scheme(order: int) -> nc.EnergyMomentum:
@@ -157,6 +161,8 @@ def _accuracy(arguments: argparse.Namespace) -> int:
     example = _checked(arguments)
     if example.problem is not None:
         raise BadOptionError(f"{example.name} is a problem of optimal control; pass another scene")
+    if example.phases is not None:
+        raise BadOptionError(f"{example.name} is a run in several phases; pass another scene")
     t_end = example.t_end if arguments.time is None else arguments.time
     if not (math.isfinite(t_end) and t_end > 0):
         raise BadOptionError(f"--time [s] is {t_end:g}; pass a positive number")
@@ -183,17 +189,22 @@ def _run(arguments: argparse.Namespace) -> int:
         tolerance = Tolerance.of(arguments.rtol, arguments.atol)
     except ValueError as problem:
         raise BadOptionError(str(problem)) from None
-    report, trajectory, solution = measure(example, steps, dt, scheme, tolerance)
+    report, phases, solution = measure(example, steps, dt, scheme, tolerance)
     print(table(report))
     if arguments.json is not None:
         ready = {key: _json_ready(value) for key, value in report.items()}
         arguments.json.write_text(json.dumps(ready, indent=2, ensure_ascii=False) + "\n", "utf-8")
-    if not Result(int(trajectory.result)).ok or (solution is not None and not solution.ok):
+    ended = Result(int(phases.trajectories[-1].result))
+    if not ended.ok or (solution is not None and not solution.ok):
         print(f"natcoord-jax: {example.name}: {report['result']}", file=sys.stderr)
         return 1
-    written = _plot(example, trajectory, solution, arguments.plot)
-    if written is not None:
-        print(f"wrote {written}")
+    written = [_plot(example, phases, solution, arguments.plot)]
+    if arguments.film is not None:
+        nc.animate(phases, file=arguments.film, beams=example.beams)
+        written.append(arguments.film)
+    for file in written:
+        if file is not None:
+            print(f"wrote {file}")
     return 0
 
 

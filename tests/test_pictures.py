@@ -9,7 +9,7 @@ import pytest  # noqa: E402
 
 import natcoord_jax as nc  # noqa: E402
 from natcoord_jax import gallery  # noqa: E402
-from natcoord_jax.viz.outline import inertia_boxes  # noqa: E402
+from natcoord_jax.viz.outline import beam_rims, inertia_boxes, is_node, with_ground  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -48,3 +48,24 @@ def test_boxes_have_the_inertia_of_the_bodies():
     corners = inertia_boxes(system)[0, :, 1:]
     assert np.ptp(corners, axis=0) == pytest.approx(size)
     assert corners.mean(axis=0) == pytest.approx((1, 2, 3))
+
+
+def test_beams_are_drawn_as_swept_sections(tmp_path):
+    scene = nc.Scene()
+    scene.add(nc.Gravity())
+    box = scene.add(nc.RigidBody(shape=nc.Box((0.1, 0.1, 0.1)), density=500.0, position=(0.55, 0, 0)))
+    section = nc.RectangularSection(width=0.02, height=0.04, E=1e8, density=1000.0)
+    beam = scene.add(nc.Beam(section, [(0, 0, 0), (0.5, 0, 0)], elements=3, start=nc.ground, end=box))
+    system, state = scene.compile()
+    rows = with_ground(np.asarray(state.q)[None])
+    quads = beam_rims(system, rows, [beam])[0]
+    assert quads.shape == (3 * 4, 4, 3)
+    size = np.ptp(quads.reshape(-1, 3), axis=0)
+    assert size[0] == pytest.approx(0.5) and sorted(size[1:]) == pytest.approx([0.02, 0.04])
+    # Without the handle: the ellipse of the same mass and inertia, half axes of edge / sqrt(3).
+    round_ = np.ptp(beam_rims(system, rows)[0].reshape(-1, 3), axis=0)
+    assert sorted(round_[1:]) == pytest.approx([2 * 0.02 / np.sqrt(3), 2 * 0.04 / np.sqrt(3)])
+    assert [is_node(system, name) for name in system.structure.bodies].count(True) == 2
+    run = nc.simulate(system, state, dt=0.01, steps=5)
+    file = nc.animate(system, run, file=tmp_path / "beam.gif", beams=[beam])
+    assert file.read_bytes()[:3] == b"GIF"

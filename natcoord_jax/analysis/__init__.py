@@ -4,6 +4,7 @@ from natcoord_jax.analysis.accuracy import Accuracy, accuracy
 from natcoord_jax.analysis.balance import Balance, balance
 from natcoord_jax.analysis.load_path import load_path
 from natcoord_jax.analysis.modes import Modes, modes
+from natcoord_jax.analysis.phases import Phases
 from natcoord_jax.analysis.statics import Equilibrium, equilibrium
 
 __all__ = [
@@ -11,6 +12,7 @@ __all__ = [
     "Balance",
     "Equilibrium",
     "Modes",
+    "Phases",
     "accuracy",
     "balance",
     "equilibrium",

@@ -1,7 +1,7 @@
 """Beams: nodes with three directors, elements between them, and what they are attached to."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import equinox as eqx
@@ -32,12 +32,14 @@ class BeamHandle:
             An attached end is the body it is attached to.
         fractions: of the length, where the nodes are.
         elements: handles of its elements.
+        outline: rim of the section (n, 2) [m], for pictures, or None.
     """
 
     name: str
     nodes: tuple[Handle, ...]
     fractions: tuple[float, ...]
     elements: tuple[Handle, ...]
+    outline: Any = field(default=None, repr=False, compare=False)
 
     @property
     def start(self) -> Handle:
@@ -141,7 +143,8 @@ class Beam(Recipe):
         handles = tuple(scene.add(element) for element in elements)
         for effect in others:
             scene.add(effect)
-        return BeamHandle(name, tuple(nodes), tuple(float(x) for x in fractions), handles)
+        places = tuple(float(x) for x in fractions)
+        return BeamHandle(name, tuple(nodes), places, handles, self.section.outline)
 
     def _damping(self, label: str) -> Any:
         if self.damping is None:

@@ -6,6 +6,8 @@ from natcoord_jax.control import goal as goal
 from natcoord_jax.control import inputs as inputs
 from natcoord_jax.control.check import Check as Check
 from natcoord_jax.control.check import check as check
+from natcoord_jax.control.computed_torque import ComputedTorque as ComputedTorque
+from natcoord_jax.control.computed_torque import computed_torque as computed_torque
 from natcoord_jax.control.descent import descend as descend
 from natcoord_jax.control.feedback import Feedback as Feedback
 from natcoord_jax.control.feedback import receding_horizon as receding_horizon

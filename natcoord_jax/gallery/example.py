@@ -1,6 +1,6 @@
 """What a scene of the gallery consists of."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -27,9 +27,13 @@ class Example:
         control: inputs as a function of the mid-times (steps,) [s] of the steps, shape (steps, inputs)
             [N, N m]; None: no inputs, or all zero.
         facts: what is known of the scene, by name: exact values, published numbers, useful handles.
-        figure: draws the scene's own figure, which the command line writes unasked; None: it has none.
+        figure: draws the scene's own figure of a run, which the command line writes unasked; None: it has
+            none.
         problem: the optimal control problem, for (steps, dt), whose solution are the inputs; None: they are
             given by `control`.
+        phases: makes the run, for (steps, dt) and options of `nc.simulate`, where it is more than a rollout
+            with given inputs; `system` and `state` are then those of its start.
+        beams: whose sections pictures draw.
 
     Example:
         >>> import jax; jax.config.update("jax_enable_x64", True)
@@ -48,8 +52,10 @@ class Example:
     steps: int
     control: Callable[[Float[Array, " steps"]], Float[Array, "steps inputs"]] | None = None
     facts: Mapping[str, Any] = field(default_factory=dict)
-    figure: Callable[[], Any] | None = None
+    figure: Callable[[nc.Phases], Any] | None = None
     problem: Callable[[int, float], nc.OptimalControl] | None = None
+    phases: Callable[..., nc.Phases] | None = None
+    beams: Sequence[nc.BeamHandle] = ()
 
     @property
     def t_end(self) -> float:
@@ -89,6 +95,15 @@ class Example:
         return self.control((jnp.arange(steps) + 0.5) * dt)
 
     def simulate(self, *, steps: int | None = None, dt: Any = None, **options: Any) -> Trajectory:
-        """Run the scene; `options` go to `nc.simulate`."""
+        """One rollout with the scene's inputs, as far as it has any; `options` go to `nc.simulate`."""
         steps, dt = steps or self.steps, self.dt if dt is None else dt
         return nc.simulate(self.system, self.state, dt=dt, inputs=self.inputs(steps, dt), **options)
+
+    def run(self, steps: int | None = None, dt: Any = None, **options: Any) -> nc.Phases:
+        """The suggested run, in one phase or several; `options` go to `nc.simulate`."""
+        steps, dt = steps or self.steps, self.dt if dt is None else dt
+        if self.phases is not None:
+            return self.phases(steps, float(dt), **options)
+        if "inputs" not in options:
+            options["inputs"] = self.inputs(steps, dt)
+        return nc.Phases((self.system,), (nc.simulate(self.system, self.state, dt=dt, **options),))

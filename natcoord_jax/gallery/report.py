@@ -14,10 +14,10 @@ from natcoord_jax.stepping.error_control import Tolerance
 from natcoord_jax.stepping.scheme import Scheme
 
 
-def _timed(run: Any) -> tuple[Trajectory, float]:
+def _timed(run: Any) -> tuple[nc.Phases, float]:
     start = time.perf_counter()
-    trajectory = jax.block_until_ready(run())
-    return trajectory, time.perf_counter() - start
+    phases = jax.block_until_ready(run())
+    return phases, time.perf_counter() - start
 
 
 def _completed(trajectory: Trajectory) -> Trajectory:
@@ -29,7 +29,9 @@ def _completed(trajectory: Trajectory) -> Trajectory:
 
 
 def _largest(values: Any) -> float | None:
-    return None if values is None else float(np.max(values))
+    """Largest of all numbers of several arrays; None where there is none."""
+    known = [float(np.max(x)) for x in values if x is not None]
+    return max(known) if known else None
 
 
 def _solved(example: Example, steps: int, dt: float, scheme: Scheme) -> tuple[nc.Solution | None, Any]:
@@ -46,7 +48,7 @@ def measure(
     dt: float,
     scheme: Scheme,
     tolerance: Tolerance | None = None,
-) -> tuple[dict[str, Any], Trajectory, nc.Solution | None]:
+) -> tuple[dict[str, Any], nc.Phases, nc.Solution | None]:
     """Run a scene twice, the first time with compilation, and judge the run.
 
     Args:
@@ -57,20 +59,17 @@ def measure(
         tolerance: error that a substep may have; None: steps are made as they are.
 
     Returns:
-        The report, the trajectory, and the solution of an optimal control problem.
+        The report, the run, and the solution of an optimal control problem.
     """
-    system = example.system
-    structure = system.structure
-    solution, inputs = _solved(example, steps, dt, scheme)
-    options = {"dt": dt, "inputs": inputs, "throw": False, "scheme": scheme}
+    solution, inputs = None, None
+    options: dict[str, Any] = {"throw": False, "scheme": scheme}
+    if example.phases is None:
+        solution, inputs = _solved(example, steps, dt, scheme)
+        options["inputs"] = inputs
     if tolerance is not None:
         options |= {"rtol": tolerance.relative, "atol": tolerance.absolute}
-    _, first = _timed(lambda: nc.simulate(system, example.state, **options))
-    trajectory, wall = _timed(lambda: nc.simulate(system, example.state, **options))
-    valid = _completed(trajectory)
-    energy, errors = np.asarray(system.energy(valid).total), system.constraint_errors(valid)
-    balance = nc.balance(system, valid)
-    result = Result(int(trajectory.result))
+    _, first = _timed(lambda: example.run(steps, dt, **options))
+    phases, wall = _timed(lambda: example.run(steps, dt, **options))
     report = {
         "scene": example.name,
         "steps": steps,
@@ -78,37 +77,52 @@ def measure(
         "scheme": type(scheme).__name__,
         "order": scheme.order,
         "t_end": steps * dt,
-        "dofs": structure.dofs,
-        "unknowns": structure.unknowns + structure.multipliers,
-        "constraints": structure.constraints,
-        "newton_iterations_mean": int(trajectory.iterations) / max(int(trajectory.steps_taken), 1),
-        "newton_iterations_max": int(trajectory.iterations_max),
         "compile_s": first - wall,
         "wall_s": wall,
-        "energy_initial": float(energy[0]),
-        "energy_final": float(energy[-1]),
-        "dissipated": None if valid.states.dissipated is None else float(valid.states.dissipated[-1]),
-        "energy_error_max": _largest(balance.energy),
-        "momentum_error_max": _largest(balance.momentum),
-        "momentum_components": balance.directions,
-        "angular_momentum_error_max": _largest(balance.angular_momentum),
-        "angular_momentum_components": balance.axes,
-        "momentum_note": balance.note,
-        "constraint_error_max": _largest(errors.position),
-        "velocity_constraint_error_max": _largest(errors.velocity),
-        "substeps": int(trajectory.steps_taken),
-        "substeps_rejected": int(trajectory.steps_rejected),
-        "steps_completed": valid.t.shape[0] - 1,
-        "result": "successful" if result == Result.SUCCESSFUL else system.explain(trajectory),
+        **_judged(phases),
     }
     if solution is None:
-        return report, trajectory, None
+        return report, phases, None
     report["cost"] = solution.cost
     report["iterations"] = len(solution.history)
     report["goal_error_max"] = max((abs(x) for x in solution.missing.values()), default=0.0)
-    if not solution.ok and result.ok:
+    if not solution.ok and report["result"] == "successful":
         report["result"] = solution.explain()
-    return report, trajectory, solution
+    return report, phases, solution
+
+
+def _judged(phases: nc.Phases) -> dict[str, Any]:
+    """What a run is like: its size, iterations, balances of each phase, and how it ended."""
+    structure, runs = phases.systems[-1].structure, phases.trajectories
+    valid = nc.Phases(phases.systems, tuple(_completed(run) for run in runs))
+    total, last = np.asarray(valid.energy().total), valid.trajectories[-1]
+    balances = [nc.balance(*pair) for pair in valid.pairs]
+    errors = [system.constraint_errors(run) for system, run in valid.pairs]
+    taken = sum(int(run.steps_taken) for run in runs)
+    ended = Result(int(runs[-1].result))
+    return {
+        "dofs": structure.dofs,
+        "unknowns": structure.unknowns + structure.multipliers,
+        "constraints": structure.constraints,
+        "newton_iterations_mean": sum(int(run.iterations) for run in runs) / max(taken, 1),
+        "newton_iterations_max": max(int(run.iterations_max) for run in runs),
+        "energy_initial": float(total[0]),
+        "energy_final": float(total[-1]),
+        "energy_lost_at_changes": [float(x) for x in valid.losses()],
+        "dissipated": None if last.states.dissipated is None else float(last.states.dissipated[-1]),
+        "energy_error_max": _largest([b.energy for b in balances]),
+        "momentum_error_max": _largest([b.momentum for b in balances]),
+        "momentum_components": min(b.directions for b in balances),
+        "angular_momentum_error_max": _largest([b.angular_momentum for b in balances]),
+        "angular_momentum_components": min(b.axes for b in balances),
+        "momentum_note": balances[-1].note,
+        "constraint_error_max": _largest([e.position for e in errors]),
+        "velocity_constraint_error_max": _largest([e.velocity for e in errors]),
+        "substeps": taken,
+        "substeps_rejected": sum(int(run.steps_rejected) for run in runs),
+        "steps_completed": sum(run.t.shape[0] - 1 for run in valid.trajectories),
+        "result": "successful" if ended == Result.SUCCESSFUL else phases.systems[-1].explain(runs[-1]),
+    }
 
 
 def _number(value: float | None) -> str:
@@ -131,6 +145,10 @@ def table(report: dict[str, Any]) -> str:
         ("wall time", f"{1e3 * r['wall_s']:.3g} ms", f"{1e6 * r['wall_s'] / r['steps']:.3g} µs a step"),
         ("compile time", f"{r['compile_s']:.3g} s", ""),
         ("energy", f"{r['energy_final']:.8g} J", f"from {r['energy_initial']:.8g} J"),
+        *[
+            ("change of joints", f"{loss:.3g} J", "lost in the impact")
+            for loss in r["energy_lost_at_changes"]
+        ],
         *[("dissipated", _number(r["dissipated"]), "J, numerically")] * (r["dissipated"] is not None),
         ("energy balance", _number(r["energy_error_max"]), "largest error, relative"),
         ("momentum balance", _number(r["momentum_error_max"]), parts),

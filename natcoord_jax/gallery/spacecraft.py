@@ -93,7 +93,7 @@ def spacecraft(working: tuple[int, ...] = (1, 2, 3)) -> Example:
         steps=100,
         control=lambda t: jnp.full((t.shape[0], len(working)), TORQUE),
         facts={"dofs": 6 + len(working), "constraints": 39, "table": TABLE, "converged_energy": 7836.18288},
-        figure=torque_figure,
+        figure=lambda phases: torque_figure(),
     )
 
 

@@ -2,5 +2,6 @@
 
 from natcoord_jax.viz.animate import animate
 from natcoord_jax.viz.plot import Curve, Panel, plot, plot_panels
+from natcoord_jax.viz.snapshots import plot_snapshots
 
-__all__ = ["Curve", "Panel", "animate", "plot", "plot_panels"]
+__all__ = ["Curve", "Panel", "animate", "plot", "plot_panels", "plot_snapshots"]

@@ -1,9 +1,13 @@
-"""What to draw of a system: boxes with the inertia of the bodies, joints as points with axes."""
+"""What to draw of a system: boxes with the inertia of the bodies, joints as points with axes, beams."""
+
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from natcoord_jax.assembly.system import System
+from natcoord_jax.assembly.system import Group, System
+from natcoord_jax.bodies.beam import BeamHandle
 
 CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
 FACES = np.array([[0, 1, 3, 2], [4, 5, 7, 6], [0, 1, 5, 4], [2, 3, 7, 6], [0, 2, 6, 4], [1, 3, 7, 5]])
@@ -42,3 +46,63 @@ def joint_places(system: System, rows: Float[np.ndarray, "t bodies 4 3"]) -> tup
     parents = np.asarray(system.joint_bodies)[named, 0]
     vectors = np.einsum("jma,tjac->tjmc", frames, rows[:, parents])
     return vectors[:, :, 0], vectors[:, :, 3]
+
+
+RIM = 12
+"""Most corners of the rim of a section."""
+
+
+def _chains(system: System) -> list[Group]:
+    """Effects between frames of bodies that make a chain of these and store energy: elements of beams."""
+    groups = (g for g in system.effects if g.effect.couples and g.effect.stores)
+    return [g for g in groups if g.weights is not None and g.weights.ndim == 4]
+
+
+def _beam_of(element: str) -> str:
+    """Name of the beam that an element belongs to: elements are called "beam/element 0" and so on."""
+    return element.rpartition("/")[0]
+
+
+def is_node(system: System, body: str) -> bool:
+    """Whether a body is a node of a beam's own, which is drawn as part of the beam."""
+    names = {_beam_of(name) for group in _chains(system) for name in group.names}
+    beam, _, rest = body.rpartition("/")
+    return bool(beam) and beam in names and rest.startswith("node ")
+
+
+def _round_section(system: System, beam: str) -> Float[np.ndarray, "n 2"]:
+    """Rim of the full ellipse with the mass and inertia of the beam's nodes."""
+    angles = np.linspace(0.0, 2 * np.pi, RIM, endpoint=False)
+    circle = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    for number, name in enumerate(system.structure.bodies):
+        if name.startswith(f"{beam}/node "):
+            block = np.asarray(system.mass)[number]
+            return circle * 2 * np.sqrt(np.diag(block)[1:3] / block[0, 0])
+    return 0.01 * circle
+
+
+def beam_rims(
+    system: System, rows: Float[np.ndarray, "t bodies 4 3"], beams: Sequence[BeamHandle] = ()
+) -> Float[np.ndarray, "t faces 4 3"]:
+    """Swept sections of all beams as quadrilaterals between the rims of neighbouring nodes [m].
+
+    Args:
+        system: compiled system.
+        rows: by body, those of the ground last.
+        beams: handles, whose sections are known; the other beams are round.
+    """
+    outlines: dict[str, Any] = {b.name: np.asarray(b.outline) for b in beams if b.outline is not None}
+    quads = [np.zeros((len(rows), 0, 4, 3))]
+    for group in _chains(system):
+        frames = np.einsum("nkma,tnkac->tnkmc", np.asarray(group.weights), rows[:, np.asarray(group.bodies)])
+        for number, name in enumerate(group.names):
+            beam = _beam_of(name)
+            if beam not in outlines:
+                outlines[beam] = _round_section(system, beam)
+            rim = outlines[beam][:: -(-len(outlines[beam]) // RIM)]
+            here = frames[:, number]
+            across = np.einsum("ri,tkic->tkrc", rim, here[:, :, 1:3]) + here[:, :, :1]
+            following = np.roll(across, -1, axis=2)
+            corners = (across[:, :-1], across[:, 1:], following[:, 1:], following[:, :-1])
+            quads.append(np.stack(corners, axis=3).reshape(len(rows), -1, 4, 3))
+    return np.concatenate(quads, axis=1)

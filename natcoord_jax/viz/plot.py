@@ -10,9 +10,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from natcoord_jax.analysis.accuracy import Accuracy
+from natcoord_jax.analysis.phases import Phases
 from natcoord_jax.assembly.system import System
 from natcoord_jax.control.solution import Solution
 from natcoord_jax.core.state import Trajectory
+from natcoord_jax.viz.stage import phases_of
 from natcoord_jax.viz.work_precision import plot_accuracy
 
 AXES = "xyz"
@@ -43,7 +45,8 @@ class Panel(NamedTuple):
     abscissa: str = "t [s]"
 
 
-def _draw(axes: Axes, panel: Panel) -> None:
+def draw(axes: Axes, panel: Panel) -> None:
+    """Draw one diagram."""
     for curve in panel.curves:
         style = "--" if curve.dashed else "-"
         axes.plot(curve.t, curve.values, style, label=curve.label, linewidth=1.2)
@@ -70,7 +73,7 @@ def plot_panels(panels: list[Panel], *, columns: int = 2) -> Figure:
         rows, columns, figsize=(5.2 * columns, 3.4 * rows), layout="constrained", squeeze=False
     )
     for axes, panel in zip(grid.flat, panels, strict=False):
-        _draw(axes, panel)
+        draw(axes, panel)
     for axes in grid.flat[len(panels) :]:
         axes.set_visible(False)
     if "inline" in matplotlib.get_backend():
@@ -166,12 +169,12 @@ def _is_free(system: System, body: int) -> bool:
     return parent == len(system.structure.bodies) and int(own.sum()) == 6
 
 
-def plot(system: System | Solution | Accuracy, trajectory: Trajectory | None = None) -> Figure:
+def plot(system: System | Phases | Solution | Accuracy, trajectory: Trajectory | None = None) -> Figure:
     """Energies by store, momenta, constraint errors, work and joint coordinates over time.
 
     Args:
-        system: compiled system; or a solution of an optimal control problem, or what `accuracy` found,
-            which need no trajectory.
+        system: compiled system; or a motion in phases, a solution of an optimal control problem, or what
+            `accuracy` found, which need no trajectory.
         trajectory: of one lane, computed with it.
 
     Returns:
@@ -192,10 +195,28 @@ def plot(system: System | Solution | Accuracy, trajectory: Trajectory | None = N
         return plot_solution(system)
     if isinstance(system, Accuracy):
         return plot_accuracy(system)
-    if trajectory is None:
-        raise ValueError("plot needs the system and a trajectory, a solution, or what accuracy found")
-    if trajectory.t.ndim != 1:
-        raise ValueError(f"plot takes one lane, not a batch of shape {trajectory.t.shape[:-1]}")
+    pairs = phases_of(system, trajectory, "plot").pairs
+    return plot_panels(_joined([_panels(*pair) for pair in pairs]))
+
+
+def _joined(phases: list[list[Panel]]) -> list[Panel]:
+    """Panels with the curves of all phases, joined by title and label."""
+    panels: dict[str, Panel] = {}
+    for panel in (panel for phase in phases for panel in phase):
+        known = panels.setdefault(panel.title, panel._replace(curves=[]))
+        for curve in panel.curves:
+            same = [k for k, other in enumerate(known.curves) if other.label == curve.label]
+            if same:
+                before = known.curves[same[0]]
+                t, values = (np.concatenate(x) for x in zip(before[1:3], curve[1:3]))
+                known.curves[same[0]] = before._replace(t=t, values=values)
+            else:
+                known.curves.append(curve)
+    return list(panels.values())
+
+
+def _panels(system: System, trajectory: Trajectory) -> list[Panel]:
+    """What is drawn of one trajectory."""
     t = np.asarray(trajectory.t)
     errors = system.constraint_errors(trajectory)
     constraints = [
@@ -217,4 +238,4 @@ def plot(system: System | Solution | Accuracy, trajectory: Trajectory | None = N
     if work:
         curves = [Curve(name, t, np.asarray(values)) for name, values in work.items()]
         panels.append(Panel("work of inputs, loads, dampers, drives", "[J]", curves))
-    return plot_panels(panels)
+    return panels
