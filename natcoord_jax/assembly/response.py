@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.diagnostics import group_places
 from natcoord_jax.assembly.system import Group, System
-from natcoord_jax.core.effect import Motion, Now
+from natcoord_jax.core.effect import Motion, Now, Response
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import Tableau
 from natcoord_jax.maths.vectors import cross
@@ -85,31 +85,13 @@ def situation(system: System, group: Group, state: State, u: Array, h: Array) ->
     )
 
 
-def respond(group: Group, where: Situation, motion: Motion, lam: Float[Array, "n s m"], tableau: Tableau):
+def respond(
+    group: Group, where: Situation, motion: Motion, lam: Float[Array, "n s m"], tableau: Tableau
+) -> Response:
     """Responses of all instances of a group; leading axis `n`."""
-
-    def one(
-        effect, place, inputs, coordinates, rates, start, rows, row_rates, spin, levers, stress, multiplier
-    ):
-        now = Now(where.t, where.h, inputs, coordinates, rates, tableau, stress)
-        return effect.respond(place, Motion(start, rows, row_rates, spin, levers), now, multiplier)
-
-    axes = (None if group.source == "mass" else 0, 0, 0, 0, 0, 0, 1, 1, 1, 1, 0, 0)
+    now = Now(where.t, where.h, where.inputs, where.coordinates, where.rates, tableau, where.stress)
     with jax.named_scope(group.effect.kind.replace(" ", "_")):
-        return jax.vmap(one, in_axes=axes)(
-            group.effect,
-            where.place,
-            where.inputs,
-            where.coordinates,
-            where.rates,
-            motion.start,
-            motion.rows,
-            motion.rates,
-            motion.spin,
-            motion.levers,
-            where.stress,
-            lam,
-        )
+        return group.effect.responses(where.place, motion, now, lam)
 
 
 def gather(group: Group, at: Stations) -> Motion:

@@ -9,6 +9,7 @@ import dataclasses
 from typing import Any, ClassVar, TypeVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -51,7 +52,7 @@ class Motion(eqx.Module):
 
 
 class Now(eqx.Module):
-    """What else an effect may depend on during a step.
+    """What else an effect (or `n` equal ones) may depend on during a step.
 
     Attributes:
         t: start time [s].
@@ -65,9 +66,9 @@ class Now(eqx.Module):
 
     t: Float[Array, ""]
     h: Float[Array, ""]
-    inputs: Float[Array, " inputs"] | Float[Array, "s inputs"]
-    coordinates: Float[Array, " c"]
-    rates: Float[Array, " r"]
+    inputs: Float[Array, "*n inputs"] | Float[Array, "*n s inputs"]
+    coordinates: Float[Array, "*n c"]
+    rates: Float[Array, "*n r"]
     tableau: Tableau = eqx.field(static=True)
     stress: Float[Array, "s p"] | None = None
 
@@ -83,7 +84,7 @@ class Now(eqx.Module):
 
 
 class Response(eqx.Module):
-    """What an effect answers for the stages of a step.
+    """What an effect (or `n` equal ones) answers for the stages of a step.
 
     Attributes:
         forces: forces on the rows of its bodies [N for points, N m for directors]; None: there are none.
@@ -92,10 +93,10 @@ class Response(eqx.Module):
         power: power delivered to the bodies [W], for work accounts.
     """
 
-    forces: Float[Array, "s k 4 3"] | None
-    torques: Float[Array, "s k 3"] | None
-    rows: Float[Array, "s m"]
-    power: Float[Array, " s"]
+    forces: Float[Array, "*n s k 4 3"] | None
+    torques: Float[Array, "*n s k 3"] | None
+    rows: Float[Array, "*n s m"]
+    power: Float[Array, "*n s"]
 
 
 class Effect(eqx.Module):
@@ -111,6 +112,7 @@ class Effect(eqx.Module):
         elastic: whether its oscillations can be damped numerically: it gives `strain_rates` and `curvature`,
             and adds `Now.stress` to its gradients.
         rotors: number of stored coordinate rates per instance.
+        shared: whether one module serves all instances, instead of one with stacked numbers.
         couples: whether bodies of neighbouring markers become neighbours in the spanning tree where no joint
             makes them so: elements of beams do, of which a chain then is a chain of bodies.
         silent: whether it has no sensor.
@@ -124,6 +126,7 @@ class Effect(eqx.Module):
     stores: ClassVar[bool] = False
     elastic: ClassVar[bool] = False
     rotors: ClassVar[int] = 0
+    shared: ClassVar[bool] = False
     couples: ClassVar[bool] = False
     silent: ClassVar[bool] = True
 
@@ -137,6 +140,38 @@ class Effect(eqx.Module):
             now: time, step, inputs, joint coordinates.
             lam: its multipliers times the step [N s or N m s].
         """
+
+    def responses(self, place: Array, motion: Motion, now: Now, lam: Float[Array, "n s m"]) -> Response:
+        """Responses of `n` instances with stacked numbers; leading axis n.
+
+        By default `respond` of each of them. Where that is slow, write it for all of them at once.
+
+        Args:
+            place: of the instances, leading axis n.
+            motion: of their bodies.
+            now: leading axis n in inputs, coordinates and rates.
+            lam: of the instances.
+        """
+
+        def one(effect, place, inputs, coordinates, rates, stress, start, rows, row_rates, spin, levers, lam):
+            alone = Now(now.t, now.h, inputs, coordinates, rates, now.tableau, stress)
+            return effect.respond(place, Motion(start, rows, row_rates, spin, levers), alone, lam)
+
+        axes = (None if self.shared else 0, 0, 0, 0, 0, 0, 0, 1, 1, 1, 1, 0)
+        numbers = self, place, now.inputs, now.coordinates, now.rates, now.stress
+        moving = motion.start, motion.rows, motion.rates, motion.spin, motion.levers
+        return jax.vmap(one, in_axes=axes)(*numbers, *moving, lam)
+
+    def tangents(
+        self, place: Array, motion: Motion, now: Now, lam: Float[Array, "n s m"]
+    ) -> Float[Array, "n k s 6 k s 6"] | None:
+        """Derivatives of the wrenches on the bodies by their twists, nearly, of `n` instances, in formulas.
+
+        For Newton's iteration, of an effect without multipliers. A wrench is a force [N] and a torque [N m]
+        about the reference point, a twist the velocity of that point [m/s] and an angular velocity [rad/s].
+        None, the default: they are found by differentiating the response of `linearised`.
+        """
+        return None
 
     def linearised(self, place: Array, motion: Motion, now: Now, lam: Float[Array, "s m"]) -> Any:
         """Something with a `respond` that is nearly this effect's, and nearly its derivative, at this motion.

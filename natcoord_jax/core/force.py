@@ -1,7 +1,7 @@
 """Forces: loads on markers from stage quantities and inputs; fields: forces on the mass of every body."""
 
 import abc
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -52,7 +52,7 @@ class Force(Effect):
     kind: ClassVar[str] = "force"
     works: ClassVar[bool] = True
 
-    def attach(self, find: Callable[[Handle], tuple[Joint, Array]]) -> tuple[Marker | Attachment, ...]:
+    def attach(self, find: Callable[[Handle], tuple[Joint, Array]]) -> Sequence[Marker | Attachment]:
         """Markers of the effect; effects on a joint look it up with `find`: handle to (joint, triad)."""
         return self.markers
 
@@ -91,6 +91,7 @@ class Field(Effect):
 
     kind: ClassVar[str] = "field"
     stores: ClassVar[bool] = True
+    shared: ClassVar[bool] = True
 
     @abc.abstractmethod
     def acceleration(self) -> Float[Array, "3"]:

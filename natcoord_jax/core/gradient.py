@@ -8,6 +8,7 @@ only while it exceeds round-off: there is no quotient near rest, hence no wrong 
 """
 
 from collections.abc import Callable
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -21,25 +22,28 @@ LEAST = 1e-12
 
 
 def averaged_gradient(
-    energy: Callable[[Float[Array, " p"]], Float[Array, ""]],
-    start: Float[Array, " p"],
-    steps: Float[Array, "s p"],
+    energy: Callable[[Float[Array, "p *n"]], Float[Array, "*n"]],
+    start: Float[Array, "p *n"],
+    steps: Float[Array, "s p *n"],
     tableau: Tableau,
     degree: int | None,
     points: int | None = None,
-) -> Float[Array, "s p"]:
+    slope: Callable[[Float[Array, "p *n"]], Float[Array, "p *n"]] | None = None,
+) -> Float[Array, "s p *n"]:
     """Gradients S_i [J per unit of invariant] with sum_i b_i S_i . steps_i = E(end) - E(start).
 
     For the variational mid-point rule the gradient at the mean of the invariants, whose work is the change of
     energy up to terms of third order in the steps.
 
     Args:
-        energy: function of the invariants, shape (p,) to scalar [J].
+        energy: function of the invariants, shape (p,) to scalar [J]; of many instances at once (last axis)
+            if start and steps have such an axis.
         start: invariants at the start of the step.
         steps: h times their rates at the stages.
         tableau: the collocation method.
         degree: polynomial degree of `energy`, or None if it is no polynomial.
         points: of the quadrature if it is no polynomial; default two more than twice the stages.
+        slope: gradient of `energy`; None: by reverse mode.
     """
     if tableau.variational:
         return jax.grad(energy)(start + 0.5 * steps[0])[None]
@@ -48,25 +52,38 @@ def averaged_gradient(
     elif points is None:
         points = 2 + 2 * tableau.stages
     integrals, averages = invariant_quadrature(tableau.stages, points)
-    path = start + jnp.asarray(integrals) @ steps
-    gradient = jnp.asarray(averages) @ jax.vmap(jax.grad(energy))(path)
+    path = start + _mixed(integrals, steps)
+    gradient = _mixed(averages, jax.vmap(slope or partial(gradient_of, energy))(path))
     if degree is not None:
         return gradient
-    weights = jnp.asarray(tableau.b)
-    increment = weights @ steps
+    weights = np.reshape(tableau.b, (-1, *(1,) * start.ndim))
+    increment = jnp.sum(weights * steps, axis=0)
     before, after = energy(start), energy(start + increment)
-    captured = jnp.sum(weights[:, None] * gradient * steps)
+    captured = jnp.sum(weights * gradient * steps, axis=(0, 1))
     missing = (after - before) - captured
     scale = jnp.abs(start) + jnp.abs(increment)
     scale = jnp.where(scale > 0, scale, 1.0)
-    measure = jnp.sum(weights[:, None] * (steps / scale) ** 2)
+    measure = jnp.sum(weights * (steps / scale) ** 2, axis=(0, 1))
     # Near its minimum an energy is less certain than its digits say: invariants are rounded before it.
-    rounded = jnp.max(jnp.abs(gradient) @ scale)
+    rounded = jnp.max(jnp.sum(jnp.abs(gradient) * scale, axis=1), axis=0)
     sizes = jnp.abs(before) + jnp.abs(after) + jnp.abs(captured) + rounded
     noise = 16 * jnp.finfo(start.dtype).eps * sizes
     relevant = (jnp.abs(missing) > noise) & (measure > LEAST**2)
     factor = jnp.where(relevant, missing / jnp.where(relevant, measure, 1.0), 0.0)
     return gradient + factor * steps / scale**2
+
+
+def gradient_of(
+    energy: Callable[[Float[Array, "p *n"]], Float[Array, "*n"]], invariants: Float[Array, "p *n"]
+) -> Float[Array, "p *n"]:
+    """Gradient of a function of the invariants, of one instance or of many at once (last axis)."""
+    value, pulled = jax.vjp(energy, invariants)
+    return pulled(jnp.ones_like(value))[0]
+
+
+def _mixed(weights: np.ndarray, x: Float[Array, "s *rest"]) -> Float[Array, "r *rest"]:
+    """Sums over the first axis, of any size without a call into a library."""
+    return jnp.sum(weights.reshape(*weights.shape, *(1,) * (x.ndim - 1)) * x, axis=1)
 
 
 def averaged_coupling(stages: int) -> np.ndarray:

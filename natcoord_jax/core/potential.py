@@ -1,7 +1,7 @@
 """Potentials: an energy of invariants of markers."""
 
 import abc
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -10,10 +10,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from natcoord_jax.core.effect import Effect, Motion, Now, Response
-from natcoord_jax.core.gradient import averaged_coupling, averaged_gradient
+from natcoord_jax.core.gradient import averaged_coupling, averaged_gradient, gradient_of
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.joint import Joint
 from natcoord_jax.core.markers import Attachment, Marker
+from natcoord_jax.maths.collocation import Tableau
+from natcoord_jax.maths.settled import settled
 
 
 def place_markers(place: Float[Array, "k *m 4"], rows: Float[Array, "*s k 4 3"]) -> Float[Array, "*out"]:
@@ -38,6 +40,9 @@ class Potential(Effect):
         degree: polynomial degree of `energy` in the invariants, if it is a polynomial; saves work.
         points: of the quadrature along a step, if it is none; more make the force a better average, energy is
             exact with any number. Default: two more than twice the stages.
+        together: whether `invariants` and `energy` (and `slope` and `curvature`, if they are given) also take
+            many instances at once, whose numbers, marker vectors and invariants then have one more axis, the
+            last. That is much faster than a function of one instance that is vmapped.
 
     Example:
         >>> import natcoord_jax as nc
@@ -58,8 +63,9 @@ class Potential(Effect):
     elastic: ClassVar[bool] = True
     degree: ClassVar[int | None] = None
     points: ClassVar[int | None] = None
+    together: ClassVar[bool] = False
 
-    def attach(self, find: Callable[[Handle], tuple[Joint, Array]]) -> tuple[Marker | Attachment, ...]:
+    def attach(self, find: Callable[[Handle], tuple[Joint, Array]]) -> Sequence[Marker | Attachment]:
         """Markers of the effect; effects on a joint look it up with `find`: handle to (joint, triad)."""
         return self.markers
 
@@ -71,25 +77,47 @@ class Potential(Effect):
     def energy(self, invariants: Float[Array, " p"]) -> Float[Array, ""]:
         """Energy [J]."""
 
+    def slope(self, invariants: Float[Array, " p"]) -> Float[Array, " p"]:
+        """Gradient of the energy by the invariants."""
+        return gradient_of(self.energy, invariants)
+
     def energy_curvature(self, invariants: Float[Array, " p"]) -> Float[Array, "p p"]:
         """Second derivatives of the energy by the invariants; for Newton's Jacobian."""
         return jax.hessian(self.energy)(invariants)
+
+    def pulled_back(self, x: Float[Array, "k *m 3"], gradient: Float[Array, " p"]) -> Float[Array, "k *m 3"]:
+        """Gradient by the marker vectors from that by the invariants."""
+        return jax.vjp(self.invariants, x)[1](gradient)[0]
 
     def respond(self, place: Array, motion: Motion, now: Now, lam: Array) -> Response:
         """Forces -D pi^T S_i with the averaged gradients S_i, D pi where forces take hold."""
         start = self.invariants(place_markers(place, motion.start))
 
         def gradient(steps: Float[Array, "s p"]) -> Float[Array, "s p"]:
-            found = averaged_gradient(self.energy, start, steps, now.tableau, self.degree, self.points)
+            found = self.averaged(start, steps, now.tableau)
             return found if now.stress is None else found + now.stress
 
         return _response(self, gradient, place, motion, now)
+
+    def responses(self, place: Array, motion: Motion, now: Now, lam: Array) -> Response:
+        """Forces of all instances, at once if they can be."""
+        as_usual = motion.levers is None and now.stress is None and not now.tableau.variational
+        if not (self.together and as_usual):
+            return super().responses(place, motion, now, lam)
+        return responses_together(self, place, motion, now)
+
+    def averaged(
+        self, start: Float[Array, "p *n"], steps: Float[Array, "s p *n"], tableau: Tableau
+    ) -> Float[Array, "s p *n"]:
+        """Averaged gradients, see `averaged_gradient`."""
+        points = self.points if self.points is None else self.points + tableau.stages - 1
+        return averaged_gradient(self.energy, start, steps, tableau, self.degree, points, self.slope)
 
     def linearised(self, place: Array, motion: Motion, now: Now, lam: Array) -> "LinearisedPotential":
         """The potential with gradients that are linear in the steps of the invariants."""
         start = self.invariants(place_markers(place, motion.start))
         steps = _steps(self, place, motion, now)
-        gradient = averaged_gradient(self.energy, start, steps, now.tableau, self.degree, self.points)
+        gradient = self.averaged(start, steps, now.tableau)
         middle = start + 0.5 * jnp.asarray(now.tableau.b) @ steps
         if now.stress is not None:
             gradient = gradient + now.stress
@@ -148,7 +176,7 @@ def _response(
     x, rates = place_markers(place, motion.rows), place_markers(place, motion.rates)
     given = gradient(_steps(potential, place, motion, now))
     held = x if motion.levers is None else place_markers(place, motion.levers)
-    forces = jax.vmap(lambda xi, gi: jax.vjp(potential.invariants, xi)[1](-gi)[0])(held, given)
+    forces = -jax.vmap(potential.pulled_back)(held, given)
     return marker_response(place, forces, None, rates, motion)
 
 
@@ -170,3 +198,39 @@ def marker_response(
     if torques is not None:
         power = power + jnp.sum(torques * motion.spin, axis=(-1, -2))
     return Response(on_rows, torques, jnp.zeros((stages, 0)), power)
+
+
+def instances_last(x: Any, axis: int = 0) -> Any:
+    """Arrays of a pytree with the axis of the instances moved to the end."""
+    return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, axis, -1), x)
+
+
+def place_together(place: Float[Array, "k *m 4 n"], rows: Float[Array, "*s k 4 3 n"]) -> Float[Array, "*out"]:
+    """Marker vectors of many instances, see `place_markers`."""
+    if place.ndim == 4:
+        rows = rows[..., None, :, :, :]
+    return settled(jnp.sum(place[..., None, :] * rows, axis=-3))
+
+
+def steps_together(
+    potential: Potential, x: Float[Array, "s k *m 3 n"], moved: Float[Array, "s k *m 3 n"]
+) -> Float[Array, "s p n"]:
+    """Changes of the invariants at the stages, of many instances, for changes of the marker vectors."""
+    return jax.vmap(lambda xi, vi: jax.jvp(potential.invariants, (xi,), (vi,))[1])(x, moved)
+
+
+def responses_together(potential: Potential, place: Array, motion: Motion, now: Now) -> Response:
+    """Responses of many instances, whose axis is the last in all that is computed."""
+    potential, place, start = instances_last((potential, place, motion.start))
+    x = place_together(place, instances_last(motion.rows, 1))
+    rates = place_together(place, instances_last(motion.rates, 1))
+    steps = steps_together(potential, x, now.h * rates)
+    begun, steps = settled((potential.invariants(place_together(place, start)), steps))
+    given = settled(potential.averaged(begun, steps, now.tableau))
+    forces = -jax.vmap(potential.pulled_back)(x, given)
+    power = jnp.sum(forces * rates, axis=tuple(range(1, forces.ndim - 1)))
+    on_rows = place[..., None, :] * forces[..., None, :, :]
+    if place.ndim == 4:
+        on_rows = jnp.sum(on_rows, axis=-4)
+    nothing = jnp.zeros((power.shape[1], now.tableau.stages, 0), power.dtype)
+    return Response(jnp.moveaxis(on_rows, -1, 0), None, nothing, power.T)

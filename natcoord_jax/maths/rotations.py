@@ -3,11 +3,14 @@
 A rotation matrix R maps body components to world components: its columns are the directors d_1, d_2, d_3.
 """
 
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from natcoord_jax.maths.vectors import cross, dot, safe_divide, safe_norm, skew
+from natcoord_jax.maths.components import Triple
+from natcoord_jax.maths.vectors import dot, safe_divide, safe_norm, skew
 
 
 def from_quaternion(quaternion: Float[Array, "4"]) -> Float[Array, "3 3"]:
@@ -102,24 +105,44 @@ def angular_velocity(
     return 0.5 * jnp.sum(jnp.cross(directors, rates), axis=-2)
 
 
-def _arctan_coefficients(x: Float[Array, "*shape"]) -> tuple[Array, Array]:
-    """A = atan(sqrt x) / sqrt x and b = (1 - a) / (4 x), smooth at zero, where they are 1 and 1/12."""
-    small = x < 0.02
-    guarded = jnp.where(small, 1.0, x)
-    root = jnp.sqrt(guarded)
-    far = jnp.arctan(root) / root
-    near = jnp.where(small, x, 0.0)
-    # 4 b = 1/3 - x/5 + x^2/7 - ..., a = 1 - 4 b x; eight terms leave less than 1e-16 at the limit.
-    series = jnp.zeros_like(x)
-    for n in range(8, 0, -1):
-        series = 1 / (2 * n + 1) - near * series
-    return jnp.where(small, 1 - near * series, far), 0.25 * jnp.where(small, series, (1 - far) / guarded)
+HALVINGS = 3
+"""Of the angle, before the series: what is left is below 11.25 degrees a quarter turn."""
+
+TERMS = 12
+"""Of the series of `arctan_coefficients`: the next is below 1e-17 then."""
 
 
-def logarithm_of_motion(
-    axial: Float[Array, "3"], trace: Float[Array, ""], place: Float[Array, "3"]
-) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
-    """Logarithm of a rigid motion: rotation vector psi [rad] and T(psi)^-1 place [m].
+def arctan_coefficients(x: Float[Array, "*shape"]) -> tuple[Array, Array, Array]:
+    """f_0 = atan(t) / t, f_1 = (1 - f_0) / x and f_2 = (1/3 - f_1) / x of x = t^2.
+
+    That is f_n = sum over k of (-x)^k / (2 k + 2 n + 1), continued to all x > -1; smooth at zero, where they
+    are 1, 1/3 and 1/5, without branches and without loss of digits. With c = 2 / (1 + sqrt(1 + x)), halving
+    the angle takes x to c^2 x / 4, and all functions to positive sums of those at half the angle:
+
+        f_0 = c f_0',  f_1 = c^2 (1 + c f_1') / 4,  f_2 = c^2 (2 + c)^2 / 48 + c^5 f_2' / 16.
+
+    Their derivatives by x are ((2 n + 1) f_(n+1) - 1 / (1 + x)) / 2.
+    """
+    factors = []
+    for _ in range(HALVINGS):
+        c = 2.0 / (1.0 + jnp.sqrt(1.0 + x))
+        factors.append(c)
+        x = 0.25 * c * c * x
+    last = jnp.zeros_like(x)
+    for k in range(TERMS, -1, -1):
+        last = 1.0 / (2 * k + 5) - x * last
+    middle = 1.0 / 3.0 - x * last
+    first = 1.0 - x * middle
+    for c in reversed(factors):
+        square = 0.25 * c * c
+        last = square * ((2.0 + c) ** 2 / 12.0 + c * square * last)
+        middle = square * (1.0 + c * middle)
+        first = c * first
+    return first, middle, last
+
+
+def logarithm_of_motion(axial: Triple, trace: Any, place: Triple) -> tuple[Triple, Triple]:
+    """Logarithm of rigid motions: rotation vectors psi [rad] and T(psi)^-1 place [m].
 
     Smooth for rotations of less than half a turn, at zero too. Defined for matrices near rotations as well:
     through k = 2 tan(angle/2) n = 2 axial / (1 + trace), without square roots near zero.
@@ -129,7 +152,7 @@ def logarithm_of_motion(
         trace: of R.
         place: in the frame that R turns from.
     """
-    k = safe_divide(2.0 * axial, (1.0 + trace)[None])
-    a, b = _arctan_coefficients(0.25 * jnp.sum(k * k))
-    across = cross(k, place)
-    return a * k, place - 0.5 * a * across + b * cross(k, across)
+    k = axial * safe_divide(2.0 * jnp.ones_like(trace), 1.0 + trace)
+    a, b, _ = arctan_coefficients(0.25 * k.dot(k))
+    across = k.cross(place)
+    return k * a, place - across * (0.5 * a) + k.cross(across) * (0.25 * b)

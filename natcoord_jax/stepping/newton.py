@@ -57,6 +57,12 @@ SLOWEST_UNSEEN = 0.02
 PATIENCE = 6
 """Corrections that are cheaper than a new Jacobian."""
 
+BY_BLOCKS = 15
+"""The same where it is kept in blocks along the tree."""
+
+NEVER = 1000
+"""More corrections than a step can need."""
+
 
 @jax.custom_batching.custom_vmap
 def any_lane(x: Shaped[Array, ""]) -> Shaped[Array, ""]:
@@ -80,13 +86,15 @@ class Factors(eqx.Module):
         inertias: inertias of the unknowns, 0 for multipliers.
         usable: whether there are any.
         fresh: whether they belong to the step that is being solved.
-        extra: corrections beyond one a step that steps have needed with them.
+        least: fewest corrections that a step has needed with them.
+        extra: corrections beyond these that later steps have needed.
     """
 
     solver: Any
     inertias: Float[Array, " unknowns"]
     usable: Bool[Array, ""]
     fresh: Bool[Array, ""]
+    least: Int[Array, ""]
     extra: Int[Array, ""]
 
     def after_step(self, corrections: Int[Array, ""], usable: Bool[Array, ""], cost: int) -> "Factors":
@@ -97,9 +105,11 @@ class Factors(eqx.Module):
             usable: whether it was solved.
             cost: of new factors, in corrections.
         """
-        extra = self.extra + jnp.maximum(corrections - 1, 0)
+        # What was needed with new factors is no guide in the step that made them: it began with old ones.
+        least = jnp.where(self.fresh, self.least, jnp.minimum(self.least, corrections))
+        extra = self.extra + jnp.where(self.fresh, 0, jnp.maximum(corrections - least, 0))
         keep = usable & self.usable & (extra <= cost)
-        return Factors(self.solver, self.inertias, keep, jnp.zeros_like(self.fresh), extra)
+        return Factors(self.solver, self.inertias, keep, jnp.zeros_like(self.fresh), least, extra)
 
 
 class Iterate(eqx.Module):
@@ -160,13 +170,13 @@ def no_factors(equations: Any, form: str) -> Factors:
     y = equations.guess()
     shapes = jax.eval_shape(lambda y: FACTORISATIONS[form](equations, equations.tangent(y)), y)
     solver, inertias = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-    return Factors(solver, inertias, jnp.array(False), jnp.array(False), jnp.array(0))
+    return Factors(solver, inertias, jnp.array(False), jnp.array(False), jnp.array(NEVER), jnp.array(0))
 
 
 def factors_of(equations: Any, form: str, matrix: Any) -> Factors:
     """Factors of a Jacobian."""
     solver, inertias = FACTORISATIONS[form](equations, matrix)
-    return Factors(solver, inertias, jnp.array(True), jnp.array(True), jnp.array(0))
+    return Factors(solver, inertias, jnp.array(True), jnp.array(True), jnp.array(NEVER), jnp.array(0))
 
 
 def refreshed(it: Iterate) -> Iterate:

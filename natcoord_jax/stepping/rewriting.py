@@ -24,7 +24,7 @@ KNOWN = frozenset(
     "min mul ne neg nextafter not optimization_barrier or pad pjit platform_index pow reduce_and "
     "reduce_max reduce_min reduce_or reduce_prod reduce_sum rem reshape rev round rsqrt scan select_n "
     "shift_left shift_right_arithmetic shift_right_logical sign sin sinh slice split sqrt square "
-    "squeeze stack stop_gradient sub tan tanh tile transpose unstack while xor".split()
+    "squeeze stack stop_gradient sub tan tanh tile transpose unstack while xla_metadata_call xor".split()
 )
 """Primitives that are compiled in place, without a call into a library."""
 

@@ -26,11 +26,14 @@ from natcoord_jax.core.state import State
 from natcoord_jax.maths.rows import row, with_row
 from natcoord_jax.stepping.course import Course, Setting, after_attempt, start_of
 from natcoord_jax.stepping.error_control import Tolerance
-from natcoord_jax.stepping.newton import PATIENCE, Factors, any_lane, factors_of, judge, refreshed
+from natcoord_jax.stepping.newton import BY_BLOCKS, PATIENCE, Factors, any_lane, factors_of, judge, refreshed
 from natcoord_jax.stepping.one_kernel import as_one_kernel
 from natcoord_jax.stepping.plan import Plan, Slots
 from natcoord_jax.stepping.probe import BY_DIFFERENCES, Probe
 from natcoord_jax.stepping.step import end_of_step
+
+RENEWALS = {"recursive": BY_BLOCKS}
+"""Corrections that are cheaper than a new Jacobian, where they are not `PATIENCE`."""
 
 ATTEMPTS = 2
 """Slots for every accepted substep with error control: one and a half, and some that are rejected."""
@@ -68,7 +71,7 @@ def _trip(setting: Setting, unpack: Callable[[Array], State], carried: Carried) 
     found = equations.evaluate(it.y if probe is None else probe.moved(it.y, equations))
     probing = jnp.array(False) if probe is None else probe.at >= 0
     driven = any(group.multipliers and group.effect.works for group in equations.groups)
-    cost = PATIENCE if probe is None else max(PATIENCE, it.y.shape[0] // 2)
+    cost = RENEWALS.get(setting.form, PATIENCE) if probe is None else max(PATIENCE, it.y.shape[0] // 2)
     options = {"balances": driven, "patience": cost}
     judged = judge(factors, plan.tolerance, it, found.residual, found.size, **options)
     it = jax.tree.map(partial(jnp.where, probing), it, judged)
@@ -101,15 +104,16 @@ def _trip(setting: Setting, unpack: Callable[[Array], State], carried: Carried) 
     _, after, x, outset, record = jax.lax.while_loop(lambda carry: carry[0], ended, start)
     # An attempt for comparison leaves the run where it is, and factors that serve.
     solved = after.taken > course.taken if setting.tolerance is None else it.converged
-    kept = factors.after_step(it.total, solved | over, 2 * cost)
+    kept = factors.after_step(it.total, solved | over, cost)
     factors = eqx.tree_at(
-        lambda f: (f.usable, f.fresh, f.extra),
+        lambda f: (f.usable, f.fresh, f.least, f.extra),
         factors,
         tuple(
             jnp.where(ending, a, b)
             for a, b in (
                 (kept.usable, factors.usable),
                 (kept.fresh, factors.fresh),
+                (kept.least, factors.least),
                 (kept.extra, factors.extra),
             )
         ),

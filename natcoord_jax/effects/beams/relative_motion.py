@@ -14,36 +14,61 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from natcoord_jax.core.effect import Motion, Now
 from natcoord_jax.core.force import Force, Load
-from natcoord_jax.core.potential import Potential, place_markers
+from natcoord_jax.core.potential import place_markers
+from natcoord_jax.effects.beams.logarithm import Logarithm
+from natcoord_jax.effects.beams.pairs import Expanded, tangents_of_pairs
 from natcoord_jax.effects.beams.readings import BeamReadings
+from natcoord_jax.maths.components import Triple, combination, rows_of
 from natcoord_jax.maths.rotations import logarithm_of_motion
+from natcoord_jax.maths.settled import settled
+
+Frame = tuple[Triple, tuple[Triple, Triple, Triple]]
+"""A point and three directors."""
 
 
-def relative_motion(x: Float[Array, "2 4 3"]) -> Float[Array, "7"]:
+def frame_of(x: Float[Array, "4 3 *n"]) -> Frame:
+    """Point and directors from an array."""
+    return Triple.of(x[0]), (Triple.of(x[1]), Triple.of(x[2]), Triple.of(x[3]))
+
+
+def relative_motion(x: Float[Array, "2 4 3 *n"]) -> Float[Array, "7 *n"]:
     """Relative rotation and place of two frames.
 
     Of R_ij = d_i^A . d_j^B the axial part 2 sin(angle) n and the trace, and s_i = d_i^A . (x^B - x^A) [m].
     """
-    first, second = x[0], x[1]
-    turned = jnp.sum(first[1:, None] * second[None, 1:], axis=-1)
-    axial = jnp.stack([turned[2, 1] - turned[1, 2], turned[0, 2] - turned[2, 0], turned[1, 0] - turned[0, 1]])
-    trace = turned[0, 0] + turned[1, 1] + turned[2, 2]
-    place = jnp.sum(first[1:] * (second[0] - first[0]), axis=-1)
-    return jnp.concatenate([axial, trace[None], place])
+    (start, (a1, a2, a3)), (end, (b1, b2, b3)) = frame_of(x[0]), frame_of(x[1])
+    apart = end - start
+    axial = Triple(a3.dot(b2) - a2.dot(b3), a1.dot(b3) - a3.dot(b1), a2.dot(b1) - a1.dot(b2))
+    trace = a1.dot(b1) + a2.dot(b2) + a3.dot(b3)
+    return rows_of(axial, trace, a1.dot(apart), a2.dot(apart), a3.dot(apart))
 
 
-def strains_of(invariants: Float[Array, "7"], length: Float[Array, ""]) -> Float[Array, "6"]:
+def pulled_back(x: Float[Array, "2 4 3 *n"], gradient: Float[Array, "7 *n"]) -> Float[Array, "2 4 3 *n"]:
+    """Gradient by points and directors from that by `relative_motion`."""
+    (start, first), (end, second) = frame_of(x[0]), frame_of(x[1])
+    (w1, w2, w3), trace, by_place = gradient[:3], gradient[3], gradient[4:]
+    apart, force = end - start, combination(list(by_place), first)
+    # Gradient by R_ij: the trace on the diagonal, else the axial part.
+    by_turned = ((trace, -w3, w2), (w3, trace, -w1), (-w2, w1, trace))
+    on_first = [combination((*row, s), (*second, apart)) for row, s in zip(by_turned, by_place)]
+    on_second = [combination(column, first) for column in zip(*by_turned)]
+    return rows_of(-force, *on_first, force, *on_second).reshape(x.shape)
+
+
+def strains_of(invariants: Float[Array, "7 *n"], length: Float[Array, "*n"]) -> Float[Array, "6 *n"]:
     """Stretch and shear (1 + strain along d_3) [-] and curvature [1/m] from the relative motion.
 
     From the helicoidal interpolation of Sonneville, Cardona & Bruls, Geometrically exact beam finite element
     formulated on the special Euclidean group SE(3) (2014), written in invariants.
     """
-    turn, shift = logarithm_of_motion(invariants[:3], invariants[3], invariants[4:])
-    return jnp.concatenate([shift, turn]) / length
+    axial, trace, place = Triple.of(invariants[:3]), invariants[3], Triple.of(invariants[4:])
+    turn, shift = logarithm_of_motion(axial, trace, place)
+    return rows_of(shift, turn) / length
 
 
-class BeamElement(Potential):
+class BeamElement(Expanded):
     """Linearly elastic beam between two frames: energy l e . C e / 2 of the strains e = (Gamma, K).
 
     Attributes:
@@ -68,10 +93,16 @@ class BeamElement(Potential):
     kind: ClassVar[str] = "beam element"
     couples: ClassVar[bool] = True
     silent: ClassVar[bool] = False
+    together: ClassVar[bool] = True
+    points: ClassVar[int | None] = 2
 
     def invariants(self, x: Array) -> Array:
         """Relative rotation [-] and place [m] of the second frame in the first."""
         return relative_motion(x)
+
+    def pulled_back(self, x: Array, gradient: Array) -> Array:
+        """Gradient by points and directors from that by the invariants."""
+        return pulled_back(x, gradient)
 
     def readings(self, place: Array, rows: Array) -> BeamReadings:
         """Strains and section forces."""
@@ -79,18 +110,53 @@ class BeamElement(Potential):
         strains = self.strains(invariants)
         return BeamReadings(strains, self.resultants(strains), self.energy(invariants))
 
-    def strains(self, invariants: Float[Array, "7"]) -> Float[Array, "6"]:
+    def strains(self, invariants: Float[Array, "7 *n"]) -> Float[Array, "6 *n"]:
         """Strains Gamma [-] and K [1/m], zero in the unstressed shape."""
         return strains_of(invariants, self.length) - self.reference
 
-    def resultants(self, strains: Float[Array, "6"]) -> Float[Array, "6"]:
+    def resultants(self, strains: Float[Array, "6 *n"]) -> Float[Array, "6 *n"]:
         """Section forces [N] and moments [N m] about the axes of the section."""
-        return jnp.sum(self.stiffness * strains, axis=-1)
+        return self._linear(strains)
+
+    def _linear(self, strains: Float[Array, "6 *n"]) -> Float[Array, "6 *n"]:
+        return jnp.sum(self.stiffness * strains, axis=1)
 
     def energy(self, invariants: Array) -> Array:
         """Strain energy [J]."""
         strains = self.strains(invariants)
-        return 0.5 * self.length * jnp.sum(strains * self.resultants(strains))
+        return 0.5 * self.length * jnp.sum(strains * self._linear(strains), axis=0)
+
+    def moduli(self, strains: Float[Array, "6 *n"]) -> Float[Array, "6 6 *n"]:
+        """Derivatives of the resultants by the strains [N, N m, N m^2]."""
+        return jnp.broadcast_to(self.stiffness, (6, *strains.shape))
+
+    def slope(self, invariants: Float[Array, "7 *n"]) -> Float[Array, "7 *n"]:
+        """Gradient of the energy by the invariants."""
+        motion = Logarithm.of(invariants)
+        return settled(motion.gradient(self._resultants_at(motion)))
+
+    def energy_curvature(self, invariants: Float[Array, "7 *n"]) -> Float[Array, "7 7 *n"]:
+        """Second derivatives of the energy by the invariants."""
+        return self.expansion(invariants)[1]
+
+    def expansion(self, invariants: Float[Array, "7 *n"]) -> tuple[Array, Array]:
+        """Gradient and second derivatives of the energy by the invariants."""
+        motion = Logarithm.of(invariants)
+        resultants = self._resultants_at(motion)
+        moduli = self.moduli(self._strains_at(motion)) / self.length
+        return motion.gradient(resultants), motion.hessian(resultants, moduli)
+
+    def _strains_at(self, motion: Logarithm) -> Float[Array, "6 *n"]:
+        return rows_of(motion.shift, motion.turn) / self.length - self.reference
+
+    def _resultants_at(self, motion: Logarithm) -> Float[Array, "6 *n"]:
+        return settled(self.resultants(settled(self._strains_at(motion))))
+
+    def tangents(self, place: Array, motion: Motion, now: Now, lam: Array) -> Array | None:
+        """Derivatives of the wrenches by the twists for one stage; more are left to the general way."""
+        if now.tableau.stages > 1:
+            return None
+        return tangents_of_pairs(self, place, motion, now)
 
 
 class NonlinearBeamElement(BeamElement):
@@ -108,13 +174,24 @@ class NonlinearBeamElement(BeamElement):
 
     kind: ClassVar[str] = "nonlinear beam element"
 
-    def resultants(self, strains: Float[Array, "6"]) -> Float[Array, "6"]:
+    def resultants(self, strains: Float[Array, "6 *n"]) -> Float[Array, "6 *n"]:
         """Section forces [N] and moments [N m]: gradient of the energy per length."""
-        return super().resultants(strains) + jax.grad(self.law)(strains)
+        return super().resultants(strains) + _of_each(jax.grad(self.law), "(i)->(i)", strains)
+
+    def moduli(self, strains: Float[Array, "6 *n"]) -> Float[Array, "6 6 *n"]:
+        """Derivatives of the resultants by the strains [N, N m, N m^2]."""
+        return super().moduli(strains) + _of_each(jax.hessian(self.law), "(i)->(i,j)", strains)
 
     def energy(self, invariants: Array) -> Array:
         """Strain energy [J]."""
-        return super().energy(invariants) + self.length * self.law(self.strains(invariants))
+        more = _of_each(self.law, "(i)->()", self.strains(invariants))
+        return super().energy(invariants) + self.length * more
+
+
+def _of_each(function: Callable[[Array], Array], signature: str, strains: Array) -> Array:
+    """A function of the strains of one element, of one or of many at once (last axis)."""
+    found = jnp.vectorize(function, signature=signature)(jnp.moveaxis(strains, 0, -1))
+    return jnp.moveaxis(found, range(strains.ndim - 1), range(1 - strains.ndim, 0))
 
 
 class BeamDamping(Force):
