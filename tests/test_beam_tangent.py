@@ -66,7 +66,7 @@ def test_gradient_and_curvature_are_derivatives_of_the_energy(law):
     invariants = np.random.default_rng(0).normal(size=(ELEMENTS, 7)) * 0.3 + [0, 0, 0, 2.5, 0, 0, 0.9]
     last = jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), effect)
     together = jnp.asarray(invariants.T)
-    slope, curvature = last.slope(together), last.curvature(together)
+    slope, curvature = last.slope(together), last.energy_curvature(together)
     energies = last.energy(together)
     assert jnp.max(jnp.abs(slope - gradient_of(last.energy, together))) <= tol.IDENTITY * jnp.max(
         jnp.abs(slope)
@@ -75,7 +75,7 @@ def test_gradient_and_curvature_are_derivatives_of_the_energy(law):
         alone = jax.tree.map(lambda leaf, i=i: leaf[i], effect)
         exact = jax.hessian(alone.energy)(jnp.asarray(x))
         assert jnp.abs(alone.energy(jnp.asarray(x)) - energies[i]) <= tol.IDENTITY * jnp.abs(energies[i])
-        for found in (alone.curvature(jnp.asarray(x)), curvature[..., i]):
+        for found in (alone.energy_curvature(jnp.asarray(x)), curvature[..., i]):
             assert jnp.max(jnp.abs(found - exact)) <= tol.IDENTITY * jnp.max(jnp.abs(exact))
 
 
@@ -100,7 +100,7 @@ class Alone(nc.BeamElement):
 
     together = False
     slope = Potential.slope
-    curvature = Potential.curvature
+    energy_curvature = Potential.energy_curvature
     pulled_back = Potential.pulled_back
     tangents = Effect.tangents
 
