@@ -4,6 +4,7 @@ The CPU compiler merges chains of elementwise operations into the loops of all t
 them share is then computed again for each, and the program grows accordingly.
 """
 
+from collections.abc import Callable
 from typing import TypeVar
 
 import jax
@@ -24,5 +25,5 @@ def settled(x: T) -> T:
     if _attributed is None or jax.default_backend() != "cpu":
         return x
     leaves, structure = jax.tree.flatten(x)
-    call = _attributed(lambda *leaves: leaves, inlineable="false")
+    call: Callable = _attributed(lambda *leaves: leaves, inlineable="false")  # pyright: ignore[reportAssignmentType]
     return jax.tree.unflatten(structure, call(*leaves))

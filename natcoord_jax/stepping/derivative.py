@@ -26,7 +26,7 @@ from natcoord_jax.core.state import State
 from natcoord_jax.stepping import linear_pair
 from natcoord_jax.stepping.correcting import Correcting
 from natcoord_jax.stepping.error_control import Tolerance
-from natcoord_jax.stepping.newton import PATIENCE, Factors, any_lane, factors_of
+from natcoord_jax.stepping.newton import PATIENCE, RENEWALS, Factors, any_lane, factors_of
 from natcoord_jax.stepping.one_kernel import as_one_kernel, in_groups
 from natcoord_jax.stepping.past import Past
 from natcoord_jax.stepping.plan import Plan, Slots
@@ -239,9 +239,11 @@ class Rule:
             _, factors, at = jax.lax.while_loop(lambda c: c[0], refresh, (any_lane(at.wanting), factors, at))
             *bars, gap = pull((lam, end_bar))
             change = factors.solver.transpose().solve(gap + y_bar)
-            at = at.judged(factors, lam, change, PATIENCE)
+            at = at.judged(factors, lam, change, patience)
             return jnp.where(at.moving, lam - change, lam), tuple(bars), factors, at
 
+        form = numbers.whole(numbers.varied)[0].structure.solver
+        patience = RENEWALS.get(form, PATIENCE)
         lam = jnp.where(jnp.all(jnp.isfinite(guess)), guess, 0.0)
         nothing = jax.tree.map(jnp.zeros_like, (numbers.varied, slot.before, slot.u))
         at = Correcting.first(slot.accepted, lam.dtype)

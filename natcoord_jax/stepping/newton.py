@@ -57,8 +57,8 @@ SLOWEST_UNSEEN = 0.02
 PATIENCE = 6
 """Corrections that are cheaper than a new Jacobian."""
 
-BY_BLOCKS = 15
-"""The same where it is kept in blocks along the tree."""
+RENEWALS = {"recursive": 15}
+"""The same by form of the equations, where it differs: a tree is seldom small, and cheap to evaluate."""
 
 NEVER = 1000
 """More corrections than a step can need."""

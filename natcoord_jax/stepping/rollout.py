@@ -26,14 +26,11 @@ from natcoord_jax.core.state import State
 from natcoord_jax.maths.rows import row, with_row
 from natcoord_jax.stepping.course import Course, Setting, after_attempt, start_of
 from natcoord_jax.stepping.error_control import Tolerance
-from natcoord_jax.stepping.newton import BY_BLOCKS, PATIENCE, Factors, any_lane, factors_of, judge, refreshed
+from natcoord_jax.stepping.newton import PATIENCE, RENEWALS, Factors, any_lane, factors_of, judge, refreshed
 from natcoord_jax.stepping.one_kernel import as_one_kernel
 from natcoord_jax.stepping.plan import Plan, Slots
 from natcoord_jax.stepping.probe import BY_DIFFERENCES, Probe
 from natcoord_jax.stepping.step import end_of_step
-
-RENEWALS = {"recursive": BY_BLOCKS}
-"""Corrections that are cheaper than a new Jacobian, where they are not `PATIENCE`."""
 
 ATTEMPTS = 2
 """Slots for every accepted substep with error control: one and a half, and some that are rejected."""

@@ -112,10 +112,12 @@ def tangents_of_pairs(
     like = jnp.zeros_like(spin[0, 0])
     given = drift, (Triple.of(spin[0]), Triple.of(spin[1]))
 
+    def wrenches(drift: Triple, spins: tuple[Triple, Triple]) -> Float[Array, "9 n"]:
+        return pair.wrenches(drift, spins, gradient)
+
     def along(unit: Float[Array, "9"]) -> Float[Array, "9 n"]:
-        moved = (Triple.of(unit[k : k + 3, None] + like) for k in (0, 3, 6))
-        drift, *spins = moved
-        return jax.jvp(lambda *x: pair.wrenches(*x, gradient), given, (drift, tuple(spins)))[1]
+        drift, first, second = (Triple.of(unit[k : k + 3, None] + like) for k in (0, 3, 6))
+        return jax.jvp(wrenches, given, (drift, (first, second)))[1]
 
     # One program for all nine columns, though a velocity turns nothing: three times the size would compile
     # for longer than it saves.
