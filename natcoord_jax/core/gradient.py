@@ -16,9 +16,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.maths.collocation import Tableau, invariant_quadrature
+from natcoord_jax.maths.vectors import safe_divide
 
 LEAST = 1e-12
-"""Relative change of the invariants below which nothing can be missing but round-off."""
+"""Work of the changes of the gradient, relative to what is missing, below which they cannot make up for it."""
 
 
 def averaged_gradient(
@@ -53,7 +54,8 @@ def averaged_gradient(
         points = 2 + 2 * tableau.stages
     integrals, averages = invariant_quadrature(tableau.stages, points)
     path = start + _mixed(integrals, steps)
-    gradient = _mixed(averages, jax.vmap(slope or partial(gradient_of, energy))(path))
+    slopes = jax.vmap(slope or partial(gradient_of, energy))(path)
+    gradient = _mixed(averages, slopes)
     if degree is not None:
         return gradient
     weights = np.reshape(tableau.b, (-1, *(1,) * start.ndim))
@@ -61,16 +63,17 @@ def averaged_gradient(
     before, after = energy(start), energy(start + increment)
     captured = jnp.sum(weights * gradient * steps, axis=(0, 1))
     missing = (after - before) - captured
-    scale = jnp.abs(start) + jnp.abs(increment)
-    scale = jnp.where(scale > 0, scale, 1.0)
-    measure = jnp.sum(weights * (steps / scale) ** 2, axis=(0, 1))
+    # In proportion to what each gradient changes by: what is soft stays soft, and hardly moved, unmoved.
+    moved = jnp.max(jnp.abs(steps), axis=0)
+    stiffness = safe_divide(jnp.max(slopes, axis=0) - jnp.min(slopes, axis=0), moved)
+    measure = jnp.sum(weights * stiffness * steps**2, axis=(0, 1))
     # Near its minimum an energy is less certain than its digits say: invariants are rounded before it.
-    rounded = jnp.max(jnp.sum(jnp.abs(gradient) * scale, axis=1), axis=0)
+    rounded = jnp.max(jnp.sum(jnp.abs(gradient) * (jnp.abs(start) + jnp.abs(increment)), axis=1), axis=0)
     sizes = jnp.abs(before) + jnp.abs(after) + jnp.abs(captured) + rounded
     noise = 16 * jnp.finfo(start.dtype).eps * sizes
-    relevant = (jnp.abs(missing) > noise) & (measure > LEAST**2)
+    relevant = (jnp.abs(missing) > noise) & (measure > LEAST * jnp.abs(missing))
     factor = jnp.where(relevant, missing / jnp.where(relevant, measure, 1.0), 0.0)
-    return gradient + factor * steps / scale**2
+    return gradient + factor * stiffness * steps
 
 
 def gradient_of(
