@@ -204,7 +204,8 @@ STEEL = {"radius": 0.01, "E": 2e11, "density": 7800.0}
 ROOTS = {True: (1.87510407, 4.69409113), False: (4.73004074, 7.85320462)}
 
 
-@pytest.mark.parametrize("clamped", [True, pytest.param(False, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("clamped", [True, False])
 def test_frequencies(clamped):
     """Of a slender cantilever and of a free beam, by Richardson's formula, against Euler-Bernoulli's roots.
 

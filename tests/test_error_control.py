@@ -78,6 +78,7 @@ def turned(angle, rtol=1e-4, **options):
     return nc.simulate(system, start, dt=DT, steps=5, rtol=rtol, throw=False, **options)
 
 
+@pytest.mark.slow
 def test_derivatives_follow_the_accepted_substeps():
     """As those of the same substeps made one by one, of lengths that do not depend on anything."""
     system, state = pendulum()

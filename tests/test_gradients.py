@@ -185,6 +185,7 @@ def second(mode: str):
     return jax.jit(SECOND[mode](small_loss))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", SECOND)
 def test_second_derivatives_against_differences(mode):
     p, d = few(), small_direction()
@@ -204,6 +205,7 @@ def test_second_derivatives_of_the_large_problem():
     assert_v_shaped(lambda x: tangent(x, d), p, d, found)
 
 
+@pytest.mark.slow
 def test_reverse_over_reverse_is_exact_or_refused():
     """Never silently wrong."""
     p, d = few(), small_direction()
@@ -243,7 +245,7 @@ def test_batches(mode):
 # --- a spring at rest -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("law", ["linear", "nonlinear"])
+@pytest.mark.parametrize("law", ["linear", pytest.param("nonlinear", marks=pytest.mark.slow)])
 def test_second_derivative_starting_at_rest(law):
     """At rest the increment of the invariant is zero: a quotient by it would lose the second derivative."""
 
@@ -319,6 +321,7 @@ def test_free_flight_is_exact():
     assert twice == pytest.approx(force * t**2 / mass**3, rel=tol.EXACT_GRADIENT)
 
 
+@pytest.mark.slow
 def test_torque_on_a_rotor_is_exact():
     """Angular momentum is the sum of the impulses: its derivative by each of them is the step."""
     scene = nc.Scene()

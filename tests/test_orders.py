@@ -124,6 +124,7 @@ def fourth_order_difference(f):
     return (8 * (values[2] - values[1]) - (values[3] - values[0])) / (12 * STEP)
 
 
+@pytest.mark.slow
 def test_gradient_against_differences():
     slope = float(jax.jit(jax.grad(loss))(AT))
     assert slope == pytest.approx(fourth_order_difference(jax.jit(loss)), rel=tol.DIFFERENCE_BEST)

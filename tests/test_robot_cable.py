@@ -45,6 +45,7 @@ def test_links_are_bodies_with_the_inertia_of_their_size():
     assert 10.0 < sum(mass for _, mass, *_ in LINKS) < 16.0
 
 
+@pytest.mark.slow
 def test_the_cable_hangs_at_rest_between_holder_and_clamp(short):
     parts, _ = short
     system, state = parts.approach, parts.state
@@ -59,6 +60,7 @@ def test_the_cable_hangs_at_rest_between_holder_and_clamp(short):
     np.testing.assert_allclose(system.sense(run, parts.cable.at(0.5)).position[-1], middle, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_gripper_closes_where_the_plug_is(short):
     parts, run = short
     (approach, before), (gripped, after) = run.pairs
@@ -79,6 +81,7 @@ def test_the_gripper_closes_where_the_plug_is(short):
     assert np.linalg.norm(gripped.sense(after, "plug").position[-1] - plug[-1]) > 1e-4
 
 
+@pytest.mark.slow
 def test_balances_and_pictures(short):
     parts, run = short
     for system, trajectory in run.pairs:
@@ -98,6 +101,7 @@ def test_balances_and_pictures(short):
     assert curves[0].lines[0].get_xdata().shape == (112,)
 
 
+@pytest.mark.slow
 def test_a_jerky_grip_loses_energy(short):
     """The gripper meets the plug in motion: what is lost is what momenta cannot keep."""
     parts, run = short

@@ -80,7 +80,8 @@ def test_order_of_positions_and_velocities(scheme):
 
 
 @BOTH
-@pytest.mark.parametrize("name", [pytest.param("four_bar", marks=pytest.mark.slow), "bricard"])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["four_bar", "bricard"])
 def test_loops_and_redundant_constraints(scheme, name):
     example = gallery.load(name)
     trajectory = nc.simulate(example.system, example.state, dt=0.01, steps=100, scheme=scheme)
@@ -115,6 +116,7 @@ def driven():
     return scene.compile(assemble=True)
 
 
+@pytest.mark.slow
 @BOTH
 def test_work_of_drives_inputs_and_dampers(scheme):
     """The balance closes: exactly, or by the square of the step in a scheme whose energy is not exact."""
@@ -181,7 +183,8 @@ def form(system, one, other):
     return pairing(one.q, other.v) - pairing(other.q, one.v) + rotor
 
 
-@pytest.mark.parametrize("bodies", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("bodies", [1, 2])
 @pytest.mark.parametrize(("scheme", "symplectic"), [(VARIATIONAL, True), (nc.EnergyMomentum(), False)])
 def test_the_canonical_form(scheme, symplectic, bodies):
     """On all pairs of variations of minimal coordinates and their rates, over one large step."""

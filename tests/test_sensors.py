@@ -210,6 +210,7 @@ def test_hanging_chain_carries_its_weight():
     np.testing.assert_allclose(system.sense(state, backwards).torque, (0, 3 * 10 * 0.2, 0), atol=1e-12)
 
 
+@pytest.mark.slow
 def test_equations_agree_with_those_of_bodies_and_multipliers():
     system, state = menagerie()
     state = nc.random_state(system, state, jax.random.key(3))
@@ -252,6 +253,7 @@ def test_door_on_two_hinges_shares_its_weight():
     close(wrenches_on_bodies(system, state, system.instant(state)), (0, 0, 40, 0, -20 + 20, 0), 1e-9)
 
 
+@pytest.mark.slow
 def test_redundant_loop_has_finite_reactions():
     system, state = loop()
     state = nc.simulate(system, state, dt=0.01, steps=20).states
@@ -397,6 +399,7 @@ def test_reactions_differentiate_and_batch():
     np.testing.assert_allclose(batch.force[:, 0], [force(rate, 1.0) for rate in rates], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_gradient_of_a_redundant_loop_is_finite():
     system, state = loop()
 

@@ -129,6 +129,7 @@ def test_the_motion_goes_on_and_opening_loses_nothing(moved):
     np.testing.assert_array_equal(state.v, end.v)
 
 
+@pytest.mark.slow
 def test_rotors_take_part_in_the_impact():
     system, state = bodies(rotor=True)
     before = last_of(nc.simulate(system, state, dt=0.01, steps=40))

@@ -63,10 +63,10 @@ class _Path(eqx.Module):
         value, by_load = jax.jvp(lambda t: residual(t, y), (state.t,), (jnp.ones_like(state.t),))
         return -inverse @ value, -inverse @ by_load
 
-    def tangent(self, state: State, lam: Array, before: tuple[Array, Array]) -> tuple[Array, Array]:
+    def tangent(self, by_load: Array, before: tuple[Array, Array]) -> tuple[Array, Array]:
         """Direction of the path, of length one, with which `before` has a positive product."""
         count = 6 * len(self.system.structure.bodies)
-        rate = self.linear(state, lam)[1][:count], jnp.ones(())
+        rate = by_load[:count], jnp.ones(())
         length = jnp.sqrt(self.product(rate, rate))
         sign = jnp.where(self.product(rate, before) < 0, -1.0, 1.0) / length
         return sign * rate[0], sign * rate[1]
@@ -97,22 +97,30 @@ class _Path(eqx.Module):
             part = 0.5 * carry[1]
             return self.step(state, lam, before, part * arc), part
 
-        whole = self.step(state, lam, before, arc), jnp.ones(())
-        return jax.lax.while_loop(lambda c: ~c[0].done & (c[1] > SHORTEST), shorter, whole)[0]
+        # The whole arc first, in the same loop: a second copy of the step would compile for as long again.
+        nothing = _point(state, lam, before)
+        return jax.lax.while_loop(
+            lambda c: ~c[0].done & (c[1] > SHORTEST), shorter, (nothing, 2 * jnp.ones(()))
+        )[0]
 
     def step(self, state: State, lam: Array, before: tuple[Array, Array], arc: Array) -> _Point:
         """The point one arc further."""
-        direction = self.tangent(state, lam, before)
         static = Static(self.system, state, self.inputs(state.t))
         rate = self.linear(state, lam)[1]
+        direction = self.tangent(rate, before)
         change = arc * direction[1] * rate
         ahead = static.moved_along_tree(change)
         ahead = replace_fields(ahead, t=ahead.t + arc * direction[1])
         lam = lam + change[direction[0].shape[0] :]
-        start = _Point(ahead, lam, direction, jnp.zeros(()), jnp.array(0), jnp.array(False), jnp.array(True))
+        start = _point(ahead, lam, direction)
         return jax.lax.while_loop(
             lambda p: ~p.done & p.finite & (p.count < ITERATIONS), lambda p: self.corrected(p), start
         )
+
+
+def _point(state: State, lam: Array, direction: tuple[Array, Array]) -> _Point:
+    """A point that has not been corrected yet."""
+    return _Point(state, lam, direction, jnp.zeros(()), jnp.array(0), jnp.array(False), jnp.array(True))
 
 
 SHORTEST = 1 / 64
@@ -159,7 +167,7 @@ def load_path(
         >>> import natcoord_jax as nc
         >>> scene = nc.Scene()
         >>> section = nc.Section.of_numbers(EA=1e4, GA=1e4, EI=2.0, GJ=1.0, density=1.0, rotary=0.1)
-        >>> beam = scene.add(nc.Beam(section, [(0, 0, 0), (1, 0, 0)], elements=4, start=nc.ground))
+        >>> beam = scene.add(nc.Beam(section, [(0, 0, 0), (1, 0, 0)], elements=2, start=nc.ground))
         >>> tip = nc.Point(beam.end, (1, 0, 0))
         >>> load = scene.add(nc.PointForce((tip,), force=lambda t: jax.numpy.array([0.0, 0.0, 1.0]) * t))
         >>> system, state = scene.compile()

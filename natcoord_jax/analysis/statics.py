@@ -191,8 +191,8 @@ def equilibrium(
         >>> load = scene.add(nc.PointForce((tip,), force=lambda t: jax.numpy.array([0.0, 0.0, 0.01]) * t))
         >>> system, state = scene.compile()
         >>> found = nc.equilibrium(system, state)
-        >>> float(system.sense(found.state, beam.end).position[2].round(5))
-        0.00167
+        >>> round(float(system.sense(found.state, beam.end).position[2]), 5)  # 0.00167 with many elements
+        0.00164
     """
     values = jnp.asarray(loads, float)
     if values.ndim == 0:

@@ -66,11 +66,11 @@ class Now(eqx.Module):
 
     t: Float[Array, ""]
     h: Float[Array, ""]
-    inputs: Float[Array, "*n inputs"] | Float[Array, "*n s inputs"]
+    inputs: Float[Array, "*_ inputs"]  # with or without an axis of stages before the last
     coordinates: Float[Array, "*n c"]
     rates: Float[Array, "*n r"]
     tableau: Tableau = eqx.field(static=True)
-    stress: Float[Array, "s p"] | None = None
+    stress: Float[Array, "*n s p"] | None = None
 
     @property
     def times(self) -> Float[Array, " s"]:

@@ -3,8 +3,9 @@
 For V(q) = E(pi(q)) with invariants pi at most quadratic, the invariants move along the polynomial that
 the stages give them, and the force is that of the gradient averaged along it. For one stage the average
 runs along the straight line pi_0 + tau (pi_1 - pi_0). Where the quadrature is exact, so is the energy
-balance; what remains for other energies is removed along the increment, as in Gonzalez' quotient, and
-only while it exceeds round-off: there is no quotient near rest, hence no wrong second derivative.
+balance; what remains for other energies is removed along the increment, as in Gonzalez' quotient but in
+proportion to what each component of the gradient changes by, and only while it exceeds round-off: there is
+no quotient near rest, hence no wrong second derivative.
 """
 
 from collections.abc import Callable
@@ -19,7 +20,7 @@ from natcoord_jax.maths.collocation import Tableau, invariant_quadrature
 from natcoord_jax.maths.vectors import safe_divide
 
 LEAST = 1e-12
-"""Work of the changes of the gradient, relative to what is missing, below which they cannot make up for it."""
+"""Relative change of the invariants below which nothing can be missing but round-off."""
 
 
 def averaged_gradient(
@@ -66,14 +67,18 @@ def averaged_gradient(
     # In proportion to what each gradient changes by: what is soft stays soft, and hardly moved, unmoved.
     moved = jnp.max(jnp.abs(steps), axis=0)
     stiffness = safe_divide(jnp.max(slopes, axis=0) - jnp.min(slopes, axis=0), moved)
-    measure = jnp.sum(weights * stiffness * steps**2, axis=(0, 1))
+    enough = jnp.sum(weights * stiffness * steps**2, axis=(0, 1)) > jnp.abs(missing)
+    # A kink can hide between the points: then in proportion to the steps, in units of the invariants.
+    scale = jnp.abs(start) + jnp.abs(increment)
+    share = jnp.where(enough, stiffness, safe_divide(jnp.ones_like(scale), scale**2))
+    measure = jnp.sum(weights * share * steps**2, axis=(0, 1))
     # Near its minimum an energy is less certain than its digits say: invariants are rounded before it.
-    rounded = jnp.max(jnp.sum(jnp.abs(gradient) * (jnp.abs(start) + jnp.abs(increment)), axis=1), axis=0)
+    rounded = jnp.max(jnp.sum(jnp.abs(gradient) * scale, axis=1), axis=0)
     sizes = jnp.abs(before) + jnp.abs(after) + jnp.abs(captured) + rounded
     noise = 16 * jnp.finfo(start.dtype).eps * sizes
-    relevant = (jnp.abs(missing) > noise) & (measure > LEAST * jnp.abs(missing))
+    relevant = (jnp.abs(missing) > noise) & (enough | (measure > LEAST**2))
     factor = jnp.where(relevant, missing / jnp.where(relevant, measure, 1.0), 0.0)
-    return gradient + factor * stiffness * steps
+    return gradient + factor * share * steps
 
 
 def gradient_of(
