@@ -70,13 +70,15 @@ def averaged_gradient(
     enough = jnp.sum(weights * stiffness * steps**2, axis=(0, 1)) > jnp.abs(missing)
     # A kink can hide between the points: then in proportion to the steps, in units of the invariants.
     scale = jnp.abs(start) + jnp.abs(increment)
-    share = jnp.where(enough, stiffness, safe_divide(jnp.ones_like(scale), scale**2))
+    units = safe_divide(jnp.ones_like(scale), scale**2)
+    change = jnp.sum(weights * units * steps**2, axis=(0, 1))
+    share = jnp.where(enough, stiffness, units)
     measure = jnp.sum(weights * share * steps**2, axis=(0, 1))
     # Near its minimum an energy is less certain than its digits say: invariants are rounded before it.
     rounded = jnp.max(jnp.sum(jnp.abs(gradient) * scale, axis=1), axis=0)
     sizes = jnp.abs(before) + jnp.abs(after) + jnp.abs(captured) + rounded
     noise = 16 * jnp.finfo(start.dtype).eps * sizes
-    relevant = (jnp.abs(missing) > noise) & (enough | (measure > LEAST**2))
+    relevant = (jnp.abs(missing) > noise) & (change > LEAST**2)
     factor = jnp.where(relevant, missing / jnp.where(relevant, measure, 1.0), 0.0)
     return gradient + factor * share * steps
 

@@ -108,7 +108,8 @@ class Factors(eqx.Module):
         # What was needed with new factors is no guide in the step that made them: it began with old ones.
         least = jnp.where(self.fresh, self.least, jnp.minimum(self.least, corrections))
         extra = self.extra + jnp.where(self.fresh, 0, jnp.maximum(corrections - least, 0))
-        keep = usable & self.usable & (extra <= cost)
+        # Factors of a step that was hard to solve are of no use to others.
+        keep = usable & self.usable & (extra <= cost) & (corrections <= 2 * cost)
         return Factors(self.solver, self.inertias, keep, jnp.zeros_like(self.fresh), least, extra)
 
 
