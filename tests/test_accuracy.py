@@ -56,6 +56,7 @@ def test_figure(tmp_path):
     assert (tmp_path / "figure.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_other_quantities():
     example = gallery.load("pendulum")
     found = nc.accuracy(

@@ -19,6 +19,7 @@ MODULES = sorted(
 )
 
 
+@pytest.mark.slow
 def test_readme_runs():
     assert len(BLOCKS) >= 3, "README.md shows no code"
     names: dict = {"__name__": "readme"}

@@ -147,6 +147,7 @@ def test_initial_state():
     assert abs(jax.grad(f)(x) @ d - ahead) <= tol.SAME_GRADIENT * abs(ahead)
 
 
+@pytest.mark.slow
 def test_geometry_through_assembly():
     """A joint's place moved in the compiled system, the state assembled anew, then a rollout."""
     p = few()

@@ -273,7 +273,8 @@ def mixed(stages: int):
     return scene
 
 
-@pytest.mark.parametrize("stages", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("stages", [1, 2])
 def test_blocks_along_the_tree_are_the_jacobian(stages):
     """Of the same residual as the reduced form's; their factors solve with it and its transpose."""
 
