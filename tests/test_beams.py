@@ -210,12 +210,12 @@ def test_frequencies(clamped):
     """Of a slender cantilever and of a free beam, by Richardson's formula, against Euler-Bernoulli's roots.
 
     Shear and rotary inertia, which the roots leave out, lower the frequencies of this rod (radius of gyration
-    over length 1/200) by less than 0.3 %.
+    over length 1/200): by Rayleigh's quotient 0.31 % for the second mode of the free one, less for others.
     """
     section = nc.CircularSection(**STEEL)
     unit = np.sqrt(float(section.stiffness[3, 3] / section.inertia[0, 0]))
     found = []
-    for elements in (8, 16):
+    for elements in (16, 32):
         scene = nc.Scene()
         start = nc.ground if clamped else None
         scene.add(nc.Beam(section, [(0, 0, 0), (1.0, 0, 0)], elements=elements, start=start))
@@ -226,7 +226,7 @@ def test_frequencies(clamped):
             assert np.all(frequencies[:6] < 1e-3 * frequencies[6])
     exact = unit * np.array(ROOTS[clamped]) ** 2
     ratio = richardson(*found) / exact
-    assert np.all(ratio < 1.0005) and np.all(ratio > 0.997)
+    assert np.all(ratio < 1.0) and np.all(ratio > 0.9965)
 
 
 @pytest.mark.slow

@@ -65,7 +65,7 @@ NEWTON_TO_THE_END = 1e-17
 # coefficients are numbers of finite length, and their kicks pass through a factorisation.
 MILLION_STEPS = 1e-10
 MILLION_STEPS_CONSTRAINT = 1e-12
-STEADY_PART = {2: 5e-18, 4: 3e-17, 6: 5e-17}
+STEADY_PART = {2: 5e-18, 4: 5e-17, 6: 5e-17}
 # Standard errors of a mean; four in 15 000 walks without drift score higher than this.
 SCORE = 4.0
 # Steps down to 1e-9 of the period: increments keep round-off what it is at any step; corrections of Newton

@@ -19,7 +19,7 @@ from natcoord_jax.stepping.factorise import FACTORISATIONS
 from natcoord_jax.stepping.step import end_of_step
 
 MIDPOINT = gauss(1)
-LEAST_ROUNDS, MOST_ROUNDS = 3, 15
+LEAST_ROUNDS, MOST_ROUNDS = 3, 30
 """Newton corrections of a step."""
 ACCURACY = 1e-8
 """Part of the loads that inputs may leave unbalanced before the path counts as impossible."""
@@ -48,9 +48,9 @@ class _Search(eqx.Module):
 
     @property
     def unfinished(self) -> Array:
-        """While corrections shrink: they end at the floor of round-off."""
-        shrinking = self.correction < 0.5 * self.before
-        return (self.count < LEAST_ROUNDS) | (shrinking & (self.count < MOST_ROUNDS))
+        """While loads are out of balance, then while corrections shrink, down to round-off."""
+        open_still = (self.left > ACCURACY) | (self.correction < 0.5 * self.before)
+        return (self.count < LEAST_ROUNDS) | (open_still & (self.count < MOST_ROUNDS))
 
 
 class _Step(eqx.Module):
@@ -216,10 +216,11 @@ def followed(system: System, state: State, coordinates: Any, dt: Any, places: np
     left, missed = np.asarray(found.left), np.asarray(found.missed)
     fine = (left < ACCURACY) & (missed < ACCURACY)
     if not np.all(fine):
+        step = int(np.argmin(fine))
         raise ValueError(
             f"the inputs {list(system.structure.inputs)} cannot bring about the path in step "
-            f"{int(np.argmin(fine))}: {np.max(left):.1e} of the loads stay unbalanced and the coordinates "
-            f"miss it by {np.max(missed):.1e} rad or m; every coordinate of the path needs an input that "
+            f"{step}: {left[step]:.1e} of the loads stay unbalanced and the coordinates "
+            f"miss it by {missed[step]:.1e} rad or m; every coordinate of the path needs an input that "
             "acts on it (leave out others by joints=), and the path must obey the constraints"
         )
     return found

@@ -80,7 +80,7 @@ def averaged_gradient(
     noise = 16 * jnp.finfo(start.dtype).eps * sizes
     relevant = (jnp.abs(missing) > noise) & (change > LEAST**2)
     factor = jnp.where(relevant, missing / jnp.where(relevant, measure, 1.0), 0.0)
-    return gradient + factor * share * steps
+    return gradient + (factor * steps) * share
 
 
 def gradient_of(
