@@ -205,6 +205,7 @@ class _Zero(eqx.Module):
 def _followed(
     system: System, state: State, arc: Array, scale: Array, steps: int, inputs: Callable[[Array], Array]
 ) -> Equilibrium:
+    # The search is not differentiated; `differentiable` gives its results their derivatives.
     fixed, begin = jax.lax.stop_gradient((system, state))
     path = _Path(fixed, scale, extent_of(fixed, begin), inputs)
     balances = 6 * len(system.structure.bodies)

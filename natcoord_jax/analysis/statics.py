@@ -128,6 +128,7 @@ def _code(search: _Search) -> Array:
 
 def differentiable(system: System, state: State, lam: Array, inputs: Array) -> tuple[State, Array]:
     """A solution as a function of system, load and inputs, by the implicit function theorem, to any order."""
+    # Where it was found plays no part in what it depends on: that is in the residual alone.
     fixed = jax.lax.stop_gradient(replace_fields(state, t=jnp.zeros_like(state.t)))
     static = Static(system, replace_fields(fixed, t=state.t), inputs)
     at = jax.lax.stop_gradient(jnp.concatenate([jnp.zeros(static.balances), lam]))
