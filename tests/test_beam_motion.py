@@ -2,6 +2,7 @@
 
 from functools import cache
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 import tolerances as tol
 from accounts import account
 from differences import assert_v_shaped
+from jaxtyping import Array, Float
 
 import natcoord_jax as nc
 from natcoord_jax.core.effect import replace_fields
@@ -114,6 +116,62 @@ def test_start_from_rest_at_zero_strain():
     slope = jax.grad(drop)(one)
     assert jnp.isfinite(drop(one)) and jnp.isfinite(slope)
     assert_v_shaped(drop, one, one, slope)
+
+
+class History(eqx.Module):
+    """A force through given values [N] at equal times, linear between them."""
+
+    times: Float[Array, " n"]
+    values: Float[Array, "n 3"]
+
+    def __call__(self, t):
+        return jax.vmap(lambda column: jnp.interp(t, self.times, column), in_axes=1)(self.values)
+
+
+@pytest.mark.slow
+def test_derivatives_of_motion():
+    """Of the tip's place with respect to stiffness, length, density, load history and unstressed curvature:
+    the scene itself is built from numbers that are differentiated."""
+    values = jnp.array([[0.0, 0.0, 0.0], [0.5, 2.0, -1.0], [-1.0, 0.5, 1.0]])
+
+    def place(p):
+        curvature = p["curvature"]
+        section = nc.Section.of_numbers(
+            EA=300.0 * p["stiffness"],
+            GA=200.0,
+            EI=(p["stiffness"], 2.0 * p["stiffness"]),
+            GJ=1.5,
+            density=p["density"],
+            rotary=0.02 * p["density"],
+        )
+
+        def arc(s):
+            # A circle through the clamp along x, of any curvature and none.
+            turn = curvature * s
+            return s * jnp.array([jnp.sinc(turn / jnp.pi), 0.5 * turn * jnp.sinc(turn / (2 * jnp.pi)) ** 2, 0])
+
+        scene = nc.Scene()
+        beam = scene.add(
+            nc.Beam(section, arc, length=p["length"], elements=4, start=nc.ground, damping=0.01, name="beam")
+        )
+        load = History(jnp.array([0.0, 0.1, 0.2]), p["load"])
+        scene.add(nc.PointForce((nc.Point(beam.end, arc(p["length"])),), force=load))
+        system, state = scene.compile()
+        trajectory = nc.simulate(system, state, dt=0.01, steps=20)
+        return system.sense(trajectory, beam.end).position[-1]
+
+    place = jax.jit(place)
+    p = {"stiffness": 1.0, "density": 1.0, "length": 1.0, "curvature": 0.4}
+    p = jax.tree.map(jnp.asarray, p) | {"load": values}
+    weights = jnp.array([0.3, -0.7, 0.6])
+    gradient = jax.jit(jax.grad(lambda p: weights @ place(p)))(p)
+    forward = jax.jit(lambda p, d: jax.jvp(place, (p,), (d,))[1])
+    steps = 10.0 ** -np.arange(1.5, 8.5, 0.5)
+    for name in p:
+        direction = jax.tree.map(jnp.zeros_like, p) | {name: jnp.ones_like(p[name])}
+        slope = forward(p, direction)
+        assert_v_shaped(place, p, direction, slope, steps=steps)
+        assert np.isclose(jnp.sum(gradient[name]), weights @ slope, rtol=1e-9), name
 
 
 def test_damping_takes_energy_only_from_strain():
