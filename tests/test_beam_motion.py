@@ -148,7 +148,8 @@ def test_derivatives_of_motion():
         def arc(s):
             # A circle through the clamp along x, of any curvature and none.
             turn = curvature * s
-            return s * jnp.array([jnp.sinc(turn / jnp.pi), 0.5 * turn * jnp.sinc(turn / (2 * jnp.pi)) ** 2, 0])
+            aside = 0.5 * turn * jnp.sinc(turn / (2 * jnp.pi)) ** 2
+            return s * jnp.array([jnp.sinc(turn / jnp.pi), aside, 0.0])
 
         scene = nc.Scene()
         beam = scene.add(
