@@ -69,14 +69,15 @@ class Static(eqx.Module):
         return self._at(rows + body_motion(rows, twists, jnp.ones((), rows.dtype), gauss(1)).rates[0])
 
     def moved_along_tree(self, y: Float[Array, " unknowns"]) -> State:
-        """The same to first order, but every body is carried along by its parent in the tree.
+        """The same to first order, but every body is carried along by its neighbour in the tree.
 
         Neighbours that turn far together stay together, so that Newton's method does not stretch a stiff
         beam that it bends; the joints of the tree stay closed.
         """
         system, rows = self.system, self.state.q.reshape(-1, 4, 3)
         velocity, spin = jnp.split(y[: self.balances].reshape(-1, 6), 2, axis=1)
-        tree, frames, h = system.tree, system.tree.frames(system.frames), jnp.ones((), rows.dtype)
+        tree, h = system.tree.chained(), jnp.ones((), rows.dtype)
+        frames = tree.frames(system.frames)
         w = start_rates(tree, frames, rows, row_rates(rows, velocity, spin))[None]
         motion, _ = sweep_nodes(tree, frames, rows, gather_slots(tree, w), h, gauss(1))
         points = rows[:, 0] + 0.5 * motion.velocity

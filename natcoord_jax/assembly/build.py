@@ -235,13 +235,13 @@ DEPTH_LIMIT = 12
 """Levels of the tree up to which its sweeps are unrolled."""
 
 
-def adjacent(group: Group, parent: np.ndarray) -> bool:
-    """Whether a group couples at most a body with its parent in the tree (the ground aside)."""
+def adjacent(group: Group, neighbour: np.ndarray) -> bool:
+    """Whether a group couples at most a body with the neighbour it follows (the ground aside)."""
     for members in group.bodies:
-        real = sorted({int(b) for b in members if b < len(parent)})
+        real = sorted({int(b) for b in members if b < len(neighbour)})
         if len(real) > 2:
             return False
-        if len(real) == 2 and parent[real[1]] != real[0] and parent[real[0]] != real[1]:
+        if len(real) == 2 and neighbour[real[1]] != real[0] and neighbour[real[0]] != real[1]:
             return False
     return True
 
@@ -253,9 +253,9 @@ def choose_solver(
     unknowns, depth = len(tree.slot_of), len(tree.levels)
     if unknowns + multipliers <= REDUCED_LIMIT and depth <= DEPTH_LIMIT:
         return "reduced"
-    parent = np.asarray(tree.parent)
+    neighbour = np.asarray(tree.neighbour)
     open_tree = multipliers == 0 and all(g.in_tree for g in joints)
-    if open_tree and all(adjacent(g, parent) for g in effects):
+    if open_tree and all(adjacent(g, neighbour) for g in effects):
         return "recursive"
     if unknowns + multipliers <= LOOP_LIMIT and depth <= DEPTH_LIMIT:
         return "reduced"
@@ -269,8 +269,8 @@ def elimination_order(layout: Layout, effects: tuple[Group, ...], joints: tuple[
     Raises:
         ValueError: if the system is no open tree with couplings between neighbours.
     """
-    parent, bodies = np.array(layout.spanning.parent), len(layout.bodies)
-    if not all(g.in_tree for g in joints) or not all(adjacent(g, parent) for g in effects):
+    neighbour, bodies = np.array(layout.spanning.neighbour), len(layout.bodies)
+    if not all(g.in_tree for g in joints) or not all(adjacent(g, neighbour) for g in effects):
         raise ValueError(
             'solver="recursive" needs an open tree whose effects couple a body with its parent at most; '
             'use solver="full" or None'

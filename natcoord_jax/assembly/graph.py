@@ -32,18 +32,19 @@ class Spanning:
     """Outcome of the search.
 
     Attributes:
-        order: bodies in their new numbering, level by level.
+        order: bodies in their new numbering: parents and neighbours before those that follow them.
         carrier: joint of each body in `order`; -1 for a free body.
         reverse: joints used from child to parent.
-        depth: level of each body in `order`.
-        parent: parent of each body in `order`, in the new numbering; the number of bodies is the ground.
+        parent: body that the joint of each body hangs on, in the new numbering; the number of bodies is the
+            ground, on which free bodies hang.
+        neighbour: body that each body follows: its parent, or the one an effect couples a free body to.
     """
 
     order: list[int]
     carrier: list[int]
     reverse: list[bool]
-    depth: list[int]
     parent: list[int]
+    neighbour: list[int]
 
 
 def spanning_tree(bodies: int, edges: list[Edge], couplings: Sequence[tuple[int, int]] = ()) -> Spanning:
@@ -51,8 +52,9 @@ def spanning_tree(bodies: int, edges: list[Edge], couplings: Sequence[tuple[int,
 
     A joint goes into the tree only if it describes its free motion; what it is used for in reverse is
     told, so that its frames can be exchanged. A coupling, an effect between two bodies that no joint
-    connects to the tree otherwise, makes one the parent of the other in all six motions: neighbours of a
-    beam follow each other along it. Free bodies that are nobody's child become roots first.
+    connects to the tree otherwise, makes neighbours of them: the second moves freely, but follows the first
+    in the order of elimination, as nodes do along a beam. Free bodies that are nobody's child become roots
+    first.
     """
     usable: list[list[tuple[int, int, bool]]] = [[] for _ in range(bodies + 1)]
     for number, edge in enumerate(edges):
@@ -100,12 +102,13 @@ def spanning_tree(bodies: int, edges: list[Edge], couplings: Sequence[tuple[int,
     order = sorted(found, key=lambda b: found[b][2])
     number = {body: i for i, body in enumerate(order)} | {bodies: bodies}
     entries = [found[b] for b in order]
+    neighbour = [number[e[3]] for e in entries]
     return Spanning(
         order,
         [e[0] for e in entries],
         [e[1] for e in entries],
-        [e[2] for e in entries],
-        [number[e[3]] for e in entries],
+        [n if e[0] >= 0 else bodies for n, e in zip(neighbour, entries)],
+        neighbour,
     )
 
 
@@ -122,25 +125,17 @@ def make_tree(spanning: Spanning, motions: list[Edge]) -> Tree:
             else:
                 slot_index[body, slot] = -1
     slot_index[slot_index < 0] = len(slot_of)
-    levels, local = [], np.zeros(bodies, np.int32)
-    depth = np.array(spanning.depth, int)
     parent = np.array(spanning.parent, np.int32)
-    for level in range(depth.max() + 1 if bodies else 0):
-        here = np.flatnonzero(depth == level)
-        start, stop = int(here[0]), int(here[-1]) + 1
-        these = [motions[b] for b in here]
-        levels.append(
-            Level(
-                start,
-                stop,
-                tuple(sorted({k for m in these for k in m.rotations})),
-                tuple(sorted({k for m in these for k in m.translations})),
-                any(m.child_rotation for m in these),
-                level == 0,
-                any(len(m.rotations) == 3 for m in these),
-            )
-        )
-        local[here] = 0 if level == 0 else parent[here] - levels[-2].start
+    depth, local = np.zeros(bodies, int), np.zeros(bodies, np.int32)
+    for body, above in enumerate(spanning.parent):
+        depth[body] = 0 if above == bodies else depth[above] + 1
+    free = np.array(spanning.carrier, int) < 0
+    levels: list[Level] = []
+    for number in range(depth.max() + 1 if bodies else 0):
+        here = np.flatnonzero(depth == number)
+        levels.append(_level(here, motions, number == 0))
+        if number > 0:
+            local[here] = np.searchsorted(levels[-2].members, parent[here])
     side = np.tile(np.array([0, 1], np.int32), (bodies, 1))
     order = np.tile(np.arange(4, dtype=np.int32), (bodies, 1))
     for body, (motion, backward) in enumerate(zip(motions, spanning.reverse)):
@@ -150,4 +145,30 @@ def make_tree(spanning: Spanning, motions: list[Edge]) -> Tree:
                 order[body] = (0, 3, 2, 1)  # the child's axis becomes the parent's
     slots = np.array(slot_of, np.int32)
     ball = np.array([len(m.rotations) == 3 for m in motions])
-    return Tree(parent, local, slot_index, slots, side, order, ball, tuple(levels), any(spanning.reverse))
+    return Tree(
+        parent,
+        np.array(spanning.neighbour, np.int32),
+        local,
+        slot_index,
+        slots,
+        side,
+        order,
+        ball,
+        tuple(levels),
+        _level(np.flatnonzero(free), motions, True),
+        _level(np.flatnonzero(~free), motions, False),
+        any(spanning.reverse),
+    )
+
+
+def _level(members: np.ndarray, motions: list[Edge], grounded: bool) -> Level:
+    """Bodies that are handled together."""
+    these = [motions[b] for b in members]
+    return Level(
+        tuple(int(b) for b in members),
+        tuple(sorted({k for m in these for k in m.rotations})),
+        tuple(sorted({k for m in these for k in m.translations})),
+        any(m.child_rotation for m in these),
+        grounded,
+        any(len(m.rotations) == 3 for m in these),
+    )

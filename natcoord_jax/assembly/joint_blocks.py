@@ -1,13 +1,15 @@
 """Derivatives of what one joint does: motion goes from parent to child, loads from child to parent."""
 
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from natcoord_jax.assembly.node_sweeps import Through, on_slots, slot_arms
+from natcoord_jax.assembly.node_sweeps import Geometry, Through, forces_on_slots, slot_arms, spread_out
 from natcoord_jax.assembly.sweeps import Hinging, relative_motion
-from natcoord_jax.assembly.tree import SLOTS, JointGeometry, Level
+from natcoord_jax.assembly.tree import SLOTS, JointGeometry, Level, Tree, joined
 from natcoord_jax.maths.collocation import Tableau, rotate_stages
 from natcoord_jax.maths.vectors import cross, skew
 
@@ -38,7 +40,7 @@ def _derivatives(
         slots = _of_slots(level, rates)
         spin, velocity, _, geometry = relative_motion(level, these, spin_p, d_p, slots, h, tableau)
         moved = cross(geometry.parent_arm + geometry.gap - geometry.child_arm, through.force)
-        return jnp.concatenate([velocity, spin, moved, on_slots(level, geometry, through)], axis=-1)
+        return jnp.concatenate([velocity, spin, moved, forces_on_slots(level, geometry, through)], axis=-1)
 
     def along(unit: Array) -> Array:
         every = jnp.broadcast_to(unit[:, None], (s, bodies, 3 + k))
@@ -51,10 +53,19 @@ def _derivatives(
     return jnp.concatenate([jnp.broadcast_to(moving, (bodies, *moving.shape)), found], axis=-1)
 
 
-def _handed_up(level: Level, geometry: JointGeometry) -> Float[Array, "n s rows s 6"]:
-    """What force and torque of a node are for its parent and for its slots."""
+def _of_free(geometry: JointGeometry, level: Level) -> Float[Array, "n s rows s columns"]:
+    """The same of free bodies: motion is linear in the rates, whatever their neighbours do."""
+    turning, sliding = slot_arms(level, geometry)
+    s, bodies, k, _ = turning.shape
+    by_rate = jnp.swapaxes(jnp.concatenate([sliding, turning], axis=-1), 2, 3)
+    found = jnp.pad(by_rate, ((0, 0), (0, 0), (0, 3 + k), (6, 0)))
+    return jnp.moveaxis(found, 0, 1)[:, :, :, None] * jnp.eye(s)[None, :, None, :, None]
+
+
+def _handed_up(level: Level, geometry: JointGeometry, carried: bool) -> Float[Array, "n s rows s 6"]:
+    """What force and torque of a node are for its parent, if that carries it, and for its slots."""
     s, bodies, _ = geometry.child_arm.shape
-    unit = jnp.broadcast_to(jnp.eye(3), (s, bodies, 3, 3))
+    unit = carried * jnp.broadcast_to(jnp.eye(3), (s, bodies, 3, 3))
     arm = skew(geometry.parent_arm + geometry.gap - geometry.child_arm)
     turning, sliding = slot_arms(level, geometry)
     blocks = [
@@ -66,13 +77,20 @@ def _handed_up(level: Level, geometry: JointGeometry) -> Float[Array, "n s rows 
     return by_stage[:, :, :, None, :] * jnp.eye(s)[None, :, None, :, None]
 
 
+def _spread(level: Level, slots: Sequence[int], x: Array, first: int, axis: int) -> Array:
+    """An array whose axis holds other things before the slots of a level, with all slots."""
+    before = jax.lax.slice_in_dim(x, 0, first, axis=axis)
+    after = jax.lax.slice_in_dim(x, first, x.shape[axis], axis=axis)
+    return jnp.concatenate([before, spread_out(level, slots, after, axis)], axis=axis)
+
+
 def joint_blocks(
-    level: Level,
+    tree: Tree,
     these: Hinging,
-    present: Bool[Array | np.ndarray, "n k"],
-    spin_p: Float[Array, "s n 3"],
-    rates: Float[Array, "s n k"],
-    geometry: JointGeometry,
+    present: Bool[Array | np.ndarray, "bodies k"],
+    spin: Float[Array, "s bodies_and_ground 3"],
+    rates: Float[Array, "s bodies 7"],
+    geometry: Geometry,
     through: Through,
     h: Array,
     tableau: Tableau,
@@ -80,31 +98,44 @@ def joint_blocks(
     """Matrices (X, Z), (T, S) and N of all joints without effects, see `linsolve.tree`.
 
     Args:
-        level: all bodies as one level.
-        these: their numbers.
-        present: which slots each joint has; the others keep their unknown at zero.
-        spin_p: angular velocities of the parents.
-        rates: mean rates by body and slot in use.
+        tree: the spanning tree.
+        these: numbers of what hangs on joints.
+        present: which slots each body has; the others keep their unknown at zero.
+        spin: stage angular velocities.
+        rates: mean rates by body and slot.
         geometry: of the joints.
         through: loads that the joints transmit.
         h: step [s].
         tableau: the collocation method.
     """
-    s, bodies, k = rates.shape
-    found = _derivatives(level, these, spin_p, rates, through, h, tableau)
+    levels, slots, s = (tree.free, tree.hung), tree.slots, tableau.stages
+    bodies, k = present.shape
+    derivatives = [_of_free(geometry.free, tree.free)]
+    gathers = [_handed_up(tree.free, geometry.free, False)]
+    if tree.hung.members:
+        here = tree.hung.here
+        spin_p, loads = spin[:, tree.parent[here]], Through(*(x[:, here] for x in through))
+        own = rates[:, here][:, :, np.array(tree.hung.slots, int)]
+        derivatives.append(_derivatives(tree.hung, these, spin_p, own, loads, h, tableau))
+        gathers.append(_handed_up(tree.hung, geometry.hung, True))
+    derivatives = [
+        _spread(level, slots, _spread(level, slots, x, 9, 2), 6, 4) for level, x in zip(levels, derivatives)
+    ]
+    gathers = [_spread(level, slots, x, 6, 2) for level, x in zip(levels, gathers)]
+    found, gather = (joined(levels[: len(x)], x, 0) for x in (derivatives, gathers))
     kept = jnp.concatenate([jnp.ones((bodies, 6), bool), present], axis=1)
     found = jnp.where(kept[:, None, None, None, :], found, 0.0)
-    motion, torque, slots = found[:, :, :6], found[:, :, 6:9], found[:, :, 9:]
-    slots = jnp.where(present[:, None, :, None, None], slots, 0.0)
+    motion, torque, by_slot = found[:, :, :6], found[:, :, 6:9], found[:, :, 9:]
+    by_slot = jnp.where(present[:, None, :, None, None], by_slot, 0.0)
     idle = jnp.eye(s)[:, None, :, None] * (~present[:, :, None] * jnp.eye(k, 6 + k, 6))[:, None, :, None, :]
     loads = jnp.concatenate([jnp.zeros_like(torque), torque], axis=2)
-    gather = jnp.where(kept[:, None, :, None, None], _handed_up(level, geometry), 0.0)
+    gather = jnp.where(kept[:, None, :, None, None], gather, 0.0)
 
     def flat(x: Array) -> Array:
         rows = x.shape[1] * x.shape[2]
         first = x[..., :6].reshape(bodies, rows, 6 * s)
         return jnp.concatenate([first, x[..., 6:].reshape(bodies, rows, -1)], axis=2)
 
-    rest = jnp.concatenate([flat(loads), flat(slots + idle)], axis=1)
+    rest = jnp.concatenate([flat(loads), flat(by_slot + idle)], axis=1)
     gather = jnp.concatenate([flat(gather[:, :, :6]), flat(gather[:, :, 6:])], axis=1)
     return flat(motion), gather, rest

@@ -7,16 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from natcoord_jax.assembly.tree import SLOTS, Level, Tree
+from natcoord_jax.assembly.tree import SLOTS, Tree
 
 
-def unknowns_of_slots(
-    tree: Tree, level: Level, by_slot: Float[Array, "s bodies k"]
-) -> Float[Array, "s unknowns"]:
+def unknowns_of_slots(tree: Tree, by_slot: Float[Array, "s bodies k"]) -> Float[Array, "s unknowns"]:
     """Numbers of the unknowns from those of all slots in use."""
     position = np.zeros(SLOTS, np.int32)
-    position[list(level.slots)] = np.arange(len(level.slots))
-    place = tree.slot_of // SLOTS * len(level.slots) + jnp.asarray(position)[tree.slot_of % SLOTS]
+    position[list(tree.slots)] = np.arange(len(tree.slots))
+    place = tree.slot_of // SLOTS * len(tree.slots) + jnp.asarray(position)[tree.slot_of % SLOTS]
     return by_slot.reshape(by_slot.shape[0], -1)[:, place]
 
 
@@ -30,7 +28,6 @@ class NodeLayout(eqx.Module):
         tree: the spanning tree.
         slots: multipliers of each node, padded with their total number.
         places: of each multiplier, in the flattened slots.
-        level: all bodies as one level.
         groups: number of instances and of multipliers of one instance, for each group.
         stages: of the collocation method.
     """
@@ -38,14 +35,13 @@ class NodeLayout(eqx.Module):
     tree: Tree
     slots: Int[Array | np.ndarray, "bodies m"]
     places: Int[Array | np.ndarray, " multipliers"]
-    level: Level = eqx.field(static=True)
     groups: tuple[tuple[int, int], ...] = eqx.field(static=True)
     stages: int = eqx.field(static=True)
 
     @property
     def rates(self) -> int:
         """Rates of a node."""
-        return self.stages * len(self.level.slots)
+        return self.stages * len(self.tree.slots)
 
     def by_multiplier(self, parts: Sequence[Array]) -> Array:
         """What belongs to the multipliers of all groups (n, m, ...), in one array."""
@@ -60,7 +56,7 @@ class NodeLayout(eqx.Module):
         """Flat vector by node."""
         s, count, bodies = self.stages, self.tree.slot_of.shape[0], self.slots.shape[0]
         padded = jnp.concatenate([y[: s * count].reshape(s, count), jnp.zeros((s, 1), y.dtype)], axis=1)
-        index = self.tree.slot_index[:, jnp.array(self.level.slots, int)]
+        index = self.tree.slot_index[:, jnp.array(self.tree.slots, int)]
         rates = jnp.moveaxis(padded[:, index], 0, 1).reshape(bodies, self.rates)
         if not self.slots.shape[1]:
             return rates
@@ -75,7 +71,7 @@ class NodeLayout(eqx.Module):
         """The inverse of `nodes`."""
         s, bodies = self.stages, self.slots.shape[0]
         by_slot = jnp.moveaxis(nodes[:, : self.rates].reshape(bodies, s, -1), 1, 0)
-        parts = [unknowns_of_slots(self.tree, self.level, by_slot).reshape(-1)]
+        parts = [unknowns_of_slots(self.tree, by_slot).reshape(-1)]
         if self.slots.shape[1]:
             multipliers = nodes[:, self.rates :].reshape(-1, s)[self.places]
             position = 0

@@ -1,50 +1,77 @@
 """Sweeps along the tree node by node, in loops whose programs do not grow with the depth of the tree.
 
 Only what is handed on from body to body is in the loops: angular velocities and sums of velocities down the
-tree, sums of loads up. All else is done for all bodies at once, as if they were one level. Loops carry one
-array and put out nothing else: an output read from what is carried would make the compiler copy all of it
-for every node.
+tree, sums of loads up. All else is done for all bodies at once, as if they were one level, and free bodies
+hand on nothing. Loops carry one array and put out nothing else: an output read from what is carried would
+make the compiler copy all of it for every node.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.diagnostics import rows_with_ground
 from natcoord_jax.assembly.sweeps import Hinging, relative_motion, turning
-from natcoord_jax.assembly.tree import JointGeometry, Level, Tree, TreeMotion, combine, frame_axes
+from natcoord_jax.assembly.tree import JointGeometry, Level, Tree, TreeMotion, combine, frame_axes, joined
 from natcoord_jax.maths.collocation import Tableau, rotate_stages
 from natcoord_jax.maths.rows import add_at, row, with_row
 from natcoord_jax.maths.vectors import cross
 
 
-def united(tree: Tree) -> Level:
-    """All bodies as one level, with the union of their joints' free motions."""
-    levels = tree.levels
-    return Level(
-        0,
-        levels[-1].stop if levels else 0,
-        tuple(sorted({k for level in levels for k in level.rotations})),
-        tuple(sorted({k for level in levels for k in level.translations})),
-        any(level.child_rotation for level in levels),
-        False,
-        any(level.balls for level in levels),
-    )
+class Geometry(NamedTuple):
+    """Stage geometry of the motions of free bodies, and of the joints of all others."""
+
+    free: JointGeometry
+    hung: JointGeometry
 
 
 def hinging(tree: Tree, frames: Array, rows: Float[Array, "bodies 4 3"]) -> Hinging:
-    """All bodies and what they hang on."""
-    above = rows_with_ground(rows.reshape(-1, 3))[tree.parent]
-    return Hinging(frames, rows, tree.ball, above)
+    """Bodies that hang on joints, and what they hang on."""
+    here = tree.hung.here
+    above = rows_with_ground(rows.reshape(-1, 3))[tree.parent[here]]
+    return Hinging(frames[here], rows[here], tree.ball[here], above)
+
+
+def free_axes(tree: Tree, rows: Float[Array, "bodies 4 3"]) -> Float[Array, "free 3 3"]:
+    """Axes of the rates of free bodies: their own at the start of the step; those of space for points."""
+    turning = jnp.asarray(tree.ball[tree.free.here])[:, None, None]
+    return jnp.where(turning, rows[tree.free.here, 1:], jnp.eye(3, dtype=rows.dtype))
+
+
+def _free_motion(
+    tree: Tree,
+    rows: Float[Array, "bodies 4 3"],
+    slots: Float[Array, "s bodies 7"],
+    h: Float[Array, ""],
+    tableau: Tableau,
+) -> tuple[Array, Array, Array, JointGeometry]:
+    """Angular velocities, velocities, stage directors and geometry of free bodies."""
+    level, axes = tree.free, free_axes(tree, rows)
+    rate, count = slots[:, level.here], len(level.members)
+    still = jnp.zeros((tableau.stages, count, 3), rows.dtype)
+    turning = [rate[:, :, k, None] * axes[:, k] for k in level.rotations]
+    sliding = [rate[:, :, 3 + k, None] * axes[:, k] for k in level.translations]
+    spin, velocity = sum(turning, still), sum(sliding, still)
+    d = rotate_stages(h * spin[:, :, None], rows[None, level.here, 1:], tableau)
+    picked = axes[:, np.array([*level.rotations, *level.translations], int)]
+    every = jnp.broadcast_to(picked, (tableau.stages, *picked.shape))
+    return spin, velocity, d, JointGeometry(every, still, still, still)
 
 
 def _spins_above(
-    tree: Tree, level: Level, these: Hinging, slots: Array, h: Array, tableau: Tableau
-) -> Float[Array, "s bodies 3"]:
-    """Angular velocities of the parents of all bodies, root to leaves."""
-    bodies, stages = these.rows.shape[0], tableau.stages
+    tree: Tree,
+    these: Hinging,
+    slots: Float[Array, "s hung 7"],
+    spins: Float[Array, "s free 3"],
+    h: Array,
+    tableau: Tableau,
+) -> Float[Array, "s hung 3"]:
+    """Angular velocities of the parents of all bodies that hang on joints, root to leaves."""
+    level, here = tree.hung, tree.hung.here
     own = these.rows[None, :, 1:]
     picked = jnp.array(level.rotations, int)
     axes = frame_axes(these.frames[:, 0, 1:, 1:], these.parent_rows[None, :, 1:])[0][:, picked]
@@ -64,19 +91,21 @@ def _spins_above(
         spin, _ = turning(level, every, start, above[:, None], rate[:, None], h, tableau)
         return with_row(spins, index, spin[:, 0]), None
 
-    start = jnp.zeros((bodies + 1, stages, 3), own.dtype)
-    nodes = (axes, child, these.ball, jnp.swapaxes(slots, 0, 1), jnp.arange(bodies), tree.parent)
-    return jnp.swapaxes(jax.lax.scan(down, start, nodes)[0][tree.parent], 0, 1)
+    known = joined((tree.free, level), (spins, jnp.zeros_like(slots[:, :, :3])))
+    parent, number = tree.parent[here], jnp.arange(tree.parent.shape[0])[here]
+    nodes = (axes, child, these.ball, jnp.swapaxes(slots, 0, 1), number, parent)
+    return jnp.swapaxes(jax.lax.scan(down, _with_rest(known), nodes)[0][parent], 0, 1)
 
 
 def _sums_from_root(tree: Tree, relative: Float[Array, "s bodies 3"]) -> Float[Array, "s bodies 3"]:
     """Of each body, the sum of what it and the bodies that it hangs on have."""
+    here = tree.hung.here
 
     def down(sums: Array, node: tuple) -> tuple[Array, None]:
         index, parent = node
         return add_at(sums, index, row(sums, parent)), None
 
-    nodes = jnp.arange(relative.shape[1]), tree.parent
+    nodes = jnp.arange(relative.shape[1])[here], tree.parent[here]
     return jnp.swapaxes(jax.lax.scan(down, _with_rest(relative), nodes)[0][:-1], 0, 1)
 
 
@@ -92,13 +121,18 @@ def sweep_nodes(
     slots: Float[Array, "s bodies 7"],
     h: Float[Array, ""],
     tableau: Tableau,
-) -> tuple[TreeMotion, JointGeometry]:
+) -> tuple[TreeMotion, Geometry]:
     """Motion of all bodies from the rates of the joints, root to leaves; see `sweeps.sweep_motion`."""
-    level, these = united(tree), hinging(tree, frames, rows)
-    spin_p = _spins_above(tree, level, these, slots, h, tableau)
+    *alone, free = _free_motion(tree, rows, slots, h, tableau)
+    if not tree.hung.members:
+        empty = jax.tree.map(lambda x: x[:, :0], free)
+        return TreeMotion(*alone), Geometry(free, empty)
+    these, hung = hinging(tree, frames, rows), slots[:, tree.hung.here]
+    spin_p = _spins_above(tree, these, hung, alone[0], h, tableau)
     d_p = rotate_stages(h * spin_p[:, :, None], these.parent_rows[None, :, 1:], tableau)
-    spin, relative, d, geometry = relative_motion(level, these, spin_p, d_p, slots, h, tableau)
-    return TreeMotion(spin, _sums_from_root(tree, relative), d), geometry
+    *hinged, geometry = relative_motion(tree.hung, these, spin_p, d_p, hung, h, tableau)
+    spin, relative, d = (joined((tree.free, tree.hung), both) for both in zip(alone, hinged))
+    return TreeMotion(spin, _sums_from_root(tree, relative), d), Geometry(free, geometry)
 
 
 class Through(NamedTuple):
@@ -109,10 +143,13 @@ class Through(NamedTuple):
 
 
 def load_nodes(
-    tree: Tree, geometry: JointGeometry, force: Float[Array, "s bodies 3"], torque: Float[Array, "s bodies 3"]
+    tree: Tree, geometry: Geometry, force: Float[Array, "s bodies 3"], torque: Float[Array, "s bodies 3"]
 ) -> Through:
     """Sums of the forces and torques on each body and on all that hangs on it, leaves to root."""
-    arm = geometry.parent_arm + geometry.gap - geometry.child_arm
+    if not tree.hung.members:
+        return Through(force, torque)
+    joints, here = geometry.hung, tree.hung.here
+    arm = joints.parent_arm + joints.gap - joints.child_arm
 
     def up(sums: Array, node: tuple) -> tuple[Array, None]:
         arm, index, parent = node
@@ -120,13 +157,31 @@ def load_nodes(
         return add_at(sums, parent, jnp.concatenate([force, torque + cross(arm, force)], axis=-1)), None
 
     start = _with_rest(jnp.concatenate([force, torque], axis=-1))
-    nodes = jnp.swapaxes(arm, 0, 1), jnp.arange(force.shape[1]), tree.parent
+    nodes = jnp.swapaxes(arm, 0, 1), jnp.arange(force.shape[1])[here], tree.parent[here]
     sums = jax.lax.scan(up, start, nodes, reverse=True)[0][:-1]
     return Through(*jnp.split(jnp.swapaxes(sums, 0, 1), 2, axis=-1))
 
 
-def on_slots(level: Level, geometry: JointGeometry, through: Through) -> Float[Array, "s bodies k"]:
+def spread_out(level: Level, slots: Sequence[int], x: Array, axis: int) -> Array:
+    """What belongs to the slots that a level uses, at their places among others; zero elsewhere."""
+    if level.slots == tuple(slots):
+        return x
+    columns = {slot: jax.lax.index_in_dim(x, i, axis, keepdims=False) for i, slot in enumerate(level.slots)}
+    zero = jnp.zeros((*x.shape[:axis], *x.shape[axis + 1 :]), x.dtype)
+    return jnp.stack([columns.get(slot, zero) for slot in slots], axis=axis)
+
+
+def on_slots(tree: Tree, geometry: Geometry, through: Through) -> Float[Array, "s bodies k"]:
     """Generalised forces of the free motions, of all slots in use."""
+    found = []
+    for level, part in zip((tree.free, tree.hung), geometry):
+        here = Through(through.force[:, level.here], through.torque[:, level.here])
+        found.append(spread_out(level, tree.slots, forces_on_slots(level, part, here), 2))
+    return joined((tree.free, tree.hung), found)
+
+
+def forces_on_slots(level: Level, geometry: JointGeometry, through: Through) -> Float[Array, "s n k"]:
+    """The same of the bodies of one level, of the slots that it uses."""
     turning_arm, sliding_arm = slot_arms(level, geometry)
     force, torque = through.force[:, :, None], through.torque[:, :, None]
     return jnp.sum(turning_arm * torque + sliding_arm * force, axis=-1)

@@ -1,8 +1,9 @@
 """Equations of a step on an open tree: those of `ReducedStep`, with loops along the tree node by node.
 
 A node is a body with the rates of its joint (and multipliers of drives and couplings on it). Every effect
-couples a body with its parent at most, so that the Jacobian is kept as blocks, see `linsolve.tree`: twists
-are passed down, forces and torques are handed up.
+couples a body with its neighbour at most, so that the Jacobian is kept as blocks, see `linsolve.tree`: twists
+are passed down, forces and torques are handed up. What moves freely follows its neighbour in the elimination
+only: its motion is its own.
 """
 
 import jax
@@ -20,11 +21,11 @@ from natcoord_jax.assembly.joint_blocks import joint_blocks
 from natcoord_jax.assembly.local import jacobians
 from natcoord_jax.assembly.momentum import momentum_balance
 from natcoord_jax.assembly.node_layout import NodeLayout, unknowns_of_slots
-from natcoord_jax.assembly.node_sweeps import hinging, load_nodes, on_slots, sweep_nodes, united
+from natcoord_jax.assembly.node_sweeps import Geometry, hinging, load_nodes, on_slots, sweep_nodes
 from natcoord_jax.assembly.reduced import ReducedStep
 from natcoord_jax.assembly.response import Stations, no_multipliers
 from natcoord_jax.assembly.system import Elimination
-from natcoord_jax.assembly.tree import JointGeometry, TreeMotion, gather_slots
+from natcoord_jax.assembly.tree import TreeMotion, gather_slots
 from natcoord_jax.maths.collocation import rotate_stages
 
 Blocks = tuple[Array, Array, Array, Array]
@@ -46,39 +47,37 @@ class RecursiveStep(ReducedStep):
             self.system.tree,
             self.elimination.slots,
             self.elimination.places,
-            united(self.system.tree),
             tuple((g.count, g.multipliers) for g in self.groups),
             self.tableau.stages,
         )
 
-    def motion(self, w: Float[Array, "s unknowns"]) -> tuple[TreeMotion, JointGeometry]:
+    def motion(self, w: Float[Array, "s unknowns"]) -> tuple[TreeMotion, Geometry]:
         """Stage motion of the bodies at given rates."""
         slots = gather_slots(self.system.tree, w)
         return sweep_nodes(self.system.tree, self.frames, self.start, slots, self.h, self.tableau)
 
     def generalised(
-        self, geometry: JointGeometry, force: Float[Array, "s bodies 3"], torque: Float[Array, "s bodies 3"]
+        self, geometry: Geometry, force: Float[Array, "s bodies 3"], torque: Float[Array, "s bodies 3"]
     ) -> Float[Array, "s unknowns"]:
         """Generalised forces of the free motions."""
-        tree, level = self.system.tree, united(self.system.tree)
+        tree = self.system.tree
         through = load_nodes(tree, geometry, force, torque)
-        return unknowns_of_slots(tree, level, on_slots(level, geometry, through))
+        return unknowns_of_slots(tree, on_slots(tree, geometry, through))
 
     def jacobian(self, y: Float[Array, " unknowns"], *, exact: bool = True) -> Blocks:
         """Blocks A, (X, Z), (T, S) and N of the Jacobian, see `linsolve.tree`."""
-        tree, level = self.system.tree, united(self.system.tree)
+        tree = self.system.tree
         w, multipliers = self.split(y)
         motion, geometry = self.motion(w)
         at = self.stations(motion)
         given = self.system, self.groups, self.situations, at, self.velocity
         found = momentum_balance(*given, multipliers, self.h, self.tableau)
-        picked = jnp.array(level.slots, int)
         joints = joint_blocks(
-            level,
+            tree,
             hinging(tree, self.frames, self.start),
-            tree.slot_index[:, picked] < tree.slot_of.shape[0],
-            at.spin[:, tree.parent],
-            gather_slots(tree, w)[:, :, picked],
+            tree.slot_index[:, jnp.array(tree.slots, int)] < tree.slot_of.shape[0],
+            at.spin,
+            gather_slots(tree, w),
             geometry,
             load_nodes(tree, geometry, found.force, found.torque),
             self.h,

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from natcoord_jax.assembly.tree import JointGeometry, Level, Tree, TreeMotion, combine, frame_axes
+from natcoord_jax.assembly.tree import JointGeometry, Level, Tree, TreeMotion, combine, frame_axes, joined
 from natcoord_jax.maths.collocation import Tableau, rotate_stages
 from natcoord_jax.maths.vectors import cross
 
@@ -142,9 +142,9 @@ def sweep_motion(
     unit = jnp.eye(3, dtype=rows.dtype)
     spins, velocities, triads, geometry = [], [], [], []
     for level in tree.levels:
-        here = slice(level.start, level.stop)
+        here = level.here
         if level.grounded:
-            shape = (tableau.stages, level.stop - level.start, 3)
+            shape = (tableau.stages, len(level.members), 3)
             spin_p = velocity_p = jnp.zeros(shape, rows.dtype)
             d_p, parent_rows = jnp.broadcast_to(unit, (*shape, 3)), rows[here]
         else:
@@ -157,4 +157,4 @@ def sweep_motion(
         spins.append(spin)
         velocities.append(velocity_p + relative)
         triads.append(d)
-    return TreeMotion(*(jnp.concatenate(x, axis=1) for x in (spins, velocities, triads))), geometry
+    return TreeMotion(*(joined(tree.levels, x) for x in (spins, velocities, triads))), geometry

@@ -1,17 +1,19 @@
 """The joint null space: sweeps along the spanning tree, forward for motion and backward for forces.
 
-Every body hangs on exactly one joint, free bodies on a free motion relative to the ground. The unknowns
-are the mean rates of the joints' free motions; with mid-point (stage) vectors, a the parent's axis and u
-the vector between the joint's points,
+Every body hangs on exactly one joint, free bodies on a free motion relative to the ground, also where an
+effect couples them to a neighbour: nodes of a beam are as free as satellites. The unknowns are the mean
+rates of the joints' free motions; with mid-point (stage) vectors, a the parent's axis and u the vector
+between the joint's points,
 
     omega_c = omega_p + sum_k w_k a_k        (rotations about the parent's axes)
             + w_6 b                          (about the child's own first axis, for universal joints)
     u'      = omega_p x u + sum_k w_3+k t_k  (t_k = a_i x a_j, cross products of the parent's axes)
 
-so that constraint rates vanish identically (47-50). Stage vectors come from `rotate_stages`. Bodies are
-numbered level by level; levels are unrolled, the bodies of one level are handled together.
+so that constraint rates vanish identically (47-50). Stage vectors come from `rotate_stages`. Levels are
+unrolled, the bodies of one level are handled together.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import equinox as eqx
@@ -19,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.maths.vectors import cross, dot
 
 SLOTS = 7
@@ -28,13 +31,12 @@ axis."""
 
 @dataclass(frozen=True)
 class Level:
-    """Bodies `start` to `stop` at one depth, and the union of their joints' free motions.
+    """Bodies that are handled together, in the order of their numbers, and the union of their free motions.
 
     `grounded`: all parents are the ground; `balls`: some joints leave all rotations free.
     """
 
-    start: int
-    stop: int
+    members: tuple[int, ...]
     rotations: tuple[int, ...]
     translations: tuple[int, ...]
     child_rotation: bool
@@ -47,12 +49,31 @@ class Level:
         last = (6,) if self.child_rotation else ()
         return (*self.rotations, *(3 + k for k in self.translations), *last)
 
+    @property
+    def here(self) -> slice | np.ndarray:
+        """Index of the members; a slice, which costs nothing, where they follow each other."""
+        first, count = (self.members or (0,))[0], len(self.members)
+        if self.members == tuple(range(first, first + count)):
+            return slice(first, first + count)
+        return np.array(self.members, np.int32)
+
+
+def joined(levels: Sequence[Level], parts: Sequence[Array], axis: int = 1) -> Array:
+    """What belongs to all bodies, in the order of their numbers, from what belongs to levels."""
+    every = [body for level in levels for body in level.members]
+    whole = parts[0] if len(parts) == 1 else jnp.concatenate(list(parts), axis=axis)
+    if every == list(range(len(every))):
+        return whole
+    return jnp.take(whole, np.argsort(every).astype(np.int32), axis=axis)
+
 
 class Tree(eqx.Module):
     """Spanning tree of the bodies: body b is the child of joint b.
 
     Attributes:
-        parent: parent body of each body; the number of bodies stands for the ground.
+        parent: body that the joint of each body hangs on; the number of bodies stands for the ground.
+        neighbour: body that each body follows in the order of elimination: its parent, or for a free body one
+            that an effect couples it to.
         parent_in_level: the same, counted within the previous level.
         slot_index: unknown of each body's slots; the number of unknowns where a slot is absent.
         slot_of: body * 7 + slot of each unknown.
@@ -60,11 +81,14 @@ class Tree(eqx.Module):
         order: rows (point, axis 1, 2, 3) of those frames as the tree uses them.
         ball: bodies whose joint leaves all rotations free; their rates are components along the child's
             axes at the start of the step, in which the inertia matrix changes least.
-        levels: shapes of the levels.
+        levels: bodies by depth, the joints between them and the ground counted.
+        free: free bodies.
+        hung: bodies that hang on joints.
         backwards: whether any joint is used from child to parent.
     """
 
     parent: Int[Array | np.ndarray, " bodies"]
+    neighbour: Int[Array | np.ndarray, " bodies"]
     parent_in_level: Int[Array | np.ndarray, " bodies"]
     slot_index: Int[Array | np.ndarray, "bodies 7"]
     slot_of: Int[Array | np.ndarray, " unknowns"]
@@ -72,7 +96,28 @@ class Tree(eqx.Module):
     order: Int[Array | np.ndarray, "bodies 4"]
     ball: Bool[Array | np.ndarray, " bodies"]
     levels: tuple[Level, ...] = eqx.field(static=True)
+    free: Level = eqx.field(static=True)
+    hung: Level = eqx.field(static=True)
     backwards: bool = eqx.field(static=True)
+
+    @property
+    def slots(self) -> tuple[int, ...]:
+        """Slots that any body uses."""
+        return tuple(sorted({*self.free.slots, *self.hung.slots}))
+
+    def chained(self) -> "Tree":
+        """The same with free bodies hanging on their neighbours, by all six motions."""
+        levels = (self.free, self.hung)
+        whole = Level(
+            tuple(range(len(self.ball))),
+            tuple(sorted({k for level in levels for k in level.rotations})),
+            tuple(sorted({k for level in levels for k in level.translations})),
+            any(level.child_rotation for level in levels),
+            False,
+            any(level.balls for level in levels),
+        )
+        none = Level((), (), (), False, True, False)
+        return replace_fields(self, parent=self.neighbour, free=none, hung=whole)
 
     def frames(self, frames: Float[Array, "joints 2 4 4"]) -> Float[Array, "bodies 2 4 4"]:
         """Frames of the tree's joints, in the direction of the tree."""
@@ -129,7 +174,7 @@ def tangent(
     """Linear map P: velocities of points and angular velocities of all bodies, at fixed geometry."""
     spins, velocities = [], []
     for level, joint in zip(tree.levels, geometry):
-        here = slice(level.start, level.stop)
+        here = level.here
         rate = slots[:, here][:, :, jnp.array(level.slots, int), None] * joint.axes
         slides = len(level.translations)
         turning = jnp.concatenate(
@@ -145,7 +190,7 @@ def tangent(
         velocity = velocity - cross(spin, joint.child_arm)
         spins.append(spin)
         velocities.append(velocity)
-    return jnp.concatenate(velocities, axis=1), jnp.concatenate(spins, axis=1)
+    return joined(tree.levels, velocities), joined(tree.levels, spins)
 
 
 def project(
@@ -163,7 +208,7 @@ def project(
     slots, through_f, through_n = [], [], []
     carried: tuple[Array, Array] | None = None
     for level, joint in zip(reversed(tree.levels), reversed(geometry)):
-        here = slice(level.start, level.stop)
+        here = level.here
         f, n = forces[:, here], torques[:, here]
         if carried is not None:
             f, n = f + carried[0], n + carried[1]
@@ -178,16 +223,15 @@ def project(
         if not level.grounded:
             onto = tree.parent_in_level[here]
             width = tree.levels[len(tree.levels) - len(slots) - 1]
-            pick = (jnp.arange(width.stop - width.start)[:, None] == onto[None, :]).astype(f.dtype)
+            pick = (jnp.arange(len(width.members))[:, None] == onto[None, :]).astype(f.dtype)
             moved = about + cross(joint.parent_arm + joint.gap, f)
             carried = (
                 jnp.sum(pick[:, :, None] * f[:, None], axis=2),
                 jnp.sum(pick[:, :, None] * moved[:, None], axis=2),
             )
-    joined = [jnp.concatenate(x[::-1], axis=1) for x in (slots, through_f, through_n)]
-    stages, bodies = joined[0].shape[:2]
-    generalised = joined[0].reshape(stages, bodies * SLOTS)[:, tree.slot_of]
-    return generalised, joined[1], joined[2]
+    by_slot, force, torque = (joined(tree.levels, x[::-1]) for x in (slots, through_f, through_n))
+    stages, bodies = by_slot.shape[:2]
+    return by_slot.reshape(stages, bodies * SLOTS)[:, tree.slot_of], force, torque
 
 
 def start_rates(

@@ -44,7 +44,7 @@ class _ByNode(eqx.Module):
 
 def _tree_blocks(equations: Any, blocks: tuple[Array, Array, Array, Array]) -> TreeBlocks:
     own, spread, gather, rest = blocks
-    parent, definite = equations.system.tree.parent, equations.layout.rates
+    parent, definite = equations.system.tree.neighbour, equations.layout.rates
     return TreeBlocks(own, spread, gather, rest, parent, definite)
 
 
