@@ -125,8 +125,8 @@ def sweep_nodes(
     """Motion of all bodies from the rates of the joints, root to leaves; see `sweeps.sweep_motion`."""
     *alone, free = _free_motion(tree, rows, slots, h, tableau)
     if not tree.hung.members:
-        empty = jax.tree.map(lambda x: x[:, :0], free)
-        return TreeMotion(*alone), Geometry(free, empty)
+        none = JointGeometry(free.axes[:, :0, :0], *(free.child_arm[:, :0],) * 3)
+        return TreeMotion(*alone), Geometry(free, none)
     these, hung = hinging(tree, frames, rows), slots[:, tree.hung.here]
     spin_p = _spins_above(tree, these, hung, alone[0], h, tableau)
     d_p = rotate_stages(h * spin_p[:, :, None], these.parent_rows[None, :, 1:], tableau)

@@ -27,8 +27,11 @@ from natcoord_jax.assembly.response import Stations, no_multipliers
 from natcoord_jax.assembly.system import Elimination
 from natcoord_jax.assembly.tree import TreeMotion, gather_slots
 from natcoord_jax.maths.collocation import rotate_stages
+from natcoord_jax.maths.components import products
 
-Blocks = tuple[Array, Array, Array, Array]
+Blocks = tuple[Array, ...]
+"""Blocks of a Jacobian: A, (X, Z), (T, S) and N of `linsolve.tree`; or, where all bodies hang on the ground
+and nothing has multipliers, those of `linsolve.neighbours`."""
 
 
 class RecursiveStep(ReducedStep):
@@ -65,7 +68,7 @@ class RecursiveStep(ReducedStep):
         return unknowns_of_slots(tree, on_slots(tree, geometry, through))
 
     def jacobian(self, y: Float[Array, " unknowns"], *, exact: bool = True) -> Blocks:
-        """Blocks A, (X, Z), (T, S) and N of the Jacobian, see `linsolve.tree`."""
+        """Blocks of the Jacobian."""
         tree = self.system.tree
         w, multipliers = self.split(y)
         motion, geometry = self.motion(w)
@@ -83,14 +86,45 @@ class RecursiveStep(ReducedStep):
             self.h,
             self.tableau,
         )
-        return self._with_effects(at, multipliers, joints, exact)
+        # Where nothing is carried, nodes see the rates of their neighbour.
+        alone = len(tree.levels) == 1 and not self.elimination.slots.shape[1]
+        with_effects = self._between_neighbours if alone else self._with_effects
+        return with_effects(at, multipliers, joints, exact)
 
     def tangent(self, y: Float[Array, " unknowns"]) -> Blocks:
         """The Jacobian nearly, from linearised effects: what Newton's iteration needs."""
         return self.jacobian(y, exact=False)
 
+    def _between_neighbours(
+        self, at: Stations, multipliers: list[Array], joints: tuple, exact: bool
+    ) -> Blocks:
+        """Blocks of bodies whose parent is the ground, without multipliers, by the rates of neighbours."""
+        own, coupled, _ = self._of_bodies(at, multipliers, exact)
+        width, neighbour = own.shape[1], self.system.tree.neighbour
+        empty = jnp.zeros_like(own)
+        upward, downward = (-sum(blocks, empty) for blocks in zip(*coupled)) if coupled else (empty, empty)
+        spread, gather, rest = joints
+        moved, pulled = spread[:, :, width:], gather[:, width:]
+        moved_p, pulled_p = (jnp.concatenate([x, jnp.zeros_like(x[:1])])[neighbour] for x in (moved, pulled))
+        left = jnp.stack([pulled, pulled, pulled_p])
+        right = jnp.stack([moved, moved_p, moved])
+        own, above, below = products(products(left, jnp.stack([own, upward, downward])), right)
+        return own + rest[:, width:, width:], above, below
+
     def _with_effects(self, at: Stations, multipliers: list[Array], joints: tuple, exact: bool) -> Blocks:
         """Blocks with those of bodies and effects, and with the multipliers of each node."""
+        own, coupled, bordered = self._of_bodies(at, multipliers, exact)
+        if coupled:
+            upward, downward = (-jnp.sum(jnp.stack(blocks), axis=0) for blocks in zip(*coupled))
+            joints = with_coupling(joints, upward, downward)
+        if bordered:
+            joints = with_multipliers(joints, self.layout, bordered)
+        return own, *joints
+
+    def _of_bodies(
+        self, at: Stations, multipliers: list[Array], exact: bool
+    ) -> tuple[Array, list[tuple[Array, Array]], list]:
+        """Derivatives by twists: of each body's own balance, of couplings both ways, of multipliers."""
         twists = jnp.concatenate([at.rates[:, :, 0], at.spin], axis=-1)
         own, every = self._own(twists[:, :-1]), jnp.moveaxis(twists, 0, 1)
         coupled, bordered = [], []
@@ -108,12 +142,7 @@ class RecursiveStep(ReducedStep):
             coupled.append((seats.nodes.collect(upward), seats.nodes.collect(downward)))
             if group.multipliers:
                 bordered.append(borders(by_lam, g_by_twist, places))
-        if coupled:
-            upward, downward = (-jnp.sum(jnp.stack(blocks), axis=0) for blocks in zip(*coupled))
-            joints = with_coupling(joints, upward, downward)
-        if bordered:
-            joints = with_multipliers(joints, self.layout, bordered)
-        return own, *joints
+        return own, coupled, bordered
 
     def _own(self, twists: Float[Array, "s bodies 6"]) -> Float[Array, "bodies n n"]:
         """Derivatives of the balances of single bodies under fields, by their own twists."""

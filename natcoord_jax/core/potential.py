@@ -14,6 +14,7 @@ from natcoord_jax.core.gradient import averaged_coupling, averaged_gradient, gra
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.joint import Joint
 from natcoord_jax.core.markers import Attachment, Marker
+from natcoord_jax.core.pieces import in_pieces
 from natcoord_jax.maths.collocation import Tableau
 from natcoord_jax.maths.settled import settled
 
@@ -104,7 +105,7 @@ class Potential(Effect):
         as_usual = motion.levers is None and now.stress is None and not now.tableau.variational
         if not (self.together and as_usual):
             return super().responses(place, motion, now, lam)
-        return responses_together(self, place, motion, now)
+        return in_pieces(responses_together, self, place, motion, now)
 
     def averaged(
         self, start: Float[Array, "p *n"], steps: Float[Array, "s p *n"], tableau: Tableau

@@ -11,6 +11,8 @@ subtree hands up a linear function of x_p, as the articulated bodies of rigid-bo
 linear in the number of nodes, whatever the shape of the tree, and the loops compile into one kernel.
 """
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -20,15 +22,18 @@ from natcoord_jax.linsolve.dense import bordered_inverse
 from natcoord_jax.maths.rows import add_at, row
 
 
-def _apply(matrix: Array, vector: Array) -> Array:
+def applied(matrix: Float[Array, "*n r c"], vector: Float[Array, "*n 1 c"]) -> Float[Array, "*n r"]:
+    """Products of matrices and vectors, as sums: cheaper than calls for small sizes."""
     return jnp.sum(matrix * vector, axis=-1)
 
 
-def _transposed(matrices: Array) -> Array:
+def transposed(matrices: Float[Array, "*n r c"]) -> Float[Array, "*n c r"]:
+    """Transposed matrices."""
     return jnp.swapaxes(matrices, -1, -2)
 
 
-def _product(a: Array, b: Array) -> Array:
+def product(a: Float[Array, "*n r k"], b: Float[Array, "*n k c"]) -> Float[Array, "*n r c"]:
+    """Products of matrices, as sums."""
     return jnp.sum(a[..., :, :, None] * b[..., None, :, :], axis=-2)
 
 
@@ -43,7 +48,7 @@ def passed_down(
 
     def down(seen: Array, node: tuple) -> tuple[Array, None]:
         across, index, parent = node
-        return add_at(seen, index, _apply(across, row(seen, parent))), None
+        return add_at(seen, index, applied(across, row(seen, parent)[None])), None
 
     start = jnp.concatenate([own, jnp.zeros_like(own[:1])])
     return jax.lax.scan(down, start, (across, jnp.arange(own.shape[0]), parent))[0]
@@ -56,7 +61,7 @@ def handed_up(
 
     def up(sums: Array, node: tuple) -> tuple[Array, None]:
         lift, own, index, parent = node
-        return add_at(sums, parent, _apply(lift, row(sums, index)) + own), None
+        return add_at(sums, parent, applied(lift, row(sums, index)[None]) + own), None
 
     start = jnp.zeros((own.shape[0] + 1, own.shape[1]), own.dtype)
     every = (lift, own, jnp.arange(own.shape[0]), parent)
@@ -121,23 +126,23 @@ class TreeFactors(eqx.Module):
 
     def solve(self, right: Float[Array, "nodes n"]) -> Float[Array, "nodes n"]:
         """Solution for a right-hand side: one loop up, one loop down."""
-        handed = _apply(self.to_parent, right[:, None, :])
-        left = right - _apply(self.gather, handed_up(self.lift, handed, self.parent)[:, None, :])
-        alone = _apply(self.inverse, left[:, None, :])
-        moved = _apply(self.spread, alone[:, None, :])
+        handed = applied(self.to_parent, right[:, None, :])
+        left = right - applied(self.gather, handed_up(self.lift, handed, self.parent)[:, None, :])
+        alone = applied(self.inverse, left[:, None, :])
+        moved = applied(self.spread, alone[:, None, :])
         seen = passed_down(self.drop, moved, self.parent)
-        return alone - _apply(self.from_parent, seen[self.parent][:, None, :])
+        return alone - applied(self.from_parent, seen[self.parent][:, None, :])
 
     def transpose(self) -> "TreeFactors":
         """Factors of the transposed matrix: what is passed down and what is handed up change places."""
         return TreeFactors(
-            _transposed(self.inverse),
-            _transposed(self.from_parent),
-            _transposed(self.to_parent),
-            _transposed(self.drop),
-            _transposed(self.lift),
-            _transposed(self.spread),
-            _transposed(self.gather),
+            transposed(self.inverse),
+            transposed(self.from_parent),
+            transposed(self.to_parent),
+            transposed(self.drop),
+            transposed(self.lift),
+            transposed(self.spread),
+            transposed(self.gather),
             self.parent,
         )
 
@@ -149,14 +154,14 @@ def factor(blocks: TreeBlocks) -> tuple[TreeFactors, Float[Array, "nodes n"]]:
     def eliminate(inertia: Array, node: tuple) -> tuple[Array, tuple]:
         spread, gather, rest, index, parent = node
         # The subtree as it is after elimination, and as if its unknowns were fixed: for the diagonal.
-        both = _product(gather[None], _product(row(inertia, index), spread[None])) + rest
+        both = product(gather[None], product(row(inertia, index), spread[None])) + rest
         free, fixed = both[0], both[1]
         inverse = bordered_inverse(free[width:, width:], blocks.definite)
-        to_parent = _product(free[:width, width:], inverse)
-        from_parent = _product(inverse, free[width:, :width])
-        eliminated = free[:width, :width] - _product(to_parent, free[width:, :width])
-        lift = gather[:width] - _product(to_parent, gather[width:])
-        drop = spread[:, :width] - _product(spread[:, width:], from_parent)
+        to_parent = product(free[:width, width:], inverse)
+        from_parent = product(inverse, free[width:, :width])
+        eliminated = free[:width, :width] - product(to_parent, free[width:, :width])
+        lift = gather[:width] - product(to_parent, gather[width:])
+        drop = spread[:, :width] - product(spread[:, width:], from_parent)
         handed = jnp.stack([eliminated, fixed[:width, :width]])
         found = inverse, to_parent, from_parent, lift, drop, jnp.diagonal(fixed)[width:]
         return add_at(inertia, parent, handed), found
@@ -170,17 +175,17 @@ def factor(blocks: TreeBlocks) -> tuple[TreeFactors, Float[Array, "nodes n"]]:
     return TreeFactors(inverse, to_parent, from_parent, lift, drop, *rims, blocks.parent), diagonal
 
 
-class TreeSolver(eqx.Module):
-    """Tree blocks with their factors: solves are refined once and differentiable in every mode."""
+class RefinedSolver(eqx.Module):
+    """Blocks by node with their factors: solves are refined once and differentiable in every mode."""
 
-    blocks: TreeBlocks
-    factors: TreeFactors
+    blocks: Any
+    factors: Any
 
     def solve(self, right: Float[Array, "nodes n"]) -> Float[Array, "nodes n"]:
         """Solution of blocks x = right."""
         factors = jax.lax.stop_gradient(self.factors)
 
-        def refined(given: TreeFactors, multiply, b: Array) -> Array:
+        def refined(given: Any, multiply, b: Array) -> Array:
             x = given.solve(b)
             return x + given.solve(b - multiply(x))
 

@@ -91,3 +91,10 @@ def rows_of(*vectors: Any) -> Float[Array, "rows *batch"]:
     for vector in vectors:
         parts += vector.parts if isinstance(vector, Triple) else [vector]
     return jnp.stack(jnp.broadcast_arrays(*parts))
+
+
+def products(a: Float[Array, "*n r k"], b: Float[Array, "*n k c"]) -> Float[Array, "*n r c"]:
+    """Products of many small matrices, each operation one long loop over them."""
+    a, b = jnp.moveaxis(a, (-2, -1), (0, 1)), jnp.moveaxis(b, (-2, -1), (0, 1))
+    total = sum(a[:, k, None] * b[None, k] for k in range(a.shape[1]))
+    return jnp.moveaxis(total, (0, 1), (-2, -1))

@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from natcoord_jax.linsolve import neighbours, tree
 from natcoord_jax.linsolve.dense import DenseSolver, Inverse, saddle_inverse
 from natcoord_jax.linsolve.sparse import SparseSolver, factorised
-from natcoord_jax.linsolve.tree import TreeBlocks, TreeSolver, factor
 from natcoord_jax.stepping.sparsity import assembled, inertias_of, regularised
 
 
@@ -42,23 +42,28 @@ class _ByNode(eqx.Module):
         return _ByNode(self.layout, self.solver.transpose())
 
 
-def _tree_blocks(equations: Any, blocks: tuple[Array, Array, Array, Array]) -> TreeBlocks:
+def _by_node(equations: Any, blocks: tuple) -> tuple[Any, Any]:
+    """A matrix in blocks, by what couples its nodes, and its factorisation."""
+    following = equations.system.tree.neighbour
+    if len(blocks) == 3:
+        own, above, below = blocks
+        return neighbours.NeighbourBlocks(own, above, below, following), neighbours.factor
     own, spread, gather, rest = blocks
-    parent, definite = equations.system.tree.neighbour, equations.layout.rates
-    return TreeBlocks(own, spread, gather, rest, parent, definite)
+    return tree.TreeBlocks(own, spread, gather, rest, following, equations.layout.rates), tree.factor
 
 
 def _recursive(equations: Any, blocks: tuple) -> tuple[_ByNode, Array]:
     """Factors along the tree, and the inertias of the unknowns (0 for multipliers)."""
     layout = equations.layout
-    factors, diagonal = factor(_tree_blocks(equations, blocks))
+    matrix, factor = _by_node(equations, blocks)
+    factors, diagonal = factor(matrix)
     inertias = layout.flat(jnp.abs(diagonal)).at[equations.balances :].set(0.0)
     return _ByNode(layout, factors), inertias
 
 
 def _recursive_differentiable(equations: Any, blocks: tuple) -> _ByNode:
-    matrix = _tree_blocks(equations, blocks)
-    return _ByNode(equations.layout, TreeSolver(matrix, factor(matrix)[0]))
+    matrix, factor = _by_node(equations, blocks)
+    return _ByNode(equations.layout, tree.RefinedSolver(matrix, factor(matrix)[0]))
 
 
 def _sparse(equations: Any, matrix: Any) -> tuple[Any, Array]:

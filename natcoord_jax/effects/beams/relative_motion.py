@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.core.effect import Motion, Now
 from natcoord_jax.core.force import Force, Load
+from natcoord_jax.core.pieces import in_pieces
 from natcoord_jax.core.potential import place_markers
 from natcoord_jax.effects.beams.logarithm import Logarithm
 from natcoord_jax.effects.beams.pairs import Expanded, tangents_of_pairs
@@ -156,7 +157,7 @@ class BeamElement(Expanded):
         """Derivatives of the wrenches by the twists for one stage; more are left to the general way."""
         if now.tableau.stages > 1:
             return None
-        return tangents_of_pairs(self, place, motion, now)
+        return in_pieces(tangents_of_pairs, self, place, motion, now)
 
 
 class NonlinearBeamElement(BeamElement):
