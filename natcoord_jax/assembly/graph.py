@@ -156,7 +156,7 @@ def make_tree(spanning: Spanning, motions: list[Edge]) -> Tree:
         ball,
         tuple(levels),
         _level(np.flatnonzero(free), motions, True),
-        _level(np.flatnonzero(~free), motions, False),
+        _level(np.flatnonzero(~free), motions, len(levels) == 1),
         any(spanning.reverse),
     )
 

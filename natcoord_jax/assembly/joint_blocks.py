@@ -7,10 +7,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from natcoord_jax.assembly.node_sweeps import Geometry, Through, forces_on_slots, slot_arms, spread_out
+from natcoord_jax.assembly.node_sweeps import (
+    Geometry,
+    Through,
+    forces_on_slots,
+    parent_directors,
+    slot_arms,
+    spread_out,
+)
 from natcoord_jax.assembly.sweeps import Hinging, relative_motion
 from natcoord_jax.assembly.tree import SLOTS, JointGeometry, Level, Tree, joined
-from natcoord_jax.maths.collocation import Tableau, rotate_stages
+from natcoord_jax.maths.collocation import Tableau
 from natcoord_jax.maths.vectors import cross, skew
 
 
@@ -34,20 +41,25 @@ def _derivatives(
     and angular velocity of the parent and the rates.
     """
     s, bodies, k = rates.shape
+    # What the ground carries sees nothing of it.
+    seen = 0 if level.grounded else 3
 
     def local(spin_p: Array, rates: Array) -> Array:
-        d_p = rotate_stages(h * spin_p[:, :, None], these.parent_rows[None, :, 1:], tableau)
+        d_p = parent_directors(level, these, spin_p, h, tableau)
         slots = _of_slots(level, rates)
         spin, velocity, _, geometry = relative_motion(level, these, spin_p, d_p, slots, h, tableau)
         moved = cross(geometry.parent_arm + geometry.gap - geometry.child_arm, through.force)
         return jnp.concatenate([velocity, spin, moved, forces_on_slots(level, geometry, through)], axis=-1)
 
     def along(unit: Array) -> Array:
-        every = jnp.broadcast_to(unit[:, None], (s, bodies, 3 + k))
-        return jax.jvp(local, (spin_p, rates), (every[..., :3], every[..., 3:]))[1]
+        every = jnp.broadcast_to(unit[:, None], (s, bodies, seen + k))
+        turned = every[..., :3] if seen else jnp.zeros_like(spin_p)
+        return jax.jvp(local, (spin_p, rates), (turned, every[..., seen:]))[1]
 
-    columns = jax.vmap(along)(jnp.eye(s * (3 + k)).reshape(-1, s, 3 + k))
-    found = jnp.transpose(columns.reshape(s, 3 + k, s, bodies, 9 + k), (3, 2, 4, 0, 1))
+    columns = jax.vmap(along)(jnp.eye(s * (seen + k)).reshape(-1, s, seen + k))
+    found = jnp.transpose(columns.reshape(s, seen + k, s, bodies, 9 + k), (3, 2, 4, 0, 1))
+    if level.grounded:
+        return jnp.pad(found, ((0, 0),) * 4 + ((6, 0),))
     # The velocity of the parent adds to that of the child, and changes nothing else.
     moving = jnp.eye(s)[:, None, :, None] * jnp.eye(9 + k, 3)[None, :, None, :]
     return jnp.concatenate([jnp.broadcast_to(moving, (bodies, *moving.shape)), found], axis=-1)
@@ -55,11 +67,15 @@ def _derivatives(
 
 def _of_free(geometry: JointGeometry, level: Level) -> Float[Array, "n s rows s columns"]:
     """The same of free bodies: motion is linear in the rates, whatever their neighbours do."""
+    k = geometry.axes.shape[2]
+    return jnp.pad(_free_motions(geometry, level), ((0, 0), (0, 0), (0, 3 + k), (0, 0), (6, 0)))
+
+
+def _free_motions(geometry: JointGeometry, level: Level) -> Float[Array, "n s 6 s k"]:
+    """Velocities and angular velocities of free bodies by their rates."""
     turning, sliding = slot_arms(level, geometry)
-    s, bodies, k, _ = turning.shape
-    by_rate = jnp.swapaxes(jnp.concatenate([sliding, turning], axis=-1), 2, 3)
-    found = jnp.pad(by_rate, ((0, 0), (0, 0), (0, 3 + k), (6, 0)))
-    return jnp.moveaxis(found, 0, 1)[:, :, :, None] * jnp.eye(s)[None, :, None, :, None]
+    by_rate = jnp.moveaxis(jnp.swapaxes(jnp.concatenate([sliding, turning], axis=-1), 2, 3), 0, 1)
+    return by_rate[:, :, :, None] * jnp.eye(turning.shape[0])[None, :, None, :, None]
 
 
 def _handed_up(level: Level, geometry: JointGeometry, carried: bool) -> Float[Array, "n s rows s 6"]:
@@ -117,7 +133,7 @@ def joint_blocks(
         spin_p, loads = spin[:, tree.parent[here]], Through(*(x[:, here] for x in through))
         own = rates[:, here][:, :, np.array(tree.hung.slots, int)]
         derivatives.append(_derivatives(tree.hung, these, spin_p, own, loads, h, tableau))
-        gathers.append(_handed_up(tree.hung, geometry.hung, True))
+        gathers.append(_handed_up(tree.hung, geometry.hung, not tree.hung.grounded))
     derivatives = [
         _spread(level, slots, _spread(level, slots, x, 9, 2), 6, 4) for level, x in zip(levels, derivatives)
     ]
@@ -139,3 +155,48 @@ def joint_blocks(
     rest = jnp.concatenate([flat(loads), flat(by_slot + idle)], axis=1)
     gather = jnp.concatenate([flat(gather[:, :, :6]), flat(gather[:, :, 6:])], axis=1)
     return flat(motion), gather, rest
+
+
+def rooted_blocks(
+    tree: Tree,
+    these: Hinging,
+    present: Bool[Array | np.ndarray, "bodies k"],
+    rates: Float[Array, "s bodies 7"],
+    geometry: Geometry,
+    through: Through,
+    h: Array,
+    tableau: Tableau,
+) -> tuple[Array, Array, Array]:
+    """Matrices Z, S and the own part of N, where all bodies hang on the ground; see `joint_blocks`."""
+    levels, slots, s = (tree.free, tree.hung), tree.slots, tableau.stages
+    bodies, k = present.shape
+    free = _free_motions(geometry.free, tree.free)
+    count = free.shape[4]
+    moved, pulled = [free], [jnp.transpose(free, (0, 3, 4, 1, 2))]
+    bent = [jnp.zeros((free.shape[0], s, count, s, count), free.dtype)]
+    if tree.hung.members:
+        here = tree.hung.here
+        loads = Through(*(x[:, here] for x in through))
+        own = rates[:, here][:, :, np.array(tree.hung.slots, int)]
+        still = jnp.zeros_like(rates[:, here, :3])
+        found = _derivatives(tree.hung, these, still, own, loads, h, tableau)[..., 6:]
+        moved.append(found[:, :, :6])
+        pulled.append(_handed_up(tree.hung, geometry.hung, False)[:, :, 6:])
+        bent.append(found[:, :, 9:])
+
+    def whole(parts: list[Array], axes: tuple[int, ...]) -> Array:
+        used = levels[: len(parts)]
+        for axis in axes:
+            parts = [spread_out(level, slots, x, axis) for level, x in zip(used, parts)]
+        return joined(used, parts, 0)
+
+    has = present.astype(free.dtype)
+    column, line = has[:, None, None, None, :], has[:, None, :, None, None]
+    idle = jnp.eye(s)[:, None, :, None] * ((1.0 - has)[:, :, None] * jnp.eye(k))[:, None, :, None, :]
+    blocks = (
+        whole(moved, (4,)) * column,
+        whole(pulled, (2,)) * line,
+        whole(bent, (2, 4)) * line * column + idle,
+    )
+    z, gather, n = (x.reshape(bodies, x.shape[1] * x.shape[2], -1) for x in blocks)
+    return z, gather, n

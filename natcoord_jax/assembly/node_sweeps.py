@@ -128,11 +128,25 @@ def sweep_nodes(
         none = JointGeometry(free.axes[:, :0, :0], *(free.child_arm[:, :0],) * 3)
         return TreeMotion(*alone), Geometry(free, none)
     these, hung = hinging(tree, frames, rows), slots[:, tree.hung.here]
-    spin_p = _spins_above(tree, these, hung, alone[0], h, tableau)
-    d_p = rotate_stages(h * spin_p[:, :, None], these.parent_rows[None, :, 1:], tableau)
+    if tree.hung.grounded:
+        spin_p = jnp.zeros_like(hung[:, :, :3])
+    else:
+        spin_p = _spins_above(tree, these, hung, alone[0], h, tableau)
+    d_p = parent_directors(tree.hung, these, spin_p, h, tableau)
     *hinged, geometry = relative_motion(tree.hung, these, spin_p, d_p, hung, h, tableau)
-    spin, relative, d = (joined((tree.free, tree.hung), both) for both in zip(alone, hinged))
-    return TreeMotion(spin, _sums_from_root(tree, relative), d), Geometry(free, geometry)
+    spin, velocity, d = (joined((tree.free, tree.hung), both) for both in zip(alone, hinged))
+    if not tree.hung.grounded:
+        velocity = _sums_from_root(tree, velocity)
+    return TreeMotion(spin, velocity, d), Geometry(free, geometry)
+
+
+def parent_directors(
+    level: Level, these: Hinging, spin_p: Float[Array, "s n 3"], h: Array, tableau: Tableau
+) -> Float[Array, "s n 3 3"]:
+    """Stage directors of what bodies hang on."""
+    if level.grounded:
+        return jnp.broadcast_to(jnp.eye(3, dtype=spin_p.dtype), (*spin_p.shape, 3))
+    return rotate_stages(h * spin_p[:, :, None], these.parent_rows[None, :, 1:], tableau)
 
 
 class Through(NamedTuple):
@@ -146,7 +160,7 @@ def load_nodes(
     tree: Tree, geometry: Geometry, force: Float[Array, "s bodies 3"], torque: Float[Array, "s bodies 3"]
 ) -> Through:
     """Sums of the forces and torques on each body and on all that hangs on it, leaves to root."""
-    if not tree.hung.members:
+    if tree.hung.grounded:
         return Through(force, torque)
     joints, here = geometry.hung, tree.hung.here
     arm = joints.parent_arm + joints.gap - joints.child_arm

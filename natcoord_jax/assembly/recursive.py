@@ -17,7 +17,7 @@ from natcoord_jax.assembly.effect_blocks import (
     with_coupling,
     with_multipliers,
 )
-from natcoord_jax.assembly.joint_blocks import joint_blocks
+from natcoord_jax.assembly.joint_blocks import joint_blocks, rooted_blocks
 from natcoord_jax.assembly.local import jacobians
 from natcoord_jax.assembly.momentum import momentum_balance
 from natcoord_jax.assembly.node_layout import NodeLayout, unknowns_of_slots
@@ -75,21 +75,20 @@ class RecursiveStep(ReducedStep):
         at = self.stations(motion)
         given = self.system, self.groups, self.situations, at, self.velocity
         found = momentum_balance(*given, multipliers, self.h, self.tableau)
-        joints = joint_blocks(
-            tree,
-            hinging(tree, self.frames, self.start),
-            tree.slot_index[:, jnp.array(tree.slots, int)] < tree.slot_of.shape[0],
-            at.spin,
-            gather_slots(tree, w),
-            geometry,
-            load_nodes(tree, geometry, found.force, found.torque),
-            self.h,
-            self.tableau,
-        )
-        # Where nothing is carried, nodes see the rates of their neighbour.
-        alone = len(tree.levels) == 1 and not self.elimination.slots.shape[1]
-        with_effects = self._between_neighbours if alone else self._with_effects
-        return with_effects(at, multipliers, joints, exact)
+        these = hinging(tree, self.frames, self.start)
+        present = tree.slot_index[:, jnp.array(tree.slots, int)] < tree.slot_of.shape[0]
+        rates, through = gather_slots(tree, w), load_nodes(tree, geometry, found.force, found.torque)
+        rest = rates, geometry, through, self.h, self.tableau
+        if self._alone:
+            return self._between_neighbours(
+                at, multipliers, rooted_blocks(tree, these, present, *rest), exact
+            )
+        return self._with_effects(at, multipliers, joint_blocks(tree, these, present, at.spin, *rest), exact)
+
+    @property
+    def _alone(self) -> bool:
+        """Whether nothing is carried and nothing has multipliers: nodes see the rates of their neighbour."""
+        return len(self.system.tree.levels) == 1 and not self.elimination.slots.shape[1]
 
     def tangent(self, y: Float[Array, " unknowns"]) -> Blocks:
         """The Jacobian nearly, from linearised effects: what Newton's iteration needs."""
@@ -100,16 +99,15 @@ class RecursiveStep(ReducedStep):
     ) -> Blocks:
         """Blocks of bodies whose parent is the ground, without multipliers, by the rates of neighbours."""
         own, coupled, _ = self._of_bodies(at, multipliers, exact)
-        width, neighbour = own.shape[1], self.system.tree.neighbour
+        neighbour = self.system.tree.neighbour
         empty = jnp.zeros_like(own)
         upward, downward = (-sum(blocks, empty) for blocks in zip(*coupled)) if coupled else (empty, empty)
-        spread, gather, rest = joints
-        moved, pulled = spread[:, :, width:], gather[:, width:]
+        moved, pulled, bent = joints
         moved_p, pulled_p = (jnp.concatenate([x, jnp.zeros_like(x[:1])])[neighbour] for x in (moved, pulled))
         left = jnp.stack([pulled, pulled, pulled_p])
         right = jnp.stack([moved, moved_p, moved])
         own, above, below = products(products(left, jnp.stack([own, upward, downward])), right)
-        return own + rest[:, width:, width:], above, below
+        return own + bent, above, below
 
     def _with_effects(self, at: Stations, multipliers: list[Array], joints: tuple, exact: bool) -> Blocks:
         """Blocks with those of bodies and effects, and with the multipliers of each node."""

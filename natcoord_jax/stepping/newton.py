@@ -39,6 +39,14 @@ axis of a thin rod, whose balance is rounded like that of the other axes.
 STALLS = 3
 """Times that the floor is raised."""
 
+NOISE = (1e-14, 2e-12)
+"""Sizes of last corrections that are known, from the steps before, to be noise: stiff parts feel how their
+places are rounded. Smaller ones are not worth the risk, since what is left of an error may add up; larger
+ones may be slow convergence."""
+
+ABOVE_NOISE = 4.0
+"""Corrections up to this multiple of the noise end a step that is expected to be solved."""
+
 STALL_OLD = 20.0
 """The same with factors of an earlier step, where a stall may be the factors' fault."""
 
@@ -57,7 +65,7 @@ SLOWEST_UNSEEN = 0.02
 PATIENCE = 6
 """Corrections that are cheaper than a new Jacobian."""
 
-RENEWALS = {"recursive": 15}
+RENEWALS = {"recursive": 8}
 """The same by form of the equations, where it differs: a tree is seldom small, and cheap to evaluate."""
 
 NEVER = 1000
@@ -88,6 +96,7 @@ class Factors(eqx.Module):
         fresh: whether they belong to the step that is being solved.
         least: fewest corrections that a step has needed with them.
         extra: corrections beyond these that later steps have needed.
+        noise: last correction of a step, relative to the terms of the equations, averaged over steps.
     """
 
     solver: Any
@@ -96,21 +105,30 @@ class Factors(eqx.Module):
     fresh: Bool[Array, ""]
     least: Int[Array, ""]
     extra: Int[Array, ""]
+    noise: Float[Array, ""]
 
-    def after_step(self, corrections: Int[Array, ""], usable: Bool[Array, ""], cost: int) -> "Factors":
+    def after_step(self, it: "Iterate", usable: Bool[Array, ""], cost: int) -> "Factors":
         """Factors for the next step: given up once they have cost more corrections than new ones would.
 
         Args:
-            corrections: of the step.
+            it: where the iteration of the step has ended.
             usable: whether it was solved.
             cost: of new factors, in corrections.
         """
+        corrections = it.total
         # What was needed with new factors is no guide in the step that made them: it began with old ones.
         least = jnp.where(self.fresh, self.least, jnp.minimum(self.least, corrections))
         extra = self.extra + jnp.where(self.fresh, 0, jnp.maximum(corrections - least, 0))
         # Factors of a step that was hard to solve are of no use to others.
         keep = usable & self.usable & (extra <= cost) & (corrections <= 2 * cost)
-        return Factors(self.solver, self.inertias, keep, jnp.zeros_like(self.fresh), least, extra)
+        noise = jnp.where(usable & it.converged, 0.5 * (self.noise + it.error), self.noise)
+        return Factors(self.solver, self.inertias, keep, jnp.zeros_like(self.fresh), least, extra, noise)
+
+    @property
+    def rounding(self) -> Float[Array, ""]:
+        """Relative size of corrections that are nothing but rounding; 0 where it is not known or small."""
+        least, most = NOISE
+        return jnp.where(self.noise > least, jnp.minimum(self.noise, most), 0.0)
 
 
 class Iterate(eqx.Module):
@@ -171,13 +189,15 @@ def no_factors(equations: Any, form: str) -> Factors:
     y = equations.guess()
     shapes = jax.eval_shape(lambda y: FACTORISATIONS[form](equations, equations.tangent(y)), y)
     solver, inertias = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-    return Factors(solver, inertias, jnp.array(False), jnp.array(False), jnp.array(NEVER), jnp.array(0))
+    no, noise = jnp.array(False), jnp.zeros((), y.dtype)
+    return Factors(solver, inertias, no, no, jnp.array(NEVER), jnp.array(0), noise)
 
 
-def factors_of(equations: Any, form: str, matrix: Any) -> Factors:
+def factors_of(equations: Any, form: str, matrix: Any, noise: Array | float = 0.0) -> Factors:
     """Factors of a Jacobian."""
     solver, inertias = FACTORISATIONS[form](equations, matrix)
-    return Factors(solver, inertias, jnp.array(True), jnp.array(True), jnp.array(NEVER), jnp.array(0))
+    yes, noise = jnp.array(True), jnp.asarray(noise, inertias.dtype)
+    return Factors(solver, inertias, yes, yes, jnp.array(NEVER), jnp.array(0), noise)
 
 
 def refreshed(it: Iterate) -> Iterate:
@@ -230,10 +250,11 @@ def judge(
     floor = jnp.where(factors.fresh, raised, STALL_OLD) * max(tolerance, ROUND_OFF) * size
     finite = jnp.isfinite(correction) & jnp.isfinite(size)
     stalled = ~first & (ratio > 0.5) & (correction <= floor)
-    solved = (
-        (correction <= tolerance * size) | stalled | (it.last & (correction <= STALL_OLD * tolerance * size))
-    )
-    slow = ~first & ((ratio > 0.5) | (correction * ratio**patience > tolerance * size))
+    enough = jnp.maximum(STALL_OLD * tolerance, ABOVE_NOISE * factors.rounding) * size
+    solved = (correction <= tolerance * size) | stalled | (it.last & (correction <= enough))
+    # Within the noise corrections shrink little, and new factors would not change it.
+    noisy = factors.fresh & (correction <= floor)
+    slow = ~first & ((ratio > 0.5) | (~noisy & (correction * ratio**patience > tolerance * size)))
     slow = slow | (it.count >= max(CHORD_ITERATIONS, 2 * patience)) | ~factors.usable
     # Old factors may have led astray: new ones begin where the first did.
     lost = ~finite & ~factors.fresh
@@ -249,7 +270,7 @@ def judge(
         it.total + ~solved,
         it.rounds,
         it.most,
-        predicted <= tolerance * size,
+        predicted <= jnp.maximum(tolerance, factors.rounding) * size,
         solved,
         slow & ~solved,
         finite | lost,
@@ -272,7 +293,7 @@ def newton(equations: Any, tolerance: float, form: str) -> tuple[Float[Array, " 
     """
 
     def renew(it: Iterate, factors: Factors) -> tuple[Iterate, Factors]:
-        return refreshed(it), factors_of(equations, form, equations.tangent(it.y))
+        return refreshed(it), factors_of(equations, form, equations.tangent(it.y), factors.noise)
 
     def keep(it: Iterate, factors: Factors) -> tuple[Iterate, Factors]:
         return it, factors

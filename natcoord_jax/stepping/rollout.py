@@ -101,9 +101,9 @@ def _trip(setting: Setting, unpack: Callable[[Array], State], carried: Carried) 
     _, after, x, outset, record = jax.lax.while_loop(lambda carry: carry[0], ended, start)
     # An attempt for comparison leaves the run where it is, and factors that serve.
     solved = after.taken > course.taken if setting.tolerance is None else it.converged
-    kept = factors.after_step(it.total, solved | over, cost)
+    kept = factors.after_step(it, solved | over, cost)
     factors = eqx.tree_at(
-        lambda f: (f.usable, f.fresh, f.least, f.extra),
+        lambda f: (f.usable, f.fresh, f.least, f.extra, f.noise),
         factors,
         tuple(
             jnp.where(ending, a, b)
@@ -112,6 +112,7 @@ def _trip(setting: Setting, unpack: Callable[[Array], State], carried: Carried) 
                 (kept.fresh, factors.fresh),
                 (kept.least, factors.least),
                 (kept.extra, factors.extra),
+                (kept.noise, factors.noise),
             )
         ),
     )
@@ -119,9 +120,15 @@ def _trip(setting: Setting, unpack: Callable[[Array], State], carried: Carried) 
         probe, wanting = probe.with_column(it.y, found.residual, equations, wanting)
 
     def renewed(carry: tuple) -> tuple:
-        _, it, _ = carry
+        _, it, factors = carry
         matrix = equations.tangent(it.y) if probe is None else probe.columns[:-1].T
-        return jnp.array(False), refreshed(it), factors_of(equations, setting.form, matrix)
+        factors = factors_of(equations, setting.form, matrix, factors.noise)
+        it = refreshed(it)
+        if probe is None:
+            # The residual is at hand: what it asks for with the new factors needs no evaluation.
+            moved = judge(factors, plan.tolerance, it, found.residual, found.size, **options)
+            it = jax.tree.map(partial(jnp.where, it.unsolved), moved, it)
+        return jnp.array(False), it, factors
 
     _, it, factors = jax.lax.while_loop(lambda carry: carry[0], renewed, (wanting, after.it, factors))
     after = eqx.tree_at(lambda c: c.it, after, it)
