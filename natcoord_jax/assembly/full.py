@@ -5,6 +5,8 @@ bodies and effects. Systems that are no tree, too large for the reduced form and
 are solved so, densely; for all others it is an independent way to the same trajectory.
 """
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -160,7 +162,7 @@ class FullStep(eqx.Module):
         wrenches = jnp.moveaxis(jnp.concatenate([found.force, torque], axis=-1), 0, 1)
         rows = project_rows(found.rows, y, self.balances, self.outset.projector)
         residual = jnp.concatenate([wrenches.reshape(-1), rows])
-        return Evaluation(residual, found.size, at, found.power, kick)
+        return Evaluation(residual, found.size, at, found.power, (found.force, found.torque), kick)
 
     def body_jacobians(self, twists: Float[Array, "bodies s 6"]) -> Float[Array, "bodies n n"]:
         """Jacobians of the bodies' own balances."""
@@ -169,7 +171,7 @@ class FullStep(eqx.Module):
         found = local(self.system.mass, self.start[:-1], self.velocity, twists, self.h, self.tableau)
         return found.reshape(self.bodies, width, width)
 
-    def tangent(self, y: Float[Array, " unknowns"]) -> Float[Array, "unknowns unknowns"]:
+    def tangent(self, y: Float[Array, " unknowns"], loads: Any = None) -> Float[Array, "unknowns unknowns"]:
         """The Jacobian nearly, from linearised effects: what Newton's iteration needs."""
         return self.jacobian(y, exact=False)
 

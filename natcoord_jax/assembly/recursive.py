@@ -6,6 +6,8 @@ are passed down, forces and torques are handed up. What moves freely follows its
 only: its motion is its own.
 """
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -67,17 +69,19 @@ class RecursiveStep(ReducedStep):
         through = load_nodes(tree, geometry, force, torque)
         return unknowns_of_slots(tree, on_slots(tree, geometry, through))
 
-    def jacobian(self, y: Float[Array, " unknowns"], *, exact: bool = True) -> Blocks:
-        """Blocks of the Jacobian."""
+    def jacobian(self, y: Float[Array, " unknowns"], *, exact: bool = True, loads: Any = None) -> Blocks:
+        """Blocks of the Jacobian; loads as in `tangent`."""
         tree = self.system.tree
         w, multipliers = self.split(y)
         motion, geometry = self.motion(w)
         at = self.stations(motion)
-        given = self.system, self.groups, self.situations, at, self.velocity
-        found = momentum_balance(*given, multipliers, self.h, self.tableau)
+        if loads is None:
+            given = self.system, self.groups, self.situations, at, self.velocity
+            found = momentum_balance(*given, multipliers, self.h, self.tableau)
+            loads = found.force, found.torque
         these = hinging(tree, self.frames, self.start)
         present = tree.slot_index[:, jnp.array(tree.slots, int)] < tree.slot_of.shape[0]
-        rates, through = gather_slots(tree, w), load_nodes(tree, geometry, found.force, found.torque)
+        rates, through = gather_slots(tree, w), load_nodes(tree, geometry, *loads)
         rest = rates, geometry, through, self.h, self.tableau
         if self._alone:
             return self._between_neighbours(
@@ -90,9 +94,14 @@ class RecursiveStep(ReducedStep):
         """Whether nothing is carried and nothing has multipliers: nodes see the rates of their neighbour."""
         return len(self.system.tree.levels) == 1 and not self.elimination.slots.shape[1]
 
-    def tangent(self, y: Float[Array, " unknowns"]) -> Blocks:
-        """The Jacobian nearly, from linearised effects: what Newton's iteration needs."""
-        return self.jacobian(y, exact=False)
+    def tangent(self, y: Float[Array, " unknowns"], loads: Any = None) -> Blocks:
+        """The Jacobian nearly, from linearised effects: what Newton's iteration needs.
+
+        Args:
+            y: unknowns.
+            loads: of the equations evaluated there, see `Evaluation.loads`; None: they are evaluated.
+        """
+        return self.jacobian(y, exact=False, loads=loads)
 
     def _between_neighbours(
         self, at: Stations, multipliers: list[Array], joints: tuple, exact: bool

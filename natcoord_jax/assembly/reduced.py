@@ -221,7 +221,7 @@ class ReducedStep(eqx.Module):
         rows = project_rows(found.rows, y, self.balances, self.outset.projector)
         residual = jnp.concatenate([generalised.reshape(-1), rows])
         asked = (situations, multipliers) if self.tableau.variational else damped
-        return Evaluation(residual, found.size, at, found.power, kick, asked)
+        return Evaluation(residual, found.size, at, found.power, (found.force, found.torque), kick, asked)
 
     def damped(self, at: Stations) -> Damped:
         """What numerical dissipation does in the step."""
@@ -239,7 +239,7 @@ class ReducedStep(eqx.Module):
         """Exact Jacobian of the residual."""
         return jax.jacfwd(lambda x: self.residual(x)[0])(y)
 
-    def tangent(self, y: Float[Array, " unknowns"]) -> Any:
+    def tangent(self, y: Float[Array, " unknowns"], loads: Any = None) -> Any:
         """What Newton's iteration takes for the Jacobian where it does not form it by differences."""
         return self.jacobian(y)
 

@@ -109,6 +109,7 @@ class Evaluation(eqx.Module):
         size: of the terms of the residual [sqrt(J)].
         at: stage motion of all bodies.
         power: power of each group, for work accounts (instances, s).
+        loads: forces and torques missing in the balances of all bodies, see `momentum.Balance`.
         kick: of the step, if the method has any.
         given: what else the end of the step asks for: situations and multipliers of the groups for the
             variational scheme, what is damped for a dissipative one.
@@ -118,6 +119,7 @@ class Evaluation(eqx.Module):
     size: Float[Array, ""]
     at: Stations
     power: list[Float[Array, "_ s"]]
+    loads: tuple[Float[Array, "s bodies 3"], Float[Array, "s bodies 3"]]
     kick: Any = None
     given: Any = None
 

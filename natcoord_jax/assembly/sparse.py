@@ -5,6 +5,8 @@ of an effect or joint, which a sparse solver puts together. The multipliers of a
 of the deepest of its bodies. With more than one stage the Jacobian is a dense matrix, as that of `FullStep`.
 """
 
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -19,7 +21,7 @@ RATES = 6  # of a body
 class SparseStep(FullStep):
     """One step with multipliers for every joint and a sparse Jacobian."""
 
-    def tangent(self, y: Float[Array, " unknowns"]) -> Array | tuple[Array, ...]:
+    def tangent(self, y: Float[Array, " unknowns"], loads: Any = None) -> Array | tuple[Array, ...]:
         """The Jacobian nearly, from linearised effects: what Newton's iteration needs."""
         return self.jacobian(y, exact=False)
 

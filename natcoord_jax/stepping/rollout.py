@@ -121,14 +121,17 @@ def _trip(setting: Setting, unpack: Callable[[Array], State], carried: Carried) 
 
     def renewed(carry: tuple) -> tuple:
         _, it, factors = carry
-        matrix = equations.tangent(it.y) if probe is None else probe.columns[:-1].T
-        factors = factors_of(equations, setting.form, matrix, factors.noise)
+        if probe is not None:
+            made = factors_of(equations, setting.form, probe.columns[:-1].T, factors.noise)
+            return jnp.array(False), refreshed(it), made
+        # Evaluated where the new factors belong, unless these begin anew where the step began.
+        here = jnp.all(it.y == carried.course.it.y)
+        loads = jax.tree.map(lambda x: jnp.where(here, x, 0.0), found.loads)
+        factors = factors_of(equations, setting.form, equations.tangent(it.y, loads), factors.noise)
         it = refreshed(it)
-        if probe is None:
-            # The residual is at hand: what it asks for with the new factors needs no evaluation.
-            moved = judge(factors, plan.tolerance, it, found.residual, found.size, **options)
-            it = jax.tree.map(partial(jnp.where, it.unsolved), moved, it)
-        return jnp.array(False), it, factors
+        # What the residual asks for with new factors needs no evaluation.
+        moved = judge(factors, plan.tolerance, it, found.residual, found.size, **options)
+        return jnp.array(False), jax.tree.map(partial(jnp.where, here & it.unsolved), moved, it), factors
 
     _, it, factors = jax.lax.while_loop(lambda carry: carry[0], renewed, (wanting, after.it, factors))
     after = eqx.tree_at(lambda c: c.it, after, it)
