@@ -21,7 +21,6 @@ from natcoord_jax.assembly.equations import prepare
 from natcoord_jax.assembly.reduced import ReducedStep
 from natcoord_jax.maths.collocation import gauss
 from natcoord_jax.stepping import rewriting
-from natcoord_jax.stepping.factorise import FACTORISATIONS, differentiable_solver
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "natcoord_jax" / "effects"
@@ -288,9 +287,9 @@ def test_blocks_along_the_tree_are_the_jacobian(stages):
         if form == "reduced":
             return same, []
         matrix = equations.jacobian(y)
-        factors, inertias = FACTORISATIONS[form](equations, matrix)
+        factors, inertias = equations.factorised(matrix)
         diagonal = jnp.where(inertias > 0, jnp.abs(jnp.diagonal(exact)), 0.0)
-        solved = differentiable_solver(equations, matrix).solve(exact @ y)
+        solved = equations.differentiable(matrix).solve(exact @ y)
         errors = solved - y, factors.transpose().solve(exact.T @ y) - y, diagonal - inertias
         return same, errors
 

@@ -22,16 +22,16 @@ FORMS: dict[str, Any] = {
 }
 
 
-def form_of(system: System, tableau: Tableau) -> str:
+def kind_of(system: System, tableau: Tableau) -> Any:
     """The form in which a scheme is solved: that chosen at compile, if its equations are separable."""
-    return system.structure.solver if tableau.separable else "reduced"
+    return FORMS[system.structure.solver if tableau.separable else "reduced"]
 
 
 def prepare(
     system: System, state: State, u: Array, h: Array, tableau: Tableau, outset: Outset | None = None
 ) -> Any:
     """The equations of one step, in the form of the scheme; what is known of its start may be given."""
-    return FORMS[form_of(system, tableau)].prepare(system, state, u, h, tableau, outset)
+    return kind_of(system, tableau).prepare(system, state, u, h, tableau, outset)
 
 
 def starting(
@@ -42,4 +42,4 @@ def starting(
     later: bool = False,
 ) -> Outset:
     """What the equations of a step that starts from a state need of it, see `Outset.of`."""
-    return FORMS[form_of(system, tableau)].starting(system, state, tableau, tangents, later)
+    return kind_of(system, tableau).starting(system, state, tableau, tangents, later)

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.diagnostics import rows_with_ground
+from natcoord_jax.assembly.form import Form
 from natcoord_jax.assembly.kick import kicked
 from natcoord_jax.assembly.local import body_balance, body_motion, jacobians
 from natcoord_jax.assembly.momentum import momentum_balance
@@ -36,7 +37,7 @@ from natcoord_jax.maths.projectors import range_projector
 from natcoord_jax.maths.vectors import cross
 
 
-class FullStep(eqx.Module):
+class FullStep(Form):
     """One step with multipliers for every joint: all that does not depend on the unknowns."""
 
     system: System

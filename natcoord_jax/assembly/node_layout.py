@@ -1,6 +1,7 @@
 """Where the unknowns of a step sit in the nodes of the tree."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -80,3 +81,18 @@ class NodeLayout(eqx.Module):
                 parts.append(jnp.swapaxes(own, 1, 2).reshape(-1))
                 position += n * m
         return jnp.concatenate(parts)
+
+
+class ByNode(eqx.Module):
+    """A solver on nodes of a tree, for flat vectors."""
+
+    layout: NodeLayout
+    solver: Any
+
+    def solve(self, right: Float[Array, " unknowns"]) -> Float[Array, " unknowns"]:
+        """Solution for a flat right-hand side."""
+        return self.layout.flat(self.solver.solve(self.layout.nodes(right)))
+
+    def transpose(self) -> "ByNode":
+        """Solver of the transposed matrix."""
+        return ByNode(self.layout, self.solver.transpose())

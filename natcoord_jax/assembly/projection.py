@@ -4,11 +4,11 @@ Positions: a step of unit size from rest, 2 M V = G(q_mid)^T lambda with g(q_0) 
 quadratic constraints is g(q_1) = 0. Velocities: a step of size zero, 2 M (V - v_0) = G^T lambda, G V = 0.
 """
 
-import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.diagnostics import joint_residuals
+from natcoord_jax.assembly.form import Form
 from natcoord_jax.assembly.full import FullStep
 from natcoord_jax.assembly.system import System
 from natcoord_jax.core.effect import replace_fields
@@ -28,7 +28,7 @@ def constraints_only(system: System) -> System:
     return replace_fields(system, effects=relations, mass=mass)
 
 
-class Projection(eqx.Module):
+class Projection(Form):
     """Equations of a projection; same interface as the equations of a step."""
 
     step: FullStep

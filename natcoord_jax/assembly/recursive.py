@@ -22,12 +22,14 @@ from natcoord_jax.assembly.effect_blocks import (
 from natcoord_jax.assembly.joint_blocks import joint_blocks, rooted_blocks
 from natcoord_jax.assembly.local import jacobians
 from natcoord_jax.assembly.momentum import momentum_balance
-from natcoord_jax.assembly.node_layout import NodeLayout, unknowns_of_slots
+from natcoord_jax.assembly.node_layout import ByNode, NodeLayout, unknowns_of_slots
 from natcoord_jax.assembly.node_sweeps import Geometry, hinging, load_nodes, on_slots, sweep_nodes
 from natcoord_jax.assembly.reduced import ReducedStep
 from natcoord_jax.assembly.response import Stations, no_multipliers
 from natcoord_jax.assembly.system import Elimination
 from natcoord_jax.assembly.tree import TreeMotion, gather_slots
+from natcoord_jax.linsolve import neighbours
+from natcoord_jax.linsolve import tree as tree_solver
 from natcoord_jax.maths.collocation import rotate_stages
 from natcoord_jax.maths.components import products
 
@@ -38,6 +40,10 @@ and nothing has multipliers, those of `linsolve.neighbours`."""
 
 class RecursiveStep(ReducedStep):
     """One step on an open tree of bodies."""
+
+    by_differences = False
+    by_formulas = True
+    renewal = 8
 
     @property
     def elimination(self) -> Elimination:
@@ -102,6 +108,28 @@ class RecursiveStep(ReducedStep):
             loads: of the equations evaluated there, see `Evaluation.loads`; None: they are evaluated.
         """
         return self.jacobian(y, exact=False, loads=loads)
+
+    def factorised(self, matrix: Blocks) -> tuple[ByNode, Float[Array, " unknowns"]]:
+        """Factors along the tree, and the inertias of the unknowns (0 for multipliers)."""
+        blocks, factor = self._by_node(matrix)
+        factors, diagonal = factor(blocks)
+        inertias = self.layout.flat(jnp.abs(diagonal)).at[self.balances :].set(0.0)
+        return ByNode(self.layout, factors), inertias
+
+    def differentiable(self, matrix: Blocks) -> ByNode:
+        """The same, refined and differentiable."""
+        blocks, factor = self._by_node(matrix)
+        return ByNode(self.layout, tree_solver.RefinedSolver(blocks, factor(blocks)[0]))
+
+    def _by_node(self, matrix: Blocks) -> tuple[Any, Any]:
+        """A matrix in blocks, by what couples its nodes, and its factorisation."""
+        following = jnp.asarray(self.system.tree.neighbour)
+        if self._alone:
+            own, above, below = matrix
+            return neighbours.NeighbourBlocks(own, above, below, following), neighbours.factor
+        own, spread, gather, rest = matrix
+        blocks = tree_solver.TreeBlocks(own, spread, gather, rest, following, self.layout.rates)
+        return blocks, tree_solver.factor
 
     def _between_neighbours(
         self, at: Stations, multipliers: list[Array], joints: tuple, exact: bool

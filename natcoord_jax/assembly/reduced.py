@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.dissipation import Damped, Damping
+from natcoord_jax.assembly.form import Form
 from natcoord_jax.assembly.kick import kicked
 from natcoord_jax.assembly.momentum import momentum_balance
 from natcoord_jax.assembly.outset import Outset
@@ -74,8 +75,10 @@ def at_rest(step: Any) -> Any:
     )
 
 
-class ReducedStep(eqx.Module):
+class ReducedStep(Form):
     """One step in the joint null space: all that does not depend on the unknowns, and the equations."""
+
+    by_differences = True
 
     system: System
     state: State

@@ -7,6 +7,7 @@ of the deepest of its bodies. With more than one stage the Jacobian is a dense m
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -14,12 +15,37 @@ from jaxtyping import Array, Float
 from natcoord_jax.assembly.full import FullStep
 from natcoord_jax.assembly.local import jacobians
 from natcoord_jax.assembly.system import Group, System
+from natcoord_jax.linsolve.blocks import BlockMatrix
+from natcoord_jax.linsolve.saddle import inertias_of, regularised
+from natcoord_jax.linsolve.sparse import SparseSolver, factorised
 
 RATES = 6  # of a body
 
 
 class SparseStep(FullStep):
     """One step with multipliers for every joint and a sparse Jacobian."""
+
+    by_formulas = True
+
+    def factorised(self, matrix: Any) -> tuple[Any, Float[Array, " unknowns"]]:
+        """Factors of a sparse matrix, of a dense one with several stages, and inertias of the unknowns."""
+        if self.tableau.stages > 1:
+            return super().factorised(matrix)
+        whole = self._assembled(matrix)
+        inertias = inertias_of(whole, self.balances)
+        return factorised(self.system.sparsity.plan, regularised(whole, inertias)), inertias
+
+    def differentiable(self, matrix: Any) -> Any:
+        """The same, refined and differentiable."""
+        if self.tableau.stages > 1:
+            return super().differentiable(matrix)
+        factors = jax.lax.stop_gradient(self.factorised(matrix)[0])
+        return SparseSolver(self._assembled(matrix), factors, rounds=2)
+
+    def _assembled(self, matrix: tuple[Array, ...]) -> BlockMatrix:
+        """The sparse matrix of element matrices."""
+        sparsity: Any = self.system.sparsity
+        return sparsity.pattern.assemble(*matrix)
 
     def tangent(self, y: Float[Array, " unknowns"], loads: Any = None) -> Array | tuple[Array, ...]:
         """The Jacobian nearly, from linearised effects: what Newton's iteration needs."""

@@ -9,13 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from natcoord_jax.assembly.equations import form_of, prepare, starting
+from natcoord_jax.assembly.equations import prepare, starting
 from natcoord_jax.assembly.system import System
 from natcoord_jax.core.compiled import quickly
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import gauss
-from natcoord_jax.stepping.factorise import FACTORISATIONS
 from natcoord_jax.stepping.step import end_of_step
 
 MIDPOINT = gauss(1)
@@ -77,7 +76,7 @@ class _Step(eqx.Module):
     def solver(self, y: Array, u: Array) -> Any:
         """Factors of the Jacobian with respect to the unknowns, in the form chosen at compile."""
         equations = self.equations(u)
-        return FACTORISATIONS[form_of(self.system, MIDPOINT)](equations, equations.jacobian(y))[0]
+        return equations.factorised(equations.jacobian(y))[0]
 
     def trip(self, search: _Search) -> _Search:
         """One correction: inputs change so that with what follows from them the path is met."""

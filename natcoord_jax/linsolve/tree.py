@@ -32,7 +32,7 @@ def transposed(matrices: Float[Array, "*n r c"]) -> Float[Array, "*n c r"]:
     return jnp.swapaxes(matrices, -1, -2)
 
 
-def product(a: Float[Array, "*n r k"], b: Float[Array, "*n k c"]) -> Float[Array, "*n r c"]:
+def product(a: Float[Array, "*#n r k"], b: Float[Array, "*#n k c"]) -> Float[Array, "*n r c"]:
     """Products of matrices, as sums."""
     return jnp.sum(a[..., :, :, None] * b[..., None, :, :], axis=-2)
 

@@ -16,7 +16,6 @@ from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.results import REASONS, Result, SimulationError
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.rotations import orthonormalise
-from natcoord_jax.stepping.factorise import dense_differentiable
 from natcoord_jax.stepping.newton import newton
 
 TOLERANCE = 1e-14
@@ -26,7 +25,7 @@ TOLERANCE = 1e-14
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _solve(make: Any, system: System, state: State) -> tuple[Array, Array]:
     """Unknowns and result code of a projection, differentiated implicitly."""
-    return newton(make(system, state), TOLERANCE, "full")
+    return newton(make(system, state), TOLERANCE)
 
 
 @_solve.defjvp
@@ -34,7 +33,7 @@ def _solve_jvp(make: Any, primals: tuple, tangents: tuple):
     y, code = _solve(make, *primals)
     moved = jax.jvp(lambda *args: make(*args).residual(y)[0], primals, tangents)[1]
     equations = make(*primals)
-    y_dot = -dense_differentiable(equations, equations.jacobian(y)).solve(moved)
+    y_dot = -equations.differentiable(equations.jacobian(y)).solve(moved)
     return (y, code), (y_dot, jnp.zeros(code.shape, jax.dtypes.float0))
 
 

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from natcoord_jax.assembly.equations import form_of, prepare
+from natcoord_jax.assembly.equations import prepare
 from natcoord_jax.assembly.outset import Outset
 from natcoord_jax.assembly.system import System
 from natcoord_jax.core.results import Result
@@ -95,11 +95,6 @@ class Setting(eqx.Module):
         u = self.plan.inputs(self.parameters, index, course.state, course.done, course.fraction)
         return u, h, index
 
-    @property
-    def form(self) -> str:
-        """Form of the equations."""
-        return form_of(self.system, self.plan.tableau)
-
 
 def start_of(setting: Setting, state: State) -> tuple[Course, Factors, Outset]:
     """The first attempt, factors that are none, and what is known of the first state."""
@@ -107,7 +102,7 @@ def start_of(setting: Setting, state: State) -> tuple[Course, Factors, Outset]:
     u = plan.inputs(setting.parameters, jnp.array(0), state, jnp.zeros(()), jnp.ones(()))
     equations = prepare(setting.system, state, u, dt, plan.tableau)
     few = setting.tolerance is not None
-    it, factors = begin(equations.guess(), few), no_factors(equations, setting.form)
+    it, factors = begin(equations.guess(), few), no_factors(equations)
     zero, nought = jnp.array(0), jnp.zeros((), state.q.dtype)
     bad = ~(jnp.isfinite(dt) & (dt > 0))
     course = Course(

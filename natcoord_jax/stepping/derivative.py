@@ -20,17 +20,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from natcoord_jax.assembly.equations import form_of, prepare
+from natcoord_jax.assembly.equations import kind_of, prepare
 from natcoord_jax.assembly.system import System
 from natcoord_jax.core.state import State
 from natcoord_jax.stepping import linear_pair
 from natcoord_jax.stepping.correcting import Correcting
 from natcoord_jax.stepping.error_control import Tolerance
-from natcoord_jax.stepping.newton import PATIENCE, RENEWALS, Factors, any_lane, factors_of
+from natcoord_jax.stepping.newton import Factors, any_lane, factors_of
 from natcoord_jax.stepping.one_kernel import as_one_kernel, in_groups
 from natcoord_jax.stepping.past import Past
 from natcoord_jax.stepping.plan import Plan, Slots
-from natcoord_jax.stepping.probe import BY_DIFFERENCES, jacobian_by_differences
+from natcoord_jax.stepping.probe import jacobian_by_differences
 from natcoord_jax.stepping.rollout import Ending, run
 from natcoord_jax.stepping.step import advance, linear_solver
 
@@ -242,8 +242,7 @@ class Rule:
             at = at.judged(factors, lam, change, patience)
             return jnp.where(at.moving, lam - change, lam), tuple(bars), factors, at
 
-        form = numbers.whole(numbers.varied)[0].structure.solver
-        patience = RENEWALS.get(form, PATIENCE)
+        patience = kind_of(numbers.whole(numbers.varied)[0], self.tableau).renewal
         lam = jnp.where(jnp.all(jnp.isfinite(guess)), guess, 0.0)
         nothing = jax.tree.map(jnp.zeros_like, (numbers.varied, slot.before, slot.u))
         at = Correcting.first(slot.accepted, lam.dtype)
@@ -261,10 +260,9 @@ class Rule:
             system, parameters, dt = numbers.whole(numbers.varied)
             u = self._inputs(parameters, slot, slot.before) if slot.u is None else slot.u
             equations = prepare(system, slot.before, u, slot.fraction * dt, self.tableau)
-            form = form_of(system, self.tableau)
-            if form not in BY_DIFFERENCES:
-                return factors_of(equations, form, equations.tangent(slot.y))
-            return factors_of(equations, form, jacobian_by_differences(equations, slot.y))
+            if equations.by_differences:
+                return factors_of(equations, jacobian_by_differences(equations, slot.y))
+            return factors_of(equations, equations.tangent(slot.y))
 
         return jnp.array(False), kernel(renewed, numbers, slot), carry[2].refreshed()
 

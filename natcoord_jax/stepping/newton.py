@@ -17,7 +17,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from natcoord_jax.core.results import Result
-from natcoord_jax.stepping.factorise import FACTORISATIONS
 
 TOLERANCE = 1e-16
 """Predicted error after the last correction, relative to the terms of the equations (energy norm).
@@ -61,12 +60,6 @@ FEW_ROUNDS = 4
 
 SLOWEST_UNSEEN = 0.02
 """Contraction assumed at least: a slow part of the error may hide behind fast ones in the first ratio."""
-
-PATIENCE = 6
-"""Corrections that are cheaper than a new Jacobian."""
-
-RENEWALS = {"recursive": 8}
-"""The same by form of the equations, where it differs: a tree is seldom small, and cheap to evaluate."""
 
 NEVER = 1000
 """More corrections than a step can need."""
@@ -184,18 +177,18 @@ def begin(y: Float[Array, " unknowns"], few: bool = False) -> Iterate:
     return Iterate(y, y, nought, zero, zero, nought, nought, nought, most, no, no, no, jnp.array(True))
 
 
-def no_factors(equations: Any, form: str) -> Factors:
+def no_factors(equations: Any) -> Factors:
     """The shapes of factors, and none usable."""
     y = equations.guess()
-    shapes = jax.eval_shape(lambda y: FACTORISATIONS[form](equations, equations.tangent(y)), y)
+    shapes = jax.eval_shape(lambda y: equations.factorised(equations.tangent(y)), y)
     solver, inertias = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
     no, noise = jnp.array(False), jnp.zeros((), y.dtype)
     return Factors(solver, inertias, no, no, jnp.array(NEVER), jnp.array(0), noise)
 
 
-def factors_of(equations: Any, form: str, matrix: Any, noise: Array | float = 0.0) -> Factors:
+def factors_of(equations: Any, matrix: Any, noise: Array | float = 0.0) -> Factors:
     """Factors of a Jacobian."""
-    solver, inertias = FACTORISATIONS[form](equations, matrix)
+    solver, inertias = equations.factorised(matrix)
     yes, noise = jnp.array(True), jnp.asarray(noise, inertias.dtype)
     return Factors(solver, inertias, yes, yes, jnp.array(NEVER), jnp.array(0), noise)
 
@@ -230,7 +223,7 @@ def judge(
         size: of their terms.
         balances: whether the residual itself counts, too. An error of multipliers alone moves nothing, but
             shows in the balances, and in the work of drives.
-        patience: see `PATIENCE`.
+        patience: corrections that are cheaper than a new Jacobian.
 
     Returns:
         Converged; or moved by one correction; or in want of new factors, when corrections shrink too slowly
@@ -280,20 +273,19 @@ def judge(
     return jax.tree.map(lambda old, new: jnp.where(done, old, new), it, following)
 
 
-def newton(equations: Any, tolerance: float, form: str) -> tuple[Float[Array, " unknowns"], Int[Array, ""]]:
+def newton(equations: Any, tolerance: float) -> tuple[Float[Array, " unknowns"], Int[Array, ""]]:
     """Solve equations from their own guess, with their Jacobian formed anew whenever it is needed.
 
     Args:
-        equations: with `guess`, `residual` and `tangent`.
+        equations: see `natcoord_jax.assembly.form`.
         tolerance: see `TOLERANCE`.
-        form: form of the equations, which decides the factorisation.
 
     Returns:
         The unknowns and the result code.
     """
 
     def renew(it: Iterate, factors: Factors) -> tuple[Iterate, Factors]:
-        return refreshed(it), factors_of(equations, form, equations.tangent(it.y), factors.noise)
+        return refreshed(it), factors_of(equations, equations.tangent(it.y), factors.noise)
 
     def keep(it: Iterate, factors: Factors) -> tuple[Iterate, Factors]:
         return it, factors
@@ -301,13 +293,11 @@ def newton(equations: Any, tolerance: float, form: str) -> tuple[Float[Array, " 
     def trip(carry: tuple[Iterate, Factors]) -> tuple[Iterate, Factors]:
         it, factors = jax.lax.cond(any_lane(carry[0].wanting), renew, keep, *carry)
         return judge(
-            factors, tolerance, it, *equations.residual(it.y), balances=True, patience=PATIENCE
+            factors, tolerance, it, *equations.residual(it.y), balances=True, patience=equations.renewal
         ), factors
 
     with jax.named_scope("newton"):
         start = begin(equations.guess())
         start = eqx.tree_at(lambda it: it.wanting, start, jnp.array(True))
-        it, _ = jax.lax.while_loop(
-            lambda c: any_lane(c[0].unsolved), trip, (start, no_factors(equations, form))
-        )
+        it, _ = jax.lax.while_loop(lambda c: any_lane(c[0].unsolved), trip, (start, no_factors(equations)))
     return it.y, it.code

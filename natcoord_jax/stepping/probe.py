@@ -7,9 +7,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-BY_DIFFERENCES = ("reduced",)
-"""Forms whose Jacobian is formed by differences; others have formulas for it."""
-
 
 class Probe(eqx.Module):
     """A Jacobian in the making, by differences; the same in all lanes but for its numbers.

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
-from natcoord_jax.assembly.equations import prepare, starting
+from natcoord_jax.assembly.equations import kind_of, prepare, starting
 from natcoord_jax.assembly.kick import Kick
 from natcoord_jax.assembly.outset import Outset
 from natcoord_jax.assembly.system import System
@@ -26,10 +26,10 @@ from natcoord_jax.core.state import State
 from natcoord_jax.maths.rows import row, with_row
 from natcoord_jax.stepping.course import Course, Setting, after_attempt, start_of
 from natcoord_jax.stepping.error_control import Tolerance
-from natcoord_jax.stepping.newton import PATIENCE, RENEWALS, Factors, any_lane, factors_of, judge, refreshed
+from natcoord_jax.stepping.newton import Factors, any_lane, factors_of, judge, refreshed
 from natcoord_jax.stepping.one_kernel import as_one_kernel
 from natcoord_jax.stepping.plan import Plan, Slots
-from natcoord_jax.stepping.probe import BY_DIFFERENCES, Probe
+from natcoord_jax.stepping.probe import Probe
 from natcoord_jax.stepping.step import end_of_step
 
 ATTEMPTS = 2
@@ -68,7 +68,7 @@ def _trip(setting: Setting, unpack: Callable[[Array], State], carried: Carried) 
     found = equations.evaluate(it.y if probe is None else probe.moved(it.y, equations))
     probing = jnp.array(False) if probe is None else probe.at >= 0
     driven = any(group.multipliers and group.effect.works for group in equations.groups)
-    cost = RENEWALS.get(setting.form, PATIENCE) if probe is None else max(PATIENCE, it.y.shape[0] // 2)
+    cost = equations.renewal if probe is None else max(equations.renewal, it.y.shape[0] // 2)
     options = {"balances": driven, "patience": cost}
     judged = judge(factors, plan.tolerance, it, found.residual, found.size, **options)
     it = jax.tree.map(partial(jnp.where, probing), it, judged)
@@ -122,12 +122,12 @@ def _trip(setting: Setting, unpack: Callable[[Array], State], carried: Carried) 
     def renewed(carry: tuple) -> tuple:
         _, it, factors = carry
         if probe is not None:
-            made = factors_of(equations, setting.form, probe.columns[:-1].T, factors.noise)
+            made = factors_of(equations, probe.columns[:-1].T, factors.noise)
             return jnp.array(False), refreshed(it), made
         # Evaluated where the new factors belong, unless these begin anew where the step began.
         here = jnp.all(it.y == carried.course.it.y)
         loads = jax.tree.map(lambda x: jnp.where(here, x, 0.0), found.loads)
-        factors = factors_of(equations, setting.form, equations.tangent(it.y, loads), factors.noise)
+        factors = factors_of(equations, equations.tangent(it.y, loads), factors.noise)
         it = refreshed(it)
         # What the residual asks for with new factors needs no evaluation.
         moved = judge(factors, plan.tolerance, it, found.residual, found.size, **options)
@@ -235,15 +235,16 @@ def _run(setting: Setting, state: State) -> tuple[Carried, Callable[[Array], Sta
 
     def every_slot(course: Course, factors: Factors, outset: Outset, x: Array) -> Carried:
         it = course.it
-        probe = Probe.first(it.y.shape[0], x.dtype) if setting.form in BY_DIFFERENCES else None
+        by_differences = kind_of(setting.system, plan.tableau).by_differences
+        probe = Probe.first(it.y.shape[0], x.dtype) if by_differences else None
         slot = x, it.y, course.step, course.fraction, course.done, course.stopped, course.step
         # A row beyond the last goes to the last.
         rows = length if plan.recorded else 1
         record = tuple(jnp.zeros((rows, *x.shape), x.dtype) for x in slot)
-        if plan.tableau.stages > 1 and setting.form in BY_DIFFERENCES:
+        if plan.tableau.stages > 1 and by_differences:
             u, h, _ = setting.situation(_with_state(course, unpack(x)))
             equations = prepare(setting.system, unpack(x), u, h, plan.tableau, outset)
-            factors = factors_of(equations, setting.form, equations.inertial_jacobian())
+            factors = factors_of(equations, equations.inertial_jacobian())
             factors = eqx.tree_at(lambda f: f.fresh, factors, jnp.array(False))
         start = Carried(jnp.array(0), course, x, outset, factors, probe, record)
         return jax.lax.while_loop(unfinished, partial(_trip, setting, unpack), start)

@@ -9,16 +9,13 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.coordinates import stage_rates
 from natcoord_jax.assembly.end_impulses import released
-from natcoord_jax.assembly.equations import form_of, prepare, starting
+from natcoord_jax.assembly.equations import prepare, starting
+from natcoord_jax.assembly.form import dense_solver
 from natcoord_jax.assembly.kick import ends_of
 from natcoord_jax.assembly.response import Evaluation
 from natcoord_jax.assembly.system import Group, System
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import Tableau
-from natcoord_jax.stepping.factorise import dense_differentiable, differentiable_solver
-
-EXACT_JACOBIAN = ("recursive", "sparse")
-"""Forms whose own Jacobian is taken for derivatives, too; those of others are dense anyway."""
 
 
 def advance(
@@ -117,8 +114,8 @@ def linear_solver(
         along: linear map of (state, unknowns) to (residual, state at the end), for dense Jacobians.
     """
     equations = prepare(system, state, u, h, tableau)
-    if form_of(system, tableau) in EXACT_JACOBIAN and not tableau.kick:
-        return differentiable_solver(equations, equations.jacobian(y))
+    if equations.by_formulas and not tableau.kick:
+        return equations.differentiable(equations.jacobian(y))
     at_rest = jax.tree.map(jnp.zeros_like, state)
     columns = jax.vmap(lambda unit: along(at_rest, unit)[0], out_axes=1)(jnp.eye(y.shape[0], dtype=y.dtype))
-    return dense_differentiable(equations, columns)
+    return dense_solver(equations, columns)
