@@ -17,7 +17,7 @@ from natcoord_jax.stepping.newton import Factors, Iterate, begin, no_factors
 from natcoord_jax.stepping.past import Past
 from natcoord_jax.stepping.plan import Plan
 
-SMALLEST_FRACTION = 1.0 / 4096
+SMALLEST_FRACTION = 1.0 / 2**16
 """A step is given up when a substep of this fraction of it fails, if slots have not run out before."""
 
 LARGEST_HALF_TURN = 10.0

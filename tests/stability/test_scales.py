@@ -60,22 +60,21 @@ REGULARISED = pytest.mark.xfail(
 pytestmark = pytest.mark.slow
 
 
-def extreme(form: str, ratio: float):
-    """Marks of a case: what keeps its multipliers is slow, and ends at a ratio of some 1e4."""
-    if form == "tree":
-        return []
-    return [pytest.mark.slow] + [REGULARISED] * (ratio in (1e-8, 1e8))
+def extreme(order: int, form: str, ratio: float):
+    """Marks of a case: what keeps its multipliers ends at ratios of some 1e4, light ends at order 2 apart."""
+    ends = form == "multipliers" and (ratio == 1e8 or (ratio == 1e-8 and order == 4))
+    return [REGULARISED] * ends
 
 
 @pytest.mark.parametrize(
-    ("form", "ratio"),
+    ("order", "form", "ratio"),
     [
-        pytest.param(form, ratio, marks=extreme(form, ratio))
+        pytest.param(order, form, ratio, marks=extreme(order, form, ratio))
+        for order in (2, 4)
         for form in ("tree", "multipliers")
         for ratio in RATIOS
     ],
 )
-@SECOND_AND_FOURTH
 def test_mass_ratios(order, form, ratio):
     """Masses from 1 to 1e8 or 1e-8 along five links in a tree, to 1e4 or 1e-4 with multipliers."""
     system, state = ladder(ratio, nc.Revolute if form == "tree" else Looped)
@@ -156,10 +155,11 @@ def beads(ratio: float):
 def test_point_masses(order, ratio):
     """Three beads on strings with masses up to 1e8 apart; angular momentum about the vertical is kept.
 
-    The light bead between heavy ones snaps at 1e4 rad/s when they pull it straight: substeps of 1/500 see it.
+    The light bead between heavy ones snaps when they pull it straight, the faster the straighter: at 1e4
+    rad/s, which substeps of 1/500 see, and now and then much faster, which takes many more.
     """
     system, state = beads(ratio)
-    found = account(system, simulate(system, state, order=order, dt=1e-3, steps=1000, extra_substeps=2000))
+    found = account(system, simulate(system, state, order=order, dt=1e-3, steps=1000, extra_substeps=20_000))
     assert found.exchanged()["kinetic"] >= 0.2
     assert found.energy_error <= tol.ENERGY
     assert found.spin_error(axes=[2]) <= tol.ANGULAR_MOMENTUM
