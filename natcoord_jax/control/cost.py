@@ -120,15 +120,17 @@ class Missed(Cost):
     Attributes:
         goal: see `natcoord_jax.control.goal`.
         weight: at the end.
-        rate: weight of the integral [1/s].
+        rate: weight of the integral [1/s]; none: there is no integral, and it costs nothing.
     """
 
     goal: Any
     weight: Any = 1.0
-    rate: Any = 0.0
+    rate: Any = None
 
     def running(self, system: System, state: State, u: Array, t: Array) -> Float[Array, ""]:
         """Weighted square of what is missing."""
+        if self.rate is None:
+            return jnp.zeros(())
         return self.rate * jnp.sum(self.goal.residual(system, state) ** 2)
 
     def terminal(self, system: System, state: State) -> Float[Array, ""]:

@@ -124,31 +124,44 @@ def scored_end(problem: OptimalControl, multipliers: Multipliers, node: Node) ->
     return found.cost + multipliers.goal @ found.missing + multipliers.end @ found.excess
 
 
-Through = Callable[[Array], tuple[Array, Array, Array]]
+Through = Callable[[Array, Array], tuple[Array, Array, Array]]
 
 
-def backward(
-    problem: OptimalControl, at: Slice, node: Node, w: Array, y: Array, sigma: Array, jacobian: Jacobians
+def through_step(
+    problem: OptimalControl, at: Slice, node: Node, w: Array, y: Array, jacobian: Jacobians
 ) -> Through:
-    """One step back, from the worth of the node after it as one vector.
+    """One step back, the adjoint of its linearised equations.
 
     Returns:
-        A function to the worth of the node before it, the gradient in what enters, and the residual's worth.
+        A function of the worth of the node after it, as one vector, and of a slope in the unknowns y, to the
+        worth of the node before it, the slope in what enters, and the residual's worth.
     """
     flat, unflat = ravel_pytree(node)
 
-    def rest(node: Array, w: Array, y: Array) -> tuple[Array, Array, Array]:
-        found = stage(problem, at, unflat(node), w, y)
-        return found.cost, found.excess, ravel_pytree(found.after)[0]
+    def reached(node: Array, w: Array, y: Array) -> Array:
+        return ravel_pytree(stage(problem, at, unflat(node), w, y).after)[0]
 
-    pull = jax.vjp(rest, flat, w, y)[1]
+    pull = jax.vjp(reached, flat, w, y)[1]
 
-    def through(after: Array) -> tuple[Array, Array, Array]:
-        before, by_w, by_y = pull((jnp.ones(()), sigma, after))
-        worth = -(by_y @ jacobian.inverses)
+    def through(after: Array, slope: Array) -> tuple[Array, Array, Array]:
+        before, by_w, by_y = pull(after)
+        worth = -((by_y + slope) @ jacobian.inverses)
         return before + worth @ jacobian.by_node, by_w + worth @ jacobian.by_w, worth
 
     return through
+
+
+def direct_slopes(
+    problem: OptimalControl, at: Slice, node: Node, w: Array, y: Array, sigma: Array
+) -> tuple[Array, Array, Array]:
+    """Slopes of a step's own cost and weighted excesses: in the node before it, as one vector, in w and y."""
+    flat, unflat = ravel_pytree(node)
+
+    def value(node: Array, w: Array, y: Array) -> Array:
+        found = stage(problem, at, unflat(node), w, y)
+        return found.cost + sigma @ found.excess
+
+    return jax.grad(value, argnums=(0, 1, 2))(flat, w, y)
 
 
 def costates(
@@ -169,7 +182,7 @@ def costates(
     last, unflat = ravel_pytree(final)
 
     def body(after: tuple[Array, Array], given: tuple) -> tuple[tuple[Array, Array], tuple]:
-        at, node, w, y, sigma, jacobian, following, rates, forth, flexibility = given
+        at, node, w, y, slopes, jacobian, following, rates, forth, flexibility = given
 
         worth_left = worth_of_left(unflat(after[1]), forth, flexibility)
 
@@ -179,13 +192,18 @@ def costates(
 
         back = jax.vjp(projected, ravel_pytree(following)[0])[1]
         unprojected = back((after[1], jnp.ones(())))[0]
-        through = backward(problem, at, node, w, y, sigma, jacobian)
-        both, by_w, worth = jax.vmap(through)(jnp.stack([after[0], unprojected]))
-        return (both[0], both[1]), (both, worth, by_w[0])
+        through = through_step(problem, at, node, w, y, jacobian)
+        both, by_w, worth = jax.vmap(through, in_axes=(0, None))(
+            jnp.stack([after[0], unprojected]), slopes[2]
+        )
+        both = both + slopes[0]
+        return (both[0], both[1]), (both, worth, by_w[0] + slopes[1])
 
     before, after = (jax.tree.map(itemgetter(s), path.nodes) for s in (slice(None, -1), slice(1, None)))
     w = entering(problem, unknowns.coefficients)
-    given = (slices(problem), before, w, unknowns.y, multipliers.path, jacobians, after)
+    each = (slices(problem), before, w, unknowns.y)
+    slopes = jax.vmap(partial(direct_slopes, problem))(*each, multipliers.path)
+    given = (*each, slopes, jacobians, after)
     rates = projections(problem, path.nodes, maps)[1:]
     given = (*given, rates, maps.forth[1:], maps.flexibility[1:])
     _, (nodes, residuals, by_w) = jax.lax.scan(body, (last, last), given, reverse=True)

@@ -80,32 +80,24 @@ class Model(eqx.Module):
     z holds changes of the state, of what is free and of the register; w those of entering coefficients.
 
     Attributes:
-        forward: z_k+1 = forward [z_k, w_k] + offset, (steps, z, z + m).
-        offset: from the residuals (steps, z).
+        forward: z_k+1 = forward [z_k, w_k], (steps, z, z + m).
         hessian: of the Lagrangian in [z, w] (steps, z + m, z + m).
-        gradient: linear terms in [z, w] (steps, z + m).
         excess: derivative of the excesses (steps, h, z + m).
-        excess_offset: from the residuals (steps, h).
         last_hessian: of the terminal Lagrangian (z, z).
         goal: derivative of the goal (c, z).
         last_excess: derivative of the terminal excesses (e, z).
         first: z_0 per what is free and leading coefficients (z, f).
         first_hessian: (f, f).
-        first_gradient: (f,).
     """
 
     forward: Float[Array, "*batch steps z zm"]
-    offset: Float[Array, "*batch steps z"]
     hessian: Float[Array, "*batch steps zm zm"]
-    gradient: Float[Array, "*batch steps zm"]
     excess: Float[Array, "*batch steps h zm"]
-    excess_offset: Float[Array, "*batch steps h"]
     last_hessian: Float[Array, "*batch z z"]
     goal: Float[Array, "*batch c z"]
     last_excess: Float[Array, "*batch e z"]
     first: Float[Array, "*batch z f"]
     first_hessian: Float[Array, "*batch f f"]
-    first_gradient: Float[Array, "*batch f"]
 
 
 class Iterate(eqx.Module):
@@ -117,8 +109,9 @@ class Iterate(eqx.Module):
         slacks: room left.
         path: the motion.
         derivatives: first derivatives there.
-        model: the last quadratic model, not necessarily formed there; None: formed anew for every step.
+        model: the last quadratic model, not necessarily formed there.
         kept: how many steps it has served.
+        corrections: solutions of the model that the last step has taken.
         barrier: barrier parameter.
         unit: of the cost.
         shift: last increase of the curvature.
@@ -126,7 +119,6 @@ class Iterate(eqx.Module):
         previous: path and slacks of the iterate before.
         step: length of the last step.
         moved: size of the last step, relative.
-        gain: what the last step left of the errors.
         unreachable: part of the goal that nothing could change.
         iteration: number of steps made.
         newton: Newton iterations of all simulations.
@@ -139,8 +131,9 @@ class Iterate(eqx.Module):
     slacks: Slacks
     path: Path
     derivatives: Derivatives
-    model: Model | None
+    model: Model
     kept: Int[Array, "*batch"]
+    corrections: Int[Array, "*batch"]
     barrier: Float[Array, "*batch"]
     unit: Float[Array, "*batch"]
     shift: Float[Array, "*batch"]
@@ -148,7 +141,6 @@ class Iterate(eqx.Module):
     previous: tuple[Path, Slacks]
     step: Float[Array, "*batch"]
     moved: Float[Array, "*batch"]
-    gain: Float[Array, "*batch"]
     unreachable: Float[Array, "*batch c"]
     iteration: Int[Array, "*batch"]
     newton: Int[Array, "*batch"]

@@ -1,4 +1,4 @@
-"""The quadratic model of a problem around a motion: exact gradients, curvature of the Lagrangian, by step."""
+"""The quadratic model of a problem around a motion: linear dynamics, curvature of the Lagrangian, by step."""
 
 from typing import Any, NamedTuple
 
@@ -17,6 +17,7 @@ from natcoord_jax.control.costates import (
     split_node,
     worth_of_left,
 )
+from natcoord_jax.control.differences import Point, columns, sizes
 from natcoord_jax.control.iterate import Derivatives, Model
 from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.control.transcription import (
@@ -48,7 +49,6 @@ class Step(NamedTuple):
         left: worth of the momenta that the projection leaves out.
         multipliers: of its residual and of its bounds.
         jacobian: of its equations.
-        residual: of its equations.
         forth: from small numbers to the node before it.
         back: to small numbers from the node after it.
         flexibility: inverse inertia of the free motions after it.
@@ -63,48 +63,46 @@ class Step(NamedTuple):
     left: Array
     multipliers: tuple[Array, Array]
     jacobian: Jacobians
-    residual: Array
     forth: Array
     back: Array
     flexibility: Array
 
 
-def _stage_model(problem: OptimalControl, step: Step) -> tuple[Array, ...]:
-    """Derivatives of one step in small numbers: dynamics, curvature, excesses; last column the offset.
+def _stage_model(problem: OptimalControl, scale: Point, step: Step) -> tuple[Array, ...]:
+    """Derivatives of one step in small numbers: dynamics, curvature, excesses.
 
     The rates after the step, its velocities projected, count as unknowns of the step like y, with the
     momenta that they leave out as their residual. The Lagrangian is linear in them.
     """
     flat, unflat = ravel_pytree(step.node)
-    point = (flat, step.w, step.y, step.rates, step.left)
 
-    def lagrangian(chi: Array, w: Array, y: Array, rates: Array, left: Array) -> tuple[Array, tuple]:
+    def lagrangian(chi: Array, w: Array, y: Array, rates: Array, left: Array) -> Array:
         found = stage(problem, step.at, unflat(chi), w, y)
         after, momenta = split_node(problem, found.after, rates, left)
         pairs = zip(jax.tree.leaves(step.worth), jax.tree.leaves(after))
         carried = sum(jnp.sum(a * b) for a, b in pairs) + momenta
         by_residual, by_excess = step.multipliers
-        value = found.cost + carried + by_residual @ found.residual + by_excess @ found.excess
-        return value, (ravel_pytree(found.after)[0], found.excess)
+        return found.cost + carried + by_residual @ found.residual + by_excess @ found.excess
+
+    def reached(chi: Array, w: Array, y: Array) -> tuple[Array, Array]:
+        found = stage(problem, step.at, unflat(chi), w, y)
+        return ravel_pytree(found.after)[0], found.excess
+
+    def slopes(chi: Array, w: Array, y: Array) -> tuple:
+        return jax.grad(lagrangian, argnums=(0, 1, 2, 3, 4))(chi, w, y, step.rates, step.left)
 
     size, channels = flat.size, step.w.size
-    count = step.forth.shape[1] + channels
     directions = jax.scipy.linalg.block_diag(step.forth, jnp.eye(channels, dtype=flat.dtype))
-    directions = jnp.pad(directions, ((0, 0), (0, 1)))
     dchi, dw = directions[:size], directions[size:]
-    moved = step.jacobian.by_node @ dchi + step.jacobian.by_w @ dw
-    dy = -step.jacobian.inverses @ moved.at[:, -1].add(step.residual)
-    slopes = jax.grad(lagrangian, argnums=(0, 1, 2, 3, 4), has_aux=True)
-
-    def along(*d: Array) -> tuple:
-        return jax.jvp(slopes, point, (*d, jnp.zeros_like(step.rates), jnp.zeros_like(step.left)))[1]
-
-    bent, (after, excess) = jax.vmap(along, in_axes=1, out_axes=1)(dchi, dw, dy)
+    dy = -step.jacobian.inverses @ (step.jacobian.by_node @ dchi + step.jacobian.by_w @ dw)
+    point, moved = Point(flat, step.w, step.y), Point(dchi, dw, dy)
+    bent = columns(slopes, point, moved, scale)
+    along = jax.vmap(lambda *d: jax.jvp(reached, tuple(point), d)[1], in_axes=1, out_axes=1)
+    after, excess = along(*moved)
     mixed = (step.flexibility @ bent[4]).T @ bent[3]
     hessian = dchi.T @ bent[0] + dw.T @ bent[1] + dy.T @ bent[2] + mixed + mixed.T
     # The momenta of the step itself: what it carries on normal to the constraints is no part of them.
-    forward = step.back @ after
-    return forward[:, :count], forward[:, count], hessian[:count, :count], hessian[:count, count], excess
+    return step.back @ after, hessian, excess
 
 
 def model(
@@ -129,14 +127,13 @@ def model(
         jax.vmap(worth_of_left)(after, maps.forth[1:], maps.flexibility[1:]),
         (bent.residuals, multipliers.path),
         derivatives.jacobians,
-        path.stages.residual,
         maps.forth[:-1],
         maps.back[1:],
         maps.flexibility[1:],
     )
-    each = _some_together(lambda step: _stage_model(problem, step), steps, problem.steps)
-    forward, offset, hessian, shift, excess = each
-    gradient = shift.at[:, -w.shape[1] :].add(derivatives.by_w)
+    scale = sizes(problem, path, unknowns)
+    each = _some_together(lambda step: _stage_model(problem, scale, step), steps, problem.steps)
+    forward, hessian, excess = each
     last, unflat = ravel_pytree(jax.tree.map(lambda x: x[-1], path.nodes))
     forth = maps.forth[-1]
 
@@ -152,17 +149,13 @@ def model(
     first, first_hessian = _first_model(problem, unknowns, bent, maps)
     return Model(
         forward,
-        offset,
         hessian,
-        gradient,
-        excess[:, :, :-1],
-        excess[:, :, -1],
+        excess,
         forth.T @ curved,
         goal,
         last_excess,
         first,
         first_hessian,
-        derivatives.by_first,
     )
 
 

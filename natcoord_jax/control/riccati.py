@@ -2,8 +2,9 @@
 
 Backward, the value of every node is a quadratic function of its small numbers z and of the changes nu of the
 goal's multipliers; at the first node, what is free and nu follow from one small system; forward, so do all
-entering coefficients. Conditions of the goal that nothing can change, because others imply them or because
-no input reaches them, are found by the eigenvalues of the small system and left out.
+entering coefficients. The quadratic parts are `factored` once and serve any number of linear ones. Conditions
+of the goal that nothing can change, because others imply them or because no input reaches them, are found by
+the eigenvalues of the small system and left out.
 """
 
 from typing import NamedTuple
@@ -33,161 +34,206 @@ class Weighted(NamedTuple):
     end_slope: Float[Array, " e"]
 
 
+class Right(NamedTuple):
+    """Linear terms of the model.
+
+    Attributes:
+        gradient: of the steps, in [z, w] (steps, z + m).
+        last: gradient in the last node (z,).
+        first: gradient in what is free and in leading coefficients (f,).
+        missing: residual of the goal.
+    """
+
+    gradient: Float[Array, "steps zm"]
+    last: Float[Array, " z"]
+    first: Float[Array, " f"]
+    missing: Float[Array, " c"]
+
+
+class Factors(eqx.Module):
+    """Quadratic parts of all nodes' values, z P z / 2 + nu S z - nu T nu / 2, and what follows from them.
+
+    Attributes:
+        forward: z_k+1 from [z_k, w_k] (steps, z, z + m).
+        lower: Cholesky factors of the curvature in w (steps, m, m).
+        gain: feedback of w on z (steps, m, z).
+        by_goal: w per nu (steps, m, c).
+        start: z_0 per what is free (z, f).
+        start_lower: Cholesky factor of the curvature in what is free (f, f).
+        start_by_goal: what is free per nu (f, c).
+        compliance: the goal's compliance T: its residual per multiplier (c, c).
+        goal_scale: units in which T is decomposed; 0 for conditions that nothing moves (c,).
+        goal_vectors: eigenvectors of T in these units (c, c).
+        goal_inverse: inverses of its eigenvalues; 0 for those that count as zero (c,).
+        added: curvature added to that in entering coefficients, and to that in what is free (f,).
+        convex: whether the model is convex where it has to be.
+    """
+
+    forward: Float[Array, "steps z zm"]
+    lower: Float[Array, "steps m m"]
+    gain: Float[Array, "steps m z"]
+    by_goal: Float[Array, "steps m c"]
+    start: Float[Array, "z f"]
+    start_lower: Float[Array, "f f"]
+    start_by_goal: Float[Array, "f c"]
+    compliance: Float[Array, "c c"]
+    goal_scale: Float[Array, " c"]
+    goal_vectors: Float[Array, "c c"]
+    goal_inverse: Float[Array, " c"]
+    added: tuple[Float[Array, ""], Float[Array, " f"]]
+    convex: Bool[Array, ""]
+
+
 class Move(eqx.Module):
-    """The solution of the quadratic model.
+    """A solution of the quadratic model.
 
     Attributes:
         w: changes of entering coefficients (steps, m).
         first: changes of what is free and of leading coefficients.
         goal: changes of the goal's multipliers.
         z: changes of all nodes in small numbers (steps + 1, z).
-        gain: feedback of w on z (steps, m, z).
-        convex: whether the model is convex where it has to be.
-        unreachable: part of the goal's residual that nothing can change.
-        compliance: the goal's compliance: its residual per multiplier.
     """
 
     w: Float[Array, "steps m"]
     first: Float[Array, " f"]
     goal: Float[Array, " c"]
     z: Float[Array, "k z"]
-    gain: Float[Array, "steps m z"]
-    convex: Bool[Array, ""]
-    unreachable: Float[Array, " c"]
-    compliance: Float[Array, "c c"]
-
-
-class _Value(NamedTuple):
-    """z P z / 2 + (p + S nu) z - nu T nu / 2 + t nu."""
-
-    P: Array
-    p: Array
-    S: Array
-    T: Array
-    t: Array
-    convex: Array
 
 
 def _symmetric(matrix: Array) -> Array:
     return 0.5 * (matrix + matrix.T)
 
 
-def _terminal(model: Model, missing: Array, bounds: Weighted, penalty: Array) -> _Value:
-    """Value of the last node; the penalty on the goal changes no solution that reaches it."""
-    goal, excess = model.goal, model.last_excess
-    hessian = model.last_hessian + excess.T @ (bounds.end[:, None] * excess)
-    hessian = hessian + goal.T @ (penalty[:, None] * goal)
-    slope = excess.T @ bounds.end_slope + goal.T @ (penalty * missing)
-    count = goal.shape[0]
-    return _Value(_symmetric(hessian), slope, goal.T, jnp.zeros((count, count)), missing, jnp.array(True))
+def _cholesky(matrix: Array, convex: Array) -> tuple[Array, Array]:
+    """Lower factor, or the identity where there is none; and whether this matrix is convex like the rest."""
+    if not matrix.shape[0]:
+        return matrix, convex
+    lower = jnp.linalg.cholesky(matrix)
+    convex = convex & jnp.all(jnp.isfinite(lower))
+    return jnp.where(convex, jnp.nan_to_num(lower), jnp.eye(lower.shape[0], dtype=lower.dtype)), convex
 
 
-def _backward(value: _Value, given: tuple) -> tuple[_Value, tuple]:
-    """Value of a node from that of the next, and the feedback of its step."""
-    forward, offset, hessian, gradient, excess, excess_offset, weight, slope, extra = given
-    size = value.p.shape[0]
-    whole = hessian + forward.T @ value.P @ forward + excess.T @ (weight[:, None] * excess)
-    whole = _symmetric(whole)
-    linear = gradient + forward.T @ (value.P @ offset + value.p)
-    linear = linear + excess.T @ (slope + weight * excess_offset)
-    mixed = forward.T @ value.S
-    quadratic = whole[size:, size:] + jnp.diag(extra)
-    lower = jnp.linalg.cholesky(quadratic)
-    convex = value.convex & jnp.all(jnp.isfinite(lower))
-    lower = jnp.where(convex, jnp.nan_to_num(lower), jnp.eye(lower.shape[0]))
-    right = jnp.concatenate([whole[size:, :size], linear[size:, None], mixed[size:]], axis=1)
-    found = -jax.scipy.linalg.cho_solve((lower, True), right)
-    gain, step, by_goal = found[:, :size], found[:, size], found[:, size + 1 :]
-    P = _symmetric(whole[:size, :size] + whole[:size, size:] @ gain)
-    p = linear[:size] + whole[:size, size:] @ step
-    S = mixed[:size] + whole[:size, size:] @ by_goal
-    T = value.T - mixed[size:].T @ by_goal
-    t = value.t + value.S.T @ offset + mixed[size:].T @ step
-    return _Value(P, p, S, T, t, convex), (gain, step, by_goal)
+def _solved(lower: Array, right: Array) -> Array:
+    """Minus the solution with a Cholesky factor."""
+    return -jax.scipy.linalg.cho_solve((lower, True), right) if lower.shape[0] else -right
 
 
-def _first(
-    model: Model, value: _Value, shift: Array, goal: Array, reach: Array
-) -> tuple[Array, Array, Array, Array, Array]:
-    """What is free at the first node, and the changes of the goal's multipliers."""
-    E = model.first
-    quadratic = _symmetric(E.T @ value.P @ E + model.first_hessian)
-    quadratic = quadratic + shift * jnp.diag(1.0 + jnp.abs(jnp.diagonal(quadratic)))
-    linear, mixed = E.T @ value.p + model.first_gradient, E.T @ value.S
-    convex, T, t = value.convex, value.T, value.t
-    if E.shape[1]:
-        lower = jnp.linalg.cholesky(quadratic)
-        convex = convex & jnp.all(jnp.isfinite(lower))
-        lower = jnp.where(convex, jnp.nan_to_num(lower), jnp.eye(lower.shape[0]))
-        found = -jax.scipy.linalg.cho_solve((lower, True), jnp.concatenate([linear[:, None], mixed], axis=1))
-        step, by_goal = found[:, 0], found[:, 1:]
-        T, t = T - mixed.T @ by_goal, t + mixed.T @ step
-    else:
-        step, by_goal = linear, mixed
-    if not T.size:
-        return step, t, convex, t, T
-    scale = jnp.sqrt(jnp.maximum(jnp.diagonal(T), 1e-300))
-    scale = jnp.where(scale > FELT * jnp.max(scale), 1.0 / scale, 0.0)
-    values, vectors = jnp.linalg.eigh(scale[:, None] * _symmetric(T) * scale)
-    reached = values > reach
-    inverse = jnp.where(reached, 1.0 / jnp.where(reached, values, 1.0), 0.0)
-    solved = inverse * (vectors.T @ (scale * t))
-    # Multipliers of what cannot be changed have no say; those found earlier are taken back.
-    left = jnp.where(
-        reached, 0.0, vectors.T @ jnp.where(scale > 0, goal / jnp.where(scale > 0, scale, 1.0), 0.0)
-    )
-    nu = scale * (vectors @ solved)
-    return step + by_goal @ nu, nu - scale * (vectors @ left), convex, t - T @ nu, T
-
-
-def solve(
+def factored(
     model: Model,
-    missing: Float[Array, " c"],
     bounds: Weighted,
     idle: Float[Array, "steps m"],
     shift: Float[Array, ""],
     penalty: Float[Array, " c"],
-    goal: Float[Array, " c"],
     reach: Float[Array, ""],
-) -> Move:
-    """Solve the quadratic model.
+) -> Factors:
+    """Factors of the quadratic model.
 
     Args:
         model: the model.
-        missing: residual of the goal.
         bounds: what slacks add.
         idle: 1 for coefficients that do not enter in a step, else 0.
         shift: relative increase of the curvature in the coefficients.
-        penalty: weight of the goal's squared residual in the model.
-        goal: present multipliers of the goal.
+        penalty: weight of the goal's squared residual in the model; changes no solution that reaches it.
         reach: eigenvalues of the goal's compliance below it count as zero, see `REACH`.
     """
-    last = _terminal(model, missing, bounds, penalty)
+    goal, last = model.goal, model.last_excess
+    size, count = model.forward.shape[1], goal.shape[0]
+    P = model.last_hessian + last.T @ (bounds.end[:, None] * last) + goal.T @ (penalty[:, None] * goal)
+    begun = (_symmetric(P), goal.T, jnp.zeros((count, count), P.dtype), jnp.array(True))
     own = jnp.diagonal(model.hessian, axis1=1, axis2=2)[:, -idle.shape[1] :]
     typical = jnp.maximum(jnp.max(jnp.abs(own)), 1e-12)
-    extra = idle + shift * jnp.where(jnp.isfinite(typical), typical, 1.0)
-    given = (
+    added = shift * jnp.where(jnp.isfinite(typical), typical, 1.0)
+
+    def backward(value: tuple, given: tuple) -> tuple[tuple, tuple]:
+        P, S, T, convex = value
+        forward, hessian, excess, weight, extra = given
+        whole = _symmetric(hessian + forward.T @ P @ forward + excess.T @ (weight[:, None] * excess))
+        mixed = forward.T @ S
+        lower, convex = _cholesky(whole[size:, size:] + jnp.diag(extra), convex)
+        found = _solved(lower, jnp.concatenate([whole[size:, :size], mixed[size:]], axis=1))
+        gain, by_goal = found[:, :size], found[:, size:]
+        before = (
+            _symmetric(whole[:size, :size] + whole[:size, size:] @ gain),
+            mixed[:size] + whole[:size, size:] @ by_goal,
+            T - mixed[size:].T @ by_goal,
+            convex,
+        )
+        return before, (lower, gain, by_goal)
+
+    given = (model.forward, model.hessian, model.excess, bounds.path, idle + added)
+    (P, S, T, convex), (lower, gain, by_goal) = jax.lax.scan(backward, begun, given, reverse=True)
+    E = model.first
+    quadratic = _symmetric(E.T @ P @ E + model.first_hessian)
+    start_added = shift * (1.0 + jnp.abs(jnp.diagonal(quadratic)))
+    start_lower, convex = _cholesky(quadratic + jnp.diag(start_added), convex)
+    start_by_goal = _solved(start_lower, E.T @ S)
+    T = T - (E.T @ S).T @ start_by_goal
+    scale, vectors, inverse = _decomposed(T, reach)
+    return Factors(
         model.forward,
-        model.offset,
-        model.hessian,
-        model.gradient,
-        model.excess,
-        model.excess_offset,
-        bounds.path,
-        bounds.path_slope,
-        extra,
+        lower,
+        gain,
+        by_goal,
+        E,
+        start_lower,
+        start_by_goal,
+        T,
+        scale,
+        vectors,
+        inverse,
+        (added, start_added),
+        convex,
     )
-    value, (gain, step, by_goal) = jax.lax.scan(_backward, last, given, reverse=True)
-    first, nu, convex, unreachable, compliance = _first(model, value, shift, goal, reach)
+
+
+def _decomposed(T: Array, reach: Array) -> tuple[Array, Array, Array]:
+    """Units, eigenvectors and inverse eigenvalues of the goal's compliance, without what is out of reach."""
+    if not T.size:
+        return T[0] if T.shape[0] else jnp.zeros(0, T.dtype), T, jnp.zeros(0, T.dtype)
+    scale = jnp.sqrt(jnp.maximum(jnp.diagonal(T), 1e-300))
+    scale = jnp.where(scale > FELT * jnp.max(scale), 1.0 / scale, 0.0)
+    values, vectors = jnp.linalg.eigh(scale[:, None] * _symmetric(T) * scale)
+    reached = values > reach
+    return scale, vectors, jnp.where(reached, 1.0 / jnp.where(reached, values, 1.0), 0.0)
+
+
+def taken_back(factors: Factors, goal: Float[Array, " c"]) -> Float[Array, " c"]:
+    """Changes of the goal's multipliers that leave none to what cannot be changed: they have no say."""
+    scale, vectors = factors.goal_scale, factors.goal_vectors
+    present = vectors.T @ jnp.where(scale > 0, goal / jnp.where(scale > 0, scale, 1.0), 0.0)
+    return -scale * (vectors @ jnp.where(factors.goal_inverse > 0, 0.0, present))
+
+
+def out_of_reach(factors: Factors, missing: Float[Array, " c"]) -> Float[Array, " c"]:
+    """The part of the goal's residual that nothing can change."""
+    scale, vectors = factors.goal_scale, factors.goal_vectors
+    reached = jnp.where(factors.goal_inverse > 0, vectors.T @ (scale * missing), 0.0)
+    return missing - jnp.where(scale > 0, (vectors @ reached) / jnp.where(scale > 0, scale, 1.0), 0.0)
+
+
+def solve(factors: Factors, right: Right) -> Move:
+    """Minimise the quadratic model with given linear terms."""
+    size = factors.forward.shape[1]
+
+    def backward(value: tuple, given: tuple) -> tuple[tuple, Array]:
+        p, t = value
+        gradient, forward, lower, gain, by_goal = given
+        linear = gradient + forward.T @ p
+        own = linear[size:]
+        return (linear[:size] + gain.T @ own, t + by_goal.T @ own), _solved(lower, own)
+
+    f = factors
+    given = (right.gradient, f.forward, f.lower, f.gain, f.by_goal)
+    (p, t), step = jax.lax.scan(backward, (right.last, right.missing), given, reverse=True)
+    linear = f.start.T @ p + right.first
+    t = t + f.start_by_goal.T @ linear
+    nu = f.goal_scale * (f.goal_vectors @ (f.goal_inverse * (f.goal_vectors.T @ (f.goal_scale * t))))
+    first = _solved(f.start_lower, linear) + f.start_by_goal @ nu
 
     def forth(z: Array, given: tuple) -> tuple[Array, tuple]:
-        forward, offset, gain, step, by_goal = given
+        forward, gain, step, by_goal = given
         w = gain @ z + step + by_goal @ nu
-        return forward @ jnp.concatenate([z, w]) + offset, (z, w)
+        return forward @ jnp.concatenate([z, w]), (z, w)
 
-    z_last, (z, w) = jax.lax.scan(
-        forth, model.first @ first, (model.forward, model.offset, gain, step, by_goal)
-    )
-    z = jnp.concatenate([z, z_last[None]])
-    finite = jnp.all(jnp.isfinite(w)) & jnp.all(jnp.isfinite(nu)) & jnp.all(jnp.isfinite(first))
-    return Move(w, first, nu, z, gain, convex & finite, unreachable, compliance)
+    last, (z, w) = jax.lax.scan(forth, f.start @ first, (f.forward, f.gain, step, f.by_goal))
+    return Move(w, first, nu, jnp.concatenate([z, last[None]]))

@@ -1,6 +1,7 @@
 """Derivatives of an optimum with respect to numbers of the problem, by the implicit function theorem."""
 
 from collections.abc import Callable
+from functools import partial
 from operator import itemgetter
 from typing import Any
 
@@ -11,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from natcoord_jax.control import sequential
-from natcoord_jax.control.costates import Multipliers, backward, scored_end, step_jacobians
+from natcoord_jax.control.costates import Multipliers, direct_slopes, scored_end, step_jacobians, through_step
 from natcoord_jax.control.iterate import Iterate, Options
 from natcoord_jax.control.linearisation import first_gradient
 from natcoord_jax.control.problem import OptimalControl
@@ -86,11 +87,14 @@ def _conditions(
     worth = ravel_pytree(jax.grad(lambda node: scored_end(problem, multipliers, node))(last))[0]
 
     def body(after: Array, given: tuple) -> tuple[Array, Array]:
-        worth, by_w, _ = backward(problem, *given)(after)
-        return worth, by_w
+        at, node, w, y, jacobian, (by_node, by_w, by_y) = given
+        worth, through_w, _ = through_step(problem, at, node, w, y, jacobian)(after, by_y)
+        return worth + by_node, through_w + by_w
 
     w = entering(problem, unknowns.coefficients)
-    given = (slices(problem), before, w, unknowns.y, multipliers.path, jacobians)
+    each = (slices(problem), before, w, unknowns.y)
+    slopes = jax.vmap(partial(direct_slopes, problem))(*each, multipliers.path)
+    given = (*each, jacobians, slopes)
     worth, by_w = jax.lax.scan(body, worth, given, reverse=True)
     by_first, count = first_gradient(problem, unknowns, worth), unknowns.free.size
     pieces = (by_first[count:], by_w[:: problem.inputs.every].reshape(-1), by_first[:count])

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 from natcoord_jax.control.costates import Multipliers
-from natcoord_jax.control.iterate import Derivatives, Errors, Iterate, Options, Slacks, largest
+from natcoord_jax.control.iterate import Derivatives, Iterate, Options, Slacks, largest
 from natcoord_jax.control.linearisation import cost_unit, linearised
 from natcoord_jax.control.merit import Found, moved, room, search
 from natcoord_jax.control.problem import OptimalControl
@@ -80,7 +80,8 @@ def _first(
         slacks,
         path,
         derivatives,
-        None if options.lifted else no_model(derivatives, multipliers),
+        no_model(derivatives, multipliers),
+        jnp.array(0),
         jnp.array(0),
         barrier,
         unit,
@@ -89,18 +90,12 @@ def _first(
         (path, slacks),
         nothing,
         infinite,
-        infinite,
         goal,
         jnp.array(0),
         newton,
         jnp.array(0),
         code,
     )
-
-
-def _whole(errors: Errors) -> Array:
-    """All that is missing, without units."""
-    return largest(*jax.tree.leaves(errors))
 
 
 @quickly
@@ -145,6 +140,7 @@ def concluded(
         derivatives,
         proposal.model,
         proposal.kept,
+        proposal.corrections,
         proposal.barrier,
         iterate.unit,
         proposal.shift,
@@ -152,7 +148,6 @@ def concluded(
         (iterate.path, iterate.slacks),
         found.length,
         change,
-        _whole(derivatives.errors) / jnp.maximum(_whole(iterate.errors), 1e-300),
         proposal.unreachable,
         iterate.iteration,
         iterate.newton,

@@ -1,0 +1,274 @@
+"""The conditions of optimality to first order about a motion, of the steps as they are.
+
+The quadratic model is that of steps whose velocities are projected (see `tangent`): its solution leaves a
+part of order dt^2 of these conditions. Here they are applied to any change, exactly: one sweep forward for
+the motion, one backward for what it is worth. `improved` makes the model's solution obey them.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float, Int
+
+from natcoord_jax.control.costates import scored_end, through_step
+from natcoord_jax.control.differences import Point, along, sizes
+from natcoord_jax.control.iterate import Iterate, Model, largest
+from natcoord_jax.control.linearisation import nodes_before
+from natcoord_jax.control.problem import OptimalControl
+from natcoord_jax.control.riccati import Factors, Right, Weighted, out_of_reach, solve, taken_back
+from natcoord_jax.control.transcription import Node, Unknowns, end, entering, first_node, slices, stage
+from natcoord_jax.linsolve.conjugate_residuals import conjugate_residuals
+
+CORRECTIONS = 8
+"""Most directions of one improvement."""
+SOFTEST = 1e-3
+"""Least curvature in an entering coefficient that counts, relative to the largest."""
+ENOUGH = (1e-6, 1e-3)
+"""Part of the conditions that may be left: the relative size of the step, which is what its square leaves."""
+
+
+class Change(eqx.Module):
+    """Changes that are solved for, or what they leave of the conditions.
+
+    Attributes:
+        first: of what is free and of leading coefficients; or the gradient there.
+        w: of entering coefficients; or the gradient there.
+        goal: of the goal's multipliers; or the goal's residual.
+        path: of the multipliers of the bounds of all steps; or what they lack to complementarity.
+        end: of those of the bounds at the end.
+    """
+
+    first: Float[Array, " f"]
+    w: Float[Array, "steps m"]
+    goal: Float[Array, " c"]
+    path: Float[Array, "steps h"]
+    end: Float[Array, " e"]
+
+
+class Sweep(eqx.Module):
+    """First-order changes along a direction: of the steps' unknowns, of excesses and of the goal."""
+
+    y: Float[Array, "steps n"]
+    excess: Float[Array, "steps h"]
+    missing: Float[Array, " c"]
+    end_excess: Float[Array, " e"]
+
+
+def as_unknowns(problem: OptimalControl, iterate: Iterate, change: Change) -> Unknowns:
+    """Changes of the unknowns, without those of the steps."""
+    count = iterate.unknowns.free.size
+    head = change.first[count:].reshape(problem.inputs.degree, problem.channels)
+    coefficients = jnp.concatenate([head, change.w[:: problem.inputs.every]])
+    return Unknowns(coefficients, change.first[:count], jnp.zeros_like(iterate.unknowns.y))
+
+
+class Linear(NamedTuple):
+    """Changes along a direction that make the linearised equations of all steps hold.
+
+    Attributes:
+        before: of the nodes before every step, as vectors.
+        last: of the last node.
+        w: of entering coefficients.
+        sweep: the rest.
+    """
+
+    before: Float[Array, "steps x"]
+    last: Float[Array, " x"]
+    w: Float[Array, "steps m"]
+    sweep: Sweep
+
+
+def swept(problem: OptimalControl, iterate: Iterate, change: Change, level: Array) -> Linear:
+    """The motion's change; level 1 makes the residuals of the steps vanish, level 0 keeps them."""
+    unknowns, path = iterate.unknowns, iterate.path
+    moved = as_unknowns(problem, iterate, change)
+    leading = problem.inputs.degree
+    given = (unknowns.free, unknowns.coefficients[:leading])
+    given_change = (moved.free, moved.coefficients[:leading])
+    start = jax.jvp(lambda *x: first_node(problem, *x), given, given_change)[1]
+    w, dw = entering(problem, unknowns.coefficients), entering(problem, moved.coefficients)
+    unflat = ravel_pytree(start)[1]
+
+    def body(dn: Array, given: tuple) -> tuple[Array, tuple]:
+        at, node, w, dw, y, jacobian, residual = given
+        dy = -(jacobian.inverses @ (level * residual + jacobian.by_node @ dn + jacobian.by_w @ dw))
+
+        def rest(node: Node, w: Array, y: Array) -> tuple[Array, Array]:
+            found = stage(problem, at, node, w, y)
+            return ravel_pytree(found.after)[0], found.excess
+
+        after, excess = jax.jvp(rest, (node, w, y), (unflat(dn), dw, dy))[1]
+        return after, (dn, dy, excess)
+
+    jacobians, residual = iterate.derivatives.jacobians, path.stages.residual
+    given = (slices(problem), nodes_before(path), w, dw, unknowns.y, jacobians, residual)
+    last, (before, y, excess) = jax.lax.scan(body, ravel_pytree(start)[0], given)
+    final = jax.tree.map(lambda x: x[-1], path.nodes)
+    reached = jax.jvp(lambda node: end(problem, node), (final,), (unflat(last),))[1]
+    return Linear(before, last, dw, Sweep(y, excess, reached.missing, reached.excess))
+
+
+def _curved(problem: OptimalControl, iterate: Iterate, change: Change, linear: Linear) -> tuple[Array, Array]:
+    """Changes of the Lagrangian's gradient along a change and that of the motion: in `first`, and in `w`."""
+    unknowns, path, multipliers = iterate.unknowns, iterate.path, iterate.multipliers
+    worth, jacobians = iterate.derivatives.worth, iterate.derivatives.jacobians
+    w = entering(problem, unknowns.coefficients)
+    final, unflat = ravel_pytree(jax.tree.map(lambda x: x[-1], path.nodes))
+
+    size = sizes(problem, path, unknowns)
+
+    def bent(at, node, w, y, after, rho, direction: Point, bounds: tuple) -> tuple[Array, ...]:
+        value = ravel_pytree(after)[0]
+
+        def slopes(node: Array, w: Array, y: Array, sigma: Array) -> tuple:
+            def lagrangian(node: Array, w: Array, y: Array) -> Array:
+                found = stage(problem, at, unflat(node), w, y)
+                carried = value @ ravel_pytree(found.after)[0]
+                return found.cost + carried + rho @ found.residual + sigma @ found.excess
+
+            return jax.grad(lagrangian, argnums=(0, 1, 2))(node, w, y)
+
+        return along(slopes, Point(ravel_pytree(node)[0], w, y), direction, size, bounds)
+
+    following = jax.tree.map(lambda x: x[1:], worth.nodes)
+    each = (slices(problem), nodes_before(path), w, unknowns.y)
+    direction = Point(linear.before, linear.w, linear.sweep.y)
+    by_node, by_w, by_y = jax.vmap(bent)(
+        *each, following, worth.residuals, direction, (multipliers.path, change.path)
+    )
+
+    def scored(node: Array, goal: Array, end: Array) -> Array:
+        given = eqx.tree_at(lambda m: (m.goal, m.end), multipliers, (goal, end))
+        return jax.grad(lambda node: scored_end(problem, given, unflat(node)))(node)
+
+    there, moved = (final, multipliers.goal, multipliers.end), (linear.last, change.goal, change.end)
+    last = jax.jvp(scored, there, moved)[1]
+
+    def body(after: Array, given: tuple) -> tuple[Array, Array]:
+        at, node, w, y, jacobian, by_node, by_w, by_y = given
+        before, more, _ = through_step(problem, at, node, w, y, jacobian)(after, by_y)
+        return before + by_node, more + by_w
+
+    first, by_w = jax.lax.scan(body, last, (*each, jacobians, by_node, by_w, by_y), reverse=True)
+    leading = unknowns.coefficients[: problem.inputs.degree]
+    free, unravel = ravel_pytree((unknowns.free, leading))
+    if not free.size:
+        return free, by_w
+    value = ravel_pytree(jax.tree.map(lambda x: x[0], worth.nodes))[0]
+
+    def slope(free: Array, value: Array) -> Array:
+        return jax.grad(lambda x: value @ ravel_pytree(first_node(problem, *unravel(x)))[0])(free)
+
+    return jax.jvp(slope, (free, value), (change.first, first))[1], by_w
+
+
+def left_of_conditions(
+    problem: OptimalControl,
+    iterate: Iterate,
+    bounds: Weighted,
+    added: tuple[Array, Array],
+    change: Change,
+    level: Array,
+) -> tuple[Change, Sweep]:
+    """What a change leaves of the conditions, to first order, and the sweep along it.
+
+    Args:
+        problem: the problem.
+        iterate: the motion.
+        bounds: what slacks add.
+        added: to the curvature in entering coefficients, and in what is free.
+        change: of coefficients and multipliers.
+        level: 1 for the conditions at the changed motion, 0 for their change alone.
+    """
+    linear = swept(problem, iterate, change, level)
+    sweep, derivatives = linear.sweep, iterate.derivatives
+    first, w = _curved(problem, iterate, change, linear)
+    enters = (jnp.arange(problem.steps) % problem.inputs.every == 0)[:, None]
+    w = jnp.where(enters, level * derivatives.by_w + w + added[0] * change.w, 0.0)
+    first = level * derivatives.by_first + first + added[1] * change.first
+    missing = level * iterate.path.end.missing + sweep.missing
+    path = change.path - level * bounds.path_slope - bounds.path * sweep.excess
+    last = change.end - level * bounds.end_slope - bounds.end * sweep.end_excess
+    return Change(first, w, missing, path, last), sweep
+
+
+class Improved(NamedTuple):
+    """A step that obeys the conditions, as far as asked for.
+
+    Attributes:
+        change: of coefficients and multipliers.
+        sweep: along it.
+        unreachable: part of the goal that nothing can change.
+        there: whether the conditions hold as well as asked for.
+        count: solutions of the model that this has taken.
+    """
+
+    change: Change
+    sweep: Sweep
+    unreachable: Float[Array, " c"]
+    there: Bool[Array, ""]
+    count: Int[Array, ""]
+
+
+def improved(
+    problem: OptimalControl,
+    iterate: Iterate,
+    found: Model,
+    factors: Factors,
+    bounds: Weighted,
+    penalty: Array,
+) -> Improved:
+    """The step that obeys the conditions to first order, with the model as approximate inverse.
+
+    Args:
+        problem: the problem.
+        iterate: the motion.
+        found: the model.
+        factors: of the model.
+        bounds: what slacks add.
+        penalty: weight of the goal's square in the model.
+    """
+    unknowns, missing = iterate.unknowns, iterate.path.end.missing
+
+    def apply(change: Change, level: Array) -> tuple[Change, Sweep]:
+        left, sweep = left_of_conditions(problem, iterate, bounds, factors.added, change, level)
+        gradient = jnp.pad(-left.w, ((0, 0), (found.forward.shape[1], 0)))
+        gradient = gradient + jnp.einsum("kh,khz->kz", left.path, found.excess)
+        last = found.last_excess.T @ left.end - found.goal.T @ (penalty * left.goal)
+        move = solve(factors, Right(gradient, last, -left.first, -left.goal))
+        both = jnp.concatenate([move.z[:-1], move.w], axis=1)
+        path = left.path + bounds.path * jnp.einsum("khz,kz->kh", found.excess, both)
+        end = left.end + bounds.end * (found.last_excess @ move.z[-1])
+        return Change(move.first, move.w, move.goal, path, end), sweep
+
+    def enough(change: Change) -> Array:
+        size = largest(unknowns.coefficients, unknowns.free)
+        return jnp.clip(largest(change.w, change.first) / jnp.where(size > 0, size, 1.0), *ENOUGH)
+
+    # What changes are worth by their curvature, without what bounds add, and multipliers by the compliance
+    # of what they press.
+    own = jnp.abs(jnp.diagonal(found.hessian, axis1=1, axis2=2)[:, -problem.channels :])
+    own = jnp.maximum(own, SOFTEST * jnp.max(own, initial=1e-300))
+    reached = factors.goal_scale > 0
+    give = jnp.sum(found.excess[:, :, -problem.channels :] ** 2 / own[:, None], axis=2)
+    weights = Change(
+        jnp.sum(factors.start_lower**2, axis=1),
+        own,
+        jnp.where(reached, 1.0 / jnp.where(reached, factors.goal_scale, 1.0) ** 2, 0.0),
+        give,
+        jnp.zeros_like(bounds.end),
+    )
+    shapes = Sweep(unknowns.y, iterate.path.stages.excess, missing, iterate.path.end.excess)
+    start = Change(
+        jnp.zeros(found.first.shape[1]),
+        jnp.zeros_like(iterate.derivatives.by_w),
+        taken_back(factors, iterate.multipliers.goal),
+        jnp.zeros_like(iterate.multipliers.path),
+        jnp.zeros_like(iterate.multipliers.end),
+    )
+    reached = conjugate_residuals(apply, start, shapes, weights, enough, CORRECTIONS)
+    unreachable = out_of_reach(factors, missing + reached.more.missing)
+    return Improved(reached.solution, reached.more, unreachable, reached.there, reached.count)
