@@ -1,0 +1,54 @@
+"""Optimal control with a flexible body: gradients go through the beam."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import natcoord_jax as nc
+from natcoord_jax.gallery import plugging
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def plugged():
+    problem, guess = plugging.plug_in()
+    return problem, guess, nc.optimise(problem, guess, method="shooting", progress=False)
+
+
+def test_the_plug_reaches_its_socket_with_the_cable_at_rest(plugged):
+    problem, guess, found = plugged
+    assert found.ok, found.explain()
+    assert len(found.history) <= 20
+    assert max(abs(x) for x in found.missing.values()) < 1e-9
+    assert found.history[-1].stationarity < 1e-8
+    # Simulated again, as anyone would: the plug is where it belongs, and the cable hangs there and rests.
+    trajectory = nc.simulate(
+        problem.system, problem.state, dt=problem.dt, steps=problem.steps, inputs=found.inputs
+    )
+    last = jax.tree.map(lambda x: x[-1], trajectory.states)
+    angles = [float(problem.system.coordinate(last, k)) for k in ("shoulder", "elbow", "wrist")]
+    assert np.allclose(angles, plugging.joint_angles(), atol=1e-9)
+    hanging = problem.cost.terms[1].goal.residual(problem.system, last)
+    assert float(jnp.max(jnp.abs(hanging))) < 0.01  # m: a sixtieth of the cable
+    effort = float(problem.dt) * float(jnp.sum(guess**2))
+    assert found.cost < 0.1 * effort
+
+
+def test_the_gradient_through_the_cable(plugged):
+    """Of effort and of what the cable misses, along a direction of the torques, against differences."""
+    problem, guess, _ = plugged
+
+    def cost(inputs):
+        trajectory = nc.simulate(
+            problem.system, problem.state, dt=problem.dt, steps=problem.steps, inputs=inputs
+        )
+        last = jax.tree.map(lambda x: x[-1], trajectory.states)
+        return problem.dt * jnp.sum(inputs**2) + problem.cost.terminal(problem.system, last)
+
+    direction = jax.random.normal(jax.random.key(0), guess.shape)
+    slope = jnp.vdot(jax.grad(cost)(guess), direction)
+    h = 1e-4
+    difference = (cost(guess + h * direction) - cost(guess - h * direction)) / (2 * h)
+    assert float(slope) == pytest.approx(float(difference), rel=1e-6)
