@@ -255,6 +255,33 @@ def nc_gallery(name):
 
 
 @pytest.mark.slow
+def test_shooting_converges_quadratically_at_coarse_steps():
+    """A double pendulum, a quarter of a radian a step: the curvature of projected steps is far off."""
+    scene = nc.Scene()
+    scene.add(nc.Gravity(vector=(0.0, -9.81, 0.0)))
+    moments = (0.1, 0.1, 0.1)
+    upper = scene.add(nc.RigidBody(mass=1.0, inertia=moments, com=(0.5, 0.0, 0.0), name="upper"))
+    lower = nc.RigidBody(
+        mass=0.5, inertia=moments, com=(0.3, 0.0, 0.0), position=(1.0, 0.0, 0.0), name="lower"
+    )
+    lower = scene.add(lower)
+    joints = [nc.Revolute(nc.ground, upper, axis=(0.0, 0.0, 1.0), name="shoulder")]
+    joints += [nc.Revolute(upper, lower, point=(1.0, 0.0, 0.0), axis=(0.0, 0.0, 1.0), name="elbow")]
+    for joint in joints:
+        scene.add(nc.JointTorque(scene.add(joint)))
+    system, state = scene.compile()
+    there = nc.goal.Coordinate("shoulder", 0.5) & nc.goal.Rate("shoulder")
+    there = there & nc.goal.Coordinate("elbow", -0.5) & nc.goal.Rate("elbow")
+    cost = nc.cost.Effort() + nc.cost.Missed(there, weight=20.0)
+    problem = nc.OptimalControl(system, state, dt=0.05, steps=20, cost=cost)
+    guess = 2.0 * np.random.default_rng(0).normal(size=(20, 2))
+    found = solved(problem, guess, method="shooting")
+    errors = [row.stationarity for row in found.history]
+    assert len(errors) <= 40
+    assert errors[-1] < 0.1 * errors[-2] < 0.01 * errors[-3], errors
+
+
+@pytest.mark.slow
 def test_costates_are_the_gradient_of_the_simulation():
     problem = numeric(manoeuvres.turn(8))
     coefficients = jnp.asarray(np.random.default_rng(1).normal(size=(8, 3)) * 5.0)

@@ -8,6 +8,7 @@ import pytest
 from benchmarks import patterns
 from natcoord_jax.linsolve import symbolic
 from natcoord_jax.linsolve.blocks import block_pattern
+from natcoord_jax.linsolve.conjugate_residuals import conjugate_residuals
 from natcoord_jax.linsolve.graph import graph_of
 from natcoord_jax.linsolve.ordering import dissection, rounds
 from natcoord_jax.linsolve.sparse import SparseSolver, choose, factorised
@@ -275,3 +276,31 @@ def test_numbers_do_not_retrace_and_structure_does():
     # Indices are arguments: no array of them is baked into the program.
     text = counted.lower(first.plan, first.matrix, first.right).as_text()
     assert len(text) < 400_000
+
+
+# An operator that is only applied.
+
+
+def nearly_identity(size: int, rank: int):
+    """A nonsymmetric matrix that differs from the identity by a few large directions, and a right side."""
+    make = np.random.default_rng(1)
+    matrix = np.eye(size) + make.normal(size=(size, rank)) @ make.normal(size=(rank, size)) / size
+    return matrix, make.normal(size=size)
+
+
+@pytest.mark.parametrize("limit", [3, 5])
+def test_conjugate_residuals_solve_in_as_many_directions_as_differ(limit):
+    """One for each direction that differs, and one more; less leaves something, and says so."""
+    matrix, right = nearly_identity(30, 4)
+
+    def apply(x, level):
+        return {"x": matrix @ x["x"] - level * right}, 2.0 * x["x"][:3] + level
+
+    start = {"x": jnp.ones(30)}
+    found = conjugate_residuals(apply, start, jnp.zeros(3), start, lambda r: jnp.array(1e-12), limit)
+    left = np.linalg.norm(matrix @ found.solution["x"] - right) / np.linalg.norm(matrix @ np.ones(30) - right)
+    assert float(found.left) == pytest.approx(left, rel=1e-6, abs=1e-13)
+    assert int(found.count) == limit
+    assert bool(found.there) == (limit == 5) == bool(left <= 1e-12)
+    # What comes along belongs to the solution, affine as it is.
+    np.testing.assert_allclose(found.more, 2.0 * found.solution["x"][:3] + 1.0, rtol=1e-10)

@@ -1,8 +1,10 @@
 """The conditions of optimality to first order about a motion, of the steps as they are.
 
 The quadratic model is that of steps whose velocities are projected (see `tangent`): its solution leaves a
-part of order dt^2 of these conditions. Here they are applied to any change, exactly: one sweep forward for
-the motion, one backward for what it is worth. `improved` makes the model's solution obey them.
+part of order dt^2 of these conditions. Here they are applied to any change: one sweep forward for the motion,
+one backward for what it is worth. First derivatives are exact, the curvature along the change is that of
+the same steps by a central difference, good to some eight digits. `improved` makes the model's solution obey
+them.
 """
 
 from typing import NamedTuple
@@ -16,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 from natcoord_jax.control.costates import scored_end, through_step
 from natcoord_jax.control.differences import Point, along, sizes
 from natcoord_jax.control.iterate import Iterate, Model, largest
-from natcoord_jax.control.linearisation import nodes_before
+from natcoord_jax.control.linearisation import first_gradient, nodes_before
 from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.control.riccati import Factors, Right, Weighted, out_of_reach, solve, taken_back
 from natcoord_jax.control.transcription import Node, Unknowns, end, entering, first_node, slices, stage
@@ -117,7 +119,6 @@ def _curved(problem: OptimalControl, iterate: Iterate, change: Change, linear: L
     worth, jacobians = iterate.derivatives.worth, iterate.derivatives.jacobians
     w = entering(problem, unknowns.coefficients)
     final, unflat = ravel_pytree(jax.tree.map(lambda x: x[-1], path.nodes))
-
     size = sizes(problem, path, unknowns)
 
     def bent(at, node, w, y, after, rho, direction: Point, bounds: tuple) -> tuple[Array, ...]:
@@ -153,16 +154,13 @@ def _curved(problem: OptimalControl, iterate: Iterate, change: Change, linear: L
         return before + by_node, more + by_w
 
     first, by_w = jax.lax.scan(body, last, (*each, jacobians, by_node, by_w, by_y), reverse=True)
-    leading = unknowns.coefficients[: problem.inputs.degree]
-    free, unravel = ravel_pytree((unknowns.free, leading))
-    if not free.size:
-        return free, by_w
     value = ravel_pytree(jax.tree.map(lambda x: x[0], worth.nodes))[0]
 
-    def slope(free: Array, value: Array) -> Array:
-        return jax.grad(lambda x: value @ ravel_pytree(first_node(problem, *unravel(x)))[0])(free)
+    def slope(unknowns: Unknowns, value: Array) -> Array:
+        return first_gradient(problem, unknowns, value)
 
-    return jax.jvp(slope, (free, value), (change.first, first))[1], by_w
+    tangent = as_unknowns(problem, iterate, change)
+    return jax.jvp(slope, (unknowns, value), (tangent, first))[1], by_w
 
 
 def left_of_conditions(
@@ -252,12 +250,12 @@ def improved(
     # of what they press.
     own = jnp.abs(jnp.diagonal(found.hessian, axis1=1, axis2=2)[:, -problem.channels :])
     own = jnp.maximum(own, SOFTEST * jnp.max(own, initial=1e-300))
-    reached = factors.goal_scale > 0
+    felt = factors.goal_scale > 0
     give = jnp.sum(found.excess[:, :, -problem.channels :] ** 2 / own[:, None], axis=2)
     weights = Change(
         jnp.sum(factors.start_lower**2, axis=1),
         own,
-        jnp.where(reached, 1.0 / jnp.where(reached, factors.goal_scale, 1.0) ** 2, 0.0),
+        jnp.where(felt, 1.0 / jnp.where(felt, factors.goal_scale, 1.0) ** 2, 0.0),
         give,
         jnp.zeros_like(bounds.end),
     )

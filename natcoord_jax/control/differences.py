@@ -1,4 +1,4 @@
-"""Changes of gradients along a direction, by central differences.
+"""Changes of gradients along directions, by differences.
 
 What they serve is improved until the exact conditions hold, which needs them to a few digits; and a program
 for derivatives of gradients is three times that of the gradients, and as long to compile.
