@@ -4,6 +4,7 @@ Every bound says how much of it is used up: values below zero are allowed. They 
 step, with the inputs of the step, and measured in a natural unit of the bound (half its range).
 """
 
+import abc
 from collections.abc import Callable
 from typing import Any
 
@@ -84,13 +85,13 @@ class Range(Bound):
         below, above = (tuple(bool(x) for x in np.ravel(limit)) for limit in limits)
         self.limited = (below, above)
 
+    @abc.abstractmethod
     def values(self, system: System, state: State, u: Array) -> Float[Array, " n"]:
         """What is bounded."""
-        raise NotImplementedError
 
+    @abc.abstractmethod
     def names(self, system: System) -> tuple[str, ...]:
         """Name and unit of what is bounded."""
-        raise NotImplementedError
 
     def excess(self, system: System, state: State, u: Array, t: Array) -> Float[Array, " n"]:
         """Excess over both limits, in units of half the range."""
