@@ -131,6 +131,7 @@ def test_jvp_and_gradient_against_differences(name):
     assert abs(total(gradient(p), d) - ahead) <= tol.SAME_GRADIENT * abs(ahead)
 
 
+@pytest.mark.slow
 def test_initial_state():
     """With respect to positions, velocities, coordinates: along motions that the joints allow."""
     p = few()
@@ -193,6 +194,7 @@ def test_second_derivatives_against_differences(mode):
     assert_v_shaped(lambda x: small_tangent(x, d), p, d, second(mode)(p, d))
 
 
+@pytest.mark.slow
 def test_modes_agree():
     p, d = few(), small_direction(seed=2)
     found = [float(second(mode)(p, d)) for mode in SECOND]

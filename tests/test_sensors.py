@@ -221,6 +221,7 @@ def test_equations_agree_with_those_of_bodies_and_multipliers():
     close(wrenches_on_bodies(system, state, found), wrenches, EQUATIONS)
 
 
+@pytest.mark.slow
 def test_acceleration_is_the_limit_of_short_steps():
     system, state = chain("screw")
     u = jnp.array([0.8])

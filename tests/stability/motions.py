@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import Any
 
+import jax
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -16,6 +17,18 @@ SECOND_AND_FOURTH = pytest.mark.parametrize("order", [2, 4])
 def simulate(system: Any, state: Any, *, order: int = 2, **options: Any) -> nc.Trajectory:
     """A run with the energy-momentum scheme of an order."""
     return nc.simulate(system, state, scheme=nc.EnergyMomentum(order=order), **options)
+
+
+OPTIMISED = {"xla_backend_optimization_level": 3}
+"""What users run with. The suite compiles without (see `conftest.py`); steps then take ten times as long."""
+
+
+def simulate_long(system: Any, state: Any, **options: Any) -> nc.Trajectory:
+    """A run of so many steps that the time to compile an optimised program is won back."""
+    run = jax.jit(lambda system, state: simulate(system, state, **options), compiler_options=OPTIMISED)
+    trajectory = run(system, state)
+    system.raise_on_failure(trajectory)
+    return trajectory
 
 
 def one_body(

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import tolerances as tol
 from accounts import account
-from motions import Drift, simulate
+from motions import OPTIMISED, Drift, simulate, simulate_long
 
 from natcoord_jax import gallery
 
@@ -37,7 +37,7 @@ def example(name: str):
 def long_run(name: str, order: int, **options):
     scene = example(name)
     options |= dict(dt=STEP[name], steps=MILLION, save_every=MILLION // SAVED)
-    return account(scene.system, simulate(scene.system, scene.state, order=order, **options))
+    return account(scene.system, simulate_long(scene.system, scene.state, order=order, **options))
 
 
 def drifts(name: str, found) -> dict[str, Drift]:
@@ -81,7 +81,7 @@ def swinging(order: int, nudge: float = 0.0, steps: int = 100_000):
     scene = example("double_pendulum")
     system, state = scene.system, scene.state
     state = system.with_coordinate(state, "hinge 2", nudge)
-    return system, simulate(system, state, order=order, dt=0.005, steps=steps, save_every=100)
+    return system, simulate_long(system, state, order=order, dt=0.005, steps=steps, save_every=100)
 
 
 @pytest.mark.parametrize("order", [2, pytest.param(4, marks=pytest.mark.slow)])
@@ -113,7 +113,9 @@ def test_gradients_of_a_chaotic_path(seconds):
         )
         return found.q[-1, 4, 2], found.result
 
-    (value, result), slope = jax.jit(jax.value_and_grad(height, has_aux=True))(0.01)
+    (value, result), slope = jax.jit(jax.value_and_grad(height, has_aux=True), compiler_options=OPTIMISED)(
+        0.01
+    )
     assert int(result) == 0
     assert bool(jnp.isfinite(value))
     if seconds > 100:
