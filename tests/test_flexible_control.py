@@ -6,15 +6,18 @@ import numpy as np
 import pytest
 
 import natcoord_jax as nc
-from natcoord_jax.gallery import plugging
+from natcoord_jax import gallery
+from natcoord_jax.gallery.plugging import along_a_smooth_path, joint_angles
 
 pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
 def plugged():
-    problem, guess = plugging.plug_in()
-    return problem, guess, nc.optimise(problem, guess, method="shooting", progress=False)
+    example = gallery.load("plugging")
+    found = example.solved(example.steps, example.dt, progress=False)
+    assert found is not None
+    return found.problem, along_a_smooth_path(found.problem), found
 
 
 def test_the_plug_reaches_its_socket_with_the_cable_at_rest(plugged):
@@ -29,7 +32,7 @@ def test_the_plug_reaches_its_socket_with_the_cable_at_rest(plugged):
     )
     last = jax.tree.map(lambda x: x[-1], trajectory.states)
     angles = [float(problem.system.coordinate(last, k)) for k in ("shoulder", "elbow", "wrist")]
-    assert np.allclose(angles, plugging.joint_angles(), atol=1e-9)
+    assert np.allclose(angles, joint_angles(), atol=1e-9)
     hanging = problem.cost.terms[1].goal.residual(problem.system, last)
     assert float(jnp.max(jnp.abs(hanging))) < 0.01  # m: a sixtieth of the cable
     effort = float(problem.dt) * float(jnp.sum(guess**2))

@@ -9,6 +9,8 @@ from natcoord_jax.gallery.spacecraft import TABLE, TORQUE, compare_torques
 
 # Compiling takes all the time: the small scenes by default, the rest with the slow tests.
 QUICK = ("spacecraft", "double_pendulum", "heavy_top")
+ELSEWHERE = ("plugging",)
+"""Scenes whose solution has tests of its own, and takes long."""
 # Balances after a few steps of round-off, relative; loops and drives are solved a little less sharply.
 BALANCE = 1e-11
 # Second-order error of the suggested step in the quantities below [m, rad/s, relative].
@@ -19,7 +21,7 @@ DIGITS |= {80: (5e-4, 0.05, 0.005)}
 
 
 def scenes(*, quick: bool):
-    return [name for name in gallery.SCENES if (name in QUICK) == quick]
+    return [name for name in gallery.SCENES if (name in QUICK) == quick and name not in ELSEWHERE]
 
 
 def check(name: str):

@@ -20,6 +20,7 @@ from natcoord_jax.analysis.statics import (
 )
 from natcoord_jax.assembly.system import System
 from natcoord_jax.core.checks import is_concrete, positive
+from natcoord_jax.core.compiled import briefly
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.results import REASONS, Result, SimulationError
 from natcoord_jax.core.state import State
@@ -201,7 +202,7 @@ class _Zero(eqx.Module):
         return jnp.zeros(self.count)
 
 
-@eqx.filter_jit
+@briefly
 def _followed(
     system: System, state: State, arc: Array, scale: Array, steps: int, inputs: Callable[[Array], Array]
 ) -> Equilibrium:

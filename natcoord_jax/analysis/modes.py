@@ -22,6 +22,7 @@ from natcoord_jax.assembly.momentum import inertia, wrench
 from natcoord_jax.assembly.rates import row_rates
 from natcoord_jax.assembly.system import System
 from natcoord_jax.core.checks import is_concrete, numbers
+from natcoord_jax.core.compiled import briefly
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.vectors import cross
 
@@ -169,7 +170,7 @@ def _damped(mass: Array, damping: Array, stiffness: Array) -> tuple[Array, Array
     return values, vectors[:count].T
 
 
-@eqx.filter_jit
+@briefly
 def _problem(system: System, state: State, inputs: Array, rotation: Array) -> tuple[Array, ...]:
     size = 6 * len(system.structure.bodies)
     static = Static(system, state, inputs)

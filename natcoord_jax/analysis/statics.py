@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, Int
 from natcoord_jax.analysis.static_equations import Static
 from natcoord_jax.assembly.system import System
 from natcoord_jax.core.checks import is_concrete
+from natcoord_jax.core.compiled import briefly
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.results import REASONS, Result, SimulationError
 from natcoord_jax.core.state import State
@@ -226,7 +227,7 @@ def _inputs_at(system: System, inputs: Any, values: Array) -> Float[Array, "load
     return jnp.broadcast_to(given, (len(values), count))
 
 
-@jax.jit
+@briefly
 def _equilibria(system: System, state: State, values: Array, inputs: Array) -> Equilibrium:
     static = Static(system, state, inputs[0])
     still = jax.lax.stop_gradient((system, state))

@@ -23,7 +23,7 @@ from natcoord_jax.assembly.response import body_rows
 from natcoord_jax.assembly.system import System
 from natcoord_jax.assembly.tangent_space import TangentSpace, Velocity
 from natcoord_jax.core.checks import is_concrete
-from natcoord_jax.core.compiled import quickly
+from natcoord_jax.core.compiled import briefly
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
 
@@ -91,7 +91,7 @@ def transfer(
     return made, moved
 
 
-@quickly
+@briefly
 def _transferred(system: System, state: State, into: System, onto: State | None) -> tuple[System, State]:
     before, after = common_joints(system, into)
     into = replace_fields(into, frames=into.frames.at[after].set(system.frames[before]))

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Int
 
 from natcoord_jax.assembly.equations import prepare, starting
 from natcoord_jax.assembly.system import System
-from natcoord_jax.core.compiled import quickly
+from natcoord_jax.core.compiled import briefly
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import gauss
@@ -120,7 +120,7 @@ class Followed(eqx.Module):
     missed: Float[Array, "*steps"]
 
 
-@quickly
+@briefly
 def _followed(
     system: System, state: State, path: Float[Array, "steps c"], places: Any, dt: Array
 ) -> Followed:

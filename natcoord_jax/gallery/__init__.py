@@ -13,6 +13,7 @@ from natcoord_jax.gallery.loops import bricard, four_bar, slider_crank
 from natcoord_jax.gallery.manoeuvres import reorientation_example
 from natcoord_jax.gallery.open_tree import open_tree
 from natcoord_jax.gallery.pendulums import double_pendulum, pendulum, torsion_spring
+from natcoord_jax.gallery.plugging import plugging
 from natcoord_jax.gallery.robot import robot_cable
 from natcoord_jax.gallery.spacecraft import spacecraft
 from natcoord_jax.gallery.tops import dzhanibekov, fast_top, free_body, heavy_top
@@ -39,6 +40,7 @@ SCENES: Mapping[str, Callable[..., Example]] = {
     "cantilever": cantilever,
     "flying_spaghetti": flying_spaghetti,
     "robot_cable": robot_cable,
+    "plugging": plugging,
 }
 
 __all__ = ["SCENES", "Example", "describe", "load"]

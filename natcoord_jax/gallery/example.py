@@ -31,6 +31,7 @@ class Example:
             none.
         problem: the optimal control problem, for (steps, dt), whose solution are the inputs; None: they are
             given by `control`.
+        guess: inputs that the solution of a problem starts from, for the problem; None: zero.
         phases: makes the run, for (steps, dt) and options of `nc.simulate`, where it is more than a rollout
             with given inputs; `system` and `state` are then those of its start.
         beams: whose sections pictures draw.
@@ -54,6 +55,7 @@ class Example:
     facts: Mapping[str, Any] = field(default_factory=dict)
     figure: Callable[[nc.Phases], Any] | None = None
     problem: Callable[[int, float], nc.OptimalControl] | None = None
+    guess: Callable[[nc.OptimalControl], Array] | None = None
     phases: Callable[..., nc.Phases] | None = None
     beams: Sequence[nc.BeamHandle] = ()
 
@@ -83,7 +85,8 @@ class Example:
         """
         steps, dt = steps or self.steps, self.dt if dt is None else dt
         if self.problem is not None:
-            solution = nc.optimise(self.problem(steps, float(dt)), progress=False)
+            solution = self.solved(steps, float(dt), progress=False)
+            assert solution is not None
             if not solution.ok:
                 raise RuntimeError(f"{self.name}: {solution.explain()}")
             return solution.inputs
@@ -93,6 +96,13 @@ class Example:
             times = scheme.times(dt, steps)
             return self.control(times.reshape(-1)).reshape(*times.shape, -1)
         return self.control((jnp.arange(steps) + 0.5) * dt)
+
+    def solved(self, steps: int, dt: float, *, progress: bool = True) -> nc.Solution | None:
+        """The solution of the scene's problem of optimal control; None where it has none."""
+        if self.problem is None:
+            return None
+        problem = self.problem(steps, dt)
+        return nc.optimise(problem, self.guess and self.guess(problem), progress=progress)
 
     def simulate(self, *, steps: int | None = None, dt: Any = None, **options: Any) -> Trajectory:
         """One rollout with the scene's inputs, as far as it has any; `options` go to `nc.simulate`."""

@@ -16,6 +16,7 @@ import natcoord_jax as nc
 from natcoord_jax.assembly.system import System
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.state import State
+from natcoord_jax.gallery.example import Example
 
 UPPER, FORE = 0.4, 0.35
 """Lengths of the links [m]."""
@@ -129,10 +130,10 @@ class Hanging(nc.goal.Goal):
         return jnp.concatenate([away[:, :2].reshape(-1), moving[:, :2].reshape(-1)])
 
 
-def plug_in(
+def problem(
     steps: int = 40, *, t_end: float = 1.0, elements: int = 3, weight: float = 20.0
-) -> tuple[nc.OptimalControl, Float[Array, "steps inputs"]]:
-    """The problem, and a guess: torques that bring the plug to its socket along a smooth path.
+) -> nc.OptimalControl:
+    """Least effort from rest to rest, the plug in its socket.
 
     Args:
         steps: of the motion.
@@ -146,12 +147,11 @@ def plug_in(
     there = nc.transfer(driven.system, rest, free.system, onto=free.state)[1]
     rows = tuple(4 * free.system.body_index(node) for node in free.cable.nodes[1:-1])
     hanging = Hanging(there.q[np.array(rows)], rows)
-    angles = joint_angles()
-    goals = [nc.goal.Coordinate(joint, angle) for joint, angle in zip(free.joints, angles)]
+    goals = [nc.goal.Coordinate(joint, angle) for joint, angle in zip(free.joints, joint_angles())]
     goal = goals[0] & goals[1] & goals[2]
     for joint in free.joints:
         goal = goal & nc.goal.Rate(joint)
-    problem = nc.OptimalControl(
+    return nc.OptimalControl(
         free.system,
         free.state,
         dt=t_end / steps,
@@ -159,6 +159,31 @@ def plug_in(
         cost=nc.cost.Effort() + nc.cost.Missed(hanging, weight=weight),
         goal=goal,
     )
-    x = np.linspace(0.0, 1.0, steps + 1)[1:, None]
-    path = (10 * x**3 - 15 * x**4 + 6 * x**5) * angles
-    return problem, nc.inverse_dynamics(free.system, free.state, path, dt=t_end / steps)[0]
+
+
+def along_a_smooth_path(problem: nc.OptimalControl) -> Float[Array, "steps inputs"]:
+    """Torques that bring the plug to its socket with joint angles that are polynomials of time [N m]."""
+    x = np.linspace(0.0, 1.0, problem.steps + 1)[1:, None]
+    path = (10 * x**3 - 15 * x**4 + 6 * x**5) * joint_angles()
+    return nc.inverse_dynamics(problem.system, problem.state, path, dt=problem.dt)[0]
+
+
+def plugging(elements: int = 3) -> Example:
+    """Least-effort motion of an arm that plugs in a flexible cable, which is at rest at the end.
+
+    Args:
+        elements: of the cable.
+    """
+    free = arm(elements)
+    return Example(
+        name="plugging",
+        description="an arm plugs in a flexible cable by least effort",
+        system=free.system,
+        state=free.state,
+        dt=0.025,
+        steps=40,
+        facts={"dofs": 3 + 6 * (elements - 1)},
+        problem=lambda steps, dt: problem(steps, t_end=steps * dt, elements=elements),
+        guess=along_a_smooth_path,
+        beams=(free.cable,),
+    )

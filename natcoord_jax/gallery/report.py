@@ -36,10 +36,8 @@ def _largest(values: Any) -> float | None:
 
 def _solved(example: Example, steps: int, dt: float, scheme: Scheme) -> tuple[nc.Solution | None, Any]:
     """The solution of an optimal control problem, if the scene is one, and the inputs of the run."""
-    if example.problem is None:
-        return None, example.inputs(steps, dt, scheme)
-    solution = nc.optimise(example.problem(steps, dt))
-    return solution, solution.inputs
+    solution = example.solved(steps, dt)
+    return solution, example.inputs(steps, dt, scheme) if solution is None else solution.inputs
 
 
 def measure(

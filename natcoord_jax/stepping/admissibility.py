@@ -9,6 +9,7 @@ import numpy as np
 from natcoord_jax.assembly.diagnostics import joint_residuals, unknown_name
 from natcoord_jax.assembly.reduced import ReducedStep
 from natcoord_jax.assembly.system import System
+from natcoord_jax.core.compiled import briefly
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import gauss
@@ -18,7 +19,7 @@ GAP = 1e-9
 """Largest gap [m, -] and constraint rate [m/s, 1/s] taken for round-off of printed data, per unit of size."""
 
 
-@jax.jit
+@briefly
 def _residuals(system: System, state: State) -> list:
     return [(value, rate) for _, value, rate in joint_residuals(system, state)]
 
@@ -67,7 +68,7 @@ def _tiny_step(system: System, state: State) -> ReducedStep:
     return ReducedStep.prepare(system, state, inputs, jnp.asarray(1e-9), gauss(1))
 
 
-@jax.jit
+@briefly
 def _jacobian(system: System, state: State):
     step = _tiny_step(system, state)
     return step.jacobian(step.guess())

@@ -12,6 +12,7 @@ from natcoord_jax.assembly.diagnostics import rows_with_ground
 from natcoord_jax.assembly.projection import Projection
 from natcoord_jax.assembly.system import System
 from natcoord_jax.core.checks import is_concrete
+from natcoord_jax.core.compiled import briefly
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.results import REASONS, Result, SimulationError
 from natcoord_jax.core.state import State
@@ -47,7 +48,7 @@ def nearest_coordinates(system: System, state: State) -> Array:
     return values
 
 
-@jax.jit
+@briefly
 def _assembled(system: System, state: State) -> tuple[State, Array]:
     rows = state.q.reshape(-1, 4, 3)
     squared = jnp.concatenate([rows[:, :1], orthonormalise(rows[:, 1:])], axis=1).reshape(-1, 3)

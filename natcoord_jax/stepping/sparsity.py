@@ -1,7 +1,6 @@
 """What a sparse solver needs to know of a system, found once when it is compiled."""
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 
 from natcoord_jax.assembly.outset import Outset
@@ -9,6 +8,7 @@ from natcoord_jax.assembly.reduced import NOTHING
 from natcoord_jax.assembly.sparse import SparseStep, elements
 from natcoord_jax.assembly.system import System
 from natcoord_jax.core.checks import is_concrete
+from natcoord_jax.core.compiled import briefly
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
 from natcoord_jax.linsolve.blocks import BlockMatrix, BlockPattern, block_pattern
@@ -34,7 +34,7 @@ def with_sparsity(system: System, state: State) -> System:
     return replace_fields(system, sparsity=Sparsity(pattern, choose(pattern, entries, matrix=matrix)))
 
 
-@jax.jit
+@briefly
 def _resting(system: System, state: State, pattern: BlockPattern) -> BlockMatrix:
     """The matrix for a vanishing step: inertias and constraints."""
     zero = jnp.zeros((), state.q.dtype)
