@@ -57,6 +57,7 @@ class Peer(NamedTuple):
         settings: of its `run`.
         compared: whether it sets the target of time per step (implicit, with constraints, as ours).
         only: numbers of steps it is run at; None: all.
+        models: models it is run on; None: all.
     """
 
     name: str
@@ -65,6 +66,7 @@ class Peer(NamedTuple):
     settings: dict[str, Any]
     compared: bool = False
     only: tuple[int, ...] | None = None
+    models: tuple[str, ...] | None = None
 
 
 PEERS = (

@@ -3,18 +3,25 @@
 usage: python -m benchmarks.work_precision [--quick] [--output FOLDER] [--peers-python PATH] [--no-peers]
        [--models NAME ...] [--redraw JSON]
 
-Spacecraft (from rest, and spinning), open tree, heavy top and double pendulum are run beside the peers at the
-settings that `benchmarks.peers` documents; the loops by natcoord_jax alone. Times are those of compiled runs
-that keep nothing but their end, compilation apart; medians. Errors are those of the end state: of the
-spacecraft from rest the angle [rad] of the base against the exact one, of other trees the centres of mass [m]
-against a converged reference, of loops positions and directors against a reference of order ten, which half
-its step confirms. `drift` is the energy at the end less energy at the start and work, relative; of the peers
-the error of their energy.
+Open trees (spacecraft, from rest and spinning, open tree, heavy top, double pendulum), closed loops (a row of
+two four-bars, Bricard's mechanism) and a chain of rods on stiff springs, beside the peers at the settings
+that `benchmarks.peers` documents. That all start from the same state is checked first. Times are those of
+compiled runs that keep nothing but their end, compilation apart; medians. Errors are those of the end state:
+of the spacecraft from rest the angle [rad] of the base against the exact one, of others the centres of mass
+[m] against a converged reference, our own of order ten, which half its step confirms (open tree: MuJoCo's).
+`drift` is the energy at the end less energy at the start and work, relative; of the peers the error of their
+energy.
 
-`long` are runs of 10^6 steps (10^4 with --quick) of the heavy top: largest drift, and its trend.
+`time_to_error` is interpolated between runs, None where no two of them bracket the error. `time_at_most` is
+the time of the coarsest run that came to an end, where that is more accurate already: explicit methods on the
+stiff chain are, as soon as they are stable. Tables print it with a "<", and "-" for what is not reached.
+
+`long`, made with the heavy top, are runs of 10^6 steps (10^4 with --quick) of 1 ms: by code the largest
+drift of energy, and its trend from start to end; None for runs that fail or diverge.
 """
 
 import math
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache, partial
@@ -29,16 +36,17 @@ import natcoord_jax as nc
 from benchmarks import common
 from benchmarks import spacecraft as beside
 from benchmarks.peers import measure as peer_measure
-from benchmarks.peers import spinning_spacecraft
+from benchmarks.peers import spinning_spacecraft, stiff_chain
 from benchmarks.spacecraft import OWN, Peer
 from natcoord_jax import gallery
 from natcoord_jax.analysis.accuracy import drift as drift_of
 from natcoord_jax.stepping.endpoint import endpoints
 
 ORDERS = (2, 4, 6, 8, 10)
-SHARED = ("spacecraft", "spinning_spacecraft", "open_tree", "heavy_top", "double_pendulum")
-ALONE = {"four_bar": 2.0, "bricard": 2.0}
-"""Other scenes and their end times [s]."""
+TREES = ("spacecraft", "spinning_spacecraft", "open_tree", "heavy_top", "double_pendulum")
+LOOPS = ("four_bar", "bricard")
+STIFF = ("stiff_chain",)
+SHARED = (*TREES, *LOOPS, *STIFF)
 ERRORS = (1e-2, 1e-3, 1e-4, 1e-6, 1e-8)
 PEERS = (
     Peer("MuJoCo RK4", "mujoco_models", "mujoco", {"integrator": "RK4"}),
@@ -50,21 +58,50 @@ PEERS = (
         "exudyn",
         {"node": "RotationEulerParameters"},
     ),
-    Peer("Exudyn kinematic tree RK44", "exudyn_models", "exudyn", {"formulation": "tree"}),
-    Peer("MJX RK4", "mjx_models", "mujoco.mjx", {"integrator": "RK4"}, only=(100, 1000)),
+    # Explicit methods cannot close loops.
+    Peer(
+        "Exudyn kinematic tree RK44",
+        "exudyn_models",
+        "exudyn",
+        {"formulation": "tree"},
+        models=(*TREES, *STIFF),
+    ),
+    # With springs a step takes ten times as long as in redundant coordinates.
+    Peer(
+        "Exudyn kinematic tree, generalised alpha",
+        "exudyn_models",
+        "exudyn",
+        {"formulation": "tree", "solver": "GeneralizedAlpha"},
+        models=("spacecraft", "spinning_spacecraft", "heavy_top", "double_pendulum", *LOOPS),
+    ),
+    Peer(
+        "MJX RK4", "mjx_models", "mujoco.mjx", {"integrator": "RK4"}, only=(100, 1000), models=TREES + LOOPS
+    ),
 )
+LONG_PEERS = (
+    *PEERS[:4],
+    Peer("Exudyn generalised alpha, radius 0.6", "exudyn_models", "exudyn", {"spectral_radius": 0.6}),
+    Peer("Exudyn trapezoidal, index 2", "exudyn_models", "exudyn", {"solver": "TrapezoidalIndex2"}),
+    *PEERS[4:6],
+)
+"""Generalised alpha at its usual spectral radius of 0.9 does not solve all steps of the top; hence others."""
+RECORDS = 1000
+LONG_DT = 1e-3
+"""Records of energy of the long run, and its step [s]."""
 IMPLICIT = "Exudyn generalised alpha"
 """Head of the names of integrators for constrained systems; the faster one counts."""
 
 
 class Plan(NamedTuple):
-    """Sizes of a run: steps by code, repetitions, peers, steps of the long run."""
+    """Sizes of a run: steps by code, repetitions, peers, steps of the long run and, by code, of the chain."""
 
     own: tuple[int, ...]
     theirs: tuple[int, ...]
     repeats: int
     peers: tuple[Peer, ...]
     long: int
+    own_stiff: tuple[int, ...]
+    theirs_stiff: tuple[int, ...]
 
 
 FULL = Plan(
@@ -73,12 +110,20 @@ FULL = Plan(
     11,
     PEERS,
     10**6,
+    # Order two takes more than ten iterations a step from here down, higher orders seconds a run.
+    (128, 192, 256, 512, 1024, 4096, 16384),
+    # 13 700 and 19 400 are within 1 % of where RK4 and the symplectic Euler method get stable.
+    (100, 200, 500, 1000, 2000, 5000, 10000, 13700, 19400, 40000),
 )
-QUICK = Plan((16, 32, 64), (100, 1000), 3, PEERS[:2], 10**4)
+QUICK = Plan(
+    (16, 32, 64), (100, 1000), 3, PEERS[:3] + PEERS[5:6], 10**4, (128, 512, 8192), (500, 1000, 13700, 19400)
+)
 
 
 def scene_of(model: str) -> gallery.Example:
     """The scene of a model, with its start."""
+    if model == stiff_chain.NAME:
+        return chain()
     if model != spinning_spacecraft.NAME:
         return gallery.load(model)
     example = gallery.load("spacecraft")
@@ -88,32 +133,77 @@ def scene_of(model: str) -> gallery.Example:
     return replace(example, name=model, state=start)
 
 
+def chain() -> gallery.Example:
+    """The chain of rods on stiff springs, which is not in the gallery."""
+    scene = nc.Scene()
+    scene.add(nc.Gravity(vector=stiff_chain.GRAVITY))
+    bodies = []
+    for data in stiff_chain.BODIES:
+        body = nc.RigidBody(
+            mass=data["mass"],
+            inertia=data["inertia"],
+            position=data["com"],
+            velocity=peer_measure.moving(data),
+            angular_velocity=peer_measure.turning(data),
+            name=data["name"],
+        )
+        bodies.append(scene.add(body))
+        if data["joint"] == "spherical":
+            scene.add(nc.Spherical(nc.ground, bodies[-1], point=data["point"], name="hook"))
+    for number, data in enumerate(stiff_chain.POINT_SPRINGS):
+        ends = tuple(nc.Point(bodies[data[f"body_{x}"]], data[f"point_{x}"]) for x in "ab")
+        name = f"spring {number + 1}"
+        scene.add(nc.Spring(ends, stiffness=data["stiffness"], length=data["length"], name=name))
+    system, state = scene.compile()
+    t_end = stiff_chain.T_END
+    return gallery.Example(stiff_chain.NAME, "rods on stiff springs", system, state, t_end / 500, 500)
+
+
+def check_start(model: str, example: gallery.Example) -> None:
+    """See that the scene and the data of the peers start from the same state.
+
+    Raises:
+        ValueError: if positions, energy or angular momentum differ by more than round-off.
+    """
+    source = peer_measure.MODELS[model]
+    places = np.array([body["com"] for body in source.BODIES])
+    velocities = np.array([peer_measure.moving(body) for body in source.BODIES])
+    spins = np.array([peer_measure.turning(body) for body in source.BODIES])
+    pose = np.tile(np.eye(3), (len(places), 1, 1))
+    theirs = peer_measure.final_state(source, places, pose, velocities, spins)
+    own = beside.own_state(model, example.system, example.state)
+    for part in ("positions", "energy", "angular_momentum"):
+        one, other = np.asarray(own[part]), np.asarray(theirs[part])
+        gap = float(np.max(np.abs(one - other)) / max(1.0, float(np.max(np.abs(other)))))
+        if not gap < 1e-13:
+            raise ValueError(f"{model}: {part} of scene and data differ by {gap:.1g}")
+    print(f"{model}: scene and data of the peers start from the same state")
+
+
 def own_runs(model: str, plan: Plan) -> list[dict[str, Any]]:
     """Times, errors and drifts of all orders."""
     example = scene_of(model)
+    check_start(model, example)
     system, start = example.system, example.state
-    shared = model in SHARED
-    t_end = peer_measure.MODELS[model].T_END if shared else ALONE[model]
-    judge = judge_of(model) if shared else None
-    exact = None if shared else _reference(example, t_end).q
+    t_end = peer_measure.MODELS[model].T_END
+    judge = judge_of(model)
     found = []
     for order in ORDERS:
         scheme = nc.EnergyMomentum(order=order)
         run = endpoints(system, start, inputs=example.torques, scheme=scheme)
         jax.clear_caches()  # the reference may have compiled this order already
         compile_s = common.seconds(lambda run=run: jax.block_until_ready(run(t_end / 64, 2)))
-        for steps in plan.own:
+        for steps in plan.own_stiff if model in STIFF else plan.own:
             if order > 2 and steps > 2048:
                 continue
             call = lambda run=run, steps=steps: jax.block_until_ready(run(t_end / steps, steps))  # noqa: E731
+            begun = time.perf_counter()
             end = call()
+            enough = max(peer_measure.FEW, int(peer_measure.ENOUGH / (time.perf_counter() - begun)))
             if int(end.result) != 0:
                 continue
-            timing = common.timed(call, steps, plan.repeats) | {"compile_s": compile_s}
-            if judge is not None:
-                errors = judge(beside.own_state(model, system, end.state))
-            else:
-                errors = {"error": float(np.max(np.abs(end.state.q - exact)))}
+            timing = common.timed(call, steps, min(plan.repeats, enough)) | {"compile_s": compile_s}
+            errors = judge(beside.own_state(model, system, end.state))
             drift = drift_of(system, start, end.state)
             newton = int(end.iterations) / steps
             code = f"{OWN}, order {order}"
@@ -154,27 +244,79 @@ def judge_of(model: str) -> Callable[[dict[str, Any]], dict[str, float | None]]:
 
 
 def long_run(steps: int) -> dict[str, Any]:
-    """Largest energy drift of the heavy top over many steps, and its trend in terms of its noise."""
+    """Drift of natcoord_jax over many steps of the heavy top."""
     example = gallery.load("heavy_top")
-    every = steps // 1000
+    every = steps // RECORDS
     trajectory = nc.simulate(
         example.system,
         example.state,
-        dt=1e-3,
+        dt=LONG_DT,
         steps=steps,
         save_every=every,
         scheme=nc.EnergyMomentum(order=2),
     )
     energy = example.system.energy(trajectory)
-    scale = float(np.max(energy.kinetic + sum(np.abs(v) for v in energy.stores.values())))
-    drift = (np.asarray(energy.total) - float(energy.total[0])) / scale
+    involved = energy.kinetic + sum(np.abs(v) for v in energy.stores.values())
+    return {"code": f"{OWN}, order 2", "steps": steps, **drifting(energy.total, involved)}
+
+
+def peer_long_run(peer: Peer, python: str, steps: int) -> dict[str, Any]:
+    """The same of a peer."""
+    settings = {"t_end": LONG_DT * steps, "records": RECORDS}
+
+    def judge(answer: dict[str, Any]) -> dict[str, float | None]:
+        kinetic, total = np.transpose(answer["records"])
+        return drifting(total, kinetic + np.abs(total - kinetic))
+
+    one = beside.QUICK._replace(lanes=0)
+    run = beside.peer_run(
+        peer._replace(settings=peer.settings | settings), python, "heavy_top", steps, one, judge
+    )
+    row: dict[str, Any] = {"code": peer.name, "steps": steps, "largest_drift": None, "trend": None}
+    return row if run is None else {key: run[key] for key in row}
+
+
+def drifting(total: Any, involved: Any) -> dict[str, float | None]:
+    """Largest drift of energy of a run, and its trend from start to end; None unless all of it is finite.
+
+    Args:
+        total: energy, by time [J].
+        involved: the kinetic energy and the absolute values of all others, by time [J].
+    """
+    total, scale = np.asarray(total), float(np.max(involved))
+    if not (np.all(np.isfinite(total)) and math.isfinite(scale)):
+        return {"largest_drift": None, "trend": None}
+    drift = (total - total[0]) / scale
     slope = np.polyfit(np.linspace(0, 1, drift.size), drift, 1)[0]
-    return {"steps": steps, "largest_drift": float(np.max(np.abs(drift))), "trend": float(slope)}
+    return {"largest_drift": float(np.max(np.abs(drift))), "trend": float(slope)}
+
+
+def long_table(rows: list[dict[str, Any]]) -> str:
+    """The long runs as plain text."""
+    lines = [("heavy top, steps of 1 ms", "steps", "largest drift", "trend")]
+    for row in rows:
+        drift, trend = ("-" if row[key] is None else f"{row[key]:.1e}" for key in ("largest_drift", "trend"))
+        lines.append((row["code"], f"{row['steps']}", drift, trend))
+    return common.aligned(lines)
 
 
 def times(runs: list[dict[str, Any]]) -> dict[str, dict[str, float | None]]:
     """Time [ms] to given errors, by code, and of the best order."""
-    table = beside.equal_error(None, runs, ERRORS)
+    return _with_best(beside.equal_error(None, runs, ERRORS))
+
+
+def times_at_most(runs: list[dict[str, Any]]) -> dict[str, dict[str, float | None]]:
+    """The same of codes whose coarsest run is more accurate already: its time."""
+    table: dict[str, dict[str, float | None]] = {}
+    for code in dict.fromkeys(run["code"] for run in runs):
+        first = min((r for r in runs if r["code"] == code), key=lambda r: r["steps"])
+        spent = 1e-3 * first["us_per_step"] * first["steps"]
+        table[code] = {f"{wanted:g}": spent if first["error"] < wanted else None for wanted in ERRORS}
+    return _with_best(table)
+
+
+def _with_best(table: dict[str, dict[str, float | None]]) -> dict[str, dict[str, float | None]]:
+    """Times of all codes, after those of our best order."""
     own = [row for code, row in table.items() if code.startswith(OWN)]
     return {f"{OWN}, best order": _fastest(own), **table}
 
@@ -188,10 +330,28 @@ def _fastest(rows: list[dict[str, float | None]]) -> dict[str, float | None]:
     return best
 
 
-def targets(models: dict[str, Any]) -> list[dict[str, Any]]:
+def _known(found: dict[str, Any]) -> dict[str, dict[str, float | None]]:
+    """Times to errors, by code, those of `time_at_most` included."""
+    bounds = found["time_at_most"]
+    return {code: _fastest([row, bounds[code]]) for code, row in found["time_to_error"].items()}
+
+
+def table_of(found: dict[str, Any]) -> str:
+    """Times to errors of one model as plain text."""
+    rows = [("ms to error", *map("{:g}".format, ERRORS))]
+    for code, row in _known(found).items():
+        interpolated = found["time_to_error"][code]
+        words = (
+            "-" if t is None else f"{'' if t == interpolated[e] else '<'}{t:.3g}" for e, t in row.items()
+        )
+        rows.append((code, *words))
+    return common.aligned(rows)
+
+
+def targets(models: dict[str, Any], long: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """What is aimed at next to what was measured."""
     lines = []
-    for model in (m for m in SHARED if m in models):
+    for model in (m for m in TREES if m in models):
         table = models[model]["time_to_error"]
         best = table[f"{OWN}, best order"]
         rk4 = table.get("MuJoCo RK4")
@@ -205,6 +365,23 @@ def targets(models: dict[str, Any]) -> list[dict[str, Any]]:
         )
         name = f"{model}: over Exudyn, implicit, at 1e-08, there extrapolated by its order two"
         lines.append(common.target(name, _ratio(best, _extrapolated(implicit), "1e-08"), 1 / 500))
+    for model in (m for m in (*LOOPS, *STIFF) if m in models):
+        table = _known(models[model])
+        best = _fastest([row for code, row in table.items() if code.startswith(OWN)])
+        several = [row for code, row in table.items() if not code.startswith(OWN)]
+        theirs = _fastest(several)
+        for error in ("0.0001", "1e-06"):
+            unmet = ", which no peer reaches" if several and theirs[error] is None else ""
+            name = f"{model}: over every peer at {error}{unmet}"
+            lines.append(common.target(name, _ratio(best, theirs, error), 1.0))
+    if long:
+        (own,) = (row["largest_drift"] for row in long if row["code"].startswith(OWN))
+        theirs = [row["largest_drift"] for row in long if not row["code"].startswith(OWN)]
+        least = min((drift for drift in theirs if drift is not None), default=None)
+        name = (
+            f"heavy top, 10^{round(math.log10(long[0]['steps']))} steps: drift over the least of the peers'"
+        )
+        lines.append(common.target(name, None if least is None or own is None else own / least, 1.0))
     return lines
 
 
@@ -229,12 +406,13 @@ def draw(results: dict[str, Any]) -> Any:
 
     figure = Figure(figsize=(16, 9), layout="constrained")
     axes = figure.subplots(2, 4).reshape(-1)
-    axes[-1].set_visible(False)
+    for panel in axes[len(results["models"]) :]:
+        panel.set_visible(False)
     codes = list(dict.fromkeys(r["code"] for found in results["models"].values() for r in found["runs"]))
     own = [code for code in codes if code.startswith(OWN)]
     looks = {code: ("o-", 1.8, f"C{k}") for k, code in enumerate(own)}
     looks |= {
-        code: ("s--", 1.0, f"C{len(own) + k}" if len(own) + k < 10 else "black")
+        code: ("s--", 1.0, f"C{len(own) + k}" if len(own) + k < 10 else ("black", "gold")[len(own) + k - 10])
         for k, code in enumerate(code for code in codes if code not in own)
     }
     shown = {}
@@ -257,8 +435,7 @@ def draw(results: dict[str, Any]) -> Any:
 def main() -> None:
     """Run the benchmark."""
     parser = common.peer_parser("What accuracy costs in time, beside other codes.", "the figure")
-    every = (*SHARED, *ALONE)
-    parser.add_argument("--models", nargs="+", choices=every, default=every, help="only these scenes")
+    parser.add_argument("--models", nargs="+", choices=SHARED, default=SHARED, help="only these scenes")
     chosen = parser.parse_args()
     if chosen.redraw:
         common.redraw(chosen.redraw, draw)
@@ -272,20 +449,22 @@ def main() -> None:
     models: dict[str, Any] = {}
     for model in chosen.models:
         runs = own_runs(model, plan)
-        for peer in peers if model in SHARED else ():
-            for steps in peer.only or plan.theirs:
+        counts = plan.theirs_stiff if model in STIFF else plan.theirs
+        for peer in (p for p in peers if p.models is None or model in p.models):
+            for steps in peer.only or counts:
                 run = beside.peer_run(peer, chosen.peers_python, model, steps, bare, judge_of(model))
                 if run is not None and run["error"]:
                     runs.append(run | {"drift": run.get("energy_error")})
-        models[model] = {"runs": runs, "time_to_error": times(runs)}
-        rows = [("ms to error", *map("{:g}".format, ERRORS))]
-        for code, row in models[model]["time_to_error"].items():
-            rows.append((code, *("-" if t is None or math.isnan(t) else f"{t:.3g}" for t in row.values())))
-        print(f"\n{model}\n{common.aligned(rows)}\n", flush=True)
-    results |= {"models": models, "long": long_run(plan.long), "targets": targets(models)}
-    print(
-        f"{common.environment_line(results)}\n{results['long']}\n\n{common.show_targets(results['targets'])}"
-    )
+        models[model] = {"runs": runs, "time_to_error": times(runs), "time_at_most": times_at_most(runs)}
+        print(f"\n{model}\n{table_of(models[model])}\n", flush=True)
+    long = []
+    if "heavy_top" in chosen.models:
+        long = [long_run(plan.long)]
+        several = () if chosen.no_peers else beside.available(LONG_PEERS, chosen.peers_python)
+        long += [peer_long_run(peer, chosen.peers_python, plan.long) for peer in several]
+        print(long_table(long))
+    results |= {"models": models, "long": long, "targets": targets(models, long)}
+    print(f"{common.environment_line(results)}\n\n{common.show_targets(results['targets'])}")
     common.write(results, draw, common.folder(chosen))
 
 

@@ -6,19 +6,37 @@ settings follow the speed-up list of Exudyn's documentation: module without rang
 Lie-group nodes with constant mass matrix, no files, no output. Where it leaves a choice (dense linear solver,
 when to refresh the Jacobian), the defaults of `run` are what was fastest with these nodes on both models.
 
+Joints that close loops are constraints in both formulations, which leaves implicit solvers. For redundant
+constraints the documentation gives two ways: to drop those that depend on others, or to keep them and let
+Eigen's LU with full pivoting resolve the singular system (EigenDense and `ignoreSingularJacobian`). Both find
+the same motion, to three digits of its error; the first takes some half of the time and is the default. The
+tree needs fewer steps than rigid bodies, too. `TrapezoidalIndex2` fails on the four-bars.
+
 usage: python -m benchmarks.peers.exudyn_models MODEL STEPS [formulation=redundant|tree] [solver=RK44|...]
        [spectral_radius=0.9] [node=RotationRotationVector|RotationEulerParameters|RotationRxyz]
-       [linear_solver=EigenDense] [jacobian_per_step=true]
+       [linear_solver=EigenDense] [jacobian_per_step=true] [redundant=true] [t_end=10 records=1000]
 """
 
 import contextlib
 import io
 import sys
 from importlib.metadata import version
+from typing import Any
 
 import numpy as np
 
-from benchmarks.peers.measure import MODELS, command_line, final_state, per_step, times_per_call, turning
+from benchmarks.peers.measure import (
+    MODELS,
+    command_line,
+    energies,
+    final_state,
+    loops,
+    moving,
+    per_step,
+    seconds,
+    times_per_call,
+    turning,
+)
 
 sys.exudynFast = True  # the documented switch to the module without range checks; it prints a line
 with contextlib.redirect_stdout(io.StringIO()):
@@ -27,7 +45,8 @@ with contextlib.redirect_stdout(io.StringIO()):
     from exudyn.rigidBodyUtilities import RigidBodyInertia
 
 _OUT = exu.OutputVariableType
-# Three single turns make a free rotation; this order stays clear of gimbal lock in both models.
+# Three single turns make a free rotation; this order meets gimbal lock on the heavy top alone, which passes
+# the vertical.
 _GLOBAL_AXES = ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
 # The one-coordinate links of a kinematic tree that make up a joint: kind, axis (None: the three global ones).
 _LINKS = {
@@ -46,6 +65,11 @@ def _frame(axis) -> np.ndarray:
     x = np.cross(np.eye(3)[np.argmin(np.abs(z))], z)
     x /= np.linalg.norm(x)
     return np.column_stack([x, np.cross(z, x), z])
+
+
+def _closing(loop: dict, redundant: bool) -> list[int]:
+    """What a hinge that closes a loop constrains, in a frame whose third axis is its own."""
+    return [1, 1, 1, 1, 1, 0] if redundant else list(loop["independent"])
 
 
 def _add_joint(mbs, body: dict, parent: int, child: int) -> None:
@@ -75,7 +99,7 @@ def _add_joint(mbs, body: dict, parent: int, child: int) -> None:
         )
 
 
-def _build_redundant(model, mbs, node: str):
+def _build_redundant(model, mbs, node: str, redundant: bool):
     """Rigid bodies and constraints; returns a function that reads the state as `final_state` wants it."""
     ground = mbs.CreateGround()
     bodies = []
@@ -85,7 +109,7 @@ def _build_redundant(model, mbs, node: str):
             mbs.CreateRigidBody(
                 inertia=inertia,
                 referencePosition=list(body["com"]),
-                initialVelocity=list(np.cross(turning(body), body["com"])),
+                initialVelocity=list(moving(body)),
                 initialAngularVelocity=list(turning(body)),
                 show=False,
                 gravity=list(model.GRAVITY),
@@ -94,6 +118,14 @@ def _build_redundant(model, mbs, node: str):
         )
         if body["joint"] != "free":
             _add_joint(mbs, body, ground if body["parent"] is None else bodies[body["parent"]], bodies[-1])
+    for loop in loops(model):
+        mbs.CreateGenericJoint(
+            itemNumbers=[ground if loop[b] is None else bodies[loop[b]] for b in ("body_a", "body_b")],
+            position=loop["point"],
+            rotationMatrixAxes=_frame(loop["axes"][0]),
+            constrainedAxes=_closing(loop, redundant),
+            show=False,
+        )
     for index, torque in model.MOTORS:
         body = model.BODIES[index]
         for sign, item in ((1.0, index), (-1.0, body["parent"])):
@@ -132,6 +164,7 @@ def _tree_links(model) -> tuple[list[dict], list[int]]:
     for body in model.BODIES:
         root = body["parent"] is None
         parent = -1 if root else carrier[body["parent"]]
+        spin = turning(body) - (0.0 if root else turning(model.BODIES[body["parent"]]))
         moves = [
             (kind, axis)
             for kind, which in _LINKS[body["joint"]]
@@ -150,7 +183,9 @@ def _tree_links(model) -> tuple[list[dict], list[int]]:
                     stiffness=0.0,
                     damping=0.0,
                     force=0.0,
-                    rate=float(np.dot(axis, turning(body))) if kind == "RevoluteZ" and root else 0.0,
+                    rate=float(np.dot(axis, spin if kind == "RevoluteZ" else moving(body)))
+                    if kind == "RevoluteZ" or body["joint"] == "free"
+                    else 0.0,
                 )
             )
             parent = len(links) - 1
@@ -168,7 +203,7 @@ def _tree_links(model) -> tuple[list[dict], list[int]]:
     return links, carrier
 
 
-def _build_tree(model, mbs):
+def _build_tree(model, mbs, redundant: bool):
     """One kinematic tree; returns a function that reads the state as `final_state` wants it."""
     links, carrier = _tree_links(model)
     frames = [link["frame"] for link in links]
@@ -214,20 +249,30 @@ def _build_tree(model, mbs):
         )
     )
 
-    def marker(body, point):
+    def marker(body, point, axes=None):
+        if body is None:
+            place = exu.HT(rotation=np.eye(3) if axes is None else axes, translation=np.asarray(point))
+            return mbs.AddMarker(items.MarkerBodyRigid(bodyNumber=mbs.CreateGround(), localHT=place))
         link = links[carrier[body]]
-        local = link["frame"].T @ np.subtract(point, link["point"])
+        back = link["frame"].T
+        place = exu.HT(
+            rotation=np.eye(3) if axes is None else back @ axes,
+            translation=back @ np.subtract(point, link["point"]),
+        )
         return mbs.AddMarker(
-            items.MarkerKinematicTreeRigid(objectNumber=tree, linkNumber=carrier[body], localPosition=local)
+            items.MarkerKinematicTreeRigid(objectNumber=tree, linkNumber=carrier[body], localHT=place)
         )
 
+    for loop in loops(model):
+        axes = _frame(loop["axes"][0])
+        mbs.AddObject(
+            items.ObjectJointGeneric(
+                markerNumbers=[marker(loop[b], loop["point"], axes) for b in ("body_a", "body_b")],
+                constrainedAxes=_closing(loop, redundant),
+            )
+        )
     for s in model.POINT_SPRINGS:
-        ends = [
-            mbs.AddMarker(items.MarkerBodyPosition(bodyNumber=mbs.CreateGround(), localPosition=list(s[p])))
-            if s[b] is None
-            else marker(s[b], s[p])
-            for b, p in (("body_a", "point_a"), ("body_b", "point_b"))
-        ]
+        ends = [marker(s[b], s[p]) for b, p in (("body_a", "point_a"), ("body_b", "point_b"))]
         mbs.AddObject(
             items.ObjectConnectorSpringDamper(
                 markerNumbers=ends,
@@ -254,19 +299,30 @@ def _build_tree(model, mbs):
 
 
 def _settings(
-    model, steps: int, solver: str, *, spectral_radius: float, linear_solver: str, jacobian_per_step: bool
+    steps: int,
+    t_end: float,
+    solver: str,
+    *,
+    spectral_radius: float,
+    linear_solver: str,
+    jacobian_per_step: bool,
+    singular: bool,
+    records: int,
 ):
-    """Exudyn's simulation settings for speed."""
+    """Exudyn's simulation settings for speed; sensors are written `records` times after the start."""
     settings = exu.SimulationSettings()
     time = settings.timeIntegration
-    time.numberOfSteps, time.endTime, time.verboseMode = steps, model.T_END, 0
+    time.numberOfSteps, time.endTime, time.verboseMode = steps, t_end, 0
     time.solverType = getattr(exu.DynamicSolverType, solver)
     time.newton.useModifiedNewton = True
     time.newton.modifiedNewtonJacUpdatePerStep = jacobian_per_step
     time.generalizedAlpha.spectralRadius = spectral_radius
     time.explicit.computeEndOfStepAccelerations = False
     settings.linearSolver.solverType = getattr(exu.LinearSolverType, linear_solver)
-    settings.solution.file.write = settings.solution.sensors.active = False
+    settings.linearSolver.ignoreSingularJacobian = singular
+    settings.solution.file.write, settings.solution.sensors.active = False, records > 0
+    if records:
+        settings.solution.sensors.writePeriod = t_end / records
     settings.cleanUpMemory = False
     return settings
 
@@ -281,9 +337,12 @@ def run(
     node: str = "RotationRotationVector",
     linear_solver: str = "EigenDense",
     jacobian_per_step: bool = True,
+    redundant: bool = False,
+    t_end: float | None = None,
+    records: int = 0,
     repeats: int = 7,
 ) -> dict:
-    """Times `steps` steps over [0, T_END] and returns times and final state.
+    """Times `steps` steps over [0, t_end] and returns times and final state.
 
     Args:
         model: a name in `MODELS`.
@@ -297,26 +356,52 @@ def run(
         linear_solver: a name in exudyn.LinearSolverType.
         jacobian_per_step: one Jacobian per step in the modified Newton method; false, Exudyn's default: when
             convergence asks for one.
+        redundant: close loops with all constraints of their joints and solve in the sense of least squares,
+            instead of dropping those that depend on others.
+        t_end: [s]; None: `T_END` of the model.
+        records: number of times at which `energies` are recorded besides the start (in "records"); the run is
+            then made once. 0: none.
         repeats: timed repetitions.
     """
     source = MODELS[model]
+    end = source.T_END if t_end is None else t_end
     solver = solver or {"redundant": "GeneralizedAlpha", "tree": "RK44"}[formulation]
     container = exu.SystemContainer()  # owns the system: it must outlive it
     mbs = container.AddSystem()
-    read = _build_tree(source, mbs) if formulation == "tree" else _build_redundant(source, mbs, node)
+    if formulation == "tree":
+        read = _build_tree(source, mbs, redundant)
+    else:
+        read = _build_redundant(source, mbs, node, redundant)
+    sensor = None
+    if records:
+        sensor = mbs.AddSensor(
+            items.SensorUserFunction(
+                sensorUserFunction=lambda *_: energies(final_state(source, *read())),
+                writeToFile=False,
+                storeInternal=True,
+            )
+        )
     mbs.Assemble()
-    options = {
+    options: dict[str, Any] = {
         "spectral_radius": spectral_radius,
         "linear_solver": linear_solver,
         "jacobian_per_step": jacobian_per_step,
     }
-    settings = _settings(source, steps, solver, **options)
+    singular = redundant and bool(loops(source))
+    settings = _settings(steps, end, solver, **options, singular=singular, records=records)
     settings.timeIntegration.reuseConstantMassMatrix = (
         formulation == "redundant" and node == "RotationRotationVector"
     )
-    timing = per_step(times_per_call(lambda: mbs.SolveDynamic(settings), repeats), steps)
+    found = {}
+    if sensor is None:
+        timing = per_step(times_per_call(lambda: mbs.SolveDynamic(settings), repeats), steps)
+    else:
+        timing = per_step([seconds(lambda: mbs.SolveDynamic(settings))], steps)
+        found = {"records": mbs.GetSensorStoredData(sensor)[:, 1:].tolist()}
     if solver not in ("GeneralizedAlpha", "TrapezoidalIndex2"):
         options = {"linear_solver": linear_solver}
+    if loops(source):
+        options["redundant"] = redundant
     options |= {"formulation": formulation, "solver": solver} | (
         {"node": node} if formulation == "redundant" else {}
     )
@@ -325,10 +410,11 @@ def run(
         "version": version("exudyn"),
         "model": model,
         "steps": steps,
-        "h": source.T_END / steps,
+        "h": end / steps,
         "settings": options,
         **timing,
         **final_state(source, *read()),
+        **found,
     }
 
 

@@ -4,24 +4,52 @@ import json
 import statistics
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from benchmarks.peers import double_pendulum, heavy_top, open_tree, spacecraft, spinning_spacecraft
+from benchmarks.peers import (
+    bricard,
+    double_pendulum,
+    four_bar,
+    heavy_top,
+    open_tree,
+    spacecraft,
+    spinning_spacecraft,
+    stiff_chain,
+)
 
-_MODULES = (spacecraft, spinning_spacecraft, open_tree, heavy_top, double_pendulum)
+_MODULES = (
+    spacecraft,
+    spinning_spacecraft,
+    open_tree,
+    heavy_top,
+    double_pendulum,
+    four_bar,
+    bricard,
+    stiff_chain,
+)
 MODELS = {module.NAME: module for module in _MODULES}
 
 
-def times_per_call(call: Callable[[], object], repeats: int) -> list[float]:
-    """Wall time of each of `repeats` calls [s], after one call that is not counted."""
+ENOUGH = 10.0
+"""Calls are repeated no more than `FEW` times where that takes longer [s]."""
+FEW = 3
+
+
+def seconds(call: Callable[[], object]) -> float:
+    """Wall time of one call [s]."""
+    start = time.perf_counter()
     call()
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        call()
-        times.append(time.perf_counter() - start)
+    return time.perf_counter() - start
+
+
+def times_per_call(call: Callable[[], object], repeats: int) -> list[float]:
+    """Wall time of each of at most `repeats` calls [s], after one call that is not counted."""
+    call()
+    times: list[float] = []
+    while len(times) < repeats and (len(times) < FEW or sum(times) < ENOUGH):
+        times.append(seconds(call))
     return times
 
 
@@ -32,8 +60,18 @@ def per_step(times: list[float], steps: int) -> dict:
 
 
 def turning(body: dict) -> np.ndarray:
-    """Angular velocity of a body at the start [rad/s]: of everything as a whole, about the origin."""
+    """Angular velocity of a body at the start [rad/s]; none given: zero."""
     return np.array(body.get("angular_velocity", (0.0, 0.0, 0.0)))
+
+
+def moving(body: dict) -> np.ndarray:
+    """Velocity of the centre of mass at the start [m/s]; none given: everything turns about the origin."""
+    return np.array(body.get("velocity", np.cross(turning(body), body["com"])))
+
+
+def loops(model) -> Sequence[dict]:
+    """The joints that close loops, see `four_bar`; none where the data have none."""
+    return getattr(model, "LOOPS", ())
 
 
 def _relative_angle(body: dict, rotation: np.ndarray, parent_rotation: np.ndarray) -> float:
@@ -112,6 +150,11 @@ def final_state(model, position, rotation, velocity, angular_velocity) -> dict:
         "base_rotation": turn[0].tolist(),
         "base_angular_velocity": w[0].tolist(),
     }
+
+
+def energies(state: dict) -> list[float]:
+    """What a record of a long run keeps of a `final_state`: kinetic energy and energy [J]."""
+    return [state["kinetic_energy"], state["energy"]]
 
 
 def command_line(run: Callable[..., dict]) -> None:
