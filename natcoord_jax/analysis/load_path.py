@@ -227,6 +227,7 @@ def _followed(
     direction = jnp.zeros(balances), jnp.ones(())
     carry = start, lam, direction, jnp.array(True)
     _, (states, lams, codes, counts) = jax.lax.scan(one, carry, None, length=steps)
+    # (The loads that were found are results of the search, too.)
     states, lams = jax.lax.stop_gradient((states, lams))
     states, lams = jax.vmap(lambda s, lam: differentiable(system, s, lam, inputs(s.t)))(states, lams)
     return Equilibrium(states, lams, codes, counts)

@@ -1,6 +1,5 @@
 """Equilibrium under loads: by steps of the load, or along its path through limit points."""
 
-from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -15,6 +14,7 @@ from natcoord_jax.core.compiled import briefly
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.results import REASONS, Result, SimulationError
 from natcoord_jax.core.state import State
+from natcoord_jax.linsolve.refinement import refined_solve
 
 ITERATIONS = 40
 """Newton iterations for one load."""
@@ -133,18 +133,11 @@ def differentiable(system: System, state: State, lam: Array, inputs: Array) -> t
     fixed = jax.lax.stop_gradient(replace_fields(state, t=jnp.zeros_like(state.t)))
     static = Static(system, replace_fields(fixed, t=state.t), inputs)
     at = jax.lax.stop_gradient(jnp.concatenate([jnp.zeros(static.balances), lam]))
+    # It only helps to solve: its derivatives must not reach the root's rule.
     inverse = jax.lax.stop_gradient(static.inverse(at))
 
     def tangent_solve(linear: Any, right: Array) -> Array:
-        def refined(inverse: Array, multiply: Any, b: Array) -> Array:
-            x = inverse @ b
-            for _ in range(3):
-                x = x + inverse @ (b - multiply(x))
-            return x
-
-        return jax.lax.custom_linear_solve(
-            linear, right, solve=partial(refined, inverse), transpose_solve=partial(refined, inverse.T)
-        )
+        return refined_solve(linear, right, inverse, jnp.matmul, lambda near, b: near.T @ b, rounds=3)
 
     y = jax.lax.custom_root(lambda y: static.residual(y), at, lambda f, start: start, tangent_solve)
     return static.displaced(y), y[static.balances :]
@@ -230,6 +223,7 @@ def _inputs_at(system: System, inputs: Any, values: Array) -> Float[Array, "load
 @briefly
 def _equilibria(system: System, state: State, values: Array, inputs: Array) -> Equilibrium:
     static = Static(system, state, inputs[0])
+    # The search is not differentiated; `differentiable` gives its results their derivatives.
     still = jax.lax.stop_gradient((system, state))
 
     def one(carry: tuple, load: tuple) -> tuple[tuple, tuple]:

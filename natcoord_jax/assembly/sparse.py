@@ -39,6 +39,7 @@ class SparseStep(FullStep):
         """The same, refined and differentiable."""
         if self.tableau.stages > 1:
             return super().differentiable(matrix)
+        # An approximate inverse: derivatives are those of the equation that the solution obeys.
         factors = jax.lax.stop_gradient(self.factorised(matrix)[0])
         return SparseSolver(self._assembled(matrix), factors, rounds=2)
 

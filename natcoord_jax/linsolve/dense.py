@@ -1,10 +1,10 @@
 """Inverses of small dense matrices, made once and applied often."""
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from natcoord_jax.linsolve.refinement import refined_solve
 from natcoord_jax.maths.elimination import definite_inverse, pivoted_inverse
 
 
@@ -85,17 +85,11 @@ class DenseSolver(eqx.Module):
     def solve(self, right: Float[Array, " n"]) -> Float[Array, " n"]:
         """Solution x of matrix x = right."""
         rounds = 0 if self.definite == right.shape[-1] else 2
-        inverse = jax.lax.stop_gradient(self.inverse)
-
-        def refined(approximate: Array, multiply, b: Array) -> Array:
-            x = apply(approximate, b)
-            for _ in range(rounds):
-                x = x + apply(approximate, b - multiply(x))
-            return x
-
-        return jax.lax.custom_linear_solve(
+        return refined_solve(
             lambda x: apply(self.matrix, x),
             right,
-            solve=lambda multiply, b: refined(inverse, multiply, b),
-            transpose_solve=lambda multiply, b: refined(inverse.T, multiply, b),
+            self.inverse,
+            apply,
+            lambda inverse, b: apply(inverse.T, b),
+            rounds,
         )

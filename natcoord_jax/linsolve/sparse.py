@@ -13,6 +13,7 @@ from natcoord_jax.linsolve.block_tridiagonal import BlockTridiagonal
 from natcoord_jax.linsolve.blocks import BlockMatrix, BlockPattern, Entries
 from natcoord_jax.linsolve.graph import graph_of
 from natcoord_jax.linsolve.multifrontal import Multifrontal
+from natcoord_jax.linsolve.refinement import refined_solve
 
 DENSE_UP_TO = 70  # unknowns up to which nothing is faster than a dense inverse
 UNEVEN = 2.0  # storage of a chain over that of its blocks, from which on padding costs more than it saves
@@ -131,23 +132,18 @@ class SparseSolver(eqx.Module):
     @classmethod
     def of(cls, plan: Plan, matrix: BlockMatrix) -> "SparseSolver":
         """Factorise a matrix."""
+        # Its derivatives would be worked out in vain: see `refined_solve`.
         return cls(matrix, factorised(plan, jax.lax.stop_gradient(matrix)))
 
     def solve(self, right: Float[Array, " n"]) -> Float[Array, " n"]:
         """Solution x of matrix x = right."""
-        factors = jax.lax.stop_gradient(self.factors)
-
-        def refined(given: Factorised, multiply: Any, b: Array) -> Array:
-            x = given.solve(b)
-            for _ in range(self.rounds):
-                x = x + given.solve(b - multiply(x))
-            return x
-
-        return jax.lax.custom_linear_solve(
+        return refined_solve(
             self.matrix.multiply,
             right,
-            solve=lambda multiply, b: refined(factors, multiply, b),
-            transpose_solve=lambda multiply, b: refined(factors.transpose(), multiply, b),
+            self.factors,
+            lambda factors, b: factors.solve(b),
+            lambda factors, b: factors.transpose().solve(b),
+            self.rounds,
         )
 
     def singular(self, x: Float[Array, " n"], right: Float[Array, " n"]) -> Bool[Array, ""]:

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from natcoord_jax.linsolve.dense import bordered_inverse
+from natcoord_jax.linsolve.refinement import refined_solve
 from natcoord_jax.maths.rows import add_at, row
 
 
@@ -183,15 +184,11 @@ class RefinedSolver(eqx.Module):
 
     def solve(self, right: Float[Array, "nodes n"]) -> Float[Array, "nodes n"]:
         """Solution of blocks x = right."""
-        factors = jax.lax.stop_gradient(self.factors)
-
-        def refined(given: Any, multiply, b: Array) -> Array:
-            x = given.solve(b)
-            return x + given.solve(b - multiply(x))
-
-        return jax.lax.custom_linear_solve(
+        return refined_solve(
             self.blocks.multiply,
             right,
-            solve=lambda multiply, b: refined(factors, multiply, b),
-            transpose_solve=lambda multiply, b: refined(factors.transpose(), multiply, b),
+            self.factors,
+            lambda factors, b: factors.solve(b),
+            lambda factors, b: factors.transpose().solve(b),
+            rounds=1,
         )
