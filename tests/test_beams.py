@@ -275,6 +275,27 @@ def test_lateral_buckling():
 
 
 @pytest.mark.slow
+def test_buckling_sets_in_in_motion():
+    """The same cantilever, touched from the side: below the critical load it swings, above it falls over."""
+    weak, torsion = 1.0, 1.5
+    section = nc.Section.of_numbers(EA=1e5, GA=1e5, EI=(1e3, weak), GJ=torsion, density=1.0, rotary=1e-2)
+    critical = 4.013 * np.sqrt(weak * torsion)
+    aside = []
+    for part in (0.9, 1.1):
+        scene, line = nc.Scene(), [(0, 0, 0), (1, 0, 0)]
+        beam = scene.add(nc.Beam(section, line, elements=8, second=(0, 1, 0), start=nc.ground, name="beam"))
+        scene.add(nc.PointForce((nc.Point(beam.end, line[1]),), force=(0, 0, -part * critical)))
+        system, state = scene.compile()
+        state = nc.equilibrium(system, state).state
+        row = 4 * system.body_index(beam.end)
+        touched = replace_fields(state, v=state.v.at[row, 1].add(1e-3))
+        found = nc.simulate(system, touched, dt=0.01, steps=400)
+        assert nc.balance(system, found).energy.max() < tol.ENERGY
+        aside.append(np.abs(np.asarray(system.sense(found, beam.end).position)[:, 1]).max())
+    assert aside[0] < 1e-3 and aside[1] > 0.05, aside
+
+
+@pytest.mark.slow
 def test_snap_through():
     """A shallow arch: the path goes through the limit point and back, symmetric about the flat shape."""
     section = nc.Section.of_numbers(EA=1e4, GA=5e3, EI=1.0, GJ=1.0, density=1.0, rotary=0.01)
@@ -294,6 +315,86 @@ def test_snap_through():
     loads, height = np.asarray(path.states.t), np.asarray(system.sense(path.states, top).position[:, 2])
     most = int(np.argmax(loads))
     assert 0 < most < 29 and loads.min() < 0 and np.all(np.diff(height[: most + 3]) < 0)
+
+
+# --- loads along beams ------------------------------------------------------------------------------------
+
+
+def straight(elements=8, *, interpolation=None, start=nc.ground, **load):
+    """A metre of beam along x with a load along it."""
+    scene, section = nc.Scene(), nc.Section.of_numbers(**NUMBERS)
+    given = {} if interpolation is None else {"interpolation": interpolation}
+    beam = scene.add(
+        nc.Beam(section, [(0, 0, 0), (1, 0, 0)], elements=elements, second=(0, 1, 0), start=start, **given)
+    )
+    if load:
+        scene.add(nc.LineLoad(beam, **load))
+    else:
+        scene.add(nc.Gravity())
+    return *scene.compile(), beam
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("interpolation", [None, nc.DirectorInterpolation(order=2)])
+def test_a_load_along_a_beam_can_be_its_weight(interpolation):
+    weight = (0.0, 0.0, -9.81 * NUMBERS["density"])
+    found = []
+    for load in ({}, {"force": weight}, {"force": lambda t: jnp.asarray(weight)}):
+        system, state, _ = straight(interpolation=interpolation, **load)
+        found.append(nc.simulate(system, state, dt=0.01, steps=10).q)
+    assert float(jnp.max(jnp.abs(found[0] - found[0][0]))) > 0.01
+    for other in found[1:]:
+        np.testing.assert_allclose(other, found[0], atol=tol.SAME_TRAJECTORY)
+
+
+@pytest.mark.parametrize(
+    ("profile", "deflection"), [(None, 1 / 8), (lambda x: 1.0 - x, 1 / 30), (lambda x: x, 11 / 120)]
+)
+def test_deflection_under_a_load_along_the_beam(profile, deflection):
+    """Of a slender cantilever, in q L^4 / (E I)."""
+    load = {"force": (0.0, 0.0, -1e-4), "profile": profile}
+    system, state, beam = straight(**load)
+    height = tip(system, nc.equilibrium(system, state).state, beam)[2]
+    shear = {1 / 8: 1 / 2, 1 / 30: 1 / 6, 11 / 120: 1 / 3}[deflection] / NUMBERS["GA"]
+    bending = NUMBERS["EI"][0]
+    # An even load is exact, others are to the square of the elements' length.
+    wanted, off = -1e-4 * (deflection / bending + shear), 1e-6 if profile is None else 2 / 8**2
+    assert height == pytest.approx(wanted, rel=off)
+
+
+def test_a_following_load_turns_with_the_beam():
+    """A rod that spins and is pushed along itself: its momentum is the integral of the turning force."""
+    rate, push, twist = 2.0, 3.0, 0.5
+    scene, section = nc.Scene(), nc.Section.of_numbers(**(NUMBERS | {"EI": 1e4, "GA": 1e5, "EA": 1e6}))
+    spin = {"angular_velocity": (0, 0, rate), "velocity": (0, -0.5 * rate, 0)}
+    rod = scene.add(nc.Beam(section, [(0, 0, 0), (1, 0, 0)], elements=2, second=(0, 0, 1), **spin))
+    scene.add(nc.LineLoad(rod, force=(0, 0, push), moment=lambda t: jnp.array([twist, 0, 0]), following=True))
+    system, state = scene.compile()
+    trajectory = nc.simulate(system, state, dt=1e-3, steps=200)
+    t = np.asarray(trajectory.t)
+    turning = np.asarray(system.angular_momentum(trajectory))[:, 2]
+    inertia = turning[0] / rate
+    # The moment about d_1, which is z, speeds it up.
+    angle = rate * t + 0.5 * twist / inertia * t**2
+    steps = 0.5 * (np.exp(1j * angle[1:]) + np.exp(1j * angle[:-1])) * 1e-3 * push
+    momentum = np.asarray(system.momentum(trajectory))
+    wanted = np.cumsum(steps)
+    np.testing.assert_allclose(momentum[1:, 0] + 1j * momentum[1:, 1], wanted, atol=2e-3 * abs(wanted[-1]))
+
+
+def test_a_wrong_load_along_a_beam_is_named():
+    with pytest.raises(ValueError, match="neither force"):
+        straight(following=True)
+    with pytest.raises(ValueError, match=r"force.*N/m"):
+        straight(force=(1.0, 2.0))
+    with pytest.raises(ValueError, match="what scene.add"):
+        nc.Scene().add(nc.LineLoad(nc.ground, force=(0, 0, 1)))
+    clamp = nc.Attachment(nc.ground, (0, 0, 0), np.eye(3))
+    for marker in (clamp, nc.Direction(nc.ground, (0, 0, 1))):
+        with pytest.raises(ValueError, match="pass 1 nc.Point"):
+            nc.PointForce((marker,), force=(0, 0, 1))
+    with pytest.raises(ValueError, match="1 nc.Point and 3 nc.Direction"):
+        nc.PointForce((nc.Point(nc.ground),), force=(0, 0, 1), following=True)
 
 
 # --- errors -----------------------------------------------------------------------------------------------

@@ -33,6 +33,8 @@ class BeamHandle:
         fractions: of the length, where the nodes are.
         elements: handles of its elements.
         outline: rim of the section (n, 2) [m], for pictures, or None.
+        attachments: where the nodes are in the assembled pose, each with the triad d_1, d_2, d_3.
+        shares: lengths that the nodes stand for (nodes,) [m].
     """
 
     name: str
@@ -40,6 +42,8 @@ class BeamHandle:
     fractions: tuple[float, ...]
     elements: tuple[Handle, ...]
     outline: Any = field(default=None, repr=False, compare=False)
+    attachments: tuple[Attachment, ...] = field(default=(), repr=False, compare=False)
+    shares: Any = field(default=None, repr=False, compare=False)
 
     @property
     def start(self) -> Handle:
@@ -144,7 +148,9 @@ class Beam(Recipe):
         for effect in others:
             scene.add(effect)
         places = tuple(float(x) for x in fractions)
-        return BeamHandle(name, tuple(nodes), places, handles, self.section.outline)
+        return BeamHandle(
+            name, tuple(nodes), places, handles, self.section.outline, tuple(attachments), lumps
+        )
 
     def _damping(self, label: str) -> Any:
         if self.damping is None:
