@@ -23,6 +23,7 @@ from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.control.riccati import Factors, Right, Weighted, out_of_reach, solve, taken_back
 from natcoord_jax.control.transcription import Node, Unknowns, end, entering, first_node, slices, stage
 from natcoord_jax.linsolve.conjugate_residuals import conjugate_residuals
+from natcoord_jax.stepping.one_kernel import scan_in_one_kernel
 
 CORRECTIONS = 8
 """Most directions of one improvement."""
@@ -107,7 +108,7 @@ def swept(problem: OptimalControl, iterate: Iterate, change: Change, level: Arra
 
     jacobians, residual = iterate.derivatives.jacobians, path.stages.residual
     given = (slices(problem), nodes_before(path), w, dw, unknowns.y, jacobians, residual)
-    last, (before, y, excess) = jax.lax.scan(body, ravel_pytree(start)[0], given)
+    last, (before, y, excess) = scan_in_one_kernel(body, ravel_pytree(start)[0], given)
     final = jax.tree.map(lambda x: x[-1], path.nodes)
     reached = jax.jvp(lambda node: end(problem, node), (final,), (unflat(last),))[1]
     return Linear(before, last, dw, Sweep(y, excess, reached.missing, reached.excess))
@@ -153,7 +154,7 @@ def _curved(problem: OptimalControl, iterate: Iterate, change: Change, linear: L
         before, more, _ = through_step(problem, at, node, w, y, jacobian)(after, by_y)
         return before + by_node, more + by_w
 
-    first, by_w = jax.lax.scan(body, last, (*each, jacobians, by_node, by_w, by_y), reverse=True)
+    first, by_w = scan_in_one_kernel(body, last, (*each, jacobians, by_node, by_w, by_y), reverse=True)
     value = ravel_pytree(jax.tree.map(lambda x: x[0], worth.nodes))[0]
 
     def slope(unknowns: Unknowns, value: Array) -> Array:
@@ -253,7 +254,7 @@ def improved(
     felt = factors.goal_scale > 0
     give = jnp.sum(found.excess[:, :, -problem.channels :] ** 2 / own[:, None], axis=2)
     weights = Change(
-        jnp.sum(factors.start_lower**2, axis=1),
+        factors.start_stiffness,
         own,
         jnp.where(felt, 1.0 / jnp.where(felt, factors.goal_scale, 1.0) ** 2, 0.0),
         give,

@@ -25,6 +25,7 @@ from natcoord_jax.control.transcription import (
     stage,
     unpacked,
 )
+from natcoord_jax.stepping.one_kernel import scan_in_one_kernel
 
 
 class Multipliers(eqx.Module):
@@ -206,7 +207,7 @@ def costates(
     given = (*each, slopes, jacobians, after)
     rates = projections(problem, path.nodes, maps)[1:]
     given = (*given, rates, maps.forth[1:], maps.flexibility[1:])
-    _, (nodes, residuals, by_w) = jax.lax.scan(body, (last, last), given, reverse=True)
+    _, (nodes, residuals, by_w) = scan_in_one_kernel(body, (last, last), given, reverse=True)
     nodes = jnp.concatenate([nodes, jnp.broadcast_to(last, (1, 2, last.size))])
     exact, model = (Costates(jax.vmap(unflat)(nodes[:, k]), residuals[:, k]) for k in range(2))
     return exact, model, by_w

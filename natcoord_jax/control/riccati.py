@@ -15,6 +15,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from natcoord_jax.control.iterate import Model
+from natcoord_jax.maths.elimination import inverse_cholesky
+from natcoord_jax.stepping.one_kernel import scan_in_one_kernel
 
 REACH = (1e-8, 1e-3)
 """Eigenvalues of the goal's compliance below this fraction of the largest count as zero: of a motion that
@@ -55,11 +57,12 @@ class Factors(eqx.Module):
 
     Attributes:
         forward: z_k+1 from [z_k, w_k] (steps, z, z + m).
-        lower: Cholesky factors of the curvature in w (steps, m, m).
+        softness: inverses of the curvature in w (steps, m, m).
         gain: feedback of w on z (steps, m, z).
         by_goal: w per nu (steps, m, c).
         start: z_0 per what is free (z, f).
-        start_lower: Cholesky factor of the curvature in what is free (f, f).
+        start_stiffness: curvature in what is free, on the diagonal (f,).
+        start_softness: its inverse (f, f).
         start_by_goal: what is free per nu (f, c).
         compliance: the goal's compliance T: its residual per multiplier (c, c).
         goal_scale: units in which T is decomposed; 0 for conditions that nothing moves (c,).
@@ -70,11 +73,12 @@ class Factors(eqx.Module):
     """
 
     forward: Float[Array, "steps z zm"]
-    lower: Float[Array, "steps m m"]
+    softness: Float[Array, "steps m m"]
     gain: Float[Array, "steps m z"]
     by_goal: Float[Array, "steps m c"]
     start: Float[Array, "z f"]
-    start_lower: Float[Array, "f f"]
+    start_stiffness: Float[Array, " f"]
+    start_softness: Float[Array, "f f"]
     start_by_goal: Float[Array, "f c"]
     compliance: Float[Array, "c c"]
     goal_scale: Float[Array, " c"]
@@ -104,18 +108,14 @@ def _symmetric(matrix: Array) -> Array:
     return 0.5 * (matrix + matrix.T)
 
 
-def _cholesky(matrix: Array, convex: Array) -> tuple[Array, Array]:
-    """Lower factor, or the identity where there is none; and whether this matrix is convex like the rest."""
+def _inverse(matrix: Array, convex: Array) -> tuple[Array, Array]:
+    """Inverse, or the identity where the matrix is not convex; and whether it is, like those before it."""
     if not matrix.shape[0]:
         return matrix, convex
-    lower = jnp.linalg.cholesky(matrix)
-    convex = convex & jnp.all(jnp.isfinite(lower))
-    return jnp.where(convex, jnp.nan_to_num(lower), jnp.eye(lower.shape[0], dtype=lower.dtype)), convex
-
-
-def _solved(lower: Array, right: Array) -> Array:
-    """Minus the solution with a Cholesky factor."""
-    return -jax.scipy.linalg.cho_solve((lower, True), right) if lower.shape[0] else -right
+    # Of the Cholesky factor: it exists for convex matrices only.
+    root = inverse_cholesky(matrix)
+    convex = convex & jnp.all(jnp.isfinite(root))
+    return jnp.where(convex, root.T @ root, jnp.eye(root.shape[0], dtype=root.dtype)), convex
 
 
 def factored(
@@ -149,8 +149,8 @@ def factored(
         forward, hessian, excess, weight, extra = given
         whole = _symmetric(hessian + forward.T @ P @ forward + excess.T @ (weight[:, None] * excess))
         mixed = forward.T @ S
-        lower, convex = _cholesky(whole[size:, size:] + jnp.diag(extra), convex)
-        found = _solved(lower, jnp.concatenate([whole[size:, :size], mixed[size:]], axis=1))
+        softness, convex = _inverse(whole[size:, size:] + jnp.diag(extra), convex)
+        found = -softness @ jnp.concatenate([whole[size:, :size], mixed[size:]], axis=1)
         gain, by_goal = found[:, :size], found[:, size:]
         before = (
             _symmetric(whole[:size, :size] + whole[:size, size:] @ gain),
@@ -158,24 +158,27 @@ def factored(
             T - mixed[size:].T @ by_goal,
             convex,
         )
-        return before, (lower, gain, by_goal)
+        return before, (softness, gain, by_goal)
 
     given = (model.forward, model.hessian, model.excess, bounds.path, idle + added)
-    (P, S, T, convex), (lower, gain, by_goal) = jax.lax.scan(backward, begun, given, reverse=True)
+    # Products of whole matrices: the library's are quicker than one kernel.
+    (P, S, T, convex), (softness, gain, by_goal) = jax.lax.scan(backward, begun, given, reverse=True)
     E = model.first
     quadratic = _symmetric(E.T @ P @ E + model.first_hessian)
     start_added = shift * (1.0 + jnp.abs(jnp.diagonal(quadratic)))
-    start_lower, convex = _cholesky(quadratic + jnp.diag(start_added), convex)
-    start_by_goal = _solved(start_lower, E.T @ S)
+    stiffness = quadratic + jnp.diag(start_added)
+    start_softness, convex = _inverse(stiffness, convex)
+    start_by_goal = -start_softness @ (E.T @ S)
     T = T - (E.T @ S).T @ start_by_goal
     scale, vectors, inverse = _decomposed(T, reach)
     return Factors(
         model.forward,
-        lower,
+        softness,
         gain,
         by_goal,
         E,
-        start_lower,
+        jnp.diagonal(stiffness),
+        start_softness,
         start_by_goal,
         T,
         scale,
@@ -217,23 +220,23 @@ def solve(factors: Factors, right: Right) -> Move:
 
     def backward(value: tuple, given: tuple) -> tuple[tuple, Array]:
         p, t = value
-        gradient, forward, lower, gain, by_goal = given
+        gradient, forward, softness, gain, by_goal = given
         linear = gradient + forward.T @ p
         own = linear[size:]
-        return (linear[:size] + gain.T @ own, t + by_goal.T @ own), _solved(lower, own)
+        return (linear[:size] + gain.T @ own, t + by_goal.T @ own), -softness @ own
 
     f = factors
-    given = (right.gradient, f.forward, f.lower, f.gain, f.by_goal)
-    (p, t), step = jax.lax.scan(backward, (right.last, right.missing), given, reverse=True)
+    given = (right.gradient, f.forward, f.softness, f.gain, f.by_goal)
+    (p, t), step = scan_in_one_kernel(backward, (right.last, right.missing), given, reverse=True)
     linear = f.start.T @ p + right.first
     t = t + f.start_by_goal.T @ linear
     nu = f.goal_scale * (f.goal_vectors @ (f.goal_inverse * (f.goal_vectors.T @ (f.goal_scale * t))))
-    first = _solved(f.start_lower, linear) + f.start_by_goal @ nu
+    first = f.start_by_goal @ nu - f.start_softness @ linear
 
     def forth(z: Array, given: tuple) -> tuple[Array, tuple]:
         forward, gain, step, by_goal = given
         w = gain @ z + step + by_goal @ nu
         return forward @ jnp.concatenate([z, w]), (z, w)
 
-    last, (z, w) = jax.lax.scan(forth, f.start @ first, (f.forward, f.gain, step, f.by_goal))
+    last, (z, w) = scan_in_one_kernel(forth, f.start @ first, (f.forward, f.gain, step, f.by_goal))
     return Move(w, first, nu, jnp.concatenate([z, last[None]]))

@@ -64,6 +64,18 @@ def as_one_kernel(function: Callable, *arguments: Any, too_large: Callable | Non
     return _flat(_kernel, program, shapes, arguments)
 
 
+def scan_in_one_kernel(body: Callable, start: Any, given: Any, reverse: bool = False) -> tuple[Any, Any]:
+    """`jax.lax.scan` in one kernel where that is possible and quickly compiled, else as it is.
+
+    Not differentiable by itself.
+    """
+
+    def scan(start: Any, given: Any) -> tuple[Any, Any]:
+        return jax.lax.scan(body, start, given, reverse=reverse)
+
+    return as_one_kernel(scan, start, given, too_large=scan)
+
+
 def in_groups(function: Callable, *arguments: Any) -> Any:
     """The value of a function; under vmap on the CPU, lanes are worked through in groups of `LANES`."""
     if not _on_cpu():
