@@ -1,6 +1,7 @@
 """Error against time beside Exudyn, MuJoCo and MJX: the spacecraft and the open tree, one run, one core.
 
 usage: python -m benchmarks.spacecraft [--quick] [--output FOLDER] [--peers-python PATH] [--no-peers]
+       [--models NAME ...]
        [--redraw JSON]
 
 The systems are those of the gallery. Of natcoord_jax the compiled rollout is timed at its default settings
@@ -417,7 +418,11 @@ def draw(results: dict[str, Any]) -> Any:
 
 def main() -> None:
     """Run the benchmark."""
-    chosen = common.peer_parser("Error against time beside other codes.", "the figure").parse_args()
+    parser = common.peer_parser("Error against time beside other codes.", "the figure")
+    parser.add_argument(
+        "--models", nargs="+", default=list(SHARE), choices=list(SHARE), metavar="NAME", help="only these"
+    )
+    chosen = parser.parse_args()
     if chosen.redraw:
         common.redraw(chosen.redraw, draw)
         return
@@ -426,7 +431,7 @@ def main() -> None:
     plan = QUICK if chosen.quick else FULL
     results = common.circumstances("spacecraft", quick=chosen.quick)
     peers = () if chosen.no_peers else available(plan.peers, chosen.peers_python)
-    models = {model: measure(model, plan, peers, chosen.peers_python) for model in SHARE}
+    models = {model: measure(model, plan, peers, chosen.peers_python) for model in chosen.models}
     versions = {
         r["code"].split()[0]: r["version"] for m in models.values() for r in m["runs"] if "version" in r
     }

@@ -34,14 +34,15 @@ MOST_MAPS = 20_000
 Every program takes a few hundred, and a process that runs out of them crashes in the compiler.
 """
 
-# Shapes and types of every annotated function are checked from the first import on.
-_hook = install_import_hook("natcoord_jax", "beartype.beartype")
 
+def pytest_configure(config: pytest.Config) -> None:
+    """Check shapes and types of every annotated function, from the first import on.
 
-@pytest.fixture(scope="session", autouse=True)
-def _checked_types():
-    yield
-    _hook.uninstall()
+    Slow tests call the same functions for longer; checks take 6 % of their time and find nothing new.
+    """
+    if config.option.markexpr != "slow":
+        hook = install_import_hook("natcoord_jax", "beartype.beartype")
+        config.add_cleanup(hook.uninstall)
 
 
 @pytest.fixture(autouse=True)

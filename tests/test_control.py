@@ -320,14 +320,15 @@ def test_least_effort_about_a_skew_axis(wheels, known):
 
 @pytest.mark.slow
 def test_beanie():
-    pair = [solved(manoeuvres.beanie(n)) for n in (10, 20)]
-    assert extrapolated(*pair) == pytest.approx(12 * (3 / 4) ** 2, rel=FOUR_DIGITS)
+    # Closed form for vanishing steps; `benchmarks/control.py` refines them.
+    assert solved(manoeuvres.beanie(40)).cost == pytest.approx(12 * (3 / 4) ** 2, rel=2 / 40**2)
 
 
 @pytest.mark.slow
 def test_two_masses_on_a_spring():
-    pair = [solved(manoeuvres.two_masses(n)) for n in (40, 80)]
-    assert extrapolated(*pair) == pytest.approx(0.2271424, rel=FOUR_DIGITS)
+    slow = solved(manoeuvres.two_masses(160))
+    # Known for vanishing steps; the error falls with their square, see `benchmarks/control.py`.
+    assert slow.cost == pytest.approx(0.2271424, rel=3e-4)
     fast = solved(manoeuvres.two_masses(160, fastest=True))
     assert fast.cost == pytest.approx(4.21786651, rel=2e-4)
     assert fast.free["final time [s]"] == pytest.approx(fast.cost)
@@ -351,11 +352,11 @@ def test_pendulum_as_a_point_with_multiplier():
 
 @pytest.mark.slow
 def test_cart_pole_swing_up():
+    """Many starts in coarse steps, the best of them refined once; `benchmarks/control.py` goes further."""
     found = nc.multi_start(manoeuvres.cart_pole(50), starts=16, rates=3.0, spread=5.0, method="lifted")
     assert found[0].ok and len(found) >= 2
-    middle = solved(manoeuvres.cart_pole(100), found[0])
-    fine = solved(manoeuvres.cart_pole(200), middle)
-    assert extrapolated(middle, fine) == pytest.approx(57.9448, rel=FOUR_DIGITS)
+    fine = solved(manoeuvres.cart_pole(100), found[0])
+    assert extrapolated(found[0], fine) == pytest.approx(57.9448, rel=5 * FOUR_DIGITS)
 
 
 @pytest.fixture(scope="module")

@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 import time
+from functools import cache
 from pathlib import Path
 
 import equinox as eqx
@@ -234,21 +235,23 @@ def test_solvers_give_one_trajectory(solver):
     assert np.max(np.abs(q - np.asarray(b.q).reshape(q.shape))) <= tol.SAME_TRAJECTORY
 
 
+@cache
+def gradient_and_curvature(solver):
+    """Reverse, and forward over reverse, with respect to the inputs."""
+    inputs = jnp.sin(jnp.arange(10.0))[:, None] * jnp.arange(1.0, 4.0)
+    system, state = star(3, solver)
+
+    def loss(u):
+        after = nc.simulate(system, state, dt=0.02, inputs=u)
+        return jnp.sum(after.v[-1] ** 2) + jnp.sum(jnp.sin(after.q[-1]))
+
+    return jax.jit(lambda u: jax.jvp(jax.grad(loss), (u,), (jnp.cos(u),)))(inputs)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("solver", ["recursive", "full"])
 def test_solvers_give_one_gradient(solver):
-    """Reverse, and forward over reverse, with respect to the inputs."""
-    inputs = jnp.sin(jnp.arange(10.0))[:, None] * jnp.arange(1.0, 4.0)
-    found = []
-    for system, state in (star(3, "reduced"), star(3, solver)):
-
-        def loss(u, system=system, state=state):
-            after = nc.simulate(system, state, dt=0.02, inputs=u)
-            return jnp.sum(after.v[-1] ** 2) + jnp.sum(jnp.sin(after.q[-1]))
-
-        both = jax.jit(lambda u, loss=loss: jax.jvp(jax.grad(loss), (u,), (jnp.cos(u),)))
-        found.append(both(inputs))
-    for a, b in zip(*found):
+    for a, b in zip(gradient_and_curvature("reduced"), gradient_and_curvature(solver)):
         assert jnp.max(jnp.abs(a - b)) <= tol.SAME_GRADIENT * jnp.max(jnp.abs(a))
 
 
