@@ -67,13 +67,19 @@ def as_one_kernel(function: Callable, *arguments: Any, too_large: Callable | Non
 def scan_in_one_kernel(body: Callable, start: Any, given: Any, reverse: bool = False) -> tuple[Any, Any]:
     """`jax.lax.scan` in one kernel where that is possible and quickly compiled, else as it is.
 
-    Not differentiable by itself.
+    Under vmap it is a scan as usual: kernels of its operations on all lanes are large enough to be worth
+    their calls. Not differentiable by itself.
     """
 
     def scan(start: Any, given: Any) -> tuple[Any, Any]:
         return jax.lax.scan(body, start, given, reverse=reverse)
 
-    return as_one_kernel(scan, start, given, too_large=scan)
+    if not _on_cpu():
+        return scan(start, given)
+    program, shapes = jax.make_jaxpr(scan, return_shape=True)(start, given)
+    if operations(program.jaxpr) > LARGEST:
+        return scan(start, given)
+    return _flat(_kernel_of_one_lane, program, shapes, (start, given))
 
 
 def in_groups(function: Callable, *arguments: Any) -> Any:
@@ -128,6 +134,22 @@ def _kernel(function: Callable) -> Callable:
     def by_lanes(axis_size: int, in_batched: Sequence[bool], *flat: Any) -> tuple[list[Any], list[bool]]:
         axes = [0 if batched else None for batched in in_batched]
         outputs = _kernel(jax.vmap(function, in_axes=axes, axis_size=axis_size))(*flat)
+        return outputs, [True] * len(outputs)
+
+    return call
+
+
+def _kernel_of_one_lane(function: Callable) -> Callable:
+    """A flat function as one kernel; of several lanes, as it is."""
+
+    @jax.custom_batching.custom_vmap
+    def call(*flat: Any) -> list[Any]:
+        return _in_one_kernel(function, flat)
+
+    @call.def_vmap
+    def by_lanes(axis_size: int, in_batched: Sequence[bool], *flat: Any) -> tuple[list[Any], list[bool]]:
+        axes = [0 if batched else None for batched in in_batched]
+        outputs = jax.vmap(function, in_axes=axes, axis_size=axis_size)(*flat)
         return outputs, [True] * len(outputs)
 
     return call
