@@ -79,7 +79,7 @@ def scan_in_one_kernel(body: Callable, start: Any, given: Any, reverse: bool = F
     program, shapes = jax.make_jaxpr(scan, return_shape=True)(start, given)
     if operations(program.jaxpr) > LARGEST:
         return scan(start, given)
-    return _flat(_kernel_of_one_lane, program, shapes, (start, given))
+    return _flat(partial(_kernel, lanes_too=False), program, shapes, (start, given))
 
 
 def in_groups(function: Callable, *arguments: Any) -> Any:
@@ -123,8 +123,8 @@ def _flat(transform: Callable, program: Any, shapes: Any, arguments: tuple) -> A
     return jax.tree.unflatten(jax.tree.structure(shapes), outputs)
 
 
-def _kernel(function: Callable) -> Callable:
-    """A flat function as one kernel, whatever the number of lanes."""
+def _kernel(function: Callable, lanes_too: bool = True) -> Callable:
+    """A flat function as one kernel, whatever the number of lanes, or of one lane only."""
 
     @jax.custom_batching.custom_vmap
     def call(*flat: Any) -> list[Any]:
@@ -133,23 +133,8 @@ def _kernel(function: Callable) -> Callable:
     @call.def_vmap
     def by_lanes(axis_size: int, in_batched: Sequence[bool], *flat: Any) -> tuple[list[Any], list[bool]]:
         axes = [0 if batched else None for batched in in_batched]
-        outputs = _kernel(jax.vmap(function, in_axes=axes, axis_size=axis_size))(*flat)
-        return outputs, [True] * len(outputs)
-
-    return call
-
-
-def _kernel_of_one_lane(function: Callable) -> Callable:
-    """A flat function as one kernel; of several lanes, as it is."""
-
-    @jax.custom_batching.custom_vmap
-    def call(*flat: Any) -> list[Any]:
-        return _in_one_kernel(function, flat)
-
-    @call.def_vmap
-    def by_lanes(axis_size: int, in_batched: Sequence[bool], *flat: Any) -> tuple[list[Any], list[bool]]:
-        axes = [0 if batched else None for batched in in_batched]
-        outputs = jax.vmap(function, in_axes=axes, axis_size=axis_size)(*flat)
+        every = jax.vmap(function, in_axes=axes, axis_size=axis_size)
+        outputs = (_kernel(every) if lanes_too else every)(*flat)
         return outputs, [True] * len(outputs)
 
     return call
