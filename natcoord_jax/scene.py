@@ -19,6 +19,7 @@ from natcoord_jax.core.joint import Joint
 from natcoord_jax.core.recipe import Recipe
 from natcoord_jax.core.state import State
 from natcoord_jax.stepping.admissibility import (
+    admitted,
     check_gaps,
     check_inertia,
     find_redundancy,
@@ -165,7 +166,8 @@ class Scene:
 
         Args:
             assemble: project positions and velocities onto the constraints (see `nc.assemble`); without it
-                a gap is refused and inconsistent velocities are projected with a warning.
+                a gap is refused (inside jit: the state is NaN) and inconsistent velocities are projected with
+                a warning (inside jit: without one).
             solver: "reduced", "recursive", "sparse" or "full"; default chosen from the structure (see
                 `System.report`).
 
@@ -181,6 +183,7 @@ class Scene:
         if assemble:
             state = assemble_state(system, state)
         if not is_concrete(system, state):
+            state = state if assemble else admitted(system, state)
             return with_sparsity(system, state) if system.structure.solver == "sparse" else system, state
         check_inertia(system, state)
         if not assemble:

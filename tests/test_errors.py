@@ -191,6 +191,29 @@ def test_velocities_are_projected_with_a_warning():
     assert float(system.constraint_errors(state).velocity) <= 1e-12
 
 
+def test_a_scene_compiled_inside_jit_starts_as_outside():
+    """There is no telling: velocities are projected without a word, and a joint that gapes makes NaN."""
+
+    def built(length, speed):
+        scene = nc.Scene()
+        arm = scene.add(body(position=(0.6, 0.0, 0.8), velocity=(speed, 0.1, 0.0)))
+        scene.add(nc.Distance(nc.ground, arm, (0.6, 0.0, 0.8), length=length, name="rod"))
+        return scene.compile()[1]
+
+    inside = jax.jit(built)
+    with pytest.warns(UserWarning, match="projected"):
+        wanted = built(1.0, 1.0)
+    for state in (inside(1.0, 1.0), jax.jit(jax.vmap(built))(jnp.array([1.0]), jnp.array([1.0]))):
+        np.testing.assert_allclose(state.v.reshape(wanted.v.shape), wanted.v, atol=1e-12)
+    assert np.all(np.isnan(inside(1.5, 1.0).q))
+    # Derivatives are those of the projection: it takes part of the speed away, and the rest turns the arm.
+    step = 1e-6
+    differences = (inside(1.0, 1.0 + step).v - inside(1.0, 1.0 - step).v) / (2 * step)
+    slopes = jax.jit(jax.jacrev(lambda speed: built(1.0, speed).v))(1.0)
+    np.testing.assert_allclose(slopes, differences, atol=1e-8)
+    assert 0 < float(jnp.max(jnp.abs(slopes)))
+
+
 def test_ideal_rod_that_spins_freely():
     scene = nc.Scene()
     rod = scene.add(body(inertia=(1.0, 1.0, 0.0), name="rod"))

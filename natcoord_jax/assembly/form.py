@@ -3,6 +3,7 @@
 from typing import Any, ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -23,6 +24,10 @@ class Form(eqx.Module):
     by_differences: ClassVar[bool] = False
     by_formulas: ClassVar[bool] = False
     renewal: ClassVar[int] = 6
+
+    def like_tangent(self, y: Float[Array, " unknowns"]) -> Any:
+        """Something of the shape of `tangent(y)`, to know the shape of its factors without tracing it."""
+        return jax.ShapeDtypeStruct((y.shape[0], y.shape[0]), y.dtype)
 
     def factorised(self, matrix: Any) -> tuple[Any, Float[Array, " unknowns"]]:
         """Factors of a Jacobian, with `solve` and `transpose`, and the inertias of the unknowns.

@@ -109,6 +109,11 @@ class RecursiveStep(ReducedStep):
         """
         return self.jacobian(y, exact=False, loads=loads)
 
+    def like_tangent(self, y: Float[Array, " unknowns"]) -> Any:
+        """Shapes of the blocks."""
+        loads = jax.ShapeDtypeStruct((self.tableau.stages, len(self.system.structure.bodies), 3), y.dtype)
+        return jax.eval_shape(self.tangent, y, (loads, loads))
+
     def factorised(self, matrix: Blocks) -> tuple[ByNode, Float[Array, " unknowns"]]:
         """Factors along the tree, and the inertias of the unknowns (0 for multipliers)."""
         blocks, factor = self._by_node(matrix)

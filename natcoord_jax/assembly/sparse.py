@@ -48,6 +48,10 @@ class SparseStep(FullStep):
         sparsity: Any = self.system.sparsity
         return sparsity.pattern.assemble(*matrix)
 
+    def like_tangent(self, y: Float[Array, " unknowns"]) -> Any:
+        """Shapes of the elements' matrices."""
+        return super().like_tangent(y) if self.tableau.stages > 1 else jax.eval_shape(self.tangent, y)
+
     def tangent(self, y: Float[Array, " unknowns"], loads: Any = None) -> Array | tuple[Array, ...]:
         """The Jacobian nearly, from linearised effects: what Newton's iteration needs."""
         return self.jacobian(y, exact=False)

@@ -11,9 +11,14 @@ from natcoord_jax.assembly.reduced import ReducedStep
 from natcoord_jax.assembly.system import System
 from natcoord_jax.core.compiled import briefly
 from natcoord_jax.core.effect import replace_fields
+from natcoord_jax.core.results import Result
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import gauss
-from natcoord_jax.stepping.assemble import assemble
+from natcoord_jax.stepping.assemble import (
+    assemble,
+    with_admissible_positions,
+    with_admissible_velocities,
+)
 
 GAP = 1e-9
 """Largest gap [m, -] and constraint rate [m/s, 1/s] taken for round-off of printed data, per unit of size."""
@@ -61,6 +66,27 @@ def project_velocities(system: System, state: State) -> State:
         stacklevel=4,
     )
     return projected
+
+
+def admitted(system: System, state: State) -> State:
+    """What `check_gaps` and `project_velocities` do, for numbers that are not known yet (inside jit).
+
+    Returns:
+        The state, with velocities that obey the joints; all NaN where a joint does not close.
+    """
+    if not system.joints:
+        return state
+    values, rates = zip(*_residuals(system, state))
+    closed = _largest(values) <= GAP * (1.0 + jnp.max(jnp.abs(state.q)))
+    moving_along = _largest(rates) <= GAP * (1.0 + jnp.max(jnp.abs(state.v)))
+    projected, code = with_admissible_velocities(system, state)
+    state = jax.tree.map(lambda x, y: jnp.where(moving_along, x, y), state, projected)
+    return jax.tree.map(lambda x: jnp.where(closed & (moving_along | (code == 0)), x, jnp.nan), state)
+
+
+def _largest(groups) -> jax.Array:
+    """Largest absolute value in any of the arrays."""
+    return jnp.max(jnp.concatenate([jnp.abs(x).reshape(-1) for x in groups]), initial=0.0)
 
 
 def _tiny_step(system: System, state: State) -> ReducedStep:
@@ -115,9 +141,9 @@ def find_redundancy(system: System, state: State) -> tuple[int, tuple[str, ...]]
     key = jax.random.PRNGKey(0)
     for attempt in range(3):
         if attempt:
-            try:
-                state_now = assemble(system, _disturbed(system, state, jax.random.fold_in(key, attempt)))
-            except RuntimeError:
+            disturbed = _disturbed(system, state, jax.random.fold_in(key, attempt))
+            state_now, code = with_admissible_positions(system, disturbed)
+            if int(code) != Result.SUCCESSFUL:
                 continue
         else:
             state_now = state

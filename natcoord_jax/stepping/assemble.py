@@ -50,15 +50,27 @@ def nearest_coordinates(system: System, state: State) -> Array:
 
 @briefly
 def _assembled(system: System, state: State) -> tuple[State, Array]:
+    state, code = with_admissible_positions(system, state)
+    state, rate_code = with_admissible_velocities(system, state)
+    return state, jnp.maximum(code, rate_code)
+
+
+@briefly
+def with_admissible_positions(system: System, state: State) -> tuple[State, Array]:
+    """State with orthonormal directors and positions that obey the constraints; and a result code."""
     rows = state.q.reshape(-1, 4, 3)
     squared = jnp.concatenate([rows[:, :1], orthonormalise(rows[:, 1:])], axis=1).reshape(-1, 3)
     state = replace_fields(state, q=squared)
     y, code = _solve(Projection.of_positions, system, state)
     state = replace_fields(state, q=state.q + Projection.of_positions(system, state).moved(y))
-    state = replace_fields(state, coordinates=nearest_coordinates(system, state))
-    w, rate_code = _solve(Projection.of_velocities, system, state)
+    return replace_fields(state, coordinates=nearest_coordinates(system, state)), code
+
+
+def with_admissible_velocities(system: System, state: State) -> tuple[State, Array]:
+    """State whose velocities, projected in the metric of the mass, obey the constraints; a result code."""
+    w, code = _solve(Projection.of_velocities, system, state)
     state = replace_fields(state, v=Projection.of_velocities(system, state).moved(w))
-    return replace_fields(state, rates=_rotor_rates(system, state)), jnp.maximum(code, rate_code)
+    return replace_fields(state, rates=_rotor_rates(system, state)), code
 
 
 def _rotor_rates(system: System, state: State) -> Array:

@@ -180,7 +180,7 @@ def begin(y: Float[Array, " unknowns"], few: bool = False) -> Iterate:
 def no_factors(equations: Any) -> Factors:
     """The shapes of factors, and none usable."""
     y = equations.guess()
-    shapes = jax.eval_shape(lambda y: equations.factorised(equations.tangent(y)), y)
+    shapes = jax.eval_shape(equations.factorised, equations.like_tangent(y))
     solver, inertias = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
     no, noise = jnp.array(False), jnp.zeros((), y.dtype)
     return Factors(solver, inertias, no, no, jnp.array(NEVER), jnp.array(0), noise)
