@@ -167,6 +167,7 @@ def test_geometry_through_assembly():
     assert abs(jax.jit(jax.grad(f))(x) @ d - ahead) <= tol.SAME_GRADIENT * abs(ahead)
 
 
+@pytest.mark.slow
 def test_checkpointed_gradient_is_the_same():
     p, d = few(), small_direction()
     found = total(jax.jit(jax.grad(partial(small_loss, checkpoint=True)))(p), d)
@@ -248,7 +249,8 @@ def test_batches(mode):
 # --- a spring at rest -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("law", ["linear", pytest.param("nonlinear", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("law", ["linear", "nonlinear"])
 def test_second_derivative_starting_at_rest(law):
     """At rest the increment of the invariant is zero: a quotient by it would lose the second derivative."""
 
@@ -343,6 +345,7 @@ def test_torque_on_a_rotor_is_exact():
     assert np.max(np.abs(jax.jit(jax.hessian(spin))(u))) <= tol.EXACT_GRADIENT
 
 
+@pytest.mark.slow
 def test_linearise_equals_differences():
     """A and B of a step act on small motions as the step does."""
     p = few()
@@ -366,6 +369,7 @@ def test_linearise_equals_differences():
     assert np.allclose(a @ along, whole, rtol=1e-8, atol=1e-8 * float(jnp.max(jnp.abs(whole))))
 
 
+@pytest.mark.slow
 def test_a_relaxed_spring_carried_along():
     """Lengths equal but for round-off: what the quadrature misses of the energy is noise, not a force."""
     scene = nc.Scene()
@@ -385,3 +389,42 @@ def test_a_relaxed_spring_carried_along():
     speed = jnp.array(0.2)
     assert float(jax.jit(jax.grad(end))(speed)) == pytest.approx(known, rel=1e-9)
     assert float(jax.jit(jax.jacfwd(end))(speed)) == pytest.approx(known, rel=1e-9)
+
+
+class Swing(eqx.Module):
+    """A prescribed angle whose amplitude is a number like any other."""
+
+    amplitude: jax.Array
+
+    def __call__(self, t):
+        return self.amplitude * (1 - jnp.cos(3.0 * t))
+
+
+def test_where_drives_prescribe_every_motion():
+    """Nothing is left to move freely: what is differentiated are the impulses of the drives."""
+    scene, carrier = nc.Scene(), nc.ground
+    scene.add(nc.Gravity())
+    for k in range(3):
+        place = np.array([0.5 * k, 0.0, 0.0])
+        inertia = (0.1, 0.2, 0.2)
+        link = scene.add(nc.RigidBody(mass=1.0, inertia=inertia, com=(0.25, 0, 0), position=place))
+        hinge = scene.add(nc.Revolute(carrier, link, place, (0.1, 1.0, 0.2 * k), name=f"hinge {k}"))
+        scene.add(nc.Drive(hinge, function=Swing(jnp.array(0.7 / (1 + k)))))
+        carrier = link
+    system, state = scene.compile()
+    assert system.structure.dofs == 0
+    place = next(k for k, group in enumerate(system.effects) if isinstance(group.effect, nc.Drive))
+    drives = system.effects[place]
+
+    def speed(scale):
+        changed = eqx.tree_at(lambda g: g.effect.function.amplitude, drives, replace_fn=lambda x: scale * x)
+        effects = (*system.effects[:place], changed, *system.effects[place + 1 :])
+        moved = eqx.tree_at(lambda s: s.effects, system, effects)
+        found = nc.simulate(moved, state, dt=0.05, steps=8, throw=False)
+        return jnp.sum(found.v[-1] ** 2)
+
+    both, step = jax.jit(jax.value_and_grad(speed)), 1e-4
+    _, slope = both(jnp.array(1.0))
+    (above, _), (below, _) = both(jnp.array(1.0 + step)), both(jnp.array(1.0 - step))
+    assert abs(float(slope)) > 0.1
+    assert float(slope) == pytest.approx(float(above - below) / (2 * step), rel=tol.DIFFERENCE_BEST)

@@ -8,10 +8,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from natcoord_jax.stepping.newton import Factors
+from natcoord_jax.stepping.newton import SLOWEST_UNSEEN, Factors
 
 CLOSE = 1e-12
-"""Last correction of a transposed system relative to its solution."""
+"""Error of the solution of a transposed system relative to its size."""
+
+SURPRISE = 10.0
+"""Times the error allowed by which the correction may be larger that was expected to be within it."""
 
 STALL = 1e-10
 """Corrections that stop shrinking below this have reached the floor of round-off."""
@@ -24,7 +27,17 @@ ROUNDS = 4
 
 
 class Correcting(eqx.Module):
-    """Where the solution of a transposed system stands."""
+    """Where the solution of a transposed system stands.
+
+    Attributes:
+        correction: size of the last correction (energy norm).
+        count: corrections with these factors.
+        rounds: factorisations for this system.
+        done: whether it is solved.
+        wanting: whether it cannot go on without new factors.
+        moving: whether the last correction is to be made.
+        last: whether the next correction is expected to be within the error allowed.
+    """
 
     correction: Float[Array, ""]
     count: Int[Array, ""]
@@ -32,12 +45,13 @@ class Correcting(eqx.Module):
     done: Bool[Array, ""]
     wanting: Bool[Array, ""]
     moving: Bool[Array, ""]
+    last: Bool[Array, ""]
 
     @classmethod
     def first(cls, accepted: Bool[Array, ""], dtype: Any) -> "Correcting":
         """Before the first correction; there is nothing to do for an attempt that failed."""
         nought, no = jnp.array(0), jnp.array(False)
-        return cls(jnp.zeros((), dtype), nought, nought, ~accepted, no, no)
+        return cls(jnp.zeros((), dtype), nought, nought, ~accepted, no, no, no)
 
     @property
     def open(self) -> Bool[Array, ""]:
@@ -48,22 +62,37 @@ class Correcting(eqx.Module):
         """With new factors."""
         nought = jnp.zeros_like(self.count)
         return eqx.tree_at(
-            lambda c: (c.count, c.rounds, c.wanting),
+            lambda c: (c.count, c.rounds, c.wanting, c.last),
             self,
-            (nought, self.rounds + 1, jnp.zeros_like(self.wanting)),
+            (nought, self.rounds + 1, jnp.zeros_like(self.wanting), jnp.zeros_like(self.last)),
         )
 
     def judged(self, factors: Factors, lam: Array, change: Array, patience: int) -> "Correcting":
         """After a correction has been found: done, or moving on by it, or in want of new factors."""
-        size, correction = (jnp.sqrt(jnp.sum(factors.inertias * x**2)) for x in (lam, change))
+        size, correction = (_size(x, factors.inertias) for x in (lam, change))
         ratio = correction / jnp.where(self.correction > 0, self.correction, 1.0)
         first = self.count == 0
         finite = jnp.isfinite(correction) & jnp.isfinite(size)
         stalled = ~first & (ratio > 0.5) & (correction <= STALL * size)
-        done = ((correction <= CLOSE * size) | stalled) & finite
+        within = correction <= jnp.where(self.last, SURPRISE * CLOSE, CLOSE) * size
+        done = (within | stalled) & finite & factors.usable
+        trusted = jnp.maximum(ratio, SLOWEST_UNSEEN)
+        following = correction * trusted / jnp.maximum(1.0 - trusted, 1e-3)
+        last = ~first & (following <= CLOSE * size)
         late = correction * ratio**patience > CLOSE * size
         slow = (~first & ((ratio > 0.5) | late)) | (self.count >= CORRECTIONS) | ~finite | ~factors.usable
         slow = slow & ~done
-        found = Correcting(correction, self.count + 1, self.rounds, done, slow, ~done & ~slow)
+        found = Correcting(correction, self.count + 1, self.rounds, done, slow, ~done & ~slow, last)
         stay = eqx.tree_at(lambda c: c.moving, self, jnp.zeros_like(self.moving))
         return jax.tree.map(partial(jnp.where, self.done), stay, found)
+
+
+def _size(lam: Float[Array, " unknowns"], inertias: Float[Array, " unknowns"]) -> Float[Array, ""]:
+    """Size of a solution in the energy norm, where constraints count, too.
+
+    Where drives prescribe every motion, nothing else is left; they carry impulses that stop a mean inertia.
+    """
+    moving = inertias > 0
+    mean = jnp.sum(inertias) / jnp.maximum(jnp.sum(moving), 1)
+    weights = jnp.where(moving, inertias, 1.0 / jnp.where(mean > 0, mean, 1.0))
+    return jnp.sqrt(jnp.sum(weights * lam**2))
