@@ -2,8 +2,8 @@
 
 import pytest
 
-SLOW = ("02", "03", "05", "06", "07", "08", "09", "10", "11")
-"""Numbers of the notebooks that take longest: all but the first, and that on gradients."""
+SLOW = ("02", "03", "04", "05", "06", "07", "08", "09", "10", "11")
+"""Numbers of the notebooks that take longest: all but the first."""
 
 
 @pytest.hookimpl(tryfirst=True)  # before tests are chosen by their marks

@@ -23,9 +23,11 @@ CACHE = os.environ.get("JAX_COMPILATION_CACHE_DIR") or str(ROOT / ".pytest_cache
 
 # Notebooks and command lines run in processes of their own and share the cache through the environment.
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", CACHE)
+# Single operations called from Python are programs, too: 30 ms each to compile, hundreds in every process.
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_compilation_cache_dir", CACHE)
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
 
 MAPS = Path("/proc/self/maps")
 MOST_MAPS = 20_000

@@ -59,7 +59,7 @@ def moving(law, stages):
     return group, where, rows[group.bodies], jnp.asarray(twists)[group.bodies]
 
 
-@pytest.mark.parametrize("law", [None, stiffening])
+@pytest.mark.parametrize("law", [pytest.param(None, marks=pytest.mark.slow), stiffening])
 def test_gradient_and_curvature_are_derivatives_of_the_energy(law):
     """Of each element alone, and of all at once."""
     effect = compiled(law)[0].effects[0].effect

@@ -56,9 +56,11 @@ def test_run_of_the_spacecraft(tmp_path, capsys):
 
 
 def test_run_with_a_tolerance(tmp_path, capsys):
-    options = ["--dt", "0.5", "--steps", "2", "--rtol", "1e-4", "--json", "report.json"]
+    options = ["--dt", "0.5", "--steps", "2", "--rtol", "1e-4", "--json", "report.json", "--film", "film.gif"]
     assert cli.main(["run", "double_pendulum", *options]) == 0
-    assert "attempts repeated in shorter ones" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "attempts repeated in shorter ones" in out and "wrote film.gif" in out
+    assert (tmp_path / "film.gif").read_bytes()[:3] == b"GIF"
     report = json.loads((tmp_path / "report.json").read_text("utf-8"))
     assert report["substeps"] > 20 and report["steps"] == 2
     assert report["energy_error_max"] <= 1e-11

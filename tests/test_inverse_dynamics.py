@@ -41,6 +41,7 @@ def test_a_flexible_arm_follows_the_path(flexible_arm):
     assert abs(angle - 1.2) > 0.02
 
 
+@pytest.mark.slow
 def test_a_passive_joint_moves_as_it_must():
     scene = nc.Scene()
     scene.add(nc.Gravity())

@@ -301,6 +301,7 @@ def test_wheel_counts_its_turns():
     np.testing.assert_allclose(quaternion[-1], (-1, 0, 0, 0), atol=1e-11)
 
 
+@pytest.mark.slow
 def test_rates_are_derivatives_of_coordinates():
     system, state = menagerie()
     state = nc.random_state(system, state, jax.random.key(2))
