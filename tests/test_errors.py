@@ -168,6 +168,23 @@ def test_numbers_of_effects_must_be_finite(case):
     rejected(build, "'part'", *words)
 
 
+WRONG_MARKERS = {
+    "spring to a direction": (lambda p, d: nc.Spring((p, d), stiffness=1.0), "2 nc.Point"),
+    "spring of one point": (lambda p, d: nc.NonlinearSpring((p,), law=jnp.square), "2 nc.Point"),
+    "quadratic spring of a body": (lambda p, d: nc.QuadraticSpring((p, p.body), stiffness=1.0), "2 nc.Point"),
+    "damper of three points": (lambda p, d: nc.Damper((p, p, p), damping=1.0), "2 nc.Point"),
+    "thruster without direction": (lambda p, d: nc.BodyForceInput((p,)), "1 nc.Point and 1 nc.Direction"),
+    "torques about one axis": (lambda p, d: nc.BodyTorqueInput((d,)), "3 nc.Direction"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG_MARKERS)
+def test_markers_must_be_of_the_kind_that_an_effect_needs(case):
+    make, words = WRONG_MARKERS[case]
+    with pytest.raises(ValueError, match=f"pass {words}, in a tuple"):
+        make(nc.Point(nc.ground), nc.Direction(nc.ground, (0.0, 0.0, 1.0)))
+
+
 def test_empty_scene():
     rejected(lambda: nc.Scene().compile(), "bodies")
 

@@ -386,7 +386,7 @@ def test_derivatives_in_every_mode(scheme):
 
 
 @pytest.mark.slow
-@BOTH
+@pytest.mark.parametrize("scheme", [DISSIPATIVE], ids=["dissipative"])  # whose state has an account more
 def test_steps_in_a_scan(scheme):
     """One by one they are those of a rollout, and so are their derivatives."""
     system, state = stiff()

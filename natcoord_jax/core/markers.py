@@ -79,3 +79,23 @@ class Attachment(eqx.Module):
     point: Any
     axes: Any
     local: bool = eqx.field(static=True, default=False)
+
+
+def require_markers(kind: str, markers: Any, points: int, directions: int) -> None:
+    """Markers are points, then directions.
+
+    Args:
+        kind: of the effect, for the message.
+        markers: that were given.
+        points: number of points.
+        directions: number of directions after them.
+
+    Raises:
+        ValueError: for others, or another number.
+    """
+    found = [m.is_point if isinstance(m, Marker) else None for m in markers]
+    if found != [True] * points + [False] * directions:
+        wanted = " and ".join(
+            f"{count} nc.{name}" for count, name in ((points, "Point"), (directions, "Direction")) if count
+        )
+        raise ValueError(f"{kind}: markers are {markers!r}; pass {wanted}, in a tuple")

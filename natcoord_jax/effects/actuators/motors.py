@@ -11,7 +11,7 @@ from natcoord_jax.core.coordinate import CoordinateForce
 from natcoord_jax.core.force import Force, Load
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.joint import Joint
-from natcoord_jax.core.markers import Marker
+from natcoord_jax.core.markers import Marker, require_markers
 
 
 class JointTorque(Force):
@@ -85,6 +85,9 @@ class BodyTorqueInput(Force):
     kind: ClassVar[str] = "body torque input"
     inputs: ClassVar[int] = 3
 
+    def __check_init__(self) -> None:
+        require_markers(self.kind, self.markers, 0, 3)
+
     def load(self, x: Array, rate: Array, inputs: Array, t: Array) -> Load:
         """Components along the mid-point directions."""
         return Load(None, jnp.zeros_like(x).at[0].set(inputs @ x))
@@ -99,6 +102,9 @@ class BodyForceInput(Force):
 
     kind: ClassVar[str] = "body force input"
     inputs: ClassVar[int] = 1
+
+    def __check_init__(self) -> None:
+        require_markers(self.kind, self.markers, 1, 1)
 
     def load(self, x: Array, rate: Array, inputs: Array, t: Array) -> Load:
         """Force along the mid-point direction."""

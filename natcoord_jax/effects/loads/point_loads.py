@@ -7,25 +7,11 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from natcoord_jax.core.force import Force, Load
-from natcoord_jax.core.markers import Marker
+from natcoord_jax.core.markers import require_markers
 
 
 def _at(value: Any, t: Array) -> Array:
     return jnp.asarray(value(t) if callable(value) else value, float)
-
-
-def _require(kind: str, markers: Any, points: int, directions: int) -> None:
-    """Markers are points, then directions.
-
-    Raises:
-        ValueError: for others, or another number.
-    """
-    found = [m.is_point if isinstance(m, Marker) else None for m in markers]
-    if found != [True] * points + [False] * directions:
-        wanted = " and ".join(
-            f"{count} nc.{name}" for count, name in ((points, "Point"), (directions, "Direction")) if count
-        )
-        raise ValueError(f"{kind}: markers are {markers!r}; pass {wanted}, in a tuple")
 
 
 class PointForce(Force):
@@ -48,9 +34,9 @@ class PointForce(Force):
 
     def __check_init__(self) -> None:
         if self.following:
-            _require(self.kind, self.markers, 1, 3)
+            require_markers(self.kind, self.markers, 1, 3)
         else:
-            _require(self.kind, self.markers[:1], 1, 0)
+            require_markers(self.kind, self.markers[:1], 1, 0)
 
     def load(self, x: Array, rate: Array, inputs: Array, t: Array) -> Load:
         """The force on the first marker."""
@@ -77,9 +63,9 @@ class BodyTorque(Force):
 
     def __check_init__(self) -> None:
         if self.following:
-            _require(self.kind, self.markers, 0, 3)
+            require_markers(self.kind, self.markers, 0, 3)
         else:
-            _require(self.kind, self.markers[:1], 0, 1)
+            require_markers(self.kind, self.markers[:1], 0, 1)
 
     def load(self, x: Array, rate: Array, inputs: Array, t: Array) -> Load:
         """The torque on the body of the first marker."""
@@ -103,7 +89,7 @@ class PairTorque(Force):
     kind: ClassVar[str] = "pair torque"
 
     def __check_init__(self) -> None:
-        _require(self.kind, self.markers, 0, 2)
+        require_markers(self.kind, self.markers, 0, 2)
 
     def load(self, x: Array, rate: Array, inputs: Array, t: Array) -> Load:
         """Torque along the mid-point direction of the first body."""

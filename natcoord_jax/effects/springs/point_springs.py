@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from natcoord_jax.core.force import Force, Load
+from natcoord_jax.core.markers import require_markers
 from natcoord_jax.core.potential import Potential
 from natcoord_jax.maths.vectors import dot, safe_divide, safe_norm, safe_sqrt
 
@@ -35,6 +36,9 @@ class Spring(Potential):
 
     kind: ClassVar[str] = "spring"
 
+    def __check_init__(self) -> None:
+        require_markers(self.kind, self.markers, 2, 0)
+
     def invariants(self, x: Array) -> Array:
         """Squared distance [m^2]."""
         return _square(x)
@@ -59,6 +63,9 @@ class QuadraticSpring(Potential):
     kind: ClassVar[str] = "quadratic spring"
     degree: ClassVar[int | None] = 2
 
+    def __check_init__(self) -> None:
+        require_markers(self.kind, self.markers, 2, 0)
+
     def invariants(self, x: Array) -> Array:
         """Squared distance [m^2]."""
         return _square(x)
@@ -80,6 +87,9 @@ class NonlinearSpring(Potential):
 
     kind: ClassVar[str] = "nonlinear spring"
 
+    def __check_init__(self) -> None:
+        require_markers(self.kind, self.markers, 2, 0)
+
     def invariants(self, x: Array) -> Array:
         """Squared distance [m^2]."""
         return _square(x)
@@ -100,6 +110,9 @@ class Damper(Force):
     damping: Any = eqx.field(kw_only=True)
 
     kind: ClassVar[str] = "damper"
+
+    def __check_init__(self) -> None:
+        require_markers(self.kind, self.markers, 2, 0)
 
     def load(self, x: Array, rate: Array, inputs: Array, t: Array) -> Load:
         """Equal and opposite forces along the mid-point line."""
