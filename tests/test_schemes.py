@@ -368,6 +368,7 @@ def fourth_order_difference(f):
 def test_gradient_against_differences(scheme):
     loss = loss_of(scheme)
     slope = float(jax.jit(jax.grad(loss))(AT))
+    assert abs(slope) > 1e-3, "nothing depends on the stiffness: nothing is tested"
     assert slope == pytest.approx(fourth_order_difference(jax.jit(loss)), rel=tol.DIFFERENCE_BEST)
 
 
