@@ -27,7 +27,7 @@ from natcoord_jax.stepping import linear_pair
 from natcoord_jax.stepping.correcting import Correcting
 from natcoord_jax.stepping.error_control import Tolerance
 from natcoord_jax.stepping.newton import Factors, any_lane, factors_of
-from natcoord_jax.stepping.one_kernel import as_one_kernel, in_groups
+from natcoord_jax.stepping.one_kernel import as_one_kernel, in_groups, plainly
 from natcoord_jax.stepping.past import Past
 from natcoord_jax.stepping.plan import Plan, Slots
 from natcoord_jax.stepping.probe import jacobian_by_differences
@@ -48,7 +48,9 @@ def run_slots(
     tolerance: Tolerance | None = None,
 ) -> tuple[Slots, Ending]:
     """All slots of a rollout and where it ended; differentiable in every mode."""
-    return _traced_once(plan, system, state, parameters, dt, tolerance)
+    # JAX sets the mesh anew for derivatives, and to jit no mesh and an empty one are different circumstances.
+    with jax.sharding.use_abstract_mesh(jax.sharding.get_abstract_mesh()):
+        return _traced_once(plan, system, state, parameters, dt, tolerance)
 
 
 @partial(jax.jit, static_argnums=0)
@@ -186,9 +188,12 @@ class Rule:
         return in_groups(self._in_kernels, record, given)
 
     def _in_kernels(self, record: Record, given: tuple[State, Array]) -> tuple:
-        """One kernel for all slots; only for new factors if that would take too long to compile."""
+        """One kernel for all slots, or one for each part if that would take too long to compile."""
         several = partial(self._backward, as_one_kernel)
-        return as_one_kernel(partial(self._backward, _plainly), record, given, too_large=several)
+        system = record.numbers.whole(record.numbers.varied)[0]
+        if kind_of(system, self.tableau).in_parts(system):
+            return several(record, given)
+        return as_one_kernel(partial(self._backward, plainly), record, given, too_large=several)
 
     def _backward(self, kernel: Callable, record: Record, given: tuple[State, Array]) -> tuple:
         numbers, slots = record.numbers, record.slots
@@ -228,19 +233,27 @@ class Rule:
         The multipliers of its equations solve J^T lam = -(cotangent of the unknowns); their guess is
         extrapolated from those of the slots after it.
         """
-        _, pull = jax.vjp(
-            lambda varied, state, u, y: self.outcome(numbers, varied, slot, state, u, y),
-            numbers.varied, slot.before, slot.u, slot.y,
-        )  # fmt: skip
+
+        def pulling(numbers: Numbers, slot: Slot) -> Callable:
+            return jax.vjp(
+                lambda varied, state, u, y: self.outcome(numbers, varied, slot, state, u, y),
+                numbers.varied, slot.before, slot.u, slot.y,
+            )[1]  # fmt: skip
+
+        pull = kernel(pulling, numbers, slot)
+
+        def corrected(lam: Array, factors: Factors, at: Correcting, pull: Callable) -> tuple:
+            *bars, gap = pull((lam, end_bar))
+            change = factors.solver.transpose().solve(gap + y_bar)
+            at = at.judged(factors, lam, change, patience)
+            return jnp.where(at.moving, lam - change, lam), tuple(bars), at
 
         def trip(carry: tuple) -> tuple:
             lam, _, factors, at = carry
             refresh = partial(self._refreshed, kernel, numbers, slot)
             _, factors, at = jax.lax.while_loop(lambda c: c[0], refresh, (any_lane(at.wanting), factors, at))
-            *bars, gap = pull((lam, end_bar))
-            change = factors.solver.transpose().solve(gap + y_bar)
-            at = at.judged(factors, lam, change, patience)
-            return jnp.where(at.moving, lam - change, lam), tuple(bars), factors, at
+            lam, bars, at = kernel(corrected, lam, factors, at, pull)
+            return lam, bars, factors, at
 
         patience = kind_of(numbers.whole(numbers.varied)[0], self.tableau).renewal
         lam = jnp.where(jnp.all(jnp.isfinite(guess)), guess, 0.0)
@@ -265,10 +278,6 @@ class Rule:
             return factors_of(equations, equations.tangent(slot.y))
 
         return jnp.array(False), kernel(renewed, numbers, slot), carry[2].refreshed()
-
-
-def _plainly(function: Callable, *arguments: Any) -> Any:
-    return function(*arguments)
 
 
 def _in_chunks(function: Callable, slots: tuple, length: int) -> Any:

@@ -8,7 +8,7 @@ and only if every argument is used; so
 
 - small products are rewritten as sums, scatters as updates of slices, long reductions as loops,
 - a program that holds anything else than the operations known to work is left as it is,
-- all arguments travel in one array.
+- small arguments travel in one array, and a number of each large one is handed back.
 
 Other backends, and programs left as they are, compute the same, at the price of the calls.
 """
@@ -24,12 +24,7 @@ from jax.extend import core as jex
 from jaxtyping import Array, Float
 
 from natcoord_jax.stepping import rewriting
-from natcoord_jax.stepping.rewriting import (
-    evaluate_closed,
-    known,
-    operations,
-    with_constants,
-)
+from natcoord_jax.stepping.rewriting import Flat, known, operations
 
 try:
     from jax.experimental.scheduling_groups import xla_metadata_call as _attributed
@@ -41,6 +36,9 @@ LARGEST = 6800
 
 ATTRIBUTES = {"xla_cpu_small_call": "true", "inlineable": "false"}
 """Compiled as one function; kept as a call until then."""
+
+PACKED_UP_TO = 256
+"""Numbers of an array up to which it travels with others."""
 
 LANES = 16
 """Lanes of a batch that are worked on together, so that what they need stays in the fastest cache."""
@@ -62,6 +60,11 @@ def as_one_kernel(function: Callable, *arguments: Any, too_large: Callable | Non
     if too_large is not None and operations(program.jaxpr) > LARGEST:
         return too_large(*arguments)
     return _flat(_kernel, program, shapes, arguments)
+
+
+def plainly(function: Callable, *arguments: Any) -> Any:
+    """The value of a function: in the kernel of its caller, if that is in one."""
+    return function(*arguments)
 
 
 def scan_in_one_kernel(body: Callable, start: Any, given: Any, reverse: bool = False) -> tuple[Any, Any]:
@@ -118,7 +121,7 @@ def _on_cpu() -> bool:
 
 def _flat(transform: Callable, program: Any, shapes: Any, arguments: tuple) -> Any:
     """A transformed function of flat arguments, among them what it closes over."""
-    flat = with_constants(program)
+    flat = Flat(program)
     outputs = transform(flat)(*program.consts, *jax.tree.leaves(arguments))
     return jax.tree.unflatten(jax.tree.structure(shapes), outputs)
 
@@ -175,39 +178,45 @@ def _group_by_group(function: Callable, axes: list[int | None], lanes: int, *fla
 
 def _in_one_kernel(function: Callable, flat: Sequence[Any]) -> list[Any]:
     kinds = [(jnp.shape(x), jnp.result_type(x)) for x in flat]
-    program = jax.make_jaxpr(function)(*flat)
-    if known(program.jaxpr, rewriting.KNOWN | rewriting.REWRITTEN):
-        # After vmap, since small reductions of one lane are large ones of many.
-        program = jax.make_jaxpr(partial(evaluate_closed, program))(*flat)
+    # After vmap, since small reductions of one lane are large ones of many.
+    whole = function if isinstance(function, Flat) else Flat(jax.make_jaxpr(function)(*flat))
+    if not known(whole.program.jaxpr, rewriting.KNOWN | rewriting.REWRITTEN):
+        return whole(*flat)
+    program = jax.make_jaxpr(whole.rewritten)(*flat)
     packable = all(jnp.issubdtype(dtype, jnp.number) or dtype == jnp.bool for _, dtype in kinds)
     empty = all(math.prod(shape) == 0 for shape, _ in kinds)
     if _attributed is None or not packable or empty or not known(program.jaxpr):
         return jex.jaxpr_as_fun(program)(*flat)
 
-    packed, unpack = in_one_array(list(flat))
+    # Large arrays travel by themselves: packing would copy them at each call.
+    alone = [math.prod(shape) > PACKED_UP_TO for shape, _ in kinds]
+    small = [kind for kind, large in zip(kinds, alone) if not large]
 
-    def unpacked(packed: Float[Array, " _"]) -> list[Any]:
-        return jex.jaxpr_as_fun(program)(*unpack(packed))
+    def unpacked(packed: Float[Array, " _"], *large: Array) -> tuple[list[Any], list[Any]]:
+        some, rest = iter(apart(packed, small)), iter(large)
+        outputs = jex.jaxpr_as_fun(program)(*(next(rest if x else some) for x in alone))
+        # A number of each: an argument that is not used cannot be compiled.
+        return outputs, [x.reshape(-1)[0] for x in large]
 
     kernel: Callable = _attributed(unpacked, **ATTRIBUTES)  # pyright: ignore[reportAssignmentType]
-    return kernel(packed)
+    arrays = [jnp.asarray(x) for x in flat]
+    packed = in_one_array([x for x, large in zip(arrays, alone) if not large])
+    return kernel(packed, *(x for x, large in zip(arrays, alone) if large))[0]
 
 
-def in_one_array(tree: Any) -> tuple[Float[Array, " _"], Callable[[Array], Any]]:
-    """All arrays of a pytree in one, and the way back."""
-    leaves, structure = jax.tree.flatten(tree)
-    kinds = [(jnp.shape(x), jnp.result_type(x)) for x in leaves]
+def in_one_array(arrays: Sequence[Array]) -> Float[Array, " _"]:
+    """All arrays in one; `apart` takes them out again."""
+    return jnp.concatenate([jnp.zeros(0), *(_to_double(x).reshape(-1) for x in arrays)])
 
-    def unpack(packed: Float[Array, " _"]) -> Any:
-        values, position = [], 0
-        for shape, dtype in kinds:
-            size = math.prod(shape)
-            values.append(_from_double(packed[position : position + size], dtype).reshape(shape))
-            position += size
-        return jax.tree.unflatten(structure, values)
 
-    parts = [_to_double(jnp.asarray(x)).reshape(-1) for x in leaves]
-    return jnp.concatenate([jnp.zeros(0), *parts]), unpack
+def apart(packed: Float[Array, " _"], kinds: Sequence[tuple[tuple[int, ...], Any]]) -> list[Array]:
+    """The arrays that are in one, of these shapes and types."""
+    arrays, position = [], 0
+    for shape, dtype in kinds:
+        size = math.prod(shape)
+        arrays.append(_from_double(packed[position : position + size], dtype).reshape(shape))
+        position += size
+    return arrays
 
 
 def _to_double(x: Array) -> Array:

@@ -74,14 +74,28 @@ def known(program: Any, names: frozenset[str] | None = None) -> bool:
     )
 
 
-def with_constants(program: Any) -> Callable:
-    """The program, with its constants first."""
+class Flat:
+    """A program as a function of its constants and arguments, in one list.
 
-    def function(*values: Any) -> list[Any]:
-        consts, rest = values[: len(program.consts)], values[len(program.consts) :]
-        return jex.jaxpr_as_fun(jex.ClosedJaxpr(program.jaxpr, consts))(*rest)
+    Attributes:
+        program: closed.
+    """
 
-    return function
+    def __init__(self, program: Any):
+        self.program = program
+
+    def _parts(self, values: Sequence[Any]) -> tuple[Sequence[Any], Sequence[Any]]:
+        count = len(self.program.consts)
+        return values[:count], values[count:]
+
+    def __call__(self, *values: Any) -> list[Any]:
+        """Its outputs."""
+        consts, arguments = self._parts(values)
+        return jex.jaxpr_as_fun(jex.ClosedJaxpr(self.program.jaxpr, consts))(*arguments)
+
+    def rewritten(self, *values: Any) -> list[Any]:
+        """Its outputs, rewritten on the way."""
+        return _evaluate(self.program.jaxpr, *self._parts(values))
 
 
 def _evaluate(program: Any, consts: Sequence[Any], arguments: Sequence[Any]) -> list[Any]:
@@ -91,13 +105,7 @@ def _evaluate(program: Any, consts: Sequence[Any], arguments: Sequence[Any]) -> 
         return x.val if isinstance(x, jex.Literal) else values[x]
 
     for equation in program.eqns:
-        given = [read(x) for x in equation.invars]
-        scope = str(equation.source_info.name_stack)
-        if scope:
-            with jax.named_scope(scope):
-                found = _apply(equation, given)
-        else:
-            found = _apply(equation, given)
+        found = _apply(equation, [read(x) for x in equation.invars])
         values.update(zip(equation.outvars, found))
     return [read(x) for x in program.outvars]
 
@@ -127,15 +135,10 @@ def _apply(equation: Any, given: list[Any]) -> list[Any]:
 def _inside(value: Any) -> Any:
     """A parameter with the programs it holds rewritten."""
     if isinstance(value, jex.ClosedJaxpr):
-        return jax.make_jaxpr(partial(evaluate_closed, value))(*value.in_avals)
+        return jax.make_jaxpr(partial(Flat(value).rewritten, *value.consts))(*value.in_avals)
     if isinstance(value, tuple) and value and all(isinstance(x, jex.ClosedJaxpr) for x in value):
         return tuple(_inside(x) for x in value)
     return value
-
-
-def evaluate_closed(program: Any, *arguments: Any) -> list[Any]:
-    """Outputs of a closed program, rewritten on the way."""
-    return _evaluate(program.jaxpr, program.consts, arguments)
 
 
 def _product(given: list[Any], params: dict[str, Any], out: Any) -> Array | None:
