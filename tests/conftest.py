@@ -1,4 +1,4 @@
-"""Settings of the test-suite: double precision, a cache of compiled programs, types checked at run time."""
+"""Settings of the test-suite: double precision, a cache of compiled programs, checks of types."""
 
 import gc
 import os
@@ -37,12 +37,16 @@ Every program takes a few hundred, and a process that runs out of them crashes i
 """
 
 
-def pytest_configure(config: pytest.Config) -> None:
-    """Check shapes and types of every annotated function, from the first import on.
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--check-types", action="store_true", help="check shapes and types at run time")
 
-    Slow tests call the same functions for longer; checks take 6 % of their time and find nothing new.
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Check shapes and types of every annotated function, from the first import on, if asked to.
+
+    Checks take a quarter of the time to trace; `test_types.py` makes them once for every kind of effect.
     """
-    if config.option.markexpr != "slow":
+    if config.option.check_types:
         hook = install_import_hook("natcoord_jax", "beartype.beartype")
         config.add_cleanup(hook.uninstall)
 

@@ -12,7 +12,7 @@ CIRCUMSTANCES = {"benchmark", "quick", "date", "commit", "machine", "versions", 
 TIMES = {"us_per_step", "us_per_step_range", "repeats", "compile_s"}
 
 pytestmark = [
-    pytest.mark.slow,
+    pytest.mark.benchmark,
     pytest.mark.skipif(not (ROOT / "benchmarks").is_dir(), reason="only a checkout has the benchmarks"),
 ]
 
