@@ -7,11 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from natcoord_jax.assembly.system import System
 from natcoord_jax.linsolve.dense import DenseSolver, Inverse, saddle_inverse
-
-PARTS_FROM = 8
-"""Bodies from which on a step takes so long that a few calls more do not count."""
 
 
 class Form(eqx.Module):
@@ -28,11 +24,6 @@ class Form(eqx.Module):
     by_differences: ClassVar[bool] = False
     by_formulas: ClassVar[bool] = False
     renewal: ClassVar[int] = 6
-
-    @classmethod
-    def in_parts(cls, system: System) -> bool:
-        """Whether evaluation, end of a step and new factors are large enough for kernels of their own."""
-        return cls.by_formulas and len(system.structure.bodies) >= PARTS_FROM
 
     def like_tangent(self, y: Float[Array, " unknowns"]) -> Any:
         """Something of the shape of `tangent(y)`, to know the shape of its factors without tracing it."""

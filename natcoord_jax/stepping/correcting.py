@@ -17,7 +17,10 @@ SURPRISE = 10.0
 """Times the error allowed by which the correction may be larger that was expected to be within it."""
 
 STALL = 1e-10
-"""Corrections that stop shrinking below this have reached the floor of round-off."""
+"""Corrections that stop shrinking below this have reached the floor of round-off.
+
+Where new factors change nothing, ten times more each time: a fine mesh of a stiff rope is as bad as that.
+"""
 
 CORRECTIONS = 30
 """Corrections with one factorisation."""
@@ -58,6 +61,11 @@ class Correcting(eqx.Module):
         """Whether to go on."""
         return ~self.done & ((self.rounds < ROUNDS) | ~self.wanting)
 
+    @property
+    def going(self) -> Bool[Array, ""]:
+        """Whether to go on with the factors at hand."""
+        return ~self.done & ~self.wanting
+
     def refreshed(self) -> "Correcting":
         """With new factors."""
         nought = jnp.zeros_like(self.count)
@@ -73,7 +81,8 @@ class Correcting(eqx.Module):
         ratio = correction / jnp.where(self.correction > 0, self.correction, 1.0)
         first = self.count == 0
         finite = jnp.isfinite(correction) & jnp.isfinite(size)
-        stalled = ~first & (ratio > 0.5) & (correction <= STALL * size)
+        floor = STALL * 10.0 ** jnp.maximum(self.rounds - 1, 0)
+        stalled = ~first & (ratio > 0.5) & (correction <= floor * size)
         within = correction <= jnp.where(self.last, SURPRISE * CLOSE, CLOSE) * size
         done = (within | stalled) & finite & factors.usable
         trusted = jnp.maximum(ratio, SLOWEST_UNSEEN)
@@ -84,7 +93,7 @@ class Correcting(eqx.Module):
         slow = slow & ~done
         found = Correcting(correction, self.count + 1, self.rounds, done, slow, ~done & ~slow, last)
         stay = eqx.tree_at(lambda c: c.moving, self, jnp.zeros_like(self.moving))
-        return jax.tree.map(partial(jnp.where, self.done), stay, found)
+        return jax.tree.map(partial(jnp.where, ~self.going), stay, found)
 
 
 def _size(lam: Float[Array, " unknowns"], inertias: Float[Array, " unknowns"]) -> Float[Array, ""]:

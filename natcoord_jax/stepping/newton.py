@@ -118,15 +118,6 @@ class Factors(eqx.Module):
         return Factors(self.solver, self.inertias, keep, jnp.zeros_like(self.fresh), least, extra, noise)
 
     @property
-    def history(self) -> tuple[Array, ...]:
-        """All but the factors themselves."""
-        return self.usable, self.fresh, self.least, self.extra, self.noise
-
-    def with_history(self, history: tuple[Array, ...]) -> "Factors":
-        """These factors with another history."""
-        return Factors(self.solver, self.inertias, *history)
-
-    @property
     def rounding(self) -> Float[Array, ""]:
         """Relative size of corrections that are nothing but rounding; 0 where it is not known or small."""
         least, most = NOISE

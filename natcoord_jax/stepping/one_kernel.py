@@ -8,7 +8,7 @@ and only if every argument is used; so
 
 - small products are rewritten as sums, scatters as updates of slices, long reductions as loops,
 - a program that holds anything else than the operations known to work is left as it is,
-- small arguments travel in one array, and a number of each large one is handed back.
+- all arguments travel in one array.
 
 Other backends, and programs left as they are, compute the same, at the price of the calls.
 """
@@ -36,9 +36,6 @@ LARGEST = 6800
 
 ATTRIBUTES = {"xla_cpu_small_call": "true", "inlineable": "false"}
 """Compiled as one function; kept as a call until then."""
-
-PACKED_UP_TO = 256
-"""Numbers of an array up to which it travels with others."""
 
 LANES = 16
 """Lanes of a batch that are worked on together, so that what they need stays in the fastest cache."""
@@ -188,20 +185,11 @@ def _in_one_kernel(function: Callable, flat: Sequence[Any]) -> list[Any]:
     if _attributed is None or not packable or empty or not known(program.jaxpr):
         return jex.jaxpr_as_fun(program)(*flat)
 
-    # Large arrays travel by themselves: packing would copy them at each call.
-    alone = [math.prod(shape) > PACKED_UP_TO for shape, _ in kinds]
-    small = [kind for kind, large in zip(kinds, alone) if not large]
-
-    def unpacked(packed: Float[Array, " _"], *large: Array) -> tuple[list[Any], list[Any]]:
-        some, rest = iter(apart(packed, small)), iter(large)
-        outputs = jex.jaxpr_as_fun(program)(*(next(rest if x else some) for x in alone))
-        # A number of each: an argument that is not used cannot be compiled.
-        return outputs, [x.reshape(-1)[0] for x in large]
+    def unpacked(packed: Float[Array, " _"]) -> list[Any]:
+        return jex.jaxpr_as_fun(program)(*apart(packed, kinds))
 
     kernel: Callable = _attributed(unpacked, **ATTRIBUTES)  # pyright: ignore[reportAssignmentType]
-    arrays = [jnp.asarray(x) for x in flat]
-    packed = in_one_array([x for x, large in zip(arrays, alone) if not large])
-    return kernel(packed, *(x for x, large in zip(arrays, alone) if large))[0]
+    return kernel(in_one_array([jnp.asarray(x) for x in flat]))
 
 
 def in_one_array(arrays: Sequence[Array]) -> Float[Array, " _"]:

@@ -61,8 +61,18 @@ def _inner_programs(equation: Any) -> list[Any]:
 
 
 def operations(program: Any) -> int:
-    """Number of operations of a program and of all programs in it."""
-    return sum(1 + sum(map(operations, _inner_programs(equation))) for equation in program.eqns)
+    """Number of operations of a program and of all programs in it that its outputs need."""
+    return sum(1 + sum(map(operations, _inner_programs(equation))) for equation in _needed(program))
+
+
+def _needed(program: Any) -> list[Any]:
+    """Equations of a program that its outputs need."""
+    wanted, found = set(map(id, program.outvars)), []
+    for equation in reversed(program.eqns):
+        if equation.effects or any(id(x) in wanted for x in equation.outvars):
+            wanted.update(map(id, equation.invars))
+            found.append(equation)
+    return found[::-1]
 
 
 def known(program: Any, names: frozenset[str] | None = None) -> bool:
@@ -104,7 +114,7 @@ def _evaluate(program: Any, consts: Sequence[Any], arguments: Sequence[Any]) -> 
     def read(x: Any) -> Any:
         return x.val if isinstance(x, jex.Literal) else values[x]
 
-    for equation in program.eqns:
+    for equation in _needed(program):
         found = _apply(equation, [read(x) for x in equation.invars])
         values.update(zip(equation.outvars, found))
     return [read(x) for x in program.outvars]
