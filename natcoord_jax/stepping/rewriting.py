@@ -115,7 +115,13 @@ def _evaluate(program: Any, consts: Sequence[Any], arguments: Sequence[Any]) -> 
         return x.val if isinstance(x, jex.Literal) else values[x]
 
     for equation in _needed(program):
-        found = _apply(equation, [read(x) for x in equation.invars])
+        given = [read(x) for x in equation.invars]
+        scope = str(equation.source_info.name_stack)
+        if scope:
+            with jax.named_scope(scope):
+                found = _apply(equation, given)
+        else:
+            found = _apply(equation, given)
         values.update(zip(equation.outvars, found))
     return [read(x) for x in program.outvars]
 
