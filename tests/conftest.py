@@ -44,7 +44,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_configure(config: pytest.Config) -> None:
     """Check shapes and types of every annotated function, from the first import on, if asked to.
 
-    Checks take a quarter of the time to trace; `test_types.py` makes them once for every kind of effect.
+    Checks take a quarter of the time to trace; `test_types.py` makes them for some scenes.
     """
     if config.option.check_types:
         hook = install_import_hook("natcoord_jax", "beartype.beartype")

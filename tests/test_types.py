@@ -1,4 +1,4 @@
-"""Shapes and types of every annotated function, checked while scenes are traced."""
+"""Shapes and types of annotated functions, checked while some scenes are traced."""
 
 import re
 import subprocess

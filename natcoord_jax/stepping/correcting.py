@@ -17,10 +17,7 @@ SURPRISE = 10.0
 """Times the error allowed by which the correction may be larger that was expected to be within it."""
 
 STALL = 1e-10
-"""Corrections that stop shrinking below this have reached the floor of round-off.
-
-Where new factors change nothing, ten times more each time: a fine mesh of a stiff rope is as bad as that.
-"""
+"""Corrections that stop shrinking below this have reached the floor of round-off."""
 
 CORRECTIONS = 30
 """Corrections with one factorisation."""
@@ -81,8 +78,7 @@ class Correcting(eqx.Module):
         ratio = correction / jnp.where(self.correction > 0, self.correction, 1.0)
         first = self.count == 0
         finite = jnp.isfinite(correction) & jnp.isfinite(size)
-        floor = STALL * 10.0 ** jnp.maximum(self.rounds - 1, 0)
-        stalled = ~first & (ratio > 0.5) & (correction <= floor * size)
+        stalled = ~first & (ratio > 0.5) & (correction <= STALL * size)
         within = correction <= jnp.where(self.last, SURPRISE * CLOSE, CLOSE) * size
         done = (within | stalled) & finite & factors.usable
         trusted = jnp.maximum(ratio, SLOWEST_UNSEEN)

@@ -232,8 +232,8 @@ class Rule:
         """
         patience = kind_of(numbers.whole(numbers.varied)[0], self.tableau).renewal
 
-        # With one stage it saves a fifth of the time to pull back only what the corrections ask for; with
-        # more of them the larger program costs more than that.
+        # With one stage it saves time to pull back only what the corrections ask for; with more of them the
+        # program grows too large for one kernel, which costs more than that.
         once = self.tableau.stages > 1
         nothing = jax.tree.map(jnp.zeros_like, (numbers.varied, slot.before, slot.u))
 
