@@ -78,7 +78,8 @@ class Rollout:
             part: what the gradient is with respect to.
 
         Returns:
-            Calls of the value and of value and gradient, and the number of parameters.
+            Calls of the value and of value and gradient, and the number of parameters. The second raises
+            FloatingPointError if its first gradient is not finite: the time of a wrong one says nothing.
         """
         chosen = self._selected(part)
 
@@ -90,8 +91,18 @@ class Rollout:
 
         values = [self._arguments[k] for k in chosen]
         value, both = jax.jit(loss), jax.jit(jax.value_and_grad(loss))
+        seen = False
+
+        def with_gradient() -> Any:
+            nonlocal seen
+            found = jax.block_until_ready(both(values, self._arguments))
+            if not seen and not all(bool(jnp.all(jnp.isfinite(x))) for x in jax.tree.leaves(found)):
+                raise FloatingPointError(f"the gradient by the {part} is not finite")
+            seen = True
+            return found
+
         return (
             lambda: jax.block_until_ready(value(values, self._arguments)),
-            lambda: jax.block_until_ready(both(values, self._arguments)),
+            with_gradient,
             sum(x.size for x in values),
         )

@@ -154,3 +154,30 @@ def test_arc_tangent_coefficients_keep_their_digits():
         expected = first, middle, (Decimal(1) / 3 - middle) / square
         for found, value in zip(arctan_coefficients(jnp.asarray(x)), expected):
             assert abs(Decimal(float(found)) / value - 1) < 1e-15
+
+
+def test_forces_of_elements_that_hardly_move_have_the_right_derivatives():
+    """Rounding along a step is no stiffness: what is missing to the energy is nothing but rounding, too.
+
+    Straight elements, where most invariants are zero, of a slender beam: stretch is far stiffer than bending.
+    """
+    many, length, rng = 4096, 1.0 / 32.0, np.random.default_rng(7)
+    effect = nc.BeamElement(None, length=length, stiffness=np.diag([40.0, 40.0, 120.0, 1e-3, 1e-3, 1e-3]))
+    effect = jax.tree.map(lambda x: jnp.asarray(x)[..., None], effect)
+    # Each from a fraction of a rounding error to what is far above it.
+    straight = jnp.array([0.0, 0.0, 0.0, 3.0, 0.0, 0.0, length])[:, None]
+    signs = jnp.asarray(rng.choice([-1.0, 1.0], size=(2, 7, many)))
+    start = straight + 10.0 ** rng.uniform(-22, -17, size=(7, many)) * signs[0]
+    steps = 10.0 ** rng.uniform(-20, -12, size=(1, 7, many)) * signs[1]
+    steps = steps.at[:, 3].mul(1e-10)
+
+    def forces(steps):
+        return effect.averaged(start, steps, gauss(1))[0]
+
+    units = jnp.broadcast_to(jnp.eye(7)[:, None, :, None], (7, *steps.shape))
+    found = jax.vmap(lambda unit: jax.jvp(forces, (steps,), (unit,))[1])(units)
+    expected = 0.5 * jnp.swapaxes(effect.energy_curvature(start + 0.5 * steps[0]), 0, 1)
+    # Moments of bending are small beside forces of stretch: each by its own.
+    sizes = jnp.stack([jnp.abs(expected[i, i]) for i in (0, 1, 2, 0, 4, 5, 6)])
+    off = jnp.abs(found - expected) / jnp.sqrt(sizes[:, None] * sizes)
+    assert jnp.max(off) <= tol.HARDLY_MOVED

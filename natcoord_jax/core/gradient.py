@@ -19,8 +19,11 @@ from jaxtyping import Array, Float
 from natcoord_jax.maths.collocation import Tableau, invariant_quadrature
 from natcoord_jax.maths.vectors import safe_divide
 
-LEAST = 1e-12
+LEAST = 1e-9
 """Relative change of the invariants below which nothing can be missing but round-off."""
+
+SPREAD = 64
+"""Rounding errors of a slope by which it must change along the step for the change to tell anything."""
 
 
 def averaged_gradient(
@@ -31,6 +34,7 @@ def averaged_gradient(
     degree: int | None,
     points: int | None = None,
     slope: Callable[[Float[Array, "p *n"]], Float[Array, "p *n"]] | None = None,
+    units: tuple[int, ...] | None = None,
 ) -> Float[Array, "s p *n"]:
     """Gradients S_i [J per unit of invariant] with sum_i b_i S_i . steps_i = E(end) - E(start).
 
@@ -46,6 +50,7 @@ def averaged_gradient(
         degree: polynomial degree of `energy`, or None if it is no polynomial.
         points: of the quadrature if it is no polynomial; default two more than twice the stages.
         slope: gradient of `energy`; None: by reverse mode.
+        units: numbers of consecutive invariants that have the same unit; None: all have.
     """
     if tableau.variational:
         return jax.grad(energy)(start + 0.5 * steps[0])[None]
@@ -65,22 +70,35 @@ def averaged_gradient(
     captured = jnp.sum(weights * gradient * steps, axis=(0, 1))
     missing = (after - before) - captured
     # In proportion to what each gradient changes by: what is soft stays soft, and hardly moved, unmoved.
+    # A change within rounding, by a step that is itself nothing but rounding, would be any stiffness.
+    epsilon = jnp.finfo(start.dtype).eps
     moved = jnp.max(jnp.abs(steps), axis=0)
-    stiffness = safe_divide(jnp.max(slopes, axis=0) - jnp.min(slopes, axis=0), moved)
+    changed = jnp.max(slopes, axis=0) - jnp.min(slopes, axis=0)
+    changed = jnp.where(changed > SPREAD * epsilon * jnp.max(jnp.abs(slopes), axis=0), changed, 0.0)
+    stiffness = safe_divide(changed, moved)
     enough = jnp.sum(weights * stiffness * steps**2, axis=(0, 1)) > jnp.abs(missing)
-    # A kink can hide between the points: then in proportion to the steps, in units of the invariants.
+    # A kink can hide between the points: then in proportion to the steps, beside the largest invariant of the
+    # same unit; where one is zero, as in a straight beam, it is rounded as that is.
     scale = jnp.abs(start) + jnp.abs(increment)
-    units = safe_divide(jnp.ones_like(scale), scale**2)
-    change = jnp.sum(weights * units * steps**2, axis=(0, 1))
-    share = jnp.where(enough, stiffness, units)
+    largest = _largest(scale, units or (scale.shape[0],))
+    weight = safe_divide(jnp.ones_like(largest), largest**2)
+    change = jnp.sum(weights * weight * steps**2, axis=(0, 1))
+    share = jnp.where(enough, stiffness, weight)
     measure = jnp.sum(weights * share * steps**2, axis=(0, 1))
     # Near its minimum an energy is less certain than its digits say: invariants are rounded before it.
     rounded = jnp.max(jnp.sum(jnp.abs(gradient) * scale, axis=1), axis=0)
     sizes = jnp.abs(before) + jnp.abs(after) + jnp.abs(captured) + rounded
-    noise = 16 * jnp.finfo(start.dtype).eps * sizes
+    noise = 16 * epsilon * sizes
     relevant = (jnp.abs(missing) > noise) & (change > LEAST**2)
     factor = jnp.where(relevant, missing / jnp.where(relevant, measure, 1.0), 0.0)
     return gradient + (factor * steps) * share
+
+
+def _largest(scale: Float[Array, "p *n"], units: tuple[int, ...]) -> Float[Array, "p *n"]:
+    """The largest of the sizes that have the same unit, for each."""
+    ends = np.cumsum(units)
+    parts = [jnp.max(scale[end - count : end], axis=0) for count, end in zip(units, ends)]
+    return jnp.stack([part for part, count in zip(parts, units) for _ in range(count)])
 
 
 def gradient_of(

@@ -41,6 +41,8 @@ class Potential(Effect):
         degree: polynomial degree of `energy` in the invariants, if it is a polynomial; saves work.
         points: of the quadrature along a step, if it is none; more make the force a better average, energy is
             exact with any number. Default: two more than twice the stages.
+        units: numbers of consecutive invariants that have the same unit; None: all have. What each is rounded
+            by is told from the largest.
         together: whether `invariants` and `energy` (and `slope` and `curvature`, if they are given) also take
             many instances at once, whose numbers, marker vectors and invariants then have one more axis, the
             last. That is much faster than a function of one instance that is vmapped.
@@ -64,6 +66,7 @@ class Potential(Effect):
     elastic: ClassVar[bool] = True
     degree: ClassVar[int | None] = None
     points: ClassVar[int | None] = None
+    units: ClassVar[tuple[int, ...] | None] = None
     together: ClassVar[bool] = False
 
     def attach(self, find: Callable[[Handle], tuple[Joint, Array]]) -> Sequence[Marker | Attachment]:
@@ -112,7 +115,8 @@ class Potential(Effect):
     ) -> Float[Array, "s p *n"]:
         """Averaged gradients, see `averaged_gradient`."""
         points = self.points if self.points is None else self.points + tableau.stages - 1
-        return averaged_gradient(self.energy, start, steps, tableau, self.degree, points, self.slope)
+        given = self.energy, start, steps, tableau, self.degree, points
+        return averaged_gradient(*given, self.slope, self.units)
 
     def linearised(self, place: Array, motion: Motion, now: Now, lam: Array) -> "LinearisedPotential":
         """The potential with gradients that are linear in the steps of the invariants."""

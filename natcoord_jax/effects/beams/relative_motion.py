@@ -96,6 +96,7 @@ class BeamElement(Expanded):
     silent: ClassVar[bool] = False
     together: ClassVar[bool] = True
     points: ClassVar[int | None] = 2
+    units: ClassVar[tuple[int, ...] | None] = (4, 3)
 
     def invariants(self, x: Array) -> Array:
         """Relative rotation [-] and place [m] of the second frame in the first."""
