@@ -72,6 +72,7 @@ class Setting(eqx.Module):
         tolerance: of the error of substeps; None: steps are made as they are given.
         plan: what is static.
         steps: number of steps.
+        first: step of the first of the inputs that are given as an array.
     """
 
     system: System
@@ -80,6 +81,15 @@ class Setting(eqx.Module):
     tolerance: Tolerance | None
     plan: Plan = eqx.field(static=True)
     steps: Int[Array, ""] | int
+    first: Int[Array, ""] | int = 0
+
+    def near(self, course: Course, steps: int) -> "Setting":
+        """With the inputs of the next steps only."""
+        if self.plan.control is not None or self.parameters.shape[0] <= steps:
+            return self
+        first = jnp.minimum(course.step, self.parameters.shape[0] - steps)
+        some = jax.lax.dynamic_slice_in_dim(self.parameters, first, steps)
+        return Setting(self.system, some, self.dt, self.tolerance, self.plan, self.steps, first)
 
     def over(self, course: Course) -> Bool[Array, ""]:
         """Whether the rollout has ended."""
@@ -92,7 +102,8 @@ class Setting(eqx.Module):
         """Inputs, length and number of the (sub)step at hand."""
         h = jnp.where(self.over(course), 1e-3, course.fraction * self.dt)
         index = jnp.minimum(course.step, self.steps - 1)
-        u = self.plan.inputs(self.parameters, index, course.state, course.done, course.fraction)
+        given = index if self.plan.control is not None else index - self.first
+        u = self.plan.inputs(self.parameters, given, course.state, course.done, course.fraction)
         return u, h, index
 
 

@@ -1,0 +1,164 @@
+"""The loop over all slots of a rollout, in one kernel or in rounds of two.
+
+What is compiled as one kernel becomes one function of machine code. The time of the compiler's passes over
+loops grows with the square of their number, so that large programs are cut where little travels: between
+steps that need no new factors, and these.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array
+
+from natcoord_jax.assembly.equations import kind_of, prepare
+from natcoord_jax.assembly.outset import Outset
+from natcoord_jax.core.state import State
+from natcoord_jax.stepping.course import Course, Setting, start_of
+from natcoord_jax.stepping.newton import Factors, Iterate, any_lane, factors_of
+from natcoord_jax.stepping.one_kernel import as_one_kernel
+from natcoord_jax.stepping.probe import Probe
+from natcoord_jax.stepping.trip import Asked, Carried, renewed_at, trip, with_state
+
+PARTS = 8
+"""Bodies from which on new factors are made in a kernel of their own."""
+
+CHUNK = 16
+"""Slots between two returns from the kernel of the steps, at most."""
+
+ATTEMPTS = 2
+"""Slots for every accepted substep with error control: one and a half, and some that are rejected."""
+
+
+def all_slots(setting: Setting, state: State) -> tuple[Carried, Callable[[Array], State]]:
+    """The loop over all evaluations of the equations."""
+    plan = setting.plan
+    length = plan.steps + plan.extra
+    if setting.tolerance is not None:
+        length = ATTEMPTS * length
+    packed, unpack = ravel_pytree(state)
+    course, factors, outset = start_of(setting, state)
+    start = with_state(course, None), factors, outset, packed
+    given = setting, unpack, length
+    if _in_parts(setting):
+        return _by_rounds(*given, *start), unpack
+    return as_one_kernel(partial(_every_slot, *given), *start), unpack
+
+
+def _in_parts(setting: Setting) -> bool:
+    """Whether new factors are made in a kernel of their own: one for all would compile for too long."""
+    kind = kind_of(setting.system, setting.plan.tableau)
+    return kind.by_formulas and setting.tolerance is None and len(setting.system.structure.bodies) >= PARTS
+
+
+def _unfinished(setting: Setting, length: int, carried: Carried) -> Array:
+    return (carried.count < length) & any_lane(~setting.over(carried.course))
+
+
+def _record(course: Course, x: Array, rows: int) -> tuple[Array, ...]:
+    """Room for so many slots."""
+    slot = x, course.it.y, course.step, course.fraction, course.done, course.stopped, course.step
+    return tuple(jnp.zeros((rows, *x.shape), x.dtype) for x in slot)
+
+
+def _every_slot(
+    setting: Setting,
+    unpack: Callable[[Array], State],
+    length: int,
+    course: Course,
+    factors: Factors,
+    outset: Outset,
+    x: Array,
+) -> Carried:
+    """All slots, in one loop."""
+    plan, it = setting.plan, course.it
+    by_differences = kind_of(setting.system, plan.tableau).by_differences
+    probe = Probe.first(it.y.shape[0], x.dtype) if by_differences else None
+    # A row beyond the last goes to the last.
+    record = _record(course, x, length if plan.recorded else 1)
+    if plan.tableau.stages > 1 and by_differences:
+        u, h, _ = setting.situation(with_state(course, unpack(x)))
+        equations = prepare(setting.system, unpack(x), u, h, plan.tableau, outset)
+        factors = factors_of(equations, equations.inertial_jacobian())
+        factors = eqx.tree_at(lambda f: f.fresh, factors, jnp.array(False))
+    start = Carried(jnp.array(0), course, x, outset, factors, probe, record, jnp.array(0), None)
+    going = partial(_unfinished, setting, length)
+    return jax.lax.while_loop(going, partial(trip, setting, unpack, False), start)
+
+
+def _by_rounds(
+    setting: Setting,
+    unpack: Callable[[Array], State],
+    length: int,
+    course: Course,
+    factors: Factors,
+    outset: Outset,
+    x: Array,
+) -> Carried:
+    """All slots, in rounds of a kernel that goes on until it needs new factors, and one that makes them.
+
+    One kernel for both would compile twice as long; the slots of a round have a record of their own, so that
+    what travels between kernels does not grow with the number of slots.
+    """
+    plan = setting.plan
+    rows = CHUNK if plan.recorded else 1
+
+    def situated(setting: Setting, carried: Carried) -> Any:
+        state = unpack(carried.state)
+        u, h, _ = setting.situation(with_state(carried.course, state))
+        return prepare(setting.system, state, u, h, plan.tableau, carried.outset)
+
+    def attempts(near: Setting, carried: Carried) -> Carried:
+        def going(c: Carried) -> Array:
+            assert c.asked is not None
+            return _unfinished(near, length, c) & ~c.asked.wanting & (c.count < c.first + CHUNK)
+
+        room = _record(carried.course, carried.state, rows)
+        begun = eqx.tree_at(lambda c: (c.record, c.first), carried, (room, carried.count))
+        return jax.lax.while_loop(going, partial(trip, near, unpack, True), begun)
+
+    def renewal(near: Setting, carried: Carried) -> tuple[Iterate, Factors]:
+        assert carried.asked is not None
+        equations = situated(near, carried)
+        return renewed_at(near, equations, carried.course.it, carried.factors, carried.asked)
+
+    def round_of(carry: tuple[Carried, tuple[Array, ...]]) -> tuple:
+        carried, record = carry
+        near = setting.near(carried.course, CHUNK)
+        found = as_one_kernel(partial(attempts, near), carried)
+        if plan.recorded:
+            record = tuple(
+                jax.lax.dynamic_update_slice_in_dim(whole, part, carried.count, 0)
+                for whole, part in zip(record, found.record)
+            )
+        else:
+            some = found.count > carried.count
+            record = tuple(jnp.where(some, part, whole) for whole, part in zip(record, found.record))
+        found = eqx.tree_at(lambda c: c.record, found, ())
+
+        def renewed(found: Carried) -> tuple[Iterate, Factors]:
+            return as_one_kernel(partial(renewal, near), found)
+
+        def kept(found: Carried) -> tuple[Iterate, Factors]:
+            return found.course.it, found.factors
+
+        it, factors = jax.lax.cond(found.asked.wanting, renewed, kept, found)
+        made = it, factors, jnp.array(False)
+        return eqx.tree_at(lambda c: (c.course.it, c.factors, c.asked.wanting), found, made), record
+
+    start = Carried(jnp.array(0), course, x, outset, factors, None, (), jnp.array(0), None)
+    like = jax.eval_shape(lambda c: situated(setting, c).evaluate(c.course.it.y), start)
+    like = like.residual, like.size, like.loads
+    residual, size, loads = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), like)
+    asked = Asked(jnp.array(False), residual, size, loads, jnp.array(False))
+    start = eqx.tree_at(lambda c: c.asked, start, asked, is_leaf=lambda x: x is None)
+    # The slots of the last round may end before its room does.
+    record = _record(course, x, length + CHUNK if plan.recorded else 1)
+    found, record = jax.lax.while_loop(
+        lambda carry: _unfinished(setting, length, carry[0]), round_of, (start, record)
+    )
+    return eqx.tree_at(lambda c: c.record, found, tuple(rows[:length] for rows in record))

@@ -1,0 +1,195 @@
+"""One evaluation of the equations in a rollout, and what follows from it."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float, Int
+
+from natcoord_jax.assembly.equations import prepare, starting
+from natcoord_jax.assembly.kick import Kick
+from natcoord_jax.assembly.outset import Outset
+from natcoord_jax.core.state import State
+from natcoord_jax.maths.rows import row, with_row
+from natcoord_jax.stepping.course import Course, Setting, after_attempt
+from natcoord_jax.stepping.newton import Factors, Iterate, any_lane, factors_of, judge, refreshed
+from natcoord_jax.stepping.probe import Probe
+from natcoord_jax.stepping.step import end_of_step
+
+
+class Carried(eqx.Module):
+    """What goes from one evaluation of the equations to the next.
+
+    Attributes:
+        count: complete slots.
+        course: where the rollout stands, its state left out.
+        state: the state in one array: fewer operations than one for every field.
+        outset: what the equations need of that state.
+        factors: of a Jacobian.
+        probe: the Jacobian in the making.
+        record: fields of `Slots`, for every slot; the states in one array.
+        first: slot of the first row of the record.
+        asked: what new factors are asked for with; None: they are made where they are wanted.
+    """
+
+    count: Int[Array, ""]
+    course: Course
+    state: Float[Array, " numbers"]
+    outset: Outset
+    factors: Factors
+    probe: Probe | None
+    record: tuple[Array, ...]
+    first: Int[Array, ""]
+    asked: "Asked | None"
+
+
+class Asked(eqx.Module):
+    """What is known where new factors are wanted.
+
+    Attributes:
+        wanting: whether they are.
+        residual: of the equations, where they were evaluated last.
+        size: of their terms.
+        loads: of the equations, see `Evaluation.loads`.
+        here: whether they are wanted where the equations were evaluated, not where the step began.
+    """
+
+    wanting: Bool[Array, ""]
+    residual: Float[Array, " unknowns"]
+    size: Float[Array, ""]
+    loads: Any
+    here: Bool[Array, ""]
+
+
+def trip(setting: Setting, unpack: Callable[[Array], State], apart: bool, carried: Carried) -> Carried:
+    """One evaluation of the equations, and what follows from it.
+
+    If apart, new factors are asked for, but not made.
+    """
+    plan, factors, probe = setting.plan, carried.factors, carried.probe
+    course = with_state(carried.course, unpack(carried.state))
+    it, over = course.it, setting.over(course)
+    u, h, index = setting.situation(course)
+    equations = prepare(setting.system, course.state, u, h, plan.tableau, carried.outset)
+    found = equations.evaluate(it.y if probe is None else probe.moved(it.y, equations))
+    probing = jnp.array(False) if probe is None else probe.at >= 0
+    cost, options = _judging(equations, it, probe)
+    judged = judge(factors, plan.tolerance, it, found.residual, found.size, **options)
+    it = jax.tree.map(partial(jnp.where, probing), it, judged)
+    ending = ~probing & ~any_lane(it.unsolved & ~over)
+    wanting = ~probing & ~ending & any_lane(it.wanting & it.unsolved & ~over)
+
+    def ended(carry: tuple) -> tuple:
+        _, before, x, _, record = carry
+        before = with_state(before, unpack(x))
+        groups, tableau = equations.groups, plan.tableau
+        ends = end_of_step(setting.system, before.state, h, groups, found, tableau)
+        after = after_attempt(setting, before, factors.inertias, ends)
+        accepted = after.taken > before.taken
+        x = ravel_pytree(after.state)[0]
+        slot = x, before.it.y, index, before.fraction, before.done, accepted, after.step
+        if after.trial is not None:
+            record = _taken_back(record, carried.count - 1 - carried.first, after.trial.undone, x)
+        record = tuple(with_row(b, carried.count - carried.first, r) for b, r in zip(record, slot))
+        outset = _outset_after(setting, after, accepted, carried.outset, found.kick)
+        return jnp.array(False), with_state(after, None), x, outset, record
+
+    # Loops of no or one trip leave what they carry where it is; a conditional would copy it.
+    start = (
+        ending,
+        eqx.tree_at(lambda c: c.it, carried.course, it),
+        carried.state,
+        carried.outset,
+        carried.record,
+    )
+    _, after, x, outset, record = jax.lax.while_loop(lambda carry: carry[0], ended, start)
+    # An attempt for comparison leaves the run where it is, and factors that serve.
+    solved = after.taken > course.taken if setting.tolerance is None else it.converged
+    kept = factors.after_step(it, solved | over, cost)
+    factors = eqx.tree_at(
+        lambda f: (f.usable, f.fresh, f.least, f.extra, f.noise),
+        factors,
+        tuple(
+            jnp.where(ending, a, b)
+            for a, b in (
+                (kept.usable, factors.usable),
+                (kept.fresh, factors.fresh),
+                (kept.least, factors.least),
+                (kept.extra, factors.extra),
+                (kept.noise, factors.noise),
+            )
+        ),
+    )
+    if probe is not None:
+        probe, wanting = probe.with_column(it.y, found.residual, equations, wanting)
+
+    # Evaluated where the new factors belong, unless these begin anew where the step began.
+    here = jnp.all(after.it.y == carried.course.it.y)
+    asked = Asked(wanting, found.residual, found.size, found.loads, here)
+    carried = Carried(carried.count + ending, after, x, outset, factors, probe, record, carried.first, None)
+    if apart:
+        return eqx.tree_at(lambda c: c.asked, carried, asked, is_leaf=_is_none)
+
+    def renewed(carry: tuple) -> tuple:
+        _, it, factors = carry
+        if probe is not None:
+            made = factors_of(equations, probe.columns[:-1].T, factors.noise)
+            return jnp.array(False), refreshed(it), made
+        return jnp.array(False), *renewed_at(setting, equations, it, factors, asked)
+
+    _, it, factors = jax.lax.while_loop(lambda carry: carry[0], renewed, (wanting, after.it, factors))
+    return eqx.tree_at(lambda c: (c.course.it, c.factors), carried, (it, factors))
+
+
+def _judging(equations: Any, it: Iterate, probe: Probe | None) -> tuple[int, dict[str, Any]]:
+    """Cost of new factors, in corrections, and options of `judge`."""
+    driven = any(group.multipliers and group.effect.works for group in equations.groups)
+    cost = equations.renewal if probe is None else max(equations.renewal, it.y.shape[0] // 2)
+    return cost, {"balances": driven, "patience": cost}
+
+
+def renewed_at(
+    setting: Setting, equations: Any, it: Iterate, factors: Factors, asked: Asked
+) -> tuple[Iterate, Factors]:
+    """New factors, and the iteration with them."""
+    _, options = _judging(equations, it, None)
+    loads = jax.tree.map(lambda x: jnp.where(asked.here, x, 0.0), asked.loads)
+    factors = factors_of(equations, equations.tangent(it.y, loads), factors.noise)
+    it = refreshed(it)
+    # What the residual asks for with new factors needs no evaluation.
+    moved = judge(factors, setting.plan.tolerance, it, asked.residual, asked.size, **options)
+    return jax.tree.map(partial(jnp.where, asked.here & it.unsolved), moved, it), factors
+
+
+def _outset_after(
+    setting: Setting, after: Course, accepted: Array, known: Outset, kick: Kick | None
+) -> Outset:
+    """What is known of the state that the next attempt starts from."""
+    tangents = None
+    if kick is not None and known.tangents is not None and setting.tolerance is None:
+        # The end of this step is the start of the next one. (With error control it may be neither.)
+        reached = kick.after.without_system()
+        tangents = jax.tree.map(lambda x, y: jnp.where(accepted, x, y), reached, known.tangents)
+    return starting(setting.system, after.state, setting.plan.tableau, tangents)
+
+
+def _taken_back(record: tuple, index: Array, undone: Array, x: Array) -> tuple:
+    """The record with one slot that was not accepted after all, if it was not."""
+    states, *others, accepted, finished = record
+    index = jnp.maximum(index, 0)
+    states = with_row(states, index, jnp.where(undone, x, row(states, index)))
+    accepted = with_row(accepted, index, row(accepted, index) & ~undone)
+    return states, *others, accepted, finished
+
+
+def _is_none(x: Any) -> bool:
+    return x is None
+
+
+def with_state(course: Course, state: State | None) -> Course:
+    """The course with another state, or without."""
+    return eqx.tree_at(lambda c: c.state, course, state, is_leaf=_is_none)
