@@ -10,8 +10,10 @@ import tolerances as tol
 import natcoord_jax as nc
 from natcoord_jax import gallery
 from natcoord_jax.maths.projectors import range_projector
-from natcoord_jax.stepping import linear_pair, one_kernel, rewriting
+from natcoord_jax.stepping import linear_pair, one_kernel, rewriting, rounds
 from natcoord_jax.stepping.one_kernel import LANES, as_one_kernel, in_groups
+from natcoord_jax.stepping.plan import Plan
+from natcoord_jax.stepping.rollout import run
 
 MARK = "xla_cpu_small_call"
 MATRIX = np.random.default_rng(1).normal(size=(6, 6))
@@ -103,6 +105,40 @@ def test_goes_on_when_the_compiler_refuses(monkeypatch):
         trajectory = nc.simulate(system, state, dt=0.01, steps=20)
     wanted = 0.2 * ((1 - 0.005) / (1 + 0.005)) ** 20
     np.testing.assert_allclose(trajectory.v[-1, 0], wanted, rtol=1e-12)
+
+
+@pytest.mark.parametrize("recorded", [True, pytest.param(False, marks=pytest.mark.slow)])
+def test_rounds_of_two_kernels_are_the_loop_in_one(monkeypatch, recorded):
+    """Slots, inputs and factors travel between the kernels; more slots than a round has, and substeps."""
+    scene = nc.Scene()
+    scene.add(nc.Gravity(vector=(0, 0, -9.81)))
+    carrier, hinges = nc.ground, []
+    for k in range(2):
+        moving = {"velocity": (0, 0, -k), "angular_velocity": (0, 1, 0)}
+        inertia, com = (0.1, 0.2, 0.25), (0.5, 0, 0)
+        body = scene.add(nc.RigidBody(mass=1.0, inertia=inertia, com=com, position=(k, 0, 0), **moving))
+        hinges.append(scene.add(nc.Revolute(carrier, body, point=(k, 0, 0), axis=(0.0, 1.0, 0.0))))
+        carrier = body
+    scene.add(nc.JointTorque(hinges[1], name="elbow"))
+    system, state = scene.compile(solver="recursive")
+    steps = 40
+    inputs = 3.0 * np.sin(np.arange(steps))[:, None]
+    speeds = jnp.array([1.0, 30.0, 3000.0])
+    plan = Plan(steps, 64, 1e-15, None, recorded=recorded)
+
+    def found(parts):
+        monkeypatch.setattr(rounds, "PARTS", parts)
+
+        def one(speed):
+            moving = eqx.tree_at(lambda s: s.v, state, speed * state.v)
+            return run(plan, system, moving, jnp.asarray(inputs), jnp.asarray(0.01), None)
+
+        return jax.jit(one)(speeds[0]), jax.jit(jax.vmap(one))(speeds)
+
+    whole, cut = found(1000), found(1)
+    assert whole[1][1].course.rejected[2] > 0, "no lane was hard"
+    for a, b in zip(jax.tree.leaves(whole), jax.tree.leaves(cut), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-10)
 
 
 @pytest.mark.parametrize("count", [4, 48])
