@@ -311,21 +311,26 @@ def test_least_effort_about_a_principal_axis():
     assert extrapolated(*pair) == pytest.approx(12 * 9.0, rel=FOUR_DIGITS)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("wheels", "known"), [(False, 120.852118), (True, 129.028096)])
+@pytest.mark.parametrize(
+    ("wheels", "known"),
+    [
+        pytest.param(False, 120.852118, marks=pytest.mark.slow),
+        pytest.param(True, 129.028096, marks=pytest.mark.benchmark),
+    ],
+)
 def test_least_effort_about_a_skew_axis(wheels, known):
     pair = [solved(manoeuvres.turn(n, wheels=wheels)) for n in (20, 40)]
     assert extrapolated(*pair) == pytest.approx(known, rel=FOUR_DIGITS)
     assert all(len(s.history) <= 30 for s in pair)
 
 
-@pytest.mark.slow
+@pytest.mark.benchmark
 def test_beanie():
     pair = [solved(manoeuvres.beanie(n)) for n in (10, 20)]
     assert extrapolated(*pair) == pytest.approx(12 * (3 / 4) ** 2, rel=FOUR_DIGITS)
 
 
-@pytest.mark.slow
+@pytest.mark.benchmark
 def test_two_masses_on_a_spring():
     pair = [solved(manoeuvres.two_masses(n)) for n in (40, 80)]
     assert extrapolated(*pair) == pytest.approx(0.2271424, rel=FOUR_DIGITS)
@@ -341,7 +346,7 @@ def test_two_masses_on_a_spring():
     assert ends[0] == 0.0
 
 
-@pytest.mark.slow
+@pytest.mark.benchmark
 def test_pendulum_as_a_point_with_multiplier():
     coarse = nc.multi_start(manoeuvres.point_pendulum(60), starts=12, rates=4.0, spread=10.0, method="lifted")
     known = [s for s in coarse if abs(s.cost - 13.0) < 0.5]
@@ -350,7 +355,7 @@ def test_pendulum_as_a_point_with_multiplier():
     assert extrapolated(known[0], fine) == pytest.approx(12.8738850, rel=FOUR_DIGITS)
 
 
-@pytest.mark.slow
+@pytest.mark.benchmark
 def test_cart_pole_swing_up():
     """Many starts in coarse steps, the best of them refined once; `benchmarks/control.py` goes further."""
     found = nc.multi_start(manoeuvres.cart_pole(50), starts=16, rates=3.0, spread=5.0, method="lifted")
