@@ -8,6 +8,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import numpy as np
+from jaxtyping import Array
 
 from natcoord_jax.assembly.build import build
 from natcoord_jax.assembly.system import System
@@ -15,6 +16,7 @@ from natcoord_jax.core.bodies import Body
 from natcoord_jax.core.checks import is_concrete, numbers, require_double
 from natcoord_jax.core.effect import Effect, replace_fields
 from natcoord_jax.core.handles import Handle, ground
+from natcoord_jax.core.host import on_host
 from natcoord_jax.core.joint import Joint
 from natcoord_jax.core.recipe import Recipe
 from natcoord_jax.core.state import State
@@ -29,6 +31,11 @@ from natcoord_jax.stepping.assemble import assemble as assemble_state
 from natcoord_jax.stepping.sparsity import with_sparsity
 
 _scene_numbers = itertools.count(1)
+
+
+@on_host
+def _sum(one: Array, other: Array) -> Array:
+    return one + other
 
 
 class Scene:
@@ -109,7 +116,7 @@ class Scene:
         if not isinstance(body, Body):
             raise ValueError(f"added mass: {handle!r} is no body that can carry mass")
         block = numbers(block, (4, 4), f"body {handle.name!r}: added mass", "kg, kg m, kg m^2")
-        self.bodies[handle.name] = replace_fields(body, mass_block=body.mass_block + block)
+        self.bodies[handle.name] = replace_fields(body, mass_block=_sum(body.mass_block, block))
 
     def _check(self, part: Body | Joint | Effect, name: str) -> None:
         """Every handle in the part must be of this scene."""

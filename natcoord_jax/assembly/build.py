@@ -17,10 +17,12 @@ from natcoord_jax.assembly.poses import Poses, joint_frames, joint_triad
 from natcoord_jax.assembly.system import CoordinateGroup, Elimination, Group, Seats, Structure, System
 from natcoord_jax.assembly.tree import Tree
 from natcoord_jax.core.bodies import Body
+from natcoord_jax.core.checks import as_array
 from natcoord_jax.core.coordinate import Coordinate, CoordinateEffect
 from natcoord_jax.core.effect import Effect, replace_fields
 from natcoord_jax.core.force import Field
 from natcoord_jax.core.handles import Handle
+from natcoord_jax.core.host import on_host, stacked
 from natcoord_jax.core.joint import Joint, frames_at
 from natcoord_jax.core.markers import Attachment, Marker
 from natcoord_jax.core.state import State
@@ -95,9 +97,9 @@ class Layout:
 
     def frames(self) -> Float[Array, "joints 2 4 4"]:
         """Frames of all joints; a free body's coincide with its reference frame and the ground's."""
-        free = jnp.stack([jnp.eye(4)] * 2)
+        free = as_array(np.stack([np.eye(4)] * 2))
         listed = list(self.joints.values())
-        return jnp.stack([joint_frames(listed[j], self.poses) if j >= 0 else free for j in self.joint_order])
+        return stacked([joint_frames(listed[j], self.poses) if j >= 0 else free for j in self.joint_order])
 
     def joint_bodies(self) -> np.ndarray:
         """Parent and child of every joint, as the scene names them."""
@@ -114,7 +116,7 @@ class Layout:
         """Constraints of all joints."""
         instances = []
         for name, joint in self.joints.items():
-            frames = frames_at(joint_frames(joint, self.poses), self._rows(joint))
+            frames = _frames_at(joint_frames(joint, self.poses), self._rows(joint))
             ready = joint.initialise(*frames)
             instances.append(
                 Instance(
@@ -131,7 +133,7 @@ class Layout:
     def _rows(self, joint: Joint) -> Float[Array, "2 4 3"]:
         poses = self.poses
         pair = [poses.of(joint.parent), poses.of(joint.child)]
-        return jnp.stack([jnp.concatenate([poses.position[b][None], poses.rotation[b].T]) for b in pair])
+        return _rows([poses.position[b] for b in pair], [poses.rotation[b] for b in pair])
 
     def effect_instance(self, name: str, effect: Effect) -> Instance:
         """Where an effect sits, and its channels."""
@@ -169,7 +171,7 @@ class Layout:
                 f"{label}: markers must be a tuple of nc.Point and nc.Direction, or one of nc.Attachment, "
                 f"not {markers!r}"
             )
-        weights = jnp.stack([self.poses.weights(m) for m in markers])
+        weights = stacked([self.poses.weights(m) for m in markers])
         drop = [f for f in ("markers", "name", "joint") if f in type(effect).__dataclass_fields__]
         bodies = [self.body(m.body) for m in markers]
         return Instance(name, bare(effect, drop, label), "markers", bodies, weights=weights)
@@ -212,14 +214,37 @@ class Layout:
     def state(self) -> State:
         """Initial state: coordinates count from the assembled pose."""
         bodies = self.ordered_bodies()
+        motion = [[getattr(b, name) for b in bodies] for name in MOTION]
+        q, v = _rows_and_velocities(*motion)
         return State(
-            jnp.zeros(()),
-            jnp.concatenate([b.rows() for b in bodies]),
-            jnp.concatenate([b.row_velocities() for b in bodies]),
-            jnp.zeros(len(self.coordinates)),
-            jnp.zeros(len(self.rotors)),
-            jnp.zeros(len(self.works)),
+            as_array(0.0),
+            q,
+            v,
+            *(as_array(np.zeros(len(x))) for x in (self.coordinates, self.rotors, self.works)),
         )
+
+
+MOTION = "position", "rotation", "velocity", "angular_velocity"
+"""What the rows of a body and their velocities are made of."""
+
+_frames_at = on_host(frames_at)
+
+
+def _stacked_rows(points: list[Array], rotations: list[Array]) -> Float[Array, "n 4 3"]:
+    return jnp.concatenate([jnp.stack(points)[:, None], jnp.stack(rotations).swapaxes(1, 2)], axis=1)
+
+
+_rows = on_host(_stacked_rows)
+
+
+@on_host
+def _rows_and_velocities(
+    points: list[Array], rotations: list[Array], velocities: list[Array], spins: list[Array]
+) -> tuple[Float[Array, "rows 3"], Float[Array, "rows 3"]]:
+    rows = _stacked_rows(points, rotations)
+    turning = jnp.cross(jnp.stack(spins)[:, None], rows[:, 1:])
+    rates = jnp.concatenate([jnp.stack(velocities)[:, None], turning], axis=1)
+    return rows.reshape(-1, 3), rates.reshape(-1, 3)
 
 
 REDUCED_LIMIT = 32
@@ -322,7 +347,7 @@ def build(
         dofs=len(tree.slot_of) - multipliers,
     )
     system = System(
-        jnp.stack([b.mass_block for b in layout.ordered_bodies()]),
+        stacked([b.mass_block for b in layout.ordered_bodies()]),
         layout.frames(),
         layout.joint_bodies(),
         tree,
@@ -333,14 +358,17 @@ def build(
         elimination_order(layout, groups, joint_groups) if structure.solver == "recursive" else None,
         structure,
     )
-    system = jax.tree.map(jnp.asarray, system)
+    system = jax.tree.map(as_array, system)
     return system, with_readings(system, layout.state())
 
 
 def with_readings(system: System, state: State) -> State:
     """The state with lengths as they are, and rotors turning with their joints; angles count from zero."""
-    if not system.coordinates:
-        return state
+    return _with_readings(system, state) if system.coordinates else state
+
+
+@on_host
+def _with_readings(system: System, state: State) -> State:
     values, rates = coordinate_values(system, rows_with_ground(state.q)), state_rates(system, state)
     coordinates, rotors = state.coordinates, state.rates
     for group in system.coordinates:

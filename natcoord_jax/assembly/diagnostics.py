@@ -1,7 +1,8 @@
 """Energies, momenta and constraint errors of a state or of a whole trajectory, and how a run ended."""
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from functools import wraps
+from typing import TYPE_CHECKING, TypeVar
 
 import equinox as eqx
 import jax
@@ -9,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from natcoord_jax.core.host import on_host
 from natcoord_jax.core.joint import frames_at
 from natcoord_jax.core.results import REASONS, REMEDIES, Result, SimulationError
 from natcoord_jax.core.state import State, Trajectory
@@ -71,12 +73,28 @@ def states_of(motion: State | Trajectory) -> State:
     return motion.states if isinstance(motion, Trajectory) else motion
 
 
-def over_states(function: Callable[[State], Any], motion: State | Trajectory) -> Any:
-    """Apply a function of one state along all leading axes."""
-    states = states_of(motion)
-    for _ in range(states.q.ndim - 2):
-        function = jax.vmap(function)
-    return function(states)
+R = TypeVar("R")
+
+
+def over_states(
+    function: Callable[["System", State], R],
+) -> Callable[["System", State | Trajectory], R]:
+    """A function of a system and one state, as one of a system and a motion: along all leading axes."""
+
+    def every(system: "System", states: State) -> R:
+        mapped = function
+        for _ in range(states.q.ndim - 2):
+            mapped = jax.vmap(mapped, in_axes=(None, 0))
+        return mapped(system, states)
+
+    on_cpu = on_host(every)
+
+    @wraps(function)
+    def along(system: "System", motion: State | Trajectory) -> R:
+        evaluate = on_cpu if jax.default_backend() == "cpu" else every
+        return evaluate(system, states_of(motion))
+
+    return along
 
 
 def rows_with_ground(rows: Float[Array, "bodies4 3"]) -> Float[Array, "bodies_and_ground 4 3"]:
@@ -114,22 +132,19 @@ def group_energies(system: "System", group: "Group", state: State) -> Float[Arra
         )
 
 
-def energy(system: "System", motion: State | Trajectory) -> Energy:
+@over_states
+def energy(system: "System", state: State) -> Energy:
     """Energies (1) and stores."""
-
-    def one(state: State) -> Energy:
-        v = state.v.reshape(-1, 4, 3)
-        kinetic = 0.5 * jnp.sum(system.mass[..., None] * v[:, :, None] * v[:, None])
-        stores = {}
-        for group in system.effects:
-            if group.effect.stores:
-                values = group_energies(system, group, state)
-                if group.source == "mass":
-                    values = jnp.sum(values)[None]
-                stores |= dict(zip(group.names, values))
-        return Energy(kinetic, stores)
-
-    return over_states(one, motion)
+    v = state.v.reshape(-1, 4, 3)
+    kinetic = 0.5 * jnp.sum(system.mass[..., None] * v[:, :, None] * v[:, None])
+    stores = {}
+    for group in system.effects:
+        if group.effect.stores:
+            values = group_energies(system, group, state)
+            if group.source == "mass":
+                values = jnp.sum(values)[None]
+            stores |= dict(zip(group.names, values))
+    return Energy(kinetic, stores)
 
 
 def body_momenta(system: "System", state: State) -> tuple[Float[Array, "bodies 3"], Float[Array, "bodies 3"]]:
@@ -139,14 +154,16 @@ def body_momenta(system: "System", state: State) -> tuple[Float[Array, "bodies 3
     return impulse[:, 0], jnp.sum(cross(q, impulse), axis=1)
 
 
-def momentum(system: "System", motion: State | Trajectory) -> Array:
+@over_states
+def momentum(system: "System", state: State) -> Float[Array, "3"]:
     """Momentum."""
-    return over_states(lambda s: jnp.sum(body_momenta(system, s)[0], axis=0), motion)
+    return jnp.sum(body_momenta(system, state)[0], axis=0)
 
 
-def angular_momentum(system: "System", motion: State | Trajectory) -> Array:
+@over_states
+def angular_momentum(system: "System", state: State) -> Float[Array, "3"]:
     """Angular momentum about the origin (55)."""
-    return over_states(lambda s: jnp.sum(body_momenta(system, s)[1], axis=0), motion)
+    return jnp.sum(body_momenta(system, state)[1], axis=0)
 
 
 def joint_residuals(system: "System", state: State) -> list[tuple["Group", Array, Array]]:
@@ -165,21 +182,24 @@ def joint_residuals(system: "System", state: State) -> list[tuple["Group", Array
     return found
 
 
-def constraint_errors(system: "System", motion: State | Trajectory) -> ConstraintErrors:
+@on_host
+def residuals(system: "System", state: State) -> list[tuple[Array, Array]]:
+    """Residual and rate of every joint's constraints, in the order of the groups."""
+    return [(value, rate) for _, value, rate in joint_residuals(system, state)]
+
+
+@over_states
+def constraint_errors(system: "System", state: State) -> ConstraintErrors:
     """Largest violations of internal and joint constraints and of their rates."""
-
-    def one(state: State) -> ConstraintErrors:
-        d, rates = state.q.reshape(-1, 4, 3)[:, 1:], state.v.reshape(-1, 4, 3)[:, 1:]
-        gram = jnp.einsum("bik,bjk->bij", d, d) - jnp.eye(3)
-        mixed = jnp.einsum("bik,bjk->bij", d, rates)
-        joints = joint_rates = jnp.zeros((), state.q.dtype)
-        for _, value, rate in joint_residuals(system, state):
-            joints = jnp.maximum(joints, jnp.max(jnp.abs(value), initial=0.0))
-            joint_rates = jnp.maximum(joint_rates, jnp.max(jnp.abs(rate), initial=0.0))
-        turning = mixed + jnp.swapaxes(mixed, 1, 2)
-        return ConstraintErrors(jnp.max(jnp.abs(gram)), joints, jnp.max(jnp.abs(turning)), joint_rates)
-
-    return over_states(one, motion)
+    d, rates = state.q.reshape(-1, 4, 3)[:, 1:], state.v.reshape(-1, 4, 3)[:, 1:]
+    gram = jnp.einsum("bik,bjk->bij", d, d) - jnp.eye(3)
+    mixed = jnp.einsum("bik,bjk->bij", d, rates)
+    joints = joint_rates = jnp.zeros((), state.q.dtype)
+    for _, value, rate in joint_residuals(system, state):
+        joints = jnp.maximum(joints, jnp.max(jnp.abs(value), initial=0.0))
+        joint_rates = jnp.maximum(joint_rates, jnp.max(jnp.abs(rate), initial=0.0))
+    turning = mixed + jnp.swapaxes(mixed, 1, 2)
+    return ConstraintErrors(jnp.max(jnp.abs(gram)), joints, jnp.max(jnp.abs(turning)), joint_rates)
 
 
 def unknown_name(system: "System", index: int, stages: int = 1) -> str:

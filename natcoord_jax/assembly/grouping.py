@@ -11,8 +11,9 @@ import numpy as np
 
 from natcoord_jax.assembly.collection import Collection
 from natcoord_jax.assembly.system import Group
-from natcoord_jax.core.checks import check_fields
+from natcoord_jax.core.checks import as_array, check_fields
 from natcoord_jax.core.effect import Effect, replace_fields
+from natcoord_jax.core.host import stacked
 
 
 class CompiledFunction(eqx.Module):
@@ -53,14 +54,14 @@ def bare(effect: Effect, drop: Sequence[str], label: str) -> Effect:
 
     def leaf(value: Any) -> Any:
         if isinstance(value, jax.Array | np.ndarray):
-            return jnp.asarray(value, float) if jnp.issubdtype(value.dtype, jnp.floating) else value
+            return as_array(value, float) if jnp.issubdtype(value.dtype, jnp.floating) else value
         if isinstance(value, bool | str):
             raise ValueError(
                 f"{label}: the field value {value!r} is no number; declare the field "
                 "`eqx.field(static=True)` to keep it as structure"
             )
         if isinstance(value, int | float | np.number):
-            return jnp.asarray(value, float)
+            return as_array(value, float)
         if callable(value):
             return CompiledFunction(value)
         raise ValueError(f"{label}: cannot use {value!r} as a parameter; pass numbers, arrays or functions")
@@ -101,8 +102,8 @@ def _group(members: list[Instance], bodies: int) -> Group:
 
     effects = [m.effect for m in members]
     return Group(
-        first.effect if field_like else jax.tree.map(lambda *x: jnp.stack(x), *effects),
-        jnp.stack([m.weights for m in members]) if first.weights is not None else None,
+        first.effect if field_like else jax.tree.map(lambda *x: stacked(x), *effects),
+        stacked([m.weights for m in members]) if first.weights is not None else None,
         *(table(name) for name in ("bodies", "joints", "inputs", "coordinates", "rotors", "works")),
         acting=Collection.of(table("bodies"), bodies),
         count=count,

@@ -3,10 +3,13 @@
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.core.bodies import Body
+from natcoord_jax.core.checks import as_array
 from natcoord_jax.core.handles import Handle
+from natcoord_jax.core.host import on_host
 from natcoord_jax.core.joint import Joint
 from natcoord_jax.core.markers import Attachment, Marker
 from natcoord_jax.maths.rotations import frame_from_axis
@@ -18,39 +21,59 @@ class Poses:
     def __init__(self, bodies: dict[str, Body]):
         self.names = list(bodies)
         self.number = {name: i for i, name in enumerate(self.names)} | {"ground": len(bodies)}
-        self.position = [b.position for b in bodies.values()] + [jnp.zeros(3)]
-        self.rotation = [b.rotation for b in bodies.values()] + [jnp.eye(3)]
+        self.position = [b.position for b in bodies.values()] + [as_array(np.zeros(3))]
+        self.rotation = [b.rotation for b in bodies.values()] + [as_array(np.eye(3))]
 
     def of(self, handle: Handle) -> int:
         """Number of a body; the number of bodies for the ground."""
         return self.number[handle.name]
 
-    def point(self, body: int, position: Any) -> Float[Array, "4"]:
-        """Weights of the material point at a world position."""
-        local = self.rotation[body].T @ (jnp.asarray(position, float) - self.position[body])
-        return jnp.concatenate([jnp.ones(1), local])
-
-    def direction(self, body: int, vector: Any) -> Float[Array, "4"]:
-        """Weights of the direction along a world vector."""
-        return jnp.concatenate([jnp.zeros(1), self.rotation[body].T @ jnp.asarray(vector, float)])
-
     def weights(self, marker: Marker | Attachment) -> Float[Array, "*m 4"]:
         """Weights of a marker: (4,) of a point or a direction, (4, 4) of an attachment."""
         if isinstance(marker, Attachment):
-            point = Marker(marker.body, marker.point, True, marker.local)
-            axes = jnp.asarray(marker.axes, float).T
-            parts = [point, *(Marker(marker.body, axis, False, marker.local) for axis in axes)]
-            return jnp.stack([self.weights(part) for part in parts])
-        vector = jnp.asarray(marker.vector, float)
-        if marker.local:
-            return jnp.concatenate([jnp.array([1.0 if marker.is_point else 0.0]), vector])
-        body = self.of(marker.body)
-        return self.point(body, vector) if marker.is_point else self.direction(body, vector)
+            return _attachment_weights(*self._pose(marker), marker.point, marker.axes)
+        return _marker_weights(*self._pose(marker), marker.vector, marker.is_point)
+
+    def _pose(self, marker: Marker | Attachment) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
+        """Pose of the frame that the vectors of a marker are given relative to."""
+        body = len(self.names) if marker.local else self.of(marker.body)
+        return self.position[body], self.rotation[body]
+
+
+def _weights(
+    position: Float[Array, "3"], rotation: Float[Array, "3 3"], vector: Any, is_point: bool
+) -> Float[Array, "4"]:
+    """Weights of the material point at a world position, or of the direction along a world vector."""
+    vector = jnp.asarray(vector, float)
+    local = rotation.T @ (vector - position if is_point else vector)
+    return jnp.concatenate([jnp.full(1, 1.0 if is_point else 0.0), local])
+
+
+def _pose_weights(position, rotation, point: Any, triad: Any) -> Float[Array, "4 4"]:
+    """Weights of a point and of three directions, one a row."""
+    directions = [_weights(position, rotation, axis, False) for axis in triad]
+    return jnp.stack([_weights(position, rotation, point, True), *directions])
+
+
+_marker_weights = on_host(_weights)
+
+
+@on_host
+def _attachment_weights(position, rotation, point: Any, axes: Any) -> Float[Array, "4 4"]:
+    return _pose_weights(position, rotation, point, jnp.asarray(axes, float).T)
+
+
+@on_host
+def _joint_weights(positions, rotations, points, triad) -> Float[Array, "2 4 4"]:
+    return jnp.stack([_pose_weights(*pose, triad) for pose in zip(positions, rotations, points)])
+
+
+_triad = on_host(frame_from_axis)
 
 
 def joint_triad(joint: Joint) -> Float[Array, "3 3"]:
     """The triad of the joint in the assembled pose, one vector a row."""
-    return frame_from_axis(joint.axis, joint.second)
+    return _triad(joint.axis, joint.second)
 
 
 def joint_frames(joint: Joint, poses: Poses) -> Float[Array, "2 4 4"]:
@@ -60,7 +83,5 @@ def joint_frames(joint: Joint, poses: Poses) -> Float[Array, "2 4 4"]:
     at_parent, at_child = joint.anchors()
     at_parent = poses.position[child] if at_parent is None else at_parent
     at_child = poses.position[child] if at_child is None else at_child
-    frames = []
-    for body, point in ((parent, at_parent), (child, at_child)):
-        frames.append(jnp.stack([poses.point(body, point), *(poses.direction(body, a) for a in triad)]))
-    return jnp.stack(frames)
+    positions, rotations = zip(*((poses.position[b], poses.rotation[b]) for b in (parent, child)))
+    return _joint_weights(positions, rotations, (at_parent, at_child), triad)

@@ -15,9 +15,11 @@ from natcoord_jax.assembly.sensors import joint_coordinates
 from natcoord_jax.assembly.sweeps import sweep_motion
 from natcoord_jax.assembly.system import System
 from natcoord_jax.assembly.tree import gather_slots
+from natcoord_jax.core.checks import as_array
 from natcoord_jax.core.coordinate import pair_motion
 from natcoord_jax.core.effect import Motion, replace_fields
 from natcoord_jax.core.handles import Handle
+from natcoord_jax.core.host import on_host
 from natcoord_jax.core.state import State, Trajectory
 from natcoord_jax.maths.collocation import gauss
 from natcoord_jax.maths.rotations import from_rotation_vector
@@ -42,12 +44,15 @@ def coordinate(
     return states_of(motion).coordinates[..., int(places[index])]
 
 
+_rates_along = over_states(state_rates)
+
+
 def rate(
     system: System, motion: State | Trajectory, joint: Handle | str, index: int = 0
 ) -> Float[Array, "*t"]:
     """Rate of a joint coordinate [rad/s or m/s]; see `System.rate`."""
     _, places = _place(system, joint, index)
-    return over_states(lambda state: state_rates(system, state), motion)[..., int(places[index])]
+    return _rates_along(system, motion)[..., int(places[index])]
 
 
 def _joint_motions(
@@ -153,7 +158,15 @@ def with_coordinate(
             f"joint {system.structure.joints[body]!r} closes a loop: its coordinates follow from the "
             "others. Set those of the other joints of the loop and project with nc.assemble(system, state)"
         )
-    value = jnp.asarray(value, float)
+    rate = None if rate is None else as_array(rate, float)
+    return _with_coordinate(system, state, body, tuple(places.tolist()), index, as_array(value, float), rate)
+
+
+@on_host
+def _with_coordinate(
+    system: System, state: State, body: int, at: tuple[int, ...], index: int, value: Array, rate: Array | None
+) -> State:
+    places = np.array(at, int)
     w = tree_rates(system, state)
     change = _with_relations(system, places, index, value - state.coordinates[places[index]])
     rows = _moved(system, state, body, places, change)
@@ -161,7 +174,7 @@ def with_coordinate(
     coordinates = _moved_coordinates(system, state.q, rows, coordinates, places)
     wanted = state_rates(system, state)[places]
     if rate is not None:
-        wanted = wanted + _with_relations(system, places, index, jnp.asarray(rate, float) - wanted[index])
+        wanted = wanted + _with_relations(system, places, index, rate - wanted[index])
     rates, _, _, slots = _joint_motions(system, rows, body, places)
     own = jnp.concatenate([w, jnp.zeros(1)])[slots]
     w = w.at[slots].add(_slot_rates(rates, wanted - rates @ own), mode="drop")
@@ -209,9 +222,19 @@ def random_state(
             "with with_coordinate and project it with nc.assemble"
         )
     first, second = jax.random.split(key)
-    size, tableau, h = system.structure.unknowns, gauss(1), jnp.ones(())
+    size, dtype = system.structure.unknowns, state.q.dtype
+    change = coordinates * jax.random.normal(first, (1, size), dtype)
+    return _displaced(system, state, change, rates * jax.random.normal(second, (size,), dtype))
+
+
+@on_host
+def _displaced(
+    system: System, state: State, change: Float[Array, "1 unknowns"], w: Float[Array, " unknowns"]
+) -> State:
+    """State after one kinematic step of unit size with the rates `change`, moving with the rates w."""
+    tableau, h = gauss(1), jnp.ones(())
     rows = state.q.reshape(-1, 4, 3)
-    slots = gather_slots(system.tree, coordinates * jax.random.normal(first, (1, size), rows.dtype))
+    slots = gather_slots(system.tree, change)
     motion, _ = sweep_motion(system.tree, system.tree.frames(system.frames), rows, slots, h, tableau)
     points = rows[:, 0] + 0.5 * motion.velocity
     at = stations(rows, points, motion.directors, motion.velocity, motion.spin)
@@ -226,7 +249,6 @@ def random_state(
         pairs = at.start[bodies], at.rows[:, bodies], at.rates[:, bodies], at.spin[:, bodies]
         found = jax.vmap(increment, in_axes=(0, 0, 1, 1, 1))(system.frames[group.joints], *pairs)
         counted = counted.at[group.index].add(found)
-    w = rates * jax.random.normal(second, (size,), rows.dtype)
     v = row_rates(after, *twists(system, after, w))
     moved = replace_fields(state, q=after.reshape(-1, 3), v=v.reshape(-1, 3), coordinates=counted)
     every = np.arange(counted.shape[0])

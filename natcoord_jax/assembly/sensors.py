@@ -217,7 +217,7 @@ def _body_motion(system: System, states: State, index: Array, along: bool) -> tu
 
 @eqx.filter_jit
 def _all_rates(system: System, states: State) -> Array:
-    return over_states(lambda state: state_rates(system, state), states)
+    return over_states(state_rates)(system, states)
 
 
 def joint_coordinates(system: System, joint: Handle | str) -> tuple[int, list[int], tuple[str, ...]]:
@@ -278,11 +278,11 @@ def _all_readings(system: System, states: State, number: int, chosen: Array) -> 
     places = group_places(system, group)[chosen]
     effects = jax.tree.map(lambda x: x[chosen], group.effect)
 
-    def one(state: State) -> Any:
+    def one(system: System, state: State) -> Any:
         rows = rows_with_ground(state.q)[group.bodies[chosen]]
         return jax.vmap(lambda effect, place, rows: effect.readings(place, rows))(effects, places, rows)
 
-    return over_states(one, states)
+    return over_states(one)(system, states)
 
 
 def sense(

@@ -1,13 +1,11 @@
 """From one system to another in the middle of a motion: joints that close, and joints that open."""
 
-from typing import Any
-
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from natcoord_jax.assembly.coordinates import state_rates
-from natcoord_jax.assembly.diagnostics import joint_residuals, rows_with_ground
+from natcoord_jax.assembly.diagnostics import residuals, rows_with_ground
 from natcoord_jax.assembly.matching import (
     check_bodies,
     check_joints,
@@ -126,9 +124,8 @@ def _rotor_rates(system: System, into: System, moved: State) -> Float[Array, " r
 
 
 def _check_closed(system: System, state: State, names: set[str]) -> None:
-    size = 1.0 + float(jnp.max(jnp.abs(state.q)))
-    found: list[tuple[Any, Array, Array]] = joint_residuals(system, state)
-    for group, value, _ in found:
+    size = 1.0 + float(np.max(np.abs(np.asarray(state.q))))
+    for group, (value, _) in zip(system.joints, residuals(system, state)):
         gaps = np.max(np.abs(np.asarray(value)), axis=1, initial=0.0)
         for name, gap in zip(group.names, gaps):
             if name in names and not gap <= GAP * size:

@@ -15,6 +15,7 @@ from natcoord_jax.bodies.sections import Section
 from natcoord_jax.core.bodies import Body
 from natcoord_jax.core.checks import is_concrete, numbers, require_double
 from natcoord_jax.core.handles import Handle
+from natcoord_jax.core.host import on_host
 from natcoord_jax.core.markers import Attachment
 from natcoord_jax.core.recipe import Builder, Recipe, pose_of
 
@@ -165,10 +166,9 @@ class Beam(Recipe):
     ) -> list[Handle]:
         """Nodes of the beam's own, and the bodies that the ends are part of."""
         count = len(lumps)
-        blocks = lumps[:, None, None] * self.section.lump(jnp.ones(()))
         spin = numbers(self.angular_velocity, (3,), f"{label}: angular_velocity", "rad/s")
         drift = numbers(self.velocity, (3,), f"{label}: velocity", "m/s")
-        velocities = drift + jnp.cross(spin[None], curve.points - curve.points[0])
+        blocks, velocities = _lumps_and_velocities(self.section, lumps, curve.points, drift, spin)
         columns = (blocks, curve.points, curve.frames, velocities)
         held = {0: self.start, count - 1: self.end}
         nodes = []
@@ -199,8 +199,21 @@ def _hold(
             f"{label}: an end cannot be rigidly part of the point mass {holder.name!r}, which has no "
             "orientation; join the end node to it by nc.Spherical"
         )
-    turned = body.rotation.T @ frame
-    weights = jnp.zeros((4, 4)).at[0, 0].set(1.0).at[1:, 1:].set(turned.T)
-    weights = weights.at[0, 1:].set(body.rotation.T @ (point - body.position))
-    scene.add_mass(holder, weights.T @ block @ weights)
+    scene.add_mass(holder, _carried_along(body.position, body.rotation, block, point, frame))
     return holder
+
+
+@on_host
+def _lumps_and_velocities(
+    section: Section, lumps: Array, points: Float[Array, "n 3"], drift: Array, spin: Array
+) -> tuple[Float[Array, "n 4 4"], Float[Array, "n 3"]]:
+    blocks = lumps[:, None, None] * section.lump(jnp.ones(()))
+    return blocks, drift + jnp.cross(spin[None], points - points[0])
+
+
+@on_host
+def _carried_along(position: Array, rotation: Array, block: Array, point: Array, frame: Array) -> Array:
+    """Mass block of a node in the frame of the body that it is rigidly part of."""
+    weights = jnp.zeros((4, 4)).at[0, 0].set(1.0).at[1:, 1:].set((rotation.T @ frame).T)
+    weights = weights.at[0, 1:].set(rotation.T @ (point - position))
+    return weights.T @ block @ weights

@@ -12,8 +12,9 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.bodies.reference_curve import ReferenceCurve
 from natcoord_jax.bodies.sections import Section
-from natcoord_jax.core.checks import is_concrete
+from natcoord_jax.core.checks import as_array, is_concrete
 from natcoord_jax.core.effect import Effect
+from natcoord_jax.core.host import on_host
 from natcoord_jax.core.markers import Attachment
 from natcoord_jax.effects.beams import (
     BeamDamping,
@@ -75,7 +76,7 @@ def frames_of(curve: ReferenceCurve) -> Float[Array, "n 4 3"]:
 def apart(stacked: Any, count: int) -> list[Any]:
     """Items of a stacked array; concrete ones without compiled calls."""
     if is_concrete(stacked):
-        return [jnp.asarray(x) for x in np.asarray(stacked)]
+        return [as_array(x) for x in np.asarray(stacked)]
     return [stacked[i] for i in range(count)]
 
 
@@ -91,8 +92,7 @@ class RelativeMotion(Interpolation):
 
     def lumps(self, arc: Array, spans: list[Span]) -> Array:
         """Half of each neighbouring element."""
-        half = 0.5 * jnp.diff(arc)
-        return jnp.zeros_like(arc).at[:-1].add(half).at[1:].add(half)
+        return _halves(arc)
 
     def effects(
         self,
@@ -103,9 +103,7 @@ class RelativeMotion(Interpolation):
         name: str,
     ) -> tuple[list[Effect], list[Effect]]:
         """One element between neighbours, and its damping if there is any."""
-        lengths, frames = jnp.diff(curve.arc), frames_of(curve)
-        pairs = jnp.stack([frames[:-1], frames[1:]], axis=1)
-        references = jax.vmap(lambda x, length: strains_of(relative_motion(x), length))(pairs, lengths)
+        lengths, references = _strains_of_pairs(curve)
         stiffness, elements, dampings = material.section.stiffness, [], []
         rows = zip(spans, apart(lengths, len(spans)), apart(references, len(spans)))
         for number, ((a, b), length, reference) in enumerate(rows):
@@ -126,6 +124,42 @@ class RelativeMotion(Interpolation):
                 damper = {"length": length, "viscosity": material.damping * stiffness}
                 dampings.append(BeamDamping((nodes[a], nodes[b]), f"{name}/damping {number}", **damper))
         return elements, dampings
+
+
+@on_host
+def _halves(arc: Float[Array, " n"]) -> Float[Array, " n"]:
+    half = 0.5 * jnp.diff(arc)
+    return jnp.zeros_like(arc).at[:-1].add(half).at[1:].add(half)
+
+
+@on_host
+def _strains_of_pairs(curve: ReferenceCurve) -> tuple[Float[Array, " e"], Float[Array, "e 6"]]:
+    """Lengths between neighbouring nodes, and strains of their unstressed shape."""
+    lengths, frames = jnp.diff(curve.arc), frames_of(curve)
+    pairs = jnp.stack([frames[:-1], frames[1:]], axis=1)
+    return lengths, jax.vmap(lambda x, length: strains_of(relative_motion(x), length))(pairs, lengths)
+
+
+@on_host
+def _shares(arc: Float[Array, " n"], order: int, spans: np.ndarray) -> Float[Array, " n"]:
+    shares = jnp.diff(arc[::order])[:, None] * jnp.asarray(lobatto(order)[1])
+    return jnp.zeros_like(arc).at[spans].add(shares)
+
+
+@on_host
+def _interpolated(curve: ReferenceCurve, order: int, spans: np.ndarray) -> tuple[Array, Array, Array, Array]:
+    """Values of the Lagrange functions at the points of integration; slopes, weights and strains by element.
+
+    Slopes are along the beam, weights those of the points, strains those of the unstressed shape.
+    """
+    points, shares = gauss_legendre(order)
+    values, unit_slopes = lagrange(lobatto(order)[0], points)
+    lengths, frames = jnp.diff(curve.arc[::order]), frames_of(curve)
+    slopes = jnp.asarray(unit_slopes) / lengths[:, None, None]
+    weights = lengths[:, None] * jnp.asarray(shares)
+    values = jnp.asarray(values)
+    references = jax.vmap(lambda x, b: director_strains(x, values, b))(frames[spans], slopes)
+    return values, slopes, weights, references
 
 
 class DirectorInterpolation(Interpolation):
@@ -160,13 +194,9 @@ class DirectorInterpolation(Interpolation):
         spans = [tuple(range(p * e, p * e + p + 1)) for e in range(len(pieces))]
         return np.concatenate([*pieces, ends[-1:]]), spans
 
-    def _lengths(self, arc: Array) -> Array:
-        return jnp.diff(arc[:: self.order])
-
     def lumps(self, arc: Array, spans: list[Span]) -> Array:
         """Gauss-Lobatto weights times the lengths of the elements."""
-        shares = self._lengths(arc)[:, None] * jnp.asarray(lobatto(self.order)[1])
-        return jnp.zeros_like(arc).at[jnp.asarray(spans)].add(shares)
+        return _shares(arc, self.order, np.array(spans))
 
     def effects(
         self,
@@ -183,13 +213,7 @@ class DirectorInterpolation(Interpolation):
         """
         if material.law is not None:
             raise ValueError(f"beam {name!r}: law= needs interpolation=nc.RelativeMotion()")
-        points, shares = gauss_legendre(self.order)
-        values, unit_slopes = lagrange(lobatto(self.order)[0], points)
-        lengths, frames = self._lengths(curve.arc), frames_of(curve)
-        slopes = jnp.asarray(unit_slopes) / lengths[:, None, None]
-        weights = lengths[:, None] * jnp.asarray(shares)
-        every = frames[jnp.asarray(spans)]
-        references = jax.vmap(lambda x, b: director_strains(x, jnp.asarray(values), b))(every, slopes)
+        values, slopes, weights, references = _interpolated(curve, self.order, np.array(spans))
         stiffness, elements, dampings = material.section.stiffness, [], []
         rows = zip(spans, *(apart(x, len(spans)) for x in (slopes, weights, references)))
         for number, (span, slope, weight, reference) in enumerate(rows):

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.core.checks import is_concrete, numbers
+from natcoord_jax.core.host import on_host
 from natcoord_jax.maths.rotations import frame_from_axis
 from natcoord_jax.maths.vectors import cross, dot
 
@@ -30,6 +31,7 @@ class ReferenceCurve(eqx.Module):
     frames: Float[Array, "n 3 3"]
 
 
+@on_host
 def _along_polyline(points: Float[Array, "k 3"], fractions: np.ndarray) -> tuple[Array, Array, Array]:
     """Arc lengths, positions and tangents; at a corner the tangent is the mean of both sides."""
     chords = points[1:] - points[:-1]
@@ -68,10 +70,7 @@ def reference_curve(
         if length is None:
             raise ValueError(f"{label}: a curve given as a function needs its length [m]; pass length=")
         total = numbers(length, (), f"{label}: length", "m")
-        arc = jnp.asarray(fractions) * total
-        along: Any = curve
-        points = jax.vmap(along)(arc)
-        tangents = jax.vmap(jax.jacfwd(along))(arc)
+        arc, points, tangents = _along_function(curve, fractions, total)
     else:
         given = np.shape(curve)
         if len(given) != 2 or given[0] < 2 or given[1] != 3:
@@ -86,11 +85,22 @@ def reference_curve(
         if length is not None:
             raise ValueError(f"{label}: the length [m] of a polyline is its own; leave length= out")
         arc, points, tangents = _along_polyline(corners, fractions)
+    return ReferenceCurve(arc, points, _frames(arc, tangents, fractions, second, twist))
+
+
+@on_host
+def _along_function(curve: Any, fractions: np.ndarray, total: Array) -> tuple[Array, Array, Array]:
+    """Arc lengths, positions and tangents."""
+    arc = jnp.asarray(fractions) * total
+    return arc, jax.vmap(curve)(arc), jax.vmap(jax.jacfwd(curve))(arc)
+
+
+@on_host
+def _frames(arc: Array, tangents: Array, fractions: np.ndarray, second: Any, twist: Any) -> Array:
     tangents = tangents / jnp.sqrt(jnp.sum(tangents**2, axis=1, keepdims=True))
-    frames = _transported(tangents, second)
     turning: Any = twist
     angles = jax.vmap(turning)(arc) if callable(twist) else jnp.asarray(twist, float) * jnp.asarray(fractions)
-    return ReferenceCurve(arc, points, _turned(frames, angles))
+    return _turned(_transported(tangents, second), angles)
 
 
 def _transported(tangents: Float[Array, "n 3"], second: Any) -> Float[Array, "n 3 3"]:

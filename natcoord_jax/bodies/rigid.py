@@ -8,11 +8,22 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.bodies.shapes import Shape
 from natcoord_jax.core.bodies import Body
-from natcoord_jax.core.checks import is_concrete, numbers, positive, require_double, shape_of
+from natcoord_jax.core.checks import (
+    as_array,
+    is_concrete,
+    numbers,
+    positive,
+    require_double,
+    shape_of,
+)
+from natcoord_jax.core.host import on_host
 from natcoord_jax.maths.rotations import from_axis_angle, from_quaternion
 
 SYMMETRY_TOLERANCE = 1e-9
 """Relative asymmetry and relative negative eigenvalue allowed in an inertia: round-off of printed data."""
+
+
+_from_axis_angle, _from_quaternion = on_host(from_axis_angle), on_host(from_quaternion)
 
 
 def orientation(value: Any, label: str) -> Float[Array, "3 3"]:
@@ -23,17 +34,17 @@ def orientation(value: Any, label: str) -> Float[Array, "3 3"]:
     """
     what = f"{label}: orientation"
     if value is None:
-        return jnp.eye(3)
+        return as_array(np.eye(3))
     if isinstance(value, tuple) and len(value) == 2 and shape_of(value[0]) == (3,):
         axis = numbers(value[0], (3,), f"{what} axis", "-")
-        if is_concrete(axis) and not float(jnp.sum(axis**2)) > 0:
+        if is_concrete(axis) and not np.any(np.asarray(axis)):
             raise ValueError(f"{what} axis [-] is zero; pass a direction")
-        return from_axis_angle(axis, numbers(value[1], (), f"{what} angle", "rad"))
+        return _from_axis_angle(axis, numbers(value[1], (), f"{what} angle", "rad"))
     if shape_of(value) == (4,):
         quaternion = numbers(value, (4,), f"{what} quaternion", "-")
-        if is_concrete(quaternion) and not float(jnp.sum(quaternion**2)) > 0:
+        if is_concrete(quaternion) and not np.any(np.asarray(quaternion)):
             raise ValueError(f"{what} quaternion [-] is zero; pass (w, x, y, z) with a length")
-        return from_quaternion(quaternion)
+        return _from_quaternion(quaternion)
     matrix = numbers(value, (3, 3), f"{what} matrix", "-")
     if is_concrete(matrix):
         concrete = np.asarray(matrix)
@@ -46,13 +57,19 @@ def orientation(value: Any, label: str) -> Float[Array, "3 3"]:
     return matrix
 
 
+@on_host
+def _diagonal(values: Float[Array, "3"]) -> Float[Array, "3 3"]:
+    return jnp.diag(values)
+
+
 def _full_inertia(value: Any, what: str, unit: str) -> Float[Array, "3 3"]:
     if shape_of(value) == (3,):
-        return jnp.diag(numbers(value, (3,), what, unit))
+        return _diagonal(numbers(value, (3,), what, unit))
     matrix = numbers(value, (3, 3), what, unit)
     if is_concrete(matrix):
-        gap = float(jnp.max(jnp.abs(matrix - matrix.T)))
-        if gap > SYMMETRY_TOLERANCE * float(jnp.max(jnp.abs(matrix))):
+        concrete = np.asarray(matrix)
+        gap = float(np.max(np.abs(concrete - concrete.T)))
+        if gap > SYMMETRY_TOLERANCE * float(np.max(np.abs(concrete))):
             raise ValueError(f"{what} [{unit}] is not symmetric (by {gap:.2e}); pass a symmetric matrix")
     return matrix
 
@@ -71,6 +88,7 @@ def _check_central(central: Array, label: str, given: str) -> None:
         )
 
 
+@on_host
 def to_second_moment(inertia: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
     """E = tr(J)/2 1 - J, about the same point as the inertia tensor J [kg m^2]."""
     return 0.5 * jnp.trace(inertia) * jnp.eye(3) - inertia
@@ -129,7 +147,7 @@ def RigidBody(
             raise ValueError(f"{label}: give either shape and density [kg/m^3], or mass [kg] and inertia")
         mass, about_com = shape.mass_properties(positive(density, f"{label}: density", "kg/m^3"))
         central = to_second_moment(about_com)
-        moment = central + mass * jnp.outer(centre, centre)
+        moment = _shifted(central, mass, centre)
     else:
         if mass is None or (inertia is None) == (second_moment is None):
             raise ValueError(
@@ -139,17 +157,15 @@ def RigidBody(
         mass = positive(mass, f"{label}: mass", "kg")
         if inertia_at not in ("com", "reference"):
             raise ValueError(f'{label}: inertia_at is {inertia_at!r}; pass "com" or "reference"')
-        offset = mass * jnp.outer(centre, centre)
         if inertia is not None:
             moment = to_second_moment(_full_inertia(inertia, f"{label}: inertia", "kg m^2"))
-            moment = moment + offset if inertia_at == "com" else moment
+            moment = _shifted(moment, mass, centre) if inertia_at == "com" else moment
         else:
             moment = _full_inertia(second_moment, f"{label}: second_moment", "kg m^2")
-        _check_central(moment - offset, label, "inertia" if inertia is not None else "second_moment")
-    first = mass * centre
-    block = jnp.block([[mass[None, None], first[None]], [first[:, None], moment]])
+        given = "inertia" if inertia is not None else "second_moment"
+        _check_central(_central(moment, mass, centre), label, given)
     return Body(
-        block,
+        _mass_block(mass, centre, moment),
         numbers(position, (3,), f"{label}: position", "m"),
         _orientation(orientation, label),
         numbers(velocity, (3,), f"{label}: velocity", "m/s"),
@@ -161,6 +177,25 @@ def RigidBody(
 
 
 _orientation = orientation
+
+
+@on_host
+def _shifted(moment: Float[Array, "3 3"], mass: Float[Array, ""], by: Float[Array, "3"]) -> Array:
+    """Second moment about a point from which the centre of mass is at `by`."""
+    return moment + mass * jnp.outer(by, by)
+
+
+@on_host
+def _central(moment: Float[Array, "3 3"], mass: Float[Array, ""], by: Float[Array, "3"]) -> Array:
+    """Second moment about the centre of mass."""
+    return moment - mass * jnp.outer(by, by)
+
+
+@on_host
+def _mass_block(mass: Float[Array, ""], centre: Float[Array, "3"], moment: Float[Array, "3 3"]) -> Array:
+    """Mass block m (15)."""
+    first = mass * centre
+    return jnp.block([[mass[None, None], first[None]], [first[:, None], moment]])
 
 
 def PointMass(
@@ -186,13 +221,13 @@ def PointMass(
     """
     label = f"point mass {name!r}" if name else "point mass"
     require_double(label)
-    block = jnp.zeros((4, 4)).at[0, 0].set(positive(mass, f"{label}: mass", "kg"))
+    mass, nothing = positive(mass, f"{label}: mass", "kg"), as_array(np.zeros(3))
     return Body(
-        block,
+        _mass_block(mass, nothing, as_array(np.zeros((3, 3)))),
         numbers(position, (3,), f"{label}: position", "m"),
-        jnp.eye(3),
+        as_array(np.eye(3)),
         numbers(velocity, (3,), f"{label}: velocity", "m/s"),
-        jnp.zeros(3),
+        nothing,
         False,
         None,
         name,

@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from natcoord_jax.core.checks import is_concrete, numbers, positive, require_double
+from natcoord_jax.core.checks import as_array, is_concrete, numbers, positive, require_double
+from natcoord_jax.core.host import on_host
 
 
 class Section(eqx.Module):
@@ -68,16 +69,13 @@ class Section(eqx.Module):
         require_double("section")
         shear, bending = (_pair(v, f"section: {n}", u) for v, n, u in ((GA, "GA", "N"), (EI, "EI", "N m^2")))
         stretch, torsion = positive(EA, "section: EA", "N"), positive(GJ, "section: GJ", "N m^2")
-        stiffness = jnp.diag(jnp.concatenate([shear, stretch[None], bending, torsion[None]]))
         mass = positive(density, "section: density", "kg/m")
-        about = numbers(jnp.broadcast_to(jnp.asarray(rotary, float), (2,)), (2,), "section: rotary", "kg m")
+        about = numbers(_twice(rotary), (2,), "section: rotary", "kg m")
         if is_concrete(about) and np.any(np.asarray(about) < 0):
             raise ValueError(f"section: rotary [kg m] is {np.asarray(about)}; pass no negative inertia")
         offset = numbers(centre, (2,), "section: centre", "m")
-        second = jnp.diag(about[::-1]) + mass * jnp.outer(offset, offset)
-        first = mass * offset
-        inertia = jnp.block([[mass[None, None], first[None]], [first[:, None], second]])
-        return cls(stiffness, inertia, outline)
+        stiffness = _stiffness(shear, stretch, bending, torsion)
+        return cls(stiffness, _inertia(mass, offset, about), outline)
 
     @classmethod
     def of_axis_along_first(cls, stiffness: Any, inertia: Any, outline: Any = None) -> "Section":
@@ -101,35 +99,56 @@ class Section(eqx.Module):
         return jnp.zeros((4, 4)).at[:3, :3].set(length * self.inertia)
 
 
+@on_host
+def _stiffness(shear: Array, stretch: Array, bending: Array, torsion: Array) -> Float[Array, "6 6"]:
+    return jnp.diag(jnp.concatenate([shear, stretch[None], bending, torsion[None]]))
+
+
+@on_host
+def _inertia(mass: Array, offset: Float[Array, "2"], about: Float[Array, "2"]) -> Float[Array, "3 3"]:
+    second = jnp.diag(about[::-1]) + mass * jnp.outer(offset, offset)
+    first = mass * offset
+    return jnp.block([[mass[None, None], first[None]], [first[:, None], second]])
+
+
+@on_host
+def _twice(value: Any) -> Array:
+    """A number for both axes; two stay as they are."""
+    given = jnp.asarray(value, float)
+    return jnp.broadcast_to(given, (2,)) if given.ndim == 0 else given
+
+
 def _pair(value: Any, what: str, unit: str) -> Float[Array, "2"]:
-    pair = numbers(jnp.broadcast_to(jnp.asarray(value, float), (2,)), (2,), what, unit)
+    pair = numbers(_twice(value), (2,), what, unit)
     if is_concrete(pair) and not np.all(np.asarray(pair) > 0):
         raise ValueError(f"{what} [{unit}] is {np.asarray(pair)}; pass positive numbers")
     return pair
 
 
-def _elastic(
-    area: Array,
-    second: Array,
-    torsion: Array,
-    shear: Array,
-    young: Any,
-    poisson: Any,
-    density: Any,
-    outline: Any,
-) -> Section:
+def _elastic(shape: "Shaped", young: Any, poisson: Any, density: Any) -> Section:
+    *moments, outline = shape
     young, density = positive(young, "section: E", "Pa"), positive(density, "section: density", "kg/m^3")
-    poisson = jnp.asarray(poisson, float)
+    found = _moduli(young, density, poisson, *moments)
+    return Section.of_numbers(**found, outline=outline)
+
+
+@on_host
+def _moduli(
+    young: Array, density: Array, poisson: Array, area: Array, second: Array, torsion: Array, shear: Array
+) -> dict[str, Array]:
     rigidity = young / (2 * (1 + poisson))
-    return Section.of_numbers(
-        EA=young * area,
-        GA=shear * rigidity * area,
-        EI=young * second,
-        GJ=rigidity * torsion,
-        density=density * area,
-        rotary=density * second,
-        outline=outline,
-    )
+    return {
+        "EA": young * area,
+        "GA": shear * rigidity * area,
+        "EI": young * second,
+        "GJ": rigidity * torsion,
+        "density": density * area,
+        "rotary": density * second,
+    }
+
+
+Shaped = tuple[Array, Array, Array, Array, Array]
+"""Area [m^2], its second moments about both axes and of torsion [m^4], shear coefficient [-], rim [m]."""
 
 
 def _ellipse(first: Any, second: Any, points: int = 24) -> Array:
@@ -156,10 +175,15 @@ def CircularSection(*, radius: Any, E: Any, nu: Any = 0.3, density: Any, shear: 
         >>> rope = nc.CircularSection(radius=0.01, E=1e6, density=1000.0)
     """
     require_double("section")
-    r, nu = positive(radius, "section: radius", "m"), jnp.asarray(nu, float)
+    r, nu = positive(radius, "section: radius", "m"), as_array(nu, float)
+    return _elastic(_circle(r, nu, shear), E, nu, density)
+
+
+@on_host
+def _circle(r: Array, nu: Array, shear: Any) -> Shaped:
     area, second = jnp.pi * r**2, jnp.pi * r**4 / 4
     k = 6 * (1 + nu) / (7 + 6 * nu) if shear is None else jnp.asarray(shear, float)
-    return _elastic(area, second, 2 * second, k, E, nu, density, _ellipse(r, r))
+    return area, second, 2 * second, k, _ellipse(r, r)
 
 
 def TubularSection(
@@ -177,13 +201,19 @@ def TubularSection(
     r, t = positive(radius, "section: radius", "m"), positive(thickness, "section: thickness", "m")
     if is_concrete(r, t) and float(t) > float(r):
         raise ValueError(f"section: thickness [m] is {float(t):g}, more than the radius {float(r):g}")
-    inner, nu = r - t, jnp.asarray(nu, float)
+    nu = as_array(nu, float)
+    return _elastic(_tube(r, t, nu, shear), E, nu, density)
+
+
+@on_host
+def _tube(r: Array, t: Array, nu: Array, shear: Any) -> Shaped:
+    inner = r - t
     ratio = (inner / r) ** 2
     area, second = jnp.pi * (r**2 - inner**2), jnp.pi * (r**4 - inner**4) / 4
     part = (1 + ratio) ** 2
     cowper = 6 * (1 + nu) * part / ((7 + 6 * nu) * part + (20 + 12 * nu) * ratio)
     k = cowper if shear is None else jnp.asarray(shear, float)
-    return _elastic(area, second, 2 * second, k, E, nu, density, _ellipse(r, r))
+    return area, second, 2 * second, k, _ellipse(r, r)
 
 
 def RectangularSection(
@@ -199,7 +229,12 @@ def RectangularSection(
     """
     require_double("section")
     b, h = positive(width, "section: width", "m"), positive(height, "section: height", "m")
-    nu = jnp.asarray(nu, float)
+    nu = as_array(nu, float)
+    return _elastic(_rectangle(b, h, nu, shear), E, nu, density)
+
+
+@on_host
+def _rectangle(b: Array, h: Array, nu: Array, shear: Any) -> Shaped:
     area = b * h
     second = jnp.stack([b * h**3, b**3 * h]) / 12
     long, short = jnp.maximum(b, h), jnp.minimum(b, h)
@@ -208,4 +243,4 @@ def RectangularSection(
     torsion = long * short**3 / 3 * (1 - 192 / jnp.pi**5 * short / long * series)
     k = 10 * (1 + nu) / (12 + 11 * nu) if shear is None else jnp.asarray(shear, float)
     corners = jnp.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
-    return _elastic(area, second, torsion, k, E, nu, density, 0.5 * corners * jnp.stack([b, h]))
+    return area, second, torsion, k, 0.5 * corners * jnp.stack([b, h])

@@ -6,6 +6,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from natcoord_jax.core.checks import as_array
+from natcoord_jax.core.host import on_host
+
 
 class Shape(eqx.Module):
     """Base of solids centred at the centre of mass of their body, axes along the body's."""
@@ -20,9 +23,14 @@ class Shape(eqx.Module):
 
     def mass_properties(self, density: Array) -> tuple[Array, Float[Array, "3 3"]]:
         """Mass [kg] and inertia about the centre [kg m^2]."""
-        mass = density * self.volume()
-        second = mass * self.gyration()
-        return mass, jnp.diag(jnp.sum(second) - second)
+        return _mass_properties(self, density)
+
+
+@on_host
+def _mass_properties(shape: Shape, density: Array) -> tuple[Array, Float[Array, "3 3"]]:
+    mass = density * shape.volume()
+    second = mass * shape.gyration()
+    return mass, jnp.diag(jnp.sum(second) - second)
 
 
 class Box(Shape):
@@ -33,7 +41,7 @@ class Box(Shape):
         >>> brick = nc.RigidBody(shape=nc.Box((0.2, 0.1, 0.05)), density=2000.0)
     """
 
-    size: Array = eqx.field(converter=lambda x: jnp.asarray(x, float))
+    size: Array = eqx.field(converter=lambda x: as_array(x, float))
 
     def volume(self) -> Array:
         """Product of the edges."""
@@ -47,8 +55,8 @@ class Box(Shape):
 class Cylinder(Shape):
     """Circular cylinder along the third body axis, `radius` and `length` [m]."""
 
-    radius: Array = eqx.field(converter=lambda x: jnp.asarray(x, float))
-    length: Array = eqx.field(converter=lambda x: jnp.asarray(x, float))
+    radius: Array = eqx.field(converter=lambda x: as_array(x, float))
+    length: Array = eqx.field(converter=lambda x: as_array(x, float))
 
     def volume(self) -> Array:
         """Pi r^2 l."""
@@ -62,7 +70,7 @@ class Cylinder(Shape):
 class Sphere(Shape):
     """Sphere of `radius` [m]."""
 
-    radius: Array = eqx.field(converter=lambda x: jnp.asarray(x, float))
+    radius: Array = eqx.field(converter=lambda x: as_array(x, float))
 
     def volume(self) -> Array:
         """4/3 pi r^3."""
@@ -76,7 +84,7 @@ class Sphere(Shape):
 class Ellipsoid(Shape):
     """Ellipsoid with semi-axes `semi_axes` (3,) [m]."""
 
-    semi_axes: Array = eqx.field(converter=lambda x: jnp.asarray(x, float))
+    semi_axes: Array = eqx.field(converter=lambda x: as_array(x, float))
 
     def volume(self) -> Array:
         """4/3 pi a b c."""

@@ -7,7 +7,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
+from jax.core import Tracer, eval_context
+from jax.extend.core import get_opaque_trace_state
 from jaxtyping import Array
 
 NUMERIC = (int, float, np.ndarray, np.number, jax.Array)
@@ -19,9 +20,14 @@ def is_concrete(*values: Any) -> bool:
     return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(values))
 
 
+with eval_context():
+    TOP_LEVEL = get_opaque_trace_state()
+    """State of JAX outside of all transformations, even if this is imported inside of one."""
+
+
 def at_top_level(*values: Any) -> bool:
     """Whether nothing is being traced: neither the values nor the function around them."""
-    return is_concrete(jnp.zeros(()), *values)
+    return get_opaque_trace_state() == TOP_LEVEL and is_concrete(values)
 
 
 def require_double(where: str) -> None:
@@ -37,10 +43,22 @@ def require_double(where: str) -> None:
         )
 
 
+def as_array(value: Any, dtype: Any = None) -> Array:
+    """`jnp.asarray`, which compiles a program for every shape that it takes from NumPy; this does not."""
+    if isinstance(value, jax.Array) and dtype in (None, float) and value.dtype == jnp.result_type(float):
+        return value
+    if at_top_level(value):
+        known = np.asarray(value)
+        if known.dtype.kind in "biuf":
+            # A copy, because the array may share its memory.
+            return jax.device_put(np.array(known, known.dtype if dtype is None else dtype))
+    return jnp.asarray(value, dtype)
+
+
 def shape_of(value: Any) -> tuple[int, ...] | None:
     """Shape of anything `jnp.asarray` takes; None for what is no array of numbers."""
     try:
-        return jnp.asarray(value, float).shape
+        return as_array(value, float).shape
     except (TypeError, ValueError):
         return None
 
@@ -58,7 +76,7 @@ def numbers(value: Any, shape: tuple[int, ...], what: str, unit: str) -> Array:
         ValueError: naming part, quantity, unit and remedy.
     """
     try:
-        array = jnp.asarray(value, float)
+        array = as_array(value, float)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{what} [{unit}] is {value!r}; pass numbers of shape {shape}") from error
     if array.shape != shape:

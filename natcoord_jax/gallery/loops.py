@@ -5,6 +5,7 @@ import numpy as np
 
 import natcoord_jax as nc
 from natcoord_jax.core.handles import Handle
+from natcoord_jax.core.host import on_host
 from natcoord_jax.gallery.example import Example
 from natcoord_jax.maths.rotations import frame_from_axis
 
@@ -63,7 +64,7 @@ def bricard() -> Example:
     for k in range(5):
         start, end = corners[k], corners[k + 1]
         # Third body axis along the rod, a solid of 0.1 m x 0.1 m x 1 m.
-        orientation = np.asarray(frame_from_axis(jnp.asarray(end - start))).T
+        orientation = np.asarray(on_host(frame_from_axis)(end - start)).T
         rod = nc.RigidBody(
             shape=nc.Box((0.1, 0.1, 1.0)),
             density=100.0,
@@ -100,7 +101,7 @@ def slider_crank() -> Example:
             inertia=(4e-3, 4e-3, 4e-4),
             com=(0, 0, 0.15),
             position=pin,
-            orientation=np.asarray(frame_from_axis(jnp.asarray(along))).T,
+            orientation=np.asarray(on_host(frame_from_axis)(along)).T,
             name="rod",
         )
     )

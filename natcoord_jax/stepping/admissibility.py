@@ -6,11 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from natcoord_jax.assembly.diagnostics import joint_residuals, unknown_name
+from natcoord_jax.assembly.diagnostics import residuals, unknown_name
 from natcoord_jax.assembly.reduced import ReducedStep
 from natcoord_jax.assembly.system import System
-from natcoord_jax.core.compiled import briefly
+from natcoord_jax.core.checks import as_array
 from natcoord_jax.core.effect import replace_fields
+from natcoord_jax.core.host import on_host
 from natcoord_jax.core.results import Result
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import gauss
@@ -24,11 +25,6 @@ GAP = 1e-9
 """Largest gap [m, -] and constraint rate [m/s, 1/s] taken for round-off of printed data, per unit of size."""
 
 
-@briefly
-def _residuals(system: System, state: State) -> list:
-    return [(value, rate) for _, value, rate in joint_residuals(system, state)]
-
-
 def check_gaps(system: System, state: State) -> None:
     """Refuse a joint that does not close.
 
@@ -37,8 +33,8 @@ def check_gaps(system: System, state: State) -> None:
     """
     if not system.joints:
         return
-    size = 1.0 + float(jnp.max(jnp.abs(state.q)))
-    for group, (value, _) in zip(system.joints, _residuals(system, state)):
+    size = 1.0 + float(np.max(np.abs(np.asarray(state.q))))
+    for group, (value, _) in zip(system.joints, residuals(system, state)):
         gaps = np.max(np.abs(np.asarray(value)), axis=1, initial=0.0)
         worst = int(np.argmax(gaps))
         if gaps[worst] > GAP * size:
@@ -52,14 +48,14 @@ def project_velocities(system: System, state: State) -> State:
     """State with velocities that obey the joints, with a warning that says by how much they changed."""
     if not system.joints:
         return state
-    speed = 1.0 + float(jnp.max(jnp.abs(state.v)))
+    speed = 1.0 + float(np.max(np.abs(np.asarray(state.v))))
     worst = 0.0
-    for _, rate in _residuals(system, state):
+    for _, rate in residuals(system, state):
         worst = max(worst, float(np.max(np.abs(np.asarray(rate)), initial=0.0)))
     if worst <= GAP * speed:
         return state
     projected = assemble(system, state)
-    change = float(jnp.max(jnp.abs(projected.v - state.v)))
+    change = float(np.max(np.abs(np.asarray(projected.v) - np.asarray(state.v))))
     warnings.warn(
         f"initial velocities violate the joints by {worst:.3g} m/s (or 1/s); they were projected onto them, "
         f"which changed row velocities by up to {change:.3g} m/s",
@@ -76,7 +72,7 @@ def admitted(system: System, state: State) -> State:
     """
     if not system.joints:
         return state
-    values, rates = zip(*_residuals(system, state))
+    values, rates = zip(*residuals(system, state))
     closed = _largest(values) <= GAP * (1.0 + jnp.max(jnp.abs(state.q)))
     moving_along = _largest(rates) <= GAP * (1.0 + jnp.max(jnp.abs(state.v)))
     projected, code = with_admissible_velocities(system, state)
@@ -94,7 +90,7 @@ def _tiny_step(system: System, state: State) -> ReducedStep:
     return ReducedStep.prepare(system, state, inputs, jnp.asarray(1e-9), gauss(1))
 
 
-@briefly
+@on_host
 def _jacobian(system: System, state: State):
     step = _tiny_step(system, state)
     return step.jacobian(step.guess())
@@ -128,6 +124,9 @@ def check_inertia(system: System, state: State) -> None:
         )
 
 
+_with_admissible_positions = on_host(with_admissible_positions)
+
+
 def find_redundancy(system: System, state: State) -> tuple[int, tuple[str, ...]]:
     """Structural rank of the constraints outside the tree, and the parts that are redundant.
 
@@ -138,11 +137,11 @@ def find_redundancy(system: System, state: State) -> tuple[int, tuple[str, ...]]
     if system.structure.multipliers == 0:
         return 0, ()
     best, names = -1, ()
-    key = jax.random.PRNGKey(0)
+    random = np.random.default_rng(0)
     for attempt in range(3):
         if attempt:
-            disturbed = _disturbed(system, state, jax.random.fold_in(key, attempt))
-            state_now, code = with_admissible_positions(system, disturbed)
+            disturbed = _disturbed(state, random)
+            state_now, code = _with_admissible_positions(system, disturbed)
             if int(code) != Result.SUCCESSFUL:
                 continue
         else:
@@ -155,12 +154,11 @@ def find_redundancy(system: System, state: State) -> tuple[int, tuple[str, ...]]
     return best, names
 
 
-def _disturbed(system: System, state: State, key) -> State:
-    points = state.q.reshape(-1, 4, 3)[:, 0]
-    extent = jnp.maximum(jnp.max(jnp.abs(points)), 1e-3)
-    noise = 0.05 * jax.random.normal(key, state.q.shape).reshape(-1, 4, 3)
-    scaled = noise.at[:, 0].multiply(extent).reshape(-1, 3)
-    return replace_fields(state, q=state.q + scaled, v=jnp.zeros_like(state.v))
+def _disturbed(state: State, random: np.random.Generator) -> State:
+    q = np.asarray(state.q).reshape(-1, 4, 3)
+    noise = 0.05 * random.normal(size=q.shape)
+    noise[:, 0] *= max(np.max(np.abs(q[:, 0])), 1e-3)
+    return replace_fields(state, q=as_array((q + noise).reshape(-1, 3)), v=as_array(np.zeros(state.v.shape)))
 
 
 def _rank(rows: np.ndarray) -> tuple[int, list[int]]:

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from natcoord_jax.core.checks import as_array
 from natcoord_jax.core.effect import Motion, Now
 from natcoord_jax.core.force import Force, Load
 from natcoord_jax.core.pieces import in_pieces
@@ -89,7 +90,7 @@ class BeamElement(Expanded):
 
     length: Any = eqx.field(kw_only=True)
     stiffness: Any = eqx.field(kw_only=True)
-    reference: Any = eqx.field(default=(0.0, 0.0, 1.0, 0.0, 0.0, 0.0), kw_only=True, converter=jnp.asarray)
+    reference: Any = eqx.field(default=(0.0, 0.0, 1.0, 0.0, 0.0, 0.0), kw_only=True, converter=as_array)
 
     kind: ClassVar[str] = "beam element"
     couples: ClassVar[bool] = True

@@ -1,0 +1,126 @@
+"""Setting up a scene compiles nothing: small calculations are done by NumPy, with the same results."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+
+import natcoord_jax as nc
+from natcoord_jax.core.checks import as_array, at_top_level
+from natcoord_jax.core.host import on_host
+
+X = jnp.asarray(np.random.default_rng(0).normal(size=(4, 3)))
+PLACES = jnp.array([2, 0, 3])
+
+
+def beam(curve):
+    return nc.Beam(nc.CircularSection(radius=0.01, E=1e6, density=1e3), curve, elements=5, length=1.0)
+
+
+CASES = {
+    "elementwise": lambda x: (
+        jnp.sin(x) ** 3 / (1 + x**2),
+        jnp.sign(x),
+        jnp.clip(x, 0, 1),
+        jnp.abs(x) ** 0.3,
+    ),
+    "integers": lambda x: (jnp.arange(7) // 2, jnp.arange(7) % 3, PLACES**2, jnp.round(x).astype(int)),
+    "reductions": lambda x: (jnp.linalg.norm(x, axis=1), jnp.max(x, 0), jnp.any(x > 0), jnp.cumsum(x, 1)),
+    "extremes": lambda x: (jnp.argmin(x, axis=1), jnp.argmax(x), jnp.min(x, initial=-3.0)),
+    "shapes": lambda x: (x.T, x[::-1, 1:], jnp.tile(x, 2), jnp.pad(x, 1), jnp.roll(x, 1), jnp.split(x, 2)),
+    "joined": lambda x: (jnp.stack([x, x], 1), jnp.block([[x, x], [x, x]]), jnp.diag(x[0]), jnp.diff(x)),
+    "taken": lambda x: (x[PLACES], x[PLACES, 1], x[:, PLACES % 3], x[-1], x[PLACES[0]], jnp.take(x, 9)),
+    "put": lambda x: (
+        x.at[PLACES].set(1.0),
+        x.at[PLACES, 0].add(x[:3, 1]),
+        x.at[jnp.array([1, 1])].add(2.0),
+        x.at[7].set(1.0, mode="drop"),
+        x.at[1].multiply(3.0),
+    ),
+    "by lanes": lambda x: jax.vmap(lambda row, k: (row[k], row.at[k].set(0.0)))(x, jnp.array([0, 1, 2, 1])),
+    "products": lambda x: (x @ x.T, jnp.einsum("ij,kj->ik", x, x), jnp.einsum("bi,bj->bij", x, x)),
+    "derivatives": lambda x: (
+        jax.vmap(jax.jacfwd(lambda r: jnp.cross(r, r**2)))(x),
+        jax.grad(lambda y: jnp.sum(jnp.tanh(y) * y))(x),
+    ),
+    "loops": lambda x: (
+        lax.scan(lambda s, y: (s + y, s * y), x[0], x, reverse=True),
+        lax.while_loop(lambda s: jnp.sum(s) < 9.0, lambda s: s + 1.0, x[0]),
+        lax.fori_loop(0, 3, lambda k, s: s * x[k, 0], 1.0),
+        lax.cond(x[0, 0] > 0, jnp.sin, jnp.cos, x[1]),
+    ),
+    "found": lambda x: (jnp.interp(x[0], jnp.arange(5.0), jnp.arange(5.0) ** 2), jnp.searchsorted(x[0], 0.0)),
+    "not a number": lambda x: (jnp.nanmax(x / 0.0 - x), jnp.isnan(x / 0.0), jnp.maximum(x, jnp.nan)),
+    "left to the compiler": lambda x: (jnp.sort(x), jnp.linalg.solve(x[:3] + 3 * jnp.eye(3), x[0])),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_results_are_those_of_jax(case):
+    """Could go wrong: an operation that NumPy defines differently, at a corner."""
+    expected, found = CASES[case](X), on_host(CASES[case])(X)
+    for want, have in zip(jax.tree.leaves(expected), jax.tree.leaves(found), strict=True):
+        assert isinstance(have, jax.Array)
+        assert (want.shape, want.dtype) == (have.shape, have.dtype)
+        np.testing.assert_allclose(have, want, rtol=1e-13, atol=1e-14)
+
+
+def test_inside_of_transformations_it_is_the_function_itself():
+    square = on_host(lambda x: jnp.sum(x**2))
+    assert at_top_level()
+    np.testing.assert_allclose(jax.grad(square)(X), 2 * X)
+    np.testing.assert_allclose(jax.jit(square)(X), jnp.sum(X**2))
+    np.testing.assert_allclose(jax.vmap(square)(X), jnp.sum(X**2, axis=1))
+    assert not jax.jit(lambda x: x * at_top_level())(1.0)
+
+
+def test_arrays_do_not_share_memory_with_what_was_given():
+    given = np.zeros(64)
+    made = as_array(given)
+    given[:] = 1.0
+    assert float(jnp.max(made)) == 0.0
+
+
+def test_functions_are_read_anew():
+    """Could go wrong: a curve that reads a number of the notebook, which has changed since."""
+    radius = 1.0
+
+    def curve(s):
+        return jnp.array([radius * jnp.sin(s / radius), 0.0, radius * (1 - jnp.cos(s / radius))])
+
+    ends = []
+    for radius in (1.0, 2.0):  # noqa: B007
+        scene = nc.Scene()
+        scene.add(beam(curve))
+        ends.append(np.asarray(scene.compile()[1].q)[-4])
+    assert abs(ends[0][2] - (1 - np.cos(1.0))) < 1e-12
+    assert abs(ends[1][2] - 2 * (1 - np.cos(0.5))) < 1e-12
+
+
+def test_setting_up_a_scene_compiles_next_to_nothing():
+    """Could go wrong: an operation called from Python, which is a program for every new shape."""
+    programs = []
+
+    def count(name, seconds, **given):
+        if name.endswith("backend_compile_duration"):
+            programs.append(given.get("fun_name"))
+
+    jax.monitoring.register_event_duration_secs_listener(count)
+    try:
+        scene = nc.Scene()
+        scene.add(nc.Gravity())
+        body, size = nc.ground, 37
+        for k in range(size):
+            link = nc.RigidBody(mass=1.0 + k, inertia=(1.0, 2.0, 2.5), position=(k, 0.0, 0.0))
+            child = scene.add(link)
+            hinge = scene.add(nc.Revolute(body, child, point=(k - 0.5, 0.0, 0.0), axis=(0.0, 1.0, k)))
+            scene.add(nc.JointSpring(hinge, stiffness=1.0))
+            body = child
+        section = nc.TubularSection(radius=0.01, thickness=0.002, E=1e9, density=1e3)
+        scene.add(nc.Beam(section, [(0, 0, 1), (1, 0, 1), (1, 1, 1)], elements=41, start=nc.ground))
+        system, state = scene.compile()
+        system.energy(state), system.constraint_errors(state)
+    finally:
+        jax.monitoring.unregister_event_duration_listener(count)
+    assert len(programs) <= 8, programs
