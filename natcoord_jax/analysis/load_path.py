@@ -19,7 +19,7 @@ from natcoord_jax.analysis.statics import (
     largest,
 )
 from natcoord_jax.assembly.system import System
-from natcoord_jax.core.checks import is_concrete, positive
+from natcoord_jax.core.checks import as_array, at_top_level, is_concrete, positive
 from natcoord_jax.core.compiled import briefly
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.results import REASONS, Result, SimulationError
@@ -179,7 +179,9 @@ def load_path(
     positive(arc, "load path: arc", "-")
     count = len(system.structure.inputs)
     channels = inputs if inputs is not None else _Zero(count)
-    found = _followed(system, state, jnp.asarray(arc, float), jnp.asarray(scale, float), steps, channels)
+    sizes = as_array(arc, float), as_array(scale, float)
+    with_derivatives = not at_top_level(system, state, sizes)
+    found = _followed(system, state, *sizes, steps, channels, with_derivatives)
     if throw and is_concrete(found.result):
         for number, code in enumerate(found.result):
             if int(code) != Result.SUCCESSFUL:
@@ -204,7 +206,13 @@ class _Zero(eqx.Module):
 
 @briefly
 def _followed(
-    system: System, state: State, arc: Array, scale: Array, steps: int, inputs: Callable[[Array], Array]
+    system: System,
+    state: State,
+    arc: Array,
+    scale: Array,
+    steps: int,
+    inputs: Callable[[Array], Array],
+    with_derivatives: bool,
 ) -> Equilibrium:
     # The search is not differentiated; `differentiable` gives its results their derivatives.
     fixed, begin = jax.lax.stop_gradient((system, state))
@@ -229,5 +237,6 @@ def _followed(
     _, (states, lams, codes, counts) = jax.lax.scan(one, carry, None, length=steps)
     # (The loads that were found are results of the search, too.)
     states, lams = jax.lax.stop_gradient((states, lams))
-    states, lams = jax.vmap(lambda s, lam: differentiable(system, s, lam, inputs(s.t)))(states, lams)
+    if with_derivatives:
+        states, lams = jax.vmap(lambda s, lam: differentiable(system, s, lam, inputs(s.t)))(states, lams)
     return Equilibrium(states, lams, codes, counts)

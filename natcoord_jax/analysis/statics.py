@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, Int
 
 from natcoord_jax.analysis.static_equations import Static
 from natcoord_jax.assembly.system import System
-from natcoord_jax.core.checks import is_concrete
+from natcoord_jax.core.checks import at_top_level, is_concrete
 from natcoord_jax.core.compiled import briefly
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.results import REASONS, Result, SimulationError
@@ -60,11 +60,15 @@ class Equilibrium(eqx.Module):
 
 
 class _Search(eqx.Module):
-    """Where Newton's iteration stands; `weight` [1/s^2] is that of the inertia added to the stiffness."""
+    """Where Newton's iteration stands.
+
+    Of the inertia added to the stiffness, `weight` [1/s^2] is what is added and `heaviest` what it begins with.
+    """
 
     state: State
     lam: Array
     weight: Array
+    heaviest: Array
     correction: Array
     count: Array
     done: Array
@@ -91,14 +95,15 @@ def _solve(system: System, state: State, lam: Array, inputs: Array) -> _Search:
     fades as corrections do (pseudo-transient continuation).
     """
     extent = extent_of(system, state)
-    first = jnp.concatenate([jnp.zeros(6 * len(system.structure.bodies)), lam])
-    pull = jnp.max(jnp.abs(Static(system, state, inputs).residual(first)[: first.shape[0] - lam.shape[0]]))
-    heaviest = pull / (jnp.mean(system.mass[:, 0, 0]) * SHORT * extent)
 
     def trip(search: _Search) -> _Search:
         static, slowed = Static(system, search.state, inputs), search.weight > 0
         y = jnp.concatenate([jnp.zeros(static.balances), search.lam])
-        change = -static.inverse(y, search.weight) @ static.residual(y)
+        residual = static.residual(y)
+        pull = jnp.max(jnp.abs(residual[: static.balances]))
+        begun = pull / (jnp.mean(system.mass[:, 0, 0]) * SHORT * extent)
+        heaviest = jnp.where(search.count == 0, begun, search.heaviest)
+        change = -static.inverse(y, search.weight) @ residual
         moved, turned = largest(change[: static.balances], extent)
         correction = jnp.maximum(moved, turned)
         finite = jnp.all(jnp.isfinite(change))
@@ -116,10 +121,10 @@ def _solve(system: System, state: State, lam: Array, inputs: Array) -> _Search:
         lost = ~slowed & ~done & (~finite | (search.count + 1 >= ITERATIONS))
         now, pulls = jax.tree.map(lambda a, b: jnp.where(lost, a, b), (state, lam), after)
         weight = jnp.where(lost, heaviest, weight)
-        return _Search(now, pulls, weight, correction, search.count + 1, done)
+        return _Search(now, pulls, weight, heaviest, correction, search.count + 1, done)
 
     nought = jnp.zeros(())
-    start = _Search(state, lam, nought, nought, jnp.array(0), jnp.array(False))
+    start = _Search(state, lam, nought, nought, nought, jnp.array(0), jnp.array(False))
     return jax.lax.while_loop(lambda s: ~s.done & (s.count < ITERATIONS + DOWNHILL), trip, start)
 
 
@@ -192,7 +197,8 @@ def equilibrium(
     values = jnp.asarray(loads, float)
     if values.ndim == 0:
         values = values * jnp.arange(1, steps + 1) / steps
-    found = _equilibria(system, state, values, _inputs_at(system, inputs, values))
+    given = _inputs_at(system, inputs, values)
+    found = _equilibria(system, state, values, given, not at_top_level(system, state, values, given))
     if throw and is_concrete(found.result):
         for number, code in enumerate(found.result):
             if int(code) != Result.SUCCESSFUL:
@@ -221,7 +227,10 @@ def _inputs_at(system: System, inputs: Any, values: Array) -> Float[Array, "load
 
 
 @briefly
-def _equilibria(system: System, state: State, values: Array, inputs: Array) -> Equilibrium:
+def _equilibria(
+    system: System, state: State, values: Array, inputs: Array, with_derivatives: bool
+) -> Equilibrium:
+    # What gives the results their derivatives is half of the program, and left out where nothing asks for it.
     static = Static(system, state, inputs[0])
     # The search is not differentiated; `differentiable` gives its results their derivatives.
     still = jax.lax.stop_gradient((system, state))
@@ -241,5 +250,6 @@ def _equilibria(system: System, state: State, values: Array, inputs: Array) -> E
     _, (states, lams, codes, counts) = jax.lax.scan(one, (start, lam, jnp.array(True)), (values, inputs))
     states, lams = jax.lax.stop_gradient((states, lams))
     states = replace_fields(states, t=values)
-    states, lams = jax.vmap(lambda s, lam, u: differentiable(system, s, lam, u))(states, lams, inputs)
+    if with_derivatives:
+        states, lams = jax.vmap(lambda s, lam, u: differentiable(system, s, lam, u))(states, lams, inputs)
     return Equilibrium(states, lams, codes, counts)
