@@ -62,7 +62,7 @@ class Equilibrium(eqx.Module):
 class _Search(eqx.Module):
     """Where Newton's iteration stands.
 
-    Of the inertia added to the stiffness, `weight` [1/s^2] is what is added and `heaviest` what it begins with.
+    Of the inertia added to the stiffness, `weight` [1/s^2] is what is added, `heaviest` what it begins with.
     """
 
     state: State

@@ -10,6 +10,7 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.system import System
@@ -194,7 +195,7 @@ class Rest(Goal):
 
     def labels(self, system: System) -> tuple[str, ...]:
         """The body each free motion belongs to."""
-        owners = [int(i) for i in system.tree.slot_of // 7]
+        owners = [int(i) for i in np.asarray(system.tree.slot_of) // 7]
         return tuple(f"rest of {system.structure.bodies[b]!r} [m/s or rad/s]" for b in owners)
 
 

@@ -11,11 +11,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.system import System
+from natcoord_jax.control.goal import Goal
 from natcoord_jax.control.guess import Guess, free_of_swings
 from natcoord_jax.control.iterate import Iterate
 from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.control.results import ADVICE, OUTCOMES, Outcome
 from natcoord_jax.control.transcription import held_inputs
+from natcoord_jax.core.host import on_host
 from natcoord_jax.core.state import State, Trajectory
 from natcoord_jax.stepping.simulate import simulate
 
@@ -109,7 +111,8 @@ class Solution:
         """Residual of the goal at the end of the simulated motion, by name."""
         final = jax.tree.map(lambda x: x[-1], self.trajectory.states)
         names = self.problem.goal.labels(self.problem.system)
-        return dict(zip(_unique(names), np.asarray(self.problem.goal.residual(self.system, final)).tolist()))
+        residual = _residual(self.problem.goal, self.system, final)
+        return dict(zip(_unique(names), np.asarray(residual).tolist()))
 
     @property
     def multipliers(self) -> dict[str, Any]:
@@ -213,6 +216,11 @@ def _interpolated(values: np.ndarray, steps: int) -> np.ndarray:
     # The kinks between the old middles excite swings from step to step.
     first = 1.5 * found[:1] - 0.5 * found[1:2] if steps > 1 else found
     return free_of_swings(np, first, found)
+
+
+@on_host
+def _residual(goal: Goal, system: System, state: State) -> Float[Array, " n"]:
+    return goal.residual(system, state)
 
 
 def _unique(names: tuple[str, ...]) -> list[str]:
