@@ -20,6 +20,7 @@ from natcoord_jax.assembly.diagnostics import body_momenta
 from natcoord_jax.assembly.response import Stations, body_rows, gather, respond, situation, stations
 from natcoord_jax.assembly.system import Group, System
 from natcoord_jax.core.effect import Motion, Response
+from natcoord_jax.core.host import on_host
 from natcoord_jax.core.state import State, Trajectory
 from natcoord_jax.maths.collocation import gauss
 from natcoord_jax.maths.vectors import cross, safe_divide
@@ -101,7 +102,10 @@ def _step(system: System, midpoint: bool, before: State, after: State, u: Array)
     return impulse, gram
 
 
-@eqx.filter_jit
+SHORT = 50_000
+"""States of single bodies up to which a trajectory is judged without compiling."""
+
+
 def _account(system: System, trajectory: Trajectory) -> dict[str, Any]:
     """All that is needed of the trajectory, at the saved times."""
     states = trajectory.states
@@ -125,6 +129,9 @@ def _account(system: System, trajectory: Trajectory) -> dict[str, Any]:
         "impulses": impulses,
         "gram": jnp.mean(grams, axis=0),
     }
+
+
+_account_on_host, _account_compiled = on_host(_account), eqx.filter_jit(_account)
 
 
 def _free_motions(gram: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -172,7 +179,9 @@ def balance(system: System, trajectory: Trajectory) -> Balance:
     saved = trajectory.t.shape[0]
     if saved == 1:
         return Balance(np.zeros(1), np.zeros(1), np.zeros(1), 3, 3, "no step was made")
-    account = jax.tree.map(np.asarray, _account(system, trajectory))
+    short = saved * len(system.structure.bodies) <= SHORT and jax.default_backend() == "cpu"
+    judge = _account_on_host if short else _account_compiled
+    account = jax.tree.map(np.asarray, judge(system, trajectory))
     energy = _relative(np.abs(account["energy"]), np.max(account["energy_scale"]))
     if int(trajectory.steps_taken) > saved - 1 and np.any(account["impulses"]):
         return Balance(energy, None, None, 0, 0, "momenta: not every step is in the trajectory")
