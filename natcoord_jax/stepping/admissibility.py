@@ -148,6 +148,8 @@ def find_redundancy(system: System, state: State) -> tuple[int, tuple[str, ...]]
             state_now = state
         rows = np.asarray(_jacobian(system, state_now))[count:, :count]
         rank, dependent = _rank(rows)
+        if not dependent:
+            return rank, ()
         if rank > best:
             best = rank
             names = tuple(dict.fromkeys(unknown_name(system, count + r) for r in dependent))
