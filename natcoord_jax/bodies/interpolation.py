@@ -141,13 +141,13 @@ def _strains_of_pairs(curve: ReferenceCurve) -> tuple[Float[Array, " e"], Float[
 
 
 @on_host
-def _shares(arc: Float[Array, " n"], order: int, spans: np.ndarray) -> Float[Array, " n"]:
+def _shares(arc: Float[Array, " n"], order: int, spans: Any) -> Float[Array, " n"]:
     shares = jnp.diff(arc[::order])[:, None] * jnp.asarray(lobatto(order)[1])
     return jnp.zeros_like(arc).at[spans].add(shares)
 
 
 @on_host
-def _interpolated(curve: ReferenceCurve, order: int, spans: np.ndarray) -> tuple[Array, Array, Array, Array]:
+def _interpolated(curve: ReferenceCurve, order: int, spans: Any) -> tuple[Array, Array, Array, Array]:
     """Values of the Lagrange functions at the points of integration; slopes, weights and strains by element.
 
     Slopes are along the beam, weights those of the points, strains those of the unstressed shape.

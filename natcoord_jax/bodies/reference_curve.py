@@ -32,7 +32,7 @@ class ReferenceCurve(eqx.Module):
 
 
 @on_host
-def _along_polyline(points: Float[Array, "k 3"], fractions: np.ndarray) -> tuple[Array, Array, Array]:
+def _along_polyline(points: Float[Array, "k 3"], fractions: Any) -> tuple[Array, Array, Array]:
     """Arc lengths, positions and tangents; at a corner the tangent is the mean of both sides."""
     chords = points[1:] - points[:-1]
     lengths = jnp.sqrt(jnp.sum(chords**2, axis=1))
@@ -89,14 +89,14 @@ def reference_curve(
 
 
 @on_host
-def _along_function(curve: Any, fractions: np.ndarray, total: Array) -> tuple[Array, Array, Array]:
+def _along_function(curve: Any, fractions: Any, total: Array) -> tuple[Array, Array, Array]:
     """Arc lengths, positions and tangents."""
     arc = jnp.asarray(fractions) * total
     return arc, jax.vmap(curve)(arc), jax.vmap(jax.jacfwd(curve))(arc)
 
 
 @on_host
-def _frames(arc: Array, tangents: Array, fractions: np.ndarray, second: Any, twist: Any) -> Array:
+def _frames(arc: Array, tangents: Array, fractions: Any, second: Any, twist: Any) -> Array:
     tangents = tangents / jnp.sqrt(jnp.sum(tangents**2, axis=1, keepdims=True))
     turning: Any = twist
     angles = jax.vmap(turning)(arc) if callable(twist) else jnp.asarray(twist, float) * jnp.asarray(fractions)
