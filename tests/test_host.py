@@ -28,6 +28,7 @@ CASES = {
     "integers": lambda x: (jnp.arange(7) // 2, jnp.arange(7) % 3, PLACES**2, jnp.round(x).astype(int)),
     "reductions": lambda x: (jnp.linalg.norm(x, axis=1), jnp.max(x, 0), jnp.any(x > 0), jnp.cumsum(x, 1)),
     "extremes": lambda x: (jnp.argmin(x, axis=1), jnp.argmax(x), jnp.min(x, initial=-3.0)),
+    "none": lambda x: (jnp.max(x[:0], initial=0.0), jnp.min(x[:0], 0, initial=1.0), jnp.sum(x[:0], 0)),
     "shapes": lambda x: (x.T, x[::-1, 1:], jnp.tile(x, 2), jnp.pad(x, 1), jnp.roll(x, 1), jnp.split(x, 2)),
     "joined": lambda x: (jnp.stack([x, x], 1), jnp.block([[x, x], [x, x]]), jnp.diag(x[0]), jnp.diff(x)),
     "taken": lambda x: (x[PLACES], x[PLACES, 1], x[:, PLACES % 3], x[-1], x[PLACES[0]], jnp.take(x, 9)),
@@ -73,6 +74,31 @@ def test_inside_of_transformations_it_is_the_function_itself():
     np.testing.assert_allclose(jax.jit(square)(X), jnp.sum(X**2))
     np.testing.assert_allclose(jax.vmap(square)(X), jnp.sum(X**2, axis=1))
     assert not jax.jit(lambda x: x * at_top_level())(1.0)
+
+
+def test_numbers_of_python_are_no_arrays():
+    """Could go wrong: a goal or a shape of the user's that decides by a field, or holds a key."""
+
+    def branching(x, size, flag=False):
+        return x * 2 if size > 1.0 else (x if flag else -x)
+
+    double = on_host(branching)
+    np.testing.assert_array_equal(double(X, 2.0), 2 * X)
+    np.testing.assert_array_equal(double(X, 0.5), -X)
+    np.testing.assert_array_equal(double(X, 0.5, True), X)
+    np.testing.assert_array_equal(double(X, 0.5, 0), -X)
+    assert np.signbit(on_host(lambda x, y: x * y)(np.ones(1), -0.0))
+    assert not np.signbit(on_host(lambda x, y: x * y)(np.ones(1), 0.0))
+    key = jax.random.key(1)
+    np.testing.assert_array_equal(on_host(jax.random.uniform)(key), jax.random.uniform(key))
+
+
+def test_large_arrays_are_left_to_the_compiler(monkeypatch):
+    scale = on_host(lambda x, by: by * jnp.sin(x))
+    small = scale(X, 3.0)
+    monkeypatch.setattr("natcoord_jax.core.host.LARGE", X.size - 1)
+    monkeypatch.setattr("natcoord_jax.core.host.evaluate", None)
+    np.testing.assert_allclose(scale(X, 3.0), small, rtol=1e-15)
 
 
 def test_arrays_do_not_share_memory_with_what_was_given():

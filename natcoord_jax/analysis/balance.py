@@ -102,10 +102,7 @@ def _step(system: System, midpoint: bool, before: State, after: State, u: Array)
     return impulse, gram
 
 
-SHORT = 50_000
-"""States of single bodies up to which a trajectory is judged without compiling."""
-
-
+@on_host
 def _account(system: System, trajectory: Trajectory) -> dict[str, Any]:
     """All that is needed of the trajectory, at the saved times."""
     states = trajectory.states
@@ -129,9 +126,6 @@ def _account(system: System, trajectory: Trajectory) -> dict[str, Any]:
         "impulses": impulses,
         "gram": jnp.mean(grams, axis=0),
     }
-
-
-_account_on_host, _account_compiled = on_host(_account), eqx.filter_jit(_account)
 
 
 def _free_motions(gram: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -179,9 +173,7 @@ def balance(system: System, trajectory: Trajectory) -> Balance:
     saved = trajectory.t.shape[0]
     if saved == 1:
         return Balance(np.zeros(1), np.zeros(1), np.zeros(1), 3, 3, "no step was made")
-    short = saved * len(system.structure.bodies) <= SHORT and jax.default_backend() == "cpu"
-    judge = _account_on_host if short else _account_compiled
-    account = jax.tree.map(np.asarray, judge(system, trajectory))
+    account = jax.tree.map(np.asarray, _account(system, trajectory))
     energy = _relative(np.abs(account["energy"]), np.max(account["energy_scale"]))
     if int(trajectory.steps_taken) > saved - 1 and np.any(account["impulses"]):
         return Balance(energy, None, None, 0, 0, "momenta: not every step is in the trajectory")

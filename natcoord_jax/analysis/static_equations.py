@@ -98,14 +98,9 @@ class Static(eqx.Module):
         pulled = self.constraint_loads(state, y)
         sums = -(jnp.concatenate([force, torque], axis=1) + jnp.concatenate(pulled, axis=1))
         # The directors of a point mass are held where they are.
-        sums = sums.at[:, 3:].add(
-            jnp.where(self._massless[:, None], y[: self.balances].reshape(-1, 6)[:, 3:], 0.0)
-        )
+        turned = y[: self.balances].reshape(-1, 6)[:, 3:]
+        sums = sums.at[:, 3:].add(self.system.idle_inertia[:, None] * turned)
         return jnp.concatenate([sums.reshape(-1), self.gaps(state)])
-
-    @property
-    def _massless(self) -> Array:
-        return jnp.trace(self.system.mass[:, 1:, 1:], axis1=1, axis2=2) <= 0
 
     def constraint_loads(self, state: State, y: Array) -> tuple[Array, Array]:
         """Forces and torques of the multipliers on all bodies."""

@@ -230,7 +230,8 @@ def _inputs_at(system: System, inputs: Any, values: Array) -> Float[Array, "load
 def _equilibria(
     system: System, state: State, values: Array, inputs: Array, with_derivatives: bool
 ) -> Equilibrium:
-    # What gives the results their derivatives is half of the program, and left out where nothing asks for it.
+    # What gives the results their derivatives takes longer to trace than the search, and is left out where
+    # nothing asks for it.
     static = Static(system, state, inputs[0])
     # The search is not differentiated; `differentiable` gives its results their derivatives.
     still = jax.lax.stop_gradient((system, state))

@@ -14,6 +14,7 @@ from natcoord_jax.assembly.diagnostics import rows_with_ground
 from natcoord_jax.assembly.graph import Edge, make_tree, spanning_tree
 from natcoord_jax.assembly.grouping import Instance, bare, families, stack
 from natcoord_jax.assembly.poses import Poses, joint_frames, joint_triad
+from natcoord_jax.assembly.rates import row_rates
 from natcoord_jax.assembly.system import CoordinateGroup, Elimination, Group, Seats, Structure, System
 from natcoord_jax.assembly.tree import Tree
 from natcoord_jax.core.bodies import Body
@@ -242,8 +243,7 @@ def _rows_and_velocities(
     points: list[Array], rotations: list[Array], velocities: list[Array], spins: list[Array]
 ) -> tuple[Float[Array, "rows 3"], Float[Array, "rows 3"]]:
     rows = _stacked_rows(points, rotations)
-    turning = jnp.cross(jnp.stack(spins)[:, None], rows[:, 1:])
-    rates = jnp.concatenate([jnp.stack(velocities)[:, None], turning], axis=1)
+    rates = row_rates(rows, jnp.stack(velocities), jnp.stack(spins))
     return rows.reshape(-1, 3), rates.reshape(-1, 3)
 
 
@@ -344,6 +344,7 @@ def build(
         multipliers=multipliers,
         solver=solver or choose_solver(tree, multipliers, joint_groups, groups, len(bodies)),
         constraints=internal + relations + sum(g.count * g.multipliers for g in joint_groups),
+        points=tuple(k for k, body in enumerate(layout.ordered_bodies()) if not body.oriented),
         dofs=len(tree.slot_of) - multipliers,
     )
     system = System(

@@ -87,11 +87,10 @@ def over_states(
             mapped = jax.vmap(mapped, in_axes=(None, 0))
         return mapped(system, states)
 
-    on_cpu = on_host(every)
+    evaluate = on_host(every)
 
     @wraps(function)
     def along(system: "System", motion: State | Trajectory) -> R:
-        evaluate = on_cpu if jax.default_backend() == "cpu" else every
         return evaluate(system, states_of(motion))
 
     return along

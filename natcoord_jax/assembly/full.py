@@ -157,9 +157,8 @@ class FullStep(Form):
         )
         given = self.system, self.groups, situations, at, velocity
         found = momentum_balance(*given, multipliers, self.h, self.tableau)
-        massless = jnp.trace(self.system.mass[:, 1:, 1:], axis1=1, axis2=2) <= 0
-        # A point mass keeps its directors by a unit inertia, as in `body_balance`.
-        torque = found.torque + jnp.where(massless[:, None], at.spin[:, :-1], 0.0)
+        # A point mass keeps its directors by an idle inertia, as in `body_balance`.
+        torque = found.torque + self.system.idle_inertia[:, None] * at.spin[:, :-1]
         wrenches = jnp.moveaxis(jnp.concatenate([found.force, torque], axis=-1), 0, 1)
         rows = project_rows(found.rows, y, self.balances, self.outset.projector)
         residual = jnp.concatenate([wrenches.reshape(-1), rows])
@@ -168,8 +167,9 @@ class FullStep(Form):
     def body_jacobians(self, twists: Float[Array, "bodies s 6"]) -> Float[Array, "bodies n n"]:
         """Jacobians of the bodies' own balances."""
         width = 6 * self.tableau.stages
-        local = jax.vmap(jax.jacfwd(body_balance, argnums=3), in_axes=(0, 0, 0, 0, None, None))
-        found = local(self.system.mass, self.start[:-1], self.velocity, twists, self.h, self.tableau)
+        local = jax.vmap(jax.jacfwd(body_balance, argnums=3), in_axes=(0, 0, 0, 0, None, None, 0))
+        given = self.system.mass, self.start[:-1], self.velocity, twists, self.h, self.tableau
+        found = local(*given, self.system.idle_inertia)
         return found.reshape(self.bodies, width, width)
 
     def tangent(self, y: Float[Array, " unknowns"], loads: Any = None) -> Float[Array, "unknowns unknowns"]:

@@ -47,13 +47,12 @@ def body_balance(
     twist: Float[Array, "s 6"],
     h: Array,
     tableau: Tableau,
+    idle: Float[Array, ""],
 ) -> Float[Array, "s 6"]:
-    """Change of momentum of one body as a wrench; a point mass keeps its directors by a unit inertia."""
+    """Change of momentum of one body as a wrench; a point mass keeps its directors by an idle inertia."""
     motion = body_motion(start[None], twist[None], h, tableau)
     momentum = stage_momentum(mass[None], motion.rates - velocity[None, None], tableau)
-    massless = jnp.trace(mass[1:, 1:]) <= 0
-    idle = jnp.where(massless, motion.spin, 0.0)
-    return wrenches(momentum, idle, motion)[0]
+    return wrenches(momentum, idle * motion.spin, motion)[0]
 
 
 def _impulses(

@@ -1,7 +1,5 @@
 """Where bodies and joints are in the assembled scene."""
 
-from typing import Any
-
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -31,8 +29,9 @@ class Poses:
     def weights(self, marker: Marker | Attachment) -> Float[Array, "*m 4"]:
         """Weights of a marker: (4,) of a point or a direction, (4, 4) of an attachment."""
         if isinstance(marker, Attachment):
-            return _attachment_weights(*self._pose(marker), marker.point, marker.axes)
-        return _marker_weights(*self._pose(marker), marker.vector, marker.is_point)
+            point, axes = as_array(marker.point, float), as_array(marker.axes, float)
+            return _attachment_weights(*self._pose(marker), point, axes)
+        return _marker_weights(*self._pose(marker), as_array(marker.vector, float), marker.is_point)
 
     def _pose(self, marker: Marker | Attachment) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
         """Pose of the frame that the vectors of a marker are given relative to."""
@@ -41,15 +40,14 @@ class Poses:
 
 
 def _weights(
-    position: Float[Array, "3"], rotation: Float[Array, "3 3"], vector: Any, is_point: bool
+    position: Float[Array, "3"], rotation: Float[Array, "3 3"], vector: Float[Array, "3"], is_point: bool
 ) -> Float[Array, "4"]:
     """Weights of the material point at a world position, or of the direction along a world vector."""
-    vector = jnp.asarray(vector, float)
     local = rotation.T @ (vector - position if is_point else vector)
     return jnp.concatenate([jnp.full(1, 1.0 if is_point else 0.0), local])
 
 
-def _pose_weights(position, rotation, point: Any, triad: Any) -> Float[Array, "4 4"]:
+def _pose_weights(position, rotation, point: Array, triad: Array) -> Float[Array, "4 4"]:
     """Weights of a point and of three directions, one a row."""
     directions = [_weights(position, rotation, axis, False) for axis in triad]
     return jnp.stack([_weights(position, rotation, point, True), *directions])
@@ -59,8 +57,8 @@ _marker_weights = on_host(_weights)
 
 
 @on_host
-def _attachment_weights(position, rotation, point: Any, axes: Any) -> Float[Array, "4 4"]:
-    return _pose_weights(position, rotation, point, jnp.asarray(axes, float).T)
+def _attachment_weights(position, rotation, point: Array, axes: Float[Array, "3 3"]) -> Float[Array, "4 4"]:
+    return _pose_weights(position, rotation, point, axes.T)
 
 
 @on_host
@@ -73,7 +71,8 @@ _triad = on_host(frame_from_axis)
 
 def joint_triad(joint: Joint) -> Float[Array, "3 3"]:
     """The triad of the joint in the assembled pose, one vector a row."""
-    return _triad(joint.axis, joint.second)
+    axis, second = (None if x is None else as_array(x, float) for x in (joint.axis, joint.second))
+    return _triad(axis, second)
 
 
 def joint_frames(joint: Joint, poses: Poses) -> Float[Array, "2 4 4"]:
@@ -84,4 +83,5 @@ def joint_frames(joint: Joint, poses: Poses) -> Float[Array, "2 4 4"]:
     at_parent = poses.position[child] if at_parent is None else at_parent
     at_child = poses.position[child] if at_child is None else at_child
     positions, rotations = zip(*((poses.position[b], poses.rotation[b]) for b in (parent, child)))
-    return _joint_weights(positions, rotations, (at_parent, at_child), triad)
+    points = as_array(at_parent, float), as_array(at_child, float)
+    return _joint_weights(positions, rotations, points, triad)

@@ -8,10 +8,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.coordinates import coordinate_rates, coordinate_values, frames_of, state_rates
-from natcoord_jax.assembly.diagnostics import over_states, rows_with_ground, states_of
+from natcoord_jax.assembly.diagnostics import rows_with_ground, states_of
 from natcoord_jax.assembly.rates import carried, null_space, row_rates, tree_rates, twists
 from natcoord_jax.assembly.response import stations
-from natcoord_jax.assembly.sensors import joint_coordinates
+from natcoord_jax.assembly.sensors import coordinate_rates_along, joint_coordinates
 from natcoord_jax.assembly.sweeps import sweep_motion
 from natcoord_jax.assembly.system import System
 from natcoord_jax.assembly.tree import gather_slots
@@ -44,15 +44,12 @@ def coordinate(
     return states_of(motion).coordinates[..., int(places[index])]
 
 
-_rates_along = over_states(state_rates)
-
-
 def rate(
     system: System, motion: State | Trajectory, joint: Handle | str, index: int = 0
 ) -> Float[Array, "*t"]:
     """Rate of a joint coordinate [rad/s or m/s]; see `System.rate`."""
     _, places = _place(system, joint, index)
-    return _rates_along(system, motion)[..., int(places[index])]
+    return coordinate_rates_along(system, motion)[..., int(places[index])]
 
 
 def _joint_motions(

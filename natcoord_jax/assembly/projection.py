@@ -19,11 +19,13 @@ from natcoord_jax.maths.collocation import Tableau, gauss
 def constraints_only(system: System) -> System:
     """The system without effects other than relations between coordinates, its inertia made regular.
 
-    Ideal rods get a small inertia about their axis, which only weighs how a gap is shared.
+    Ideal rods get a small inertia about their axis, and nodes without rotary inertia one like that of a
+    point mass; these only weigh how a gap is shared.
     """
     relations = tuple(g for g in system.effects if g.multipliers)
     moment = system.mass[:, 1:, 1:]
-    filled = moment + 1e-3 * jnp.trace(moment, axis1=1, axis2=2)[:, None, None] * jnp.eye(3)
+    size = jnp.trace(moment, axis1=1, axis2=2)
+    filled = moment + jnp.where(size > 0, 1e-3 * size, 1.0)[:, None, None] * jnp.eye(3)
     mass = system.mass.at[:, 1:, 1:].set(filled)
     return replace_fields(system, effects=relations, mass=mass)
 

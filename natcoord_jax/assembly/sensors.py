@@ -215,9 +215,8 @@ def _body_motion(system: System, states: State, index: Array, along: bool) -> tu
     return rows[..., 0, :], rotation, quaternion, rates[..., 0, :], spin, com, com_velocity
 
 
-@eqx.filter_jit
-def _all_rates(system: System, states: State) -> Array:
-    return over_states(state_rates)(system, states)
+coordinate_rates_along = over_states(state_rates)
+"""Rates of all joint coordinates of a state or along a motion [rad/s or m/s]."""
 
 
 def joint_coordinates(system: System, joint: Handle | str) -> tuple[int, list[int], tuple[str, ...]]:
@@ -322,7 +321,7 @@ def sense(
     if name and name in system.structure.joints:
         index, places, units = joint_coordinates(system, name)
         chosen = np.array(places, int)
-        rates = _all_rates(system, states)[..., chosen]
+        rates = coordinate_rates_along(system, states)[..., chosen]
         return JointSensor(states.coordinates[..., chosen], rates, units, name, index, source)
     raise ValueError(
         f"cannot sense {part!r}: pass a body ({list(system.structure.bodies)}), a joint "

@@ -101,6 +101,7 @@ class Structure:
         constraints: number of constraints, internal ones of rigid bodies included.
         dofs: degrees of freedom: unknowns less the structural rank of the remaining constraints.
         rank: structural rank of the constraints outside the tree where some are redundant, else None.
+        points: numbers of the bodies that are point masses, without orientation.
         redundant: names of joints and relations whose constraints depend on the others.
         notes: findings of the compilation for the report.
     """
@@ -116,6 +117,7 @@ class Structure:
     solver: str
     constraints: int
     rank: int | None = None
+    points: tuple[int, ...] = ()
     dofs: int = field(default=0, compare=False)
     redundant: tuple[str, ...] = field(default=(), compare=False)
     notes: tuple[str, ...] = field(default=(), compare=False)
@@ -149,6 +151,16 @@ class System(eqx.Module):
     elimination: Elimination | None
     structure: Structure = eqx.field(static=True)
     sparsity: Any = None
+
+    @property
+    def idle_inertia(self) -> Float[np.ndarray, " bodies"]:
+        """One for point masses, whose directors it keeps where they are, and zero for all other bodies.
+
+        Massless is not the same: nodes of a beam without rotary inertia turn as their torques ask.
+        """
+        idle = np.zeros(len(self.structure.bodies))
+        idle[list(self.structure.points)] = 1.0
+        return idle
 
     def energy(self, motion: State | Trajectory) -> "diagnostics.Energy":
         """Kinetic energy and stored energies [J]; see `Energy`."""

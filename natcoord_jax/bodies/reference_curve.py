@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from natcoord_jax.core.checks import is_concrete, numbers
+from natcoord_jax.core.checks import as_array, is_concrete, numbers
 from natcoord_jax.core.host import on_host
 from natcoord_jax.maths.rotations import frame_from_axis
 from natcoord_jax.maths.vectors import cross, dot
@@ -85,6 +85,8 @@ def reference_curve(
         if length is not None:
             raise ValueError(f"{label}: the length [m] of a polyline is its own; leave length= out")
         arc, points, tangents = _along_polyline(corners, fractions)
+    second = None if second is None else as_array(second, float)
+    twist = twist if callable(twist) else as_array(twist, float)
     return ReferenceCurve(arc, points, _frames(arc, tangents, fractions, second, twist))
 
 
@@ -99,7 +101,7 @@ def _along_function(curve: Any, fractions: Any, total: Array) -> tuple[Array, Ar
 def _frames(arc: Array, tangents: Array, fractions: Any, second: Any, twist: Any) -> Array:
     tangents = tangents / jnp.sqrt(jnp.sum(tangents**2, axis=1, keepdims=True))
     turning: Any = twist
-    angles = jax.vmap(turning)(arc) if callable(twist) else jnp.asarray(twist, float) * jnp.asarray(fractions)
+    angles = jax.vmap(turning)(arc) if callable(twist) else twist * jnp.asarray(fractions)
     return _turned(_transported(tangents, second), angles)
 
 

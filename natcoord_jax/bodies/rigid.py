@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.bodies.shapes import Shape
-from natcoord_jax.core.bodies import Body
+from natcoord_jax.core.bodies import Body, mass_block
 from natcoord_jax.core.checks import (
     as_array,
     is_concrete,
@@ -165,7 +165,7 @@ def RigidBody(
         given = "inertia" if inertia is not None else "second_moment"
         _check_central(_central(moment, mass, centre), label, given)
     return Body(
-        _mass_block(mass, centre, moment),
+        mass_block(mass, centre, moment),
         numbers(position, (3,), f"{label}: position", "m"),
         _orientation(orientation, label),
         numbers(velocity, (3,), f"{label}: velocity", "m/s"),
@@ -189,13 +189,6 @@ def _shifted(moment: Float[Array, "3 3"], mass: Float[Array, ""], by: Float[Arra
 def _central(moment: Float[Array, "3 3"], mass: Float[Array, ""], by: Float[Array, "3"]) -> Array:
     """Second moment about the centre of mass."""
     return moment - mass * jnp.outer(by, by)
-
-
-@on_host
-def _mass_block(mass: Float[Array, ""], centre: Float[Array, "3"], moment: Float[Array, "3 3"]) -> Array:
-    """Mass block m (15)."""
-    first = mass * centre
-    return jnp.block([[mass[None, None], first[None]], [first[:, None], moment]])
 
 
 def PointMass(
@@ -223,7 +216,7 @@ def PointMass(
     require_double(label)
     mass, nothing = positive(mass, f"{label}: mass", "kg"), as_array(np.zeros(3))
     return Body(
-        _mass_block(mass, nothing, as_array(np.zeros((3, 3)))),
+        mass_block(mass, nothing, as_array(np.zeros((3, 3)))),
         numbers(position, (3,), f"{label}: position", "m"),
         as_array(np.eye(3)),
         numbers(velocity, (3,), f"{label}: velocity", "m/s"),

@@ -11,8 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from natcoord_jax.core.checks import as_array, is_concrete, numbers, positive, require_double
-from natcoord_jax.core.host import on_host
+from natcoord_jax.core.bodies import mass_block
+from natcoord_jax.core.checks import as_array, is_concrete, numbers, positive, require_double, shape_of
+from natcoord_jax.core.host import on_host, stacked
 
 
 class Section(eqx.Module):
@@ -107,15 +108,12 @@ def _stiffness(shear: Array, stretch: Array, bending: Array, torsion: Array) -> 
 @on_host
 def _inertia(mass: Array, offset: Float[Array, "2"], about: Float[Array, "2"]) -> Float[Array, "3 3"]:
     second = jnp.diag(about[::-1]) + mass * jnp.outer(offset, offset)
-    first = mass * offset
-    return jnp.block([[mass[None, None], first[None]], [first[:, None], second]])
+    return mass_block(mass, offset, second)
 
 
-@on_host
-def _twice(value: Any) -> Array:
-    """A number for both axes; two stay as they are."""
-    given = jnp.asarray(value, float)
-    return jnp.broadcast_to(given, (2,)) if given.ndim == 0 else given
+def _twice(value: Any) -> Any:
+    """A number for both axes; what is more than a number stays as it is."""
+    return stacked([as_array(value, float)] * 2) if shape_of(value) == () else value
 
 
 def _pair(value: Any, what: str, unit: str) -> Float[Array, "2"]:

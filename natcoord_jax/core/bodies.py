@@ -6,6 +6,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from natcoord_jax.core.host import on_host
+
 
 class Body(eqx.Module):
     """Rows and mass of a body in its assembled pose.
@@ -30,11 +32,15 @@ class Body(eqx.Module):
     shape: Any
     name: str | None = eqx.field(static=True)
 
-    def rows(self) -> Float[Array, "4 3"]:
-        """Reference point and directors."""
-        return jnp.concatenate([self.position[None], self.rotation.T])
 
-    def row_velocities(self) -> Float[Array, "4 3"]:
-        """Velocities of the rows."""
-        turning = jnp.cross(self.angular_velocity[None], self.rotation.T)
-        return jnp.concatenate([self.velocity[None], turning])
+@on_host
+def mass_block(mass: Float[Array, ""], centre: Float[Array, " k"], moment: Float[Array, "k k"]) -> Array:
+    """Mass block (15) of a body, k = 3, or of a section of a beam, k = 2.
+
+    Args:
+        mass: or mass per length [kg or kg/m].
+        centre: centre of mass from the reference point [m].
+        moment: second moment about the reference point [kg m^2 or kg m].
+    """
+    first = mass * centre
+    return jnp.block([[mass[None, None], first[None]], [first[:, None], moment]])
