@@ -6,6 +6,7 @@ from natcoord_jax.analysis import (
     Accuracy,
     Balance,
     Equilibrium,
+    Growth,
     Modes,
     Phases,
     accuracy,
@@ -13,6 +14,7 @@ from natcoord_jax.analysis import (
     equilibrium,
     load_path,
     modes,
+    tangent_growth,
 )
 from natcoord_jax.assembly.posing import random_state
 from natcoord_jax.assembly.system import System
@@ -146,6 +148,7 @@ __all__ = [
     "Force",
     "Frame",
     "Gravity",
+    "Growth",
     "Guess",
     "Joint",
     "JointDamper",
@@ -218,6 +221,7 @@ __all__ = [
     "regulator",
     "simulate",
     "step",
+    "tangent_growth",
     "transfer",
 ]
 

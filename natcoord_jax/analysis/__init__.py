@@ -2,6 +2,7 @@
 
 from natcoord_jax.analysis.accuracy import Accuracy, accuracy
 from natcoord_jax.analysis.balance import Balance, balance
+from natcoord_jax.analysis.growth import Growth, tangent_growth
 from natcoord_jax.analysis.load_path import load_path
 from natcoord_jax.analysis.modes import Modes, modes
 from natcoord_jax.analysis.phases import Phases
@@ -11,6 +12,7 @@ __all__ = [
     "Accuracy",
     "Balance",
     "Equilibrium",
+    "Growth",
     "Modes",
     "Phases",
     "accuracy",
@@ -18,4 +20,5 @@ __all__ = [
     "equilibrium",
     "load_path",
     "modes",
+    "tangent_growth",
 ]

@@ -30,6 +30,7 @@ def report(system: "System") -> str:
         effects[group.effect.kind] += len(group.names)
     free = sum(1 for name in structure.joints[:bodies] if not name)
     tree = sum(g.count * g.multipliers for g in system.joints if g.in_tree)
+    plan = f", {system.sparsity.plan.name}" if system.sparsity is not None else ""
     lines = [
         f"bodies            {bodies} ({free} free)",
         f"joints, tree      {_count(joints)}",
@@ -41,7 +42,7 @@ def report(system: "System") -> str:
         f"unknowns          {12 * bodies + structure.constraints} in full; {6 * bodies + tree} + "
         f"{structure.multipliers} multipliers in the local null space; {structure.unknowns} + "
         f"{structure.multipliers} multipliers in the joint null space",
-        f"solver            {structure.solver} ({REASONS[structure.solver]})",
+        f"solver            {structure.solver}{plan} ({REASONS[structure.solver]})",
         f"levels            {len(system.tree.levels)}",
     ]
     if structure.redundant:
