@@ -28,9 +28,11 @@ class Rollout:
         state: initial state.
         inputs: inputs of every step (steps, inputs).
         dt: step [s].
+        order: of the scheme.
     """
 
-    def __init__(self, system: nc.System, state: nc.State, inputs: Array, dt: float):
+    def __init__(self, system: nc.System, state: nc.State, inputs: Array, dt: float, order: int = 2):
+        self._scheme = nc.EnergyMomentum(order=order)
         whole = (system, state, jnp.asarray(inputs), jnp.asarray(dt, float))
         self._leaves, self._structure = jax.tree.flatten(whole)
         owners = [part for part, tree in zip(PARTS, whole, strict=True) for _ in jax.tree.leaves(tree)]
@@ -44,7 +46,7 @@ class Rollout:
         for place, array in zip(self._places, arguments, strict=True):
             leaves[place] = array
         system, state, inputs, dt = jax.tree.unflatten(self._structure, leaves)
-        return nc.simulate(system, state, dt=dt, inputs=inputs)
+        return nc.simulate(system, state, dt=dt, inputs=inputs, scheme=self._scheme)
 
     def _selected(self, part: str) -> list[int]:
         return [

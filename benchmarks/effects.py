@@ -3,9 +3,10 @@
 usage: python -m benchmarks.effects [--quick] [--output FOLDER] [--redraw JSON]
 
 The base scene is an arm of two bodies on two hinges, released from rest under gravity; gravity is taken away
-to measure it. Every other line adds one effect, or one body with the joint. `over_base` is the time a step
-over that of the base; `program` counts the lines of the lowered program; what is not in a scene is in none of
-its numbers.
+to measure it. Every other line adds one effect, or one body with the joint, a third body that closes a
+four-bar (two hinges, planar: redundant), or a beam of four elements. `over_base` is the time a step over that
+of the base; `program` counts the lines of the lowered program; what is not in a scene is in none of its
+numbers.
 """
 
 from collections.abc import Callable
@@ -43,6 +44,21 @@ def _joined(kind: type, **options: Any) -> Addition:
     return add
 
 
+def _directions(body: Any) -> tuple[Any, ...]:
+    return tuple(nc.Direction(body, axis) for axis in ((1, 0, 0), (0, 1, 0), (0, 0, 1)))
+
+
+def _closed(scene: nc.Scene, bodies: list[Any], hinges: list[Any]) -> None:
+    rocker = scene.add(nc.RigidBody(mass=1.0, inertia=(0.09, 0.09, 0.01), position=(2.0, 0, -0.5)))
+    for name, parent, height in (("coupler", bodies[1], 0.0), ("foot", nc.ground, -1.0)):
+        scene.add(nc.Revolute(parent, rocker, point=(2.0, 0, height), axis=(0, 1, 0), name=name))
+
+
+def _beam(scene: nc.Scene, bodies: list[Any], hinges: list[Any]) -> None:
+    section = nc.Section.of_numbers(EA=1e4, GA=5e3, EI=2.0, GJ=1.5, density=1.0, rotary=1e-3)
+    scene.add(nc.Beam(section, [(2, 0, 0), (3, 0, 0)], elements=4, start=bodies[1]))
+
+
 EFFECTS: dict[str, Addition] = {
     "spring": lambda s, b, h: s.add(nc.Spring(_points(b), stiffness=20.0, length=0.8)),
     "nonlinear spring": lambda s, b, h: s.add(
@@ -53,6 +69,17 @@ EFFECTS: dict[str, Addition] = {
     "joint damper": lambda s, b, h: s.add(nc.JointDamper(h[1], damping=0.1)),
     "armature": lambda s, b, h: s.add(nc.Armature(h[1], inertia=0.1)),
     "motor (an input)": lambda s, b, h: s.add(nc.JointTorque(h[1], name="motor")),
+    "force at a point": lambda s, b, h: s.add(nc.PointForce(_points(b)[1:], force=(0.0, 0.5, 1.0))),
+    "following torque": lambda s, b, h: s.add(
+        nc.BodyTorque(_directions(b[1]), torque=(0.0, 0.5, 0.1), following=True)
+    ),
+    "thruster (an input)": lambda s, b, h: s.add(
+        nc.BodyForceInput((_points(b)[1], nc.Direction(b[1], (0, 0, 1))), name="thruster")
+    ),
+    "body torque (three inputs)": lambda s, b, h: s.add(nc.BodyTorqueInput(_directions(b[1]), name="torque")),
+    "joint stops": lambda s, b, h: s.add(nc.JointStops(h[1], lower=-0.5, upper=0.5, stiffness=50.0)),
+    "drive": lambda s, b, h: s.add(nc.Drive(h[1], function=lambda t: 0.3 * (1 - jnp.cos(2 * t)))),
+    "coupling": lambda s, b, h: s.add(nc.Coupling((h[0], h[1]), factors=(1.0, -2.0), coordinate=(0, 0))),
     "free body": lambda s, b, h: _body(s),
     "revolute": _joined(nc.Revolute),
     "spherical": _joined(nc.Spherical),
@@ -63,9 +90,8 @@ EFFECTS: dict[str, Addition] = {
     "fixed": _joined(nc.Fixed),
     "screw": _joined(nc.Screw, pitch=0.1),
     "distance": _joined(nc.Distance),
-    "loop: a hinge more": lambda s, b, h: s.add(
-        nc.Revolute(nc.ground, b[1], point=(2.0, 0, 0), axis=(0, 1, 0), name="loop")
-    ),
+    "loop: a rocker on two hinges": _closed,
+    "beam, four elements": _beam,
 }
 
 
@@ -154,8 +180,11 @@ def main() -> None:
     for name, (system, state) in scenes.items():
         runs.append(measure(name, system, state, steps, repeats))
         runs[-1]["over_base"] = runs[-1]["us_per_step"] / runs[0]["us_per_step"]
-    results |= {"runs": runs, "targets": []}
+    kept = [common.target(f"balance of energy, {r['effect']}", r["energy_balance"], 1e-11) for r in runs]
+    results |= {"runs": runs, "targets": kept}
     print(f"{common.environment_line(results)}\n{common.columns(runs, COLUMNS)}")
+    missed = [t for t in kept if not t["reached"]]
+    print(common.show_targets(missed) if missed else "energy balances to 1e-11 in all of them")
     common.write(results, draw, common.folder(chosen))
 
 

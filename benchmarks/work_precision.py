@@ -16,6 +16,8 @@ energy.
 the time of the coarsest run that came to an end, where that is more accurate already: explicit methods on the
 stiff chain are, as soon as they are stable. Tables print it with a "<", and "-" for what is not reached.
 
+`gradients` are of the initial state, value and gradient over the value alone, by order.
+
 `long`, made with the heavy top, are runs of 10^6 steps (10^4 with --quick) of 1 ms: by code the largest
 drift of energy, and its trend from start to end; None for runs that fail or diverge.
 """
@@ -47,6 +49,14 @@ TREES = ("spacecraft", "spinning_spacecraft", "open_tree", "heavy_top", "double_
 LOOPS = ("four_bar", "bricard")
 STIFF = ("stiff_chain",)
 SHARED = (*TREES, *LOOPS, *STIFF)
+GRADIENTS = {
+    "spacecraft": (2, 4, 6),
+    "heavy_top": (2, 4, 6, 8),
+    "double_pendulum": (2, 4, 6),
+    "four_bar": (2, 4),
+}
+GRADIENT_STEPS = 100
+"""Scenes and orders that value and gradient are timed for, and their steps."""
 ERRORS = (1e-2, 1e-3, 1e-4, 1e-6, 1e-8)
 PEERS = (
     Peer("MuJoCo RK4", "mujoco_models", "mujoco", {"integrator": "RK4"}),
@@ -106,7 +116,7 @@ class Plan(NamedTuple):
 
 FULL = Plan(
     (8, 12, 16, 24, 32, 48, 64, 96, 128, 256, 512, 1024, 4096, 16384),
-    (50, 100, 200, 500, 1000, 2000, 5000, 10000),
+    (8, 16, 32, 50, 100, 200, 500, 1000, 2000, 5000, 10000),
     11,
     PEERS,
     10**6,
@@ -209,6 +219,16 @@ def own_runs(model: str, plan: Plan) -> list[dict[str, Any]]:
             code = f"{OWN}, order {order}"
             found.append({"code": code, "steps": steps, **timing, **errors, "drift": drift, "newton": newton})
         print(f"{model}: order {order} done", flush=True)
+    return found
+
+
+def own_gradients(model: str, repeats: int) -> list[dict[str, Any]]:
+    """Value and gradient by the initial state over the value, by order."""
+    found = []
+    for order in GRADIENTS.get(model, ()):
+        example = scene_of(model)
+        found.append({"order": order} | beside.own_gradient(example, "state", GRADIENT_STEPS, repeats, order))
+        print(f"{model}: gradient at order {order}: {found[-1]['over_forward']:.2f}", flush=True)
     return found
 
 
@@ -352,7 +372,7 @@ def targets(models: dict[str, Any], long: list[dict[str, Any]]) -> list[dict[str
     """What is aimed at next to what was measured."""
     lines = []
     for model in (m for m in TREES if m in models):
-        table = models[model]["time_to_error"]
+        table = _known(models[model])
         best = table[f"{OWN}, best order"]
         rk4 = table.get("MuJoCo RK4")
         implicit = _fastest([row for code, row in table.items() if code.startswith(IMPLICIT)])
@@ -370,10 +390,14 @@ def targets(models: dict[str, Any], long: list[dict[str, Any]]) -> list[dict[str
         best = _fastest([row for code, row in table.items() if code.startswith(OWN)])
         several = [row for code, row in table.items() if not code.startswith(OWN)]
         theirs = _fastest(several)
-        for error in ("0.0001", "1e-06"):
+        for error in map("{:g}".format, ERRORS):
             unmet = ", which no peer reaches" if several and theirs[error] is None else ""
             name = f"{model}: over every peer at {error}{unmet}"
             lines.append(common.target(name, _ratio(best, theirs, error), 1.0))
+    for model, found in models.items():
+        for row in found["gradients"]:
+            name = f"{model}: value and gradient over value at order {row['order']}"
+            lines.append(common.target(name, row["over_forward"], 2.5))
     if long:
         (own,) = (row["largest_drift"] for row in long if row["code"].startswith(OWN))
         theirs = [row["largest_drift"] for row in long if not row["code"].startswith(OWN)]
@@ -455,7 +479,12 @@ def main() -> None:
                 run = beside.peer_run(peer, chosen.peers_python, model, steps, bare, judge_of(model))
                 if run is not None and run["error"]:
                     runs.append(run | {"drift": run.get("energy_error")})
-        models[model] = {"runs": runs, "time_to_error": times(runs), "time_at_most": times_at_most(runs)}
+        models[model] = {
+            "runs": runs,
+            "time_to_error": times(runs),
+            "time_at_most": times_at_most(runs),
+            "gradients": [] if chosen.quick else own_gradients(model, plan.repeats),
+        }
         print(f"\n{model}\n{table_of(models[model])}\n", flush=True)
     long = []
     if "heavy_top" in chosen.models:
