@@ -38,7 +38,7 @@ import natcoord_jax as nc
 from benchmarks import common
 from benchmarks import spacecraft as beside
 from benchmarks.peers import measure as peer_measure
-from benchmarks.peers import spinning_spacecraft, stiff_chain
+from benchmarks.peers import spinning_spacecraft
 from benchmarks.spacecraft import OWN, Peer
 from natcoord_jax import gallery
 from natcoord_jax.analysis.accuracy import drift as drift_of
@@ -132,8 +132,6 @@ QUICK = Plan(
 
 def scene_of(model: str) -> gallery.Example:
     """The scene of a model, with its start."""
-    if model == stiff_chain.NAME:
-        return chain()
     if model != spinning_spacecraft.NAME:
         return gallery.load(model)
     example = gallery.load("spacecraft")
@@ -141,32 +139,6 @@ def scene_of(model: str) -> gallery.Example:
     # All rows turn about the origin, the centre of the base: points and directors alike.
     start = eqx.tree_at(lambda s: s.v, example.state, jnp.cross(spin, rows))
     return replace(example, name=model, state=start)
-
-
-def chain() -> gallery.Example:
-    """The chain of rods on stiff springs, which is not in the gallery."""
-    scene = nc.Scene()
-    scene.add(nc.Gravity(vector=stiff_chain.GRAVITY))
-    bodies = []
-    for data in stiff_chain.BODIES:
-        body = nc.RigidBody(
-            mass=data["mass"],
-            inertia=data["inertia"],
-            position=data["com"],
-            velocity=peer_measure.moving(data),
-            angular_velocity=peer_measure.turning(data),
-            name=data["name"],
-        )
-        bodies.append(scene.add(body))
-        if data["joint"] == "spherical":
-            scene.add(nc.Spherical(nc.ground, bodies[-1], point=data["point"], name="hook"))
-    for number, data in enumerate(stiff_chain.POINT_SPRINGS):
-        ends = tuple(nc.Point(bodies[data[f"body_{x}"]], data[f"point_{x}"]) for x in "ab")
-        name = f"spring {number + 1}"
-        scene.add(nc.Spring(ends, stiffness=data["stiffness"], length=data["length"], name=name))
-    system, state = scene.compile()
-    t_end = stiff_chain.T_END
-    return gallery.Example(stiff_chain.NAME, "rods on stiff springs", system, state, t_end / 500, 500)
 
 
 def check_start(model: str, example: gallery.Example) -> None:

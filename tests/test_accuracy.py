@@ -1,8 +1,11 @@
 """What accuracy costs in time: rows, reference, table, figure and command line."""
 
+import importlib
 import json
 from functools import cache
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -10,6 +13,7 @@ import tolerances as tol
 
 import natcoord_jax as nc
 from natcoord_jax import cli, gallery
+from natcoord_jax.analysis.accuracy import FALLING, FLAT, ROUND_OFF, SAMPLES, Accuracy, Row, drift, note_of
 
 
 @cache
@@ -49,6 +53,103 @@ def test_cheapest_and_table():
     assert found.cheapest(1e-30) is None
     text = str(found)
     assert "cheapest for an error of 1e-06" in text and "reference: order 4" in text and "compiled in" in text
+
+
+REFERENCE = 1e-12
+
+
+@pytest.mark.parametrize(
+    ("error", "before", "said"),
+    [
+        (1e-3, np.inf, ""),  # the first run of an order
+        (2.5e-4, 1e-3, ""),
+        (0.99 * FALLING * 1e-3, 1e-3, ""),
+        (1.01 * FALLING * 1e-3, 1e-3, "does not fall"),
+        (2e-3, 1e-3, "does not fall"),
+        (1.01 * ROUND_OFF * REFERENCE, 1e-9, "does not fall"),
+        (0.99 * ROUND_OFF * REFERENCE, 1e-9, "round-off"),
+        (1.01 * FLAT * REFERENCE, 2e-12, "round-off"),
+        (1.01 * FLAT * REFERENCE, 1e-10, ""),  # falls, and is not yet as good
+        (0.99 * FLAT * REFERENCE, 1e-10, "as good as the reference"),
+        (0.99 * FLAT * REFERENCE, 1e-12, "as good as the reference"),
+        (0.0, 0.0, "as good as the reference"),
+    ],
+)
+def test_notes(error, before, said):
+    """Could go wrong: a curve that rounding ends passes for one that a defect ends, or the other way."""
+    assert note_of(error, before, REFERENCE) == said
+
+
+def by_hand(*rows, reference_error=REFERENCE):
+    made = tuple(
+        Row(order, steps, error, {"positions": error}, wall_s, 2.0, 1e-15, result)
+        for order, steps, error, wall_s, result in rows
+    )
+    return Accuracy(1.0, made, reference_error, (10, 64), {2: 1.0, 4: 2.0})
+
+
+def test_cheapest_of_rows_made_by_hand():
+    """Could go wrong: the run with the fewest steps, the least error, or that failed, not the fastest."""
+    found = by_hand(
+        (2, 100, 1e-4, 3e-3, "successful"),
+        (2, 200, 2e-5, 5e-3, "successful"),
+        (4, 10, 9e-5, 4e-3, "successful"),
+        (4, 20, 5e-6, 2e-3, "successful"),  # timed by luck: faster than with half the steps
+        (6, 5, 1e-7, 1e-3, "max_iterations"),
+        (6, 10, 1e-8, 9e-3, "successful"),
+    )
+
+    def best(error):
+        row = found.cheapest(error)
+        return row and (row.order, row.steps)
+
+    assert best(1e-3) == best(1e-4) == best(5e-6) == (4, 20)
+    assert best(4.9e-6) == best(1e-8) == (6, 10)
+    assert best(9e-9) is None and best(0.1 * REFERENCE) is None
+    assert found.to_dict()["cheapest"]["1e-06"] == {"order": 6, "steps": 10}
+    assert found.to_dict()["cheapest"]["1e-10"] is None
+    assert "cheapest for an error of 0.0001: order 4, 20 steps, 2 ms" in str(found)
+    assert "max_iterations" in str(found)
+    # What the reference is no better than cannot be promised, whatever the rows say.
+    assert by_hand((2, 100, 1e-9, 3e-3, "successful"), reference_error=1e-6).cheapest(1e-8) is None
+    slower_first = by_hand((2, 8, 1e-6, 3e-3, "successful"), (4, 8, 1e-6, 2e-3, "successful"))
+    row = slower_first.cheapest(1e-6)
+    assert row is not None and row.order == 4
+
+
+def test_drift_is_the_largest_on_the_way():
+    """Could go wrong: energy that is lost and found again does not show at the end."""
+    example = gallery.load("pendulum")
+    system, start = example.system, example.state
+
+    def with_energy(factor):
+        return eqx.tree_at(lambda s: s.v, moving, factor * moving.v)
+
+    moving = nc.simulate(system, start, dt=0.01, steps=30).states
+    moving = jax.tree.map(lambda x: x[-1], moving)
+    energy = system.energy(moving)
+    kinetic, faster = float(energy.kinetic), with_energy(1.1)
+    scale = 1.21 * kinetic + sum(abs(float(x)) for x in energy.stores.values())
+    assert drift(system, moving, moving) == 0.0
+    assert drift(system, moving, faster, moving) == pytest.approx(0.21 * kinetic / scale, rel=1e-12)
+    assert drift(system, moving, faster, moving) == drift(system, moving, moving, faster)
+
+
+def test_the_column_of_drifts_looks_along_the_way(monkeypatch):
+    """Up to so many times a run, whose steps the parts add up to, to the same end."""
+    example, looked = gallery.load("pendulum"), []
+
+    def listening(system, *states):
+        looked.append([float(s.t) for s in states])
+        return drift(system, *states)
+
+    # The function of this name hides the module.
+    monkeypatch.setattr(importlib.import_module("natcoord_jax.analysis.accuracy"), "drift", listening)
+    nc.accuracy(example.system, example.state, 1.0, orders=(2, 4), steps=(25, 100), repeats=1)
+    assert [len(times) for times in looked] == 2 * [26, SAMPLES + 1]
+    for times in looked:
+        assert times[0] == 0.0 and times[-1] == pytest.approx(1.0, rel=1e-12)
+        assert max(np.diff(times)) <= 1.0 / 25 + 1e-12
 
 
 def test_figure(tmp_path):

@@ -66,6 +66,17 @@ def test_run_with_a_tolerance(tmp_path, capsys):
     assert report["energy_error_max"] <= 1e-11
 
 
+def test_run_of_high_order(tmp_path):
+    """Could go wrong: the order is not used; at order two rates of constraints are off by 0.05 m/s."""
+    options = ["--order", "6", "--steps", "15", "--dt", "0.1", "--json", "report.json"]
+    assert cli.main(["run", "pendulum", *options]) == 0
+    report = json.loads((tmp_path / "report.json").read_text("utf-8"))
+    assert report.keys() >= KEYS
+    assert (report["result"], report["steps"], report["t_end"]) == ("successful", 15, 1.5)
+    for key in ("energy_error_max", "constraint_error_max", "velocity_constraint_error_max"):
+        assert 0 <= report[key] <= 1e-11, key
+
+
 @pytest.mark.parametrize(
     ("options", "steps", "dt"),
     [

@@ -72,42 +72,69 @@ def test_the_same_again_in_jit_and_in_lanes():
     assert np.all(np.asarray(lanes.result) == 0)
 
 
+RTOL, ANGLES = {2: 1e-4, 4: 1e-5}, {2: (-1.5, 0.3), 4: (0.3, -1.5)}
+"""For some ten to twenty substeps of several lengths, another number from each start."""
+
+
 def turned(angle, rtol=1e-4, **options):
     system, state = pendulum()
     start = system.with_coordinate(state, "hinge 2", angle)
     return nc.simulate(system, start, dt=DT, steps=5, rtol=rtol, throw=False, **options)
 
 
+def check_counts(slots, course):
+    """Counters against the record of attempts: every substep is a whole and two halves, which are kept."""
+    accepted, times = np.asarray(slots.accepted), np.asarray(slots.states.t)
+    points = times[accepted]
+    assert np.all(np.diff(points) > 0), "no two accepted substeps end at one time"
+    assert len(points) == int(course.taken) and points[-1] == pytest.approx(5 * DT, rel=1e-12)
+    # Unused slots say step 0; there nothing was rejected, or it would have more parts than two.
+    first = np.asarray(slots.step) == 0
+    assert np.sum(accepted & first) == 2
+    attempts = np.sum(~first) - np.sum(accepted & ~first)
+    rejected = (attempts - np.sum(accepted & ~first) / 2) / 3
+    assert rejected == int(course.rejected) > 0
+
+
 @pytest.mark.slow
-def test_derivatives_follow_the_accepted_substeps():
-    """As those of the same substeps made one by one, of lengths that do not depend on anything."""
+@pytest.mark.parametrize("order", [2, 4])
+def test_derivatives_follow_the_accepted_substeps(order):
+    """As those of the same substeps made one by one, of lengths that do not depend on anything; in lanes."""
     system, state = pendulum()
-    start = system.with_coordinate(state, "hinge 2", 0.3)
-    plan = Plan(5, 256, 1e-16, None)
-    tolerance = Tolerance(jnp.array(1e-4), jnp.array(1e-4))
-    slots, _ = run_slots(plan, system, start, jnp.zeros((5, 0)), jnp.array(DT), tolerance)
+    scheme = nc.EnergyMomentum(order=order)
+    rtol, (other, angle) = RTOL[order], ANGLES[order]
+    start = system.with_coordinate(state, "hinge 2", angle)
+    plan = Plan(5, 256, 1e-16, None, None, scheme.tableau)
+    tolerance = Tolerance(jnp.array(rtol), jnp.array(rtol))
+    slots, ending = run_slots(plan, system, start, jnp.zeros((5, order // 2, 0)), jnp.array(DT), tolerance)
+    check_counts(slots, ending.course)
     lengths = np.asarray(slots.fraction)[np.asarray(slots.accepted)] * DT
-    assert len(lengths) > 10 and len(set(np.round(lengths, 12))) >= 3
+    assert len(lengths) > 10 and len(set(np.round(lengths, 12))) >= (3 if order == 2 else 2)
     assert np.sum(lengths) == pytest.approx(5 * DT, rel=1e-12)
 
     @jax.jit
     @jax.grad
     def one_by_one(angle):
         after, _ = jax.lax.scan(
-            lambda s, h: (nc.step(system, s, None, h), None),
+            lambda s, h: (nc.step(system, s, None, h, scheme=scheme), None),
             system.with_coordinate(state, "hinge 2", angle),
             jnp.asarray(lengths),
         )
         return jnp.sum(after.q[4] ** 2 + after.v[4] ** 3)
 
     def value(angle):
-        found = turned(angle)
-        return jnp.sum(found.q[-1, 4] ** 2 + found.v[-1, 4] ** 3)
+        found = turned(angle, rtol, scheme=scheme)
+        return jnp.sum(found.q[-1, 4] ** 2 + found.v[-1, 4] ** 3), (found.steps_taken, found.steps_rejected)
 
-    slope = float(jax.jit(jax.grad(value))(0.3))
-    assert slope == pytest.approx(float(one_by_one(0.3)), rel=tol.SAME_GRADIENT)
-    along = float(jax.jit(lambda x: jax.jvp(value, (x,), (1.0,))[1])(0.3))
-    assert along == pytest.approx(slope, rel=tol.SAME_GRADIENT)
+    # The other lane takes another number of substeps.
+    slopes, (taken, rejected) = jax.jit(jax.vmap(jax.grad(value, has_aux=True)))(jnp.array([other, angle]))
+    assert int(taken[1]) == len(lengths) != int(taken[0])
+    assert int(rejected[1]) == int(ending.course.rejected)
+    slope = float(slopes[1])
+    assert slope == pytest.approx(float(one_by_one(angle)), rel=tol.SAME_GRADIENT)
+    if order == 2:
+        along = float(jax.jit(lambda x: jax.jvp(lambda x: value(x)[0], (x,), (1.0,))[1])(angle))
+        assert along == pytest.approx(slope, rel=tol.SAME_GRADIENT)
 
 
 @pytest.mark.slow

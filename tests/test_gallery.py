@@ -78,6 +78,28 @@ def test_heavy_top_has_the_energy_of_its_reference():
     assert energy == pytest.approx(example.facts["energy"], abs=1e-8)
 
 
+def test_the_stiff_chain_is_that_of_the_peers():
+    """Could go wrong: the scene whose times are published is not the one that the peers are given."""
+    work_precision = pytest.importorskip("benchmarks.work_precision", reason="only a checkout has it")
+    example = gallery.load("stiff_chain")
+    work_precision.check_start("stiff_chain", example)
+    stored = example.system.energy(example.state).stores
+    assert len([name for name in stored if name.startswith("spring")]) == 5
+    assert all(float(stored[f"spring {k}"]) > 0 for k in range(1, 6))
+
+
+def test_the_stiff_chain_swings_slowly():
+    """Fast modes, of 80 rad a step, stay at rest: springs are stretched as the swing wants, by a micron."""
+    example = gallery.load("stiff_chain")
+    trajectory = example.simulate(steps=100)
+    assert int(trajectory.steps_taken) == 100
+    q = np.asarray(trajectory.q).reshape(101, -1, 4, 3)
+    middle, along = q[:, :, 0], q[:, :, 3]
+    gaps = np.linalg.norm((middle - 0.1 * along)[:, :-1] - (middle + 0.1 * along)[:, 1:], axis=-1)
+    assert np.max(np.abs(gaps - 0.1)) <= 1e-6
+    assert np.max(np.abs(middle - middle[0])) >= 0.5, "it does not swing"
+
+
 def test_torque_formulas_give_the_table_of_the_paper():
     comparisons = {(c.formula, c.steps): c for c in compare_torques()}
     for steps, (energy, wrong_energy, wrong_momentum) in TABLE.items():

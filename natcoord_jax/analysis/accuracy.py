@@ -27,6 +27,10 @@ FLAT = 3.0
 """An error within this factor of that of the reference says nothing more."""
 FALLING = 0.7
 """An error above this part of that with twice the step does not fall."""
+ROUND_OFF = 1e3
+"""An error within this factor of that of the reference that does not fall is made by rounding."""
+SAMPLES = 32
+"""Times at which the balance of energy of a run is looked at."""
 
 Quantities = Mapping[str, Callable[[State], Array]]
 
@@ -42,7 +46,8 @@ class Row:
         errors: of all quantities, by name.
         wall_s: median time of the run, compiled [s].
         newton: Newton iterations per step.
-        drift: energy at the end less energy at the start and work, relative to the energies involved.
+        drift: largest change of energy less work, over up to `SAMPLES` equally spaced times, relative to the
+            largest sum of the energies and works.
         result: "successful", or why the run ended early.
         note: why the error does not fall any more, or "".
     """
@@ -125,15 +130,30 @@ def _difference(quantities: Quantities, one: State, other: State) -> dict[str, f
     return {name: float(x) if np.isfinite(float(x)) else math.inf for name, x in found.items()}
 
 
-def drift(system: System, start: State, end: State) -> float:
-    """Energy at the end less energy at the start and work, relative to the energies involved."""
-    before, after = system.energy(start), system.energy(end)
-    work = end.work - start.work
-    scale = max(
-        float(e.kinetic) + sum(float(abs(x)) for x in e.stores.values()) for e in (before, after)
-    ) + float(jnp.sum(jnp.abs(work)))
-    error = abs(float(after.total - before.total - jnp.sum(work)))
-    return error / scale if scale > 0 else 0.0
+def drift(system: System, *states: State) -> float:
+    """Largest change of energy less work since the first of the states, relative to the energies involved."""
+    stacked = jax.tree.map(lambda *x: jnp.stack(x), *states)
+    energy, work = system.energy(stacked), np.asarray(stacked.work - stacked.work[0])
+    sizes = [np.abs(x) for x in (energy.kinetic, *energy.stores.values())]
+    scale = np.max(np.sum(sizes, axis=0) + np.sum(np.abs(work), axis=-1))
+    balance = np.asarray(energy.total) - np.sum(work, axis=-1)
+    error = float(np.max(np.abs(balance - balance[0])))
+    return error / float(scale) if scale > 0 else 0.0
+
+
+def note_of(error: float, before: float, reference_error: float) -> str:
+    """Why an error does not fall any more, or "".
+
+    Args:
+        error: of a run.
+        before: of that with twice the step; infinite if there is none.
+        reference_error: of the reference.
+    """
+    if error <= FLAT * reference_error:
+        return "as good as the reference"
+    if error <= FALLING * before:
+        return ""
+    return "round-off" if error <= ROUND_OFF * reference_error else "does not fall"
 
 
 class _Runs:
@@ -146,12 +166,24 @@ class _Runs:
 
     def __call__(self, order: int, steps: int) -> Endpoint:
         if order not in self.programs:
-            scheme = EnergyMomentum(order=order)
-            self.programs[order] = endpoints(self.system, self.state, inputs=self.inputs, scheme=scheme)
+            self.programs[order] = self.from_state(order, self.state)
             # The first run compiles; its own time is that of the second.
             first, second = self.timed(order, 1), self.timed(order, 1)
             self.compile_s[order] = max(first - second, 0.0)
         return jax.block_until_ready(self.programs[order](self.t_end / steps, steps))
+
+    def from_state(self, order: int, state: State) -> Callable[[Any, int], Endpoint]:
+        return endpoints(self.system, state, inputs=self.inputs, scheme=EnergyMomentum(order=order))
+
+    def drift(self, order: int, steps: int) -> float:
+        """Largest error of the balance of energy, by a run in parts."""
+        ends, states = np.linspace(0, steps, min(steps, SAMPLES) + 1).astype(int), [self.state]
+        for count in np.diff(ends):
+            found = self.from_state(order, states[-1])(self.t_end / steps, int(count))
+            states.append(found.state)
+            if not Result(int(found.result)).ok:
+                break
+        return drift(self.system, *states)
 
     def timed(self, order: int, steps: int) -> float:
         start = time.perf_counter()
@@ -264,17 +296,13 @@ def accuracy(
             code = Result(int(found.result))
             errors = _difference(measured, found.state, best)
             error = next(iter(errors.values()))
-            note = ""
-            if error <= FLAT * reference_error:
-                note = "as good as the reference"
-            elif error > FALLING * last and code.ok:
-                note = "round-off" if error <= 1e3 * reference_error else "does not fall"
+            note = note_of(error, last, reference_error) if code.ok else ""
             wall = runs.median(order, count, repeats)
             rows.append(
                 Row(
                     order, count, error, errors, wall,
                     int(found.iterations) / max(int(found.substeps), 1),
-                    drift(system, state, found.state),
+                    runs.drift(order, count),
                     "successful" if code == Result.SUCCESSFUL else code.name.lower(),
                     note,
                 )

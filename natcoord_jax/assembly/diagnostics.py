@@ -227,7 +227,12 @@ def explain(system: "System", trajectory: Trajectory) -> str:
     if result == Result.SUCCESSFUL:
         return text
     text += f" in step {int(trajectory.failed_step)} at t = {float(trajectory.failed_time):.6g} s"
-    if int(trajectory.failed_part) >= 0:
+    broken = ~np.all(np.isfinite(np.asarray(trajectory.inputs)), axis=0)
+    if result == Result.NONFINITE and broken.any():
+        # Such a number spoils all unknowns of the step, of which the first would be named.
+        names = [repr(name) for name, bad in zip(system.structure.inputs, broken) if bad]
+        text += f"; not finite: the input {', '.join(names)}"
+    elif int(trajectory.failed_part) >= 0:
         stages = trajectory.scheme.stages if trajectory.scheme is not None else 1
         text += f"; worst residual at {unknown_name(system, int(trajectory.failed_part), stages)}"
     return text + (f"; {REMEDIES[result]}" if result in REMEDIES else "")

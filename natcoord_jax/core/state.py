@@ -35,10 +35,12 @@ class Trajectory(eqx.Module):
         states: saved states, the initial one first; leading axis `saved`.
         inputs: inputs of the steps before each saved state, shape (saved - 1, inputs); with `save_every`
             larger than one, those of the last step of each interval. The mean of inputs given at stages.
+            Beyond the end of a run that failed, those of the step that failed.
         result: result code (see `Result`); 0 is successful.
         failed_step: index of the step that failed or ended the run, or the number of steps.
-        failed_time: time [s] at the start of that step, or the end time.
-        failed_part: index of the body with the worst residual when a step failed; -1 if none did.
+        failed_time: time [s] at the start of the (sub)step that failed, or the end time.
+        failed_part: number of the unknown with the largest correction in the last attempt that failed, named
+            by `System.explain`; -1 where the run went well.
         residual: size of that residual, or the largest accepted one (relative).
         steps_taken: accepted (sub)steps.
         steps_rejected: (sub)steps that were repeated in shorter ones.

@@ -16,6 +16,7 @@ from natcoord_jax.gallery.pendulums import double_pendulum, pendulum, torsion_sp
 from natcoord_jax.gallery.plugging import plugging
 from natcoord_jax.gallery.robot import robot_cable
 from natcoord_jax.gallery.spacecraft import spacecraft
+from natcoord_jax.gallery.stiff import mass_ladder, stiff_chain
 from natcoord_jax.gallery.tops import dzhanibekov, fast_top, free_body, heavy_top
 from natcoord_jax.gallery.trees import binary_tree, chain, robot_arm
 
@@ -36,6 +37,8 @@ SCENES: Mapping[str, Callable[..., Example]] = {
     "chain": chain,
     "binary_tree": binary_tree,
     "robot_arm": robot_arm,
+    "stiff_chain": stiff_chain,
+    "mass_ladder": mass_ladder,
     "rope": rope,
     "cantilever": cantilever,
     "flying_spaghetti": flying_spaghetti,

@@ -36,7 +36,7 @@ class Course(eqx.Module):
         fraction: part of it that is attempted.
         code: result.
         stopped: whether the run has ended before its time.
-        worst: unknown with the largest correction in the attempt that ended the run, -1 without one.
+        worst: unknown with the largest correction in the last attempt that failed, -1 without one.
         taken: accepted (sub)steps.
         rejected: (sub)steps that were repeated in parts.
         iterations: corrections in all attempts.
@@ -209,7 +209,7 @@ def after_attempt(setting: Setting, course: Course, inertias: Array, found: tupl
         fraction=fraction,
         code=result,
         stopped=stopped,
-        worst=jnp.where(verdict.hopeless, it.worst, course.worst),
+        worst=jnp.where(verdict.hopeless | verdict.failed, it.worst, course.worst),
         taken=course.taken + verdict.change,
         rejected=course.rejected + verdict.failed,
         iterations=course.iterations + worked,

@@ -73,7 +73,9 @@ def run_to_the_end(
 
 
 def _judged(course: Course, steps: Any) -> Course:
-    """With the code of a run that used up its substeps."""
+    """With the code of a run that used up its substeps, and no culprit in one that went well."""
     short = (course.step < steps) & ~course.stopped
     code = jnp.where(short, int(Result.MAX_SUBSTEPS), course.code)
-    return eqx.tree_at(lambda c: c.code, course, code)
+    well = (code == int(Result.SUCCESSFUL)) | (code == int(Result.EVENT))
+    worst = jnp.where(well, -1, course.worst)
+    return eqx.tree_at(lambda c: (c.code, c.worst), course, (code, worst))

@@ -80,8 +80,14 @@ def _rollout(
             saved = jax.tree.map(lambda x, s: jnp.where(running, x, s), saved, state)
         after = jax.tree.map(keep, course.state, state)
         starts = jax.tree.map(lambda x: x[jnp.maximum(picked - 1, 0)], slots.states)
+        # Beyond the end of a run that failed there are the inputs of the step that failed.
+        beyond = jnp.arange(save_every, length + 1, save_every) > course.step
+        number = jnp.where(beyond, jnp.minimum(course.step, length - 1), slots.step[picked])
+        starts = jax.tree.map(
+            lambda x, last: jax.vmap(jnp.where, (0, None, 0))(beyond, last, x), starts, course.state
+        )
         whole = jnp.zeros(()), jnp.ones(())
-        used = jax.vmap(lambda k, s: plan.inputs(parameters, slots.step[k], s, *whole))(picked, starts)
+        used = jax.vmap(lambda k, s: plan.inputs(parameters, k, s, *whole))(number, starts)
         if used.ndim == 3:
             used = jnp.einsum("j,kji->ki", jnp.asarray(tableau.b), used)
         code = keep(course.code, code)

@@ -45,28 +45,43 @@ def one_body(
     return scene.compile()
 
 
+BLOCKS = 25
+
+
 @dataclass(frozen=True)
 class Drift:
-    """The steady part of an error that is sampled at equal intervals.
+    """The steady part of an error sampled at equal intervals: the slope of a straight line through it.
 
-    An error that rounding makes is a random walk: its increments have no mean. The mean increment is the
-    best estimate of the slope of a walk (a straight line fitted to the walk itself finds slopes where there
-    are none), and it is known to the scatter of the increments over the root of their number.
+    An error that rounding makes is a walk: its increments have no mean, and a line finds a slope all the
+    same, far above what the scatter about the line tells. The slope is a weighted sum of the increments;
+    were they independent, its variance would be theirs times the sum of the squares of the weights. They
+    are not, as rounding repeats itself with the motion: the variance is taken from means over blocks,
+    each many times as long as they are alike.
 
     Attributes:
-        rate: mean increment of a step.
-        score: the mean increment in terms of its standard error; below three for a walk without drift.
+        rate: slope per step.
+        error: its standard error.
         largest: largest error.
     """
 
     rate: float
-    score: float
+    error: float
     largest: float
+
+    @property
+    def score(self) -> float:
+        """The slope in terms of its standard error: below three for a walk without drift."""
+        return self.rate / self.error if self.error > 0 else 0.0
 
     @classmethod
     def of(cls, errors: NDArray, steps: int) -> "Drift":
         """Of errors sampled over so many steps."""
+        samples = len(errors) - 1
+        times = np.linspace(-0.5, 0.5, samples + 1) * steps
         increments = np.diff(errors)
-        deviation = np.std(increments) / np.sqrt(len(increments))
-        score = np.mean(increments) / deviation if deviation > 0 else 0.0
-        return cls(float(errors[-1] - errors[0]) / steps, float(score), float(np.max(np.abs(errors))))
+        weights = np.cumsum(times[:0:-1])[::-1] / np.sum(times**2)
+        length = samples // BLOCKS
+        means = increments[: BLOCKS * length].reshape(BLOCKS, length).mean(axis=1)
+        variance = length * np.var(means, ddof=1)
+        error = np.sqrt(variance * np.sum(weights**2))
+        return cls(float(weights @ increments), float(error), float(np.max(np.abs(errors))))

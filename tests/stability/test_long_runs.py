@@ -15,12 +15,18 @@ import tolerances as tol
 from accounts import account
 from motions import OPTIMISED, Drift, simulate, simulate_long
 
+import natcoord_jax as nc
 from natcoord_jax import gallery
+from natcoord_jax.core.effect import replace_fields
 
 MILLION = 10**6
 SAVED = 1000
 STEP = {"heavy_top": 1e-3, "dzhanibekov": 1e-2}  # 0.15 and 0.05 rad a step
 KEPT_AXES = {"heavy_top": (2,), "dzhanibekov": (0, 1, 2)}
+
+BOOST = {"heavy_top": (0.0, 0.0, 0.0), "dzhanibekov": (1e-3, -2e-3, 1.5e-3)}
+"""Velocities [m/s] that the bodies get: without one the free body has no momentum to lose. It travels 27 m;
+were it faster, the rounding of its position would be the error of its angular momentum about the origin."""
 
 EVERY_TOP = pytest.mark.parametrize("name", STEP)
 EVERY_ORDER = pytest.mark.parametrize(
@@ -34,42 +40,72 @@ def example(name: str):
 
 
 @cache
-def long_run(name: str, order: int, **options):
+def long_run(name: str, order: int):
     scene = example(name)
-    options |= dict(dt=STEP[name], steps=MILLION, save_every=MILLION // SAVED)
-    return account(scene.system, simulate_long(scene.system, scene.state, order=order, **options))
+    state = replace_fields(scene.state, v=scene.state.v.at[0].add(jnp.array(BOOST[name])))
+    options = dict(dt=STEP[name], steps=MILLION, save_every=MILLION // SAVED)
+    return account(scene.system, simulate_long(scene.system, state, order=order, **options))
 
 
 def drifts(name: str, found) -> dict[str, Drift]:
-    """Of energy and of every component of the angular momentum that is kept."""
+    """Of energy and of every component of the momenta that is kept."""
     energy = found.kinetic + sum(found.stores.values())
-    spins = found.spins.sum(axis=1)
-    scale = np.max(np.sum(np.linalg.norm(found.spins, axis=-1), axis=1))
     errors = {"energy": (energy - energy[0]) / found.energy_scale}
-    errors |= {f"spin {k}": (spins[:, k] - spins[0, k]) / scale for k in KEPT_AXES[name]}
+    kept = {"spin": (found.spins, KEPT_AXES[name])}
+    if name != "heavy_top":
+        kept["momentum"] = (found.momenta, (0, 1, 2))
+    for what, (parts, axes) in kept.items():
+        total, scale = parts.sum(axis=1), np.max(np.sum(np.linalg.norm(parts, axis=-1), axis=1))
+        errors |= {f"{what} {k}": (total[:, k] - total[0, k]) / scale for k in axes}
     return {what: Drift.of(error, MILLION) for what, error in errors.items()}
 
 
 @EVERY_ORDER
 @EVERY_TOP
 def test_a_million_steps(name, order):
-    """At the default settings: everything within 1e-10, and next to nothing of it steady."""
+    """At the default settings everything is within 1e-10."""
     found = long_run(name, order)
     assert found.turned >= 1.0
     assert found.energy_error <= tol.MILLION_STEPS
     assert found.spin_error(axes=KEPT_AXES[name]) <= tol.MILLION_STEPS
-    assert name == "heavy_top" or found.momentum_error() <= tol.MILLION_STEPS
+    if name != "heavy_top":
+        assert np.max(np.linalg.norm(found.momenta, axis=-1)) >= 1e-3, "there is no momentum to lose"
+        assert found.momentum_error() <= tol.MILLION_STEPS
     assert max(found.directors, found.joints) <= tol.MILLION_STEPS_CONSTRAINT
-    for what, drift in drifts(name, found).items():
-        assert abs(drift.rate) <= tol.STEADY_PART[order], (what, drift)
 
 
-@pytest.mark.slow
+@EVERY_ORDER
 @EVERY_TOP
-def test_no_trend(name):
-    """With Newton's iteration carried to where rounding stops it, drifts are walks without direction."""
-    for what, drift in drifts(name, long_run(name, 2, newton_tol=tol.NEWTON_TO_THE_END)).items():
-        assert abs(drift.score) <= tol.SCORE, (what, drift)
+def test_no_trend(name, order):
+    """At the default settings, too, drifts are walks without direction: all of them at order two.
+
+    At orders four and six some are not. What is steady is listed by name, with a bound for every step: a
+    fraction of a rounding, which a million steps add up to 5e-11.
+    """
+    for what, drift in drifts(name, long_run(name, order)).items():
+        steady = tol.STEADY_PARTS.get((name, order, what.split()[0]))
+        if steady is None:
+            assert abs(drift.score) <= tol.SCORE, (what, drift)
+        else:
+            assert abs(drift.rate) + 2 * drift.error <= steady, (what, drift)
+
+
+@pytest.mark.parametrize("alike", [0.0, 0.8])
+def test_trends_are_found(alike):
+    """Walks score as their direction deserves, also where each increment is like the one before."""
+    generator = np.random.default_rng(0)
+    scores = {0.0: [], 1.0: []}
+    for _ in range(200):
+        increments = generator.normal(size=1000)
+        for k in range(1, 1000):
+            increments[k] += alike * increments[k - 1]
+        for steady, found in scores.items():
+            # Ten standard errors of the mean increment.
+            pull = 10.0 * steady / np.sqrt(1000) / (1 - alike)
+            found.append(Drift.of(np.cumsum(np.append(0.0, increments + pull)), 10**6).score)
+    assert np.std(scores[0.0]) == pytest.approx(1.0, abs=0.2)
+    assert np.mean(np.abs(scores[0.0]) > tol.SCORE) <= 0.01
+    assert np.mean(np.abs(scores[1.0]) > tol.SCORE) >= 0.99
 
 
 # --- chaos ------------------------------------------------------------------------------------------------
@@ -100,25 +136,37 @@ def test_laws_outlive_the_path(order):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seconds", [100, 2000])
+@pytest.mark.parametrize("seconds", [10, 100, 2000])
 def test_gradients_of_a_chaotic_path(seconds):
-    """They grow as the path forgets its start; where squares overflow they are not finite, never wrong."""
+    """They grow as the path forgets its start. Could go wrong: a number that is none of them; and no word of
+    why there is none where it is too large: `nc.tangent_growth` tells, whatever the time."""
     scene = example("double_pendulum")
     system, state = scene.system, scene.state
+    steps = dict(dt=0.01, steps=100 * seconds, save_every=100)
 
     def height(angle):
         start = system.with_coordinate(state, "hinge 2", angle)
-        found = simulate(
-            system, start, dt=0.01, steps=100 * seconds, save_every=100, checkpoint=True, throw=False
-        )
+        found = simulate(system, start, checkpoint=True, throw=False, **steps)
         return found.q[-1, 4, 2], found.result
 
-    (value, result), slope = jax.jit(jax.value_and_grad(height, has_aux=True), compiler_options=OPTIMISED)(
-        0.01
-    )
+    gradient = jax.jit(jax.value_and_grad(height, has_aux=True), compiler_options=OPTIMISED)
+    (value, result), slope = gradient(0.01)
     assert int(result) == 0
     assert bool(jnp.isfinite(value))
-    if seconds > 100:
-        assert not bool(jnp.isfinite(slope))
+    growth = nc.tangent_growth(system, system.with_coordinate(state, "hinge 2", 0.01), **steps)
+    too_large = [line for line in growth.explain().splitlines() if "too large to be numbers" in line]
+    if seconds == 10:
+        assert float(growth.decades[-1]) > 4, "not chaotic: the test means nothing"
+        along = jax.jvp(lambda a: height(a)[0], (0.01,), (1.0,))[1]
+        np.testing.assert_allclose(slope, along, rtol=1e-7)
+        ends = [height(0.01 + change)[0] for change in (-1e-8, 1e-8)]
+        np.testing.assert_allclose(slope, (ends[1] - ends[0]) / 2e-8, rtol=1e-3)
+        return
+    assert 0.8 <= float(growth.rate) <= 1.5  # [1/s]
+    if seconds == 100:
+        # The path itself depends on rounding of its start, and its derivative, too; of their sizes not much.
+        assert "nowhere" in too_large[0]
+        assert abs(np.log10(abs(float(slope))) - float(growth.decades[-1])) < 8
     else:
-        assert 1e3 <= abs(float(slope)) < np.inf, "not chaotic: the test means nothing"
+        assert not bool(jnp.isfinite(slope))
+        assert "from t = " in too_large[0] and growth.decades[-1] > 308
