@@ -86,7 +86,7 @@ def test_a_coarse_rope_does_not_stretch(elements):
     assert abs(length(points)[-1] / 1.0121 - 1) < (0.03 if elements == 4 else 1e-3)
     if elements == 32:
         # Exudyn, 64 elements: (-0.1994, -0.9487); what is left is the mesh.
-        assert np.allclose(points[-1, -1], [-0.1994, 0.0, -0.9487], atol=2e-3)
+        np.testing.assert_allclose(points[-1, -1], [-0.1994, 0.0, -0.9487], rtol=0, atol=2e-3)
 
 
 @pytest.mark.slow
@@ -221,7 +221,7 @@ def test_flying_spaghetti():
     trajectory = nc.simulate(system, state, dt=0.1, steps=150)
     after = trajectory.t > 2.55
     momentum = np.asarray(system.momentum(trajectory))[after]
-    assert np.allclose(momentum, [20.0, 0, 0], atol=1e-9)
+    np.testing.assert_allclose(momentum, np.broadcast_to([20.0, 0, 0], momentum.shape), rtol=0, atol=1e-9)
     turning = np.asarray(system.angular_momentum(trajectory))[after]
     energy = np.asarray(system.energy(trajectory).total)[after]
     assert np.ptp(energy) <= tol.ENERGY * energy[0] and np.ptp(turning[:, 2]) <= 1e-10 * np.abs(turning).max()
@@ -232,7 +232,8 @@ def test_steady_elongation_of_a_rotating_beam():
     """B13: by the internal damping the spinning beam settles at L (tan kL / kL - 1), k^2 = w^2 rho / EA."""
     total, rate = 10.0, 6.0
     section = nc.Section.of_numbers(EA=2.8e7, GA=1e7, EI=1.4e4, GJ=1.4e4, density=1.2, rotary=6e-4)
-    elements = 20
+    # Lumps at n equal pieces stretch by a part of 1 / 2 n^2 more.
+    elements = 25
     scene = nc.Scene()
     hub = scene.add(nc.RigidBody(mass=1.0, inertia=(1.0, 1.0, 1.0), angular_velocity=(0, 0, rate)))
     scene.add(nc.Revolute(nc.ground, hub, axis=(0, 0, 1), name="hinge"))
@@ -252,4 +253,4 @@ def test_steady_elongation_of_a_rotating_beam():
     k = hinge * np.sqrt(1.2 / 2.8e7)
     exact = total * (np.tan(k * total) / (k * total) - 1)
     radius = np.linalg.norm(nodes(system, trajectory.states, beam)[-1, -1])
-    assert abs((radius - total) / exact - 1) < 3e-3
+    assert abs((radius - total) / exact - 1) < 1e-3

@@ -19,6 +19,9 @@ from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.effects.beams.relative_motion import relative_motion, strains_of
 from natcoord_jax.maths.rotations import from_rotation_vector
 
+ROUNDING = 1e-13
+"""Of what is exact in exact arithmetic, relative to its size: some hundred roundings."""
+
 NUMBERS = {"EA": 1e4, "GA": 5e3, "EI": (1.0, 2.0), "GJ": 1.5, "density": 2.0, "rotary": 0.01}
 
 
@@ -70,7 +73,8 @@ def test_rigid_motions_do_not_strain():
     for _ in range(5):
         turn = from_rotation_vector(jnp.asarray(3 * rng.normal(size=3)))
         moved = (x @ turn.T).at[:, 0].add(jnp.asarray(rng.normal(size=3)))
-        assert np.allclose(strains_of(relative_motion(moved), jnp.asarray(0.7)), before, atol=1e-12)
+        found = strains_of(relative_motion(moved), jnp.asarray(0.7))
+        np.testing.assert_allclose(found, before, rtol=0, atol=ROUNDING * np.abs(before).max())
 
 
 def test_pure_bending_rolls_up_to_a_circle():
@@ -86,7 +90,7 @@ def test_pure_bending_rolls_up_to_a_circle():
     found = nc.equilibrium(system, state, steps=8)
     angle = 2 * np.pi * np.asarray(found.states.t)
     exact = length * np.stack([np.sin(angle), 0 * angle, 1 - np.cos(angle)], axis=1) / angle[:, None]
-    assert np.allclose(tip(system, found.states, beam), exact, atol=1e-10 * length)
+    np.testing.assert_allclose(tip(system, found.states, beam), exact, rtol=0, atol=ROUNDING * length)
 
 
 @pytest.mark.slow
@@ -96,8 +100,9 @@ def test_stretch_and_torsion_are_exact():
     system, state, beam = cantilever(section, [(0, 0, 0), (0, 0, 1.0)], 3, **options)
     found = nc.equilibrium(system, state, steps=2)
     sensed = system.sense(found.state, beam.end)
-    assert np.allclose(sensed.position, [0, 0, 1.003], atol=1e-12)
-    assert np.allclose(sensed.rotation, from_rotation_vector(jnp.array([0, 0, 0.6])), atol=1e-11)
+    np.testing.assert_allclose(sensed.position, [0, 0, 1.003], rtol=0, atol=ROUNDING)
+    turned = from_rotation_vector(jnp.array([0, 0, 0.6]))
+    np.testing.assert_allclose(sensed.rotation, turned, rtol=0, atol=ROUNDING)
 
 
 @cache
@@ -110,7 +115,7 @@ def test_equilibria_do_not_depend_on_the_path():
     system, state, beam = loaded()
     direct = nc.equilibrium(system, state, steps=2).state
     around = nc.equilibrium(system, state, jnp.array([-1.0, 1.0])).state
-    assert np.allclose(direct.q, around.q, atol=1e-10)
+    np.testing.assert_allclose(direct.q, around.q, rtol=0, atol=ROUNDING)
     assert abs(tip(system, direct, beam)[1]) > 0.2
 
 
@@ -165,23 +170,31 @@ def test_bend_of_45_degrees():
         system, state, beam = cantilever(section, curve, elements, load=(0, 0, 600.0), length=length)
         state = nc.equilibrium(system, state, steps=6).state
         found.append(tip(system, state, beam) - np.asarray(curve(length)))
-    assert np.allclose(richardson(*found), [-23.5613, -13.60502, 53.47611], atol=2e-4)
+    np.testing.assert_allclose(richardson(*found), [-23.5613, -13.60502, 53.47611], rtol=0, atol=1e-4)
 
 
 @pytest.mark.slow
 def test_cantilever_by_number_of_elements():
-    """B05: order two, and the converged values; one element is nearer to them than Exudyn's."""
+    """B05: order two, and the converged values of a small load and of a large one.
+
+    Coarse meshes are nearer to them than Exudyn's element of the same number of nodes.
+    """
     section = nc.RectangularSection(width=0.1, height=0.5, E=2.07e11, nu=0.3, density=7800.0)
     options = {"load": (0.0, 6.25e7, 0.0), "second": (0.0, 0.0, 1.0)}
-    reference = np.array([-0.15097103, 0.71056837])
-    found = []
-    for elements in (1, 8, 16):
+    small, large = np.array([-1.88847418e-07, 0.000809900305]), np.array([-0.15097103, 0.71056837])
+    exudyn = {1: (-0.07140274, 0.54225823), 2: (-0.12379212, 0.65687111), 4: (-0.14346767, 0.69593561)}
+    found = {}
+    for elements in (1, 2, 4, 8, 16):
         system, state, beam = cantilever(section, [(0, 0, 0), (2.0, 0, 0)], elements, **options)
-        found.append(tip(system, nc.equilibrium(system, state, steps=5).state, beam)[:2] - [2.0, 0])
-    errors = [np.max(np.abs(x - reference)) for x in found]
-    assert errors[0] < np.max(np.abs([-0.07140274, 0.54225823] - reference))
-    assert 3.8 < errors[1] / errors[2] < 4.2
-    assert np.allclose(richardson(*found[1:]), reference, atol=2e-6)
+        states = nc.equilibrium(system, state, jnp.array([1e-3, 0.2, 0.4, 0.6, 0.8, 1.0])).states
+        found[elements] = (tip(system, states, beam)[:, :2] - [2.0, 0])[[0, -1]]
+    errors = {n: np.max(np.abs(x[1] - large)) for n, x in found.items()}
+    for elements, other in exudyn.items():
+        assert errors[elements] < np.max(np.abs(np.array(other) - large)), elements
+    assert 3.8 < errors[8] / errors[16] < 4.2
+    converged = richardson(found[8], found[16])
+    np.testing.assert_allclose(converged[0], small, rtol=1e-5, atol=0)
+    np.testing.assert_allclose(converged[1], large, rtol=0, atol=1e-6)
 
 
 @pytest.mark.slow
@@ -266,7 +279,8 @@ def test_lateral_buckling():
     # d_1 along y: bending about it, in the plane of the load, is stiff.
     options = {"load": (0.0, 0.0, -critical), "second": (0.0, 1.0, 0.0)}
     system, state, _ = cantilever(section, [(0, 0, 0), (length, 0, 0)], 16, **options)
-    found = nc.equilibrium(system, state, jnp.array([0.5, 0.97, 1.03]))
+    # Half a per cent to either side; the mesh and the strong side's give, EI / 1e4, make less than 0.15 %.
+    found = nc.equilibrium(system, state, jnp.array([0.5, 0.995, 1.005]))
     slowest = [
         nc.modes(system, jax.tree.map(lambda x, k=k: x[k], found.states), count=1).s[0] for k in (1, 2)
     ]
@@ -344,7 +358,7 @@ def test_a_load_along_a_beam_can_be_its_weight(interpolation):
         found.append(nc.simulate(system, state, dt=0.01, steps=10).q)
     assert float(jnp.max(jnp.abs(found[0] - found[0][0]))) > 0.01
     for other in found[1:]:
-        np.testing.assert_allclose(other, found[0], atol=tol.SAME_TRAJECTORY)
+        np.testing.assert_allclose(other, found[0], rtol=0, atol=tol.SAME_TRAJECTORY)
 
 
 @pytest.mark.parametrize(
@@ -379,7 +393,8 @@ def test_a_following_load_turns_with_the_beam():
     steps = 0.5 * (np.exp(1j * angle[1:]) + np.exp(1j * angle[:-1])) * 1e-3 * push
     momentum = np.asarray(system.momentum(trajectory))
     wanted = np.cumsum(steps)
-    np.testing.assert_allclose(momentum[1:, 0] + 1j * momentum[1:, 1], wanted, atol=2e-3 * abs(wanted[-1]))
+    off = momentum[1:, 0] + 1j * momentum[1:, 1] - wanted
+    assert np.abs(off).max() < 2e-3 * abs(wanted[-1])
 
 
 def test_a_wrong_load_along_a_beam_is_named():
@@ -428,14 +443,27 @@ def test_mass_properties_of_a_beam_with_a_body_at_its_end():
     """The end of a beam is rigidly part of a body: total mass, centre and inertia are those of both."""
     section = nc.Section.of_numbers(**NUMBERS)
     scene = nc.Scene()
-    plug = scene.add(
-        nc.RigidBody(mass=3.0, inertia=(0.1, 0.1, 0.1), position=(1, 0, 0.2), orientation=((0, 1, 0), 0.4))
-    )
+    turn = (0, 1, 0), 0.4
+    plug = scene.add(nc.RigidBody(mass=3.0, inertia=(0.1, 0.2, 0.25), position=(1, 0, 0.2), orientation=turn))
     beam = scene.add(nc.Beam(section, [(0, 0, 0), (1, 0, 0)], elements=4, end=plug))
     system, state = scene.compile()
     assert beam.end == plug and len(system.structure.bodies) == 5
-    spinning = replace_fields(
-        state, v=jnp.zeros_like(state.v).reshape(-1, 4, 3).at[:, 0].set(1.0).reshape(-1, 3)
-    )
-    assert np.allclose(system.momentum(spinning), 5.0)
-    assert np.allclose(system.energy(state).kinetic, 0.0, atol=tol.IDENTITY)
+    # Lumps of density 2 kg/m, with rotary inertia 0.01 kg m across and 0.02 kg m along.
+    places = np.linspace(0, 1, 5)[:, None] * [1.0, 0, 0]
+    shares = np.array([0.125, 0.25, 0.25, 0.25, 0.125])
+    parts = [(2 * w, x, w * np.diag([0.02, 0.01, 0.01])) for w, x in zip(shares, places)]
+    rotation = np.asarray(from_rotation_vector(0.4 * jnp.array([0.0, 1.0, 0.0])))
+    parts.append((3.0, np.array([1, 0, 0.2]), rotation @ np.diag([0.1, 0.2, 0.25]) @ rotation.T))
+    first = sum(m * x for m, x, _ in parts)
+    inertia = sum(m * (x @ x * np.eye(3) - np.outer(x, x)) + own for m, x, own in parts)
+    drift, spin = np.array([1.0, -2.0, 0.5]), np.array([0.3, 0.7, -0.4])
+    rows = np.asarray(state.q).reshape(-1, 4, 3)
+    v = np.cross(spin, rows)
+    v[:, 0] += drift
+    moving = replace_fields(state, v=jnp.asarray(v.reshape(-1, 3)))
+    momentum, turning = 5 * drift + np.cross(spin, first), inertia @ spin + np.cross(first, drift)
+    np.testing.assert_allclose(system.momentum(moving), momentum, rtol=0, atol=ROUNDING * 5)
+    np.testing.assert_allclose(system.angular_momentum(moving), turning, rtol=0, atol=ROUNDING * 5)
+    kinetic = 2.5 * drift @ drift + drift @ np.cross(spin, first) + 0.5 * spin @ inertia @ spin
+    assert float(system.energy(moving).kinetic) == pytest.approx(kinetic, rel=ROUNDING)
+    assert float(system.energy(state).kinetic) == 0.0

@@ -30,8 +30,8 @@ def short():
 def test_the_way_rests_at_its_points():
     for number, (time, point) in enumerate(zip((0.0, 2.0, 5.0, 7.0, 10.0, 12.0), WAY)):
         place, rate = jax.jvp(way, (jnp.asarray(time),), (jnp.ones(()),))
-        np.testing.assert_allclose(place, point, atol=1e-14)
-        np.testing.assert_allclose(rate, 0.0, atol=1e-12)
+        np.testing.assert_allclose(place, point, rtol=0, atol=1e-14)
+        np.testing.assert_allclose(rate, 0.0, rtol=0, atol=1e-12)
         assert number == 0 or np.abs(np.array(point) - WAY[number - 1]).max() > 0.1
     limits = np.deg2rad([170.0, 120.0, 170.0, 120.0, 170.0, 120.0, 170.0])
     angles = jax.vmap(way)(jnp.linspace(0.0, 12.0, 200))
@@ -53,11 +53,11 @@ def test_the_cable_hangs_at_rest_between_holder_and_clamp(short):
     middle = system.sense(state, parts.cable.at(0.5)).position
     ends = [system.sense(state, parts.cable.nodes[k]).position for k in (1, -2)]
     assert 0.005 < PLACE[2] - float(middle[2]) < 0.1
-    np.testing.assert_allclose(ends[0][2], ends[1][2], atol=1e-12)
-    np.testing.assert_allclose(middle[1], PLACE[1] + 0.03 + LENGTH / 2, atol=1e-9)
+    np.testing.assert_allclose(ends[0][2], ends[1][2], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(middle[1], PLACE[1] + 0.03 + LENGTH / 2, rtol=0, atol=1e-9)
     # Left alone it stays: nothing holds the robot, which is not part of the cable.
     run = nc.simulate(system, state, dt=0.02, steps=5)
-    np.testing.assert_allclose(system.sense(run, parts.cable.at(0.5)).position[-1], middle, atol=1e-9)
+    np.testing.assert_allclose(system.sense(run, parts.cable.at(0.5)).position[-1], middle, rtol=0, atol=1e-9)
 
 
 @pytest.mark.slow
@@ -66,18 +66,18 @@ def test_the_gripper_closes_where_the_plug_is(short):
     (approach, before), (gripped, after) = run.pairs
     assert float(after.t[0]) == float(before.t[-1]) == pytest.approx(GRIP)
     plug = approach.sense(before, "plug").position
-    np.testing.assert_allclose(plug, np.broadcast_to(PLACE, plug.shape), atol=1e-12)
+    np.testing.assert_allclose(plug, np.broadcast_to(PLACE, plug.shape), rtol=0, atol=1e-12)
     # Angles count from the pose at the start; the way is followed to round-off of feedback.
     for trajectory in run.trajectories:
         wanted = jax.vmap(way)(trajectory.t) - jnp.asarray(WAY[0])
-        np.testing.assert_allclose(trajectory.states.coordinates, wanted, atol=1e-9)
+        np.testing.assert_allclose(trajectory.states.coordinates, wanted, rtol=0, atol=1e-9)
     assert abs(float(run.losses()[0])) < 1e-9
     offset = [
         gripped.sense(after, "plug").position - gripped.sense(after, "gripper").position,
         gripped.sense(after, "gripper").rotation,
     ]
     local = np.einsum("tji,tj->ti", offset[1], offset[0])
-    np.testing.assert_allclose(local, np.broadcast_to(local[0], local.shape), atol=1e-12)
+    np.testing.assert_allclose(local, np.broadcast_to(local[0], local.shape), rtol=0, atol=1e-12)
     assert np.linalg.norm(gripped.sense(after, "plug").position[-1] - plug[-1]) > 1e-4
 
 
