@@ -69,3 +69,10 @@ def test_beams_are_drawn_as_swept_sections(tmp_path):
     run = nc.simulate(system, state, dt=0.01, steps=5)
     file = nc.animate(system, run, file=tmp_path / "beam.gif", beams=[beam])
     assert file.read_bytes()[:3] == b"GIF"
+    figure = nc.plot(system, run, times=(0.0, 0.02, 0.05, 9.0), beams=[beam])
+    figure.canvas.draw()
+    above, below = figure.subfigs
+    assert [axes.get_title() for axes in above.axes] == ["t = 0 s", "t = 0.02 s", "t = 0.05 s"]
+    assert [axes.get_title() for axes in below.axes][0] == "energy by store"
+    swept = [c for axes in above.axes for c in axes.collections if c.__class__.__name__ == "Poly3DCollection"]
+    assert swept and any(len(c.get_paths()) == 3 * 4 for c in swept)

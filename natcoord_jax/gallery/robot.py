@@ -185,7 +185,7 @@ def mount(elements: int, steps: int, dt: float, **options: Any) -> nc.Phases:
 
 def figure(parts: Mounting, phases: nc.Phases) -> Any:
     """Figures 7 and 8 of the paper: snapshots; total, potential and strain energy."""
-    from natcoord_jax.viz import Curve, plot_snapshots
+    from natcoord_jax.viz import Curve, Panel, plot_snapshots
 
     energy, t = phases.energy(), np.asarray(phases.t)
     gravity = np.asarray(energy.stores["gravity"])
@@ -195,7 +195,10 @@ def figure(parts: Mounting, phases: nc.Phases) -> Any:
         Curve("potential, of gravity", t, gravity),
         Curve("strain", t, strain, dashed=True),
     ]
-    panels = [("energies", curves), ("strain energy of the cable", [Curve("strain", t, strain)])]
+    panels = [
+        Panel("energies", "[J]", curves),
+        Panel("strain energy of the cable", "[J]", [Curve("strain", t, strain)]),
+    ]
     return plot_snapshots(phases, SNAPSHOTS, panels, beams=(parts.cable,))
 
 

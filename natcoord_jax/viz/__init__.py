@@ -1,7 +1,8 @@
 """Pictures. matplotlib is imported here and nowhere else, and only when this package is."""
 
 from natcoord_jax.viz.animate import animate
-from natcoord_jax.viz.plot import Curve, Panel, plot, plot_panels
+from natcoord_jax.viz.panels import Curve, Panel, plot_panels
+from natcoord_jax.viz.plot import plot
 from natcoord_jax.viz.snapshots import plot_snapshots
 
 __all__ = ["Curve", "Panel", "animate", "plot", "plot_panels", "plot_snapshots"]

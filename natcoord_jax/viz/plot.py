@@ -1,84 +1,26 @@
 """Curves over time: energies, momenta, constraint errors, work and joint coordinates of a trajectory."""
 
-import math
-from typing import NamedTuple
+from collections.abc import Sequence
 
-import matplotlib
-import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from natcoord_jax.analysis.accuracy import Accuracy
 from natcoord_jax.analysis.phases import Phases
 from natcoord_jax.assembly.system import System
+from natcoord_jax.bodies.beam import BeamHandle
 from natcoord_jax.control.solution import Solution
 from natcoord_jax.core.state import Trajectory
+from natcoord_jax.viz.panels import Curve, Panel, plot_panels
+from natcoord_jax.viz.snapshots import plot_snapshots
 from natcoord_jax.viz.stage import phases_of
 from natcoord_jax.viz.work_precision import plot_accuracy
 
 AXES = "xyz"
-LEGEND_ENTRIES = 10
-"""More curves than this in one panel go without a legend."""
 MOST_STORES = 6
 """More stores of energy than this are summed by kind."""
 ROUND_OFF = 1e-17
 """Errors below it are drawn as if they were as large, on the logarithmic scale."""
-
-
-class Curve(NamedTuple):
-    """One curve: its label, times [s] and values; `dashed` sets it apart."""
-
-    label: str
-    t: np.ndarray
-    values: np.ndarray
-    dashed: bool = False
-
-
-class Panel(NamedTuple):
-    """One diagram over time: title, label of the ordinate with its unit, curves."""
-
-    title: str
-    ordinate: str
-    curves: list[Curve]
-    logarithmic: bool = False
-    abscissa: str = "t [s]"
-
-
-def draw(axes: Axes, panel: Panel) -> None:
-    """Draw one diagram."""
-    for curve in panel.curves:
-        style = "--" if curve.dashed else "-"
-        axes.plot(curve.t, curve.values, style, label=curve.label, linewidth=1.2)
-    if panel.logarithmic:
-        axes.set_yscale("log")
-    axes.set(title=panel.title, xlabel=panel.abscissa, ylabel=panel.ordinate)
-    axes.grid(alpha=0.3)
-    if 1 < len(panel.curves) <= LEGEND_ENTRIES:
-        axes.legend(fontsize="small")
-
-
-def plot_panels(panels: list[Panel], *, columns: int = 2) -> Figure:
-    """Draw diagrams side by side.
-
-    Args:
-        panels: the diagrams.
-        columns: how many in a row.
-
-    Returns:
-        The figure; a notebook shows it once, a script shows it with `plt.show()`.
-    """
-    rows = math.ceil(len(panels) / columns)
-    figure, grid = plt.subplots(
-        rows, columns, figsize=(5.2 * columns, 3.4 * rows), layout="constrained", squeeze=False
-    )
-    for axes, panel in zip(grid.flat, panels, strict=False):
-        draw(axes, panel)
-    for axes in grid.flat[len(panels) :]:
-        axes.set_visible(False)
-    if "inline" in matplotlib.get_backend():
-        plt.close(figure)  # the returned figure is shown by the notebook, not a second time by pyplot
-    return figure
 
 
 def _components(label: str, t: np.ndarray, vectors: np.ndarray) -> list[Curve]:
@@ -169,19 +111,27 @@ def _is_free(system: System, body: int) -> bool:
     return parent == len(system.structure.bodies) and int(own.sum()) == 6
 
 
-def plot(system: System | Phases | Solution | Accuracy, trajectory: Trajectory | None = None) -> Figure:
+def plot(
+    system: System | Phases | Solution | Accuracy,
+    trajectory: Trajectory | None = None,
+    *,
+    times: Sequence[float] | None = None,
+    beams: Sequence[BeamHandle] = (),
+) -> Figure:
     """Energies by store, momenta, constraint errors, work and joint coordinates over time.
 
     Args:
         system: compiled system; or a motion in phases, a solution of an optimal control problem, or what
             `accuracy` found, which need no trajectory.
         trajectory: of one lane, computed with it.
+        times: of pictures of the motion above the diagrams [s]; None: no pictures.
+        beams: handles of beams, whose sections are drawn in the pictures; others are round.
 
     Returns:
         The figure.
 
     Raises:
-        ValueError: for a trajectory of a batch, or none.
+        ValueError: for a trajectory of a batch, or none; or times without a motion.
 
     Example:
         >>> import jax; jax.config.update("jax_enable_x64", True)
@@ -191,12 +141,15 @@ def plot(system: System | Phases | Solution | Accuracy, trajectory: Trajectory |
         >>> system, state = scene.compile()
         >>> figure = nc.plot(system, nc.simulate(system, state, dt=0.1, steps=10))
     """
+    if isinstance(system, Solution | Accuracy) and times is not None:
+        raise ValueError("plot: times [s] are for pictures of a motion; pass a system and a trajectory")
     if isinstance(system, Solution):
         return plot_solution(system)
     if isinstance(system, Accuracy):
         return plot_accuracy(system)
-    pairs = phases_of(system, trajectory, "plot").pairs
-    return plot_panels(_joined([_panels(*pair) for pair in pairs]))
+    phases = phases_of(system, trajectory, "plot")
+    panels = _joined([_panels(*pair) for pair in phases.pairs])
+    return plot_panels(panels) if times is None else plot_snapshots(phases, times, panels, beams=beams)
 
 
 def _joined(phases: list[list[Panel]]) -> list[Panel]:

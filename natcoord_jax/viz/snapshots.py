@@ -1,4 +1,4 @@
-"""Snapshots of a motion above its energies over time."""
+"""Snapshots of a motion above diagrams over time."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -9,26 +9,29 @@ from matplotlib.figure import Figure
 
 from natcoord_jax.analysis.phases import Phases
 from natcoord_jax.bodies.beam import BeamHandle
-from natcoord_jax.viz.plot import Curve, Panel, draw
+from natcoord_jax.viz.panels import Panel, draw, shown_once
 from natcoord_jax.viz.stage import Stage, pictures
 
 COLUMNS = 4
+"""Pictures in a row."""
+MOST_IN_A_ROW = 3
+"""Diagrams in a row."""
 
 
 def plot_snapshots(
     phases: Phases,
     times: Sequence[float],
-    panels: Sequence[tuple[str, Sequence[Curve]]],
+    panels: Sequence[Panel],
     *,
     beams: Sequence[BeamHandle] = (),
     view: tuple[float, float] = (15.0, 25.0),
 ) -> Figure:
-    """Pictures of a motion at some times, with diagrams of energies below.
+    """Pictures of a motion at some times, with diagrams below.
 
     Args:
         phases: the motion.
         times: of the snapshots [s]; those after the end are left out.
-        panels: title and curves [J] of each diagram.
+        panels: the diagrams.
         beams: handles of beams, whose sections are drawn.
         view: elevation and azimuth of the eye [deg].
     """
@@ -36,8 +39,10 @@ def plot_snapshots(
     shown = pictures(phases, np.array([t for t in times if t <= end + 1e-9 * (1 + end)]), beams)
     frames = [(at, k) for at in shown for k in range(len(at.t))]
     rows = -(-len(frames) // COLUMNS)
-    figure = plt.figure(figsize=(3.2 * COLUMNS, 3.2 * rows + 3.6), layout="constrained")
-    halves: Any = figure.subfigures(2, 1, height_ratios=(3.2 * rows, 3.6))
+    wide = min(len(panels), MOST_IN_A_ROW)
+    high = 3.6 * -(-len(panels) // wide)
+    figure = plt.figure(figsize=(3.2 * COLUMNS, 3.2 * rows + high), layout="constrained")
+    halves: Any = figure.subfigures(2, 1, height_ratios=(3.2 * rows, high))
     above, below = halves
     points = np.concatenate([at.points for at in shown])
     for number, frame in enumerate(frames):
@@ -46,7 +51,9 @@ def plot_snapshots(
         axes.set_axis_off()
         Stage(axes, shown[0], points, "t = {:g} s").show(*frame)
         axes.set_box_aspect((1, 1, 1), zoom=1.4)
-    grid = below.subplots(1, len(panels), squeeze=False)[0]
-    for axes, (title, curves) in zip(grid, panels):
-        draw(axes, Panel(title, "[J]", list(curves)))
-    return figure
+    grid = list(below.subplots(-(-len(panels) // wide), wide, squeeze=False).flat)
+    for axes, panel in zip(grid, panels):
+        draw(axes, panel)
+    for axes in grid[len(panels) :]:
+        axes.set_visible(False)
+    return shown_once(figure)
