@@ -139,9 +139,9 @@ def tangent_growth(
         >>> scene = nc.Scene()
         >>> ball = scene.add(nc.RigidBody(mass=1.0, inertia=(1.0, 1.0, 1.0)))
         >>> system, state = scene.compile()
-        >>> growth = nc.tangent_growth(system, state, dt=0.1, steps=100, save_every=10)  # in proportion to t
-        >>> [round(float(x), 1) for x in (growth.decades[1] - growth.decades[0], growth.decades[-1])]
-        [1.0, 2.0]
+        >>> growth = nc.tangent_growth(system, state, dt=0.1, steps=100, save_every=10)
+        >>> round(10 ** float(growth.decades[10] - growth.decades[5]), 1)  # free flight: twice the time
+        2.0
     """
     state = scheme.started(state)
     step = checked_step(dt)

@@ -25,6 +25,11 @@ class Form(eqx.Module):
     by_formulas: ClassVar[bool] = False
     renewal: ClassVar[int] = 6
 
+    @property
+    def dependent(self) -> bool:
+        """Whether constraints may depend on each other."""
+        return True
+
     def like_tangent(self, y: Float[Array, " unknowns"]) -> Any:
         """Something of the shape of `tangent(y)`, to know the shape of its factors without tracing it."""
         return jax.ShapeDtypeStruct((y.shape[0], y.shape[0]), y.dtype)
@@ -37,7 +42,7 @@ class Form(eqx.Module):
         equations: Any = self
         inertias = equations.inertias(matrix)
         every = jnp.zeros(matrix.shape[0], matrix.dtype).at[: inertias.shape[0]].set(inertias)
-        return Inverse(saddle_inverse(matrix, inertias)), every
+        return Inverse(saddle_inverse(matrix, inertias, dependent=equations.dependent)), every
 
     def differentiable(self, matrix: Any) -> Any:
         """A solver whose solutions are differentiable in every mode."""
@@ -46,4 +51,5 @@ class Form(eqx.Module):
 
 def dense_solver(equations: Any, matrix: Float[Array, "unknowns unknowns"]) -> DenseSolver:
     """The solver with one dense matrix, whatever the form is."""
-    return DenseSolver(matrix, saddle_inverse(matrix, equations.inertias(matrix)), equations.balances)
+    inverse = saddle_inverse(matrix, equations.inertias(matrix), dependent=equations.dependent)
+    return DenseSolver(matrix, inverse, equations.balances)

@@ -104,6 +104,11 @@ class FullStep(Form):
         return self.velocity.shape[0]
 
     @property
+    def dependent(self) -> bool:
+        """Whether constraints depend on each other."""
+        return self.system.structure.rank is not None
+
+    @property
     def balances(self) -> int:
         """Number of balance equations."""
         return 6 * self.bodies * self.tableau.stages

@@ -157,6 +157,11 @@ class ReducedStep(Form):
         return active_groups(self.system)
 
     @property
+    def dependent(self) -> bool:
+        """Whether constraints depend on each other."""
+        return self.system.structure.rank is not None
+
+    @property
     def balances(self) -> int:
         """Number of balance equations; the rest are constraints."""
         return self.system.structure.unknowns * self.tableau.stages

@@ -27,7 +27,9 @@ def bordered_inverse(matrix: Float[Array, "n n"], visible: int) -> Float[Array, 
     return jnp.concatenate([inverse[:, :visible], inverse[:, visible:] + spread], axis=1)
 
 
-def saddle_inverse(matrix: Float[Array, "n n"], inertias: Float[Array, " balances"]) -> Float[Array, "n n"]:
+def saddle_inverse(
+    matrix: Float[Array, "n n"], inertias: Float[Array, " balances"], *, dependent: bool = True
+) -> Float[Array, "n n"]:
     """Inverse of a saddle-point matrix [[A, -B^T], [C, 0]], regularised so that redundant rows do no harm.
 
     The constraint rows get a small positive diagonal in units of the matrix itself. Used as the
@@ -37,14 +39,17 @@ def saddle_inverse(matrix: Float[Array, "n n"], inertias: Float[Array, " balance
     Args:
         matrix: the matrix; its first rows are the balance equations.
         inertias: of their unknowns, which give the diagonal its size.
+        dependent: whether rows of constraints may depend on each other. If not, each row has a diagonal of
+            its own size: what is little beside a light body would swamp the constraints of heavy ones.
     """
     size, definite = matrix.shape[-1], inertias.shape[0]
     if size == definite:
         return definite_inverse(matrix)
     coupling = jnp.abs(matrix[definite:, :definite])
     scale = jnp.max(coupling**2 / jnp.where(inertias > 0, inertias, 1.0), axis=1)
-    shift = 1e-10 * jnp.maximum(jnp.max(scale), jnp.finfo(matrix.dtype).tiny)
-    diagonal = jnp.concatenate([jnp.zeros(definite, matrix.dtype), jnp.full(size - definite, shift)])
+    least = (1.0 if dependent else 1e-16) * jnp.max(scale)
+    shift = 1e-10 * jnp.maximum(jnp.maximum(scale, least), jnp.finfo(matrix.dtype).tiny)
+    diagonal = jnp.concatenate([jnp.zeros(definite, matrix.dtype), shift])
     return pivoted_inverse(matrix + jnp.diag(diagonal))
 
 

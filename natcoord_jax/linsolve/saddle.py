@@ -5,7 +5,7 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.linsolve.blocks import BlockMatrix
 
-SHIFT = 1e-10  # diagonal of the constraint rows in units of the matrix, as in `dense.saddle_inverse`
+SHIFT = 1e-10  # diagonal of the constraint rows in units of the matrix, one for all of them
 
 
 def inertias_of(matrix: BlockMatrix, balances: int) -> Float[Array, " n"]:
