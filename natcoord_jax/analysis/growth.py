@@ -44,7 +44,8 @@ class Growth(eqx.Module):
 
     def explain(self) -> str:
         """What is left of the motion and of its derivatives, in words."""
-        decades, t = np.asarray(self.decades), np.asarray(self.t)
+        known = np.isfinite(np.asarray(self.decades))
+        decades, t = np.asarray(self.decades)[known], np.asarray(self.t)[known]
 
         def first(limit: float) -> str:
             beyond = decades > limit
@@ -78,7 +79,7 @@ def _grown(
         state, tangent = carry
 
         def run(state: State) -> tuple[State, Array]:
-            u = inputs if given is None else given
+            u = inputs if callable(inputs) else given
             found = simulate(
                 system, state, dt=dt, steps=length, inputs=u, save_every=length, throw=False, scheme=scheme
             )
@@ -91,9 +92,7 @@ def _grown(
         return (after, moved), (after.t, jnp.where(result == 0, jnp.log10(known), jnp.nan), result)
 
     first = jnp.log10(size(tangent))
-    pieces = None
-    if inputs is not None and not callable(inputs):
-        pieces = inputs.reshape(count, length, *inputs.shape[1:])
+    pieces = None if callable(inputs) else inputs.reshape(count, length, *inputs.shape[1:])
     _, (t, decades, results) = jax.lax.scan(segment, (state, tangent), pieces, length=count)
     total = jnp.cumsum(decades.at[0].add(-first))
     return t, total, jnp.max(results)
@@ -145,12 +144,9 @@ def tangent_growth(
     """
     state = scheme.started(state)
     step = checked_step(dt)
-    _, count = checked_inputs(system, inputs, steps, scheme.stages)
+    inputs, count = checked_inputs(system, inputs, steps, scheme.stages)
     if save_every < 1 or count % save_every:
         raise ValueError(f"save_every is {save_every}; pass a positive divisor of steps = {count}")
-    if inputs is not None and not callable(inputs):
-        inputs = jnp.asarray(inputs, float)
-        inputs = jnp.broadcast_to(inputs, (count, *inputs.shape)) if inputs.ndim == 1 else inputs
     still = jax.tree.map(jnp.zeros_like, state)
     push = np.random.default_rng(seed).normal(size=state.v.shape)
     given = state, replace_fields(still, v=jnp.asarray(push)), inputs

@@ -227,7 +227,9 @@ def explain(system: "System", trajectory: Trajectory) -> str:
     if result == Result.SUCCESSFUL:
         return text
     text += f" in step {int(trajectory.failed_step)} at t = {float(trajectory.failed_time):.6g} s"
-    broken = ~np.all(np.isfinite(np.asarray(trajectory.inputs)), axis=0)
+    # The first interval without an end holds the inputs of the step that failed.
+    failed = int(np.argmax(np.diff(np.asarray(trajectory.t)) == 0))
+    broken = ~np.isfinite(np.asarray(trajectory.inputs)[failed])
     if result == Result.NONFINITE and broken.any():
         # Such a number spoils all unknowns of the step, of which the first would be named.
         names = [repr(name) for name, bad in zip(system.structure.inputs, broken) if bad]
