@@ -34,19 +34,24 @@ from natcoord_jax.assembly.response import (
     situation,
     stations,
 )
-from natcoord_jax.assembly.sweeps import sweep_motion
+from natcoord_jax.assembly.sweeps import sweep_motion, turned_directors
 from natcoord_jax.assembly.system import Group, System
 from natcoord_jax.assembly.tangent_space import TangentSpace
 from natcoord_jax.assembly.tree import (
+    SLOTS,
     TreeMotion,
+    frame_axes,
     gather_slots,
     project,
     start_rates,
 )
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
+from natcoord_jax.linsolve.dense import Inverse
+from natcoord_jax.linsolve.stages import fitted, stagewise_inverse
 from natcoord_jax.maths.collocation import Tableau, gauss
 from natcoord_jax.maths.projectors import range_projector
+from natcoord_jax.maths.vectors import dot
 
 NOTHING = Outset(None, None)
 """Of the start of a step that is used for its constraints alone."""
@@ -182,7 +187,22 @@ class ReducedStep(Form):
     def motion(self, w: Float[Array, "s unknowns"]) -> tuple[TreeMotion, Any]:
         """Stage motion of the bodies at given rates, and the geometry of the joints."""
         slots = gather_slots(self.system.tree, w)
-        return sweep_motion(self.system.tree, self.frames, self.start, slots, self.h, self.tableau)
+        turned = None
+        if self._swings:
+            # Another basis of the same motion: derivatives need not know how it turns.
+            turned = turned_directors(self.start, self.velocity, self.h, self.tableau)
+            turned = jax.lax.stop_gradient(turned)
+        given = self.frames, self.start, slots, self.h, self.tableau, turned
+        return sweep_motion(self.system.tree, *given)
+
+    @property
+    def _swings(self) -> bool:
+        """Whether the axes of free bodies' rates turn with them within a step of several stages.
+
+        Along these, springs between the bodies act nearly alike at all stages, however stiff they are.
+        """
+        elastic = any(group.effect.elastic for group in self.groups)
+        return elastic and self.tableau.stages > 1 and bool(self.system.tree.free.members)
 
     def generalised(
         self, geometry: Any, force: Float[Array, "s bodies 3"], torque: Float[Array, "s bodies 3"]
@@ -251,32 +271,54 @@ class ReducedStep(Form):
         """What Newton's iteration takes for the Jacobian where it does not form it by differences."""
         return self.jacobian(y)
 
-    def inertial_jacobian(self) -> Float[Array, "unknowns unknowns"]:
-        """Jacobian for steps of length zero: inertia and constraints at the start, one stage like the other.
+    @property
+    def stage_places(self) -> np.ndarray:
+        """Places (s, n) among the unknowns of the rates and multipliers of each stage."""
+        stages, count = self.tableau.stages, self.system.structure.unknowns
+        rates = np.arange(stages * count).reshape(stages, count)
+        return np.concatenate([rates, self.balances + places_by_stage(self.groups, stages)], axis=1)
 
-        Cheap for several stages, and good enough to start with where the motion is not stiff.
+    def factorised_alike(
+        self, columns: Float[Array, "n unknowns"]
+    ) -> tuple[Inverse, Float[Array, " unknowns"]]:
+        """Factors as of `factorised`, with what changes little within a step taken for constant.
+
+        Args:
+            columns: what changes do that are the same at all stages, one a row.
         """
-        resting = at_rest(self)
-        count, stages = self.system.structure.unknowns, self.tableau.stages
-        unit = jnp.eye(count + self.system.structure.multipliers, dtype=self.start.dtype)
-        base = resting.residual(jnp.zeros_like(unit[0]))[0]
-        one = jax.lax.map(lambda y: resting.residual(y)[0] - base, unit).T
-        places = np.concatenate(
-            [
-                np.arange(stages * count).reshape(stages, count),
-                self.balances + places_by_stage(self.groups, stages),
-            ],
-            axis=1,
+        places, count = self.stage_places, self.system.structure.unknowns
+        size = places.size
+        alike = jnp.moveaxis(columns[:, places], 0, -1)
+        own = self.own_inertia()
+        inertia = jnp.zeros(alike.shape[1:], alike.dtype).at[:count, :count].set(own)
+        damping, stiffness = fitted(alike, inertia, count, self.tableau)
+        stages = jnp.asarray(np.stack([np.diag(self.tableau.a_inverse), np.diag(self.tableau.a)]))
+        found = stages[0, :, None] * jnp.diagonal(inertia) + jnp.diagonal(damping)
+        found = (found + stages[1, :, None] * jnp.diagonal(stiffness))[:, :count]
+        inertias = self._at_least(jnp.abs(found).reshape(-1))
+        inverse = stagewise_inverse(
+            inertia, damping, stiffness, inertias[:count], self.tableau, dependent=self.dependent
         )
-        inverse = jnp.asarray(self.tableau.a_inverse) / gauss(1).a_inverse[0][0]
-        bodies = jnp.arange(unit.shape[0]) < count
-        inertia, rest = (
-            jnp.where(bodies[:, None] & bodies, one, 0.0),
-            jnp.where(bodies[:, None] & bodies, 0.0, one),
-        )
-        blocks = inverse[:, :, None, None] * inertia + jnp.eye(stages)[:, :, None, None] * rest
-        matrix = jnp.zeros((places.size, places.size), one.dtype)
-        return matrix.at[places[:, None, :, None], places[None, :, None, :]].set(blocks)
+        whole = jnp.zeros((size, size), inverse.dtype)
+        whole = whole.at[places[:, :, None, None], places[None, None, :, :]].set(inverse)
+        return Inverse(whole), jnp.zeros(size, inverse.dtype).at[: self.balances].set(inertias)
+
+    def own_inertia(self) -> Float[Array, "unknowns unknowns"]:
+        """Inertia of the free motions at the start of the step, P^T M P."""
+        tangents = self.outset.tangents
+        if tangents is None:
+            tangents = TangentSpace.at(self.system, self.state)
+        tangents = tangents.with_system(self.system)
+        tree = self.system.tree
+        body, kind, axis = tree.slot_of // SLOTS, tree.slot_of % SLOTS // 3, tree.slot_of % SLOTS % 3
+        above = jnp.concatenate([self.start[:, 1:], jnp.eye(3, dtype=self.start.dtype)[None]])[tree.parent]
+        parent = frame_axes(self.frames[:, 0, 1:, 1:], above[None])[0][body, axis]
+        own = frame_axes(self.frames[:, 1, 1:, 1:], self.start[None, :, 1:])[0][body, axis]
+        # There rates are along the axes of the parent, here those of balls along their own.
+        together = (body[:, None] == body) & (kind[:, None] == kind)
+        cosines = jnp.where(together, dot(parent[:, None], own), 0.0)
+        turned = jnp.where(tree.ball[body], cosines, jnp.eye(body.size, dtype=cosines.dtype))
+        return turned.T @ tangents.pulled(tangents.impulses) @ turned
 
     def inertias(self, matrix: Float[Array, "unknowns unknowns"]) -> Float[Array, " balances"]:
         """Inertias of the rates, from the Jacobian and from the mass.
@@ -284,12 +326,14 @@ class ReducedStep(Form):
         Kicks take up what moves against constraints: in the Jacobian the inertia of a rate that is
         prescribed, or that loops forbid, is missing.
         """
-        found = jnp.abs(jnp.diagonal(matrix))[: self.balances]
+        return self._at_least(jnp.abs(jnp.diagonal(matrix))[: self.balances])
+
+    def _at_least(self, found: Float[Array, " balances"]) -> Float[Array, " balances"]:
+        """Inertias, none less than that of the mass at its stage."""
         if self.outset.tangents is None:
             return found
-        tangents = self.outset.tangents.with_system(self.system)
-        own = jnp.diagonal(tangents.pulled(tangents.impulses))
-        stages = jnp.diagonal(jnp.asarray(self.tableau.a_inverse, matrix.dtype))
+        own = jnp.diagonal(self.own_inertia())
+        stages = jnp.diagonal(jnp.asarray(self.tableau.a_inverse, found.dtype))
         return jnp.maximum(found, (stages[:, None] * own).reshape(-1))
 
     def probes(self, y: Float[Array, " unknowns"]) -> Float[Array, " unknowns"]:

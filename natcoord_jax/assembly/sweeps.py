@@ -20,12 +20,15 @@ class Hinging(eqx.Module):
         rows: of the bodies at the start of the step.
         ball: whether the joints leave all rotations free.
         parent_rows: rows of the parents at the start of the step.
+        turned: directors at the stages whose axes the free rotations and translations are taken along; None:
+            those at the start of the step.
     """
 
     frames: Float[Array, "n 2 4 4"]
     rows: Float[Array, "n 4 3"]
     ball: Bool[Array | np.ndarray, " n"]
     parent_rows: Float[Array, "n 4 3"]
+    turned: Float[Array, "s n 3 3"] | None = None
 
 
 def turning(
@@ -88,7 +91,8 @@ def relative_motion(
         cross(parent_axes[:, :, (k + 1) % 3], parent_axes[:, :, (k + 2) % 3]) for k in level.translations
     ]
     if level.balls:
-        own_axes, ball = frame_axes(place[:, 1, 1:, 1:], d0), these.ball[:, None]
+        along = d0 if these.turned is None else these.turned
+        own_axes, ball = frame_axes(place[:, 1, 1:, 1:], along), these.ball[:, None]
         axes = [jnp.where(ball, own_axes[:, :, k], a) for k, a in zip(level.rotations, axes)]
         slides = [jnp.where(ball, own_axes[:, :, k], t) for k, t in zip(level.translations, slides)]
     start = combine(place[:, 1, 1, 1:], d0) if level.child_rotation else None
@@ -121,6 +125,15 @@ def _stack(vectors: list[Array], like: Array) -> Array:
     return jnp.stack(vectors, axis=2)
 
 
+def turned_directors(
+    rows: Float[Array, "bodies 4 3"], velocity: Float[Array, "bodies 4 3"], h: Array, tableau: Tableau
+) -> Float[Array, "s bodies 3 3"]:
+    """Directors at the stages, if all bodies keep the angular velocities of the start of the step."""
+    spin = 0.5 * jnp.sum(cross(rows[:, 1:], velocity[:, 1:]), axis=1)
+    turn = jnp.broadcast_to(h * spin[:, None], (tableau.stages, *rows[:, 1:].shape))
+    return rotate_stages(turn, rows[None, :, 1:], tableau)
+
+
 def sweep_motion(
     tree: Tree,
     frames: Float[Array, "bodies 2 4 4"],
@@ -128,6 +141,7 @@ def sweep_motion(
     slots: Float[Array, "s bodies 7"],
     h: Float[Array, ""],
     tableau: Tableau,
+    turned: Float[Array, "s bodies 3 3"] | None = None,
 ) -> tuple[TreeMotion, list[JointGeometry]]:
     """Motion of all bodies from the rates of the joints, root to leaves, level by level.
 
@@ -138,6 +152,7 @@ def sweep_motion(
         slots: mean rates by body and slot.
         h: step [s].
         tableau: the collocation method.
+        turned: see `Hinging`.
     """
     unit = jnp.eye(3, dtype=rows.dtype)
     spins, velocities, triads, geometry = [], [], [], []
@@ -151,7 +166,8 @@ def sweep_motion(
             up = tree.parent_in_level[here]
             spin_p, velocity_p, d_p = spins[-1][:, up], velocities[-1][:, up], triads[-1][:, up]
             parent_rows = rows[tree.parent[here]]
-        these = Hinging(frames[here], rows[here], tree.ball[here], parent_rows)
+        along = None if turned is None else turned[:, here]
+        these = Hinging(frames[here], rows[here], tree.ball[here], parent_rows, along)
         spin, relative, d, joint = relative_motion(level, these, spin_p, d_p, slots[:, here], h, tableau)
         geometry.append(joint)
         spins.append(spin)

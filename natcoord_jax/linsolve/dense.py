@@ -45,12 +45,20 @@ def saddle_inverse(
     size, definite = matrix.shape[-1], inertias.shape[0]
     if size == definite:
         return definite_inverse(matrix)
+    shift = constraint_shifts(matrix, inertias, dependent=dependent)
+    diagonal = jnp.concatenate([jnp.zeros(definite, matrix.dtype), shift])
+    return pivoted_inverse(matrix + jnp.diag(diagonal))
+
+
+def constraint_shifts(
+    matrix: Float[Array, "n n"], inertias: Float[Array, " balances"], *, dependent: bool
+) -> Float[Array, " multipliers"]:
+    """Small positive numbers for the diagonal of the constraint rows, see `saddle_inverse`."""
+    definite = inertias.shape[0]
     coupling = jnp.abs(matrix[definite:, :definite])
     scale = jnp.max(coupling**2 / jnp.where(inertias > 0, inertias, 1.0), axis=1)
     least = (1.0 if dependent else 1e-16) * jnp.max(scale)
-    shift = 1e-10 * jnp.maximum(jnp.maximum(scale, least), jnp.finfo(matrix.dtype).tiny)
-    diagonal = jnp.concatenate([jnp.zeros(definite, matrix.dtype), shift])
-    return pivoted_inverse(matrix + jnp.diag(diagonal))
+    return 1e-10 * jnp.maximum(jnp.maximum(scale, least), jnp.finfo(matrix.dtype).tiny)
 
 
 def apply(inverse: Float[Array, "n n"], right: Float[Array, " n"]) -> Float[Array, " n"]:

@@ -188,7 +188,12 @@ def no_factors(equations: Any) -> Factors:
 
 def factors_of(equations: Any, matrix: Any, noise: Array | float = 0.0) -> Factors:
     """Factors of a Jacobian."""
-    solver, inertias = equations.factorised(matrix)
+    return new_factors(equations.factorised(matrix), noise)
+
+
+def new_factors(made: tuple[Any, Array], noise: Array | float = 0.0) -> Factors:
+    """Factors that have just been made, with the inertias of the unknowns."""
+    solver, inertias = made
     yes, noise = jnp.array(True), jnp.asarray(noise, inertias.dtype)
     return Factors(solver, inertias, yes, yes, jnp.array(NEVER), jnp.array(0), noise)
 

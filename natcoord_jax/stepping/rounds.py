@@ -19,7 +19,7 @@ from natcoord_jax.assembly.equations import kind_of, prepare
 from natcoord_jax.assembly.outset import Outset
 from natcoord_jax.core.state import State
 from natcoord_jax.stepping.course import Course, Setting, start_of
-from natcoord_jax.stepping.newton import Factors, Iterate, any_lane, factors_of
+from natcoord_jax.stepping.newton import Factors, Iterate, any_lane
 from natcoord_jax.stepping.one_kernel import as_one_kernel
 from natcoord_jax.stepping.probe import Probe
 from natcoord_jax.stepping.trip import Asked, Carried, renewed_at, trip, with_state
@@ -77,14 +77,9 @@ def _every_slot(
     """All slots, in one loop."""
     plan, it = setting.plan, course.it
     by_differences = kind_of(setting.system, plan.tableau).by_differences
-    probe = Probe.first(it.y.shape[0], x.dtype) if by_differences else None
+    probe = Probe.first(it.y.shape[0], plan.tableau.stages, x.dtype) if by_differences else None
     # A row beyond the last goes to the last.
     record = _record(course, x, length if plan.recorded else 1)
-    if plan.tableau.stages > 1 and by_differences:
-        u, h, _ = setting.situation(with_state(course, unpack(x)))
-        equations = prepare(setting.system, unpack(x), u, h, plan.tableau, outset)
-        factors = factors_of(equations, equations.inertial_jacobian())
-        factors = eqx.tree_at(lambda f: f.fresh, factors, jnp.array(False))
     start = Carried(jnp.array(0), course, x, outset, factors, probe, record, jnp.array(0), None)
     going = partial(_unfinished, setting, length)
     return jax.lax.while_loop(going, partial(trip, setting, unpack, False), start)

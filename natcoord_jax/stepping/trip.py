@@ -16,7 +16,7 @@ from natcoord_jax.assembly.outset import Outset
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.rows import row, with_row
 from natcoord_jax.stepping.course import Course, Setting, after_attempt
-from natcoord_jax.stepping.newton import Factors, Iterate, any_lane, factors_of, judge, refreshed
+from natcoord_jax.stepping.newton import Factors, Iterate, any_lane, factors_of, judge, new_factors, refreshed
 from natcoord_jax.stepping.probe import Probe
 from natcoord_jax.stepping.step import end_of_step
 
@@ -125,7 +125,8 @@ def trip(setting: Setting, unpack: Callable[[Array], State], apart: bool, carrie
         ),
     )
     if probe is not None:
-        probe, wanting = probe.with_column(it.y, found.residual, equations, wanting)
+        rounds = any_lane(after.it.rounds)
+        probe, wanting = probe.with_column(it.y, found.residual, equations, wanting, rounds)
 
     # Evaluated where the new factors belong, unless these begin anew where the step began.
     here = jnp.all(after.it.y == carried.course.it.y)
@@ -137,12 +138,25 @@ def trip(setting: Setting, unpack: Callable[[Array], State], apart: bool, carrie
     def renewed(carry: tuple) -> tuple:
         _, it, factors = carry
         if probe is not None:
-            made = factors_of(equations, probe.columns[:-1].T, factors.noise)
-            return jnp.array(False), refreshed(it), made
+            return jnp.array(False), refreshed(it), _by_differences(equations, probe, factors.noise)
         return jnp.array(False), *renewed_at(setting, equations, it, factors, asked)
 
     _, it, factors = jax.lax.while_loop(lambda carry: carry[0], renewed, (wanting, after.it, factors))
     return eqx.tree_at(lambda c: (c.course.it, c.factors), carried, (it, factors))
+
+
+def _by_differences(equations: Any, probe: Probe, noise: Array) -> Factors:
+    """Factors of the Jacobian that is complete."""
+
+    def whole() -> tuple:
+        return equations.factorised(probe.columns[:-1].T)
+
+    def alike() -> tuple:
+        return equations.factorised_alike(probe.columns[: equations.stage_places.shape[1]])
+
+    if equations.tableau.stages == 1:
+        return new_factors(whole(), noise)
+    return new_factors(jax.lax.cond(probe.alike, alike, whole), noise)
 
 
 def _judging(equations: Any, it: Iterate, probe: Probe | None) -> tuple[int, dict[str, Any]]:
