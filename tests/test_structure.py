@@ -235,6 +235,35 @@ def test_solvers_give_one_trajectory(solver):
     assert np.max(np.abs(q - np.asarray(b.q).reshape(q.shape))) <= tol.SAME_TRAJECTORY
 
 
+def blocks_on_springs(count, closed, solver=None):
+    """Free blocks in a row, or in a ring, on springs and dampers between their corners."""
+    scene = nc.Scene()
+    scene.add(nc.Gravity())
+    blocks = [
+        scene.add(nc.RigidBody(mass=1.0 + k, inertia=(0.1, 0.2, 0.25), position=(0.5 * k, 0.0, 0.0)))
+        for k in range(count)
+    ]
+    pairs = list(zip(blocks, blocks[1:])) + [(nc.ground, blocks[0])] + [(blocks[-1], blocks[0])] * closed
+    for k, (one, other) in enumerate(pairs):
+        ends = nc.Point(one, (0.5 * k + 0.1, 0.1, 0.0)), nc.Point(other, (0.5 * k + 0.4, 0.0, 0.1))
+        kinds = nc.Spring(ends, stiffness=300.0, length=0.3), nc.Damper(ends, damping=0.5)
+        for kind in kinds[: 1 + k % 2]:
+            scene.add(kind)
+    return scene.compile(solver=solver)
+
+
+def test_chains_on_springs_are_solved_along_the_chain():
+    system, state = blocks_on_springs(7, closed=False)
+    assert system.structure.solver == "recursive"
+    assert blocks_on_springs(7, closed=True)[0].structure.solver != "recursive"
+    whole, start = blocks_on_springs(7, closed=False, solver="full")
+    for order in (2, 4):
+        scheme = nc.EnergyMomentum(order)
+        a = nc.simulate(system, state, dt=0.02, steps=25, scheme=scheme)
+        b = nc.simulate(whole, start, dt=0.02, steps=25, scheme=scheme)
+        assert jnp.max(jnp.abs(a.q - b.q)) <= tol.SAME_TRAJECTORY
+
+
 @cache
 def gradient_and_curvature(solver):
     """Reverse, and forward over reverse, with respect to the inputs."""

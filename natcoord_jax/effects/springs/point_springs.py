@@ -35,6 +35,7 @@ class Spring(Potential):
     length: Any = eqx.field(default=0.0, kw_only=True)
 
     kind: ClassVar[str] = "spring"
+    couples: ClassVar[bool] = True
 
     def __check_init__(self) -> None:
         require_markers(self.kind, self.markers, 2, 0)
@@ -61,6 +62,7 @@ class QuadraticSpring(Potential):
     length: Any = eqx.field(default=0.0, kw_only=True)
 
     kind: ClassVar[str] = "quadratic spring"
+    couples: ClassVar[bool] = True
     degree: ClassVar[int | None] = 2
 
     def __check_init__(self) -> None:
@@ -86,6 +88,7 @@ class NonlinearSpring(Potential):
     law: Any = eqx.field(kw_only=True)
 
     kind: ClassVar[str] = "nonlinear spring"
+    couples: ClassVar[bool] = True
 
     def __check_init__(self) -> None:
         require_markers(self.kind, self.markers, 2, 0)
@@ -110,6 +113,7 @@ class Damper(Force):
     damping: Any = eqx.field(kw_only=True)
 
     kind: ClassVar[str] = "damper"
+    couples: ClassVar[bool] = True
 
     def __check_init__(self) -> None:
         require_markers(self.kind, self.markers, 2, 0)
