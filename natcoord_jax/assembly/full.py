@@ -154,6 +154,7 @@ class FullStep(Form):
             self.system,
             self.state,
             self.outset.tangents,
+            self.outset.lag,
             self.groups,
             self.situations,
             at,

@@ -23,6 +23,7 @@ chosen, and redundant constraints are no special case.
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -30,6 +31,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from natcoord_jax.assembly.coordinates import stage_rates
+from natcoord_jax.assembly.lag import NEGLIGIBLE, NEGLIGIBLE_ENERGY, Lag
 from natcoord_jax.assembly.response import Situation, Stations
 from natcoord_jax.assembly.system import Group, System
 from natcoord_jax.assembly.tangent_space import TangentSpace, Velocity
@@ -50,11 +52,21 @@ UNSOUND = 1e-11
 
 
 class Kick(eqx.Module):
-    """The kick of a step, and what is admitted at its ends."""
+    """The kick of a step, and what is admitted at its ends.
+
+    Attributes:
+        kick: that the stages begin with.
+        before: tangent space at the start of the step.
+        after: at its end.
+        exact: the kick that belongs to the stages; the same, but for what is negligible.
+        change: by which it differs from that which was held before, if that is not negligible [sqrt(J)].
+    """
 
     kick: Velocity
     before: TangentSpace
     after: TangentSpace
+    exact: Velocity
+    change: Float[Array, ""]
 
 
 class Ends(eqx.Module):
@@ -95,6 +107,7 @@ def kick_of(
     at: Stations,
     h: Array,
     tableau: Tableau,
+    lag: Lag | None = None,
 ) -> Kick:
     """The kick that belongs to given stages.
 
@@ -106,6 +119,7 @@ def kick_of(
         at: stage motion.
         h: step [s].
         tableau: the collocation method.
+        lag: with the kick at hand, which serves if it differs by nothing but what is negligible.
     """
     beta, sigma = jnp.asarray(tableau.beta), tableau.reflection
     end = end_of(state, at, h, tableau)
@@ -119,7 +133,16 @@ def kick_of(
         sigma * (carried[0] - drift.rows) - state.v.reshape(-1, 4, 3),
         sigma * (carried[1] - drift.rotors) - state.rates,
     )
-    return Kick(_kick(before, after, d), before, after)
+    found = _kick(before, after, d)
+    if lag is None:
+        return Kick(found, before, after, found, jnp.zeros_like(h))
+    change = Velocity(found.rows - lag.held.rows, found.rotors - lag.held.rotors)
+    motion = jnp.maximum(before.energy(Velocity(state.v.reshape(-1, 4, 3), state.rates)), before.energy(d))
+    size, kick, motion = (jnp.sqrt(2.0 * x) for x in (before.energy(change), before.energy(found), motion))
+    serves = (size <= NEGLIGIBLE * motion) & (size * kick <= NEGLIGIBLE_ENERGY * motion**2)
+    kept = (serves & ~lag.everywhere) | lag.held_fast
+    used = jax.tree.map(lambda x, y: jnp.where(kept, x, y), lag.held, found)
+    return Kick(used, before, after, found, jnp.where(serves, 0.0, size))
 
 
 def _both(system: System, start: State, end: State) -> tuple[TangentSpace, TangentSpace]:
@@ -196,20 +219,54 @@ def kicked(
     system: System,
     state: State,
     tangents: TangentSpace | None,
+    lag: Lag | None,
     groups: Sequence[Group],
     situations: Sequence[Situation],
     at: Stations,
     h: Array,
     tableau: Tableau,
 ) -> tuple[Array, Sequence[Situation], Kick | None]:
-    """What the stages begin with: velocities of rows, situations with rates of rotors; and the kick."""
+    """What the stages begin with: velocities of rows, situations with rates of rotors; and the kick.
+
+    Where the kick lags behind the stages and is not due, it is that which is held, and nothing else of it is
+    of use.
+    """
     velocity = state.v.reshape(-1, 4, 3)
     if not tableau.kick:
         return velocity, situations, None
     before = None if tangents is None else tangents.with_system(system)
-    found = kick_of(system, state, before, groups, at, h, tableau)
+    if lag is None:
+        found = kick_of(system, state, before, groups, at, h, tableau)
+    else:
+        found = _lagging(lag, system, state, before, groups, at, h, tableau)
     moved = with_rotors(groups, situations, state.rates + found.kick.rotors)
     return velocity + found.kick.rows, moved, found
+
+
+def _lagging(lag: Lag, system: System, *given: Any) -> Kick:
+    """The kick, found anew if it is due."""
+
+    def anew() -> Kick:
+        return _without_system(kick_of(system, *given, lag=lag))
+
+    def renewed(_: tuple[Array, Kick]) -> tuple[Array, Kick]:
+        return jnp.array(False), anew()
+
+    blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(anew))
+    start = eqx.tree_at(lambda found: (found.kick, found.exact), blank, (lag.held, lag.held))
+    # A loop of no or one trip leaves what it carries where it is; a conditional would copy it.
+    _, found = jax.lax.while_loop(lambda carry: carry[0], renewed, (lag.due, start))
+    return eqx.tree_at(
+        lambda x: (x.before, x.after),
+        found,
+        (found.before.with_system(system), found.after.with_system(system)),
+    )
+
+
+def _without_system(found: Kick) -> Kick:
+    return eqx.tree_at(
+        lambda x: (x.before, x.after), found, (found.before.without_system(), found.after.without_system())
+    )
 
 
 def with_rotors(

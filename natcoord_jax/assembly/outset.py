@@ -4,6 +4,7 @@ import equinox as eqx
 from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.dissipation import Damping
+from natcoord_jax.assembly.lag import Lag
 from natcoord_jax.assembly.system import System
 from natcoord_jax.assembly.tangent_space import TangentSpace
 from natcoord_jax.core.state import State
@@ -18,11 +19,13 @@ class Outset(eqx.Module):
             independent.
         tangents: tangent space, without the system; None for schemes without kicks, or if found later.
         damping: what can be damped; None for schemes that do not dissipate, or if found later.
+        lag: kick at hand, while the equations are being solved; None: it is found in every evaluation.
     """
 
     projector: Float[Array, "m m"] | None
     tangents: TangentSpace | None
     damping: Damping | None = None
+    lag: Lag | None = None
 
     @classmethod
     def of(

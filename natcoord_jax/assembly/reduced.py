@@ -233,6 +233,7 @@ class ReducedStep(Form):
             self.system,
             self.state,
             self.outset.tangents,
+            self.outset.lag,
             self.groups,
             self.situations,
             at,

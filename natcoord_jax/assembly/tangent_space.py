@@ -140,6 +140,11 @@ class TangentSpace(eqx.Module):
         lost = Velocity(v.rows - found.rows, v.rotors - found.rotors)
         return self.spread(w + known.frame.T @ known.within(self.framed(lost)))
 
+    def normal(self, v: Velocity) -> Velocity:
+        """What of a velocity is orthogonal to all that the constraints admit."""
+        along = self.along(self.admissible.within(self.framed(v)))
+        return Velocity(v.rows - along.rows, v.rotors - along.rotors)
+
     def with_momentum(self, momentum: Float[Array, " u"]) -> Velocity:
         """The admissible velocity with given momenta P^T M v; projected twice, as above."""
         known = self.admissible

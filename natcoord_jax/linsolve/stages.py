@@ -116,9 +116,9 @@ def stagewise_inverse(
     if size > definite:
         shift = shift.at[definite:].set(constraint_shifts(damping, inertias, dependent=dependent))
     whole = damping + jnp.diag(shift)
-    up, down = (jnp.asarray(x)[:, None, None] for x in (values, 1.0 / values))
-    real = jnp.real(down) * inertia + whole + jnp.real(up) * stiffness
-    imaginary = jnp.imag(down) * inertia + jnp.imag(up) * stiffness
+    up, down = values[:, None, None], 1.0 / values[:, None, None]
+    real = jnp.asarray(np.real(down)) * inertia + whole + jnp.asarray(np.real(up)) * stiffness
+    imaginary = jnp.asarray(np.imag(down)) * inertia + jnp.asarray(np.imag(up)) * stiffness
     inverses = jnp.concatenate(jax.vmap(complex_inverse)(real, imaginary))
     weights = jnp.asarray(np.concatenate([np.real(couplings), -np.imag(couplings)]))
     return jnp.sum(weights[:, :, None, :, None] * inverses[:, None, :, None, :], axis=0)

@@ -8,8 +8,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from natcoord_jax.assembly.equations import prepare
+from natcoord_jax.assembly.lag import Lagging, from_body_axes, in_body_axes
 from natcoord_jax.assembly.outset import Outset
 from natcoord_jax.assembly.system import System
+from natcoord_jax.assembly.tangent_space import Velocity
 from natcoord_jax.core.results import Result
 from natcoord_jax.core.state import State
 from natcoord_jax.stepping.error_control import Tolerance, Trial, Verdict, follow
@@ -30,7 +32,7 @@ class Course(eqx.Module):
     Attributes:
         state: at the start of the attempt at hand.
         it: its iteration.
-        past: solutions of earlier attempts.
+        past: solutions of earlier attempts, and the kicks with them in the axes of the bodies.
         step: steps completed.
         done: part of the step at hand that is done.
         fraction: part of it that is attempted.
@@ -43,6 +45,7 @@ class Course(eqx.Module):
         iterations_max: in one of them.
         residual: largest accepted.
         trial: where a substep with error control stands.
+        lagging: what is known of the kick; None for schemes without.
     """
 
     state: State
@@ -60,6 +63,7 @@ class Course(eqx.Module):
     iterations_max: Int[Array, ""]
     residual: Float[Array, ""]
     trial: Trial | None
+    lagging: Lagging | None
 
 
 class Setting(eqx.Module):
@@ -116,10 +120,15 @@ def start_of(setting: Setting, state: State) -> tuple[Course, Factors, Outset]:
     it, factors = begin(equations.guess(), few), no_factors(equations)
     zero, nought = jnp.array(0), jnp.zeros((), state.q.dtype)
     bad = ~(jnp.isfinite(dt) & (dt > 0))
+    lagging = None
+    if plan.tableau.kick:
+        lagging = Lagging.begin(
+            Velocity(jnp.zeros_like(state.q.reshape(-1, 4, 3)), jnp.zeros_like(state.rates))
+        )
     course = Course(
         state=state,
         it=it,
-        past=Past.of(it.y),
+        past=Past.of(it.y if lagging is None else jnp.concatenate([it.y, in_body_axes(state, lagging.held)])),
         step=zero,
         done=nought,
         fraction=nought + 1.0,
@@ -132,6 +141,7 @@ def start_of(setting: Setting, state: State) -> tuple[Course, Factors, Outset]:
         iterations_max=zero,
         residual=nought,
         trial=None if setting.tolerance is None else Trial.first(state),
+        lagging=lagging,
     )
     return course, factors, equations.outset
 
@@ -154,7 +164,13 @@ def _halve(course: Course, after: State, solved: Array, over: Array) -> Verdict:
     )
 
 
-def after_attempt(setting: Setting, course: Course, inertias: Array, found: tuple[State, Array]) -> Course:
+def after_attempt(
+    setting: Setting,
+    course: Course,
+    inertias: Array,
+    found: tuple[State, Array],
+    kick: Velocity | None = None,
+) -> Course:
     """The end of an attempt: what is attempted next, and from where.
 
     Args:
@@ -162,6 +178,7 @@ def after_attempt(setting: Setting, course: Course, inertias: Array, found: tupl
         course: with the solved iteration.
         inertias: of the unknowns.
         found: state at the end of the attempt, and its largest half turn.
+        kick: of the attempt.
     """
     plan, it, over = setting.plan, course.it, setting.over(course)
     new, half_turn = found
@@ -192,17 +209,26 @@ def after_attempt(setting: Setting, course: Course, inertias: Array, found: tupl
         fraction = jnp.where(complete, trial.length, fraction)
     kept, worked = verdict.change > 0, jnp.where(over, 0, it.total)
     # Guesses hold for steps of one length: another length begins anew from the last solution.
+    solution, size = it.y, it.y.shape[0]
+    if kick is not None:
+        # What the past says of kicks is measured by the rates that go with them.
+        kicks = in_body_axes(course.state, kick)
+        solution = jnp.concatenate([it.y, kicks])
+        inertias = jnp.concatenate([inertias, jnp.zeros_like(kicks)])
     alone = Past(course.past.differences, jnp.ones_like(course.past.known), jnp.zeros_like(course.past.order))
     if trial is not None:
-        alone = alone.beginning_with(it.y, solved)
-    followed = course.past.followed_by(it.y, inertias)
+        alone = alone.beginning_with(solution, solved)
+    followed = course.past.followed_by(solution, inertias)
     past = jax.tree.map(lambda x, y: jnp.where(kept, x, y), followed, alone)
     same = fraction == course.fraction
     past = Past(past.differences, jnp.where(same, past.known, 1), jnp.where(same, past.order, 0))
-    guess = jnp.where(jnp.all(jnp.isfinite(past.guess)), past.guess, it.start)
+    guess, lagging = past.guess, course.lagging
+    sound = jnp.all(jnp.isfinite(guess))
+    if lagging is not None:
+        lagging = lagging.beginning(from_body_axes(verdict.state, jnp.where(sound, guess[size:], 0.0)))
     return Course(
         state=verdict.state,
-        it=begin(guess, few=trial is not None),
+        it=begin(jnp.where(sound, guess[:size], it.start), few=trial is not None),
         past=past,
         step=course.step + complete,
         done=done,
@@ -216,4 +242,5 @@ def after_attempt(setting: Setting, course: Course, inertias: Array, found: tupl
         iterations_max=jnp.maximum(course.iterations_max, worked),
         residual=jnp.where(kept, jnp.maximum(course.residual, it.error), course.residual),
         trial=trial,
+        lagging=lagging,
     )

@@ -217,6 +217,8 @@ def judge(
     *,
     balances: bool,
     patience: int,
+    jumped: Bool[Array, ""] | bool = False,
+    whole: Bool[Array, ""] | bool = True,
 ) -> Iterate:
     """What follows from one evaluation of the equations at `it.y`.
 
@@ -229,6 +231,8 @@ def judge(
         balances: whether the residual itself counts, too. An error of multipliers alone moves nothing, but
             shows in the balances, and in the work of drives.
         patience: corrections that are cheaper than a new Jacobian.
+        jumped: whether the equations are not those of the last evaluation: corrections do not compare.
+        whole: whether they are all that the end of a step asks for; if not, the next evaluation is the last.
 
     Returns:
         Converged; or moved by one correction; or in want of new factors, when corrections shrink too slowly
@@ -240,7 +244,7 @@ def judge(
         real = factors.inertias > 0
         energies = energies + jnp.where(real, residual**2 / jnp.where(real, factors.inertias, 1.0), 0.0)
     correction = jnp.sqrt(jnp.sum(energies))
-    first = it.count == 0
+    first = (it.count == 0) | jumped
     ratio = correction / jnp.where(it.correction > 0, it.correction, 1.0)
     trusted = jnp.maximum(ratio, SLOWEST_UNSEEN)
     predicted = correction * jnp.where(first, 1.0, trusted / jnp.maximum(1.0 - trusted, 1e-3))
@@ -256,7 +260,8 @@ def judge(
     slow = slow | (it.count >= max(CHORD_ITERATIONS, 2 * patience)) | ~factors.usable
     # Old factors may have led astray: new ones begin where the first did.
     lost = ~finite & ~factors.fresh
-    solved, slow = solved & finite & factors.usable, (slow & finite) | lost
+    ready, slow = solved & finite & factors.usable, (slow & finite) | lost
+    solved, slow = ready & whole, slow & ~ready
     y = jnp.where(solved | slow | ~finite, it.y, it.y - change)
     following = Iterate(
         it.start,
@@ -268,9 +273,9 @@ def judge(
         it.total + ~solved,
         it.rounds,
         it.most,
-        predicted <= jnp.maximum(tolerance, factors.rounding) * size,
+        ready | (predicted <= jnp.maximum(tolerance, factors.rounding) * size),
         solved,
-        slow & ~solved,
+        slow,
         finite | lost,
     )
     # Lanes that are done, or that wait for factors, stay as they are.

@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from natcoord_jax.assembly.equations import prepare, starting
 from natcoord_jax.assembly.kick import Kick
+from natcoord_jax.assembly.lag import Lag
 from natcoord_jax.assembly.outset import Outset
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.rows import row, with_row
@@ -74,13 +75,22 @@ def trip(setting: Setting, unpack: Callable[[Array], State], apart: bool, carrie
     course = with_state(carried.course, unpack(carried.state))
     it, over = course.it, setting.over(course)
     u, h, index = setting.situation(course)
-    equations = prepare(setting.system, course.state, u, h, plan.tableau, carried.outset)
-    found = equations.evaluate(it.y if probe is None else probe.moved(it.y, equations))
     probing = jnp.array(False) if probe is None else probe.at >= 0
+    lag, lagging = lag_of(course, over, probing), course.lagging
+    outset = eqx.tree_at(lambda o: o.lag, carried.outset, lag, is_leaf=_is_none)
+    equations = prepare(setting.system, course.state, u, h, plan.tableau, outset)
+    found = equations.evaluate(it.y if probe is None else probe.moved(it.y, equations))
     cost, options = _judging(equations, it, probe)
+    if lag is not None and lagging is not None:
+        options |= {"jumped": lagging.jumped(found.kick, lag, it), "whole": lag.due}
     judged = judge(factors, plan.tolerance, it, found.residual, found.size, **options)
+    if lag is not None and lagging is not None:
+        moving = ~probing & it.unsolved & ~it.wanting
+        lagging = lagging.after(found.kick, lag.due, judged.correction, it.total == 0, moving)
     it = jax.tree.map(partial(jnp.where, probing), it, judged)
     ending = ~probing & ~any_lane(it.unsolved & ~over)
+    if lag is not None:
+        ending = ending & lag.due
     wanting = ~probing & ~ending & any_lane(it.wanting & it.unsolved & ~over)
 
     def ended(carry: tuple) -> tuple:
@@ -88,7 +98,8 @@ def trip(setting: Setting, unpack: Callable[[Array], State], apart: bool, carrie
         before = with_state(before, unpack(x))
         groups, tableau = equations.groups, plan.tableau
         ends = end_of_step(setting.system, before.state, h, groups, found, tableau)
-        after = after_attempt(setting, before, factors.inertias, ends)
+        kick = None if found.kick is None else found.kick.exact
+        after = after_attempt(setting, before, factors.inertias, ends, kick)
         accepted = after.taken > before.taken
         x = ravel_pytree(after.state)[0]
         slot = x, before.it.y, index, before.fraction, before.done, accepted, after.step
@@ -96,12 +107,16 @@ def trip(setting: Setting, unpack: Callable[[Array], State], apart: bool, carrie
             record = _taken_back(record, carried.count - 1 - carried.first, after.trial.undone, x)
         record = tuple(with_row(b, carried.count - carried.first, r) for b, r in zip(record, slot))
         outset = _outset_after(setting, after, accepted, carried.outset, found.kick)
+        if after.lagging is not None and outset.tangents is not None:
+            # A kick that is not normal would change momenta.
+            held = outset.tangents.with_system(setting.system).normal(after.lagging.held)
+            after = eqx.tree_at(lambda c: c.lagging.held, after, held)
         return jnp.array(False), with_state(after, None), x, outset, record
 
     # Loops of no or one trip leave what they carry where it is; a conditional would copy it.
     start = (
         ending,
-        eqx.tree_at(lambda c: c.it, carried.course, it),
+        eqx.tree_at(lambda c: (c.it, c.lagging), carried.course, (it, lagging), is_leaf=_is_none),
         carried.state,
         carried.outset,
         carried.record,
@@ -143,6 +158,19 @@ def trip(setting: Setting, unpack: Callable[[Array], State], apart: bool, carrie
 
     _, it, factors = jax.lax.while_loop(lambda carry: carry[0], renewed, (wanting, after.it, factors))
     return eqx.tree_at(lambda c: (c.course.it, c.factors), carried, (it, factors))
+
+
+def lag_of(course: Course, over: Array, probing: Array) -> Lag | None:
+    """What the evaluation of the equations is told of the kick, if there is any."""
+    lagging, it = course.lagging, course.it
+    if lagging is None:
+        return None
+    going = it.unsolved & ~over
+    # Lanes that are done wait for the others; the last evaluation has the kicks of all.
+    wanted = any_lane(lagging.wanted(it) & going) | ~any_lane(going)
+    closed = lagging.closed > 0
+    due = jnp.where(probing, any_lane(closed & ~over), wanted)
+    return Lag(lagging.held, due, closed, probing & ~closed)
 
 
 def _by_differences(equations: Any, probe: Probe, noise: Array) -> Factors:
