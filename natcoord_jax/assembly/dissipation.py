@@ -118,7 +118,7 @@ class Damping(eqx.Module):
         strength, part = ONSET * h**2, (1.0 - rho) / (1.0 + rho)
         v = Velocity(state.v.reshape(-1, 4, 3), state.rates)
         known = space.admissible
-        w = known.frame.T @ known.within(space.framed(v)) + space.drift
+        w = known.frame.T @ known.within(space.framed(v)) + space.drift_rates
         along = space.projected(v)
         normal = Velocity(v.rows - along.rows, v.rotors - along.rotors)
         # Per component along the frame of what the constraints admit.

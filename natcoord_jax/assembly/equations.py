@@ -8,9 +8,9 @@ from natcoord_jax.assembly.full import FullStep
 from natcoord_jax.assembly.outset import Outset
 from natcoord_jax.assembly.recursive import RecursiveStep
 from natcoord_jax.assembly.reduced import ReducedStep
+from natcoord_jax.assembly.separate import Tangents
 from natcoord_jax.assembly.sparse import SparseStep
 from natcoord_jax.assembly.system import System
-from natcoord_jax.assembly.tangent_space import TangentSpace
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import Tableau
 
@@ -38,7 +38,7 @@ def starting(
     system: System,
     state: State,
     tableau: Tableau,
-    tangents: TangentSpace | None = None,
+    tangents: Tangents | None = None,
     later: bool = False,
 ) -> Outset:
     """What the equations of a step that starts from a state need of it, see `Outset.of`."""

@@ -29,8 +29,8 @@ from natcoord_jax.assembly.response import (
     situation,
     stations,
 )
+from natcoord_jax.assembly.separate import Tangents
 from natcoord_jax.assembly.system import Group, System
-from natcoord_jax.assembly.tangent_space import TangentSpace
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import Tableau, gauss
 from natcoord_jax.maths.projectors import range_projector
@@ -78,7 +78,7 @@ class FullStep(Form):
         system: System,
         state: State,
         tableau: Tableau,
-        tangents: TangentSpace | None = None,
+        tangents: Tangents | None = None,
         later: bool = False,
     ) -> Outset:
         """What a step needs of its start, see `Outset.of`."""

@@ -33,16 +33,12 @@ from jaxtyping import Array, Bool, Float
 from natcoord_jax.assembly.coordinates import stage_rates
 from natcoord_jax.assembly.lag import NEGLIGIBLE, NEGLIGIBLE_ENERGY, Lag
 from natcoord_jax.assembly.response import Situation, Stations
+from natcoord_jax.assembly.separate import Tangents, tangents_at
 from natcoord_jax.assembly.system import Group, System
-from natcoord_jax.assembly.tangent_space import TangentSpace, Velocity
+from natcoord_jax.assembly.tangent_space import Velocity
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import Tableau
-from natcoord_jax.maths.elimination import definite_inverse
-
-POLISHING = 9
-"""Newton-Schulz iterations for the direct rotation of subspaces: enough for cosines from 0.4 on."""
-
 
 LARGEST = 0.5
 """Kinetic energy of a kick in terms of that of the motion, twice, beyond which a step is refused."""
@@ -63,8 +59,8 @@ class Kick(eqx.Module):
     """
 
     kick: Velocity
-    before: TangentSpace
-    after: TangentSpace
+    before: Tangents
+    after: Tangents
     exact: Velocity
     change: Float[Array, ""]
 
@@ -102,7 +98,7 @@ def rotor_rates(system: System, groups: Sequence[Group], at: Stations, h: Array)
 def kick_of(
     system: System,
     state: State,
-    before: TangentSpace | None,
+    before: Tangents | None,
     groups: Sequence[Group],
     at: Stations,
     h: Array,
@@ -126,14 +122,15 @@ def kick_of(
     if before is None:
         before, after = _both(system, state, end)
     else:
-        after = TangentSpace.at(system, end)
-    drift = after.spread(after.drift)
+        after = tangents_at(system, end)
+    drift = after.drift
     carried = jnp.tensordot(beta, at.rates[:, :-1], 1), beta @ rotor_rates(system, groups, at, h)
     d = Velocity(
         sigma * (carried[0] - drift.rows) - state.v.reshape(-1, 4, 3),
         sigma * (carried[1] - drift.rotors) - state.rates,
     )
-    found = _kick(before, after, d)
+    first, last = before.shares(after, d)  # pyright: ignore[reportArgumentType]  (they are of one kind)
+    found = Velocity(0.5 * (d.rows + first.rows - last.rows), 0.5 * (d.rotors + first.rotors - last.rotors))
     if lag is None:
         return Kick(found, before, after, found, jnp.zeros_like(h))
     change = Velocity(found.rows - lag.held.rows, found.rotors - lag.held.rotors)
@@ -145,11 +142,11 @@ def kick_of(
     return Kick(used, before, after, found, jnp.where(serves, 0.0, size))
 
 
-def _both(system: System, start: State, end: State) -> tuple[TangentSpace, TangentSpace]:
+def _both(system: System, start: State, end: State) -> tuple[Tangents, Tangents]:
     """The tangent spaces of two states by one program for both, half as long as two."""
 
-    def at(q: Array, t: Array) -> TangentSpace:
-        return TangentSpace.at(system, replace_fields(end, q=q, v=q, t=t)).without_system()
+    def at(q: Array, t: Array) -> Tangents:
+        return tangents_at(system, replace_fields(end, q=q, v=q, t=t)).without_system()
 
     found = jax.vmap(at)(jnp.stack([start.q, end.q]), jnp.stack([start.t, end.t]))
     before, after = jax.tree.map(lambda x: x[0], found), jax.tree.map(lambda x: x[1], found)
@@ -176,49 +173,17 @@ def ends_of(
     )
     end = after.projected(last)
     back = Velocity(end.rows - last.rows, end.rotors - last.rotors)
-    work = _work(before, kick.kick) + _work(after, back)
+    work = before.work(kick.kick) + after.work(back)
     moving = jnp.maximum(before.energy(start), after.energy(end))
     missing = before.energy(start) - before.energy(v) + after.energy(end) - after.energy(last) - jnp.sum(work)
     small = 2.0 * before.energy(kick.kick) <= LARGEST * moving
     return Ends(end, work, small & (jnp.abs(missing) <= UNSOUND * moving))
 
 
-def _work(space: TangentSpace, kick: Velocity) -> Float[Array, " c"]:
-    """Work of the constraints in a kick."""
-    known = space.admissible
-    return known.prescribed * (known.lift.T @ space.pulled(space.impulse(kick)))
-
-
-def _kick(before: TangentSpace, after: TangentSpace, d: Velocity) -> Velocity:
-    """n_0, see the head of the module."""
-    start, end = before.admissible, after.admissible
-    cosines = start.frame @ before.pulled(after.impulses) @ end.frame.T
-    b0, b1 = start.within(before.framed(d)), end.within(after.framed(d))
-    size = b0.shape[0]
-    moved = None
-    if start.subspace is not None and end.subspace is not None:
-        moved = _direct_rotation(start.subspace, end.subspace)
-        cosines, b1 = start.subspace @ cosines @ moved @ start.subspace, moved.T @ b1
-    matrix = jnp.eye(size, dtype=b0.dtype) + 2.0 * cosines + cosines @ cosines.T
-    u = definite_inverse(matrix) @ (cosines @ b1 - b0)
-    first, second = before.along(u), b1 - 2.0 * u - cosines.T @ u
-    last = after.along(second if moved is None else moved @ second)
-    return Velocity(0.5 * (d.rows + first.rows - last.rows), 0.5 * (d.rotors + first.rotors - last.rotors))
-
-
-def _direct_rotation(start: Float[Array, "u u"], end: Float[Array, "u u"]) -> Float[Array, "u u"]:
-    """The smallest rotation that takes one subspace to another, from their projectors."""
-    unit = jnp.eye(start.shape[0], dtype=start.dtype)
-    x = end @ start + (unit - end) @ (unit - start)
-    for _ in range(POLISHING):
-        x = 1.5 * x - 0.5 * x @ (x.T @ x)
-    return x
-
-
 def kicked(
     system: System,
     state: State,
-    tangents: TangentSpace | None,
+    tangents: Tangents | None,
     lag: Lag | None,
     groups: Sequence[Group],
     situations: Sequence[Situation],

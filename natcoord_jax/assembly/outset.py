@@ -5,8 +5,8 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.dissipation import Damping
 from natcoord_jax.assembly.lag import Lag
+from natcoord_jax.assembly.separate import Tangents, tangents_at
 from natcoord_jax.assembly.system import System
-from natcoord_jax.assembly.tangent_space import TangentSpace
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import Tableau
 
@@ -23,7 +23,7 @@ class Outset(eqx.Module):
     """
 
     projector: Float[Array, "m m"] | None
-    tangents: TangentSpace | None
+    tangents: Tangents | None
     damping: Damping | None = None
     lag: Lag | None = None
 
@@ -34,7 +34,7 @@ class Outset(eqx.Module):
         state: State,
         tableau: Tableau,
         projector: Array | None,
-        tangents: TangentSpace | None = None,
+        tangents: Tangents | None = None,
         later: bool = False,
     ) -> "Outset":
         """With the tangent space of a state.
@@ -52,5 +52,5 @@ class Outset(eqx.Module):
         if not tableau.kick or later:
             return cls(projector, None)
         if tangents is None:
-            tangents = TangentSpace.at(system, state).without_system()
+            tangents = tangents_at(system, state).without_system()
         return cls(projector, tangents)

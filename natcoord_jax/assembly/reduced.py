@@ -34,9 +34,9 @@ from natcoord_jax.assembly.response import (
     situation,
     stations,
 )
+from natcoord_jax.assembly.separate import Tangents, tangents_at
 from natcoord_jax.assembly.sweeps import sweep_motion, turned_directors
 from natcoord_jax.assembly.system import Group, System
-from natcoord_jax.assembly.tangent_space import TangentSpace
 from natcoord_jax.assembly.tree import (
     SLOTS,
     TreeMotion,
@@ -133,7 +133,7 @@ class ReducedStep(Form):
         system: System,
         state: State,
         tableau: Tableau,
-        tangents: TangentSpace | None = None,
+        tangents: Tangents | None = None,
         later: bool = False,
     ) -> Outset:
         """What a step needs of its start, see `Outset.of`."""
@@ -308,7 +308,7 @@ class ReducedStep(Form):
         """Inertia of the free motions at the start of the step, P^T M P."""
         tangents = self.outset.tangents
         if tangents is None:
-            tangents = TangentSpace.at(self.system, self.state)
+            tangents = tangents_at(self.system, self.state)
         tangents = tangents.with_system(self.system)
         tree = self.system.tree
         body, kind, axis = tree.slot_of // SLOTS, tree.slot_of % SLOTS // 3, tree.slot_of % SLOTS % 3
@@ -319,7 +319,7 @@ class ReducedStep(Form):
         together = (body[:, None] == body) & (kind[:, None] == kind)
         cosines = jnp.where(together, dot(parent[:, None], own), 0.0)
         turned = jnp.where(tree.ball[body], cosines, jnp.eye(body.size, dtype=cosines.dtype))
-        return turned.T @ tangents.pulled(tangents.impulses) @ turned
+        return turned.T @ tangents.inertia @ turned
 
     def inertias(self, matrix: Float[Array, "unknowns unknowns"]) -> Float[Array, " balances"]:
         """Inertias of the rates, from the Jacobian and from the mass.

@@ -18,6 +18,9 @@ from natcoord_jax.core.state import State
 from natcoord_jax.maths.elimination import definite_inverse, inverse_cholesky
 from natcoord_jax.maths.projectors import range_projector
 
+POLISHING = 9
+"""Newton-Schulz iterations for the direct rotation of subspaces: enough for cosines from 0.4 on."""
+
 
 class Velocity(eqx.Module):
     """Velocities of all rows, and rates of the joint coordinates that carry rotors (or impulses on both)."""
@@ -124,9 +127,37 @@ class TangentSpace(eqx.Module):
         return found if impulse.rows.ndim == 4 else found[:, 0]
 
     @property
-    def drift(self) -> Float[Array, " u"]:
-        """Rates that drives prescribe, orthogonal to all admissible ones."""
+    def drift(self) -> Velocity:
+        """Velocity that drives prescribe, orthogonal to all admissible ones."""
+        return self.spread(self.drift_rates)
+
+    @property
+    def drift_rates(self) -> Float[Array, " u"]:
+        """The same as rates of the spanning tree."""
         return self.admissible.lift @ self.admissible.prescribed
+
+    def work(self, kick: Velocity) -> Float[Array, " c"]:
+        """Work of the constraints in a kick [J], drives being the only ones that do any."""
+        known = self.admissible
+        return known.prescribed * (known.lift.T @ self.pulled(self.impulse(kick)))
+
+    @property
+    def inertia(self) -> Float[Array, "u u"]:
+        """P^T M P."""
+        return self.pulled(self.impulses)
+
+    def shares(self, after: "TangentSpace", d: Velocity) -> tuple[Velocity, Velocity]:
+        """P^_0 u and P^_1 (b_1 - 2 u - K^T u) of the kick from here to another configuration, see `kick`."""
+        start, end = self.admissible, after.admissible
+        cosines = start.frame @ self.pulled(after.impulses) @ end.frame.T
+        b0, b1 = start.within(self.framed(d)), end.within(after.framed(d))
+        if start.subspace is None or end.subspace is None:
+            first, last = isometric(cosines, b0, b1)
+            return self.along(first), after.along(last)
+        moved = _direct_rotation(start.subspace, end.subspace)
+        cosines = start.subspace @ cosines @ moved @ start.subspace
+        first, last = isometric(cosines, b0, moved.T @ b1)
+        return self.along(first), after.along(moved @ last)
 
     def projected(self, v: Velocity) -> Velocity:
         """Nearest velocity that the constraints admit.
@@ -135,7 +166,7 @@ class TangentSpace(eqx.Module):
         change steadily. What the first projection lost is projected once more.
         """
         known = self.admissible
-        w = known.frame.T @ known.within(self.framed(v)) + self.drift
+        w = known.frame.T @ known.within(self.framed(v)) + self.drift_rates
         found = self.spread(w)
         lost = Velocity(v.rows - found.rows, v.rotors - found.rotors)
         return self.spread(w + known.frame.T @ known.within(self.framed(lost)))
@@ -152,8 +183,26 @@ class TangentSpace(eqx.Module):
         def rates(momentum: Array) -> Array:
             return known.frame.T @ known.within(known.frame @ momentum)
 
-        w = rates(momentum) + self.drift
+        w = rates(momentum) + self.drift_rates
         return self.spread(w + rates(momentum - self.pulled(self.impulse(self.spread(w)))))
+
+
+def isometric(
+    cosines: Float[Array, "u u"], b0: Float[Array, " u"], b1: Float[Array, " u"]
+) -> tuple[Float[Array, " u"], Float[Array, " u"]]:
+    """U and b_1 - 2 u - K^T u, see `kick`."""
+    matrix = jnp.eye(b0.shape[0], dtype=b0.dtype) + 2.0 * cosines + cosines @ cosines.T
+    u = definite_inverse(matrix) @ (cosines @ b1 - b0)
+    return u, b1 - 2.0 * u - cosines.T @ u
+
+
+def _direct_rotation(start: Float[Array, "u u"], end: Float[Array, "u u"]) -> Float[Array, "u u"]:
+    """The smallest rotation that takes one subspace to another, from their projectors."""
+    unit = jnp.eye(start.shape[0], dtype=start.dtype)
+    x = end @ start + (unit - end) @ (unit - start)
+    for _ in range(POLISHING):
+        x = 1.5 * x - 0.5 * x @ (x.T @ x)
+    return x
 
 
 def rotor_inertias(system: System) -> Float[Array, " rotors"]:
