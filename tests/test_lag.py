@@ -29,6 +29,10 @@ SCENES = {
 }
 
 
+NOISE = {"double_pendulum": 3e-14, "heavy_top": 3e-14, "four_bar": 3e-14, "stiff_chain": 1e-12}
+"""Of the last correction: kicks that serve, and stiff springs, which feel how their ends are rounded."""
+
+
 @pytest.mark.parametrize("name", SCENES)
 def test_steps_obey_the_equations_with_their_own_kick(name):
     order, h, steps = SCENES[name]
@@ -52,14 +56,13 @@ def test_steps_obey_the_equations_with_their_own_kick(name):
     errors, kicks = error(states, slots.y, slots.fraction)
     done = np.asarray(slots.accepted)
     assert np.sum(done) >= steps and np.max(np.asarray(kicks)[done]) > 1e-9
-    # What kicks miss that are held is 1e-12 of the motion at most, and moves the stages by less.
-    assert np.max(np.asarray(errors)[done]) < 1e-12
+    assert np.max(np.asarray(errors)[done]) < NOISE[name]
 
 
-def a_kick(change, rows=0.0):
+def a_kick(change, rows=0.0, motion=1.0):
     zero = jnp.asarray(rows) + jnp.zeros((1, 4, 3))
     v = Velocity(zero, jnp.zeros(0))
-    return Kick(v, None, None, v, jnp.asarray(change))  # pyright: ignore[reportArgumentType]
+    return Kick(v, None, None, v, jnp.asarray(change), jnp.asarray(motion))  # pyright: ignore[reportArgumentType]
 
 
 def iteration(correction=0.0, total=0, last=False):
@@ -110,6 +113,9 @@ def test_kicks_with_a_strong_answer_are_found_everywhere():
         assert weak.closed == 0
         weak = after(weak, 1e-3 * weak.moved, True, 1e-3)
     assert weak.closed == SPANS[0]
+    # What is nothing but rounding tells nothing.
+    noisy = after(Lagging.begin(a_kick(0.0).kick), 1.0, True, 1e-14)
+    assert after(noisy, 2e-13, True, 1e-14).closed == 0
 
 
 def test_body_axes_there_and_back():

@@ -56,6 +56,7 @@ class Kick(eqx.Module):
         after: at its end.
         exact: the kick that belongs to the stages; the same, but for what is negligible.
         change: by which it differs from that which was held before, if that is not negligible [sqrt(J)].
+        motion: size of the velocities at the ends [sqrt(J)].
     """
 
     kick: Velocity
@@ -63,6 +64,7 @@ class Kick(eqx.Module):
     after: Tangents
     exact: Velocity
     change: Float[Array, ""]
+    motion: Float[Array, ""]
 
 
 class Ends(eqx.Module):
@@ -132,14 +134,14 @@ def kick_of(
     first, last = before.shares(after, d)  # pyright: ignore[reportArgumentType]  (they are of one kind)
     found = Velocity(0.5 * (d.rows + first.rows - last.rows), 0.5 * (d.rotors + first.rotors - last.rotors))
     if lag is None:
-        return Kick(found, before, after, found, jnp.zeros_like(h))
+        return Kick(found, before, after, found, jnp.zeros_like(h), jnp.zeros_like(h))
     change = Velocity(found.rows - lag.held.rows, found.rotors - lag.held.rotors)
     motion = jnp.maximum(before.energy(Velocity(state.v.reshape(-1, 4, 3), state.rates)), before.energy(d))
     size, kick, motion = (jnp.sqrt(2.0 * x) for x in (before.energy(change), before.energy(found), motion))
     serves = (size <= NEGLIGIBLE * motion) & (size * kick <= NEGLIGIBLE_ENERGY * motion**2)
     kept = (serves & ~lag.everywhere) | lag.held_fast
     used = jax.tree.map(lambda x, y: jnp.where(kept, x, y), lag.held, found)
-    return Kick(used, before, after, found, jnp.where(serves, 0.0, size))
+    return Kick(used, before, after, found, jnp.where(serves, 0.0, size), motion)
 
 
 def _both(system: System, start: State, end: State) -> tuple[Tangents, Tangents]:

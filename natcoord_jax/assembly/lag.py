@@ -21,15 +21,17 @@ from jaxtyping import Array, Bool, Float, Int
 from natcoord_jax.assembly.tangent_space import Velocity
 from natcoord_jax.core.state import State
 
-NEGLIGIBLE = 1e-12
+NEGLIGIBLE = 1e-14
 """Change of a kick in terms of the motion below which that which is held serves."""
 
-NEGLIGIBLE_ENERGY = 1e-17
-"""The same for the energy of the change, kick times change in terms of the motion squared: energy is kept to
-round-off."""
+NEGLIGIBLE_ENERGY = 1e-18
+"""The same for the energy of the change, kick times change in terms of the motion squared."""
 
 STRONG = 0.1
 """Change of a kick in terms of that of the stages from which on it is found in every evaluation."""
+
+TELLING = 1e-12
+"""Change of a kick in terms of the motion from which on it tells how kicks depend on the stages."""
 
 MOST_RENEWALS = 6
 """Kicks in one step after which the same is done."""
@@ -100,8 +102,12 @@ class Lagging(eqx.Module):
         return it.last | (self.closed > 0) | (told & (stages <= BEHIND * behind))
 
     def jumped(self, kick: Any, lag: Lag, it: Any) -> Bool[Array, ""]:
-        """Whether the kick has changed so much that corrections of the stages do not compare."""
-        return lag.due & (self.closed == 0) & (kick.change > JUMP * it.correction)
+        """Whether the kick has changed so much that corrections of the stages do not compare.
+
+        Nothing is so little that the last one may be left out: it would have the same sign in every step.
+        """
+        much = kick.change > jnp.where(it.last, 0.0, JUMP * it.correction)
+        return lag.due & (self.closed == 0) & much
 
     def after(self, kick: Any, due: Array, correction: Array, first: Array, moving: Array) -> "Lagging":
         """After an evaluation.
@@ -118,7 +124,8 @@ class Lagging(eqx.Module):
         answer = jnp.where(self.moved > 0, kick.change / jnp.where(self.moved > 0, self.moved, 1.0), 0.0)
         answer = jnp.where(again, answer, self.answer)
         renewals = self.renewals + found
-        strong = (again & (answer > STRONG)) | (renewals >= MOST_RENEWALS)
+        telling = kick.change > TELLING * kick.motion
+        strong = (again & telling & (answer > STRONG)) | (renewals >= MOST_RENEWALS)
         strong = strong & (self.closed == 0) & moving
         return Lagging(
             held=jax.tree.map(lambda x, y: jnp.where(found, x, y), kick.kick, self.held),

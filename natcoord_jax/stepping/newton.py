@@ -253,7 +253,7 @@ def judge(
     finite = jnp.isfinite(correction) & jnp.isfinite(size)
     stalled = ~first & (ratio > 0.5) & (correction <= floor)
     enough = jnp.maximum(STALL_OLD * tolerance, ABOVE_NOISE * factors.rounding) * size
-    solved = (correction <= tolerance * size) | stalled | (it.last & (correction <= enough))
+    solved = (correction <= tolerance * size) | stalled | (it.last & ~first & (correction <= enough))
     # Within the noise corrections shrink little, and new factors would not change it.
     noisy = factors.fresh & (correction <= floor)
     slow = ~first & ((ratio > 0.5) | (~noisy & (correction * ratio**patience > tolerance * size)))

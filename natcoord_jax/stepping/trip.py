@@ -139,6 +139,10 @@ def trip(setting: Setting, unpack: Callable[[Array], State], apart: bool, carrie
             )
         ),
     )
+    if lagging is not None and course.lagging is not None:
+        # Factors of equations in which kicks are held are not those of equations in which they are not.
+        other = (course.lagging.closed > 0) != (after.lagging.closed > 0)  # pyright: ignore[reportOptionalMemberAccess]
+        factors = eqx.tree_at(lambda f: f.usable, factors, factors.usable & ~other)
     if probe is not None:
         rounds = any_lane(after.it.rounds)
         probe, wanting = probe.with_column(it.y, found.residual, equations, wanting, rounds)

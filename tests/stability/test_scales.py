@@ -79,15 +79,7 @@ def test_what_is_light_pulls_in_proportion():
 THIN = [
     *((order, thickness) for order in (2, 4) for thickness in (1e-3, 1e-6)),
     (2, 1e-9),
-    pytest.param(
-        4,
-        1e-9,
-        marks=pytest.mark.xfail(
-            strict=True,
-            raises=nc.SimulationError,
-            reason="rounding turns the rod about itself by more than a stalled correction may be",
-        ),
-    ),
+    (4, 1e-9),
 ]
 
 
