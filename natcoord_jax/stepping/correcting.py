@@ -13,6 +13,13 @@ from natcoord_jax.stepping.newton import SLOWEST_UNSEEN, Factors
 CLOSE = 1e-12
 """Error of the solution of a transposed system relative to its size."""
 
+ROUND_OFF = 1e-15
+"""The same relative to what the solution would be if nothing cancelled. The gradient of a quantity that is
+kept is zero but for rounding, and no solution can be right to its own size then."""
+
+STALL_ROUND_OFF = 1e-12
+"""The same for corrections that stop shrinking."""
+
 SURPRISE = 10.0
 """Times the error allowed by which the correction may be larger that was expected to be within it."""
 
@@ -72,19 +79,31 @@ class Correcting(eqx.Module):
             (nought, self.rounds + 1, jnp.zeros_like(self.wanting), jnp.zeros_like(self.last)),
         )
 
-    def judged(self, factors: Factors, lam: Array, change: Array, patience: int) -> "Correcting":
-        """After a correction has been found: done, or moving on by it, or in want of new factors."""
+    def judged(
+        self, factors: Factors, lam: Array, change: Array, patience: int, whole: Array
+    ) -> "Correcting":
+        """After a correction has been found: done, or moving on by it, or in want of new factors.
+
+        Args:
+            factors: at hand.
+            lam: solution as it is.
+            change: correction of it.
+            patience: corrections that are cheaper than new factors.
+            whole: size of the solution if nothing cancelled.
+        """
         size, correction = (_size(x, factors.inertias) for x in (lam, change))
+        allowed = jnp.maximum(CLOSE * size, ROUND_OFF * whole)
         ratio = correction / jnp.where(self.correction > 0, self.correction, 1.0)
         first = self.count == 0
         finite = jnp.isfinite(correction) & jnp.isfinite(size)
-        stalled = ~first & (ratio > 0.5) & (correction <= STALL * size)
-        within = correction <= jnp.where(self.last, SURPRISE * CLOSE, CLOSE) * size
+        floor = jnp.maximum(STALL * size, STALL_ROUND_OFF * whole)
+        stalled = ~first & (ratio > 0.5) & (correction <= floor)
+        within = correction <= jnp.where(self.last, SURPRISE, 1.0) * allowed
         done = (within | stalled) & finite & factors.usable
         trusted = jnp.maximum(ratio, SLOWEST_UNSEEN)
         following = correction * trusted / jnp.maximum(1.0 - trusted, 1e-3)
-        last = ~first & (following <= CLOSE * size)
-        late = correction * ratio**patience > CLOSE * size
+        last = ~first & (following <= allowed)
+        late = correction * ratio**patience > allowed
         slow = (~first & ((ratio > 0.5) | late)) | (self.count >= CORRECTIONS) | ~finite | ~factors.usable
         slow = slow & ~done
         found = Correcting(correction, self.count + 1, self.rounds, done, slow, ~done & ~slow, last)

@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from natcoord_jax.assembly.equations import kind_of, prepare
+from natcoord_jax.assembly.momentum import row_weights
 from natcoord_jax.assembly.system import System
 from natcoord_jax.core.state import State
 from natcoord_jax.stepping import linear_pair
@@ -230,7 +231,9 @@ class Rule:
         The multipliers of its equations solve J^T lam = -(cotangent of the unknowns); their guess is
         extrapolated from those of the slots after it.
         """
-        patience = kind_of(numbers.whole(numbers.varied)[0], self.tableau).renewal
+        system, _, dt = numbers.whole(numbers.varied)
+        patience = kind_of(system, self.tableau).renewal
+        whole = _size_of(system, slot.fraction * dt, end_bar, y_bar, factors)
 
         # With one stage it saves time to pull back only what the corrections ask for; with more of them the
         # program grows too large for one kernel, which costs more than that.
@@ -248,7 +251,7 @@ class Rule:
                 _, lam, at = carry
                 *bars, gap = pull((lam, end_bar))
                 change = factors.solver.transpose().solve(gap + y_bar)
-                at = at.judged(factors, lam, change, patience)
+                at = at.judged(factors, lam, change, patience, whole)
                 return tuple(bars) if once else None, jnp.where(at.moving, lam - change, lam), at
 
             start = nothing if once else None, lam, at
@@ -281,6 +284,14 @@ class Rule:
             return factors_of(equations, equations.tangent(slot.y))
 
         return jnp.array(False), kernel(renewed, numbers, slot), carry[2].refreshed()
+
+
+def _size_of(system: System, h: Array, end_bar: State, y_bar: Array, factors: Factors) -> Array:
+    """Energy norm of the solution of a transposed system, if nothing in its right-hand side cancelled."""
+    weights, real = row_weights(system.mass), factors.inertias > 0
+    moving = (h * jnp.abs(end_bar.q) + jnp.abs(end_bar.v)).reshape(*weights.shape, 3)
+    own = jnp.where(real, y_bar**2 / jnp.where(real, factors.inertias, 1.0), 0.0)
+    return jnp.sqrt(jnp.sum(weights[..., None] * moving**2) + jnp.sum(own))
 
 
 def _in_chunks(function: Callable, slots: tuple, length: int) -> Any:
