@@ -24,7 +24,7 @@ from natcoord_jax.stepping.one_kernel import as_one_kernel
 from natcoord_jax.stepping.probe import Probe
 from natcoord_jax.stepping.trip import Asked, Carried, renewed_at, trip, with_state
 
-PARTS = 8
+PARTS = 4
 """Bodies from which on new factors are made in a kernel of their own."""
 
 CHUNK = 16
