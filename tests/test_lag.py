@@ -21,15 +21,14 @@ from natcoord_jax.stepping.newton import begin
 from natcoord_jax.stepping.plan import Plan
 
 SCENES = {
-    # Kicks that depend on the stages weakly and strongly; with loops; along the chain.
-    "double_pendulum": (4, 2**-9, 40),
-    "heavy_top": (4, 2**-7, 40),
+    # Trees, loops, and along the chain.
+    "open_tree": (4, 2**-7, 30),
     "four_bar": (4, 2**-9, 40),
     "stiff_chain": (4, 2**-7, 20),
 }
 
 
-NOISE = {"double_pendulum": 3e-14, "heavy_top": 3e-14, "four_bar": 3e-14, "stiff_chain": 1e-12}
+NOISE = {"open_tree": 3e-14, "four_bar": 3e-14, "stiff_chain": 1e-12}
 """Of the last correction: kicks that serve, and stiff springs, which feel how their ends are rounded."""
 
 

@@ -21,6 +21,9 @@ from jaxtyping import Array, Bool, Float, Int
 from natcoord_jax.assembly.tangent_space import Velocity
 from natcoord_jax.core.state import State
 
+FEWEST = 6
+"""Unknowns of a stage from which on kicks lag: in smaller systems they cost no more than an evaluation."""
+
 NEGLIGIBLE = 1e-14
 """Change of a kick in terms of the motion below which that which is held serves."""
 

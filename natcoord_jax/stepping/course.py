@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from natcoord_jax.assembly.equations import prepare
-from natcoord_jax.assembly.lag import Lagging, from_body_axes, in_body_axes
+from natcoord_jax.assembly.lag import FEWEST, Lagging, from_body_axes, in_body_axes
 from natcoord_jax.assembly.outset import Outset
 from natcoord_jax.assembly.system import System
 from natcoord_jax.assembly.tangent_space import Velocity
@@ -121,7 +121,8 @@ def start_of(setting: Setting, state: State) -> tuple[Course, Factors, Outset]:
     zero, nought = jnp.array(0), jnp.zeros((), state.q.dtype)
     bad = ~(jnp.isfinite(dt) & (dt > 0))
     lagging = None
-    if plan.tableau.kick:
+    structure = setting.system.structure
+    if plan.tableau.kick and structure.unknowns + structure.multipliers >= FEWEST:
         lagging = Lagging.begin(
             Velocity(jnp.zeros_like(state.q.reshape(-1, 4, 3)), jnp.zeros_like(state.rates))
         )

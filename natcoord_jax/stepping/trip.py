@@ -98,7 +98,7 @@ def trip(setting: Setting, unpack: Callable[[Array], State], apart: bool, carrie
         before = with_state(before, unpack(x))
         groups, tableau = equations.groups, plan.tableau
         ends = end_of_step(setting.system, before.state, h, groups, found, tableau)
-        kick = None if found.kick is None else found.kick.exact
+        kick = None if before.lagging is None else found.kick.exact
         after = after_attempt(setting, before, factors.inertias, ends, kick)
         accepted = after.taken > before.taken
         x = ravel_pytree(after.state)[0]
