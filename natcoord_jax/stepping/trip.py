@@ -139,9 +139,9 @@ def trip(setting: Setting, unpack: Callable[[Array], State], apart: bool, carrie
             )
         ),
     )
-    if lagging is not None and course.lagging is not None:
+    if course.lagging is not None and after.lagging is not None:
         # Factors of equations in which kicks are held are not those of equations in which they are not.
-        other = (course.lagging.closed > 0) != (after.lagging.closed > 0)  # pyright: ignore[reportOptionalMemberAccess]
+        other = (course.lagging.closed > 0) != (after.lagging.closed > 0)
         factors = eqx.tree_at(lambda f: f.usable, factors, factors.usable & ~other)
     if probe is not None:
         rounds = any_lane(after.it.rounds)
@@ -206,7 +206,8 @@ def renewed_at(
     loads = jax.tree.map(lambda x: jnp.where(asked.here, x, 0.0), asked.loads)
     factors = factors_of(equations, equations.tangent(it.y, loads), factors.noise)
     it = refreshed(it)
-    # What the residual asks for with new factors needs no evaluation.
+    # What the residual asks for with new factors needs no evaluation; but the kick in it may have been held.
+    options |= {"whole": not setting.plan.tableau.kick}
     moved = judge(factors, setting.plan.tolerance, it, asked.residual, asked.size, **options)
     return jax.tree.map(partial(jnp.where, asked.here & it.unsolved), moved, it), factors
 
