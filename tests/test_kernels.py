@@ -40,6 +40,9 @@ BODIES = {
     "rows": lambda x: x.at[jnp.array([3, 3, 1])].add(0.1 * x[:3]),
     "branch": lambda x: jax.lax.cond(x[0, 0] > 0, lambda x: 0.5 * x, lambda x: x + 1.0, x),
     "projector": lambda x: range_projector(x[:, :3], 2),
+    "derivative of a projector": lambda x: jax.grad(lambda x: (range_projector(x[:, :3], 3) * MATRIX).sum())(
+        x
+    ),
     "integers": _bits,
 }
 

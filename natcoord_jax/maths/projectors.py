@@ -7,7 +7,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from natcoord_jax.maths.elimination import definite_inverse
 from natcoord_jax.maths.vectors import safe_divide, safe_norm
+
+LEAST = 1e-14
+"""Square of a singular value in terms of the others below which it counts as none."""
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(1,))
@@ -42,6 +46,28 @@ def range_projector(matrix: Float[Array, "m n"], rank: int) -> Float[Array, "m m
 def _range_projector_jvp(rank: int, primals: tuple, tangents: tuple):
     (matrix,), (change,) = primals, tangents
     projector = range_projector(matrix, rank)
-    inverse = jnp.linalg.pinv(matrix, rtol=1e-7)
-    half = (jnp.eye(matrix.shape[0], dtype=matrix.dtype) - projector) @ change @ inverse
+    half = (jnp.eye(matrix.shape[0], dtype=matrix.dtype) - projector) @ change
+    half = half @ pseudo_inverse(matrix, projector, rank)
     return projector, half + half.T
+
+
+def pseudo_inverse(
+    matrix: Float[Array, "m n"], projector: Float[Array, "m m"], rank: int
+) -> Float[Array, "n m"]:
+    """Pseudo-inverse from the projector on the range: A^T (A A^T + 1 - P)^-1, polished.
+
+    Like the projector it compiles into one kernel, which singular values would not.
+
+    Args:
+        matrix: A.
+        projector: P.
+        rank: of the matrix.
+    """
+    gram = matrix @ matrix.T
+    mean = jnp.trace(gram) / max(rank, 1)
+    mean = jnp.where(mean > 0, mean, 1.0)
+    unit = jnp.eye(matrix.shape[0], dtype=matrix.dtype)
+    inverse = matrix.T @ definite_inverse(gram + mean * ((1.0 + LEAST) * unit - projector))
+    for _ in range(2):
+        inverse = inverse + inverse @ (projector - matrix @ inverse)
+    return inverse
