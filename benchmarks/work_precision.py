@@ -55,8 +55,9 @@ GRADIENTS = {
     "double_pendulum": (2, 4, 6),
     "four_bar": (2, 4),
 }
-GRADIENT_STEPS = 100
-"""Scenes and orders that value and gradient are timed for, and their steps."""
+GRADIENT_STEPS = 200
+"""Scenes and orders that value and gradient are timed for, and the number of their steps. Their length is that
+which the gallery suggests: a run that fails, or hardly converges, would flatter its gradient."""
 ERRORS = (1e-2, 1e-3, 1e-4, 1e-6, 1e-8)
 PEERS = (
     Peer("MuJoCo RK4", "mujoco_models", "mujoco", {"integrator": "RK4"}),
@@ -198,10 +199,23 @@ def own_gradients(model: str, repeats: int) -> list[dict[str, Any]]:
     """Value and gradient by the initial state over the value, by order."""
     found = []
     for order in GRADIENTS.get(model, ()):
-        example = scene_of(model)
+        example = replace(scene_of(model), steps=GRADIENT_STEPS)
+        check_run(example, order)
         found.append({"order": order} | beside.own_gradient(example, "state", GRADIENT_STEPS, repeats, order))
         print(f"{model}: gradient at order {order}: {found[-1]['over_forward']:.2f}", flush=True)
     return found
+
+
+def check_run(example: gallery.Example, order: int) -> None:
+    """See that the suggested run comes to its end without a failed step.
+
+    Raises:
+        RuntimeError: if it does not.
+    """
+    options = dict(dt=example.dt, steps=example.steps, inputs=example.inputs(example.steps, example.dt))
+    run = nc.simulate(example.system, example.state, scheme=nc.EnergyMomentum(order), **options)
+    if int(run.steps_rejected):
+        raise RuntimeError(f"{example.name}: {int(run.steps_rejected)} steps of order {order} were repeated")
 
 
 def _reference(example: gallery.Example, t_end: float) -> nc.State:

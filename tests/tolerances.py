@@ -79,6 +79,8 @@ STEADY_PARTS = {
     ("heavy_top", 6, "energy"): 6e-17,  # 5.2e-17
     ("heavy_top", 4, "spin"): 1.2e-17,  # 6.6e-18
     ("heavy_top", 6, "spin"): 1.8e-17,  # -1.2e-17
+    ("dzhanibekov", 2, "energy"): 6e-18,  # -2.0e-18; -1.0e-18 to -2.8e-18 with other ends of the iteration
+    ("dzhanibekov", 2, "spin"): 3e-18,  # -8.6e-19
     ("dzhanibekov", 4, "energy"): 6e-18,  # -2.9e-18
     ("dzhanibekov", 6, "energy"): 1.2e-17,  # -8.9e-18
     ("dzhanibekov", 4, "spin"): 3e-18,  # -1.3e-18

@@ -77,6 +77,10 @@ class Inverse(eqx.Module):
         """Product with the inverse."""
         return apply(self.inverse, right)
 
+    def updated(self, u: Float[Array, " n"], weights: Float[Array, " n"]) -> "Inverse":
+        """With u (weights^T X) added, of rank one."""
+        return Inverse(self.inverse + u[:, None] * jnp.sum(weights[:, None] * self.inverse, axis=0)[None, :])
+
     def transpose(self) -> "Inverse":
         """Inverse of the transposed matrix."""
         return Inverse(self.inverse.T)

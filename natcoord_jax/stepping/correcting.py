@@ -1,13 +1,13 @@
 """Transposed systems, solved by corrections with factors that need not be their own."""
 
 from functools import partial
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from natcoord_jax.linsolve.learning import SPEED, learns, learnt
 from natcoord_jax.stepping.newton import SLOWEST_UNSEEN, Factors
 
 CLOSE = 1e-12
@@ -37,7 +37,8 @@ class Correcting(eqx.Module):
     """Where the solution of a transposed system stands.
 
     Attributes:
-        correction: size of the last correction (energy norm).
+        change: last correction with these factors.
+        correction: its size (energy norm).
         count: corrections with these factors.
         rounds: factorisations for this system.
         done: whether it is solved.
@@ -46,6 +47,7 @@ class Correcting(eqx.Module):
         last: whether the next correction is expected to be within the error allowed.
     """
 
+    change: Float[Array, " unknowns"]
     correction: Float[Array, ""]
     count: Int[Array, ""]
     rounds: Int[Array, ""]
@@ -55,10 +57,10 @@ class Correcting(eqx.Module):
     last: Bool[Array, ""]
 
     @classmethod
-    def first(cls, accepted: Bool[Array, ""], dtype: Any) -> "Correcting":
+    def first(cls, accepted: Bool[Array, ""], lam: Float[Array, " unknowns"]) -> "Correcting":
         """Before the first correction; there is nothing to do for an attempt that failed."""
         nought, no = jnp.array(0), jnp.array(False)
-        return cls(jnp.zeros((), dtype), nought, nought, ~accepted, no, no, no)
+        return cls(jnp.zeros_like(lam), jnp.zeros((), lam.dtype), nought, nought, ~accepted, no, no, no)
 
     @property
     def open(self) -> Bool[Array, ""]:
@@ -80,19 +82,29 @@ class Correcting(eqx.Module):
         )
 
     def judged(
-        self, factors: Factors, lam: Array, change: Array, patience: int, whole: Array
-    ) -> "Correcting":
-        """After a correction has been found: done, or moving on by it, or in want of new factors.
+        self, factors: Factors, lam: Array, residual: Array, patience: int, whole: Array
+    ) -> tuple["Correcting", Factors]:
+        """After an evaluation: done, or moving on by a correction, or in want of new factors.
 
         Args:
             factors: at hand.
             lam: solution as it is.
-            change: correction of it.
+            residual: of the transposed equations.
             patience: corrections that are cheaper than new factors.
             whole: size of the solution if nothing cancelled.
+
+        Returns:
+            Where it stands, and the factors, which have learnt from it if they are of that kind.
         """
-        size, correction = (_size(x, factors.inertias) for x in (lam, change))
+        solver, weights = factors.solver.transpose(), _weights(factors.inertias)
+        change = solver.solve(residual)
+        size = _size(lam, weights)
         allowed = jnp.maximum(CLOSE * size, ROUND_OFF * whole)
+        if learns(solver):
+            telling = self.going & (self.count > 0) & (self.correction > allowed)
+            solver, change = learnt(solver, self.change, change, weights, telling)
+            factors = eqx.tree_at(lambda f: f.solver, factors, solver.transpose())
+        correction = _size(change, weights)
         ratio = correction / jnp.where(self.correction > 0, self.correction, 1.0)
         first = self.count == 0
         finite = jnp.isfinite(correction) & jnp.isfinite(size)
@@ -103,20 +115,23 @@ class Correcting(eqx.Module):
         trusted = jnp.maximum(ratio, SLOWEST_UNSEEN)
         following = correction * trusted / jnp.maximum(1.0 - trusted, 1e-3)
         last = ~first & (following <= allowed)
-        late = correction * ratio**patience > allowed
+        late = correction * ratio ** (patience * (SPEED if learns(solver) else 1)) > allowed
         slow = (~first & ((ratio > 0.5) | late)) | (self.count >= CORRECTIONS) | ~finite | ~factors.usable
         slow = slow & ~done
-        found = Correcting(correction, self.count + 1, self.rounds, done, slow, ~done & ~slow, last)
+        found = Correcting(change, correction, self.count + 1, self.rounds, done, slow, ~done & ~slow, last)
         stay = eqx.tree_at(lambda c: c.moving, self, jnp.zeros_like(self.moving))
-        return jax.tree.map(partial(jnp.where, ~self.going), stay, found)
+        return jax.tree.map(partial(jnp.where, ~self.going), stay, found), factors
 
 
-def _size(lam: Float[Array, " unknowns"], inertias: Float[Array, " unknowns"]) -> Float[Array, ""]:
-    """Size of a solution in the energy norm, where constraints count, too.
+def _size(lam: Float[Array, " unknowns"], weights: Float[Array, " unknowns"]) -> Float[Array, ""]:
+    return jnp.sqrt(jnp.sum(weights * lam**2))
+
+
+def _weights(inertias: Float[Array, " unknowns"]) -> Float[Array, " unknowns"]:
+    """Weights of the energy norm, where constraints count, too.
 
     Where drives prescribe every motion, nothing else is left; they carry impulses that stop a mean inertia.
     """
     moving = inertias > 0
     mean = jnp.sum(inertias) / jnp.maximum(jnp.sum(moving), 1)
-    weights = jnp.where(moving, inertias, 1.0 / jnp.where(mean > 0, mean, 1.0))
-    return jnp.sqrt(jnp.sum(weights * lam**2))
+    return jnp.where(moving, inertias, 1.0 / jnp.where(mean > 0, mean, 1.0))

@@ -24,6 +24,7 @@ from natcoord_jax.assembly.equations import kind_of, prepare
 from natcoord_jax.assembly.momentum import row_weights
 from natcoord_jax.assembly.system import System
 from natcoord_jax.core.state import State
+from natcoord_jax.linsolve.learning import learns
 from natcoord_jax.stepping import linear_pair
 from natcoord_jax.stepping.correcting import Correcting
 from natcoord_jax.stepping.error_control import Tolerance
@@ -240,6 +241,13 @@ class Rule:
         once = self.tableau.stages > 1
         nothing = jax.tree.map(jnp.zeros_like, (numbers.varied, slot.before, slot.u))
 
+        def changing(factors: Factors) -> Any:
+            """What of the factors the corrections change."""
+            return factors.solver if learns(factors.solver) else None
+
+        def with_solver(factors: Factors, learnt: Any) -> Factors:
+            return factors if learnt is None else eqx.tree_at(lambda f: f.solver, factors, learnt)
+
         def corrected(factors: Factors, lam: Array, at: Correcting) -> tuple:
             """As far as these factors go, and the cotangents there."""
             _, pull = jax.vjp(
@@ -248,25 +256,25 @@ class Rule:
             )  # fmt: skip
 
             def trip(carry: tuple) -> tuple:
-                _, lam, at = carry
+                _, learnt, lam, at = carry
                 *bars, gap = pull((lam, end_bar))
-                change = factors.solver.transpose().solve(gap + y_bar)
-                at = at.judged(factors, lam, change, patience, whole)
-                return tuple(bars) if once else None, jnp.where(at.moving, lam - change, lam), at
+                at, known = at.judged(with_solver(factors, learnt), lam, gap + y_bar, patience, whole)
+                lam = jnp.where(at.moving, lam - at.change, lam)
+                return tuple(bars) if once else None, changing(known), lam, at
 
-            start = nothing if once else None, lam, at
-            bars, lam, at = jax.lax.while_loop(lambda carry: any_lane(carry[-1].going), trip, start)
-            return bars if once else tuple(pull((lam, end_bar))[:-1]), lam, at
+            start = nothing if once else None, changing(factors), lam, at
+            bars, learnt, lam, at = jax.lax.while_loop(lambda carry: any_lane(carry[-1].going), trip, start)
+            return bars if once else tuple(pull((lam, end_bar))[:-1]), learnt, lam, at
 
         def rounds(carry: tuple) -> tuple:
             _, factors, lam, at = carry
             refresh = partial(self._refreshed, kernel, numbers, slot)
             _, factors, at = jax.lax.while_loop(lambda c: c[0], refresh, (any_lane(at.wanting), factors, at))
-            bars, lam, at = kernel(corrected, factors, lam, at)
-            return bars, factors, lam, at
+            bars, learnt, lam, at = kernel(corrected, factors, lam, at)
+            return bars, with_solver(factors, learnt), lam, at
 
         lam = jnp.where(jnp.all(jnp.isfinite(guess)), guess, 0.0)
-        start = nothing, factors, lam, Correcting.first(slot.accepted, lam.dtype)
+        start = nothing, factors, lam, Correcting.first(slot.accepted, lam)
         bars, factors, lam, at = jax.lax.while_loop(lambda carry: any_lane(carry[-1].open), rounds, start)
         lost = slot.accepted & ~at.done
         bars = jax.tree.map(lambda x: jnp.where(lost, jnp.nan, x), bars)

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from natcoord_jax.core.results import Result
+from natcoord_jax.linsolve.learning import SPEED, learns, learnt
 
 TOLERANCE = 1e-16
 """Predicted error after the last correction, relative to the terms of the equations (energy norm).
@@ -60,6 +61,10 @@ FEW_ROUNDS = 4
 
 SLOWEST_UNSEEN = 0.02
 """Contraction assumed at least: a slow part of the error may hide behind fast ones in the first ratio."""
+
+LEARNING = 1e-12
+"""Size of a correction relative to the terms of the equations from which on the next tells how good the
+factors are: below, rounding has a part in it."""
 
 NEVER = 1000
 """More corrections than a step can need."""
@@ -130,6 +135,7 @@ class Iterate(eqx.Module):
     Attributes:
         start: unknowns that it began with.
         y: unknowns to be evaluated next.
+        change: last correction with these factors; 0 before the first.
         worst: unknown with the largest last correction.
         correction: size of the last correction (energy norm); 0 before the first with these factors.
         error: that size relative to the terms of the equations.
@@ -145,6 +151,7 @@ class Iterate(eqx.Module):
 
     start: Float[Array, " unknowns"]
     y: Float[Array, " unknowns"]
+    change: Float[Array, " unknowns"]
     worst: Int[Array, ""]
     correction: Float[Array, ""]
     error: Float[Array, ""]
@@ -174,7 +181,8 @@ def begin(y: Float[Array, " unknowns"], few: bool = False) -> Iterate:
     """The iteration before its first evaluation, with few factorisations if a shorter step is an answer."""
     most = jnp.array(FEW_ROUNDS if few else NEWTON_ROUNDS)
     zero, no, nought = jnp.zeros((), y.dtype), jnp.array(False), jnp.array(0)
-    return Iterate(y, y, nought, zero, zero, nought, nought, nought, most, no, no, no, jnp.array(True))
+    still, yes = jnp.zeros_like(y), jnp.array(True)
+    return Iterate(y, y, still, nought, zero, zero, nought, nought, nought, most, no, no, no, yes)
 
 
 def no_factors(equations: Any) -> Factors:
@@ -201,10 +209,11 @@ def new_factors(made: tuple[Any, Array], noise: Array | float = 0.0) -> Factors:
 def refreshed(it: Iterate) -> Iterate:
     """The iteration with new factors."""
     zero, nought, no = jnp.zeros_like(it.correction), jnp.zeros_like(it.count), jnp.zeros_like(it.last)
+    correction = jnp.where(it.converged, it.correction, zero)
     return eqx.tree_at(
-        lambda x: (x.correction, x.count, x.rounds, x.last, x.wanting),
+        lambda x: (x.change, x.correction, x.count, x.rounds, x.last, x.wanting),
         it,
-        (jnp.where(it.converged, it.correction, zero), nought, it.rounds + 1, no, no),
+        (jnp.zeros_like(it.change), correction, nought, it.rounds + 1, no, no),
     )
 
 
@@ -219,7 +228,8 @@ def judge(
     patience: int,
     jumped: Bool[Array, ""] | bool = False,
     whole: Bool[Array, ""] | bool = True,
-) -> Iterate:
+    evaluated: Bool[Array, ""] | bool = True,
+) -> tuple[Iterate, Factors]:
     """What follows from one evaluation of the equations at `it.y`.
 
     Args:
@@ -233,12 +243,17 @@ def judge(
         patience: corrections that are cheaper than a new Jacobian.
         jumped: whether the equations are not those of the last evaluation: corrections do not compare.
         whole: whether they are all that the end of a step asks for; if not, the next evaluation is the last.
+        evaluated: whether the residual is that at `it.y`; if not, only the factors matter that come back.
 
     Returns:
         Converged; or moved by one correction; or in want of new factors, when corrections shrink too slowly
-        (then not moved).
+        (then not moved). And the factors, which have learnt from it if they are of that kind.
     """
+    done = it.converged | it.wanting | ~it.finite
     change = factors.solver.solve(residual)
+    telling = ~done & (it.count > 0) & ~jnp.asarray(jumped) & evaluated & (it.error > LEARNING)
+    solver, change = learnt(factors.solver, it.change, change, factors.inertias, telling)
+    factors = eqx.tree_at(lambda f: f.solver, factors, solver)
     energies = factors.inertias * change**2
     if balances:
         real = factors.inertias > 0
@@ -254,9 +269,10 @@ def judge(
     stalled = ~first & (ratio > 0.5) & (correction <= floor)
     enough = jnp.maximum(STALL_OLD * tolerance, ABOVE_NOISE * factors.rounding) * size
     solved = (correction <= tolerance * size) | stalled | (it.last & ~first & (correction <= enough))
+    speed = SPEED if learns(factors.solver) else 1
     # Within the noise corrections shrink little, and new factors would not change it.
     noisy = factors.fresh & (correction <= floor)
-    slow = ~first & ((ratio > 0.5) | (~noisy & (correction * ratio**patience > tolerance * size)))
+    slow = ~first & ((ratio > 0.5) | (~noisy & (correction * ratio ** (speed * patience) > tolerance * size)))
     slow = slow | (it.count >= max(CHORD_ITERATIONS, 2 * patience)) | ~factors.usable
     # Old factors may have led astray: new ones begin where the first did.
     lost = ~finite & ~factors.fresh
@@ -266,6 +282,7 @@ def judge(
     following = Iterate(
         it.start,
         jnp.where(lost, it.start, y),
+        change,
         jnp.argmax(energies) if energies.shape[0] else it.worst,
         correction,
         correction / jnp.where(size > 0, size, 1.0),
@@ -279,8 +296,7 @@ def judge(
         finite | lost,
     )
     # Lanes that are done, or that wait for factors, stay as they are.
-    done = it.converged | it.wanting | ~it.finite
-    return jax.tree.map(lambda old, new: jnp.where(done, old, new), it, following)
+    return jax.tree.map(lambda old, new: jnp.where(done, old, new), it, following), factors
 
 
 def newton(equations: Any, tolerance: float) -> tuple[Float[Array, " unknowns"], Int[Array, ""]]:
@@ -304,7 +320,7 @@ def newton(equations: Any, tolerance: float) -> tuple[Float[Array, " unknowns"],
         it, factors = jax.lax.cond(any_lane(carry[0].wanting), renew, keep, *carry)
         return judge(
             factors, tolerance, it, *equations.residual(it.y), balances=True, patience=equations.renewal
-        ), factors
+        )
 
     with jax.named_scope("newton"):
         start = begin(equations.guess())

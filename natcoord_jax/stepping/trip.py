@@ -83,7 +83,9 @@ def trip(setting: Setting, unpack: Callable[[Array], State], apart: bool, carrie
     cost, options = _judging(equations, it, probe)
     if lag is not None and lagging is not None:
         options |= {"jumped": lagging.jumped(found.kick, lag, it), "whole": lag.due}
-    judged = judge(factors, plan.tolerance, it, found.residual, found.size, **options)
+    judged, factors = judge(
+        factors, plan.tolerance, it, found.residual, found.size, evaluated=~probing, **options
+    )
     if lag is not None and lagging is not None:
         moving = ~probing & it.unsolved & ~it.wanting
         lagging = lagging.after(found.kick, lag.due, judged.correction, it.total == 0, moving)
@@ -208,7 +210,7 @@ def renewed_at(
     it = refreshed(it)
     # What the residual asks for with new factors needs no evaluation; but the kick in it may have been held.
     options |= {"whole": not setting.plan.tableau.kick}
-    moved = judge(factors, setting.plan.tolerance, it, asked.residual, asked.size, **options)
+    moved, factors = judge(factors, setting.plan.tolerance, it, asked.residual, asked.size, **options)
     return jax.tree.map(partial(jnp.where, asked.here & it.unsolved), moved, it), factors
 
 

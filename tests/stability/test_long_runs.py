@@ -77,10 +77,10 @@ def test_a_million_steps(name, order):
 @EVERY_ORDER
 @EVERY_TOP
 def test_no_trend(name, order):
-    """At the default settings, too, drifts are walks without direction: all of them at order two.
+    """At the default settings, too, drifts are walks without direction: at order two all those of the top.
 
-    At orders four and six some are not. What is steady is listed by name, with a bound for every step: a
-    fraction of a rounding, which a million steps add up to 5e-11.
+    At orders four and six, and of the free body, some are not. What is steady is listed by name, with a bound
+    for every step: a fraction of a rounding, which a million steps add up to 5e-11.
     """
     for what, drift in drifts(name, long_run(name, order)).items():
         steady = tol.STEADY_PARTS.get((name, order, what.split()[0]))

@@ -1,0 +1,90 @@
+"""Approximate inverses that learn, and the pseudo-inverse from a projector."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import natcoord_jax as nc
+from natcoord_jax import gallery
+from natcoord_jax.linsolve.dense import Inverse
+from natcoord_jax.linsolve.learning import FORESEEN, learnt
+from natcoord_jax.maths.projectors import pseudo_inverse, range_projector
+from natcoord_jax.stepping import newton
+
+YES = jnp.array(True)
+
+
+def linear_problem(size, wrong, seed=0):
+    """A matrix, a right-hand side, and an inverse that is off by a part of it."""
+    rng = np.random.default_rng(seed)
+    matrix = np.eye(size) + 0.2 * rng.normal(size=(size, size))
+    inverse = np.linalg.inv(matrix) @ (np.eye(size) + wrong * rng.normal(size=(size, size)))
+    return jnp.asarray(matrix), jnp.asarray(rng.normal(size=size)), Inverse(jnp.asarray(inverse))
+
+
+def test_what_was_learnt_holds():
+    matrix, right, solver = linear_problem(5, 0.1)
+    last = solver.solve(right)
+    change = solver.solve(right - matrix @ last)
+    weights = jnp.arange(1.0, 6.0)
+    better, following = learnt(solver, last, change, weights, YES)
+    # The secant condition, and the next correction by the new inverse.
+    np.testing.assert_allclose(better.solve(matrix @ last), last, rtol=1e-12)
+    np.testing.assert_allclose(better.solve(right - matrix @ last), following, rtol=1e-12)
+    # The least change that does it: none where the inverse gives what is orthogonal to the last correction.
+    other = np.linalg.solve(np.stack([weights * last, *np.eye(5)[1:]]), np.eye(5)[1])
+    assert abs(np.dot(weights * last, other)) < 1e-12
+    direction = np.linalg.solve(solver.inverse, other)
+    np.testing.assert_allclose(better.solve(direction), other, rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.parametrize("size", [1, 3, 6])
+def test_linear_equations_are_solved_in_twice_as_many_steps_as_unknowns(size):
+    matrix, right, solver = linear_problem(size, 0.1)
+    x, last = jnp.zeros(size), jnp.zeros(size)
+    for _ in range(2 * size + 1):
+        change = solver.solve(right - matrix @ x)
+        solver, change = learnt(solver, last, change, jnp.ones(size), jnp.any(last != 0))
+        x, last = x + change, change
+    np.testing.assert_allclose(matrix @ x, right, atol=1e-13)
+
+
+@pytest.mark.parametrize("case", ["not told", "nothing done", "undone", "not finite"])
+def test_nothing_is_learnt_from_what_tells_nothing(case):
+    _, right, solver = linear_problem(3, 0.1)
+    last = right * (case != "nothing done")
+    change = {"undone": -2.0 * FORESEEN * right, "not finite": right * jnp.nan}.get(case, 0.1 * right)
+    same, following = learnt(solver, last, change, jnp.ones(3), jnp.array(case != "not told"))
+    np.testing.assert_array_equal(same.inverse, solver.inverse)
+    np.testing.assert_array_equal(following, change)
+
+
+def test_steps_take_fewer_corrections(monkeypatch):
+    example = gallery.load("heavy_top")
+
+    def iterations():
+        dt = example.t_end / 800
+        return int(nc.simulate(example.system, example.state, dt=dt, steps=100).iterations)
+
+    learning = iterations()
+    monkeypatch.setattr(newton, "LEARNING", np.inf)
+    jax.clear_caches()
+    without = iterations()
+    jax.clear_caches()
+    assert learning < 0.85 * without
+
+
+@pytest.mark.parametrize("least", [1.0, 1e-2, 1e-4])
+@pytest.mark.parametrize("shape", [(9, 6), (5, 7), (4, 4)])
+def test_pseudo_inverse_from_a_projector(shape, least):
+    rng = np.random.default_rng(1)
+    matrix = rng.normal(size=(shape[0], 3)) @ np.diag([1.0, 1.0, least]) @ rng.normal(size=(3, shape[1]))
+    found = pseudo_inverse(jnp.asarray(matrix), range_projector(jnp.asarray(matrix), 3), 3)
+    wanted = np.linalg.pinv(matrix, rcond=1e-9)
+    np.testing.assert_allclose(found, wanted, atol=1e-11 * np.abs(wanted).max())
+
+
+def test_nothing_has_a_pseudo_inverse():
+    nothing = jnp.zeros((3, 2))
+    np.testing.assert_array_equal(pseudo_inverse(nothing, range_projector(nothing, 1), 1), nothing.T)
