@@ -56,8 +56,8 @@ GRADIENTS = {
     "four_bar": (2, 4),
 }
 GRADIENT_STEPS = 200
-"""Scenes and orders that value and gradient are timed for, and the number of their steps. Their length is that
-which the gallery suggests: a run that fails, or hardly converges, would flatter its gradient."""
+"""Scenes and orders that value and gradient are timed for, and the number of their steps, of the length that
+the gallery suggests: a run that fails, or hardly converges, would flatter its gradient."""
 ERRORS = (1e-2, 1e-3, 1e-4, 1e-6, 1e-8)
 PEERS = (
     Peer("MuJoCo RK4", "mujoco_models", "mujoco", {"integrator": "RK4"}),
