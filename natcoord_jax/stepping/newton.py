@@ -66,6 +66,10 @@ LEARNING = 1e-12
 """Size of a correction relative to the terms of the equations from which on the next tells how good the
 factors are: below, rounding has a part in it."""
 
+NEAR = 1e-3
+"""The same up to which it does: far off, equations are not linear, and what failed attempts teach is noise,
+by which the next ones would be accepted or not."""
+
 NEVER = 1000
 """More corrections than a step can need."""
 
@@ -251,7 +255,8 @@ def judge(
     """
     done = it.converged | it.wanting | ~it.finite
     change = factors.solver.solve(residual)
-    telling = ~done & (it.count > 0) & ~jnp.asarray(jumped) & evaluated & (it.error > LEARNING)
+    near = (it.error > LEARNING) & (it.error < NEAR)
+    telling = ~done & (it.count > 0) & ~jnp.asarray(jumped) & evaluated & near
     solver, change = learnt(factors.solver, it.change, change, factors.inertias, telling)
     factors = eqx.tree_at(lambda f: f.solver, factors, solver)
     energies = factors.inertias * change**2
@@ -269,7 +274,7 @@ def judge(
     stalled = ~first & (ratio > 0.5) & (correction <= floor)
     enough = jnp.maximum(STALL_OLD * tolerance, ABOVE_NOISE * factors.rounding) * size
     solved = (correction <= tolerance * size) | stalled | (it.last & ~first & (correction <= enough))
-    speed = SPEED if learns(factors.solver) else 1
+    speed = jnp.where(it.error < NEAR, SPEED, 1) if learns(factors.solver) else 1
     # Within the noise corrections shrink little, and new factors would not change it.
     noisy = factors.fresh & (correction <= floor)
     slow = ~first & ((ratio > 0.5) | (~noisy & (correction * ratio ** (speed * patience) > tolerance * size)))
