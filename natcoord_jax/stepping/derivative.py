@@ -23,8 +23,10 @@ from jaxtyping import Array, Bool, Float, Int
 from natcoord_jax.assembly.equations import kind_of, prepare
 from natcoord_jax.assembly.momentum import row_weights
 from natcoord_jax.assembly.system import System
+from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
 from natcoord_jax.linsolve.learning import learns
+from natcoord_jax.maths.rows import row, with_row
 from natcoord_jax.stepping import linear_pair
 from natcoord_jax.stepping.correcting import Correcting
 from natcoord_jax.stepping.error_control import Tolerance
@@ -131,6 +133,30 @@ class Record(eqx.Module):
     factors: Factors
 
 
+class Returning(eqx.Module):
+    """What goes back from slot to slot.
+
+    Attributes:
+        left: slots that are not done.
+        state_bar: cotangent of the state after the last of them, but for its own.
+        varied_bar: of what varies, so far.
+        past: multipliers of the slots that are done.
+        lam: of the last one that is not.
+        at: where their solution stands.
+        factors: of a Jacobian.
+        stuck: whether it cannot go on without new ones, in any lane.
+    """
+
+    left: Int[Array, ""]
+    state_bar: State
+    varied_bar: list[Array]
+    past: Past
+    lam: Float[Array, " unknowns"]
+    at: Correcting
+    factors: Factors
+    stuck: Bool[Array, ""]
+
+
 class Rule:
     """The tangents of a rollout and their transpose; hashable, without traced values."""
 
@@ -195,46 +221,94 @@ class Rule:
         return as_one_kernel(partial(self._backward, plainly), record, given, too_large=several)
 
     def _backward(self, kernel: Callable, record: Record, given: tuple[State, Array]) -> tuple:
+        """In rounds: of a kernel that goes on until it needs new factors, and one that makes them.
+
+        A round sees a few slots, so that what travels between kernels does not grow with their number.
+        """
         numbers, slots = record.numbers, record.slots
+        count = slots.y.shape[0]
+        rows = min(CHUNK, count)
 
-        def body(carry: tuple, xs: tuple) -> tuple:
-            state_bar, varied_bar, past, factors = carry
-            slot, (end_bar, y_bar) = xs
-            end_bar = jax.tree.map(jnp.add, state_bar, end_bar)
-            bars, lam, factors = self._pulled(kernel, numbers, slot, end_bar, y_bar, past.guess, factors)
-            keep = partial(jnp.where, slot.accepted)
-            past = jax.tree.map(keep, past.followed_by(lam, factors.inertias), past)
-            more, before_bar, u_bar = bars
-            state_bar = jax.tree.map(keep, before_bar, end_bar)
-            varied_bar = jax.tree.map(lambda total, x: total + keep(x, jnp.zeros_like(x)), varied_bar, more)
-            u_bar = jax.tree.map(lambda x: keep(x, jnp.zeros_like(x)), u_bar)
-            return (state_bar, varied_bar, past, factors), u_bar
+        def round_of(carry: tuple[Returning, Any]) -> tuple[Returning, Any]:
+            c, u_bar = carry
+            first = jnp.maximum(c.left - rows, 0)
+            near = jax.tree.map(
+                lambda x: jax.lax.dynamic_slice_in_dim(x, first, rows, 0), (slots, given, u_bar)
+            )
 
-        resting = jax.tree.map(lambda x: jnp.zeros_like(x[0]), slots.before)
-        start = resting, jax.tree.map(jnp.zeros_like, numbers.varied), Past.of(jnp.zeros_like(slots.y[0]))
-        (state_bar, varied_bar, *_), u_bar = jax.lax.scan(
-            body, (*start, record.factors), (slots, given), reverse=True
+            def renewed(carry: tuple) -> tuple:
+                _, factors, at = carry
+                slot = jax.tree.map(lambda x: row(x, c.left - 1 - first), near[0])
+                return jnp.array(False), kernel(self._renewed, numbers, slot), at.refreshed()
+
+            start = c.stuck, c.factors, c.at
+            _, factors, at = jax.lax.while_loop(lambda carry: carry[0], renewed, start)
+            c = replace_fields(c, factors=factors, at=at, stuck=jnp.array(False))
+            c, part = kernel(self._several, numbers, first, *near, c)
+            update = partial(jax.lax.dynamic_update_slice_in_dim, start_index=first, axis=0)
+            return c, jax.tree.map(update, u_bar, part)
+
+        y = slots.y[-1]
+        start = Returning(
+            left=jnp.array(count),
+            state_bar=jax.tree.map(lambda x: jnp.zeros_like(x[0]), slots.before),
+            varied_bar=jax.tree.map(jnp.zeros_like, numbers.varied),
+            past=Past.of(jnp.zeros_like(y)),
+            lam=jnp.zeros_like(y),
+            at=Correcting.first(slots.accepted[-1], y),
+            factors=record.factors,
+            stuck=jnp.array(False),
         )
-        return varied_bar, u_bar, state_bar
+        u_bar = jax.tree.map(jnp.zeros_like, slots.u)
+        c, u_bar = jax.lax.while_loop(lambda carry: carry[0].left > 0, round_of, (start, u_bar))
+        return c.varied_bar, u_bar, c.state_bar
+
+    def _several(
+        self, numbers: Numbers, first: Array, slots: Slot, given: tuple, u_bar: Any, c: "Returning"
+    ) -> tuple["Returning", Any]:
+        """Slots from the last one back, down to the first given here or to one that needs new factors."""
+
+        def one(carry: tuple[Returning, Any]) -> tuple[Returning, Any]:
+            c, u_bar = carry
+            here = c.left - 1 - first
+            slot, (end_bar, y_bar) = jax.tree.map(lambda x: row(x, here), (slots, given))
+            end_bar = jax.tree.map(jnp.add, c.state_bar, end_bar)
+            bars, lam, at, factors = self._pulled(numbers, slot, end_bar, y_bar, c)
+            stuck = any_lane(at.open & at.wanting)
+            lost = slot.accepted & ~at.done
+            more, before_bar, found = jax.tree.map(lambda x: jnp.where(lost, jnp.nan, x), bars)
+            keep = partial(jnp.where, slot.accepted)
+            past = jax.tree.map(keep, c.past.followed_by(lam, factors.inertias), c.past)
+            before_bar = jax.tree.map(keep, before_bar, end_bar)
+            varied_bar = jax.tree.map(lambda total, x: keep(total + x, total), c.varied_bar, more)
+            # Of a slot that waits for factors nothing counts yet; this row is written again.
+            u_bar = jax.tree.map(
+                lambda rows, x: with_row(rows, here, keep(x, jnp.zeros_like(x))), u_bar, found
+            )
+            guess = past.guess
+            guess = jnp.where(jnp.all(jnp.isfinite(guess)), guess, 0.0)
+            following = Correcting.first(row(slots.accepted, jnp.maximum(here - 1, 0)), lam)
+            done = Returning(c.left - 1, before_bar, varied_bar, past, guess, following, factors, stuck)
+            waiting = replace_fields(c, lam=lam, at=at, factors=factors, stuck=stuck)
+            return jax.tree.map(partial(jnp.where, stuck), waiting, done), u_bar
+
+        return jax.lax.while_loop(lambda carry: (carry[0].left > first) & ~carry[0].stuck, one, (c, u_bar))
 
     def _pulled(
-        self,
-        kernel: Callable,
-        numbers: Numbers,
-        slot: Slot,
-        end_bar: State,
-        y_bar: Array,
-        guess: Array,
-        factors: Factors,
-    ) -> tuple[tuple, Array, Factors]:
-        """Cotangents of one slot: of what varies, of the state before it and of its inputs.
+        self, numbers: Numbers, slot: Slot, end_bar: State, y_bar: Array, c: "Returning"
+    ) -> tuple[tuple, Array, Correcting, Factors]:
+        """Cotangents of one slot, as far as the factors at hand go.
 
         The multipliers of its equations solve J^T lam = -(cotangent of the unknowns); their guess is
         extrapolated from those of the slots after it.
+
+        Returns:
+            Cotangents of what varies, of the state before the slot and of its inputs; the multipliers, where
+            their solution stands, and the factors.
         """
         system, _, dt = numbers.whole(numbers.varied)
         patience = kind_of(system, self.tableau).renewal
-        whole = _size_of(system, slot.fraction * dt, end_bar, y_bar, factors)
+        whole = _size_of(system, slot.fraction * dt, end_bar, y_bar, c.factors)
 
         # With one stage it saves time to pull back only what the corrections ask for; with more of them the
         # program grows too large for one kernel, which costs more than that.
@@ -245,53 +319,34 @@ class Rule:
             """What of the factors the corrections change."""
             return factors.solver if learns(factors.solver) else None
 
-        def with_solver(factors: Factors, learnt: Any) -> Factors:
-            return factors if learnt is None else eqx.tree_at(lambda f: f.solver, factors, learnt)
+        def with_solver(learnt: Any) -> Factors:
+            return c.factors if learnt is None else eqx.tree_at(lambda f: f.solver, c.factors, learnt)
 
-        def corrected(factors: Factors, lam: Array, at: Correcting) -> tuple:
-            """As far as these factors go, and the cotangents there."""
-            _, pull = jax.vjp(
-                lambda varied, state, u, y: self.outcome(numbers, varied, slot, state, u, y),
-                numbers.varied, slot.before, slot.u, slot.y,
-            )  # fmt: skip
+        _, pull = jax.vjp(
+            lambda varied, state, u, y: self.outcome(numbers, varied, slot, state, u, y),
+            numbers.varied, slot.before, slot.u, slot.y,
+        )  # fmt: skip
 
-            def trip(carry: tuple) -> tuple:
-                _, learnt, lam, at = carry
-                *bars, gap = pull((lam, end_bar))
-                at, known = at.judged(with_solver(factors, learnt), lam, gap + y_bar, patience, whole)
-                lam = jnp.where(at.moving, lam - at.change, lam)
-                return tuple(bars) if once else None, changing(known), lam, at
+        def trip(carry: tuple) -> tuple:
+            _, learnt, lam, at = carry
+            *bars, gap = pull((lam, end_bar))
+            at, known = at.judged(with_solver(learnt), lam, gap + y_bar, patience, whole)
+            lam = jnp.where(at.moving, lam - at.change, lam)
+            return tuple(bars) if once else None, changing(known), lam, at
 
-            start = nothing if once else None, changing(factors), lam, at
-            bars, learnt, lam, at = jax.lax.while_loop(lambda carry: any_lane(carry[-1].going), trip, start)
-            return bars if once else tuple(pull((lam, end_bar))[:-1]), learnt, lam, at
+        start = nothing if once else None, changing(c.factors), c.lam, c.at
+        bars, learnt, lam, at = jax.lax.while_loop(lambda carry: any_lane(carry[-1].going), trip, start)
+        found: Any = bars if once else tuple(pull((lam, end_bar))[:-1])
+        return found, lam, at, with_solver(learnt)
 
-        def rounds(carry: tuple) -> tuple:
-            _, factors, lam, at = carry
-            refresh = partial(self._refreshed, kernel, numbers, slot)
-            _, factors, at = jax.lax.while_loop(lambda c: c[0], refresh, (any_lane(at.wanting), factors, at))
-            bars, learnt, lam, at = kernel(corrected, factors, lam, at)
-            return bars, with_solver(factors, learnt), lam, at
-
-        lam = jnp.where(jnp.all(jnp.isfinite(guess)), guess, 0.0)
-        start = nothing, factors, lam, Correcting.first(slot.accepted, lam)
-        bars, factors, lam, at = jax.lax.while_loop(lambda carry: any_lane(carry[-1].open), rounds, start)
-        lost = slot.accepted & ~at.done
-        bars = jax.tree.map(lambda x: jnp.where(lost, jnp.nan, x), bars)
-        return bars, lam, factors
-
-    def _refreshed(self, kernel: Callable, numbers: Numbers, slot: Slot, carry: tuple) -> tuple:
+    def _renewed(self, numbers: Numbers, slot: Slot) -> Factors:
         """New factors, for this slot."""
-
-        def renewed(numbers: Numbers, slot: Slot) -> Factors:
-            system, parameters, dt = numbers.whole(numbers.varied)
-            u = self._inputs(parameters, slot, slot.before) if slot.u is None else slot.u
-            equations = prepare(system, slot.before, u, slot.fraction * dt, self.tableau)
-            if equations.by_differences:
-                return factors_of(equations, jacobian_by_differences(equations, slot.y))
-            return factors_of(equations, equations.tangent(slot.y))
-
-        return jnp.array(False), kernel(renewed, numbers, slot), carry[2].refreshed()
+        system, parameters, dt = numbers.whole(numbers.varied)
+        u = self._inputs(parameters, slot, slot.before) if slot.u is None else slot.u
+        equations = prepare(system, slot.before, u, slot.fraction * dt, self.tableau)
+        if equations.by_differences:
+            return factors_of(equations, jacobian_by_differences(equations, slot.y))
+        return factors_of(equations, equations.tangent(slot.y))
 
 
 def _size_of(system: System, h: Array, end_bar: State, y_bar: Array, factors: Factors) -> Array:
