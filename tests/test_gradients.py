@@ -4,6 +4,7 @@ A rollout is a scan, so every derivative here is taken through `lax.scan`. Deriv
 shape of the difference errors (`differences`), by each other, and by exact ones where there are any.
 """
 
+import time
 from functools import cache, partial
 
 import equinox as eqx
@@ -15,6 +16,7 @@ import tolerances as tol
 from differences import assert_v_shaped
 
 import natcoord_jax as nc
+from natcoord_jax import gallery
 
 STEPS = 12
 
@@ -299,6 +301,30 @@ def test_gradient_through_retried_steps():
     ahead = jax.jvp(f, (x,), (d,))[1]
     assert_v_shaped(f, x, d, ahead, steps=10.0 ** -np.arange(3.0, 9.5, 0.5))
     assert abs(jax.grad(f)(x) - ahead) <= tol.SAME_GRADIENT * abs(ahead)
+
+
+@pytest.mark.benchmark
+def test_room_for_retries_costs_a_batch_nothing():
+    """A batch whose steps all succeed takes as long with room for repeated steps as without, within 5 %."""
+    example = gallery.load("double_pendulum")
+    system = example.system
+    swing = jax.vmap(
+        lambda rate: system.with_coordinate(example.state, system.structure.joints[0], 0.0, rate=rate)
+    )
+    starts = swing(jnp.linspace(-0.5, 0.5, 256))
+
+    def batch(extra):
+        options = dict(dt=example.dt, steps=100, extra_substeps=extra, throw=False)
+        return jax.jit(jax.vmap(lambda state: nc.simulate(system, state, **options).v[-1]))
+
+    runs = {extra: batch(extra) for extra in (0, 8)}
+    least = dict.fromkeys(runs, np.inf)
+    for _ in range(40):
+        for extra, run in runs.items():
+            begun = time.process_time()
+            jax.block_until_ready(run(starts))
+            least[extra] = min(least[extra], time.process_time() - begun)
+    assert least[8] <= 1.05 * least[0]
 
 
 # --- exact gradients --------------------------------------------------------------------------------------
