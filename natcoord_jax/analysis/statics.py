@@ -239,6 +239,7 @@ def _equilibria(
     def one(carry: tuple, load: tuple) -> tuple[tuple, tuple]:
         now, lam, alive = carry
         value, u = load
+        # Loads belong to the search as well; `differentiable` is given them again.
         begin = replace_fields(now, t=jax.lax.stop_gradient(value))
         search = _solve(still[0], begin, lam, jax.lax.stop_gradient(u))
         code = jnp.where(alive, _code(search), int(Result.DIVERGED))
@@ -249,6 +250,7 @@ def _equilibria(
     start = replace_fields(still[1], v=jnp.zeros_like(state.v), rates=jnp.zeros_like(state.rates))
     lam = jnp.zeros(static.unknowns - static.balances)
     _, (states, lams, codes, counts) = jax.lax.scan(one, (start, lam, jnp.array(True)), (values, inputs))
+    # Results of the search: their derivatives are those of the equations that they solve, below.
     states, lams = jax.lax.stop_gradient((states, lams))
     states = replace_fields(states, t=values)
     if with_derivatives:

@@ -100,7 +100,7 @@ class Correcting(eqx.Module):
         change = solver.solve(residual)
         size = _size(lam, weights)
         allowed = jnp.maximum(CLOSE * size, ROUND_OFF * whole)
-        if learns(solver):
+        if learns(solver):  # Others would only be transposed twice.
             telling = self.going & (self.count > 0) & (self.correction > allowed)
             solver, change = learnt(solver, self.change, change, weights, telling)
             factors = eqx.tree_at(lambda f: f.solver, factors, solver.transpose())

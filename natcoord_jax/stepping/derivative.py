@@ -17,8 +17,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array
 
 from natcoord_jax.assembly.equations import kind_of, prepare
 from natcoord_jax.assembly.momentum import row_weights
@@ -35,6 +34,7 @@ from natcoord_jax.stepping.one_kernel import as_one_kernel, in_groups, plainly
 from natcoord_jax.stepping.past import Past
 from natcoord_jax.stepping.plan import Plan, Slots
 from natcoord_jax.stepping.probe import jacobian_by_differences
+from natcoord_jax.stepping.record import Numbers, Record, Returning, Slot, instantiated, zero_tangent
 from natcoord_jax.stepping.rollout import Ending, run
 from natcoord_jax.stepping.step import advance, linear_solver
 
@@ -61,100 +61,6 @@ def run_slots(
 def _traced_once(plan: Plan, *numbers: Any) -> tuple[Slots, Ending]:
     """JAX evaluates the function and the rule for its derivative; jit remembers the program."""
     return in_groups(partial(run, plan), *numbers)
-
-
-def _zero_tangent(x: Array) -> Array | np.ndarray:
-    if jnp.issubdtype(jnp.result_type(x), jnp.inexact):
-        return jnp.zeros_like(x)
-    return np.zeros(jnp.shape(x), jax.dtypes.float0)
-
-
-def _is_zero(x: Any) -> bool:
-    return isinstance(x, jax.custom_derivatives.SymbolicZero)
-
-
-def _instantiated(tangents: Any, primals: Any) -> Any:
-    """Tangents with arrays for symbolic zeros."""
-    return jax.tree.map(
-        lambda t, p: _zero_tangent(p) if _is_zero(t) else t, tangents, primals, is_leaf=_is_zero
-    )
-
-
-class Numbers(eqx.Module):
-    """What a rollout depends on besides its first state, apart into what varies and what does not.
-
-    Attributes:
-        varied: leaves that are differentiated.
-        fixed: all others.
-        chosen: which leaves vary.
-        structure: of (system, parameters, dt).
-    """
-
-    varied: list[Array]
-    fixed: list[Array]
-    chosen: tuple[int, ...] = eqx.field(static=True)
-    structure: Any = eqx.field(static=True)
-
-    @classmethod
-    def of(cls, numbers: tuple, tangents: tuple) -> tuple["Numbers", list[Array]]:
-        """Split by the tangents, and the tangents of what varies."""
-        leaves, structure = jax.tree.flatten(numbers)
-        changes = jax.tree.leaves(tangents, is_leaf=_is_zero)
-        chosen = tuple(i for i, change in enumerate(changes) if not _is_zero(change))
-        fixed = [x for i, x in enumerate(leaves) if i not in chosen]
-        return cls([leaves[i] for i in chosen], fixed, chosen, structure), [changes[i] for i in chosen]
-
-    def whole(self, varied: list[Array]) -> tuple[System, Any, Array]:
-        """System, parameters and step with other values of what varies."""
-        some, rest = iter(varied), iter(self.fixed)
-        count = len(self.varied) + len(self.fixed)
-        return jax.tree.unflatten(
-            self.structure, [next(some) if i in self.chosen else next(rest) for i in range(count)]
-        )
-
-
-class Slot(eqx.Module):
-    """Where one slot began, its solution and its inputs (None where a control decides)."""
-
-    before: State
-    y: Float[Array, "*slots unknowns"]
-    u: Float[Array, "*slots inputs"] | None
-    step: Int[Array, "*slots"]
-    fraction: Float[Array, "*slots"]
-    done: Float[Array, "*slots"]
-    accepted: Bool[Array, "*slots"]
-
-
-class Record(eqx.Module):
-    """All that the derivative is taken at."""
-
-    numbers: Numbers
-    slots: Slot
-    factors: Factors
-
-
-class Returning(eqx.Module):
-    """What goes back from slot to slot.
-
-    Attributes:
-        left: slots that are not done.
-        state_bar: cotangent of the state after the last of them, but for its own.
-        varied_bar: of what varies, so far.
-        past: multipliers of the slots that are done.
-        lam: of the last one that is not.
-        at: where their solution stands.
-        factors: of a Jacobian.
-        stuck: whether it cannot go on without new ones, in any lane.
-    """
-
-    left: Int[Array, ""]
-    state_bar: State
-    varied_bar: list[Array]
-    past: Past
-    lam: Float[Array, " unknowns"]
-    at: Correcting
-    factors: Factors
-    stuck: Bool[Array, ""]
 
 
 class Rule:
@@ -377,14 +283,14 @@ def _run_slots_jvp(plan: Plan, primals: tuple, tangents: tuple):
     system, state, parameters, dt, _ = primals
     system_dot, state_dot, parameters_dot, dt_dot, _ = tangents
     slots, ending = run_slots(plan, *primals)
-    state_dot = _instantiated(state_dot, state)
+    state_dot = instantiated(state_dot, state)
     u = u_dot = None
     if plan.control is None:
         # Inputs are those of the slots, so that no slot sees all of them.
         within = jax.vmap(plan.within_step)
         u, u_dot = (
             within(x[slots.step], slots.done, slots.fraction)
-            for x in (parameters, _instantiated(parameters_dot, parameters))
+            for x in (parameters, instantiated(parameters_dot, parameters))
         )
         numbers, varied_dot = Numbers.of((system, None, dt), (system_dot, None, dt_dot))
     else:
@@ -403,8 +309,8 @@ def _run_slots_jvp(plan: Plan, primals: tuple, tangents: tuple):
     changes, outputs = (varied_dot, u_dot, state_dot), (slots.states, slots.y)
     states_dot, y_dot = linear_pair.apply(rule.tangents, rule.cotangents, record, changes, outputs)
     last_dot = jax.tree.map(lambda x: x[-1], states_dot)
-    slots_dot = jax.tree.map(_zero_tangent, slots)
+    slots_dot = jax.tree.map(zero_tangent, slots)
     slots_dot = eqx.tree_at(lambda s: (s.states, s.y), slots_dot, (states_dot, y_dot))
-    ending_dot = jax.tree.map(_zero_tangent, ending)
+    ending_dot = jax.tree.map(zero_tangent, ending)
     ending_dot = eqx.tree_at(lambda e: e.course.state, ending_dot, last_dot)
     return (slots, ending), (slots_dot, ending_dot)

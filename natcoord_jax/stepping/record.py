@@ -1,0 +1,109 @@
+"""What the derivative of a rollout is taken at, and what goes back along it."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from natcoord_jax.assembly.system import System
+from natcoord_jax.core.state import State
+from natcoord_jax.stepping.correcting import Correcting
+from natcoord_jax.stepping.newton import Factors
+from natcoord_jax.stepping.past import Past
+
+
+def zero_tangent(x: Array) -> Array | np.ndarray:
+    """No change of an array; of integers JAX wants one of a kind of its own."""
+    if jnp.issubdtype(jnp.result_type(x), jnp.inexact):
+        return jnp.zeros_like(x)
+    return np.zeros(jnp.shape(x), jax.dtypes.float0)
+
+
+def is_zero(x: Any) -> bool:
+    """Whether a tangent is known to be none."""
+    return isinstance(x, jax.custom_derivatives.SymbolicZero)
+
+
+def instantiated(tangents: Any, primals: Any) -> Any:
+    """Tangents with arrays for symbolic zeros."""
+    return jax.tree.map(lambda t, p: zero_tangent(p) if is_zero(t) else t, tangents, primals, is_leaf=is_zero)
+
+
+class Numbers(eqx.Module):
+    """What a rollout depends on besides its first state, apart into what varies and what does not.
+
+    Attributes:
+        varied: leaves that are differentiated.
+        fixed: all others.
+        chosen: which leaves vary.
+        structure: of (system, parameters, dt).
+    """
+
+    varied: list[Array]
+    fixed: list[Array]
+    chosen: tuple[int, ...] = eqx.field(static=True)
+    structure: Any = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, numbers: tuple, tangents: tuple) -> tuple["Numbers", list[Array]]:
+        """Split by the tangents, and the tangents of what varies."""
+        leaves, structure = jax.tree.flatten(numbers)
+        changes = jax.tree.leaves(tangents, is_leaf=is_zero)
+        chosen = tuple(i for i, change in enumerate(changes) if not is_zero(change))
+        fixed = [x for i, x in enumerate(leaves) if i not in chosen]
+        return cls([leaves[i] for i in chosen], fixed, chosen, structure), [changes[i] for i in chosen]
+
+    def whole(self, varied: list[Array]) -> tuple[System, Any, Array]:
+        """System, parameters and step with other values of what varies."""
+        some, rest = iter(varied), iter(self.fixed)
+        count = len(self.varied) + len(self.fixed)
+        return jax.tree.unflatten(
+            self.structure, [next(some) if i in self.chosen else next(rest) for i in range(count)]
+        )
+
+
+class Slot(eqx.Module):
+    """Where one slot began, its solution and its inputs (None where a control decides)."""
+
+    before: State
+    y: Float[Array, "*slots unknowns"]
+    u: Float[Array, "*slots inputs"] | None
+    step: Int[Array, "*slots"]
+    fraction: Float[Array, "*slots"]
+    done: Float[Array, "*slots"]
+    accepted: Bool[Array, "*slots"]
+
+
+class Record(eqx.Module):
+    """All that the derivative is taken at."""
+
+    numbers: Numbers
+    slots: Slot
+    factors: Factors
+
+
+class Returning(eqx.Module):
+    """What goes back from slot to slot.
+
+    Attributes:
+        left: slots that are not done.
+        state_bar: cotangent of the state after the last of them, but for its own.
+        varied_bar: of what varies, so far.
+        past: multipliers of the slots that are done.
+        lam: of the last one that is not.
+        at: where their solution stands.
+        factors: of a Jacobian.
+        stuck: whether it cannot go on without new ones, in any lane.
+    """
+
+    left: Int[Array, ""]
+    state_bar: State
+    varied_bar: list[Array]
+    past: Past
+    lam: Float[Array, " unknowns"]
+    at: Correcting
+    factors: Factors
+    stuck: Bool[Array, ""]
