@@ -50,6 +50,10 @@ ABOVE_NOISE = 4.0
 STALL_OLD = 20.0
 """The same with factors of an earlier step, where a stall may be the factors' fault."""
 
+STALL_ALIKE = 2.0
+"""The same with factors for which stages are alike: about an axis with next to no inertia these may halve the
+error only, which would be taken for noise in the steps that follow, too."""
+
 CHORD_ITERATIONS = 14
 """Corrections with one factorisation."""
 
@@ -233,6 +237,7 @@ def judge(
     jumped: Bool[Array, ""] | bool = False,
     whole: Bool[Array, ""] | bool = True,
     evaluated: Bool[Array, ""] | bool = True,
+    alike: Bool[Array, ""] | bool = False,
 ) -> tuple[Iterate, Factors]:
     """What follows from one evaluation of the equations at `it.y`.
 
@@ -248,6 +253,8 @@ def judge(
         jumped: whether the equations are not those of the last evaluation: corrections do not compare.
         whole: whether they are all that the end of a step asks for; if not, the next evaluation is the last.
         evaluated: whether the residual is that at `it.y`; if not, only the factors matter that come back.
+        alike: whether the last factors that were made take stages for alike. Corrections by them may shrink
+            slowly, which is no sign of rounding.
 
     Returns:
         Converged; or moved by one correction; or in want of new factors, when corrections shrink too slowly
@@ -269,7 +276,8 @@ def judge(
     trusted = jnp.maximum(ratio, SLOWEST_UNSEEN)
     predicted = correction * jnp.where(first, 1.0, trusted / jnp.maximum(1.0 - trusted, 1e-3))
     raised = STALL * 10.0 ** jnp.clip(it.rounds - 1, 0, STALLS)
-    floor = jnp.where(factors.fresh, raised, STALL_OLD) * max(tolerance, ROUND_OFF) * size
+    trust = jnp.where(alike, STALL_ALIKE, jnp.where(factors.fresh, raised, STALL_OLD))
+    floor = trust * max(tolerance, ROUND_OFF) * size
     finite = jnp.isfinite(correction) & jnp.isfinite(size)
     stalled = ~first & (ratio > 0.5) & (correction <= floor)
     enough = jnp.maximum(STALL_OLD * tolerance, ABOVE_NOISE * factors.rounding) * size

@@ -197,7 +197,8 @@ def _judging(equations: Any, it: Iterate, probe: Probe | None) -> tuple[int, dic
     """Cost of new factors, in corrections, and options of `judge`."""
     driven = any(group.multipliers and group.effect.works for group in equations.groups)
     cost = equations.renewal if probe is None else max(equations.renewal, it.y.shape[0] // 2)
-    return cost, {"balances": driven, "patience": cost}
+    alike = False if probe is None else probe.alike
+    return cost, {"balances": driven, "patience": cost, "alike": alike}
 
 
 def renewed_at(
