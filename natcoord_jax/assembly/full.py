@@ -240,8 +240,17 @@ class FullStep(Form):
         """Twists at the start, repeated for every stage; multipliers zero."""
         start = self.start[:-1]
         spin = 0.5 * jnp.sum(cross(start[:, 1:], self.velocity[:, 1:]), axis=1)
-        twist = jnp.concatenate([self.velocity[:, 0], spin], axis=1)[:, None]
-        twists = jnp.broadcast_to(twist, (self.bodies, self.tableau.stages, 6)).reshape(-1)
+        return self.repeated(jnp.concatenate([self.velocity[:, 0], spin], axis=1).reshape(-1))
+
+    def by_stage(self, y: Float[Array, " unknowns"]) -> Float[Array, "s rates"]:
+        """Twists among the unknowns, or balances among the equations."""
+        twists = y[: self.balances].reshape(self.bodies, self.tableau.stages, 6)
+        return jnp.moveaxis(twists, 1, 0).reshape(self.tableau.stages, -1)
+
+    def repeated(self, w: Float[Array, " rates"]) -> Float[Array, " unknowns"]:
+        """The same at all stages; multipliers zero."""
+        shape = self.bodies, self.tableau.stages, 6
+        twists = jnp.broadcast_to(w.reshape(self.bodies, 1, 6), shape).reshape(-1)
         return jnp.concatenate([twists, jnp.zeros(self.unknowns - self.balances, twists.dtype)])
 
     def motion_of(self, y: Float[Array, " unknowns"]) -> Stations:

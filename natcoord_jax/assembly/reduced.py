@@ -260,9 +260,16 @@ class ReducedStep(Form):
 
     def guess(self) -> Float[Array, " unknowns"]:
         """Rates of the velocities at the start, repeated for every stage; multipliers zero."""
-        w = start_rates(self.system.tree, self.frames, self.start, self.velocity)
-        w = jnp.tile(w, self.tableau.stages)
-        return jnp.concatenate([w, jnp.zeros(self.system.structure.multipliers * self.tableau.stages)])
+        return self.repeated(start_rates(self.system.tree, self.frames, self.start, self.velocity))
+
+    def by_stage(self, y: Float[Array, " unknowns"]) -> Float[Array, "s rates"]:
+        """Rates among the unknowns, or balances among the equations."""
+        return y[: self.balances].reshape(self.tableau.stages, -1)
+
+    def repeated(self, w: Float[Array, " rates"]) -> Float[Array, " unknowns"]:
+        """The same at all stages; multipliers zero."""
+        idle = jnp.zeros(self.system.structure.multipliers * self.tableau.stages, w.dtype)
+        return jnp.concatenate([jnp.tile(w, self.tableau.stages), idle])
 
     def jacobian(self, y: Float[Array, " unknowns"]) -> Float[Array, "unknowns unknowns"]:
         """Exact Jacobian of the residual."""

@@ -46,6 +46,7 @@ class Course(eqx.Module):
         residual: largest accepted.
         trial: where a substep with error control stands.
         lagging: what is known of the kick; None for schemes without.
+        left: impulse that the last (sub)step left to the next, see `remainder`.
     """
 
     state: State
@@ -64,6 +65,7 @@ class Course(eqx.Module):
     residual: Float[Array, ""]
     trial: Trial | None
     lagging: Lagging | None
+    left: Float[Array, " rates"]
 
 
 class Setting(eqx.Module):
@@ -117,7 +119,9 @@ def start_of(setting: Setting, state: State) -> tuple[Course, Factors, Outset]:
     u = plan.inputs(setting.parameters, jnp.array(0), state, jnp.zeros(()), jnp.ones(()))
     equations = prepare(setting.system, state, u, dt, plan.tableau)
     few = setting.tolerance is not None
-    it, factors = begin(equations.guess(), few), no_factors(equations)
+    guess = equations.guess()
+    left = jnp.zeros_like(equations.by_stage(guess)[0])
+    it, factors = begin(guess, few), no_factors(equations)
     zero, nought = jnp.array(0), jnp.zeros((), state.q.dtype)
     bad = ~(jnp.isfinite(dt) & (dt > 0))
     lagging = None
@@ -141,8 +145,9 @@ def start_of(setting: Setting, state: State) -> tuple[Course, Factors, Outset]:
         iterations=zero,
         iterations_max=zero,
         residual=nought,
-        trial=None if setting.tolerance is None else Trial.first(state),
+        trial=None if setting.tolerance is None else Trial.first(state, left),
         lagging=lagging,
+        left=left,
     )
     return course, factors, equations.outset
 
@@ -170,6 +175,7 @@ def after_attempt(
     course: Course,
     inertias: Array,
     found: tuple[State, Array],
+    left: Float[Array, " rates"],
     kick: Velocity | None = None,
 ) -> Course:
     """The end of an attempt: what is attempted next, and from where.
@@ -179,6 +185,7 @@ def after_attempt(
         course: with the solved iteration.
         inertias: of the unknowns.
         found: state at the end of the attempt, and its largest half turn.
+        left: impulse that it leaves to the next.
         kick: of the attempt.
     """
     plan, it, over = setting.plan, course.it, setting.over(course)
@@ -202,11 +209,13 @@ def after_attempt(
         crossed = verdict.accepted & (before * after <= 0) & (before != 0)
         stopped, result = stopped | crossed, jnp.where(crossed, int(Result.EVENT), result)
     done, fraction, trial = verdict.done, verdict.fraction, verdict.trial
+    left = jnp.where(verdict.change > 0, left, course.left)
     done = jnp.where(complete, 0.0, done)
     if trial is None:
         fraction = jnp.where(complete, 1.0, fraction)
     else:
-        trial = trial.beginning(done, complete)
+        left = jnp.where(verdict.change < 0, trial.left, left)
+        trial = trial.beginning(done, complete).leaving(left, verdict.accepted | verdict.failed)
         fraction = jnp.where(complete, trial.length, fraction)
     kept, worked = verdict.change > 0, jnp.where(over, 0, it.total)
     # Guesses hold for steps of one length: another length begins anew from the last solution.
@@ -244,4 +253,5 @@ def after_attempt(
         residual=jnp.where(kept, jnp.maximum(course.residual, it.error), course.residual),
         trial=trial,
         lagging=lagging,
+        left=left,
     )

@@ -92,6 +92,7 @@ class Trial(eqx.Module):
         whole: state that it reached at once.
         undone: whether the slot before this one has just been taken back.
         repeated: whether the substep at hand is one that failed before.
+        left: impulse that was left before it, see `remainder`.
     """
 
     phase: Int[Array, ""]
@@ -102,12 +103,14 @@ class Trial(eqx.Module):
     whole: State
     undone: Bool[Array, ""]
     repeated: Bool[Array, ""]
+    left: Float[Array, " rates"]
 
     @classmethod
-    def first(cls, state: State) -> "Trial":
+    def first(cls, state: State, left: Float[Array, " rates"]) -> "Trial":
         """Before the first attempt: the whole step."""
         nought, one = jnp.array(0), jnp.ones(())
-        return cls(nought, one, one, state, 0.0 * one, state, jnp.array(False), jnp.array(False))
+        no = jnp.array(False)
+        return cls(nought, one, one, state, 0.0 * one, state, no, no, left)
 
     def wish_after(
         self, excess: Float[Array, ""], solved: Bool[Array, ""], failed: Bool[Array, ""], order: int
@@ -141,6 +144,10 @@ class Trial(eqx.Module):
             self,
             (jnp.where(anew, done, self.done), jnp.where(anew, length, self.length)),
         )
+
+    def leaving(self, left: Float[Array, " rates"], anew: Bool[Array, ""]) -> "Trial":
+        """The trial with what was left before the substep that begins, if one does."""
+        return eqx.tree_at(lambda t: t.left, self, jnp.where(anew, left, self.left))
 
 
 class Verdict(eqx.Module):
@@ -210,6 +217,7 @@ def follow(
         jax.tree.map(lambda x, y: jnp.where(trial.phase == WHOLE, x, y), after, trial.whole),
         undone,
         jnp.where(anew, failed, trial.repeated),
+        trial.left,
     ).beginning(done, anew)
     return Verdict(
         trial=following,

@@ -19,6 +19,7 @@ from natcoord_jax.maths.rows import row, with_row
 from natcoord_jax.stepping.course import Course, Setting, after_attempt
 from natcoord_jax.stepping.newton import Factors, Iterate, any_lane, factors_of, judge, new_factors, refreshed
 from natcoord_jax.stepping.probe import Probe
+from natcoord_jax.stepping.remainder import remainder, with_remainder
 from natcoord_jax.stepping.step import end_of_step
 
 
@@ -80,12 +81,11 @@ def trip(setting: Setting, unpack: Callable[[Array], State], apart: bool, carrie
     outset = eqx.tree_at(lambda o: o.lag, carried.outset, lag, is_leaf=_is_none)
     equations = prepare(setting.system, course.state, u, h, plan.tableau, outset)
     found = equations.evaluate(it.y if probe is None else probe.moved(it.y, equations))
+    residual = with_remainder(equations, found.residual, course.left)
     cost, options = _judging(equations, it, probe)
     if lag is not None and lagging is not None:
         options |= {"jumped": lagging.jumped(found.kick, lag, it), "whole": lag.due}
-    judged, factors = judge(
-        factors, plan.tolerance, it, found.residual, found.size, evaluated=~probing, **options
-    )
+    judged, factors = judge(factors, plan.tolerance, it, residual, found.size, evaluated=~probing, **options)
     if lag is not None and lagging is not None:
         moving = ~probing & it.unsolved & ~it.wanting
         lagging = lagging.after(found.kick, lag.due, judged.correction, it.total == 0, moving)
@@ -101,7 +101,8 @@ def trip(setting: Setting, unpack: Callable[[Array], State], apart: bool, carrie
         groups, tableau = equations.groups, plan.tableau
         ends = end_of_step(setting.system, before.state, h, groups, found, tableau)
         kick = None if before.lagging is None else found.kick.exact
-        after = after_attempt(setting, before, factors.inertias, ends, kick)
+        left = remainder(equations, residual)
+        after = after_attempt(setting, before, factors.inertias, ends, left, kick)
         accepted = after.taken > before.taken
         x = ravel_pytree(after.state)[0]
         slot = x, before.it.y, index, before.fraction, before.done, accepted, after.step
@@ -147,11 +148,11 @@ def trip(setting: Setting, unpack: Callable[[Array], State], apart: bool, carrie
         factors = eqx.tree_at(lambda f: f.usable, factors, factors.usable & ~other)
     if probe is not None:
         rounds = any_lane(after.it.rounds)
-        probe, wanting = probe.with_column(it.y, found.residual, equations, wanting, rounds)
+        probe, wanting = probe.with_column(it.y, residual, equations, wanting, rounds)
 
     # Evaluated where the new factors belong, unless these begin anew where the step began.
     here = jnp.all(after.it.y == carried.course.it.y)
-    asked = Asked(wanting, found.residual, found.size, found.loads, here)
+    asked = Asked(wanting, residual, found.size, found.loads, here)
     carried = Carried(carried.count + ending, after, x, outset, factors, probe, record, carried.first, None)
     if apart:
         return eqx.tree_at(lambda c: c.asked, carried, asked, is_leaf=_is_none)
