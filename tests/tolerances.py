@@ -69,9 +69,9 @@ OTHER_SCHEME = 5e-5
 
 # --- hard cases (tests/stability) ---------------------------------------------------------------------------
 
-# A million steps. What rounding leaves of a balance is made up for in the next step, so that the energy does not
-# walk as 1e-16 sqrt(10^6), and there is nothing steady at order two. Kicks of higher orders pass through a
-# factorisation, and their coefficients are numbers of finite length: there some parts are steady, up to a
+# A million steps. What rounding leaves of a balance is made up for in the next step, so that the energy does
+# not walk as 1e-16 sqrt(10^6), and there is nothing steady at order two. Kicks of higher orders pass through
+# a factorisation, and their coefficients are numbers of finite length: there some parts are steady, up to a
 # twentieth of a rounding a step. Relative errors a step by scene, order and quantity.
 MILLION_STEPS = 1e-10
 MILLION_STEPS_ENERGY = {2: 2e-13, 4: 2e-11, 6: 2e-11}  # found: 8e-14, 6e-12, 5e-12
