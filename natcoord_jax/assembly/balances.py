@@ -150,13 +150,18 @@ class Balances(eqx.Module):
     def columns(self) -> Gains:
         """Accelerations of everything per unit of w', leading axis the unknowns."""
         velocity, spin = self.free
-        rows = jax.vmap(lambda v, s: row_rates(self.rows, v, s), in_axes=1)(velocity, spin)
+        at_rest = jnp.zeros_like(velocity[:, 0])
 
-        def along(part):
-            on_velocity, on_spin = (x[:, :-1] for x in part)
-            return jnp.einsum("kbc,buc->uk", on_velocity, velocity) + jnp.einsum("kbc,buc->uk", on_spin, spin)
+        def relative(velocity: Array, spin: Array) -> tuple[Array, Array]:
+            return relative_rates(self.system, self.rows, with_rest(velocity), with_rest(spin), self.t)
 
-        return Gains(rows, along(self.rotors), along(self.constraints))
+        def column(velocity: Array, spin: Array) -> Gains:
+            # Of what drives prescribe nothing: one motion of the tree at a time, of which there are fewer
+            # than velocities of bodies.
+            found = jax.jvp(relative, (at_rest, at_rest), (velocity, spin))[1]
+            return Gains(row_rates(self.rows, velocity, spin), *found)
+
+        return jax.vmap(column, in_axes=1)(velocity, spin)
 
     def inertial(self, gains: Gains) -> Twists:
         """Forces and torques that give bodies and rotors their accelerations."""

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from natcoord_jax.assembly.balances import Balances, with_rest
+from natcoord_jax.assembly.balances import Balances
 from natcoord_jax.assembly.momentum import inertia, wrench
 from natcoord_jax.assembly.rates import row_rates
 from natcoord_jax.assembly.system import System
@@ -101,11 +101,7 @@ class TangentSpace(eqx.Module):
     def spread(self, w: Float[Array, " u"]) -> Velocity:
         """P w."""
         velocity, spin = self.balances.twists(w)
-        along = self.balances.rotors
-        turning = jnp.sum(along[0] * with_rest(velocity), (1, 2)) + jnp.sum(
-            along[1] * with_rest(spin), (1, 2)
-        )
-        return Velocity(row_rates(self.balances.rows, velocity, spin), turning)
+        return Velocity(row_rates(self.balances.rows, velocity, spin), w @ self.columns.rotors)
 
     def impulse(self, v: Velocity) -> Velocity:
         """M v."""
