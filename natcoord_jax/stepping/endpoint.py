@@ -8,6 +8,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from natcoord_jax.assembly.system import System
@@ -78,6 +79,10 @@ def _program(structure: Any, inputs: Callable | None, scheme: Scheme, tolerance:
     return jax.jit(run, compiler_options=QUICK if jax.default_backend() == "cpu" else None)
 
 
+def _number(x: Any, kind: type) -> Any:
+    return x if isinstance(x, jax.Array) else kind(x)
+
+
 def endpoints(
     system: System,
     state: State,
@@ -102,4 +107,5 @@ def endpoints(
     leaves, structure = jax.tree.flatten((system, scheme.started(state)))
     program = _program(structure, inputs, scheme, newton_tol)
     placed = [jnp.asarray(x) for x in leaves]
-    return lambda dt, steps: program(placed, jnp.asarray(dt, float), jnp.asarray(steps))
+    # Numbers of NumPy go in ten times as fast as arrays of JAX are made of them.
+    return lambda dt, steps: program(placed, _number(dt, np.float64), _number(steps, np.int64))
