@@ -217,7 +217,8 @@ def test_a_rejected_substep_begins_where_it_began():
     tolerance = Tolerance(jnp.array(1e-6), jnp.array(1e-6))
     yes, no = jnp.array(True), jnp.array(False)
     tableau = FOURTH.tableau
-    first = follow(tolerance, Trial.first(state), state, state, yes, no, tableau)
+    left = jnp.zeros(1)
+    first = follow(tolerance, Trial.first(state, left), state, state, yes, no, tableau)
     assert int(first.change) == 0 and float(first.fraction) == 0.5
     second = follow(tolerance, first.trial, first.state, moved, yes, no, tableau)
     assert int(second.change) == 1 and int(second.trial.phase) == SECOND and float(second.done) == 0.5

@@ -74,13 +74,13 @@ OTHER_SCHEME = 5e-5
 # a factorisation, and their coefficients are numbers of finite length: there some parts are steady, up to a
 # twentieth of a rounding a step. Relative errors a step by scene, order and quantity.
 MILLION_STEPS = 1e-10
-MILLION_STEPS_ENERGY = {2: 2e-13, 4: 2e-11, 6: 2e-11}  # found: 8e-14, 6e-12, 5e-12
+MILLION_STEPS_ENERGY = {2: 2e-13, 4: 2e-11, 6: 2e-11}  # found: 5e-14, 6e-12, 4e-12
 MILLION_STEPS_CONSTRAINT = 1e-12
 STEADY_PARTS = {
-    ("heavy_top", 4, "energy"): 1e-17,  # found: -5.2e-18
-    ("heavy_top", 6, "energy"): 1e-17,  # 5.2e-18
-    ("dzhanibekov", 6, "energy"): 4e-18,  # -1.7e-18
-    ("dzhanibekov", 6, "spin"): 2e-18,  # -8.6e-19
+    ("heavy_top", 4, "energy"): 1e-17,  # found: -5.3e-18
+    ("heavy_top", 6, "energy"): 1e-17,  # 4.3e-18
+    ("dzhanibekov", 6, "energy"): 4e-18,  # -1.5e-18
+    ("dzhanibekov", 6, "spin"): 2e-18,  # -7.3e-19
 }
 # Standard errors of a slope; of a thousand walks without drift, whose scatter is taken from 25 blocks, one
 # scores higher than this.

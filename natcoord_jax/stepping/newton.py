@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int, Shaped
 from natcoord_jax.core.results import Result
 from natcoord_jax.linsolve.learning import SPEED, learns, learnt
 
-TOLERANCE = 5e-16
+TOLERANCE = 2e-16
 """Predicted error after the last correction, relative to the terms of the equations (energy norm).
 
 What is left after the last correction has the same sign in every step. The next step makes up for it, see

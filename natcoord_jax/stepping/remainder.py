@@ -13,18 +13,32 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from natcoord_jax.assembly.momentum import inertia, row_weights
+from natcoord_jax.maths.vectors import safe_divide
 
-def remainder(equations: Any, residual: Float[Array, " unknowns"]) -> Float[Array, " rates"]:
-    """Impulse that is missing in the balances of a step, sum_i b_i r_i, by rate.
+ROUNDING = 5e-15
+"""Impulse in terms of the momenta (energy norm) up to which it is handed on. What stiff forces leave is more,
+and has their direction: turned with the body by one step, it would be an impulse in others, too."""
+
+
+def remainder(
+    equations: Any, residual: Float[Array, " unknowns"], inertias: Float[Array, " unknowns"]
+) -> Float[Array, " rates"]:
+    """Impulse that is missing in the balances of a step, sum_i b_i r_i, by rate; zero if it is no rounding.
 
     Args:
         equations: of the step.
         residual: of them where its iteration has ended.
+        inertias: of the unknowns.
     """
     balances = equations.by_stage(residual)
-    if equations.tableau.stages == 1:
-        return balances[0]
-    return jnp.asarray(equations.tableau.b) @ balances
+    found = balances[0]
+    if equations.tableau.stages > 1:
+        found = jnp.asarray(equations.tableau.b) @ balances
+    size = jnp.sum(safe_divide(found**2, equations.by_stage(inertias)[0]))
+    mass = equations.system.mass
+    motion = jnp.sum(row_weights(mass)[..., None] * inertia(mass, equations.velocity) ** 2)
+    return jnp.where(size <= ROUNDING**2 * motion, found, 0.0)
 
 
 def with_remainder(

@@ -101,7 +101,7 @@ def trip(setting: Setting, unpack: Callable[[Array], State], apart: bool, carrie
         groups, tableau = equations.groups, plan.tableau
         ends = end_of_step(setting.system, before.state, h, groups, found, tableau)
         kick = None if before.lagging is None else found.kick.exact
-        left = remainder(equations, residual)
+        left = remainder(equations, residual, factors.inertias)
         after = after_attempt(setting, before, factors.inertias, ends, left, kick)
         accepted = after.taken > before.taken
         x = ravel_pytree(after.state)[0]
