@@ -73,6 +73,7 @@ OTHER_SCHEME = 5e-5
 # not walk as 1e-16 sqrt(10^6), and there is nothing steady at order two. Kicks of higher orders pass through
 # a factorisation, and their coefficients are numbers of finite length: there some parts are steady, up to a
 # twentieth of a rounding a step. Relative errors a step by scene, order and quantity.
+HANDED_ON = 4e-15  # energy over 4000 steps, root mean square; 1e-14 if every step begins anew
 MILLION_STEPS = 1e-10
 MILLION_STEPS_ENERGY = {2: 2e-13, 4: 2e-11, 6: 2e-11}  # found: 5e-14, 6e-12, 4e-12
 MILLION_STEPS_CONSTRAINT = 1e-12

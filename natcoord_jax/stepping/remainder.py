@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from natcoord_jax.assembly.momentum import inertia, row_weights
 from natcoord_jax.maths.vectors import safe_divide
 
-ROUNDING = 5e-15
+ROUNDING = 1e-14
 """Impulse in terms of the momenta (energy norm) up to which it is handed on. What stiff forces leave is more,
 and has their direction: turned with the body by one step, it would be an impulse in others, too."""
 
