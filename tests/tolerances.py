@@ -69,6 +69,9 @@ OTHER_SCHEME = 5e-5
 
 # --- hard cases (tests/stability) ---------------------------------------------------------------------------
 
+# Steps far too long for a linkage that passes singular positions, over a run, in terms of the energy.
+FAR_TOO_LONG_ENERGY = 1e-9  # found: 3e-11
+
 # A million steps. What rounding leaves of a balance is made up for in the next step, so that the energy does
 # not walk as 1e-16 sqrt(10^6), and there is nothing steady at order two. Kicks of higher orders pass through
 # a factorisation, and their coefficients are numbers of finite length: there some parts are steady, up to a

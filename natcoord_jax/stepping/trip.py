@@ -21,6 +21,7 @@ from natcoord_jax.stepping.newton import Factors, Iterate, any_lane, factors_of,
 from natcoord_jax.stepping.probe import Probe
 from natcoord_jax.stepping.remainder import remainder, with_remainder
 from natcoord_jax.stepping.step import end_of_step
+from natcoord_jax.stepping.watch import sound
 
 
 class Carried(eqx.Module):
@@ -101,6 +102,8 @@ def trip(setting: Setting, unpack: Callable[[Array], State], apart: bool, carrie
         groups, tableau = equations.groups, plan.tableau
         ends = end_of_step(setting.system, before.state, h, groups, found, tableau)
         kick = None if before.lagging is None else found.kick.exact
+        steady = sound(equations, before.it.y, residual, found.size, ends[0], plan.tolerance)
+        before = eqx.tree_at(lambda c: c.it.converged, before, before.it.converged & steady)
         left = remainder(equations, residual, factors.inertias)
         after = after_attempt(setting, before, factors.inertias, ends, left, kick)
         accepted = after.taken > before.taken

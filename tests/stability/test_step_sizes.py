@@ -9,6 +9,7 @@ own round-off.
 from functools import cache
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from motions import SECOND_AND_FOURTH, one_body, simulate
 import natcoord_jax as nc
 from natcoord_jax import gallery
 from natcoord_jax.assembly.equations import prepare
+from natcoord_jax.stepping.endpoint import endpoints
 
 pytestmark = pytest.mark.slow
 
@@ -52,6 +54,32 @@ def test_radians_in_a_step(order, turn):
     assert found.momentum_error() <= tol.MOMENTUM
     assert found.spin_error() <= tol.ANGULAR_MOMENTUM
     assert found.directors <= tol.CONSTRAINT
+
+
+def coarse_runs(scene, run, seconds, numbers):
+    """Result codes of runs with far too long steps, and by how much the energy of those that end is off."""
+    energy = jax.jit(lambda state: scene.system.energy(state).total)
+    start = energy(scene.state)
+    for number in numbers:
+        for stretch in np.linspace(1.0, 1.1, 25, endpoint=False):
+            end = run(seconds / number * stretch, number)
+            yield int(end.result), abs(float(energy(end.state) - start)) / abs(start)
+
+
+@pytest.mark.parametrize("order", [2, 6])
+def test_steps_far_too_long_are_refused_or_keep_energy(order):
+    """Linkages that turn by a radian and more a step, through positions in which their loops are singular.
+
+    Stages next to such a position need forces without bound; what is rounding beside these is not beside the
+    motion. Of 200 runs at most one may end with the message that steps were too long.
+    """
+    scene = gallery.load("four_bar")
+    run = endpoints(scene.system, scene.state, scheme=nc.EnergyMomentum(order=order))
+    found = list(coarse_runs(scene, run, 2.0, (6, 8, 10, 12, 16, 20, 24, 32)))
+    failed = [code for code, _ in found if code]
+    assert set(failed) <= {int(nc.Result.MAX_ITERATIONS), int(nc.Result.DIVERGED)}
+    assert len(failed) <= 1
+    assert max(error for code, error in found if not code) <= tol.FAR_TOO_LONG_ENERGY
 
 
 # --- stiff springs ----------------------------------------------------------------------------------------

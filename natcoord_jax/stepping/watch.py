@@ -1,0 +1,78 @@
+"""A second opinion on a step that Newton's iteration calls solved: the work of what is missing in it.
+
+Corrections are small against the terms of the equations where these are huge: a stage next to a singular
+position, of which there are some where steps are far too long, needs enormous forces of constraints, and
+rounding of these would be taken for the end of the iteration. Energy tells. It changes in a step by the work
+of the effects and by that of the residual, exactly: sum_i b_i w_i . r_i by the stages' rates w_i and balances
+r_i (for the step of one stage the work over (57)), and by what multipliers do on rates of constraints that
+are not zero. So no energy has to be known for it, and no store of energy asked.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from natcoord_jax.assembly.balances import rotors_of
+from natcoord_jax.assembly.momentum import inertia, row_weights
+from natcoord_jax.assembly.system import System
+from natcoord_jax.core.state import State
+from natcoord_jax.stepping.newton import TOLERANCE
+
+UNSOUND = 1e-12
+"""Work of the residual in terms of the energy of the motion, twice, beyond which a step is refused."""
+
+ROUNDING = 1e-13
+"""The same in terms of the forces and of the motion on which they work: a hundred times their rounding."""
+
+
+def unbalanced_work(
+    equations: Any, y: Float[Array, " unknowns"], residual: Float[Array, " unknowns"]
+) -> Float[Array, ""]:
+    """Energy that a step makes or loses because its equations are not solved [J], an upper bound of it.
+
+    Args:
+        equations: of the step.
+        y: unknowns.
+        residual: of the equations there.
+    """
+    by_stage = jnp.sum(equations.by_stage(y) * equations.by_stage(residual), axis=1)
+    held = y[equations.balances :] * residual[equations.balances :]
+    return jnp.abs(jnp.asarray(equations.tableau.b) @ by_stage) + jnp.sum(jnp.abs(held))
+
+
+def motion_of(system: System, state: State) -> Float[Array, ""]:
+    """Energy of the motion, twice, rotors included, within a small factor [J]."""
+    momenta = inertia(system.mass, state.v.reshape(-1, 4, 3))
+    motion = jnp.sum(row_weights(system.mass)[..., None] * momenta**2)
+    for group in rotors_of(system):
+        inertias = jax.vmap(lambda effect: effect.inertia_of())(group.effect)
+        motion = motion + jnp.sum(inertias * state.rates[group.rotors] ** 2)
+    return motion
+
+
+def sound(
+    equations: Any,
+    y: Float[Array, " unknowns"],
+    residual: Float[Array, " unknowns"],
+    size: Float[Array, ""],
+    after: State,
+    tolerance: float,
+) -> Bool[Array, ""]:
+    """Whether a step keeps the balance of energy, as far as rounding lets it.
+
+    Args:
+        equations: of the step.
+        y: its solution.
+        residual: of the equations there.
+        size: of their terms [sqrt(J)].
+        after: state at the end.
+        tolerance: of Newton's iteration; a larger one than the default lets energy drift in proportion.
+    """
+    before, system = equations.state, equations.system
+    motion = jnp.maximum(motion_of(system, before), motion_of(system, after))
+    # Forces that are large, but at rest, are rounded, too.
+    rounding = ROUNDING * size * (jnp.sqrt(motion) + ROUNDING * size)
+    allowed = max(tolerance / TOLERANCE, 1.0) * (UNSOUND * motion + rounding)
+    return unbalanced_work(equations, y, residual) <= allowed
