@@ -23,6 +23,9 @@ STALL_ROUND_OFF = 1e-12
 SURPRISE = 10.0
 """Times the error allowed by which the correction may be larger that was expected to be within it."""
 
+FORESEEN = 0.1
+"""Part of the error allowed that what is foreseen may be: it is not looked at."""
+
 STALL = 1e-10
 """Corrections that stop shrinking below this have reached the floor of round-off."""
 
@@ -82,7 +85,13 @@ class Correcting(eqx.Module):
         )
 
     def judged(
-        self, factors: Factors, lam: Array, residual: Array, patience: int, whole: Array
+        self,
+        factors: Factors,
+        lam: Array,
+        residual: Array,
+        patience: int,
+        whole: Array,
+        foreseen: bool,
     ) -> tuple["Correcting", Factors]:
         """After an evaluation: done, or moving on by a correction, or in want of new factors.
 
@@ -92,6 +101,8 @@ class Correcting(eqx.Module):
             residual: of the transposed equations.
             patience: corrections that are cheaper than new factors.
             whole: size of the solution if nothing cancelled.
+            foreseen: whether it is done with a correction that leaves nothing for the next, as far as can be
+                foreseen; if not, with an evaluation at the solution.
 
         Returns:
             Where it stands, and the factors, which have learnt from it if they are of that kind.
@@ -115,10 +126,12 @@ class Correcting(eqx.Module):
         trusted = jnp.maximum(ratio, SLOWEST_UNSEEN)
         following = correction * trusted / jnp.maximum(1.0 - trusted, 1e-3)
         last = ~first & (following <= allowed)
+        done = done | (foreseen & ~first & (following <= FORESEEN * allowed) & finite & factors.usable)
         late = correction * ratio ** (patience * (SPEED if learns(solver) else 1)) > allowed
         slow = (~first & ((ratio > 0.5) | late)) | (self.count >= CORRECTIONS) | ~finite | ~factors.usable
         slow = slow & ~done
-        found = Correcting(change, correction, self.count + 1, self.rounds, done, slow, ~done & ~slow, last)
+        moving = ~slow & (foreseen | ~done)
+        found = Correcting(change, correction, self.count + 1, self.rounds, done, slow, moving, last)
         stay = eqx.tree_at(lambda c: c.moving, self, jnp.zeros_like(self.moving))
         return jax.tree.map(partial(jnp.where, ~self.going), stay, found), factors
 

@@ -69,6 +69,9 @@ class Rule:
     def __init__(self, plan: Plan):
         self.plan = plan
         self.tableau = plan.tableau
+        # Velocities across constraints alternate from step to step where no kicks hold them: v_1 = 2 V - v_0.
+        # So do their cotangents, and a part of the multipliers; every other one of these is smooth.
+        self.stride = 1 if self.tableau.kick else 2
 
     def _inputs(self, parameters: Any, slot: Slot, state: State) -> Array:
         """Inputs that a control decides."""
@@ -159,7 +162,7 @@ class Rule:
             left=jnp.array(count),
             state_bar=jax.tree.map(lambda x: jnp.zeros_like(x[0]), slots.before),
             varied_bar=jax.tree.map(jnp.zeros_like, numbers.varied),
-            past=Past.of(jnp.zeros_like(y)),
+            pasts=(Past.of(jnp.zeros_like(y)),) * self.stride,
             lam=jnp.zeros_like(y),
             at=Correcting.first(slots.accepted[-1], y),
             factors=record.factors,
@@ -184,17 +187,18 @@ class Rule:
             lost = slot.accepted & ~at.done
             more, before_bar, found = jax.tree.map(lambda x: jnp.where(lost, jnp.nan, x), bars)
             keep = partial(jnp.where, slot.accepted)
-            past = jax.tree.map(keep, c.past.followed_by(lam, factors.inertias), c.past)
+            own, *others = c.pasts
+            pasts = jax.tree.map(keep, (*others, own.followed_by(lam, factors.inertias)), c.pasts)
             before_bar = jax.tree.map(keep, before_bar, end_bar)
             varied_bar = jax.tree.map(lambda total, x: keep(total + x, total), c.varied_bar, more)
             # Of a slot that waits for factors nothing counts yet; this row is written again.
             u_bar = jax.tree.map(
                 lambda rows, x: with_row(rows, here, keep(x, jnp.zeros_like(x))), u_bar, found
             )
-            guess = past.guess
+            guess = pasts[0].guess
             guess = jnp.where(jnp.all(jnp.isfinite(guess)), guess, 0.0)
             following = Correcting.first(row(slots.accepted, jnp.maximum(here - 1, 0)), lam)
-            done = Returning(c.left - 1, before_bar, varied_bar, past, guess, following, factors, stuck)
+            done = Returning(c.left - 1, before_bar, varied_bar, pasts, guess, following, factors, stuck)
             waiting = replace_fields(c, lam=lam, at=at, factors=factors, stuck=stuck)
             return jax.tree.map(partial(jnp.where, stuck), waiting, done), u_bar
 
@@ -206,7 +210,7 @@ class Rule:
         """Cotangents of one slot, as far as the factors at hand go.
 
         The multipliers of its equations solve J^T lam = -(cotangent of the unknowns); their guess is
-        extrapolated from those of the slots after it.
+        extrapolated from those of the slots after it, or of every other one.
 
         Returns:
             Cotangents of what varies, of the state before the slot and of its inputs; the multipliers, where
@@ -236,7 +240,7 @@ class Rule:
         def trip(carry: tuple) -> tuple:
             _, learnt, lam, at = carry
             *bars, gap = pull((lam, end_bar))
-            at, known = at.judged(with_solver(learnt), lam, gap + y_bar, patience, whole)
+            at, known = at.judged(with_solver(learnt), lam, gap + y_bar, patience, whole, not once)
             lam = jnp.where(at.moving, lam - at.change, lam)
             return tuple(bars) if once else None, changing(known), lam, at
 

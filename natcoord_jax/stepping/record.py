@@ -92,7 +92,7 @@ class Returning(eqx.Module):
         left: slots that are not done.
         state_bar: cotangent of the state after the last of them, but for its own.
         varied_bar: of what varies, so far.
-        past: multipliers of the slots that are done.
+        pasts: multipliers of the slots that are done, dealt out in turn; the first guesses the next.
         lam: of the last one that is not.
         at: where their solution stands.
         factors: of a Jacobian.
@@ -102,7 +102,7 @@ class Returning(eqx.Module):
     left: Int[Array, ""]
     state_bar: State
     varied_bar: list[Array]
-    past: Past
+    pasts: tuple[Past, ...]
     lam: Float[Array, " unknowns"]
     at: Correcting
     factors: Factors
