@@ -102,7 +102,8 @@ def trip(setting: Setting, unpack: Callable[[Array], State], apart: bool, carrie
         groups, tableau = equations.groups, plan.tableau
         ends = end_of_step(setting.system, before.state, h, groups, found, tableau)
         kick = None if before.lagging is None else found.kick.exact
-        steady = sound(equations, before.it.y, residual, found.size, ends[0], plan.tolerance)
+        missed = residual, found.size, before.it.correction
+        steady = sound(equations, before.it.y, *missed, ends[0], plan.tolerance)
         before = eqx.tree_at(lambda c: c.it.converged, before, before.it.converged & steady)
         left = remainder(equations, residual, factors.inertias)
         after = after_attempt(setting, before, factors.inertias, ends, left, kick)

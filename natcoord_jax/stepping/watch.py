@@ -26,6 +26,10 @@ UNSOUND = 1e-12
 ROUNDING = 1e-13
 """The same in terms of the forces and of the motion on which they work: a hundred times their rounding."""
 
+PLACES = 1e-11
+"""Displacement, relative to the places, that a step may miss whatever work that is: stiff parts feel how their
+places are rounded."""
+
 
 def unbalanced_work(
     equations: Any, y: Float[Array, " unknowns"], residual: Float[Array, " unknowns"]
@@ -57,16 +61,18 @@ def sound(
     y: Float[Array, " unknowns"],
     residual: Float[Array, " unknowns"],
     size: Float[Array, ""],
+    correction: Float[Array, ""],
     after: State,
     tolerance: float,
 ) -> Bool[Array, ""]:
-    """Whether a step keeps the balance of energy, as far as rounding lets it.
+    """Whether a step keeps the balance of energy, as far as rounding of forces and of places lets it.
 
     Args:
         equations: of the step.
         y: its solution.
         residual: of the equations there.
         size: of their terms [sqrt(J)].
+        correction: that would follow (energy norm) [sqrt(J)].
         after: state at the end.
         tolerance: of Newton's iteration; a larger one than the default lets energy drift in proportion.
     """
@@ -75,4 +81,7 @@ def sound(
     # Forces that are large, but at rest, are rounded, too.
     rounding = ROUNDING * size * (jnp.sqrt(motion) + ROUNDING * size)
     allowed = max(tolerance / TOLERANCE, 1.0) * (UNSOUND * motion + rounding)
-    return unbalanced_work(equations, y, residual) <= allowed
+    rows = before.q.reshape(-1, 4, 3)
+    places = jnp.sum(rows * inertia(system.mass, rows))
+    near = (equations.h * correction) ** 2 <= PLACES**2 * places
+    return near | (unbalanced_work(equations, y, residual) <= allowed)
