@@ -27,8 +27,8 @@ ROUNDING = 1e-13
 """The same in terms of the forces and of the motion on which they work: a hundred times their rounding."""
 
 PLACES = 1e-11
-"""Displacement, relative to the places, that a step may miss whatever work that is: stiff parts feel how their
-places are rounded."""
+"""Displacement, relative to the places, that a step may miss whatever work that is: stiff parts feel how
+their places are rounded."""
 
 
 def unbalanced_work(
