@@ -33,6 +33,11 @@ def row_weights(mass: Float[Array, "bodies 4 4"]) -> Float[Array, "bodies 4"]:
     return jnp.where(sizes > 0, 1.0 / jnp.where(sizes > 0, sizes, 1.0), 0.0)
 
 
+def motion(mass: Float[Array, "bodies 4 4"], rates: Float[Array, "bodies 4 3"]) -> Float[Array, ""]:
+    """Energy of the bodies' motion, twice, within a small factor: each row by its own mass [J]."""
+    return jnp.sum(row_weights(mass)[..., None] * inertia(mass, rates) ** 2)
+
+
 def stage_momentum(
     mass: Float[Array, "bodies 4 4"], difference: Float[Array, "s bodies 4 3"], tableau: Tableau
 ) -> Float[Array, "s bodies 4 3"]:

@@ -13,7 +13,7 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from natcoord_jax.assembly.momentum import inertia, row_weights
+from natcoord_jax.assembly.momentum import motion
 from natcoord_jax.maths.vectors import safe_divide
 
 ROUNDING = 1e-14
@@ -36,9 +36,8 @@ def remainder(
     if equations.tableau.stages > 1:
         found = jnp.asarray(equations.tableau.b) @ balances
     size = jnp.sum(safe_divide(found**2, equations.by_stage(inertias)[0]))
-    mass = equations.system.mass
-    motion = jnp.sum(row_weights(mass)[..., None] * inertia(mass, equations.velocity) ** 2)
-    return jnp.where(size <= ROUNDING**2 * motion, found, 0.0)
+    moving = motion(equations.system.mass, equations.velocity)
+    return jnp.where(size <= ROUNDING**2 * moving, found, 0.0)
 
 
 def with_remainder(

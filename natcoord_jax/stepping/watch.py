@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from natcoord_jax.assembly.balances import rotors_of
-from natcoord_jax.assembly.momentum import inertia, row_weights
+from natcoord_jax.assembly.momentum import inertia, motion
 from natcoord_jax.assembly.system import System
 from natcoord_jax.core.state import State
 from natcoord_jax.stepping.newton import TOLERANCE
@@ -48,12 +48,11 @@ def unbalanced_work(
 
 def motion_of(system: System, state: State) -> Float[Array, ""]:
     """Energy of the motion, twice, rotors included, within a small factor [J]."""
-    momenta = inertia(system.mass, state.v.reshape(-1, 4, 3))
-    motion = jnp.sum(row_weights(system.mass)[..., None] * momenta**2)
+    moving = motion(system.mass, state.v.reshape(-1, 4, 3))
     for group in rotors_of(system):
         inertias = jax.vmap(lambda effect: effect.inertia_of())(group.effect)
-        motion = motion + jnp.sum(inertias * state.rates[group.rotors] ** 2)
-    return motion
+        moving = moving + jnp.sum(inertias * state.rates[group.rotors] ** 2)
+    return moving
 
 
 def sound(
@@ -77,10 +76,10 @@ def sound(
         tolerance: of Newton's iteration; a larger one than the default lets energy drift in proportion.
     """
     before, system = equations.state, equations.system
-    motion = jnp.maximum(motion_of(system, before), motion_of(system, after))
+    moving = jnp.maximum(motion_of(system, before), motion_of(system, after))
     # Forces that are large, but at rest, are rounded, too.
-    rounding = ROUNDING * size * (jnp.sqrt(motion) + ROUNDING * size)
-    allowed = max(tolerance / TOLERANCE, 1.0) * (UNSOUND * motion + rounding)
+    rounding = ROUNDING * size * (jnp.sqrt(moving) + ROUNDING * size)
+    allowed = max(tolerance / TOLERANCE, 1.0) * (UNSOUND * moving + rounding)
     rows = before.q.reshape(-1, 4, 3)
     places = jnp.sum(rows * inertia(system.mass, rows))
     near = (equations.h * correction) ** 2 <= PLACES**2 * places
