@@ -11,6 +11,7 @@ import natcoord_jax as nc
 from natcoord_jax import gallery
 from natcoord_jax.maths.projectors import range_projector
 from natcoord_jax.stepping import linear_pair, one_kernel, rewriting, rounds
+from natcoord_jax.stepping.endpoint import endpoints
 from natcoord_jax.stepping.one_kernel import LANES, as_one_kernel, in_groups
 from natcoord_jax.stepping.plan import Plan
 from natcoord_jax.stepping.rollout import run
@@ -170,6 +171,17 @@ def test_every_scene_of_the_gallery_runs_in_one_kernel(name):
     )
     run = jax.jit(lambda s, x: nc.simulate(s, x, dt=example.dt, steps=4, inputs=inputs))
     assert MARK in run.lower(example.system, example.state).as_text()
+
+
+@pytest.mark.parametrize("name", ["heavy_top", "spacecraft", "four_bar"])
+def test_the_end_of_a_run_is_one_kernel_and_little_else(name):
+    """Every operation outside takes as long as an evaluation of the equations of a small system."""
+    example = gallery.load(name)
+    end = endpoints(example.system, example.state, inputs=example.torques, scheme=nc.EnergyMomentum(order=4))
+    (program,) = jax.make_jaxpr(end)(1e-3, 4).eqns
+    names = [equation.primitive.name for equation in program.params["jaxpr"].eqns]
+    assert names == ["custom_vmap_call"]
+    assert MARK in jax.jit(end).lower(1e-3, 4).as_text(), "not compiled into one kernel"
 
 
 def _forward(residuals, x):

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import equinox as eqx
@@ -12,11 +12,15 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from natcoord_jax.assembly.system import System
+from natcoord_jax.core.checks import at_top_level
 from natcoord_jax.core.compiled import QUICK
 from natcoord_jax.core.state import State
+from natcoord_jax.stepping.course import Setting
 from natcoord_jax.stepping.newton import TOLERANCE
+from natcoord_jax.stepping.one_kernel import apart, as_one_kernel, in_one_array, plainly
 from natcoord_jax.stepping.plan import Plan
 from natcoord_jax.stepping.rollout import run_to_the_end
+from natcoord_jax.stepping.rounds import in_parts
 from natcoord_jax.stepping.scheme import Scheme
 
 MOST = 1 << 30
@@ -65,18 +69,31 @@ class Sampled:
 
 
 @lru_cache(maxsize=64)
-def _program(structure: Any, inputs: Callable | None, scheme: Scheme, tolerance: float) -> Callable:
-    """The compiled program for all systems and states of one structure."""
+def _program(
+    structure: Any, kinds: tuple, inputs: Callable | None, scheme: Scheme, tolerance: float
+) -> Callable:
+    """The compiled program for all systems and states of one structure, their numbers in one array.
 
-    def run(leaves: list[Array], dt: Array, steps: Array) -> Endpoint:
-        system, state = jax.tree.unflatten(structure, leaves)
-        tableau = scheme.tableau
-        control = Sampled(inputs, len(system.structure.inputs), tableau.c)
-        plan = Plan(MOST, 0, tolerance, control, None, tableau, recorded=False)
-        course = run_to_the_end(plan, system, state, dt, dt, steps)
+    Nothing but one kernel where that is possible: every array that goes in and every operation outside take
+    longer than an evaluation of the equations of a small system.
+    """
+    like, _ = jax.tree.unflatten(structure, kinds)  # for what is static in it
+    control = Sampled(inputs, len(like.structure.inputs), scheme.tableau.c)
+    plan = Plan(MOST, 0, tolerance, control, None, scheme.tableau, recorded=False)
+
+    def end(kernel: Callable, numbers: Array, dt: Array, steps: Array) -> Endpoint:
+        system, state = jax.tree.unflatten(structure, apart(numbers, kinds))
+        course = run_to_the_end(Setting(system, dt, dt, None, plan, steps), state, kernel)
         return Endpoint(course.state, course.code, course.step, course.iterations, course.taken)
 
-    return jax.jit(run, compiler_options=QUICK if jax.default_backend() == "cpu" else None)
+    def run(*numbers: Array) -> Endpoint:
+        if in_parts(like, plan, None):
+            return end(as_one_kernel, *numbers)
+        return as_one_kernel(partial(end, plainly), *numbers)
+
+    outermost = jax.jit(run, compiler_options=QUICK if jax.default_backend() == "cpu" else None)
+    within = jax.jit(run)  # JAX accepts options at the outermost call only.
+    return lambda *numbers: (outermost if at_top_level(numbers) else within)(*numbers)
 
 
 def _number(x: Any, kind: type) -> Any:
@@ -105,7 +122,8 @@ def endpoints(
         repeated in parts, as in `simulate`, without a limit.
     """
     leaves, structure = jax.tree.flatten((system, scheme.started(state)))
-    program = _program(structure, inputs, scheme, newton_tol)
-    placed = [jnp.asarray(x) for x in leaves]
+    kinds = tuple((jnp.shape(x), jnp.result_type(x)) for x in leaves)
+    program = _program(structure, kinds, inputs, scheme, newton_tol)
+    placed = jax.jit(in_one_array)(leaves)
     # Numbers of NumPy go in ten times as fast as arrays of JAX are made of them.
     return lambda dt, steps: program(placed, _number(dt, np.float64), _number(steps, np.int64))

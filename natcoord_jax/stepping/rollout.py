@@ -7,12 +7,13 @@ make up for it, and are not entered otherwise.
 The derivative of a rollout runs along its recorded slots, see `derivative`.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Int
+from jaxtyping import Array
 
 from natcoord_jax.assembly.system import System
 from natcoord_jax.core.results import Result
@@ -20,6 +21,7 @@ from natcoord_jax.core.state import State
 from natcoord_jax.stepping.course import Course, Setting
 from natcoord_jax.stepping.error_control import Tolerance
 from natcoord_jax.stepping.newton import Factors, any_lane
+from natcoord_jax.stepping.one_kernel import as_one_kernel
 from natcoord_jax.stepping.plan import Plan, Slots
 from natcoord_jax.stepping.rounds import all_slots
 from natcoord_jax.stepping.trip import with_state
@@ -61,15 +63,18 @@ def run(
     return slots, Ending(_judged(course, plan.steps), factors)
 
 
-def run_to_the_end(
-    plan: Plan, system: System, state: State, parameters: Any, dt: Array, steps: Int[Array, ""]
-) -> Course:
+def run_to_the_end(setting: Setting, state: State, kernel: Callable = as_one_kernel) -> Course:
     """Where a rollout of any number of steps ends: one program for all numbers, and nothing recorded.
 
-    Without derivatives. At most `plan.steps` steps are made.
+    Without derivatives. At most as many steps are made as the plan has.
+
+    Args:
+        setting: of the rollout.
+        state: the first.
+        kernel: see `all_slots`.
     """
-    found, unpack = all_slots(Setting(system, parameters, dt, None, plan, steps), state)
-    return _judged(with_state(found.course, unpack(found.state)), steps)
+    found, unpack = all_slots(setting, state, kernel)
+    return _judged(with_state(found.course, unpack(found.state)), setting.steps)
 
 
 def _judged(course: Course, steps: Any) -> Course:

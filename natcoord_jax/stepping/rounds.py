@@ -17,10 +17,13 @@ from jaxtyping import Array
 
 from natcoord_jax.assembly.equations import kind_of, prepare
 from natcoord_jax.assembly.outset import Outset
+from natcoord_jax.assembly.system import System
 from natcoord_jax.core.state import State
 from natcoord_jax.stepping.course import Course, Setting, start_of
+from natcoord_jax.stepping.error_control import Tolerance
 from natcoord_jax.stepping.newton import Factors, Iterate, any_lane
 from natcoord_jax.stepping.one_kernel import as_one_kernel
+from natcoord_jax.stepping.plan import Plan
 from natcoord_jax.stepping.probe import Probe
 from natcoord_jax.stepping.trip import Asked, Carried, renewed_at, trip, with_state
 
@@ -34,25 +37,35 @@ ATTEMPTS = 2
 """Slots for every accepted substep with error control: one and a half, and some that are rejected."""
 
 
-def all_slots(setting: Setting, state: State) -> tuple[Carried, Callable[[Array], State]]:
-    """The loop over all evaluations of the equations."""
+def all_slots(
+    setting: Setting, state: State, kernel: Callable = as_one_kernel
+) -> tuple[Carried, Callable[[Array], State]]:
+    """The loop over all evaluations of the equations.
+
+    Args:
+        setting: of the rollout.
+        state: the first.
+        kernel: what runs the loop where it is one kernel, see `in_parts`; `plainly` in that of the caller.
+    """
     plan = setting.plan
     length = plan.steps + plan.extra
     if setting.tolerance is not None:
         length = ATTEMPTS * length
     packed, unpack = ravel_pytree(state)
-    course, factors, outset = start_of(setting, state)
-    start = with_state(course, None), factors, outset, packed
-    given = setting, unpack, length
-    if _in_parts(setting):
-        return _by_rounds(*given, *start), unpack
-    return as_one_kernel(partial(_every_slot, *given), *start), unpack
+    if in_parts(setting.system, plan, setting.tolerance):
+        return _by_rounds(setting, unpack, length, packed), unpack
+    return kernel(partial(_every_slot, setting, unpack, length), packed), unpack
 
 
-def _in_parts(setting: Setting) -> bool:
+def in_parts(system: System, plan: Plan, tolerance: Tolerance | None) -> bool:
     """Whether new factors are made in a kernel of their own: one for all would compile for too long."""
-    kind = kind_of(setting.system, setting.plan.tableau)
-    return kind.by_formulas and setting.tolerance is None and len(setting.system.structure.bodies) >= PARTS
+    kind = kind_of(system, plan.tableau)
+    return kind.by_formulas and tolerance is None and len(system.structure.bodies) >= PARTS
+
+
+def _start(setting: Setting, unpack: Callable[[Array], State], x: Array) -> tuple[Course, Factors, Outset]:
+    course, factors, outset = start_of(setting, unpack(x))
+    return with_state(course, None), factors, outset
 
 
 def _unfinished(setting: Setting, length: int, carried: Carried) -> Array:
@@ -69,12 +82,11 @@ def _every_slot(
     setting: Setting,
     unpack: Callable[[Array], State],
     length: int,
-    course: Course,
-    factors: Factors,
-    outset: Outset,
     x: Array,
 ) -> Carried:
     """All slots, in one loop."""
+    # In the kernel, too: a few dozen fusions before it would take longer than the first steps.
+    course, factors, outset = _start(setting, unpack, x)
     plan, it = setting.plan, course.it
     by_differences = kind_of(setting.system, plan.tableau).by_differences
     probe = Probe.first(it.y.shape[0], plan.tableau.stages, x.dtype) if by_differences else None
@@ -89,9 +101,6 @@ def _by_rounds(
     setting: Setting,
     unpack: Callable[[Array], State],
     length: int,
-    course: Course,
-    factors: Factors,
-    outset: Outset,
     x: Array,
 ) -> Carried:
     """All slots, in rounds of a kernel that goes on until it needs new factors, and one that makes them.
@@ -100,6 +109,7 @@ def _by_rounds(
     what travels between kernels does not grow with the number of slots.
     """
     plan = setting.plan
+    course, factors, outset = _start(setting, unpack, x)
     rows = CHUNK if plan.recorded else 1
 
     def situated(setting: Setting, carried: Carried) -> Any:
