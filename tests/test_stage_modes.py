@@ -11,7 +11,7 @@ from natcoord_jax.assembly.equations import prepare
 from natcoord_jax.linsolve.stages import complex_inverse, fitted, modes_of, stagewise_inverse
 from natcoord_jax.maths.collocation import gauss
 from natcoord_jax.stepping.newton import newton
-from natcoord_jax.stepping.probe import FAILURES, Probe
+from natcoord_jax.stepping.probe import FAILURES, Probe, jacobian_by_differences
 
 SIZES = [(5, 0), (5, 2), (50, 3)]
 
@@ -75,22 +75,26 @@ def test_complex_inverse_needs_no_diagonal(size):
 
 
 def driven(probe, y, equations):
-    """The probe once its Jacobian at y is complete."""
+    """The probe once its Jacobian at y is complete, and the number of evaluations that it took."""
 
     def trip(carry):
-        probe, _ = carry
+        probe, _, count = carry
         residual = equations.residual(probe.moved(y, equations))[0]
-        return probe.with_column(y, residual, equations, jnp.array(False), jnp.array(0))
+        return *probe.with_column(y, residual, equations, jnp.array(False), jnp.array(0)), count + 1
 
-    return jax.lax.while_loop(lambda carry: ~carry[1], trip, (probe, jnp.array(False)))[0]
+    start = probe, jnp.array(False), 0
+    probe, _, count = jax.lax.while_loop(lambda carry: ~carry[1], trip, start)
+    return probe, count
 
 
 class Linear:
     """Equations of two stages with two rates and a multiplier each, with the Jacobian `matrix`."""
 
     tableau = gauss(2)
+    balances = 4
     stage_places = np.array([[0, 1, 4], [2, 3, 5]])
     matrix = np.arange(36.0).reshape(6, 6)
+    matrix[np.ix_([2, 3, 5], [4])] = matrix[np.ix_([0, 1, 4], [5])] = 0.0  # multipliers act at their stage
 
     def probes(self, y):
         return jnp.array([0.5, 0.25, 0.5, 0.25, 2.0, 1.0])
@@ -101,7 +105,8 @@ class Linear:
 
 def test_columns_of_changes_that_are_the_same_at_all_stages():
     equations, y = Linear(), jnp.ones(6)
-    probe = driven(Probe.first(6, 2, y.dtype), y, equations)
+    probe, count = driven(Probe.first(6, 2, y.dtype), y, equations)
+    assert count == 1 + 3
     alike = equations.matrix[:, equations.stage_places].sum(axis=1).T
     np.testing.assert_allclose(probe.columns[:3], alike, atol=1e-12)
 
@@ -110,14 +115,29 @@ def test_stages_are_told_apart_where_that_is_needed():
     equations, y, yes = Linear(), jnp.ones(6), jnp.array(True)
     residual, probe = equations.residual(y)[0], Probe.first(6, 2, y.dtype)
     for failures in range(1, FAILURES + 1):
-        probe = driven(probe, y, equations)
+        probe, _ = driven(probe, y, equations)
         # A later step begins with stages that are alike; where that is not enough, they are told apart.
         probe, _ = probe.with_column(y, residual, equations, yes, jnp.array(1))
         assert not probe.alike and probe.failures == failures
-        probe = driven(probe, y, equations)
-        np.testing.assert_allclose(probe.columns[:6], equations.matrix.T, atol=1e-12)
+        probe, count = driven(probe, y, equations)
+        assert count == 1 + 4 + 1, "multipliers of all stages need one evaluation"
+        np.testing.assert_allclose(probe.matrix(equations), equations.matrix, atol=1e-12)
         probe, _ = probe.with_column(y, residual, equations, yes, jnp.array(0))
         assert probe.alike == (failures < FAILURES)
+
+
+@pytest.mark.parametrize("name", ["four_bar", "bricard", "robot_arm"])
+def test_jacobian_with_multipliers_of_all_stages_together(name):
+    # What could go wrong: forces of a constraint, or of a drive, that reach another stage.
+    example = gallery.load(name)
+    system = example.system
+    u = jnp.full((2, len(system.structure.inputs)), 0.1)
+    equations = prepare(system, example.state, u, jnp.asarray(example.dt), gauss(2, True))
+    y = equations.guess()
+    y = y + 0.1 * jax.random.normal(jax.random.key(0), y.shape)
+    found = jax.jit(lambda y: jacobian_by_differences(equations, y))(y)
+    exact = jax.jit(lambda y: equations.jacobian(y))(y)
+    np.testing.assert_allclose(found, exact, atol=1e-5 * float(jnp.max(jnp.abs(exact))))
 
 
 @pytest.mark.parametrize("order", [4, 6])
@@ -132,7 +152,7 @@ def test_stiff_springs_are_nearly_alike_at_all_stages(order):
     @jax.jit
     def left():
         y, code = newton(equations, 1e-16)
-        probe = driven(Probe.first(y.shape[0], tableau.stages, y.dtype), y, equations)
+        probe, _ = driven(Probe.first(y.shape[0], tableau.stages, y.dtype), y, equations)
         columns = probe.columns[: equations.stage_places.shape[1]]
         found = equations.factorised_alike(columns)[0].inverse
         return jnp.eye(y.shape[0]) - found @ equations.jacobian(y), code

@@ -141,6 +141,11 @@ class Lagging(eqx.Module):
             span=jnp.where(strong, jnp.minimum(2 * self.span, SPANS[1]), self.span),
         )
 
+    def holding(self, kick: Any, anew: Bool[Array, ""]) -> "Lagging":
+        """With the kick that has been found for what a Jacobian is formed at."""
+        held = jax.tree.map(lambda x, y: jnp.where(anew, x, y), kick.kick, self.held)
+        return eqx.tree_at(lambda x: x.held, self, held)
+
     def beginning(self, held: Velocity) -> "Lagging":
         """Before the next step."""
         zero, nought = jnp.zeros_like(self.moved), jnp.zeros_like(self.renewals)

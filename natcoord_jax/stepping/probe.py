@@ -1,6 +1,10 @@
-"""Jacobians by differences, one evaluation of the equations a column."""
+"""Jacobians by differences, one evaluation of the equations a column.
 
-from typing import Any
+Multipliers act on the balances of their own stage alone, and do not change where the stages are. So one
+evaluation gives their columns of all stages, and kicks stay as they are in it.
+"""
+
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -10,6 +14,41 @@ from jaxtyping import Array, Bool, Float, Int
 
 FAILURES = 3
 """Jacobians with stages taken for alike that were not good enough, after which none is tried."""
+
+
+class Layout(NamedTuple):
+    """Which unknowns are changed together in one evaluation.
+
+    Attributes:
+        number: of the evaluation that changes each unknown.
+        measure: by number, the unknown whose change is the measure.
+    """
+
+    number: np.ndarray
+    measure: np.ndarray
+
+
+def layouts(equations: Any) -> tuple[Layout, Layout]:
+    """With all stages taken for alike, and with the rates of every stage apart."""
+    places, balances = equations.stage_places, equations.balances
+    rates = balances // places.shape[0]
+    together, apart = np.zeros(places.size, int), np.arange(places.size)
+    together[places] = np.arange(places.shape[1])
+    apart[places[:, rates:]] = balances + np.arange(places.shape[1] - rates)
+    measure = np.concatenate([np.arange(balances), places[0, rates:]])
+    return Layout(together, places[0]), Layout(apart, measure)
+
+
+def _whole(equations: Any, columns: Float[Array, "rows unknowns"]) -> Float[Array, "unknowns unknowns"]:
+    """The Jacobian from its columns, one a row, those of multipliers for all stages together."""
+    places, (_, apart) = equations.stage_places, layouts(equations)
+    if places.shape[0] == 1:
+        return columns[: places.size].T
+    stage = np.zeros(places.size, int)
+    stage[places] = np.arange(places.shape[0])[:, None]
+    rate = np.arange(places.size) < equations.balances
+    there = rate[:, None] | (stage[:, None] == stage)
+    return jnp.where(there, columns[apart.number], 0.0).T
 
 
 class Probe(eqx.Module):
@@ -22,7 +61,8 @@ class Probe(eqx.Module):
     Attributes:
         at: -1: none in the making; 0: the residual itself is evaluated; k: column k.
         residual: at the unknowns.
-        columns: found so far, one a row; what is evaluated at other times goes to the last row.
+        columns: found so far, one a row; what is evaluated at other times goes to the last row. Rows beyond
+            those of the layout are not used.
         alike: whether stages are taken for alike.
         failures: how often that was not good enough.
     """
@@ -41,22 +81,22 @@ class Probe(eqx.Module):
 
     def steps(self, y: Float[Array, " unknowns"], equations: Any) -> Float[Array, " unknowns"]:
         """Changes of the unknowns."""
-        found = equations.probes(y)
-        if equations.tableau.stages == 1:
-            return found
-        places = equations.stage_places
-        same = found.at[places].set(jnp.max(found[places], axis=0))
+        found, same = _changes(equations, y)
         return jnp.where(self.alike, same, found)
 
     def moved(self, y: Float[Array, " unknowns"], equations: Any) -> Float[Array, " unknowns"]:
         """Where the equations are evaluated next."""
-        here = jnp.arange(y.shape[0]) == self.at - 1
-        if equations.tableau.stages > 1:
-            places = equations.stage_places
-            column = np.zeros(y.shape[0], int)
-            column[places] = np.arange(places.shape[1])
-            here = jnp.where(self.alike, column == self.at - 1, here)
+        together, apart = layouts(equations)
+        here = jnp.where(self.alike, together.number == self.at - 1, apart.number == self.at - 1)
         return y + jnp.where(here, self.steps(y, equations), 0.0)
+
+    def moves_rates(self, rates: int, stages: int) -> Bool[Array, ""]:
+        """Whether rates are changed, or nothing: multipliers leave kicks as they are."""
+        return self.at <= jnp.where(self.alike, rates, rates * stages)
+
+    def matrix(self, equations: Any) -> Float[Array, "unknowns unknowns"]:
+        """The Jacobian that is complete, with stages told apart."""
+        return _whole(equations, self.columns)
 
     def with_column(
         self,
@@ -77,16 +117,14 @@ class Probe(eqx.Module):
         """
         size = residual.shape[0]
         base = jnp.where(self.at == 0, residual, self.residual)
-        # Of the changes of one unknown at all stages the first is the measure.
         steps = jnp.append(self.steps(y, equations), 1.0)
         row = jnp.where(self.at > 0, self.at - 1, size)
-        alike, failures, last = self.alike, self.failures, jnp.array(size)
-        measure = row
+        both = layouts(equations)
+        together, apart = (jnp.asarray(np.append(x.measure, np.full(size, size))) for x in both)
+        measure = jnp.where(self.alike, together[row], apart[row])
+        alike, failures, last = self.alike, self.failures, jnp.array(both[1].measure.size)
         if equations.tableau.stages > 1:
-            first = np.full(size + 1, size)
-            first[: equations.stage_places.shape[1]] = equations.stage_places[0]
-            measure = jnp.where(alike & (self.at > 0), jnp.asarray(first)[row], row)
-            last = jnp.where(alike, equations.stage_places.shape[1], size)
+            last = jnp.where(alike, both[0].measure.size, last)
             again = wanting & (rounds > 0)
             failures = failures + (again & alike)
             alike = jnp.where(wanting, ~again & (failures < FAILURES), alike)
@@ -97,11 +135,23 @@ class Probe(eqx.Module):
         return Probe(jnp.where(wanting, 0, further), base, columns, alike, failures), complete
 
 
+def _changes(
+    equations: Any, y: Float[Array, " unknowns"]
+) -> tuple[Float[Array, " unknowns"], Float[Array, " unknowns"]]:
+    """Changes of the unknowns, those of multipliers the same at all stages; and all the same."""
+    found, places = equations.probes(y), equations.stage_places
+    if places.shape[0] == 1:
+        return found, found
+    same = found.at[places].set(jnp.max(found[places], axis=0))
+    return jnp.where(np.arange(y.shape[0]) < equations.balances, found, same), same
+
+
 def jacobian_by_differences(
     equations: Any, y: Float[Array, " unknowns"]
 ) -> Float[Array, "unknowns unknowns"]:
     """The same in one go, where the residual is not evaluated for anything else."""
-    steps = equations.probes(y)
-    points = jnp.concatenate([y[None], y + jnp.diag(steps)])
+    steps, (_, apart) = _changes(equations, y)[0], layouts(equations)
+    chosen = apart.number == np.arange(apart.measure.size)[:, None]
+    points = jnp.concatenate([y[None], y + jnp.where(chosen, steps, 0.0)])
     found = jax.lax.map(lambda y: equations.residual(y)[0], points)
-    return ((found[1:] - found[:1]) / steps[:, None]).T
+    return _whole(equations, (found[1:] - found[:1]) / steps[apart.measure][:, None])

@@ -78,7 +78,11 @@ def trip(setting: Setting, unpack: Callable[[Array], State], apart: bool, carrie
     it, over = course.it, setting.over(course)
     u, h, index = setting.situation(course)
     probing = jnp.array(False) if probe is None else probe.at >= 0
-    lag, lagging = lag_of(course, over, probing), course.lagging
+    asking = probing
+    if probe is not None:
+        structure = setting.system.structure
+        asking = probing & probe.moves_rates(structure.unknowns, plan.tableau.stages)
+    lag, lagging = lag_of(course, over, probing, asking), course.lagging
     outset = eqx.tree_at(lambda o: o.lag, carried.outset, lag, is_leaf=_is_none)
     equations = prepare(setting.system, course.state, u, h, plan.tableau, outset)
     found = equations.evaluate(it.y if probe is None else probe.moved(it.y, equations))
@@ -90,6 +94,8 @@ def trip(setting: Setting, unpack: Callable[[Array], State], apart: bool, carrie
     if lag is not None and lagging is not None:
         moving = ~probing & it.unsolved & ~it.wanting
         lagging = lagging.after(found.kick, lag.due, judged.correction, it.total == 0, moving)
+        if probe is not None:
+            lagging = lagging.holding(found.kick, lag.due & (probe.at == 0))
     it = jax.tree.map(partial(jnp.where, probing), it, judged)
     ending = ~probing & ~any_lane(it.unsolved & ~over)
     if lag is not None:
@@ -171,8 +177,15 @@ def trip(setting: Setting, unpack: Callable[[Array], State], apart: bool, carrie
     return eqx.tree_at(lambda c: (c.course.it, c.factors), carried, (it, factors))
 
 
-def lag_of(course: Course, over: Array, probing: Array) -> Lag | None:
-    """What the evaluation of the equations is told of the kick, if there is any."""
+def lag_of(course: Course, over: Array, probing: Array, asking: Array) -> Lag | None:
+    """What the evaluation of the equations is told of the kick, if there is any.
+
+    Args:
+        course: where the rollout stands.
+        over: whether it has ended.
+        probing: whether the evaluation is for a column of the Jacobian.
+        asking: whether that may change the kick.
+    """
     lagging, it = course.lagging, course.it
     if lagging is None:
         return None
@@ -180,7 +193,7 @@ def lag_of(course: Course, over: Array, probing: Array) -> Lag | None:
     # Lanes that are done wait for the others; the last evaluation has the kicks of all.
     wanted = any_lane(lagging.wanted(it) & going) | ~any_lane(going)
     closed = lagging.closed > 0
-    due = jnp.where(probing, any_lane(closed & ~over), wanted)
+    due = jnp.where(probing, asking & any_lane(closed & ~over), wanted)
     return Lag(lagging.held, due, closed, probing & ~closed)
 
 
@@ -188,7 +201,7 @@ def _by_differences(equations: Any, probe: Probe, noise: Array) -> Factors:
     """Factors of the Jacobian that is complete."""
 
     def whole() -> tuple:
-        return equations.factorised(probe.columns[:-1].T)
+        return equations.factorised(probe.matrix(equations))
 
     def alike() -> tuple:
         return equations.factorised_alike(probe.columns[: equations.stage_places.shape[1]])
