@@ -79,8 +79,8 @@ def driven(probe, y, equations):
 
     def trip(carry):
         probe, _, count = carry
-        residual = equations.residual(probe.moved(y, equations))[0]
-        return *probe.with_column(y, residual, equations, jnp.array(False), jnp.array(0)), count + 1
+        residual, no = equations.residual(probe.moved(y, equations))[0], jnp.array(False)
+        return *probe.with_column(y, residual, equations, no, jnp.array(0), no), count + 1
 
     start = probe, jnp.array(False), 0
     probe, _, count = jax.lax.while_loop(lambda carry: ~carry[1], trip, start)
@@ -117,12 +117,12 @@ def test_stages_are_told_apart_where_that_is_needed():
     for failures in range(1, FAILURES + 1):
         probe, _ = driven(probe, y, equations)
         # A later step begins with stages that are alike; where that is not enough, they are told apart.
-        probe, _ = probe.with_column(y, residual, equations, yes, jnp.array(1))
+        probe, _ = probe.with_column(y, residual, equations, yes, jnp.array(1), yes)
         assert not probe.alike and probe.failures == failures
         probe, count = driven(probe, y, equations)
-        assert count == 1 + 4 + 1, "multipliers of all stages need one evaluation"
+        assert count == 4 + 1, "multipliers of all stages need one evaluation, a known residual none"
         np.testing.assert_allclose(probe.matrix(equations), equations.matrix, atol=1e-12)
-        probe, _ = probe.with_column(y, residual, equations, yes, jnp.array(0))
+        probe, _ = probe.with_column(y, residual, equations, yes, jnp.array(0), ~yes)
         assert probe.alike == (failures < FAILURES)
 
 

@@ -105,6 +105,7 @@ class Probe(eqx.Module):
         equations: Any,
         wanting: Bool[Array, ""],
         rounds: Int[Array, ""],
+        known: Bool[Array, ""],
     ) -> tuple["Probe", Bool[Array, ""]]:
         """After an evaluation: the next state, and whether the Jacobian is complete.
 
@@ -114,6 +115,7 @@ class Probe(eqx.Module):
             equations: of the step.
             wanting: whether a Jacobian is wanted; never while one is in the making.
             rounds: Jacobians that the step has had.
+            known: whether the residual is that at `y`, so that it need not be found again.
         """
         size = residual.shape[0]
         base = jnp.where(self.at == 0, residual, self.residual)
@@ -132,7 +134,9 @@ class Probe(eqx.Module):
         columns = jax.lax.dynamic_update_index_in_dim(self.columns, quotient, row, 0)
         complete = self.at == last
         further = jnp.where((self.at >= 0) & ~complete, self.at + 1, -1)
-        return Probe(jnp.where(wanting, 0, further), base, columns, alike, failures), complete
+        base = jnp.where(wanting & known, residual, base)
+        at = jnp.where(wanting, jnp.where(known, 1, 0), further)
+        return Probe(at, base, columns, alike, failures), complete
 
 
 def _changes(

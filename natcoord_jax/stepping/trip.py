@@ -156,12 +156,11 @@ def trip(setting: Setting, unpack: Callable[[Array], State], apart: bool, carrie
         # Factors of equations in which kicks are held are not those of equations in which they are not.
         other = (course.lagging.closed > 0) != (after.lagging.closed > 0)
         factors = eqx.tree_at(lambda f: f.usable, factors, factors.usable & ~other)
-    if probe is not None:
-        rounds = any_lane(after.it.rounds)
-        probe, wanting = probe.with_column(it.y, residual, equations, wanting, rounds)
-
     # Evaluated where the new factors belong, unless these begin anew where the step began.
     here = jnp.all(after.it.y == carried.course.it.y)
+    if probe is not None:
+        rounds, known = any_lane(after.it.rounds), ~any_lane(~here)
+        probe, wanting = probe.with_column(it.y, residual, equations, wanting, rounds, known)
     asked = Asked(wanting, residual, found.size, found.loads, here)
     carried = Carried(carried.count + ending, after, x, outset, factors, probe, record, carried.first, None)
     if apart:
