@@ -64,7 +64,7 @@ def a_kick(change, rows=0.0, motion=1.0):
     return Kick(v, None, None, v, jnp.asarray(change), jnp.asarray(motion))  # pyright: ignore[reportArgumentType]
 
 
-def iteration(correction=0.0, total=0, last=False):
+def iteration(correction=0.0, total=0, last=False, wanting=False):
     it = begin(jnp.zeros(3))
     return it.__class__(
         **{
@@ -72,13 +72,14 @@ def iteration(correction=0.0, total=0, last=False):
             "correction": jnp.asarray(correction),
             "total": jnp.asarray(total),
             "last": jnp.asarray(last),
+            "wanting": jnp.asarray(wanting),
         }
     )
 
 
 def after(lagging, change, due, correction, first=False):
-    yes = jnp.array(True)
-    return lagging.after(a_kick(change), jnp.array(due), jnp.asarray(correction), jnp.array(first), yes)
+    it = iteration(total=0 if first else 1)
+    return lagging.after(a_kick(change), jnp.array(due), jnp.asarray(correction), it)
 
 
 def test_a_kick_is_due_where_it_is_what_is_missed_most():
@@ -115,6 +116,15 @@ def test_kicks_with_a_strong_answer_are_found_everywhere():
     # What is nothing but rounding tells nothing.
     noisy = after(Lagging.begin(a_kick(0.0).kick), 1.0, True, 1e-14)
     assert after(noisy, 2e-13, True, 1e-14).closed == 0
+
+
+def test_an_iteration_that_begins_anew_finds_its_kick_first():
+    # Could go wrong: a Jacobian formed with the kick of where corrections led astray, or no kick ever after.
+    lost = after(Lagging.begin(a_kick(0.0).kick), 1e-6, True, jnp.nan, first=True)
+    waiting = iteration(jnp.nan, 2, wanting=True)
+    assert lost.wanted(waiting)
+    found = lost.after(a_kick(1e-6, rows=1.0), jnp.array(True), jnp.asarray(jnp.nan), waiting)
+    assert np.all(np.asarray(found.held.rows) == 1.0) and found.moved == 0.0
 
 
 def test_body_axes_there_and_back():

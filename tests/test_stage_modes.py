@@ -1,5 +1,7 @@
 """The eigenvalues of the Runge-Kutta matrix take matrices of several stages apart."""
 
+from typing import Any, NamedTuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +13,7 @@ from natcoord_jax.assembly.equations import prepare
 from natcoord_jax.linsolve.stages import complex_inverse, fitted, modes_of, stagewise_inverse
 from natcoord_jax.maths.collocation import gauss
 from natcoord_jax.stepping.newton import newton
-from natcoord_jax.stepping.probe import FAILURES, Probe, jacobian_by_differences
+from natcoord_jax.stepping.probe import FAILURES, Probe, jacobian_by_differences, matrix_of
 
 SIZES = [(5, 0), (5, 2), (50, 3)]
 
@@ -74,17 +76,24 @@ def test_complex_inverse_needs_no_diagonal(size):
     np.testing.assert_allclose(found @ matrix, np.eye(size), atol=1e-10)
 
 
-def driven(probe, y, equations):
-    """The probe once its Jacobian at y is complete, and the number of evaluations that it took."""
+class Found(NamedTuple):
+    residual: Any
 
-    def trip(carry):
-        probe, _, count = carry
-        residual, no = equations.residual(probe.moved(y, equations))[0], jnp.array(False)
-        return *probe.with_column(y, residual, equations, no, jnp.array(0), no), count + 1
 
-    start = probe, jnp.array(False), 0
-    probe, _, count = jax.lax.while_loop(lambda carry: ~carry[1], trip, start)
-    return probe, count
+def begun(y, equations):
+    """The probe before the first Jacobian."""
+    return Probe.first(equations, Found(y))
+
+
+def formed(probe, y, equations, rounds=0):
+    """The probe once it has formed a Jacobian at y, the step having had so many."""
+    probe = probe.asked(jnp.array(True), jnp.array(rounds), equations.tableau.stages)
+    return probe.evaluated(equations, y, lambda y, *_: Found(equations.residual(y)[0]))
+
+
+def evaluations(probe):
+    """Number of columns that were evaluated, in the first Jacobian of a probe."""
+    return int(jnp.sum(jnp.any(probe.moved[:-1] != 0.0, axis=1)))
 
 
 class Linear:
@@ -105,25 +114,46 @@ class Linear:
 
 def test_columns_of_changes_that_are_the_same_at_all_stages():
     equations, y = Linear(), jnp.ones(6)
-    probe, count = driven(Probe.first(6, 2, y.dtype), y, equations)
-    assert count == 1 + 3
+    probe = formed(begun(y, equations), y, equations)
+    assert evaluations(probe) == 3
     alike = equations.matrix[:, equations.stage_places].sum(axis=1).T
-    np.testing.assert_allclose(probe.columns[:3], alike, atol=1e-12)
+    np.testing.assert_allclose(probe.columns(equations, y)[:3], alike, atol=1e-12)
 
 
 def test_stages_are_told_apart_where_that_is_needed():
-    equations, y, yes = Linear(), jnp.ones(6), jnp.array(True)
-    residual, probe = equations.residual(y)[0], Probe.first(6, 2, y.dtype)
+    equations, y = Linear(), jnp.ones(6)
+    assert evaluations(formed(begun(y, equations), y, equations, rounds=1)) == 5, "one for both multipliers"
+    probe = begun(y, equations)
     for failures in range(1, FAILURES + 1):
-        probe, _ = driven(probe, y, equations)
         # A later step begins with stages that are alike; where that is not enough, they are told apart.
-        probe, _ = probe.with_column(y, residual, equations, yes, jnp.array(1), yes)
+        probe = formed(probe, y, equations)
+        assert probe.alike and probe.failures == failures - 1
+        probe = formed(probe, y, equations, rounds=1)
         assert not probe.alike and probe.failures == failures
-        probe, count = driven(probe, y, equations)
-        assert count == 4 + 1, "multipliers of all stages need one evaluation, a known residual none"
-        np.testing.assert_allclose(probe.matrix(equations), equations.matrix, atol=1e-12)
-        probe, _ = probe.with_column(y, residual, equations, yes, jnp.array(0), ~yes)
-        assert probe.alike == (failures < FAILURES)
+        np.testing.assert_allclose(matrix_of(equations, probe.columns(equations, y)), equations.matrix)
+    assert not formed(probe, y, equations).alike
+
+
+def test_without_a_jacobian_the_equations_are_evaluated_once():
+    equations, y, no = Linear(), jnp.ones(6), jnp.array(False)
+    probe = begun(y, equations).asked(no, jnp.array(0), 2)
+    probe = probe.evaluated(equations, y, lambda y, *_: Found(equations.residual(y)[0]))
+    assert evaluations(probe) == 0 and not probe.making
+    np.testing.assert_array_equal(probe.found.residual, equations.residual(y)[0])
+
+
+def test_evaluations_of_a_jacobian_are_told_what_they_are_for():
+    # Kicks are found anew only where rates are others, and the last evaluation is that of the residual.
+    equations, y = Linear(), jnp.ones(6)
+
+    def told(y, at_end, moving):
+        return Found(equations.residual(y)[0] * 0.0 + jnp.where(at_end, 2.0, jnp.where(moving, 1.0, 0.0)))
+
+    for alike, expected in ((True, [1, 1, 0]), (False, [1, 1, 1, 1, 0])):
+        probe = begun(y, equations).asked(jnp.array(True), jnp.array(0 if alike else 1), 2)
+        probe = probe.evaluated(equations, y, told)
+        np.testing.assert_array_equal(probe.moved[: len(expected), 0], expected)
+        assert np.all(np.asarray(probe.found.residual) == 2.0)
 
 
 @pytest.mark.parametrize("name", ["four_bar", "bricard", "robot_arm"])
@@ -152,8 +182,8 @@ def test_stiff_springs_are_nearly_alike_at_all_stages(order):
     @jax.jit
     def left():
         y, code = newton(equations, 1e-16)
-        probe, _ = driven(Probe.first(y.shape[0], tableau.stages, y.dtype), y, equations)
-        columns = probe.columns[: equations.stage_places.shape[1]]
+        columns = formed(begun(y, equations), y, equations).columns(equations, y)
+        columns = columns[: equations.stage_places.shape[1]]
         found = equations.factorised_alike(columns)[0].inverse
         return jnp.eye(y.shape[0]) - found @ equations.jacobian(y), code
 

@@ -66,6 +66,16 @@ class Kick(eqx.Module):
     change: Float[Array, ""]
     motion: Float[Array, ""]
 
+    def without_system(self) -> "Kick":
+        """To be carried along; `with_system` puts the rest back."""
+        return replace_fields(self, before=self.before.without_system(), after=self.after.without_system())
+
+    def with_system(self, system: System) -> "Kick":
+        """Ready for use."""
+        return replace_fields(
+            self, before=self.before.with_system(system), after=self.after.with_system(system)
+        )
+
 
 class Ends(eqx.Module):
     """The end of a step with kicks.
@@ -214,7 +224,7 @@ def _lagging(lag: Lag, system: System, *given: Any) -> Kick:
     """The kick, found anew if it is due."""
 
     def anew() -> Kick:
-        return _without_system(kick_of(system, *given, lag=lag))
+        return kick_of(system, *given, lag=lag).without_system()
 
     def renewed(_: tuple[Array, Kick]) -> tuple[Array, Kick]:
         return jnp.array(False), anew()
@@ -223,17 +233,7 @@ def _lagging(lag: Lag, system: System, *given: Any) -> Kick:
     start = eqx.tree_at(lambda found: (found.kick, found.exact), blank, (lag.held, lag.held))
     # A loop of no or one trip leaves what it carries where it is; a conditional would copy it.
     _, found = jax.lax.while_loop(lambda carry: carry[0], renewed, (lag.due, start))
-    return eqx.tree_at(
-        lambda x: (x.before, x.after),
-        found,
-        (found.before.with_system(system), found.after.with_system(system)),
-    )
-
-
-def _without_system(found: Kick) -> Kick:
-    return eqx.tree_at(
-        lambda x: (x.before, x.after), found, (found.before.without_system(), found.after.without_system())
-    )
+    return found.with_system(system)
 
 
 def with_rotors(

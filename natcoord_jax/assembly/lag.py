@@ -102,7 +102,8 @@ class Lagging(eqx.Module):
         begun = it.total > 0
         stages = jnp.where(begun, it.correction, self.first)
         told = (it.correction > 0) | ~begun
-        return it.last | (self.closed > 0) | (told & (stages <= BEHIND * behind))
+        # An iteration that waits for factors begins anew elsewhere.
+        return it.last | it.wanting | (self.closed > 0) | (told & (stages <= BEHIND * behind))
 
     def jumped(self, kick: Any, lag: Lag, it: Any) -> Bool[Array, ""]:
         """Whether the kick has changed so much that corrections of the stages do not compare.
@@ -112,17 +113,17 @@ class Lagging(eqx.Module):
         much = kick.change > jnp.where(it.last, 0.0, JUMP * it.correction)
         return lag.due & (self.closed == 0) & much
 
-    def after(self, kick: Any, due: Array, correction: Array, first: Array, moving: Array) -> "Lagging":
+    def after(self, kick: Any, due: Array, correction: Array, it: Any) -> "Lagging":
         """After an evaluation.
 
         Args:
             kick: that was used, and its change.
             due: whether it was found anew.
             correction: size of the correction of the stages that followed.
-            first: whether that is the first of the step.
-            moving: whether the stages are being solved.
+            it: where their iteration stood before.
         """
-        found = due & moving
+        found = due & it.unsolved
+        moving, first = it.unsolved & ~it.wanting, it.total == 0
         again = found & (self.renewals > 0)
         answer = jnp.where(self.moved > 0, kick.change / jnp.where(self.moved > 0, self.moved, 1.0), 0.0)
         answer = jnp.where(again, answer, self.answer)
@@ -130,21 +131,17 @@ class Lagging(eqx.Module):
         telling = kick.change > TELLING * kick.motion
         strong = (again & telling & (answer > STRONG)) | (renewals >= MOST_RENEWALS)
         strong = strong & (self.closed == 0) & moving
+        further = moving & jnp.isfinite(correction)
         return Lagging(
             held=jax.tree.map(lambda x, y: jnp.where(found, x, y), kick.kick, self.held),
-            moved=jnp.where(found, 0.0, self.moved) + jnp.where(moving, correction, 0.0),
+            moved=jnp.where(found, 0.0, self.moved) + jnp.where(further, correction, 0.0),
             answer=answer,
             missed=jnp.where(found & ~again, kick.change, self.missed),
-            first=jnp.where(first & moving, correction, self.first),
+            first=jnp.where(first & further, correction, self.first),
             renewals=renewals,
             closed=jnp.where(strong, self.span, self.closed),
             span=jnp.where(strong, jnp.minimum(2 * self.span, SPANS[1]), self.span),
         )
-
-    def holding(self, kick: Any, anew: Bool[Array, ""]) -> "Lagging":
-        """With the kick that has been found for what a Jacobian is formed at."""
-        held = jax.tree.map(lambda x, y: jnp.where(anew, x, y), kick.kick, self.held)
-        return eqx.tree_at(lambda x: x.held, self, held)
 
     def beginning(self, held: Velocity) -> "Lagging":
         """Before the next step."""

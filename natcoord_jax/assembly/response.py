@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.diagnostics import group_places
 from natcoord_jax.assembly.system import Group, System
-from natcoord_jax.core.effect import Motion, Now, Response
+from natcoord_jax.core.effect import Motion, Now, Response, replace_fields
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import Tableau
 from natcoord_jax.maths.vectors import cross
@@ -122,6 +122,14 @@ class Evaluation(eqx.Module):
     loads: tuple[Float[Array, "s bodies 3"], Float[Array, "s bodies 3"]]
     kick: Any = None
     given: Any = None
+
+    def without_system(self) -> "Evaluation":
+        """To be carried along; `with_system` puts the rest back."""
+        return self if self.kick is None else replace_fields(self, kick=self.kick.without_system())
+
+    def with_system(self, system: System) -> "Evaluation":
+        """Ready for use."""
+        return self if self.kick is None else replace_fields(self, kick=self.kick.with_system(system))
 
 
 def collect(group: Group, loads: Float[Array, "n s k *rest"]) -> Float[Array, "bodies s *rest"]:

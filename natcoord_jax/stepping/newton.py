@@ -40,6 +40,9 @@ axis of a thin rod, whose balance is rounded like that of the other axes.
 STALLS = 3
 """Times that the floor is raised."""
 
+RAISED = [STALL * 10.0**k for k in range(STALLS + 1)]
+"""The floor by factorisations after the first."""
+
 NOISE = (1e-14, 2e-12)
 """Sizes of last corrections that are known, from the steps before, to be noise: stiff parts feel how their
 places are rounded. Smaller ones are not worth the risk, since what is left of an error may add up; larger
@@ -237,7 +240,6 @@ def judge(
     patience: int,
     jumped: Bool[Array, ""] | bool = False,
     whole: Bool[Array, ""] | bool = True,
-    evaluated: Bool[Array, ""] | bool = True,
     alike: Bool[Array, ""] | bool = False,
 ) -> tuple[Iterate, Factors]:
     """What follows from one evaluation of the equations at `it.y`.
@@ -253,7 +255,6 @@ def judge(
         patience: corrections that are cheaper than a new Jacobian.
         jumped: whether the equations are not those of the last evaluation: corrections do not compare.
         whole: whether they are all that the end of a step asks for; if not, the next evaluation is the last.
-        evaluated: whether the residual is that at `it.y`; if not, only the factors matter that come back.
         alike: whether the last factors that were made take stages for alike. Corrections by them may shrink
             slowly, which is no sign of rounding.
 
@@ -264,7 +265,7 @@ def judge(
     done = it.converged | it.wanting | ~it.finite
     change = factors.solver.solve(residual)
     near = (it.error > LEARNING) & (it.error < NEAR)
-    telling = ~done & (it.count > 0) & ~jnp.asarray(jumped) & evaluated & near
+    telling = ~done & (it.count > 0) & ~jnp.asarray(jumped) & near
     solver, change = learnt(factors.solver, it.change, change, factors.inertias, telling)
     factors = eqx.tree_at(lambda f: f.solver, factors, solver)
     energies = factors.inertias * change**2
@@ -276,17 +277,20 @@ def judge(
     ratio = correction / jnp.where(it.correction > 0, it.correction, 1.0)
     trusted = jnp.maximum(ratio, SLOWEST_UNSEEN)
     predicted = correction * jnp.where(first, 1.0, trusted / jnp.maximum(1.0 - trusted, 1e-3))
-    raised = STALL * 10.0 ** jnp.clip(it.rounds - 1, 0, STALLS)
+    raised = jnp.asarray(RAISED)[jnp.clip(it.rounds - 1, 0, STALLS)]
     trust = jnp.where(alike, STALL_ALIKE, jnp.where(factors.fresh, raised, STALL_OLD))
     floor = trust * max(tolerance, ROUND_OFF) * size
     finite = jnp.isfinite(correction) & jnp.isfinite(size)
     stalled = ~first & (ratio > 0.5) & (correction <= floor)
     enough = jnp.maximum(STALL_OLD * tolerance, ABOVE_NOISE * factors.rounding) * size
     solved = (correction <= tolerance * size) | stalled | (it.last & ~first & (correction <= enough))
-    speed = jnp.where(it.error < NEAR, SPEED, 1) if learns(factors.solver) else 1
+    # In constant powers: others are as slow as a solution.
+    shrinking = ratio**patience
+    if learns(factors.solver):
+        shrinking = jnp.where(it.error < NEAR, shrinking**SPEED, shrinking)
     # Within the noise corrections shrink little, and new factors would not change it.
     noisy = factors.fresh & (correction <= floor)
-    slow = ~first & ((ratio > 0.5) | (~noisy & (correction * ratio ** (speed * patience) > tolerance * size)))
+    slow = ~first & ((ratio > 0.5) | (~noisy & (correction * shrinking > tolerance * size)))
     slow = slow | (it.count >= max(CHORD_ITERATIONS, 2 * patience)) | ~factors.usable
     # Old factors may have led astray: new ones begin where the first did.
     lost = ~finite & ~factors.fresh

@@ -2,8 +2,13 @@
 
 Multipliers act on the balances of their own stage alone, and do not change where the stages are. So one
 evaluation gives their columns of all stages, and kicks stay as they are in it.
+
+With several stages, the first Jacobian of a step takes them for alike: a change of an unknown is the same at
+all stages, so that one column is enough for all of them, see `natcoord_jax.linsolve.stages`. If that is not
+good enough, the next has all columns.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -39,104 +44,132 @@ def layouts(equations: Any) -> tuple[Layout, Layout]:
     return Layout(together, places[0]), Layout(apart, measure)
 
 
-def _whole(equations: Any, columns: Float[Array, "rows unknowns"]) -> Float[Array, "unknowns unknowns"]:
-    """The Jacobian from its columns, one a row, those of multipliers for all stages together."""
+class Probe(eqx.Module):
+    """What Jacobians by differences are formed with; the same in all lanes but for its numbers.
+
+    Columns are found right before the residual itself, by the same code: a second copy of it would compile
+    for half as long again, and step by step it would have to be fetched anew.
+
+    Attributes:
+        making: whether a Jacobian is to be formed, where the residual is evaluated next.
+        alike: whether stages are taken for alike, in that or in the last one.
+        failures: how often that was not good enough.
+        moved: residuals at other unknowns, one a row; the last row is never of use.
+        found: the last evaluation of the equations.
+    """
+
+    making: Bool[Array, ""]
+    alike: Bool[Array, ""]
+    failures: Int[Array, ""]
+    moved: Float[Array, "rows unknowns"]
+    found: Any
+
+    @classmethod
+    def first(cls, equations: Any, found: Any) -> "Probe":
+        """Before the first Jacobian.
+
+        Args:
+            equations: of a step.
+            found: an evaluation of them, for its shapes.
+        """
+        size, no = layouts(equations)[1].measure.size, jnp.array(False)
+        blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), found)
+        moved = jnp.zeros((size + 1, *blank.residual.shape), blank.residual.dtype)
+        return cls(no, jnp.array(equations.tableau.stages > 1), jnp.array(0), moved, blank)
+
+    def asked(self, wanting: Bool[Array, ""], rounds: Int[Array, ""], stages: int) -> "Probe":
+        """After an evaluation.
+
+        Args:
+            wanting: whether a Jacobian is.
+            rounds: Jacobians that the step has had.
+            stages: of a step.
+        """
+        alike, failures = self.alike, self.failures
+        if stages > 1:
+            again = wanting & (rounds > 0)
+            failures = failures + (again & alike)
+            alike = jnp.where(wanting, ~again & (failures < FAILURES), alike)
+        return Probe(wanting, alike, failures, self.moved, self.found)
+
+    def evaluated(
+        self, equations: Any, y: Float[Array, " unknowns"], evaluate: Callable[[Array, Array, Array], Any]
+    ) -> "Probe":
+        """With the equations evaluated: everywhere a Jacobian asks for, if it is to be formed, and at y.
+
+        Args:
+            equations: of the step.
+            y: unknowns.
+            evaluate: the equations at given unknowns, told whether these are y, and if not, whether rates are
+                others, or multipliers alone.
+        """
+        choice = self._choice(equations)
+        last = choice.measure.shape[0]
+        steps = self.changes(equations, y)
+
+        def going(carry: tuple) -> Array:
+            return carry[0] <= last
+
+        def point(carry: tuple) -> tuple:
+            k, moved, _ = carry
+            end = k == last
+            found = evaluate(y + jnp.where(choice.number == k, steps, 0.0), end, k < choice.moving)
+            moved = jax.lax.dynamic_update_index_in_dim(moved, found.residual, k, 0)
+            return jnp.where(k + 1 == choice.count, last, k + 1), moved, found
+
+        start = jnp.where(self.making, 0, last), self.moved, self.found
+        _, moved, found = jax.lax.while_loop(going, point, start)
+        return Probe(self.making, self.alike, self.failures, moved, found)
+
+    def columns(self, equations: Any, y: Float[Array, " unknowns"]) -> Float[Array, "columns unknowns"]:
+        """Columns of the Jacobian, one a row, in the order of the layout."""
+        measure = self._choice(equations).measure
+        steps = self.changes(equations, y)[measure]
+        return (self.moved[: measure.shape[0]] - self.found.residual) / steps[:, None]
+
+    def changes(self, equations: Any, y: Float[Array, " unknowns"]) -> Float[Array, " unknowns"]:
+        """Changes of the unknowns."""
+        apart, same = _changes(equations, y)
+        return jnp.where(self.alike, same, apart)
+
+    def _choice(self, equations: Any) -> "Choice":
+        together, apart = layouts(equations)
+        stages = equations.tableau.stages
+        rates, count = equations.balances // stages, apart.measure.size
+        every = Choice(jnp.asarray(apart.number), jnp.asarray(apart.measure), count, rates * stages)
+        if stages == 1:
+            return every
+        fewer = jnp.asarray(np.resize(together.measure, count))
+        alike = Choice(jnp.asarray(together.number), fewer, together.measure.size, rates)
+        return Choice(*(jnp.where(self.alike, x, y) for x, y in zip(alike, every)))
+
+
+class Choice(NamedTuple):
+    """One of the two layouts, in arrays of the same shape; with the number of its evaluations.
+
+    Attributes:
+        number: of the evaluation that changes each unknown.
+        measure: by number, the unknown whose change is the measure.
+        count: of the evaluations.
+        moving: of those among them, the first ones, that change rates.
+    """
+
+    number: Int[Array, " unknowns"]
+    measure: Int[Array, " rows"]
+    count: Any
+    moving: Any
+
+
+def matrix_of(equations: Any, columns: Float[Array, "columns unknowns"]) -> Float[Array, "unknowns unknowns"]:
+    """The Jacobian from its columns with stages told apart."""
     places, (_, apart) = equations.stage_places, layouts(equations)
     if places.shape[0] == 1:
-        return columns[: places.size].T
+        return columns.T
     stage = np.zeros(places.size, int)
     stage[places] = np.arange(places.shape[0])[:, None]
     rate = np.arange(places.size) < equations.balances
     there = rate[:, None] | (stage[:, None] == stage)
     return jnp.where(there, columns[apart.number], 0.0).T
-
-
-class Probe(eqx.Module):
-    """A Jacobian in the making, by differences; the same in all lanes but for its numbers.
-
-    With several stages, the first one of a step takes them for alike: a change of an unknown is the same at
-    all stages, so that one column is enough for all of them, see `natcoord_jax.linsolve.stages`. If that is
-    not good enough, the next has all columns.
-
-    Attributes:
-        at: -1: none in the making; 0: the residual itself is evaluated; k: column k.
-        residual: at the unknowns.
-        columns: found so far, one a row; what is evaluated at other times goes to the last row. Rows beyond
-            those of the layout are not used.
-        alike: whether stages are taken for alike.
-        failures: how often that was not good enough.
-    """
-
-    at: Int[Array, ""]
-    residual: Float[Array, " unknowns"]
-    columns: Float[Array, "rows unknowns"]
-    alike: Bool[Array, ""]
-    failures: Int[Array, ""]
-
-    @classmethod
-    def first(cls, size: int, stages: int, dtype: Any) -> "Probe":
-        """Before the first Jacobian."""
-        columns = jnp.zeros((size + 1, size), dtype)
-        return cls(jnp.array(0), columns[0], columns, jnp.array(stages > 1), jnp.array(0))
-
-    def steps(self, y: Float[Array, " unknowns"], equations: Any) -> Float[Array, " unknowns"]:
-        """Changes of the unknowns."""
-        found, same = _changes(equations, y)
-        return jnp.where(self.alike, same, found)
-
-    def moved(self, y: Float[Array, " unknowns"], equations: Any) -> Float[Array, " unknowns"]:
-        """Where the equations are evaluated next."""
-        together, apart = layouts(equations)
-        here = jnp.where(self.alike, together.number == self.at - 1, apart.number == self.at - 1)
-        return y + jnp.where(here, self.steps(y, equations), 0.0)
-
-    def moves_rates(self, rates: int, stages: int) -> Bool[Array, ""]:
-        """Whether rates are changed, or nothing: multipliers leave kicks as they are."""
-        return self.at <= jnp.where(self.alike, rates, rates * stages)
-
-    def matrix(self, equations: Any) -> Float[Array, "unknowns unknowns"]:
-        """The Jacobian that is complete, with stages told apart."""
-        return _whole(equations, self.columns)
-
-    def with_column(
-        self,
-        y: Float[Array, " unknowns"],
-        residual: Float[Array, " unknowns"],
-        equations: Any,
-        wanting: Bool[Array, ""],
-        rounds: Int[Array, ""],
-        known: Bool[Array, ""],
-    ) -> tuple["Probe", Bool[Array, ""]]:
-        """After an evaluation: the next state, and whether the Jacobian is complete.
-
-        Args:
-            y: where the Jacobian is wanted.
-            residual: found.
-            equations: of the step.
-            wanting: whether a Jacobian is wanted; never while one is in the making.
-            rounds: Jacobians that the step has had.
-            known: whether the residual is that at `y`, so that it need not be found again.
-        """
-        size = residual.shape[0]
-        base = jnp.where(self.at == 0, residual, self.residual)
-        steps = jnp.append(self.steps(y, equations), 1.0)
-        row = jnp.where(self.at > 0, self.at - 1, size)
-        both = layouts(equations)
-        together, apart = (jnp.asarray(np.append(x.measure, np.full(size, size))) for x in both)
-        measure = jnp.where(self.alike, together[row], apart[row])
-        alike, failures, last = self.alike, self.failures, jnp.array(both[1].measure.size)
-        if equations.tableau.stages > 1:
-            last = jnp.where(alike, both[0].measure.size, last)
-            again = wanting & (rounds > 0)
-            failures = failures + (again & alike)
-            alike = jnp.where(wanting, ~again & (failures < FAILURES), alike)
-        quotient = (residual - base) / steps[measure]
-        columns = jax.lax.dynamic_update_index_in_dim(self.columns, quotient, row, 0)
-        complete = self.at == last
-        further = jnp.where((self.at >= 0) & ~complete, self.at + 1, -1)
-        base = jnp.where(wanting & known, residual, base)
-        at = jnp.where(wanting, jnp.where(known, 1, 0), further)
-        return Probe(at, base, columns, alike, failures), complete
 
 
 def _changes(
@@ -153,9 +186,9 @@ def _changes(
 def jacobian_by_differences(
     equations: Any, y: Float[Array, " unknowns"]
 ) -> Float[Array, "unknowns unknowns"]:
-    """The same in one go, where the residual is not evaluated for anything else."""
+    """The Jacobian with stages told apart."""
     steps, (_, apart) = _changes(equations, y)[0], layouts(equations)
     chosen = apart.number == np.arange(apart.measure.size)[:, None]
     points = jnp.concatenate([y[None], y + jnp.where(chosen, steps, 0.0)])
     found = jax.lax.map(lambda y: equations.residual(y)[0], points)
-    return _whole(equations, (found[1:] - found[:1]) / steps[apart.measure][:, None])
+    return matrix_of(equations, (found[1:] - found[:1]) / steps[apart.measure][:, None])

@@ -24,8 +24,7 @@ from natcoord_jax.stepping.error_control import Tolerance
 from natcoord_jax.stepping.newton import Factors, Iterate, any_lane
 from natcoord_jax.stepping.one_kernel import as_one_kernel
 from natcoord_jax.stepping.plan import Plan
-from natcoord_jax.stepping.probe import Probe
-from natcoord_jax.stepping.trip import Asked, Carried, renewed_at, trip, with_state
+from natcoord_jax.stepping.trip import Asked, Carried, first_probe, renewed_at, trip, with_state
 
 PARTS = 4
 """Bodies from which on new factors are made in a kernel of their own."""
@@ -87,9 +86,10 @@ def _every_slot(
     """All slots, in one loop."""
     # In the kernel, too: a few dozen fusions before it would take longer than the first steps.
     course, factors, outset = _start(setting, unpack, x)
-    plan, it = setting.plan, course.it
-    by_differences = kind_of(setting.system, plan.tableau).by_differences
-    probe = Probe.first(it.y.shape[0], plan.tableau.stages, x.dtype) if by_differences else None
+    plan = setting.plan
+    probe = None
+    if kind_of(setting.system, plan.tableau).by_differences:
+        probe = first_probe(setting, with_state(course, unpack(x)), outset)
     # A row beyond the last goes to the last.
     record = _record(course, x, length if plan.recorded else 1)
     start = Carried(jnp.array(0), course, x, outset, factors, probe, record, jnp.array(0), None)

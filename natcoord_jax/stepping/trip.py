@@ -14,11 +14,12 @@ from natcoord_jax.assembly.equations import prepare, starting
 from natcoord_jax.assembly.kick import Kick
 from natcoord_jax.assembly.lag import Lag
 from natcoord_jax.assembly.outset import Outset
+from natcoord_jax.assembly.response import Evaluation
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.rows import row, with_row
 from natcoord_jax.stepping.course import Course, Setting, after_attempt
 from natcoord_jax.stepping.newton import Factors, Iterate, any_lane, factors_of, judge, new_factors, refreshed
-from natcoord_jax.stepping.probe import Probe
+from natcoord_jax.stepping.probe import Probe, matrix_of
 from natcoord_jax.stepping.remainder import remainder, with_remainder
 from natcoord_jax.stepping.step import end_of_step
 from natcoord_jax.stepping.watch import sound
@@ -33,7 +34,7 @@ class Carried(eqx.Module):
         state: the state in one array: fewer operations than one for every field.
         outset: what the equations need of that state.
         factors: of a Jacobian.
-        probe: the Jacobian in the making.
+        probe: what Jacobians by differences are formed with; None: they have formulas.
         record: fields of `Slots`, for every slot; the states in one array.
         first: slot of the first row of the record.
         asked: what new factors are asked for with; None: they are made where they are wanted.
@@ -77,30 +78,28 @@ def trip(setting: Setting, unpack: Callable[[Array], State], apart: bool, carrie
     course = with_state(carried.course, unpack(carried.state))
     it, over = course.it, setting.over(course)
     u, h, index = setting.situation(course)
-    probing = jnp.array(False) if probe is None else probe.at >= 0
-    asking = probing
-    if probe is not None:
-        structure = setting.system.structure
-        asking = probing & probe.moves_rates(structure.unknowns, plan.tableau.stages)
-    lag, lagging = lag_of(course, over, probing, asking), course.lagging
+    lag, lagging = lag_of(course, over), course.lagging
     outset = eqx.tree_at(lambda o: o.lag, carried.outset, lag, is_leaf=_is_none)
     equations = prepare(setting.system, course.state, u, h, plan.tableau, outset)
-    found = equations.evaluate(it.y if probe is None else probe.moved(it.y, equations))
+    if probe is None:
+        found = equations.evaluate(it.y)
+    else:
+        lag = _in_probe(lag, probe.making, jnp.array(True), jnp.array(True))
+        probe = probe.evaluated(equations, it.y, partial(_evaluated, equations, probe.making))
+        found = probe.found.with_system(setting.system)
+        it, factors = _renewed_by(equations, probe, it, factors)
     residual = with_remainder(equations, found.residual, course.left)
     cost, options = _judging(equations, it, probe)
     if lag is not None and lagging is not None:
         options |= {"jumped": lagging.jumped(found.kick, lag, it), "whole": lag.due}
-    judged, factors = judge(factors, plan.tolerance, it, residual, found.size, evaluated=~probing, **options)
+    judged, factors = judge(factors, plan.tolerance, it, residual, found.size, **options)
     if lag is not None and lagging is not None:
-        moving = ~probing & it.unsolved & ~it.wanting
-        lagging = lagging.after(found.kick, lag.due, judged.correction, it.total == 0, moving)
-        if probe is not None:
-            lagging = lagging.holding(found.kick, lag.due & (probe.at == 0))
-    it = jax.tree.map(partial(jnp.where, probing), it, judged)
-    ending = ~probing & ~any_lane(it.unsolved & ~over)
+        lagging = lagging.after(found.kick, lag.due, judged.correction, it)
+    it = judged
+    ending = ~any_lane(it.unsolved & ~over)
     if lag is not None:
         ending = ending & lag.due
-    wanting = ~probing & ~ending & any_lane(it.wanting & it.unsolved & ~over)
+    wanting = ~ending & any_lane(it.wanting & it.unsolved & ~over)
 
     def ended(carry: tuple) -> tuple:
         _, before, x, _, record = carry
@@ -157,33 +156,43 @@ def trip(setting: Setting, unpack: Callable[[Array], State], apart: bool, carrie
         other = (course.lagging.closed > 0) != (after.lagging.closed > 0)
         factors = eqx.tree_at(lambda f: f.usable, factors, factors.usable & ~other)
     # Evaluated where the new factors belong, unless these begin anew where the step began.
-    here = jnp.all(after.it.y == carried.course.it.y)
+    here = jnp.all(after.it.y == course.it.y)
     if probe is not None:
-        rounds, known = any_lane(after.it.rounds), ~any_lane(~here)
-        probe, wanting = probe.with_column(it.y, residual, equations, wanting, rounds, known)
+        # Differences need the kick: where the iteration begins anew, it is found first.
+        astray = any_lane(after.it.wanting & after.it.unsolved & ~over & ~here)
+        probe = probe.asked(wanting & ~astray, any_lane(after.it.rounds), plan.tableau.stages)
     asked = Asked(wanting, residual, found.size, found.loads, here)
     carried = Carried(carried.count + ending, after, x, outset, factors, probe, record, carried.first, None)
+    if probe is not None:
+        return carried
     if apart:
         return eqx.tree_at(lambda c: c.asked, carried, asked, is_leaf=_is_none)
 
     def renewed(carry: tuple) -> tuple:
         _, it, factors = carry
-        if probe is not None:
-            return jnp.array(False), refreshed(it), _by_differences(equations, probe, factors.noise)
         return jnp.array(False), *renewed_at(setting, equations, it, factors, asked)
 
     _, it, factors = jax.lax.while_loop(lambda carry: carry[0], renewed, (wanting, after.it, factors))
     return eqx.tree_at(lambda c: (c.course.it, c.factors), carried, (it, factors))
 
 
-def lag_of(course: Course, over: Array, probing: Array, asking: Array) -> Lag | None:
+def first_probe(setting: Setting, course: Course, outset: Outset) -> Probe:
+    """What Jacobians by differences are formed with, before the first."""
+    u, h, _ = setting.situation(course)
+    lag = lag_of(course, setting.over(course))
+    near = eqx.tree_at(lambda o: o.lag, outset, lag, is_leaf=_is_none)
+    equations = prepare(setting.system, course.state, u, h, setting.plan.tableau, near)
+    return Probe.first(
+        equations, jax.eval_shape(lambda y: equations.evaluate(y).without_system(), course.it.y)
+    )
+
+
+def lag_of(course: Course, over: Array) -> Lag | None:
     """What the evaluation of the equations is told of the kick, if there is any.
 
     Args:
         course: where the rollout stands.
         over: whether it has ended.
-        probing: whether the evaluation is for a column of the Jacobian.
-        asking: whether that may change the kick.
     """
     lagging, it = course.lagging, course.it
     if lagging is None:
@@ -192,22 +201,54 @@ def lag_of(course: Course, over: Array, probing: Array, asking: Array) -> Lag | 
     # Lanes that are done wait for the others; the last evaluation has the kicks of all.
     wanted = any_lane(lagging.wanted(it) & going) | ~any_lane(going)
     closed = lagging.closed > 0
-    due = jnp.where(probing, asking & any_lane(closed & ~over), wanted)
-    return Lag(lagging.held, due, closed, probing & ~closed)
+    return Lag(lagging.held, wanted, closed, jnp.zeros_like(closed))
 
 
-def _by_differences(equations: Any, probe: Probe, noise: Array) -> Factors:
-    """Factors of the Jacobian that is complete."""
+def _in_probe(lag: Lag | None, making: Array, at_end: Array, moving: Array) -> Lag | None:
+    """What an evaluation is told of the kick where it may be one of those that a Jacobian asks for.
 
-    def whole() -> tuple:
-        return equations.factorised(probe.matrix(equations))
+    In these kicks are held, or found anew where they are in every evaluation; multipliers do not change them.
 
-    def alike() -> tuple:
-        return equations.factorised_alike(probe.columns[: equations.stage_places.shape[1]])
+    Args:
+        lag: what it is told otherwise.
+        making: whether a Jacobian is being formed.
+        at_end: whether this is the last of its evaluations, that of the residual itself.
+        moving: whether rates are others in it.
+    """
+    if lag is None:
+        return None
+    due = jnp.where(making, (at_end | moving) & any_lane(lag.everywhere), lag.due)
+    return Lag(lag.held, due, lag.everywhere, making & ~lag.everywhere)
 
-    if equations.tableau.stages == 1:
-        return new_factors(whole(), noise)
-    return new_factors(jax.lax.cond(probe.alike, alike, whole), noise)
+
+def _evaluated(equations: Any, making: Array, y: Array, at_end: Array, moving: Array) -> Evaluation:
+    """The equations at unknowns of the probe."""
+    lag = _in_probe(equations.outset.lag, making, at_end, moving)
+    near = eqx.tree_at(lambda e: e.outset.lag, equations, lag, is_leaf=_is_none)
+    return near.evaluate(y).without_system()
+
+
+def _renewed_by(equations: Any, probe: Probe, it: Iterate, factors: Factors) -> tuple[Iterate, Factors]:
+    """New factors where a Jacobian has been formed by differences, and the iteration with them."""
+
+    def whole(columns: Array) -> tuple:
+        return equations.factorised(matrix_of(equations, columns))
+
+    def alike(columns: Array) -> tuple:
+        return equations.factorised_alike(columns[: equations.stage_places.shape[1]])
+
+    def renewed(carry: tuple) -> tuple:
+        _, it, factors = carry
+        columns = probe.columns(equations, it.y)
+        if equations.tableau.stages == 1:
+            made = whole(columns)
+        else:
+            made = jax.lax.cond(probe.alike, alike, whole, columns)
+        return jnp.array(False), refreshed(it), new_factors(made, factors.noise)
+
+    # A loop of no or one trip, as at the end of a step.
+    _, it, factors = jax.lax.while_loop(lambda carry: carry[0], renewed, (probe.making, it, factors))
+    return it, factors
 
 
 def _judging(equations: Any, it: Iterate, probe: Probe | None) -> tuple[int, dict[str, Any]]:
@@ -221,7 +262,7 @@ def _judging(equations: Any, it: Iterate, probe: Probe | None) -> tuple[int, dic
 def renewed_at(
     setting: Setting, equations: Any, it: Iterate, factors: Factors, asked: Asked
 ) -> tuple[Iterate, Factors]:
-    """New factors, and the iteration with them."""
+    """New factors by formulas, and the iteration with them."""
     _, options = _judging(equations, it, None)
     loads = jax.tree.map(lambda x: jnp.where(asked.here, x, 0.0), asked.loads)
     factors = factors_of(equations, equations.tangent(it.y, loads), factors.noise)
