@@ -219,6 +219,11 @@ class Balances(eqx.Module):
         return forces, torques
 
 
+def constraint_matrix(system: System, state: State) -> Float[Array, "c unknowns"]:
+    """Rates of relations and loops per unit rate of each free motion of the tree."""
+    return Balances.at(system, state).columns().constraints.T
+
+
 def _weighted(lam: Array, loads: tuple[Array, Array]) -> Twists:
     """Sum of unit loads on the bodies, without the ground."""
     return jnp.tensordot(lam, loads[0][:, :-1], 1), jnp.tensordot(lam, loads[1][:, :-1], 1)

@@ -88,10 +88,10 @@ class Damping(eqx.Module):
     def at(cls, system: System, state: State) -> "Damping":
         """That of a state; its velocities play no part."""
         space = TangentSpace.at(system, state)
-        rows, unit = rows_with_ground(state.q), space.columns.rows
+        rows, unit = rows_with_ground(state.q), space.columns
         still = jnp.zeros((unit.shape[0], 1, 4, 3), unit.dtype)
         moving = jnp.concatenate([unit, still], axis=1)
-        turning = jnp.concatenate([jnp.swapaxes(space.balances.free[1], 0, 1), still[:, :, 0]], axis=1)
+        turning = jnp.concatenate([jnp.swapaxes(space.free[1], 0, 1), still[:, :, 0]], axis=1)
         groups = elastic_of(system)
         rates = [jax.vmap(partial(_instant_rates, system, g, rows))(moving, turning) for g in groups]
         return cls(space, rates, [_stiffness(system, g, rows, state.coordinates) for g in groups])
@@ -118,12 +118,13 @@ class Damping(eqx.Module):
         strength, part = ONSET * h**2, (1.0 - rho) / (1.0 + rho)
         v = Velocity(state.v.reshape(-1, 4, 3), state.rates)
         known = space.admissible
+        assert space.system is not None and known.lift is not None and known.prescribed is not None
         w = known.frame.T @ known.within(space.framed(v)) + space.drift_rates
         along = space.projected(v)
         normal = Velocity(v.rows - along.rows, v.rotors - along.rotors)
         # Per component along the frame of what the constraints admit.
         framed = [jnp.einsum("unp,fu->fnp", b, self._admitted) for b in self.rates]
-        mean = [_mean_rates(g, self.space.balances.system, at, h) for g in groups if g.effect.elastic]
+        mean = [_mean_rates(g, space.system, at, h) for g in groups if g.effect.elastic]
         ahead = [jnp.einsum("unp,u->np", b, w) - r for b, r in zip(self.rates, mean)]
         inverse = definite_inverse(jnp.eye(w.shape[0], dtype=w.dtype) + strength * self._stiffened(framed))
         a = strength * h * (inverse @ self._pulled(framed, mean))

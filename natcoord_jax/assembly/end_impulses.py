@@ -54,10 +54,12 @@ def released(
     impulse = _impulse(space, groups, found, h, tableau)
     rotors = rotor_rates(system, groups, found.at, h)[0]
     if rotors.shape[0]:
-        impulse = impulse + space.columns.rotors @ (space.inertias * rotors)
+        impulse = impulse + space.turning @ (space.inertias * rotors)
     v = space.with_momentum(impulse)
     lost = impulse - space.pulled(space.impulse(v))
-    return Ends(v, _work(system, groups, found, turning[0], -space.admissible.lift.T @ lost), jnp.array(True))
+    assert space.admissible.lift is not None
+    missed = -space.admissible.lift.T @ lost
+    return Ends(v, _work(system, groups, found, turning[0], missed), jnp.array(True))
 
 
 def _impulse(
@@ -65,6 +67,7 @@ def _impulse(
 ) -> Float[Array, " u"]:
     """P(q_1)^T [M V + h/2 F_1], without rotors."""
     at, (situations, _) = found.at, found.given
+    assert space.system is not None
     levers = at.start + h * at.rates[0]
     acting = [
         (group, where)
@@ -72,7 +75,7 @@ def _impulse(
         if not group.multipliers and not group.effect.rotors
     ]
     missing = momentum_balance(
-        space.balances.system,
+        space.system,
         [group for group, _ in acting],
         [where for _, where in acting],
         replace_fields(at, levers=levers[None]),
@@ -81,7 +84,7 @@ def _impulse(
         h,
         tableau,
     )
-    return -0.5 * space.balances.project(missing.force[0], missing.torque[0])
+    return -0.5 * space.generalised(missing.force[0], missing.torque[0])
 
 
 def _work(

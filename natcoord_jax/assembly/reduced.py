@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from natcoord_jax.assembly.balances import constraint_matrix
 from natcoord_jax.assembly.dissipation import Damped, Damping
 from natcoord_jax.assembly.form import Form
 from natcoord_jax.assembly.kick import kicked
@@ -37,6 +38,7 @@ from natcoord_jax.assembly.response import (
 from natcoord_jax.assembly.separate import Tangents, tangents_at
 from natcoord_jax.assembly.sweeps import sweep_motion, turned_directors
 from natcoord_jax.assembly.system import Group, System
+from natcoord_jax.assembly.tangent_space import TangentSpace
 from natcoord_jax.assembly.tree import (
     SLOTS,
     TreeMotion,
@@ -137,24 +139,14 @@ class ReducedStep(Form):
         later: bool = False,
     ) -> Outset:
         """What a step needs of its start, see `Outset.of`."""
-        projector = None
-        if system.structure.rank is not None:
-            no_inputs = jnp.zeros(len(system.structure.inputs), state.q.dtype)
-            plain = cls.prepare(system, state, no_inputs, jnp.zeros((), state.q.dtype), gauss(1), NOTHING)
-            projector = range_projector(plain.constraint_matrix(), system.structure.rank)
-            projector = at_every_stage(projector, plain.groups, tableau.stages)
+        projector, rank = None, system.structure.rank
+        if rank is not None:
+            if isinstance(tangents, TangentSpace) and tangents.admissible.range is not None:
+                projector = tangents.admissible.range
+            else:
+                projector = range_projector(constraint_matrix(system, state), rank)
+            projector = at_every_stage(projector, active_groups(system), tableau.stages)
         return Outset.of(system, state, tableau, projector, tangents, later)
-
-    def constraint_matrix(self) -> Float[Array, "m unknowns"]:
-        """Rates of all constraints per rate of the free motions, at the start of the step."""
-        resting = at_rest(self)
-        count = self.system.structure.unknowns
-        rest = jnp.zeros(self.system.structure.multipliers, self.start.dtype)
-
-        def rows(w: Array) -> Array:
-            return resting.residual(jnp.concatenate([w, rest]))[0][count:]
-
-        return jax.jacfwd(rows)(jnp.zeros(count, self.start.dtype))
 
     @property
     def groups(self) -> tuple[Group, ...]:

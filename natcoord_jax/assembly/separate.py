@@ -15,7 +15,7 @@ from natcoord_jax.assembly.balances import loops_of, relations_of, rotors_of
 from natcoord_jax.assembly.momentum import inertia, wrench
 from natcoord_jax.assembly.rates import joint_axes, row_rates
 from natcoord_jax.assembly.system import System
-from natcoord_jax.assembly.tangent_space import TangentSpace, Velocity, isometric
+from natcoord_jax.assembly.tangent_space import TangentSpace, Velocity, driven, isometric
 from natcoord_jax.assembly.tree import SLOTS
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
@@ -152,5 +152,6 @@ def separate(system: System) -> bool:
 
 def tangents_at(system: System, state: State) -> Tangents:
     """The tangent space of a state; its velocities play no part."""
-    kind = SeparateTangents if separate(system) else TangentSpace
-    return kind.at(system, state)
+    if separate(system):
+        return SeparateTangents.at(system, state)
+    return TangentSpace.at(system, state, lifted=driven(system))

@@ -16,10 +16,13 @@ from natcoord_jax.assembly.system import System
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.elimination import definite_inverse, inverse_cholesky
-from natcoord_jax.maths.projectors import range_projector
+from natcoord_jax.maths.projectors import pseudo_inverse, range_projector
 
 POLISHING = 9
 """Newton-Schulz iterations for the direct rotation of subspaces: enough for cosines from 0.4 on."""
+
+POLISHED = 1e-9
+"""Error of X^T X from which one iteration more is the last: it squares it."""
 
 
 class Velocity(eqx.Module):
@@ -35,14 +38,16 @@ class Admissible(eqx.Module):
     Attributes:
         frame: X, with X P^T M P X^T = 1.
         subspace: projector on what the constraints outside the tree admit, in the frame; None: everything.
-        lift: rates of the smallest energy per unit rate of the constraints.
-        prescribed: rates that drives prescribe, zero for all other constraints.
+        lift: rates of the smallest energy per unit rate of the constraints; None: not asked for.
+        prescribed: rates that drives prescribe, zero for all other constraints; None: not asked for.
+        range: projector on the range of the constraints' rates; None: they are independent.
     """
 
     frame: Float[Array, "u u"]
     subspace: Float[Array, "u u"] | None
-    lift: Float[Array, "u c"]
-    prescribed: Float[Array, " c"]
+    lift: Float[Array, "u c"] | None
+    prescribed: Float[Array, " c"] | None
+    range: Float[Array, "c c"] | None = None
 
     def within(self, y: Float[Array, " u"]) -> Float[Array, " u"]:
         """The part of a vector in the frame that the constraints admit."""
@@ -53,42 +58,49 @@ class TangentSpace(eqx.Module):
     """Velocities that the constraints admit at one configuration.
 
     Attributes:
-        balances: inertia and constraints there; the null space P of the tree.
-        columns: P, one free motion after the other.
+        system: whose tangents they are, None while they are carried along.
+        rows: of the bodies.
+        free: the null space P of the tree: velocities and angular velocities of the bodies per unit rate of
+            each free motion.
+        turning: the same of the rotors.
         impulses: M P.
         inertias: of the rotors.
         admissible: what the constraints admit.
     """
 
-    balances: Balances
-    columns: Velocity
+    system: System | None
+    rows: Float[Array, "bodies 4 3"]
+    free: tuple[Float[Array, "bodies u 3"], Float[Array, "bodies u 3"]]
+    turning: Float[Array, "u rotors"]
     impulses: Velocity
     inertias: Float[Array, " rotors"]
     admissible: Admissible
 
     @classmethod
-    def at(cls, system: System, state: State) -> "TangentSpace":
-        """The tangent space of a state; its velocities play no part."""
+    def at(cls, system: System, state: State, lifted: bool = True) -> "TangentSpace":
+        """The tangent space of a state; its velocities play no part.
+
+        Args:
+            system: compiled system.
+            state: where.
+            lifted: whether impulses of the constraints are of interest, too.
+        """
         balances, inertias = Balances.at(system, state), rotor_inertias(system)
         gains = balances.columns()
-        columns = Velocity(gains.rows, gains.rotors)
         impulses = Velocity(inertia(system.mass, gains.rows), inertias * gains.rotors)
         unit = jnp.eye(gains.rows.shape[0], dtype=state.q.dtype)
-        lift = jnp.zeros((unit.shape[0], gains.constraints.shape[1]), unit.dtype)
-        plain = Admissible(unit, None, lift, jnp.zeros(lift.shape[1], unit.dtype))
-        space = cls(balances, columns, impulses, inertias, plain)
-        plain = replace_fields(plain, frame=inverse_cholesky(space.pulled(impulses) + _idle(balances)))
-        if gains.constraints.shape[1]:
-            plain = _constrained(balances, plain.frame, gains.constraints.T)
-        return replace_fields(space, admissible=plain)
+        plain = Admissible(unit, None, None, None)
+        space = cls(system, balances.rows, balances.free, gains.rotors, impulses, inertias, plain)
+        frame = inverse_cholesky(space.pulled(impulses) + _idle(balances))
+        return replace_fields(space, admissible=_admissible(balances, frame, gains.constraints.T, lifted))
 
     def without_system(self) -> "TangentSpace":
         """What belongs to the configuration alone; `with_system` puts the rest back."""
-        return eqx.tree_at(lambda space: space.balances.system, self, None)
+        return replace_fields(self, system=None)
 
     def with_system(self, system: System) -> "TangentSpace":
         """Ready for use."""
-        return eqx.tree_at(lambda space: space.balances.system, self, system, is_leaf=lambda x: x is None)
+        return replace_fields(self, system=system)
 
     def framed(self, v: Velocity) -> Float[Array, " u"]:
         """Components of a velocity along the frame, X P^T M v."""
@@ -100,12 +112,23 @@ class TangentSpace(eqx.Module):
 
     def spread(self, w: Float[Array, " u"]) -> Velocity:
         """P w."""
-        velocity, spin = self.balances.twists(w)
-        return Velocity(row_rates(self.balances.rows, velocity, spin), w @ self.columns.rotors)
+        velocity, spin = (jnp.einsum("buc,u->bc", x, w) for x in self.free)
+        return Velocity(row_rates(self.rows, velocity, spin), w @ self.turning)
+
+    @property
+    def columns(self) -> Float[Array, "u bodies 4 3"]:
+        """Rates of the rows per unit rate of each free motion."""
+        return jax.vmap(row_rates, in_axes=(None, 1, 1))(self.rows, *self.free)
+
+    def generalised(self, force: Float[Array, "bodies 3"], torque: Float[Array, "bodies 3"]) -> Array:
+        """Generalised forces of the free motions from forces and torques at the reference points."""
+        velocity, spin = self.free
+        return jnp.einsum("buc,bc->u", velocity, force) + jnp.einsum("buc,bc->u", spin, torque)
 
     def impulse(self, v: Velocity) -> Velocity:
         """M v."""
-        return Velocity(inertia(self.balances.system.mass, v.rows), self.inertias * v.rotors)
+        assert self.system is not None
+        return Velocity(inertia(self.system.mass, v.rows), self.inertias * v.rotors)
 
     def energy(self, v: Velocity) -> Float[Array, ""]:
         """Kinetic energy [J]."""
@@ -115,11 +138,11 @@ class TangentSpace(eqx.Module):
     def pulled(self, impulse: Velocity) -> Float[Array, "u *k"]:
         """P^T of impulses (with a leading axis: of several, to columns)."""
         rows = impulse.rows.reshape(-1, *impulse.rows.shape[-3:])
-        force, torque = wrench(rows, self.balances.rows[None, :, 1:])
-        velocity, spin = self.balances.free
+        force, torque = wrench(rows, self.rows[None, :, 1:])
+        velocity, spin = self.free
         found = jnp.einsum("buc,kbc->uk", velocity, force) + jnp.einsum("buc,kbc->uk", spin, torque)
         if self.inertias.shape[0]:
-            found = found + self.columns.rotors @ impulse.rotors.reshape(rows.shape[0], -1).T
+            found = found + self.turning @ impulse.rotors.reshape(rows.shape[0], -1).T
         return found if impulse.rows.ndim == 4 else found[:, 0]
 
     @property
@@ -130,11 +153,19 @@ class TangentSpace(eqx.Module):
     @property
     def drift_rates(self) -> Float[Array, " u"]:
         """The same as rates of the spanning tree."""
-        return self.admissible.lift @ self.admissible.prescribed
+        known = self.admissible
+        if known.lift is None or known.prescribed is None:
+            return jnp.zeros(known.frame.shape[0], known.frame.dtype)
+        return known.lift @ known.prescribed
 
     def work(self, kick: Velocity) -> Float[Array, " c"]:
-        """Work of the constraints in a kick [J], drives being the only ones that do any."""
+        """Work of the constraints in a kick [J], drives being the only ones that do any.
+
+        Empty where impulses of the constraints are not asked for.
+        """
         known = self.admissible
+        if known.lift is None or known.prescribed is None:
+            return jnp.zeros(0, kick.rows.dtype)
         return known.prescribed * (known.lift.T @ self.pulled(self.impulse(kick)))
 
     @property
@@ -195,10 +226,35 @@ def isometric(
 def _direct_rotation(start: Float[Array, "u u"], end: Float[Array, "u u"]) -> Float[Array, "u u"]:
     """The smallest rotation that takes one subspace to another, from their projectors."""
     unit = jnp.eye(start.shape[0], dtype=start.dtype)
-    x = end @ start + (unit - end) @ (unit - start)
-    for _ in range(POLISHING):
-        x = 1.5 * x - 0.5 * x @ (x.T @ x)
-    return x
+    return _orthogonal(end @ start + (unit - end) @ (unit - start))
+
+
+def _polished(x: Float[Array, "u u"]) -> tuple[Float[Array, "u u"], Float[Array, ""]]:
+    """One Newton-Schulz iteration, and how far from orthogonal the matrix was before it."""
+    square = x.T @ x
+    return 1.5 * x - 0.5 * x @ square, jnp.max(jnp.abs(square - jnp.eye(x.shape[0], dtype=x.dtype)))
+
+
+@jax.custom_jvp
+def _orthogonal(x: Float[Array, "u u"]) -> Float[Array, "u u"]:
+    """The nearest orthogonal matrix. Over short steps subspaces turn little, and few iterations do."""
+
+    def going(carry: tuple) -> Array:
+        return (carry[0] < POLISHING) & (carry[2] > POLISHED)
+
+    def once(carry: tuple) -> tuple:
+        return carry[0] + 1, *_polished(carry[1])
+
+    return jax.lax.while_loop(going, once, (0, x, jnp.ones((), x.dtype)))[1]
+
+
+@_orthogonal.defjvp
+def _orthogonal_jvp(primals: tuple, tangents: tuple) -> tuple:
+    # Derivatives have to go through all iterations, in a loop that can be transposed.
+    def every(x: Array) -> Array:
+        return jax.lax.fori_loop(0, POLISHING, lambda _, x: _polished(x)[0], x)
+
+    return _orthogonal(*primals), jax.jvp(every, primals, tangents)[1]
 
 
 def rotor_inertias(system: System) -> Float[Array, " rotors"]:
@@ -215,21 +271,29 @@ def _idle(balances: Balances) -> Float[Array, "u u"]:
     return jnp.einsum("buc,bwc->uw", spin, spin)
 
 
-def _constrained(balances: Balances, frame: Array, matrix: Float[Array, "c u"]) -> Admissible:
-    """With the constraints of loops and relations, whose rates are the matrix times those of the tree."""
-    structure = balances.system.structure
-    prescribed = -balances.rates(jnp.zeros(matrix.shape[1], matrix.dtype)).constraints
-    framed = matrix @ frame.T
-    coupling = framed @ framed.T
-    if structure.rank is None:
-        inverse = definite_inverse(coupling)
+def driven(system: System) -> bool:
+    """Whether constraints prescribe motions."""
+    return any(group.multipliers and group.effect.works for group in system.effects)
+
+
+def _admissible(balances: Balances, frame: Array, matrix: Float[Array, "c u"], lifted: bool) -> Admissible:
+    """What constraints of loops and relations admit, whose rates are the matrix times those of the tree."""
+    if not matrix.shape[0]:
+        lift, none = jnp.zeros((matrix.shape[1], 0), matrix.dtype), jnp.zeros(0, matrix.dtype)
+        return Admissible(frame, None, lift if lifted else None, none if lifted else None)
+    framed, unit = frame @ matrix.T, jnp.eye(matrix.shape[1], dtype=matrix.dtype)
+    rank, onto, reached = balances.system.structure.rank, None, framed
+    if rank is None:
+        rank = matrix.shape[0]
     else:
-        # What redundant rows never reach gets a unit matrix.
-        onto = range_projector(matrix, structure.rank)
-        idle = jnp.eye(matrix.shape[0], dtype=matrix.dtype) - onto
-        filled = onto @ coupling @ onto + idle * jnp.trace(coupling) / matrix.shape[0]
-        inverse = onto @ definite_inverse(filled) @ onto
-    back = framed.T @ inverse
-    subspace = jnp.eye(framed.shape[1], dtype=matrix.dtype) - back @ framed
-    subspace = 0.5 * (subspace + subspace.T)
-    return Admissible(frame, subspace, frame.T @ back, prescribed)
+        # Only where constraints hold is that their rank. Elsewhere the weakest direction has to be left out,
+        # and that among the constraints first: then the choice matters to second order only.
+        onto = range_projector(matrix, rank)
+        reached = framed @ onto
+    forbidden = range_projector(reached, rank)
+    subspace = unit - 0.5 * (forbidden + forbidden.T)
+    if not lifted:
+        return Admissible(frame, subspace, None, None, onto)
+    prescribed = -balances.rates(jnp.zeros(matrix.shape[1], matrix.dtype)).constraints
+    lift = frame.T @ pseudo_inverse(reached, forbidden, rank).T
+    return Admissible(frame, subspace, lift, prescribed, onto)
