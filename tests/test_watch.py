@@ -9,7 +9,8 @@ from scenes import pair, with_multipliers
 import natcoord_jax as nc
 from natcoord_jax.assembly.equations import prepare
 from natcoord_jax.stepping import watch as subject
-from natcoord_jax.stepping.newton import TOLERANCE, factors_of, newton
+from natcoord_jax.stepping.factors import factors_of
+from natcoord_jax.stepping.newton import TOLERANCE, newton
 from natcoord_jax.stepping.step import advance
 
 FORMS = {"tree": nc.Revolute, "multipliers": with_multipliers(nc.Revolute)}

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from natcoord_jax.linsolve.learning import SPEED, learns, learnt
-from natcoord_jax.stepping.newton import SLOWEST_UNSEEN, Factors
+from natcoord_jax.stepping.factors import Factors
+from natcoord_jax.stepping.newton import SLOWEST_UNSEEN
 
 CLOSE = 1e-12
 """Error of the solution of a transposed system relative to its size."""

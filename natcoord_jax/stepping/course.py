@@ -15,7 +15,8 @@ from natcoord_jax.assembly.tangent_space import Velocity
 from natcoord_jax.core.results import Result
 from natcoord_jax.core.state import State
 from natcoord_jax.stepping.error_control import Tolerance, Trial, Verdict, follow
-from natcoord_jax.stepping.newton import Factors, Iterate, begin, no_factors
+from natcoord_jax.stepping.factors import Factors, no_factors
+from natcoord_jax.stepping.newton import Iterate, begin
 from natcoord_jax.stepping.past import Past
 from natcoord_jax.stepping.plan import Plan
 

@@ -29,7 +29,8 @@ from natcoord_jax.maths.rows import row, with_row
 from natcoord_jax.stepping import linear_pair
 from natcoord_jax.stepping.correcting import Correcting
 from natcoord_jax.stepping.error_control import Tolerance
-from natcoord_jax.stepping.newton import Factors, any_lane, factors_of
+from natcoord_jax.stepping.factors import Factors, factors_of
+from natcoord_jax.stepping.newton import any_lane
 from natcoord_jax.stepping.one_kernel import as_one_kernel, in_groups, plainly
 from natcoord_jax.stepping.past import Past
 from natcoord_jax.stepping.plan import Plan, Slots

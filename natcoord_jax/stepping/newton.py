@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from natcoord_jax.core.results import Result
 from natcoord_jax.linsolve.learning import SPEED, learns, learnt
+from natcoord_jax.stepping.factors import Factors, factors_of, no_factors
 
 TOLERANCE = 2e-16
 """Predicted error after the last correction, relative to the terms of the equations (energy norm).
@@ -42,11 +43,6 @@ STALLS = 3
 
 RAISED = [STALL * 10.0**k for k in range(STALLS + 1)]
 """The floor by factorisations after the first."""
-
-NOISE = (1e-14, 2e-12)
-"""Sizes of last corrections that are known, from the steps before, to be noise: stiff parts feel how their
-places are rounded. Smaller ones are not worth the risk, since what is left of an error may add up; larger
-ones may be slow convergence."""
 
 ABOVE_NOISE = 4.0
 """Corrections up to this multiple of the noise end a step that is expected to be solved."""
@@ -78,9 +74,6 @@ NEAR = 1e-3
 """The same up to which it does: far off, equations are not linear, and what failed attempts teach is noise,
 by which the next ones would be accepted or not."""
 
-NEVER = 1000
-"""More corrections than a step can need."""
-
 
 @jax.custom_batching.custom_vmap
 def any_lane(x: Shaped[Array, ""]) -> Shaped[Array, ""]:
@@ -94,51 +87,6 @@ def any_lane(x: Shaped[Array, ""]) -> Shaped[Array, ""]:
 @any_lane.def_vmap
 def _any_lane_rule(axis_size: int, in_batched: list[bool], x: Array) -> tuple[Array, bool]:
     return any_lane(jnp.max(x, axis=0)), False
-
-
-class Factors(eqx.Module):
-    """Factors of a Jacobian.
-
-    Attributes:
-        solver: `solve(right)` applies them.
-        inertias: inertias of the unknowns, 0 for multipliers.
-        usable: whether there are any.
-        fresh: whether they belong to the step that is being solved.
-        least: fewest corrections that a step has needed with them.
-        extra: corrections beyond these that later steps have needed.
-        noise: last correction of a step, relative to the terms of the equations, averaged over steps.
-    """
-
-    solver: Any
-    inertias: Float[Array, " unknowns"]
-    usable: Bool[Array, ""]
-    fresh: Bool[Array, ""]
-    least: Int[Array, ""]
-    extra: Int[Array, ""]
-    noise: Float[Array, ""]
-
-    def after_step(self, it: "Iterate", usable: Bool[Array, ""], cost: int) -> "Factors":
-        """Factors for the next step: given up once they have cost more corrections than new ones would.
-
-        Args:
-            it: where the iteration of the step has ended.
-            usable: whether it was solved.
-            cost: of new factors, in corrections.
-        """
-        corrections = it.total
-        # What was needed with new factors is no guide in the step that made them: it began with old ones.
-        least = jnp.where(self.fresh, self.least, jnp.minimum(self.least, corrections))
-        extra = self.extra + jnp.where(self.fresh, 0, jnp.maximum(corrections - least, 0))
-        # Factors of a step that was hard to solve are of no use to others.
-        keep = usable & self.usable & (extra <= cost) & (corrections <= 2 * cost)
-        noise = jnp.where(usable & it.converged, 0.5 * (self.noise + it.error), self.noise)
-        return Factors(self.solver, self.inertias, keep, jnp.zeros_like(self.fresh), least, extra, noise)
-
-    @property
-    def rounding(self) -> Float[Array, ""]:
-        """Relative size of corrections that are nothing but rounding; 0 where it is not known or small."""
-        least, most = NOISE
-        return jnp.where(self.noise > least, jnp.minimum(self.noise, most), 0.0)
 
 
 class Iterate(eqx.Module):
@@ -195,27 +143,6 @@ def begin(y: Float[Array, " unknowns"], few: bool = False) -> Iterate:
     zero, no, nought = jnp.zeros((), y.dtype), jnp.array(False), jnp.array(0)
     still, yes = jnp.zeros_like(y), jnp.array(True)
     return Iterate(y, y, still, nought, zero, zero, nought, nought, nought, most, no, no, no, yes)
-
-
-def no_factors(equations: Any) -> Factors:
-    """The shapes of factors, and none usable."""
-    y = equations.guess()
-    shapes = jax.eval_shape(equations.factorised, equations.like_tangent(y))
-    solver, inertias = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-    no, noise = jnp.array(False), jnp.zeros((), y.dtype)
-    return Factors(solver, inertias, no, no, jnp.array(NEVER), jnp.array(0), noise)
-
-
-def factors_of(equations: Any, matrix: Any, noise: Array | float = 0.0) -> Factors:
-    """Factors of a Jacobian."""
-    return new_factors(equations.factorised(matrix), noise)
-
-
-def new_factors(made: tuple[Any, Array], noise: Array | float = 0.0) -> Factors:
-    """Factors that have just been made, with the inertias of the unknowns."""
-    solver, inertias = made
-    yes, noise = jnp.array(True), jnp.asarray(noise, inertias.dtype)
-    return Factors(solver, inertias, yes, yes, jnp.array(NEVER), jnp.array(0), noise)
 
 
 def refreshed(it: Iterate) -> Iterate:

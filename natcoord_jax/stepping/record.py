@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 from natcoord_jax.assembly.system import System
 from natcoord_jax.core.state import State
 from natcoord_jax.stepping.correcting import Correcting
-from natcoord_jax.stepping.newton import Factors
+from natcoord_jax.stepping.factors import Factors
 from natcoord_jax.stepping.past import Past
 
 

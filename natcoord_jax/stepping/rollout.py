@@ -20,7 +20,8 @@ from natcoord_jax.core.results import Result
 from natcoord_jax.core.state import State
 from natcoord_jax.stepping.course import Course, Setting
 from natcoord_jax.stepping.error_control import Tolerance
-from natcoord_jax.stepping.newton import Factors, any_lane
+from natcoord_jax.stepping.factors import Factors
+from natcoord_jax.stepping.newton import any_lane
 from natcoord_jax.stepping.one_kernel import as_one_kernel
 from natcoord_jax.stepping.plan import Plan, Slots
 from natcoord_jax.stepping.rounds import all_slots

@@ -15,10 +15,12 @@ from natcoord_jax.assembly.kick import Kick
 from natcoord_jax.assembly.lag import Lag
 from natcoord_jax.assembly.outset import Outset
 from natcoord_jax.assembly.response import Evaluation
+from natcoord_jax.assembly.tangent_space import driven
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.rows import row, with_row
 from natcoord_jax.stepping.course import Course, Setting, after_attempt
-from natcoord_jax.stepping.newton import Factors, Iterate, any_lane, factors_of, judge, new_factors, refreshed
+from natcoord_jax.stepping.factors import Factors, factors_of, new_factors
+from natcoord_jax.stepping.newton import Iterate, any_lane, judge, refreshed
 from natcoord_jax.stepping.probe import Probe, matrix_of
 from natcoord_jax.stepping.remainder import remainder, with_remainder
 from natcoord_jax.stepping.step import end_of_step
@@ -200,7 +202,7 @@ def lag_of(course: Course, over: Array) -> Lag | None:
     going = it.unsolved & ~over
     # Lanes that are done wait for the others; the last evaluation has the kicks of all.
     wanted = any_lane(lagging.wanted(it) & going) | ~any_lane(going)
-    closed = lagging.closed > 0
+    closed = (lagging.closed > 0) & ~over
     return Lag(lagging.held, wanted, closed, jnp.zeros_like(closed))
 
 
@@ -253,10 +255,9 @@ def _renewed_by(equations: Any, probe: Probe, it: Iterate, factors: Factors) -> 
 
 def _judging(equations: Any, it: Iterate, probe: Probe | None) -> tuple[int, dict[str, Any]]:
     """Cost of new factors, in corrections, and options of `judge`."""
-    driven = any(group.multipliers and group.effect.works for group in equations.groups)
     cost = equations.renewal if probe is None else max(equations.renewal, it.y.shape[0] // 2)
     alike = False if probe is None else probe.alike
-    return cost, {"balances": driven, "patience": cost, "alike": alike}
+    return cost, {"balances": driven(equations.system), "patience": cost, "alike": alike}
 
 
 def renewed_at(
