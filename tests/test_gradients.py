@@ -17,6 +17,10 @@ from differences import assert_v_shaped
 
 import natcoord_jax as nc
 from natcoord_jax import gallery
+from natcoord_jax.stepping.derivative import Rule, run_slots
+from natcoord_jax.stepping.newton import TOLERANCE
+from natcoord_jax.stepping.plan import Plan
+from natcoord_jax.stepping.step import advance
 
 STEPS = 12
 
@@ -473,3 +477,38 @@ def test_gradient_of_what_is_kept_is_zero(order):
 
     value, gradient = jax.jit(jax.value_and_grad(length))(state.v)
     assert abs(value - 3.25) < 1e-12 and jnp.max(jnp.abs(gradient)) < 1e-12
+
+
+@pytest.mark.parametrize(("order", "stride"), [(2, 2), (4, 1)])
+def test_multipliers_of_the_way_back_are_smooth_at_the_stride_of_their_guesses(order, stride):
+    # v_1 = 2 V - v_0 alternates across constraints, and so do cotangents, where no kicks hold velocities.
+    example = gallery.load("heavy_top")
+    system, tableau, steps, dt = example.system, nc.EnergyMomentum(order).tableau, 30, jnp.asarray(example.dt)
+    plan = Plan(steps, 4, TOLERANCE, None, None, tableau)
+    u = jnp.zeros((steps, len(system.structure.inputs)))
+    slots, _ = run_slots(plan, system, example.state, u, dt)
+    assert np.sum(slots.accepted[:steps]) == steps and Rule(plan).stride == stride
+    rng = np.random.default_rng(0)
+    end_bar = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape)), example.state)
+
+    @jax.jit
+    def back(before, y, end_bar):
+        def outcome(state, y):
+            return advance(system, state, u[0], dt, y, tableau)[:2]
+
+        _, pull = jax.vjp(outcome, before, y)
+        matrix = jax.jacfwd(lambda y: outcome(before, y)[0])(y)
+        lam = -jnp.linalg.solve(matrix.T, pull((jnp.zeros_like(y), end_bar))[1])
+        return lam, pull((lam, end_bar))[0]
+
+    found = []
+    for k in range(steps - 1, -1, -1):
+        before = example.state if k == 0 else jax.tree.map(lambda x, k=k: x[k - 1], slots.states)
+        lam, end_bar = back(before, slots.y[k], end_bar)
+        found.append(lam)
+    # What a cubic polynomial misses, from every step and from every other one, the first ones apart.
+    every, other = np.asarray(found)[2:], np.asarray(found)[2:]
+    for _ in range(4):
+        every, other = every[1:] - every[:-1], other[2:] - other[:-2]
+    best, worse = (other, every) if stride == 2 else (every, other)
+    assert 5.0 * np.max(np.abs(best)) < np.max(np.abs(worse))
