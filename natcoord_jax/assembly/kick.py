@@ -40,8 +40,9 @@ from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import Tableau
 
-LARGEST = 0.5
-"""Kinetic energy of a kick in terms of that of the motion, twice, beyond which a step is refused."""
+LARGEST = 0.51
+"""Kinetic energy of a kick in terms of that of the motion, twice, beyond which a step is refused. A drive
+that sets in motion at once what was at rest has 0.5 exactly, and must not depend on rounding."""
 
 UNSOUND = 1e-11
 """Energy made by kicks in terms of that of the motion, beyond which a step is refused."""
