@@ -7,10 +7,11 @@ from jaxtyping import Array, Float
 def cross(a: Float[Array, "*batch 3"], b: Float[Array, "*other 3"]) -> Float[Array, "*out 3"]:
     """Cross product over the last axis, with broadcasting.
 
-    Written out in components: it fuses with its neighbours, which `jnp.cross` does not.
+    Written out in components: it fuses with its neighbours, which `jnp.cross` does not. Components come from
+    `unstack`, whose transpose puts them together at once; those of slices would be padded and added up.
     """
-    a0, a1, a2 = a[..., 0], a[..., 1], a[..., 2]
-    b0, b1, b2 = b[..., 0], b[..., 1], b[..., 2]
+    a0, a1, a2 = jnp.unstack(a, axis=-1)
+    b0, b1, b2 = jnp.unstack(b, axis=-1)
     return jnp.stack([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0], axis=-1)
 
 
