@@ -52,12 +52,13 @@ def turning(
         tableau: the collocation method.
     """
     spin = spin_p
+    rates = jnp.unstack(rate[..., None], axis=2)
     for k, axis in zip(level.rotations, axes):
-        spin = spin + rate[:, :, k, None] * axis
+        spin = spin + rates[k] * axis
     if child_axis is None:
         return spin, []
     turned = rotate_stages(h * spin, child_axis, tableau)
-    return spin + rate[:, :, 6, None] * turned, [turned]
+    return spin + rates[6] * turned, [turned]
 
 
 def relative_motion(
@@ -86,15 +87,14 @@ def relative_motion(
     place, rows = these.frames, these.rows
     d0 = rows[None, :, 1:]
     parent_axes = frame_axes(place[:, 0, 1:, 1:], d_p)
-    axes = [parent_axes[:, :, k] for k in level.rotations]
-    slides = [
-        cross(parent_axes[:, :, (k + 1) % 3], parent_axes[:, :, (k + 2) % 3]) for k in level.translations
-    ]
+    along = jnp.unstack(parent_axes, axis=2)
+    axes = [along[k] for k in level.rotations]
+    slides = [cross(along[(k + 1) % 3], along[(k + 2) % 3]) for k in level.translations]
     if level.balls:
-        along = d0 if these.turned is None else these.turned
-        own_axes, ball = frame_axes(place[:, 1, 1:, 1:], along), these.ball[:, None]
-        axes = [jnp.where(ball, own_axes[:, :, k], a) for k, a in zip(level.rotations, axes)]
-        slides = [jnp.where(ball, own_axes[:, :, k], t) for k, t in zip(level.translations, slides)]
+        turned = d0 if these.turned is None else these.turned
+        own, ball = jnp.unstack(frame_axes(place[:, 1, 1:, 1:], turned), axis=2), these.ball[:, None]
+        axes = [jnp.where(ball, own[k], a) for k, a in zip(level.rotations, axes)]
+        slides = [jnp.where(ball, own[k], t) for k, t in zip(level.translations, slides)]
     start = combine(place[:, 1, 1, 1:], d0) if level.child_rotation else None
     spin, child_axis = turning(level, axes, start, spin_p, rate, h, tableau)
     d = rotate_stages(h * spin[:, :, None], d0, tableau)
@@ -105,7 +105,8 @@ def relative_motion(
         velocity = velocity + cross(spin_p, parent_arm)
     gap = jnp.zeros_like(child_arm)
     if level.translations:
-        sliding = sum(rate[:, :, 3 + k, None] * t for k, t in zip(level.translations, slides))
+        rates = jnp.unstack(rate[..., None], axis=2)
+        sliding = sum(rates[3 + k] * t for k, t in zip(level.translations, slides))
         velocity = velocity + sliding
         if not level.grounded:
             above = these.parent_rows

@@ -215,7 +215,7 @@ def project(
         about = n - cross(joint.child_arm, f)
         rotations, slides = len(level.rotations), len(level.translations)
         vectors = [about] * rotations + [f] * slides + [about] * level.child_rotation
-        columns = {slot: dot(v, joint.axes[:, :, i]) for i, (slot, v) in enumerate(zip(level.slots, vectors))}
+        columns = {k: dot(v, a) for k, v, a in zip(level.slots, vectors, jnp.unstack(joint.axes, axis=2))}
         zero = jnp.zeros_like(f[..., 0])
         slots.append(jnp.stack([columns.get(slot, zero) for slot in range(SLOTS)], axis=-1))
         through_f.append(f)

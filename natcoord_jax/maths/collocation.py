@@ -244,9 +244,9 @@ def _on(a: Float[Array, "*batch 3 3"], x: Float[Array, "*other 3"]) -> Float[Arr
 
 def _inverse(a: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 3"]:
     """Inverses of 3 x 3 matrices by cofactors."""
-    first, second, third = a[..., 0, :], a[..., 1, :], a[..., 2, :]
-    cofactors = jnp.stack([cross(second, third), cross(third, first), cross(first, second)], axis=-1)
-    return cofactors / dot(first, cofactors[..., 0])[..., None, None]
+    first, second, third = jnp.unstack(a, axis=-2)
+    cofactors = [cross(second, third), cross(third, first), cross(first, second)]
+    return jnp.stack(cofactors, axis=-1) / dot(first, cofactors[0])[..., None, None]
 
 
 def _block_solve(

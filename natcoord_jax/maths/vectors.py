@@ -22,11 +22,12 @@ def dot(a: Float[Array, "*batch k"], b: Float[Array, "*other k"]) -> Float[Array
 
 def skew(a: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3 3"]:
     """Matrix of the map b -> a x b."""
-    zero = jnp.zeros_like(a[..., 0])
+    a0, a1, a2 = jnp.unstack(a, axis=-1)
+    zero = jnp.zeros_like(a0)
     rows = [
-        jnp.stack([zero, -a[..., 2], a[..., 1]], axis=-1),
-        jnp.stack([a[..., 2], zero, -a[..., 0]], axis=-1),
-        jnp.stack([-a[..., 1], a[..., 0], zero], axis=-1),
+        jnp.stack([zero, -a2, a1], axis=-1),
+        jnp.stack([a2, zero, -a0], axis=-1),
+        jnp.stack([-a1, a0, zero], axis=-1),
     ]
     return jnp.stack(rows, axis=-2)
 
