@@ -192,14 +192,15 @@ def folder(options: argparse.Namespace) -> Path | None:
     return options.output or (None if options.quick else RESULTS)
 
 
-def write(results: dict[str, Any], draw: Callable[[dict[str, Any]], Any], where: Path | None) -> None:
-    """Write the JSON, and the figure made from it."""
+def write(results: dict[str, Any], draw: Callable[[dict[str, Any]], Any] | None, where: Path | None) -> None:
+    """Write the JSON, and the figure made from it if there is one."""
     if where is None:
         return
     where.mkdir(parents=True, exist_ok=True)
     file = where / f"{results['benchmark']}.json"
     file.write_text(json.dumps(results, indent=2, allow_nan=False) + "\n", "utf-8")
-    redraw(file, draw)
+    if draw is not None:
+        redraw(file, draw)
 
 
 def redraw(file: Path, draw: Callable[[dict[str, Any]], Any]) -> None:

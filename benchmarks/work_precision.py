@@ -1,7 +1,7 @@
 """What accuracy costs in time, by order, beside MuJoCo, MJX and Exudyn: one run, one core.
 
 usage: python -m benchmarks.work_precision [--quick] [--output FOLDER] [--peers-python PATH] [--no-peers]
-       [--models NAME ...] [--redraw JSON]
+       [--models NAME ...] [--gradients] [--redraw JSON]
 
 Open trees (spacecraft, from rest and spinning, open tree, heavy top, double pendulum), closed loops (a row of
 two four-bars, Bricard's mechanism) and a chain of rods on stiff springs, beside the peers at the settings
@@ -16,7 +16,8 @@ energy.
 the time of the coarsest run that came to an end, where that is more accurate already: explicit methods on the
 stiff chain are, as soon as they are stable. Tables print it with a "<", and "-" for what is not reached.
 
-`gradients` are of the initial state, value and gradient over the value alone, by order.
+`gradients` are of the initial state, value and gradient over the value alone, by order. With --gradients
+nothing else is measured, in minutes, and goes into gradients.json.
 
 `long`, made with the heavy top, are runs of 10^6 steps (10^4 with --quick) of 1 ms: by code the largest
 drift of energy, and its trend from start to end; None for runs that fail or diverge.
@@ -206,6 +207,17 @@ def own_gradients(model: str, repeats: int) -> list[dict[str, Any]]:
     return found
 
 
+def gradient_targets(found: dict[str, list[dict[str, Any]]]) -> list[dict[str, Any]]:
+    """What value and gradient are to take."""
+    return [
+        common.target(
+            f"{model}: value and gradient over value at order {row['order']}", row["over_forward"], 2.5
+        )
+        for model, rows in found.items()
+        for row in rows
+    ]
+
+
 def check_run(example: gallery.Example, order: int) -> None:
     """See that the suggested run comes to its end without a failed step.
 
@@ -380,10 +392,7 @@ def targets(models: dict[str, Any], long: list[dict[str, Any]]) -> list[dict[str
             unmet = ", which no peer reaches" if several and theirs[error] is None else ""
             name = f"{model}: over every peer at {error}{unmet}"
             lines.append(common.target(name, _ratio(best, theirs, error), 1.0))
-    for model, found in models.items():
-        for row in found["gradients"]:
-            name = f"{model}: value and gradient over value at order {row['order']}"
-            lines.append(common.target(name, row["over_forward"], 2.5))
+    lines += gradient_targets({model: found["gradients"] for model, found in models.items()})
     if long:
         (own,) = (row["largest_drift"] for row in long if row["code"].startswith(OWN))
         theirs = [row["largest_drift"] for row in long if not row["code"].startswith(OWN)]
@@ -446,6 +455,7 @@ def main() -> None:
     """Run the benchmark."""
     parser = common.peer_parser("What accuracy costs in time, beside other codes.", "the figure")
     parser.add_argument("--models", nargs="+", choices=SHARED, default=SHARED, help="only these scenes")
+    parser.add_argument("--gradients", action="store_true", help="nothing but value and gradient")
     chosen = parser.parse_args()
     if chosen.redraw:
         common.redraw(chosen.redraw, draw)
@@ -453,6 +463,13 @@ def main() -> None:
     common.on_one_core()
     jax.config.update("jax_enable_x64", True)
     plan = QUICK if chosen.quick else FULL
+    if chosen.gradients:
+        results = common.circumstances("gradients", quick=chosen.quick)
+        found = {model: own_gradients(model, plan.repeats) for model in chosen.models if model in GRADIENTS}
+        results |= {"models": found, "targets": gradient_targets(found)}
+        print(f"{common.environment_line(results)}\n\n{common.show_targets(results['targets'])}")
+        common.write(results, None, common.folder(chosen))
+        return
     results = common.circumstances("work_precision", quick=chosen.quick)
     peers = () if chosen.no_peers else beside.available(plan.peers, chosen.peers_python)
     bare = beside.QUICK._replace(repeats=plan.repeats, lanes=0)

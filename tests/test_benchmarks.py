@@ -17,12 +17,13 @@ pytestmark = [
 ]
 
 
-def _results(name, folder, *options):
+def _results(name, folder, *options, written=None):
     command = [sys.executable, "-m", f"benchmarks.{name}", "--quick", "--output", str(folder), *options]
     run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert run.returncode == 0, run.stderr
-    assert (folder / f"{name}.png").stat().st_size > 10_000
-    results = json.loads((folder / f"{name}.json").read_text("utf-8"))
+    if written is None:
+        assert (folder / f"{name}.png").stat().st_size > 10_000
+    results = json.loads((folder / f"{written or name}.json").read_text("utf-8"))
     assert results.keys() >= CIRCUMSTANCES
     assert results["machine"].keys() >= {"processor", "cores", "cores_used"}
     for target in results["targets"]:
@@ -53,6 +54,15 @@ def test_work_precision_of_one_scene_alone(tmp_path):
     for run in found["runs"]:
         assert run.keys() >= TIMES | {"steps", "error", "drift"} and run["drift"] < 1e-11
     assert "double_pendulum" in text
+
+
+def test_gradients_alone(tmp_path):
+    options = "--gradients", "--models", "heavy_top"
+    results, _ = _results("work_precision", tmp_path, *options, written="gradients")
+    assert [row["order"] for row in results["models"]["heavy_top"]] == [2, 4, 6, 8]
+    for row in results["models"]["heavy_top"]:
+        assert row.keys() >= TIMES | {"over_forward", "forward_us_per_step"} and row["finite"]
+    assert len(results["targets"]) == 4
 
 
 def test_spacecraft_alone(tmp_path):
