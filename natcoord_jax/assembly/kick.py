@@ -162,7 +162,8 @@ def _both(system: System, start: State, end: State) -> tuple[Tangents, Tangents]
         return tangents_at(system, replace_fields(end, q=q, v=q, t=t)).without_system()
 
     found = jax.vmap(at)(jnp.stack([start.q, end.q]), jnp.stack([start.t, end.t]))
-    before, after = jax.tree.map(lambda x: x[0], found), jax.tree.map(lambda x: x[1], found)
+    parts, structure = jax.tree.flatten(found)
+    before, after = (jax.tree.unflatten(structure, x) for x in zip(*map(jnp.unstack, parts)))
     return before.with_system(system), after.with_system(system)
 
 

@@ -23,7 +23,8 @@ def wrench(
     rows: Float[Array, "s bodies 4 3"], directors: Float[Array, "#s bodies 3 3"]
 ) -> tuple[Float[Array, "s bodies 3"], Float[Array, "s bodies 3"]]:
     """Force and torque about the reference point of forces on rows: r_phi and sum d_i x r_i (26, 31)."""
-    return rows[:, :, 0], jnp.sum(cross(directors, rows[:, :, 1:]), axis=2)
+    force, pulls = jnp.split(rows, [1], axis=2)
+    return force[:, :, 0], jnp.sum(cross(directors, pulls), axis=2)
 
 
 def row_weights(mass: Float[Array, "bodies 4 4"]) -> Float[Array, "bodies 4"]:

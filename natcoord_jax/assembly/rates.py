@@ -44,7 +44,8 @@ def joint_axes(
     frames = system.tree.frames(system.frames)
     parent, child = jax.vmap(frames_at)(frames, jnp.stack([above, rows], axis=1))
     a = parent.axes
-    slides = jnp.stack([cross(a[:, (k + 1) % 3], a[:, (k + 2) % 3]) for k in range(3)], axis=1)
+    along = jnp.unstack(a, axis=1)
+    slides = jnp.stack([cross(along[(k + 1) % 3], along[(k + 2) % 3]) for k in range(3)], axis=1)
     return jnp.concatenate([a, slides, child.axes[:, :1]], axis=1), child.point
 
 

@@ -32,11 +32,9 @@ class Frame(eqx.Module):
 def frames_at(place: Float[Array, "2 4 4"], rows: Float[Array, "*s 2 4 3"]) -> tuple[Frame, Frame]:
     """Frames of parent and child from their rows; place[b] = weights of (point, axis 1, 2, 3) of body b."""
     vectors = jnp.sum(place[..., None] * rows[..., None, :, :], axis=-2)
-    parent, child = vectors[..., 0, :, :], vectors[..., 1, :, :]
-    return (
-        Frame(parent[..., 0, :], parent[..., 1:, :]),
-        Frame(child[..., 0, :], child[..., 1:, :]),
-    )
+    points, axes = jnp.split(vectors, [1], axis=-2)
+    (parent, child), (parent_axes, child_axes) = (jnp.unstack(x, axis=-3) for x in (points, axes))
+    return Frame(parent[..., 0, :], parent_axes), Frame(child[..., 0, :], child_axes)
 
 
 class Joint(Effect):

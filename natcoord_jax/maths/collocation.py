@@ -262,13 +262,16 @@ def _block_solve(
     pivots, rows, rights = [], [], []
     for k in range(s):
         # What is left of the matrix and of the right-hand sides, from stage k on.
-        pivots.append(_inverse(blocks[0, 0]))
-        rows.append(blocks[0, 1:])
-        rights.append(x[0])
+        (first, *below), (right, *rest) = jnp.split(blocks, [1]), jnp.split(x, [1])
+        pivot, row = jnp.split(first[0], [1])
+        pivots.append(_inverse(pivot[0]))
+        rows.append(jnp.unstack(row))
+        rights.append(right[0])
         if k + 1 < s:
-            factors = _times(blocks[1:, 0], pivots[-1][None])
-            blocks = blocks[1:, 1:] - _times(factors[:, None], blocks[0, 1:][None])
-            x = x[1:] - _on(factors, x[0])
+            column, blocks = jnp.split(below[0], [1], axis=1)
+            factors = _times(column[:, 0], pivots[-1][None])
+            blocks = blocks - _times(factors[:, None], row[None])
+            x = rest[0] - _on(factors, right)
     found: list[Array] = []
     for pivot, row, right in zip(reversed(pivots), reversed(rows), reversed(rights)):
         for block, known in zip(row, found):

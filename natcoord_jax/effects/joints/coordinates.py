@@ -49,8 +49,13 @@ def _stages(pair: PairMotion) -> int:
 def _turned(invariants: Callable[[Frame, Frame], Array], pair: PairMotion, h: Array) -> UnitLoad:
     """Unit load of an angle with the given (cosine, sine), for several stages; at most half a turn a step."""
     c, s = invariants(pair.parent_start, pair.child_start)
-    # From the start on, so that the angle never jumps.
-    return unit_load_of(invariants, lambda x: jnp.arctan2(c * x[1] - s * x[0], c * x[0] + s * x[1]), pair, h)
+
+    def angle(x: Array) -> Array:
+        # From the start on, so that the angle never jumps.
+        cosine, sine = jnp.unstack(x)
+        return jnp.arctan2(c * sine - s * cosine, c * cosine + s * sine)
+
+    return unit_load_of(invariants, angle, pair, h)
 
 
 @dataclass(frozen=True)
@@ -70,8 +75,9 @@ class Angle(Coordinate):
         return UnitLoad(rate[None], None, _pair(quotient * middle))
 
     def _cosine_sine(self, parent: Frame, child: Frame) -> Array:
-        first, second = parent.axes[(self.axis + 1) % 3], parent.axes[(self.axis + 2) % 3]
-        moving = child.axes[(self.axis + 1) % 3]
+        axes, k = jnp.unstack(parent.axes), self.axis
+        first, second = axes[(k + 1) % 3], axes[(k + 2) % 3]
+        moving = jnp.unstack(child.axes)[(k + 1) % 3]
         return jnp.stack([dot(first, moving), dot(second, moving)])
 
     def value(self, parent: Frame, child: Frame) -> Array:

@@ -17,12 +17,15 @@ from natcoord_jax.maths.vectors import dot
 
 def _axis_parallel(parent: Frame, child: Frame) -> list[Array]:
     """Two conditions that keep the child's third axis parallel to the parent's."""
-    return [dot(parent.axes[0], child.axes[2]), dot(parent.axes[1], child.axes[2])]
+    first, second, _ = jnp.unstack(parent.axes)
+    third = jnp.unstack(child.axes)[2]
+    return [dot(first, third), dot(second, third)]
 
 
 def _orientation(parent: Frame, child: Frame) -> list[Array]:
     """Three conditions that keep the two triads parallel."""
-    return [*_axis_parallel(parent, child), dot(parent.axes[0], child.axes[1])]
+    (first, second, _), (_, moving, third) = jnp.unstack(parent.axes), jnp.unstack(child.axes)
+    return [dot(first, third), dot(second, third), dot(first, moving)]
 
 
 class Fixed(Joint):
