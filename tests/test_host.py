@@ -8,7 +8,7 @@ from jax import lax
 
 import natcoord_jax as nc
 from natcoord_jax.core.checks import as_array, at_top_level
-from natcoord_jax.core.host import on_host
+from natcoord_jax.core.host import FLOWS, on_host
 
 X = jnp.asarray(np.random.default_rng(0).normal(size=(4, 3)))
 PLACES = jnp.array([2, 0, 3])
@@ -30,6 +30,7 @@ CASES = {
     "extremes": lambda x: (jnp.argmin(x, axis=1), jnp.argmax(x), jnp.min(x, initial=-3.0)),
     "none": lambda x: (jnp.max(x[:0], initial=0.0), jnp.min(x[:0], 0, initial=1.0), jnp.sum(x[:0], 0)),
     "shapes": lambda x: (x.T, x[::-1, 1:], jnp.tile(x, 2), jnp.pad(x, 1), jnp.roll(x, 1), jnp.split(x, 2)),
+    "taken apart": lambda x: (*jnp.unstack(x), *jnp.unstack(x, axis=1), *jnp.unstack(x[0])),
     "joined": lambda x: (jnp.stack([x, x], 1), jnp.block([[x, x], [x, x]]), jnp.diag(x[0]), jnp.diff(x)),
     "taken": lambda x: (x[PLACES], x[PLACES, 1], x[:, PLACES % 3], x[-1], x[PLACES[0]], jnp.take(x, 9)),
     "put": lambda x: (
@@ -65,6 +66,25 @@ def test_results_are_those_of_jax(case):
         assert isinstance(have, jax.Array)
         assert (want.shape, want.dtype) == (have.shape, have.dtype)
         np.testing.assert_allclose(have, want, rtol=1e-13, atol=1e-14)
+
+
+@pytest.mark.parametrize("name", FLOWS)
+def test_operations_with_several_results_give_arrays(name):
+    """Could go wrong: numbers of NumPy, which the elements of a vector are."""
+    found = []
+    of_numpy = FLOWS[name]
+
+    def noting(given, operands):
+        results = of_numpy(given, operands)
+        found.extend(results)
+        return results
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(FLOWS, name, noting)
+        for case in ("loops", "taken apart"):
+            on_host(CASES[case])(X)
+        on_host(lambda x: jnp.split(x, 3))(X[0])
+    assert found and all(isinstance(x, np.ndarray) for x in found)
 
 
 def test_inside_of_transformations_it_is_the_function_itself():

@@ -210,7 +210,8 @@ def _split(given: dict[str, Any], operands: list[np.ndarray]) -> list[np.ndarray
 
 
 def _unstack(given: dict[str, Any], operands: list[np.ndarray]) -> list[np.ndarray]:
-    return list(np.moveaxis(operands[0], given["axis"], 0))
+    # Of a vector these are numbers of NumPy, which are no arrays.
+    return [np.asarray(x) for x in np.moveaxis(operands[0], given["axis"], 0)]
 
 
 FLOWS = {"scan": _scan, "while": _while, "cond": _cond, "split": _split, "unstack": _unstack}
