@@ -8,7 +8,7 @@ import pytest
 import natcoord_jax as nc
 from natcoord_jax import gallery
 from natcoord_jax.linsolve.dense import Inverse
-from natcoord_jax.linsolve.learning import FORESEEN, learnt
+from natcoord_jax.linsolve.learning import FORESEEN, across, learnt
 from natcoord_jax.maths.projectors import pseudo_inverse, range_projector
 from natcoord_jax.stepping import newton
 
@@ -28,7 +28,7 @@ def test_what_was_learnt_holds():
     last = solver.solve(right)
     change = solver.solve(right - matrix @ last)
     weights = jnp.arange(1.0, 6.0)
-    better, following = learnt(solver, last, change, weights, YES)
+    better, following, _ = learnt(solver, last, change, weights, YES)
     # The secant condition, and the next correction by the new inverse.
     np.testing.assert_allclose(better.solve(matrix @ last), last, rtol=1e-12)
     np.testing.assert_allclose(better.solve(right - matrix @ last), following, rtol=1e-12)
@@ -45,9 +45,30 @@ def test_linear_equations_are_solved_in_twice_as_many_steps_as_unknowns(size):
     x, last = jnp.zeros(size), jnp.zeros(size)
     for _ in range(2 * size + 1):
         change = solver.solve(right - matrix @ x)
-        solver, change = learnt(solver, last, change, jnp.ones(size), jnp.any(last != 0))
+        solver, change, _ = learnt(solver, last, change, jnp.ones(size), jnp.any(last != 0))
         x, last = x + change, change
     np.testing.assert_allclose(matrix @ x, right, atol=1e-13)
+
+
+@pytest.mark.parametrize("size", [1, 3, 6])
+def test_what_is_known_saves_half_of_them(size):
+    """Could go wrong: an update that spoils what was learnt before."""
+    matrix, right, solver = linear_problem(size, 0.1)
+    weights = jnp.arange(1.0, size + 1.0)
+    x, last, news = (jnp.zeros(size),) * 3
+    known, steps = jnp.zeros((size, size)), []
+    for k in range(size + 1):
+        change = solver.solve(right - matrix @ x)
+        solver, change, told = learnt(solver, last, change, weights, jnp.array(k > 0), news)
+        assert bool(told) == (k > 0)
+        known = jnp.concatenate([news[None], known[:-1]]) if told else known
+        for step in steps:
+            np.testing.assert_allclose(solver.solve(matrix @ step), step, rtol=1e-8, atol=1e-12)
+        news = across(known, change, weights)
+        np.testing.assert_allclose(known @ (weights * news), 0.0, atol=1e-12)
+        x, last = x + change, change
+        steps.append(change)
+    np.testing.assert_allclose(matrix @ x, right, atol=1e-12)
 
 
 @pytest.mark.parametrize("case", ["not told", "nothing done", "undone", "not finite"])
@@ -55,7 +76,8 @@ def test_nothing_is_learnt_from_what_tells_nothing(case):
     _, right, solver = linear_problem(3, 0.1)
     last = right * (case != "nothing done")
     change = {"undone": -2.0 * FORESEEN * right, "not finite": right * jnp.nan}.get(case, 0.1 * right)
-    same, following = learnt(solver, last, change, jnp.ones(3), jnp.array(case != "not told"))
+    same, following, told = learnt(solver, last, change, jnp.ones(3), jnp.array(case != "not told"))
+    assert not told
     np.testing.assert_array_equal(same.inverse, solver.inverse)
     np.testing.assert_array_equal(following, change)
 

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from natcoord_jax.linsolve.learning import SPEED, learns, learnt
+from natcoord_jax.linsolve.learning import MEMORY, SPEED, across, learns, learnt
 from natcoord_jax.stepping.factors import Factors
 from natcoord_jax.stepping.newton import SLOWEST_UNSEEN
 
@@ -42,7 +42,11 @@ class Correcting(eqx.Module):
 
     Attributes:
         change: last correction with these factors.
-        correction: its size (energy norm).
+        news: the part of it that is across those before it, of which the factors have learnt. What they make
+            of the others is known: equations are linear here. Only of this part an error remains.
+        known: the same of corrections of which the factors have learnt, if they are of that kind; the last
+            one first.
+        correction: size of the news (energy norm).
         count: corrections with these factors.
         rounds: factorisations for this system.
         done: whether it is solved.
@@ -52,6 +56,8 @@ class Correcting(eqx.Module):
     """
 
     change: Float[Array, " unknowns"]
+    news: Float[Array, " unknowns"]
+    known: Float[Array, "corrections unknowns"]
     correction: Float[Array, ""]
     count: Int[Array, ""]
     rounds: Int[Array, ""]
@@ -61,10 +67,16 @@ class Correcting(eqx.Module):
     last: Bool[Array, ""]
 
     @classmethod
-    def first(cls, accepted: Bool[Array, ""], lam: Float[Array, " unknowns"]) -> "Correcting":
+    def first(
+        cls, accepted: Bool[Array, ""], lam: Float[Array, " unknowns"], factors: Factors
+    ) -> "Correcting":
         """Before the first correction; there is nothing to do for an attempt that failed."""
+        memory = min(MEMORY, lam.size) if learns(factors.solver) else 0
         nought, no = jnp.array(0), jnp.array(False)
-        return cls(jnp.zeros_like(lam), jnp.zeros((), lam.dtype), nought, nought, ~accepted, no, no, no)
+        nothing = jnp.zeros_like(lam)
+        known = jnp.zeros((memory, *lam.shape), lam.dtype)
+        size = jnp.zeros((), lam.dtype)
+        return cls(nothing, nothing, known, size, nought, nought, ~accepted, no, no, no)
 
     @property
     def open(self) -> Bool[Array, ""]:
@@ -78,11 +90,11 @@ class Correcting(eqx.Module):
 
     def refreshed(self) -> "Correcting":
         """With new factors."""
-        nought = jnp.zeros_like(self.count)
+        nought, no = jnp.zeros_like(self.count), jnp.zeros_like(self.last)
         return eqx.tree_at(
-            lambda c: (c.count, c.rounds, c.wanting, c.last),
+            lambda c: (c.known, c.count, c.rounds, c.wanting, c.last),
             self,
-            (nought, self.rounds + 1, jnp.zeros_like(self.wanting), jnp.zeros_like(self.last)),
+            (jnp.zeros_like(self.known), nought, self.rounds + 1, no, no),
         )
 
     def judged(
@@ -112,17 +124,20 @@ class Correcting(eqx.Module):
         change = solver.solve(residual)
         size = _size(lam, weights)
         allowed = jnp.maximum(CLOSE * size, ROUND_OFF * whole)
+        known, news = self.known, change
         if learns(solver):  # Others would only be transposed twice.
             telling = self.going & (self.count > 0) & (self.correction > allowed)
-            solver, change = learnt(solver, self.change, change, weights, telling)
+            solver, change, telling = learnt(solver, self.change, change, weights, telling, self.news)
             factors = eqx.tree_at(lambda f: f.solver, factors, solver.transpose())
-        correction = _size(change, weights)
+            known = jnp.where(telling, jnp.concatenate([self.news[None], known[:-1]]), known)
+            news = across(known, change, weights)
+        correction, entire = _size(news, weights), _size(change, weights)
         ratio = correction / jnp.where(self.correction > 0, self.correction, 1.0)
         first = self.count == 0
         finite = jnp.isfinite(correction) & jnp.isfinite(size)
         floor = jnp.maximum(STALL * size, STALL_ROUND_OFF * whole)
-        stalled = ~first & (ratio > 0.5) & (correction <= floor)
-        within = correction <= jnp.where(self.last, SURPRISE, 1.0) * allowed
+        stalled = ~first & (ratio > 0.5) & (entire <= floor)
+        within = entire <= jnp.where(self.last, SURPRISE, 1.0) * allowed
         done = (within | stalled) & finite & factors.usable
         trusted = jnp.maximum(ratio, SLOWEST_UNSEEN)
         following = correction * trusted / jnp.maximum(1.0 - trusted, 1e-3)
@@ -132,7 +147,8 @@ class Correcting(eqx.Module):
         slow = (~first & ((ratio > 0.5) | late)) | (self.count >= CORRECTIONS) | ~finite | ~factors.usable
         slow = slow & ~done
         moving = ~slow & (foreseen | ~done)
-        found = Correcting(change, correction, self.count + 1, self.rounds, done, slow, moving, last)
+        count = self.count + 1
+        found = Correcting(change, news, known, correction, count, self.rounds, done, slow, moving, last)
         stay = eqx.tree_at(lambda c: c.moving, self, jnp.zeros_like(self.moving))
         return jax.tree.map(partial(jnp.where, ~self.going), stay, found), factors
 

@@ -165,7 +165,7 @@ class Rule:
             varied_bar=jax.tree.map(jnp.zeros_like, numbers.varied),
             pasts=(Past.of(jnp.zeros_like(y)),) * self.stride,
             lam=jnp.zeros_like(y),
-            at=Correcting.first(slots.accepted[-1], y),
+            at=Correcting.first(slots.accepted[-1], y, record.factors),
             factors=record.factors,
             stuck=jnp.array(False),
         )
@@ -198,7 +198,8 @@ class Rule:
             )
             guess = pasts[0].guess
             guess = jnp.where(jnp.all(jnp.isfinite(guess)), guess, 0.0)
-            following = Correcting.first(row(slots.accepted, jnp.maximum(here - 1, 0)), lam)
+            coming = row(slots.accepted, jnp.maximum(here - 1, 0))
+            following = Correcting.first(coming, lam, factors)
             done = Returning(c.left - 1, before_bar, varied_bar, pasts, guess, following, factors, stuck)
             waiting = replace_fields(c, lam=lam, at=at, factors=factors, stuck=stuck)
             return jax.tree.map(partial(jnp.where, stuck), waiting, done), u_bar

@@ -193,7 +193,7 @@ def judge(
     change = factors.solver.solve(residual)
     near = (it.error > LEARNING) & (it.error < NEAR)
     telling = ~done & (it.count > 0) & ~jnp.asarray(jumped) & near
-    solver, change = learnt(factors.solver, it.change, change, factors.inertias, telling)
+    solver, change, _ = learnt(factors.solver, it.change, change, factors.inertias, telling)
     factors = eqx.tree_at(lambda f: f.solver, factors, solver)
     energies = factors.inertias * change**2
     if balances:
