@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from natcoord_jax.assembly.equations import prepare
-from natcoord_jax.assembly.lag import FEWEST, Lagging, from_body_axes, in_body_axes
+from natcoord_jax.assembly.lag import FEWEST, Lag, Lagging, from_body_axes, in_body_axes
 from natcoord_jax.assembly.outset import Outset
 from natcoord_jax.assembly.system import System
 from natcoord_jax.assembly.tangent_space import Velocity
@@ -16,7 +16,7 @@ from natcoord_jax.core.results import Result
 from natcoord_jax.core.state import State
 from natcoord_jax.stepping.error_control import Tolerance, Trial, Verdict, follow
 from natcoord_jax.stepping.factors import Factors, no_factors
-from natcoord_jax.stepping.newton import Iterate, begin
+from natcoord_jax.stepping.newton import Iterate, any_lane, begin
 from natcoord_jax.stepping.past import Past
 from natcoord_jax.stepping.plan import Plan
 
@@ -104,6 +104,17 @@ class Setting(eqx.Module):
         if self.tolerance is None:
             return over
         return over | (course.taken >= self.plan.steps + self.plan.extra)
+
+    def lag(self, course: Course) -> Lag | None:
+        """What the evaluation of the equations is told of the kick, if there is any."""
+        lagging, it, over = course.lagging, course.it, self.over(course)
+        if lagging is None:
+            return None
+        going = it.unsolved & ~over
+        # Lanes that are done wait for the others; the last evaluation has the kicks of all.
+        wanted = any_lane(lagging.wanted(it) & going) | ~any_lane(going)
+        closed = (lagging.closed > 0) & ~over
+        return Lag(lagging.held, wanted, closed, jnp.zeros_like(closed))
 
     def situation(self, course: Course) -> tuple[Array, Array, Array]:
         """Inputs, length and number of the (sub)step at hand."""

@@ -12,16 +12,16 @@ from jaxtyping import Array, Bool, Float, Int
 
 from natcoord_jax.assembly.equations import prepare, starting
 from natcoord_jax.assembly.kick import Kick
-from natcoord_jax.assembly.lag import Lag
 from natcoord_jax.assembly.outset import Outset
-from natcoord_jax.assembly.response import Evaluation
 from natcoord_jax.assembly.tangent_space import driven
+from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.rows import row, with_row
 from natcoord_jax.stepping.course import Course, Setting, after_attempt
-from natcoord_jax.stepping.factors import Factors, factors_of, new_factors
+from natcoord_jax.stepping.differences import evaluated, told
+from natcoord_jax.stepping.factors import Factors, factors_of
 from natcoord_jax.stepping.newton import Iterate, any_lane, judge, refreshed
-from natcoord_jax.stepping.probe import Probe, matrix_of
+from natcoord_jax.stepping.probe import Probe
 from natcoord_jax.stepping.remainder import remainder, with_remainder
 from natcoord_jax.stepping.step import end_of_step
 from natcoord_jax.stepping.watch import sound
@@ -80,16 +80,14 @@ def trip(setting: Setting, unpack: Callable[[Array], State], apart: bool, carrie
     course = with_state(carried.course, unpack(carried.state))
     it, over = course.it, setting.over(course)
     u, h, index = setting.situation(course)
-    lag, lagging = lag_of(course, over), course.lagging
-    outset = eqx.tree_at(lambda o: o.lag, carried.outset, lag, is_leaf=_is_none)
+    lag, lagging = setting.lag(course), course.lagging
+    outset = replace_fields(carried.outset, lag=lag)
     equations = prepare(setting.system, course.state, u, h, plan.tableau, outset)
     if probe is None:
         found = equations.evaluate(it.y)
     else:
-        lag = _in_probe(lag, probe.making, jnp.array(True), jnp.array(True))
-        probe = probe.evaluated(equations, it.y, partial(_evaluated, equations, probe.making))
-        found = probe.found.with_system(setting.system)
-        it, factors = _renewed_by(equations, probe, it, factors)
+        lag = told(lag, probe.making)
+        probe, found, it, factors = evaluated(setting, equations, probe, it, factors)
     residual = with_remainder(equations, found.residual, course.left)
     cost, options = _judging(equations, it, probe)
     if lag is not None and lagging is not None:
@@ -130,7 +128,7 @@ def trip(setting: Setting, unpack: Callable[[Array], State], apart: bool, carrie
     # Loops of no or one trip leave what they carry where it is; a conditional would copy it.
     start = (
         ending,
-        eqx.tree_at(lambda c: (c.it, c.lagging), carried.course, (it, lagging), is_leaf=_is_none),
+        replace_fields(carried.course, it=it, lagging=lagging),
         carried.state,
         carried.outset,
         carried.record,
@@ -168,7 +166,7 @@ def trip(setting: Setting, unpack: Callable[[Array], State], apart: bool, carrie
     if probe is not None:
         return carried
     if apart:
-        return eqx.tree_at(lambda c: c.asked, carried, asked, is_leaf=_is_none)
+        return replace_fields(carried, asked=asked)
 
     def renewed(carry: tuple) -> tuple:
         _, it, factors = carry
@@ -176,81 +174,6 @@ def trip(setting: Setting, unpack: Callable[[Array], State], apart: bool, carrie
 
     _, it, factors = jax.lax.while_loop(lambda carry: carry[0], renewed, (wanting, after.it, factors))
     return eqx.tree_at(lambda c: (c.course.it, c.factors), carried, (it, factors))
-
-
-def first_probe(setting: Setting, course: Course, outset: Outset) -> Probe:
-    """What Jacobians by differences are formed with, before the first."""
-    u, h, _ = setting.situation(course)
-    lag = lag_of(course, setting.over(course))
-    near = eqx.tree_at(lambda o: o.lag, outset, lag, is_leaf=_is_none)
-    equations = prepare(setting.system, course.state, u, h, setting.plan.tableau, near)
-    return Probe.first(
-        equations, jax.eval_shape(lambda y: equations.evaluate(y).without_system(), course.it.y)
-    )
-
-
-def lag_of(course: Course, over: Array) -> Lag | None:
-    """What the evaluation of the equations is told of the kick, if there is any.
-
-    Args:
-        course: where the rollout stands.
-        over: whether it has ended.
-    """
-    lagging, it = course.lagging, course.it
-    if lagging is None:
-        return None
-    going = it.unsolved & ~over
-    # Lanes that are done wait for the others; the last evaluation has the kicks of all.
-    wanted = any_lane(lagging.wanted(it) & going) | ~any_lane(going)
-    closed = (lagging.closed > 0) & ~over
-    return Lag(lagging.held, wanted, closed, jnp.zeros_like(closed))
-
-
-def _in_probe(lag: Lag | None, making: Array, at_end: Array, moving: Array) -> Lag | None:
-    """What an evaluation is told of the kick where it may be one of those that a Jacobian asks for.
-
-    In these kicks are held, or found anew where they are in every evaluation; multipliers do not change them.
-
-    Args:
-        lag: what it is told otherwise.
-        making: whether a Jacobian is being formed.
-        at_end: whether this is the last of its evaluations, that of the residual itself.
-        moving: whether rates are others in it.
-    """
-    if lag is None:
-        return None
-    due = jnp.where(making, (at_end | moving) & any_lane(lag.everywhere), lag.due)
-    return Lag(lag.held, due, lag.everywhere, making & ~lag.everywhere)
-
-
-def _evaluated(equations: Any, making: Array, y: Array, at_end: Array, moving: Array) -> Evaluation:
-    """The equations at unknowns of the probe."""
-    lag = _in_probe(equations.outset.lag, making, at_end, moving)
-    near = eqx.tree_at(lambda e: e.outset.lag, equations, lag, is_leaf=_is_none)
-    return near.evaluate(y).without_system()
-
-
-def _renewed_by(equations: Any, probe: Probe, it: Iterate, factors: Factors) -> tuple[Iterate, Factors]:
-    """New factors where a Jacobian has been formed by differences, and the iteration with them."""
-
-    def whole(columns: Array) -> tuple:
-        return equations.factorised(matrix_of(equations, columns))
-
-    def alike(columns: Array) -> tuple:
-        return equations.factorised_alike(columns[: equations.stage_places.shape[1]])
-
-    def renewed(carry: tuple) -> tuple:
-        _, it, factors = carry
-        columns = probe.columns(equations, it.y)
-        if equations.tableau.stages == 1:
-            made = whole(columns)
-        else:
-            made = jax.lax.cond(probe.alike, alike, whole, columns)
-        return jnp.array(False), refreshed(it), new_factors(made, factors.noise)
-
-    # A loop of no or one trip, as at the end of a step.
-    _, it, factors = jax.lax.while_loop(lambda carry: carry[0], renewed, (probe.making, it, factors))
-    return it, factors
 
 
 def _judging(equations: Any, it: Iterate, probe: Probe | None) -> tuple[int, dict[str, Any]]:
@@ -295,10 +218,6 @@ def _taken_back(record: tuple, index: Array, undone: Array, x: Array) -> tuple:
     return states, *others, accepted, finished
 
 
-def _is_none(x: Any) -> bool:
-    return x is None
-
-
 def with_state(course: Course, state: State | None) -> Course:
     """The course with another state, or without."""
-    return eqx.tree_at(lambda c: c.state, course, state, is_leaf=_is_none)
+    return replace_fields(course, state=state)
