@@ -15,7 +15,7 @@ from natcoord_jax.assembly.rates import row_rates
 from natcoord_jax.assembly.system import System
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
-from natcoord_jax.maths.elimination import definite_inverse, inverse_cholesky
+from natcoord_jax.maths.elimination import definite_solution, inverse_cholesky
 from natcoord_jax.maths.projectors import pseudo_inverse, range_projector
 
 POLISHING = 9
@@ -219,7 +219,7 @@ def isometric(
 ) -> tuple[Float[Array, " u"], Float[Array, " u"]]:
     """U and b_1 - 2 u - K^T u, see `kick`."""
     matrix = jnp.eye(b0.shape[0], dtype=b0.dtype) + 2.0 * cosines + cosines @ cosines.T
-    u = definite_inverse(matrix) @ (cosines @ b1 - b0)
+    u = definite_solution(matrix, cosines @ b1 - b0)
     return u, b1 - 2.0 * u - cosines.T @ u
 
 

@@ -12,8 +12,12 @@ BLOCK = 32
 """Columns that are eliminated together in a large matrix."""
 
 
+@jax.custom_jvp
 def definite_inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """Inverse of a matrix whose symmetric part is positive definite, or of a quasi-definite one."""
+    """Inverse of a matrix whose symmetric part is positive definite, or of a quasi-definite one.
+
+    Derivatives are those of the inverse, not of the elimination: its loop would have to be kept turn by turn.
+    """
     size = matrix.shape[-1]
     if size > LOOPED:
         return jnp.linalg.inv(matrix)
@@ -30,8 +34,37 @@ def definite_inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
     return jax.lax.fori_loop(0, size, eliminate, matrix)
 
 
+@definite_inverse.defjvp
+def _definite_inverse_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    (matrix,), (change,) = primals, tangents
+    inverse = definite_inverse(matrix)
+    return inverse, -inverse @ change @ inverse
+
+
+@jax.custom_jvp
+def definite_solution(matrix: Float[Array, "n n"], right: Float[Array, " n"]) -> Float[Array, " n"]:
+    """Solution of equations with such a matrix."""
+    return definite_inverse(matrix) @ right
+
+
+@definite_solution.defjvp
+def _definite_solution_jvp(
+    primals: tuple[Array, Array], tangents: tuple[Array, Array]
+) -> tuple[Array, Array]:
+    (matrix, right), (matrix_dot, right_dot) = primals, tangents
+    inverse = definite_inverse(matrix)
+    found = inverse @ right
+    return found, inverse @ (right_dot - matrix_dot @ found)
+
+
+@jax.custom_jvp
 def inverse_cholesky(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """Lower triangular X with X A X^T = 1, for a symmetric positive definite A."""
+    """Lower triangular X with X A X^T = 1, for a symmetric positive definite A.
+
+    Derivatives, as above, are closed formulas: dX = -F X with the lower half F of X dA X^T, its diagonal
+    halved (S. P. Smith, Differentiation of the Cholesky algorithm, J. Comput. Graph. Stat. 4 (1995) 134-147,
+    after L = X^-1).
+    """
     size = matrix.shape[-1]
     unit = jnp.eye(size, dtype=matrix.dtype)
     if size > LOOPED:
@@ -44,6 +77,15 @@ def inverse_cholesky(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
         return jnp.where((number == k)[:, None], row[None, :], both - column[:, None] * row[None, :])
 
     return jax.lax.fori_loop(0, size, eliminate, jnp.concatenate([matrix, unit], axis=1))[:, size:]
+
+
+@inverse_cholesky.defjvp
+def _inverse_cholesky_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    (matrix,), (change,) = primals, tangents
+    factor = inverse_cholesky(matrix)
+    number = jnp.arange(matrix.shape[-1])
+    share = jnp.where(number[:, None] > number, 1.0, jnp.where(number[:, None] == number, 0.5, 0.0))
+    return factor, -(share * (factor @ change @ factor.T)) @ factor
 
 
 def pivoted_inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
