@@ -6,8 +6,9 @@ equations are, once for every slot (implicit function theorem). Substep fraction
 Forward, all Jacobians are formed at once, vmapped over the slots, and only the recursion from state to state
 is a scan. Backward, a loop goes from the last slot to the first; each transposed system is solved by
 corrections with factors carried from slot to slot, as the step itself is, and nothing is stored but the
-states. Recorded outputs are differentiated by the same rule, so second derivatives (forward over reverse,
-forward over forward) are exact.
+states. What the constraints admit at the end of one step is what they admit at the start of the next: its
+cotangent is carried along with that of the state, and it is differentiated once a step. Recorded outputs are
+differentiated by the same rule, so second derivatives (forward over reverse, forward over forward) are exact.
 """
 
 from collections.abc import Callable
@@ -21,6 +22,7 @@ from jaxtyping import Array
 
 from natcoord_jax.assembly.equations import kind_of, prepare
 from natcoord_jax.assembly.momentum import row_weights
+from natcoord_jax.assembly.separate import Tangents, tangents_at
 from natcoord_jax.assembly.system import System
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
@@ -37,7 +39,7 @@ from natcoord_jax.stepping.plan import Plan, Slots
 from natcoord_jax.stepping.probe import jacobian_by_differences
 from natcoord_jax.stepping.record import Numbers, Record, Returning, Slot, instantiated, zero_tangent
 from natcoord_jax.stepping.rollout import Ending, run
-from natcoord_jax.stepping.step import advance, linear_solver
+from natcoord_jax.stepping.step import advance, advance_between, linear_solver
 
 CHUNK = 32
 """Slots whose Jacobians are formed together."""
@@ -158,10 +160,11 @@ class Rule:
             update = partial(jax.lax.dynamic_update_slice_in_dim, start_index=first, axis=0)
             return c, jax.tree.map(update, u_bar, part)
 
-        y = slots.y[-1]
+        y, before_all = slots.y[-1], jax.tree.map(lambda x: x[0], slots.before)
         start = Returning(
             left=jnp.array(count),
-            state_bar=jax.tree.map(lambda x: jnp.zeros_like(x[0]), slots.before),
+            state_bar=jax.tree.map(jnp.zeros_like, before_all),
+            tangents_bar=self._no_change(numbers, before_all),
             varied_bar=jax.tree.map(jnp.zeros_like, numbers.varied),
             pasts=(Past.of(jnp.zeros_like(y)),) * self.stride,
             lam=jnp.zeros_like(y),
@@ -171,7 +174,25 @@ class Rule:
         )
         u_bar = jax.tree.map(jnp.zeros_like, slots.u)
         c, u_bar = jax.lax.while_loop(lambda carry: carry[0].left > 0, round_of, (start, u_bar))
-        return c.varied_bar, u_bar, c.state_bar
+        if c.tangents_bar is None:
+            return c.varied_bar, u_bar, c.state_bar
+        varied_bar, state_bar = kernel(self._before_all, numbers, before_all, c)
+        return varied_bar, u_bar, state_bar
+
+    def _tangents(self, numbers: Numbers, varied: list[Array], state: State) -> Tangents | None:
+        """What the constraints admit in a state, for schemes that ask for it."""
+        if not self.tableau.kick:
+            return None
+        return tangents_at(numbers.whole(varied)[0], state).without_system()
+
+    def _no_change(self, numbers: Numbers, state: State) -> Tangents | None:
+        shapes = jax.eval_shape(partial(self._tangents, numbers, numbers.varied), state)
+        return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+
+    def _before_all(self, numbers: Numbers, state: State, c: "Returning") -> tuple[list[Array], State]:
+        """Cotangents of what varies and of the first state, with those of the tangent space there."""
+        _, pull = jax.vjp(partial(self._tangents, numbers), numbers.varied, state)
+        return jax.tree.map(jnp.add, (c.varied_bar, c.state_bar), pull(c.tangents_bar))
 
     def _several(
         self, numbers: Numbers, first: Array, slots: Slot, given: tuple, u_bar: Any, c: "Returning"
@@ -186,11 +207,12 @@ class Rule:
             bars, lam, at, factors = self._pulled(numbers, slot, end_bar, y_bar, c)
             stuck = any_lane(at.open & at.wanting)
             lost = slot.accepted & ~at.done
-            more, before_bar, found = jax.tree.map(lambda x: jnp.where(lost, jnp.nan, x), bars)
+            more, before_bar, tangents_bar, found = jax.tree.map(lambda x: jnp.where(lost, jnp.nan, x), bars)
             keep = partial(jnp.where, slot.accepted)
             own, *others = c.pasts
             pasts = jax.tree.map(keep, (*others, own.followed_by(lam, factors.inertias)), c.pasts)
             before_bar = jax.tree.map(keep, before_bar, end_bar)
+            tangents_bar = jax.tree.map(keep, tangents_bar, c.tangents_bar)
             varied_bar = jax.tree.map(lambda total, x: keep(total + x, total), c.varied_bar, more)
             # Of a slot that waits for factors nothing counts yet; this row is written again.
             u_bar = jax.tree.map(
@@ -200,7 +222,9 @@ class Rule:
             guess = jnp.where(jnp.all(jnp.isfinite(guess)), guess, 0.0)
             coming = row(slots.accepted, jnp.maximum(here - 1, 0))
             following = Correcting.first(coming, lam, factors)
-            done = Returning(c.left - 1, before_bar, varied_bar, pasts, guess, following, factors, stuck)
+            done = Returning(
+                c.left - 1, before_bar, tangents_bar, varied_bar, pasts, guess, following, factors, stuck
+            )
             waiting = replace_fields(c, lam=lam, at=at, factors=factors, stuck=stuck)
             return jax.tree.map(partial(jnp.where, stuck), waiting, done), u_bar
 
@@ -215,8 +239,8 @@ class Rule:
         extrapolated from those of the slots after it, or of every other one.
 
         Returns:
-            Cotangents of what varies, of the state before the slot and of its inputs; the multipliers, where
-            their solution stands, and the factors.
+            Cotangents of what varies, of the state before the slot and the tangent space there, and of its
+            inputs; the multipliers, where their solution stands, and the factors.
         """
         system, _, dt = numbers.whole(numbers.varied)
         patience = kind_of(system, self.tableau).renewal
@@ -225,7 +249,9 @@ class Rule:
         # With one stage it saves time to pull back only what the corrections ask for; with more of them the
         # program grows too large for one kernel, which costs more than that.
         once = self.tableau.stages > 1
-        nothing = jax.tree.map(jnp.zeros_like, (numbers.varied, slot.before, slot.u))
+        tangents = self._tangents(numbers, numbers.varied, slot.before)
+        given = numbers.varied, slot.before, tangents, slot.u
+        nothing = jax.tree.map(jnp.zeros_like, given)
 
         def changing(factors: Factors) -> Any:
             """What of the factors the corrections change."""
@@ -234,21 +260,24 @@ class Rule:
         def with_solver(learnt: Any) -> Factors:
             return c.factors if learnt is None else eqx.tree_at(lambda f: f.solver, c.factors, learnt)
 
-        _, pull = jax.vjp(
-            lambda varied, state, u, y: self.outcome(numbers, varied, slot, state, u, y),
-            numbers.varied, slot.before, slot.u, slot.y,
-        )  # fmt: skip
+        def outcome(varied: list[Array], state: State, tangents: Tangents | None, u: Any, y: Array) -> tuple:
+            system, parameters, dt = numbers.whole(varied)
+            u = self._inputs(parameters, slot, state) if u is None else u
+            return advance_between(system, state, tangents, u, slot.fraction * dt, y, self.tableau)
+
+        _, pull = jax.vjp(outcome, *given, slot.y)
+        end_bars = end_bar, c.tangents_bar
 
         def trip(carry: tuple) -> tuple:
             _, learnt, lam, at = carry
-            *bars, gap = pull((lam, end_bar))
+            *bars, gap = pull((lam, *end_bars))
             at, known = at.judged(with_solver(learnt), lam, gap + y_bar, patience, whole, not once)
             lam = jnp.where(at.moving, lam - at.change, lam)
             return tuple(bars) if once else None, changing(known), lam, at
 
         start = nothing if once else None, changing(c.factors), c.lam, c.at
         bars, learnt, lam, at = jax.lax.while_loop(lambda carry: any_lane(carry[-1].going), trip, start)
-        found: Any = bars if once else tuple(pull((lam, end_bar))[:-1])
+        found: Any = bars if once else tuple(pull((lam, *end_bars))[:-1])
         return found, lam, at, with_solver(learnt)
 
     def _renewed(self, numbers: Numbers, slot: Slot) -> Factors:

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from natcoord_jax.assembly.separate import Tangents
 from natcoord_jax.assembly.system import System
 from natcoord_jax.core.state import State
 from natcoord_jax.stepping.correcting import Correcting
@@ -91,6 +92,7 @@ class Returning(eqx.Module):
     Attributes:
         left: slots that are not done.
         state_bar: cotangent of the state after the last of them, but for its own.
+        tangents_bar: of the tangent space there, for schemes with kicks.
         varied_bar: of what varies, so far.
         pasts: multipliers of the slots that are done, dealt out in turn; the first guesses the next.
         lam: of the last one that is not.
@@ -101,6 +103,7 @@ class Returning(eqx.Module):
 
     left: Int[Array, ""]
     state_bar: State
+    tangents_bar: Tangents | None
     varied_bar: list[Array]
     pasts: tuple[Past, ...]
     lam: Float[Array, " unknowns"]

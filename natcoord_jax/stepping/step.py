@@ -11,8 +11,10 @@ from natcoord_jax.assembly.coordinates import stage_rates
 from natcoord_jax.assembly.end_impulses import released
 from natcoord_jax.assembly.equations import prepare, starting
 from natcoord_jax.assembly.form import dense_solver
-from natcoord_jax.assembly.kick import ends_of
+from natcoord_jax.assembly.kick import Kick, ends_of
+from natcoord_jax.assembly.outset import Outset
 from natcoord_jax.assembly.response import Evaluation
+from natcoord_jax.assembly.separate import Tangents
 from natcoord_jax.assembly.system import Group, System
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import Tableau
@@ -26,11 +28,36 @@ def advance(
     Differentiable in everything. The half turn |h omega / 2| of a body is the tangent of half the angle it
     turned: it grows without bound towards half a turn a step, the pole of Cayley's rotation.
     """
-    outset = starting(system, state, tableau, later=True)
+    return _advanced(system, state, starting(system, state, tableau, later=True), u, h, y, tableau)[:3]
+
+
+def advance_between(
+    system: System,
+    state: State,
+    tangents: Tangents | None,
+    u: Array,
+    h: Array,
+    y: Float[Array, " unknowns"],
+    tableau: Tableau,
+) -> tuple[Float[Array, " unknowns"], State, Tangents | None]:
+    """Residual of the step's equations at `y`, the state at its end, and the tangent space there.
+
+    The tangent space at the start is given, so that a chain of steps is a function of every one of them once;
+    without a system in it, as it is carried along. None for schemes without kicks.
+    """
+    outset = starting(system, state, tableau, tangents, later=tangents is None)
+    residual, after, _, kick = _advanced(system, state, outset, u, h, y, tableau)
+    return residual, after, None if kick is None else kick.after.without_system()
+
+
+def _advanced(
+    system: System, state: State, outset: Outset, u: Array, h: Array, y: Array, tableau: Tableau
+) -> tuple[Array, State, Array, Kick | None]:
+    """Residual, state at the end, largest half turn, and the kick."""
     equations = prepare(system, state, u, h, tableau, outset)
     found = equations.evaluate(y)
     after, half_turn = end_of_step(system, state, h, equations.groups, found, tableau)
-    return found.residual, after, half_turn
+    return found.residual, after, half_turn, found.kick
 
 
 def end_of_step(
