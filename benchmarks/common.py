@@ -92,16 +92,49 @@ def timed(
     Returns:
         us_per_step (the median), us_per_step_range, repeats, and compile_s: the first call less the median.
     """
-    first = seconds(call, clock)
-    call()
-    times = [seconds(call, clock) for _ in range(repeats)]
-    median = statistics.median(times)
-    return {
-        "us_per_step": 1e6 * median / count,
-        "us_per_step_range": [1e6 * min(times) / count, 1e6 * max(times) / count],
-        "repeats": repeats,
-        "compile_s": first - median,
-    }
+    (timing,) = timed_in_turn((call,), count, repeats, clock)
+    del timing["over_first"]
+    return timing
+
+
+def timed_in_turn(
+    calls: Sequence[Callable[[], object]],
+    count: int,
+    repeats: int,
+    clock: Callable[[], float] = time.perf_counter,
+) -> list[dict[str, Any]]:
+    """Times of compiled programs that are to be compared, called one after the other, again and again.
+
+    What slows the machine for a while then slows all of them, and leaves the ratios what they are.
+
+    Args:
+        calls: each runs a program and waits for its end.
+        count: number of steps (or of steps times lanes) of one call.
+        repeats: number of rounds, after the first calls, which compile, and one more of each.
+        clock: see `timed`.
+
+    Returns:
+        by call what `timed` returns, and over_first: the median of its time over that of the first call in
+        the same round.
+    """
+    first = [seconds(call, clock) for call in calls]
+    for call in calls:
+        call()
+    rounds = [[seconds(call, clock) for call in calls] for _ in range(repeats)]
+    found = []
+    for k, compiling in enumerate(first):
+        times = [times[k] for times in rounds]
+        median = statistics.median(times)
+        found.append(
+            {
+                "us_per_step": 1e6 * median / count,
+                "us_per_step_range": [1e6 * min(times) / count, 1e6 * max(times) / count],
+                "repeats": repeats,
+                "compile_s": compiling - median,
+                "over_first": statistics.median(times[k] / times[0] for times in rounds),
+            }
+        )
+    return found
 
 
 def target(name: str, measured: float | None, limit: float, unit: str = "") -> dict[str, Any]:

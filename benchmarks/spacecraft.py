@@ -183,7 +183,8 @@ def own_gradient(
 ) -> dict[str, Any]:
     """Value and gradient of the summed squares of the final velocities, over the value alone."""
     value, both, count = _rollout(example, steps, order).loss(part)
-    forward, backward = (common.timed(call, steps, repeats) for call in (value, both))
+    forward, backward = common.timed_in_turn((value, both), steps, repeats)
+    over_forward = backward.pop("over_first")
     _, gradient = both()
     return {
         "code": OWN,
@@ -193,7 +194,7 @@ def own_gradient(
         **backward,
         "forward_us_per_step": forward["us_per_step"],
         "forward_compile_s": forward["compile_s"],
-        "over_forward": backward["us_per_step"] / forward["us_per_step"],
+        "over_forward": over_forward,
         "finite": all(bool(np.all(np.isfinite(leaf))) for leaf in gradient),
     }
 

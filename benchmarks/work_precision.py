@@ -59,6 +59,8 @@ GRADIENTS = {
 GRADIENT_STEPS = 200
 """Scenes and orders that value and gradient are timed for, and the number of their steps, of the length that
 the gallery suggests: a run that fails, or hardly converges, would flatter its gradient."""
+GRADIENT_ROUNDS = 5
+"""Rounds of both, as a multiple of the repeats of a plan: a ratio of two times asks for more of them."""
 ERRORS = (1e-2, 1e-3, 1e-4, 1e-6, 1e-8)
 PEERS = (
     Peer("MuJoCo RK4", "mujoco_models", "mujoco", {"integrator": "RK4"}),
@@ -202,7 +204,8 @@ def own_gradients(model: str, repeats: int) -> list[dict[str, Any]]:
     for order in GRADIENTS.get(model, ()):
         example = replace(scene_of(model), steps=GRADIENT_STEPS)
         check_run(example, order)
-        found.append({"order": order} | beside.own_gradient(example, "state", GRADIENT_STEPS, repeats, order))
+        rounds = GRADIENT_ROUNDS * repeats
+        found.append({"order": order} | beside.own_gradient(example, "state", GRADIENT_STEPS, rounds, order))
         print(f"{model}: gradient at order {order}: {found[-1]['over_forward']:.2f}", flush=True)
     return found
 
