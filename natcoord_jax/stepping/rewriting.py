@@ -16,6 +16,15 @@ from jaxtyping import Array
 PRODUCT_LIMIT = 1 << 15
 """Multiplications up to which a product of matrices is written as a sum."""
 
+SUMMED = 12
+"""Terms of the sums of a product up to which it is written as one."""
+
+PIECE = 8
+"""Terms of longer ones that are summed at a time."""
+
+TERMS = 6
+"""The same of products too large for that, whose terms are added one by one."""
+
 KNOWN = frozenset(
     "abs acos acosh add add_any and argmax argmin asin asinh atan atan2 atanh bitcast_convert_type "
     "broadcast_in_dim cbrt ceil clamp concatenate cond convert_element_type copy copy_p cos cosh "
@@ -167,6 +176,14 @@ def _product(given: list[Any], params: dict[str, Any], out: Any) -> Array | None
     free_left = [k for k in range(left.ndim) if k not in (*sum_left, *batch_left)]
     free_right = [k for k in range(right.ndim) if k not in (*sum_right, *batch_right)]
     shared, summed = len(batch_left), len(sum_left)
+    rows, columns, length = (
+        math.prod(x.shape[k] for k in axes)
+        for x, axes in ((left, free_left), (right, free_right), (left, sum_left))
+    )
+    if min(rows, columns) > 1 and (length > SUMMED or terms >= REDUCTION_LIMIT):
+        left = jnp.transpose(left, (*sum_left, *batch_left, *free_left)).reshape(length, -1, rows)
+        right = jnp.transpose(right, (*sum_right, *batch_right, *free_right)).reshape(length, -1, columns)
+        return _piece_by_piece(left, right).reshape(out.shape)
     left = jnp.transpose(left, (*batch_left, *free_left, *sum_left))
     right = jnp.transpose(right, (*batch_right, *free_right, *sum_right))
     left = jnp.expand_dims(left, range(shared + len(free_left), shared + len(free_left) + len(free_right)))
@@ -175,6 +192,38 @@ def _product(given: list[Any], params: dict[str, Any], out: Any) -> Array | None
     if terms < REDUCTION_LIMIT:
         return jnp.sum(left * right, axis=axes)
     return _reduced(jnp.add, left * right, axes)
+
+
+def _piece_by_piece(left: Array, right: Array) -> Array:
+    """Products of matrices with long sums, a few terms at a time.
+
+    A sum is worked through number by number, in its order. A short one is written out by the compiler, and
+    then runs over several columns at once.
+
+    Args:
+        left: axes of the sums, of the products, and of their rows.
+        right: the same with columns.
+    """
+    if left.shape[2] > right.shape[2]:
+        return jnp.swapaxes(_piece_by_piece(right, left), 1, 2)
+    length, count, rows = left.shape
+    columns = right.shape[2]
+    short = count * rows * columns * PIECE < REDUCTION_LIMIT
+    size = min(PIECE if short else TERMS, length)
+
+    def product(left: Array, right: Array) -> Array:
+        terms = left[:, :, :, None] * right[:, :, None, :]
+        return jnp.sum(terms, axis=0) if short else sum(jnp.unstack(terms), jnp.zeros(terms.shape[1:]))
+
+    def add(k: Array, total: Array) -> Array:
+        parts = (jax.lax.dynamic_slice_in_dim(x, k * size, size) for x in (left, right))
+        return total + product(*parts)
+
+    whole, rest = length // size, length % size
+    first = jnp.zeros((count, rows, columns), left.dtype)
+    if rest:
+        first = product(left[length - rest :], right[length - rest :])
+    return jax.lax.fori_loop(0, whole, add, first)
 
 
 def _reduced(operation: Callable, x: Array, axes: Sequence[Any]) -> Array:
