@@ -13,6 +13,8 @@ import pytest
 import natcoord_jax as nc
 from natcoord_jax import gallery
 from natcoord_jax.assembly.balances import constraint_matrix
+from natcoord_jax.assembly.momentum import inertia, spatial_inertia, wrench
+from natcoord_jax.assembly.rates import row_rates
 from natcoord_jax.assembly.reduced import NOTHING, ReducedStep, at_rest
 from natcoord_jax.assembly.separate import tangents_at
 from natcoord_jax.assembly.tangent_space import TangentSpace, _orthogonal
@@ -71,6 +73,25 @@ def test_subspaces_are_those_of_singular_vectors(scene):
         np.testing.assert_allclose(known.range, left[:, :rank] @ left[:, :rank].T, atol=1e-12)
     lift = np.asarray(known.frame).T @ np.linalg.pinv(framed, rcond=1e-9)
     np.testing.assert_allclose(known.lift, lift, atol=1e-11 * np.max(np.abs(lift)))
+
+
+def test_momenta_of_bodies_are_those_of_their_rows(scene):
+    # Also between two configurations, with a centre of mass that is not the reference point.
+    system, state = scene
+    rng = np.random.default_rng(5)
+    rows, others = (jnp.asarray(rng.normal(size=(3, 4, 3))) for _ in range(2))
+    root = rng.normal(size=(3, 4, 4))
+    mass = jnp.asarray(root @ root.swapaxes(1, 2))
+    velocity, spin = (jnp.asarray(rng.normal(size=(3, 3))) for _ in range(2))
+    moved = inertia(mass, row_rates(others, velocity, spin))
+    expected = jnp.concatenate([x[0] for x in wrench(moved[None], rows[None, :, 1:])], axis=1)
+    bodies = spatial_inertia(mass, rows[:, 1:], others[:, 1:])
+    found = jnp.einsum("bij,bj->bi", bodies, jnp.concatenate([velocity, spin], axis=1))
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+    # And so are those of the free motions of a tree.
+    space = TangentSpace.at(system, state)
+    columns = [space.pulled(space.impulse(space.spread(unit))) for unit in jnp.eye(space.turning.shape[0])]
+    np.testing.assert_allclose(space.inertia, jnp.stack(columns, axis=1), atol=1e-13)
 
 
 def test_velocities_of_drives_are_those_prescribed():

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from natcoord_jax.assembly.response import Situation, Stations, collect, gather, respond
 from natcoord_jax.assembly.system import Group, System
 from natcoord_jax.maths.collocation import Tableau
-from natcoord_jax.maths.vectors import cross
+from natcoord_jax.maths.vectors import cross, skew
 
 
 def inertia(
@@ -25,6 +25,36 @@ def wrench(
     """Force and torque about the reference point of forces on rows: r_phi and sum d_i x r_i (26, 31)."""
     force, pulls = jnp.split(rows, [1], axis=2)
     return force[:, :, 0], jnp.sum(cross(directors, pulls), axis=2)
+
+
+def spatial_inertia(
+    mass: Float[Array, "bodies 4 4"],
+    directors: Float[Array, "bodies 3 3"],
+    others: Float[Array, "bodies 3 3"],
+) -> Float[Array, "bodies 6 6"]:
+    """What `wrench` makes, with some directors, of the momenta of bodies that move with others.
+
+    The momenta of a body with the velocity v of its reference point and the angular velocity w, r_phi and
+    r_i of M (v, w x d_i'), are the force M_phi v + w x s' and the torque s x v + (tr S - S^T) w, with
+    s = e_i d_i and S = E_ij d_i d_j'. Of one configuration this is the inertia of the bodies about their
+    reference points.
+
+    Args:
+        mass: of the bodies.
+        directors: d_i, by which forces on rows are taken together.
+        others: d_j', with which the bodies move.
+
+    Returns:
+        Matrices from (v, w) to (force, torque).
+    """
+    first, second = mass[:, 0, 1:, None], mass[:, 1:, 1:]
+    arm, moved = jnp.sum(first * directors, axis=1), jnp.sum(first * others, axis=1)
+    products = jnp.einsum("bix,bij,bjy->bxy", directors, second, others)
+    unit = jnp.eye(3, dtype=mass.dtype)
+    turning = jnp.trace(products, axis1=1, axis2=2)[:, None, None] * unit - jnp.swapaxes(products, 1, 2)
+    force = jnp.concatenate([mass[:, 0, 0, None, None] * unit, -skew(moved)], axis=2)
+    torque = jnp.concatenate([skew(arm), turning], axis=2)
+    return jnp.concatenate([force, torque], axis=1)
 
 
 def row_weights(mass: Float[Array, "bodies 4 4"]) -> Float[Array, "bodies 4"]:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.balances import Balances
-from natcoord_jax.assembly.momentum import inertia, wrench
+from natcoord_jax.assembly.momentum import inertia, spatial_inertia, wrench
 from natcoord_jax.assembly.rates import row_rates
 from natcoord_jax.assembly.system import System
 from natcoord_jax.core.effect import replace_fields
@@ -63,7 +63,6 @@ class TangentSpace(eqx.Module):
         free: the null space P of the tree: velocities and angular velocities of the bodies per unit rate of
             each free motion.
         turning: the same of the rotors.
-        impulses: M P.
         inertias: of the rotors.
         admissible: what the constraints admit.
     """
@@ -72,7 +71,6 @@ class TangentSpace(eqx.Module):
     rows: Float[Array, "bodies 4 3"]
     free: tuple[Float[Array, "bodies u 3"], Float[Array, "bodies u 3"]]
     turning: Float[Array, "u rotors"]
-    impulses: Velocity
     inertias: Float[Array, " rotors"]
     admissible: Admissible
 
@@ -87,11 +85,12 @@ class TangentSpace(eqx.Module):
         """
         balances, inertias = Balances.at(system, state), rotor_inertias(system)
         gains = balances.columns()
-        impulses = Velocity(inertia(system.mass, gains.rows), inertias * gains.rotors)
         unit = jnp.eye(gains.rows.shape[0], dtype=state.q.dtype)
         plain = Admissible(unit, None, None, None)
-        space = cls(system, balances.rows, balances.free, gains.rotors, impulses, inertias, plain)
-        frame = inverse_cholesky(space.pulled(impulses) + _idle(balances))
+        space = cls(system, balances.rows, balances.free, gains.rotors, inertias, plain)
+        # A unit inertia for turns of point masses, which nothing else sees.
+        massless = jnp.trace(system.mass[:, 1:, 1:], axis1=1, axis2=2) <= 0
+        frame = inverse_cholesky(space.coupled(space, idle=jnp.where(massless, 1.0, 0.0)))
         return replace_fields(space, admissible=_admissible(balances, frame, gains.constraints.T, lifted))
 
     def without_system(self) -> "TangentSpace":
@@ -135,15 +134,10 @@ class TangentSpace(eqx.Module):
         impulse = self.impulse(v)
         return 0.5 * (jnp.sum(impulse.rows * v.rows) + jnp.sum(impulse.rotors * v.rotors))
 
-    def pulled(self, impulse: Velocity) -> Float[Array, "u *k"]:
-        """P^T of impulses (with a leading axis: of several, to columns)."""
-        rows = impulse.rows.reshape(-1, *impulse.rows.shape[-3:])
-        force, torque = wrench(rows, self.rows[None, :, 1:])
-        velocity, spin = self.free
-        found = jnp.einsum("buc,kbc->uk", velocity, force) + jnp.einsum("buc,kbc->uk", spin, torque)
-        if self.inertias.shape[0]:
-            found = found + self.turning @ impulse.rotors.reshape(rows.shape[0], -1).T
-        return found if impulse.rows.ndim == 4 else found[:, 0]
+    def pulled(self, impulse: Velocity) -> Float[Array, " u"]:
+        """P^T of impulses."""
+        force, torque = wrench(impulse.rows[None], self.rows[None, :, 1:])
+        return self.generalised(force[0], torque[0]) + self.turning @ impulse.rotors
 
     @property
     def drift(self) -> Velocity:
@@ -171,12 +165,37 @@ class TangentSpace(eqx.Module):
     @property
     def inertia(self) -> Float[Array, "u u"]:
         """P^T M P."""
-        return self.pulled(self.impulses)
+        return self.coupled(self)
+
+    def coupled(
+        self, other: "TangentSpace", idle: Float[Array, " bodies"] | None = None
+    ) -> Float[Array, "u u"]:
+        """P_0^T M P_1 with the null space of another configuration.
+
+        Args:
+            other: that.
+            idle: inertias of the bodies against all turns, in addition.
+        """
+        assert self.system is not None
+        bodies = spatial_inertia(self.system.mass, self.rows[:, 1:], other.rows[:, 1:])
+        if idle is not None:
+            turning = jnp.diag(jnp.array([0.0, 0.0, 0.0, 1.0, 1.0, 1.0]))
+            bodies = bodies + idle[:, None, None] * turning
+        momenta = jnp.einsum("bij,bju->biu", bodies, other.motions)
+        found = jnp.einsum("biu,biw->uw", self.motions, momenta)
+        if self.inertias.shape[0]:
+            found = found + (self.turning * self.inertias) @ other.turning.T
+        return found
+
+    @property
+    def motions(self) -> Float[Array, "bodies 6 u"]:
+        """Velocities and angular velocities of the bodies per unit rate of each free motion."""
+        return jnp.concatenate([jnp.swapaxes(x, 1, 2) for x in self.free], axis=1)
 
     def shares(self, after: "TangentSpace", d: Velocity) -> tuple[Velocity, Velocity]:
         """P^_0 u and P^_1 (b_1 - 2 u - K^T u) of the kick from here to another configuration, see `kick`."""
         start, end = self.admissible, after.admissible
-        cosines = start.frame @ self.pulled(after.impulses) @ end.frame.T
+        cosines = start.frame @ self.coupled(after) @ end.frame.T
         b0, b1 = start.within(self.framed(d)), end.within(after.framed(d))
         if start.subspace is None or end.subspace is None:
             first, last = isometric(cosines, b0, b1)
@@ -262,13 +281,6 @@ def rotor_inertias(system: System) -> Float[Array, " rotors"]:
     groups = [g for g in system.effects if g.effect.rotors]
     parts = [jax.vmap(lambda e: e.inertia_of())(g.effect) for g in groups]
     return jnp.concatenate([jnp.zeros(0, system.mass.dtype), *parts])
-
-
-def _idle(balances: Balances) -> Float[Array, "u u"]:
-    """A unit inertia for turns of point masses, which nothing else sees."""
-    massless = jnp.trace(balances.system.mass[:, 1:, 1:], axis1=1, axis2=2) <= 0
-    spin = jnp.where(massless[:, None, None], balances.free[1], 0.0)
-    return jnp.einsum("buc,bwc->uw", spin, spin)
 
 
 def driven(system: System) -> bool:
