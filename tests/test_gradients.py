@@ -17,7 +17,8 @@ from differences import assert_v_shaped
 
 import natcoord_jax as nc
 from natcoord_jax import gallery
-from natcoord_jax.stepping.derivative import Rule, run_slots
+from natcoord_jax.stepping.backward import Backward
+from natcoord_jax.stepping.derivative import run_slots
 from natcoord_jax.stepping.newton import TOLERANCE
 from natcoord_jax.stepping.plan import Plan
 from natcoord_jax.stepping.step import advance
@@ -487,7 +488,7 @@ def test_multipliers_of_the_way_back_are_smooth_at_the_stride_of_their_guesses(o
     plan = Plan(steps, 4, TOLERANCE, None, None, tableau)
     u = jnp.zeros((steps, len(system.structure.inputs)))
     slots, _ = run_slots(plan, system, example.state, u, dt)
-    assert np.sum(slots.accepted[:steps]) == steps and Rule(plan).stride == stride
+    assert np.sum(slots.accepted[:steps]) == steps and Backward(plan).stride == stride
     rng = np.random.default_rng(0)
     end_bar = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape)), example.state)
 

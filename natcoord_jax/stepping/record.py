@@ -14,6 +14,7 @@ from natcoord_jax.core.state import State
 from natcoord_jax.stepping.correcting import Correcting
 from natcoord_jax.stepping.factors import Factors
 from natcoord_jax.stepping.past import Past
+from natcoord_jax.stepping.plan import Plan
 
 
 def zero_tangent(x: Array) -> Array | np.ndarray:
@@ -76,6 +77,12 @@ class Slot(eqx.Module):
     fraction: Float[Array, "*slots"]
     done: Float[Array, "*slots"]
     accepted: Bool[Array, "*slots"]
+
+    def inputs(self, plan: Plan, parameters: Any, state: State) -> Float[Array, " inputs"]:
+        """Its inputs, those that a control decides at a state."""
+        if self.u is not None:
+            return self.u
+        return plan.inputs(parameters, self.step, state, self.done, self.fraction)
 
 
 class Record(eqx.Module):
