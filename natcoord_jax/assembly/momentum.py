@@ -51,7 +51,10 @@ def spatial_inertia(
     arm, moved = jnp.sum(first * directors, axis=1), jnp.sum(first * others, axis=1)
     products = jnp.einsum("bix,bij,bjy->bxy", directors, second, others)
     unit = jnp.eye(3, dtype=mass.dtype)
-    turning = jnp.trace(products, axis1=1, axis2=2)[:, None, None] * unit - jnp.swapaxes(products, 1, 2)
+    # The trace less a diagonal element is the sum of the others: about the axis of a rod nothing may cancel.
+    x, y, z = jnp.unstack(jnp.diagonal(products, axis1=1, axis2=2), axis=1)
+    sums = jnp.stack([y + z, x + z, x + y], axis=1)
+    turning = jnp.where(unit > 0, sums[:, :, None], -jnp.swapaxes(products, 1, 2))
     force = jnp.concatenate([mass[:, 0, 0, None, None] * unit, -skew(moved)], axis=2)
     torque = jnp.concatenate([skew(arm), turning], axis=2)
     return jnp.concatenate([force, torque], axis=1)

@@ -90,7 +90,9 @@ class TangentSpace(eqx.Module):
         space = cls(system, balances.rows, balances.free, gains.rotors, inertias, plain)
         # A unit inertia for turns of point masses, which nothing else sees.
         massless = jnp.trace(system.mass[:, 1:, 1:], axis1=1, axis2=2) <= 0
-        frame = inverse_cholesky(space.coupled(space, idle=jnp.where(massless, 1.0, 0.0)))
+        own = space.coupled(space, idle=jnp.where(massless, 1.0, 0.0))
+        # Symmetric but for rounding, which would otherwise enter the frame with the same sign in every step.
+        frame = inverse_cholesky(0.5 * (own + own.T))
         return replace_fields(space, admissible=_admissible(balances, frame, gains.constraints.T, lifted))
 
     def without_system(self) -> "TangentSpace":
