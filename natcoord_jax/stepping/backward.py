@@ -26,7 +26,7 @@ from natcoord_jax.maths.rows import row, with_row
 from natcoord_jax.stepping.correcting import Correcting
 from natcoord_jax.stepping.factors import Factors, factors_of
 from natcoord_jax.stepping.newton import any_lane
-from natcoord_jax.stepping.one_kernel import as_one_kernel, in_groups, plainly
+from natcoord_jax.stepping.one_kernel import as_one_kernel, lane_by_lane, plainly
 from natcoord_jax.stepping.past import Past
 from natcoord_jax.stepping.plan import Plan
 from natcoord_jax.stepping.probe import jacobian_by_differences
@@ -54,7 +54,7 @@ class Backward:
             record: where.
             given: cotangents of the states after all slots and of their unknowns.
         """
-        return in_groups(self._in_kernels, record, given)
+        return lane_by_lane(self._in_kernels, record, given)
 
     def _in_kernels(self, record: Record, given: tuple[State, Array]) -> tuple:
         """One kernel for all slots, or one for each part if that would take too long to compile."""

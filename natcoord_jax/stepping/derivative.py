@@ -22,7 +22,7 @@ from natcoord_jax.core.state import State
 from natcoord_jax.stepping import linear_pair
 from natcoord_jax.stepping.backward import Backward
 from natcoord_jax.stepping.error_control import Tolerance
-from natcoord_jax.stepping.one_kernel import in_groups
+from natcoord_jax.stepping.one_kernel import lane_by_lane
 from natcoord_jax.stepping.plan import Plan, Slots
 from natcoord_jax.stepping.record import Numbers, Record, Slot, instantiated, zero_tangent
 from natcoord_jax.stepping.rollout import Ending, run
@@ -50,7 +50,7 @@ def run_slots(
 @partial(jax.jit, static_argnums=0)
 def _traced_once(plan: Plan, *numbers: Any) -> tuple[Slots, Ending]:
     """JAX evaluates the function and the rule for its derivative; jit remembers the program."""
-    return in_groups(partial(run, plan), *numbers)
+    return lane_by_lane(partial(run, plan), *numbers)
 
 
 class Rule:

@@ -6,7 +6,8 @@ differences, one evaluation a column. Differences are exact to a few parts in 10
 iteration needs that is carried to the floor anyway; and a second, larger program for the exact Jacobian would
 take longer to compile than everything else. (Derivatives of trajectories use the exact one.)
 
-All lanes of a vmap are judged together: they form Jacobians when one needs to, and end a step when all can.
+Lanes that a vmap works through together are judged together: they form Jacobians when one needs to, and end a
+step when all can. (On a CPU they are not, see `one_kernel.lane_by_lane`.)
 """
 
 from typing import Any

@@ -37,9 +37,6 @@ LARGEST = 6800
 ATTRIBUTES = {"xla_cpu_small_call": "true", "inlineable": "false"}
 """Compiled as one function; kept as a call until then."""
 
-LANES = 16
-"""Lanes of a batch that are worked on together, so that what they need stays in the fastest cache."""
-
 
 def as_one_kernel(function: Callable, *arguments: Any, too_large: Callable | None = None) -> Any:
     """The value of a function, computed in one kernel where that is possible.
@@ -82,11 +79,15 @@ def scan_in_one_kernel(body: Callable, start: Any, given: Any, reverse: bool = F
     return _flat(partial(_kernel, lanes_too=False), program, shapes, (start, given))
 
 
-def in_groups(function: Callable, *arguments: Any) -> Any:
-    """The value of a function; under vmap on the CPU, lanes are worked through in groups of `LANES`."""
+def lane_by_lane(function: Callable, *arguments: Any) -> Any:
+    """The value of a function; under vmap on the CPU, lanes are worked through one after the other.
+
+    Several at once would wait for the slowest of them and take twice as long to compile, and what they need
+    would leave the fastest cache. Only the smallest systems, of one or two bodies, would gain by it.
+    """
     if not _on_cpu():
         return function(*arguments)
-    return _flat(_grouped, *jax.make_jaxpr(function, return_shape=True)(*arguments), arguments)
+    return _flat(_in_turn, *jax.make_jaxpr(function, return_shape=True)(*arguments), arguments)
 
 
 REFUSALS = ("UNIMPLEMENTED", "Failed to materialize symbols")
@@ -140,8 +141,8 @@ def _kernel(function: Callable, lanes_too: bool = True) -> Callable:
     return call
 
 
-def _grouped(function: Callable) -> Callable:
-    """A flat function that works through lanes in groups."""
+def _in_turn(function: Callable) -> Callable:
+    """A flat function that works through lanes one after the other."""
 
     @jax.custom_batching.custom_vmap
     def call(*flat: Any) -> list[Any]:
@@ -149,28 +150,17 @@ def _grouped(function: Callable) -> Callable:
 
     @call.def_vmap
     def by_lanes(axis_size: int, in_batched: Sequence[bool], *flat: Any) -> tuple[list[Any], list[bool]]:
-        axes = [0 if batched else None for batched in in_batched]
-        every = jax.vmap(function, in_axes=axes, axis_size=axis_size)
-        if axis_size > LANES:
-            every = partial(_group_by_group, function, axes, axis_size)
-        outputs = _grouped(every)(*flat)
+        def every(*flat: Any) -> list[Any]:
+            def lane(own: list[Any]) -> list[Any]:
+                rest = iter(own)
+                return function(*(next(rest) if batched else x for x, batched in zip(flat, in_batched)))
+
+            return jax.lax.map(lane, [x for x, batched in zip(flat, in_batched) if batched])
+
+        outputs = _in_turn(every)(*flat)
         return outputs, [True] * len(outputs)
 
     return call
-
-
-def _group_by_group(function: Callable, axes: list[int | None], lanes: int, *flat: Any) -> list[Any]:
-    """The function of all lanes; the last lane fills up the last group."""
-    groups = -(-lanes // LANES)
-    padding = jnp.minimum(jnp.arange(groups * LANES), lanes - 1).reshape(groups, LANES)
-    varied = [x for x, axis in zip(flat, axes) if axis == 0]
-
-    def group(rows: Array) -> list[Any]:
-        own = iter([x[rows] for x in varied])
-        return jax.vmap(function, in_axes=axes)(*(x if a is None else next(own) for x, a in zip(flat, axes)))
-
-    outputs = jax.lax.map(group, padding)
-    return [x.reshape(groups * LANES, *x.shape[2:])[:lanes] for x in outputs]
 
 
 def _in_one_kernel(function: Callable, flat: Sequence[Any]) -> list[Any]:
