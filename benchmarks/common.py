@@ -24,6 +24,8 @@ ONE_THREAD = {
     "OPENBLAS_NUM_THREADS": "1",
 }
 PACKAGES = ("natcoord-jax", "jax", "jaxlib", "equinox", "numpy")
+CODE = ("natcoord_jax", "benchmarks", ":(exclude)benchmarks/results")
+"""What figures depend on: those of the benchmark before are no change."""
 
 
 def on_one_core() -> None:
@@ -207,7 +209,7 @@ def circumstances(name: str, *, quick: bool) -> dict[str, Any]:
         "quick": quick,
         "date": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
         "commit": _git("rev-parse", "HEAD") or None,
-        "uncommitted_changes": bool(_git("status", "--porcelain", "--", "natcoord_jax", "benchmarks")),
+        "uncommitted_changes": bool(_git("status", "--porcelain", "--", *CODE)),
         "machine": {
             "processor": _processor(),
             "cores": os.cpu_count(),

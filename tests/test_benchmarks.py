@@ -44,7 +44,7 @@ def test_effects(tmp_path):
     results, _ = _results("effects", tmp_path)
     assert [run["effect"] for run in results["runs"]][:2] == ["base", "base without gravity"]
     for run in results["runs"]:
-        assert run.keys() >= TIMES | {"over_base", "unknowns", "multipliers", "program"}
+        assert run.keys() >= TIMES | {"over_first", "unknowns", "multipliers", "program"}
 
 
 def test_work_precision_of_one_scene_alone(tmp_path):
