@@ -15,14 +15,9 @@ from natcoord_jax.assembly.rates import row_rates
 from natcoord_jax.assembly.system import System
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
+from natcoord_jax.maths.direct_rotation import direct_rotation
 from natcoord_jax.maths.elimination import definite_solution, inverse_cholesky
 from natcoord_jax.maths.projectors import pseudo_inverse, range_projector
-
-POLISHING = 9
-"""Newton-Schulz iterations for the direct rotation of subspaces: enough for cosines from 0.4 on."""
-
-POLISHED = 1e-9
-"""Error of X^T X from which one iteration more is the last: it squares it."""
 
 
 class Velocity(eqx.Module):
@@ -202,7 +197,7 @@ class TangentSpace(eqx.Module):
         if start.subspace is None or end.subspace is None:
             first, last = isometric(cosines, b0, b1)
             return self.along(first), after.along(last)
-        moved = _direct_rotation(start.subspace, end.subspace)
+        moved = direct_rotation(start.subspace, end.subspace)
         cosines = start.subspace @ cosines @ moved @ start.subspace
         first, last = isometric(cosines, b0, moved.T @ b1)
         return self.along(first), after.along(moved @ last)
@@ -242,40 +237,6 @@ def isometric(
     matrix = jnp.eye(b0.shape[0], dtype=b0.dtype) + 2.0 * cosines + cosines @ cosines.T
     u = definite_solution(matrix, cosines @ b1 - b0)
     return u, b1 - 2.0 * u - cosines.T @ u
-
-
-def _direct_rotation(start: Float[Array, "u u"], end: Float[Array, "u u"]) -> Float[Array, "u u"]:
-    """The smallest rotation that takes one subspace to another, from their projectors."""
-    unit = jnp.eye(start.shape[0], dtype=start.dtype)
-    return _orthogonal(end @ start + (unit - end) @ (unit - start))
-
-
-def _polished(x: Float[Array, "u u"]) -> tuple[Float[Array, "u u"], Float[Array, ""]]:
-    """One Newton-Schulz iteration, and how far from orthogonal the matrix was before it."""
-    square = x.T @ x
-    return 1.5 * x - 0.5 * x @ square, jnp.max(jnp.abs(square - jnp.eye(x.shape[0], dtype=x.dtype)))
-
-
-@jax.custom_jvp
-def _orthogonal(x: Float[Array, "u u"]) -> Float[Array, "u u"]:
-    """The nearest orthogonal matrix. Over short steps subspaces turn little, and few iterations do."""
-
-    def going(carry: tuple) -> Array:
-        return (carry[0] < POLISHING) & (carry[2] > POLISHED)
-
-    def once(carry: tuple) -> tuple:
-        return carry[0] + 1, *_polished(carry[1])
-
-    return jax.lax.while_loop(going, once, (0, x, jnp.ones((), x.dtype)))[1]
-
-
-@_orthogonal.defjvp
-def _orthogonal_jvp(primals: tuple, tangents: tuple) -> tuple:
-    # Derivatives have to go through all iterations, in a loop that can be transposed.
-    def every(x: Array) -> Array:
-        return jax.lax.fori_loop(0, POLISHING, lambda _, x: _polished(x)[0], x)
-
-    return _orthogonal(*primals), jax.jvp(every, primals, tangents)[1]
 
 
 def rotor_inertias(system: System) -> Float[Array, " rotors"]:
