@@ -4,9 +4,9 @@ usage: python -m benchmarks.effects [--quick] [--output FOLDER] [--redraw JSON]
 
 The base scene is an arm of two bodies on two hinges, released from rest under gravity; gravity is taken away
 to measure it. Every other line adds one effect, or one body with the joint, a third body that closes a
-four-bar (two hinges, planar: redundant), or a beam of four elements. Each is timed in turn with the base, round
-by round; `over_first` is the time a step over that of the base in the same round, and `program` counts the lines
-of the lowered program. What is not in a scene is in none of its numbers.
+four-bar (two hinges, planar: redundant), or a beam of four elements. Each is timed in turn with the base,
+round by round: `over_first` is the time a step over that of the base in the same round. `program` counts the
+lines of the lowered program. What is not in a scene is in none of its numbers.
 """
 
 from collections.abc import Callable
