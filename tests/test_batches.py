@@ -1,5 +1,6 @@
 """Lanes of a vmap: each as if it were alone, also on several cores."""
 
+import os
 import re
 import subprocess
 import sys
@@ -80,6 +81,7 @@ steps = jnp.linspace(0.001, 0.02, 2 * len(jax.devices()))
 assert len(jax.devices()) == 4
 print(float(jnp.max(jnp.abs(on_all_cores(steps) - jax.vmap(final_energy)(steps)))))
 """
-    run = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True)
+    env = os.environ | {"JAX_PLATFORMS": "cpu"}
+    run = subprocess.run([sys.executable, "-c", program], cwd=ROOT, env=env, capture_output=True, text=True)
     assert run.returncode == 0, run.stderr
     assert float(run.stdout) < 1e-12
