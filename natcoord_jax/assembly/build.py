@@ -15,6 +15,7 @@ from natcoord_jax.assembly.graph import Edge, make_tree, spanning_tree
 from natcoord_jax.assembly.grouping import Instance, bare, families, stack
 from natcoord_jax.assembly.poses import Poses, joint_frames, joint_triad
 from natcoord_jax.assembly.rates import row_rates
+from natcoord_jax.assembly.roundness import symmetries
 from natcoord_jax.assembly.system import CoordinateGroup, Elimination, Group, Seats, Structure, System
 from natcoord_jax.assembly.tree import Tree
 from natcoord_jax.core.bodies import Body
@@ -359,8 +360,26 @@ def build(
         elimination_order(layout, groups, joint_groups) if structure.solver == "recursive" else None,
         structure,
     )
-    system = jax.tree.map(as_array, system)
-    return system, with_readings(system, layout.state())
+    state = layout.state()
+    system = jax.tree.map(as_array, with_symmetries(system, state))
+    return system, with_readings(system, state)
+
+
+def with_symmetries(system: System, state: State) -> System:
+    """The system with the axes of bodies that are round, turn freely, and that nothing is fixed to.
+
+    Along axes that do not spin with a body, what is fixed to it off its axis would go round.
+    """
+    tree, count = system.tree, len(system.structure.bodies)
+    single = tree.ball & ~np.isin(np.arange(count), tree.parent)
+    for group in (*system.effects, *system.joints):
+        if group.effect.elastic or (group.source == "joint" and not group.in_tree):
+            single = single & ~np.isin(np.arange(count), group.bodies)
+    if not single.any():
+        return system
+    rows = state.q.reshape(-1, 4, 3)
+    found = symmetries(system.mass, tree.frames(system.frames), rows, jnp.asarray(single))
+    return replace_fields(system, tree=replace_fields(tree, symmetry=found))
 
 
 def with_readings(system: System, state: State) -> State:

@@ -15,8 +15,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.diagnostics import rows_with_ground
+from natcoord_jax.assembly.roundness import ball_axes, frame_axes
 from natcoord_jax.assembly.sweeps import Hinging, relative_motion, turning
-from natcoord_jax.assembly.tree import JointGeometry, Level, Tree, TreeMotion, combine, frame_axes, joined
+from natcoord_jax.assembly.tree import JointGeometry, Level, Tree, TreeMotion, combine, joined
 from natcoord_jax.maths.collocation import Tableau, rotate_stages
 from natcoord_jax.maths.rows import add_at, row, with_row
 from natcoord_jax.maths.vectors import cross
@@ -33,24 +34,29 @@ def hinging(tree: Tree, frames: Array, rows: Float[Array, "bodies 4 3"]) -> Hing
     """Bodies that hang on joints, and what they hang on."""
     here = tree.hung.here
     above = rows_with_ground(rows.reshape(-1, 3))[tree.parent[here]]
-    return Hinging(frames[here], rows[here], tree.ball[here], above)
+    symmetry = None if tree.symmetry is None else tree.symmetry[here]
+    return Hinging(frames[here], rows[here], tree.ball[here], above, symmetry=symmetry)
 
 
-def free_axes(tree: Tree, rows: Float[Array, "bodies 4 3"]) -> Float[Array, "free 3 3"]:
-    """Axes of the rates of free bodies: their own at the start of the step; those of space for points."""
+def free_axes(
+    tree: Tree, frames: Float[Array, "bodies 2 4 4"], rows: Float[Array, "bodies 4 3"]
+) -> Float[Array, "free 3 3"]:
+    """Axes of the rates of free bodies, see `roundness`; those of space for points."""
     turning = jnp.asarray(tree.ball[tree.free.here])[:, None, None]
-    return jnp.where(turning, rows[tree.free.here, 1:], jnp.eye(3, dtype=rows.dtype))
+    axes = tree.ball_axes(frames, rows[:, 1:])[0, tree.free.here]
+    return jnp.where(turning, axes, jnp.eye(3, dtype=rows.dtype))
 
 
 def _free_motion(
     tree: Tree,
+    frames: Float[Array, "bodies 2 4 4"],
     rows: Float[Array, "bodies 4 3"],
     slots: Float[Array, "s bodies 7"],
     h: Float[Array, ""],
     tableau: Tableau,
 ) -> tuple[Array, Array, Array, JointGeometry]:
     """Angular velocities, velocities, stage directors and geometry of free bodies."""
-    level, axes = tree.free, free_axes(tree, rows)
+    level, axes = tree.free, free_axes(tree, frames, rows)
     rate, count = slots[:, level.here], len(level.members)
     still = jnp.zeros((tableau.stages, count, 3), rows.dtype)
     turning = [rate[:, :, k, None] * axes[:, k] for k in level.rotations]
@@ -76,7 +82,7 @@ def _spins_above(
     picked = jnp.array(level.rotations, int)
     axes = frame_axes(these.frames[:, 0, 1:, 1:], these.parent_rows[None, :, 1:])[0][:, picked]
     if level.balls:
-        own_axes = frame_axes(these.frames[:, 1, 1:, 1:], own)[0][:, picked]
+        own_axes = ball_axes(these.frames, these.symmetry, own)[0][:, picked]
         axes = jnp.where(these.ball[:, None, None], own_axes, axes)
     child = combine(these.frames[:, 1, 1, 1:], own)[0]
 
@@ -123,7 +129,7 @@ def sweep_nodes(
     tableau: Tableau,
 ) -> tuple[TreeMotion, Geometry]:
     """Motion of all bodies from the rates of the joints, root to leaves; see `sweeps.sweep_motion`."""
-    *alone, free = _free_motion(tree, rows, slots, h, tableau)
+    *alone, free = _free_motion(tree, frames, rows, slots, h, tableau)
     if not tree.hung.members:
         none = JointGeometry(free.axes[:, :0, :0], *(free.child_arm[:, :0],) * 3)
         return TreeMotion(*alone), Geometry(free, none)

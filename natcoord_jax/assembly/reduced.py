@@ -35,6 +35,7 @@ from natcoord_jax.assembly.response import (
     situation,
     stations,
 )
+from natcoord_jax.assembly.roundness import frame_axes
 from natcoord_jax.assembly.separate import Tangents, tangents_at
 from natcoord_jax.assembly.sweeps import sweep_motion, turned_directors
 from natcoord_jax.assembly.system import Group, System
@@ -42,7 +43,6 @@ from natcoord_jax.assembly.tangent_space import TangentSpace
 from natcoord_jax.assembly.tree import (
     SLOTS,
     TreeMotion,
-    frame_axes,
     gather_slots,
     project,
     start_rates,
@@ -313,7 +313,7 @@ class ReducedStep(Form):
         body, kind, axis = tree.slot_of // SLOTS, tree.slot_of % SLOTS // 3, tree.slot_of % SLOTS % 3
         above = jnp.concatenate([self.start[:, 1:], jnp.eye(3, dtype=self.start.dtype)[None]])[tree.parent]
         parent = frame_axes(self.frames[:, 0, 1:, 1:], above[None])[0][body, axis]
-        own = frame_axes(self.frames[:, 1, 1:, 1:], self.start[None, :, 1:])[0][body, axis]
+        own = tree.ball_axes(self.frames, self.start[:, 1:])[0][body, axis]
         # There rates are along the axes of the parent, here those of balls along their own.
         together = (body[:, None] == body) & (kind[:, None] == kind)
         cosines = jnp.where(together, dot(parent[:, None], own), 0.0)

@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from natcoord_jax.assembly.tree import JointGeometry, Level, Tree, TreeMotion, combine, frame_axes, joined
+from natcoord_jax.assembly.roundness import ball_axes, frame_axes
+from natcoord_jax.assembly.tree import JointGeometry, Level, Tree, TreeMotion, combine, joined
 from natcoord_jax.maths.collocation import Tableau, rotate_stages
 from natcoord_jax.maths.vectors import cross
 
@@ -22,6 +23,7 @@ class Hinging(eqx.Module):
         parent_rows: rows of the parents at the start of the step.
         turned: directors at the stages whose axes the free rotations and translations are taken along; None:
             those at the start of the step.
+        symmetry: axes about which bodies are round, see `roundness`; None: nothing can be.
     """
 
     frames: Float[Array, "n 2 4 4"]
@@ -29,6 +31,7 @@ class Hinging(eqx.Module):
     ball: Bool[Array | np.ndarray, " n"]
     parent_rows: Float[Array, "n 4 3"]
     turned: Float[Array, "s n 3 3"] | None = None
+    symmetry: Float[Array, "n 4"] | None = None
 
 
 def turning(
@@ -92,7 +95,7 @@ def relative_motion(
     slides = [cross(along[(k + 1) % 3], along[(k + 2) % 3]) for k in level.translations]
     if level.balls:
         turned = d0 if these.turned is None else these.turned
-        own, ball = jnp.unstack(frame_axes(place[:, 1, 1:, 1:], turned), axis=2), these.ball[:, None]
+        own, ball = jnp.unstack(ball_axes(place, these.symmetry, turned), axis=2), these.ball[:, None]
         axes = [jnp.where(ball, own[k], a) for k, a in zip(level.rotations, axes)]
         slides = [jnp.where(ball, own[k], t) for k, t in zip(level.translations, slides)]
     start = combine(place[:, 1, 1, 1:], d0) if level.child_rotation else None
@@ -168,7 +171,8 @@ def sweep_motion(
             spin_p, velocity_p, d_p = spins[-1][:, up], velocities[-1][:, up], triads[-1][:, up]
             parent_rows = rows[tree.parent[here]]
         along = None if turned is None else turned[:, here]
-        these = Hinging(frames[here], rows[here], tree.ball[here], parent_rows, along)
+        symmetry = None if tree.symmetry is None else tree.symmetry[here]
+        these = Hinging(frames[here], rows[here], tree.ball[here], parent_rows, along, symmetry)
         spin, relative, d, joint = relative_motion(level, these, spin_p, d_p, slots[:, here], h, tableau)
         geometry.append(joint)
         spins.append(spin)

@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from natcoord_jax.assembly.roundness import ball_axes, frame_axes
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.maths.vectors import cross, dot
 
@@ -79,12 +80,13 @@ class Tree(eqx.Module):
         slot_of: body * 7 + slot of each unknown.
         side: (parent, child) frame of each joint as the tree uses it, exchanged where it is used backwards.
         order: rows (point, axis 1, 2, 3) of those frames as the tree uses them.
-        ball: bodies whose joint leaves all rotations free; their rates are components along the child's
-            axes at the start of the step, in which the inertia matrix changes least.
+        ball: bodies whose joint leaves all rotations free; their rates are components along axes in which
+            the inertia matrix changes least, see `roundness`.
         levels: bodies by depth, the joints between them and the ground counted.
         free: free bodies.
         hung: bodies that hang on joints.
         backwards: whether any joint is used from child to parent.
+        symmetry: axes about which bodies are round, see `roundness`; None: nothing can be.
     """
 
     parent: Int[Array | np.ndarray, " bodies"]
@@ -99,6 +101,7 @@ class Tree(eqx.Module):
     free: Level = eqx.field(static=True)
     hung: Level = eqx.field(static=True)
     backwards: bool = eqx.field(static=True)
+    symmetry: Float[Array, "bodies 4"] | None = None
 
     @property
     def slots(self) -> tuple[int, ...]:
@@ -118,6 +121,12 @@ class Tree(eqx.Module):
         )
         none = Level((), (), (), False, True, False)
         return replace_fields(self, parent=self.neighbour, free=none, hung=whole)
+
+    def ball_axes(
+        self, frames: Float[Array, "bodies 2 4 4"], directors: Float[Array, "bodies 3 3"]
+    ) -> Float[Array, "1 bodies 3 3"]:
+        """Axes of the rates of balls, with the directors at the start of the step."""
+        return ball_axes(frames, self.symmetry, directors[None])
 
     def frames(self, frames: Float[Array, "joints 2 4 4"]) -> Float[Array, "bodies 2 4 4"]:
         """Frames of the tree's joints, in the direction of the tree."""
@@ -161,11 +170,6 @@ def gather_slots(tree: Tree, w: Float[Array, "s unknowns"]) -> Float[Array, "s b
 def combine(coefficients: Float[Array, "n m"], vectors: Float[Array, "*s n m 3"]) -> Float[Array, "*s n 3"]:
     """Sums of vectors of each body."""
     return jnp.sum(coefficients[..., None] * vectors, axis=-2)
-
-
-def frame_axes(coefficients: Float[Array, "n k 3"], directors: Float[Array, "s n 3 3"]) -> Array:
-    """Axes of frames from the directors of the bodies that they are fixed to."""
-    return jnp.sum(coefficients[..., None] * directors[:, :, None], axis=-2)
 
 
 def tangent(
@@ -254,7 +258,7 @@ def start_rates(
     apart = rows[:, 0] + child_arm - parent[:, 0]
     relative = spin[:-1] - spin_p
     gap_rate = velocity[:, 0] + cross(spin[:-1], child_arm) - moving[tree.parent][:, 0] - cross(spin_p, apart)
-    axes = jnp.where(tree.ball[:, None, None], own_axes, parent_axes)
+    axes = jnp.where(tree.ball[:, None, None], tree.ball_axes(frames, rows[:, 1:])[0], parent_axes)
     turning, sliding = dot(relative[:, None], axes), dot(gap_rate[:, None], axes)
     slots = jnp.concatenate([turning, sliding, dot(relative, own_axes[:, 0])[:, None]], axis=1)
     return slots.reshape(-1)[tree.slot_of]
