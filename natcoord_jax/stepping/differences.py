@@ -23,13 +23,11 @@ def first_probe(setting: Setting, course: Course, outset: Outset) -> Probe:
     u, h, _ = setting.situation(course)
     near = replace_fields(outset, lag=setting.lag(course))
     equations = prepare(setting.system, course.state, u, h, setting.plan.tableau, near)
-    return Probe.first(
-        equations, jax.eval_shape(lambda y: equations.evaluate(y).without_system(), course.it.y)
-    )
+    return Probe.first(equations, course.it.y)
 
 
 def evaluated(
-    setting: Setting, equations: Any, probe: Probe, it: Iterate, factors: Factors
+    setting: Setting, equations: Any, probe: Probe, found: Evaluation, it: Iterate, factors: Factors
 ) -> tuple[Probe, Evaluation, Iterate, Factors]:
     """The equations at the unknowns at hand, and everywhere a Jacobian asks for if one is to be formed.
 
@@ -37,6 +35,7 @@ def evaluated(
         setting: of the rollout.
         equations: of the step, told of the kick what they are where no Jacobian is formed.
         probe: what Jacobians are formed with.
+        found: the last evaluation.
         it: where the iteration stands.
         factors: of the Jacobian at hand.
 
@@ -44,9 +43,9 @@ def evaluated(
         The probe, the equations at the unknowns; the iteration and factors, which are new where there is a
         new Jacobian.
     """
-    probe = probe.evaluated(equations, it.y, partial(_at, equations, probe.making))
+    probe, found = probe.evaluated(equations, it.y, partial(_at, equations, probe.making), found)
     it, factors = _renewed(equations, probe, it, factors)
-    return probe, probe.found.with_system(setting.system), it, factors
+    return probe, found.with_system(setting.system), it, factors
 
 
 def told(

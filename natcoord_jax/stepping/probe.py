@@ -54,28 +54,20 @@ class Probe(eqx.Module):
         making: whether a Jacobian is to be formed, where the residual is evaluated next.
         alike: whether stages are taken for alike, in that or in the last one.
         failures: how often that was not good enough.
-        moved: residuals at other unknowns, one a row; the last row is never of use.
-        found: the last evaluation of the equations.
+        moved: residuals at other unknowns, one a row; the last row is that at the unknowns themselves.
     """
 
     making: Bool[Array, ""]
     alike: Bool[Array, ""]
     failures: Int[Array, ""]
     moved: Float[Array, "rows unknowns"]
-    found: Any
 
     @classmethod
-    def first(cls, equations: Any, found: Any) -> "Probe":
-        """Before the first Jacobian.
-
-        Args:
-            equations: of a step.
-            found: an evaluation of them, for its shapes.
-        """
+    def first(cls, equations: Any, y: Float[Array, " unknowns"]) -> "Probe":
+        """Before the first Jacobian of the equations of a step, with so many unknowns."""
         size, no = layouts(equations)[1].measure.size, jnp.array(False)
-        blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), found)
-        moved = jnp.zeros((size + 1, *blank.residual.shape), blank.residual.dtype)
-        return cls(no, jnp.array(equations.tableau.stages > 1), jnp.array(0), moved, blank)
+        moved = jnp.zeros((size + 1, *y.shape), y.dtype)
+        return cls(no, jnp.array(equations.tableau.stages > 1), jnp.array(0), moved)
 
     def asked(self, wanting: Bool[Array, ""], rounds: Int[Array, ""], stages: int) -> "Probe":
         """After an evaluation.
@@ -90,11 +82,15 @@ class Probe(eqx.Module):
             again = wanting & (rounds > 0)
             failures = failures + (again & alike)
             alike = jnp.where(wanting, ~again & (failures < FAILURES), alike)
-        return Probe(wanting, alike, failures, self.moved, self.found)
+        return Probe(wanting, alike, failures, self.moved)
 
     def evaluated(
-        self, equations: Any, y: Float[Array, " unknowns"], evaluate: Callable[[Array, Array, Array], Any]
-    ) -> "Probe":
+        self,
+        equations: Any,
+        y: Float[Array, " unknowns"],
+        evaluate: Callable[[Array, Array, Array], Any],
+        found: Any,
+    ) -> tuple["Probe", Any]:
         """With the equations evaluated: everywhere a Jacobian asks for, if it is to be formed, and at y.
 
         Args:
@@ -102,6 +98,10 @@ class Probe(eqx.Module):
             y: unknowns.
             evaluate: the equations at given unknowns, told whether these are y, and if not, whether rates are
                 others, or multipliers alone.
+            found: an evaluation of them, for its shapes.
+
+        Returns:
+            The probe, and the equations at y.
         """
         choice = self._choice(equations)
         last = choice.measure.shape[0]
@@ -117,15 +117,15 @@ class Probe(eqx.Module):
             moved = jax.lax.dynamic_update_index_in_dim(moved, found.residual, k, 0)
             return jnp.where(k + 1 == choice.count, last, k + 1), moved, found
 
-        start = jnp.where(self.making, 0, last), self.moved, self.found
+        start = jnp.where(self.making, 0, last), self.moved, found
         _, moved, found = jax.lax.while_loop(going, point, start)
-        return Probe(self.making, self.alike, self.failures, moved, found)
+        return Probe(self.making, self.alike, self.failures, moved), found
 
     def columns(self, equations: Any, y: Float[Array, " unknowns"]) -> Float[Array, "columns unknowns"]:
         """Columns of the Jacobian, one a row, in the order of the layout."""
         measure = self._choice(equations).measure
         steps = self.changes(equations, y)[measure]
-        return (self.moved[: measure.shape[0]] - self.found.residual) / steps[:, None]
+        return (self.moved[: measure.shape[0]] - self.moved[measure.shape[0]]) / steps[:, None]
 
     def changes(self, equations: Any, y: Float[Array, " unknowns"]) -> Float[Array, " unknowns"]:
         """Changes of the unknowns."""

@@ -26,7 +26,7 @@ from natcoord_jax.stepping.factors import Factors
 from natcoord_jax.stepping.newton import Iterate, any_lane
 from natcoord_jax.stepping.one_kernel import as_one_kernel
 from natcoord_jax.stepping.plan import Plan
-from natcoord_jax.stepping.trip import Asked, Carried, renewed_at, trip, with_state
+from natcoord_jax.stepping.trip import Asked, Carried, attempt, renewed_at, with_state
 
 PARTS = 4
 """Bodies from which on new factors are made in a kernel of their own."""
@@ -96,7 +96,7 @@ def _every_slot(
     record = _record(course, x, length if plan.recorded else 1)
     start = Carried(jnp.array(0), course, x, outset, factors, probe, record, jnp.array(0), None)
     going = partial(_unfinished, setting, length)
-    return jax.lax.while_loop(going, partial(trip, setting, unpack, False), start)
+    return jax.lax.while_loop(going, partial(attempt, setting, unpack, False), start)
 
 
 def _by_rounds(
@@ -126,7 +126,7 @@ def _by_rounds(
 
         room = _record(carried.course, carried.state, rows)
         begun = eqx.tree_at(lambda c: (c.record, c.first), carried, (room, carried.count))
-        return jax.lax.while_loop(going, partial(trip, near, unpack, True), begun)
+        return jax.lax.while_loop(going, partial(attempt, near, unpack, True), begun)
 
     def renewal(near: Setting, carried: Carried) -> tuple[Iterate, Factors]:
         assert carried.asked is not None

@@ -1,4 +1,4 @@
-"""One evaluation of the equations in a rollout, and what follows from it."""
+"""One attempt at a (sub)step in a rollout: evaluations of its equations, and what follows from them."""
 
 from collections.abc import Callable
 from functools import partial
@@ -12,7 +12,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from natcoord_jax.assembly.equations import prepare, starting
 from natcoord_jax.assembly.kick import Kick
+from natcoord_jax.assembly.lag import Lagging
 from natcoord_jax.assembly.outset import Outset
+from natcoord_jax.assembly.response import Evaluation
 from natcoord_jax.assembly.tangent_space import driven
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
@@ -28,7 +30,7 @@ from natcoord_jax.stepping.watch import sound
 
 
 class Carried(eqx.Module):
-    """What goes from one evaluation of the equations to the next.
+    """What goes from one attempt to the next.
 
     Attributes:
         count: complete slots.
@@ -71,46 +73,56 @@ class Asked(eqx.Module):
     here: Bool[Array, ""]
 
 
-def trip(setting: Setting, unpack: Callable[[Array], State], apart: bool, carried: Carried) -> Carried:
-    """One evaluation of the equations, and what follows from it.
+class Solving(eqx.Module):
+    """Where the equations of an attempt stand, from one evaluation to the next.
 
-    If apart, new factors are asked for, but not made.
+    Attributes:
+        it: the iteration.
+        lagging: what is known of the kick.
+        factors: of a Jacobian.
+        probe: what Jacobians by differences are formed with.
+        found: the last evaluation, without the system.
+        residual: of the equations there, with what the step before has left.
+        ending: whether the attempt is at its end.
+        wanting: whether new factors are asked for, which are made elsewhere.
+        here: whether they are wanted where the equations were evaluated, not where the step began.
     """
-    plan, factors, probe = setting.plan, carried.factors, carried.probe
+
+    it: Iterate
+    lagging: Lagging | None
+    factors: Factors
+    probe: Probe | None
+    found: Evaluation
+    residual: Float[Array, " unknowns"]
+    ending: Bool[Array, ""]
+    wanting: Bool[Array, ""]
+    here: Bool[Array, ""]
+
+
+def attempt(setting: Setting, unpack: Callable[[Array], State], apart: bool, carried: Carried) -> Carried:
+    """One attempt at a (sub)step, to its end; if apart, no further than to where new factors are wanted.
+
+    What does not change from one evaluation to the next is outside of the loop over these, where the compiler
+    can see it: it is half of what an evaluation asks for.
+    """
     course = with_state(carried.course, unpack(carried.state))
-    it, over = course.it, setting.over(course)
     u, h, index = setting.situation(course)
-    lag, lagging = setting.lag(course), course.lagging
-    outset = replace_fields(carried.outset, lag=lag)
-    equations = prepare(setting.system, course.state, u, h, plan.tableau, outset)
-    if probe is None:
-        found = equations.evaluate(it.y)
-    else:
-        lag = told(lag, probe.making)
-        probe, found, it, factors = evaluated(setting, equations, probe, it, factors)
-    residual = with_remainder(equations, found.residual, course.left)
-    cost, options = _judging(equations, it, probe)
-    if lag is not None and lagging is not None:
-        options |= {"jumped": lagging.jumped(found.kick, lag, it), "whole": lag.due}
-    judged, factors = judge(factors, plan.tolerance, it, residual, found.size, **options)
-    if lag is not None and lagging is not None:
-        lagging = lagging.after(found.kick, lag.due, judged.correction, it)
-    it = judged
-    ending = ~any_lane(it.unsolved & ~over)
-    if lag is not None:
-        ending = ending & lag.due
-    wanting = ~ending & any_lane(it.wanting & it.unsolved & ~over)
+    equations = prepare(setting.system, course.state, u, h, setting.plan.tableau, carried.outset)
+    start = _unsolved(equations, carried)
+    evaluate = partial(_evaluation, setting, course, equations, apart)
+    solving = jax.lax.while_loop(lambda s: ~(s.ending | s.wanting), evaluate, start)
+    begun = replace_fields(carried.course, it=solving.it, lagging=solving.lagging)
+    found = solving.found.with_system(setting.system)
 
     def ended(carry: tuple) -> tuple:
-        _, before, x, _, record = carry
+        _, before, x, _, record, factors = carry
         before = with_state(before, unpack(x))
-        groups, tableau = equations.groups, plan.tableau
-        ends = end_of_step(setting.system, before.state, h, groups, found, tableau)
+        ends = end_of_step(setting.system, before.state, h, equations.groups, found, setting.plan.tableau)
         kick = None if before.lagging is None else found.kick.exact
-        missed = residual, found.size, before.it.correction
-        steady = sound(equations, before.it.y, *missed, ends[0], plan.tolerance)
+        missed = solving.residual, found.size, before.it.correction
+        steady = sound(equations, before.it.y, *missed, ends[0], setting.plan.tolerance)
         before = eqx.tree_at(lambda c: c.it.converged, before, before.it.converged & steady)
-        left = remainder(equations, residual, factors.inertias)
+        left = remainder(equations, solving.residual, factors.inertias)
         after = after_attempt(setting, before, factors.inertias, ends, left, kick)
         accepted = after.taken > before.taken
         x = ravel_pytree(after.state)[0]
@@ -123,57 +135,87 @@ def trip(setting: Setting, unpack: Callable[[Array], State], apart: bool, carrie
             # A kick that is not normal would change momenta.
             held = outset.tangents.with_system(setting.system).normal(after.lagging.held)
             after = eqx.tree_at(lambda c: c.lagging.held, after, held)
-        return jnp.array(False), with_state(after, None), x, outset, record
+        factors = _kept(setting, equations, before, after, factors, solving.probe)
+        return jnp.array(False), with_state(after, None), x, outset, record, factors
 
-    # Loops of no or one trip leave what they carry where it is; a conditional would copy it.
-    start = (
-        ending,
-        replace_fields(carried.course, it=it, lagging=lagging),
-        carried.state,
-        carried.outset,
-        carried.record,
-    )
-    _, after, x, outset, record = jax.lax.while_loop(lambda carry: carry[0], ended, start)
-    # An attempt for comparison leaves the run where it is, and factors that serve.
-    solved = after.taken > course.taken if setting.tolerance is None else it.converged
-    kept = factors.after_step(it, solved | over, cost)
-    factors = eqx.tree_at(
-        lambda f: (f.usable, f.fresh, f.least, f.extra, f.noise),
-        factors,
-        tuple(
-            jnp.where(ending, a, b)
-            for a, b in (
-                (kept.usable, factors.usable),
-                (kept.fresh, factors.fresh),
-                (kept.least, factors.least),
-                (kept.extra, factors.extra),
-                (kept.noise, factors.noise),
-            )
-        ),
-    )
-    if course.lagging is not None and after.lagging is not None:
-        # Factors of equations in which kicks are held are not those of equations in which they are not.
-        other = (course.lagging.closed > 0) != (after.lagging.closed > 0)
-        factors = eqx.tree_at(lambda f: f.usable, factors, factors.usable & ~other)
-    # Evaluated where the new factors belong, unless these begin anew where the step began.
-    here = jnp.all(after.it.y == course.it.y)
+    carry = solving.ending, begun, carried.state, carried.outset, carried.record, solving.factors
+    if apart:
+        # A loop of no or one trip leaves what it carries where it is; a conditional would copy it.
+        carry = jax.lax.while_loop(lambda carry: carry[0], ended, carry)
+    else:
+        carry = ended(carry)
+    _, after, x, outset, record, factors = carry
+    asked = None
+    if apart:
+        asked = Asked(solving.wanting, solving.residual, found.size, found.loads, solving.here)
+    count = carried.count + solving.ending
+    return Carried(count, after, x, outset, factors, solving.probe, record, carried.first, asked)
+
+
+def _unsolved(equations: Any, carried: Carried) -> Solving:
+    """Before the first evaluation."""
+    course, no = carried.course, jnp.array(False)
+    shapes = jax.eval_shape(lambda y: equations.evaluate(y).without_system(), course.it.y)
+    blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+    given = course.it, course.lagging, carried.factors, carried.probe
+    return Solving(*given, blank, blank.residual, no, no, no)
+
+
+def _evaluation(setting: Setting, course: Course, equations: Any, apart: bool, solving: Solving) -> Solving:
+    """One evaluation of the equations, and what follows from it.
+
+    If apart, new factors are asked for, but not made.
+    """
+    it, lagging, factors, probe = solving.it, solving.lagging, solving.factors, solving.probe
+    over = setting.over(course)
+    lag = setting.lag(replace_fields(course, it=it, lagging=lagging))
+    equations = replace_fields(equations, outset=replace_fields(equations.outset, lag=lag))
+    if probe is None:
+        found = equations.evaluate(it.y)
+    else:
+        lag = told(lag, probe.making)
+        probe, found, it, factors = evaluated(setting, equations, probe, solving.found, it, factors)
+    residual = with_remainder(equations, found.residual, course.left)
+    cost, options = _judging(equations, it, probe)
+    if lag is not None and lagging is not None:
+        options |= {"jumped": lagging.jumped(found.kick, lag, it), "whole": lag.due}
+    judged, factors = judge(factors, setting.plan.tolerance, it, residual, found.size, **options)
+    if lag is not None and lagging is not None:
+        lagging = lagging.after(found.kick, lag.due, judged.correction, it)
+    it, here = judged, jnp.all(judged.y == it.y)
+    ending = ~any_lane(it.unsolved & ~over)
+    if lag is not None:
+        ending = ending & lag.due
+    wanting = ~ending & any_lane(it.wanting & it.unsolved & ~over)
     if probe is not None:
         # Differences need the kick: where the iteration begins anew, it is found first.
-        astray = any_lane(after.it.wanting & after.it.unsolved & ~over & ~here)
-        probe = probe.asked(wanting & ~astray, any_lane(after.it.rounds), plan.tableau.stages)
-    asked = Asked(wanting, residual, found.size, found.loads, here)
-    carried = Carried(carried.count + ending, after, x, outset, factors, probe, record, carried.first, None)
-    if probe is not None:
-        return carried
-    if apart:
-        return replace_fields(carried, asked=asked)
+        astray = any_lane(it.wanting & it.unsolved & ~over & ~here)
+        probe = probe.asked(wanting & ~astray, any_lane(it.rounds), setting.plan.tableau.stages)
+        wanting = jnp.array(False)
+    elif not apart:
+        asked = Asked(wanting, residual, found.size, found.loads, here)
 
-    def renewed(carry: tuple) -> tuple:
-        _, it, factors = carry
-        return jnp.array(False), *renewed_at(setting, equations, it, factors, asked)
+        def renewed(carry: tuple) -> tuple:
+            _, it, factors = carry
+            return jnp.array(False), *renewed_at(setting, equations, it, factors, asked)
 
-    _, it, factors = jax.lax.while_loop(lambda carry: carry[0], renewed, (wanting, after.it, factors))
-    return eqx.tree_at(lambda c: (c.course.it, c.factors), carried, (it, factors))
+        wanting, it, factors = jax.lax.while_loop(lambda carry: carry[0], renewed, (wanting, it, factors))
+    return Solving(it, lagging, factors, probe, found.without_system(), residual, ending, wanting, here)
+
+
+def _kept(
+    setting: Setting, equations: Any, before: Course, after: Course, factors: Factors, probe: Probe | None
+) -> Factors:
+    """Factors after an attempt."""
+    # An attempt for comparison leaves the run where it is, and factors that serve.
+    solved = after.taken > before.taken if setting.tolerance is None else before.it.converged
+    cost, _ = _judging(equations, before.it, probe)
+    factors = factors.after_step(before.it, solved | setting.over(before), cost)
+    if before.lagging is not None and after.lagging is not None:
+        # Factors of equations in which kicks are held are not those of equations in which they are not.
+        other = (before.lagging.closed > 0) != (after.lagging.closed > 0)
+        factors = eqx.tree_at(lambda f: f.usable, factors, factors.usable & ~other)
+    return factors
 
 
 def _judging(equations: Any, it: Iterate, probe: Probe | None) -> tuple[int, dict[str, Any]]:
