@@ -187,6 +187,31 @@ def test_long_products_are_summed_piece_by_piece(product, left, right):
     assert loops == (0 if product == "ij,ij->" else 1)
 
 
+@pytest.mark.parametrize("length", [33, 40, 64])
+@pytest.mark.parametrize("reduction", [jnp.sum, jnp.max, jnp.min, jnp.all, jnp.any])
+def test_reductions_of_middle_length_stay_whole_for_the_compiler(length, reduction):
+    """It would take them apart into windows, which do not fuse and take several times as long."""
+    x = jnp.asarray(np.random.default_rng(4).normal(size=(3, length)))
+
+    def reduced(x):
+        return reduction(x > -3.0 if reduction in (jnp.all, jnp.any) else x, axis=1)
+
+    program = jax.jit(lambda x: as_one_kernel(reduced, x)).lower(x)
+    np.testing.assert_allclose(jax.jit(lambda x: as_one_kernel(reduced, x))(x), reduced(x), rtol=1e-14)
+    assert MARK in program.as_text() and "reduce-window" not in program.compile().as_text()
+
+
+@pytest.mark.parametrize("length", [25, 36, 60])
+def test_products_with_vectors_of_middle_length(length):
+    rng = np.random.default_rng(5)
+    a, x = jnp.asarray(rng.normal(size=(length, length))), jnp.asarray(rng.normal(size=length))
+    program = jax.jit(lambda a, x: as_one_kernel(lambda a, x: (a @ x, x @ a), a, x))
+    found = program(a, x)
+    np.testing.assert_allclose(found[0], np.asarray(a) @ np.asarray(x), atol=1e-13)
+    np.testing.assert_allclose(found[1], np.asarray(x) @ np.asarray(a), atol=1e-13)
+    assert "reduce-window" not in program.lower(a, x).compile().as_text()
+
+
 @pytest.mark.parametrize(
     "name", [n if n in USUAL else pytest.param(n, marks=pytest.mark.slow) for n in gallery.SCENES]
 )

@@ -5,7 +5,7 @@ Small products become sums, scatters updates of slices, long reductions loops; s
 
 import math
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import partial, reduce
 from typing import Any
 
 import jax
@@ -21,6 +21,10 @@ SUMMED = 12
 
 PIECE = 8
 """Terms of longer ones that are summed at a time."""
+
+LONG = 24
+"""Terms of the sums of a product with a vector from which on the same is done: short ones fuse with what they
+are made of."""
 
 TERMS = 6
 """The same of products too large for that, whose terms are added one by one."""
@@ -50,8 +54,20 @@ programs are."""
 REDUCTION_LIMIT = 3000
 """Numbers from which on the compiler hands a reduction to a library (seen: 4096)."""
 
-REDUCTIONS = {"reduce_sum": jnp.add, "reduce_max": jnp.maximum, "reduce_min": jnp.minimum}
-"""Reductions that are written as loops where they are long."""
+REDUCTIONS = {
+    "reduce_sum": jnp.add,
+    "reduce_max": jnp.maximum,
+    "reduce_min": jnp.minimum,
+    "reduce_and": jnp.logical_and,
+    "reduce_or": jnp.logical_or,
+}
+"""Reductions that are written as loops where they are long, and in pieces where an axis is."""
+
+WINDOW = 32
+"""Length of an axis beyond which the compiler takes a reduction apart itself, into parts that do not fuse."""
+
+FEW = 64
+"""Length up to which it is taken apart here: programs should not grow with the number of bodies."""
 
 REWRITTEN = frozenset(("dot_general", "scatter", "scatter-add", *INLINED))
 """Primitives that may be rewritten in terms of those."""
@@ -146,8 +162,12 @@ def _apply(equation: Any, given: list[Any]) -> list[Any]:
         found = _update(name, given, params)
         if found is not None:
             return [found]
-    if name in REDUCTIONS and math.prod(given[0].shape) >= REDUCTION_LIMIT:
-        return [_reduced(REDUCTIONS[name], given[0], params["axes"])]
+    if name in REDUCTIONS:
+        x, axes = given[0], params["axes"]
+        if math.prod(x.shape) >= REDUCTION_LIMIT:
+            return [_reduced(REDUCTIONS[name], x, axes)]
+        if WINDOW < max((x.shape[axis] for axis in axes), default=0) <= FEW:
+            return [_in_pieces(equation, x, WINDOW)]
     if name in INLINED and isinstance(params.get(INLINED[name]), jex.ClosedJaxpr):
         inner = params[INLINED[name]]
         return _evaluate(inner.jaxpr, inner.consts, given)
@@ -189,9 +209,13 @@ def _product(given: list[Any], params: dict[str, Any], out: Any) -> Array | None
     left = jnp.expand_dims(left, range(shared + len(free_left), shared + len(free_left) + len(free_right)))
     right = jnp.expand_dims(right, range(shared, shared + len(free_left)))
     axes = tuple(range(left.ndim - summed, left.ndim))
-    if terms < REDUCTION_LIMIT:
-        return jnp.sum(left * right, axis=axes)
-    return _reduced(jnp.add, left * right, axes)
+    if terms >= REDUCTION_LIMIT:
+        return _reduced(jnp.add, left * right, axes)
+    if summed == 1 and LONG < length <= FEW:
+        pieces = [slice(k, k + PIECE) for k in range(0, length, PIECE)]
+        parts = [jnp.sum(left[..., here] * right[..., here], axis=axes) for here in pieces]
+        return sum(parts[1:], parts[0])
+    return jnp.sum(left * right, axis=axes)
 
 
 def _piece_by_piece(left: Array, right: Array) -> Array:
@@ -224,6 +248,18 @@ def _piece_by_piece(left: Array, right: Array) -> Array:
     if rest:
         first = product(left[length - rest :], right[length - rest :])
     return jax.lax.fori_loop(0, whole, add, first)
+
+
+def _in_pieces(equation: Any, x: Array, size: int) -> Array:
+    """A reduction with long axes taken apart into pieces of some size."""
+    operation, axes = REDUCTIONS[equation.primitive.name], equation.params["axes"]
+    parts = [x]
+    for axis in axes:
+        starts = range(0, x.shape[axis], size)
+        ends = [min(start + size, x.shape[axis]) for start in starts]
+        parts = [jax.lax.slice_in_dim(p, a, b, axis=axis) for p in parts for a, b in zip(starts, ends)]
+    found = [equation.primitive.bind(part, **equation.params) for part in parts]
+    return reduce(operation, found)
 
 
 def _reduced(operation: Callable, x: Array, axes: Sequence[Any]) -> Array:
