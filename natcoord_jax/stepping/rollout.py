@@ -18,6 +18,7 @@ from jaxtyping import Array
 from natcoord_jax.assembly.system import System
 from natcoord_jax.core.results import Result
 from natcoord_jax.core.state import State
+from natcoord_jax.stepping.attempt import with_state
 from natcoord_jax.stepping.course import Course, Setting
 from natcoord_jax.stepping.error_control import Tolerance
 from natcoord_jax.stepping.factors import Factors
@@ -25,7 +26,6 @@ from natcoord_jax.stepping.newton import any_lane
 from natcoord_jax.stepping.one_kernel import as_one_kernel
 from natcoord_jax.stepping.plan import Plan, Slots
 from natcoord_jax.stepping.rounds import all_slots
-from natcoord_jax.stepping.trip import with_state
 
 
 class Ending(eqx.Module):

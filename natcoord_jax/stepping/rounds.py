@@ -19,6 +19,7 @@ from natcoord_jax.assembly.equations import kind_of, prepare
 from natcoord_jax.assembly.outset import Outset
 from natcoord_jax.assembly.system import System
 from natcoord_jax.core.state import State
+from natcoord_jax.stepping.attempt import Asked, Carried, attempt, renewed_at, with_state
 from natcoord_jax.stepping.course import Course, Setting, start_of
 from natcoord_jax.stepping.differences import first_probe
 from natcoord_jax.stepping.error_control import Tolerance
@@ -26,7 +27,6 @@ from natcoord_jax.stepping.factors import Factors
 from natcoord_jax.stepping.newton import Iterate, any_lane
 from natcoord_jax.stepping.one_kernel import as_one_kernel
 from natcoord_jax.stepping.plan import Plan
-from natcoord_jax.stepping.trip import Asked, Carried, attempt, renewed_at, with_state
 
 PARTS = 4
 """Bodies from which on new factors are made in a kernel of their own."""
