@@ -7,10 +7,13 @@ import pytest
 
 import natcoord_jax as nc
 from natcoord_jax import gallery
+from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.linsolve.dense import Inverse
 from natcoord_jax.linsolve.learning import FORESEEN, across, learnt
 from natcoord_jax.maths.projectors import pseudo_inverse, range_projector
-from natcoord_jax.stepping import newton
+from natcoord_jax.stepping import factors, newton
+from natcoord_jax.stepping.endpoint import endpoints
+from natcoord_jax.stepping.factors import new_factors
 
 YES = jnp.array(True)
 
@@ -110,3 +113,51 @@ def test_pseudo_inverse_from_a_projector(shape, least):
 def test_nothing_has_a_pseudo_inverse():
     nothing = jnp.zeros((3, 2))
     np.testing.assert_array_equal(pseudo_inverse(nothing, range_projector(nothing, 1), 1), nothing.T)
+
+
+def remembering(leaving):
+    return replace_fields(new_factors((Inverse(jnp.eye(2)), jnp.ones(2))), leaving=jnp.asarray(leaving))
+
+
+def test_factors_remember_what_corrections_have_left():
+    """Could go wrong: one lucky correction believed for ever, or an error that hides until it is not seen."""
+    new, no = remembering(1.0), jnp.array(False)
+    # Where nothing is known, the first correction leaves as much as it is, and others not less than is safe.
+    assert new.left_by(jnp.asarray(0.0), YES) == 1.0
+    np.testing.assert_allclose(new.left_by(jnp.asarray(1e-6), no), 0.02 / 0.98)
+    seen = new.having_left(jnp.asarray(1e-6), no)
+    assert seen.leaving == 1.0
+    seen = new.having_left(jnp.asarray(1e-6), YES)
+    np.testing.assert_allclose(seen.left_by(jnp.asarray(0.0), YES), 2e-6, rtol=1e-5)
+    np.testing.assert_allclose(seen.left_by(jnp.asarray(1e-7), no), 2e-6, rtol=1e-5)
+    # A worse one counts at once, a better one little by little; a ratio that is seen counts in any case.
+    worse = seen.having_left(jnp.asarray(1e-3), YES)
+    np.testing.assert_allclose(worse.leaving, 1e-3)
+    np.testing.assert_allclose(worse.having_left(jnp.asarray(1e-9), YES).leaving, 0.7e-3)
+    np.testing.assert_allclose(seen.left_by(jnp.asarray(0.3), no), 0.3 / 0.7)
+    # Where no one looks, less is known every time; and nothing at last.
+    old = seen
+    for _ in range(100):
+        old = old.aged()
+    assert seen.aged().leaving > seen.leaving and old.leaving == 1.0
+
+
+@pytest.mark.slow
+def test_what_is_remembered_saves_evaluations(monkeypatch):
+    """A step that knows its next evaluation to be the last one finds the kick there, and not one later."""
+    example = gallery.load("spacecraft")
+    # All parts turn about the origin, the centre of the base.
+    spin = jnp.cross(jnp.asarray([0.3, -0.2, 0.5]), example.state.q)
+    start = replace_fields(example.state, v=spin)
+
+    def corrections():
+        jax.clear_caches()
+        run = endpoints(example.system, start, inputs=example.torques, scheme=nc.EnergyMomentum(4))
+        end = run(5.0 / 100, 100)
+        return int(end.iterations), end.state.q
+
+    remembered, q = corrections()
+    monkeypatch.setattr(factors, "CAUTION", 1e9)
+    forgotten, other = corrections()
+    assert remembered < 0.85 * forgotten
+    np.testing.assert_allclose(q, other, atol=1e-11)

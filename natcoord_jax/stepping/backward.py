@@ -10,7 +10,6 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
@@ -151,8 +150,9 @@ class Backward:
             guess = jnp.where(jnp.all(jnp.isfinite(guess)), guess, 0.0)
             coming = row(slots.accepted, jnp.maximum(here - 1, 0))
             following = Correcting.first(coming, lam, factors)
+            aged = factors.aged()
             done = Returning(
-                c.left - 1, before_bar, tangents_bar, varied_bar, pasts, guess, following, factors, stuck
+                c.left - 1, before_bar, tangents_bar, varied_bar, pasts, guess, following, aged, stuck
             )
             waiting = replace_fields(c, lam=lam, at=at, factors=factors, stuck=stuck)
             return jax.tree.map(partial(jnp.where, stuck), waiting, done), u_bar
@@ -182,12 +182,14 @@ class Backward:
         given = numbers.varied, slot.before, tangents, slot.u
         nothing = jax.tree.map(jnp.zeros_like, given)
 
-        def changing(factors: Factors) -> Any:
+        def changing(factors: Factors) -> tuple:
             """What of the factors the corrections change."""
-            return factors.solver if learns(factors.solver) else None
+            return factors.leaving, factors.solver if learns(factors.solver) else None
 
-        def with_solver(learnt: Any) -> Factors:
-            return c.factors if learnt is None else eqx.tree_at(lambda f: f.solver, c.factors, learnt)
+        def with_changes(changes: tuple) -> Factors:
+            leaving, learnt = changes
+            solver = c.factors.solver if learnt is None else learnt
+            return replace_fields(c.factors, leaving=leaving, solver=solver)
 
         def outcome(varied: list[Array], state: State, tangents: Tangents | None, u: Any, y: Array) -> tuple:
             system, parameters, dt = numbers.whole(varied)
@@ -200,14 +202,14 @@ class Backward:
         def trip(carry: tuple) -> tuple:
             _, learnt, lam, at = carry
             *bars, gap = pull((lam, *end_bars))
-            at, known = at.judged(with_solver(learnt), lam, gap + y_bar, patience, whole, not once)
+            at, known = at.judged(with_changes(learnt), lam, gap + y_bar, patience, whole, not once)
             lam = jnp.where(at.moving, lam - at.change, lam)
             return tuple(bars) if once else None, changing(known), lam, at
 
         start = nothing if once else None, changing(c.factors), c.lam, c.at
         bars, learnt, lam, at = jax.lax.while_loop(lambda carry: any_lane(carry[-1].going), trip, start)
         found: Any = bars if once else tuple(pull((lam, *end_bars))[:-1])
-        return found, lam, at, with_solver(learnt)
+        return found, lam, at, with_changes(learnt)
 
     def _renewed(self, numbers: Numbers, slot: Slot) -> Factors:
         """New factors, for this slot."""

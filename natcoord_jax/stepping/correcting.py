@@ -9,7 +9,6 @@ from jaxtyping import Array, Bool, Float, Int
 
 from natcoord_jax.linsolve.learning import MEMORY, SPEED, across, learns, learnt
 from natcoord_jax.stepping.factors import Factors
-from natcoord_jax.stepping.newton import SLOWEST_UNSEEN
 
 CLOSE = 1e-12
 """Error of the solution of a transposed system relative to its size."""
@@ -23,9 +22,6 @@ STALL_ROUND_OFF = 1e-12
 
 SURPRISE = 10.0
 """Times the error allowed by which the correction may be larger that was expected to be within it."""
-
-FORESEEN = 0.1
-"""Part of the error allowed that what is foreseen may be: it is not looked at."""
 
 STALL = 1e-10
 """Corrections that stop shrinking below this have reached the floor of round-off."""
@@ -139,10 +135,11 @@ class Correcting(eqx.Module):
         stalled = ~first & (ratio > 0.5) & (entire <= floor)
         within = entire <= jnp.where(self.last, SURPRISE, 1.0) * allowed
         done = (within | stalled) & finite & factors.usable
-        trusted = jnp.maximum(ratio, SLOWEST_UNSEEN)
-        following = correction * trusted / jnp.maximum(1.0 - trusted, 1e-3)
-        last = ~first & (following <= allowed)
-        done = done | (foreseen & ~first & (following <= FORESEEN * allowed) & finite & factors.usable)
+        following = correction * factors.left_by(ratio, first)
+        compares = self.going & ~first & (self.correction > allowed) & finite
+        factors = factors.having_left(ratio, compares)
+        last = following <= allowed
+        done = done | (foreseen & last & finite & factors.usable)
         late = correction * ratio ** (patience * (SPEED if learns(solver) else 1)) > allowed
         slow = (~first & ((ratio > 0.5) | late)) | (self.count >= CORRECTIONS) | ~finite | ~factors.usable
         slow = slow & ~done

@@ -15,6 +15,19 @@ ones may be slow convergence."""
 NEVER = 1000
 """More corrections than a step can need."""
 
+SLOWEST_UNSEEN = 0.02
+"""Part of a correction that is assumed to be left at least where less has not been seen in earlier steps: a
+slow part of the error may hide behind fast ones in the first ratio."""
+
+CAUTION = 2.0
+"""Times what earlier corrections have left to the next that another may leave."""
+
+AGEING = 1.2
+"""Times what was seen in one system that is taken for seen in the next, where no one looks."""
+
+FORGETTING = 0.7
+"""Part of the most that corrections have left which still counts after one that leaves less."""
+
 
 class Factors(eqx.Module):
     """Factors of a Jacobian.
@@ -27,6 +40,8 @@ class Factors(eqx.Module):
         least: fewest corrections that a step has needed with them.
         extra: corrections beyond these that later steps have needed.
         noise: last correction of a step, relative to the terms of the equations, averaged over steps.
+        leaving: most that a correction has left to the next one lately, in terms of its size; 1: nothing is
+            known yet.
     """
 
     solver: Any
@@ -36,6 +51,7 @@ class Factors(eqx.Module):
     least: Int[Array, ""]
     extra: Int[Array, ""]
     noise: Float[Array, ""]
+    leaving: Float[Array, ""]
 
     def after_step(self, it: Any, usable: Bool[Array, ""], cost: int) -> "Factors":
         """Factors for the next step: given up once they have cost more corrections than new ones would.
@@ -52,7 +68,29 @@ class Factors(eqx.Module):
         # Factors of a step that was hard to solve are of no use to others.
         keep = usable & self.usable & (extra <= cost) & (corrections <= 2 * cost)
         noise = jnp.where(usable & it.converged, 0.5 * (self.noise + it.error), self.noise)
-        return Factors(self.solver, self.inertias, keep, jnp.zeros_like(self.fresh), least, extra, noise)
+        stale = jnp.zeros_like(self.fresh)
+        return Factors(self.solver, self.inertias, keep, stale, least, extra, noise, self.leaving)
+
+    def having_left(self, ratio: Array, telling: Array) -> "Factors":
+        """What is known of them after a correction that was this part of the one before it, if that tells."""
+        before = jnp.where(self.leaving < 1.0, FORGETTING * self.leaving, 0.0)
+        leaving = jnp.where(telling, jnp.clip(ratio, before, 1.0), self.leaving)
+        return eqx.tree_at(lambda f: f.leaving, self, leaving)
+
+    def aged(self) -> "Factors":
+        """Factors for another system, in which corrections may leave more."""
+        return eqx.tree_at(lambda f: f.leaving, self, jnp.minimum(AGEING * self.leaving, 1.0))
+
+    def left_by(self, ratio: Array, first: Array) -> Float[Array, ""]:
+        """Error that is expected after a correction, in terms of its size.
+
+        Args:
+            ratio: of its size to that of the one before it.
+            first: whether it is the first one, to which nothing compares.
+        """
+        seen = jnp.minimum(CAUTION * self.leaving, 1.0)
+        part = jnp.where(first, seen, jnp.maximum(ratio, jnp.minimum(seen, SLOWEST_UNSEEN)))
+        return jnp.minimum(part / jnp.maximum(1.0 - part, 1e-3), jnp.where(first, 1.0, jnp.inf))
 
     @property
     def rounding(self) -> Float[Array, ""]:
@@ -67,7 +105,7 @@ def no_factors(equations: Any) -> Factors:
     shapes = jax.eval_shape(equations.factorised, equations.like_tangent(y))
     solver, inertias = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
     no, noise = jnp.array(False), jnp.zeros((), y.dtype)
-    return Factors(solver, inertias, no, no, jnp.array(NEVER), jnp.array(0), noise)
+    return Factors(solver, inertias, no, no, jnp.array(NEVER), jnp.array(0), noise, noise + 1.0)
 
 
 def factors_of(equations: Any, matrix: Any, noise: Array | float = 0.0) -> Factors:
@@ -79,4 +117,5 @@ def new_factors(made: tuple[Any, Array], noise: Array | float = 0.0) -> Factors:
     """Factors that have just been made, with the inertias of the unknowns."""
     solver, inertias = made
     yes, noise = jnp.array(True), jnp.asarray(noise, inertias.dtype)
-    return Factors(solver, inertias, yes, yes, jnp.array(NEVER), jnp.array(0), noise)
+    unknown = jnp.ones_like(noise)
+    return Factors(solver, inertias, yes, yes, jnp.array(NEVER), jnp.array(0), noise, unknown)

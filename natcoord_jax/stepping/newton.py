@@ -64,9 +64,6 @@ NEWTON_ROUNDS = 25
 FEW_ROUNDS = 4
 """The same where a shorter substep is an answer: at the right length, one or two do."""
 
-SLOWEST_UNSEEN = 0.02
-"""Contraction assumed at least: a slow part of the error may hide behind fast ones in the first ratio."""
-
 LEARNING = 1e-12
 """Size of a correction relative to the terms of the equations from which on the next tells how good the
 factors are: below, rounding has a part in it."""
@@ -203,8 +200,8 @@ def judge(
     correction = jnp.sqrt(jnp.sum(energies))
     first = (it.count == 0) | jumped
     ratio = correction / jnp.where(it.correction > 0, it.correction, 1.0)
-    trusted = jnp.maximum(ratio, SLOWEST_UNSEEN)
-    predicted = correction * jnp.where(first, 1.0, trusted / jnp.maximum(1.0 - trusted, 1e-3))
+    predicted = correction * factors.left_by(ratio, jnp.asarray(first))
+    factors = factors.having_left(ratio, telling)
     raised = jnp.asarray(RAISED)[jnp.clip(it.rounds - 1, 0, STALLS)]
     trust = jnp.where(alike, STALL_ALIKE, jnp.where(factors.fresh, raised, STALL_OLD))
     floor = trust * max(tolerance, ROUND_OFF) * size
