@@ -1,5 +1,6 @@
 """The schemes of order four to ten: what is kept, and how fast errors fall."""
 
+from fractions import Fraction
 from functools import cache
 
 import equinox as eqx
@@ -13,6 +14,7 @@ from scenes import JOINTS, pair, with_multipliers
 
 import natcoord_jax as nc
 from natcoord_jax import gallery
+from natcoord_jax.maths.coefficients import collocation
 from natcoord_jax.maths.collocation import gauss, rotate_stages
 from natcoord_jax.stepping.plan import Plan
 
@@ -263,6 +265,30 @@ def test_one_stage_with_kicks():
         errors.append(float(jnp.max(jnp.abs(found.v[-1] - wanted.v[-1]))))
         assert float(jnp.max(system.constraint_errors(found).velocity)) <= tol.TANGENT
     assert np.log2(errors[0] / errors[1]) == pytest.approx(2.0, abs=tol.ORDER_TOLERANCE)
+
+
+@pytest.mark.parametrize("stages", [2, 3, 4, 5])
+def test_coefficients_keep_what_they_are_to_keep(stages):
+    """Far beyond rounding: an error of one has the same sign in every step."""
+    tableau, every = gauss(stages), range(stages)
+    exact = collocation(tableau.c)
+    x = [[sum(map(Fraction, parts)) for parts in zip(*rows)] for rows in zip(*tableau.a_inverse_parts)]
+    beta = [sum(map(Fraction, parts)) for parts in zip(*tableau.beta_parts)]
+    for j in every:
+        assert abs(sum(exact.b[i] * x[i][j] for i in every) - beta[j]) < 1e-22
+        for i in every:
+            assert abs(exact.b[i] * x[i][j] + exact.b[j] * x[j][i] - beta[i] * beta[j]) < 1e-22
+            b, a = [Fraction(y) for y in tableau.b], tableau.a
+            assert abs(b[i] * Fraction(a[i][j]) + b[j] * Fraction(a[j][i]) - b[i] * b[j]) < 1e-18
+    np.testing.assert_allclose(tableau.a_inverse, np.linalg.inv(tableau.a), rtol=1e-13)
+    np.testing.assert_array_equal(np.asarray(tableau.beta), [float(y) for y in beta])
+    rates = jax.random.normal(jax.random.key(0), (stages, 2, 3))
+    np.testing.assert_allclose(
+        tableau.differentiated(rates), np.einsum("ij,j...->i...", tableau.a_inverse, rates), atol=1e-14
+    )
+    np.testing.assert_allclose(
+        tableau.gained(rates), np.einsum("j,j...->...", tableau.beta, rates), atol=1e-14
+    )
 
 
 @pytest.mark.parametrize("stages", [1, 2, 3, 5])

@@ -177,13 +177,13 @@ def ends_of(
     tableau: Tableau,
 ) -> Ends:
     """The velocity at the end of a step: that of its stages, less the kick taken back."""
-    beta, rates, turning = jnp.asarray(tableau.beta), at.rates[:, :-1], rotor_rates(system, groups, at, h)
+    rates, turning = at.rates[:, :-1], rotor_rates(system, groups, at, h)
     before, after = kick.before, kick.after
     v = Velocity(state.v.reshape(-1, 4, 3), state.rates)
     start = Velocity(v.rows + kick.kick.rows, v.rotors + kick.kick.rotors)
     last = Velocity(
-        start.rows + jnp.tensordot(beta, rates - start.rows, 1),
-        start.rotors + beta @ (turning - start.rotors),
+        start.rows + tableau.gained(rates - start.rows),
+        start.rotors + tableau.gained(turning - start.rotors),
     )
     end = after.projected(last)
     back = Velocity(end.rows - last.rows, end.rotors - last.rotors)

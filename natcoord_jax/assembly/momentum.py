@@ -78,7 +78,7 @@ def stage_momentum(
     """M sum_j (A^-1)_ij (V_j - v_0)."""
     if tableau.stages == 1:
         return inertia(mass, tableau.a_inverse[0][0] * difference)
-    return inertia(mass, jnp.einsum("ij,jbrc->ibrc", jnp.asarray(tableau.a_inverse), difference))
+    return inertia(mass, tableau.differentiated(difference))
 
 
 class Balance(eqx.Module):

@@ -222,8 +222,7 @@ class CoordinateInertia(CoordinateEffect):
 
     def generalised(self, rates: Array, now: Now, lam: Array) -> tuple[Array, Array, Array]:
         """Inertia impulse -I sum_j (A^-1)_ij (r_j - r_0) with the stored rate r_0."""
-        coefficients = jnp.asarray(now.tableau.a_inverse)
-        forces = -self.inertia_of() * (coefficients @ (rates - now.rates))
+        forces = -self.inertia_of() * now.tableau.differentiated(rates - now.rates)
         return forces, jnp.zeros((forces.shape[0], 0)), jnp.zeros(forces.shape[0])
 
     def stored(self, place: Array, rows: Array, coordinates: Array, rates: Array) -> Array:

@@ -4,16 +4,14 @@ A step over h has stage velocities V_i at the Gauss points. Positions at the sta
 Q_i = q_0 + h sum_j a_ij V_j; one stage is the implicit mid-point rule.
 """
 
-import math
-from collections.abc import Iterator
 from dataclasses import dataclass
-from fractions import Fraction
-from functools import lru_cache, partial
+from functools import lru_cache
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from natcoord_jax.maths.coefficients import Rows, collocation, in_parts, rounded, rounded_pairs
 from natcoord_jax.maths.vectors import cross, dot, skew
 
 
@@ -22,12 +20,16 @@ class Tableau:
     """Coefficients of Gauss collocation with `stages` stages, as nested tuples (hashable, hence static)."""
 
     stages: int
-    a: tuple[tuple[float, ...], ...]
+    a: Rows
     b: tuple[float, ...]
     c: tuple[float, ...]
-    a_inverse: tuple[tuple[float, ...], ...]
+    a_inverse: Rows
     beta: tuple[float, ...]
     """b^T A^-1: the end velocity is v_0 + sum beta_i (V_i - v_0)."""
+    a_inverse_parts: tuple[Rows, Rows] | None = None
+    """A^-1 as a sum of few digits and the rest, see `differentiated`; None: it is exact as it is."""
+    beta_parts: tuple[tuple[float, ...], tuple[float, ...]] | None = None
+    """The same of beta."""
     kick: bool = False
     """Whether velocities are kept tangent to the constraints by isometric kicks along their normals."""
     variational: bool = False
@@ -60,6 +62,25 @@ class Tableau:
         """-R(infinity), the sign with which a kick is taken back at the end of the step."""
         return 1.0 if self.stages % 2 else -1.0
 
+    def differentiated(self, x: Float[Array, "stages *n"]) -> Float[Array, "stages *n"]:
+        """sum_j (A^-1)_ij x_j, with no error of the coefficients that would show.
+
+        Energy is kept because sum_i b_i (A^-1)_ij = beta_j and b_i (A^-1)_ij + b_j (A^-1)_ji = beta_i beta_j.
+        Rounded coefficients violate this by up to 1e-15, always to the same side. Here the products are
+        rounded, each time anew, and the coefficients are not.
+        """
+        return _summed(self.a_inverse_parts or (self.a_inverse,), x)
+
+    def gained(self, x: Float[Array, "stages *n"]) -> Float[Array, "*n"]:
+        """sum_i beta_i x_i, likewise."""
+        return _summed(self.beta_parts or (self.beta,), x)
+
+
+def _summed(parts: tuple, x: Array) -> Array:
+    """Sum of products with the parts of a coefficient matrix."""
+    first, *rest = (jnp.tensordot(jnp.asarray(part, x.dtype), x, 1) for part in parts)
+    return sum(rest, first)
+
 
 def _gauss_points(count: int) -> tuple[np.ndarray, np.ndarray]:
     points, weights = np.polynomial.legendre.leggauss(count)
@@ -78,119 +99,22 @@ def _integrals(nodes: np.ndarray, upper: np.ndarray) -> np.ndarray:
     return np.array(rows).T
 
 
-Polynomial = list[Fraction]
-"""Coefficients, the constant one first."""
-
-DIGITS = 10**45
-"""Denominator of the exact nodes: their errors are far below those of rounding the coefficients."""
-
-NEIGHBOURS = 1
-"""Steps of the last place within which rounded coefficients are chosen. More would spoil their sums."""
-
-
-def _at(p: Polynomial, x: Fraction) -> Fraction:
-    value = Fraction(0)
-    for coefficient in reversed(p):
-        value = value * x + coefficient
-    return value
-
-
-def _derivative(p: Polynomial) -> Polynomial:
-    return [k * coefficient for k, coefficient in enumerate(p)][1:]
-
-
-def _integral(p: Polynomial) -> Polynomial:
-    return [Fraction(0), *(coefficient / (k + 1) for k, coefficient in enumerate(p))]
-
-
-def _exact_nodes(count: int) -> list[Fraction]:
-    """Zeros of Legendre's polynomial on [0, 1], by Newton's iteration."""
-    legendre = [
-        Fraction((-1) ** (count + k) * math.comb(count, k) * math.comb(count + k, k))
-        for k in range(count + 1)
-    ]
-    nodes = []
-    for start in _gauss_points(count)[0]:
-        x = Fraction(float(start))
-        for _ in range(3):
-            x = (x - _at(legendre, x) / _at(_derivative(legendre), x)).limit_denominator(DIGITS)
-        nodes.append(x)
-    return nodes
-
-
-def _through(node: Fraction, zeros: list[Fraction]) -> Polynomial:
-    """The polynomial that is one at a node and zero at others."""
-    p = [Fraction(1)]
-    for zero in zeros:
-        raised, scaled = [Fraction(0), *p], [*p, Fraction(0)]
-        p = [(up - zero * down) / (node - zero) for up, down in zip(raised, scaled)]
-    return p
-
-
-def _near(x: float) -> Iterator[float]:
-    """A number and its neighbours, itself first."""
-    yield x
-    for direction in (-math.inf, math.inf):
-        neighbour = x
-        for _ in range(NEIGHBOURS):
-            neighbour = math.nextafter(neighbour, direction)
-            yield neighbour
-
-
-def _partner(x: float, product: Fraction, own: Fraction, other: Fraction) -> float:
-    """What makes own * x + other * partner the product, rounded."""
-    return float((product - own * Fraction(x)) / other)
-
-
-def _missing(x: float, product: Fraction, own: Fraction, other: Fraction) -> Fraction:
-    """By how much a number and its partner fail to make the product."""
-    return abs(product - own * Fraction(x) - other * Fraction(_partner(x, product, own, other)))
-
-
-def _unequal(x: float, weight: Fraction) -> Fraction:
-    """By how much the square of a number differs from twice a rounded number times the weight."""
-    square = Fraction(x) ** 2
-    return abs(square - 2 * weight * Fraction(float(square / (2 * weight))))
-
-
-def _rounded_pairs(exact: list[list[Fraction]], b: list[float], products: list[float]) -> list[list[float]]:
-    """A matrix X rounded so that b_i X_ij + b_j X_ji = p_i p_j holds as well as it can."""
-    weights, p = [Fraction(x) for x in b], [Fraction(x) for x in products]
-    rounded = [[float(x) for x in row] for row in exact]
-    for i in range(len(b)):
-        rounded[i][i] = float(p[i] ** 2 / (2 * weights[i]))
-        for j in range(i):
-            pair = dict(product=p[i] * p[j], own=weights[i], other=weights[j])
-            rounded[i][j] = min(_near(rounded[i][j]), key=partial(_missing, **pair))
-            rounded[j][i] = _partner(rounded[i][j], **pair)
-    return rounded
-
-
 @lru_cache
 def gauss(stages: int, kick: bool = False) -> Tableau:
     """Tableau of Gauss collocation; one stage without kick gives the energy-momentum step (57).
 
-    Quadratic invariants are kept because b_i a_ij + b_j a_ji = b_i b_j, and energy because the same holds
-    for A^-1 with beta. Coefficients that are merely rounded violate this by up to 1e-13, always to the same
-    side: over 10^6 steps the error of the energy then grows steadily, to 1e-10. Therefore they are computed
-    exactly, and rounded in pairs.
+    Quadratic invariants are kept because b_i a_ij + b_j a_ji = b_i b_j. Coefficients that are merely rounded
+    violate this, always to the same side, and over 10^6 steps the error grows steadily. Therefore they are
+    computed exactly, and rounded in pairs; for what keeps the energy see `Tableau.differentiated`.
     """
-    nodes = _exact_nodes(stages)
-    others = [[x for x in nodes if x != node] for node in nodes]
-    lagrange = [_through(node, rest) for node, rest in zip(nodes, others)]
-    # What begins at zero: A^-1 is its differentiation, beta its value at the end.
-    growing = [_through(node, [Fraction(0), *rest]) for node, rest in zip(nodes, others)]
-    integrals = [_integral(p) for p in lagrange]
-    b = [float(_at(p, Fraction(1))) for p in integrals]
-    ends = [float(_at(p, Fraction(1))) for p in growing]
-    beta = [min(_near(end), key=partial(_unequal, weight=Fraction(x))) for end, x in zip(ends, b)]
-    a = _rounded_pairs([[_at(p, x) for p in integrals] for x in nodes], b, b)
-    a_inverse = _rounded_pairs([[_at(_derivative(p), x) for p in growing] for x in nodes], b, beta)
-
-    def rows(matrix: list[list[float]]) -> tuple[tuple[float, ...], ...]:
-        return tuple(tuple(row) for row in matrix)
-
-    return Tableau(stages, rows(a), tuple(b), tuple(map(float, nodes)), rows(a_inverse), tuple(beta), kick)
+    exact = collocation(_gauss_points(stages)[0].tolist())
+    nodes, b = tuple(map(float, exact.nodes)), rounded([exact.b])[0]
+    a, a_inverse, beta = rounded_pairs(exact.a, b), rounded(exact.a_inverse), rounded([exact.beta])[0]
+    if stages == 1:  # All of them are whole numbers, or halves.
+        return Tableau(stages, a, b, nodes, a_inverse, beta, kick=kick)
+    first, rest = in_parts([exact.beta])
+    beta_parts = first[0], rest[0]
+    return Tableau(stages, a, b, nodes, a_inverse, beta, in_parts(exact.a_inverse), beta_parts, kick)
 
 
 @lru_cache

@@ -71,7 +71,7 @@ def end_of_step(
     at = found.at
     bodies = len(system.structure.bodies)
     rates = at.rates[:, :bodies].reshape(tableau.stages, 4 * bodies, 3)
-    b, beta = jnp.asarray(tableau.b), jnp.asarray(tableau.beta)
+    b = jnp.asarray(tableau.b)
     q = state.q + h * jnp.tensordot(b, rates, 1)
     coordinates, work = state.coordinates, state.work
     turning, ends = stage_rates(system, at, h), None
@@ -86,11 +86,11 @@ def end_of_step(
         jumped = found.given.velocity
         start, rotors, extra = jumped.rows.reshape(state.v.shape), jumped.rotors, found.given.work
     if ends is None:
-        v = start + jnp.tensordot(beta, rates - start, 1)
+        v = start + tableau.gained(rates - start)
         carrying = [g.coordinates[:, 0] for g in groups if g.effect.rotors]
         if carrying:
             # Groups own consecutive pieces of the stored rates, in order.
-            rotors = rotors + beta @ (turning[:, jnp.concatenate(carrying)] - rotors)
+            rotors = rotors + tableau.gained(turning[:, jnp.concatenate(carrying)] - rotors)
     else:
         v, rotors = ends.velocity.rows.reshape(state.v.shape), ends.velocity.rotors
     working, relation = [], 0
