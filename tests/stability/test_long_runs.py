@@ -94,8 +94,10 @@ def test_no_trend(name, order):
 @pytest.mark.slow
 @pytest.mark.parametrize("order", [4, 10])
 def test_no_trend_at_long_steps(order):
-    """A body turns by 1.5 rad in every step. Could go wrong: coefficients that are rounded once keep the energy
-    to 1e-15 a step, but always to the same side."""
+    """A body turns by 1.5 rad in every step.
+
+    Could go wrong: coefficients that are rounded once, and lose 1e-15 of the energy in each.
+    """
     scene, steps = example("heavy_top"), 20_000
     run = endpoints(scene.system, scene.state, scheme=nc.EnergyMomentum(order))
     start, end = (scene.system.energy(state).total for state in (scene.state, run(0.01, steps).state))
