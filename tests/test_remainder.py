@@ -10,8 +10,8 @@ from scenes import pair, with_multipliers
 import natcoord_jax as nc
 from natcoord_jax import gallery
 from natcoord_jax.assembly.equations import prepare
+from natcoord_jax.stepping import attempt
 from natcoord_jax.stepping import remainder as subject
-from natcoord_jax.stepping import trip
 
 
 def equations_of(order, form):
@@ -57,6 +57,6 @@ def test_rounding_does_not_add_up(name, monkeypatch):
     """Energy walks far less than if every step began anew."""
     with_it = drift_of(name)
     assert with_it <= tol.HANDED_ON
-    monkeypatch.setattr(trip, "remainder", lambda equations, *given: 0.0 * equations.by_stage(given[0])[0])
+    monkeypatch.setattr(attempt, "remainder", lambda equations, *given: 0.0 * equations.by_stage(given[0])[0])
     # Another number of steps is another program.
     assert drift_of(name, 4001) >= 3.0 * with_it
