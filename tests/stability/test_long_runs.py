@@ -78,7 +78,7 @@ def test_a_million_steps(name, order):
 @EVERY_ORDER
 @EVERY_TOP
 def test_no_trend(name, order):
-    """At the default settings, too, drifts are walks without direction: all at order two.
+    """At the default settings, too, drifts are walks without direction: all at orders two and four.
 
     At order six some are not. What is steady is listed by name, with a bound for every step: a fraction of a
     rounding, which a million steps add up to 3e-12.
