@@ -112,7 +112,12 @@ def test_rows_of_four_bars(order, bars):
     assert system.structure.dofs == 1
     assert kept.energy_error <= tol.ENERGY
     upright = [found[f"upright {k}"][:, 1:] for k in range(bars + 1)]
-    assert max(np.max(np.abs(x - upright[0])) for x in upright) <= tol.SAME_TRAJECTORY
+    apart = np.max([np.max(np.abs(x - upright[0]), axis=(1, 2)) for x in upright], axis=0)
+    # Where the row is flat, lengths of its bars do not see how uprights turn: rounding counts as the inverse
+    # of the distance from there, and a step may end as near to it as chance will have it.
+    from_flat = np.abs(upright[0][:, 1, 1])
+    assert np.min(from_flat) <= 0.05
+    assert np.max(apart * from_flat) <= tol.ALONG_THE_ROW
 
 
 @ORDERS
