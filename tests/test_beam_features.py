@@ -658,7 +658,7 @@ def test_a_rotating_cantilever(rate, flap):
 # --- derivatives and limit points -------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_sag_by_density():
     """Could go wrong: weight that is no function of the section. Small sag is in proportion to density, and
 
@@ -737,7 +737,7 @@ def limit_load():
     return largest_load(heights, np.array(loads))
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_limit_load_of_an_arch():
     """Could go wrong: a path that leaves the branch, meshes that do not converge to Reissner's equations."""
     found = []
@@ -751,7 +751,7 @@ def test_limit_load_of_an_arch():
     assert richardson(*found) == pytest.approx(exact, rel=1e-3)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_derivatives_of_a_path():
     """Could go wrong: a rate along the path in place of the derivative at fixed load, which is promised."""
     system, state, top = shallow_arch(4)

@@ -128,7 +128,7 @@ class History(eqx.Module):
         return jax.vmap(lambda column: jnp.interp(t, self.times, column), in_axes=1)(self.values)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_derivatives_of_motion():
     """Of the tip's place with respect to stiffness, length, density, load history and unstressed curvature:
     the scene itself is built from numbers that are differentiated."""

@@ -119,7 +119,7 @@ def test_equilibria_do_not_depend_on_the_path():
     assert abs(tip(system, direct, beam)[1]) > 0.2
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_derivatives_of_equilibria():
     """With respect to stiffness, length, load and unstressed curvature; forward, reverse, second."""
     system, state, beam = loaded()

@@ -379,7 +379,7 @@ def test_reorientation_of_the_spacecraft(reoriented):
     assert found.hamiltonian_spread < 0.02
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_reorientation_with_failed_wheels():
     two = solved(manoeuvres.reorientation(100, working=(1, 2)))
     assert max(abs(x) for x in two.missing.values()) < 1e-10
@@ -430,7 +430,7 @@ def test_receding_horizon_brings_a_disturbed_spacecraft_home():
     assert missed(horizons.trajectory) < 0.1 * missed(open_loop)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_derivative_of_the_optimum_by_a_parameter(hinged):
     system, state = hinged
 
@@ -498,7 +498,7 @@ def test_first_order_descent_respects_bounds_of_inputs(hinged):
     assert found.cost == pytest.approx(known.cost, rel=2e-2)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_mirror_images_are_two_optima(hinged):
     either = nc.goal.Equal(lambda s: s.coordinates[0] ** 2 - 1.0, "one radian, either way") & nc.goal.Rest()
     problem = rest_to_rest(hinged, steps=10, goal=either)

@@ -9,7 +9,7 @@ import natcoord_jax as nc
 from natcoord_jax import gallery
 from natcoord_jax.gallery.plugging import along_a_smooth_path, joint_angles
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.exhaustive
 
 
 @pytest.fixture(scope="module")

@@ -24,7 +24,7 @@ def flexible_arm():
     return (*scene.compile(), beam)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_flexible_arm_follows_the_path(flexible_arm):
     system, state, beam = flexible_arm
     assert system.structure.solver == "recursive"

@@ -167,7 +167,7 @@ def test_derivatives_in_every_mode():
     assert float(forward(AT)) == pytest.approx(slope, rel=tol.SAME_GRADIENT)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_second_derivatives():
     """Of one hinge and its spring: programs of second derivatives are long."""
 
@@ -188,7 +188,7 @@ def test_second_derivatives():
     assert curvature == pytest.approx(difference, rel=10 * tol.DIFFERENCE_BEST)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_derivatives_with_loops():
     """Of the loop whose constraints depend on each other."""
     example = gallery.load("bricard")

@@ -117,7 +117,7 @@ def test_a_jerky_grip_loses_energy(short):
     assert float(turning[0]) == pytest.approx(float(turning[1]), abs=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_whole_run(tmp_path, monkeypatch, capsys):
     """From the command line, in the steps that the scene suggests."""
     runs, run_of = [], gallery.Example.run

@@ -279,7 +279,7 @@ def gradient_and_curvature(solver):
     return jax.jit(lambda u: jax.jvp(jax.grad(loss), (u,), (jnp.cos(u),)))(inputs)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("solver", ["recursive", "full"])
 def test_solvers_give_one_gradient(solver):
     for a, b in zip(gradient_and_curvature("reduced"), gradient_and_curvature(solver)):

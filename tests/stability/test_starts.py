@@ -11,11 +11,14 @@ import jax
 import jax.numpy as jnp
 import pytest
 import tolerances as tol
-from motions import SECOND_AND_FOURTH, simulate
+from motions import simulate
 
 import natcoord_jax as nc
 
-pytestmark = pytest.mark.slow
+ORDERS = (
+    pytest.param(2, marks=pytest.mark.slow),
+    pytest.param(4, marks=pytest.mark.exhaustive),
+)
 
 
 JOINTS = (("cardan", nc.Universal), ("tube", nc.Cylindrical))
@@ -73,7 +76,7 @@ def at_rest(order, system, state, second=True):
     return *jax.jit(along)(x), gradient, curvature
 
 
-@SECOND_AND_FOURTH
+@pytest.mark.parametrize("order", ORDERS)
 def test_everything_at_zero(order):
     """Rest, zero strain, aligned axes: value, gradient, tangent and Hessian times vector are finite.
 
@@ -100,16 +103,19 @@ def collapsed(length: float):
 @pytest.mark.parametrize(
     "order, length",
     [
-        (2, 0.0),
-        (4, 0.0),
+        pytest.param(2, 0.0, marks=pytest.mark.slow),
+        pytest.param(4, 0.0, marks=pytest.mark.exhaustive),
         pytest.param(
             2,
             0.5,
-            marks=pytest.mark.xfail(
-                strict=True,
-                raises=AssertionError,
-                reason="the energy has a cone there: its second derivative does not exist, and is NaN",
-            ),
+            marks=[
+                pytest.mark.slow,
+                pytest.mark.xfail(
+                    strict=True,
+                    raises=AssertionError,
+                    reason="the energy has a cone there: its second derivative does not exist, and is NaN",
+                ),
+            ],
         ),
     ],
 )
