@@ -1,7 +1,7 @@
 """What accuracy costs in time, by order, beside MuJoCo, MJX and Exudyn: one run, one core.
 
 usage: python -m benchmarks.work_precision [--quick] [--output FOLDER] [--peers-python PATH] [--no-peers]
-       [--models NAME ...] [--gradients] [--redraw JSON]
+       [--models NAME ...] [--keep] [--gradients] [--redraw JSON]
 
 Open trees (spacecraft, from rest and spinning, open tree, heavy top, double pendulum), closed loops (a row of
 two four-bars, Bricard's mechanism) and a chain of rods on stiff springs, beside the peers at the settings
@@ -19,15 +19,23 @@ stiff chain are, as soon as they are stable. Tables print it with a "<", and "-"
 `gradients` are of the initial state, value and gradient over the value alone, by order. With --gradients
 nothing else is measured, in minutes, and goes into gradients.json.
 
+Codes are compared on one scene in one run. JSON and figure are written after every scene, so a run that is
+stopped loses only the scene it was at; --keep goes on from there, or measures some scenes again. `run` of
+each scene has the date and commit of its figures, and the load of the machine; everything else must be the
+same for all.
+
 `long`, made with the heavy top, are runs of 10^6 steps (10^4 with --quick) of 1 ms: by code the largest
 drift of energy, and its trend from start to end; None for runs that fail or diverge.
 """
 
+import argparse
+import json
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache, partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -50,6 +58,7 @@ TREES = ("spacecraft", "spinning_spacecraft", "open_tree", "heavy_top", "double_
 LOOPS = ("four_bar", "bricard")
 STIFF = ("stiff_chain",)
 SHARED = (*TREES, *LOOPS, *STIFF)
+RUN = ("date", "commit", "uncommitted_changes")
 GRADIENTS = {
     "spacecraft": (2, 4, 6),
     "heavy_top": (2, 4, 6, 8),
@@ -450,14 +459,68 @@ def draw(results: dict[str, Any]) -> Any:
         panel.set(title=model, xlabel="wall time [ms]", ylabel="error of the end state [rad or m]")
         panel.grid(alpha=0.3)
     figure.legend(shown.values(), shown.keys(), loc="outside lower center", ncols=4, fontsize=8)
-    figure.suptitle(common.environment_line(results), fontsize=9)
+    # Scenes may be of several runs.
+    scenes = results["models"].values()
+    lines = dict.fromkeys(common.environment_line(results | found["run"]) for found in scenes)
+    figure.suptitle("\n".join(lines), fontsize=9)
     return figure
+
+
+def earlier(where: Path | None, results: dict[str, Any]) -> dict[str, Any]:
+    """What an earlier run has left in a folder: models and long.
+
+    Raises:
+        SystemExit: if there is nothing, or it is of another machine or other versions.
+    """
+    file = None if where is None else where / f"{results['benchmark']}.json"
+    if file is None or not file.is_file():
+        raise SystemExit(f"--keep: there is no {file or 'folder of results'} to add to")
+    found = json.loads(file.read_text("utf-8"))
+    asked = [
+        {"quick": run["quick"], "processor": run["machine"]["processor"]} | run["versions"]
+        for run in (results, found)
+    ]
+    here, there = asked
+    other = [f"{key} {there.get(key)}, here {here[key]}" for key in here if there.get(key) != here[key]]
+    if other:
+        raise SystemExit(f"--keep: {file} does not compare with this run ({'; '.join(other)})")
+    return {"models": found["models"], "long": found["long"]}
+
+
+def measured(model: str, plan: Plan, chosen: argparse.Namespace, peers: Sequence[Peer]) -> dict[str, Any]:
+    """All that is measured of one scene, and when."""
+    now = common.circumstances("work_precision", quick=chosen.quick)
+    bare = beside.QUICK._replace(repeats=plan.repeats, lanes=0)
+    runs = own_runs(model, plan)
+    counts = plan.theirs_stiff if model in STIFF else plan.theirs
+    for peer in (p for p in peers if p.models is None or model in p.models):
+        for steps in peer.only or counts:
+            run = beside.peer_run(peer, chosen.peers_python, model, steps, bare, judge_of(model))
+            if run is not None and run["error"]:
+                runs.append(run | {"drift": run.get("energy_error")})
+    return {
+        "run": {key: now[key] for key in RUN} | {"load_at_start": now["machine"]["load_at_start"]},
+        "runs": runs,
+        "time_to_error": times(runs),
+        "time_at_most": times_at_most(runs),
+        "gradients": [] if chosen.quick else own_gradients(model, plan.repeats),
+    }
+
+
+def long_runs(plan: Plan, chosen: argparse.Namespace) -> list[dict[str, Any]]:
+    """Drift of energy over a million steps of the heavy top, by code."""
+    several = () if chosen.no_peers else beside.available(LONG_PEERS, chosen.peers_python)
+    found = [long_run(plan.long)]
+    found += [peer_long_run(peer, chosen.peers_python, plan.long) for peer in several]
+    print(long_table(found), flush=True)
+    return found
 
 
 def main() -> None:
     """Run the benchmark."""
     parser = common.peer_parser("What accuracy costs in time, beside other codes.", "the figure")
     parser.add_argument("--models", nargs="+", choices=SHARED, default=SHARED, help="only these scenes")
+    parser.add_argument("--keep", action="store_true", help="keep what the file has of other scenes")
     parser.add_argument("--gradients", action="store_true", help="nothing but value and gradient")
     chosen = parser.parse_args()
     if chosen.redraw:
@@ -475,32 +538,18 @@ def main() -> None:
         return
     results = common.circumstances("work_precision", quick=chosen.quick)
     peers = () if chosen.no_peers else beside.available(plan.peers, chosen.peers_python)
-    bare = beside.QUICK._replace(repeats=plan.repeats, lanes=0)
-    models: dict[str, Any] = {}
+    where = common.folder(chosen)
+    kept = earlier(where, results) if chosen.keep else {"models": {}, "long": []}
+    models, long = kept["models"], kept["long"]
     for model in chosen.models:
-        runs = own_runs(model, plan)
-        counts = plan.theirs_stiff if model in STIFF else plan.theirs
-        for peer in (p for p in peers if p.models is None or model in p.models):
-            for steps in peer.only or counts:
-                run = beside.peer_run(peer, chosen.peers_python, model, steps, bare, judge_of(model))
-                if run is not None and run["error"]:
-                    runs.append(run | {"drift": run.get("energy_error")})
-        models[model] = {
-            "runs": runs,
-            "time_to_error": times(runs),
-            "time_at_most": times_at_most(runs),
-            "gradients": [] if chosen.quick else own_gradients(model, plan.repeats),
-        }
+        models[model] = measured(model, plan, chosen, peers)
         print(f"\n{model}\n{table_of(models[model])}\n", flush=True)
-    long = []
-    if "heavy_top" in chosen.models:
-        long = [long_run(plan.long)]
-        several = () if chosen.no_peers else beside.available(LONG_PEERS, chosen.peers_python)
-        long += [peer_long_run(peer, chosen.peers_python, plan.long) for peer in several]
-        print(long_table(long))
-    results |= {"models": models, "long": long, "targets": targets(models, long)}
+        if model == "heavy_top":
+            long = long_runs(plan, chosen)
+        models = {name: models[name] for name in SHARED if name in models}
+        results |= {"models": models, "long": long, "targets": targets(models, long)}
+        common.write(results, draw, where)
     print(f"{common.environment_line(results)}\n\n{common.show_targets(results['targets'])}")
-    common.write(results, draw, common.folder(chosen))
 
 
 if __name__ == "__main__":

@@ -54,6 +54,10 @@ def test_work_precision_of_one_scene_alone(tmp_path):
     for run in found["runs"]:
         assert run.keys() >= TIMES | {"steps", "error", "drift"} and run["drift"] < 1e-11
     assert "double_pendulum" in text
+    again, _ = _results("work_precision", tmp_path, "--no-peers", "--models", "heavy_top", "--keep")
+    assert list(again["models"]) == ["heavy_top", "double_pendulum"]
+    assert again["models"]["double_pendulum"] == found
+    assert again["long"] and not results["long"]
 
 
 def test_gradients_alone(tmp_path):
