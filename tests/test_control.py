@@ -408,7 +408,7 @@ def test_feedback_brings_a_disturbed_spacecraft_home(reoriented):
     assert missed(closed) < 0.2 * missed(open_loop)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_receding_horizon_brings_a_disturbed_spacecraft_home():
     example = manoeuvres.spacecraft()
     goal = nc.goal.Attitude("base", (np.cos(0.5), np.sin(0.5), 0.0, 0.0)) & nc.goal.Motion("base")

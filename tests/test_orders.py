@@ -211,7 +211,7 @@ class Swing(eqx.Module):
         return self.amplitude * (1 - jnp.cos(3.0 * t))
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_derivatives_with_drives():
     """Two driven links carry a free one; the loss has the work of the drives in it."""
 
