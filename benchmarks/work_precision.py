@@ -476,11 +476,10 @@ def earlier(where: Path | None, results: dict[str, Any]) -> dict[str, Any]:
     if file is None or not file.is_file():
         raise SystemExit(f"--keep: there is no {file or 'folder of results'} to add to")
     found = json.loads(file.read_text("utf-8"))
-    asked = [
+    here, there = (
         {"quick": run["quick"], "processor": run["machine"]["processor"]} | run["versions"]
         for run in (results, found)
-    ]
-    here, there = asked
+    )
     other = [f"{key} {there.get(key)}, here {here[key]}" for key in here if there.get(key) != here[key]]
     if other:
         raise SystemExit(f"--keep: {file} does not compare with this run ({'; '.join(other)})")
