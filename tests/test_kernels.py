@@ -1,5 +1,7 @@
 """Loops compiled into one kernel compute what they compute otherwise; what does not fit is left as it is."""
 
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -236,15 +238,36 @@ def test_the_end_of_a_run_is_one_kernel_and_little_else(name):
     assert MARK in jax.jit(end).lower(1e-3, 4).as_text(), "not compiled into one kernel"
 
 
-def _forward(residuals, x):
-    """x -> sin(a) x, summed over a second copy."""
+def _scaled(residuals, x):
+    """x -> sin(a) x, and its sum with weights a."""
     (a,) = residuals
     return jnp.sin(a) * x, jnp.sum(a * x)
 
 
-def _backward(residuals, given):
-    (a,) = residuals
-    return jnp.sin(a) * given[0] + a * given[1]
+class Scaled(linear_pair.Pair):
+    """The same with its transpose; neither is differentiated, nor could it be."""
+
+    def forward(self, residuals, arguments):
+        return jax.lax.while_loop(lambda x: False, lambda x: x, _scaled(residuals, arguments))
+
+    def backward(self, residuals, cotangents):
+        (a,) = residuals
+        found = jnp.sin(a) * cotangents[0] + a * cotangents[1]
+        return jax.lax.while_loop(lambda x: False, lambda x: x, found)
+
+    def forward_changed(self, residuals, changes, arguments, arguments_dot):
+        found = linear_pair.apply(self, residuals, arguments, _scaled(residuals, arguments))
+        moved = linear_pair.apply(self, residuals, arguments_dot, found)
+        more = linear_pair.along(lambda a: _scaled(a, arguments), (residuals,), (changes,))[1]
+        return found, jax.tree.map(jnp.add, moved, more)
+
+    def backward_changed(self, residuals, changes, cotangents, cotangents_dot):
+        (a,) = residuals
+        found = linear_pair.transposed(self, residuals, cotangents, a)
+        moved = linear_pair.transposed(self, residuals, cotangents_dot, a)
+        pulled = partial(jax.vjp, lambda x, a: _scaled((a,), x), a)
+        more = linear_pair.along(lambda a: pulled(a)[1](cotangents)[0], (a,), changes)[1]
+        return found, moved + more
 
 
 def test_components_go_back_together():
@@ -258,13 +281,13 @@ def test_components_go_back_together():
 
 def test_linear_pair_in_every_mode():
     a, x = jnp.array([0.3, 0.7, 1.1]), jnp.array([1.0, -2.0, 0.5])
-    shapes = jax.eval_shape(_forward, (a,), x)
+    shapes = jax.eval_shape(_scaled, (a,), x)
 
     def paired(a, x):
-        return linear_pair.apply(_forward, _backward, (a,), x, shapes)
+        return linear_pair.apply(Scaled(), (a,), x, shapes)
 
     def plain(a, x):
-        return _forward((a,), x)
+        return _scaled((a,), x)
 
     def loss(f):
         def value(a, x):
@@ -278,6 +301,7 @@ def test_linear_pair_in_every_mode():
         lambda f: jax.grad(loss(f), argnums=(0, 1))(a, x),
         lambda f: jax.hessian(loss(f), argnums=(0, 1))(a, x),
         lambda f: jax.jacrev(jax.jacrev(loss(f)))(a, x),
+        lambda f: jax.jacfwd(jax.hessian(loss(f), argnums=(0, 1)))(a, x),
         lambda f: jax.jit(jax.vmap(jax.grad(loss(f), argnums=(0, 1)), in_axes=(None, 0)))(
             a, jnp.stack([x, 2 * x])
         ),

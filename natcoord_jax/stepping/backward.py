@@ -29,7 +29,7 @@ from natcoord_jax.stepping.one_kernel import as_one_kernel, lane_by_lane, plainl
 from natcoord_jax.stepping.past import Past
 from natcoord_jax.stepping.plan import Plan
 from natcoord_jax.stepping.probe import jacobian_by_differences
-from natcoord_jax.stepping.record import Numbers, Record, Returning, Slot
+from natcoord_jax.stepping.record import Changes, Numbers, Record, Returning, Slot
 from natcoord_jax.stepping.step import advance_between
 
 CHUNK = 32
@@ -37,16 +37,22 @@ CHUNK = 32
 
 
 class Backward:
-    """The way back; hashable, without traced values."""
+    """The way back; hashable, without traced values.
 
-    def __init__(self, plan: Plan):
+    Args:
+        plan: of the rollout.
+        forced: whether the multipliers of all slots and the cotangents of their ends are kept, see `Changes`.
+    """
+
+    def __init__(self, plan: Plan, forced: bool = False):
         self.plan = plan
+        self.forced = forced
         self.tableau = plan.tableau
         # Velocities across constraints alternate from step to step where no kicks hold them: v_1 = 2 V - v_0.
         # So do their cotangents, and a part of the multipliers; every other one of these is smooth.
         self.stride = 1 if self.tableau.kick else 2
 
-    def cotangents(self, record: Record, given: tuple[State, Array]) -> tuple:
+    def cotangents(self, record: Record, given: tuple[State, Array]) -> Changes:
         """Cotangents of what varies, of the slots' inputs, and of the first state.
 
         Args:
@@ -55,12 +61,12 @@ class Backward:
         """
         return lane_by_lane(self._in_kernels, record, given)
 
-    def _in_kernels(self, record: Record, given: tuple[State, Array]) -> tuple:
+    def _in_kernels(self, record: Record, given: tuple[State, Array]) -> Changes:
         """One kernel for all slots, or one for each part if that would take too long to compile."""
         several = partial(self._backward, as_one_kernel)
         return as_one_kernel(partial(self._backward, plainly), record, given, too_large=several)
 
-    def _backward(self, kernel: Callable, record: Record, given: tuple[State, Array]) -> tuple:
+    def _backward(self, kernel: Callable, record: Record, given: tuple[State, Array]) -> Changes:
         """In rounds: of a kernel that goes on until it needs new factors, and one that makes them.
 
         A round sees a few slots, so that what travels between kernels does not grow with their number.
@@ -70,10 +76,10 @@ class Backward:
         rows = min(CHUNK, count)
 
         def round_of(carry: tuple[Returning, Any]) -> tuple[Returning, Any]:
-            c, u_bar = carry
+            c, found = carry
             first = jnp.maximum(c.left - rows, 0)
             near = jax.tree.map(
-                lambda x: jax.lax.dynamic_slice_in_dim(x, first, rows, 0), (slots, given, u_bar)
+                lambda x: jax.lax.dynamic_slice_in_dim(x, first, rows, 0), (slots, given, found)
             )
 
             def renewed(carry: tuple) -> tuple:
@@ -86,7 +92,7 @@ class Backward:
             c = replace_fields(c, factors=factors, at=at, stuck=jnp.array(False))
             c, part = kernel(self._several, numbers, first, *near, c)
             update = partial(jax.lax.dynamic_update_slice_in_dim, start_index=first, axis=0)
-            return c, jax.tree.map(update, u_bar, part)
+            return c, jax.tree.map(update, found, part)
 
         y, before_all = slots.y[-1], jax.tree.map(lambda x: x[0], slots.before)
         start = Returning(
@@ -100,12 +106,12 @@ class Backward:
             factors=record.factors,
             stuck=jnp.array(False),
         )
-        u_bar = jax.tree.map(jnp.zeros_like, slots.u)
-        c, u_bar = jax.lax.while_loop(lambda carry: carry[0].left > 0, round_of, (start, u_bar))
+        found = jax.tree.map(jnp.zeros_like, (slots.u, (slots.y, slots.before) if self.forced else None))
+        c, (u_bar, forced_bar) = jax.lax.while_loop(lambda carry: carry[0].left > 0, round_of, (start, found))
         if c.tangents_bar is None:
-            return c.varied_bar, u_bar, c.state_bar
+            return Changes(c.varied_bar, u_bar, c.state_bar, forced_bar)
         varied_bar, state_bar = kernel(self._before_all, numbers, before_all, c)
-        return varied_bar, u_bar, state_bar
+        return Changes(varied_bar, u_bar, state_bar, forced_bar)
 
     def _tangents(self, numbers: Numbers, varied: list[Array], state: State) -> Tangents | None:
         """What the constraints admit in a state, for schemes that ask for it."""
@@ -123,19 +129,22 @@ class Backward:
         return jax.tree.map(jnp.add, (c.varied_bar, c.state_bar), pull(c.tangents_bar))
 
     def _several(
-        self, numbers: Numbers, first: Array, slots: Slot, given: tuple, u_bar: Any, c: Returning
-    ) -> tuple[Returning, Any]:
+        self, numbers: Numbers, first: Array, slots: Slot, given: tuple, found: tuple, c: Returning
+    ) -> tuple[Returning, tuple]:
         """Slots from the last one back, down to the first given here or to one that needs new factors."""
 
-        def one(carry: tuple[Returning, Any]) -> tuple[Returning, Any]:
-            c, u_bar = carry
+        def one(carry: tuple[Returning, tuple]) -> tuple[Returning, tuple]:
+            c, found = carry
             here = c.left - 1 - first
             slot, (end_bar, y_bar) = jax.tree.map(lambda x: row(x, here), (slots, given))
             end_bar = jax.tree.map(jnp.add, c.state_bar, end_bar)
             bars, lam, at, factors = self._pulled(numbers, slot, end_bar, y_bar, c)
             stuck = any_lane(at.open & at.wanting)
             lost = slot.accepted & ~at.done
-            more, before_bar, tangents_bar, found = jax.tree.map(lambda x: jnp.where(lost, jnp.nan, x), bars)
+            forced_bar = (lam, end_bar) if self.forced else None
+            more, before_bar, tangents_bar, own_bar, forced_bar = jax.tree.map(
+                lambda x: jnp.where(lost, jnp.nan, x), (*bars, forced_bar)
+            )
             keep = partial(jnp.where, slot.accepted)
             own, *others = c.pasts
             pasts = jax.tree.map(keep, (*others, own.followed_by(lam, factors.inertias)), c.pasts)
@@ -143,8 +152,8 @@ class Backward:
             tangents_bar = jax.tree.map(keep, tangents_bar, c.tangents_bar)
             varied_bar = jax.tree.map(lambda total, x: keep(total + x, total), c.varied_bar, more)
             # Of a slot that waits for factors nothing counts yet; this row is written again.
-            u_bar = jax.tree.map(
-                lambda rows, x: with_row(rows, here, keep(x, jnp.zeros_like(x))), u_bar, found
+            found = jax.tree.map(
+                lambda rows, x: with_row(rows, here, keep(x, jnp.zeros_like(x))), found, (own_bar, forced_bar)
             )
             guess = pasts[0].guess
             guess = jnp.where(jnp.all(jnp.isfinite(guess)), guess, 0.0)
@@ -155,9 +164,9 @@ class Backward:
                 c.left - 1, before_bar, tangents_bar, varied_bar, pasts, guess, following, aged, stuck
             )
             waiting = replace_fields(c, lam=lam, at=at, factors=factors, stuck=stuck)
-            return jax.tree.map(partial(jnp.where, stuck), waiting, done), u_bar
+            return jax.tree.map(partial(jnp.where, stuck), waiting, done), found
 
-        return jax.lax.while_loop(lambda carry: (carry[0].left > first) & ~carry[0].stuck, one, (c, u_bar))
+        return jax.lax.while_loop(lambda carry: (carry[0].left > first) & ~carry[0].stuck, one, (c, found))
 
     def _pulled(
         self, numbers: Numbers, slot: Slot, end_bar: State, y_bar: Array, c: Returning

@@ -5,10 +5,12 @@ equations are, once for every slot (implicit function theorem). Substep fraction
 
 Forward, all Jacobians are formed at once, vmapped over the slots, and only the recursion from state to state
 is a scan. The way back has a program of its own, see `backward`. Recorded outputs are differentiated by the
-same rule, so second derivatives (forward over reverse, forward over forward) are exact.
+same rule, and what changes with them is made of the same two programs, see `Rule`: derivatives of any order
+are exact, in every mode.
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -18,13 +20,15 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from natcoord_jax.assembly.system import System
+from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
+from natcoord_jax.maths.collocation import Tableau
 from natcoord_jax.stepping import linear_pair
 from natcoord_jax.stepping.backward import Backward
 from natcoord_jax.stepping.error_control import Tolerance
 from natcoord_jax.stepping.one_kernel import lane_by_lane
 from natcoord_jax.stepping.plan import Plan, Slots
-from natcoord_jax.stepping.record import Numbers, Record, Slot, instantiated, zero_tangent
+from natcoord_jax.stepping.record import Changes, Numbers, Record, Slot, instantiated, zero_tangent
 from natcoord_jax.stepping.rollout import Ending, run
 from natcoord_jax.stepping.step import advance, linear_solver
 
@@ -53,15 +57,31 @@ def _traced_once(plan: Plan, *numbers: Any) -> tuple[Slots, Ending]:
     return lane_by_lane(partial(run, plan), *numbers)
 
 
-class Rule:
-    """The tangents of a rollout and their transpose; hashable, without traced values."""
+@dataclass(frozen=True)
+class Rule(linear_pair.Pair):
+    """The tangents of a rollout and their transpose; hashable, without traced values.
 
-    def __init__(self, plan: Plan):
-        self.plan = plan
-        self.tableau = plan.tableau
+    How both change with the record follows from what they are at every slot: the tangents of a slot solve
+    J y_dot = -r, and their change solves the same equations with r the change of the slot's linearised
+    equations at the tangents known. So it is with the transpose and the multipliers known. Nothing that is
+    solved is differentiated.
+
+    Attributes:
+        plan: of the rollout.
+        forced: whether residuals and ends of the slots have tangents of their own among the arguments. Their
+            cotangents are the multipliers of the slots' equations and the cotangents of their ends.
+    """
+
+    plan: Plan
+    forced: bool = False
+
+    @property
+    def tableau(self) -> Tableau:
+        """Of the collocation method."""
+        return self.plan.tableau
 
     def outcome(
-        self, numbers: Numbers, varied: list[Array], slot: Slot, state: State, u: Any, y: Array
+        self, numbers: Numbers, slot: Slot, varied: list[Array], state: State, u: Any, y: Array
     ) -> tuple[Array, State]:
         """Residual of the slot's equations and the state at its end."""
         system, parameters, dt = numbers.whole(varied)
@@ -70,57 +90,132 @@ class Rule:
 
     def prepared(self, numbers: Numbers, varied_dot: list[Array], slot: Slot, u_dot: Any) -> tuple:
         """Linear maps of one slot: from (state, unknowns), of everything else's change, and the solver."""
-        at = partial(self.outcome, numbers)
-        _, along = jax.linearize(
-            lambda state, y: at(numbers.varied, slot, state, slot.u, y), slot.before, slot.y
-        )
+        at = partial(self.outcome, numbers, slot)
+        _, along = jax.linearize(lambda state, y: at(numbers.varied, state, slot.u, y), slot.before, slot.y)
         given, given_dot = (numbers.varied, slot.u), (varied_dot, u_dot)
-        forcing = jax.jvp(lambda varied, u: at(varied, slot, slot.before, u, slot.y), given, given_dot)[1]
+        forcing = jax.jvp(lambda varied, u: at(varied, slot.before, u, slot.y), given, given_dot)[1]
         system, parameters, dt = numbers.whole(numbers.varied)
         u = slot.inputs(self.plan, parameters, slot.before)
         h = slot.fraction * dt
         return along, linear_solver(system, slot.before, u, h, slot.y, self.tableau, along), forcing
 
-    def tangents(self, record: Record, changes: tuple) -> tuple[State, Array]:
-        """Tangents of the states after all slots and of their unknowns.
-
-        Args:
-            record: where.
-            changes: of what varies, of the slots' inputs, and of the first state.
-        """
-        varied_dot, u_dot, state_dot = changes
-        slots = record.slots
+    def forward(self, residuals: Record, arguments: Changes) -> tuple[State, Array]:
+        """Tangents of the states after all slots and of their unknowns."""
+        slots = residuals.slots
 
         def body(state_dot: State, xs: tuple) -> tuple:
-            (along, solver, (residual_dot, end_dot)), accepted = xs
+            (along, solver, forcing), accepted, forced = xs
+            residual_dot, end_dot = forcing if forced is None else jax.tree.map(jnp.add, forcing, forced)
             resting = jnp.zeros(slots.y.shape[1:], slots.y.dtype)
             y_dot = -solver.solve(residual_dot + along(state_dot, resting)[0])
             end = jax.tree.map(jnp.add, end_dot, along(state_dot, y_dot)[1])
             end = jax.tree.map(partial(jnp.where, accepted), end, state_dot)
             return end, (end, jnp.where(accepted, y_dot, 0.0))
 
-        each = partial(self.prepared, record.numbers, varied_dot)
-        maps = _in_chunks(each, (slots, u_dot), slots.y.shape[0])
-        return jax.lax.scan(body, state_dot, (maps, slots.accepted))[1]
+        each = partial(self.prepared, residuals.numbers, arguments.varied)
+        maps = _in_chunks(each, (slots, arguments.u), slots.y.shape[0])
+        return jax.lax.scan(body, arguments.state, (maps, slots.accepted, arguments.forced))[1]
 
-    def cotangents(self, record: Record, given: tuple[State, Array]) -> tuple:
-        """The transpose of `tangents`, see `backward`."""
-        return Backward(self.plan).cotangents(record, given)
+    def backward(self, residuals: Record, cotangents: tuple[State, Array]) -> Changes:
+        """The transpose, see `backward`."""
+        return Backward(self.plan, self.forced).cotangents(residuals, cotangents)
+
+    def forward_changed(
+        self, residuals: Record, changes: Record, arguments: Changes, arguments_dot: Changes
+    ) -> tuple[tuple[State, Array], tuple[State, Array]]:
+        """The tangents, and their change with the record and with what they are linear in."""
+        numbers, slots = residuals.numbers, residuals.slots
+        outputs = slots.before, slots.y
+        found = linear_pair.apply(self, residuals, arguments, outputs)
+        before_dot = jax.tree.map(
+            lambda first, after: jnp.concatenate([first[None], after[:-1]]), arguments.state, found[0]
+        )
+
+        def change(slot: Slot, slot_dot: Slot, u_dot: Any, state_dot: State, y_dot: Array) -> tuple:
+            def tangents(numbers: Numbers, slot: Slot) -> tuple[Array, State]:
+                at = numbers.varied, slot.before, slot.u, slot.y
+                by = arguments.varied, state_dot, u_dot, y_dot
+                return jax.jvp(partial(self.outcome, numbers, slot), at, by)[1]
+
+            _, more = linear_pair.along(tangents, (numbers, slot), (changes.numbers, slot_dot))
+            return _if(slot.accepted, more)
+
+        given = slots, changes.slots, arguments.u, before_dot, found[1]
+        forced = _in_chunks(change, given, slots.y.shape[0])
+        if arguments_dot.forced is not None:
+            forced = jax.tree.map(jnp.add, forced, arguments_dot.forced)
+        arguments_dot = replace_fields(arguments_dot, forced=forced)
+        return found, linear_pair.apply(Rule(self.plan, True), residuals, arguments_dot, outputs)
+
+    def backward_changed(
+        self, residuals: Record, changes: Record, cotangents: tuple[State, Array], cotangents_dot: tuple
+    ) -> tuple[Changes, Changes]:
+        """The cotangents, and their change with the record and with what they are linear in."""
+        numbers, slots = residuals.numbers, residuals.slots
+        first = jax.tree.map(lambda x: x[0], slots.before)
+        plain = Changes(numbers.varied, slots.u, first)
+        whole = replace_fields(plain, forced=(slots.y, slots.before))
+        found = linear_pair.transposed(Rule(self.plan, True), residuals, cotangents, whole)
+
+        def change(slot: Slot, slot_dot: Slot, forced: tuple[Array, State]) -> tuple:
+            def pulled(numbers: Numbers, slot: Slot) -> tuple:
+                at = numbers.varied, slot.before, slot.u, slot.y
+                return jax.vjp(partial(self.outcome, numbers, slot), *at)[1](forced)
+
+            _, more = linear_pair.along(pulled, (numbers, slot), (changes.numbers, slot_dot))
+            return _if(slot.accepted, more)
+
+        given = slots, changes.slots, found.forced
+        varied, before, u, y = _in_chunks(change, given, slots.y.shape[0], summed=True)
+        # What changes the cotangent of a state changes that of the end of the slot before.
+        ends = jax.tree.map(lambda x: jnp.concatenate([x[1:], jnp.zeros_like(x[:1])]), before)
+        given = jax.tree.map(jnp.add, cotangents_dot, (ends, y))
+        changed = linear_pair.transposed(self, residuals, given, whole if self.forced else plain)
+        more = varied, u, jax.tree.map(lambda x: x[0], before)
+        parts = jax.tree.map(jnp.add, (changed.varied, changed.u, changed.state), more)
+        if not self.forced:
+            found = replace_fields(found, forced=None)
+        return found, Changes(*parts, changed.forced)
 
 
-def _in_chunks(function: Callable, slots: tuple, length: int) -> Any:
-    """The function of every slot, vmapped in chunks whose temporaries stay in the cache."""
+def _if(accepted: Array, changes: Any) -> Any:
+    """Changes of what a slot contributes, none if its attempt failed."""
+    return jax.tree.map(lambda x: jnp.where(accepted, x, 0.0), changes)
+
+
+def _in_chunks(function: Callable, slots: tuple, length: int, summed: bool = False) -> Any:
+    """The function of every slot, vmapped in chunks whose temporaries stay in the cache.
+
+    If summed, its first output is added up, so that not all of them are there at once.
+    """
     every = jax.vmap(lambda x: function(*x))
     if length <= CHUNK:
-        return every(slots)
+        found = every(slots)
+        return (_total(found[0]), *found[1:]) if summed else found
     chunks = -(-length // CHUNK)
     padding = jnp.minimum(jnp.arange(chunks * CHUNK), length - 1)
 
     def chunked(x: Array) -> Array:
         return x[padding].reshape(chunks, CHUNK, *x.shape[1:])
 
-    found = jax.lax.map(every, jax.tree.map(chunked, slots))
-    return jax.tree.map(lambda x: x.reshape(chunks * CHUNK, *x.shape[2:])[:length], found)
+    def adding(x: tuple) -> tuple:
+        chunk, slots = x
+        first, *others = every(slots)
+        real = chunk * CHUNK + jnp.arange(CHUNK) < length
+        first = jax.tree.map(lambda x: jnp.where(real.reshape(-1, *(1,) * (x.ndim - 1)), x, 0.0), first)
+        return _total(first), *others
+
+    if summed:
+        first, *found = jax.lax.map(adding, (jnp.arange(chunks), jax.tree.map(chunked, slots)))
+    else:
+        first, found = (), jax.lax.map(every, jax.tree.map(chunked, slots))
+    found = jax.tree.map(lambda x: x.reshape(chunks * CHUNK, *x.shape[2:])[:length], found)
+    return (_total(first), *found) if summed else found
+
+
+def _total(parts: Any) -> Any:
+    """The sum along the first axis."""
+    return jax.tree.map(lambda x: jnp.sum(x, axis=0), parts)
 
 
 @partial(run_slots.defjvp, symbolic_zeros=True)
@@ -150,9 +245,8 @@ def _run_slots_jvp(plan: Plan, primals: tuple, tangents: tuple):
         Slot(before, sound, u, slots.step, slots.fraction, slots.done, slots.accepted),
         ending.factors,
     )
-    rule = Rule(plan)
-    changes, outputs = (varied_dot, u_dot, state_dot), (slots.states, slots.y)
-    states_dot, y_dot = linear_pair.apply(rule.tangents, rule.cotangents, record, changes, outputs)
+    changes, outputs = Changes(varied_dot, u_dot, state_dot), (slots.states, slots.y)
+    states_dot, y_dot = linear_pair.apply(Rule(plan), record, changes, outputs)
     last_dot = jax.tree.map(lambda x: x[-1], states_dot)
     slots_dot = jax.tree.map(zero_tangent, slots)
     slots_dot = eqx.tree_at(lambda s: (s.states, s.y), slots_dot, (states_dot, y_dot))

@@ -1,10 +1,11 @@
 """A linear function that comes with its transpose, each computed in its own way.
 
-JAX transposes a linear program operation by operation. Where the transpose has a better program of its own,
-`apply` binds both together; derivatives with respect to what the function depends on nonlinearly are taken
-of plain programs, so that second derivatives are exact.
+JAX transposes a linear program operation by operation, and differentiates it in the same way. Where the
+transpose has a better program of its own, and the changes of both are the same linear functions of other
+arguments, `apply` binds all of that together: derivatives of any order are then made of these two programs.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -17,55 +18,116 @@ from jax.extend import core as jex
 from jax.interpreters import ad, batching, mlir
 
 
+@jax.tree_util.register_static
+@dataclass(frozen=True)
+class Unchanged:
+    """In the place of the tangent of a number that does not change."""
+
+
+def along(function: Callable, at: tuple, changes: tuple) -> tuple[Any, Any]:
+    """Value of a function and its change along changes of its arguments, some of them `Unchanged`."""
+    leaves, structure = jax.tree.flatten(at)
+    every = structure.flatten_up_to(changes)
+    varied = [k for k, change in enumerate(every) if not isinstance(change, Unchanged)]
+
+    def of_varied(*some: Any) -> Any:
+        given = list(leaves)
+        for k, x in zip(varied, some):
+            given[k] = x
+        return function(*jax.tree.unflatten(structure, given))
+
+    return jax.jvp(of_varied, tuple(leaves[k] for k in varied), tuple(every[k] for k in varied))
+
+
+class Pair(ABC):
+    """A linear function of arguments after residuals, and its transpose; without traced values.
+
+    The programs of `forward` and `backward` need not be differentiable. Those of their changes are where the
+    two are used in them through `apply` and `transposed`.
+    """
+
+    @abstractmethod
+    def forward(self, residuals: Any, arguments: Any) -> Any:
+        """The function."""
+
+    @abstractmethod
+    def backward(self, residuals: Any, cotangents: Any) -> Any:
+        """Its transpose."""
+
+    @abstractmethod
+    def forward_changed(
+        self, residuals: Any, changes: Any, arguments: Any, arguments_dot: Any
+    ) -> tuple[Any, Any]:
+        """The function and its change along changes of the residuals, some `Unchanged`, and the arguments."""
+
+    @abstractmethod
+    def backward_changed(
+        self, residuals: Any, changes: Any, cotangents: Any, cotangents_dot: Any
+    ) -> tuple[Any, Any]:
+        """The same of its transpose."""
+
+
 @dataclass(frozen=True, eq=False)
 class Side:
     """A linear function of flat arguments after flat residuals.
 
     Attributes:
-        fast: computes it.
-        plain: the same as a program that JAX can differentiate.
+        value: computes it.
+        changed: (which residuals change, all arguments, changes of these, changes of the linear arguments) to
+            the value and its change.
         shapes: of its outputs.
     """
 
-    fast: Callable
-    plain: Callable
+    value: Callable
+    changed: Callable
     shapes: tuple[jax.ShapeDtypeStruct, ...]
 
 
-def apply(forward: Callable, backward: Callable, residuals: Any, arguments: Any, outputs: Any) -> Any:
-    """Value of a linear function whose transpose is known.
+def apply(pair: Pair, residuals: Any, arguments: Any, outputs: Any) -> Any:
+    """Value of a linear function, differentiable in every mode.
 
     Args:
-        forward: function of (residuals, arguments), linear in the arguments, differentiable by JAX.
-        backward: its transpose, a function of (residuals, cotangents of the outputs). Neither closes over
-            traced values.
+        pair: the function and its transpose.
         residuals: pytree of arrays.
         arguments: pytree of arrays.
         outputs: pytree of arrays or shapes like the value.
     """
+    return _bound(pair, residuals, arguments, outputs, 0)
+
+
+def transposed(pair: Pair, residuals: Any, cotangents: Any, arguments: Any) -> Any:
+    """Value of its transpose, where `arguments` is like what the function is of."""
+    return _bound(pair, residuals, cotangents, arguments, 1)
+
+
+def _bound(pair: Pair, residuals: Any, given: Any, outputs: Any, number: int) -> Any:
+    """The function, number 0, or its transpose, number 1."""
     res, res_tree = jax.tree.flatten(residuals)
-    lin, lin_tree = jax.tree.flatten(arguments)
+    own, own_tree = jax.tree.flatten(given)
     out, out_tree = jax.tree.flatten(outputs)
     count = len(res)
 
-    def forwards(*flat: Any) -> list[Any]:
-        given = jax.tree.unflatten(res_tree, flat[:count]), jax.tree.unflatten(lin_tree, flat[count:])
-        return jax.tree.leaves(forward(*given))
+    def side(value: Callable, changed: Callable, linear_tree: Any, shapes: Sequence[Any]) -> Side:
+        def unflattened(flat: Sequence[Any]) -> tuple[Any, Any]:
+            return res_tree.unflatten(flat[:count]), linear_tree.unflatten(flat[count:])
 
-    def backwards(*flat: Any) -> list[Any]:
-        given = jax.tree.unflatten(res_tree, flat[:count]), jax.tree.unflatten(out_tree, flat[count:])
-        return jax.tree.leaves(backward(*given))
+        def flat_value(*flat: Any) -> list[Any]:
+            return jax.tree.leaves(value(*unflattened(flat)))
 
-    def transposed(*flat: Any) -> list[Any]:
-        fixed, cotangents = flat[:count], flat[count:]
-        shapes = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in lin]
-        return list(jax.linear_transpose(lambda *x: forwards(*fixed, *x), *shapes)(list(cotangents)))
+        def flat_changed(varied: Sequence[int], flat: Any, some: Any, linear_dot: Any) -> tuple[Any, Any]:
+            every: list[Any] = [Unchanged()] * count
+            for k, x in zip(varied, some):
+                every[k] = x
+            fixed, linear = unflattened(flat)
+            changes = res_tree.unflatten(every), linear_tree.unflatten(linear_dot)
+            found, found_dot = changed(fixed, changes[0], linear, changes[1])
+            return jax.tree.leaves(found), jax.tree.leaves(found_dot)
 
-    sides = (
-        Side(forwards, forwards, _shapes(out)),
-        Side(backwards, transposed, _shapes(lin)),
-    )
-    return jax.tree.unflatten(out_tree, linear_pair_p.bind(*res, *lin, sides=sides, count=count))
+        return Side(flat_value, flat_changed, _shapes(shapes))
+
+    programs = (pair.forward, pair.forward_changed), (pair.backward, pair.backward_changed)
+    sides = side(*programs[number], own_tree, out), side(*programs[1 - number], out_tree, own)
+    return out_tree.unflatten(linear_pair_p.bind(*res, *own, sides=sides, count=count))
 
 
 def _shapes(values: Sequence[Any]) -> tuple[jax.ShapeDtypeStruct, ...]:
@@ -78,7 +140,7 @@ linear_pair_p.multiple_results = True
 
 @linear_pair_p.def_impl
 def _impl(*args: Any, sides: tuple[Side, Side], count: int) -> list[Any]:
-    return sides[0].fast(*args)
+    return sides[0].value(*args)
 
 
 @linear_pair_p.def_abstract_eval
@@ -87,30 +149,20 @@ def _abstract(*args: Any, sides: tuple[Side, Side], count: int) -> list[Any]:
 
 
 def _lowered(*args: Any, sides: tuple[Side, Side], count: int) -> list[Any]:
-    return sides[0].fast(*args)
+    return sides[0].value(*args)
 
 
 mlir.register_lowering(linear_pair_p, mlir.lower_fun(_lowered, multiple_results=True))
 
 
 def _jvp(primals: Sequence[Any], tangents: Sequence[Any], *, sides: tuple[Side, Side], count: int):
-    bind = partial(linear_pair_p.bind, sides=sides, count=count)
-    changed = [ad.instantiate_zeros(t) for t in tangents[count:]]
-    values, changes = bind(*primals), bind(*primals[:count], *changed)
+    linear_dot = [ad.instantiate_zeros(t) for t in tangents[count:]]
     varied = [k for k, t in enumerate(tangents[:count]) if not isinstance(t, ad.Zero)]
     varied = [k for k in varied if jnp.issubdtype(jnp.result_type(primals[k]), jnp.inexact)]
     if varied:
-
-        def of_residuals(*some: Any) -> list[Any]:
-            every = list(primals)
-            for k, x in zip(varied, some):
-                every[k] = x
-            return sides[0].plain(*every)
-
-        at, along = tuple(primals[k] for k in varied), tuple(tangents[k] for k in varied)
-        more = jax.jvp(of_residuals, at, along)[1]
-        changes = [a + b for a, b in zip(changes, more)]
-    return values, changes
+        return sides[0].changed(varied, primals, [tangents[k] for k in varied], linear_dot)
+    bind = partial(linear_pair_p.bind, sides=sides, count=count)
+    return bind(*primals), bind(*primals[:count], *linear_dot)
 
 
 ad.primitive_jvps[linear_pair_p] = _jvp
@@ -135,10 +187,18 @@ def _batched(args: Sequence[Any], dims: Sequence[Any], *, sides: tuple[Side, Sid
     ]
 
     def every(side: Side, other: Side) -> Side:
-        inside = [*axes, *(0 for _ in other.shapes)]
+        inside = [0] * len(other.shapes)
+
+        def changed(varied: Sequence[int], flat: Any, some: Any, linear_dot: Any) -> tuple[Any, Any]:
+            of_lane = partial(side.changed, varied)
+            along_axes = [*axes, *inside], [axes[k] for k in varied], inside
+            return jax.vmap(of_lane, in_axes=along_axes, axis_size=size)(
+                list(flat), list(some), list(linear_dot)
+            )
+
         return Side(
-            jax.vmap(side.fast, in_axes=inside),
-            jax.vmap(side.plain, in_axes=inside),
+            jax.vmap(side.value, in_axes=[*axes, *inside], axis_size=size),
+            changed,
             tuple(jax.ShapeDtypeStruct((size, *s.shape), s.dtype) for s in side.shapes),
         )
 

@@ -93,6 +93,22 @@ class Record(eqx.Module):
     factors: Factors
 
 
+class Changes(eqx.Module):
+    """Tangents that those of all slots are linear in, or their cotangents.
+
+    Attributes:
+        varied: of `Numbers.varied`.
+        u: of the slots' inputs.
+        state: of the first state.
+        forced: of the slots' residuals and their ends, in addition; None: there are none.
+    """
+
+    varied: list[Array]
+    u: Any
+    state: State
+    forced: tuple[Float[Array, "slots unknowns"], State] | None = None
+
+
 class Returning(eqx.Module):
     """What goes back from slot to slot.
 
