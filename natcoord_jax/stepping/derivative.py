@@ -172,10 +172,10 @@ class Rule(linear_pair.Pair):
         given = jax.tree.map(jnp.add, cotangents_dot, (ends, y))
         changed = linear_pair.transposed(self, residuals, given, whole if self.forced else plain)
         more = varied, u, jax.tree.map(lambda x: x[0], before)
-        parts = jax.tree.map(jnp.add, (changed.varied, changed.u, changed.state), more)
+        sums = jax.tree.map(jnp.add, (changed.varied, changed.u, changed.state), more)
         if not self.forced:
             found = replace_fields(found, forced=None)
-        return found, Changes(*parts, changed.forced)
+        return found, Changes(sums[0], sums[1], sums[2], changed.forced)
 
 
 def _if(accepted: Array, changes: Any) -> Any:
