@@ -18,7 +18,7 @@ from differences import assert_v_shaped
 import natcoord_jax as nc
 from natcoord_jax import gallery
 from natcoord_jax.stepping.backward import Backward
-from natcoord_jax.stepping.derivative import run_slots
+from natcoord_jax.stepping.derivative import CHUNK, run_slots
 from natcoord_jax.stepping.newton import TOLERANCE
 from natcoord_jax.stepping.plan import Plan
 from natcoord_jax.stepping.step import advance
@@ -284,7 +284,7 @@ def test_second_derivative_starting_at_rest(law):
 # --- steps that were retried ------------------------------------------------------------------------------
 
 
-def retried(rate, length=0.5):
+def retried(rate, length=0.5, dt=0.5, steps=6, extra=64):
     """A pendulum that turns by radians in a step that is far too large."""
     scene = nc.Scene()
     scene.add(nc.Gravity(vector=(0.0, 0.0, -9.81)))
@@ -293,7 +293,7 @@ def retried(rate, length=0.5):
     system, state = scene.compile()
     spin = rate * jnp.array([4.0, 11.0, -6.0])
     state = eqx.tree_at(lambda s: s.v, state, state.v.at[1:].set(jnp.cross(spin[None], state.q[1:])))
-    return nc.simulate(system, state, dt=0.5, steps=6, extra_substeps=64, throw=False)
+    return nc.simulate(system, state, dt=dt, steps=steps, extra_substeps=extra, throw=False)
 
 
 def test_gradient_through_retried_steps():
@@ -309,18 +309,18 @@ def test_gradient_through_retried_steps():
 
 
 @pytest.mark.slow
-def test_second_derivatives_through_retried_steps():
+@pytest.mark.parametrize("dt, steps, extra", [(0.5, 6, 64), (0.05, 40, 0)])
+def test_second_derivatives_of_many_slots(dt, steps, extra):
     """Attempts that failed, and what fills up the last chunk of slots, count for nothing in them."""
 
     def f(x):
-        found = retried(x, 0.5 * x)
+        found = retried(x, 0.5 * x, dt, steps, extra)
         return (found.q[-1, 1:] ** 3).sum()
 
-    found = retried(jnp.array(1.0))
-    assert int(found.steps_rejected) > 0, "no attempt failed: nothing is tested"
+    assert (int(retried(jnp.array(1.0), 0.5, dt, steps, extra).steps_rejected) > 0) == (extra > 0)
+    assert steps + extra > CHUNK and (steps + extra) % CHUNK, "slots fill their chunks"
     x, d = jnp.array(1.0), jnp.array(1.0)
-    modes = [jax.jit(SECOND[mode](f))(x, d) for mode in SECOND]
-    slope = jax.jit(along(f))
+    slope, modes = jax.jit(along(f)), [jax.jit(SECOND[mode](f))(x, d) for mode in SECOND]
     assert_v_shaped(lambda x: slope(x, d), x, d, modes[0], steps=10.0 ** -np.arange(3.0, 9.5, 0.5))
     assert np.ptp(modes) <= tol.SAME_GRADIENT * abs(modes[0])
 
