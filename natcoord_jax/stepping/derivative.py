@@ -127,9 +127,7 @@ class Rule(linear_pair.Pair):
         numbers, slots = residuals.numbers, residuals.slots
         outputs = slots.before, slots.y
         found = linear_pair.apply(self, residuals, arguments, outputs)
-        before_dot = jax.tree.map(
-            lambda first, after: jnp.concatenate([first[None], after[:-1]]), arguments.state, found[0]
-        )
+        before_dot = _before_each(arguments.state, found[0])
 
         def change(slot: Slot, slot_dot: Slot, u_dot: Any, state_dot: State, y_dot: Array) -> tuple:
             def tangents(numbers: Numbers, slot: Slot) -> tuple[Array, State]:
@@ -178,8 +176,13 @@ class Rule(linear_pair.Pair):
         return found, Changes(sums[0], sums[1], sums[2], changed.forced)
 
 
+def _before_each(first: State, after: State) -> State:
+    """The states before all slots: the first one, and those after all but the last."""
+    return jax.tree.map(lambda one, ends: jnp.concatenate([one[None], ends[:-1]]), first, after)
+
+
 def _if(accepted: Array, changes: Any) -> Any:
-    """Changes of what a slot contributes, none if its attempt failed."""
+    """Changes of what a slot contributes, none if its attempt failed: its maps may not even be numbers."""
     return jax.tree.map(lambda x: jnp.where(accepted, x, 0.0), changes)
 
 
@@ -235,9 +238,7 @@ def _run_slots_jvp(plan: Plan, primals: tuple, tangents: tuple):
         numbers, varied_dot = Numbers.of((system, None, dt), (system_dot, None, dt_dot))
     else:
         numbers, varied_dot = Numbers.of((system, parameters, dt), (system_dot, parameters_dot, dt_dot))
-    before = jax.tree.map(
-        lambda first, after: jnp.concatenate([first[None], after[:-1]]), state, slots.states
-    )
+    before = _before_each(state, slots.states)
     # Attempts that failed may hold anything: their maps are formed at rest, and then not used.
     sound = jnp.where(slots.accepted[:, None], slots.y, 0.0)
     record = Record(
