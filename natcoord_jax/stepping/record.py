@@ -8,12 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from natcoord_jax.assembly.separate import Tangents
 from natcoord_jax.assembly.system import System
 from natcoord_jax.core.state import State
-from natcoord_jax.stepping.correcting import Correcting
 from natcoord_jax.stepping.factors import Factors
-from natcoord_jax.stepping.past import Past
 from natcoord_jax.stepping.plan import Plan
 
 
@@ -107,29 +104,3 @@ class Changes(eqx.Module):
     u: Any
     state: State
     forced: tuple[Float[Array, "slots unknowns"], State] | None = None
-
-
-class Returning(eqx.Module):
-    """What goes back from slot to slot.
-
-    Attributes:
-        left: slots that are not done.
-        state_bar: cotangent of the state after the last of them, but for its own.
-        tangents_bar: of the tangent space there, for schemes with kicks.
-        varied_bar: of what varies, so far.
-        pasts: multipliers of the slots that are done, dealt out in turn; the first guesses the next.
-        lam: of the last one that is not.
-        at: where their solution stands.
-        factors: of a Jacobian.
-        stuck: whether it cannot go on without new ones, in any lane.
-    """
-
-    left: Int[Array, ""]
-    state_bar: State
-    tangents_bar: Tangents | None
-    varied_bar: list[Array]
-    pasts: tuple[Past, ...]
-    lam: Float[Array, " unknowns"]
-    at: Correcting
-    factors: Factors
-    stuck: Bool[Array, ""]

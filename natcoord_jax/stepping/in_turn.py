@@ -1,0 +1,206 @@
+"""The recorded slots of a rollout in turn, each with a linear system to solve.
+
+The systems of neighbouring slots are alike. So each is solved by corrections with factors carried from slot
+to slot, as the steps themselves are, and nothing is stored but the states.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from natcoord_jax.assembly.equations import prepare
+from natcoord_jax.core.effect import replace_fields
+from natcoord_jax.maths.rows import row, with_row
+from natcoord_jax.stepping.correcting import Correcting
+from natcoord_jax.stepping.factors import Factors, factors_of
+from natcoord_jax.stepping.newton import any_lane
+from natcoord_jax.stepping.one_kernel import as_one_kernel, lane_by_lane, plainly
+from natcoord_jax.stepping.past import Past
+from natcoord_jax.stepping.plan import Plan
+from natcoord_jax.stepping.probe import jacobian_by_differences
+from natcoord_jax.stepping.record import Numbers, Record, Slot
+
+CHUNK = 32
+"""Slots that a round sees, at most."""
+
+
+class Going(eqx.Module):
+    """What goes from slot to slot.
+
+    Attributes:
+        left: slots that are not done.
+        own: what is carried besides the solutions, see `InTurn`.
+        pasts: solutions of the slots that are done, dealt out in turn; the first guesses the next.
+        solution: of the system of the last slot that is not done.
+        at: where it stands.
+        factors: of a Jacobian.
+        stuck: whether it cannot go on without new ones, in any lane.
+    """
+
+    left: Int[Array, ""]
+    own: Any
+    pasts: tuple[Past, ...]
+    solution: Float[Array, " unknowns"]
+    at: Correcting
+    factors: Factors
+    stuck: Bool[Array, ""]
+
+
+class InTurn(ABC):
+    """Slots from the last one to the first; hashable, without traced values.
+
+    Args:
+        plan: of the rollout.
+        stride: from which solutions before it one is guessed: 1 for every one, 2 for every other.
+    """
+
+    def __init__(self, plan: Plan, stride: int):
+        self.plan = plan
+        self.tableau = plan.tableau
+        self.stride = stride
+
+    @abstractmethod
+    def arriving(self, own: Any, given: Any) -> Any:
+        """What arrives at a slot, of what is carried and of its row of what is given."""
+
+    @abstractmethod
+    def solved(
+        self, fixed: Any, slot: Slot, arrived: Any, given: Any, c: Going
+    ) -> tuple[Any, Array, Correcting, Factors]:
+        """The system of one slot, as far as the factors at hand go.
+
+        Returns:
+            What follows from its solution, the solution, where it stands, and the factors.
+        """
+
+    @abstractmethod
+    def passed_on(self, own: Any, arrived: Any, outcome: Any, keep: Callable) -> tuple[Any, Any]:
+        """What is carried on, and the slot's row of what is found.
+
+        Args:
+            own: what is carried to it.
+            arrived: what arrives.
+            outcome: what follows from its solution.
+            keep: chooses between two values: the second one for attempts that failed.
+        """
+
+    @abstractmethod
+    def numbers_of(self, fixed: Any) -> Numbers:
+        """What the rollout depends on, in what is the same for all slots."""
+
+    @abstractmethod
+    def following(self, kernel: Callable, record: Record, given: Any) -> Any:
+        """Everything, with a function that computes others in one kernel."""
+
+    def every(self, record: Record, given: Any) -> Any:
+        """Everything: in one kernel for all slots, or one for each part if that takes too long to compile."""
+        return lane_by_lane(self._in_kernels, record, given)
+
+    def _in_kernels(self, record: Record, given: Any) -> Any:
+        several = partial(self.following, as_one_kernel)
+        return as_one_kernel(partial(self.following, plainly), record, given, too_large=several)
+
+    def in_rounds(
+        self,
+        kernel: Callable,
+        fixed: Any,
+        slots: Slot,
+        given: Any,
+        start: tuple[Array, Factors, Any],
+        like: Any,
+    ) -> tuple[Going, Any]:
+        """In rounds: of a kernel that goes on until it needs new factors, and one that makes them.
+
+        A round sees a few slots, so that what travels between kernels does not grow with their number.
+
+        Args:
+            kernel: computes a function in one kernel.
+            fixed: what is the same for all slots.
+            slots: of the rollout, the one to begin with at last.
+            given: what is given to every slot, a row for each.
+            start: what it begins with: the unknowns of that slot, factors of a Jacobian, and what is carried.
+            like: pytree like what is found, a row for each slot.
+        """
+        count = slots.y.shape[0]
+        rows = min(CHUNK, count)
+
+        def round_of(carry: tuple[Going, Any]) -> tuple[Going, Any]:
+            c, found = carry
+            first = jnp.maximum(c.left - rows, 0)
+            near = jax.tree.map(
+                lambda x: jax.lax.dynamic_slice_in_dim(x, first, rows, 0), (slots, given, found)
+            )
+
+            def renewed(carry: tuple) -> tuple:
+                _, factors, at = carry
+                slot = jax.tree.map(lambda x: row(x, c.left - 1 - first), near[0])
+                return jnp.array(False), kernel(self._renewed, fixed, slot), at.refreshed()
+
+            start = c.stuck, c.factors, c.at
+            _, factors, at = jax.lax.while_loop(lambda carry: carry[0], renewed, start)
+            c = replace_fields(c, factors=factors, at=at, stuck=jnp.array(False))
+            c, part = kernel(self._several, fixed, first, *near, c)
+            update = partial(jax.lax.dynamic_update_slice_in_dim, start_index=first, axis=0)
+            return c, jax.tree.map(update, found, part)
+
+        y, factors, own = start
+        first = Going(
+            left=jnp.array(count),
+            own=own,
+            pasts=(Past.of(jnp.zeros_like(y)),) * self.stride,
+            solution=jnp.zeros_like(y),
+            at=Correcting.first(slots.accepted[-1], y, factors),
+            factors=factors,
+            stuck=jnp.array(False),
+        )
+        found = jax.tree.map(jnp.zeros_like, like)
+        return jax.lax.while_loop(lambda carry: carry[0].left > 0, round_of, (first, found))
+
+    def _several(
+        self, fixed: Any, first: Array, slots: Slot, given: Any, found: Any, c: Going
+    ) -> tuple[Going, Any]:
+        """Slots from the last one back, down to the first given here or to one that needs new factors."""
+
+        def one(carry: tuple[Going, Any]) -> tuple[Going, Any]:
+            c, found = carry
+            here = c.left - 1 - first
+            slot, own_given = jax.tree.map(lambda x: row(x, here), (slots, given))
+            arrived = self.arriving(c.own, own_given)
+            outcome, solution, at, factors = self.solved(fixed, slot, arrived, own_given, c)
+            stuck = any_lane(at.open & at.wanting)
+            lost = slot.accepted & ~at.done
+            outcome = jax.tree.map(lambda x: jnp.where(lost, jnp.nan, x), outcome)
+            keep = partial(jnp.where, slot.accepted)
+            own, *others = c.pasts
+            pasts = jax.tree.map(keep, (*others, own.followed_by(solution, factors.inertias)), c.pasts)
+            carried, found_here = self.passed_on(c.own, arrived, outcome, keep)
+            # Of a slot that waits for factors nothing counts yet; this row is written again.
+            found = jax.tree.map(
+                lambda rows, x: with_row(rows, here, keep(x, jnp.zeros_like(x))), found, found_here
+            )
+            guess = pasts[0].guess
+            guess = jnp.where(jnp.all(jnp.isfinite(guess)), guess, 0.0)
+            coming = row(slots.accepted, jnp.maximum(here - 1, 0))
+            following = Correcting.first(coming, solution, factors)
+            aged = factors.aged()
+            done = Going(c.left - 1, carried, pasts, guess, following, aged, stuck)
+            waiting = replace_fields(c, solution=solution, at=at, factors=factors, stuck=stuck)
+            return jax.tree.map(partial(jnp.where, stuck), waiting, done), found
+
+        return jax.lax.while_loop(lambda carry: (carry[0].left > first) & ~carry[0].stuck, one, (c, found))
+
+    def _renewed(self, fixed: Any, slot: Slot) -> Factors:
+        """New factors, for this slot."""
+        numbers = self.numbers_of(fixed)
+        system, parameters, dt = numbers.whole(numbers.varied)
+        u = slot.inputs(self.plan, parameters, slot.before)
+        equations = prepare(system, slot.before, u, slot.fraction * dt, self.tableau)
+        if equations.by_differences:
+            return factors_of(equations, jacobian_by_differences(equations, slot.y))
+        return factors_of(equations, equations.tangent(slot.y))
