@@ -18,7 +18,7 @@ from differences import assert_v_shaped
 import natcoord_jax as nc
 from natcoord_jax import gallery
 from natcoord_jax.stepping.backward import Backward
-from natcoord_jax.stepping.derivative import CHUNK, run_slots
+from natcoord_jax.stepping.derivative import CHUNK, Rule, run_slots
 from natcoord_jax.stepping.newton import TOLERANCE
 from natcoord_jax.stepping.plan import Plan
 from natcoord_jax.stepping.step import advance
@@ -281,10 +281,57 @@ def test_second_derivative_starting_at_rest(law):
     assert abs(again - curvature) <= tol.SAME_GRADIENT * abs(curvature)
 
 
+# --- forward mode -----------------------------------------------------------------------------------------
+
+
+RUNS = [(2, True), (4, False), (4, True)]
+
+
+@pytest.mark.parametrize(
+    ("order", "retries"), [(2, False), *(pytest.param(*x, marks=pytest.mark.slow) for x in RUNS)]
+)
+def test_directions_one_by_one_are_those_of_jacobians(order, retries, monkeypatch):
+    """Corrections with factors of other slots end where Jacobians of every slot lead to."""
+    dt, extra = (0.5, 64) if retries else (0.02, 0)
+
+    def end(rate, length):
+        found = retried(rate, length, dt, 40, extra, order)
+        return found.q[:, 1:], found.v[-1]
+
+    rejected = retried(jnp.array(1.0), 0.5, dt, 40, extra, order).steps_rejected
+    assert (int(rejected) > 0) == retries
+    at, by = (jnp.array(1.0), jnp.array(0.5)), (jnp.array(0.7), jnp.array(-0.2))
+    one = jax.jit(lambda x, d: jax.jvp(end, x, d)[1])(at, by)
+    monkeypatch.setattr(Rule, "forward", Rule.with_jacobians)
+    jax.clear_caches()
+    wanted = jax.jit(lambda x, d: jax.jvp(end, x, d)[1])(at, by)
+    for found, exact in zip(one, wanted):
+        assert jnp.all(jnp.abs(found - exact) <= tol.EXACT_GRADIENT * jnp.max(jnp.abs(exact)))
+
+
+def test_many_directions_share_jacobians(monkeypatch):
+    """As many as half the unknowns; fewer are followed one by one."""
+    asked = []
+    forward, jacobians = Rule.forward, Rule.with_jacobians
+    monkeypatch.setattr(Rule, "forward", lambda *given: asked.append("one") or forward(*given))
+    monkeypatch.setattr(Rule, "with_jacobians", lambda *given: asked.append("all") or jacobians(*given))
+    jax.clear_caches()
+
+    def end(x):
+        return retried(1.0 + x[0], 0.5 + x[1], 0.02, 4, 0).q[-1]
+
+    at = jnp.zeros(2)
+    jax.jit(jax.jacfwd(end)).lower(at)
+    assert asked == ["all"]
+    asked.clear()
+    jax.jit(lambda x: jax.jvp(end, (x,), (x,))).lower(at)
+    assert asked == ["one"]
+
+
 # --- steps that were retried ------------------------------------------------------------------------------
 
 
-def retried(rate, length=0.5, dt=0.5, steps=6, extra=64):
+def retried(rate, length=0.5, dt=0.5, steps=6, extra=64, order=2):
     """A pendulum that turns by radians in a step that is far too large."""
     scene = nc.Scene()
     scene.add(nc.Gravity(vector=(0.0, 0.0, -9.81)))
@@ -293,7 +340,8 @@ def retried(rate, length=0.5, dt=0.5, steps=6, extra=64):
     system, state = scene.compile()
     spin = rate * jnp.array([4.0, 11.0, -6.0])
     state = eqx.tree_at(lambda s: s.v, state, state.v.at[1:].set(jnp.cross(spin[None], state.q[1:])))
-    return nc.simulate(system, state, dt=dt, steps=steps, extra_substeps=extra, throw=False)
+    scheme = nc.EnergyMomentum(order)
+    return nc.simulate(system, state, dt=dt, steps=steps, extra_substeps=extra, scheme=scheme, throw=False)
 
 
 def test_gradient_through_retried_steps():

@@ -311,6 +311,44 @@ def test_linear_pair_in_every_mode():
         assert eqx.tree_equal(found, wanted, rtol=1e-12, atol=1e-12), (found, wanted)
 
 
+class Told(Scaled):
+    """Tells of how many arguments at once it is asked."""
+
+    asked: list[int] = []
+
+    def forward_many(self, residuals, arguments):
+        self.asked.append(arguments.shape[0])
+        return super().forward_many(residuals, arguments)
+
+
+def test_linear_pair_of_several_arguments():
+    """Those that share their residuals are asked for together, in lanes, too; others one by one."""
+    a, x = jnp.array([[0.3, 0.7, 1.1], [0.2, 0.5, 0.9]]), jnp.arange(1.0, 13.0).reshape(4, 3)
+    shapes = jax.eval_shape(_scaled, (a[0],), x[0])
+
+    def paired(a, x):
+        return linear_pair.apply(Told(), (a,), x, shapes)
+
+    def of_all(f):
+        return jax.vmap(f, in_axes=(None, 0))
+
+    def asked_by(make):
+        Told.asked.clear()
+        found, wanted = make(paired), make(lambda a, x: _scaled((a,), x))
+        assert eqx.tree_equal(found, wanted, rtol=1e-12, atol=1e-12), (found, wanted)
+        return Told.asked
+
+    assert asked_by(lambda f: of_all(f)(a[0], x)) == [4]
+    assert asked_by(lambda f: jax.vmap(f)(a, x[:2])) == []
+    assert asked_by(lambda f: jax.vmap(of_all(f), in_axes=(0, None))(a, x)) == [4]
+    assert asked_by(lambda f: jax.vmap(jax.vmap(f), in_axes=(None, 0))(a, x.reshape(2, 2, 3))) == [2]
+    assert asked_by(
+        lambda f: jax.vmap(jax.vmap(f), in_axes=(None, 1), out_axes=1)(a, x.reshape(2, 2, 3))
+    ) == [2]
+    assert asked_by(lambda f: of_all(of_all(f))(a[0], x.reshape(2, 2, 3))) == [2]
+    assert asked_by(lambda f: jax.jacfwd(lambda x: f(a[0], x))(x[0])) == [3]
+
+
 @pytest.mark.slow
 def test_gradients_of_stiff_and_coarse_steps_are_solved_to_the_end():
     """Factors of other steps serve badly here: the transposed systems need their own."""

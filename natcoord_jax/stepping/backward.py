@@ -15,18 +15,15 @@ from jaxtyping import Array
 
 from natcoord_jax.assembly.equations import kind_of
 from natcoord_jax.assembly.momentum import row_weights
-from natcoord_jax.assembly.separate import Tangents, tangents_at
+from natcoord_jax.assembly.separate import Tangents
 from natcoord_jax.assembly.system import System
-from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
-from natcoord_jax.linsolve.learning import learns
 from natcoord_jax.stepping.correcting import Correcting
 from natcoord_jax.stepping.factors import Factors
 from natcoord_jax.stepping.in_turn import Going, InTurn
 from natcoord_jax.stepping.newton import any_lane
 from natcoord_jax.stepping.plan import Plan
 from natcoord_jax.stepping.record import Changes, Numbers, Record, Slot
-from natcoord_jax.stepping.step import advance_between
 
 
 class Backward(InTurn):
@@ -74,20 +71,14 @@ class Backward(InTurn):
         varied_bar, state_bar = kernel(self._before_all, numbers, before_all, c)
         return Changes(varied_bar, u_bar, state_bar, forced_bar)
 
-    def _tangents(self, numbers: Numbers, varied: list[Array], state: State) -> Tangents | None:
-        """What the constraints admit in a state, for schemes that ask for it."""
-        if not self.tableau.kick:
-            return None
-        return tangents_at(numbers.whole(varied)[0], state).without_system()
-
     def _no_change(self, numbers: Numbers, state: State) -> Tangents | None:
-        shapes = jax.eval_shape(partial(self._tangents, numbers, numbers.varied), state)
+        shapes = jax.eval_shape(partial(self.admitted, numbers, numbers.varied), state)
         return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
 
     def _before_all(self, numbers: Numbers, state: State, c: Going) -> tuple[list[Array], State]:
         """Cotangents of what varies and of the first state, with those of the tangent space there."""
         state_bar, tangents_bar, varied_bar = c.own
-        _, pull = jax.vjp(partial(self._tangents, numbers), numbers.varied, state)
+        _, pull = jax.vjp(partial(self.admitted, numbers), numbers.varied, state)
         return jax.tree.map(jnp.add, (varied_bar, state_bar), pull(tangents_bar))
 
     def arriving(self, own: tuple, given: tuple[State, Array]) -> State:
@@ -122,38 +113,24 @@ class Backward(InTurn):
         # With one stage it saves time to pull back only what the corrections ask for; with more of them the
         # program grows too large for one kernel, which costs more than that.
         once = self.tableau.stages > 1
-        tangents = self._tangents(numbers, numbers.varied, slot.before)
+        tangents = self.admitted(numbers, numbers.varied, slot.before)
         at_slot = numbers.varied, slot.before, tangents, slot.u
         nothing = jax.tree.map(jnp.zeros_like, at_slot)
 
-        def changing(factors: Factors) -> tuple:
-            """What of the factors the corrections change."""
-            return factors.leaving, factors.solver if learns(factors.solver) else None
-
-        def with_changes(changes: tuple) -> Factors:
-            leaving, learnt = changes
-            solver = c.factors.solver if learnt is None else learnt
-            return replace_fields(c.factors, leaving=leaving, solver=solver)
-
-        def outcome(varied: list[Array], state: State, tangents: Tangents | None, u: Any, y: Array) -> tuple:
-            system, parameters, dt = numbers.whole(varied)
-            u = slot.inputs(self.plan, parameters, state) if u is None else u
-            return advance_between(system, state, tangents, u, slot.fraction * dt, y, self.tableau)
-
-        _, pull = jax.vjp(outcome, *at_slot, slot.y)
+        _, pull = jax.vjp(partial(self.outcome, numbers, slot), *at_slot, slot.y)
         end_bars = arrived, tangents_bar
 
         def trip(carry: tuple) -> tuple:
             _, learnt, lam, at = carry
             *bars, gap = pull((lam, *end_bars))
-            at, known = at.judged(with_changes(learnt), lam, gap + y_bar, patience, whole, not once)
+            at, known = at.judged(c.factors.with_changes(learnt), lam, gap + y_bar, patience, whole, not once)
             lam = jnp.where(at.moving, lam - at.change, lam)
-            return tuple(bars) if once else None, changing(known), lam, at
+            return tuple(bars) if once else None, known.changing, lam, at
 
-        start = nothing if once else None, changing(c.factors), c.solution, c.at
+        start = nothing if once else None, c.factors.changing, c.solution, c.at
         bars, learnt, lam, at = jax.lax.while_loop(lambda carry: any_lane(carry[-1].going), trip, start)
         found: Any = bars if once else tuple(pull((lam, *end_bars))[:-1])
-        return (*found, (lam, arrived) if self.forced else None), lam, at, with_changes(learnt)
+        return (*found, (lam, arrived) if self.forced else None), lam, at, c.factors.with_changes(learnt)
 
 
 def _size_of(system: System, h: Array, end_bar: State, y_bar: Array, factors: Factors) -> Array:

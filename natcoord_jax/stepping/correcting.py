@@ -1,4 +1,4 @@
-"""Transposed systems, solved by corrections with factors that need not be their own."""
+"""Linear systems, solved by corrections with factors that need not be their own."""
 
 from functools import partial
 
@@ -12,6 +12,9 @@ from natcoord_jax.stepping.factors import Factors
 
 CLOSE = 1e-12
 """Error of the solution of a transposed system relative to its size."""
+
+CLOSE_FORWARD = 1e-13
+"""The same of a system that is not transposed: errors of tangents add up from slot to slot."""
 
 ROUND_OFF = 1e-15
 """The same relative to what the solution would be if nothing cancelled. The gradient of a quantity that is
@@ -30,7 +33,7 @@ CORRECTIONS = 30
 """Corrections with one factorisation."""
 
 ROUNDS = 4
-"""Factorisations for one transposed system."""
+"""Factorisations for one system."""
 
 
 class Correcting(eqx.Module):
@@ -101,30 +104,34 @@ class Correcting(eqx.Module):
         patience: int,
         whole: Array,
         foreseen: bool,
+        transposed: bool = True,
     ) -> tuple["Correcting", Factors]:
         """After an evaluation: done, or moving on by a correction, or in want of new factors.
 
         Args:
             factors: at hand.
             lam: solution as it is.
-            residual: of the transposed equations.
+            residual: of the equations.
             patience: corrections that are cheaper than new factors.
             whole: size of the solution if nothing cancelled.
             foreseen: whether it is done with a correction that leaves nothing for the next, as far as can be
                 foreseen; if not, with an evaluation at the solution.
+            transposed: whether the system is that of the transposed Jacobian.
 
         Returns:
             Where it stands, and the factors, which have learnt from it if they are of that kind.
         """
-        solver, weights = factors.solver.transpose(), _weights(factors.inertias)
+        solver = factors.solver.transpose() if transposed else factors.solver
+        weights = _weights(factors.inertias)
         change = solver.solve(residual)
         size = _size(lam, weights)
-        allowed = jnp.maximum(CLOSE * size, ROUND_OFF * whole)
+        allowed = jnp.maximum((CLOSE if transposed else CLOSE_FORWARD) * size, ROUND_OFF * whole)
         known, news = self.known, change
         if learns(solver):  # Others would only be transposed twice.
             telling = self.going & (self.count > 0) & (self.correction > allowed)
             solver, change, telling = learnt(solver, self.change, change, weights, telling, self.news)
-            factors = eqx.tree_at(lambda f: f.solver, factors, solver.transpose())
+            given_back = solver.transpose() if transposed else solver
+            factors = eqx.tree_at(lambda f: f.solver, factors, given_back)
             known = jnp.where(telling, jnp.concatenate([self.news[None], known[:-1]]), known)
             news = across(known, change, weights)
         correction, entire = _size(news, weights), _size(change, weights)

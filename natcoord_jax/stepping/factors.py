@@ -7,6 +7,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from natcoord_jax.core.effect import replace_fields
+from natcoord_jax.linsolve.learning import learns
+
 NOISE = (1e-14, 2e-12)
 """Sizes of last corrections that are known, from the steps before, to be noise: stiff parts feel how their
 places are rounded. Smaller ones are not worth the risk, since what is left of an error may add up; larger
@@ -76,6 +79,16 @@ class Factors(eqx.Module):
         before = jnp.where(self.leaving < 1.0, FORGETTING * self.leaving, 0.0)
         leaving = jnp.where(telling, jnp.clip(ratio, before, 1.0), self.leaving)
         return eqx.tree_at(lambda f: f.leaving, self, leaving)
+
+    @property
+    def changing(self) -> tuple[Array, Any]:
+        """What of them changes as they correct."""
+        return self.leaving, self.solver if learns(self.solver) else None
+
+    def with_changes(self, changes: tuple[Array, Any]) -> "Factors":
+        """These, changed."""
+        leaving, learnt = changes
+        return replace_fields(self, leaving=leaving, solver=self.solver if learnt is None else learnt)
 
     def aged(self) -> "Factors":
         """Factors for another system, in which corrections may leave more."""

@@ -15,7 +15,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from natcoord_jax.assembly.equations import prepare
+from natcoord_jax.assembly.separate import Tangents, tangents_at
 from natcoord_jax.core.effect import replace_fields
+from natcoord_jax.core.state import State
 from natcoord_jax.maths.rows import row, with_row
 from natcoord_jax.stepping.correcting import Correcting
 from natcoord_jax.stepping.factors import Factors, factors_of
@@ -25,6 +27,7 @@ from natcoord_jax.stepping.past import Past
 from natcoord_jax.stepping.plan import Plan
 from natcoord_jax.stepping.probe import jacobian_by_differences
 from natcoord_jax.stepping.record import Numbers, Record, Slot
+from natcoord_jax.stepping.step import advance_between
 
 CHUNK = 32
 """Slots that a round sees, at most."""
@@ -97,6 +100,27 @@ class InTurn(ABC):
     @abstractmethod
     def following(self, kernel: Callable, record: Record, given: Any) -> Any:
         """Everything, with a function that computes others in one kernel."""
+
+    def admitted(self, numbers: Numbers, varied: list[Array], state: State) -> Tangents | None:
+        """What the constraints admit in a state, for schemes that ask for it."""
+        if not self.tableau.kick:
+            return None
+        return tangents_at(numbers.whole(varied)[0], state).without_system()
+
+    def outcome(
+        self,
+        numbers: Numbers,
+        slot: Slot,
+        varied: list[Array],
+        state: State,
+        tangents: Tangents | None,
+        u: Any,
+        y: Array,
+    ) -> tuple[Array, State, Tangents | None]:
+        """Residual of a slot's equations, the state at its end, and what the constraints admit there."""
+        system, parameters, dt = numbers.whole(varied)
+        u = slot.inputs(self.plan, parameters, state) if u is None else u
+        return advance_between(system, state, tangents, u, slot.fraction * dt, y, self.tableau)
 
     def every(self, record: Record, given: Any) -> Any:
         """Everything: in one kernel for all slots, or one for each part if that takes too long to compile."""

@@ -54,6 +54,14 @@ class Pair(ABC):
     def backward(self, residuals: Any, cotangents: Any) -> Any:
         """Its transpose."""
 
+    def forward_many(self, residuals: Any, arguments: Any) -> Any:
+        """The function of several arguments, along the first axis of each array."""
+        return jax.vmap(partial(self.forward, residuals))(arguments)
+
+    def backward_many(self, residuals: Any, cotangents: Any) -> Any:
+        """The transpose of several cotangents, along the first axis of each array."""
+        return jax.vmap(partial(self.backward, residuals))(cotangents)
+
     @abstractmethod
     def forward_changed(
         self, residuals: Any, changes: Any, arguments: Any, arguments_dot: Any
@@ -73,12 +81,14 @@ class Side:
 
     Attributes:
         value: computes it.
+        many: computes it for several linear arguments, along the first axis of each.
         changed: (which residuals change, all arguments, changes of these, changes of the linear arguments) to
             the value and its change.
         shapes: of its outputs.
     """
 
     value: Callable
+    many: Callable
     changed: Callable
     shapes: tuple[jax.ShapeDtypeStruct, ...]
 
@@ -107,12 +117,17 @@ def _bound(pair: Pair, residuals: Any, given: Any, outputs: Any, number: int) ->
     out, out_tree = jax.tree.flatten(outputs)
     count = len(res)
 
-    def side(value: Callable, changed: Callable, linear_tree: Any, shapes: Sequence[Any]) -> Side:
+    def side(programs: tuple[Callable, ...], linear_tree: Any, shapes: Sequence[Any]) -> Side:
+        value, many, changed = programs
+
         def unflattened(flat: Sequence[Any]) -> tuple[Any, Any]:
             return res_tree.unflatten(flat[:count]), linear_tree.unflatten(flat[count:])
 
         def flat_value(*flat: Any) -> list[Any]:
             return jax.tree.leaves(value(*unflattened(flat)))
+
+        def flat_many(*flat: Any) -> list[Any]:
+            return jax.tree.leaves(many(*unflattened(flat)))
 
         def flat_changed(varied: Sequence[int], flat: Any, some: Any, linear_dot: Any) -> tuple[Any, Any]:
             every: list[Any] = [Unchanged()] * count
@@ -123,10 +138,12 @@ def _bound(pair: Pair, residuals: Any, given: Any, outputs: Any, number: int) ->
             found, found_dot = changed(fixed, changes[0], linear, changes[1])
             return jax.tree.leaves(found), jax.tree.leaves(found_dot)
 
-        return Side(flat_value, flat_changed, _shapes(shapes))
+        return Side(flat_value, flat_many, flat_changed, _shapes(shapes))
 
-    programs = (pair.forward, pair.forward_changed), (pair.backward, pair.backward_changed)
-    sides = side(*programs[number], own_tree, out), side(*programs[1 - number], out_tree, own)
+    forward = pair.forward, pair.forward_many, pair.forward_changed
+    backward = pair.backward, pair.backward_many, pair.backward_changed
+    programs = forward, backward
+    sides = side(programs[number], own_tree, out), side(programs[1 - number], out_tree, own)
     return out_tree.unflatten(linear_pair_p.bind(*res, *own, sides=sides, count=count))
 
 
@@ -185,22 +202,22 @@ def _batched(args: Sequence[Any], dims: Sequence[Any], *, sides: tuple[Side, Sid
     linear = [
         jnp.broadcast_to(x, (size, *x.shape)) if d is None else x for x, d in zip(moved[count:], dims[count:])
     ]
+    shared = all(axis is None for axis in axes)
 
     def every(side: Side, other: Side) -> Side:
         inside = [0] * len(other.shapes)
+        over = partial(jax.vmap, axis_size=size)
+        value = side.many if shared else over(side.value, in_axes=[*axes, *inside])
+        # Several arguments of every lane, or lanes of several arguments, where these are lanes themselves.
+        many = over(side.many, in_axes=[*axes, *(1 for _ in inside)], out_axes=1)
 
         def changed(varied: Sequence[int], flat: Any, some: Any, linear_dot: Any) -> tuple[Any, Any]:
             of_lane = partial(side.changed, varied)
             along_axes = [*axes, *inside], [axes[k] for k in varied], inside
-            return jax.vmap(of_lane, in_axes=along_axes, axis_size=size)(
-                list(flat), list(some), list(linear_dot)
-            )
+            return over(of_lane, in_axes=along_axes)(list(flat), list(some), list(linear_dot))
 
-        return Side(
-            jax.vmap(side.value, in_axes=[*axes, *inside], axis_size=size),
-            changed,
-            tuple(jax.ShapeDtypeStruct((size, *s.shape), s.dtype) for s in side.shapes),
-        )
+        shapes = tuple(jax.ShapeDtypeStruct((size, *s.shape), s.dtype) for s in side.shapes)
+        return Side(value, many, changed, shapes)
 
     pair = every(sides[0], sides[1]), every(sides[1], sides[0])
     found = linear_pair_p.bind(*moved[:count], *linear, sides=pair, count=count)

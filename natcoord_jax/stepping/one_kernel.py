@@ -48,7 +48,7 @@ def as_one_kernel(function: Callable, *arguments: Any, too_large: Callable | Non
         arguments: pytrees of arrays.
         too_large: what to call instead if the program has more than `LARGEST` operations.
     """
-    if not _on_cpu():
+    if not on_cpu():
         return function(*arguments)
     program, shapes = jax.make_jaxpr(function, return_shape=True)(*arguments)
     if too_large is not None and operations(program.jaxpr) > LARGEST:
@@ -71,7 +71,7 @@ def scan_in_one_kernel(body: Callable, start: Any, given: Any, reverse: bool = F
     def scan(start: Any, given: Any) -> tuple[Any, Any]:
         return jax.lax.scan(body, start, given, reverse=reverse)
 
-    if not _on_cpu():
+    if not on_cpu():
         return scan(start, given)
     program, shapes = jax.make_jaxpr(scan, return_shape=True)(start, given)
     if operations(program.jaxpr) > LARGEST:
@@ -85,7 +85,7 @@ def lane_by_lane(function: Callable, *arguments: Any) -> Any:
     Several at once would wait for the slowest of them and take twice as long to compile, and what they need
     would leave the fastest cache. Only the smallest systems, of one or two bodies, would gain by it.
     """
-    if not _on_cpu():
+    if not on_cpu():
         return function(*arguments)
     return _flat(_in_turn, *jax.make_jaxpr(function, return_shape=True)(*arguments), arguments)
 
@@ -113,7 +113,8 @@ def give_up(reason: str) -> bool:
     return True
 
 
-def _on_cpu() -> bool:
+def on_cpu() -> bool:
+    """Whether loops of small operations are made one kernel: on the CPU, if the compiler can do it."""
     return jax.default_backend() == "cpu" and _attributed is not None and not _refused
 
 
