@@ -74,7 +74,7 @@ def measure(scene: str, elements: int, steps: int, repeats: int, gradient: bool)
         "result": "successful" if int(trajectory.result) == 0 else example.system.explain(trajectory),
     }
     if gradient:
-        value, both, _ = run.loss("system")
+        value, both, _, _ = run.loss("system")
         _, whole = common.timed_in_turn((value, both), steps, repeats)
         found["gradient_ratio"] = whole["over_first"]
         found["gradient_compile_s"] = whole["compile_s"]

@@ -73,15 +73,16 @@ class Rollout:
         program = jax.jit(jax.vmap(self._simulate, in_axes=(axes,)))
         return lambda: jax.block_until_ready(program(arguments))
 
-    def loss(self, part: str) -> tuple[Callable[[], Array], Callable[[], Any], int]:
-        """Sum of squares of the final velocities, and the same with its gradient.
+    def loss(self, part: str) -> tuple[Callable[[], Array], Callable[[], Any], Callable[[], Any], int]:
+        """Sum of squares of the final velocities, the same with its gradient, and with one tangent.
 
         Args:
-            part: what the gradient is with respect to.
+            part: what the gradient is with respect to. The tangent is along these numbers themselves.
 
         Returns:
-            Calls of the value and of value and gradient, and the number of parameters. The second raises
-            FloatingPointError if its first gradient is not finite: the time of a wrong one says nothing.
+            Calls of the value, of value and gradient and of value and tangent, and the number of parameters.
+            The second raises FloatingPointError if its first gradient is not finite, and the third if its
+            first tangent is not that of the gradient: the time of a wrong one says nothing.
         """
         chosen = self._selected(part)
 
@@ -103,8 +104,25 @@ class Rollout:
             seen = True
             return found
 
+        def along(values: list[Array], arguments: list[Array]) -> tuple[Array, Array]:
+            return jax.jvp(lambda x: loss(x, arguments), (values,), (values,))
+
+        tangent, compared = jax.jit(along), False
+
+        def with_tangent() -> Any:
+            nonlocal compared
+            found = jax.block_until_ready(tangent(values, self._arguments))
+            if not compared:
+                terms = [g * x for g, x in zip(with_gradient()[1], values, strict=True)]
+                size = sum(float(jnp.sum(jnp.abs(x))) for x in terms)
+                if not abs(float(found[1]) - sum(float(jnp.sum(x)) for x in terms)) <= 1e-6 * size:
+                    raise FloatingPointError(f"the tangent by the {part} is not that of the gradient")
+            compared = True
+            return found
+
         return (
             lambda: jax.block_until_ready(value(values, self._arguments)),
             with_gradient,
+            with_tangent,
             sum(x.size for x in values),
         )

@@ -181,9 +181,12 @@ def own_run(model: str, example: gallery.Example, steps: int, repeats: int) -> d
 def own_gradient(
     example: gallery.Example, part: str, steps: int, repeats: int, order: int = 2
 ) -> dict[str, Any]:
-    """Value and gradient of the summed squares of the final velocities, over the value alone."""
-    value, both, count = _rollout(example, steps, order).loss(part)
-    forward, backward = common.timed_in_turn((value, both), steps, repeats)
+    """Value and gradient of the summed squares of the final velocities, over the value alone.
+
+    Under `tangent`, the same of value and one tangent, in forward mode.
+    """
+    value, both, along, count = _rollout(example, steps, order).loss(part)
+    forward, backward, tangent = common.timed_in_turn((value, both, along), steps, repeats)
     over_forward = backward.pop("over_first")
     _, gradient = both()
     return {
@@ -195,6 +198,7 @@ def own_gradient(
         "forward_us_per_step": forward["us_per_step"],
         "forward_compile_s": forward["compile_s"],
         "over_forward": over_forward,
+        "tangent": {"over_forward": tangent.pop("over_first"), **tangent},
         "finite": all(bool(np.all(np.isfinite(leaf))) for leaf in gradient),
     }
 

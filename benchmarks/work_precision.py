@@ -215,7 +215,8 @@ def own_gradients(model: str, repeats: int) -> list[dict[str, Any]]:
         check_run(example, order)
         rounds = GRADIENT_ROUNDS * repeats
         found.append({"order": order} | beside.own_gradient(example, "state", GRADIENT_STEPS, rounds, order))
-        print(f"{model}: gradient at order {order}: {found[-1]['over_forward']:.2f}", flush=True)
+        ratio, tangent = found[-1]["over_forward"], found[-1]["tangent"]["over_forward"]
+        print(f"{model}: order {order}: gradient {ratio:.2f}, tangent {tangent:.2f}", flush=True)
     return found
 
 

@@ -91,7 +91,8 @@ class Backward(InTurn):
         before_bar = jax.tree.map(keep, before_bar, arrived)
         tangents_bar = jax.tree.map(keep, tangents_bar, own[1])
         varied_bar = jax.tree.map(lambda total, x: keep(total + x, total), own[2], more)
-        return (before_bar, tangents_bar, varied_bar), (own_bar, forced_bar)
+        found = jax.tree.map(lambda x: keep(x, jnp.zeros_like(x)), (own_bar, forced_bar))
+        return (before_bar, tangents_bar, varied_bar), found
 
     def solved(
         self, fixed: Numbers, slot: Slot, arrived: State, given: tuple[State, Array], c: Going

@@ -78,7 +78,7 @@ class Forward(InTurn):
         end_dot, tangents_dot, y_dot, known = outcome
         past = own[2].followed_by(known, jnp.ones_like(known))
         end_dot, tangents_dot, past = jax.tree.map(keep, (end_dot, tangents_dot, past), own)
-        return (end_dot, tangents_dot, past), (end_dot, y_dot)
+        return (end_dot, tangents_dot, past), (end_dot, keep(y_dot, jnp.zeros_like(y_dot)))
 
     def solved(
         self, fixed: tuple[Numbers, list[Array]], slot: Slot, arrived: tuple, given: tuple, c: Going

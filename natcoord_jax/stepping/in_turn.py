@@ -205,9 +205,7 @@ class InTurn(ABC):
             pasts = jax.tree.map(keep, (*others, own.followed_by(solution, factors.inertias)), c.pasts)
             carried, found_here = self.passed_on(c.own, arrived, outcome, keep)
             # Of a slot that waits for factors nothing counts yet; this row is written again.
-            found = jax.tree.map(
-                lambda rows, x: with_row(rows, here, keep(x, jnp.zeros_like(x))), found, found_here
-            )
+            found = jax.tree.map(lambda rows, x: with_row(rows, here, x), found, found_here)
             guess = pasts[0].guess
             guess = jnp.where(jnp.all(jnp.isfinite(guess)), guess, 0.0)
             coming = row(slots.accepted, jnp.maximum(here - 1, 0))
