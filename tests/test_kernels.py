@@ -16,7 +16,7 @@ from natcoord_jax.maths.projectors import range_projector
 from natcoord_jax.maths.vectors import cross, skew
 from natcoord_jax.stepping import linear_pair, one_kernel, rewriting, rounds
 from natcoord_jax.stepping.endpoint import endpoints
-from natcoord_jax.stepping.one_kernel import as_one_kernel, lane_by_lane
+from natcoord_jax.stepping.one_kernel import as_one_kernel, in_few_kernels, lane_by_lane
 from natcoord_jax.stepping.plan import Plan
 from natcoord_jax.stepping.rollout import run
 
@@ -63,6 +63,36 @@ def test_one_kernel_computes_the_same(name):
     several = jax.jit(jax.vmap(lambda x: lane_by_lane(lambda x: as_one_kernel(plain, x), x)))
     assert MARK in several.lower(lanes).as_text(), "lanes are not compiled into one kernel"
     np.testing.assert_allclose(several(lanes), jax.vmap(plain)(lanes), rtol=1e-13, atol=1e-13)
+
+
+@pytest.mark.parametrize("largest", (one_kernel.LARGEST, 0))
+def test_parts_are_traced_once_whether_apart_or_not(monkeypatch, largest):
+    monkeypatch.setattr(one_kernel, "LARGEST", largest)
+    traced = []
+
+    def grown(x):
+        traced.append("grown")
+        return 1.5 * x
+
+    def shrunk(x):
+        traced.append("shrunk")
+        return {"x": jnp.sin(x), "times": jnp.array(1)}
+
+    def every(part, x, count):
+        def one(carry):
+            k, total, x = carry
+            found = part(shrunk, part(grown, x))
+            return k + found["times"], total + part(grown, found["x"]), found["x"]
+
+        return jax.lax.while_loop(lambda carry: carry[0] < count, one, (0, jnp.zeros_like(x), x))
+
+    x = jnp.arange(1.0, 4.0)
+    program = jax.jit(partial(in_few_kernels, every)).lower(x, 3)
+    assert sorted(traced) == ["grown", "shrunk"]
+    assert program.as_text().count("xla_cpu_small_call") == (1 if largest else 3)
+    found = program.compile()(x, 3)
+    expected = every(lambda part, *given: part(*given), x, 3)
+    np.testing.assert_allclose(found[1], expected[1], rtol=1e-14)
 
 
 def test_what_calls_a_library_is_left_as_it_is():

@@ -22,7 +22,7 @@ from natcoord_jax.maths.rows import row, with_row
 from natcoord_jax.stepping.correcting import Correcting
 from natcoord_jax.stepping.factors import Factors, factors_of
 from natcoord_jax.stepping.newton import any_lane
-from natcoord_jax.stepping.one_kernel import as_one_kernel, lane_by_lane, plainly
+from natcoord_jax.stepping.one_kernel import in_few_kernels, lane_by_lane
 from natcoord_jax.stepping.past import Past
 from natcoord_jax.stepping.plan import Plan
 from natcoord_jax.stepping.probe import jacobian_by_differences
@@ -99,7 +99,7 @@ class InTurn(ABC):
 
     @abstractmethod
     def following(self, kernel: Callable, record: Record, given: Any) -> Any:
-        """Everything, with a function that computes others in one kernel."""
+        """Everything, with what computes a function of its arguments in a kernel."""
 
     def admitted(self, numbers: Numbers, varied: list[Array], state: State) -> Tangents | None:
         """What the constraints admit in a state, for schemes that ask for it."""
@@ -124,11 +124,7 @@ class InTurn(ABC):
 
     def every(self, record: Record, given: Any) -> Any:
         """Everything: in one kernel for all slots, or one for each part if that takes too long to compile."""
-        return lane_by_lane(self._in_kernels, record, given)
-
-    def _in_kernels(self, record: Record, given: Any) -> Any:
-        several = partial(self.following, as_one_kernel)
-        return as_one_kernel(partial(self.following, plainly), record, given, too_large=several)
+        return lane_by_lane(partial(in_few_kernels, self.following), record, given)
 
     def in_rounds(
         self,

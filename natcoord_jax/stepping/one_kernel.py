@@ -38,7 +38,7 @@ ATTRIBUTES = {"xla_cpu_small_call": "true", "inlineable": "false"}
 """Compiled as one function; kept as a call until then."""
 
 
-def as_one_kernel(function: Callable, *arguments: Any, too_large: Callable | None = None) -> Any:
+def as_one_kernel(function: Callable, *arguments: Any) -> Any:
     """The value of a function, computed in one kernel where that is possible.
 
     Not differentiable by itself.
@@ -46,13 +46,43 @@ def as_one_kernel(function: Callable, *arguments: Any, too_large: Callable | Non
     Args:
         function: of the arguments; it may close over traced values.
         arguments: pytrees of arrays.
-        too_large: what to call instead if the program has more than `LARGEST` operations.
     """
     if not on_cpu():
         return function(*arguments)
-    program, shapes = jax.make_jaxpr(function, return_shape=True)(*arguments)
-    if too_large is not None and operations(program.jaxpr) > LARGEST:
-        return too_large(*arguments)
+    return _flat(_kernel, *jax.make_jaxpr(function, return_shape=True)(*arguments), arguments)
+
+
+def in_few_kernels(function: Callable, *arguments: Any) -> Any:
+    """The value of a function, in one kernel; in one for each of its parts if that would be too large.
+
+    Parts are traced once, whichever it is. Not differentiable by itself.
+
+    Args:
+        function: of what calls a part with its arguments, and of the arguments. Parts are hashable functions
+            of pytrees of arrays that close over no traced values.
+        arguments: pytrees of arrays.
+    """
+    if not on_cpu():
+        return function(plainly, *arguments)
+    parts: dict[Any, tuple[Any, Any]] = {}
+
+    def traced(part: Callable, given: tuple) -> tuple[Any, Any]:
+        leaves, tree = jax.tree.flatten(given)
+        key = part, tree, *map(jax.typeof, leaves)
+        if key not in parts:
+            parts[key] = jax.make_jaxpr(part, return_shape=True)(*given)
+        return parts[key]
+
+    def written_out(part: Callable, *given: Any) -> Any:
+        return _flat(lambda flat: flat, *traced(part, given), given)
+
+    def apart(part: Callable, *given: Any) -> Any:
+        return _flat(_kernel, *traced(part, given), given)
+
+    whole = partial(function, written_out)
+    program, shapes = jax.make_jaxpr(whole, return_shape=True)(*arguments)
+    if operations(program.jaxpr) > LARGEST:
+        return function(apart, *arguments)
     return _flat(_kernel, program, shapes, arguments)
 
 
