@@ -317,11 +317,11 @@ def equal_error(
     for code in dict.fromkeys(run["code"] for run in runs):
         own = sorted((r for r in runs if r["code"] == code and r["error"]), key=lambda r: r["steps"])
         points = [(math.log(r["error"]), math.log(1e-3 * r["us_per_step"] * r["steps"])) for r in own]
-        table[code] = {f"{wanted:g}": _time_at(points, math.log(wanted)) for wanted in levels}
+        table[code] = {f"{wanted:g}": time_at(points, math.log(wanted)) for wanted in levels}
     return table
 
 
-def _time_at(points: list[tuple[float, float]], wanted: float) -> float | None:
+def time_at(points: list[tuple[float, float]], wanted: float) -> float | None:
     """Time at the first crossing of an error, from points (log error, log time) in the order of steps."""
     for (e0, t0), (e1, t1) in zip(points[:-1], points[1:], strict=True):
         if e0 >= wanted >= e1 and e0 > e1:

@@ -74,6 +74,31 @@ def _gradient(rollout, controls, velocity, steps: int, repeats: int) -> dict:
     }
 
 
+def batch(model: str, integrator: str, steps: int, factors):
+    """A function of the step [s]: positions and velocities after some steps, of all lanes.
+
+    Args:
+        model: a name in `MODELS`.
+        integrator: Euler, RK4 or implicitfast.
+        steps: number of steps.
+        factors: of the start velocities, by lane.
+    """
+    source = MODELS[model]
+    mj_model, data = build(source, 1.0, integrator)
+    jax.config.update("jax_enable_x64", True)
+    mjx_model, start = mjx.put_model(mj_model), mjx.put_data(mj_model, data)
+    controls = jnp.tile(start.ctrl, (steps, 1))
+
+    def rollout(dt, factor):
+        # The time constant of constraints is given in steps, of one second in this model.
+        solref = mjx_model.eq_solref * jnp.stack([dt, jnp.ones_like(dt)])
+        timed = mjx_model.tree_replace({"opt.timestep": dt, "eq_solref": solref})
+        return _rollout(timed, start, steps)(controls, factor * start.qvel)
+
+    program = jax.jit(jax.vmap(rollout, in_axes=(None, 0)))
+    return lambda dt: program(jnp.asarray(dt), factors)
+
+
 def run(
     model: str,
     steps: int,

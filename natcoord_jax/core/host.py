@@ -176,7 +176,10 @@ INNER = "jaxpr", "call_jaxpr", "call"
 
 
 def _scan(given: dict[str, Any], operands: list[np.ndarray]) -> list[np.ndarray]:
-    fixed, carried = given["num_consts"], given["num_carry"]
+    if "ft_in" in given:  # since JAX 0.11
+        fixed, carried, _ = (len(list(part)) for part in given["ft_in"].unpack())
+    else:
+        fixed, carried = given["num_consts"], given["num_carry"]
     constants, state = operands[:fixed], operands[fixed : fixed + carried]
     listed, body = operands[fixed + carried :], given["jaxpr"]
     order = range(given["length"])
