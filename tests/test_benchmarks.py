@@ -60,6 +60,16 @@ def test_work_precision_of_one_scene_alone(tmp_path):
     assert again["long"] and not results["long"]
 
 
+def test_batches_of_one_scene(tmp_path):
+    options = "--no-peers", "--models", "heavy_top", "--lanes", "2"
+    results, text = _results("batches", tmp_path, *options)
+    (found,) = results["models"].values()
+    assert {run["code"][-1] for run in found["runs"]} == {"2", "4"}
+    for run in found["runs"]:
+        assert run.keys() >= {"lanes", "steps", "error", "us_per_step"} and run["finite"]
+    assert results["device"] and "heavy_top" in text
+
+
 def test_gradients_alone(tmp_path):
     options = "--gradients", "--models", "heavy_top"
     results, _ = _results("work_precision", tmp_path, *options, written="gradients")
