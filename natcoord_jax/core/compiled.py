@@ -20,6 +20,21 @@ ten times, which are milliseconds. Who runs one often wraps it in `jax.jit`, whe
 F = TypeVar("F", bound=Callable[..., Any])
 
 
+def accepted(options: dict[str, Any]) -> dict[str, Any]:
+    """Those options that the compiler has: they come and go with its versions. None but on the CPU."""
+    on_cpu = jax.default_backend() == "cpu"
+    return {name: value for name, value in options.items() if on_cpu and _is_known(name, value)}
+
+
+@cache
+def _is_known(name: str, value: Any) -> bool:
+    try:
+        jax.jit(lambda: 0, compiler_options={name: value})()
+    except jax.errors.JaxRuntimeError:
+        return False
+    return True
+
+
 def quickly(function: F) -> F:
     """`eqx.filter_jit` that compiles quicker at the outermost call; JAX accepts options only there."""
     return _with(QUICK, function)
@@ -30,27 +45,17 @@ def briefly(function: F) -> F:
     return _with(BRIEF, function)
 
 
-@cache
-def _known(name: str, value: Any) -> bool:
-    """Whether the compiler has an option: they come and go with its versions."""
-    try:
-        jax.jit(lambda: 0, compiler_options={name: value})()
-    except jax.errors.JaxRuntimeError:
-        return False
-    return True
-
-
 def _with(options: dict[str, Any], function: F) -> F:
     within = eqx.filter_jit(function)
 
     @cache
     def outermost() -> Callable:
-        known = {name: value for name, value in options.items() if _known(name, value)}
+        known = accepted(options)
         return eqx.filter_jit(function, compiler_options=known)  # pyright: ignore[reportCallIssue]
 
     @wraps(function)
     def call(*arguments: Any) -> Any:
-        quick = at_top_level(eqx.filter(arguments, eqx.is_array)) and jax.default_backend() == "cpu"
+        quick = at_top_level(eqx.filter(arguments, eqx.is_array))
         return (outermost() if quick else within)(*arguments)
 
     return call  # pyright: ignore[reportReturnType]

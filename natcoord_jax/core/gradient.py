@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.maths.collocation import Tableau, invariant_quadrature
-from natcoord_jax.maths.vectors import safe_divide
+from natcoord_jax.maths.vectors import largest, safe_divide
 
 LEAST = 1e-9
 """Relative change of the invariants below which nothing can be missing but round-off."""
@@ -72,21 +72,21 @@ def averaged_gradient(
     # In proportion to what each gradient changes by: what is soft stays soft, and hardly moved, unmoved.
     # A change within rounding, by a step that is itself nothing but rounding, would be any stiffness.
     epsilon = jnp.finfo(start.dtype).eps
-    moved = jnp.max(jnp.abs(steps), axis=0)
-    changed = jnp.max(slopes, axis=0) - jnp.min(slopes, axis=0)
-    changed = jnp.where(changed > SPREAD * epsilon * jnp.max(jnp.abs(slopes), axis=0), changed, 0.0)
+    moved = largest(jnp.abs(steps))
+    changed = largest(slopes) + largest(-slopes)
+    changed = jnp.where(changed > SPREAD * epsilon * largest(jnp.abs(slopes)), changed, 0.0)
     stiffness = safe_divide(changed, moved)
     enough = jnp.sum(weights * stiffness * steps**2, axis=(0, 1)) > jnp.abs(missing)
     # A kink can hide between the points: then in proportion to the steps, beside the largest invariant of the
     # same unit; where one is zero, as in a straight beam, it is rounded as that is.
     scale = jnp.abs(start) + jnp.abs(increment)
-    largest = _largest(scale, units or (scale.shape[0],))
-    weight = safe_divide(jnp.ones_like(largest), largest**2)
+    beside = _largest(scale, units or (scale.shape[0],))
+    weight = safe_divide(jnp.ones_like(beside), beside**2)
     change = jnp.sum(weights * weight * steps**2, axis=(0, 1))
     share = jnp.where(enough, stiffness, weight)
     measure = jnp.sum(weights * share * steps**2, axis=(0, 1))
     # Near its minimum an energy is less certain than its digits say: invariants are rounded before it.
-    rounded = jnp.max(jnp.sum(jnp.abs(gradient) * scale, axis=1), axis=0)
+    rounded = largest(jnp.sum(jnp.abs(gradient) * scale, axis=1))
     sizes = jnp.abs(before) + jnp.abs(after) + jnp.abs(captured) + rounded
     noise = 16 * epsilon * sizes
     relevant = (jnp.abs(missing) > noise) & (change > LEAST**2)
@@ -97,7 +97,7 @@ def averaged_gradient(
 def _largest(scale: Float[Array, "p *n"], units: tuple[int, ...]) -> Float[Array, "p *n"]:
     """The largest of the sizes that have the same unit, for each."""
     ends = np.cumsum(units)
-    parts = [jnp.max(scale[end - count : end], axis=0) for count, end in zip(units, ends)]
+    parts = [largest(scale[end - count : end]) for count, end in zip(units, ends)]
     return jnp.stack([part for part, count in zip(parts, units) for _ in range(count)])
 
 

@@ -38,6 +38,20 @@ def safe_sqrt(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
 
 
+def largest(x: Float[Array, "k *rest"]) -> Float[Array, "*rest"]:
+    """Largest number along the first axis, of at least one.
+
+    Its derivative is that of one of the numbers, also where equal ones are computed twice. `jnp.max` looks
+    for those that equal the largest; a compiler that rounds the same product in two ways, once with a fused
+    multiply-add, lets it find none, and divide zero by zero.
+    """
+    while x.shape[0] > 1:
+        half = x.shape[0] // 2
+        one, other = x[:half], x[half : 2 * half]
+        x = jnp.concatenate([jnp.where(one > other, one, other), x[2 * half :]])
+    return x[0]
+
+
 def safe_norm(a: Float[Array, "*batch k"]) -> Float[Array, "*batch"]:
     """Euclidean norm over the last axis; its derivative at the origin is zero, not NaN."""
     return safe_sqrt(jnp.sum(a * a, axis=-1))

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int
 
 from natcoord_jax.assembly.system import System
 from natcoord_jax.core.checks import at_top_level
-from natcoord_jax.core.compiled import QUICK
+from natcoord_jax.core.compiled import QUICK, accepted
 from natcoord_jax.core.state import State
 from natcoord_jax.stepping.course import Setting
 from natcoord_jax.stepping.newton import TOLERANCE
@@ -91,7 +91,7 @@ def _program(
             return end(as_one_kernel, *numbers)
         return as_one_kernel(partial(end, plainly), *numbers)
 
-    outermost = jax.jit(run, compiler_options=QUICK if jax.default_backend() == "cpu" else None)
+    outermost = jax.jit(run, compiler_options=accepted(QUICK))
     within = jax.jit(run)  # JAX accepts options at the outermost call only.
     return lambda *numbers: (outermost if at_top_level(numbers) else within)(*numbers)
 
