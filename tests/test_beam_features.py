@@ -179,6 +179,7 @@ def test_data_with_the_first_axis_along_the_beam():
     assert ours @ np.asarray(coupled) @ ours == pytest.approx(np.sum((root.T @ theirs) ** 2), rel=ROUNDING)
 
 
+@pytest.mark.slow
 def test_centre_of_mass_beside_the_axis():
     """Could go wrong: an offset along the wrong director, its inertia missing or counted twice.
 
@@ -550,6 +551,7 @@ def hinged(section):
     return np.asarray(nc.modes(*scene.compile()).frequencies)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("aside", [0.0, 0.05])
 def test_frequencies_between_hinges(aside):
     """Could go wrong: an offset of the mass that does not couple, constraints of a loop that stiffen.

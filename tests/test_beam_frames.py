@@ -37,6 +37,7 @@ def flexibility(first, second, cuts):
     return a**2 * (3 * b - a) / (6 * BENDING) + a / SHEAR, mesh + a / SHEAR
 
 
+@pytest.mark.slow
 def test_a_portal_with_a_rigid_corner_and_a_hinge():
     """Could go wrong: a corner that two beams share carries no moment, a hinge does.
 
@@ -163,6 +164,7 @@ def loop():
     return system, replace_fields(state, v=v)
 
 
+@pytest.mark.slow
 def test_a_loop_of_beams_and_bodies_in_flight():
     """Could go wrong: a cut of the loop that works, elements between joints. All balances over 300 steps."""
     system, state = loop()

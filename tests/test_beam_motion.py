@@ -100,6 +100,7 @@ def test_a_coarse_rope_stays_together():
     assert account(system, trajectory).energy_error <= tol.ENERGY
 
 
+@pytest.mark.slow
 def test_start_from_rest_at_zero_strain():
     """Values and derivatives are finite where rotations, strains and velocities are exactly zero."""
     system, state, beam = rope(4)

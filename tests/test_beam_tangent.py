@@ -122,14 +122,14 @@ def differentiated(stages, exact):
     return [jax.jit(lambda g=g: jacobians(g, *rest, exact=exact)[0][0])() for g in (group, plain)]
 
 
-@pytest.mark.parametrize("stages", [1, 2])
+@pytest.mark.parametrize("stages", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_tangents_are_derivatives_of_the_linearised_response(stages):
     """Exact in the geometry, for arms, rotated frames and finite turns."""
     found, plain = differentiated(stages, exact=False)
     assert jnp.max(jnp.abs(found - plain)) <= tol.IDENTITY * jnp.max(jnp.abs(plain))
 
 
-@pytest.mark.parametrize("stages", [1, 2])
+@pytest.mark.parametrize("stages", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_exact_jacobians_at_once_are_those_of_each(stages):
     """As derivatives of trajectories use them."""
     found, plain = differentiated(stages, exact=True)

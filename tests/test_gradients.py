@@ -231,7 +231,7 @@ def test_reverse_over_reverse_is_exact_or_refused():
     assert abs(found - second("forward over reverse")(p, d)) <= tol.SAME_GRADIENT * abs(found)
 
 
-USUAL = ("value", "tangent", "gradient")
+USUAL = ("value", "gradient")
 
 
 @pytest.mark.parametrize(
@@ -284,12 +284,8 @@ def test_second_derivative_starting_at_rest(law):
 # --- forward mode -----------------------------------------------------------------------------------------
 
 
-RUNS = [(2, True), (4, False), (4, True)]
-
-
-@pytest.mark.parametrize(
-    ("order", "retries"), [(2, False), *(pytest.param(*x, marks=pytest.mark.slow) for x in RUNS)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("order", "retries"), [(2, False), (2, True), (4, False), (4, True)])
 def test_directions_one_by_one_are_those_of_jacobians(order, retries, monkeypatch):
     """Corrections with factors of other slots end where Jacobians of every slot lead to."""
     dt, extra = (0.5, 64) if retries else (0.02, 0)

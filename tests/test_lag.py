@@ -32,7 +32,9 @@ NOISE = {"open_tree": 3e-14, "four_bar": 3e-14, "stiff_chain": 1e-12}
 """Of the last correction: kicks that serve, and stiff springs, which feel how their ends are rounded."""
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize(
+    "name", ["four_bar", *(pytest.param(x, marks=pytest.mark.slow) for x in ("open_tree", "stiff_chain"))]
+)
 def test_steps_obey_the_equations_with_their_own_kick(name):
     order, h, steps = SCENES[name]
     example, tableau = gallery.load(name), nc.EnergyMomentum(order).tableau

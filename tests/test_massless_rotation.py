@@ -25,6 +25,7 @@ def motion(solver, **options):
     return np.asarray(system.sense(trajectory, beam.end).position)
 
 
+@pytest.mark.slow
 def test_they_are_no_point_masses():
     """Could go wrong: the form with all multipliers takes them for point masses and holds their directors by
     an inertia of its own, so that the beam hardly bends and energy is lost."""

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 import tolerances as tol
 
 import natcoord_jax as nc
@@ -69,6 +70,7 @@ def test_what_is_no_set_of_single_bodies():
     assert not separate.separate(scene.compile()[0])
 
 
+@pytest.mark.slow
 def test_motion_with_tangents_of_single_bodies(monkeypatch):
     system, state = mixed()
     runs = []

@@ -165,7 +165,9 @@ def test_evaluations_of_a_jacobian_are_told_what_they_are_for():
         assert np.all(np.asarray(found.residual) == 2.0)
 
 
-@pytest.mark.parametrize("name", ["four_bar", "bricard", "robot_arm"])
+@pytest.mark.parametrize(
+    "name", ["bricard", *(pytest.param(x, marks=pytest.mark.slow) for x in ("four_bar", "robot_arm"))]
+)
 def test_jacobian_with_multipliers_of_all_stages_together(name):
     # What could go wrong: forces of a constraint, or of a drive, that reach another stage.
     example = gallery.load(name)
@@ -179,7 +181,7 @@ def test_jacobian_with_multipliers_of_all_stages_together(name):
     np.testing.assert_allclose(found, exact, atol=1e-5 * float(jnp.max(jnp.abs(exact))))
 
 
-@pytest.mark.parametrize("order", [4, 6])
+@pytest.mark.parametrize("order", [4, pytest.param(6, marks=pytest.mark.slow)])
 def test_stiff_springs_are_nearly_alike_at_all_stages(order):
     # What is left of an error after one correction, with w h = 160; along axes that rest 0.23.
     example = gallery.load("stiff_chain", rods=3)

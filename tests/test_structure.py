@@ -254,6 +254,7 @@ def blocks_on_springs(count, closed, solver=None):
     return scene.compile(solver=solver)
 
 
+@pytest.mark.slow
 def test_chains_on_springs_are_solved_along_the_chain():
     system, state = blocks_on_springs(7, closed=False)
     assert system.structure.solver == "recursive"

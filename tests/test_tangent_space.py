@@ -43,7 +43,12 @@ def scenes():
     yield "driven", *driven_four_bar()
 
 
-@pytest.fixture(scope="module", params=["four_bar", "bricard", "slider_crank", "driven"])
+LONG = "bricard", "slider_crank"
+
+
+@pytest.fixture(
+    scope="module", params=["four_bar", "driven", *(pytest.param(x, marks=pytest.mark.slow) for x in LONG)]
+)
 def scene(request):
     system, state = next((system, state) for name, system, state in scenes() if name == request.param)
     moved = nc.simulate(system, state, dt=0.01, steps=5)
@@ -53,9 +58,13 @@ def scene(request):
 def test_constraints_of_a_step_at_rest_are_those_of_an_instant(scene):
     system, state = scene
     inputs = jnp.zeros(len(system.structure.inputs))
-    step = at_rest(ReducedStep.prepare(system, state, inputs, jnp.zeros(()), gauss(1), NOTHING))
     count, rest = system.structure.unknowns, jnp.zeros(system.structure.multipliers)
-    rows = jax.jacfwd(lambda w: step.residual(jnp.concatenate([w, rest]))[0][count:])(jnp.zeros(count))
+
+    def constraints(w):
+        step = at_rest(ReducedStep.prepare(system, state, inputs, jnp.zeros(()), gauss(1), NOTHING))
+        return step.residual(jnp.concatenate([w, rest]))[0][count:]
+
+    rows = jax.jit(jax.jacfwd(constraints))(jnp.zeros(count))
     np.testing.assert_allclose(constraint_matrix(system, state), rows, atol=1e-13)
 
 
