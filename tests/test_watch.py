@@ -18,7 +18,13 @@ from natcoord_jax.stepping.step import advance
 FORMS = {"tree": nc.Revolute, "multipliers": with_multipliers(nc.Revolute)}
 
 
-@pytest.fixture(scope="module", params=[(2, "tree"), (4, "tree"), (2, "multipliers"), (4, "multipliers")])
+LONG = (4, "tree"), (2, "multipliers")
+
+
+@pytest.fixture(
+    scope="module",
+    params=[(2, "tree"), (4, "multipliers"), *(pytest.param(x, marks=pytest.mark.slow) for x in LONG)],
+)
 def solved(request):
     """Next to the solution of a step: change of energy and work of the residual, and whether it is sound."""
     order, form = request.param
