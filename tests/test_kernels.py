@@ -179,9 +179,10 @@ def test_rounds_of_two_kernels_are_the_loop_in_one(monkeypatch, recorded):
     expected = jax.tree.leaves(cut)
     for (path, a), b in zip(jax.tree.leaves_with_path(whole), expected, strict=True):
         # How much corrections leave is measured in roundings, which compilers may choose differently.
-        loose = jax.tree_util.keystr(path).endswith("factors.leaving")
-        tolerance = 1e-4 if loose else 1e-10
-        np.testing.assert_allclose(a, b, rtol=0, atol=tolerance * np.max(np.abs(b), initial=1.0))
+        if jax.tree_util.keystr(path).endswith("factors.leaving"):
+            np.testing.assert_allclose(a, b, rtol=1e-2)
+        else:
+            np.testing.assert_allclose(a, b, rtol=0, atol=1e-10 * np.max(np.abs(b), initial=1.0))
 
 
 @pytest.mark.parametrize("count", [4, 48])
