@@ -28,12 +28,12 @@ from benchmarks.peers import measure as peer_measure
 from benchmarks.spacecraft import OWN
 from benchmarks.work_precision import scene_of
 
-MODELS = ("heavy_top", "double_pendulum")
-OTHERS = ("spinning_spacecraft", "four_bar")
-"""Scenes that take minutes to compile on a GPU, and are measured if they are asked for."""
+MODELS = ("heavy_top", "double_pendulum", "spinning_spacecraft", "four_bar")
 ORDERS = (2, 4)
 COUNTS = (16, 32, 64, 128, 256, 512, 1024)
-"""Steps of the rollouts of natcoord_jax."""
+FEWEST = {"spinning_spacecraft": 64, "four_bar": 64}
+"""Steps of the rollouts of natcoord_jax, and the fewest at which no lane repeats steps in parts: all others
+wait for one that does, and such a batch takes minutes."""
 THEIRS = (100, 1000)
 """Steps of the rollouts of MJX: those that its errors are known for."""
 LANES = (1, 1024, 32768)
@@ -51,14 +51,15 @@ def known(model: str, code: str, key: str) -> dict[int, float]:
 
 
 def own_batch(model: str, order: int, lanes: int) -> Callable[[float], Any]:
-    """A function of the step [s]: the ends of all lanes after `STEPS` steps."""
+    """A function of the step [s]: by lane, the end after `STEPS` steps, the code and the steps repeated."""
     example = scene_of(model)
 
     def run(state: nc.State, factor: Any, dt: Any) -> Any:
         state = eqx.tree_at(lambda s: s.v, state, factor * state.v)
         inputs = jax.vmap(example.torques)(dt * (jnp.arange(STEPS) + 0.5)) if example.torques else None
         options = {"save_every": STEPS, "scheme": nc.EnergyMomentum(order=order), "throw": False}
-        return nc.simulate(example.system, state, dt=dt, steps=STEPS, inputs=inputs, **options).states.q[-1]
+        found = nc.simulate(example.system, state, dt=dt, steps=STEPS, inputs=inputs, **options)
+        return found.states.q[-1], found.result, found.steps_rejected
 
     program = jax.jit(jax.vmap(run, in_axes=(None, 0, None)))
     factors = 1.0 + DISTURBANCE * jnp.linspace(0.0, 1.0, lanes)
@@ -77,23 +78,32 @@ def runs_of(
 ) -> list[dict[str, Any]]:
     """Times per step and lane, by the number of steps of a rollout."""
     errors, alone = known(model, code, "error"), known(model, code, "us_per_step")
-    counts = [n for n in (THEIRS if code == MJX else plan["counts"]) if n in errors]
+    fewest = FEWEST.get(model, 0)
+    counts = [n for n in (THEIRS if code == MJX else plan["counts"]) if n in errors and n >= fewest]
     found = []
     for steps in counts:
         dt = peer_measure.MODELS[model].T_END / steps
         timing = common.timed(lambda dt=dt: jax.block_until_ready(run(dt)), STEPS * lanes, plan["repeats"])
-        finite = all(bool(jnp.all(jnp.isfinite(x))) for x in jax.tree.leaves(run(dt)))
+        ends = run(dt)
+        finite = all(bool(jnp.all(jnp.isfinite(x))) for x in jax.tree.leaves(ends))
         row = {"code": code, "lanes": lanes, "steps": steps, "error": errors[steps], "finite": finite}
+        if code != MJX:
+            row |= {"failed_lanes": int(jnp.sum(ends[1] != 0)), "repeated_steps": int(jnp.sum(ends[2]))}
         del timing["compile_s"]  # of the first of them only
         found.append(row | {"one_core_us_per_step": alone[steps]} | timing)
-    if found:
-        print(f"{model}: {code}, {lanes} lanes: {found[-1]['us_per_step']:.3g} us a step", flush=True)
+        at = f"{model}: {code}, {lanes} lanes, {steps} steps: {timing['us_per_step']:.3g} us a step"
+        print(at, {key: row[key] for key in row if key in ("failed_lanes", "repeated_steps")}, flush=True)
     return found
+
+
+def successful(runs: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Runs that all lanes came to the end of: `STEPS` steps may be more than those of the rollout."""
+    return [run for run in runs if run["finite"] and not run.get("failed_lanes")]
 
 
 def rollouts(runs: list[dict[str, Any]], key: str = "us_per_step") -> dict[str, dict[str, float | None]]:
     """Time of a rollout [us] at given errors, and that of the coarsest run where it is more accurate."""
-    sound = [(run["error"], run[key] * run["steps"]) for run in runs if run["finite"]]
+    sound = [(run["error"], run[key] * run["steps"]) for run in successful(runs)]
     points = [(math.log(error), math.log(time)) for error, time in sound]
     return {
         "us_per_rollout": {f"{wanted:g}": beside.time_at(points, math.log(wanted)) for wanted in ERRORS},
@@ -145,7 +155,7 @@ def draw(results: dict[str, Any]) -> Any:
         sizes = list(dict.fromkeys(run["lanes"] for run in found["runs"]))
         for k, code in enumerate(codes):
             for size, style in zip((*sizes, None), ("o:", "o--", "o-", "o-.", "x:")):
-                at = [run for run in found["runs"] if run["code"] == code]
+                at = [run for run in successful(found["runs"]) if run["code"] == code]
                 at = [run for run in at if run["lanes"] == (sizes[0] if size is None else size)]
                 key = "one_core_us_per_step" if size is None else "us_per_step"
                 x, y = [run[key] * run["steps"] for run in at], [run["error"] for run in at]
@@ -162,7 +172,7 @@ def main() -> None:
     """Run the benchmark."""
     parser = common.parser("Time of a rollout in a batch.", "the figure")
     parser.add_argument("--no-peers", action="store_true", help="natcoord_jax alone")
-    parser.add_argument("--models", nargs="+", metavar="NAME", choices=MODELS + OTHERS, default=MODELS)
+    parser.add_argument("--models", nargs="+", metavar="NAME", choices=MODELS, default=MODELS)
     parser.add_argument("--lanes", nargs="+", type=int, metavar="NUMBER", default=LANES)
     options = parser.parse_args()
     if options.redraw:

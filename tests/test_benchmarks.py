@@ -67,6 +67,7 @@ def test_batches_of_one_scene(tmp_path):
     assert {run["code"][-1] for run in found["runs"]} == {"2", "4"}
     for run in found["runs"]:
         assert run.keys() >= {"lanes", "steps", "error", "us_per_step"} and run["finite"]
+        assert run["failed_lanes"] == run["repeated_steps"] == 0
     assert results["device"] and "heavy_top" in text
 
 
