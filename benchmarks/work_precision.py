@@ -16,8 +16,9 @@ energy.
 the time of the coarsest run that came to an end, where that is more accurate already: explicit methods on the
 stiff chain are, as soon as they are stable. Tables print it with a "<", and "-" for what is not reached.
 
-`gradients` are of the initial state, value and gradient over the value alone, by order. With --gradients
-nothing else is measured, in minutes, and goes into gradients.json.
+With --gradients nothing is measured but value and gradient by the initial state, over the value alone, of
+some scenes at every order. That goes into gradients.json, written after every order: they compile for up to
+minutes each.
 
 Codes are compared on one scene in one run. JSON and figure are written after every scene, so a run that is
 stopped loses only the scene it was at; --keep goes on from there, or measures some scenes again. `run` of
@@ -59,15 +60,10 @@ LOOPS = ("four_bar", "bricard")
 STIFF = ("stiff_chain",)
 SHARED = (*TREES, *LOOPS, *STIFF)
 RUN = ("date", "commit", "uncommitted_changes")
-GRADIENTS = {
-    "spacecraft": (2, 4, 6),
-    "heavy_top": (2, 4, 6, 8),
-    "double_pendulum": (2, 4, 6),
-    "four_bar": (2, 4),
-}
+GRADIENTS = ("spacecraft", "heavy_top", "double_pendulum", "four_bar")
 GRADIENT_STEPS = 200
-"""Scenes and orders that value and gradient are timed for, and the number of their steps, of the length that
-the gallery suggests: a run that fails, or hardly converges, would flatter its gradient."""
+"""Scenes that value and gradient are timed for, and the number of their steps, of the length that the gallery
+suggests: a run that fails, or hardly converges, would flatter its gradient."""
 GRADIENT_ROUNDS = 5
 """Rounds of both, as a multiple of the repeats of a plan: a ratio of two times asks for more of them."""
 ERRORS = (1e-2, 1e-3, 1e-4, 1e-6, 1e-8)
@@ -207,17 +203,27 @@ def own_runs(model: str, plan: Plan) -> list[dict[str, Any]]:
     return found
 
 
-def own_gradients(model: str, repeats: int) -> list[dict[str, Any]]:
-    """Value and gradient by the initial state over the value, by order."""
-    found = []
-    for order in GRADIENTS.get(model, ()):
-        example = replace(scene_of(model), steps=GRADIENT_STEPS)
-        check_run(example, order)
-        rounds = GRADIENT_ROUNDS * repeats
-        found.append({"order": order} | beside.own_gradient(example, "state", GRADIENT_STEPS, rounds, order))
-        ratio, tangent = found[-1]["over_forward"], found[-1]["tangent"]["over_forward"]
-        print(f"{model}: order {order}: gradient {ratio:.2f}, tangent {tangent:.2f}", flush=True)
+def own_gradient(model: str, order: int, repeats: int) -> dict[str, Any]:
+    """Value and gradient by the initial state over the value."""
+    example = replace(scene_of(model), steps=GRADIENT_STEPS)
+    check_run(example, order)
+    rounds = GRADIENT_ROUNDS * repeats
+    found = {"order": order} | beside.own_gradient(example, "state", GRADIENT_STEPS, rounds, order)
+    ratio, tangent = found["over_forward"], found["tangent"]["over_forward"]
+    print(f"{model}: order {order}: gradient {ratio:.2f}, tangent {tangent:.2f}", flush=True)
     return found
+
+
+def gradients(chosen: argparse.Namespace, plan: Plan) -> None:
+    """Value and gradient of the chosen scenes, by order: the lowest one of all scenes first."""
+    results = common.circumstances("gradients", quick=chosen.quick)
+    models: dict[str, list[dict[str, Any]]] = {model: [] for model in GRADIENTS if model in chosen.models}
+    for order in ORDERS[:2] if chosen.quick else ORDERS:
+        for model, rows in models.items():
+            rows.append(own_gradient(model, order, plan.repeats))
+            results |= {"models": models, "targets": gradient_targets(models)}
+            common.write(results, None, common.folder(chosen))
+    print(f"{common.environment_line(results)}\n\n{common.show_targets(results['targets'])}")
 
 
 def gradient_targets(found: dict[str, list[dict[str, Any]]]) -> list[dict[str, Any]]:
@@ -405,7 +411,6 @@ def targets(models: dict[str, Any], long: list[dict[str, Any]]) -> list[dict[str
             unmet = ", which no peer reaches" if several and theirs[error] is None else ""
             name = f"{model}: over every peer at {error}{unmet}"
             lines.append(common.target(name, _ratio(best, theirs, error), 1.0))
-    lines += gradient_targets({model: found["gradients"] for model, found in models.items()})
     if long:
         (own,) = (row["largest_drift"] for row in long if row["code"].startswith(OWN))
         theirs = [row["largest_drift"] for row in long if not row["code"].startswith(OWN)]
@@ -503,7 +508,6 @@ def measured(model: str, plan: Plan, chosen: argparse.Namespace, peers: Sequence
         "runs": runs,
         "time_to_error": times(runs),
         "time_at_most": times_at_most(runs),
-        "gradients": [] if chosen.quick else own_gradients(model, plan.repeats),
     }
 
 
@@ -530,11 +534,7 @@ def main() -> None:
     jax.config.update("jax_enable_x64", True)
     plan = QUICK if chosen.quick else FULL
     if chosen.gradients:
-        results = common.circumstances("gradients", quick=chosen.quick)
-        found = {model: own_gradients(model, plan.repeats) for model in chosen.models if model in GRADIENTS}
-        results |= {"models": found, "targets": gradient_targets(found)}
-        print(f"{common.environment_line(results)}\n\n{common.show_targets(results['targets'])}")
-        common.write(results, None, common.folder(chosen))
+        gradients(chosen, plan)
         return
     results = common.circumstances("work_precision", quick=chosen.quick)
     peers = () if chosen.no_peers else beside.available(plan.peers, chosen.peers_python)

@@ -209,7 +209,7 @@ def test_modes_agree():
     assert np.ptp(found) <= tol.SAME_GRADIENT * abs(found[0])
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_second_derivatives_of_the_large_problem():
     p, d = numbers(), direction(*numbers())
     found = jax.jit(SECOND["forward over reverse"](loss))(p, d)
@@ -231,11 +231,15 @@ def test_reverse_over_reverse_is_exact_or_refused():
     assert abs(found - second("forward over reverse")(p, d)) <= tol.SAME_GRADIENT * abs(found)
 
 
-USUAL = ("value", "gradient")
-
-
 @pytest.mark.parametrize(
-    "mode", [*USUAL, *(pytest.param(m, marks=pytest.mark.slow) for m in SECOND if m not in USUAL)]
+    "mode",
+    [
+        "value",
+        "gradient",
+        pytest.param("forward over reverse", marks=pytest.mark.slow),
+        pytest.param("forward over forward", marks=pytest.mark.exhaustive),
+        pytest.param("reverse over forward", marks=pytest.mark.exhaustive),
+    ],
 )
 def test_batches(mode):
     """vmap of each equals the loop."""
@@ -256,8 +260,13 @@ def test_batches(mode):
 # --- a spring at rest -------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("law", ["linear", "nonlinear"])
+@pytest.mark.parametrize(
+    "law",
+    [
+        pytest.param("linear", marks=pytest.mark.exhaustive),
+        pytest.param("nonlinear", marks=pytest.mark.slow),
+    ],
+)
 def test_second_derivative_starting_at_rest(law):
     """At rest the increment of the invariant is zero: a quotient by it would lose the second derivative."""
 
@@ -284,8 +293,13 @@ def test_second_derivative_starting_at_rest(law):
 # --- forward mode -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("order", "retries"), [(2, False), (2, True), (4, False), (4, True)])
+@pytest.mark.parametrize(
+    ("order", "retries"),
+    [
+        *(pytest.param(*case, marks=pytest.mark.slow) for case in [(2, False), (2, True), (4, True)]),
+        pytest.param(4, False, marks=pytest.mark.exhaustive),
+    ],
+)
 def test_directions_one_by_one_are_those_of_jacobians(order, retries, monkeypatch):
     """Corrections with factors of other slots end where Jacobians of every slot lead to."""
     dt, extra = (0.5, 64) if retries else (0.02, 0)
@@ -352,8 +366,13 @@ def test_gradient_through_retried_steps():
     assert abs(jax.grad(f)(x) - ahead) <= tol.SAME_GRADIENT * abs(ahead)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("dt, steps, extra", [(0.5, 6, 64), (0.05, 40, 0)])
+@pytest.mark.parametrize(
+    "dt, steps, extra",
+    [
+        pytest.param(0.5, 6, 64, marks=pytest.mark.slow),
+        pytest.param(0.05, 40, 0, marks=pytest.mark.exhaustive),
+    ],
+)
 def test_second_derivatives_of_many_slots(dt, steps, extra):
     """Attempts that failed, and what fills up the last chunk of slots, count for nothing in them."""
 

@@ -119,8 +119,9 @@ def last(stiffness, order, steps=5):
     return jnp.sum(found.q[-1] ** 3) + 0.1 * jnp.sum(found.v[-1] ** 2) + jnp.sum(found.states.work[-1])
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("order", [6, 10])
+@pytest.mark.parametrize(
+    "order", [pytest.param(6, marks=pytest.mark.exhaustive), pytest.param(10, marks=pytest.mark.slow)]
+)
 def test_a_gradient(order):
     """In reverse, of a loss that has the work of motor and damper in it, against differences."""
     at, h = 8.0, 0.02

@@ -150,8 +150,14 @@ def test_laws_outlive_the_path(order):
     assert np.max(apart) >= 1.0, "not chaotic: the test means nothing"
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seconds", [10, 100, 2000])
+@pytest.mark.parametrize(
+    "seconds",
+    [
+        pytest.param(10, marks=pytest.mark.slow),
+        pytest.param(100, marks=pytest.mark.exhaustive),
+        pytest.param(2000, marks=pytest.mark.slow),
+    ],
+)
 def test_gradients_of_a_chaotic_path(seconds):
     """They grow as the path forgets its start. Could go wrong: a number that is none of them; and no word of
     why there is none where it is too large: `nc.tangent_growth` tells, whatever the time."""
