@@ -1,7 +1,7 @@
 """What accuracy costs in time, by order, beside MuJoCo, MJX and Exudyn: one run, one core.
 
 usage: python -m benchmarks.work_precision [--quick] [--output FOLDER] [--peers-python PATH] [--no-peers]
-       [--models NAME ...] [--keep] [--gradients] [--redraw JSON]
+       [--models NAME ...] [--keep] [--gradients [--orders ORDER ...]] [--redraw JSON]
 
 Open trees (spacecraft, from rest and spinning, open tree, heavy top, double pendulum), closed loops (a row of
 two four-bars, Bricard's mechanism) and a chain of rods on stiff springs, beside the peers at the settings
@@ -17,8 +17,8 @@ the time of the coarsest run that came to an end, where that is more accurate al
 stiff chain are, as soon as they are stable. Tables print it with a "<", and "-" for what is not reached.
 
 With --gradients nothing is measured but value and gradient by the initial state, over the value alone, of
-some scenes at every order. That goes into gradients.json, written after every order: they compile for up to
-minutes each.
+some scenes at every order. That goes into gradients.json, written after every scene and order: they compile
+for up to minutes each.
 
 Codes are compared on one scene in one run. JSON and figure are written after every scene, so a run that is
 stopped loses only the scene it was at; --keep goes on from there, or measures some scenes again. `run` of
@@ -216,13 +216,16 @@ def own_gradient(model: str, order: int, repeats: int) -> dict[str, Any]:
 
 def gradients(chosen: argparse.Namespace, plan: Plan) -> None:
     """Value and gradient of the chosen scenes, by order: the lowest one of all scenes first."""
-    results = common.circumstances("gradients", quick=chosen.quick)
-    models: dict[str, list[dict[str, Any]]] = {model: [] for model in GRADIENTS if model in chosen.models}
-    for order in ORDERS[:2] if chosen.quick else ORDERS:
-        for model, rows in models.items():
-            rows.append(own_gradient(model, order, plan.repeats))
+    results, where = common.circumstances("gradients", quick=chosen.quick), common.folder(chosen)
+    models = earlier(where, results)["models"] if chosen.keep else {}
+    for order in ORDERS[:2] if chosen.quick else chosen.orders:
+        for model in (model for model in GRADIENTS if model in chosen.models):
+            others = [row for row in models.get(model, []) if row["order"] != order]
+            run = {key: results[key] for key in RUN}
+            found = own_gradient(model, order, plan.repeats) | {"run": run}
+            models[model] = sorted([*others, found], key=lambda row: row["order"])
             results |= {"models": models, "targets": gradient_targets(models)}
-            common.write(results, None, common.folder(chosen))
+            common.write(results, None, where)
     print(f"{common.environment_line(results)}\n\n{common.show_targets(results['targets'])}")
 
 
@@ -489,7 +492,7 @@ def earlier(where: Path | None, results: dict[str, Any]) -> dict[str, Any]:
     other = [f"{key} {there.get(key)}, here {here[key]}" for key in here if there.get(key) != here[key]]
     if other:
         raise SystemExit(f"--keep: {file} does not compare with this run ({'; '.join(other)})")
-    return {"models": found["models"], "long": found["long"]}
+    return {"models": found["models"], "long": found.get("long", [])}
 
 
 def measured(model: str, plan: Plan, chosen: argparse.Namespace, peers: Sequence[Peer]) -> dict[str, Any]:
@@ -526,6 +529,7 @@ def main() -> None:
     parser.add_argument("--models", nargs="+", choices=SHARED, default=SHARED, help="only these scenes")
     parser.add_argument("--keep", action="store_true", help="keep what the file has of other scenes")
     parser.add_argument("--gradients", action="store_true", help="nothing but value and gradient")
+    parser.add_argument("--orders", nargs="+", type=int, choices=ORDERS, default=ORDERS, help="of these")
     chosen = parser.parse_args()
     if chosen.redraw:
         common.redraw(chosen.redraw, draw)
