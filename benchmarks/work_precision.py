@@ -218,7 +218,7 @@ def gradients(chosen: argparse.Namespace, plan: Plan) -> None:
     """Value and gradient of the chosen scenes, by order: the lowest one of all scenes first."""
     results, where = common.circumstances("gradients", quick=chosen.quick), common.folder(chosen)
     models = earlier(where, results)["models"] if chosen.keep else {}
-    for order in ORDERS[:2] if chosen.quick else chosen.orders:
+    for order in chosen.orders or (ORDERS[:2] if chosen.quick else ORDERS):
         for model in (model for model in GRADIENTS if model in chosen.models):
             others = [row for row in models.get(model, []) if row["order"] != order]
             run = {key: results[key] for key in RUN}
@@ -529,8 +529,10 @@ def main() -> None:
     parser.add_argument("--models", nargs="+", choices=SHARED, default=SHARED, help="only these scenes")
     parser.add_argument("--keep", action="store_true", help="keep what the file has of other scenes")
     parser.add_argument("--gradients", action="store_true", help="nothing but value and gradient")
-    parser.add_argument("--orders", nargs="+", type=int, choices=ORDERS, default=ORDERS, help="of these")
+    parser.add_argument("--orders", nargs="+", type=int, choices=ORDERS, help="of these")
     chosen = parser.parse_args()
+    if chosen.orders and not chosen.gradients:
+        parser.error("--orders: they are those of --gradients")
     if chosen.redraw:
         common.redraw(chosen.redraw, draw)
         return
