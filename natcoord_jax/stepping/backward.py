@@ -111,9 +111,9 @@ class Backward(InTurn):
         patience = kind_of(system, self.tableau).renewal
         whole = _size_of(system, slot.fraction * dt, arrived, y_bar, c.factors)
 
-        # With one stage it saves time to pull back only what the corrections ask for; with more of them the
-        # program grows too large for one kernel, which costs more than that.
-        once = self.tableau.stages > 1
+        # With one stage it saves time to pull back only what the corrections ask for until the solution is
+        # expected; with more of them the program grows too large for one kernel, which costs more than that.
+        apart = self.tableau.stages == 1
         tangents = self.admitted(numbers, numbers.varied, slot.before)
         at_slot = numbers.varied, slot.before, tangents, slot.u
         nothing = jax.tree.map(jnp.zeros_like, at_slot)
@@ -121,17 +121,23 @@ class Backward(InTurn):
         _, pull = jax.vjp(partial(self.outcome, numbers, slot), *at_slot, slot.y)
         end_bars = arrived, tangents_bar
 
-        def trip(carry: tuple) -> tuple:
-            _, learnt, lam, at = carry
-            *bars, gap = pull((lam, *end_bars))
-            at, known = at.judged(c.factors.with_changes(learnt), lam, gap + y_bar, patience, whole, not once)
-            lam = jnp.where(at.moving, lam - at.change, lam)
-            return tuple(bars) if once else None, known.changing, lam, at
+        def judged(lam: Array, learnt: tuple, at: Correcting, gap: Array) -> tuple:
+            at, known = at.judged(c.factors.with_changes(learnt), lam, gap + y_bar, patience, whole)
+            return jnp.where(at.moving, lam - at.change, lam), known.changing, at
 
-        start = nothing if once else None, c.factors.changing, c.solution, c.at
-        bars, learnt, lam, at = jax.lax.while_loop(lambda carry: any_lane(carry[-1].going), trip, start)
-        found: Any = bars if once else tuple(pull((lam, *end_bars))[:-1])
-        return (*found, (lam, arrived) if self.forced else None), lam, at, c.factors.with_changes(learnt)
+        def nearer(carry: tuple) -> tuple:
+            return judged(*carry, pull((carry[0], *end_bars))[-1])
+
+        def evaluated(carry: tuple) -> tuple:
+            given = carry[1:]
+            if apart:
+                given = jax.lax.while_loop(lambda x: any_lane(x[-1].going & ~x[-1].last), nearer, given)
+            *bars, gap = pull((given[0], *end_bars))
+            return tuple(bars), *judged(*given, gap)
+
+        start = nothing, c.solution, c.factors.changing, c.at
+        bars, lam, learnt, at = jax.lax.while_loop(lambda x: any_lane(x[-1].going), evaluated, start)
+        return (*bars, (lam, arrived) if self.forced else None), lam, at, c.factors.with_changes(learnt)
 
 
 def _size_of(system: System, h: Array, end_bar: State, y_bar: Array, factors: Factors) -> Array:

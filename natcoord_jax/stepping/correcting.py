@@ -39,6 +39,9 @@ ROUNDS = 4
 class Correcting(eqx.Module):
     """Where the solution of a transposed system stands.
 
+    It is solved where an evaluation at the solution says so, never before: factors of another system, and what
+    corrections have left there, are a guess of how many corrections it takes.
+
     Attributes:
         change: last correction with these factors.
         news: the part of it that is across those before it, of which the factors have learnt. What they make
@@ -51,7 +54,7 @@ class Correcting(eqx.Module):
         done: whether it is solved.
         wanting: whether it cannot go on without new factors.
         moving: whether the last correction is to be made.
-        last: whether the next correction is expected to be within the error allowed.
+        last: whether the next evaluation is expected to be at the solution.
     """
 
     change: Float[Array, " unknowns"]
@@ -103,7 +106,6 @@ class Correcting(eqx.Module):
         residual: Array,
         patience: int,
         whole: Array,
-        foreseen: bool,
         transposed: bool = True,
     ) -> tuple["Correcting", Factors]:
         """After an evaluation: done, or moving on by a correction, or in want of new factors.
@@ -114,8 +116,6 @@ class Correcting(eqx.Module):
             residual: of the equations.
             patience: corrections that are cheaper than new factors.
             whole: size of the solution if nothing cancelled.
-            foreseen: whether it is done with a correction that leaves nothing for the next, as far as can be
-                foreseen; if not, with an evaluation at the solution.
             transposed: whether the system is that of the transposed Jacobian.
 
         Returns:
@@ -139,18 +139,18 @@ class Correcting(eqx.Module):
         first = self.count == 0
         finite = jnp.isfinite(correction) & jnp.isfinite(size)
         floor = jnp.maximum(STALL * size, STALL_ROUND_OFF * whole)
-        stalled = ~first & (ratio > 0.5) & (entire <= floor)
+        # With factors of another system, corrections that stop shrinking may be these factors' fault.
+        stalled = ~first & (ratio > 0.5) & (entire <= floor) & (self.rounds > 0)
         within = entire <= jnp.where(self.last, SURPRISE, 1.0) * allowed
         done = (within | stalled) & finite & factors.usable
         following = correction * factors.left_by(ratio, first)
         compares = self.going & ~first & (self.correction > allowed) & finite
         factors = factors.having_left(ratio, compares)
         last = following <= allowed
-        done = done | (foreseen & last & finite & factors.usable)
         late = correction * ratio ** (patience * (SPEED if learns(solver) else 1)) > allowed
         slow = (~first & ((ratio > 0.5) | late)) | (self.count >= CORRECTIONS) | ~finite | ~factors.usable
         slow = slow & ~done
-        moving = ~slow & (foreseen | ~done)
+        moving = ~slow & ~done
         count = self.count + 1
         found = Correcting(change, news, known, correction, count, self.rounds, done, slow, moving, last)
         stay = eqx.tree_at(lambda c: c.moving, self, jnp.zeros_like(self.moving))

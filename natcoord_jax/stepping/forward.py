@@ -107,7 +107,7 @@ class Forward(InTurn):
         fresh = (c.at.count == 0) & (c.at.rounds == 0) & c.factors.usable
 
         def trip(carry: tuple) -> tuple:
-            begun, _, learnt, y_dot, at, known, ends, _ = carry
+            begun, learnt, y_dot, at, known, ends, _ = carry
             given = jax.tree.map(lambda x: jnp.where(begun, 0.0, x), changes)
             gap, *moved = along(*given, jnp.where(begun, y_dot, 0.0))
             if forced is not None:
@@ -120,16 +120,15 @@ class Forward(InTurn):
             )
             factors = c.factors.with_changes(learnt)
             start = jnp.where(fresh, y_dot - factors.solver.solve(known - foreseen), y_dot)
-            judged, knows = at.judged(factors, y_dot, gap + known, patience, none, True, False)
+            judged, knows = at.judged(factors, y_dot, gap + known, patience, none, False)
             at, factors = jax.tree.map(partial(jnp.where, begun), (judged, knows), (at, factors))
-            moving = begun & at.moving
-            y_dot = jnp.where(begun, jnp.where(moving, y_dot - at.change, y_dot), start)
-            return jnp.array(True), begun & ~moving, factors.changing, y_dot, at, known, ends, moved
+            y_dot = jnp.where(begun, jnp.where(at.moving, y_dot - at.change, y_dot), start)
+            return jnp.array(True), factors.changing, y_dot, at, known, ends, moved
 
-        no, start = jnp.array(False), (c.factors.changing, c.solution, c.at)
-        start = no, no, *start, jnp.zeros_like(slot.y), nothing, nothing
-        found = jax.lax.while_loop(lambda x: any_lane(x[4].going | ~x[1]), trip, start)
-        _, _, learnt, y_dot, at, known, ends, moved = found
+        start = jnp.array(False), c.factors.changing, c.solution, c.at
+        start = *start, jnp.zeros_like(slot.y), nothing, nothing
+        found = jax.lax.while_loop(lambda x: any_lane(x[3].going | ~x[0]), trip, start)
+        _, learnt, y_dot, at, known, ends, moved = found
         end_dot, tangents_dot = jax.tree.map(jnp.add, ends, moved)
         return (end_dot, tangents_dot, y_dot, known), y_dot, at, c.factors.with_changes(learnt)
 
