@@ -69,16 +69,14 @@ class Correcting(eqx.Module):
     last: Bool[Array, ""]
 
     @classmethod
-    def first(
-        cls, accepted: Bool[Array, ""], lam: Float[Array, " unknowns"], factors: Factors
-    ) -> "Correcting":
-        """Before the first correction; there is nothing to do for an attempt that failed."""
+    def first(cls, lam: Float[Array, " unknowns"], factors: Factors) -> "Correcting":
+        """Before the first correction."""
         memory = min(MEMORY, lam.size) if learns(factors.solver) else 0
         nought, no = jnp.array(0), jnp.array(False)
         nothing = jnp.zeros_like(lam)
         known = jnp.zeros((memory, *lam.shape), lam.dtype)
         size = jnp.zeros((), lam.dtype)
-        return cls(nothing, nothing, known, size, nought, nought, ~accepted, no, no, no)
+        return cls(nothing, nothing, known, size, nought, nought, no, no, no, no)
 
     @property
     def open(self) -> Bool[Array, ""]:
@@ -89,6 +87,10 @@ class Correcting(eqx.Module):
     def going(self) -> Bool[Array, ""]:
         """Whether to go on with the factors at hand."""
         return ~self.done & ~self.wanting
+
+    def unless(self, failed: Bool[Array, ""]) -> "Correcting":
+        """Done, if it is that of an attempt that failed: there is nothing to solve."""
+        return eqx.tree_at(lambda c: c.done, self, self.done | failed)
 
     def refreshed(self) -> "Correcting":
         """With new factors."""

@@ -175,7 +175,7 @@ class InTurn(ABC):
             own=own,
             pasts=(Past.of(jnp.zeros_like(y)),) * self.stride,
             solution=jnp.zeros_like(y),
-            at=Correcting.first(slots.accepted[-1], y, factors),
+            at=Correcting.first(y, factors),
             factors=factors,
             stuck=jnp.array(False),
         )
@@ -191,6 +191,7 @@ class InTurn(ABC):
             c, found = carry
             here = c.left - 1 - first
             slot, own_given = jax.tree.map(lambda x: row(x, here), (slots, given))
+            c = replace_fields(c, at=c.at.unless(~slot.accepted))
             arrived = self.arriving(c.own, own_given)
             outcome, solution, at, factors = self.solved(fixed, slot, arrived, own_given, c)
             stuck = any_lane(at.open & at.wanting)
@@ -204,8 +205,7 @@ class InTurn(ABC):
             found = jax.tree.map(lambda rows, x: with_row(rows, here, x), found, found_here)
             guess = pasts[0].guess
             guess = jnp.where(jnp.all(jnp.isfinite(guess)), guess, 0.0)
-            coming = row(slots.accepted, jnp.maximum(here - 1, 0))
-            following = Correcting.first(coming, solution, factors)
+            following = Correcting.first(solution, factors)
             aged = factors.aged()
             done = Going(c.left - 1, carried, pasts, guess, following, aged, stuck)
             waiting = replace_fields(c, solution=solution, at=at, factors=factors, stuck=stuck)
