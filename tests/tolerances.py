@@ -115,3 +115,17 @@ FAST_TOP = 2e-3
 # Rates and multipliers times h: the matrix of a step is, up to this, the one in the limit h = 0.
 CONDITION = 1e6
 FLAT = 0.05
+
+# --- the hunt (test_hunt.py) --------------------------------------------------------------------------------
+
+# Modes of differentiation against the plain reference, in terms of the largest term of the derivative of the
+# loss by the saved states; along directions that change next to nothing, of a part of the largest along any.
+SAME_DERIVATIVE = 1e-9
+SMALL_PART = 1e-4
+# Central differences, in the same terms. Motions with stops, friction and latches have large second and third
+# derivatives, so that steps have to be short and rounding counts; mostly found: 1e-8 and less. What scatters
+# by more is judged by its scatter, as far as three neighbouring steps agree at all.
+DIFFERENCE_OF_A_SUDDEN_MOTION = 1e-6
+SPREAD_OF_DIFFERENCES = 1e-3
+# Solutions of a step's equations against Newton's iteration with their whole Jacobian, relative to 1 + |x|.
+SAME_SOLUTION = 1e-10

@@ -13,7 +13,8 @@ from natcoord_jax.linsolve.dense import DenseSolver, Inverse, saddle_inverse
 class Form(eqx.Module):
     """Base of the equations of a step, and of projections; with one dense matrix, unless a form overrides it.
 
-    A form has `balances`, `inertias(matrix)`, `guess()`, `residual(y)`, `jacobian(y)`, `tangent(y, loads)`.
+    A form has `balances`, `inertias(matrix)`, `guess()`, `residual(y)`, `jacobian(y)`, `tangent(y, loads)`;
+    the equations of a step have `least_inertias()`, too.
 
     Class attributes:
         by_differences: whether Newton's iteration forms the Jacobian by differences: there are no formulas.

@@ -17,7 +17,7 @@ from natcoord_jax.assembly.diagnostics import rows_with_ground
 from natcoord_jax.assembly.form import Form
 from natcoord_jax.assembly.kick import kicked
 from natcoord_jax.assembly.local import body_balance, body_motion, jacobians
-from natcoord_jax.assembly.momentum import momentum_balance
+from natcoord_jax.assembly.momentum import least_inertias, momentum_balance
 from natcoord_jax.assembly.outset import Outset
 from natcoord_jax.assembly.reduced import NOTHING
 from natcoord_jax.assembly.redundancy import at_every_stage, project_multipliers, project_rows
@@ -235,6 +235,12 @@ class FullStep(Form):
     def inertias(self, matrix: Float[Array, "unknowns unknowns"]) -> Float[Array, " balances"]:
         """Inertias of the rates."""
         return jnp.abs(jnp.diagonal(matrix))[: self.balances]
+
+    def least_inertias(self) -> Float[Array, " balances"]:
+        """Inertias that the rates have at least, by the mass of their bodies; the same in every step."""
+        own = jnp.repeat(least_inertias(self.system.mass), 3, axis=1)
+        stages = jnp.diagonal(jnp.asarray(self.tableau.a_inverse, own.dtype))
+        return (own[:, None, :] * stages[:, None]).reshape(-1)
 
     def guess(self) -> Float[Array, " unknowns"]:
         """Twists at the start, repeated for every stage; multipliers zero."""

@@ -67,6 +67,20 @@ def row_weights(mass: Float[Array, "bodies 4 4"]) -> Float[Array, "bodies 4"]:
     return jnp.where(sizes > 0, 1.0 / jnp.where(sizes > 0, sizes, 1.0), 0.0)
 
 
+def least_inertias(mass: Float[Array, "bodies 4 4"]) -> Float[Array, "bodies 2"]:
+    """Mass of each body and a lower bound of its moments of inertia about any axis [kg, kg m^2].
+
+    With the central second moments E, tr E is the sum of its eigenvalues and |E| bounds the largest. A rod
+    has a thousandth of tr E about its axis here, a body without moments of inertia 0.
+    """
+    total, first = mass[:, 0, 0], mass[:, 0, 1:]
+    moved = first[:, :, None] * first[:, None, :] / jnp.where(total > 0, total, 1.0)[:, None, None]
+    central = mass[:, 1:, 1:] - moved
+    trace = jnp.maximum(jnp.trace(central, axis1=1, axis2=2), 0.0)
+    least = trace - jnp.sqrt(jnp.sum(central**2, axis=(1, 2)))
+    return jnp.stack([total, jnp.maximum(least, 1e-3 * trace)], axis=1)
+
+
 def motion(mass: Float[Array, "bodies 4 4"], rates: Float[Array, "bodies 4 3"]) -> Float[Array, ""]:
     """Energy of the bodies' motion, twice, within a small factor: each row by its own mass [J]."""
     return jnp.sum(row_weights(mass)[..., None] * inertia(mass, rates) ** 2)

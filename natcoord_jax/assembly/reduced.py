@@ -19,7 +19,7 @@ from natcoord_jax.assembly.balances import constraint_matrix
 from natcoord_jax.assembly.dissipation import Damped, Damping
 from natcoord_jax.assembly.form import Form
 from natcoord_jax.assembly.kick import kicked
-from natcoord_jax.assembly.momentum import momentum_balance
+from natcoord_jax.assembly.momentum import least_inertias, momentum_balance
 from natcoord_jax.assembly.outset import Outset
 from natcoord_jax.assembly.redundancy import (
     at_every_stage,
@@ -328,13 +328,22 @@ class ReducedStep(Form):
         """
         return self._at_least(jnp.abs(jnp.diagonal(matrix))[: self.balances])
 
+    def least_inertias(self) -> Float[Array, " balances"]:
+        """Inertias that the rates have at least, by the mass of their own bodies; the same in every step."""
+        body, slot = self.system.tree.slot_of // SLOTS, self.system.tree.slot_of % SLOTS
+        kind = jnp.where((slot < 3) | (slot == SLOTS - 1), 1, 0)
+        return self._by_stage(least_inertias(self.system.mass)[body, kind])
+
     def _at_least(self, found: Float[Array, " balances"]) -> Float[Array, " balances"]:
         """Inertias, none less than that of the mass at its stage."""
         if self.outset.tangents is None:
             return found
-        own = jnp.diagonal(self.own_inertia())
-        stages = jnp.diagonal(jnp.asarray(self.tableau.a_inverse, found.dtype))
-        return jnp.maximum(found, (stages[:, None] * own).reshape(-1))
+        return jnp.maximum(found, self._by_stage(jnp.diagonal(self.own_inertia())))
+
+    def _by_stage(self, inertias: Float[Array, " rates"]) -> Float[Array, " balances"]:
+        """Of the mass at every stage."""
+        stages = jnp.diagonal(jnp.asarray(self.tableau.a_inverse, inertias.dtype))
+        return (stages[:, None] * inertias).reshape(-1)
 
     def probes(self, y: Float[Array, " unknowns"]) -> Float[Array, " unknowns"]:
         """Changes of the unknowns that give columns of the Jacobian as quotients of differences.

@@ -20,7 +20,7 @@ from natcoord_jax.assembly.system import System
 from natcoord_jax.core.state import State
 from natcoord_jax.stepping.correcting import Correcting
 from natcoord_jax.stepping.factors import Factors
-from natcoord_jax.stepping.in_turn import Going, InTurn
+from natcoord_jax.stepping.in_turn import Fixed, Going, InTurn
 from natcoord_jax.stepping.newton import any_lane
 from natcoord_jax.stepping.plan import Plan
 from natcoord_jax.stepping.record import Changes, Numbers, Record, Slot
@@ -52,10 +52,6 @@ class Backward(InTurn):
         """
         return self.every(record, given)
 
-    def numbers_of(self, fixed: Numbers) -> Numbers:
-        """What the rollout depends on."""
-        return fixed
-
     def following(self, kernel: Callable, record: Record, given: tuple[State, Array]) -> Changes:
         """Cotangents of everything."""
         numbers, slots = record.numbers, record.slots
@@ -64,7 +60,8 @@ class Backward(InTurn):
         own = state_bar, self._no_change(numbers, before_all), jax.tree.map(jnp.zeros_like, numbers.varied)
         like = slots.u, (slots.y, slots.before) if self.forced else None
         start = y, record.factors, own
-        c, (u_bar, forced_bar) = self.in_rounds(kernel, numbers, slots, given, start, like)
+        fixed = Fixed.of(self.tableau, record)
+        c, (u_bar, forced_bar) = self.in_rounds(kernel, fixed, slots, given, start, like)
         state_bar, tangents_bar, varied_bar = c.own
         if tangents_bar is None:
             return Changes(varied_bar, u_bar, state_bar, forced_bar)
@@ -95,8 +92,8 @@ class Backward(InTurn):
         return (before_bar, tangents_bar, varied_bar), found
 
     def solved(
-        self, fixed: Numbers, slot: Slot, arrived: State, given: tuple[State, Array], c: Going
-    ) -> tuple[tuple, Array, Correcting, Factors]:
+        self, fixed: Fixed, slot: Slot, arrived: State, given: tuple[State, Array], c: Going, matrix: Array
+    ) -> tuple[tuple, Array, Correcting, Factors, Array]:
         """Cotangents of one slot, as far as the factors at hand go.
 
         The multipliers of its equations solve J^T lam = -(cotangent of the unknowns); their guess is
@@ -104,9 +101,9 @@ class Backward(InTurn):
 
         Returns:
             Cotangents of what varies, of the state before the slot and the tangent space there, of its inputs
-            and its forces; the multipliers, where their solution stands, and the factors.
+            and its forces; the multipliers, where their solution stands, the factors, and the matrix.
         """
-        numbers, y_bar, tangents_bar = fixed, given[1], c.own[1]
+        numbers, y_bar, tangents_bar = fixed.numbers, given[1], c.own[1]
         system, _, dt = numbers.whole(numbers.varied)
         patience = kind_of(system, self.tableau).renewal
         whole = _size_of(system, slot.fraction * dt, arrived, y_bar, c.factors)
@@ -121,23 +118,35 @@ class Backward(InTurn):
         _, pull = jax.vjp(partial(self.outcome, numbers, slot), *at_slot, slot.y)
         end_bars = arrived, tangents_bar
 
-        def judged(lam: Array, learnt: tuple, at: Correcting, gap: Array) -> tuple:
-            at, known = at.judged(c.factors.with_changes(learnt), lam, gap + y_bar, patience, whole)
-            return jnp.where(at.moving, lam - at.change, lam), known.changing, at
+        def pulled(lam: Array, at: Correcting) -> tuple:
+            ends: Any = end_bars
+            if matrix.shape[0]:
+                ends = jax.tree.map(lambda x: jnp.where(at.forming, 0.0, x), ends)
+            return pull((at.asked(lam), *ends))
+
+        def judged(lam: Array, learnt: tuple, at: Correcting, matrix: Array, gap: Array) -> tuple:
+            at, matrix = at.formed(matrix, gap)
+            factors = c.factors.with_changes(learnt)
+            at, known = at.judged(factors, lam, gap + y_bar, fixed.masses, patience, whole)
+            return jnp.where(at.moving, lam - at.change, lam), known.changing, at, matrix
 
         def nearer(carry: tuple) -> tuple:
-            return judged(*carry, pull((carry[0], *end_bars))[-1])
+            return judged(*carry, pulled(carry[0], carry[2])[-1])
 
         def evaluated(carry: tuple) -> tuple:
             given = carry[1:]
             if apart:
-                given = jax.lax.while_loop(lambda x: any_lane(x[-1].going & ~x[-1].last), nearer, given)
-            *bars, gap = pull((given[0], *end_bars))
+                given = jax.lax.while_loop(
+                    lambda x: any_lane((x[2].going & ~x[2].last) | x[2].forming), nearer, given
+                )
+            *bars, gap = pulled(given[0], given[2])
             return tuple(bars), *judged(*given, gap)
 
-        start = nothing, c.solution, c.factors.changing, c.at
-        bars, lam, learnt, at = jax.lax.while_loop(lambda x: any_lane(x[-1].going), evaluated, start)
-        return (*bars, (lam, arrived) if self.forced else None), lam, at, c.factors.with_changes(learnt)
+        start = nothing, c.solution, c.factors.changing, c.at, matrix
+        going = lambda x: any_lane(x[3].going | x[3].forming)  # noqa: E731
+        bars, lam, learnt, at, matrix = jax.lax.while_loop(going, evaluated, start)
+        factors = c.factors.with_changes(learnt)
+        return (*bars, (lam, arrived) if self.forced else None), lam, at, factors, matrix
 
 
 def _size_of(system: System, h: Array, end_bar: State, y_bar: Array, factors: Factors) -> Array:

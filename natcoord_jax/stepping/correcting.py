@@ -7,7 +7,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from natcoord_jax.linsolve.acceleration import Directions
 from natcoord_jax.linsolve.learning import MEMORY, SPEED, across, learns, learnt
+from natcoord_jax.maths.rows import row, with_row
 from natcoord_jax.stepping.factors import Factors
 
 CLOSE = 1e-12
@@ -26,6 +28,12 @@ STALL_ROUND_OFF = 1e-12
 SURPRISE = 10.0
 """Times the error allowed by which the correction may be larger that was expected to be within it."""
 
+NOISE = 4.0
+"""Times what rounding has left of a system solved with factors of its own that may be left of the next."""
+
+FORGETTING = 0.5
+"""Part of what rounding has left of a system which still counts in those that follow."""
+
 STALL = 1e-10
 """Corrections that stop shrinking below this have reached the floor of round-off."""
 
@@ -39,8 +47,11 @@ ROUNDS = 4
 class Correcting(eqx.Module):
     """Where the solution of a transposed system stands.
 
-    It is solved where an evaluation at the solution says so, never before: factors of another system, and what
-    corrections have left there, are a guess of how many corrections it takes.
+    It is solved where an evaluation at the solution says so, never before: factors of another system, and
+    what corrections have left there, are a guess of how many corrections it takes. Such factors may not even
+    see an error, as those of a stiff stop do not where the stop is left. So the residual has to be small in
+    terms of the masses alone, too: the error is no larger, whatever stiffness there is. What rounding of
+    stiff forces leaves is more than that; it is known from systems solved with factors of their own.
 
     Attributes:
         change: last correction with these factors.
@@ -48,9 +59,13 @@ class Correcting(eqx.Module):
             of the others is known: equations are linear here. Only of this part an error remains.
         known: the same of corrections of which the factors have learnt, if they are of that kind; the last
             one first.
+        directions: corrections and what they have changed, if the factors do not learn.
+        residual: before the last correction, likewise.
         correction: size of the news (energy norm).
         count: corrections with these factors.
         rounds: factorisations for this system.
+        rows: rows of its matrix that have been formed for the next.
+        most: rows that are to be formed: none where factors are made of formulas.
         done: whether it is solved.
         wanting: whether it cannot go on without new factors.
         moving: whether the last correction is to be made.
@@ -60,28 +75,68 @@ class Correcting(eqx.Module):
     change: Float[Array, " unknowns"]
     news: Float[Array, " unknowns"]
     known: Float[Array, "corrections unknowns"]
+    directions: Directions
+    residual: Float[Array, " _"]
     correction: Float[Array, ""]
     count: Int[Array, ""]
     rounds: Int[Array, ""]
+    rows: Int[Array, ""]
+    most: Int[Array, ""]
     done: Bool[Array, ""]
     wanting: Bool[Array, ""]
     moving: Bool[Array, ""]
     last: Bool[Array, ""]
 
     @classmethod
-    def first(cls, lam: Float[Array, " unknowns"], factors: Factors) -> "Correcting":
-        """Before the first correction."""
-        memory = min(MEMORY, lam.size) if learns(factors.solver) else 0
+    def first(cls, lam: Float[Array, " unknowns"], factors: Factors, most: int) -> "Correcting":
+        """Before the first correction, where so many rows of the matrix are to be formed for new factors."""
+        memory, learning = min(MEMORY, lam.size), learns(factors.solver)
         nought, no = jnp.array(0), jnp.array(False)
         nothing = jnp.zeros_like(lam)
-        known = jnp.zeros((memory, *lam.shape), lam.dtype)
+        known = jnp.zeros((memory * learning, *lam.shape), lam.dtype)
+        directions = Directions.none(memory * (not learning), lam)
+        before = nothing[: 0 if learning else None]
         size = jnp.zeros((), lam.dtype)
-        return cls(nothing, nothing, known, size, nought, nought, no, no, no, no)
+        return cls(
+            nothing,
+            nothing,
+            known,
+            directions,
+            before,
+            size,
+            nought,
+            nought,
+            nought,
+            nought + most,
+            no,
+            no,
+            no,
+            no,
+        )
 
     @property
     def open(self) -> Bool[Array, ""]:
         """Whether to go on."""
         return ~self.done & ((self.rounds < ROUNDS) | ~self.wanting)
+
+    @property
+    def forming(self) -> Bool[Array, ""]:
+        """Whether another row of its matrix is to be formed, for new factors."""
+        return self.wanting & self.open & (self.rows < self.most)
+
+    def asked(self, lam: Float[Array, " unknowns"]) -> Float[Array, " unknowns"]:
+        """What its matrix is to be applied to next: the solution as it is, or a unit vector for a row."""
+        return jnp.where(self.forming, jnp.where(jnp.arange(lam.shape[0]) == self.rows, 1.0, 0.0), lam)
+
+    def formed(
+        self, matrix: Float[Array, "n unknowns"], product: Float[Array, " unknowns"]
+    ) -> tuple["Correcting", Float[Array, "n unknowns"]]:
+        """With one more row, if that was asked for."""
+        if not matrix.shape[0]:
+            return self, matrix
+        place = jnp.minimum(self.rows, matrix.shape[0] - 1)
+        matrix = with_row(matrix, place, jnp.where(self.forming, product, row(matrix, place)))
+        return eqx.tree_at(lambda c: c.rows, self, self.rows + self.forming), matrix
 
     @property
     def going(self) -> Bool[Array, ""]:
@@ -92,13 +147,14 @@ class Correcting(eqx.Module):
         """Done, if it is that of an attempt that failed: there is nothing to solve."""
         return eqx.tree_at(lambda c: c.done, self, self.done | failed)
 
-    def refreshed(self) -> "Correcting":
-        """With new factors."""
+    def refreshed(self, most: int) -> "Correcting":
+        """With new factors; for the next ones, so many rows of the matrix are to be formed."""
         nought, no = jnp.zeros_like(self.count), jnp.zeros_like(self.last)
+        known, directions = jax.tree.map(jnp.zeros_like, (self.known, self.directions))
         return eqx.tree_at(
-            lambda c: (c.known, c.count, c.rounds, c.wanting, c.last),
+            lambda c: (c.known, c.directions, c.count, c.rounds, c.rows, c.most, c.wanting, c.last),
             self,
-            (jnp.zeros_like(self.known), nought, self.rounds + 1, no, no),
+            (known, directions, nought, self.rounds + 1, nought, nought + most, no, no),
         )
 
     def judged(
@@ -106,6 +162,7 @@ class Correcting(eqx.Module):
         factors: Factors,
         lam: Array,
         residual: Array,
+        masses: Float[Array, " balances"],
         patience: int,
         whole: Array,
         transposed: bool = True,
@@ -116,6 +173,7 @@ class Correcting(eqx.Module):
             factors: at hand.
             lam: solution as it is.
             residual: of the equations.
+            masses: inertias that the unknowns have at least, see `least_inertias`.
             patience: corrections that are cheaper than new factors.
             whole: size of the solution if nothing cancelled.
             transposed: whether the system is that of the transposed Jacobian.
@@ -125,7 +183,13 @@ class Correcting(eqx.Module):
         """
         solver = factors.solver.transpose() if transposed else factors.solver
         weights = _weights(factors.inertias)
-        change = solver.solve(residual)
+        directions, before = self.directions, self.residual
+        if learns(solver):
+            change = solver.solve(residual)
+        else:
+            made = self.going & (self.count > 0)
+            directions = directions.followed_by(self.change, before - residual, 1.0 / weights, made)
+            change, before = directions.correction(solver, residual, 1.0 / weights), residual
         size = _size(lam, weights)
         allowed = jnp.maximum((CLOSE if transposed else CLOSE_FORWARD) * size, ROUND_OFF * whole)
         known, news = self.known, change
@@ -144,23 +208,46 @@ class Correcting(eqx.Module):
         # With factors of another system, corrections that stop shrinking may be these factors' fault.
         stalled = ~first & (ratio > 0.5) & (entire <= floor) & (self.rounds > 0)
         within = entire <= jnp.where(self.last, SURPRISE, 1.0) * allowed
-        done = (within | stalled) & finite & factors.usable
+        own = self.rounds > 0
+        size_by_mass, missing = sizes_by_mass(lam, residual, masses)
+        sure = jnp.maximum((CLOSE if transposed else CLOSE_FORWARD) * size_by_mass, ROUND_OFF * whole)
+        sure = missing <= jnp.maximum(sure, NOISE * factors.floor * size_by_mass)
+        done = (within | stalled) & (own | sure) & finite & factors.usable
         following = correction * factors.left_by(ratio, first)
         compares = self.going & ~first & (self.correction > allowed) & finite
         factors = factors.having_left(ratio, compares)
+        left = missing / jnp.where(size_by_mass > 0, size_by_mass, jnp.inf)
+        left = jnp.maximum(left, FORGETTING * factors.floor)
+        left = jnp.where(done & own & self.going, left, factors.floor)
+        factors = eqx.tree_at(lambda f: f.floor, factors, left)
         last = following <= allowed
         late = correction * ratio ** (patience * (SPEED if learns(solver) else 1)) > allowed
         slow = (~first & ((ratio > 0.5) | late)) | (self.count >= CORRECTIONS) | ~finite | ~factors.usable
         slow = slow & ~done
         moving = ~slow & ~done
         count = self.count + 1
-        found = Correcting(change, news, known, correction, count, self.rounds, done, slow, moving, last)
+        rounds = self.rounds, self.rows, self.most
+        made = change, news, known, directions, before
+        found = Correcting(*made, correction, count, *rounds, done, slow, moving, last)
         stay = eqx.tree_at(lambda c: c.moving, self, jnp.zeros_like(self.moving))
         return jax.tree.map(partial(jnp.where, ~self.going), stay, found), factors
 
 
 def _size(lam: Float[Array, " unknowns"], weights: Float[Array, " unknowns"]) -> Float[Array, ""]:
     return jnp.sqrt(jnp.sum(weights * lam**2))
+
+
+def sizes_by_mass(
+    lam: Float[Array, " unknowns"], residual: Float[Array, " unknowns"], masses: Float[Array, " balances"]
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Size of a solution, and of its error by masses: without stiffness, a residual is mass times error."""
+    mean = jnp.sum(masses) / max(masses.shape[0], 1)
+    mean = jnp.where(mean > 0, mean, 1.0)
+    real = jnp.where(masses > 0, masses, jnp.inf)
+    rest = residual.shape[0] - masses.shape[0]
+    own = jnp.concatenate([masses, jnp.full(rest, 1.0 / mean, residual.dtype)])
+    dual = jnp.concatenate([1.0 / real, jnp.full(rest, mean, residual.dtype)])
+    return _size(lam, own), _size(residual, dual)
 
 
 def _weights(inertias: Float[Array, " unknowns"]) -> Float[Array, " unknowns"]:

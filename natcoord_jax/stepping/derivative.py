@@ -25,8 +25,10 @@ from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import Tableau
 from natcoord_jax.stepping import linear_pair
 from natcoord_jax.stepping.backward import Backward
+from natcoord_jax.stepping.correcting import sizes_by_mass
 from natcoord_jax.stepping.error_control import Tolerance
 from natcoord_jax.stepping.forward import Forward
+from natcoord_jax.stepping.in_turn import Fixed
 from natcoord_jax.stepping.one_kernel import lane_by_lane, on_cpu
 from natcoord_jax.stepping.plan import Plan, Slots
 from natcoord_jax.stepping.record import Changes, Numbers, Record, Slot, instantiated, zero_tangent
@@ -39,6 +41,10 @@ CHUNK = 32
 JACOBIANS_FROM = 0.5
 """Directions, in terms of the number of unknowns, from which on Jacobians of all slots save time. Measured:
 they take as long as a third as many directions as unknowns (one stage) to two thirds (two stages)."""
+
+UNSOLVED = 1e-6
+"""Residual of a slot's linear system, relative to its terms and those of its solution, from which on the
+Jacobian is taken for singular: tangents are no numbers then. Rounding of very stiff systems leaves 1e-7."""
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
@@ -118,14 +124,19 @@ class Rule(linear_pair.Pair):
 
     def with_jacobians(self, residuals: Record, arguments: Changes) -> tuple[State, Array]:
         """The same by Jacobians of all slots, which serve any number of directions."""
-        slots = residuals.slots
+        slots, masses = residuals.slots, Fixed.of(self.tableau, residuals).masses
 
         def body(state_dot: State, xs: tuple) -> tuple:
             (along, solver, forcing), accepted, forced = xs
             residual_dot, end_dot = forcing if forced is None else jax.tree.map(jnp.add, forcing, forced)
             resting = jnp.zeros(slots.y.shape[1:], slots.y.dtype)
-            y_dot = -solver.solve(residual_dot + along(state_dot, resting)[0])
-            end = jax.tree.map(jnp.add, end_dot, along(state_dot, y_dot)[1])
+            known = residual_dot + along(state_dot, resting)[0]
+            y_dot = -solver.solve(known)
+            missing, moved = along(state_dot, y_dot)
+            size, missing = sizes_by_mass(y_dot, missing + residual_dot, masses)
+            solved = missing <= UNSOLVED * (size + sizes_by_mass(y_dot, known, masses)[1])
+            y_dot, moved = jax.tree.map(lambda x: jnp.where(solved, x, jnp.nan), (y_dot, moved))
+            end = jax.tree.map(jnp.add, end_dot, moved)
             end = jax.tree.map(partial(jnp.where, accepted), end, state_dot)
             return end, (end, jnp.where(accepted, y_dot, 0.0))
 

@@ -45,6 +45,7 @@ class Factors(eqx.Module):
         noise: last correction of a step, relative to the terms of the equations, averaged over steps.
         leaving: most that a correction has left to the next one lately, in terms of its size; 1: nothing is
             known yet.
+        floor: residual that is left of a linear system solved with factors of its own, see `Correcting`.
     """
 
     solver: Any
@@ -55,6 +56,7 @@ class Factors(eqx.Module):
     extra: Int[Array, ""]
     noise: Float[Array, ""]
     leaving: Float[Array, ""]
+    floor: Float[Array, ""]
 
     def after_step(self, it: Any, usable: Bool[Array, ""], cost: int) -> "Factors":
         """Factors for the next step: given up once they have cost more corrections than new ones would.
@@ -72,7 +74,7 @@ class Factors(eqx.Module):
         keep = usable & self.usable & (extra <= cost) & (corrections <= 2 * cost)
         noise = jnp.where(usable & it.converged, 0.5 * (self.noise + it.error), self.noise)
         stale = jnp.zeros_like(self.fresh)
-        return Factors(self.solver, self.inertias, keep, stale, least, extra, noise, self.leaving)
+        return replace_fields(self, usable=keep, fresh=stale, least=least, extra=extra, noise=noise)
 
     def having_left(self, ratio: Array, telling: Array) -> "Factors":
         """What is known of them after a correction that was this part of the one before it, if that tells."""
@@ -118,7 +120,7 @@ def no_factors(equations: Any) -> Factors:
     shapes = jax.eval_shape(equations.factorised, equations.like_tangent(y))
     solver, inertias = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
     no, noise = jnp.array(False), jnp.zeros((), y.dtype)
-    return Factors(solver, inertias, no, no, jnp.array(NEVER), jnp.array(0), noise, noise + 1.0)
+    return Factors(solver, inertias, no, no, jnp.array(NEVER), jnp.array(0), noise, noise + 1.0, noise)
 
 
 def factors_of(equations: Any, matrix: Any, noise: Array | float = 0.0) -> Factors:
@@ -131,4 +133,4 @@ def new_factors(made: tuple[Any, Array], noise: Array | float = 0.0) -> Factors:
     solver, inertias = made
     yes, noise = jnp.array(True), jnp.asarray(noise, inertias.dtype)
     unknown = jnp.ones_like(noise)
-    return Factors(solver, inertias, yes, yes, jnp.array(NEVER), jnp.array(0), noise, unknown)
+    return Factors(solver, inertias, yes, yes, jnp.array(NEVER), jnp.array(0), noise, unknown, 0.0 * unknown)

@@ -18,7 +18,7 @@ from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
 from natcoord_jax.stepping.correcting import Correcting
 from natcoord_jax.stepping.factors import Factors
-from natcoord_jax.stepping.in_turn import Going, InTurn
+from natcoord_jax.stepping.in_turn import Fixed, Going, InTurn
 from natcoord_jax.stepping.newton import any_lane
 from natcoord_jax.stepping.past import Past
 from natcoord_jax.stepping.plan import Plan
@@ -35,6 +35,8 @@ class Forward(InTurn):
         plan: of the rollout.
     """
 
+    columns = True
+
     def __init__(self, plan: Plan):
         super().__init__(plan, 1)
 
@@ -49,16 +51,13 @@ class Forward(InTurn):
         given = replace_fields(given, u=_reversed(given.u), forced=_reversed(given.forced))
         return _reversed(self.every(record, given))
 
-    def numbers_of(self, fixed: tuple[Numbers, list[Array]]) -> Numbers:
-        """What the rollout depends on."""
-        return fixed[0]
-
     def following(self, kernel: Callable, record: Record, given: Changes) -> tuple[State, Array]:
         """Tangents of everything."""
         numbers, slots = record.numbers, record.slots
         y, before_all = slots.y[-1], jax.tree.map(lambda x: x[-1], slots.before)
-        fixed = numbers, given.varied
-        tangents_dot = kernel(self._first, fixed, before_all, given.state) if self.tableau.kick else None
+        fixed, tangents_dot = Fixed.of(self.tableau, record, given.varied), None
+        if self.tableau.kick:
+            tangents_dot = kernel(self._first, (numbers, given.varied), before_all, given.state)
         own = given.state, tangents_dot, Past.of(jnp.zeros_like(y))
         start, like = (y, record.factors, own), (slots.before, slots.y)
         return self.in_rounds(kernel, fixed, slots, (given.u, given.forced), start, like)[1]
@@ -81,8 +80,8 @@ class Forward(InTurn):
         return (end_dot, tangents_dot, past), (end_dot, keep(y_dot, jnp.zeros_like(y_dot)))
 
     def solved(
-        self, fixed: tuple[Numbers, list[Array]], slot: Slot, arrived: tuple, given: tuple, c: Going
-    ) -> tuple[tuple, Array, Correcting, Factors]:
+        self, fixed: Fixed, slot: Slot, arrived: tuple, given: tuple, c: Going, matrix: Array
+    ) -> tuple[tuple, Array, Correcting, Factors, Array]:
         """Tangents of one slot, as far as the factors at hand go.
 
         Those of its unknowns solve J y_dot = -r. Their guess is extrapolated from those of the slots before,
@@ -90,9 +89,9 @@ class Forward(InTurn):
 
         Returns:
             Tangents of the state after the slot, of the tangent space there and of the unknowns, and r; the
-            tangents of the unknowns, where their solution stands, and the factors.
+            tangents of the unknowns, where their solution stands, the factors, and the matrix.
         """
-        (numbers, varied_dot), (u_dot, forced) = fixed, given
+        numbers, varied_dot, (u_dot, forced) = fixed.numbers, fixed.changes, given
         patience = kind_of(numbers.whole(numbers.varied)[0], self.tableau).renewal
         tangents = self.admitted(numbers, numbers.varied, slot.before)
         at_slot = numbers.varied, slot.before, tangents, slot.u
@@ -107,30 +106,33 @@ class Forward(InTurn):
         fresh = (c.at.count == 0) & (c.at.rounds == 0) & c.factors.usable
 
         def trip(carry: tuple) -> tuple:
-            begun, learnt, y_dot, at, known, ends, _ = carry
+            begun, learnt, y_dot, at, known, ends, _, matrix = carry
             given = jax.tree.map(lambda x: jnp.where(begun, 0.0, x), changes)
-            gap, *moved = along(*given, jnp.where(begun, y_dot, 0.0))
+            product, *moved = along(*given, jnp.where(begun, at.asked(y_dot), 0.0))
             if forced is not None:
                 more = jax.tree.map(lambda x: jnp.where(begun, 0.0, x), forced)
-                gap, moved[0] = jax.tree.map(jnp.add, (gap, moved[0]), more)
-            known = jnp.where(begun, known, gap)
+                product, moved[0] = jax.tree.map(jnp.add, (product, moved[0]), more)
+            known = jnp.where(begun, known, product)
             ends, moved = (
                 jax.tree.map(partial(jnp.where, begun), *x)
                 for x in ((ends, tuple(moved)), (tuple(moved), nothing))
             )
             factors = c.factors.with_changes(learnt)
             start = jnp.where(fresh, y_dot - factors.solver.solve(known - foreseen), y_dot)
-            judged, knows = at.judged(factors, y_dot, gap + known, patience, none, False)
-            at, factors = jax.tree.map(partial(jnp.where, begun), (judged, knows), (at, factors))
+            formed, matrix = at.formed(matrix, product)
+            given = y_dot, product + known, fixed.masses, patience, none
+            judged = formed.judged(factors, *given, transposed=False)
+            at, factors = jax.tree.map(partial(jnp.where, begun), judged, (at, factors))
             y_dot = jnp.where(begun, jnp.where(at.moving, y_dot - at.change, y_dot), start)
-            return jnp.array(True), factors.changing, y_dot, at, known, ends, moved
+            return jnp.array(True), factors.changing, y_dot, at, known, ends, moved, matrix
 
         start = jnp.array(False), c.factors.changing, c.solution, c.at
-        start = *start, jnp.zeros_like(slot.y), nothing, nothing
-        found = jax.lax.while_loop(lambda x: any_lane(x[3].going | ~x[0]), trip, start)
-        _, learnt, y_dot, at, known, ends, moved = found
+        start = *start, jnp.zeros_like(slot.y), nothing, nothing, matrix
+        found = jax.lax.while_loop(lambda x: any_lane(x[3].going | x[3].forming | ~x[0]), trip, start)
+        _, learnt, y_dot, at, known, ends, moved, matrix = found
         end_dot, tangents_dot = jax.tree.map(jnp.add, ends, moved)
-        return (end_dot, tangents_dot, y_dot, known), y_dot, at, c.factors.with_changes(learnt)
+        factors = c.factors.with_changes(learnt)
+        return (end_dot, tangents_dot, y_dot, known), y_dot, at, factors, matrix
 
 
 def _reversed(tree: Any) -> Any:

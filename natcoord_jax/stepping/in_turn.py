@@ -14,10 +14,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from natcoord_jax.assembly.equations import prepare
+from natcoord_jax.assembly.equations import kind_of, prepare
+from natcoord_jax.assembly.reduced import NOTHING
 from natcoord_jax.assembly.separate import Tangents, tangents_at
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
+from natcoord_jax.linsolve.learning import learns
+from natcoord_jax.maths.collocation import Tableau
 from natcoord_jax.maths.rows import row, with_row
 from natcoord_jax.stepping.correcting import Correcting
 from natcoord_jax.stepping.factors import Factors, factors_of
@@ -25,12 +28,37 @@ from natcoord_jax.stepping.newton import any_lane
 from natcoord_jax.stepping.one_kernel import in_few_kernels, lane_by_lane
 from natcoord_jax.stepping.past import Past
 from natcoord_jax.stepping.plan import Plan
-from natcoord_jax.stepping.probe import jacobian_by_differences
 from natcoord_jax.stepping.record import Numbers, Record, Slot
 from natcoord_jax.stepping.step import advance_between
 
 CHUNK = 32
 """Slots that a round sees, at most."""
+
+
+class Fixed(eqx.Module):
+    """What is the same for all slots.
+
+    Attributes:
+        numbers: what the rollout depends on.
+        masses: inertias that unknowns have at least, see `least_inertias`.
+        changes: tangents of the numbers that vary; None on the way back.
+        unknowns: of a slot.
+    """
+
+    numbers: Numbers
+    masses: Float[Array, " balances"]
+    changes: list[Array] | None
+    unknowns: int = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, tableau: Tableau, record: Record, changes: list[Array] | None = None) -> "Fixed":
+        """Of what the derivative is taken at."""
+        numbers, slots = record.numbers, record.slots
+        system, parameters, dt = numbers.whole(numbers.varied)
+        state = jax.tree.map(lambda x: x[0], slots.before)
+        idle = jnp.zeros(len(system.structure.inputs), dt.dtype)
+        equations = prepare(system, state, idle, dt, tableau, NOTHING)
+        return cls(numbers, equations.least_inertias(), changes, slots.y.shape[-1])
 
 
 class Going(eqx.Module):
@@ -68,18 +96,24 @@ class InTurn(ABC):
         self.tableau = plan.tableau
         self.stride = stride
 
+    columns = False
+    """Whether products with a unit vector are columns of a slot's Jacobian; if not, rows."""
+
     @abstractmethod
     def arriving(self, own: Any, given: Any) -> Any:
         """What arrives at a slot, of what is carried and of its row of what is given."""
 
     @abstractmethod
     def solved(
-        self, fixed: Any, slot: Slot, arrived: Any, given: Any, c: Going
-    ) -> tuple[Any, Array, Correcting, Factors]:
-        """The system of one slot, as far as the factors at hand go.
+        self, fixed: "Fixed", slot: Slot, arrived: Any, given: Any, c: Going, matrix: Array
+    ) -> tuple[Any, Array, Correcting, Factors, Array]:
+        """The system of one slot, as far as the factors at hand go, and its matrix where they do not.
+
+        The matrix is formed by the products that corrections are made with, so that it is that of the slot
+        exactly, and the equations are not in the program a second time.
 
         Returns:
-            What follows from its solution, the solution, where it stands, and the factors.
+            What follows from its solution, the solution, where it stands, the factors, and the matrix.
         """
 
     @abstractmethod
@@ -92,10 +126,6 @@ class InTurn(ABC):
             outcome: what follows from its solution.
             keep: chooses between two values: the second one for attempts that failed.
         """
-
-    @abstractmethod
-    def numbers_of(self, fixed: Any) -> Numbers:
-        """What the rollout depends on, in what is the same for all slots."""
 
     @abstractmethod
     def following(self, kernel: Callable, record: Record, given: Any) -> Any:
@@ -129,7 +159,7 @@ class InTurn(ABC):
     def in_rounds(
         self,
         kernel: Callable,
-        fixed: Any,
+        fixed: "Fixed",
         slots: Slot,
         given: Any,
         start: tuple[Array, Factors, Any],
@@ -149,9 +179,11 @@ class InTurn(ABC):
         """
         count = slots.y.shape[0]
         rows = min(CHUNK, count)
+        y, factors, own = start
+        places = y.shape[0] if learns(factors.solver) else 0
 
-        def round_of(carry: tuple[Going, Any]) -> tuple[Going, Any]:
-            c, found = carry
+        def round_of(carry: tuple[Going, Any, Array]) -> tuple[Going, Any, Array]:
+            c, found, matrix = carry
             first = jnp.maximum(c.left - rows, 0)
             near = jax.tree.map(
                 lambda x: jax.lax.dynamic_slice_in_dim(x, first, rows, 0), (slots, given, found)
@@ -160,40 +192,49 @@ class InTurn(ABC):
             def renewed(carry: tuple) -> tuple:
                 _, factors, at = carry
                 slot = jax.tree.map(lambda x: row(x, c.left - 1 - first), near[0])
-                return jnp.array(False), kernel(self._renewed, fixed, slot), at.refreshed()
+                made = kernel(self._renewed, fixed, slot, matrix, at.most)
+                made = replace_fields(made, floor=factors.floor)
+                return jnp.array(False), made, at.refreshed(places)
 
             start = c.stuck, c.factors, c.at
             _, factors, at = jax.lax.while_loop(lambda carry: carry[0], renewed, start)
             c = replace_fields(c, factors=factors, at=at, stuck=jnp.array(False))
-            c, part = kernel(self._several, fixed, first, *near, c)
+            c, part, matrix = kernel(self._several, fixed, first, *near, c, matrix)
             update = partial(jax.lax.dynamic_update_slice_in_dim, start_index=first, axis=0)
-            return c, jax.tree.map(update, found, part)
+            return c, jax.tree.map(update, found, part), matrix
 
-        y, factors, own = start
         first = Going(
             left=jnp.array(count),
             own=own,
             pasts=(Past.of(jnp.zeros_like(y)),) * self.stride,
             solution=jnp.zeros_like(y),
-            at=Correcting.first(y, factors),
+            at=Correcting.first(y, factors, self._formed_first(fixed, factors)),
             factors=factors,
             stuck=jnp.array(False),
         )
         found = jax.tree.map(jnp.zeros_like, like)
-        return jax.lax.while_loop(lambda carry: carry[0].left > 0, round_of, (first, found))
+        matrix = jnp.zeros((places, *y.shape), y.dtype)
+        return jax.lax.while_loop(lambda carry: carry[0].left > 0, round_of, (first, found, matrix))[:2]
+
+    def _formed_first(self, fixed: "Fixed", factors: Factors) -> int:
+        """Rows of a slot's matrix that its first own factors ask for: none where there are formulas."""
+        system = fixed.numbers.whole(fixed.numbers.varied)[0]
+        rows = learns(factors.solver) and kind_of(system, self.tableau).by_differences
+        return fixed.unknowns if rows else 0
 
     def _several(
-        self, fixed: Any, first: Array, slots: Slot, given: Any, found: Any, c: Going
-    ) -> tuple[Going, Any]:
+        self, fixed: "Fixed", first: Array, slots: Slot, given: Any, found: Any, c: Going, matrix: Array
+    ) -> tuple[Going, Any, Array]:
         """Slots from the last one back, down to the first given here or to one that needs new factors."""
 
-        def one(carry: tuple[Going, Any]) -> tuple[Going, Any]:
-            c, found = carry
+        def one(carry: tuple[Going, Any, Array]) -> tuple[Going, Any, Array]:
+            c, found, matrix = carry
             here = c.left - 1 - first
             slot, own_given = jax.tree.map(lambda x: row(x, here), (slots, given))
             c = replace_fields(c, at=c.at.unless(~slot.accepted))
             arrived = self.arriving(c.own, own_given)
-            outcome, solution, at, factors = self.solved(fixed, slot, arrived, own_given, c)
+            solved = self.solved(fixed, slot, arrived, own_given, c, matrix)
+            outcome, solution, at, factors, matrix = solved
             stuck = any_lane(at.open & at.wanting)
             lost = slot.accepted & ~at.done
             outcome = jax.tree.map(lambda x: jnp.where(lost, jnp.nan, x), outcome)
@@ -205,20 +246,26 @@ class InTurn(ABC):
             found = jax.tree.map(lambda rows, x: with_row(rows, here, x), found, found_here)
             guess = pasts[0].guess
             guess = jnp.where(jnp.all(jnp.isfinite(guess)), guess, 0.0)
-            following = Correcting.first(solution, factors)
+            following = Correcting.first(solution, factors, self._formed_first(fixed, factors))
             aged = factors.aged()
             done = Going(c.left - 1, carried, pasts, guess, following, aged, stuck)
             waiting = replace_fields(c, solution=solution, at=at, factors=factors, stuck=stuck)
-            return jax.tree.map(partial(jnp.where, stuck), waiting, done), found
+            return jax.tree.map(partial(jnp.where, stuck), waiting, done), found, matrix
 
-        return jax.lax.while_loop(lambda carry: (carry[0].left > first) & ~carry[0].stuck, one, (c, found))
+        def going(carry: tuple[Going, Any, Array]) -> Array:
+            return (carry[0].left > first) & ~carry[0].stuck
 
-    def _renewed(self, fixed: Any, slot: Slot) -> Factors:
-        """New factors, for this slot."""
-        numbers = self.numbers_of(fixed)
+        return jax.lax.while_loop(going, one, (c, found, matrix))
+
+    def _renewed(self, fixed: "Fixed", slot: Slot, matrix: Array, rows: Array) -> Factors:
+        """New factors, for this slot, of so many rows of its matrix, or of formulas if none was asked for."""
+        numbers = fixed.numbers
         system, parameters, dt = numbers.whole(numbers.varied)
         u = slot.inputs(self.plan, parameters, slot.before)
         equations = prepare(system, slot.before, u, slot.fraction * dt, self.tableau)
-        if equations.by_differences:
-            return factors_of(equations, jacobian_by_differences(equations, slot.y))
-        return factors_of(equations, equations.tangent(slot.y))
+        if not matrix.shape[0]:
+            return factors_of(equations, equations.tangent(slot.y))
+        matrix = matrix.T if self.columns else matrix
+        if not equations.by_differences:
+            matrix = jnp.where(rows > 0, matrix, equations.tangent(slot.y))
+        return factors_of(equations, matrix)

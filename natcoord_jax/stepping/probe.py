@@ -181,14 +181,3 @@ def _changes(
         return found, found
     same = found.at[places].set(jnp.max(found[places], axis=0))
     return jnp.where(np.arange(y.shape[0]) < equations.balances, found, same), same
-
-
-def jacobian_by_differences(
-    equations: Any, y: Float[Array, " unknowns"]
-) -> Float[Array, "unknowns unknowns"]:
-    """The Jacobian with stages told apart."""
-    steps, (_, apart) = _changes(equations, y)[0], layouts(equations)
-    chosen = apart.number == np.arange(apart.measure.size)[:, None]
-    points = jnp.concatenate([y[None], y + jnp.where(chosen, steps, 0.0)])
-    found = jax.lax.map(lambda y: equations.residual(y)[0], points)
-    return matrix_of(equations, (found[1:] - found[:1]) / steps[apart.measure][:, None])

@@ -164,7 +164,9 @@ def simulate(
     """Simulate with the energy-momentum step (57), its relatives of higher order, or another scheme.
 
     Works under `jit`, `vmap`, `grad`, `jvp` and their compositions up to one reverse mode; `dt` and every
-    floating leaf of `system`, `state` and `inputs` can be differentiated.
+    floating leaf of `system`, `state` and `inputs` can be differentiated. Derivatives are exact where the
+    motion changes suddenly, too; where the linear system of a step cannot be solved they are NaN, in every
+    mode, though the run itself went well.
 
     Args:
         system: compiled system.

@@ -1,0 +1,167 @@
+"""Derivatives of one random scene in every mode, and how far each is from what it should be."""
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tolerances as tol
+from differences import along
+from hunting import KINDS, Case, Template, case_of, plainly, recorded, score, simulated
+
+STEPS = 10.0 ** -np.arange(2.0, 8.5, 0.5)
+"""Of the differences."""
+
+compiled = partial(jax.jit, static_argnums=0)
+
+
+@compiled
+def reverse(template: Template, case: Case, numbers: Any) -> tuple:
+    """Value, what the runs say, and the gradient."""
+    f = simulated(template)
+    return jax.value_and_grad(f, has_aux=True)(numbers, case.rest, case.weights)
+
+
+@compiled
+def checkpointed(template: Template, case: Case) -> Any:
+    """The gradient where the way back recomputes."""
+    f = simulated(template, checkpoint=True)
+    return jax.grad(f, has_aux=True)(case.numbers, case.rest, case.weights)[0]
+
+
+@compiled
+def batch(template: Template, cases: Case) -> Any:
+    """Gradients of stacked cases."""
+
+    def gradient(case):
+        return jax.grad(simulated(template), has_aux=True)(case.numbers, case.rest, case.weights)[0]
+
+    return jax.vmap(gradient)(cases)
+
+
+@compiled
+def forward(template: Template, case: Case, direction: Any) -> tuple:
+    """Value, its change, and the record of all slots."""
+
+    def f(numbers):
+        return recorded(template)(numbers, case.rest, case.weights)
+
+    return jax.jvp(f, (case.numbers,), (direction,), has_aux=True)
+
+
+@compiled
+def directions(template: Template, case: Case) -> Any:
+    """Changes along all directions at once."""
+
+    def f(numbers):
+        return simulated(template)(numbers, case.rest, case.weights)[0]
+
+    return jax.vmap(lambda d: jax.jvp(f, (case.numbers,), (d,))[1])(case.directions)
+
+
+@compiled
+def second(template: Template, case: Case, direction: Any) -> tuple:
+    """Second derivative along a direction, forward over reverse."""
+
+    def slope(numbers):
+        found = jax.grad(simulated(template), has_aux=True)(numbers, case.rest, case.weights)[0]
+        parts = zip(jax.tree.leaves(found), jax.tree.leaves(direction))
+        return sum(jnp.vdot(g, d) for g, d in parts)
+
+    return jax.jvp(slope, (case.numbers,), (direction,))
+
+
+@compiled
+def plain(template: Template, case: Case, records: Any) -> tuple:
+    """Changes along all directions, the largest term of each, and how far solutions are apart.
+
+    Terms are those of the derivative of the loss by all saved states.
+    """
+
+    def f(numbers):
+        total, said = plainly(template, records)(numbers, case.rest, case.weights)
+        return (total, [x for x, _ in said]), [apart for _, apart in said]
+
+    def change(direction):
+        (_, seen), (slope, changes), apart = jax.jvp(f, (case.numbers,), (direction,), has_aux=True)
+        largest = jnp.zeros(())
+        for x, dx, weights in zip(seen, changes, case.weights):
+            largest = jnp.maximum(largest, jnp.max(jnp.abs(jax.grad(score)(x, weights) * dx)))
+        return slope, largest, jnp.max(jnp.stack(apart))
+
+    return jax.vmap(change)(case.directions)
+
+
+@compiled
+def plain_second(template: Template, case: Case, records: Any, direction: Any) -> Any:
+    """Second derivative along a direction."""
+
+    def f(numbers):
+        return plainly(template, records, 3)(numbers, case.rest, case.weights)[0]
+
+    def slope(numbers):
+        return jax.jvp(f, (numbers,), (direction,))[1]
+
+    return jax.jvp(slope, (case.numbers,), (direction,))[1]
+
+
+def contracted(gradient: Any, directions: Any) -> np.ndarray:
+    """Changes along stacked directions by a gradient."""
+    parts = zip(jax.tree.leaves(gradient), jax.tree.leaves(directions))
+    return sum(np.asarray(d).reshape(len(d), -1) @ np.ravel(g) for g, d in parts)
+
+
+def missed(quotients: np.ndarray, known: float) -> float:
+    """Error by the differences that know best, in terms of their noise where that is more than tolerated.
+
+    Long steps see what is not linear, or beyond a kink; short ones are noise. How much is known from three
+    neighbours, which have to agree to some digits.
+    """
+    three = np.stack([quotients[:-2], quotients[1:-1], quotients[2:]])
+    spread = np.max(three, axis=0) - np.min(three, axis=0)
+    error = np.min(np.abs(three - known), axis=0)
+    noise = np.maximum(spread / tol.DIFFERENCE_OF_A_SUDDEN_MOTION, 1.0)
+    return float(np.min(np.where(spread <= tol.SPREAD_OF_DIFFERENCES, error / noise, np.inf)))
+
+
+def examined(template: Template, seed: int) -> dict[str, tuple[float, float]]:
+    """By mode: the error relative to the largest term, and what it may be."""
+    case = case_of(template, seed)
+    whole = jax.tree.map(lambda x: jnp.sum(x, axis=0), case.directions)
+    value, slope, records = forward(template, case, whole)
+    (again, _), gradient = reverse(template, case, case.numbers)
+    known, terms, apart = (np.asarray(x) for x in plain(template, case, records))
+    largest = np.max(terms)
+    scales = np.maximum(terms, tol.SMALL_PART * largest)
+    assert largest > 0 and np.all(np.isfinite(known)), "nothing is tested"
+    total, same = np.sum(known), tol.SAME_DERIVATIVE
+
+    def every(found: Any) -> float:
+        return float(np.max(np.abs(np.asarray(found) - known) / scales))
+
+    errors = {"solutions": (float(np.max(apart)), tol.SAME_SOLUTION)}
+    errors["value"] = float(abs(again - value) / max(abs(value), largest)), same
+    for kind, x, y, scale in zip(KINDS, contracted(gradient, case.directions), known, scales):
+        errors[f"reverse, {kind}"] = float(abs(x - y) / scale), same
+    errors["forward"] = float(abs(slope - total) / largest), same
+    if "checkpointed" in template.more:
+        errors["checkpointed"] = every(contracted(checkpointed(template, case), case.directions)), same
+    if "directions" in template.more:
+        errors["directions"] = every(directions(template, case)), same
+    if "batch" in template.more:
+        cases = jax.tree.map(lambda *x: jnp.stack(x), case_of(template, seed + 1), case)
+        found = jax.tree.map(lambda x: x[1], batch(template, cases))
+        errors["batch"] = every(contracted(found, case.directions)), same
+    if "second" in template.more:
+        (_, found), bent = second(template, case, whole), plain_second(template, case, records, whole)
+        errors["second"] = float(abs(found - bent) / max(abs(bent), largest)), same
+    if template.rtol is None:  # Derivatives hold lengths of substeps, which change with the motion.
+        steps = STEPS / np.sqrt(max(1.0, largest))
+        ahead, behind = (
+            np.array([reverse(template, case, along(case.numbers, whole, s))[0][0] for s in sign * steps])
+            for sign in (1.0, -1.0)
+        )
+        error = missed((ahead - behind) / (2.0 * steps) / largest, total / largest)
+        errors["differences"] = error, tol.DIFFERENCE_OF_A_SUDDEN_MOTION
+    return errors
