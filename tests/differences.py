@@ -59,3 +59,14 @@ def assert_v_shaped(
         falling = errors[: best + 1]
         ratios = falling[:-2] / np.maximum(falling[2:], 1e-300)
         assert np.max(ratios, initial=0.0) >= tol.DIFFERENCE_FALL, f"no fall of order two:\n{report}"
+
+
+def alternation(values, order=4):
+    """What changes its sign in every row, in terms of the largest value.
+
+    Args:
+        values: shape (rows, columns), equally spaced.
+        order: of the differences that leave out what is smooth.
+    """
+    values = np.asarray(values)
+    return np.max(np.abs(np.diff(values, order, axis=0))) / 2.0**order / np.max(np.abs(values))

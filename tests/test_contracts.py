@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import tolerances as tol
-from differences import assert_v_shaped
+from differences import assert_v_shaped, difference_errors
 from scenes import AXIS, JOINTS, SECOND, SPECIAL, with_multipliers
 
 import natcoord_jax as nc
@@ -337,7 +337,7 @@ def test_batch_equals_loop(effect):
 
 @EFFECTS
 def test_derivatives_equal_differences(effect):
-    """Of forces, torques and constraint rates with respect to the motion, forward and reverse."""
+    """Of forces, torques and constraint rates with respect to the motion, in both modes; at rest, too."""
     respond_to, _ = answering(effect)
     w, lam = random_motion(effect, 3)
 
@@ -346,12 +346,17 @@ def test_derivatives_equal_differences(effect):
         return answer.forces, answer.torques, answer.rows, motion.rates
 
     direction = jnp.asarray(np.random.default_rng(4).normal(size=w.shape))
-    derivative = jax.jvp(f, (w,), (direction,))[1]
-    assert_v_shaped(f, w, direction, derivative)
-    weights = jax.tree.map(jnp.cos, derivative)
-    back = jax.vjp(f, w)[1](weights)[0] @ direction
-    ahead = sum(jnp.vdot(a, b) for a, b in zip(*map(jax.tree.leaves, (weights, derivative)), strict=True))
-    assert abs(back - ahead) <= tol.SAME_GRADIENT * abs(ahead)
+    for at in (w, jnp.zeros_like(w)):
+        derivative = jax.jvp(f, (at,), (direction,))[1]
+        if at is w:
+            assert_v_shaped(f, at, direction, derivative)
+        else:  # there may be nothing of second order
+            assert np.min(difference_errors(f, at, direction, derivative)) <= tol.DIFFERENCE_BEST
+        weights = jax.tree.map(jnp.cos, derivative)
+        back = jax.vjp(f, at)[1](weights)[0] @ direction
+        pairs = zip(*map(jax.tree.leaves, (weights, derivative)), strict=True)
+        ahead = sum(jnp.vdot(a, b) for a, b in pairs)
+        assert abs(back - ahead) <= tol.SAME_GRADIENT * abs(ahead)
 
 
 # --- joints -----------------------------------------------------------------------------------------------

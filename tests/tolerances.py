@@ -55,6 +55,10 @@ HIGH_ORDER_TOLERANCE = 0.16
 # ... and constraint velocities, absolute [m/s, 1/s], of motions at some ten of those.
 TANGENT = 1e-10
 
+# What changes its sign in every step, of rates and velocities that are read, in terms of the largest of them;
+# found: up to 1e-4, the motion itself. What is across the constraints as it is: 1e-2, up to all of it.
+ALTERNATION = 1e-3
+
 # A hundred steps of three bodies without stiff parts, at any order and with forces of every kind: some ten
 # roundings of the terms, 2e-15 to 5e-15.
 ENERGY_OF_A_SMALL_SCENE = 1e-13
@@ -67,6 +71,8 @@ SPACECRAFT_MOMENTUM = 1e-9 * 3000.0  # [N m s]
 
 # Against exact solutions, by Richardson's formula from two steps: what the fourth order leaves.
 EXACT_SOLUTION = 1e-6
+# Rates of order two at the ends of steps miss those of a drive by the square of the angle a step, here 0.03.
+CONSTANT_SPEED = 1e-3
 # Positions made by another scheme of order two at the same step differ by the square of the step.
 OTHER_SCHEME = 5e-5
 

@@ -179,8 +179,15 @@ def _problem(system: System, state: State, inputs: Array, rotation: Array) -> tu
     def gaps(x: Array) -> Array:
         return static.gaps(static.displaced(jnp.concatenate([x, none])))
 
-    rows = jax.jacfwd(gaps)(jnp.zeros(size))
-    return _matrices(_Steady(system, state, inputs, rotation, none), rows, size)
+    rows = jnp.concatenate([jax.jacfwd(gaps)(jnp.zeros(size)), _held(system)])
+    held = jnp.zeros(rows.shape[0] - none.shape[0])
+    return _matrices(_Steady(system, state, inputs, rotation, jnp.concatenate([none, held])), rows, size)
+
+
+def _held(system: System) -> np.ndarray:
+    """Rates of the turns of point masses, which have no inertia and do not turn."""
+    turns = [6 * point + k for point in system.structure.points for k in (3, 4, 5)]
+    return np.eye(6 * len(system.structure.bodies))[turns]
 
 
 def modes(

@@ -11,21 +11,21 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.balances import loads
-from natcoord_jax.assembly.diagnostics import joint_residuals
 from natcoord_jax.assembly.full import FullStep
 from natcoord_jax.assembly.local import body_motion
 from natcoord_jax.assembly.momentum import wrench
 from natcoord_jax.assembly.node_sweeps import sweep_nodes
 from natcoord_jax.assembly.outset import Outset
+from natcoord_jax.assembly.projection import nearest_coordinates
 from natcoord_jax.assembly.rates import row_rates
 from natcoord_jax.assembly.response import gather, respond, situation, stations
 from natcoord_jax.assembly.system import Group, System
 from natcoord_jax.assembly.tree import gather_slots, start_rates
+from natcoord_jax.assembly.violations import joint_residuals
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import gauss
 from natcoord_jax.maths.elimination import pivoted_inverse
-from natcoord_jax.stepping.assemble import nearest_coordinates
 
 NO_MASS = 1e-30
 """Factor on masses that leaves them no weight in the equations, but tells bodies from point masses."""

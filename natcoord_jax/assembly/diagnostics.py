@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.core.host import on_host
-from natcoord_jax.core.joint import frames_at
 from natcoord_jax.core.results import REASONS, REMEDIES, Result, SimulationError
 from natcoord_jax.core.state import State, Trajectory
 from natcoord_jax.maths.vectors import cross
@@ -40,32 +39,6 @@ class Energy(eqx.Module):
     def total(self) -> Float[Array, "*t"]:
         """Kinetic energy and stores."""
         return self.kinetic + self.potential
-
-
-class ConstraintErrors(eqx.Module):
-    """Largest violations at each time.
-
-    Attributes:
-        directors: of d_i . d_j = delta_ij [-].
-        joints: of the joints' constraints [m, -].
-        director_rates: of their time derivatives [1/s].
-        joint_rates: of those of the joints [m/s, 1/s].
-    """
-
-    directors: Float[Array, "*t"]
-    joints: Float[Array, "*t"]
-    director_rates: Float[Array, "*t"]
-    joint_rates: Float[Array, "*t"]
-
-    @property
-    def position(self) -> Float[Array, "*t"]:
-        """Largest violation of any constraint."""
-        return jnp.maximum(self.directors, self.joints)
-
-    @property
-    def velocity(self) -> Float[Array, "*t"]:
-        """Largest violation of any constraint rate."""
-        return jnp.maximum(self.director_rates, self.joint_rates)
 
 
 def states_of(motion: State | Trajectory) -> State:
@@ -163,42 +136,6 @@ def momentum(system: "System", state: State) -> Float[Array, "3"]:
 def angular_momentum(system: "System", state: State) -> Float[Array, "3"]:
     """Angular momentum about the origin (55)."""
     return jnp.sum(body_momenta(system, state)[1], axis=0)
-
-
-def joint_residuals(system: "System", state: State) -> list[tuple["Group", Array, Array]]:
-    """Residual and rate of every joint's constraints, by group."""
-    q, v = rows_with_ground(state.q), rows_with_ground(state.v).at[-1].set(0.0)
-    found = []
-    for group in system.joints:
-
-        def one(effect, place, rows, rates):
-            return jax.jvp(lambda x: effect.residual(*frames_at(place, x)), (rows,), (rates,))
-
-        value, rate = jax.vmap(one)(
-            group.effect, group_places(system, group), q[group.bodies], v[group.bodies]
-        )
-        found.append((group, value, rate))
-    return found
-
-
-@on_host
-def residuals(system: "System", state: State) -> list[tuple[Array, Array]]:
-    """Residual and rate of every joint's constraints, in the order of the groups."""
-    return [(value, rate) for _, value, rate in joint_residuals(system, state)]
-
-
-@over_states
-def constraint_errors(system: "System", state: State) -> ConstraintErrors:
-    """Largest violations of internal and joint constraints and of their rates."""
-    d, rates = state.q.reshape(-1, 4, 3)[:, 1:], state.v.reshape(-1, 4, 3)[:, 1:]
-    gram = jnp.einsum("bik,bjk->bij", d, d) - jnp.eye(3)
-    mixed = jnp.einsum("bik,bjk->bij", d, rates)
-    joints = joint_rates = jnp.zeros((), state.q.dtype)
-    for _, value, rate in joint_residuals(system, state):
-        joints = jnp.maximum(joints, jnp.max(jnp.abs(value), initial=0.0))
-        joint_rates = jnp.maximum(joint_rates, jnp.max(jnp.abs(rate), initial=0.0))
-    turning = mixed + jnp.swapaxes(mixed, 1, 2)
-    return ConstraintErrors(jnp.max(jnp.abs(gram)), joints, jnp.max(jnp.abs(turning)), joint_rates)
 
 
 def unknown_name(system: "System", index: int, stages: int = 1) -> str:

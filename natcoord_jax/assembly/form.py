@@ -35,6 +35,11 @@ class Form(eqx.Module):
         """Something of the shape of `tangent(y)`, to know the shape of its factors without tracing it."""
         return jax.ShapeDtypeStruct((y.shape[0], y.shape[0]), y.dtype)
 
+    @property
+    def grain(self) -> Float[Array, ""]:
+        """Size of the terms that cancel in the equations [sqrt(J)], see `natcoord_jax.assembly.grain`."""
+        return jnp.zeros(())
+
     def factorised(self, matrix: Any) -> tuple[Any, Float[Array, " unknowns"]]:
         """Factors of a Jacobian, with `solve` and `transpose`, and the inertias of the unknowns.
 

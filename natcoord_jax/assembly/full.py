@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.diagnostics import rows_with_ground
 from natcoord_jax.assembly.form import Form
+from natcoord_jax.assembly.grain import cancelling_size
 from natcoord_jax.assembly.kick import kicked
 from natcoord_jax.assembly.local import body_balance, body_motion, jacobians
 from natcoord_jax.assembly.momentum import least_inertias, momentum_balance
@@ -112,6 +113,11 @@ class FullStep(Form):
     def balances(self) -> int:
         """Number of balance equations."""
         return 6 * self.bodies * self.tableau.stages
+
+    @property
+    def grain(self) -> Float[Array, ""]:
+        """Size of the terms that cancel in the forces [sqrt(J)]."""
+        return cancelling_size(self.system, self.groups, self.situations, self.state, self.h)
 
     def _blocks(self) -> list[tuple[int, int]]:
         """First unknown and size of the multipliers of each group."""

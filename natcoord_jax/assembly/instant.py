@@ -2,7 +2,7 @@
 
 Redundant joints and relations are allowed: accelerations do not depend on how they share the load, and
 of all possible reactions those with the least sum of squares of forces and torques are taken. Velocities
-are projected on the constraints first, because the energy-momentum step keeps them in position only.
+are taken as they are read, see `reading`.
 """
 
 from typing import Any
@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 from natcoord_jax.assembly.balances import Balances, Gains, loads, loops_of, relations_of
 from natcoord_jax.assembly.diagnostics import states_of
 from natcoord_jax.assembly.rates import Twists, tree_rates
+from natcoord_jax.assembly.reading import Source
 from natcoord_jax.assembly.system import System
 from natcoord_jax.core.state import State, Trajectory
 
@@ -203,13 +204,9 @@ def inputs_along(system: System, motion: State | Trajectory, inputs: Any) -> Flo
 
 
 @eqx.filter_jit
-def _instants(system: System, states: State, inputs: Array) -> Instant:
-    def function(state, u):
-        return instant_of(system, state, u)
-
-    for _ in range(states.t.ndim):
-        function = jax.vmap(function)
-    return function(states, inputs)
+def instants(source: Source) -> Instant:
+    """Accelerations and reactions at all states of a source."""
+    return source.each(instant_of, source.inputs)
 
 
 def instant(system: System, motion: State | Trajectory, inputs: Any = None) -> Instant:
@@ -225,4 +222,4 @@ def instant(system: System, motion: State | Trajectory, inputs: Any = None) -> I
     Raises:
         ValueError: for a wrong shape of the inputs.
     """
-    return _instants(system, states_of(motion), inputs_along(system, motion, inputs))
+    return instants(Source.of(system, motion, inputs_along(system, motion, inputs)))

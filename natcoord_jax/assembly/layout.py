@@ -175,9 +175,15 @@ class Layout:
     def _on_coordinates(self, name: str, effect: CoordinateEffect, label: str) -> Instance:
         many = isinstance(effect.joint, tuple)
         handles = effect.joint if many else (effect.joint,)
-        indices = effect.coordinate if many else (effect.coordinate,)
+        given = effect.coordinate
+        indices = given if isinstance(given, tuple | list) else (given,) * len(handles)
+        if len(indices) != len(handles):
+            raise ValueError(
+                f"{label}: {len(indices)} coordinate indices for {len(handles)} joints; pass one for each, "
+                "or one integer for all"
+            )
         numbers, bodies, axes = [], [], []
-        for handle, index in zip(handles, indices, strict=True):
+        for handle, index in zip(handles, indices):
             joint = self.joints[handle.name]
             if not 0 <= index < len(joint.coordinates):
                 raise ValueError(

@@ -10,8 +10,9 @@ from jaxtyping import Array, Float
 from natcoord_jax.assembly.coordinates import coordinate_rates, coordinate_values, frames_of, state_rates
 from natcoord_jax.assembly.diagnostics import rows_with_ground, states_of
 from natcoord_jax.assembly.rates import carried, null_space, row_rates, tree_rates, twists
+from natcoord_jax.assembly.reading import Source
 from natcoord_jax.assembly.response import stations
-from natcoord_jax.assembly.sensors import coordinate_rates_along, joint_coordinates
+from natcoord_jax.assembly.sensors import joint_coordinates, rates_of
 from natcoord_jax.assembly.sweeps import sweep_motion
 from natcoord_jax.assembly.system import System
 from natcoord_jax.assembly.tree import gather_slots
@@ -49,7 +50,7 @@ def rate(
 ) -> Float[Array, "*t"]:
     """Rate of a joint coordinate [rad/s or m/s]; see `System.rate`."""
     _, places = _place(system, joint, index)
-    return coordinate_rates_along(system, motion)[..., int(places[index])]
+    return rates_of(Source.of(system, motion))[..., int(places[index])]
 
 
 def _joint_motions(
@@ -179,6 +180,11 @@ def _with_coordinate(
     inside = (carried(system)[:, body] > 0)[:, None, None]
     v = jnp.where(inside, moving, state.v.reshape(-1, 4, 3))
     found = replace_fields(state, q=rows.reshape(-1, 3), v=v.reshape(-1, 3), coordinates=coordinates)
+    if system.structure.multipliers:
+        held = jnp.zeros((2, *coordinates.shape)) if state.held is None else state.held
+        chosen = jnp.array([1.0, 0.0 if rate is None else 1.0])
+        at = places[index]
+        found = replace_fields(found, held=held.at[:, at].set(jnp.maximum(held[:, at], chosen)))
     if rate is None:
         return found
     return replace_fields(found, rates=_rotors(system, state_rates(system, found), state, places))

@@ -1,101 +1,197 @@
-"""Projection of a state onto the constraints, as one step of a body system without forces.
+"""The constraints of a state linearised: which small motions close them, at least expense of mass.
 
-Positions: a step of unit size from rest, 2 M V = G(q_mid)^T lambda with g(q_0) + G(q_mid) V = 0, which for
-quadratic constraints is g(q_1) = 0. Velocities: a step of size zero, 2 M (V - v_0) = G^T lambda, G V = 0.
+All positions and velocities enter as twists of the bodies (velocities of the reference points, angular
+velocities). Of the twists w with G w = -g the one of least kinetic energy is w = -M^-1 G^T (G M^-1 G^T)^-1 g.
+Every constraint is measured by the root of the energy that closing it alone takes, so that metres, radians
+and cosines compare. Where constraints depend on each other, or where one of them is nearly singular, the
+damping mu in G M^-1 G^T + mu decides (Levenberg 1944, Marquardt 1963).
 """
 
+from typing import Any
+
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from natcoord_jax.assembly.diagnostics import joint_residuals
-from natcoord_jax.assembly.form import Form
-from natcoord_jax.assembly.full import FullStep
-from natcoord_jax.assembly.system import System
+from natcoord_jax.assembly.coordinates import coordinate_values, velocities_with_ground
+from natcoord_jax.assembly.diagnostics import group_places, rows_with_ground
+from natcoord_jax.assembly.rates import row_rates
+from natcoord_jax.assembly.system import Group, System
+from natcoord_jax.assembly.violations import constrained, violation_rates_of, violations_of
 from natcoord_jax.core.effect import replace_fields
+from natcoord_jax.core.joint import frames_at
 from natcoord_jax.core.state import State
-from natcoord_jax.maths.collocation import Tableau, gauss
+from natcoord_jax.maths.elimination import definite_inverse
+from natcoord_jax.maths.rotations import from_rotation_vector
+
+TWIST = 6
+"""Components of a twist."""
 
 
-def constraints_only(system: System) -> System:
-    """The system without effects other than relations between coordinates, its inertia made regular.
+def inertias(system: System, rows: Float[Array, "bodies 4 3"]) -> Float[Array, "bodies 6 6"]:
+    """Inertia of every body against its twist, made regular.
 
     Ideal rods get a small inertia about their axis, and nodes without rotary inertia one like that of a
     point mass; these only weigh how a gap is shared.
     """
-    relations = tuple(g for g in system.effects if g.multipliers)
     moment = system.mass[:, 1:, 1:]
     size = jnp.trace(moment, axis1=1, axis2=2)
     filled = moment + jnp.where(size > 0, 1e-3 * size, 1.0)[:, None, None] * jnp.eye(3)
     mass = system.mass.at[:, 1:, 1:].set(filled)
-    return replace_fields(system, effects=relations, mass=mass)
+    moving = _unit_motions(rows)
+    return jnp.einsum("bixc,bij,bjxd->bcd", moving, mass, moving)
 
 
-class Projection(Form):
-    """Equations of a projection; same interface as the equations of a step."""
+def _unit_motions(rows: Float[Array, "*n 4 3"]) -> Float[Array, "*n 4 3 6"]:
+    """Velocities of the rows of bodies for unit twists."""
+    flat = rows.reshape(-1, 4, 3)
+    unit = jnp.broadcast_to(jnp.eye(TWIST)[:, None], (TWIST, flat.shape[0], TWIST))
+    found = jax.vmap(lambda w: row_rates(flat, w[:, :3], w[:, 3:]))(unit)
+    return jnp.moveaxis(found, 0, -1).reshape(*rows.shape, TWIST)
 
-    step: FullStep
-    offset: Float[Array, " rows"]
-    extent: Float[Array, ""]
 
-    @classmethod
-    def of_positions(cls, system: System, state: State) -> "Projection":
-        """Positions of `state` with orthonormal directors; its velocities play no part."""
-        bare = constraints_only(system)
-        resting = replace_fields(
-            state, v=jnp.zeros_like(state.v), t=state.t - 1.0, rates=jnp.zeros_like(state.rates)
+def _along_twists(
+    group: Group, place: Any, rows: Float[Array, "n k 4 3"], t: Array, rate_of: Any
+) -> Float[Array, "n m k6"]:
+    """Derivatives of what `rate_of` finds from velocities of rows and spins, by the twists of its bodies."""
+    count, bodies = rows.shape[:2]
+    unit = jnp.eye(TWIST * bodies).reshape(-1, bodies, TWIST)
+
+    def one(effect, place, rows):
+        def along(w):
+            return rate_of(effect, place, rows, row_rates(rows, w[:, :3], w[:, 3:]), w[:, 3:], t)
+
+        return jax.vmap(along, out_axes=1)(unit)
+
+    return jax.vmap(one)(group, place, rows)
+
+
+def _scattered(block: Float[Array, "n m k6"], bodies: Array, count: int) -> Float[Array, "nm count6"]:
+    """Local derivatives as rows over the twists of all bodies; those of the ground are dropped."""
+    n, m, width = block.shape
+    columns = (bodies[:, :, None] * TWIST + jnp.arange(TWIST)).reshape(n, width)
+    whole = jnp.zeros((n, m, count * TWIST), block.dtype)
+    instance, row = jnp.arange(n)[:, None, None], jnp.arange(m)[None, :, None]
+    return whole.at[instance, row, columns[:, None, :]].add(block, mode="drop").reshape(n * m, -1)
+
+
+def constraint_matrix(system: System, state: State) -> Float[Array, "m twists"]:
+    """G: derivatives of the rates of all constraints by the twists of the bodies."""
+    rows, count = rows_with_ground(state.q), len(system.structure.bodies)
+    found = [jnp.zeros((0, TWIST * count), state.q.dtype)]
+    for group in constrained(system):
+        block = _along_twists(
+            group.effect,
+            group_places(system, group),
+            rows[group.bodies],
+            state.t,
+            lambda e, place, rows, rates, spin, t: e.violation_rate(place, rows, rates, spin, t, 0.0),
         )
-        inputs = jnp.zeros(len(system.structure.inputs))
-        step = FullStep.prepare(bare, resting, inputs, jnp.ones(()), gauss(1))
-        gaps = [jnp.zeros(g.count * g.multipliers) for g in bare.effects]
-        gaps += [value.reshape(-1) for _, value, _ in joint_residuals(bare, resting)]
-        points = state.q.reshape(-1, 4, 3)[:, 0]
-        extent = jnp.sqrt(jnp.sum(system.mass[:, 0, 0])) * (1e-3 + jnp.max(jnp.abs(points)))
-        return cls(step, jnp.concatenate(gaps) if gaps else jnp.zeros(0), extent)
+        found.append(_scattered(block, group.bodies, count))
+    return jnp.concatenate(found)
+
+
+def coordinate_matrix(system: System, state: State) -> Float[Array, "coordinates twists"]:
+    """Derivatives of the rates of all joint coordinates by the twists of the bodies."""
+    rows, count = rows_with_ground(state.q), len(system.structure.bodies)
+    found = jnp.zeros((len(system.structure.coordinates), TWIST * count), state.q.dtype)
+    for group in system.coordinates:
+        bodies = jnp.asarray(system.joint_bodies)[group.joints]
+
+        def rate(_, place, rows, rates, spin, t, axis=group.axis):
+            return axis.rate(*frames_at(place, rows), *frames_at(place, rates), spin[1] - spin[0])[None]
+
+        block = _along_twists(group, system.frames[group.joints], rows[bodies], state.t, rate)
+        found = found.at[group.index].set(_scattered(block, bodies, count))
+    return found
+
+
+class Projection(eqx.Module):
+    """Linearised constraints of a state.
+
+    Attributes:
+        matrix: their derivatives by the twists of the bodies, in units of `scale`.
+        impulses: twists that unit multipliers of them make.
+        scale: root of the energy that one unit of violation takes, inverse [1/sqrt(J) times its unit].
+    """
+
+    matrix: Float[Array, "m twists"]
+    impulses: Float[Array, "twists m"]
+    scale: Float[Array, " m"]
 
     @classmethod
-    def of_velocities(cls, system: System, state: State) -> "Projection":
-        """Velocities of `state` at its positions."""
-        bare = constraints_only(system)
-        inputs = jnp.zeros(len(system.structure.inputs))
-        step = FullStep.prepare(bare, state, inputs, jnp.zeros(()), gauss(1))
-        return cls(step, jnp.zeros(step.unknowns - step.balances), jnp.zeros(()))
+    def of(cls, system: System, state: State, held: Float[Array, " coordinates"] | None) -> "Projection":
+        """At the positions of a state.
 
-    @property
-    def system(self) -> System:
-        """The system without its effects."""
-        return self.step.system
+        Args:
+            system: compiled system.
+            state: whose directors are orthonormal.
+            held: coordinates that are constraints as well, where it is 1; None: there are none.
+        """
+        matrix = constraint_matrix(system, state)
+        if held is not None:
+            matrix = jnp.concatenate([matrix, held[:, None] * coordinate_matrix(system, state)])
+        inverse = jax.vmap(definite_inverse)(inertias(system, state.q.reshape(-1, 4, 3)))
+        by_body = matrix.reshape(matrix.shape[0], -1, TWIST)
+        impulses = jnp.einsum("bcd,mbd->bcm", inverse, by_body).reshape(-1, matrix.shape[0])
+        stiffness = jnp.einsum("mt,tm->m", matrix, impulses)
+        scale = jnp.sqrt(jnp.where(stiffness > 0, stiffness, 1.0))
+        return cls(matrix / scale[:, None], impulses / scale, scale)
 
-    @property
-    def balances(self) -> int:
-        """Number of balance equations."""
-        return self.step.balances
+    def damped(self, damping: Array | float) -> Float[Array, "m m"]:
+        """The damped matrix of the constraints."""
+        return self.matrix @ self.impulses + damping * jnp.eye(self.scale.shape[0])
 
-    @property
-    def tableau(self) -> Tableau:
-        """One stage."""
-        return self.step.tableau
 
-    def guess(self) -> Float[Array, " unknowns"]:
-        """That of the step."""
-        return self.step.guess()
+def gaps(
+    system: System, state: State, held: Float[Array, " coordinates"] | None, wanted: Array
+) -> Float[Array, " m"]:
+    """Violations of all constraints, held coordinates included: these shall be as wanted."""
+    found = [x.reshape(-1) for x in violations_of(system, constrained(system), state)]
+    found += [] if held is None else [held * (state.coordinates - wanted)]
+    return jnp.concatenate([jnp.zeros(0), *found])
 
-    def residual(self, y: Float[Array, " unknowns"]) -> tuple[Array, Array]:
-        """Residual of the step with the initial gaps added to the constraint rows."""
-        residual, size = self.step.residual(y)
-        return residual.at[self.balances :].add(self.offset), size + self.extent
 
-    def jacobian(self, y: Float[Array, " unknowns"]) -> Array:
-        """That of the step."""
-        return self.step.jacobian(y)
+def gap_rates(system: System, state: State) -> Float[Array, " m"]:
+    """Rates of the violations of all joints and relations."""
+    found = violation_rates_of(system, constrained(system), state)
+    return jnp.concatenate([jnp.zeros(0), *(x.reshape(-1) for x in found)])
 
-    def tangent(self, y: Float[Array, " unknowns"]) -> Array:
-        """The same."""
-        return self.step.jacobian(y)
 
-    def inertias(self, matrix: Float[Array, "unknowns unknowns"]) -> Float[Array, " balances"]:
-        """Inertias of the rates."""
-        return jnp.abs(jnp.diagonal(matrix))[: self.balances]
+def moved(
+    system: System, state: State, twist: Float[Array, "bodies 6"], increments: Float[Array, " coordinates"]
+) -> State:
+    """State after the bodies have been shifted, and turned about their reference points.
 
-    def moved(self, y: Float[Array, " unknowns"]) -> Float[Array, "rows 3"]:
-        """Mean velocities of all rows: the displacement of positions, or the projected velocities."""
-        return self.step.motion_of(y).rates[0, :-1].reshape(-1, 3)
+    Args:
+        system: compiled system.
+        state: before.
+        twist: shifts [m] and rotation vectors [rad].
+        increments: of the joint coordinates to first order, by which whole turns are told.
+    """
+    rows = state.q.reshape(-1, 4, 3)
+    directors = jnp.einsum("bij,bkj->bki", from_rotation_vector(twist[:, 3:]), rows[:, 1:])
+    q = jnp.concatenate([rows[:, :1] + twist[:, None, :3], directors], axis=1).reshape(-1, 3)
+    expected = replace_fields(state, q=q, coordinates=state.coordinates + increments)
+    return replace_fields(expected, coordinates=nearest_coordinates(system, expected))
+
+
+def nearest_coordinates(system: System, state: State) -> Array:
+    """Joint coordinates of the positions, each angle taken in the turn nearest to the stored one."""
+    values = coordinate_values(system, rows_with_ground(state.q))
+    for group in system.coordinates:
+        if group.axis.unit == "rad":
+            turns = jnp.round((state.coordinates - values)[group.index] / (2 * jnp.pi))
+            values = values.at[group.index].add(2 * jnp.pi * turns)
+    return values
+
+
+def twists_of(system: System, state: State) -> Float[Array, "bodies 6"]:
+    """Twists of the bodies nearest to the velocities of their rows, in the metric of the mass."""
+    rows, v = (x.reshape(-1, 4, 3) for x in (state.q, state.v))
+    _, spin = velocities_with_ground(state.v, rows_with_ground(state.q))
+    rigid = jnp.concatenate([v[:, 0], spin[:-1]], axis=1)
+    rest = v - row_rates(rows, rigid[:, :3], rigid[:, 3:])
+    pushed = jnp.einsum("bixc,bij,bjx->bc", _unit_motions(rows), system.mass, rest)
+    return rigid + jnp.einsum("bcd,bd->bc", jax.vmap(definite_inverse)(inertias(system, rows)), pushed)

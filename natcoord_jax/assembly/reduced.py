@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 from natcoord_jax.assembly.balances import constraint_matrix
 from natcoord_jax.assembly.dissipation import Damped, Damping
 from natcoord_jax.assembly.form import Form
+from natcoord_jax.assembly.grain import cancelling_size
 from natcoord_jax.assembly.kick import kicked
 from natcoord_jax.assembly.momentum import least_inertias, momentum_balance
 from natcoord_jax.assembly.outset import Outset
@@ -162,6 +163,11 @@ class ReducedStep(Form):
     def balances(self) -> int:
         """Number of balance equations; the rest are constraints."""
         return self.system.structure.unknowns * self.tableau.stages
+
+    @property
+    def grain(self) -> Float[Array, ""]:
+        """Size of the terms that cancel in the forces [sqrt(J)]."""
+        return cancelling_size(self.system, self.groups, self.situations, self.state, self.h)
 
     def split(self, y: Float[Array, " unknowns"]) -> tuple[Array, list[Array]]:
         """Rates (s, unknowns) and multipliers of each active group (n, s, m)."""

@@ -1,7 +1,7 @@
 """Sensors: what bodies, joints and points do, at one time or along a trajectory.
 
-Kinematic quantities are read when the sensor is made; accelerations and reactions solve the equations of
-motion and are computed when they are asked for.
+Positions are read when the sensor is made. Velocities (see `reading`), accelerations and reactions, which
+solve the equations of motion, are computed when they are asked for.
 """
 
 from typing import Any
@@ -14,30 +14,13 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.coordinates import state_rates
 from natcoord_jax.assembly.diagnostics import group_places, over_states, rows_with_ground, states_of
-from natcoord_jax.assembly.instant import Instant, inputs_along, instant_of
+from natcoord_jax.assembly.instant import inputs_along, instants
+from natcoord_jax.assembly.reading import Source, over_source
 from natcoord_jax.assembly.system import System
 from natcoord_jax.core.handles import Handle, ground
 from natcoord_jax.core.markers import Marker
 from natcoord_jax.core.state import State, Trajectory
 from natcoord_jax.maths.rotations import angular_velocity, to_quaternion
-
-
-class Source(eqx.Module):
-    """What a sensor looks at: the system, the states and the inputs at each of them."""
-
-    system: System
-    states: State
-    inputs: Float[Array, "*t inputs"]
-
-
-@eqx.filter_jit
-def _instants(source: Source) -> Instant:
-    """Accelerations and reactions; a source that went through `jax.vmap` has a batched system, too."""
-    lanes = source.system.mass.ndim - 3
-    function = instant_of
-    for axis in range(source.states.t.ndim):
-        function = jax.vmap(function, in_axes=(0 if axis >= source.states.t.ndim - lanes else None, 0, 0))
-    return function(source.system, source.states, source.inputs)
 
 
 class BodySensor(eqx.Module):
@@ -47,10 +30,7 @@ class BodySensor(eqx.Module):
         position: of the reference point [m].
         rotation: rotation matrix, body to world; its columns are the directors [-].
         quaternion: (w, x, y, z) of it; with w >= 0 for a state, of continuous sign along a trajectory.
-        velocity: of the reference point [m/s].
-        angular_velocity: world components [rad/s].
         com: centre of mass [m].
-        com_velocity: its velocity [m/s].
         index: number of the body.
         source: what the sensor looks at.
     """
@@ -58,24 +38,36 @@ class BodySensor(eqx.Module):
     position: Float[Array, "*t 3"]
     rotation: Float[Array, "*t 3 3"]
     quaternion: Float[Array, "*t 4"]
-    velocity: Float[Array, "*t 3"]
-    angular_velocity: Float[Array, "*t 3"]
     com: Float[Array, "*t 3"]
-    com_velocity: Float[Array, "*t 3"]
     index: int = eqx.field(static=True)
     source: Source
 
     @property
+    def velocity(self) -> Float[Array, "*t 3"]:
+        """Velocity of the reference point [m/s]."""
+        return _body_rates(self.source)[0][..., self.index, :]
+
+    @property
+    def angular_velocity(self) -> Float[Array, "*t 3"]:
+        """Angular velocity, world components [rad/s]."""
+        return _body_rates(self.source)[1][..., self.index, :]
+
+    @property
+    def com_velocity(self) -> Float[Array, "*t 3"]:
+        """Velocity of the centre of mass [m/s]."""
+        return _body_rates(self.source)[2][..., self.index, :]
+
+    @property
     def acceleration(self) -> Float[Array, "*t 3"]:
         """Acceleration of the reference point [m/s^2]."""
-        return _instants(self.source).accelerations[..., 4 * self.index, :]
+        return instants(self.source).accelerations[..., 4 * self.index, :]
 
     @property
     def angular_acceleration(self) -> Float[Array, "*t 3"]:
         """Angular acceleration, world components [rad/s^2]."""
         first = 4 * self.index + 1
         directors = jnp.swapaxes(self.rotation, -1, -2)
-        return angular_velocity(directors, _instants(self.source).accelerations[..., first : first + 3, :])
+        return angular_velocity(directors, instants(self.source).accelerations[..., first : first + 3, :])
 
 
 class JointSensor(eqx.Module):
@@ -83,19 +75,24 @@ class JointSensor(eqx.Module):
 
     Attributes:
         coordinates: all coordinates of the joint in its order, angles counted on over many turns [rad or m].
-        rates: their rates [rad/s or m/s].
         units: "rad" or "m" of each coordinate.
         name: of the joint.
         index: number of the joint.
+        places: of its coordinates among those of all joints.
         source: what the sensor looks at.
     """
 
     coordinates: Float[Array, "*t n"]
-    rates: Float[Array, "*t n"]
     units: tuple[str, ...] = eqx.field(static=True)
     name: str = eqx.field(static=True)
     index: int = eqx.field(static=True)
+    places: tuple[int, ...] = eqx.field(static=True)
     source: Source
+
+    @property
+    def rates(self) -> Float[Array, "*t n"]:
+        """Rates of the coordinates [rad/s or m/s]."""
+        return rates_of(self.source)[..., np.array(self.places, int)]
 
     def _all(self, values: Array, unit: str) -> Array:
         return values[..., np.array([k for k, u in enumerate(self.units) if u == unit], int)]
@@ -151,12 +148,12 @@ class JointSensor(eqx.Module):
         The force of the constraints: motors, springs and dampers of the joint are not part of it. Along a
         trajectory with the inputs of the step that starts at each saved state (see `System.instant`).
         """
-        return _instants(self.source).forces[..., self.index, :]
+        return instants(self.source).forces[..., self.index, :]
 
     @property
     def torque(self) -> Float[Array, "*t 3"]:
         """Reaction torque on the child about the joint's point on the child [N m], world components."""
-        return _instants(self.source).torques[..., self.index, :]
+        return instants(self.source).torques[..., self.index, :]
 
 
 class MarkerSensor(eqx.Module):
@@ -164,22 +161,25 @@ class MarkerSensor(eqx.Module):
 
     Attributes:
         position: of the point [m], or the direction itself [-].
-        velocity: its time derivative [m/s, 1/s].
         weights: of the rows of the body (7, 46).
         body: number of the body; the number of bodies is the ground.
         source: what the sensor looks at.
     """
 
     position: Float[Array, "*t 3"]
-    velocity: Float[Array, "*t 3"]
     weights: Float[Array, "4"]
     body: int = eqx.field(static=True)
     source: Source
 
     @property
+    def velocity(self) -> Float[Array, "*t 3"]:
+        """Time derivative of the position [m/s, 1/s]."""
+        return _weighted(self.weights, self.source.read.v, self.body)
+
+    @property
     def acceleration(self) -> Float[Array, "*t 3"]:
         """Second time derivative [m/s^2, 1/s^2]."""
-        return _weighted(self.weights, _instants(self.source).accelerations, self.body)
+        return _weighted(self.weights, instants(self.source).accelerations, self.body)
 
 
 def _weighted(
@@ -204,19 +204,25 @@ def _continuous(quaternions: Float[Array, "*t 4"], along: bool) -> Float[Array, 
 
 
 @eqx.filter_jit
-def _body_motion(system: System, states: State, index: Array, along: bool) -> tuple[Array, ...]:
+def _body_pose(system: System, states: State, index: Array, along: bool) -> tuple[Array, ...]:
     shape = (*states.t.shape, len(system.structure.bodies), 4, 3)
-    rows, rates = states.q.reshape(shape)[..., index, :, :], states.v.reshape(shape)[..., index, :, :]
+    rows = states.q.reshape(shape)[..., index, :, :]
     rotation = jnp.swapaxes(rows[..., 1:, :], -1, -2)
     mass = system.mass[index, 0] / system.mass[index, 0, 0]
-    com, com_velocity = (jnp.sum(mass[:, None] * x, axis=-2) for x in (rows, rates))
-    spin = angular_velocity(rows[..., 1:, :], rates[..., 1:, :])
     quaternion = _continuous(to_quaternion(rotation), along)
-    return rows[..., 0, :], rotation, quaternion, rates[..., 0, :], spin, com, com_velocity
+    return rows[..., 0, :], rotation, quaternion, jnp.sum(mass[:, None] * rows, axis=-2)
 
 
-coordinate_rates_along = over_states(state_rates)
-"""Rates of all joint coordinates of a state or along a motion [rad/s or m/s]."""
+@over_source
+def _body_rates(system: System, state: State) -> tuple[Array, Array, Array]:
+    """Velocities of the reference points, angular velocities and velocities of the centres of mass."""
+    rows, rates = state.q.reshape(-1, 4, 3), state.v.reshape(-1, 4, 3)
+    shares = system.mass[:, 0] / system.mass[:, :1, 0]
+    return rates[:, 0], angular_velocity(rows[:, 1:], rates[:, 1:]), jnp.sum(shares[..., None] * rates, 1)
+
+
+rates_of = over_source(state_rates)
+"""Rates of all joint coordinates [rad/s or m/s]."""
 
 
 def joint_coordinates(system: System, joint: Handle | str) -> tuple[int, list[int], tuple[str, ...]]:
@@ -294,14 +300,13 @@ def sense(
 ) -> Any:
     """Sensor of a body, a joint, a marker or elements of beams; see `System.sense`."""
     states = states_of(motion)
-    source = Source(system, states, inputs_along(system, motion, inputs))
+    source = Source.of(system, motion, inputs_along(system, motion, inputs))
     if isinstance(part, Marker):
         weights, body = marker_weights(system, part, state)
         if body == len(system.structure.bodies):
             still = jnp.broadcast_to(weights[1:], (*states.t.shape, 3))
-            return MarkerSensor(still, jnp.zeros_like(still), weights, body, source)
-        position, velocity = _weighted(weights, states.q, body), _weighted(weights, states.v, body)
-        return MarkerSensor(position, velocity, weights, body, source)
+            return MarkerSensor(still, weights, body, source)
+        return MarkerSensor(_weighted(weights, states.q, body), weights, body, source)
     if isinstance(part, tuple) and not part:
         raise ValueError("cannot sense nothing: the tuple of elements is empty")
     listed = part if isinstance(part, tuple) else (part,)
@@ -313,16 +318,12 @@ def sense(
     name = names[0]
     if name in system.structure.bodies:
         index = system.body_index(name)
-        found = _body_motion(system, states, jnp.asarray(index), isinstance(motion, Trajectory))
-        position, rotation, quaternion, velocity, spin, com, com_velocity = found
-        return BodySensor(
-            position, rotation, quaternion, velocity, spin, com, com_velocity, index=index, source=source
-        )
+        pose = _body_pose(system, states, jnp.asarray(index), isinstance(motion, Trajectory))
+        return BodySensor(*pose, index=index, source=source)
     if name and name in system.structure.joints:
         index, places, units = joint_coordinates(system, name)
         chosen = np.array(places, int)
-        rates = coordinate_rates_along(system, states)[..., chosen]
-        return JointSensor(states.coordinates[..., chosen], rates, units, name, index, source)
+        return JointSensor(states.coordinates[..., chosen], units, name, index, tuple(places), source)
     raise ValueError(
         f"cannot sense {part!r}: pass a body ({list(system.structure.bodies)}), a joint "
         f"({[n for n in system.structure.joints if n]}), nc.Point or nc.Direction"

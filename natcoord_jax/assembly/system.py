@@ -174,9 +174,39 @@ class System(eqx.Module):
         """Angular momentum J about the origin [kg m^2/s] (55)."""
         return diagnostics.angular_momentum(self, motion)
 
-    def constraint_errors(self, motion: State | Trajectory) -> "diagnostics.ConstraintErrors":
-        """Largest violations of the constraints and of their rates."""
-        return diagnostics.constraint_errors(self, motion)
+    def constraint_errors(self, motion: State | Trajectory) -> "violations.ConstraintErrors":
+        """Largest violations of the constraints and of their rates.
+
+        Of a trajectory those velocities are judged that are read of it, see `tangent`; of a state its own.
+        """
+        return violations.constraint_errors(self, motion)
+
+    def tangent(self, motion: State | Trajectory) -> State:
+        """States with velocities that obey the constraints: the nearest in the metric of the mass.
+
+        So velocities are read, by all sensors, and by controllers and terminal events. States of the
+        energy-momentum step of order two, `trajectory.states`, have small parts across the constraints
+        besides, which alternate from step to step: its balances hold with them. Trajectories of other
+        schemes that keep velocities tangent, and of `EnergyMomentum(kick=False)`, are read as they are.
+
+        Args:
+            motion: state or trajectory, with any leading axes.
+
+        Example:
+            >>> import jax; jax.config.update("jax_enable_x64", True)
+            >>> import natcoord_jax as nc
+            >>> scene = nc.Scene()
+            >>> arm = scene.add(nc.RigidBody(mass=2.0, inertia=(1.0, 1.0, 1.0), com=(1.0, 0.0, 0.0)))
+            >>> hinge = scene.add(nc.Revolute(nc.ground, arm, axis=(0, 1, 0)))
+            >>> gravity = scene.add(nc.Gravity())
+            >>> system, state = scene.compile()
+            >>> trajectory = nc.simulate(system, state, dt=0.1, steps=10)
+            >>> as_they_are = system.constraint_errors(trajectory.states).velocity
+            >>> as_read = system.constraint_errors(system.tangent(trajectory)).velocity
+            >>> bool(as_they_are.max() > 1e-3), bool(as_read.max() < 1e-13)
+            (True, True)
+        """
+        return reading.tangent_states(self, motion)
 
     def work(self, motion: State | Trajectory) -> dict[str, Float[Array, "*t"]]:
         """Work done so far [J] by each input, load, damper and drive, by name.
@@ -268,7 +298,8 @@ class System(eqx.Module):
         Everything that hangs on the joint is turned or moved along rigidly and keeps its motion relative to
         the joint; the coordinate counts on, so that 4 pi are two turns. A relation among the coordinates of
         the joint (the pitch of a screw) is kept; loops, drives and couplings of several joints are not: use
-        `nc.assemble` afterwards where there are any. Pure, jittable and differentiable.
+        `nc.assemble` afterwards where there are any. It keeps the coordinates and rates that were set, where
+        the constraints allow it, and moves the others. Pure, jittable and differentiable.
 
         Args:
             state: one state.
@@ -327,4 +358,12 @@ def _index(names: tuple[str, ...], part: Handle | str, kind: str) -> int:
     return names.index(name)
 
 
-from natcoord_jax.assembly import diagnostics, instant, posing, reporting, sensors  # noqa: E402  (need System)
+from natcoord_jax.assembly import (  # noqa: E402  (need System)
+    diagnostics,
+    instant,
+    posing,
+    reading,
+    reporting,
+    sensors,
+    violations,
+)

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from natcoord_jax.assembly.balances import Balances
+from natcoord_jax.assembly.balances import Balances, Gains
 from natcoord_jax.assembly.momentum import inertia, spatial_inertia, wrench
 from natcoord_jax.assembly.rates import row_rates
 from natcoord_jax.assembly.system import System
@@ -78,17 +78,29 @@ class TangentSpace(eqx.Module):
             state: where.
             lifted: whether impulses of the constraints are of interest, too.
         """
-        balances, inertias = Balances.at(system, state), rotor_inertias(system)
+        balances = Balances.at(system, state)
         gains = balances.columns()
-        unit = jnp.eye(gains.rows.shape[0], dtype=state.q.dtype)
-        plain = Admissible(unit, None, None, None)
-        space = cls(system, balances.rows, balances.free, gains.rotors, inertias, plain)
-        # A unit inertia for turns of point masses, which nothing else sees.
-        massless = jnp.trace(system.mass[:, 1:, 1:], axis1=1, axis2=2) <= 0
-        own = space.coupled(space, idle=jnp.where(massless, 1.0, 0.0))
+        space, own = cls.without_frame(balances, gains)
         # Symmetric but for rounding, which would otherwise enter the frame with the same sign in every step.
         frame = inverse_cholesky(0.5 * (own + own.T))
         return replace_fields(space, admissible=_admissible(balances, frame, gains.constraints.T, lifted))
+
+    @classmethod
+    def without_frame(cls, balances: Balances, gains: Gains) -> tuple["TangentSpace", Float[Array, "u u"]]:
+        """The tangents of the tree alone, with a unit matrix for a frame, and their inertia.
+
+        Args:
+            balances: where.
+            gains: the columns of these.
+        """
+        system = balances.system
+        unit = jnp.eye(gains.rows.shape[0], dtype=balances.rows.dtype)
+        plain = Admissible(unit, None, None, None)
+        inertias = rotor_inertias(system)
+        space = cls(system, balances.rows, balances.free, gains.rotors, inertias, plain)
+        # A unit inertia for turns of point masses, which nothing else sees.
+        massless = jnp.trace(system.mass[:, 1:, 1:], axis1=1, axis2=2) <= 0
+        return space, space.coupled(space, idle=jnp.where(massless, 1.0, 0.0))
 
     def without_system(self) -> "TangentSpace":
         """What belongs to the configuration alone; `with_system` puts the rest back."""

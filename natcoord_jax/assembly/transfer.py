@@ -5,7 +5,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from natcoord_jax.assembly.coordinates import state_rates
-from natcoord_jax.assembly.diagnostics import residuals, rows_with_ground
+from natcoord_jax.assembly.diagnostics import rows_with_ground
 from natcoord_jax.assembly.matching import (
     check_bodies,
     check_joints,
@@ -20,6 +20,7 @@ from natcoord_jax.assembly.matching import (
 from natcoord_jax.assembly.response import body_rows
 from natcoord_jax.assembly.system import System
 from natcoord_jax.assembly.tangent_space import TangentSpace, Velocity
+from natcoord_jax.assembly.violations import residuals
 from natcoord_jax.core.checks import is_concrete
 from natcoord_jax.core.compiled import briefly
 from natcoord_jax.core.effect import replace_fields

@@ -75,6 +75,9 @@ class BeamHandle:
 class Beam(Recipe):
     """Geometrically exact beam (Simo-Reissner) along a curve, unstressed as it is given.
 
+    Mass is lumped at the nodes: by default the inertia of n equal elements about an end is too large by the
+    factor 1 + 1 / (2 n^2), see `RelativeMotion`.
+
     Attributes:
         section: `Section`, d_1 and d_2 across, d_3 along the tangent.
         curve: points (k, 3) [m] that straight lines join, or a function of arc length [m] to position.

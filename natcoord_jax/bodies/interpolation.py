@@ -27,6 +27,12 @@ from natcoord_jax.effects.beams.directors import director_strains
 from natcoord_jax.effects.beams.relative_motion import relative_motion, strains_of
 from natcoord_jax.maths.lagrange import LOBATTO, gauss_legendre, lagrange, lobatto
 
+HALF_TURN = -0.99
+"""Cosine of the turn over an element below which it is half a turn, nearly: 172 degrees."""
+
+COILED = 0.2
+"""Distance of the ends of an element over its length below which it is a coil; half a circle has 0.64."""
+
 Span = tuple[int, ...]
 """Nodes of an element, in order."""
 
@@ -83,7 +89,10 @@ def apart(stacked: Any, count: int) -> list[Any]:
 class RelativeMotion(Interpolation):
     """Two-node elements, strains from the relative motion of the nodes; see `BeamElement`.
 
-    Mass is lumped at the nodes, by halves of the neighbouring elements.
+    Mass is lumped at the nodes, by halves of the neighbouring elements. Mass and centre of mass are exact;
+    the inertia [kg m^2] of n equal elements of a straight beam is m l^2 / 3 (1 + 1 / (2 n^2)) about an end
+    and m l^2 / 12 (1 + 2 / n^2) about the middle: half as much again, and three times, with one element,
+    0.5 % and 2 % more with ten.
     """
 
     def refine(self, ends: np.ndarray) -> tuple[np.ndarray, list[Span]]:
@@ -104,6 +113,7 @@ class RelativeMotion(Interpolation):
     ) -> tuple[list[Effect], list[Effect]]:
         """One element between neighbours, and its damping if there is any."""
         lengths, references = _strains_of_pairs(curve)
+        _check_turns(curve, name)
         stiffness, elements, dampings = material.section.stiffness, [], []
         rows = zip(spans, apart(lengths, len(spans)), apart(references, len(spans)))
         for number, ((a, b), length, reference) in enumerate(rows):
@@ -140,6 +150,25 @@ def _strains_of_pairs(curve: ReferenceCurve) -> tuple[Float[Array, " e"], Float[
     return lengths, jax.vmap(lambda x, length: strains_of(relative_motion(x), length))(pairs, lengths)
 
 
+def _check_turns(curve: ReferenceCurve, name: str) -> None:
+    """Nodes of an element are less than half a turn apart, which is all that their frames can tell.
+
+    Raises:
+        ValueError: for others, naming the element.
+    """
+    if not is_concrete(curve):
+        return
+    frames, points = np.asarray(curve.frames), np.asarray(curve.points)
+    cosines = 0.5 * (np.einsum("nij,nij->n", frames[:-1], frames[1:]) - 1.0)
+    straight = np.linalg.norm(np.diff(points, axis=0), axis=1) / np.diff(np.asarray(curve.arc))
+    bent = (cosines < HALF_TURN) | (straight < COILED)
+    if bent.any():
+        raise ValueError(
+            f"beam {name!r}: the curve turns by half a turn or more over element {int(np.argmax(bent))}; "
+            "pass more elements, or stations= at its corners"
+        )
+
+
 @on_host
 def _shares(arc: Float[Array, " n"], order: int, spans: Any) -> Float[Array, " n"]:
     shares = jnp.diff(arc[::order])[:, None] * jnp.asarray(lobatto(order)[1])
@@ -166,7 +195,8 @@ class DirectorInterpolation(Interpolation):
     """Elements over two to four nodes that interpolate points and directors; see `DirectorElement`.
 
     Nodes are at Gauss-Lobatto points of the elements, and the mass is lumped there with the weights of that
-    rule, which keeps the order of convergence of the elements.
+    rule, which keeps the order of convergence of the elements: from order two on the inertia of a straight
+    beam is exact, at order one it is that of `RelativeMotion`.
 
     Attributes:
         order: of the Lagrange functions: 1, 2 or 3.

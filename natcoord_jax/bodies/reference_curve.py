@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from natcoord_jax.core.checks import as_array, is_concrete, numbers
 from natcoord_jax.core.host import on_host
 from natcoord_jax.maths.rotations import frame_from_axis
-from natcoord_jax.maths.vectors import cross, dot
+from natcoord_jax.maths.vectors import cross, dot, unit
 
 Curve = Callable[[Float[Array, ""]], Float[Array, "3"]]
 
@@ -64,7 +64,8 @@ def reference_curve(
         label: the part, for messages.
 
     Raises:
-        ValueError: for a curve that is neither, points that coincide, or a missing length.
+        ValueError: for a curve that is neither, points that coincide, a missing length, or a curve that turns
+            back on itself.
     """
     if callable(curve):
         if length is None:
@@ -87,7 +88,13 @@ def reference_curve(
         arc, points, tangents = _along_polyline(corners, fractions)
     second = None if second is None else as_array(second, float)
     twist = twist if callable(twist) else as_array(twist, float)
-    return ReferenceCurve(arc, points, _frames(arc, tangents, fractions, second, twist))
+    frames = _frames(arc, tangents, fractions, second, twist)
+    if is_concrete(frames) and not np.all(np.isfinite(np.asarray(frames))):
+        raise ValueError(
+            f"{label}: curve [m] turns back on itself at a node or between two, or has no tangent there; "
+            "pass stations= or more elements, so that neighbours turn by less than half a turn, or smooth it"
+        )
+    return ReferenceCurve(arc, points, frames)
 
 
 @on_host
@@ -99,7 +106,7 @@ def _along_function(curve: Any, fractions: Any, total: Array) -> tuple[Array, Ar
 
 @on_host
 def _frames(arc: Array, tangents: Array, fractions: Any, second: Any, twist: Any) -> Array:
-    tangents = tangents / jnp.sqrt(jnp.sum(tangents**2, axis=1, keepdims=True))
+    tangents = unit(tangents)
     turning: Any = twist
     angles = jax.vmap(turning)(arc) if callable(twist) else twist * jnp.asarray(fractions)
     return _turned(_transported(tangents, second), angles)
@@ -116,8 +123,7 @@ def _transported(tangents: Float[Array, "n 3"], second: Any) -> Float[Array, "n 
         turned = (
             across + cross(normal, across) + cross(normal, cross(normal, across)) / (1 + dot(before, after))
         )
-        turned = turned - dot(turned, after) * after
-        turned = turned / jnp.sqrt(dot(turned, turned))
+        turned = unit(turned - dot(turned, after) * after)
         return turned, turned
 
     rest = jax.lax.scan(carry, first, (tangents[:-1], tangents[1:]))[1]

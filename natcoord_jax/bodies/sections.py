@@ -235,7 +235,8 @@ def RectangularSection(
 def _rectangle(b: Array, h: Array, nu: Array, shear: Any) -> Shaped:
     area = b * h
     second = jnp.stack([b * h**3, b**3 * h]) / 12
-    long, short = jnp.maximum(b, h), jnp.minimum(b, h)
+    # Not the maximum, which gives a square the mean of both sides, and wrong second derivatives.
+    long, short = jnp.where(b > h, b, h), jnp.where(b > h, h, b)
     odd = jnp.arange(1.0, 40.0, 2.0)
     series = jnp.sum(jnp.tanh(0.5 * odd * jnp.pi * long / short) / odd**5)
     torsion = long * short**3 / 3 * (1 - 192 / jnp.pi**5 * short / long * series)

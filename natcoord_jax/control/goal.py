@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.system import System
-from natcoord_jax.control.tangent import steadied, steady_rates
+from natcoord_jax.control.tangent import steady_rates
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.rotations import angular_velocity, from_quaternion, to_quaternion
@@ -124,7 +124,7 @@ class Motion(Goal):
     def residual(self, system: System, state: State) -> Float[Array, " n"]:
         """Motion less the wanted one."""
         first = 4 * system.body_index(self.body)
-        rows, rates = state.q[first : first + 4], steadied(system, state).v[first : first + 4]
+        rows, rates = state.q[first : first + 4], system.tangent(state).v[first : first + 4]
         spin = angular_velocity(rows[1:], rates[1:])
         return jnp.concatenate(
             [rates[0] - jnp.asarray(self.velocity), spin - jnp.asarray(self.angular_velocity)]
@@ -175,7 +175,7 @@ class Rate(Goal):
 
     def residual(self, system: System, state: State) -> Float[Array, " n"]:
         """Rate less the wanted one."""
-        return (system.rate(steadied(system, state), self.joint, self.index) - self.value)[None]
+        return (system.rate(state, self.joint, self.index) - self.value)[None]
 
     def labels(self, system: System) -> tuple[str, ...]:
         """The rate."""

@@ -73,12 +73,6 @@ def steady_rates(system: System, state: State) -> Float[Array, " n"]:
     return jnp.linalg.solve(inertia + jnp.diag(floor), along(_with_mass(system, state.v)))
 
 
-def steadied(system: System, state: State) -> State:
-    """State with velocities projected in the metric of the mass."""
-    moving = _free_motions(system, state.q.reshape(-1, 4, 3))[0](steady_rates(system, state))
-    return replace_fields(state, v=moving.reshape(-1, 3))
-
-
 def split(
     system: System, state: State, w: Float[Array, " n"], worth: Float[Array, " n"]
 ) -> tuple[State, Float[Array, ""]]:

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from natcoord_jax.core.effect import Effect, Motion, Now, Response
-from natcoord_jax.core.gradient import averaged_gradient
+from natcoord_jax.core.gradient import averaged_gradient, cancelling_energy
 from natcoord_jax.core.joint import Frame, frames_at
 from natcoord_jax.maths.collocation import gauss
 
@@ -108,7 +108,8 @@ class CoordinateEffect(Effect):
 
     Attributes:
         joint: handle of the joint, or a tuple of handles.
-        coordinate: index of the coordinate in the joint's list, or a tuple of indices.
+        coordinate: index of the coordinate in the joint's list; of several joints the same of each, or a
+            tuple of indices.
         name: optional name.
         axes: the coordinates' descriptions, filled in at compile.
     """
@@ -187,6 +188,10 @@ class CoordinatePotential(CoordinateEffect):
         """Second derivative of the energy [N m/rad or N/m]."""
         return jax.hessian(lambda c: self.energy(c[0]))(coordinates)
 
+    def cancelling(self, place: Array, rows: Array, coordinates: Array) -> tuple[Array, Array]:
+        """Stiffness times the coordinate, of which the generalised force is a difference; the coordinate."""
+        return cancelling_energy(lambda c: self.energy(c[0]), coordinates), jnp.abs(coordinates[0])
+
     def stored(self, place: Array, rows: Array, coordinates: Array, rates: Array) -> Array:
         """Energy [J]."""
         return self.energy(coordinates[0])
@@ -249,6 +254,27 @@ class CoordinateConstraint(CoordinateEffect):
     @abc.abstractmethod
     def target(self, t: Float[Array, ""]) -> Float[Array, ""]:
         """Right-hand side f(t)."""
+
+    def violation(self, place: Array, rows: Array, coordinates: Array, t: Array) -> Array:
+        """Left-hand side less right-hand side."""
+        return (self.coefficients() @ coordinates - self.target(t))[None]
+
+    def violation_rate(
+        self, place: Array, rows: Array, rates: Array, spin: Array, t: Array, passing: Any
+    ) -> Array:
+        """That of both sides."""
+        frames, moving = (jax.vmap(frames_at)(place, x.reshape(-1, 2, 4, 3)) for x in (rows, rates))
+        relative = spin[1::2] - spin[::2]
+        found = [
+            axis.rate(*jax.tree.map(lambda x, k=k: x[k], (*frames, *moving)), relative[k])
+            for k, axis in enumerate(self.axes)
+        ]
+        target = jax.jvp(self.target, (t,), (jnp.ones_like(t),))[1]
+        return (self.coefficients() @ jnp.stack(found) - passing * target)[None]
+
+    def violation_units(self, place: Array, rows: Array) -> tuple[str, ...]:
+        """That of the coordinates; metres where a relation has angles and displacements."""
+        return ("m" if any(axis.unit == "m" for axis in self.axes) else "rad",)
 
     def generalised(self, rates: Array, now: Now, lam: Array) -> tuple[Array, Array, Array]:
         """Impulses a lambda; the row asks the coordinates at the end of the step to obey the relation.

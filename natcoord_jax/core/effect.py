@@ -191,6 +191,42 @@ class Effect(eqx.Module):
         """Second derivatives of the energy of an elastic effect by its invariants."""
         return jnp.zeros((0, 0))
 
+    def cancelling(
+        self, place: Array, rows: Float[Array, "k 4 3"], coordinates: Float[Array, " c"]
+    ) -> tuple[Float[Array, ""], Float[Array, ""]] | None:
+        """Terms that cancel in its forces at given rows, by which these are rounded; None: none do.
+
+        What they would do along the whole of what they depend on [J], and how far a point moves then [m].
+        Forces that are no differences are rounded as they are large, which the step knows of every effect.
+        """
+        return None
+
+    def violation(
+        self,
+        place: Array,
+        rows: Float[Array, "k 4 3"],
+        coordinates: Float[Array, " c"],
+        t: Float[Array, ""],
+    ) -> Float[Array, " m"]:
+        """Constraints g of an effect with multipliers at one time: zero where they are obeyed."""
+        return jnp.zeros(0)
+
+    def violation_rate(
+        self,
+        place: Array,
+        rows: Float[Array, "k 4 3"],
+        rates: Float[Array, "k 4 3"],
+        spin: Float[Array, "k 3"],
+        t: Float[Array, ""],
+        passing: Any,
+    ) -> Float[Array, " m"]:
+        """Their rates, linear in velocities of the rows, angular velocities and how time passes (1 or 0)."""
+        return jnp.zeros(0)
+
+    def violation_units(self, place: Array, rows: Float[Array, "k 4 3"]) -> tuple[str, ...]:
+        """Their units: "m", "rad", or "-" for cosines."""
+        return ()
+
     def readings(self, place: Array, rows: Float[Array, "k 4 3"]) -> Any:
         """What its sensor shows: a pytree of arrays; for effects that are not `silent`."""
         return None

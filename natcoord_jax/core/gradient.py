@@ -25,6 +25,9 @@ LEAST = 1e-9
 SPREAD = 64
 """Rounding errors of a slope by which it must change along the step for the change to tell anything."""
 
+SHARE = 1e-4
+"""Relative change of an invariant that shows the stiffness: small, its square far above rounding."""
+
 
 def averaged_gradient(
     energy: Callable[[Float[Array, "p *n"]], Float[Array, "*n"]],
@@ -75,23 +78,51 @@ def averaged_gradient(
     moved = largest(jnp.abs(steps))
     changed = largest(slopes) + largest(-slopes)
     changed = jnp.where(changed > SPREAD * epsilon * largest(jnp.abs(slopes)), changed, 0.0)
-    stiffness = safe_divide(changed, moved)
-    enough = jnp.sum(weights * stiffness * steps**2, axis=(0, 1)) > jnp.abs(missing)
     # A kink can hide between the points: then in proportion to the steps, beside the largest invariant of the
     # same unit; where one is zero, as in a straight beam, it is rounded as that is.
     scale = jnp.abs(start) + jnp.abs(increment)
     beside = _largest(scale, units or (scale.shape[0],))
-    weight = safe_divide(jnp.ones_like(beside), beside**2)
-    change = jnp.sum(weights * weight * steps**2, axis=(0, 1))
-    share = jnp.where(enough, stiffness, weight)
-    measure = jnp.sum(weights * share * steps**2, axis=(0, 1))
+    inverse = safe_divide(jnp.ones_like(beside), beside)
+    relative = steps * inverse
     # Near its minimum an energy is less certain than its digits say: invariants are rounded before it.
     rounded = largest(jnp.sum(jnp.abs(gradient) * scale, axis=1))
     sizes = jnp.abs(before) + jnp.abs(after) + jnp.abs(captured) + rounded
     noise = 16 * epsilon * sizes
-    relevant = (jnp.abs(missing) > noise) & (change > LEAST**2)
-    factor = jnp.where(relevant, missing / jnp.where(relevant, measure, 1.0), 0.0)
-    return gradient + (factor * steps) * share
+    relevant = (jnp.abs(missing) > noise) & (jnp.sum(weights * relative**2, axis=(0, 1)) > LEAST**2)
+    # What is irrelevant must not reach a quotient: its derivatives need not be finite. Nor is any energy or
+    # stiffness squared, of which laws that decay exponentially have 1e-260.
+    moving = relevant & (moved > 0)
+    stiffness = jnp.where(moving, safe_divide(changed, jnp.where(moving, moved, 1.0)), 0.0)
+    stiff = stiffness * steps
+    enough = jnp.sum(weights * stiff * steps, axis=(0, 1)) > jnp.abs(missing)
+    share = jnp.where(enough, stiff, jnp.where(relevant, relative * inverse, 0.0))
+    measure = jnp.sum(weights * share * steps, axis=(0, 1))
+    factor = safe_divide(jnp.where(relevant, missing, 0.0), jnp.where(relevant, measure, 1.0))
+    return gradient + factor * share
+
+
+def cancelling_energy(
+    energy: Callable[[Float[Array, " p"]], Float[Array, ""]],
+    invariants: Float[Array, " p"],
+    units: tuple[int, ...] | None = None,
+) -> Float[Array, ""]:
+    """What the terms that cancel in the gradient of an energy would do along the whole of the invariants [J].
+
+    At rest a stiff part has no gradient at all, but it is a difference: of stiffness times invariants, and of
+    the same where it is unstressed. By these it is rounded. On both sides, since stops are stiff on one.
+
+    Args:
+        energy: of the invariants.
+        invariants: at which.
+        units: as in `averaged_gradient`.
+    """
+    count = invariants.shape[0]
+    scale = _largest(jnp.abs(invariants), units or (count,))
+    changes = SHARE * scale * jnp.eye(count, dtype=scale.dtype)
+    found = jax.vmap(energy)(invariants + jnp.concatenate([changes, -changes, jnp.zeros_like(changes[:1])]))
+    ahead, behind = found[:count], found[count:-1]
+    work = jnp.abs(ahead - behind) / (2 * SHARE) + jnp.abs(ahead - 2 * found[-1] + behind) / SHARE**2
+    return jnp.sum(jnp.where(jnp.isfinite(work), work, 0.0))
 
 
 def _largest(scale: Float[Array, "p *n"], units: tuple[int, ...]) -> Float[Array, "p *n"]:

@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.core.effect import Effect, Motion, Now, Response
@@ -99,6 +100,26 @@ class Joint(Effect):
     def companions(self, handle: Handle) -> list[Effect]:
         """Effects that come with the joint, such as the pitch relation of a screw."""
         return []
+
+    def violation(self, place: Array, rows: Array, coordinates: Array, t: Array) -> Array:
+        """The residual."""
+        return self.residual(*frames_at(place, rows))
+
+    def violation_rate(
+        self, place: Array, rows: Array, rates: Array, spin: Array, t: Array, passing: Any
+    ) -> Array:
+        """That of the residual."""
+        return jax.jvp(lambda x: self.residual(*frames_at(place, x)), (rows,), (rates,))[1]
+
+    def violation_units(self, place: Array, rows: Array) -> tuple[str, ...]:
+        """Metres where a constraint depends on where the points are."""
+        parent, child = frames_at(place, rows)
+
+        def from_points(points: Array) -> Array:
+            return self.residual(Frame(points[0], parent.axes), Frame(points[1], child.axes))
+
+        change = jax.jacfwd(from_points)(jnp.stack([parent.point, child.point]))
+        return tuple("m" if np.any(x) else "-" for x in np.asarray(change))
 
     def respond(self, place: Array, motion: Motion, now: Now, lam: Array) -> Response:
         """Rates G(Q_i) V_i: for quadratic g the discrete derivative (57); and forces G^T lambda_i."""

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from natcoord_jax.core.effect import Effect, Motion, Now, Response
-from natcoord_jax.core.gradient import averaged_coupling, averaged_gradient, gradient_of
+from natcoord_jax.core.gradient import averaged_coupling, averaged_gradient, cancelling_energy, gradient_of
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.joint import Joint
 from natcoord_jax.core.markers import Attachment, Marker
@@ -136,6 +136,13 @@ class Potential(Effect):
     def curvature(self, place: Array, rows: Array, coordinates: Array) -> Array:
         """Second derivatives of the energy [J per squared unit of invariant]."""
         return self.energy_curvature(self.invariants(place_markers(place, rows)))
+
+    def cancelling(self, place: Array, rows: Array, coordinates: Array) -> tuple[Array, Array]:
+        """Stiffness times invariants, of which the stresses are differences; the distance of the markers."""
+        x = place_markers(place, rows)
+        points = x if place.ndim == 2 else x[:, 0]
+        reach = jnp.sqrt(jnp.max(jnp.sum((points - points[0]) ** 2, axis=-1), initial=0.0))
+        return cancelling_energy(self.energy, self.invariants(x), self.units), reach
 
     def stored(self, place: Array, rows: Array, coordinates: Array, rates: Array) -> Array:
         """Energy [J]."""

@@ -12,11 +12,15 @@ class State(eqx.Module):
     Attributes:
         t: time [s].
         q: rows of all bodies: reference points [m] and directors [-], four rows a body.
-        v: their velocities [1/s times that].
+        v: their velocities [1/s times that], as the scheme carries them on: after energy-momentum steps of
+            order two with small parts across the constraints; `System.tangent` leaves them out.
         coordinates: joint coordinates, angles counted on over many turns [rad, m].
         rates: stored rates of rotors (armature) [rad/s, m/s].
         work: work done so far by each input, load, damper and drive [J].
         dissipated: energy that a dissipative scheme has taken out so far [J]; None before it is used.
+        held: which joint coordinates (first row) and which of their rates (second) `with_coordinate` has set,
+            1 or 0: `assemble` keeps these where the constraints allow it, and forgets them. None: none; a
+            tree without drives and couplings never has any.
     """
 
     t: Float[Array, "*batch"]
@@ -26,6 +30,7 @@ class State(eqx.Module):
     rates: Float[Array, "*batch rotors"]
     work: Float[Array, "*batch works"]
     dissipated: Float[Array, "*batch"] | None = None
+    held: Float[Array, "*batch 2 coordinates"] | None = None
 
 
 class Trajectory(eqx.Module):
@@ -74,5 +79,5 @@ class Trajectory(eqx.Module):
 
     @property
     def v(self) -> Float[Array, "*batch saved rows 3"]:
-        """Saved velocities of the rows."""
+        """Saved velocities of the rows, as the scheme carries them on; see `System.tangent`."""
         return self.states.v

@@ -109,7 +109,8 @@ def arm(elements: int = 3, *, driven: bool = False, stiffness: Any = 0.03) -> Ar
             name="cable",
         )
     )
-    return Arm(*scene.compile(), joints, cable)
+    # The drives go at constant speed, of which a load path sees the places only.
+    return Arm(*scene.compile(assemble=driven), joints, cable)
 
 
 class Hanging(nc.goal.Goal):

@@ -10,12 +10,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.maths.components import Triple
-from natcoord_jax.maths.vectors import dot, safe_divide, safe_norm, skew
+from natcoord_jax.maths.vectors import dot, quotient, safe_divide, skew, unit
 
 
 def from_quaternion(quaternion: Float[Array, "4"]) -> Float[Array, "3 3"]:
     """Rotation matrix of a quaternion (w, x, y, z), scalar first; it is normalised first."""
-    w, x, y, z = quaternion / jnp.sqrt(jnp.sum(quaternion**2))
+    w, x, y, z = unit(quaternion)
     return jnp.array(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -44,23 +44,26 @@ def to_quaternion(rotation: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 
     candidates = jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
     best = jnp.argmax(jnp.stack(pivots, axis=-1), axis=-1)
     chosen = jnp.take_along_axis(candidates, best[..., None, None], axis=-2)[..., 0, :]
-    chosen = chosen / jnp.sqrt(jnp.sum(chosen**2, axis=-1, keepdims=True))
+    chosen = unit(chosen)
     return jnp.where(chosen[..., :1] < 0, -chosen, chosen)
 
 
 def from_axis_angle(axis: Float[Array, "3"], angle: Float[Array, ""]) -> Float[Array, "3 3"]:
     """Rotation matrix of a turn by `angle` [rad] about `axis` (any length but zero)."""
-    k = skew(axis / jnp.sqrt(jnp.sum(axis**2)))
+    k = skew(unit(axis))
     return jnp.eye(3) + jnp.sin(angle) * k + (1 - jnp.cos(angle)) * (k @ k)
 
 
 def from_rotation_vector(vector: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3 3"]:
     """Rotation matrix of a rotation vector [rad], smooth at zero."""
-    angle = safe_norm(vector)[..., None, None]
-    small = angle < 1e-4
-    guarded = jnp.where(small, 1.0, angle)
-    first = jnp.where(small, 1 - angle**2 / 6, jnp.sin(guarded) / guarded)
-    second = jnp.where(small, 0.5 - angle**2 / 24, (1 - jnp.cos(guarded)) / guarded**2)
+    # Functions of the square: the angle itself has no derivatives at zero.
+    square = dot(vector, vector)[..., None, None]
+    small = square < 1e-3
+    x, guarded = jnp.where(small, square, 0.0), jnp.sqrt(jnp.where(small, 1.0, square))
+    series = 1 - x / 6 * (1 - x / 20 * (1 - x / 42 * (1 - x / 72 * (1 - x / 110))))
+    first = jnp.where(small, series, jnp.sin(guarded) / guarded)
+    series = 0.5 - x / 24 * (1 - x / 30 * (1 - x / 56 * (1 - x / 90 * (1 - x / 132))))
+    second = jnp.where(small, series, 2 * (jnp.sin(0.5 * guarded) / guarded) ** 2)
     k = skew(vector)
     return jnp.eye(3) + first * k + second * (k @ k)
 
@@ -72,13 +75,12 @@ def frame_from_axis(axis, second=None) -> Float[Array, "3 3"]:
     world axis that is least aligned with `axis` (chosen on concrete numbers when there are any).
     """
     axis = jnp.asarray(axis, float)
-    third = axis / jnp.sqrt(jnp.sum(axis**2))
+    third = unit(axis)
     if second is None:
         helper = jnp.asarray(np.eye(3))[jnp.argmin(jnp.abs(third))]
     else:
         helper = jnp.asarray(second, float)
-    first = helper - dot(helper, third) * third
-    first = first / jnp.sqrt(jnp.sum(first**2))
+    first = unit(helper - dot(helper, third) * third)
     return jnp.stack([first, jnp.cross(third, first), third])
 
 
@@ -145,14 +147,15 @@ def logarithm_of_motion(axial: Triple, trace: Any, place: Triple) -> tuple[Tripl
     """Logarithm of rigid motions: rotation vectors psi [rad] and T(psi)^-1 place [m].
 
     Smooth for rotations of less than half a turn, at zero too. Defined for matrices near rotations as well:
-    through k = 2 tan(angle/2) n = 2 axial / (1 + trace), without square roots near zero.
+    through k = 2 tan(angle/2) n = 2 axial / (1 + trace), without square roots near zero. Half a turn has no
+    logarithm: not a number. Beyond, it is that of the rest of a turn, the other way round.
 
     Args:
         axial: (R_32 - R_23, R_13 - R_31, R_21 - R_12) of the rotation R.
         trace: of R.
         place: in the frame that R turns from.
     """
-    k = axial * safe_divide(2.0 * jnp.ones_like(trace), 1.0 + trace)
+    k = axial * quotient(2.0 * jnp.ones_like(trace), 1.0 + trace)
     a, b, _ = arctan_coefficients(0.25 * k.dot(k))
     across = k.cross(place)
     return k * a, place - across * (0.5 * a) + k.cross(across) * (0.25 * b)

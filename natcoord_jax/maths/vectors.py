@@ -1,5 +1,6 @@
 """Products and norms of 3-vectors that stay finite under every derivative."""
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -38,6 +39,14 @@ def safe_sqrt(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
 
 
+def positive_part(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """The number where it is positive, else zero; at zero its derivative is that of smaller ones, zero.
+
+    `jnp.maximum` halves it, so that the second derivative of the square at zero is a quarter.
+    """
+    return jnp.where(x > 0, x, 0.0)
+
+
 def largest(x: Float[Array, "k *rest"]) -> Float[Array, "*rest"]:
     """Largest number along the first axis, of at least one.
 
@@ -52,12 +61,54 @@ def largest(x: Float[Array, "k *rest"]) -> Float[Array, "*rest"]:
     return x[0]
 
 
+def _scaled(a: Float[Array, "*batch k"]) -> tuple[Float[Array, "*batch k"], Float[Array, "*batch"]]:
+    """Vectors over their largest components, and those, of which no derivatives are taken."""
+    size = jax.lax.stop_gradient(jnp.max(jnp.abs(a), axis=-1, initial=0.0))
+    size = jnp.where((size > 0) & jnp.isfinite(size), size, 1.0)
+    return a / size[..., None], size
+
+
 def safe_norm(a: Float[Array, "*batch k"]) -> Float[Array, "*batch"]:
-    """Euclidean norm over the last axis; its derivative at the origin is zero, not NaN."""
-    return safe_sqrt(jnp.sum(a * a, axis=-1))
+    """Euclidean norm over the last axis; its derivative at the origin is zero, not NaN.
+
+    The largest component is taken out before the squares: they neither underflow nor overflow.
+    """
+    scaled, size = _scaled(a)
+    return size * safe_sqrt(jnp.sum(scaled * scaled, axis=-1))
+
+
+def unit(a: Float[Array, "*batch k"]) -> Float[Array, "*batch k"]:
+    """Unit vectors along vectors of any length but zero, over the last axis."""
+    scaled, _ = _scaled(a)
+    return scaled / jnp.sqrt(jnp.sum(scaled * scaled, axis=-1, keepdims=True))
+
+
+@jax.custom_jvp
+def quotient(a: Float[Array, "*shape"], b: Float[Array, "*other"]) -> Float[Array, "*out"]:
+    """Quotient a / b whose derivatives do not square b, which may be as small as 1e-300."""
+    return a / b
+
+
+@quotient.defjvp
+def _quotient_jvp(primals: tuple, tangents: tuple) -> tuple:
+    (_, b), (da, db) = primals, tangents
+    found = quotient(*primals)
+    # Times the reciprocal: a division would be transposed to one whose derivatives square b again.
+    return found, (da - found * db) * _reciprocal(b)
+
+
+@jax.custom_jvp
+def _reciprocal(b: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    return 1.0 / b
+
+
+@_reciprocal.defjvp
+def _reciprocal_jvp(primals: tuple, tangents: tuple) -> tuple:
+    found = _reciprocal(*primals)
+    return found, -(found * tangents[0]) * found
 
 
 def safe_divide(a: Float[Array, "*shape"], b: Float[Array, "*other"]) -> Float[Array, "*out"]:
     """Quotient a / b, zero (with zero derivatives) where b == 0."""
     zero = b == 0
-    return jnp.where(zero, 0.0, a / jnp.where(zero, 1.0, b))
+    return jnp.where(zero, 0.0, quotient(a, jnp.where(zero, 1.0, b)))

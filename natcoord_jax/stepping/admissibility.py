@@ -1,64 +1,97 @@
 """What a fresh system is checked for: gaps, velocities across constraints, missing inertia, redundancy."""
 
 import warnings
+import weakref
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from natcoord_jax.assembly.diagnostics import residuals, unknown_name
+from natcoord_jax.assembly.diagnostics import unknown_name
 from natcoord_jax.assembly.reduced import ReducedStep
 from natcoord_jax.assembly.system import System
-from natcoord_jax.core.checks import as_array
+from natcoord_jax.assembly.violations import constrained, misses, worst_violation
+from natcoord_jax.core.checks import as_array, at_top_level
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.host import on_host
 from natcoord_jax.core.results import Result
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import gauss
-from natcoord_jax.stepping.assemble import (
-    assemble,
-    with_admissible_positions,
-    with_admissible_velocities,
-)
+from natcoord_jax.stepping.assemble import with_admissible_positions, with_admissible_velocities
 
-GAP = 1e-9
-"""Largest gap [m, -] and constraint rate [m/s, 1/s] taken for round-off of printed data, per unit of size."""
+LEFT_OPEN = 1e-6
+"""Largest violation [m, rad, -], per unit of size, of a state that a run may start from: what is left by one
+with a loose `newton_tol`."""
 
 
 def check_gaps(system: System, state: State) -> None:
-    """Refuse a joint that does not close.
+    """Refuse a joint that does not close, and a relation between coordinates that does not hold.
 
     Raises:
-        ValueError: with the joint's name and the gap.
+        ValueError: with the part, and by how much.
     """
-    if not system.joints:
+    worst = worst_violation(system, state)
+    if worst is None:
         return
-    size = 1.0 + float(np.max(np.abs(np.asarray(state.q))))
-    for group, (value, _) in zip(system.joints, residuals(system, state)):
-        gaps = np.max(np.abs(np.asarray(value)), axis=1, initial=0.0)
-        worst = int(np.argmax(gaps))
-        if gaps[worst] > GAP * size:
-            raise ValueError(
-                f"joint {group.names[worst]!r} does not close: its constraints are violated by "
-                f"{gaps[worst]:.3g} m; move the bodies, or pass assemble=True to compile"
-            )
+    by = f"by {worst.size:.3g} {worst.unit}"
+    if worst.is_joint:
+        raise ValueError(
+            f"{worst} does not close: its constraints are violated {by}; move the bodies, or pass "
+            "assemble=True to compile"
+        )
+    raise ValueError(
+        f"the start violates {worst} {by} (coordinates count from the assembled pose, distances from zero); "
+        f"pass assemble=True to compile, which moves the bodies there, or change what it asks for at "
+        f"t = {float(state.t):g} s"
+    )
+
+
+def check_obeyed(system: System, state: State) -> None:
+    """Refuse to start from positions that the constraints forbid; those of tracers pass, and pure trees.
+
+    Velocities are not looked at: those at the ends of steps of order two miss the constraints by the square
+    of the step, and a run may go on from there.
+
+    Raises:
+        ValueError: with the part, and by how much.
+    """
+    if not system.structure.multipliers or not at_top_level(system, state):
+        return
+    if _obeyed and all(seen() is now for seen, now in zip(_obeyed[0], (system, state))):
+        return
+    worst = worst_violation(system, state, allowed=LEFT_OPEN)
+    if worst is not None:
+        raise ValueError(
+            f"the state violates {worst} by {worst.size:.3g} {worst.unit}; pass nc.assemble(system, state)"
+        )
+    _obeyed[:] = [(weakref.ref(system), weakref.ref(state))]
+
+
+_obeyed: list[tuple[weakref.ref, weakref.ref]] = []
+"""The system and the state last found to obey each other: to look takes some milliseconds, as long as a short
+run, and runs are repeated."""
 
 
 def project_velocities(system: System, state: State) -> State:
-    """State with velocities that obey the joints, with a warning that says by how much they changed."""
-    if not system.joints:
+    """State with velocities that obey the constraints, with a warning that says by how much they changed.
+
+    Raises:
+        ValueError: for velocities that no projection makes obey them, with the part.
+    """
+    worst = worst_violation(system, state, rates=True)
+    if worst is None:
         return state
-    speed = 1.0 + float(np.max(np.abs(np.asarray(state.v))))
-    worst = 0.0
-    for _, rate in residuals(system, state):
-        worst = max(worst, float(np.max(np.abs(np.asarray(rate)), initial=0.0)))
-    if worst <= GAP * speed:
-        return state
-    projected = assemble(system, state)
+    projected, code = _with_admissible_velocities(system, state)
+    if int(code) != Result.SUCCESSFUL:
+        left = worst_violation(system, projected, rates=True) or worst
+        raise ValueError(
+            f"no velocities obey all constraints at the start: {left} misses its rate by {left.size:.3g} "
+            f"{left.unit}; check drives that ask for what others or the position forbid"
+        )
     change = float(np.max(np.abs(np.asarray(projected.v) - np.asarray(state.v))))
     warnings.warn(
-        f"initial velocities violate the joints by {worst:.3g} m/s (or 1/s); they were projected onto them, "
-        f"which changed row velocities by up to {change:.3g} m/s",
+        f"initial velocities violate {worst} by {worst.size:.3g} {worst.unit}; they were projected onto the "
+        f"constraints, which changed row velocities by up to {change:.3g} m/s (directors: 1/s)",
         stacklevel=4,
     )
     return projected
@@ -68,21 +101,18 @@ def admitted(system: System, state: State) -> State:
     """What `check_gaps` and `project_velocities` do, for numbers that are not known yet (inside jit).
 
     Returns:
-        The state, with velocities that obey the joints; all NaN where a joint does not close.
+        The state, with velocities that obey the constraints; all NaN where positions do not.
     """
-    if not system.joints:
+    if not constrained(system):
         return state
-    values, rates = zip(*residuals(system, state))
-    closed = _largest(values) <= GAP * (1.0 + jnp.max(jnp.abs(state.q)))
-    moving_along = _largest(rates) <= GAP * (1.0 + jnp.max(jnp.abs(state.v)))
+    gap, rate = misses(system, state)
+    moving_along = rate <= 1.0
     projected, code = with_admissible_velocities(system, state)
     state = jax.tree.map(lambda x, y: jnp.where(moving_along, x, y), state, projected)
-    return jax.tree.map(lambda x: jnp.where(closed & (moving_along | (code == 0)), x, jnp.nan), state)
+    return jax.tree.map(lambda x: jnp.where((gap <= 1.0) & (moving_along | (code == 0)), x, jnp.nan), state)
 
 
-def _largest(groups) -> jax.Array:
-    """Largest absolute value in any of the arrays."""
-    return jnp.max(jnp.concatenate([jnp.abs(x).reshape(-1) for x in groups]), initial=0.0)
+_with_admissible_velocities = on_host(with_admissible_velocities)
 
 
 def _tiny_step(system: System, state: State) -> ReducedStep:

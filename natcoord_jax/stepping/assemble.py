@@ -1,76 +1,102 @@
-"""Assembly of a state: positions and velocities projected onto the constraints."""
-
-from functools import partial
-from typing import Any
+"""Assembly of a state: positions and velocities brought to obey the constraints."""
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from natcoord_jax.assembly.coordinates import coordinate_values, state_rates
-from natcoord_jax.assembly.diagnostics import rows_with_ground
-from natcoord_jax.assembly.projection import Projection
+from natcoord_jax.assembly.coordinates import state_rates
+from natcoord_jax.assembly.projection import Projection, gap_rates, twists_of
+from natcoord_jax.assembly.rates import row_rates
 from natcoord_jax.assembly.system import System
+from natcoord_jax.assembly.violations import GAP, rate_size, worst_violation
 from natcoord_jax.core.checks import is_concrete
 from natcoord_jax.core.compiled import briefly
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.results import REASONS, Result, SimulationError
 from natcoord_jax.core.state import State
+from natcoord_jax.maths.elimination import definite_inverse
 from natcoord_jax.maths.rotations import orthonormalise
-from natcoord_jax.stepping.newton import newton
+from natcoord_jax.stepping.closing import closed
 
-TOLERANCE = 1e-14
-"""Accuracy of the projection relative to the extent of the system."""
+DAMPING = 1e-14
+"""Of velocities, see `Projection`; what it leaves is projected again."""
 
+PASSES = 5
+"""Projections of velocities with one inverse."""
 
-@partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _solve(make: Any, system: System, state: State) -> tuple[Array, Array]:
-    """Unknowns and result code of a projection, differentiated implicitly."""
-    return newton(make(system, state), TOLERANCE)
-
-
-@_solve.defjvp
-def _solve_jvp(make: Any, primals: tuple, tangents: tuple):
-    y, code = _solve(make, *primals)
-    moved = jax.jvp(lambda *args: make(*args).residual(y)[0], primals, tangents)[1]
-    equations = make(*primals)
-    y_dot = -equations.differentiable(equations.jacobian(y)).solve(moved)
-    return (y, code), (y_dot, jnp.zeros(code.shape, jax.dtypes.float0))
-
-
-def nearest_coordinates(system: System, state: State) -> Array:
-    """Joint coordinates of the positions, each angle taken in the turn nearest to the stored one."""
-    values = coordinate_values(system, rows_with_ground(state.q))
-    for group in system.coordinates:
-        if group.axis.unit == "rad":
-            turns = jnp.round((state.coordinates - values)[group.index] / (2 * jnp.pi))
-            values = values.at[group.index].add(2 * jnp.pi * turns)
-    return values
+ENOUGH = 1e3 * GAP
+"""Rates of constraints [m/s, rad/s, 1/s], per unit of size, up to which velocities obey them. Near singular
+positions no projection leaves less."""
 
 
 @briefly
 def _assembled(system: System, state: State) -> tuple[State, Array]:
-    state, code = with_admissible_positions(system, state)
-    state, rate_code = with_admissible_velocities(system, state)
-    return state, jnp.maximum(code, rate_code)
+    found, code = with_admissible_positions(system, state)
+    found, rate_code = with_admissible_velocities(system, found, state_rates(system, state))
+    return replace_fields(found, held=None), jnp.maximum(code, rate_code)
 
 
-@briefly
 def with_admissible_positions(system: System, state: State) -> tuple[State, Array]:
-    """State with orthonormal directors and positions that obey the constraints; and a result code."""
+    """State with orthonormal directors and positions that obey the constraints; and a result code.
+
+    Bodies keep their velocities and angular velocities.
+    """
     rows = state.q.reshape(-1, 4, 3)
     squared = jnp.concatenate([rows[:, :1], orthonormalise(rows[:, 1:])], axis=1).reshape(-1, 3)
     state = replace_fields(state, q=squared)
-    y, code = _solve(Projection.of_positions, system, state)
-    state = replace_fields(state, q=state.q + Projection.of_positions(system, state).moved(y))
-    return replace_fields(state, coordinates=nearest_coordinates(system, state)), code
+    twists = twists_of(system, state)
+    found, code = closed(system, replace_fields(state, v=jnp.zeros_like(state.v)))
+    return _moving(found, twists), code
 
 
-def with_admissible_velocities(system: System, state: State) -> tuple[State, Array]:
-    """State whose velocities, projected in the metric of the mass, obey the constraints; a result code."""
-    w, code = _solve(Projection.of_velocities, system, state)
-    state = replace_fields(state, v=Projection.of_velocities(system, state).moved(w))
-    return replace_fields(state, rates=_rotor_rates(system, state)), code
+def _moving(state: State, twists: Array) -> State:
+    """The state with velocities from the twists of its bodies."""
+    rates = row_rates(state.q.reshape(-1, 4, 3), twists[:, :3], twists[:, 3:])
+    return replace_fields(state, v=rates.reshape(-1, 3))
+
+
+def with_admissible_velocities(
+    system: System, state: State, rates: Array | None = None
+) -> tuple[State, Array]:
+    """State whose velocities, projected in the metric of the mass, obey the constraints; a result code.
+
+    Args:
+        system: compiled system.
+        state: its positions obey the constraints.
+        rates: of all joint coordinates, kept where `state.held` says so; None: those of the state.
+    """
+    twists = twists_of(system, state)
+    found = _moving(state, _projected_twists(system, state, twists, None, twists[:0, 0]))
+    allowed = ENOUGH * rate_size(found)
+    if state.held is not None:
+        wanted = state_rates(system, state) if rates is None else rates
+        holding = _moving(state, _projected_twists(system, state, twists, state.held[1], wanted))
+        missed = state.held[1] * (state_rates(system, holding) - wanted)
+        held = _most(gap_rates(system, holding)) <= allowed
+        held = held & (_most(missed) <= ENOUGH * (1.0 + _most(wanted)))
+        found = jax.tree.map(lambda x, y: jnp.where(held, x, y), holding, found)
+    code = jnp.where(_most(gap_rates(system, found)) <= allowed, int(Result.SUCCESSFUL), int(Result.SINGULAR))
+    return replace_fields(found, rates=_rotor_rates(system, found)), code
+
+
+def _projected_twists(
+    system: System, state: State, twists: Array, held: Array | None, wanted: Array
+) -> Array:
+    """Twists nearest to the given ones that obey the constraints, with those rates held that are."""
+    start = _moving(state, twists)
+    linear = Projection.of(system, state, held)
+    rates = [gap_rates(system, start)]
+    rates += [] if held is None else [held * (state_rates(system, start) - wanted)]
+    scaled = jnp.concatenate(rates) / linear.scale
+    inverse = definite_inverse(linear.damped(DAMPING))
+    change = jnp.zeros(linear.matrix.shape[1], scaled.dtype)
+    for _ in range(PASSES):
+        change = change - linear.impulses @ (inverse @ (scaled + linear.matrix @ change))
+    return twists + change.reshape(twists.shape)
+
+
+def _most(x: Array) -> Array:
+    return jnp.max(jnp.abs(x), initial=0.0)
 
 
 def _rotor_rates(system: System, state: State) -> Array:
@@ -85,40 +111,60 @@ def _rotor_rates(system: System, state: State) -> Array:
 
 
 def assemble(system: System, state: State) -> State:
-    """Project positions and velocities onto the constraints.
+    """Bring positions and velocities to obey the constraints, from wherever they are.
 
-    Directors are made orthonormal, positions move along the constraint normals, velocities are projected in
-    the metric of the mass, drives and relations between coordinates included; coordinates and rotor rates
-    follow. Pure, jittable and implicitly differentiable, with respect to the state and to every parameter
-    that moves geometry.
+    Directors are made orthonormal; bodies are turned and shifted until joints, drives and relations between
+    coordinates are obeyed, each step at least expense of mass; then velocities are projected in the metric of
+    the mass. Coordinates and rates that `System.with_coordinate` has set are kept, where the constraints
+    allow it, and angles are counted over all turns on the way. Rotor rates follow. Pure, jittable and
+    differentiable in every mode, with respect to the state and to every parameter that moves geometry.
 
     Args:
         system: compiled system.
-        state: any state near an admissible one.
+        state: any state.
 
     Returns:
         The assembled state; where no admissible state is found, all NaN inside jit.
 
     Raises:
-        SimulationError: in an eager call, if no admissible state is found nearby.
+        SimulationError: in an eager call, if no admissible state is found: with the joint, drive or coupling
+            that stays open, and by how much.
 
     Example:
         >>> import jax; jax.config.update("jax_enable_x64", True)
         >>> import natcoord_jax as nc
         >>> scene = nc.Scene()
-        >>> arm = scene.add(nc.RigidBody(mass=1.0, inertia=(1.0, 1.0, 1.0), angular_velocity=(0, 0, 1)))
-        >>> hinge = scene.add(nc.Revolute(nc.ground, arm, axis=(0, 0, 1)))
+        >>> arm, wheel = (scene.add(nc.RigidBody(mass=1.0, inertia=(1.0, 1.0, 1.0))) for _ in range(2))
+        >>> hinge, axle = (scene.add(nc.Revolute(nc.ground, body)) for body in (arm, wheel))
+        >>> gear = scene.add(nc.Coupling((axle, hinge), factors=(1.0, -20.0)))
         >>> system, state = scene.compile()
-        >>> state = nc.assemble(system, state)
+        >>> state = nc.assemble(system, system.with_coordinate(state, hinge, 0.5))
+        >>> state.coordinates.round(9).tolist()
+        [0.5, 10.0]
     """
     assembled, code = _assembled(system, state)
     if is_concrete(code):
         result = Result(int(code))
         if result != Result.SUCCESSFUL:
-            raise SimulationError(
-                f"no admissible state was found near this one ({REASONS[result]}); start closer to one",
-                result,
-                assembled,
-            )
+            raise SimulationError(_failure(system, assembled, result), result, assembled)
         return assembled
     return jax.tree.map(lambda x: jnp.where(code == 0, x, jnp.nan), assembled)
+
+
+def _failure(system: System, state: State, result: Result) -> str:
+    """Why a state could not be assembled, in words."""
+    if result == Result.NONFINITE:
+        return f"the state cannot be assembled: {REASONS[result]}; check its positions and the parameters"
+    open_part = worst_violation(system, state)
+    if open_part is not None:
+        return (
+            f"the state cannot be assembled: {open_part} stays open by {open_part.size:.3g} {open_part.unit} "
+            "in the nearest state that was found; check its lengths and targets against those of the parts "
+            "that it is joined to, or set coordinates on another side of where it sticks"
+        )
+    moving = worst_violation(system, state, rates=True)
+    return f"the velocities cannot be made to obey the constraints: {moving} misses its rate by " + (
+        f"{moving.size:.3g} {moving.unit}; check drives that ask for what others or the position forbid"
+        if moving is not None
+        else "little"
+    )

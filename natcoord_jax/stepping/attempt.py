@@ -120,7 +120,8 @@ def attempt(setting: Setting, unpack: Callable[[Array], State], apart: bool, car
         ends = end_of_step(setting.system, before.state, h, equations.groups, found, setting.plan.tableau)
         kick = None if before.lagging is None else found.kick.exact
         missed = solving.residual, found.size, before.it.correction
-        steady = sound(equations, before.it.y, *missed, ends[0], setting.plan.tolerance)
+        given = ends[0], setting.plan.tolerance, factors.grain
+        steady = sound(equations, before.it.y, *missed, *given)
         before = eqx.tree_at(lambda c: c.it.converged, before, before.it.converged & steady)
         left = remainder(equations, solving.residual, factors.inertias)
         after = after_attempt(setting, before, factors.inertias, ends, left, kick)
@@ -231,7 +232,7 @@ def renewed_at(
     """New factors by formulas, and the iteration with them."""
     _, options = _judging(equations, it, None)
     loads = jax.tree.map(lambda x: jnp.where(asked.here, x, 0.0), asked.loads)
-    factors = factors_of(equations, equations.tangent(it.y, loads), factors.noise)
+    factors = factors_of(equations, equations.tangent(it.y, loads), factors.noise, equations.grain)
     it = refreshed(it)
     # What the residual asks for with new factors needs no evaluation; but the kick in it may have been held.
     options |= {"whole": not setting.plan.tableau.kick}

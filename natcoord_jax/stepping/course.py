@@ -121,14 +121,14 @@ class Setting(eqx.Module):
         h = jnp.where(self.over(course), 1e-3, course.fraction * self.dt)
         index = jnp.minimum(course.step, self.steps - 1)
         given = index if self.plan.control is not None else index - self.first
-        u = self.plan.inputs(self.parameters, given, course.state, course.done, course.fraction)
+        u = self.plan.inputs(self.system, self.parameters, given, course.state, course.done, course.fraction)
         return u, h, index
 
 
 def start_of(setting: Setting, state: State) -> tuple[Course, Factors, Outset]:
     """The first attempt, factors that are none, and what is known of the first state."""
     dt, plan = setting.dt, setting.plan
-    u = plan.inputs(setting.parameters, jnp.array(0), state, jnp.zeros(()), jnp.ones(()))
+    u = plan.inputs(setting.system, setting.parameters, jnp.array(0), state, jnp.zeros(()), jnp.ones(()))
     equations = prepare(setting.system, state, u, dt, plan.tableau)
     few = setting.tolerance is not None
     guess = equations.guess()
@@ -217,7 +217,7 @@ def after_attempt(
     stopped = course.stopped | verdict.hopeless
     result = jnp.where(verdict.hopeless, code, course.code)
     if plan.event is not None:
-        before, after = plan.event(origin), plan.event(verdict.state)
+        before, after = (plan.indicator(setting.system, state) for state in (origin, verdict.state))
         crossed = verdict.accepted & (before * after <= 0) & (before != 0)
         stopped, result = stopped | crossed, jnp.where(crossed, int(Result.EVENT), result)
     done, fraction, trial = verdict.done, verdict.fraction, verdict.trial

@@ -96,7 +96,7 @@ class Rule(linear_pair.Pair):
     ) -> tuple[Array, State]:
         """Residual of the slot's equations and the state at its end."""
         system, parameters, dt = numbers.whole(varied)
-        u = slot.inputs(self.plan, parameters, state) if u is None else u
+        u = slot.inputs(self.plan, system, parameters, state) if u is None else u
         return advance(system, state, u, slot.fraction * dt, y, self.tableau)[:2]
 
     def prepared(self, numbers: Numbers, varied_dot: list[Array], slot: Slot, u_dot: Any) -> tuple:
@@ -106,7 +106,7 @@ class Rule(linear_pair.Pair):
         given, given_dot = (numbers.varied, slot.u), (varied_dot, u_dot)
         forcing = jax.jvp(lambda varied, u: at(varied, slot.before, u, slot.y), given, given_dot)[1]
         system, parameters, dt = numbers.whole(numbers.varied)
-        u = slot.inputs(self.plan, parameters, slot.before)
+        u = slot.inputs(self.plan, system, parameters, slot.before)
         h = slot.fraction * dt
         return along, linear_solver(system, slot.before, u, h, slot.y, self.tableau, along), forcing
 

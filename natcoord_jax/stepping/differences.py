@@ -90,7 +90,7 @@ def _renewed(equations: Any, probe: Probe, it: Iterate, factors: Factors) -> tup
             made = whole(columns)
         else:
             made = jax.lax.cond(probe.alike, alike, whole, columns)
-        return jnp.array(False), refreshed(it), new_factors(made, factors.noise)
+        return jnp.array(False), refreshed(it), new_factors(made, factors.noise, equations.grain)
 
     # A loop of no or one trip, as at the end of a step.
     _, it, factors = jax.lax.while_loop(lambda carry: carry[0], renewed, (probe.making, it, factors))

@@ -43,6 +43,7 @@ class Factors(eqx.Module):
         least: fewest corrections that a step has needed with them.
         extra: corrections beyond these that later steps have needed.
         noise: last correction of a step, relative to the terms of the equations, averaged over steps.
+        grain: size of the terms that cancel in the equations [sqrt(J)], by which they are rounded.
         leaving: most that a correction has left to the next one lately, in terms of its size; 1: nothing is
             known yet.
         floor: residual that is left of a linear system solved with factors of its own, see `Correcting`.
@@ -55,6 +56,7 @@ class Factors(eqx.Module):
     least: Int[Array, ""]
     extra: Int[Array, ""]
     noise: Float[Array, ""]
+    grain: Float[Array, ""]
     leaving: Float[Array, ""]
     floor: Float[Array, ""]
 
@@ -107,11 +109,15 @@ class Factors(eqx.Module):
         part = jnp.where(first, seen, jnp.maximum(ratio, jnp.minimum(seen, SLOWEST_UNSEEN)))
         return jnp.minimum(part / jnp.maximum(1.0 - part, 1e-3), jnp.where(first, 1.0, jnp.inf))
 
-    @property
-    def rounding(self) -> Float[Array, ""]:
-        """Relative size of corrections that are nothing but rounding; 0 where it is not known or small."""
-        least, most = NOISE
-        return jnp.where(self.noise > least, jnp.minimum(self.noise, most), 0.0)
+    def noise_of(self, size: Float[Array, ""]) -> Float[Array, ""]:
+        """Size of corrections that are nothing but rounding [sqrt(J)]; 0 where it is not known or small.
+
+        Args:
+            size: of the terms of the equations, but for those that cancel.
+        """
+        (least, most), terms = NOISE, size + self.grain
+        found = jnp.minimum(self.noise, most) * terms
+        return jnp.where(found > least * size, found, 0.0)
 
 
 def no_factors(equations: Any) -> Factors:
@@ -120,17 +126,20 @@ def no_factors(equations: Any) -> Factors:
     shapes = jax.eval_shape(equations.factorised, equations.like_tangent(y))
     solver, inertias = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
     no, noise = jnp.array(False), jnp.zeros((), y.dtype)
-    return Factors(solver, inertias, no, no, jnp.array(NEVER), jnp.array(0), noise, noise + 1.0, noise)
+    return Factors(solver, inertias, no, no, jnp.array(NEVER), jnp.array(0), noise, noise, noise + 1.0, noise)
 
 
-def factors_of(equations: Any, matrix: Any, noise: Array | float = 0.0) -> Factors:
+def factors_of(
+    equations: Any, matrix: Any, noise: Array | float = 0.0, grain: Array | float = 0.0
+) -> Factors:
     """Factors of a Jacobian."""
-    return new_factors(equations.factorised(matrix), noise)
+    return new_factors(equations.factorised(matrix), noise, grain)
 
 
-def new_factors(made: tuple[Any, Array], noise: Array | float = 0.0) -> Factors:
+def new_factors(made: tuple[Any, Array], noise: Array | float = 0.0, grain: Array | float = 0.0) -> Factors:
     """Factors that have just been made, with the inertias of the unknowns."""
     solver, inertias = made
     yes, noise = jnp.array(True), jnp.asarray(noise, inertias.dtype)
-    unknown = jnp.ones_like(noise)
-    return Factors(solver, inertias, yes, yes, jnp.array(NEVER), jnp.array(0), noise, unknown, 0.0 * unknown)
+    grain, unknown = jnp.asarray(grain, inertias.dtype), jnp.ones_like(noise)
+    never = jnp.array(NEVER), jnp.array(0)
+    return Factors(solver, inertias, yes, yes, *never, noise, grain, unknown, jnp.zeros_like(noise))

@@ -149,7 +149,7 @@ class InTurn(ABC):
     ) -> tuple[Array, State, Tangents | None]:
         """Residual of a slot's equations, the state at its end, and what the constraints admit there."""
         system, parameters, dt = numbers.whole(varied)
-        u = slot.inputs(self.plan, parameters, state) if u is None else u
+        u = slot.inputs(self.plan, system, parameters, state) if u is None else u
         return advance_between(system, state, tangents, u, slot.fraction * dt, y, self.tableau)
 
     def every(self, record: Record, given: Any) -> Any:
@@ -261,7 +261,7 @@ class InTurn(ABC):
         """New factors, for this slot, of so many rows of its matrix, or of formulas if none was asked for."""
         numbers = fixed.numbers
         system, parameters, dt = numbers.whole(numbers.varied)
-        u = slot.inputs(self.plan, parameters, slot.before)
+        u = slot.inputs(self.plan, system, parameters, slot.before)
         equations = prepare(system, slot.before, u, slot.fraction * dt, self.tableau)
         if not matrix.shape[0]:
             return factors_of(equations, equations.tangent(slot.y))

@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from natcoord_jax.core.results import Result
 from natcoord_jax.linsolve.learning import SPEED, learns, learnt
+from natcoord_jax.maths.vectors import safe_divide
 from natcoord_jax.stepping.factors import Factors, factors_of, no_factors
 
 TOLERANCE = 2e-16
@@ -68,6 +69,9 @@ LEARNING = 1e-12
 """Size of a correction relative to the terms of the equations from which on the next tells how good the
 factors are: below, rounding has a part in it."""
 
+CLEAR = STALL_OLD * ROUND_OFF
+"""The same in terms of what cancels in the equations: known, not guessed."""
+
 NEAR = 1e-3
 """The same up to which it does: far off, equations are not linear, and what failed attempts teach is noise,
 by which the next ones would be accepted or not."""
@@ -96,7 +100,7 @@ class Iterate(eqx.Module):
         change: last correction with these factors; 0 before the first.
         worst: unknown with the largest last correction.
         correction: size of the last correction (energy norm); 0 before the first with these factors.
-        error: that size relative to the terms of the equations.
+        error: that size relative to the terms of the equations, those that cancel included.
         count: corrections with these factors.
         total: all corrections.
         rounds: factorisations in this step.
@@ -174,7 +178,7 @@ def judge(
         tolerance: see `TOLERANCE`.
         it: where the iteration stands.
         residual: of the equations.
-        size: of their terms.
+        size: of their terms, but for those that cancel in stiff parts, see `Factors.grain`.
         balances: whether the residual itself counts, too. An error of multipliers alone moves nothing, but
             shows in the balances, and in the work of drives.
         patience: corrections that are cheaper than a new Jacobian.
@@ -188,8 +192,9 @@ def judge(
         (then not moved). And the factors, which have learnt from it if they are of that kind.
     """
     done = it.converged | it.wanting | ~it.finite
+    grain = factors.grain
     change = factors.solver.solve(residual)
-    near = (it.error > LEARNING) & (it.error < NEAR)
+    near = (it.correction > LEARNING * size + CLEAR * grain) & (it.correction < NEAR * size)
     telling = ~done & (it.count > 0) & ~jnp.asarray(jumped) & near
     solver, change, _ = learnt(factors.solver, it.change, change, factors.inertias, telling)
     factors = eqx.tree_at(lambda f: f.solver, factors, solver)
@@ -204,21 +209,24 @@ def judge(
     factors = factors.having_left(ratio, telling)
     raised = jnp.asarray(RAISED)[jnp.clip(it.rounds - 1, 0, STALLS)]
     trust = jnp.where(alike, STALL_ALIKE, jnp.where(factors.fresh, raised, STALL_OLD))
-    floor = trust * max(tolerance, ROUND_OFF) * size
+    # What stiff parts at rest are rounded by is known, and needs no room for more.
+    resting = jnp.minimum(trust, STALL_OLD / STALL * raised)
+    floor = trust * max(tolerance, ROUND_OFF) * size + resting * ROUND_OFF * grain
+    noise = factors.noise_of(size)
     finite = jnp.isfinite(correction) & jnp.isfinite(size)
     stalled = ~first & (ratio > 0.5) & (correction <= floor)
-    enough = jnp.maximum(STALL_OLD * tolerance, ABOVE_NOISE * factors.rounding) * size
+    enough = jnp.maximum(STALL_OLD * tolerance * size, ABOVE_NOISE * noise)
     solved = (correction <= tolerance * size) | stalled | (it.last & ~first & (correction <= enough))
     # In constant powers: others are as slow as a solution.
     shrinking = ratio**patience
     if learns(factors.solver):
-        shrinking = jnp.where(it.error < NEAR, shrinking**SPEED, shrinking)
+        shrinking = jnp.where(it.correction < NEAR * size, shrinking**SPEED, shrinking)
     # Within the noise corrections shrink little, and new factors would not change it.
     noisy = factors.fresh & (correction <= floor)
     slow = ~first & ((ratio > 0.5) | (~noisy & (correction * shrinking > tolerance * size)))
     slow = slow | (it.count >= max(CHORD_ITERATIONS, 2 * patience)) | ~factors.usable
-    # Old factors may have led astray: new ones begin where the first did.
-    lost = ~finite & ~factors.fresh
+    # Old factors may have led astray: new ones begin where the first did, if that is anywhere.
+    lost = ~finite & ~factors.fresh & jnp.all(jnp.isfinite(it.start))
     ready, slow = solved & finite & factors.usable, (slow & finite) | lost
     solved, slow = ready & whole, slow & ~ready
     y = jnp.where(solved | slow | ~finite, it.y, it.y - change)
@@ -228,12 +236,12 @@ def judge(
         change,
         jnp.argmax(energies) if energies.shape[0] else it.worst,
         correction,
-        correction / jnp.where(size > 0, size, 1.0),
+        safe_divide(correction, size + grain),
         it.count + 1,
         it.total + ~solved,
         it.rounds,
         it.most,
-        ready | (predicted <= jnp.maximum(tolerance, factors.rounding) * size),
+        ready | (predicted <= jnp.maximum(tolerance * size, noise)),
         solved,
         slow,
         finite | lost,

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.system import System
 from natcoord_jax.core.checks import is_concrete
+from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.results import REASONS, REMEDIES, Result, SimulationError
 from natcoord_jax.core.state import State
 from natcoord_jax.stepping.checked import check_state, checked_inputs, checked_step
@@ -63,7 +64,7 @@ def step(
         0.5
     """
     check_state(system, state)
-    state = scheme.started(state)
+    state = scheme.started(replace_fields(state, held=None))
     h = checked_step(dt)
     inputs, _ = checked_inputs(system, None if u is None else jnp.asarray(u, float)[None], 1)
     after, code = _one_step(system, state, inputs[0], h, newton_tol, 16, scheme.tableau)

@@ -10,6 +10,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from natcoord_jax.assembly.reading import tangent
+from natcoord_jax.assembly.system import System
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import Tableau, gauss
 
@@ -27,6 +29,9 @@ class Plan:
         event: function of the state whose change of sign ends the run, or None.
         tableau: of the collocation method.
         recorded: whether every slot is; else only the last is kept.
+        control_reads: whether the control reads velocities, from states whose velocities have to be made
+            tangent for it, see `assembly.reading`.
+        event_reads: the same of the event.
     """
 
     steps: int
@@ -36,14 +41,22 @@ class Plan:
     event: Callable[[State], Array] | None = None
     tableau: Tableau = gauss(1)
     recorded: bool = True
+    control_reads: bool = False
+    event_reads: bool = False
 
     def inputs(
-        self, parameters: Any, step: Array, state: State, done: Array, fraction: Array
+        self, system: System, parameters: Any, step: Array, state: State, done: Array, fraction: Array
     ) -> Float[Array, " inputs"] | Float[Array, "s inputs"]:
         """Inputs of a (sub)step that starts at a state, after a part `done` of its step."""
         if self.control is None:
             return self.within_step(parameters[step], done, fraction)
+        state = tangent(system, state) if self.control_reads else state
         return self.control(parameters, step, state.t, state, fraction)
+
+    def indicator(self, system: System, state: State) -> Array:
+        """What ends the run when its sign changes."""
+        assert self.event is not None
+        return self.event(tangent(system, state) if self.event_reads else state)
 
     def within_step(self, inputs: Array, done: Array, fraction: Array) -> Array:
         """Inputs of a part of a step from those of the whole one: held, or interpolated from its stages."""

@@ -75,11 +75,11 @@ class Slot(eqx.Module):
     done: Float[Array, "*slots"]
     accepted: Bool[Array, "*slots"]
 
-    def inputs(self, plan: Plan, parameters: Any, state: State) -> Float[Array, " inputs"]:
+    def inputs(self, plan: Plan, system: System, parameters: Any, state: State) -> Float[Array, " inputs"]:
         """Its inputs, those that a control decides at a state."""
         if self.u is not None:
             return self.u
-        return plan.inputs(parameters, self.step, state, self.done, self.fraction)
+        return plan.inputs(system, parameters, self.step, state, self.done, self.fraction)
 
 
 class Record(eqx.Module):

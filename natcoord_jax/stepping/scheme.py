@@ -33,6 +33,11 @@ class Scheme(abc.ABC):
         """Order of accuracy of positions."""
         return self.tableau.order
 
+    @property
+    def loose(self) -> bool:
+        """Whether velocities of states have parts normal to the constraints, which readings leave out."""
+        return not self.tableau.tangent
+
     def times(
         self, dt: Float[Array, ""] | float, steps: int, start: float = 0.0
     ) -> Float[Array, "steps stages"]:
@@ -60,11 +65,17 @@ class EnergyMomentum(Scheme):
     thanks to kicks along the normals of the constraints, in velocities; energy, momenta and constraints of
     positions and of velocities hold to round-off at every order. Without kicks energy, momenta and
     constraints of positions still do, but velocities obey their constraints only as accurately as the
-    scheme is, and lose orders.
+    scheme is, and lose orders: what is normal to the constraints changes its sign in every step.
+
+    Kicks take several times as long as the rest of a step of order two, which therefore has none. Its states
+    keep velocities as (57) makes them; what is read of them (rates, velocities, accelerations, reactions,
+    and the states that controllers and terminal events are given) are the nearest velocities that the
+    constraints admit, see `System.tangent`.
 
     Attributes:
         order: 2, 4, 6, 8 or 10.
-        kick: whether velocities are kept tangent; None: from order four on.
+        kick: whether velocities are kept tangent by kicks. None: from order four on; at order two they are
+            read so. False: they are neither, order two is (57) as it stands.
 
     Raises:
         ValueError: for another order.
@@ -89,6 +100,11 @@ class EnergyMomentum(Scheme):
     def tableau(self) -> Tableau:
         """Coefficients of the method."""
         return gauss(int(self.order) // 2, self.order > 2 if self.kick is None else bool(self.kick))
+
+    @property
+    def loose(self) -> bool:
+        """Whether velocities of states have parts normal to the constraints, which readings leave out."""
+        return self.kick is None and not self.tableau.kick
 
 
 SECOND_ORDER = EnergyMomentum()

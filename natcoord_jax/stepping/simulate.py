@@ -10,18 +10,22 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from natcoord_jax.assembly.reading import handing, reads_velocities
 from natcoord_jax.assembly.system import System
 from natcoord_jax.core.checks import is_concrete
 from natcoord_jax.core.compiled import quickly
+from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.results import Result
 from natcoord_jax.core.state import State, Trajectory
 from natcoord_jax.stepping import one_kernel
+from natcoord_jax.stepping.admissibility import check_obeyed
 from natcoord_jax.stepping.checked import check_state, checked_inputs, checked_step
 from natcoord_jax.stepping.derivative import run_slots
 from natcoord_jax.stepping.error_control import Tolerance
 from natcoord_jax.stepping.newton import TOLERANCE
 from natcoord_jax.stepping.plan import Plan, Slots
 from natcoord_jax.stepping.scheme import SECOND_ORDER, Scheme
+from natcoord_jax.stepping.turns import warn_of_far_turns
 
 SEGMENT = 512
 """Longest segment of a rollout that does not save every step, or that is checkpointed."""
@@ -57,16 +61,22 @@ def _rollout(
     *,
     allowed: Tolerance | None,
 ) -> Trajectory:
-    tableau = scheme.tableau
+    tableau, control_reads = scheme.tableau, False
     length = _segments(steps, save_every, checkpoint)
     if callable(inputs):
         # A policy may be a module with numbers of its own, which has no hash while it is traced.
-        policy, constants = jax.closure_convert(lambda t, state: inputs(t, state), state.t, state)
+        policy, constants = jax.closure_convert(handing(inputs), state.t, state)
+        control_reads = scheme.loose and reads_velocities(lambda x: policy(x.t, x, *constants), state)
         control, every_segment = partial(_by_policy, policy), constants
         pieces = jax.tree.map(lambda x: jnp.broadcast_to(x, (steps // length, *x.shape)), every_segment)
     else:
         control, pieces = None, inputs.reshape(steps // length, length, *inputs.shape[1:])
-    plan = Plan(length, extra_substeps, tolerance, control, until, tableau)
+    event = None if until is None else handing(until)
+    event_reads = scheme.loose and event is not None and reads_velocities(event, state)
+    plan = Plan(
+        length, extra_substeps, tolerance, control, event, tableau,
+        control_reads=control_reads, event_reads=event_reads,
+    )  # fmt: skip
 
     def segment(carry, parameters):
         state, code, failed = carry
@@ -79,7 +89,7 @@ def _rollout(
         if steps != length:
             saved = jax.tree.map(lambda x, s: jnp.where(running, x, s), saved, state)
         after = jax.tree.map(keep, course.state, state)
-        starts = jax.tree.map(lambda x: x[jnp.maximum(picked - 1, 0)], slots.states)
+        starts = jax.tree.map(lambda one, x: jnp.concatenate([one[None], x])[picked], state, slots.states)
         # Beyond the end of a run that failed there are the inputs of the step that failed.
         beyond = jnp.arange(save_every, length + 1, save_every) > course.step
         number = jnp.where(beyond, jnp.minimum(course.step, length - 1), slots.step[picked])
@@ -87,7 +97,7 @@ def _rollout(
             lambda x, last: jax.vmap(jnp.where, (0, None, 0))(beyond, last, x), starts, course.state
         )
         whole = jnp.zeros(()), jnp.ones(())
-        used = jax.vmap(lambda k, s: plan.inputs(parameters, k, s, *whole))(number, starts)
+        used = jax.vmap(lambda k, s: plan.inputs(system, parameters, k, s, *whole))(number, starts)
         if used.ndim == 3:
             used = jnp.einsum("j,kji->ki", jnp.asarray(tableau.b), used)
         code = keep(course.code, code)
@@ -170,18 +180,21 @@ def simulate(
 
     Args:
         system: compiled system.
-        state: initial state; its velocities should obey the constraints (see `assemble`).
+        state: initial state; its positions must obey joints, drives and couplings (looked at where there
+            are any of the latter or loops, in calls that are not being traced), its velocities should; see
+            `assemble`.
         dt: step [s].
         steps: number of steps; may be left out when `inputs` is an array.
         inputs: array (steps, inputs) [N, N m], held over each step; (inputs,) for constant ones; or a
-            function (t, state) -> (inputs,), evaluated at the start of each (sub)step. None: zero. Held
-            inputs that stand for smooth ones limit the order to two: give an array (steps, stages, inputs)
-            at the times `scheme.times` instead.
+            function (t, state) -> (inputs,), evaluated at the start of each (sub)step, for which velocities
+            obey the constraints (see `System.tangent`). None: zero. Held inputs that stand for smooth ones
+            limit the order to two: give an array (steps, stages, inputs) at the times `scheme.times` instead.
         save_every: save every so many steps; must divide `steps`.
         throw: raise on failure when called eagerly; inside jit, vmap or grad nothing is raised, see
             `Trajectory.result` and `System.explain`.
-        until: terminal event, a function of the state; the run stops after the step in which its sign
-            changes, and later states repeat the last one. Derivatives hold that step fixed.
+        until: terminal event, a function of the state, given like that of `inputs`; the run stops after the
+            step in which its sign changes, and later states repeat the last one. Derivatives hold that step
+            fixed.
         checkpoint: recompute in the backward pass: memory of a gradient grows with the root of `steps`.
         newton_tol: accuracy of Newton's iteration relative to the terms of the equations. The default is
             the floor of round-off; larger values are faster and let energy and momentum drift in proportion.
@@ -200,8 +213,14 @@ def simulate(
     Returns:
         Trajectory with `steps / save_every + 1` saved states.
 
+    Warns:
+        UserWarning: in an eager call, of a joint that turns so far in a step that its rate and its angle tell
+            different things, with the step to take: at order two from a radian on. What spins faster than
+            half a turn in a step has no angle.
+
     Raises:
-        ValueError: for a wrong dt, steps, tolerance, shape of inputs or state.
+        ValueError: for a wrong dt, steps, tolerance, shape of inputs or state, or a state that violates
+            a constraint, with its name and size.
         SimulationError: if the run fails and `throw` holds; it carries the trajectory computed so far.
 
     Example:
@@ -215,7 +234,8 @@ def simulate(
         (11, 4, 3)
     """
     check_state(system, state)
-    state = scheme.started(state)
+    check_obeyed(system, state)
+    state = scheme.started(replace_fields(state, held=None))
     step = checked_step(dt)
     checked, count = checked_inputs(system, inputs, steps, scheme.stages)
     if save_every < 1 or count % save_every:
@@ -238,4 +258,6 @@ def simulate(
         trajectory = _compiled(system, state, checked, step, tolerance, static)
     if throw and is_concrete(trajectory.result):
         system.raise_on_failure(trajectory)
+    if tolerance is None:
+        warn_of_far_turns(system, trajectory, step, int(save_every))
     return trajectory

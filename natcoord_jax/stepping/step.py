@@ -107,7 +107,7 @@ def end_of_step(
     dissipated = state.dissipated
     if tableau.dissipative:
         dissipated = found.given.loss + (0.0 if dissipated is None else dissipated)
-    after = State(state.t + h, q, v, coordinates, rotors, work, dissipated)
+    after = State(state.t + h, q, v, coordinates, rotors, work, dissipated, state.held)
     half_turn = _half_turn(at.spin[:, :bodies], h, tableau)
     if ends is not None:
         half_turn = jnp.where(ends.sound, half_turn, jnp.inf)

@@ -18,7 +18,7 @@ from natcoord_jax.assembly.balances import rotors_of
 from natcoord_jax.assembly.momentum import inertia, motion
 from natcoord_jax.assembly.system import System
 from natcoord_jax.core.state import State
-from natcoord_jax.stepping.newton import TOLERANCE
+from natcoord_jax.stepping.newton import CLEAR, TOLERANCE
 
 UNSOUND = 1e-12
 """Work of the residual in terms of the energy of the motion, twice, beyond which a step is refused."""
@@ -63,6 +63,7 @@ def sound(
     correction: Float[Array, ""],
     after: State,
     tolerance: float,
+    grain: Float[Array, ""] | float = 0.0,
 ) -> Bool[Array, ""]:
     """Whether a step keeps the balance of energy, as far as rounding of forces and of places lets it.
 
@@ -74,6 +75,7 @@ def sound(
         correction: that would follow (energy norm) [sqrt(J)].
         after: state at the end.
         tolerance: of Newton's iteration; a larger one than the default lets energy drift in proportion.
+        grain: size of the terms that cancel in the equations [sqrt(J)].
     """
     before, system = equations.state, equations.system
     moving = jnp.maximum(motion_of(system, before), motion_of(system, after))
@@ -82,5 +84,5 @@ def sound(
     allowed = max(tolerance / TOLERANCE, 1.0) * (UNSOUND * moving + rounding)
     rows = before.q.reshape(-1, 4, 3)
     places = jnp.sum(rows * inertia(system.mass, rows))
-    near = (equations.h * correction) ** 2 <= PLACES**2 * places
+    near = ((equations.h * correction) ** 2 <= PLACES**2 * places) | (correction <= CLEAR * grain)
     return near | (unbalanced_work(equations, y, residual) <= allowed)

@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 from natcoord_jax.maths.components import Triple, rows_of
 from natcoord_jax.maths.rotations import arctan_coefficients
 from natcoord_jax.maths.settled import settled
-from natcoord_jax.maths.vectors import safe_divide
+from natcoord_jax.maths.vectors import quotient
 
 
 class Logarithm(eqx.Module):
@@ -48,7 +48,7 @@ class Logarithm(eqx.Module):
     def of(cls, invariants: Float[Array, "7 *n"]) -> "Logarithm":
         """Of axial part and trace of the relative rotation and the relative place."""
         axial, trace, place = Triple.of(invariants[:3]), invariants[3], Triple.of(invariants[4:])
-        factor = safe_divide(2.0 * jnp.ones_like(trace), 1.0 + trace)
+        factor = quotient(2.0 * jnp.ones_like(trace), 1.0 + trace)
         k = axial * factor
         k, place, factor = settled((k, place, factor))
         x = settled(0.25 * k.dot(k))

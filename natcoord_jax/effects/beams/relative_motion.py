@@ -73,6 +73,9 @@ def strains_of(invariants: Float[Array, "7 *n"], length: Float[Array, "*n"]) -> 
 class BeamElement(Expanded):
     """Linearly elastic beam between two frames: energy l e . C e / 2 of the strains e = (Gamma, K).
 
+    The frames must stay less than half a turn apart: at half a turn the strain has no direction and is not a
+    number, beyond it is that of the rest of a turn.
+
     Attributes:
         markers: two attachments, the third axis along the tangent.
         length: l, of the unstressed piece of the reference curve [m].

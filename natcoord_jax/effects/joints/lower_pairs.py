@@ -6,13 +6,14 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from natcoord_jax.core.checks import positive
 from natcoord_jax.core.coordinate import Coordinate
 from natcoord_jax.core.effect import Effect, replace_fields
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.joint import Frame, Joint
 from natcoord_jax.effects.joints.coordinates import Angle, Displacement, Separation, UniversalAngle
 from natcoord_jax.effects.joints.relations import Coupling
-from natcoord_jax.maths.vectors import dot
+from natcoord_jax.maths.vectors import dot, safe_norm
 
 
 def _axis_parallel(parent: Frame, child: Frame) -> list[Array]:
@@ -180,7 +181,7 @@ class Distance(Joint):
     Attributes:
         point: point of the child, world coordinates of the assembled pose [m].
         parent_point: point of the parent [m].
-        length: length [m]; default that of the assembled pose.
+        length: length [m]; default that of the assembled pose; not zero, for which there is `Spherical`.
 
     Coordinate 0 is the distance [m].
     """
@@ -198,11 +199,14 @@ class Distance(Joint):
         return self.parent_point, self.point
 
     def initialise(self, parent: Frame, child: Frame) -> "Distance":
-        """With the length of the assembled pose where none was given."""
-        if self.length is not None:
-            return self
-        u = child.point - parent.point
-        return replace_fields(self, length=jnp.sqrt(dot(u, u)))
+        """With the length of the assembled pose where none was given.
+
+        Raises:
+            ValueError: for a length that is not positive: a rod without length has no direction.
+        """
+        length = safe_norm(child.point - parent.point) if self.length is None else self.length
+        positive(length, f"distance joint {self.name!r}: length", "m")
+        return replace_fields(self, length=length)
 
     def residual(self, parent: Frame, child: Frame) -> Array:
         """Half the difference of the squared lengths over the length [m]: scaled like a length."""

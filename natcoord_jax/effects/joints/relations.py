@@ -38,7 +38,7 @@ class Coupling(CoordinateConstraint):
     Attributes:
         joint: tuple of joint handles.
         factors: shape (c,), one a coordinate.
-        coordinate: tuple of indices, which coordinate of each joint.
+        coordinate: which coordinate of each joint, a tuple of indices or one index for all (default: 0).
         offset: right-hand side, in the unit of factor times coordinate [rad or m].
     """
 

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from natcoord_jax.core.coordinate import CoordinateForce, CoordinateInertia, CoordinatePotential
+from natcoord_jax.maths.vectors import positive_part
 
 
 class JointSpring(CoordinatePotential):
@@ -56,6 +57,9 @@ class JointPotential(CoordinatePotential):
 class JointStops(CoordinatePotential):
     """Stiff elastic stops: energy k s^2 / 2 of the excess s beyond `lower` or `upper`; conserves energy.
 
+    The force is continuous, its slope is not: it jumps from 0 to k. At the stop itself second derivatives of
+    the energy are those before contact, and derivatives of a motion that rests there hold to that side.
+
     Attributes:
         lower: lower stop [rad or m].
         upper: upper stop [rad or m].
@@ -70,8 +74,7 @@ class JointStops(CoordinatePotential):
 
     def energy(self, coordinate: Array) -> Array:
         """Energy [J]."""
-        below = jnp.maximum(self.lower - coordinate, 0.0)
-        above = jnp.maximum(coordinate - self.upper, 0.0)
+        below, above = positive_part(self.lower - coordinate), positive_part(coordinate - self.upper)
         return 0.5 * self.stiffness * (below**2 + above**2)
 
 

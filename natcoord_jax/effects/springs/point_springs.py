@@ -1,15 +1,20 @@
 """Springs and dampers between two points."""
 
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from natcoord_jax.core.force import Force, Load
 from natcoord_jax.core.markers import require_markers
 from natcoord_jax.core.potential import Potential
-from natcoord_jax.maths.vectors import dot, safe_divide, safe_norm, safe_sqrt
+from natcoord_jax.maths.vectors import dot, safe_divide, safe_norm
+
+COINCIDENT = 1e-12
+"""Distance [m] of points that coincide: what rounding leaves of none."""
 
 
 def _square(x: Array) -> Array:
@@ -17,8 +22,27 @@ def _square(x: Array) -> Array:
     return dot(u, u)[None]
 
 
+def energy_of_distance(law: Callable[[Array], Array], square: Float[Array, ""]) -> Float[Array, ""]:
+    """Energy [J] as a law of a distance [m], and its derivatives by the squared distance, at zero too.
+
+    A law that is even, such as k d^2 / 2, is a smooth function of the squared distance, though the distance
+    is none: where the points coincide its derivative by the square is half the law's second one. Of a law
+    with a slope at zero, a spring with an unstretched length, that is the even part: the force on points that
+    coincide has no direction, and is zero.
+    """
+    apart = square > COINCIDENT**2
+    still = jnp.maximum(jax.lax.stop_gradient(square), 0.0)
+    distance = jnp.where(apart, jnp.sqrt(jnp.where(apart, square, 1.0)), jnp.sqrt(still))
+    bend = jax.hessian(law)(jnp.full_like(square, COINCIDENT))
+    # The value is that of the law; along paths of several stages the square can fall a little below zero.
+    return law(distance) + jnp.where(apart, 0.0, 0.5 * bend * (square - still))
+
+
 class Spring(Potential):
     """Linear spring between two points: energy k (|u| - L)^2 / 2.
+
+    Smooth where the points coincide if L = 0, as of a mount or a bushing. With an unstretched length the
+    force has no direction there: it is taken as zero, its derivatives as those for L = 0.
 
     Attributes:
         markers: two points.
@@ -46,7 +70,7 @@ class Spring(Potential):
 
     def energy(self, invariants: Array) -> Array:
         """Energy [J]."""
-        return 0.5 * self.stiffness * (safe_sqrt(invariants[0]) - self.length) ** 2
+        return energy_of_distance(lambda d: 0.5 * self.stiffness * (d - self.length) ** 2, invariants[0])
 
 
 class QuadraticSpring(Potential):
@@ -80,6 +104,8 @@ class QuadraticSpring(Potential):
 class NonlinearSpring(Potential):
     """Spring between two points with any energy of its length.
 
+    A law whose slope is not zero at length zero gives no direction to the force there, see `Spring`.
+
     Attributes:
         markers: two points.
         law: function of the distance [m] to the energy [J], in jax.numpy.
@@ -99,11 +125,14 @@ class NonlinearSpring(Potential):
 
     def energy(self, invariants: Array) -> Array:
         """Energy [J]."""
-        return self.law(safe_sqrt(invariants[0]))
+        return energy_of_distance(self.law, invariants[0])
 
 
 class Damper(Force):
     """Viscous damper along the line between two points: force c d|u|/dt; keeps momentum and angular momentum.
+
+    The line has no direction where the points coincide: there the force is zero and has no derivatives, and
+    near there it depends on which side the points pass each other.
 
     Attributes:
         markers: two points.

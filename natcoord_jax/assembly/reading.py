@@ -1,0 +1,200 @@
+"""Velocities as they are read: the nearest to those of a state that the constraints admit.
+
+The energy-momentum step (57) keeps constraints in position only. With the mean velocity V of a step, which is
+tangent at its mid-point, it is v_1 = 2 V - v_0: what of v_0 is normal to the constraints is reversed in every
+step, with an amplitude of the order of h^2 at first, and more where a controller answers to it. States keep
+it, because the balances of energy and momentum hold with it to round-off. Readings leave it out,
+
+    minimise |v - v_read|_M,    G v_read + c_t = 0.
+
+Orthogonality in the mass matters. In M (v_1 - v_0) = h F the normal parts at both ends of a step act on the
+motion along the constraints by what the constraints turn over half a step, with opposite signs, which cancel.
+Relative rates of joints that are taken from v as it is have a part of the alternation instead.
+"""
+
+import math
+from collections.abc import Callable
+from contextvars import ContextVar
+from functools import partial
+from typing import Any, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.interpreters import partial_eval
+from jaxtyping import Array, Float
+
+from natcoord_jax.assembly.balances import Balances
+from natcoord_jax.assembly.diagnostics import states_of
+from natcoord_jax.assembly.rates import tree_rates
+from natcoord_jax.assembly.separate import SeparateTangents, separate
+from natcoord_jax.assembly.system import System
+from natcoord_jax.assembly.tangent_space import TangentSpace, Velocity
+from natcoord_jax.core.effect import replace_fields
+from natcoord_jax.core.host import on_host
+from natcoord_jax.core.state import State, Trajectory
+from natcoord_jax.maths.elimination import definite_inverse, definite_solution
+
+SHIFT = 1e-12
+"""Compliance that is added to constraints, relative, and refined away where they are independent. Where they
+are not, or close to singular positions (below a millionth of the others), they are left as they are."""
+ROUNDS = 4
+
+LARGEST = 10_000_000
+"""Numbers that are at hand at once when many states are read."""
+
+
+def tangent(system: System, state: State) -> State:
+    """One state with velocities that the constraints admit, the nearest in the metric of the mass."""
+    if not system.structure.unknowns:
+        return replace_fields(state, v=jnp.zeros_like(state.v), rates=jnp.zeros_like(state.rates))
+    find = _body_by_body if separate(system) else _together
+    found = find(system, state, Velocity(state.v.reshape(-1, 4, 3), state.rates))
+    return replace_fields(state, v=found.rows.reshape(state.v.shape), rates=found.rotors)
+
+
+def _less(v: Velocity, other: Velocity) -> Velocity:
+    return Velocity(v.rows - other.rows, v.rotors - other.rotors)
+
+
+def _body_by_body(system: System, state: State, v: Velocity) -> Velocity:
+    space = SeparateTangents.at(system, state)
+    w = space.by_body(tree_rates(system, state))
+    lost = space.framed(_less(v, space.spread(w)))
+    return space.spread(w + space.unframed(lost))
+
+
+def _together(system: System, state: State, v: Velocity) -> Velocity:
+    """A change of the rates of the tree, so that what is admissible stays as it is to the last digits."""
+    balances = Balances.at(system, state)
+    gains = balances.columns()
+    space, matrix = TangentSpace.without_frame(balances, gains)
+    w, rows = tree_rates(system, state), gains.constraints.T
+    impulse = space.pulled(space.impulse(_less(v, space.spread(w))))
+    if not rows.shape[0]:
+        return space.spread(w + definite_solution(matrix, impulse))
+    # Where all rows vanish, because the tree lets nothing move that they forbid, they are rounding.
+    size = sum(jnp.sum(x**2) for x in balances.constraints)
+    gap = -balances.rates(w).constraints
+    return space.spread(w + _constrained(matrix, rows, jnp.trace(matrix) / size, impulse, gap))
+
+
+def _constrained(
+    matrix: Float[Array, "u u"],
+    rows: Float[Array, "c u"],
+    weight: Float[Array, ""],
+    impulse: Float[Array, " u"],
+    gap: Float[Array, " c"],
+) -> Float[Array, " u"]:
+    """Solution x of A x - C^T lambda = impulse, C x = gap, whether or not rows of C depend on each other.
+
+    A is completed by C^T C, times a weight, which changes no solution: bodies may lack inertia along what
+    only loops forbid.
+    """
+    inverse = definite_inverse(matrix + weight * rows.T @ rows)
+    spread = inverse @ rows.T
+    shifted = definite_inverse(rows @ spread + SHIFT / weight * jnp.eye(rows.shape[0], dtype=rows.dtype))
+    x = inverse @ (impulse + weight * rows.T @ gap)
+    for _ in range(ROUNDS):
+        x = x + spread @ (shifted @ (gap - rows @ x))
+    return x
+
+
+@on_host
+def _every(system: System, states: State) -> State:
+    """The same of states along any leading axes, so many at a time that memory suffices."""
+    shape, read = states.t.shape, partial(tangent, system)
+    if system.mass.ndim > 3:
+        return jax.vmap(_every)(system, states)
+    if not shape:
+        return read(states)
+    bodies, unknowns, count = len(system.structure.bodies), system.structure.unknowns, math.prod(shape)
+    size = 0 if separate(system) else unknowns + system.structure.multipliers
+    together = max(1, LARGEST // (4 * size**2 + 24 * bodies * (size + 12)))
+    flat = jax.tree.map(lambda x: x.reshape(count, *x.shape[len(shape) :]), states)
+    if count <= together:
+        found = jax.vmap(read)(flat)
+    else:
+        found = jax.lax.map(read, flat, batch_size=together)
+    return jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), found)
+
+
+_handed: ContextVar[Any] = ContextVar("handed", default=None)
+"""Velocities of the state that a controller was handed: made tangent already, if they are to be."""
+
+
+class Source(eqx.Module):
+    """What is read: states of a system.
+
+    Attributes:
+        system: compiled system; with leading axes, too, if the whole went through `jax.vmap`.
+        states: along any leading axes.
+        as_they_are: whether velocities are read as the states have them: the scheme keeps them tangent, or
+            they are asked for as it leaves them.
+        inputs: at each of the states.
+    """
+
+    system: System
+    states: State
+    as_they_are: bool = eqx.field(static=True)
+    inputs: Float[Array, "*t inputs"] | None = None
+
+    @classmethod
+    def of(cls, system: System, motion: State | Trajectory, inputs: Array | None = None) -> "Source":
+        """That of a state or of a trajectory."""
+        states = states_of(motion)
+        if isinstance(motion, Trajectory):
+            as_they_are = motion.scheme is not None and not motion.scheme.loose
+        else:
+            as_they_are = motion.v is _handed.get()
+        return cls(system, states, as_they_are, inputs)
+
+    @property
+    def read(self) -> State:
+        """The states with the velocities that are read of them."""
+        return self.states if self.as_they_are else _every(self.system, self.states)
+
+    def each(self, function: Callable, *along: Any) -> Any:
+        """A function of system and state, and of more along the same axes, for all states as read."""
+        axes, lanes = self.states.t.ndim, self.system.mass.ndim - 3
+        for axis in range(axes):
+            own = 0 if axis >= axes - lanes else None
+            function = jax.vmap(function, in_axes=(own, 0, *(0 for _ in along)))
+        return function(self.system, self.read, *along)
+
+
+R = TypeVar("R")
+
+
+def over_source(function: Callable[[System, State], R]) -> Callable[[Source], R]:
+    """A function of a system and one state, as one of all states of a source as they are read."""
+    return on_host(lambda source: source.each(function))
+
+
+def tangent_states(system: System, motion: State | Trajectory) -> State:
+    """The states of a motion with velocities that obey the constraints; see `System.tangent`."""
+    return Source.of(system, motion).read
+
+
+def handing(function: Callable) -> Callable:
+    """The function of a state, its last argument, that reads velocities as this state has them."""
+
+    def call(*arguments: Any) -> Any:
+        before = _handed.set(arguments[-1].v)
+        try:
+            return function(*arguments)
+        finally:
+            _handed.reset(before)
+
+    return call
+
+
+def reads_velocities(function: Callable[[State], Any], state: State) -> bool:
+    """Whether what a function of a state gives depends on velocities; to find them takes time."""
+
+    def of_velocities(v: Array, rates: Array) -> Any:
+        return function(replace_fields(state, v=v, rates=rates))
+
+    program = jax.make_jaxpr(of_velocities)(state.v, state.rates).jaxpr
+    return bool(np.any(partial_eval.dce_jaxpr(program, [True] * len(program.outvars))[1]))

@@ -1,0 +1,215 @@
+"""By how much a state misses the constraints: of bodies, joints, and relations between joint coordinates."""
+
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from natcoord_jax.assembly.coordinates import velocities_with_ground
+from natcoord_jax.assembly.diagnostics import group_places, over_states, rows_with_ground
+from natcoord_jax.assembly.reading import Source, over_source
+from natcoord_jax.assembly.system import Group, System
+from natcoord_jax.core.effect import replace_fields
+from natcoord_jax.core.host import on_host
+from natcoord_jax.core.state import State, Trajectory
+
+GAP = 1e-9
+"""Largest violation [m, rad, -] and rate of it taken for round-off of printed data, per unit of size."""
+
+
+class ConstraintErrors(eqx.Module):
+    """Largest violations at each time.
+
+    Attributes:
+        directors: of d_i . d_j = delta_ij [-].
+        joints: of the joints' constraints [m, -].
+        relations: of drives, couplings and pitches of screws [rad, m].
+        source: whose velocities are judged: of a trajectory those that are read, of a state its own.
+    """
+
+    directors: Float[Array, "*t"]
+    joints: Float[Array, "*t"]
+    relations: Float[Array, "*t"]
+    source: Source
+
+    @property
+    def director_rates(self) -> Float[Array, "*t"]:
+        """Of the time derivatives of what holds for directors [1/s]."""
+        return _rates(self.source)[0]
+
+    @property
+    def joint_rates(self) -> Float[Array, "*t"]:
+        """Of those of the joints' constraints [m/s, 1/s]."""
+        return _rates(self.source)[1]
+
+    @property
+    def relation_rates(self) -> Float[Array, "*t"]:
+        """Of those of relations [rad/s, m/s]."""
+        return _rates(self.source)[2]
+
+    @property
+    def position(self) -> Float[Array, "*t"]:
+        """Largest violation of any constraint."""
+        return jnp.maximum(jnp.maximum(self.directors, self.joints), self.relations)
+
+    @property
+    def velocity(self) -> Float[Array, "*t"]:
+        """Largest violation of any constraint rate."""
+        directors, joints, relations = _rates(self.source)
+        return jnp.maximum(jnp.maximum(directors, joints), relations)
+
+
+def constrained(system: System) -> tuple[Group, ...]:
+    """All groups with constraints: relations between coordinates, then joints."""
+    return (*(g for g in system.effects if g.multipliers), *(g for g in system.joints if g.multipliers))
+
+
+def violations_of(system: System, groups: tuple[Group, ...], state: State) -> list[Float[Array, "n m"]]:
+    """Violations of the constraints of some groups."""
+    rows, found = rows_with_ground(state.q), []
+    for group in groups:
+        given = group_places(system, group), rows[group.bodies], state.coordinates[group.coordinates]
+        found.append(jax.vmap(lambda e, *x: e.violation(*x, state.t))(group.effect, *given))
+    return found
+
+
+def violation_rates_of(
+    system: System, groups: tuple[Group, ...], state: State, passing: float = 1.0
+) -> list[Float[Array, "n m"]]:
+    """Rates of the violations; with `passing` 0, of those at a fixed time."""
+    rows, found = rows_with_ground(state.q), []
+    rates, spin = velocities_with_ground(state.v, rows)
+    for group in groups:
+        given = (x[group.bodies] for x in (rows, rates, spin))
+        every = jax.vmap(lambda e, *x: e.violation_rate(*x, state.t, passing))
+        found.append(every(group.effect, group_places(system, group), *given))
+    return found
+
+
+def joint_residuals(system: System, state: State) -> list[tuple[Group, Array, Array]]:
+    """Residual and rate of every joint's constraints, by group."""
+    groups = system.joints
+    values, rates = violations_of(system, groups, state), violation_rates_of(system, groups, state)
+    return list(zip(groups, values, rates))
+
+
+@on_host
+def residuals(system: System, state: State) -> list[tuple[Array, Array]]:
+    """Residual and rate of every joint's constraints, in the order of the groups."""
+    return [(value, rate) for _, value, rate in joint_residuals(system, state)]
+
+
+def largest(groups: list[Array]) -> Float[Array, ""]:
+    """Largest absolute value in any of the arrays, zero without any; NaN where there is one."""
+    return jnp.max(jnp.concatenate([jnp.zeros(1), *(jnp.abs(x).reshape(-1) for x in groups)]))
+
+
+def _relations(system: System) -> tuple[Group, ...]:
+    return tuple(g for g in system.effects if g.multipliers)
+
+
+@over_states
+def _values(system: System, state: State) -> tuple[Array, Array, Array]:
+    d = state.q.reshape(-1, 4, 3)[:, 1:]
+    gram = jnp.einsum("bik,bjk->bij", d, d) - jnp.eye(3)
+    joints, relations = (
+        largest(violations_of(system, groups, state)) for groups in (system.joints, _relations(system))
+    )
+    return jnp.max(jnp.abs(gram)), joints, relations
+
+
+@over_source
+def _rates(system: System, state: State) -> tuple[Array, Array, Array]:
+    d, rates = (x.reshape(-1, 4, 3)[:, 1:] for x in (state.q, state.v))
+    mixed = jnp.einsum("bik,bjk->bij", d, rates)
+    joints, relations = (
+        largest(violation_rates_of(system, groups, state)) for groups in (system.joints, _relations(system))
+    )
+    return jnp.max(jnp.abs(mixed + jnp.swapaxes(mixed, 1, 2))), joints, relations
+
+
+def constraint_errors(system: System, motion: State | Trajectory) -> ConstraintErrors:
+    """Largest violations of internal constraints, joints and relations, and of their rates."""
+    source = Source.of(system, motion)
+    if isinstance(motion, State):
+        source = replace_fields(source, as_they_are=True)
+    return ConstraintErrors(*_values(system, motion), source)
+
+
+def position_size(state: State) -> Float[Array, ""]:
+    """What violations of positions are compared with."""
+    return 1.0 + jnp.max(jnp.abs(state.q)) + jnp.max(jnp.abs(state.coordinates), initial=0.0)
+
+
+def rate_size(state: State) -> Float[Array, ""]:
+    """What their rates are compared with."""
+    return 1.0 + jnp.max(jnp.abs(state.v))
+
+
+def misses(system: System, state: State) -> tuple[Array, Array]:
+    """Largest violation of any joint or relation and of their rates, in terms of `GAP` times the size."""
+    groups = constrained(system)
+    gap, rate = (
+        largest(violations_of(system, groups, state)),
+        largest(violation_rates_of(system, groups, state)),
+    )
+    return gap / (GAP * position_size(state)), rate / (GAP * rate_size(state))
+
+
+@on_host
+def _position_violations(system: System, state: State) -> tuple[list[Array], Array]:
+    return violations_of(system, constrained(system), state), position_size(state)
+
+
+@on_host
+def _rate_violations(system: System, state: State) -> tuple[list[Array], Array]:
+    return violation_rates_of(system, constrained(system), state), rate_size(state)
+
+
+@dataclass(frozen=True)
+class Violation:
+    """The constraint that a state violates most.
+
+    Attributes:
+        kind: of the part.
+        name: of the part.
+        size: of the violation, or of its rate.
+        unit: of the size.
+        is_joint: whether the part is a joint.
+    """
+
+    kind: str
+    name: str
+    size: float
+    unit: str
+    is_joint: bool
+
+    def __str__(self) -> str:
+        return f"{'joint' if self.is_joint else self.kind} {self.name!r}"
+
+
+def worst_violation(
+    system: System, state: State, *, rates: bool = False, allowed: float = GAP
+) -> Violation | None:
+    """The largest violation (or rate of one) of a concrete state beyond what is allowed, per unit of size."""
+    groups = constrained(system)
+    if not groups:
+        return None
+    listed, size = (_rate_violations if rates else _position_violations)(system, state)
+    found = [np.abs(np.asarray(x)) for x in listed]
+    sizes = [np.max(x) for x in found]
+    worst = int(np.argmax(sizes))
+    if not sizes[worst] > allowed * float(size):
+        return None
+    group = groups[worst]
+    instance, row = np.unravel_index(np.argmax(found[worst]), found[worst].shape)
+    places, rows = group_places(system, group)[instance], rows_with_ground(state.q)[group.bodies[instance]]
+    alone = jax.tree.map(lambda x: x[instance], group.effect)
+    unit = alone.violation_units(places, rows)[row]
+    if rates:
+        unit = "1/s" if unit == "-" else f"{unit}/s"
+    is_joint = group.source == "joint"
+    return Violation(group.effect.kind, group.names[instance], float(sizes[worst]), unit, is_joint)

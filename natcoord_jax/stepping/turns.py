@@ -1,0 +1,73 @@
+"""A look, after a run, at how far joints turn in a step."""
+
+import warnings
+
+import numpy as np
+from jaxtyping import Array, Float
+
+from natcoord_jax.assembly.system import System
+from natcoord_jax.core.checks import is_concrete
+from natcoord_jax.core.state import Trajectory
+
+FAR = {1: 1.0}
+"""Turn in a step [rad] by number of stages from which on the rate shown is off: by a tenth for one stage."""
+
+NEARLY_HALF = 2.5
+"""The same for more stages: by 4 %, and from half a turn on an angle cannot be told from one turned back."""
+
+MODEST = {1: 0.35}
+"""Turn in a step [rad] that is advised: the rate is within 1 %."""
+
+MODEST_OTHERWISE = 1.0
+"""The same for more stages: within 0.2 %."""
+
+
+def _turns(system: System, trajectory: Trajectory, every: int) -> Float[np.ndarray, " coordinates"]:
+    """Largest change in a step of the joint angles [rad], zero for displacements."""
+    angles = np.zeros(len(system.structure.coordinates), bool)
+    for group in system.coordinates:
+        if group.axis.unit == "rad":
+            angles[np.asarray(group.index)] = True
+    if not angles.any():
+        return np.zeros(0)
+    values = np.asarray(trajectory.states.coordinates)
+    changes = np.abs(np.diff(values, axis=0)) / every
+    return np.where(angles, np.max(changes, axis=0, where=np.isfinite(changes), initial=0.0), 0.0)
+
+
+def warn_of_far_turns(system: System, trajectory: Trajectory, dt: Float[Array, ""], every: int) -> None:
+    """Warn of a joint that turns so far in a step that its rate and its angle tell different things.
+
+    Over a step of one stage at the rate r, a body turns by the angle 2 atan(r h / 2): kept are energy and
+    momenta, thus the rate, not the phase.
+
+    Args:
+        system: that ran.
+        trajectory: what came of it; inside of a transformation nothing is looked at.
+        dt: step [s].
+        every: steps between saved states.
+    """
+    if not is_concrete(trajectory.states.coordinates, dt, system.coordinates):
+        return
+    turns, stages = _turns(system, trajectory, every), trajectory.scheme.stages
+    worst = int(np.argmax(turns)) if turns.size else 0
+    if not turns.size or turns[worst] <= FAR.get(stages, NEARLY_HALF):
+        return
+    turn, step = float(turns[worst]), float(dt)
+    name, number = system.structure.coordinates[worst]
+    several = sum(joint == name for joint, _ in system.structure.coordinates) > 1
+    angle = f"the angle {number} of joint {name!r}" if several else f"joint {name!r}"
+    gained = turn / step
+    if stages == 1:
+        shown = 2.0 * np.tan(0.5 * turn) / step
+        seen = f"the rate shows {shown:.4g} rad/s where the angle gains {gained:.4g} rad/s"
+    else:
+        shown = gained
+        seen = "the rate shows more than the angle gains, and beyond half a turn the angle is lost"
+    fitting = MODEST.get(stages, MODEST_OTHERWISE) / shown
+    higher = " or a scheme of higher order" if stages == 1 else ""
+    warnings.warn(
+        f"{angle} turns by {turn:.3g} rad in a step of {step:.4g} s, too far for order "
+        f"{trajectory.scheme.order}: {seen}; take dt = {fitting:.2g} s{higher}",
+        stacklevel=3,
+    )

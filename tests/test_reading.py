@@ -1,0 +1,233 @@
+"""Velocities as they are read: tangent, the nearest in the metric of the mass, and free of alternation.
+
+Could go wrong: a projection in another metric, or of bodies but not of rotors; drives and redundant loops
+left out; controllers, terminal events or derivatives that see other velocities than sensors do; states that
+a step goes on from, changed; projections in programs that read no velocity.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import tolerances as tol
+from differences import alternation
+
+import natcoord_jax as nc
+from natcoord_jax import gallery
+from natcoord_jax.assembly.coordinates import state_rates
+from natcoord_jax.assembly.diagnostics import joint_residuals
+from natcoord_jax.assembly.reading import reads_velocities
+
+AXES = [(0, 0, 1), (0, 1, 0), (0, 1, 0), (0, 0, 1), (0, 1, 0), (0, 0, 1)]
+LENGTHS, MASSES = (0.3, 0.4, 0.35, 0.2, 0.15, 0.1), (5, 4, 3, 1.5, 1, 0.5)
+TARGET = jnp.array([0.5, 0.6, -0.8, 0.3, 0.7, 0.2])
+STIFFNESS = jnp.array([5.0, 200, 100, 0.5, 3, 0.1])
+DAMPING = jnp.array([0.3, 20, 10, 0.05, 0.3, 0.01])
+ROTOR = 0.7
+
+
+def arm():
+    """Six slender links upon each other, a motor in every hinge."""
+    scene = nc.Scene()
+    scene.add(nc.Gravity())
+    z, parent, hinges = 0.0, nc.ground, []
+    for k, (length, mass) in enumerate(zip(LENGTHS, MASSES)):
+        radius = 0.05 - 0.005 * k
+        link = nc.RigidBody(
+            shape=nc.Cylinder(radius, length),
+            density=mass / (np.pi * radius**2 * length),
+            position=(0, 0, z + length / 2),
+            name=f"link {k + 1}",
+        )
+        link = scene.add(link)
+        hinges.append(scene.add(nc.Revolute(parent, link, point=(0, 0, z), axis=AXES[k], name=f"hinge {k}")))
+        scene.add(nc.JointTorque(hinges[-1], name=f"motor {k + 1}"))
+        z, parent = z + length, link
+    return *scene.compile(), hinges
+
+
+def test_rates_of_a_controlled_arm_do_not_alternate():
+    """What a controller answers to would be its own noise: 3.6 of 22 rad/s at the longest step, otherwise."""
+    system, state, hinges = arm()
+
+    def rates(state):
+        return jnp.stack([system.rate(state, hinge) for hinge in hinges])
+
+    def controller(t, state):
+        return STIFFNESS * (TARGET - state.coordinates) - DAMPING * rates(state)
+
+    for dt in (0.01, 0.005, 0.0025):
+        trajectory = nc.simulate(system, state, dt=dt, steps=200, inputs=controller)
+        found = np.stack([np.asarray(system.rate(trajectory, hinge)) for hinge in hinges], axis=1)
+        assert alternation(found[-40:], order=2) <= tol.ALTERNATION
+        assert float(system.constraint_errors(trajectory).velocity.max()) <= tol.TANGENT_OF_A_SMALL_SCENE
+        seen = jax.vmap(rates)(trajectory.states)
+        np.testing.assert_allclose(found, seen, atol=tol.TANGENT_OF_A_SMALL_SCENE)
+        wanted = jax.vmap(controller)(trajectory.t, trajectory.states)[:-1]
+        np.testing.assert_allclose(trajectory.inputs, wanted, atol=tol.TANGENT)
+
+
+def swinging(kind):
+    """A link on the ground and one on it, with a rotor, a drive or a loop."""
+    if kind == "loops":
+        example = gallery.load("four_bar")
+        return example.system, example.state
+    scene = nc.Scene()
+    scene.add(nc.Gravity())
+    part = {"inertia": (0.3, 0.4, 0.5), "com": (0.1, 0.0, -0.2)}
+    one = scene.add(nc.RigidBody(mass=2.0, position=(0, 0, -0.5), name="one", **part))
+    two = scene.add(nc.RigidBody(mass=1.0, position=(0.5, 0.2, -1.0), name="two", **part))
+    first = scene.add(nc.Revolute(nc.ground, one, axis=(0, 1, 0.2), name="first"))
+    second = scene.add(nc.Universal(one, two, (0.2, 0, -0.8), (1, 0, 0), second=(0, 1, 0), name="second"))
+    scene.add(nc.Armature(second, inertia=ROTOR, name="rotor"))
+    if kind == "drive":
+        scene.add(nc.Drive(first, function=lambda t: 0.8 * jnp.sin(2.0 * t), name="drive"))
+    return scene.compile(assemble=True)
+
+
+def nearest(system, state):
+    """The same from all constraints at once, by NumPy: none of them is solved in advance."""
+
+    def broken(numbers):
+        v, rotors = numbers[: state.v.size].reshape(state.v.shape), numbers[state.v.size :]
+        moving = eqx.tree_at(lambda s: (s.v, s.rates), state, (v, rotors))
+        d, turning = (x.reshape(-1, 4, 3)[:, 1:] for x in (state.q, v))
+        mixed = jnp.einsum("bik,bjk->bij", d, turning)
+        found, along = [(mixed + jnp.swapaxes(mixed, 1, 2)).reshape(-1)], state_rates(system, moving)
+        found += [rate.reshape(-1) for _, _, rate in joint_residuals(system, moving)]
+        for group in system.effects:
+            if group.multipliers:
+                found.append(along[group.coordinates[:, 0]] - 1.6 * jnp.cos(2.0 * state.t))
+            if group.effect.rotors:
+                found.append(along[group.coordinates[:, 0]] - rotors[group.rotors[:, 0]])
+        return jnp.concatenate(found)
+
+    numbers = jnp.concatenate([state.v.reshape(-1), state.rates])
+    still, rows = broken(jnp.zeros_like(numbers)), jax.jacfwd(broken)(numbers)
+    bodies, count = len(system.structure.bodies), rows.shape[0]
+    mass = np.zeros((numbers.size, numbers.size))
+    for k in range(bodies):
+        mass[12 * k : 12 * k + 12, 12 * k : 12 * k + 12] = np.kron(np.asarray(system.mass[k]), np.eye(3))
+    mass[12 * bodies :, 12 * bodies :] = ROTOR * np.eye(state.rates.size)
+    # Of rods and redundant constraints any solution is one.
+    matrix = np.block([[mass, rows.T], [np.asarray(rows), np.zeros((count, count))]])
+    right = np.concatenate([mass @ numbers, -still])
+    return np.linalg.lstsq(matrix, right, rcond=1e-12)[0][: numbers.size]
+
+
+@pytest.mark.parametrize("kind", ["rotor", "drive", "loops"])
+def test_the_nearest_velocities_that_the_constraints_admit(kind):
+    system, state = swinging(kind)
+    trajectory = nc.simulate(system, state, dt=0.02, steps=20)
+    read = system.tangent(trajectory)
+    assert float(system.constraint_errors(trajectory.states).velocity.max()) > tol.TANGENT
+    assert float(system.constraint_errors(read).velocity.max()) <= tol.TANGENT_OF_A_SMALL_SCENE
+    for k in (0, 7, 20):
+        state, found = (jax.tree.map(lambda x, k=k: x[k], s) for s in (trajectory.states, read))
+        numbers = np.concatenate([found.v.reshape(-1), found.rates])
+        np.testing.assert_allclose(numbers, nearest(system, state), atol=tol.TANGENT)
+    # What is admissible stays, and energies are those of the states as they are.
+    again = system.tangent(read)
+    np.testing.assert_allclose(again.v, read.v, atol=tol.TANGENT_OF_A_SMALL_SCENE)
+    kinetic = np.asarray(system.energy(trajectory).kinetic)
+    assert np.all(np.asarray(system.energy(read).kinetic) <= kinetic * (1 + 1e-14)) or kind == "drive"
+    if kind == "drive":
+        wanted = 1.6 * np.cos(2.0 * np.asarray(trajectory.t))
+        np.testing.assert_allclose(system.rate(trajectory, "first"), wanted, atol=tol.TANGENT)
+
+
+def test_the_step_of_the_paper_as_it_stands():
+    """The same states to the last digit, and readings of them as they are."""
+    system, state = swinging("rotor")
+    plain = nc.simulate(system, state, dt=0.02, steps=20)
+    paper = nc.simulate(system, state, dt=0.02, steps=20, scheme=nc.EnergyMomentum(kick=False))
+    np.testing.assert_array_equal(plain.v, paper.v)
+    np.testing.assert_array_equal(system.tangent(paper).v, paper.v)
+    assert float(system.constraint_errors(paper).velocity.max()) > tol.TANGENT
+    errors = system.constraint_errors(plain.states).velocity
+    np.testing.assert_array_equal(system.constraint_errors(paper).velocity, errors)
+
+
+def test_whoever_is_given_a_state_is_given_tangent_velocities():
+    """By `state.v`, too."""
+    system, state = swinging("rotor")
+
+    def until(state):
+        return jnp.max(system.constraint_errors(state).velocity) - tol.TANGENT
+
+    states = nc.simulate(system, state, dt=0.02, steps=5).states
+    assert float(until(jax.tree.map(lambda x: x[-1], states))) > 0
+    found = nc.simulate(system, state, dt=0.02, steps=5, until=until)
+    assert int(found.steps_taken) == 5, "the event was given velocities across the constraints"
+
+
+def test_velocities_that_nobody_reads_are_not_made():
+    system, state = swinging("rotor")
+    for function, wanted in (
+        (lambda state: state.coordinates, False),
+        (lambda state: jnp.where(state.t > 1.0, 0.0, system.rate(state, "first")), True),
+        (lambda state: jax.lax.fori_loop(0, 2, lambda k, x: x + state.q[0], jnp.zeros(3)), False),
+        (lambda state: jax.jit(lambda s: (s.q, s.rates))(state)[1], True),
+        (lambda state: jax.jit(lambda s: (s.q, s.rates))(state)[0], False),
+    ):
+        assert reads_velocities(function, state) is wanted
+
+
+def pendulum():
+    scene = nc.Scene()
+    scene.add(nc.Gravity())
+    part = {"inertia": (0.3, 0.4, 0.5), "com": (0.1, 0.05, -0.4), "angular_velocity": (0, 2.0, 0.4)}
+    arm = scene.add(nc.RigidBody(mass=2.0, name="arm", **part))
+    hinge = scene.add(nc.Revolute(nc.ground, arm, axis=(0, 1, 0.2), name="hinge"))
+    scene.add(nc.JointTorque(hinge, name="motor"))
+    return *scene.compile(), hinge
+
+
+def test_derivatives_through_a_controller_that_reads_rates():
+    """By its gain, by the mass, which is in the projection, too, and by the start; both ways."""
+    system, state, hinge = pendulum()
+    rng = np.random.default_rng(0)
+    across = jnp.asarray(0.1 * rng.normal(size=state.v.shape))
+
+    def last(x):
+        shares = 1.0 + x[1] * jnp.diag(jnp.arange(4.0))
+        heavier = eqx.tree_at(lambda s: s.mass, system, system.mass * shares)
+        pushed = eqx.tree_at(lambda s: s.v, state, state.v + x[2] * across)
+
+        def controller(t, state):
+            read = heavier.tangent(state).v
+            return -(x[0] * heavier.rate(state, hinge) + 0.1 * read[1, 2])[None]
+
+        end = nc.simulate(heavier, pushed, dt=0.05, steps=20, inputs=controller)
+        return heavier.rate(end, hinge)[-1] + end.states.coordinates[-1, 0]
+
+    at, h = jnp.array([0.7, 0.01, 0.5]), 1e-3
+    value = jax.jit(last)
+    shifts = [[float(value(at.at[k].add(m * h))) for m in (-2, -1, 1, 2)] for k in range(3)]
+    wanted = [(8 * (x[2] - x[1]) - (x[3] - x[0])) / (12 * h) for x in shifts]
+    assert np.min(np.abs(wanted)) > 1e-3
+    gradient = jax.jit(jax.grad(last))(at)
+    np.testing.assert_allclose(gradient, wanted, rtol=tol.DIFFERENCE_BEST)
+    along = jnp.array([0.3, -0.2, 0.5])
+    tangent = jax.jit(lambda x: jax.jvp(last, (x,), (along,))[1])(at)
+    scale = np.abs(gradient) @ np.abs(along)
+    np.testing.assert_allclose(tangent, gradient @ along, atol=tol.SAME_GRADIENT * scale)
+
+
+def test_lanes_of_a_batch_are_read_as_they_are_alone():
+    system, state, hinge = pendulum()
+
+    def run(dt):
+        return nc.simulate(system, state, dt=dt, steps=20, inputs=lambda t, s: -system.rate(s, hinge)[None])
+
+    lengths = jnp.array([0.02, 0.05])
+    found = jax.vmap(run)(lengths)
+    rates = jax.vmap(lambda trajectory: system.sense(trajectory, hinge).rates)(found)
+    np.testing.assert_allclose(system.sense(found, hinge).rates, rates, atol=tol.TANGENT_OF_A_SMALL_SCENE)
+    one = system.sense(run(lengths[1]), hinge)
+    np.testing.assert_allclose(rates[1], one.rates, atol=tol.TANGENT_OF_A_SMALL_SCENE)
+    # A sensor that comes out of a batch has a batch of systems.
+    sensors, wanted = jax.vmap(lambda x: system.sense(x, "arm"))(found), system.sense(found, "arm")
+    spins = sensors.angular_velocity, wanted.angular_velocity
+    np.testing.assert_allclose(*spins, atol=tol.TANGENT_OF_A_SMALL_SCENE)
