@@ -168,7 +168,9 @@ class Scene:
             )
         return store[handle.name]
 
-    def compile(self, *, assemble: bool = False, solver: str | None = None) -> tuple[System, State]:
+    def compile(
+        self, *, assemble: bool = False, solver: str | None = None, t: Any = 0.0
+    ) -> tuple[System, State]:
         """Compile to a system (parameters and structure) and its initial state.
 
         Args:
@@ -177,6 +179,7 @@ class Scene:
                 a warning (inside jit: without one).
             solver: "reduced", "recursive", "sparse" or "full"; default chosen from the structure (see
                 `System.report`).
+            t: time of the initial state [s], at which drives are and loads begin.
 
         Raises:
             ValueError: for an empty scene, a gap in a joint (with its name and size), a body without inertia
@@ -187,6 +190,7 @@ class Scene:
         if solver not in (None, "reduced", "recursive", "sparse", "full"):
             raise ValueError(f'solver is {solver!r}; pass "reduced", "recursive", "sparse", "full" or None')
         system, state = build(self.bodies, self.joints, self.effects, solver)
+        state = state.at_time(t)
         if assemble:
             state = assemble_state(system, state)
         if not is_concrete(system, state):

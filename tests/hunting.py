@@ -41,6 +41,7 @@ class Template:
         rtol: of error control.
         until: event.
         more: modes besides forward and reverse.
+        exhaustive: whether its programs take too long to compile for the slow suite.
     """
 
     name: str
@@ -52,6 +53,7 @@ class Template:
     until: Callable | None = None
     steps: int = STEPS
     more: tuple[str, ...] = ()
+    exhaustive: bool = False
 
     @property
     def options(self) -> dict:

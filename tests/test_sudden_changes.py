@@ -172,7 +172,8 @@ def test_links_hit_their_stops_in_every_form(links, solver):
         np.testing.assert_allclose(found / scale, jnp.sum(terms[1]) / scale, atol=SAME_GRADIENT)
 
 
-def test_a_step_repeated_at_the_end_of_a_round(bounce):
+@pytest.mark.slow
+def test_a_step_repeated_at_the_end_of_a_round():
     """Sweeps see 32 slots at once: a rejected one may be the first or the last of them."""
     system, state, slide = wall()
     changed = number_of(system, "joint stops")
@@ -190,7 +191,9 @@ def test_a_step_repeated_at_the_end_of_a_round(bounce):
         np.testing.assert_allclose(forward(1.0, 1e5, place), -1.0, atol=EXACT_GRADIENT)
 
 
-@pytest.mark.parametrize("mode", ["reverse", "forward", "many"])
+@pytest.mark.parametrize(
+    "mode", ["reverse", *(pytest.param(x, marks=pytest.mark.slow) for x in ("forward", "many"))]
+)
 def test_what_cannot_be_solved_is_no_number(bounce, monkeypatch, mode):
     """A derivative whose linear systems are not solved is NaN, in every mode, and not some number."""
     monkeypatch.setattr(correcting, "CORRECTIONS", 0)

@@ -135,3 +135,6 @@ DIFFERENCE_OF_A_SUDDEN_MOTION = 1e-6
 SPREAD_OF_DIFFERENCES = 1e-3
 # Solutions of a step's equations against Newton's iteration with their whole Jacobian, relative to 1 + |x|.
 SAME_SOLUTION = 1e-10
+
+# What moves by rounding alone: places of a metre and less, over a few dozen steps; found: 7e-16.
+AT_REST = 2e-14

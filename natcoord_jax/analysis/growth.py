@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from natcoord_jax.assembly.system import System
+from natcoord_jax.core.compiled import compiled
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.results import Result
 from natcoord_jax.core.state import State
@@ -61,7 +62,7 @@ class Growth(eqx.Module):
         return "\n".join(lines)
 
 
-@eqx.filter_jit
+@compiled
 def _grown(
     system: System,
     state: State,

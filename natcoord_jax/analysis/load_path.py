@@ -19,6 +19,7 @@ from natcoord_jax.analysis.statics import (
     largest,
 )
 from natcoord_jax.assembly.system import System
+from natcoord_jax.core.callables import Function
 from natcoord_jax.core.checks import as_array, at_top_level, is_concrete, positive
 from natcoord_jax.core.compiled import briefly
 from natcoord_jax.core.effect import replace_fields
@@ -44,7 +45,7 @@ class _Path(eqx.Module):
     system: System
     scale: Float[Array, ""]
     extent: Float[Array, ""]
-    inputs: Callable[[Array], Array] = eqx.field(static=True)
+    inputs: Callable[[Array], Array]
 
     def product(self, one: tuple[Array, Array], other: tuple[Array, Array]) -> Array:
         """Product of two increments (displacements and rotations, load): mean squares over the bodies."""
@@ -178,7 +179,7 @@ def load_path(
     """
     positive(arc, "load path: arc", "-")
     count = len(system.structure.inputs)
-    channels = inputs if inputs is not None else _Zero(count)
+    channels = Function.of(inputs, state.t) if inputs is not None else _Zero(count)
     sizes = as_array(arc, float), as_array(scale, float)
     with_derivatives = not at_top_level(system, state, sizes)
     found = _followed(system, state, *sizes, steps, channels, with_derivatives)

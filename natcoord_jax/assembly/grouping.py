@@ -1,29 +1,19 @@
 """Stacking of equal kinds: one group for all instances that share class, structure and shapes."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from natcoord_jax.assembly.collection import Collection
 from natcoord_jax.assembly.system import Group
-from natcoord_jax.core.checks import as_array, check_fields
+from natcoord_jax.core.callables import Function
+from natcoord_jax.core.checks import NUMERIC, as_array, check_fields, shape_of
 from natcoord_jax.core.effect import Effect, replace_fields
 from natcoord_jax.core.host import stacked
-
-
-class CompiledFunction(eqx.Module):
-    """A plain function as a static part of an effect: compiled in, compared by identity."""
-
-    function: Callable = eqx.field(static=True)
-
-    def __call__(self, *args: Any) -> Any:
-        """The function's value."""
-        return self.function(*args)
 
 
 @dataclass
@@ -50,6 +40,7 @@ def bare(effect: Effect, drop: Sequence[str], label: str) -> Effect:
         ValueError: if a field is neither number nor function, or not finite.
     """
     effect = replace_fields(effect, **dict.fromkeys(drop))
+    effect = replace_fields(effect, **{f.name: _as_one(getattr(effect, f.name)) for f in fields(effect)})
     check_fields(effect, label)
 
     def leaf(value: Any) -> Any:
@@ -63,10 +54,20 @@ def bare(effect: Effect, drop: Sequence[str], label: str) -> Effect:
         if isinstance(value, int | float | np.number):
             return as_array(value, float)
         if callable(value):
-            return CompiledFunction(value)
+            return Function.of(value)
         raise ValueError(f"{label}: cannot use {value!r} as a parameter; pass numbers, arrays or functions")
 
     return jax.tree.map(leaf, effect)
+
+
+def _as_one(value: Any) -> Any:
+    """A tuple of numbers as one array; anything else as it is."""
+    if not isinstance(value, tuple | list):
+        return value
+    leaves = jax.tree.leaves(value)
+    if not leaves or not all(isinstance(x, NUMERIC) and not isinstance(x, bool) for x in leaves):
+        return value
+    return value if shape_of(value) is None else as_array(value, float)
 
 
 def families(instances: list[Instance]) -> list[list[Instance]]:

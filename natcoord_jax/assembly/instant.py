@@ -17,6 +17,7 @@ from natcoord_jax.assembly.diagnostics import states_of
 from natcoord_jax.assembly.rates import Twists, tree_rates
 from natcoord_jax.assembly.reading import Source
 from natcoord_jax.assembly.system import System
+from natcoord_jax.core.compiled import compiled
 from natcoord_jax.core.state import State, Trajectory
 
 SHIFT = 1e-7
@@ -203,7 +204,7 @@ def inputs_along(system: System, motion: State | Trajectory, inputs: Any) -> Flo
     return jnp.broadcast_to(given, (*leading, count))
 
 
-@eqx.filter_jit
+@compiled
 def instants(source: Source) -> Instant:
     """Accelerations and reactions at all states of a source."""
     return source.each(instant_of, source.inputs)

@@ -15,7 +15,7 @@ Relative rates of joints that are taken from v as it is have a part of the alter
 import math
 from collections.abc import Callable
 from contextvars import ContextVar
-from functools import partial
+from functools import partial, wraps
 from typing import Any, TypeVar
 
 import equinox as eqx
@@ -23,18 +23,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.interpreters import partial_eval
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
-from natcoord_jax.assembly.balances import Balances
-from natcoord_jax.assembly.diagnostics import states_of
-from natcoord_jax.assembly.rates import tree_rates
-from natcoord_jax.assembly.separate import SeparateTangents, separate
+from natcoord_jax.assembly.balances import Balances, loops_of, relations_of, rotors_of
+from natcoord_jax.assembly.diagnostics import rows_with_ground, states_of
+from natcoord_jax.assembly.momentum import inertia, spatial_inertia, wrench
+from natcoord_jax.assembly.rates import joint_axes, row_rates, tree_rates
 from natcoord_jax.assembly.system import System
 from natcoord_jax.assembly.tangent_space import TangentSpace, Velocity
+from natcoord_jax.assembly.tree import SLOTS
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.host import on_host
 from natcoord_jax.core.state import State, Trajectory
+from natcoord_jax.linsolve.tree import TreeBlocks, factor, handed_up, passed_down
 from natcoord_jax.maths.elimination import definite_inverse, definite_solution
+from natcoord_jax.maths.vectors import cross, skew
 
 SHIFT = 1e-12
 """Compliance that is added to constraints, relative, and refined away where they are independent. Where they
@@ -49,20 +52,64 @@ def tangent(system: System, state: State) -> State:
     """One state with velocities that the constraints admit, the nearest in the metric of the mass."""
     if not system.structure.unknowns:
         return replace_fields(state, v=jnp.zeros_like(state.v), rates=jnp.zeros_like(state.rates))
-    find = _body_by_body if separate(system) else _together
+    find = _along_the_tree if _by_body(system) else _together
     found = find(system, state, Velocity(state.v.reshape(-1, 4, 3), state.rates))
     return replace_fields(state, v=found.rows.reshape(state.v.shape), rates=found.rotors)
+
+
+def _by_body(system: System) -> bool:
+    """Whether rates are found from body to body: in trees so large that steps are solved so, too.
+
+    In small ones, and where more than the joints of the tree couples velocities, they are all found together.
+    """
+    coupled = relations_of(system) or loops_of(system) or rotors_of(system)
+    return system.structure.solver == "recursive" and not coupled
 
 
 def _less(v: Velocity, other: Velocity) -> Velocity:
     return Velocity(v.rows - other.rows, v.rotors - other.rotors)
 
 
-def _body_by_body(system: System, state: State, v: Velocity) -> Velocity:
-    space = SeparateTangents.at(system, state)
-    w = space.by_body(tree_rates(system, state))
-    lost = space.framed(_less(v, space.spread(w)))
-    return space.spread(w + space.unframed(lost))
+def _along_the_tree(system: System, state: State, v: Velocity) -> Velocity:
+    """By elimination from body to body, at a cost in proportion to their number."""
+    tree, rows = system.tree, state.q.reshape(-1, 4, 3)
+    blocks, present = _spatial(system, rows)
+    across, own = blocks.spread[:, :, :6], blocks.spread[:, :, 6:]
+    places = tree.slot_index[:, np.array(tree.slots, int)]
+    w = jnp.where(present, tree_rates(system, state).at[places].get(mode="fill", fill_value=0.0), 0.0)
+
+    def moving(w: Float[Array, "bodies m"]) -> Float[Array, "bodies 4 3"]:
+        twists = passed_down(across, jnp.sum(own * w[:, None], axis=2), tree.parent)[:-1]
+        return row_rates(rows, twists[:, :3], twists[:, 3:])
+
+    lost = inertia(system.mass, v.rows - moving(w))
+    loads = jnp.concatenate([x[0] for x in wrench(lost[None], rows[None, :, 1:])], axis=1)
+    upward = jnp.swapaxes(across, 1, 2)
+    loads = loads + handed_up(upward, jnp.sum(upward * loads[:, None], axis=2), tree.parent)
+    change = factor(blocks)[0].solve(jnp.sum(own * loads[:, :, None], axis=1))
+    return Velocity(moving(w + change), v.rotors)
+
+
+def _spatial(system: System, rows: Float[Array, "bodies 4 3"]) -> tuple[TreeBlocks, Bool[Array, "bodies m"]]:
+    """Inertia of the free motions by body, from twists of the bodies, and which of the slots a body has."""
+    tree, slots = system.tree, np.array(system.tree.slots, int)
+    axes, points = joint_axes(system, rows)
+    present = tree.slot_index[:, slots] < tree.slot_of.shape[0]
+    axis, turning = jnp.where(present[..., None], axes[:, slots], 0.0), (slots < 3) | (slots == SLOTS - 1)
+    velocity = jnp.where(turning[:, None], cross(axis, (rows[:, 0] - points)[:, None]), axis)
+    own = jnp.concatenate([velocity, jnp.where(turning[:, None], axis, 0.0)], axis=2)
+    count, unit = rows.shape[0], jnp.eye(3, dtype=rows.dtype)
+    arm = rows[:, 0] - rows_with_ground(rows.reshape(-1, 3))[tree.parent, 0]
+    across = jnp.broadcast_to(jnp.eye(6, dtype=rows.dtype), (count, 6, 6)).at[:, :3, 3:].set(-skew(arm))
+    # A unit inertia for turns of point masses, which nothing else sees.
+    idle = jnp.where(jnp.trace(system.mass[:, 1:, 1:], axis1=1, axis2=2) <= 0, 1.0, 0.0)
+    masses = spatial_inertia(system.mass, rows[:, 1:], rows[:, 1:])
+    masses = masses.at[:, 3:, 3:].add(idle[:, None, None] * unit)
+    absent = jnp.where(present, 0.0, 1.0)[:, None] * jnp.eye(slots.size, dtype=rows.dtype)
+    rest = jnp.zeros((count, 6 + slots.size, 6 + slots.size), rows.dtype).at[:, 6:, 6:].set(absent)
+    spread = jnp.concatenate([across, jnp.swapaxes(own, 1, 2)], axis=2)
+    gather = jnp.swapaxes(spread, 1, 2)
+    return TreeBlocks(masses, spread, gather, rest, tree.parent, slots.size), present
 
 
 def _together(system: System, state: State, v: Velocity) -> Velocity:
@@ -110,7 +157,7 @@ def _every(system: System, states: State) -> State:
     if not shape:
         return read(states)
     bodies, unknowns, count = len(system.structure.bodies), system.structure.unknowns, math.prod(shape)
-    size = 0 if separate(system) else unknowns + system.structure.multipliers
+    size = 0 if _by_body(system) else unknowns + system.structure.multipliers + system.structure.rotors
     together = max(1, LARGEST // (4 * size**2 + 24 * bodies * (size + 12)))
     flat = jax.tree.map(lambda x: x.reshape(count, *x.shape[len(shape) :]), states)
     if count <= together:
@@ -177,9 +224,16 @@ def tangent_states(system: System, motion: State | Trajectory) -> State:
     return Source.of(system, motion).read
 
 
-def handing(function: Callable) -> Callable:
-    """The function of a state, its last argument, that reads velocities as this state has them."""
+def handing(function: Any) -> Any:
+    """The function of a state, its last argument, that reads velocities as this state has them.
 
+    What is no function stays as it is. A module with numbers of its own does, too: it reads velocities that
+    are tangent already, and makes them so once more.
+    """
+    if isinstance(function, eqx.Module) or not callable(function):
+        return function
+
+    @wraps(function)
     def call(*arguments: Any) -> Any:
         before = _handed.set(arguments[-1].v)
         try:

@@ -17,10 +17,12 @@ from natcoord_jax.assembly.diagnostics import group_places, over_states, rows_wi
 from natcoord_jax.assembly.instant import inputs_along, instants
 from natcoord_jax.assembly.reading import Source, over_source
 from natcoord_jax.assembly.system import System
+from natcoord_jax.core.compiled import compiled
 from natcoord_jax.core.handles import Handle, ground
 from natcoord_jax.core.markers import Marker
 from natcoord_jax.core.state import State, Trajectory
 from natcoord_jax.maths.rotations import angular_velocity, to_quaternion
+from natcoord_jax.maths.vectors import cross
 
 
 class BodySensor(eqx.Module):
@@ -80,6 +82,7 @@ class JointSensor(eqx.Module):
         index: number of the joint.
         places: of its coordinates among those of all joints.
         source: what the sensor looks at.
+        lever: from the point that torques are about to the joint's point on the child [m]; None: that is it.
     """
 
     coordinates: Float[Array, "*t n"]
@@ -88,6 +91,7 @@ class JointSensor(eqx.Module):
     index: int = eqx.field(static=True)
     places: tuple[int, ...] = eqx.field(static=True)
     source: Source
+    lever: Float[Array, "*t 3"] | None = None
 
     @property
     def rates(self) -> Float[Array, "*t n"]:
@@ -152,8 +156,10 @@ class JointSensor(eqx.Module):
 
     @property
     def torque(self) -> Float[Array, "*t 3"]:
-        """Reaction torque on the child about the joint's point on the child [N m], world components."""
-        return instants(self.source).torques[..., self.index, :]
+        """Reaction torque on the child [N m], world components: about the joint's point on it, or `about`."""
+        found = instants(self.source)
+        torque = found.torques[..., self.index, :]
+        return torque if self.lever is None else torque + cross(self.lever, found.forces[..., self.index, :])
 
 
 class MarkerSensor(eqx.Module):
@@ -203,7 +209,7 @@ def _continuous(quaternions: Float[Array, "*t 4"], along: bool) -> Float[Array, 
     return quaternions.at[..., 1:, :].multiply(flips[..., None])
 
 
-@eqx.filter_jit
+@compiled
 def _body_pose(system: System, states: State, index: Array, along: bool) -> tuple[Array, ...]:
     shape = (*states.t.shape, len(system.structure.bodies), 4, 3)
     rows = states.q.reshape(shape)[..., index, :, :]
@@ -277,7 +283,7 @@ def _readings(system: System, states: State, names: tuple[str, ...]) -> Any:
     return _all_readings(system, states, number, chosen)
 
 
-@eqx.filter_jit
+@compiled
 def _all_readings(system: System, states: State, number: int, chosen: Array) -> Any:
     group = system.effects[number]
     places = group_places(system, group)[chosen]
@@ -290,6 +296,22 @@ def _all_readings(system: System, states: State, number: int, chosen: Array) -> 
     return over_states(one)(system, states)
 
 
+def _lever(system: System, states: State, index: int, about: Any, state: State | None) -> Array:
+    """From a point to that of a joint on its child."""
+    child, weights = int(np.asarray(system.joint_bodies)[index, 1]), system.frames[index, 1, 0]
+    joint = weights[1:] if child == len(system.structure.bodies) else _weighted(weights, states.q, child)
+    if isinstance(about, Marker):
+        if not about.is_point:
+            raise ValueError(f"about is a direction, {about!r}; pass a point [m], or nc.Point")
+        weights, body = marker_weights(system, about, state)
+        still = body == len(system.structure.bodies)
+        return joint - (weights[1:] if still else _weighted(weights, states.q, body))
+    point, leading = jnp.asarray(about, float), states.t.shape
+    if point.shape not in ((3,), (*leading, 3)):
+        raise ValueError(f"about [m] has shape {point.shape}; pass (3,) or {(*leading, 3)}, or nc.Point")
+    return joint - point
+
+
 def sense(
     system: System,
     motion: State | Trajectory,
@@ -297,9 +319,13 @@ def sense(
     *,
     inputs: Any = None,
     state: State | None = None,
+    about: Any = None,
 ) -> Any:
     """Sensor of a body, a joint, a marker or elements of beams; see `System.sense`."""
     states = states_of(motion)
+    named = part.name if isinstance(part, Handle) else part
+    if about is not None and (not isinstance(named, str) or named not in system.structure.joints):
+        raise ValueError(f"{part!r} has no reaction about a point: pass `about` with a joint")
     source = Source.of(system, motion, inputs_along(system, motion, inputs))
     if isinstance(part, Marker):
         weights, body = marker_weights(system, part, state)
@@ -323,7 +349,9 @@ def sense(
     if name and name in system.structure.joints:
         index, places, units = joint_coordinates(system, name)
         chosen = np.array(places, int)
-        return JointSensor(states.coordinates[..., chosen], units, name, index, tuple(places), source)
+        lever = None if about is None else _lever(system, states, index, about, state)
+        chosen = states.coordinates[..., chosen]
+        return JointSensor(chosen, units, name, index, tuple(places), source, lever)
     raise ValueError(
         f"cannot sense {part!r}: pass a body ({list(system.structure.bodies)}), a joint "
         f"({[n for n in system.structure.joints if n]}), nc.Point or nc.Direction"

@@ -97,22 +97,9 @@ class SeparateTangents(eqx.Module):
 
     def along(self, y: Float[Array, "bodies m"]) -> Velocity:
         """Velocity with given components along the frames."""
-        return self.spread(self.unframed(y))
-
-    def unframed(self, y: Float[Array, "bodies m"]) -> Float[Array, "bodies m"]:
-        """Rates of the free motions from components along the frames."""
-        return jnp.sum(self.frame * y[:, :, None], axis=1)
-
-    def spread(self, w: Float[Array, "bodies m"]) -> Velocity:
-        """P w."""
-        velocity, spin = (jnp.sum(x * w[:, :, None], axis=1) for x in (self.velocity, self.spin))
-        return Velocity(row_rates(self.rows, velocity, spin), jnp.zeros(0, w.dtype))
-
-    def by_body(self, w: Float[Array, " u"]) -> Float[Array, "bodies m"]:
-        """Rates of the tree's free motions, body by body; zero where a slot is absent."""
-        assert self.system is not None
-        places = self.system.tree.slot_index[:, np.array(self.system.tree.slots, int)]
-        return w.at[places].get(mode="fill", fill_value=0.0)
+        w = jnp.sum(self.frame * y[:, :, None], axis=1)[:, :, None]
+        velocity, spin = jnp.sum(self.velocity * w, axis=1), jnp.sum(self.spin * w, axis=1)
+        return Velocity(row_rates(self.rows, velocity, spin), jnp.zeros(0, y.dtype))
 
     def projected(self, v: Velocity) -> Velocity:
         """Nearest velocity that the constraints admit; see `TangentSpace.projected`."""

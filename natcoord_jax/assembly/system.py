@@ -1,7 +1,8 @@
 """The compiled system: arrays as leaves, structure static and hashable."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import numpy as np
@@ -9,6 +10,7 @@ from jaxtyping import Array, Float, Int
 
 from natcoord_jax.assembly.collection import Collection
 from natcoord_jax.assembly.tree import Tree
+from natcoord_jax.core.callables import Stacked
 from natcoord_jax.core.coordinate import Coordinate
 from natcoord_jax.core.effect import Effect
 from natcoord_jax.core.handles import Handle
@@ -16,7 +18,7 @@ from natcoord_jax.core.markers import Marker
 from natcoord_jax.core.state import State, Trajectory
 
 
-class Group(eqx.Module):
+class Group(Stacked):
     """All instances of one kind of effect, stacked.
 
     Attributes:
@@ -48,6 +50,14 @@ class Group(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)
     source: str = eqx.field(static=True)
     in_tree: bool = eqx.field(static=True, default=False)
+
+    stacked: ClassVar[str] = "effect"
+
+    @property
+    def lanes(self) -> tuple[int, ...]:
+        """Instances, where each has numbers of its own, after the systems of a batch."""
+        batch = np.shape(self.bodies)[:-2]
+        return batch if self.effect.shared or self.source == "mass" else (*batch, self.count)
 
     @property
     def multipliers(self) -> int:
@@ -233,6 +243,52 @@ class System(eqx.Module):
         """
         return instant.instant(self, motion, inputs)
 
+    def get(self, part: Handle | str | Sequence[Handle | str], field: str | None = None) -> Any:
+        """Numbers of a part by name.
+
+        Args:
+            part: handle or name of a body, a joint or an effect; or several of one kind, stacked.
+            field: name of the number; None: all of them, in a dictionary. Of a body "mass" [kg], "com" [m]
+                and "inertia" about it [kg m^2] in body axes, or all of it as "mass_block" (15); of an effect
+                its fields, "field.number" for those of a module in a field, and "weights" of its markers
+                (1, position in the body) or (0, direction); of a joint its fields and "frames", the weights
+                of (point, axis 1, 2, 3) in parent and child.
+
+        Raises:
+            ValueError: for a part or a number that there is not, naming those that there are.
+        """
+        return parts.get(self, part, field)
+
+    def set(self, part: Handle | str | Sequence[Handle | str], **values: Any) -> "System":
+        """A copy of the system with other numbers in a part.
+
+        Pure, differentiable in the numbers, and nothing is compiled anew for the copy. Numbers that move
+        the geometry (weights, frames, the pitch of a screw) ask for `nc.assemble` of the state.
+
+        Args:
+            part: see `get`; of several, in a list, each is given the same value or one of its own, along a
+                leading axis.
+            **values: numbers by name, see `get`. Other numbers keep their values: with another mass a body
+                keeps its centre of mass and its inertia.
+
+        Raises:
+            ValueError: for a part or a number that there is not, naming those that there are, or a shape
+                that does not fit.
+
+        Example:
+            >>> import jax; jax.config.update("jax_enable_x64", True)
+            >>> import natcoord_jax as nc
+            >>> scene = nc.Scene()
+            >>> ball = scene.add(nc.RigidBody(mass=1.0, inertia=(1.0, 1.0, 1.0), name="ball"))
+            >>> ends = (nc.Point(nc.ground, (0, 0, 1)), nc.Point(ball))
+            >>> spring = scene.add(nc.Spring(ends, stiffness=50.0, name="spring"))
+            >>> system, state = scene.compile()
+            >>> stiffer = system.set("spring", stiffness=60.0).set(ball, mass=2.0)
+            >>> float(stiffer.get("spring", "stiffness")), float(stiffer.get(ball)["mass"])
+            (60.0, 2.0)
+        """
+        return parts.set_numbers(self, part, values)
+
     def sense(
         self,
         motion: State | Trajectory,
@@ -240,6 +296,7 @@ class System(eqx.Module):
         *,
         inputs: Any = None,
         state: State | None = None,
+        about: Any = None,
     ) -> Any:
         """Sensor of a body, a joint, a marker or elements of a beam.
 
@@ -252,10 +309,12 @@ class System(eqx.Module):
                 energy).
             inputs: for accelerations and reactions, as in `instant`.
             state: the assembled pose that a marker in world coordinates refers to.
+            about: of a joint, the point that its torque is about: shape (3,) or (*leading, 3) [m] in the
+                world, or an `nc.Point`, which moves with its body. Default: the joint's point on the child.
 
         Raises:
-            ValueError: for a part that is not in the system, or a marker in world coordinates without
-                `state`.
+            ValueError: for a part that is not in the system, a marker in world coordinates without
+                `state`, or `about` where there is no reaction.
 
         Example:
             >>> import jax; jax.config.update("jax_enable_x64", True)
@@ -270,7 +329,7 @@ class System(eqx.Module):
             >>> float(system.sense(state, hinge).force[2].round(9))
             6.0
         """
-        return sensors.sense(self, motion, part, inputs=inputs, state=state)
+        return sensors.sense(self, motion, part, inputs=inputs, state=state, about=about)
 
     def coordinate(
         self, motion: State | Trajectory, joint: Handle | str, index: int = 0
@@ -361,6 +420,7 @@ def _index(names: tuple[str, ...], part: Handle | str, kind: str) -> int:
 from natcoord_jax.assembly import (  # noqa: E402  (need System)
     diagnostics,
     instant,
+    parts,
     posing,
     reading,
     reporting,

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.system import System
+from natcoord_jax.core.callables import Function
 from natcoord_jax.core.checks import is_concrete
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.state import State
@@ -216,7 +217,7 @@ class Path(Bound):
         count: how many numbers the function returns.
     """
 
-    function: Callable[[State, Array, Array], Any] = eqx.field(static=True)
+    function: Callable[[State, Array, Array], Any] = eqx.field(converter=Function.of)
     name: str = eqx.field(default="own bound", static=True)
     count: int = eqx.field(default=1, kw_only=True, static=True)
 

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, Int
 from natcoord_jax.assembly.coordinates import state_rates
 from natcoord_jax.assembly.system import System
 from natcoord_jax.control.inverse import followed, places_of
+from natcoord_jax.core.compiled import compiled
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.state import State
 
@@ -117,6 +118,6 @@ def computed_torque(
     )
 
 
-@eqx.filter_jit
+@compiled
 def _rates(system: System, states: State) -> Float[Array, "steps c"]:
     return jax.vmap(lambda state: state_rates(system, state))(states)

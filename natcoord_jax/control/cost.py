@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.system import System
+from natcoord_jax.core.callables import Function
 from natcoord_jax.core.state import State
 
 
@@ -90,7 +91,7 @@ class Running(Cost):
         weight: factor.
     """
 
-    function: Callable[[State, Array, Array], Any] = eqx.field(static=True)
+    function: Callable[[State, Array, Array], Any] = eqx.field(converter=Function.of)
     weight: Any = 1.0
 
     def running(self, system: System, state: State, u: Array, t: Array) -> Float[Array, ""]:
@@ -106,7 +107,7 @@ class Terminal(Cost):
         weight: factor.
     """
 
-    function: Callable[[State], Any] = eqx.field(static=True)
+    function: Callable[[State], Any] = eqx.field(converter=Function.of)
     weight: Any = 1.0
 
     def terminal(self, system: System, state: State) -> Float[Array, ""]:

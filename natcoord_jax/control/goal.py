@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.system import System
 from natcoord_jax.control.tangent import steady_rates
+from natcoord_jax.core.callables import Function
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.rotations import angular_velocity, from_quaternion, to_quaternion
@@ -207,7 +208,7 @@ class Equal(Goal):
         name: for reports.
     """
 
-    function: Callable[[State], Any] = eqx.field(static=True)
+    function: Callable[[State], Any] = eqx.field(converter=Function.of)
     name: str = eqx.field(default="own goal", static=True)
     count: int = eqx.field(default=1, kw_only=True, static=True)
 

@@ -4,10 +4,12 @@ from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.system import System
+from natcoord_jax.core.callables import Function
 
 
 class Parameter(eqx.Module):
@@ -30,11 +32,13 @@ class Parameter(eqx.Module):
     """
 
     name: str = eqx.field(static=True)
-    where: Callable[[System], Array] | None = eqx.field(default=None, kw_only=True, static=True)
+    where: Callable[[System], Array] | None = eqx.field(default=None, kw_only=True, converter=Function.of)
     index: Any = eqx.field(default=(), kw_only=True, static=True)
     lower: float | None = eqx.field(default=None, kw_only=True, static=True)
     upper: float | None = eqx.field(default=None, kw_only=True, static=True)
-    apply: Callable[[System, Array], System] | None = eqx.field(default=None, kw_only=True, static=True)
+    apply: Callable[[System, Array], System] | None = eqx.field(
+        default=None, kw_only=True, converter=Function.of
+    )
     value: Any = eqx.field(default=None, kw_only=True)
     moves: bool = eqx.field(default=False, kw_only=True, static=True)
 
@@ -52,11 +56,26 @@ class Parameter(eqx.Module):
         """Value at the start of the optimisation."""
         if self.value is not None or self.where is None:
             return jnp.asarray(self.value, float)
-        return jnp.asarray(self.where(system))[self.index]
+        return jnp.asarray(self._leaf(system)[1])[self.index]
 
     def applied(self, system: System, value: Float[Array, ""]) -> System:
         """The system with another value."""
         if self.where is None:
             assert self.apply is not None
             return self.apply(system, value)
-        return eqx.tree_at(self.where, system, jnp.asarray(self.where(system)).at[self.index].set(value))
+        number, leaf = self._leaf(system)
+        leaves, structure = jax.tree.flatten(system)
+        leaves[number] = jnp.asarray(leaf).at[self.index].set(value)
+        return jax.tree.unflatten(structure, leaves)
+
+    def _leaf(self, system: System) -> tuple[int, Array]:
+        """Which leaf of the system it is a place of, and that leaf."""
+        leaves, structure = jax.tree.flatten(system)
+        assert self.where is not None
+        number: Any = self.where(jax.tree.unflatten(structure, range(len(leaves))))
+        if not isinstance(number, int):
+            raise ValueError(
+                f"parameter {self.name!r}: `where` gives {type(number).__name__}, which is no leaf of the "
+                "system; return one of its arrays as it is, and a place in it as `index`, or pass `apply`"
+            )
+        return number, leaves[number]

@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 
 from natcoord_jax.core.checks import at_top_level
+from natcoord_jax.core.closures import with_callables
 
 QUICK = {"xla_cpu_use_fusion_emitters": False}
 """Option of the CPU compiler of JAX 0.10: a third less time to compile, for programs that run as fast. JAX
@@ -35,8 +36,13 @@ def _is_known(name: str, value: Any) -> bool:
     return True
 
 
+def compiled(function: F) -> F:
+    """`eqx.filter_jit` of a function whose callables are seen anew at each call, see `closures`."""
+    return _with({}, function)
+
+
 def quickly(function: F) -> F:
-    """`eqx.filter_jit` that compiles quicker at the outermost call; JAX accepts options only there."""
+    """The same, but it compiles quicker at the outermost call; JAX accepts options only there."""
     return _with(QUICK, function)
 
 
@@ -51,11 +57,16 @@ def _with(options: dict[str, Any], function: F) -> F:
     @cache
     def outermost() -> Callable:
         known = accepted(options)
+        if not known:
+            return within
         return eqx.filter_jit(function, compiler_options=known)  # pyright: ignore[reportCallIssue]
+
+    def run(*arguments: Any) -> Any:
+        quick = at_top_level(eqx.filter(arguments, eqx.is_array))
+        return (outermost() if quick else within)(*arguments)
 
     @wraps(function)
     def call(*arguments: Any) -> Any:
-        quick = at_top_level(eqx.filter(arguments, eqx.is_array))
-        return (outermost() if quick else within)(*arguments)
+        return with_callables(function, run, arguments)
 
     return call  # pyright: ignore[reportReturnType]

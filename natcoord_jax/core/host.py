@@ -18,6 +18,7 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 from natcoord_jax.core.checks import as_array, at_top_level
+from natcoord_jax.core.closures import with_callables
 from natcoord_jax.core.numpy_operations import OPERATIONS
 
 REMEMBERED = 256
@@ -50,8 +51,7 @@ def on_host(function: F) -> F:
     programs: dict[Any, tuple[ClosedJaxpr, Any]] = {}
     compiled = eqx.filter_jit(function)
 
-    @wraps(function)
-    def call(*arguments: Any) -> Any:
+    def run(*arguments: Any) -> Any:
         leaves, structure = jax.tree.flatten(arguments)
         given, rest = [x for x in leaves if _is_array(x)], [x for x in leaves if not _is_array(x)]
         if not at_top_level(leaves) or not all(map(_is_numeric, given)):
@@ -74,6 +74,10 @@ def on_host(function: F) -> F:
         with np.errstate(all="ignore"):
             found = evaluate(program, arrays)
         return jax.tree.unflatten(made, [as_array(x) for x in found])
+
+    @wraps(function)
+    def call(*arguments: Any) -> Any:
+        return with_callables(function, run, arguments)
 
     return call  # pyright: ignore[reportReturnType]
 

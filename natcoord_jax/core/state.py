@@ -3,7 +3,11 @@
 from typing import Any
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
+
+from natcoord_jax.core.checks import numbers
+from natcoord_jax.core.effect import replace_fields
 
 
 class State(eqx.Module):
@@ -31,6 +35,28 @@ class State(eqx.Module):
     work: Float[Array, "*batch works"]
     dissipated: Float[Array, "*batch"] | None = None
     held: Float[Array, "*batch 2 coordinates"] | None = None
+
+    def at_time(self, t: Any) -> "State":
+        """The same positions and velocities at another time, from which a simulation then starts.
+
+        Drives ask for other coordinates there: pass it through `nc.assemble` where there are any.
+
+        Args:
+            t: [s].
+
+        Raises:
+            ValueError: for what is no finite number.
+
+        Example:
+            >>> import jax; jax.config.update("jax_enable_x64", True)
+            >>> import natcoord_jax as nc
+            >>> scene = nc.Scene()
+            >>> ball = scene.add(nc.RigidBody(mass=1.0, inertia=(1.0, 2.0, 3.0)))
+            >>> system, state = scene.compile()
+            >>> float(nc.simulate(system, state.at_time(2.0), dt=0.5, steps=2).t[-1])
+            3.0
+        """
+        return replace_fields(self, t=numbers(t, jnp.shape(self.t), "state: t", "s"))
 
 
 class Trajectory(eqx.Module):

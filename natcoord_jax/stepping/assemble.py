@@ -1,7 +1,10 @@
 """Assembly of a state: positions and velocities brought to obey the constraints."""
 
+import warnings
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 from natcoord_jax.assembly.coordinates import state_rates
@@ -115,9 +118,10 @@ def assemble(system: System, state: State) -> State:
 
     Directors are made orthonormal; bodies are turned and shifted until joints, drives and relations between
     coordinates are obeyed, each step at least expense of mass; then velocities are projected in the metric of
-    the mass. Coordinates and rates that `System.with_coordinate` has set are kept, where the constraints
-    allow it, and angles are counted over all turns on the way. Rotor rates follow. Pure, jittable and
-    differentiable in every mode, with respect to the state and to every parameter that moves geometry.
+    the mass. Coordinates and rates that `System.with_coordinate` has set are kept where the constraints allow
+    it (an eager call warns of coordinates that are not), and angles are counted over all turns on the way.
+    Rotor rates follow. Pure, jittable and differentiable in every mode, with respect to the state and to
+    every parameter that moves geometry.
 
     Args:
         system: compiled system.
@@ -147,8 +151,23 @@ def assemble(system: System, state: State) -> State:
         result = Result(int(code))
         if result != Result.SUCCESSFUL:
             raise SimulationError(_failure(system, assembled, result), result, assembled)
+        if state.held is not None:
+            _warn_of_what_moved(system, state, assembled)
         return assembled
     return jax.tree.map(lambda x: jnp.where(code == 0, x, jnp.nan), assembled)
+
+
+def _warn_of_what_moved(system: System, state: State, assembled: State) -> None:
+    """Say which coordinates were set to what the constraints do not allow."""
+    for k, (name, _) in enumerate(system.structure.coordinates):
+        given, found = float(state.coordinates[k]), float(assembled.coordinates[k])
+        if float(state.held[0, k]) and abs(found - given) > 1e3 * GAP * (1.0 + abs(given)):
+            unit = next(g.axis.unit for g in system.coordinates if k in np.asarray(g.index))
+            warnings.warn(
+                f"the constraints do not allow joint {name!r} to be at {given:.6g} {unit}, where it was set; "
+                f"it was assembled at {found:.6g} {unit}",
+                stacklevel=3,
+            )
 
 
 def _failure(system: System, state: State, result: Result) -> str:

@@ -27,7 +27,7 @@ from natcoord_jax.assembly.violations import GAP, position_size
 from natcoord_jax.core.results import Result
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.elimination import definite_solution
-from natcoord_jax.maths.vectors import safe_norm
+from natcoord_jax.maths.vectors import largest, safe_norm
 from natcoord_jax.stepping.newton import any_lane
 
 TRIPS = 400
@@ -48,7 +48,7 @@ ROUND_OFF = 1e-15
 MOST_DAMPING = 1e4
 """Damping at which a step is along the slope of the gaps: if it does not help, nothing does."""
 
-SLOW = 30
+SLOW = 15
 """Steps in sequence that may close less than a hundredth of the gaps."""
 
 SHAKES = 2
@@ -115,11 +115,11 @@ def _step(system: System, origin: State, state: State, manner: Manner) -> Outcom
     scaled = gap / linear.scale
     multipliers = definite_solution(linear.damped(manner.damping), scaled)
     twist = -(linear.impulses @ multipliers).reshape(-1, 6)
-    turned = jnp.max(safe_norm(twist[:, 3:]))
+    turned = largest(safe_norm(twist[:, 3:]))
     limited = turned > manner.reach
     twist = jnp.where(limited, manner.reach / jnp.where(limited, turned, 1.0), 1.0) * twist
     points = state.q.reshape(-1, 4, 3)[:, 0]
-    extent = jnp.max(jnp.abs(points - jnp.mean(points, axis=0))) + 0.1
+    extent = largest(jnp.abs(points - jnp.mean(points, axis=0)).reshape(-1)) + 0.1
     size = jnp.concatenate([jnp.full(3, extent), jnp.ones(3, extent.dtype)])
     shaken = jnp.asarray(_shakes(points.shape[0]))[manner.shake] * size
     twist = jnp.where(manner.shake > 0, shaken, twist)
@@ -188,12 +188,13 @@ def _judged(way: Way, found: Outcome, holds: bool) -> Way:
     # One step more than positions need: it takes derivatives to where these are.
     done = found.least | (found.left >= 0.25 * found.before)
     closed = found.close & done & (way.accepted > 0)
-    creeping = (found.left > 0.99 * found.before) & ~found.limited & ~found.close & ~shaken
-    slow = jnp.where(accepted, jnp.where(creeping, way.slow + 1, 0), way.slow)
-    stuck = (~accepted & (manner.damping >= MOST_DAMPING)) | (slow >= SLOW)
     # Foreseen within a tenth: the gaps are straight enough for twice the way.
     straight = jnp.abs(found.left - found.foreseen) <= 0.1 * jnp.abs(found.before - found.foreseen)
-    reach = jnp.where(accepted & found.limited & straight, 2.0 * manner.reach, manner.reach)
+    under_way = found.limited & straight
+    creeping = (found.left > 0.99 * found.before) & ~under_way & ~found.close & ~shaken
+    slow = jnp.where(accepted, jnp.where(creeping, way.slow + 1, 0), way.slow)
+    stuck = (~accepted & (manner.damping >= MOST_DAMPING)) | (slow >= SLOW)
+    reach = jnp.where(accepted & under_way, 2.0 * manner.reach, manner.reach)
     reach = jnp.where(accepted, reach, jnp.minimum(0.5 * manner.reach, REACH))
     softer, harder = jnp.maximum(0.01 * manner.damping, DAMPING), 100.0 * manner.damping
     first = Manner.at_first(manner.reach.dtype)

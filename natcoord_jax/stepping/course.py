@@ -80,6 +80,7 @@ class Setting(eqx.Module):
         plan: what is static.
         steps: number of steps.
         first: step of the first of the inputs that are given as an array.
+        event: numbers of the event.
     """
 
     system: System
@@ -89,6 +90,7 @@ class Setting(eqx.Module):
     plan: Plan = eqx.field(static=True)
     steps: Int[Array, ""] | int
     first: Int[Array, ""] | int = 0
+    event: Any = None
 
     def near(self, course: Course, steps: int) -> "Setting":
         """With the inputs of the next steps only."""
@@ -96,7 +98,7 @@ class Setting(eqx.Module):
             return self
         first = jnp.minimum(course.step, self.parameters.shape[0] - steps)
         some = jax.lax.dynamic_slice_in_dim(self.parameters, first, steps)
-        return Setting(self.system, some, self.dt, self.tolerance, self.plan, self.steps, first)
+        return Setting(self.system, some, self.dt, self.tolerance, self.plan, self.steps, first, self.event)
 
     def over(self, course: Course) -> Bool[Array, ""]:
         """Whether the rollout has ended."""
@@ -217,7 +219,7 @@ def after_attempt(
     stopped = course.stopped | verdict.hopeless
     result = jnp.where(verdict.hopeless, code, course.code)
     if plan.event is not None:
-        before, after = (plan.indicator(setting.system, state) for state in (origin, verdict.state))
+        before, after = (plan.indicator(setting.system, setting.event, x) for x in (origin, verdict.state))
         crossed = verdict.accepted & (before * after <= 0) & (before != 0)
         stopped, result = stopped | crossed, jnp.where(crossed, int(Result.EVENT), result)
     done, fraction, trial = verdict.done, verdict.fraction, verdict.trial

@@ -55,11 +55,12 @@ def run_slots(
     parameters: Any,
     dt: Array,
     tolerance: Tolerance | None = None,
+    event: Any = None,
 ) -> tuple[Slots, Ending]:
     """All slots of a rollout and where it ended; differentiable in every mode."""
     # JAX sets the mesh anew for derivatives, and to jit no mesh and an empty one are different circumstances.
     with jax.sharding.use_abstract_mesh(jax.sharding.get_abstract_mesh()):
-        return _traced_once(plan, system, state, parameters, dt, tolerance)
+        return _traced_once(plan, system, state, parameters, dt, tolerance, event)
 
 
 @partial(jax.jit, static_argnums=0)
@@ -251,8 +252,8 @@ def _total(parts: Any) -> Any:
 
 @partial(run_slots.defjvp, symbolic_zeros=True)
 def _run_slots_jvp(plan: Plan, primals: tuple, tangents: tuple):
-    system, state, parameters, dt, _ = primals
-    system_dot, state_dot, parameters_dot, dt_dot, _ = tangents
+    system, state, parameters, dt, *_ = primals
+    system_dot, state_dot, parameters_dot, dt_dot, *_ = tangents
     slots, ending = run_slots(plan, *primals)
     state_dot = instantiated(state_dot, state)
     u = u_dot = None

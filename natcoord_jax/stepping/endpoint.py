@@ -12,7 +12,9 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from natcoord_jax.assembly.system import System
+from natcoord_jax.core.callables import Function
 from natcoord_jax.core.checks import at_top_level
+from natcoord_jax.core.closures import with_callables
 from natcoord_jax.core.compiled import QUICK, accepted
 from natcoord_jax.core.state import State
 from natcoord_jax.stepping.course import Setting
@@ -50,40 +52,37 @@ class Sampled:
     """Inputs that are a function of time, taken at the stages of a step.
 
     Attributes:
-        function: of the time [s], to shape (inputs,); None: zero.
         channels: number of inputs.
         fractions: where in the step the stages are.
     """
 
-    function: Callable[[Array], Array] | None
     channels: int
     fractions: tuple[float, ...]
 
     def __call__(
         self, parameters: Any, step: Array, t: Array, state: State, fraction: Array
     ) -> Float[Array, "s inputs"]:
-        """At the stages of a (sub)step that starts at t; the length of the step is the parameter."""
-        if self.function is None:
+        """At the stages of a (sub)step that starts at t; parameters: length of the step, function of time."""
+        dt, function = parameters
+        if function is None:
             return jnp.zeros((len(self.fractions), self.channels), state.q.dtype)
-        return jax.vmap(self.function)(t + fraction * parameters * jnp.asarray(self.fractions))
+        return jax.vmap(function)(t + fraction * dt * jnp.asarray(self.fractions))
 
 
 @lru_cache(maxsize=64)
-def _program(
-    structure: Any, kinds: tuple, inputs: Callable | None, scheme: Scheme, tolerance: float
-) -> Callable:
+def _program(structure: Any, kinds: tuple, scheme: Scheme, tolerance: float) -> Callable:
     """The compiled program for all systems and states of one structure, their numbers in one array.
 
     Nothing but one kernel where that is possible: every array that goes in and every operation outside take
     longer than an evaluation of the equations of a small system.
     """
-    like, _ = jax.tree.unflatten(structure, kinds)  # for what is static in it
-    control = Sampled(inputs, len(like.structure.inputs), scheme.tableau.c)
+    like = jax.tree.unflatten(structure, kinds)[0]  # for what is static in it
+    control = Sampled(len(like.structure.inputs), scheme.tableau.c)
     plan = Plan(MOST, 0, tolerance, control, None, scheme.tableau, recorded=False)
 
     def end(kernel: Callable, numbers: Array, dt: Array, steps: Array) -> Endpoint:
-        system, state = jax.tree.unflatten(structure, apart(numbers, kinds))
-        course = run_to_the_end(Setting(system, dt, dt, None, plan, steps), state, kernel)
+        system, state, inputs = jax.tree.unflatten(structure, apart(numbers, kinds))
+        course = run_to_the_end(Setting(system, (dt, inputs), dt, None, plan, steps), state, kernel)
         return Endpoint(course.state, course.code, course.step, course.iterations, course.taken)
 
     def run(*numbers: Array) -> Endpoint:
@@ -121,9 +120,22 @@ def endpoints(
         A function of step [s] and number of steps; another number does not compile anew. Steps that fail are
         repeated in parts, as in `simulate`, without a limit.
     """
-    leaves, structure = jax.tree.flatten((system, scheme.started(state)))
-    kinds = tuple((jnp.shape(x), jnp.result_type(x)) for x in leaves)
-    program = _program(structure, kinds, inputs, scheme, newton_tol)
-    placed = jax.jit(in_one_array)(leaves)
-    # Numbers of NumPy go in ten times as fast as arrays of JAX are made of them.
-    return lambda dt, steps: program(placed, _number(dt, np.float64), _number(steps, np.int64))
+    begun: list[Callable[[Any, int], Endpoint]] = []
+
+    def first(dt: Any, steps: Any, *numbers: Any) -> Endpoint:
+        leaves, structure = jax.tree.flatten(numbers)
+        kinds = tuple((jnp.shape(x), jnp.result_type(x)) for x in leaves)
+        program = _program(structure, kinds, scheme, newton_tol)
+        placed = jax.jit(in_one_array)(leaves)
+        # Numbers of NumPy go in ten times as fast as arrays of JAX are made of them.
+        found = program(placed, _number(dt, np.float64), _number(steps, np.int64))
+        begun.append(lambda dt, steps: program(placed, _number(dt, np.float64), _number(steps, np.int64)))
+        return found
+
+    def end(dt: Any, steps: int) -> Endpoint:
+        if begun:
+            return begun[0](dt, steps)
+        numbers = system, scheme.started(state), Function.of(inputs, state.t)
+        return with_callables((endpoints, scheme, newton_tol), partial(first, dt, steps), numbers)
+
+    return end

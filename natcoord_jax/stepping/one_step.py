@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.system import System
 from natcoord_jax.core.checks import is_concrete
+from natcoord_jax.core.compiled import compiled
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.results import REASONS, REMEDIES, Result, SimulationError
 from natcoord_jax.core.state import State
@@ -21,7 +22,7 @@ from natcoord_jax.stepping.plan import Plan
 from natcoord_jax.stepping.scheme import SECOND_ORDER, Scheme
 
 
-@eqx.filter_jit
+@compiled
 def _one_step(system, state, u, dt, tolerance, extra, tableau):
     plan = Plan(1, extra, tolerance, None, None, tableau)
     course = run_slots(plan, system, state, u[None], dt)[1].course

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import reduce
-from typing import Any
+from typing import Any, Self
 
 import equinox as eqx
 import jax
@@ -26,7 +26,7 @@ class Plan:
         tolerance: of Newton's iteration.
         control: function (parameters, step index, t, state, fraction of the step) to inputs; None: they are
             parameters[step].
-        event: function of the state whose change of sign ends the run, or None.
+        event: function (numbers, state) whose change of sign ends the run, or None.
         tableau: of the collocation method.
         recorded: whether every slot is; else only the last is kept.
         control_reads: whether the control reads velocities, from states whose velocities have to be made
@@ -38,7 +38,7 @@ class Plan:
     extra: int
     tolerance: float
     control: Callable[[Any, Array, Array, State, Array], Array] | None
-    event: Callable[[State], Array] | None = None
+    event: Callable[[Any, State], Array] | None = None
     tableau: Tableau = gauss(1)
     recorded: bool = True
     control_reads: bool = False
@@ -53,10 +53,10 @@ class Plan:
         state = tangent(system, state) if self.control_reads else state
         return self.control(parameters, step, state.t, state, fraction)
 
-    def indicator(self, system: System, state: State) -> Array:
-        """What ends the run when its sign changes."""
+    def indicator(self, system: System, numbers: Any, state: State) -> Array:
+        """What ends the run when its sign changes, with the numbers of the event."""
         assert self.event is not None
-        return self.event(tangent(system, state) if self.event_reads else state)
+        return self.event(numbers, tangent(system, state) if self.event_reads else state)
 
     def within_step(self, inputs: Array, done: Array, fraction: Array) -> Array:
         """Inputs of a part of a step from those of the whole one: held, or interpolated from its stages."""
@@ -70,6 +70,35 @@ class Plan:
             columns.append(reduce(jnp.multiply, others, jnp.ones_like(times)))
         weights = jnp.where(fraction == 1.0, jnp.eye(len(nodes)), jnp.stack(columns, axis=1))
         return weights @ inputs
+
+
+@dataclass(frozen=True)
+class Apart:
+    """A callable without its numbers: hashable, as what is static about a rollout must be."""
+
+    rest: Any
+
+    @classmethod
+    def of(cls, function: Any) -> tuple[Self, Any]:
+        """A callable apart into this and its numbers."""
+        numbers, rest = eqx.partition(function, eqx.is_array)
+        return cls(rest), numbers
+
+
+class Control(Apart):
+    """Inputs by a function of time and state."""
+
+    def __call__(self, numbers: Any, step: Array, t: Array, state: State, fraction: Array) -> Array:
+        """Inputs of a (sub)step that starts at t."""
+        return jnp.asarray(eqx.combine(numbers, self.rest)(t, state), float)
+
+
+class Event(Apart):
+    """A function of the state whose change of sign ends a run."""
+
+    def __call__(self, numbers: Any, state: State) -> Array:
+        """Its value."""
+        return jnp.asarray(eqx.combine(numbers, self.rest)(state), float)
 
 
 class Slots(eqx.Module):

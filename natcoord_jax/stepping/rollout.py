@@ -36,10 +36,17 @@ class Ending(eqx.Module):
 
 
 def run(
-    plan: Plan, system: System, state: State, parameters: Any, dt: Array, tolerance: Tolerance | None
+    plan: Plan,
+    system: System,
+    state: State,
+    parameters: Any,
+    dt: Array,
+    tolerance: Tolerance | None,
+    event: Any = None,
 ) -> tuple[Slots, Ending]:
     """All slots of a rollout and where it ended; without derivatives (see `derivative`)."""
-    found, unpack = all_slots(Setting(system, parameters, dt, tolerance, plan, plan.steps), state)
+    setting = Setting(system, parameters, dt, tolerance, plan, plan.steps, event=event)
+    found, unpack = all_slots(setting, state)
     course, (states, *rest) = with_state(found.course, unpack(found.state)), found.record
     count, factors, slots = found.count, found.factors, Slots(jax.vmap(unpack)(states), *rest)
     if tolerance is not None:

@@ -12,6 +12,7 @@ from jaxtyping import Array
 
 from natcoord_jax.assembly.reading import handing, reads_velocities
 from natcoord_jax.assembly.system import System
+from natcoord_jax.core.callables import Function
 from natcoord_jax.core.checks import is_concrete
 from natcoord_jax.core.compiled import quickly
 from natcoord_jax.core.effect import replace_fields
@@ -23,7 +24,7 @@ from natcoord_jax.stepping.checked import check_state, checked_inputs, checked_s
 from natcoord_jax.stepping.derivative import run_slots
 from natcoord_jax.stepping.error_control import Tolerance
 from natcoord_jax.stepping.newton import TOLERANCE
-from natcoord_jax.stepping.plan import Plan, Slots
+from natcoord_jax.stepping.plan import Control, Event, Plan, Slots
 from natcoord_jax.stepping.scheme import SECOND_ORDER, Scheme
 from natcoord_jax.stepping.turns import warn_of_far_turns
 
@@ -64,15 +65,14 @@ def _rollout(
     tableau, control_reads = scheme.tableau, False
     length = _segments(steps, save_every, checkpoint)
     if callable(inputs):
-        # A policy may be a module with numbers of its own, which has no hash while it is traced.
-        policy, constants = jax.closure_convert(handing(inputs), state.t, state)
-        control_reads = scheme.loose and reads_velocities(lambda x: policy(x.t, x, *constants), state)
-        control, every_segment = partial(_by_policy, policy), constants
+        control, every_segment = Control.of(inputs)
+        at_start = partial(control, every_segment, jnp.array(0), state.t, fraction=jnp.ones(()))
+        control_reads = scheme.loose and reads_velocities(lambda x: at_start(state=x), state)
         pieces = jax.tree.map(lambda x: jnp.broadcast_to(x, (steps // length, *x.shape)), every_segment)
     else:
         control, pieces = None, inputs.reshape(steps // length, length, *inputs.shape[1:])
-    event = None if until is None else handing(until)
-    event_reads = scheme.loose and event is not None and reads_velocities(event, state)
+    event, limit = (None, None) if until is None else Event.of(until)
+    event_reads = scheme.loose and event is not None and reads_velocities(partial(event, limit), state)
     plan = Plan(
         length, extra_substeps, tolerance, control, event, tableau,
         control_reads=control_reads, event_reads=event_reads,
@@ -80,7 +80,7 @@ def _rollout(
 
     def segment(carry, parameters):
         state, code, failed = carry
-        slots, ending = run_slots(plan, system, state, parameters, dt, allowed)
+        slots, ending = run_slots(plan, system, state, parameters, dt, allowed, limit)
         course = ending.course
         running = code == int(Result.SUCCESSFUL)
         keep = partial(jnp.where, running)
@@ -141,12 +141,6 @@ def _rollout(
     )
 
 
-def _by_policy(
-    policy: Callable, constants: Any, step: Array, t: Array, state: State, fraction: Array
-) -> Array:
-    return jnp.asarray(policy(t, state, *constants), float)
-
-
 @quickly
 def _compiled(
     system: System, state: State, inputs: Any, dt: Array, tolerance: Tolerance | None, static: Any
@@ -178,11 +172,18 @@ def simulate(
     motion changes suddenly, too; where the linear system of a step cannot be solved they are NaN, in every
     mode, though the run itself went well.
 
+    Functions (inputs, `until`, drives, loads, laws) and methods of effects of one's own are traced at each
+    call from Python: whatever they read is as it is then, and another number, also a function made anew,
+    compiles nothing. A number inside of a branch or a loop (`jax.lax.cond`, `scan`) or a changed formula
+    compile once. What is inside of a `jax.jit` of one's own is as JAX has kept it. A function that gives
+    something else when it is called again, or has a rule by `jax.custom_vjp`, is refused.
+
     Args:
         system: compiled system.
         state: initial state; its positions must obey joints, drives and couplings (looked at where there
             are any of the latter or loops, in calls that are not being traced), its velocities should; see
-            `assemble`.
+            `assemble`. The run starts at its time: `Scene.compile(t=...)` and `State.at_time` set another
+            than zero.
         dt: step [s].
         steps: number of steps; may be left out when `inputs` is an array.
         inputs: array (steps, inputs) [N, N m], held over each step; (inputs,) for constant ones; or a
@@ -219,8 +220,8 @@ def simulate(
             half a turn in a step has no angle.
 
     Raises:
-        ValueError: for a wrong dt, steps, tolerance, shape of inputs or state, or a state that violates
-            a constraint, with its name and size.
+        ValueError: for a wrong dt, steps, tolerance, shape of inputs or state, a state that violates a
+            constraint, with its name and size, or a function that cannot be seen.
         SimulationError: if the run fails and `throw` holds; it carries the trajectory computed so far.
 
     Example:
@@ -237,6 +238,7 @@ def simulate(
     check_obeyed(system, state)
     state = scheme.started(replace_fields(state, held=None))
     step = checked_step(dt)
+    inputs, until = Function.of(handing(inputs), state.t, state), Function.of(handing(until), state)
     checked, count = checked_inputs(system, inputs, steps, scheme.stages)
     if save_every < 1 or count % save_every:
         raise ValueError(f"save_every is {save_every}; pass a positive divisor of steps = {count}")

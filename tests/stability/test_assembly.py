@@ -119,7 +119,8 @@ def test_a_geared_motor_follows_over_many_turns(angle):
 
 def test_a_coordinate_that_was_set_gives_way_to_a_drive():
     system, state = jointed(nc.Revolute, function=lambda t: 0.0 * t).compile()
-    found = nc.assemble(system, system.with_coordinate(state, "joint", 2.0, rate=1.0))
+    with pytest.warns(UserWarning, match="do not allow joint 'joint' to be at 2 rad"):
+        found = nc.assemble(system, system.with_coordinate(state, "joint", 2.0, rate=1.0))
     np.testing.assert_allclose(found.coordinates, 0.0, atol=1e-12)
     assert errors(system, found) <= tol.CONSTRAINT
 
@@ -198,13 +199,15 @@ def test_random_starts(name):
     else:
         example, joint = gallery.load(name), MECHANISMS[name]
         system, state = example.system, example.state
-    random = np.random.default_rng(1)
+    # Bricard's hinges reach only some angles; elsewhere the one that was set gives way.
+    kept = 0
     assemble = jax.jit(nc.assemble)
-    for angle in random.uniform(-8.0, 8.0, 12):
-        start = system.with_coordinate(state, joint, angle)
-        found = assemble(system, start)
-        assert float(system.coordinate(found, joint)) == pytest.approx(angle, rel=1e-9)
+    angles = np.random.default_rng(1).uniform(-8.0, 8.0, 12)
+    for angle in angles:
+        found = assemble(system, system.with_coordinate(state, joint, angle))
         assert float(system.constraint_errors(found).position) <= tol.CONSTRAINT
+        kept += abs(float(system.coordinate(found, joint)) - angle) <= 1e-9
+    assert kept == len(angles) if name != "bricard" else kept >= 5
 
 
 @pytest.mark.slow

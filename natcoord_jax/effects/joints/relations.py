@@ -15,7 +15,7 @@ class Drive(CoordinateConstraint):
     Attributes:
         joint: handle of the joint.
         function: function of time [s] to the coordinate [rad or m], in jax.numpy. An `eqx.Module` with
-            array fields has its numbers as leaves; a plain function is compiled in.
+            array fields has its numbers as leaves; what a plain function reads is seen at each call.
         coordinate: which coordinate of the joint.
     """
 

@@ -1,0 +1,175 @@
+"""Numbers of parts by name, another time to start at, and reactions about a point."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import natcoord_jax as nc
+
+
+def scene(stiffness=50.0, mass=1.0, inertia=(1.0, 1.0, 2.0), gravity=-9.81, com=(0.1, 0.0, 0.2)):
+    """A round body and a point mass on equal springs, and a hinged arm with a stop."""
+    made = nc.Scene()
+    made.add(nc.Gravity(vector=(0.0, 0.0, gravity), name="gravity"))
+    body = nc.RigidBody(mass=mass, inertia=inertia, com=com, name="body", angular_velocity=(0.3, 1.0, 2.0))
+    ends = made.add(body), made.add(nc.PointMass(mass=2.0, position=(1.0, 0.0, 0.0), name="bead"))
+    for k, end in enumerate(ends):
+        points = nc.Point(nc.ground, (0.0, 0.0, 1.0)), nc.Point(end, (1.0, 0.0, 0.0))
+        made.add(nc.Spring(points, stiffness=stiffness, name=f"spring {k}"))
+    arm = made.add(nc.RigidBody(mass=1.0, inertia=(1.0, 1.0, 1.0), com=(0.5, 0.0, 0.0), name="arm"))
+    hinge = made.add(nc.Revolute(nc.ground, arm, axis=(0, 1, 0), name="hinge"))
+    made.add(nc.JointStops(hinge, stiffness=100.0, lower=-1.0, name="stops"))
+    return made.compile()
+
+
+@pytest.fixture(scope="module")
+def compiled():
+    return scene()
+
+
+def end(system, state):
+    return nc.simulate(system, state, dt=0.05, steps=20).q[-1]
+
+
+def test_every_number_has_a_name(compiled):
+    """What there is of a body, a point mass, an effect, a joint."""
+    system, _ = compiled
+    found = system.get("body")
+    assert list(found) == ["mass_block", "mass", "com", "inertia"]
+    assert np.allclose(found["inertia"], np.diag([1.0, 1.0, 2.0])) and np.allclose(
+        found["com"], [0.1, 0, 0.2]
+    )
+    assert list(system.get("bead")) == ["mass_block", "mass"]
+    assert system.get("spring 1", "stiffness") == 50.0
+    assert system.get(("spring 0", "spring 1"), "stiffness").shape == (2,)
+    assert system.get("gravity", "vector").shape == (3,)
+    assert system.get("stops", "lower") == -1.0 and system.get("stops", "upper") == np.inf
+    assert system.get("hinge", "frames").shape == (2, 4, 4)
+
+
+def test_set_is_as_built_anew(compiled):
+    """Leaf by leaf, but for what was found of symmetry; the motion, from the same program."""
+    system, state = compiled
+    changed = (
+        system.set(["spring 0", "spring 1"], stiffness=60.0)
+        .set("body", mass=3.0, inertia=(1.0, 1.5, 2.0), com=(0.0, 0.1, 0.0))
+        .set("gravity", vector=(0.0, 0.0, -1.0))
+    )
+    anew, _ = scene(60.0, 3.0, (1.0, 1.5, 2.0), -1.0, (0.0, 0.1, 0.0))
+    assert jax.tree.structure(changed) == jax.tree.structure(system)
+    assert np.allclose(changed.mass, anew.mass, atol=1e-15)
+    assert np.abs(end(changed, state) - end(anew, state)).max() < 1e-11
+    assert np.all(system.get("spring 0", "stiffness") == 50.0), "the system itself was changed"
+    each = system.set(["spring 0", "spring 1"], stiffness=(1.0, 2.0))
+    assert np.array_equal(each.get(["spring 0", "spring 1"], "stiffness"), [1.0, 2.0])
+
+
+def test_set_compiles_nothing_and_is_differentiable(compiled):
+    """A gradient by a number of one part of a stack, against differences; no rollout is compiled."""
+    system, state = compiled
+    programs = []
+
+    def count(name, seconds, **given):
+        if name.endswith("backend_compile_duration"):
+            programs.append(given.get("fun_name"))
+
+    def height(stiffness, mass):
+        changed = system.set("spring 0", stiffness=stiffness).set("body", mass=mass)
+        return end(changed, state)[0, 2]
+
+    height(50.0, 1.0)
+    jax.monitoring.register_event_duration_secs_listener(count)
+    try:
+        at = [[float(height(k, m)) for k, m in pair] for pair in (
+            ((50.001, 1.0), (49.999, 1.0)),
+            ((50.0, 1.00001), (50.0, 0.99999)),
+        )]  # fmt: skip
+    finally:
+        jax.monitoring.unregister_event_duration_listener(count)
+    assert "jit(_compiled)" not in programs
+    expected = [(a - b) / h for (a, b), h in zip(at, (2e-3, 2e-5), strict=True)]
+    assert jax.grad(height, argnums=(0, 1))(50.0, 1.0) == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        (
+            lambda s: s.set("nothing", x=1.0),
+            "no part 'nothing'; it has the bodies .*'arm'.*'hinge'.*'gravity'",
+        ),
+        (lambda s: s.set("spring 0", rest=1.0), r"has no number 'rest'; it has \['stiffness', 'length'"),
+        (lambda s: s.set("spring 0", stiffness=(1.0, 2.0)), r"stiffness has shape \(2,\); pass shape \(\)"),
+        (lambda s: s.set(["spring 0", "spring 1"], stiffness=(1, 2, 3)), r"pass shape \(\) or \(2,\)"),
+        (lambda s: s.set("bead", inertia=(1.0, 1.0, 1.0)), "'bead' has no number 'inertia'"),
+        (lambda s: s.set("body", mass=-1.0), "pass a positive number"),
+        (lambda s: s.set("body", mass=1.0, mass_block=np.eye(4)), "not both"),
+        (lambda s: s.set("spring 0", stiffness=np.nan), "pass finite"),
+        (lambda s: s.set("spring 0"), "nothing to set"),
+        (lambda s: s.get("spring 0", "rest"), "has no number 'rest'"),
+    ],
+)
+def test_what_is_wrong_is_named(compiled, change, message):
+    with pytest.raises(ValueError, match=message):
+        change(compiled[0])
+
+
+def test_starting_at_another_time():
+    """A load and a drive that depend on time: a run in two parts, and one that starts in between."""
+
+    def build(t):
+        made = nc.Scene()
+        body = made.add(nc.RigidBody(mass=1.0, inertia=(1.0, 1.0, 1.0), name="body"))
+        disc = made.add(nc.RigidBody(mass=1.0, inertia=(1.0, 1.0, 1.0), position=(3, 0, 0), name="disc"))
+        hinge = made.add(nc.Revolute(nc.ground, disc, name="hinge"))
+        made.add(nc.PointForce((nc.Point(body),), force=lambda t: jnp.array([t, 0.0, 0.0])))
+        made.add(nc.Drive(hinge, function=lambda t: (t - 2.0) ** 2))
+        return made.compile(t=t)
+
+    system, state = build(2.0)
+    assert float(state.t) == 2.0
+    late = nc.simulate(system, state, dt=0.1, steps=10)
+    assert late.t[0] == 2.0 and late.t[-1] == pytest.approx(3.0)
+    # The impulse of a force t from 2 to 3 s is 2.5 N s, and the mid-point rule is exact for it.
+    assert system.momentum(late)[-1, 0] == pytest.approx(2.5, abs=1e-12)
+    assert system.sense(late, "hinge").angle[-1] == pytest.approx(1.0, abs=1e-12)
+    moved = state.at_time(3.0)
+    assert float(moved.t) == 3.0 and moved.q is state.q
+    with pytest.raises(ValueError, match="state: t"):
+        state.at_time(jnp.zeros(2))
+
+
+def test_reactions_about_a_point():
+    """Statics of an arm on an upright hinge: its moment about any point is that of the weight about it."""
+    made = nc.Scene()
+    made.add(nc.Gravity(vector=(0.0, 0.0, -10.0)))
+    beam = made.add(
+        nc.RigidBody(mass=2.0, inertia=(1.0, 1.0, 1.0), com=(0.7, 0.2, 0.0), position=(1, 0, 0), name="beam")
+    )
+    hinge = made.add(nc.Revolute(nc.ground, beam, (0.5, 0.0, 0.3), name="hinge"))
+    system, state = made.compile()
+    weight, centre = np.array([0.0, 0.0, -20.0]), np.array([1.7, 0.2, 0.0])
+
+    def needed(point):
+        return -np.cross(centre - np.asarray(point), weight)
+
+    assert np.allclose(system.sense(state, hinge).torque, needed((0.5, 0.0, 0.3)), atol=1e-12)
+    for point in ((0.0, 0.0, 0.0), (3.0, -1.0, 2.0)):
+        assert np.allclose(system.sense(state, hinge, about=point).torque, needed(point), atol=1e-12)
+    tip = nc.Point(beam, (1.0, 0.0, 0.0), local=True)
+    assert np.allclose(system.sense(state, hinge, about=tip).torque, needed((2.0, 0.0, 0.0)), atol=1e-12)
+    ground = nc.Point(nc.ground, (0.0, 0.0, 1.0))
+    assert np.allclose(system.sense(state, hinge, about=ground).torque, needed((0, 0, 1)), atol=1e-12)
+    run = nc.simulate(system, state, dt=0.1, steps=2)
+    along = jnp.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 2.0, 0.0]])
+    found = system.sense(run, hinge, about=along).torque
+    assert np.allclose(found, [needed(x) for x in along], atol=1e-9)
+    assert np.allclose(system.sense(run, hinge, about=tip).torque[-1], needed((2.0, 0.0, 0.0)), atol=1e-9)
+    for part, about, message in (
+        (beam, (0, 0, 0), "no reaction"),
+        (hinge, (0.0, 0.0), "about .* has shape"),
+        (hinge, nc.Direction(beam, (1, 0, 0)), "direction"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            system.sense(state, part, about=about)
