@@ -110,6 +110,7 @@ from natcoord_jax.stepping.simulate import simulate
 from natcoord_jax.stepping.variational import VariationalMidpoint
 
 if TYPE_CHECKING:
+    __version__: str
     from natcoord_jax.viz import animate, plot
 
 __all__ = [
@@ -227,7 +228,11 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """Pictures are loaded when first asked for, and matplotlib with them."""
+    """Pictures are loaded when first asked for, and matplotlib with them; the version is looked up then."""
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("natcoord_jax")
     if name in ("animate", "plot"):
         from natcoord_jax import viz
 

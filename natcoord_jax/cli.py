@@ -38,6 +38,7 @@ class Parser(argparse.ArgumentParser):
 def parser() -> Parser:
     """The command line's options."""
     whole = Parser(prog="natcoord-jax", description="Differentiable multibody simulation: ready scenes.")
+    whole.add_argument("--version", action="version", version=f"natcoord-jax {nc.__version__}")
     commands = whole.add_subparsers(dest="command", required=True, parser_class=Parser)
     commands.add_parser("scenes", help="list the scenes of the gallery")
     run = commands.add_parser("run", help="simulate a scene and report its balances")

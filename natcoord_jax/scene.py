@@ -12,12 +12,15 @@ from jaxtyping import Array
 
 from natcoord_jax.assembly.build import build
 from natcoord_jax.assembly.system import System
+from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.bodies import Body
-from natcoord_jax.core.checks import is_concrete, numbers, require_double
+from natcoord_jax.core.checks import as_array, is_concrete, require_double
 from natcoord_jax.core.effect import Effect, replace_fields
 from natcoord_jax.core.handles import Handle, ground
 from natcoord_jax.core.host import on_host
 from natcoord_jax.core.joint import Joint
+from natcoord_jax.core.kinds import BODY, FLAG, JOINT, NAME, Choice, HandleOf, of
+from natcoord_jax.core.numeric import Number, Numbers
 from natcoord_jax.core.recipe import Recipe
 from natcoord_jax.core.state import State
 from natcoord_jax.stepping.admissibility import (
@@ -29,6 +32,8 @@ from natcoord_jax.stepping.admissibility import (
 )
 from natcoord_jax.stepping.assemble import assemble as assemble_state
 from natcoord_jax.stepping.sparsity import with_sparsity
+
+PART = of("a body, a joint, an effect or a beam, as nc.RigidBody(...)", Body, Joint, Effect, Recipe)
 
 _scene_numbers = itertools.count(1)
 
@@ -60,6 +65,7 @@ class Scene:
         self.effects: dict[str, Effect] = {}
         self.recipes: dict[str, Recipe] = {}
 
+    @checked("Scene.add", part=PART)
     def add(self, part: Body | Joint | Effect | Recipe) -> Any:
         """Add a body, a joint, another effect, or a recipe of several of them (a beam).
 
@@ -79,10 +85,8 @@ class Scene:
             store, kind, label = self.joints, "joint", type(part).__name__.lower()
         elif isinstance(part, Effect):
             store, kind, label = self.effects, "effect", type(part).kind
-        elif isinstance(part, Recipe):
-            store, kind, label = self.recipes, "recipe", part.kind
         else:
-            raise ValueError(f"cannot add {part!r} to a scene; add bodies, joints, effects and beams")
+            store, kind, label = self.recipes, "recipe", part.kind
         given: str | None = getattr(part, "name", None)
         name = given or self._free_name(label)
         if name == ground.name or any(name in taken for taken in self._stores()):
@@ -106,6 +110,7 @@ class Scene:
         numbered = (f"{label} {k}" for k in itertools.count(1))
         return next(name for name in numbered if not any(name in store for store in self._stores()))
 
+    @checked("Scene.add_mass", handle=BODY, block=Numbers((4, 4)))
     def add_mass(self, handle: Handle, block: Any) -> None:
         """Add mass to a body: a mass block m (4, 4) (15) in its own frame [kg, kg m, kg m^2].
 
@@ -115,8 +120,9 @@ class Scene:
         body = self.find(handle, "added mass")
         if not isinstance(body, Body):
             raise ValueError(f"added mass: {handle!r} is no body that can carry mass")
-        block = numbers(block, (4, 4), f"body {handle.name!r}: added mass", "kg, kg m, kg m^2")
-        self.bodies[handle.name] = replace_fields(body, mass_block=_sum(body.mass_block, block))
+        self.bodies[handle.name] = replace_fields(
+            body, mass_block=_sum(body.mass_block, as_array(block, float))
+        )
 
     def _check(self, part: Body | Joint | Effect, name: str) -> None:
         """Every handle in the part must be of this scene."""
@@ -127,31 +133,20 @@ class Scene:
                 raise ValueError(
                     f"joint {name!r} joins body {part.child.name!r} with itself; pass two bodies"
                 )
-            self._check_joint_numbers(part, name)
+            self._check_axes(part, name)
         flat = jax.tree.leaves(part, is_leaf=lambda x: isinstance(x, Handle | eqx.Module) and x is not part)
         for leaf in flat:
             handle = leaf if isinstance(leaf, Handle) else getattr(leaf, "body", None)
             if isinstance(handle, Handle):
                 self.find(handle, f"{name!r}")
 
-    def _check_joint_numbers(self, joint: Joint, name: str) -> None:
-        for body in (joint.parent, joint.child):
-            if not isinstance(body, Handle) or body.kind != "body":
-                raise ValueError(f"joint {name!r}: {body!r} is no body; pass handles returned by Scene.add")
-        for vector, what, unit in (
-            (joint.axis, "axis", "-"),
-            (joint.second, "second", "-"),
-            (joint.point, "point", "m"),
-        ):
-            if vector is not None:
-                array = numbers(vector, (3,), f"joint {name!r}: {what}", unit)
-                if unit == "-" and is_concrete(array) and not np.any(np.asarray(array)):
-                    raise ValueError(f"joint {name!r}: {what} [-] is zero; pass a direction")
+    def _check_axes(self, joint: Joint, name: str) -> None:
         if joint.second is not None and is_concrete(joint.axis, joint.second):
             axis, second = np.asarray(joint.axis, float), np.asarray(joint.second, float)
             if np.linalg.norm(np.cross(axis, second)) <= 1e-9 * np.linalg.norm(axis) * np.linalg.norm(second):
                 raise ValueError(f"joint {name!r}: second [-] points along the axis; pass another direction")
 
+    @checked("Scene.find", handle=BODY | JOINT | HandleOf("effect"), user=NAME)
     def find(self, handle: Handle, user: str = "a request") -> Body | Joint | Effect | None:
         """The part behind a handle; None for the ground.
 
@@ -168,6 +163,12 @@ class Scene:
             )
         return store[handle.name]
 
+    @checked(
+        "Scene.compile",
+        assemble=FLAG,
+        solver=Choice(("reduced", "recursive", "sparse", "full")),
+        t=Number(),
+    )
     def compile(
         self, *, assemble: bool = False, solver: str | None = None, t: Any = 0.0
     ) -> tuple[System, State]:
@@ -187,8 +188,6 @@ class Scene:
         """
         if not self.bodies:
             raise ValueError("the scene has no bodies; add one before compiling")
-        if solver not in (None, "reduced", "recursive", "sparse", "full"):
-            raise ValueError(f'solver is {solver!r}; pass "reduced", "recursive", "sparse", "full" or None')
         system, state = build(self.bodies, self.joints, self.effects, solver)
         state = state.at_time(t)
         if assemble:

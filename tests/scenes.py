@@ -80,12 +80,14 @@ def pair(
         )
     )
     options = next((o for kind, o in SPECIAL.items() if issubclass(joint, kind)), {})
-    hinge = scene.add(joint(first, second, (0.2, 0.1, -1.3), AXIS, second=SECOND, name="joint", **options))
+    hinge = scene.add(
+        joint(first, second, point=(0.2, 0.1, -1.3), axis=AXIS, second=SECOND, name="joint", **options)
+    )
     for number in range(len(joint.coordinates)):
         name = f"coil {number}"
         scene.add(nc.JointSpring(hinge, coordinate=number, stiffness=coil, rest=0.4, name=name))
     hang = (nc.Point(nc.ground), nc.Point(first, (0.1, 0.0, -0.6)))
-    scene.add(nc.Spring(hang, "hanging", stiffness=hanging, length=0.3))
+    scene.add(nc.Spring(hang, name="hanging", stiffness=hanging, length=0.3))
     across = (nc.Point(first, (0.0, -0.4, -1.2)), nc.Point(second, (0.8, 0.4, -1.9)))
-    scene.add(nc.Spring(across, "between", stiffness=between, length=0.4))
+    scene.add(nc.Spring(across, name="between", stiffness=between, length=0.4))
     return scene.compile(solver=solver)

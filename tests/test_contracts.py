@@ -117,7 +117,9 @@ TABLE = {
     nc.Screw: Entry(joint=nc.Screw, constraints=4),
     nc.Distance: Entry(joint=nc.Distance, constraints=1),
     nc.Drive: Entry(lambda p: nc.Drive(p.joint, function=jnp.sin, coordinate=1), nc.Universal),
-    nc.Coupling: Entry(lambda p: nc.Coupling((p.joint,) * 2, (1.0, -0.7), coordinate=(0, 1)), nc.Cylindrical),
+    nc.Coupling: Entry(
+        lambda p: nc.Coupling((p.joint,) * 2, factors=(1.0, -0.7), coordinate=(0, 1)), nc.Cylindrical
+    ),
     nc.Gravity: Entry(lambda p: nc.Gravity(vector=(1.0, -2.0, 3.0)), inside=False),
     nc.PointForce: Entry(
         lambda p: nc.PointForce((p.ends[0], *p.triad), force=_wave, following=True), inside=False
@@ -218,7 +220,7 @@ def stage(effect: type, in_tree: bool = False):
     kind = entry.joint if entry.make or in_tree else with_multipliers(entry.joint)
     options = SPECIAL.get(entry.joint, {})
     parts.joint = scene.add(
-        kind(parts.one, parts.two, (0.2, 0.1, -1.3), AXIS, second=SECOND, name="joint", **options)
+        kind(parts.one, parts.two, point=(0.2, 0.1, -1.3), axis=AXIS, second=SECOND, name="joint", **options)
     )
     if entry.make:
         scene.add(entry.make(parts))

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -95,6 +96,17 @@ def test_warm_start_from_solution_and_file(solution, tmp_path):
     with pytest.raises(ValueError, match="not a solution"):
         file.write_text("{}")
         nc.load_guess(file)
+
+
+def test_solutions_go_through_files(solution, tmp_path):
+    """All numbers of it; what is read goes into a solution of the same problem."""
+    file = tmp_path / "solution.eqx"
+    eqx.tree_serialise_leaves(file, solution)
+    assert file.stat().st_size > 10_000
+    other = eqx.tree_at(lambda s: (s.inputs, s.cost, s.code), solution, (0 * solution.inputs, 0.0, 2))
+    again = eqx.tree_deserialise_leaves(file, other)
+    assert eqx.tree_equal(again, solution) and again.outcome is solution.outcome is not other.outcome
+    assert again.explain() == solution.explain()
 
 
 def test_a_changed_number_does_not_compile_anew(solution, hinged, monkeypatch):

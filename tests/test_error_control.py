@@ -146,7 +146,7 @@ def test_short_substeps_where_motion_is_fast_for_a_moment():
     for k in range(3):
         following = place + np.array([0.5, 0.1 * k, -0.1])
         bead = scene.add(nc.PointMass(mass=100.0**k, position=following, name=f"bead {k}"))
-        scene.add(nc.Distance(carrier, bead, following, parent_point=place, name=f"string {k}"))
+        scene.add(nc.Distance(carrier, bead, point=following, parent_point=place, name=f"string {k}"))
         carrier, place = bead, following
     system, state = scene.compile()
     exact = nc.simulate(system, state, dt=5e-6, steps=100_000, save_every=100_000).q[-1]
@@ -165,7 +165,7 @@ def test_inputs_change_at_the_ends_of_steps():
     """A wheel under a torque that is switched: exact at the ends of steps whatever the substeps."""
     scene = nc.Scene()
     wheel = scene.add(nc.RigidBody(mass=1.0, inertia=(1.0, 1.0, 0.5), name="wheel"))
-    hinge = scene.add(nc.Revolute(nc.ground, wheel, (0, 0, 0), (0, 0, 1), name="hinge"))
+    hinge = scene.add(nc.Revolute(nc.ground, wheel, point=(0, 0, 0), axis=(0, 0, 1), name="hinge"))
     scene.add(nc.JointTorque(hinge, name="motor"))
     system, state = scene.compile()
     torques = jnp.array([[3.0], [-40.0], [0.0], [25.0]])

@@ -56,7 +56,7 @@ BODIES = {
     "position of wrong shape": (dict(position=(0.0, 0.0)), "position", "[m]"),
     "position no numbers": (dict(position="here"), "position", "[m]"),
     "velocity not finite": (dict(velocity=(0.0, np.inf, 0.0)), "velocity", "[m/s]"),
-    "angular velocity of wrong shape": (dict(angular_velocity=1.0), "angular velocity", "[rad/s]"),
+    "angular velocity of wrong shape": (dict(angular_velocity=1.0), "angular_velocity", "[rad/s]"),
     "com not finite": (dict(com=(np.nan, 0.0, 0.0)), "com", "[m]"),
     "no rotation": (dict(orientation=2 * np.eye(3)), "orientation", "[-]"),
     "reflection": (dict(orientation=np.diag([1.0, 1.0, -1.0])), "orientation", "[-]"),
@@ -89,7 +89,7 @@ def test_body_of_another_scene():
     scene = nc.Scene()
     other = scene.add(body(name="other"))
     rejected(lambda: scene.add(nc.Revolute(other, arm, name="hinge")), "'hinge'", "'arm'")
-    spring = nc.Spring((nc.Point(other), nc.Point(arm)), "coil", stiffness=1.0)
+    spring = nc.Spring((nc.Point(other), nc.Point(arm)), name="coil", stiffness=1.0)
     rejected(lambda: scene.add(spring), "'coil'", "'arm'")
 
 
@@ -144,11 +144,11 @@ def test_coordinates_that_a_joint_does_not_have():
 
 
 NUMBERS = {
-    "stiffness": (lambda p, j: nc.Spring(p, "part", stiffness=np.nan), "stiffness", "[N/m]"),
+    "stiffness": (lambda p, j: nc.Spring(p, name="part", stiffness=np.nan), "stiffness", "[N/m]"),
     "coil": (lambda p, j: nc.JointSpring(j, stiffness=np.inf, name="part"), "stiffness"),
-    "damping": (lambda p, j: nc.Damper(p, "part", damping=np.nan), "damping", "[N s/m]"),
+    "damping": (lambda p, j: nc.Damper(p, name="part", damping=np.nan), "damping", "[N s/m]"),
     "gravity": (lambda p, j: nc.Gravity(vector=(0.0, np.nan, 0.0), name="part"), "vector", "[m/s^2]"),
-    "force": (lambda p, j: nc.PointForce(p[:1], "part", force=(np.inf, 0.0, 0.0)), "force", "[N]"),
+    "force": (lambda p, j: nc.PointForce(p[:1], name="part", force=(np.inf, 0.0, 0.0)), "force", "[N]"),
     "armature": (lambda p, j: nc.Armature(j, inertia=np.nan, name="part"), "inertia"),
 }
 
@@ -192,7 +192,7 @@ def test_empty_scene():
 def test_gap_is_refused_with_its_size():
     scene = nc.Scene()
     arm = scene.add(body(position=(0.0, 0.0, 1.0)))
-    rod = nc.Distance(nc.ground, arm, (0.0, 0.0, 1.0), length=0.75, name="rod")
+    rod = nc.Distance(nc.ground, arm, point=(0.0, 0.0, 1.0), length=0.75, name="rod")
     scene.add(rod)
     rejected(scene.compile, "'rod'", " m")
     state = scene.compile(assemble=True)[1]
@@ -202,7 +202,7 @@ def test_gap_is_refused_with_its_size():
 def test_velocities_are_projected_with_a_warning():
     scene = nc.Scene()
     arm = scene.add(body(com=(0.0, 0.0, 1.0), velocity=(1.0, 0.0, 0.0)))
-    scene.add(nc.Revolute(nc.ground, arm, (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), name="hinge"))
+    scene.add(nc.Revolute(nc.ground, arm, point=(0.0, 0.0, 0.0), axis=(0.0, 1.0, 0.0), name="hinge"))
     with pytest.warns(UserWarning, match=r"m/s"):
         system, state = scene.compile()
     assert float(system.constraint_errors(state).velocity) <= 1e-12
@@ -214,7 +214,7 @@ def test_a_scene_compiled_inside_jit_starts_as_outside():
     def built(length, speed):
         scene = nc.Scene()
         arm = scene.add(body(position=(0.6, 0.0, 0.8), velocity=(speed, 0.1, 0.0)))
-        scene.add(nc.Distance(nc.ground, arm, (0.6, 0.0, 0.8), length=length, name="rod"))
+        scene.add(nc.Distance(nc.ground, arm, point=(0.6, 0.0, 0.8), length=length, name="rod"))
         return scene.compile()[1]
 
     inside = jax.jit(built)
@@ -234,7 +234,7 @@ def test_a_scene_compiled_inside_jit_starts_as_outside():
 def test_ideal_rod_that_spins_freely():
     scene = nc.Scene()
     rod = scene.add(body(inertia=(1.0, 1.0, 0.0), name="rod"))
-    scene.add(nc.Spherical(nc.ground, rod, (0.0, 0.0, 0.0)))
+    scene.add(nc.Spherical(nc.ground, rod, point=(0.0, 0.0, 0.0)))
     with pytest.raises(ValueError, match=r"inertia \[kg m\^2\]"):
         scene.compile()
 
@@ -247,7 +247,7 @@ def pendulum():
     scene = nc.Scene()
     scene.add(nc.Gravity())
     arm = scene.add(body(com=(0.3, 0.0, 0.0)))
-    hinge = scene.add(nc.Revolute(nc.ground, arm, (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), name="hinge"))
+    hinge = scene.add(nc.Revolute(nc.ground, arm, point=(0.0, 0.0, 0.0), axis=(0.0, 1.0, 0.0), name="hinge"))
     scene.add(nc.JointTorque(hinge, name="motor"))
     return scene.compile()
 
@@ -268,7 +268,7 @@ def test_other_bad_arguments(pendulum):
     rejected(lambda: nc.simulate(*pendulum, dt=0.1, steps=0), "steps")
     rejected(lambda: nc.simulate(*pendulum, dt=0.1, steps=3, inputs=jnp.zeros((2, 1))), "inputs")
     rejected(lambda: nc.simulate(*pendulum, dt=0.1, steps=3, save_every=2), "save_every")
-    rejected(lambda: nc.simulate(*pendulum, dt=0.1, inputs=jnp.full((2, 1), jnp.nan)), "inputs", "[N m]")
+    rejected(lambda: nc.simulate(*pendulum, dt=0.1, inputs=jnp.full((2, 1), jnp.nan)), "inputs", "[N, N m]")
     rejected(lambda: nc.simulate(*pendulum, dt=jnp.ones(3), steps=3), "dt", "[s]")
     system, state = pendulum
     batch = jax.tree.map(lambda x: jnp.stack([x, x]), state)
@@ -313,7 +313,7 @@ class Breaking(nc.Force):
 def breaking():
     scene = nc.Scene()
     ball = scene.add(nc.PointMass(mass=1.0, name="ball"))
-    scene.add(Breaking((nc.Point(ball),), "breaking"))
+    scene.add(Breaking((nc.Point(ball),), name="breaking"))
     return scene.compile()
 
 

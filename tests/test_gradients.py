@@ -51,8 +51,8 @@ def built(p):
     first = nc.RigidBody(mass=2.0, inertia=(0.3, 0.4, 0.5), com=(0.1, 0.3, 0.0), name="first")
     second = nc.RigidBody(mass=p["mass"], inertia=p["inertia"], position=(0.2, 1.3, -0.1), name="second")
     one, two = scene.add(first), scene.add(second)
-    scene.add(nc.Spherical(nc.ground, one, (0.0, 0.0, 0.0)))
-    hinge = scene.add(nc.Revolute(one, two, p["joint position"], p["axis"], name="hinge"))
+    scene.add(nc.Spherical(nc.ground, one, point=(0.0, 0.0, 0.0)))
+    hinge = scene.add(nc.Revolute(one, two, point=p["joint position"], axis=p["axis"], name="hinge"))
     scene.add(nc.JointTorque(hinge, name="motor"))
     scene.add(nc.JointSpring(hinge, stiffness=p["coil"], rest=0.5))
     scene.add(nc.JointDamper(hinge, damping=p["damping"]))
@@ -82,7 +82,7 @@ def small(p):
     axis = jnp.array([0.0, 0.6, 0.8])
     spin = p["initial spin"] * axis
     link = scene.add(nc.RigidBody(mass=p["mass"], inertia=(0.3, 0.4, 0.5), com=(0.3, 0.1, 0.0)))
-    scene.add(nc.JointTorque(scene.add(nc.Revolute(nc.ground, link, (0.0, 0.0, 0.0), axis))))
+    scene.add(nc.JointTorque(scene.add(nc.Revolute(nc.ground, link, point=(0.0, 0.0, 0.0), axis=axis))))
     ends = nc.Point(nc.ground, (1.0, 1.0, 0.5)), nc.Point(link, (0.3, 0.5, 0.1))
     scene.add(nc.Spring(ends, stiffness=p["stiffness"], length=0.4))
     system, state = scene.compile()
@@ -346,7 +346,7 @@ def retried(rate, length=0.5, dt=0.5, steps=6, extra=64, order=2):
     scene = nc.Scene()
     scene.add(nc.Gravity(vector=(0.0, 0.0, -9.81)))
     body = nc.RigidBody(mass=1.0, inertia=(0.1, 0.2, 0.3), com=(length, 0.0, 0.0), name="body")
-    scene.add(nc.Spherical(nc.ground, scene.add(body), (0.0, 0.0, 0.0)))
+    scene.add(nc.Spherical(nc.ground, scene.add(body), point=(0.0, 0.0, 0.0)))
     system, state = scene.compile()
     spin = rate * jnp.array([4.0, 11.0, -6.0])
     state = eqx.tree_at(lambda s: s.v, state, state.v.at[1:].set(jnp.cross(spin[None], state.q[1:])))
@@ -442,7 +442,7 @@ def test_torque_on_a_rotor_is_exact():
     """Angular momentum is the sum of the impulses: its derivative by each of them is the step."""
     scene = nc.Scene()
     rotor = scene.add(nc.RigidBody(mass=1.0, inertia=(0.3, 0.3, 0.5)))
-    hinge = scene.add(nc.Revolute(nc.ground, rotor, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)))
+    hinge = scene.add(nc.Revolute(nc.ground, rotor, point=(0.0, 0.0, 0.0), axis=(0.0, 0.0, 1.0)))
     scene.add(nc.JointTorque(hinge))
     system, state = scene.compile()
     dt = 0.1
@@ -519,7 +519,9 @@ def test_where_drives_prescribe_every_motion():
         place = np.array([0.5 * k, 0.0, 0.0])
         inertia = (0.1, 0.2, 0.2)
         link = scene.add(nc.RigidBody(mass=1.0, inertia=inertia, com=(0.25, 0, 0), position=place))
-        hinge = scene.add(nc.Revolute(carrier, link, place, (0.1, 1.0, 0.2 * k), name=f"hinge {k}"))
+        hinge = scene.add(
+            nc.Revolute(carrier, link, point=place, axis=(0.1, 1.0, 0.2 * k), name=f"hinge {k}")
+        )
         scene.add(nc.Drive(hinge, function=Swing(jnp.array(0.7 / (1 + k)))))
         carrier = link
     system, state = scene.compile()

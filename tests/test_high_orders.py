@@ -60,15 +60,15 @@ def machine():
     hub = part("hub", (0.0, 0.0, 0.0), (0.3, 0.4, 0.5))
     arm = part("arm", (0.5, 0.0, 0.0), (0.1, 0.15, 0.2))
     fin = part("fin", (-0.5, 0.0, 0.0), (0.08, 0.1, 0.12))
-    elbow = scene.add(nc.Revolute(hub, arm, (0.3, 0.0, 0.0), (0.0, 1.0, 0.5), name="elbow"))
-    root = scene.add(nc.Revolute(hub, fin, (-0.3, 0.0, 0.0), (1.0, 0.0, 0.2), name="root"))
+    elbow = scene.add(nc.Revolute(hub, arm, point=(0.3, 0.0, 0.0), axis=(0.0, 1.0, 0.5), name="elbow"))
+    root = scene.add(nc.Revolute(hub, fin, point=(-0.3, 0.0, 0.0), axis=(1.0, 0.0, 0.2), name="root"))
     scene.add(nc.JointTorque(elbow, name="motor"))
     scene.add(nc.Drive(root, function=beat, name="drive"))
     ends = nc.Point(hub, (0.0, 0.4, 0.1)), nc.Point(arm, (0.7, 0.1, 0.2))
     law = lambda x: 40.0 * (x - 0.5) ** 2 + 60.0 * (x - 0.5) ** 4  # noqa: E731
-    scene.add(nc.NonlinearSpring(ends, "spring", law=law))
+    scene.add(nc.NonlinearSpring(ends, name="spring", law=law))
     tips = nc.Point(arm, (0.8, 0.0, 0.0)), nc.Point(fin, (-0.7, 0.1, 0.0))
-    scene.add(nc.Damper(tips, "damper", damping=0.8))
+    scene.add(nc.Damper(tips, name="damper", damping=0.8))
     return scene.compile()
 
 

@@ -224,7 +224,9 @@ def test_derivatives_with_drives():
             link = scene.add(
                 nc.RigidBody(mass=1.0, inertia=(0.1, 0.2, 0.2), com=(0.25, 0, 0), position=place, name=f"{k}")
             )
-            hinge = scene.add(nc.Revolute(carrier, link, place, (0.0, 1.0, 0.2 * k), name=f"hinge {k}"))
+            hinge = scene.add(
+                nc.Revolute(carrier, link, point=place, axis=(0.0, 1.0, 0.2 * k), name=f"hinge {k}")
+            )
             if k < 2:
                 scene.add(nc.Drive(hinge, function=Swing(amplitude / (1 + k))))
             carrier = link

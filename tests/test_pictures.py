@@ -9,7 +9,7 @@ import pytest  # noqa: E402
 
 import natcoord_jax as nc  # noqa: E402
 from natcoord_jax import gallery  # noqa: E402
-from natcoord_jax.viz.outline import beam_rims, inertia_boxes, is_node, with_ground  # noqa: E402
+from natcoord_jax.viz.outline import beam_rims, inertia_boxes, is_node, surfaces, with_ground  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -48,6 +48,30 @@ def test_boxes_have_the_inertia_of_the_bodies():
     corners = inertia_boxes(system)[0, :, 1:]
     assert np.ptp(corners, axis=0) == pytest.approx(size)
     assert corners.mean(axis=0) == pytest.approx((1, 2, 3))
+
+
+SHAPES = {
+    "box": (nc.Box((0.4, 0.3, 0.2)), (0.4, 0.3, 0.2)),
+    "sphere": (nc.Sphere(0.2), (0.4, 0.4, 0.4)),
+    "cylinder": (nc.Cylinder(0.2, 0.6), (0.4, 0.4, 0.6)),
+    "ellipsoid": (nc.Ellipsoid((0.1, 0.2, 0.3)), (0.2, 0.4, 0.6)),
+}
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_bodies_are_drawn_as_their_shapes(name):
+    """Right size and place, and every point on the surface: the normalised radius is one."""
+    shape, size = SHAPES[name]
+    scene = nc.Scene()
+    scene.add(nc.RigidBody(shape=shape, density=1000.0, com=(1, 2, 3)))
+    system, _ = scene.compile()
+    [(weights, faces)] = surfaces(system)
+    points = weights[:, 1:] - (1, 2, 3)
+    assert np.ptp(points, axis=0) == pytest.approx(size)
+    assert sorted({int(k) for face in faces for k in face}) == list(range(len(points)))
+    x, y, z = (2 * points / size).T
+    on = {"box": np.abs(x) * np.abs(y) * np.abs(z), "cylinder": (x**2 + y**2) * np.abs(z)}
+    assert on.get(name, x**2 + y**2 + z**2) == pytest.approx(1.0)
 
 
 def test_beams_are_drawn_as_swept_sections(tmp_path):

@@ -5,6 +5,8 @@ left out; controllers, terminal events or derivatives that see other velocities 
 a step goes on from, changed; projections in programs that read no velocity.
 """
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -12,12 +14,13 @@ import numpy as np
 import pytest
 import tolerances as tol
 from differences import alternation
+from scenes import pair
 
 import natcoord_jax as nc
 from natcoord_jax import gallery
 from natcoord_jax.assembly.coordinates import state_rates
-from natcoord_jax.assembly.diagnostics import joint_residuals
 from natcoord_jax.assembly.reading import reads_velocities
+from natcoord_jax.assembly.violations import joint_residuals
 
 AXES = [(0, 0, 1), (0, 1, 0), (0, 1, 0), (0, 0, 1), (0, 1, 0), (0, 0, 1)]
 LENGTHS, MASSES = (0.3, 0.4, 0.35, 0.2, 0.15, 0.1), (5, 4, 3, 1.5, 1, 0.5)
@@ -75,7 +78,7 @@ def swinging(kind):
         return example.system, example.state
     scene = nc.Scene()
     scene.add(nc.Gravity())
-    part = {"inertia": (0.3, 0.4, 0.5), "com": (0.1, 0.0, -0.2)}
+    part: Any = {"inertia": (0.3, 0.4, 0.5), "com": (0.1, 0.0, -0.2)}
     one = scene.add(nc.RigidBody(mass=2.0, position=(0, 0, -0.5), name="one", **part))
     two = scene.add(nc.RigidBody(mass=1.0, position=(0.5, 0.2, -1.0), name="two", **part))
     first = scene.add(nc.Revolute(nc.ground, one, axis=(0, 1, 0.2), name="first"))
@@ -137,6 +140,17 @@ def test_the_nearest_velocities_that_the_constraints_admit(kind):
         np.testing.assert_allclose(system.rate(trajectory, "first"), wanted, atol=tol.TANGENT)
 
 
+@pytest.mark.parametrize("joint", [nc.Universal, nc.Cylindrical, nc.Planar])
+def test_from_body_to_body_as_all_together(joint):
+    rng, found = np.random.default_rng(0), []
+    for solver in ("reduced", "recursive"):
+        system, state = pair(joint, solver=solver)
+        found.append(system.tangent(eqx.tree_at(lambda s: s.v, state, state.v + rng.normal(size=(8, 3)))))
+        rng = np.random.default_rng(0)
+    np.testing.assert_allclose(found[0].v, found[1].v, atol=tol.TANGENT_OF_A_SMALL_SCENE)
+    assert float(system.constraint_errors(found[1]).velocity) <= tol.TANGENT_OF_A_SMALL_SCENE
+
+
 def test_the_step_of_the_paper_as_it_stands():
     """The same states to the last digit, and readings of them as they are."""
     system, state = swinging("rotor")
@@ -177,7 +191,7 @@ def test_velocities_that_nobody_reads_are_not_made():
 def pendulum():
     scene = nc.Scene()
     scene.add(nc.Gravity())
-    part = {"inertia": (0.3, 0.4, 0.5), "com": (0.1, 0.05, -0.4), "angular_velocity": (0, 2.0, 0.4)}
+    part: Any = {"inertia": (0.3, 0.4, 0.5), "com": (0.1, 0.05, -0.4), "angular_velocity": (0, 2.0, 0.4)}
     arm = scene.add(nc.RigidBody(mass=2.0, name="arm", **part))
     hinge = scene.add(nc.Revolute(nc.ground, arm, axis=(0, 1, 0.2), name="hinge"))
     scene.add(nc.JointTorque(hinge, name="motor"))

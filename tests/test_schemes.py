@@ -114,8 +114,10 @@ def driven():
     two = scene.add(
         nc.RigidBody(mass=1.0, inertia=(0.1, 0.2, 0.3), com=(0.2, 0, 0), position=(0.5, 0, 0), name="two")
     )
-    first = scene.add(nc.Revolute(nc.ground, one, (0, 0, 0), (0.0, 1.0, 0.0), name="first"))
-    second = scene.add(nc.Universal(one, two, (0.5, 0, 0), (0, 0, 1), second=(0, 1, 0), name="second"))
+    first = scene.add(nc.Revolute(nc.ground, one, point=(0, 0, 0), axis=(0.0, 1.0, 0.0), name="first"))
+    second = scene.add(
+        nc.Universal(one, two, point=(0.5, 0, 0), axis=(0, 0, 1), second=(0, 1, 0), name="second")
+    )
     scene.add(nc.Drive(first, function=lambda t: 0.7 * (1 - jnp.cos(3.0 * t)), name="drive"))
     scene.add(nc.JointSpring(second, stiffness=20.0))
     scene.add(nc.JointDamper(second, damping=0.1, coordinate=1))
@@ -171,13 +173,15 @@ def chain(bodies: int):
     scene = nc.Scene()
     scene.add(nc.Gravity())
     last = scene.add(nc.RigidBody(mass=1.0, inertia=(0.1, 0.25, 0.2), com=(0.25, 0, 0.1), name="one"))
-    joint = scene.add(nc.Universal(nc.ground, last, (0, 0, 0), (0, 0, 1), second=(0, 1, 0), name="first"))
+    joint = scene.add(
+        nc.Universal(nc.ground, last, point=(0, 0, 0), axis=(0, 0, 1), second=(0, 1, 0), name="first")
+    )
     scene.add(nc.JointSpring(joint, stiffness=2.0, rest=0.3))
     if bodies == 2:
         place = (0.5, 0, 0)
         two = nc.RigidBody(mass=0.7, inertia=(0.1, 0.2, 0.28), com=(0.2, 0.1, 0), position=place, name="two")
         one, last = last, scene.add(two)
-        joint = scene.add(nc.Revolute(one, last, place, (0.0, 0.6, 0.8), name="second"))
+        joint = scene.add(nc.Revolute(one, last, point=place, axis=(0.0, 0.6, 0.8), name="second"))
     scene.add(nc.Armature(joint, inertia=0.05, coordinate=2 - bodies))
     scene.add(nc.Spring((nc.Point(nc.ground, (0, 0.3, -0.4)), nc.Point(last, (0.8, 0, 0))), stiffness=20.0))
     return scene.compile()

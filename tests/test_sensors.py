@@ -309,8 +309,8 @@ def test_rates_are_derivatives_of_coordinates():
         lambda q, v: jax.jvp(lambda q: coordinate_values(system, rows_with_ground(q)), (q,), (v,))
     )(state.q, state.v)
     for k, (joint, index) in enumerate(system.structure.coordinates):
-        close(system.rate(state, joint, index), derivative[k], 1e-12)
-        turns = (system.coordinate(state, joint, index) - found[k]) / (2 * math.pi)
+        close(system.rate(state, joint, index=index), derivative[k], 1e-12)
+        turns = (system.coordinate(state, joint, index=index) - found[k]) / (2 * math.pi)
         close(turns, jnp.round(turns), 1e-12)
 
 
@@ -479,7 +479,7 @@ def test_requests_that_cannot_be_met_say_why():
     with pytest.raises(ValueError, match="loops"):
         nc.random_state(system, state, jax.random.key(0))
     with pytest.raises(ValueError, match="no number 1"):
-        system.coordinate(state, closing, 1)
+        system.coordinate(state, closing, index=1)
     with pytest.raises(ValueError, match="cannot sense"):
         system.sense(state, "nobody")
     with pytest.raises(ValueError, match="0 coordinates in m"):

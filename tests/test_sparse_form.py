@@ -24,7 +24,7 @@ def ladder(length: int, solver: str | None, *, rods: int = 1):
     for j, row in enumerate(bodies):
         for k, body in enumerate(row):
             before = row[k - 1] if k else nc.ground
-            scene.add(nc.Spherical(before, body, (float(k), float(j), 0.0)))
+            scene.add(nc.Spherical(before, body, point=(float(k), float(j), 0.0)))
     for k in range(1, length, 2):
         for _ in range(rods):
             near, far = (row[k] for row in bodies)

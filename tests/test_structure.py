@@ -40,7 +40,7 @@ SCENES = {
         [],
     ),
     "hinge and motor": (
-        "hinge = scene.add(nc.Revolute(one, two, (0.5, 0.0, 0.0)))\nscene.add(nc.JointTorque(hinge))",
+        "hinge = scene.add(nc.Revolute(one, two, point=(0.5, 0.0, 0.0)))\nscene.add(nc.JointTorque(hinge))",
         ["joints.coordinates", "joints.lower_pairs", "joints.relations", "actuators.motors"],
     ),
     "springs": (
@@ -51,7 +51,7 @@ SCENES = {
         ["loads.gravity", "loads.point_loads", "springs.point_springs"],
     ),
     "coil": (
-        "hinge = scene.add(nc.Revolute(one, two, (0.5, 0.0, 0.0)))\n"
+        "hinge = scene.add(nc.Revolute(one, two, point=(0.5, 0.0, 0.0)))\n"
         "scene.add(nc.JointSpring(hinge, stiffness=2.0))",
         ["joints.coordinates", "joints.lower_pairs", "joints.relations", "springs.joint_springs"],
     ),
@@ -172,7 +172,7 @@ def star(arms: int, solver: str):
         angle = 2 * np.pi * k / arms
         out = np.array([np.cos(angle), np.sin(angle), 0.0])
         arm = scene.add(nc.RigidBody(mass=1.0, inertia=(0.1, 0.2, 0.25), position=2 * out))
-        hinge = scene.add(nc.Revolute(hub, arm, out, np.cross(out, (0.0, 0.0, 1.0))))
+        hinge = scene.add(nc.Revolute(hub, arm, point=out, axis=np.cross(out, (0.0, 0.0, 1.0))))
         scene.add(nc.JointSpring(hinge, stiffness=3.0 + k))
         scene.add(nc.JointTorque(hinge))
     return scene.compile(solver=solver)
@@ -367,7 +367,7 @@ def test_a_changed_number_never_retraces(programs):
         made = nc.Scene()
         made.add(nc.Gravity(vector=(0.0, 0.1 * mass, -9.81)))
         one = made.add(nc.RigidBody(mass=mass, inertia=(0.1, 0.2, 0.25), name="one"))
-        hinge = made.add(nc.Revolute(nc.ground, one, (place, 0.0, 0.0)))
+        hinge = made.add(nc.Revolute(nc.ground, one, point=(place, 0.0, 0.0)))
         made.add(nc.JointSpring(hinge, stiffness=stiffness))
         made.add(nc.JointTorque(hinge))
         made.add(Idle((nc.Point(one),)))
@@ -396,7 +396,7 @@ def test_a_scene_of_traced_numbers():
     def build(mass, place):
         scene = nc.Scene()
         body = scene.add(nc.RigidBody(mass=mass, inertia=(0.1, 0.2, 0.25), com=(0.1, 0.0, 0.0)))
-        scene.add(nc.Revolute(nc.ground, body, place, (0.0, 1.0, 0.0)))
+        scene.add(nc.Revolute(nc.ground, body, point=place, axis=(0.0, 1.0, 0.0)))
         scene.add(nc.Gravity())
         return scene.compile()
 

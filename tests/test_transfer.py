@@ -200,7 +200,7 @@ def test_what_cannot_be_carried_over_is_refused(moved):
         nc.transfer(system, before, scene.compile()[0])
 
     def distance(parent, child, axis, name):
-        return nc.Distance(parent, child, (0.9, 0.2, 0.0), parent_point=(0.2, 0.0, 0.1), name=name)
+        return nc.Distance(parent, child, point=(0.9, 0.2, 0.0), parent_point=(0.2, 0.0, 0.1), name=name)
 
     with pytest.raises(ValueError, match="'catch' cannot close"):
         nc.transfer(system, before, bodies(distance)[0])

@@ -93,7 +93,7 @@ def heavy_top():
     spin = CASES["R01"]["setup"]["Omega0_body"]
     top = nc.RigidBody(mass=p["m"], inertia=p["J_com"], com=p["r_com"], angular_velocity=spin, name="top")
     body = scene.add(top)
-    scene.add(nc.Spherical(nc.ground, body, (0.0, 0.0, 0.0)))
+    scene.add(nc.Spherical(nc.ground, body, point=(0.0, 0.0, 0.0)))
     return (*scene.compile(), body)
 
 
@@ -144,7 +144,7 @@ def test_r02_steady_precession():
         orientation=((1.0, 0.0, 0.0), tilt),
         angular_velocity=rate * np.array([0.0, 0.0, 1.0]) + steady * axis,
     )
-    scene.add(nc.Spherical(nc.ground, scene.add(top), (0.0, 0.0, 0.0)))
+    scene.add(nc.Spherical(nc.ground, scene.add(top), point=(0.0, 0.0, 0.0)))
     system, state = scene.compile()
     moments = [0.02, 0.04, 0.06, 0.08, 0.1]
     found, coarse, fine = richardson(lambda s: np.asarray(s.q)[3], system, state, 2e-4, moments, 100)
@@ -224,7 +224,7 @@ def test_r13_double_pendulum():
             position=start,
         )
         body = scene.add(rod)
-        scene.add(nc.Revolute(carrier, body, start, (0.0, 1.0, 0.0)))
+        scene.add(nc.Revolute(carrier, body, point=start, axis=(0.0, 1.0, 0.0)))
         carrier = body
     system, state = scene.compile()
     entries = reference("R13", "tip_xz", until=3.0)
@@ -270,7 +270,7 @@ def test_r16_revolute_pendulum_and_its_reaction():
     scene = nc.Scene()
     scene.add(nc.Gravity(vector=(0.0, 0.0, -p["g"])))
     arm = nc.RigidBody(mass=p["m"], inertia=p["J"], position=(p["length"] / 2, 0.0, 0.0), name="bar")
-    hinge = scene.add(nc.Revolute(nc.ground, scene.add(arm), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
+    hinge = scene.add(nc.Revolute(nc.ground, scene.add(arm), point=(0.0, 0.0, 0.0), axis=(0.0, 1.0, 0.0)))
     system, state = scene.compile()
     entries = reference("R16", "pos", "own")
 

@@ -11,11 +11,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from natcoord_jax.assembly.system import System
+from natcoord_jax.assembly.system import SYSTEM, System
+from natcoord_jax.core.arguments import checked
+from natcoord_jax.core.kinds import FunctionOf, Several, of
+from natcoord_jax.core.numeric import Number, Vector, Whole
 from natcoord_jax.core.results import Result
-from natcoord_jax.core.state import State
+from natcoord_jax.core.state import STATE, State
 from natcoord_jax.stepping.endpoint import Endpoint, endpoints
-from natcoord_jax.stepping.scheme import EnergyMomentum
+from natcoord_jax.stepping.scheme import ORDER, EnergyMomentum
 
 ORDERS = (2, 4, 6, 8, 10)
 TARGETS = (1e-2, 1e-4, 1e-6, 1e-8, 1e-10)
@@ -225,6 +228,18 @@ def _extrapolated(runs: _Runs, order: int, steps: int) -> State:
     return jax.tree.map(lambda x, y: y + (y - x) / (2.0**order - 1.0), coarse, fine)
 
 
+@checked(
+    system=SYSTEM,
+    state=STATE,
+    t_end=Number("positive"),
+    inputs=FunctionOf("of time [s] to the inputs (inputs,)"),
+    quantities=of("a dictionary of functions of the end state, by name", Mapping),
+    orders=Several(ORDER, 1),
+    steps=Several(Whole(1), 1),
+    targets=Vector(None),
+    repeats=Whole(1),
+    limit_s=Number("positive"),
+)
 def accuracy(
     system: System,
     state: State,
@@ -274,10 +289,6 @@ def accuracy(
         >>> 3.5 < found.rows[0].error / found.rows[1].error < 4.5
         True
     """
-    if not (math.isfinite(t_end) and t_end > 0):
-        raise ValueError(f"t_end [s] is {t_end}; pass a positive finite time")
-    if not orders:
-        raise ValueError("orders is empty; pass some of 2, 4, 6, 8, 10")
     measured, runs = quantities or _default_quantities(), _Runs(system, state, float(t_end), inputs)
     best, reference_error, made = _reference(runs, measured, orders)
     if not math.isfinite(reference_error):

@@ -18,10 +18,11 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.diagnostics import body_momenta
 from natcoord_jax.assembly.response import Stations, body_rows, gather, respond, situation, stations
-from natcoord_jax.assembly.system import Group, System
+from natcoord_jax.assembly.system import SYSTEM, Group, System
+from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.effect import Motion, Response
 from natcoord_jax.core.host import on_host
-from natcoord_jax.core.state import State, Trajectory
+from natcoord_jax.core.state import TRAJECTORY, State, Trajectory
 from natcoord_jax.maths.collocation import gauss
 from natcoord_jax.maths.vectors import cross, safe_divide
 
@@ -50,6 +51,18 @@ class Balance(eqx.Module):
     directions: int
     axes: int
     note: str
+
+    def __repr__(self) -> str:
+        """The largest errors over all times."""
+        lines = [f"energy            {np.max(self.energy):.2g} of the largest sum of energies and works"]
+        for name, errors, count, scale in (
+            ("momentum", self.momentum, f"{self.directions} directions", "momenta"),
+            ("angular momentum", self.angular_momentum, f"{self.axes} axes", "angular momenta"),
+        ):
+            worth = "not judged" if errors is None else f"{np.max(errors):.2g} of the largest sum of {scale}"
+            lines.append(f"{name:<17} {worth}" + (f", along {count}" if errors is not None else ""))
+        lines += [f"({self.note})"] if self.note else []
+        return "\n".join(["Balance: largest relative errors [-]", *lines])
 
 
 def _midpoint(before: State, after: State, h: Array) -> Stations:
@@ -143,6 +156,7 @@ def _relative(error: np.ndarray, scale: float) -> np.ndarray:
     return error / scale if scale > 0 else np.zeros_like(error)
 
 
+@checked(system=SYSTEM, trajectory=TRAJECTORY)
 def balance(system: System, trajectory: Trajectory) -> Balance:
     """Errors of the balances of energy, momentum and angular momentum along a trajectory.
 

@@ -8,13 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from natcoord_jax.assembly.system import System
+from natcoord_jax.assembly.system import SYSTEM, System
+from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.compiled import compiled
 from natcoord_jax.core.effect import replace_fields
+from natcoord_jax.core.numeric import Whole
 from natcoord_jax.core.results import Result
-from natcoord_jax.core.state import State
-from natcoord_jax.stepping.checked import checked_inputs, checked_step
-from natcoord_jax.stepping.scheme import SECOND_ORDER, Scheme
+from natcoord_jax.core.state import STATE, State
+from natcoord_jax.stepping.checked import INPUTS, STEP, checked_inputs, checked_step
+from natcoord_jax.stepping.scheme import SCHEME, SECOND_ORDER, Scheme
 from natcoord_jax.stepping.simulate import simulate
 
 DIGITS = 16
@@ -99,6 +101,16 @@ def _grown(
     return t, total, jnp.max(results)
 
 
+@checked(
+    system=SYSTEM,
+    state=STATE,
+    dt=STEP,
+    steps=Whole(1),
+    inputs=INPUTS,
+    save_every=Whole(1),
+    scheme=SCHEME,
+    seed=Whole(0),
+)
 def tangent_growth(
     system: System,
     state: State,

@@ -18,13 +18,16 @@ from natcoord_jax.analysis.statics import (
     extent_of,
     largest,
 )
-from natcoord_jax.assembly.system import System
+from natcoord_jax.assembly.system import SYSTEM, System
+from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.callables import Function
 from natcoord_jax.core.checks import as_array, at_top_level, is_concrete, positive
 from natcoord_jax.core.compiled import briefly
 from natcoord_jax.core.effect import replace_fields
+from natcoord_jax.core.kinds import FLAG, FunctionOf
+from natcoord_jax.core.numeric import Number, Whole
 from natcoord_jax.core.results import REASONS, Result, SimulationError
-from natcoord_jax.core.state import State
+from natcoord_jax.core.state import STATE, State
 
 
 class _Point(eqx.Module):
@@ -129,6 +132,15 @@ SHORTEST = 1 / 64
 """Shortest part of an arc that is tried where a whole one fails."""
 
 
+@checked(
+    system=SYSTEM,
+    state=STATE,
+    arc=Number("positive"),
+    steps=Whole(1),
+    scale=Number("positive"),
+    inputs=FunctionOf("of the load parameter to the inputs (inputs,)"),
+    throw=FLAG,
+)
 def load_path(
     system: System,
     state: State,

@@ -20,10 +20,13 @@ from natcoord_jax.analysis.static_equations import Static
 from natcoord_jax.assembly.balances import loads, relative_rates, rotors_of, with_rest
 from natcoord_jax.assembly.momentum import inertia, wrench
 from natcoord_jax.assembly.rates import row_rates
-from natcoord_jax.assembly.system import System
+from natcoord_jax.assembly.system import SYSTEM, System
+from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.checks import is_concrete, numbers
 from natcoord_jax.core.compiled import briefly
-from natcoord_jax.core.state import State
+from natcoord_jax.core.kinds import FLAG
+from natcoord_jax.core.numeric import COMPONENTS, Vector, Whole
+from natcoord_jax.core.state import STATE, State
 from natcoord_jax.maths.vectors import cross
 
 BALANCE = 1e-6
@@ -190,6 +193,7 @@ def _held(system: System) -> np.ndarray:
     return np.eye(6 * len(system.structure.bodies))[turns]
 
 
+@checked(system=SYSTEM, state=STATE, count=Whole(1), rotation=COMPONENTS, inputs=Vector(None), damped=FLAG)
 def modes(
     system: System,
     state: State,

@@ -8,11 +8,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.diagnostics import Energy
-from natcoord_jax.assembly.system import System
-from natcoord_jax.core.state import Trajectory
+from natcoord_jax.assembly.system import SYSTEM, System
+from natcoord_jax.core.arguments import Part, is_a
+from natcoord_jax.core.kinds import Several
+from natcoord_jax.core.state import TRAJECTORY, Trajectory
 
 
-class Phases(eqx.Module):
+class Phases(Part):
     """Trajectories that follow one another, each with its system; see `nc.transfer`.
 
     The last state of a phase and the first one of the next have the same time: what an impact changes is
@@ -41,8 +43,8 @@ class Phases(eqx.Module):
         ((42,), True)
     """
 
-    systems: tuple[System, ...]
-    trajectories: tuple[Trajectory, ...]
+    systems: tuple[System, ...] = eqx.field(metadata=is_a(Several(SYSTEM, 1)))
+    trajectories: tuple[Trajectory, ...] = eqx.field(metadata=is_a(Several(TRAJECTORY, 1)))
 
     def __check_init__(self) -> None:
         """One system for each trajectory.

@@ -8,12 +8,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from natcoord_jax.analysis.static_equations import Static
-from natcoord_jax.assembly.system import System
+from natcoord_jax.assembly.system import SYSTEM, System
+from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.checks import at_top_level, is_concrete
 from natcoord_jax.core.compiled import briefly
 from natcoord_jax.core.effect import replace_fields
+from natcoord_jax.core.kinds import FLAG, FunctionOf
+from natcoord_jax.core.numeric import Number, Numbers, Vector, Whole
 from natcoord_jax.core.results import REASONS, Result, SimulationError
-from natcoord_jax.core.state import State
+from natcoord_jax.core.state import STATE, State
 from natcoord_jax.linsolve.refinement import refined_solve
 
 ITERATIONS = 40
@@ -36,6 +39,15 @@ TOLERANCE = 1e-11
 
 FLOOR = 1e-7
 """Corrections that stop shrinking below this have reached the floor of round-off of a stiff system."""
+
+INPUTS_OF_LOAD = Numbers(("...", None)) | FunctionOf("of the load parameter to the inputs (inputs,)")
+
+GROWING = "take more steps, or follow the path through a limit point with nc.load_path"
+STANDING = (
+    "nothing that acts depends on the load parameter, so neither steps nor a path of the load lead there: "
+    "start nearer to the equilibrium, or let loads grow as functions of it"
+)
+"""What to do where no equilibrium is found, under loads that grow and others."""
 
 
 class Equilibrium(eqx.Module):
@@ -148,6 +160,14 @@ def differentiable(system: System, state: State, lam: Array, inputs: Array) -> t
     return static.displaced(y), y[static.balances :]
 
 
+@checked(
+    system=SYSTEM,
+    state=STATE,
+    loads=Number() | Vector(None),
+    inputs=INPUTS_OF_LOAD,
+    steps=Whole(1),
+    throw=FLAG,
+)
 def equilibrium(
     system: System,
     state: State,
@@ -202,14 +222,29 @@ def equilibrium(
     if throw and is_concrete(found.result):
         for number, code in enumerate(found.result):
             if int(code) != Result.SUCCESSFUL:
+                before = max(number - 1, 0)
+                reached = jax.tree.map(lambda x, k=before: x[k], found.states)
+                grows = _grows(system, replace_fields(reached, t=values[number]), given, number)
                 raise SimulationError(
                     f"no equilibrium found at the load parameter {float(values[number]):.6g} (load "
-                    f"{number + 1} of {len(values)}): {REASONS[Result(int(code))]}; take more "
-                    "steps, or follow the path through a limit point with nc.load_path",
+                    f"{number + 1} of {len(values)}): {REASONS[Result(int(code))]}; "
+                    f"{GROWING if grows else STANDING}",
                     Result(int(code)),
                     found,
                 )
     return found
+
+
+def _grows(system: System, state: State, inputs: Array, number: int) -> bool:
+    """Whether the equations of a load are others than those of the load before, or depend on it."""
+    if number > 0 and bool(jnp.any(inputs[number] != inputs[number - 1])):
+        return True
+
+    def residual(t: Array) -> Array:
+        static = Static(system, replace_fields(state, t=t), inputs[number])
+        return static.residual(jnp.zeros(static.unknowns))
+
+    return bool(jnp.any(jax.jvp(residual, (state.t,), (jnp.ones_like(state.t),))[1] != 0))
 
 
 def _inputs_at(system: System, inputs: Any, values: Array) -> Float[Array, "loads inputs"]:

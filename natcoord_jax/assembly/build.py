@@ -1,5 +1,7 @@
 """Compilation: from named parts to a system and its initial state."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,7 +15,7 @@ from natcoord_jax.assembly.layout import Layout
 from natcoord_jax.assembly.roundness import symmetries
 from natcoord_jax.assembly.system import Structure, System
 from natcoord_jax.core.bodies import Body
-from natcoord_jax.core.checks import as_array
+from natcoord_jax.core.checks import as_array, is_concrete
 from natcoord_jax.core.effect import Effect, replace_fields
 from natcoord_jax.core.host import on_host, stacked
 from natcoord_jax.core.joint import Joint
@@ -48,6 +50,7 @@ def build(
         constraints=internal + relations + sum(g.count * g.multipliers for g in joint_groups),
         points=tuple(k for k, body in enumerate(layout.ordered_bodies()) if not body.oriented),
         dofs=len(tree.slot_of) - multipliers,
+        shapes=tuple(_drawn(body.shape) for body in layout.ordered_bodies()),
     )
     system = System(
         stacked([b.mass_block for b in layout.ordered_bodies()]),
@@ -64,6 +67,11 @@ def build(
     state = layout.state()
     system = jax.tree.map(as_array, with_symmetries(system, state))
     return system, with_readings(system, state)
+
+
+def _drawn(shape: Any) -> Any:
+    """A shape by numbers of NumPy, which are no part of the program; None for one that is traced."""
+    return jax.tree.map(np.asarray, shape) if is_concrete(shape) else None
 
 
 def with_symmetries(system: System, state: State) -> System:

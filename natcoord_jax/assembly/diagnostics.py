@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from natcoord_jax.core.checks import require_double
 from natcoord_jax.core.host import on_host
 from natcoord_jax.core.results import REASONS, REMEDIES, Result, SimulationError
 from natcoord_jax.core.state import State, Trajectory
@@ -33,11 +34,13 @@ class Energy(eqx.Module):
     @property
     def potential(self) -> Float[Array, "*t"]:
         """Sum of the stores."""
+        require_double("Energy.potential")
         return sum(self.stores.values(), jnp.zeros_like(self.kinetic))
 
     @property
     def total(self) -> Float[Array, "*t"]:
         """Kinetic energy and stores."""
+        require_double("Energy.total")
         return self.kinetic + self.potential
 
 
@@ -155,26 +158,58 @@ def unknown_name(system: "System", index: int, stages: int = 1) -> str:
 
 
 def explain(system: "System", trajectory: Trajectory) -> str:
-    """How a run ended, in words: result, step, time, and the part with the worst residual by name."""
+    """How a run ended, in words: result, step, time, and the part with the worst residual by name.
+
+    Of a batch, how many lanes failed for which reason at which part, and the first of each.
+    """
     if np.ndim(trajectory.result):
-        lanes = [jax.tree.map(lambda x, k=k: x[k], trajectory) for k in range(trajectory.result.shape[0])]
-        return "\n".join(f"lane {k}: {explain(system, lane)}" for k, lane in enumerate(lanes))
+        return _explain_lanes(system, trajectory)
     result = Result(int(trajectory.result))
-    text = REASONS[result]
     if result == Result.SUCCESSFUL:
-        return text
-    text += f" in step {int(trajectory.failed_step)} at t = {float(trajectory.failed_time):.6g} s"
+        return REASONS[result]
+    where = f" in step {int(trajectory.failed_step)} at t = {float(trajectory.failed_time):.6g} s"
+    return REASONS[result] + where + _culprit(system, trajectory) + _remedy(result)
+
+
+def _remedy(result: Result) -> str:
+    return f"; {REMEDIES[result]}" if result in REMEDIES else ""
+
+
+def _culprit(system: "System", trajectory: Trajectory) -> str:
+    """The part that a run failed at, as far as it is known."""
+    result = Result(int(trajectory.result))
     # The first interval without an end holds the inputs of the step that failed.
     failed = int(np.argmax(np.diff(np.asarray(trajectory.t)) == 0))
     broken = ~np.isfinite(np.asarray(trajectory.inputs)[failed])
     if result == Result.NONFINITE and broken.any():
         # Such a number spoils all unknowns of the step, of which the first would be named.
         names = [repr(name) for name, bad in zip(system.structure.inputs, broken) if bad]
-        text += f"; not finite: the input {', '.join(names)}"
-    elif int(trajectory.failed_part) >= 0:
+        return f"; not finite: the input {', '.join(names)}"
+    if int(trajectory.failed_part) >= 0:
         stages = trajectory.scheme.stages if trajectory.scheme is not None else 1
-        text += f"; worst residual at {unknown_name(system, int(trajectory.failed_part), stages)}"
-    return text + (f"; {REMEDIES[result]}" if result in REMEDIES else "")
+        return f"; worst residual at {unknown_name(system, int(trajectory.failed_part), stages)}"
+    return ""
+
+
+def _explain_lanes(system: "System", batch: Trajectory) -> str:
+    """A line for each reason and part, the most frequent first."""
+    batch = jax.tree.map(np.asarray, batch)
+    shape = batch.result.shape
+    found: dict[tuple[Result, str], list[tuple[int, ...]]] = {}
+    for place in np.ndindex(*shape):
+        result = Result(int(batch.result[place]))
+        if result != Result.SUCCESSFUL:
+            lane = jax.tree.map(lambda x, place=place: x[place], batch)
+            found.setdefault((result, _culprit(system, lane)), []).append(place)
+    failed = sum(len(lanes) for (result, _), lanes in found.items() if not result.ok)
+    lines = [f"{failed or 'none'} of {batch.result.size} lanes failed"]
+    for (result, culprit), lanes in sorted(found.items(), key=lambda item: -len(item[1])):
+        first = lanes[0]
+        name = first[0] if len(first) == 1 else first
+        step, t = int(batch.failed_step[first]), float(batch.failed_time[first])
+        at = f"first lane {name} in step {step} at t = {t:.6g} s"
+        lines.append(f"{len(lanes)}: {REASONS[result]}{culprit}; {at}{_remedy(result)}")
+    return "\n".join(lines)
 
 
 def raise_on_failure(system: "System", trajectory: Trajectory) -> None:

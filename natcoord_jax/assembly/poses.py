@@ -80,7 +80,7 @@ def joint_frames(joint: Joint, poses: Poses) -> Float[Array, "2 4 4"]:
     parent, child = poses.of(joint.parent), poses.of(joint.child)
     triad = joint_triad(joint)
     at_parent, at_child = joint.anchors()
-    at_parent = poses.position[child] if at_parent is None else at_parent
+    at_parent = poses.position[parent if joint.apart else child] if at_parent is None else at_parent
     at_child = poses.position[child] if at_child is None else at_child
     positions, rotations = zip(*((poses.position[b], poses.rotation[b]) for b in (parent, child)))
     points = as_array(at_parent, float), as_array(at_child, float)

@@ -14,17 +14,23 @@ from natcoord_jax.assembly.reading import Source
 from natcoord_jax.assembly.response import stations
 from natcoord_jax.assembly.sensors import joint_coordinates, rates_of
 from natcoord_jax.assembly.sweeps import sweep_motion
-from natcoord_jax.assembly.system import System
+from natcoord_jax.assembly.system import SYSTEM, System
 from natcoord_jax.assembly.tree import gather_slots
+from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.checks import as_array
 from natcoord_jax.core.coordinate import pair_motion
 from natcoord_jax.core.effect import Motion, replace_fields
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.host import on_host
-from natcoord_jax.core.state import State, Trajectory
+from natcoord_jax.core.kinds import of
+from natcoord_jax.core.numeric import Number
+from natcoord_jax.core.state import STATE, State, Trajectory
 from natcoord_jax.maths.collocation import gauss
 from natcoord_jax.maths.rotations import from_rotation_vector
 from natcoord_jax.maths.vectors import cross, safe_divide
+
+DEVIATION = Number("not negative")
+KEY = of("a random key, jax.random.key(0)", jax.Array)
 
 
 def _place(system: System, joint: Handle | str, index: int) -> tuple[int, np.ndarray]:
@@ -190,6 +196,7 @@ def _with_coordinate(
     return replace_fields(found, rates=_rotors(system, state_rates(system, found), state, places))
 
 
+@checked(system=SYSTEM, state=STATE, key=KEY, coordinates=DEVIATION, rates=DEVIATION)
 def random_state(
     system: System, state: State, key: Array, *, coordinates: float = 1.0, rates: float = 1.0
 ) -> State:

@@ -32,6 +32,7 @@ from natcoord_jax.assembly.rates import joint_axes, row_rates, tree_rates
 from natcoord_jax.assembly.system import System
 from natcoord_jax.assembly.tangent_space import TangentSpace, Velocity
 from natcoord_jax.assembly.tree import SLOTS
+from natcoord_jax.core.checks import require_double
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.host import on_host
 from natcoord_jax.core.state import State, Trajectory
@@ -75,17 +76,17 @@ def _along_the_tree(system: System, state: State, v: Velocity) -> Velocity:
     tree, rows = system.tree, state.q.reshape(-1, 4, 3)
     blocks, present = _spatial(system, rows)
     across, own = blocks.spread[:, :, :6], blocks.spread[:, :, 6:]
-    places = tree.slot_index[:, np.array(tree.slots, int)]
+    places, parent = jnp.asarray(tree.slot_index)[:, np.array(tree.slots, int)], blocks.parent
     w = jnp.where(present, tree_rates(system, state).at[places].get(mode="fill", fill_value=0.0), 0.0)
 
     def moving(w: Float[Array, "bodies m"]) -> Float[Array, "bodies 4 3"]:
-        twists = passed_down(across, jnp.sum(own * w[:, None], axis=2), tree.parent)[:-1]
+        twists = passed_down(across, jnp.sum(own * w[:, None], axis=2), parent)[:-1]
         return row_rates(rows, twists[:, :3], twists[:, 3:])
 
     lost = inertia(system.mass, v.rows - moving(w))
     loads = jnp.concatenate([x[0] for x in wrench(lost[None], rows[None, :, 1:])], axis=1)
     upward = jnp.swapaxes(across, 1, 2)
-    loads = loads + handed_up(upward, jnp.sum(upward * loads[:, None], axis=2), tree.parent)
+    loads = loads + handed_up(upward, jnp.sum(upward * loads[:, None], axis=2), parent)
     change = factor(blocks)[0].solve(jnp.sum(own * loads[:, :, None], axis=1))
     return Velocity(moving(w + change), v.rotors)
 
@@ -94,7 +95,7 @@ def _spatial(system: System, rows: Float[Array, "bodies 4 3"]) -> tuple[TreeBloc
     """Inertia of the free motions by body, from twists of the bodies, and which of the slots a body has."""
     tree, slots = system.tree, np.array(system.tree.slots, int)
     axes, points = joint_axes(system, rows)
-    present = tree.slot_index[:, slots] < tree.slot_of.shape[0]
+    present = jnp.asarray(tree.slot_index)[:, slots] < tree.slot_of.shape[0]
     axis, turning = jnp.where(present[..., None], axes[:, slots], 0.0), (slots < 3) | (slots == SLOTS - 1)
     velocity = jnp.where(turning[:, None], cross(axis, (rows[:, 0] - points)[:, None]), axis)
     own = jnp.concatenate([velocity, jnp.where(turning[:, None], axis, 0.0)], axis=2)
@@ -109,7 +110,7 @@ def _spatial(system: System, rows: Float[Array, "bodies 4 3"]) -> tuple[TreeBloc
     rest = jnp.zeros((count, 6 + slots.size, 6 + slots.size), rows.dtype).at[:, 6:, 6:].set(absent)
     spread = jnp.concatenate([across, jnp.swapaxes(own, 1, 2)], axis=2)
     gather = jnp.swapaxes(spread, 1, 2)
-    return TreeBlocks(masses, spread, gather, rest, tree.parent, slots.size), present
+    return TreeBlocks(masses, spread, gather, rest, jnp.asarray(tree.parent), slots.size), present
 
 
 def _together(system: System, state: State, v: Velocity) -> Velocity:
@@ -204,6 +205,7 @@ class Source(eqx.Module):
 
     def each(self, function: Callable, *along: Any) -> Any:
         """A function of system and state, and of more along the same axes, for all states as read."""
+        require_double("sensor")
         axes, lanes = self.states.t.ndim, self.system.mass.ndim - 3
         for axis in range(axes):
             own = 0 if axis >= axes - lanes else None

@@ -10,12 +10,22 @@ from jaxtyping import Array, Float, Int
 
 from natcoord_jax.assembly.collection import Collection
 from natcoord_jax.assembly.tree import Tree
+from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.callables import Stacked
 from natcoord_jax.core.coordinate import Coordinate
 from natcoord_jax.core.effect import Effect
 from natcoord_jax.core.handles import Handle
+from natcoord_jax.core.kinds import BODY_NAME, JOINT_NAME, NAME, HandleOf, Several, of
 from natcoord_jax.core.markers import Marker
-from natcoord_jax.core.state import State, Trajectory
+from natcoord_jax.core.numeric import Number, Numbers, Whole
+from natcoord_jax.core.state import MOTION, STATE, TRAJECTORY, State, Trajectory
+
+ELEMENT = HandleOf("effect") | NAME
+SENSED = (
+    of("the handle or name of a body, a joint or an element", Handle, str)
+    | of("nc.Point or nc.Direction", Marker)
+    | Several(ELEMENT, 1)
+)
 
 
 class Group(Stacked):
@@ -114,6 +124,7 @@ class Structure:
         points: numbers of the bodies that are point masses, without orientation.
         redundant: names of joints and relations whose constraints depend on the others.
         notes: findings of the compilation for the report.
+        shapes: what to draw of the bodies, in their order; None: what has their inertia.
     """
 
     bodies: tuple[str, ...]
@@ -131,6 +142,7 @@ class Structure:
     dofs: int = field(default=0, compare=False)
     redundant: tuple[str, ...] = field(default=(), compare=False)
     notes: tuple[str, ...] = field(default=(), compare=False)
+    shapes: tuple[Any, ...] = field(default=(), compare=False, repr=False)
 
 
 class System(eqx.Module):
@@ -172,18 +184,22 @@ class System(eqx.Module):
         idle[list(self.structure.points)] = 1.0
         return idle
 
+    @checked("System.energy", motion=MOTION)
     def energy(self, motion: State | Trajectory) -> "diagnostics.Energy":
         """Kinetic energy and stored energies [J]; see `Energy`."""
         return diagnostics.energy(self, motion)
 
+    @checked("System.momentum", motion=MOTION)
     def momentum(self, motion: State | Trajectory) -> Float[Array, "*t 3"]:
         """Momentum L [kg m/s]."""
         return diagnostics.momentum(self, motion)
 
+    @checked("System.angular_momentum", motion=MOTION)
     def angular_momentum(self, motion: State | Trajectory) -> Float[Array, "*t 3"]:
         """Angular momentum J about the origin [kg m^2/s] (55)."""
         return diagnostics.angular_momentum(self, motion)
 
+    @checked("System.constraint_errors", motion=MOTION)
     def constraint_errors(self, motion: State | Trajectory) -> "violations.ConstraintErrors":
         """Largest violations of the constraints and of their rates.
 
@@ -191,6 +207,7 @@ class System(eqx.Module):
         """
         return violations.constraint_errors(self, motion)
 
+    @checked("System.tangent", motion=MOTION)
     def tangent(self, motion: State | Trajectory) -> State:
         """States with velocities that obey the constraints: the nearest in the metric of the mass.
 
@@ -218,6 +235,7 @@ class System(eqx.Module):
         """
         return reading.tangent_states(self, motion)
 
+    @checked("System.work", motion=MOTION)
     def work(self, motion: State | Trajectory) -> dict[str, Float[Array, "*t"]]:
         """Work done so far [J] by each input, load, damper and drive, by name.
 
@@ -229,6 +247,7 @@ class System(eqx.Module):
             works["numerical dissipation"] = -states.dissipated
         return works
 
+    @checked("System.instant", motion=MOTION, inputs=Numbers(("...", None)))
     def instant(self, motion: State | Trajectory, inputs: Any = None) -> "instant.Instant":
         """Accelerations and reactions from the equations of motion at one instant, or along a trajectory.
 
@@ -289,6 +308,14 @@ class System(eqx.Module):
         """
         return parts.set_numbers(self, part, values)
 
+    @checked(
+        "System.sense",
+        motion=MOTION,
+        part=SENSED,
+        inputs=Numbers(("...", None)),
+        state=STATE,
+        about=Numbers((3,)),
+    )
     def sense(
         self,
         motion: State | Trajectory,
@@ -331,8 +358,9 @@ class System(eqx.Module):
         """
         return sensors.sense(self, motion, part, inputs=inputs, state=state, about=about)
 
+    @checked("System.coordinate", motion=MOTION, joint=JOINT_NAME, index=Whole(0))
     def coordinate(
-        self, motion: State | Trajectory, joint: Handle | str, index: int = 0
+        self, motion: State | Trajectory, joint: Handle | str, *, index: int = 0
     ) -> Float[Array, "*t"]:
         """Coordinate number `index` of a joint [rad, counted on over many turns, or m].
 
@@ -341,7 +369,8 @@ class System(eqx.Module):
         """
         return posing.coordinate(self, motion, joint, index)
 
-    def rate(self, motion: State | Trajectory, joint: Handle | str, index: int = 0) -> Float[Array, "*t"]:
+    @checked("System.rate", motion=MOTION, joint=JOINT_NAME, index=Whole(0))
+    def rate(self, motion: State | Trajectory, joint: Handle | str, *, index: int = 0) -> Float[Array, "*t"]:
         """Rate of coordinate number `index` of a joint [rad/s or m/s].
 
         Raises:
@@ -349,6 +378,14 @@ class System(eqx.Module):
         """
         return posing.rate(self, motion, joint, index)
 
+    @checked(
+        "System.with_coordinate",
+        state=STATE,
+        joint=JOINT_NAME,
+        value=Number(),
+        rate=Number(),
+        index=Whole(0),
+    )
     def with_coordinate(
         self, state: State, joint: Handle | str, value: Any, *, rate: Any = None, index: int = 0
     ) -> State:
@@ -372,6 +409,7 @@ class System(eqx.Module):
         """
         return posing.with_coordinate(self, state, joint, value, rate=rate, index=index)
 
+    @checked("System.body_index", body=BODY_NAME)
     def body_index(self, body: Handle | str) -> int:
         """Number of a body in the rows of the state.
 
@@ -380,6 +418,7 @@ class System(eqx.Module):
         """
         return _index(self.structure.bodies, body, "body")
 
+    @checked("System.joint_index", joint=JOINT_NAME)
     def joint_index(self, joint: Handle | str) -> int:
         """Number of a joint.
 
@@ -388,6 +427,7 @@ class System(eqx.Module):
         """
         return _index(self.structure.joints, joint, "joint")
 
+    @checked("System.input_index", name=HandleOf("effect") | NAME)
     def input_index(self, name: Handle | str) -> int:
         """Number of an input channel.
 
@@ -400,13 +440,19 @@ class System(eqx.Module):
         """Contents, unknowns before and after reduction, the solver and why, in words."""
         return reporting.report(self)
 
+    @checked("System.explain", trajectory=TRAJECTORY)
     def explain(self, trajectory: Trajectory) -> str:
         """How a run ended, in words, with the part of the worst residual by name."""
         return diagnostics.explain(self, trajectory)
 
+    @checked("System.raise_on_failure", trajectory=TRAJECTORY)
     def raise_on_failure(self, trajectory: Trajectory) -> None:
         """Raise `SimulationError` for a concrete trajectory that failed."""
         diagnostics.raise_on_failure(self, trajectory)
+
+
+SYSTEM = of("a system, as scene.compile() returned it with the state", System)
+"""What an argument may be."""
 
 
 def _index(names: tuple[str, ...], part: Handle | str, kind: str) -> int:

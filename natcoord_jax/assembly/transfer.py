@@ -18,18 +18,20 @@ from natcoord_jax.assembly.matching import (
     with_coordinates_of,
 )
 from natcoord_jax.assembly.response import body_rows
-from natcoord_jax.assembly.system import System
+from natcoord_jax.assembly.system import SYSTEM, System
 from natcoord_jax.assembly.tangent_space import TangentSpace, Velocity
 from natcoord_jax.assembly.violations import residuals
+from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.checks import is_concrete
 from natcoord_jax.core.compiled import briefly
 from natcoord_jax.core.effect import replace_fields
-from natcoord_jax.core.state import State
+from natcoord_jax.core.state import STATE, State
 
 GAP = 1e-9
 """Largest gap [m, -] of a joint that has closed, per unit of size."""
 
 
+@checked(system=SYSTEM, state=STATE, into=SYSTEM, onto=STATE)
 def transfer(
     system: System, state: State, into: System, *, onto: State | None = None
 ) -> tuple[System, State]:

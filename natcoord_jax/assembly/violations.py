@@ -12,6 +12,7 @@ from natcoord_jax.assembly.coordinates import velocities_with_ground
 from natcoord_jax.assembly.diagnostics import group_places, over_states, rows_with_ground
 from natcoord_jax.assembly.reading import Source, over_source
 from natcoord_jax.assembly.system import Group, System
+from natcoord_jax.core.checks import is_concrete
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.host import on_host
 from natcoord_jax.core.state import State, Trajectory
@@ -34,6 +35,17 @@ class ConstraintErrors(eqx.Module):
     joints: Float[Array, "*t"]
     relations: Float[Array, "*t"]
     source: Source
+
+    def __repr__(self) -> str:
+        """The largest over all times."""
+        if not is_concrete(self) or self.joints.size == 0:
+            return eqx.tree_pformat(self)
+        names = ("director_rates", "1/s"), ("joint_rates", "m/s, 1/s"), ("relation_rates", "rad/s, m/s")
+        values = self.directors, self.joints, self.relations, *_rates(self.source)
+        units = ("directors", "-"), ("joints", "m, -"), ("relations", "rad, m"), *names
+        sizes = [f"{name} {np.max(x):.2g} [{unit}]" for (name, unit), x in zip(units, values)]
+        times = f", largest of {self.joints.size} states" if self.joints.size > 1 else ""
+        return f"ConstraintErrors({', '.join(sizes)}{times})"
 
     @property
     def director_rates(self) -> Float[Array, "*t"]:

@@ -12,12 +12,21 @@ from jaxtyping import Array, Float
 from natcoord_jax.bodies.interpolation import Interpolation, Material, RelativeMotion, apart
 from natcoord_jax.bodies.reference_curve import ReferenceCurve, node_fractions, reference_curve
 from natcoord_jax.bodies.sections import Section
+from natcoord_jax.core.arguments import checked, is_a
 from natcoord_jax.core.bodies import Body
-from natcoord_jax.core.checks import is_concrete, numbers, require_double
+from natcoord_jax.core.checks import numbers, require_double
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.host import on_host
+from natcoord_jax.core.kinds import BODY, NAME, FunctionOf, of
 from natcoord_jax.core.markers import Attachment
+from natcoord_jax.core.numeric import COMPONENTS, Directions, Number, Numbers, Vector, Whole
 from natcoord_jax.core.recipe import Builder, Recipe, pose_of
+
+SECTION = of("nc.CircularSection(...), nc.Section.of_numbers(...) or another section", Section)
+CURVE = Numbers((None, 3)) | FunctionOf("of arc length [m] to the position, together with length=")
+ANGLE = FunctionOf("of arc length [m] to the angle [rad]")
+LAW = FunctionOf("of the strains (6,) to the energy per length [J/m]")
+INTERPOLATION = of("nc.RelativeMotion() or nc.DirectorInterpolation(order=...)", Interpolation)
 
 FIT = 1e-9
 """Largest distance between a fraction and its node."""
@@ -56,6 +65,7 @@ class BeamHandle:
         """The last node."""
         return self.nodes[-1]
 
+    @checked("BeamHandle.at", fraction=Number())
     def at(self, fraction: float) -> Handle:
         """The node at a fraction of the length.
 
@@ -109,21 +119,23 @@ class Beam(Recipe):
         24
     """
 
-    section: Section
-    curve: Any
-    elements: int = eqx.field(static=True)
-    length: Any = eqx.field(default=None, kw_only=True)
-    second: Any = eqx.field(default=None, kw_only=True)
-    twist: Any = eqx.field(default=0.0, kw_only=True)
-    start: Any = eqx.field(default=None, kw_only=True)
-    end: Any = eqx.field(default=None, kw_only=True)
-    stations: Sequence[float] = eqx.field(default=(), kw_only=True)
-    damping: Any = eqx.field(default=None, kw_only=True)
-    law: Any = eqx.field(default=None, kw_only=True)
-    interpolation: Interpolation = eqx.field(default=RelativeMotion(), kw_only=True)
-    velocity: Any = eqx.field(default=(0.0, 0.0, 0.0), kw_only=True)
-    angular_velocity: Any = eqx.field(default=(0.0, 0.0, 0.0), kw_only=True)
-    name: str | None = eqx.field(default=None, kw_only=True, static=True)
+    section: Section = eqx.field(metadata=is_a(SECTION))
+    curve: Any = eqx.field(metadata=is_a(CURVE))
+    elements: int = eqx.field(kw_only=True, static=True, metadata=is_a(Whole(1)))
+    length: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Number("positive")))
+    second: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Directions()))
+    twist: Any = eqx.field(default=0.0, kw_only=True, metadata=is_a(Number() | ANGLE))
+    start: Any = eqx.field(default=None, kw_only=True, metadata=is_a(BODY))
+    end: Any = eqx.field(default=None, kw_only=True, metadata=is_a(BODY))
+    stations: Sequence[float] = eqx.field(default=(), kw_only=True, metadata=is_a(Vector(None)))
+    damping: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Number("not negative")))
+    law: Any = eqx.field(default=None, kw_only=True, metadata=is_a(LAW))
+    interpolation: Interpolation = eqx.field(
+        default=RelativeMotion(), kw_only=True, metadata=is_a(INTERPOLATION)
+    )
+    velocity: Any = eqx.field(default=(0.0, 0.0, 0.0), kw_only=True, metadata=is_a(COMPONENTS))
+    angular_velocity: Any = eqx.field(default=(0.0, 0.0, 0.0), kw_only=True, metadata=is_a(COMPONENTS))
+    name: str | None = eqx.field(default=None, kw_only=True, static=True, metadata=is_a(NAME))
 
     kind = "beam"
 
@@ -135,10 +147,6 @@ class Beam(Recipe):
         """
         label = f"beam {name!r}"
         require_double(label)
-        if not isinstance(self.section, Section):
-            raise ValueError(
-                f"{label}: section is {self.section!r}; pass nc.Section, nc.CircularSection, ..."
-            )
         ends = node_fractions(self.elements, self.stations, label)
         fractions, spans = self.interpolation.refine(ends)
         curve = reference_curve(self.curve, fractions, self.length, self.second, self.twist, label)
@@ -159,10 +167,7 @@ class Beam(Recipe):
     def _damping(self, label: str) -> Any:
         if self.damping is None:
             return None
-        time = numbers(self.damping, (), f"{label}: damping", "s")
-        if is_concrete(time) and float(time) < 0:
-            raise ValueError(f"{label}: damping [s] is {float(time):g}; pass a time that is not negative")
-        return time
+        return numbers(self.damping, (), f"{label}: damping", "s")
 
     def _nodes(
         self, scene: Builder, curve: ReferenceCurve, lumps: Array, name: str, label: str

@@ -12,9 +12,11 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.bodies.reference_curve import ReferenceCurve
 from natcoord_jax.bodies.sections import Section
+from natcoord_jax.core.arguments import Part, is_a
 from natcoord_jax.core.checks import as_array, is_concrete
 from natcoord_jax.core.effect import Effect
 from natcoord_jax.core.host import on_host
+from natcoord_jax.core.kinds import Choice
 from natcoord_jax.core.markers import Attachment
 from natcoord_jax.effects.beams import (
     BeamDamping,
@@ -51,7 +53,7 @@ class Material(eqx.Module):
     damping: Any
 
 
-class Interpolation(eqx.Module):
+class Interpolation(Part):
     """Base of the ways in which a beam is made of elements."""
 
     @abc.abstractmethod
@@ -132,7 +134,7 @@ class RelativeMotion(Interpolation):
             elements.append(made)
             if material.damping is not None:
                 damper = {"length": length, "viscosity": material.damping * stiffness}
-                dampings.append(BeamDamping((nodes[a], nodes[b]), f"{name}/damping {number}", **damper))
+                dampings.append(BeamDamping((nodes[a], nodes[b]), name=f"{name}/damping {number}", **damper))
         return elements, dampings
 
 
@@ -210,11 +212,7 @@ class DirectorInterpolation(Interpolation):
         2
     """
 
-    order: int = eqx.field(default=1, static=True)
-
-    def __check_init__(self) -> None:
-        if self.order not in LOBATTO:
-            raise ValueError(f"director interpolation: order is {self.order!r}; pass one of {list(LOBATTO)}")
+    order: int = eqx.field(default=1, static=True, metadata=is_a(Choice(tuple(LOBATTO))))
 
     def refine(self, ends: np.ndarray) -> tuple[np.ndarray, list[Span]]:
         """Nodes at the Gauss-Lobatto points of the elements."""
@@ -253,6 +251,8 @@ class DirectorInterpolation(Interpolation):
             elements.append(DirectorElement(markers, **shape, **made))
             if material.damping is not None:
                 viscosity = material.damping * stiffness
-                damper = DirectorDamping(markers, f"{name}/damping {number}", **shape, viscosity=viscosity)
+                damper = DirectorDamping(
+                    markers, name=f"{name}/damping {number}", **shape, viscosity=viscosity
+                )
                 dampings.append(damper)
         return elements, dampings

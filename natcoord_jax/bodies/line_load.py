@@ -9,11 +9,18 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.bodies.beam import BeamHandle
+from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.checks import numbers
 from natcoord_jax.core.handles import Handle, ground
+from natcoord_jax.core.kinds import FLAG, NAME, FunctionOf, of
 from natcoord_jax.core.markers import Direction, Point
+from natcoord_jax.core.numeric import COMPONENTS
 from natcoord_jax.core.recipe import Builder, Recipe
 from natcoord_jax.effects.loads import BodyTorque, PointForce
+
+BEAM = of("what scene.add(nc.Beam(...)) returned", BeamHandle)
+LOAD = COMPONENTS | FunctionOf("of time [s] to three numbers")
+PROFILE = FunctionOf("of the fraction of the length [-] to a factor [-]")
 
 
 class Share(eqx.Module):
@@ -56,12 +63,12 @@ class LineLoad(Recipe):
         >>> system, state = scene.compile()
     """
 
-    beam: Any = eqx.field(static=True)
-    force: Any = eqx.field(default=None, kw_only=True)
-    moment: Any = eqx.field(default=None, kw_only=True)
-    profile: Callable[[float], Any] | None = eqx.field(default=None, kw_only=True)
-    following: bool = eqx.field(default=False, kw_only=True, static=True)
-    name: str | None = eqx.field(default=None, kw_only=True, static=True)
+    beam: Any = eqx.field(static=True, metadata=is_a(BEAM))
+    force: Any = eqx.field(default=None, kw_only=True, metadata=is_a(LOAD))
+    moment: Any = eqx.field(default=None, kw_only=True, metadata=is_a(LOAD))
+    profile: Callable[[float], Any] | None = eqx.field(default=None, kw_only=True, metadata=is_a(PROFILE))
+    following: bool = eqx.field(default=False, kw_only=True, static=True, metadata=is_a(FLAG))
+    name: str | None = eqx.field(default=None, kw_only=True, static=True, metadata=is_a(NAME))
 
     kind = "line load"
 
@@ -72,8 +79,6 @@ class LineLoad(Recipe):
             ValueError: without force and moment, for another shape, or for something else than a beam.
         """
         label = f"line load {name!r}"
-        if not isinstance(self.beam, BeamHandle):
-            raise ValueError(f"{label}: beam is {self.beam!r}; pass what scene.add(nc.Beam(...)) returned")
         if self.force is None and self.moment is None:
             raise ValueError(f"{label} has neither force [N/m] nor moment [N m/m]; pass one of them")
         added = []

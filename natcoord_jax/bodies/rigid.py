@@ -6,22 +6,30 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from natcoord_jax.bodies.shapes import Shape
+from natcoord_jax.bodies.shapes import Placed, Shape
+from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.bodies import Body, mass_block
 from natcoord_jax.core.checks import (
     as_array,
     is_concrete,
     numbers,
     positive,
-    require_double,
     shape_of,
 )
 from natcoord_jax.core.host import on_host
+from natcoord_jax.core.kinds import NAME, Choice, Kind, is_other, of
+from natcoord_jax.core.numeric import COMPONENTS, Number, Numbers
 from natcoord_jax.maths.rotations import from_axis_angle, from_quaternion
 
 SYMMETRY_TOLERANCE = 1e-9
-"""Relative asymmetry and relative negative eigenvalue allowed in an inertia: round-off of printed data."""
+"""Relative asymmetry and relative negative eigenvalue allowed in an inertia: round-off."""
 
+PRINTED = 5e-3
+"""By how much a principal inertia may exceed the sum of the other two, relative to the largest second moment:
+three printed digits, as of a plate with (0.00333, 0.00333, 0.00667) kg m^2. It is taken as it is given."""
+
+
+MASS, TENSOR = Number("positive"), Numbers((3,)) | Numbers((3, 3))
 
 _from_axis_angle, _from_quaternion = on_host(from_axis_angle), on_host(from_quaternion)
 
@@ -57,6 +65,18 @@ def orientation(value: Any, label: str) -> Float[Array, "3 3"]:
     return matrix
 
 
+class Orientation(Kind):
+    """A rotation in one of three forms; `orientation` looks at its numbers."""
+
+    wanted = "a rotation matrix, a quaternion (w, x, y, z) or a pair (axis, angle [rad])"
+
+    def complaint(self, value: Any) -> str | None:
+        """Whether it has the shape of one."""
+        pair = isinstance(value, tuple) and len(value) == 2 and shape_of(value[0]) == (3,)
+        shape = None if isinstance(value, str) else shape_of(value)
+        return None if pair or shape in ((4,), (3, 3)) else is_other(value)
+
+
 @on_host
 def _diagonal(values: Float[Array, "3"]) -> Float[Array, "3 3"]:
     return jnp.diag(values)
@@ -74,18 +94,42 @@ def _full_inertia(value: Any, what: str, unit: str) -> Float[Array, "3 3"]:
     return matrix
 
 
-def _check_central(central: Array, label: str, given: str) -> None:
-    """A body exists only if its central second moment is positive semidefinite."""
-    if not is_concrete(central):
+def _check_central(central: Array, moment: Array, label: str, given: str) -> None:
+    """A body exists only if its central second moment is positive semidefinite.
+
+    Args:
+        central: second moment about the centre of mass.
+        moment: the same about the point that the data refers to, which says how large rounding may be.
+        label: the part, for the message.
+        given: "inertia" or "second_moment".
+    """
+    if not is_concrete(central, moment):
         return
-    values = np.linalg.eigvalsh(np.asarray(central))
-    if values[0] < -SYMMETRY_TOLERANCE * max(values[2], 0.0) or values[2] <= 0:
-        raise ValueError(
-            f"{label}: {given} belongs to no body: the principal second moments about the centre of mass "
-            f"would be {values} kg m^2, and none may be negative (a principal inertia may not exceed the sum "
-            "of the other two); check units, and whether the inertia is about the centre of mass "
-            '(inertia_at="com") or the reference point (inertia_at="reference")'
-        )
+    values, axes = np.linalg.eigh(np.asarray(central))
+    size = max(values[2], float(np.linalg.eigvalsh(np.asarray(moment))[2]), 0.0)
+    # An inertia about a principal axis is the sum of the other two second moments.
+    least = values[0] + values[1] if given == "inertia" else values[0]
+    printed = PRINTED if given == "inertia" else SYMMETRY_TOLERANCE
+    if values[0] >= -printed * size and least >= -SYMMETRY_TOLERANCE * size and values[2] > 0:
+        return
+    nearest = ""
+    if values[2] > 0:
+        possible = (axes * np.maximum(values, 0.0)) @ axes.T
+        possible = np.trace(possible) * np.eye(3) - possible if given == "inertia" else possible
+        diagonal = np.max(np.abs(possible - np.diag(np.diag(possible)))) <= 1e-12 * np.max(np.abs(possible))
+        shown = np.diag(possible) if diagonal else possible
+        nearest = f"; the nearest possible {given} about the centre of mass is {_listed(shown)} kg m^2"
+    raise ValueError(
+        f"{label}: {given} belongs to no body: the principal second moments about the centre of mass "
+        f"would be {values} kg m^2, and none may be negative (a principal inertia may not exceed the sum "
+        f"of the other two, up to the rounding of three printed digits, {PRINTED:g}); check units, "
+        'and whether the inertia is about the centre of mass (inertia_at="com") or the reference point '
+        f'(inertia_at="reference"){nearest}'
+    )
+
+
+def _listed(values: np.ndarray) -> str:
+    return np.array2string(values, separator=", ", precision=6).replace("\n", "")
 
 
 @on_host
@@ -94,6 +138,20 @@ def to_second_moment(inertia: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
     return 0.5 * jnp.trace(inertia) * jnp.eye(3) - inertia
 
 
+@checked(
+    mass=MASS,
+    inertia=TENSOR,
+    second_moment=TENSOR,
+    com=COMPONENTS,
+    inertia_at=Choice(("com", "reference")),
+    shape=of("nc.Box(...), nc.Cylinder(...), nc.Sphere(...) or nc.Ellipsoid(...)", Shape),
+    density=MASS,
+    position=COMPONENTS,
+    orientation=Orientation(),
+    velocity=COMPONENTS,
+    angular_velocity=COMPONENTS,
+    name=NAME,
+)
 def RigidBody(
     *,
     mass: Any = None,
@@ -116,7 +174,8 @@ def RigidBody(
     Args:
         mass: [kg].
         inertia: inertia tensor (3, 3) or its diagonal (3,), in body axes [kg m^2]. Zero along one axis: an
-            ideal rod, which needs joints that fix its spin.
+            ideal rod, which needs joints that fix its spin. Rounding to three digits is allowed for: a
+            principal inertia may exceed the sum of the other two by 5e-3 of the largest second moment.
         second_moment: E^ij (3, 3) or its diagonal about the reference point, instead of
             `inertia` (14) [kg m^2].
         com: centre of mass, from the reference point in body axes [m].
@@ -139,8 +198,7 @@ def RigidBody(
         >>> body.mass_block.shape
         (4, 4)
     """
-    label = f"rigid body {name!r}" if name else "rigid body"
-    require_double(label)
+    label = f"RigidBody {name!r}" if name else "RigidBody"
     centre = numbers(com, (3,), f"{label}: com", "m")
     if shape is not None and density is not None:
         if mass is not None or inertia is not None or second_moment is not None:
@@ -155,23 +213,22 @@ def RigidBody(
                 "or shape and density [kg/m^3]"
             )
         mass = positive(mass, f"{label}: mass", "kg")
-        if inertia_at not in ("com", "reference"):
-            raise ValueError(f'{label}: inertia_at is {inertia_at!r}; pass "com" or "reference"')
         if inertia is not None:
             moment = to_second_moment(_full_inertia(inertia, f"{label}: inertia", "kg m^2"))
             moment = _shifted(moment, mass, centre) if inertia_at == "com" else moment
         else:
             moment = _full_inertia(second_moment, f"{label}: second_moment", "kg m^2")
         given = "inertia" if inertia is not None else "second_moment"
-        _check_central(_central(moment, mass, centre), label, given)
+        about = _central(moment, mass, centre)
+        _check_central(about, about if inertia_at == "com" and inertia is not None else moment, label, given)
     return Body(
         mass_block(mass, centre, moment),
         numbers(position, (3,), f"{label}: position", "m"),
         _orientation(orientation, label),
         numbers(velocity, (3,), f"{label}: velocity", "m/s"),
-        numbers(angular_velocity, (3,), f"{label}: angular velocity", "rad/s"),
+        numbers(angular_velocity, (3,), f"{label}: angular_velocity", "rad/s"),
         True,
-        shape,
+        None if shape is None else Placed(shape, centre),
         name,
     )
 
@@ -191,6 +248,7 @@ def _central(moment: Float[Array, "3 3"], mass: Float[Array, ""], by: Float[Arra
     return moment - mass * jnp.outer(by, by)
 
 
+@checked(mass=MASS, position=COMPONENTS, velocity=COMPONENTS, name=NAME)
 def PointMass(
     *, mass: Any, position: Any = (0.0, 0.0, 0.0), velocity: Any = (0.0, 0.0, 0.0), name: str | None = None
 ) -> Body:
@@ -212,8 +270,7 @@ def PointMass(
         >>> nc.PointMass(mass=1.0, position=(1, 0, 0)).oriented
         False
     """
-    label = f"point mass {name!r}" if name else "point mass"
-    require_double(label)
+    label = f"PointMass {name!r}" if name else "PointMass"
     mass, nothing = positive(mass, f"{label}: mass", "kg"), as_array(np.zeros(3))
     return Body(
         mass_block(mass, nothing, as_array(np.zeros((3, 3)))),

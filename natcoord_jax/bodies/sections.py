@@ -4,19 +4,24 @@ Axes: d_1 and d_2 span the section, d_3 is the tangent. The strains (Gamma_1, Ga
 are shear along d_1 and d_2, stretch, bending about d_1 and d_2, torsion.
 """
 
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from natcoord_jax.core.arguments import Part, checked, is_a
 from natcoord_jax.core.bodies import mass_block
-from natcoord_jax.core.checks import as_array, is_concrete, numbers, positive, require_double, shape_of
+from natcoord_jax.core.checks import as_array, is_concrete, numbers, positive, shape_of
 from natcoord_jax.core.host import on_host, stacked
+from natcoord_jax.core.numeric import Number, Numbers, Vector
+
+SIZE, PAIR, RIM = Number("positive"), Number("positive") | Numbers((2,), "positive"), Numbers((None, 2))
+POISSON = Number()
 
 
-class Section(eqx.Module):
+class Section(Part):
     """A cross-section by its numbers.
 
     Attributes:
@@ -34,11 +39,24 @@ class Section(eqx.Module):
         [10000.0, 10000.0, 10000.0, 100.0, 100.0, 100.0]
     """
 
-    stiffness: Float[Array, "6 6"]
-    inertia: Float[Array, "3 3"]
-    outline: Any = None
+    stiffness: Any = eqx.field(converter=lambda x: as_array(x, float), metadata=is_a(Numbers((6, 6))))
+    inertia: Any = eqx.field(converter=lambda x: as_array(x, float), metadata=is_a(Numbers((3, 3))))
+    outline: Any = eqx.field(default=None, kw_only=True, metadata=is_a(RIM))
+
+    makes_arrays: ClassVar[bool] = True
 
     @classmethod
+    @checked(
+        "Section.of_numbers",
+        EA=SIZE,
+        GA=PAIR,
+        EI=PAIR,
+        GJ=SIZE,
+        density=SIZE,
+        rotary=Number("not negative") | Numbers((2,), "not negative"),
+        centre=Vector(2),
+        outline=RIM,
+    )
     def of_numbers(
         cls,
         *,
@@ -67,19 +85,22 @@ class Section(eqx.Module):
         Raises:
             ValueError: for a stiffness or density that is not positive, or a negative rotary inertia.
         """
-        require_double("section")
         shear, bending = (_pair(v, f"section: {n}", u) for v, n, u in ((GA, "GA", "N"), (EI, "EI", "N m^2")))
         stretch, torsion = positive(EA, "section: EA", "N"), positive(GJ, "section: GJ", "N m^2")
         mass = positive(density, "section: density", "kg/m")
         about = numbers(_twice(rotary), (2,), "section: rotary", "kg m")
-        if is_concrete(about) and np.any(np.asarray(about) < 0):
-            raise ValueError(f"section: rotary [kg m] is {np.asarray(about)}; pass no negative inertia")
         offset = numbers(centre, (2,), "section: centre", "m")
         stiffness = _stiffness(shear, stretch, bending, torsion)
-        return cls(stiffness, _inertia(mass, offset, about), outline)
+        return cls(stiffness, _inertia(mass, offset, about), outline=outline)
 
     @classmethod
-    def of_axis_along_first(cls, stiffness: Any, inertia: Any, outline: Any = None) -> "Section":
+    @checked(
+        "Section.of_axis_along_first",
+        stiffness=Numbers((6, 6)),
+        inertia=Numbers((3, 3)),
+        outline=RIM,
+    )
+    def of_axis_along_first(cls, stiffness: Any, inertia: Any, *, outline: Any = None) -> "Section":
         """Section from data with axis 1 along the beam and axes 2 and 3 across, as many codes have them.
 
         The axes (1, 2, 3) of the data are d_3, d_1, d_2 here: a cyclic exchange, which keeps hands.
@@ -91,9 +112,7 @@ class Section(eqx.Module):
         """
         given = numbers(stiffness, (6, 6), "section: stiffness", "N, N m, N m^2")
         places = np.array([1, 2, 0, 4, 5, 3])
-        return cls(
-            given[np.ix_(places, places)], numbers(inertia, (3, 3), "section: inertia", "kg m"), outline
-        )
+        return cls(given[np.ix_(places, places)], inertia, outline=outline)
 
     def lump(self, length: Float[Array, ""]) -> Float[Array, "4 4"]:
         """Mass block (15) of a node that carries a length [m] of the beam; d_3 is massless."""
@@ -117,10 +136,7 @@ def _twice(value: Any) -> Any:
 
 
 def _pair(value: Any, what: str, unit: str) -> Float[Array, "2"]:
-    pair = numbers(_twice(value), (2,), what, unit)
-    if is_concrete(pair) and not np.all(np.asarray(pair) > 0):
-        raise ValueError(f"{what} [{unit}] is {np.asarray(pair)}; pass positive numbers")
-    return pair
+    return numbers(_twice(value), (2,), what, unit)
 
 
 def _elastic(shape: "Shaped", young: Any, poisson: Any, density: Any) -> Section:
@@ -154,6 +170,7 @@ def _ellipse(first: Any, second: Any, points: int = 24) -> Array:
     return jnp.stack([first * jnp.cos(angle), second * jnp.sin(angle)], axis=1)
 
 
+@checked(radius=SIZE, E=SIZE, nu=POISSON, density=SIZE, shear=SIZE)
 def CircularSection(*, radius: Any, E: Any, nu: Any = 0.3, density: Any, shear: Any = None) -> Section:
     """Full circle.
 
@@ -172,7 +189,6 @@ def CircularSection(*, radius: Any, E: Any, nu: Any = 0.3, density: Any, shear: 
         >>> import natcoord_jax as nc
         >>> rope = nc.CircularSection(radius=0.01, E=1e6, density=1000.0)
     """
-    require_double("section")
     r, nu = positive(radius, "section: radius", "m"), as_array(nu, float)
     return _elastic(_circle(r, nu, shear), E, nu, density)
 
@@ -184,10 +200,19 @@ def _circle(r: Array, nu: Array, shear: Any) -> Shaped:
     return area, second, 2 * second, k, _ellipse(r, r)
 
 
+@checked(radius=SIZE, thickness=SIZE, E=SIZE, nu=POISSON, density=SIZE, shear=SIZE)
 def TubularSection(
     *, radius: Any, thickness: Any, E: Any, nu: Any = 0.3, density: Any, shear: Any = None
 ) -> Section:
-    """Circular tube of outer `radius` and wall `thickness` [m]; otherwise as `CircularSection`.
+    """Circular tube; otherwise as `CircularSection`.
+
+    Args:
+        radius: the outer one [m].
+        thickness: of the wall [m].
+        E: Young's modulus [Pa].
+        nu: Poisson's ratio [-].
+        density: [kg/m^3].
+        shear: shear coefficient [-].
 
     The default shear coefficient is Cowper's (1966), 6 (1 + nu) p / ((7 + 6 nu) p + (20 + 12 nu) m^2) with
     p = (1 + m^2)^2 and the ratio m of inner and outer radius.
@@ -195,7 +220,6 @@ def TubularSection(
     Raises:
         ValueError: for numbers that are not positive, or a wall thicker than the radius.
     """
-    require_double("section")
     r, t = positive(radius, "section: radius", "m"), positive(thickness, "section: thickness", "m")
     if is_concrete(r, t) and float(t) > float(r):
         raise ValueError(f"section: thickness [m] is {float(t):g}, more than the radius {float(r):g}")
@@ -214,10 +238,19 @@ def _tube(r: Array, t: Array, nu: Array, shear: Any) -> Shaped:
     return area, second, 2 * second, k, _ellipse(r, r)
 
 
+@checked(width=SIZE, height=SIZE, E=SIZE, nu=POISSON, density=SIZE, shear=SIZE)
 def RectangularSection(
     *, width: Any, height: Any, E: Any, nu: Any = 0.3, density: Any, shear: Any = None
 ) -> Section:
-    """Rectangle, `width` along d_1 and `height` along d_2 [m]; otherwise as `CircularSection`.
+    """Rectangle; otherwise as `CircularSection`.
+
+    Args:
+        width: along d_1 [m].
+        height: along d_2 [m].
+        E: Young's modulus [Pa].
+        nu: Poisson's ratio [-].
+        density: [kg/m^3].
+        shear: shear coefficient [-].
 
     The default shear coefficient is 10 (1 + nu) / (12 + 11 nu) (Cowper 1966); torsion is Saint-Venant's
     series.
@@ -225,7 +258,6 @@ def RectangularSection(
     Raises:
         ValueError: for numbers that are not positive.
     """
-    require_double("section")
     b, h = positive(width, "section: width", "m"), positive(height, "section: height", "m")
     nu = as_array(nu, float)
     return _elastic(_rectangle(b, h, nu, shear), E, nu, density)

@@ -6,7 +6,7 @@ step, with the inputs of the step, and measured in a natural unit of the bound (
 
 import abc
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -14,13 +14,19 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.system import System
+from natcoord_jax.core.arguments import Part, is_a
 from natcoord_jax.core.callables import Function
 from natcoord_jax.core.checks import is_concrete
 from natcoord_jax.core.handles import Handle
+from natcoord_jax.core.kinds import BODY_NAME, JOINT_NAME, NAME, FunctionOf, HandleOf, Several, of
+from natcoord_jax.core.numeric import Directions, Number, Numbers, Whole
 from natcoord_jax.core.state import State
 
+LIMIT = Number(infinite=True) | Numbers((None,), infinite=True)
+EXCESS = FunctionOf("(state, u, t) -> number or vector")
 
-class Bound(eqx.Module):
+
+class Bound(Part):
     """Base of all bounds."""
 
     def excess(
@@ -34,13 +40,15 @@ class Bound(eqx.Module):
         return ()
 
     def __and__(self, other: "Bound") -> "Bound":
+        if not isinstance(other, Bound):
+            return NotImplemented
         return All((*_parts(self), *_parts(other)))
 
 
 class All(Bound):
     """Several bounds at once."""
 
-    parts: tuple[Bound, ...]
+    parts: tuple[Bound, ...] = eqx.field(metadata=is_a(Several(of("a bound", Bound))))
 
     def excess(self, system: System, state: State, u: Array, t: Array) -> Float[Array, " n"]:
         """Excesses of all parts."""
@@ -68,9 +76,11 @@ class Range(Bound):
         limited: which of the limits are finite.
     """
 
-    lower: Any
-    upper: Any
+    lower: Any = eqx.field(metadata=is_a(LIMIT))
+    upper: Any = eqx.field(metadata=is_a(LIMIT))
     limited: tuple[tuple[bool, ...], tuple[bool, ...]] = eqx.field(init=False, static=True)
+
+    makes_arrays: ClassVar[bool] = True
 
     def __post_init__(self):
         """Convert, and refuse limits that leave no room."""
@@ -125,7 +135,9 @@ class Input(Range):
         channel: name or handle of one channel; None: all.
     """
 
-    channel: Handle | str | None = eqx.field(default=None, kw_only=True, static=True)
+    channel: Handle | str | None = eqx.field(
+        default=None, kw_only=True, static=True, metadata=is_a(HandleOf("effect") | NAME)
+    )
 
     def values(self, system: System, state: State, u: Array) -> Float[Array, " n"]:
         """The inputs."""
@@ -147,12 +159,12 @@ class Coordinate(Range):
         index: which coordinate of the joint.
     """
 
-    joint: Handle | str = eqx.field(kw_only=True, static=True)
-    index: int = eqx.field(default=0, kw_only=True, static=True)
+    joint: Handle | str = eqx.field(kw_only=True, static=True, metadata=is_a(JOINT_NAME))
+    index: int = eqx.field(default=0, kw_only=True, static=True, metadata=is_a(Whole(0)))
 
     def values(self, system: System, state: State, u: Array) -> Float[Array, " n"]:
         """The coordinate."""
-        return system.coordinate(state, self.joint, self.index)[None]
+        return system.coordinate(state, self.joint, index=self.index)[None]
 
     def names(self, system: System) -> tuple[str, ...]:
         """The joint."""
@@ -169,12 +181,12 @@ class Rate(Range):
         index: which coordinate of the joint.
     """
 
-    joint: Handle | str = eqx.field(kw_only=True, static=True)
-    index: int = eqx.field(default=0, kw_only=True, static=True)
+    joint: Handle | str = eqx.field(kw_only=True, static=True, metadata=is_a(JOINT_NAME))
+    index: int = eqx.field(default=0, kw_only=True, static=True, metadata=is_a(Whole(0)))
 
     def values(self, system: System, state: State, u: Array) -> Float[Array, " n"]:
         """The rate."""
-        return system.rate(state, self.joint, self.index)[None]
+        return system.rate(state, self.joint, index=self.index)[None]
 
     def names(self, system: System) -> tuple[str, ...]:
         """The joint."""
@@ -186,15 +198,15 @@ class KeepOut(Bound):
 
     Attributes:
         body: handle or name.
-        axis: direction in components of the body.
-        cone: axis of the cone in space.
+        axis: direction in components of the body [-].
+        cone: axis of the cone in space [-].
         angle: half the opening of the cone [rad].
     """
 
-    body: Handle | str = eqx.field(static=True)
-    axis: Any
-    cone: Any
-    angle: Any
+    body: Handle | str = eqx.field(static=True, metadata=is_a(BODY_NAME))
+    axis: Any = eqx.field(kw_only=True, metadata=is_a(Directions()))
+    cone: Any = eqx.field(kw_only=True, metadata=is_a(Directions()))
+    angle: Any = eqx.field(kw_only=True, metadata=is_a(Number()))
 
     def excess(self, system: System, state: State, u: Array, t: Array) -> Float[Array, " n"]:
         """Cosine of the angle between the directions, less that of the cone."""
@@ -217,9 +229,9 @@ class Path(Bound):
         count: how many numbers the function returns.
     """
 
-    function: Callable[[State, Array, Array], Any] = eqx.field(converter=Function.of)
-    name: str = eqx.field(default="own bound", static=True)
-    count: int = eqx.field(default=1, kw_only=True, static=True)
+    function: Callable[[State, Array, Array], Any] = eqx.field(converter=Function.of, metadata=is_a(EXCESS))
+    name: str = eqx.field(default="own bound", static=True, metadata=is_a(NAME))
+    count: int = eqx.field(default=1, kw_only=True, static=True, metadata=is_a(Whole(1)))
 
     def excess(self, system: System, state: State, u: Array, t: Array) -> Float[Array, " n"]:
         """Value of the function."""
@@ -228,3 +240,7 @@ class Path(Bound):
     def labels(self, system: System) -> tuple[str, ...]:
         """The name, numbered if there are several."""
         return (self.name,) if self.count == 1 else tuple(f"{self.name} [{k}]" for k in range(self.count))
+
+
+BOUND = of("a bound, as nc.bounds.Input(-1.0, 1.0)", Bound)
+"""What an argument may be."""

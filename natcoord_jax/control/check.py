@@ -13,9 +13,11 @@ from natcoord_jax.analysis import balance
 from natcoord_jax.control.iterate import Iterate
 from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.control.run import optimise
-from natcoord_jax.control.solution import Solution
+from natcoord_jax.control.solution import SOLUTION, Solution
 from natcoord_jax.control.transcription import entering, slices, stage
+from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.compiled import quickly
+from natcoord_jax.core.kinds import FLAG, FunctionOf
 
 
 @dataclasses.dataclass(frozen=True)
@@ -105,6 +107,7 @@ def _hamiltonian(solution: Solution) -> tuple[float | None, float | None]:
     return float(np.mean(smooth)), float(np.max(np.abs(smooth - np.mean(smooth))) / size)
 
 
+@checked(solution=SOLUTION, refine=FLAG, autonomous=FLAG, make=FunctionOf("(steps) -> problem"))
 def check(
     solution: Solution,
     *,

@@ -10,11 +10,15 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from natcoord_jax.assembly.coordinates import state_rates
-from natcoord_jax.assembly.system import System
+from natcoord_jax.assembly.system import SYSTEM, System
 from natcoord_jax.control.inverse import followed, places_of
+from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.compiled import compiled
 from natcoord_jax.core.handles import Handle
-from natcoord_jax.core.state import State
+from natcoord_jax.core.kinds import JOINT_NAME, Several
+from natcoord_jax.core.numeric import Number, Numbers
+from natcoord_jax.core.state import STATE, State
+from natcoord_jax.stepping.checked import STEP
 
 
 class ComputedTorque(eqx.Module):
@@ -52,6 +56,14 @@ class ComputedTorque(eqx.Module):
         return self.inputs[k] + jnp.sum(self.gains[k] * wanted, axis=-1)
 
 
+@checked(
+    system=SYSTEM,
+    state=STATE,
+    coordinates=Numbers((None, None)),
+    dt=STEP,
+    bandwidth=Number("positive"),
+    joints=Several(JOINT_NAME, 1),
+)
 def computed_torque(
     system: System,
     state: State,

@@ -8,11 +8,19 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.system import System
+from natcoord_jax.control.goal import GOAL
+from natcoord_jax.core.arguments import Part, is_a
 from natcoord_jax.core.callables import Function
+from natcoord_jax.core.kinds import FunctionOf, Several, of
+from natcoord_jax.core.numeric import Number, Vector
 from natcoord_jax.core.state import State
 
+WEIGHTS = Number() | Vector(None)
+RUNNING = FunctionOf("(state, u, t) -> cost per second")
+TERMINAL = FunctionOf("(state) -> cost")
 
-class Cost(eqx.Module):
+
+class Cost(Part):
     """Base of all costs: an integral over time and a value at the end.
 
     The integral is taken by the trapezoidal rule over every step, with the inputs held over it. A cost of
@@ -30,13 +38,15 @@ class Cost(eqx.Module):
         return jnp.zeros(())
 
     def __add__(self, other: "Cost") -> "Cost":
+        if not isinstance(other, Cost):
+            return NotImplemented
         return Sum((*_terms(self), *_terms(other)))
 
 
 class Sum(Cost):
     """A sum of costs."""
 
-    terms: tuple[Cost, ...]
+    terms: tuple[Cost, ...] = eqx.field(metadata=is_a(Several(of("a cost", Cost))))
 
     def running(self, system: System, state: State, u: Array, t: Array) -> Float[Array, ""]:
         """Sum of the running costs."""
@@ -62,7 +72,7 @@ class Effort(Cost):
         >>> cost = nc.cost.Effort(weight=2.0) + nc.cost.Duration()
     """
 
-    weight: Any = 1.0
+    weight: Any = eqx.field(default=1.0, metadata=is_a(WEIGHTS))
 
     def running(self, system: System, state: State, u: Array, t: Array) -> Float[Array, ""]:
         """Weighted sum of squares."""
@@ -76,7 +86,7 @@ class Duration(Cost):
         weight: [1/s].
     """
 
-    weight: Any = 1.0
+    weight: Any = eqx.field(default=1.0, metadata=is_a(Number()))
 
     def running(self, system: System, state: State, u: Array, t: Array) -> Float[Array, ""]:
         """The weight."""
@@ -91,8 +101,8 @@ class Running(Cost):
         weight: factor.
     """
 
-    function: Callable[[State, Array, Array], Any] = eqx.field(converter=Function.of)
-    weight: Any = 1.0
+    function: Callable[[State, Array, Array], Any] = eqx.field(converter=Function.of, metadata=is_a(RUNNING))
+    weight: Any = eqx.field(default=1.0, metadata=is_a(Number()))
 
     def running(self, system: System, state: State, u: Array, t: Array) -> Float[Array, ""]:
         """Value of the function."""
@@ -107,8 +117,8 @@ class Terminal(Cost):
         weight: factor.
     """
 
-    function: Callable[[State], Any] = eqx.field(converter=Function.of)
-    weight: Any = 1.0
+    function: Callable[[State], Any] = eqx.field(converter=Function.of, metadata=is_a(TERMINAL))
+    weight: Any = eqx.field(default=1.0, metadata=is_a(Number()))
 
     def terminal(self, system: System, state: State) -> Float[Array, ""]:
         """Value of the function."""
@@ -124,9 +134,9 @@ class Missed(Cost):
         rate: weight of the integral [1/s]; none: there is no integral, and it costs nothing.
     """
 
-    goal: Any
-    weight: Any = 1.0
-    rate: Any = None
+    goal: Any = eqx.field(metadata=is_a(GOAL))
+    weight: Any = eqx.field(default=1.0, kw_only=True, metadata=is_a(Number()))
+    rate: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Number()))
 
     def running(self, system: System, state: State, u: Array, t: Array) -> Float[Array, ""]:
         """Weighted square of what is missing."""
@@ -137,3 +147,7 @@ class Missed(Cost):
     def terminal(self, system: System, state: State) -> Float[Array, ""]:
         """Weighted square of what is missing."""
         return self.weight * jnp.sum(self.goal.residual(system, state) ** 2)
+
+
+COST = of("a cost, as nc.cost.Effort()", Cost)
+"""What an argument may be."""

@@ -9,14 +9,27 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from natcoord_jax.control.guess import unknowns_of
-from natcoord_jax.control.problem import OptimalControl
+from natcoord_jax.control.guess import GUESS, unknowns_of
+from natcoord_jax.control.problem import PROBLEM, OptimalControl
 from natcoord_jax.control.results import Outcome
 from natcoord_jax.control.run import HEADER, numeric, printed
 from natcoord_jax.control.solution import Row, Solution
 from natcoord_jax.control.transcription import Unknowns, end, first_node, held_inputs, packed
+from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.compiled import quickly
+from natcoord_jax.core.kinds import FLAG, Kind, is_other
+from natcoord_jax.core.numeric import Number, Whole
 from natcoord_jax.stepping.simulate import simulate
+
+
+class Optimiser(Kind):
+    """A gradient transformation of optax, which is not imported for this."""
+
+    wanted = "an optax gradient transformation, as optax.adam(0.05)"
+
+    def complaint(self, value: Any) -> str | None:
+        """Whether it has what makes one."""
+        return None if getattr(value, "_fields", None) == ("init", "update") else is_other(value)
 
 
 def _constraints(
@@ -53,6 +66,18 @@ def _augmented(variables: tuple[Array, Array], problem: OptimalControl, multipli
     return cost + equal + bound, (cost, missing, excess, code)
 
 
+@checked(
+    problem=PROBLEM,
+    guess=GUESS,
+    optimiser=Optimiser(),
+    iterations=Whole(1),
+    rounds=Whole(1),
+    penalty=Number("positive"),
+    growth=Number("positive"),
+    tol=Number("positive"),
+    progress=FLAG,
+    time_limit=Number("not negative", infinite=True),
+)
 def descend(
     problem: OptimalControl,
     guess: Any = None,
@@ -142,4 +167,5 @@ def descend(
     free = dict(zip(problem.free, jnp.asarray(problem.values(unknowns.free)).tolist()))
     dt = float(problem.applied(unknowns.free)[1])
     inputs = held_inputs(problem, unknowns.coefficients)
-    return Solution(problem, inputs, free, dt, float(cost), outcome, "first-order descent (optax)", history)
+    method = "first-order descent (optax)"
+    return Solution(problem, inputs, free, dt, float(cost), int(outcome), method, history=history)

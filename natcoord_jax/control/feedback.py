@@ -7,15 +7,18 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from natcoord_jax.assembly.system import System
-from natcoord_jax.control.guess import unknowns_of
+from natcoord_jax.assembly.system import SYSTEM, System
+from natcoord_jax.control.guess import GUESS, unknowns_of
 from natcoord_jax.control.iterate import Iterate, Options
-from natcoord_jax.control.problem import OptimalControl
+from natcoord_jax.control.problem import PROBLEM, OptimalControl
 from natcoord_jax.control.quadratic import model
-from natcoord_jax.control.run import numeric, optimise_jit
-from natcoord_jax.control.solution import Solution
+from natcoord_jax.control.run import OPTIONS, WEIGHTS, numeric, optimise_jit
+from natcoord_jax.control.solution import SOLUTION, Solution
 from natcoord_jax.control.transcription import held_inputs, packed
+from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.compiled import quickly
+from natcoord_jax.core.kinds import Several
+from natcoord_jax.core.numeric import Number, Numbers, Whole
 from natcoord_jax.core.state import State, Trajectory
 from natcoord_jax.stepping.simulate import simulate
 
@@ -73,6 +76,14 @@ def _gains(problem: OptimalControl, iterate: Iterate, weights: tuple) -> tuple[A
     return gains, d.maps.back[:-1, : 2 * count, :size]
 
 
+@checked(
+    solution=SOLUTION,
+    displacement=WEIGHTS,
+    rate=WEIGHTS,
+    effort=WEIGHTS,
+    final=Number("not negative"),
+    limits=Several(Number(infinite=True) | Numbers((None,), infinite=True), 2),
+)
 def regulator(
     solution: Solution,
     *,
@@ -126,6 +137,14 @@ class Horizons(NamedTuple):
     iterations: Float[Array, " updates"]
 
 
+@checked(
+    problem=PROBLEM,
+    plant=SYSTEM,
+    updates=Whole(1),
+    steps_each=Whole(1),
+    guess=GUESS,
+    options=OPTIONS,
+)
 def receding_horizon(
     problem: OptimalControl,
     plant: System,

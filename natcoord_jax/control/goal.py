@@ -15,13 +15,19 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.system import System
 from natcoord_jax.control.tangent import steady_rates
+from natcoord_jax.core.arguments import Part, is_a
 from natcoord_jax.core.callables import Function
 from natcoord_jax.core.handles import Handle
+from natcoord_jax.core.kinds import BODY_NAME, JOINT_NAME, NAME, FunctionOf, Several, of
+from natcoord_jax.core.numeric import COMPONENTS, Number, Numbers, Whole
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.rotations import angular_velocity, from_quaternion, to_quaternion
 
+ROTATION = Numbers((4,)) | Numbers((3, 3))
+RESIDUAL = FunctionOf("(state) -> number or vector")
 
-class Goal(eqx.Module):
+
+class Goal(Part):
     """Base of all goals: equations that the final state has to fulfil."""
 
     def residual(self, system: System, state: State) -> Float[Array, " n"]:
@@ -33,13 +39,15 @@ class Goal(eqx.Module):
         return ()
 
     def __and__(self, other: "Goal") -> "Goal":
+        if not isinstance(other, Goal):
+            return NotImplemented
         return All((*_parts(self), *_parts(other)))
 
 
 class All(Goal):
     """Several goals at once."""
 
-    parts: tuple[Goal, ...]
+    parts: tuple[Goal, ...] = eqx.field(metadata=is_a(Several(of("a goal", Goal))))
 
     def residual(self, system: System, state: State) -> Float[Array, " n"]:
         """Residuals of all parts."""
@@ -69,8 +77,8 @@ class Attitude(Goal):
         rotation: unit quaternion (w, x, y, z) or rotation matrix, body to world.
     """
 
-    body: Handle | str = eqx.field(static=True)
-    rotation: Any
+    body: Handle | str = eqx.field(static=True, metadata=is_a(BODY_NAME))
+    rotation: Any = eqx.field(metadata=is_a(ROTATION))
 
     def residual(self, system: System, state: State) -> Float[Array, " n"]:
         """Twice the vector part of the error, in world components."""
@@ -94,9 +102,9 @@ class Position(Goal):
         point: in coordinates of the body [m]; its reference point if none is given.
     """
 
-    body: Handle | str = eqx.field(static=True)
-    position: Any
-    point: Any = eqx.field(default=(0.0, 0.0, 0.0), kw_only=True)
+    body: Handle | str = eqx.field(static=True, metadata=is_a(BODY_NAME))
+    position: Any = eqx.field(metadata=is_a(COMPONENTS))
+    point: Any = eqx.field(default=(0.0, 0.0, 0.0), kw_only=True, metadata=is_a(COMPONENTS))
 
     def residual(self, system: System, state: State) -> Float[Array, " n"]:
         """Position less the wanted one."""
@@ -118,9 +126,9 @@ class Motion(Goal):
         angular_velocity: in world components [rad/s].
     """
 
-    body: Handle | str = eqx.field(static=True)
-    velocity: Any = (0.0, 0.0, 0.0)
-    angular_velocity: Any = (0.0, 0.0, 0.0)
+    body: Handle | str = eqx.field(static=True, metadata=is_a(BODY_NAME))
+    velocity: Any = eqx.field(default=(0.0, 0.0, 0.0), kw_only=True, metadata=is_a(COMPONENTS))
+    angular_velocity: Any = eqx.field(default=(0.0, 0.0, 0.0), kw_only=True, metadata=is_a(COMPONENTS))
 
     def residual(self, system: System, state: State) -> Float[Array, " n"]:
         """Motion less the wanted one."""
@@ -148,13 +156,13 @@ class Coordinate(Goal):
         index: which coordinate of the joint.
     """
 
-    joint: Handle | str = eqx.field(static=True)
-    value: Any
-    index: int = eqx.field(default=0, kw_only=True, static=True)
+    joint: Handle | str = eqx.field(static=True, metadata=is_a(JOINT_NAME))
+    value: Any = eqx.field(metadata=is_a(Number()))
+    index: int = eqx.field(default=0, kw_only=True, static=True, metadata=is_a(Whole(0)))
 
     def residual(self, system: System, state: State) -> Float[Array, " n"]:
         """Coordinate less the wanted value."""
-        return (system.coordinate(state, self.joint, self.index) - self.value)[None]
+        return (system.coordinate(state, self.joint, index=self.index) - self.value)[None]
 
     def labels(self, system: System) -> tuple[str, ...]:
         """The coordinate."""
@@ -170,13 +178,13 @@ class Rate(Goal):
         index: which coordinate of the joint.
     """
 
-    joint: Handle | str = eqx.field(static=True)
-    value: Any = 0.0
-    index: int = eqx.field(default=0, kw_only=True, static=True)
+    joint: Handle | str = eqx.field(static=True, metadata=is_a(JOINT_NAME))
+    value: Any = eqx.field(default=0.0, metadata=is_a(Number()))
+    index: int = eqx.field(default=0, kw_only=True, static=True, metadata=is_a(Whole(0)))
 
     def residual(self, system: System, state: State) -> Float[Array, " n"]:
         """Rate less the wanted one."""
-        return (system.rate(state, self.joint, self.index) - self.value)[None]
+        return (system.rate(state, self.joint, index=self.index) - self.value)[None]
 
     def labels(self, system: System) -> tuple[str, ...]:
         """The rate."""
@@ -206,11 +214,12 @@ class Equal(Goal):
     Attributes:
         function: (state) -> number or vector.
         name: for reports.
+        count: how many numbers the function returns.
     """
 
-    function: Callable[[State], Any] = eqx.field(converter=Function.of)
-    name: str = eqx.field(default="own goal", static=True)
-    count: int = eqx.field(default=1, kw_only=True, static=True)
+    function: Callable[[State], Any] = eqx.field(converter=Function.of, metadata=is_a(RESIDUAL))
+    name: str = eqx.field(default="own goal", static=True, metadata=is_a(NAME))
+    count: int = eqx.field(default=1, kw_only=True, static=True, metadata=is_a(Whole(1)))
 
     def residual(self, system: System, state: State) -> Float[Array, " n"]:
         """Value of the function."""
@@ -219,3 +228,7 @@ class Equal(Goal):
     def labels(self, system: System) -> tuple[str, ...]:
         """The name, numbered if there are several."""
         return (self.name,) if self.count == 1 else tuple(f"{self.name} [{k}]" for k in range(self.count))
+
+
+GOAL = of("a goal, as nc.goal.Rest()", Goal)
+"""What an argument may be."""

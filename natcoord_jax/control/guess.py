@@ -11,7 +11,10 @@ from jaxtyping import Array, Float
 from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.control.tangent import steady_rates
 from natcoord_jax.control.transcription import Unknowns, end, roll
+from natcoord_jax.core.arguments import Part, is_a
 from natcoord_jax.core.compiled import quickly
+from natcoord_jax.core.kinds import of
+from natcoord_jax.core.numeric import Numbers, Vector
 
 ROUNDS = 12
 """Gauss-Newton corrections of the constant rates that lead to the goal."""
@@ -19,7 +22,7 @@ LONGEST = 2.0
 """Largest turn of a body in one step of a guess [rad]."""
 
 
-class Guess(eqx.Module):
+class Guess(Part):
     """A first guess.
 
     Attributes:
@@ -34,9 +37,13 @@ class Guess(eqx.Module):
         >>> guess = nc.Guess(rates=(0.5, 1.57))
     """
 
-    inputs: Any = None
-    rates: Any = None
-    free: Any = None
+    inputs: Any = eqx.field(default=None, metadata=is_a(Numbers((None, None))))
+    rates: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Vector(None) | Numbers((None, None))))
+    free: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Vector(None)))
+
+
+GUESS = Numbers((None, None)) | of("nc.Guess(...)", Guess)
+"""What an argument may be."""
 
 
 def unknowns_of(problem: OptimalControl, guess: Any, lifted: bool) -> Unknowns:

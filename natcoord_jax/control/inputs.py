@@ -7,6 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from natcoord_jax.core.arguments import Part, checked, is_a
+from natcoord_jax.core.kinds import of
+from natcoord_jax.core.numeric import Whole
+
 
 class Shaping(NamedTuple):
     """A spline as a linear machine with a small register, one step after the other.
@@ -43,7 +47,7 @@ def _basis(degree: int, place: float) -> np.ndarray:
     return values
 
 
-class Spline(eqx.Module):
+class Spline(Part):
     """Inputs as uniform B-splines over intervals of some steps, taken at the middle of each step.
 
     Attributes:
@@ -56,17 +60,10 @@ class Spline(eqx.Module):
         21
     """
 
-    degree: int = eqx.field(default=0, kw_only=True, static=True)
-    every: int = eqx.field(default=1, kw_only=True, static=True)
+    degree: int = eqx.field(default=0, kw_only=True, static=True, metadata=is_a(Whole(0)))
+    every: int = eqx.field(default=1, kw_only=True, static=True, metadata=is_a(Whole(1)))
 
-    def __check_init__(self):
-        """Refuse what is no spline."""
-        if self.degree < 0 or self.every < 1:
-            raise ValueError(
-                f"a spline of degree {self.degree} over intervals of {self.every} steps; "
-                "pass degree >= 0 and every >= 1"
-            )
-
+    @checked("coefficients", steps=Whole(1))
     def coefficients(self, steps: int) -> int:
         """Number of coefficients of each input channel."""
         return -(-steps // self.every) + self.degree
@@ -108,16 +105,23 @@ class Spline(eqx.Module):
         return Shaping(shift, load, read, direct, enters, start)
 
 
+SPLINE = of("nc.inputs.held(), nc.inputs.cubic(...) or another spline", Spline)
+"""What an argument may be."""
+
+
+@checked()
 def held() -> Spline:
     """Inputs held over each step, free in every step."""
     return Spline()
 
 
+@checked(every=Whole(1))
 def piecewise_linear(every: int = 1) -> Spline:
     """Inputs that are linear over intervals of `every` steps and continuous."""
     return Spline(degree=1, every=every)
 
 
+@checked(every=Whole(1))
 def cubic(every: int = 10) -> Spline:
     """Inputs as cubic B-splines, twice continuously differentiable, over intervals of `every` steps."""
     return Spline(degree=3, every=every)

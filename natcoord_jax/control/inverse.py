@@ -10,11 +10,15 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from natcoord_jax.assembly.equations import prepare, starting
-from natcoord_jax.assembly.system import System
+from natcoord_jax.assembly.system import SYSTEM, System
+from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.compiled import briefly
 from natcoord_jax.core.handles import Handle
-from natcoord_jax.core.state import State
+from natcoord_jax.core.kinds import JOINT_NAME, Several
+from natcoord_jax.core.numeric import Numbers
+from natcoord_jax.core.state import STATE, State
 from natcoord_jax.maths.collocation import gauss
+from natcoord_jax.stepping.checked import STEP
 from natcoord_jax.stepping.step import end_of_step
 
 MIDPOINT = gauss(1)
@@ -150,6 +154,13 @@ def places_of(system: System, joints: Sequence[Handle | str] | None) -> np.ndarr
     return np.array([i for name in names for i, (owner, _) in enumerate(every) if owner == name], int)
 
 
+@checked(
+    system=SYSTEM,
+    state=STATE,
+    coordinates=Numbers((None, None)),
+    dt=STEP,
+    joints=Several(JOINT_NAME, 1),
+)
 def inverse_dynamics(
     system: System,
     state: State,

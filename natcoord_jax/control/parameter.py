@@ -9,10 +9,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.system import System
+from natcoord_jax.core.arguments import Part, is_a
 from natcoord_jax.core.callables import Function
+from natcoord_jax.core.kinds import FLAG, NAME, FunctionOf, Several
+from natcoord_jax.core.numeric import Number, Whole
 
 
-class Parameter(eqx.Module):
+class Parameter(Part):
     """A number of the system that is free: a stiffness, a mass, a length.
 
     Attributes:
@@ -31,16 +34,21 @@ class Parameter(eqx.Module):
         >>> mass = nc.Parameter("mass", where=lambda system: system.mass, index=(0, 0, 0), lower=1.0)
     """
 
-    name: str = eqx.field(static=True)
-    where: Callable[[System], Array] | None = eqx.field(default=None, kw_only=True, converter=Function.of)
-    index: Any = eqx.field(default=(), kw_only=True, static=True)
-    lower: float | None = eqx.field(default=None, kw_only=True, static=True)
-    upper: float | None = eqx.field(default=None, kw_only=True, static=True)
-    apply: Callable[[System, Array], System] | None = eqx.field(
-        default=None, kw_only=True, converter=Function.of
+    name: str = eqx.field(static=True, metadata=is_a(NAME))
+    where: Callable[[System], Array] | None = eqx.field(
+        default=None, kw_only=True, converter=Function.of, metadata=is_a(FunctionOf("(system) -> array"))
     )
-    value: Any = eqx.field(default=None, kw_only=True)
-    moves: bool = eqx.field(default=False, kw_only=True, static=True)
+    index: Any = eqx.field(default=(), kw_only=True, static=True, metadata=is_a(Whole() | Several(Whole())))
+    lower: float | None = eqx.field(default=None, kw_only=True, static=True, metadata=is_a(Number()))
+    upper: float | None = eqx.field(default=None, kw_only=True, static=True, metadata=is_a(Number()))
+    apply: Callable[[System, Array], System] | None = eqx.field(
+        default=None,
+        kw_only=True,
+        converter=Function.of,
+        metadata=is_a(FunctionOf("(system, value) -> system")),
+    )
+    value: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Number()))
+    moves: bool = eqx.field(default=False, kw_only=True, static=True, metadata=is_a(FLAG))
 
     def __check_init__(self):
         """Refuse a parameter that is nowhere, or has no room."""

@@ -1,6 +1,6 @@
 """An optimal control problem: a system, a horizon, what to make small, where to end, what to respect."""
 
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -8,18 +8,23 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from natcoord_jax.assembly.system import System
-from natcoord_jax.control.bounds import Bound
-from natcoord_jax.control.cost import Cost
-from natcoord_jax.control.goal import Goal
-from natcoord_jax.control.inputs import Spline
+from natcoord_jax.assembly.system import SYSTEM, System
+from natcoord_jax.control.bounds import BOUND, Bound
+from natcoord_jax.control.cost import COST, Cost
+from natcoord_jax.control.goal import GOAL, Goal
+from natcoord_jax.control.inputs import SPLINE, Spline
 from natcoord_jax.control.parameter import Parameter
-from natcoord_jax.core.checks import is_concrete, positive
-from natcoord_jax.core.state import State
+from natcoord_jax.core.arguments import Part, is_a
+from natcoord_jax.core.checks import is_concrete
+from natcoord_jax.core.kinds import FLAG, Several, of
+from natcoord_jax.core.numeric import Number, Numbers, Whole
+from natcoord_jax.core.state import STATE, State
 from natcoord_jax.stepping.assemble import assemble
 
+PARAMETERS = Several(of("nc.Parameter(...)", Parameter))
 
-class OptimalControl(eqx.Module):
+
+class OptimalControl(Part):
     """Inputs, and free parameters, that make a cost small over a horizon of steps of the discrete motion.
 
     The motion is that of `nc.simulate`, step for step: what is found is optimal for the energy-momentum
@@ -57,22 +62,25 @@ class OptimalControl(eqx.Module):
         48.15
     """
 
-    system: System
-    state: State
-    dt: Any = eqx.field(kw_only=True)
-    steps: int = eqx.field(kw_only=True, static=True)
-    cost: Cost = eqx.field(default_factory=Cost, kw_only=True)
-    goal: Goal = eqx.field(default_factory=Goal, kw_only=True)
-    bounds: Bound = eqx.field(default_factory=Bound, kw_only=True)
-    inputs: Spline = eqx.field(default_factory=Spline, kw_only=True)
-    parameters: tuple[Parameter, ...] = eqx.field(default=(), kw_only=True, converter=tuple)
-    free_time: Any = eqx.field(default=False, kw_only=True, static=True)
+    system: System = eqx.field(metadata=is_a(SYSTEM))
+    state: State = eqx.field(metadata=is_a(STATE))
+    dt: Any = eqx.field(kw_only=True, metadata=is_a(Number("positive")))
+    steps: int = eqx.field(kw_only=True, static=True, metadata=is_a(Whole(1)))
+    cost: Cost = eqx.field(default_factory=Cost, kw_only=True, metadata=is_a(COST))
+    goal: Goal = eqx.field(default_factory=Goal, kw_only=True, metadata=is_a(GOAL))
+    bounds: Bound = eqx.field(default_factory=Bound, kw_only=True, metadata=is_a(BOUND))
+    inputs: Spline = eqx.field(default_factory=Spline, kw_only=True, metadata=is_a(SPLINE))
+    parameters: tuple[Parameter, ...] = eqx.field(
+        default=(), kw_only=True, converter=tuple, metadata=is_a(PARAMETERS)
+    )
+    free_time: Any = eqx.field(
+        default=False, kw_only=True, static=True, metadata=is_a(FLAG | Numbers((2,), "positive"))
+    )
+
+    makes_arrays: ClassVar[bool] = True
 
     def __check_init__(self):
         """Refuse what is no problem."""
-        if isinstance(self.steps, bool) or not isinstance(self.steps, int | np.integer) or self.steps < 1:
-            raise ValueError(f"the horizon has {self.steps!r} steps; pass steps >= 1")
-        positive(self.dt, "optimal control: dt", "s")
         channels = self.system.structure.inputs
         if not channels:
             raise ValueError(
@@ -151,3 +159,7 @@ class OptimalControl(eqx.Module):
         if not any(parameter.moves for parameter in self.parameters):
             return self.state
         return assemble(self.applied(scaled)[0], self.state)
+
+
+PROBLEM = of("a problem, nc.OptimalControl(...)", OptimalControl)
+"""What an argument may be."""

@@ -11,19 +11,25 @@ import jax.numpy as jnp
 import numpy as np
 
 from natcoord_jax.control import sequential
-from natcoord_jax.control.guess import Guess, scattered, unknowns_of
+from natcoord_jax.control.guess import GUESS, Guess, scattered, unknowns_of
 from natcoord_jax.control.iterate import Iterate, Options
-from natcoord_jax.control.problem import OptimalControl
+from natcoord_jax.control.problem import PROBLEM, OptimalControl
 from natcoord_jax.control.results import Outcome
 from natcoord_jax.control.solution import Row, Solution, solution_of, worst_condition
 from natcoord_jax.control.transcription import Unknowns
+from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.compiled import quickly
+from natcoord_jax.core.kinds import FLAG, Choice, Several, of
+from natcoord_jax.core.numeric import Number, Vector, Whole
 
 METHODS = ("auto", "shooting", "lifted")
 HEADER = (
     f"{'iter':>4} {'cost':>14} {'gradient':>9} {'violation':>9} {'step':>7} {'newton':>7} {'s':>7}  worst"
 )
 DEFAULT = Options()
+UNKNOWNS = of("unknowns, as the `unknowns` of an iterate", Unknowns)
+OPTIONS = of("natcoord_jax.control.iterate.Options(...)", Options)
+WEIGHTS = Number("not negative") | Vector(None)
 NAMES = {True: "lifted", False: "shooting"}
 METHOD = "sequential quadratic programming"
 FOR_THE_OTHER = (Outcome.SIMULATION_FAILED, Outcome.STALLED, Outcome.MAX_ITERATIONS, Outcome.NONFINITE)
@@ -39,8 +45,6 @@ def numeric(problem: OptimalControl) -> OptimalControl:
 
 def _chosen(problem: OptimalControl, method: str, guess: Any = None) -> bool:
     """Whether to lift: where time or parameters are free or the path is bounded, simulations lead astray."""
-    if method not in METHODS:
-        raise ValueError(f"method is {method!r}; pass one of {METHODS}")
     if method != "auto":
         return method == "lifted"
     if problem.free_time:
@@ -100,6 +104,16 @@ def _run(
     return iterate, history, outcome
 
 
+@checked(
+    problem=PROBLEM,
+    guess=GUESS | of("an earlier solution", Solution),
+    method=Choice(METHODS),
+    progress=FLAG,
+    max_iterations=Whole(0),
+    tol=Number("positive"),
+    goal_tol=Number("positive"),
+    time_limit=Number("not negative", infinite=True),
+)
 def optimise(
     problem: OptimalControl,
     guess: Any = None,
@@ -150,11 +164,14 @@ def optimise(
     found = solved(lifted, guess)
     if method == "auto" and found.outcome in FOR_THE_OTHER:
         # A motion that nearly is one is a start for simulations; a failed simulation is one for neither.
-        other = solved(not lifted, Guess(found.inputs, None, found.guess().free) if lifted else guess)
+        other = solved(
+            not lifted, Guess(found.inputs, rates=None, free=found.guess().free) if lifted else guess
+        )
         found = other if other.ok or not found.ok and other.outcome not in FOR_THE_OTHER else found
     return found
 
 
+@checked(problem=PROBLEM, unknowns=UNKNOWNS, options=OPTIONS)
 @quickly
 def optimise_jit(problem: OptimalControl, unknowns: Unknowns, options: Options = DEFAULT) -> Iterate:
     """The method as one program, for `jax.vmap`, receding horizons and other programs around it.
@@ -173,6 +190,18 @@ def optimise_jit(problem: OptimalControl, unknowns: Unknowns, options: Options =
     )
 
 
+@checked(
+    problem=PROBLEM,
+    guess=GUESS | of("an earlier solution", Solution) | Several(of("a guess or a solution", Guess, Solution)),
+    starts=Whole(1),
+    spread=WEIGHTS,
+    rates=WEIGHTS,
+    seed=Whole(0),
+    method=Choice(METHODS),
+    max_iterations=Whole(0),
+    tol=Number("positive"),
+    goal_tol=Number("positive"),
+)
 def multi_start(
     problem: OptimalControl,
     guess: Any = None,

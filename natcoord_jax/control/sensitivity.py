@@ -16,7 +16,7 @@ from natcoord_jax.control.costates import Multipliers, direct_slopes, scored_end
 from natcoord_jax.control.iterate import Iterate, Options
 from natcoord_jax.control.linearisation import first_gradient
 from natcoord_jax.control.problem import OptimalControl
-from natcoord_jax.control.run import DEFAULT, numeric, optimise_jit
+from natcoord_jax.control.run import DEFAULT, OPTIONS, numeric, optimise_jit
 from natcoord_jax.control.transcription import (
     Node,
     Path,
@@ -27,8 +27,12 @@ from natcoord_jax.control.transcription import (
     slices,
     stage,
 )
+from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.checks import at_top_level
 from natcoord_jax.core.compiled import quickly
+from natcoord_jax.core.kinds import FunctionOf, of
+
+START = of("an iterate, as the `iterate` of a solution, or its `unknowns`", Unknowns, Iterate)
 
 CUT = 1e-12
 """Singular values of the conditions of optimality below this fraction of the largest are left out."""
@@ -134,6 +138,7 @@ def _halves(size: int) -> tuple[slice, slice]:
     return slice(None, size), slice(size, None)
 
 
+@checked(make=FunctionOf("(numbers) -> problem"), guess=START, options=OPTIONS)
 def optimum(
     make: Callable[[Any], OptimalControl], guess: Unknowns | Iterate, options: Options = DEFAULT
 ) -> Callable[[Any], Optimum]:

@@ -1,10 +1,10 @@
 """What an optimisation returns, and files of it."""
 
-import dataclasses
 import json
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,9 +17,14 @@ from natcoord_jax.control.iterate import Iterate
 from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.control.results import ADVICE, OUTCOMES, Outcome
 from natcoord_jax.control.transcription import held_inputs
+from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.host import on_host
+from natcoord_jax.core.kinds import of
+from natcoord_jax.core.numeric import Whole
 from natcoord_jax.core.state import State, Trajectory
 from natcoord_jax.stepping.simulate import simulate
+
+FILE = of("the name of a file", str, Path)
 
 NAMED = 3
 """How many violated conditions a message names."""
@@ -49,9 +54,11 @@ class Row(NamedTuple):
     seconds: float
 
 
-@dataclasses.dataclass(frozen=True)
-class Solution:
+class Solution(eqx.Module):
     """The end of an optimisation, reached or not.
+
+    Its numbers are leaves: `eqx.tree_serialise_leaves` writes them, and reads them into a solution of the
+    same problem with as many rows of history. `save` writes what a warm start needs, for any number of steps.
 
     Attributes:
         problem: the problem.
@@ -59,11 +66,11 @@ class Solution:
         free: values of final time [s] and parameters by name.
         dt: step [s].
         cost: whole cost.
-        outcome: how it ended.
+        code: how it ended, see `outcome`.
         method: how it was found: "shooting", "lifted" or "first-order", and with what.
-        history: one row for each iteration.
         iterate: where the second-order method ended, for warm starts, feedback and sensitivities.
         unreachable: part of the goal's residual that no input changes.
+        history: one row for each iteration.
     """
 
     problem: OptimalControl
@@ -71,11 +78,16 @@ class Solution:
     free: dict[str, float]
     dt: float
     cost: float
-    outcome: Outcome
+    code: int
     method: str
-    history: list[Row]
     iterate: Iterate | None = None
     unreachable: Any = None
+    history: list[Row] = eqx.field(default_factory=list)
+
+    @property
+    def outcome(self) -> Outcome:
+        """How it ended."""
+        return Outcome(int(self.code))
 
     @property
     def ok(self) -> bool:
@@ -146,6 +158,7 @@ class Solution:
             text += f"; worst: {self.history[-1].worst}"
         return text + (f"; {ADVICE[self.outcome]}" if self.outcome in ADVICE else "")
 
+    @checked("Solution.guess", steps=Whole(1))
     def guess(self, steps: int | None = None) -> Guess:
         """A guess for another problem, with the inputs resampled in time to another number of steps."""
         rates = None
@@ -155,8 +168,9 @@ class Solution:
         free = [self.free[name] for name in self.problem.free] or None
         steps = steps or self.problem.steps
         rates = None if rates is None else _interpolated(rates, steps)
-        return Guess(_resampled(np.asarray(self.inputs), steps), rates, free)
+        return Guess(_resampled(np.asarray(self.inputs), steps), rates=rates, free=free)
 
+    @checked("Solution.save", file=FILE)
     def save(self, file: str | Path) -> None:
         """Write inputs, rates and what is free as JSON; `nc.load_guess` reads it for a warm start."""
         guess = self.guess()
@@ -173,6 +187,11 @@ class Solution:
         Path(file).write_text(json.dumps(content) + "\n", "utf-8")
 
 
+SOLUTION = of("a solution, as nc.optimise(...) returned it", Solution)
+"""What an argument may be."""
+
+
+@checked(file=FILE, steps=Whole(1))
 def load_guess(file: str | Path, steps: int | None = None) -> Guess:
     """Read what `Solution.save` wrote, as a guess.
 
@@ -191,7 +210,9 @@ def load_guess(file: str | Path, steps: int | None = None) -> Guess:
         raise ValueError(f"{file} is not a solution that `Solution.save` wrote: {error}") from error
     count = inputs.shape[0] if steps is None else steps
     return Guess(
-        _resampled(inputs, count), None if rates is None else _interpolated(rates, count), content["free"]
+        _resampled(inputs, count),
+        rates=None if rates is None else _interpolated(rates, count),
+        free=content["free"],
     )
 
 
@@ -240,9 +261,9 @@ def solution_of(
     names = dict(zip(problem.free, np.asarray(free).tolist()))
     inputs = held_inputs(problem, iterate.unknowns.coefficients)
     cost = float(iterate.path.cost)
-    return Solution(
-        problem, inputs, names, dt, cost, outcome, method, history, iterate, np.asarray(iterate.unreachable)
-    )
+    unreachable = np.asarray(iterate.unreachable)
+    code = int(outcome)
+    return Solution(problem, inputs, names, dt, cost, code, method, iterate, unreachable, history)
 
 
 def worst_condition(problem: OptimalControl, iterate: Iterate) -> tuple[float, str]:

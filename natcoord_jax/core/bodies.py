@@ -19,7 +19,7 @@ class Body(eqx.Module):
         velocity: of the reference point [m/s].
         angular_velocity: world components [rad/s].
         oriented: False for a point mass, which has no orientation and no free rotations.
-        shape: what to draw, or None.
+        shape: what to draw: something with a `surface`, or None.
         name: name, or None.
     """
 

@@ -11,6 +11,8 @@ from jax.core import Tracer, eval_context
 from jax.extend.core import get_opaque_trace_state
 from jaxtyping import Array
 
+from natcoord_jax.core.numeric import Number, Numbers
+
 NUMERIC = (int, float, np.ndarray, np.number, jax.Array)
 """Types of concrete numbers."""
 
@@ -36,10 +38,10 @@ def require_double(where: str) -> None:
     Raises:
         ValueError: with the line to add.
     """
-    if jnp.result_type(float) != jnp.float64:
+    if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
         raise ValueError(
-            f"{where}: natcoord_jax needs double precision. Add this line before building a scene: "
-            'jax.config.update("jax_enable_x64", True)'
+            f"{where}: natcoord_jax needs double precision, to build a scene and for all that follows. "
+            'Add this line before building a scene: jax.config.update("jax_enable_x64", True)'
         )
 
 
@@ -75,15 +77,14 @@ def numbers(value: Any, shape: tuple[int, ...], what: str, unit: str) -> Array:
     Raises:
         ValueError: naming part, quantity, unit and remedy.
     """
-    try:
-        array = as_array(value, float)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{what} [{unit}] is {value!r}; pass numbers of shape {shape}") from error
-    if array.shape != shape:
-        raise ValueError(f"{what} [{unit}] has shape {array.shape}; pass shape {shape}")
-    if is_concrete(array) and not np.all(np.isfinite(np.asarray(array))):
-        raise ValueError(f"{what} [{unit}] is not finite: {np.asarray(array)}; pass finite numbers")
-    return array
+    return _array(value, Numbers(shape), what, unit)
+
+
+def _array(value: Any, kind: Numbers, what: str, unit: str) -> Array:
+    complaint = kind.complaint(value)
+    if complaint is not None:
+        raise ValueError(f"{what} [{unit}] {complaint}; pass {kind.wanted}")
+    return as_array(value, float)
 
 
 def check_fields(module: Any, label: str) -> None:
@@ -113,7 +114,4 @@ def positive(value: Any, what: str, unit: str) -> Array:
     Raises:
         ValueError: naming part, quantity, unit and remedy.
     """
-    array = numbers(value, (), what, unit)
-    if is_concrete(array) and not float(array) > 0:
-        raise ValueError(f"{what} [{unit}] is {float(array):g}; pass a positive number")
-    return array
+    return _array(value, Number("positive"), what, unit)

@@ -15,9 +15,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.effect import Effect, Motion, Now, Response
 from natcoord_jax.core.gradient import averaged_gradient, cancelling_energy
 from natcoord_jax.core.joint import Frame, frames_at
+from natcoord_jax.core.kinds import JOINT, NAME, Several
+from natcoord_jax.core.numeric import Whole
 from natcoord_jax.maths.collocation import gauss
 
 
@@ -114,10 +117,10 @@ class CoordinateEffect(Effect):
         axes: the coordinates' descriptions, filled in at compile.
     """
 
-    joint: Any
-    coordinate: Any = eqx.field(default=0, kw_only=True)
-    name: Any = eqx.field(default=None, kw_only=True)
-    axes: tuple[Coordinate, ...] = eqx.field(default=(), kw_only=True, static=True)
+    joint: Any = eqx.field(metadata=is_a(JOINT | Several(JOINT, 1)))
+    coordinate: Any = eqx.field(default=0, kw_only=True, metadata=is_a(Whole(0) | Several(Whole(0), 1)))
+    name: Any = eqx.field(default=None, kw_only=True, metadata=is_a(NAME))
+    axes: tuple[Coordinate, ...] = eqx.field(default=(), init=False, static=True)
 
     kind: ClassVar[str] = "coordinate effect"
 
@@ -161,6 +164,9 @@ def _joined(parts: list[tuple[int, Array]], count: int) -> Array | None:
 class CoordinatePotential(CoordinateEffect):
     """Base of elastic laws on one joint coordinate: subclass it and give `energy`."""
 
+    joint: Any = eqx.field(metadata=is_a(JOINT))
+    coordinate: Any = eqx.field(default=0, kw_only=True, metadata=is_a(Whole(0)))
+
     kind: ClassVar[str] = "coordinate potential"
     stores: ClassVar[bool] = True
     elastic: ClassVar[bool] = True
@@ -200,6 +206,9 @@ class CoordinatePotential(CoordinateEffect):
 class CoordinateForce(CoordinateEffect):
     """Base of non-potential laws on one joint coordinate: subclass it and give `force`."""
 
+    joint: Any = eqx.field(metadata=is_a(JOINT))
+    coordinate: Any = eqx.field(default=0, kw_only=True, metadata=is_a(Whole(0)))
+
     kind: ClassVar[str] = "coordinate force"
     works: ClassVar[bool] = True
 
@@ -215,6 +224,9 @@ class CoordinateForce(CoordinateEffect):
 
 class CoordinateInertia(CoordinateEffect):
     """Base of rotors: inertia that only a joint coordinate sees; subclass it and give `inertia_of`."""
+
+    joint: Any = eqx.field(metadata=is_a(JOINT))
+    coordinate: Any = eqx.field(default=0, kw_only=True, metadata=is_a(Whole(0)))
 
     kind: ClassVar[str] = "coordinate inertia"
     stores: ClassVar[bool] = True

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from natcoord_jax.core.arguments import Part
 from natcoord_jax.maths.collocation import Tableau
 
 M = TypeVar("M", bound=eqx.Module)
@@ -99,7 +100,7 @@ class Response(eqx.Module):
     power: Float[Array, "*n s"]
 
 
-class Effect(eqx.Module):
+class Effect(Part):
     """Base of everything that acts on bodies.
 
     Class attributes:

@@ -9,10 +9,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.effect import Effect, Motion, Now, Response
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.joint import Joint
-from natcoord_jax.core.markers import Attachment, Marker
+from natcoord_jax.core.kinds import NAME
+from natcoord_jax.core.markers import Attachment, Marker, Markers
 from natcoord_jax.core.potential import marker_response, place_markers
 
 
@@ -46,8 +48,8 @@ class Force(Effect):
         ...         return nc.Load(-self.coefficient * rate, None)
     """
 
-    markers: Any
-    name: Any = None
+    markers: Any = eqx.field(metadata=is_a(Markers()))
+    name: Any = eqx.field(default=None, kw_only=True, metadata=is_a(NAME))
 
     kind: ClassVar[str] = "force"
     works: ClassVar[bool] = True
@@ -87,7 +89,7 @@ class Field(Effect):
     force rows m_a0 g (14, 19).
     """
 
-    name: Any = None
+    name: Any = eqx.field(default=None, kw_only=True, metadata=is_a(NAME))
 
     kind: ClassVar[str] = "field"
     stores: ClassVar[bool] = True

@@ -14,8 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.effect import Effect, Motion, Now, Response
 from natcoord_jax.core.handles import Handle
+from natcoord_jax.core.kinds import BODY, NAME
+from natcoord_jax.core.numeric import COMPONENTS, Directions
 
 
 class Frame(eqx.Module):
@@ -57,6 +60,8 @@ class Joint(Effect):
         free: whether `rotations` and `translations` describe the free motion completely, so that the
             joint may be part of the spanning tree; False keeps its multipliers.
         coordinates: the joint's coordinates, in the order sensors and drives count them.
+        apart: whether parent and child have points of their own, by default their reference points; else both
+            have one, by default the child's reference point.
 
     Example:
         A joint of one's own, a point that stays in a plane through the joint:
@@ -68,12 +73,12 @@ class Joint(Effect):
         ...         return (parent.axes[2] @ (child.point - parent.point))[None]
     """
 
-    parent: Any
-    child: Any
-    point: Any = None
-    axis: Any = (0.0, 0.0, 1.0)
-    second: Any = eqx.field(default=None, kw_only=True)
-    name: Any = eqx.field(default=None, kw_only=True)
+    parent: Any = eqx.field(metadata=is_a(BODY))
+    child: Any = eqx.field(metadata=is_a(BODY))
+    point: Any = eqx.field(default=None, kw_only=True, metadata=is_a(COMPONENTS))
+    axis: Any = eqx.field(default=(0.0, 0.0, 1.0), kw_only=True, metadata=is_a(Directions()))
+    second: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Directions()))
+    name: Any = eqx.field(default=None, kw_only=True, metadata=is_a(NAME))
 
     kind: ClassVar[str] = "joint"
     impulsive: ClassVar[bool] = True
@@ -84,13 +89,14 @@ class Joint(Effect):
     free: ClassVar[bool] = False
     coordinates: ClassVar[tuple[Any, ...]] = ()
     needs_axis: ClassVar[bool] = True
+    apart: ClassVar[bool] = False
 
     @abc.abstractmethod
     def residual(self, parent: Frame, child: Frame) -> Float[Array, " m"]:
         """Constraints g, at most quadratic in the vectors of the two frames."""
 
     def anchors(self) -> tuple[Any, Any]:
-        """Points of parent and child [m] in the assembled pose; None: the child's reference point."""
+        """Points of parent and child [m] in the assembled pose; None: see `apart`."""
         return self.point, self.point
 
     def initialise(self, parent: Frame, child: Frame) -> "Joint":

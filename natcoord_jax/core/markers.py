@@ -5,11 +5,15 @@ The rows q_a of a body are its reference point and its three directors, so a poi
 joins whatever has rows: rigid bodies, the ground, nodes of beams. An attachment is a point with a triad.
 """
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
 
+from natcoord_jax.core.arguments import Part, checked, is_a
 from natcoord_jax.core.handles import Handle
+from natcoord_jax.core.kinds import BODY, FLAG, Kind, described, is_other, short
+from natcoord_jax.core.numeric import COMPONENTS, Directions, Numbers
 
 
 class Marker(eqx.Module):
@@ -28,23 +32,37 @@ class Marker(eqx.Module):
     local: bool = eqx.field(static=True, default=False)
 
 
-def Point(body: Handle, position=(0.0, 0.0, 0.0), *, local: bool = False) -> Marker:
+@described.register
+def _(value: Marker) -> str:
+    return f"a {'point' if value.is_point else 'direction'} of {short(value.body)}"
+
+
+@checked(body=BODY, position=COMPONENTS, local=FLAG)
+def Point(body: Handle, position: Any = None, *, local: bool = False) -> Marker:
     """Material point of a body.
 
     Args:
         body: handle returned by `Scene.add`, or `ground`.
-        position: shape (3,) [m], in world coordinates of the assembled pose.
+        position: shape (3,) [m], in world coordinates of the assembled pose; default the body's reference
+            point.
         local: take `position` in the body's reference frame instead, from its reference point.
 
+    Raises:
+        ValueError: for something else than a body and numbers.
+
     Example:
+        >>> import jax; jax.config.update("jax_enable_x64", True)
         >>> import natcoord_jax as nc
         >>> nc.Point(nc.ground, (0, 0, 1)).is_point
         True
     """
-    return Marker(body, position, True, local)
+    return (
+        Marker(body, (0.0, 0.0, 0.0), True, True) if position is None else Marker(body, position, True, local)
+    )
 
 
-def Direction(body: Handle, vector, *, local: bool = False) -> Marker:
+@checked(body=BODY, vector=Directions(), local=FLAG)
+def Direction(body: Handle, vector: Any, *, local: bool = False) -> Marker:
     """Direction fixed in a body.
 
     Args:
@@ -52,7 +70,11 @@ def Direction(body: Handle, vector, *, local: bool = False) -> Marker:
         vector: shape (3,) [-], in world coordinates of the assembled pose; its length is kept.
         local: take `vector` in the body's reference frame instead.
 
+    Raises:
+        ValueError: for something else than a body and a direction.
+
     Example:
+        >>> import jax; jax.config.update("jax_enable_x64", True)
         >>> import natcoord_jax as nc
         >>> nc.Direction(nc.ground, (0, 0, 1)).is_point
         False
@@ -60,7 +82,7 @@ def Direction(body: Handle, vector, *, local: bool = False) -> Marker:
     return Marker(body, vector, False, local)
 
 
-class Attachment(eqx.Module):
+class Attachment(Part):
     """A point with a triad, both fixed in a body, given in the assembled pose: four vectors in one marker.
 
     Attributes:
@@ -75,27 +97,50 @@ class Attachment(eqx.Module):
         >>> clamp = nc.Attachment(nc.ground, (0, 0, 1), np.eye(3))
     """
 
-    body: Handle = eqx.field(static=True)
-    point: Any
-    axes: Any
-    local: bool = eqx.field(static=True, default=False)
+    body: Handle = eqx.field(static=True, metadata=is_a(BODY))
+    point: Any = eqx.field(metadata=is_a(COMPONENTS))
+    axes: Any = eqx.field(metadata=is_a(Numbers((3, 3))))
+    local: bool = eqx.field(static=True, default=False, kw_only=True, metadata=is_a(FLAG))
 
 
-def require_markers(kind: str, markers: Any, points: int, directions: int) -> None:
-    """Markers are points, then directions.
+@dataclasses.dataclass(frozen=True)
+class Markers(Kind):
+    """Points and directions in a tuple.
 
-    Args:
-        kind: of the effect, for the message.
-        markers: that were given.
-        points: number of points.
+    Attributes:
+        points: number of points; None: any markers at all.
         directions: number of directions after them.
-
-    Raises:
-        ValueError: for others, or another number.
+        more: whether others may follow.
+        attachments: number of attachments, instead of points and directions; None: none; zero: any number.
     """
-    found = [m.is_point if isinstance(m, Marker) else None for m in markers]
-    if found != [True] * points + [False] * directions:
-        wanted = " and ".join(
-            f"{count} nc.{name}" for count, name in ((points, "Point"), (directions, "Direction")) if count
-        )
-        raise ValueError(f"{kind}: markers are {markers!r}; pass {wanted}, in a tuple")
+
+    points: int | None = None
+    directions: int = 0
+    more: bool = False
+    attachments: int | None = None
+
+    @property
+    def wanted(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """How many of what."""
+        if self.attachments is not None:
+            return f"{self.attachments or 'several'} nc.Attachment, in a tuple"
+        if self.points is None:
+            return "nc.Point and nc.Direction, or nc.Attachment, in a tuple"
+        parts = ((self.points, "Point"), (self.directions, "Direction"))
+        return " and ".join(f"{count} nc.{name}" for count, name in parts if count) + ", in a tuple"
+
+    def complaint(self, value: Any) -> str | None:
+        """Whether they are these."""
+        if not isinstance(value, tuple | list):
+            return is_other(value)
+        described = f"is ({', '.join(short(x) for x in value)})"
+        found = [m.is_point if isinstance(m, Marker) else None for m in value]
+        attached = [isinstance(m, Attachment) for m in value]
+        if self.attachments is not None:
+            enough = len(value) == self.attachments or (self.attachments == 0 and value)
+            return None if all(attached) and enough else described
+        if self.points is None:
+            return None if all(attached) or None not in found else described
+        wanted = [True] * self.points + [False] * self.directions
+        fits = found[: len(wanted)] == wanted if self.more else found == wanted
+        return None if fits and None not in found else described

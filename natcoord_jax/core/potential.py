@@ -9,11 +9,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.effect import Effect, Motion, Now, Response
 from natcoord_jax.core.gradient import averaged_coupling, averaged_gradient, cancelling_energy, gradient_of
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.joint import Joint
-from natcoord_jax.core.markers import Attachment, Marker
+from natcoord_jax.core.kinds import NAME
+from natcoord_jax.core.markers import Attachment, Marker, Markers
 from natcoord_jax.core.pieces import in_pieces
 from natcoord_jax.maths.collocation import Tableau
 from natcoord_jax.maths.settled import settled
@@ -58,8 +60,8 @@ class Potential(Effect):
         ...         return 0.5 * self.stiffness * invariants[0] ** 2
     """
 
-    markers: Any
-    name: Any = None
+    markers: Any = eqx.field(metadata=is_a(Markers()))
+    name: Any = eqx.field(default=None, kw_only=True, metadata=is_a(NAME))
 
     kind: ClassVar[str] = "potential"
     stores: ClassVar[bool] = True

@@ -3,9 +3,9 @@
 import abc
 from typing import Any, Protocol, runtime_checkable
 
-import equinox as eqx
 from jaxtyping import Array, Float
 
+from natcoord_jax.core.arguments import Part
 from natcoord_jax.core.bodies import Body
 from natcoord_jax.core.handles import Handle
 
@@ -27,7 +27,7 @@ class Builder(Protocol):
         ...
 
 
-class Recipe(eqx.Module):
+class Recipe(Part):
     """Base of parts that add bodies, joints and effects to a scene."""
 
     kind = "recipe"

@@ -1,13 +1,18 @@
 """State of a system and trajectory of a rollout: plain data."""
 
+import dataclasses
+from collections.abc import Iterator
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from natcoord_jax.core.checks import numbers
 from natcoord_jax.core.effect import replace_fields
+from natcoord_jax.core.kinds import of, short
 
 
 class State(eqx.Module):
@@ -62,6 +67,11 @@ class State(eqx.Module):
 class Trajectory(eqx.Module):
     """States at the saved times, and what happened on the way.
 
+    It counts and is indexed along the first axis, as its times are: `trajectory[k].t` is `trajectory.t[k]`.
+    So a trajectory has as many items as saved states, an index gives a state, and a slice a trajectory of
+    the states that it picks (with the inputs of the last step before each; codes and counts stay those of
+    the run, `steps_taken` less the intervals cut off at the ends). Of a batch the items are the lanes.
+
     Attributes:
         states: saved states, the initial one first; leading axis `saved`.
         inputs: inputs of the steps before each saved state, shape (saved - 1, inputs); with `save_every`
@@ -78,6 +88,21 @@ class Trajectory(eqx.Module):
         iterations: Newton iterations summed over all attempts.
         iterations_max: largest number in one attempt.
         scheme: that made it (static).
+
+    Example:
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import natcoord_jax as nc
+        >>> scene = nc.Scene()
+        >>> ball = scene.add(nc.RigidBody(mass=1.0, inertia=(1.0, 1.0, 1.0), velocity=(1.0, 0.0, 0.0)))
+        >>> system, state = scene.compile()
+        >>> trajectory = nc.simulate(system, state, dt=0.5, steps=10)
+        >>> len(trajectory), float(trajectory[-1].q[0, 0])
+        (11, 5.0)
+        >>> later = trajectory[5:]
+        >>> later.t.tolist(), float(later[0].t)
+        ([2.5, 3.0, 3.5, 4.0, 4.5, 5.0], 2.5)
+        >>> [float(state.q[0, 0]) for state in trajectory[::5]]
+        [0.0, 2.5, 5.0]
     """
 
     states: State
@@ -93,6 +118,39 @@ class Trajectory(eqx.Module):
     iterations_max: Int[Array, "*batch"]
     scheme: Any = eqx.field(static=True, default=None)
 
+    def __len__(self) -> int:
+        return self.t.shape[0]
+
+    def __iter__(self) -> Iterator[Any]:
+        return (self[k] for k in range(len(self)))
+
+    def __getitem__(self, index: Any) -> Any:
+        """A state or a trajectory, of a batch always a trajectory.
+
+        Raises:
+            IndexError: for a place beyond the ends, or a slice of nothing.
+            TypeError: for what is neither a number nor a slice.
+        """
+        if isinstance(index, bool) or not isinstance(index, int | np.integer | slice):
+            raise TypeError(f"trajectory: index {short(index)} is no place; pass a whole number or a slice")
+        if not isinstance(index, slice) and not -len(self) <= int(index) < len(self):
+            raise IndexError(f"trajectory: there is no item {index}; it has {len(self)}")
+        places = range(len(self))[index]
+        if isinstance(places, range) and not places:
+            raise IndexError(f"trajectory: nothing is in {index}; it has {len(self)} items")
+        if self.t.ndim > 1:
+            return _picked(self, places)
+        states = _picked(self.states, places)
+        if not isinstance(places, range):
+            return states
+        if places.step < 0:
+            raise IndexError("trajectory: a slice may not go backwards, times increase; pass a positive step")
+        before = range(places[0] + places.step - 1, places[-1], places.step)
+        cut = len(self) - 1 - (places[-1] - places[0])
+        return dataclasses.replace(
+            self, states=states, inputs=_picked(self.inputs, before), steps_taken=self.steps_taken - cut
+        )
+
     @property
     def t(self) -> Float[Array, "*batch saved"]:
         """Saved times [s]."""
@@ -107,3 +165,16 @@ class Trajectory(eqx.Module):
     def v(self) -> Float[Array, "*batch saved rows 3"]:
         """Saved velocities of the rows, as the scheme carries them on; see `System.tangent`."""
         return self.states.v
+
+
+def _picked(tree: Any, places: int | range) -> Any:
+    """Items of all arrays along the first axis."""
+    if isinstance(places, range):
+        places = slice(places.start, places.stop, places.step)  # pyright: ignore[reportAssignmentType]
+    return jax.tree.map(lambda x: x[places], tree)
+
+
+STATE = of("a state, as scene.compile() returned it with the system", State)
+TRAJECTORY = of("a trajectory, as nc.simulate(...) returned it", Trajectory)
+MOTION = of("a state or a trajectory", State, Trajectory)
+"""What arguments may be."""

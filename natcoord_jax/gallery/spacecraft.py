@@ -135,7 +135,7 @@ def compare_torques(numbers: tuple[int, ...] = tuple(TABLE)) -> list[Comparison]
     for number, (base, wheel, hinge) in enumerate(parts):
         scene.add(nc.JointTorque(hinge, name=f"motor {number + 1}"))
         markers = (nc.Direction(base, np.eye(3)[number]), *_axes(base), *_axes(wheel))
-        scene.add(CovariantJointTorque(markers, f"covariant motor {number + 1}"))
+        scene.add(CovariantJointTorque(markers, name=f"covariant motor {number + 1}"))
     system, state = scene.compile()
     longest = max(numbers)
     kinds = {"contravariant": [1.0, 0.0] * 3, "covariant": [0.0, 1.0] * 3}

@@ -43,7 +43,7 @@ def stiff_chain(rods: int = 6, stiffness: float = 1e8) -> Example:
         end = middles[k] - length / 2
         ends = nc.Point(bodies[k], (0, 0, end)), nc.Point(bodies[k + 1], (0, 0, end - gap))
         name = f"spring {k + 1}"
-        scene.add(nc.Spring(ends, name, stiffness=stiffness, length=gap - force / stiffness))
+        scene.add(nc.Spring(ends, name=name, stiffness=stiffness, length=gap - force / stiffness))
     system, state = scene.compile()
     facts = {"dofs": 6 * rods - 3}
     return Example("stiff_chain", "rods on stiff springs", system, state, 0.004, 500, facts=facts)

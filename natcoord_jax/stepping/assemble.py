@@ -10,13 +10,14 @@ from jaxtyping import Array
 from natcoord_jax.assembly.coordinates import state_rates
 from natcoord_jax.assembly.projection import Projection, gap_rates, twists_of
 from natcoord_jax.assembly.rates import row_rates
-from natcoord_jax.assembly.system import System
+from natcoord_jax.assembly.system import SYSTEM, System
 from natcoord_jax.assembly.violations import GAP, rate_size, worst_violation
+from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.checks import is_concrete
 from natcoord_jax.core.compiled import briefly
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.results import REASONS, Result, SimulationError
-from natcoord_jax.core.state import State
+from natcoord_jax.core.state import STATE, State
 from natcoord_jax.maths.elimination import definite_inverse
 from natcoord_jax.maths.rotations import orthonormalise
 from natcoord_jax.stepping.closing import closed
@@ -113,6 +114,7 @@ def _rotor_rates(system: System, state: State) -> Array:
     return rates
 
 
+@checked(system=SYSTEM, state=STATE)
 def assemble(system: System, state: State) -> State:
     """Bring positions and velocities to obey the constraints, from wherever they are.
 

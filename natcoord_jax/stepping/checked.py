@@ -3,12 +3,16 @@
 from typing import Any
 
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.system import System
-from natcoord_jax.core.checks import is_concrete
+from natcoord_jax.core.kinds import FunctionOf
+from natcoord_jax.core.numeric import Number, Numbers
 from natcoord_jax.core.state import State
+
+STEP = Number("positive", instead=" (jax.vmap takes several)")
+INPUTS = Numbers(("...", None)) | FunctionOf("(t, state) -> inputs")
+"""What arguments may be."""
 
 
 def checked_step(dt: Any) -> Float[Array, ""]:
@@ -17,23 +21,19 @@ def checked_step(dt: Any) -> Float[Array, ""]:
     Raises:
         ValueError: unless it is one positive number.
     """
-    step = jnp.asarray(dt, float)
-    if step.shape != ():
-        raise ValueError(f"dt [s] must be a scalar, not of shape {step.shape}; use jax.vmap for several")
-    if is_concrete(step) and not (np.isfinite(float(step)) and float(step) > 0):
-        raise ValueError(f"dt [s] is {float(step)}; pass a positive finite step")
-    return step
+    complaint = STEP.complaint(dt)
+    if complaint is not None:
+        raise ValueError(f"dt [s] {complaint}; pass {STEP.wanted}")
+    return jnp.asarray(dt, float)
 
 
 def checked_inputs(system: System, inputs: Any, steps: int | None, stages: int = 1) -> tuple[Any, int]:
     """Inputs as an array (steps, [stages,] inputs) or a callable, and the number of steps.
 
     Raises:
-        ValueError: for a shape that does not fit, or numbers that are not finite.
+        ValueError: for a shape that does not fit.
     """
     names = system.structure.inputs
-    if steps is not None and (not isinstance(steps, int | np.integer) or steps < 1):
-        raise ValueError(f"steps is {steps!r}; pass a positive integer")
     if callable(inputs):
         if steps is None:
             raise ValueError("pass steps when inputs is a function of (t, state)")
@@ -54,8 +54,6 @@ def checked_inputs(system: System, inputs: Any, steps: int | None, stages: int =
             f"inputs has shape {array.shape}; this system has the input channels {list(names)}: pass shape "
             f"{wanted}, or a function (t, state) -> ({len(names)},)"
         )
-    if is_concrete(array) and not np.all(np.isfinite(np.asarray(array))):
-        raise ValueError("inputs has numbers that are not finite; pass finite forces [N] and torques [N m]")
     return array, int(array.shape[0])
 
 

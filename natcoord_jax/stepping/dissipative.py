@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 
+from natcoord_jax.core.numeric import Number
 from natcoord_jax.maths.collocation import Tableau, gauss
 from natcoord_jax.stepping.scheme import Scheme
 
@@ -59,8 +60,10 @@ class Dissipative(Scheme):
     spectral_radius: float = 0.8
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.spectral_radius <= 1.0:
-            raise ValueError(f"spectral_radius is {self.spectral_radius!r}; pass a number from 0 to 1")
+        wrong = Number().complaint(self.spectral_radius)
+        if wrong is not None or not 0.0 <= self.spectral_radius <= 1.0:
+            said = wrong or f"is {self.spectral_radius!r}"
+            raise ValueError(f"Dissipative: spectral_radius {said}; pass a number from 0 to 1")
 
     @property
     def tableau(self) -> Tableau:

@@ -9,17 +9,21 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from natcoord_jax.assembly.system import System
+from natcoord_jax.assembly.system import SYSTEM, System
+from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.checks import is_concrete
 from natcoord_jax.core.compiled import compiled
 from natcoord_jax.core.effect import replace_fields
+from natcoord_jax.core.numeric import Number, Vector
 from natcoord_jax.core.results import REASONS, REMEDIES, Result, SimulationError
-from natcoord_jax.core.state import State
-from natcoord_jax.stepping.checked import check_state, checked_inputs, checked_step
+from natcoord_jax.core.state import STATE, State
+from natcoord_jax.stepping.checked import STEP, check_state, checked_inputs, checked_step
 from natcoord_jax.stepping.derivative import run_slots
 from natcoord_jax.stepping.newton import TOLERANCE
 from natcoord_jax.stepping.plan import Plan
-from natcoord_jax.stepping.scheme import SECOND_ORDER, Scheme
+from natcoord_jax.stepping.scheme import SCHEME, SECOND_ORDER, Scheme
+
+CHANNELS = Vector(None)
 
 
 @compiled
@@ -29,6 +33,7 @@ def _one_step(system, state, u, dt, tolerance, extra, tableau):
     return course.state, course.code
 
 
+@checked(system=SYSTEM, state=STATE, u=CHANNELS, dt=STEP, newton_tol=Number("positive"), scheme=SCHEME)
 def step(
     system: System,
     state: State,
@@ -77,6 +82,7 @@ def step(
     return jax.tree.map(lambda x: jnp.where(code == 0, x, jnp.nan), after)
 
 
+@checked(system=SYSTEM, state=STATE, u=CHANNELS, dt=STEP)
 def linearise(
     system: System, state: State, u: Any = None, dt: Any = None
 ) -> tuple[Float[Array, "n n"], Float[Array, "n inputs"]]:

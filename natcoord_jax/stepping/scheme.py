@@ -1,18 +1,21 @@
 """What a scheme is, and the energy-momentum family."""
 
 import abc
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
+from natcoord_jax.core.arguments import checked, require
 from natcoord_jax.core.effect import replace_fields
+from natcoord_jax.core.kinds import FLAG, Choice, of
+from natcoord_jax.core.numeric import Number, Whole
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import Tableau, gauss
 
 LARGEST = 10
 """Largest order of the energy-momentum family."""
+ORDER = Choice(tuple(range(2, LARGEST + 1, 2)))
 
 
 class Scheme(abc.ABC):
@@ -38,6 +41,7 @@ class Scheme(abc.ABC):
         """Whether velocities of states have parts normal to the constraints, which readings leave out."""
         return not self.tableau.tangent
 
+    @checked("times", dt=Number(), steps=Whole(1), start=Number())
     def times(
         self, dt: Float[Array, ""] | float, steps: int, start: float = 0.0
     ) -> Float[Array, "steps stages"]:
@@ -90,11 +94,13 @@ class EnergyMomentum(Scheme):
     """
 
     order: int = 2
-    kick: bool | None = None
+    kick: bool | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
-        if not isinstance(self.order, int | np.integer) or self.order not in range(2, LARGEST + 1, 2):
-            raise ValueError(f"order is {self.order!r}; pass an even number from 2 to {LARGEST}")
+        wrong = ORDER.complaint(self.order)
+        if wrong is not None:
+            raise ValueError(f"EnergyMomentum: order {wrong}; pass an even number from 2 to {LARGEST}")
+        require(self, "kick", FLAG | of("None", type(None)))
 
     @property
     def tableau(self) -> Tableau:
@@ -109,3 +115,6 @@ class EnergyMomentum(Scheme):
 
 SECOND_ORDER = EnergyMomentum()
 """The step of the paper (57)."""
+
+SCHEME = of("nc.EnergyMomentum(...), nc.VariationalMidpoint() or nc.Dissipative(...)", Scheme)
+"""What an argument may be."""

@@ -11,21 +11,24 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from natcoord_jax.assembly.reading import handing, reads_velocities
-from natcoord_jax.assembly.system import System
+from natcoord_jax.assembly.system import SYSTEM, System
+from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.callables import Function
 from natcoord_jax.core.checks import is_concrete
 from natcoord_jax.core.compiled import quickly
 from natcoord_jax.core.effect import replace_fields
+from natcoord_jax.core.kinds import FLAG, FunctionOf
+from natcoord_jax.core.numeric import Number, Whole
 from natcoord_jax.core.results import Result
-from natcoord_jax.core.state import State, Trajectory
+from natcoord_jax.core.state import STATE, State, Trajectory
 from natcoord_jax.stepping import one_kernel
 from natcoord_jax.stepping.admissibility import check_obeyed
-from natcoord_jax.stepping.checked import check_state, checked_inputs, checked_step
+from natcoord_jax.stepping.checked import INPUTS, STEP, check_state, checked_inputs, checked_step
 from natcoord_jax.stepping.derivative import run_slots
 from natcoord_jax.stepping.error_control import Tolerance
 from natcoord_jax.stepping.newton import TOLERANCE
 from natcoord_jax.stepping.plan import Control, Event, Plan, Slots
-from natcoord_jax.stepping.scheme import SECOND_ORDER, Scheme
+from natcoord_jax.stepping.scheme import SCHEME, SECOND_ORDER, Scheme
 from natcoord_jax.stepping.turns import warn_of_far_turns
 
 SEGMENT = 512
@@ -148,6 +151,22 @@ def _compiled(
     return _rollout(system, state, inputs, dt, *static, allowed=tolerance)
 
 
+@checked(
+    system=SYSTEM,
+    state=STATE,
+    dt=STEP,
+    steps=Whole(1),
+    inputs=INPUTS,
+    save_every=Whole(1),
+    throw=FLAG,
+    until=FunctionOf("of the state to a number, whose sign changes"),
+    checkpoint=FLAG,
+    newton_tol=Number("positive"),
+    extra_substeps=Whole(0),
+    scheme=SCHEME,
+    rtol=Number("not negative"),
+    atol=Number("not negative"),
+)
 def simulate(
     system: System,
     state: State,
@@ -240,7 +259,7 @@ def simulate(
     step = checked_step(dt)
     inputs, until = Function.of(handing(inputs), state.t, state), Function.of(handing(until), state)
     checked, count = checked_inputs(system, inputs, steps, scheme.stages)
-    if save_every < 1 or count % save_every:
+    if count % save_every:
         raise ValueError(f"save_every is {save_every}; pass a positive divisor of steps = {count}")
     tolerance = Tolerance.of(rtol, atol)
     if extra_substeps is None:

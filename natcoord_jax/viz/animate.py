@@ -12,8 +12,11 @@ from matplotlib.figure import Figure
 from natcoord_jax.analysis.phases import Phases
 from natcoord_jax.assembly.system import System
 from natcoord_jax.bodies.beam import BeamHandle
-from natcoord_jax.core.state import Trajectory
-from natcoord_jax.viz.stage import Stage, phases_of, pictures
+from natcoord_jax.core.arguments import checked
+from natcoord_jax.core.kinds import of
+from natcoord_jax.core.numeric import Whole
+from natcoord_jax.core.state import TRAJECTORY, Trajectory
+from natcoord_jax.viz.stage import BEAMS, MOVING, Stage, phases_of, pictures
 
 MOST_FRAMES = 250
 
@@ -46,6 +49,13 @@ def _film(
     return film, figure
 
 
+@checked(
+    system=MOVING,
+    trajectory=TRAJECTORY,
+    file=of("the name of a gif file", str, Path),
+    fps=Whole(1),
+    beams=BEAMS,
+)
 def animate(
     system: System | Phases,
     trajectory: Trajectory | None = None,

@@ -1,4 +1,4 @@
-"""What to draw of a system: boxes with the inertia of the bodies, joints as points with axes, beams."""
+"""What to draw of a system: shapes of the bodies or boxes with their inertia, joints, beams."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -8,9 +8,8 @@ from jaxtyping import Float
 
 from natcoord_jax.assembly.system import Group, System
 from natcoord_jax.bodies.beam import BeamHandle
+from natcoord_jax.bodies.shapes import CORNERS, FACES
 
-CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
-FACES = np.array([[0, 1, 3, 2], [4, 5, 7, 6], [0, 1, 5, 4], [2, 3, 7, 6], [0, 2, 6, 4], [1, 3, 7, 5]])
 THINNEST = 0.02
 """Least edge of a box, relative to its longest: plates and rods stay visible."""
 
@@ -30,6 +29,18 @@ def inertia_boxes(system: System) -> Float[np.ndarray, "bodies 8 4"]:
         corners = centre + (CORNERS * half) @ axes.T
         boxes.append(np.concatenate([np.ones((8, 1)), corners], axis=1))
     return np.stack(boxes)
+
+
+def surfaces(system: System) -> list[tuple[Float[np.ndarray, "n 4"], list[np.ndarray]]]:
+    """Marker weights of the points of what is drawn of each body, and the faces between them.
+
+    That is the shape that it was given; of others the box with their inertia.
+    """
+    found = []
+    for box, shape in zip(inertia_boxes(system), system.structure.shapes):
+        points, faces = (box[:, 1:], list(FACES)) if shape is None else shape.surface()
+        found.append((np.concatenate([np.ones((len(points), 1)), points], axis=1), faces))
+    return found
 
 
 def with_ground(q: Float[np.ndarray, "t rows 3"]) -> Float[np.ndarray, "t bodies_and_ground 4 3"]:

@@ -10,10 +10,13 @@ from natcoord_jax.analysis.phases import Phases
 from natcoord_jax.assembly.system import System
 from natcoord_jax.bodies.beam import BeamHandle
 from natcoord_jax.control.solution import Solution
-from natcoord_jax.core.state import Trajectory
+from natcoord_jax.core.arguments import checked
+from natcoord_jax.core.kinds import of
+from natcoord_jax.core.numeric import Vector
+from natcoord_jax.core.state import TRAJECTORY, Trajectory
 from natcoord_jax.viz.panels import Curve, Panel, plot_panels
 from natcoord_jax.viz.snapshots import plot_snapshots
-from natcoord_jax.viz.stage import phases_of
+from natcoord_jax.viz.stage import BEAMS, phases_of
 from natcoord_jax.viz.work_precision import plot_accuracy
 
 AXES = "xyz"
@@ -111,6 +114,12 @@ def _is_free(system: System, body: int) -> bool:
     return parent == len(system.structure.bodies) and int(own.sum()) == 6
 
 
+DRAWN = of(
+    "a system, nc.Phases(...), a solution, or what nc.accuracy(...) found", System, Phases, Solution, Accuracy
+)
+
+
+@checked(system=DRAWN, trajectory=TRAJECTORY, times=Vector(None), beams=BEAMS)
 def plot(
     system: System | Phases | Solution | Accuracy,
     trajectory: Trajectory | None = None,

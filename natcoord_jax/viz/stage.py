@@ -1,6 +1,7 @@
 """What is seen of a motion at some times, and the diagram that shows it.
 
-Bodies are boxes of equal inertia, joints points with axes, beams swept sections.
+Bodies are the shapes they were given, or boxes of equal inertia; joints are points with axes, beams swept
+sections.
 """
 
 from collections.abc import Sequence
@@ -14,8 +15,13 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 from natcoord_jax.analysis.phases import Phases
 from natcoord_jax.assembly.system import System
 from natcoord_jax.bodies.beam import BeamHandle
+from natcoord_jax.bodies.shapes import FACES
+from natcoord_jax.core.kinds import Several, of
 from natcoord_jax.core.state import State, Trajectory
-from natcoord_jax.viz.outline import FACES, beam_rims, inertia_boxes, is_node, joint_places, with_ground
+from natcoord_jax.viz.outline import beam_rims, is_node, joint_places, surfaces, with_ground
+
+MOVING = of("a system, as scene.compile() returned it, or nc.Phases(...)", System, Phases)
+BEAMS = Several(of("what scene.add(nc.Beam(...)) returned", BeamHandle))
 
 
 def _frame(axes: Any, points: np.ndarray) -> float:
@@ -33,22 +39,29 @@ class Picture(NamedTuple):
 
     Attributes:
         t: times [s].
-        names: of the bodies that are boxes.
-        corners: of the boxes (t, bodies, 8, 3) [m].
+        names: of the bodies.
+        corners: of what is drawn of each (t, n, 3) [m].
+        faces: numbers of the corners around each face, by body.
         pins: ends of the axes of the joints (t, joints, 2, 3) [m].
         beams: quadrilaterals of the beams (t, faces, 4, 3) [m].
     """
 
     t: np.ndarray
     names: list[str]
-    corners: np.ndarray
+    corners: list[np.ndarray]
+    faces: list[list[np.ndarray]]
     pins: np.ndarray
     beams: np.ndarray
 
     @property
     def points(self) -> np.ndarray:
         """Everything that must be seen."""
-        return np.concatenate([x.reshape(-1, 3) for x in (self.corners, self.beams, self.pins.mean(axis=2))])
+        drawn = (*self.corners, self.beams, self.pins.mean(axis=2))
+        return np.concatenate([x.reshape(-1, 3) for x in drawn])
+
+    def polygons(self, body: int, frame: int) -> list[np.ndarray]:
+        """Corners of the faces of a body at one time."""
+        return [self.corners[body][frame][face] for face in self.faces[body]]
 
 
 def picture(system: System, states: State, beams: Sequence[BeamHandle] = ()) -> Picture:
@@ -56,12 +69,14 @@ def picture(system: System, states: State, beams: Sequence[BeamHandle] = ()) -> 
     rows = with_ground(np.asarray(states.q))
     named = system.structure.bodies
     order = [k for k in np.argsort(named) if not is_node(system, named[k])]
-    corners = np.einsum("bka,tbac->tbkc", inertia_boxes(system)[order], rows[:, order])
+    drawn = surfaces(system)
+    corners = [np.einsum("ka,tac->tkc", drawn[k][0], rows[:, k]) for k in order]
     points, axes = joint_places(system, rows)
     return Picture(
         np.asarray(states.t),
         [named[k] for k in order],
         corners,
+        [drawn[k][1] for k in order],
         np.stack([points - axes, points + axes], axis=2),
         beam_rims(system, rows, beams),
     )
@@ -79,11 +94,13 @@ class Stage:
         self.axes, self.title = axes, title
         self.half = _frame(axes, points)
         colours = matplotlib.colormaps["tab10"]
-        self.boxes = []
+        self.solids = []
         for body, name in enumerate(first.names):
-            box = Poly3DCollection(first.corners[0, body][FACES], facecolor=colours(body % 10), edgecolor="k")
-            box.set(alpha=0.45, linewidth=0.5, label=name)
-            self.boxes.append(axes.add_collection3d(box))
+            faces = first.polygons(body, 0)
+            solid = Poly3DCollection(faces, facecolor=colours(body % 10), edgecolor="k")
+            # Edges between the flat pieces of a round body are none of its own.
+            solid.set(alpha=0.45, linewidth=0.5 if len(faces) <= len(FACES) else 0.1, label=name)
+            self.solids.append(axes.add_collection3d(solid))
         lines = Line3DCollection(np.zeros((1, 2, 3)), colors="k", linewidths=1.5)  # there must be one
         self.pins = axes.add_collection3d(lines)
         self.pins.set_visible(bool(first.pins.shape[1]))
@@ -95,8 +112,8 @@ class Stage:
 
     def show(self, at: Picture, frame: int) -> list[Any]:
         """Move everything to a frame of a picture."""
-        for body, box in enumerate(self.boxes):
-            box.set_verts(at.corners[frame, body][FACES])
+        for body, solid in enumerate(self.solids):
+            solid.set_verts(at.polygons(body, frame))
         middle = at.pins[frame].mean(axis=1)
         if len(middle):
             ends = middle[:, None] + 0.16 * self.half * (at.pins[frame] - middle[:, None])
@@ -105,7 +122,7 @@ class Stage:
         for skin in self.beams:
             skin.set_verts(at.beams[frame])
         self.axes.set_title(self.title.format(at.t[frame]))
-        return [*self.boxes, self.pins, self.dots, *self.beams]
+        return [*self.solids, self.pins, self.dots, *self.beams]
 
 
 def pictures(phases: Phases, times: np.ndarray, beams: Sequence[BeamHandle] = ()) -> list[Picture]:

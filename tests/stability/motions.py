@@ -41,7 +41,7 @@ def one_body(
     scene.add(nc.Gravity(vector=gravity))
     body = scene.add(part)
     if joint is not None:
-        scene.add(joint(nc.ground, body, (0.0, 0.0, 0.0), name="hinge"))
+        scene.add(joint(nc.ground, body, point=(0.0, 0.0, 0.0), name="hinge"))
     return scene.compile()
 
 

@@ -36,7 +36,9 @@ def arms():
             mass=1.0, inertia=(0.02, 0.1, 0.1), com=(0.5, 0, 0), position=(float(k), 0, 0), name=f"arm {k}"
         )
         body = scene.add(arm)
-        hinge = scene.add(nc.Revolute(carrier, body, (float(k), 0, 0), (0, 1, 0), name=f"hinge {k}"))
+        hinge = scene.add(
+            nc.Revolute(carrier, body, point=(float(k), 0, 0), axis=(0, 1, 0), name=f"hinge {k}")
+        )
         scene.add(nc.JointTorque(hinge, name=f"motor {k}"))
         carrier = body
     return scene.compile()
@@ -131,7 +133,7 @@ def apart(released: int):
     for k in range(2):
         com = (0.5, 0.0, 0.0) if k == released else (0.0, 0.0, -0.5)
         arm = nc.RigidBody(mass=1.0, inertia=(0.1, 0.1, 0.1), com=com, name=f"arm {k}")
-        scene.add(nc.Revolute(nc.ground, scene.add(arm), (0, 0, 0), (0, 1, 0), name=f"hinge {k}"))
+        scene.add(nc.Revolute(nc.ground, scene.add(arm), point=(0, 0, 0), axis=(0, 1, 0), name=f"hinge {k}"))
     return scene.compile()
 
 
@@ -165,7 +167,7 @@ def singular(inertia: float):
     scene = nc.Scene()
     scene.add(nc.Gravity())
     rod = nc.RigidBody(mass=1.0, inertia=(inertia, 0.1, 0.1), com=(0.5, 0, 0), name="rod")
-    scene.add(nc.Spherical(nc.ground, scene.add(rod), (0.0, 0.0, 0.0), name="ball"))
+    scene.add(nc.Spherical(nc.ground, scene.add(rod), point=(0.0, 0.0, 0.0), name="ball"))
     return scene
 
 

@@ -45,12 +45,12 @@ def added(scene: nc.Scene) -> None:
     """With rods parallel to the uprights; with the rows of a hinge twice."""
     if "hinge 6" in scene.joints:
         last = scene.joints["hinge 6"]
-        scene.add(nc.Cylindrical(last.parent, last.child, last.point, last.axis, name="again"))
+        scene.add(nc.Cylindrical(last.parent, last.child, point=last.point, axis=last.axis, name="again"))
         return
     bar = scene.joints["left pin 0"].child
     for k in range(2):
         at = 0.25 + 0.5 * k
-        stay = nc.Distance(nc.ground, bar, (at, 1, 0), parent_point=(at, 0, 0), name=f"stay {k}")
+        stay = nc.Distance(nc.ground, bar, point=(at, 1, 0), parent_point=(at, 0, 0), name=f"stay {k}")
         scene.add(stay)
 
 

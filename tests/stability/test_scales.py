@@ -115,7 +115,7 @@ def beads(ratio: float):
         following = place + np.array([0.5, 0.1 * k, -0.1])
         bead = nc.PointMass(mass=ratio ** (k / 2), position=following, name=f"bead {k}")
         body = scene.add(bead)
-        string = nc.Distance(carrier, body, following, parent_point=place, name=f"string {k}")
+        string = nc.Distance(carrier, body, point=following, parent_point=place, name=f"string {k}")
         scene.add(string)
         carrier, place = body, following
     return scene.compile()
@@ -157,13 +157,15 @@ def measured(unit: float):
             name=f"arm {k}",
         )
         arms.append(scene.add(arm))
-    pivot = scene.add(nc.Universal(nc.ground, arms[0], (0, 0, 0), (0, 1, 0), second=(0, 0, 1), name="pivot"))
-    scene.add(nc.Spherical(arms[0], arms[1], unit * np.array([1.0, 0.0, 0.0]), name="elbow"))
+    pivot = scene.add(
+        nc.Universal(nc.ground, arms[0], point=(0, 0, 0), axis=(0, 1, 0), second=(0, 0, 1), name="pivot")
+    )
+    scene.add(nc.Spherical(arms[0], arms[1], point=unit * np.array([1.0, 0.0, 0.0]), name="elbow"))
     scene.add(nc.JointSpring(pivot, stiffness=unit**2 * 5.0, rest=0.3, name="coil"))
     string = nc.Distance(
         nc.ground,
         arms[1],
-        unit * np.array([2.0, 0.0, 0.0]),
+        point=unit * np.array([2.0, 0.0, 0.0]),
         parent_point=unit * np.array([1.5, 0.5, 1.0]),
         name="string",
     )
@@ -172,7 +174,7 @@ def measured(unit: float):
         nc.Point(nc.ground, unit * np.array([1.0, 1.0, 0.0])),
         nc.Point(arms[0], unit * np.array([1.0, 0, 0])),
     )
-    scene.add(nc.Spring(ends, "spring", stiffness=30.0, length=0.6 * unit))
+    scene.add(nc.Spring(ends, name="spring", stiffness=30.0, length=0.6 * unit))
     return scene.compile()
 
 
@@ -238,7 +240,7 @@ def limbs(kinds, form: str):
                 nc.JointSpring(joint, coordinate=k, stiffness=3.0, rest=0.4, name=f"coil {k} of {name}")
             )
         ends = nc.Point(hub, (0.1, -0.2, 0.3)), nc.Point(limb, place + np.array([0.1, 0.1, 0.1]))
-        scene.add(nc.Spring(ends, f"spring of {name}", stiffness=20.0, length=0.3))
+        scene.add(nc.Spring(ends, name=f"spring of {name}", stiffness=20.0, length=0.3))
     return scene.compile()
 
 

@@ -37,11 +37,13 @@ def still():
         for k in range(len(joint.coordinates)):
             scene.add(nc.JointSpring(hinge, coordinate=k, stiffness=3.0, name=f"coil {k} of {name}"))
         ends = nc.Point(carrier, place + jnp.array([0.0, 1.0, 0.0])), nc.Point(body, place)
-        scene.add(nc.Spring(ends, f"spring of {name}", stiffness=5.0, length=1.0))
-        scene.add(nc.Damper(ends, f"dashpot of {name}", damping=0.1))
+        scene.add(nc.Spring(ends, name=f"spring of {name}", stiffness=5.0, length=1.0))
+        scene.add(nc.Damper(ends, name=f"dashpot of {name}", damping=0.1))
         carrier, place = body, place + jnp.array([1.0, 0.0, 0.0])
     last = scene.add(nc.PointMass(mass=1.0, position=place, name="bead"))
-    scene.add(nc.Distance(carrier, last, place, parent_point=place - jnp.array([1.0, 0.0, 0.0]), name="rod"))
+    scene.add(
+        nc.Distance(carrier, last, point=place, parent_point=place - jnp.array([1.0, 0.0, 0.0]), name="rod")
+    )
     return scene.compile()
 
 
@@ -96,7 +98,7 @@ def collapsed(length: float):
     """A spring whose ends coincide: it has no direction, and no force only without natural length."""
     scene = nc.Scene()
     ball = scene.add(nc.PointMass(mass=1.0, name="ball"))
-    scene.add(nc.Spring((nc.Point(nc.ground), nc.Point(ball)), "spring", stiffness=5.0, length=length))
+    scene.add(nc.Spring((nc.Point(nc.ground), nc.Point(ball)), name="spring", stiffness=5.0, length=length))
     return scene.compile()
 
 

@@ -113,12 +113,14 @@ def stiff(swing: float):
             name=f"arm {k}",
         )
         arms.append(scene.add(arm))
-    scene.add(nc.Spherical(nc.ground, arms[0], (0.0, 0.0, 0.0), name="pivot"))
-    joint = scene.add(nc.Revolute(arms[0], arms[1], (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), name="elbow"))
+    scene.add(nc.Spherical(nc.ground, arms[0], point=(0.0, 0.0, 0.0), name="pivot"))
+    joint = scene.add(
+        nc.Revolute(arms[0], arms[1], point=(1.0, 0.0, 0.0), axis=(0.0, 1.0, 0.0), name="elbow")
+    )
     angle, stretch = np.sqrt(2 * WOUND / np.array([0.2 * stiffness, stiffness]))
     scene.add(nc.JointSpring(joint, stiffness=0.2 * stiffness, rest=angle, name="coil"))
     ends = nc.Point(nc.ground, (1.0, 1.0, 0.0)), nc.Point(arms[0], (1.0, 0.0, 0.0))
-    scene.add(nc.Spring(ends, "stay", stiffness=stiffness, length=1.0 - stretch))
+    scene.add(nc.Spring(ends, name="stay", stiffness=stiffness, length=1.0 - stretch))
     return scene.compile()
 
 

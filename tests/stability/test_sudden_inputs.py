@@ -27,7 +27,9 @@ def craft():
     scene = nc.Scene()
     base = scene.add(nc.RigidBody(mass=10.0, inertia=(2.0, 3.0, 4.0), name="base"))
     wheel = nc.RigidBody(mass=2.0, inertia=(0.2, 0.2, 0.3), position=(0.0, 0.0, 0.5), name="wheel")
-    hinge = scene.add(nc.Revolute(base, scene.add(wheel), (0.0, 0.0, 0.5), (0.0, 0.0, 1.0), name="axle"))
+    hinge = scene.add(
+        nc.Revolute(base, scene.add(wheel), point=(0.0, 0.0, 0.5), axis=(0.0, 0.0, 1.0), name="axle")
+    )
     scene.add(nc.JointTorque(hinge, name="motor"))
     thruster = nc.BodyForceInput((nc.Point(base, (0.3, 0.0, 0.0)), nc.Direction(base, (0.0, 1.0, 0.0))))
     scene.add(thruster)
@@ -103,13 +105,18 @@ def driven(on: bool):
     scene.add(nc.Gravity())
     crank = nc.RigidBody(mass=1.0, inertia=(0.1, 0.1, 0.1), com=(0.2, 0.0, 0.0), name="crank")
     crank = scene.add(crank)
-    axle = scene.add(nc.Revolute(nc.ground, crank, (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), name="axle"))
+    axle = scene.add(nc.Revolute(nc.ground, crank, point=(0.0, 0.0, 0.0), axis=(0.0, 1.0, 0.0), name="axle"))
     bob = nc.RigidBody(
         mass=1.0, inertia=(0.05, 0.06, 0.07), com=(0.0, 0.0, -0.3), position=(0.5, 0.0, 0.0), name="bob"
     )
     scene.add(
         nc.Universal(
-            crank, scene.add(bob), (0.5, 0.0, 0.0), (0.0, 1.0, 0.0), second=(1.0, 0.0, 0.0), name="ball"
+            crank,
+            scene.add(bob),
+            point=(0.5, 0.0, 0.0),
+            axis=(0.0, 1.0, 0.0),
+            second=(1.0, 0.0, 0.0),
+            name="ball",
         )
     )
     if on:

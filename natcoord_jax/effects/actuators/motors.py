@@ -7,11 +7,14 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.coordinate import CoordinateForce
 from natcoord_jax.core.force import Force, Load
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.joint import Joint
-from natcoord_jax.core.markers import Marker, require_markers
+from natcoord_jax.core.kinds import JOINT, Choice
+from natcoord_jax.core.markers import Marker, Markers
+from natcoord_jax.core.numeric import Number
 
 
 class JointTorque(Force):
@@ -34,10 +37,9 @@ class JointTorque(Force):
     """
 
     markers: Any = eqx.field(default=None, init=False)
-    name: Any = eqx.field(default=None, kw_only=True)
-    joint: Any = None
-    gear: Any = eqx.field(default=1.0, kw_only=True)
-    axis: int = eqx.field(default=2, kw_only=True, static=True)
+    joint: Any = eqx.field(metadata=is_a(JOINT))
+    gear: Any = eqx.field(default=1.0, kw_only=True, metadata=is_a(Number()))
+    axis: int = eqx.field(default=2, kw_only=True, static=True, metadata=is_a(Choice((0, 1, 2))))
 
     kind: ClassVar[str] = "joint torque"
     inputs: ClassVar[int] = 1
@@ -65,7 +67,7 @@ class JointForce(CoordinateForce):
         gear: factor on the input.
     """
 
-    gear: Any = eqx.field(default=1.0, kw_only=True)
+    gear: Any = eqx.field(default=1.0, kw_only=True, metadata=is_a(Number()))
 
     kind: ClassVar[str] = "joint force"
     inputs: ClassVar[int] = 1
@@ -82,11 +84,10 @@ class BodyTorqueInput(Force):
         markers: three directions of the body (for example its principal axes).
     """
 
+    markers: Any = eqx.field(metadata=is_a(Markers(0, 3)))
+
     kind: ClassVar[str] = "body torque input"
     inputs: ClassVar[int] = 3
-
-    def __check_init__(self) -> None:
-        require_markers(self.kind, self.markers, 0, 3)
 
     def load(self, x: Array, rate: Array, inputs: Array, t: Array) -> Load:
         """Components along the mid-point directions."""
@@ -100,11 +101,10 @@ class BodyForceInput(Force):
         markers: the point and the direction.
     """
 
+    markers: Any = eqx.field(metadata=is_a(Markers(1, 1)))
+
     kind: ClassVar[str] = "body force input"
     inputs: ClassVar[int] = 1
-
-    def __check_init__(self) -> None:
-        require_markers(self.kind, self.markers, 1, 1)
 
     def load(self, x: Array, rate: Array, inputs: Array, t: Array) -> Load:
         """Force along the mid-point direction."""

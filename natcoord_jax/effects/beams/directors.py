@@ -16,7 +16,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.force import Force, Load
+from natcoord_jax.core.markers import Markers
+from natcoord_jax.core.numeric import Numbers, Vector
 from natcoord_jax.core.potential import Potential, place_markers
 from natcoord_jax.effects.beams.readings import BeamReadings
 from natcoord_jax.maths.vectors import dot
@@ -46,11 +49,12 @@ class DirectorElement(Potential):
         reference: strains of the unstressed shape, shape (points, 6) [-, 1/m].
     """
 
-    values: Any = eqx.field(kw_only=True)
-    slopes: Any = eqx.field(kw_only=True)
-    weights: Any = eqx.field(kw_only=True)
-    stiffness: Any = eqx.field(kw_only=True)
-    reference: Any = eqx.field(kw_only=True)
+    markers: Any = eqx.field(metadata=is_a(Markers(attachments=0)))
+    values: Any = eqx.field(kw_only=True, metadata=is_a(Numbers((None, None))))
+    slopes: Any = eqx.field(kw_only=True, metadata=is_a(Numbers((None, None))))
+    weights: Any = eqx.field(kw_only=True, metadata=is_a(Vector(None)))
+    stiffness: Any = eqx.field(kw_only=True, metadata=is_a(Numbers((6, 6))))
+    reference: Any = eqx.field(kw_only=True, metadata=is_a(Numbers((None, 6))))
 
     kind: ClassVar[str] = "director element"
     couples: ClassVar[bool] = True
@@ -92,10 +96,11 @@ class DirectorDamping(Force):
         viscosity: C_v, shape (6, 6) [N s, N m s, N m^2 s].
     """
 
-    values: Any = eqx.field(kw_only=True)
-    slopes: Any = eqx.field(kw_only=True)
-    weights: Any = eqx.field(kw_only=True)
-    viscosity: Any = eqx.field(kw_only=True)
+    markers: Any = eqx.field(metadata=is_a(Markers(attachments=0)))
+    values: Any = eqx.field(kw_only=True, metadata=is_a(Numbers((None, None))))
+    slopes: Any = eqx.field(kw_only=True, metadata=is_a(Numbers((None, None))))
+    weights: Any = eqx.field(kw_only=True, metadata=is_a(Vector(None)))
+    viscosity: Any = eqx.field(kw_only=True, metadata=is_a(Numbers((6, 6))))
 
     kind: ClassVar[str] = "director damping"
 

@@ -14,9 +14,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.checks import as_array
 from natcoord_jax.core.effect import Motion, Now
 from natcoord_jax.core.force import Force, Load
+from natcoord_jax.core.kinds import FunctionOf
+from natcoord_jax.core.markers import Markers
+from natcoord_jax.core.numeric import Number, Numbers, Vector
 from natcoord_jax.core.pieces import in_pieces
 from natcoord_jax.core.potential import place_markers
 from natcoord_jax.effects.beams.logarithm import Logarithm
@@ -25,6 +29,8 @@ from natcoord_jax.effects.beams.readings import BeamReadings
 from natcoord_jax.maths.components import Triple, combination, rows_of
 from natcoord_jax.maths.rotations import logarithm_of_motion
 from natcoord_jax.maths.settled import settled
+
+LAW = FunctionOf("of the strains (6,) to the energy per length [J/m]")
 
 Frame = tuple[Triple, tuple[Triple, Triple, Triple]]
 """A point and three directors."""
@@ -91,9 +97,12 @@ class BeamElement(Expanded):
         >>> element = nc.BeamElement(ends, length=1.0, stiffness=stiffness)
     """
 
-    length: Any = eqx.field(kw_only=True)
-    stiffness: Any = eqx.field(kw_only=True)
-    reference: Any = eqx.field(default=(0.0, 0.0, 1.0, 0.0, 0.0, 0.0), kw_only=True, converter=as_array)
+    markers: Any = eqx.field(metadata=is_a(Markers(attachments=2)))
+    length: Any = eqx.field(kw_only=True, metadata=is_a(Number("positive")))
+    stiffness: Any = eqx.field(kw_only=True, metadata=is_a(Numbers((6, 6))))
+    reference: Any = eqx.field(
+        default=(0.0, 0.0, 1.0, 0.0, 0.0, 0.0), kw_only=True, converter=as_array, metadata=is_a(Vector(6))
+    )
 
     kind: ClassVar[str] = "beam element"
     couples: ClassVar[bool] = True
@@ -176,7 +185,7 @@ class NonlinearBeamElement(BeamElement):
         law: function of the strains (Gamma, K), shape (6,), to the energy per length [J/m], in jax.numpy.
     """
 
-    law: Callable[[Array], Array] = eqx.field(kw_only=True)
+    law: Callable[[Array], Array] = eqx.field(kw_only=True, metadata=is_a(LAW))
 
     kind: ClassVar[str] = "nonlinear beam element"
 
@@ -212,8 +221,9 @@ class BeamDamping(Force):
             stiffness.
     """
 
-    length: Any = eqx.field(kw_only=True)
-    viscosity: Any = eqx.field(kw_only=True)
+    markers: Any = eqx.field(metadata=is_a(Markers(attachments=2)))
+    length: Any = eqx.field(kw_only=True, metadata=is_a(Number("positive")))
+    viscosity: Any = eqx.field(kw_only=True, metadata=is_a(Numbers((6, 6))))
 
     kind: ClassVar[str] = "beam damping"
 

@@ -6,11 +6,13 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.checks import positive
 from natcoord_jax.core.coordinate import Coordinate
 from natcoord_jax.core.effect import Effect, replace_fields
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.joint import Frame, Joint
+from natcoord_jax.core.numeric import COMPONENTS, Number
 from natcoord_jax.effects.joints.coordinates import Angle, Displacement, Separation, UniversalAngle
 from natcoord_jax.effects.joints.relations import Coupling
 from natcoord_jax.maths.vectors import dot, safe_norm
@@ -155,7 +157,7 @@ class Screw(Joint):
     Coordinates: 0 the angle [rad], 1 the displacement [m].
     """
 
-    pitch: Any = eqx.field(default=0.01, kw_only=True)
+    pitch: Any = eqx.field(default=0.01, kw_only=True, metadata=is_a(Number()))
 
     kind: ClassVar[str] = "screw joint"
     multipliers: ClassVar[int] = 4
@@ -172,26 +174,27 @@ class Screw(Joint):
     def companions(self, handle: Handle) -> list[Effect]:
         """The pitch relation: displacement - pitch / (2 pi) angle = 0."""
         factors = jnp.stack([-jnp.asarray(self.pitch, float) / (2 * jnp.pi), jnp.asarray(1.0)])
-        return [Coupling((handle, handle), factors, coordinate=(0, 1), name=f"{handle.name} pitch")]
+        return [Coupling((handle, handle), factors=factors, coordinate=(0, 1), name=f"{handle.name} pitch")]
 
 
 class Distance(Joint):
     """Massless rod between two points: 1 constraint, |x_c - x_p|^2 = length^2; keeps its multiplier.
 
     Attributes:
-        point: point of the child, world coordinates of the assembled pose [m].
-        parent_point: point of the parent [m].
+        point: point of the child, world coordinates of the assembled pose [m]; default its reference point.
+        parent_point: the same of the parent [m].
         length: length [m]; default that of the assembled pose; not zero, for which there is `Spherical`.
 
     Coordinate 0 is the distance [m].
     """
 
-    parent_point: Any = eqx.field(default=(0.0, 0.0, 0.0), kw_only=True)
-    length: Any = eqx.field(default=None, kw_only=True)
+    parent_point: Any = eqx.field(default=None, kw_only=True, metadata=is_a(COMPONENTS))
+    length: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Number("positive")))
 
     kind: ClassVar[str] = "distance joint"
     multipliers: ClassVar[int] = 1
     needs_axis: ClassVar[bool] = False
+    apart: ClassVar[bool] = True
     coordinates: ClassVar[tuple[Coordinate, ...]] = (Separation(),)
 
     def anchors(self) -> tuple[Any, Any]:

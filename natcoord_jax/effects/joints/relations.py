@@ -6,7 +6,12 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.coordinate import CoordinateConstraint
+from natcoord_jax.core.kinds import JOINT, FunctionOf, Several
+from natcoord_jax.core.numeric import Number, Vector, Whole
+
+MOTION = FunctionOf("of time [s] to the coordinate [rad or m] (lambda t: value for one that stands still)")
 
 
 class Drive(CoordinateConstraint):
@@ -19,7 +24,9 @@ class Drive(CoordinateConstraint):
         coordinate: which coordinate of the joint.
     """
 
-    function: Any = eqx.field(kw_only=True, default=None)
+    joint: Any = eqx.field(metadata=is_a(JOINT))
+    coordinate: Any = eqx.field(default=0, kw_only=True, metadata=is_a(Whole(0)))
+    function: Any = eqx.field(kw_only=True, metadata=is_a(MOTION))
 
     kind: ClassVar[str] = "drive"
 
@@ -42,8 +49,9 @@ class Coupling(CoordinateConstraint):
         offset: right-hand side, in the unit of factor times coordinate [rad or m].
     """
 
-    factors: Any = (1.0, -1.0)
-    offset: Any = eqx.field(default=0.0, kw_only=True)
+    joint: Any = eqx.field(metadata=is_a(Several(JOINT, 1)))
+    factors: Any = eqx.field(default=(1.0, -1.0), kw_only=True, metadata=is_a(Vector(None)))
+    offset: Any = eqx.field(default=0.0, kw_only=True, metadata=is_a(Number()))
 
     kind: ClassVar[str] = "coupling"
 

@@ -6,7 +6,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.force import Field
+from natcoord_jax.core.numeric import COMPONENTS
 
 
 class Gravity(Field):
@@ -21,7 +23,7 @@ class Gravity(Field):
         >>> gravity = scene.add(nc.Gravity(vector=(0, 0, -9.81)))
     """
 
-    vector: Any = eqx.field(default=(0.0, 0.0, -9.81), kw_only=True)
+    vector: Any = eqx.field(default=(0.0, 0.0, -9.81), kw_only=True, metadata=is_a(COMPONENTS))
 
     kind: ClassVar[str] = "gravity"
 

@@ -6,8 +6,13 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from natcoord_jax.core.arguments import is_a, require
 from natcoord_jax.core.force import Force, Load
-from natcoord_jax.core.markers import require_markers
+from natcoord_jax.core.kinds import FLAG, FunctionOf
+from natcoord_jax.core.markers import Markers
+from natcoord_jax.core.numeric import COMPONENTS, Number
+
+VECTOR_OR_FUNCTION = COMPONENTS | FunctionOf("of time [s] to three numbers")
 
 
 def _at(value: Any, t: Array) -> Array:
@@ -27,16 +32,15 @@ class PointForce(Force):
         >>> load = nc.PointForce((nc.Point(nc.ground),), force=(0.0, 0.0, -1.0))
     """
 
-    force: Any = eqx.field(kw_only=True)
-    following: bool = eqx.field(default=False, kw_only=True, static=True)
+    markers: Any = eqx.field(metadata=is_a(Markers(1, more=True)))
+    force: Any = eqx.field(kw_only=True, metadata=is_a(VECTOR_OR_FUNCTION))
+    following: bool = eqx.field(default=False, kw_only=True, static=True, metadata=is_a(FLAG))
 
     kind: ClassVar[str] = "point force"
 
     def __check_init__(self) -> None:
         if self.following:
-            require_markers(self.kind, self.markers, 1, 3)
-        else:
-            require_markers(self.kind, self.markers[:1], 1, 0)
+            require(self, "markers", Markers(1, 3))
 
     def load(self, x: Array, rate: Array, inputs: Array, t: Array) -> Load:
         """The force on the first marker."""
@@ -56,16 +60,15 @@ class BodyTorque(Force):
         following: take the components along the three directions.
     """
 
-    torque: Any = eqx.field(kw_only=True)
-    following: bool = eqx.field(default=False, kw_only=True, static=True)
+    markers: Any = eqx.field(metadata=is_a(Markers(0, 1, more=True)))
+    torque: Any = eqx.field(kw_only=True, metadata=is_a(VECTOR_OR_FUNCTION))
+    following: bool = eqx.field(default=False, kw_only=True, static=True, metadata=is_a(FLAG))
 
     kind: ClassVar[str] = "body torque"
 
     def __check_init__(self) -> None:
         if self.following:
-            require_markers(self.kind, self.markers, 0, 3)
-        else:
-            require_markers(self.kind, self.markers[:1], 0, 1)
+            require(self, "markers", Markers(0, 3))
 
     def load(self, x: Array, rate: Array, inputs: Array, t: Array) -> Load:
         """The torque on the body of the first marker."""
@@ -84,12 +87,10 @@ class PairTorque(Force):
         torque: [N m], scalar or a function of time [s] to it.
     """
 
-    torque: Any = eqx.field(kw_only=True)
+    markers: Any = eqx.field(metadata=is_a(Markers(0, 2)))
+    torque: Any = eqx.field(kw_only=True, metadata=is_a(Number() | FunctionOf("of time [s] to a number")))
 
     kind: ClassVar[str] = "pair torque"
-
-    def __check_init__(self) -> None:
-        require_markers(self.kind, self.markers, 0, 2)
 
     def load(self, x: Array, rate: Array, inputs: Array, t: Array) -> Load:
         """Torque along the mid-point direction of the first body."""

@@ -4,10 +4,18 @@ from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
+from natcoord_jax.core.arguments import is_a
+from natcoord_jax.core.checks import is_concrete
 from natcoord_jax.core.coordinate import CoordinateForce, CoordinateInertia, CoordinatePotential
+from natcoord_jax.core.kinds import FunctionOf
+from natcoord_jax.core.numeric import Number
 from natcoord_jax.maths.vectors import positive_part
+
+STIFFNESS = Number("not negative", instead=" (for a spring that pushes away, nc.JointPotential)")
+DAMPING = Number("not negative", instead=" (what drives a motion is an input)")
 
 
 class JointSpring(CoordinatePotential):
@@ -15,7 +23,7 @@ class JointSpring(CoordinatePotential):
 
     Attributes:
         joint: handle of the joint.
-        stiffness: k [N m/rad or N/m].
+        stiffness: k [N m/rad or N/m], not negative; a spring that pushes away is a `JointPotential`.
         rest: unstretched coordinate [rad or m].
         coordinate: which coordinate of the joint.
 
@@ -27,8 +35,8 @@ class JointSpring(CoordinatePotential):
         >>> spring = scene.add(nc.JointSpring(hinge, stiffness=3.0))
     """
 
-    stiffness: Any = eqx.field(kw_only=True)
-    rest: Any = eqx.field(default=0.0, kw_only=True)
+    stiffness: Any = eqx.field(kw_only=True, metadata=is_a(STIFFNESS))
+    rest: Any = eqx.field(default=0.0, kw_only=True, metadata=is_a(Number()))
 
     kind: ClassVar[str] = "joint spring"
     degree: ClassVar[int | None] = 2
@@ -45,7 +53,9 @@ class JointPotential(CoordinatePotential):
         law: function of the coordinate [rad or m] to the energy [J], in jax.numpy.
     """
 
-    law: Any = eqx.field(kw_only=True)
+    law: Any = eqx.field(
+        kw_only=True, metadata=is_a(FunctionOf("of the coordinate [rad or m] to the energy [J]"))
+    )
 
     kind: ClassVar[str] = "joint potential"
 
@@ -66,11 +76,21 @@ class JointStops(CoordinatePotential):
         stiffness: k [N m/rad or N/m].
     """
 
-    stiffness: Any = eqx.field(kw_only=True)
-    lower: Any = eqx.field(default=-jnp.inf, kw_only=True)
-    upper: Any = eqx.field(default=jnp.inf, kw_only=True)
+    stiffness: Any = eqx.field(kw_only=True, metadata=is_a(STIFFNESS))
+    lower: Any = eqx.field(default=-jnp.inf, kw_only=True, metadata=is_a(Number(infinite=True)))
+    upper: Any = eqx.field(default=jnp.inf, kw_only=True, metadata=is_a(Number(infinite=True)))
 
     kind: ClassVar[str] = "joint stops"
+
+    def __check_init__(self) -> None:
+        """Refuse stops that leave no room."""
+        if is_concrete(self.lower, self.upper) and not np.all(
+            np.asarray(self.lower) < np.asarray(self.upper)
+        ):
+            raise ValueError(
+                f"JointStops: lower [rad or m] is {self.lower}, not below upper, {self.upper}; pass stops "
+                "with room between them"
+            )
 
     def energy(self, coordinate: Array) -> Array:
         """Energy [J]."""
@@ -82,10 +102,11 @@ class JointDamper(CoordinateForce):
     """Viscous damper on a joint coordinate: dissipates exactly c (increment)^2 / h in a step.
 
     Attributes:
-        damping: c [N m s/rad or N s/m].
+        joint: handle of the joint.
+        damping: c [N m s/rad or N s/m], not negative; what drives a motion is an input.
     """
 
-    damping: Any = eqx.field(kw_only=True)
+    damping: Any = eqx.field(kw_only=True, metadata=is_a(DAMPING))
 
     kind: ClassVar[str] = "joint damper"
 
@@ -98,10 +119,11 @@ class Armature(CoordinateInertia):
     """Rotor inertia reflected to a joint coordinate, seen by that coordinate only.
 
     Attributes:
-        inertia: [kg m^2 or kg].
+        joint: handle of the joint.
+        inertia: [kg m^2 or kg], not negative.
     """
 
-    inertia: Any = eqx.field(kw_only=True)
+    inertia: Any = eqx.field(kw_only=True, metadata=is_a(Number("not negative")))
 
     kind: ClassVar[str] = "armature"
 

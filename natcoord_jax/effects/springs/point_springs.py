@@ -8,13 +8,19 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.force import Force, Load
-from natcoord_jax.core.markers import require_markers
+from natcoord_jax.core.kinds import FunctionOf
+from natcoord_jax.core.markers import Markers
+from natcoord_jax.core.numeric import Number
 from natcoord_jax.core.potential import Potential
 from natcoord_jax.maths.vectors import dot, safe_divide, safe_norm
 
 COINCIDENT = 1e-12
 """Distance [m] of points that coincide: what rounding leaves of none."""
+
+STIFFNESS = Number("not negative", instead=" (for a spring that pushes away, nc.NonlinearSpring)")
+DAMPING = Number("not negative", instead=" (what drives a motion is an input or a force)")
 
 
 def _square(x: Array) -> Array:
@@ -46,7 +52,7 @@ class Spring(Potential):
 
     Attributes:
         markers: two points.
-        stiffness: k [N/m].
+        stiffness: k [N/m], not negative; a spring that pushes away is a `NonlinearSpring`.
         length: unstretched length L [m].
 
     Example:
@@ -55,14 +61,12 @@ class Spring(Potential):
         >>> spring = nc.Spring(ends, stiffness=50.0, length=1.0)
     """
 
-    stiffness: Any = eqx.field(kw_only=True)
-    length: Any = eqx.field(default=0.0, kw_only=True)
+    markers: Any = eqx.field(metadata=is_a(Markers(2)))
+    stiffness: Any = eqx.field(kw_only=True, metadata=is_a(STIFFNESS))
+    length: Any = eqx.field(default=0.0, kw_only=True, metadata=is_a(Number("not negative")))
 
     kind: ClassVar[str] = "spring"
     couples: ClassVar[bool] = True
-
-    def __check_init__(self) -> None:
-        require_markers(self.kind, self.markers, 2, 0)
 
     def invariants(self, x: Array) -> Array:
         """Squared distance [m^2]."""
@@ -82,15 +86,13 @@ class QuadraticSpring(Potential):
         length: unstretched length L [m].
     """
 
-    stiffness: Any = eqx.field(kw_only=True)
-    length: Any = eqx.field(default=0.0, kw_only=True)
+    markers: Any = eqx.field(metadata=is_a(Markers(2)))
+    stiffness: Any = eqx.field(kw_only=True, metadata=is_a(STIFFNESS))
+    length: Any = eqx.field(default=0.0, kw_only=True, metadata=is_a(Number("not negative")))
 
     kind: ClassVar[str] = "quadratic spring"
     couples: ClassVar[bool] = True
     degree: ClassVar[int | None] = 2
-
-    def __check_init__(self) -> None:
-        require_markers(self.kind, self.markers, 2, 0)
 
     def invariants(self, x: Array) -> Array:
         """Squared distance [m^2]."""
@@ -111,13 +113,11 @@ class NonlinearSpring(Potential):
         law: function of the distance [m] to the energy [J], in jax.numpy.
     """
 
-    law: Any = eqx.field(kw_only=True)
+    markers: Any = eqx.field(metadata=is_a(Markers(2)))
+    law: Any = eqx.field(kw_only=True, metadata=is_a(FunctionOf("of the distance [m] to the energy [J]")))
 
     kind: ClassVar[str] = "nonlinear spring"
     couples: ClassVar[bool] = True
-
-    def __check_init__(self) -> None:
-        require_markers(self.kind, self.markers, 2, 0)
 
     def invariants(self, x: Array) -> Array:
         """Squared distance [m^2]."""
@@ -136,16 +136,14 @@ class Damper(Force):
 
     Attributes:
         markers: two points.
-        damping: c [N s/m].
+        damping: c [N s/m], not negative.
     """
 
-    damping: Any = eqx.field(kw_only=True)
+    markers: Any = eqx.field(metadata=is_a(Markers(2)))
+    damping: Any = eqx.field(kw_only=True, metadata=is_a(DAMPING))
 
     kind: ClassVar[str] = "damper"
     couples: ClassVar[bool] = True
-
-    def __check_init__(self) -> None:
-        require_markers(self.kind, self.markers, 2, 0)
 
     def load(self, x: Array, rate: Array, inputs: Array, t: Array) -> Load:
         """Equal and opposite forces along the mid-point line."""

@@ -1,0 +1,203 @@
+"""Arguments of public functions and parts: what each is, said once, and looked at in one way.
+
+A public function says by `checked` what its arguments are; a part (an effect, a joint, the shape of a body)
+says it of its fields, `metadata=is_a(Number())`. A call with something else ends in an error that names the
+part, the argument with its unit, what was given and what to pass. Units are read from the docstring. What is
+traced has no value yet, and only its shape is looked at.
+"""
+
+import dataclasses
+import inspect
+import re
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache, wraps
+from typing import Any, ClassVar, TypeVar
+
+import equinox as eqx
+
+from natcoord_jax.core.checks import require_double
+from natcoord_jax.core.kinds import Kind, short
+
+F = TypeVar("F", bound=Callable[..., Any])
+DECLARED = "natcoord_jax: kind of argument"
+"""Key of a field's metadata."""
+
+
+BOUND = {"self", "cls"}
+"""What a method is called on."""
+
+
+def is_a(kind: Kind) -> dict[str, Any]:
+    """What a field of a part is, as its metadata."""
+    return {DECLARED: kind}
+
+
+@dataclasses.dataclass(frozen=True)
+class Declaration:
+    """The arguments of a call.
+
+    Attributes:
+        label: name of the function or part.
+        order: names of the arguments that may be given by position.
+        kinds: of all arguments, by name.
+        defaults: of those that may be left out.
+        source: where the docstrings are, which tell units.
+    """
+
+    label: str
+    order: tuple[str, ...]
+    kinds: Mapping[str, Kind | None]
+    defaults: Mapping[str, Any]
+    source: Any
+
+    @classmethod
+    def of(cls, label: str, signature: inspect.Signature, kinds: Mapping[str, Any], source: Any):
+        """From a signature, without `self`."""
+        listed = [p for p in signature.parameters.values() if p.name not in BOUND]
+        places = inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD
+        order = tuple(p.name for p in listed if p.kind in places)
+        defaults = {p.name: p.default for p in listed if p.default is not inspect.Parameter.empty}
+        return cls(label, order, {p.name: kinds.get(p.name) for p in listed}, defaults, source)
+
+    def check(self, positional: Sequence[Any], named: Mapping[str, Any], label: str) -> None:
+        """Refuse a call with other arguments than declared.
+
+        Raises:
+            TypeError: for too many arguments by position, or one that there is not.
+            ValueError: for an argument that is something else.
+        """
+        self._check_names(positional, named, label)
+        given = {**dict(zip(self.order, positional)), **named}
+        for name, value in given.items():
+            kind = self.kinds[name]
+            if kind is None or (name in self.defaults and value is self.defaults[name]):
+                continue
+            complaint = kind.complaint(value)
+            if complaint is not None:
+                raise ValueError(self._message(name, kind, complaint, given, label))
+
+    def _check_names(self, positional: Sequence[Any], named: Mapping[str, Any], label: str) -> None:
+        by_name = [f"{name}=" for name in self.kinds if name not in self.order]
+        if len(positional) > len(self.order):
+            first = (
+                f"takes {', '.join(self.order)} by position" if self.order else "takes nothing by position"
+            )
+            rest = positional[len(self.order)]
+            raise TypeError(f"{label} {first}, and got {short(rest)} besides; pass it by name: "
+                            f"{', '.join(by_name)}")  # fmt: skip
+        unknown = [name for name in named if name not in self.kinds]
+        if unknown:
+            raise TypeError(
+                f"{label} has no argument {unknown[0]!r}; pass some of {', '.join([*self.order, *by_name])}"
+            )
+
+    def _message(self, name: str, kind: Kind, complaint: str, given: Mapping[str, Any], label: str) -> str:
+        unit = unit_of(self.source, name) if kind.measured else ""
+        swapped = [
+            other
+            for other, value in given.items()
+            if kind.distinct
+            and kind.complaint(value) is None
+            and (self.kinds[other] or kind).complaint(value) is not None
+        ]
+        hint = f" (`{swapped[0]}` got one: are the two swapped?)" if swapped else ""
+        return f"{label}: {name}{unit} {complaint}; pass {kind.wanted}{hint}"
+
+
+def require(part: Any, name: str, kind: Kind) -> None:
+    """Refuse a field of a part that depends on other fields, in its `__check_init__`.
+
+    Raises:
+        ValueError: naming part, field, unit and what to pass.
+    """
+    complaint = kind.complaint(getattr(part, name))
+    if complaint is not None:
+        own = getattr(part, "name", None)
+        named = f"{type(part).__name__} {own!r}" if isinstance(own, str) else type(part).__name__
+        unit = unit_of(type(part), name) if kind.measured else ""
+        raise ValueError(f"{named}: {name}{unit} {complaint}; pass {kind.wanted}")
+
+
+def unit_of(source: Any, name: str) -> str:
+    """Unit of an argument or a field, " [m]", as the docstring has it; "" if it says none."""
+    classes = source.__mro__ if inspect.isclass(source) else (source,)
+    for documented in classes:
+        text = documented.__doc__ or ""
+        entry = re.search(rf"^( *){name}: ?((?:.*\n)(?:\1 +.*\n)*)", text + "\n", re.MULTILINE)
+        unit = re.search(r"\[[^\[\]]+\]", entry[2]) if entry else None
+        if unit:
+            return f" {unit[0]}"
+    return ""
+
+
+DECLARATIONS: dict[Any, Declaration] = {}
+"""Those of the functions, for tests."""
+
+
+def checked(label: str | None = None, /, **kinds: Kind) -> Callable[[F], F]:
+    """Decorator of a public function: what its arguments are, all of them; double precision is asked for.
+
+    Args:
+        label: name of the function in messages; default its own.
+        kinds: of the arguments by name. The default value of an argument is always allowed.
+
+    Raises:
+        TypeError: where it is applied, for arguments that are not declared, or are none.
+    """
+
+    def declare(function: F) -> F:
+        signature = inspect.signature(function)
+        missing = (set(signature.parameters) - BOUND) ^ set(kinds)
+        if missing:
+            raise TypeError(
+                f"{function.__qualname__}: arguments and declarations differ in {sorted(missing)}"
+            )
+        name = label or function.__name__
+        declaration = Declaration.of(name, signature, kinds, function)
+        bound = bool(BOUND & set(signature.parameters))
+
+        @wraps(function)
+        def call(*positional: Any, **named: Any) -> Any:
+            require_double(name)
+            part = named.get("name")
+            said = f"{name} {part!r}" if isinstance(part, str) else name
+            declaration.check(positional[1:] if bound else positional, named, said)
+            return function(*positional, **named)
+
+        DECLARATIONS[call] = declaration
+        return call  # pyright: ignore[reportReturnType]
+
+    return declare
+
+
+@cache
+def declaration_of(cls: type) -> Declaration | None:
+    """What the fields of a class of parts declare; None where it makes them in an `__init__` of its own."""
+    fields = [f for f in dataclasses.fields(cls) if f.init]
+    signature = inspect.signature(cls.__init__)
+    if {f.name for f in fields} != set(signature.parameters) - {"self"}:
+        return None
+    return Declaration.of(cls.__name__, signature, {f.name: f.metadata.get(DECLARED) for f in fields}, cls)
+
+
+class Part(eqx.Module):
+    """Base of what users make: its fields say what they are, and are looked at when it is made.
+
+    Fields without a kind, as in classes of users' own, are left alone.
+
+    Class attributes:
+        makes_arrays: whether numbers become arrays when it is made, which takes double precision. Others keep
+            them as they were given until a scene is compiled.
+    """
+
+    makes_arrays: ClassVar[bool] = False
+
+    def __new__(cls, *positional: Any, **named: Any):
+        """Looks at the arguments before they become fields."""
+        declaration, name = declaration_of(cls), named.get("name")
+        if cls.makes_arrays:
+            require_double(cls.__name__)
+        if declaration is not None:
+            label = f"{cls.__name__} {name!r}" if isinstance(name, str) else cls.__name__
+            declaration.check(positional, named, label)
+        return super().__new__(cls)

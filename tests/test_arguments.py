@@ -1,0 +1,600 @@
+"""Every public call with something else than it takes: an error of our own that names the argument.
+
+The table gives for every argument what it takes, by examples. Everything of another sort is fed to it: text,
+a number, nothing, a body, a joint, an object. A new public name, or argument, needs its line.
+"""
+
+import inspect
+import traceback
+from functools import cache
+from pathlib import Path
+from types import SimpleNamespace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+import natcoord_jax as nc
+from natcoord_jax.assembly.system import System
+from natcoord_jax.control.iterate import Options
+from natcoord_jax.control.solution import Solution
+from natcoord_jax.control.transcription import Unknowns
+from natcoord_jax.core.handles import Handle
+
+
+@cache
+def world():
+    """A compiled scene, and one of each thing that can be passed."""
+    scene = nc.Scene()
+    scene.add(nc.Gravity())
+    body = scene.add(nc.RigidBody(mass=1.0, inertia=(1.0, 1.0, 1.0), com=(0.3, 0.0, 0.0), name="body"))
+    hinge = scene.add(nc.Revolute(nc.ground, body, axis=(0.0, 1.0, 0.0), name="hinge"))
+    motor = scene.add(nc.JointTorque(hinge, name="motor"))
+    section = nc.Section.of_numbers(EA=1e4, GA=1e4, EI=2.0, GJ=1.0, density=1.0, rotary=0.1)
+    system, state = scene.compile()
+    other = nc.Scene()
+    beam = other.add(nc.Beam(section, [(0, 0, 0), (1, 0, 0)], elements=2, start=nc.ground, name="beam"))
+    trajectory = nc.simulate(system, state, dt=0.1, steps=2)
+    problem = nc.OptimalControl(system, state, dt=0.1, steps=2, cost=nc.cost.Effort())
+    point, direction = nc.Point(body, (1.0, 0.0, 0.0)), nc.Direction(body, (1.0, 0.0, 0.0))
+    unknowns = Unknowns(jnp.zeros((2, 1)), jnp.zeros(0), jnp.zeros((2, 1)))
+    solution = Solution(problem, jnp.zeros((2, 1)), {}, 0.1, 0.0, 0, "none", None, None, [])
+    return SimpleNamespace(
+        scene=scene, body=body, hinge=hinge, motor=motor, section=section, system=system, state=state,
+        beam=beam, trajectory=trajectory, problem=problem, unknowns=unknowns, solution=solution, point=point,
+        direction=direction, triad=tuple(nc.Direction(body, axis) for axis in np.eye(3)),
+        ends=(nc.Point(nc.ground), point),
+        attached=tuple(nc.Attachment(b, (0, 0, 0), np.eye(3)) for b in (nc.ground, body)),
+    )  # fmt: skip
+
+
+def f(*_):
+    """A function."""
+    return 0.0
+
+
+V, NAME, NUMBER, WHOLE, FLAG = [np.ones(3)], ["name"], [1.0], [1], [True]
+JOINT = lambda w: {  # noqa: E731
+    "parent": [nc.ground], "child": [w.body], "point": V, "axis": V, "second": [np.array([0, 1, -1.0])],
+    "name": NAME,
+}  # fmt: skip
+ON_JOINT = lambda w: {"joint": [w.hinge], "coordinate": [0], "name": NAME}  # noqa: E731
+MARKED = lambda markers: {"markers": [markers], "name": NAME}  # noqa: E731
+RUN = lambda w: {"system": [w.system], "state": [w.state]}  # noqa: E731
+MATRIX, SHAPES = (
+    [np.eye(6)],
+    {"values": [np.ones((2, 3))], "slopes": [np.ones((2, 3))], "weights": [np.ones(2)]},
+)
+SECTION = {"E": NUMBER, "nu": [0.3], "density": NUMBER, "shear": NUMBER}
+STEPPED = {
+    "dt": [0.1],
+    "steps": WHOLE,
+    "inputs": [np.ones((1, 1)), f],
+    "save_every": WHOLE,
+    "scheme": [nc.EnergyMomentum()],
+}
+SOLVED = {"max_iterations": WHOLE, "tol": NUMBER, "goal_tol": NUMBER, "method": ["auto"]}
+
+CALLS = {
+    # bodies
+    "RigidBody": lambda w: {
+        "mass": NUMBER, "inertia": V, "second_moment": [None, np.ones(3)], "com": V, "inertia_at": ["com"],
+        "shape": [None, nc.Box((1, 1, 1))], "density": [None, 1.0], "position": V, "orientation": [np.eye(3)],
+        "velocity": V, "angular_velocity": V, "name": NAME,
+    },
+    "PointMass": lambda w: {"mass": NUMBER, "position": V, "velocity": V, "name": NAME},
+    "Box": lambda w: {"size": V},
+    "Cylinder": lambda w: {"radius": NUMBER, "length": NUMBER},
+    "Sphere": lambda w: {"radius": NUMBER},
+    "Ellipsoid": lambda w: {"semi_axes": V},
+    "CircularSection": lambda w: {"radius": NUMBER, **SECTION},
+    "TubularSection": lambda w: {"radius": NUMBER, "thickness": [0.1], **SECTION},
+    "RectangularSection": lambda w: {"width": NUMBER, "height": NUMBER, **SECTION},
+    "Section": lambda w: {"stiffness": MATRIX, "inertia": [np.eye(3)], "outline": [np.ones((4, 2))]},
+    "Section.of_numbers": lambda w: {
+        "EA": NUMBER, "GA": NUMBER, "EI": NUMBER, "GJ": NUMBER, "density": NUMBER, "rotary": NUMBER,
+        "centre": [np.zeros(2)], "outline": [np.ones((4, 2))],
+    },
+    "Section.of_axis_along_first": lambda w: {
+        "stiffness": MATRIX, "inertia": [np.eye(3)], "outline": [np.ones((4, 2))]
+    },
+    "Beam": lambda w: {
+        "section": [w.section], "curve": [np.eye(3), f], "elements": WHOLE, "length": NUMBER, "second": V,
+        "twist": [0.1, f], "start": [w.body], "end": [w.body], "stations": [(0.5,)],
+        "damping": NUMBER, "law": [f],
+        "interpolation": [nc.RelativeMotion()], "velocity": V, "angular_velocity": V, "name": NAME,
+    },
+    "LineLoad": lambda w: {
+        "beam": [w.beam], "force": [np.ones(3), f], "moment": [np.ones(3), f], "profile": [f],
+        "following": FLAG,
+        "name": NAME,
+    },
+    "DirectorInterpolation": lambda w: {"order": WHOLE},
+    "RelativeMotion": lambda w: {},
+    # markers and joints
+    "Point": lambda w: {"body": [w.body], "position": V, "local": FLAG},
+    "Direction": lambda w: {"body": [w.body], "vector": V, "local": FLAG},
+    "Attachment": lambda w: {"body": [w.body], "point": V, "axes": [np.eye(3)], "local": FLAG},
+    **dict.fromkeys(("Fixed", "Spherical", "Revolute", "Universal", "Cylindrical", "Prismatic",
+    "Planar"), JOINT),
+    "Screw": lambda w: {**JOINT(w), "pitch": NUMBER},
+    "Distance": lambda w: {**JOINT(w), "parent_point": V, "length": NUMBER},
+    "Drive": lambda w: {**ON_JOINT(w), "function": [f]},
+    "Coupling": lambda w: {
+        "joint": [(w.hinge,)], "coordinate": [(0,), 0], "name": NAME, "factors": [(1.0,)], "offset": NUMBER
+    },
+    # effects
+    "Gravity": lambda w: {"vector": V, "name": NAME},
+    "PointForce": lambda w: {**MARKED((w.point,)), "force": [np.ones(3), f], "following": [False]},
+    "BodyTorque": lambda w: {**MARKED((w.direction,)), "torque": [np.ones(3), f], "following": [False]},
+    "PairTorque": lambda w: {**MARKED(w.triad[:2]), "torque": [1.0, f]},
+    "Spring": lambda w: {**MARKED(w.ends), "stiffness": NUMBER, "length": NUMBER},
+    "QuadraticSpring": lambda w: {**MARKED(w.ends), "stiffness": NUMBER, "length": NUMBER},
+    "NonlinearSpring": lambda w: {**MARKED(w.ends), "law": [f]},
+    "Damper": lambda w: {**MARKED(w.ends), "damping": NUMBER},
+    "JointSpring": lambda w: {**ON_JOINT(w), "stiffness": NUMBER, "rest": NUMBER},
+    "JointPotential": lambda w: {**ON_JOINT(w), "law": [f]},
+    "JointStops": lambda w: {**ON_JOINT(w), "stiffness": NUMBER, "lower": [-1.0], "upper": NUMBER},
+    "JointDamper": lambda w: {**ON_JOINT(w), "damping": NUMBER},
+    "Armature": lambda w: {**ON_JOINT(w), "inertia": NUMBER},
+    "JointTorque": lambda w: {"joint": [w.hinge], "gear": NUMBER, "axis": [2], "name": NAME},
+    "JointForce": lambda w: {**ON_JOINT(w), "gear": NUMBER},
+    "BodyTorqueInput": lambda w: MARKED(w.triad),
+    "BodyForceInput": lambda w: MARKED((w.point, w.direction)),
+    "BeamElement": lambda w: {
+        **MARKED(w.attached), "length": NUMBER, "stiffness": MATRIX, "reference": [np.ones(6)]
+    },
+    "NonlinearBeamElement": lambda w: {
+        **MARKED(w.attached), "length": NUMBER, "stiffness": MATRIX, "reference": [np.ones(6)], "law": [f]
+    },
+    "BeamDamping": lambda w: {**MARKED(w.attached), "length": NUMBER, "viscosity": MATRIX},
+    "DirectorElement": lambda w: {
+        **MARKED(w.attached), **SHAPES, "stiffness": MATRIX, "reference": [np.ones((2, 6))]
+    },
+    "DirectorDamping": lambda w: {**MARKED(w.attached), **SHAPES, "viscosity": MATRIX},
+    # runs and analysis
+    "Scene": lambda w: {},
+    "Scene.add": lambda w: {"part": [nc.PointMass(mass=1.0)]},
+    "Scene.add_mass": lambda w: {"handle": [w.body], "block": [np.zeros((4, 4))]},
+    "Scene.find": lambda w: {"handle": [w.body, w.hinge], "user": NAME},
+    "Scene.compile": lambda w: {"assemble": FLAG, "solver": ["reduced"]},
+    "simulate": lambda w: {
+        **RUN(w), **STEPPED, "throw": FLAG, "until": [f], "checkpoint": FLAG, "newton_tol": NUMBER,
+        "extra_substeps": WHOLE, "rtol": NUMBER, "atol": NUMBER,
+    },
+    "step": lambda w: {
+        **RUN(w), "u": [np.ones(1)], "dt": [0.1], "newton_tol": NUMBER, "scheme": [nc.EnergyMomentum()]
+    },
+    "linearise": lambda w: {**RUN(w), "u": [np.ones(1)], "dt": [0.1]},
+    "assemble": RUN,
+    "transfer": lambda w: {**RUN(w), "into": [w.system], "onto": [w.state]},
+    "random_state": lambda w: {**RUN(w), "key": [jax.random.key(0)], "coordinates": NUMBER, "rates": NUMBER},
+    "EnergyMomentum": lambda w: {"order": [2], "kick": FLAG},
+    "Dissipative": lambda w: {"spectral_radius": NUMBER},
+    "VariationalMidpoint": lambda w: {},
+    "Phases": lambda w: {"systems": [(w.system,)], "trajectories": [(w.trajectory,)]},
+    "accuracy": lambda w: {
+        **RUN(w), "t_end": NUMBER, "inputs": [f], "quantities": [{"one": f}], "orders": [(2,)],
+        "steps": [(2,)],
+        "targets": [(1.0,)], "repeats": WHOLE, "limit_s": NUMBER,
+    },
+    "balance": lambda w: {"system": [w.system], "trajectory": [w.trajectory]},
+    "equilibrium": lambda w: {
+        **RUN(w), "loads": NUMBER, "inputs": [f, np.ones(1)], "steps": WHOLE, "throw": FLAG
+    },
+    "load_path": lambda w: {
+        **RUN(w), "arc": NUMBER, "steps": WHOLE, "scale": NUMBER, "inputs": [f], "throw": FLAG
+    },
+    "modes": lambda w: {**RUN(w), "count": WHOLE, "rotation": V, "inputs": [np.ones(1)], "damped": FLAG},
+    "tangent_growth": lambda w: {**RUN(w), **STEPPED, "seed": [0]},
+    "plot": lambda w: {
+        "system": [w.system], "trajectory": [w.trajectory], "times": [(0.1,)], "beams": [(w.beam,)]
+    },
+    "animate": lambda w: {
+        "system": [w.system], "trajectory": [w.trajectory], "file": ["film.gif"], "fps": WHOLE,
+        "beams": [(w.beam,)]
+    },
+    **{
+        f"System.{name}": lambda w: {"motion": [w.state]}
+        for name in ("energy", "momentum", "angular_momentum", "constraint_errors", "work")
+    },
+    "System.instant": lambda w: {"motion": [w.state], "inputs": [np.ones(1)]},
+    "System.sense": lambda w: {
+        "motion": [w.state], "part": [w.hinge, w.body, "hinge"], "inputs": [np.ones(1)], "state": [w.state]
+    },
+    "System.coordinate": lambda w: {"motion": [w.state], "joint": [w.hinge, "hinge"], "index": [0]},
+    "System.rate": lambda w: {"motion": [w.state], "joint": [w.hinge, "hinge"], "index": [0]},
+    "System.with_coordinate": lambda w: {
+        "state": [w.state], "joint": [w.hinge, "hinge"], "value": NUMBER, "rate": NUMBER, "index": [0]
+    },
+    "System.body_index": lambda w: {"body": [w.body, "body"]},
+    "System.joint_index": lambda w: {"joint": [w.hinge, "hinge"]},
+    "System.input_index": lambda w: {"name": [w.motor, "motor"]},
+    "System.report": lambda w: {},
+    "System.explain": lambda w: {"trajectory": [w.trajectory]},
+    "System.raise_on_failure": lambda w: {"trajectory": [w.trajectory]},
+    # control
+    "OptimalControl": lambda w: {
+        **RUN(w), "dt": [0.1], "steps": WHOLE, "cost": [nc.cost.Effort()], "goal": [nc.goal.Rest()],
+        "bounds": [nc.bounds.Input(-1.0, 1.0)], "inputs": [nc.inputs.held()], "parameters": [()],
+        "free_time": FLAG,
+    },
+    "Parameter": lambda w: {
+        "name": NAME, "where": [f], "index": [(0,), 0], "lower": [-1.0], "upper": NUMBER, "apply": [None, f],
+        "value": NUMBER, "moves": FLAG,
+    },
+    "Guess": lambda w: {"inputs": [np.ones((2, 1))], "rates": [np.ones(1)], "free": [np.ones(1)]},
+    "optimise": lambda w: {
+        "problem": [w.problem], "guess": [np.ones((2, 1))], "progress": FLAG, "time_limit": NUMBER, **SOLVED
+    },
+    "optimise_jit": lambda w: {
+        "problem": [w.problem], "unknowns": [w.unknowns], "options": [Options()]
+    },
+    "multi_start": lambda w: {
+        "problem": [w.problem], "guess": [np.ones((2, 1))], "starts": WHOLE, "spread": NUMBER,
+        "rates": NUMBER,
+        "seed": [0], **SOLVED,
+    },
+    "descend": lambda w: {
+        "problem": [w.problem], "guess": [np.ones((2, 1))], "optimiser": [optax.sgd(0.1)],
+        "iterations": WHOLE,
+        "rounds": WHOLE, "penalty": NUMBER, "growth": NUMBER, "tol": NUMBER, "progress": FLAG,
+        "time_limit": NUMBER,
+    },
+    "optimum": lambda w: {"make": [f], "guess": [w.unknowns], "options": [Options()]},
+    "check": lambda w: {"solution": [w.solution], "refine": FLAG, "autonomous": FLAG, "make": [f]},
+    "regulator": lambda w: {
+        "solution": [w.solution], "displacement": NUMBER, "rate": NUMBER, "effort": NUMBER, "final": NUMBER,
+        "limits": [(-1.0, 1.0)],
+    },
+    "receding_horizon": lambda w: {
+        "problem": [w.problem], "plant": [w.system], "updates": WHOLE, "steps_each": WHOLE,
+        "guess": [np.ones((2, 1))], "options": [Options()],
+    },
+    "load_guess": lambda w: {"file": ["guess.json"], "steps": WHOLE},
+    "inverse_dynamics": lambda w: {
+        **RUN(w), "coordinates": [np.ones((1, 1))], "dt": [0.1], "joints": [(w.hinge,)]
+    },
+    "computed_torque": lambda w: {
+        **RUN(w), "coordinates": [np.ones((1, 1))], "dt": [0.1], "bandwidth": NUMBER, "joints": [(w.hinge,)]
+    },
+    "cost.Effort": lambda w: {"weight": NUMBER},
+    "cost.Duration": lambda w: {"weight": NUMBER},
+    "cost.Running": lambda w: {"function": [f], "weight": NUMBER},
+    "cost.Terminal": lambda w: {"function": [f], "weight": NUMBER},
+    "cost.Missed": lambda w: {"goal": [nc.goal.Rest()], "weight": NUMBER, "rate": NUMBER},
+    "goal.Attitude": lambda w: {"body": [w.body, "body"], "rotation": [np.eye(3)]},
+    "goal.Position": lambda w: {"body": [w.body, "body"], "position": V, "point": V},
+    "goal.Motion": lambda w: {"body": [w.body, "body"], "velocity": V, "angular_velocity": V},
+    "goal.Coordinate": lambda w: {"joint": [w.hinge, "hinge"], "value": NUMBER, "index": [0]},
+    "goal.Rate": lambda w: {"joint": [w.hinge, "hinge"], "value": NUMBER, "index": [0]},
+    "goal.Rest": lambda w: {},
+    "goal.Equal": lambda w: {"function": [f], "name": NAME, "count": WHOLE},
+    "bounds.Input": lambda w: {"lower": [-1.0], "upper": NUMBER, "channel": ["motor"]},
+    "bounds.Coordinate": lambda w: {
+        "lower": [-1.0], "upper": NUMBER, "joint": [w.hinge, "hinge"], "index": [0]
+    },
+    "bounds.Rate": lambda w: {"lower": [-1.0], "upper": NUMBER, "joint": [w.hinge, "hinge"], "index": [0]},
+    "bounds.KeepOut": lambda w: {"body": [w.body, "body"], "axis": V, "cone": V, "angle": NUMBER},
+    "bounds.Path": lambda w: {"function": [f], "name": NAME, "count": WHOLE},
+    "inputs.Spline": lambda w: {"degree": WHOLE, "every": WHOLE},
+    "inputs.held": lambda w: {},
+    "inputs.piecewise_linear": lambda w: {"every": WHOLE},
+    "inputs.cubic": lambda w: {"every": WHOLE},
+}  # fmt: skip
+
+# What calls return or hand over, and bases: nobody is to make these by hand.
+MADE = {
+    "Accuracy", "Balance", "BeamHandle", "Check", "ComputedTorque", "Equilibrium", "Feedback",
+    "Frame", "Growth",
+    "Load", "Modes", "Outcome", "Result", "SimulationError", "Solution", "State", "System", "Trajectory",
+}  # fmt: skip
+BASES = {"Field", "Force", "Joint", "Potential"}
+IN_MODULES = {"cost": nc.cost, "goal": nc.goal, "bounds": nc.bounds, "inputs": nc.inputs}
+BASES_IN_MODULES = {
+    "cost.Cost", "cost.Sum", "goal.Goal", "goal.All", "bounds.Bound", "bounds.All", "bounds.Range",
+    "inputs.Shaping",
+}  # fmt: skip
+
+
+def called(name):
+    """The callable behind a name of the table."""
+    owner, _, method = name.rpartition(".")
+    if owner in ("System", "Scene"):
+        return getattr(world().system if owner == "System" else world().scene, method)
+    return getattr(getattr(nc, owner), method) if owner else getattr(nc, name)
+
+
+def sort_of(value):
+    """The sort of thing that a value is."""
+    if isinstance(value, Handle):
+        return value.kind
+    if value is None or isinstance(value, bool | str):
+        return str(type(value).__name__)
+    return "number" if isinstance(value, int | float) else "object"
+
+
+def wrong():
+    """One of each sort."""
+    return ["nonsense", 90.5, None, world().body, world().hinge, object()]
+
+
+# --- the table --------------------------------------------------------------------------------------------
+
+
+def test_everything_public_is_in_the_table():
+    names = {n for n in nc.__all__ if callable(getattr(nc, n))} - MADE - BASES
+    for module, content in IN_MODULES.items():
+        own = (n for n, x in vars(content).items() if getattr(x, "__module__", "") == content.__name__)
+        names |= {f"{module}.{n}" for n in own if n[0] != "_" and callable(getattr(content, n))}
+    for cls in (System, nc.Scene):
+        methods = inspect.getmembers(cls, inspect.isfunction)
+        names |= {f"{cls.__name__}.{n}" for n, _ in methods if n[0] != "_"}
+    names |= {"Section.of_numbers", "Section.of_axis_along_first"}
+    assert names - BASES_IN_MODULES == set(CALLS)
+
+
+@pytest.mark.parametrize("name", CALLS)
+def test_wrong_arguments_are_named(name):
+    function, table = called(name), CALLS[name](world())
+    parameters = inspect.signature(function).parameters
+    assert set(parameters) == set(table), "the table has another argument, or lacks one"
+    fine = {key: values[0] for key, values in table.items()}
+    for argument, values in table.items():
+        allowed = {sort_of(value) for value in values}
+        allowed |= {"NoneType"} if parameters[argument].default is None else set()
+        for value in wrong():
+            if sort_of(value) in allowed:
+                continue
+            with pytest.raises((TypeError, ValueError)) as caught:
+                function(**{**fine, argument: value})
+            told = f"{name}({argument}={value!r}): {caught.value}"
+            assert argument in str(caught.value), told
+            last = traceback.extract_tb(caught.value.__traceback__)[-1].filename
+            assert Path(nc.__file__).parent in Path(last).parents, told
+
+
+CHEAP = [n for n in CALLS if n[0].isupper() and not n.startswith(("Scene", "System"))] + [
+    n for n in CALLS if n.partition(".")[0] in IN_MODULES
+]
+
+
+@pytest.mark.parametrize("name", CHEAP)
+def test_right_arguments_pass(name):
+    table = CALLS[name](world())
+    fine = {key: values[0] for key, values in table.items()}
+    if name in ("LineLoad", "Beam", "OptimalControl"):  # as parts they are looked at when they are added
+        fine |= {"force": np.ones(3)} if name == "LineLoad" else {}
+    for argument, values in table.items():
+        for value in values:
+            if name == "RigidBody" and value is not fine[argument]:
+                continue
+            if name == "Parameter" and argument == "apply":
+                continue
+            called(name)(**{**fine, argument: value})
+
+
+# --- what the table cannot say ----------------------------------------------------------------------------
+
+
+def test_what_goes_by_name_says_so():
+    w = world()
+    for call, words in (
+        (lambda: nc.Gravity(-1.62), "vector="),
+        (lambda: nc.Revolute(nc.ground, w.body, (0, 0, 1)), "axis="),
+        (lambda: nc.JointSpring(w.hinge, 3.0), "stiffness="),
+        (lambda: nc.simulate(w.system, w.state, 0.1), "dt="),
+        (lambda: nc.JointSpring(w.hinge, stiff=3.0), "'stiff'.*stiffness="),
+        (lambda: nc.simulate(w.system, w.state, step=0.1), "'step'.*dt="),
+    ):
+        with pytest.raises(TypeError, match=words):
+            call()
+
+
+def test_swapped_arguments_are_told():
+    w = world()
+    with pytest.raises(ValueError, match="system is .*State.*`state` got one.*swapped"):
+        nc.simulate(w.state, w.system, dt=0.1, steps=2)
+    with pytest.raises(ValueError, match="motion is the joint 'hinge'.*`part` got one.*swapped"):
+        w.system.sense(w.hinge, w.state)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda w: nc.Gravity(vector=9.81), r"vector \[m/s\^2\] is 9.81; pass .*\(3,\)"),
+        (lambda w: nc.Gravity(vector=(0, 9.81)), r"vector \[m/s\^2\] has shape \(2,\)"),
+        (
+            lambda w: nc.JointTorque(w.body, name="motor"),
+            "JointTorque 'motor': joint is the body 'body'; pass",
+        ),
+        (lambda w: nc.Drive(w.hinge, function=90), "function is 90; pass a function of time"),
+        (lambda w: nc.JointSpring(w.hinge, stiffness=-1.0), r"stiffness \[.*\] is -1.0.*nc.JointPotential"),
+        (lambda w: nc.Spring(w.ends, stiffness=-1.0), r"stiffness \[N/m\] is -1.0.*nc.NonlinearSpring"),
+        (lambda w: nc.JointDamper(w.hinge, damping=-1.0), r"damping \[.*\] is -1.0.*not negative"),
+        (lambda w: nc.Armature(w.hinge, inertia=-1.0), r"inertia \[.*\] is -1.0.*not negative"),
+        (lambda w: nc.JointStops(w.hinge, stiffness=1.0, lower=1.0, upper=0.0), "lower .* not below upper"),
+        (lambda w: nc.Sphere(-1.0), r"radius \[m\] is -1.0; pass a positive number"),
+        (lambda w: nc.PointForce(w.point, force=(0, 0, 1)), "markers is a point of the body.*in a tuple"),
+        (
+            lambda w: nc.simulate(w.system, w.state, dt="0.01", steps=2),
+            r"dt \[s\] is '0.01'; pass a positive",
+        ),
+        (lambda w: nc.simulate(w.system, w.state, dt=0.1, steps=2.0), "steps is 2.0; pass a positive whole"),
+        (
+            lambda w: nc.simulate(w.system, w.state, dt=0.1, steps=2, scheme="rk4"),
+            "scheme is 'rk4'.*nc.Energy",
+        ),
+        (
+            lambda w: nc.simulate(w.system, w.state, dt=0.1, steps=2, until=1.0),
+            "until is 1.0; pass a function",
+        ),
+        (lambda w: nc.plot(w.system, w.state), "trajectory is an object of type State"),
+        (lambda w: nc.Scene().add(nc.RigidBody), "part is .*RigidBody"),
+    ],
+)
+def test_messages(make, words):
+    with pytest.raises((TypeError, ValueError), match=words):
+        make(world())
+
+
+def test_numbers_may_be_traced_and_of_numpy():
+    """Under transformations only shapes are known; they are looked at all the same."""
+    w = world()
+    jax.jit(lambda k: nc.JointSpring(w.hinge, stiffness=k).stiffness)(-1.0)
+    jax.vmap(lambda g: nc.Gravity(vector=(0.0, 0.0, g)).vector[2])(jnp.ones(2))
+    nc.JointSpring(w.hinge, stiffness=np.float64(2.0), coordinate=np.int32(0))
+    with pytest.raises(ValueError, match=r"vector.*shape \(2,\)"):
+        jax.jit(lambda g: nc.Gravity(vector=jnp.stack([g, g])).vector)(1.0)
+
+
+def test_a_scene_may_be_compiled_twice():
+    first, second = (world().scene.compile()[0] for _ in range(2))
+    assert eqx.tree_equal(first, second)
+
+
+def test_all_that_computes_asks_for_double_precision():
+    """A scene built in double precision and used outside of it is refused, not computed in single."""
+    w = world()
+    calls = {name: CALLS[name](w) for name in CALLS if not name.startswith(("cost", "goal"))}
+    parts = {n for n in calls if inspect.isclass(called(n)) and not getattr(called(n), "makes_arrays", False)}
+    parts -= {"Scene"}
+    asked = set(calls) - parts - {"System.report"}
+    assert {"simulate", "System.energy", "System.sense", "balance", "modes", "Scene", "Box", "Point"} <= asked
+    sensor = w.system.sense(w.state, w.hinge)
+    energy = w.system.energy(w.state)
+    with jax.enable_x64(False):
+        for name in sorted(asked):
+            fine = {key: values[0] for key, values in calls[name].items()}
+            with pytest.raises(ValueError, match="double precision"):
+                called(name)(**fine)
+        for late in (lambda: sensor.force, lambda: energy.total):
+            with pytest.raises(ValueError, match="double precision"):
+                late()
+
+
+# --- defaults, and inertia as it is printed -----------------------------------------------------------------
+
+
+def test_points_are_the_bodies_reference_points_by_default():
+    scene = nc.Scene()
+    mass = scene.add(nc.PointMass(mass=1.0, position=(1, 0, 0), name="mass"))
+    scene.add(nc.Spring((nc.Point(nc.ground, (1, 0, 2)), nc.Point(mass)), stiffness=3.0))
+    rod = scene.add(nc.PointMass(mass=1.0, position=(4, 4, 0), name="end"))
+    scene.add(nc.Distance(mass, rod))
+    system, state = scene.compile()
+    assert float(system.energy(state).total) == pytest.approx(0.5 * 3 * 2**2)
+    assert float(system.sense(state, nc.Point(mass)).position[0]) == 1.0
+    assert float(system.sense(state, system.structure.joints[-1]).distance) == pytest.approx(5.0)
+
+
+def test_inertia_rounded_in_print():
+    """A thin plate with three digits breaks the triangle inequality by rounding; with two it is refused."""
+    scene = nc.Scene()
+    scene.add(nc.RigidBody(mass=1.0, inertia=(0.00333, 0.00333, 0.00667), angular_velocity=(0, 0, 2.0)))
+    system, state = scene.compile()
+    assert float(system.energy(state).total) == pytest.approx(0.5 * 0.00667 * 4, rel=1e-12)
+    with pytest.raises(ValueError, match=r"nearest possible inertia.*\[0.00335, 0.00335, 0.0067 \]"):
+        nc.RigidBody(mass=1.0, inertia=(0.0033, 0.0033, 0.0067))
+    nc.RigidBody(mass=1.0, inertia=(0.00335, 0.00335, 0.0067))
+    with pytest.raises(ValueError, match="belongs to no body"):
+        nc.RigidBody(mass=1.0, inertia=(1.0, 1.0, -0.004))
+
+
+# --- what is returned: items, prints, files -----------------------------------------------------------------
+
+
+def test_a_trajectory_has_items():
+    """`trajectory[k].t` is `trajectory.t[k]`, for states, pieces and lanes alike."""
+    w = world()
+    run = nc.simulate(w.system, w.state, dt=0.1, inputs=jnp.arange(6.0)[:, None])
+    assert len(run) == 7 and [float(s.t) for s in run] == run.t.tolist()
+    for index in (0, 3, -1, np.int64(2)):
+        assert float(run[index].t) == float(run.t[index])
+        np.testing.assert_array_equal(run[index].q, run.q[index])
+    for index in (slice(2, 5), slice(None, None, 2), slice(-3, None), slice(4, 5)):
+        piece = run[index]
+        np.testing.assert_array_equal(piece.t, run.t[index])
+        starts = np.arange(7)[index]
+        np.testing.assert_array_equal(piece.inputs, run.inputs[starts[1:] - 1])
+    piece = run[2:5]
+    assert float(nc.balance(w.system, piece).energy.max()) <= 1e-14
+    assert nc.balance(w.system, piece).axes == 1 and nc.balance(w.system, run[::2]).axes == 0
+    for index, error in ((7, IndexError), (-8, IndexError), (slice(5, 5), IndexError), ("a", TypeError)):
+        with pytest.raises(error, match="trajectory"):
+            run[index]
+    lanes = jax.vmap(lambda dt: nc.simulate(w.system, w.state, dt=dt, steps=2))(jnp.array([0.1, 0.2, 0.3]))
+    assert len(lanes) == 3 and lanes[1].t.tolist() == [0.0, 0.2, 0.4] and lanes[1:].t.shape == (2, 3)
+    assert float(jax.jit(lambda run: run[-1].t)(run)) == float(run.t[-1])
+
+
+class Spoilt(nc.Force):
+    """No force, and none at all after a time [s]."""
+
+    end: float = 1.0
+
+    def load(self, x, rate, inputs, t):
+        """Zero, or NaN."""
+        return nc.Load(0.0 * jnp.sqrt(self.end - t) * jnp.ones_like(x), None)
+
+
+def test_a_batch_is_explained_by_reason_and_part():
+    scene = nc.Scene()
+    ball = scene.add(nc.PointMass(mass=1.0, velocity=(1.0, 0.0, 0.0), name="ball"))
+    scene.add(Spoilt((nc.Point(ball),), name="spoilt"))
+    system, state = scene.compile()
+    steps = jnp.linspace(0.1, 1.0, 10)
+    runs = jax.vmap(lambda dt: nc.simulate(system, state, dt=dt, steps=4))(steps)
+    words = system.explain(runs).splitlines()
+    failed = int((np.asarray(runs.result) != 0).sum())
+    assert 0 < failed < 10 and words[0] == f"{failed} of 10 lanes failed" and len(words) > 1
+    first = int(np.argmax(np.asarray(runs.result) != 0))
+    counts = [int(line.partition(":")[0]) for line in words[1:]]
+    assert sum(counts) == failed and counts == sorted(counts, reverse=True)
+    assert all("'ball'" in line for line in words[1:]) and f"first lane {first} in" in "".join(words)
+    assert system.explain(runs[:1]) == "none of 1 lanes failed"
+    with pytest.raises(nc.SimulationError, match="lanes failed"):
+        system.raise_on_failure(runs)
+
+
+def test_prints_show_the_largest():
+    w = world()
+    run = nc.simulate(w.system, w.state, dt=0.1, steps=5)
+    errors, balance = w.system.constraint_errors(run), nc.balance(w.system, run)
+    assert f"director_rates {float(errors.director_rates.max()):.2g} [1/s]" in str(errors)
+    assert f"{balance.energy.max():.2g}" in str(balance) and balance.note in str(balance)
+    jax.jit(lambda run: repr(w.system.constraint_errors(run)) and run.t)(run)
+
+
+def test_files_hold_trajectories(tmp_path):
+    w = world()
+    run, other = (nc.simulate(w.system, w.state, dt=dt, steps=2) for dt in (0.1, 0.2))
+    eqx.tree_serialise_leaves(tmp_path / "run.eqx", run)
+    again = eqx.tree_deserialise_leaves(tmp_path / "run.eqx", other)
+    assert eqx.tree_equal(run, again) and not eqx.tree_equal(run, other)
+
+
+def test_version(capsys):
+    import tomllib
+
+    from natcoord_jax import cli
+
+    project = tomllib.loads((Path(nc.__file__).parents[1] / "pyproject.toml").read_text("utf-8"))["project"]
+    assert nc.__version__ == project["version"]
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["--version"])
+    assert ended.value.code == 0 and project["version"] in capsys.readouterr().out
+
+
+def test_no_advice_that_cannot_help():
+    """A load that does not grow is not reached by more steps of it."""
+    scene = nc.Scene()
+    scene.add(nc.Gravity())
+    scene.add(nc.PointMass(mass=1.0, name="ball"))
+    falling = scene.compile()
+    with pytest.raises(nc.SimulationError, match="nothing that acts depends on the load parameter") as caught:
+        nc.equilibrium(*falling)
+    assert "more steps" not in str(caught.value)
