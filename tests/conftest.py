@@ -59,3 +59,17 @@ def _room_for_programs():
     yield
     if MAPS.exists() and MAPS.read_bytes().count(b"\n") > MOST_MAPS:
         jax.clear_caches()
+
+
+@pytest.fixture
+def programs():
+    """Programs that are compiled."""
+    found = []
+
+    def count(name, seconds, **given):
+        if name.endswith("backend_compile_duration"):
+            found.append(given.get("fun_name"))
+
+    jax.monitoring.register_event_duration_secs_listener(count)
+    yield found
+    jax.monitoring.unregister_event_duration_listener(count)

@@ -16,10 +16,10 @@ def parallelogram(rng: Chance):
     a = scene.add(rng.body((0, 0, 0), "a", 0.2))
     b = scene.add(rng.body((0, height, 0), "b", 0.2))
     c = scene.add(rng.body((width, 0, 0), "c", 0.2))
-    crank = scene.add(nc.Revolute(nc.ground, a, (0, 0, 0), z, name="crank"))
-    scene.add(nc.Revolute(a, b, (0, height, 0), z, name="left"))
-    scene.add(nc.Revolute(nc.ground, c, (width, 0, 0), z, name="rocker"))
-    scene.add(nc.Revolute(b, c, (width, height + rng.uniform(-0.1, 0.1), 0), z, name="right"))
+    crank = scene.add(nc.Revolute(nc.ground, a, point=(0, 0, 0), axis=z, name="crank"))
+    scene.add(nc.Revolute(a, b, point=(0, height, 0), axis=z, name="left"))
+    scene.add(nc.Revolute(nc.ground, c, point=(width, 0, 0), axis=z, name="rocker"))
+    scene.add(nc.Revolute(b, c, point=(width, height + rng.uniform(-0.1, 0.1), 0), axis=z, name="right"))
     scene.add(rng.stops(crank, 1e6))
     scene.add(rng.brake(crank, dt))
     scene.add(nc.JointTorque(crank))
@@ -34,10 +34,10 @@ def ring(rng: Chance):
     a = scene.add(rng.body((0, 0, 0), "a", 0.2))
     b = scene.add(rng.body((0.1, 0.4, 0.1), "b", 0.2))
     c = scene.add(rng.body((0.8, 0.1, 0), "c", 0.2))
-    crank = scene.add(nc.Revolute(nc.ground, a, (0, 0, 0), (0.1, 0.2, 1), name="crank"))
-    scene.add(nc.Spherical(a, b, (0.1, 0.4, 0.1), name="left"))
-    rocker = scene.add(nc.Revolute(nc.ground, c, (0.8, 0, 0), (0.3, 0, 1), name="rocker"))
-    scene.add(nc.Distance(b, c, (0.8, 0.5, 0.2), parent_point=(0.4, 0.5, 0.1), name="rod"))
+    crank = scene.add(nc.Revolute(nc.ground, a, point=(0, 0, 0), axis=(0.1, 0.2, 1), name="crank"))
+    scene.add(nc.Spherical(a, b, point=(0.1, 0.4, 0.1), name="left"))
+    rocker = scene.add(nc.Revolute(nc.ground, c, point=(0.8, 0, 0), axis=(0.3, 0, 1), name="rocker"))
+    scene.add(nc.Distance(b, c, point=(0.8, 0.5, 0.2), parent_point=(0.4, 0.5, 0.1), name="rod"))
     scene.add(rng.dry(crank))
     scene.add(rng.stops(rocker, 1e5))
     held = nc.Point(nc.ground, (0.3, 0.9, 0)), nc.Point(b, (0.4, 0.5, 0.1))
@@ -68,7 +68,7 @@ def flag(rng: Chance):
     scene, dt = nc.Scene(), rng.step(0.01)
     scene.add(rng.gravity())
     beam = _rope(rng, scene)
-    hinge = scene.add(nc.Revolute(nc.ground, beam.start, (0, 0, 0), (0, 0, 1)))
+    hinge = scene.add(nc.Revolute(nc.ground, beam.start, point=(0, 0, 0), axis=(0, 0, 1)))
     scene.add(rng.stops(hinge, 1e4))
     scene.add(rng.brake(hinge, dt))
     system, state = scene.compile()
@@ -85,9 +85,9 @@ def grip(rng: Chance):
         scene, same = nc.Scene(), Chance(masses)
         scene.add(same.gravity())
         arm, load = scene.add(same.body((0, 0, 0), "arm")), scene.add(same.body((0.6, 0, 0), "load", 0.1))
-        hinge = scene.add(nc.Revolute(nc.ground, arm, (0, 0, 0), axes[0], name="hinge"))
+        hinge = scene.add(nc.Revolute(nc.ground, arm, point=(0, 0, 0), axis=axes[0], name="hinge"))
         if gripped:
-            scene.add(nc.Revolute(arm, load, (0.6, 0, 0), axes[1], name="grip"))
+            scene.add(nc.Revolute(arm, load, point=(0.6, 0, 0), axis=axes[1], name="grip"))
         scene.add(Chance(stops).stops(hinge, 1e6, name="stops"))
         scene.add(Chance(dry).dry(hinge, name="dry"))
         return scene.compile()
@@ -101,27 +101,28 @@ FOURTH = nc.EnergyMomentum(order=4)
 
 TEMPLATES = (
     Template("slide", trees.slide),
-    Template("slide, damped", trees.slide, scheme=nc.Dissipative(), more=("second",)),
     Template("disc", trees.disc, more=("checkpointed", "directions")),
-    Template("arm", trees.arm, save_every=5),
     Template("taut, error control", trees.taut, rtol=1e-4, extra=160),
-    Template("taut, until an event", trees.taut, until=trees.event, more=("batch",)),
-    Template("craft", trees.craft),
+    Template("taut, until an event", trees.taut, until=trees.event),
     Template("driven", trees.driven),
-    Template("geared", trees.geared),
-    Template("switching", trees.switching),
+    Template("switching", trees.switching, more=("batch",)),
     Template("tumbling", trees.tumbling, steps=12, extra=64),
     Template("parallelogram", parallelogram),
     Template("ring", ring),
     Template("rod", rod),
     Template("slide, fourth order", trees.slide, scheme=FOURTH, save_every=4),
     Template("grip", grip),
-    Template("lamp", trees.lamp, exhaustive=True),
-    Template("flag", flag, exhaustive=True),
-    Template("mixed", trees.mixed, exhaustive=True),
-    Template("tree", trees.tree, exhaustive=True),
-    Template("double, fourth order", trees.double, scheme=FOURTH, exhaustive=True),
+    Template("slide, twice", trees.slide, more=("second",), exhaustive=True),
+    Template("slide, damped", trees.slide, scheme=nc.Dissipative(), exhaustive=True),
+    Template("disc, twice", trees.disc, more=("second",), exhaustive=True),
     Template("disc, sixth order", trees.disc, scheme=nc.EnergyMomentum(order=6), exhaustive=True),
     Template("disc, variational", trees.disc, scheme=nc.VariationalMidpoint(), exhaustive=True),
-    Template("switching, twice", trees.switching, more=("second", "batch", "checkpointed"), exhaustive=True),
+    Template("double, fourth order", trees.double, scheme=FOURTH, exhaustive=True),
+    Template("arm", trees.arm, save_every=5, exhaustive=True),
+    Template("lamp", trees.lamp, exhaustive=True),
+    Template("craft", trees.craft, exhaustive=True),
+    Template("geared", trees.geared, exhaustive=True),
+    Template("mixed", trees.mixed, exhaustive=True),
+    Template("tree", trees.tree, exhaustive=True),
+    Template("flag", flag, exhaustive=True),
 )

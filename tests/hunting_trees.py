@@ -41,7 +41,9 @@ def _chain(rng: Chance, count: int):
     for k in range(count):
         links.append(scene.add(rng.body((0.5 * k, 0, 0), f"link {k}")))
         axis = rng.direction()
-        joints.append(scene.add(nc.Revolute(*links[-2:], (0.5 * k, 0, 0), axis, name=f"hinge {k}")))
+        joints.append(
+            scene.add(nc.Revolute(*links[-2:], point=(0.5 * k, 0, 0), axis=axis, name=f"hinge {k}"))
+        )
     return scene, links[1:], joints
 
 
@@ -109,7 +111,7 @@ def craft(rng: Chance):
     scene, dt = nc.Scene(), rng.step()
     base = scene.add(rng.body((0, 0, 0), "base"))
     wheel = scene.add(rng.body((0, 0, 0.3), "wheel", 0.1))
-    axle = scene.add(nc.Revolute(base, wheel, (0, 0, 0.3), rng.direction()))
+    axle = scene.add(nc.Revolute(base, wheel, point=(0, 0, 0.3), axis=rng.direction()))
     scene.add(rng.brake(axle, dt))
     scene.add(nc.BodyForceInput((nc.Point(base, (0.3, 0, 0)), nc.Direction(base, (0, 1, 0)))))
     scene.add(nc.BodyTorqueInput(tuple(nc.Direction(base, x) for x in np.eye(3))))
@@ -171,7 +173,7 @@ def tumbling(rng: Chance):
     scene.add(rng.gravity())
     spin = rng.size(5.0, 20.0) * rng.direction()
     body = scene.add(rng.body((0, 0, 0), "a", 0.5, angular_velocity=spin))
-    scene.add(nc.Spherical(nc.ground, body, (0, 0, 0)))
+    scene.add(nc.Spherical(nc.ground, body, point=(0, 0, 0)))
     system, state = scene.compile()
     return (system,), state, pushed(rng, system, state)[0], none(12), rng.uniform(0.2, 0.6)
 
@@ -203,7 +205,7 @@ def tree(rng: Chance):
         parent = 1 if k == 4 else k
         place = np.array([0.3 * (k if k < 4 else k - 3), 0.0 if k < 4 else 0.3, 0.0])
         links.append(scene.add(rng.body(place, f"link {k}", 0.15)))
-        joint = nc.Revolute(links[parent], links[-1], place, rng.direction(), name=f"hinge {k}")
+        joint = nc.Revolute(links[parent], links[-1], point=place, axis=rng.direction(), name=f"hinge {k}")
         joint = scene.add(joint)
         scene.add(rng.stops(joint, 1e5, name=f"stops {k}"))
         scene.add(

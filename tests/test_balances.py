@@ -69,7 +69,7 @@ def rotor(*effects, inertia=0.5, gravity=0.0, com=(0.0, 0.0, 0.0), rate=0.0, joi
         angular_velocity=rate * axis * (not slides),
         name="body",
     )
-    hinge = scene.add(joint(nc.ground, scene.add(body), (0.0, 0.0, 0.0), axis, name="joint"))
+    hinge = scene.add(joint(nc.ground, scene.add(body), point=(0.0, 0.0, 0.0), axis=axis, name="joint"))
     for effect in effects:
         scene.add(effect(hinge))
     return scene.compile()

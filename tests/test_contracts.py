@@ -25,8 +25,10 @@ from scenes import AXIS, JOINTS, SECOND, SPECIAL, with_multipliers
 import natcoord_jax as nc
 import natcoord_jax.effects
 from natcoord_jax.assembly.build import build
+from natcoord_jax.assembly.diagnostics import group_places, rows_with_ground
 from natcoord_jax.assembly.reduced import ReducedStep
 from natcoord_jax.assembly.response import gather, respond, situation
+from natcoord_jax.core.coordinate import CoordinateEffect
 from natcoord_jax.core.effect import Effect, replace_fields
 from natcoord_jax.core.joint import frames_at
 from natcoord_jax.core.potential import place_markers
@@ -265,6 +267,23 @@ def impulses(answer, motion):
     forces = forces.reshape(motion.start.shape[0], -1, 4, 3)[0]
     torques = jnp.zeros_like(forces[:, 0]) if answer.torques is None else answer.torques[0, 0]
     return np.asarray(forces), np.asarray(torques)
+
+
+@pytest.mark.parametrize("effect", [e for e in TABLE if e.elastic], ids=lambda e: e.__name__)
+def test_elastic_effects_tell_what_cancels(effect):
+    """At rest their forces are rounded as stiffness times invariants, of which they are differences, are."""
+    system, state, group = stage(effect)
+    one = jax.tree.map(lambda x: x[0], group.effect)
+    place, rows = group_places(system, group)[0], rows_with_ground(state.q)[group.bodies[0]]
+    given = place, rows, state.coordinates[group.coordinates[0]] + 0.3
+    told = one.cancelling(*given)
+    assert told is not None, "a stiff part of this kind could not be told from an unsolved step"
+    coordinate = issubclass(effect, CoordinateEffect)
+    invariants = given[2] if coordinate else one.invariants(place_markers(place, rows))
+    stiffness = jnp.diag(one.curvature(*given))
+    energy, reach = map(float, told)
+    assert energy >= (1 - tol.STIFFNESS_BY_ENERGIES) * float(jnp.sum(jnp.abs(stiffness) * invariants**2)) > 0
+    assert 0 < reach <= 10, "of the size of the scene"
 
 
 @EFFECTS

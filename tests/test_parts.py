@@ -147,7 +147,7 @@ def test_reactions_about_a_point():
     beam = made.add(
         nc.RigidBody(mass=2.0, inertia=(1.0, 1.0, 1.0), com=(0.7, 0.2, 0.0), position=(1, 0, 0), name="beam")
     )
-    hinge = made.add(nc.Revolute(nc.ground, beam, (0.5, 0.0, 0.3), name="hinge"))
+    hinge = made.add(nc.Revolute(nc.ground, beam, point=(0.5, 0.0, 0.3), name="hinge"))
     system, state = made.compile()
     weight, centre = np.array([0.0, 0.0, -20.0]), np.array([1.7, 0.2, 0.0])
 

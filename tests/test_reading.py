@@ -82,7 +82,9 @@ def swinging(kind):
     one = scene.add(nc.RigidBody(mass=2.0, position=(0, 0, -0.5), name="one", **part))
     two = scene.add(nc.RigidBody(mass=1.0, position=(0.5, 0.2, -1.0), name="two", **part))
     first = scene.add(nc.Revolute(nc.ground, one, axis=(0, 1, 0.2), name="first"))
-    second = scene.add(nc.Universal(one, two, (0.2, 0, -0.8), (1, 0, 0), second=(0, 1, 0), name="second"))
+    second = scene.add(
+        nc.Universal(one, two, point=(0.2, 0, -0.8), axis=(1, 0, 0), second=(0, 1, 0), name="second")
+    )
     scene.add(nc.Armature(second, inertia=ROTOR, name="rotor"))
     if kind == "drive":
         scene.add(nc.Drive(first, function=lambda t: 0.8 * jnp.sin(2.0 * t), name="drive"))

@@ -16,6 +16,7 @@ from differences import STEPS, difference_errors
 import natcoord_jax as nc
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.gradient import averaged_gradient
+from natcoord_jax.core.handles import Handle
 from natcoord_jax.effects.springs.point_springs import COINCIDENT, energy_of_distance
 from natcoord_jax.maths.collocation import gauss
 from natcoord_jax.maths.rotations import from_rotation_vector
@@ -152,14 +153,18 @@ def test_laws_without_second_derivative_at_zero_keep_their_force():
 
 @pytest.mark.parametrize("coordinate", [-0.3, -1e-9, 1e-9, 0.4])
 def test_stops_on_both_sides(coordinate):
-    stops = nc.JointStops("joint", lower=-jnp.inf, upper=0.0, stiffness=9.0)
+    stops = nc.JointStops(Handle("joint", "joint", 1), lower=-jnp.inf, upper=0.0, stiffness=9.0)
     found = [f(coordinate) for f in (stops.energy, jax.grad(stops.energy), jax.hessian(stops.energy))]
     beyond = max(coordinate, 0.0)
     assert np.allclose(found, [4.5 * beyond**2, 9.0 * beyond, 9.0 * (coordinate > 0)], rtol=tol.IDENTITY)
 
 
 def test_at_the_stop_derivatives_are_those_before_contact():
-    for stops in (nc.JointStops("j", upper=0.2, stiffness=9.0), nc.JointStops("j", lower=0.2, stiffness=9.0)):
+    joint = Handle("joint", "joint", 1)
+    for stops in (
+        nc.JointStops(joint, upper=0.2, stiffness=9.0),
+        nc.JointStops(joint, lower=0.2, stiffness=9.0),
+    ):
         assert [float(f(0.2)) for f in (jax.grad(stops.energy), jax.hessian(stops.energy))] == [0.0, 0.0]
     assert float(jax.grad(positive_part)(0.0)) == 0.0
 
@@ -337,7 +342,7 @@ def test_modes_of_a_point_mass_on_a_joint():
     scene = nc.Scene()
     scene.add(nc.Gravity(vector=(0, 0, -10.0)))
     ball = scene.add(nc.PointMass(mass=1.0, position=(0, 0, -2.0)))
-    scene.add(nc.Distance(nc.ground, ball, (0, 0, -2.0)))
+    scene.add(nc.Distance(nc.ground, ball, point=(0, 0, -2.0)))
     assert np.allclose(nc.modes(*scene.compile()).frequencies, np.sqrt([5.0, 5.0]), rtol=tol.EXACT_GRADIENT)
 
 
@@ -347,7 +352,7 @@ def test_modes_of_a_point_mass_on_a_joint():
 def test_a_rod_without_length_is_refused():
     scene = nc.Scene()
     ball = scene.add(nc.PointMass(mass=1.0))
-    scene.add(nc.Distance(nc.ground, ball, (0, 0, 0), name="rod"))
+    scene.add(nc.Distance(nc.ground, ball, point=(0, 0, 0), name="rod"))
     with pytest.raises(ValueError, match=r"'rod': length \[m\] is 0"):
         scene.compile()
 

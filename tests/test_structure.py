@@ -346,20 +346,6 @@ class Idle(nc.Force):
         return nc.Load(0.0 * rate, None)
 
 
-@pytest.fixture
-def programs():
-    """Programs that are compiled."""
-    found = []
-
-    def count(name, seconds, **given):
-        if name.endswith("backend_compile_duration"):
-            found.append(given.get("fun_name"))
-
-    jax.monitoring.register_event_duration_secs_listener(count)
-    yield found
-    jax.monitoring.unregister_event_duration_listener(count)
-
-
 def test_a_changed_number_never_retraces(programs):
     """Every leaf of system and state, the step, the inputs; a scene built anew with other numbers."""
 

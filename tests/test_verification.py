@@ -249,7 +249,7 @@ def test_r14_four_particles():
         balls.append(scene.add(nc.PointMass(mass=mass, position=place, velocity=speed, name=f"r{k + 1}")))
     for i, j in p["bars"]:
         ends = balls[i - 1], balls[j - 1]
-        scene.add(nc.Distance(*ends, p["r0"][j - 1], parent_point=p["r0"][i - 1]))
+        scene.add(nc.Distance(*ends, point=p["r0"][j - 1], parent_point=p["r0"][i - 1]))
     for spring in p["springs"]:
         i, j = spring["i"] - 1, spring["j"] - 1
         ends = nc.Point(balls[i], p["r0"][i]), nc.Point(balls[j], p["r0"][j])

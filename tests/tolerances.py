@@ -136,5 +136,11 @@ SPREAD_OF_DIFFERENCES = 1e-3
 # Solutions of a step's equations against Newton's iteration with their whole Jacobian, relative to 1 + |x|.
 SAME_SOLUTION = 1e-10
 
-# What moves by rounding alone: places of a metre and less, over a few dozen steps; found: 7e-16.
-AT_REST = 2e-14
+# What moves by rounding alone: places of a metre and less, over a few dozen steps. A rod of 50 elements is
+# bent by how its places are rounded, 2e-14; others: 1e-15.
+AT_REST = 1e-13
+# The same about an equilibrium, which is found to this part of its extent.
+EQUILIBRIUM = 1e-9
+
+# Second differences of an energy over 1e-4 of its invariants, for the size of what is rounded.
+STIFFNESS_BY_ENERGIES = 1e-3

@@ -56,7 +56,8 @@ def _derivatives(
         turned = every[..., :3] if seen else jnp.zeros_like(spin_p)
         return jax.jvp(local, (spin_p, rates), (turned, every[..., seen:]))[1]
 
-    columns = jax.vmap(along)(jnp.eye(s * (seen + k)).reshape(-1, s, seen + k))
+    count = s * (seen + k)
+    columns = jax.vmap(along)(jnp.eye(count).reshape(count, s, seen + k))
     found = jnp.transpose(columns.reshape(s, seen + k, s, bodies, 9 + k), (3, 2, 4, 0, 1))
     if level.grounded:
         return jnp.pad(found, ((0, 0),) * 4 + ((6, 0),))

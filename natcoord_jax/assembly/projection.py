@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from natcoord_jax.assembly.coordinates import coordinate_values, velocities_with_ground
 from natcoord_jax.assembly.diagnostics import group_places, rows_with_ground
 from natcoord_jax.assembly.rates import row_rates
-from natcoord_jax.assembly.system import Group, System
+from natcoord_jax.assembly.system import System
 from natcoord_jax.assembly.violations import constrained, violation_rates_of, violations_of
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.joint import frames_at
@@ -52,7 +52,7 @@ def _unit_motions(rows: Float[Array, "*n 4 3"]) -> Float[Array, "*n 4 3 6"]:
 
 
 def _along_twists(
-    group: Group, place: Any, rows: Float[Array, "n k 4 3"], t: Array, rate_of: Any
+    instances: Any, place: Any, rows: Float[Array, "n k 4 3"], t: Array, rate_of: Any
 ) -> Float[Array, "n m k6"]:
     """Derivatives of what `rate_of` finds from velocities of rows and spins, by the twists of its bodies."""
     count, bodies = rows.shape[:2]
@@ -64,10 +64,10 @@ def _along_twists(
 
         return jax.vmap(along, out_axes=1)(unit)
 
-    return jax.vmap(one)(group, place, rows)
+    return jax.vmap(one)(instances, place, rows)
 
 
-def _scattered(block: Float[Array, "n m k6"], bodies: Array, count: int) -> Float[Array, "nm count6"]:
+def _scattered(block: Float[Array, "n m k6"], bodies: Any, count: int) -> Float[Array, "nm count6"]:
     """Local derivatives as rows over the twists of all bodies; those of the ground are dropped."""
     n, m, width = block.shape
     columns = (bodies[:, :, None] * TWIST + jnp.arange(TWIST)).reshape(n, width)

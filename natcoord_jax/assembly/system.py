@@ -21,6 +21,7 @@ from natcoord_jax.core.numeric import Number, Numbers, Whole
 from natcoord_jax.core.state import MOTION, STATE, TRAJECTORY, State, Trajectory
 
 ELEMENT = HandleOf("effect") | NAME
+PART = of("the handle or name of a body, a joint or an effect", Handle, str)
 SENSED = (
     of("the handle or name of a body, a joint or an element", Handle, str)
     | of("nc.Point or nc.Direction", Marker)
@@ -262,6 +263,7 @@ class System(eqx.Module):
         """
         return instant.instant(self, motion, inputs)
 
+    @checked("System.get", part=PART | Several(PART, 1), field=NAME)
     def get(self, part: Handle | str | Sequence[Handle | str], field: str | None = None) -> Any:
         """Numbers of a part by name.
 
@@ -314,7 +316,7 @@ class System(eqx.Module):
         part=SENSED,
         inputs=Numbers(("...", None)),
         state=STATE,
-        about=Numbers((3,)),
+        about=Numbers(("...", 3)) | of("nc.Point", Marker),
     )
     def sense(
         self,

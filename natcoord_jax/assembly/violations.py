@@ -1,5 +1,6 @@
 """By how much a state misses the constraints: of bodies, joints, and relations between joint coordinates."""
 
+import dataclasses
 from dataclasses import dataclass
 
 import equinox as eqx
@@ -22,45 +23,33 @@ GAP = 1e-9
 
 
 class ConstraintErrors(eqx.Module):
-    """Largest violations at each time.
+    """Largest violations at each time; of a trajectory, of the velocities that are read of it.
 
     Attributes:
         directors: of d_i . d_j = delta_ij [-].
         joints: of the joints' constraints [m, -].
         relations: of drives, couplings and pitches of screws [rad, m].
-        source: whose velocities are judged: of a trajectory those that are read, of a state its own.
+        director_rates: of the time derivatives of what holds for directors [1/s].
+        joint_rates: of those of the joints' constraints [m/s, 1/s].
+        relation_rates: of those of relations [rad/s, m/s].
     """
 
     directors: Float[Array, "*t"]
     joints: Float[Array, "*t"]
     relations: Float[Array, "*t"]
-    source: Source
+    director_rates: Float[Array, "*t"]
+    joint_rates: Float[Array, "*t"]
+    relation_rates: Float[Array, "*t"]
 
     def __repr__(self) -> str:
         """The largest over all times."""
         if not is_concrete(self) or self.joints.size == 0:
             return eqx.tree_pformat(self)
-        names = ("director_rates", "1/s"), ("joint_rates", "m/s, 1/s"), ("relation_rates", "rad/s, m/s")
-        values = self.directors, self.joints, self.relations, *_rates(self.source)
-        units = ("directors", "-"), ("joints", "m, -"), ("relations", "rad, m"), *names
-        sizes = [f"{name} {np.max(x):.2g} [{unit}]" for (name, unit), x in zip(units, values)]
+        units = "-", "m, -", "rad, m", "1/s", "m/s, 1/s", "rad/s, m/s"
+        names = (field.name for field in dataclasses.fields(self))
+        sizes = [f"{name} {np.max(getattr(self, name)):.2g} [{unit}]" for name, unit in zip(names, units)]
         times = f", largest of {self.joints.size} states" if self.joints.size > 1 else ""
         return f"ConstraintErrors({', '.join(sizes)}{times})"
-
-    @property
-    def director_rates(self) -> Float[Array, "*t"]:
-        """Of the time derivatives of what holds for directors [1/s]."""
-        return _rates(self.source)[0]
-
-    @property
-    def joint_rates(self) -> Float[Array, "*t"]:
-        """Of those of the joints' constraints [m/s, 1/s]."""
-        return _rates(self.source)[1]
-
-    @property
-    def relation_rates(self) -> Float[Array, "*t"]:
-        """Of those of relations [rad/s, m/s]."""
-        return _rates(self.source)[2]
 
     @property
     def position(self) -> Float[Array, "*t"]:
@@ -70,8 +59,7 @@ class ConstraintErrors(eqx.Module):
     @property
     def velocity(self) -> Float[Array, "*t"]:
         """Largest violation of any constraint rate."""
-        directors, joints, relations = _rates(self.source)
-        return jnp.maximum(jnp.maximum(directors, joints), relations)
+        return jnp.maximum(jnp.maximum(self.director_rates, self.joint_rates), self.relation_rates)
 
 
 def constrained(system: System) -> tuple[Group, ...]:
@@ -148,7 +136,7 @@ def constraint_errors(system: System, motion: State | Trajectory) -> ConstraintE
     source = Source.of(system, motion)
     if isinstance(motion, State):
         source = replace_fields(source, as_they_are=True)
-    return ConstraintErrors(*_values(system, motion), source)
+    return ConstraintErrors(*_values(system, motion), *_rates(source))
 
 
 def position_size(state: State) -> Float[Array, ""]:

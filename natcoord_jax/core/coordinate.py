@@ -277,10 +277,10 @@ class CoordinateConstraint(CoordinateEffect):
         """That of both sides."""
         frames, moving = (jax.vmap(frames_at)(place, x.reshape(-1, 2, 4, 3)) for x in (rows, rates))
         relative = spin[1::2] - spin[::2]
-        found = [
-            axis.rate(*jax.tree.map(lambda x, k=k: x[k], (*frames, *moving)), relative[k])
-            for k, axis in enumerate(self.axes)
-        ]
+        found = []
+        for k, axis in enumerate(self.axes):
+            parent, child, *pair = jax.tree.map(lambda x, k=k: x[k], (*frames, *moving))
+            found.append(axis.rate(parent, child, pair[0], pair[1], relative[k]))
         target = jax.jvp(self.target, (t,), (jnp.ones_like(t),))[1]
         return (self.coefficients() @ jnp.stack(found) - passing * target)[None]
 

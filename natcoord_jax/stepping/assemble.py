@@ -154,16 +154,16 @@ def assemble(system: System, state: State) -> State:
         if result != Result.SUCCESSFUL:
             raise SimulationError(_failure(system, assembled, result), result, assembled)
         if state.held is not None:
-            _warn_of_what_moved(system, state, assembled)
+            _warn_of_what_moved(system, state, np.asarray(state.held[0]), assembled)
         return assembled
     return jax.tree.map(lambda x: jnp.where(code == 0, x, jnp.nan), assembled)
 
 
-def _warn_of_what_moved(system: System, state: State, assembled: State) -> None:
+def _warn_of_what_moved(system: System, state: State, held: np.ndarray, assembled: State) -> None:
     """Say which coordinates were set to what the constraints do not allow."""
     for k, (name, _) in enumerate(system.structure.coordinates):
         given, found = float(state.coordinates[k]), float(assembled.coordinates[k])
-        if float(state.held[0, k]) and abs(found - given) > 1e3 * GAP * (1.0 + abs(given)):
+        if held[k] and abs(found - given) > 1e3 * GAP * (1.0 + abs(given)):
             unit = next(g.axis.unit for g in system.coordinates if k in np.asarray(g.index))
             warnings.warn(
                 f"the constraints do not allow joint {name!r} to be at {given:.6g} {unit}, where it was set; "

@@ -124,14 +124,15 @@ class Backward(InTurn):
                 ends = jax.tree.map(lambda x: jnp.where(at.forming, 0.0, x), ends)
             return pull((at.asked(lam), *ends))
 
-        def judged(lam: Array, learnt: tuple, at: Correcting, matrix: Array, gap: Array) -> tuple:
+        def judged(given: tuple, gap: Array) -> tuple:
+            lam, learnt, at, matrix = given
             at, matrix = at.formed(matrix, gap)
             factors = c.factors.with_changes(learnt)
             at, known = at.judged(factors, lam, gap + y_bar, fixed.masses, patience, whole)
             return jnp.where(at.moving, lam - at.change, lam), known.changing, at, matrix
 
         def nearer(carry: tuple) -> tuple:
-            return judged(*carry, pulled(carry[0], carry[2])[-1])
+            return judged(carry, pulled(carry[0], carry[2])[-1])
 
         def evaluated(carry: tuple) -> tuple:
             given = carry[1:]
@@ -140,7 +141,7 @@ class Backward(InTurn):
                     lambda x: any_lane((x[2].going & ~x[2].last) | x[2].forming), nearer, given
                 )
             *bars, gap = pulled(given[0], given[2])
-            return tuple(bars), *judged(*given, gap)
+            return tuple(bars), *judged(given, gap)
 
         start = nothing, c.solution, c.factors.changing, c.at, matrix
         going = lambda x: any_lane(x[3].going | x[3].forming)  # noqa: E731

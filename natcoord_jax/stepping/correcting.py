@@ -1,6 +1,7 @@
 """Linear systems, solved by corrections with factors that need not be their own."""
 
 from functools import partial
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -40,7 +41,7 @@ STALL = 1e-10
 CORRECTIONS = 30
 """Corrections with one factorisation."""
 
-ROUNDS = 4
+ROUNDS = 3
 """Factorisations for one system."""
 
 
@@ -157,6 +158,22 @@ class Correcting(eqx.Module):
             (known, directions, nought, self.rounds + 1, nought, nought + most, no, no),
         )
 
+    def _proposed(
+        self, solver: Any, residual: Array, weights: Array, allowed: Array
+    ) -> tuple[Any, Array, tuple[Array, Array, Array, Directions, Array]]:
+        """The solver with what it has learnt, the next correction, and what is kept of it."""
+        telling = self.going & (self.count > 0) & (self.correction > allowed)
+        if not learns(solver):
+            image = self.residual - residual
+            directions = self.directions.followed_by(self.change, image, 1.0 / weights, telling)
+            change = directions.correction(solver, residual, 1.0 / weights)
+            return solver, change, (change, change, self.known, directions, residual)
+        change = solver.solve(residual)
+        solver, change, telling = learnt(solver, self.change, change, weights, telling, self.news)
+        known = jnp.where(telling, jnp.concatenate([self.news[None], self.known[:-1]]), self.known)
+        news = across(known, change, weights)
+        return solver, change, (change, news, known, self.directions, self.residual)
+
     def judged(
         self,
         factors: Factors,
@@ -183,32 +200,21 @@ class Correcting(eqx.Module):
         """
         solver = factors.solver.transpose() if transposed else factors.solver
         weights = _weights(factors.inertias)
-        directions, before = self.directions, self.residual
-        if learns(solver):
-            change = solver.solve(residual)
-        else:
-            made = self.going & (self.count > 0)
-            directions = directions.followed_by(self.change, before - residual, 1.0 / weights, made)
-            change, before = directions.correction(solver, residual, 1.0 / weights), residual
         size = _size(lam, weights)
         allowed = jnp.maximum((CLOSE if transposed else CLOSE_FORWARD) * size, ROUND_OFF * whole)
-        known, news = self.known, change
-        if learns(solver):  # Others would only be transposed twice.
-            telling = self.going & (self.count > 0) & (self.correction > allowed)
-            solver, change, telling = learnt(solver, self.change, change, weights, telling, self.news)
+        solver, change, made = self._proposed(solver, residual, weights, allowed)
+        if learns(solver):  # Others have not changed, and would only be transposed twice.
             given_back = solver.transpose() if transposed else solver
             factors = eqx.tree_at(lambda f: f.solver, factors, given_back)
-            known = jnp.where(telling, jnp.concatenate([self.news[None], known[:-1]]), known)
-            news = across(known, change, weights)
-        correction, entire = _size(news, weights), _size(change, weights)
+        correction, entire = _size(made[1], weights), _size(change, weights)
         ratio = correction / jnp.where(self.correction > 0, self.correction, 1.0)
         first = self.count == 0
         finite = jnp.isfinite(correction) & jnp.isfinite(size)
         floor = jnp.maximum(STALL * size, STALL_ROUND_OFF * whole)
         # With factors of another system, corrections that stop shrinking may be these factors' fault.
-        stalled = ~first & (ratio > 0.5) & (entire <= floor) & (self.rounds > 0)
-        within = entire <= jnp.where(self.last, SURPRISE, 1.0) * allowed
         own = self.rounds > 0
+        stalled = ~first & (ratio > 0.5) & (entire <= floor) & own
+        within = entire <= jnp.where(self.last, SURPRISE, 1.0) * allowed
         size_by_mass, missing = sizes_by_mass(lam, residual, masses)
         sure = jnp.maximum((CLOSE if transposed else CLOSE_FORWARD) * size_by_mass, ROUND_OFF * whole)
         sure = missing <= jnp.maximum(sure, NOISE * factors.floor * size_by_mass)
@@ -222,12 +228,13 @@ class Correcting(eqx.Module):
         factors = eqx.tree_at(lambda f: f.floor, factors, left)
         last = following <= allowed
         late = correction * ratio ** (patience * (SPEED if learns(solver) else 1)) > allowed
-        slow = (~first & ((ratio > 0.5) | late)) | (self.count >= CORRECTIONS) | ~finite | ~factors.usable
+        # Formulas leave out what is mostly small: where it is not, directions make up for it.
+        slow = ~first & ((ratio > 0.5) | late) & ~(own & (not learns(solver)))
+        slow = slow | (self.count >= CORRECTIONS) | ~finite | ~factors.usable
         slow = slow & ~done
         moving = ~slow & ~done
         count = self.count + 1
         rounds = self.rounds, self.rows, self.most
-        made = change, news, known, directions, before
         found = Correcting(*made, correction, count, *rounds, done, slow, moving, last)
         stay = eqx.tree_at(lambda c: c.moving, self, jnp.zeros_like(self.moving))
         return jax.tree.map(partial(jnp.where, ~self.going), stay, found), factors

@@ -115,9 +115,8 @@ class Factors(eqx.Module):
         Args:
             size: of the terms of the equations, but for those that cancel.
         """
-        (least, most), terms = NOISE, size + self.grain
-        found = jnp.minimum(self.noise, most) * terms
-        return jnp.where(found > least * size, found, 0.0)
+        (least, most), found = NOISE, self.noise * (size + self.grain)
+        return jnp.where(found > least * size, jnp.minimum(found, most * size), 0.0)
 
 
 def no_factors(equations: Any) -> Factors:

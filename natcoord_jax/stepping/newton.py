@@ -56,6 +56,9 @@ STALL_ALIKE = 2.0
 """The same with factors for which stages are alike: about an axis with next to no inertia these may halve the
 error only, which would be taken for noise in the steps that follow, too."""
 
+RESTING = STALL_OLD * ROUND_OFF
+"""Corrections up to this part of the terms that cancel are what stiff parts at rest are rounded by."""
+
 CHORD_ITERATIONS = 14
 """Corrections with one factorisation."""
 
@@ -68,9 +71,6 @@ FEW_ROUNDS = 4
 LEARNING = 1e-12
 """Size of a correction relative to the terms of the equations from which on the next tells how good the
 factors are: below, rounding has a part in it."""
-
-CLEAR = STALL_OLD * ROUND_OFF
-"""The same in terms of what cancels in the equations: known, not guessed."""
 
 NEAR = 1e-3
 """The same up to which it does: far off, equations are not linear, and what failed attempts teach is noise,
@@ -194,7 +194,7 @@ def judge(
     done = it.converged | it.wanting | ~it.finite
     grain = factors.grain
     change = factors.solver.solve(residual)
-    near = (it.correction > LEARNING * size + CLEAR * grain) & (it.correction < NEAR * size)
+    near = (it.correction > LEARNING * size) & (it.correction < NEAR * size)
     telling = ~done & (it.count > 0) & ~jnp.asarray(jumped) & near
     solver, change, _ = learnt(factors.solver, it.change, change, factors.inertias, telling)
     factors = eqx.tree_at(lambda f: f.solver, factors, solver)
@@ -210,8 +210,8 @@ def judge(
     raised = jnp.asarray(RAISED)[jnp.clip(it.rounds - 1, 0, STALLS)]
     trust = jnp.where(alike, STALL_ALIKE, jnp.where(factors.fresh, raised, STALL_OLD))
     # What stiff parts at rest are rounded by is known, and needs no room for more.
-    resting = jnp.minimum(trust, STALL_OLD / STALL * raised)
-    floor = trust * max(tolerance, ROUND_OFF) * size + resting * ROUND_OFF * grain
+    resting = jnp.minimum(trust / STALL_OLD, raised / STALL) * RESTING * grain
+    floor = trust * max(tolerance, ROUND_OFF) * size + resting
     noise = factors.noise_of(size)
     finite = jnp.isfinite(correction) & jnp.isfinite(size)
     stalled = ~first & (ratio > 0.5) & (correction <= floor)

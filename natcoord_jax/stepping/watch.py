@@ -18,7 +18,7 @@ from natcoord_jax.assembly.balances import rotors_of
 from natcoord_jax.assembly.momentum import inertia, motion
 from natcoord_jax.assembly.system import System
 from natcoord_jax.core.state import State
-from natcoord_jax.stepping.newton import CLEAR, TOLERANCE
+from natcoord_jax.stepping.newton import RESTING, TOLERANCE
 
 UNSOUND = 1e-12
 """Work of the residual in terms of the energy of the motion, twice, beyond which a step is refused."""
@@ -84,5 +84,5 @@ def sound(
     allowed = max(tolerance / TOLERANCE, 1.0) * (UNSOUND * moving + rounding)
     rows = before.q.reshape(-1, 4, 3)
     places = jnp.sum(rows * inertia(system.mass, rows))
-    near = ((equations.h * correction) ** 2 <= PLACES**2 * places) | (correction <= CLEAR * grain)
+    near = ((equations.h * correction) ** 2 <= PLACES**2 * places) | (correction <= RESTING * grain)
     return near | (unbalanced_work(equations, y, residual) <= allowed)

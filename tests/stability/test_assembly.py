@@ -39,7 +39,8 @@ def jointed(joint, **drive):
     scene = nc.Scene()
     body = scene.add(block(position=(0.3, 0.2, 0.1)))
     options = next((o for kind, o in SPECIAL.items() if issubclass(joint, kind)), {})
-    made = joint(nc.ground, body, (0.2, 0.1, -0.3), AXIS, second=SECOND, name="joint", **options)
+    place = {"point": (0.2, 0.1, -0.3), "axis": AXIS, "second": SECOND}
+    made = joint(nc.ground, body, **place, name="joint", **options)
     hinge = scene.add(made)
     if drive:
         scene.add(nc.Drive(hinge, name="drive", **drive))
@@ -60,7 +61,7 @@ def test_a_drive_that_the_start_does_not_obey(name, index):
         jointed(joint, coordinate=index, function=lambda t: 0.3 + 0.2 * t).compile()
     with pytest.warns(UserWarning, match=rf"drive 'drive' by 0\.2 {unit}/s"):
         system, state = jointed(joint, coordinate=index, function=lambda t: 0.2 * t).compile()
-    assert float(system.rate(state, "joint", index)) == pytest.approx(0.2, rel=1e-9)
+    assert float(system.rate(state, "joint", index=index)) == pytest.approx(0.2, rel=1e-9)
     assert errors(system, state) <= tol.CONSTRAINT
 
 
@@ -68,8 +69,8 @@ def test_a_drive_that_the_start_does_not_obey(name, index):
 def test_a_drive_is_assembled_where_it_asks(name, index):
     scene = jointed(JOINTS[name], coordinate=index, function=lambda t: 0.3 + 0.2 * t)
     system, state = scene.compile(assemble=True)
-    assert float(system.coordinate(state, "joint", index)) == pytest.approx(0.3, rel=1e-9)
-    assert float(system.rate(state, "joint", index)) == pytest.approx(0.2, rel=1e-9)
+    assert float(system.coordinate(state, "joint", index=index)) == pytest.approx(0.3, rel=1e-9)
+    assert float(system.rate(state, "joint", index=index)) == pytest.approx(0.2, rel=1e-9)
     assert errors(system, state) <= tol.CONSTRAINT
 
 
@@ -158,7 +159,7 @@ def test_what_cannot_be_reached_is_named_with_what_remains(target):
     arm = scene.add(block(position=(0.0, 0.0, 0.0)))
     scene.add(nc.Revolute(nc.ground, arm, name="shoulder"))
     rod = nc.Distance(
-        nc.ground, arm, (1.0, 0.0, 0.0), parent_point=(-1.0, 0.0, 0.0), length=target, name="rod"
+        nc.ground, arm, point=(1.0, 0.0, 0.0), parent_point=(-1.0, 0.0, 0.0), length=target, name="rod"
     )
     scene.add(rod)
     with pytest.raises(ValueError, match="joint 'rod' does not close"):

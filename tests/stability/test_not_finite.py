@@ -118,6 +118,7 @@ def test_other_lanes_are_untouched():
         np.testing.assert_array_equal(batch.q[lane], run(speeds[lane]).q)
 
 
+@pytest.mark.slow
 def test_gradients_come_back():
     """Of a run that has failed: nothing is said of their value but that it is not a hang."""
     system, state, _ = arms("reduced")

@@ -35,10 +35,12 @@ def removed(scene: nc.Scene) -> None:
     for name, joint in scene.joints.items():
         bodies = joint.parent, joint.child
         if name.startswith("right pin"):
-            scene.joints[name] = nc.Spherical(*bodies, joint.point, name=name)
+            scene.joints[name] = nc.Spherical(*bodies, point=joint.point, name=name)
         elif name == "hinge 6":
             second = np.roll(joint.axis, 1)
-            scene.joints[name] = nc.Universal(*bodies, joint.point, joint.axis, second=second, name=name)
+            scene.joints[name] = nc.Universal(
+                *bodies, point=joint.point, axis=joint.axis, second=second, name=name
+            )
 
 
 def added(scene: nc.Scene) -> None:

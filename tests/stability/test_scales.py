@@ -234,7 +234,9 @@ def limbs(kinds, form: str):
         limb = part(f"{name} limb", place)
         kind = JOINTS[name] if form == "tree" else with_multipliers(JOINTS[name])
         more = {"pitch": 0.4} if name == "screw" else {}
-        joint = scene.add(kind(hub, limb, 0.6 * place, (1, 2, 2), second=(2, 1, -2), name=name, **more))
+        joint = scene.add(
+            kind(hub, limb, point=0.6 * place, axis=(1, 2, 2), second=(2, 1, -2), name=name, **more)
+        )
         for k in range(len(kind.coordinates)):
             scene.add(
                 nc.JointSpring(joint, coordinate=k, stiffness=3.0, rest=0.4, name=f"coil {k} of {name}")

@@ -33,7 +33,9 @@ def still():
         body = scene.add(
             nc.RigidBody(mass=1.0, inertia=(0.2, 0.2, 0.2), position=place, name=f"body of {name}")
         )
-        hinge = scene.add(joint(carrier, body, place, (0.0, 0.0, 1.0), second=(1.0, 0.0, 0.0), name=name))
+        hinge = scene.add(
+            joint(carrier, body, point=place, axis=(0.0, 0.0, 1.0), second=(1.0, 0.0, 0.0), name=name)
+        )
         for k in range(len(joint.coordinates)):
             scene.add(nc.JointSpring(hinge, coordinate=k, stiffness=3.0, name=f"coil {k} of {name}"))
         ends = nc.Point(carrier, place + jnp.array([0.0, 1.0, 0.0])), nc.Point(body, place)
