@@ -89,7 +89,7 @@ def spinning(moment, attached=False):
     moving = dict(position=(0, 0, 0.5), velocity=(-0.15, -0.2, 0.0), angular_velocity=(0.4, -0.3, 60.0))
     body = scene.add(nc.RigidBody(mass=2.0, second_moment=moment, **moving))
     scene.add(nc.Spherical(nc.ground, body, point=(0, 0, 0)))
-    scene.add(nc.Gravity(name=(0.0, 0.0, -9.81)))
+    scene.add(nc.Gravity(vector=(0.0, 0.0, -9.81)))
     if attached:
         scene.add(nc.Spring((nc.Point(nc.ground, (2, 0, 0)), nc.Point(body, (0.1, 0, 0.5))), stiffness=10.0))
     return scene.compile()
