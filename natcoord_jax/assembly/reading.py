@@ -164,8 +164,25 @@ def _every(system: System, states: State) -> State:
     if count <= together:
         found = jax.vmap(read)(flat)
     else:
-        found = jax.lax.map(read, flat, batch_size=together)
+        found = _in_batches(read, flat, together)
     return jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), found)
+
+
+def _in_batches(read: Callable[[State], State], states: State, size: int) -> State:
+    """So many states at a time; `jax.lax.map` takes no arrays without numbers."""
+    leaves, structure = jax.tree.flatten(states)
+    full = [k for k, x in enumerate(leaves) if x.size]
+
+    def some(given: list[Array]) -> list[Array]:
+        every = [jnp.zeros(x.shape[1:], x.dtype) for x in leaves]
+        for k, x in zip(full, given):
+            every[k] = x
+        found = jax.tree.leaves(read(jax.tree.unflatten(structure, every)))
+        return [found[k] for k in full]
+
+    for k, x in zip(full, jax.lax.map(some, [leaves[k] for k in full], batch_size=size)):
+        leaves[k] = x
+    return jax.tree.unflatten(structure, leaves)
 
 
 _handed: ContextVar[Any] = ContextVar("handed", default=None)

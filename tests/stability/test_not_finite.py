@@ -66,7 +66,7 @@ def sick(solver):
         "far away": (system, eqx.tree_at(lambda s: s.q, state, state.q.at[4, 0].set(jnp.inf)), 0.0),
         "speeds": (system, eqx.tree_at(lambda s: s.v, state, state.v * jnp.nan), 0.0),
         "too fast": (system, eqx.tree_at(lambda s: s.v, state, state.v.at[4, 0].set(jnp.inf)), 0.0),
-        "coordinate": (system, system.with_coordinate(state, hinge, jnp.nan), 0.0),
+        "coordinate": (system, jax.jit(lambda x: system.with_coordinate(state, hinge, x))(jnp.nan), 0.0),
         "mass": (eqx.tree_at(lambda s: s.mass, system, system.mass * jnp.nan), state, 0.0),
         "torque": (system, state, jnp.nan),
     }
