@@ -18,20 +18,6 @@ TABLE = np.array([0.0, 0.0, 1.0])
 GAINS = dict.fromkeys(("drive", "pull", "law", "module", "force", "tether", "damper", "invariant"), 1.0)
 
 
-@pytest.fixture
-def programs():
-    """Rollouts and other programs that are compiled."""
-    found = []
-
-    def count(name, seconds, **given):
-        if name.endswith("backend_compile_duration"):
-            found.append(given.get("fun_name"))
-
-    jax.monitoring.register_event_duration_secs_listener(count)
-    yield found
-    jax.monitoring.unregister_event_duration_listener(count)
-
-
 @functools.cache
 def motor():
     scene = nc.Scene()
