@@ -21,7 +21,7 @@ from natcoord_jax.core.host import on_host
 from natcoord_jax.stepping.derivative import run_slots
 from natcoord_jax.stepping.error_control import Tolerance
 from natcoord_jax.stepping.newton import TOLERANCE
-from natcoord_jax.stepping.plan import Plan
+from natcoord_jax.stepping.plan import Event, Plan
 
 KINDS = "start", "system", "inputs", "step"
 """What changes along the directions of a case."""
@@ -190,8 +190,8 @@ def _policy(parameters: Any, step: Any, t: Any, state: nc.State, fraction: Any) 
 
 def _plan(template: Template, inputs: Any) -> Plan:
     control = _policy if callable(inputs) else None
-    tableau = template.scheme.tableau
-    return Plan(template.steps, template.extra, TOLERANCE, control, template.until, tableau)
+    event = None if template.until is None else Event.of(template.until)[0]
+    return Plan(template.steps, template.extra, TOLERANCE, control, event, template.scheme.tableau)
 
 
 def _saved(template: Template, slots: Any, states: nc.State) -> nc.State:

@@ -299,7 +299,7 @@ def mixed(stages: int):
         axes = {"axis": (1.0, 0.0, 0.0), "second": (0.0, 1.0, 0.0)} if kind is nc.Universal else {}
         axes = {"axis": random.normal(size=3)} if kind not in (nc.Universal, nc.Spherical) else axes
         pair = (bodies[-1], parent) if kind is nc.Cylindrical else (parent, bodies[-1])
-        joint = scene.add(kind(*pair, random.normal(size=3), **axes))
+        joint = scene.add(kind(*pair, point=random.normal(size=3), **axes))
         scene.add(nc.Spring((nc.Point(parent, 0.5 * place), nc.Point(bodies[-1], place)), stiffness=5.0))
         if stages == 1 and kind is nc.Revolute:
             scene.add(nc.JointSpring(joint, stiffness=3.0))

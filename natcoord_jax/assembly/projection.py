@@ -133,8 +133,8 @@ class Projection(eqx.Module):
         if held is not None:
             matrix = jnp.concatenate([matrix, held[:, None] * coordinate_matrix(system, state)])
         inverse = jax.vmap(definite_inverse)(inertias(system, state.q.reshape(-1, 4, 3)))
-        by_body = matrix.reshape(matrix.shape[0], -1, TWIST)
-        impulses = jnp.einsum("bcd,mbd->bcm", inverse, by_body).reshape(-1, matrix.shape[0])
+        by_body = matrix.reshape(matrix.shape[0], inverse.shape[0], TWIST)
+        impulses = jnp.einsum("bcd,mbd->bcm", inverse, by_body).reshape(matrix.shape[::-1])
         stiffness = jnp.einsum("mt,tm->m", matrix, impulses)
         scale = jnp.sqrt(jnp.where(stiffness > 0, stiffness, 1.0))
         return cls(matrix / scale[:, None], impulses / scale, scale)

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from natcoord_jax.assembly.coordinates import state_rates
+from natcoord_jax.assembly.reading import tangent
 from natcoord_jax.assembly.system import SYSTEM, System
 from natcoord_jax.control.inverse import followed, places_of
 from natcoord_jax.core.arguments import checked
@@ -132,4 +133,5 @@ def computed_torque(
 
 @compiled
 def _rates(system: System, states: State) -> Float[Array, "steps c"]:
-    return jax.vmap(lambda state: state_rates(system, state))(states)
+    """As the feedback is handed them."""
+    return jax.vmap(lambda state: state_rates(system, tangent(system, state)))(states)

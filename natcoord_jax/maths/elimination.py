@@ -21,6 +21,8 @@ def definite_inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
     size = matrix.shape[-1]
     if size > LOOPED:
         return jnp.linalg.inv(matrix)
+    if not size:
+        return matrix
     number = jnp.arange(size)
 
     def eliminate(k: Array, matrix: Array) -> Array:

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import reduce
-from typing import Any, Self
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -79,7 +79,7 @@ class Apart:
     rest: Any
 
     @classmethod
-    def of(cls, function: Any) -> tuple[Self, Any]:
+    def of(cls, function: Any) -> tuple["Apart", Any]:
         """A callable apart into this and its numbers."""
         numbers, rest = eqx.partition(function, eqx.is_array)
         return cls(rest), numbers

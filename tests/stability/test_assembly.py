@@ -239,3 +239,17 @@ def test_derivatives_of_assembly(name, angle):
     batch = jax.jit(jax.vmap(gradient))(both)
     for k in range(2):
         np.testing.assert_allclose(batch[k], gradient(both[k]), rtol=tol.SAME_GRADIENT)
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_bodies_without_joints_only_get_square_frames(count):
+    """No constraint, nothing to close: also where there is nothing but a mass."""
+    scene = nc.Scene()
+    scene.add(nc.PointMass(mass=1.0, position=(0, 0, 1), velocity=(1, 2, 3), name="bead"))
+    if count == 2:
+        scene.add(nc.RigidBody(mass=1.0, inertia=(1, 2, 2), velocity=(1, 0, 0), name="hull"))
+    system, state = scene.compile()
+    found, tangents = jax.jvp(lambda x: nc.assemble(system, x), (state,), (state,))
+    for reached in (found, tangents):
+        np.testing.assert_allclose(reached.q[0], state.q[0], rtol=0, atol=1e-15)
+        np.testing.assert_allclose(reached.v[0], state.v[0], rtol=0, atol=1e-15)
