@@ -26,10 +26,10 @@ def reverse(template: Template, case: Case, numbers: Any) -> tuple:
 
 
 @compiled
-def checkpointed(template: Template, case: Case) -> Any:
-    """The gradient where the way back recomputes."""
+def checkpointed(template: Template, case: Case) -> tuple:
+    """The gradient where the way back recomputes, and what the runs say."""
     f = simulated(template, checkpoint=True)
-    return jax.grad(f, has_aux=True)(case.numbers, case.rest, case.weights)[0]
+    return jax.grad(f, has_aux=True)(case.numbers, case.rest, case.weights)
 
 
 @compiled
@@ -160,7 +160,10 @@ def examined(template: Template, seed: int) -> dict[str, tuple[float, float]]:
         errors[f"reverse, {kind}"] = float(abs(x - y) / scale), same
     errors["forward"] = float(abs(slope - total) / largest), same
     if "checkpointed" in template.more and ended:  # Its segments have substeps of their own to use up.
-        errors["checkpointed"] = every(contracted(checkpointed(template, case), case.directions)), same
+        found, segments = checkpointed(template, case)
+        # Which steps are repeated may be a matter of rounding: other substeps are another motion.
+        if np.all(np.array(segments) == np.array(said)):
+            errors["checkpointed"] = every(contracted(found, case.directions)), same
     if "directions" in template.more:
         errors["directions"] = every(directions(template, case)), same
     if "batch" in template.more:
