@@ -96,8 +96,9 @@ def check_counts(slots, course):
     assert rejected == int(course.rejected) > 0
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("order", [2, 4])
+@pytest.mark.parametrize(
+    "order", [pytest.param(2, marks=pytest.mark.slow), pytest.param(4, marks=pytest.mark.exhaustive)]
+)
 def test_derivatives_follow_the_accepted_substeps(order):
     """As those of the same substeps made one by one, of lengths that do not depend on anything; in lanes."""
     system, state = pendulum()

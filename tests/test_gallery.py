@@ -1,16 +1,21 @@
 """Scenes of the gallery: each runs, keeps its balances, and meets the numbers that are known of it."""
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+import tolerances as tol
 
+import natcoord_jax as nc
 from natcoord_jax import gallery
 from natcoord_jax.analysis import balance
 from natcoord_jax.gallery.spacecraft import TABLE, TORQUE, compare_torques
 
 # Compiling takes all the time: the small scenes by default, the rest with the slow tests.
 QUICK = ("spacecraft", "double_pendulum", "heavy_top")
-ELSEWHERE = ("plugging",)
-"""Scenes whose solution has tests of its own, and takes long."""
+ELSEWHERE = ("plugging", "reorientation", "robot_cable")
+"""Scenes that have tests of their own, and take long."""
 # Balances after a few steps of round-off, relative; loops and drives are solved a little less sharply.
 BALANCE = 1e-11
 # Second-order error of the suggested step in the quantities below [m, rad/s, relative].
@@ -110,3 +115,33 @@ def test_torque_formulas_give_the_table_of_the_paper():
         assert wrong.angular_momentum[-1] == pytest.approx(wrong_momentum, abs=digits[2])
         assert np.abs(right.angular_momentum).max() <= 1e-9 * 3 * TORQUE * 5.0
         assert right.t.shape == right.energy.shape == (steps + 1,)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(x, marks=pytest.mark.slow if x == "four_bar" else pytest.mark.exhaustive)
+        for x in gallery.SCENES
+    ],
+)
+def test_modes_of_differentiation_agree(name: str):
+    """Forward and reverse, along a change of velocities and one of all masses."""
+    example, steps = gallery.load(name), 20
+    system, rng = example.system, np.random.default_rng(0)
+    inputs = jnp.ones((steps, len(system.structure.inputs)))
+    weights, faster = rng.normal(size=(2, *example.state.q.shape))
+    point, changes = (example.state.v, jnp.ones(())), (jnp.asarray(faster), jnp.ones(()))
+
+    def loss(point):
+        v, factor = point
+        heavier = eqx.tree_at(lambda s: s.mass, system, factor * system.mass)
+        start = eqx.tree_at(lambda s: s.v, example.state, v)
+        end = nc.simulate(heavier, start, dt=example.dt, steps=steps, inputs=inputs).states
+        return jnp.sum(weights * (end.q[-1] + end.v[-1]))
+
+    (by_v, by_factor), slope = jax.jit(lambda x: (jax.grad(loss)(x), jax.jvp(loss, (x,), (changes,))[1]))(
+        point
+    )
+    terms = np.append(np.ravel(by_v * faster), by_factor)
+    assert np.max(np.abs(terms)) > 0, "nothing is tested"
+    assert abs(float(slope) - terms.sum()) <= tol.SAME_DERIVATIVE * np.max(np.abs(terms))

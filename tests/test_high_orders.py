@@ -120,7 +120,7 @@ def last(stiffness, order, steps=5):
 
 
 @pytest.mark.parametrize(
-    "order", [pytest.param(6, marks=pytest.mark.exhaustive), pytest.param(10, marks=pytest.mark.slow)]
+    "order", [pytest.param(6, marks=pytest.mark.slow), pytest.param(10, marks=pytest.mark.exhaustive)]
 )
 def test_a_gradient(order):
     """In reverse, of a loss that has the work of motor and damper in it, against differences."""

@@ -33,7 +33,12 @@ NOISE = {"open_tree": 3e-14, "four_bar": 3e-14, "stiff_chain": 1e-12}
 
 
 @pytest.mark.parametrize(
-    "name", ["four_bar", *(pytest.param(x, marks=pytest.mark.slow) for x in ("open_tree", "stiff_chain"))]
+    "name",
+    [
+        "four_bar",
+        pytest.param("stiff_chain", marks=pytest.mark.slow),
+        pytest.param("open_tree", marks=pytest.mark.exhaustive),
+    ],
 )
 def test_steps_obey_the_equations_with_their_own_kick(name):
     order, h, steps = SCENES[name]

@@ -269,7 +269,15 @@ def end_of(scene, order):
 
 
 CASES = [
-    pytest.param(scene, order, id=f"{name}-{order}", marks=[pytest.mark.slow] if order > 2 else [])
+    pytest.param(scene, order, id=f"{name}-{order}", marks=[pytest.mark.exhaustive] if order > 2 else [])
+    for name, scene in SCENES.items()
+    for order in SCHEMES
+]
+
+SECOND = [
+    pytest.param(
+        scene, order, id=f"{name}-{order}", marks=pytest.mark.exhaustive if order > 2 else pytest.mark.slow
+    )
     for name, scene in SCENES.items()
     for order in SCHEMES
 ]
@@ -289,8 +297,7 @@ def test_rollouts_from_special_points(scene, order):
         assert np.min(difference_errors(value, x, direction, forward)) <= tol.DIFFERENCE_BEST, point
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("scene", "order"), CASES)
+@pytest.mark.parametrize(("scene", "order"), SECOND)
 def test_second_derivatives_of_rollouts_at_special_points(scene, order):
     """Forward over reverse, against differences of the gradient."""
     end, points = end_of(scene, order)

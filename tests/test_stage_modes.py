@@ -166,7 +166,12 @@ def test_evaluations_of_a_jacobian_are_told_what_they_are_for():
 
 
 @pytest.mark.parametrize(
-    "name", ["bricard", *(pytest.param(x, marks=pytest.mark.slow) for x in ("four_bar", "robot_arm"))]
+    "name",
+    [
+        "bricard",
+        pytest.param("four_bar", marks=pytest.mark.slow),
+        pytest.param("robot_arm", marks=pytest.mark.exhaustive),
+    ],
 )
 def test_jacobian_with_multipliers_of_all_stages_together(name):
     # What could go wrong: forces of a constraint, or of a drive, that reach another stage.

@@ -307,8 +307,9 @@ def mixed(stages: int):
     return scene
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("stages", [1, 2])
+@pytest.mark.parametrize(
+    "stages", [pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.exhaustive)]
+)
 def test_blocks_along_the_tree_are_the_jacobian(stages):
     """Of the same residual as the reduced form's; their factors solve with it and its transpose."""
 

@@ -59,7 +59,7 @@ from natcoord_jax.maths.vectors import dot
 NOTHING = Outset(None, None)
 """Of the start of a step that is used for its constraints alone."""
 
-PROBE = 1e-7
+PROBE = 1e-6
 """Change of a rotation [rad] that gives a column of the Jacobian."""
 
 

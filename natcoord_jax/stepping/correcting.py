@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from natcoord_jax.linsolve.acceleration import Directions
 from natcoord_jax.linsolve.learning import MEMORY, SPEED, across, learns, learnt
 from natcoord_jax.maths.rows import row, with_row
 from natcoord_jax.stepping.factors import Factors
@@ -29,12 +28,6 @@ STALL_ROUND_OFF = 1e-12
 SURPRISE = 10.0
 """Times the error allowed by which the correction may be larger that was expected to be within it."""
 
-NOISE = 4.0
-"""Times what rounding has left of a system solved with factors of its own that may be left of the next."""
-
-FORGETTING = 0.5
-"""Part of what rounding has left of a system which still counts in those that follow."""
-
 STALL = 1e-10
 """Corrections that stop shrinking below this have reached the floor of round-off."""
 
@@ -51,8 +44,8 @@ class Correcting(eqx.Module):
     It is solved where an evaluation at the solution says so, never before: factors of another system, and
     what corrections have left there, are a guess of how many corrections it takes. Such factors may not even
     see an error, as those of a stiff stop do not where the stop is left. So the residual has to be small in
-    terms of the masses alone, too: the error is no larger, whatever stiffness there is. What rounding of
-    stiff forces leaves is more than that; it is known from systems solved with factors of their own.
+    terms of the masses alone, too: the error is no larger, whatever stiffness there is. Where rounding
+    of stiff forces leaves more, factors of its own tell.
 
     Attributes:
         change: last correction with these factors.
@@ -60,8 +53,6 @@ class Correcting(eqx.Module):
             of the others is known: equations are linear here. Only of this part an error remains.
         known: the same of corrections of which the factors have learnt, if they are of that kind; the last
             one first.
-        directions: corrections and what they have changed, if the factors do not learn.
-        residual: before the last correction, likewise.
         correction: size of the news (energy norm).
         count: corrections with these factors.
         rounds: factorisations for this system.
@@ -76,8 +67,6 @@ class Correcting(eqx.Module):
     change: Float[Array, " unknowns"]
     news: Float[Array, " unknowns"]
     known: Float[Array, "corrections unknowns"]
-    directions: Directions
-    residual: Float[Array, " _"]
     correction: Float[Array, ""]
     count: Int[Array, ""]
     rounds: Int[Array, ""]
@@ -95,25 +84,9 @@ class Correcting(eqx.Module):
         nought, no = jnp.array(0), jnp.array(False)
         nothing = jnp.zeros_like(lam)
         known = jnp.zeros((memory * learning, *lam.shape), lam.dtype)
-        directions = Directions.none(memory * (not learning), lam)
-        before = nothing[: 0 if learning else None]
         size = jnp.zeros((), lam.dtype)
-        return cls(
-            nothing,
-            nothing,
-            known,
-            directions,
-            before,
-            size,
-            nought,
-            nought,
-            nought,
-            nought + most,
-            no,
-            no,
-            no,
-            no,
-        )
+        counts = nought, nought, nought, nought + most
+        return cls(nothing, nothing, known, size, *counts, no, no, no, no)
 
     @property
     def open(self) -> Bool[Array, ""]:
@@ -151,28 +124,25 @@ class Correcting(eqx.Module):
     def refreshed(self, most: int) -> "Correcting":
         """With new factors; for the next ones, so many rows of the matrix are to be formed."""
         nought, no = jnp.zeros_like(self.count), jnp.zeros_like(self.last)
-        known, directions = jax.tree.map(jnp.zeros_like, (self.known, self.directions))
+        known = jnp.zeros_like(self.known)
         return eqx.tree_at(
-            lambda c: (c.known, c.directions, c.count, c.rounds, c.rows, c.most, c.wanting, c.last),
+            lambda c: (c.known, c.count, c.rounds, c.rows, c.most, c.wanting, c.last),
             self,
-            (known, directions, nought, self.rounds + 1, nought, nought + most, no, no),
+            (known, nought, self.rounds + 1, nought, nought + most, no, no),
         )
 
     def _proposed(
         self, solver: Any, residual: Array, weights: Array, allowed: Array
-    ) -> tuple[Any, Array, tuple[Array, Array, Array, Directions, Array]]:
+    ) -> tuple[Any, Array, tuple[Array, Array, Array]]:
         """The solver with what it has learnt, the next correction, and what is kept of it."""
-        telling = self.going & (self.count > 0) & (self.correction > allowed)
-        if not learns(solver):
-            image = self.residual - residual
-            directions = self.directions.followed_by(self.change, image, 1.0 / weights, telling)
-            change = directions.correction(solver, residual, 1.0 / weights)
-            return solver, change, (change, change, self.known, directions, residual)
         change = solver.solve(residual)
+        if not learns(solver):
+            return solver, change, (change, change, self.known)
+        telling = self.going & (self.count > 0) & (self.correction > allowed)
         solver, change, telling = learnt(solver, self.change, change, weights, telling, self.news)
         known = jnp.where(telling, jnp.concatenate([self.news[None], self.known[:-1]]), self.known)
         news = across(known, change, weights)
-        return solver, change, (change, news, known, self.directions, self.residual)
+        return solver, change, (change, news, known)
 
     def judged(
         self,
@@ -216,19 +186,15 @@ class Correcting(eqx.Module):
         stalled = ~first & (ratio > 0.5) & (entire <= floor) & own
         within = entire <= jnp.where(self.last, SURPRISE, 1.0) * allowed
         size_by_mass, missing = sizes_by_mass(lam, residual, masses)
-        sure = jnp.maximum((CLOSE if transposed else CLOSE_FORWARD) * size_by_mass, ROUND_OFF * whole)
-        sure = missing <= jnp.maximum(sure, NOISE * factors.floor * size_by_mass)
+        close_by_mass = (CLOSE if transposed else CLOSE_FORWARD) * size_by_mass
+        sure = missing <= jnp.maximum(close_by_mass, ROUND_OFF * whole)
         done = (within | stalled) & (own | sure) & finite & factors.usable
         following = correction * factors.left_by(ratio, first)
         compares = self.going & ~first & (self.correction > allowed) & finite
         factors = factors.having_left(ratio, compares)
-        left = missing / jnp.where(size_by_mass > 0, size_by_mass, jnp.inf)
-        left = jnp.maximum(left, FORGETTING * factors.floor)
-        left = jnp.where(done & own & self.going, left, factors.floor)
-        factors = eqx.tree_at(lambda f: f.floor, factors, left)
         last = following <= allowed
         late = correction * ratio ** (patience * (SPEED if learns(solver) else 1)) > allowed
-        # Formulas leave out what is mostly small: where it is not, directions make up for it.
+        # Formulas leave out what is mostly small, and no others would take more of it in.
         slow = ~first & ((ratio > 0.5) | late) & ~(own & (not learns(solver)))
         slow = slow | (self.count >= CORRECTIONS) | ~finite | ~factors.usable
         slow = slow & ~done

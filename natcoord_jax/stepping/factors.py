@@ -46,7 +46,6 @@ class Factors(eqx.Module):
         grain: size of the terms that cancel in the equations [sqrt(J)], by which they are rounded.
         leaving: most that a correction has left to the next one lately, in terms of its size; 1: nothing is
             known yet.
-        floor: residual that is left of a linear system solved with factors of its own, see `Correcting`.
     """
 
     solver: Any
@@ -58,7 +57,6 @@ class Factors(eqx.Module):
     noise: Float[Array, ""]
     grain: Float[Array, ""]
     leaving: Float[Array, ""]
-    floor: Float[Array, ""]
 
     def after_step(self, it: Any, usable: Bool[Array, ""], cost: int) -> "Factors":
         """Factors for the next step: given up once they have cost more corrections than new ones would.
@@ -125,7 +123,7 @@ def no_factors(equations: Any) -> Factors:
     shapes = jax.eval_shape(equations.factorised, equations.like_tangent(y))
     solver, inertias = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
     no, noise = jnp.array(False), jnp.zeros((), y.dtype)
-    return Factors(solver, inertias, no, no, jnp.array(NEVER), jnp.array(0), noise, noise, noise + 1.0, noise)
+    return Factors(solver, inertias, no, no, jnp.array(NEVER), jnp.array(0), noise, noise, noise + 1.0)
 
 
 def factors_of(
@@ -141,4 +139,4 @@ def new_factors(made: tuple[Any, Array], noise: Array | float = 0.0, grain: Arra
     yes, noise = jnp.array(True), jnp.asarray(noise, inertias.dtype)
     grain, unknown = jnp.asarray(grain, inertias.dtype), jnp.ones_like(noise)
     never = jnp.array(NEVER), jnp.array(0)
-    return Factors(solver, inertias, yes, yes, *never, noise, grain, unknown, jnp.zeros_like(noise))
+    return Factors(solver, inertias, yes, yes, *never, noise, grain, unknown)

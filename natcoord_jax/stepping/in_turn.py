@@ -190,10 +190,9 @@ class InTurn(ABC):
             )
 
             def renewed(carry: tuple) -> tuple:
-                _, factors, at = carry
+                _, _, at = carry
                 slot = jax.tree.map(lambda x: row(x, c.left - 1 - first), near[0])
                 made = kernel(self._renewed, fixed, slot, matrix, at.most)
-                made = replace_fields(made, floor=factors.floor)
                 return jnp.array(False), made, at.refreshed(places)
 
             start = c.stuck, c.factors, c.at

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import reduce
-from typing import Any
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -72,6 +72,9 @@ class Plan:
         return weights @ inputs
 
 
+A = TypeVar("A", bound="Apart")
+
+
 @dataclass(frozen=True)
 class Apart:
     """A callable without its numbers: hashable, as what is static about a rollout must be."""
@@ -79,7 +82,7 @@ class Apart:
     rest: Any
 
     @classmethod
-    def of(cls, function: Any) -> tuple["Apart", Any]:
+    def of(cls: type[A], function: Any) -> tuple[A, Any]:
         """A callable apart into this and its numbers."""
         numbers, rest = eqx.partition(function, eqx.is_array)
         return cls(rest), numbers

@@ -211,9 +211,14 @@ def test_random_starts(name):
     assert kept == len(angles) if name != "bricard" else kept >= 5
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("angle", [0.3, 2.0])
-@pytest.mark.parametrize("name", ["slider_crank", "gears"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param("slider_crank", marks=pytest.mark.slow),
+        pytest.param("gears", marks=pytest.mark.exhaustive),
+    ],
+)
 def test_derivatives_of_assembly(name, angle):
     """Through all steps of the way, far starts included: tangent, gradient, and both in a batch."""
     if name == "gears":

@@ -55,8 +55,8 @@ def assert_run(system, found, where):
 
 SHAPES = [
     pytest.param(10, "hinged"),
-    pytest.param(10, "clamped", marks=pytest.mark.slow),
-    pytest.param(10, "free", marks=pytest.mark.slow),
+    pytest.param(10, "clamped", marks=pytest.mark.exhaustive),
+    pytest.param(10, "free", marks=pytest.mark.exhaustive),
     pytest.param(50, "hinged", marks=pytest.mark.slow),
     pytest.param(200, "clamped", marks=pytest.mark.slow),
 ]
@@ -183,8 +183,13 @@ def test_a_rod_that_is_hardly_driven(acceleration):
         assert abs(float(angle) - asked) <= 1e-9 * asked + tol.AT_REST
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("elastic", [RUBBER, STEEL], ids=["rubber", "steel"])
+@pytest.mark.parametrize(
+    "elastic",
+    [
+        pytest.param(RUBBER, id="rubber", marks=pytest.mark.exhaustive),
+        pytest.param(STEEL, id="steel", marks=pytest.mark.slow),
+    ],
+)
 def test_a_rod_that_has_come_to_rest(elastic):
     """Bent by its weight, in equilibrium: it stays there, with damping, which has nothing to damp."""
     scene = nc.Scene()

@@ -113,5 +113,5 @@ def collapsed(length: float):
     ],
 )
 def test_ends_of_a_spring_that_coincide(order, length):
-    """Finite in every mode: without natural length the spring is linear, with one its force counts as none."""
+    """Finite in every mode: without natural length the spring is linear, with one it has no force."""
     assert finite(at_rest(order, *collapsed(length)))
