@@ -26,7 +26,8 @@ STALL_ROUND_OFF = 1e-12
 """The same for corrections that stop shrinking."""
 
 SURPRISE = 10.0
-"""Times the error allowed by which the correction may be larger that was expected to be within it."""
+"""Times the error allowed by which the correction may be larger that was expected to be within it, and the error
+by masses alone: at the error allowed that is what rounding leaves."""
 
 STALL = 1e-10
 """Corrections that stop shrinking below this have reached the floor of round-off."""
@@ -187,7 +188,7 @@ class Correcting(eqx.Module):
         within = entire <= jnp.where(self.last, SURPRISE, 1.0) * allowed
         size_by_mass, missing = sizes_by_mass(lam, residual, masses)
         close_by_mass = (CLOSE if transposed else CLOSE_FORWARD) * size_by_mass
-        sure = missing <= jnp.maximum(close_by_mass, ROUND_OFF * whole)
+        sure = missing <= SURPRISE * jnp.maximum(close_by_mass, ROUND_OFF * whole)
         done = (within | stalled) & (own | sure) & finite & factors.usable
         following = correction * factors.left_by(ratio, first)
         compares = self.going & ~first & (self.correction > allowed) & finite
