@@ -26,8 +26,8 @@ STALL_ROUND_OFF = 1e-12
 """The same for corrections that stop shrinking."""
 
 SURPRISE = 10.0
-"""Times the error allowed by which the correction may be larger that was expected to be within it, and the error
-by masses alone: at the error allowed that is what rounding leaves."""
+"""Times the error allowed by which the correction may be larger that was expected to be within it, and the
+error by masses alone: rounding leaves as much as is allowed."""
 
 STALL = 1e-10
 """Corrections that stop shrinking below this have reached the floor of round-off."""
