@@ -486,3 +486,17 @@ def test_requests_that_cannot_be_met_say_why():
         _ = system.sense(state, closing).displacement
     with pytest.raises(ValueError, match="inputs has shape"):
         system.instant(state, jnp.zeros(2))
+
+
+def test_a_body_that_is_welded_to_the_ground():
+    """Nothing can move: its weight is the reaction, and the sensor prints what it has."""
+    scene = nc.Scene()
+    scene.add(nc.Gravity(vector=(0, 0, -10)))
+    block = scene.add(nc.RigidBody(mass=2.0, inertia=(1, 1, 1), position=(0, 0, 1), name="block"))
+    scene.add(nc.Fixed(nc.ground, block, name="weld"))
+    system, state = scene.compile()
+    weld = system.sense(state, "weld")
+    np.testing.assert_allclose(weld.force, (0, 0, 20), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(system.tangent(state).v, 0.0, rtol=0, atol=0)
+    assert "weld" in str(weld) and len(str(weld)) < 200
+    assert len(str(system.sense(state, "block"))) < 200

@@ -42,7 +42,7 @@ class BodySensor(eqx.Module):
     quaternion: Float[Array, "*t 4"]
     com: Float[Array, "*t 3"]
     index: int = eqx.field(static=True)
-    source: Source
+    source: Source = eqx.field(repr=False)
 
     @property
     def velocity(self) -> Float[Array, "*t 3"]:
@@ -90,7 +90,7 @@ class JointSensor(eqx.Module):
     name: str = eqx.field(static=True)
     index: int = eqx.field(static=True)
     places: tuple[int, ...] = eqx.field(static=True)
-    source: Source
+    source: Source = eqx.field(repr=False)
     lever: Float[Array, "*t 3"] | None = None
 
     @property
@@ -175,7 +175,7 @@ class MarkerSensor(eqx.Module):
     position: Float[Array, "*t 3"]
     weights: Float[Array, "4"]
     body: int = eqx.field(static=True)
-    source: Source
+    source: Source = eqx.field(repr=False)
 
     @property
     def velocity(self) -> Float[Array, "*t 3"]:
