@@ -91,17 +91,14 @@ class Backward(InTurn):
         found = jax.tree.map(lambda x: keep(x, jnp.zeros_like(x)), (own_bar, forced_bar))
         return (before_bar, tangents_bar, varied_bar), found
 
-    def solved(
-        self, fixed: Fixed, slot: Slot, arrived: State, given: tuple[State, Array], c: Going, matrix: Array
-    ) -> tuple[tuple, Array, Correcting, Factors, Array]:
-        """Cotangents of one slot, as far as the factors at hand go.
+    def solving(
+        self, fixed: Fixed, slot: Slot, arrived: State, given: tuple[State, Array], c: Going
+    ) -> Callable:
+        """How the cotangents of one slot are found.
 
         The multipliers of its equations solve J^T lam = -(cotangent of the unknowns); their guess is
-        extrapolated from those of the slots after it, or of every other one.
-
-        Returns:
-            Cotangents of what varies, of the state before the slot and the tangent space there, of its inputs
-            and its forces; the multipliers, where their solution stands, the factors, and the matrix.
+        extrapolated from those of the slots after it, or of every other one. From them follow cotangents of
+        what varies, of the state before the slot and the tangent space there, of its inputs and its forces.
         """
         numbers, y_bar, tangents_bar = fixed.numbers, given[1], c.own[1]
         system, _, dt = numbers.whole(numbers.varied)
@@ -116,38 +113,34 @@ class Backward(InTurn):
         nothing = jax.tree.map(jnp.zeros_like, at_slot)
 
         _, pull = jax.vjp(partial(self.outcome, numbers, slot), *at_slot, slot.y)
-        end_bars = arrived, tangents_bar
 
-        def pulled(lam: Array, at: Correcting) -> tuple:
-            ends: Any = end_bars
-            if matrix.shape[0]:
-                ends = jax.tree.map(lambda x: jnp.where(at.forming, 0.0, x), ends)
-            return pull((at.asked(lam), *ends))
+        def solve(lam: Array, learnt: Any, at: Correcting) -> tuple:
+            ends: Any = arrived, tangents_bar
+            ends = jax.tree.map(lambda x: jnp.where(at.forming, 0.0, x), ends)
 
-        def judged(given: tuple, gap: Array) -> tuple:
-            lam, learnt, at, matrix = given
-            at, matrix = at.formed(matrix, gap)
-            factors = c.factors.with_changes(learnt)
-            at, known = at.judged(factors, lam, gap + y_bar, fixed.masses, patience, whole)
-            return jnp.where(at.moving, lam - at.change, lam), known.changing, at, matrix
+            def judged(given: tuple, product: Array) -> tuple:
+                lam, learnt, at = given
+                factors = c.factors.with_changes(learnt)
+                at, known = at.judged(factors, lam, product + y_bar, fixed.masses, patience, whole)
+                return jnp.where(at.moving, lam - at.change, lam), known.changing, at
 
-        def nearer(carry: tuple) -> tuple:
-            return judged(carry, pulled(carry[0], carry[2])[-1])
+            def nearer(given: tuple) -> tuple:
+                return judged(given, pull((given[0], *ends))[-1])
 
-        def evaluated(carry: tuple) -> tuple:
-            given = carry[1:]
-            if apart:
-                given = jax.lax.while_loop(
-                    lambda x: any_lane((x[2].going & ~x[2].last) | x[2].forming), nearer, given
-                )
-            *bars, gap = pulled(given[0], given[2])
-            return tuple(bars), *judged(given, gap)
+            def evaluated(carry: tuple) -> tuple:
+                _, given, _ = carry
+                if apart:
+                    given = jax.lax.while_loop(lambda x: any_lane(x[2].going & ~x[2].last), nearer, given)
+                bars = pull((given[0], *ends))
+                lam, learnt, at = judged(given, bars[-1])
+                return at.going, (lam, learnt, at), bars
 
-        start = nothing, c.solution, c.factors.changing, c.at, matrix
-        going = lambda x: any_lane(x[3].going | x[3].forming)  # noqa: E731
-        bars, lam, learnt, at, matrix = jax.lax.while_loop(going, evaluated, start)
-        factors = c.factors.with_changes(learnt)
-        return (*bars, (lam, arrived) if self.forced else None), lam, at, factors, matrix
+            start = at.going | at.forming, (lam, learnt, at), (*nothing, jnp.zeros_like(slot.y))
+            found = jax.lax.while_loop(lambda carry: any_lane(carry[0]), evaluated, start)
+            _, (lam, learnt, at), (*bars, product) = found
+            return lam, learnt, at, (*bars, (lam, arrived) if self.forced else None), product
+
+        return solve
 
 
 def _size_of(system: System, h: Array, end_bar: State, y_bar: Array, factors: Factors) -> Array:

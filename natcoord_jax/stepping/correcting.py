@@ -99,19 +99,17 @@ class Correcting(eqx.Module):
         """Whether another row of its matrix is to be formed, for new factors."""
         return self.wanting & self.open & (self.rows < self.most)
 
-    def asked(self, lam: Float[Array, " unknowns"]) -> Float[Array, " unknowns"]:
-        """What its matrix is to be applied to next: the solution as it is, or a unit vector for a row."""
-        return jnp.where(self.forming, jnp.where(jnp.arange(lam.shape[0]) == self.rows, 1.0, 0.0), lam)
+    def unit(self, lam: Float[Array, " unknowns"]) -> Float[Array, " unknowns"]:
+        """The unit vector whose product is the next row."""
+        return jnp.where(jnp.arange(lam.shape[0]) == self.rows, 1.0, 0.0)
 
     def formed(
-        self, matrix: Float[Array, "n unknowns"], product: Float[Array, " unknowns"]
+        self, asked: Bool[Array, ""], matrix: Float[Array, "n unknowns"], product: Float[Array, " unknowns"]
     ) -> tuple["Correcting", Float[Array, "n unknowns"]]:
         """With one more row, if that was asked for."""
-        if not matrix.shape[0]:
-            return self, matrix
         place = jnp.minimum(self.rows, matrix.shape[0] - 1)
-        matrix = with_row(matrix, place, jnp.where(self.forming, product, row(matrix, place)))
-        return eqx.tree_at(lambda c: c.rows, self, self.rows + self.forming), matrix
+        matrix = with_row(matrix, place, jnp.where(asked, product, row(matrix, place)))
+        return eqx.tree_at(lambda c: c.rows, self, self.rows + asked), matrix
 
     @property
     def going(self) -> Bool[Array, ""]:

@@ -17,7 +17,6 @@ from natcoord_jax.assembly.separate import Tangents
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
 from natcoord_jax.stepping.correcting import Correcting
-from natcoord_jax.stepping.factors import Factors
 from natcoord_jax.stepping.in_turn import Fixed, Going, InTurn
 from natcoord_jax.stepping.newton import any_lane
 from natcoord_jax.stepping.past import Past
@@ -79,17 +78,12 @@ class Forward(InTurn):
         end_dot, tangents_dot, past = jax.tree.map(keep, (end_dot, tangents_dot, past), own)
         return (end_dot, tangents_dot, past), (end_dot, keep(y_dot, jnp.zeros_like(y_dot)))
 
-    def solved(
-        self, fixed: Fixed, slot: Slot, arrived: tuple, given: tuple, c: Going, matrix: Array
-    ) -> tuple[tuple, Array, Correcting, Factors, Array]:
-        """Tangents of one slot, as far as the factors at hand go.
+    def solving(self, fixed: Fixed, slot: Slot, arrived: tuple, given: tuple, c: Going) -> Callable:
+        """How the tangents of one slot are found.
 
         Those of its unknowns solve J y_dot = -r. Their guess is extrapolated from those of the slots before,
         and corrected by what extrapolation misses of r, which is known.
-
-        Returns:
-            Tangents of the state after the slot, of the tangent space there and of the unknowns, and r; the
-            tangents of the unknowns, where their solution stands, the factors, and the matrix.
+        From them follow tangents of the state after the slot and of the tangent space there.
         """
         numbers, varied_dot, (u_dot, forced) = fixed.numbers, fixed.changes, given
         patience = kind_of(numbers.whole(numbers.varied)[0], self.tableau).renewal
@@ -105,34 +99,37 @@ class Forward(InTurn):
         foreseen = jnp.where(jnp.all(jnp.isfinite(foreseen)), foreseen, 0.0)
         fresh = (c.at.count == 0) & (c.at.rounds == 0) & c.factors.usable
 
-        def trip(carry: tuple) -> tuple:
-            begun, learnt, y_dot, at, known, ends, _, matrix = carry
-            given = jax.tree.map(lambda x: jnp.where(begun, 0.0, x), changes)
-            product, *moved = along(*given, jnp.where(begun, at.asked(y_dot), 0.0))
-            if forced is not None:
-                more = jax.tree.map(lambda x: jnp.where(begun, 0.0, x), forced)
-                product, moved[0] = jax.tree.map(jnp.add, (product, moved[0]), more)
-            known = jnp.where(begun, known, product)
-            ends, moved = (
-                jax.tree.map(partial(jnp.where, begun), *x)
-                for x in ((ends, tuple(moved)), (tuple(moved), nothing))
-            )
-            factors = c.factors.with_changes(learnt)
-            start = jnp.where(fresh, y_dot - factors.solver.solve(known - foreseen), y_dot)
-            formed, matrix = at.formed(matrix, product)
-            given = y_dot, product + known, fixed.masses, patience, none
-            judged = formed.judged(factors, *given, transposed=False)
-            at, factors = jax.tree.map(partial(jnp.where, begun), judged, (at, factors))
-            y_dot = jnp.where(begun, jnp.where(at.moving, y_dot - at.change, y_dot), start)
-            return jnp.array(True), factors.changing, y_dot, at, known, ends, moved, matrix
+        def solve(y_dot: Array, learnt: Any, at: Correcting) -> tuple:
+            forming = at.forming
 
-        start = jnp.array(False), c.factors.changing, c.solution, c.at
-        start = *start, jnp.zeros_like(slot.y), nothing, nothing, matrix
-        found = jax.lax.while_loop(lambda x: any_lane(x[3].going | x[3].forming | ~x[0]), trip, start)
-        _, learnt, y_dot, at, known, ends, moved, matrix = found
-        end_dot, tangents_dot = jax.tree.map(jnp.add, ends, moved)
-        factors = c.factors.with_changes(learnt)
-        return (end_dot, tangents_dot, y_dot, known), y_dot, at, factors, matrix
+            def trip(carry: tuple) -> tuple:
+                ran, y_dot, learnt, at, known, ends, _ = carry
+                begun = ran | forming
+                given = jax.tree.map(lambda x: jnp.where(begun, 0.0, x), changes)
+                product, *moved = along(*given, jnp.where(begun, y_dot, 0.0))
+                if forced is not None:
+                    more = jax.tree.map(lambda x: jnp.where(begun, 0.0, x), forced)
+                    product, moved[0] = jax.tree.map(jnp.add, (product, moved[0]), more)
+                known = jnp.where(ran & ~forming, known, product)
+                ends, moved = (
+                    jax.tree.map(partial(jnp.where, begun), *x)
+                    for x in ((ends, tuple(moved)), (tuple(moved), nothing))
+                )
+                factors = c.factors.with_changes(learnt)
+                start = jnp.where(fresh, y_dot - factors.solver.solve(known - foreseen), y_dot)
+                given = y_dot, product + known, fixed.masses, patience, none
+                judged = at.judged(factors, *given, transposed=False)
+                at, factors = jax.tree.map(partial(jnp.where, begun), judged, (at, factors))
+                y_dot = jnp.where(begun, jnp.where(at.moving, y_dot - at.change, y_dot), start)
+                return jnp.array(True), y_dot, factors.changing, at, known, ends, moved
+
+            start = jnp.array(False), y_dot, learnt, at, jnp.zeros_like(slot.y), nothing, nothing
+            found = jax.lax.while_loop(lambda x: any_lane(x[3].going | ~x[0]), trip, start)
+            _, y_dot, learnt, at, known, ends, moved = found
+            end_dot, tangents_dot = jax.tree.map(jnp.add, ends, moved)
+            return y_dot, learnt, at, (end_dot, tangents_dot, y_dot, known), known
+
+        return solve
 
 
 def _reversed(tree: Any) -> Any:

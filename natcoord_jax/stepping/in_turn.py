@@ -104,16 +104,13 @@ class InTurn(ABC):
         """What arrives at a slot, of what is carried and of its row of what is given."""
 
     @abstractmethod
-    def solved(
-        self, fixed: "Fixed", slot: Slot, arrived: Any, given: Any, c: Going, matrix: Array
-    ) -> tuple[Any, Array, Correcting, Factors, Array]:
-        """The system of one slot, as far as the factors at hand go, and its matrix where they do not.
-
-        The matrix is formed by the products that corrections are made with, so that it is that of the slot
-        exactly, and the equations are not in the program a second time.
+    def solving(self, fixed: "Fixed", slot: Slot, arrived: Any, given: Any, c: Going) -> Callable:
+        """How the system of one slot is solved, as far as the factors at hand go.
 
         Returns:
-            What follows from its solution, the solution, where it stands, the factors, and the matrix.
+            A function of a solution, what factors have learnt, and where the solution stands. It returns
+            these three, what follows from the solution, and the last product with the matrix: that with the
+            solution it was given, where it stands at one of the products asked for.
         """
 
     @abstractmethod
@@ -232,8 +229,10 @@ class InTurn(ABC):
             slot, own_given = jax.tree.map(lambda x: row(x, here), (slots, given))
             c = replace_fields(c, at=c.at.unless(~slot.accepted))
             arrived = self.arriving(c.own, own_given)
-            solved = self.solved(fixed, slot, arrived, own_given, c, matrix)
-            outcome, solution, at, factors, matrix = solved
+            solving = self.solving(fixed, slot, arrived, own_given, c)
+            start = c.solution, c.factors.changing, c.at
+            solution, learnt, at, outcome, matrix = self._formed(solving, start, matrix)
+            factors = c.factors.with_changes(learnt)
             stuck = any_lane(at.open & at.wanting)
             lost = slot.accepted & ~at.done
             outcome = jax.tree.map(lambda x: jnp.where(lost, jnp.nan, x), outcome)
@@ -255,6 +254,30 @@ class InTurn(ABC):
             return (carry[0].left > first) & ~carry[0].stuck
 
         return jax.lax.while_loop(going, one, (c, found, matrix))
+
+    def _formed(self, solving: Callable, start: tuple[Array, Any, Correcting], matrix: Array) -> tuple:
+        """The system of a slot solved; or, where factors do not serve, its matrix formed for new ones.
+
+        It is formed by the products that corrections are made with, so that it is that of the slot exactly,
+        and the equations are not in the program a second time. In the loops of corrections themselves, a
+        matrix would cost a tenth of their time.
+        """
+        if not matrix.shape[0]:
+            *found, _ = solving(*start)
+            return *found, matrix
+
+        def trip(carry: tuple) -> tuple:
+            _, (solution, learnt, at), _, matrix = carry
+            forming = at.forming
+            given = jnp.where(forming, at.unit(solution), solution)
+            found, learnt, at, outcome, product = solving(given, learnt, at)
+            at, matrix = at.formed(forming, matrix, product)
+            return at.forming, (jnp.where(forming, solution, found), learnt, at), outcome, matrix
+
+        nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(solving, *start)[3])
+        begun = jnp.ones_like(start[2].forming), start, nothing, matrix
+        _, found, outcome, matrix = jax.lax.while_loop(lambda carry: any_lane(carry[0]), trip, begun)
+        return *found, outcome, matrix
 
     def _renewed(self, fixed: "Fixed", slot: Slot, matrix: Array, rows: Array) -> Factors:
         """New factors, for this slot, of so many rows of its matrix, or of formulas if none was asked for."""
