@@ -20,7 +20,8 @@ FOUND = {
     # Contacts: factors carried over them were taken for good; both modes wrong by up to 1e13.
     "slide": [0, 2, 4, 8, 9, 10, 11],
     # A brake, dry friction: forward mode wrong by up to 1e97, reverse by up to 1e2, or not a number.
-    "disc": [2, 3, 4, 5, 7, 9, 10, 11],
+    # 58: steps whose slow convergence was taken for noise.
+    "disc": [2, 3, 4, 5, 7, 9, 10, 11, 58],
 }
 """Seeds that failed once."""
 

@@ -44,7 +44,7 @@ STALLS = 3
 """Times that the floor is raised."""
 
 RAISED = [STALL * 10.0**k for k in range(STALLS + 1)]
-"""The floor by factorisations after the first."""
+"""The floor by factorisations that have brought the solution no nearer."""
 
 ABOVE_NOISE = 4.0
 """Corrections up to this multiple of the noise end a step that is expected to be solved."""
@@ -103,6 +103,8 @@ class Iterate(eqx.Module):
         error: that size relative to the terms of the equations, those that cancel included.
         count: corrections with these factors.
         total: all corrections.
+        before: size of the last correction with the factors before these.
+        vain: factorisations that have brought it no nearer.
         rounds: factorisations in this step.
         most: factorisations that are allowed.
         last: whether the next evaluation is expected to be at the solution.
@@ -119,6 +121,8 @@ class Iterate(eqx.Module):
     error: Float[Array, ""]
     count: Int[Array, ""]
     total: Int[Array, ""]
+    before: Float[Array, ""]
+    vain: Int[Array, ""]
     rounds: Int[Array, ""]
     most: Int[Array, ""]
     last: Bool[Array, ""]
@@ -144,17 +148,20 @@ def begin(y: Float[Array, " unknowns"], few: bool = False) -> Iterate:
     most = jnp.array(FEW_ROUNDS if few else NEWTON_ROUNDS)
     zero, no, nought = jnp.zeros((), y.dtype), jnp.array(False), jnp.array(0)
     still, yes = jnp.zeros_like(y), jnp.array(True)
-    return Iterate(y, y, still, nought, zero, zero, nought, nought, nought, most, no, no, no, yes)
+    return Iterate(
+        y, y, still, nought, zero, zero, nought, nought, zero, nought, nought, most, no, no, no, yes
+    )
 
 
 def refreshed(it: Iterate) -> Iterate:
     """The iteration with new factors."""
     zero, nought, no = jnp.zeros_like(it.correction), jnp.zeros_like(it.count), jnp.zeros_like(it.last)
     correction = jnp.where(it.converged, it.correction, zero)
+    vain = it.vain + (2.0 * it.correction > it.before) * (it.before > 0)
     return eqx.tree_at(
-        lambda x: (x.change, x.correction, x.count, x.rounds, x.last, x.wanting),
+        lambda x: (x.change, x.correction, x.count, x.before, x.vain, x.rounds, x.last, x.wanting),
         it,
-        (jnp.zeros_like(it.change), correction, nought, it.rounds + 1, no, no),
+        (jnp.zeros_like(it.change), correction, nought, it.correction, vain, it.rounds + 1, no, no),
     )
 
 
@@ -207,7 +214,7 @@ def judge(
     ratio = correction / jnp.where(it.correction > 0, it.correction, 1.0)
     predicted = correction * factors.left_by(ratio, jnp.asarray(first))
     factors = factors.having_left(ratio, telling)
-    raised = jnp.asarray(RAISED)[jnp.clip(it.rounds - 1, 0, STALLS)]
+    raised = jnp.asarray(RAISED)[jnp.clip(it.vain, 0, STALLS)]
     trust = jnp.where(alike, STALL_ALIKE, jnp.where(factors.fresh, raised, STALL_OLD))
     # What stiff parts at rest are rounded by is known, and needs no room for more.
     resting = jnp.minimum(trust / STALL_OLD, raised / STALL) * RESTING * grain
@@ -239,6 +246,8 @@ def judge(
         safe_divide(correction, size + grain),
         it.count + 1,
         it.total + ~solved,
+        it.before,
+        it.vain,
         it.rounds,
         it.most,
         ready | (predicted <= jnp.maximum(tolerance * size, noise)),
