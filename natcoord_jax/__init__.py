@@ -63,6 +63,7 @@ from natcoord_jax.control import (
 )
 from natcoord_jax.core.force import Field, Force, Load
 from natcoord_jax.core.handles import ground
+from natcoord_jax.core.jit import jit, keep_programs, set_effort
 from natcoord_jax.core.joint import Frame, Joint
 from natcoord_jax.core.markers import Attachment, Direction, Point
 from natcoord_jax.core.potential import Potential
@@ -208,6 +209,8 @@ __all__ = [
     "ground",
     "inputs",
     "inverse_dynamics",
+    "jit",
+    "keep_programs",
     "linearise",
     "load_guess",
     "load_path",
@@ -220,6 +223,7 @@ __all__ = [
     "random_state",
     "receding_horizon",
     "regulator",
+    "set_effort",
     "simulate",
     "step",
     "tangent_growth",

@@ -62,6 +62,12 @@ def parser() -> Parser:
     for command in (run, costs):
         command.add_argument("--json", type=Path, metavar="FILE", help="write the report as JSON")
         command.add_argument("--plot", type=Path, metavar="FILE", help="write a figure")
+        command.add_argument(
+            "--keep-programs",
+            action=argparse.BooleanOptionalAction,
+            default=True,
+            help="keep compiled programs for the next time, in the cache folder of this user",
+        )
     return whole
 
 
@@ -224,6 +230,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         width = max(map(len, gallery.SCENES))
         print("\n".join(f"{name:<{width}}  {gallery.describe(name)}" for name in gallery.SCENES))
         return 0
+    # (Where the environment names a folder of JAX's own, that is meant.)
+    if parsed.keep_programs and jax.config.jax_compilation_cache_dir is None:  # pyright: ignore[reportAttributeAccessIssue]
+        nc.keep_programs()
     try:
         return _accuracy(parsed) if parsed.command == "accuracy" else _run(parsed)
     except BadOptionError as problem:

@@ -5,12 +5,13 @@ import os
 from importlib.metadata import version
 from pathlib import Path
 
-# Half the time to compile, for programs that are run briefly; read when the first program is compiled. Flags
-# given from outside come last and win: XLA_FLAGS=--xla_backend_optimization_level=3 tests what users run.
+# A third of the time to compile, for programs that are run briefly; read when the first one is compiled.
+# Flags from outside come last and win: XLA_FLAGS=--xla_backend_optimization_level=3 tests what users run.
 os.environ["XLA_FLAGS"] = (
     # Compilers from JAX 0.11 on do not have this, and end a process that asks for it.
     ("--xla_cpu_use_fusion_emitters=false " if version("jaxlib").startswith("0.10.") else "")
-    + f"--xla_backend_optimization_level=0 {os.environ.get('XLA_FLAGS', '')}"
+    + "--xla_disable_hlo_passes=while-loop-invariant-code-motion,simplify-while-loops,"
+    + f"while-loop-trip-count-annotator --xla_backend_optimization_level=0 {os.environ.get('XLA_FLAGS', '')}"
 )
 
 import jax
@@ -52,6 +53,10 @@ def pytest_configure(config: pytest.Config) -> None:
     if config.option.check_types:
         hook = install_import_hook("natcoord_jax", "beartype.beartype")
         config.add_cleanup(hook.uninstall)
+    from natcoord_jax import set_effort
+
+    # With the flags above, a second program with full effort would be the first again.
+    set_effort("quick")
 
 
 @pytest.fixture(autouse=True)

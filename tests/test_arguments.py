@@ -79,6 +79,14 @@ STEPPED = {
 SOLVED = {"max_iterations": WHOLE, "tol": NUMBER, "goal_tol": NUMBER, "method": ["auto"]}
 
 CALLS = {
+    # programs
+    "jit": lambda w: {
+        "function": [f], "effort": [None, "quick"],
+        "static_argnums": [(), 0, (0,)], "static_argnames": [(), "t"],
+        "donate_argnums": [(), 0, (0,)], "donate_argnames": [(), "t"],
+    },
+    "set_effort": lambda w: {"effort": ["quick"]},
+    "keep_programs": lambda w: {"folder": [None, "folder"], "on": [True]},
     # bodies
     "RigidBody": lambda w: {
         "mass": NUMBER, "inertia": V, "second_moment": [None, np.ones(3)], "com": V, "inertia_at": ["com"],

@@ -22,6 +22,7 @@ SOURCE = ROOT / PACKAGE
 
 # From the ground up. A module imports from its own floor and from those below it.
 FLOORS = (
+    "xla",
     "maths",
     "linsolve",
     "core",

@@ -11,7 +11,6 @@ import tolerances as tol
 
 import natcoord_jax as nc
 from natcoord_jax import gallery
-from natcoord_jax.core import compiled
 from natcoord_jax.maths.collocation import _inverse
 from natcoord_jax.maths.projectors import range_projector
 from natcoord_jax.maths.vectors import cross, skew
@@ -401,11 +400,3 @@ def test_gradients_of_stiff_and_coarse_steps_are_solved_to_the_end():
     forward = jax.jvp(end, (one,), (one,))[1]
     np.testing.assert_allclose(jax.grad(end)(one), forward, rtol=tol.EXACT_GRADIENT)
     np.testing.assert_allclose(forward, difference, rtol=1e-5)
-
-
-def test_options_that_the_compiler_does_not_have_are_left_out():
-    """They come and go with versions of JAX, and one that is not known ends every call."""
-    unknown = {"xla_no_such_option": True}
-    assert compiled.accepted(compiled.BRIEF | unknown).keys() >= {"xla_backend_optimization_level"}
-    assert not compiled.accepted(unknown)
-    assert float(compiled._with(compiled.BRIEF | unknown, lambda x: 2 * x)(jnp.array(1.5))) == 3.0

@@ -16,7 +16,7 @@ from natcoord_jax.control.run import optimise
 from natcoord_jax.control.solution import SOLUTION, Solution
 from natcoord_jax.control.transcription import entering, slices, stage
 from natcoord_jax.core.arguments import checked
-from natcoord_jax.core.compiled import quickly
+from natcoord_jax.core.compiled import compiled
 from natcoord_jax.core.kinds import FLAG, FunctionOf
 
 
@@ -72,7 +72,7 @@ class Check:
         return "\n".join(lines)
 
 
-@quickly
+@compiled
 def _hamiltonians(
     problem: OptimalControl, iterate: Iterate
 ) -> tuple[Float[Array, " steps"], Float[Array, " steps"]]:

@@ -16,7 +16,7 @@ from natcoord_jax.control.run import HEADER, numeric, printed
 from natcoord_jax.control.solution import Row, Solution
 from natcoord_jax.control.transcription import Unknowns, end, first_node, held_inputs, packed
 from natcoord_jax.core.arguments import checked
-from natcoord_jax.core.compiled import quickly
+from natcoord_jax.core.compiled import compiled
 from natcoord_jax.core.kinds import FLAG, Kind, is_other
 from natcoord_jax.core.numeric import Number, Whole
 from natcoord_jax.stepping.simulate import simulate
@@ -32,6 +32,7 @@ class Optimiser(Kind):
         return None if getattr(value, "_fields", None) == ("init", "update") else is_other(value)
 
 
+@compiled
 def _constraints(
     problem: OptimalControl, variables: tuple[Array, Array]
 ) -> tuple[Array, Array, Array, Array]:
@@ -121,11 +122,11 @@ def descend(
     variables = (start.coefficients, start.free)
     if optimiser is None:
         optimiser = optax.adam(optax.cosine_decay_schedule(0.05, iterations, alpha=0.01))
-    cost, missing, excess, code = quickly(_constraints)(problem, variables)
+    cost, missing, excess, code = _constraints(problem, variables)
     multipliers = (jnp.zeros_like(missing), jnp.zeros_like(excess))
     constrained = bool(missing.size or excess.size)
 
-    @quickly
+    @compiled
     def one_round(variables: Any, multipliers: Any, penalty: Array) -> Any:
         def body(carry: tuple, _: Any) -> tuple:
             variables, memory = carry

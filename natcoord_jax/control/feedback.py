@@ -16,7 +16,7 @@ from natcoord_jax.control.run import OPTIONS, WEIGHTS, numeric, optimise_jit
 from natcoord_jax.control.solution import SOLUTION, Solution
 from natcoord_jax.control.transcription import held_inputs, packed
 from natcoord_jax.core.arguments import checked
-from natcoord_jax.core.compiled import quickly
+from natcoord_jax.core.compiled import compiled
 from natcoord_jax.core.kinds import Several
 from natcoord_jax.core.numeric import Number, Numbers, Whole
 from natcoord_jax.core.state import State, Trajectory
@@ -53,7 +53,7 @@ class Feedback(eqx.Module):
         return jnp.clip(self.inputs[k] - self.gains[k] @ deviation, *self.limits)
 
 
-@quickly
+@compiled
 def _gains(problem: OptimalControl, iterate: Iterate, weights: tuple) -> tuple[Array, Array]:
     """Gains of the regulator, and what they act on."""
     d = iterate.derivatives

@@ -12,7 +12,7 @@ from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.control.tangent import steady_rates
 from natcoord_jax.control.transcription import Unknowns, end, roll
 from natcoord_jax.core.arguments import Part, is_a
-from natcoord_jax.core.compiled import quickly
+from natcoord_jax.core.compiled import compiled
 from natcoord_jax.core.kinds import of
 from natcoord_jax.core.numeric import Numbers, Vector
 
@@ -114,7 +114,7 @@ def _shaped(value: Any, shape: tuple[int, ...], what: str) -> Array:
     return array
 
 
-@quickly
+@compiled
 def _leading_to_goal(problem: OptimalControl, unknowns: Unknowns) -> Float[Array, "steps n"]:
     """Constant rates that lead the configuration to the goal, as near as they can; forces play no part."""
     count = problem.system.structure.unknowns

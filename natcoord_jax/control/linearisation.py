@@ -17,7 +17,7 @@ from natcoord_jax.control.transcription import (
     slices,
     stage,
 )
-from natcoord_jax.core.compiled import quickly
+from natcoord_jax.core.compiled import compiled
 
 
 def nodes_before(path: Path) -> Node:
@@ -51,7 +51,7 @@ def _gradient_scale(problem: OptimalControl, unknowns: Unknowns, path: Path, sig
     return jnp.where(scale > 0, scale, 1.0)
 
 
-@quickly
+@compiled
 def linearised(
     problem: OptimalControl,
     unknowns: Unknowns,

@@ -14,7 +14,7 @@ from natcoord_jax.control.merit import Direction, Violations, slope_and_weights
 from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.control.quadratic import model
 from natcoord_jax.control.riccati import REACH, Factors, Weighted, factored
-from natcoord_jax.core.compiled import quickly
+from natcoord_jax.core.compiled import compiled
 
 SHIFT = 1e-4
 """First increase of the curvature where the model is not convex."""
@@ -180,7 +180,7 @@ def _attempt(problem: OptimalControl, iterate: Iterate) -> Attempt:
     return jax.lax.while_loop(unserved, body, (jnp.array(0), nothing))[1]
 
 
-@quickly
+@compiled
 def propose(problem: OptimalControl, options: Options, iterate: Iterate) -> Proposal:
     """The next step, from the quadratic model."""
     iterate = eqx.tree_at(lambda i: i.barrier, iterate, _lowered(iterate))

@@ -18,7 +18,7 @@ from natcoord_jax.control.results import Outcome
 from natcoord_jax.control.solution import Row, Solution, solution_of, worst_condition
 from natcoord_jax.control.transcription import Unknowns
 from natcoord_jax.core.arguments import checked
-from natcoord_jax.core.compiled import quickly
+from natcoord_jax.core.compiled import compiled
 from natcoord_jax.core.kinds import FLAG, Choice, Several, of
 from natcoord_jax.core.numeric import Number, Vector, Whole
 
@@ -172,7 +172,7 @@ def optimise(
 
 
 @checked(problem=PROBLEM, unknowns=UNKNOWNS, options=OPTIONS)
-@quickly
+@compiled
 def optimise_jit(problem: OptimalControl, unknowns: Unknowns, options: Options = DEFAULT) -> Iterate:
     """The method as one program, for `jax.vmap`, receding horizons and other programs around it.
 
@@ -249,7 +249,7 @@ def multi_start(
     return _distinct(problem, _all_solved(problem, many, options), lifted)
 
 
-@quickly
+@compiled
 def _all_solved(problem: OptimalControl, many: Unknowns, options: Options) -> Iterate:
     """The method from many guesses at once; one program for all calls of the same structure."""
     return jax.vmap(lambda unknowns: optimise_jit(problem, unknowns, options))(many)

@@ -29,7 +29,7 @@ from natcoord_jax.control.transcription import (
 )
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.checks import at_top_level
-from natcoord_jax.core.compiled import quickly
+from natcoord_jax.core.compiled import compiled
 from natcoord_jax.core.kinds import FunctionOf, of
 
 START = of("an iterate, as the `iterate` of a solution, or its `unknowns`", Unknowns, Iterate)
@@ -106,7 +106,7 @@ def _conditions(
     return Conditions(jnp.concatenate(pieces), jnp.concatenate(constraints), path.cost)
 
 
-@quickly
+@compiled
 def _jacobian(make: Callable[[Any], OptimalControl], numbers: Any, found: Iterate) -> Float[Array, "o p"]:
     """How coefficients, what is free and the cost change with the numbers, one column each."""
     given, unflat_numbers = ravel_pytree(numbers)

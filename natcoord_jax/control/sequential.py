@@ -24,7 +24,7 @@ from natcoord_jax.control.transcription import (
     roll,
     simulated,
 )
-from natcoord_jax.core.compiled import quickly
+from natcoord_jax.core.compiled import compiled
 
 ROOM = 0.01
 """Least room left to a bound at the start."""
@@ -34,7 +34,7 @@ NEARLY = 1e-6
 """Residual of the steps, relative, of a motion that nearly obeys its equations."""
 
 
-@quickly
+@compiled
 def _begun(problem: OptimalControl, options: Options, unknowns: Unknowns) -> tuple[tuple, tuple]:
     newton, whole = jnp.array(0), jnp.array(True)
     if not options.lifted:
@@ -63,7 +63,7 @@ def init(problem: OptimalControl, options: Options, unknowns: Unknowns) -> Itera
     return _first(begin, begun, derivatives, *rest)
 
 
-@quickly
+@compiled
 def _first(
     options: Options, begun: tuple, derivatives: Derivatives, barrier: Array, whole: Array, newton: Array
 ) -> Iterate:
@@ -98,7 +98,7 @@ def _first(
     )
 
 
-@quickly
+@compiled
 def tried(
     problem: OptimalControl, options: Options, iterate: Iterate, proposal: Proposal
 ) -> tuple[Found, Multipliers]:
@@ -119,7 +119,7 @@ def tried(
     return found, Multipliers(goal, jnp.where(fine, path, m.path), jnp.where(fine, end, m.end))
 
 
-@quickly
+@compiled
 def concluded(
     options: Options,
     iterate: Iterate,

@@ -7,29 +7,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer, eval_context
-from jax.extend.core import get_opaque_trace_state
 from jaxtyping import Array
 
 from natcoord_jax.core.numeric import Number, Numbers
+from natcoord_jax.xla.tracing import at_top_level as at_top_level
+from natcoord_jax.xla.tracing import is_concrete as is_concrete
 
 NUMERIC = (int, float, np.ndarray, np.number, jax.Array)
 """Types of concrete numbers."""
-
-
-def is_concrete(*values: Any) -> bool:
-    """Whether none of the values is being traced."""
-    return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(values))
-
-
-with eval_context():
-    TOP_LEVEL = get_opaque_trace_state()
-    """State of JAX outside of all transformations, even if this is imported inside of one."""
-
-
-def at_top_level(*values: Any) -> bool:
-    """Whether nothing is being traced: neither the values nor the function around them."""
-    return get_opaque_trace_state() == TOP_LEVEL and is_concrete(values)
 
 
 def require_double(where: str) -> None:

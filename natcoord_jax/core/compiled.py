@@ -1,72 +1,42 @@
-"""Compilation that is quicker where a function is called from Python."""
+"""Compilation of functions of the library: of pytrees, with callables that are seen anew at each call."""
 
 from collections.abc import Callable
-from functools import cache, wraps
+from functools import partial, wraps
 from typing import Any, TypeVar
 
-import equinox as eqx
-import jax
-
-from natcoord_jax.core.checks import at_top_level
 from natcoord_jax.core.closures import with_callables
-
-QUICK = {"xla_cpu_use_fusion_emitters": False}
-"""Option of the CPU compiler of JAX 0.10: a third less time to compile, for programs that run as fast. JAX
-accepts options at the outermost call only."""
-
-BRIEF = QUICK | {"xla_backend_optimization_level": 0}
-"""Options for programs that are run once or a few times: half the time to compile, and slower by as much as
-ten times, which are milliseconds. Who runs one often wraps it in `jax.jit`, where these do not apply."""
+from natcoord_jax.xla.effort import Effort
+from natcoord_jax.xla.jit import programs_of
 
 F = TypeVar("F", bound=Callable[..., Any])
 
 
-def accepted(options: dict[str, Any]) -> dict[str, Any]:
-    """Those options that the compiler has: they come and go with its versions. None but on the CPU."""
-    on_cpu = jax.default_backend() == "cpu"
-    return {name: value for name, value in options.items() if on_cpu and _is_known(name, value)}
+def _with(effort: Effort | None, function: F) -> F:
+    """A function of pytrees, compiled; leaves that are no arrays are part of the program."""
 
+    def called(donated: tuple, arguments: tuple) -> Any:
+        return function(*arguments)
 
-@cache
-def _is_known(name: str, value: Any) -> bool:
-    try:
-        jax.jit(lambda: 0, compiler_options={name: value})()
-    except jax.errors.JaxRuntimeError:
-        return False
-    return True
-
-
-def compiled(function: F) -> F:
-    """`eqx.filter_jit` of a function whose callables are seen anew at each call, see `closures`."""
-    return _with({}, function)
-
-
-def quickly(function: F) -> F:
-    """The same, but it compiles quicker at the outermost call; JAX accepts options only there."""
-    return _with(QUICK, function)
-
-
-def briefly(function: F) -> F:
-    """The same for a function that is run once or a few times: it compiles quicker still, and runs slower."""
-    return _with(BRIEF, function)
-
-
-def _with(options: dict[str, Any], function: F) -> F:
-    within = eqx.filter_jit(function)
-
-    @cache
-    def outermost() -> Callable:
-        known = accepted(options)
-        if not known:
-            return within
-        return eqx.filter_jit(function, compiler_options=known)  # pyright: ignore[reportCallIssue]
+    programs = partial(programs_of(function.__name__.strip("_"), called, effort), ())
 
     def run(*arguments: Any) -> Any:
-        quick = at_top_level(eqx.filter(arguments, eqx.is_array))
-        return (outermost() if quick else within)(*arguments)
+        return programs(arguments)
 
     @wraps(function)
     def call(*arguments: Any) -> Any:
         return with_callables(function, run, arguments)
 
     return call  # pyright: ignore[reportReturnType]
+
+
+def compiled(function: F) -> F:
+    """A function compiled as `nc.jit` does, whose callables are seen anew at each call, see `closures`."""
+    return _with(None, function)
+
+
+def briefly(function: F) -> F:
+    """The same for a function that is run once or a few times, with least effort.
+
+    Who runs one often wraps it in a `jit`, where its own effort does not apply.
+    """
+    return _with("quick", function)

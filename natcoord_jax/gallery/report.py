@@ -66,8 +66,12 @@ def measure(
         options["inputs"] = inputs
     if tolerance is not None:
         options |= {"rtol": tolerance.relative, "atol": tolerance.absolute}
-    _, first = _timed(lambda: example.run(steps, dt, **options))
-    phases, wall = _timed(lambda: example.run(steps, dt, **options))
+    before = nc.set_effort("full")  # times are to be those of programs that run for long
+    try:
+        _, first = _timed(lambda: example.run(steps, dt, **options))
+        phases, wall = _timed(lambda: example.run(steps, dt, **options))
+    finally:
+        nc.set_effort(before)
     report = {
         "scene": example.name,
         "steps": steps,

@@ -3,9 +3,11 @@
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.system import System
+from natcoord_jax.core.checks import as_array, at_top_level
 from natcoord_jax.core.kinds import FunctionOf
 from natcoord_jax.core.numeric import Number, Numbers
 from natcoord_jax.core.state import State
@@ -24,7 +26,7 @@ def checked_step(dt: Any) -> Float[Array, ""]:
     complaint = STEP.complaint(dt)
     if complaint is not None:
         raise ValueError(f"dt [s] {complaint}; pass {STEP.wanted}")
-    return jnp.asarray(dt, float)
+    return as_array(dt, float)
 
 
 def checked_inputs(system: System, inputs: Any, steps: int | None, stages: int = 1) -> tuple[Any, int]:
@@ -41,10 +43,15 @@ def checked_inputs(system: System, inputs: Any, steps: int | None, stages: int =
     if inputs is None:
         if steps is None:
             raise ValueError("pass steps, or inputs of shape (steps, inputs)")
-        return jnp.zeros((steps, len(names))), int(steps)
-    array = jnp.asarray(inputs, float)
+        return as_array(np.zeros((steps, len(names)))), int(steps)
+    array = as_array(inputs, float)
     if array.shape == (len(names),) and steps is not None:
-        array = jnp.broadcast_to(array, (steps, len(names)))
+        # (Where nothing is traced, an operation of JAX would compile a program for every number of steps.)
+        whole = steps, len(names)
+        if at_top_level(array):
+            array = as_array(np.broadcast_to(np.asarray(array), whole))
+        else:
+            array = jnp.broadcast_to(array, whole)
     counted = array.shape[0] if array.ndim else 0
     shapes = (len(names),), (stages, len(names))
     if array.shape[1:] not in shapes or counted != (steps or counted) or counted == 0:

@@ -105,7 +105,7 @@ class Setting(eqx.Module):
         over = course.stopped | (course.step >= self.steps)
         if self.tolerance is None:
             return over
-        return over | (course.taken >= self.plan.steps + self.plan.extra)
+        return over | (course.taken >= self.steps + self.plan.extra)
 
     def lag(self, course: Course) -> Lag | None:
         """What the evaluation of the equations is told of the kick, if there is any."""

@@ -56,11 +56,12 @@ def run_slots(
     dt: Array,
     tolerance: Tolerance | None = None,
     event: Any = None,
+    steps: Array | None = None,
 ) -> tuple[Slots, Ending]:
-    """All slots of a rollout and where it ended; differentiable in every mode."""
+    """All slots of a rollout and where it ended, see `rollout.run`; differentiable in every mode."""
     # JAX sets the mesh anew for derivatives, and to jit no mesh and an empty one are different circumstances.
     with jax.sharding.use_abstract_mesh(jax.sharding.get_abstract_mesh()):
-        return _traced_once(plan, system, state, parameters, dt, tolerance, event)
+        return _traced_once(plan, system, state, parameters, dt, tolerance, event, steps)
 
 
 @partial(jax.jit, static_argnums=0)

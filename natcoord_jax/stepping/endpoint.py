@@ -15,7 +15,6 @@ from natcoord_jax.assembly.system import System
 from natcoord_jax.core.callables import Function
 from natcoord_jax.core.checks import at_top_level
 from natcoord_jax.core.closures import with_callables
-from natcoord_jax.core.compiled import QUICK, accepted
 from natcoord_jax.core.state import State
 from natcoord_jax.stepping.course import Setting
 from natcoord_jax.stepping.newton import TOLERANCE
@@ -24,6 +23,7 @@ from natcoord_jax.stepping.plan import Plan
 from natcoord_jax.stepping.rollout import run_to_the_end
 from natcoord_jax.stepping.rounds import in_parts
 from natcoord_jax.stepping.scheme import Scheme
+from natcoord_jax.xla.effort import FULL, accepted
 
 MOST = 1 << 30
 """Steps that one program can make."""
@@ -90,7 +90,7 @@ def _program(structure: Any, kinds: tuple, scheme: Scheme, tolerance: float) -> 
             return end(as_one_kernel, *numbers)
         return as_one_kernel(partial(end, plainly), *numbers)
 
-    outermost = jax.jit(run, compiler_options=accepted(QUICK))
+    outermost = jax.jit(run, compiler_options=accepted(FULL))
     within = jax.jit(run)  # JAX accepts options at the outermost call only.
     return lambda *numbers: (outermost if at_top_level(numbers) else within)(*numbers)
 

@@ -13,7 +13,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, Int
 
 from natcoord_jax.assembly.system import System
 from natcoord_jax.core.results import Result
@@ -43,9 +43,15 @@ def run(
     dt: Array,
     tolerance: Tolerance | None,
     event: Any = None,
+    steps: Int[Array, ""] | None = None,
 ) -> tuple[Slots, Ending]:
-    """All slots of a rollout and where it ended; without derivatives (see `derivative`)."""
-    setting = Setting(system, parameters, dt, tolerance, plan, plan.steps, event=event)
+    """All slots of a rollout and where it ended; without derivatives (see `derivative`).
+
+    The plan has room for its steps, of which the first are made: as many as `steps` says, or all.
+    """
+    setting = Setting(
+        system, parameters, dt, tolerance, plan, plan.steps if steps is None else steps, event=event
+    )
     found, unpack = all_slots(setting, state)
     course, (states, *rest) = with_state(found.course, unpack(found.state)), found.record
     count, factors, slots = found.count, found.factors, Slots(jax.vmap(unpack)(states), *rest)
@@ -68,7 +74,7 @@ def run(
             slots.accepted & ~unused,
         ),
     )
-    return slots, Ending(_judged(course, plan.steps), factors)
+    return slots, Ending(_judged(course, setting.steps), factors)
 
 
 def run_to_the_end(setting: Setting, state: State, kernel: Callable = as_one_kernel) -> Course:

@@ -8,14 +8,15 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 from natcoord_jax.assembly.reading import handing, reads_velocities
 from natcoord_jax.assembly.system import SYSTEM, System
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.callables import Function
-from natcoord_jax.core.checks import is_concrete
-from natcoord_jax.core.compiled import quickly
+from natcoord_jax.core.checks import as_array, at_top_level, is_concrete
+from natcoord_jax.core.compiled import compiled
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.kinds import FLAG, FunctionOf
 from natcoord_jax.core.numeric import Number, Whole
@@ -30,6 +31,9 @@ from natcoord_jax.stepping.newton import TOLERANCE
 from natcoord_jax.stepping.plan import Control, Event, Plan, Slots
 from natcoord_jax.stepping.scheme import SCHEME, SECOND_ORDER, Scheme
 from natcoord_jax.stepping.turns import warn_of_far_turns
+
+ROOM, MOST_ROOM = 64, 16384
+"""Steps that the smallest program has room for, and the largest before room grows by as many at a time."""
 
 SEGMENT = 512
 """Longest segment of a rollout that does not save every step, or that is checkpointed."""
@@ -64,6 +68,7 @@ def _rollout(
     scheme: Scheme,
     *,
     allowed: Tolerance | None,
+    made: Array | None,
 ) -> Trajectory:
     tableau, control_reads = scheme.tableau, False
     length = _segments(steps, save_every, checkpoint)
@@ -83,7 +88,7 @@ def _rollout(
 
     def segment(carry, parameters):
         state, code, failed = carry
-        slots, ending = run_slots(plan, system, state, parameters, dt, allowed, limit)
+        slots, ending = run_slots(plan, system, state, parameters, dt, allowed, limit, made)
         course = ending.course
         running = code == int(Result.SUCCESSFUL)
         keep = partial(jnp.where, running)
@@ -144,11 +149,44 @@ def _rollout(
     )
 
 
-@quickly
-def _compiled(
-    system: System, state: State, inputs: Any, dt: Array, tolerance: Tolerance | None, static: Any
+@compiled
+def _simulate(
+    system: System,
+    state: State,
+    inputs: Any,
+    dt: Array,
+    tolerance: Tolerance | None,
+    made: Array | None,
+    static: Any,
 ) -> Trajectory:
-    return _rollout(system, state, inputs, dt, *static, allowed=tolerance)
+    return _rollout(system, state, inputs, dt, *static, allowed=tolerance, made=made)
+
+
+def _room(steps: int) -> int:
+    """Steps that a program has room for, so that it serves other numbers of them, too."""
+    room = ROOM
+    while room < min(steps, MOST_ROOM):
+        room *= 4
+    return room if steps <= room else -(-steps // MOST_ROOM) * MOST_ROOM
+
+
+def _in_room(inputs: Any, steps: int, room: int) -> Any:
+    """Inputs with rows of zeros for the steps that are not made."""
+    if callable(inputs):
+        return inputs
+    rows = np.zeros((room, *inputs.shape[1:]))
+    rows[:steps] = inputs
+    return as_array(rows)
+
+
+def _cut(trajectory: Trajectory, steps: int) -> Trajectory:
+    """The steps that were made; an operation of JAX would compile a program for every number of them."""
+
+    def first(x: Array, count: int) -> Array:
+        return as_array(np.asarray(x)[:count])
+
+    states = jax.tree.map(lambda x: first(x, steps + 1), trajectory.states)
+    return replace_fields(trajectory, states=states, inputs=first(trajectory.inputs, steps))
 
 
 @checked(
@@ -262,11 +300,15 @@ def simulate(
     if count % save_every:
         raise ValueError(f"save_every is {save_every}; pass a positive divisor of steps = {count}")
     tolerance = Tolerance.of(rtol, atol)
+    room, made = count, None
+    if save_every == 1 and not checkpoint and at_top_level(system, state, inputs, step, until):
+        room, made = _room(count), as_array(count, int)
+        checked = _in_room(checked, count, room)
     if extra_substeps is None:
-        extra_substeps = 16 if tolerance is None else max(256, 8 * count)
-    static = (count, int(save_every), checkpoint, newton_tol, int(extra_substeps), until, scheme)
+        extra_substeps = 16 if tolerance is None else max(256, 8 * room)
+    static = (room, int(save_every), checkpoint, newton_tol, int(extra_substeps), until, scheme)
     try:
-        trajectory = _compiled(system, state, checked, step, tolerance, static)
+        trajectory = _simulate(system, state, checked, step, tolerance, made, static)
     except jax.errors.JaxRuntimeError as error:
         # Another version of the compiler may lack what one kernel needs.
         if not one_kernel.give_up(str(error)):
@@ -276,7 +318,9 @@ def simulate(
             f"{str(error).splitlines()[0]}; please report it with your version of jax, {jax.__version__}",
             stacklevel=2,
         )
-        trajectory = _compiled(system, state, checked, step, tolerance, static)
+        trajectory = _simulate(system, state, checked, step, tolerance, made, static)
+    if made is not None:
+        trajectory = _cut(trajectory, count)
     if throw and is_concrete(trajectory.result):
         system.raise_on_failure(trajectory)
     if tolerance is None:

@@ -1,0 +1,39 @@
+"""What is being waited for, said where somebody sees it."""
+
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+PATIENCE = 2.0
+"""Time [s] from which on it is said what takes so long."""
+
+_last: list[float] = []
+"""How long the last program took [s]."""
+
+
+@contextmanager
+def told(name: str) -> Iterator[None]:
+    """Say on a terminal that a program is being compiled, if that takes long."""
+    begun = time.monotonic()
+    said = threading.Event()
+
+    def say() -> None:
+        said.set()
+        before = f" (the last program took {_last[0]:.1f} s)" if _last else ""
+        print(f"compiling {name}{before} ...", end="", file=sys.stderr, flush=True)
+
+    terminal = sys.stderr is not None and sys.stderr.isatty()
+    timer = threading.Timer(PATIENCE, say)
+    timer.daemon = True
+    if terminal:
+        timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+        taken = time.monotonic() - begun
+        _last[:] = [taken]
+        if said.is_set():
+            print(f" {taken:.1f} s", file=sys.stderr, flush=True)
