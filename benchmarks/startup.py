@@ -17,6 +17,8 @@ from typing import Any, NamedTuple
 from benchmarks import common
 
 STEPS = 200
+REPEATS = 1
+"""Of fresh processes: a run of all of them takes a quarter of an hour."""
 
 
 class Row(NamedTuple):
@@ -84,8 +86,8 @@ REORIENTATION = """
 import jax
 jax.config.update("jax_enable_x64", True)
 import natcoord_jax as nc
-from natcoord_jax import gallery
-solution = nc.optimise(gallery.reorientation())
+from natcoord_jax.gallery.manoeuvres import reorientation
+solution = nc.optimise(reorientation())
 assert solution.ok, solution.explain()
 print("done", flush=True)
 """
@@ -96,11 +98,12 @@ JITS = {"": "nc.jit", " by jax.jit": "jax.jit"}
 
 def waited(command: list[str], environment: dict[str, str] | None = None) -> float:
     """Time [s] from the start of a process to its word "done", or to its end."""
+    settings = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
     begun = time.monotonic()
     run = subprocess.Popen(
         command,
         cwd=common.ROOT,
-        env=os.environ | (environment or {}),
+        env=settings | (environment or {}),
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -153,7 +156,8 @@ def main() -> None:
     peers = None if chosen.no_peers else chosen.peers_python
     results = common.circumstances("startup", quick=chosen.quick)
     rows = dict(list(ROWS.items())[:1]) if chosen.quick else ROWS
-    repeats = 1 if chosen.quick else 3
+    repeats = 1 if chosen.quick else REPEATS
+    waited([sys.executable, "-c", "import natcoord_jax"])  # (Python compiles its own files once, too.)
     runs = []
     for name, row in rows.items():
         runs.append(measure(name, row, repeats, peers))

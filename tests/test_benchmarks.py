@@ -113,3 +113,13 @@ def test_beams_alone(tmp_path):
     for run in results["runs"]:
         assert run.keys() >= TIMES | {"elements", "solver", "us_per_step_and_element"}
         assert run["result"] == "successful" and run["energy_balance"] < 1e-11
+
+
+@pytest.mark.slow
+def test_startup(tmp_path):
+    results, text = _results("startup", tmp_path, "--no-peers", written="startup")
+    (run,) = results["runs"]
+    assert run["scene"] == "heavy top"
+    assert 0 < run["value"] < run["gradient"] and run["gradient"] < run["gradient by jax.jit"]
+    assert results["command_line"][1] < results["command_line"][0]
+    assert "second time" in text

@@ -15,8 +15,9 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import export
 
-from natcoord_jax.xla.elsewhere import elsewhere
+from natcoord_jax.xla.elsewhere import Compilation, elsewhere
 from natcoord_jax.xla.tracing import at_top_level
 from natcoord_jax.xla.waiting import told
 
@@ -95,31 +96,40 @@ class Program:
             return arrays
 
         flat.__name__ = flat.__qualname__ = self.name = name
-        jitted = jax.jit(flat, donate_argnums=0)
-        least, full = accepted(LEAST), accepted(FULL)
-        self.run: Callable = jitted.lower(*shapes).compile(full if effort == "full" else least)
+        jitted, options = jax.jit(flat, donate_argnums=0), accepted(FULL)
+        source = _exported(jitted, shapes) if effort == "tiers" and options != accepted(LEAST) else None
+        if effort == "quick" or source is not None:
+            options = accepted(LEAST)
+        whole = jitted if source is None else jax.jit(source.call, donate_argnums=0)
+        self.run: Callable = whole.lower(*shapes).compile(options)
         self.rest = made[0]
+        self._again = None if source is None else Compilation(source, shapes, accepted(FULL))
         self._calls = 0
-        self._source = (jitted, shapes, _settings()) if effort == "tiers" and least != full else None
 
     def __call__(self, *arguments: Any) -> Any:
         """What it computes."""
         self._calls += 1
-        if self._calls == 2 and self._source is not None:
-            elsewhere.do(self._improve)
+        if self._again is not None:
+            if self._calls == 2:
+                elsewhere.compile(self._again)
+            if self._again.answer is not None:
+                self._take_over(self._again)
         return self.run(*arguments), self.rest
 
-    def _improve(self) -> None:
-        assert self._source is not None
-        jitted, shapes, settings = self._source
-        self._source = None
+    def _take_over(self, again: Compilation) -> None:
+        self._again = None
         try:
-            if settings != _settings():
-                raise ValueError("settings of JAX hold for this thread only")
-            self.run = elsewhere.compiled(jitted, shapes, accepted(FULL))
-        except Exception as error:
-            # Whatever it is, as a call back into Python, which no other process can make: this goes on.
-            warnings.warn(f"{self.name} stays compiled with least effort: {error}", stacklevel=1)
+            self.run = again.loaded()
+        except Exception as error:  # (Whatever it is: the program at hand goes on.)
+            warnings.warn(f"{self.name} stays compiled with least effort: {error}", stacklevel=4)
+
+
+def _exported(jitted: Any, shapes: tuple[list, list]) -> export.Exported | None:
+    """What another process can compile; None for what calls back into Python, or cannot be traced."""
+    try:
+        return export.export(jitted)(*shapes)
+    except Exception:
+        return None
 
 
 class Programs:

@@ -1,4 +1,8 @@
-"""Programs compiled in another process, see `compiler_process`."""
+"""Programs compiled in another process, see `compiler_process`.
+
+The thread that waits for them handles nothing but bytes: an interpreter that ends while a thread is within
+JAX crashes.
+"""
 
 import atexit
 import dataclasses
@@ -8,7 +12,6 @@ import queue
 import subprocess
 import sys
 import threading
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -18,6 +21,7 @@ from jax import export
 from jax.experimental.serialize_executable import deserialize_and_load
 
 from natcoord_jax.xla import kept
+from natcoord_jax.xla.compiler_process import receive, send
 
 IDLE = 30.0
 """Time [s] after which a process without work ends: it takes some hundred megabytes."""
@@ -26,17 +30,50 @@ SETTINGS = ("jax_enable_x64",)
 """Settings of JAX that the process shares."""
 
 
+class Compilation:
+    """A program that is compiled elsewhere.
+
+    Args:
+        program: exported.
+        shapes: of its two lists of arguments, the first to be used again.
+        options: of the compiler.
+
+    Attributes:
+        request: what the process is asked.
+        answer: what it says, once it has: whether all went well, and the code or the reason.
+    """
+
+    def __init__(self, program: export.Exported, shapes: tuple[list, list], options: dict[str, Any]):
+        fields = {x.name: _pickled(getattr(program, x.name)) for x in dataclasses.fields(program)}
+        listed = [[(x.shape, x.dtype) for x in arrays] for arrays in shapes]
+        settings = {name: getattr(jax.config, name) for name in SETTINGS}
+        self.request = pickle.dumps(dict(settings=settings, fields=fields, shapes=listed, options=options))
+        self.answer: tuple[bool, bytes] | None = None
+
+    def loaded(self) -> Callable:
+        """The program.
+
+        Raises:
+            RuntimeError: if it could not be compiled.
+        """
+        assert self.answer is not None
+        well, found = self.answer
+        if not well:
+            raise RuntimeError(found.decode())
+        return deserialize_and_load(*pickle.loads(found))
+
+
 class Elsewhere:
     """A thread that has programs compiled one after the other, and the process that does it."""
 
     def __init__(self) -> None:
-        self._work: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self._work: queue.SimpleQueue[Compilation] = queue.SimpleQueue()
         self._thread: threading.Thread | None = None
         self._process: subprocess.Popen | None = None
         self._starting = threading.Lock()
 
-    def do(self, work: Callable[[], None]) -> None:
-        """Do it in the thread, in its turn."""
+    def compile(self, work: Compilation) -> None:
+        """Compile it in its turn."""
         with self._starting:
             self._work.put(work)
             # (After a fork, the thread is that of the other process, as is its work.)
@@ -45,54 +82,12 @@ class Elsewhere:
                 self._thread = threading.Thread(target=self._run, name="natcoord_jax compiles", daemon=True)
                 self._thread.start()
 
-    def compiled(self, function: Any, shapes: tuple[list, list], options: dict[str, Any]) -> Callable:
-        """A function of two lists of arrays, the first to be used again, compiled elsewhere.
-
-        Raises:
-            Exception: whatever keeps it from being exported (calls back into Python), or compiled.
-        """
-        program = export.export(function)(*shapes)
-        request = {
-            "settings": {name: getattr(jax.config, name) for name in SETTINGS},
-            "fields": {x.name: _pickled(getattr(program, x.name)) for x in dataclasses.fields(program)},
-            "shapes": [[(x.shape, x.dtype) for x in arrays] for arrays in shapes],
-            "options": options,
-        }
-        found = kept.get(request)
-        if found is None:
-            found = self._answer(request)
-            kept.put(request, found)
-        return deserialize_and_load(*found)
-
-    def _answer(self, request: dict[str, Any]) -> Any:
-        process = self._started()
-        assert process.stdin is not None and process.stdout is not None
-        pickle.dump(request, process.stdin)
-        process.stdin.flush()
-        well, found = pickle.load(process.stdout)
-        if not well:
-            raise RuntimeError(found)
-        return found
-
     def end(self) -> None:
         """End the process."""
         process, self._process = self._process, None
         if process is not None:
             process.kill()
             process.wait()
-
-    def _started(self) -> subprocess.Popen:
-        if self._process is None or self._process.poll() is not None:
-            self._process = subprocess.Popen(
-                [sys.executable, str(Path(__file__).with_name("compiler_process.py"))],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.DEVNULL,
-                # (Code that has been read from JAX's cache cannot be sent on.)
-                env=os.environ | {"JAX_PLATFORMS": "cpu", "JAX_ENABLE_COMPILATION_CACHE": "false"},
-                start_new_session=True,  # an interrupt is meant for the run
-            )
-        return self._process
 
     def _run(self) -> None:
         while True:
@@ -106,9 +101,34 @@ class Elsewhere:
                         return
                 continue
             try:
-                work()
-            except Exception as error:
-                warnings.warn(f"a program could not be compiled with full effort: {error}", stacklevel=1)
+                work.answer = self._answer(work.request)
+            except (OSError, EOFError) as error:  # (The process could not be started, or was ended.)
+                work.answer = False, str(error).encode()
+
+    def _answer(self, request: bytes) -> tuple[bool, bytes]:
+        code = kept.get(request)
+        if code is not None:
+            return True, code
+        process = self._started()
+        assert process.stdin is not None and process.stdout is not None
+        send(process.stdin, request)
+        well, found = receive(process.stdout) == b"well", receive(process.stdout)
+        if well:
+            kept.put(request, found)
+        return well, found
+
+    def _started(self) -> subprocess.Popen:
+        if self._process is None or self._process.poll() is not None:
+            self._process = subprocess.Popen(
+                [sys.executable, str(Path(__file__).with_name("compiler_process.py"))],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+                # (Code that has been read from JAX's cache cannot be sent on.)
+                env=os.environ | {"JAX_PLATFORMS": "cpu", "JAX_ENABLE_COMPILATION_CACHE": "false"},
+                start_new_session=True,  # an interrupt is meant for the run
+            )
+        return self._process
 
 
 def _pickled(value: Any) -> bytes:

@@ -2,13 +2,11 @@
 
 import hashlib
 import os
-import pickle
 import platform
 import tempfile
 import time
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import jax
 import jaxlib.version
@@ -19,6 +17,9 @@ FOLDER = "natcoord_jax"
 
 FULL = "full"
 """Name of the folder of programs that were compiled with full effort, beside those that JAX keeps itself."""
+
+DIGEST = 32
+"""Bytes of a file that tell whether the others are all there."""
 
 MONTH = 30 * 24 * 3600.0
 """Age [s] at which a program is deleted: versions of JAX follow each other as fast."""
@@ -46,18 +47,18 @@ def _keep_in(folder: Path | None) -> None:
     compilation_cache.reset_cache()  # JAX looks at the setting once, when it compiles its first program
 
 
-def get(request: dict[str, Any]) -> Any:
-    """What was put there for a request; None if there is nothing, or nothing that can be read."""
+def get(request: bytes) -> bytes | None:
+    """What was put there for a request; None if there is nothing, or not all of it."""
     path = _path(request)
-    if path is None:
-        return None
     try:
-        return pickle.loads(path.read_bytes())
-    except (OSError, EOFError, pickle.UnpicklingError, AttributeError, ImportError, IndexError):
+        content = b"" if path is None else path.read_bytes()
+    except OSError:
         return None
+    found, check = content[DIGEST:], content[:DIGEST]
+    return found if found and hashlib.sha256(found).digest() == check else None
 
 
-def put(request: dict[str, Any], found: Any) -> None:
+def put(request: bytes, found: bytes) -> None:
     """Keep it, if programs are kept, all at once: whoever reads meanwhile finds nothing."""
     path = _path(request)
     if path is None:
@@ -65,19 +66,18 @@ def put(request: dict[str, Any], found: Any) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".part", delete=False) as file:
-            pickle.dump(found, file)
+            file.write(hashlib.sha256(found).digest() + found)
         os.replace(file.name, path)
     except OSError:  # (No room, or not ours to write: it is compiled again then.)
         return
 
 
-def _path(request: dict[str, Any]) -> Path | None:
+def _path(request: bytes) -> Path | None:
     folder = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
     if folder is None or "://" in folder:
         return None
     versions = jax.__version__, jaxlib.version.__version__, os.environ.get("XLA_FLAGS"), processor()
-    content = pickle.dumps((versions, sorted(request.items())))
-    return Path(folder) / FULL / hashlib.sha256(content).hexdigest()
+    return Path(folder) / FULL / hashlib.sha256(repr(versions).encode() + request).hexdigest()
 
 
 @cache
