@@ -14,6 +14,9 @@ os.environ["XLA_FLAGS"] = (
     + f"while-loop-trip-count-annotator --xla_backend_optimization_level=0 {os.environ.get('XLA_FLAGS', '')}"
 )
 
+# With these, a second program with full effort would be the first again.
+os.environ.setdefault("NATCOORD_JAX_EFFORT", "quick")
+
 import jax
 import pytest
 from jaxtyping import install_import_hook
@@ -53,10 +56,6 @@ def pytest_configure(config: pytest.Config) -> None:
     if config.option.check_types:
         hook = install_import_hook("natcoord_jax", "beartype.beartype")
         config.add_cleanup(hook.uninstall)
-    from natcoord_jax import set_effort
-
-    # With the flags above, a second program with full effort would be the first again.
-    set_effort("quick")
 
 
 @pytest.fixture(autouse=True)

@@ -21,6 +21,8 @@ import natcoord_jax as nc
 from natcoord_jax import gallery
 from natcoord_jax.xla import effort, waiting
 
+OURS = "XLA_FLAGS", "JAX_COMPILATION_CACHE_DIR", "NATCOORD_JAX_EFFORT"
+"""What of the environment is that of the tests."""
 ROOT = Path(__file__).resolve().parents[1]
 
 
@@ -212,6 +214,14 @@ def test_other_efforts_are_refused():
         nc.set_effort(3)
 
 
+def test_the_environment_chooses(monkeypatch):
+    monkeypatch.setenv(effort.VARIABLE, "full")
+    assert effort._of_environment() == "full"
+    monkeypatch.setenv(effort.VARIABLE, "most")
+    with pytest.raises(ValueError, match="NATCOORD_JAX_EFFORT in the environment is 'most'; set tiers"):
+        effort._of_environment()
+
+
 def test_settings_of_jax_are_followed():
     function = nc.jit(lambda x: x / (x - 1.0))
     assert np.isinf(function(1.0))
@@ -248,7 +258,7 @@ print(found, flush=True)
 
 def process(more, **env):
     """Run with the compiler that users have, whose full effort takes seconds."""
-    plain = {k: v for k, v in os.environ.items() if k not in ("XLA_FLAGS", "JAX_COMPILATION_CACHE_DIR")}
+    plain = {k: v for k, v in os.environ.items() if k not in OURS}
     return subprocess.Popen(
         [sys.executable, "-c", PROGRAM + more],
         cwd=ROOT,
@@ -346,7 +356,7 @@ def lasting(tmp_path):
         found = subprocess.run(
             [sys.executable, "-c", LASTING.replace("# here", more), str(tmp_path)],
             cwd=ROOT,
-            env={k: v for k, v in os.environ.items() if k not in ("XLA_FLAGS", "JAX_COMPILATION_CACHE_DIR")},
+            env={k: v for k, v in os.environ.items() if k not in OURS},
             capture_output=True,
             text=True,
         )

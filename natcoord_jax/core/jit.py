@@ -89,7 +89,8 @@ def set_effort(effort: Effort) -> Effort:
     """Choose how much effort programs are compiled with, where it is not said at the function.
 
     That is for `nc.jit` without `effort`, and for what compiles when it is called from Python: `nc.simulate`,
-    `nc.optimise`, and so on. What has been compiled with other effort is kept beside.
+    `nc.optimise`, and so on. What has been compiled with other effort is kept beside. The variable
+    `NATCOORD_JAX_EFFORT` of the environment does the same from outside.
 
     Args:
         effort: "tiers" for little effort first and full effort in a thread, see `nc.jit`; "quick" for little;

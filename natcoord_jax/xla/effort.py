@@ -6,11 +6,12 @@ long as they run a few times. What is run a second time is compiled in full by a
 when that is done.
 """
 
+import os
 import warnings
 import weakref
 from collections.abc import Callable, Hashable, Sequence
 from functools import cache, partial
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -67,7 +68,18 @@ def _are_known(options: tuple[tuple[str, Any], ...]) -> bool:
     return True
 
 
-_default: list[Effort] = ["tiers"]
+VARIABLE = "NATCOORD_JAX_EFFORT"
+"""Of the environment, where it is not to be written into the program."""
+
+
+def _of_environment() -> Any:
+    effort = os.environ.get(VARIABLE, "tiers")
+    if effort not in get_args(Effort):
+        raise ValueError(f"{VARIABLE} in the environment is {effort!r}; set {' or '.join(get_args(Effort))}")
+    return effort
+
+
+_default: list[Effort] = [_of_environment()]
 
 
 def set_default(effort: Effort) -> Effort:
