@@ -34,12 +34,13 @@ def jit(
     donate_argnums: int | Sequence[int] = (),
     donate_argnames: str | Iterable[str] = (),
 ) -> Any:
-    """`jax.jit`, with the first result in seconds: least effort first, full effort in a thread meanwhile.
+    """`jax.jit`, with the first result in seconds: least effort first, full effort meanwhile.
 
-    The first call compiles without optimisations, which takes a fourth of the time, and runs; the program is
-    several times slower than it could be. From the second call on it is compiled in full, in a thread, and
-    the call after that is ready runs as fast as by `jax.jit`. Results of both differ by rounding: ask for
-    one of them where every bit has to be the same in every run.
+    The first call compiles without optimisations, which takes a half to a fifth of the time, and runs; the
+    program is several times slower than it could be. From the second call on another process compiles it in
+    full, and the first call after that runs as fast as by `jax.jit`. Results of both differ by rounding: ask
+    for one of them where every bit has to be the same in every run. What calls back into Python (as
+    `jax.pure_callback` and `jax.debug.print`) no other process can compile: it is compiled in full at once.
 
     Put it outermost, around the derivative: `nc.jit(jax.value_and_grad(cost))`. Within another
     transformation or another `jit` it is `jax.jit`, and so it is on other processors than the CPU.
@@ -93,7 +94,7 @@ def set_effort(effort: Effort) -> Effort:
     `NATCOORD_JAX_EFFORT` of the environment does the same from outside.
 
     Args:
-        effort: "tiers" for little effort first and full effort in a thread, see `nc.jit`; "quick" for little;
+        effort: "tiers" for little effort first and full effort meanwhile, see `nc.jit`; "quick" for little;
             "full" for one long run, for measurements, and where every bit has to be the same in every run.
 
     Returns:

@@ -8,7 +8,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array
 
 from natcoord_jax.assembly.reading import handing, reads_velocities
@@ -29,11 +28,9 @@ from natcoord_jax.stepping.derivative import run_slots
 from natcoord_jax.stepping.error_control import Tolerance
 from natcoord_jax.stepping.newton import TOLERANCE
 from natcoord_jax.stepping.plan import Control, Event, Plan, Slots
+from natcoord_jax.stepping.room import cut, in_host_memory, room_for, with_room
 from natcoord_jax.stepping.scheme import SCHEME, SECOND_ORDER, Scheme
 from natcoord_jax.stepping.turns import warn_of_far_turns
-
-ROOM, MOST_ROOM = 64, 16384
-"""Steps that the smallest program has room for, and the largest before room grows by as many at a time."""
 
 SEGMENT = 512
 """Longest segment of a rollout that does not save every step, or that is checkpointed."""
@@ -162,33 +159,6 @@ def _simulate(
     return _rollout(system, state, inputs, dt, *static, allowed=tolerance, made=made)
 
 
-def _room(steps: int) -> int:
-    """Steps that a program has room for, so that it serves other numbers of them, too."""
-    room = ROOM
-    while room < min(steps, MOST_ROOM):
-        room *= 4
-    return room if steps <= room else -(-steps // MOST_ROOM) * MOST_ROOM
-
-
-def _in_room(inputs: Any, steps: int, room: int) -> Any:
-    """Inputs with rows of zeros for the steps that are not made."""
-    if callable(inputs):
-        return inputs
-    rows = np.zeros((room, *inputs.shape[1:]))
-    rows[:steps] = inputs
-    return as_array(rows)
-
-
-def _cut(trajectory: Trajectory, steps: int) -> Trajectory:
-    """The steps that were made; an operation of JAX would compile a program for every number of them."""
-
-    def first(x: Array, count: int) -> Array:
-        return as_array(np.asarray(x)[:count])
-
-    states = jax.tree.map(lambda x: first(x, steps + 1), trajectory.states)
-    return replace_fields(trajectory, states=states, inputs=first(trajectory.inputs, steps))
-
-
 @checked(
     system=SYSTEM,
     state=STATE,
@@ -258,7 +228,7 @@ def simulate(
             the floor of round-off; larger values are faster and let energy and momentum drift in proportion.
         extra_substeps: how many substeps may be made beyond one a step (per segment of at most 512 steps
             where not every step is saved); by default 16, for steps that fail and are repeated in parts, and
-            with error control 256 or eight a step. A gradient takes time for all of them.
+            with error control 256 or eight a step (that there is room for). A gradient takes time for all.
         scheme: `EnergyMomentum`, by default that of order two; `VariationalMidpoint`; `Dissipative`.
         rtol: error that a substep may have, relative: steps are made in as few substeps as keep to it, of
             lengths found on the way. Inputs change at the ends of steps, states are saved there, and what
@@ -301,9 +271,10 @@ def simulate(
         raise ValueError(f"save_every is {save_every}; pass a positive divisor of steps = {count}")
     tolerance = Tolerance.of(rtol, atol)
     room, made = count, None
-    if save_every == 1 and not checkpoint and at_top_level(system, state, inputs, step, until):
-        room, made = _room(count), as_array(count, int)
-        checked = _in_room(checked, count, room)
+    spare = save_every == 1 and not checkpoint and in_host_memory()
+    if spare and at_top_level(system, state, inputs, step, until):
+        room, made = room_for(count), as_array(count, int)
+        checked = with_room(checked, count, room)
     if extra_substeps is None:
         extra_substeps = 16 if tolerance is None else max(256, 8 * room)
     static = (room, int(save_every), checkpoint, newton_tol, int(extra_substeps), until, scheme)
@@ -319,8 +290,8 @@ def simulate(
             stacklevel=2,
         )
         trajectory = _simulate(system, state, checked, step, tolerance, made, static)
-    if made is not None:
-        trajectory = _cut(trajectory, count)
+    if count < room:
+        trajectory = cut(trajectory, count)
     if throw and is_concrete(trajectory.result):
         system.raise_on_failure(trajectory)
     if tolerance is None:
