@@ -67,7 +67,7 @@ from natcoord_jax.core.jit import jit, keep_programs, set_effort
 from natcoord_jax.core.joint import Frame, Joint
 from natcoord_jax.core.markers import Attachment, Direction, Point
 from natcoord_jax.core.potential import Potential
-from natcoord_jax.core.results import Result, SimulationError
+from natcoord_jax.core.results import DerivativeError, Result, SimulationError
 from natcoord_jax.core.state import State, Trajectory
 from natcoord_jax.effects.actuators import BodyForceInput, BodyTorqueInput, JointForce, JointTorque
 from natcoord_jax.effects.beams import (
@@ -134,6 +134,7 @@ __all__ = [
     "Cylinder",
     "Cylindrical",
     "Damper",
+    "DerivativeError",
     "Direction",
     "DirectorDamping",
     "DirectorElement",

@@ -299,7 +299,7 @@ CALLS = {
 
 # What calls return or hand over, and bases: nobody is to make these by hand.
 MADE = {
-    "Accuracy", "Balance", "BeamHandle", "Check", "ComputedTorque", "Equilibrium", "Feedback",
+    "Accuracy", "Balance", "BeamHandle", "Check", "ComputedTorque", "DerivativeError", "Equilibrium", "Feedback",
     "Frame", "Growth",
     "Load", "Modes", "Outcome", "Result", "SimulationError", "Solution", "State", "System", "Trajectory",
 }  # fmt: skip

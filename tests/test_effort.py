@@ -282,6 +282,7 @@ def test_an_interpreter_ends_while_full_effort_is_under_way():
 def test_an_interrupt_ends_the_run_and_not_the_compiler():
     run = process(
         """
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have it ignored in the background
 try:
     print("ready", flush=True)
     time.sleep(60)

@@ -5,7 +5,9 @@ be none. Everything is held against differences, which know nothing of branches.
 """
 
 import warnings
+from functools import partial
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,6 +16,7 @@ import tolerances as tol
 from differences import STEPS, difference_errors
 
 import natcoord_jax as nc
+from natcoord_jax.control import costates
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.gradient import averaged_gradient
 from natcoord_jax.core.handles import Handle
@@ -21,6 +24,7 @@ from natcoord_jax.effects.springs.point_springs import COINCIDENT, energy_of_dis
 from natcoord_jax.maths.collocation import gauss
 from natcoord_jax.maths.rotations import from_rotation_vector
 from natcoord_jax.maths.vectors import positive_part, quotient, safe_divide, safe_norm, unit
+from natcoord_jax.stepping.correcting import ROUNDS, Correcting
 
 SCHEMES = {order: nc.EnergyMomentum(order=order) for order in (2, 4)}
 
@@ -421,3 +425,100 @@ def test_a_rotor_that_turns_too_far_in_a_step_is_told():
         run = nc.simulate(system, spinning, dt=0.0014, steps=4)
         jax.jit(lambda s: nc.simulate(system, s, dt=0.01, steps=4).q)(spinning)
     assert float(run.states.coordinates[-1, 0] / run.t[-1]) == pytest.approx(250.0, rel=0.0105)
+
+
+# --- derivatives that are none ----------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def turntable():
+    """A disc on a hinge with a motor."""
+    scene = nc.Scene()
+    disc = scene.add(nc.RigidBody(mass=1.0, inertia=(1.0, 1.0, 2.0)))
+    hinge = scene.add(nc.Revolute(nc.ground, disc, name="hinge"))
+    scene.add(nc.JointTorque(hinge, name="motor"))
+    return scene.compile()
+
+
+def unsolvable(monkeypatch):
+    """Linear systems of derivatives are found unsolved from now on."""
+    judged = Correcting.judged
+
+    def never(self, *args, **kwargs):
+        found, factors = judged(self, *args, **kwargs)
+        no, yes = jnp.zeros_like(found.done), jnp.ones_like(found.done)
+        given = no, yes, jnp.zeros_like(found.rounds) + ROUNDS
+        return eqx.tree_at(lambda c: (c.done, c.wanting, c.rounds), found, given), factors
+
+    monkeypatch.setattr(Correcting, "judged", never)
+
+
+MODES = {
+    "grad": lambda f, x: jax.grad(f)(x),
+    "jvp": lambda f, x: jax.jvp(f, (x,), (jnp.ones_like(x),))[1],
+    "jacrev": lambda f, x: jax.jacrev(f)(x),
+    "jacfwd": lambda f, x: jax.jacfwd(f)(x),
+    "hessian": lambda f, x: jax.hessian(f)(x),
+}
+
+
+@pytest.mark.parametrize(
+    "mode",
+    ["grad", "jvp", *(pytest.param(m, marks=pytest.mark.slow) for m in ("jacrev", "jacfwd", "hessian"))],
+)
+def test_a_derivative_that_is_none_is_an_error_in_python_and_nan_in_jit(turntable, mode):
+    system, state = turntable
+
+    def end(u, law):
+        given = dict(dt=0.1, steps=5, inputs=lambda t, s: u * law(s.coordinates[:1]))
+        return nc.simulate(system, state, **given).states.coordinates[-1, 0]
+
+    rough, u = partial(end, law=lambda x: jnp.sqrt(jnp.abs(x))), jnp.array([0.5])
+    with pytest.raises(nc.DerivativeError, match="simulate: a derivative is not a number"):
+        MODES[mode](rough, u)
+    assert np.all(np.isnan(nc.jit(partial(MODES[mode], rough))(u)))
+    assert np.all(np.isfinite(MODES[mode](partial(end, law=jnp.cos), u)))
+
+
+def test_what_is_no_number_before_is_no_fault_of_a_run(turntable):
+    system, state = turntable
+
+    def end(u):
+        return nc.simulate(system, state, dt=0.1, steps=5, inputs=jnp.sqrt(u)).states.coordinates[-1, 0]
+
+    assert np.isinf(jax.grad(end)(jnp.zeros(1))[0])
+    assert np.isnan(jax.grad(lambda u: jnp.sqrt(end(u)) * 0.0)(jnp.zeros(1))[0])
+
+
+@pytest.mark.parametrize("mode", ["grad", "jvp"])
+def test_a_system_that_corrections_do_not_solve_is_reported(turntable, mode, monkeypatch):
+    system, state = turntable
+    unsolvable(monkeypatch)
+
+    def end(u):  # (a number of steps of its own: another program)
+        inputs = jnp.broadcast_to(u, (67, 1))
+        return nc.simulate(system, state, dt=0.1, inputs=inputs, save_every=67).states.coordinates[-1, 0]
+
+    with pytest.raises(nc.DerivativeError):
+        MODES[mode](end, jnp.ones(1))
+
+
+def test_control_says_that_a_step_has_no_derivative(turntable, monkeypatch):
+    system, state = turntable
+    problem = nc.OptimalControl(
+        system, state, dt=0.1, steps=7, cost=nc.cost.Effort(), goal=nc.goal.Coordinate("hinge", 1.0)
+    )
+    monkeypatch.setattr(costates, "UNSOLVED", -1.0)
+    for method in ("shooting", "lifted", "auto"):
+        solution = nc.optimise(problem, method=method, progress=False)
+        assert solution.outcome is nc.Outcome.SINGULAR
+        assert "linearised equations have no solution" in solution.explain()
+
+
+def test_descent_ends_where_there_is_no_slope(turntable):
+    system, state = turntable
+    rough = nc.cost.Terminal(lambda state: jnp.sqrt(jnp.abs(state.coordinates[0])))
+    problem = nc.OptimalControl(system, state, dt=0.1, steps=5, cost=rough)
+    solution = nc.descend(problem, iterations=3, progress=False)
+    assert solution.outcome is nc.Outcome.NONFINITE
+    assert np.all(np.isfinite(solution.inputs))

@@ -25,6 +25,7 @@ from natcoord_jax.control.transcription import (
     stage,
     unpacked,
 )
+from natcoord_jax.stepping.derivative import UNSOLVED
 from natcoord_jax.stepping.one_kernel import scan_in_one_kernel
 
 
@@ -73,7 +74,7 @@ class Jacobians(NamedTuple):
     """How the equations of every step depend on what they are solved for and on what is given.
 
     Attributes:
-        inverses: of the Jacobians in the step's own unknowns.
+        inverses: of the Jacobians in the step's own unknowns; NaN for those that have none.
         by_node: in the node before the step, as one vector.
         by_w: in the coefficients that enter.
     """
@@ -93,7 +94,10 @@ def step_jacobians(problem: OptimalControl, path: Path, unknowns: Unknowns) -> J
             return stage(problem, at, unflat(flat), w, y).residual
 
         by_node, by_w, by_y = jax.jacrev(residual, argnums=(0, 1, 2))(flat, w, y)
-        return Jacobians(jnp.linalg.inv(by_y), by_node, by_w)
+        inverse = jnp.linalg.inv(by_y)
+        missing = jnp.abs(by_y @ inverse - jnp.eye(y.size))
+        solved = jnp.all(missing <= UNSOLVED * (1.0 + jnp.abs(by_y) @ jnp.abs(inverse)))
+        return Jacobians(jnp.where(solved, inverse, jnp.nan), by_node, by_w)
 
     before = jax.tree.map(lambda x: x[:-1], path.nodes)
     return jax.vmap(one)(slices(problem), before, entering(problem, unknowns.coefficients), unknowns.y)

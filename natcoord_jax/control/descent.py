@@ -2,14 +2,18 @@
 
 import sys
 import time
+from functools import partial
 from operator import itemgetter
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from natcoord_jax.control.guess import GUESS, unknowns_of
+from natcoord_jax.control.iterate import largest
 from natcoord_jax.control.problem import PROBLEM, OptimalControl
 from natcoord_jax.control.results import Outcome
 from natcoord_jax.control.run import HEADER, numeric, printed
@@ -131,8 +135,11 @@ def descend(
         def body(carry: tuple, _: Any) -> tuple:
             variables, memory = carry
             slope = jax.grad(_augmented, has_aux=True)(variables, problem, multipliers, penalty)[0]
-            change, memory = optimiser.update(slope, memory, variables)
-            return (optax.apply_updates(variables, change), memory), None
+            change, updated = optimiser.update(slope, memory, variables)
+            moved = optax.apply_updates(variables, change), updated
+            # Where there is no slope it ends, with what was reached.
+            sound = jnp.all(jnp.isfinite(ravel_pytree(slope)[0]))
+            return jax.tree.map(partial(jnp.where, sound), moved, carry), None
 
         (variables, _), _ = jax.lax.scan(body, (variables, optimiser.init(variables)), None, iterations)
         slope, found = jax.grad(_augmented, has_aux=True)(variables, problem, multipliers, penalty)
@@ -148,14 +155,14 @@ def descend(
         nu, sigma = multipliers
         multipliers = (nu + penalty * missing, jnp.maximum(0.0, sigma + penalty * excess))
         violation = jnp.max(jnp.concatenate([jnp.zeros(1), jnp.abs(missing), excess]))
-        size = max(float(jnp.max(jnp.abs(x), initial=0.0)) for x in slope)
+        size = float(largest(*slope))
         row = Row((k + 1) * iterations, float(cost), size, float(violation), "", 1.0, 0, 0.0)
         row = row._replace(seconds=time.perf_counter() - began)
         history.append(row)
         if progress:
             print(printed(row), file=sys.stderr, flush=True)
         penalty = growth * penalty
-        if not jnp.isfinite(cost) or int(code) != 0:
+        if not np.isfinite(float(cost) + size) or int(code) != 0:
             outcome = Outcome.SIMULATION_FAILED if int(code) else Outcome.NONFINITE
             break
         if constrained and violation <= tol or not constrained:

@@ -15,6 +15,7 @@ class Outcome(IntEnum):
     NONFINITE = 6
     STOPPED = 7
     TIME_LIMIT = 8
+    SINGULAR = 9
 
     @property
     def ok(self) -> bool:
@@ -32,6 +33,7 @@ OUTCOMES = {
     Outcome.NONFINITE: "a number became infinite or not a number",
     Outcome.STOPPED: "stopped by the user",
     Outcome.TIME_LIMIT: "the time limit was reached",
+    Outcome.SINGULAR: "a step has no derivative: its linearised equations have no solution",
 }
 
 ADVICE = {
@@ -40,5 +42,7 @@ ADVICE = {
     "inputs that cannot move what the goal asks for; start from another guess",
     Outcome.STALLED: "start from another guess, or look for cost, goal or bounds that are not smooth",
     Outcome.SIMULATION_FAILED: "start from a milder guess or with a smaller dt, or use method='lifted'",
+    Outcome.SINGULAR: "start from a guess that keeps away from positions where constraints depend on "
+    "each other",
     Outcome.NONFINITE: "check cost, goal and bounds for undefined operations",
 }

@@ -32,7 +32,9 @@ OPTIONS = of("natcoord_jax.control.iterate.Options(...)", Options)
 WEIGHTS = Number("not negative") | Vector(None)
 NAMES = {True: "lifted", False: "shooting"}
 METHOD = "sequential quadratic programming"
-FOR_THE_OTHER = (Outcome.SIMULATION_FAILED, Outcome.STALLED, Outcome.MAX_ITERATIONS, Outcome.NONFINITE)
+FOR_THE_OTHER = (
+    Outcome.SIMULATION_FAILED, Outcome.STALLED, Outcome.MAX_ITERATIONS, Outcome.NONFINITE, Outcome.SINGULAR
+)  # fmt: skip
 """Outcomes after which the other form of the method is tried, if the choice was ours."""
 SAME = 1e-3
 """Difference of inputs, relative to the largest, below which two optima are taken for one."""

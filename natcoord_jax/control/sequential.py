@@ -19,11 +19,7 @@ from natcoord_jax.control.merit import Found, moved, room, search
 from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.control.proposal import Proposal, no_model, propose
 from natcoord_jax.control.results import Outcome
-from natcoord_jax.control.transcription import (
-    Unknowns,
-    roll,
-    simulated,
-)
+from natcoord_jax.control.transcription import Path, Unknowns, roll, simulated
 from natcoord_jax.core.compiled import compiled
 
 ROOM = 0.01
@@ -72,7 +68,7 @@ def _first(
     nothing, infinite = jnp.zeros(()), jnp.full((), jnp.inf, float)
     goal = multipliers.goal
     finite = jnp.isfinite(path.cost) & jnp.isfinite(derivatives.errors.stationarity)
-    code = jnp.where(finite, int(Outcome.RUNNING), int(Outcome.NONFINITE))
+    code = jnp.where(finite, int(Outcome.RUNNING), _undefined(path, derivatives))
     code = jnp.where(whole, code, int(Outcome.SIMULATION_FAILED))
     return Iterate(
         unknowns,
@@ -182,6 +178,13 @@ def step(problem: OptimalControl, options: Options, iterate: Iterate) -> Iterate
     return concluded(options, iterate, proposal, found, multipliers, derivatives)
 
 
+def _undefined(path: Path, derivatives: Derivatives) -> Int[Array, ""]:
+    """Outcome where a number is none: of the motion, or only of its derivative."""
+    solved = jnp.all(jnp.isfinite(derivatives.jacobians.inverses))
+    singular = ~solved & jnp.all(jnp.isfinite(path.stages.residual))
+    return jnp.where(singular, int(Outcome.SINGULAR), int(Outcome.NONFINITE))
+
+
 def _judged(options: Options, it: Iterate) -> Int[Array, ""]:
     """Outcome of an iteration."""
     e = it.errors
@@ -197,7 +200,7 @@ def _judged(options: Options, it: Iterate) -> Int[Array, ""]:
     )
     code = jnp.where(it.failures >= 5, int(Outcome.STALLED), code)
     code = jnp.where(unreachable, int(Outcome.UNREACHABLE), code)
-    code = jnp.where(finite, code, int(Outcome.NONFINITE))
+    code = jnp.where(finite, code, _undefined(it.path, it.derivatives))
     return jnp.where(optimal, int(Outcome.OPTIMAL), code)
 
 

@@ -5,6 +5,7 @@ from functools import partial, wraps
 from typing import Any, TypeVar
 
 from natcoord_jax.core.closures import with_callables
+from natcoord_jax.core.reported import Passage
 from natcoord_jax.xla.effort import Effort
 from natcoord_jax.xla.jit import programs_of
 
@@ -17,10 +18,12 @@ def _with(effort: Effort | None, function: F) -> F:
     def called(donated: tuple, arguments: tuple) -> Any:
         return function(*arguments)
 
-    programs = partial(programs_of(function.__name__.strip("_"), called, effort), ())
+    name = function.__name__.strip("_")
+    programs = partial(programs_of(name, called, effort), ())
 
     def run(*arguments: Any) -> Any:
-        return programs(arguments)
+        passage = Passage(name)
+        return passage.leave(programs(passage.enter(arguments)))
 
     @wraps(function)
     def call(*arguments: Any) -> Any:

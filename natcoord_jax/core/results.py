@@ -57,3 +57,7 @@ class SimulationError(RuntimeError):
         super().__init__(message)
         self.result = result
         self.trajectory = trajectory
+
+
+class DerivativeError(ArithmeticError):
+    """A derivative of a run that is none, raised where it is taken outside of `jit`; within, it is NaN."""

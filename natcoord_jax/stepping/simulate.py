@@ -197,7 +197,7 @@ def simulate(
     Works under `jit`, `vmap`, `grad`, `jvp` and their compositions up to one reverse mode; `dt` and every
     floating leaf of `system`, `state` and `inputs` can be differentiated. Derivatives are exact where the
     motion changes suddenly, too; where the linear system of a step cannot be solved they are NaN, in every
-    mode, though the run itself went well.
+    mode, though the run itself went well; outside of any `jit` that raises a `DerivativeError`.
 
     Functions (inputs, `until`, drives, loads, laws) and methods of effects of one's own are traced at each
     call from Python: whatever they read is as it is then, and another number, also a function made anew,
