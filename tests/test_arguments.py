@@ -299,9 +299,9 @@ CALLS = {
 
 # What calls return or hand over, and bases: nobody is to make these by hand.
 MADE = {
-    "Accuracy", "Balance", "BeamHandle", "Check", "ComputedTorque", "DerivativeError", "Equilibrium", "Feedback",
-    "Frame", "Growth",
-    "Load", "Modes", "Outcome", "Result", "SimulationError", "Solution", "State", "System", "Trajectory",
+    "Accuracy", "Balance", "BeamHandle", "Check", "ComputedTorque", "DerivativeError", "Equilibrium",
+    "Feedback", "Frame", "Growth", "Load", "Modes", "Outcome", "Result", "SimulationError", "Solution",
+    "State", "System", "Trajectory",
 }  # fmt: skip
 BASES = {"Field", "Force", "Joint", "Potential"}
 IN_MODULES = {"cost": nc.cost, "goal": nc.goal, "bounds": nc.bounds, "inputs": nc.inputs}
