@@ -274,6 +274,12 @@ def test_the_end_of_a_run_is_one_kernel_and_little_else(name):
     assert MARK in jax.jit(end).lower(1e-3, 4).as_text(), "not compiled into one kernel"
 
 
+def test_the_end_of_a_run_is_found_by_parts_of_steps_where_whole_ones_fail():
+    example = gallery.load("four_bar")
+    end = endpoints(example.system, example.state, scheme=nc.EnergyMomentum())(0.2, 10)
+    assert int(end.result) == 0 and int(end.substeps) > 10
+
+
 def _scaled(residuals, x):
     """x -> sin(a) x, and its sum with weights a."""
     (a,) = residuals

@@ -522,3 +522,19 @@ def test_descent_ends_where_there_is_no_slope(turntable):
     solution = nc.descend(problem, iterations=3, progress=False)
     assert solution.outcome is nc.Outcome.NONFINITE
     assert np.all(np.isfinite(solution.inputs))
+
+
+def test_known_tangents_and_unknown_ones_pass_side_by_side(turntable):
+    """The gradient of a directional derivative along a direction that is fixed, several of them at once."""
+    system, state = turntable
+
+    def end(u, dt):
+        return nc.simulate(system, state, dt=dt, inputs=u).states.coordinates[-1, 0]
+
+    def along(u, direction):
+        return jax.jvp(partial(end, u), (0.1,), (direction,))[1]
+
+    u, directions = jnp.ones((5, 1)), jnp.array([1.0, 2.0])
+    every = jax.vmap(jax.grad(along), (None, 0))(u, directions)
+    slope = jax.grad(lambda u: jax.grad(end, 1)(u, 0.1))(u)
+    np.testing.assert_allclose(every, directions[:, None, None] * slope, rtol=tol.SAME_GRADIENT)

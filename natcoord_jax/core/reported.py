@@ -28,10 +28,12 @@ class Passage:
 
     Attributes:
         where: name of the function, for the message.
-        sound: whether what went in last was finite.
+        entering: whether changes go in still.
+        sound: whether those that went in were finite.
     """
 
     where: str
+    entering: bool = field(default=False, compare=False)
     sound: bool = field(default=False, compare=False)
 
     def __hash__(self) -> int:
@@ -45,78 +47,72 @@ class Passage:
         """What comes out, as it is."""
         return _through(values, self, False)
 
-    def look(self, first: bool, changes: Sequence[Array]) -> None:
-        """See the changes that go in, or those that come out after them.
+    def look(self, first: bool, change: Array) -> None:
+        """See a change that goes in, or one that comes out after all of these.
 
         Raises:
-            DerivativeError: if the latter are no numbers, the former being some.
+            DerivativeError: if the latter is no number, the former being some.
         """
-        finite = all(np.all(np.isfinite(x)) for x in changes)
-        if not first and self.sound and not finite:
+        finite = bool(np.all(np.isfinite(change)))
+        if first:
+            self.sound = finite and (self.sound or not self.entering)
+        elif self.sound and not finite:
             raise DerivativeError(
                 f"{self.where}: a derivative is not a number, though what it is of went well: linearised "
                 "equations cannot be solved there, or a function in them has no derivative. Look for a "
                 "position where constraints depend on each other, and for sqrt, norms, quotients and `where` "
                 "at zero in laws and functions of your own; or start a little beside. Within jit it is NaN"
             )
-        self.sound = first and finite
+        self.entering = first
 
 
 def _through(values: Any, passage: Passage, entering: bool) -> Any:
-    leaves, structure = jax.tree.flatten(values)
-    moving = [
-        k for k, x in enumerate(leaves) if isinstance(x, Tracer) and jnp.issubdtype(x.dtype, jnp.inexact)
-    ]
-    if not moving:
-        return values
-    found = passage_p.bind(*(leaves[k] for k in moving), passage=passage, entering=entering, change=None)
-    for k, x in zip(moving, found):
-        leaves[k] = x
-    return jax.tree.unflatten(structure, leaves)
+    def one(x: Any) -> Any:
+        if not isinstance(x, Tracer) or not jnp.issubdtype(x.dtype, jnp.inexact):
+            return x
+        return passage_p.bind(x, passage=passage, entering=entering, change=None)
+
+    return jax.tree.map(one, values)
 
 
 passage_p = jex.Primitive("passage")
-passage_p.multiple_results = True
 
 
 @passage_p.def_impl
-def _impl(*values: Any, passage: Passage, entering: bool, change: str | None) -> list[Any]:
+def _impl(value: Any, *, passage: Passage, entering: bool, change: str | None) -> Any:
     if change is not None:
         # Tangents enter where the program begins, cotangents where it ends.
-        passage.look(entering == (change == "forward"), values)
-    return list(values)
+        passage.look(entering == (change == "forward"), value)
+    return value
 
 
 @passage_p.def_abstract_eval
-def _abstract(*values: Any, **_: Any) -> list[Any]:
-    return [ShapedArray(x.shape, x.dtype) for x in values]
+def _abstract(value: Any, **_: Any) -> Any:
+    return ShapedArray(value.shape, value.dtype)
 
 
-mlir.register_lowering(passage_p, lambda _, *values, **__: list(values))
-
-
-def _of_those_that_change(changes: Sequence[Any], **at: Any) -> list[Any]:
-    found = iter(passage_p.bind(*(x for x in changes if not isinstance(x, ad.Zero)), **at))
-    return [x if isinstance(x, ad.Zero) else next(found) for x in changes]
+mlir.register_lowering(passage_p, lambda _, value, **__: [value])
 
 
 def _jvp(primals: Sequence[Any], tangents: Sequence[Any], *, change: str | None, **at: Any):
-    values = passage_p.bind(*primals, change=change, **at)
-    return values, _of_those_that_change(tangents, change="forward", **at)
+    value, moved = passage_p.bind(*primals, change=change, **at), tangents[0]
+    zero = isinstance(moved, ad.Zero)
+    return value, moved if zero else passage_p.bind(moved, change="forward", **at)
 
 
 ad.primitive_jvps[passage_p] = _jvp
 
 
-def _transpose(cotangents: Sequence[Any], *_: Any, change: str | None, **at: Any) -> list[Any]:
-    return _of_those_that_change(cotangents, change="back", **at)
+def _transpose(cotangent: Any, _: Any, *, change: str | None, **at: Any) -> list[Any]:
+    zero = isinstance(cotangent, ad.Zero)
+    return [cotangent if zero else passage_p.bind(cotangent, change="back", **at)]
 
 
 ad.primitive_transposes[passage_p] = _transpose
 
 
 def _batched(values: Sequence[Any], dims: Sequence[Any], **at: Any):
-    return passage_p.bind(*values, **at), dims
+    return passage_p.bind(*values, **at), dims[0]
 
 
 batching.primitive_batchers[passage_p] = _batched

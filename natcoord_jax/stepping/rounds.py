@@ -70,10 +70,11 @@ def _start(setting: Setting, unpack: Callable[[Array], State], x: Array) -> tupl
 
 
 def _unfinished(setting: Setting, length: int, carried: Carried) -> Array:
-    # Of a run of fewer steps than the plan has room for, as many attempts are made as with room for these.
-    attempts = 1 if setting.tolerance is None else ATTEMPTS
-    unused = attempts * (setting.plan.steps - setting.steps)
-    return (carried.count < length - unused) & any_lane(~setting.over(carried.course))
+    if setting.plan.recorded:
+        # Of fewer steps than there is room for, as many attempts are made as with room for these.
+        attempts = 1 if setting.tolerance is None else ATTEMPTS
+        length = length - attempts * (setting.plan.steps - setting.steps)
+    return (carried.count < length) & any_lane(~setting.over(carried.course))
 
 
 def _record(course: Course, x: Array, rows: int) -> tuple[Array, ...]:
