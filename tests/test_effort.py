@@ -276,7 +276,7 @@ def test_an_interpreter_ends_while_full_effort_is_under_way():
     begun = time.monotonic()
     _, errors = run.communicate(timeout=60)
     assert run.returncode == 0 and not errors, errors
-    assert time.monotonic() - begun < 2.0, "it waited for the compiler"
+    assert time.monotonic() - begun < 6.0, "it waited for the compiler"
 
 
 def test_an_interrupt_ends_the_run_and_not_the_compiler():

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import tolerances as tol
+from jaxlib.mlir import ir
 
 import natcoord_jax as nc
 from natcoord_jax import gallery
@@ -139,8 +140,10 @@ def test_goes_on_when_the_compiler_refuses(monkeypatch):
     body = scene.add(nc.RigidBody(mass=1.0, inertia=(1.0, 2.0, 3.0), velocity=(0.2, 0.2, 0.2)))
     scene.add(Sorted((nc.Point(body),)))
     system, state = scene.compile()
+    before = nc.set_effort("full")  # with least effort nothing is asked for that might be refused
     with pytest.warns(UserWarning, match="goes on with many"):
         trajectory = nc.simulate(system, state, dt=0.01, steps=20)
+    nc.set_effort(before)
     wanted = 0.2 * ((1 - 0.005) / (1 + 0.005)) ** 20
     np.testing.assert_allclose(trajectory.v[-1, 0], wanted, rtol=1e-12)
 
@@ -278,6 +281,45 @@ def test_the_end_of_a_run_is_found_by_parts_of_steps_where_whole_ones_fail():
     example = gallery.load("four_bar")
     end = endpoints(example.system, example.state, scheme=nc.EnergyMomentum())(0.2, 10)
     assert int(end.result) == 0 and int(end.substeps) > 10
+
+
+BUDGETS = {
+    ("heavy_top", 2): (2200, 4600),
+    ("spacecraft", 2): (2800, 6600),
+    ("four_bar", 2): (4100, 9400),
+    ("open_tree", 2): (5900, 20500),
+    ("rope", 2): (13600, 35500),
+    ("spacecraft", 6): (9100, 23000),
+}
+"""Operations of a value and of a gradient by scene and order: they are what compiling takes time for."""
+
+
+def operations_of(lowered):
+    """Operations of a lowered program, but for constants and what holds others."""
+    found = []
+
+    def seen(operation):
+        found.append(operation.name)
+        return ir.WalkResult.ADVANCE
+
+    lowered.compiler_ir().operation.walk(seen)
+    return sum(name.startswith("stablehlo.") for name in found) - found.count("stablehlo.constant")
+
+
+@pytest.mark.parametrize(
+    "scene, order",
+    [pytest.param(*k, marks=pytest.mark.slow if v[1] > 1e4 else ()) for k, v in BUDGETS.items()],
+)
+def test_programs_grow_no_larger(scene, order):
+    example, scheme = gallery.load(scene), nc.EnergyMomentum(order=order)
+
+    def cost(state):
+        given = dict(dt=example.dt, steps=10, inputs=example.inputs(10), scheme=scheme)
+        return jnp.sum(nc.simulate(example.system, state, **given).v[-1] ** 2)
+
+    found = [operations_of(jax.jit(f).lower(example.state)) for f in (cost, jax.value_and_grad(cost))]
+    for count, budget in zip(found, BUDGETS[scene, order], strict=True):
+        assert 0.85 * budget <= count <= budget, found
 
 
 def _scaled(residuals, x):

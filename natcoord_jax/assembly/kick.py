@@ -39,6 +39,7 @@ from natcoord_jax.assembly.tangent_space import Velocity
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import Tableau
+from natcoord_jax.xla.tracing import traced_once
 
 LARGEST = 0.51
 """Kinetic energy of a kick in terms of that of the motion, twice, beyond which a step is refused. A drive
@@ -231,7 +232,7 @@ def _lagging(lag: Lag, system: System, *given: Any) -> Kick:
     def renewed(_: tuple[Array, Kick]) -> tuple[Array, Kick]:
         return jnp.array(False), anew()
 
-    blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(anew))
+    anew, blank = traced_once(anew)
     start = eqx.tree_at(lambda found: (found.kick, found.exact), blank, (lag.held, lag.held))
     # A loop of no or one trip leaves what it carries where it is; a conditional would copy it.
     _, found = jax.lax.while_loop(lambda carry: carry[0], renewed, (lag.due, start))

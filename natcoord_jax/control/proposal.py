@@ -15,6 +15,7 @@ from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.control.quadratic import model
 from natcoord_jax.control.riccati import REACH, Factors, Weighted, factored
 from natcoord_jax.core.compiled import compiled
+from natcoord_jax.xla.tracing import traced_once
 
 SHIFT = 1e-4
 """First increase of the curvature where the model is not convex."""
@@ -79,8 +80,7 @@ def _convex(problem: OptimalControl, iterate: Iterate, found: Model) -> tuple[Fa
 
     start = jnp.where(iterate.failures > 0, jnp.maximum(10.0 * iterate.shift, SHIFT), 0.1 * iterate.shift)
     start = jnp.where(start < SHIFT, 0.0, start)
-    shapes = jax.eval_shape(attempt, start, start)
-    nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+    attempt, nothing = traced_once(attempt, start, start)
     first = (nothing, jnp.ones(()), start, jnp.array(False))
     factors, stiffness, shift, _ = jax.lax.while_loop(unfinished, body, first)
     return factors, shift, stiffness * iterate.penalty
@@ -175,8 +175,7 @@ def _attempt(problem: OptimalControl, iterate: Iterate) -> Attempt:
         near = (iterate.step >= 1.0) & (iterate.moved < NEAR) & (iterate.shift < SHIFT)
         return turn + 1, made(~near | (iterate.failures > 0) | (iterate.corrections > FEW) | (turn > 0))
 
-    shapes = jax.eval_shape(made, jnp.array(True))
-    nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+    made, nothing = traced_once(made, jnp.array(True))
     return jax.lax.while_loop(unserved, body, (jnp.array(0), nothing))[1]
 
 

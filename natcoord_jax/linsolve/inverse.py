@@ -4,6 +4,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from natcoord_jax.maths.rows import part, with_part
+
 UNBLOCKED = 16
 SMALL = 8
 LARGE = 32
@@ -59,12 +61,12 @@ def _blocked(matrices: Array, size: int) -> Array:
 
     def step(k: Array, left: Array) -> Array:
         first = k * size
-        rows = jax.lax.dynamic_slice_in_dim(left, first, size, 1)
-        pivot = inverses(jax.lax.dynamic_slice_in_dim(rows, first, size, 2))
-        columns = jax.lax.dynamic_slice_in_dim(left, first, size, 2)
-        scaled = jax.lax.dynamic_update_slice_in_dim(pivot @ rows, pivot, first, 2)
-        left = jax.lax.dynamic_update_slice_in_dim(left, jnp.zeros_like(columns), first, 2)
-        return jax.lax.dynamic_update_slice_in_dim(left - columns @ scaled, scaled, first, 1)
+        rows = part(left, first, size, 1)
+        pivot = inverses(part(rows, first, size, 2))
+        columns = part(left, first, size, 2)
+        scaled = with_part(pivot @ rows, first, pivot, 2)
+        left = with_part(left, first, jnp.zeros_like(columns), 2)
+        return with_part(left - columns @ scaled, first, scaled, 1)
 
     return jax.lax.fori_loop(0, matrices.shape[-1] // size, step, matrices)
 

@@ -4,6 +4,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from natcoord_jax.maths.rows import part, with_part
+
 LOOPED = 48
 """Largest size for elimination written as a loop of rank-one updates, which compiles into one kernel and runs
 in lanes when batched; products of blocks do neither, but win for large matrices."""
@@ -143,17 +145,17 @@ def _inverse_by_blocks(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
     def eliminate(block: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
         matrix, order = carry
         first = block * BLOCK
-        moved = _pivots(jax.lax.dynamic_slice_in_dim(matrix, first, BLOCK, 1), first)
+        moved = _pivots(part(matrix, first, BLOCK, 1), first)
         matrix, order = matrix[moved], order[moved]
-        columns = jax.lax.dynamic_slice_in_dim(matrix, first, BLOCK, 1)
-        rows = jax.lax.dynamic_slice_in_dim(matrix, first, BLOCK, 0)
-        inverse = pivoted_inverse(jax.lax.dynamic_slice_in_dim(columns, first, BLOCK, 0))
+        columns = part(matrix, first, BLOCK, 1)
+        rows = part(matrix, first, BLOCK, 0)
+        inverse = pivoted_inverse(part(columns, first, BLOCK, 0))
         inside = (number >= first) & (number < first + BLOCK)
         rows = inverse @ jnp.where(inside[None, :], 0.0, rows)
-        rows = jax.lax.dynamic_update_slice_in_dim(rows, inverse, first, 1)
+        rows = with_part(rows, first, inverse, 1)
         others = jnp.where(inside[:, None], 0.0, columns)
         kept = jnp.where(inside[None, :], 0.0, matrix)
-        matrix = jax.lax.dynamic_update_slice_in_dim(kept - others @ rows, rows, first, 0)
+        matrix = with_part(kept - others @ rows, first, rows)
         return matrix, order
 
     found, order = jax.lax.fori_loop(0, padded // BLOCK, eliminate, (matrix, number))

@@ -14,6 +14,7 @@ from natcoord_jax.assembly.system import System
 from natcoord_jax.assembly.tangent_space import Velocity
 from natcoord_jax.core.results import Result
 from natcoord_jax.core.state import State
+from natcoord_jax.maths.rows import part
 from natcoord_jax.stepping.error_control import Tolerance, Trial, Verdict, follow
 from natcoord_jax.stepping.factors import Factors, no_factors
 from natcoord_jax.stepping.newton import Iterate, any_lane, begin
@@ -97,7 +98,7 @@ class Setting(eqx.Module):
         if self.plan.control is not None or self.parameters.shape[0] <= steps:
             return self
         first = jnp.minimum(course.step, self.parameters.shape[0] - steps)
-        some = jax.lax.dynamic_slice_in_dim(self.parameters, first, steps)
+        some = part(self.parameters, first, steps)
         return Setting(self.system, some, self.dt, self.tolerance, self.plan, self.steps, first, self.event)
 
     def over(self, course: Course) -> Bool[Array, ""]:

@@ -21,7 +21,7 @@ from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
 from natcoord_jax.linsolve.learning import learns
 from natcoord_jax.maths.collocation import Tableau
-from natcoord_jax.maths.rows import row, with_row
+from natcoord_jax.maths.rows import part, row, with_part, with_row
 from natcoord_jax.stepping.correcting import Correcting
 from natcoord_jax.stepping.factors import Factors, factors_of
 from natcoord_jax.stepping.newton import any_lane
@@ -30,6 +30,7 @@ from natcoord_jax.stepping.past import Past
 from natcoord_jax.stepping.plan import Plan
 from natcoord_jax.stepping.record import Numbers, Record, Slot
 from natcoord_jax.stepping.step import advance_between
+from natcoord_jax.xla.tracing import traced_once
 
 CHUNK = 32
 """Slots that a round sees, at most."""
@@ -182,9 +183,7 @@ class InTurn(ABC):
         def round_of(carry: tuple[Going, Any, Array]) -> tuple[Going, Any, Array]:
             c, found, matrix = carry
             first = jnp.maximum(c.left - rows, 0)
-            near = jax.tree.map(
-                lambda x: jax.lax.dynamic_slice_in_dim(x, first, rows, 0), (slots, given, found)
-            )
+            near = jax.tree.map(lambda x: part(x, first, rows), (slots, given, found))
 
             def renewed(carry: tuple) -> tuple:
                 _, _, at = carry
@@ -195,9 +194,8 @@ class InTurn(ABC):
             start = c.stuck, c.factors, c.at
             _, factors, at = jax.lax.while_loop(lambda carry: carry[0], renewed, start)
             c = replace_fields(c, factors=factors, at=at, stuck=jnp.array(False))
-            c, part, matrix = kernel(self._several, fixed, first, *near, c, matrix)
-            update = partial(jax.lax.dynamic_update_slice_in_dim, start_index=first, axis=0)
-            return c, jax.tree.map(update, found, part), matrix
+            c, near_found, matrix = kernel(self._several, fixed, first, *near, c, matrix)
+            return c, jax.tree.map(lambda x, y: with_part(x, first, y), found, near_found), matrix
 
         first = Going(
             left=jnp.array(count),
@@ -266,6 +264,8 @@ class InTurn(ABC):
             *found, _ = solving(*start)
             return *found, matrix
 
+        solving, (*_, nothing, _) = traced_once(solving, *start)
+
         def trip(carry: tuple) -> tuple:
             _, (solution, learnt, at), _, matrix = carry
             forming = at.forming
@@ -274,7 +274,6 @@ class InTurn(ABC):
             at, matrix = at.formed(forming, matrix, product)
             return at.forming, (jnp.where(forming, solution, found), learnt, at), outcome, matrix
 
-        nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(solving, *start)[3])
         begun = jnp.ones_like(start[2].forming), start, nothing, matrix
         _, found, outcome, matrix = jax.lax.while_loop(lambda carry: any_lane(carry[0]), trip, begun)
         return *found, outcome, matrix

@@ -25,6 +25,7 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.stepping import rewriting
 from natcoord_jax.stepping.rewriting import Flat, known, operations
+from natcoord_jax.xla.kernels import KERNEL
 
 try:
     from jax.experimental.scheduling_groups import xla_metadata_call as _attributed
@@ -34,7 +35,7 @@ except ImportError:  # an experimental module of JAX: without it everything runs
 LARGEST = 6800
 """Operations of a program that still compiles quickly in one piece: the time grows faster than the size."""
 
-ATTRIBUTES = {"xla_cpu_small_call": "true", "inlineable": "false"}
+ATTRIBUTES = {KERNEL: "true", "inlineable": "false"}
 """Compiled as one function; kept as a call until then."""
 
 

@@ -17,6 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from natcoord_jax.maths.rows import with_row
+
 FAILURES = 3
 """Jacobians with stages taken for alike that were not good enough, after which none is tried."""
 
@@ -114,7 +116,7 @@ class Probe(eqx.Module):
             k, moved, _ = carry
             end = k == last
             found = evaluate(y + jnp.where(choice.number == k, steps, 0.0), end, k < choice.moving)
-            moved = jax.lax.dynamic_update_index_in_dim(moved, found.residual, k, 0)
+            moved = with_row(moved, k, found.residual)
             return jnp.where(k + 1 == choice.count, last, k + 1), moved, found
 
         start = jnp.where(self.making, 0, last), self.moved, found

@@ -13,6 +13,8 @@ import jax.numpy as jnp
 from jax.extend import core as jex
 from jaxtyping import Array
 
+from natcoord_jax.maths.rows import part, row
+
 PRODUCT_LIMIT = 1 << 15
 """Multiplications up to which a product of matrices is written as a sum."""
 
@@ -240,7 +242,7 @@ def _piece_by_piece(left: Array, right: Array) -> Array:
         return jnp.sum(terms, axis=0) if short else sum(jnp.unstack(terms), jnp.zeros(terms.shape[1:]))
 
     def add(k: Array, total: Array) -> Array:
-        parts = (jax.lax.dynamic_slice_in_dim(x, k * size, size) for x in (left, right))
+        parts = (part(x, k * size, size) for x in (left, right))
         return total + product(*parts)
 
     whole, rest = length // size, length % size
@@ -267,7 +269,7 @@ def _reduced(operation: Callable, x: Array, axes: Sequence[Any]) -> Array:
     for axis in sorted(axes, reverse=True):
 
         def add(k: Array, total: Array, x: Array = x, axis: int = axis) -> Array:
-            return operation(total, jax.lax.dynamic_index_in_dim(x, k, axis, keepdims=False))
+            return operation(total, row(x, k, axis))
 
         first = jax.lax.index_in_dim(x, 0, axis, keepdims=False)
         x = jax.lax.fori_loop(1, x.shape[axis], add, first)
@@ -291,17 +293,17 @@ def _update(name: str, given: list[Any], params: dict[str, Any]) -> Array | None
         return operand
 
     def one(k: Any, total: Array) -> Array:
-        window, place = updates[k], places[k]
+        window, place = row(updates, k), row(places, k)
         starts = [jnp.zeros((), place.dtype)] * operand.ndim
         for n, dim in enumerate(numbers.scatter_dims_to_operand_dims):
             starts[dim] = place[n]
-        now = jax.lax.dynamic_slice(total, starts, shape)
+        now = jax.lax.dynamic_slice(total, starts, shape, allow_negative_indices=False)
         if name == "scatter-add":
             window = now + window
         if params["mode"] == jax.lax.GatherScatterMode.FILL_OR_DROP:
             limits = zip(starts, shape, operand.shape)
             inside = jnp.all(jnp.stack([(at >= 0) & (at + size <= end) for at, size, end in limits]))
             window = jnp.where(inside, window, now)
-        return jax.lax.dynamic_update_slice(total, window, starts)
+        return jax.lax.dynamic_update_slice(total, window, starts, allow_negative_indices=False)
 
     return one(0, operand) if count == 1 else jax.lax.fori_loop(0, count, one, operand)

@@ -19,6 +19,7 @@ from natcoord_jax.assembly.equations import kind_of, prepare
 from natcoord_jax.assembly.outset import Outset
 from natcoord_jax.assembly.system import System
 from natcoord_jax.core.state import State
+from natcoord_jax.maths.rows import with_part
 from natcoord_jax.stepping.attempt import Asked, Carried, attempt, renewed_at, with_state
 from natcoord_jax.stepping.course import Course, Setting, start_of
 from natcoord_jax.stepping.differences import first_probe
@@ -142,10 +143,7 @@ def _by_rounds(
         near = setting.near(carried.course, CHUNK)
         found = as_one_kernel(partial(attempts, near), carried)
         if plan.recorded:
-            record = tuple(
-                jax.lax.dynamic_update_slice_in_dim(whole, part, carried.count, 0)
-                for whole, part in zip(record, found.record)
-            )
+            record = tuple(with_part(whole, carried.count, new) for whole, new in zip(record, found.record))
         else:
             some = found.count > carried.count
             record = tuple(jnp.where(some, part, whole) for whole, part in zip(record, found.record))

@@ -19,6 +19,7 @@ import numpy as np
 from jax import export
 
 from natcoord_jax.xla.elsewhere import Compilation, elsewhere
+from natcoord_jax.xla.kernels import without_kernels
 from natcoord_jax.xla.tracing import at_top_level
 from natcoord_jax.xla.waiting import told
 
@@ -108,12 +109,13 @@ class Program:
             return arrays
 
         flat.__name__ = flat.__qualname__ = self.name = name
-        jitted, options = jax.jit(flat, donate_argnums=0), accepted(FULL)
-        source = _exported(jitted, shapes) if effort == "tiers" and options != accepted(LEAST) else None
-        if effort == "quick" or source is not None:
-            options = accepted(LEAST)
+        jitted, differ = jax.jit(flat, donate_argnums=0), accepted(FULL) != accepted(LEAST)
+        source = _exported(jitted, shapes) if effort == "tiers" and differ else None
+        quick = differ and (effort == "quick" or source is not None)
         whole = jitted if source is None else jax.jit(source.call, donate_argnums=0)
-        self.run: Callable = whole.lower(*shapes).compile(options)
+        lowered = whole.lower(*shapes)
+        lowered = without_kernels(lowered) if quick else lowered
+        self.run: Callable = lowered.compile(accepted(LEAST if quick else FULL))
         self.rest = made[0]
         self._again = None if source is None else Compilation(source, shapes, accepted(FULL))
         self._calls = 0

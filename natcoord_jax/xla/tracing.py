@@ -1,10 +1,12 @@
-"""Whether something is being traced."""
+"""Whether something is being traced, and functions that are traced once."""
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 from jax.core import Tracer, eval_context
-from jax.extend.core import get_opaque_trace_state
+from jax.extend.core import get_opaque_trace_state, jaxpr_as_fun
 
 
 def is_concrete(*values: Any) -> bool:
@@ -20,3 +22,17 @@ with eval_context():
 def at_top_level(*values: Any) -> bool:
     """Whether nothing is being traced: neither the values nor the function around them."""
     return get_opaque_trace_state() == TOP_LEVEL and is_concrete(values)
+
+
+def traced_once(function: Callable, *examples: Any) -> tuple[Callable, Any]:
+    """A function of arguments like these examples, traced here and now, and zeros like what it gives.
+
+    A loop that starts with zeros of the shapes of what it makes would be traced for these a second time.
+    """
+    program, shapes = jax.make_jaxpr(function, return_shape=True)(*examples)
+    run, structure = jaxpr_as_fun(program), jax.tree.structure(shapes)
+
+    def call(*arguments: Any) -> Any:
+        return jax.tree.unflatten(structure, run(*jax.tree.leaves(arguments)))
+
+    return call, jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
