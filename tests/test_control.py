@@ -510,6 +510,43 @@ def test_first_order_descent_respects_bounds_of_inputs(hinged):
     assert found.cost == pytest.approx(known.cost, rel=2e-2)
 
 
+@pytest.fixture(scope="module")
+def asymmetric():
+    """A free body of three different inertias with torques along its axes."""
+    scene = nc.Scene()
+    body = scene.add(nc.RigidBody(mass=1.0, inertia=(1.0, 2.0, 3.0), name="body"))
+    scene.add(nc.BodyTorqueInput(tuple(nc.Direction(body, a, local=True) for a in np.eye(3)), name="torque"))
+    return scene.compile()
+
+
+def turned(asymmetric, axis, degrees):
+    """Rest to rest in a second by least effort."""
+    unit, half = np.asarray(axis) / np.linalg.norm(axis), np.radians(degrees) / 2
+    attitude = (np.cos(half), *np.sin(half) * unit)
+    goal = nc.goal.Attitude("body", attitude) & nc.goal.Rest()
+    return nc.OptimalControl(*asymmetric, dt=1 / 20, steps=20, cost=nc.cost.Effort(), goal=goal)
+
+
+@pytest.mark.parametrize("method", ["shooting", pytest.param("lifted", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("axis", [(1, 0, 0), (0, 1, 0), (1, 1, 0), (1, 2, 3)])
+def test_turns_by_any_angle_are_found_from_rest(asymmetric, axis, method):
+    """Half turns too; and beyond, the other way round at the same cost."""
+    for degrees in (10, 90, 150, 180):
+        ways = [turned(asymmetric, axis, angle) for angle in (degrees, 360 - degrees)]
+        found = [nc.optimise(problem, method=method, progress=False) for problem in ways]
+        assert all(s.ok and len(s.history) <= 40 for s in found), [s.explain() for s in found]
+        assert found[0].cost == pytest.approx(found[1].cost, rel=1e-9)
+
+
+@pytest.mark.parametrize("method", ["shooting", pytest.param("lifted", marks=pytest.mark.slow)])
+def test_saddles_are_left(asymmetric, method):
+    """Turned about the axis of the largest inertia alone the body obeys all conditions, and needs more."""
+    for degrees, known, symmetric in ((120, 469.70634, 476.28007), (150, 667.59325, 745.37894)):
+        found = nc.optimise(turned(asymmetric, (0, 0, 1), degrees), method=method, progress=False)
+        assert found.ok and len(found.history) <= 40, found.explain()
+        assert found.cost == pytest.approx(known, rel=1e-7) and found.cost < symmetric
+
+
 @pytest.mark.exhaustive
 def test_mirror_images_are_two_optima(hinged):
     either = nc.goal.Equal(lambda s: s.coordinates[0] ** 2 - 1.0, "one radian, either way") & nc.goal.Rest()

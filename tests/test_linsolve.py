@@ -293,11 +293,14 @@ def test_conjugate_residuals_solve_in_as_many_directions_as_differ(limit):
     """One for each direction that differs, and one more; less leaves something, and says so."""
     matrix, right = nearly_identity(30, 4)
 
-    def apply(x, level):
-        return {"x": matrix @ x["x"] - level * right}, 2.0 * x["x"][:3] + level
+    def apply(x, level, seen):
+        return {"x": matrix @ x["x"] - level * seen[0] * right}, 2.0 * x["x"][:3] + level
 
-    start = {"x": jnp.ones(30)}
-    found = conjugate_residuals(apply, start, jnp.zeros(3), start, lambda r: jnp.array(1e-12), limit)
+    start, half, yes = {"x": jnp.ones(30)}, {"x": jnp.full(30, 0.5)}, jnp.array(True)
+    found = conjugate_residuals(
+        apply, half, yes, start, jnp.zeros(3), start, lambda r: jnp.array(1e-12), limit
+    )
+    np.testing.assert_array_equal(found.found, 1.0)  # of what is seen, which what is solved depends on
     left = np.linalg.norm(matrix @ found.solution["x"] - right) / np.linalg.norm(matrix @ np.ones(30) - right)
     assert float(found.left) == pytest.approx(left, rel=1e-6, abs=1e-13)
     assert int(found.count) == limit

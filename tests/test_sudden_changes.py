@@ -206,10 +206,13 @@ def test_what_cannot_be_solved_is_no_number(bounce, monkeypatch, mode):
     monkeypatch.setattr("natcoord_jax.stepping.derivative.UNSOLVED", -1.0)
     jax.clear_caches()
     if mode == "reverse":
-        found = jax.grad(bounce)(1.1, 1e4)
+        slope = jax.grad(bounce)
     elif mode == "forward":
-        found = jax.jvp(lambda v: bounce(v, 1e4), (1.1,), (1.0,))[1]
+        slope = lambda v, k: jax.jvp(lambda v: bounce(v, k), (v,), (1.0,))[1]  # noqa: E731
     else:
-        found = jax.jacfwd(bounce, (0, 1))(1.1, 1e4)[0]
+        slope = lambda v, k: jax.jacfwd(bounce, (0, 1))(v, k)[0]  # noqa: E731
+    found = jax.jit(slope)(1.1, 1e4)
+    with pytest.raises(nc.DerivativeError):
+        slope(1.1, 1e4)
     jax.clear_caches()
     assert np.isnan(found)

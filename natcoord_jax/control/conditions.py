@@ -29,6 +29,12 @@ CORRECTIONS = 8
 """Most directions of one improvement."""
 SOFTEST = 1e-3
 """Least curvature in an entering coefficient that counts, relative to the largest."""
+ASIDE = 0.1
+"""Size of the inputs' change that is asked for along negative curvature, relative to the inputs."""
+STILL = 1e-2
+"""Gradient of the Lagrangian, relative, below which a step is drawn aside: others know where to go."""
+TURNS = 12
+"""Inverse iterations that find its direction."""
 ENOUGH = (1e-6, 1e-3)
 """Part of the conditions that may be left: the relative size of the step, which is what its square leaves."""
 
@@ -194,6 +200,32 @@ def left_of_conditions(
     return Change(first, w, missing, path, last), sweep
 
 
+def least_curved(problem: OptimalControl, iterate: Iterate, factors: Factors) -> Change:
+    """The direction along which the model is curved least, by inverse iteration; the way that the cost falls.
+
+    The increase of the curvature, little more than it is negative, makes that quick.
+    """
+    by_w, multipliers = iterate.derivatives.by_w, iterate.multipliers
+    states = factors.forward.shape[1]
+    last, nothing = jnp.zeros(states), jnp.zeros_like(multipliers.goal)
+    enters = (jnp.arange(problem.steps) % problem.inputs.every == 0)[:, None]
+
+    def again(_: Array, along: tuple[Array, Array]) -> tuple[Array, Array]:
+        first, w = along
+        move = solve(factors, Right(jnp.pad(w, ((0, 0), (states, 0))), last, first, nothing))
+        w = jnp.where(enters, move.w, 0.0)
+        size = jnp.maximum(largest(move.first, w), 1e-300)
+        return move.first / size, w / size
+
+    # Without any symmetry.
+    start = jnp.sin(1.0 + 2.4 * jnp.arange(by_w.size).reshape(by_w.shape))
+    turns = jnp.where(factors.added[0] > 0, TURNS, 0)
+    first, w = jax.lax.fori_loop(0, turns, again, (jnp.zeros_like(iterate.derivatives.by_first), start))
+    uphill = jnp.sum(by_w * w) + iterate.derivatives.by_first @ first > 0
+    first, w = (jnp.where(uphill, -x, x) for x in (first, w))
+    return Change(first, w, nothing, jnp.zeros_like(multipliers.path), jnp.zeros_like(multipliers.end))
+
+
 class Improved(NamedTuple):
     """A step that obeys the conditions, as far as asked for.
 
@@ -201,6 +233,7 @@ class Improved(NamedTuple):
         change: of coefficients and multipliers.
         sweep: along it.
         unreachable: part of the goal that nothing can change.
+        saddle: whether the curvature is negative along the direction in which the model's is least.
         there: whether the conditions hold as well as asked for.
         count: solutions of the model that this has taken.
     """
@@ -208,6 +241,7 @@ class Improved(NamedTuple):
     change: Change
     sweep: Sweep
     unreachable: Float[Array, " c"]
+    saddle: Bool[Array, ""]
     there: Bool[Array, ""]
     count: Int[Array, ""]
 
@@ -232,8 +266,28 @@ def improved(
     """
     unknowns, missing = iterate.unknowns, iterate.path.end.missing
 
-    def apply(change: Change, level: Array) -> tuple[Change, Sweep]:
-        left, sweep = left_of_conditions(problem, iterate, bounds, factors.added, change, level)
+    added, soft = factors.added, least_curved(problem, iterate, factors)
+    still, size = iterate.errors.stationarity < STILL, largest(unknowns.coefficients)
+    aside = ASIDE * jnp.where(size > 0, size, 1.0)
+
+    def bent(seen: tuple[Sweep, Array]) -> Array:
+        """Curvature along the softest direction, with what bounds add, and without what has been added."""
+        sweep, curvature = seen
+        own = curvature - jnp.sum(added[0] * soft.w**2) - jnp.sum(added[1] * soft.first**2)
+        return own + jnp.sum(bounds.path * sweep.excess**2) + jnp.sum(bounds.end * sweep.end_excess**2)
+
+    def apply(change: Change, level: Array, seen: tuple[Sweep, Array]) -> tuple[Change, tuple[Sweep, Array]]:
+        # The model is not exact: where the curvature of the steps themselves is not negative, it needs no
+        # increase. Far from the solution, that keeps steps short in valleys that wind.
+        rising = (bent(seen) >= 0) & still & (iterate.step >= 1.0) & (iterate.failures == 0)
+        own = jax.tree.map(lambda x: jnp.where(rising, 0.0, x), added)
+        left, sweep = left_of_conditions(problem, iterate, bounds, own, change, level)
+        curvature = jnp.sum(soft.w * left.w) + soft.first @ left.first
+        # A motion that is as symmetric as its problem may be stationary and no minimum: nothing in the
+        # conditions leads out of the symmetry, but a force along negative curvature does.
+        away = level * aside * ((bent(seen) < 0) & still)
+        force = away * added[0] * soft.w, away * added[1] * soft.first
+        left = eqx.tree_at(lambda x: (x.w, x.first), left, (left.w - force[0], left.first - force[1]))
         gradient = jnp.pad(-left.w, ((0, 0), (found.forward.shape[1], 0)))
         gradient = gradient + jnp.einsum("kh,khz->kz", left.path, found.excess)
         last = found.last_excess.T @ left.end - found.goal.T @ (penalty * left.goal)
@@ -241,7 +295,7 @@ def improved(
         both = jnp.concatenate([move.z[:-1], move.w], axis=1)
         path = left.path + bounds.path * jnp.einsum("khz,kz->kh", found.excess, both)
         end = left.end + bounds.end * (found.last_excess @ move.z[-1])
-        return Change(move.first, move.w, move.goal, path, end), sweep
+        return Change(move.first, move.w, move.goal, path, end), (sweep, curvature)
 
     def enough(change: Change) -> Array:
         size = largest(unknowns.coefficients, unknowns.free)
@@ -260,7 +314,8 @@ def improved(
         give,
         jnp.zeros_like(bounds.end),
     )
-    shapes = Sweep(unknowns.y, iterate.path.stages.excess, missing, iterate.path.end.excess)
+    sweep = Sweep(unknowns.y, iterate.path.stages.excess, missing, iterate.path.end.excess)
+    shapes = sweep, jnp.zeros_like(iterate.unit)
     start = Change(
         jnp.zeros(found.first.shape[1]),
         jnp.zeros_like(iterate.derivatives.by_w),
@@ -268,6 +323,8 @@ def improved(
         jnp.zeros_like(iterate.multipliers.path),
         jnp.zeros_like(iterate.multipliers.end),
     )
-    reached = conjugate_residuals(apply, start, shapes, weights, enough, CORRECTIONS)
-    unreachable = out_of_reach(factors, missing + reached.more.missing)
-    return Improved(reached.solution, reached.more, unreachable, reached.there, reached.count)
+    look = added[0] > 0
+    reached = conjugate_residuals(apply, soft, look, start, shapes, weights, enough, CORRECTIONS)
+    sweep, saddle = reached.more[0], look & (bent(reached.found) < 0)
+    unreachable = out_of_reach(factors, missing + sweep.missing)
+    return Improved(reached.solution, sweep, unreachable, saddle, reached.there, reached.count)

@@ -21,7 +21,7 @@ from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.kinds import BODY_NAME, JOINT_NAME, NAME, FunctionOf, Several, of
 from natcoord_jax.core.numeric import COMPONENTS, Number, Numbers, Whole
 from natcoord_jax.core.state import State
-from natcoord_jax.maths.rotations import angular_velocity, from_quaternion, to_quaternion
+from natcoord_jax.maths.rotations import angular_velocity, from_quaternion, to_rotation_vector
 
 ROTATION = Numbers((4,)) | Numbers((3, 3))
 RESIDUAL = FunctionOf("(state) -> number or vector")
@@ -67,10 +67,10 @@ def _name(part: Any) -> str:
 
 
 class Attitude(Goal):
-    """Attitude of a body: three numbers, twice the vector part of the quaternion that is missing.
+    """Attitude of a body: three numbers, the rotation vector that is missing [rad], the short way round.
 
-    For small errors that is the rotation vector [rad]; at half a turn its length is 2, and it is nowhere
-    zero but at the goal.
+    At half a turn both ways are as short, and it is one of them. Its slope is zero nowhere, so that each
+    start shows the way to the goal.
 
     Attributes:
         body: handle or name.
@@ -81,12 +81,12 @@ class Attitude(Goal):
     rotation: Any = eqx.field(metadata=is_a(ROTATION))
 
     def residual(self, system: System, state: State) -> Float[Array, " n"]:
-        """Twice the vector part of the error, in world components."""
+        """Rotation vector from the wanted attitude to that of the body, in world components."""
         given = jnp.asarray(self.rotation, float)
         wanted = from_quaternion(given) if given.shape == (4,) else given
         first = 4 * system.body_index(self.body) + 1
         now = state.q[first : first + 3].T
-        return 2.0 * to_quaternion(now @ wanted.T)[1:]
+        return to_rotation_vector(now @ wanted.T)
 
     def labels(self, system: System) -> tuple[str, ...]:
         """Three components of the rotation that is missing."""

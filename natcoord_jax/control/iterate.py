@@ -120,6 +120,7 @@ class Iterate(eqx.Module):
         step: length of the last step.
         moved: size of the last step, relative.
         unreachable: part of the goal that nothing could change.
+        saddle: whether the curvature is negative along some direction, as the last step found.
         iteration: number of steps made.
         newton: Newton iterations of all simulations.
         failures: steps given up in a row.
@@ -142,6 +143,7 @@ class Iterate(eqx.Module):
     step: Float[Array, "*batch"]
     moved: Float[Array, "*batch"]
     unreachable: Float[Array, "*batch c"]
+    saddle: Bool[Array, "*batch"]
     iteration: Int[Array, "*batch"]
     newton: Int[Array, "*batch"]
     failures: Int[Array, "*batch"]

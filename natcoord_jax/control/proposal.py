@@ -45,6 +45,7 @@ class Proposal(eqx.Module):
     shift: Float[Array, ""]
     penalty: Float[Array, " c"]
     unreachable: Float[Array, " c"]
+    saddle: Bool[Array, ""]
     convex: Bool[Array, ""]
 
 
@@ -74,7 +75,7 @@ def _convex(problem: OptimalControl, iterate: Iterate, found: Model) -> tuple[Fa
         # A penalty on the goal bends the model only where the goal forbids a change; it is tried first.
         _, stiffness, shift, begun = carry
         exhausted = begun & (stiffness >= STIFFEST)
-        shift = jnp.where(exhausted, jnp.maximum(10.0 * shift, SHIFT), shift)
+        shift = jnp.where(exhausted, jnp.maximum(3.0 * shift, SHIFT), shift)
         stiffness = jnp.where(begun & ~exhausted, 10.0 * stiffness, stiffness)
         return attempt(stiffness, shift), stiffness, shift, jnp.array(True)
 
@@ -198,5 +199,6 @@ def propose(problem: OptimalControl, options: Options, iterate: Iterate) -> Prop
         found.shift,
         _penalty(iterate, found.factors),
         found.better.unreachable,
+        found.better.saddle & (found.shift > SHIFT),
         found.factors.convex & finite,
     )

@@ -87,6 +87,7 @@ def _first(
         nothing,
         infinite,
         goal,
+        jnp.array(False),
         jnp.array(0),
         newton,
         jnp.array(0),
@@ -145,19 +146,21 @@ def concluded(
         found.length,
         change,
         proposal.unreachable,
+        proposal.saddle,
         iterate.iteration,
         iterate.newton,
         jnp.zeros_like(iterate.failures),
         iterate.code,
     )
     kept = eqx.tree_at(
-        lambda i: (i.failures, i.shift, i.step, i.unreachable, i.multipliers, i.derivatives),
+        lambda i: (i.failures, i.shift, i.step, i.unreachable, i.saddle, i.multipliers, i.derivatives),
         iterate,
         (
             iterate.failures + 1,
             proposal.shift,
             jnp.zeros_like(found.length),
             proposal.unreachable,
+            proposal.saddle,
             multipliers,
             derivatives,
         ),
@@ -190,6 +193,8 @@ def _judged(options: Options, it: Iterate) -> Int[Array, ""]:
     e = it.errors
     fulfilled = (e.goal <= options.goal_tol) & (e.bounds <= options.goal_tol) & (e.motion <= options.goal_tol)
     optimal = fulfilled & (e.stationarity <= options.tol) & (e.complementarity <= options.tol)
+    # What is stationary where curvature is negative is a saddle, and left.
+    optimal = optimal & ~it.saddle
     finite = jnp.isfinite(e.stationarity) & jnp.isfinite(e.goal)
     resting = (it.moved < AT_REST) | (it.failures >= 3)
     # What is out of reach is known only where the motion obeys its equations.

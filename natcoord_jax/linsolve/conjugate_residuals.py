@@ -26,6 +26,7 @@ class Reached(eqx.Module):
     Attributes:
         solution: as `apply` takes it.
         more: what `apply` returned beside its image, for the solution.
+        found: the same of what was seen first.
         left: norm of the residual over that of the first.
         there: whether no more is left than is enough.
         count: directions.
@@ -33,13 +34,16 @@ class Reached(eqx.Module):
 
     solution: Any
     more: Any
+    found: Any
     left: Float[Array, ""]
     there: Bool[Array, ""]
     count: Int[Array, ""]
 
 
 def conjugate_residuals(
-    apply: Callable[[Any, Array], tuple[Any, Any]],
+    apply: Callable[[Any, Array, Any], tuple[Any, Any]],
+    seen: Any,
+    look: Bool[Array, ""],
     start: Any,
     more: Any,
     weights: Any,
@@ -49,7 +53,10 @@ def conjugate_residuals(
     """Make an affine function vanish.
 
     Args:
-        apply: (x, level) -> (image like x, more), linear in x where the level is 0, and affine where it is 1.
+        apply: (x, level, found) -> (image like x, more), linear in x where the level is 0, and affine where
+            it is 1. Found is what it returned beside the image of `seen`: what is solved may depend on it.
+        seen: x whose image is found before all others.
+        look: whether it is; else found is zero.
         start: x to begin with.
         more: what `apply` returns beside the image; only its structure and shapes count.
         weights: of the squares of the entries of x; 0 leaves them out of norms.
@@ -60,17 +67,19 @@ def conjugate_residuals(
     count, dtype = heavy.shape[0], heavy.dtype
     unflat = ravel_pytree(weights)[1]
     begin, unpack = ravel_pytree((start, more))
+    beside, unpack_beside = ravel_pytree(more)
 
     def going(carry: tuple) -> Array:
-        k, _, _, _, _, _, left, before, target = carry
+        k, _, _, _, _, _, left, before, target, _ = carry
         return (k <= 1) | ((k <= limit) & (left > target) & (left < LEAST_GAIN * before) & jnp.isfinite(left))
 
     def body(carry: tuple) -> tuple:
-        # The first turn finds the first residual, by the same program.
-        k, x, r, directions, images, whole, left, _, target = carry
-        z = jax.tree.map(lambda z, x: jnp.where(k > 0, z, x), unflat(r), start)
-        image, more = apply(z, (k == 0).astype(dtype))
+        # The first two turns find the image of what is seen and the first residual, by the same program.
+        k, x, r, directions, images, whole, left, _, target, found = carry
+        z = jax.tree.map(lambda z, x, y: jnp.where(k > 0, z, jnp.where(k == 0, x, y)), unflat(r), start, seen)
+        image, more = apply(z, (k == 0).astype(dtype), unpack_beside(found))
         w, d = ravel_pytree(image)[0], ravel_pytree((z, more))[0]
+        found = jnp.where(k < 0, ravel_pytree(more)[0], found)
         along = images @ (heavy * w)
         w1, d1 = w - along @ images, d - along @ directions
         size = jnp.sqrt(jnp.sum(heavy * w1**2))
@@ -85,11 +94,11 @@ def conjugate_residuals(
         whole = jnp.where(k > 0, whole, norm)
         target = jnp.where(k == 1, enough(z), target)
         now = norm / jnp.where(whole > 0, whole, 1.0)
-        return k + 1, x, r, directions, images, whole, now, jnp.where(k > 0, left, jnp.inf), target
+        return k + 1, x, r, directions, images, whole, now, jnp.where(k > 0, left, jnp.inf), target, found
 
     nothing, one = jnp.zeros((), dtype), jnp.ones((), dtype)
     begun = (
-        jnp.array(0),
+        jnp.where(look, -1, 0),
         begin,
         jnp.zeros(count, dtype),
         jnp.zeros((limit, begin.shape[0]), dtype),
@@ -98,7 +107,8 @@ def conjugate_residuals(
         one,
         one,
         nothing,
+        jnp.zeros_like(beside),
     )
-    k, x, _, _, _, _, left, _, target = jax.lax.while_loop(going, body, begun)
+    k, x, _, _, _, _, left, _, target, found = jax.lax.while_loop(going, body, begun)
     solution, more = unpack(x)
-    return Reached(solution, more, left, left <= target, k - 1)
+    return Reached(solution, more, unpack_beside(found), left, left <= target, k - 1)

@@ -48,6 +48,17 @@ def to_quaternion(rotation: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 
     return jnp.where(chosen[..., :1] < 0, -chosen, chosen)
 
 
+def to_rotation_vector(rotation: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3"]:
+    """Rotation vector [rad] of a rotation matrix, no longer than pi; at half a turn one of the two there are.
+
+    Smooth but at half turns, where it goes from one of them to the other; its slope is nowhere zero.
+    """
+    quaternion = to_quaternion(rotation)
+    # Tangent of a quarter of the angle times the axis.
+    k = quaternion[..., 1:] / (1.0 + quaternion[..., :1])
+    return 4.0 * arctan_coefficients(jnp.sum(k * k, axis=-1, keepdims=True))[0] * k
+
+
 def from_axis_angle(axis: Float[Array, "3"], angle: Float[Array, ""]) -> Float[Array, "3 3"]:
     """Rotation matrix of a turn by `angle` [rad] about `axis` (any length but zero)."""
     k = skew(unit(axis))
