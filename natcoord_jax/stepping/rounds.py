@@ -71,11 +71,10 @@ def _start(setting: Setting, unpack: Callable[[Array], State], x: Array) -> tupl
 
 
 def _unfinished(setting: Setting, length: int, carried: Carried) -> Array:
-    if setting.plan.recorded:
-        # Of fewer steps than there is room for, as many attempts are made as with room for these.
-        attempts = 1 if setting.tolerance is None else ATTEMPTS
-        length = length - attempts * (setting.plan.steps - setting.steps)
-    return (carried.count < length) & any_lane(~setting.over(carried.course))
+    # Of fewer steps than there is room for in the record, as many attempts are made as with room for these.
+    attempts = 1 if setting.tolerance is None else ATTEMPTS
+    unused = attempts * (setting.plan.steps - setting.steps) if setting.plan.recorded else 0
+    return (carried.count < length - unused) & any_lane(~setting.over(carried.course))
 
 
 def _record(course: Course, x: Array, rows: int) -> tuple[Array, ...]:
