@@ -10,7 +10,7 @@ import optax
 import pytest
 
 import natcoord_jax as nc
-from natcoord_jax.control import proposal, sequential
+from natcoord_jax.control import conditions, proposal, sequential
 from natcoord_jax.control.costates import Multipliers
 from natcoord_jax.control.guess import unknowns_of
 from natcoord_jax.control.inputs import Spline
@@ -519,6 +519,28 @@ def asymmetric():
     return scene.compile()
 
 
+def reduced_eigenvalues(solution):
+    """Of the Lagrangian's Hessian in the inputs, where the goal is kept, of the whole simulation."""
+    problem, u = solution.problem, jnp.asarray(solution.inputs)
+    system, state, dt = problem.system, problem.state, float(problem.dt)
+    multipliers = jnp.asarray(list(solution.multipliers.values()))
+
+    def end(u):
+        states = nc.simulate(system, state, dt=dt, inputs=u).states
+        return problem.goal.residual(system, jax.tree.map(lambda x: x[-1], states))
+
+    def slope(u):
+        return jax.grad(lambda u: dt * jnp.sum(u**2) + multipliers @ end(u))(u)
+
+    directions = jnp.eye(u.size).reshape(u.size, *u.shape)
+    jacobian = nc.jit(jax.jacrev(end))(u).reshape(-1, u.size)
+    slope, size = nc.jit(slope), 1e-4 * float(jnp.max(jnp.abs(u)))
+    hessian = np.stack([(slope(u + size * d) - slope(u - size * d)).reshape(-1) for d in directions])
+    _, values, rows = np.linalg.svd(jacobian)
+    kept = rows[np.sum(values > 1e-9 * values[0]) :]
+    return np.linalg.eigvalsh(kept @ (hessian + hessian.T) @ kept.T) / (4 * size)
+
+
 def turned(asymmetric, axis, degrees):
     """Rest to rest in a second by least effort."""
     unit, half = np.asarray(axis) / np.linalg.norm(axis), np.radians(degrees) / 2
@@ -545,6 +567,26 @@ def test_saddles_are_left(asymmetric, method):
         found = nc.optimise(turned(asymmetric, (0, 0, 1), degrees), method=method, progress=False)
         assert found.ok and len(found.history) <= 40, found.explain()
         assert found.cost == pytest.approx(known, rel=1e-7) and found.cost < symmetric
+
+
+@pytest.mark.slow
+def test_check_tells_a_saddle_from_a_minimum(asymmetric, monkeypatch):
+    """By the least eigenvalue of the whole Hessian in the inputs that keep the goal."""
+    problem = turned(asymmetric, (0, 0, 1), 120)
+    found = nc.optimise(problem, method="shooting", progress=False)
+    verdict = nc.check(found, refine=False)
+    least, most = reduced_eigenvalues(found)[[0, -1]]
+    assert verdict.kind == "minimum" and "minimum" in str(verdict)
+    assert verdict.curvature * 2 * found.dt == pytest.approx(least, rel=0.02)
+    assert np.linalg.norm(verdict.direction) == pytest.approx(1.0)
+    monkeypatch.setattr(conditions, "STILL", 0.0)  # nothing is drawn aside
+    jax.clear_caches()
+    stuck = nc.optimise(problem, method="shooting", progress=False, max_iterations=6)
+    assert not stuck.ok and stuck.iterate.errors.stationarity < 1e-2
+    verdict, least = nc.check(stuck, refine=False), reduced_eigenvalues(stuck)[0]
+    assert verdict.kind == "saddle" and least < 0
+    assert verdict.curvature * 2 * stuck.dt == pytest.approx(least, rel=0.02)
+    jax.clear_caches()
 
 
 @pytest.mark.exhaustive

@@ -10,8 +10,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.analysis import balance
+from natcoord_jax.control.conditions import as_unknowns
 from natcoord_jax.control.iterate import Iterate
 from natcoord_jax.control.problem import OptimalControl
+from natcoord_jax.control.proposal import softest
 from natcoord_jax.control.run import optimise
 from natcoord_jax.control.solution import SOLUTION, Solution
 from natcoord_jax.control.transcription import entering, slices, stage
@@ -27,6 +29,12 @@ class Check:
     Attributes:
         stationarity: gradient of the Lagrangian, relative.
         complementarity: multiplier times room of the bounds, relative to the cost.
+        kind: "minimum", "saddle", or "unknown" where the curvature is too small to tell.
+        curvature: the least of the Lagrangian, relative to the largest in a single input, along changes that
+            keep to the motion and the goal to first order; bounds add to it as they press. None without an
+            iterate of the second-order method.
+        direction: of unit length along which it is so, as change of the inputs' coefficients (coefficients,
+            inputs).
         missing: residual of the goal by name, of the simulated motion.
         exceeded: largest excess of each bound by name; negative inside.
         costs: cost by number of steps, with the steps halved and doubled.
@@ -40,6 +48,9 @@ class Check:
 
     stationarity: float
     complementarity: float
+    kind: str
+    curvature: float | None
+    direction: np.ndarray | None
     missing: dict[str, float]
     exceeded: dict[str, float]
     costs: dict[int, float]
@@ -56,6 +67,8 @@ class Check:
             f"gradient of the Lagrangian  {self.stationarity:.2e}",
             f"complementarity             {self.complementarity:.2e}",
         ]
+        if self.curvature is not None:
+            lines.append(f"least curvature, relative   {self.curvature:+.2e}: {self.kind}")
         lines += [f"goal: {name}  {value:+.2e}" for name, value in self.missing.items()]
         lines += [f"bound: {name}  {value:+.2e}" for name, value in self.exceeded.items()]
         lines += [f"cost with {steps} steps  {cost:.10g}" for steps, cost in sorted(self.costs.items())]
@@ -107,6 +120,21 @@ def _hamiltonian(solution: Solution) -> tuple[float | None, float | None]:
     return float(np.mean(smooth)), float(np.max(np.abs(smooth - np.mean(smooth))) / size)
 
 
+SEEN = 1e-6
+"""Curvature, relative to the largest, that differences can tell from none."""
+
+
+def _second_order(solution: Solution) -> tuple[str, float | None, np.ndarray | None]:
+    """Whether it is a minimum, and the least curvature with its direction."""
+    if solution.iterate is None:
+        return "unknown", None, None
+    value, along, unit = softest(solution.problem, solution.iterate)
+    relative = float(value) / max(float(unit), 1e-300)
+    kind = "minimum" if relative > SEEN else "saddle" if relative < -SEEN else "unknown"
+    change = as_unknowns(solution.problem, solution.iterate, along)
+    return kind, relative, np.asarray(change.coefficients)
+
+
 @checked(solution=SOLUTION, refine=FLAG, autonomous=FLAG, make=FunctionOf("(steps) -> problem"))
 def check(
     solution: Solution,
@@ -148,6 +176,7 @@ def check(
     return Check(
         float(iterate.errors.stationarity) if iterate is not None else math.nan,
         float(iterate.errors.complementarity) if iterate is not None else math.nan,
+        *_second_order(solution),
         solution.missing,
         exceeded,
         costs,

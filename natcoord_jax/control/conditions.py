@@ -200,10 +200,16 @@ def left_of_conditions(
     return Change(first, w, missing, path, last), sweep
 
 
-def least_curved(problem: OptimalControl, iterate: Iterate, factors: Factors) -> Change:
+def least_curved(problem: OptimalControl, iterate: Iterate, factors: Factors, turns: Array | int) -> Change:
     """The direction along which the model is curved least, by inverse iteration; the way that the cost falls.
 
     The increase of the curvature, little more than it is negative, makes that quick.
+
+    Args:
+        problem: the problem.
+        iterate: the motion.
+        factors: of the model.
+        turns: iterations.
     """
     by_w, multipliers = iterate.derivatives.by_w, iterate.multipliers
     states = factors.forward.shape[1]
@@ -219,11 +225,31 @@ def least_curved(problem: OptimalControl, iterate: Iterate, factors: Factors) ->
 
     # Without any symmetry.
     start = jnp.sin(1.0 + 2.4 * jnp.arange(by_w.size).reshape(by_w.shape))
-    turns = jnp.where(factors.added[0] > 0, TURNS, 0)
     first, w = jax.lax.fori_loop(0, turns, again, (jnp.zeros_like(iterate.derivatives.by_first), start))
     uphill = jnp.sum(by_w * w) + iterate.derivatives.by_first @ first > 0
     first, w = (jnp.where(uphill, -x, x) for x in (first, w))
     return Change(first, w, nothing, jnp.zeros_like(multipliers.path), jnp.zeros_like(multipliers.end))
+
+
+def curvature(
+    along: Change, bent: Array, sweep: Sweep, bounds: Weighted, added: tuple[Array, Array]
+) -> Float[Array, ""]:
+    """Curvature of the Lagrangian along a direction, with what bounds add.
+
+    Args:
+        along: the direction.
+        bent: the direction times what it leaves of the conditions, at level 0.
+        sweep: along it.
+        bounds: what slacks add.
+        added: what has been added to the curvature, which is left out.
+    """
+    own = bent - jnp.sum(added[0] * along.w**2) - jnp.sum(added[1] * along.first**2)
+    return own + jnp.sum(bounds.path * sweep.excess**2) + jnp.sum(bounds.end * sweep.end_excess**2)
+
+
+def times(change: Change, left: Change) -> Float[Array, ""]:
+    """A direction of what is solved for times what another one leaves of the conditions there."""
+    return jnp.sum(change.w * left.w) + change.first @ left.first
 
 
 class Improved(NamedTuple):
@@ -266,15 +292,13 @@ def improved(
     """
     unknowns, missing = iterate.unknowns, iterate.path.end.missing
 
-    added, soft = factors.added, least_curved(problem, iterate, factors)
+    added, look = factors.added, factors.added[0] > 0
+    soft = least_curved(problem, iterate, factors, jnp.where(look, TURNS, 0))
     still, size = iterate.errors.stationarity < STILL, largest(unknowns.coefficients)
     aside = ASIDE * jnp.where(size > 0, size, 1.0)
 
     def bent(seen: tuple[Sweep, Array]) -> Array:
-        """Curvature along the softest direction, with what bounds add, and without what has been added."""
-        sweep, curvature = seen
-        own = curvature - jnp.sum(added[0] * soft.w**2) - jnp.sum(added[1] * soft.first**2)
-        return own + jnp.sum(bounds.path * sweep.excess**2) + jnp.sum(bounds.end * sweep.end_excess**2)
+        return curvature(soft, seen[1], seen[0], bounds, added)
 
     def apply(change: Change, level: Array, seen: tuple[Sweep, Array]) -> tuple[Change, tuple[Sweep, Array]]:
         # The model is not exact: where the curvature of the steps themselves is not negative, it needs no
@@ -282,7 +306,7 @@ def improved(
         rising = (bent(seen) >= 0) & still & (iterate.step >= 1.0) & (iterate.failures == 0)
         own = jax.tree.map(lambda x: jnp.where(rising, 0.0, x), added)
         left, sweep = left_of_conditions(problem, iterate, bounds, own, change, level)
-        curvature = jnp.sum(soft.w * left.w) + soft.first @ left.first
+        product = times(soft, left)
         # A motion that is as symmetric as its problem may be stationary and no minimum: nothing in the
         # conditions leads out of the symmetry, but a force along negative curvature does.
         away = level * aside * ((bent(seen) < 0) & still)
@@ -295,7 +319,7 @@ def improved(
         both = jnp.concatenate([move.z[:-1], move.w], axis=1)
         path = left.path + bounds.path * jnp.einsum("khz,kz->kh", found.excess, both)
         end = left.end + bounds.end * (found.last_excess @ move.z[-1])
-        return Change(move.first, move.w, move.goal, path, end), (sweep, curvature)
+        return Change(move.first, move.w, move.goal, path, end), (sweep, product)
 
     def enough(change: Change) -> Array:
         size = largest(unknowns.coefficients, unknowns.free)
@@ -323,7 +347,6 @@ def improved(
         jnp.zeros_like(iterate.multipliers.path),
         jnp.zeros_like(iterate.multipliers.end),
     )
-    look = added[0] > 0
     reached = conjugate_residuals(apply, soft, look, start, shapes, weights, enough, CORRECTIONS)
     sweep, saddle = reached.more[0], look & (bent(reached.found) < 0)
     unreachable = out_of_reach(factors, missing + sweep.missing)

@@ -7,7 +7,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from natcoord_jax.control.conditions import Improved, as_unknowns, improved
+from natcoord_jax.control.conditions import (
+    Change,
+    Improved,
+    as_unknowns,
+    curvature,
+    improved,
+    least_curved,
+    left_of_conditions,
+    times,
+)
 from natcoord_jax.control.costates import Multipliers
 from natcoord_jax.control.iterate import Derivatives, Iterate, Model, Options, Slacks, largest
 from natcoord_jax.control.merit import Direction, Violations, slope_and_weights
@@ -28,6 +37,8 @@ LEAST_BARRIER = 1e-10
 
 NEAR = 0.5
 """Relative size of a step after which the model it came from may serve another one."""
+MANY = 60
+"""Inverse iterations that find the least curvature of a solution."""
 FEW = 7
 """Solutions of a model that a step may take, for the model to serve on."""
 
@@ -202,3 +213,24 @@ def propose(problem: OptimalControl, options: Options, iterate: Iterate) -> Prop
         found.better.saddle & (found.shift > SHIFT),
         found.factors.convex & finite,
     )
+
+
+@compiled
+def softest(problem: OptimalControl, iterate: Iterate) -> tuple[Array, Change, Array]:
+    """The direction in which the Lagrangian is curved least while all conditions hold to first order.
+
+    Found in the model, by inverse iteration; the curvature is that of the steps themselves.
+
+    Returns:
+        The curvature along it [cost per square of a coefficient], the direction of unit length, and the
+        largest curvature in a coefficient.
+    """
+    found = model(problem, iterate.path, iterate.unknowns, iterate.multipliers, iterate.derivatives)
+    factors, _, _ = _convex(problem, iterate, found)
+    along, bounds = least_curved(problem, iterate, factors, MANY), _weighted(iterate)
+    length = jnp.sqrt(jnp.sum(along.w**2) + jnp.sum(along.first**2))
+    along = jax.tree.map(lambda x: x / jnp.where(length > 0, length, 1.0), along)
+    left, sweep = left_of_conditions(problem, iterate, bounds, factors.added, along, jnp.zeros(()))
+    own = jnp.diagonal(found.hessian, axis1=1, axis2=2)[:, -problem.channels :]
+    value = curvature(along, times(along, left), sweep, bounds, factors.added)
+    return value, along, jnp.max(jnp.abs(own), initial=0.0)
