@@ -152,6 +152,13 @@ def test_contradictory_goal_is_reported_by_name(hinged):
 # Bad input
 
 
+def test_a_start_outside_of_a_limit_is_found_before_the_first_iteration(hinged):
+    bounds = nc.bounds.Coordinate(0.5, 2.0, joint="hinge") & nc.bounds.Input(-1.0, 1.0)
+    found = nc.optimise(rest_to_rest(hinged, bounds=bounds), progress=False)
+    assert found.outcome is nc.Outcome.INFEASIBLE_START and not found.history
+    assert "'hinge'" in found.explain() and "missed by 0.67 of half the range" in found.explain()
+
+
 def test_bad_problems_are_refused(hinged):
     system, state = hinged
     for options, words in (

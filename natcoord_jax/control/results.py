@@ -16,6 +16,7 @@ class Outcome(IntEnum):
     STOPPED = 7
     TIME_LIMIT = 8
     SINGULAR = 9
+    INFEASIBLE_START = 10
 
     @property
     def ok(self) -> bool:
@@ -34,6 +35,7 @@ OUTCOMES = {
     Outcome.STOPPED: "stopped by the user",
     Outcome.TIME_LIMIT: "the time limit was reached",
     Outcome.SINGULAR: "a step has no derivative: its linearised equations have no solution",
+    Outcome.INFEASIBLE_START: "the start is outside of bounds that no input can change there",
 }
 
 ADVICE = {
@@ -44,5 +46,7 @@ ADVICE = {
     Outcome.SIMULATION_FAILED: "start from a milder guess or with a smaller dt, or use method='lifted'",
     Outcome.SINGULAR: "start from a guess that keeps away from positions where constraints depend on "
     "each other",
+    Outcome.INFEASIBLE_START: "start inside of them, or widen them (the zero of a joint coordinate is "
+    "the pose in which the scene was compiled)",
     Outcome.NONFINITE: "check cost, goal and bounds for undefined operations",
 }

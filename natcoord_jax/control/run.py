@@ -1,5 +1,6 @@
 """The entrances: an optimisation with progress and a way out, and one that compiles into other programs."""
 
+import math
 import sys
 import time
 from collections.abc import Sequence
@@ -15,8 +16,8 @@ from natcoord_jax.control.guess import GUESS, Guess, scattered, unknowns_of
 from natcoord_jax.control.iterate import Iterate, Options
 from natcoord_jax.control.problem import PROBLEM, OptimalControl
 from natcoord_jax.control.results import Outcome
-from natcoord_jax.control.solution import Row, Solution, solution_of, worst_condition
-from natcoord_jax.control.transcription import Unknowns
+from natcoord_jax.control.solution import Row, Solution, outside_at_start, solution_of, worst_condition
+from natcoord_jax.control.transcription import Unknowns, held_inputs
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.compiled import compiled
 from natcoord_jax.core.kinds import FLAG, Choice, Several, of
@@ -163,6 +164,12 @@ def optimise(
         iterate, history, outcome = _run(problem, options, start, progress, time_limit)
         return solution_of(problem, iterate, f"{NAMES[lifted]} {METHOD}", history, outcome)
 
+    if outside_at_start(problem):
+        start = unknowns_of(problem, guess, lifted)
+        names, values = problem.free, np.asarray(problem.values(start.free)).tolist()
+        inputs, dt = held_inputs(problem, start.coefficients), float(problem.applied(start.free)[1])
+        code = int(Outcome.INFEASIBLE_START)
+        return Solution(problem, inputs, dict(zip(names, values)), dt, math.nan, code, NAMES[lifted])
     found = solved(lifted, guess)
     if method == "auto" and found.outcome in FOR_THE_OTHER:
         # A motion that nearly is one is a start for simulations; a failed simulation is one for neither.

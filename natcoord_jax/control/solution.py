@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.system import System
+from natcoord_jax.control.bounds import Bound
 from natcoord_jax.control.goal import Goal
 from natcoord_jax.control.guess import Guess, free_of_swings
 from natcoord_jax.control.iterate import Iterate
@@ -25,6 +26,9 @@ from natcoord_jax.core.state import State, Trajectory
 from natcoord_jax.stepping.simulate import simulate
 
 FILE = of("the name of a file", str, Path)
+
+AT_BOUND = 1e-9
+"""Excess, in half a range, that is rounding."""
 
 NAMED = 3
 """How many violated conditions a message names."""
@@ -139,7 +143,9 @@ class Solution(eqx.Module):
 
     def explain(self) -> str:
         """How it ended, in words, with the conditions that are violated most."""
-        text = f"{OUTCOMES[self.outcome]} after {len(self.history)} iterations by {self.method}"
+        text = OUTCOMES[self.outcome]
+        if self.iterate is not None or self.history:
+            text += f" after {len(self.history)} iterations by {self.method}"
         if self.history:
             last = self.history[-1]
             text += (
@@ -147,7 +153,10 @@ class Solution(eqx.Module):
             )
         if self.ok:
             return text
-        if self.outcome is Outcome.UNREACHABLE:
+        if self.outcome is Outcome.INFEASIBLE_START:
+            outside = outside_at_start(self.problem).items()
+            text += ": " + ", ".join(f"{name}, missed by {x:.2g} of half the range" for name, x in outside)
+        elif self.outcome is Outcome.UNREACHABLE:
             names = self.problem.goal.labels(self.problem.system)
             sizes = np.abs(np.asarray(self.unreachable))
             order = np.argsort(-sizes)[:NAMED]
@@ -242,6 +251,30 @@ def _interpolated(values: np.ndarray, steps: int) -> np.ndarray:
 @on_host
 def _residual(goal: Goal, system: System, state: State) -> Float[Array, " n"]:
     return goal.residual(system, state)
+
+
+def outside_at_start(problem: OptimalControl) -> dict[str, float]:
+    """Bounds that the initial state exceeds whatever the inputs are, and by how much, in half their range.
+
+    Those of problems whose parameters are free are not looked at.
+    """
+    if problem.parameters:
+        return {}
+    excess, by_input = (
+        np.asarray(x) for x in _excess_at_start(problem.bounds, problem.system, problem.state)
+    )
+    fixed = ~np.any(by_input != 0, axis=-1)
+    names = _unique(problem.bounds.labels(problem.system))
+    return {name: float(x) for name, x, keep in zip(names, excess, fixed) if keep and x > AT_BOUND}
+
+
+@on_host
+def _excess_at_start(bounds: Bound, system: System, state: State) -> tuple[Array, Array]:
+    def excess(u: Array) -> Array:
+        return bounds.excess(system, state, u, state.t)
+
+    idle = jnp.zeros(len(system.structure.inputs))
+    return excess(idle), jax.jacfwd(excess)(idle)
 
 
 def _unique(names: tuple[str, ...]) -> list[str]:
