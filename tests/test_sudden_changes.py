@@ -216,3 +216,20 @@ def test_what_cannot_be_solved_is_no_number(bounce, monkeypatch, mode):
         slope(1.1, 1e4)
     jax.clear_caches()
     assert np.isnan(found)
+
+
+def test_jacobians_serve_where_a_motion_dies_away():
+    """What is known of a slot is then a difference of what stays: a millionth of it is no measure."""
+
+    scene = nc.Scene()
+    disc = scene.add(nc.RigidBody(mass=1.0, inertia=(0.1, 0.1, 0.2)))
+    hinge = scene.add(nc.Revolute(nc.ground, disc))
+    scene.add(Brake(hinge, damping=50.0))
+    system, state = scene.compile()
+
+    def angle(w):
+        start = system.with_coordinate(state, hinge, 0.0, rate=w)
+        return system.coordinate(nc.simulate(system, start, dt=0.01, steps=100), hinge)[-1]
+
+    slope = nc.jit(jax.jacfwd(angle), effort="quick")(1.0)
+    np.testing.assert_allclose(slope, nc.jit(jax.grad(angle), effort="quick")(1.0), rtol=1e-9)

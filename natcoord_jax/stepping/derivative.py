@@ -19,13 +19,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from natcoord_jax.assembly.momentum import row_weights
 from natcoord_jax.assembly.system import System
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import Tableau
 from natcoord_jax.stepping import linear_pair
 from natcoord_jax.stepping.backward import Backward
-from natcoord_jax.stepping.correcting import sizes_by_mass
+from natcoord_jax.stepping.correcting import STALL_ROUND_OFF, sizes_by_mass
 from natcoord_jax.stepping.error_control import Tolerance
 from natcoord_jax.stepping.forward import Forward
 from natcoord_jax.stepping.in_turn import Fixed
@@ -127,6 +128,8 @@ class Rule(linear_pair.Pair):
     def with_jacobians(self, residuals: Record, arguments: Changes) -> tuple[State, Array]:
         """The same by Jacobians of all slots, which serve any number of directions."""
         slots, masses = residuals.slots, Fixed.of(self.tableau, residuals).masses
+        system, _, dt = residuals.numbers.whole(residuals.numbers.varied)
+        weights = row_weights(system.mass)
 
         def body(state_dot: State, xs: tuple) -> tuple:
             (along, solver, forcing), accepted, forced = xs
@@ -136,7 +139,11 @@ class Rule(linear_pair.Pair):
             y_dot = -solver.solve(known)
             missing, moved = along(state_dot, y_dot)
             size, missing = sizes_by_mass(y_dot, missing + residual_dot, masses)
-            solved = missing <= UNSOLVED * (size + sizes_by_mass(y_dot, known, masses)[1])
+            # Where tangents decay within a state that keeps its own, what is known is a difference of these.
+            moving = (jnp.abs(state_dot.v) + jnp.abs(state_dot.q) / dt).reshape(*weights.shape, 3)
+            whole = jnp.sqrt(jnp.sum(weights[..., None] * moving**2))
+            terms = size + sizes_by_mass(y_dot, known, masses)[1]
+            solved = missing <= UNSOLVED * terms + STALL_ROUND_OFF * whole
             y_dot, moved = jax.tree.map(lambda x: jnp.where(solved, x, jnp.nan), (y_dot, moved))
             end = jax.tree.map(jnp.add, end_dot, moved)
             end = jax.tree.map(partial(jnp.where, accepted), end, state_dot)
