@@ -556,7 +556,7 @@ def turned(asymmetric, axis, degrees):
     return nc.OptimalControl(*asymmetric, dt=1 / 20, steps=20, cost=nc.cost.Effort(), goal=goal)
 
 
-@pytest.mark.parametrize("method", ["shooting", pytest.param("lifted", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("method", ["shooting", pytest.param("lifted", marks=pytest.mark.exhaustive)])
 @pytest.mark.parametrize("axis", [(1, 0, 0), (0, 1, 0), (1, 1, 0), (1, 2, 3)])
 def test_turns_by_any_angle_are_found_from_rest(asymmetric, axis, method):
     """Half turns too; and beyond, the other way round at the same cost."""
@@ -567,7 +567,7 @@ def test_turns_by_any_angle_are_found_from_rest(asymmetric, axis, method):
         assert found[0].cost == pytest.approx(found[1].cost, rel=1e-9)
 
 
-@pytest.mark.parametrize("method", ["shooting", pytest.param("lifted", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("method", ["shooting", pytest.param("lifted", marks=pytest.mark.exhaustive)])
 def test_saddles_are_left(asymmetric, method):
     """Turned about the axis of the largest inertia alone the body obeys all conditions, and needs more."""
     for degrees, known, symmetric in ((120, 469.70634, 476.28007), (150, 667.59325, 745.37894)):
@@ -576,7 +576,7 @@ def test_saddles_are_left(asymmetric, method):
         assert found.cost == pytest.approx(known, rel=1e-7) and found.cost < symmetric
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_check_tells_a_saddle_from_a_minimum(asymmetric, monkeypatch):
     """By the least eigenvalue of the whole Hessian in the inputs that keep the goal."""
     problem = turned(asymmetric, (0, 0, 1), 120)
