@@ -266,7 +266,7 @@ def _in_pieces(equation: Any, x: Array, size: int) -> Array:
 
 def _reduced(operation: Callable, x: Array, axes: Sequence[Any]) -> Array:
     """A large reduction as loops, which the compiler does not hand to a library."""
-    for axis in sorted(axes, reverse=True):
+    for axis in sorted(map(int, axes), reverse=True):
 
         def add(k: Array, total: Array, x: Array = x, axis: int = axis) -> Array:
             return operation(total, row(x, k, axis))
