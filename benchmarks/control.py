@@ -32,7 +32,7 @@ from benchmarks import common
 from natcoord_jax.control import sequential
 from natcoord_jax.control.guess import unknowns_of
 from natcoord_jax.control.iterate import Options
-from natcoord_jax.control.run import numeric
+from natcoord_jax.control.problem import numeric
 from natcoord_jax.gallery import manoeuvres
 
 OWN = "natcoord_jax"

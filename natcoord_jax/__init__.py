@@ -41,6 +41,7 @@ from natcoord_jax.control import (
     ComputedTorque,
     Feedback,
     Guess,
+    NonlinearProgram,
     OptimalControl,
     Outcome,
     Parameter,
@@ -60,6 +61,7 @@ from natcoord_jax.control import (
     optimum,
     receding_horizon,
     regulator,
+    to_nlp,
 )
 from natcoord_jax.core.force import Field, Force, Load
 from natcoord_jax.core.handles import ground
@@ -165,6 +167,7 @@ __all__ = [
     "Modes",
     "NonlinearBeamElement",
     "NonlinearSpring",
+    "NonlinearProgram",
     "OptimalControl",
     "Outcome",
     "PairTorque",
@@ -228,6 +231,7 @@ __all__ = [
     "simulate",
     "step",
     "tangent_growth",
+    "to_nlp",
     "transfer",
 ]
 

@@ -15,7 +15,7 @@ from natcoord_jax.control.costates import Multipliers
 from natcoord_jax.control.guess import unknowns_of
 from natcoord_jax.control.inputs import Spline
 from natcoord_jax.control.iterate import Options
-from natcoord_jax.control.run import numeric
+from natcoord_jax.control.problem import numeric
 from natcoord_jax.control.transcription import Unknowns, roll, simulated
 from natcoord_jax.gallery import manoeuvres
 

@@ -14,9 +14,9 @@ from jaxtyping import Array
 
 from natcoord_jax.control.guess import GUESS, unknowns_of
 from natcoord_jax.control.iterate import largest
-from natcoord_jax.control.problem import PROBLEM, OptimalControl
+from natcoord_jax.control.problem import PROBLEM, OptimalControl, numeric
 from natcoord_jax.control.results import Outcome
-from natcoord_jax.control.run import HEADER, numeric, printed
+from natcoord_jax.control.run import HEADER, printed
 from natcoord_jax.control.solution import Row, Solution
 from natcoord_jax.control.transcription import Unknowns, end, first_node, held_inputs, packed
 from natcoord_jax.core.arguments import checked

@@ -10,9 +10,9 @@ from jaxtyping import Array, Float
 from natcoord_jax.assembly.system import SYSTEM, System
 from natcoord_jax.control.guess import GUESS, unknowns_of
 from natcoord_jax.control.iterate import Iterate, Options
-from natcoord_jax.control.problem import PROBLEM, OptimalControl
+from natcoord_jax.control.problem import PROBLEM, OptimalControl, numeric
 from natcoord_jax.control.quadratic import model
-from natcoord_jax.control.run import OPTIONS, WEIGHTS, numeric, optimise_jit
+from natcoord_jax.control.run import OPTIONS, WEIGHTS, optimise_jit
 from natcoord_jax.control.solution import SOLUTION, Solution
 from natcoord_jax.control.transcription import held_inputs, packed
 from natcoord_jax.core.arguments import checked

@@ -161,5 +161,10 @@ class OptimalControl(Part):
         return assemble(self.applied(scaled)[0], self.state)
 
 
+def numeric(problem: OptimalControl) -> OptimalControl:
+    """The problem with all its numbers as arrays, so that a changed number never compiles anew."""
+    return jax.tree.map(lambda x: jnp.asarray(x, float) if isinstance(x, int | float) else x, problem)
+
+
 PROBLEM = of("a problem, nc.OptimalControl(...)", OptimalControl)
 """What an argument may be."""

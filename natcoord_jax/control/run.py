@@ -14,7 +14,7 @@ import numpy as np
 from natcoord_jax.control import sequential
 from natcoord_jax.control.guess import GUESS, Guess, scattered, unknowns_of
 from natcoord_jax.control.iterate import Iterate, Options
-from natcoord_jax.control.problem import PROBLEM, OptimalControl
+from natcoord_jax.control.problem import PROBLEM, OptimalControl, numeric
 from natcoord_jax.control.results import Outcome
 from natcoord_jax.control.solution import Row, Solution, outside_at_start, solution_of, worst_condition
 from natcoord_jax.control.transcription import Unknowns, held_inputs
@@ -39,11 +39,6 @@ FOR_THE_OTHER = (
 """Outcomes after which the other form of the method is tried, if the choice was ours."""
 SAME = 1e-3
 """Difference of inputs, relative to the largest, below which two optima are taken for one."""
-
-
-def numeric(problem: OptimalControl) -> OptimalControl:
-    """The problem with all its numbers as arrays, so that a changed number never compiles anew."""
-    return jax.tree.map(lambda x: jnp.asarray(x, float) if isinstance(x, int | float) else x, problem)
 
 
 def _chosen(problem: OptimalControl, method: str, guess: Any = None) -> bool:

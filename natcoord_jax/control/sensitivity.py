@@ -15,8 +15,8 @@ from natcoord_jax.control import sequential
 from natcoord_jax.control.costates import Multipliers, direct_slopes, scored_end, step_jacobians, through_step
 from natcoord_jax.control.iterate import Iterate, Options
 from natcoord_jax.control.linearisation import first_gradient
-from natcoord_jax.control.problem import OptimalControl
-from natcoord_jax.control.run import DEFAULT, OPTIONS, numeric, optimise_jit
+from natcoord_jax.control.problem import OptimalControl, numeric
+from natcoord_jax.control.run import DEFAULT, OPTIONS, optimise_jit
 from natcoord_jax.control.transcription import (
     Node,
     Path,
