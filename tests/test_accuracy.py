@@ -157,7 +157,7 @@ def test_figure(tmp_path):
     assert (tmp_path / "figure.png").stat().st_size > 10_000
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_other_quantities():
     example = gallery.load("pendulum")
     found = nc.accuracy(

@@ -416,7 +416,7 @@ def test_a_law_needs_two_node_elements():
         nc.Scene().add(nc.Beam(section, LINE, elements=2, **directors))
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_quadratic_law_is_linear_elasticity():
     """Could go wrong: a law in place of the section's energy, per element instead of per length."""
     load = {"force": (-2.0, 1.0, 2.0), "torque": (0.5, 0, 0)}

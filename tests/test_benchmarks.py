@@ -115,7 +115,7 @@ def test_beams_alone(tmp_path):
         assert run["result"] == "successful" and run["energy_balance"] < 1e-11
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_startup(tmp_path):
     results, text = _results("startup", tmp_path, "--no-peers", written="startup")
     (run,) = results["runs"]

@@ -471,7 +471,7 @@ def test_derivative_of_the_optimum_by_a_parameter(hinged):
     assert float(slope) == pytest.approx(float(differences), rel=1e-5)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_parameters_and_splines_are_optimised_together(hinged):
     # A heavier disc costs effort, a lighter one is fined: the optimum of both is between the bounds.
     parameter = nc.Parameter(
@@ -507,7 +507,7 @@ def test_first_order_descent_comes_near(hinged, solution):
     assert plain.cost < 1e-4
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_first_order_descent_respects_bounds_of_inputs(hinged):
     problem = rest_to_rest(hinged, bounds=nc.bounds.Input(-10.0, 10.0))
     known = solved(problem)

@@ -138,7 +138,7 @@ def test_derivatives_follow_the_accepted_substeps(order):
         assert along == pytest.approx(slope, rel=tol.SAME_GRADIENT)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_short_substeps_where_motion_is_fast_for_a_moment():
     """Beads of 1, 100 and 10^4 kg on strings: the light one snaps once, at hundreds of radians a second."""
     scene = nc.Scene()

@@ -66,7 +66,7 @@ def test_a_passive_joint_moves_as_it_must():
         nc.inverse_dynamics(system, state, both, dt=0.02, joints=["rail"])
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_computed_torque_holds_an_unstable_path(flexible_arm):
     system, state, _ = flexible_arm
     steps, dt = 50, 0.01

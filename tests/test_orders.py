@@ -157,7 +157,7 @@ def fourth_order_difference(f):
     return (8 * (values[2] - values[1]) - (values[3] - values[0])) / (12 * STEP)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_derivatives_in_every_mode():
     slopes = jax.jit(jax.vmap(jax.grad(loss)))(jnp.array([AT, AT + STEP]))
     slope = float(slopes[0])

@@ -45,7 +45,7 @@ def test_links_are_bodies_with_the_inertia_of_their_size():
     assert 10.0 < sum(mass for _, mass, *_ in LINKS) < 16.0
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_cable_hangs_at_rest_between_holder_and_clamp(short):
     parts, _ = short
     system, state = parts.approach, parts.state

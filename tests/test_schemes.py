@@ -197,7 +197,7 @@ def form(system, one, other):
     return pairing(one.q, other.v) - pairing(other.q, one.v) + rotor
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(
     ("scheme", "symplectic", "bodies"), [(VARIATIONAL, True, 2), (nc.EnergyMomentum(), False, 1)]
 )
@@ -377,7 +377,7 @@ def test_gradient_against_differences(scheme):
     assert slope == pytest.approx(fourth_order_difference(jax.jit(loss)), rel=tol.DIFFERENCE_BEST)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @BOTH
 def test_derivatives_in_every_mode(scheme):
     loss = loss_of(scheme)

@@ -70,7 +70,7 @@ def test_what_is_no_set_of_single_bodies():
     assert not separate.separate(scene.compile()[0])
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_motion_with_tangents_of_single_bodies(monkeypatch):
     system, state = mixed()
     runs = []

@@ -64,9 +64,7 @@ class _Function(ca.Callback):
 
     def eval(self, arg: list[Any]) -> list[ca.DM]:
         found = self.function(*(np.asarray(x).reshape(-1) for x in arg))
-        return [
-            ca.project(ca.DM(np.asarray(x)), pattern) for x, pattern in zip(found, self.outputs.values())
-        ]
+        return [ca.project(ca.DM(np.asarray(x)), pattern) for x, pattern in zip(found, self.outputs.values())]
 
 
 def solved(program: nc.NonlinearProgram, max_iter: int = 500, **options: Any) -> Answer:

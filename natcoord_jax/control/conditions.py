@@ -58,12 +58,21 @@ class Change(eqx.Module):
 
 
 class Sweep(eqx.Module):
-    """First-order changes along a direction: of the steps' unknowns, of excesses and of the goal."""
+    """First-order changes along a direction.
+
+    Attributes:
+        y: of the steps' unknowns.
+        excess: of the excesses over bounds.
+        missing: of the goal's residual.
+        end_excess: of the excesses at the end.
+        motion: of the multipliers of the steps' equations.
+    """
 
     y: Float[Array, "steps n"]
     excess: Float[Array, "steps h"]
     missing: Float[Array, " c"]
     end_excess: Float[Array, " e"]
+    motion: Float[Array, "steps n"]
 
 
 def as_unknowns(problem: OptimalControl, iterate: Iterate, change: Change) -> Unknowns:
@@ -117,13 +126,19 @@ def swept(problem: OptimalControl, iterate: Iterate, change: Change, level: Arra
     last, (before, y, excess) = scan_in_one_kernel(body, ravel_pytree(start)[0], given)
     final = jax.tree.map(lambda x: x[-1], path.nodes)
     reached = jax.jvp(lambda node: end(problem, node), (final,), (unflat(last),))[1]
-    return Linear(before, last, dw, Sweep(y, excess, reached.missing, reached.excess))
+    return Linear(before, last, dw, Sweep(y, excess, reached.missing, reached.excess, jnp.zeros_like(y)))
 
 
-def _curved(problem: OptimalControl, iterate: Iterate, change: Change, linear: Linear) -> tuple[Array, Array]:
-    """Changes of the Lagrangian's gradient along a change and that of the motion: in `first`, and in `w`."""
+def _curved(
+    problem: OptimalControl, iterate: Iterate, change: Change, linear: Linear
+) -> tuple[Array, Array, Array]:
+    """Changes of the Lagrangian's gradient along a change and that of the motion.
+
+    Returns:
+        The gradient's change in `first`, and in `w`, and that of the multipliers of the motion.
+    """
     unknowns, path, multipliers = iterate.unknowns, iterate.path, iterate.multipliers
-    worth, jacobians = iterate.derivatives.worth, iterate.derivatives.jacobians
+    worth, jacobians = iterate.derivatives.bending, iterate.derivatives.jacobians
     w = entering(problem, unknowns.coefficients)
     final, unflat = ravel_pytree(jax.tree.map(lambda x: x[-1], path.nodes))
     size = sizes(problem, path, unknowns)
@@ -155,19 +170,21 @@ def _curved(problem: OptimalControl, iterate: Iterate, change: Change, linear: L
     there, moved = (final, multipliers.goal, multipliers.end), (linear.last, change.goal, change.end)
     last = jax.jvp(scored, there, moved)[1]
 
-    def body(after: Array, given: tuple) -> tuple[Array, Array]:
+    def body(after: Array, given: tuple) -> tuple[Array, tuple[Array, Array]]:
         at, node, w, y, jacobian, by_node, by_w, by_y = given
-        before, more, _ = through_step(problem, at, node, w, y, jacobian)(after, by_y)
-        return before + by_node, more + by_w
+        before, more, motion = through_step(problem, at, node, w, y, jacobian)(after, by_y)
+        return before + by_node, (more + by_w, motion)
 
-    first, by_w = scan_in_one_kernel(body, last, (*each, jacobians, by_node, by_w, by_y), reverse=True)
+    first, (by_w, motion) = scan_in_one_kernel(
+        body, last, (*each, jacobians, by_node, by_w, by_y), reverse=True
+    )
     value = ravel_pytree(jax.tree.map(lambda x: x[0], worth.nodes))[0]
 
     def slope(unknowns: Unknowns, value: Array) -> Array:
         return first_gradient(problem, unknowns, value)
 
     tangent = as_unknowns(problem, iterate, change)
-    return jax.jvp(slope, (unknowns, value), (tangent, first))[1], by_w
+    return jax.jvp(slope, (unknowns, value), (tangent, first))[1], by_w, motion
 
 
 def left_of_conditions(
@@ -190,7 +207,8 @@ def left_of_conditions(
     """
     linear = swept(problem, iterate, change, level)
     sweep, derivatives = linear.sweep, iterate.derivatives
-    first, w = _curved(problem, iterate, change, linear)
+    first, w, motion = _curved(problem, iterate, change, linear)
+    sweep = eqx.tree_at(lambda s: s.motion, sweep, motion)
     enters = (jnp.arange(problem.steps) % problem.inputs.every == 0)[:, None]
     w = jnp.where(enters, level * derivatives.by_w + w + added[0] * change.w, 0.0)
     first = level * derivatives.by_first + first + added[1] * change.first
@@ -338,7 +356,8 @@ def improved(
         give,
         jnp.zeros_like(bounds.end),
     )
-    sweep = Sweep(unknowns.y, iterate.path.stages.excess, missing, iterate.path.end.excess)
+    y, path = unknowns.y, iterate.path
+    sweep = Sweep(y, path.stages.excess, missing, path.end.excess, y)
     shapes = sweep, jnp.zeros_like(iterate.unit)
     start = Change(
         jnp.zeros(found.first.shape[1]),

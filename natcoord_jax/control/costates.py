@@ -30,11 +30,19 @@ from natcoord_jax.stepping.one_kernel import scan_in_one_kernel
 
 
 class Multipliers(eqx.Module):
-    """Multipliers of the goal, of the bounds at every step, and of the bounds of what is free."""
+    """Multipliers of the constraints.
+
+    Attributes:
+        goal: of the goal.
+        path: of the bounds at every step.
+        end: of the bounds of what is free.
+        motion: of the equations of all steps, as they bend the model; None: those that the others imply.
+    """
 
     goal: Float[Array, "*batch c"]
     path: Float[Array, "*batch steps h"]
     end: Float[Array, "*batch e"]
+    motion: Float[Array, "*batch steps n"] | None = None
 
 
 class Costates(eqx.Module):
@@ -176,12 +184,13 @@ def costates(
     multipliers: Multipliers,
     jacobians: Jacobians,
     maps: Charts,
-) -> tuple[Costates, Costates, Float[Array, "steps m"]]:
+) -> tuple[Costates, Costates, Costates, Float[Array, "steps m"]]:
     """Worth of nodes and residuals, such that the Lagrangian is stationary in all states and unknowns y.
 
     Returns:
-        Costates, exact; those of steps with projected velocities, for the curvature; and the gradient of the
-        Lagrangian in the entering coefficients, exact.
+        Costates; those that bend the exact conditions, and, of steps with projected velocities, those that
+        bend the model, where multipliers of the motion that are given replace what the others imply; and the
+        gradient of the Lagrangian in the entering coefficients.
     """
     final = jax.grad(partial(scored_end, problem, multipliers))(jax.tree.map(lambda x: x[-1], path.nodes))
     last, unflat = ravel_pytree(final)
@@ -189,14 +198,7 @@ def costates(
     def body(after: tuple[Array, Array], given: tuple) -> tuple[tuple[Array, Array], tuple]:
         at, node, w, y, slopes, jacobian, following, rates, forth, flexibility = given
 
-        worth_left = worth_of_left(unflat(after[1]), forth, flexibility)
-
-        def projected(node: Array) -> tuple[Array, Array]:
-            reached, left = split_node(problem, unflat(node), rates, worth_left)
-            return ravel_pytree(reached)[0], left
-
-        back = jax.vjp(projected, ravel_pytree(following)[0])[1]
-        unprojected = back((after[1], jnp.ones(())))[0]
+        unprojected = _unprojected(problem, after[1], following, rates, forth, flexibility)
         through = through_step(problem, at, node, w, y, jacobian)
         both, by_w, worth = jax.vmap(through, in_axes=(0, None))(
             jnp.stack([after[0], unprojected]), slopes[2]
@@ -214,4 +216,40 @@ def costates(
     _, (nodes, residuals, by_w) = scan_in_one_kernel(body, (last, last), given, reverse=True)
     nodes = jnp.concatenate([nodes, jnp.broadcast_to(last, (1, 2, last.size))])
     exact, model = (Costates(jax.vmap(unflat)(nodes[:, k]), residuals[:, k]) for k in range(2))
-    return exact, model, by_w
+    if multipliers.motion is None:
+        return exact, exact, model, by_w
+    # Of projected steps they differ by a part of order dt^2.
+    motion = jnp.stack([multipliers.motion, multipliers.motion + model.residuals - exact.residuals], axis=1)
+
+    def given_body(after: Array, given: tuple) -> tuple[Array, Array]:
+        (at, node, w, y, slopes, _, following, *maps), motion = given
+        flat, unflat = ravel_pytree(node)
+
+        def reached(node: Array) -> tuple[Array, Array]:
+            found = stage(problem, at, unflat(node), w, y)
+            return ravel_pytree(found.after)[0], found.residual
+
+        pull = jax.vjp(reached, flat)[1]
+        unprojected = _unprojected(problem, after[1], following, *maps)
+        both = jax.vmap(pull)((jnp.stack([after[0], unprojected]), motion))[0] + slopes[0]
+        return both, both
+
+    begun = jnp.broadcast_to(last, (2, last.size))
+    _, nodes = scan_in_one_kernel(given_body, begun, (given, motion), reverse=True)
+    nodes = jnp.concatenate([nodes, begun[None]])
+    bending, model = (Costates(jax.vmap(unflat)(nodes[:, k]), motion[:, k]) for k in range(2))
+    return exact, bending, model, by_w
+
+
+def _unprojected(
+    problem: OptimalControl, worth: Array, node: Node, rates: Array, forth: Array, flexibility: Array
+) -> Array:
+    """Worth of a node from that of the same with its velocities projected, as vectors."""
+    flat, unflat = ravel_pytree(node)
+    worth_left = worth_of_left(unflat(worth), forth, flexibility)
+
+    def projected(node: Array) -> tuple[Array, Array]:
+        reached, left = split_node(problem, unflat(node), rates, worth_left)
+        return ravel_pytree(reached)[0], left
+
+    return jax.vjp(projected, flat)[1]((worth, jnp.ones(())))[0]

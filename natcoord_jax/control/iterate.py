@@ -16,15 +16,15 @@ class Options(eqx.Module):
         max_iterations: of the method.
         tol: largest gradient of the Lagrangian and complementarity, relative.
         goal_tol: largest residual of the goal, in its units, of the bounds, in theirs, and of the steps.
-        barrier: barrier parameter at the start, all bounds together, relative to the cost; a small one lets
-            the first steps, which know no multipliers yet, run into bounds.
+        barrier: barrier parameter at the start, of every bound, relative to the cost; a small one lets the
+            first steps, which know no multipliers yet, run into bounds.
     """
 
     lifted: bool = eqx.field(default=False, static=True)
     max_iterations: int = eqx.field(default=100, static=True)
     tol: float = eqx.field(default=1e-8, static=True)
     goal_tol: float = eqx.field(default=1e-10, static=True)
-    barrier: float = eqx.field(default=3.0, static=True)
+    barrier: float = eqx.field(default=0.03, static=True)
 
 
 class Slacks(eqx.Module):
@@ -59,7 +59,8 @@ class Derivatives(eqx.Module):
         jacobians: of the equations of the steps.
         maps: small numbers of the nodes.
         worth: costates.
-        bent: costates of projected steps, for the curvature.
+        bending: those that the curvature is taken with.
+        bent: the same of projected steps, for the model.
         by_w: gradient of the Lagrangian in the entering coefficients.
         by_first: gradient in what is free and the leading coefficients.
         errors: what is missing.
@@ -68,6 +69,7 @@ class Derivatives(eqx.Module):
     jacobians: Jacobians
     maps: Charts
     worth: Costates
+    bending: Costates
     bent: Costates
     by_w: Float[Array, "*batch steps m"]
     by_first: Float[Array, "*batch f"]
@@ -100,6 +102,26 @@ class Model(eqx.Module):
     first_hessian: Float[Array, "*batch f f"]
 
 
+class Filter(eqx.Module):
+    """What the search for a step remembers, see `line_search`.
+
+    Attributes:
+        violations: that no iterate may exceed together with the cost beside it; infinite where none is.
+        costs: barrier costs, in units of the cost.
+        count: how many have been written.
+        units: of the residuals of a step: what they change of positions, roughly, over the whole motion.
+        least: violation below which a step is for the cost.
+        largest: violation that is never exceeded.
+    """
+
+    violations: Float[Array, "*batch k"]
+    costs: Float[Array, "*batch k"]
+    count: Int[Array, "*batch"]
+    units: Float[Array, "*batch n"]
+    least: Float[Array, "*batch"]
+    largest: Float[Array, "*batch"]
+
+
 class Iterate(eqx.Module):
     """Where the method stands.
 
@@ -116,7 +138,7 @@ class Iterate(eqx.Module):
         unit: of the cost.
         shift: last increase of the curvature.
         penalty: weight of the goal's square in the model.
-        previous: path and slacks of the iterate before.
+        filter: what the search for a step remembers.
         step: length of the last step.
         moved: size of the last step, relative.
         unreachable: part of the goal that nothing could change.
@@ -139,7 +161,7 @@ class Iterate(eqx.Module):
     unit: Float[Array, "*batch"]
     shift: Float[Array, "*batch"]
     penalty: Float[Array, "*batch c"]
-    previous: tuple[Path, Slacks]
+    filter: Filter
     step: Float[Array, "*batch"]
     moved: Float[Array, "*batch"]
     unreachable: Float[Array, "*batch c"]

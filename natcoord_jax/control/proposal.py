@@ -1,4 +1,4 @@
-"""The step that the quadratic model proposes: made convex, corrected, with its merit function."""
+"""The step that the quadratic model proposes: made convex, and corrected."""
 
 from typing import NamedTuple
 
@@ -19,7 +19,7 @@ from natcoord_jax.control.conditions import (
 )
 from natcoord_jax.control.costates import Multipliers
 from natcoord_jax.control.iterate import Derivatives, Iterate, Model, Options, Slacks, largest
-from natcoord_jax.control.merit import Direction, Violations, slope_and_weights
+from natcoord_jax.control.line_search import Direction
 from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.control.quadratic import model
 from natcoord_jax.control.riccati import REACH, Factors, Weighted, factored
@@ -28,9 +28,9 @@ from natcoord_jax.xla.tracing import traced_once
 
 SHIFT = 1e-4
 """First increase of the curvature where the model is not convex."""
+GROWTH = 8.0
+"""Of the increase, until the model is convex."""
 LARGEST_SHIFT = 1e8
-STIFFEST = 1e3
-"""Largest penalty on the goal, in units of its stiffness."""
 LEAST_BARRIER = 1e-10
 """Barrier parameter at the end, relative to the cost."""
 
@@ -51,7 +51,6 @@ class Proposal(eqx.Module):
     corrections: Int[Array, ""]
     direction: Direction
     slope: Float[Array, ""]
-    weights: Violations
     barrier: Float[Array, ""]
     shift: Float[Array, ""]
     penalty: Float[Array, " c"]
@@ -73,29 +72,32 @@ def _convex(problem: OptimalControl, iterate: Iterate, found: Model) -> tuple[Fa
     bounds = _weighted(iterate)
     idle = (jnp.arange(problem.steps) % problem.inputs.every != 0).astype(float)
     idle = jnp.broadcast_to(idle[:, None], (problem.steps, problem.channels))
-    reach = jnp.clip(30.0 * iterate.errors.motion, *REACH)
+    # Conditions that depend on each other along motions only, by conserved momenta, are told from those that
+    # inputs reach with difficulty by trying the latter first.
+    reach = jnp.where(iterate.failures > 0, jnp.clip(30.0 * iterate.errors.motion, *REACH), REACH[0])
 
-    def attempt(stiffness: Array, shift: Array) -> Factors:
-        return factored(found, bounds, idle, shift, stiffness * iterate.penalty, reach)
+    def attempt(shift: Array) -> Factors:
+        return factored(found, bounds, idle, shift, iterate.penalty, reach, iterate.unit)
 
     def unfinished(carry: tuple) -> Array:
-        factors, _, shift, begun = carry
+        factors, shift, begun = carry
         return ~begun | (~factors.convex & (shift < LARGEST_SHIFT))
 
-    def body(carry: tuple) -> tuple:
-        # A penalty on the goal bends the model only where the goal forbids a change; it is tried first.
-        _, stiffness, shift, begun = carry
-        exhausted = begun & (stiffness >= STIFFEST)
-        shift = jnp.where(exhausted, jnp.maximum(3.0 * shift, SHIFT), shift)
-        stiffness = jnp.where(begun & ~exhausted, 10.0 * stiffness, stiffness)
-        return attempt(stiffness, shift), stiffness, shift, jnp.array(True)
+    # None is tried first, as long as steps are found.
+    last = iterate.shift
+    least = jnp.where(iterate.failures > 0, jnp.maximum(10.0 * last, SHIFT), 0.0)
 
-    start = jnp.where(iterate.failures > 0, jnp.maximum(10.0 * iterate.shift, SHIFT), 0.1 * iterate.shift)
-    start = jnp.where(start < SHIFT, 0.0, start)
-    attempt, nothing = traced_once(attempt, start, start)
-    first = (nothing, jnp.ones(()), start, jnp.array(False))
-    factors, stiffness, shift, _ = jax.lax.while_loop(unfinished, body, first)
-    return factors, shift, stiffness * iterate.penalty
+    def body(carry: tuple) -> tuple:
+        _, shift, begun = carry
+        more = jnp.where(
+            shift > least, GROWTH * shift, jnp.maximum(jnp.maximum(last / 3.0, 2.0 * least), SHIFT)
+        )
+        shift = jnp.where(begun, more, shift)
+        return attempt(shift), shift, jnp.array(True)
+
+    attempt, nothing = traced_once(attempt, least)
+    factors, shift, _ = jax.lax.while_loop(unfinished, body, (nothing, least, jnp.array(False)))
+    return factors, shift, iterate.penalty
 
 
 def _penalty(iterate: Iterate, factors: Factors) -> Array:
@@ -114,8 +116,25 @@ def _direction(problem: OptimalControl, options: Options, iterate: Iterate, bett
     s = iterate.slacks
     slack = -(iterate.path.stages.excess + s.path) - sweep.excess
     last = -(iterate.path.end.excess + s.end) - sweep.end_excess
-    multipliers = Multipliers(better.change.goal, better.change.path, better.change.end)
+    motion = iterate.multipliers.motion
+    if motion is not None:
+        motion = iterate.derivatives.worth.residuals + sweep.motion - motion
+    multipliers = Multipliers(better.change.goal, better.change.path, better.change.end, motion)
     return Direction(unknowns, multipliers, Slacks(slack, last))
+
+
+def _slope(problem: OptimalControl, iterate: Iterate, better: Improved, slacks: Slacks) -> Array:
+    """Slope of the barrier cost: that of the Lagrangian without what constraints change in it."""
+    change, sweep, derivatives = better.change, better.sweep, iterate.derivatives
+    m, s, mu = iterate.multipliers, iterate.slacks, iterate.barrier
+    enters = (jnp.arange(problem.steps) % problem.inputs.every == 0)[:, None]
+    lagrangian = jnp.sum(derivatives.by_w * jnp.where(enters, change.w, 0.0))
+    lagrangian = lagrangian + derivatives.by_first @ change.first
+    # The equations of all steps hold at the end of the direction, to first order.
+    closed = -jnp.sum(derivatives.worth.residuals * iterate.path.stages.residual)
+    bounds = jnp.sum(m.path * sweep.excess) + jnp.sum(m.end * sweep.end_excess)
+    rooms = jnp.sum(mu / s.path * slacks.path) + jnp.sum(mu / s.end * slacks.end)
+    return lagrangian - closed - m.goal @ sweep.missing - bounds - rooms
 
 
 def _lowered(iterate: Iterate) -> Array:
@@ -127,7 +146,7 @@ def _lowered(iterate: Iterate) -> Array:
     central = largest(s.path * m.path - mu, s.end * m.end - mu) / unit
     missing = jnp.maximum(jnp.maximum(e.stationarity, central), jnp.maximum(e.bounds, e.goal))
     lower = unit * jnp.maximum(LEAST_BARRIER, jnp.minimum(0.2 * relative, relative**1.5))
-    return jnp.where(missing < 10.0 * relative, jnp.minimum(lower, mu), mu)
+    return jnp.where(missing < jnp.minimum(10.0 * relative, 0.5), jnp.minimum(lower, mu), mu)
 
 
 def no_model(derivatives: Derivatives, multipliers: Multipliers) -> Model:
@@ -197,7 +216,7 @@ def propose(problem: OptimalControl, options: Options, iterate: Iterate) -> Prop
     iterate = eqx.tree_at(lambda i: i.barrier, iterate, _lowered(iterate))
     found = _attempt(problem, iterate)
     direction = _direction(problem, options, iterate, found.better)
-    slope, weights = slope_and_weights(iterate, direction, problem.inputs.every)
+    slope = _slope(problem, iterate, found.better, direction.slacks)
     finite = jnp.all(jnp.array([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(direction)]))
     return Proposal(
         found.model,
@@ -205,7 +224,6 @@ def propose(problem: OptimalControl, options: Options, iterate: Iterate) -> Prop
         found.better.count,
         direction,
         slope,
-        weights,
         iterate.barrier,
         found.shift,
         _penalty(iterate, found.factors),

@@ -15,7 +15,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from natcoord_jax.control.iterate import Model
-from natcoord_jax.maths.elimination import inverse_cholesky
 from natcoord_jax.stepping.one_kernel import scan_in_one_kernel
 
 REACH = (1e-8, 1e-3)
@@ -23,6 +22,10 @@ REACH = (1e-8, 1e-3)
 obeys its equations, and of one that does not by far."""
 
 
+SINGULAR = 1e-12
+"""Pivots below this part of the diagonal are none."""
+TOO_MANY = 1_000_000
+"""More negative eigenvalues than any problem has conditions."""
 FELT = 1e-5
 """Conditions of the goal that inputs move less than this, relative to the others, count as out of reach."""
 
@@ -69,7 +72,7 @@ class Factors(eqx.Module):
         goal_vectors: eigenvectors of T in these units (c, c).
         goal_inverse: inverses of its eigenvalues; 0 for those that count as zero (c,).
         added: curvature added to that in entering coefficients, and to that in what is free (f,).
-        convex: whether the model is convex where it has to be.
+        convex: whether the model is convex along all changes that keep to the goal.
     """
 
     forward: Float[Array, "steps z zm"]
@@ -108,14 +111,28 @@ def _symmetric(matrix: Array) -> Array:
     return 0.5 * (matrix + matrix.T)
 
 
-def _inverse(matrix: Array, convex: Array) -> tuple[Array, Array]:
-    """Inverse, or the identity where the matrix is not convex; and whether it is, like those before it."""
-    if not matrix.shape[0]:
-        return matrix, convex
-    # Of the Cholesky factor: it exists for convex matrices only.
-    root = inverse_cholesky(matrix)
-    convex = convex & jnp.all(jnp.isfinite(root))
-    return jnp.where(convex, root.T @ root, jnp.eye(root.shape[0], dtype=root.dtype)), convex
+def _inverse(matrix: Array, negative: Array) -> tuple[Array, Array]:
+    """Inverse of a symmetric matrix, and the number of its negative eigenvalues, added to that before.
+
+    By elimination without pivoting, X A X^T = D; a pivot that vanishes counts as too many.
+    """
+    size = matrix.shape[0]
+    if not size:
+        return matrix, negative
+    number, diagonal = jnp.arange(size), jnp.abs(jnp.diagonal(matrix))
+
+    def eliminate(k: Array, both: Array) -> Array:
+        row = both[k] / both[k, k]
+        column = jnp.where(number > k, both[:, k], 0.0)
+        return both - column[:, None] * row[None, :]
+
+    both = jnp.concatenate([matrix, jnp.eye(size, dtype=matrix.dtype)], axis=1)
+    both = jax.lax.fori_loop(0, size, eliminate, both)
+    pivots, root = jnp.diagonal(both), both[:, size:]
+    regular = jnp.all(jnp.abs(pivots) > SINGULAR * diagonal) & jnp.all(jnp.isfinite(both))
+    inverse = root.T @ (root / jnp.where(regular, pivots, 1.0)[:, None])
+    found = jnp.where(regular, negative + jnp.sum(pivots < 0), TOO_MANY)
+    return jnp.where(regular, inverse, jnp.eye(size, dtype=matrix.dtype)), found
 
 
 def factored(
@@ -125,6 +142,7 @@ def factored(
     shift: Float[Array, ""],
     penalty: Float[Array, " c"],
     reach: Float[Array, ""],
+    unit: Float[Array, ""],
 ) -> Factors:
     """Factors of the quadratic model.
 
@@ -135,42 +153,49 @@ def factored(
         shift: relative increase of the curvature in the coefficients.
         penalty: weight of the goal's squared residual in the model; changes no solution that reaches it.
         reach: eigenvalues of the goal's compliance below it count as zero, see `REACH`.
+        unit: of the cost.
     """
     goal, last = model.goal, model.last_excess
     size, count = model.forward.shape[1], goal.shape[0]
     P = model.last_hessian + last.T @ (bounds.end[:, None] * last) + goal.T @ (penalty[:, None] * goal)
-    begun = (_symmetric(P), goal.T, jnp.zeros((count, count), P.dtype), jnp.array(True))
+    begun = (_symmetric(P), goal.T, jnp.zeros((count, count), P.dtype), jnp.array(0))
     own = jnp.diagonal(model.hessian, axis1=1, axis2=2)[:, -idle.shape[1] :]
-    typical = jnp.maximum(jnp.max(jnp.abs(own)), 1e-12)
+    steep = model.excess[:, :, -idle.shape[1] :]
+    # Half of the coefficients are stiffer, by their cost and their bounds.
+    stiff = jnp.abs(own) + jnp.einsum("kh,khm->km", bounds.path, steep**2)
+    typical = jnp.median(jnp.where(idle > 0, jnp.max(stiff), stiff))
+    typical = jnp.maximum(jnp.where(typical > 0, typical, jnp.max(stiff)), 1e-12)
     added = shift * jnp.where(jnp.isfinite(typical), typical, 1.0)
 
     def backward(value: tuple, given: tuple) -> tuple[tuple, tuple]:
-        P, S, T, convex = value
+        P, S, T, negative = value
         forward, hessian, excess, weight, extra = given
         whole = _symmetric(hessian + forward.T @ P @ forward + excess.T @ (weight[:, None] * excess))
         mixed = forward.T @ S
-        softness, convex = _inverse(whole[size:, size:] + jnp.diag(extra), convex)
+        softness, negative = _inverse(whole[size:, size:] + jnp.diag(extra), negative)
         found = -softness @ jnp.concatenate([whole[size:, :size], mixed[size:]], axis=1)
         gain, by_goal = found[:, :size], found[:, size:]
         before = (
             _symmetric(whole[:size, :size] + whole[:size, size:] @ gain),
             mixed[:size] + whole[:size, size:] @ by_goal,
             T - mixed[size:].T @ by_goal,
-            convex,
+            negative,
         )
         return before, (softness, gain, by_goal)
 
     given = (model.forward, model.hessian, model.excess, bounds.path, idle + added)
     # Products of whole matrices: the library's are quicker than one kernel.
-    (P, S, T, convex), (softness, gain, by_goal) = jax.lax.scan(backward, begun, given, reverse=True)
+    (P, S, T, negative), (softness, gain, by_goal) = jax.lax.scan(backward, begun, given, reverse=True)
     E = model.first
     quadratic = _symmetric(E.T @ P @ E + model.first_hessian)
-    start_added = shift * (1.0 + jnp.abs(jnp.diagonal(quadratic)))
+    start_added = 0.01 * shift * (unit + jnp.abs(jnp.diagonal(quadratic)))
     stiffness = quadratic + jnp.diag(start_added)
-    start_softness, convex = _inverse(stiffness, convex)
+    start_softness, negative = _inverse(stiffness, negative)
     start_by_goal = -start_softness @ (E.T @ S)
     T = T - (E.T @ S).T @ start_by_goal
-    scale, vectors, inverse = _decomposed(T, reach)
+    scale, vectors, inverse = _decomposed(_symmetric(T), reach)
+    # Sylvester's law of inertia: what the curvature has negative, the goal has to forbid.
+    convex = negative == jnp.sum(inverse < 0)
     return Factors(
         model.forward,
         softness,
@@ -193,10 +218,10 @@ def _decomposed(T: Array, reach: Array) -> tuple[Array, Array, Array]:
     """Units, eigenvectors and inverse eigenvalues of the goal's compliance, without what is out of reach."""
     if not T.size:
         return T[0] if T.shape[0] else jnp.zeros(0, T.dtype), T, jnp.zeros(0, T.dtype)
-    scale = jnp.sqrt(jnp.maximum(jnp.diagonal(T), 1e-300))
+    scale = jnp.sqrt(jnp.maximum(jnp.abs(jnp.diagonal(T)), 1e-300))
     scale = jnp.where(scale > FELT * jnp.max(scale), 1.0 / scale, 0.0)
-    values, vectors = jnp.linalg.eigh(scale[:, None] * _symmetric(T) * scale)
-    reached = values > reach
+    values, vectors = jnp.linalg.eigh(scale[:, None] * T * scale)
+    reached = jnp.abs(values) > reach
     return scale, vectors, jnp.where(reached, 1.0 / jnp.where(reached, values, 1.0), 0.0)
 
 
@@ -204,13 +229,13 @@ def taken_back(factors: Factors, goal: Float[Array, " c"]) -> Float[Array, " c"]
     """Changes of the goal's multipliers that leave none to what cannot be changed: they have no say."""
     scale, vectors = factors.goal_scale, factors.goal_vectors
     present = vectors.T @ jnp.where(scale > 0, goal / jnp.where(scale > 0, scale, 1.0), 0.0)
-    return -scale * (vectors @ jnp.where(factors.goal_inverse > 0, 0.0, present))
+    return -scale * (vectors @ jnp.where(factors.goal_inverse != 0, 0.0, present))
 
 
 def out_of_reach(factors: Factors, missing: Float[Array, " c"]) -> Float[Array, " c"]:
     """The part of the goal's residual that nothing can change."""
     scale, vectors = factors.goal_scale, factors.goal_vectors
-    reached = jnp.where(factors.goal_inverse > 0, vectors.T @ (scale * missing), 0.0)
+    reached = jnp.where(factors.goal_inverse != 0, vectors.T @ (scale * missing), 0.0)
     return missing - jnp.where(scale > 0, (vectors @ reached) / jnp.where(scale > 0, scale, 1.0), 0.0)
 
 

@@ -13,9 +13,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 from natcoord_jax.control.costates import Multipliers
-from natcoord_jax.control.iterate import Derivatives, Iterate, Options, Slacks, largest
+from natcoord_jax.control.iterate import Derivatives, Filter, Iterate, Options, Slacks, largest
+from natcoord_jax.control.line_search import Found, at_barrier, first_filter, moved, remembered, room, search
 from natcoord_jax.control.linearisation import cost_unit, linearised
-from natcoord_jax.control.merit import Found, moved, room, search
 from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.control.proposal import Proposal, no_model, propose
 from natcoord_jax.control.results import Outcome
@@ -38,9 +38,10 @@ def _begun(problem: OptimalControl, options: Options, unknowns: Unknowns) -> tup
     path = roll(problem, unknowns)
     slacks = Slacks(jnp.maximum(-path.stages.excess, ROOM), jnp.maximum(-path.end.excess, ROOM))
     unit = cost_unit(problem, unknowns, path)
-    barrier = options.barrier * unit / max(1, slacks.path.size + slacks.end.size)
+    barrier = options.barrier * unit
     goal = jnp.zeros_like(path.end.missing)
-    multipliers = Multipliers(goal, barrier / slacks.path, barrier / slacks.end)
+    motion = jnp.zeros_like(unknowns.y) if options.lifted else None
+    multipliers = Multipliers(goal, barrier / slacks.path, barrier / slacks.end, motion)
     return (unknowns, multipliers, slacks, path, unit), (barrier, whole, newton)
 
 
@@ -56,12 +57,18 @@ def init(problem: OptimalControl, options: Options, unknowns: Unknowns) -> Itera
     begun, rest = _begun(problem, begin, unknowns)
     unknowns, multipliers, slacks, path, unit = begun
     derivatives = linearised(problem, unknowns, multipliers, slacks, path, unit)
-    return _first(begin, begun, derivatives, *rest)
+    return _first(problem, begin, begun, derivatives, *rest)
 
 
 @compiled
 def _first(
-    options: Options, begun: tuple, derivatives: Derivatives, barrier: Array, whole: Array, newton: Array
+    problem: OptimalControl,
+    options: Options,
+    begun: tuple,
+    derivatives: Derivatives,
+    barrier: Array,
+    whole: Array,
+    newton: Array,
 ) -> Iterate:
     """The first iterate; compiled, so that its constants are numbers also where derivatives are traced."""
     unknowns, multipliers, slacks, path, unit = begun
@@ -83,7 +90,7 @@ def _first(
         unit,
         nothing,
         goal,
-        (path, slacks),
+        first_filter(problem, unknowns, path, slacks, derivatives.jacobians.inverses),
         nothing,
         infinite,
         goal,
@@ -98,22 +105,27 @@ def _first(
 @compiled
 def tried(
     problem: OptimalControl, options: Options, iterate: Iterate, proposal: Proposal
-) -> tuple[Found, Multipliers]:
-    """The step as far as it makes the merit smaller, and the multipliers there."""
-    iterate = eqx.tree_at(lambda i: i.barrier, iterate, proposal.barrier)
-    found = search(problem, options, iterate, proposal.direction, proposal.slope, proposal.weights)
+) -> tuple[Found, Multipliers, Filter]:
+    """The step as far as the filter takes it, the multipliers there, and the filter after it."""
+    iterate = at_barrier(iterate, proposal.barrier)
+    found = search(problem, options, iterate, proposal.direction, proposal.slope)
     fine = found.fine & proposal.convex
     reached = (found.unknowns, found.slacks, found.path)
     stayed = (iterate.unknowns, iterate.slacks, iterate.path)
     reached = jax.tree.map(lambda x, x0: jnp.where(fine, x, x0), reached, stayed)
-    found = Found(found.length, reached[0], reached[1], reached[2], fine, found.newton)
+    unknowns, slacks, path = reached
+    found = Found(found.length, unknowns, slacks, path, fine, found.for_cost, found.newton)
     m, dm = iterate.multipliers, proposal.direction.multipliers
     dual = room([(m.path, dm.path), (m.end, dm.end)])
-    # Multipliers of the goal are those of the model, however short the step, even if there is none: without
-    # them the merit of the next attempt is misjudged as that of this one was.
-    goal = jnp.where(proposal.convex & jnp.all(jnp.isfinite(dm.goal)), m.goal + dm.goal, m.goal)
-    path, end = moved(m.path, dm.path, dual), moved(m.end, dm.end, dual)
-    return found, Multipliers(goal, jnp.where(fine, path, m.path), jnp.where(fine, end, m.end))
+    # Multipliers of equations go as far as the step does: those of a model that a short step shows to be a
+    # poor one would bend the next one more, and grow without end.
+    there = Multipliers(
+        moved(m.goal, dm.goal, found.length),
+        moved(m.path, dm.path, dual),
+        moved(m.end, dm.end, dual),
+        moved(m.motion, dm.motion, found.length),
+    )
+    return found, jax.tree.map(lambda x, x0: jnp.where(fine, x, x0), there, m), remembered(iterate, found)
 
 
 @compiled
@@ -123,6 +135,7 @@ def concluded(
     proposal: Proposal,
     found: Found,
     multipliers: Multipliers,
+    known: Filter,
     derivatives: Derivatives,
 ) -> Iterate:
     """The next iterate: the step, or the old one with a sign of failure."""
@@ -142,7 +155,7 @@ def concluded(
         iterate.unit,
         proposal.shift,
         proposal.penalty,
-        (iterate.path, iterate.slacks),
+        known,
         found.length,
         change,
         proposal.unreachable,
@@ -176,9 +189,9 @@ def step(problem: OptimalControl, options: Options, iterate: Iterate) -> Iterate
     # The large programs know nothing of tolerances, which may change without compiling them anew.
     form = Options(options.lifted)
     proposal = propose(problem, form, iterate)
-    found, multipliers = tried(problem, form, iterate, proposal)
+    found, multipliers, known = tried(problem, form, iterate, proposal)
     derivatives = linearised(problem, found.unknowns, multipliers, found.slacks, found.path, iterate.unit)
-    return concluded(options, iterate, proposal, found, multipliers, derivatives)
+    return concluded(options, iterate, proposal, found, multipliers, known, derivatives)
 
 
 def _undefined(path: Path, derivatives: Derivatives) -> Int[Array, ""]:

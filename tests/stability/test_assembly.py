@@ -215,7 +215,7 @@ def test_random_starts(name):
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param("slider_crank", marks=pytest.mark.slow),
+        pytest.param("slider_crank", marks=pytest.mark.exhaustive),
         pytest.param("gears", marks=pytest.mark.exhaustive),
     ],
 )

@@ -154,7 +154,7 @@ def test_laws_outlive_the_path(order):
     [
         pytest.param(10, marks=pytest.mark.slow),
         pytest.param(100, marks=pytest.mark.exhaustive),
-        pytest.param(2000, marks=pytest.mark.slow),
+        pytest.param(2000, marks=pytest.mark.exhaustive),
     ],
 )
 def test_gradients_of_a_chaotic_path(seconds):
