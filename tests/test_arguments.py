@@ -265,6 +265,7 @@ CALLS = {
         "problem": [w.problem], "plant": [w.system], "updates": WHOLE, "steps_each": WHOLE,
         "guess": [np.ones((2, 1))], "options": [Options()],
     },
+    "to_nlp": lambda w: {"problem": [w.problem], "guess": [np.ones((2, 1))]},
     "load_guess": lambda w: {"file": ["guess.json"], "steps": WHOLE},
     "inverse_dynamics": lambda w: {
         **RUN(w), "coordinates": [np.ones((1, 1))], "dt": [0.1], "joints": [(w.hinge,)]
@@ -300,8 +301,8 @@ CALLS = {
 # What calls return or hand over, and bases: nobody is to make these by hand.
 MADE = {
     "Accuracy", "Balance", "BeamHandle", "Check", "ComputedTorque", "DerivativeError", "Equilibrium",
-    "Feedback", "Frame", "Growth", "Load", "Modes", "Outcome", "Result", "SimulationError", "Solution",
-    "State", "System", "Trajectory",
+    "Feedback", "Frame", "Growth", "Load", "Modes", "NonlinearProgram", "Outcome", "Result", "SimulationError",
+    "Solution", "State", "System", "Trajectory",
 }  # fmt: skip
 BASES = {"Field", "Force", "Joint", "Potential"}
 IN_MODULES = {"cost": nc.cost, "goal": nc.goal, "bounds": nc.bounds, "inputs": nc.inputs}
