@@ -301,8 +301,8 @@ CALLS = {
 # What calls return or hand over, and bases: nobody is to make these by hand.
 MADE = {
     "Accuracy", "Balance", "BeamHandle", "Check", "ComputedTorque", "DerivativeError", "Equilibrium",
-    "Feedback", "Frame", "Growth", "Load", "Modes", "NonlinearProgram", "Outcome", "Result", "SimulationError",
-    "Solution", "State", "System", "Trajectory",
+    "Feedback", "Frame", "Growth", "Load", "Modes", "NonlinearProgram", "Outcome", "Result",
+    "SimulationError", "Solution", "State", "System", "Trajectory",
 }  # fmt: skip
 BASES = {"Field", "Force", "Joint", "Potential"}
 IN_MODULES = {"cost": nc.cost, "goal": nc.goal, "bounds": nc.bounds, "inputs": nc.inputs}

@@ -67,8 +67,8 @@ def to_nlp(problem: OptimalControl, guess: Any = None) -> NonlinearProgram:
     Example:
         >>> import jax; jax.config.update("jax_enable_x64", True)
         >>> import natcoord_jax as nc
-        >>> system, state = nc.gallery.build("reorientation")
-        >>> problem = nc.OptimalControl(system, state, dt=0.5, steps=4, cost=nc.cost.Effort())
+        >>> from natcoord_jax.gallery import manoeuvres
+        >>> problem = manoeuvres.beanie(4)
         >>> program = nc.to_nlp(problem)
         >>> program.jacobian(program.start).shape == (program.lower.size, program.start.size)
         True
