@@ -10,12 +10,13 @@ import optax
 import pytest
 
 import natcoord_jax as nc
-from natcoord_jax.control import conditions, proposal, sequential
+from natcoord_jax.control import conditions, line_search, proposal, sequential
 from natcoord_jax.control.costates import Multipliers
 from natcoord_jax.control.guess import unknowns_of
 from natcoord_jax.control.inputs import Spline
-from natcoord_jax.control.iterate import Options
+from natcoord_jax.control.iterate import Model, Options
 from natcoord_jax.control.problem import numeric
+from natcoord_jax.control.riccati import Right, Weighted, factored, solve
 from natcoord_jax.control.transcription import Unknowns, roll, simulated
 from natcoord_jax.gallery import manoeuvres
 
@@ -694,3 +695,75 @@ def test_least_time_of_a_swing_up_is_found_cold():
     )
     found = nc.optimise(problem, progress=False)
     assert found.ok and found.cost == pytest.approx(1.1456818, rel=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_inertia_is_that_of_the_whole_model(seed):
+    """A model counts as convex if it is so along changes that keep to the goal; it is solved exactly."""
+    rng = np.random.default_rng(seed)
+    steps, z, m, c, f, h = 4, 2, 2, 2, 1, 1
+    forward = rng.normal(size=(steps, z, z + m))
+    hessian = rng.normal(size=(steps, z + m, z + m)) + rng.uniform(0.0, 6.0) * np.eye(z + m)
+    hessian = hessian + hessian.transpose(0, 2, 1)
+    last = np.diag(rng.uniform(-1.0, 1.0, z))
+    goal, first = rng.normal(size=(c, z)), rng.normal(size=(z, f))
+    excess, last_excess = np.zeros((steps, h, z + m)), np.zeros((0, z))
+    numbers = (forward, hessian, excess, last, goal, last_excess, first, np.array([[rng.uniform(-1, 3)]]))
+    found = Model(*(jnp.asarray(x) for x in numbers))
+    none = jnp.zeros(0)
+    bounds = Weighted(jnp.zeros((steps, h)), jnp.zeros((steps, h)), none, none)
+    nothing = jnp.zeros(())
+    idle, penalty = jnp.zeros((steps, m)), jnp.zeros(c)
+    factors = jax.jit(factored)(found, bounds, idle, nothing, penalty, jnp.asarray(1e-12), jnp.ones(()))
+
+    # All changes x = (first, w): nodes z_k = Z_k x.
+    size = f + steps * m
+    node, matrix = np.concatenate([first, np.zeros((z, steps * m))], axis=1), np.zeros((size, size))
+    matrix[:f, :f] = numbers[-1]
+    for k in range(steps):
+        w = np.zeros((m, size))
+        w[:, f + k * m : f + (k + 1) * m] = np.eye(m)
+        both = np.concatenate([node, w])
+        matrix += both.T @ hessian[k] @ both
+        node = forward[k] @ both
+    matrix += node.T @ last @ node
+    kept = np.linalg.svd(goal @ node)[2][c:].T
+    convex = np.linalg.eigvalsh(kept.T @ matrix @ kept).min() > 0
+    assert bool(factors.convex) == convex
+
+    slope, missing = rng.normal(size=size), rng.normal(size=c)
+    gradient = np.zeros((steps, z + m))
+    gradient[:, z:] = slope[f:].reshape(steps, m)
+    right = Right(*(jnp.asarray(x) for x in (gradient, np.zeros(z), slope[:f], missing)))
+    move = jax.jit(solve)(factors, right)
+    whole = np.block([[matrix, (goal @ node).T], [goal @ node, np.zeros((c, c))]])
+    exact = np.linalg.solve(whole, -np.concatenate([slope, missing]))
+    found = np.concatenate([move.first, np.ravel(move.w), move.goal])
+    assert np.max(np.abs(found - exact)) <= 1e-8 * np.max(np.abs(exact))
+
+
+def test_a_motion_that_is_none_violates_its_equations():
+    """The cost may be a number all the same, such as a time: no step may lead there."""
+    problem = numeric(manoeuvres.two_masses(4, fastest=True))
+    start = unknowns_of(problem, None, True)
+    begun = sequential.init(problem, Options(lifted=True), start)
+    ill = roll(problem, eqx.tree_at(lambda u: u.y, start, jnp.full_like(start.y, jnp.nan)))
+    assert np.isfinite(ill.cost) and np.isnan(line_search.violation(begun.filter.units, ill, begun.slacks))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["shooting", "lifted"])
+def test_a_saddle_is_left_by_a_start_from_it(method):
+    """A turn by 120 degrees about a principal axis costs less off it; by a hinge, it costs least along it."""
+    scene, angle = nc.Scene(), np.radians(120)
+    disc = scene.add(nc.RigidBody(mass=1.0, inertia=(1.0, 2.0, 3.0), name="disc"))
+    hinge = scene.add(nc.Revolute(nc.ground, disc, name="hinge"))
+    scene.add(nc.JointTorque(hinge, name="motor"))
+    system, state = scene.compile()
+    goal = nc.goal.Coordinate(hinge, angle) & nc.goal.Rest()
+    hinged = nc.OptimalControl(system, state, dt=0.05, steps=20, cost=nc.cost.Effort(), goal=goal)
+    along = solved(hinged, method="shooting")
+    assert along.cost == pytest.approx(476.28, rel=1e-4)
+    free = manoeuvres.turn(20, axis=(0, 0, 1), angle=angle)
+    found = solved(free, np.asarray(along.inputs) * np.array([0.0, 0.0, 1.0]), method=method)
+    assert found.cost == pytest.approx(469.71, rel=1e-4)

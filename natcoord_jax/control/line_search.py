@@ -37,7 +37,7 @@ CLOSED = 1e-12
 
 
 class Direction(eqx.Module):
-    """Directions of everything, and the slopes of cost along them."""
+    """Directions of everything."""
 
     unknowns: Unknowns
     multipliers: Multipliers
@@ -59,18 +59,20 @@ def moved(x: Any, dx: Any, a: Array) -> Any:
     return jax.tree.map(lambda x, dx: x + a * dx, x, dx)
 
 
-def _violation(units: Array, path: Path, slacks: Slacks) -> Array:
+def violation(units: Array, path: Path, slacks: Slacks) -> Array:
+    """Sum of what all constraints leave, the equations of steps in their units."""
     gap, last = path.stages.excess + slacks.path, path.end.excess + slacks.end
     parts = (units * path.stages.residual, path.end.missing, gap, last)
     found = sum((jnp.sum(jnp.abs(part)) for part in parts), jnp.zeros(()))
-    return jnp.where(found > CLOSED, found, 0.0)
+    # What is no number stays none.
+    return jnp.where(found <= CLOSED, 0.0, found)
 
 
 def _measured(iterate: Iterate, path: Path, slacks: Slacks) -> tuple[Array, Array]:
     """Violation of all constraints, and barrier cost in units of the cost."""
     logarithms = jnp.sum(jnp.log(slacks.path)) + jnp.sum(jnp.log(slacks.end))
     cost = (path.cost - iterate.barrier * logarithms) / iterate.unit
-    return _violation(iterate.filter.units, path, slacks), cost
+    return violation(iterate.filter.units, path, slacks), cost
 
 
 def first_filter(
@@ -80,7 +82,7 @@ def first_filter(
     rates = inverses[:, : problem.system.structure.unknowns]
     _, dt = problem.applied(unknowns.free)
     units = dt * jnp.max(jnp.abs(rates), axis=(0, 1))
-    size = jnp.maximum(1.0, _violation(units, path, slacks))
+    size = jnp.maximum(1.0, violation(units, path, slacks))
     nothing = jnp.full(MEMORY, jnp.inf, float)
     return Filter(nothing, nothing, jnp.array(0), units, SMALL * size, LARGE * size)
 
@@ -134,7 +136,7 @@ def search(
     """
     s, ds = iterate.slacks, direction.slacks
     longest = room([(s.path, ds.path), (s.end, ds.end)])
-    violation, cost = _measured(iterate, iterate.path, s)
+    left, cost = _measured(iterate, iterate.path, s)
     known, slope = iterate.filter, slope / iterate.unit
     noise = ROUND_OFF * (1.0 + jnp.abs(cost))
 
@@ -147,13 +149,11 @@ def search(
         violated, costs = _measured(iterate, path, slacks)
         gain = -a * slope
         promising = (gain > 0) & (
-            jnp.maximum(gain, 0.0) ** SLOPE_POWER * a ** (1.0 - SLOPE_POWER) > violation**VIOLATION_POWER
+            jnp.maximum(gain, 0.0) ** SLOPE_POWER * a ** (1.0 - SLOPE_POWER) > left**VIOLATION_POWER
         )
-        for_cost = promising & (violation <= known.least)
+        for_cost = promising & (left <= known.least)
         lower = costs <= cost - ARMIJO * gain + noise
-        either = (violated <= (1.0 - LESS_VIOLATION) * violation) | (
-            costs <= cost - LESS_COST * violation + noise
-        )
+        either = (violated <= (1.0 - LESS_VIOLATION) * left) | (costs <= cost - LESS_COST * left + noise)
         new = jnp.all((violated <= known.violations) | (costs <= known.costs + noise))
         taken = jnp.where(for_cost, lower, either) & new & (violated <= known.largest)
         finite = whole & jnp.isfinite(violated) & jnp.isfinite(costs)
@@ -174,9 +174,9 @@ def search(
 def remembered(iterate: Iterate, found: Found) -> Filter:
     """The filter after a step: one that was not for the cost leaves its start behind, for good."""
     known = iterate.filter
-    violation, cost = _measured(iterate, iterate.path, iterate.slacks)
+    left, cost = _measured(iterate, iterate.path, iterate.slacks)
     place = known.count % known.costs.shape[0]
-    pair = ((1.0 - LESS_VIOLATION) * violation, cost - LESS_COST * violation)
+    pair = ((1.0 - LESS_VIOLATION) * left, cost - LESS_COST * left)
     kept = found.fine & ~found.for_cost
     violations = jnp.where(kept, known.violations.at[place].set(pair[0]), known.violations)
     costs = jnp.where(kept, known.costs.at[place].set(pair[1]), known.costs)

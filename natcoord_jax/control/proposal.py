@@ -67,8 +67,8 @@ def _weighted(iterate: Iterate) -> Weighted:
     return Weighted(path, mu / s.path - m.path + path * gap, end, mu / s.end - m.end + end * last)
 
 
-def _convex(problem: OptimalControl, iterate: Iterate, found: Model) -> tuple[Factors, Array, Array]:
-    """Factors of the model, its curvature increased until it is convex, its shift, and the goal's weight."""
+def _convex(problem: OptimalControl, iterate: Iterate, found: Model) -> tuple[Factors, Array]:
+    """Factors of the model, its curvature increased until it is convex, and its shift."""
     bounds = _weighted(iterate)
     idle = (jnp.arange(problem.steps) % problem.inputs.every != 0).astype(float)
     idle = jnp.broadcast_to(idle[:, None], (problem.steps, problem.channels))
@@ -97,7 +97,7 @@ def _convex(problem: OptimalControl, iterate: Iterate, found: Model) -> tuple[Fa
 
     attempt, nothing = traced_once(attempt, least)
     factors, shift, _ = jax.lax.while_loop(unfinished, body, (nothing, least, jnp.array(False)))
-    return factors, shift, iterate.penalty
+    return factors, shift
 
 
 def _penalty(iterate: Iterate, factors: Factors) -> Array:
@@ -167,7 +167,6 @@ class Attempt(NamedTuple):
         kept: how many steps it has served before this one.
         factors: of the model.
         shift: of its curvature.
-        penalty: weight of the goal's square in it.
         better: the step.
     """
 
@@ -175,7 +174,6 @@ class Attempt(NamedTuple):
     kept: Array
     factors: Factors
     shift: Array
-    penalty: Array
     better: Improved
 
 
@@ -191,9 +189,9 @@ def _attempt(problem: OptimalControl, iterate: Iterate) -> Attempt:
 
     def made(fresh: Array) -> Attempt:
         found = jax.lax.cond(fresh, formed, lambda: iterate.model)
-        factors, shift, penalty = _convex(problem, iterate, found)
-        better = improved(problem, iterate, found, factors, _weighted(iterate), penalty)
-        return Attempt(found, jnp.where(fresh, 0, iterate.kept + 1), factors, shift, penalty, better)
+        factors, shift = _convex(problem, iterate, found)
+        better = improved(problem, iterate, found, factors, _weighted(iterate), iterate.penalty)
+        return Attempt(found, jnp.where(fresh, 0, iterate.kept + 1), factors, shift, better)
 
     def unserved(carry: tuple[Array, Attempt]) -> Array:
         turn, last = carry
@@ -204,6 +202,8 @@ def _attempt(problem: OptimalControl, iterate: Iterate) -> Attempt:
         turn = carry[0]
         # A model that was not convex would need its shift again, which a new one may not.
         near = (iterate.step >= 1.0) & (iterate.moved < NEAR) & (iterate.shift < SHIFT)
+        # The first one knows no multipliers, and bends as little at a saddle as at a minimum.
+        near = near & (iterate.iteration > 1)
         return turn + 1, made(~near | (iterate.failures > 0) | (iterate.corrections > FEW) | (turn > 0))
 
     made, nothing = traced_once(made, jnp.array(True))
@@ -244,7 +244,7 @@ def softest(problem: OptimalControl, iterate: Iterate) -> tuple[Array, Change, A
         largest curvature in a coefficient.
     """
     found = model(problem, iterate.path, iterate.unknowns, iterate.multipliers, iterate.derivatives)
-    factors, _, _ = _convex(problem, iterate, found)
+    factors, _ = _convex(problem, iterate, found)
     along, bounds = least_curved(problem, iterate, factors, MANY), _weighted(iterate)
     length = jnp.sqrt(jnp.sum(along.w**2) + jnp.sum(along.first**2))
     along = jax.tree.map(lambda x: x / jnp.where(length > 0, length, 1.0), along)

@@ -19,9 +19,7 @@ from natcoord_jax.stepping.one_kernel import scan_in_one_kernel
 
 REACH = (1e-8, 1e-3)
 """Eigenvalues of the goal's compliance below this fraction of the largest count as zero: of a motion that
-obeys its equations, and of one that does not by far."""
-
-
+obeys its equations, and, after a step that failed, of one that does not by far."""
 SINGULAR = 1e-12
 """Pivots below this part of the diagonal are none."""
 TOO_MANY = 1_000_000
@@ -161,9 +159,9 @@ def factored(
     begun = (_symmetric(P), goal.T, jnp.zeros((count, count), P.dtype), jnp.array(0))
     own = jnp.diagonal(model.hessian, axis1=1, axis2=2)[:, -idle.shape[1] :]
     steep = model.excess[:, :, -idle.shape[1] :]
-    # Half of the coefficients are stiffer, by their cost and their bounds.
+    # Half of the coefficients that enter are stiffer, by their cost and their bounds.
     stiff = jnp.abs(own) + jnp.einsum("kh,khm->km", bounds.path, steep**2)
-    typical = jnp.median(jnp.where(idle > 0, jnp.max(stiff), stiff))
+    typical = jnp.nanmedian(jnp.where(idle > 0, jnp.nan, stiff))
     typical = jnp.maximum(jnp.where(typical > 0, typical, jnp.max(stiff)), 1e-12)
     added = shift * jnp.where(jnp.isfinite(typical), typical, 1.0)
 
@@ -188,7 +186,7 @@ def factored(
     (P, S, T, negative), (softness, gain, by_goal) = jax.lax.scan(backward, begun, given, reverse=True)
     E = model.first
     quadratic = _symmetric(E.T @ P @ E + model.first_hessian)
-    start_added = 0.01 * shift * (unit + jnp.abs(jnp.diagonal(quadratic)))
+    start_added = shift * (unit + jnp.abs(jnp.diagonal(quadratic)))
     stiffness = quadratic + jnp.diag(start_added)
     start_softness, negative = _inverse(stiffness, negative)
     start_by_goal = -start_softness @ (E.T @ S)

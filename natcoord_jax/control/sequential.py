@@ -206,8 +206,9 @@ def _judged(options: Options, it: Iterate) -> Int[Array, ""]:
     e = it.errors
     fulfilled = (e.goal <= options.goal_tol) & (e.bounds <= options.goal_tol) & (e.motion <= options.goal_tol)
     optimal = fulfilled & (e.stationarity <= options.tol) & (e.complementarity <= options.tol)
-    # What is stationary where curvature is negative is a saddle, and left.
-    optimal = optimal & ~it.saddle
+    # What is stationary where curvature is negative is a saddle, and left. That of the first step knows no
+    # multipliers, and tells none from a minimum.
+    optimal = optimal & ~it.saddle & (it.iteration > 1)
     finite = jnp.isfinite(e.stationarity) & jnp.isfinite(e.goal)
     resting = (it.moved < AT_REST) | (it.failures >= 3)
     # What is out of reach is known only where the motion obeys its equations.
