@@ -67,14 +67,11 @@ def _weighted(iterate: Iterate) -> Weighted:
     return Weighted(path, mu / s.path - m.path + path * gap, end, mu / s.end - m.end + end * last)
 
 
-def _convex(problem: OptimalControl, iterate: Iterate, found: Model) -> tuple[Factors, Array]:
+def _convex(problem: OptimalControl, iterate: Iterate, found: Model, reach: Array) -> tuple[Factors, Array]:
     """Factors of the model, its curvature increased until it is convex, and its shift."""
     bounds = _weighted(iterate)
     idle = (jnp.arange(problem.steps) % problem.inputs.every != 0).astype(float)
     idle = jnp.broadcast_to(idle[:, None], (problem.steps, problem.channels))
-    # Conditions that depend on each other along motions only, by conserved momenta, are told from those that
-    # inputs reach with difficulty by trying the latter first.
-    reach = jnp.where(iterate.failures > 0, jnp.clip(30.0 * iterate.errors.motion, *REACH), REACH[0])
 
     def attempt(shift: Array) -> Factors:
         return factored(found, bounds, idle, shift, iterate.penalty, reach, iterate.unit)
@@ -167,6 +164,7 @@ class Attempt(NamedTuple):
         kept: how many steps it has served before this one.
         factors: of the model.
         shift: of its curvature.
+        reach: eigenvalues of the goal's compliance that count as zero.
         better: the step.
     """
 
@@ -174,6 +172,7 @@ class Attempt(NamedTuple):
     kept: Array
     factors: Factors
     shift: Array
+    reach: Array
     better: Improved
 
 
@@ -187,26 +186,33 @@ def _attempt(problem: OptimalControl, iterate: Iterate) -> Attempt:
     def formed() -> Model:
         return model(problem, iterate.path, iterate.unknowns, iterate.multipliers, iterate.derivatives)
 
-    def made(fresh: Array) -> Attempt:
+    def made(fresh: Array, reach: Array) -> Attempt:
         found = jax.lax.cond(fresh, formed, lambda: iterate.model)
-        factors, shift = _convex(problem, iterate, found)
+        factors, shift = _convex(problem, iterate, found, reach)
         better = improved(problem, iterate, found, factors, _weighted(iterate), iterate.penalty)
-        return Attempt(found, jnp.where(fresh, 0, iterate.kept + 1), factors, shift, better)
+        return Attempt(found, jnp.where(fresh, 0, iterate.kept + 1), factors, shift, reach, better)
+
+    def left_out(last: Attempt) -> Array:
+        # Conditions that depend on each other along motions only, by conserved momenta, are nearly fulfilled
+        # by a step that leaves them out. It makes worse those that inputs only reach with difficulty.
+        return (last.reach > REACH[0]) & (largest(last.better.unreachable) > iterate.errors.goal)
 
     def unserved(carry: tuple[Array, Attempt]) -> Array:
         turn, last = carry
         poor = ~(last.better.there & last.factors.convex)
-        return (turn == 0) | ((turn == 1) & (last.kept > 0) & poor)
+        return (turn == 0) | ((turn == 1) & (last.kept > 0) & poor) | left_out(last)
 
     def body(carry: tuple[Array, Attempt]) -> tuple[Array, Attempt]:
-        turn = carry[0]
+        turn, last = carry
         # A model that was not convex would need its shift again, which a new one may not.
         near = (iterate.step >= 1.0) & (iterate.moved < NEAR) & (iterate.shift < SHIFT)
         # The first one knows no multipliers, and bends as little at a saddle as at a minimum.
         near = near & (iterate.iteration > 1)
-        return turn + 1, made(~near | (iterate.failures > 0) | (iterate.corrections > FEW) | (turn > 0))
+        fresh = ~near | (iterate.failures > 0) | (iterate.corrections > FEW) | (turn > 0)
+        reach = jnp.where(left_out(last), REACH[0], jnp.clip(30.0 * iterate.errors.motion, *REACH))
+        return turn + 1, made(fresh, reach)
 
-    made, nothing = traced_once(made, jnp.array(True))
+    made, nothing = traced_once(made, jnp.array(True), jnp.asarray(REACH[0]))
     return jax.lax.while_loop(unserved, body, (jnp.array(0), nothing))[1]
 
 
@@ -244,7 +250,7 @@ def softest(problem: OptimalControl, iterate: Iterate) -> tuple[Array, Change, A
         largest curvature in a coefficient.
     """
     found = model(problem, iterate.path, iterate.unknowns, iterate.multipliers, iterate.derivatives)
-    factors, _ = _convex(problem, iterate, found)
+    factors, _ = _convex(problem, iterate, found, jnp.clip(30.0 * iterate.errors.motion, *REACH))
     along, bounds = least_curved(problem, iterate, factors, MANY), _weighted(iterate)
     length = jnp.sqrt(jnp.sum(along.w**2) + jnp.sum(along.first**2))
     along = jax.tree.map(lambda x: x / jnp.where(length > 0, length, 1.0), along)

@@ -19,7 +19,7 @@ from natcoord_jax.stepping.one_kernel import scan_in_one_kernel
 
 REACH = (1e-8, 1e-3)
 """Eigenvalues of the goal's compliance below this fraction of the largest count as zero: of a motion that
-obeys its equations, and, after a step that failed, of one that does not by far."""
+obeys its equations, and of one that does not by far."""
 SINGULAR = 1e-12
 """Pivots below this part of the diagonal are none."""
 TOO_MANY = 1_000_000
