@@ -143,7 +143,7 @@ def _lowered(iterate: Iterate) -> Array:
     central = largest(s.path * m.path - mu, s.end * m.end - mu) / unit
     missing = jnp.maximum(jnp.maximum(e.stationarity, central), jnp.maximum(e.bounds, e.goal))
     lower = unit * jnp.maximum(LEAST_BARRIER, jnp.minimum(0.2 * relative, relative**1.5))
-    return jnp.where(missing < jnp.minimum(10.0 * relative, 0.5), jnp.minimum(lower, mu), mu)
+    return jnp.where(missing < 10.0 * relative, jnp.minimum(lower, mu), mu)
 
 
 def no_model(derivatives: Derivatives, multipliers: Multipliers) -> Model:
