@@ -249,6 +249,10 @@ CALLS = {
         "rates": NUMBER,
         "seed": [0], **SOLVED,
     },
+    "continuation": lambda w: {
+        "problem": [w.problem], "path": [lambda problem, s: problem], "guess": [np.ones((2, 1))],
+        "first": NUMBER, "least": NUMBER, "progress": FLAG, "time_limit": NUMBER, **SOLVED,
+    },
     "descend": lambda w: {
         "problem": [w.problem], "guess": [np.ones((2, 1))], "optimiser": [optax.sgd(0.1)],
         "iterations": WHOLE,
@@ -300,9 +304,9 @@ CALLS = {
 
 # What calls return or hand over, and bases: nobody is to make these by hand.
 MADE = {
-    "Accuracy", "Balance", "BeamHandle", "Check", "ComputedTorque", "DerivativeError", "Equilibrium",
-    "Feedback", "Frame", "Growth", "Load", "Modes", "NonlinearProgram", "Outcome", "Result",
-    "SimulationError", "Solution", "State", "System", "Trajectory",
+    "Accuracy", "Balance", "BeamHandle", "Check", "ComputedTorque", "Continuation", "DerivativeError",
+    "Equilibrium", "Feedback", "Frame", "Growth", "Load", "Modes", "NonlinearProgram", "Optima", "Outcome",
+    "Result", "SimulationError", "Solution", "State", "System", "Trajectory",
 }  # fmt: skip
 BASES = {"Field", "Force", "Joint", "Potential"}
 IN_MODULES = {"cost": nc.cost, "goal": nc.goal, "bounds": nc.bounds, "inputs": nc.inputs}

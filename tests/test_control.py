@@ -713,13 +713,17 @@ def test_inertia_is_that_of_the_whole_model(seed):
     none = jnp.zeros(0)
     bounds = Weighted(jnp.zeros((steps, h)), jnp.zeros((steps, h)), none, none)
     nothing = jnp.zeros(())
-    idle, penalty = jnp.zeros((steps, m)), jnp.zeros(c)
-    factors = jax.jit(factored)(found, bounds, idle, nothing, penalty, jnp.asarray(1e-12), jnp.ones(()))
+    idle, penalty, held = jnp.zeros((steps, m)), jnp.zeros(c), rng.uniform(0.0, 1.0)
+    # Every other one has a goal that may be missed.
+    soft = (seed % 2) * rng.uniform(0.1, 1.0, c)
+    reach, one = jnp.asarray(1e-12), jnp.ones(())
+    given = (found, bounds, idle, nothing, penalty, jnp.asarray(soft), reach, one, jnp.asarray(held))
+    factors = jax.jit(factored)(*given)
 
     # All changes x = (first, w): nodes z_k = Z_k x.
     size = f + steps * m
     node, matrix = np.concatenate([first, np.zeros((z, steps * m))], axis=1), np.zeros((size, size))
-    matrix[:f, :f] = numbers[-1]
+    matrix[:f, :f] = numbers[-1] + held
     for k in range(steps):
         w = np.zeros((m, size))
         w[:, f + k * m : f + (k + 1) * m] = np.eye(m)
@@ -727,8 +731,10 @@ def test_inertia_is_that_of_the_whole_model(seed):
         matrix += both.T @ hessian[k] @ both
         node = forward[k] @ both
     matrix += node.T @ last @ node
-    kept = np.linalg.svd(goal @ node)[2][c:].T
-    convex = np.linalg.eigvalsh(kept.T @ matrix @ kept).min() > 0
+    kept, curved = np.linalg.svd(goal @ node)[2][c:].T, matrix
+    if soft.all():
+        kept, curved = np.eye(size), matrix + node.T @ goal.T @ np.diag(1.0 / soft) @ goal @ node
+    convex = np.linalg.eigvalsh(kept.T @ curved @ kept).min() > 0
     assert bool(factors.convex) == convex
 
     slope, missing = rng.normal(size=size), rng.normal(size=c)
@@ -736,7 +742,7 @@ def test_inertia_is_that_of_the_whole_model(seed):
     gradient[:, z:] = slope[f:].reshape(steps, m)
     right = Right(*(jnp.asarray(x) for x in (gradient, np.zeros(z), slope[:f], missing)))
     move = jax.jit(solve)(factors, right)
-    whole = np.block([[matrix, (goal @ node).T], [goal @ node, np.zeros((c, c))]])
+    whole = np.block([[matrix, (goal @ node).T], [goal @ node, -np.diag(soft)]])
     exact = np.linalg.solve(whole, -np.concatenate([slope, missing]))
     found = np.concatenate([move.first, np.ravel(move.w), move.goal])
     assert np.max(np.abs(found - exact)) <= 1e-8 * np.max(np.abs(exact))
@@ -748,7 +754,8 @@ def test_a_motion_that_is_none_violates_its_equations():
     start = unknowns_of(problem, None, True)
     begun = sequential.init(problem, Options(lifted=True), start)
     ill = roll(problem, eqx.tree_at(lambda u: u.y, start, jnp.full_like(start.y, jnp.nan)))
-    assert np.isfinite(ill.cost) and np.isnan(line_search.violation(begun.filter.units, ill, begun.slacks))
+    units, soft = begun.filter.units, begun.softness
+    assert np.isfinite(ill.cost) and np.isnan(line_search.violation(units, soft, ill, begun.slacks))
 
 
 @pytest.mark.slow

@@ -19,9 +19,12 @@ from natcoord_jax.control.nlp import to_nlp as to_nlp
 from natcoord_jax.control.parameter import Parameter as Parameter
 from natcoord_jax.control.problem import OptimalControl as OptimalControl
 from natcoord_jax.control.results import Outcome as Outcome
-from natcoord_jax.control.run import multi_start as multi_start
 from natcoord_jax.control.run import optimise as optimise
 from natcoord_jax.control.run import optimise_jit as optimise_jit
 from natcoord_jax.control.sensitivity import optimum as optimum
+from natcoord_jax.control.several import Continuation as Continuation
+from natcoord_jax.control.several import Optima as Optima
+from natcoord_jax.control.several import continuation as continuation
+from natcoord_jax.control.several import multi_start as multi_start
 from natcoord_jax.control.solution import Solution as Solution
 from natcoord_jax.control.solution import load_guess as load_guess

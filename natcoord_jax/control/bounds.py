@@ -39,6 +39,10 @@ class Bound(Part):
         """Name of each bound."""
         return ()
 
+    def widened(self, factor: Any) -> "Bound":
+        """The same with the limits of inputs so many times as wide; itself if it has none."""
+        return self
+
     def __and__(self, other: "Bound") -> "Bound":
         if not isinstance(other, Bound):
             return NotImplemented
@@ -57,6 +61,11 @@ class All(Bound):
     def labels(self, system: System) -> tuple[str, ...]:
         """Labels of all parts."""
         return tuple(label for part in self.parts for label in part.labels(system))
+
+    def widened(self, factor: Any) -> Bound:
+        """The same with the limits of inputs so many times as wide; itself if it has none."""
+        parts = tuple(part.widened(factor) for part in self.parts)
+        return self if all(a is b for a, b in zip(parts, self.parts)) else All(parts)
 
 
 def _parts(bound: Bound) -> tuple[Bound, ...]:
@@ -147,6 +156,13 @@ class Input(Range):
         """Names of the channels."""
         channels = system.structure.inputs if self.channel is None else (_name(self.channel),)
         return tuple(f"input {name!r}" for name in channels)
+
+    def widened(self, factor: Any) -> Bound:
+        """The same with limits so many times as wide, about their middle."""
+        both = jnp.isfinite(self.lower) & jnp.isfinite(self.upper)
+        middle = jnp.where(both, 0.5 * (self.lower + self.upper), 0.0)
+        sides = tuple(middle + factor * (x - middle) for x in (self.lower, self.upper))
+        return eqx.tree_at(lambda b: (b.lower, b.upper), self, sides)
 
 
 class Coordinate(Range):

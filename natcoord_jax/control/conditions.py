@@ -212,7 +212,7 @@ def left_of_conditions(
     enters = (jnp.arange(problem.steps) % problem.inputs.every == 0)[:, None]
     w = jnp.where(enters, level * derivatives.by_w + w + added[0] * change.w, 0.0)
     first = level * derivatives.by_first + first + added[1] * change.first
-    missing = level * iterate.path.end.missing + sweep.missing
+    missing = level * iterate.path.end.missing + sweep.missing - iterate.softness * change.goal
     path = change.path - level * bounds.path_slope - bounds.path * sweep.excess
     last = change.end - level * bounds.end_slope - bounds.end * sweep.end_excess
     return Change(first, w, missing, path, last), sweep
@@ -368,5 +368,5 @@ def improved(
     )
     reached = conjugate_residuals(apply, soft, look, start, shapes, weights, enough, CORRECTIONS)
     sweep, saddle = reached.more[0], look & (bent(reached.found) < 0)
-    unreachable = out_of_reach(factors, missing + sweep.missing)
+    unreachable = jnp.where(iterate.softness > 0, 0.0, out_of_reach(factors, missing + sweep.missing))
     return Improved(reached.solution, sweep, unreachable, saddle, reached.there, reached.count)

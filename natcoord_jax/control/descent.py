@@ -12,11 +12,11 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
+from natcoord_jax.control.attempts import HEADER, printed
 from natcoord_jax.control.guess import GUESS, unknowns_of
 from natcoord_jax.control.iterate import largest
 from natcoord_jax.control.problem import PROBLEM, OptimalControl, numeric
 from natcoord_jax.control.results import Outcome
-from natcoord_jax.control.run import HEADER, printed
 from natcoord_jax.control.solution import Row, Solution
 from natcoord_jax.control.transcription import Unknowns, end, first_node, held_inputs, packed
 from natcoord_jax.core.arguments import checked

@@ -12,13 +12,13 @@ from natcoord_jax.control.guess import GUESS, unknowns_of
 from natcoord_jax.control.iterate import Iterate, Options
 from natcoord_jax.control.problem import PROBLEM, OptimalControl, numeric
 from natcoord_jax.control.quadratic import model
-from natcoord_jax.control.run import OPTIONS, WEIGHTS, optimise_jit
+from natcoord_jax.control.run import OPTIONS, optimise_jit
 from natcoord_jax.control.solution import SOLUTION, Solution
 from natcoord_jax.control.transcription import held_inputs, packed
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.compiled import compiled
 from natcoord_jax.core.kinds import Several
-from natcoord_jax.core.numeric import Number, Numbers, Whole
+from natcoord_jax.core.numeric import Number, Numbers, Vector, Whole
 from natcoord_jax.core.state import State, Trajectory
 from natcoord_jax.stepping.simulate import simulate
 
@@ -78,9 +78,9 @@ def _gains(problem: OptimalControl, iterate: Iterate, weights: tuple) -> tuple[A
 
 @checked(
     solution=SOLUTION,
-    displacement=WEIGHTS,
-    rate=WEIGHTS,
-    effort=WEIGHTS,
+    displacement=Number("not negative") | Vector(None),
+    rate=Number("not negative") | Vector(None),
+    effort=Number("not negative") | Vector(None),
     final=Number("not negative"),
     limits=Several(Number(infinite=True) | Numbers((None,), infinite=True), 2),
 )

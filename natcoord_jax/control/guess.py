@@ -18,6 +18,8 @@ from natcoord_jax.core.numeric import Numbers, Vector
 
 ROUNDS = 12
 """Gauss-Newton corrections of the constant rates that lead to the goal."""
+LEAST_SCALE = 0.1
+"""Least scale of a condition of the goal, relative to the largest."""
 LONGEST = 2.0
 """Largest turn of a body in one step of a guess [rad]."""
 
@@ -163,3 +165,38 @@ def scattered(problem: OptimalControl, unknowns: Unknowns, key: Array, spread: A
     coefficients = unknowns.coefficients + problem.inputs.fitted(inputs)
     y = unknowns.y.at[:, :count].add(changes)
     return Unknowns(coefficients, unknowns.free, y)
+
+
+@compiled
+def goal_scale(problem: OptimalControl, unknowns: Unknowns) -> Float[Array, " c"]:
+    """What the goal's residual amounts to along a motion, for each of its conditions.
+
+    Those that hold all along, as that another body rests, get a part of the largest.
+    """
+    nodes = roll(problem, unknowns).nodes
+    missing = jax.vmap(lambda node: end(problem, node).missing)(nodes)
+    sizes = jnp.max(jnp.abs(missing), axis=0)
+    return jnp.maximum(sizes, LEAST_SCALE * jnp.max(sizes, initial=0.0))
+
+
+def input_ranges(problem: OptimalControl, unknowns: Unknowns) -> Float[Array, " m"]:
+    """Half the ranges of the inputs; for those without limits, the largest input of the guess, or 1."""
+    system, state = problem.system, problem.start(unknowns.free)
+    idle = jnp.zeros(problem.channels)
+    steep = jax.jacfwd(lambda u: problem.bounds.excess(system, state, u, state.t))(idle)
+    steepest = jnp.max(jnp.abs(steep), axis=0, initial=0.0)
+    largest = jnp.max(jnp.abs(unknowns.coefficients))
+    usual = jnp.where(largest > 0, largest, 1.0)
+    return jnp.where(steepest > 0, 1.0 / jnp.where(steepest > 0, steepest, 1.0), usual)
+
+
+def slower(problem: OptimalControl, unknowns: Unknowns, factor: float) -> Unknowns:
+    """The same with a longer final time, within its limits, where that is free."""
+    if not problem.free_time:
+        return unknowns
+    reference, scale = problem.references()
+    longer = factor * problem.values(unknowns.free)[0]
+    longer = jnp.clip(longer, *(x[0] for x in problem.limits()))
+    return eqx.tree_at(
+        lambda u: u.free, unknowns, unknowns.free.at[0].set((longer - reference[0]) / scale[0])
+    )

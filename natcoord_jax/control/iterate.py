@@ -138,6 +138,7 @@ class Iterate(eqx.Module):
         unit: of the cost.
         shift: last increase of the curvature.
         penalty: weight of the goal's square in the model.
+        softness: of the goal: missing it by x costs x^2 / (2 softness); zero where it is to be reached.
         filter: what the search for a step remembers.
         step: length of the last step.
         moved: size of the last step, relative.
@@ -161,6 +162,7 @@ class Iterate(eqx.Module):
     unit: Float[Array, "*batch"]
     shift: Float[Array, "*batch"]
     penalty: Float[Array, "*batch c"]
+    softness: Float[Array, "*batch c"]
     filter: Filter
     step: Float[Array, "*batch"]
     moved: Float[Array, "*batch"]

@@ -59,10 +59,16 @@ def moved(x: Any, dx: Any, a: Array) -> Any:
     return jax.tree.map(lambda x, dx: x + a * dx, x, dx)
 
 
-def violation(units: Array, path: Path, slacks: Slacks) -> Array:
+def missed(softness: Array, missing: Array) -> Array:
+    """Multipliers of a soft goal: what missing it costs, by what is missing."""
+    return jnp.where(softness > 0, missing / jnp.where(softness > 0, softness, 1.0), 0.0)
+
+
+def violation(units: Array, softness: Array, path: Path, slacks: Slacks) -> Array:
     """Sum of what all constraints leave, the equations of steps in their units."""
     gap, last = path.stages.excess + slacks.path, path.end.excess + slacks.end
-    parts = (units * path.stages.residual, path.end.missing, gap, last)
+    missing = jnp.where(softness > 0, 0.0, path.end.missing)
+    parts = (units * path.stages.residual, missing, gap, last)
     found = sum((jnp.sum(jnp.abs(part)) for part in parts), jnp.zeros(()))
     # What is no number stays none.
     return jnp.where(found <= CLOSED, 0.0, found)
@@ -71,18 +77,24 @@ def violation(units: Array, path: Path, slacks: Slacks) -> Array:
 def _measured(iterate: Iterate, path: Path, slacks: Slacks) -> tuple[Array, Array]:
     """Violation of all constraints, and barrier cost in units of the cost."""
     logarithms = jnp.sum(jnp.log(slacks.path)) + jnp.sum(jnp.log(slacks.end))
-    cost = (path.cost - iterate.barrier * logarithms) / iterate.unit
-    return violation(iterate.filter.units, path, slacks), cost
+    soft = 0.5 * missed(iterate.softness, path.end.missing) @ path.end.missing
+    cost = (path.cost + soft - iterate.barrier * logarithms) / iterate.unit
+    return violation(iterate.filter.units, iterate.softness, path, slacks), cost
 
 
 def first_filter(
-    problem: OptimalControl, unknowns: Unknowns, path: Path, slacks: Slacks, inverses: Array
+    problem: OptimalControl,
+    unknowns: Unknowns,
+    softness: Array,
+    path: Path,
+    slacks: Slacks,
+    inverses: Array,
 ) -> Filter:
     """A filter that knows nothing but what the first iterate violates."""
     rates = inverses[:, : problem.system.structure.unknowns]
     _, dt = problem.applied(unknowns.free)
     units = dt * jnp.max(jnp.abs(rates), axis=(0, 1))
-    size = jnp.maximum(1.0, violation(units, path, slacks))
+    size = jnp.maximum(1.0, violation(units, softness, path, slacks))
     nothing = jnp.full(MEMORY, jnp.inf, float)
     return Filter(nothing, nothing, jnp.array(0), units, SMALL * size, LARGE * size)
 

@@ -19,7 +19,7 @@ from natcoord_jax.control.conditions import (
 )
 from natcoord_jax.control.costates import Multipliers
 from natcoord_jax.control.iterate import Derivatives, Iterate, Model, Options, Slacks, largest
-from natcoord_jax.control.line_search import Direction
+from natcoord_jax.control.line_search import SMALL, Direction, missed, violation
 from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.control.quadratic import model
 from natcoord_jax.control.riccati import REACH, Factors, Weighted, factored
@@ -31,6 +31,11 @@ SHIFT = 1e-4
 GROWTH = 8.0
 """Of the increase, until the model is convex."""
 LARGEST_SHIFT = 1e8
+HELD = 3.0
+"""Curvature in what is free, in units of the cost, where the equations are violated as at the start: least
+time would else be at its lower bound before there is any motion that lasts as long."""
+FIXED = 1e9
+"""The same while a way to the goal is looked for: time and parameters stay."""
 LEAST_BARRIER = 1e-10
 """Barrier parameter at the end, relative to the cost."""
 
@@ -73,8 +78,12 @@ def _convex(problem: OptimalControl, iterate: Iterate, found: Model, reach: Arra
     idle = (jnp.arange(problem.steps) % problem.inputs.every != 0).astype(float)
     idle = jnp.broadcast_to(idle[:, None], (problem.steps, problem.channels))
 
+    soft, known = iterate.softness, iterate.filter
+    left = violation(known.units, soft, iterate.path, iterate.slacks) / (known.least / SMALL)
+    held = iterate.unit * jnp.where(jnp.any(soft > 0), FIXED, HELD * jnp.clip(left, 0.0, 1.0))
+
     def attempt(shift: Array) -> Factors:
-        return factored(found, bounds, idle, shift, iterate.penalty, reach, iterate.unit)
+        return factored(found, bounds, idle, shift, iterate.penalty, soft, reach, iterate.unit, held)
 
     def unfinished(carry: tuple) -> Array:
         factors, shift, begun = carry
@@ -102,6 +111,7 @@ def _penalty(iterate: Iterate, factors: Factors) -> Array:
     compliance = jnp.diagonal(factors.compliance)
     reached = compliance > 1e-12 * jnp.max(compliance, initial=0.0)
     found = jnp.where(reached, 1.0 / jnp.where(reached, compliance, 1.0), 0.0)
+    found = jnp.where(iterate.softness > 0, 0.0, found)
     return jnp.where(iterate.iteration == 0, found, iterate.penalty)
 
 
@@ -131,7 +141,8 @@ def _slope(problem: OptimalControl, iterate: Iterate, better: Improved, slacks: 
     closed = -jnp.sum(derivatives.worth.residuals * iterate.path.stages.residual)
     bounds = jnp.sum(m.path * sweep.excess) + jnp.sum(m.end * sweep.end_excess)
     rooms = jnp.sum(mu / s.path * slacks.path) + jnp.sum(mu / s.end * slacks.end)
-    return lagrangian - closed - m.goal @ sweep.missing - bounds - rooms
+    soft = missed(iterate.softness, iterate.path.end.missing) @ sweep.missing
+    return lagrangian - closed - m.goal @ sweep.missing - bounds - rooms + soft
 
 
 def _lowered(iterate: Iterate) -> Array:

@@ -17,6 +17,7 @@ class Outcome(IntEnum):
     TIME_LIMIT = 8
     SINGULAR = 9
     INFEASIBLE_START = 10
+    DIVERGED = 11
 
     @property
     def ok(self) -> bool:
@@ -28,7 +29,7 @@ OUTCOMES = {
     Outcome.OPTIMAL: "optimal",
     Outcome.RUNNING: "still running",
     Outcome.MAX_ITERATIONS: "the maximum of iterations was reached",
-    Outcome.UNREACHABLE: "the goal cannot be reached with these inputs and bounds",
+    Outcome.UNREACHABLE: "no motion was found that reaches the goal",
     Outcome.STALLED: "no step along the search direction made progress",
     Outcome.SIMULATION_FAILED: "the motion of the guess could not be simulated",
     Outcome.NONFINITE: "a number became infinite or not a number",
@@ -36,17 +37,21 @@ OUTCOMES = {
     Outcome.TIME_LIMIT: "the time limit was reached",
     Outcome.SINGULAR: "a step has no derivative: its linearised equations have no solution",
     Outcome.INFEASIBLE_START: "the start is outside of bounds that no input can change there",
+    Outcome.DIVERGED: "the multipliers grew without end",
 }
 
 ADVICE = {
     Outcome.MAX_ITERATIONS: "allow more iterations, or start from a better guess",
-    Outcome.UNREACHABLE: "check for conditions that contradict each other or the conservation laws, and for "
-    "inputs that cannot move what the goal asks for; start from another guess",
+    Outcome.UNREACHABLE: "check for conditions that contradict each other or the conservation laws, for "
+    "inputs that cannot move what the goal asks for, and for too little time or too narrow limits; start "
+    "from another guess",
     Outcome.STALLED: "start from another guess, or look for cost, goal or bounds that are not smooth",
     Outcome.SIMULATION_FAILED: "start from a milder guess or with a smaller dt, or use method='lifted'",
     Outcome.SINGULAR: "start from a guess that keeps away from positions where constraints depend on "
     "each other",
     Outcome.INFEASIBLE_START: "start inside of them, or widen them (the zero of a joint coordinate is "
     "the pose in which the scene was compiled)",
+    Outcome.DIVERGED: "look for conditions of the goal that depend on each other, or a time that is too "
+    "short; start from another guess",
     Outcome.NONFINITE: "check cost, goal and bounds for undefined operations",
 }

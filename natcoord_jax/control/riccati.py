@@ -139,8 +139,10 @@ def factored(
     idle: Float[Array, "steps m"],
     shift: Float[Array, ""],
     penalty: Float[Array, " c"],
+    softness: Float[Array, " c"],
     reach: Float[Array, ""],
     unit: Float[Array, ""],
+    held: Float[Array, ""],
 ) -> Factors:
     """Factors of the quadratic model.
 
@@ -150,13 +152,15 @@ def factored(
         idle: 1 for coefficients that do not enter in a step, else 0.
         shift: relative increase of the curvature in the coefficients.
         penalty: weight of the goal's squared residual in the model; changes no solution that reaches it.
+        softness: compliance that the goal has itself, see `Iterate`.
         reach: eigenvalues of the goal's compliance below it count as zero, see `REACH`.
         unit: of the cost.
+        held: curvature added to that of the cost in what is free.
     """
     goal, last = model.goal, model.last_excess
-    size, count = model.forward.shape[1], goal.shape[0]
+    size = model.forward.shape[1]
     P = model.last_hessian + last.T @ (bounds.end[:, None] * last) + goal.T @ (penalty[:, None] * goal)
-    begun = (_symmetric(P), goal.T, jnp.zeros((count, count), P.dtype), jnp.array(0))
+    begun = (_symmetric(P), goal.T, jnp.diag(softness), jnp.array(0))
     own = jnp.diagonal(model.hessian, axis1=1, axis2=2)[:, -idle.shape[1] :]
     steep = model.excess[:, :, -idle.shape[1] :]
     # Half of the coefficients that enter are stiffer, by their cost and their bounds.
@@ -186,7 +190,7 @@ def factored(
     (P, S, T, negative), (softness, gain, by_goal) = jax.lax.scan(backward, begun, given, reverse=True)
     E = model.first
     quadratic = _symmetric(E.T @ P @ E + model.first_hessian)
-    start_added = shift * (unit + jnp.abs(jnp.diagonal(quadratic)))
+    start_added = shift * (unit + jnp.abs(jnp.diagonal(quadratic))) + held
     stiffness = quadratic + jnp.diag(start_added)
     start_softness, negative = _inverse(stiffness, negative)
     start_by_goal = -start_softness @ (E.T @ S)

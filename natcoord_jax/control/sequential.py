@@ -14,7 +14,16 @@ from jaxtyping import Array, Bool, Int
 
 from natcoord_jax.control.costates import Multipliers
 from natcoord_jax.control.iterate import Derivatives, Filter, Iterate, Options, Slacks, largest
-from natcoord_jax.control.line_search import Found, at_barrier, first_filter, moved, remembered, room, search
+from natcoord_jax.control.line_search import (
+    Found,
+    at_barrier,
+    first_filter,
+    missed,
+    moved,
+    remembered,
+    room,
+    search,
+)
 from natcoord_jax.control.linearisation import cost_unit, linearised
 from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.control.proposal import Proposal, no_model, propose
@@ -26,6 +35,14 @@ ROOM = 0.01
 """Least room left to a bound at the start."""
 AT_REST = 1e-7
 """Relative size of a step that moves nothing any more."""
+STILL = 1e-4
+"""The same while a way to the goal is looked for."""
+MISSED = 300.0
+"""What it costs to miss a soft goal by its scale, in units of the cost."""
+NEAR = 0.01
+"""The same, where it is near enough."""
+GROWN = 1e12
+"""Multipliers, in units of the cost, that lead nowhere."""
 NEARLY = 1e-6
 """Residual of the steps, relative, of a motion that nearly obeys its equations."""
 
@@ -45,19 +62,24 @@ def _begun(problem: OptimalControl, options: Options, unknowns: Unknowns) -> tup
     return (unknowns, multipliers, slacks, path, unit), (barrier, whole, newton)
 
 
-def init(problem: OptimalControl, options: Options, unknowns: Unknowns) -> Iterate:
+def init(
+    problem: OptimalControl, options: Options, unknowns: Unknowns, scale: Array | None = None
+) -> Iterate:
     """First iterate from a guess.
 
     Args:
         problem: the problem.
         options: settings.
         unknowns: coefficients and what is free; `y` is replaced by a simulation unless the method is lifted.
+        scale: of the goal, which is then soft: the method ends near it, and time and parameters stay; None:
+            the goal is to be reached.
     """
     begin = Options(options.lifted, barrier=options.barrier)
     begun, rest = _begun(problem, begin, unknowns)
     unknowns, multipliers, slacks, path, unit = begun
     derivatives = linearised(problem, unknowns, multipliers, slacks, path, unit)
-    return _first(problem, begin, begun, derivatives, *rest)
+    soft = jnp.zeros_like(path.end.missing) if scale is None else scale**2 / (2.0 * MISSED * unit)
+    return _first(problem, begin, begun, derivatives, soft, *rest)
 
 
 @compiled
@@ -66,6 +88,7 @@ def _first(
     options: Options,
     begun: tuple,
     derivatives: Derivatives,
+    softness: Array,
     barrier: Array,
     whole: Array,
     newton: Array,
@@ -90,7 +113,8 @@ def _first(
         unit,
         nothing,
         goal,
-        first_filter(problem, unknowns, path, slacks, derivatives.jacobians.inverses),
+        softness,
+        first_filter(problem, unknowns, softness, path, slacks, derivatives.jacobians.inverses),
         nothing,
         infinite,
         goal,
@@ -117,13 +141,17 @@ def tried(
     found = Found(found.length, unknowns, slacks, path, fine, found.for_cost, found.newton)
     m, dm = iterate.multipliers, proposal.direction.multipliers
     dual = room([(m.path, dm.path), (m.end, dm.end)])
-    # Multipliers of equations go as far as the step does: those of a model that a short step shows to be a
-    # poor one would bend the next one more, and grow without end.
+    # Multipliers of equations go as far as the step does, and less where what has been added to the curvature
+    # has made them large: those of a model that a short step shows to be a poor one would bend the next one
+    # more, and grow without end.
+    length = found.length
+    length = jnp.where(length < 1.0, length / (1.0 + proposal.shift), length)
     there = Multipliers(
-        moved(m.goal, dm.goal, found.length),
+        # Those of a soft goal are what it costs to miss it; without any, its curvature is that of its square.
+        jnp.where(iterate.softness > 0, m.goal, moved(m.goal, dm.goal, length)),
         moved(m.path, dm.path, dual),
         moved(m.end, dm.end, dual),
-        moved(m.motion, dm.motion, found.length),
+        moved(m.motion, dm.motion, length),
     )
     return found, jax.tree.map(lambda x, x0: jnp.where(fine, x, x0), there, m), remembered(iterate, found)
 
@@ -155,6 +183,7 @@ def concluded(
         iterate.unit,
         proposal.shift,
         proposal.penalty,
+        iterate.softness,
         known,
         found.length,
         change,
@@ -210,17 +239,22 @@ def _judged(options: Options, it: Iterate) -> Int[Array, ""]:
     # multipliers, and tells none from a minimum.
     optimal = optimal & ~it.saddle & (it.iteration > 1)
     finite = jnp.isfinite(e.stationarity) & jnp.isfinite(e.goal)
-    resting = (it.moved < AT_REST) | (it.failures >= 3)
+    grown = largest(it.multipliers.goal, *jax.tree.leaves(it.multipliers.motion)) > GROWN * it.unit
+    soft = jnp.any(it.softness > 0)
+    resting = (it.moved < jnp.where(soft, STILL, AT_REST)) | (it.failures >= 3)
     # What is out of reach is known only where the motion obeys its equations.
     known = (e.motion < NEARLY) & (largest(it.unreachable) > 0.5 * e.goal)
-    unreachable = (e.goal > options.goal_tol) & known & resting
+    unreachable = resting & (soft | ((e.goal > options.goal_tol) & known))
+    missing = it.path.end.missing
+    near = soft & (0.5 * missed(it.softness, missing) @ missing < NEAR * it.unit)
     code = jnp.where(
         it.iteration >= options.max_iterations, int(Outcome.MAX_ITERATIONS), int(Outcome.RUNNING)
     )
     code = jnp.where(it.failures >= 5, int(Outcome.STALLED), code)
+    code = jnp.where(grown, int(Outcome.DIVERGED), code)
     code = jnp.where(unreachable, int(Outcome.UNREACHABLE), code)
     code = jnp.where(finite, code, _undefined(it.path, it.derivatives))
-    return jnp.where(optimal, int(Outcome.OPTIMAL), code)
+    return jnp.where(optimal | near, int(Outcome.OPTIMAL), code)
 
 
 def done(iterate: Iterate) -> Bool[Array, ""]:

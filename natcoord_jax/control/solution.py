@@ -11,11 +11,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.system import System
-from natcoord_jax.control.bounds import Bound
 from natcoord_jax.control.goal import Goal
 from natcoord_jax.control.guess import Guess, free_of_swings
 from natcoord_jax.control.iterate import Iterate
 from natcoord_jax.control.problem import OptimalControl
+from natcoord_jax.control.reasons import seen, unique
 from natcoord_jax.control.results import ADVICE, OUTCOMES, Outcome
 from natcoord_jax.control.transcription import held_inputs
 from natcoord_jax.core.arguments import checked
@@ -27,18 +27,12 @@ from natcoord_jax.stepping.simulate import simulate
 
 FILE = of("the name of a file", str, Path)
 
-AT_BOUND = 1e-9
-"""Excess, in half a range, that is rounding."""
-
-NAMED = 3
-"""How many violated conditions a message names."""
-
 
 class Row(NamedTuple):
     """One line of the history.
 
     Attributes:
-        iteration: number.
+        iteration: number, counted over all attempts.
         cost: whole cost.
         stationarity: gradient of the Lagrangian, relative.
         violation: largest violation of goal, bounds and equations.
@@ -58,6 +52,29 @@ class Row(NamedTuple):
     seconds: float
 
 
+class Attempt(NamedTuple):
+    """An attempt that another one followed.
+
+    Attributes:
+        method: by which.
+        outcome: how it ended.
+        iterations: how many it took.
+        seconds: with compilation.
+        reason: what was seen.
+    """
+
+    method: str
+    outcome: Outcome
+    iterations: int
+    seconds: float
+    reason: str
+
+    def __str__(self) -> str:
+        """In words."""
+        found = f"{self.method}: {OUTCOMES[self.outcome]} after {self.iterations} iterations"
+        return f"{found}, {self.seconds:.1f} s" + (f"; {self.reason}" if self.reason else "")
+
+
 class Solution(eqx.Module):
     """The end of an optimisation, reached or not.
 
@@ -74,7 +91,9 @@ class Solution(eqx.Module):
         method: how it was found: "shooting", "lifted" or "first-order", and with what.
         iterate: where the second-order method ended, for warm starts, feedback and sensitivities.
         unreachable: part of the goal's residual that no input changes.
-        history: one row for each iteration.
+        history: one row for each iteration, of all attempts.
+        reason: what was seen where it did not end well.
+        attempts: those before the last one.
     """
 
     problem: OptimalControl
@@ -87,6 +106,8 @@ class Solution(eqx.Module):
     iterate: Iterate | None = None
     unreachable: Any = None
     history: list[Row] = eqx.field(default_factory=list)
+    reason: str = ""
+    attempts: list[Attempt] = eqx.field(default_factory=list)
 
     @property
     def outcome(self) -> Outcome:
@@ -128,7 +149,7 @@ class Solution(eqx.Module):
         final = jax.tree.map(lambda x: x[-1], self.trajectory.states)
         names = self.problem.goal.labels(self.problem.system)
         residual = _residual(self.problem.goal, self.system, final)
-        return dict(zip(_unique(names), np.asarray(residual).tolist()))
+        return dict(zip(unique(names), np.asarray(residual).tolist()))
 
     @property
     def multipliers(self) -> dict[str, Any]:
@@ -136,13 +157,13 @@ class Solution(eqx.Module):
         if self.iterate is None:
             return {}
         m = self.iterate.multipliers
-        goal = _unique(self.problem.goal.labels(self.problem.system))
-        bounds = _unique(self.problem.bounds.labels(self.problem.system))
+        goal = unique(self.problem.goal.labels(self.problem.system))
+        bounds = unique(self.problem.bounds.labels(self.problem.system))
         found: dict[str, Any] = dict(zip(goal, np.asarray(m.goal).tolist()))
         return found | {name: np.asarray(m.path)[:, k] for k, name in enumerate(bounds)}
 
     def explain(self) -> str:
-        """How it ended, in words, with the conditions that are violated most."""
+        """How it ended, in words, with what was seen, and the attempts before the last one."""
         text = OUTCOMES[self.outcome]
         if self.iterate is not None or self.history:
             text += f" after {len(self.history)} iterations by {self.method}"
@@ -151,21 +172,10 @@ class Solution(eqx.Module):
             text += (
                 f": cost {last.cost:.8g}, gradient {last.stationarity:.1e}, violation {last.violation:.1e}"
             )
-        if self.ok:
-            return text
-        if self.outcome is Outcome.INFEASIBLE_START:
-            outside = outside_at_start(self.problem).items()
-            text += ": " + ", ".join(f"{name}, missed by {x:.2g} of half the range" for name, x in outside)
-        elif self.outcome is Outcome.UNREACHABLE:
-            names = self.problem.goal.labels(self.problem.system)
-            sizes = np.abs(np.asarray(self.unreachable))
-            order = np.argsort(-sizes)[:NAMED]
-            text += "; what no input changes: " + ", ".join(
-                f"{names[k]} {sizes[k]:.2e}" for k in order if sizes[k] > 1e-3 * sizes.max()
-            )
-        elif self.history and self.history[-1].violation > 0:
-            text += f"; worst: {self.history[-1].worst}"
-        return text + (f"; {ADVICE[self.outcome]}" if self.outcome in ADVICE else "")
+        if not self.ok:
+            text += f"; {self.reason}" if self.reason else ""
+            text += f"; {ADVICE[self.outcome]}" if self.outcome in ADVICE else ""
+        return text + "".join(f"\n  before that, {attempt}" for attempt in self.attempts)
 
     @checked("Solution.guess", steps=Whole(1))
     def guess(self, steps: int | None = None) -> Guess:
@@ -253,38 +263,6 @@ def _residual(goal: Goal, system: System, state: State) -> Float[Array, " n"]:
     return goal.residual(system, state)
 
 
-def outside_at_start(problem: OptimalControl) -> dict[str, float]:
-    """Bounds that the initial state exceeds whatever the inputs are, and by how much, in half their range.
-
-    Those of problems whose parameters are free are not looked at.
-    """
-    if problem.parameters:
-        return {}
-    excess, by_input = (
-        np.asarray(x) for x in _excess_at_start(problem.bounds, problem.system, problem.state)
-    )
-    fixed = ~np.any(by_input != 0, axis=-1)
-    names = _unique(problem.bounds.labels(problem.system))
-    return {name: float(x) for name, x, keep in zip(names, excess, fixed) if keep and x > AT_BOUND}
-
-
-@on_host
-def _excess_at_start(bounds: Bound, system: System, state: State) -> tuple[Array, Array]:
-    def excess(u: Array) -> Array:
-        return bounds.excess(system, state, u, state.t)
-
-    idle = jnp.zeros(len(system.structure.inputs))
-    return excess(idle), jax.jacfwd(excess)(idle)
-
-
-def _unique(names: tuple[str, ...]) -> list[str]:
-    """Names with numbers where they occur more than once."""
-    return [
-        name if names.count(name) == 1 else f"{name} #{names[:k].count(name) + 1}"
-        for k, name in enumerate(names)
-    ]
-
-
 def solution_of(
     problem: OptimalControl, iterate: Iterate, method: str, history: list[Row], outcome: Outcome
 ) -> Solution:
@@ -295,20 +273,6 @@ def solution_of(
     inputs = held_inputs(problem, iterate.unknowns.coefficients)
     cost = float(iterate.path.cost)
     unreachable = np.asarray(iterate.unreachable)
+    reason = seen(problem, iterate, outcome)
     code = int(outcome)
-    return Solution(problem, inputs, names, dt, cost, code, method, iterate, unreachable, history)
-
-
-def worst_condition(problem: OptimalControl, iterate: Iterate) -> tuple[float, str]:
-    """Largest violation of an iterate, and the name of what violates it."""
-    found: list[tuple[float, str]] = [(float(iterate.errors.motion), "equations of motion")]
-    missing = np.abs(np.asarray(iterate.path.end.missing))
-    if missing.size:
-        k = int(np.argmax(missing))
-        found.append((float(missing[k]), problem.goal.labels(problem.system)[k]))
-    excess = np.asarray(iterate.path.stages.excess)
-    if excess.size:
-        at, k = np.unravel_index(int(np.argmax(excess)), excess.shape)
-        name = problem.bounds.labels(problem.system)[int(k)]
-        found.append((max(float(excess[at, k]), 0.0), f"{name}, step {int(at)}"))
-    return max(found)
+    return Solution(problem, inputs, names, dt, cost, code, method, iterate, unreachable, history, reason)

@@ -1,0 +1,193 @@
+"""The attempts of an optimisation: from the guess, then by motions that may miss the goal."""
+
+import dataclasses
+import math
+import sys
+import time
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from natcoord_jax.control import sequential
+from natcoord_jax.control.guess import Guess, goal_scale, input_ranges, scattered, slower, unknowns_of
+from natcoord_jax.control.iterate import Iterate, Options
+from natcoord_jax.control.problem import OptimalControl
+from natcoord_jax.control.reasons import nearest, seen, worst_condition
+from natcoord_jax.control.results import Outcome
+from natcoord_jax.control.solution import Attempt, Row, Solution, solution_of
+from natcoord_jax.control.transcription import Unknowns
+
+HEADER = (
+    f"{'iter':>4} {'cost':>14} {'gradient':>9} {'violation':>9} {'step':>7} {'newton':>7} {'s':>7}  worst"
+)
+NAMES = {True: "lifted", False: "shooting"}
+METHOD = "sequential quadratic programming"
+LOST = (
+    Outcome.SIMULATION_FAILED, Outcome.STALLED, Outcome.MAX_ITERATIONS, Outcome.NONFINITE, Outcome.SINGULAR,
+    Outcome.DIVERGED,
+)  # fmt: skip
+"""Outcomes after which another way is tried, if the choice was ours."""
+NOWHERE = (Outcome.SIMULATION_FAILED, Outcome.NONFINITE, Outcome.SINGULAR)
+"""Outcomes that leave no motion to go on from."""
+WAY = "a way to the goal, by motions that miss it"
+STARTS = 4
+"""Places from which ways to the goal are looked for: the guess, and random ones about it."""
+SPREAD = 0.25
+"""Standard deviation of random inputs, relative to half their range or to the largest of the guess."""
+LONGER = 1.5
+"""Factor on a free final time from one of these places to the next."""
+PART = 0.4
+"""Part of the iterations left that an attempt may take where others can follow."""
+WIDER = (1.25, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
+"""Factors on the limits of the inputs that are tried where no way to the goal was found within them."""
+
+
+def row_of(problem: OptimalControl, iterate: Iterate, start: float) -> Row:
+    """A line of the history; `start` is when it began [s]."""
+    violation, worst = worst_condition(problem, iterate)
+    return Row(
+        int(iterate.iteration),
+        float(iterate.path.cost),
+        float(iterate.errors.stationarity),
+        violation,
+        worst,
+        float(iterate.step),
+        int(iterate.newton),
+        time.perf_counter() - start,
+    )
+
+
+def printed(row: Row) -> str:
+    """One line of the progress table."""
+    return (
+        f"{row.iteration:>4} {row.cost:>14.8g} {row.stationarity:>9.1e} {row.violation:>9.1e} "
+        f"{row.step:>7.2g} {row.newton:>7} {row.seconds:>7.2f}  {row.worst}"
+    )
+
+
+class Search:
+    """The attempts of one optimisation: they share limits, the history, and the lines that are printed."""
+
+    def __init__(self, problem: OptimalControl, options: Options, progress: bool, time_limit: float) -> None:
+        self.problem, self.options, self.progress = problem, options, progress
+        self.start, self.time_limit = time.perf_counter(), time_limit
+        self.history: list[Row] = []
+        self.attempts: list[Attempt] = []
+
+    @property
+    def left(self) -> int:
+        """Iterations left."""
+        return self.options.max_iterations - len(self.history)
+
+    def run(
+        self,
+        lifted: bool,
+        unknowns: Unknowns,
+        *,
+        scale: Any = None,
+        last: bool = False,
+        problem: OptimalControl | None = None,
+    ) -> Solution:
+        """One attempt: the method's loop in Python, a line for each iteration, and a way out.
+
+        Args:
+            lifted: the form of the method.
+            unknowns: where it starts.
+            scale: of a soft goal, see `sequential.init`.
+            last: whether no other attempt follows, so that it may take all iterations that are left.
+            problem: another one of the same structure.
+        """
+        problem = self.problem if problem is None else problem
+        before, begun = len(self.history), time.perf_counter()
+        method = WAY if scale is not None else f"{NAMES[lifted]} {METHOD}"
+        count = self.left if last else math.ceil(PART * self.left)
+        o = self.options
+        options = Options(lifted, count, o.tol, o.goal_tol)
+        iterate = sequential.init(problem, options, unknowns, scale)
+        outcome = Outcome.RUNNING
+        if self.progress:
+            print(f"{method}\n{HEADER}", file=sys.stderr)
+        try:
+            while not sequential.done(iterate):
+                if time.perf_counter() - self.start > self.time_limit:
+                    outcome = Outcome.TIME_LIMIT
+                    break
+                iterate = sequential.step(problem, options, iterate)
+                row = row_of(problem, iterate, self.start)
+                self.history.append(row._replace(iteration=len(self.history) + 1))
+                if self.progress:
+                    print(printed(self.history[-1]), file=sys.stderr, flush=True)
+        except KeyboardInterrupt:
+            outcome = Outcome.STOPPED
+        if outcome is Outcome.RUNNING:
+            outcome = Outcome(int(iterate.code))
+        reason = seen(problem, iterate, outcome)
+        if scale is not None and outcome is Outcome.UNREACHABLE:
+            reason = nearest(problem, iterate)
+        taken, seconds = len(self.history) - before, time.perf_counter() - begun
+        self.attempts.append(Attempt(method, outcome, taken, seconds, reason))
+        found = solution_of(problem, iterate, method, list(self.history), outcome)
+        return dataclasses.replace(found, reason=reason, attempts=self.attempts[:-1])
+
+
+def over(found: Solution) -> bool:
+    """Whether nothing follows: it is solved, the user or a limit stops it, or nothing can be done."""
+    return found.outcome not in LOST
+
+
+def other_ways(search: Search, found: Solution, guess: Guess) -> Solution:
+    """Attempts after one that has got lost.
+
+    A motion of the equations that comes near to the goal is looked for first, by simulations that may miss
+    it, from the guess and then from random inputs about it and longer times, where time is free; the lifted
+    form goes on from there.
+    """
+    problem = search.problem
+    begin = unknowns_of(problem, guess, False)
+    scale = goal_scale(problem, unknowns_of(problem, None, True))
+    if not scale.size:
+        lifted = not found.method.startswith(NAMES[True])
+        inputs = Guess(found.inputs, free=found.guess().free)
+        return search.run(lifted, unknowns_of(problem, inputs, lifted), last=True)
+    spread = SPREAD * input_ranges(problem, begin)
+    failed: list[Solution] = []
+    for k in range(STARTS):
+        start = begin
+        if k:
+            start = scattered(problem, slower(problem, begin, LONGER**k), jax.random.key(k), spread, 0.0)
+        way = search.run(False, start, scale=scale)
+        if way.outcome in (Outcome.TIME_LIMIT, Outcome.STOPPED):
+            return way
+        failed += [way] if way.outcome is Outcome.UNREACHABLE else []
+        if way.outcome not in NOWHERE and search.left > 0 and way.iterate is not None:
+            found = search.run(True, way.iterate.unknowns, last=k == STARTS - 1)
+            if over(found):
+                return found
+        if search.left <= 0:
+            break
+    if len(failed) == STARTS:
+        found = _unreachable(search, failed, scale)
+    return dataclasses.replace(found, history=search.history, attempts=search.attempts)
+
+
+def _unreachable(search: Search, failed: list[Solution], scale: Any) -> Solution:
+    """The nearest of motions that all miss the goal, and the limits of inputs that would lead to it."""
+    problem = search.problem
+    iterates = [way.iterate for way in failed if way.iterate is not None]
+    misses = [float(jnp.sum((i.path.end.missing / scale) ** 2)) for i in iterates]
+    best = int(np.argmin(misses))
+    nearest_one, begin = failed[best], iterates[best].unknowns
+    reason, attempts = nearest_one.reason, len(search.attempts)
+    if problem.bounds.widened(WIDER[0]) is not problem.bounds:
+        for factor in WIDER:
+            wider = eqx.tree_at(lambda p: p.bounds, problem, problem.bounds.widened(factor))
+            way = search.run(False, begin, scale=scale, problem=wider)
+            if way.ok:
+                reason += f"; with {factor:g} times the limits of the inputs it comes near"
+            if way.outcome is not Outcome.UNREACHABLE or search.left <= 0:
+                break
+    del search.attempts[attempts:]
+    return dataclasses.replace(nearest_one, reason=reason)

@@ -1,0 +1,161 @@
+"""What was seen of an optimisation that did not end well: conditions by name, with numbers and units."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from natcoord_jax.assembly.system import System
+from natcoord_jax.control.bounds import Bound
+from natcoord_jax.control.iterate import Iterate
+from natcoord_jax.control.problem import OptimalControl
+from natcoord_jax.control.results import Outcome
+from natcoord_jax.core.host import on_host
+from natcoord_jax.core.state import State
+
+AT_BOUND = 1e-9
+"""Excess, in half a range, that is rounding."""
+AT_LIMIT = 0.01
+"""Room to a bound, in half a range, of what counts as at its limit."""
+NAMED = 3
+"""How many violated conditions a message names."""
+
+
+def unique(names: tuple[str, ...]) -> list[str]:
+    """Names with numbers where they occur more than once."""
+    return [
+        name if names.count(name) == 1 else f"{name} #{names[:k].count(name) + 1}"
+        for k, name in enumerate(names)
+    ]
+
+
+def seen(problem: OptimalControl, iterate: Iterate, outcome: Outcome) -> str:
+    """What an iterate shows of the reason why the method ended there; nothing where all is well."""
+    if outcome.ok:
+        return ""
+    if outcome is Outcome.UNREACHABLE:
+        return out_of_reach(problem, np.asarray(iterate.unreachable))
+    if outcome in (Outcome.NONFINITE, Outcome.SIMULATION_FAILED, Outcome.SINGULAR):
+        return undefined(problem, iterate)
+    violation, worst = worst_condition(problem, iterate)
+    text = f"worst: {worst}, {violation:.1e}" if violation > 0 else ""
+    if outcome is Outcome.STALLED:
+        count = int(iterate.failures)
+        text += f"; {count} steps in a row made nothing better, however short"
+        if float(iterate.shift) > 0:
+            text += f", with {float(iterate.shift):.0e} times the typical curvature added"
+    if outcome is Outcome.DIVERGED:
+        text += f"; {largest_multiplier(problem, iterate)}"
+    return text.removeprefix("; ")
+
+
+def _largest_of(names: list[str], values: np.ndarray, wording: str = "{name} {value:.2e}") -> str:
+    """The largest of some numbers, by name."""
+    sizes = np.abs(values)
+    order = [k for k in np.argsort(-sizes)[:NAMED] if sizes[k] > 1e-3 * sizes.max()]
+    return ", ".join(wording.format(name=names[k], value=sizes[k]) for k in order)
+
+
+def out_of_reach(problem: OptimalControl, unreachable: np.ndarray) -> str:
+    """What no input changes, to first order."""
+    names = unique(problem.goal.labels(problem.system))
+    if not unreachable.size or not np.any(unreachable):
+        return ""
+    return f"what no input changes: {_largest_of(names, unreachable)}"
+
+
+def nearest(problem: OptimalControl, iterate: Iterate) -> str:
+    """How near to the goal a motion comes that no change of the inputs brings nearer, and what holds it."""
+    names = unique(problem.goal.labels(problem.system))
+    text = f"the nearest motion misses {_largest_of(names, np.asarray(iterate.path.end.missing))}"
+    excess = np.asarray(iterate.path.stages.excess)
+    labels = unique(problem.bounds.labels(problem.system))
+    counts = np.sum(excess > -AT_LIMIT, axis=0)
+    held = [
+        f"{label} in {count} of {problem.steps} steps" for label, count in zip(labels, counts) if count > 0
+    ]
+    return text + (f", at the limits: {', '.join(held[:NAMED])}" if held else "")
+
+
+def undefined(problem: OptimalControl, iterate: Iterate) -> str:
+    """The first of what is no number, and where."""
+    path, dt = iterate.path, problem.applied(iterate.unknowns.free)[1]
+
+    def at(values: Array) -> str:
+        bad = np.flatnonzero(~np.isfinite(np.asarray(values).reshape(problem.steps, -1)).all(axis=1))
+        return f"step {bad[0]}, t = {float((bad[0] + 1) * dt):.4g} s" if bad.size else ""
+
+    for what, values in (
+        ("the motion", path.stages.residual),
+        ("the running cost", path.stages.cost),
+        ("a bound", path.stages.excess),
+    ):
+        if at(values):
+            return f"{what} is no number in {at(values)}"
+    if not np.isfinite(float(path.end.cost)):
+        return "the cost at the end is no number"
+    for name, value in zip(unique(problem.goal.labels(problem.system)), np.asarray(path.end.missing)):
+        if not np.isfinite(value):
+            return f"the goal is no number: {name}"
+    if at(iterate.derivatives.jacobians.inverses):
+        return f"a step has no derivative: {at(iterate.derivatives.jacobians.inverses)}"
+    residual = np.max(np.abs(np.asarray(path.stages.residual)), axis=1)
+    size = max(float(np.max(np.abs(np.asarray(iterate.unknowns.y)))), 1.0)
+    open_steps = np.flatnonzero(residual > 1e-6 * size)
+    if open_steps.size:
+        k = int(open_steps[0])
+        return f"the equations of motion have no solution in step {k}, t = {float((k + 1) * dt):.4g} s"
+    if not np.isfinite(float(iterate.errors.stationarity)):
+        return "a derivative of cost, goal or bounds is no number"
+    return ""
+
+
+def largest_multiplier(problem: OptimalControl, iterate: Iterate) -> str:
+    """The multiplier that has grown most, by the name of its condition."""
+    found = {}
+    for name, value in zip(unique(problem.goal.labels(problem.system)), np.asarray(iterate.multipliers.goal)):
+        found[name] = abs(float(value))
+    if iterate.multipliers.motion is not None:
+        sizes = np.max(np.abs(np.asarray(iterate.multipliers.motion)), axis=1)
+        found[f"equations of motion, step {int(np.argmax(sizes))}"] = float(np.max(sizes))
+    name = max(found, key=lambda name: found[name])
+    return f"largest multiplier: {name}, {found[name]:.1e}, for a cost of {float(iterate.unit):.1e}"
+
+
+def outside_at_start(problem: OptimalControl) -> dict[str, float]:
+    """Bounds that the initial state exceeds whatever the inputs are, and by how much, in half their range.
+
+    Those of problems whose parameters are free are not looked at.
+    """
+    if problem.parameters:
+        return {}
+    excess, by_input = (
+        np.asarray(x) for x in _excess_at_start(problem.bounds, problem.system, problem.state)
+    )
+    fixed = ~np.any(by_input != 0, axis=-1)
+    names = unique(problem.bounds.labels(problem.system))
+    return {name: float(x) for name, x, keep in zip(names, excess, fixed) if keep and x > AT_BOUND}
+
+
+@on_host
+def _excess_at_start(bounds: Bound, system: System, state: State) -> tuple[Array, Array]:
+    def excess(u: Array) -> Array:
+        return bounds.excess(system, state, u, state.t)
+
+    idle = jnp.zeros(len(system.structure.inputs))
+    return excess(idle), jax.jacfwd(excess)(idle)
+
+
+def worst_condition(problem: OptimalControl, iterate: Iterate) -> tuple[float, str]:
+    """Largest violation of an iterate, and the name of what violates it."""
+    found: list[tuple[float, str]] = [(float(iterate.errors.motion), "equations of motion")]
+    missing = np.abs(np.asarray(iterate.path.end.missing))
+    if missing.size:
+        k = int(np.argmax(missing))
+        found.append((float(missing[k]), problem.goal.labels(problem.system)[k]))
+    excess = np.asarray(iterate.path.stages.excess)
+    if excess.size:
+        at, k = np.unravel_index(int(np.argmax(excess)), excess.shape)
+        name = problem.bounds.labels(problem.system)[int(k)]
+        found.append((max(float(excess[at, k]), 0.0), f"{name}, step {int(at)}"))
+    return max(found)
