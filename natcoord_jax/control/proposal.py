@@ -31,6 +31,8 @@ SHIFT = 1e-4
 GROWTH = 8.0
 """Of the increase, until the model is convex."""
 LARGEST_SHIFT = 1e8
+LEFT_OUT = 0.1
+"""Part of what is missing to the goal that a step may leave out."""
 HELD = 3.0
 """Curvature in what is free, in units of the cost, where the equations are violated as at the start: least
 time would else be at its lower bound before there is any motion that lasts as long."""
@@ -206,7 +208,7 @@ def _attempt(problem: OptimalControl, iterate: Iterate) -> Attempt:
     def left_out(last: Attempt) -> Array:
         # Conditions that depend on each other along motions only, by conserved momenta, are nearly fulfilled
         # by a step that leaves them out. It makes worse those that inputs only reach with difficulty.
-        return (last.reach > REACH[0]) & (largest(last.better.unreachable) > iterate.errors.goal)
+        return (last.reach > REACH[0]) & (largest(last.better.unreachable) > LEFT_OUT * iterate.errors.goal)
 
     def unserved(carry: tuple[Array, Attempt]) -> Array:
         turn, last = carry
