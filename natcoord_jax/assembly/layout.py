@@ -145,6 +145,11 @@ class Layout:
         self.inputs += [name] if count == 1 else [f"{name}[{k}]" for k in range(count)]
         return instance
 
+    def _angles(self) -> Float[Array, " coordinates"]:
+        """Joint coordinates in the assembled pose, as far as they are angles."""
+        found = [self.joints[name].assembled(k) for name, k, _ in self.coordinates]
+        return stacked([as_array(x, float) for x in found]) if found else as_array(np.zeros(0))
+
     def number_accounts(self, instances: list[Instance]) -> None:
         """Places in the work account and among the stored rates: one piece of the state for each group."""
         for instance in (x for family in families(instances) for x in family):
@@ -222,7 +227,8 @@ class Layout:
             as_array(0.0),
             q,
             v,
-            *(as_array(np.zeros(len(x))) for x in (self.coordinates, self.rotors, self.works)),
+            self._angles(),
+            *(as_array(np.zeros(len(x))) for x in (self.rotors, self.works)),
         )
 
 

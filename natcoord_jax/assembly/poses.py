@@ -62,8 +62,10 @@ def _attachment_weights(position, rotation, point: Array, axes: Float[Array, "3 
 
 
 @on_host
-def _joint_weights(positions, rotations, points, triad) -> Float[Array, "2 4 4"]:
-    return jnp.stack([_pose_weights(*pose, triad) for pose in zip(positions, rotations, points)])
+def _joint_weights(joint: Joint, positions, rotations, points, triad) -> Float[Array, "2 4 4"]:
+    turned, shift = joint.zeroed(triad)
+    given = zip(positions, rotations, (points[0] + shift, points[1]), (turned, triad))
+    return jnp.stack([_pose_weights(*pose) for pose in given])
 
 
 _triad = on_host(frame_from_axis)
@@ -84,4 +86,4 @@ def joint_frames(joint: Joint, poses: Poses) -> Float[Array, "2 4 4"]:
     at_child = poses.position[child] if at_child is None else at_child
     positions, rotations = zip(*((poses.position[b], poses.rotation[b]) for b in (parent, child)))
     points = as_array(at_parent, float), as_array(at_child, float)
-    return _joint_weights(positions, rotations, points, triad)
+    return _joint_weights(joint, positions, rotations, points, triad)

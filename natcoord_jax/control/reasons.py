@@ -5,13 +5,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from natcoord_jax.assembly.diagnostics import explain
 from natcoord_jax.assembly.system import System
 from natcoord_jax.control.bounds import Bound
 from natcoord_jax.control.iterate import Iterate
 from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.control.results import Outcome
+from natcoord_jax.control.transcription import held_inputs
 from natcoord_jax.core.host import on_host
 from natcoord_jax.core.state import State
+from natcoord_jax.stepping.simulate import simulate
 
 AT_BOUND = 1e-9
 """Excess, in half a range, that is rounding."""
@@ -35,7 +38,9 @@ def seen(problem: OptimalControl, iterate: Iterate, outcome: Outcome) -> str:
         return ""
     if outcome is Outcome.UNREACHABLE:
         return out_of_reach(problem, np.asarray(iterate.unreachable))
-    if outcome in (Outcome.NONFINITE, Outcome.SIMULATION_FAILED, Outcome.SINGULAR):
+    if outcome is Outcome.SIMULATION_FAILED:
+        return not_simulated(problem, iterate)
+    if outcome in (Outcome.NONFINITE, Outcome.SINGULAR):
         return undefined(problem, iterate)
     violation, worst = worst_condition(problem, iterate)
     text = f"worst: {worst}, {violation:.1e}" if violation > 0 else ""
@@ -77,6 +82,17 @@ def nearest(problem: OptimalControl, iterate: Iterate) -> str:
     return text + (f", at the limits: {', '.join(held[:NAMED])}" if held else "")
 
 
+def not_simulated(problem: OptimalControl, iterate: Iterate) -> str:
+    """Where the simulation with the inputs of an iterate fails."""
+    unknowns = iterate.unknowns
+    system, dt = problem.applied(unknowns.free)
+    inputs = held_inputs(problem, unknowns.coefficients)
+    trajectory = simulate(system, problem.start(unknowns.free), dt=dt, inputs=inputs, throw=False)
+    if int(trajectory.result) == 0:
+        return "steps had to be divided, which is none of the problem's"
+    return explain(system, trajectory)
+
+
 def undefined(problem: OptimalControl, iterate: Iterate) -> str:
     """The first of what is no number, and where."""
     path, dt = iterate.path, problem.applied(iterate.unknowns.free)[1]
@@ -99,12 +115,6 @@ def undefined(problem: OptimalControl, iterate: Iterate) -> str:
             return f"the goal is no number: {name}"
     if at(iterate.derivatives.jacobians.inverses):
         return f"a step has no derivative: {at(iterate.derivatives.jacobians.inverses)}"
-    residual = np.max(np.abs(np.asarray(path.stages.residual)), axis=1)
-    size = max(float(np.max(np.abs(np.asarray(iterate.unknowns.y)))), 1.0)
-    open_steps = np.flatnonzero(residual > 1e-6 * size)
-    if open_steps.size:
-        k = int(open_steps[0])
-        return f"the equations of motion have no solution in step {k}, t = {float((k + 1) * dt):.4g} s"
     if not np.isfinite(float(iterate.errors.stationarity)):
         return "a derivative of cost, goal or bounds is no number"
     return ""

@@ -99,6 +99,17 @@ class Joint(Effect):
         """Points of parent and child [m] in the assembled pose; None: see `apart`."""
         return self.point, self.point
 
+    def zeroed(self, triad: Float[Array, "3 3"]) -> tuple[Float[Array, "3 3"], Float[Array, "3"]]:
+        """The parent's triad in the assembled pose, and how far its point is from the joint's [m].
+
+        Coordinates count from where both frames coincide: from the assembled pose, unless a joint says else.
+        """
+        return triad, jnp.zeros(3)
+
+    def assembled(self, coordinate: int) -> Any:
+        """The angle that a coordinate has in the assembled pose [rad], counted on over many turns."""
+        return 0.0
+
     def initialise(self, parent: Frame, child: Frame) -> "Joint":
         """This joint with the numbers it takes from the assembled pose."""
         return self

@@ -65,13 +65,42 @@ class Spherical(Joint):
 
 
 class Revolute(Joint):
-    """Hinge about `axis` through `point`: 5 constraints; coordinate 0 is the angle [rad]."""
+    """Hinge about `axis` through `point`: 5 constraints; coordinate 0 is the angle [rad].
+
+    Attributes:
+        zero: angle from the assembled pose at which the coordinate is zero [rad].
+
+    Example:
+        A rod that is compiled hanging, and whose angle counts from where it stands upright:
+
+        >>> import math, jax; jax.config.update("jax_enable_x64", True)
+        >>> import natcoord_jax as nc
+        >>> scene = nc.Scene()
+        >>> rod = scene.add(nc.RigidBody(mass=1.0, inertia=(0.1, 0.1, 0.01), com=(0, 0, -0.5), name="rod"))
+        >>> hinge = scene.add(nc.Revolute(nc.ground, rod, axis=(0, 1, 0), zero=-math.pi))
+        >>> system, state = scene.compile()
+        >>> round(float(system.coordinate(state, hinge)), 12) == round(math.pi, 12)
+        True
+    """
+
+    zero: Any = eqx.field(default=0.0, kw_only=True, metadata=is_a(Number()))
 
     kind: ClassVar[str] = "revolute joint"
     multipliers: ClassVar[int] = 5
     rotations: ClassVar[tuple[int, ...]] = (2,)
     free: ClassVar[bool] = True
     coordinates: ClassVar[tuple[Coordinate, ...]] = (Angle(),)
+
+    def zeroed(self, triad: Array) -> tuple[Array, Array]:
+        """The parent's triad turned about the axis."""
+        first, second, third = jnp.unstack(triad)
+        cosine, sine = jnp.cos(self.zero), jnp.sin(self.zero)
+        turned = (cosine * first + sine * second, cosine * second - sine * first, third)
+        return jnp.stack(turned), jnp.zeros(3)
+
+    def assembled(self, coordinate: int) -> Any:
+        """As far as the coordinate's zero is away."""
+        return 0.0 - self.zero
 
     def residual(self, parent: Frame, child: Frame) -> Array:
         """Coincident points [m], parallel axes [-]."""
@@ -117,13 +146,23 @@ class Cylindrical(Joint):
 
 
 class Prismatic(Joint):
-    """Sliding along `axis`: 5 constraints; coordinate 0 is the displacement [m]."""
+    """Sliding along `axis`: 5 constraints; coordinate 0 is the displacement [m].
+
+    Attributes:
+        zero: displacement from the assembled pose at which the coordinate is zero [m].
+    """
+
+    zero: Any = eqx.field(default=0.0, kw_only=True, metadata=is_a(Number()))
 
     kind: ClassVar[str] = "prismatic joint"
     multipliers: ClassVar[int] = 5
     translations: ClassVar[tuple[int, ...]] = (2,)
     free: ClassVar[bool] = True
     coordinates: ClassVar[tuple[Coordinate, ...]] = (Displacement(),)
+
+    def zeroed(self, triad: Array) -> tuple[Array, Array]:
+        """The parent's point, moved along the axis."""
+        return triad, self.zero * triad[2]
 
     def residual(self, parent: Frame, child: Frame) -> Array:
         """No offset across the axis [m], parallel triads [-]."""
