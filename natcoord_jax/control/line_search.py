@@ -11,9 +11,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from natcoord_jax.control.conditions import Change, Sweep, as_unknowns, swept
 from natcoord_jax.control.costates import Multipliers
 from natcoord_jax.control.iterate import Filter, Iterate, Options, Slacks
 from natcoord_jax.control.problem import OptimalControl
+from natcoord_jax.control.riccati import Factors, Right, solve
 from natcoord_jax.control.transcription import Path, Unknowns, roll, simulated
 
 BOUNDARY = 0.99
@@ -119,6 +121,7 @@ class Found(eqx.Module):
         fine: whether it is taken.
         for_cost: whether it is, because it lowers the cost as predicted.
         newton: Newton iterations spent.
+        corrected: whether the whole step has been corrected.
     """
 
     length: Float[Array, ""]
@@ -128,6 +131,7 @@ class Found(eqx.Module):
     fine: Bool[Array, ""]
     for_cost: Bool[Array, ""]
     newton: Int[Array, ""]
+    corrected: Bool[Array, ""]
 
 
 def search(
@@ -136,8 +140,12 @@ def search(
     iterate: Iterate,
     direction: Direction,
     slope: Float[Array, ""],
+    factors: Factors,
 ) -> Found:
     """A step along the direction, halved until the filter takes it.
+
+    A whole step that is not taken is corrected once, by the least change that takes back what it violates to
+    second order: near the solution steps would else be cut for ever (Maratos, thesis, Paris 1978).
 
     Args:
         problem: the problem.
@@ -145,6 +153,7 @@ def search(
         iterate: where it starts.
         direction: where it goes.
         slope: of the barrier cost along it.
+        factors: of the model.
     """
     s, ds = iterate.slacks, direction.slacks
     longest = room([(s.path, ds.path), (s.end, ds.end)])
@@ -152,12 +161,13 @@ def search(
     known, slope = iterate.filter, slope / iterate.unit
     noise = ROUND_OFF * (1.0 + jnp.abs(cost))
 
-    def attempt(a: Array, spent: Array) -> Found:
-        unknowns = moved(iterate.unknowns, direction.unknowns, a)
+    def attempt(a: Array, extra: tuple[Unknowns, Slacks], spent: Array, corrected: Array) -> Found:
+        along = moved((iterate.unknowns, s), (direction.unknowns, ds), a)
+        unknowns, slacks = moved(along, extra, jnp.ones(()))
         newton, whole = jnp.array(0), jnp.array(True)
         if not options.lifted:
             unknowns, whole, newton = simulated(problem, unknowns)
-        path, slacks = roll(problem, unknowns), moved(s, ds, a)
+        path = roll(problem, unknowns)
         violated, costs = _measured(iterate, path, slacks)
         gain = -a * slope
         promising = (gain > 0) & (
@@ -169,18 +179,51 @@ def search(
         new = jnp.all((violated <= known.violations) | (costs <= known.costs + noise))
         taken = jnp.where(for_cost, lower, either) & new & (violated <= known.largest)
         finite = whole & jnp.isfinite(violated) & jnp.isfinite(costs)
-        return Found(a, unknowns, slacks, path, finite & taken, for_cost & lower, spent + newton)
+        return Found(a, unknowns, slacks, path, finite & taken, for_cost & lower, spent + newton, corrected)
 
     def unfinished(found: Found) -> Array:
         return ~found.fine & (found.length > longest * 0.5**HALVINGS)
 
+    nothing = jax.tree.map(jnp.zeros_like, (iterate.unknowns, s))
+
     def body(found: Found) -> Found:
-        return attempt(0.5 * found.length, found.newton)
+        whole = (found.length == 1.0) & ~found.corrected & jnp.all(iterate.softness == 0)
+        extra = jax.lax.cond(
+            whole, lambda: brought_back(problem, iterate, factors, found.path), lambda: nothing
+        )
+        a = jnp.where(whole, 1.0, 0.5 * found.length)
+        return attempt(a, extra, found.newton, found.corrected | whole)
 
     # The first attempt is a turn of the loop like the others, so that it is compiled once.
     no = jnp.array(False)
-    begun = Found(2.0 * longest, iterate.unknowns, s, iterate.path, no, no, jnp.array(0))
+    begun = Found(2.0 * longest, iterate.unknowns, s, iterate.path, no, no, jnp.array(0), no)
     return jax.lax.while_loop(unfinished, body, begun)
+
+
+def brought_back(
+    problem: OptimalControl, iterate: Iterate, factors: Factors, path: Path
+) -> tuple[Unknowns, Slacks]:
+    """The least change, as the model weighs it, that takes away what a motion near an iterate violates."""
+    steps, channels, size = *factors.gain.shape[:2], factors.forward.shape[1]
+    zero = jnp.zeros((steps, size + channels)), jnp.zeros(size), jnp.zeros(factors.start.shape[1])
+    near = eqx.tree_at(lambda i: i.path.stages.residual, iterate, path.stages.residual)
+    m = iterate.multipliers
+
+    def again(_: Array, carry: tuple[Change, Sweep]) -> tuple[Change, Sweep]:
+        change = carry[0]
+        sweep = swept(problem, near, change, jnp.ones(())).sweep
+        move = solve(factors, Right(*zero, path.end.missing + sweep.missing))
+        first, w = change.first + move.first, change.w + move.w
+        return Change(first, w, change.goal, change.path, change.end), sweep
+
+    rest = (jnp.zeros_like(x) for x in (m.goal, m.path, m.end))
+    none = Change(jnp.zeros(factors.start.shape[1]), jnp.zeros((steps, channels)), *rest)
+    y, end = jnp.zeros_like(iterate.unknowns.y), iterate.path.end
+    begun = Sweep(y, m.path, end.missing, end.excess, y)
+    # The first turn finds the change, the second the motion with it.
+    change, sweep = jax.lax.fori_loop(0, 2, again, (none, begun))
+    unknowns = eqx.tree_at(lambda u: u.y, as_unknowns(problem, iterate, change), sweep.y)
+    return unknowns, Slacks(-sweep.excess, -sweep.end_excess)
 
 
 def remembered(iterate: Iterate, found: Found) -> Filter:

@@ -51,9 +51,10 @@ FEW = 7
 
 
 class Proposal(eqx.Module):
-    """The step that is proposed, the model, the steps that it has served, and its solutions for this one."""
+    """The step that is proposed, the model, its factors, steps that it has served, solutions for this one."""
 
     model: Model
+    factors: Factors
     kept: Int[Array, ""]
     corrections: Int[Array, ""]
     direction: Direction
@@ -239,6 +240,7 @@ def propose(problem: OptimalControl, options: Options, iterate: Iterate) -> Prop
     finite = jnp.all(jnp.array([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(direction)]))
     return Proposal(
         found.model,
+        found.factors,
         found.kept,
         found.better.count,
         direction,

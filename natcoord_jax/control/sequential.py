@@ -7,6 +7,8 @@ only, so that a guess need not be a motion. `shooting`: every iterate is simulat
 A solver is three pure functions: `init`, `step` and `done`.
 """
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -132,13 +134,13 @@ def tried(
 ) -> tuple[Found, Multipliers, Filter]:
     """The step as far as the filter takes it, the multipliers there, and the filter after it."""
     iterate = at_barrier(iterate, proposal.barrier)
-    found = search(problem, options, iterate, proposal.direction, proposal.slope)
+    found = search(problem, options, iterate, proposal.direction, proposal.slope, proposal.factors)
     fine = found.fine & proposal.convex
     reached = (found.unknowns, found.slacks, found.path)
     stayed = (iterate.unknowns, iterate.slacks, iterate.path)
     reached = jax.tree.map(lambda x, x0: jnp.where(fine, x, x0), reached, stayed)
     unknowns, slacks, path = reached
-    found = Found(found.length, unknowns, slacks, path, fine, found.for_cost, found.newton)
+    found = dataclasses.replace(found, unknowns=unknowns, slacks=slacks, path=path, fine=fine)
     m, dm = iterate.multipliers, proposal.direction.multipliers
     dual = room([(m.path, dm.path), (m.end, dm.end)])
     # Multipliers of equations go as far as the step does, and less where what has been added to the curvature
