@@ -165,6 +165,16 @@ def test_limits_hold_for_all_attempts(made):
     assert late.outcome is nc.Outcome.TIME_LIMIT
 
 
+def test_a_switch_within_a_step_is_told(made):
+    """Of a turn in least time, halfway: in the middle of the middle step, if their number is odd."""
+    options = {"cost": nc.cost.Duration(), "free_time": (0.1, 5.0), "steps": 11, "dt": 0.1}
+    found = nc.optimise(turn(made, 20.0, **options), progress=False)
+    assert found.ok and found.cost == pytest.approx(2 * np.sqrt(2.0 / 20.0), rel=0.01)
+    verdict = nc.check(found, refine=False)
+    assert verdict.switches == {"input 'motor'": [5]}
+    assert "switches within step 5" in str(verdict)
+
+
 # No compiling anew
 
 
@@ -237,6 +247,23 @@ def test_a_path_reaches_its_end(made):
 
 
 # Where coordinates count from
+
+
+def test_rates_of_a_guess_are_named_in_their_order():
+    scene = nc.Scene()
+    base = scene.add(nc.RigidBody(mass=1.0, inertia=(1.0, 2.0, 2.5), name="base"))
+    wheel = scene.add(nc.RigidBody(mass=1.0, inertia=(1.0, 1.0, 1.0), name="wheel"))
+    hinge = scene.add(nc.Revolute(base, wheel, axis=(0, 1, 0), name="hinge"))
+    scene.add(nc.JointTorque(hinge, name="motor"))
+    problem = nc.OptimalControl(*scene.compile(), dt=0.1, steps=4)
+    assert problem.rates[-1] == "'wheel' about axis 3 of its joint [rad/s]" and len(problem.rates) == 7
+    assert problem.rates[0] == "'base' about axis 1 of the body [rad/s]"
+    assert problem.rates[3] == "'base' along axis 1 of the body [m/s]"
+    guess = nc.Guess(rates=(0.0, 0.0, 0.0, 0.5, 0.0, 0.0, 2.0))
+    begun = sequential.init(numeric(problem), Options(True), unknowns_of(problem, guess, True))
+    last = np.asarray(begun.path.nodes.x[-1])
+    assert last[0] == pytest.approx(0.5 * 0.35, rel=1e-6)  # taken up over the first step
+    assert last[2 * problem.state.q.size] == pytest.approx(2.0 * 0.35, rel=1e-6)
 
 
 def cart_and_pole(zero, slide_zero):

@@ -14,6 +14,7 @@ from natcoord_jax.control.conditions import as_unknowns
 from natcoord_jax.control.iterate import Iterate
 from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.control.proposal import softest
+from natcoord_jax.control.reasons import switches
 from natcoord_jax.control.run import optimise
 from natcoord_jax.control.solution import SOLUTION, Solution
 from natcoord_jax.control.transcription import entering, slices, stage
@@ -37,6 +38,8 @@ class Check:
             inputs).
         missing: residual of the goal by name, of the simulated motion.
         exceeded: largest excess of each bound by name; negative inside.
+        switches: steps within which an input goes from one of its limits to the other, by its name: a held
+            input is a mean of both there, and more steps show the moment better.
         costs: cost by number of steps, with the steps halved and doubled.
         order: observed order of the cost; None if it was not asked for or cannot be seen.
         extrapolated: cost at vanishing step by Richardson's extrapolation, with order two.
@@ -53,6 +56,7 @@ class Check:
     direction: np.ndarray | None
     missing: dict[str, float]
     exceeded: dict[str, float]
+    switches: dict[str, list[int]]
     costs: dict[int, float]
     order: float | None
     extrapolated: float | None
@@ -71,6 +75,10 @@ class Check:
             lines.append(f"least curvature, relative   {self.curvature:+.2e}: {self.kind}")
         lines += [f"goal: {name}  {value:+.2e}" for name, value in self.missing.items()]
         lines += [f"bound: {name}  {value:+.2e}" for name, value in self.exceeded.items()]
+        lines += [
+            f"{name} switches within step {', '.join(map(str, steps))}: a mean of its limits; refine it"
+            for name, steps in self.switches.items()
+        ]
         lines += [f"cost with {steps} steps  {cost:.10g}" for steps, cost in sorted(self.costs.items())]
         for label, value in (
             ("observed order", self.order),
@@ -179,6 +187,7 @@ def check(
         *_second_order(solution),
         solution.missing,
         exceeded,
+        {} if iterate is None else switches(problem, iterate),
         costs,
         order,
         extrapolated,

@@ -27,6 +27,13 @@ LONGEST = 2.0
 class Guess(Part):
     """A first guess.
 
+    What is not given is made: inputs zero; rates constant, such that joints and attitudes go to the goal
+    the short way round (either way at half a turn) while forces play no part; time and parameters as in the
+    problem.
+
+    The order of rates is that of `problem.rates`, their names: for every body in the order of
+    `system.structure.bodies` the rotations, then the translations that its joint leaves free.
+
     Attributes:
         inputs: of all steps (steps, inputs) [N, N m]; None: zero.
         rates: mean rates of the free motions in all steps (steps, n), or constant ones (n,) [rad/s, m/s] that
@@ -35,7 +42,11 @@ class Guess(Part):
         free: final time [s] and parameters in the order of `problem.free`; None: those of the problem.
 
     Example:
+        >>> import jax; jax.config.update("jax_enable_x64", True)
         >>> import natcoord_jax as nc
+        >>> from natcoord_jax.gallery import manoeuvres
+        >>> manoeuvres.cart_pole(10).rates
+        ("'cart' along axis 3 of its joint [m/s]", "'pole' about axis 3 of its joint [rad/s]")
         >>> guess = nc.Guess(rates=(0.5, 1.57))
     """
 

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.system import SYSTEM, System
+from natcoord_jax.assembly.tree import SLOTS
 from natcoord_jax.control.bounds import BOUND, Bound
 from natcoord_jax.control.cost import COST, Cost
 from natcoord_jax.control.goal import GOAL, Goal
@@ -41,6 +42,10 @@ class OptimalControl(Part):
         inputs: how inputs are made of coefficients; default: held over each step.
         parameters: numbers of the system that are free as well.
         free_time: whether the step, and so the final time, is free; or (lower, upper) of the final time [s].
+            It needs something that makes waiting cost or forbids it: `nc.cost.Duration`, a running cost, or
+            an upper bound (least effort takes all the time there is); and limits of the inputs where time
+            is what is made small. `dt` is where it starts; a time too short for the limits is made longer
+            on the way.
 
     Raises:
         ValueError: for a horizon without steps, a system without inputs, shapes that do not fit.
@@ -123,6 +128,20 @@ class OptimalControl(Part):
         """Names of what is free besides the inputs."""
         times = ("final time [s]",) if self.free_time else ()
         return (*times, *(parameter.name for parameter in self.parameters))
+
+    @property
+    def rates(self) -> tuple[str, ...]:
+        """Names and units of the rates of the free motions, in the order of `nc.Guess(rates=...)`.
+
+        Axis 3 of a joint is its `axis`, axis 1 its `second`; those of a body without one are its own.
+        """
+        structure, names = self.system.structure, []
+        for number, slot in (divmod(int(k), SLOTS) for k in np.asarray(self.system.tree.slot_of)):
+            whose = "its joint" if structure.joints[number] else "the body"
+            axis = 1 if slot == 6 else slot % 3 + 1
+            way, unit = ("along", "m/s") if 3 <= slot < 6 else ("about", "rad/s")
+            names.append(f"{structure.bodies[number]!r} {way} axis {axis} of {whose} [{unit}]")
+        return tuple(names)
 
     def references(self) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
         """Initial values of what is free besides the inputs, and the scale of each."""

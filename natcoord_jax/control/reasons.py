@@ -82,6 +82,27 @@ def nearest(problem: OptimalControl, iterate: Iterate) -> str:
     return text + (f", at the limits: {', '.join(held[:NAMED])}" if held else "")
 
 
+def switches(problem: OptimalControl, iterate: Iterate) -> dict[str, list[int]]:
+    """Steps within which an input goes from one of its limits to the other: held, it is a mean of both.
+
+    Twice as many steps show the moment twice as well.
+    """
+    labels = problem.bounds.labels(problem.system)
+    held = np.asarray(iterate.path.stages.excess) > -AT_LIMIT
+
+    def at(limit: str) -> dict[str, np.ndarray]:
+        return {x.split(limit)[0]: held[:, k] for k, x in enumerate(labels) if limit in x}
+
+    below, above = at(" above its lower bound"), at(" below its upper bound")
+    found = {}
+    for name in (x for x in below if x in above and x.startswith("input ")):
+        low, high = below[name], above[name]
+        free = ~(low | high)[1:-1]
+        across = (low[:-2] & high[2:]) | (high[:-2] & low[2:])
+        found[name] = (np.flatnonzero(free & across) + 1).tolist()
+    return {name: steps for name, steps in found.items() if steps}
+
+
 def not_simulated(problem: OptimalControl, iterate: Iterate) -> str:
     """Where the simulation with the inputs of an iterate fails."""
     unknowns = iterate.unknowns
