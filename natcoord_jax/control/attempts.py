@@ -152,17 +152,19 @@ def other_ways(search: Search, found: Solution, guess: Guess) -> Solution:
         lifted = not found.method.startswith(NAMES[True])
         inputs = Guess(found.inputs, free=found.guess().free)
         return search.run(lifted, unknowns_of(problem, inputs, lifted), last=True)
-    spread = SPREAD * input_ranges(problem, begin)
     failed: list[Solution] = []
     for k in range(STARTS):
         start = begin
         if k:
+            spread = SPREAD * input_ranges(problem, begin)
             start = scattered(problem, slower(problem, begin, LONGER**k), jax.random.key(k), spread, 0.0)
         way = search.run(False, start, scale=scale)
         if way.outcome in (Outcome.TIME_LIMIT, Outcome.STOPPED):
             return way
         failed += [way] if way.outcome is Outcome.UNREACHABLE else []
-        if way.outcome not in NOWHERE and search.left > 0 and way.iterate is not None:
+        if way.outcome in NOWHERE:
+            begin = eqx.tree_at(lambda u: u.coefficients, begin, jnp.zeros_like(begin.coefficients))
+        elif search.left > 0 and way.iterate is not None:
             found = search.run(True, way.iterate.unknowns, last=k == STARTS - 1)
             if over(found):
                 return found
