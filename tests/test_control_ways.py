@@ -84,6 +84,7 @@ def test_swing_up_by_least_effort(pendulum, method):
     assert found.ok and found.cost == pytest.approx(5.6284862, rel=1e-7)
 
 
+@pytest.mark.slow
 def test_a_soft_goal_costs_what_missing_it_does(made):
     """The minimum of effort and of what is missed, of a linear motion: one solution of linear equations."""
     problem = numeric(turn(made))
@@ -110,6 +111,7 @@ def test_a_soft_goal_costs_what_missing_it_does(made):
 # Reasons
 
 
+@pytest.mark.slow
 def test_limits_that_are_too_narrow_are_told_with_what_they_would_have_to_be(made):
     found = nc.optimise(turn(made, 0.75 * LEAST), progress=False)
     assert found.outcome is nc.Outcome.UNREACHABLE, found.explain()
@@ -172,6 +174,7 @@ def test_limits_hold_for_all_attempts(made):
     assert late.outcome is nc.Outcome.TIME_LIMIT
 
 
+@pytest.mark.slow
 def test_a_switch_within_a_step_is_told(made):
     """Of a turn in least time, halfway: in the middle of the middle step, if their number is odd."""
     options = {"cost": nc.cost.Duration(), "free_time": (0.1, 5.0), "steps": 11, "dt": 0.1}
@@ -204,13 +207,11 @@ def test_other_numbers_and_an_equal_scene_compile_nothing(made, monkeypatch):
 # Several starts, and paths
 
 
+@pytest.mark.slow
 def test_several_starts_are_tallied(made):
     found = nc.multi_start(turn(made, 20.0), starts=4, spread=3.0)
     assert len(found) == 1 and found.outcomes == [nc.Outcome.OPTIMAL] * 4
     assert "4 of 4 starts converged" in str(found) and f"4 to cost {found[0].cost:.8g}" in str(found)
-    hopeless = nc.multi_start(turn(made, 0.5 * LEAST), starts=3, spread=3.0, method="shooting")
-    assert not hopeless[0].ok and "0 of 3 starts converged" in str(hopeless)
-    assert "3 not: " in str(hopeless) or "not: " in str(hopeless)
 
 
 @pytest.mark.slow
@@ -222,6 +223,7 @@ def test_starts_that_get_lost_go_on(pendulum):
     assert found[0].cost == pytest.approx(2.5407527, rel=1e-6)
     alone = nc.multi_start(problem, starts=4, rates=1.0, spread=1.0, method="lifted")
     assert sum(outcome.ok for outcome in alone.outcomes) < sum(outcome.ok for outcome in found.outcomes)
+    assert " not: " in str(alone)
 
 
 def test_a_path_is_followed_as_far_as_there_are_solutions(made):
