@@ -214,7 +214,7 @@ def test_several_starts_are_tallied(made):
     assert "4 of 4 starts converged" in str(found) and f"4 to cost {found[0].cost:.8g}" in str(found)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_starts_that_get_lost_go_on(pendulum):
     """Least times, of which the lifted form alone finds none from the middle."""
     problem = swing_up(pendulum, cost=nc.cost.Duration(), free_time=(0.5, 10.0))
