@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import natcoord_jax as nc
-from natcoord_jax.control import proposal, sequential
+from natcoord_jax.control import line_search, proposal, sequential
 from natcoord_jax.control.guess import goal_scale, unknowns_of
 from natcoord_jax.control.iterate import Options
 from natcoord_jax.control.problem import numeric
@@ -106,6 +106,29 @@ def test_a_soft_goal_costs_what_missing_it_does(made):
     whole[np.diag_indices(20)] += 0.05 * (2.0 * weight - 1.0)
     exact = -np.linalg.solve(whole, matrix.T @ (first / softness))
     np.testing.assert_allclose(np.asarray(iterate.unknowns.coefficients)[:, 0], exact, rtol=1e-5)
+
+
+def test_first_coefficients_of_inputs_move_where_a_way_is_looked_for(made):
+    """They are no parameters: only time and what is free besides stays as it is."""
+    problem = numeric(turn(made, inputs=nc.inputs.linear(5)))
+    scale = goal_scale(problem, unknowns_of(problem, None, True))
+    iterate = sequential.init(problem, Options(), unknowns_of(problem, None, False), scale)
+    iterate = sequential.step(problem, Options(), iterate)
+    coefficients = np.abs(np.asarray(iterate.unknowns.coefficients)[:, 0])
+    assert coefficients[0] > 0.1 * coefficients.max()
+
+
+def test_a_step_that_a_bound_cuts_in_half_is_not_corrected(made):
+    """Twice its length is a whole one, and was none."""
+    problem = numeric(turn(made, 20.0))
+    options = Options()
+    iterate = sequential.init(problem, options, unknowns_of(problem, None, False))
+    proposal_ = proposal.propose(problem, options, iterate)
+    nothing = jax.tree.map(jnp.zeros_like, proposal_.direction)
+    half = -line_search.BOUNDARY * iterate.slacks.path.at[1:].set(0.0) / 0.5
+    direction = dataclasses.replace(nothing, slacks=dataclasses.replace(nothing.slacks, path=half))
+    found = line_search.search(problem, options, iterate, direction, jnp.zeros(()), proposal_.factors)
+    assert not found.corrected and found.length <= 0.5
 
 
 # Reasons

@@ -15,7 +15,7 @@ from natcoord_jax.control import sequential
 from natcoord_jax.control.guess import Guess, goal_scale, input_ranges, scattered, slower, unknowns_of
 from natcoord_jax.control.iterate import Iterate, Options
 from natcoord_jax.control.problem import OptimalControl
-from natcoord_jax.control.reasons import nearest, seen, worst_condition
+from natcoord_jax.control.reasons import nearest, worst_condition
 from natcoord_jax.control.results import Outcome
 from natcoord_jax.control.solution import Attempt, Row, Solution, solution_of
 from natcoord_jax.control.transcription import Unknowns
@@ -41,6 +41,8 @@ LONGER = 1.5
 """Factor on a free final time from one of these places to the next."""
 PART = 0.4
 """Part of the iterations left that an attempt may take where others can follow."""
+MANY = 100
+"""Iterations that it may take at least."""
 WIDER = (1.25, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
 """Factors on the limits of the inputs that are tried where no way to the goal was found within them."""
 
@@ -103,7 +105,7 @@ class Search:
         problem = self.problem if problem is None else problem
         before, begun = len(self.history), time.perf_counter()
         method = WAY if scale is not None else f"{NAMES[lifted]} {METHOD}"
-        count = self.left if last else math.ceil(PART * self.left)
+        count = self.left if last else min(self.left, max(MANY, math.ceil(PART * self.left)))
         o = self.options
         options = Options(lifted, count, o.tol, o.goal_tol)
         iterate = sequential.init(problem, options, unknowns, scale)
@@ -124,13 +126,13 @@ class Search:
             outcome = Outcome.STOPPED
         if outcome is Outcome.RUNNING:
             outcome = Outcome(int(iterate.code))
-        reason = seen(problem, iterate, outcome)
-        if scale is not None and outcome is Outcome.UNREACHABLE:
-            reason = nearest(problem, iterate)
         taken, seconds = len(self.history) - before, time.perf_counter() - begun
-        self.attempts.append(Attempt(method, outcome, taken, seconds, reason))
         found = solution_of(problem, iterate, method, list(self.history), outcome)
-        return dataclasses.replace(found, reason=reason, attempts=self.attempts[:-1])
+        soft = scale is not None and outcome is Outcome.UNREACHABLE
+        reason = nearest(problem, iterate) if soft else found.reason
+        found = dataclasses.replace(found, reason=reason, attempts=list(self.attempts))
+        self.attempts.append(Attempt(method, outcome, taken, seconds, reason))
+        return found
 
 
 def over(found: Solution) -> bool:
@@ -172,7 +174,8 @@ def other_ways(search: Search, found: Solution, guess: Guess) -> Solution:
             break
     if len(failed) == STARTS:
         found = _unreachable(search, failed, scale)
-    return dataclasses.replace(found, history=search.history, attempts=search.attempts)
+    others = [a for k, a in enumerate(search.attempts) if k != len(found.attempts)]
+    return dataclasses.replace(found, history=search.history, attempts=others)
 
 
 def _unreachable(search: Search, failed: list[Solution], scale: Any) -> Solution:
@@ -182,7 +185,7 @@ def _unreachable(search: Search, failed: list[Solution], scale: Any) -> Solution
     misses = [float(jnp.sum((i.path.end.missing / scale) ** 2)) for i in iterates]
     best = int(np.argmin(misses))
     nearest_one, begin = failed[best], iterates[best].unknowns
-    reason, attempts = nearest_one.reason, len(search.attempts)
+    reason, attempts, rows = nearest_one.reason, len(search.attempts), len(search.history)
     if problem.bounds.widened(WIDER[0]) is not problem.bounds:
         for factor in WIDER:
             wider = eqx.tree_at(lambda p: p.bounds, problem, problem.bounds.widened(factor))
@@ -191,5 +194,5 @@ def _unreachable(search: Search, failed: list[Solution], scale: Any) -> Solution
                 reason += f"; with {factor:g} times the limits of the inputs it comes near"
             if way.outcome is not Outcome.UNREACHABLE or search.left <= 0:
                 break
-    del search.attempts[attempts:]
+    del search.attempts[attempts:], search.history[rows:]
     return dataclasses.replace(nearest_one, reason=reason)

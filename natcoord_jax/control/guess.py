@@ -187,7 +187,9 @@ def goal_scale(problem: OptimalControl, unknowns: Unknowns) -> Float[Array, " c"
     nodes = roll(problem, unknowns).nodes
     missing = jax.vmap(lambda node: end(problem, node).missing)(nodes)
     sizes = jnp.max(jnp.abs(missing), axis=0)
-    return jnp.maximum(sizes, LEAST_SCALE * jnp.max(sizes, initial=0.0))
+    sizes = jnp.where(jnp.isfinite(sizes), sizes, 0.0)
+    largest = jnp.max(sizes, initial=0.0)
+    return jnp.maximum(sizes, LEAST_SCALE * jnp.where(largest > 0, largest, 1.0))
 
 
 def input_ranges(problem: OptimalControl, unknowns: Unknowns) -> Float[Array, " m"]:

@@ -187,7 +187,7 @@ def search(
     nothing = jax.tree.map(jnp.zeros_like, (iterate.unknowns, s))
 
     def body(found: Found) -> Found:
-        whole = (found.length == 1.0) & ~found.corrected & jnp.all(iterate.softness == 0)
+        whole = (longest == 1.0) & (found.length == 1.0) & ~found.corrected & jnp.all(iterate.softness == 0)
         extra = jax.lax.cond(
             whole, lambda: brought_back(problem, iterate, factors, found.path), lambda: nothing
         )

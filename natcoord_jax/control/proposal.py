@@ -84,6 +84,8 @@ def _convex(problem: OptimalControl, iterate: Iterate, found: Model, reach: Arra
     soft, known = iterate.softness, iterate.filter
     left = violation(known.units, soft, iterate.path, iterate.slacks) / (known.least / SMALL)
     held = iterate.unit * jnp.where(jnp.any(soft > 0), FIXED, HELD * jnp.clip(left, 0.0, 1.0))
+    # Time and parameters, not the first coefficients of the inputs.
+    held = jnp.where(jnp.arange(found.first.shape[1]) < iterate.unknowns.free.size, held, 0.0)
 
     def attempt(shift: Array) -> Factors:
         return factored(found, bounds, idle, shift, iterate.penalty, soft, reach, iterate.unit, held)

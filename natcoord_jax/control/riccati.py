@@ -142,7 +142,7 @@ def factored(
     softness: Float[Array, " c"],
     reach: Float[Array, ""],
     unit: Float[Array, ""],
-    held: Float[Array, ""],
+    held: Float[Array, " f"],
 ) -> Factors:
     """Factors of the quadratic model.
 

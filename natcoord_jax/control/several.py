@@ -294,6 +294,9 @@ def continuation(
             found.append(last)
             found.reason = f"the first problem is not solved: {last.explain()}"
             return found
+        elif last.outcome in (Outcome.STOPPED, Outcome.TIME_LIMIT):
+            found.reason = f"at {found.at[-1]:.4f}: {last.explain()}"
+            return found
         else:
             length *= 0.5
         if found.ok:
@@ -305,7 +308,15 @@ def continuation(
         s = min(found.at[-1] + length, 1.0)
         form = next(name for name in NAMES.values() if found[-1].method.startswith(name))
         start = _carried_on(found, s)
-        last = optimise(_at(path, problem, s), start, method=form, max_iterations=max_iterations, **shared)
+        left = max(0.0, time_limit - (time.perf_counter() - begun))
+        last = optimise(
+            _at(path, problem, s),
+            start,
+            method=form,
+            max_iterations=max_iterations,
+            time_limit=left,
+            **shared,
+        )
 
 
 def _at(path: Callable, problem: OptimalControl, s: float) -> OptimalControl:

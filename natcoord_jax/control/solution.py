@@ -15,7 +15,7 @@ from natcoord_jax.control.goal import Goal
 from natcoord_jax.control.guess import Guess, free_of_swings
 from natcoord_jax.control.iterate import Iterate
 from natcoord_jax.control.problem import OptimalControl
-from natcoord_jax.control.reasons import seen, unique
+from natcoord_jax.control.reasons import seen, unique, worst_condition
 from natcoord_jax.control.results import ADVICE, OUTCOMES, Outcome
 from natcoord_jax.control.transcription import held_inputs
 from natcoord_jax.core.arguments import checked
@@ -168,10 +168,12 @@ class Solution(eqx.Module):
         if self.iterate is not None or self.history:
             text += f" after {len(self.history)} iterations by {self.method}"
         if self.history:
-            last = self.history[-1]
-            text += (
-                f": cost {last.cost:.8g}, gradient {last.stationarity:.1e}, violation {last.violation:.1e}"
-            )
+            # The last attempt is not always the one that is returned.
+            last, it = self.history[-1], self.iterate
+            slope, violation = last.stationarity, last.violation
+            if it is not None:
+                slope, violation = it.errors.stationarity, worst_condition(self.problem, it)[0]
+            text += f": cost {self.cost:.8g}, gradient {slope:.1e}, violation {violation:.1e}"
         if not self.ok:
             text += f"; {self.reason}" if self.reason else ""
             text += f"; {ADVICE[self.outcome]}" if self.outcome in ADVICE else ""
