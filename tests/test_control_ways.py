@@ -110,7 +110,7 @@ def test_a_soft_goal_costs_what_missing_it_does(made):
 
 def test_first_coefficients_of_inputs_move_where_a_way_is_looked_for(made):
     """They are no parameters: only time and what is free besides stays as it is."""
-    problem = numeric(turn(made, inputs=nc.inputs.linear(5)))
+    problem = numeric(turn(made, inputs=nc.inputs.piecewise_linear(5)))
     scale = goal_scale(problem, unknowns_of(problem, None, True))
     iterate = sequential.init(problem, Options(), unknowns_of(problem, None, False), scale)
     iterate = sequential.step(problem, Options(), iterate)
