@@ -8,6 +8,8 @@ from natcoord_jax.control.check import Check as Check
 from natcoord_jax.control.check import check as check
 from natcoord_jax.control.computed_torque import ComputedTorque as ComputedTorque
 from natcoord_jax.control.computed_torque import computed_torque as computed_torque
+from natcoord_jax.control.continuation import Continuation as Continuation
+from natcoord_jax.control.continuation import continuation as continuation
 from natcoord_jax.control.descent import descend as descend
 from natcoord_jax.control.feedback import Feedback as Feedback
 from natcoord_jax.control.feedback import receding_horizon as receding_horizon
@@ -22,9 +24,7 @@ from natcoord_jax.control.results import Outcome as Outcome
 from natcoord_jax.control.run import optimise as optimise
 from natcoord_jax.control.run import optimise_jit as optimise_jit
 from natcoord_jax.control.sensitivity import optimum as optimum
-from natcoord_jax.control.several import Continuation as Continuation
 from natcoord_jax.control.several import Optima as Optima
-from natcoord_jax.control.several import continuation as continuation
 from natcoord_jax.control.several import multi_start as multi_start
 from natcoord_jax.control.solution import Solution as Solution
 from natcoord_jax.control.solution import load_guess as load_guess

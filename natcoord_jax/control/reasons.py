@@ -87,19 +87,15 @@ def switches(problem: OptimalControl, iterate: Iterate) -> dict[str, list[int]]:
 
     Twice as many steps show the moment twice as well.
     """
-    labels = problem.bounds.labels(problem.system)
+    steep = np.asarray(_excess_at_start(problem.bounds, problem.system, problem.state)[1])
     held = np.asarray(iterate.path.stages.excess) > -AT_LIMIT
-
-    def at(limit: str) -> dict[str, np.ndarray]:
-        return {x.split(limit)[0]: held[:, k] for k, x in enumerate(labels) if limit in x}
-
-    below, above = at(" above its lower bound"), at(" below its upper bound")
+    alone = np.count_nonzero(steep, axis=1) == 1
     found = {}
-    for name in (x for x in below if x in above and x.startswith("input ")):
-        low, high = below[name], above[name]
+    for k, name in enumerate(problem.system.structure.inputs):
+        low, high = (np.any(held[:, alone & (side * steep[:, k] > 0)], axis=1) for side in (-1, 1))
         free = ~(low | high)[1:-1]
         across = (low[:-2] & high[2:]) | (high[:-2] & low[2:])
-        found[name] = (np.flatnonzero(free & across) + 1).tolist()
+        found[f"input {name!r}"] = (np.flatnonzero(free & across) + 1).tolist()
     return {name: steps for name, steps in found.items() if steps}
 
 

@@ -3,7 +3,6 @@
 import math
 from typing import Any
 
-import jax
 import numpy as np
 
 from natcoord_jax.control import sequential
@@ -122,7 +121,4 @@ def optimise_jit(problem: OptimalControl, unknowns: Unknowns, options: Options =
     Returns:
         The last iterate; its `code` says how it ended.
     """
-    first = sequential.init(problem, options, unknowns)
-    return jax.lax.while_loop(
-        lambda iterate: iterate.running, lambda iterate: sequential.step(problem, options, iterate), first
-    )
+    return sequential.solved(problem, options, unknowns)

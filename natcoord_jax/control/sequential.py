@@ -259,6 +259,14 @@ def _judged(options: Options, it: Iterate) -> Int[Array, ""]:
     return jnp.where(optimal | near, int(Outcome.OPTIMAL), code)
 
 
+def solved(
+    problem: OptimalControl, options: Options, unknowns: Unknowns, scale: Array | None = None
+) -> Iterate:
+    """The last iterate, all in one program; arguments as of `init`."""
+    first = init(problem, options, unknowns, scale)
+    return jax.lax.while_loop(lambda it: it.running, lambda it: step(problem, options, it), first)
+
+
 def done(iterate: Iterate) -> Bool[Array, ""]:
     """Whether the method has ended."""
     return ~iterate.running
