@@ -1,12 +1,13 @@
 """How often optimal control converges from where a user starts, beside IPOPT on the same discrete problems.
 
 usage: python -m benchmarks.control_starts [--starts N] [--problems NAME ...] [--method METHOD]
-       [--no-peers] [--json FILE]
+       [--patience SECONDS] [--no-peers] [--json FILE]
 
 Every problem is solved from the default start and from random ones: smooth random inputs and rates about it,
 see `natcoord_jax.control.guess.scattered`. IPOPT gets the functions of `nc.to_nlp` at the same unknowns, so
 that equations, bounds and exact derivatives are the same and only the solver differs; its matrices are dense,
-and its times are listed for orders of magnitude only. Times of both are without compilation.
+and its times are listed for orders of magnitude only. Times of both are without compilation. A file that
+exists keeps what it has of other problems.
 """
 
 import argparse
@@ -239,11 +240,11 @@ def starts(problem: nc.OptimalControl, case: Case, count: int) -> list[nc.Guess]
     return found
 
 
-def solved_by_ipopt(problem: nc.OptimalControl, guess: nc.Guess) -> dict[str, Any]:
-    """One solution by the peer."""
+def solved_by_ipopt(problem: nc.OptimalControl, guess: nc.Guess, patience: float) -> dict[str, Any]:
+    """One solution by the peer, or what it has after so many seconds."""
     from benchmarks.peers import ipopt
 
-    answer = ipopt.solved(nc.to_nlp(problem, guess))
+    answer = ipopt.solved(nc.to_nlp(problem, guess), max_wall_time=patience)
     return {
         "ok": answer.ok,
         "outcome": answer.status,
@@ -288,11 +289,12 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--problems", nargs="*", default=list(CASES), metavar="NAME")
     parser.add_argument("--method", default="auto")
     parser.add_argument("--limit", type=int, default=200)
+    parser.add_argument("--patience", type=float, default=120.0, help="seconds a start is left to IPOPT")
     parser.add_argument("--no-peers", action="store_true")
     parser.add_argument("--json", type=Path)
     given = parser.parse_args(arguments)
     jax.config.update("jax_enable_x64", True)
-    results = {}
+    results = json.loads(given.json.read_text()) if given.json and given.json.exists() else {}
     for name in given.problems:
         case = CASES[name]
         problem = numeric(case.problem())
@@ -302,7 +304,7 @@ def main(arguments: list[str] | None = None) -> None:
         ours = [solved(problem, guess, given.method, given.limit) for guess in guesses]
         results[name] = {"natcoord_jax": summary(ours) | {"runs": ours}}
         if not given.no_peers:
-            theirs = [solved_by_ipopt(problem, guess) for guess in guesses]
+            theirs = [solved_by_ipopt(problem, guess, given.patience) for guess in guesses]
             results[name]["IPOPT"] = summary(theirs) | {"runs": theirs}
         for who, found in results[name].items():
             first = found["default"]

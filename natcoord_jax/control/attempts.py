@@ -1,4 +1,4 @@
-"""The attempts of an optimisation: from the guess, then by motions that may miss the goal."""
+"""The attempts of an optimisation: from the guess, then after feasibility restorations."""
 
 import dataclasses
 import math
@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from natcoord_jax.control import sequential
-from natcoord_jax.control.guess import Guess, goal_scale, input_ranges, scattered, slower, unknowns_of
+from natcoord_jax.control.guess import Guess, goal_scale, input_ranges, scattered, stretched, unknowns_of
 from natcoord_jax.control.iterate import Iterate, Options
 from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.control.reasons import nearest, worst_condition
@@ -32,9 +32,9 @@ LOST = (
 """Outcomes after which another way is tried, if the choice was ours."""
 NOWHERE = (Outcome.SIMULATION_FAILED, Outcome.NONFINITE, Outcome.SINGULAR)
 """Outcomes that leave no motion to go on from."""
-WAY = "a way to the goal, by motions that miss it"
+RESTORATION = "feasibility restoration, by motions that may miss the goal"
 STARTS = 4
-"""Places from which ways to the goal are looked for: the guess, and random ones about it."""
+"""Starts of feasibility restorations: the guess, and random ones about it."""
 SPREAD = 0.25
 """Standard deviation of random inputs, relative to half their range or to the largest of the guess."""
 LONGER = 1.5
@@ -44,7 +44,7 @@ PART = 0.4
 MANY = 100
 """Iterations that it may take at least."""
 WIDER = (1.25, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
-"""Factors on the limits of the inputs that are tried where no way to the goal was found within them."""
+"""Factors on the limits of the inputs that are tried where none was restored within them."""
 
 
 def row_of(problem: OptimalControl, iterate: Iterate, start: float) -> Row:
@@ -104,7 +104,7 @@ class Search:
         """
         problem = self.problem if problem is None else problem
         before, begun = len(self.history), time.perf_counter()
-        method = WAY if scale is not None else f"{NAMES[lifted]} {METHOD}"
+        method = RESTORATION if scale is not None else f"{NAMES[lifted]} {METHOD}"
         count = self.left if last else min(self.left, max(MANY, math.ceil(PART * self.left)))
         o = self.options
         options = Options(lifted, count, o.tol, o.goal_tol)
@@ -140,7 +140,7 @@ def over(found: Solution) -> bool:
     return found.outcome not in LOST
 
 
-def other_ways(search: Search, found: Solution, guess: Guess) -> Solution:
+def after_restoration(search: Search, found: Solution, guess: Guess) -> Solution:
     """Attempts after one that has got lost.
 
     A motion of the equations that comes near to the goal is looked for first, by simulations that may miss
@@ -159,15 +159,15 @@ def other_ways(search: Search, found: Solution, guess: Guess) -> Solution:
         start = begin
         if k:
             spread = SPREAD * input_ranges(problem, begin)
-            start = scattered(problem, slower(problem, begin, LONGER**k), jax.random.key(k), spread, 0.0)
-        way = search.run(False, start, scale=scale)
-        if way.outcome in (Outcome.TIME_LIMIT, Outcome.STOPPED):
-            return way
-        failed += [way] if way.outcome is Outcome.UNREACHABLE else []
-        if way.outcome in NOWHERE:
+            start = scattered(problem, stretched(problem, begin, LONGER**k), jax.random.key(k), spread, 0.0)
+        restored = search.run(False, start, scale=scale)
+        if restored.outcome in (Outcome.TIME_LIMIT, Outcome.STOPPED):
+            return restored
+        failed += [restored] if restored.outcome is Outcome.UNREACHABLE else []
+        if restored.outcome in NOWHERE:
             begin = eqx.tree_at(lambda u: u.coefficients, begin, jnp.zeros_like(begin.coefficients))
-        elif search.left > 0 and way.iterate is not None:
-            found = search.run(True, way.iterate.unknowns, last=k == STARTS - 1)
+        elif search.left > 0 and restored.iterate is not None:
+            found = search.run(True, restored.iterate.unknowns, last=k == STARTS - 1)
             if over(found):
                 return found
         if search.left <= 0:
@@ -181,7 +181,7 @@ def other_ways(search: Search, found: Solution, guess: Guess) -> Solution:
 def _unreachable(search: Search, failed: list[Solution], scale: Any) -> Solution:
     """The nearest of motions that all miss the goal, and the limits of inputs that would lead to it."""
     problem = search.problem
-    iterates = [way.iterate for way in failed if way.iterate is not None]
+    iterates = [one.iterate for one in failed if one.iterate is not None]
     misses = [float(jnp.sum((i.path.end.missing / scale) ** 2)) for i in iterates]
     best = int(np.argmin(misses))
     nearest_one, begin = failed[best], iterates[best].unknowns
@@ -189,10 +189,10 @@ def _unreachable(search: Search, failed: list[Solution], scale: Any) -> Solution
     if problem.bounds.widened(WIDER[0]) is not problem.bounds:
         for factor in WIDER:
             wider = eqx.tree_at(lambda p: p.bounds, problem, problem.bounds.widened(factor))
-            way = search.run(False, begin, scale=scale, problem=wider)
-            if way.ok:
+            restored = search.run(False, begin, scale=scale, problem=wider)
+            if restored.ok:
                 reason += f"; with {factor:g} times the limits of the inputs it comes near"
-            if way.outcome is not Outcome.UNREACHABLE or search.left <= 0:
+            if restored.outcome is not Outcome.UNREACHABLE or search.left <= 0:
                 break
     del search.attempts[attempts:], search.history[rows:]
     return dataclasses.replace(nearest_one, reason=reason)

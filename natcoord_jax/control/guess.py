@@ -203,7 +203,7 @@ def input_ranges(problem: OptimalControl, unknowns: Unknowns) -> Float[Array, " 
     return jnp.where(steepest > 0, 1.0 / jnp.where(steepest > 0, steepest, 1.0), usual)
 
 
-def slower(problem: OptimalControl, unknowns: Unknowns, factor: float) -> Unknowns:
+def stretched(problem: OptimalControl, unknowns: Unknowns, factor: float) -> Unknowns:
     """The same with a longer final time, within its limits, where that is free."""
     if not problem.free_time:
         return unknowns

@@ -189,7 +189,7 @@ def search(
     def body(found: Found) -> Found:
         whole = (longest == 1.0) & (found.length == 1.0) & ~found.corrected & jnp.all(iterate.softness == 0)
         extra = jax.lax.cond(
-            whole, lambda: brought_back(problem, iterate, factors, found.path), lambda: nothing
+            whole, lambda: second_order_correction(problem, iterate, factors, found.path), lambda: nothing
         )
         a = jnp.where(whole, 1.0, 0.5 * found.length)
         return attempt(a, extra, found.newton, found.corrected | whole)
@@ -200,7 +200,7 @@ def search(
     return jax.lax.while_loop(unfinished, body, begun)
 
 
-def brought_back(
+def second_order_correction(
     problem: OptimalControl, iterate: Iterate, factors: Factors, path: Path
 ) -> tuple[Unknowns, Slacks]:
     """The least change, as the model weighs it, that takes away what a motion near an iterate violates."""

@@ -7,17 +7,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from natcoord_jax.control.conditions import (
-    Change,
-    Improved,
-    as_unknowns,
-    curvature,
-    improved,
-    least_curved,
-    left_of_conditions,
-    times,
-)
+from natcoord_jax.control.conditions import Change, as_unknowns, left_of_conditions
 from natcoord_jax.control.costates import Multipliers
+from natcoord_jax.control.improvement import Improved, curvature, improved, least_curved, times
 from natcoord_jax.control.iterate import Derivatives, Iterate, Model, Options, Slacks, largest
 from natcoord_jax.control.line_search import SMALL, Direction, missed, violation
 from natcoord_jax.control.problem import OptimalControl
@@ -37,7 +29,7 @@ HELD = 3.0
 """Curvature in what is free, in units of the cost, where the equations are violated as at the start: least
 time would else be at its lower bound before there is any motion that lasts as long."""
 FIXED = 1e9
-"""The same while a way to the goal is looked for: time and parameters stay."""
+"""The same in a feasibility restoration: time and parameters stay."""
 LEAST_BARRIER = 1e-10
 """Barrier parameter at the end, relative to the cost."""
 

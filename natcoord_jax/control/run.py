@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from natcoord_jax.control import sequential
-from natcoord_jax.control.attempts import NAMES, Search, other_ways, over
+from natcoord_jax.control.attempts import NAMES, Search, after_restoration, over
 from natcoord_jax.control.guess import GUESS, Guess, unknowns_of
 from natcoord_jax.control.iterate import Iterate, Options
 from natcoord_jax.control.problem import PROBLEM, OptimalControl, numeric
@@ -104,7 +104,7 @@ def optimise(
     search = Search(problem, Options(lifted, max_iterations, tol, goal_tol), progress, time_limit)
     found = search.run(lifted, start, last=method != "auto")
     if method == "auto" and not over(found) and search.left > 0:
-        found = other_ways(search, found, guess)
+        found = after_restoration(search, found, guess)
     return found
 
 

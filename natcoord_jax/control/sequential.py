@@ -38,7 +38,7 @@ ROOM = 0.01
 AT_REST = 1e-7
 """Relative size of a step that moves nothing any more."""
 STILL = 1e-4
-"""The same while a way to the goal is looked for."""
+"""The same in a feasibility restoration."""
 MISSED = 300.0
 """What it costs to miss a soft goal by its scale, in units of the cost."""
 NEAR = 0.01

@@ -1,4 +1,4 @@
-"""Optimal control from where a user starts: ways to the goal, reasons, several starts, paths of problems."""
+"""Optimal control from where a user starts: restoration, reasons, several starts, paths of problems."""
 
 import dataclasses
 
@@ -57,11 +57,11 @@ def swing_up(pendulum, **options):
     return nc.OptimalControl(*pendulum, **(given | options))
 
 
-# Ways to the goal
+# Feasibility restoration
 
 
 @pytest.mark.slow
-def test_a_way_is_found_where_the_first_attempt_gets_lost(pendulum):
+def test_feasibility_is_restored_where_the_first_attempt_gets_lost(pendulum):
     """Least time from a guess that goes straight up, which the motor cannot; IPOPT ends infeasible there.
 
     From random starts IPOPT finds 2.54075 s on the same equations.
@@ -69,11 +69,11 @@ def test_a_way_is_found_where_the_first_attempt_gets_lost(pendulum):
     problem = swing_up(pendulum, cost=nc.cost.Duration(), free_time=(0.5, 10.0))
     found = nc.optimise(problem, progress=False)
     assert found.ok and found.cost == pytest.approx(2.5407527, rel=1e-6)
-    first, way = found.attempts
+    first, restoration = found.attempts
     assert first.outcome is nc.Outcome.STALLED and "hinge" in first.reason and first.seconds > 0
-    assert way.outcome.ok and first.iterations + way.iterations < len(found.history)
+    assert restoration.outcome.ok and first.iterations + restoration.iterations < len(found.history)
     assert [row.iteration for row in found.history] == list(range(1, len(found.history) + 1))
-    assert "before that, a way to the goal" in found.explain()
+    assert "before that, feasibility restoration" in found.explain()
 
 
 @pytest.mark.slow
@@ -108,7 +108,7 @@ def test_a_soft_goal_costs_what_missing_it_does(made):
     np.testing.assert_allclose(np.asarray(iterate.unknowns.coefficients)[:, 0], exact, rtol=1e-5)
 
 
-def test_first_coefficients_of_inputs_move_where_a_way_is_looked_for(made):
+def test_first_coefficients_of_inputs_move_in_a_restoration(made):
     """They are no parameters: only time and what is free besides stays as it is."""
     problem = numeric(turn(made, inputs=nc.inputs.piecewise_linear(5)))
     scale = goal_scale(problem, unknowns_of(problem, None, True))
