@@ -288,7 +288,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--starts", type=int, default=20)
     parser.add_argument("--problems", nargs="*", default=list(CASES), metavar="NAME")
     parser.add_argument("--method", default="auto")
-    parser.add_argument("--limit", type=int, default=200)
+    parser.add_argument("--limit", type=int, default=500)
     parser.add_argument("--patience", type=float, default=120.0, help="seconds a start is left to IPOPT")
     parser.add_argument("--no-peers", action="store_true")
     parser.add_argument("--json", type=Path)

@@ -45,6 +45,7 @@ Every program takes a few hundred, and a process that runs out of them crashes i
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--check-types", action="store_true", help="check shapes and types at run time")
+    parser.addoption("--write-golden", action="store_true", help="write the file of test_golden.py anew")
     parser.addoption("--hunt-seeds", type=int, help="random numbers of each structure in test_hunt.py")
 
 

@@ -144,3 +144,7 @@ EQUILIBRIUM = 1e-9
 
 # Second differences of an energy over 1e-4 of its invariants, for the size of what is rounded.
 STIFFNESS_BY_ENERGIES = 1e-3
+
+# --- scenes as they were (see test_golden) ----------------------------------------------------------------
+GOLDEN_STATE = 1e-12
+GOLDEN_GRADIENT = 1e-9

@@ -1,0 +1,120 @@
+"""Twelve scenes as they were: states, gradients, iterations and the size of their programs.
+
+What rebuilds the engine changes none of them. `pytest tests/test_golden.py -m "slow or exhaustive"
+--write-golden` writes the file anew, where a change is meant; the commit says why.
+"""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import tolerances as tol
+
+import natcoord_jax as nc
+from natcoord_jax import gallery
+
+FILE = Path(__file__).with_name("golden.json")
+STEPS = 20
+SCENES = (
+    "heavy_top",
+    "spacecraft",
+    "double_pendulum",
+    "torsion_spring",
+    "four_bar",
+    "bricard",
+    "slider_crank",
+    "binary_tree",
+    "robot_arm",
+    "mass_ladder",
+    "rope",
+    "cantilever",
+)
+EVERY_TIME = {("heavy_top", 2), ("spacecraft", 2), ("four_bar", 2), ("heavy_top", 4)}
+"""The others compile for longer."""
+CASES = [
+    pytest.param(
+        scene,
+        order,
+        marks=pytest.mark.slow if (scene, order) in EVERY_TIME else pytest.mark.exhaustive,
+        id=f"{scene}, {order}",
+    )
+    for scene in SCENES
+    for order in (2, 4)
+]
+
+
+def equations(program: Any) -> Iterator[Any]:
+    """All operations of a traced program, those of loops and branches once."""
+    for equation in program.eqns:
+        yield equation
+        for inner in jax.tree.leaves(list(equation.params.values()), is_leaf=is_program):
+            if is_program(inner):
+                yield from equations(getattr(inner, "jaxpr", inner))
+
+
+def is_program(x: Any) -> bool:
+    return hasattr(getattr(x, "jaxpr", x), "eqns")
+
+
+def size(function: Any, *arguments: Any) -> dict[str, int]:
+    """Operations and loops of a function's program."""
+    names = [e.primitive.name for e in equations(jax.make_jaxpr(function)(*arguments).jaxpr)]
+    return {"operations": len(names), "loops": sum(name in ("while", "scan") for name in names)}
+
+
+def measured(name: str, order: int) -> dict[str, Any]:
+    """What the file holds of a scene."""
+    example = gallery.load(name)
+    scheme = nc.EnergyMomentum(order=order)
+    inputs = example.inputs(STEPS, scheme=scheme)
+    numbers, structure = eqx.partition((example.system, example.state, inputs), eqx.is_inexact_array)
+
+    def run(numbers: Any, v: Any, dt: Any) -> tuple[Any, nc.Trajectory]:
+        system, state, inputs = eqx.combine(numbers, structure)
+        state = eqx.tree_at(lambda s: s.v, state, v)
+        trajectory = nc.simulate(system, state, dt=dt, inputs=inputs, scheme=scheme)
+        return jnp.sum(trajectory.v[-1] ** 2) + jnp.sum(trajectory.q[-1] ** 2), trajectory
+
+    by_start = jax.value_and_grad(run, argnums=(1, 2), has_aux=True)
+    arguments = numbers, example.state.v, jnp.asarray(example.dt, float)
+    (_, trajectory), (by_v, by_dt) = jax.jit(by_start)(*arguments)
+    assert int(trajectory.result) == 0
+    return {
+        "q": trajectory.q[-1].ravel().tolist(),
+        "v": trajectory.v[-1].ravel().tolist(),
+        "by v": by_v.ravel().tolist(),
+        "by dt": float(by_dt),
+        "iterations": int(trajectory.iterations),
+        "value": size(run, *arguments),
+        "gradient": size(by_start, *arguments),
+    }
+
+
+def distance(a: Any, b: Any) -> float:
+    """Relative, by the largest number."""
+    a, b = np.asarray(a), np.asarray(b)
+    return float(np.max(np.abs(a - b), initial=0.0) / max(np.max(np.abs(b), initial=0.0), 1e-300))
+
+
+@pytest.mark.parametrize(("scene", "order"), CASES)
+def test_scenes_are_as_they_were(scene, order, request):
+    found, key = measured(scene, order), f"{scene}, {order}"
+    if request.config.option.write_golden:
+        golden = json.loads(FILE.read_text()) if FILE.exists() else {}
+        golden[key] = found
+        FILE.write_text(json.dumps(dict(sorted(golden.items())), indent=0) + "\n")
+    golden = json.loads(FILE.read_text())[key]
+    assert distance(found["q"], golden["q"]) <= tol.GOLDEN_STATE
+    assert distance(found["v"], golden["v"]) <= tol.GOLDEN_STATE
+    assert distance(found["by v"], golden["by v"]) <= tol.GOLDEN_GRADIENT
+    assert distance(found["by dt"], golden["by dt"]) <= tol.GOLDEN_GRADIENT
+    assert found["iterations"] == golden["iterations"]
+    for program in ("value", "gradient"):
+        for what, count in golden[program].items():
+            assert found[program][what] <= count, f"{what} of the {program}'s program"
