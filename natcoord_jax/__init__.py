@@ -66,6 +66,7 @@ from natcoord_jax.control import (
     regulator,
     to_nlp,
 )
+from natcoord_jax.core.constraint import Constraint, VelocityConstraint
 from natcoord_jax.core.force import Field, Force, Load
 from natcoord_jax.core.handles import ground
 from natcoord_jax.core.jit import jit, keep_programs, set_effort
@@ -82,6 +83,7 @@ from natcoord_jax.effects.beams import (
     DirectorElement,
     NonlinearBeamElement,
 )
+from natcoord_jax.effects.constraints import PointOnLine, PointOnPlane, Rod, Rolling
 from natcoord_jax.effects.joints import (
     Coupling,
     Cylindrical,
@@ -135,6 +137,7 @@ __all__ = [
     "Check",
     "CircularSection",
     "ComputedTorque",
+    "Constraint",
     "Continuation",
     "Coupling",
     "Cylinder",
@@ -149,8 +152,8 @@ __all__ = [
     "Distance",
     "Drive",
     "Ellipsoid",
-    "Equilibrium",
     "EnergyMomentum",
+    "Equilibrium",
     "Feedback",
     "Field",
     "Fixed",
@@ -170,8 +173,8 @@ __all__ = [
     "Load",
     "Modes",
     "NonlinearBeamElement",
-    "NonlinearSpring",
     "NonlinearProgram",
+    "NonlinearSpring",
     "Optima",
     "OptimalControl",
     "Outcome",
@@ -182,6 +185,8 @@ __all__ = [
     "Point",
     "PointForce",
     "PointMass",
+    "PointOnLine",
+    "PointOnPlane",
     "Potential",
     "Prismatic",
     "QuadraticSpring",
@@ -190,6 +195,8 @@ __all__ = [
     "Result",
     "Revolute",
     "RigidBody",
+    "Rod",
+    "Rolling",
     "Scene",
     "Screw",
     "Section",
@@ -204,6 +211,7 @@ __all__ = [
     "TubularSection",
     "Universal",
     "VariationalMidpoint",
+    "VelocityConstraint",
     "accuracy",
     "animate",
     "assemble",

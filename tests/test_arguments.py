@@ -139,6 +139,10 @@ CALLS = {
     "PointForce": lambda w: {**MARKED((w.point,)), "force": [np.ones(3), f], "following": [False]},
     "BodyTorque": lambda w: {**MARKED((w.direction,)), "torque": [np.ones(3), f], "following": [False]},
     "PairTorque": lambda w: {**MARKED(w.triad[:2]), "torque": [1.0, f]},
+    "PointOnPlane": lambda w: {**MARKED((w.ends[0], w.direction, w.point)), "distance": NUMBER},
+    "PointOnLine": lambda w: MARKED((w.ends[0], w.direction, w.point)),
+    "Rod": lambda w: {**MARKED(w.ends), "length": NUMBER},
+    "Rolling": lambda w: {**MARKED((w.ends[0], w.direction, w.point)), "radius": NUMBER},
     "Spring": lambda w: {**MARKED(w.ends), "stiffness": NUMBER, "length": NUMBER},
     "QuadraticSpring": lambda w: {**MARKED(w.ends), "stiffness": NUMBER, "length": NUMBER},
     "NonlinearSpring": lambda w: {**MARKED(w.ends), "law": [f]},
@@ -308,7 +312,7 @@ MADE = {
     "Equilibrium", "Feedback", "Frame", "Growth", "Load", "Modes", "NonlinearProgram", "Optima", "Outcome",
     "Result", "SimulationError", "Solution", "State", "System", "Trajectory",
 }  # fmt: skip
-BASES = {"Field", "Force", "Joint", "Potential"}
+BASES = {"Constraint", "Field", "Force", "Joint", "Potential", "VelocityConstraint"}
 IN_MODULES = {"cost": nc.cost, "goal": nc.goal, "bounds": nc.bounds, "inputs": nc.inputs}
 BASES_IN_MODULES = {
     "cost.Cost", "cost.Sum", "goal.Goal", "goal.All", "bounds.Bound", "bounds.All", "bounds.Range",

@@ -122,6 +122,12 @@ TABLE = {
     nc.Coupling: Entry(
         lambda p: nc.Coupling((p.joint,) * 2, factors=(1.0, -0.7), coordinate=(0, 1)), nc.Cylindrical
     ),
+    nc.PointOnPlane: Entry(lambda p: nc.PointOnPlane((p.ends[0], p.triad[2], p.ends[1]), distance=0.2)),
+    nc.PointOnLine: Entry(lambda p: nc.PointOnLine((p.ends[0], p.triad[2], p.ends[1]))),
+    nc.Rod: Entry(lambda p: nc.Rod(p.ends)),
+    nc.Rolling: Entry(
+        lambda p: nc.Rolling((p.ends[0], p.triad[2], p.ends[1], nc.Direction(p.two, AXIS)), radius=0.3)
+    ),
     nc.Gravity: Entry(lambda p: nc.Gravity(vector=(1.0, -2.0, 3.0)), inside=False),
     nc.PointForce: Entry(
         lambda p: nc.PointForce((p.ends[0], *p.triad), force=_wave, following=True), inside=False
@@ -383,14 +389,18 @@ def test_derivatives_equal_differences(effect):
 # --- joints -----------------------------------------------------------------------------------------------
 
 
+RESIDUALS = pytest.mark.parametrize(
+    "joint", [e for e in TABLE if issubclass(e, nc.Joint | nc.Constraint)], ids=lambda e: e.__name__
+)
+
+
 @cache
 def constraint(joint: type):
-    """Compiled residual of a joint over the rows (2, 4, 3) of its bodies, and rows that obey it."""
+    """Compiled residual over the rows (k, 4, 3) of its bodies, and rows that obey it."""
     system, state, group = stage(joint)
-    effect = jax.tree.map(lambda x: x[0], group.effect)
-    place = system.frames[group.joints[0, 0]]
-    rows = jnp.concatenate([state.q.reshape(-1, 4, 3), jnp.zeros((1, 4, 3))])[group.bodies[0]]
-    return jax.jit(lambda x: effect.residual(*frames_at(place, x))), rows
+    effect, place = jax.tree.map(lambda x: x[0], (group.effect, group_places(system, group)))
+    rows = rows_with_ground(state.q)[group.bodies[0]]
+    return jax.jit(lambda x: effect.violation(place, x, state.coordinates, state.t)), rows
 
 
 @JOINT_TYPES
@@ -408,7 +418,7 @@ def test_residual_vanishes_in_the_assembled_pose(joint):
     assert np.max(np.abs(residual(rows))) <= tol.IDENTITY
 
 
-@JOINT_TYPES
+@RESIDUALS
 def test_residual_is_at_most_quadratic(joint):
     """Third differences vanish along any direction, second ones along some do not."""
     residual, rows = constraint(joint)
@@ -420,7 +430,7 @@ def test_residual_is_at_most_quadratic(joint):
     assert joint is nc.Spherical or np.max(np.abs(g[2] - 2 * g[1] + g[0])) > 1e-3
 
 
-@JOINT_TYPES
+@RESIDUALS
 def test_residual_does_not_see_rigid_motions(joint):
     """A common rotation of all rows and a common translation of the points change nothing."""
     residual, rows = constraint(joint)
@@ -434,7 +444,7 @@ def test_residual_does_not_see_rigid_motions(joint):
     assert np.max(np.abs(seen - unseen)) <= tol.INDIFFERENCE
 
 
-@JOINT_TYPES
+@RESIDUALS
 def test_central_differences_of_the_residual_are_exact(joint):
     """For a quadratic a central difference has no truncation at any step."""
     residual, rows = constraint(joint)

@@ -6,7 +6,6 @@ is the parameter of the load: forces, drives and inputs that are functions of ti
 """
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -21,7 +20,7 @@ from natcoord_jax.assembly.rates import row_rates
 from natcoord_jax.assembly.response import gather, respond, situation, stations
 from natcoord_jax.assembly.system import Group, System
 from natcoord_jax.assembly.tree import gather_slots, start_rates
-from natcoord_jax.assembly.violations import joint_residuals
+from natcoord_jax.assembly.violations import violations_of
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import gauss
@@ -124,17 +123,9 @@ class Static(eqx.Module):
         return force[0], torque[0] + torques[:-1]
 
     def gaps(self, state: State) -> Array:
-        """What relations between coordinates and joints miss."""
-        found = [jnp.zeros(0, state.q.dtype)]
-        for group in self.system.effects:
-            if group.multipliers:
-
-                def missing(effect, index):
-                    return effect.coefficients() @ state.coordinates[index] - effect.target(state.t)
-
-                found.append(jax.vmap(missing)(group.effect, group.coordinates).reshape(-1))
-        found += [value.reshape(-1) for _, value, _ in joint_residuals(self.system, state)]
-        return jnp.concatenate(found)
+        """What constraints miss."""
+        found = (x.reshape(-1) for x in violations_of(self.system, self.groups, state))
+        return jnp.concatenate([jnp.zeros(0, state.q.dtype), *found])
 
     def matrix(
         self, y: Float[Array, " unknowns"], weight: Array | float = 0.0

@@ -12,12 +12,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.coordinates import coordinate_rates, frames_of
-from natcoord_jax.assembly.diagnostics import rows_with_ground
+from natcoord_jax.assembly.diagnostics import group_places, rows_with_ground
 from natcoord_jax.assembly.momentum import inertia, wrench
 from natcoord_jax.assembly.rates import Twists, null_space, passed_on, row_rates, twists
 from natcoord_jax.assembly.response import gather, no_multipliers, respond, situation, stations
 from natcoord_jax.assembly.system import Group, System
-from natcoord_jax.core.joint import frames_at
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import gauss
 from natcoord_jax.maths.vectors import cross
@@ -28,16 +27,8 @@ def with_rest(x: Float[Array, "bodies *k"]) -> Float[Array, "bodies_and_ground *
     return jnp.concatenate([x, jnp.zeros_like(x[:1])])
 
 
-def joint_constraint_rates(
-    effect, frames: Array, rows: Float[Array, "2 4 3"], velocity: Array, spin: Array
-) -> Float[Array, " m"]:
-    """Rates of the constraints of one joint from velocities and angular velocities of its two bodies."""
-    rates = row_rates(rows, velocity, spin)
-    return jax.jvp(lambda x: effect.residual(*frames_at(frames, x)), (rows,), (rates,))[1]
-
-
 def relations_of(system: System) -> list[Group]:
-    """Relations between joint coordinates, the first of the constraints."""
+    """Relations between joint coordinates and constraints on markers, the first of the constraints."""
     return [g for g in system.effects if g.multipliers]
 
 
@@ -62,7 +53,7 @@ def relative_rates(
     relations, rotors = relations_of(system), rotors_of(system)
     extended = rows_with_ground(rows.reshape(-1, 3))
     along = jnp.zeros(0, rows.dtype)
-    if relations or rotors:
+    if rotors or any(g.source == "coordinates" for g in relations):
         along = coordinate_rates(system, extended, row_rates(extended, velocity, spin), spin)
     turning = [along[g.coordinates[:, 0]] for g in rotors]
 
@@ -70,11 +61,17 @@ def relative_rates(
         wanted = jax.jvp(effect.target, (t,), (jnp.ones_like(t),))[1]
         return effect.coefficients() @ along[index] - wanted
 
-    found = [jax.vmap(relation)(g.effect, g.coordinates) for g in relations]
-    for group in loops_of(system):
-        pairs = [x[group.bodies] for x in (extended, velocity, spin)]
-        frames = system.frames[group.joints[:, 0]]
-        found.append(jax.vmap(joint_constraint_rates)(group.effect, frames, *pairs).reshape(-1))
+    def constraint(effect, place, rows, velocity, spin):
+        return effect.violation_rate(place, rows, row_rates(rows, velocity, spin), spin, t, 1.0)
+
+    found = []
+    for group in (*relations, *loops_of(system)):
+        if group.source == "coordinates":
+            found.append(jax.vmap(relation)(group.effect, group.coordinates))
+        else:
+            here = (x[group.bodies] for x in (extended, velocity, spin))
+            rates = jax.vmap(constraint)(group.effect, group_places(system, group), *here)
+            found.append(rates.reshape(-1))
     none = [along[:0]]
     return jnp.concatenate(none + turning), jnp.concatenate(none + found)
 
@@ -85,7 +82,7 @@ class Gains(eqx.Module):
     Attributes:
         rows: of the rows of the bodies.
         rotors: of the joint coordinates that carry rotors.
-        constraints: of relations between coordinates, then of joints that close loops.
+        constraints: of relations between coordinates and between markers, then of joints that close loops.
     """
 
     rows: Float[Array, "*u bodies 4 3"]

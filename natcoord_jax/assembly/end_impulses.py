@@ -101,7 +101,13 @@ def _work(
     def mean(effect, index):
         return effect.coefficients() @ turning[index]
 
-    rates = jnp.concatenate([jax.vmap(mean)(g.effect, g.coordinates) for g in relations_of(system)])
-    powers = [power[:, 0] for group, power in zip(groups, found.power) if group.multipliers]
-    booked = jnp.concatenate(powers)[: rates.shape[0]]
-    return impulses[: rates.shape[0]] * rates - 0.5 * booked
+    done, position = [], 0
+    for group, power in zip(groups, found.power):
+        if group.multipliers and group.source != "joint":
+            size = group.count * group.multipliers
+            here, position = impulses[position : position + size], position + size
+            if group.source == "coordinates":
+                done.append(here * jax.vmap(mean)(group.effect, group.coordinates) - 0.5 * power[:, 0])
+            else:
+                done.append(jnp.zeros_like(here))
+    return jnp.concatenate(done)

@@ -21,6 +21,7 @@ from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.host import on_host, stacked
 from natcoord_jax.core.joint import Joint, frames_at
 from natcoord_jax.core.markers import Attachment, Marker
+from natcoord_jax.core.potential import place_markers
 from natcoord_jax.core.state import State
 
 JOINT_FIELDS = ("parent", "child", "point", "axis", "second", "name", "parent_point")
@@ -173,9 +174,17 @@ class Layout:
                 f"not {markers!r}"
             )
         weights = stacked([self.poses.weights(m) for m in markers])
+        if type(effect).assembled_at is not Effect.assembled_at:
+            effect = effect.assembled_at(self._placed(markers, weights))
         drop = [f for f in ("markers", "name", "joint") if f in type(effect).__dataclass_fields__]
         bodies = [self.body(m.body) for m in markers]
         return Instance(name, bare(effect, drop, label), "markers", bodies, weights=weights)
+
+    def _placed(self, markers: Any, weights: Array) -> Array:
+        """Where markers are in the assembled pose."""
+        bodies = [self.poses.of(m.body) for m in markers]
+        rows = _rows([self.poses.position[b] for b in bodies], [self.poses.rotation[b] for b in bodies])
+        return _place_markers(weights, rows)
 
     def _on_coordinates(self, name: str, effect: CoordinateEffect, label: str) -> Instance:
         many = isinstance(effect.joint, tuple)
@@ -236,6 +245,7 @@ MOTION = "position", "rotation", "velocity", "angular_velocity"
 """What the rows of a body and their velocities are made of."""
 
 _frames_at = on_host(frames_at)
+_place_markers = on_host(place_markers)
 
 
 def _stacked_rows(points: list[Array], rotations: list[Array]) -> Float[Array, "n 4 3"]:

@@ -90,7 +90,7 @@ def _with_relations(system: System, places: np.ndarray, index: int, change: Arra
     changes = jnp.zeros(len(places)).at[index].set(change)
     others = np.delete(np.arange(len(places)), index)
     for group in system.effects:
-        if group.multipliers and others.size:
+        if group.multipliers and group.source == "coordinates" and others.size:
             factors = jax.vmap(lambda e: e.coefficients())(group.effect)
             every = jnp.zeros((group.count, len(system.structure.coordinates)))
             every = every.at[jnp.arange(group.count)[:, None], group.coordinates].add(factors)

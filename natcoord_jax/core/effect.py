@@ -131,6 +131,10 @@ class Effect(Part):
     couples: ClassVar[bool] = False
     silent: ClassVar[bool] = True
 
+    def assembled_at(self, x: Float[Array, "k *m 3"]) -> "Effect":
+        """This effect with the numbers that it takes from where its markers are in the assembled pose."""
+        return self
+
     @abc.abstractmethod
     def respond(self, place: Array, motion: Motion, now: Now, lam: Float[Array, "s m"]) -> Response:
         """Forces, torques, constraint rates and power over a step.

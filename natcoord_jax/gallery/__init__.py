@@ -15,6 +15,7 @@ from natcoord_jax.gallery.open_tree import open_tree
 from natcoord_jax.gallery.pendulums import double_pendulum, pendulum, torsion_spring
 from natcoord_jax.gallery.plugging import plugging
 from natcoord_jax.gallery.robot import robot_cable
+from natcoord_jax.gallery.rolling import bicycle
 from natcoord_jax.gallery.spacecraft import spacecraft
 from natcoord_jax.gallery.stiff import mass_ladder, stiff_chain
 from natcoord_jax.gallery.tops import dzhanibekov, fast_top, free_body, heavy_top
@@ -33,6 +34,7 @@ SCENES: Mapping[str, Callable[..., Example]] = {
     "four_bar": four_bar,
     "bricard": bricard,
     "slider_crank": slider_crank,
+    "bicycle": bicycle,
     "open_tree": open_tree,
     "chain": chain,
     "binary_tree": binary_tree,

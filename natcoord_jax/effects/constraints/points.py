@@ -1,0 +1,129 @@
+"""Constraints between points: on a plane, on a line, at a distance."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from natcoord_jax.core.arguments import is_a
+from natcoord_jax.core.checks import as_array, positive
+from natcoord_jax.core.constraint import Constraint
+from natcoord_jax.core.effect import replace_fields
+from natcoord_jax.core.handles import Handle
+from natcoord_jax.core.host import on_host
+from natcoord_jax.core.joint import Joint
+from natcoord_jax.core.markers import Attachment, Direction, Marker, Markers
+from natcoord_jax.core.numeric import Number
+from natcoord_jax.maths.rotations import frame_from_axis
+from natcoord_jax.maths.vectors import dot
+
+_triad = on_host(frame_from_axis)
+
+
+def perpendicular(along: Marker) -> tuple[Marker, Marker]:
+    """Two directions of the same body at right angles to one and to each other."""
+    across = _triad(as_array(along.vector, float), None)[:2]
+    return tuple(Direction(along.body, a, local=along.local) for a in across)  # pyright: ignore
+
+
+class PointOnPlane(Constraint):
+    """A point that stays in a plane, or at a distance from it.
+
+    Attributes:
+        markers: a point of the plane, its normal as a direction of the same body, and the point.
+        distance: of the point from the plane along the normal [m].
+
+    Example:
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import natcoord_jax as nc
+        >>> table = nc.Point(nc.ground), nc.Direction(nc.ground, (0, 0, 1))
+        >>> nc.PointOnPlane((*table, nc.Point(nc.ground))).multipliers
+        1
+    """
+
+    markers: Any = eqx.field(metadata=is_a(Markers(1, 1, more=True)))
+    distance: Any = eqx.field(default=0.0, kw_only=True, metadata=is_a(Number()))
+
+    kind: ClassVar[str] = "point on plane"
+    multipliers: ClassVar[int] = 1
+
+    def residual(self, x: Array) -> Array:
+        """How far the point is from where it should be [m]."""
+        return (dot(x[1], x[2] - x[0]) - self.distance)[None]
+
+
+class PointOnLine(Constraint):
+    """A point that stays on a straight line of another body.
+
+    Attributes:
+        markers: a point of the line, its direction in the same body, and the point, in [m] as all points.
+
+    Example:
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import natcoord_jax as nc
+        >>> wire = nc.Point(nc.ground), nc.Direction(nc.ground, (1, 0, 0))
+        >>> nc.PointOnLine((*wire, nc.Point(nc.ground))).multipliers
+        2
+    """
+
+    markers: Any = eqx.field(metadata=is_a(Markers(1, 1, more=True)))
+
+    kind: ClassVar[str] = "point on line"
+    multipliers: ClassVar[int] = 2
+
+    def attach(self, find: Callable[[Handle], tuple[Joint, Array]]) -> Sequence[Marker | Attachment]:
+        """A point of the line, two directions across it, and the point."""
+        origin, along, point = self.markers
+        return origin, *perpendicular(along), point
+
+    def residual(self, x: Array) -> Array:
+        """How far the point is from the line [m]."""
+        return jnp.stack([dot(x[1], x[3] - x[0]), dot(x[2], x[3] - x[0])])
+
+
+class Rod(Constraint):
+    """A rigid rod without mass between two points.
+
+    Attributes:
+        markers: two points.
+        length: [m]; None: as in the assembled pose.
+
+    Example:
+        A double pendulum of point masses:
+
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import natcoord_jax as nc
+        >>> scene = nc.Scene()
+        >>> upper = scene.add(nc.PointMass(mass=1.0, position=(1, 0, 0)))
+        >>> lower = scene.add(nc.PointMass(mass=1.0, position=(2, 0, 0)))
+        >>> first = scene.add(nc.Rod((nc.Point(nc.ground), nc.Point(upper))))
+        >>> second = scene.add(nc.Rod((nc.Point(upper), nc.Point(lower))))
+        >>> system, state = scene.compile()
+        >>> system.structure.dofs
+        4
+    """
+
+    markers: Any = eqx.field(metadata=is_a(Markers(2)))
+    length: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Number("positive")))
+
+    kind: ClassVar[str] = "rod"
+    multipliers: ClassVar[int] = 1
+    couples: ClassVar[bool] = True
+
+    def assembled_at(self, x: Array) -> "Rod":
+        """With its length.
+
+        Raises:
+            ValueError: for points that coincide.
+        """
+        if self.length is not None:
+            return self
+        found = jnp.sqrt(jnp.sum((x[1] - x[0]) ** 2))
+        return replace_fields(self, length=positive(found, "rod: the distance of its points", "m"))
+
+    def residual(self, x: Array) -> Array:
+        """Half the square of its stretch, by its length, to first order [m]."""
+        along = x[1] - x[0]
+        return (0.5 * (dot(along, along) / self.length - self.length))[None]
