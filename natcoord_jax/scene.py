@@ -12,14 +12,17 @@ from jaxtyping import Array
 
 from natcoord_jax.assembly.build import build
 from natcoord_jax.assembly.system import System
+from natcoord_jax.bodies.nodes import Nodes
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.bodies import Body
 from natcoord_jax.core.checks import as_array, is_concrete, require_double
 from natcoord_jax.core.effect import Effect, replace_fields
+from natcoord_jax.core.elements import Elements
 from natcoord_jax.core.handles import Handle, ground
 from natcoord_jax.core.host import on_host
 from natcoord_jax.core.joint import Joint
 from natcoord_jax.core.kinds import BODY, FLAG, JOINT, NAME, Choice, HandleOf, of
+from natcoord_jax.core.nodes import NodeSet
 from natcoord_jax.core.numeric import Number, Numbers
 from natcoord_jax.core.recipe import Recipe
 from natcoord_jax.core.state import State
@@ -33,7 +36,15 @@ from natcoord_jax.stepping.admissibility import (
 from natcoord_jax.stepping.assemble import assemble as assemble_state
 from natcoord_jax.stepping.sparsity import with_sparsity
 
-PART = of("a body, a joint, an effect or a beam, as nc.RigidBody(...)", Body, Joint, Effect, Recipe)
+PART = of(
+    "a body, a joint, an effect, a beam, nodes or elements, as nc.RigidBody(...)",
+    Body,
+    Joint,
+    Effect,
+    Recipe,
+    Nodes,
+    Elements,
+)
 
 _scene_numbers = itertools.count(1)
 
@@ -64,16 +75,19 @@ class Scene:
         self.joints: dict[str, Joint] = {}
         self.effects: dict[str, Effect] = {}
         self.recipes: dict[str, Recipe] = {}
+        self.nodes: dict[str, Nodes] = {}
+        self.elements: dict[str, Elements] = {}
 
     @checked("Scene.add", part=PART)
-    def add(self, part: Body | Joint | Effect | Recipe) -> Any:
-        """Add a body, a joint, another effect, or a recipe of several of them (a beam).
+    def add(self, part: Body | Joint | Effect | Recipe | Nodes | Elements) -> Any:
+        """Add a body, a joint, another effect, a recipe of several of them (a beam), or thousands at once.
 
         Args:
             part: what to add.
 
         Returns:
-            The handle that joints, effects and sensors refer to it with; of a recipe, what it returns.
+            The handle that joints, effects and sensors refer to it with; of a recipe, what it returns; of
+            nodes, their set.
 
         Raises:
             ValueError: for a duplicate name, a part of another scene, or a joint of a body with itself.
@@ -85,6 +99,10 @@ class Scene:
             store, kind, label = self.joints, "joint", type(part).__name__.lower()
         elif isinstance(part, Effect):
             store, kind, label = self.effects, "effect", type(part).kind
+        elif isinstance(part, Nodes):
+            store, kind, label = self.nodes, "nodes", "nodes"
+        elif isinstance(part, Elements):
+            store, kind, label = self.elements, "effect", f"{type(part.effect).kind} elements"
         else:
             store, kind, label = self.recipes, "recipe", part.kind
         given: str | None = getattr(part, "name", None)
@@ -95,6 +113,10 @@ class Scene:
             made = part.add_to(self, name)
             store[name] = part
             return made
+        if isinstance(part, Nodes):
+            store[name] = part
+            places = np.asarray(part.position) if is_concrete(part.position) else part.position
+            return NodeSet(name, self._number, np.arange(len(places)), places)
         self._check(part, name)
         store[name] = part
         handle = Handle(kind, name, self._number)
@@ -104,7 +126,7 @@ class Scene:
         return handle
 
     def _stores(self) -> tuple[dict[str, Any], ...]:
-        return self.bodies, self.joints, self.effects, self.recipes
+        return self.bodies, self.joints, self.effects, self.recipes, self.nodes, self.elements
 
     def _free_name(self, label: str) -> str:
         numbered = (f"{label} {k}" for k in itertools.count(1))
@@ -124,10 +146,11 @@ class Scene:
             body, mass_block=_sum(body.mass_block, as_array(block, float))
         )
 
-    def _check(self, part: Body | Joint | Effect, name: str) -> None:
+    def _check(self, part: Body | Joint | Effect | Elements, name: str) -> None:
         """Every handle in the part must be of this scene."""
         if isinstance(part, Body):
             return
+        part = part.effect if isinstance(part, Elements) else part
         if isinstance(part, Joint):
             if part.parent == part.child:
                 raise ValueError(
@@ -155,7 +178,11 @@ class Scene:
         """
         if handle == ground:
             return None
-        store = {"body": self.bodies, "joint": self.joints, "effect": self.effects}[handle.kind]
+        owner, _, number = handle.name.partition("[")
+        if handle.kind == "body" and owner in self.nodes and handle.scene == self._number:
+            return self.nodes[owner].body(int(number[:-1]))
+        effects = {**self.effects, **{name: part.effect for name, part in self.elements.items()}}
+        store = {"body": self.bodies, "joint": self.joints, "effect": effects}[handle.kind]
         if handle.scene != self._number or handle.name not in store:
             raise ValueError(
                 f"{user} refers to {handle!r}, which is not part of this scene; "
@@ -186,9 +213,10 @@ class Scene:
             ValueError: for an empty scene, a gap in a joint (with its name and size), a body without inertia
                 along a free motion, or a solver that cannot handle the scene.
         """
-        if not self.bodies:
+        if not self.bodies and not self.nodes:
             raise ValueError("the scene has no bodies; add one before compiling")
-        system, state = build(self.bodies, self.joints, self.effects, solver)
+        parts = self.bodies, self.joints, self.effects, solver, self.nodes, self.elements
+        system, state = build(*parts)
         state = state.at_time(t)
         if assemble:
             state = assemble_state(system, state)

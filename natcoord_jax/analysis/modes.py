@@ -182,15 +182,21 @@ def _problem(system: System, state: State, inputs: Array, rotation: Array) -> tu
     def gaps(x: Array) -> Array:
         return static.gaps(static.displaced(jnp.concatenate([x, none])))
 
-    rows = jnp.concatenate([jax.jacfwd(gaps)(jnp.zeros(size)), _held(system)])
+    rows = jnp.concatenate([jax.jacfwd(gaps)(jnp.zeros(size)), _held(system, state)])
     held = jnp.zeros(rows.shape[0] - none.shape[0])
     return _matrices(_Steady(system, state, inputs, rotation, jnp.concatenate([none, held])), rows, size)
 
 
-def _held(system: System) -> np.ndarray:
-    """Rates of the turns of point masses, which have no inertia and do not turn."""
+def _held(system: System, state: State) -> Array:
+    """Rates of the turns of point masses, and of directors about themselves: there are none."""
+    size = 6 * len(system.structure.bodies)
     turns = [6 * point + k for point in system.structure.points for k in (3, 4, 5)]
-    return np.eye(6 * len(system.structure.bodies))[turns]
+    rows, first = jnp.eye(size)[np.array(turns, int)], state.q.reshape(-1, 4, 3)[:, 1]
+    directed = system.structure.directors
+    own = jnp.zeros((len(directed), size))
+    places = 6 * np.array(directed, int)[:, None] + np.arange(3, 6)
+    own = own.at[np.arange(len(directed))[:, None], places].set(first[np.array(directed, int)])
+    return jnp.concatenate([rows, own])
 
 
 @checked(system=SYSTEM, state=STATE, count=Whole(1), rotation=COMPONENTS, inputs=Vector(None), damped=FLAG)

@@ -98,7 +98,7 @@ class Static(eqx.Module):
         sums = -(jnp.concatenate([force, torque], axis=1) + jnp.concatenate(pulled, axis=1))
         # The directors of a point mass are held where they are.
         turned = y[: self.balances].reshape(-1, 6)[:, 3:]
-        sums = sums.at[:, 3:].add(self.system.idle_inertia[:, None] * turned)
+        sums = sums.at[:, 3:].add(self.system.idle_torque(self.state.q.reshape(-1, 4, 3), turned))
         return jnp.concatenate([sums.reshape(-1), self.gaps(state)])
 
     def constraint_loads(self, state: State, y: Array) -> tuple[Array, Array]:

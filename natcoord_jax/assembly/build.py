@@ -6,40 +6,50 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from natcoord_jax.assembly.bodies import Bodies
 from natcoord_jax.assembly.choice import choose_solver, elimination_order
 from natcoord_jax.assembly.coordinates import coordinate_values, state_rates
 from natcoord_jax.assembly.diagnostics import rows_with_ground
 from natcoord_jax.assembly.graph import make_tree
-from natcoord_jax.assembly.grouping import stack
+from natcoord_jax.assembly.grouping import element_group, stack
 from natcoord_jax.assembly.layout import Layout
 from natcoord_jax.assembly.roundness import symmetries
 from natcoord_jax.assembly.system import Structure, System
-from natcoord_jax.core.bodies import Body
+from natcoord_jax.core.bodies import DIRECTOR, POINT, Body
 from natcoord_jax.core.checks import as_array, is_concrete
 from natcoord_jax.core.effect import Effect, replace_fields
-from natcoord_jax.core.host import on_host, stacked
+from natcoord_jax.core.elements import Elements
+from natcoord_jax.core.host import on_host
 from natcoord_jax.core.joint import Joint
+from natcoord_jax.core.names import compact
 from natcoord_jax.core.state import State
 
 
 def build(
-    bodies: dict[str, Body], joints: dict[str, Joint], effects: dict[str, Effect], solver: str | None
+    singles: dict[str, Body],
+    joints: dict[str, Joint],
+    effects: dict[str, Effect],
+    solver: str | None,
+    sets: dict[str, Any] | None = None,
+    elements: dict[str, Elements] | None = None,
 ) -> tuple[System, State]:
     """Number bodies along the spanning tree, group equal kinds, and lay out the state."""
+    bodies = Bodies(singles, sets or {})
     layout = Layout(bodies, joints, effects)
     instances = [layout.effect_instance(name, effect) for name, effect in effects.items()]
     layout.number_accounts(instances)
     joint_groups = stack(layout.joint_instances(), len(bodies))
     groups = stack(instances, len(bodies))
+    groups += tuple(element_group(layout, name, part) for name, part in (elements or {}).items())
     tree = make_tree(layout.spanning, layout.motions())
     multipliers = sum(g.count * g.multipliers for g in groups)
     relations = multipliers
     multipliers += sum(g.count * g.multipliers for g in joint_groups if not g.in_tree)
-    internal = 6 * sum(b.oriented for b in bodies.values())
-    ordered = [list(bodies)[i] for i in layout.spanning.order]
+    # A director is as long as it was: one constraint; a triad has six.
+    internal = sum({3: 6, 2: 1, 0: 0}[len(own)] for own in bodies.rotations)
     structure = Structure(
-        bodies=tuple(ordered),
-        joints=tuple(layout.names[j] if j >= 0 else "" for j in layout.joint_order),
+        bodies=layout.ordered_names,
+        joints=layout.ordered_joints,
         inputs=tuple(layout.inputs),
         works=tuple(layout.works),
         coordinates=tuple((name, k) for name, k, _ in layout.coordinates),
@@ -48,12 +58,13 @@ def build(
         multipliers=multipliers,
         solver=solver or choose_solver(tree, multipliers, joint_groups, groups, len(bodies)),
         constraints=internal + relations + sum(g.count * g.multipliers for g in joint_groups),
-        points=tuple(k for k, body in enumerate(layout.ordered_bodies()) if not body.oriented),
+        points=compact([k for k, own in enumerate(layout.rotations) if own == POINT]),
+        directors=compact([k for k, own in enumerate(layout.rotations) if own == DIRECTOR]),
         dofs=len(tree.slot_of) - multipliers,
-        shapes=tuple(_drawn(body.shape) for body in layout.ordered_bodies()),
+        shapes=tuple(_drawn(bodies.shapes[k]) for k in layout.order),
     )
     system = System(
-        stacked([b.mass_block for b in layout.ordered_bodies()]),
+        layout.every("mass_block"),
         layout.frames(),
         layout.joint_bodies(),
         tree,
@@ -81,6 +92,8 @@ def with_symmetries(system: System, state: State) -> System:
     """
     tree, count = system.tree, len(system.structure.bodies)
     single = tree.ball & ~np.isin(np.arange(count), tree.parent)
+    if tree.directed is not None:
+        single = single & ~tree.directed
     for group in (*system.effects, *system.joints):
         if group.effect.elastic or (group.source == "joint" and not group.in_tree):
             single = single & ~np.isin(np.arange(count), group.bodies)

@@ -27,7 +27,8 @@ class Collection(eqx.Module):
     def of(cls, receivers: np.ndarray, count: int) -> "Collection":
         """Collection for the receivers of all entries; what goes beyond the last one falls away."""
         flat = np.asarray(receivers).reshape(-1)
-        own = [np.flatnonzero(flat == receiver) for receiver in range(count)]
+        order = np.argsort(flat, kind="stable")
+        own = np.split(order, np.searchsorted(flat[order], np.arange(1, count + 1)))[:count]
         if max(map(len, own), default=0) <= ROW:
             return cls(_padded(own, len(flat)), None)
         pieces = [[entries[k : k + ROW] for k in range(0, len(entries), ROW)] for entries in own]

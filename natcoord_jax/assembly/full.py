@@ -170,7 +170,7 @@ class FullStep(Form):
         given = self.system, self.groups, situations, at, velocity
         found = momentum_balance(*given, multipliers, self.h, self.tableau)
         # A point mass keeps its directors by an idle inertia, as in `body_balance`.
-        torque = found.torque + self.system.idle_inertia[:, None] * at.spin[:, :-1]
+        torque = found.torque + self.system.idle_torque(self.start[:-1], at.spin[:, :-1])
         wrenches = jnp.moveaxis(jnp.concatenate([found.force, torque], axis=-1), 0, 1)
         rows = project_rows(found.rows, y, self.balances, self.outset.projector)
         residual = jnp.concatenate([wrenches.reshape(-1), rows])
@@ -181,7 +181,8 @@ class FullStep(Form):
         width = 6 * self.tableau.stages
         local = jax.vmap(jax.jacfwd(body_balance, argnums=3), in_axes=(0, 0, 0, 0, None, None, 0))
         given = self.system.mass, self.start[:-1], self.velocity, twists, self.h, self.tableau
-        found = local(*given, self.system.idle_inertia)
+        unit = jnp.broadcast_to(jnp.eye(3, dtype=twists.dtype)[:, None], (3, self.bodies, 3))
+        found = local(*given, jnp.swapaxes(self.system.idle_torque(self.start[:-1], unit), 0, 1))
         return found.reshape(self.bodies, width, width)
 
     def tangent(self, y: Float[Array, " unknowns"], loads: Any = None) -> Float[Array, "unknowns unknowns"]:

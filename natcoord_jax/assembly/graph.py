@@ -7,11 +7,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from natcoord_jax.assembly.tree import SLOTS, Level, Tree
+from natcoord_jax.core.names import compact
 
 
 @dataclass(frozen=True)
 class Edge:
-    """A joint as seen by the graph: body numbers (the number of bodies is the ground) and free motions."""
+    """A joint as seen by the graph: body numbers (the number of bodies is the ground) and free motions.
+
+    `own_axes`: rotations are about axes of the child, as those of a director.
+    """
 
     parent: int
     child: int
@@ -19,6 +23,7 @@ class Edge:
     translations: tuple[int, ...]
     child_rotation: bool
     free: bool
+    own_axes: bool = False
 
     @property
     def slots(self) -> tuple[int, ...]:
@@ -47,14 +52,16 @@ class Spanning:
     neighbour: list[int]
 
 
-def spanning_tree(bodies: int, edges: list[Edge], couplings: Sequence[tuple[int, int]] = ()) -> Spanning:
+def spanning_tree(
+    bodies: int, edges: list[Edge], couplings: Sequence[tuple[int, int]] = (), sets: int = 0
+) -> Spanning:
     """Tree from the ground along joints, then along couplings, then from bodies not yet reached.
 
     A joint goes into the tree only if it describes its free motion; what it is used for in reverse is
     told, so that its frames can be exchanged. A coupling, an effect between two bodies that no joint
     connects to the tree otherwise, makes neighbours of them: the second moves freely, but follows the first
     in the order of elimination, as nodes do along a beam. Free bodies that are nobody's child become roots
-    first.
+    first; the first of them, `sets`, which no joint carries, come before all others.
     """
     usable: list[list[tuple[int, int, bool]]] = [[] for _ in range(bodies + 1)]
     for number, edge in enumerate(edges):
@@ -99,7 +106,7 @@ def spanning_tree(bodies: int, edges: list[Edge], couplings: Sequence[tuple[int,
             found[root] = (-1, False, 0, bodies)
             grow([root], 1)
             along_couplings()
-    order = sorted(found, key=lambda b: found[b][2])
+    order = sorted(found, key=lambda b: (b >= sets, found[b][2]))
     number = {body: i for i, body in enumerate(order)} | {bodies: bodies}
     entries = [found[b] for b in order]
     neighbour = [number[e[3]] for e in entries]
@@ -144,7 +151,8 @@ def make_tree(spanning: Spanning, motions: list[Edge]) -> Tree:
             if motion.child_rotation:
                 order[body] = (0, 3, 2, 1)  # the child's axis becomes the parent's
     slots = np.array(slot_of, np.int32)
-    ball = np.array([len(m.rotations) == 3 for m in motions])
+    directed = np.array([m.own_axes for m in motions], bool)
+    ball = np.array([len(m.rotations) == 3 for m in motions], bool) | directed
     return Tree(
         parent,
         np.array(spanning.neighbour, np.int32),
@@ -158,6 +166,7 @@ def make_tree(spanning: Spanning, motions: list[Edge]) -> Tree:
         _level(np.flatnonzero(free), motions, True),
         _level(np.flatnonzero(~free), motions, len(levels) == 1),
         any(spanning.reverse),
+        directed=directed if directed.any() else None,
     )
 
 
@@ -165,10 +174,10 @@ def _level(members: np.ndarray, motions: list[Edge], grounded: bool) -> Level:
     """Bodies that are handled together."""
     these = [motions[b] for b in members]
     return Level(
-        tuple(int(b) for b in members),
+        compact(members.tolist()),
         tuple(sorted({k for m in these for k in m.rotations})),
         tuple(sorted({k for m in these for k in m.translations})),
         any(m.child_rotation for m in these),
         grounded,
-        any(len(m.rotations) == 3 for m in these),
+        any(len(m.rotations) == 3 or m.own_axes for m in these),
     )

@@ -13,7 +13,9 @@ from natcoord_jax.assembly.system import Group
 from natcoord_jax.core.callables import Function
 from natcoord_jax.core.checks import NUMERIC, as_array, check_fields, shape_of
 from natcoord_jax.core.effect import Effect, replace_fields
+from natcoord_jax.core.elements import Elements
 from natcoord_jax.core.host import stacked
+from natcoord_jax.core.names import Names
 
 
 @dataclass
@@ -88,6 +90,28 @@ def families(instances: list[Instance]) -> list[list[Instance]]:
 def stack(instances: list[Instance], bodies: int) -> tuple[Group, ...]:
     """Groups of equal instances."""
     return tuple(_group(members, bodies) for members in families(instances))
+
+
+def element_group(layout: Any, name: str, elements: Elements) -> Group:
+    """The group of a set of elements."""
+    effect, label, count = elements.effect, f"elements {name!r}", len(elements)
+    if effect.inputs or effect.rotors or effect.works:
+        raise ValueError(
+            f"{label}: {type(effect).__name__} has inputs or an account of work; add it one by one"
+        )
+    scene = layout.numbers(elements)
+    alone = bare(effect, ("markers", "name"), label)
+    bodies, nothing = layout.body_number[scene].astype(np.int32), np.zeros((count, 0), np.int32)
+    return Group(
+        elements.stacked(alone, layout.rows_at(scene)),
+        as_array(elements.weights()),
+        bodies,
+        *(nothing,) * 5,
+        acting=Collection.of(bodies, len(layout.bodies)),
+        count=count,
+        names=Names(((name, count),)),
+        source="markers",
+    )
 
 
 def _group(members: list[Instance], bodies: int) -> Group:

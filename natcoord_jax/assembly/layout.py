@@ -1,5 +1,7 @@
 """The layout of a system: numbers of bodies, joints, coordinates and channels, and the initial state."""
 
+from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -7,59 +9,60 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from natcoord_jax.assembly.bodies import Bodies
 from natcoord_jax.assembly.graph import Edge, spanning_tree
 from natcoord_jax.assembly.grouping import Instance, bare, families
 from natcoord_jax.assembly.poses import Poses, joint_frames, joint_triad
 from natcoord_jax.assembly.rates import row_rates
 from natcoord_jax.assembly.system import CoordinateGroup
-from natcoord_jax.core.bodies import Body
+from natcoord_jax.core.bodies import TRIAD
 from natcoord_jax.core.checks import as_array
 from natcoord_jax.core.coordinate import Coordinate, CoordinateEffect
 from natcoord_jax.core.effect import Effect, replace_fields
+from natcoord_jax.core.elements import Elements
 from natcoord_jax.core.force import Field
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.host import on_host, stacked
 from natcoord_jax.core.joint import Joint, frames_at
 from natcoord_jax.core.markers import Attachment, Marker
+from natcoord_jax.core.names import names_of
 from natcoord_jax.core.potential import place_markers
 from natcoord_jax.core.state import State
+from natcoord_jax.xla.tracing import at_top_level
 
 JOINT_FIELDS = ("parent", "child", "point", "axis", "second", "name", "parent_point")
 
 
-def _edge(joint: Joint, poses: Poses) -> Edge:
-    return Edge(
-        poses.of(joint.parent),
-        poses.of(joint.child),
-        joint.rotations,
-        joint.translations,
-        joint.child_rotation,
-        joint.free,
-    )
+def _edge(joint: Joint, poses: Poses, sets: int) -> Edge:
+    pair = poses.of(joint.parent), poses.of(joint.child)
+    # Nodes of sets are free: what joins them keeps its multipliers.
+    free = joint.free and min(pair) >= sets
+    return Edge(*pair, joint.rotations, joint.translations, joint.child_rotation, free)
 
 
-def _couplings(effects: dict[str, Effect], poses: Poses) -> list[tuple[int, int]]:
-    """Pairs of neighbouring bodies of the effects that make neighbours of them."""
+def _couplings(effects: dict[str, Effect], poses: Poses, sets: int) -> list[tuple[int, int]]:
+    """Pairs of neighbouring bodies of the effects that make neighbours of them, but for nodes of sets."""
     found = []
     for effect in effects.values():
         if effect.couples:
             markers: Any = getattr(effect, "markers", ())
             listed = [poses.of(m.body) for m in markers]
-            found += list(pairwise(listed))
+            found += [pair for pair in pairwise(listed) if min(pair) >= sets]
     return found
 
 
 class Layout:
     """Numbers of everything: bodies along the tree, joints with those of the tree first, channels."""
 
-    def __init__(self, bodies: dict[str, Body], joints: dict[str, Joint], effects: dict[str, Effect]):
+    def __init__(self, bodies: Bodies, joints: dict[str, Joint], effects: dict[str, Effect]):
         self.bodies, self.joints = bodies, joints
         self.poses = Poses(bodies)
         self.names = list(joints)
-        self.edges = [_edge(j, self.poses) for j in joints.values()]
-        self.spanning = spanning_tree(len(bodies), self.edges, _couplings(effects, self.poses))
-        self.body_number = {old: new for new, old in enumerate(self.spanning.order)}
-        self.body_number[len(bodies)] = len(bodies)
+        self.edges = [_edge(j, self.poses, bodies.sets) for j in joints.values()]
+        couplings = _couplings(effects, self.poses, bodies.sets)
+        self.spanning = spanning_tree(len(bodies), self.edges, couplings, bodies.sets)
+        self.order = np.array(self.spanning.order, int)
+        self.body_number = np.argsort(np.append(self.order, len(bodies)))
         carriers = self.spanning.carrier
         loops = [j for j in range(len(self.names)) if j not in carriers]
         self.joint_order = [*carriers, *loops]
@@ -74,21 +77,45 @@ class Layout:
 
     def body(self, handle: Handle) -> int:
         """Number of a body in the system."""
-        return self.body_number[self.poses.of(handle)]
+        return int(self.body_number[self.poses.of(handle)])
 
-    def ordered_bodies(self) -> list[Body]:
-        """Bodies in the order of the system."""
-        listed = list(self.bodies.values())
-        return [listed[i] for i in self.spanning.order]
+    def numbers(self, elements: Elements) -> np.ndarray:
+        """Numbers in the scene of the nodes of a set of elements."""
+        first = self.bodies.names.index(f"{elements.nodes.name}[0]")
+        return first + elements.connectivity
+
+    def every(self, field: str) -> Array:
+        """A field of all bodies, in the order of the system."""
+        found = self.bodies.every(field)
+        return as_array(np.asarray(found)[self.order]) if at_top_level(found) else found[self.order]
+
+    @property
+    def rotations(self) -> list[tuple[int, ...]]:
+        """Own axes about which the bodies turn, in the order of the system."""
+        return [self.bodies.rotations[k] for k in self.order]
+
+    @property
+    def ordered_names(self) -> Sequence[str]:
+        """Names of the bodies, in the order of the system: sets come first there, too."""
+        sets = [run for run in self.bodies.runs if run[1] is not None]
+        return names_of([*sets, *((self.bodies.names[int(k)], None) for k in self.order[self.bodies.sets :])])
+
+    @property
+    def ordered_joints(self) -> Sequence[str]:
+        """Names of the joints, those of the tree first; none of free bodies."""
+        sets = self.bodies.sets
+        names = [(self.names[j] if j >= 0 else "", None) for j in self.joint_order[sets:]]
+        return names_of([("", sets), *names] if sets else names)
 
     def motions(self) -> list[Edge]:
         """Free motion of each body relative to its parent in the tree."""
         motions = []
-        for body, carrier in zip(self.ordered_bodies(), self.spanning.carrier):
+        for own, carrier in zip(self.rotations, self.spanning.carrier):
             every = tuple(range(3))
             edge = self.edges[carrier] if carrier >= 0 else Edge(0, 0, every, every, False, True)
-            if not body.oriented:
-                edge = Edge(edge.parent, edge.child, (), edge.translations, False, True)
+            if own != TRIAD:
+                rotations = own if carrier < 0 else ()
+                edge = replace(edge, rotations=rotations, child_rotation=False, own_axes=bool(rotations))
             motions.append(edge)
         return motions
 
@@ -113,7 +140,7 @@ class Layout:
         """Constraints of all joints."""
         instances = []
         for name, joint in self.joints.items():
-            frames = _frames_at(joint_frames(joint, self.poses), self._rows(joint))
+            frames = _frames_at(joint_frames(joint, self.poses), self._rows(joint.parent, joint.child))
             ready = joint.initialise(*frames)
             instances.append(
                 Instance(
@@ -127,10 +154,16 @@ class Layout:
             )
         return instances
 
-    def _rows(self, joint: Joint) -> Float[Array, "2 4 3"]:
-        poses = self.poses
-        pair = [poses.of(joint.parent), poses.of(joint.child)]
-        return _rows([poses.position[b] for b in pair], [poses.rotation[b] for b in pair])
+    def _rows(self, *handles: Handle) -> Float[Array, "n 4 3"]:
+        """Rows of bodies in the assembled pose."""
+        return self.rows_at(np.array([self.poses.of(handle) for handle in handles]))
+
+    def rows_at(self, numbers: np.ndarray) -> Float[Array, "*n 4 3"]:
+        """The same by their numbers in the scene."""
+        flat = numbers.reshape(-1)
+        given = (self.poses.position, self.poses.rotation)
+        picked = (as_array(np.asarray(x)[flat]) if at_top_level(x) else x[flat] for x in given)
+        return _rows(*picked).reshape(*numbers.shape, 4, 3)
 
     def effect_instance(self, name: str, effect: Effect) -> Instance:
         """Where an effect sits, and its channels."""
@@ -182,9 +215,7 @@ class Layout:
 
     def _placed(self, markers: Any, weights: Array) -> Array:
         """Where markers are in the assembled pose."""
-        bodies = [self.poses.of(m.body) for m in markers]
-        rows = _rows([self.poses.position[b] for b in bodies], [self.poses.rotation[b] for b in bodies])
-        return _place_markers(weights, rows)
+        return _place_markers(weights, self._rows(*(m.body for m in markers)))
 
     def _on_coordinates(self, name: str, effect: CoordinateEffect, label: str) -> Instance:
         many = isinstance(effect.joint, tuple)
@@ -229,9 +260,7 @@ class Layout:
 
     def state(self) -> State:
         """Initial state: coordinates count from the assembled pose."""
-        bodies = self.ordered_bodies()
-        motion = [[getattr(b, name) for b in bodies] for name in MOTION]
-        q, v = _rows_and_velocities(*motion)
+        q, v = _rows_and_velocities(*(self.every(name) for name in MOTION))
         return State(
             as_array(0.0),
             q,
@@ -248,8 +277,8 @@ _frames_at = on_host(frames_at)
 _place_markers = on_host(place_markers)
 
 
-def _stacked_rows(points: list[Array], rotations: list[Array]) -> Float[Array, "n 4 3"]:
-    return jnp.concatenate([jnp.stack(points)[:, None], jnp.stack(rotations).swapaxes(1, 2)], axis=1)
+def _stacked_rows(points: Float[Array, "n 3"], rotations: Float[Array, "n 3 3"]) -> Float[Array, "n 4 3"]:
+    return jnp.concatenate([points[:, None], rotations.swapaxes(1, 2)], axis=1)
 
 
 _rows = on_host(_stacked_rows)
@@ -257,8 +286,8 @@ _rows = on_host(_stacked_rows)
 
 @on_host
 def _rows_and_velocities(
-    points: list[Array], rotations: list[Array], velocities: list[Array], spins: list[Array]
+    points: Array, rotations: Array, velocities: Array, spins: Array
 ) -> tuple[Float[Array, "rows 3"], Float[Array, "rows 3"]]:
     rows = _stacked_rows(points, rotations)
-    rates = row_rates(rows, jnp.stack(velocities), jnp.stack(spins))
+    rates = row_rates(rows, velocities, spins)
     return rows.reshape(-1, 3), rates.reshape(-1, 3)

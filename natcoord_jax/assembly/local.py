@@ -47,12 +47,12 @@ def body_balance(
     twist: Float[Array, "s 6"],
     h: Array,
     tableau: Tableau,
-    idle: Float[Array, ""],
+    idle: Float[Array, "3 3"],
 ) -> Float[Array, "s 6"]:
-    """Change of momentum of one body as a wrench; a point mass keeps its directors by an idle inertia."""
+    """Change of momentum of one body as a wrench, with an idle inertia, see `System.idle_torque`."""
     motion = body_motion(start[None], twist[None], h, tableau)
     momentum = stage_momentum(mass[None], motion.rates - velocity[None, None], tableau)
-    return wrenches(momentum, idle * motion.spin, motion)[0]
+    return wrenches(momentum, motion.spin @ idle, motion)[0]
 
 
 def _impulses(

@@ -13,6 +13,7 @@ from natcoord_jax.assembly.system import Group, System
 from natcoord_jax.core.checks import as_array, is_concrete
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.host import on_host
+from natcoord_jax.core.names import listed
 
 Names = Handle | str | Sequence[Handle | str]
 
@@ -75,9 +76,9 @@ def places(system: System, name: str) -> dict[str, Place]:
         if name in group.names:
             return found | _in_group(group, same, name)
     joints = [n for n in structure.joints if n]
-    effects = [n for group in system.effects for n in group.names]
+    bodies, effects = listed(structure.bodies), [n for g in system.effects for n in listed(g.names)]
     raise ValueError(
-        f"this system has no part {name!r}; it has the bodies {list(structure.bodies)}, the joints {joints} "
+        f"this system has no part {name!r}; it has the bodies {bodies}, the joints {joints} "
         f"and the effects {effects}"
     )
 

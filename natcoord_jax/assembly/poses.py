@@ -4,9 +4,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from natcoord_jax.core.bodies import Body
+from natcoord_jax.assembly.bodies import Bodies, joined
 from natcoord_jax.core.checks import as_array
 from natcoord_jax.core.handles import Handle
+from natcoord_jax.core.handles import ground as ground_handle
 from natcoord_jax.core.host import on_host
 from natcoord_jax.core.joint import Joint
 from natcoord_jax.core.markers import Attachment, Marker
@@ -16,15 +17,15 @@ from natcoord_jax.maths.rotations import frame_from_axis
 class Poses:
     """Assembled poses of all bodies and the ground, in scene order."""
 
-    def __init__(self, bodies: dict[str, Body]):
-        self.names = list(bodies)
-        self.number = {name: i for i, name in enumerate(self.names)} | {"ground": len(bodies)}
-        self.position = [b.position for b in bodies.values()] + [as_array(np.zeros(3))]
-        self.rotation = [b.rotation for b in bodies.values()] + [as_array(np.eye(3))]
+    def __init__(self, bodies: Bodies):
+        self.names, self.rotations = bodies.names, bodies.rotations
+        ground = as_array(np.zeros((1, 3))), as_array(np.eye(3)[None])
+        given = bodies.every("position"), bodies.every("rotation")
+        self.position, self.rotation = (joined(x, y) for x, y in zip(given, ground))
 
     def of(self, handle: Handle) -> int:
         """Number of a body; the number of bodies for the ground."""
-        return self.number[handle.name]
+        return len(self.names) if handle == ground_handle else self.names.index(handle.name)
 
     def weights(self, marker: Marker | Attachment) -> Float[Array, "*m 4"]:
         """Weights of a marker: (4,) of a point or a direction, (4, 4) of an attachment."""

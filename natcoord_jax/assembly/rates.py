@@ -45,6 +45,8 @@ def joint_axes(
     parent, child = jax.vmap(frames_at)(frames, jnp.stack([above, rows], axis=1))
     a = parent.axes
     along = jnp.unstack(a, axis=1)
+    if system.tree.directed is not None:
+        a = jnp.where(system.tree.directed[:, None, None], child.axes, a)
     slides = jnp.stack([cross(along[(k + 1) % 3], along[(k + 2) % 3]) for k in range(3)], axis=1)
     return jnp.concatenate([a, slides, child.axes[:, :1]], axis=1), child.point
 

@@ -323,7 +323,8 @@ class ReducedStep(Form):
         # There rates are along the axes of the parent, here those of balls along their own.
         together = (body[:, None] == body) & (kind[:, None] == kind)
         cosines = jnp.where(together, dot(parent[:, None], own), 0.0)
-        turned = jnp.where(tree.ball[body], cosines, jnp.eye(body.size, dtype=cosines.dtype))
+        balls = tree.ball if tree.directed is None else tree.ball & ~tree.directed
+        turned = jnp.where(balls[body], cosines, jnp.eye(body.size, dtype=cosines.dtype))
         return turned.T @ tangents.inertia @ turned
 
     def inertias(self, matrix: Float[Array, "unknowns unknowns"]) -> Float[Array, " balances"]:

@@ -20,6 +20,7 @@ from natcoord_jax.assembly.system import System
 from natcoord_jax.core.compiled import compiled
 from natcoord_jax.core.handles import Handle, ground
 from natcoord_jax.core.markers import Marker
+from natcoord_jax.core.names import listed as listed_names
 from natcoord_jax.core.state import State, Trajectory
 from natcoord_jax.maths.rotations import angular_velocity, to_quaternion
 from natcoord_jax.maths.vectors import cross
@@ -353,6 +354,6 @@ def sense(
         chosen = states.coordinates[..., chosen]
         return JointSensor(chosen, units, name, index, tuple(places), source, lever)
     raise ValueError(
-        f"cannot sense {part!r}: pass a body ({list(system.structure.bodies)}), a joint "
+        f"cannot sense {part!r}: pass a body ({listed_names(system.structure.bodies)}), a joint "
         f"({[n for n in system.structure.joints if n]}), nc.Point or nc.Direction"
     )

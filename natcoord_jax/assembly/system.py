@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
@@ -17,8 +18,10 @@ from natcoord_jax.core.effect import Effect
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.kinds import BODY_NAME, JOINT_NAME, NAME, HandleOf, Several, of
 from natcoord_jax.core.markers import Marker
+from natcoord_jax.core.names import listed
 from natcoord_jax.core.numeric import Number, Numbers, Whole
 from natcoord_jax.core.state import MOTION, STATE, TRAJECTORY, State, Trajectory
+from natcoord_jax.maths.vectors import dot
 
 ELEMENT = HandleOf("effect") | NAME
 PART = of("the handle or name of a body, a joint or an effect", Handle, str)
@@ -58,7 +61,7 @@ class Group(Stacked):
     works: Int[Array | np.ndarray, "n w"]
     acting: Collection
     count: int = eqx.field(static=True)
-    names: tuple[str, ...] = eqx.field(static=True)
+    names: Sequence[str] = eqx.field(static=True)
     source: str = eqx.field(static=True)
     in_tree: bool = eqx.field(static=True, default=False)
 
@@ -123,13 +126,14 @@ class Structure:
         dofs: degrees of freedom: unknowns less the structural rank of the remaining constraints.
         rank: structural rank of the constraints outside the tree where some are redundant, else None.
         points: numbers of the bodies that are point masses, without orientation.
+        directors: numbers of the nodes with one director.
         redundant: names of joints and relations whose constraints depend on the others.
         notes: findings of the compilation for the report.
         shapes: what to draw of the bodies, in their order; None: what has their inertia.
     """
 
-    bodies: tuple[str, ...]
-    joints: tuple[str, ...]
+    bodies: Sequence[str]
+    joints: Sequence[str]
     inputs: tuple[str, ...]
     works: tuple[str, ...]
     coordinates: tuple[tuple[str, int], ...]
@@ -139,7 +143,8 @@ class Structure:
     solver: str
     constraints: int
     rank: int | None = None
-    points: tuple[int, ...] = ()
+    points: Sequence[int] = ()
+    directors: Sequence[int] = ()
     dofs: int = field(default=0, compare=False)
     redundant: tuple[str, ...] = field(default=(), compare=False)
     notes: tuple[str, ...] = field(default=(), compare=False)
@@ -184,6 +189,21 @@ class System(eqx.Module):
         idle = np.zeros(len(self.structure.bodies))
         idle[list(self.structure.points)] = 1.0
         return idle
+
+    def idle_torque(
+        self, rows: Float[Array, "bodies 4 3"], spin: Float[Array, "*s bodies 3"]
+    ) -> Float[Array, "*s bodies 3"]:
+        """Torques of a unit inertia against turns that nothing sees: of points, of directors about them.
+
+        Args:
+            rows: at the start of the step.
+            spin: angular velocities.
+        """
+        held = jnp.asarray(self.idle_inertia)[:, None] * spin
+        if self.tree.directed is None:
+            return held
+        first = jnp.where(self.tree.directed[:, None], rows[:, 1], 0.0)
+        return held + dot(first, spin)[..., None] * first
 
     @checked("System.energy", motion=MOTION)
     def energy(self, motion: State | Trajectory) -> "diagnostics.Energy":
@@ -457,11 +477,10 @@ SYSTEM = of("a system, as scene.compile() returned it with the state", System)
 """What an argument may be."""
 
 
-def _index(names: tuple[str, ...], part: Handle | str, kind: str) -> int:
+def _index(names: Sequence[str], part: Handle | str, kind: str) -> int:
     name = part.name if isinstance(part, Handle) else part
     if name not in names or not name:
-        known = [n for n in names if n]
-        raise ValueError(f"this system has no {kind} {name!r}; it has {known}")
+        raise ValueError(f"this system has no {kind} {name!r}; it has {listed(names)}")
     return names.index(name)
 
 

@@ -86,7 +86,7 @@ def transfer(
     check_bodies(system, into, onto)
     check_joints(system, into)
     made, moved = _transferred(system, state, into, onto)
-    names = {into.structure.joints[j] for j in new_joints(system, into)}
+    names = {into.structure.joints[int(j)] for j in new_joints(system, into)}
     if names and is_concrete(made, moved):
         _check_closed(made, moved, names)
     return made, moved

@@ -37,7 +37,7 @@ class Level:
     `grounded`: all parents are the ground; `balls`: some joints leave all rotations free.
     """
 
-    members: tuple[int, ...]
+    members: Sequence[int]
     rotations: tuple[int, ...]
     translations: tuple[int, ...]
     child_rotation: bool
@@ -53,10 +53,9 @@ class Level:
     @property
     def here(self) -> slice | np.ndarray:
         """Index of the members; a slice, which costs nothing, where they follow each other."""
-        first, count = (self.members or (0,))[0], len(self.members)
-        if self.members == tuple(range(first, first + count)):
-            return slice(first, first + count)
-        return np.array(self.members, np.int32)
+        if isinstance(self.members, range):
+            return slice(self.members.start, self.members.stop)
+        return np.array(self.members, np.int32) if self.members else slice(0, 0)
 
 
 def joined(levels: Sequence[Level], parts: Sequence[Array], axis: int = 1) -> Array:
@@ -80,13 +79,14 @@ class Tree(eqx.Module):
         slot_of: body * 7 + slot of each unknown.
         side: (parent, child) frame of each joint as the tree uses it, exchanged where it is used backwards.
         order: rows (point, axis 1, 2, 3) of those frames as the tree uses them.
-        ball: bodies whose joint leaves all rotations free; their rates are components along axes in which
-            the inertia matrix changes least, see `roundness`.
+        ball: bodies whose joint leaves all rotations free, and directors; their rates are components along
+            axes in which the inertia matrix changes least, see `roundness`.
         levels: bodies by depth, the joints between them and the ground counted.
         free: free bodies.
         hung: bodies that hang on joints.
         backwards: whether any joint is used from child to parent.
         symmetry: axes about which bodies are round, see `roundness`; None: nothing can be.
+        directed: which bodies are directors, that do not turn about their first axes; None: there are none.
     """
 
     parent: Int[Array | np.ndarray, " bodies"]
@@ -102,6 +102,7 @@ class Tree(eqx.Module):
     hung: Level = eqx.field(static=True)
     backwards: bool = eqx.field(static=True)
     symmetry: Float[Array, "bodies 4"] | None = None
+    directed: Bool[Array | np.ndarray, " bodies"] | None = None
 
     @property
     def slots(self) -> tuple[int, ...]:
@@ -112,7 +113,7 @@ class Tree(eqx.Module):
         """The same with free bodies hanging on their neighbours, by all six motions."""
         levels = (self.free, self.hung)
         whole = Level(
-            tuple(range(len(self.ball))),
+            range(len(self.ball)),
             tuple(sorted({k for level in levels for k in level.rotations})),
             tuple(sorted({k for level in levels for k in level.translations})),
             any(level.child_rotation for level in levels),

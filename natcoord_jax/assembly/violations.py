@@ -212,4 +212,4 @@ def worst_violation(
     if rates:
         unit = "1/s" if unit == "-" else f"{unit}/s"
     is_joint = group.source == "joint"
-    return Violation(group.effect.kind, group.names[instance], float(sizes[worst]), unit, is_joint)
+    return Violation(group.effect.kind, group.names[int(instance)], float(sizes[worst]), unit, is_joint)

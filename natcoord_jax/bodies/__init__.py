@@ -5,6 +5,7 @@ from natcoord_jax.bodies.beam import BeamHandle as BeamHandle
 from natcoord_jax.bodies.interpolation import DirectorInterpolation as DirectorInterpolation
 from natcoord_jax.bodies.interpolation import RelativeMotion as RelativeMotion
 from natcoord_jax.bodies.line_load import LineLoad as LineLoad
+from natcoord_jax.bodies.nodes import Nodes as Nodes
 from natcoord_jax.bodies.rigid import PointMass as PointMass
 from natcoord_jax.bodies.rigid import RigidBody as RigidBody
 from natcoord_jax.bodies.sections import (

@@ -13,7 +13,7 @@ from natcoord_jax.bodies.interpolation import Interpolation, Material, RelativeM
 from natcoord_jax.bodies.reference_curve import ReferenceCurve, node_fractions, reference_curve
 from natcoord_jax.bodies.sections import Section
 from natcoord_jax.core.arguments import checked, is_a
-from natcoord_jax.core.bodies import Body
+from natcoord_jax.core.bodies import TRIAD, Body
 from natcoord_jax.core.checks import numbers, require_double
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.host import on_host
@@ -183,7 +183,7 @@ class Beam(Recipe):
         for i, (block, point, frame, velocity) in enumerate(zip(*(apart(x, count) for x in columns))):
             holder = held.get(i)
             if holder is None:
-                node = Body(block, point, frame, velocity, spin, True, None, f"{name}/node {i}")
+                node = Body(block, point, frame, velocity, spin, TRIAD, None, f"{name}/node {i}")
                 nodes.append(scene.add(node))
             else:
                 nodes.append(_hold(scene, holder, block, point, frame, label))
@@ -204,8 +204,8 @@ def _hold(
         return holder
     if not body.oriented:
         raise ValueError(
-            f"{label}: an end cannot be rigidly part of the point mass {holder.name!r}, which has no "
-            "orientation; join the end node to it by nc.Spherical"
+            f"{label}: an end cannot be rigidly part of {holder.name!r}, which has no orientation; "
+            "join the end node to it by nc.Spherical"
         )
     scene.add_mass(holder, _carried_along(body.position, body.rotation, block, point, frame))
     return holder

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.bodies.shapes import Placed, Shape
 from natcoord_jax.core.arguments import checked
-from natcoord_jax.core.bodies import Body, mass_block
+from natcoord_jax.core.bodies import POINT, TRIAD, Body, mass_block
 from natcoord_jax.core.checks import (
     as_array,
     is_concrete,
@@ -227,7 +227,7 @@ def RigidBody(
         _orientation(orientation, label),
         numbers(velocity, (3,), f"{label}: velocity", "m/s"),
         numbers(angular_velocity, (3,), f"{label}: angular_velocity", "rad/s"),
-        True,
+        TRIAD,
         None if shape is None else Placed(shape, centre),
         name,
     )
@@ -278,7 +278,7 @@ def PointMass(
         as_array(np.eye(3)),
         numbers(velocity, (3,), f"{label}: velocity", "m/s"),
         nothing,
-        False,
+        POINT,
         None,
         name,
     )

@@ -8,6 +8,9 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.core.host import on_host
 
+TRIAD, DIRECTOR, POINT = (0, 1, 2), (1, 2), ()
+"""Axes about which nodes turn."""
+
 
 class Body(eqx.Module):
     """Rows and mass of a body in its assembled pose.
@@ -18,7 +21,8 @@ class Body(eqx.Module):
         rotation: directors as columns [-].
         velocity: of the reference point [m/s].
         angular_velocity: world components [rad/s].
-        oriented: False for a point mass, which has no orientation and no free rotations.
+        rotations: axes of its own about which it turns: all of a body, none of a point mass, and those normal
+            to the first of a director.
         shape: what to draw: something with a `surface`, or None.
         name: name, or None.
     """
@@ -28,9 +32,14 @@ class Body(eqx.Module):
     rotation: Float[Array, "3 3"]
     velocity: Float[Array, "3"]
     angular_velocity: Float[Array, "3"]
-    oriented: bool = eqx.field(static=True)
+    rotations: tuple[int, ...] = eqx.field(static=True)
     shape: Any
     name: str | None = eqx.field(static=True)
+
+    @property
+    def oriented(self) -> bool:
+        """Whether it is a body that turns about all axes."""
+        return self.rotations == TRIAD
 
 
 @on_host

@@ -117,6 +117,7 @@ class Effect(Part):
         couples: whether bodies of neighbouring markers become neighbours in the spanning tree where no joint
             makes them so: elements of beams do, of which a chain then is a chain of bodies.
         silent: whether it has no sensor.
+        vectors: of each node of an element made by `on`: 1 for its point, 2 with a director, 4 with a triad.
     """
 
     kind: ClassVar[str] = "effect"
@@ -130,6 +131,37 @@ class Effect(Part):
     shared: ClassVar[bool] = False
     couples: ClassVar[bool] = False
     silent: ClassVar[bool] = True
+    vectors: ClassVar[int] = 1
+
+    @classmethod
+    def on(
+        cls, nodes: Any, connectivity: Any, *, each: Any = None, name: str | None = None, **shared: Any
+    ) -> Any:
+        """Elements of this kind on the nodes of a set, thousands at once.
+
+        Args:
+            nodes: a set of nodes, as `scene.add(nc.Nodes.points(...))` returned it.
+            connectivity: numbers of the nodes of each element (elements, nodes) in the set.
+            each: fields whose numbers differ from element to element, by name, leading axis elements.
+            name: of the elements.
+            shared: the other fields.
+
+        Returns:
+            Something to add to the scene.
+
+        Example:
+            >>> import jax; jax.config.update("jax_enable_x64", True)
+            >>> import natcoord_jax as nc
+            >>> import numpy as np
+            >>> scene = nc.Scene()
+            >>> line = scene.add(nc.Nodes.points(np.linspace((0, 0, 0), (1, 0, 0), 5), mass=0.1))
+            >>> pairs = np.stack([np.arange(4), np.arange(1, 5)], axis=1)
+            >>> springs = scene.add(nc.Spring.on(line, pairs, stiffness=50.0, length=0.25))
+            >>> system, state = scene.compile()
+        """
+        from natcoord_jax.core.elements import on
+
+        return on(cls, nodes, connectivity, each, name, shared)
 
     def assembled_at(self, x: Float[Array, "k *m 3"]) -> "Effect":
         """This effect with the numbers that it takes from where its markers are in the assembled pose."""

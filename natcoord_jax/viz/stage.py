@@ -68,7 +68,7 @@ def picture(system: System, states: State, beams: Sequence[BeamHandle] = ()) -> 
     """What to draw of a system at several states, by the names of its bodies."""
     rows = with_ground(np.asarray(states.q))
     named = system.structure.bodies
-    order = [k for k in np.argsort(named) if not is_node(system, named[k])]
+    order = [int(k) for k in np.argsort(named) if not is_node(system, named[int(k)])]
     drawn = surfaces(system)
     corners = [np.einsum("ka,tac->tkc", drawn[k][0], rows[:, k]) for k in order]
     points, axes = joint_places(system, rows)

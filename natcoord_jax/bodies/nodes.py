@@ -1,0 +1,196 @@
+"""Nodes by the thousands: points, directors and triads, added to a scene as arrays under one name."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from natcoord_jax.core.arguments import checked
+from natcoord_jax.core.bodies import DIRECTOR, POINT, TRIAD, Body
+from natcoord_jax.core.checks import as_array
+from natcoord_jax.core.host import on_host
+from natcoord_jax.core.kinds import NAME
+from natcoord_jax.core.numeric import Numbers
+from natcoord_jax.maths.vectors import cross, dot
+
+PLACES = Numbers((None, 3))
+EACH = Numbers(("...",), sign="not negative")
+VECTORS = Numbers(("...", 3))
+
+
+class Nodes(eqx.Module):
+    """A set of nodes of one kind in their assembled pose; made by `points`, `directors` or `triads`.
+
+    Attributes:
+        mass_blocks: m (n, 4, 4) (15) [kg, kg m, kg m^2].
+        position: (n, 3) [m].
+        rotation: directors as columns (n, 3, 3) [-].
+        velocity: (n, 3) [m/s].
+        angular_velocity: (n, 3) [rad/s].
+        rotations: own axes about which they turn, see `Body`.
+        name: of the set, or None.
+    """
+
+    mass_blocks: Float[Array, "n 4 4"]
+    position: Float[Array, "n 3"]
+    rotation: Float[Array, "n 3 3"]
+    velocity: Float[Array, "n 3"]
+    angular_velocity: Float[Array, "n 3"]
+    rotations: tuple[int, ...] = eqx.field(static=True)
+    name: str | None = eqx.field(static=True)
+
+    def body(self, number: int) -> Body:
+        """One of them as a body."""
+        return Body(
+            self.mass_blocks[number],
+            self.position[number],
+            self.rotation[number],
+            self.velocity[number],
+            self.angular_velocity[number],
+            self.rotations,
+            None,
+            None,
+        )
+
+    @staticmethod
+    @checked("Nodes.points", positions=PLACES, mass=EACH, velocity=VECTORS, name=NAME)
+    def points(
+        positions: Any, *, mass: Any, velocity: Any = (0.0, 0.0, 0.0), name: str | None = None
+    ) -> "Nodes":
+        """Points: three rates each.
+
+        Args:
+            positions: (n, 3) [m].
+            mass: of each, one number or (n,) [kg]. What elements add to it need not be counted.
+            velocity: (3,) or (n, 3) [m/s].
+            name: of the set.
+
+        Example:
+            >>> import jax; jax.config.update("jax_enable_x64", True)
+            >>> import natcoord_jax as nc
+            >>> import numpy as np
+            >>> nc.Nodes.points(np.zeros((1000, 3)), mass=0.1).position.shape
+            (1000, 3)
+        """
+        place, count = as_array(positions, float), len(positions)
+        blocks, still = _blocks(_every(mass, (count,)), as_array(0.0)), as_array(jnp.zeros((count, 3)))
+        unit = as_array(jnp.broadcast_to(jnp.eye(3), (count, 3, 3)))
+        return Nodes(blocks, place, unit, _every(velocity, (count, 3)), still, POINT, name)
+
+    @staticmethod
+    @checked(
+        "Nodes.directors",
+        positions=PLACES,
+        directors=VECTORS,
+        mass=EACH,
+        inertia=EACH,
+        velocity=VECTORS,
+        angular_velocity=VECTORS,
+        name=NAME,
+    )
+    def directors(
+        positions: Any,
+        directors: Any,
+        *,
+        mass: Any,
+        inertia: Any = 0.0,
+        velocity: Any = (0.0, 0.0, 0.0),
+        angular_velocity: Any = (0.0, 0.0, 0.0),
+        name: str | None = None,
+    ) -> "Nodes":
+        """Points with a unit director, as shells have: five rates each, none about the director.
+
+        Args:
+            positions: (n, 3) [m].
+            directors: (3,) or (n, 3) [-], of any length but zero.
+            mass: of each, one number or (n,) [kg].
+            inertia: against turns of the director, one number or (n,) [kg m^2].
+            velocity: (3,) or (n, 3) [m/s].
+            angular_velocity: (3,) or (n, 3) [rad/s]; what turns a director about itself is left out.
+            name: of the set.
+
+        Example:
+            >>> import jax; jax.config.update("jax_enable_x64", True)
+            >>> import natcoord_jax as nc
+            >>> import numpy as np
+            >>> shell = nc.Nodes.directors(np.zeros((9, 3)), (0, 0, 1), mass=0.1, inertia=1e-5)
+            >>> shell.rotation[0, :, 0].tolist()
+            [0.0, 0.0, 1.0]
+        """
+        place, count = as_array(positions, float), len(positions)
+        frames, spin = _frames(_every(directors, (count, 3)), _every(angular_velocity, (count, 3)))
+        blocks = _blocks(_every(mass, (count,)), _every(inertia, (count,)))
+        return Nodes(blocks, place, frames, _every(velocity, (count, 3)), spin, DIRECTOR, name)
+
+    @staticmethod
+    @checked(
+        "Nodes.triads",
+        positions=PLACES,
+        orientations=Numbers(("...", 3, 3)),
+        mass_blocks=Numbers(("...", 4, 4)),
+        velocity=VECTORS,
+        angular_velocity=VECTORS,
+        name=NAME,
+    )
+    def triads(
+        positions: Any,
+        orientations: Any,
+        *,
+        mass_blocks: Any,
+        velocity: Any = (0.0, 0.0, 0.0),
+        angular_velocity: Any = (0.0, 0.0, 0.0),
+        name: str | None = None,
+    ) -> "Nodes":
+        """Points with three directors, as rigid bodies have: six rates each.
+
+        Args:
+            positions: (n, 3) [m].
+            orientations: rotation matrices (3, 3) or (n, 3, 3), directors as columns.
+            mass_blocks: m (4, 4) or (n, 4, 4) (15) [kg, kg m, kg m^2].
+            velocity: of the reference points (3,) or (n, 3) [m/s].
+            angular_velocity: (3,) or (n, 3) [rad/s].
+            name: of the set.
+        """
+        place, count = as_array(positions, float), len(positions)
+        return Nodes(
+            _every(mass_blocks, (count, 4, 4)),
+            place,
+            _every(orientations, (count, 3, 3)),
+            _every(velocity, (count, 3)),
+            _every(angular_velocity, (count, 3)),
+            TRIAD,
+            name,
+        )
+
+
+def _every(value: Any, shape: tuple[int, ...]) -> Array:
+    """One for each node."""
+    return _broadcast(as_array(value, float), shape)
+
+
+@on_host
+def _broadcast(value: Array, shape: tuple[int, ...]) -> Array:
+    return jnp.broadcast_to(value, shape)
+
+
+@on_host
+def _blocks(mass: Float[Array, " n"], inertia: Float[Array, "*n"]) -> Float[Array, "n 4 4"]:
+    """Mass blocks of points with a director."""
+    blocks = jnp.zeros((mass.shape[0], 4, 4)).at[:, 0, 0].set(mass)
+    return blocks.at[:, 1, 1].set(inertia)
+
+
+@on_host
+def _frames(
+    directors: Float[Array, "n 3"], spin: Float[Array, "n 3"]
+) -> tuple[Float[Array, "n 3 3"], Float[Array, "n 3"]]:
+    """Triads as columns whose first axis is the director, and angular velocities normal to it."""
+    first = directors / jnp.sqrt(jnp.sum(directors**2, axis=1, keepdims=True))
+    # The world axis that is least aligned with it.
+    least = jnp.argmin(jnp.abs(first), axis=1)
+    helper = jnp.eye(3)[least]
+    second = helper - dot(helper, first)[:, None] * first
+    second = second / jnp.sqrt(jnp.sum(second**2, axis=1, keepdims=True))
+    frames = jnp.stack([first, second, cross(first, second)], axis=2)
+    return frames, spin - dot(spin, first)[:, None] * first

@@ -1,0 +1,96 @@
+"""Elements by the thousands: equal effects on the nodes of a set, added to a scene as arrays."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from natcoord_jax.core.checks import as_array
+from natcoord_jax.core.effect import Effect, replace_fields
+from natcoord_jax.core.host import on_host
+from natcoord_jax.core.markers import Attachment, Marker, Point
+from natcoord_jax.core.nodes import NodeSet
+from natcoord_jax.core.potential import place_markers
+
+
+class Elements(eqx.Module):
+    """Effects of one kind on nodes of one set; made by `on`.
+
+    Attributes:
+        effect: one of them, whose numbers are those of all but `each`.
+        each: numbers of every element by field, leading axis n.
+        nodes: the set.
+        connectivity: numbers of the nodes of each element.
+        name: of the set of elements, or None.
+    """
+
+    effect: Effect
+    each: dict[str, Any]
+    nodes: NodeSet = eqx.field(static=True)
+    connectivity: Int[np.ndarray, "n k"]
+    name: str | None = eqx.field(static=True)
+
+    def __len__(self) -> int:
+        return len(self.connectivity)
+
+    def weights(self) -> Float[np.ndarray, "n k *m 4"]:
+        """Weights of the vectors of every node: of its point, and of its directors."""
+        n, k = self.connectivity.shape
+        own = np.eye(4)[: self.effect.vectors]
+        shape = (n, k, 4) if self.effect.vectors == 1 else (n, k, self.effect.vectors, 4)
+        return np.broadcast_to(own[0] if self.effect.vectors == 1 else own, shape).copy()
+
+    def stacked(self, bare: Effect, rows: Float[Array, "n k 4 3"]) -> Effect:
+        """All elements as one module, with the numbers that they take from the assembled pose.
+
+        Args:
+            bare: `effect` as arrays.
+            rows: of the nodes of every element.
+        """
+        n = len(self)
+        given = jax.tree.map(lambda x: np.broadcast_to(np.asarray(x), (n, *np.shape(x))), bare)
+        given = replace_fields(given, **{key: as_array(value, float) for key, value in self.each.items()})
+        if type(bare).assembled_at is Effect.assembled_at:
+            return given
+        return _assembled(given, as_array(self.weights()), rows)
+
+
+@on_host
+def _assembled(effect: Effect, place: Array, rows: Array) -> Effect:
+    def one(effect: Effect, place: Array, rows: Array) -> Effect:
+        return effect.assembled_at(place_markers(place, rows))
+
+    return jax.vmap(one)(effect, place, rows)
+
+
+def on(cls: type, nodes: NodeSet, connectivity: Any, each: Any, name: str | None, shared: Any) -> Elements:
+    """Elements of a class on nodes, see `Effect.on`.
+
+    Raises:
+        ValueError: for nodes of another kind, numbers that are none of the set's, or fields of another size.
+    """
+    label = f"{cls.__name__}.on"
+    if not isinstance(nodes, NodeSet):
+        raise ValueError(f"{label}: nodes is {nodes!r}, but must be a set of nodes as scene.add returned it")
+    table = np.asarray(connectivity)
+    if table.ndim != 2 or table.dtype.kind not in "iu":
+        raise ValueError(
+            f"{label}: connectivity must be whole numbers (elements, nodes of each), not {table!r}"
+        )
+    if table.size and not 0 <= table.min() <= table.max() < len(nodes):
+        raise ValueError(
+            f"{label}: connectivity has nodes from {table.min()} to {table.max()}; {nodes!r} has 0 to "
+            f"{len(nodes) - 1}"
+        )
+    each = {key: as_array(value, float) for key, value in (each or {}).items()}
+    wrong = [key for key, value in each.items() if value.ndim < 1 or len(value) != len(table)]
+    if wrong:
+        raise ValueError(f"{label}: each[{wrong[0]!r}] needs a leading axis of {len(table)} elements")
+    first = [nodes[int(k)] for k in table[0]] if len(table) else []
+    markers: list[Marker | Attachment] = [Point(handle) for handle in first]
+    if cls.vectors > 1:  # pyright: ignore[reportAttributeAccessIssue]
+        markers = [Attachment(handle, (0.0, 0.0, 0.0), np.eye(3), local=True) for handle in first]
+    one = {key: np.asarray(value)[0] for key, value in each.items()}
+    return Elements(cls(tuple(markers), **shared, **one), each, nodes, nodes.numbers[table], name)

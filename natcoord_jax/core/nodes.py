@@ -1,0 +1,68 @@
+"""Handles of sets of nodes: indexed, sliced, and selected by position."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from natcoord_jax.core.handles import Handle
+
+
+@dataclass(frozen=True, eq=False)
+class NodeSet:
+    """Nodes of a set, or some of them.
+
+    One number gives the handle of a node, which joints, markers and sensors take as that of any body;
+    slices, arrays of numbers and conditions give some of the nodes.
+
+    Attributes:
+        name: of the set.
+        scene: identity of the scene.
+        numbers: of the nodes in the set.
+        positions: of the nodes in the assembled pose (n, 3) [m].
+
+    Example:
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import natcoord_jax as nc
+        >>> import numpy as np
+        >>> scene = nc.Scene()
+        >>> line = scene.add(nc.Nodes.points(np.linspace((0, 0, 0), (1, 0, 0), 5), mass=0.1, name="line"))
+        >>> line[4], len(line[1:3]), line.where(lambda x: x[:, 0] > 0.6)
+        (<body 'line[4]'>, 2, <2 nodes of 'line'>)
+    """
+
+    name: str
+    scene: int
+    numbers: np.ndarray
+    positions: Any
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    def __iter__(self) -> Iterator[Handle]:
+        return (self[k] for k in range(len(self)))
+
+    def __getitem__(self, index: Any) -> Any:
+        """A handle, or a set of some.
+
+        Raises:
+            IndexError: for numbers beyond the ends.
+        """
+        if isinstance(index, int | np.integer) and not isinstance(index, bool):
+            if not -len(self) <= index < len(self):
+                raise IndexError(f"nodes {self.name!r}: there is no node {index}; there are {len(self)}")
+            return Handle("body", f"{self.name}[{int(self.numbers[index])}]", self.scene)
+        index = index if isinstance(index, slice) else np.asarray(index)
+        return NodeSet(self.name, self.scene, self.numbers[index].reshape(-1), self.positions[index])
+
+    def where(self, condition: Callable[[Any], Any]) -> "NodeSet":
+        """The nodes whose positions obey a condition.
+
+        Args:
+            condition: of positions (n, 3) [m] to booleans (n,).
+        """
+        return self[np.flatnonzero(np.asarray(condition(self.positions)))]
+
+    def __repr__(self) -> str:
+        return f"<{len(self)} nodes of {self.name!r}>"
