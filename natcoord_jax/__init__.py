@@ -99,6 +99,8 @@ from natcoord_jax.effects.joints import (
     Universal,
 )
 from natcoord_jax.effects.loads import BodyTorque, Gravity, PairTorque, PointForce
+from natcoord_jax.effects.shells import ShellElement
+from natcoord_jax.effects.solids import Brick
 from natcoord_jax.effects.springs import (
     Armature,
     Damper,
@@ -136,6 +138,7 @@ __all__ = [
     "BodyTorqueInput",
     "Box",
     "Check",
+    "Brick",
     "CircularSection",
     "ComputedTorque",
     "Constraint",
@@ -203,6 +206,7 @@ __all__ = [
     "Screw",
     "Section",
     "SimulationError",
+    "ShellElement",
     "Solution",
     "Sphere",
     "Spherical",

@@ -57,6 +57,7 @@ def f(*_):
 
 
 V, NAME, NUMBER, WHOLE, FLAG = [np.ones(3)], ["name"], [1.0], [1], [True]
+PLACES = [np.ones((4, 3))]
 JOINT = lambda w: {  # noqa: E731
     "parent": [nc.ground], "child": [w.body], "point": V, "axis": V, "second": [np.array([0, 1, -1.0])],
     "name": NAME,
@@ -139,6 +140,19 @@ CALLS = {
     "PointForce": lambda w: {**MARKED((w.point,)), "force": [np.ones(3), f], "following": [False]},
     "BodyTorque": lambda w: {**MARKED((w.direction,)), "torque": [np.ones(3), f], "following": [False]},
     "PairTorque": lambda w: {**MARKED(w.triad[:2]), "torque": [1.0, f]},
+    "ShellElement": lambda w: {
+        **MARKED(w.attached * 2), "thickness": NUMBER, "E": NUMBER, "nu": [0.3]
+    },
+    "Brick": lambda w: {**MARKED(w.ends * 4), "E": NUMBER, "nu": [0.3]},
+    "Nodes.points": lambda w: {"positions": PLACES, "mass": NUMBER, "velocity": V, "name": NAME},
+    "Nodes.directors": lambda w: {
+        "positions": PLACES, "directors": V, "mass": NUMBER, "inertia": NUMBER, "velocity": V,
+        "angular_velocity": V, "name": NAME,
+    },
+    "Nodes.triads": lambda w: {
+        "positions": PLACES, "orientations": [np.eye(3)], "mass_blocks": [np.eye(4)], "velocity": V,
+        "angular_velocity": V, "name": NAME,
+    },
     "PointOnPlane": lambda w: {**MARKED((w.ends[0], w.direction, w.point)), "distance": NUMBER},
     "PointOnLine": lambda w: MARKED((w.ends[0], w.direction, w.point)),
     "Rod": lambda w: {**MARKED(w.ends), "length": NUMBER},
@@ -309,8 +323,8 @@ CALLS = {
 # What calls return or hand over, and bases: nobody is to make these by hand.
 MADE = {
     "Accuracy", "Balance", "BeamHandle", "Check", "ComputedTorque", "Continuation", "DerivativeError",
-    "Equilibrium", "Feedback", "Frame", "Growth", "Load", "Modes", "NonlinearProgram", "Optima", "Outcome",
-    "Result", "SimulationError", "Solution", "State", "System", "Trajectory",
+    "Equilibrium", "Feedback", "Frame", "Growth", "Load", "Modes", "Nodes", "NonlinearProgram", "Optima",
+    "Outcome", "Result", "SimulationError", "Solution", "State", "System", "Trajectory",
 }  # fmt: skip
 BASES = {"Constraint", "Field", "Force", "Joint", "Potential", "VelocityConstraint"}
 IN_MODULES = {"cost": nc.cost, "goal": nc.goal, "bounds": nc.bounds, "inputs": nc.inputs}
@@ -354,6 +368,7 @@ def test_everything_public_is_in_the_table():
         methods = inspect.getmembers(cls, inspect.isfunction)
         names |= {f"{cls.__name__}.{n}" for n, _ in methods if n[0] != "_"}
     names |= {"Section.of_numbers", "Section.of_axis_along_first"}
+    names |= {"Nodes.points", "Nodes.directors", "Nodes.triads"}
     # What `System.set` takes are numbers of the part by name, see `test_parts`.
     assert names - BASES_IN_MODULES - {"System.set"} == set(CALLS)
 

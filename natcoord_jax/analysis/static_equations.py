@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from natcoord_jax.assembly.balances import loads
 from natcoord_jax.assembly.full import FullStep
 from natcoord_jax.assembly.local import body_motion
-from natcoord_jax.assembly.momentum import wrench
+from natcoord_jax.assembly.momentum import idle_torque, wrench
 from natcoord_jax.assembly.node_sweeps import sweep_nodes
 from natcoord_jax.assembly.outset import Outset
 from natcoord_jax.assembly.projection import nearest_coordinates
@@ -98,7 +98,7 @@ class Static(eqx.Module):
         sums = -(jnp.concatenate([force, torque], axis=1) + jnp.concatenate(pulled, axis=1))
         # The directors of a point mass are held where they are.
         turned = y[: self.balances].reshape(-1, 6)[:, 3:]
-        sums = sums.at[:, 3:].add(self.system.idle_torque(self.state.q.reshape(-1, 4, 3), turned))
+        sums = sums.at[:, 3:].add(idle_torque(self.system, self.state.q.reshape(-1, 4, 3), turned))
         return jnp.concatenate([sums.reshape(-1), self.gaps(state)])
 
     def constraint_loads(self, state: State, y: Array) -> tuple[Array, Array]:

@@ -116,9 +116,9 @@ def energy(system: "System", state: State) -> Energy:
     for group in system.effects:
         if group.effect.stores:
             values = group_energies(system, group, state)
-            if group.source == "mass":
+            if len(group.labels) < values.shape[0]:
                 values = jnp.sum(values)[None]
-            stores |= dict(zip(group.names, values))
+            stores |= dict(zip(group.labels, values))
     return Energy(kinetic, stores)
 
 

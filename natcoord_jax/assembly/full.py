@@ -18,7 +18,7 @@ from natcoord_jax.assembly.form import Form
 from natcoord_jax.assembly.grain import cancelling_size
 from natcoord_jax.assembly.kick import kicked
 from natcoord_jax.assembly.local import body_balance, body_motion, jacobians
-from natcoord_jax.assembly.momentum import least_inertias, momentum_balance
+from natcoord_jax.assembly.momentum import idle_torque, least_inertias, momentum_balance
 from natcoord_jax.assembly.outset import Outset
 from natcoord_jax.assembly.reduced import NOTHING
 from natcoord_jax.assembly.redundancy import at_every_stage, project_multipliers, project_rows
@@ -170,7 +170,7 @@ class FullStep(Form):
         given = self.system, self.groups, situations, at, velocity
         found = momentum_balance(*given, multipliers, self.h, self.tableau)
         # A point mass keeps its directors by an idle inertia, as in `body_balance`.
-        torque = found.torque + self.system.idle_torque(self.start[:-1], at.spin[:, :-1])
+        torque = found.torque + idle_torque(self.system, self.start[:-1], at.spin[:, :-1])
         wrenches = jnp.moveaxis(jnp.concatenate([found.force, torque], axis=-1), 0, 1)
         rows = project_rows(found.rows, y, self.balances, self.outset.projector)
         residual = jnp.concatenate([wrenches.reshape(-1), rows])
@@ -182,7 +182,7 @@ class FullStep(Form):
         local = jax.vmap(jax.jacfwd(body_balance, argnums=3), in_axes=(0, 0, 0, 0, None, None, 0))
         given = self.system.mass, self.start[:-1], self.velocity, twists, self.h, self.tableau
         unit = jnp.broadcast_to(jnp.eye(3, dtype=twists.dtype)[:, None], (3, self.bodies, 3))
-        found = local(*given, jnp.swapaxes(self.system.idle_torque(self.start[:-1], unit), 0, 1))
+        found = local(*given, jnp.swapaxes(idle_torque(self.system, self.start[:-1], unit), 0, 1))
         return found.reshape(self.bodies, width, width)
 
     def tangent(self, y: Float[Array, " unknowns"], loads: Any = None) -> Float[Array, "unknowns unknowns"]:

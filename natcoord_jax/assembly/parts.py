@@ -42,7 +42,7 @@ def _numbered(system: System) -> System:
 
 def _in_group(group: Group, numbered: Group, name: str) -> dict[str, Place]:
     """Floating numbers of an effect, or of the relation of a joint."""
-    row = group.names.index(name) if group.lanes else None
+    row = group.names.index(name) if group.lanes and name in group.names else None
     kind = f"{group.effect.kind} {name!r}"
     paths, _ = jax.tree_util.tree_flatten_with_path(group.effect)
     leaves = jax.tree.leaves(numbered.effect)
@@ -73,7 +73,7 @@ def places(system: System, name: str) -> dict[str, Place]:
         found["frames"] = Place(leaf, structure.joints.index(name), f"joint {name!r}")
     groups = zip((*system.joints, *system.effects), (*numbered.joints, *numbered.effects), strict=True)
     for group, same in groups:
-        if name in group.names:
+        if name in group.names or name in group.labels:
             return found | _in_group(group, same, name)
     joints = [n for n in structure.joints if n]
     bodies, effects = listed(structure.bodies), [n for g in system.effects for n in listed(g.names)]

@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
@@ -18,10 +17,9 @@ from natcoord_jax.core.effect import Effect
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.kinds import BODY_NAME, JOINT_NAME, NAME, HandleOf, Several, of
 from natcoord_jax.core.markers import Marker
-from natcoord_jax.core.names import listed
+from natcoord_jax.core.names import Names, listed
 from natcoord_jax.core.numeric import Number, Numbers, Whole
 from natcoord_jax.core.state import MOTION, STATE, TRAJECTORY, State, Trajectory
-from natcoord_jax.maths.vectors import dot
 
 ELEMENT = HandleOf("effect") | NAME
 PART = of("the handle or name of a body, a joint or an effect", Handle, str)
@@ -72,6 +70,11 @@ class Group(Stacked):
         """Instances, where each has numbers of its own, after the systems of a batch."""
         batch = np.shape(self.bodies)[:-2]
         return batch if self.effect.shared or self.source == "mass" else (*batch, self.count)
+
+    @property
+    def labels(self) -> Sequence[str]:
+        """Names of the instances; of a set its own."""
+        return [name for name, _ in self.names.runs] if isinstance(self.names, Names) else self.names
 
     @property
     def multipliers(self) -> int:
@@ -189,21 +192,6 @@ class System(eqx.Module):
         idle = np.zeros(len(self.structure.bodies))
         idle[list(self.structure.points)] = 1.0
         return idle
-
-    def idle_torque(
-        self, rows: Float[Array, "bodies 4 3"], spin: Float[Array, "*s bodies 3"]
-    ) -> Float[Array, "*s bodies 3"]:
-        """Torques of a unit inertia against turns that nothing sees: of points, of directors about them.
-
-        Args:
-            rows: at the start of the step.
-            spin: angular velocities.
-        """
-        held = jnp.asarray(self.idle_inertia)[:, None] * spin
-        if self.tree.directed is None:
-            return held
-        first = jnp.where(self.tree.directed[:, None], rows[:, 1], 0.0)
-        return held + dot(first, spin)[..., None] * first
 
     @checked("System.energy", motion=MOTION)
     def energy(self, motion: State | Trajectory) -> "diagnostics.Energy":

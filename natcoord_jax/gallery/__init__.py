@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from natcoord_jax.gallery.beams import cantilever, flying_spaghetti, rope
+from natcoord_jax.gallery.continua import block, plate
 from natcoord_jax.gallery.example import Example
 from natcoord_jax.gallery.loops import bricard, four_bar, slider_crank
 from natcoord_jax.gallery.manoeuvres import reorientation_example
@@ -44,6 +45,8 @@ SCENES: Mapping[str, Callable[..., Example]] = {
     "rope": rope,
     "cantilever": cantilever,
     "flying_spaghetti": flying_spaghetti,
+    "plate": plate,
+    "block": block,
     "robot_cable": robot_cable,
     "plugging": plugging,
 }

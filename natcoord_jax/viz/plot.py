@@ -37,7 +37,7 @@ def _stores(system: System, trajectory: Trajectory) -> dict[str, np.ndarray]:
         return stores
     kinds: dict[str, np.ndarray] = {}
     for group in system.effects:
-        for name in group.names:
+        for name in group.labels:
             if name in stores:
                 kind = group.effect.kind
                 kinds[kind] = kinds.get(kind, 0.0) + stores[name]

@@ -1,0 +1,3 @@
+"""Shells."""
+
+from natcoord_jax.effects.shells.quadrilateral import ShellElement as ShellElement

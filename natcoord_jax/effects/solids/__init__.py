@@ -1,0 +1,3 @@
+"""Solids."""
+
+from natcoord_jax.effects.solids.brick import Brick as Brick

@@ -1,0 +1,210 @@
+"""Nodes and elements by the thousands, shells and solids: handles, statics, modes and conservation."""
+
+import time
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import tolerances as tol
+from differences import assert_v_shaped
+
+import natcoord_jax as nc
+from natcoord_jax import gallery
+from natcoord_jax.analysis import balance
+from natcoord_jax.assembly.build import build
+
+
+def net(count, *, kind="points", solver=None):
+    """A square net of threads, hung by a rod at one corner."""
+    line = np.linspace(0.0, 1.0, count)
+    places = np.stack([*np.meshgrid(line, line, indexing="ij"), np.zeros((count, count))], -1).reshape(-1, 3)
+    number = np.arange(count**2).reshape(count, count)
+    along = [(number[:-1], number[1:]), (number[:, :-1], number[:, 1:])]
+    pairs = np.concatenate([np.stack([x.ravel() for x in pair], axis=1) for pair in along])
+    scene = nc.Scene()
+    scene.add(nc.Gravity())
+    mass = 1.0 / count**2
+    if kind == "points":
+        nodes = nc.Nodes.points(places, mass=mass, name="net")
+    else:
+        turning = {"inertia": 1e-3 * mass, "angular_velocity": (0.3, 0.2, 1.0)}
+        nodes = nc.Nodes.directors(places, (0, 0, 1), mass=mass, name="net", **turning)
+    mesh = scene.add(nodes)
+    length = 1.0 / (count - 1)
+    scene.add(nc.QuadraticSpring.on(mesh, pairs, stiffness=200.0, length=length, name="threads"))
+    scene.add(nc.Rod((nc.Point(nc.ground, (0, 0, 1)), nc.Point(mesh[0])), name="rod"))
+    return *scene.compile(solver=solver), mesh
+
+
+def rows_of(trajectory):
+    return np.asarray(trajectory.q).reshape(len(trajectory), -1, 4, 3)
+
+
+def test_handles_of_sets():
+    system, state, mesh = net(3)
+    assert len(mesh) == 9 and mesh[-1] == mesh[8] and mesh[4].name == "net[4]"
+    edge = mesh.where(lambda x: x[:, 0] == 1.0)
+    assert [h.name for h in edge] == ["net[6]", "net[7]", "net[8]"] and edge[1:][0] == mesh[7]
+    assert [h.name for h in mesh[[4, 0]]] == ["net[4]", "net[0]"]
+    np.testing.assert_allclose(edge.positions[:, 1], [0.0, 0.5, 1.0])
+    assert system.body_index(mesh[5]) == 5 and list(system.structure.bodies)[5] == "net[5]"
+    np.testing.assert_allclose(system.sense(state, mesh[5]).position, (0.5, 1.0, 0.0))
+    assert set(system.energy(state).stores) == {"gravity 1", "threads"}
+    heavy = system.set("threads", stiffness=jnp.full(12, 300.0))
+    assert heavy.effects[-1].effect.stiffness.shape == (12,)
+    for wrong in (9, -10):
+        with pytest.raises(IndexError, match="there are 9"):
+            mesh[wrong]
+
+
+@pytest.mark.parametrize(
+    ("connectivity", "options", "message"),
+    [
+        ([[0, 9]], {}, "has nodes from 0 to 9; .* has 0 to 8"),
+        ([[0.5, 1.0]], {}, "must be whole numbers"),
+        ([0, 1], {}, "must be whole numbers"),
+        ([[0, 1], [1, 2]], {"each": {"stiffness": [1.0]}}, r"each\['stiffness'\] needs a leading axis of 2"),
+        ([[0, 1, 2]], {"stiffness": 1.0}, "2 nc.Point, in a tuple"),
+    ],
+)
+def test_wrong_elements_are_refused(connectivity, options, message):
+    _, _, mesh = net(3)
+    with pytest.raises((ValueError, TypeError), match=message):
+        nc.QuadraticSpring.on(mesh, connectivity, length=1.0, **options)
+
+
+def test_elements_are_effects_added_one_by_one():
+    """With numbers of their own, too."""
+    places, stiffness = np.array([(0.0, 0, 0), (1, 0, 0), (2, 0.5, 0)]), np.array([20.0, 50.0])
+    scene, other = nc.Scene(), nc.Scene()
+    mesh = scene.add(nc.Nodes.points(places, mass=(1.0, 2.0, 3.0)))
+    scene.add(nc.Spring.on(mesh, [(0, 1), (1, 2)], each={"stiffness": stiffness}, length=0.8))
+    masses = [other.add(nc.PointMass(mass=m, position=x)) for m, x in zip((1.0, 2.0, 3.0), places)]
+    for k in range(2):
+        ends = nc.Point(masses[k]), nc.Point(masses[k + 1])
+        other.add(nc.Spring(ends, stiffness=stiffness[k], length=0.8))
+    one, two = (nc.simulate(*s.compile(), dt=0.01, steps=50) for s in (scene, other))
+    np.testing.assert_allclose(rows_of(one)[-1, :, 0], rows_of(two)[-1, :, 0], atol=tol.SAME_TRAJECTORY)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["points", "directors"])
+@pytest.mark.parametrize("order", [2, 4])
+def test_nodes_in_all_forms(kind, order):
+    """One trajectory; energy, and the length of directors, to round-off."""
+    found = []
+    for solver in ("reduced", "full", "sparse"):
+        system, state, _ = net(3, kind=kind, solver=solver)
+        assert system.structure.unknowns == 9 * (3 if kind == "points" else 5)
+        trajectory = nc.simulate(system, state, dt=0.01, steps=50, scheme=nc.EnergyMomentum(order=order))
+        assert balance(system, trajectory).energy.max() <= tol.ENERGY_OF_A_SMALL_SCENE
+        found.append(rows_of(trajectory))
+        lengths = np.sum(found[-1][:, :, 1] ** 2, axis=-1)
+        assert np.abs(lengths - 1).max() <= tol.CONSTRAINT_OF_A_SMALL_SCENE
+    for other in found[1:]:
+        np.testing.assert_allclose(other[-1, :, :2], found[0][-1, :, :2], atol=tol.SAME_TRAJECTORY)
+
+
+def test_gradients_through_nodes():
+    system, state, _ = net(2, kind="directors")
+    ahead = jnp.asarray(np.random.default_rng(0).normal(size=state.v.shape))
+    moved = jnp.zeros(state.v.shape).at[::4].set(ahead[::4])
+
+    def loss(speed):
+        start = eqx.tree_at(lambda s: s.v, state, state.v + speed * moved)
+        return jnp.sum(nc.simulate(system, start, dt=0.02, steps=10).q[-1] ** 2)
+
+    at = jnp.asarray(0.3)
+    slope = jax.jit(jax.grad(loss))(at)
+    assert_v_shaped(jax.jit(loss), at, jnp.ones(()), slope)
+    np.testing.assert_allclose(jax.jvp(loss, (at,), (jnp.ones(()),))[1], slope, rtol=tol.SAME_GRADIENT)
+
+
+def test_ten_thousand_nodes():
+    """Added, and their structure compiled, in seconds; neither hash nor names grow."""
+    begun = time.process_time()
+    line = np.linspace(0.0, 1.0, 21)
+    places = np.stack(np.meshgrid(line, line, line, indexing="ij"), axis=-1).reshape(-1, 3)
+    number = np.arange(21**3).reshape(21, 21, 21)
+    corners = [number[i : i + 20, j : j + 20, k : k + 20] for i in (0, 1) for j in (0, 1) for k in (0, 1)]
+    bricks = np.stack(corners, axis=-1).reshape(-1, 8)[:, [0, 4, 6, 2, 1, 5, 7, 3]]
+    scene = nc.Scene()
+    mesh = scene.add(nc.Nodes.points(places, mass=1e-3, name="block"))
+    scene.add(nc.Brick.on(mesh, bricks, E=1e5, nu=0.3, name="bricks"))
+    added = time.process_time()
+    system, _ = build(scene.bodies, scene.joints, scene.effects, "sparse", scene.nodes, scene.elements)
+    built = time.process_time()
+    assert system.structure.unknowns == 3 * 21**3 and system.effects[0].count == 8000
+    assert added - begun < 2.0 and built - added < 10.0
+    start = time.process_time()
+    for _ in range(100):
+        hash(system.structure)
+    assert time.process_time() - start < 0.1
+    assert (
+        len(repr(system.structure)) < 2000 + sum(len(str(x)) for x in system.structure.shapes[:1]) * 21**3 * 3
+    )
+
+
+class HeldDirector(nc.Constraint):
+    """A direction that two others stay normal to [-]; the clamp of a shell's edge."""
+
+    multipliers = 2
+
+    def residual(self, x):
+        return jnp.stack([x[0] @ x[2], x[1] @ x[2]])
+
+
+def cantilever(elements, force=0.0):
+    """A strip of 10 m by 1 m, 0.1 m thick, clamped, with a force at its end (Sze et al. 2004)."""
+    along = np.repeat(np.linspace(0.0, 10.0, elements + 1), 2)
+    places = np.stack([along, np.tile([0.0, 1.0], elements + 1)], axis=1)
+    places = np.pad(places, ((0, 0), (0, 1)))
+    number = np.arange(len(places)).reshape(-1, 2)
+    quads = np.stack([number[:-1, 0], number[1:, 0], number[1:, 1], number[:-1, 1]], axis=1)
+    area = np.bincount(quads.ravel()) * 10.0 / elements / 4
+    density, thickness = 3.1314e-4, 0.1
+    lumps = {"mass": density * thickness * area, "inertia": density * thickness**3 / 12 * area}
+    scene = nc.Scene()
+    mesh = scene.add(nc.Nodes.directors(places, (0, 0, 1), name="mesh", **lumps))
+    scene.add(nc.ShellElement.on(mesh, quads, thickness=thickness, E=1.2e6, nu=0.0, name="strip"))
+    held = nc.Direction(nc.ground, (1, 0, 0)), nc.Direction(nc.ground, (0, 1, 0))
+    for node in mesh.where(lambda x: x[:, 0] == 0.0):
+        scene.add(nc.Spherical(nc.ground, node))
+        scene.add(HeldDirector((*held, nc.Direction(node, (0, 0, 1)))))
+    tip = mesh.where(lambda x: x[:, 0] == 10.0)
+    for node in tip if force else ():
+        scene.add(nc.PointForce((nc.Point(node),), force=(0, 0, 0.5 * force)))
+    return *scene.compile(), tip
+
+
+@pytest.mark.slow
+def test_cantilever_of_shells():
+    """Bent by its end by two thirds of its length: 3.286 and 6.698 m, and on this mesh 3.2930 and 6.7047."""
+    system, state, tip = cantilever(16, force=4.0)
+    end = nc.equilibrium(system, state).state.q.reshape(-1, 4, 3)[system.body_index(tip[0]), 0]
+    np.testing.assert_allclose((10.0 - end[0], end[2]), (3.2930, 6.7047), atol=1e-4)
+
+
+@pytest.mark.slow
+def test_frequency_of_shells():
+    """10 Hz by the theory of beams; 9.958 Hz on eight elements with lumped masses."""
+    system, state, _ = cantilever(8)
+    lowest = nc.modes(system, state, count=1).frequencies[0] / (2 * np.pi)
+    np.testing.assert_allclose(lowest, 9.958, atol=5e-4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["plate", "block"])
+def test_continua_keep_what_they_should(name):
+    """Energy, momentum and angular momentum over 1000 steps, with a good part of the energy stored."""
+    example = gallery.load(name)
+    trajectory = example.simulate()
+    found = balance(example.system, trajectory)
+    assert found.energy.max() <= tol.MOMENTUM
+    assert found.momentum.max() <= tol.MOMENTUM and found.angular_momentum.max() <= tol.ANGULAR_MOMENTUM
+    energy = example.system.energy(trajectory)
+    stored = np.asarray(energy.stores[name])
+    assert stored.max() - stored.min() >= 0.2 * float(energy.total[0])
+    assert np.abs(np.sum(rows_of(trajectory)[:, :, 1] ** 2, axis=-1) - 1).max() <= tol.CONSTRAINT
