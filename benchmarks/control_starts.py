@@ -24,6 +24,7 @@ import jax
 import numpy as np
 
 import natcoord_jax as nc
+from benchmarks import common
 from natcoord_jax.control.guess import scattered, unknowns_of
 from natcoord_jax.control.problem import numeric
 from natcoord_jax.control.transcription import held_inputs
@@ -294,7 +295,8 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--json", type=Path)
     given = parser.parse_args(arguments)
     jax.config.update("jax_enable_x64", True)
-    results = json.loads(given.json.read_text()) if given.json and given.json.exists() else {}
+    known = json.loads(given.json.read_text()) if given.json and given.json.exists() else {}
+    results = known.get("problems", {})
     for name in given.problems:
         case = CASES[name]
         problem = numeric(case.problem())
@@ -316,7 +318,8 @@ def main(arguments: list[str] | None = None) -> None:
                 flush=True,
             )
         if given.json:
-            given.json.write_text(json.dumps(results, indent=1) + "\n")
+            about = common.circumstances("control_starts", quick=False)
+            given.json.write_text(json.dumps(about | {"problems": results}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

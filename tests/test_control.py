@@ -334,7 +334,7 @@ def test_least_effort_about_a_principal_axis():
 @pytest.mark.parametrize(
     ("wheels", "known"),
     [
-        pytest.param(False, 120.852118, marks=pytest.mark.slow),
+        pytest.param(False, 120.852118, marks=pytest.mark.exhaustive),
         pytest.param(True, 129.028096, marks=pytest.mark.benchmark),
     ],
 )

@@ -369,7 +369,7 @@ def test_gradient_through_retried_steps():
 @pytest.mark.parametrize(
     "dt, steps, extra",
     [
-        pytest.param(0.5, 6, 64, marks=pytest.mark.slow),
+        pytest.param(0.5, 6, 64, marks=pytest.mark.exhaustive),
         pytest.param(0.05, 40, 0, marks=pytest.mark.exhaustive),
     ],
 )

@@ -60,7 +60,7 @@ def test_the_cable_hangs_at_rest_between_holder_and_clamp(short):
     np.testing.assert_allclose(system.sense(run, parts.cable.at(0.5)).position[-1], middle, rtol=0, atol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_gripper_closes_where_the_plug_is(short):
     parts, run = short
     (approach, before), (gripped, after) = run.pairs
@@ -81,7 +81,7 @@ def test_the_gripper_closes_where_the_plug_is(short):
     assert np.linalg.norm(gripped.sense(after, "plug").position[-1] - plug[-1]) > 1e-4
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_balances_and_pictures(short, tmp_path):
     parts, run = short
     for system, trajectory in run.pairs:
@@ -103,7 +103,7 @@ def test_balances_and_pictures(short, tmp_path):
     assert film.read_bytes()[:3] == b"GIF"
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_jerky_grip_loses_energy(short):
     """The gripper meets the plug in motion: what is lost is what momenta cannot keep."""
     parts, run = short

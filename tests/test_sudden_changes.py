@@ -144,7 +144,7 @@ def chain(links, solver):
     "links, solver",
     [
         pytest.param(3, "reduced", marks=pytest.mark.slow),
-        pytest.param(4, "recursive", marks=pytest.mark.slow),
+        pytest.param(4, "recursive", marks=pytest.mark.exhaustive),
         pytest.param(3, "full", marks=pytest.mark.exhaustive),
         pytest.param(3, "sparse", marks=pytest.mark.exhaustive),
     ],

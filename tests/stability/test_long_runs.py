@@ -31,7 +31,8 @@ were it faster, the rounding of its position would be the error of its angular m
 
 EVERY_TOP = pytest.mark.parametrize("name", STEP)
 EVERY_ORDER = pytest.mark.parametrize(
-    "order", [2, *(pytest.param(order, marks=pytest.mark.slow) for order in (4, 6))]
+    "order",
+    [2, pytest.param(4, marks=pytest.mark.slow), pytest.param(6, marks=pytest.mark.exhaustive)],
 )
 
 
@@ -134,7 +135,7 @@ def swinging(order: int, nudge: float = 0.0, steps: int = 100_000):
     return system, simulate_long(system, state, order=order, dt=0.005, steps=steps, save_every=100)
 
 
-@pytest.mark.parametrize("order", [2, pytest.param(4, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("order", [2, pytest.param(4, marks=pytest.mark.exhaustive)])
 def test_laws_outlive_the_path(order):
     """Starts 1e-9 rad apart lead to other paths within 500 s; each keeps its energy."""
     paths = []

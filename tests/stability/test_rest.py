@@ -58,7 +58,7 @@ SHAPES = [
     pytest.param(10, "clamped", marks=pytest.mark.exhaustive),
     pytest.param(10, "free", marks=pytest.mark.exhaustive),
     pytest.param(50, "hinged", marks=pytest.mark.slow),
-    pytest.param(200, "clamped", marks=pytest.mark.slow),
+    pytest.param(200, "clamped", marks=pytest.mark.exhaustive),
 ]
 
 
@@ -94,11 +94,13 @@ def test_a_rod_at_rest_or_hardly_moving(elements, end):
         assert_stays(run, *given, (1e-6, 1e-5, 1e-4, 1e-3, 1e-2))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "scheme",
-    [nc.EnergyMomentum(order=4), nc.VariationalMidpoint(), nc.Dissipative()],
-    ids=["fourth", "variational", "dissipative"],
+    [
+        pytest.param(nc.EnergyMomentum(order=4), id="fourth", marks=pytest.mark.exhaustive),
+        pytest.param(nc.VariationalMidpoint(), id="variational", marks=pytest.mark.slow),
+        pytest.param(nc.Dissipative(), id="dissipative", marks=pytest.mark.slow),
+    ],
 )
 def test_other_schemes_at_rest(scheme):
     run = program(scheme)
@@ -187,7 +189,7 @@ def test_a_rod_that_is_hardly_driven(acceleration):
     "elastic",
     [
         pytest.param(RUBBER, id="rubber", marks=pytest.mark.exhaustive),
-        pytest.param(STEEL, id="steel", marks=pytest.mark.slow),
+        pytest.param(STEEL, id="steel", marks=pytest.mark.exhaustive),
     ],
 )
 def test_a_rod_that_has_come_to_rest(elastic):

@@ -15,12 +15,6 @@ from motions import simulate
 
 import natcoord_jax as nc
 
-ORDERS = (
-    pytest.param(2, marks=pytest.mark.slow),
-    pytest.param(4, marks=pytest.mark.exhaustive),
-)
-
-
 JOINTS = (("cardan", nc.Universal), ("tube", nc.Cylindrical))
 
 
@@ -80,7 +74,8 @@ def at_rest(order, system, state, second=True):
     return *jax.jit(along)(x), gradient, curvature
 
 
-@pytest.mark.parametrize("order", ORDERS)
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("order", [2, 4])
 def test_everything_at_zero(order):
     """Rest, zero strain, aligned axes: value, gradient, tangent and Hessian times vector are finite.
 
