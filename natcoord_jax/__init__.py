@@ -84,7 +84,7 @@ from natcoord_jax.effects.beams import (
     DirectorElement,
     NonlinearBeamElement,
 )
-from natcoord_jax.effects.constraints import PointOnLine, PointOnPlane, Rod, Rolling
+from natcoord_jax.effects.constraints import PointOnLine, PointOnPlane, PointOnPoint, Rod, Rolling
 from natcoord_jax.effects.joints import (
     Coupling,
     Cylindrical,
@@ -192,6 +192,7 @@ __all__ = [
     "PointMass",
     "PointOnLine",
     "PointOnPlane",
+    "PointOnPoint",
     "Potential",
     "Prismatic",
     "QuadraticSpring",

@@ -155,6 +155,7 @@ CALLS = {
     },
     "PointOnPlane": lambda w: {**MARKED((w.ends[0], w.direction, w.point)), "distance": NUMBER},
     "PointOnLine": lambda w: MARKED((w.ends[0], w.direction, w.point)),
+    "PointOnPoint": lambda w: MARKED(w.ends),
     "Rod": lambda w: {**MARKED(w.ends), "length": NUMBER},
     "Rolling": lambda w: {**MARKED((w.ends[0], w.direction, w.point)), "radius": NUMBER},
     "Spring": lambda w: {**MARKED(w.ends), "stiffness": NUMBER, "length": NUMBER},

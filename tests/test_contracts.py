@@ -140,6 +140,9 @@ TABLE = {
     nc.Brick: Entry(lambda p: nc.Brick(p.eight, E=50.0, nu=0.3)),
     nc.PointOnPlane: Entry(lambda p: nc.PointOnPlane((p.ends[0], p.triad[2], p.ends[1]), distance=0.2)),
     nc.PointOnLine: Entry(lambda p: nc.PointOnLine((p.ends[0], p.triad[2], p.ends[1]))),
+    nc.PointOnPoint: Entry(
+        lambda p: nc.PointOnPoint(tuple(nc.Point(body, (0.2, 0.1, -1.3)) for body in (p.one, p.two)))
+    ),
     nc.Rod: Entry(lambda p: nc.Rod(p.ends)),
     nc.Rolling: Entry(
         lambda p: nc.Rolling((p.ends[0], p.triad[2], p.ends[1], nc.Direction(p.two, AXIS)), radius=0.3)
@@ -443,7 +446,8 @@ def test_residual_is_at_most_quadratic(joint):
         g = [residual(rows + k * step) for k in range(4)]
         scale = max(float(jnp.max(jnp.abs(x))) for x in g)
         assert np.max(np.abs(g[3] - 3 * g[2] + 3 * g[1] - g[0])) <= tol.IDENTITY * scale
-    assert joint is nc.Spherical or np.max(np.abs(g[2] - 2 * g[1] + g[0])) > 1e-3
+    linear = joint in (nc.Spherical, nc.PointOnPoint)
+    assert linear or np.max(np.abs(g[2] - 2 * g[1] + g[0])) > 1e-3
 
 
 @RESIDUALS
@@ -455,7 +459,13 @@ def test_residual_does_not_see_rigid_motions(joint):
     turn = from_rotation_vector(jnp.asarray(rng.normal(size=3)))
     moved = (rows @ turn.T).at[:, 0].add(jnp.asarray(rng.normal(size=3)))
     seen, unseen = residual(moved), residual(rows)
-    if joint in (nc.Fixed, nc.Spherical, nc.Revolute, nc.Universal):  # the gap is a vector of the world
+    if joint in (
+        nc.Fixed,
+        nc.Spherical,
+        nc.Revolute,
+        nc.Universal,
+        nc.PointOnPoint,
+    ):  # the gap is a vector of the world
         unseen = unseen.at[:3].set(turn @ unseen[:3])
     assert np.max(np.abs(seen - unseen)) <= tol.INDIFFERENCE
 

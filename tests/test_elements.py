@@ -122,6 +122,58 @@ def test_gradients_through_nodes():
     np.testing.assert_allclose(jax.jvp(loss, (at,), (jnp.ones(()),))[1], slope, rtol=tol.SAME_GRADIENT)
 
 
+def square(solver=None, *, make):
+    """One shell element, and something that is made of a point inside it."""
+    scene = nc.Scene()
+    scene.add(nc.Gravity())
+    places = [(0.0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)]
+    mesh = scene.add(nc.Nodes.directors(places, (0, 0, 1), mass=1.0, inertia=0.01, name="mesh"))
+    scene.add(nc.ShellElement.on(mesh, [(0, 1, 2, 3)], thickness=0.1, E=1e4, nu=0.3))
+    inside = nc.Point(mesh[[0, 1, 2, 3]], (0.1, 0.2, 0.3, 0.4))
+    scene.add(make(inside))
+    return *scene.compile(solver=solver), inside
+
+
+ABOVE = nc.Point(nc.ground, (0.5, 0.7, 1.0))
+INSIDE = {
+    "spring": lambda x: nc.Spring((ABOVE, x), stiffness=50.0, length=1.0),
+    "rod": lambda x: nc.Rod((ABOVE, x)),
+    "pin": lambda x: nc.PointOnPoint((nc.Point(nc.ground, (0.5, 0.7, 0)), x), name="pin"),
+    "force": lambda x: nc.PointForce((x,), force=(0, 0, 30.0)),
+}
+
+
+@pytest.mark.parametrize(
+    "name", ["pin", *(pytest.param(x, marks=pytest.mark.slow) for x in INSIDE if x != "pin")]
+)
+def test_points_inside_of_elements(name):
+    """What takes a point takes one between nodes, in all forms."""
+    found = []
+    for solver in ("reduced", "full", "sparse"):
+        system, state, inside = square(solver, make=INSIDE[name])
+        np.testing.assert_allclose(system.sense(state, inside).position, (0.5, 0.7, 0.0), atol=1e-15)
+        trajectory = nc.simulate(system, state, dt=0.01, steps=30)
+        assert balance(system, trajectory).energy.max() <= tol.ENERGY_OF_A_SMALL_SCENE
+        assert system.constraint_errors(trajectory).position.max() <= tol.CONSTRAINT_OF_A_SMALL_SCENE
+        sensor = system.sense(trajectory, inside)
+        found.append(np.asarray(sensor.position))
+        if name == "pin":
+            assert np.abs(sensor.velocity).max() <= 1e-12
+    for other in found[1:]:
+        np.testing.assert_allclose(other, found[0], atol=tol.SAME_TRAJECTORY)
+
+
+def test_wrong_weights_are_refused():
+    _, _, mesh = net(2)
+    for weights, message in (
+        ((0.5, 0.6), "add up to 1.1"),
+        ((0.5, 0.2, 0.3), "pass 2 numbers for <2 nodes of 'net'>"),
+        (None, "pass 2 numbers"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            nc.Point(mesh[[0, 1]], weights)
+
+
 def test_ten_thousand_nodes():
     """Added, and their structure compiled, in seconds; neither hash nor names grow."""
     begun = time.process_time()

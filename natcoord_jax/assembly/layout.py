@@ -46,7 +46,7 @@ def _couplings(effects: dict[str, Effect], poses: Poses, sets: int) -> list[tupl
     for effect in effects.values():
         if effect.couples:
             markers: Any = getattr(effect, "markers", ())
-            listed = [poses.of(m.body) for m in markers]
+            listed = [poses.of(handle) for m in markers for handle in getattr(m, "handles", (m.body,))]
             found += [pair for pair in pairwise(listed) if min(pair) >= sets]
     return found
 
@@ -206,16 +206,25 @@ class Layout:
                 f"{label}: markers must be a tuple of nc.Point and nc.Direction, or one of nc.Attachment, "
                 f"not {markers!r}"
             )
-        weights = stacked([self.poses.weights(m) for m in markers])
+        weights, bodies = self._weighted(markers)
         if type(effect).assembled_at is not Effect.assembled_at:
-            effect = effect.assembled_at(self._placed(markers, weights))
+            effect = effect.assembled_at(_place_markers(weights, self.rows_at(np.array(bodies))))
         drop = [f for f in ("markers", "name", "joint") if f in type(effect).__dataclass_fields__]
-        bodies = [self.body(m.body) for m in markers]
-        return Instance(name, bare(effect, drop, label), "markers", bodies, weights=weights)
+        numbers = [int(self.body_number[b]) for b in bodies]
+        return Instance(name, bare(effect, drop, label), "markers", numbers, weights=weights)
 
-    def _placed(self, markers: Any, weights: Array) -> Array:
-        """Where markers are in the assembled pose."""
-        return _place_markers(weights, self._rows(*(m.body for m in markers)))
+    def _weighted(self, markers: Any) -> tuple[Array, list[int]]:
+        """Weights of markers (k, ..., 4 b), and numbers in the scene of the b bodies of each in turn.
+
+        What has fewer bodies than others has the ground for the rest, without weight.
+        """
+        own = [[self.poses.of(handle) for handle in getattr(m, "handles", (m.body,))] for m in markers]
+        most = max(map(len, own))
+        weights = [self.poses.weights(m) for m in markers]
+        if most > 1:
+            weights = [_padded(w, 4 * most) for w in weights]
+        ground = len(self.bodies)
+        return stacked(weights), [b for x in own for b in (*x, *(ground,) * (most - len(x)))]
 
     def _on_coordinates(self, name: str, effect: CoordinateEffect, label: str) -> Instance:
         many = isinstance(effect.joint, tuple)
@@ -274,6 +283,13 @@ MOTION = "position", "rotation", "velocity", "angular_velocity"
 """What the rows of a body and their velocities are made of."""
 
 _frames_at = on_host(frames_at)
+
+
+@on_host
+def _padded(weights: Float[Array, "*m w"], width: int) -> Float[Array, "*m width"]:
+    return jnp.concatenate([weights, jnp.zeros((*weights.shape[:-1], width - weights.shape[-1]))], axis=-1)
+
+
 _place_markers = on_host(place_markers)
 
 

@@ -10,7 +10,7 @@ from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.handles import ground as ground_handle
 from natcoord_jax.core.host import on_host
 from natcoord_jax.core.joint import Joint
-from natcoord_jax.core.markers import Attachment, Marker
+from natcoord_jax.core.markers import Attachment, Interpolated, Marker
 from natcoord_jax.maths.rotations import frame_from_axis
 
 
@@ -29,6 +29,9 @@ class Poses:
 
     def weights(self, marker: Marker | Attachment) -> Float[Array, "*m 4"]:
         """Weights of a marker: (4,) of a point or a direction, (4, 4) of an attachment."""
+        if isinstance(marker, Interpolated):
+            row = np.eye(4)[0 if marker.is_point else 1]
+            return as_array(np.kron(np.asarray(marker.vector), row))
         if isinstance(marker, Attachment):
             point, axes = as_array(marker.point, float), as_array(marker.axes, float)
             return _attachment_weights(*self._pose(marker), point, axes)

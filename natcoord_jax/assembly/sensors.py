@@ -19,7 +19,7 @@ from natcoord_jax.assembly.reading import Source, over_source
 from natcoord_jax.assembly.system import System
 from natcoord_jax.core.compiled import compiled
 from natcoord_jax.core.handles import Handle, ground
-from natcoord_jax.core.markers import Marker
+from natcoord_jax.core.markers import Interpolated, Marker
 from natcoord_jax.core.names import listed as listed_names
 from natcoord_jax.core.state import State, Trajectory
 from natcoord_jax.maths.rotations import angular_velocity, to_quaternion
@@ -169,13 +169,13 @@ class MarkerSensor(eqx.Module):
     Attributes:
         position: of the point [m], or the direction itself [-].
         weights: of the rows of the body (7, 46).
-        body: number of the body; the number of bodies is the ground.
+        body: number of the body; the number of bodies is the ground. Of a marker between nodes all of them.
         source: what the sensor looks at.
     """
 
     position: Float[Array, "*t 3"]
-    weights: Float[Array, "4"]
-    body: int = eqx.field(static=True)
+    weights: Float[Array, "*b 4"]
+    body: int | tuple[int, ...] = eqx.field(static=True)
     source: Source = eqx.field(repr=False)
 
     @property
@@ -190,9 +190,11 @@ class MarkerSensor(eqx.Module):
 
 
 def _weighted(
-    weights: Float[Array, "*l 4"], rows: Float[Array, "*t rows 3"], body: int
+    weights: Float[Array, "*l 4"], rows: Float[Array, "*t rows 3"], body: int | tuple[int, ...]
 ) -> Float[Array, "*t 3"]:
     """Marker vector sum_a w_a q_a; zero on the ground, whose rows do not move."""
+    if isinstance(body, tuple):
+        return sum((_weighted(w, rows, b) for w, b in zip(weights, body)), jnp.zeros_like(rows[..., 0, :]))
     if 4 * body >= rows.shape[-2]:
         return jnp.zeros_like(rows[..., 0, :])
     own = rows[..., 4 * body : 4 * body + 4, :]
@@ -328,6 +330,10 @@ def sense(
     if about is not None and (not isinstance(named, str) or named not in system.structure.joints):
         raise ValueError(f"{part!r} has no reaction about a point: pass `about` with a joint")
     source = Source.of(system, motion, inputs_along(system, motion, inputs))
+    if isinstance(part, Interpolated):
+        bodies = tuple(system.body_index(handle) for handle in part.bodies)
+        weights = jnp.outer(jnp.asarray(part.vector, float), jnp.eye(4)[0 if part.is_point else 1])
+        return MarkerSensor(_weighted(weights, states.q, bodies), weights, bodies, source)
     if isinstance(part, Marker):
         weights, body = marker_weights(system, part, state)
         if body == len(system.structure.bodies):

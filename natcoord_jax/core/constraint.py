@@ -77,7 +77,7 @@ class Constraint(Effect):
         """Metres where the residual depends on where points are."""
         at = place_markers(place, rows)
         change = np.asarray(jax.jacfwd(self.residual)(at))
-        points = np.asarray(place[..., 0] != 0)[..., None]
+        points = np.any(np.asarray(place)[..., ::4] != 0, axis=-1, keepdims=True)
         return tuple("m" if np.any(x * points) else "-" for x in change)
 
     def respond(self, place: Array, motion: Motion, now: Now, lam: Array) -> Response:
@@ -146,7 +146,8 @@ class VelocityConstraint(Effect):
         self, place: Array, rows: Array, rates: Array, spin: Array, t: Array, passing: Any
     ) -> Array:
         """What the velocities leave."""
-        return self.rate(place_markers(place, rows), place_markers(place, rates), spin)
+        own = spin[:: spin.shape[0] // place.shape[0]]
+        return self.rate(place_markers(place, rows), place_markers(place, rates), own)
 
     def violation_units(self, place: Array, rows: Array) -> tuple[str, ...]:
         """Metres, as of points."""
@@ -160,5 +161,6 @@ class VelocityConstraint(Effect):
             return given, *jax.vjp(lambda v, w: self.rate(held, v, w), rates, spin)[1](multipliers)
 
         x, rates, held = (place_markers(place, q) for q in (motion.rows, motion.rates, motion.held.rows))
-        found, forces, torques = jax.vmap(stage)(x, rates, motion.spin, held, lam)
+        spin = motion.spin[:, :: motion.spin.shape[1] // place.shape[0]]
+        found, forces, torques = jax.vmap(stage)(x, rates, spin, held, lam)
         return replace_fields(marker_response(place, forces, torques, rates, motion), rows=found)

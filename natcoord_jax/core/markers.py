@@ -9,11 +9,13 @@ import dataclasses
 from typing import Any
 
 import equinox as eqx
+import numpy as np
 
 from natcoord_jax.core.arguments import Part, checked, is_a
 from natcoord_jax.core.handles import Handle
-from natcoord_jax.core.kinds import BODY, FLAG, Kind, described, is_other, short
-from natcoord_jax.core.numeric import COMPONENTS, Directions, Numbers
+from natcoord_jax.core.kinds import BODY, FLAG, Anything, Kind, described, is_other, of, short
+from natcoord_jax.core.nodes import NodeSet
+from natcoord_jax.core.numeric import COMPONENTS, Directions, Numbers, array_of, values_of
 
 
 class Marker(eqx.Module):
@@ -31,24 +33,68 @@ class Marker(eqx.Module):
     is_point: bool = eqx.field(static=True)
     local: bool = eqx.field(static=True, default=False)
 
+    @property
+    def handles(self) -> tuple[Handle, ...]:
+        """Bodies that it moves with."""
+        return (self.body,)
+
+
+class Interpolated(Marker):
+    """A point, or a director, that is a sum of those of several nodes with constant weights.
+
+    Attributes:
+        bodies: handles of the nodes; `body` is the first of them, and `vector` their weights.
+    """
+
+    bodies: tuple[Handle, ...] = eqx.field(static=True, default=())
+
+    @property
+    def handles(self) -> tuple[Handle, ...]:
+        """All of them."""
+        return self.bodies
+
 
 @described.register
 def _(value: Marker) -> str:
+    if len(value.handles) > 1:
+        return f"a {'point' if value.is_point else 'direction'} between {len(value.handles)} nodes"
     return f"a {'point' if value.is_point else 'direction'} of {short(value.body)}"
 
 
-@checked(body=BODY, position=COMPONENTS, local=FLAG)
-def Point(body: Handle, position: Any = None, *, local: bool = False) -> Marker:
-    """Material point of a body.
+NODES = BODY | of("some nodes of a set, as nodes[[3, 4]]", NodeSet)
+
+
+def _refuse(what: str, kind: Kind, value: Any) -> None:
+    """Complain of a value, if it is none of a kind."""
+    complaint = kind.complaint(value)
+    if complaint is not None:
+        raise ValueError(f"{what} {complaint}; pass {kind.wanted}")
+
+
+def _between(nodes: NodeSet, weights: Any, is_point: bool) -> Marker:
+    """A marker between nodes."""
+    given = values_of(array_of(weights))
+    if given is None or given.shape != (len(nodes),) or not np.isfinite(given).all():
+        kind = "Point" if is_point else "Direction"
+        raise ValueError(f"{kind}: weights [-] {is_other(weights)}; pass {len(nodes)} numbers for {nodes!r}")
+    if is_point and abs(given.sum() - 1.0) > 1e-9:
+        raise ValueError(f"Point: weights [-] add up to {given.sum():g}; those of a point add up to 1")
+    handles = tuple(nodes)
+    return Interpolated(handles[0], given.astype(float), is_point, False, handles)
+
+
+@checked(body=NODES, position=Anything(), local=FLAG)
+def Point(body: Handle | NodeSet, position: Any = None, *, local: bool = False) -> Marker:
+    """Material point of a body, or between nodes.
 
     Args:
-        body: handle returned by `Scene.add`, or `ground`.
+        body: handle returned by `Scene.add`, or `ground`; or some nodes of a set.
         position: shape (3,) [m], in world coordinates of the assembled pose; default the body's reference
-            point.
+            point. Of nodes their weights [-], which add up to 1.
         local: take `position` in the body's reference frame instead, from its reference point.
 
     Raises:
-        ValueError: for something else than a body and numbers.
+        ValueError: for something else than a body and numbers, or weights that are no mean.
 
     Example:
         >>> import jax; jax.config.update("jax_enable_x64", True)
@@ -56,18 +102,22 @@ def Point(body: Handle, position: Any = None, *, local: bool = False) -> Marker:
         >>> nc.Point(nc.ground, (0, 0, 1)).is_point
         True
     """
-    return (
-        Marker(body, (0.0, 0.0, 0.0), True, True) if position is None else Marker(body, position, True, local)
-    )
+    if isinstance(body, NodeSet):
+        return _between(body, position, True)
+    if position is None:
+        return Marker(body, (0.0, 0.0, 0.0), True, True)
+    _refuse("Point: position [m]", COMPONENTS, position)
+    return Marker(body, position, True, local)
 
 
-@checked(body=BODY, vector=Directions(), local=FLAG)
-def Direction(body: Handle, vector: Any, *, local: bool = False) -> Marker:
-    """Direction fixed in a body.
+@checked(body=NODES, vector=Anything(), local=FLAG)
+def Direction(body: Handle | NodeSet, vector: Any, *, local: bool = False) -> Marker:
+    """Direction fixed in a body, or a mean of the directors of nodes.
 
     Args:
-        body: handle returned by `Scene.add`, or `ground`.
-        vector: shape (3,) [-], in world coordinates of the assembled pose; its length is kept.
+        body: handle returned by `Scene.add`, or `ground`; or some nodes of a set that have directors.
+        vector: shape (3,) [-], in world coordinates of the assembled pose; its length is kept. Of nodes their
+            weights [-].
         local: take `vector` in the body's reference frame instead.
 
     Raises:
@@ -79,6 +129,9 @@ def Direction(body: Handle, vector: Any, *, local: bool = False) -> Marker:
         >>> nc.Direction(nc.ground, (0, 0, 1)).is_point
         False
     """
+    if isinstance(body, NodeSet):
+        return _between(body, vector, False)
+    _refuse("Direction: vector [-]", Directions(), vector)
     return Marker(body, vector, False, local)
 
 

@@ -21,8 +21,11 @@ from natcoord_jax.maths.collocation import Tableau
 from natcoord_jax.maths.settled import settled
 
 
-def place_markers(place: Float[Array, "k *m 4"], rows: Float[Array, "*s k 4 3"]) -> Float[Array, "*out"]:
-    """Marker vectors x_k = sum_a w_ka q_a, one marker to a body slot; of attachments, four vectors each."""
+def place_markers(place: Float[Array, "k *m w"], rows: Float[Array, "*s b 4 3"]) -> Float[Array, "*out"]:
+    """Marker vectors x_k = sum_a w_ka q_a, of the rows of one body or of several; of attachments four."""
+    several = rows.shape[-3] // place.shape[0]
+    if several > 1:
+        rows = rows.reshape(*rows.shape[:-3], place.shape[0], 4 * several, 3)
     if place.ndim == 3:
         rows = rows[..., None, :, :]
     return jnp.sum(place[..., None] * rows, axis=-2)
@@ -195,7 +198,7 @@ def _response(
 
 
 def marker_response(
-    place: Float[Array, "k *m 4"],
+    place: Float[Array, "k *m w"],
     forces: Float[Array, "s k *m 3"] | None,
     torques: Float[Array, "s k 3"] | None,
     rates: Float[Array, "s k *m 3"],
@@ -209,7 +212,11 @@ def marker_response(
         on_rows = place[..., None] * forces[..., None, :]
         if place.ndim == 3:
             on_rows = jnp.sum(on_rows, axis=-3)
+        on_rows = on_rows.reshape(stages, -1, 4, 3)
     if torques is not None:
+        several = motion.spin.shape[-2] // place.shape[0]
+        if several > 1:
+            torques = jnp.zeros_like(motion.spin).at[:, ::several].set(torques)
         power = power + jnp.sum(torques * motion.spin, axis=(-1, -2))
     return Response(on_rows, torques, jnp.zeros((stages, 0)), power)
 
@@ -219,8 +226,11 @@ def instances_last(x: Any, axis: int = 0) -> Any:
     return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, axis, -1), x)
 
 
-def place_together(place: Float[Array, "k *m 4 n"], rows: Float[Array, "*s k 4 3 n"]) -> Float[Array, "*out"]:
+def place_together(place: Float[Array, "k *m w n"], rows: Float[Array, "*s b 4 3 n"]) -> Float[Array, "*out"]:
     """Marker vectors of many instances, see `place_markers`."""
+    several = rows.shape[-4] // place.shape[0]
+    if several > 1:
+        rows = rows.reshape(*rows.shape[:-4], place.shape[0], 4 * several, *rows.shape[-2:])
     if place.ndim == 4:
         rows = rows[..., None, :, :, :]
     return settled(jnp.sum(place[..., None, :] * rows, axis=-3))
@@ -246,5 +256,6 @@ def responses_together(potential: Potential, place: Array, motion: Motion, now: 
     on_rows = place[..., None, :] * forces[..., None, :, :]
     if place.ndim == 4:
         on_rows = jnp.sum(on_rows, axis=-4)
+    on_rows = on_rows.reshape(on_rows.shape[0], -1, 4, *on_rows.shape[-2:])
     nothing = jnp.zeros((power.shape[1], now.tableau.stages, 0), power.dtype)
     return Response(jnp.moveaxis(on_rows, -1, 0), None, nothing, power.T)

@@ -7,6 +7,9 @@ from natcoord_jax.effects.constraints.points import (
     PointOnPlane as PointOnPlane,
 )
 from natcoord_jax.effects.constraints.points import (
+    PointOnPoint as PointOnPoint,
+)
+from natcoord_jax.effects.constraints.points import (
     Rod as Rod,
 )
 from natcoord_jax.effects.constraints.rolling import (

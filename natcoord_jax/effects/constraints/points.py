@@ -28,6 +28,29 @@ def perpendicular(along: Marker) -> tuple[Marker, Marker]:
     return tuple(Direction(along.body, a, local=along.local) for a in across)  # pyright: ignore
 
 
+class PointOnPoint(Constraint):
+    """Two points that stay together, as a ball joint keeps them; of bodies, nodes, or between nodes.
+
+    Attributes:
+        markers: two points [m].
+
+    Example:
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import natcoord_jax as nc
+        >>> nc.PointOnPoint((nc.Point(nc.ground), nc.Point(nc.ground))).multipliers
+        3
+    """
+
+    markers: Any = eqx.field(metadata=is_a(Markers(2)))
+
+    kind: ClassVar[str] = "point on point"
+    multipliers: ClassVar[int] = 3
+
+    def residual(self, x: Array) -> Array:
+        """The gap [m]."""
+        return x[1] - x[0]
+
+
 class PointOnPlane(Constraint):
     """A point that stays in a plane, or at a distance from it.
 
