@@ -73,6 +73,7 @@ from natcoord_jax.core.handles import ground
 from natcoord_jax.core.jit import jit, keep_programs, set_effort
 from natcoord_jax.core.joint import Frame, Joint
 from natcoord_jax.core.markers import Attachment, Direction, Point
+from natcoord_jax.core.nodes import Clamp
 from natcoord_jax.core.potential import Potential
 from natcoord_jax.core.results import DerivativeError, Result, SimulationError
 from natcoord_jax.core.state import State, Trajectory
@@ -140,6 +141,7 @@ __all__ = [
     "Check",
     "Brick",
     "CircularSection",
+    "Clamp",
     "ComputedTorque",
     "Constraint",
     "Continuation",

@@ -22,7 +22,7 @@ from natcoord_jax.core.handles import Handle, ground
 from natcoord_jax.core.host import on_host
 from natcoord_jax.core.joint import Joint
 from natcoord_jax.core.kinds import BODY, FLAG, JOINT, NAME, Choice, HandleOf, of
-from natcoord_jax.core.nodes import NodeSet
+from natcoord_jax.core.nodes import Clamp, NodeSet
 from natcoord_jax.core.numeric import Number, Numbers
 from natcoord_jax.core.recipe import Recipe
 from natcoord_jax.core.state import State
@@ -44,6 +44,7 @@ PART = of(
     Recipe,
     Nodes,
     Elements,
+    Clamp,
 )
 
 _scene_numbers = itertools.count(1)
@@ -77,9 +78,10 @@ class Scene:
         self.recipes: dict[str, Recipe] = {}
         self.nodes: dict[str, Nodes] = {}
         self.elements: dict[str, Elements] = {}
+        self.clamps: dict[str, Clamp] = {}
 
     @checked("Scene.add", part=PART)
-    def add(self, part: Body | Joint | Effect | Recipe | Nodes | Elements) -> Any:
+    def add(self, part: Body | Joint | Effect | Recipe | Nodes | Elements | Clamp) -> Any:
         """Add a body, a joint, another effect, a recipe of several of them (a beam), or thousands at once.
 
         Args:
@@ -103,6 +105,8 @@ class Scene:
             store, kind, label = self.nodes, "nodes", "nodes"
         elif isinstance(part, Elements):
             store, kind, label = self.elements, "effect", f"{type(part.effect).kind} elements"
+        elif isinstance(part, Clamp):
+            store, kind, label = self.clamps, "clamp", "clamp"
         else:
             store, kind, label = self.recipes, "recipe", part.kind
         given: str | None = getattr(part, "name", None)
@@ -126,7 +130,7 @@ class Scene:
         return handle
 
     def _stores(self) -> tuple[dict[str, Any], ...]:
-        return self.bodies, self.joints, self.effects, self.recipes, self.nodes, self.elements
+        return self.bodies, self.joints, self.effects, self.recipes, self.nodes, self.elements, self.clamps
 
     def _free_name(self, label: str) -> str:
         numbered = (f"{label} {k}" for k in itertools.count(1))
@@ -146,10 +150,25 @@ class Scene:
             body, mass_block=_sum(body.mass_block, as_array(block, float))
         )
 
-    def _check(self, part: Body | Joint | Effect | Elements, name: str) -> None:
+    def _check_clamp(self, part: Clamp, name: str) -> None:
+        owner = self.find(part.body, f"{name!r}")
+        if part.nodes.scene != self._number:
+            raise ValueError(f"{name!r} refers to {part.nodes!r}, which are no nodes of this scene")
+        held = {h.name for clamp in self.clamps.values() for h in clamp.nodes}
+        twice = next((h.name for h in part.nodes if h.name in held), None)
+        if twice is not None:
+            raise ValueError(f"{name!r}: node {twice!r} is clamped already")
+        if owner is not None and not (isinstance(owner, Body) and owner.oriented):
+            raise ValueError(f"{name!r}: {part.body.name!r} has no orientation; pass a rigid body")
+        if owner is not None and part.body.name not in self.bodies:
+            raise ValueError(f"{name!r}: {part.body.name!r} is a node of a set itself; pass a rigid body")
+
+    def _check(self, part: Body | Joint | Effect | Elements | Clamp, name: str) -> None:
         """Every handle in the part must be of this scene."""
         if isinstance(part, Body):
             return
+        if isinstance(part, Clamp):
+            return self._check_clamp(part, name)
         part = part.effect if isinstance(part, Elements) else part
         if isinstance(part, Joint):
             if part.parent == part.child:
@@ -216,7 +235,7 @@ class Scene:
         if not self.bodies and not self.nodes:
             raise ValueError("the scene has no bodies; add one before compiling")
         parts = self.bodies, self.joints, self.effects, solver, self.nodes, self.elements
-        system, state = build(*parts)
+        system, state = build(*parts, list(self.clamps.values()))
         state = state.at_time(t)
         if assemble:
             state = assemble_state(system, state)

@@ -46,7 +46,7 @@ def world():
         scene=scene, body=body, hinge=hinge, motor=motor, section=section, system=system, state=state,
         beam=beam, trajectory=trajectory, problem=problem, unknowns=unknowns, solution=solution, point=point,
         direction=direction, triad=tuple(nc.Direction(body, axis) for axis in np.eye(3)),
-        ends=(nc.Point(nc.ground), point),
+        ends=(nc.Point(nc.ground), point), nodes=nc.Scene().add(nc.Nodes.points(np.ones((4, 3)), mass=1.0)),
         attached=tuple(nc.Attachment(b, (0, 0, 0), np.eye(3)) for b in (nc.ground, body)),
     )  # fmt: skip
 
@@ -144,6 +144,7 @@ CALLS = {
         **MARKED(w.attached * 2), "thickness": NUMBER, "E": NUMBER, "nu": [0.3]
     },
     "Brick": lambda w: {**MARKED(w.ends * 4), "E": NUMBER, "nu": [0.3]},
+    "Clamp": lambda w: {"body": [nc.ground], "nodes": [w.nodes], "name": NAME},
     "Nodes.points": lambda w: {"positions": PLACES, "mass": NUMBER, "velocity": V, "name": NAME},
     "Nodes.directors": lambda w: {
         "positions": PLACES, "directors": V, "mass": NUMBER, "inertia": NUMBER, "velocity": V,

@@ -200,7 +200,7 @@ def test_ten_thousand_nodes():
 
 
 class HeldDirector(nc.Constraint):
-    """A direction that two others stay normal to [-]; the clamp of a shell's edge."""
+    """A direction that two others stay normal to [-]; with a ball joint another clamp."""
 
     multipliers = 2
 
@@ -208,7 +208,7 @@ class HeldDirector(nc.Constraint):
         return jnp.stack([x[0] @ x[2], x[1] @ x[2]])
 
 
-def cantilever(elements, force=0.0):
+def cantilever(elements, force=0.0, clamp=True):
     """A strip of 10 m by 1 m, 0.1 m thick, clamped, with a force at its end (Sze et al. 2004)."""
     along = np.repeat(np.linspace(0.0, 10.0, elements + 1), 2)
     places = np.stack([along, np.tile([0.0, 1.0], elements + 1)], axis=1)
@@ -221,8 +221,11 @@ def cantilever(elements, force=0.0):
     scene = nc.Scene()
     mesh = scene.add(nc.Nodes.directors(places, (0, 0, 1), name="mesh", **lumps))
     scene.add(nc.ShellElement.on(mesh, quads, thickness=thickness, E=1.2e6, nu=0.0, name="strip"))
+    edge = mesh.where(lambda x: x[:, 0] == 0.0)
     held = nc.Direction(nc.ground, (1, 0, 0)), nc.Direction(nc.ground, (0, 1, 0))
-    for node in mesh.where(lambda x: x[:, 0] == 0.0):
+    if clamp:
+        scene.add(nc.Clamp(nc.ground, edge))
+    for node in () if clamp else edge:
         scene.add(nc.Spherical(nc.ground, node))
         scene.add(HeldDirector((*held, nc.Direction(node, (0, 0, 1)))))
     tip = mesh.where(lambda x: x[:, 0] == 10.0)
@@ -232,9 +235,10 @@ def cantilever(elements, force=0.0):
 
 
 @pytest.mark.slow
-def test_cantilever_of_shells():
+@pytest.mark.parametrize("clamp", [True, False])
+def test_cantilever_of_shells(clamp):
     """Bent by its end by two thirds of its length: 3.286 and 6.698 m, and on this mesh 3.2930 and 6.7047."""
-    system, state, tip = cantilever(16, force=4.0)
+    system, state, tip = cantilever(16, force=4.0, clamp=clamp)
     end = nc.equilibrium(system, state).state.q.reshape(-1, 4, 3)[system.body_index(tip[0]), 0]
     np.testing.assert_allclose((10.0 - end[0], end[2]), (3.2930, 6.7047), atol=1e-4)
 
@@ -245,6 +249,57 @@ def test_frequency_of_shells():
     system, state, _ = cantilever(8)
     lowest = nc.modes(system, state, count=1).frequencies[0] / (2 * np.pi)
     np.testing.assert_allclose(lowest, 9.958, atol=5e-4)
+
+
+def winged(*, free=True):
+    """A shell whose edge is part of a hub, which spins in space or hangs on a hinge."""
+    scene = nc.Scene()
+    hub = scene.add(
+        nc.RigidBody(mass=1.0, inertia=(0.1, 0.2, 0.25), angular_velocity=(0, 0, 3.0), name="hub")
+    )
+    places = np.array([(x, y, 0.1) for x in (0.2, 0.6, 1.0) for y in (-0.2, 0.2)])
+    lumps = {"mass": 0.1, "inertia": 1e-3, "velocity": np.cross((0, 0, 3.0), places)}
+    wing = scene.add(nc.Nodes.directors(places, (0, 0, 1), name="wing", **lumps))
+    scene.add(nc.ShellElement.on(wing, [(0, 2, 3, 1), (2, 4, 5, 3)], thickness=0.05, E=1e4, nu=0.3))
+    scene.add(nc.Clamp(hub, wing.where(lambda x: x[:, 0] < 0.3)))
+    if not free:
+        scene.add(nc.Revolute(nc.ground, hub, axis=(0, 0, 1)))
+        scene.add(nc.Gravity())
+    return *scene.compile(), hub, wing
+
+
+@pytest.mark.parametrize("free", [True, pytest.param(False, marks=pytest.mark.slow)])
+def test_nodes_that_are_part_of_a_body(free):
+    """They add their mass to it, and what they carry bends with it; nothing is lost."""
+    system, state, hub, wing = winged(free=free)
+    assert list(system.structure.bodies) == [f"wing[{k}]" for k in range(2, 6)] + ["hub"]
+    assert float(system.mass[system.body_index(hub), 0, 0]) == pytest.approx(1.2)
+    trajectory = nc.simulate(system, state, dt=0.01, steps=100)
+    found = balance(system, trajectory)
+    assert found.energy.max() <= tol.ENERGY_OF_A_SMALL_SCENE
+    if free:
+        assert found.momentum.max() <= tol.MOMENTUM_OF_A_SMALL_SCENE
+        assert found.angular_momentum.max() <= tol.MOMENTUM_OF_A_SMALL_SCENE
+    stored = np.asarray(next(iter(system.energy(trajectory).stores.values())))
+    assert stored.max() > 1e-3
+
+
+def test_wrong_clamps_are_refused():
+    scene = nc.Scene()
+    mesh = scene.add(nc.Nodes.points(np.eye(3), mass=1.0, name="mesh"))
+    hub = scene.add(nc.RigidBody(mass=1.0, inertia=(1.0, 1.0, 1.0), name="hub"))
+    mass = scene.add(nc.PointMass(mass=1.0, name="mass"))
+    scene.add(nc.Clamp(hub, mesh[:1]))
+    for body, nodes, message in (
+        (hub, mesh[:2], r"node 'mesh\[0\]' is clamped already"),
+        (mass, mesh[1:], "'mass' has no orientation; pass a rigid body"),
+        (mesh[2], mesh[1:2], "has no orientation"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            scene.add(nc.Clamp(body, nodes))
+    scene.add(nc.Spherical(mesh[0], hub))
+    with pytest.raises(ValueError, match=r"node 'mesh\[0\]' is clamped to 'hub'; join that"):
+        scene.compile()
 
 
 @pytest.mark.slow

@@ -1,5 +1,9 @@
-"""All bodies of a scene as arrays: sets of nodes, then single ones."""
+"""All bodies of a scene as arrays: sets of nodes, then single ones.
 
+A node that is clamped to a body is none: what is fixed to it is fixed to that body, which has its mass.
+"""
+
+from collections.abc import Sequence
 from typing import Any
 
 import jax.numpy as jnp
@@ -8,8 +12,9 @@ from jaxtyping import Array
 
 from natcoord_jax.core.bodies import Body
 from natcoord_jax.core.checks import as_array
+from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.host import stacked
-from natcoord_jax.core.names import names_of
+from natcoord_jax.core.names import Run, names_of, ranges_of
 from natcoord_jax.xla.tracing import at_top_level
 
 
@@ -23,15 +28,21 @@ class Bodies:
         shapes: what to draw.
     """
 
-    def __init__(self, singles: dict[str, Body], sets: dict[str, Any]):
-        self._singles, self._sets = list(singles.values()), list(sets.values())
-        sizes = [len(nodes.position) for nodes in self._sets]
-        self.sets = sum(sizes)
-        self.names = names_of([*zip(sets, sizes), *((name, None) for name in singles)])
-        self.runs = [*zip(sets, sizes), *((name, None) for name in singles)]
-        self.rotations = [n.rotations for n, size in zip(self._sets, sizes) for _ in range(size)]
-        self.rotations += [body.rotations for body in self._singles]
-        self.shapes = [None] * self.sets + [body.shape for body in self._singles]
+    def __init__(self, singles: dict[str, Body], sets: dict[str, Any], clamps: Sequence[Any] = ()):
+        self._singles, self._sets, self._clamps = singles, sets, clamps
+        self._kept = {name: np.arange(len(nodes.position)) for name, nodes in sets.items()}
+        self.owners: dict[str, Handle] = {}
+        for clamp in clamps:
+            name = clamp.nodes.name
+            self._kept[name] = np.setdiff1d(self._kept[name], clamp.nodes.numbers)
+            self.owners |= {handle.name: clamp.body for handle in clamp.nodes}
+        self.sets = sum(map(len, self._kept.values()))
+        kept = [(name, ranges_of(numbers)) for name, numbers in self._kept.items()]
+        self.runs: list[Run] = [*kept, *((name, None) for name in singles)]
+        self.names = names_of(self.runs)
+        self.rotations = [sets[name].rotations for name, numbers in self._kept.items() for _ in numbers]
+        self.rotations += [body.rotations for body in singles.values()]
+        self.shapes = [None] * self.sets + [body.shape for body in singles.values()]
 
     def __len__(self) -> int:
         return len(self.rotations)
@@ -39,10 +50,44 @@ class Bodies:
     def every(self, field: str) -> Array:
         """A field of all bodies, leading axis their number."""
         block = "mass_blocks" if field == "mass_block" else field
-        parts = [getattr(nodes, block) for nodes in self._sets]
+        parts = [picked(getattr(self._sets[name], block), numbers) for name, numbers in self._kept.items()]
         if self._singles:
-            parts.append(stacked([getattr(body, field) for body in self._singles]))
+            parts.append(stacked([getattr(body, field) for body in self._singles.values()]))
         return parts[0] if len(parts) == 1 else joined(*parts)
+
+    def pose(self, name: str) -> tuple[Array, Array]:
+        """Place and directors of a node of a set, clamped or not."""
+        owner, _, number = name.rstrip("]").rpartition("[")
+        nodes = self._sets[owner]
+        return nodes.position[int(number)], nodes.rotation[int(number)]
+
+    def places(self, name: str) -> np.ndarray:
+        """Numbers in the scene of all nodes of a set; -1 of those that are clamped."""
+        found = np.full(len(self._sets[name].position), -1)
+        kept = self._kept[name]
+        before = sum(len(self._kept[other]) for other in list(self._kept)[: list(self._kept).index(name)])
+        found[kept] = before + np.arange(len(kept))
+        return found
+
+    def clamped(self, name: str) -> list[tuple[np.ndarray, Handle]]:
+        """Numbers of the clamped nodes of a set, and the bodies that they are clamped to."""
+        return [(clamp.nodes.numbers, clamp.body) for clamp in self._clamps if clamp.nodes.name == name]
+
+    @property
+    def with_clamps(self) -> list[str]:
+        """Names of the sets of which nodes are clamped."""
+        return sorted({clamp.nodes.name for clamp in self._clamps})
+
+    def node_masses(self, name: str, numbers: np.ndarray) -> Array:
+        """Mass blocks of some nodes of a set."""
+        return picked(self._sets[name].mass_blocks, numbers)
+
+
+def picked(values: Array, numbers: np.ndarray) -> Array:
+    """Some entries, without a program where nothing is being traced."""
+    if at_top_level(values):
+        return as_array(np.asarray(values)[numbers])
+    return values[numbers]
 
 
 def joined(*parts: Array) -> Array:

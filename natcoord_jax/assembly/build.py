@@ -1,5 +1,6 @@
 """Compilation: from named parts to a system and its initial state."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -22,6 +23,7 @@ from natcoord_jax.core.elements import Elements
 from natcoord_jax.core.host import on_host
 from natcoord_jax.core.joint import Joint
 from natcoord_jax.core.names import compact
+from natcoord_jax.core.nodes import Clamp
 from natcoord_jax.core.state import State
 
 
@@ -32,9 +34,10 @@ def build(
     solver: str | None,
     sets: dict[str, Any] | None = None,
     elements: dict[str, Elements] | None = None,
+    clamps: Sequence[Clamp] = (),
 ) -> tuple[System, State]:
     """Number bodies along the spanning tree, group equal kinds, and lay out the state."""
-    bodies = Bodies(singles, sets or {})
+    bodies = Bodies(singles, sets or {}, clamps)
     layout = Layout(bodies, joints, effects)
     instances = [layout.effect_instance(name, effect) for name, effect in effects.items()]
     layout.number_accounts(instances)
@@ -64,7 +67,7 @@ def build(
         shapes=tuple(_drawn(bodies.shapes[k]) for k in layout.order),
     )
     system = System(
-        layout.every("mass_block"),
+        layout.masses(),
         layout.frames(),
         layout.joint_bodies(),
         tree,

@@ -99,17 +99,18 @@ def element_group(layout: Any, name: str, elements: Elements) -> Group:
         raise ValueError(
             f"{label}: {type(effect).__name__} has inputs or an account of work; add it one by one"
         )
-    scene = layout.numbers(elements)
+    places, rows = layout.nodes(elements.nodes.name)
+    scene, weights = places[elements.connectivity], elements.weights(rows)
     alone = bare(effect, ("markers", "name"), label)
     bodies, nothing = layout.body_number[scene].astype(np.int32), np.zeros((count, 0), np.int32)
     return Group(
-        elements.stacked(alone, layout.rows_at(scene)),
-        as_array(elements.weights()),
+        elements.stacked(alone, weights, layout.rows_at(scene)),
+        as_array(weights),
         bodies,
         *(nothing,) * 5,
         acting=Collection.of(bodies, len(layout.bodies)),
         count=count,
-        names=Names(((name, count),)),
+        names=Names(((name, (range(count),)),)),
         source="markers",
     )
 

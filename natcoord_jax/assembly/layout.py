@@ -7,7 +7,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from natcoord_jax.assembly.bodies import Bodies
 from natcoord_jax.assembly.graph import Edge, spanning_tree
@@ -19,9 +19,8 @@ from natcoord_jax.core.bodies import TRIAD
 from natcoord_jax.core.checks import as_array
 from natcoord_jax.core.coordinate import Coordinate, CoordinateEffect
 from natcoord_jax.core.effect import Effect, replace_fields
-from natcoord_jax.core.elements import Elements
 from natcoord_jax.core.force import Field
-from natcoord_jax.core.handles import Handle
+from natcoord_jax.core.handles import Handle, ground
 from natcoord_jax.core.host import on_host, stacked
 from natcoord_jax.core.joint import Joint, frames_at
 from natcoord_jax.core.markers import Attachment, Marker
@@ -46,7 +45,7 @@ def _couplings(effects: dict[str, Effect], poses: Poses, sets: int) -> list[tupl
     for effect in effects.values():
         if effect.couples:
             markers: Any = getattr(effect, "markers", ())
-            listed = [poses.of(handle) for m in markers for handle in getattr(m, "handles", (m.body,))]
+            listed = [poses.carrier(handle) for m in markers for handle in getattr(m, "handles", (m.body,))]
             found += [pair for pair in pairwise(listed) if min(pair) >= sets]
     return found
 
@@ -79,10 +78,25 @@ class Layout:
         """Number of a body in the system."""
         return int(self.body_number[self.poses.of(handle)])
 
-    def numbers(self, elements: Elements) -> np.ndarray:
-        """Numbers in the scene of the nodes of a set of elements."""
-        first = self.bodies.names.index(f"{elements.nodes.name}[0]")
-        return first + elements.connectivity
+    def nodes(self, name: str) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n 4 4"]]:
+        """Of all nodes of a set their body's number in the scene, and their rows as weights of its rows."""
+        numbers = self.bodies.places(name)
+        rows = np.broadcast_to(np.eye(4), (len(numbers), 4, 4)).copy()
+        for members, owner in self.bodies.clamped(name):
+            numbers[members] = self.poses.of(owner)
+            for k in members:
+                rows[k] = np.asarray(self.poses.held(Handle("body", f"{name}[{k}]", owner.scene)))
+        return numbers, rows
+
+    def masses(self) -> Float[Array, "bodies 4 4"]:
+        """Mass blocks of the bodies, with those of what is clamped to them, in the order of the system."""
+        found = self.bodies.every("mass_block")
+        for name, clamps in ((name, self.bodies.clamped(name)) for name in self.bodies.with_clamps):
+            for members, owner in clamps:
+                if owner != ground:
+                    rows, own = self.nodes(name)[1][members], self.bodies.node_masses(name, members)
+                    found = _with_masses(found, as_array(self.poses.of(owner)), as_array(rows), own)
+        return as_array(np.asarray(found)[self.order]) if at_top_level(found) else found[self.order]
 
     def every(self, field: str) -> Array:
         """A field of all bodies, in the order of the system."""
@@ -105,7 +119,7 @@ class Layout:
         """Names of the joints, those of the tree first; none of free bodies."""
         sets = self.bodies.sets
         names = [(self.names[j] if j >= 0 else "", None) for j in self.joint_order[sets:]]
-        return names_of([("", sets), *names] if sets else names)
+        return names_of([("", (range(sets),)), *names] if sets else names)
 
     def motions(self) -> list[Edge]:
         """Free motion of each body relative to its parent in the tree."""
@@ -218,13 +232,13 @@ class Layout:
 
         What has fewer bodies than others has the ground for the rest, without weight.
         """
-        own = [[self.poses.of(handle) for handle in getattr(m, "handles", (m.body,))] for m in markers]
+        own = [[self.poses.carrier(handle) for handle in getattr(m, "handles", (m.body,))] for m in markers]
         most = max(map(len, own))
         weights = [self.poses.weights(m) for m in markers]
         if most > 1:
             weights = [_padded(w, 4 * most) for w in weights]
-        ground = len(self.bodies)
-        return stacked(weights), [b for x in own for b in (*x, *(ground,) * (most - len(x)))]
+        rest = len(self.bodies)
+        return stacked(weights), [b for x in own for b in (*x, *(rest,) * (most - len(x)))]
 
     def _on_coordinates(self, name: str, effect: CoordinateEffect, label: str) -> Instance:
         many = isinstance(effect.joint, tuple)
@@ -283,6 +297,13 @@ MOTION = "position", "rotation", "velocity", "angular_velocity"
 """What the rows of a body and their velocities are made of."""
 
 _frames_at = on_host(frames_at)
+
+
+@on_host
+def _with_masses(
+    blocks: Array, body: Array, rows: Float[Array, "n 4 4"], own: Float[Array, "n 4 4"]
+) -> Array:
+    return blocks.at[body].add(jnp.einsum("nai,nab,nbj->ij", rows, own, rows))
 
 
 @on_host

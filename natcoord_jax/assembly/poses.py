@@ -18,17 +18,51 @@ class Poses:
     """Assembled poses of all bodies and the ground, in scene order."""
 
     def __init__(self, bodies: Bodies):
-        self.names, self.rotations = bodies.names, bodies.rotations
+        self.names, self._bodies = bodies.names, bodies
         ground = as_array(np.zeros((1, 3))), as_array(np.eye(3)[None])
         given = bodies.every("position"), bodies.every("rotation")
         self.position, self.rotation = (joined(x, y) for x, y in zip(given, ground))
 
     def of(self, handle: Handle) -> int:
-        """Number of a body; the number of bodies for the ground."""
+        """Number of a body; the number of bodies for the ground.
+
+        Raises:
+            ValueError: for a node that is clamped to one.
+        """
+        if handle.name in self._bodies.owners:
+            owner = self._bodies.owners[handle.name]
+            raise ValueError(
+                f"node {handle.name!r} is clamped to {owner.name!r}; join that to others instead"
+            )
         return len(self.names) if handle == ground_handle else self.names.index(handle.name)
 
-    def weights(self, marker: Marker | Attachment) -> Float[Array, "*m 4"]:
-        """Weights of a marker: (4,) of a point or a direction, (4, 4) of an attachment."""
+    def carrier(self, handle: Handle) -> int:
+        """Number of a body, or of that which a node is clamped to."""
+        return self.of(self._bodies.owners.get(handle.name, handle))
+
+    def held(self, handle: Handle) -> Float[Array, "4 4"] | None:
+        """Rows of a clamped node as weights of those of the body that it is clamped to; None of others."""
+        if handle.name not in self._bodies.owners:
+            return None
+        body = self.carrier(handle)
+        return _attachment_weights(self.position[body], self.rotation[body], *self._bodies.pose(handle.name))
+
+    def weights(self, marker: Marker | Attachment) -> Float[Array, "*m w"]:
+        """Weights of a marker: (4,) of a point or a direction, (4, 4) of an attachment.
+
+        Of a marker between nodes there are four for each of them.
+        """
+        own = self._own_weights(marker)
+        handles = marker.handles if isinstance(marker, Marker) else (marker.body,)
+        held = [self.held(handle) for handle in handles]
+        if all(rows is None for rows in held):
+            return own
+        parts = zip(np.split(np.asarray(own), len(held), axis=-1), held)
+        return as_array(
+            np.concatenate([x if rows is None else x @ np.asarray(rows) for x, rows in parts], -1)
+        )
+
+    def _own_weights(self, marker: Marker | Attachment) -> Float[Array, "*m w"]:
         if isinstance(marker, Interpolated):
             row = np.eye(4)[0 if marker.is_point else 1]
             return as_array(np.kron(np.asarray(marker.vector), row))
@@ -39,6 +73,8 @@ class Poses:
 
     def _pose(self, marker: Marker | Attachment) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
         """Pose of the frame that the vectors of a marker are given relative to."""
+        if not marker.local and marker.body.name in self._bodies.owners:
+            return self._bodies.pose(marker.body.name)
         body = len(self.names) if marker.local else self.of(marker.body)
         return self.position[body], self.rotation[body]
 

@@ -35,26 +35,29 @@ class Elements(eqx.Module):
     def __len__(self) -> int:
         return len(self.connectivity)
 
-    def weights(self) -> Float[np.ndarray, "n k *m 4"]:
-        """Weights of the vectors of every node: of its point, and of its directors."""
-        n, k = self.connectivity.shape
-        own = np.eye(4)[: self.effect.vectors]
-        shape = (n, k, 4) if self.effect.vectors == 1 else (n, k, self.effect.vectors, 4)
-        return np.broadcast_to(own[0] if self.effect.vectors == 1 else own, shape).copy()
+    def weights(self, rows: Float[np.ndarray, "nodes 4 4"]) -> Float[np.ndarray, "n k *m 4"]:
+        """Weights of the vectors of every node: of its point, and of its directors.
 
-    def stacked(self, bare: Effect, rows: Float[Array, "n k 4 3"]) -> Effect:
+        Args:
+            rows: of all nodes, as weights of the rows of their bodies.
+        """
+        own = rows[self.connectivity, : self.effect.vectors]
+        return own[:, :, 0] if self.effect.vectors == 1 else own
+
+    def stacked(self, bare: Effect, weights: np.ndarray, rows: Float[Array, "n k 4 3"]) -> Effect:
         """All elements as one module, with the numbers that they take from the assembled pose.
 
         Args:
             bare: `effect` as arrays.
-            rows: of the nodes of every element.
+            weights: of the vectors of the nodes.
+            rows: of the bodies of the nodes of every element.
         """
         n = len(self)
         given = jax.tree.map(lambda x: np.broadcast_to(np.asarray(x), (n, *np.shape(x))), bare)
         given = replace_fields(given, **{key: as_array(value, float) for key, value in self.each.items()})
         if type(bare).assembled_at is Effect.assembled_at:
             return given
-        return _assembled(given, as_array(self.weights()), rows)
+        return _assembled(given, as_array(weights), rows)
 
 
 @on_host

@@ -14,20 +14,20 @@ class Names(Sequence):
     Neither this nor its hash grows with the size of the sets.
 
     Attributes:
-        runs: names of single parts, with None, and of sets, with their size.
+        runs: names of single parts, with None, and of sets, with ranges of the numbers in them.
 
     Example:
         >>> from natcoord_jax.core.names import Names
-        >>> names = Names((("hub", None), ("mesh", 1000)))
+        >>> names = Names((("hub", None), ("mesh", (range(1000),))))
         >>> names[18], names.index("mesh[17]"), len(names)
         ('mesh[17]', 18, 1001)
     """
 
-    runs: tuple[tuple[str, int | None], ...]
+    runs: tuple["Run", ...]
 
     @cached_property
     def _ends(self) -> np.ndarray:
-        return np.cumsum([1 if count is None else count for _, count in self.runs])
+        return np.cumsum([1 if ranges is None else sum(map(len, ranges)) for _, ranges in self.runs])
 
     @cached_property
     def _places(self) -> dict[str, int]:
@@ -43,15 +43,22 @@ class Names(Sequence):
             raise IndexError(f"there is no name {index}; there are {len(self)}")
         index = index % len(self)
         run = int(np.searchsorted(self._ends, index, side="right"))
-        name, count = self.runs[run]
-        return name if count is None or not name else f"{name}[{index - int(self._ends[run]) + count}]"
+        name, ranges = self.runs[run]
+        if ranges is None or not name:
+            return name
+        rest = index - (int(self._ends[run - 1]) if run else 0)
+        for numbers in ranges:
+            if rest < len(numbers):
+                return f"{name}[{numbers[rest]}]"
+            rest -= len(numbers)
+        raise AssertionError("unreachable")
 
     def __iter__(self) -> Iterator[str]:
-        for name, count in self.runs:
-            if count is None:
+        for name, ranges in self.runs:
+            if ranges is None:
                 yield name
             else:
-                yield from (f"{name}[{k}]" if name else "" for k in range(count))
+                yield from (f"{name}[{k}]" if name else "" for numbers in ranges for k in numbers)
 
     def __contains__(self, name: object) -> bool:
         return self.place(name) is not None
@@ -66,8 +73,13 @@ class Names(Sequence):
             run = self._places.get(owner)
             if run is None or not rest.isdigit() or not name.endswith("]"):
                 return None
-            count, number = self.runs[run][1], int(rest)
-            if count is None or number >= count:
+            wanted, ranges, number = int(rest), self.runs[run][1] or (), 0
+            for numbers in ranges:
+                if wanted in numbers:
+                    number += numbers.index(wanted)
+                    break
+                number += len(numbers)
+            else:
                 return None
         return (int(self._ends[run - 1]) if run else 0) + number
 
@@ -83,11 +95,21 @@ class Names(Sequence):
         return found
 
 
-def names_of(runs: Sequence[tuple[str, int | None]]) -> Sequence[str]:
+Run = tuple[str, tuple[range, ...] | None]
+"""A name, and the numbers of a set."""
+
+
+def names_of(runs: Sequence[Run]) -> Sequence[str]:
     """Names, as a tuple where all are of single parts."""
-    if all(count is None for _, count in runs):
+    if all(ranges is None for _, ranges in runs):
         return tuple(name for name, _ in runs)
     return Names(tuple(runs))
+
+
+def ranges_of(numbers: np.ndarray) -> tuple[range, ...]:
+    """Increasing numbers as ranges."""
+    pieces = np.split(numbers, np.flatnonzero(np.diff(numbers) != 1) + 1)
+    return tuple(range(int(piece[0]), int(piece[-1]) + 1) for piece in pieces if len(piece))
 
 
 def listed(names: Sequence[str]) -> list[str]:
@@ -95,7 +117,7 @@ def listed(names: Sequence[str]) -> list[str]:
     if not isinstance(names, Names):
         return [name for name in names if name]
     runs = [run for run in names.runs if run[0]]
-    return [name if count is None else f"{name}[0] ... {name}[{count - 1}]" for name, count in runs]
+    return [name if not r else f"{name}[{r[0][0]}] ... {name}[{r[-1][-1]}]" for name, r in runs]
 
 
 def compact(numbers: Sequence[int]) -> Sequence[int]:

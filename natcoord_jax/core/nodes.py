@@ -4,9 +4,12 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
+import equinox as eqx
 import numpy as np
 
+from natcoord_jax.core.arguments import Part, is_a
 from natcoord_jax.core.handles import Handle
+from natcoord_jax.core.kinds import BODY, NAME, of
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,3 +69,34 @@ class NodeSet:
 
     def __repr__(self) -> str:
         return f"<{len(self)} nodes of {self.name!r}>"
+
+
+class Clamp(Part):
+    """Nodes that are rigidly part of a body, or of the ground, with all that they carry.
+
+    They have no unknowns of their own, and are no bodies of the system any more: what is fixed to them is
+    fixed to the body, which also gets their mass.
+
+    Attributes:
+        body: handle of the body, or `nc.ground`.
+        nodes: some nodes of a set.
+        name: optional name.
+
+    Example:
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import natcoord_jax as nc
+        >>> import numpy as np
+        >>> scene = nc.Scene()
+        >>> line = scene.add(nc.Nodes.points(np.linspace((0, 0, 0), (1, 0, 0), 5), mass=0.1, name="line"))
+        >>> pairs = np.stack([np.arange(4), np.arange(1, 5)], axis=1)
+        >>> springs = scene.add(nc.Spring.on(line, pairs, stiffness=50.0, length=0.25))
+        >>> held = scene.add(nc.Clamp(nc.ground, line[:1]))
+        >>> scene.compile()[0].structure.unknowns
+        12
+    """
+
+    body: Handle = eqx.field(static=True, metadata=is_a(BODY))
+    nodes: NodeSet = eqx.field(static=True, metadata=is_a(of("some nodes of a set, as mesh[:4]", NodeSet)))
+    name: Any = eqx.field(static=True, default=None, kw_only=True, metadata=is_a(NAME))
+
+    kind = "clamp"
