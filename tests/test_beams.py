@@ -435,7 +435,7 @@ def test_wrong_input_is_named():
     with pytest.raises(ValueError, match="stations="):
         beam.at(0.4)
     mass = scene.add(nc.PointMass(mass=1.0))
-    with pytest.raises(ValueError, match="point mass"):
+    with pytest.raises(ValueError, match="which has no orientation"):
         scene.add(nc.Beam(section, [(0, 0, 0), (1, 0, 0)], elements=2, start=mass))
 
 
