@@ -14,6 +14,7 @@ import natcoord_jax as nc
 from natcoord_jax import gallery
 from natcoord_jax.analysis import balance
 from natcoord_jax.assembly.build import build
+from natcoord_jax.viz.outline import element_faces, is_node, with_ground
 
 
 def net(count, *, kind="points", solver=None):
@@ -315,3 +316,12 @@ def test_continua_keep_what_they_should(name):
     stored = np.asarray(energy.stores[name])
     assert stored.max() - stored.min() >= 0.2 * float(energy.total[0])
     assert np.abs(np.sum(rows_of(trajectory)[:, :, 1] ** 2, axis=-1) - 1).max() <= tol.CONSTRAINT
+
+
+def test_pictures_show_surfaces():
+    """Of a plate all its faces, of a block those outside; nodes are no bodies to be drawn."""
+    for name, counts, faces in (("plate", (3, 2), 6), ("block", (2, 2, 2), 24)):
+        example = gallery.load(name, counts=counts)
+        rows = with_ground(np.asarray(example.state.q)[None])
+        assert element_faces(example.system, rows).shape == (1, faces, 4, 3)
+        assert all(is_node(example.system, body) for body in example.system.structure.bodies)

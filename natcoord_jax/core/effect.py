@@ -117,6 +117,7 @@ class Effect(Part):
         couples: whether bodies of neighbouring markers become neighbours in the spanning tree where no joint
             makes them so: elements of beams do, of which a chain then is a chain of bodies.
         silent: whether it has no sensor.
+        faces: numbers of the nodes round each face of an element, four each, for pictures.
         vectors: of each node of an element made by `on`: 1 for its point, 2 with a director, 4 with a triad.
     """
 
@@ -131,6 +132,7 @@ class Effect(Part):
     shared: ClassVar[bool] = False
     couples: ClassVar[bool] = False
     silent: ClassVar[bool] = True
+    faces: ClassVar[tuple[tuple[int, ...], ...]] = ()
     vectors: ClassVar[int] = 1
 
     @classmethod

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from natcoord_jax.assembly.system import Group, System
 from natcoord_jax.bodies.beam import BeamHandle
 from natcoord_jax.bodies.shapes import CORNERS, FACES
+from natcoord_jax.core.names import Names
 
 THINNEST = 0.02
 """Least edge of a box, relative to its longest: plates and rods stay visible."""
@@ -75,10 +76,36 @@ def _beam_of(element: str) -> str:
 
 
 def is_node(system: System, body: str) -> bool:
-    """Whether a body is a node of a beam's own, which is drawn as part of the beam."""
+    """Whether a body is a node of a set, or a beam's own, which is drawn as part of that."""
+    if isinstance(system.structure.bodies, Names) and body.endswith("]"):
+        return True
     names = {_beam_of(name) for group in _chains(system) for name in group.names}
     beam, _, rest = body.rpartition("/")
     return bool(beam) and beam in names and rest.startswith("node ")
+
+
+def element_faces(
+    system: System, rows: Float[np.ndarray, "t bodies 4 3"]
+) -> Float[np.ndarray, "t faces 4 3"]:
+    """Faces of shells, and those of solids that no two of them share [m].
+
+    Args:
+        system: compiled system.
+        rows: by body, those of the ground last.
+    """
+    found = [np.zeros((len(rows), 0, 4, 3))]
+    for group in system.effects:
+        if group.effect.faces and group.weights is not None:
+            weights, bodies = np.asarray(group.weights), np.asarray(group.bodies)
+            own = weights if weights.ndim == 3 else weights[:, :, 0]
+            places = np.einsum("nka,tnkac->tnkc", own, rows[:, bodies])
+            corners = np.array(group.effect.faces)
+            # Nodes that are clamped to one body have its number: faces are told apart by their middles.
+            middles = np.round(places[0][:, corners].mean(axis=2).reshape(-1, 3), 9)
+            _, back, count = np.unique(middles, axis=0, return_inverse=True, return_counts=True)
+            outer = count[back.reshape(-1)] == 1
+            found.append(places[:, :, corners].reshape(len(rows), -1, 4, 3)[:, outer])
+    return np.concatenate(found, axis=1)
 
 
 def _round_section(system: System, beam: str) -> Float[np.ndarray, "n 2"]:

@@ -18,7 +18,7 @@ from natcoord_jax.bodies.beam import BeamHandle
 from natcoord_jax.bodies.shapes import FACES
 from natcoord_jax.core.kinds import Several, of
 from natcoord_jax.core.state import State, Trajectory
-from natcoord_jax.viz.outline import beam_rims, is_node, joint_places, surfaces, with_ground
+from natcoord_jax.viz.outline import beam_rims, element_faces, is_node, joint_places, surfaces, with_ground
 
 MOVING = of("a system, as scene.compile() returned it, or nc.Phases(...)", System, Phases)
 BEAMS = Several(of("what scene.add(nc.Beam(...)) returned", BeamHandle))
@@ -78,7 +78,7 @@ def picture(system: System, states: State, beams: Sequence[BeamHandle] = ()) -> 
         corners,
         [drawn[k][1] for k in order],
         np.stack([points - axes, points + axes], axis=2),
-        beam_rims(system, rows, beams),
+        np.concatenate([beam_rims(system, rows, beams), element_faces(system, rows)], axis=1),
     )
 
 

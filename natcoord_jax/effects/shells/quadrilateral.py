@@ -150,6 +150,7 @@ class ShellElement(Potential):
     units: ClassVar[tuple[int, ...] | None] = (6, 6, 4)
     together: ClassVar[bool] = True
     vectors: ClassVar[int] = 2
+    faces: ClassVar[tuple[tuple[int, ...], ...]] = ((0, 1, 2, 3),)
 
     def assembled_at(self, x: Float[Array, "4 2 3"]) -> "ShellElement":
         """With the stiffness and the invariants of the assembled pose."""

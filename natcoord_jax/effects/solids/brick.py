@@ -79,6 +79,9 @@ class Brick(Potential):
     kind: ClassVar[str] = "brick"
     degree: ClassVar[int | None] = 2
     together: ClassVar[bool] = True
+    faces: ClassVar[tuple[tuple[int, ...], ...]] = (
+        (0, 3, 2, 1), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7),
+    )  # fmt: skip
 
     def assembled_at(self, x: Float[Array, "8 3"]) -> "Brick":
         """With the gradients and the stiffness of the assembled pose."""
