@@ -318,6 +318,31 @@ def test_continua_keep_what_they_should(name):
     assert np.abs(np.sum(rows_of(trajectory)[:, :, 1] ** 2, axis=-1) - 1).max() <= tol.CONSTRAINT
 
 
+def test_what_a_node_does_not_carry_is_refused():
+    """Directions of points, others than the director, and joints that need axes."""
+    places = [(0.0, 0, 0), (1, 0, 0)]
+    ends, up = (nc.Point(nc.ground, (0, 0, 1)), nc.Point(nc.ground)), nc.Direction(nc.ground, (0, 0, 1))
+    point, director = r"'points\[0\]' is a point and carries itself only", r"'shell\[0\]' is a director"
+    for make, message in (
+        (lambda p, d: nc.PairTorque((up, nc.Direction(p, (1, 0, 0))), torque=1.0), point),
+        (lambda p, d: nc.Spring((ends[0], nc.Point(p, (0, 0, 0.5))), stiffness=1.0), point),
+        (lambda p, d: nc.PairTorque((up, nc.Direction(d, (1, 0, 0))), torque=1.0), director),
+        (lambda p, d: nc.Revolute(nc.ground, d, name="hinge"), "joint 'hinge': .* has a director only"),
+        (lambda p, d: nc.Fixed(nc.ground, d, name="weld"), "joint 'weld': .* has a director only"),
+    ):
+        scene = nc.Scene()
+        points = scene.add(nc.Nodes.points(places, mass=1.0, name="points"))
+        shell = scene.add(nc.Nodes.directors(places, (0, 0, 1), mass=1.0, inertia=0.1, name="shell"))
+        scene.add(make(points[0], shell[0]))
+        with pytest.raises(ValueError, match=message):
+            scene.compile()
+    scene = nc.Scene()
+    shell = scene.add(nc.Nodes.directors(places, (0, 0, 1), mass=1.0, inertia=0.1))
+    scene.add(nc.Spring((ends[0], nc.Point(shell[0], (0, 0, 0.5))), stiffness=1.0))
+    scene.add(nc.Spherical(nc.ground, shell[1]))
+    assert scene.compile()[0].structure.dofs == 7
+
+
 def test_pictures_show_surfaces():
     """Of a plate all its faces, of a block those outside; nodes are no bodies to be drawn."""
     for name, counts, faces in (("plate", (3, 2), 6), ("block", (2, 2, 2), 24)):

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from natcoord_jax.core.bodies import Body
+from natcoord_jax.core.bodies import TRIAD, Body
 from natcoord_jax.core.checks import as_array
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.host import stacked
@@ -54,6 +54,13 @@ class Bodies:
         if self._singles:
             parts.append(stacked([getattr(body, field) for body in self._singles.values()]))
         return parts[0] if len(parts) == 1 else joined(*parts)
+
+    def rotations_of(self, handle: Handle) -> tuple[int, ...]:
+        """Own axes about which a body, or a node, turns."""
+        if handle.name in self._singles:
+            return self._singles[handle.name].rotations
+        nodes = self._sets.get(handle.name.rpartition("[")[0])
+        return TRIAD if nodes is None else nodes.rotations
 
     def pose(self, name: str) -> tuple[Array, Array]:
         """Place and directors of a node of a set, clamped or not."""

@@ -15,7 +15,7 @@ from natcoord_jax.assembly.grouping import Instance, bare, families
 from natcoord_jax.assembly.poses import Poses, joint_frames, joint_triad
 from natcoord_jax.assembly.rates import row_rates
 from natcoord_jax.assembly.system import CoordinateGroup
-from natcoord_jax.core.bodies import TRIAD
+from natcoord_jax.core.bodies import DIRECTOR, TRIAD
 from natcoord_jax.core.checks import as_array
 from natcoord_jax.core.coordinate import Coordinate, CoordinateEffect
 from natcoord_jax.core.effect import Effect, replace_fields
@@ -154,6 +154,7 @@ class Layout:
         """Constraints of all joints."""
         instances = []
         for name, joint in self.joints.items():
+            self._check_joint(name, joint)
             frames = _frames_at(joint_frames(joint, self.poses), self._rows(joint.parent, joint.child))
             ready = joint.initialise(*frames)
             instances.append(
@@ -167,6 +168,22 @@ class Layout:
                 )
             )
         return instances
+
+    def _check_joint(self, name: str, joint: Joint) -> None:
+        """Refuse joints of directors that need more axes than these have.
+
+        Raises:
+            ValueError: naming joint and node.
+        """
+        for handle in (joint.parent, joint.child):
+            # A ball joint and a distance are between points; all others hold axes, a fixed one, too.
+            axes = joint.needs_axis or joint.multipliers > 3
+            if axes and self.bodies.rotations_of(handle) == DIRECTOR:
+                kind = type(joint).__name__
+                raise ValueError(
+                    f"joint {name!r}: {handle.name!r} has a director only, no axes that a {kind} joint could "
+                    "hold; clamp it to a rigid body (nc.Clamp) and join that"
+                )
 
     def _rows(self, *handles: Handle) -> Float[Array, "n 4 3"]:
         """Rows of bodies in the assembled pose."""

@@ -5,13 +5,16 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.bodies import Bodies, joined
+from natcoord_jax.core.bodies import POINT, TRIAD
 from natcoord_jax.core.checks import as_array
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.handles import ground as ground_handle
 from natcoord_jax.core.host import on_host
 from natcoord_jax.core.joint import Joint
+from natcoord_jax.core.kinds import short
 from natcoord_jax.core.markers import Attachment, Interpolated, Marker
 from natcoord_jax.maths.rotations import frame_from_axis
+from natcoord_jax.xla.tracing import at_top_level
 
 
 class Poses:
@@ -53,6 +56,7 @@ class Poses:
         Of a marker between nodes there are four for each of them.
         """
         own = self._own_weights(marker)
+        self._check(marker, own)
         handles = marker.handles if isinstance(marker, Marker) else (marker.body,)
         held = [self.held(handle) for handle in handles]
         if all(rows is None for rows in held):
@@ -61,6 +65,25 @@ class Poses:
         return as_array(
             np.concatenate([x if rows is None else x @ np.asarray(rows) for x, rows in parts], -1)
         )
+
+    def _check(self, marker: Marker | Attachment, own: Array) -> None:
+        """Refuse what a node does not carry along: points have no directions, directors one.
+
+        Raises:
+            ValueError: naming the node, and what it carries.
+        """
+        rotations = self._bodies.rotations_of(marker.body)
+        if rotations == TRIAD or not at_top_level(own):
+            return
+        beyond = np.asarray(own).reshape(-1, 4)[:, 1 if rotations == POINT else 2 :]
+        if np.abs(beyond).max() > 1e-9 * np.abs(np.asarray(own)).max():
+            name = marker.body.name
+            carried = "itself" if rotations == POINT else "itself and its director"
+            kind = "point" if rotations == POINT else "director"
+            raise ValueError(
+                f"{short(marker)}: {name!r} is a {kind} and carries {carried} only; pass nc.Point({name}) or "
+                "join a rigid body to it"
+            )
 
     def _own_weights(self, marker: Marker | Attachment) -> Float[Array, "*m w"]:
         if isinstance(marker, Interpolated):
