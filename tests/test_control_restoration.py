@@ -77,7 +77,7 @@ def test_feasibility_is_restored_where_the_first_attempt_gets_lost(pendulum):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", ["auto", "shooting"])
+@pytest.mark.parametrize("method", ["auto", "shooting", pytest.param("lifted", marks=pytest.mark.exhaustive)])
 def test_swing_up_by_least_effort(pendulum, method):
     """The cost that IPOPT finds on the same equations from starts where it does not end infeasible."""
     found = nc.optimise(swing_up(pendulum, cost=nc.cost.Effort()), method=method, progress=False)

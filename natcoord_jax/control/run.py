@@ -71,8 +71,9 @@ def optimise(
         guess: inputs (steps, inputs), a `Guess`, an earlier `Solution`, or None.
         method: "shooting", "lifted" or "auto": that of an earlier solution as guess, else lifted if
             parameters are free or more than inputs is bounded; with free time always lifted. Where that gets
-            lost, "auto" looks for a motion that comes near to the goal, by simulations that may miss it, and
-            goes on from there; then from random inputs. What the attempts saw is in `explain()`.
+            lost, "auto" and "lifted" look for a motion that comes near to the goal, by simulations that may
+            miss it (feasibility restoration), and go on from there; then from random inputs. What the
+            attempts saw is in `explain()`.
         progress: print a line for each iteration to stderr.
         max_iterations: limit of iterations, of all attempts together.
         tol: largest gradient of the Lagrangian and complementarity, relative.
@@ -102,8 +103,9 @@ def optimise(
         free = dict(zip(names, values))
         return Solution(problem, inputs, free, dt, math.nan, code, NAMES[lifted], reason=reason)
     search = Search(problem, Options(lifted, max_iterations, tol, goal_tol), progress, time_limit)
-    found = search.run(lifted, start, last=method != "auto")
-    if method == "auto" and not over(found) and search.left > 0:
+    # Restored motions are gone on from in the lifted form.
+    found = search.run(lifted, start, last=method == "shooting")
+    if method != "shooting" and not over(found) and search.left > 0:
         found = after_restoration(search, found, guess)
     return found
 
