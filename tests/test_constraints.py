@@ -162,6 +162,18 @@ def test_a_ball_rolls_down_a_slope(order):
     np.testing.assert_allclose(force, (-2 / 7 * mass, 0, 9.81 * mass), atol=1e-9 * mass)
 
 
+def test_modes_of_what_rolls():
+    """A ball on a spring carries its spin along: 7/5 of its mass swings."""
+    scene = nc.Scene()
+    ball = scene.add(nc.RigidBody(shape=nc.Sphere(0.1), density=1000.0, position=(0, 0, 0.1), name="ball"))
+    scene.add(nc.Rolling((*TABLE, nc.Point(ball)), radius=0.1))
+    scene.add(nc.Spring((nc.Point(nc.ground, (0, 0, 0.1)), nc.Point(ball)), stiffness=100.0))
+    system, state = scene.compile()
+    found = np.asarray(nc.modes(system, state).frequencies)
+    expected = (100.0 / (1.4 * float(system.mass[0, 0, 0]))) ** 0.5
+    np.testing.assert_allclose(found, [0.0, expected, expected], atol=1e-6)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("speed", [3.5, 5.0, 7.0])
 def test_bicycle(speed):

@@ -164,6 +164,43 @@ def test_points_inside_of_elements(name):
         np.testing.assert_allclose(other, found[0], atol=tol.SAME_TRAJECTORY)
 
 
+def test_a_torque_between_nodes_is_refused():
+    """It would have acted on one of them."""
+    scene = nc.Scene()
+    mesh = scene.add(nc.Nodes.directors([(0.0, 0, 0), (1, 0, 0)], (0, 0, 1), mass=1.0, inertia=0.1))
+    between = nc.Direction(mesh[[0, 1]], (0.5, 0.5))
+    scene.add(nc.PairTorque((nc.Direction(nc.ground, (1, 0, 0)), between), torque=1.0))
+    with pytest.raises(ValueError, match="between nodes is none"):
+        nc.simulate(*scene.compile(), dt=0.1, steps=1)
+
+
+def test_wrong_nodes_are_refused():
+    places = [(0.0, 0, 0), (1, 0, 0)]
+    with pytest.raises(ValueError, match=r"mass \[kg\] has shape \(3,\)"):
+        nc.Nodes.points(places, mass=(1.0, 2.0, 3.0))
+    with pytest.raises(ValueError, match=r"mass \[kg\].*positive"):
+        nc.Nodes.points(places, mass=(1.0, 0.0))
+    with pytest.raises(ValueError, match="some of the directors"):
+        nc.Nodes.directors(places, [(0, 0, 1), (0, 0, 0)], mass=1.0)
+
+
+def test_sets_of_constraints():
+    """A chain of rods, as a set and one by one."""
+    places = np.linspace((0.0, 0, 0), (1, 0, 0), 4)
+    scene = nc.Scene()
+    scene.add(nc.Gravity())
+    mesh = scene.add(nc.Nodes.points(places, mass=1.0, name="chain"))
+    scene.add(nc.Clamp(nc.ground, mesh[:1]))
+    scene.add(nc.Rod.on(mesh, [(0, 1), (1, 2), (2, 3)], name="rods"))
+    system, state = scene.compile()
+    trajectory = nc.simulate(system, state, dt=0.01, steps=30)
+    assert system.structure.dofs == 6
+    assert balance(system, trajectory).energy.max() <= tol.ENERGY_OF_A_SMALL_SCENE
+    ends = np.concatenate([np.zeros((31, 1, 3)), rows_of(trajectory)[:, :, 0]], axis=1)
+    lengths = np.linalg.norm(np.diff(ends, axis=1), axis=-1)
+    np.testing.assert_allclose(lengths, 1 / 3, atol=tol.CONSTRAINT_OF_A_SMALL_SCENE)
+
+
 def test_wrong_weights_are_refused():
     _, _, mesh = net(2)
     for weights, message in (

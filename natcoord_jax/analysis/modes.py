@@ -19,6 +19,7 @@ from jaxtyping import Array, Complex, Float
 from natcoord_jax.analysis.static_equations import Static
 from natcoord_jax.assembly.balances import loads, relative_rates, rotors_of, with_rest
 from natcoord_jax.assembly.momentum import inertia, wrench
+from natcoord_jax.assembly.projection import constraint_matrix
 from natcoord_jax.assembly.rates import row_rates
 from natcoord_jax.assembly.system import SYSTEM, System
 from natcoord_jax.core.arguments import checked
@@ -178,11 +179,8 @@ def _problem(system: System, state: State, inputs: Array, rotation: Array) -> tu
     size = 6 * len(system.structure.bodies)
     static = Static(system, state, inputs)
     none = jnp.zeros(static.unknowns - size)
-
-    def gaps(x: Array) -> Array:
-        return static.gaps(static.displaced(jnp.concatenate([x, none])))
-
-    rows = jnp.concatenate([jax.jacfwd(gaps)(jnp.zeros(size)), _held(system, state)])
+    # By their rates: what velocities alone obey has no gaps.
+    rows = jnp.concatenate([constraint_matrix(system, state), _held(system, state)])
     held = jnp.zeros(rows.shape[0] - none.shape[0])
     return _matrices(_Steady(system, state, inputs, rotation, jnp.concatenate([none, held])), rows, size)
 

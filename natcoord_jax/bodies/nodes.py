@@ -4,18 +4,19 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.bodies import DIRECTOR, POINT, TRIAD, Body
-from natcoord_jax.core.checks import as_array
+from natcoord_jax.core.checks import as_array, is_concrete
 from natcoord_jax.core.host import on_host
 from natcoord_jax.core.kinds import NAME
 from natcoord_jax.core.numeric import Numbers
 from natcoord_jax.maths.vectors import cross, dot
 
 PLACES = Numbers((None, 3))
-EACH = Numbers(("...",), sign="not negative")
+MASS, INERTIA = Numbers(("...",), sign="positive"), Numbers(("...",), sign="not negative")
 VECTORS = Numbers(("...", 3))
 
 
@@ -54,7 +55,7 @@ class Nodes(eqx.Module):
         )
 
     @staticmethod
-    @checked("Nodes.points", positions=PLACES, mass=EACH, velocity=VECTORS, name=NAME)
+    @checked("Nodes.points", positions=PLACES, mass=MASS, velocity=VECTORS, name=NAME)
     def points(
         positions: Any, *, mass: Any, velocity: Any = (0.0, 0.0, 0.0), name: str | None = None
     ) -> "Nodes":
@@ -62,7 +63,7 @@ class Nodes(eqx.Module):
 
         Args:
             positions: (n, 3) [m].
-            mass: of each, one number or (n,) [kg]. What elements add to it need not be counted.
+            mass: of each, one number or (n,) [kg].
             velocity: (3,) or (n, 3) [m/s].
             name: of the set.
 
@@ -74,17 +75,21 @@ class Nodes(eqx.Module):
             (1000, 3)
         """
         place, count = as_array(positions, float), len(positions)
-        blocks, still = _blocks(_every(mass, (count,)), as_array(0.0)), as_array(jnp.zeros((count, 3)))
-        unit = as_array(jnp.broadcast_to(jnp.eye(3), (count, 3, 3)))
-        return Nodes(blocks, place, unit, _every(velocity, (count, 3)), still, POINT, name)
+        blocks, still = (
+            _blocks(_every(mass, (count,), "mass [kg]"), as_array(0.0)),
+            as_array(np.zeros((count, 3))),
+        )
+        unit = as_array(np.broadcast_to(np.eye(3), (count, 3, 3)))
+        moving = _every(velocity, (count, 3), "velocity [m/s]")
+        return Nodes(blocks, place, unit, moving, still, POINT, name)
 
     @staticmethod
     @checked(
         "Nodes.directors",
         positions=PLACES,
         directors=VECTORS,
-        mass=EACH,
-        inertia=EACH,
+        mass=MASS,
+        inertia=INERTIA,
         velocity=VECTORS,
         angular_velocity=VECTORS,
         name=NAME,
@@ -119,9 +124,14 @@ class Nodes(eqx.Module):
             [0.0, 0.0, 1.0]
         """
         place, count = as_array(positions, float), len(positions)
-        frames, spin = _frames(_every(directors, (count, 3)), _every(angular_velocity, (count, 3)))
-        blocks = _blocks(_every(mass, (count,)), _every(inertia, (count,)))
-        return Nodes(blocks, place, frames, _every(velocity, (count, 3)), spin, DIRECTOR, name)
+        along = _every(directors, (count, 3), "directors [-]")
+        if is_concrete(along) and not np.any(np.asarray(along), axis=1).all():
+            raise ValueError("Nodes: some of the directors [-] are zero; pass directions")
+        frames, spin = _frames(along, _every(angular_velocity, (count, 3), "angular_velocity [rad/s]"))
+        turning = _every(inertia, (count,), "inertia [kg m^2]")
+        blocks = _blocks(_every(mass, (count,), "mass [kg]"), turning)
+        moving = _every(velocity, (count, 3), "velocity [m/s]")
+        return Nodes(blocks, place, frames, moving, spin, DIRECTOR, name)
 
     @staticmethod
     @checked(
@@ -154,19 +164,26 @@ class Nodes(eqx.Module):
         """
         place, count = as_array(positions, float), len(positions)
         return Nodes(
-            _every(mass_blocks, (count, 4, 4)),
+            _every(mass_blocks, (count, 4, 4), "mass_blocks [kg, kg m, kg m^2]"),
             place,
-            _every(orientations, (count, 3, 3)),
-            _every(velocity, (count, 3)),
-            _every(angular_velocity, (count, 3)),
+            _every(orientations, (count, 3, 3), "orientations [-]"),
+            _every(velocity, (count, 3), "velocity [m/s]"),
+            _every(angular_velocity, (count, 3), "angular_velocity [rad/s]"),
             TRIAD,
             name,
         )
 
 
-def _every(value: Any, shape: tuple[int, ...]) -> Array:
-    """One for each node."""
-    return _broadcast(as_array(value, float), shape)
+def _every(value: Any, shape: tuple[int, ...], what: str) -> Array:
+    """One for each node.
+
+    Raises:
+        ValueError: for another number of them, naming the quantity with its unit.
+    """
+    given = as_array(value, float)
+    if given.shape not in (shape, shape[1:]):
+        raise ValueError(f"Nodes: {what} has shape {given.shape}; pass {shape[1:]} for all, or {shape}")
+    return _broadcast(given, shape)
 
 
 @on_host

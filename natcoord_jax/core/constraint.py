@@ -146,8 +146,7 @@ class VelocityConstraint(Effect):
         self, place: Array, rows: Array, rates: Array, spin: Array, t: Array, passing: Any
     ) -> Array:
         """What the velocities leave."""
-        own = spin[:: spin.shape[0] // place.shape[0]]
-        return self.rate(place_markers(place, rows), place_markers(place, rates), own)
+        return self.rate(place_markers(place, rows), place_markers(place, rates), spin)
 
     def violation_units(self, place: Array, rows: Array) -> tuple[str, ...]:
         """Metres, as of points."""
@@ -161,6 +160,5 @@ class VelocityConstraint(Effect):
             return given, *jax.vjp(lambda v, w: self.rate(held, v, w), rates, spin)[1](multipliers)
 
         x, rates, held = (place_markers(place, q) for q in (motion.rows, motion.rates, motion.held.rows))
-        spin = motion.spin[:, :: motion.spin.shape[1] // place.shape[0]]
-        found, forces, torques = jax.vmap(stage)(x, rates, spin, held, lam)
+        found, forces, torques = jax.vmap(stage)(x, rates, motion.spin, held, lam)
         return replace_fields(marker_response(place, forces, torques, rates, motion), rows=found)

@@ -214,9 +214,11 @@ def marker_response(
             on_rows = jnp.sum(on_rows, axis=-3)
         on_rows = on_rows.reshape(stages, -1, 4, 3)
     if torques is not None:
-        several = motion.spin.shape[-2] // place.shape[0]
-        if several > 1:
-            torques = jnp.zeros_like(motion.spin).at[:, ::several].set(torques)
+        if motion.spin.shape[-2] > place.shape[0]:
+            raise ValueError(
+                "a torque [N m] acts on a body, and what lies between nodes is none; pass markers of bodies, "
+                "or forces on points between nodes"
+            )
         power = power + jnp.sum(torques * motion.spin, axis=(-1, -2))
     return Response(on_rows, torques, jnp.zeros((stages, 0)), power)
 
