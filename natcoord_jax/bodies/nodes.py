@@ -75,10 +75,8 @@ class Nodes(eqx.Module):
             (1000, 3)
         """
         place, count = as_array(positions, float), len(positions)
-        blocks, still = (
-            _blocks(_every(mass, (count,), "mass [kg]"), as_array(0.0)),
-            as_array(np.zeros((count, 3))),
-        )
+        blocks = _blocks(_every(mass, (count,), "mass [kg]"), as_array(0.0))
+        still = as_array(np.zeros((count, 3)))
         unit = as_array(np.broadcast_to(np.eye(3), (count, 3, 3)))
         moving = _every(velocity, (count, 3), "velocity [m/s]")
         return Nodes(blocks, place, unit, moving, still, POINT, name)
