@@ -12,8 +12,12 @@ from differences import assert_v_shaped
 
 import natcoord_jax as nc
 from natcoord_jax import gallery
-from natcoord_jax.analysis import balance
+from natcoord_jax.analysis import balance, static_equations
 from natcoord_jax.assembly.build import build
+from natcoord_jax.assembly.full import FullStep
+from natcoord_jax.assembly.reduced import NOTHING
+from natcoord_jax.gallery import continua
+from natcoord_jax.maths.collocation import gauss
 from natcoord_jax.viz.outline import element_faces, is_node, with_ground
 
 
@@ -287,6 +291,51 @@ def test_frequency_of_shells():
     system, state, _ = cantilever(8)
     lowest = nc.modes(system, state, count=1).frequencies[0] / (2 * np.pi)
     np.testing.assert_allclose(lowest, 9.958, atol=5e-4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("analysis", ["statics", "path"])
+def test_large_statics_are_solved_by_the_sparse_plan(analysis, monkeypatch):
+    """As the dense matrix does, with gradients."""
+    system, state, tip = cantilever(42, force=2.0)
+    assert system.local_rates.count > static_equations.DENSE
+
+    def tip_height(stiffness):
+        stiffer = system.set("strip", stiffness=stiffness * system.get("strip", "stiffness"))
+        if analysis == "path":
+            end = nc.load_path(stiffer, state, arc=0.05, steps=3).state
+        else:
+            end = nc.equilibrium(stiffer, state).state
+        return end.q.reshape(-1, 4, 3)[system.body_index(tip[0]), 0, 2]
+
+    found = []
+    for most in (static_equations.DENSE, 10**6):
+        monkeypatch.setattr(static_equations, "DENSE", most)
+        found.append(jnp.stack(jax.value_and_grad(tip_height)(jnp.asarray(1.0))))
+    assert found[0][0] > 0.1
+    np.testing.assert_allclose(*found, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "make", [lambda: winged()[:2], lambda: _continuum("plate"), lambda: _continuum("block")]
+)
+def test_tangents_in_formulas_are_exact(make):
+    """An energy that is quadratic in its invariants has forces that are linear in their steps."""
+    system, state = make()
+    random = np.random.default_rng(1)
+    h, no_inputs = jnp.asarray(0.01), jnp.zeros(0)
+    step = FullStep.prepare(system, state, no_inputs, h, gauss(1), NOTHING)
+    y = step.guess() + 3.0 * random.normal(size=step.unknowns)
+    exact, formulas = (step.matrices(y, choice) for choice in (True, False))
+    for one, other in zip(exact, formulas):
+        np.testing.assert_allclose(other, one, atol=1e-11 * float(jnp.abs(one).max()))
+    group = next(g for g in system.effects if g.effect.elastic)
+    assert group.turning == bool(system.structure.directors)
+
+
+def _continuum(name):
+    example = {"plate": continua.plate, "block": continua.block}[name]((2,) * (2 + (name == "block")))
+    return example.system, example.state
 
 
 def winged(*, free=True):

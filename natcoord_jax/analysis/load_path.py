@@ -52,9 +52,9 @@ class _Path(eqx.Module):
 
     def product(self, one: tuple[Array, Array], other: tuple[Array, Array]) -> Array:
         """Product of two increments (displacements and rotations, load): mean squares over the bodies."""
-        a, b = one[0].reshape(-1, 6), other[0].reshape(-1, 6)
-        moved = jnp.sum(a[:, :3] * b[:, :3]) / self.extent**2 + jnp.sum(a[:, 3:] * b[:, 3:])
-        return moved / a.shape[0] + one[1] * other[1] / self.scale**2
+        rates = self.system.local_rates
+        shifts, turns = (jnp.sum(a * b) for a, b in zip(rates.parts(one[0]), rates.parts(other[0])))
+        return (shifts / self.extent**2 + turns) / rates.bodies + one[1] * other[1] / self.scale**2
 
     def linear(self, state: State, lam: Array) -> tuple[Array, Array]:
         """Newton's change of displacements and multipliers at this load, and their rate with the load."""
@@ -64,13 +64,13 @@ class _Path(eqx.Module):
 
         static = Static(self.system, state, self.inputs(state.t))
         y = jnp.concatenate([jnp.zeros(static.balances), lam])
-        inverse = static.inverse(y)
+        solver = static.solver(y)
         value, by_load = jax.jvp(lambda t: residual(t, y), (state.t,), (jnp.ones_like(state.t),))
-        return -inverse @ value, -inverse @ by_load
+        return -solver.solve(value), -solver.solve(by_load)
 
     def tangent(self, by_load: Array, before: tuple[Array, Array]) -> tuple[Array, Array]:
         """Direction of the path, of length one, with which `before` has a positive product."""
-        count = 6 * len(self.system.structure.bodies)
+        count = self.system.local_rates.count
         rate = by_load[:count], jnp.ones(())
         length = jnp.sqrt(self.product(rate, rate))
         sign = jnp.where(self.product(rate, before) < 0, -1.0, 1.0) / length
@@ -84,7 +84,7 @@ class _Path(eqx.Module):
         across = self.product((rate[:count], unit[0]), point.direction)
         load = -self.product((change[:count], unit[1]), point.direction) / across
         change = change + load * rate
-        moved, turned = largest(change[:count], self.extent)
+        moved, turned = largest(self.system, change[:count], self.extent)
         correction = jnp.maximum(jnp.maximum(moved, turned), jnp.abs(load) / self.scale)
         stalled = (point.count > 0) & (correction > 0.5 * point.correction) & (correction <= FLOOR)
         static = Static(self.system, point.state, self.inputs(point.state.t))
@@ -230,7 +230,7 @@ def _followed(
     # The search is not differentiated; `differentiable` gives its results their derivatives.
     fixed, begin = jax.lax.stop_gradient((system, state))
     path = _Path(fixed, scale, extent_of(fixed, begin), inputs)
-    balances = 6 * len(system.structure.bodies)
+    balances = system.local_rates.count
     lam = jnp.zeros(Static(system, state, inputs(state.t)).unknowns - balances)
 
     def one(carry: tuple, _: None) -> tuple[tuple, tuple]:

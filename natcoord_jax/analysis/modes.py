@@ -8,6 +8,7 @@ with D from dampers and from the rotation, K from stiffness, loads, reactions an
 space x = Z xi of the constraints it is a quadratic eigenvalue problem of the size of the degrees of freedom.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -19,7 +20,7 @@ from jaxtyping import Array, Complex, Float
 from natcoord_jax.analysis.static_equations import Static
 from natcoord_jax.assembly.balances import loads, relative_rates, rotors_of, with_rest
 from natcoord_jax.assembly.momentum import inertia, wrench
-from natcoord_jax.assembly.projection import constraint_matrix
+from natcoord_jax.assembly.projection import TWIST, constraint_matrix
 from natcoord_jax.assembly.rates import row_rates
 from natcoord_jax.assembly.system import SYSTEM, System
 from natcoord_jax.core.arguments import checked
@@ -73,8 +74,7 @@ class _Steady(eqx.Module):
         y = jnp.concatenate([x, self.lam])
         state = static.displaced(y)
         rows = state.q.reshape(-1, 4, 3)
-        moved, turned = self._apart(x)
-        v_rel, w_rel = self._apart(rates)
+        (moved, _), (v_rel, w_rel) = self._apart(x), self._apart(rates)
         first = rows.shape[0]
         origin = self.state.q.reshape(-1, 4, 3)[:, 0]
         about = self._steady_velocity(origin)
@@ -92,11 +92,16 @@ class _Steady(eqx.Module):
         applied = loads(self.system, state, self.inputs, velocity, spin)
         pulled = static.constraint_loads(state, y)
         parts = [a[0] - b - c for a, b, c in zip(inertial, applied, pulled)]
-        return jnp.concatenate(parts, axis=1).reshape(-1)
+        return self._balances(parts)
 
     def _apart(self, x: Array) -> tuple[Array, Array]:
-        every = x.reshape(-1, 6)
+        rows = self.state.q.reshape(-1, 4, 3)
+        every = self.system.local_rates.twists(x, rows)[:, 0]
         return every[:, :3], every[:, 3:]
+
+    def _balances(self, forces_and_torques: Sequence[Array]) -> Array:
+        wrenches = jnp.concatenate(forces_and_torques, axis=1)[:, None]
+        return self.system.local_rates.balances(wrenches, self.state.q.reshape(-1, 4, 3))
 
     def _steady_velocity(self, points: Array) -> Array:
         v = self.state.v.reshape(-1, 4, 3)[:, 0]
@@ -109,9 +114,9 @@ class _Steady(eqx.Module):
         def inertial(gains: Array) -> Array:
             impulses = inertia(self.system.mass, row_rates(rows, *self._apart(gains)))
             parts = [x[0] for x in wrench(impulses[None], rows[None, :, 1:])]
-            return jnp.concatenate(parts, axis=1).reshape(-1)
+            return self._balances(parts)
 
-        size = 6 * rows.shape[0]
+        size = self.system.local_rates.count
         matrix = jax.vmap(inertial)(jnp.eye(size)).T
         groups = rotors_of(self.system)
         if groups:
@@ -176,25 +181,12 @@ def _damped(mass: Array, damping: Array, stiffness: Array) -> tuple[Array, Array
 
 @briefly
 def _problem(system: System, state: State, inputs: Array, rotation: Array) -> tuple[Array, ...]:
-    size = 6 * len(system.structure.bodies)
-    static = Static(system, state, inputs)
-    none = jnp.zeros(static.unknowns - size)
+    rates, start = system.local_rates, state.q.reshape(-1, 4, 3)
     # By their rates: what velocities alone obey has no gaps.
-    rows = jnp.concatenate([constraint_matrix(system, state), _held(system, state)])
-    held = jnp.zeros(rows.shape[0] - none.shape[0])
-    return _matrices(_Steady(system, state, inputs, rotation, jnp.concatenate([none, held])), rows, size)
-
-
-def _held(system: System, state: State) -> Array:
-    """Rates of the turns of point masses, and of directors about themselves: there are none."""
-    size = 6 * len(system.structure.bodies)
-    turns = [6 * point + k for point in system.structure.points for k in (3, 4, 5)]
-    rows, first = jnp.eye(size)[np.array(turns, int)], state.q.reshape(-1, 4, 3)[:, 1]
-    directed = system.structure.directors
-    own = jnp.zeros((len(directed), size))
-    places = 6 * np.array(directed, int)[:, None] + np.arange(3, 6)
-    own = own.at[np.arange(len(directed))[:, None], places].set(first[np.array(directed, int)])
-    return jnp.concatenate([rows, own])
+    by_twist = constraint_matrix(system, state).reshape(-1, rates.bodies, 1, TWIST)
+    rows = jax.vmap(lambda row: rates.balances(row, start))(by_twist)
+    steady = _Steady(system, state, inputs, rotation, jnp.zeros(rows.shape[0]))
+    return _matrices(steady, rows, rates.count)
 
 
 @checked(system=SYSTEM, state=STATE, count=Whole(1), rotation=COMPONENTS, inputs=Vector(None), damped=FLAG)
@@ -257,7 +249,7 @@ def modes(
     if damped is None:
         damped = concrete and _unsymmetric(mass, damping, stiffness)
     s, shapes = _damped(mass, damping, stiffness) if damped else _undamped(mass, stiffness)
-    return _ordered(state, s, shapes @ free.T, mass.shape[0], count, damped)
+    return _ordered(system, state, s, shapes @ free.T, mass.shape[0], count, damped)
 
 
 def _unsymmetric(mass: Array, damping: Array, stiffness: Array) -> bool:
@@ -269,7 +261,9 @@ def _unsymmetric(mass: Array, damping: Array, stiffness: Array) -> bool:
     return circulation > 1e-9 * size or drag**2 > 1e-24 * size * weight
 
 
-def _ordered(state: State, s: Array, moved: Array, freedoms: int, count: int | None, damped: bool) -> Modes:
+def _ordered(
+    system: System, state: State, s: Array, moved: Array, freedoms: int, count: int | None, damped: bool
+) -> Modes:
     """One of each conjugate pair, by frequency; shapes as displacements of rows."""
     if damped:
         order = jnp.argsort(jnp.where(jnp.imag(s) < 0, jnp.inf, jnp.abs(s)))
@@ -278,7 +272,7 @@ def _ordered(state: State, s: Array, moved: Array, freedoms: int, count: int | N
         kept = jnp.argsort(jnp.abs(s))
     kept = kept[:count]
     rows = state.q.reshape(-1, 4, 3)
-    parts = moved[kept].reshape(len(kept), -1, 6)
+    parts = jax.vmap(lambda w: system.local_rates.twists(w, rows)[:, 0])(moved[kept])
     turned = jnp.cross(parts[:, :, None, 3:], rows[None, :, 1:])
     shapes = jnp.concatenate([parts[:, :, None, :3], turned], axis=2).reshape(len(kept), -1, 3)
     largest = jnp.max(jnp.abs(shapes), axis=(1, 2), keepdims=True, initial=1e-300)

@@ -1,18 +1,23 @@
 """The equations of equilibrium: no resultant force or torque on any body, no gap in any joint.
 
-Unknowns are the displacements and rotations of all bodies (six a body, Cayley's vectors) from a given
-configuration, and the multipliers of all joints and of relations between coordinates. The time of the state
-is the parameter of the load: forces, drives and inputs that are functions of time follow it.
+Unknowns are the displacements and rotations of all bodies (Cayley's vectors, along the rates that a body
+has) from a given configuration, and the multipliers of all joints and of relations between coordinates. The
+time of the state is the parameter of the load: forces, drives and inputs that are functions of time follow
+it.
 """
+
+import functools
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.balances import loads
-from natcoord_jax.assembly.full import FullStep
+from natcoord_jax.assembly.full import FullStep, dense, rates_of, touches
 from natcoord_jax.assembly.local import body_motion
-from natcoord_jax.assembly.momentum import idle_torque, wrench
+from natcoord_jax.assembly.local_rates import TWIST
+from natcoord_jax.assembly.momentum import wrench
 from natcoord_jax.assembly.node_sweeps import sweep_nodes
 from natcoord_jax.assembly.outset import Outset
 from natcoord_jax.assembly.projection import nearest_coordinates
@@ -23,11 +28,16 @@ from natcoord_jax.assembly.tree import gather_slots, start_rates
 from natcoord_jax.assembly.violations import violations_of
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
+from natcoord_jax.linsolve.dense import Inverse
+from natcoord_jax.linsolve.sparse import factorised
 from natcoord_jax.maths.collocation import gauss
 from natcoord_jax.maths.elimination import pivoted_inverse
 
 NO_MASS = 1e-30
 """Factor on masses that leaves them no weight in the equations, but tells bodies from point masses."""
+
+DENSE = 400
+"""Unknowns up to which the Jacobian is inverted as a dense matrix, with pivots."""
 
 SHIFT = 1e-10
 """Compliance given to constraints, relative to that of the structure: redundant ones share their load."""
@@ -48,8 +58,8 @@ class Static(eqx.Module):
 
     @property
     def balances(self) -> int:
-        """Number of balances: three of forces and three of torques a body."""
-        return 6 * len(self.system.structure.bodies)
+        """Number of balances of forces and torques: as many as the bodies have rates."""
+        return self.system.local_rates.count
 
     @property
     def groups(self) -> tuple[Group, ...]:
@@ -64,8 +74,13 @@ class Static(eqx.Module):
     def displaced(self, y: Float[Array, " unknowns"]) -> State:
         """The state at rest after the displacements in `y`."""
         rows = self.state.q.reshape(-1, 4, 3)
-        twists = y[: self.balances].reshape(-1, 1, 6)
+        twists = self.twists(y)[:, None]
         return self._at(rows + body_motion(rows, twists, jnp.ones((), rows.dtype), gauss(1)).rates[0])
+
+    def twists(self, y: Float[Array, " unknowns"]) -> Float[Array, "bodies 6"]:
+        """Displacements and rotations of all bodies."""
+        rows = self.state.q.reshape(-1, 4, 3)
+        return self.system.local_rates.twists(y[: self.balances], rows)[:, 0]
 
     def moved_along_tree(self, y: Float[Array, " unknowns"]) -> State:
         """The same to first order, but every body is carried along by its neighbour in the tree.
@@ -74,7 +89,7 @@ class Static(eqx.Module):
         beam that it bends; the joints of the tree stay closed.
         """
         system, rows = self.system, self.state.q.reshape(-1, 4, 3)
-        velocity, spin = jnp.split(y[: self.balances].reshape(-1, 6), 2, axis=1)
+        velocity, spin = jnp.split(self.twists(y), 2, axis=1)
         tree, h = system.tree.chained(), jnp.ones((), rows.dtype)
         frames = tree.frames(system.frames)
         w = start_rates(tree, frames, rows, row_rates(rows, velocity, spin))[None]
@@ -96,10 +111,8 @@ class Static(eqx.Module):
         force, torque = loads(self.system, state, self.inputs, still, still)
         pulled = self.constraint_loads(state, y)
         sums = -(jnp.concatenate([force, torque], axis=1) + jnp.concatenate(pulled, axis=1))
-        # The directors of a point mass are held where they are.
-        turned = y[: self.balances].reshape(-1, 6)[:, 3:]
-        sums = sums.at[:, 3:].add(idle_torque(self.system, self.state.q.reshape(-1, 4, 3), turned))
-        return jnp.concatenate([sums.reshape(-1), self.gaps(state)])
+        balances = self.system.local_rates.balances(sums[:, None], self.state.q.reshape(-1, 4, 3))
+        return jnp.concatenate([balances, self.gaps(state)])
 
     def constraint_loads(self, state: State, y: Array) -> tuple[Array, Array]:
         """Forces and torques of the multipliers on all bodies."""
@@ -127,14 +140,14 @@ class Static(eqx.Module):
         found = (x.reshape(-1) for x in violations_of(self.system, self.groups, state))
         return jnp.concatenate([jnp.zeros(0, state.q.dtype), *found])
 
-    def matrix(
+    def matrices(
         self, y: Float[Array, " unknowns"], weight: Array | float = 0.0
-    ) -> Float[Array, "unknowns unknowns"]:
-        """Jacobian of the residual at displacements zero, assembled from those of single effects.
+    ) -> list[Float[Array, "_ _ _"]]:
+        """Jacobian of the residual at displacements zero: matrices of bodies and single effects.
 
-        It is that of a step of the body system without mass: a step's forces are those of its middle, which
-        moves by half the displacement. With a `weight` [1/s^2] that times the inertia is added to it (four
-        times, to be exact), as of a short step.
+        They are those of a step of the body system without mass: a step's forces are those of its middle,
+        which moves by half the displacement. With a `weight` [1/s^2] that times the inertia is added to them
+        (four times, to be exact), as of a short step.
         """
         system = replace_fields(self.system, mass=(NO_MASS + weight) * self.system.mass)
         resting = self.displaced(jnp.zeros_like(y))
@@ -144,16 +157,32 @@ class Static(eqx.Module):
         # Times of a step of length one, shifted to that of the load.
         situations = tuple(eqx.tree_at(lambda s: s.t, where, where.t - 0.5) for where in step.situations)
         step = eqx.tree_at(lambda s: s.situations, step, situations)
-        matrix = step.jacobian(y.at[: self.balances].set(0.0), exact=False)
-        return matrix.at[: self.balances, : self.balances].multiply(2.0)
+        every = step.matrices(y.at[: self.balances].set(0.0), exact=False)
+        return [x.at[:, :width, :width].multiply(2.0) for x, width in zip(every, self._widths)]
 
-    def inverse(
-        self, y: Float[Array, " unknowns"], weight: Array | float = 0.0
-    ) -> Float[Array, "unknowns unknowns"]:
-        """Inverse of the matrix, slightly regularised."""
-        matrix, count = self.matrix(y, weight), self.balances
-        stiffness = jnp.max(jnp.abs(jnp.diagonal(matrix)[:count]), initial=0.0)
-        arms = jnp.max(jnp.abs(matrix[count:, :count]), initial=1e-300)
+    @property
+    def _widths(self) -> list[int]:
+        """Components of twists among the unknowns of each element; multipliers follow them."""
+        groups = (g for g in (*self.system.effects, *self.system.joints) if touches(g))
+        return [TWIST, *(rates_of(g) * g.bodies.shape[1] for g in groups)]
+
+    def solver(self, y: Float[Array, " unknowns"], weight: Array | float = 0.0) -> Any:
+        """What solves equations with the Jacobian at displacements zero, slightly regularised.
+
+        Returns:
+            An object with `solve(right)` and `transpose()`.
+        """
+        given, sparsity = self.matrices(y, weight), self.system.sparsity
+        pulls = (jnp.max(jnp.abs(x[:, w:, :w]), initial=1e-300) for x, w in zip(given, self._widths))
+        arms = functools.reduce(jnp.maximum, pulls)
+        if sparsity is not None and self.unknowns > DENSE:
+            matrix: Any = sparsity.pattern.assemble(*given)
+            return factorised(sparsity.plan, matrix.with_diagonal(self._shifts(matrix.diagonal(), arms)))
+        matrix = dense(self.system, given, self.unknowns)
+        return Inverse(pivoted_inverse(matrix + jnp.diag(self._shifts(jnp.diagonal(matrix), arms))))
+
+    def _shifts(self, diagonal: Float[Array, " unknowns"], arms: Array) -> Float[Array, " unknowns"]:
+        """What is added to the diagonal: a compliance of the constraints."""
+        stiffness = jnp.max(jnp.abs(diagonal[: self.balances]), initial=0.0)
         shift = SHIFT * arms**2 / jnp.where(stiffness > 0, stiffness, 1.0)
-        diagonal = jnp.where(jnp.arange(matrix.shape[0]) < count, 0.0, shift)
-        return pivoted_inverse(matrix + jnp.diag(diagonal))
+        return jnp.where(jnp.arange(diagonal.shape[0]) < self.balances, 0.0, shift)

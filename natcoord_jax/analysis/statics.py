@@ -93,10 +93,10 @@ def extent_of(system: System, state: State) -> Array:
     return points + jnp.where(moment > 0, jnp.sqrt(jnp.where(moment > 0, moment, 1.0)), 1e-300)
 
 
-def largest(change: Float[Array, " balances"], extent: Array) -> tuple[Array, Array]:
+def largest(system: System, change: Float[Array, " balances"], extent: Array) -> tuple[Array, Array]:
     """Largest displacement relative to the extent, and largest rotation."""
-    moved = jnp.abs(change.reshape(-1, 6))
-    return jnp.max(moved[:, :3], initial=0.0) / extent, jnp.max(moved[:, 3:], initial=0.0)
+    moved, turned = (jnp.max(jnp.abs(x), initial=0.0) for x in system.local_rates.parts(change))
+    return moved / extent, turned
 
 
 def _solve(system: System, state: State, lam: Array, inputs: Array) -> _Search:
@@ -115,8 +115,8 @@ def _solve(system: System, state: State, lam: Array, inputs: Array) -> _Search:
         pull = jnp.max(jnp.abs(residual[: static.balances]))
         begun = pull / (jnp.mean(system.mass[:, 0, 0]) * SHORT * extent)
         heaviest = jnp.where(search.count == 0, begun, search.heaviest)
-        change = -static.inverse(y, search.weight) @ residual
-        moved, turned = largest(change[: static.balances], extent)
+        change = -static.solver(y, search.weight).solve(residual)
+        moved, turned = largest(system, change[: static.balances], extent)
         correction = jnp.maximum(moved, turned)
         finite = jnp.all(jnp.isfinite(change))
         # No body moves or turns too far at once: shortened, or repeated with more inertia.
@@ -151,10 +151,17 @@ def differentiable(system: System, state: State, lam: Array, inputs: Array) -> t
     static = Static(system, replace_fields(fixed, t=state.t), inputs)
     at = jax.lax.stop_gradient(jnp.concatenate([jnp.zeros(static.balances), lam]))
     # It only helps to solve: its derivatives must not reach the root's rule.
-    inverse = jax.lax.stop_gradient(static.inverse(at))
+    solver = jax.lax.stop_gradient(static.solver(at))
 
     def tangent_solve(linear: Any, right: Array) -> Array:
-        return refined_solve(linear, right, inverse, jnp.matmul, lambda near, b: near.T @ b, rounds=3)
+        return refined_solve(
+            linear,
+            right,
+            solver,
+            lambda near, b: near.solve(b),
+            lambda near, b: near.transpose().solve(b),
+            rounds=3,
+        )
 
     y = jax.lax.custom_root(lambda y: static.residual(y), at, lambda f, start: start, tangent_solve)
     return static.displaced(y), y[static.balances :]

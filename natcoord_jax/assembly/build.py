@@ -14,6 +14,7 @@ from natcoord_jax.assembly.diagnostics import rows_with_ground
 from natcoord_jax.assembly.graph import make_tree
 from natcoord_jax.assembly.grouping import element_group, stack
 from natcoord_jax.assembly.layout import Layout
+from natcoord_jax.assembly.local_rates import LocalRates
 from natcoord_jax.assembly.roundness import symmetries
 from natcoord_jax.assembly.system import Structure, System
 from natcoord_jax.core.bodies import DIRECTOR, POINT, Body
@@ -41,9 +42,9 @@ def build(
     layout = Layout(bodies, joints, effects)
     instances = [layout.effect_instance(name, effect) for name, effect in effects.items()]
     layout.number_accounts(instances)
-    joint_groups = stack(layout.joint_instances(), len(bodies))
-    groups = stack(instances, len(bodies))
-    groups += tuple(element_group(layout, name, part) for name, part in (elements or {}).items())
+    turning = np.array([*map(bool, layout.rotations), False])
+    joint_groups, groups = stack(layout.joint_instances(), turning), stack(instances, turning)
+    groups += tuple(element_group(layout, name, part, turning) for name, part in (elements or {}).items())
     tree = make_tree(layout.spanning, layout.motions())
     multipliers = sum(g.count * g.multipliers for g in groups)
     relations = multipliers
@@ -71,6 +72,7 @@ def build(
         layout.frames(),
         layout.joint_bodies(),
         tree,
+        LocalRates.of(layout.rotations),
         joint_groups,
         groups,
         layout.coordinate_groups(),

@@ -5,6 +5,7 @@ bodies and effects. Systems that are no tree, too large for the reduced form and
 are solved so, densely; for all others it is an independent way to the same trajectory.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -18,7 +19,8 @@ from natcoord_jax.assembly.form import Form
 from natcoord_jax.assembly.grain import cancelling_size
 from natcoord_jax.assembly.kick import kicked
 from natcoord_jax.assembly.local import body_balance, body_motion, jacobians
-from natcoord_jax.assembly.momentum import idle_torque, least_inertias, momentum_balance
+from natcoord_jax.assembly.local_rates import TWIST
+from natcoord_jax.assembly.momentum import least_inertias, momentum_balance
 from natcoord_jax.assembly.outset import Outset
 from natcoord_jax.assembly.reduced import NOTHING
 from natcoord_jax.assembly.redundancy import at_every_stage, project_multipliers, project_rows
@@ -32,6 +34,7 @@ from natcoord_jax.assembly.response import (
 )
 from natcoord_jax.assembly.separate import Tangents
 from natcoord_jax.assembly.system import Group, System
+from natcoord_jax.core.checks import is_concrete
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import Tableau, gauss
 from natcoord_jax.maths.projectors import range_projector
@@ -112,7 +115,7 @@ class FullStep(Form):
     @property
     def balances(self) -> int:
         """Number of balance equations."""
-        return 6 * self.bodies * self.tableau.stages
+        return self.system.local_rates.count * self.tableau.stages
 
     @property
     def grain(self) -> Float[Array, ""]:
@@ -137,7 +140,7 @@ class FullStep(Form):
     def split(self, y: Float[Array, " unknowns"]) -> tuple[Array, list[Array]]:
         """Twists (bodies, s, 6) and multipliers of each group (n, s, m)."""
         s = self.tableau.stages
-        twists = y[: self.balances].reshape(self.bodies, s, 6)
+        twists = self.system.local_rates.twists(y[: self.balances], self.start[:-1])
         multipliers = [
             y[first : first + size].reshape(group.count, s, group.multipliers)
             for group, (first, size) in zip(self.groups, self._blocks())
@@ -169,20 +172,19 @@ class FullStep(Form):
         )
         given = self.system, self.groups, situations, at, velocity
         found = momentum_balance(*given, multipliers, self.h, self.tableau)
-        # A point mass keeps its directors by an idle inertia, as in `body_balance`.
-        torque = found.torque + idle_torque(self.system, self.start[:-1], at.spin[:, :-1])
-        wrenches = jnp.moveaxis(jnp.concatenate([found.force, torque], axis=-1), 0, 1)
+        wrenches = jnp.moveaxis(jnp.concatenate([found.force, found.torque], axis=-1), 0, 1)
+        balances = self.system.local_rates.balances(wrenches, self.start[:-1])
         rows = project_rows(found.rows, y, self.balances, self.outset.projector)
-        residual = jnp.concatenate([wrenches.reshape(-1), rows])
+        residual = jnp.concatenate([balances, rows])
         return Evaluation(residual, found.size, at, found.power, (found.force, found.torque), kick)
 
     def body_jacobians(self, twists: Float[Array, "bodies s 6"]) -> Float[Array, "bodies n n"]:
         """Jacobians of the bodies' own balances."""
-        width = 6 * self.tableau.stages
-        local = jax.vmap(jax.jacfwd(body_balance, argnums=3), in_axes=(0, 0, 0, 0, None, None, 0))
-        given = self.system.mass, self.start[:-1], self.velocity, twists, self.h, self.tableau
-        unit = jnp.broadcast_to(jnp.eye(3, dtype=twists.dtype)[:, None], (3, self.bodies, 3))
-        found = local(*given, jnp.swapaxes(idle_torque(self.system, self.start[:-1], unit), 0, 1))
+        width = TWIST * self.tableau.stages
+        local = jax.vmap(jax.jacfwd(body_balance, argnums=3), in_axes=(0, 0, 0, 0, None, None))
+        found = local(self.system.mass, self.start[:-1], self.velocity, twists, self.h, self.tableau)
+        along = self.system.local_rates.blocks(np.arange(self.bodies)[:, None], self.start)
+        found = along(along(found[:, None, :, :, None], 1), 4)
         return found.reshape(self.bodies, width, width)
 
     def tangent(self, y: Float[Array, " unknowns"], loads: Any = None) -> Float[Array, "unknowns unknowns"]:
@@ -192,41 +194,35 @@ class FullStep(Form):
     def jacobian(
         self, y: Float[Array, " unknowns"], *, exact: bool = True
     ) -> Float[Array, "unknowns unknowns"]:
-        """Jacobian, assembled from local ones."""
-        twists, multipliers = self.split(project_multipliers(y, self.balances, self.outset.projector))
-        s, bodies, size = self.tableau.stages, self.bodies, self.unknowns
-        width = 6 * s
-        own = self.body_jacobians(twists)
-        columns = np.arange(bodies)[:, None] * width + np.arange(width)
-        matrix = jnp.zeros((size + width, size + width), y.dtype)
-        matrix = matrix.at[columns[:, :, None], columns[:, None, :]].add(own)
+        """Jacobian, put together from those of bodies, effects and joints."""
+        y = project_multipliers(y, self.balances, self.outset.projector)
+        return self._projected(
+            dense(self.system, self.matrices(y, exact), self.unknowns, self.tableau.stages)
+        )
+
+    def matrices(self, y: Float[Array, " unknowns"], exact: bool) -> list[Float[Array, "_ _ _"]]:
+        """Jacobians of the bodies and of the instances of each group, by the unknowns in `elements`."""
+        twists, multipliers = self.split(y)
         every = self._with_ground(twists)
-        for group, where, lam, (first, _) in zip(self.groups, self.situations, multipliers, self._blocks()):
+        found = [self.body_jacobians(twists)]
+        for group, where, lam in zip(self.groups, self.situations, multipliers):
+            if not touches(group):
+                continue
+            bodies, rates = group.bodies, rates_of(group)
             (by_twist, by_lam), (g_by_twist, _) = jacobians(
-                group,
-                where,
-                self.tableau,
-                self.start[group.bodies],
-                every[group.bodies],
-                lam,
-                exact=exact,
+                group, where, self.tableau, self.start[bodies], every[bodies][..., :rates], lam, exact=exact
             )
-            n, k = group.bodies.shape
-            m = s * group.multipliers
-            # ground columns and rows go beyond the matrix and are cut off at the end
-            base = jnp.where(group.bodies == bodies, size, group.bodies * width)
-            touched = (base[:, :, None] + jnp.arange(width)).reshape(n, k * width)
-            local = by_twist.reshape(n, k * width, k * width)
-            matrix = matrix.at[touched[:, :, None], touched[:, None, :]].add(-local)
-            if m:
-                lams = first + jnp.arange(n)[:, None] * m + jnp.arange(m)
-                matrix = matrix.at[touched[:, :, None], lams[:, None, :]].add(
-                    -by_lam.reshape(n, k * width, m)
-                )
-                matrix = matrix.at[lams[:, :, None], touched[:, None, :]].add(
-                    g_by_twist.reshape(n, m, k * width)
-                )
-        return self._projected(matrix[:size, :size])
+            if group.turning:
+                along = self.system.local_rates.blocks(bodies, self.start)
+                by_twist, by_lam, g_by_twist = along(by_twist, 1), along(by_lam, 1), along(g_by_twist, 3)
+                by_twist = along(by_twist, 4)
+            count, width = group.count, bodies.shape[1] * self.tableau.stages * rates
+            rows = self.tableau.stages * group.multipliers
+            above = [-by_twist.reshape(count, width, width), -by_lam.reshape(count, width, rows)]
+            below = [g_by_twist.reshape(count, rows, width), jnp.zeros((count, rows, rows), y.dtype)]
+            whole = [jnp.concatenate(parts, axis=2) for parts in (above, below)]
+            found.append(jnp.concatenate(whole, axis=1) if rows else above[0])
+        return found
 
     def _projected(self, matrix: Array) -> Array:
         """Columns of multipliers and rows of constraints in the range of the constraints."""
@@ -247,24 +243,23 @@ class FullStep(Form):
         """Inertias that the rates have at least, by the mass of their bodies; the same in every step."""
         own = jnp.repeat(least_inertias(self.system.mass), 3, axis=1)
         stages = jnp.diagonal(jnp.asarray(self.tableau.a_inverse, own.dtype))
-        return (own[:, None, :] * stages[:, None]).reshape(-1)
+        return self.system.local_rates.picked(own[:, None, :] * stages[:, None])
 
     def guess(self) -> Float[Array, " unknowns"]:
-        """Twists at the start, repeated for every stage; multipliers zero."""
+        """Rates at the start, repeated for every stage; multipliers zero."""
         start = self.start[:-1]
         spin = 0.5 * jnp.sum(cross(start[:, 1:], self.velocity[:, 1:]), axis=1)
-        return self.repeated(jnp.concatenate([self.velocity[:, 0], spin], axis=1).reshape(-1))
+        twists = jnp.concatenate([self.velocity[:, 0], spin], axis=1)
+        return self.repeated(self.system.local_rates.balances(twists[:, None], start))
 
     def by_stage(self, y: Float[Array, " unknowns"]) -> Float[Array, "s rates"]:
-        """Twists among the unknowns, or balances among the equations."""
-        twists = y[: self.balances].reshape(self.bodies, self.tableau.stages, 6)
-        return jnp.moveaxis(twists, 1, 0).reshape(self.tableau.stages, -1)
+        """Rates among the unknowns, or balances among the equations."""
+        return self.system.local_rates.by_stage(y[: self.balances], self.tableau.stages)
 
     def repeated(self, w: Float[Array, " rates"]) -> Float[Array, " unknowns"]:
         """The same at all stages; multipliers zero."""
-        shape = self.bodies, self.tableau.stages, 6
-        twists = jnp.broadcast_to(w.reshape(self.bodies, 1, 6), shape).reshape(-1)
-        return jnp.concatenate([twists, jnp.zeros(self.unknowns - self.balances, twists.dtype)])
+        rates = self.system.local_rates.repeated(w, self.tableau.stages)
+        return jnp.concatenate([rates, jnp.zeros(self.unknowns - self.balances, w.dtype)])
 
     def motion_of(self, y: Float[Array, " unknowns"]) -> Stations:
         """Stage motion of all bodies."""
@@ -279,3 +274,53 @@ class FullStep(Form):
             motion.rates[:, :, 0],
             motion.spin,
         )
+
+
+def touches(group: Group) -> bool:
+    """Whether a group has anything to do with bodies."""
+    return group.count > 0 and group.bodies.shape[1] > 0
+
+
+def rates_of(group: Group) -> int:
+    """Components of the twists of its bodies that a group has to do with: of points there is no spin."""
+    return TWIST if group.turning else TWIST // 2
+
+
+def elements(system: System, stages: int = 1) -> list[Array | np.ndarray]:
+    """The unknowns that each element of the Jacobian touches; on the host where the numbers are known.
+
+    Args:
+        system: compiled system.
+        stages: of the collocation method.
+
+    Returns:
+        An array (count, width) for the bodies and for each group with bodies, in the order of
+        `FullStep.matrices`; the number of unknowns stands for what is fixed.
+    """
+    groups = tuple(g for g in (*system.effects, *system.joints) if touches(g))
+    tables = [group.bodies for group in groups]
+    xp: Any = jnp
+    if is_concrete(system.local_rates, tables):
+        xp, tables = np, [np.asarray(table) for table in tables]
+    first = stages * system.local_rates.count
+    size = first + stages * sum(g.count * g.multipliers for g in groups)
+    places = system.local_rates.places(stages, size, xp)
+    found = [places[:-1].reshape(places.shape[0] - 1, -1)]
+    for group, table in zip(groups, tables):
+        count, rows = group.count, stages * group.multipliers
+        lams = first + np.arange(count * rows, dtype=np.int32).reshape(count, rows)
+        first += count * rows
+        touched = places[table][..., : rates_of(group)].reshape(count, -1)
+        found.append(xp.concatenate([touched, lams], axis=1))
+    return found
+
+
+def dense(
+    system: System, matrices: Sequence[Float[Array, "_ _ _"]], size: int, stages: int = 1
+) -> Float[Array, "n n"]:
+    """The dense matrix of element matrices, see `elements`."""
+    # What is fixed goes beyond the matrix and is cut off.
+    matrix = jnp.zeros((size + 1, size + 1), matrices[0].dtype)
+    for touched, local in zip(elements(system, stages), matrices, strict=True):
+        matrix = matrix.at[touched[:, :, None], touched[:, None, :]].add(local)
+    return matrix[:size, :size]

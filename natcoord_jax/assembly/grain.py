@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.diagnostics import rows_with_ground
@@ -66,6 +67,8 @@ def _mobilities(system: System) -> tuple[Float[Array, " bodies_and_ground"], ...
     """Reciprocal inertia of each body against a force, and against a torque."""
     weights = row_weights(system.mass)[:, :2]
     # What turns without inertia, and is no point, turns as far as its stiffness lets it.
-    turning = jnp.where((weights[:, 1] == 0) & (system.idle_inertia == 0), UNRESISTED, weights[:, 1])
+    turns = np.ones(len(system.structure.bodies), bool)
+    turns[list(system.structure.points)] = False
+    turning = jnp.where((weights[:, 1] == 0) & turns, UNRESISTED, weights[:, 1])
     still = jnp.zeros(1, weights.dtype)
     return jnp.concatenate([weights[:, 0], still]), jnp.concatenate([turning, still])

@@ -87,12 +87,12 @@ def families(instances: list[Instance]) -> list[list[Instance]]:
     return list(found.values())
 
 
-def stack(instances: list[Instance], bodies: int) -> tuple[Group, ...]:
-    """Groups of equal instances."""
-    return tuple(_group(members, bodies) for members in families(instances))
+def stack(instances: list[Instance], turning: np.ndarray) -> tuple[Group, ...]:
+    """Groups of equal instances; `turning` tells which bodies do, the ground last."""
+    return tuple(_group(members, turning) for members in families(instances))
 
 
-def element_group(layout: Any, name: str, elements: Elements) -> Group:
+def element_group(layout: Any, name: str, elements: Elements, turning: np.ndarray) -> Group:
     """The group of a set of elements."""
     effect, label, count = elements.effect, f"elements {name!r}", len(elements)
     if effect.inputs or effect.rotors or effect.works:
@@ -112,11 +112,12 @@ def element_group(layout: Any, name: str, elements: Elements) -> Group:
         count=count,
         names=Names(((name, (range(count),)),)),
         source="markers",
+        turning=bool(turning[bodies].any()),
     )
 
 
-def _group(members: list[Instance], bodies: int) -> Group:
-    first = members[0]
+def _group(members: list[Instance], turning: np.ndarray) -> Group:
+    first, bodies = members[0], len(turning) - 1
     field_like = first.source == "mass"
     count = bodies if field_like else len(members)
 
@@ -136,4 +137,5 @@ def _group(members: list[Instance], bodies: int) -> Group:
         names=tuple(m.name for m in members),
         source=first.source,
         in_tree=first.in_tree,
+        turning=bool(turning[table("bodies")].any()),
     )

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from natcoord_jax.assembly.local_rates import TWIST
 from natcoord_jax.assembly.momentum import stage_momentum
 from natcoord_jax.assembly.response import Situation, respond
 from natcoord_jax.assembly.system import Group
@@ -47,12 +48,11 @@ def body_balance(
     twist: Float[Array, "s 6"],
     h: Array,
     tableau: Tableau,
-    idle: Float[Array, "3 3"],
 ) -> Float[Array, "s 6"]:
-    """Change of momentum of one body as a wrench, with an idle inertia, see `System.idle_torque`."""
+    """Change of momentum of one body as a wrench."""
     motion = body_motion(start[None], twist[None], h, tableau)
     momentum = stage_momentum(mass[None], motion.rates - velocity[None, None], tableau)
-    return wrenches(momentum, motion.spin @ idle, motion)[0]
+    return wrenches(momentum, jnp.zeros_like(motion.spin), motion)[0]
 
 
 def _impulses(
@@ -74,12 +74,22 @@ def effect_balances(
     where: Situation,
     tableau: Tableau,
     start: Float[Array, "n k 4 3"],
-    twists: Float[Array, "n k s 6"],
+    twists: Float[Array, "n k s r"],
     lam: Float[Array, "n s m"],
-) -> tuple[Float[Array, "n k s 6"], Float[Array, "n s m"]]:
-    """Impulsive wrenches of all effects of a group on their bodies, and their constraint rates."""
-    motion = body_motion(start, twists, where.h, tableau)
-    return _impulses(group, respond(group, where, motion, lam, tableau), motion, where.h)
+) -> tuple[Float[Array, "n k s r"], Float[Array, "n s m"]]:
+    """Impulsive wrenches of all effects of a group on their bodies, and their constraint rates.
+
+    Of what does not turn, twists and wrenches are velocities and forces.
+    """
+    motion = body_motion(start, whole(twists), where.h, tableau)
+    found, rows = _impulses(group, respond(group, where, motion, lam, tableau), motion, where.h)
+    return found[..., : twists.shape[-1]], rows
+
+
+def whole(twists: Float[Array, "*n r"]) -> Float[Array, "*n 6"]:
+    """Twists of what need not turn."""
+    missing = TWIST - twists.shape[-1]
+    return jnp.pad(twists, ((0, 0),) * (twists.ndim - 1) + ((0, missing),)) if missing else twists
 
 
 def jacobians(
@@ -87,7 +97,7 @@ def jacobians(
     where: Situation,
     tableau: Tableau,
     start: Array,
-    twists: Array,
+    twists: Float[Array, "n k s r"],
     lam: Array,
     *,
     exact: bool = True,
@@ -118,33 +128,35 @@ def jacobians(
 def _linearised_jacobians(
     group: Group, where: Situation, tableau: Tableau, start: Array, twists: Array, lam: Array
 ) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    rates = twists.shape[-1]
     with jax.named_scope(group.effect.kind.replace(" ", "_")):
-        now = Now(where.t, where.h, where.inputs, where.coordinates, where.rates, tableau)
-        motion = body_motion(start, twists, where.h, tableau)
-        found = group.effect.tangents(where.place, motion, now, lam)
+        now = Now(where.t, where.h, where.inputs, where.coordinates, where.rates, tableau, where.stress)
+        motion = body_motion(start, whole(twists), where.h, tableau)
+        found = group.effect.tangents(where.place, motion, now, lam, turning=rates == TWIST)
         if found is not None:
             scale = 1.0 if group.effect.impulsive else where.h
             return _without_multipliers(scale * found, lam)
 
-        def one(effect, place, inputs, coordinates, rates, start, twists, lam):
-            now = Now(where.t, where.h, inputs, coordinates, rates, tableau)
-            effect = effect.linearised(place, body_motion(start, twists, where.h, tableau), now, lam)
+        def one(effect, place, inputs, coordinates, rates, stress, start, twists, lam):
+            now = Now(where.t, where.h, inputs, coordinates, rates, tableau, stress)
+            effect = effect.linearised(place, body_motion(start, whole(twists), where.h, tableau), now, lam)
 
             def f(twists: Array, lam: Array) -> tuple[Array, Array]:
-                motion = body_motion(start, twists, where.h, tableau)
-                return _impulses(group, effect.respond(place, motion, now, lam), motion, where.h)
+                motion = body_motion(start, whole(twists), where.h, tableau)
+                found, rows = _impulses(group, effect.respond(place, motion, now, lam), motion, where.h)
+                return found[..., : twists.shape[-1]], rows
 
             return jax.jacfwd(f, argnums=(0, 1))(twists, lam)
 
-        axes = (None if group.effect.shared else 0, 0, 0, 0, 0, 0, 0, 0)
-        numbers = (group.effect, where.place, where.inputs, where.coordinates, where.rates)
+        axes = (None if group.effect.shared else 0, 0, 0, 0, 0, 0, 0, 0, 0)
+        numbers = (group.effect, where.place, where.inputs, where.coordinates, where.rates, where.stress)
         return jax.vmap(one, in_axes=axes)(*numbers, start, twists, lam)
 
 
 def _without_multipliers(
-    by_twist: Float[Array, "n k s 6 k s 6"], lam: Float[Array, "n s 0"]
+    by_twist: Float[Array, "n k s r k s r"], lam: Float[Array, "n s 0"]
 ) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
     """Derivatives of an effect that has no multipliers."""
-    n, k, s = by_twist.shape[:3]
-    rows = jnp.zeros((n, s, 0, k, s, 6), lam.dtype), jnp.zeros((n, s, 0, s, 0), lam.dtype)
-    return (by_twist, jnp.zeros((n, k, s, 6, s, 0), lam.dtype)), rows
+    n, k, s, r = by_twist.shape[:4]
+    rows = jnp.zeros((n, s, 0, k, s, r), lam.dtype), jnp.zeros((n, s, 0, s, 0), lam.dtype)
+    return (by_twist, jnp.zeros((n, k, s, r, s, 0), lam.dtype)), rows

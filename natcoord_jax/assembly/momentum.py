@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from natcoord_jax.assembly.response import Situation, Stations, collect, gather, respond
 from natcoord_jax.assembly.system import Group, System
 from natcoord_jax.maths.collocation import Tableau
-from natcoord_jax.maths.vectors import cross, dot, skew
+from natcoord_jax.maths.vectors import cross, skew
 
 
 def inertia(
@@ -58,23 +58,6 @@ def spatial_inertia(
     force = jnp.concatenate([mass[:, 0, 0, None, None] * unit, -skew(moved)], axis=2)
     torque = jnp.concatenate([skew(arm), turning], axis=2)
     return jnp.concatenate([force, torque], axis=1)
-
-
-def idle_torque(
-    system: System, rows: Float[Array, "bodies 4 3"], spin: Float[Array, "*s bodies 3"]
-) -> Float[Array, "*s bodies 3"]:
-    """Torques of a unit inertia against turns that nothing sees: of points, of directors about themselves.
-
-    Args:
-        system: compiled system.
-        rows: at the start of the step.
-        spin: angular velocities.
-    """
-    held = jnp.asarray(system.idle_inertia)[:, None] * spin
-    if system.tree.directed is None:
-        return held
-    first = jnp.where(system.tree.directed[:, None], rows[:, 1], 0.0)
-    return held + dot(first, spin)[..., None] * first
 
 
 def row_weights(mass: Float[Array, "bodies 4 4"]) -> Float[Array, "bodies 4"]:

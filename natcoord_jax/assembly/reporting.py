@@ -30,6 +30,7 @@ def report(system: "System") -> str:
         effects[group.effect.kind] += len(group.names)
     free = sum(1 for name in structure.joints[:bodies] if not name)
     tree = sum(g.count * g.multipliers for g in system.joints if g.in_tree)
+    natural = 12 * bodies - 9 * len(structure.points) - 6 * len(structure.directors)
     plan = f", {system.sparsity.plan.name}" if system.sparsity is not None else ""
     lines = [
         f"bodies            {bodies} ({free} free)",
@@ -38,8 +39,8 @@ def report(system: "System") -> str:
         f"effects           {_count(effects)}",
         f"inputs            {', '.join(structure.inputs) or 'none'}",
         f"freedom           {structure.dofs} degrees of freedom",
-        f"coordinates       {12 * bodies} natural coordinates, {structure.constraints} constraints",
-        f"unknowns          {12 * bodies + structure.constraints} in full; {6 * bodies + tree} + "
+        f"coordinates       {natural} natural coordinates, {structure.constraints} constraints",
+        f"unknowns          {natural + structure.constraints} in full; {system.local_rates.count + tree} + "
         f"{structure.multipliers} multipliers in the local null space; {structure.unknowns} + "
         f"{structure.multipliers} multipliers in the joint null space",
         f"solver            {structure.solver}{plan} ({REASONS[structure.solver]})",

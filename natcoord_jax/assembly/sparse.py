@@ -8,18 +8,14 @@ of the deepest of its bodies. With more than one stage the Jacobian is a dense m
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from natcoord_jax.assembly.full import FullStep
-from natcoord_jax.assembly.local import jacobians
-from natcoord_jax.assembly.system import Group, System
+from natcoord_jax.assembly.full import FullStep, touches
+from natcoord_jax.assembly.system import System
 from natcoord_jax.linsolve.blocks import BlockMatrix
 from natcoord_jax.linsolve.saddle import inertias_of, regularised
 from natcoord_jax.linsolve.sparse import SparseSolver, factorised
-
-RATES = 6  # of a body
 
 
 class SparseStep(FullStep):
@@ -60,55 +56,15 @@ class SparseStep(FullStep):
         """Jacobian: matrices of the elements as `elements` lists them; with several stages, dense."""
         if self.tableau.stages > 1:
             return super().jacobian(y, exact=exact)
-        twists, multipliers = self.split(y)
-        every = self._with_ground(twists)
-        found = [self.body_jacobians(twists)]
-        for group, where, lam in zip(self.groups, self.situations, multipliers):
-            if not _touches(group):
-                continue
-            (by_twist, by_lam), (g_by_twist, _) = jacobians(
-                group, where, self.tableau, self.start[group.bodies], every[group.bodies], lam, exact=exact
-            )
-            count, m = group.count, group.multipliers
-            width = RATES * group.bodies.shape[1]
-            above = [-by_twist.reshape(count, width, width), -by_lam.reshape(count, width, m)]
-            below = [g_by_twist.reshape(count, m, width), jnp.zeros((count, m, m), y.dtype)]
-            found.append(
-                jnp.concatenate([jnp.concatenate(above, axis=2), jnp.concatenate(below, axis=2)], axis=1)
-            )
-        return tuple(found)
+        return tuple(self.matrices(y, exact))
 
 
-def _touches(group: Group) -> bool:
-    return group.count > 0 and group.bodies.shape[1] > 0
-
-
-def elements(system: System) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Node of each unknown, and the unknowns that each element touches, for one stage; on the host.
-
-    Args:
-        system: compiled system.
-
-    Returns:
-        Nodes (n,), and an array (count, width) of unknowns for the bodies and for each group with bodies, in
-        the order of `SparseStep.jacobian`; n stands for the ground.
-    """
-    groups = (*system.effects, *system.joints)
-    bodies = len(system.structure.bodies)
-    first = RATES * bodies
-    size = first + sum(g.count * g.multipliers for g in groups)
-    number = np.arange(first).reshape(bodies, RATES)
-    rates = np.concatenate([number, np.full((1, RATES), size)])
-    nodes, found = [np.repeat(np.arange(bodies), RATES)], [number]
-    for group in groups:
-        count, m = group.count, group.multipliers
-        if not _touches(group):
-            continue
-        table = np.asarray(group.bodies)
-        lams = first + np.arange(count * m).reshape(count, m)
-        first += count * m
-        # Bodies are numbered from the root: the deepest has the largest number.
-        deepest = np.where(table < bodies, table, 0).max(axis=1)
-        nodes.append(np.repeat(deepest, m))
-        found.append(np.concatenate([rates[table].reshape(count, -1), lams], axis=1))
-    return np.concatenate(nodes), found
+def nodes_of(system: System) -> np.ndarray:
+    """Node of each unknown, for one stage: of multipliers the deepest of their bodies; on the host."""
+    bodies, nodes = len(system.structure.bodies), [system.local_rates.nodes()]
+    for group in (*system.effects, *system.joints):
+        if touches(group):
+            # Bodies are numbered from the root: the deepest has the largest number.
+            table = np.asarray(group.bodies)
+            nodes.append(np.repeat(np.where(table < bodies, table, 0).max(axis=1), group.multipliers))
+    return np.concatenate(nodes)

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from natcoord_jax.assembly.collection import Collection
+from natcoord_jax.assembly.local_rates import LocalRates
 from natcoord_jax.assembly.tree import Tree
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.callables import Stacked
@@ -47,6 +48,7 @@ class Group(Stacked):
         names: of the instances.
         in_tree: joints of the spanning tree, whose multipliers are not needed.
         source: where the place of the effect comes from: "markers", "joint", "coordinates" or "mass".
+        turning: whether any of the bodies turns; points do not.
     """
 
     effect: Effect
@@ -62,6 +64,7 @@ class Group(Stacked):
     names: Sequence[str] = eqx.field(static=True)
     source: str = eqx.field(static=True)
     in_tree: bool = eqx.field(static=True, default=False)
+    turning: bool = eqx.field(static=True, default=True)
 
     stacked: ClassVar[str] = "effect"
 
@@ -162,6 +165,7 @@ class System(eqx.Module):
         frames: weights of the two frames of every joint; joint b carries body b.
         joint_bodies: parent and child of every joint.
         tree: the spanning tree.
+        local_rates: which components of the twists of the bodies are unknowns of local equations.
         joints: constraint groups of all joints; a group is in the tree or closes loops, never both.
         effects: all other groups.
         coordinates: joint coordinates.
@@ -175,6 +179,7 @@ class System(eqx.Module):
     frames: Float[Array, "joints 2 4 4"]
     joint_bodies: Int[Array | np.ndarray, "joints 2"]
     tree: Tree
+    local_rates: LocalRates
     joints: tuple[Group, ...]
     effects: tuple[Group, ...]
     coordinates: tuple[CoordinateGroup, ...]
@@ -182,16 +187,6 @@ class System(eqx.Module):
     elimination: Elimination | None
     structure: Structure = eqx.field(static=True)
     sparsity: Any = None
-
-    @property
-    def idle_inertia(self) -> Float[np.ndarray, " bodies"]:
-        """One for point masses, whose directors it keeps where they are, and zero for all other bodies.
-
-        Massless is not the same: nodes of a beam without rotary inertia turn as their torques ask.
-        """
-        idle = np.zeros(len(self.structure.bodies))
-        idle[list(self.structure.points)] = 1.0
-        return idle
 
     @checked("System.energy", motion=MOTION)
     def energy(self, motion: State | Trajectory) -> "diagnostics.Energy":

@@ -202,12 +202,13 @@ class Effect(Part):
         return jax.vmap(one, in_axes=axes)(*numbers, *moving, lam)
 
     def tangents(
-        self, place: Array, motion: Motion, now: Now, lam: Float[Array, "n s m"]
-    ) -> Float[Array, "n k s 6 k s 6"] | None:
+        self, place: Array, motion: Motion, now: Now, lam: Float[Array, "n s m"], *, turning: bool
+    ) -> Float[Array, "n k s r k s r"] | None:
         """Derivatives of the wrenches on the bodies by their twists, nearly, of `n` instances, in formulas.
 
         For Newton's iteration, of an effect without multipliers. A wrench is a force [N] and a torque [N m]
-        about the reference point, a twist the velocity of that point [m/s] and an angular velocity [rad/s].
+        about the reference point, a twist the velocity of that point [m/s] and an angular velocity [rad/s];
+        where none of the bodies is `turning`, forces and velocities are all there is.
         None, the default: they are found by differentiating the response of `linearised`.
         """
         return None

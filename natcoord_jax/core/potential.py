@@ -2,6 +2,7 @@
 
 import abc
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -10,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from natcoord_jax.core.arguments import is_a
+from natcoord_jax.core.closed_tangents import tangents_together
 from natcoord_jax.core.effect import Effect, Motion, Now, Response
 from natcoord_jax.core.gradient import averaged_coupling, averaged_gradient, cancelling_energy, gradient_of
 from natcoord_jax.core.handles import Handle
@@ -17,6 +19,7 @@ from natcoord_jax.core.joint import Joint
 from natcoord_jax.core.kinds import NAME
 from natcoord_jax.core.markers import Attachment, Marker, Markers
 from natcoord_jax.core.pieces import in_pieces
+from natcoord_jax.core.together import instances_last, place_together, steps_together
 from natcoord_jax.maths.collocation import Tableau
 from natcoord_jax.maths.settled import settled
 
@@ -123,6 +126,13 @@ class Potential(Effect):
         given = self.energy, start, steps, tableau, self.degree, points
         return averaged_gradient(*given, self.slope, self.units)
 
+    def tangents(self, place: Array, motion: Motion, now: Now, lam: Array, *, turning: bool) -> Array | None:
+        """In formulas for one stage, of what takes many instances at once on markers of single bodies."""
+        several = motion.spin.shape[-2] > place.shape[1]
+        if not self.together or several or now.tableau.stages > 1 or now.stress is not None:
+            return None
+        return in_pieces(partial(tangents_together, turning=turning), self, place, motion, now)
+
     def linearised(self, place: Array, motion: Motion, now: Now, lam: Array) -> "LinearisedPotential":
         """The potential with gradients that are linear in the steps of the invariants."""
         start = self.invariants(place_markers(place, motion.start))
@@ -221,28 +231,6 @@ def marker_response(
             )
         power = power + jnp.sum(torques * motion.spin, axis=(-1, -2))
     return Response(on_rows, torques, jnp.zeros((stages, 0)), power)
-
-
-def instances_last(x: Any, axis: int = 0) -> Any:
-    """Arrays of a pytree with the axis of the instances moved to the end."""
-    return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, axis, -1), x)
-
-
-def place_together(place: Float[Array, "k *m w n"], rows: Float[Array, "*s b 4 3 n"]) -> Float[Array, "*out"]:
-    """Marker vectors of many instances, see `place_markers`."""
-    several = rows.shape[-4] // place.shape[0]
-    if several > 1:
-        rows = rows.reshape(*rows.shape[:-4], place.shape[0], 4 * several, *rows.shape[-2:])
-    if place.ndim == 4:
-        rows = rows[..., None, :, :, :]
-    return settled(jnp.sum(place[..., None, :] * rows, axis=-3))
-
-
-def steps_together(
-    potential: Potential, x: Float[Array, "s k *m 3 n"], moved: Float[Array, "s k *m 3 n"]
-) -> Float[Array, "s p n"]:
-    """Changes of the invariants at the stages, of many instances, for changes of the marker vectors."""
-    return jax.vmap(lambda xi, vi: jax.jvp(potential.invariants, (xi,), (vi,))[1])(x, moved)
 
 
 def responses_together(potential: Potential, place: Array, motion: Motion, now: Now) -> Response:

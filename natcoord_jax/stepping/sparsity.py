@@ -2,10 +2,12 @@
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 
+from natcoord_jax.assembly.full import elements
 from natcoord_jax.assembly.outset import Outset
 from natcoord_jax.assembly.reduced import NOTHING
-from natcoord_jax.assembly.sparse import SparseStep, elements
+from natcoord_jax.assembly.sparse import SparseStep, nodes_of
 from natcoord_jax.assembly.system import System
 from natcoord_jax.core.checks import is_concrete
 from natcoord_jax.core.compiled import briefly
@@ -26,8 +28,7 @@ class Sparsity(eqx.Module):
 
 def with_sparsity(system: System, state: State) -> System:
     """The system with the plan for its sparse Jacobian, rehearsed at its initial state."""
-    nodes, found = elements(system)
-    pattern, entries = block_pattern(nodes, found)
+    pattern, entries = block_pattern(nodes_of(system), [np.asarray(x) for x in elements(system)])
     matrix = None
     if is_concrete(system, state):
         matrix = _resting(system, state, pattern)

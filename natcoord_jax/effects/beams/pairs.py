@@ -14,7 +14,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.core.effect import Motion, Now
-from natcoord_jax.core.potential import Potential, instances_last, place_together, steps_together
+from natcoord_jax.core.potential import Potential
+from natcoord_jax.core.together import instances_last, place_together, steps_together
 from natcoord_jax.maths.components import Triple, combination, rows_of, turned_midway
 from natcoord_jax.maths.settled import settled
 

@@ -167,7 +167,7 @@ class BeamElement(Expanded):
     def _resultants_at(self, motion: Logarithm) -> Float[Array, "6 *n"]:
         return settled(self.resultants(settled(self._strains_at(motion))))
 
-    def tangents(self, place: Array, motion: Motion, now: Now, lam: Array) -> Array | None:
+    def tangents(self, place: Array, motion: Motion, now: Now, lam: Array, *, turning: bool) -> Array | None:
         """Derivatives of the wrenches by the twists for one stage; more are left to the general way."""
         if now.tableau.stages > 1:
             return None
