@@ -2,6 +2,7 @@
 
 from typing import TYPE_CHECKING, Any
 
+from natcoord_jax import mesh
 from natcoord_jax.analysis import (
     Accuracy,
     Balance,
@@ -28,12 +29,16 @@ from natcoord_jax.bodies import (
     DirectorInterpolation,
     Ellipsoid,
     LineLoad,
+    MeshHandle,
     Nodes,
     PointMass,
+    Pressure,
     RectangularSection,
     RelativeMotion,
     RigidBody,
     Section,
+    Shell,
+    Solid,
     Sphere,
     TubularSection,
 )
@@ -99,7 +104,8 @@ from natcoord_jax.effects.joints import (
     Spherical,
     Universal,
 )
-from natcoord_jax.effects.loads import BodyTorque, Gravity, PairTorque, PointForce
+from natcoord_jax.effects.loads import BodyTorque, FacePressure, Gravity, PairTorque, PointForce
+from natcoord_jax.effects.materials import Elastic
 from natcoord_jax.effects.shells import ShellElement
 from natcoord_jax.effects.solids import Brick
 from natcoord_jax.effects.springs import (
@@ -157,9 +163,11 @@ __all__ = [
     "Dissipative",
     "Distance",
     "Drive",
+    "Elastic",
     "Ellipsoid",
     "EnergyMomentum",
     "Equilibrium",
+    "FacePressure",
     "Feedback",
     "Field",
     "Fixed",
@@ -177,6 +185,7 @@ __all__ = [
     "JointTorque",
     "LineLoad",
     "Load",
+    "MeshHandle",
     "Modes",
     "Nodes",
     "NonlinearBeamElement",
@@ -196,6 +205,7 @@ __all__ = [
     "PointOnPlane",
     "PointOnPoint",
     "Potential",
+    "Pressure",
     "Prismatic",
     "QuadraticSpring",
     "RectangularSection",
@@ -208,8 +218,10 @@ __all__ = [
     "Scene",
     "Screw",
     "Section",
+    "Shell",
     "SimulationError",
     "ShellElement",
+    "Solid",
     "Solution",
     "Sphere",
     "Spherical",
@@ -241,6 +253,7 @@ __all__ = [
     "linearise",
     "load_guess",
     "load_path",
+    "mesh",
     "modes",
     "multi_start",
     "optimise",

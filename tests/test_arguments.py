@@ -47,6 +47,9 @@ def world():
         beam=beam, trajectory=trajectory, problem=problem, unknowns=unknowns, solution=solution, point=point,
         direction=direction, triad=tuple(nc.Direction(body, axis) for axis in np.eye(3)),
         ends=(nc.Point(nc.ground), point), nodes=nc.Scene().add(nc.Nodes.points(np.ones((4, 3)), mass=1.0)),
+        shell=nc.Scene().add(
+            nc.Shell(nc.mesh.rectangle((1, 1), (1, 1)), thickness=0.1, material=nc.Elastic(E=1, density=1))
+        ),
         attached=tuple(nc.Attachment(b, (0, 0, 0), np.eye(3)) for b in (nc.ground, body)),
     )  # fmt: skip
 
@@ -65,6 +68,11 @@ JOINT = lambda w: {  # noqa: E731
 ON_JOINT = lambda w: {"joint": [w.hinge], "coordinate": [0], "name": NAME}  # noqa: E731
 MARKED = lambda markers: {"markers": [markers], "name": NAME}  # noqa: E731
 RUN = lambda w: {"system": [w.system], "state": [w.state]}  # noqa: E731
+METAL, SQUARE = [nc.Elastic(E=1.0)], np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0.0)])
+PLACED = {
+    "material": METAL, "position": V, "orientation": [np.eye(3)], "velocity": V, "angular_velocity": V,
+    "name": NAME,
+}  # fmt: skip
 MATRIX, SHAPES = (
     [np.eye(6)],
     {"values": [np.ones((2, 3))], "slopes": [np.ones((2, 3))], "weights": [np.ones(2)]},
@@ -141,9 +149,23 @@ CALLS = {
     "BodyTorque": lambda w: {**MARKED((w.direction,)), "torque": [np.ones(3), f], "following": [False]},
     "PairTorque": lambda w: {**MARKED(w.triad[:2]), "torque": [1.0, f]},
     "ShellElement": lambda w: {
-        **MARKED(w.attached * 2), "thickness": NUMBER, "E": NUMBER, "nu": [0.3]
+        **MARKED(w.attached * 2), "thickness": NUMBER, "material": METAL, "reference": [np.ones((4, 2, 3))]
     },
-    "Brick": lambda w: {**MARKED(w.ends * 4), "E": NUMBER, "nu": [0.3]},
+    "Brick": lambda w: {**MARKED(w.ends * 4), "material": METAL, "reference": [np.ones((8, 3))]},
+    "Elastic": lambda w: {"E": NUMBER, "nu": [0.3], "density": NUMBER},
+    "Shell": lambda w: {
+        "mesh": [nc.mesh.rectangle((1.0, 1.0), (1, 1))], "thickness": NUMBER, "directors": PLACES, **PLACED
+    },
+    "FacePressure": lambda w: {**MARKED(w.ends * 2), "pressure": [1.0, f]},
+    "Pressure": lambda w: {"surface": [w.shell], "pressure": [1.0, f], "face": NAME, "name": NAME},
+    "Solid": lambda w: {"mesh": [nc.mesh.box((1.0, 1.0, 1.0), (1, 1, 1))], **PLACED},
+    "mesh.rectangle": lambda w: {"size": [(1.0, 1.0)], "counts": [(2, 2)]},
+    "mesh.box": lambda w: {"size": V, "counts": [(2, 2, 2)]},
+    "mesh.cylinder": lambda w: {"radius": NUMBER, "length": NUMBER, "counts": [(4, 2)]},
+    "mesh.sphere": lambda w: {"radius": NUMBER, "count": WHOLE},
+    "mesh.cleaned": lambda w: {
+        "nodes": [SQUARE], "cells": [np.array([[0, 1, 2, 3]])], "sets": [{}], "faces": [{}]
+    },
     "Clamp": lambda w: {"body": [nc.ground], "nodes": [w.nodes], "name": NAME},
     "Nodes.points": lambda w: {"positions": PLACES, "mass": NUMBER, "velocity": V, "name": NAME},
     "Nodes.directors": lambda w: {
@@ -325,14 +347,16 @@ CALLS = {
 # What calls return or hand over, and bases: nobody is to make these by hand.
 MADE = {
     "Accuracy", "Balance", "BeamHandle", "Check", "ComputedTorque", "Continuation", "DerivativeError",
-    "Equilibrium", "Feedback", "Frame", "Growth", "Load", "Modes", "Nodes", "NonlinearProgram", "Optima",
-    "Outcome", "Result", "SimulationError", "Solution", "State", "System", "Trajectory",
+    "Equilibrium", "Feedback", "Frame", "Growth", "Load", "MeshHandle", "Modes", "Nodes", "NonlinearProgram",
+    "Optima", "Outcome", "Result", "SimulationError", "Solution", "State", "System", "Trajectory",
 }  # fmt: skip
 BASES = {"Constraint", "Field", "Force", "Joint", "Potential", "VelocityConstraint"}
-IN_MODULES = {"cost": nc.cost, "goal": nc.goal, "bounds": nc.bounds, "inputs": nc.inputs}
+IN_MODULES = {
+    "cost": nc.cost, "goal": nc.goal, "bounds": nc.bounds, "inputs": nc.inputs, "mesh": nc.mesh,
+}  # fmt: skip
 BASES_IN_MODULES = {
     "cost.Cost", "cost.Sum", "goal.Goal", "goal.All", "bounds.Bound", "bounds.All", "bounds.Range",
-    "inputs.Shaping",
+    "inputs.Shaping", "mesh.Mesh",
 }  # fmt: skip
 
 

@@ -136,8 +136,10 @@ TABLE = {
     nc.Coupling: Entry(
         lambda p: nc.Coupling((p.joint,) * 2, factors=(1.0, -0.7), coordinate=(0, 1)), nc.Cylindrical
     ),
-    nc.ShellElement: Entry(lambda p: nc.ShellElement(p.four, thickness=0.1, E=300.0, nu=0.3)),
-    nc.Brick: Entry(lambda p: nc.Brick(p.eight, E=50.0, nu=0.3)),
+    nc.ShellElement: Entry(
+        lambda p: nc.ShellElement(p.four, thickness=0.1, material=nc.Elastic(E=300.0, nu=0.3))
+    ),
+    nc.Brick: Entry(lambda p: nc.Brick(p.eight, material=nc.Elastic(E=50.0, nu=0.3))),
     nc.PointOnPlane: Entry(lambda p: nc.PointOnPlane((p.ends[0], p.triad[2], p.ends[1]), distance=0.2)),
     nc.PointOnLine: Entry(lambda p: nc.PointOnLine((p.ends[0], p.triad[2], p.ends[1]))),
     nc.PointOnPoint: Entry(

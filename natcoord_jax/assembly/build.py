@@ -15,6 +15,7 @@ from natcoord_jax.assembly.graph import make_tree
 from natcoord_jax.assembly.grouping import element_group, stack
 from natcoord_jax.assembly.layout import Layout
 from natcoord_jax.assembly.local_rates import LocalRates
+from natcoord_jax.assembly.masses import with_masses
 from natcoord_jax.assembly.roundness import symmetries
 from natcoord_jax.assembly.system import Structure, System
 from natcoord_jax.core.bodies import DIRECTOR, POINT, Body
@@ -67,8 +68,11 @@ def build(
         dofs=len(tree.slot_of) - multipliers,
         shapes=tuple(_drawn(bodies.shapes[k]) for k in layout.order),
     )
+    masses = layout.masses()
+    for group in groups:
+        masses = with_masses(masses, group)
     system = System(
-        layout.masses(),
+        masses,
         layout.frames(),
         layout.joint_bodies(),
         tree,

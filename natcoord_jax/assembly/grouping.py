@@ -95,16 +95,16 @@ def stack(instances: list[Instance], turning: np.ndarray) -> tuple[Group, ...]:
 def element_group(layout: Any, name: str, elements: Elements, turning: np.ndarray) -> Group:
     """The group of a set of elements."""
     effect, label, count = elements.effect, f"elements {name!r}", len(elements)
-    if effect.inputs or effect.rotors or effect.works:
-        raise ValueError(
-            f"{label}: {type(effect).__name__} has inputs or an account of work; add it one by one"
-        )
+    if effect.inputs or effect.rotors:
+        raise ValueError(f"{label}: {type(effect).__name__} has inputs; add it one by one")
+    if effect.works:
+        layout.works.append(name)
     places, rows = layout.nodes(elements.nodes.name)
     scene, weights = places[elements.connectivity], elements.weights(rows)
     alone = bare(effect, ("markers", "name"), label)
     bodies, nothing = layout.body_number[scene].astype(np.int32), np.zeros((count, 0), np.int32)
     return Group(
-        elements.stacked(alone, weights, layout.rows_at(scene)),
+        elements.stacked(alone, weights, layout.rows_at(scene), label),
         as_array(weights),
         bodies,
         *(nothing,) * 5,

@@ -9,8 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from natcoord_jax.assembly.masses import with_masses
 from natcoord_jax.assembly.system import Group, System
 from natcoord_jax.core.checks import as_array, is_concrete
+from natcoord_jax.core.effect import Effect, replace_fields
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.host import on_host
 from natcoord_jax.core.names import listed
@@ -115,6 +117,11 @@ def _block(mass: Array, com: Float[Array, "3"], inertia: Float[Array, "3 3"]) ->
 
 
 @on_host
+def _for_all(value: Array, shape: tuple[int, ...]) -> Array:
+    return jnp.broadcast_to(value, shape)
+
+
+@on_host
 def _with_row(leaf: Array, row: int | None, value: Array) -> Array:
     return value if row is None else leaf.at[row].set(value)
 
@@ -138,6 +145,7 @@ def get(system: System, part: Names, field: str | None = None) -> Any:
     values = {key: values[key] for key in known}
     if field is None:
         return values
+    field = _whole_name(field, known)
     _check(name, known, field, next(iter(found.values()), None))
     return values[field]
 
@@ -154,17 +162,42 @@ def set_numbers(system: System, part: Names, values: dict[str, Any]) -> System:
         kind = next(iter(found.values()), None)
         now = get(system, name)
         given = {}
-        for field, value in values.items():
+        for field, value in ((_whole_name(field, known), value) for field, value in values.items()):
             _check(name, known, field, kind)
-            given[field] = _fitting(value, now[field], k if many else None, len(names), f"{name!r}: {field}")
+            label = f"{name!r}: {field}"
+            every = found[field].row is None if field in found else False
+            given[field] = _fitting(value, now[field], k if many else None, len(names), label, every=every)
         if "mass_block" in found:
             given = _as_block(name, now, given)
         leaves, structure = jax.tree.flatten(system)
         for field, value in given.items():
             leaf, row, _ = found[field]
             leaves[leaf] = _with_row(jnp.asarray(leaves[leaf]), row, value)
-        system = jax.tree.unflatten(structure, leaves)
+        system = _renewed(system, jax.tree.unflatten(structure, leaves), name, set(given))
     return system
+
+
+def _renewed(before: System, after: System, name: str, given: set[str]) -> System:
+    """The system with what follows from the numbers of an effect that have been set, masses included."""
+    effects, mass = list(after.effects), after.mass
+    for number, (old, group) in enumerate(zip(before.effects, after.effects)):
+        if name not in group.names and name not in group.labels:
+            continue
+        kind = type(group.effect)
+        if kind.renewed is not Effect.renewed and not given <= {*kind.derived, "weights"}:
+            row = group.names.index(name) if group.lanes and name in group.names else None
+            effects[number] = replace_fields(group, effect=_anew(group.effect, row))
+        mass = with_masses(mass, effects[number], old.effect)
+    return replace_fields(after, effects=tuple(effects), mass=mass)
+
+
+@on_host
+def _anew(effect: Effect, row: int | None) -> Effect:
+    """All instances renewed, or one of them."""
+    if row is None:
+        return jax.vmap(lambda e: e.renewed())(effect)
+    one = jax.tree.map(lambda x: x[row], effect).renewed()
+    return jax.tree.map(lambda x, y: x.at[row].set(y), effect, one)
 
 
 def _as_block(name: str, now: dict[str, Array], given: dict[str, Array]) -> dict[str, Array]:
@@ -180,6 +213,12 @@ def _as_block(name: str, now: dict[str, Array], given: dict[str, Array]) -> dict
     return {"mass_block": _block(*(given.get(key, now[key]) for key in BODY))}
 
 
+def _whole_name(field: str, known: list[str]) -> str:
+    """Name of a number of a part: "E" stands for "material.E" where there is no other."""
+    ends = [key for key in known if key.endswith(f".{field}")]
+    return ends[0] if field not in known and len(ends) == 1 else field
+
+
 def _check(name: str, known: list[str], field: str, place: Place | None) -> None:
     if field not in known:
         label = repr(name) if place is None else place.kind
@@ -189,8 +228,11 @@ def _check(name: str, known: list[str], field: str, place: Place | None) -> None
         )
 
 
-def _fitting(value: Any, now: Array, k: int | None, count: int, label: str) -> Array:
-    """A value of the shape of the one that is there; of several parts one for all, or one for each."""
+def _fitting(value: Any, now: Array, k: int | None, count: int, label: str, *, every: bool = False) -> Array:
+    """A value of the shape of the one that is there; of several parts one for all, or one for each.
+
+    Of a set, `every`, one for all elements will do as well.
+    """
     array = as_array(value, float)
     if label.endswith(": inertia") and array.shape[-1:] == (3,) and array.shape in ((3,), (count, 3)):
         # (Three numbers for three bodies are a matrix, or rows of diagonals: the matrix is square itself.)
@@ -198,6 +240,8 @@ def _fitting(value: Any, now: Array, k: int | None, count: int, label: str) -> A
             array = _diagonal(array)
         elif k is not None and count != 3:
             return _diagonal(array[k])
+    if every and k is None and array.shape == now.shape[1:]:
+        array = _for_all(array, now.shape)
     shapes = [now.shape] + ([(count, *now.shape)] if k is not None else [])
     if array.shape not in shapes:
         wanted = " or ".join(map(str, shapes))

@@ -16,7 +16,7 @@ from natcoord_jax.assembly.coordinates import state_rates
 from natcoord_jax.assembly.diagnostics import group_places, over_states, rows_with_ground, states_of
 from natcoord_jax.assembly.instant import inputs_along, instants
 from natcoord_jax.assembly.reading import Source, over_source
-from natcoord_jax.assembly.system import System
+from natcoord_jax.assembly.system import Group, System
 from natcoord_jax.core.compiled import compiled
 from natcoord_jax.core.handles import Handle, ground
 from natcoord_jax.core.markers import Interpolated, Marker
@@ -270,19 +270,29 @@ def marker_weights(system: System, marker: Marker, state: State | None) -> tuple
     return jnp.concatenate([head, vector]), body
 
 
+def _tells(group: Group, name: str) -> bool:
+    """Whether a name is that of an effect of a group, or of the set of them."""
+    return name in group.names or name in group.labels
+
+
 def _readings(system: System, states: State, names: tuple[str, ...]) -> Any:
-    """What effects of one kind tell of themselves, stacked along an axis before that of the quantities.
+    """What effects of one kind, or all of a set, tell of themselves, along an axis before that of quantities.
 
     Raises:
         ValueError: for effects of several kinds, or of one that tells nothing.
     """
-    number, group = next((k, g) for k, g in enumerate(system.effects) if names[0] in g.names)
-    missing = [name for name in names if name not in group.names]
+    number, group = next((k, g) for k, g in enumerate(system.effects) if _tells(g, names[0]))
+    missing = [name for name in names if not _tells(group, name)]
     if missing:
         raise ValueError(f"{missing[0]!r} is of another kind than {names[0]!r}: sense them one by one")
     if group.effect.silent:
-        raise ValueError(f"the {group.effect.kind} {names[0]!r} has no sensor; elements of beams do")
-    chosen = jnp.array([group.names.index(name) for name in names])
+        raise ValueError(
+            f"the {group.effect.kind} {names[0]!r} has no sensor; elements of beams, shells and solids do"
+        )
+    if group.is_set and names[0] in group.labels:
+        chosen = jnp.arange(group.count)
+    else:
+        chosen = jnp.array([group.names.index(name) for name in names])
     return _all_readings(system, states, number, chosen)
 
 
@@ -344,10 +354,11 @@ def sense(
         raise ValueError("cannot sense nothing: the tuple of elements is empty")
     listed = part if isinstance(part, tuple) else (part,)
     names = tuple(x.name if isinstance(x, Handle) else x for x in listed)
-    if any(names[0] in g.names for g in system.effects):
+    if any(_tells(group, names[0]) for group in system.effects):
         found = _readings(system, states, names)
         axis = states.t.ndim
-        return found if isinstance(part, tuple) else jax.tree.map(lambda x: jnp.take(x, 0, axis), found)
+        whole = isinstance(part, tuple) or any(g.is_set and names[0] in g.labels for g in system.effects)
+        return found if whole else jax.tree.map(lambda x: jnp.take(x, 0, axis), found)
     name = names[0]
     if name in system.structure.bodies:
         index = system.body_index(name)

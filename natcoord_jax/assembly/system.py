@@ -75,6 +75,11 @@ class Group(Stacked):
         return batch if self.effect.shared or self.source == "mass" else (*batch, self.count)
 
     @property
+    def is_set(self) -> bool:
+        """Whether they were added as a set, which has one name and one account."""
+        return isinstance(self.names, Names)
+
+    @property
     def labels(self) -> Sequence[str]:
         """Names of the instances; of a set its own."""
         return [name for name, _ in self.names.runs] if isinstance(self.names, Names) else self.names

@@ -2,6 +2,9 @@
 
 from natcoord_jax.bodies.beam import Beam as Beam
 from natcoord_jax.bodies.beam import BeamHandle as BeamHandle
+from natcoord_jax.bodies.continua import MeshHandle as MeshHandle
+from natcoord_jax.bodies.continua import Shell as Shell
+from natcoord_jax.bodies.continua import Solid as Solid
 from natcoord_jax.bodies.interpolation import DirectorInterpolation as DirectorInterpolation
 from natcoord_jax.bodies.interpolation import RelativeMotion as RelativeMotion
 from natcoord_jax.bodies.line_load import LineLoad as LineLoad
@@ -32,3 +35,4 @@ from natcoord_jax.bodies.shapes import (
 from natcoord_jax.bodies.shapes import (
     Sphere as Sphere,
 )
+from natcoord_jax.bodies.surface_load import Pressure as Pressure

@@ -16,7 +16,7 @@ from natcoord_jax.core.numeric import Numbers
 from natcoord_jax.maths.vectors import cross, dot
 
 PLACES = Numbers((None, 3))
-MASS, INERTIA = Numbers(("...",), sign="positive"), Numbers(("...",), sign="not negative")
+MASS = Numbers(("...",), sign="not negative")
 VECTORS = Numbers(("...", 3))
 
 
@@ -57,13 +57,13 @@ class Nodes(eqx.Module):
     @staticmethod
     @checked("Nodes.points", positions=PLACES, mass=MASS, velocity=VECTORS, name=NAME)
     def points(
-        positions: Any, *, mass: Any, velocity: Any = (0.0, 0.0, 0.0), name: str | None = None
+        positions: Any, *, mass: Any = 0.0, velocity: Any = (0.0, 0.0, 0.0), name: str | None = None
     ) -> "Nodes":
         """Points: three rates each.
 
         Args:
             positions: (n, 3) [m].
-            mass: of each, one number or (n,) [kg].
+            mass: of each, one number or (n,) [kg]; elements bring theirs on top of it.
             velocity: (3,) or (n, 3) [m/s].
             name: of the set.
 
@@ -87,7 +87,7 @@ class Nodes(eqx.Module):
         positions=PLACES,
         directors=VECTORS,
         mass=MASS,
-        inertia=INERTIA,
+        inertia=MASS,
         velocity=VECTORS,
         angular_velocity=VECTORS,
         name=NAME,
@@ -96,7 +96,7 @@ class Nodes(eqx.Module):
         positions: Any,
         directors: Any,
         *,
-        mass: Any,
+        mass: Any = 0.0,
         inertia: Any = 0.0,
         velocity: Any = (0.0, 0.0, 0.0),
         angular_velocity: Any = (0.0, 0.0, 0.0),
@@ -107,7 +107,7 @@ class Nodes(eqx.Module):
         Args:
             positions: (n, 3) [m].
             directors: (3,) or (n, 3) [-], of any length but zero.
-            mass: of each, one number or (n,) [kg].
+            mass: of each, one number or (n,) [kg]; elements bring theirs on top of it.
             inertia: against turns of the director, one number or (n,) [kg m^2].
             velocity: (3,) or (n, 3) [m/s].
             angular_velocity: (3,) or (n, 3) [rad/s]; what turns a director about itself is left out.

@@ -119,6 +119,7 @@ class Effect(Part):
         silent: whether it has no sensor.
         faces: numbers of the nodes round each face of an element, four each, for pictures.
         vectors: of each node of an element made by `on`: 1 for its point, 2 with a director, 4 with a triad.
+        derived: fields that follow from the others, see `renewed`.
     """
 
     kind: ClassVar[str] = "effect"
@@ -134,6 +135,7 @@ class Effect(Part):
     silent: ClassVar[bool] = True
     faces: ClassVar[tuple[tuple[int, ...], ...]] = ()
     vectors: ClassVar[int] = 1
+    derived: ClassVar[tuple[str, ...]] = ()
 
     @classmethod
     def on(
@@ -168,6 +170,18 @@ class Effect(Part):
     def assembled_at(self, x: Float[Array, "k *m 3"]) -> "Effect":
         """This effect with the numbers that it takes from where its markers are in the assembled pose."""
         return self
+
+    def renewed(self) -> "Effect":
+        """This effect with its `derived` numbers as the others ask for; called when others have been set."""
+        return self
+
+    def lumped_mass(self) -> Float[Array, "k *m"] | None:
+        """Mass that it brings to its marker vectors, points [kg] and directions [kg m^2]; None: none."""
+        return None
+
+    def flaws(self) -> dict[str, Array]:
+        """What may be wrong with its numbers, as the rest of a sentence about it, and whether it is."""
+        return {}
 
     @abc.abstractmethod
     def respond(self, place: Array, motion: Motion, now: Now, lam: Float[Array, "s m"]) -> Response:

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from natcoord_jax.core.checks import as_array
+from natcoord_jax.core.checks import as_array, is_concrete
 from natcoord_jax.core.effect import Effect, replace_fields
 from natcoord_jax.core.host import on_host
 from natcoord_jax.core.markers import Attachment, Marker, Point
@@ -44,20 +44,31 @@ class Elements(eqx.Module):
         own = rows[self.connectivity, : self.effect.vectors]
         return own[:, :, 0] if self.effect.vectors == 1 else own
 
-    def stacked(self, bare: Effect, weights: np.ndarray, rows: Float[Array, "n k 4 3"]) -> Effect:
+    def stacked(self, bare: Effect, weights: np.ndarray, rows: Float[Array, "n k 4 3"], label: str) -> Effect:
         """All elements as one module, with the numbers that they take from the assembled pose.
 
         Args:
             bare: `effect` as arrays.
             weights: of the vectors of the nodes.
             rows: of the bodies of the nodes of every element.
+            label: the set, for messages.
+
+        Raises:
+            ValueError: for an element that cannot be, with its number and its nodes.
         """
         n = len(self)
         given = jax.tree.map(lambda x: np.broadcast_to(np.asarray(x), (n, *np.shape(x))), bare)
         given = replace_fields(given, **{key: as_array(value, float) for key, value in self.each.items()})
         if type(bare).assembled_at is Effect.assembled_at:
             return given
-        return _assembled(given, as_array(weights), rows)
+        found = _assembled(given, as_array(weights), rows)
+        for said, wrong in _flaws(found).items():
+            if is_concrete(wrong) and np.any(wrong):
+                number = int(np.flatnonzero(wrong)[0])
+                raise ValueError(
+                    f"{label}: element {number}, on the nodes {self.connectivity[number].tolist()}, {said}"
+                )
+        return found
 
 
 @on_host
@@ -66,6 +77,11 @@ def _assembled(effect: Effect, place: Array, rows: Array) -> Effect:
         return effect.assembled_at(place_markers(place, rows))
 
     return jax.vmap(one)(effect, place, rows)
+
+
+@on_host
+def _flaws(effect: Effect) -> dict[str, Array]:
+    return jax.vmap(lambda e: e.flaws())(effect)
 
 
 def on(cls: type, nodes: NodeSet, connectivity: Any, each: Any, name: str | None, shared: Any) -> Elements:

@@ -160,17 +160,20 @@ class Several(Kind):
 
     each: Kind
     least: int = 0
+    most: int | None = None
 
     @property
     def wanted(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
         """What each is."""
+        if self.most is not None and self.most == self.least:
+            return f"a tuple of {self.most}, each of it {self.each.wanted}"
         return f"a tuple, each of it {self.each.wanted}"
 
     def complaint(self, value: Any) -> str | None:
         """The first complaint about any."""
         if not isinstance(value, tuple | list):
             return is_other(value)
-        if len(value) < self.least:
+        if len(value) < self.least or (self.most is not None and len(value) > self.most):
             return f"has {len(value)} entries"
         wrong = [self.each.complaint(x) for x in value]
         return next((f"[{k}] {text}" for k, text in enumerate(wrong) if text), None)

@@ -99,7 +99,7 @@ def end_of_step(
             done = (1.0 if group.effect.impulsive else h) * (power @ b)
             if group.multipliers and extra is not None:
                 done = done + extra[relation : relation + group.count]
-            working.append(done)
+            working.append(jnp.sum(done, keepdims=True) if group.is_set else done)
         if group.multipliers and group.source != "joint":
             relation += group.count * group.multipliers
     # The same of the work account.

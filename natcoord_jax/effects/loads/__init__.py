@@ -10,3 +10,4 @@ from natcoord_jax.effects.loads.point_loads import (
 from natcoord_jax.effects.loads.point_loads import (
     PointForce as PointForce,
 )
+from natcoord_jax.effects.loads.pressure import FacePressure as FacePressure

@@ -16,9 +16,11 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.effect import replace_fields
+from natcoord_jax.core.kinds import of
 from natcoord_jax.core.markers import Markers
-from natcoord_jax.core.numeric import Number
-from natcoord_jax.core.potential import Potential
+from natcoord_jax.core.numeric import Number, Numbers
+from natcoord_jax.core.potential import Potential, place_markers
+from natcoord_jax.effects.materials import Elastic
 from natcoord_jax.maths.elimination import definite_inverse
 from natcoord_jax.maths.vectors import cross
 
@@ -29,8 +31,9 @@ MODES = np.stack([XI, ETA, XI * ETA]) / 4.0
 EDGES = ((0, 1), (3, 2), (0, 3), (1, 2))
 GAUSS = 1.0 / np.sqrt(3.0)
 POINTS = ((-GAUSS, -GAUSS), (GAUSS, -GAUSS), (GAUSS, GAUSS), (-GAUSS, GAUSS))
-SHEAR = 5.0 / 6.0
-"""Shear coefficient of a homogeneous plate."""
+SHAPES = np.array([(1 + XI * xi) * (1 + ETA * eta) / 4 for xi, eta in POINTS])
+"""Shape functions of the nodes at the Gauss points."""
+MATERIAL = of("a material, as nc.Elastic(...)", Elastic)
 
 
 def _natural(xi: float, eta: float) -> np.ndarray:
@@ -123,27 +126,75 @@ def stiffness_of(
     return found.at[6:12, 6:12].set(bend).at[12:, 12:].set(slide)
 
 
+def areas_of(x: Float[Array, "4 3"]) -> Float[Array, "4"]:
+    """Areas that the nodes of an element stand for [m^2]."""
+    surface = _Surface(x)
+    areas = jnp.stack([surface.at(xi, eta)[1] for xi, eta in POINTS])
+    return jnp.asarray(SHAPES).T @ areas
+
+
+class ShellReadings(eqx.Module):
+    """What goes on in an element of a shell, in its middle, along its own axes 1 and 2.
+
+    The first axis bisects between the side from the first node to the second and what the other sides ask
+    for; the director is on the side of positive thickness.
+
+    Attributes:
+        strain: of the mid-surface 11, 22, and the angle 12 [-].
+        curvature: of the mid-surface, by which strains grow along the director [1/m].
+        shear: angles 13 and 23 between director and surface [-].
+        resultants: membrane forces per length 11, 22, 12 [N/m].
+        moments: per length [N].
+        shear_forces: per length [N/m].
+        stress: 11, 22, 12 at the surfaces on the sides against and along the director [N/m^2].
+        energy: stored [J].
+    """
+
+    strain: Float[Array, "*t 3"]
+    curvature: Float[Array, "*t 3"]
+    shear: Float[Array, "*t 2"]
+    resultants: Float[Array, "*t 3"]
+    moments: Float[Array, "*t 3"]
+    shear_forces: Float[Array, "*t 2"]
+    stress: Float[Array, "*t 2 3"]
+    energy: Float[Array, "*t"]
+
+
 class ShellElement(Potential):
-    """A quadrilateral of four nodes with directors, of an isotropic material, stress-free as assembled.
+    """A quadrilateral of four nodes with directors, stress-free as assembled.
 
     Saint Venant-Kirchhoff material in plane stress. The directors are those through the thickness, in the
-    assembled pose normal to the surface.
+    assembled pose normal to the surface. The element brings its mass to its nodes.
 
     Attributes:
         markers: the four nodes in turn round the element: a point and a director of each.
         thickness: [m].
-        E: Young's modulus [N/m^2].
-        nu: Poisson's ratio [-].
-        stiffness: made at compile.
-        rest: invariants in the assembled pose, made at compile.
+        material: as `nc.Elastic`.
+        reference: points and directors (4, 2, 3) without stress [m, -]; None: those of the assembled pose.
+        stiffness: by the invariants, follows from the others.
+        rest: invariants without stress, follow from the others.
+        areas: that the nodes stand for [m^2], follow from the others.
+
+    Example:
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import natcoord_jax as nc
+        >>> import numpy as np
+        >>> scene = nc.Scene()
+        >>> corners = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)], float)
+        >>> nodes = scene.add(nc.Nodes.directors(corners, (0, 0, 1)))
+        >>> glass = nc.Elastic(E=70e9, nu=0.22, density=2500.0)
+        >>> pane = scene.add(nc.ShellElement.on(nodes, [range(4)], thickness=4e-3, material=glass))
+        >>> float(scene.compile()[0].mass[:, 0, 0].sum().round(6))
+        10.0
     """
 
     markers: Any = eqx.field(metadata=is_a(Markers(attachments=4)))
     thickness: Any = eqx.field(kw_only=True, metadata=is_a(Number("positive")))
-    E: Any = eqx.field(kw_only=True, metadata=is_a(Number("positive")))
-    nu: Any = eqx.field(default=0.0, kw_only=True, metadata=is_a(Number()))
+    material: Any = eqx.field(kw_only=True, metadata=is_a(MATERIAL))
+    reference: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Numbers((4, 2, 3))))
     stiffness: Any = eqx.field(default=None, init=False)
     rest: Any = eqx.field(default=None, init=False)
+    areas: Any = eqx.field(default=None, init=False)
 
     kind: ClassVar[str] = "shell"
     degree: ClassVar[int | None] = 2
@@ -151,16 +202,38 @@ class ShellElement(Potential):
     together: ClassVar[bool] = True
     vectors: ClassVar[int] = 2
     faces: ClassVar[tuple[tuple[int, ...], ...]] = ((0, 1, 2, 3),)
+    derived: ClassVar[tuple[str, ...]] = ("stiffness", "rest", "areas")
+    silent: ClassVar[bool] = False
 
-    def assembled_at(self, x: Float[Array, "4 2 3"]) -> "ShellElement":
-        """With the stiffness and the invariants of the assembled pose."""
-        h, nu = self.thickness, self.nu
-        plane = jnp.array([[1.0, 0, 0], [0, 1.0, 0], [0, 0, 0.5]])
-        plane = plane + nu * jnp.array([[0, 1.0, 0], [1.0, 0, 0], [0, 0, -0.5]])
-        plane = self.E / (1 - nu**2) * plane
-        shear = SHEAR * self.E / (2 * (1 + nu)) * h * jnp.eye(2)
-        stiffness = stiffness_of(x[:, 0], h * plane, h**3 / 12 * plane, shear)
-        return replace_fields(self, stiffness=stiffness, rest=self.invariants(x))
+    def assembled_at(self, x: Float[Array, "4 *m 3"]) -> "ShellElement":
+        """With the assembled pose as the one without stress, unless another is given."""
+        given = x[:, :2] if self.reference is None else self.reference
+        return replace_fields(self, reference=given).renewed()
+
+    def renewed(self) -> "ShellElement":
+        """With the stiffness and the invariants of the pose without stress."""
+        x, (membrane, bending, shear) = self.reference, self.sheet()
+        return replace_fields(
+            self,
+            stiffness=stiffness_of(x[:, 0], membrane, bending, shear),
+            rest=self.invariants(x),
+            areas=areas_of(x[:, 0]),
+        )
+
+    def sheet(self) -> tuple[Float[Array, "3 3"], Float[Array, "3 3"], Float[Array, "2 2"]]:
+        """Stiffness against strains [N/m], curvatures [N m] and shears [N/m]."""
+        h, plane = self.thickness, self.material.plane_stress()
+        return h * plane, h**3 / 12 * plane, h * self.material.transverse_shear()
+
+    def lumped_mass(self) -> Float[Array, "4 2"]:
+        """Of the points [kg] and of the directors [kg m^2]."""
+        h = self.thickness
+        each = self.material.density * h * self.areas
+        return jnp.stack([each, h**2 / 12 * each], axis=1)
+
+    def flaws(self) -> dict[str, Array]:
+        """Corners that are no corners."""
+        return {"is degenerate or turned over: list its nodes in turn round it": jnp.min(self.areas) <= 0.0}
 
     def invariants(self, x: Float[Array, "4 m 3 *n"]) -> Float[Array, "16 *n"]:
         """Membrane [m^2], curvature [m] and shear [m]."""
@@ -189,3 +262,24 @@ class ShellElement(Potential):
     def energy_curvature(self, invariants: Float[Array, " p"]) -> Float[Array, "p p"]:
         """The constant stiffness."""
         return self.stiffness
+
+    def readings(self, place: Array, rows: Array) -> ShellReadings:
+        """Strains and stresses in the middle."""
+        found = self.invariants(place_markers(place, rows))
+        change, h = found - self.rest, self.thickness
+        strain_of, inverse = _cartesian(_Surface(self.reference[:, 0]).at(0.0, 0.0)[0])
+        strain, curvature = (strain_of @ _natural(0.0, 0.0) @ x for x in (change[:6], change[6:12]))
+        shear = inverse @ _shears(0.0, 0.0) @ change[12:]
+        membrane, bending, sliding = self.sheet()
+        plane = membrane / h
+        stress = jnp.stack([plane @ (strain + side * h / 2 * curvature) for side in (-1.0, 1.0)])
+        return ShellReadings(
+            strain,
+            curvature,
+            shear,
+            membrane @ strain,
+            bending @ curvature,
+            sliding @ shear,
+            stress,
+            self.energy(found),
+        )

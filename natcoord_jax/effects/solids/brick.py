@@ -15,9 +15,11 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.effect import replace_fields
+from natcoord_jax.core.kinds import of
 from natcoord_jax.core.markers import Markers
-from natcoord_jax.core.numeric import Number
-from natcoord_jax.core.potential import Potential
+from natcoord_jax.core.numeric import Numbers
+from natcoord_jax.core.potential import Potential, place_markers
+from natcoord_jax.effects.materials import Elastic
 from natcoord_jax.maths.elimination import definite_inverse
 from natcoord_jax.maths.vectors import cross
 
@@ -38,6 +40,8 @@ def _slopes(at: np.ndarray) -> Float[np.ndarray, "8 3"]:
 
 
 SLOPES = np.stack([_slopes(at) for at in POINTS])
+SHAPES = np.array([np.prod(1 + CORNERS * at, axis=1) / 8 for at in POINTS])
+"""Shape functions of the nodes at the Gauss points."""
 CENTRE = _slopes(np.zeros(3))
 
 
@@ -59,43 +63,79 @@ def _strains(inverse: Float[Array, "3 3"]) -> Float[Array, "6 6"]:
     return jnp.stack(rows)
 
 
+class SolidReadings(eqx.Module):
+    """What goes on in an element of a solid, on average.
+
+    Attributes:
+        strain: of Green and Lagrange 11, 22, 33, and the angles 12, 23, 13, in the axes of the assembled
+            pose [-].
+        stress: of Cauchy (3, 3), in the axes of the world [N/m^2].
+        von_mises: equivalent stress [N/m^2].
+        energy: stored [J].
+    """
+
+    strain: Float[Array, "*t 6"]
+    stress: Float[Array, "*t 3 3"]
+    von_mises: Float[Array, "*t"]
+    energy: Float[Array, "*t"]
+
+
 class Brick(Potential):
     """A hexahedron of eight points, of a Saint Venant-Kirchhoff material, stress-free as assembled.
 
+    The element brings its mass to its nodes.
+
     Attributes:
         markers: the eight nodes: four in turn round one face, then those above them.
-        E: Young's modulus [N/m^2].
-        nu: Poisson's ratio [-], below 1/2.
-        gradients: derivatives of the shape functions at the Gauss points [1/m], made at compile.
-        stiffness: made at compile.
+        material: as `nc.Elastic`.
+        reference: points (8, 3) without stress [m]; None: those of the assembled pose.
+        gradients: derivatives of the shape functions at the Gauss points [1/m], follow from the others.
+        stiffness: by the strains there [J], follows from the others.
+        volumes: of the Gauss points [m^3], follow from the others.
+
+    Example:
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import natcoord_jax as nc
+        >>> import numpy as np
+        >>> scene = nc.Scene()
+        >>> corners = [(x, y, z) for z in (0, 1) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))]
+        >>> nodes = scene.add(nc.Nodes.points(np.array(corners, float)))
+        >>> rubber = nc.Elastic(E=1e6, nu=0.4, density=1100.0)
+        >>> cube = scene.add(nc.Brick.on(nodes, [range(8)], material=rubber))
+        >>> float(scene.compile()[0].mass[:, 0, 0].sum().round(6))
+        1100.0
     """
 
     markers: Any = eqx.field(metadata=is_a(Markers(8)))
-    E: Any = eqx.field(kw_only=True, metadata=is_a(Number("positive")))
-    nu: Any = eqx.field(default=0.0, kw_only=True, metadata=is_a(Number()))
+    material: Any = eqx.field(kw_only=True, metadata=is_a(of("a material, as nc.Elastic(...)", Elastic)))
+    reference: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Numbers((8, 3))))
     gradients: Any = eqx.field(default=None, init=False)
     stiffness: Any = eqx.field(default=None, init=False)
+    volumes: Any = eqx.field(default=None, init=False)
 
     kind: ClassVar[str] = "brick"
     degree: ClassVar[int | None] = 2
     together: ClassVar[bool] = True
+    derived: ClassVar[tuple[str, ...]] = ("gradients", "stiffness", "volumes")
+    silent: ClassVar[bool] = False
     faces: ClassVar[tuple[tuple[int, ...], ...]] = (
         (0, 3, 2, 1), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7),
     )  # fmt: skip
 
     def assembled_at(self, x: Float[Array, "8 3"]) -> "Brick":
-        """With the gradients and the stiffness of the assembled pose."""
-        first, second = self.E * self.nu / ((1 + self.nu) * (1 - 2 * self.nu)), self.E / (2 * (1 + self.nu))
-        unit = jnp.diag(jnp.array([2.0, 2, 2, 1, 1, 1]))
-        law = second * unit + first * jnp.zeros((6, 6)).at[:3, :3].set(1.0)
-        centre = x.T @ CENTRE
-        inverse, size = _inverse(centre)
+        """With the assembled pose as the one without stress, unless another is given."""
+        return replace_fields(self, reference=x if self.reference is None else self.reference).renewed()
+
+    def renewed(self) -> "Brick":
+        """With the gradients and the stiffness of the pose without stress."""
+        x, law = self.reference, self.material.stiffness()
+        inverse, size = _inverse(x.T @ CENTRE)
         turned = _strains(inverse)
-        gradients, blocks, mixed, soft = [], [], [], jnp.zeros((9, 9))
+        gradients, volumes, blocks, mixed, soft = [], [], [], [], jnp.zeros((9, 9))
         for slopes, at in zip(SLOPES, POINTS):
-            jacobian = x.T @ slopes
-            inverse, volume = _inverse(jacobian)
+            inverse, volume = _inverse(x.T @ slopes)
             gradients.append(slopes @ inverse)
+            volumes.append(volume)
             modes = np.zeros((6, 9))
             for k, (component, axis) in enumerate(ENHANCED):
                 modes[component, k] = at[axis]
@@ -108,7 +148,17 @@ class Brick(Potential):
             stiffness = stiffness.at[6 * k : 6 * k + 6, 6 * k : 6 * k + 6].set(block)
         mixed = jnp.concatenate(mixed)
         stiffness = stiffness - mixed @ definite_inverse(soft) @ mixed.T
-        return replace_fields(self, gradients=jnp.stack(gradients), stiffness=stiffness)
+        found = {"gradients": jnp.stack(gradients), "volumes": jnp.stack(volumes), "stiffness": stiffness}
+        return replace_fields(self, **found)
+
+    def lumped_mass(self) -> Float[Array, "8"]:
+        """Of the points [kg]."""
+        return self.material.density * (SHAPES.T @ self.volumes)
+
+    def flaws(self) -> dict[str, Array]:
+        """Corners that are no corners."""
+        said = "is degenerate or turned inside out: list four nodes in turn round one face, then those above"
+        return {said: jnp.min(self.volumes) <= 0.0}
 
     def invariants(self, x: Float[Array, "8 3 *n"]) -> Float[Array, "48 *n"]:
         """Strains of Green and Lagrange at the Gauss points [-]."""
@@ -132,3 +182,19 @@ class Brick(Potential):
     def energy_curvature(self, invariants: Float[Array, " p"]) -> Float[Array, "p p"]:
         """The constant stiffness."""
         return self.stiffness
+
+    def readings(self, place: Array, rows: Array) -> SolidReadings:
+        """Strains and stresses on average over the element."""
+        x = place_markers(place, rows)
+        found = self.invariants(x)
+        strain = self.volumes @ found.reshape(8, 6) / jnp.sum(self.volumes)
+        xx, yy, zz, xy, yz, xz = jnp.sum(self.slope(found).reshape(8, 6), axis=0) / jnp.sum(self.volumes)
+        pulled = jnp.stack([jnp.stack([xx, xy, xz]), jnp.stack([xy, yy, yz]), jnp.stack([xz, yz, zz])])
+        deformation = x.T @ (self.volumes @ self.gradients.reshape(8, -1)).reshape(8, 3)
+        deformation = deformation / jnp.sum(self.volumes)
+        volume = deformation[:, 0] @ cross(deformation[:, 1], deformation[:, 2])
+        stress = deformation @ pulled @ deformation.T / volume
+        away = stress - jnp.trace(stress) / 3.0 * jnp.eye(3)
+        square = 1.5 * jnp.sum(away**2)
+        equivalent = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
+        return SolidReadings(strain, stress, equivalent, self.energy(found))

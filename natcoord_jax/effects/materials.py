@@ -1,0 +1,69 @@
+"""Elastic materials of shells and solids."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from natcoord_jax.core.arguments import Part, is_a
+from natcoord_jax.core.checks import is_concrete
+from natcoord_jax.core.numeric import Number
+
+SHEAR = 5.0 / 6.0
+"""Shear coefficient of a homogeneous plate."""
+
+
+class Elastic(Part):
+    """An isotropic material whose stresses are linear in the strains of Green and Lagrange.
+
+    The law of Saint Venant and Kirchhoff: for any rotations, and for moderate strains; under strong
+    compression it softens.
+
+    Attributes:
+        E: Young's modulus [N/m^2].
+        nu: Poisson's ratio [-], between -1 and 1/2.
+        density: [kg/m^3].
+
+    Example:
+        >>> import natcoord_jax as nc
+        >>> steel = nc.Elastic(E=210e9, nu=0.3, density=7850.0)
+        >>> print(f"{steel.plane_stress()[0, 0]:.3e}")
+        2.308e+11
+    """
+
+    E: Any = eqx.field(kw_only=True, metadata=is_a(Number("positive")))
+    nu: Any = eqx.field(default=0.0, kw_only=True, metadata=is_a(Number()))
+    density: Any = eqx.field(default=0.0, kw_only=True, metadata=is_a(Number("not negative")))
+
+    kind = "material"
+
+    def __check_init__(self) -> None:
+        if is_concrete(self.nu) and np.ndim(self.nu) == 0 and not -1.0 < float(self.nu) < 0.5:
+            raise ValueError(
+                f"Elastic: nu [-] is {float(self.nu):g}; pass a number between -1 and 1/2: at 1/2 the volume "
+                "cannot change, and such a material needs a pressure of its own"
+            )
+
+    @property
+    def shear_modulus(self) -> Any:
+        """G [N/m^2]."""
+        return self.E / (2 * (1 + self.nu))
+
+    def stiffness(self) -> Float[Array, "6 6"]:
+        """Stresses by strains 11, 22, 33, 12, 23, 13, shears as angles [N/m^2]."""
+        first = self.E * self.nu / ((1 + self.nu) * (1 - 2 * self.nu))
+        unit = jnp.diag(jnp.array([2.0, 2, 2, 1, 1, 1]))
+        return self.shear_modulus * unit + first * jnp.zeros((6, 6)).at[:3, :3].set(1.0)
+
+    def plane_stress(self) -> Float[Array, "3 3"]:
+        """Stresses by strains 11, 22, 12 of a layer without stress across it [N/m^2]."""
+        nu = self.nu
+        plane = jnp.array([[1.0, 0, 0], [0, 1.0, 0], [0, 0, 0.5]])
+        plane = plane + nu * jnp.array([[0, 1.0, 0], [1.0, 0, 0], [0, 0, -0.5]])
+        return self.E / (1 - nu**2) * plane
+
+    def transverse_shear(self) -> Float[Array, "2 2"]:
+        """Mean shear stresses across a layer by shears 13 and 23, with the shear coefficient [N/m^2]."""
+        return SHEAR * self.shear_modulus * jnp.eye(2)

@@ -1,0 +1,281 @@
+"""Meshes: nodes, cells between them, and names of their edges and faces; for `nc.Shell` and `nc.Solid`."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from natcoord_jax.core.arguments import checked
+from natcoord_jax.core.checks import is_concrete
+from natcoord_jax.core.kinds import Several, of
+from natcoord_jax.core.numeric import Number, Numbers, Whole
+
+NAMED = of("a dictionary of names", dict)
+
+HEXAHEDRON = ((0, 3, 2, 1), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7))
+"""Corners of the six faces of a hexahedron, in turn as seen from outside."""
+
+SAME = 1e-9
+"""Distance relative to the extent of the mesh up to which nodes are at the same place."""
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """Nodes and cells.
+
+    Attributes:
+        nodes: positions (n, 3) [m].
+        cells: numbers of the nodes of each cell (m, 4) in turn round a quadrilateral; (m, 8) of a hexahedron
+            four in turn round one face, then those above them.
+        sets: numbers of nodes by name, as of edges and faces.
+        faces: corners (f, 4) of the faces of hexahedra by name, in turn as seen from outside.
+
+    Raises:
+        ValueError: for cells of nodes that there are not, nodes without a cell, or two at the same place.
+
+    Example:
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import natcoord_jax as nc
+        >>> import numpy as np
+        >>> square = nc.mesh.Mesh(np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)]), [(0, 1, 2, 3)])
+        >>> square
+        <mesh: 4 nodes, 1 quadrilaterals>
+    """
+
+    nodes: Any
+    cells: Int[np.ndarray, "m k"]
+    sets: dict[str, np.ndarray] = field(default_factory=dict)
+    faces: dict[str, np.ndarray] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        nodes = np.asarray(self.nodes, float) if is_concrete(self.nodes) else self.nodes
+        object.__setattr__(self, "nodes", nodes)
+        object.__setattr__(self, "cells", np.asarray(self.cells))
+        if nodes.ndim != 2 or nodes.shape[1] != 3:
+            raise ValueError(f"mesh: nodes [m] has shape {nodes.shape}; pass (n, 3)")
+        if self.cells.ndim != 2 or self.cells.shape[1] not in KINDS or self.cells.dtype.kind not in "iu":
+            raise ValueError(
+                f"mesh: cells has shape {self.cells.shape} of {self.cells.dtype}; pass whole numbers (m, 4) "
+                "of quadrilaterals or (m, 8) of hexahedra"
+            )
+        _check(nodes, self.cells)
+
+    def __repr__(self) -> str:
+        named = f"; {', '.join(sorted(self.sets))}" if self.sets else ""
+        return f"<mesh: {len(self.nodes)} nodes, {len(self.cells)} {KINDS[self.cells.shape[1]]}{named}>"
+
+    @property
+    def outside(self) -> Int[np.ndarray, "f 4"]:
+        """Faces of hexahedra that belong to one cell only, in turn as seen from outside."""
+        every = np.concatenate([self.cells[:, list(face)] for face in HEXAHEDRON])
+        _, first, count = np.unique(np.sort(every, axis=1), axis=0, return_index=True, return_counts=True)
+        return every[np.sort(first[count == 1])]
+
+
+KINDS = {4: "quadrilaterals", 8: "hexahedra"}
+
+
+def _check(nodes: Any, cells: np.ndarray) -> None:
+    if cells.size and not 0 <= cells.min() <= cells.max() < len(nodes):
+        raise ValueError(
+            f"mesh: cells has nodes from {cells.min()} to {cells.max()}; there are 0 to {len(nodes) - 1}"
+        )
+    unused = np.setdiff1d(np.arange(len(nodes)), cells)
+    if unused.size:
+        raise ValueError(
+            f"mesh: nodes {unused[:8].tolist()} are in no cell and would have no mass; leave them out "
+            "(`nc.mesh.cleaned` does)"
+        )
+    if is_concrete(nodes):
+        twins = _twins(np.asarray(nodes))
+        if twins is not None:
+            raise ValueError(
+                f"mesh: nodes {twins[0]} and {twins[1]} are at the same place, so that the cells on them are "
+                "not joined; merge them (`nc.mesh.cleaned` does)"
+            )
+
+
+def _twins(nodes: Float[np.ndarray, "n 3"]) -> tuple[int, int] | None:
+    """Two nodes at the same place, if there are any."""
+    number = _places(nodes)
+    first = np.unique(number, return_index=True)[1]
+    later = np.setdiff1d(np.arange(len(nodes)), first)
+    if not later.size:
+        return None
+    return int(np.flatnonzero(number == number[later[0]])[0]), int(later[0])
+
+
+def _places(nodes: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
+    """Numbers of places, equal for nodes at the same one."""
+    size = SAME * max(float(np.ptp(nodes, axis=0).max(initial=0.0)), 1e-300)
+    # Rounded to a grid of twice the distance, and again to one shifted by half: neighbours that one grid
+    # parts share a place in the other, unless they are a diagonal apart.
+    found = np.arange(len(nodes))
+    for shift in (0.0, 0.5):
+        _, number = np.unique(np.floor(nodes / (2 * size) + shift), axis=0, return_inverse=True)
+        number = number.reshape(-1)
+        least = np.full(number.max(initial=-1) + 1, len(nodes))
+        np.minimum.at(least, number, found)
+        found = least[number]
+    return found
+
+
+@checked("mesh.cleaned", nodes=Numbers((None, 3)), cells=Numbers((None, None)), sets=NAMED, faces=NAMED)
+def cleaned(
+    nodes: Any, cells: Any, sets: dict[str, Any] | None = None, faces: dict[str, Any] | None = None
+) -> Mesh:
+    """A mesh of nodes some of which are at the same place, or in no cell: merged, and left out.
+
+    Args:
+        nodes: positions (n, 3) [m].
+        cells: numbers of the nodes of each cell, see `Mesh`.
+        sets: numbers of nodes by name.
+        faces: corners of faces by name.
+
+    Example:
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import natcoord_jax as nc
+        >>> nodes = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (1, 0, 0), (2, 0, 0), (2, 1, 0), (1, 1, 0)]
+        >>> nc.mesh.cleaned(nodes, [(0, 1, 2, 3), (4, 5, 6, 7)])
+        <mesh: 6 nodes, 2 quadrilaterals>
+    """
+    place = np.asarray(nodes, float)
+    found = _places(place)[np.asarray(cells)]
+    kept = np.unique(found)
+    number = np.full(len(place), -1)
+    number[kept] = np.arange(len(kept))
+    first = _places(place)
+
+    def renumbered(x: Any) -> np.ndarray:
+        return number[first[np.asarray(x, int)]]
+
+    named = {name: np.unique(renumbered(x)) for name, x in (sets or {}).items()}
+    named = {name: x[x >= 0] for name, x in named.items()}
+    return Mesh(place[kept], number[found], named, {k: renumbered(x) for k, x in (faces or {}).items()})
+
+
+def _lines(size: Any, counts: Any) -> list[np.ndarray]:
+    return [np.linspace(0.0, float(length), int(count) + 1) for length, count in zip(size, counts)]
+
+
+@checked("mesh.rectangle", size=Numbers((2,), sign="positive"), counts=Several(Whole(1), 2, 2))
+def rectangle(size: Any, counts: tuple[int, int]) -> Mesh:
+    """A rectangle in the plane z = 0, from the origin along x and y.
+
+    Args:
+        size: along x and y [m].
+        counts: of quadrilaterals along x and y.
+
+    Returns:
+        A mesh with the sets "left", "right" (x), "bottom" and "top" (y).
+
+    Example:
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import natcoord_jax as nc
+        >>> nc.mesh.rectangle((1.0, 0.5), (16, 8))
+        <mesh: 153 nodes, 128 quadrilaterals; bottom, left, right, top>
+    """
+    x, y = _lines(size, counts)
+    nodes = np.stack([*np.meshgrid(x, y, indexing="ij"), np.zeros((len(x), len(y)))], axis=-1)
+    number = np.arange(nodes[..., 0].size).reshape(nodes.shape[:2])
+    corners = number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]
+    sets = {"left": number[0], "right": number[-1], "bottom": number[:, 0], "top": number[:, -1]}
+    return Mesh(nodes.reshape(-1, 3), np.stack(corners, axis=-1).reshape(-1, 4), sets)
+
+
+@checked("mesh.box", size=Numbers((3,), sign="positive"), counts=Several(Whole(1), 3, 3))
+def box(size: Any, counts: tuple[int, int, int]) -> Mesh:
+    """A box from the origin along x, y and z.
+
+    Args:
+        size: along x, y and z [m].
+        counts: of hexahedra along x, y and z.
+
+    Returns:
+        A mesh with sets and faces "x0", "x1", "y0", "y1", "z0" and "z1".
+
+    Example:
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import natcoord_jax as nc
+        >>> nc.mesh.box((1.0, 0.5, 0.5), (4, 2, 2))
+        <mesh: 45 nodes, 16 hexahedra; x0, x1, y0, y1, z0, z1>
+    """
+    nodes = np.stack(np.meshgrid(*_lines(size, counts), indexing="ij"), axis=-1)
+    number = np.arange(nodes[..., 0].size).reshape(nodes.shape[:3])
+    low, high = slice(None, -1), slice(1, None)
+    around = (low, low), (high, low), (high, high), (low, high)
+    corners = [number[a, b, c] for c in (low, high) for a, b in around]
+    cells = np.stack(corners, axis=-1).reshape(-1, 8)
+    sets = {
+        f"{axis}{end}": np.take(number, -end, axis=k).reshape(-1)
+        for k, axis in enumerate("xyz")
+        for end in (0, 1)
+    }
+    mesh = Mesh(nodes.reshape(-1, 3), cells, sets)
+    faces = {name: mesh.outside[np.isin(mesh.outside, x).all(axis=1)] for name, x in sets.items()}
+    return Mesh(mesh.nodes, cells, sets, faces)
+
+
+@checked(
+    "mesh.cylinder", radius=Number("positive"), length=Number("positive"), counts=Several(Whole(1), 2, 2)
+)
+def cylinder(radius: Any, length: Any, counts: tuple[int, int]) -> Mesh:
+    """The surface of a cylinder about the z axis, from z = 0 on, open at both ends; directors point outwards.
+
+    Args:
+        radius: [m].
+        length: [m].
+        counts: of quadrilaterals round the axis and along it.
+
+    Returns:
+        A mesh with the sets "bottom" and "top".
+
+    Example:
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import natcoord_jax as nc
+        >>> nc.mesh.cylinder(0.1, 0.5, (16, 8))
+        <mesh: 144 nodes, 128 quadrilaterals; bottom, top>
+    """
+    around, along = counts
+    if around < 3:
+        raise ValueError(f"mesh.cylinder: {around} cells round the axis enclose nothing; pass three or more")
+    angle, z = 2 * np.pi * np.arange(around) / around, np.linspace(0.0, float(length), along + 1)
+    radius = float(radius)
+    circle = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=-1)
+    nodes = np.concatenate(
+        [np.repeat(circle[:, None], along + 1, axis=1), np.broadcast_to(z[:, None], (around, along + 1, 1))],
+        axis=-1,
+    )
+    number = np.arange(around * (along + 1)).reshape(around, along + 1)
+    ahead = np.roll(number, -1, axis=0)
+    corners = number[:, :-1], ahead[:, :-1], ahead[:, 1:], number[:, 1:]
+    cells = np.stack(corners, axis=-1).reshape(-1, 4)
+    return Mesh(nodes.reshape(-1, 3), cells, {"bottom": number[:, 0], "top": number[:, -1]})
+
+
+@checked("mesh.sphere", radius=Number("positive"), count=Whole(1))
+def sphere(radius: Any, count: int) -> Mesh:
+    """The surface of a sphere about the origin, as a cube blown up; directors point outwards.
+
+    Args:
+        radius: [m].
+        count: of quadrilaterals along each edge of the cube: six times its square in all.
+
+    Example:
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import natcoord_jax as nc
+        >>> nc.mesh.sphere(0.033, 4)
+        <mesh: 98 nodes, 96 quadrilaterals>
+    """
+    cube = box((2.0, 2.0, 2.0), (count, count, count))
+    # Equal angles as seen from the middle, not equal lengths, keep the cells alike.
+    nodes = np.tan(np.pi / 4 * (cube.nodes - 1.0))
+    nodes = float(radius) * nodes / np.maximum(np.linalg.norm(nodes, axis=1, keepdims=True), 1e-300)
+    kept = np.unique(cube.outside)
+    number = np.full(len(nodes), -1)
+    number[kept] = np.arange(len(kept))
+    return Mesh(nodes[kept], number[cube.outside])
+
+
+__all__ = ["Mesh", "box", "cleaned", "cylinder", "rectangle", "sphere"]
