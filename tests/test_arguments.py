@@ -68,6 +68,9 @@ JOINT = lambda w: {  # noqa: E731
 ON_JOINT = lambda w: {"joint": [w.hinge], "coordinate": [0], "name": NAME}  # noqa: E731
 MARKED = lambda markers: {"markers": [markers], "name": NAME}  # noqa: E731
 RUN = lambda w: {"system": [w.system], "state": [w.state]}  # noqa: E731
+GAP = lambda markers: {  # noqa: E731
+    **MARKED(markers), "stiffness": NUMBER, "law": ["linear", "hertz"],
+}  # fmt: skip
 METAL, SQUARE = [nc.Elastic(E=1.0)], np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0.0)])
 PLACED = {
     "material": METAL, "position": V, "orientation": [np.eye(3)], "velocity": V, "angular_velocity": V,
@@ -156,6 +159,21 @@ CALLS = {
     "Shell": lambda w: {
         "mesh": [nc.mesh.rectangle((1.0, 1.0), (1, 1))], "thickness": NUMBER, "directors": PLACES, **PLACED
     },
+    "Capsule": lambda w: {"radius": NUMBER, "length": NUMBER},
+    "Plane": lambda w: {"normal": V, "point": V, "body": [w.body]},
+    "Contact": lambda w: {
+        "one": [w.body], "other": [nc.Plane()], "stiffness": NUMBER, "restitution": NUMBER, "speed": NUMBER,
+        "law": ["linear", "hertz"], "name": NAME,
+    },
+    "ContactLoss": lambda w: {
+        **MARKED(w.ends), "contact": [nc.SphereOnSphere(w.ends, radii=(1.0, 1.0), stiffness=1.0)],
+        "damping": NUMBER,
+    },
+    "SphereOnPlane": lambda w: {**GAP((w.ends[0], w.direction, w.point)), "radius": NUMBER},
+    "SphereOnSphere": lambda w: {**GAP(w.ends), "radii": [(1.0, 1.0)]},
+    "CapsuleOnCapsule": lambda w: {**GAP(w.ends * 2), "radii": [(1.0, 1.0)]},
+    "EllipsoidOnPlane": lambda w: {**GAP((w.ends[0], w.direction, w.point, *w.triad)), "semi_axes": V},
+    "SphereOnBox": lambda w: {**GAP((*w.ends, *w.triad)), "size": V, "radius": NUMBER},
     "FacePressure": lambda w: {**MARKED(w.ends * 2), "pressure": [1.0, f]},
     "Pressure": lambda w: {"surface": [w.shell], "pressure": [1.0, f], "face": NAME, "name": NAME},
     "Solid": lambda w: {"mesh": [nc.mesh.box((1.0, 1.0, 1.0), (1, 1, 1))], **PLACED},
@@ -350,7 +368,7 @@ MADE = {
     "Equilibrium", "Feedback", "Frame", "Growth", "Load", "MeshHandle", "Modes", "Nodes", "NonlinearProgram",
     "Optima", "Outcome", "Result", "SimulationError", "Solution", "State", "System", "Trajectory",
 }  # fmt: skip
-BASES = {"Constraint", "Field", "Force", "Joint", "Potential", "VelocityConstraint"}
+BASES = {"Constraint", "Field", "Force", "GapPotential", "Joint", "Potential", "VelocityConstraint"}
 IN_MODULES = {
     "cost": nc.cost, "goal": nc.goal, "bounds": nc.bounds, "inputs": nc.inputs, "mesh": nc.mesh,
 }  # fmt: skip

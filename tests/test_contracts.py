@@ -140,6 +140,33 @@ TABLE = {
         lambda p: nc.ShellElement(p.four, thickness=0.1, material=nc.Elastic(E=300.0, nu=0.3))
     ),
     nc.Brick: Entry(lambda p: nc.Brick(p.eight, material=nc.Elastic(E=50.0, nu=0.3))),
+    nc.SphereOnPlane: Entry(
+        lambda p: nc.SphereOnPlane((p.ends[0], p.triad[2], p.ends[1]), radius=2.0, stiffness=9.0)
+    ),
+    nc.SphereOnSphere: Entry(
+        lambda p: nc.SphereOnSphere(p.ends, radii=(1.0, 0.9), stiffness=9.0, law="hertz")
+    ),
+    nc.ContactLoss: Entry(
+        lambda p: nc.ContactLoss(
+            p.ends, contact=nc.SphereOnSphere(p.ends, radii=(1.0, 0.9), stiffness=9.0), damping=0.2
+        )
+    ),
+    nc.CapsuleOnCapsule: Entry(
+        lambda p: nc.CapsuleOnCapsule((*p.eight[:2], *p.eight[5:7]), radii=(0.6, 0.7), stiffness=9.0)
+    ),
+    nc.EllipsoidOnPlane: Entry(
+        lambda p: nc.EllipsoidOnPlane(
+            (p.ends[0], p.triad[2], p.ends[1], *(nc.Direction(p.two, a) for a in np.eye(3))),
+            semi_axes=(2.0, 2.2, 2.4),
+            stiffness=9.0,
+        )
+    ),
+    nc.SphereOnBox: Entry(
+        lambda p: nc.SphereOnBox((*p.ends, *p.triad), size=(0.2, 0.3, 0.1), radius=1.5, stiffness=9.0)
+    ),
+    nc.FacePressure: Entry(
+        lambda p: nc.FacePressure((*p.eight[:2], *p.eight[5:7]), pressure=jnp.sin), inside=False
+    ),
     nc.PointOnPlane: Entry(lambda p: nc.PointOnPlane((p.ends[0], p.triad[2], p.ends[1]), distance=0.2)),
     nc.PointOnLine: Entry(lambda p: nc.PointOnLine((p.ends[0], p.triad[2], p.ends[1]))),
     nc.PointOnPoint: Entry(
@@ -194,7 +221,7 @@ def exported() -> set[type]:
         if module.ispkg:
             names = vars(importlib.import_module(module.name)).values()
             found |= {x for x in names if inspect.isclass(x) and issubclass(x, Effect)}
-    return found
+    return {x for x in found if not inspect.isabstract(x)}
 
 
 # --- the table and the names ------------------------------------------------------------------------------

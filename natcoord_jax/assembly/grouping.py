@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -63,7 +64,10 @@ def bare(effect: Effect, drop: Sequence[str], label: str) -> Effect:
 
 
 def _as_one(value: Any) -> Any:
-    """A tuple of numbers as one array; anything else as it is."""
+    """A tuple of numbers as one array, in modules too; anything else as it is."""
+    if isinstance(value, eqx.Module) and not isinstance(value, Function):
+        inner = {f.name: getattr(value, f.name) for f in fields(value) if not f.metadata.get("static")}
+        return replace_fields(value, **{name: _as_one(x) for name, x in inner.items()})
     if not isinstance(value, tuple | list):
         return value
     leaves = jax.tree.leaves(value)

@@ -2,6 +2,8 @@
 
 from natcoord_jax.bodies.beam import Beam as Beam
 from natcoord_jax.bodies.beam import BeamHandle as BeamHandle
+from natcoord_jax.bodies.contact import Contact as Contact
+from natcoord_jax.bodies.contact import Plane as Plane
 from natcoord_jax.bodies.continua import MeshHandle as MeshHandle
 from natcoord_jax.bodies.continua import Shell as Shell
 from natcoord_jax.bodies.continua import Solid as Solid
@@ -25,6 +27,9 @@ from natcoord_jax.bodies.sections import (
 )
 from natcoord_jax.bodies.shapes import (
     Box as Box,
+)
+from natcoord_jax.bodies.shapes import (
+    Capsule as Capsule,
 )
 from natcoord_jax.bodies.shapes import (
     Cylinder as Cylinder,

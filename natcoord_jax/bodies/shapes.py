@@ -175,6 +175,42 @@ class Ellipsoid(Shape):
         return np.asarray(self.semi_axes) * points, faces
 
 
+class Capsule(Shape):
+    """Cylinder along the third body axis with half a sphere at each end.
+
+    Attributes:
+        radius: of the cylinder and the spheres [m].
+        length: of the cylinder, from centre to centre of the spheres [m].
+
+    Example:
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import natcoord_jax as nc
+        >>> link = nc.RigidBody(shape=nc.Capsule(radius=0.03, length=0.2), density=1000.0)
+    """
+
+    radius: Array = eqx.field(converter=lambda x: as_array(x, float), metadata=is_a(LENGTH))
+    length: Array = eqx.field(converter=lambda x: as_array(x, float), metadata=is_a(LENGTH))
+
+    def volume(self) -> Array:
+        """Pi r^2 (l + 4/3 r)."""
+        return jnp.pi * self.radius**2 * (self.length + 4 / 3 * self.radius)
+
+    def gyration(self) -> Array:
+        """Of the cylinder and of two half spheres, 3/8 r beyond its ends."""
+        r, half = self.radius, self.length / 2
+        middle, ends = jnp.pi * r**2 * self.length, 4 / 3 * jnp.pi * r**3
+        across = middle * r**2 / 4 + ends * r**2 / 5
+        # About the flat side of a half sphere the mean square along the axis is r^2/5, as of the whole.
+        along = middle * half**2 / 3 + ends * (r**2 / 5 + half**2 + 3 / 4 * r * half)
+        return jnp.stack([across, across, along]) / (middle + ends)
+
+    def surface(self) -> Surface:
+        """A globe whose halves are moved apart."""
+        points, faces = _globe()
+        shift = 0.5 * np.asarray(self.length) * np.sign(np.round(points[:, 2], 12))
+        return np.asarray(self.radius) * points + shift[:, None] * np.array([0.0, 0.0, 1.0]), faces
+
+
 class Placed(eqx.Module):
     """A shape where it is in its body, for pictures.
 

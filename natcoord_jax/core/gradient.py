@@ -91,7 +91,8 @@ def averaged_gradient(
     relevant = (jnp.abs(missing) > noise) & (jnp.sum(weights * relative**2, axis=(0, 1)) > LEAST**2)
     # What is irrelevant must not reach a quotient: its derivatives need not be finite. Nor is any energy or
     # stiffness squared, of which laws that decay exponentially have 1e-260.
-    moving = relevant & (moved > 0)
+    # A step that is rounding of its invariant tells no stiffness either.
+    moving = relevant & (moved > SPREAD * epsilon * beside)
     stiffness = jnp.where(moving, safe_divide(changed, jnp.where(moving, moved, 1.0)), 0.0)
     stiff = stiffness * steps
     enough = jnp.sum(weights * stiff * steps, axis=(0, 1)) > jnp.abs(missing)

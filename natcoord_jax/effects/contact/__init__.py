@@ -1,0 +1,10 @@
+"""Contact between surfaces."""
+
+from natcoord_jax.effects.contact.gap_potential import ContactLoss as ContactLoss
+from natcoord_jax.effects.contact.gap_potential import GapPotential as GapPotential
+from natcoord_jax.effects.contact.gap_potential import damping_of as damping_of
+from natcoord_jax.effects.contact.pairs import CapsuleOnCapsule as CapsuleOnCapsule
+from natcoord_jax.effects.contact.pairs import EllipsoidOnPlane as EllipsoidOnPlane
+from natcoord_jax.effects.contact.pairs import SphereOnBox as SphereOnBox
+from natcoord_jax.effects.contact.pairs import SphereOnPlane as SphereOnPlane
+from natcoord_jax.effects.contact.pairs import SphereOnSphere as SphereOnSphere

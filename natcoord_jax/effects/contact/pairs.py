@@ -1,0 +1,168 @@
+"""Gaps between pairs of shapes, as functions of invariants of their markers."""
+
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from natcoord_jax.core.arguments import is_a
+from natcoord_jax.core.markers import Markers
+from natcoord_jax.core.numeric import Number, Numbers
+from natcoord_jax.effects.contact.gap_potential import GapPotential
+from natcoord_jax.maths.vectors import dot
+
+RADIUS = Number("not negative")
+PARALLEL = 1e-12
+"""Squared sine of the angle between segments below which any point of the shorter overlap is nearest."""
+
+
+def _length(square: Array) -> Array:
+    """Root of a square, with derivatives that are zero where it is."""
+    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
+
+
+class SphereOnPlane(GapPotential):
+    """A sphere, or a point, above a plane.
+
+    Attributes:
+        markers: a point of the plane, its normal as a direction of the same body, and the centre.
+        radius: of the sphere [m].
+
+    Example:
+        >>> import natcoord_jax as nc
+        >>> floor = nc.Point(nc.ground), nc.Direction(nc.ground, (0, 0, 1))
+        >>> contact = nc.SphereOnPlane((*floor, nc.Point(nc.ground, (0, 0, 1))), stiffness=1e5, radius=0.1)
+    """
+
+    markers: Any = eqx.field(metadata=is_a(Markers(1, 1, more=True)))
+    radius: Any = eqx.field(default=0.0, kw_only=True, metadata=is_a(RADIUS))
+
+    kind: ClassVar[str] = "sphere on plane"
+
+    def invariants(self, x: Float[Array, "3 3"]) -> Float[Array, "1"]:
+        """Height of the centre [m]."""
+        return dot(x[1], x[2] - x[0])[None]
+
+    def gap(self, invariants: Float[Array, "1"]) -> Float[Array, ""]:
+        """Height less radius."""
+        return invariants[0] - self.radius
+
+
+class SphereOnSphere(GapPotential):
+    """Two spheres.
+
+    Attributes:
+        markers: their centres.
+        radii: of both (2,) [m].
+    """
+
+    markers: Any = eqx.field(metadata=is_a(Markers(2)))
+    radii: Any = eqx.field(kw_only=True, metadata=is_a(Numbers((2,), "not negative")))
+
+    kind: ClassVar[str] = "sphere on sphere"
+
+    def invariants(self, x: Float[Array, "2 3"]) -> Float[Array, "1"]:
+        """Square of the distance [m^2]."""
+        apart = x[1] - x[0]
+        return dot(apart, apart)[None]
+
+    def gap(self, invariants: Float[Array, "1"]) -> Float[Array, ""]:
+        """Distance less radii."""
+        return _length(invariants[0]) - jnp.sum(self.radii)
+
+
+class CapsuleOnCapsule(GapPotential):
+    """Two capsules: all that is within a radius of a segment. With a segment of no length, a sphere.
+
+    Attributes:
+        markers: both ends of the first segment, and of the second.
+        radii: of both (2,) [m].
+    """
+
+    markers: Any = eqx.field(metadata=is_a(Markers(4)))
+    radii: Any = eqx.field(kw_only=True, metadata=is_a(Numbers((2,), "not negative")))
+
+    kind: ClassVar[str] = "capsule on capsule"
+
+    def invariants(self, x: Float[Array, "4 3"]) -> Float[Array, "6"]:
+        """Products of the segments and of what is between their first ends [m^2]."""
+        one, other, apart = x[1] - x[0], x[3] - x[2], x[0] - x[2]
+        pairs = (one, one), (other, other), (one, other), (one, apart), (other, apart), (apart, apart)
+        return jnp.stack([dot(u, v) for u, v in pairs])
+
+    def gap(self, invariants: Float[Array, "6"]) -> Float[Array, ""]:
+        """Distance of the nearest points less radii."""
+        return _length(segment_distance_square(invariants)) - jnp.sum(self.radii)
+
+
+def segment_distance_square(products: Float[Array, "6"]) -> Float[Array, ""]:
+    """Least square of the distance of two segments r + s d_1 - t d_2 with s and t from 0 to 1.
+
+    Source: C. Ericson, Real-Time Collision Detection, 2005, section 5.1.9; here with derivatives, of the
+    nearest points too.
+
+    Args:
+        products: d_1.d_1, d_2.d_2, d_1.d_2, d_1.r, d_2.r and r.r.
+    """
+    a, e, b, c, f, square = products
+    sine = a * e - b * b
+    slanted, long, other = sine > PARALLEL * a * e, a > 0, e > 0
+    s = jnp.where(slanted, jnp.clip((b * f - c * e) / jnp.where(slanted, sine, 1.0), 0.0, 1.0), 0.5)
+    t = jnp.where(other, (b * s + f) / jnp.where(other, e, 1.0), 0.0)
+    inside = jnp.clip(t, 0.0, 1.0)
+    # Where the second end is beyond its segment, or there is none, the first point is that nearest to it.
+    again = jnp.clip((b * inside - c) / jnp.where(long, a, 1.0), 0.0, 1.0)
+    s = jnp.where(long, jnp.where((t == inside) & slanted & other, s, again), 0.0)
+    # (Parallel segments: from the nearest point of the first once more to the second.)
+    t = jnp.where(other, jnp.clip((b * s + f) / jnp.where(other, e, 1.0), 0.0, 1.0), 0.0)
+    return square + a * s * s + e * t * t + 2 * (c * s - f * t - b * s * t)
+
+
+class EllipsoidOnPlane(GapPotential):
+    """An ellipsoid above a plane.
+
+    Attributes:
+        markers: a point of the plane and its normal, the centre, and the directions of the axes.
+        semi_axes: (3,) [m].
+    """
+
+    markers: Any = eqx.field(metadata=is_a(Markers(1, 1, more=True)))
+    semi_axes: Any = eqx.field(kw_only=True, metadata=is_a(Numbers((3,), "positive")))
+
+    kind: ClassVar[str] = "ellipsoid on plane"
+
+    def invariants(self, x: Float[Array, "6 3"]) -> Float[Array, "4"]:
+        """Height of the centre [m], and cosines of the axes with the normal [-]."""
+        return jnp.stack([dot(x[1], x[2] - x[0]), *(dot(x[1], axis) for axis in x[3:6])])
+
+    def gap(self, invariants: Float[Array, "4"]) -> Float[Array, ""]:
+        """Height less what the ellipsoid reaches along the normal (its support function)."""
+        return invariants[0] - _length(jnp.sum((self.semi_axes * invariants[1:]) ** 2))
+
+
+class SphereOnBox(GapPotential):
+    """A sphere beside a box, with round edges as the sphere sees them.
+
+    Attributes:
+        markers: the centre of the box, the centre of the sphere, and three directions of the box.
+        size: edges of the box (3,) [m].
+        radius: of the sphere [m].
+    """
+
+    markers: Any = eqx.field(metadata=is_a(Markers(2, 3)))
+    size: Any = eqx.field(kw_only=True, metadata=is_a(Numbers((3,), "positive")))
+    radius: Any = eqx.field(kw_only=True, metadata=is_a(RADIUS))
+
+    kind: ClassVar[str] = "sphere on box"
+
+    def invariants(self, x: Float[Array, "5 3"]) -> Float[Array, "3"]:
+        """Place of the sphere in the axes of the box [m]."""
+        apart = x[1] - x[0]
+        return jnp.stack([dot(axis, apart) for axis in x[2:5]])
+
+    def gap(self, invariants: Float[Array, "3"]) -> Float[Array, ""]:
+        """Distance from the box less radius; inside of it to the nearest face."""
+        beyond = jnp.abs(invariants) - 0.5 * self.size
+        outside = _length(jnp.sum(jnp.where(beyond > 0, beyond, 0.0) ** 2))
+        return jnp.where(outside > 0, outside, jnp.max(beyond)) - self.radius
