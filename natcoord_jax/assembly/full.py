@@ -209,7 +209,7 @@ class FullStep(Form):
             if not touches(group):
                 continue
             bodies, rates = group.bodies, rates_of(group)
-            (by_twist, by_lam), (g_by_twist, _) = jacobians(
+            (by_twist, by_lam), (g_by_twist, g_by_lam) = jacobians(
                 group, where, self.tableau, self.start[bodies], every[bodies][..., :rates], lam, exact=exact
             )
             if group.turning:
@@ -219,7 +219,7 @@ class FullStep(Form):
             count, width = group.count, bodies.shape[1] * self.tableau.stages * rates
             rows = self.tableau.stages * group.multipliers
             above = [-by_twist.reshape(count, width, width), -by_lam.reshape(count, width, rows)]
-            below = [g_by_twist.reshape(count, rows, width), jnp.zeros((count, rows, rows), y.dtype)]
+            below = [g_by_twist.reshape(count, rows, width), g_by_lam.reshape(count, rows, rows)]
             whole = [jnp.concatenate(parts, axis=2) for parts in (above, below)]
             found.append(jnp.concatenate(whole, axis=1) if rows else above[0])
         return found
