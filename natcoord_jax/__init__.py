@@ -43,6 +43,8 @@ from natcoord_jax.bodies import (
     Shell,
     Solid,
     Sphere,
+    Surface,
+    Tie,
     TubularSection,
 )
 from natcoord_jax.control import (
@@ -93,7 +95,7 @@ from natcoord_jax.effects.beams import (
     DirectorElement,
     NonlinearBeamElement,
 )
-from natcoord_jax.effects.constraints import PointOnLine, PointOnPlane, PointOnPoint, Rod, Rolling
+from natcoord_jax.effects.constraints import PointOnLine, PointOnPlane, PointOnPoint, PointSum, Rod, Rolling
 from natcoord_jax.effects.contact import (
     CapsuleOnCapsule,
     ContactLoss,
@@ -223,6 +225,7 @@ __all__ = [
     "PointOnLine",
     "PointOnPlane",
     "PointOnPoint",
+    "PointSum",
     "Potential",
     "Pressure",
     "Prismatic",
@@ -249,7 +252,9 @@ __all__ = [
     "Spherical",
     "Spring",
     "State",
+    "Surface",
     "System",
+    "Tie",
     "Trajectory",
     "TubularSection",
     "Universal",

@@ -47,12 +47,19 @@ PART = of(
     Clamp,
 )
 
+NODES = of("some nodes of a set, as mesh[:4]", NodeSet)
+
 _scene_numbers = itertools.count(1)
 
 
 @on_host
 def _sum(one: Array, other: Array) -> Array:
     return one + other
+
+
+@on_host
+def _placed(every: Array, numbers: np.ndarray, places: Array) -> Array:
+    return every.at[numbers].set(places)
 
 
 class Scene:
@@ -149,6 +156,23 @@ class Scene:
         self.bodies[handle.name] = replace_fields(
             body, mass_block=_sum(body.mass_block, as_array(block, float))
         )
+
+    @checked("Scene.move_nodes", nodes=NODES, positions=Numbers((None, 3)))
+    def move_nodes(self, nodes: NodeSet, positions: Any) -> None:
+        """Put some nodes of a set elsewhere in the assembled pose; elements are without stress there.
+
+        Args:
+            nodes: of this scene.
+            positions: (n, 3) [m].
+
+        Raises:
+            ValueError: for nodes of another scene.
+        """
+        if nodes.scene != self._number:
+            raise ValueError(f"move_nodes: {nodes!r} are no nodes of this scene")
+        whole = self.nodes[nodes.name]
+        place = _placed(whole.position, nodes.numbers, as_array(positions, float))
+        self.nodes[nodes.name] = replace_fields(whole, position=place)
 
     def _check_clamp(self, part: Clamp, name: str) -> None:
         owner = self.find(part.body, f"{name!r}")

@@ -175,7 +175,10 @@ CALLS = {
     "EllipsoidOnPlane": lambda w: {**GAP((w.ends[0], w.direction, w.point, *w.triad)), "semi_axes": V},
     "SphereOnBox": lambda w: {**GAP((*w.ends, *w.triad)), "size": V, "radius": NUMBER},
     "FacePressure": lambda w: {**MARKED(w.ends * 2), "pressure": [1.0, f]},
-    "Pressure": lambda w: {"surface": [w.shell], "pressure": [1.0, f], "face": NAME, "name": NAME},
+    "Pressure": lambda w: {"surface": [w.shell], "pressure": [1.0, f], "name": NAME},
+    "PointSum": lambda w: {**MARKED(w.ends), "weights": [(1.0, -1.0)]},
+    "Tie": lambda w: {"one": [w.shell.face()], "other": [w.shell.face()], "name": NAME},
+    "Scene.move_nodes": lambda w: {"nodes": [w.nodes], "positions": PLACES},
     "Solid": lambda w: {"mesh": [nc.mesh.box((1.0, 1.0, 1.0), (1, 1, 1))], **PLACED},
     "mesh.rectangle": lambda w: {"size": [(1.0, 1.0)], "counts": [(2, 2)]},
     "mesh.box": lambda w: {"size": V, "counts": [(2, 2, 2)]},
@@ -366,7 +369,8 @@ CALLS = {
 MADE = {
     "Accuracy", "Balance", "BeamHandle", "Check", "ComputedTorque", "Continuation", "DerivativeError",
     "Equilibrium", "Feedback", "Frame", "Growth", "Load", "MeshHandle", "Modes", "Nodes", "NonlinearProgram",
-    "Optima", "Outcome", "Result", "SimulationError", "Solution", "State", "System", "Trajectory",
+    "Optima", "Outcome", "Result", "SimulationError", "Solution", "State", "Surface", "System",
+    "Trajectory",
 }  # fmt: skip
 BASES = {"Constraint", "Field", "Force", "GapPotential", "Joint", "Potential", "VelocityConstraint"}
 IN_MODULES = {

@@ -141,7 +141,7 @@ def test_pressure_pushes_as_it_should():
     """On the end of a solid: its resultant, and along the axis of a column its shortening; on a ball none."""
     scene, part = body("solid")
     scene.add(nc.Clamp(nc.ground, part.set("x0")))
-    scene.add(nc.Pressure(part, lambda t: 1.0 * t, face="x1", name="push"))
+    scene.add(nc.Pressure(part.face("x1"), lambda t: 1.0 * t, name="push"))
     system, state = scene.compile()
     end = nc.equilibrium(system, state, loads=1.0, steps=1).state
     shortened = [1.0 - float(system.sense(end, h).position[0]) for h in part.set("x1")]
@@ -197,12 +197,94 @@ def test_wrong_names_are_refused():
     scene, solid = body("solid")
     with pytest.raises(ValueError, match=r"'body' has no nodes 'left'; its mesh has \['x0', 'x1'"):
         solid.set("left")
-    with pytest.raises(ValueError, match="has no faces 'left'"):
-        scene.add(nc.Pressure(solid, 1.0, face="left"))
+    with pytest.raises(ValueError, match="'body' has no faces 'left'; its mesh has"):
+        solid.face("left")
     scene, shell = body("shell")
-    with pytest.raises(ValueError, match="a shell has none to choose"):
-        scene.add(nc.Pressure(shell, 1.0, face="x1"))
+    with pytest.raises(ValueError, match="its mesh has none by name"):
+        shell.face("x1")
     with pytest.raises(ValueError, match="that is on one shell node|has a director only"):
         hub = scene.add(nc.RigidBody(mass=1.0, inertia=(1, 1, 1), position=(1, 0, 0)))
         scene.add(nc.Fixed(hub, shell.nearest((1, 0, 0))))
         scene.compile()
+
+
+# --- ties -------------------------------------------------------------------------------------------------
+
+
+def bent(mesh, amplitude):
+    """A mesh whose end faces along x are curved surfaces."""
+    nodes = mesh.nodes.copy()
+    nodes[:, 0] += amplitude * np.sin(3.0 * nodes[:, 1]) * np.cos(2.0 * nodes[:, 2])
+    return nc.mesh.Mesh(nodes, mesh.cells, mesh.sets, mesh.faces)
+
+
+def tied(amplitude=0.0, **moving):
+    """Two blocks end to end, of meshes that do not match."""
+    scene = nc.Scene()
+    fine, coarse = (bent(nc.mesh.box((1.0, 0.8, 0.8), (2, n, n)), amplitude) for n in (3, 2))
+    one = scene.add(nc.Solid(coarse, material=METAL, name="coarse"))
+    spin = moving.get("angular_velocity", (0, 0, 0))
+    two = scene.add(
+        nc.Solid(
+            fine,
+            material=METAL,
+            position=(1, 0, 0),
+            velocity=np.cross(spin, (1, 0, 0)),
+            name="fine",
+            **moving,
+        )
+    )
+    scene.add(nc.Tie(two.face("x0"), one.face("x1"), name="seam"))
+    return scene, one, two
+
+
+def test_a_uniform_stress_passes_a_tie():
+    """Pulled at one end and held at the other without hindering its width: the same stress in all elements."""
+    scene, one, two = tied()
+    table = nc.Point(nc.ground), nc.Direction(nc.ground, (1, 0, 0))
+    held = one.set("x0")
+    for node in held:
+        scene.add(nc.PointOnPlane((*table, nc.Point(node))))
+    for node, normals in (
+        (one.nearest((0, 0, 0)), [(0, 1, 0), (0, 0, 1)]),
+        (one.nearest((0, 0, 0.8)), [(0, 1, 0)]),
+    ):
+        place = nc.Point(nc.ground, node_place(one, node))
+        for normal in normals:
+            scene.add(nc.PointOnPlane((place, nc.Direction(nc.ground, normal), nc.Point(node))))
+    scene.add(nc.Pressure(two.face("x1"), lambda t: -1e3 * t))
+    system, state = scene.compile()
+    end = nc.equilibrium(system, state, steps=1).state
+    stress = np.concatenate([system.sense(end, part).stress for part in (one, two)])
+    np.testing.assert_allclose(stress[:, 0, 0], 1e3, rtol=1e-6)
+    np.testing.assert_allclose(stress[:, 1:, 1:], 0.0, atol=1e-3)
+
+
+def node_place(part, node):
+    return np.asarray(part.nodes.positions)[int(node.name.split("[")[1][:-1])]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("amplitude", [0.0, 0.06])
+def test_a_tie_in_motion(amplitude):
+    """On flat and on curved surfaces energy, momentum and angular momentum are exact, and it stays closed."""
+    scene, _, _ = tied(amplitude, angular_velocity=(0.5, 0.3, 2.0))
+    system, state = scene.compile(assemble=True)
+    trajectory = nc.simulate(system, state, dt=2e-3, steps=300)
+    found = nc.balance(system, trajectory)
+    assert found.energy.max() <= 10 * tol.ENERGY_OF_A_SMALL_SCENE
+    assert found.momentum.max() <= tol.MOMENTUM_OF_A_SMALL_SCENE
+    assert found.angular_momentum.max() <= tol.MOMENTUM_OF_A_SMALL_SCENE
+    assert system.constraint_errors(trajectory).position.max() <= 1e-12
+    stored = np.asarray(system.energy(trajectory).stores["fine"])
+    assert stored.max() >= 1e-3 * float(system.energy(state).kinetic)
+
+
+def test_ties_that_do_not_meet_are_refused():
+    scene = nc.Scene()
+    blocks = [scene.add(nc.Solid(nc.mesh.box((1, 1, 1), (1, 1, 1)), material=METAL, position=(x, 0, 0)))
+              for x in (0, 1.25, 4)]  # fmt: skip
+    with pytest.raises(ValueError, match="surfaces are 0.25 m apart at node"):
+        scene.add(nc.Tie(blocks[1].face("x0"), blocks[0].face("x1")))
+    with pytest.raises(ValueError, match="do not meet at node"):
+        scene.add(nc.Tie(blocks[2].face("x0"), blocks[0].face("x1")))

@@ -172,6 +172,13 @@ TABLE = {
     nc.PointOnPoint: Entry(
         lambda p: nc.PointOnPoint(tuple(nc.Point(body, (0.2, 0.1, -1.3)) for body in (p.one, p.two)))
     ),
+    # Two points of one body whose mean is the point of the joint, on the other.
+    nc.PointSum: Entry(
+        lambda p: nc.PointSum(
+            (nc.Point(p.one, (0.2, 0.1, -1.3)), *(nc.Point(p.two, (x, 0.1, -1.3)) for x in (0.8, -0.2))),
+            weights=(-1.0, 0.4, 0.6),
+        )
+    ),
     nc.Rod: Entry(lambda p: nc.Rod(p.ends)),
     nc.Rolling: Entry(
         lambda p: nc.Rolling((p.ends[0], p.triad[2], p.ends[1], nc.Direction(p.two, AXIS)), radius=0.3)
@@ -475,7 +482,7 @@ def test_residual_is_at_most_quadratic(joint):
         g = [residual(rows + k * step) for k in range(4)]
         scale = max(float(jnp.max(jnp.abs(x))) for x in g)
         assert np.max(np.abs(g[3] - 3 * g[2] + 3 * g[1] - g[0])) <= tol.IDENTITY * scale
-    linear = joint in (nc.Spherical, nc.PointOnPoint)
+    linear = joint in (nc.Spherical, nc.PointOnPoint, nc.PointSum)
     assert linear or np.max(np.abs(g[2] - 2 * g[1] + g[0])) > 1e-3
 
 
@@ -494,6 +501,7 @@ def test_residual_does_not_see_rigid_motions(joint):
         nc.Revolute,
         nc.Universal,
         nc.PointOnPoint,
+        nc.PointSum,
     ):  # the gap is a vector of the world
         unseen = unseen.at[:3].set(turn @ unseen[:3])
     assert np.max(np.abs(seen - unseen)) <= tol.INDIFFERENCE

@@ -17,6 +17,7 @@ from natcoord_jax.core.effect import Effect, replace_fields
 from natcoord_jax.core.elements import Elements
 from natcoord_jax.core.host import stacked
 from natcoord_jax.core.names import Names
+from natcoord_jax.core.nodes import NodeSet, NodeUnion
 
 
 @dataclass
@@ -103,7 +104,7 @@ def element_group(layout: Any, name: str, elements: Elements, turning: np.ndarra
         raise ValueError(f"{label}: {type(effect).__name__} has inputs; add it one by one")
     if effect.works:
         layout.works.append(name)
-    places, rows = layout.nodes(elements.nodes.name)
+    places, rows = _located(layout, elements.nodes)
     scene, weights = places[elements.connectivity], elements.weights(rows)
     alone = bare(effect, ("markers", "name"), label)
     bodies, nothing = layout.body_number[scene].astype(np.int32), np.zeros((count, 0), np.int32)
@@ -118,6 +119,15 @@ def element_group(layout: Any, name: str, elements: Elements, turning: np.ndarra
         source="markers",
         turning=bool(turning[bodies].any()),
     )
+
+
+def _located(layout: Any, nodes: NodeSet | NodeUnion) -> tuple[np.ndarray, np.ndarray]:
+    """Of all nodes of a set, or of some of several, their bodies, and their rows as weights of their rows."""
+    if isinstance(nodes, NodeSet):
+        return layout.nodes(nodes.name)
+    found = [(part.numbers, *layout.nodes(part.name)) for part in nodes.parts]
+    places, rows = ([x[k][x[0]] for x in found] for k in (1, 2))
+    return np.concatenate(places), np.concatenate(rows)
 
 
 def _group(members: list[Instance], turning: np.ndarray) -> Group:

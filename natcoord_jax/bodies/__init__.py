@@ -7,6 +7,7 @@ from natcoord_jax.bodies.contact import Plane as Plane
 from natcoord_jax.bodies.continua import MeshHandle as MeshHandle
 from natcoord_jax.bodies.continua import Shell as Shell
 from natcoord_jax.bodies.continua import Solid as Solid
+from natcoord_jax.bodies.continua import Surface as Surface
 from natcoord_jax.bodies.interpolation import DirectorInterpolation as DirectorInterpolation
 from natcoord_jax.bodies.interpolation import RelativeMotion as RelativeMotion
 from natcoord_jax.bodies.line_load import LineLoad as LineLoad
@@ -41,3 +42,4 @@ from natcoord_jax.bodies.shapes import (
     Sphere as Sphere,
 )
 from natcoord_jax.bodies.surface_load import Pressure as Pressure
+from natcoord_jax.bodies.tie import Tie as Tie

@@ -55,10 +55,40 @@ class MeshHandle(Handle):
             raise ValueError(f"{self.name!r} has no nodes {name!r}; its mesh has {sorted(self.mesh.sets)}")
         return self.nodes[self.mesh.sets[name]]
 
+    def face(self, name: str | None = None) -> "Surface":
+        """Faces of a solid by their name in the mesh, as "x1"; without one all that are outside, or a shell.
+
+        Raises:
+            ValueError: for a name that there is not, naming those that there are.
+        """
+        shell = self.mesh.cells.shape[1] == 4
+        if name is None:
+            return Surface(self, self.mesh.cells if shell else self.mesh.outside)
+        if name not in self.mesh.faces:
+            known = sorted(self.mesh.faces) or "none by name"
+            raise ValueError(f"{self.name!r} has no faces {name!r}; its mesh has {known}")
+        return Surface(self, self.mesh.faces[name])
+
     def nearest(self, position: Any) -> Handle:
         """The node nearest to a position in the assembled pose [m]."""
         away = np.asarray(self.nodes.positions) - np.asarray(position, float)
         return self.nodes[int(np.argmin(np.sum(away**2, axis=1)))]
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Faces of a solid, or a shell.
+
+    Attributes:
+        handle: of the solid or the shell.
+        faces: numbers of the nodes round each of them (f, 4), in turn as seen from outside.
+    """
+
+    handle: MeshHandle
+    faces: Int[np.ndarray, "f 4"]
+
+    def __repr__(self) -> str:
+        return f"<{len(self.faces)} faces of {self.handle.name!r}>"
 
 
 @on_host

@@ -11,7 +11,7 @@ from natcoord_jax.core.checks import as_array, is_concrete
 from natcoord_jax.core.effect import Effect, replace_fields
 from natcoord_jax.core.host import on_host
 from natcoord_jax.core.markers import Attachment, Marker, Point
-from natcoord_jax.core.nodes import NodeSet
+from natcoord_jax.core.nodes import NodeSet, NodeUnion
 from natcoord_jax.core.potential import place_markers
 
 
@@ -28,7 +28,7 @@ class Elements(eqx.Module):
 
     effect: Effect
     each: dict[str, Any]
-    nodes: NodeSet = eqx.field(static=True)
+    nodes: NodeSet | NodeUnion = eqx.field(static=True)
     connectivity: Int[np.ndarray, "n k"]
     name: str | None = eqx.field(static=True)
 
@@ -84,14 +84,16 @@ def _flaws(effect: Effect) -> dict[str, Array]:
     return jax.vmap(lambda e: e.flaws())(effect)
 
 
-def on(cls: type, nodes: NodeSet, connectivity: Any, each: Any, name: str | None, shared: Any) -> Elements:
+def on(
+    cls: type, nodes: NodeSet | NodeUnion, connectivity: Any, each: Any, name: str | None, shared: Any
+) -> Elements:
     """Elements of a class on nodes, see `Effect.on`.
 
     Raises:
         ValueError: for nodes of another kind, numbers that are none of the set's, or fields of another size.
     """
     label = f"{cls.__name__}.on"
-    if not isinstance(nodes, NodeSet):
+    if not isinstance(nodes, NodeSet | NodeUnion):
         raise ValueError(f"{label}: nodes is {nodes!r}, but must be a set of nodes as scene.add returned it")
     table = np.asarray(connectivity)
     if table.ndim != 2 or table.dtype.kind not in "iu":

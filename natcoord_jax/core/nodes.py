@@ -71,6 +71,35 @@ class NodeSet:
         return f"<{len(self)} nodes of {self.name!r}>"
 
 
+@dataclass(frozen=True, eq=False)
+class NodeUnion:
+    """Nodes of several sets, one set after the other, for elements that lie on all of them.
+
+    Attributes:
+        parts: the sets, or some nodes of each.
+    """
+
+    parts: tuple[NodeSet, ...]
+
+    @property
+    def numbers(self) -> np.ndarray:
+        """Of the nodes, through all sets."""
+        return np.arange(len(self))
+
+    def __len__(self) -> int:
+        return sum(map(len, self.parts))
+
+    def __getitem__(self, index: int) -> Handle:
+        for part in self.parts:
+            if index < len(part):
+                return part[index]
+            index -= len(part)
+        raise IndexError(f"there is no node {index}")
+
+    def __repr__(self) -> str:
+        return " and ".join(map(repr, self.parts))
+
+
 class Clamp(Part):
     """Nodes that are rigidly part of a body, or of the ground, with all that they carry.
 

@@ -8,6 +8,7 @@ from jaxtyping import Array, Float
 from natcoord_jax.core.arguments import Part
 from natcoord_jax.core.bodies import Body
 from natcoord_jax.core.handles import Handle
+from natcoord_jax.core.nodes import NodeSet
 
 
 @runtime_checkable
@@ -20,6 +21,10 @@ class Builder(Protocol):
 
     def find(self, handle: Handle, user: str = ...) -> Any:
         """The part behind a handle; None for the ground."""
+        ...
+
+    def move_nodes(self, nodes: NodeSet, positions: Any) -> None:
+        """Put some nodes of a set elsewhere in the assembled pose."""
         ...
 
     def add_mass(self, handle: Handle, block: Float[Array, "4 4"]) -> None:

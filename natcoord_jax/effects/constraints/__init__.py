@@ -15,3 +15,4 @@ from natcoord_jax.effects.constraints.points import (
 from natcoord_jax.effects.constraints.rolling import (
     Rolling as Rolling,
 )
+from natcoord_jax.effects.constraints.ties import PointSum as PointSum
