@@ -17,7 +17,14 @@ def _link(scene: nc.Scene, name: str, start: np.ndarray, end: np.ndarray) -> Han
     """Link of 1 kg between two points, a rod of the inertia of a sphere: the same in every direction."""
     size = float(np.linalg.norm(end - start))
     inertia = np.full(3, size**2 / 12)
-    body = nc.RigidBody(mass=1.0, inertia=inertia, com=0.5 * (end - start), position=start, name=name)
+    body = nc.RigidBody(
+        mass=1.0,
+        inertia=inertia,
+        com=0.5 * (end - start),
+        shape=nc.Sphere(0.12 * size),  # drawn smaller than its inertia says: that would hide others
+        position=start,
+        name=name,
+    )
     return scene.add(body)
 
 
@@ -98,6 +105,7 @@ def robot_arm() -> Example:
             mass=MASSES[k],
             inertia=np.full(3, 0.02 * MASSES[k]),
             com=0.5 * (following - origin),
+            shape=nc.Sphere(0.07 - 0.006 * k),  # to be seen; hands and arms are between them
             position=origin,
             name=f"link {k + 1}",
         )

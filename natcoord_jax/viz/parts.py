@@ -1,0 +1,237 @@
+"""From a system and its states to what there is to draw: bodies, joints, springs, forces, traces, ground."""
+
+import re
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from natcoord_jax.assembly.system import System
+from natcoord_jax.bodies.beam import BeamHandle
+from natcoord_jax.bodies.shapes import Surface
+from natcoord_jax.core.force import Force
+from natcoord_jax.core.markers import Marker
+from natcoord_jax.core.state import State, Trajectory
+from natcoord_jax.viz.outline import arrow, ball, bar, bodies_of, coil, marked, within
+from natcoord_jax.viz.scenery import DARK, PALETTE, RED, STEEL, Scenery, Solid, Trace
+from natcoord_jax.viz.skins import (
+    Colouring,
+    beam_skins,
+    element_skins,
+    is_node,
+    markers_of,
+    places_of,
+    with_ground,
+)
+
+MOST_COILS = 40
+"""More springs than this are drawn as bars."""
+
+
+def merged(meshes: Sequence[Surface]) -> Surface:
+    """Several meshes as one."""
+    starts = np.cumsum([0, *(len(points) for points, _ in meshes)])
+    faces = [start + np.asarray(face) for start, (_, mesh) in zip(starts, meshes) for face in mesh]
+    return np.concatenate([np.zeros((0, 3)), *(points for points, _ in meshes)]), faces
+
+
+def _named_joints(system: System) -> list[int]:
+    return [j for j, name in enumerate(system.structure.joints) if name]
+
+
+def _natural(name: str) -> list[tuple[int, str]]:
+    """For sorting: "link 2" before "link 10"."""
+    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]
+
+
+def _bodies(system: System, rows: np.ndarray, scale: float) -> list[Solid]:
+    """Bodies with arms to their joints, in the order of their names."""
+    names, frames = system.structure.bodies, np.asarray(system.frames)
+    pairs, meshes, mass = np.asarray(system.joint_bodies), bodies_of(system), np.asarray(system.mass)
+    found, number = [], 0
+    for k in sorted(range(len(names)), key=lambda k: _natural(names[k])):
+        if is_node(system, names[k]):
+            continue
+        centre = mass[k, 0, 1:] / mass[k, 0, 0]
+        mesh, colour = meshes[k], PALETTE[number % len(PALETTE)]
+        number += 1
+        small, faces = ball(0.02 * scale)
+        own, is_round = mesh or ((centre + small, faces), False)
+        (points, faces), shade = marked(own) if is_round else (own, np.ones(len(own[1])))
+        found.append(Solid(names[k], "body", points, faces, rows[:, k], colour, shade))
+        sides = [(j, side) for j in _named_joints(system) for side in (0, 1) if pairs[j, side] == k]
+        ends = [frames[j, side, 0, 1:] for j, side in sides]
+        arms = [bar(0.007 * scale, centre, end) for end in ends if not within(own, end)]
+        if arms:
+            points, faces = merged(arms)
+            found.append(Solid(names[k], "arm", points, faces, rows[:, k], colour, np.full(len(faces), 0.85)))
+    return found
+
+
+def _glyph(joint: Any, r: float) -> Surface | None:
+    """What is drawn of a joint: a ball, or bars along the axes it turns about or slides along."""
+    axes = np.eye(3)
+    if not joint.free or len(joint.rotations) == 3:
+        return ball(1.5 * r)
+    meshes = [bar(r, -2.4 * r * axes[a], 2.4 * r * axes[a]) for a in joint.rotations]
+    meshes += [bar(0.5 * r, -7 * r * axes[a], 7 * r * axes[a]) for a in joint.translations]
+    return merged(meshes) if meshes else None
+
+
+def _joints(system: System, rows: np.ndarray, scale: float) -> list[Solid]:
+    found = []
+    names, pairs, frames = system.structure.joints, np.asarray(system.joint_bodies), np.asarray(system.frames)
+    for group in system.joints:
+        joint: Any = group.effect
+        for j in (int(j) for j in np.asarray(group.joints).reshape(-1)):
+            if not names[j]:
+                continue
+            places = [np.einsum("ma,tac->tmc", frames[j, s], rows[:, pairs[j, s]]) for s in (0, 1)]
+            if joint.apart:
+                found += [_between(names[j], places[0][:, 0], places[1][:, 0], 0.006 * scale, coiled=False)]
+                continue
+            mesh = _glyph(joint, 0.011 * scale)
+            if mesh is not None:
+                shade = np.ones(len(mesh[1]))
+                found.append(Solid(names[j], "joint", *mesh, places[0], DARK, shade))
+    return found
+
+
+def _between(
+    name: str, start: np.ndarray, end: np.ndarray, radius: float, *, coiled: bool, kind: str = "link"
+) -> Solid:
+    """A coil, a bar or an arrow from one point to another (t, 3)."""
+    along = end - start
+    length = np.linalg.norm(along, axis=1, keepdims=True)
+    third = along / np.where(length > 0, length, np.nan)
+    first = np.cross(third, np.eye(3)[np.abs(np.nan_to_num(third[0])).argmin()])
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    rows = np.stack([start, radius * first, radius * np.cross(third, first), along], axis=1)
+    rows[np.isnan(rows).any(axis=(1, 2))] = np.nan
+    if kind == "force":
+        points, faces = arrow()
+        return Solid(name, kind, points, faces, rows, RED, np.ones(len(faces)), rigid=False)
+    points, faces = coil() if coiled else bar(1.0, np.zeros(3), np.array([0.0, 0, 1]))
+    return Solid(name, kind, points, faces, rows, STEEL, np.ones(len(faces)), rigid=False)
+
+
+def _links(system: System, rows: np.ndarray, scale: float) -> list[Solid]:
+    """Springs, dampers and rods: whatever sits on two points."""
+    found = []
+    for group in system.effects:
+        if group.weights is None or group.weights.ndim != 3 or group.weights.shape[1] != 2:
+            continue
+        if not np.allclose(markers_of(group)[0][..., 0].sum(axis=-1), 1.0):
+            continue
+        coiled = group.effect.stores and group.count <= MOST_COILS
+        ends = places_of(group, rows)
+        for k, name in enumerate(group.names):
+            radius = scale * (0.018 if coiled else 0.006)
+            found.append(_between(name, ends[:, k, 0], ends[:, k, 1], radius, coiled=coiled))
+    return found
+
+
+def _loads(group: Any, x: np.ndarray, inputs: np.ndarray, t: np.ndarray) -> np.ndarray | None:
+    """Forces [N] on the markers of the instances of a group (t, n, k, 3); None: torques only."""
+
+    def one(effect: Any, x: Any, u: Any, t: Any) -> Any:
+        return effect.load(x, 0 * x, u, t).forces
+
+    each = jax.vmap(one, in_axes=(None if group.effect.shared else 0, 0, 0, None))
+    found = jax.vmap(each, in_axes=(None, 0, 0, 0))(group.effect, x, inputs[:, np.asarray(group.inputs)], t)
+    return None if found is None else np.asarray(found)
+
+
+def _forces(system: System, states: State, rows: np.ndarray, inputs: np.ndarray, scale: float) -> list[Solid]:
+    """Forces at points, as arrows: the largest is a fifth of the scene long."""
+    drawn = []
+    for group in system.effects:
+        if not isinstance(group.effect, Force) or group.weights is None or group.weights.ndim != 3:
+            continue
+        x = places_of(group, rows)
+        forces = _loads(group, x, inputs, np.asarray(states.t))
+        if forces is not None:
+            at = np.isclose(markers_of(group)[0][..., 0].sum(axis=-1), 1.0)
+            drawn += [(group.names[n], x[:, n, k], forces[:, n, k]) for n, k in np.argwhere(at)]
+    largest = max((float(np.abs(force).max()) for _, _, force in drawn), default=0.0)
+    found = []
+    for name, start, force in drawn:
+        if np.abs(force).max() > 1e-6 * largest:
+            end = start + 0.2 * scale / largest * force
+            found.append(_between(name, start, end, 0.014 * scale, coiled=False, kind="force"))
+    return found
+
+
+def _up(system: System) -> tuple[np.ndarray, bool]:
+    """Direction against gravity, and whether there is any."""
+    for group in system.effects:
+        if group.effect.kind == "gravity":
+            gravity: Any = group.effect
+            down = np.asarray(gravity.vector, float).reshape(-1)[:3]
+            if np.linalg.norm(down) > 0:
+                return -down / np.linalg.norm(down), True
+    return np.array([0.0, 0.0, 1.0]), False
+
+
+def _scale(system: System, rows: np.ndarray, skins: Sequence[Any]) -> float:
+    """Diagonal of the box around everything in the first picture [m]."""
+    pairs, frames = np.asarray(system.joint_bodies), np.asarray(system.frames)
+    points = [rows[:1, : len(system.structure.bodies), 0].reshape(-1, 3)]
+    points += [skin.points[0] for skin in skins]
+    points += [frames[j, 0, 0] @ rows[:1, pairs[j, 0]][0][None] for j in _named_joints(system)]
+    for k, mesh in enumerate(bodies_of(system)):
+        if mesh is not None and not is_node(system, system.structure.bodies[k]):
+            points.append(rows[0, k, 0] + mesh[0][0] @ rows[0, k, 1:])
+    return float(np.linalg.norm(np.ptp(np.concatenate([p.reshape(-1, 3) for p in points]), axis=0))) or 1.0
+
+
+def scenery_of(
+    system: System,
+    trajectory: Trajectory,
+    saved: np.ndarray,
+    *,
+    beams: Sequence[BeamHandle] = (),
+    traces: Sequence[Marker] = (),
+    colour: Colouring = "parts",
+    title: str = "",
+) -> Scenery:
+    """What there is to draw of a trajectory of one lane.
+
+    Args:
+        system: compiled system.
+        trajectory: computed with it.
+        saved: numbers of the saved states that are drawn.
+        beams: handles, whose sections are known; the other beams are round.
+        traces: points whose paths are drawn.
+        colour: "energy", "parts", or values of elements by name, see `nc.view`.
+        title: one line.
+    """
+    states = jax.tree.map(lambda x: x[saved], trajectory.states)
+    rows = with_ground(np.asarray(states.q))
+    skins = [
+        *beam_skins(system, states, rows, saved, colour, beams),
+        *element_skins(system, states, rows, saved, colour),
+    ]
+    scale = _scale(system, rows, skins)
+    given = np.asarray(trajectory.inputs)
+    inputs = given[np.clip(saved - 1, 0, len(given) - 1)] if len(given) else np.zeros((len(saved), 0))
+    solids = [
+        *_bodies(system, rows, scale),
+        *_joints(system, rows, scale),
+        *_links(system, rows, scale),
+        *_forces(system, states, rows, inputs, scale),
+    ]
+    start = jax.tree.map(lambda x: x[0], trajectory.states)
+    paths = [np.asarray(system.sense(states, point, state=start).position) for point in traces]
+    lines = [
+        Trace(f"path of {point.body.name}", path, PALETTE[(3 + k) % len(PALETTE)])
+        for k, (point, path) in enumerate(zip(traces, paths))
+    ]
+    up, falls = _up(system)
+    found = Scenery(np.asarray(states.t), solids, skins, lines, up, None, title)
+    if not falls:
+        return found
+    heights = [np.nanmin(s.corners @ up) for s in solids if s.kind == "body"]
+    heights += [np.nanmin(s.points @ up) for s in skins]
+    return found._replace(ground=float(min(heights, default=0.0)))
