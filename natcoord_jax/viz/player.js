@@ -6,49 +6,21 @@ const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a
 const unit = a => scaled(a, 1 / (Math.hypot(...a) || 1));
 const times = (a, b) => a.map((_, i) => [0, 1, 2, 3].reduce((s, k) => s + a[4 * k + i % 4] * b[(i & 12) + k], 0));
 const ONE = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1];
-
-const VERTEX = `#version 300 es
-uniform mat4 seen, model; in vec3 place, normal, colour; out vec3 at, out_normal, out_colour;
-void main() { vec4 world = model * vec4(place, 1.); at = world.xyz; out_normal = mat3(model) * normal;
-  out_colour = colour; gl_Position = seen * world; }`;
-const FRAGMENT = `#version 300 es
-precision highp float; in vec3 at, out_normal, out_colour; out vec4 shown;
-uniform vec3 eye, up, middle; uniform vec4 plain; uniform int mode; uniform float alpha, cell, reach;
-float lattice(vec2 p) { vec2 d = abs(fract(p - .5) - .5) / fwidth(p); return 1. - min(min(d.x, d.y), 1.); }
-void main() {
-  vec3 view = normalize(eye - at);
-  if (mode == 1) { shown = plain; return; }
-  if (mode == 2) { // the ground, which fades out
-    vec3 a = normalize(abs(up.z) < .9 ? cross(up, vec3(0, 0, 1)) : cross(up, vec3(0, 1, 0))), b = cross(up, a);
-    vec2 p = vec2(dot(at, a), dot(at, b)) / cell;
-    float line = max(.5 * lattice(p), lattice(p / 5.)) * .16;
-    shown = vec4(vec3(.90, .91, .925) - line, 1. - smoothstep(.35, 1., length(at - middle) / reach)); return; }
-  // Surfaces without normals of their own are flat; all are seen from both sides.
-  vec3 n = dot(out_normal, out_normal) > 1e-12 ? normalize(out_normal) : normalize(cross(dFdx(at), dFdy(at)));
-  n = faceforward(n, -view, n);
-  vec3 side = normalize(cross(up, view) + vec3(1e-6)), light = normalize(view + .9 * up - .5 * side);
-  float lit = .54 + .1 * dot(n, up) + .44 * max(dot(n, light), 0.);
-  float gloss = .13 * pow(max(dot(n, normalize(light + view)), 0.), 40.);
-  shown = vec4(out_colour * lit + gloss, alpha); }`;
-
 async function unpack() {
   const bytes = Uint8Array.from(atob(packed), c => c.charCodeAt(0));
   const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
   return new Response(stream).arrayBuffer();
 }
-
 function program(gl) {
   const made = gl.createProgram();
-  for (const [kind, text] of [[gl.VERTEX_SHADER, VERTEX], [gl.FRAGMENT_SHADER, FRAGMENT]]) {
+  for (const [kind, id] of [[gl.VERTEX_SHADER, "vertex"], [gl.FRAGMENT_SHADER, "fragment"]]) {
     const shader = gl.createShader(kind);
-    gl.shaderSource(shader, text); gl.compileShader(shader); gl.attachShader(made, shader);
+    gl.shaderSource(shader, $(id).textContent.trim()); gl.compileShader(shader); gl.attachShader(made, shader);
     if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) throw Error(gl.getShaderInfoLog(shader));
   }
   ["place", "normal", "colour"].forEach((name, k) => gl.bindAttribLocation(made, k, name));
-  gl.linkProgram(made); gl.useProgram(made);
-  return made;
+  gl.linkProgram(made); gl.useProgram(made); return made;
 }
-
 function start(data) {
   const gl = $("canvas").getContext("webgl2", { antialias: true });
   if (!gl) { $("title").textContent = "This view needs WebGL 2, which this browser does not offer."; return; }
@@ -89,25 +61,22 @@ function start(data) {
 
   const lattice = scene.ground === null ? "" : `   (lattice of ${+scene.cell.toPrecision(3)} m)`;
   // --- what the reader sets
-  const state = { now: 0, playing: true, lane: 0, follow: "", offset: [0, 0, 0] };
-  const up = unit(scene.up), middle = scaled(add(...scene.extent), 0.5), end = scene.times[pictures - 1] - scene.times[0];
+  const state = { now: 0, playing: true, lane: 0, follow: "" }, camera = {}, up = unit(scene.up), middle = scaled(add(...scene.extent), 0.5), end = scene.times[pictures - 1] - scene.times[0];
   const across = unit(cross(Math.abs(up[2]) < 0.9 ? [0, 0, 1] : [1, 0, 0], up)), ahead = cross(up, across);
-  const camera = {};
-  const home = () => Object.assign(camera, { target: middle, distance: 1.15 * scene.reach, offset: [0, 0, 0],
+  const home = () => Object.assign(camera, { target: middle, distance: 1.3 * scene.reach, offset: [0, 0, 0],
     turn: Math.atan2(dot(scene.eye, ahead), dot(scene.eye, across)), lift: Math.asin(dot(scene.eye, up)) });
-  home();
-  $("title").textContent = scene.title;
+  home(); $("title").textContent = scene.title;
   for (const f of [0.05, 0.1, 0.25, 0.5, 1, 2, 4]) {
-    const pace = f * scene.pace, option = new Option(`${+pace.toPrecision(2)} ×`, pace, f === 1, f === 1);
-    $("speed").add(option);
+    const pace = f * scene.pace;
+    $("speed").add(new Option(`${+pace.toPrecision(2)} ×`, pace, f === 1, f === 1));
   }
   for (const name of scene.bodies) $("follow").add(new Option(name, name));
   $("follow").value = state.follow = scene.follow;
-  $("lanes").hidden = $("ghostly").hidden = scene.lanes === 1;
-  $("lane").max = scene.lanes - 1;
-  const swatches = [...scene.solids.filter(s => s.kind === "body"), ...scene.skins.filter(s => !s.values), ...scene.traces];
+  $("lanes").hidden = $("ghostly").hidden = scene.lanes === 1; $("lane").max = scene.lanes - 1;
+  const bodies = scene.solids.filter(s => s.kind === "body");
+  const swatches = [...bodies, ...scene.skins.filter(s => !s.values), ...scene.traces];
   const css = c => `rgb(${c.map(x => Math.round(255 * x))})`;
-  const line = (parent, kind, text) => { const e = parent.appendChild(document.createElement(kind)); e.textContent = text; return e; };
+  const line = (parent, kind, text) => Object.assign(parent.appendChild(document.createElement(kind)), { textContent: text });
   for (const s of swatches.slice(0, 12)) {
     const row = line($("legend"), "div", "");
     line(row, "i", "").style.background = css(s.colour); line(row, "span", s.name);
@@ -118,7 +87,6 @@ function start(data) {
     line(box, "div", "").style.background = `linear-gradient(90deg, ${scene.colours.map(css)})`;
     for (const x of s.range) line(box, "span", x.toPrecision(3));
   }
-
   // --- where things are at a time
   const picture = t => {
     let k = 0, high = pictures - 1;
@@ -134,30 +102,26 @@ function start(data) {
     for (let i = 0; i < size; i++) found[i] = ref.least + ref.step * (track[a + i] * (1 - f) + track[b + i] * f);
     return found;
   };
-  const frame = (s, lane, place) => {
-    const r = between(s.track, s.rows, 12, lane, place);
+  const frame = (s, lane, place, r = between(s.track, s.rows, 12, lane, place)) => {
     if (!r) return null;
     let v = [1, 2, 3].map(k => [...r.slice(3 * k, 3 * k + 3)]);
     if (s.rigid) { const a = unit(v[0]), c = unit(cross(a, v[1])); v = [a, cross(c, a), c]; }
     return [...v[0], 0, ...v[1], 0, ...v[2], 0, r[0], r[1], r[2], 1];
   };
   const centre = place => {
-    const s = scene.solids.find(s => s.kind === "body" && s.name === state.follow);
-    const m = s && frame(s, state.lane, place);
+    const s = bodies.find(s => s.name === state.follow), m = s && frame(s, state.lane, place);
     if (m) return [0, 1, 2].map(i => m[12 + i] + s.centre.reduce((t, c, k) => t + c * m[4 * k + i], 0));
     const skin = scene.skins.find(s => s.name === state.follow);
     const p = skin && between(skin.track, skin.points, skin.size, state.lane, place);
     return p && [0, 1, 2].map(i => { let t = 0; for (let k = i; k < p.length; k += 3) t += p[k]; return 3 * t / p.length; });
   };
-
   // --- drawing
   const attribute = (k, b, fallback) => {
     if (!b) { gl.disableVertexAttribArray(k); gl.vertexAttrib3f(k, ...(fallback || [0, 0, 0])); return; }
     gl.bindBuffer(gl.ARRAY_BUFFER, b); gl.enableVertexAttribArray(k); gl.vertexAttribPointer(k, 3, gl.FLOAT, false, 0, 0);
   };
   const plain = (mode, colour) => { gl.uniform1i(at.mode, mode); if (colour) gl.uniform4fv(at.plain, colour); };
-  const solid = (s, model, edges) => {
-    const m = meshes[s.mesh];
+  const solid = (s, model, edges, m = meshes[s.mesh]) => {
     gl.uniformMatrix4fv(at.model, false, model);
     attribute(0, m.place); attribute(1, s.rigid && m.normal); attribute(2, s.paint);
     gl.drawArrays(gl.TRIANGLES, 0, m.count);
@@ -248,7 +212,6 @@ function start(data) {
     $("time").textContent = `t = ${(scene.times[0] + state.now).toFixed(scene.digits)} s` + lattice;
     $("place").value = end > 0 ? state.now / end : 0; $("which").textContent = `${state.lane + 1} of ${scene.lanes}`;
   };
-
   // --- hands
   const play = on => { state.playing = on; $("play").textContent = on ? "❚❚" : "►"; };
   $("play").onclick = () => play(!state.playing);
@@ -270,7 +233,7 @@ function start(data) {
       camera.lift = Math.max(-1.55, Math.min(1.55, camera.lift + 0.008 * e.movementY));
     }
   };
-  $("canvas").addEventListener("wheel", e => { e.preventDefault(); camera.distance *= Math.exp(0.001 * e.deltaY); }, { passive: false });
+  $("canvas").onwheel = e => { e.preventDefault(); camera.distance *= Math.exp(0.001 * e.deltaY); };
 
   // A number behind the name of the file stops there: motion.html#0.5 is the middle.
   const asked = parseFloat(location.hash.slice(1));
