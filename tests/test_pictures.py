@@ -64,7 +64,7 @@ def test_bodies_without_a_shape_are_the_plainest_solid_with_their_inertia():
     solids = {
         "box": nc.Box((0.4, 0.3, 0.2)),
         "disc": nc.Cylinder(0.3, 0.1),
-        "rod": nc.Cylinder(0.02, 1.0),
+        "rod": nc.Cylinder(0.03, 1.0),
         "ball": nc.Sphere(0.2),
     }
     for name, shape in solids.items():

@@ -17,6 +17,7 @@ import natcoord_jax as nc
 from natcoord_jax import gallery
 from natcoord_jax.viz import motion
 from natcoord_jax.viz.packed import Blob, triangles
+from natcoord_jax.viz.scenery import PALETTE
 
 CHROMIUM = next((p for p in ("chromium", "chromium-browser", "google-chrome") if shutil.which(p)), None)
 FLAGS = (
@@ -196,7 +197,9 @@ def test_a_browser_shows_it_without_complaint(name, run, sheet, tmp_path):
     """Drawn at two times: something is there, it moves, and the console is silent."""
     from matplotlib.image import imread
 
-    nc.view(*{"rods": run, "sheet": sheet}[name], file=tmp_path / "motion.html", title=name)
+    moving = {"rods": run, "sheet": sheet}[name]
+    traces = gallery.load("double_pendulum").traces if name == "rods" else ()
+    nc.view(*moving, file=tmp_path / "motion.html", title=name, traces=traces)
     pictures = []
     for place in (0.0, 0.9):
         shot = tmp_path / f"{place}.png"
@@ -211,4 +214,7 @@ def test_a_browser_shows_it_without_complaint(name, run, sheet, tmp_path):
     # Bodies are far from the grey of ground and sky.
     coloured = [float((np.ptp(p, axis=2) > 0.15).mean()) for p in pictures]
     assert min(coloured) > 1e-3, f"nothing is drawn: {coloured}"
+    # A path is a line of a pixel or two, and not the scribble that wrong numbers would be.
+    path = [float((np.abs(p - PALETTE[3]).max(axis=2) < 0.05).mean()) for p in pictures]
+    assert name == "sheet" or (path[0] < 1e-5 < path[1] < 1e-2), path
     assert float((np.abs(pictures[0] - pictures[1]).max(axis=2) > 0.1).mean()) > 1e-3, "nothing moves"

@@ -43,7 +43,9 @@ def chain(bodies: int = 8) -> Example:
         scene.add(nc.Revolute(carrier, body, point=k * step, axis=axis, name=f"hinge {k + 1}"))
         carrier = body
     system, state = scene.compile()
-    return Example("chain", f"a chain of {bodies} links", system, state, 0.005, 200, facts={"dofs": bodies})
+    end = nc.Point(carrier, step, local=True)
+    about = f"a chain of {bodies} links"
+    return Example("chain", about, system, state, 0.005, 200, facts={"dofs": bodies}, traces=(end,))
 
 
 def binary_tree(bodies: int = 15) -> Example:

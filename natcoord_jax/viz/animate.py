@@ -29,8 +29,8 @@ from natcoord_jax.viz.stage import Stage
 
 LONGEST, SHORTEST = 10.0, 2.0
 """Shown time of a film [s]; longer and shorter motions are shown faster or slower than they are."""
-LIMIT = 2_900_000
-"""Most bytes of a film."""
+LIMIT = 2_400_000
+"""Bytes that the pictures of a film may have by their first one; later ones may be larger."""
 DOTS = 90
 SUFFIXES = (".gif", ".mp4", ".html")
 POINTS = Several(of("nc.Point(body, (x, y, z))", Marker))

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from natcoord_jax.assembly.system import System
 from natcoord_jax.bodies.shapes import Box, Cylinder, Ellipsoid, Placed, Sphere, Surface
 
-THINNEST = 0.02
+THINNEST = 0.03
 """Least edge of a solid, relative to its longest: plates and rods stay visible."""
 ALIKE = 0.02
 """How far two principal second moments may differ for a round solid, relative to the largest."""

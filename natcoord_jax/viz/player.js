@@ -28,7 +28,7 @@ function start(data) {
   for (const name of ["seen", "model", "eye", "up", "middle", "plain", "mode", "alpha", "cell", "reach"])
     at[name] = gl.getUniformLocation(made, name);
 
-  // Numbers are whole multiples of a step, as differences from one picture to the next where there are several.
+  // Numbers are whole multiples of a step, differences along time where there is one: to be undone once, in place.
   const whole = r => {
     const found = new Int16Array(data, r.at, r.count);
     for (let i = r.stride; i < r.count && r.stride; i++) found[i] += found[i - r.stride];
@@ -56,7 +56,7 @@ function start(data) {
     s.corners = new Int32Array(data, s.faces.at, s.faces.count);
     s.place = buffer(0); s.paint = buffer(0); s.lines = buffer(0);
   }
-  for (const s of scene.traces) { s.track = whole(s.points); s.path = buffer(floats(s.points), 1); }
+  for (const s of scene.traces) s.path = buffer(floats(s.points), 1);
   const plane = buffer(new Float32Array(18)), pictures = scene.times.length;
 
   const lattice = scene.ground === null ? "" : `   (lattice of ${+scene.cell.toPrecision(3)} m)`;

@@ -19,8 +19,8 @@ PALETTE: tuple[Colour, ...] = (
 DARK, STEEL, RED = (0.16, 0.18, 0.21), (0.42, 0.45, 0.49), (0.85, 0.16, 0.12)
 
 
-TRAVELS = 2.0
-"""How many times the size of one picture the whole motion is, for the eye to go along."""
+TRAVELS = 1.5
+"""How many times its own size a motion goes, for the eye to go along."""
 
 
 class Solid(NamedTuple):
@@ -137,8 +137,8 @@ class Scenery(NamedTuple):
 
     @property
     def travels(self) -> bool:
-        """Whether the whole motion is so much larger than a picture of it that the eye has to go along."""
-        return self.size > TRAVELS * self.reach
+        """Whether it goes so far that the eye has to go along."""
+        return float(np.linalg.norm(np.ptp(self.boxes.mean(axis=1), axis=0))) > TRAVELS * self.reach
 
     def eye(self) -> np.ndarray:
         """Direction from which the motion is seen best: across the plane that it spreads in, and from above.

@@ -25,6 +25,7 @@ def plot_snapshots(
     panels: Sequence[Panel],
     *,
     beams: Sequence[BeamHandle] = (),
+    caption: str = "",
 ) -> Figure:
     """Pictures of a motion at some times, with diagrams below.
 
@@ -33,12 +34,13 @@ def plot_snapshots(
         times: of the snapshots [s]; those after the end are left out.
         panels: the diagrams.
         beams: handles of beams, whose sections are drawn.
+        caption: what there is to see, below the pictures.
     """
     end = float(phases.t[-1])
     scenery = scenery_at(phases, np.array([t for t in times if t <= end + 1e-9 * (1 + end)]), beams=beams)
     frames = range(len(scenery.t))
     rows = -(-len(frames) // COLUMNS)
-    wide = min(len(panels), MOST_IN_A_ROW)
+    wide = 2 if len(panels) == 4 else min(len(panels), MOST_IN_A_ROW)
     high = 3.6 * -(-len(panels) // wide)
     figure = plt.figure(figsize=(3.2 * COLUMNS, 3.2 * rows + high), layout="constrained")
     halves: Any = figure.subfigures(2, 1, height_ratios=(3.2 * rows, high))
@@ -46,6 +48,8 @@ def plot_snapshots(
     for frame in frames:
         axes = above.add_subplot(rows, COLUMNS, frame + 1, projection="3d")
         Stage(axes, scenery, labelled=False, zoom=1.25).show(frame, "t = {:g} s")
+    if caption:
+        below.suptitle(caption, fontsize=10, x=0.02, ha="left")
     grid = list(below.subplots(-(-len(panels) // wide), wide, squeeze=False).flat)
     for axes, panel in zip(grid, panels):
         draw(axes, panel)
