@@ -16,7 +16,6 @@ from natcoord_jax.core.results import Result
 from natcoord_jax.gallery.report import measure, table
 from natcoord_jax.stepping.error_control import Tolerance
 from natcoord_jax.stepping.scheme import Scheme
-from natcoord_jax.viz.views import open_file
 
 WHOLE = 1e-9
 """How far the number of steps may be from a whole number, relatively."""
