@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 import sys
+import urllib.request
 import zlib
 
 import jax
@@ -189,6 +190,33 @@ def test_round_faces_are_smooth_and_edges_are_seen(run):
     mantle = np.abs(normal[:, 0]) < 1e-9
     away = place[mantle][:, 1:] / np.linalg.norm(place[mantle][:, 1:], axis=1, keepdims=True)
     np.testing.assert_allclose(np.abs(np.sum(away * normal[mantle][:, 1:], axis=1)), 1.0, atol=0.01)
+
+
+def test_it_is_served_live(run, sheet, capsys):
+    pytest.importorskip("viser", reason="no viser: install the extra viz3d")
+    system, trajectory = run
+    live = nc.view(
+        system, trajectory, live=True, follow="rod 2", traces=gallery.load("double_pendulum").traces
+    )
+    try:
+        assert live.address in capsys.readouterr().out
+        with urllib.request.urlopen(live.address, timeout=10) as page:
+            assert page.status == 200
+        live.playing.value = False
+        live.now.value = 0.1
+        live.show()
+        place = dict(zip([s.name for s in live.lanes[0].solids], live.moved))["rod 2"].position
+        np.testing.assert_allclose(place, np.asarray(trajectory.q)[20, 4], atol=1e-6)
+    finally:
+        live.stop()
+    live = nc.view(*sheet, live=True)
+    live.stop()
+
+
+def test_without_viser_the_line_to_install_it_is_named(run, monkeypatch):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    with pytest.raises(ImportError, match=r'pip install "natcoord-jax\[viz3d\]"'):
+        nc.view(*run, live=True)
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no chromium: install it, apt-get install chromium")

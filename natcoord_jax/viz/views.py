@@ -160,10 +160,10 @@ def view(
             [J/m^3]; "parts"; or values of the elements by name, shape (elements,) or (saved, elements).
         beams: handles of beams, whose sections are drawn as given; the others are round.
         live: serve it by viser (the extra `viz3d`) instead, with no limit of size: for what runs on another
-            machine. Returns the server.
+            machine. Of what is returned, `.wait()` stays until it is interrupted, `.stop()` ends it.
 
     Returns:
-        A `View`; the path of the file; or the server.
+        A `View`; the path of the file; or what is served, with its `address`.
 
     Raises:
         ValueError: for no trajectory, a batch of several axes, another kind of file, a body that there is
@@ -196,9 +196,9 @@ def view(
     }
     pace = pace_of(np.asarray(phases.t).reshape(-1, np.shape(phases.t)[-1])[0])
     if live:
-        from natcoord_jax.viz.live import serve
+        from natcoord_jax.viz.live import Live
 
-        return serve(_sceneries(phases, MOST_PICTURES, options), pace, name)
+        return Live(_sceneries(phases, MOST_PICTURES, options), pace, name)
     # A notebook stores what it shows, escaped once more.
     shown = file is None and _in_notebook()
     made = View(_page(phases, name, pace, LIMIT // 4 if shown else LIMIT, options))
