@@ -56,8 +56,11 @@ def _errors(system: System, trajectory: Trajectory, t: np.ndarray) -> Panel:
     found, violated = balance(system, trajectory), system.constraint_errors(trajectory)
     kept = [
         ("energy less work", found.energy),
-        (f"momentum ({found.directions} directions)", found.momentum),
-        (f"angular momentum ({found.axes} axes)", found.angular_momentum),
+        (
+            f"momentum ({found.directions} {'direction' if found.directions == 1 else 'directions'})",
+            found.momentum,
+        ),
+        (f"angular momentum ({found.axes} {'axis' if found.axes == 1 else 'axes'})", found.angular_momentum),
         ("constraints [m, -]", violated.position),
         ("their rates [m/s, 1/s]", violated.velocity),
     ]

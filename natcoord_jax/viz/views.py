@@ -100,7 +100,10 @@ def _page(phases: Phases, follow: str, pace: float, limit: int, options: Mapping
 
 
 def _in_notebook() -> bool:
-    return "ipykernel" in sys.modules and "IPython" in sys.modules
+    """Whether this runs in the kernel of a notebook; to look must not load anything."""
+    ipython = sys.modules.get("IPython")
+    shell = ipython.get_ipython() if ipython is not None else None
+    return shell is not None and "IPKernelApp" in shell.config
 
 
 def _has_display() -> bool:
