@@ -17,7 +17,8 @@ from natcoord_jax import gallery  # noqa: E402
 from natcoord_jax.viz.motion import scenery_at  # noqa: E402
 from natcoord_jax.viz.outline import bodies_of  # noqa: E402
 from natcoord_jax.viz.panels import Curve, Panel, draw  # noqa: E402
-from natcoord_jax.viz.skins import beam_skins, is_node, with_ground  # noqa: E402
+from natcoord_jax.viz.skins import beam_skins, drawn_bodies, with_ground  # noqa: E402
+from natcoord_jax.viz.solutions import solution_panels  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +73,7 @@ def test_bodies_without_a_shape_are_the_plainest_solid_with_their_inertia():
         mass, inertia = shape.mass_properties(1000.0)
         scene.add(nc.RigidBody(mass=mass, inertia=inertia, com=(1, 2, 3)))
         system, _ = scene.compile()
-        [((points, _), is_round)] = bodies_of(system)
+        ((points, _), is_round) = bodies_of(system, [0])[0]
         assert is_round == (name != "box")
         assert sorted(np.ptp(points, axis=0)) == pytest.approx(sorted(np.ptp(shape.surface()[0], axis=0)))
         assert 0.5 * (points.min(axis=0) + points.max(axis=0)) == pytest.approx((1, 2, 3))
@@ -119,6 +120,24 @@ def test_batches_are_bands(run):
         nc.plot(system, batch, times=(0.0,))
 
 
+def test_solutions_show_their_bounds_and_goals():
+    """Whether they are obeyed or not: here by inputs that nobody has optimised."""
+    example = gallery.load("slider_crank")
+    system, state = example.system, example.state
+    limits = nc.bounds.Input(-2.0, 3.0) & nc.bounds.Coordinate(-1.0, float("inf"), joint="hinge")
+    aim = nc.goal.Coordinate("hinge", 0.5) & nc.goal.Rate("hinge", 0.25)
+    problem = nc.OptimalControl(
+        system, state, dt=0.002, steps=3, cost=nc.cost.Effort(), bounds=limits, goal=aim
+    )
+    solution = nc.Solution(problem, jnp.ones((3, 1)), {}, 0.002, 0.0, 0, "none", None, None, [])
+    panels = {panel.title: panel for panel in solution_panels(solution)}
+    assert list(panels)[:3] == ["inputs", "joint angles", "joint rates"]
+    assert panels["inputs"].bounds == [-2.0, 3.0] and panels["joint angles"].bounds == [-1.0]
+    assert panels["joint angles"].goals == [(0.006, pytest.approx(0.5))]
+    assert panels["joint rates"].goals == [(0.006, pytest.approx(0.25))]
+    nc.plot(solution)
+
+
 SHAPES = {
     "box": (nc.Box((0.4, 0.3, 0.2)), (0.4, 0.3, 0.2)),
     "sphere": (nc.Sphere(0.2), (0.4, 0.4, 0.4)),
@@ -134,7 +153,7 @@ def test_bodies_are_drawn_as_their_shapes(name):
     scene = nc.Scene()
     scene.add(nc.RigidBody(shape=shape, density=1000.0, com=(1, 2, 3)))
     system, _ = scene.compile()
-    [((points, faces), _)] = bodies_of(system)
+    ((points, faces), _) = bodies_of(system, [0])[0]
     points = points - (1, 2, 3)
     assert np.ptp(points, axis=0) == pytest.approx(size)
     assert sorted({int(k) for face in faces for k in face}) == list(range(len(points)))
@@ -161,7 +180,7 @@ def test_beams_are_drawn_as_swept_sections(tmp_path):
     round_ = np.ptp(skin.points.reshape(-1, 3), axis=0)
     most = 2 * 0.02 * 0.5
     assert sorted(round_[1:]) == pytest.approx([min(most, 2 * 0.02 / np.sqrt(3)), most])
-    assert [is_node(system, name) for name in system.structure.bodies].count(True) == 2
+    assert [system.structure.bodies[k] for k in drawn_bodies(system)] == ["body 1"]
     run = nc.simulate(system, state, dt=0.01, steps=5)
     file = nc.animate(system, run, file=tmp_path / "beam.gif", beams=[beam])
     assert file.read_bytes()[:3] == b"GIF"

@@ -4,6 +4,8 @@ A mesh is points and the numbers of those around each face. It is the one descri
 films and the 3D view alike.
 """
 
+from collections.abc import Iterable
+
 import numpy as np
 from jaxtyping import Float
 
@@ -49,20 +51,21 @@ def equal_inertia(block: Float[np.ndarray, "4 4"]) -> tuple[Surface, bool]:
     return (centre + (points * size) @ axes[:, order].T, faces), isinstance(shape, ROUND)
 
 
-def bodies_of(system: System) -> list[tuple[Surface, bool] | None]:
-    """Mesh of each body in its axes, and whether it is round; None for what has no extent, a point mass.
+def bodies_of(system: System, numbers: Iterable[int]) -> dict[int, tuple[Surface, bool] | None]:
+    """Meshes of some bodies in their axes, and whether they are round; None of a point mass, without extent.
 
     That is the shape that it was given; of others the plainest solid with their inertia.
     """
-    found: list[tuple[Surface, bool] | None] = []
-    points = set(system.structure.points)
-    for number, (block, shape) in enumerate(zip(np.asarray(system.mass), system.structure.shapes)):
+    found: dict[int, tuple[Surface, bool] | None] = {}
+    points, mass = set(system.structure.points), np.asarray(system.mass)
+    for number in numbers:
+        block, shape = mass[number], system.structure.shapes[number]
         if isinstance(shape, Placed):
-            found.append((shape.surface(), isinstance(shape.shape, ROUND)))
+            found[number] = shape.surface(), isinstance(shape.shape, ROUND)
         elif number in points or not np.any(np.abs(block[1:, 1:]) > 0):
-            found.append(None)
+            found[number] = None
         else:
-            found.append(equal_inertia(block))
+            found[number] = equal_inertia(block)
     return found
 
 

@@ -18,13 +18,15 @@ from natcoord_jax.viz.scenery import DARK, PALETTE, RED, STEEL, Scenery, Solid, 
 from natcoord_jax.viz.skins import (
     Colouring,
     beam_skins,
+    drawn_bodies,
     element_skins,
-    is_node,
     markers_of,
     places_of,
     with_ground,
 )
 
+Meshes = dict[int, tuple[Surface, bool] | None]
+"""Meshes of the bodies that are drawn, by their numbers, and whether they are round."""
 MOST_COILS = 40
 """More springs than this are drawn as bars."""
 
@@ -45,17 +47,13 @@ def _natural(name: str) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]
 
 
-def _bodies(system: System, rows: np.ndarray, scale: float) -> list[Solid]:
+def _bodies(system: System, meshes: Meshes, rows: np.ndarray, scale: float) -> list[Solid]:
     """Bodies with arms to their joints, in the order of their names."""
     names, frames = system.structure.bodies, np.asarray(system.frames)
-    pairs, meshes, mass = np.asarray(system.joint_bodies), bodies_of(system), np.asarray(system.mass)
-    found, number = [], 0
-    for k in sorted(range(len(names)), key=lambda k: _natural(names[k])):
-        if is_node(system, names[k]):
-            continue
+    pairs, mass, found = np.asarray(system.joint_bodies), np.asarray(system.mass), []
+    for number, k in enumerate(sorted(meshes, key=lambda k: _natural(names[k]))):
         centre = mass[k, 0, 1:] / mass[k, 0, 0]
         mesh, colour = meshes[k], PALETTE[number % len(PALETTE)]
-        number += 1
         small, faces = ball(0.02 * scale)
         own, is_round = mesh or ((centre + small, faces), False)
         (points, faces), shade = marked(own) if is_round else (own, np.ones(len(own[1])))
@@ -174,14 +172,14 @@ def _up(system: System) -> tuple[np.ndarray, bool]:
     return np.array([0.0, 0.0, 1.0]), False
 
 
-def _scale(system: System, rows: np.ndarray, skins: Sequence[Any]) -> float:
+def _scale(system: System, meshes: Meshes, rows: np.ndarray, skins: Sequence[Any]) -> float:
     """Diagonal of the box around everything in the first picture [m]."""
     pairs, frames = np.asarray(system.joint_bodies), np.asarray(system.frames)
     points = [rows[:1, : len(system.structure.bodies), 0].reshape(-1, 3)]
     points += [skin.points[0] for skin in skins]
     points += [frames[j, 0, 0] @ rows[:1, pairs[j, 0]][0][None] for j in _named_joints(system)]
-    for k, mesh in enumerate(bodies_of(system)):
-        if mesh is not None and not is_node(system, system.structure.bodies[k]):
+    for k, mesh in meshes.items():
+        if mesh is not None:
             points.append(rows[0, k, 0] + mesh[0][0] @ rows[0, k, 1:])
     return float(np.linalg.norm(np.ptp(np.concatenate([p.reshape(-1, 3) for p in points]), axis=0))) or 1.0
 
@@ -213,11 +211,12 @@ def scenery_of(
         *beam_skins(system, states, rows, saved, colour, beams),
         *element_skins(system, states, rows, saved, colour),
     ]
-    scale = _scale(system, rows, skins)
+    meshes = bodies_of(system, drawn_bodies(system))
+    scale = _scale(system, meshes, rows, skins)
     given = np.asarray(trajectory.inputs)
     inputs = given[np.clip(saved - 1, 0, len(given) - 1)] if len(given) else np.zeros((len(saved), 0))
     solids = [
-        *_bodies(system, rows, scale),
+        *_bodies(system, meshes, rows, scale),
         *_joints(system, rows, scale),
         *_links(system, rows, scale),
         *_forces(system, states, rows, inputs, scale),

@@ -55,13 +55,17 @@ def _beam_of(element: str) -> str:
     return element.rpartition("/")[0]
 
 
-def is_node(system: System, body: str) -> bool:
-    """Whether a body is a node of a set, or a beam's own, which is drawn as part of that."""
-    if isinstance(system.structure.bodies, Names) and body.endswith("]"):
-        return True
-    names = {_beam_of(name) for group in _chains(system) for name in group.names}
-    beam, _, rest = body.rpartition("/")
-    return bool(beam) and beam in names and rest.startswith("node ")
+def drawn_bodies(system: System) -> list[int]:
+    """Numbers of the bodies that are drawn as such: not those of the nodes of sets and of beams."""
+    names = system.structure.bodies
+    beams = {_beam_of(name) for group in _chains(system) for name in group.names}
+    found = []
+    for number, name in enumerate(names):
+        owner, _, rest = name.rpartition("/")
+        of_a_set = isinstance(names, Names) and name.endswith("]")
+        if not of_a_set and not (owner and owner in beams and rest.startswith("node ")):
+            found.append(number)
+    return found
 
 
 def energies(system: System, group: Group, states: State) -> Float[np.ndarray, "t n"]:
