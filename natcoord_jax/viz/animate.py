@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from natcoord_jax.analysis.phases import Phases
 from natcoord_jax.assembly.system import System
 from natcoord_jax.bodies.beam import BeamHandle
+from natcoord_jax.control.solution import Solution
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.kinds import NAME, Several, of
 from natcoord_jax.core.markers import Marker
@@ -69,13 +70,15 @@ def _bytes_of_a_picture(figure: Figure, suffix: str) -> int:
 
 def _stage(scenery: Scenery) -> tuple[Figure, Stage]:
     figure = plt.figure(figsize=(5.6, 4.8), dpi=DOTS)
-    axes: Any = figure.add_axes((0.0, 0.05, 0.96, 0.85), projection="3d")
+    coloured = any(s.values is not None for s in scenery.skins)
+    place = (0.0, 0.14, 0.96, 0.77) if coloured else (0.0, 0.05, 0.96, 0.85)
+    axes: Any = figure.add_axes(place, projection="3d")
     for skin, values in [(s, s.values) for s in scenery.skins if s.values is not None][:1]:
         scale = ScalarMappable(Normalize(*limits(values)), LinearSegmentedColormap.from_list("", STOPS))
-        bar = figure.colorbar(scale, cax=figure.add_axes((0.3, 0.06, 0.4, 0.018)), orientation="horizontal")
+        bar = figure.colorbar(scale, cax=figure.add_axes((0.3, 0.09, 0.4, 0.018)), orientation="horizontal")
         bar.ax.tick_params(labelsize=7)
         bar.set_label(f"{skin.name}: {skin.label}", fontsize=7, labelpad=1)
-    return figure, Stage(axes, scenery)
+    return figure, Stage(axes, scenery, zoom=1.05)
 
 
 def _write(film: FuncAnimation, file: Path, fps: int) -> None:
@@ -106,7 +109,7 @@ def _write(film: FuncAnimation, file: Path, fps: int) -> None:
     colour=COLOURS,
 )
 def animate(
-    system: System | Phases,
+    system: System | Phases | Solution,
     trajectory: Trajectory | None = None,
     *,
     file: str | Path | None = None,
@@ -122,7 +125,8 @@ def animate(
     a motion from all sides there is `nc.view`.
 
     Args:
-        system: compiled system; or a motion in phases, which needs no trajectory.
+        system: compiled system; or a motion in phases or a solution of an optimal control problem, which need
+            no trajectory.
         trajectory: of one lane, computed with it.
         file: where to write it, a .gif, a .mp4 (by the program ffmpeg) or a .html with a player, below 3 MB;
             None: return HTML for a notebook instead.

@@ -9,17 +9,20 @@ import numpy as np
 from natcoord_jax.analysis.phases import Phases
 from natcoord_jax.assembly.system import System
 from natcoord_jax.bodies.beam import BeamHandle
+from natcoord_jax.control.solution import Solution
 from natcoord_jax.core.kinds import Choice, Several, of
 from natcoord_jax.core.state import Trajectory
 from natcoord_jax.viz.parts import scenery_of
 from natcoord_jax.viz.scenery import Scenery, joined
 
-MOVING = of("a system, as scene.compile() returned it, or nc.Phases(...)", System, Phases)
+MOVING = of(
+    "a system, as scene.compile() returned it, nc.Phases(...), or a solution", System, Phases, Solution
+)
 COLOURS = Choice(("energy", "parts")) | of("values of the elements, by name", Mapping)
 BEAMS = Several(of("what scene.add(nc.Beam(...)) returned", BeamHandle))
 
 
-def phases_of(system: System | Phases, trajectory: Trajectory | None, user: str) -> Phases:
+def phases_of(system: System | Phases | Solution, trajectory: Trajectory | None, user: str) -> Phases:
     """A motion in phases, of which a trajectory is one.
 
     Raises:
@@ -32,7 +35,7 @@ def phases_of(system: System | Phases, trajectory: Trajectory | None, user: str)
     return phases
 
 
-def lanes_of(system: System | Phases, trajectory: Trajectory | None, user: str) -> Phases:
+def lanes_of(system: System | Phases | Solution, trajectory: Trajectory | None, user: str) -> Phases:
     """The same, of a batch as well.
 
     Raises:
@@ -40,6 +43,8 @@ def lanes_of(system: System | Phases, trajectory: Trajectory | None, user: str) 
     """
     if isinstance(system, Phases):
         return system
+    if isinstance(system, Solution):
+        return Phases((system.system,), (system.trajectory,))
     if trajectory is None:
         raise ValueError(f"{user} needs the system and a trajectory, or nc.Phases")
     return Phases((system,), (trajectory,))

@@ -59,7 +59,7 @@ class Blob:
         numbers = scaled.astype(np.int16)
         if stride:
             with np.errstate(over="ignore"):
-                numbers[stride:] -= numbers[:-stride].copy()
+                numbers[stride:] -= numbers[:-stride]
         return {**self._place(numbers), "least": least + MOST * step, "step": step, "stride": stride}
 
     def text(self) -> str:

@@ -19,6 +19,7 @@ import numpy as np
 from natcoord_jax.analysis.phases import Phases
 from natcoord_jax.assembly.system import System
 from natcoord_jax.bodies.beam import BeamHandle
+from natcoord_jax.control.solution import Solution
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.kinds import FLAG, NAME, HandleOf, of
@@ -133,7 +134,7 @@ def open_file(file: Path) -> None:
     live=FLAG,
 )
 def view(
-    system: System | Phases,
+    system: System | Phases | Solution,
     trajectory: Trajectory | None = None,
     *,
     file: str | Path | None = None,
@@ -152,7 +153,8 @@ def view(
     file, which the browser opens if there is a display.
 
     Args:
-        system: compiled system; or a motion in phases, which needs no trajectory.
+        system: compiled system; or a motion in phases or a solution of an optimal control problem, which need
+            no trajectory.
         trajectory: computed with it, of one lane or of a batch with one axis: then a slider chooses the run
             and the others are ghosts, 16 of them at most.
         file: where to write it, one .html below 3 MB that needs no network; None: see above.
