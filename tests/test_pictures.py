@@ -70,7 +70,7 @@ def test_bodies_without_a_shape_are_the_plainest_solid_with_their_inertia():
     }
     for name, shape in solids.items():
         scene = nc.Scene()
-        mass, inertia = shape.mass_properties(1000.0)
+        mass, inertia = shape.mass_properties(jnp.asarray(1000.0))
         scene.add(nc.RigidBody(mass=mass, inertia=inertia, com=(1, 2, 3)))
         system, _ = scene.compile()
         ((points, _), is_round) = bodies_of(system, [0])[0]

@@ -9,6 +9,7 @@ import sys
 import urllib.request
 import zlib
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -156,6 +157,15 @@ def test_phases_with_joints_that_come_and_go():
     hinge = next(s for s in shown.solids if s.name == "hinge")
     assert np.isfinite(hinge.rows[:5]).all() and np.isnan(hinge.rows[6:]).all()
     assert "hinge" in nc.viz.packed.page([shown], 1.0, "")
+
+
+def test_a_run_that_broke_down_is_shown_as_far_as_it_went(run, tmp_path):
+    system, trajectory = run
+    broken = eqx.tree_at(lambda x: x.states.q, trajectory, trajectory.q.at[20:].set(jnp.nan))
+    scene, data = scene_of(nc.view(system, broken, file=tmp_path / "broken.html").read_text("utf-8"))
+    rows = numbers(data, scene["solids"][0]["rows"]).reshape(41, 12)
+    assert np.isfinite(rows[:20]).all() and np.isnan(rows[20:]).all() and 0 < scene["size"] < 10
+    nc.animate(system, broken, file=tmp_path / "broken.gif", fps=5)
 
 
 def test_what_it_refuses(run, tmp_path):

@@ -117,7 +117,11 @@ class Scenery(NamedTuple):
             return np.tile(np.array([[-1.0, -1, -1], [1, 1, 1]]), (len(self.t), 1, 1))
         lower = [np.where(np.isnan(x), np.inf, x).min(axis=1) for x in drawn]
         upper = [np.where(np.isnan(x), -np.inf, x).max(axis=1) for x in drawn]
-        return np.stack([np.min(lower, axis=0), np.max(upper, axis=0)], axis=1)
+        found = np.stack([np.min(lower, axis=0), np.max(upper, axis=0)], axis=1)
+        # Of a run that broke down there is nothing to see at its end: then what was seen first.
+        there = np.isfinite(found).all(axis=(1, 2))
+        found[~there] = found[there][0] if there.any() else np.array([[-1.0, -1, -1], [1, 1, 1]])
+        return found
 
     @property
     def extent(self) -> np.ndarray:

@@ -199,7 +199,8 @@ def view(
         "colour": colour,
         "beams": beams,
     }
-    pace = pace_of(np.asarray(phases.t).reshape(-1, np.shape(phases.t)[-1])[0])
+    first = lane(phases, 0) if np.ndim(phases.trajectories[0].t) == 2 else phases
+    pace = pace_of(np.concatenate([np.ravel(part.t) for part in first.trajectories]))
     if live:
         from natcoord_jax.viz.live import Live
 
