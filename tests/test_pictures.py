@@ -17,6 +17,7 @@ from natcoord_jax import gallery  # noqa: E402
 from natcoord_jax.viz.motion import scenery_at  # noqa: E402
 from natcoord_jax.viz.outline import bodies_of  # noqa: E402
 from natcoord_jax.viz.panels import Curve, Panel, draw  # noqa: E402
+from natcoord_jax.viz.parts import seats  # noqa: E402
 from natcoord_jax.viz.skins import beam_skins, drawn_bodies, with_ground  # noqa: E402
 from natcoord_jax.viz.solutions import solution_panels  # noqa: E402
 
@@ -87,6 +88,19 @@ def test_round_bodies_are_marked(run):
     shades = {s.name: s.shade for s in shown.solids if s.kind == "body"}
     assert len(np.unique(shades["wheel 1"])) == 2 and len(np.unique(shades["base"])) == 1
     assert [s.name for s in shown.solids if s.kind == "joint"] == ["hinge 1", "hinge 2", "hinge 3"]
+
+
+def test_a_hinge_is_drawn_on_its_axis_where_the_bodies_are():
+    """The head of the bicycle is given where its axis meets the road."""
+    system = gallery.load("bicycle").system
+    head = system.joint_index("head")
+    moved = seats(system)[head] - np.asarray(system.frames)[head]
+    fork = seats(system)[head, 1, 0, 1:]
+    assert np.linalg.norm(fork) < 0.1 and np.abs(moved[:, 1:]).max() == 0
+    axis = np.asarray(system.frames)[head, 1, 3, 1:]
+    assert np.linalg.norm(np.cross(moved[1, 0, 1:], axis)) < 1e-12
+    hub = system.joint_index("rear hub")
+    assert np.all(seats(system)[hub] == np.asarray(system.frames)[hub])
 
 
 def test_errors_of_what_is_kept_are_small_and_look_small(run):

@@ -10,25 +10,21 @@ import numpy as np
 from natcoord_jax.assembly.system import System
 from natcoord_jax.bodies.beam import BeamHandle
 from natcoord_jax.bodies.shapes import Surface
-from natcoord_jax.core.force import Force
 from natcoord_jax.core.markers import Marker
-from natcoord_jax.core.state import State, Trajectory
-from natcoord_jax.viz.outline import arrow, ball, bar, bodies_of, coil, marked, within
-from natcoord_jax.viz.scenery import DARK, PALETTE, RED, STEEL, Scenery, Solid, Trace
+from natcoord_jax.core.state import Trajectory
+from natcoord_jax.viz.links import between, forces, links
+from natcoord_jax.viz.outline import ball, bar, bodies_of, marked, within
+from natcoord_jax.viz.scenery import DARK, PALETTE, Scenery, Solid, Trace
 from natcoord_jax.viz.skins import (
     Colouring,
     beam_skins,
     drawn_bodies,
     element_skins,
-    markers_of,
-    places_of,
     with_ground,
 )
 
 Meshes = dict[int, tuple[Surface, bool] | None]
 """Meshes of the bodies that are drawn, by their numbers, and whether they are round."""
-MOST_COILS = 40
-"""More springs than this are drawn as bars."""
 
 
 def merged(meshes: Sequence[Surface]) -> Surface:
@@ -47,9 +43,31 @@ def _natural(name: str) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]
 
 
+def seats(system: System) -> np.ndarray:
+    """Frames of the joints where they are drawn: weights (joints, 2, 4, 4), as `system.frames`.
+
+    A hinge may be given anywhere on its axis. Far off, as the head of a bicycle where its axis meets the
+    road, it is drawn on the axis where the child is.
+    """
+    frames, mass = np.array(system.frames), np.asarray(system.mass)
+    pairs = np.asarray(system.joint_bodies)
+    for group in system.joints:
+        joint: Any = group.effect
+        if not joint.free or len(joint.rotations) != 1 or joint.translations:
+            continue
+        for j in (int(j) for j in np.asarray(group.joints).reshape(-1)):
+            side = 1 if pairs[j, 1] < len(mass) else 0
+            block, own = mass[pairs[j, side]], frames[j, side]
+            away = block[0, 1:] / block[0, 0] - own[0, 1:]
+            along = float(away @ own[3, 1:])
+            if abs(along) > np.linalg.norm(away - along * own[3, 1:]):
+                frames[j, :, 0] += along * frames[j, :, 3]
+    return frames
+
+
 def _bodies(system: System, meshes: Meshes, rows: np.ndarray, scale: float) -> list[Solid]:
     """Bodies with arms to their joints, in the order of their names."""
-    names, frames = system.structure.bodies, np.asarray(system.frames)
+    names, frames = system.structure.bodies, seats(system)
     pairs, mass, found = np.asarray(system.joint_bodies), np.asarray(system.mass), []
     for number, k in enumerate(sorted(meshes, key=lambda k: _natural(names[k]))):
         centre = mass[k, 0, 1:] / mass[k, 0, 0]
@@ -79,7 +97,7 @@ def _glyph(joint: Any, r: float) -> Surface | None:
 
 def _joints(system: System, rows: np.ndarray, scale: float) -> list[Solid]:
     found = []
-    names, pairs, frames = system.structure.joints, np.asarray(system.joint_bodies), np.asarray(system.frames)
+    names, pairs, frames = system.structure.joints, np.asarray(system.joint_bodies), seats(system)
     for group in system.joints:
         joint: Any = group.effect
         for j in (int(j) for j in np.asarray(group.joints).reshape(-1)):
@@ -87,77 +105,12 @@ def _joints(system: System, rows: np.ndarray, scale: float) -> list[Solid]:
                 continue
             places = [np.einsum("ma,tac->tmc", frames[j, s], rows[:, pairs[j, s]]) for s in (0, 1)]
             if joint.apart:
-                found += [_between(names[j], places[0][:, 0], places[1][:, 0], 0.006 * scale, coiled=False)]
+                found += [between(names[j], places[0][:, 0], places[1][:, 0], 0.006 * scale, coiled=False)]
                 continue
             mesh = _glyph(joint, 0.011 * scale)
             if mesh is not None:
                 shade = np.ones(len(mesh[1]))
                 found.append(Solid(names[j], "joint", *mesh, places[0], DARK, shade))
-    return found
-
-
-def _between(
-    name: str, start: np.ndarray, end: np.ndarray, radius: float, *, coiled: bool, kind: str = "link"
-) -> Solid:
-    """A coil, a bar or an arrow from one point to another (t, 3)."""
-    along = end - start
-    length = np.linalg.norm(along, axis=1, keepdims=True)
-    third = along / np.where(length > 0, length, np.nan)
-    first = np.cross(third, np.eye(3)[np.abs(np.nan_to_num(third[0])).argmin()])
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    rows = np.stack([start, radius * first, radius * np.cross(third, first), along], axis=1)
-    rows[np.isnan(rows).any(axis=(1, 2))] = np.nan
-    if kind == "force":
-        points, faces = arrow()
-        return Solid(name, kind, points, faces, rows, RED, np.ones(len(faces)), rigid=False)
-    points, faces = coil() if coiled else bar(1.0, np.zeros(3), np.array([0.0, 0, 1]))
-    return Solid(name, kind, points, faces, rows, STEEL, np.ones(len(faces)), rigid=False)
-
-
-def _links(system: System, rows: np.ndarray, scale: float) -> list[Solid]:
-    """Springs, dampers and rods: whatever sits on two points."""
-    found = []
-    for group in system.effects:
-        if group.weights is None or group.weights.ndim != 3 or group.weights.shape[1] != 2:
-            continue
-        if not np.allclose(markers_of(group)[0][..., 0].sum(axis=-1), 1.0):
-            continue
-        coiled = group.effect.stores and group.count <= MOST_COILS
-        ends = places_of(group, rows)
-        for k, name in enumerate(group.names):
-            radius = scale * (0.018 if coiled else 0.006)
-            found.append(_between(name, ends[:, k, 0], ends[:, k, 1], radius, coiled=coiled))
-    return found
-
-
-def _loads(group: Any, x: np.ndarray, inputs: np.ndarray, t: np.ndarray) -> np.ndarray | None:
-    """Forces [N] on the markers of the instances of a group (t, n, k, 3); None: torques only."""
-
-    def one(effect: Any, x: Any, u: Any, t: Any) -> Any:
-        return effect.load(x, 0 * x, u, t).forces
-
-    each = jax.vmap(one, in_axes=(None if group.effect.shared else 0, 0, 0, None))
-    found = jax.vmap(each, in_axes=(None, 0, 0, 0))(group.effect, x, inputs[:, np.asarray(group.inputs)], t)
-    return None if found is None else np.asarray(found)
-
-
-def _forces(system: System, states: State, rows: np.ndarray, inputs: np.ndarray, scale: float) -> list[Solid]:
-    """Forces at points, as arrows: the largest is a fifth of the scene long."""
-    drawn = []
-    for group in system.effects:
-        if not isinstance(group.effect, Force) or group.weights is None or group.weights.ndim != 3:
-            continue
-        x = places_of(group, rows)
-        forces = _loads(group, x, inputs, np.asarray(states.t))
-        if forces is not None:
-            at = np.isclose(markers_of(group)[0][..., 0].sum(axis=-1), 1.0)
-            drawn += [(group.names[n], x[:, n, k], forces[:, n, k]) for n, k in np.argwhere(at)]
-    largest = max((float(np.abs(force).max()) for _, _, force in drawn), default=0.0)
-    found = []
-    for name, start, force in drawn:
-        if np.abs(force).max() > 1e-6 * largest:
-            end = start + 0.2 * scale / largest * force
-            found.append(_between(name, start, end, 0.014 * scale, coiled=False, kind="force"))
     return found
 
 
@@ -218,8 +171,8 @@ def scenery_of(
     solids = [
         *_bodies(system, meshes, rows, scale),
         *_joints(system, rows, scale),
-        *_links(system, rows, scale),
-        *_forces(system, states, rows, inputs, scale),
+        *links(system, rows, scale),
+        *forces(system, states, rows, inputs, scale),
     ]
     start = jax.tree.map(lambda x: x[0], trajectory.states)
     paths = [np.asarray(system.sense(states, point, state=start).position) for point in traces]
