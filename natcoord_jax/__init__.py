@@ -143,7 +143,7 @@ from natcoord_jax.stepping.variational import VariationalMidpoint
 
 if TYPE_CHECKING:
     __version__: str
-    from natcoord_jax.viz import animate, plot
+    from natcoord_jax.viz import animate, plot, view
 
 __all__ = [
     "Accuracy",
@@ -296,6 +296,7 @@ __all__ = [
     "tangent_growth",
     "to_nlp",
     "transfer",
+    "view",
 ]
 
 
@@ -305,7 +306,7 @@ def __getattr__(name: str) -> Any:
         from importlib.metadata import version
 
         return version("natcoord_jax")
-    if name in ("animate", "plot"):
+    if name in ("animate", "plot", "view"):
         from natcoord_jax import viz
 
         return getattr(viz, name)

@@ -21,6 +21,7 @@ WHOLE = 1e-9
 """How far the number of steps may be from a whole number, relatively."""
 SCHEMES = ("energy-momentum", "variational", "dissipative")
 FIGURES = (".png", ".pdf", ".svg")
+FILMS = (".gif", ".mp4", ".html")
 
 
 class BadOptionError(ValueError):
@@ -52,7 +53,12 @@ def parser() -> Parser:
     )
     run.add_argument("--rtol", type=float, metavar="R", help="error tolerated in a substep, relative")
     run.add_argument("--atol", type=float, metavar="A", help="the same in metres; by default as --rtol")
-    run.add_argument("--film", type=Path, metavar="FILE", help="write an animation, a gif")
+    run.add_argument("--film", type=Path, metavar="FILE", help="write a film: .gif, .mp4 or .html")
+    run.add_argument(
+        "--view",
+        action="store_true",
+        help="write SCENE.html, to be turned and played, and open it",
+    )
     costs = commands.add_parser("accuracy", help="show what accuracy costs in time, over steps and orders")
     costs.add_argument("scene", metavar="SCENE", help="a name that `natcoord-jax scenes` lists")
     costs.add_argument("--time", type=float, metavar="T", help="end time [s]; by default that of the scene")
@@ -121,8 +127,8 @@ def _checked(arguments: argparse.Namespace) -> gallery.Example:
     if scene not in gallery.SCENES:
         raise BadOptionError(f"no scene {arguments.scene!r}; there are {', '.join(gallery.SCENES)}")
     film = getattr(arguments, "film", None)
-    if film is not None and film.suffix.lower() != ".gif":
-        raise BadOptionError(f"cannot write {film}; an animation ends in .gif")
+    if film is not None and film.suffix.lower() not in FILMS:
+        raise BadOptionError(f"cannot write {film}; a film ends in {', '.join(FILMS)}")
     for file in (arguments.json, arguments.plot, film):
         if file is not None and not file.resolve().parent.is_dir():
             raise BadOptionError(f"cannot write {file}: no such folder")
@@ -207,12 +213,23 @@ def _run(arguments: argparse.Namespace) -> int:
         return 1
     written = [_plot(example, phases, solution, arguments.plot)]
     if arguments.film is not None:
-        nc.animate(phases, file=arguments.film, beams=example.beams)
+        nc.animate(phases, file=arguments.film, **_drawn(example))
         written.append(arguments.film)
-    for file in written:
-        if file is not None:
-            print(f"wrote {file}")
+    if arguments.view:
+        written.append(Path(f"{example.name}.html"))
+        nc.view(phases, file=written[-1], **_drawn(example))
+    for file in filter(None, written):
+        print(f"wrote {file}")
+    if arguments.view:
+        from natcoord_jax.viz.views import open_file  # matplotlib comes with it
+
+        open_file(Path(f"{example.name}.html"))
     return 0
+
+
+def _drawn(example: gallery.Example) -> dict[str, Any]:
+    """How a scene is drawn."""
+    return {"title": example.description, "beams": example.beams, "traces": example.traces}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

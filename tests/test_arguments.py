@@ -266,7 +266,12 @@ CALLS = {
     },
     "animate": lambda w: {
         "system": [w.system], "trajectory": [w.trajectory], "file": ["film.gif"], "fps": WHOLE,
-        "beams": [(w.beam,)]
+        "beams": [(w.beam,)], "traces": [(w.point,)], "title": NAME, "colour": ["energy", {}],
+    },
+    "view": lambda w: {
+        "system": [w.system], "trajectory": [w.trajectory], "file": ["view.html"], "title": NAME,
+        "follow": [w.body, "body"], "traces": [(w.point,)], "colour": ["energy", {}], "beams": [(w.beam,)],
+        "live": FLAG,
     },
     **{
         f"System.{name}": lambda w: {"motion": [w.state]}

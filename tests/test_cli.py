@@ -55,6 +55,15 @@ def test_run_of_the_spacecraft(tmp_path, capsys):
     assert report["wall_s"] < report["compile_s"]
 
 
+def test_run_with_a_view(tmp_path, capsys, monkeypatch):
+    """Without a display it says where the file is."""
+    monkeypatch.setattr("natcoord_jax.viz.views._has_display", lambda: False)
+    assert cli.main(["run", "double-pendulum", "--steps", "4", "--view"]) == 0
+    file = tmp_path / "double_pendulum.html"
+    assert f"wrote double_pendulum.html\nopen {file} in a browser" in capsys.readouterr().out
+    assert "two rods on hinges" in file.read_text("utf-8")
+
+
 def test_run_with_a_tolerance(tmp_path, capsys):
     options = ["--dt", "0.5", "--steps", "2", "--rtol", "1e-4", "--json", "report.json", "--film", "film.gif"]
     assert cli.main(["run", "double_pendulum", *options]) == 0

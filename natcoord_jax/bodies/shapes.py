@@ -16,7 +16,7 @@ from natcoord_jax.core.numeric import Number, Numbers
 LENGTH, LENGTHS = Number("positive"), Numbers((3,), "positive")
 
 
-AROUND = 20
+AROUND = 32
 """Corners of a circle in a picture."""
 
 CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)

@@ -35,6 +35,7 @@ class Example:
         phases: makes the run, for (steps, dt) and options of `nc.simulate`, where it is more than a rollout
             with given inputs; `system` and `state` are then those of its start.
         beams: whose sections pictures draw.
+        traces: points whose paths pictures draw.
 
     Example:
         >>> import jax; jax.config.update("jax_enable_x64", True)
@@ -58,6 +59,7 @@ class Example:
     guess: Callable[[nc.OptimalControl], Array] | None = None
     phases: Callable[..., nc.Phases] | None = None
     beams: Sequence[nc.BeamHandle] = ()
+    traces: Sequence[Any] = ()
 
     @property
     def t_end(self) -> float:

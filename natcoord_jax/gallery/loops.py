@@ -93,13 +93,21 @@ def slider_crank() -> Example:
     scene = nc.Scene()
     scene.add(nc.Gravity(vector=(0, 0, -9.81)))
     crank = scene.add(
-        nc.RigidBody(mass=0.12, inertia=(1e-4, 1e-4, 1e-5), com=(0, 0, 0.04), position=pivot, name="crank")
+        nc.RigidBody(
+            mass=0.12,
+            inertia=(1e-4, 1e-4, 1e-5),
+            com=(0, 0, 0.04),
+            shape=nc.Cylinder(0.008, 0.08),
+            position=pivot,
+            name="crank",
+        )
     )
     rod = scene.add(
         nc.RigidBody(
             mass=0.5,
             inertia=(4e-3, 4e-3, 4e-4),
             com=(0, 0, 0.15),
+            shape=nc.Cylinder(0.008, 0.3),
             position=pin,
             orientation=np.asarray(on_host(frame_from_axis)(along)).T,
             name="rod",

@@ -130,7 +130,9 @@ def two_masses(steps: int = 60, *, fastest: bool = False, t_end: float = 6.0) ->
     masses, slides = [], []
     for k in range(2):
         place = (float(k), 0.0, 0.0)
-        body = nc.RigidBody(mass=1.0, inertia=(1.0, 1.0, 1.0), position=place, name=f"mass {k + 1}")
+        body = nc.RigidBody(
+            mass=1.0, inertia=(1, 1, 1), shape=nc.Box((0.3, 0.3, 0.3)), position=place, name=f"mass {k + 1}"
+        )
         masses.append(scene.add(body))
         slide = nc.Prismatic(nc.ground, masses[-1], point=place, axis=(1, 0, 0), name=f"slide {k + 1}")
         slides.append(scene.add(slide))
@@ -196,7 +198,9 @@ def cart_pole(steps: int = 100, *, t_end: float = 2.0, turn: float = np.pi) -> n
     """
     scene = nc.Scene()
     scene.add(nc.Gravity(vector=(0.0, 0.0, -GRAVITY)))
-    cart = scene.add(nc.RigidBody(mass=1.0, inertia=(1.0, 1.0, 1.0), name="cart"))
+    cart = scene.add(
+        nc.RigidBody(mass=1.0, inertia=(1.0, 1.0, 1.0), shape=nc.Box((0.3, 0.2, 0.1)), name="cart")
+    )
     pole = scene.add(nc.RigidBody(mass=0.3, inertia=POINT, com=(0.0, 0.0, -0.5), name="pole"))
     rail = scene.add(nc.Prismatic(nc.ground, cart, axis=(1, 0, 0), name="rail"))
     hinge = scene.add(nc.Revolute(cart, pole, axis=(0, -1, 0), name="hinge"))

@@ -47,7 +47,10 @@ def double_pendulum() -> Example:
         "dofs": 2,
         "tip": {0.5: (1.2966885362, 0, -1.4057799232), 1.0: (-1.6621151358, 0, -1.0414666372)},
     }
-    return Example("double_pendulum", "two rods on hinges", system, state, 0.005, 400, facts=facts)
+    tip = nc.Point(carrier, (1.0, 0.0, 0.0), local=True)
+    return Example(
+        "double_pendulum", "two rods on hinges", system, state, 0.005, 400, facts=facts, traces=(tip,)
+    )
 
 
 def torsion_spring() -> Example:

@@ -73,7 +73,17 @@ def arm(elements: int = 3, *, driven: bool = False, stiffness: Any = 0.03) -> Ar
     """
     scene = nc.Scene()
     bodies = [
-        scene.add(nc.RigidBody(mass=m, inertia=inertia, com=com, position=at, orientation=o, name=name))
+        scene.add(
+            nc.RigidBody(
+                mass=m,
+                inertia=inertia,
+                com=com,
+                position=at,
+                orientation=o,
+                shape=nc.Box((2 * com[0], 0.05, 0.05)),  # drawn more slender than its inertia says
+                name=name,
+            )
+        )
         for name, m, inertia, com, at, o in (
             ("upper arm", 3.0, (0.01, 0.05, 0.05), (UPPER / 2, 0, 0), np.zeros(3), _turned(START[0])),
             ("forearm", 2.0, (0.01, 0.03, 0.03), (FORE / 2, 0, 0), ELBOW, _turned(START[1])),

@@ -17,7 +17,8 @@ def heavy_top() -> Example:
         angular_velocity=(0, 150, -4.61538),
         name="top",
     )
-    scene.add(nc.Spherical(nc.ground, scene.add(top), point=(0, 0, 0), name="tip"))
+    body = scene.add(top)
+    scene.add(nc.Spherical(nc.ground, body, point=(0, 0, 0), name="tip"))
     system, state = scene.compile()
     facts = {
         "dofs": 3,
@@ -27,7 +28,10 @@ def heavy_top() -> Example:
             2.0: (-0.15041682, -0.72416559, -0.67302227),
         },
     }
-    return Example("heavy_top", "a fast top under gravity", system, state, 0.001, 2000, facts=facts)
+    centre = nc.Point(body, (0, 1, 0), local=True)
+    return Example(
+        "heavy_top", "a fast top under gravity", system, state, 0.001, 2000, facts=facts, traces=(centre,)
+    )
 
 
 def fast_top() -> Example:
@@ -75,7 +79,7 @@ def free_body() -> Example:
 def dzhanibekov() -> Example:
     """A body spinning about its middle axis, which turns over again and again (reference case R12)."""
     scene = nc.Scene()
-    scene.add(nc.RigidBody(mass=1.0, inertia=(1, 2, 3), angular_velocity=(1e-3, 5, 1e-3), name="body"))
+    body = scene.add(nc.RigidBody(mass=1.0, inertia=(1, 2, 3), angular_velocity=(1e-3, 5, 1e-3), name="body"))
     system, state = scene.compile()
     facts = {
         "dofs": 6,
@@ -85,5 +89,12 @@ def dzhanibekov() -> Example:
         },
     }
     return Example(
-        "dzhanibekov", "unstable spin about the middle axis", system, state, 0.01, 1000, facts=facts
+        "dzhanibekov",
+        "unstable spin about the middle axis",
+        system,
+        state,
+        0.01,
+        1000,
+        facts=facts,
+        traces=(nc.Point(body, (0, 3.0, 0), local=True),),
     )

@@ -17,7 +17,14 @@ def _link(scene: nc.Scene, name: str, start: np.ndarray, end: np.ndarray) -> Han
     """Link of 1 kg between two points, a rod of the inertia of a sphere: the same in every direction."""
     size = float(np.linalg.norm(end - start))
     inertia = np.full(3, size**2 / 12)
-    body = nc.RigidBody(mass=1.0, inertia=inertia, com=0.5 * (end - start), position=start, name=name)
+    body = nc.RigidBody(
+        mass=1.0,
+        inertia=inertia,
+        com=0.5 * (end - start),
+        shape=nc.Sphere(0.12 * size),  # drawn smaller than its inertia says: that would hide others
+        position=start,
+        name=name,
+    )
     return scene.add(body)
 
 
@@ -36,7 +43,9 @@ def chain(bodies: int = 8) -> Example:
         scene.add(nc.Revolute(carrier, body, point=k * step, axis=axis, name=f"hinge {k + 1}"))
         carrier = body
     system, state = scene.compile()
-    return Example("chain", f"a chain of {bodies} links", system, state, 0.005, 200, facts={"dofs": bodies})
+    end = nc.Point(carrier, step, local=True)
+    about = f"a chain of {bodies} links"
+    return Example("chain", about, system, state, 0.005, 200, facts={"dofs": bodies}, traces=(end,))
 
 
 def binary_tree(bodies: int = 15) -> Example:
@@ -98,6 +107,7 @@ def robot_arm() -> Example:
             mass=MASSES[k],
             inertia=np.full(3, 0.02 * MASSES[k]),
             com=0.5 * (following - origin),
+            shape=nc.Sphere(0.07 - 0.006 * k),  # to be seen; hands and arms are between them
             position=origin,
             name=f"link {k + 1}",
         )

@@ -1,146 +1,155 @@
-"""What to draw of a system: shapes of the bodies or boxes with their inertia, joints, beams."""
+"""Meshes that pictures are made of: the shapes of bodies, and glyphs of joints, springs and forces.
 
-from collections.abc import Sequence
-from typing import Any
+A mesh is points and the numbers of those around each face. It is the one description of a shape, for figures,
+films and the 3D view alike.
+"""
+
+from collections.abc import Iterable
 
 import numpy as np
 from jaxtyping import Float
 
-from natcoord_jax.assembly.system import Group, System
-from natcoord_jax.bodies.beam import BeamHandle
-from natcoord_jax.bodies.shapes import CORNERS, FACES
-from natcoord_jax.core.names import Names
+from natcoord_jax.assembly.system import System
+from natcoord_jax.bodies.shapes import Box, Cylinder, Ellipsoid, Placed, Sphere, Surface
 
-THINNEST = 0.02
-"""Least edge of a box, relative to its longest: plates and rods stay visible."""
+THINNEST = 0.03
+"""Least edge of a solid, relative to its longest: plates and rods stay visible."""
+ALIKE = 0.02
+"""How far two principal second moments may differ for a round solid, relative to the largest."""
+ROUND = (Cylinder, Sphere, Ellipsoid)
+"""Shapes whose spin is not seen without a mark."""
+TURNS, AROUND_WIRE, AROUND_TURN = 7, 3, 10
+"""Of a coil: turns, corners around its wire, pieces of a turn."""
 
 
-def inertia_boxes(system: System) -> Float[np.ndarray, "bodies 8 4"]:
-    """Marker weights of the corners of the uniform box with each body's mass and inertia.
+def equal_inertia(block: Float[np.ndarray, "4 4"]) -> tuple[Surface, bool]:
+    """Mesh of the plainest solid with a body's mass and inertia, in body axes, and whether it is round.
 
-    A uniform box with half edges a_i has the central second moments M a_i^2 / 3.
+    That is a sphere, a cylinder or a box, as two or three of the principal second moments are alike or none.
+    Half edges a of a box have the central second moments M a^2 / 3, radii those M r^2 / 4 and M r^2 / 5.
+
+    Args:
+        block: mass block (15) of the body.
     """
-    boxes = []
-    for block in np.asarray(system.mass):
-        centre = block[0, 1:] / block[0, 0]
-        central = block[1:, 1:] / block[0, 0] - np.outer(centre, centre)
-        values, axes = np.linalg.eigh(central)
-        half = np.sqrt(3 * np.maximum(values, 0.0))
-        half = np.maximum(half, THINNEST * half.max())
-        corners = centre + (CORNERS * half) @ axes.T
-        boxes.append(np.concatenate([np.ones((8, 1)), corners], axis=1))
-    return np.stack(boxes)
+    centre = block[0, 1:] / block[0, 0]
+    values, axes = np.linalg.eigh(block[1:, 1:] / block[0, 0] - np.outer(centre, centre))
+    values = np.maximum(values, 0.0)
+    small, middle, large = values
+    alike = ALIKE * large
+    if large - small <= alike:
+        shape, size, order = Sphere(1.0), np.full(3, np.sqrt(5 * large)), (0, 1, 2)
+    elif middle - small <= alike:
+        radius = np.sqrt(2 * (small + middle))
+        shape, size, order = Cylinder(1.0, 2.0), np.array([radius, radius, np.sqrt(3 * large)]), (0, 1, 2)
+    elif large - middle <= alike:
+        radius = np.sqrt(2 * (middle + large))
+        shape, size, order = Cylinder(1.0, 2.0), np.array([radius, radius, np.sqrt(3 * small)]), (1, 2, 0)
+    else:
+        shape, size, order = Box((2.0, 2.0, 2.0)), np.sqrt(3 * values), (0, 1, 2)
+    size = np.maximum(size, THINNEST * size.max())
+    points, faces = shape.surface()
+    return (centre + (points * size) @ axes[:, order].T, faces), isinstance(shape, ROUND)
 
 
-def surfaces(system: System) -> list[tuple[Float[np.ndarray, "n 4"], list[np.ndarray]]]:
-    """Marker weights of the points of what is drawn of each body, and the faces between them.
+def bodies_of(system: System, numbers: Iterable[int]) -> dict[int, tuple[Surface, bool] | None]:
+    """Meshes of some bodies in their axes, and whether they are round; None of a point mass, without extent.
 
-    That is the shape that it was given; of others the box with their inertia.
+    That is the shape that it was given; of others the plainest solid with their inertia.
     """
-    found = []
-    for box, shape in zip(inertia_boxes(system), system.structure.shapes):
-        points, faces = (box[:, 1:], list(FACES)) if shape is None else shape.surface()
-        found.append((np.concatenate([np.ones((len(points), 1)), points], axis=1), faces))
+    found: dict[int, tuple[Surface, bool] | None] = {}
+    points, mass = set(system.structure.points), np.asarray(system.mass)
+    for number in numbers:
+        block, shape = mass[number], system.structure.shapes[number]
+        if isinstance(shape, Placed):
+            found[number] = shape.surface(), isinstance(shape.shape, ROUND)
+        elif number in points or not np.any(np.abs(block[1:, 1:]) > 0):
+            found[number] = None
+        else:
+            found[number] = equal_inertia(block)
     return found
 
 
-def with_ground(q: Float[np.ndarray, "t rows 3"]) -> Float[np.ndarray, "t bodies_and_ground 4 3"]:
-    """Rows by body, those of the ground last."""
-    ground = np.concatenate([np.zeros((1, 3)), np.eye(3)])
-    rows = q.reshape(len(q), -1, 4, 3)
-    return np.concatenate([rows, np.broadcast_to(ground, (len(q), 1, 4, 3))], axis=1)
+def marked(surface: Surface) -> tuple[Surface, Float[np.ndarray, " faces"]]:
+    """A round body, and the brightness of its faces: quarters about its axis in turn, so that spin is seen.
 
-
-def joint_places(system: System, rows: Float[np.ndarray, "t bodies 4 3"]) -> tuple[np.ndarray, np.ndarray]:
-    """Points (t, joints, 3) [m] and axes (t, joints, 3) [-] of the named joints, as carried by the parent."""
-    named = [j for j, name in enumerate(system.structure.joints) if name]
-    frames = np.asarray(system.frames)[named, 0]
-    parents = np.asarray(system.joint_bodies)[named, 0]
-    vectors = np.einsum("jma,tjac->tjmc", frames, rows[:, parents])
-    return vectors[:, :, 0], vectors[:, :, 3]
-
-
-RIM = 12
-"""Most corners of the rim of a section."""
-
-
-def _chains(system: System) -> list[Group]:
-    """Effects between frames of bodies that make a chain of these and store energy: elements of beams."""
-    groups = (g for g in system.effects if g.effect.couples and g.effect.stores)
-    return [g for g in groups if g.weights is not None and g.weights.ndim == 4]
-
-
-def _beam_of(element: str) -> str:
-    """Name of the beam that an element belongs to: elements are called "beam/element 0" and so on."""
-    return element.rpartition("/")[0]
-
-
-def is_node(system: System, body: str) -> bool:
-    """Whether a body is a node of a set, or a beam's own, which is drawn as part of that."""
-    if isinstance(system.structure.bodies, Names) and body.endswith("]"):
-        return True
-    names = {_beam_of(name) for group in _chains(system) for name in group.names}
-    beam, _, rest = body.rpartition("/")
-    return bool(beam) and beam in names and rest.startswith("node ")
-
-
-def element_faces(
-    system: System, rows: Float[np.ndarray, "t bodies 4 3"]
-) -> Float[np.ndarray, "t faces 4 3"]:
-    """Faces of shells, and those of solids that no two of them share [m].
-
-    Args:
-        system: compiled system.
-        rows: by body, those of the ground last.
+    Ends of cylinders are cut into quarters, too.
     """
-    found = [np.zeros((len(rows), 0, 4, 3))]
-    for group in system.effects:
-        if group.effect.faces and group.weights is not None:
-            weights, bodies = np.asarray(group.weights), np.asarray(group.bodies)
-            own = weights if weights.ndim == 3 else weights[:, :, 0]
-            places = np.einsum("nka,tnkac->tnkc", own, rows[:, bodies])
-            corners = np.array(group.effect.faces)
-            # Nodes that are clamped to one body have its number: faces are told apart by their middles.
-            middles = np.round(places[0][:, corners].mean(axis=2).reshape(-1, 3), 9)
-            _, back, count = np.unique(middles, axis=0, return_inverse=True, return_counts=True)
-            outer = count[back.reshape(-1)] == 1
-            found.append(places[:, :, corners].reshape(len(rows), -1, 4, 3)[:, outer])
-    return np.concatenate(found, axis=1)
+    points, faces = surface
+    cut = []
+    for face in map(np.asarray, faces):
+        if len(face) <= 4:
+            cut.append(face)
+            continue
+        quarter = len(face) // 4
+        points = np.concatenate([points, points[face].mean(axis=0)[None]])
+        around = np.append(face, face[0])
+        cut += [np.append(around[k : k + quarter + 1], len(points) - 1) for k in range(0, len(face), quarter)]
+    middle = surface[0].mean(axis=0)
+    # The axis of a body of revolution is that which its points spread about alone.
+    spread, axes = np.linalg.eigh(np.cov((surface[0] - middle).T))
+    alone = 2 if spread[2] - spread[1] > spread[1] - spread[0] else 0
+    across = np.delete(axes, alone, axis=1)
+    # Quarters begin at the first corner.
+    first = (surface[0][0] - middle) @ across
+    if np.linalg.norm(first) > 1e-9:
+        first /= np.linalg.norm(first)
+        across = across @ np.array([[first[0], -first[1]], [first[1], first[0]]])
+    places = np.stack([(points[face].mean(axis=0) - middle) @ across for face in cut])
+    return (points, cut), np.where(places[:, 0] * places[:, 1] > 0, 1.0, 0.72)
 
 
-def _round_section(system: System, beam: str) -> Float[np.ndarray, "n 2"]:
-    """Rim of the full ellipse with the mass and inertia of the beam's nodes."""
-    angles = np.linspace(0.0, 2 * np.pi, RIM, endpoint=False)
-    circle = np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    for number, name in enumerate(system.structure.bodies):
-        if name.startswith(f"{beam}/node "):
-            block = np.asarray(system.mass)[number]
-            return circle * 2 * np.sqrt(np.diag(block)[1:3] / block[0, 0])
-    return 0.01 * circle
+def within(surface: Surface, point: Float[np.ndarray, "3"]) -> bool:
+    """Whether a point is in the box around a mesh, or nearly."""
+    lower, upper = surface[0].min(axis=0), surface[0].max(axis=0)
+    margin = 0.08 * float(np.max(upper - lower))
+    return bool(np.all((point > lower - margin) & (point < upper + margin)))
 
 
-def beam_rims(
-    system: System, rows: Float[np.ndarray, "t bodies 4 3"], beams: Sequence[BeamHandle] = ()
-) -> Float[np.ndarray, "t faces 4 3"]:
-    """Swept sections of all beams as quadrilaterals between the rims of neighbouring nodes [m].
+def ball(radius: float) -> Surface:
+    """A sphere about the origin."""
+    return Sphere(radius).surface()
 
-    Args:
-        system: compiled system.
-        rows: by body, those of the ground last.
-        beams: handles, whose sections are known; the other beams are round.
-    """
-    outlines: dict[str, Any] = {b.name: np.asarray(b.outline) for b in beams if b.outline is not None}
-    quads = [np.zeros((len(rows), 0, 4, 3))]
-    for group in _chains(system):
-        frames = np.einsum("nkma,tnkac->tnkmc", np.asarray(group.weights), rows[:, np.asarray(group.bodies)])
-        for number, name in enumerate(group.names):
-            beam = _beam_of(name)
-            if beam not in outlines:
-                outlines[beam] = _round_section(system, beam)
-            rim = outlines[beam][:: -(-len(outlines[beam]) // RIM)]
-            here = frames[:, number]
-            across = np.einsum("ri,tkic->tkrc", rim, here[:, :, 1:3]) + here[:, :, :1]
-            following = np.roll(across, -1, axis=2)
-            corners = (across[:, :-1], across[:, 1:], following[:, 1:], following[:, :-1])
-            quads.append(np.stack(corners, axis=3).reshape(len(rows), -1, 4, 3))
-    return np.concatenate(quads, axis=1)
+
+def bar(radius: float, start: np.ndarray, end: np.ndarray) -> Surface:
+    """A round bar between two points."""
+    length = float(np.linalg.norm(end - start))
+    points, faces = Cylinder(radius, length).surface()
+    third = (end - start) / length
+    first = np.cross(third, np.eye(3)[np.abs(third).argmin()])
+    first /= np.linalg.norm(first)
+    return 0.5 * (start + end) + points @ np.stack([first, np.cross(third, first), third]), faces
+
+
+def tube(path: Float[np.ndarray, "k 3"], radii: Float[np.ndarray, " k"], around: int) -> Surface:
+    """A tube along a path near the third axis, closed at its ends."""
+    along = np.gradient(path, axis=0)
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    first = np.cross(along, np.where(np.abs(along[:, :1]) < 0.9, np.eye(3)[0], np.eye(3)[1]))
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    angle = np.linspace(0.0, 2 * np.pi, around, endpoint=False)
+    rim = np.cos(angle)[:, None, None] * first + np.sin(angle)[:, None, None] * np.cross(along, first)
+    points = (path + radii[:, None] * rim).swapaxes(0, 1).reshape(-1, 3)
+    here = np.arange(around)
+    piece = np.stack([here, np.roll(here, -1), around + np.roll(here, -1), around + here], axis=1)
+    faces = [around * k + face for k in range(len(path) - 1) for face in piece]
+    return points, [*faces, here, around * (len(path) - 1) + here]
+
+
+def coil() -> Surface:
+    """A coil spring along the third axis, from 0 to 1, of radius one across."""
+    s = np.linspace(0.12, 0.88, TURNS * AROUND_TURN)
+    angle = np.linspace(0.0, 2 * np.pi * TURNS, len(s))
+    wound = np.stack([np.cos(angle), np.sin(angle), s], axis=1)
+    ends = np.array([[0, 0, 0], [0, 0, 0.1]]), np.array([[0, 0, 0.9], [0, 0, 1.0]])
+    path = np.concatenate([ends[0], wound, ends[1]])
+    points, faces = tube(path, np.zeros(len(path)), AROUND_WIRE)
+    # The wire is round across only: along, the coil is stretched by any factor.
+    angle = np.linspace(0.0, 2 * np.pi, AROUND_WIRE, endpoint=False)
+    rim = 0.16 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+    return points + np.tile(rim, (len(path), 1)), faces
+
+
+def arrow() -> Surface:
+    """An arrow along the third axis, from 0 to 1, of radius one across."""
+    path = np.array([[0, 0, 0], [0, 0, 0.7], [0, 0, 0.701], [0, 0, 1.0]])
+    return tube(path, np.array([0.4, 0.4, 1.0, 0.02]), 10)

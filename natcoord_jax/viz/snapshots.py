@@ -9,8 +9,9 @@ from matplotlib.figure import Figure
 
 from natcoord_jax.analysis.phases import Phases
 from natcoord_jax.bodies.beam import BeamHandle
+from natcoord_jax.viz.motion import scenery_at
 from natcoord_jax.viz.panels import Panel, draw, shown_once
-from natcoord_jax.viz.stage import Stage, pictures
+from natcoord_jax.viz.stage import Stage
 
 COLUMNS = 4
 """Pictures in a row."""
@@ -24,7 +25,7 @@ def plot_snapshots(
     panels: Sequence[Panel],
     *,
     beams: Sequence[BeamHandle] = (),
-    view: tuple[float, float] = (15.0, 25.0),
+    caption: str = "",
 ) -> Figure:
     """Pictures of a motion at some times, with diagrams below.
 
@@ -33,24 +34,22 @@ def plot_snapshots(
         times: of the snapshots [s]; those after the end are left out.
         panels: the diagrams.
         beams: handles of beams, whose sections are drawn.
-        view: elevation and azimuth of the eye [deg].
+        caption: what there is to see, below the pictures.
     """
     end = float(phases.t[-1])
-    shown = pictures(phases, np.array([t for t in times if t <= end + 1e-9 * (1 + end)]), beams)
-    frames = [(at, k) for at in shown for k in range(len(at.t))]
+    scenery = scenery_at(phases, np.array([t for t in times if t <= end + 1e-9 * (1 + end)]), beams=beams)
+    frames = range(len(scenery.t))
     rows = -(-len(frames) // COLUMNS)
-    wide = min(len(panels), MOST_IN_A_ROW)
+    wide = 2 if len(panels) == 4 else min(len(panels), MOST_IN_A_ROW)
     high = 3.6 * -(-len(panels) // wide)
     figure = plt.figure(figsize=(3.2 * COLUMNS, 3.2 * rows + high), layout="constrained")
     halves: Any = figure.subfigures(2, 1, height_ratios=(3.2 * rows, high))
     above, below = halves
-    points = np.concatenate([at.points for at in shown])
-    for number, frame in enumerate(frames):
-        axes = above.add_subplot(rows, COLUMNS, number + 1, projection="3d")
-        axes.view_init(*view)
-        axes.set_axis_off()
-        Stage(axes, shown[0], points, "t = {:g} s").show(*frame)
-        axes.set_box_aspect((1, 1, 1), zoom=1.4)
+    for frame in frames:
+        axes = above.add_subplot(rows, COLUMNS, frame + 1, projection="3d")
+        Stage(axes, scenery, labelled=False, zoom=1.25).show(frame, "t = {:g} s")
+    if caption:
+        below.suptitle(caption, fontsize=10, x=0.02, ha="left")
     grid = list(below.subplots(-(-len(panels) // wide), wide, squeeze=False).flat)
     for axes, panel in zip(grid, panels):
         draw(axes, panel)

@@ -1,155 +1,166 @@
-"""What is seen of a motion at some times, and the diagram that shows it.
+"""The diagram that shows a motion: true shapes, joints, ground, title and time."""
 
-Bodies are the shapes they were given, or boxes of equal inertia; joints are points with axes, beams swept
-sections.
-"""
+from typing import Any
 
-from collections.abc import Sequence
-from typing import Any, NamedTuple
-
-import jax
-import matplotlib
 import numpy as np
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 
-from natcoord_jax.analysis.phases import Phases
-from natcoord_jax.assembly.system import System
-from natcoord_jax.bodies.beam import BeamHandle
-from natcoord_jax.bodies.shapes import FACES
-from natcoord_jax.core.kinds import Several, of
-from natcoord_jax.core.state import State, Trajectory
-from natcoord_jax.viz.outline import beam_rims, element_faces, is_node, joint_places, surfaces, with_ground
+from natcoord_jax.viz.colours import along_map
+from natcoord_jax.viz.scenery import Scenery, rounded
 
-MOVING = of("a system, as scene.compile() returned it, or nc.Phases(...)", System, Phases)
-BEAMS = Several(of("what scene.add(nc.Beam(...)) returned", BeamHandle))
-
-
-def _frame(axes: Any, points: np.ndarray) -> float:
-    """Equal scales around all points; half the edge of the cube."""
-    lower, upper = points.min(axis=0), points.max(axis=0)
-    centre, half = 0.5 * (lower + upper), 0.55 * max(float(np.max(upper - lower)), 1e-9)
-    for set_limits, middle in zip((axes.set_xlim, axes.set_ylim, axes.set_zlim), centre, strict=True):
-        set_limits(middle - half, middle + half)
-    axes.set_box_aspect((1, 1, 1))
-    return half
+LEAST = 0.3
+"""Least edge of the box of the axes, relative to its longest."""
+MARGIN = 0.06
+AMBIENT = 0.5
+GRID = 8
+"""Least number of lines of the ground along its longer edge."""
 
 
-class Picture(NamedTuple):
-    """What is drawn at the times of a phase (leading axis of everything but `names`).
+class Faces:
+    """The faces of a scenery: which corners, which colours, in one list.
 
-    Attributes:
-        t: times [s].
-        names: of the bodies.
-        corners: of what is drawn of each (t, n, 3) [m].
-        faces: numbers of the corners around each face, by body.
-        pins: ends of the axes of the joints (t, joints, 2, 3) [m].
-        beams: quadrilaterals of the beams (t, faces, 4, 3) [m].
+    One collection draws them all: matplotlib sorts faces by distance within one, not across several.
     """
 
-    t: np.ndarray
-    names: list[str]
-    corners: list[np.ndarray]
-    faces: list[list[np.ndarray]]
-    pins: np.ndarray
-    beams: np.ndarray
+    def __init__(self, scenery: Scenery):
+        self.scenery, eye = scenery, scenery.eye()
+        light = eye + 0.7 * scenery.up + 0.4 * np.cross(scenery.up, eye)
+        self.light = light / np.linalg.norm(light)
+        start, faces, colours, edges = 0, [np.zeros((0, 4), int)], [np.zeros((0, 3))], [np.zeros(0, bool)]
+        for solid in scenery.solids:
+            cut = [(four, shade) for face, shade in zip(solid.faces, solid.shade) for four in _fours(face)]
+            faces.append(start + np.array([four for four, _ in cut]))
+            colours.append(np.outer([shade for _, shade in cut], solid.colour))
+            edges.append(np.zeros(len(cut), bool))
+            start += len(solid.points)
+        self.skins = sum(map(len, faces))
+        for skin in scenery.skins:
+            faces.append(start + skin.faces)
+            colours.append(np.tile(skin.colour, (len(skin.faces), 1)))
+            edges.append(np.full(len(skin.faces), skin.edges))
+            start += skin.points.shape[1]
+        self.faces = np.concatenate(faces)
+        self.colours, self.edges = np.concatenate(colours), np.concatenate(edges)
 
-    @property
-    def points(self) -> np.ndarray:
-        """Everything that must be seen."""
-        drawn = (*self.corners, self.beams, self.pins.mean(axis=2))
-        return np.concatenate([x.reshape(-1, 3) for x in drawn])
+    def at(self, frame: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Corners of the faces that are there (n, 4, 3), colours of faces and edges in the light (n, 3)."""
+        scenery = self.scenery
+        corners = [s.rows[frame, 0] + s.points @ s.rows[frame, 1:] for s in scenery.solids]
+        corners += [s.points[frame] for s in scenery.skins]
+        points = np.concatenate([np.zeros((0, 3)), *corners])[self.faces]
+        base, done = self.colours.copy(), self.skins
+        for skin in scenery.skins:
+            if skin.values is not None:
+                base[done : done + len(skin.faces)] = along_map(skin.values[frame], skin.values)
+            done += len(skin.faces)
+        normals = np.cross(points[:, 2] - points[:, 0], points[:, 3] - points[:, 1])
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+        lit = AMBIENT + (1 - AMBIENT) * np.abs(normals @ self.light)
+        there = np.isfinite(lit)
+        colours = np.clip(base * lit[:, None], 0, 1)[there]
+        return points[there], colours, np.where(self.edges[there, None], 0.6, 1.0) * colours
 
-    def polygons(self, body: int, frame: int) -> list[np.ndarray]:
-        """Corners of the faces of a body at one time."""
-        return [self.corners[body][frame][face] for face in self.faces[body]]
+
+def _fours(face: np.ndarray) -> list[list[int]]:
+    """A face as faces of four corners; matplotlib draws arrays of them faster, and sorts them better."""
+    cut = [[face[0], *face[k : k + 3]] for k in range(1, len(face) - 1, 2)]
+    return [[int(a) for a in (*four, four[-1])[:4]] for four in cut]
 
 
-def picture(system: System, states: State, beams: Sequence[BeamHandle] = ()) -> Picture:
-    """What to draw of a system at several states, by the names of its bodies."""
-    rows = with_ground(np.asarray(states.q))
-    named = system.structure.bodies
-    order = [int(k) for k in np.argsort(named) if not is_node(system, named[int(k)])]
-    drawn = surfaces(system)
-    corners = [np.einsum("ka,tac->tkc", drawn[k][0], rows[:, k]) for k in order]
-    points, axes = joint_places(system, rows)
-    return Picture(
-        np.asarray(states.t),
-        [named[k] for k in order],
-        corners,
-        [drawn[k][1] for k in order],
-        np.stack([points - axes, points + axes], axis=2),
-        np.concatenate([beam_rims(system, rows, beams), element_faces(system, rows)], axis=1),
-    )
+def _axes_of(up: np.ndarray) -> tuple[int, int, int]:
+    """The order of the axes with which the vertical one comes last: a cyclic one, so that hands are kept."""
+    vertical = int(np.abs(up).argmax())
+    return ((vertical + 1) % 3, (vertical + 2) % 3, vertical)
 
 
 class Stage:
-    """Figure or diagram on which pictures of a motion are shown, one after the other.
+    """A diagram on which pictures of a motion are shown, one after the other.
 
     Attributes:
-        axes: three-dimensional, with equal scales.
-        parts: what changes.
+        axes: three-dimensional, with equal scales, fitted to the whole motion.
     """
 
-    def __init__(self, axes: Any, first: Picture, points: np.ndarray, title: str = "t = {:.2f} s"):
-        self.axes, self.title = axes, title
-        self.half = _frame(axes, points)
-        colours = matplotlib.colormaps["tab10"]
-        self.solids = []
-        for body, name in enumerate(first.names):
-            faces = first.polygons(body, 0)
-            solid = Poly3DCollection(faces, facecolor=colours(body % 10), edgecolor="k")
-            # Edges between the flat pieces of a round body are none of its own.
-            solid.set(alpha=0.45, linewidth=0.5 if len(faces) <= len(FACES) else 0.1, label=name)
-            self.solids.append(axes.add_collection3d(solid))
-        lines = Line3DCollection(np.zeros((1, 2, 3)), colors="k", linewidths=1.5)  # there must be one
-        self.pins = axes.add_collection3d(lines)
-        self.pins.set_visible(bool(first.pins.shape[1]))
-        self.dots = axes.plot(*first.pins[0].mean(axis=1).T, "ko", markersize=3)[0]
-        self.beams = []
-        if first.beams.shape[1]:
-            skin = Poly3DCollection(first.beams[0], facecolor="0.35", edgecolor="k", linewidth=0.1)
-            self.beams.append(axes.add_collection3d(skin))
+    def __init__(self, axes: Any, scenery: Scenery, *, labelled: bool = True, zoom: float = 1.0):
+        self.axes, self.scenery = axes, scenery
+        self.order = list(_axes_of(scenery.up))
+        self.faces = Faces(scenery)
+        axes.computed_zorder = False
+        eye = scenery.eye()[self.order]
+        axes.set_proj_type("persp", focal_length=1.6)
+        self._fit(zoom)
+        axes.view_init(np.degrees(np.arcsin(eye[2])), np.degrees(np.arctan2(eye[1], eye[0])))
+        if labelled:
+            labels = [f"{'xyz'[k]} [m]" for k in self.order]
+            axes.set(xlabel=labels[0], ylabel=labels[1], zlabel=labels[2])
+            axes.tick_params(labelsize=7)
+            for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
+                axis.set_pane_color((0.97, 0.97, 0.98))
+                axis.set_major_locator(_few())
+        else:
+            axes.set_axis_off()
+        self.lattice = Line3DCollection(np.zeros((1, 2, 3)), colors="0.8", linewidths=0.6, zorder=1)
+        self.plane = Poly3DCollection([np.zeros((4, 3))], facecolor="0.91", edgecolor="0.75", zorder=0)
+        if scenery.ground is not None:
+            axes.add_collection3d(self.plane)
+            axes.add_collection3d(self.lattice)
+            axes.grid(False)
+        self._look_at(0)
+        self.solid = axes.add_collection3d(Poly3DCollection([np.zeros((3, 3))], linewidths=0.3, zorder=2))
+        self.lines = [
+            axes.plot([], [], [], color=trace.colour, linewidth=1.0, zorder=3)[0] for trace in scenery.traces
+        ]
 
-    def show(self, at: Picture, frame: int) -> list[Any]:
-        """Move everything to a frame of a picture."""
-        for body, solid in enumerate(self.solids):
-            solid.set_verts(at.polygons(body, frame))
-        middle = at.pins[frame].mean(axis=1)
-        if len(middle):
-            ends = middle[:, None] + 0.16 * self.half * (at.pins[frame] - middle[:, None])
-            self.pins.set_segments(list(ends))
-        self.dots.set_data_3d(*middle.T)
-        for skin in self.beams:
-            skin.set_verts(at.beams[frame])
-        self.axes.set_title(self.title.format(at.t[frame]))
-        return [*self.solids, self.pins, self.dots, *self.beams]
+    def _fit(self, zoom: float) -> None:
+        """Equal scales, and limits round the whole motion; round one picture where that travels far."""
+        boxes, along, whole = self.scenery.boxes, self.order[2], self.scenery.extent
+        # (What stands below, or is seen from below, has its ground above: then it is only in the way.)
+        if self.scenery.ground is not None and self.scenery.up[along] > 0:
+            boxes[:, 0, along] = self.scenery.ground
+        size, most = np.ptp(whole, axis=0), np.ptp(boxes, axis=1).max(axis=0)
+        self.travels = self.scenery.travels
+        wanted = 1.2 * most if self.travels else size
+        self.edges = (1 + 2 * MARGIN) * np.maximum(wanted, LEAST * max(wanted.max(), 1e-9))
+        self.middles = boxes.mean(axis=1) if self.travels else np.tile(whole.mean(axis=0), (len(boxes), 1))
+        if self.scenery.ground is not None and self.scenery.up[along] > 0:
+            self.middles[:, along] = self.scenery.ground + 0.5 * self.edges[along]
+        self.axes.set_box_aspect(self.edges[self.order], zoom=zoom)
+
+    def _look_at(self, frame: int) -> None:
+        """Limits of the axes, and the lattice on the ground."""
+        lower = (self.middles[frame] - 0.5 * self.edges)[self.order]
+        upper = (self.middles[frame] + 0.5 * self.edges)[self.order]
+        for k, set_limits in enumerate((self.axes.set_xlim, self.axes.set_ylim, self.axes.set_zlim)):
+            set_limits(lower[k], upper[k])
+        height = self.scenery.ground
+        if height is None:
+            return
+        step = rounded(max(upper[:2] - lower[:2]) / GRID)
+        segments = []
+        for k in (0, 1):
+            for x in np.arange(np.ceil(lower[k] / step), np.floor(upper[k] / step) + 1) * step:
+                ends = np.array([[lower[0], lower[1], height], [upper[0], upper[1], height]])
+                ends[:, k] = x
+                segments.append(ends)
+        corners = [(lower[0], lower[1]), (upper[0], lower[1]), (upper[0], upper[1]), (lower[0], upper[1])]
+        self.plane.set_verts([[(*corner, height) for corner in corners]])
+        self.lattice.set_segments(segments)
+
+    def show(self, frame: int, caption: str = "t = {:.2f} s") -> None:
+        """Move everything to a picture of the scenery."""
+        if self.travels:
+            self._look_at(frame)
+        corners, colours, edges = self.faces.at(frame)
+        self.solid.set_verts(corners[:, :, self.order] if len(corners) else np.zeros((1, 3, 3)))
+        self.solid.set_facecolor(colours)
+        self.solid.set_edgecolor(edges)
+        for line, trace in zip(self.lines, self.scenery.traces):
+            line.set_data_3d(*trace.points[: frame + 1, self.order].T)
+        time = caption.format(self.scenery.t[frame])
+        title = f"{self.scenery.title}\n{time}" if self.scenery.title else time
+        self.axes.set_title(title, fontsize=10)
 
 
-def pictures(phases: Phases, times: np.ndarray, beams: Sequence[BeamHandle] = ()) -> list[Picture]:
-    """Pictures of the saved states next to given times, one a phase; at a change the later phase is shown."""
-    found, starts = [], [float(trajectory.t[0]) for trajectory in phases.trajectories]
-    owner = np.searchsorted(starts, times + 1e-9 * (1 + np.abs(times)), side="right").clip(1) - 1
-    for number, (system, trajectory) in enumerate(phases.pairs):
-        saved, wanted = np.asarray(trajectory.t), times[owner == number]
-        if wanted.size:
-            nearest = np.abs(saved[:, None] - wanted).argmin(axis=0)
-            found.append(picture(system, jax.tree.map(lambda x, k=nearest: x[k], trajectory.states), beams))
-    return found
+def _few() -> Any:
+    from matplotlib.ticker import MaxNLocator
 
-
-def phases_of(system: System | Phases, trajectory: Trajectory | None, user: str) -> Phases:
-    """A motion in phases, of which a trajectory is one.
-
-    Raises:
-        ValueError: for a trajectory of a batch, or none.
-    """
-    if isinstance(system, Phases):
-        phases = system
-    elif trajectory is None:
-        raise ValueError(f"{user} needs the system and a trajectory, or nc.Phases")
-    else:
-        phases = Phases((system,), (trajectory,))
-    for part in phases.trajectories:
-        if part.t.ndim != 1:
-            raise ValueError(f"{user} takes one lane, not a batch of shape {part.t.shape[:-1]}")
-    return phases
+    return MaxNLocator(nbins=4, steps=[1, 2, 5, 10])
