@@ -239,7 +239,7 @@ def tied(amplitude=0.0, **moving):
 
 
 def test_a_uniform_stress_passes_a_tie():
-    """Pulled at one end and held at the other without hindering its width: the same stress in all elements."""
+    """Pulled at one end, held at the other, where its width is free: the same stress in all elements."""
     scene, one, two = tied()
     table = nc.Point(nc.ground), nc.Direction(nc.ground, (1, 0, 0))
     held = one.set("x0")

@@ -48,7 +48,7 @@ def sheet():
             places, (0, 0, 1), mass=1.0, inertia=0.01, angular_velocity=(0.5, 0, 0), name="mesh"
         )
     )
-    scene.add(nc.ShellElement.on(nodes, quads, thickness=0.05, E=1e5, name="plate"))
+    scene.add(nc.ShellElement.on(nodes, quads, thickness=0.05, material=nc.Elastic(E=1e5), name="plate"))
     ends = (nc.Point(nc.ground, (0, 0, 1)), nc.Point(nodes[0]))
     scene.add(nc.Spring(ends, stiffness=30.0, length=0.5, name="spring"))
     scene.add(nc.PointForce((nc.Point(nodes[5]),), force=(0, 0, 5.0), name="push"))
