@@ -18,10 +18,14 @@ THINNEST = 0.02
 def inertia_boxes(system: System) -> Float[np.ndarray, "bodies 8 4"]:
     """Marker weights of the corners of the uniform box with each body's mass and inertia.
 
-    A uniform box with half edges a_i has the central second moments M a_i^2 / 3.
+    A uniform box with half edges a_i has the central second moments M a_i^2 / 3. Of bodies without mass it is
+    a point.
     """
     boxes = []
     for block in np.asarray(system.mass):
+        if not block.any():
+            boxes.append(np.tile([1.0, 0.0, 0.0, 0.0], (8, 1)))
+            continue
         centre = block[0, 1:] / block[0, 0]
         central = block[1:, 1:] / block[0, 0] - np.outer(centre, centre)
         values, axes = np.linalg.eigh(central)
