@@ -77,7 +77,15 @@ from natcoord_jax.core.nodes import Clamp
 from natcoord_jax.core.potential import Potential
 from natcoord_jax.core.results import DerivativeError, Result, SimulationError
 from natcoord_jax.core.state import State, Trajectory
-from natcoord_jax.effects.actuators import BodyForceInput, BodyTorqueInput, JointForce, JointTorque
+from natcoord_jax.effects.actuators import (
+    AffineActuator,
+    BodyForceInput,
+    BodyTorqueInput,
+    JointForce,
+    JointTorque,
+    SphericalTorque,
+    WrenchInput,
+)
 from natcoord_jax.effects.beams import (
     BeamDamping,
     BeamElement,
@@ -106,11 +114,13 @@ from natcoord_jax.effects.springs import (
     Armature,
     Damper,
     JointDamper,
+    JointFriction,
     JointPotential,
     JointSpring,
     JointStops,
     NonlinearSpring,
     QuadraticSpring,
+    SphericalDamper,
     Spring,
 )
 from natcoord_jax.scene import Scene
@@ -127,6 +137,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Accuracy",
+    "AffineActuator",
     "Armature",
     "Attachment",
     "Balance",
@@ -171,6 +182,7 @@ __all__ = [
     "Joint",
     "JointDamper",
     "JointForce",
+    "JointFriction",
     "JointPotential",
     "JointSpring",
     "JointStops",
@@ -213,6 +225,8 @@ __all__ = [
     "Solution",
     "Sphere",
     "Spherical",
+    "SphericalDamper",
+    "SphericalTorque",
     "Spring",
     "State",
     "System",
@@ -221,6 +235,7 @@ __all__ = [
     "Universal",
     "VariationalMidpoint",
     "VelocityConstraint",
+    "WrenchInput",
     "accuracy",
     "animate",
     "assemble",

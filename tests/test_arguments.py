@@ -167,9 +167,21 @@ CALLS = {
     "JointPotential": lambda w: {**ON_JOINT(w), "law": [f]},
     "JointStops": lambda w: {**ON_JOINT(w), "stiffness": NUMBER, "lower": [-1.0], "upper": NUMBER},
     "JointDamper": lambda w: {**ON_JOINT(w), "damping": NUMBER},
+    "JointFriction": lambda w: {**ON_JOINT(w), "friction": NUMBER, "slip": NUMBER},
+    "SphericalDamper": lambda w: {**MARKED(w.triad[:2]), "damping": NUMBER},
     "Armature": lambda w: {**ON_JOINT(w), "inertia": NUMBER},
     "JointTorque": lambda w: {"joint": [w.hinge], "gear": NUMBER, "axis": [2], "name": NAME},
     "JointForce": lambda w: {**ON_JOINT(w), "gear": NUMBER},
+    "AffineActuator": lambda w: {
+        "joint": [(w.hinge,)], "coordinate": [(0,), 0], "name": NAME, "gear": [(1.0,)], "gain": V, "bias": V,
+        "lower": [-1.0], "upper": NUMBER, "least": [-1.0], "most": NUMBER,
+    },
+    "WrenchInput": lambda w: {
+        **MARKED((w.point, *w.triad)), "force": V, "torque": V, "lower": [-1.0], "upper": NUMBER
+    },
+    "SphericalTorque": lambda w: {
+        **MARKED(w.triad[:2]), "gear": NUMBER, "lower": [-1.0], "upper": NUMBER
+    },
     "BodyTorqueInput": lambda w: MARKED(w.triad),
     "BodyForceInput": lambda w: MARKED((w.point, w.direction)),
     "BeamElement": lambda w: {
