@@ -133,6 +133,7 @@ from natcoord_jax.stepping.variational import VariationalMidpoint
 
 if TYPE_CHECKING:
     __version__: str
+    from natcoord_jax import io
     from natcoord_jax.viz import animate, plot
 
 __all__ = [
@@ -251,6 +252,7 @@ __all__ = [
     "ground",
     "inputs",
     "inverse_dynamics",
+    "io",
     "jit",
     "keep_programs",
     "linearise",
@@ -275,7 +277,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """Pictures are loaded when first asked for, and matplotlib with them; the version is looked up then."""
+    """Pictures and readers of files are loaded when first asked for; the version is looked up then."""
     if name == "__version__":
         from importlib.metadata import version
 
@@ -284,4 +286,8 @@ def __getattr__(name: str) -> Any:
         from natcoord_jax import viz
 
         return getattr(viz, name)
+    if name == "io":
+        from importlib import import_module
+
+        return import_module("natcoord_jax.io")
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -197,7 +197,9 @@ CALLS = {
     "DirectorDamping": lambda w: {**MARKED(w.attached), **SHAPES, "viscosity": MATRIX},
     # runs and analysis
     "Scene": lambda w: {},
-    "Scene.add": lambda w: {"part": [nc.PointMass(mass=1.0)]},
+    "Scene.add": lambda w: {
+        "part": [nc.PointMass(mass=1.0)], "name": [None], "position": [None], "orientation": [None]
+    },
     "Scene.add_mass": lambda w: {"handle": [w.body], "block": [np.zeros((4, 4))]},
     "Scene.find": lambda w: {"handle": [w.body, w.hinge], "user": NAME},
     "Scene.compile": lambda w: {"assemble": FLAG, "solver": ["reduced"], "t": NUMBER},
