@@ -150,8 +150,8 @@ class Scene:
         if not isinstance(part, Recipe):
             given = " and ".join(placement)
             raise ValueError(
-                f"Scene.add: {given} for an object of type {type(part).__name__}, which has them itself; pass "
-                "them when you make the part"
+                f"Scene.add: {given} for an object of type {type(part).__name__}, which says them itself; "
+                "pass them when you make the part"
             )
         return part.at(**placement)
 

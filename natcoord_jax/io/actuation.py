@@ -33,9 +33,7 @@ def read_actuators(
             notes.left_out(name, made)
             continue
         if kinds["dynamics"] != "NONE":
-            notes.changed(
-                name, "its activation follows at once: the input is the activation, not the control"
-            )
+            notes.changed(name, "its activation follows at once: it is the input, instead of the control")
         found.append(made)
         numbers.append(number)
     return _with_efforts(found, joints, notes), numbers
@@ -125,16 +123,12 @@ def _transmitted(
         factors = fixed_tendon(model, target)
         if factors is None:
             return f"the tendon {model.tendon(target).name} runs through space, which is not mapped"
-        return ActuatorData(
-            name, "coordinates", tuple(factors), gear[0] * np.array([*factors.values()]), **law
-        )
+        along = gear[0] * np.array([*factors.values()])
+        return ActuatorData(name, "coordinates", tuple(factors), along, **law)
     if transmission == "SITE" and model.actuator_trnid[number][1] < 0:
         if np.any(law["bias"]) or np.any(law["gain"][1:]):
             return "at a site only a force in proportion to the control is mapped"
-        frame = poses.frame(
-            int(model.site_bodyid[target]), poses.site_points[target], poses.site_axes[target]
-        )
-        return ActuatorData(name, "wrench", (), gear, frame=frame, **law)
+        return ActuatorData(name, "wrench", (), gear, frame=poses.site(target), **law)
     return f"transmission {transmission} is not mapped"
 
 
@@ -149,13 +143,13 @@ def _with_efforts(
     found = []
     for actuator in actuators:
         limits = [joints[name].effort for name in actuator.joints if joints[name].effort != UNBOUNDED]
-        if limits and (len(actuator.joints) > 1 or users[actuator.joints[0]] > 1 or not actuator.gear[0]):
-            notes.left_out(
-                f"force range of {', '.join(actuator.joints)}", "several actuators or joints share it"
-            )
+        alone = len(actuator.joints) == 1 and users[actuator.joints[0]] == 1 and actuator.gear[0] != 0
+        if limits and not alone:
+            names = ", ".join(actuator.joints)
+            notes.left_out(f"force range of {names}", "several actuators or joints share it")
         elif limits:
-            low, high = sorted(x / actuator.gear[0] for x in limits[0])
-            low, high = max(low, actuator.force[0]), min(high, actuator.force[1])
-            actuator = replace(actuator, force=(low, high))
+            low, high = np.sort(np.array(limits[0]) / actuator.gear[0])
+            force = max(float(low), actuator.force[0]), min(float(high), actuator.force[1])
+            actuator = replace(actuator, force=force)
         found.append(actuator)
     return tuple(found)

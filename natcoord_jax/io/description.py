@@ -110,7 +110,7 @@ class ActuatorData:
         name: of the input.
         kind: "coordinates", "wrench" (at a frame) or "ball".
         joints: names of the joints it acts on.
-        gear: length per unit of each coordinate; of a wrench force and torque (6,), of a ball the torque (3,).
+        gear: length per unit of each coordinate; of a wrench force and torque (6,), of a ball torque (3,).
         gain: see `nc.AffineActuator`.
         bias: likewise.
         range: of the input [-].

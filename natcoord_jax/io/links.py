@@ -41,6 +41,11 @@ class Poses:
         origin, own = self.points[self.heads[link]], self.axes[self.heads[link]]
         return FrameData(link, own.T @ (point - origin), own.T @ axes)
 
+    def site(self, number: int) -> FrameData:
+        """A site, as carried by its link."""
+        body = int(self.model.site_bodyid[number])
+        return self.frame(body, self.site_points[number], self.site_axes[number])
+
     def in_body(self, body: int, point: np.ndarray, axes: np.ndarray | None = None) -> FrameData:
         """A frame of a body of the file, as carried by its link."""
         own = self.axes[body]
@@ -152,7 +157,8 @@ def _stop(model: Any, number: int) -> float:
 
     There the acceleration a_1 that the constraint leaves of a_0 obeys a_1 + d (b v + k r) = (1 - d) a_0
     (documentation, "Computation", solver parameters), with the impedance d and k = 1 / (d_max^2 T^2 z^2) of
-    time constant T and damping ratio z. At rest that is a force d k / ((1 - d) A) per r, A the inverse inertia.
+        time constant T and damping ratio z. At rest that is a force d k / ((1 - d) A) per r, A the inverse of
+    the inertia.
     """
     first, second = model.jnt_solref[number]
     impedance = float(np.clip(model.jnt_solimp[number][1], 1e-4, 0.9999))
@@ -187,6 +193,4 @@ def _list_what_is_left(notes: Notes, model: Any, number: int, joint: JointData) 
             "limits of joints", "elastic stops without damping, as stiff as MuJoCo's soft limits at rest"
         )
     if joint.has_coordinate and model.dof_frictionloss[joint.rate_index]:
-        notes.changed(
-            "friction loss", "smooth at rest, see nc.JointFriction: below the slip rate joints creep"
-        )
+        notes.changed("friction loss", "smooth at rest, see nc.JointFriction: what should stick creeps")

@@ -98,12 +98,7 @@ def described(found: Source, leave_out: set[str], motors: bool | None) -> Descri
     surfaces = {} if "visuals" in leave_out else read_surfaces(model, poses, notes)
     links = tuple(replace(link, surface=surfaces.get(k)) for k, link in enumerate(links))
     frames = {body_name(model, b): poses.in_body(b, np.zeros(3)) for b in range(1, model.nbody)}
-    sites = {
-        model.site(s).name or f"site {s + 1}": poses.frame(
-            int(model.site_bodyid[s]), poses.site_points[s], poses.site_axes[s]
-        )
-        for s in range(model.nsite)
-    }
+    sites = {model.site(s).name or f"site {s + 1}": poses.site(s) for s in range(model.nsite)}
     gravity = np.zeros(3) if "gravity" in leave_out else np.array(model.opt.gravity)
     return Description(
         name=_model_name(model),

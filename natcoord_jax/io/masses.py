@@ -30,20 +30,26 @@ def settle(spec: Any, notes: Notes) -> set[str]:
             continue
         if sum(b.mass for b in _subtree(body)) <= 0:
             for joint in list(body.joints):
-                notes.left_out(
-                    joint.name, f"nothing that {body.name} carries has mass: its motion moves nothing"
-                )
-                spec.delete(joint)
+                notes.left_out(joint.name, f"it moves no mass, and is fixed: all that carries is {body.name}")
+                _forget(spec, joint)
             continue
         carried = _rigid(body)
         if sum(b.mass for b in carried) <= 0:
             body.mass, body.ipos, light = FEATHER, np.zeros(3), light | {body.name}
             body.explicitinertial = True
-        if max(max(b.inertia) for b in carried) <= 0 and all(np.isnan(b.fullinertia[0]) for b in carried):
-            body.inertia = np.full(3, FEATHER)
-            if body.name not in light:
+        if         if all(np.isnan(b.fullinertia[0]) and min(b.inertia) < FEATHER for b in carried):
+            if body.name not in light and max(max(b.inertia) for b in carried) < FEATHER:
                 notes.changed(body.name, "it has mass and no inertia, and is a point mass")
+            body.inertia = np.maximum(body.inertia, FEATHER)
     return light
+
+
+def _forget(spec: Any, joint: Any) -> None:
+    """Delete a joint, and the relations that it is part of."""
+    for equality in list(spec.equalities):
+        if joint.name in (equality.name1, equality.name2):
+            spec.delete(equality)
+    spec.delete(joint)
 
 
 def _settle_tensor(body: Any, notes: Notes) -> None:

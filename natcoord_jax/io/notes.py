@@ -1,5 +1,7 @@
 """What a file says and a robot does not do, or does otherwise: by name, with the reason."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 
@@ -48,6 +50,18 @@ def in_words(notes: tuple[Note, ...], mapped: bool) -> list[str]:
         if note.mapped == mapped:
             together.setdefault(note.reason, []).append(note.part)
     return [f"{', '.join(parts)}: {reason}" for reason, parts in together.items()]
+
+
+@contextmanager
+def warnings_noted(notes: Notes) -> Iterator[None]:
+    """While it lasts, what MuJoCo warns of becomes a note, instead of a file in the folder of the user."""
+    package = mujoco()
+    before = package.get_mju_user_warning()
+    package.set_mju_user_warning(lambda said: notes.left_out("MuJoCo warns", " ".join(said.split())))
+    try:
+        yield
+    finally:
+        package.set_mju_user_warning(before)
 
 
 def mujoco() -> Any:

@@ -140,13 +140,19 @@ class Robot(Recipe):
         axes = np.asarray(rotation_of(self.orientation, label))
         place = np.asarray(self.position, float), axes
         parts = building.build(self.description, scene, "" if self.name is None else f"{name}/", place)
-        sites = [
-            {key: _site(frame, parts) for key, frame in frames.items()}
-            for frames in (self.description.frames, self.description.sites)
-        ]
-        bodies = {key: site.body for key, site in sites[0].items()}
-        given = parts.joints, parts.inputs, *sites, self.description.keyframes
-        return RobotHandle(name, bodies, *given, self.description, place, parts)
+        frames = {key: _site(frame, parts) for key, frame in self.description.frames.items()}
+        return RobotHandle(
+            name=name,
+            bodies={key: frame.body for key, frame in frames.items()},
+            joints=parts.joints,
+            inputs=parts.inputs,
+            frames=frames,
+            sites={key: _site(frame, parts) for key, frame in self.description.sites.items()},
+            keyframes=self.description.keyframes,
+            description=self.description,
+            place=place,
+            parts=parts,
+        )
 
     def __str__(self) -> str:
         robot = self.description

@@ -1,4 +1,4 @@
-"""URDF text before MuJoCo's parser sees it: settings, paths of meshes, and what the parser would pass over."""
+"""URDF text before MuJoCo's parser sees it: settings, paths of meshes, and what it would pass over."""
 
 import os
 import xml.etree.ElementTree as ElementTree
@@ -46,9 +46,7 @@ def prepared(text: str, folder: Path | None, notes: Notes, *, visuals: bool, flo
     if weighed:
         options["inertiafromgeom"] = "false"
     else:
-        notes.changed(
-            "all links", "no link has an inertial element: they weigh what is drawn, at 1000 kg/m^3"
-        )
+        notes.changed("all links", "none has an inertial element: they weigh what is drawn, at 1000 kg/m^3")
     ElementTree.SubElement(ElementTree.SubElement(root, "mujoco"), "compiler", options)
     if floating:
         _float(root)
@@ -118,17 +116,16 @@ def _found(shape: Element, folder: Path | None, notes: Notes) -> bool:
         notes.left_out(name, "the mesh file is not there; it is not drawn")
         return False
     if file.suffix.lower() not in READABLE:
-        notes.left_out(
-            name, f"meshes of format {file.suffix} are not read; convert to .stl or .obj to draw it"
-        )
+        notes.left_out(name, f"meshes of format {file.suffix} are not read; it is not drawn")
         return False
     mesh.set("filename", str(file))
     return True
 
 
 def resolve(name: str, folder: Path | None) -> Path | None:
-    """The file behind a path of URDF: of "package://name/rest" below a folder above the file, or where
-    ROS_PACKAGE_PATH says.
+    """The file behind a path of URDF; None: it is not there.
+
+    That of "package://name/rest" is looked for below all folders above, and where ROS_PACKAGE_PATH says.
     """
     scheme, _, rest = name.rpartition("://")
     rest = rest if scheme else name
