@@ -37,7 +37,7 @@ def settle(spec: Any, notes: Notes) -> set[str]:
         if sum(b.mass for b in carried) <= 0:
             body.mass, body.ipos, light = FEATHER, np.zeros(3), light | {body.name}
             body.explicitinertial = True
-        if         if all(np.isnan(b.fullinertia[0]) and min(b.inertia) < FEATHER for b in carried):
+        if all(np.isnan(b.fullinertia[0]) and min(b.inertia) < FEATHER for b in carried):
             if body.name not in light and max(max(b.inertia) for b in carried) < FEATHER:
                 notes.changed(body.name, "it has mass and no inertia, and is a point mass")
             body.inertia = np.maximum(body.inertia, FEATHER)
