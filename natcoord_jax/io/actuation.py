@@ -17,7 +17,8 @@ def actuator_name(model: Any, number: int) -> str:
 
 def input_index(model: Any, number: int) -> int:
     """Where the control of an actuator is in `ctrl` of MuJoCo."""
-    return int(model.actuator_ctrladr[number]) if hasattr(model, "actuator_ctrladr") else number
+    addresses = getattr(model, "actuator_ctrladr", None)  # since MuJoCo 4 an actuator may have several
+    return number if addresses is None else int(addresses[number])
 
 
 def read_actuators(
@@ -108,7 +109,8 @@ def _transmitted(
 ) -> ActuatorData | str:
     """The actuator with what it acts on, or why that is not mapped."""
     name, target = actuator_name(model, number), int(model.actuator_trnid[number][0])
-    out = int(model.actuator_outadr[number]) if hasattr(model, "actuator_outadr") else number
+    addresses = getattr(model, "actuator_outadr", None)
+    out = number if addresses is None else int(addresses[number])
     gear = np.array(model.actuator_gear[out])
     if transmission in ("JOINT", "JOINTINPARENT"):
         joint, kind = joint_name(model, target), KINDS[model.jnt_type[target]]

@@ -29,7 +29,8 @@ class Poses:
         self.site_points = np.array(data.site_xpos).reshape(-1, 3)
         self.site_axes = np.array(data.site_xmat).reshape(-1, 3, 3)
         weld = np.array(model.body_weldid)
-        self.heads = [b for b in range(1, model.nbody) if weld[b] == b and weld[b] != 0]
+        # Mocap bodies are welded to nothing and have no joints: here they are part of the ground.
+        self.heads = [b for b in range(1, model.nbody) if weld[b] == b and model.body_jntnum[b] > 0]
         number = {head: k for k, head in enumerate(self.heads)}
         self.link_of = [number.get(int(head), -1) for head in weld]
 
@@ -155,14 +156,14 @@ def _range(pair: Any) -> Range:
 def _stop(model: Any, number: int) -> float:
     """Stiffness of an elastic stop that gives way as far as MuJoCo's soft limit under a steady load.
 
-    There the acceleration a_1 that the constraint leaves of a_0 obeys a_1 + d (b v + k r) = (1 - d) a_0
-    (documentation, "Computation", solver parameters), with the impedance d and k = 1 / (d_max^2 T^2 z^2) of
-        time constant T and damping ratio z. At rest that is a force d k / ((1 - d) A) per r, A the inverse of
-    the inertia.
+    There the acceleration a_1 that the constraint leaves of a_0 obeys a_1 + d (b v + k r) = (1 - d) a_0,
+    with the impedance d and, where it is largest, k = 1 / (d T^2 z^2) of time constant T and damping ratio
+    z (documentation, "Solver parameters"). At rest that is a force d k / ((1 - d) A) per r, with the inverse
+    A of the inertia.
     """
     first, second = model.jnt_solref[number]
     impedance = float(np.clip(model.jnt_solimp[number][1], 1e-4, 0.9999))
-    k = 1.0 / (impedance * first * second) ** 2 if first > 0 else -first / impedance**2
+    k = 1.0 / (impedance * (first * second) ** 2) if first > 0 else -first / impedance
     inverse = max(float(model.dof_invweight0[model.jnt_dofadr[number]]), 1e-15)
     return impedance * k / ((1.0 - impedance) * inverse)
 

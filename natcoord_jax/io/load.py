@@ -11,7 +11,7 @@ from natcoord_jax.core.kinds import FLAG, Anything, Choice, Several
 from natcoord_jax.io.actuation import input_index, read_actuators
 from natcoord_jax.io.description import UNBOUNDED, ActuatorData, Description, Keyframe, LinkData
 from natcoord_jax.io.links import Poses, body_name, read_links
-from natcoord_jax.io.notes import Notes
+from natcoord_jax.io.notes import Notes, mujoco
 from natcoord_jax.io.relations import list_the_rest, read_equalities
 from natcoord_jax.io.robot import Robot
 from natcoord_jax.io.source import Source, read
@@ -84,11 +84,11 @@ def load(
 def described(found: Source, leave_out: set[str], motors: bool | None) -> Description:
     """All that the robot is, in numbers."""
     model, notes = found.model, found.notes
+    leave_out = leave_out | _switched_off(model)
     poses = Poses(model)
     links = read_links(found, poses)
     equalities = () if "equalities" in leave_out else read_equalities(model, poses, notes)
-    if not leave_out.isdisjoint({"limits", "friction"}):
-        links = tuple(_without(link, leave_out) for link in links)
+    links = tuple(_without(link, leave_out) for link in links)
     joints = {joint.name: joint for link in links for joint in link.joints}
     actuators, numbers = read_actuators(model, poses, joints, notes)
     followers = {equality.joints[0] for equality in equalities if equality.kind == "joint"}
@@ -116,15 +116,32 @@ def described(found: Source, leave_out: set[str], motors: bool | None) -> Descri
     )
 
 
+def _switched_off(model: Any) -> set[str]:
+    """What the flags of a file switch off."""
+    flags = mujoco().mjtDisableBit
+    names = {
+        "GRAVITY": "gravity",
+        "LIMIT": "limits",
+        "FRICTIONLOSS": "friction",
+        "EQUALITY": "equalities",
+        "SPRING": "springs",
+        "DAMPER": "dampers",
+    }
+    off = {name for flag, name in names.items() if model.opt.disableflags & getattr(flags, f"mjDSBL_{flag}")}
+    if model.opt.disableflags & flags.mjDSBL_CONSTRAINT:
+        off |= {"limits", "friction", "equalities"}
+    return off
+
+
 def _model_name(model: Any) -> str:
     """Name of the model, which is the first of all names."""
     return bytes(model.names).partition(b"\0")[0].decode() or "robot"
 
 
 def _without(link: LinkData, leave_out: set[str]) -> LinkData:
-    """A link without limits or friction."""
-    gone = {"stop": 0.0} if "limits" in leave_out else {}
-    gone |= {"friction": 0.0} if "friction" in leave_out else {}
+    """A link without limits, friction, springs or dampers."""
+    fields = {"limits": "stop", "friction": "friction", "springs": "stiffness", "dampers": "damping"}
+    gone = {field: 0.0 for name, field in fields.items() if name in leave_out}
     return replace(link, joints=tuple(replace(joint, **gone) for joint in link.joints))
 
 

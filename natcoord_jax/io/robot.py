@@ -15,7 +15,7 @@ from natcoord_jax.core.markers import Direction, Marker, Point
 from natcoord_jax.core.recipe import Builder, Recipe
 from natcoord_jax.core.state import State
 from natcoord_jax.io import building, placing
-from natcoord_jax.io.description import Description, JointData, Keyframe
+from natcoord_jax.io.description import Description, FrameData, JointData, Keyframe
 from natcoord_jax.io.notes import Note, in_words
 
 
@@ -174,8 +174,11 @@ class Robot(Recipe):
     __repr__ = __str__
 
 
-def _site(frame: Any, parts: Any) -> Site:
-    """Markers of a frame, by its place in the scene."""
+def _site(frame: FrameData, parts: Any) -> Site:
+    """Markers of a frame, in the axes of its body; of the ground by its place in the scene."""
     body, point, axes = parts.placed(frame)
-    first, second, third = (Direction(body, axis) for axis in axes.T)
-    return Site(body, Point(body, point), (first, second, third))
+    local = frame.link >= 0
+    if local:
+        point, axes = frame.position, frame.rotation
+    first, second, third = (Direction(body, axis, local=local) for axis in axes.T)
+    return Site(body, Point(body, point, local=local), (first, second, third))
