@@ -98,7 +98,7 @@ def accelerations_of(robot, data):
     for body in Poses(model).heads:
         both = np.zeros(6)
         mujoco.mj_objectAcceleration(model, data, kind, body, both, 0)
-        turning, moving = both[:3].copy(), both[3:] + model.opt.gravity
+        turning, moving = both[:3].copy(), both[3:] + robot.description.gravity
         mujoco.mj_objectVelocity(model, data, kind, body, both, 0)
         spin, axes = both[:3].copy(), data.xmat[body].reshape(3, 3).T
         bent = np.cross(turning, axes) + np.cross(spin, np.cross(spin, axes))
