@@ -23,6 +23,8 @@ class Agreement:
     mass: float
     gravity: float
     acceleration: float
+    condition: float = 1.0
+    """Of the mass matrix, the largest."""
 
 
 def comparable(robot):
@@ -126,6 +128,7 @@ def agreement(robot, *, states=10, seed=0):
         mujoco.mj_fullM(model, data, full)
         mass, gravity = dynamics(robot, system, handle, data.qpos)
         found.mass = max(found.mass, off(mass, full))
+        found.condition = max(found.condition, float(np.linalg.cond(full)))
         ours.append(handle.state(system, start, data.qpos, data.qvel))
         theirs.append(accelerations_of(robot, data))
         data.qvel[:] = 0.0
