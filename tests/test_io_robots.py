@@ -2,6 +2,7 @@
 
 import sys
 
+import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -346,6 +347,72 @@ def test_from_a_file(tmp_path):
     (tmp_path / "arm.urdf").write_text(MACHINE, encoding="utf-8")
     assert nc.io.load(tmp_path / "arm.urdf").bodies == machine().bodies
     assert nc.io.load(str(tmp_path / "arm.urdf")).description.name == "machine"
+
+
+# --- out again --------------------------------------------------------------------------------------------
+
+
+def test_what_is_saved_moves_with_mujoco_as_here(tmp_path):
+    """Joints of every kind that is written, one of them used backwards, one on a body without mass."""
+    scene = nc.Scene()
+    scene.add(nc.Gravity(vector=(1.0, 2.0, -8.0)))
+    bodies = []
+    for k, place in enumerate(np.random.default_rng(0).normal(size=(8, 3))):
+        link = nc.RigidBody(
+            mass=1.0 + k, inertia=(0.2, 0.3, 0.4), com=(0.1, 0.0, 0.2), position=place,
+            orientation=((1.0, k, 0.5), 0.3 * k), name=f"link {k}",
+        )  # fmt: skip
+        bodies.append(scene.add(link))
+    chain = [
+        nc.Revolute(nc.ground, bodies[0], axis=(0, 1, 1), zero=0.2, name="hinge"),
+        nc.Cylindrical(bodies[0], bodies[1], axis=(1, 0, 1), name="cylinder"),
+        nc.Planar(bodies[2], bodies[1], axis=(1, 1, 0), name="plane"),
+        nc.Universal(bodies[3], bodies[2], axis=(1, 0, 0), second=(0, 0, 1), name="cardan"),
+        nc.Prismatic(bodies[4], bodies[0], axis=(0, 0, 1), zero=-0.1, name="slide"),
+        nc.Spherical(bodies[4], bodies[5], point=(0.3, 0.2, 0.1), name="socket"),
+        nc.Fixed(bodies[5], bodies[6], name="flange"),
+    ]
+    joints = {joint.name: scene.add(joint) for joint in chain}
+    hinge, slide = joints["hinge"], joints["slide"]
+    scene.add(nc.JointSpring(hinge, stiffness=30.0, rest=0.4, name="spring"))
+    scene.add(nc.JointDamper(slide, damping=2.0, name="damper"))
+    scene.add(nc.Armature(hinge, inertia=0.3, name="rotor"))
+    scene.add(nc.JointForce(slide, gear=2.0, name="push"))
+    scene.add(nc.AffineActuator((hinge, slide), gear=(1.0, -2.0), bias=(0.1, -3.0, -0.2), name="pull"))
+    scene.add(nc.Spring((nc.Point(nc.ground), nc.Point(bodies[7])), stiffness=1.0, name="string"))
+    system, state = scene.compile()
+    state = nc.random_state(system, state, key=jax.random.key(0), coordinates=0.5, rates=0.7)
+    saved = nc.io.save_mjcf(system, state, tmp_path / "chain.xml")
+    assert [note.part for note in saved.notes] == ["string"]
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "chain.xml"))
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+    inputs = np.array([0.7, -1.3])
+    data.ctrl[[data.actuator(name).id for name in system.structure.inputs]] = inputs
+    mujoco.mj_forward(model, data)
+    mujoco.mj_rnePostConstraint(model, data)
+    # The string is not written, so it is made slack here.
+    rows = system.set("string", stiffness=0.0).instant(state, inputs).accelerations.reshape(-1, 4, 3)
+    for name in system.structure.bodies:
+        number, both = system.body_index(name), np.zeros(6)
+        np.testing.assert_allclose(state.q[4 * number], data.body(name).xpos, atol=1e-12)
+        kind = mujoco.mjtObj.mjOBJ_XBODY
+        mujoco.mj_objectAcceleration(model, data, kind, data.body(name).id, both, 0)
+        np.testing.assert_allclose(rows[number, 0], both[3:] + model.opt.gravity, rtol=1e-9, atol=1e-9)
+
+
+def test_loops_are_saved_as_equalities():
+    scene = nc.Scene()
+    scene.add(nc.io.load(LOOP))
+    system, state = scene.compile(assemble=True)
+    saved = nc.io.save_mjcf(system, state)
+    model = mujoco.MjModel.from_xml_string(saved.text)
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+    mujoco.mj_forward(model, data)
+    assert model.neq == 2  # the weld is the joint by which the load hangs
+    assert np.max(np.abs(data.efc_pos[data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY])) < 1e-10
+    assert "equality constraints: MuJoCo's are soft" in saved.text
 
 
 # --- errors -----------------------------------------------------------------------------------------------

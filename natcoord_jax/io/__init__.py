@@ -9,3 +9,5 @@ from natcoord_jax.io.notes import Note as Note
 from natcoord_jax.io.robot import Robot as Robot
 from natcoord_jax.io.robot import RobotHandle as RobotHandle
 from natcoord_jax.io.robot import Site as Site
+from natcoord_jax.io.saving import Saved as Saved
+from natcoord_jax.io.saving import save_mjcf as save_mjcf

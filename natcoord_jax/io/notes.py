@@ -1,5 +1,6 @@
 """What a file says and a robot does not do, or does otherwise: by name, with the reason."""
 
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, NamedTuple
@@ -59,9 +60,13 @@ def warnings_noted(notes: Notes) -> Iterator[None]:
     before = package.get_mju_user_warning()
     package.set_mju_user_warning(lambda said: notes.left_out("MuJoCo warns", " ".join(said.split())))
     try:
-        yield
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always")
+            yield
     finally:
         package.set_mju_user_warning(before)
+    for warning in said:
+        notes.changed("MuJoCo warns", " ".join(str(warning.message).split()))
 
 
 def mujoco() -> Any:

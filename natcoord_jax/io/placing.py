@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from natcoord_jax.assembly.system import System
-from natcoord_jax.core.checks import as_array
+from natcoord_jax.core.checks import as_array, is_concrete
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
 from natcoord_jax.io.motion import at_rest, link_poses
@@ -25,6 +25,11 @@ def with_positions(robot: "RobotHandle", system: System, state: State, positions
     """See `RobotHandle.state`."""
     file = robot.description
     label = f"robot {robot.name!r}"
+    if not is_concrete(state, positions, rates):
+        raise ValueError(
+            f"{label}: positions and rates [rad, m] are not known yet inside of a transformation; "
+            "set joint coordinates there with system.with_coordinate"
+        )
     q = _given(positions, file.positions, f"{label}: positions", "rad, m")
     v = _given(rates, np.zeros(file.rate_count), f"{label}: rates", "rad/s, m/s")
     rows, moving = (np.array(x).reshape(-1, 4, 3) for x in (state.q, state.v))
