@@ -311,6 +311,10 @@ CALLS = {
     "computed_torque": lambda w: {
         **RUN(w), "coordinates": [np.ones((1, 1))], "dt": [0.1], "bandwidth": NUMBER, "joints": [(w.hinge,)]
     },
+    "io.load": lambda w: {
+        "source": [nc.io.PENDULUM], "leave_out": [("limits",)], "floating": FLAG, "motors": FLAG
+    },
+    "io.save_mjcf": lambda w: {**RUN(w), "file": [None, "file.xml"], "name": NAME},
     "cost.Effort": lambda w: {"weight": NUMBER},
     "cost.Duration": lambda w: {"weight": NUMBER},
     "cost.Running": lambda w: {"function": [f], "weight": NUMBER},
@@ -384,6 +388,7 @@ def test_everything_public_is_in_the_table():
         methods = inspect.getmembers(cls, inspect.isfunction)
         names |= {f"{cls.__name__}.{n}" for n, _ in methods if n[0] != "_"}
     names |= {"Section.of_numbers", "Section.of_axis_along_first"}
+    names |= {"io.load", "io.save_mjcf"}
     names |= {"Nodes.points", "Nodes.directors", "Nodes.triads"}
     # What `System.set` takes are numbers of the part by name, see `test_parts`.
     assert names - BASES_IN_MODULES - {"System.set"} == set(CALLS)

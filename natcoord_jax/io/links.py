@@ -189,9 +189,3 @@ def _list_what_is_left(notes: Notes, model: Any, number: int, joint: JointData) 
     for reason, (values, index) in checks.items():
         if values is not None and np.any(values[index]):
             notes.left_out(joint.name, reason)
-    if joint.has_coordinate and model.jnt_limited[number]:
-        notes.changed(
-            "limits of joints", "elastic stops without damping, as stiff as MuJoCo's soft limits at rest"
-        )
-    if joint.has_coordinate and model.dof_frictionloss[joint.rate_index]:
-        notes.changed("friction loss", "smooth at rest, see nc.JointFriction: what should stick creeps")

@@ -9,7 +9,7 @@ import numpy as np
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.kinds import FLAG, Anything, Choice, Several
 from natcoord_jax.io.actuation import input_index, read_actuators
-from natcoord_jax.io.description import UNBOUNDED, ActuatorData, Description, Keyframe, LinkData
+from natcoord_jax.io.description import UNBOUNDED, ActuatorData, Description, JointData, Keyframe, LinkData
 from natcoord_jax.io.links import Poses, body_name, read_links
 from natcoord_jax.io.notes import Notes, mujoco
 from natcoord_jax.io.relations import list_the_rest, read_equalities
@@ -39,8 +39,10 @@ def load(
 ) -> Robot:
     """Read a robot from URDF or MJCF.
 
-    MuJoCo's parser and compiler read both. Links that fixed joints join become one body; what cannot be
-    mapped is listed by name with the reason, see `Robot.notes` and `print`.
+    MuJoCo's parser and compiler read both. Links that fixed joints join become one body; several joints of a
+    body become a chain of bodies without mass, so that each has a handle. What cannot be mapped is listed by
+    name with the reason, see `Robot.notes` and `print`. The first robot of a scene brings the gravity of its
+    file, unless the scene has one.
 
     Args:
         source: path of a .urdf or .xml file, the text of one, or a `mujoco.MjSpec`, which is not changed.
@@ -90,6 +92,7 @@ def described(found: Source, leave_out: set[str], motors: bool | None) -> Descri
     equalities = () if "equalities" in leave_out else read_equalities(model, poses, notes)
     links = tuple(_without(link, leave_out) for link in links)
     joints = {joint.name: joint for link in links for joint in link.joints}
+    _list_what_differs(links, joints, notes)
     actuators, numbers = read_actuators(model, poses, joints, notes)
     followers = {equality.joints[0] for equality in equalities if equality.kind == "joint"}
     if motors or (motors is None and found.is_urdf):
@@ -131,6 +134,18 @@ def _switched_off(model: Any) -> set[str]:
     if model.opt.disableflags & flags.mjDSBL_CONSTRAINT:
         off |= {"limits", "friction", "equalities"}
     return off
+
+
+def _list_what_differs(links: Sequence[LinkData], joints: dict[str, JointData], notes: Notes) -> None:
+    """What all robots have otherwise than MuJoCo, where they have it."""
+    if not links:
+        notes.left_out("all bodies", "none can move; a URDF whose root should is read with floating=True")
+    if any(joint.stop for joint in joints.values()):
+        notes.changed(
+            "limits of joints", "elastic stops without damping, at rest as stiff as MuJoCo's limits"
+        )
+    if any(joint.friction for joint in joints.values()):
+        notes.changed("friction loss", "smooth at rest, see nc.JointFriction: what should stick creeps")
 
 
 def _model_name(model: Any) -> str:

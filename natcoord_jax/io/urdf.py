@@ -49,7 +49,7 @@ def prepared(text: str, folder: Path | None, notes: Notes, *, visuals: bool, flo
         notes.changed("all links", "none has an inertial element: they weigh what is drawn, at 1000 kg/m^3")
     ElementTree.SubElement(ElementTree.SubElement(root, "mujoco"), "compiler", options)
     if floating:
-        _float(root)
+        _float(root, notes)
     others = Counter(child.tag for child in root if child.tag not in KNOWN)
     for tag, count in others.items():
         notes.left_out(f"{count} <{tag}>", "extensions of URDF are not read")
@@ -83,11 +83,12 @@ def mimics(root: Element) -> list[str]:
     return [joint.get("name", "") for joint in root.findall("joint") if joint.find("mimic") is not None]
 
 
-def _float(root: Element) -> None:
+def _float(root: Element, notes: Notes) -> None:
     """A link "world" above the root link, which a floating joint joins to it."""
     children = {child.get("link") for child in root.findall("joint/child")}
     top = next(link.get("name", "") for link in root.findall("link") if link.get("name") not in children)
     if top == "world":
+        notes.left_out("floating", "the root link is called world, and that is the ground")
         return
     ElementTree.SubElement(root, "link", {"name": "world"})
     joint = ElementTree.SubElement(root, "joint", {"name": "root", "type": "floating"})
