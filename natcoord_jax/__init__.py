@@ -121,6 +121,7 @@ from natcoord_jax.effects.springs import (
     NonlinearSpring,
     QuadraticSpring,
     SphericalDamper,
+    SphericalSpring,
     Spring,
 )
 from natcoord_jax.scene import Scene
@@ -227,6 +228,7 @@ __all__ = [
     "Sphere",
     "Spherical",
     "SphericalDamper",
+    "SphericalSpring",
     "SphericalTorque",
     "Spring",
     "State",

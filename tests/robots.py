@@ -38,9 +38,9 @@ def comparable(robot):
         kind, first = model.jnt_type[joint], model.jnt_dofadr[joint]
         rates = slice(first, first + (6, 3, 1, 1)[kind])
         if kind < 2:
-            model.jnt_stiffness[joint] = model.dof_armature[rates] = 0.0
+            model.dof_armature[rates] = 0.0
         if kind == 0:
-            model.dof_damping[rates] = 0.0
+            model.dof_damping[rates] = model.jnt_stiffness[joint] = 0.0
     for number in range(len(model.actuator_trntype)):
         if actuator_name(model, number) not in robot.inputs:
             model.actuator_gainprm[number] = model.actuator_biasprm[number] = 0.0

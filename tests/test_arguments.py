@@ -168,6 +168,7 @@ CALLS = {
     "JointStops": lambda w: {**ON_JOINT(w), "stiffness": NUMBER, "lower": [-1.0], "upper": NUMBER},
     "JointDamper": lambda w: {**ON_JOINT(w), "damping": NUMBER},
     "JointFriction": lambda w: {**ON_JOINT(w), "friction": NUMBER, "slip": NUMBER},
+    "SphericalSpring": lambda w: {**MARKED(w.attached), "stiffness": NUMBER},
     "SphericalDamper": lambda w: {**MARKED(w.triad[:2]), "damping": NUMBER},
     "Armature": lambda w: {**ON_JOINT(w), "inertia": NUMBER},
     "JointTorque": lambda w: {"joint": [w.hinge], "gear": NUMBER, "axis": [2], "name": NAME},

@@ -181,6 +181,7 @@ TABLE = {
     nc.JointStops: Entry(lambda p: nc.JointStops(p.joint, stiffness=9.0, lower=-0.1, upper=0.1), nc.Planar),
     nc.JointDamper: Entry(lambda p: nc.JointDamper(p.joint, damping=5.0), nc.Distance),
     nc.JointFriction: Entry(lambda p: nc.JointFriction(p.joint, friction=5.0), nc.Revolute),
+    nc.SphericalSpring: Entry(lambda p: nc.SphericalSpring(p.attached, stiffness=5.0)),
     nc.SphericalDamper: Entry(
         lambda p: nc.SphericalDamper((p.triad[0], nc.Direction(p.two, AXIS)), damping=5.0)
     ),

@@ -11,7 +11,7 @@ from natcoord_jax.core.bodies import TRIAD, Body
 from natcoord_jax.core.checks import as_array
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.handles import Handle, ground
-from natcoord_jax.core.markers import Direction, Point
+from natcoord_jax.core.markers import Attachment, Direction, Point
 from natcoord_jax.core.recipe import Builder
 from natcoord_jax.effects.actuators import AffineActuator, JointForce, SphericalTorque, WrenchInput
 from natcoord_jax.effects.constraints import PointOnPoint
@@ -25,6 +25,7 @@ from natcoord_jax.effects.springs import (
     JointSpring,
     JointStops,
     SphericalDamper,
+    SphericalSpring,
 )
 from natcoord_jax.io.description import (
     UNBOUNDED,
@@ -155,6 +156,9 @@ def _add_joint(parts: Parts, link: LinkData, joint: JointData, parent: Handle, c
         if joint.damping:
             ends = Direction(parent, axis), Direction(child, axis)
             parts.scene.add(SphericalDamper(ends, damping=joint.damping, name=f"{name} damper"))
+        if joint.stiffness:
+            held = Attachment(parent, point, own), Attachment(child, point, own)
+            parts.scene.add(SphericalSpring(held, stiffness=joint.stiffness, name=f"{name} spring"))
         return
     kind = Revolute if joint.kind == "hinge" else Prismatic
     made = kind(parent, child, point=point, axis=axis, zero=-joint.zero, name=name)

@@ -28,7 +28,7 @@ class JointData:
         effort: least and largest force of all its actuators [N m or N].
         velocity: largest rate [rad/s or m/s].
         stiffness: of its spring [N m/rad or N/m].
-        rest: coordinate at which the spring is not stretched [rad or m].
+        rest: coordinate at which the spring is not stretched [rad or m]; of a ball in the pose of the file.
         damping: [N m s/rad or N s/m].
         armature: inertia of the rotor, seen by the joint [kg m^2 or kg].
         friction: dry friction [N m or N].

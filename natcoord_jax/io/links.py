@@ -128,6 +128,7 @@ def _joint(source: Source, number: int) -> JointData:
         axis=np.array(model.jnt_axis[number]),
         position_index=place,
         rate_index=rate,
+        stiffness=float(model.jnt_stiffness[number]),
         damping=float(model.dof_damping[rate]),
         velocity=source.velocities.get(name, np.inf),
     )
@@ -142,7 +143,6 @@ def _joint(source: Source, number: int) -> JointData:
         range=_range(model.jnt_range[number]) if limited else UNBOUNDED,
         stop=_stop(model, number) if limited else 0.0,
         effort=_range(model.jnt_actfrcrange[number]) if bounded else UNBOUNDED,
-        stiffness=float(model.jnt_stiffness[number]),
         rest=float(model.qpos_spring[place]),
         armature=float(model.dof_armature[rate]),
         friction=float(model.dof_frictionloss[rate]),
@@ -179,13 +179,13 @@ def _list_what_is_left(notes: Notes, model: Any, number: int, joint: JointData) 
     if not joint.has_coordinate:
         several = f"of a {joint.kind} joint, which has no single coordinate"
         checks |= {
-            f"the spring {several}": (model.jnt_stiffness, number),
             f"the armature {several}": (model.dof_armature, rates),
             f"the dry friction {several}": (model.dof_frictionloss, rates),
             f"the limit {several}": (model.jnt_limited, number),
         }
     if joint.kind == "free":
         checks["the damping of a free joint"] = (model.dof_damping, rates)
+        checks["the spring of a free joint"] = (model.jnt_stiffness, number)
     for reason, (values, index) in checks.items():
         if values is not None and np.any(values[index]):
             notes.left_out(joint.name, reason)

@@ -33,3 +33,6 @@ from natcoord_jax.effects.springs.point_springs import (
 from natcoord_jax.effects.springs.point_springs import (
     Spring as Spring,
 )
+from natcoord_jax.effects.springs.spherical_spring import (
+    SphericalSpring as SphericalSpring,
+)
