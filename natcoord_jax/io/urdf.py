@@ -86,9 +86,12 @@ def mimics(root: Element) -> list[str]:
 def _float(root: Element, notes: Notes) -> None:
     """A link "world" above the root link, which a floating joint joins to it."""
     children = {child.get("link") for child in root.findall("joint/child")}
-    top = next(link.get("name", "") for link in root.findall("link") if link.get("name") not in children)
-    if top == "world":
-        notes.left_out("floating", "the root link is called world, and that is the ground")
+    tops = [link.get("name", "") for link in root.findall("link") if link.get("name") not in children]
+    top = tops[0] if tops else ""
+    if top in ("", "world"):
+        notes.left_out(
+            "floating", "the root link is called world, and that is the ground" if top else "there is no link"
+        )
         return
     ElementTree.SubElement(root, "link", {"name": "world"})
     joint = ElementTree.SubElement(root, "joint", {"name": "root", "type": "floating"})
