@@ -73,14 +73,19 @@ def save_mjcf(system: System, state: State, file: str | Path | None = None, *, n
     key = _keyframe(state, bodies)
     SubElement(SubElement(root, "keyframe"), "key", {"name": "state", **key})
     listed = notes.listed()
-    lines = [line for mapped in (False, True) for line in in_words(listed, mapped)]
-    if lines:
-        root.insert(0, ElementTree.Comment(" " + "; ".join(lines).replace("--", "- -") + " "))
-    ElementTree.indent(root)
-    text = ElementTree.tostring(root, encoding="unicode") + "\n"
+    text = _written(root, listed)
     if file is not None:
         Path(file).write_text(text, encoding="utf-8")
     return Saved(text, listed)
+
+
+def _written(root: Element, notes: tuple[Note, ...]) -> str:
+    """The text, which begins with the notes."""
+    lines = [line for mapped in (False, True) for line in in_words(notes, mapped)]
+    if lines:
+        root.insert(0, ElementTree.Comment(" " + "; ".join(lines).replace("--", "- -") + " "))
+    ElementTree.indent(root)
+    return ElementTree.tostring(root, encoding="unicode") + "\n"
 
 
 def _write_bodies(
