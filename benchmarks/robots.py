@@ -231,12 +231,13 @@ def main() -> None:
     common.on_one_core()
     jax.config.update("jax_enable_x64", True)
     results = common.circumstances("robots", quick=options.quick)
-    results["versions"] |= {name: version(name) for name in ("mujoco", *FOLDERS)}
+    there = ("mujoco", *(name for name, (folder, _) in FOLDERS.items() if folder.is_dir()))
+    results["versions"] |= {name: version(name) for name in there}
     results["runs"] = sweep(options.quick)
     turned = TORQUES[:1] if options.quick else TORQUES
-    results["torques"] = [torques(*given) for given in turned]
+    results["torques"] = [torques(*given) for given in turned if given[0] in there]
     flown = FLIERS[:0] if options.quick else FLIERS
-    results["flights"] = [fly(*given, STEPS) for given in flown]
+    results["flights"] = [fly(*given, STEPS) for given in flown if given[0] in there]
     results["targets"] = targets(results)
     print(f"\n{common.environment_line(results)}\n\n{show(results['runs'])}\n")
     print(common.show_targets(results["targets"]))
