@@ -400,6 +400,12 @@ def test_what_cannot_float_or_move_is_noted():
     )
 
 
+def test_a_start_beyond_a_limit_is_noted():
+    text = nc.io.PENDULUM.replace('damping="0.01"', 'range="10 20"')
+    assert reasons(nc.io.load(text))["hinge"].startswith("it starts beyond its limit")
+    assert "hinge" not in reasons(nc.io.load(text, leave_out=("limits",)))
+
+
 def test_flags_of_a_file_are_respected():
     flags = '<option><flag gravity="disable" damper="disable"/></option>'
     text = nc.io.PENDULUM.replace("<worldbody>", f"{flags}<worldbody>")

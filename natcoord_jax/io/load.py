@@ -144,6 +144,9 @@ def _list_what_differs(links: Sequence[LinkData], joints: dict[str, JointData], 
         notes.changed(
             "limits of joints", "elastic stops without damping, at rest as stiff as MuJoCo's limits"
         )
+    for joint in joints.values():
+        if joint.stop and not joint.range[0] <= joint.zero <= joint.range[1]:
+            notes.changed(joint.name, "it starts beyond its limit: pose the robot, see RobotHandle.state")
     if any(joint.friction for joint in joints.values()):
         notes.changed("friction loss", "smooth at rest, see nc.JointFriction: what should stick creeps")
 

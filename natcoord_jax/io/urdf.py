@@ -94,7 +94,9 @@ def _float(root: Element, notes: Notes) -> None:
         )
         return
     ElementTree.SubElement(root, "link", {"name": "world"})
-    joint = ElementTree.SubElement(root, "joint", {"name": "root", "type": "floating"})
+    taken = {joint.get("name") for joint in root.findall("joint")}
+    name = "root" if "root" not in taken else f"{top} free"
+    joint = ElementTree.SubElement(root, "joint", {"name": name, "type": "floating"})
     ElementTree.SubElement(joint, "parent", {"link": "world"})
     ElementTree.SubElement(joint, "child", {"link": top})
 
