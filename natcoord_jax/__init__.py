@@ -87,7 +87,15 @@ from natcoord_jax.core.nodes import Clamp
 from natcoord_jax.core.potential import Potential
 from natcoord_jax.core.results import DerivativeError, Result, SimulationError
 from natcoord_jax.core.state import State, Trajectory
-from natcoord_jax.effects.actuators import BodyForceInput, BodyTorqueInput, JointForce, JointTorque
+from natcoord_jax.effects.actuators import (
+    AffineActuator,
+    BodyForceInput,
+    BodyTorqueInput,
+    JointForce,
+    JointTorque,
+    SphericalTorque,
+    WrenchInput,
+)
 from natcoord_jax.effects.beams import (
     BeamDamping,
     BeamElement,
@@ -126,11 +134,14 @@ from natcoord_jax.effects.springs import (
     Armature,
     Damper,
     JointDamper,
+    JointFriction,
     JointPotential,
     JointSpring,
     JointStops,
     NonlinearSpring,
     QuadraticSpring,
+    SphericalDamper,
+    SphericalSpring,
     Spring,
 )
 from natcoord_jax.scene import Scene
@@ -143,10 +154,12 @@ from natcoord_jax.stepping.variational import VariationalMidpoint
 
 if TYPE_CHECKING:
     __version__: str
+    from natcoord_jax import io
     from natcoord_jax.viz import animate, plot, view
 
 __all__ = [
     "Accuracy",
+    "AffineActuator",
     "Armature",
     "Attachment",
     "Balance",
@@ -199,6 +212,7 @@ __all__ = [
     "Joint",
     "JointDamper",
     "JointForce",
+    "JointFriction",
     "JointPotential",
     "JointSpring",
     "JointStops",
@@ -250,6 +264,9 @@ __all__ = [
     "SphereOnPlane",
     "SphereOnSphere",
     "Spherical",
+    "SphericalDamper",
+    "SphericalSpring",
+    "SphericalTorque",
     "Spring",
     "State",
     "Surface",
@@ -260,6 +277,7 @@ __all__ = [
     "Universal",
     "VariationalMidpoint",
     "VelocityConstraint",
+    "WrenchInput",
     "accuracy",
     "animate",
     "assemble",
@@ -275,6 +293,7 @@ __all__ = [
     "ground",
     "inputs",
     "inverse_dynamics",
+    "io",
     "jit",
     "keep_programs",
     "linearise",
@@ -301,7 +320,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """Pictures are loaded when first asked for, and matplotlib with them; the version is looked up then."""
+    """Pictures and readers of files are loaded when first asked for; the version is looked up then."""
     if name == "__version__":
         from importlib.metadata import version
 
@@ -310,4 +329,8 @@ def __getattr__(name: str) -> Any:
         from natcoord_jax import viz
 
         return getattr(viz, name)
+    if name == "io":
+        from importlib import import_module
+
+        return import_module("natcoord_jax.io")
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

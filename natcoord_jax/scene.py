@@ -13,6 +13,7 @@ from jaxtyping import Array
 from natcoord_jax.assembly.build import build
 from natcoord_jax.assembly.system import System
 from natcoord_jax.bodies.nodes import Nodes
+from natcoord_jax.bodies.rigid import Orientation
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.bodies import Body
 from natcoord_jax.core.checks import as_array, is_concrete, require_double
@@ -23,7 +24,7 @@ from natcoord_jax.core.host import on_host
 from natcoord_jax.core.joint import Joint
 from natcoord_jax.core.kinds import BODY, FLAG, JOINT, NAME, Choice, HandleOf, of
 from natcoord_jax.core.nodes import Clamp, NodeSet
-from natcoord_jax.core.numeric import Number, Numbers
+from natcoord_jax.core.numeric import COMPONENTS, Number, Numbers
 from natcoord_jax.core.recipe import Recipe
 from natcoord_jax.core.state import State
 from natcoord_jax.stepping.admissibility import (
@@ -87,20 +88,36 @@ class Scene:
         self.elements: dict[str, Elements] = {}
         self.clamps: dict[str, Clamp] = {}
 
-    @checked("Scene.add", part=PART)
-    def add(self, part: Body | Joint | Effect | Recipe | Nodes | Elements | Clamp) -> Any:
+    @checked("Scene.add", part=PART, name=NAME, position=COMPONENTS, orientation=Orientation())
+    def add(
+        self,
+        part: Body | Joint | Effect | Recipe | Nodes | Elements | Clamp,
+        *,
+        name: str | None = None,
+        position: Any = None,
+        orientation: Any = None,
+    ) -> Any:
         """Add a body, a joint, another effect, a recipe of several of them (a beam), or thousands at once.
 
         Args:
             part: what to add.
+            name: of a robot, the prefix of the names of its parts; other parts have their names themselves.
+            position: of a robot, where the origin of its file is put [m].
+            orientation: of a robot, that of the axes of its file: matrix, quaternion (w, x, y, z) or
+                (axis, angle [rad]).
 
         Returns:
             The handle that joints, effects and sensors refer to it with; of a recipe, what it returns; of
             nodes, their set.
 
         Raises:
-            ValueError: for a duplicate name, a part of another scene, or a joint of a body with itself.
+            ValueError: for a duplicate name, a part of another scene, a joint of a body with itself, or a
+                place for what has one itself.
         """
+        placement = {"name": name, "position": position, "orientation": orientation}
+        placement = {key: value for key, value in placement.items() if value is not None}
+        if placement:
+            part = self._moved(part, placement)
         store: dict[str, Any]
         if isinstance(part, Body):
             store, kind, label = self.bodies, "body", "body"
@@ -135,6 +152,15 @@ class Scene:
             for companion in part.companions(handle):
                 self.add(companion)
         return handle
+
+    def _moved(self, part: Any, placement: dict[str, Any]) -> Any:
+        if not isinstance(part, Recipe):
+            given = " and ".join(placement)
+            raise ValueError(
+                f"Scene.add: {given} for an object of type {type(part).__name__}, which says them itself; "
+                "pass them when you make the part"
+            )
+        return part.at(**placement)
 
     def _stores(self) -> tuple[dict[str, Any], ...]:
         return self.bodies, self.joints, self.effects, self.recipes, self.nodes, self.elements, self.clamps

@@ -210,9 +210,22 @@ CALLS = {
     "JointPotential": lambda w: {**ON_JOINT(w), "law": [f]},
     "JointStops": lambda w: {**ON_JOINT(w), "stiffness": NUMBER, "lower": [-1.0], "upper": NUMBER},
     "JointDamper": lambda w: {**ON_JOINT(w), "damping": NUMBER},
+    "JointFriction": lambda w: {**ON_JOINT(w), "friction": NUMBER, "slip": NUMBER},
+    "SphericalSpring": lambda w: {**MARKED(w.attached), "stiffness": NUMBER},
+    "SphericalDamper": lambda w: {**MARKED(w.triad[:2]), "damping": NUMBER},
     "Armature": lambda w: {**ON_JOINT(w), "inertia": NUMBER},
     "JointTorque": lambda w: {"joint": [w.hinge], "gear": NUMBER, "axis": [2], "name": NAME},
     "JointForce": lambda w: {**ON_JOINT(w), "gear": NUMBER},
+    "AffineActuator": lambda w: {
+        "joint": [(w.hinge,)], "coordinate": [(0,), 0], "name": NAME, "gear": [(1.0,)], "gain": V, "bias": V,
+        "lower": [-1.0], "upper": NUMBER, "least": [-1.0], "most": NUMBER,
+    },
+    "WrenchInput": lambda w: {
+        **MARKED((w.point, *w.triad)), "force": V, "torque": V, "lower": [-1.0], "upper": NUMBER
+    },
+    "SphericalTorque": lambda w: {
+        **MARKED(w.triad[:2]), "gear": NUMBER, "lower": [-1.0], "upper": NUMBER
+    },
     "BodyTorqueInput": lambda w: MARKED(w.triad),
     "BodyForceInput": lambda w: MARKED((w.point, w.direction)),
     "BeamElement": lambda w: {
@@ -228,7 +241,9 @@ CALLS = {
     "DirectorDamping": lambda w: {**MARKED(w.attached), **SHAPES, "viscosity": MATRIX},
     # runs and analysis
     "Scene": lambda w: {},
-    "Scene.add": lambda w: {"part": [nc.PointMass(mass=1.0)]},
+    "Scene.add": lambda w: {
+        "part": [nc.PointMass(mass=1.0)], "name": [None], "position": [None], "orientation": [None]
+    },
     "Scene.add_mass": lambda w: {"handle": [w.body], "block": [np.zeros((4, 4))]},
     "Scene.find": lambda w: {"handle": [w.body, w.hinge], "user": NAME},
     "Scene.compile": lambda w: {"assemble": FLAG, "solver": ["reduced"], "t": NUMBER},
@@ -345,6 +360,10 @@ CALLS = {
     "computed_torque": lambda w: {
         **RUN(w), "coordinates": [np.ones((1, 1))], "dt": [0.1], "bandwidth": NUMBER, "joints": [(w.hinge,)]
     },
+    "io.load": lambda w: {
+        "source": [nc.io.PENDULUM], "leave_out": [("limits",)], "floating": FLAG, "motors": FLAG
+    },
+    "io.save_mjcf": lambda w: {**RUN(w), "file": [None, "file.xml"], "name": NAME},
     "cost.Effort": lambda w: {"weight": NUMBER},
     "cost.Duration": lambda w: {"weight": NUMBER},
     "cost.Running": lambda w: {"function": [f], "weight": NUMBER},
@@ -421,6 +440,7 @@ def test_everything_public_is_in_the_table():
         methods = inspect.getmembers(cls, inspect.isfunction)
         names |= {f"{cls.__name__}.{n}" for n, _ in methods if n[0] != "_"}
     names |= {"Section.of_numbers", "Section.of_axis_along_first"}
+    names |= {"io.load", "io.save_mjcf"}
     names |= {"Nodes.points", "Nodes.directors", "Nodes.triads"}
     # What `System.set` takes are numbers of the part by name, see `test_parts`.
     assert names - BASES_IN_MODULES - {"System.set"} == set(CALLS)

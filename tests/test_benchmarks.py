@@ -40,6 +40,15 @@ def test_scaling(tmp_path):
     assert "exponent" in text
 
 
+def test_robots(tmp_path):
+    results, text = _results("robots", tmp_path)
+    for run in results["runs"]:
+        assert max(run[key] for key in ("mass", "gravity", "acceleration")) < 1e-9
+    for run in results["torques"]:
+        assert run["torque"] < 1e-9
+    assert "URDF that are refused" in text
+
+
 def test_effects(tmp_path):
     results, _ = _results("effects", tmp_path)
     assert [run["effect"] for run in results["runs"]][:2] == ["base", "base without gravity"]

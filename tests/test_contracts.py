@@ -191,6 +191,19 @@ TABLE = {
     nc.PairTorque: Entry(lambda p: nc.PairTorque((p.triad[0], nc.Direction(p.two, AXIS)), torque=0.7)),
     nc.JointTorque: Entry(lambda p: nc.JointTorque(p.joint, gear=2.0), nc.Planar),
     nc.JointForce: Entry(lambda p: nc.JointForce(p.joint, coordinate=1, gear=2.0), nc.Cylindrical),
+    nc.AffineActuator: Entry(
+        lambda p: nc.AffineActuator(
+            (p.joint,) * 2, coordinate=(0, 1), gear=(2.0, -0.5), gain=(3.0, 0.4, 0.2), bias=(0.3, -5.0, -0.7)
+        ),
+        nc.Cylindrical,
+    ),
+    nc.WrenchInput: Entry(
+        lambda p: nc.WrenchInput((p.ends[0], *p.triad), force=(1.0, 0.2, 3.0), torque=(0.0, 0.5, 0.1)),
+        inside=False,
+    ),
+    nc.SphericalTorque: Entry(
+        lambda p: nc.SphericalTorque((p.triad[0], nc.Direction(p.two, AXIS)), gear=2.0)
+    ),
     nc.BodyTorqueInput: Entry(lambda p: nc.BodyTorqueInput(p.triad), inside=False),
     nc.BodyForceInput: Entry(lambda p: nc.BodyForceInput((p.ends[0], p.triad[1])), inside=False),
     nc.Spring: Entry(lambda p: nc.Spring(p.ends, stiffness=5.0, length=0.3)),
@@ -203,6 +216,11 @@ TABLE = {
     nc.JointPotential: Entry(lambda p: nc.JointPotential(p.joint, law=_law), nc.Revolute),
     nc.JointStops: Entry(lambda p: nc.JointStops(p.joint, stiffness=9.0, lower=-0.1, upper=0.1), nc.Planar),
     nc.JointDamper: Entry(lambda p: nc.JointDamper(p.joint, damping=5.0), nc.Distance),
+    nc.JointFriction: Entry(lambda p: nc.JointFriction(p.joint, friction=5.0), nc.Revolute),
+    nc.SphericalSpring: Entry(lambda p: nc.SphericalSpring(p.attached, stiffness=5.0)),
+    nc.SphericalDamper: Entry(
+        lambda p: nc.SphericalDamper((p.triad[0], nc.Direction(p.two, AXIS)), damping=5.0)
+    ),
     nc.Armature: Entry(lambda p: nc.Armature(p.joint, inertia=5.0), nc.Revolute),
     nc.BeamElement: Entry(lambda p: nc.BeamElement(p.attached, length=0.8, stiffness=STIFFNESS)),
     nc.NonlinearBeamElement: Entry(

@@ -31,6 +31,7 @@ FLOORS = (
     "bodies",
     "stepping",
     "scene",
+    "io",
     "analysis",
     "control",
     "viz",
@@ -50,7 +51,7 @@ THROUGH_THE_ROOF = {"gallery", "cli"}
 # Third parties that linsolve may use beside the standard library.
 LINSOLVE_TOOLS = {"jax", "jaxlib", "equinox", "jaxtyping", "numpy"}
 PLOTTING = {"matplotlib", "mpl_toolkits"}
-HEAVY = ("matplotlib", "optax", "scipy.optimize")
+HEAVY = ("matplotlib", "mujoco", "optax", "scipy.optimize")
 
 FILES = sorted(SOURCE.rglob("*.py"))
 

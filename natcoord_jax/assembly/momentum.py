@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from natcoord_jax.assembly.response import Situation, Stations, collect, gather, respond
 from natcoord_jax.assembly.system import Group, System
@@ -58,6 +58,14 @@ def spatial_inertia(
     force = jnp.concatenate([mass[:, 0, 0, None, None] * unit, -skew(moved)], axis=2)
     torque = jnp.concatenate([skew(arm), turning], axis=2)
     return jnp.concatenate([force, torque], axis=1)
+
+
+def weighs_only(mass: Float[Array, "bodies 4 4"]) -> Bool[Array, " bodies"]:
+    """Bodies with mass and no moments of inertia, whose turns nothing resists.
+
+    Those without any mass are none of them: between two joints they turn as what hangs on them asks.
+    """
+    return (jnp.trace(mass[:, 1:, 1:], axis1=1, axis2=2) <= 0) & (mass[:, 0, 0] > 0)
 
 
 def row_weights(mass: Float[Array, "bodies 4 4"]) -> Float[Array, "bodies 4"]:

@@ -27,7 +27,7 @@ from jaxtyping import Array, Bool, Float
 
 from natcoord_jax.assembly.balances import Balances, loops_of, relations_of, rotors_of
 from natcoord_jax.assembly.diagnostics import rows_with_ground, states_of
-from natcoord_jax.assembly.momentum import inertia, spatial_inertia, wrench
+from natcoord_jax.assembly.momentum import inertia, spatial_inertia, weighs_only, wrench
 from natcoord_jax.assembly.rates import joint_axes, row_rates, tree_rates
 from natcoord_jax.assembly.system import System
 from natcoord_jax.assembly.tangent_space import TangentSpace, Velocity
@@ -103,7 +103,7 @@ def _spatial(system: System, rows: Float[Array, "bodies 4 3"]) -> tuple[TreeBloc
     arm = rows[:, 0] - rows_with_ground(rows.reshape(-1, 3))[tree.parent, 0]
     across = jnp.broadcast_to(jnp.eye(6, dtype=rows.dtype), (count, 6, 6)).at[:, :3, 3:].set(-skew(arm))
     # A unit inertia for turns of point masses, which nothing else sees.
-    idle = jnp.where(jnp.trace(system.mass[:, 1:, 1:], axis1=1, axis2=2) <= 0, 1.0, 0.0)
+    idle = jnp.where(weighs_only(system.mass), 1.0, 0.0)
     masses = spatial_inertia(system.mass, rows[:, 1:], rows[:, 1:])
     masses = masses.at[:, 3:, 3:].add(idle[:, None, None] * unit)
     absent = jnp.where(present, 0.0, 1.0)[:, None] * jnp.eye(slots.size, dtype=rows.dtype)

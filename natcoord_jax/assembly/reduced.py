@@ -360,7 +360,8 @@ class ReducedStep(Form):
         multiplier itself loses no digits, which constraints on a light part between heavy ones cannot spare.
         """
         mass = self.system.mass
-        gyration = jnp.trace(mass[:, 1:, 1:], axis1=1, axis2=2) / mass[:, 0, 0]
+        total = mass[:, 0, 0]
+        gyration = jnp.trace(mass[:, 1:, 1:], axis1=1, axis2=2) / jnp.where(total > 0, total, 1.0)
         apart = jnp.max(jnp.abs(self.start[:, 0] - self.start[0, 0]))
         extent = jnp.sqrt(jnp.max(gyration)) + jnp.max(jnp.abs(self.frames[:, :, 0, 1:])) + apart
         extent = jnp.where(extent > 0, extent, 1.0)

@@ -212,12 +212,19 @@ def _continuous(quaternions: Float[Array, "*t 4"], along: bool) -> Float[Array, 
     return quaternions.at[..., 1:, :].multiply(flips[..., None])
 
 
+def _centres(mass: Float[Array, "bodies 4 4"]) -> Float[Array, "bodies 4"]:
+    """Marker weights of the centres of mass; of bodies without mass those of the reference point."""
+    total = mass[:, :1, 0]
+    reference = jnp.eye(4, dtype=mass.dtype)[0]
+    return jnp.where(total > 0, mass[:, 0] / jnp.where(total > 0, total, 1.0), reference)
+
+
 @compiled
 def _body_pose(system: System, states: State, index: Array, along: bool) -> tuple[Array, ...]:
     shape = (*states.t.shape, len(system.structure.bodies), 4, 3)
     rows = states.q.reshape(shape)[..., index, :, :]
     rotation = jnp.swapaxes(rows[..., 1:, :], -1, -2)
-    mass = system.mass[index, 0] / system.mass[index, 0, 0]
+    mass = _centres(system.mass)[index]
     quaternion = _continuous(to_quaternion(rotation), along)
     return rows[..., 0, :], rotation, quaternion, jnp.sum(mass[:, None] * rows, axis=-2)
 
@@ -226,7 +233,7 @@ def _body_pose(system: System, states: State, index: Array, along: bool) -> tupl
 def _body_rates(system: System, state: State) -> tuple[Array, Array, Array]:
     """Velocities of the reference points, angular velocities and velocities of the centres of mass."""
     rows, rates = state.q.reshape(-1, 4, 3), state.v.reshape(-1, 4, 3)
-    shares = system.mass[:, 0] / system.mass[:, :1, 0]
+    shares = _centres(system.mass)
     return rates[:, 0], angular_velocity(rows[:, 1:], rates[:, 1:]), jnp.sum(shares[..., None] * rates, 1)
 
 

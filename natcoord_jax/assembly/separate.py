@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.balances import loops_of, relations_of, rotors_of
-from natcoord_jax.assembly.momentum import inertia, wrench
+from natcoord_jax.assembly.momentum import inertia, weighs_only, wrench
 from natcoord_jax.assembly.rates import joint_axes, row_rates
 from natcoord_jax.assembly.system import System
 from natcoord_jax.assembly.tangent_space import TangentSpace, Velocity, driven, isometric
@@ -58,7 +58,7 @@ class SeparateTangents(eqx.Module):
         impulses = jax.vmap(inertia, in_axes=(None, 1), out_axes=1)(system.mass, columns)
         blank = jnp.zeros((rows.shape[0], slots.size, slots.size), rows.dtype)
         space = cls(system, rows, velocity, spin, impulses, blank, blank)
-        massless = jnp.trace(system.mass[:, 1:, 1:], axis1=1, axis2=2) <= 0
+        massless = weighs_only(system.mass)
         turns = jnp.where(massless[:, None, None], spin, 0.0)
         # A unit inertia for turns of point masses, which nothing else sees.
         idle = jnp.sum(turns[:, :, None] * turns[:, None], axis=-1)

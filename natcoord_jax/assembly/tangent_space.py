@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.balances import Balances, Gains
-from natcoord_jax.assembly.momentum import inertia, spatial_inertia, wrench
+from natcoord_jax.assembly.momentum import inertia, spatial_inertia, weighs_only, wrench
 from natcoord_jax.assembly.rates import row_rates
 from natcoord_jax.assembly.system import System
 from natcoord_jax.core.effect import replace_fields
@@ -99,7 +99,7 @@ class TangentSpace(eqx.Module):
         inertias = rotor_inertias(system)
         space = cls(system, balances.rows, balances.free, gains.rotors, inertias, plain)
         # A unit inertia for turns of point masses, which nothing else sees.
-        massless = jnp.trace(system.mass[:, 1:, 1:], axis1=1, axis2=2) <= 0
+        massless = weighs_only(system.mass)
         return space, space.coupled(space, idle=jnp.where(massless, 1.0, 0.0))
 
     def without_system(self) -> "TangentSpace":

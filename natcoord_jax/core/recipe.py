@@ -37,6 +37,18 @@ class Recipe(Part):
 
     kind = "recipe"
 
+    def at(self, **placement: Any) -> "Recipe":
+        """The recipe under another name or at another place, see `Scene.add`.
+
+        Raises:
+            ValueError: for one that says itself where its parts are.
+        """
+        given = " and ".join(placement)
+        raise ValueError(
+            f"Scene.add: {given} for a {self.kind}, which has its name and its places itself; "
+            "pass them to the part, or a robot of nc.io.load"
+        )
+
     @abc.abstractmethod
     def add_to(self, scene: Builder, name: str) -> Any:
         """Add everything under names that start with `name`; returns what refers to it."""

@@ -133,9 +133,12 @@ def check_inertia(system: System, state: State) -> None:
         ValueError: naming the body or joint of the motion.
     """
     moments = np.asarray(system.mass)
-    central = moments[:, 1:, 1:] - moments[:, :1, 1:] * moments[:, 1:, :1] / moments[:, :1, :1]
+    # Bodies without mass are fine between two joints, as the cross of a universal joint, but not at an end.
+    massless = ~np.any(moments, axis=(1, 2))
+    mass = np.where(massless[:, None, None], 1.0, moments[:, :1, :1])
+    central = moments[:, 1:, 1:] - moments[:, :1, 1:] * moments[:, 1:, :1] / mass
     values = np.linalg.eigvalsh(central)
-    thin = (values[:, 1] <= 1e-12 * values[:, 2]) & (values[:, 2] > 0)
+    thin = massless | ((values[:, 1] <= 1e-12 * values[:, 2]) & (values[:, 2] > 0))
     if not thin.any() or system.structure.unknowns > 200:
         return
     count = system.structure.unknowns

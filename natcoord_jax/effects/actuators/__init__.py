@@ -1,5 +1,14 @@
 """Actuators: input channels."""
 
+from natcoord_jax.effects.actuators.affine import (
+    AffineActuator as AffineActuator,
+)
+from natcoord_jax.effects.actuators.affine import (
+    SphericalTorque as SphericalTorque,
+)
+from natcoord_jax.effects.actuators.affine import (
+    WrenchInput as WrenchInput,
+)
 from natcoord_jax.effects.actuators.motors import (
     BodyForceInput as BodyForceInput,
 )

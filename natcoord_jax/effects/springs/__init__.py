@@ -1,5 +1,11 @@
 """Springs, dampers and stops, between points and on joint coordinates."""
 
+from natcoord_jax.effects.springs.joint_friction import (
+    JointFriction as JointFriction,
+)
+from natcoord_jax.effects.springs.joint_friction import (
+    SphericalDamper as SphericalDamper,
+)
 from natcoord_jax.effects.springs.joint_springs import (
     Armature as Armature,
 )
@@ -26,4 +32,7 @@ from natcoord_jax.effects.springs.point_springs import (
 )
 from natcoord_jax.effects.springs.point_springs import (
     Spring as Spring,
+)
+from natcoord_jax.effects.springs.spherical_spring import (
+    SphericalSpring as SphericalSpring,
 )
