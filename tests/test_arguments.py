@@ -162,7 +162,7 @@ CALLS = {
     "Capsule": lambda w: {"radius": NUMBER, "length": NUMBER},
     "Plane": lambda w: {"normal": V, "point": V, "body": [w.body]},
     "Contact": lambda w: {
-        "one": [w.body], "other": [nc.Plane()], "stiffness": NUMBER, "restitution": NUMBER, "speed": NUMBER,
+        "one": [w.body], "other": [nc.Plane(), w.body], "stiffness": NUMBER, "restitution": NUMBER, "speed": NUMBER,
         "law": ["linear", "hertz"], "name": NAME,
     },
     "ContactLoss": lambda w: {

@@ -10,7 +10,7 @@ import pytest
 from robots import HARD, agreement
 
 import natcoord_jax as nc
-from natcoord_jax.viz.outline import surfaces
+from natcoord_jax.viz.outline import bodies_of
 
 CLOSE = 1e-9
 """What is asked for; it is 1e-14 where inertias are not of very different sizes."""
@@ -374,11 +374,12 @@ def test_what_is_drawn_is_that_of_the_file():
     scene = nc.Scene()
     handle = scene.add(robot)
     system, state = scene.compile()
-    weights, faces = surfaces(system)[system.body_index(handle.bodies["trunk"])]
-    np.testing.assert_allclose(np.ptp(weights[:, 1:], axis=0), (0.6, 0.4, 0.2))
+    trunk, hip = (system.body_index(handle.bodies[name]) for name in ("trunk", "hip"))
+    drawn = bodies_of(system, (trunk, hip))
+    (points, faces), _ = drawn[trunk]
+    np.testing.assert_allclose(np.ptp(points, axis=0), (0.6, 0.4, 0.2))
     assert len(faces) == 6
-    capsule, _ = surfaces(system)[system.body_index(handle.bodies["hip"])]
-    assert np.min(capsule[:, 3]) < -0.44
+    assert np.min(drawn[hip][0][0][:, 2]) < -0.44
     assert len(robot.description.links[0].surface.colours) == 6
 
 

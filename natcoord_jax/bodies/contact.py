@@ -178,6 +178,8 @@ class Contact(Recipe):
 
     def add_to(self, scene: Builder, name: str) -> tuple[Handle, ...]:
         """Add its gaps, and what impacts lose; handles of the gaps."""
+        if self.one == self.other:
+            raise ValueError(f"contact {name!r}: {self.one.name!r} would be in contact with itself")
         law, damping = {"stiffness": self.stiffness, "law": self.law}, self._damping(name)
         solids = self._solids(scene, self.one, name)
         gaps = [gap for solid in solids for gap in self._gaps(scene, solid, law, name)]

@@ -60,8 +60,9 @@ def bodies_of(system: System, numbers: Iterable[int]) -> dict[int, tuple[Surface
     points, mass = set(system.structure.points), np.asarray(system.mass)
     for number in numbers:
         block, shape = mass[number], system.structure.shapes[number]
-        if isinstance(shape, Placed):
-            found[number] = shape.surface(), isinstance(shape.shape, ROUND)
+        if shape is not None:
+            round_ = isinstance(shape, Placed) and isinstance(shape.shape, ROUND)
+            found[number] = shape.surface(), round_
         elif number in points or not np.any(np.abs(block[1:, 1:]) > 0):
             found[number] = None
         else:
