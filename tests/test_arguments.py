@@ -162,8 +162,8 @@ CALLS = {
     "Capsule": lambda w: {"radius": NUMBER, "length": NUMBER},
     "Plane": lambda w: {"normal": V, "point": V, "body": [w.body]},
     "Contact": lambda w: {
-        "one": [w.body], "other": [nc.Plane(), w.body], "stiffness": NUMBER, "restitution": NUMBER, "speed": NUMBER,
-        "law": ["linear", "hertz"], "name": NAME,
+        "one": [w.body], "other": [nc.Plane(), w.body], "stiffness": NUMBER, "restitution": NUMBER,
+        "speed": NUMBER, "law": ["linear", "hertz"], "name": NAME,
     },
     "ContactLoss": lambda w: {
         **MARKED(w.ends), "contact": [nc.SphereOnSphere(w.ends, radii=(1.0, 1.0), stiffness=1.0)],

@@ -8,8 +8,10 @@ import tolerances as tol
 from differences import assert_v_shaped
 
 import natcoord_jax as nc
+from natcoord_jax import gallery
 from natcoord_jax.effects.contact.gap_potential import damping_of
 from natcoord_jax.effects.contact.pairs import segment_distance_square
+from natcoord_jax.viz.links import links
 
 FLOOR = nc.Plane(normal=(0, 0, 1))
 STIFF = 10 * tol.ENERGY_OF_A_SMALL_SCENE
@@ -209,6 +211,12 @@ def test_a_cradle_passes_the_impact_on():
     last = [float(system.sense(trajectory, ball).velocity[-1, 0]) for ball in balls]
     np.testing.assert_allclose(last, (0, 0, 0, 0, 1.0), atol=2e-3)
     assert nc.balance(system, trajectory).energy.max() <= STIFF
+
+
+def test_contacts_are_no_springs_in_pictures():
+    example = gallery.load("newton_cradle", balls=2)
+    drawn = links(example.system, np.asarray(example.state.q).reshape(1, -1, 4, 3), 1.0)
+    assert not [solid.name for solid in drawn if "impact" in solid.name]
 
 
 def test_gradients_through_a_bounce():

@@ -120,6 +120,7 @@ class Effect(Part):
         faces: numbers of the nodes round each face of an element, four each, for pictures.
         vectors: of each node of an element made by `on`: 1 for its point, 2 with a director, 4 with a triad.
         derived: fields that follow from the others, see `renewed`.
+        drawn: whether pictures show it as a link where it is between two points.
     """
 
     kind: ClassVar[str] = "effect"
@@ -136,6 +137,7 @@ class Effect(Part):
     faces: ClassVar[tuple[tuple[int, ...], ...]] = ()
     vectors: ClassVar[int] = 1
     derived: ClassVar[tuple[str, ...]] = ()
+    drawn: ClassVar[bool] = True
 
     @classmethod
     def on(

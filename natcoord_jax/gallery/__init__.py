@@ -8,7 +8,8 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from natcoord_jax.gallery.beams import cantilever, flying_spaghetti, rope
-from natcoord_jax.gallery.continua import block, plate
+from natcoord_jax.gallery.contact import bouncing_balls, newton_cradle, tumbling_capsules
+from natcoord_jax.gallery.continua import block, plate, solar_panels
 from natcoord_jax.gallery.example import Example
 from natcoord_jax.gallery.loops import bricard, four_bar, slider_crank
 from natcoord_jax.gallery.manoeuvres import reorientation_example
@@ -47,6 +48,10 @@ SCENES: Mapping[str, Callable[..., Example]] = {
     "flying_spaghetti": flying_spaghetti,
     "plate": plate,
     "block": block,
+    "solar_panels": solar_panels,
+    "bouncing_balls": bouncing_balls,
+    "newton_cradle": newton_cradle,
+    "tumbling_capsules": tumbling_capsules,
     "robot_cable": robot_cable,
     "plugging": plugging,
 }

@@ -1,6 +1,8 @@
-"""Shells and solids in free flight."""
+"""Shells and solids in free flight, and wings of shells on a hub."""
 
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 import natcoord_jax as nc
 from natcoord_jax.gallery.example import Example
@@ -35,3 +37,29 @@ def block(counts: tuple[int, int, int] = (4, 2, 2)) -> Example:
     system, state = scene.compile()
     facts = {"dofs": 3 * len(mesh.nodes), "mass": 1000.0 * float(np.prod(size))}
     return Example("block", "a block of bricks", system, state, 2e-3, 1000, facts=facts)
+
+
+def solar_panels(counts: tuple[int, int] = (6, 2), torque: float = 2.0) -> Example:
+    """A spacecraft with two flexible solar panels that is turned and stopped; the panels go on swinging."""
+    size, scene = (1.5, 0.5), nc.Scene()
+    hub = scene.add(nc.RigidBody(shape=nc.Box((0.5, 0.5, 0.5)), density=400.0, name="hub"))
+    panel = nc.Elastic(E=3e8, nu=0.3, density=300.0)
+    mesh = nc.mesh.rectangle(size, counts)
+    for side, turn in (("left", np.pi), ("right", 0.0)):
+        rotation = (0, 0, 1), turn
+        corner = np.array([0.25, -0.25, 0.0]) * (1 if turn == 0 else -1)
+        wing = nc.Shell(
+            mesh, thickness=0.01, material=panel, position=corner, orientation=rotation, name=side
+        )
+        scene.add(nc.Clamp(hub, scene.add(wing).set("left")))
+    axes = tuple(nc.Direction(hub, axis) for axis in np.eye(3))
+    scene.add(nc.BodyTorqueInput(axes, name="torque"))
+    system, state = scene.compile()
+
+    def control(t: Array) -> Array:
+        push = jnp.where(t < 1.0, torque, jnp.where(t < 2.0, -torque, 0.0))
+        return jnp.stack([0.3 * push, push, 0.0 * push], axis=1)
+
+    return Example(
+        "solar_panels", "a spacecraft with flexible panels", system, state, 0.01, 400, control=control
+    )

@@ -38,7 +38,9 @@ def links(system: System, rows: np.ndarray, scale: float) -> list[Solid]:
     """Springs, dampers and rods: whatever sits on two points."""
     found = []
     for group in system.effects:
-        if group.weights is None or group.weights.ndim != 3 or group.weights.shape[1] != 2:
+        if not group.effect.drawn or group.weights is None or group.weights.ndim != 3:
+            continue
+        if group.weights.shape[1] != 2:
             continue
         if not np.allclose(markers_of(group)[0][..., 0].sum(axis=-1), 1.0):
             continue

@@ -34,6 +34,7 @@ class PointSum(Constraint):
     weights: Any = eqx.field(kw_only=True, metadata=is_a(Vector(None)))
 
     kind: ClassVar[str] = "point sum"
+    drawn: ClassVar[bool] = False
     multipliers: ClassVar[int] = 3
 
     def residual(self, x: Float[Array, "k 3"]) -> Float[Array, "3"]:

@@ -97,6 +97,7 @@ class GapPotential(Potential):
     law: str = eqx.field(default="linear", kw_only=True, static=True, metadata=is_a(LAW))
 
     kind: ClassVar[str] = "contact"
+    drawn: ClassVar[bool] = False
     silent: ClassVar[bool] = False
 
     @abc.abstractmethod
@@ -148,6 +149,7 @@ class ContactLoss(Effect):
     name: Any = eqx.field(default=None, kw_only=True, metadata=is_a(NAME))
 
     kind: ClassVar[str] = "contact loss"
+    drawn: ClassVar[bool] = False
     works: ClassVar[bool] = True
 
     def attach(self, find: Any) -> Any:

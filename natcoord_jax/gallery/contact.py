@@ -1,0 +1,78 @@
+"""Bodies that bounce and collide."""
+
+import numpy as np
+
+import natcoord_jax as nc
+from natcoord_jax.gallery.example import Example
+
+GRAVITY = 9.81
+
+
+def bouncing_balls(restitutions: tuple[float, ...] = (1.0, 0.8, 0.5)) -> Example:
+    """Balls that are dropped on a floor and keep different parts of their speed at an impact."""
+    scene = nc.Scene()
+    scene.add(nc.Gravity(vector=(0, 0, -GRAVITY)))
+    floor, radius, height = nc.Plane(normal=(0, 0, 1)), 0.1, 1.0
+    speed = float(np.sqrt(2 * GRAVITY * height))
+    for k, restitution in enumerate(restitutions):
+        ball = scene.add(
+            nc.RigidBody(
+                shape=nc.Sphere(radius),
+                density=200.0,
+                position=(0.5 * k, 0, height + radius),
+                angular_velocity=(0, 1.0, 0),
+                name=f"ball {k + 1}",
+            )
+        )
+        lossy = {} if restitution == 1 else {"restitution": restitution, "speed": speed}
+        scene.add(nc.Contact(ball, floor, stiffness=2e4, name=f"bounce {k + 1}", **lossy))
+    system, state = scene.compile()
+    fall = float(np.sqrt(2 * height / GRAVITY))
+    facts = {"fall": fall, "apexes": tuple(e**2 * height for e in restitutions)}
+    return Example("bouncing_balls", "balls on a floor", system, state, 1e-3, 2500, facts=facts)
+
+
+def newton_cradle(balls: int = 5, raised: float = 0.8) -> Example:
+    """A cradle: balls on rods that hang side by side with small gaps, the first one raised."""
+    radius, length, gap = 0.1, 1.0, 1e-3
+    scene = nc.Scene()
+    scene.add(nc.Gravity(vector=(0, 0, -GRAVITY)))
+    handles = []
+    for k in range(balls):
+        above = np.array([k * (2 * radius + gap), 0.0, 0.0])
+        angle = raised if k == 0 else 0.0
+        below = above - length * np.array([np.sin(angle), 0.0, np.cos(angle)])
+        ball = scene.add(
+            nc.RigidBody(shape=nc.Sphere(radius), density=7800.0, position=below, name=f"ball {k + 1}")
+        )
+        scene.add(nc.Revolute(nc.ground, ball, point=above, axis=(0, 1, 0), name=f"rod {k + 1}"))
+        handles.append(ball)
+    for k, (one, two) in enumerate(zip(handles, handles[1:])):
+        scene.add(nc.Contact(one, two, stiffness=3e7, name=f"impact {k + 1}"))
+    system, state = scene.compile()
+    facts = {"height": length * (1 - np.cos(raised)), "angle": raised}
+    return Example("newton_cradle", "a cradle of balls", system, state, 2e-4, 10000, facts=facts)
+
+
+def tumbling_capsules() -> Example:
+    """Capsules and balls that are thrown at each other in space."""
+    scene, random = nc.Scene(), np.random.default_rng(3)
+    handles = []
+    for k in range(6):
+        place = 0.6 * np.array([np.cos(k * np.pi / 3), np.sin(k * np.pi / 3), 0.15 * (-1) ** k])
+        shape = nc.Capsule(radius=0.07, length=0.35) if k % 2 == 0 else nc.Sphere(0.12)
+        body = nc.RigidBody(
+            shape=shape,
+            density=500.0,
+            position=place,
+            velocity=-1.5 * place,
+            orientation=((1.0, 0.3, 0.2), 1.2 * k),
+            angular_velocity=random.normal(size=3),
+            name=f"{'capsule' if k % 2 == 0 else 'ball'} {k + 1}",
+        )
+        handles.append(scene.add(body))
+    for i, one in enumerate(handles):
+        for j, two in enumerate(handles[:i]):
+            scene.add(nc.Contact(one, two, stiffness=3e4, name=f"impact {j + 1} {i + 1}"))
+    system, state = scene.compile()
+    return Example("tumbling_capsules", "capsules and balls", system, state, 2e-3, 1000)
