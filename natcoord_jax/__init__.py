@@ -17,7 +17,7 @@ from natcoord_jax.analysis import (
     modes,
     tangent_growth,
 )
-from natcoord_jax.assembly.posing import random_state
+from natcoord_jax.assembly.set_coordinates import random_state
 from natcoord_jax.assembly.system import System
 from natcoord_jax.assembly.transfer import transfer
 from natcoord_jax.bodies import (

@@ -17,10 +17,10 @@ from natcoord_jax.bodies.rigid import Orientation
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.bodies import Body
 from natcoord_jax.core.checks import as_array, is_concrete, require_double
+from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.effect import Effect, replace_fields
 from natcoord_jax.core.elements import Elements
 from natcoord_jax.core.handles import Handle, ground
-from natcoord_jax.core.host import on_host
 from natcoord_jax.core.joint import Joint
 from natcoord_jax.core.kinds import BODY, FLAG, JOINT, NAME, Choice, HandleOf, of
 from natcoord_jax.core.nodes import Clamp, NodeSet
@@ -53,12 +53,12 @@ NODES = of("some nodes of a set, as mesh[:4]", NodeSet)
 _scene_numbers = itertools.count(1)
 
 
-@on_host
+@eager_numpy
 def _sum(one: Array, other: Array) -> Array:
     return one + other
 
 
-@on_host
+@eager_numpy
 def _placed(every: Array, numbers: np.ndarray, places: Array) -> Array:
     return every.at[numbers].set(places)
 

@@ -17,7 +17,7 @@ from hunting_effects import STEPS, Chance
 
 import natcoord_jax as nc
 from natcoord_jax.assembly.coordinates import state_rates
-from natcoord_jax.core.host import on_host
+from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.stepping.derivative import run_slots
 from natcoord_jax.stepping.error_control import Tolerance
 from natcoord_jax.stepping.newton import TOLERANCE
@@ -71,7 +71,7 @@ class Case(eqx.Module):
     directions: Any
 
 
-_rates_of = on_host(state_rates)
+_rates_of = eager_numpy(state_rates)
 
 
 # --- one case ---------------------------------------------------------------------------------------------

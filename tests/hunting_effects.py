@@ -10,8 +10,8 @@ import numpy as np
 import natcoord_jax as nc
 from natcoord_jax.assembly.response import body_rows
 from natcoord_jax.assembly.tangent_space import TangentSpace, Velocity
+from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.effect import replace_fields
-from natcoord_jax.core.host import on_host
 
 STEPS = 40
 """Of most scenes."""
@@ -185,7 +185,7 @@ class Chance(np.random.Generator):
 # --- starts -----------------------------------------------------------------------------------------------
 
 
-@on_host
+@eager_numpy
 def _projected(system: nc.System, state: nc.State, v: Any) -> nc.State:
     free = TangentSpace.at(system, state).projected(Velocity(body_rows(v), state.rates))
     return replace_fields(state, v=free.rows.reshape(state.v.shape), rates=free.rotors)

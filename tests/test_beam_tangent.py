@@ -13,7 +13,7 @@ import tolerances as tol
 import natcoord_jax as nc
 from natcoord_jax.assembly.local import jacobians
 from natcoord_jax.assembly.response import body_rows, ground_rows, situation
-from natcoord_jax.core.effect import Effect, Motion, Now, replace_fields
+from natcoord_jax.core.effect import Effect, Motion, StepContext, replace_fields
 from natcoord_jax.core.gradient import gradient_of
 from natcoord_jax.core.potential import Potential, place_markers
 from natcoord_jax.maths.collocation import gauss
@@ -88,7 +88,7 @@ def test_responses_at_once_are_those_of_each(law, stages):
     rng = np.random.default_rng(5)
     rows = jnp.asarray(start + 0.1 * rng.normal(size=(stages, *start.shape)))
     rates, spin = jnp.asarray(rng.normal(size=rows.shape)), jnp.zeros((stages, *start.shape[:2], 3))
-    now = Now(where.t, where.h, where.inputs, where.coordinates, where.rates, gauss(stages))
+    now = StepContext(where.t, where.h, where.inputs, where.coordinates, where.rates, gauss(stages))
     given = where.place, Motion(start, rows, rates, spin), now, jnp.zeros((ELEMENTS, stages, 0))
     found = jax.jit(lambda *x: group.effect.responses(*x))(*given)
     alone = jax.jit(lambda *x: Effect.responses(group.effect, *x))(*given)

@@ -26,6 +26,7 @@ FLOORS = (
     "maths",
     "linsolve",
     "core",
+    "mesh",
     "effects",
     "assembly",
     "bodies",

@@ -8,7 +8,7 @@ from jax import lax
 
 import natcoord_jax as nc
 from natcoord_jax.core.checks import as_array, at_top_level
-from natcoord_jax.core.host import FLOWS, on_host
+from natcoord_jax.core.eager_numpy import FLOWS, eager_numpy
 
 X = jnp.asarray(np.random.default_rng(0).normal(size=(4, 3)))
 PLACES = jnp.array([2, 0, 3])
@@ -61,7 +61,7 @@ CASES = {
 @pytest.mark.parametrize("case", CASES)
 def test_results_are_those_of_jax(case):
     """Could go wrong: an operation that NumPy defines differently, at a corner."""
-    expected, found = CASES[case](X), on_host(CASES[case])(X)
+    expected, found = CASES[case](X), eager_numpy(CASES[case])(X)
     for want, have in zip(jax.tree.leaves(expected), jax.tree.leaves(found), strict=True):
         assert isinstance(have, jax.Array)
         assert (want.shape, want.dtype) == (have.shape, have.dtype)
@@ -82,13 +82,13 @@ def test_operations_with_several_results_give_arrays(name):
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(FLOWS, name, noting)
         for case in ("loops", "taken apart"):
-            on_host(CASES[case])(X)
-        on_host(lambda x: jnp.split(x, 3))(X[0])
+            eager_numpy(CASES[case])(X)
+        eager_numpy(lambda x: jnp.split(x, 3))(X[0])
     assert found and all(isinstance(x, np.ndarray) for x in found)
 
 
 def test_inside_of_transformations_it_is_the_function_itself():
-    square = on_host(lambda x: jnp.sum(x**2))
+    square = eager_numpy(lambda x: jnp.sum(x**2))
     assert at_top_level()
     np.testing.assert_allclose(jax.grad(square)(X), 2 * X)
     np.testing.assert_allclose(jax.jit(square)(X), jnp.sum(X**2))
@@ -102,22 +102,22 @@ def test_numbers_of_python_are_no_arrays():
     def branching(x, size, flag=False):
         return x * 2 if size > 1.0 else (x if flag else -x)
 
-    double = on_host(branching)
+    double = eager_numpy(branching)
     np.testing.assert_array_equal(double(X, 2.0), 2 * X)
     np.testing.assert_array_equal(double(X, 0.5), -X)
     np.testing.assert_array_equal(double(X, 0.5, True), X)
     np.testing.assert_array_equal(double(X, 0.5, 0), -X)
-    assert np.signbit(on_host(lambda x, y: x * y)(np.ones(1), -0.0))
-    assert not np.signbit(on_host(lambda x, y: x * y)(np.ones(1), 0.0))
+    assert np.signbit(eager_numpy(lambda x, y: x * y)(np.ones(1), -0.0))
+    assert not np.signbit(eager_numpy(lambda x, y: x * y)(np.ones(1), 0.0))
     key = jax.random.key(1)
-    np.testing.assert_array_equal(on_host(jax.random.uniform)(key), jax.random.uniform(key))
+    np.testing.assert_array_equal(eager_numpy(jax.random.uniform)(key), jax.random.uniform(key))
 
 
 def test_large_arrays_are_left_to_the_compiler(monkeypatch):
-    scale = on_host(lambda x, by: by * jnp.sin(x))
+    scale = eager_numpy(lambda x, by: by * jnp.sin(x))
     small = scale(X, 3.0)
-    monkeypatch.setattr("natcoord_jax.core.host.LARGE", X.size - 1)
-    monkeypatch.setattr("natcoord_jax.core.host.evaluate", None)
+    monkeypatch.setattr("natcoord_jax.core.eager_numpy.LARGE", X.size - 1)
+    monkeypatch.setattr("natcoord_jax.core.eager_numpy.evaluate", None)
     np.testing.assert_allclose(scale(X, 3.0), small, rtol=1e-15)
 
 

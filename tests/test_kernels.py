@@ -15,7 +15,7 @@ from natcoord_jax import gallery
 from natcoord_jax.maths.collocation import _inverse
 from natcoord_jax.maths.projectors import range_projector
 from natcoord_jax.maths.vectors import cross, skew
-from natcoord_jax.stepping import linear_pair, one_kernel, rewriting, rounds
+from natcoord_jax.stepping import linear_pair, one_kernel, rewriting
 from natcoord_jax.stepping.endpoint import endpoints
 from natcoord_jax.stepping.one_kernel import as_one_kernel, in_few_kernels, lane_by_lane
 from natcoord_jax.stepping.plan import Plan
@@ -328,7 +328,7 @@ def _scaled(residuals, x):
     return jnp.sin(a) * x, jnp.sum(a * x)
 
 
-class Scaled(linear_pair.Pair):
+class Scaled(linear_pair.LinearWithTranspose):
     """The same with its transpose; neither is differentiated, nor could it be."""
 
     def forward(self, residuals, arguments):

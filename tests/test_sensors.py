@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 import natcoord_jax as nc
-from natcoord_jax.assembly.balances import loads
 from natcoord_jax.assembly.coordinates import coordinate_values
 from natcoord_jax.assembly.diagnostics import rows_with_ground
+from natcoord_jax.assembly.equations_of_motion import loads
 from natcoord_jax.core.joint import frames_at
 
 ROUND_OFF = 1e-13

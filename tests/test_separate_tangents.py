@@ -8,8 +8,8 @@ import tolerances as tol
 
 import natcoord_jax as nc
 from natcoord_jax import gallery
-from natcoord_jax.assembly import separate
-from natcoord_jax.assembly.separate import SeparateTangents, tangents_at
+from natcoord_jax.assembly import block_tangent_space
+from natcoord_jax.assembly.block_tangent_space import SeparateTangents, tangents_at
 from natcoord_jax.assembly.tangent_space import TangentSpace, Velocity
 
 
@@ -38,7 +38,7 @@ def mixed():
 
 def test_tangents_of_single_bodies_are_those_of_all():
     system, start = mixed()
-    assert separate.separate(system)
+    assert block_tangent_space.separate(system)
     end = jax.tree.map(lambda x: x[-1], nc.simulate(system, start, dt=0.05, steps=6).states)
     rng = np.random.default_rng(0)
     d = Velocity(jnp.asarray(rng.normal(size=(5, 4, 3))), jnp.zeros(0))
@@ -57,17 +57,17 @@ def test_tangents_of_single_bodies_are_those_of_all():
 
 
 def test_what_is_no_set_of_single_bodies():
-    assert not separate.separate(gallery.load("double_pendulum").system)
-    assert not separate.separate(gallery.load("four_bar").system)
-    assert not separate.separate(gallery.load("spacecraft").system)
+    assert not block_tangent_space.separate(gallery.load("double_pendulum").system)
+    assert not block_tangent_space.separate(gallery.load("four_bar").system)
+    assert not block_tangent_space.separate(gallery.load("spacecraft").system)
     scene = nc.Scene()
     one = scene.add(nc.RigidBody(mass=1.0, inertia=(1.0, 1.0, 1.0)))
     scene.add(nc.RigidBody(mass=1.0, inertia=(1.0, 1.0, 1.0), position=(1.0, 0, 0)))
-    assert separate.separate(scene.compile()[0])
+    assert block_tangent_space.separate(scene.compile()[0])
     hinge = scene.add(nc.Revolute(nc.ground, one, point=(0, 0, 0), axis=(0, 0, 1), name="hinge"))
-    assert separate.separate(scene.compile()[0])
+    assert block_tangent_space.separate(scene.compile()[0])
     scene.add(nc.Drive(hinge, function=lambda t: 0.1 * t))
-    assert not separate.separate(scene.compile()[0])
+    assert not block_tangent_space.separate(scene.compile()[0])
 
 
 @pytest.mark.exhaustive

@@ -24,7 +24,7 @@ from natcoord_jax.effects.springs.point_springs import COINCIDENT, energy_of_dis
 from natcoord_jax.maths.collocation import gauss
 from natcoord_jax.maths.rotations import from_rotation_vector
 from natcoord_jax.maths.vectors import positive_part, quotient, safe_divide, safe_norm, unit
-from natcoord_jax.stepping.correcting import ROUNDS, Correcting
+from natcoord_jax.stepping.linear_iteration import ROUNDS, LinearIteration
 
 SCHEMES = {order: nc.EnergyMomentum(order=order) for order in (2, 4)}
 
@@ -442,7 +442,7 @@ def turntable():
 
 def unsolvable(monkeypatch):
     """Linear systems of derivatives are found unsolved from now on."""
-    judged = Correcting.judged
+    judged = LinearIteration.judged
 
     def never(self, *args, **kwargs):
         found, factors = judged(self, *args, **kwargs)
@@ -450,7 +450,7 @@ def unsolvable(monkeypatch):
         given = no, yes, jnp.zeros_like(found.rounds) + ROUNDS
         return eqx.tree_at(lambda c: (c.done, c.wanting, c.rounds), found, given), factors
 
-    monkeypatch.setattr(Correcting, "judged", never)
+    monkeypatch.setattr(LinearIteration, "judged", never)
 
 
 MODES = {

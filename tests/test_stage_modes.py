@@ -12,8 +12,8 @@ from natcoord_jax import gallery
 from natcoord_jax.assembly.equations import prepare
 from natcoord_jax.linsolve.stages import complex_inverse, fitted, modes_of, stagewise_inverse
 from natcoord_jax.maths.collocation import gauss
+from natcoord_jax.stepping.difference_jacobian import FAILURES, DifferenceJacobian, matrix_of
 from natcoord_jax.stepping.newton import newton
-from natcoord_jax.stepping.probe import FAILURES, Probe, matrix_of
 
 SIZES = [(5, 0), (5, 2), (50, 3)]
 
@@ -82,7 +82,7 @@ class Found(NamedTuple):
 
 def begun(y, equations):
     """The probe before the first Jacobian."""
-    return Probe.first(equations, y)
+    return DifferenceJacobian.first(equations, y)
 
 
 def found_at(probe, y, equations):

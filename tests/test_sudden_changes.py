@@ -13,7 +13,6 @@ import pytest
 from tolerances import EXACT_GRADIENT, SAME_GRADIENT
 
 import natcoord_jax as nc
-from natcoord_jax.stepping import correcting
 
 
 class Brake(nc.JointDamper):

@@ -10,7 +10,7 @@ from scenes import pair, with_multipliers
 
 import natcoord_jax as nc
 from natcoord_jax.assembly.equations import prepare
-from natcoord_jax.stepping import watch as subject
+from natcoord_jax.stepping import energy_check as subject
 from natcoord_jax.stepping.factors import factors_of
 from natcoord_jax.stepping.newton import TOLERANCE, newton
 from natcoord_jax.stepping.step import advance

@@ -17,11 +17,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.diagnostics import body_momenta
-from natcoord_jax.assembly.response import Stations, body_rows, gather, respond, situation, stations
+from natcoord_jax.assembly.response import StageKinematics, body_rows, gather, respond, situation, stations
 from natcoord_jax.assembly.system import SYSTEM, Group, System
 from natcoord_jax.core.arguments import checked
+from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.effect import Motion, Response
-from natcoord_jax.core.host import on_host
 from natcoord_jax.core.state import TRAJECTORY, State, Trajectory
 from natcoord_jax.maths.collocation import gauss
 from natcoord_jax.maths.vectors import cross, safe_divide
@@ -65,7 +65,7 @@ class Balance(eqx.Module):
         return "\n".join(["Balance: largest relative errors [-]", *lines])
 
 
-def _midpoint(before: State, after: State, h: Array) -> Stations:
+def _midpoint(before: State, after: State, h: Array) -> StageKinematics:
     """Motion over a step as the effects saw it: mid-point rows, mean velocities, spins of the mid-points."""
     start, rates = body_rows(before.q), body_rows(0.5 * (before.v + after.v))
     middle = (start + 0.5 * h * rates)[:, 1:]
@@ -115,7 +115,7 @@ def _step(system: System, midpoint: bool, before: State, after: State, u: Array)
     return impulse, gram
 
 
-@on_host
+@eager_numpy
 def _account(system: System, trajectory: Trajectory) -> dict[str, Any]:
     """All that is needed of the trajectory, at the saved times."""
     states = trajectory.states

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from natcoord_jax.analysis.static_equations import Static
-from natcoord_jax.assembly.balances import loads, relative_rates, rotors_of, with_rest
+from natcoord_jax.assembly.equations_of_motion import loads, relative_rates, rotors_of, with_rest
 from natcoord_jax.assembly.momentum import inertia, wrench
 from natcoord_jax.assembly.projection import TWIST, constraint_matrix
 from natcoord_jax.assembly.rates import row_rates

@@ -13,16 +13,16 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from natcoord_jax.assembly.balances import loads
+from natcoord_jax.assembly.equations_of_motion import loads
 from natcoord_jax.assembly.full import FullStep, dense, rates_of, touches
 from natcoord_jax.assembly.local import body_motion
 from natcoord_jax.assembly.local_rates import TWIST
 from natcoord_jax.assembly.momentum import wrench
 from natcoord_jax.assembly.node_sweeps import sweep_nodes
-from natcoord_jax.assembly.outset import Outset
 from natcoord_jax.assembly.projection import nearest_coordinates
 from natcoord_jax.assembly.rates import row_rates
 from natcoord_jax.assembly.response import gather, respond, situation, stations
+from natcoord_jax.assembly.start_cache import StartCache
 from natcoord_jax.assembly.system import Group, System
 from natcoord_jax.assembly.tree import gather_slots, start_rates
 from natcoord_jax.assembly.violations import violations_of
@@ -152,7 +152,7 @@ class Static(eqx.Module):
         system = replace_fields(self.system, mass=(NO_MASS + weight) * self.system.mass)
         resting = self.displaced(jnp.zeros_like(y))
         step = FullStep.prepare(
-            system, resting, self.inputs, jnp.ones((), y.dtype), gauss(1), Outset(None, None)
+            system, resting, self.inputs, jnp.ones((), y.dtype), gauss(1), StartCache(None, None)
         )
         # Times of a step of length one, shifted to that of the load.
         situations = tuple(eqx.tree_at(lambda s: s.t, where, where.t - 0.5) for where in step.situations)

@@ -12,8 +12,8 @@ from jaxtyping import Array
 
 from natcoord_jax.core.bodies import TRIAD, Body
 from natcoord_jax.core.checks import as_array
+from natcoord_jax.core.eager_numpy import stacked
 from natcoord_jax.core.handles import Handle
-from natcoord_jax.core.host import stacked
 from natcoord_jax.core.names import Run, names_of, ranges_of
 from natcoord_jax.xla.tracing import at_top_level
 

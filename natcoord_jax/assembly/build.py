@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from natcoord_jax.assembly.axisymmetric_axes import symmetries
 from natcoord_jax.assembly.bodies import Bodies
 from natcoord_jax.assembly.choice import choose_solver, elimination_order
 from natcoord_jax.assembly.coordinates import coordinate_values, state_rates
@@ -16,13 +17,12 @@ from natcoord_jax.assembly.grouping import element_group, stack
 from natcoord_jax.assembly.layout import Layout
 from natcoord_jax.assembly.local_rates import LocalRates
 from natcoord_jax.assembly.masses import with_masses
-from natcoord_jax.assembly.roundness import symmetries
 from natcoord_jax.assembly.system import Structure, System
 from natcoord_jax.core.bodies import DIRECTOR, POINT, Body
 from natcoord_jax.core.checks import as_array, is_concrete
+from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.effect import Effect, replace_fields
 from natcoord_jax.core.elements import Elements
-from natcoord_jax.core.host import on_host
 from natcoord_jax.core.joint import Joint
 from natcoord_jax.core.names import compact
 from natcoord_jax.core.nodes import Clamp
@@ -118,7 +118,7 @@ def with_readings(system: System, state: State) -> State:
     return _with_readings(system, state) if system.coordinates else state
 
 
-@on_host
+@eager_numpy
 def _with_readings(system: System, state: State) -> State:
     values, rates = coordinate_values(system, rows_with_ground(state.q)), state_rates(system, state)
     coordinates, rotors = state.coordinates, state.rates

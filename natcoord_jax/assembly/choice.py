@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from natcoord_jax.assembly.collection import Collection
 from natcoord_jax.assembly.layout import Layout
+from natcoord_jax.assembly.segment_sum import SegmentSum
 from natcoord_jax.assembly.system import Elimination, Group, Seats
 from natcoord_jax.assembly.tree import Tree
 
@@ -68,7 +68,7 @@ def elimination_order(layout: Layout, effects: tuple[Group, ...], joints: tuple[
         nodes = np.where(table < bodies, table, -1).max(axis=1)
         others = np.where((table < bodies) & (table != nodes[:, None]), table, -1).max(axis=1)
         nodes, others = (np.where(x < 0, bodies, x) for x in (nodes, others))
-        seats.append(Seats(Collection.of(nodes, bodies), Collection.of(others, bodies)))
+        seats.append(Seats(SegmentSum.of(nodes, bodies), SegmentSum.of(others, bodies)))
         for node in nodes:
             owned[min(node, bodies - 1)] += range(total, total + group.multipliers)
             total += group.multipliers

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.diagnostics import rows_with_ground
-from natcoord_jax.assembly.response import Stations
+from natcoord_jax.assembly.response import StageKinematics
 from natcoord_jax.assembly.system import CoordinateGroup, System
 from natcoord_jax.core.coordinate import pair_motion
 from natcoord_jax.core.effect import Motion
@@ -64,7 +64,9 @@ def state_rates(system: System, state: State) -> Float[Array, " coordinates"]:
     return coordinate_rates(system, rows, *velocities_with_ground(state.v, rows))
 
 
-def _rates_of_group(group: CoordinateGroup, system: System, at: Stations, h: Array) -> Float[Array, "s n"]:
+def _rates_of_group(
+    group: CoordinateGroup, system: System, at: StageKinematics, h: Array
+) -> Float[Array, "s n"]:
     bodies = system.joint_bodies[group.joints]
 
     def one(place, start, rows, rates, spin):
@@ -75,7 +77,7 @@ def _rates_of_group(group: CoordinateGroup, system: System, at: Stations, h: Arr
         return jax.vmap(one, in_axes=(0, 0, 1, 1, 1), out_axes=1)(system.frames[group.joints], *motion)
 
 
-def stage_rates(system: System, at: Stations, h: Array) -> Float[Array, "s coordinates"]:
+def stage_rates(system: System, at: StageKinematics, h: Array) -> Float[Array, "s coordinates"]:
     """Rates of joint coordinates whose weighted sum over the stages is the exact increment over h."""
     if not system.coordinates:
         return jnp.zeros((at.rates.shape[0], 0), at.rates.dtype)

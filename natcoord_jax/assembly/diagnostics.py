@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.core.checks import require_double
-from natcoord_jax.core.host import on_host
+from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.results import REASONS, REMEDIES, Result, SimulationError
 from natcoord_jax.core.state import State, Trajectory
 from natcoord_jax.maths.vectors import cross
@@ -63,7 +63,7 @@ def over_states(
             mapped = jax.vmap(mapped, in_axes=(None, 0))
         return mapped(system, states)
 
-    evaluate = on_host(every)
+    evaluate = eager_numpy(every)
 
     @wraps(function)
     def along(system: "System", motion: State | Trajectory) -> R:

@@ -30,7 +30,7 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.diagnostics import group_places, rows_with_ground
 from natcoord_jax.assembly.kick import with_rotors
-from natcoord_jax.assembly.response import Situation, Stations, gather
+from natcoord_jax.assembly.response import GroupData, StageKinematics, gather
 from natcoord_jax.assembly.system import Group, System
 from natcoord_jax.assembly.tangent_space import TangentSpace, Velocity
 from natcoord_jax.core.effect import Motion, replace_fields
@@ -61,8 +61,8 @@ class Damped(eqx.Module):
     loss: Float[Array, ""]
 
     def started(
-        self, groups: Sequence[Group], situations: Sequence[Situation]
-    ) -> tuple[Float[Array, "bodies 4 3"], list[Situation]]:
+        self, groups: Sequence[Group], situations: Sequence[GroupData]
+    ) -> tuple[Float[Array, "bodies 4 3"], list[GroupData]]:
         """Velocities of rows and situations of the groups with which the stages start."""
         moved = with_rotors(groups, situations, self.velocity.rotors)
         return self.velocity.rows, [
@@ -104,7 +104,9 @@ class Damping(eqx.Module):
         """Ready for use."""
         return replace_fields(self, space=self.space.with_system(system))
 
-    def over(self, state: State, groups: Sequence[Group], at: Stations, h: Array, tableau: Tableau) -> Damped:
+    def over(
+        self, state: State, groups: Sequence[Group], at: StageKinematics, h: Array, tableau: Tableau
+    ) -> Damped:
         """What is damped in a step.
 
         Args:
@@ -192,7 +194,7 @@ def _instant_rates(system: System, group: Group, rows: Array, moving: Array, tur
     return jax.vmap(one)(group.effect, places, rows[index], moving[index], turning[index])
 
 
-def _mean_rates(group: Group, system: System, at: Stations, h: Array) -> Float[Array, "n p"]:
+def _mean_rates(group: Group, system: System, at: StageKinematics, h: Array) -> Float[Array, "n p"]:
     """Mean rates of the invariants of a group over the step."""
 
     def one(effect, place, start, rows, rates, spin):

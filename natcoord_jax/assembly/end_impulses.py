@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from natcoord_jax.assembly.balances import relations_of
+from natcoord_jax.assembly.equations_of_motion import relations_of
 from natcoord_jax.assembly.kick import Ends, end_of, rotor_rates
 from natcoord_jax.assembly.momentum import momentum_balance
 from natcoord_jax.assembly.response import Evaluation, no_multipliers
@@ -68,7 +68,7 @@ def _impulse(
     """P(q_1)^T [M V + h/2 F_1], without rotors."""
     at, (situations, _) = found.at, found.given
     assert space.system is not None
-    levers = at.start + h * at.rates[0]
+    force_rows = at.start + h * at.rates[0]
     acting = [
         (group, where)
         for group, where in zip(groups, situations)
@@ -78,9 +78,9 @@ def _impulse(
         space.system,
         [group for group, _ in acting],
         [where for _, where in acting],
-        replace_fields(at, levers=levers[None]),
+        replace_fields(at, force_rows=force_rows[None]),
         2.0 * at.rates[0, :-1],
-        [no_multipliers(group, tableau, levers.dtype) for group, _ in acting],
+        [no_multipliers(group, tableau, force_rows.dtype) for group, _ in acting],
         h,
         tableau,
     )

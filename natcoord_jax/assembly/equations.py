@@ -4,12 +4,12 @@ from typing import Any
 
 from jaxtyping import Array
 
+from natcoord_jax.assembly.block_tangent_space import Tangents
 from natcoord_jax.assembly.full import FullStep
-from natcoord_jax.assembly.outset import Outset
 from natcoord_jax.assembly.recursive import RecursiveStep
 from natcoord_jax.assembly.reduced import ReducedStep
-from natcoord_jax.assembly.separate import Tangents
 from natcoord_jax.assembly.sparse import SparseStep
+from natcoord_jax.assembly.start_cache import StartCache
 from natcoord_jax.assembly.system import System
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import Tableau
@@ -28,10 +28,10 @@ def kind_of(system: System, tableau: Tableau) -> Any:
 
 
 def prepare(
-    system: System, state: State, u: Array, h: Array, tableau: Tableau, outset: Outset | None = None
+    system: System, state: State, u: Array, h: Array, tableau: Tableau, start_cache: StartCache | None = None
 ) -> Any:
     """The equations of one step, in the form of the scheme; what is known of its start may be given."""
-    return kind_of(system, tableau).prepare(system, state, u, h, tableau, outset)
+    return kind_of(system, tableau).prepare(system, state, u, h, tableau, start_cache)
 
 
 def starting(
@@ -40,6 +40,6 @@ def starting(
     tableau: Tableau,
     tangents: Tangents | None = None,
     later: bool = False,
-) -> Outset:
-    """What the equations of a step that starts from a state need of it, see `Outset.of`."""
+) -> StartCache:
+    """What the equations of a step that starts from a state need of it, see `StartCache.of`."""
     return kind_of(system, tableau).starting(system, state, tableau, tangents, later)

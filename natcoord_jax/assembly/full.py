@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from natcoord_jax.assembly.block_tangent_space import Tangents
 from natcoord_jax.assembly.diagnostics import rows_with_ground
 from natcoord_jax.assembly.form import Form
 from natcoord_jax.assembly.grain import cancelling_size
@@ -21,18 +22,17 @@ from natcoord_jax.assembly.kick import kicked
 from natcoord_jax.assembly.local import body_balance, body_motion, jacobians
 from natcoord_jax.assembly.local_rates import TWIST
 from natcoord_jax.assembly.momentum import least_inertias, momentum_balance
-from natcoord_jax.assembly.outset import Outset
 from natcoord_jax.assembly.reduced import NOTHING
 from natcoord_jax.assembly.redundancy import at_every_stage, project_multipliers, project_rows
 from natcoord_jax.assembly.response import (
     Evaluation,
-    Situation,
-    Stations,
+    GroupData,
+    StageKinematics,
     body_rows,
     situation,
     stations,
 )
-from natcoord_jax.assembly.separate import Tangents
+from natcoord_jax.assembly.start_cache import StartCache
 from natcoord_jax.assembly.system import Group, System
 from natcoord_jax.core.checks import is_concrete
 from natcoord_jax.core.state import State
@@ -48,9 +48,9 @@ class FullStep(Form):
     state: State
     start: Float[Array, "bodies_and_ground 4 3"]
     velocity: Float[Array, "bodies 4 3"]
-    situations: tuple[Situation, ...]
+    situations: tuple[GroupData, ...]
     h: Float[Array, ""]
-    outset: Outset
+    start_cache: StartCache
     tableau: Tableau = eqx.field(static=True)
 
     @classmethod
@@ -61,7 +61,7 @@ class FullStep(Form):
         u: Array,
         h: Array,
         tableau: Tableau,
-        outset: Outset | None = None,
+        start_cache: StartCache | None = None,
     ) -> "FullStep":
         """Gather what the step needs, once; see `ReducedStep.prepare`."""
         groups = (*system.effects, *system.joints)
@@ -72,7 +72,7 @@ class FullStep(Form):
             body_rows(state.v),
             tuple(situation(system, g, state, u, h) for g in groups),
             h,
-            cls.starting(system, state, tableau) if outset is None else outset,
+            cls.starting(system, state, tableau) if start_cache is None else start_cache,
             tableau,
         )
 
@@ -84,8 +84,8 @@ class FullStep(Form):
         tableau: Tableau,
         tangents: Tangents | None = None,
         later: bool = False,
-    ) -> Outset:
-        """What a step needs of its start, see `Outset.of`."""
+    ) -> StartCache:
+        """What a step needs of its start, see `StartCache.of`."""
         projector, rank = None, system.structure.rank
         if rank is not None:
             no_inputs = jnp.zeros(len(system.structure.inputs), state.q.dtype)
@@ -95,7 +95,7 @@ class FullStep(Form):
             in_tree = sum(g.count * g.multipliers for g in system.joints if g.in_tree)
             projector = range_projector(rows, rank + in_tree)
             projector = at_every_stage(projector, resting.groups, tableau.stages)
-        return Outset.of(system, state, tableau, projector, tangents, later)
+        return StartCache.of(system, state, tableau, projector, tangents, later)
 
     @property
     def groups(self) -> tuple[Group, ...]:
@@ -157,13 +157,13 @@ class FullStep(Form):
 
     def evaluate(self, y: Float[Array, " unknowns"]) -> Evaluation:
         """Residual, and what the end of the step needs."""
-        twists, multipliers = self.split(project_multipliers(y, self.balances, self.outset.projector))
+        twists, multipliers = self.split(project_multipliers(y, self.balances, self.start_cache.projector))
         at = self._stations(twists)
         velocity, situations, kick = kicked(
             self.system,
             self.state,
-            self.outset.tangents,
-            self.outset.lag,
+            self.start_cache.tangents,
+            self.start_cache.lag,
             self.groups,
             self.situations,
             at,
@@ -174,7 +174,7 @@ class FullStep(Form):
         found = momentum_balance(*given, multipliers, self.h, self.tableau)
         wrenches = jnp.moveaxis(jnp.concatenate([found.force, found.torque], axis=-1), 0, 1)
         balances = self.system.local_rates.balances(wrenches, self.start[:-1])
-        rows = project_rows(found.rows, y, self.balances, self.outset.projector)
+        rows = project_rows(found.rows, y, self.balances, self.start_cache.projector)
         residual = jnp.concatenate([balances, rows])
         return Evaluation(residual, found.size, at, found.power, (found.force, found.torque), kick)
 
@@ -195,7 +195,7 @@ class FullStep(Form):
         self, y: Float[Array, " unknowns"], *, exact: bool = True
     ) -> Float[Array, "unknowns unknowns"]:
         """Jacobian, put together from those of bodies, effects and joints."""
-        y = project_multipliers(y, self.balances, self.outset.projector)
+        y = project_multipliers(y, self.balances, self.start_cache.projector)
         return self._projected(
             dense(self.system, self.matrices(y, exact), self.unknowns, self.tableau.stages)
         )
@@ -226,13 +226,13 @@ class FullStep(Form):
 
     def _projected(self, matrix: Array) -> Array:
         """Columns of multipliers and rows of constraints in the range of the constraints."""
-        if self.outset.projector is None:
+        if self.start_cache.projector is None:
             return matrix
         first = self.balances
         count = matrix.shape[0] - first
-        idle = (jnp.eye(count, dtype=matrix.dtype) - self.outset.projector) / (1.0 + count)
-        matrix = matrix.at[:first, first:].set(matrix[:first, first:] @ self.outset.projector)
-        matrix = matrix.at[first:, :first].set(self.outset.projector @ matrix[first:, :first])
+        idle = (jnp.eye(count, dtype=matrix.dtype) - self.start_cache.projector) / (1.0 + count)
+        matrix = matrix.at[:first, first:].set(matrix[:first, first:] @ self.start_cache.projector)
+        matrix = matrix.at[first:, :first].set(self.start_cache.projector @ matrix[first:, :first])
         return matrix.at[first:, first:].set(idle)
 
     def inertias(self, matrix: Float[Array, "unknowns unknowns"]) -> Float[Array, " balances"]:
@@ -261,11 +261,11 @@ class FullStep(Form):
         rates = self.system.local_rates.repeated(w, self.tableau.stages)
         return jnp.concatenate([rates, jnp.zeros(self.unknowns - self.balances, w.dtype)])
 
-    def motion_of(self, y: Float[Array, " unknowns"]) -> Stations:
+    def motion_of(self, y: Float[Array, " unknowns"]) -> StageKinematics:
         """Stage motion of all bodies."""
         return self._stations(self.split(y)[0])
 
-    def _stations(self, twists: Float[Array, "bodies s 6"]) -> Stations:
+    def _stations(self, twists: Float[Array, "bodies s 6"]) -> StageKinematics:
         motion = body_motion(self.start[:-1], twists, self.h, self.tableau)
         return stations(
             self.start[:-1],

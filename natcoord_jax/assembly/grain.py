@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.diagnostics import rows_with_ground
 from natcoord_jax.assembly.momentum import row_weights
-from natcoord_jax.assembly.response import Situation
+from natcoord_jax.assembly.response import GroupData
 from natcoord_jax.assembly.system import Group, System
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.vectors import safe_divide
@@ -31,7 +31,7 @@ UNRESISTED = 1e200
 def cancelling_size(
     system: System,
     groups: Sequence[Group],
-    situations: Sequence[Situation],
+    situations: Sequence[GroupData],
     state: State,
     h: Float[Array, ""],
 ) -> Float[Array, ""]:

@@ -9,13 +9,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from natcoord_jax.assembly.collection import Collection
+from natcoord_jax.assembly.segment_sum import SegmentSum
 from natcoord_jax.assembly.system import Group
 from natcoord_jax.core.callables import Function
 from natcoord_jax.core.checks import NUMERIC, as_array, check_fields, shape_of
+from natcoord_jax.core.eager_numpy import stacked
 from natcoord_jax.core.effect import Effect, replace_fields
 from natcoord_jax.core.elements import Elements
-from natcoord_jax.core.host import stacked
 from natcoord_jax.core.names import Names
 from natcoord_jax.core.nodes import NodeSet, NodeUnion
 
@@ -113,7 +113,7 @@ def element_group(layout: Any, name: str, elements: Elements, turning: np.ndarra
         as_array(weights),
         bodies,
         *(nothing,) * 5,
-        acting=Collection.of(bodies, len(layout.bodies)),
+        acting=SegmentSum.of(bodies, len(layout.bodies)),
         count=count,
         names=Names(((name, (range(count),)),)),
         source="markers",
@@ -146,7 +146,7 @@ def _group(members: list[Instance], turning: np.ndarray) -> Group:
         first.effect if field_like else jax.tree.map(lambda *x: stacked(x), *effects),
         stacked([m.weights for m in members]) if first.weights is not None else None,
         *(table(name) for name in ("bodies", "joints", "inputs", "coordinates", "rotors", "works")),
-        acting=Collection.of(table("bodies"), bodies),
+        acting=SegmentSum.of(table("bodies"), bodies),
         count=count,
         names=tuple(m.name for m in members),
         source=first.source,

@@ -12,8 +12,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from natcoord_jax.assembly.balances import Balances, Gains, loads, loops_of, relations_of
 from natcoord_jax.assembly.diagnostics import states_of
+from natcoord_jax.assembly.equations_of_motion import (
+    Accelerations,
+    EquationsOfMotion,
+    loads,
+    loops_of,
+    relations_of,
+)
 from natcoord_jax.assembly.rates import Twists, tree_rates
 from natcoord_jax.assembly.reading import Source
 from natcoord_jax.assembly.system import System
@@ -105,24 +111,30 @@ def scales(system: System) -> tuple[Float[Array, ""], Float[Array, ""]]:
     return jnp.mean(masses), jnp.where(radius > 0, radius, 1.0)
 
 
-def _accelerated(balances: Balances, columns: Gains, applied: Twists, bias: Gains) -> tuple[Array, Array]:
+def _accelerated(
+    balances: EquationsOfMotion, columns: Accelerations, applied: Twists, bias: Accelerations
+) -> tuple[Array, Array]:
     """Matrix and right-hand side P^T (F - M bias) of the balances."""
     matrix = jax.vmap(lambda gains: balances.project(*balances.inertial(gains)))(columns).T
     force, torque = balances.inertial(bias)
     return matrix, balances.project(applied[0] - force, applied[1] - torque)
 
 
-def _combined(bias: Gains, columns: Gains, w_dot: Array) -> Gains:
+def _combined(bias: Accelerations, columns: Accelerations, w_dot: Array) -> Accelerations:
     return jax.tree.map(lambda b, c: b + jnp.tensordot(w_dot, c, 1), bias, columns)
 
 
-def _reactions(balances: Balances, gains: Gains, applied: Twists, lam: Array) -> tuple[Array, Array]:
+def _reactions(
+    balances: EquationsOfMotion, gains: Accelerations, applied: Twists, lam: Array
+) -> tuple[Array, Array]:
     pulled = balances.constrained(lam) if lam.size else (0.0, 0.0)
     force, torque = (a - b - c for a, b, c in zip(balances.inertial(gains), applied, pulled, strict=True))
     return balances.reactions(force, torque, lam)
 
 
-def _measured(balances: Balances, radius: Array, gains: Gains, applied: Twists, lam: Array) -> Array:
+def _measured(
+    balances: EquationsOfMotion, radius: Array, gains: Accelerations, applied: Twists, lam: Array
+) -> Array:
     """All reactions as one vector [N], torques divided by the radius of gyration."""
     forces, torques = _reactions(balances, gains, applied, lam)
     related = lam[: sum(g.count for g in relations_of(balances.system))]
@@ -131,8 +143,8 @@ def _measured(balances: Balances, radius: Array, gains: Gains, applied: Twists, 
 
 
 def _with_constraints(
-    system: System, state: State, u: Array, balances: Balances, w: Array
-) -> tuple[Gains, Twists, Array]:
+    system: System, state: State, u: Array, balances: EquationsOfMotion, w: Array
+) -> tuple[Accelerations, Twists, Array]:
     """Accelerations, loads and multipliers of a system with relations or loops."""
     mass, radius = scales(system)
     columns = balances.columns()
@@ -154,8 +166,8 @@ def _with_constraints(
 
 
 def _without_constraints(
-    system: System, state: State, u: Array, balances: Balances, w: Array
-) -> tuple[Gains, Twists, Array]:
+    system: System, state: State, u: Array, balances: EquationsOfMotion, w: Array
+) -> tuple[Accelerations, Twists, Array]:
     """Accelerations, loads and no multipliers of a tree."""
     applied = loads(system, state, u, *balances.twists(w))
     bias = balances.bias(w)
@@ -166,7 +178,7 @@ def _without_constraints(
     return bias, applied, bias.constraints
 
 
-def _named(balances: Balances, lam: Array) -> dict[str, Array]:
+def _named(balances: EquationsOfMotion, lam: Array) -> dict[str, Array]:
     found, position = {}, 0
     for group in (*relations_of(balances.system), *loops_of(balances.system)):
         for name in group.names:
@@ -177,7 +189,7 @@ def _named(balances: Balances, lam: Array) -> dict[str, Array]:
 
 def instant_of(system: System, state: State, u: Float[Array, " inputs"]) -> Instant:
     """Accelerations and reactions of one state."""
-    balances = Balances.at(system, state)
+    balances = EquationsOfMotion.at(system, state)
     w = tree_rates(system, state)
     solve = _with_constraints if system.structure.multipliers else _without_constraints
     gains, applied, lam = solve(system, state, u, balances, w)

@@ -9,13 +9,13 @@ from jaxtyping import Array, Bool, Float
 
 from natcoord_jax.assembly.node_sweeps import (
     Geometry,
-    Through,
+    TransmittedWrench,
     forces_on_slots,
     parent_directors,
     slot_arms,
     spread_out,
 )
-from natcoord_jax.assembly.sweeps import Hinging, relative_motion
+from natcoord_jax.assembly.sweeps import JointData, relative_motion
 from natcoord_jax.assembly.tree import SLOTS, JointGeometry, Level, Tree, joined
 from natcoord_jax.maths.collocation import Tableau
 from natcoord_jax.maths.vectors import cross, skew
@@ -28,10 +28,10 @@ def _of_slots(level: Level, rates: Float[Array, "s n k"]) -> Float[Array, "s n 7
 
 def _derivatives(
     level: Level,
-    these: Hinging,
+    these: JointData,
     spin_p: Float[Array, "s n 3"],
     rates: Float[Array, "s n k"],
-    through: Through,
+    through: TransmittedWrench,
     h: Array,
     tableau: Tableau,
 ) -> Float[Array, "n s 9+k s 6+k"]:
@@ -103,12 +103,12 @@ def _spread(level: Level, slots: Sequence[int], x: Array, first: int, axis: int)
 
 def joint_blocks(
     tree: Tree,
-    these: Hinging,
+    these: JointData,
     present: Bool[Array | np.ndarray, "bodies k"],
     spin: Float[Array, "s bodies_and_ground 3"],
     rates: Float[Array, "s bodies 7"],
     geometry: Geometry,
-    through: Through,
+    through: TransmittedWrench,
     h: Array,
     tableau: Tableau,
 ) -> tuple[Array, Array, Array]:
@@ -131,7 +131,7 @@ def joint_blocks(
     gathers = [_handed_up(tree.free, geometry.free, False)]
     if tree.hung.members:
         here = tree.hung.here
-        spin_p, loads = spin[:, tree.parent[here]], Through(*(x[:, here] for x in through))
+        spin_p, loads = spin[:, tree.parent[here]], TransmittedWrench(*(x[:, here] for x in through))
         own = rates[:, here][:, :, np.array(tree.hung.slots, int)]
         derivatives.append(_derivatives(tree.hung, these, spin_p, own, loads, h, tableau))
         gathers.append(_handed_up(tree.hung, geometry.hung, not tree.hung.grounded))
@@ -160,11 +160,11 @@ def joint_blocks(
 
 def rooted_blocks(
     tree: Tree,
-    these: Hinging,
+    these: JointData,
     present: Bool[Array | np.ndarray, "bodies k"],
     rates: Float[Array, "s bodies 7"],
     geometry: Geometry,
-    through: Through,
+    through: TransmittedWrench,
     h: Array,
     tableau: Tableau,
 ) -> tuple[Array, Array, Array]:
@@ -177,7 +177,7 @@ def rooted_blocks(
     bent = [jnp.zeros((free.shape[0], s, count, s, count), free.dtype)]
     if tree.hung.members:
         here = tree.hung.here
-        loads = Through(*(x[:, here] for x in through))
+        loads = TransmittedWrench(*(x[:, here] for x in through))
         own = rates[:, here][:, :, np.array(tree.hung.slots, int)]
         still = jnp.zeros_like(rates[:, here, :3])
         found = _derivatives(tree.hung, these, still, own, loads, h, tableau)[..., 6:]

@@ -30,10 +30,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from natcoord_jax.assembly.block_tangent_space import Tangents, tangents_at
 from natcoord_jax.assembly.coordinates import stage_rates
-from natcoord_jax.assembly.lag import NEGLIGIBLE, NEGLIGIBLE_ENERGY, Lag
-from natcoord_jax.assembly.response import Situation, Stations
-from natcoord_jax.assembly.separate import Tangents, tangents_at
+from natcoord_jax.assembly.frozen_kick import NEGLIGIBLE, NEGLIGIBLE_ENERGY, FrozenKick
+from natcoord_jax.assembly.response import GroupData, StageKinematics
 from natcoord_jax.assembly.system import Group, System
 from natcoord_jax.assembly.tangent_space import Velocity
 from natcoord_jax.core.effect import replace_fields
@@ -94,14 +94,16 @@ class Ends(eqx.Module):
     sound: Bool[Array, ""]
 
 
-def end_of(state: State, at: Stations, h: Array, tableau: Tableau) -> State:
+def end_of(state: State, at: StageKinematics, h: Array, tableau: Tableau) -> State:
     """Positions and time at the end of a step; nothing else of it is of use."""
     rows = at.start[:-1] + h * jnp.tensordot(jnp.asarray(tableau.b), at.rates[:, :-1], 1)
     q = rows.reshape(-1, 3)
     return State(state.t + h, q, q, state.coordinates, state.rates, state.work)
 
 
-def rotor_rates(system: System, groups: Sequence[Group], at: Stations, h: Array) -> Float[Array, "s rotors"]:
+def rotor_rates(
+    system: System, groups: Sequence[Group], at: StageKinematics, h: Array
+) -> Float[Array, "s rotors"]:
     """Rates at the stages of the joint coordinates that carry rotors."""
     carrying = [g.coordinates[:, 0] for g in groups if g.effect.rotors]
     if not carrying:
@@ -114,10 +116,10 @@ def kick_of(
     state: State,
     before: Tangents | None,
     groups: Sequence[Group],
-    at: Stations,
+    at: StageKinematics,
     h: Array,
     tableau: Tableau,
-    lag: Lag | None = None,
+    lag: FrozenKick | None = None,
 ) -> Kick:
     """The kick that belongs to given stages.
 
@@ -172,7 +174,7 @@ def ends_of(
     system: System,
     state: State,
     groups: Sequence[Group],
-    at: Stations,
+    at: StageKinematics,
     kick: Kick,
     h: Array,
     tableau: Tableau,
@@ -199,13 +201,13 @@ def kicked(
     system: System,
     state: State,
     tangents: Tangents | None,
-    lag: Lag | None,
+    lag: FrozenKick | None,
     groups: Sequence[Group],
-    situations: Sequence[Situation],
-    at: Stations,
+    situations: Sequence[GroupData],
+    at: StageKinematics,
     h: Array,
     tableau: Tableau,
-) -> tuple[Array, Sequence[Situation], Kick | None]:
+) -> tuple[Array, Sequence[GroupData], Kick | None]:
     """What the stages begin with: velocities of rows, situations with rates of rotors; and the kick.
 
     Where the kick lags behind the stages and is not due, it is that which is held, and nothing else of it is
@@ -223,7 +225,7 @@ def kicked(
     return velocity + found.kick.rows, moved, found
 
 
-def _lagging(lag: Lag, system: System, *given: Any) -> Kick:
+def _lagging(lag: FrozenKick, system: System, *given: Any) -> Kick:
     """The kick, found anew if it is due."""
 
     def anew() -> Kick:
@@ -240,8 +242,8 @@ def _lagging(lag: Lag, system: System, *given: Any) -> Kick:
 
 
 def with_rotors(
-    groups: Sequence[Group], situations: Sequence[Situation], rotors: Float[Array, " rotors"]
-) -> list[Situation]:
+    groups: Sequence[Group], situations: Sequence[GroupData], rotors: Float[Array, " rotors"]
+) -> list[GroupData]:
     """Situations with other rates of the rotors at the start of the step."""
     return [
         replace_fields(where, rates=rotors[group.rotors]) if group.effect.rotors else where

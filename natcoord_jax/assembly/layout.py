@@ -9,19 +9,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from natcoord_jax.assembly.assembled_poses import Poses, joint_frames, joint_triad
 from natcoord_jax.assembly.bodies import Bodies
 from natcoord_jax.assembly.graph import Edge, spanning_tree
 from natcoord_jax.assembly.grouping import Instance, bare, families
-from natcoord_jax.assembly.poses import Poses, joint_frames, joint_triad
 from natcoord_jax.assembly.rates import row_rates
 from natcoord_jax.assembly.system import CoordinateGroup
 from natcoord_jax.core.bodies import DIRECTOR, TRIAD
 from natcoord_jax.core.checks import as_array
 from natcoord_jax.core.coordinate import Coordinate, CoordinateEffect
+from natcoord_jax.core.eager_numpy import eager_numpy, stacked
 from natcoord_jax.core.effect import Effect, replace_fields
 from natcoord_jax.core.force import Field
 from natcoord_jax.core.handles import Handle, ground
-from natcoord_jax.core.host import on_host, stacked
 from natcoord_jax.core.joint import Joint, frames_at
 from natcoord_jax.core.markers import Attachment, Marker
 from natcoord_jax.core.names import names_of
@@ -313,32 +313,32 @@ class Layout:
 MOTION = "position", "rotation", "velocity", "angular_velocity"
 """What the rows of a body and their velocities are made of."""
 
-_frames_at = on_host(frames_at)
+_frames_at = eager_numpy(frames_at)
 
 
-@on_host
+@eager_numpy
 def _with_masses(
     blocks: Array, body: Array, rows: Float[Array, "n 4 4"], own: Float[Array, "n 4 4"]
 ) -> Array:
     return blocks.at[body].add(jnp.einsum("nai,nab,nbj->ij", rows, own, rows))
 
 
-@on_host
+@eager_numpy
 def _padded(weights: Float[Array, "*m w"], width: int) -> Float[Array, "*m width"]:
     return jnp.concatenate([weights, jnp.zeros((*weights.shape[:-1], width - weights.shape[-1]))], axis=-1)
 
 
-_place_markers = on_host(place_markers)
+_place_markers = eager_numpy(place_markers)
 
 
 def _stacked_rows(points: Float[Array, "n 3"], rotations: Float[Array, "n 3 3"]) -> Float[Array, "n 4 3"]:
     return jnp.concatenate([points[:, None], rotations.swapaxes(1, 2)], axis=1)
 
 
-_rows = on_host(_stacked_rows)
+_rows = eager_numpy(_stacked_rows)
 
 
-@on_host
+@eager_numpy
 def _rows_and_velocities(
     points: Array, rotations: Array, velocities: Array, spins: Array
 ) -> tuple[Float[Array, "rows 3"], Float[Array, "rows 3"]]:

@@ -13,9 +13,9 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.local_rates import TWIST
 from natcoord_jax.assembly.momentum import stage_momentum
-from natcoord_jax.assembly.response import Situation, respond
+from natcoord_jax.assembly.response import GroupData, respond
 from natcoord_jax.assembly.system import Group
-from natcoord_jax.core.effect import Motion, Now, Response
+from natcoord_jax.core.effect import Motion, Response, StepContext
 from natcoord_jax.maths.collocation import Tableau, rotate_stages
 from natcoord_jax.maths.vectors import cross
 
@@ -71,7 +71,7 @@ def _impulses(
 
 def effect_balances(
     group: Group,
-    where: Situation,
+    where: GroupData,
     tableau: Tableau,
     start: Float[Array, "n k 4 3"],
     twists: Float[Array, "n k s r"],
@@ -94,7 +94,7 @@ def whole(twists: Float[Array, "*n r"]) -> Float[Array, "*n 6"]:
 
 def jacobians(
     group: Group,
-    where: Situation,
+    where: GroupData,
     tableau: Tableau,
     start: Array,
     twists: Float[Array, "n k s r"],
@@ -126,11 +126,13 @@ def jacobians(
 
 
 def _linearised_jacobians(
-    group: Group, where: Situation, tableau: Tableau, start: Array, twists: Array, lam: Array
+    group: Group, where: GroupData, tableau: Tableau, start: Array, twists: Array, lam: Array
 ) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
     rates = twists.shape[-1]
     with jax.named_scope(group.effect.kind.replace(" ", "_")):
-        now = Now(where.t, where.h, where.inputs, where.coordinates, where.rates, tableau, where.stress)
+        now = StepContext(
+            where.t, where.h, where.inputs, where.coordinates, where.rates, tableau, where.stress
+        )
         motion = body_motion(start, whole(twists), where.h, tableau)
         found = group.effect.tangents(where.place, motion, now, lam, turning=rates == TWIST)
         if found is not None:
@@ -138,7 +140,7 @@ def _linearised_jacobians(
             return _without_multipliers(scale * found, lam)
 
         def one(effect, place, inputs, coordinates, rates, stress, start, twists, lam):
-            now = Now(where.t, where.h, inputs, coordinates, rates, tableau, stress)
+            now = StepContext(where.t, where.h, inputs, coordinates, rates, tableau, stress)
             effect = effect.linearised(place, body_motion(start, whole(twists), where.h, tableau), now, lam)
 
             def f(twists: Array, lam: Array) -> tuple[Array, Array]:

@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from natcoord_jax.assembly.system import Group
+from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.effect import Effect
-from natcoord_jax.core.host import on_host
 
 
 def with_masses(
@@ -25,7 +25,7 @@ def with_masses(
     return _with_masses(masses, group.bodies, group.effect, before, group.weights)
 
 
-@on_host
+@eager_numpy
 def _with_masses(
     masses: Float[Array, "bodies 4 4"],
     bodies: Int[Array | np.ndarray, "n k"],

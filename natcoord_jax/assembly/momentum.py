@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from natcoord_jax.assembly.response import Situation, Stations, collect, gather, respond
+from natcoord_jax.assembly.response import GroupData, StageKinematics, collect, gather, respond
 from natcoord_jax.assembly.system import Group, System
 from natcoord_jax.maths.collocation import Tableau
 from natcoord_jax.maths.vectors import cross, skew
@@ -124,8 +124,8 @@ class Balance(eqx.Module):
 def momentum_balance(
     system: System,
     groups: Sequence[Group],
-    situations: Sequence[Situation],
-    at: Stations,
+    situations: Sequence[GroupData],
+    at: StageKinematics,
     velocity: Float[Array, "bodies 4 3"],
     multipliers: Sequence[Array],
     h: Float[Array, ""],

@@ -14,9 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from natcoord_jax.assembly.axisymmetric_axes import ball_axes, frame_axes
 from natcoord_jax.assembly.diagnostics import rows_with_ground
-from natcoord_jax.assembly.roundness import ball_axes, frame_axes
-from natcoord_jax.assembly.sweeps import Hinging, relative_motion, turning
+from natcoord_jax.assembly.sweeps import JointData, relative_motion, turning
 from natcoord_jax.assembly.tree import JointGeometry, Level, Tree, TreeMotion, combine, joined
 from natcoord_jax.maths.collocation import Tableau, rotate_stages
 from natcoord_jax.maths.rows import add_at, row, with_row
@@ -30,12 +30,12 @@ class Geometry(NamedTuple):
     hung: JointGeometry
 
 
-def hinging(tree: Tree, frames: Array, rows: Float[Array, "bodies 4 3"]) -> Hinging:
+def hinging(tree: Tree, frames: Array, rows: Float[Array, "bodies 4 3"]) -> JointData:
     """Bodies that hang on joints, and what they hang on."""
     here = tree.hung.here
     above = rows_with_ground(rows.reshape(-1, 3))[tree.parent[here]]
     symmetry = None if tree.symmetry is None else tree.symmetry[here]
-    return Hinging(frames[here], rows[here], tree.ball[here], above, symmetry=symmetry)
+    return JointData(frames[here], rows[here], tree.ball[here], above, symmetry=symmetry)
 
 
 def free_axes(
@@ -70,7 +70,7 @@ def _free_motion(
 
 def _spins_above(
     tree: Tree,
-    these: Hinging,
+    these: JointData,
     slots: Float[Array, "s hung 7"],
     spins: Float[Array, "s free 3"],
     h: Array,
@@ -147,7 +147,7 @@ def sweep_nodes(
 
 
 def parent_directors(
-    level: Level, these: Hinging, spin_p: Float[Array, "s n 3"], h: Array, tableau: Tableau
+    level: Level, these: JointData, spin_p: Float[Array, "s n 3"], h: Array, tableau: Tableau
 ) -> Float[Array, "s n 3 3"]:
     """Stage directors of what bodies hang on."""
     if level.grounded:
@@ -155,7 +155,7 @@ def parent_directors(
     return rotate_stages(h * spin_p[:, :, None], these.parent_rows[None, :, 1:], tableau)
 
 
-class Through(NamedTuple):
+class TransmittedWrench(NamedTuple):
     """Forces and torques that the joints transmit, the torques about the bodies' reference points."""
 
     force: Float[Array, "s bodies 3"]
@@ -164,10 +164,10 @@ class Through(NamedTuple):
 
 def load_nodes(
     tree: Tree, geometry: Geometry, force: Float[Array, "s bodies 3"], torque: Float[Array, "s bodies 3"]
-) -> Through:
+) -> TransmittedWrench:
     """Sums of the forces and torques on each body and on all that hangs on it, leaves to root."""
     if tree.hung.grounded:
-        return Through(force, torque)
+        return TransmittedWrench(force, torque)
     joints, here = geometry.hung, tree.hung.here
     arm = joints.parent_arm + joints.gap - joints.child_arm
 
@@ -179,7 +179,7 @@ def load_nodes(
     start = _with_rest(jnp.concatenate([force, torque], axis=-1))
     nodes = jnp.swapaxes(arm, 0, 1), jnp.arange(force.shape[1])[here], tree.parent[here]
     sums = jax.lax.scan(up, start, nodes, reverse=True)[0][:-1]
-    return Through(*jnp.split(jnp.swapaxes(sums, 0, 1), 2, axis=-1))
+    return TransmittedWrench(*jnp.split(jnp.swapaxes(sums, 0, 1), 2, axis=-1))
 
 
 def spread_out(level: Level, slots: Sequence[int], x: Array, axis: int) -> Array:
@@ -191,16 +191,18 @@ def spread_out(level: Level, slots: Sequence[int], x: Array, axis: int) -> Array
     return jnp.stack([columns.get(slot, zero) for slot in slots], axis=axis)
 
 
-def on_slots(tree: Tree, geometry: Geometry, through: Through) -> Float[Array, "s bodies k"]:
+def on_slots(tree: Tree, geometry: Geometry, through: TransmittedWrench) -> Float[Array, "s bodies k"]:
     """Generalised forces of the free motions, of all slots in use."""
     found = []
     for level, part in zip((tree.free, tree.hung), geometry):
-        here = Through(through.force[:, level.here], through.torque[:, level.here])
+        here = TransmittedWrench(through.force[:, level.here], through.torque[:, level.here])
         found.append(spread_out(level, tree.slots, forces_on_slots(level, part, here), 2))
     return joined((tree.free, tree.hung), found)
 
 
-def forces_on_slots(level: Level, geometry: JointGeometry, through: Through) -> Float[Array, "s n k"]:
+def forces_on_slots(
+    level: Level, geometry: JointGeometry, through: TransmittedWrench
+) -> Float[Array, "s n k"]:
     """The same of the bodies of one level, of the slots that it uses."""
     turning_arm, sliding_arm = slot_arms(level, geometry)
     force, torque = through.force[:, :, None], through.torque[:, :, None]

@@ -12,9 +12,9 @@ from jaxtyping import Array, Float
 from natcoord_jax.assembly.masses import with_masses
 from natcoord_jax.assembly.system import Group, System
 from natcoord_jax.core.checks import as_array, is_concrete
+from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.effect import Effect, replace_fields
 from natcoord_jax.core.handles import Handle
-from natcoord_jax.core.host import on_host
 from natcoord_jax.core.names import listed
 
 Names = Handle | str | Sequence[Handle | str]
@@ -98,7 +98,7 @@ def _value(system: System, place: Place) -> Array:
     return leaf if place.row is None else leaf[place.row]
 
 
-@on_host
+@eager_numpy
 def _parted(block: Float[Array, "4 4"]) -> dict[str, Array]:
     """Mass [kg], centre of mass [m] and inertia about it [kg m^2] of a mass block (15)."""
     mass = block[0, 0]
@@ -108,7 +108,7 @@ def _parted(block: Float[Array, "4 4"]) -> dict[str, Array]:
     return {"mass": mass, "com": com, "inertia": jnp.trace(moment) * jnp.eye(3) - moment}
 
 
-@on_host
+@eager_numpy
 def _block(mass: Array, com: Float[Array, "3"], inertia: Float[Array, "3 3"]) -> Float[Array, "4 4"]:
     """The mass block (15) of these."""
     moment = 0.5 * jnp.trace(inertia) * jnp.eye(3) - inertia + mass * jnp.outer(com, com)
@@ -116,17 +116,17 @@ def _block(mass: Array, com: Float[Array, "3"], inertia: Float[Array, "3 3"]) ->
     return jnp.block([[mass[None, None], first[None]], [first[:, None], moment]])
 
 
-@on_host
+@eager_numpy
 def _for_all(value: Array, shape: tuple[int, ...]) -> Array:
     return jnp.broadcast_to(value, shape)
 
 
-@on_host
+@eager_numpy
 def _with_row(leaf: Array, row: int | None, value: Array) -> Array:
     return value if row is None else leaf.at[row].set(value)
 
 
-@on_host
+@eager_numpy
 def _diagonal(values: Float[Array, "3"]) -> Float[Array, "3 3"]:
     return jnp.diag(values)
 
@@ -191,7 +191,7 @@ def _renewed(before: System, after: System, name: str, given: set[str]) -> Syste
     return replace_fields(after, effects=tuple(effects), mass=mass)
 
 
-@on_host
+@eager_numpy
 def _anew(effect: Effect, row: int | None) -> Effect:
     """All instances renewed, or one of them."""
     if row is None:

@@ -25,16 +25,16 @@ import numpy as np
 from jax.interpreters import partial_eval
 from jaxtyping import Array, Bool, Float
 
-from natcoord_jax.assembly.balances import Balances, loops_of, relations_of, rotors_of
 from natcoord_jax.assembly.diagnostics import rows_with_ground, states_of
+from natcoord_jax.assembly.equations_of_motion import EquationsOfMotion, loops_of, relations_of, rotors_of
 from natcoord_jax.assembly.momentum import inertia, spatial_inertia, weighs_only, wrench
 from natcoord_jax.assembly.rates import joint_axes, row_rates, tree_rates
 from natcoord_jax.assembly.system import System
 from natcoord_jax.assembly.tangent_space import TangentSpace, Velocity
 from natcoord_jax.assembly.tree import SLOTS
 from natcoord_jax.core.checks import require_double
+from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.effect import replace_fields
-from natcoord_jax.core.host import on_host
 from natcoord_jax.core.state import State, Trajectory
 from natcoord_jax.linsolve.tree import TreeBlocks, factor, handed_up, passed_down
 from natcoord_jax.maths.elimination import definite_inverse, definite_solution
@@ -115,7 +115,7 @@ def _spatial(system: System, rows: Float[Array, "bodies 4 3"]) -> tuple[TreeBloc
 
 def _together(system: System, state: State, v: Velocity) -> Velocity:
     """A change of the rates of the tree, so that what is admissible stays as it is to the last digits."""
-    balances = Balances.at(system, state)
+    balances = EquationsOfMotion.at(system, state)
     gains = balances.columns()
     space, matrix = TangentSpace.without_frame(balances, gains)
     w, rows = tree_rates(system, state), gains.constraints.T
@@ -149,7 +149,7 @@ def _constrained(
     return x
 
 
-@on_host
+@eager_numpy
 def _every(system: System, states: State) -> State:
     """The same of states along any leading axes, so many at a time that memory suffices."""
     shape, read = states.t.shape, partial(tangent, system)
@@ -235,7 +235,7 @@ R = TypeVar("R")
 
 def over_source(function: Callable[[System, State], R]) -> Callable[[Source], R]:
     """A function of a system and one state, as one of all states of a source as they are read."""
-    return on_host(lambda source: source.each(function))
+    return eager_numpy(lambda source: source.each(function))
 
 
 def tangent_states(system: System, motion: State | Trajectory) -> State:

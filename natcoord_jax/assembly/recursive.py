@@ -25,7 +25,7 @@ from natcoord_jax.assembly.momentum import momentum_balance
 from natcoord_jax.assembly.node_layout import ByNode, NodeLayout, unknowns_of_slots
 from natcoord_jax.assembly.node_sweeps import Geometry, hinging, load_nodes, on_slots, sweep_nodes
 from natcoord_jax.assembly.reduced import ReducedStep
-from natcoord_jax.assembly.response import Stations, no_multipliers
+from natcoord_jax.assembly.response import StageKinematics, no_multipliers
 from natcoord_jax.assembly.system import Elimination
 from natcoord_jax.assembly.tree import TreeMotion, gather_slots
 from natcoord_jax.linsolve import neighbours
@@ -137,7 +137,7 @@ class RecursiveStep(ReducedStep):
         return blocks, tree_solver.factor
 
     def _between_neighbours(
-        self, at: Stations, multipliers: list[Array], joints: tuple, exact: bool
+        self, at: StageKinematics, multipliers: list[Array], joints: tuple, exact: bool
     ) -> Blocks:
         """Blocks of bodies whose parent is the ground, without multipliers, by the rates of neighbours."""
         own, coupled, _ = self._of_bodies(at, multipliers, exact)
@@ -151,7 +151,9 @@ class RecursiveStep(ReducedStep):
         own, above, below = products(products(left, jnp.stack([own, upward, downward])), right)
         return own + bent, above, below
 
-    def _with_effects(self, at: Stations, multipliers: list[Array], joints: tuple, exact: bool) -> Blocks:
+    def _with_effects(
+        self, at: StageKinematics, multipliers: list[Array], joints: tuple, exact: bool
+    ) -> Blocks:
         """Blocks with those of bodies and effects, and with the multipliers of each node."""
         own, coupled, bordered = self._of_bodies(at, multipliers, exact)
         if coupled:
@@ -162,7 +164,7 @@ class RecursiveStep(ReducedStep):
         return own, *joints
 
     def _of_bodies(
-        self, at: Stations, multipliers: list[Array], exact: bool
+        self, at: StageKinematics, multipliers: list[Array], exact: bool
     ) -> tuple[Array, list[tuple[Array, Array]], list]:
         """Derivatives by twists: of each body's own balance, of couplings both ways, of multipliers."""
         twists = jnp.concatenate([at.rates[:, :, 0], at.spin], axis=-1)

@@ -15,13 +15,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from natcoord_jax.assembly.balances import constraint_matrix
+from natcoord_jax.assembly.axisymmetric_axes import frame_axes
+from natcoord_jax.assembly.block_tangent_space import Tangents, tangents_at
 from natcoord_jax.assembly.dissipation import Damped, Damping
+from natcoord_jax.assembly.equations_of_motion import constraint_matrix
 from natcoord_jax.assembly.form import Form
 from natcoord_jax.assembly.grain import cancelling_size
 from natcoord_jax.assembly.kick import kicked
 from natcoord_jax.assembly.momentum import least_inertias, momentum_balance
-from natcoord_jax.assembly.outset import Outset
 from natcoord_jax.assembly.redundancy import (
     at_every_stage,
     places_by_stage,
@@ -30,14 +31,13 @@ from natcoord_jax.assembly.redundancy import (
 )
 from natcoord_jax.assembly.response import (
     Evaluation,
-    Situation,
-    Stations,
+    GroupData,
+    StageKinematics,
     body_rows,
     situation,
     stations,
 )
-from natcoord_jax.assembly.roundness import frame_axes
-from natcoord_jax.assembly.separate import Tangents, tangents_at
+from natcoord_jax.assembly.start_cache import StartCache
 from natcoord_jax.assembly.sweeps import sweep_motion, turned_directors
 from natcoord_jax.assembly.system import Group, System
 from natcoord_jax.assembly.tangent_space import TangentSpace
@@ -56,7 +56,7 @@ from natcoord_jax.maths.collocation import Tableau, gauss
 from natcoord_jax.maths.projectors import range_projector
 from natcoord_jax.maths.vectors import dot
 
-NOTHING = Outset(None, None)
+NOTHING = StartCache(None, None)
 """Of the start of a step that is used for its constraints alone."""
 
 PROBE = 1e-6
@@ -78,7 +78,7 @@ def at_rest(step: Any) -> Any:
         step,
         h=jnp.zeros_like(step.h),
         situations=tuple(situations),
-        outset=NOTHING,
+        start_cache=NOTHING,
         tableau=gauss(1),
     )
 
@@ -93,9 +93,9 @@ class ReducedStep(Form):
     start: Float[Array, "bodies 4 3"]
     velocity: Float[Array, "bodies 4 3"]
     frames: Float[Array, "bodies 2 4 4"]
-    situations: tuple[Situation, ...]
+    situations: tuple[GroupData, ...]
     h: Float[Array, ""]
-    outset: Outset
+    start_cache: StartCache
     tableau: Tableau = eqx.field(static=True)
 
     @classmethod
@@ -106,7 +106,7 @@ class ReducedStep(Form):
         u: Array,
         h: Array,
         tableau: Tableau,
-        outset: Outset | None = None,
+        start_cache: StartCache | None = None,
     ) -> "ReducedStep":
         """Gather what the step needs, once.
 
@@ -116,7 +116,7 @@ class ReducedStep(Form):
             u: inputs.
             h: step [s].
             tableau: the collocation method.
-            outset: what is known of the start, see `starting`; None: found here.
+            start_cache: what is known of the start, see `starting`; None: found here.
         """
         return cls(
             system,
@@ -126,7 +126,7 @@ class ReducedStep(Form):
             system.tree.frames(system.frames),
             tuple(situation(system, g, state, u, h) for g in active_groups(system)),
             h,
-            cls.starting(system, state, tableau) if outset is None else outset,
+            cls.starting(system, state, tableau) if start_cache is None else start_cache,
             tableau,
         )
 
@@ -138,8 +138,8 @@ class ReducedStep(Form):
         tableau: Tableau,
         tangents: Tangents | None = None,
         later: bool = False,
-    ) -> Outset:
-        """What a step needs of its start, see `Outset.of`."""
+    ) -> StartCache:
+        """What a step needs of its start, see `StartCache.of`."""
         projector, rank = None, system.structure.rank
         if rank is not None:
             if isinstance(tangents, TangentSpace) and tangents.admissible.range is not None:
@@ -147,7 +147,7 @@ class ReducedStep(Form):
             else:
                 projector = range_projector(constraint_matrix(system, state), rank)
             projector = at_every_stage(projector, active_groups(system), tableau.stages)
-        return Outset.of(system, state, tableau, projector, tangents, later)
+        return StartCache.of(system, state, tableau, projector, tangents, later)
 
     @property
     def groups(self) -> tuple[Group, ...]:
@@ -208,7 +208,7 @@ class ReducedStep(Form):
         """Generalised forces of the free motions from forces and torques at the reference points."""
         return project(self.system.tree, geometry, force, torque)[0]
 
-    def stations(self, motion: TreeMotion) -> Stations:
+    def stations(self, motion: TreeMotion) -> StageKinematics:
         """Motion as the effects see it."""
         a = self.h * jnp.asarray(self.tableau.a, motion.velocity.dtype)
         points = self.start[:, 0] + jnp.sum(a[:, :, None, None] * motion.velocity, axis=1)
@@ -222,16 +222,16 @@ class ReducedStep(Form):
     def evaluate(self, y: Float[Array, " unknowns"]) -> Evaluation:
         """Residual, and what the end of the step needs."""
         system = self.system
-        w, multipliers = self.split(project_multipliers(y, self.balances, self.outset.projector))
+        w, multipliers = self.split(project_multipliers(y, self.balances, self.start_cache.projector))
         motion, geometry = self.motion(w)
         at = self.stations(motion)
         if self.tableau.variational:
-            at, geometry = replace_fields(at, levers=at.start[None]), at_rest(self).motion(w)[1]
+            at, geometry = replace_fields(at, force_rows=at.start[None]), at_rest(self).motion(w)[1]
         velocity, situations, kick = kicked(
             self.system,
             self.state,
-            self.outset.tangents,
-            self.outset.lag,
+            self.start_cache.tangents,
+            self.start_cache.lag,
             self.groups,
             self.situations,
             at,
@@ -245,14 +245,14 @@ class ReducedStep(Form):
         given = system, self.groups, situations, at, velocity
         found = momentum_balance(*given, multipliers, self.h, self.tableau)
         generalised = self.generalised(geometry, found.force, found.torque)
-        rows = project_rows(found.rows, y, self.balances, self.outset.projector)
+        rows = project_rows(found.rows, y, self.balances, self.start_cache.projector)
         residual = jnp.concatenate([generalised.reshape(-1), rows])
         asked = (situations, multipliers) if self.tableau.variational else damped
         return Evaluation(residual, found.size, at, found.power, (found.force, found.torque), kick, asked)
 
-    def damped(self, at: Stations) -> Damped:
+    def damped(self, at: StageKinematics) -> Damped:
         """What numerical dissipation does in the step."""
-        damping = self.outset.damping
+        damping = self.start_cache.damping
         damping = Damping.at(self.system, self.state) if damping is None else damping.with_system(self.system)
         return damping.over(self.state, self.groups, at, self.h, self.tableau)
 
@@ -311,7 +311,7 @@ class ReducedStep(Form):
 
     def own_inertia(self) -> Float[Array, "unknowns unknowns"]:
         """Inertia of the free motions at the start of the step, P^T M P."""
-        tangents = self.outset.tangents
+        tangents = self.start_cache.tangents
         if tangents is None:
             tangents = tangents_at(self.system, self.state)
         tangents = tangents.with_system(self.system)
@@ -343,7 +343,7 @@ class ReducedStep(Form):
 
     def _at_least(self, found: Float[Array, " balances"]) -> Float[Array, " balances"]:
         """Inertias, none less than that of the mass at its stage."""
-        if self.outset.tangents is None:
+        if self.start_cache.tangents is None:
             return found
         return jnp.maximum(found, self._by_stage(jnp.diagonal(self.own_inertia())))
 

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.diagnostics import group_places
 from natcoord_jax.assembly.system import Group, System
-from natcoord_jax.core.effect import Motion, Now, Response, replace_fields
+from natcoord_jax.core.effect import Motion, Response, StepContext, replace_fields
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import Tableau
 from natcoord_jax.maths.vectors import cross
@@ -25,19 +25,19 @@ def body_rows(q: Float[Array, "*s rows 3"]) -> Float[Array, "*s bodies 4 3"]:
     return q.reshape(*q.shape[:-2], q.shape[-2] // 4, 4, 3)
 
 
-class Stations(eqx.Module):
-    """Motion of all bodies and, last, the ground; `levers` as in `Motion`."""
+class StageKinematics(eqx.Module):
+    """Motion of all bodies and, last, the ground; `force_rows` as in `Motion`."""
 
     start: Float[Array, "bodies_and_ground 4 3"]
     rows: Float[Array, "s bodies_and_ground 4 3"]
     rates: Float[Array, "s bodies_and_ground 4 3"]
     spin: Float[Array, "s bodies_and_ground 3"]
-    levers: Float[Array, "s bodies_and_ground 4 3"] | None = None
+    force_rows: Float[Array, "s bodies_and_ground 4 3"] | None = None
 
     @property
     def held(self) -> Float[Array, "s bodies_and_ground 4 3"]:
         """Rows on which forces take hold."""
-        return self.rows if self.levers is None else self.levers
+        return self.rows if self.force_rows is None else self.force_rows
 
 
 def stations(
@@ -46,14 +46,14 @@ def stations(
     directors: Float[Array, "s bodies 3 3"],
     velocity: Float[Array, "s bodies 3"],
     spin: Float[Array, "s bodies 3"],
-) -> Stations:
+) -> StageKinematics:
     """Motion with the ground appended; director rates are spin x director."""
     ground = ground_rows(start)
     stages = points.shape[0]
     rows = jnp.concatenate([points[:, :, None], directors], axis=2)
     rates = jnp.concatenate([velocity[:, :, None], cross(spin[:, :, None], directors)], axis=2)
     still = jnp.zeros((stages, 1, 4, 3), start.dtype)
-    return Stations(
+    return StageKinematics(
         jnp.concatenate([start, ground]),
         jnp.concatenate([rows, jnp.broadcast_to(ground, still.shape)], axis=1),
         jnp.concatenate([rates, still], axis=1),
@@ -61,7 +61,7 @@ def stations(
     )
 
 
-class Situation(eqx.Module):
+class GroupData(eqx.Module):
     """What a group needs besides the motion: places, inputs, coordinates, rates, time, step, extra stress."""
 
     place: Array
@@ -73,9 +73,9 @@ class Situation(eqx.Module):
     stress: Float[Array, "n s p"] | None = None
 
 
-def situation(system: System, group: Group, state: State, u: Array, h: Array) -> Situation:
+def situation(system: System, group: Group, state: State, u: Array, h: Array) -> GroupData:
     """Gather what a group needs at the start of a step."""
-    return Situation(
+    return GroupData(
         group_places(system, group),
         jnp.moveaxis(u[..., group.inputs], -2, 0),
         state.coordinates[group.coordinates],
@@ -86,19 +86,19 @@ def situation(system: System, group: Group, state: State, u: Array, h: Array) ->
 
 
 def respond(
-    group: Group, where: Situation, motion: Motion, lam: Float[Array, "n s m"], tableau: Tableau
+    group: Group, where: GroupData, motion: Motion, lam: Float[Array, "n s m"], tableau: Tableau
 ) -> Response:
     """Responses of all instances of a group; leading axis `n`."""
-    now = Now(where.t, where.h, where.inputs, where.coordinates, where.rates, tableau, where.stress)
+    now = StepContext(where.t, where.h, where.inputs, where.coordinates, where.rates, tableau, where.stress)
     with jax.named_scope(group.effect.kind.replace(" ", "_")):
         return group.effect.responses(where.place, motion, now, lam)
 
 
-def gather(group: Group, at: Stations) -> Motion:
+def gather(group: Group, at: StageKinematics) -> Motion:
     """Motion of the bodies of a group: start (n, k, ...), stage quantities (s, n, k, ...)."""
     index = group.bodies
-    levers = None if at.levers is None else at.levers[:, index]
-    return Motion(at.start[index], at.rows[:, index], at.rates[:, index], at.spin[:, index], levers)
+    force_rows = None if at.force_rows is None else at.force_rows[:, index]
+    return Motion(at.start[index], at.rows[:, index], at.rates[:, index], at.spin[:, index], force_rows)
 
 
 class Evaluation(eqx.Module):
@@ -117,7 +117,7 @@ class Evaluation(eqx.Module):
 
     residual: Float[Array, " unknowns"]
     size: Float[Array, ""]
-    at: Stations
+    at: StageKinematics
     power: list[Float[Array, "_ s"]]
     loads: tuple[Float[Array, "s bodies 3"], Float[Array, "s bodies 3"]]
     kick: Any = None

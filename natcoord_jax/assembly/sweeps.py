@@ -7,13 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from natcoord_jax.assembly.roundness import ball_axes, frame_axes
+from natcoord_jax.assembly.axisymmetric_axes import ball_axes, frame_axes
 from natcoord_jax.assembly.tree import JointGeometry, Level, Tree, TreeMotion, combine, joined
 from natcoord_jax.maths.collocation import Tableau, rotate_stages
 from natcoord_jax.maths.vectors import cross
 
 
-class Hinging(eqx.Module):
+class JointData(eqx.Module):
     """Bodies of one level, and what they hang on.
 
     Attributes:
@@ -66,7 +66,7 @@ def turning(
 
 def relative_motion(
     level: Level,
-    these: Hinging,
+    these: JointData,
     spin_p: Float[Array, "s n 3"],
     d_p: Float[Array, "s n 3 3"],
     rate: Float[Array, "s n 7"],
@@ -156,7 +156,7 @@ def sweep_motion(
         slots: mean rates by body and slot.
         h: step [s].
         tableau: the collocation method.
-        turned: see `Hinging`.
+        turned: see `JointData`.
     """
     unit = jnp.eye(3, dtype=rows.dtype)
     spins, velocities, triads, geometry = [], [], [], []
@@ -172,7 +172,7 @@ def sweep_motion(
             parent_rows = rows[tree.parent[here]]
         along = None if turned is None else turned[:, here]
         symmetry = None if tree.symmetry is None else tree.symmetry[here]
-        these = Hinging(frames[here], rows[here], tree.ball[here], parent_rows, along, symmetry)
+        these = JointData(frames[here], rows[here], tree.ball[here], parent_rows, along, symmetry)
         spin, relative, d, joint = relative_motion(level, these, spin_p, d_p, slots[:, here], h, tableau)
         geometry.append(joint)
         spins.append(spin)

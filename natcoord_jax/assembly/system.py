@@ -8,8 +8,8 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from natcoord_jax.assembly.collection import Collection
 from natcoord_jax.assembly.local_rates import LocalRates
+from natcoord_jax.assembly.segment_sum import SegmentSum
 from natcoord_jax.assembly.tree import Tree
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.callables import Stacked
@@ -59,7 +59,7 @@ class Group(Stacked):
     coordinates: Int[Array | np.ndarray, "n c"]
     rotors: Int[Array | np.ndarray, "n r"]
     works: Int[Array | np.ndarray, "n w"]
-    acting: Collection
+    acting: SegmentSum
     count: int = eqx.field(static=True)
     names: Sequence[str] = eqx.field(static=True)
     source: str = eqx.field(static=True)
@@ -101,8 +101,8 @@ class CoordinateGroup(eqx.Module):
 class Seats(eqx.Module):
     """Nodes and parents of the instances of a group, whose blocks they collect."""
 
-    nodes: Collection
-    parents: Collection
+    nodes: SegmentSum
+    parents: SegmentSum
 
 
 class Elimination(eqx.Module):
@@ -377,7 +377,7 @@ class System(eqx.Module):
         Raises:
             ValueError: for a joint that is not in the system or has no such coordinate.
         """
-        return posing.coordinate(self, motion, joint, index)
+        return set_coordinates.coordinate(self, motion, joint, index)
 
     @checked("System.rate", motion=MOTION, joint=JOINT_NAME, index=Whole(0))
     def rate(self, motion: State | Trajectory, joint: Handle | str, *, index: int = 0) -> Float[Array, "*t"]:
@@ -386,7 +386,7 @@ class System(eqx.Module):
         Raises:
             ValueError: for a joint that is not in the system or has no such coordinate.
         """
-        return posing.rate(self, motion, joint, index)
+        return set_coordinates.rate(self, motion, joint, index)
 
     @checked(
         "System.with_coordinate",
@@ -417,7 +417,7 @@ class System(eqx.Module):
         Raises:
             ValueError: for a joint that closes a loop, is not in the system or has no such coordinate.
         """
-        return posing.with_coordinate(self, state, joint, value, rate=rate, index=index)
+        return set_coordinates.with_coordinate(self, state, joint, value, rate=rate, index=index)
 
     @checked("System.body_index", body=BODY_NAME)
     def body_index(self, body: Handle | str) -> int:
@@ -476,9 +476,9 @@ from natcoord_jax.assembly import (  # noqa: E402  (need System)
     diagnostics,
     instant,
     parts,
-    posing,
     reading,
     reporting,
     sensors,
+    set_coordinates,
     violations,
 )

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from natcoord_jax.assembly.balances import Balances, Gains
+from natcoord_jax.assembly.equations_of_motion import Accelerations, EquationsOfMotion
 from natcoord_jax.assembly.momentum import inertia, spatial_inertia, weighs_only, wrench
 from natcoord_jax.assembly.rates import row_rates
 from natcoord_jax.assembly.system import System
@@ -78,7 +78,7 @@ class TangentSpace(eqx.Module):
             state: where.
             lifted: whether impulses of the constraints are of interest, too.
         """
-        balances = Balances.at(system, state)
+        balances = EquationsOfMotion.at(system, state)
         gains = balances.columns()
         space, own = cls.without_frame(balances, gains)
         # Symmetric but for rounding, which would otherwise enter the frame with the same sign in every step.
@@ -86,7 +86,9 @@ class TangentSpace(eqx.Module):
         return replace_fields(space, admissible=_admissible(balances, frame, gains.constraints.T, lifted))
 
     @classmethod
-    def without_frame(cls, balances: Balances, gains: Gains) -> tuple["TangentSpace", Float[Array, "u u"]]:
+    def without_frame(
+        cls, balances: EquationsOfMotion, gains: Accelerations
+    ) -> tuple["TangentSpace", Float[Array, "u u"]]:
         """The tangents of the tree alone, with a unit matrix for a frame, and their inertia.
 
         Args:
@@ -263,7 +265,9 @@ def driven(system: System) -> bool:
     return any(group.multipliers and group.effect.works for group in system.effects)
 
 
-def _admissible(balances: Balances, frame: Array, matrix: Float[Array, "c u"], lifted: bool) -> Admissible:
+def _admissible(
+    balances: EquationsOfMotion, frame: Array, matrix: Float[Array, "c u"], lifted: bool
+) -> Admissible:
     """What constraints of loops and relations admit, whose rates are the matrix times those of the tree."""
     if not matrix.shape[0]:
         lift, none = jnp.zeros((matrix.shape[1], 0), matrix.dtype), jnp.zeros(0, matrix.dtype)

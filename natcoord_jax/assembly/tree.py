@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from natcoord_jax.assembly.roundness import ball_axes, frame_axes
+from natcoord_jax.assembly.axisymmetric_axes import ball_axes, frame_axes
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.maths.vectors import cross, dot
 

@@ -14,8 +14,8 @@ from natcoord_jax.assembly.diagnostics import group_places, over_states, rows_wi
 from natcoord_jax.assembly.reading import Source, over_source
 from natcoord_jax.assembly.system import Group, System
 from natcoord_jax.core.checks import is_concrete
+from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.effect import replace_fields
-from natcoord_jax.core.host import on_host
 from natcoord_jax.core.state import State, Trajectory
 
 GAP = 1e-9
@@ -96,7 +96,7 @@ def joint_residuals(system: System, state: State) -> list[tuple[Group, Array, Ar
     return list(zip(groups, values, rates))
 
 
-@on_host
+@eager_numpy
 def residuals(system: System, state: State) -> list[tuple[Array, Array]]:
     """Residual and rate of every joint's constraints, in the order of the groups."""
     return [(value, rate) for _, value, rate in joint_residuals(system, state)]
@@ -159,12 +159,12 @@ def misses(system: System, state: State) -> tuple[Array, Array]:
     return gap / (GAP * position_size(state)), rate / (GAP * rate_size(state))
 
 
-@on_host
+@eager_numpy
 def _position_violations(system: System, state: State) -> tuple[list[Array], Array]:
     return violations_of(system, constrained(system), state), position_size(state)
 
 
-@on_host
+@eager_numpy
 def _rate_violations(system: System, state: State) -> tuple[list[Array], Array]:
     return violation_rates_of(system, constrained(system), state), rate_size(state)
 

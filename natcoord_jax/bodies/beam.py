@@ -15,8 +15,8 @@ from natcoord_jax.bodies.sections import Section
 from natcoord_jax.core.arguments import checked, is_a
 from natcoord_jax.core.bodies import TRIAD, Body
 from natcoord_jax.core.checks import numbers, require_double
+from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.handles import Handle
-from natcoord_jax.core.host import on_host
 from natcoord_jax.core.kinds import BODY, NAME, FunctionOf, of
 from natcoord_jax.core.markers import Attachment
 from natcoord_jax.core.numeric import COMPONENTS, Directions, Number, Numbers, Vector, Whole
@@ -211,7 +211,7 @@ def _hold(
     return holder
 
 
-@on_host
+@eager_numpy
 def _lumps_and_velocities(
     section: Section, lumps: Array, points: Float[Array, "n 3"], drift: Array, spin: Array
 ) -> tuple[Float[Array, "n 4 4"], Float[Array, "n 3"]]:
@@ -219,7 +219,7 @@ def _lumps_and_velocities(
     return blocks, drift + jnp.cross(spin[None], points - points[0])
 
 
-@on_host
+@eager_numpy
 def _carried_along(position: Array, rotation: Array, block: Array, point: Array, frame: Array) -> Array:
     """Mass block of a node in the frame of the body that it is rigidly part of."""
     weights = jnp.zeros((4, 4)).at[0, 0].set(1.0).at[1:, 1:].set((rotation.T @ frame).T)

@@ -12,9 +12,9 @@ from natcoord_jax.bodies.shapes import CORNERS, Box, Capsule, Ellipsoid, Shape, 
 from natcoord_jax.core.arguments import Part, is_a
 from natcoord_jax.core.bodies import Body
 from natcoord_jax.core.checks import as_array, is_concrete
+from natcoord_jax.core.eager_numpy import stacked
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.handles import Handle, ground
-from natcoord_jax.core.host import stacked
 from natcoord_jax.core.kinds import BODY, NAME, Choice, HandleOf, of
 from natcoord_jax.core.markers import Direction, Marker, Point
 from natcoord_jax.core.numeric import COMPONENTS, Directions, Number

@@ -12,8 +12,8 @@ from natcoord_jax.bodies.nodes import Nodes
 from natcoord_jax.bodies.rigid import Orientation, orientation
 from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.checks import as_array, is_concrete, require_double
+from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.handles import Handle
-from natcoord_jax.core.host import on_host
 from natcoord_jax.core.kinds import NAME, of
 from natcoord_jax.core.nodes import NodeSet
 from natcoord_jax.core.numeric import COMPONENTS, Number, Numbers
@@ -91,7 +91,7 @@ class Surface:
         return f"<{len(self.faces)} faces of {self.handle.name!r}>"
 
 
-@on_host
+@eager_numpy
 def _placed(
     nodes: Float[Array, "n 3"], position: Array, rotation: Array, velocity: Array, spin: Array
 ) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
@@ -100,7 +100,7 @@ def _placed(
     return position + arms, velocity + cross(spin, arms)
 
 
-@on_host
+@eager_numpy
 def _normals(nodes: Float[Array, "n 3"], cells: Int[np.ndarray, "m 4"]) -> Float[Array, "n 3"]:
     """Mean normals of the cells at the nodes, by their areas."""
     corners = nodes[cells]
@@ -223,7 +223,7 @@ class Shell(_Continuum):
             )
 
 
-@on_host
+@eager_numpy
 def _turned(vectors: Float[Array, "n 3"], rotation: Float[Array, "3 3"]) -> Float[Array, "n 3"]:
     return vectors @ rotation.T
 

@@ -14,8 +14,8 @@ from natcoord_jax.bodies.reference_curve import ReferenceCurve
 from natcoord_jax.bodies.sections import Section
 from natcoord_jax.core.arguments import Part, is_a
 from natcoord_jax.core.checks import as_array, is_concrete
+from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.effect import Effect
-from natcoord_jax.core.host import on_host
 from natcoord_jax.core.kinds import Choice
 from natcoord_jax.core.markers import Attachment
 from natcoord_jax.effects.beams import (
@@ -138,13 +138,13 @@ class RelativeMotion(Interpolation):
         return elements, dampings
 
 
-@on_host
+@eager_numpy
 def _halves(arc: Float[Array, " n"]) -> Float[Array, " n"]:
     half = 0.5 * jnp.diff(arc)
     return jnp.zeros_like(arc).at[:-1].add(half).at[1:].add(half)
 
 
-@on_host
+@eager_numpy
 def _strains_of_pairs(curve: ReferenceCurve) -> tuple[Float[Array, " e"], Float[Array, "e 6"]]:
     """Lengths between neighbouring nodes, and strains of their unstressed shape."""
     lengths, frames = jnp.diff(curve.arc), frames_of(curve)
@@ -171,13 +171,13 @@ def _check_turns(curve: ReferenceCurve, name: str) -> None:
         )
 
 
-@on_host
+@eager_numpy
 def _shares(arc: Float[Array, " n"], order: int, spans: Any) -> Float[Array, " n"]:
     shares = jnp.diff(arc[::order])[:, None] * jnp.asarray(lobatto(order)[1])
     return jnp.zeros_like(arc).at[spans].add(shares)
 
 
-@on_host
+@eager_numpy
 def _interpolated(curve: ReferenceCurve, order: int, spans: Any) -> tuple[Array, Array, Array, Array]:
     """Values of the Lagrange functions at the points of integration; slopes, weights and strains by element.
 

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.bodies import DIRECTOR, POINT, TRIAD, Body
 from natcoord_jax.core.checks import as_array, is_concrete
-from natcoord_jax.core.host import on_host
+from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.kinds import NAME
 from natcoord_jax.core.numeric import Numbers
 from natcoord_jax.maths.vectors import cross, dot
@@ -184,19 +184,19 @@ def _every(value: Any, shape: tuple[int, ...], what: str) -> Array:
     return _broadcast(given, shape)
 
 
-@on_host
+@eager_numpy
 def _broadcast(value: Array, shape: tuple[int, ...]) -> Array:
     return jnp.broadcast_to(value, shape)
 
 
-@on_host
+@eager_numpy
 def _blocks(mass: Float[Array, " n"], inertia: Float[Array, "*n"]) -> Float[Array, "n 4 4"]:
     """Mass blocks of points with a director."""
     blocks = jnp.zeros((mass.shape[0], 4, 4)).at[:, 0, 0].set(mass)
     return blocks.at[:, 1, 1].set(inertia)
 
 
-@on_host
+@eager_numpy
 def _frames(
     directors: Float[Array, "n 3"], spin: Float[Array, "n 3"]
 ) -> tuple[Float[Array, "n 3 3"], Float[Array, "n 3"]]:

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.core.checks import as_array, is_concrete, numbers
-from natcoord_jax.core.host import on_host
+from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.maths.rotations import frame_from_axis
 from natcoord_jax.maths.vectors import cross, dot, unit
 
@@ -31,7 +31,7 @@ class ReferenceCurve(eqx.Module):
     frames: Float[Array, "n 3 3"]
 
 
-@on_host
+@eager_numpy
 def _along_polyline(points: Float[Array, "k 3"], fractions: Any) -> tuple[Array, Array, Array]:
     """Arc lengths, positions and tangents; at a corner the tangent is the mean of both sides."""
     chords = points[1:] - points[:-1]
@@ -97,14 +97,14 @@ def reference_curve(
     return ReferenceCurve(arc, points, frames)
 
 
-@on_host
+@eager_numpy
 def _along_function(curve: Any, fractions: Any, total: Array) -> tuple[Array, Array, Array]:
     """Arc lengths, positions and tangents."""
     arc = jnp.asarray(fractions) * total
     return arc, jax.vmap(curve)(arc), jax.vmap(jax.jacfwd(curve))(arc)
 
 
-@on_host
+@eager_numpy
 def _frames(arc: Array, tangents: Array, fractions: Any, second: Any, twist: Any) -> Array:
     tangents = unit(tangents)
     turning: Any = twist

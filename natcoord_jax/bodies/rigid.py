@@ -16,7 +16,7 @@ from natcoord_jax.core.checks import (
     positive,
     shape_of,
 )
-from natcoord_jax.core.host import on_host
+from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.kinds import NAME, Choice, Kind, is_other, of
 from natcoord_jax.core.numeric import COMPONENTS, Number, Numbers
 from natcoord_jax.maths.rotations import from_axis_angle, from_quaternion
@@ -31,7 +31,7 @@ three printed digits, as of a plate with (0.00333, 0.00333, 0.00667) kg m^2. It 
 
 MASS, TENSOR = Number("positive"), Numbers((3,)) | Numbers((3, 3))
 
-_from_axis_angle, _from_quaternion = on_host(from_axis_angle), on_host(from_quaternion)
+_from_axis_angle, _from_quaternion = eager_numpy(from_axis_angle), eager_numpy(from_quaternion)
 
 
 def orientation(value: Any, label: str) -> Float[Array, "3 3"]:
@@ -77,7 +77,7 @@ class Orientation(Kind):
         return None if pair or shape in ((4,), (3, 3)) else is_other(value)
 
 
-@on_host
+@eager_numpy
 def _diagonal(values: Float[Array, "3"]) -> Float[Array, "3 3"]:
     return jnp.diag(values)
 
@@ -132,7 +132,7 @@ def _listed(values: np.ndarray) -> str:
     return np.array2string(values, separator=", ", precision=6).replace("\n", "")
 
 
-@on_host
+@eager_numpy
 def to_second_moment(inertia: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
     """E = tr(J)/2 1 - J, about the same point as the inertia tensor J [kg m^2]."""
     return 0.5 * jnp.trace(inertia) * jnp.eye(3) - inertia
@@ -236,13 +236,13 @@ def RigidBody(
 _orientation = orientation
 
 
-@on_host
+@eager_numpy
 def _shifted(moment: Float[Array, "3 3"], mass: Float[Array, ""], by: Float[Array, "3"]) -> Array:
     """Second moment about a point from which the centre of mass is at `by`."""
     return moment + mass * jnp.outer(by, by)
 
 
-@on_host
+@eager_numpy
 def _central(moment: Float[Array, "3 3"], mass: Float[Array, ""], by: Float[Array, "3"]) -> Array:
     """Second moment about the centre of mass."""
     return moment - mass * jnp.outer(by, by)

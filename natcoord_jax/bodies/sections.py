@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from natcoord_jax.core.arguments import Part, checked, is_a
 from natcoord_jax.core.bodies import mass_block
 from natcoord_jax.core.checks import as_array, is_concrete, numbers, positive, shape_of
-from natcoord_jax.core.host import on_host, stacked
+from natcoord_jax.core.eager_numpy import eager_numpy, stacked
 from natcoord_jax.core.numeric import Number, Numbers, Vector
 
 SIZE, PAIR, RIM = Number("positive"), Number("positive") | Numbers((2,), "positive"), Numbers((None, 2))
@@ -119,12 +119,12 @@ class Section(Part):
         return jnp.zeros((4, 4)).at[:3, :3].set(length * self.inertia)
 
 
-@on_host
+@eager_numpy
 def _stiffness(shear: Array, stretch: Array, bending: Array, torsion: Array) -> Float[Array, "6 6"]:
     return jnp.diag(jnp.concatenate([shear, stretch[None], bending, torsion[None]]))
 
 
-@on_host
+@eager_numpy
 def _inertia(mass: Array, offset: Float[Array, "2"], about: Float[Array, "2"]) -> Float[Array, "3 3"]:
     second = jnp.diag(about[::-1]) + mass * jnp.outer(offset, offset)
     return mass_block(mass, offset, second)
@@ -146,7 +146,7 @@ def _elastic(shape: "Shaped", young: Any, poisson: Any, density: Any) -> Section
     return Section.of_numbers(**found, outline=outline)
 
 
-@on_host
+@eager_numpy
 def _moduli(
     young: Array, density: Array, poisson: Array, area: Array, second: Array, torsion: Array, shear: Array
 ) -> dict[str, Array]:
@@ -193,7 +193,7 @@ def CircularSection(*, radius: Any, E: Any, nu: Any = 0.3, density: Any, shear: 
     return _elastic(_circle(r, nu, shear), E, nu, density)
 
 
-@on_host
+@eager_numpy
 def _circle(r: Array, nu: Array, shear: Any) -> Shaped:
     area, second = jnp.pi * r**2, jnp.pi * r**4 / 4
     k = 6 * (1 + nu) / (7 + 6 * nu) if shear is None else jnp.asarray(shear, float)
@@ -227,7 +227,7 @@ def TubularSection(
     return _elastic(_tube(r, t, nu, shear), E, nu, density)
 
 
-@on_host
+@eager_numpy
 def _tube(r: Array, t: Array, nu: Array, shear: Any) -> Shaped:
     inner = r - t
     ratio = (inner / r) ** 2
@@ -263,7 +263,7 @@ def RectangularSection(
     return _elastic(_rectangle(b, h, nu, shear), E, nu, density)
 
 
-@on_host
+@eager_numpy
 def _rectangle(b: Array, h: Array, nu: Array, shear: Any) -> Shaped:
     area = b * h
     second = jnp.stack([b * h**3, b**3 * h]) / 12

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.core.arguments import Part, is_a
 from natcoord_jax.core.checks import as_array
-from natcoord_jax.core.host import on_host
+from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.numeric import Number, Numbers
 
 LENGTH, LENGTHS = Number("positive"), Numbers((3,), "positive")
@@ -68,7 +68,7 @@ class Shape(Part):
         return _mass_properties(self, density)
 
 
-@on_host
+@eager_numpy
 def _mass_properties(shape: Shape, density: Array) -> tuple[Array, Float[Array, "3 3"]]:
     mass = density * shape.volume()
     second = mass * shape.gyration()

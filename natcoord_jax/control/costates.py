@@ -137,12 +137,12 @@ def scored_end(problem: OptimalControl, multipliers: Multipliers, node: Node) ->
     return found.cost + multipliers.goal @ found.missing + multipliers.end @ found.excess
 
 
-Through = Callable[[Array, Array], tuple[Array, Array, Array]]
+TransmittedWrench = Callable[[Array, Array], tuple[Array, Array, Array]]
 
 
 def through_step(
     problem: OptimalControl, at: Slice, node: Node, w: Array, y: Array, jacobian: Jacobians
-) -> Through:
+) -> TransmittedWrench:
     """One step back, the adjoint of its linearised equations.
 
     Returns:

@@ -64,11 +64,11 @@ class _Step(eqx.Module):
     h: Float[Array, ""]
     wanted: Float[Array, " c"]
     places: Int[Array | np.ndarray, " c"]
-    outset: Any
+    start_cache: Any
 
     def equations(self, u: Array) -> Any:
         """With given inputs."""
-        return prepare(self.system, self.state, u, self.h, MIDPOINT, self.outset)
+        return prepare(self.system, self.state, u, self.h, MIDPOINT, self.start_cache)
 
     def end(self, y: Array, u: Array) -> tuple[Array, Array, State]:
         """Residual of the equations, the size of its terms, and the state that follows."""
@@ -132,8 +132,8 @@ def _followed(
     big, nought = jnp.asarray(jnp.inf), jnp.array(0)
 
     def body(state: State, wanted: Array) -> tuple:
-        outset = starting(system, state, MIDPOINT, later=True)
-        step = _Step(system, state, dt, wanted, places, outset)
+        start_cache = starting(system, state, MIDPOINT, later=True)
+        step = _Step(system, state, dt, wanted, places, start_cache)
         u = jnp.zeros(channels)
         reach = jnp.zeros((len(places), channels))
         start = _Search(step.equations(u).guess(), u, big, big, big, reach, nought)

@@ -12,7 +12,7 @@ from natcoord_jax.control.iterate import Iterate
 from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.control.results import Outcome
 from natcoord_jax.control.transcription import held_inputs
-from natcoord_jax.core.host import on_host
+from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.state import State
 from natcoord_jax.stepping.simulate import simulate
 
@@ -164,7 +164,7 @@ def outside_at_start(problem: OptimalControl) -> dict[str, float]:
     return {name: float(x) for name, x, keep in zip(names, excess, fixed) if keep and x > AT_BOUND}
 
 
-@on_host
+@eager_numpy
 def _excess_at_start(bounds: Bound, system: System, state: State) -> tuple[Array, Array]:
     def excess(u: Array) -> Array:
         return bounds.excess(system, state, u, state.t)

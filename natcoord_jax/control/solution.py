@@ -19,7 +19,7 @@ from natcoord_jax.control.reasons import seen, unique, worst_condition
 from natcoord_jax.control.results import ADVICE, OUTCOMES, Outcome
 from natcoord_jax.control.transcription import held_inputs
 from natcoord_jax.core.arguments import checked
-from natcoord_jax.core.host import on_host
+from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.kinds import of
 from natcoord_jax.core.numeric import Whole
 from natcoord_jax.core.state import State, Trajectory
@@ -260,7 +260,7 @@ def _interpolated(values: np.ndarray, steps: int) -> np.ndarray:
     return free_of_swings(np, first, found)
 
 
-@on_host
+@eager_numpy
 def _residual(goal: Goal, system: System, state: State) -> Float[Array, " n"]:
     return goal.residual(system, state)
 

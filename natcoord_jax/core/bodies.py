@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from natcoord_jax.core.host import on_host
+from natcoord_jax.core.eager_numpy import eager_numpy
 
 TRIAD, DIRECTOR, POINT = (0, 1, 2), (1, 2), ()
 """Axes about which nodes turn."""
@@ -42,7 +42,7 @@ class Body(eqx.Module):
         return self.rotations == TRIAD
 
 
-@on_host
+@eager_numpy
 def mass_block(mass: Float[Array, ""], centre: Float[Array, " k"], moment: Float[Array, "k k"]) -> Array:
     """Mass block (15) of a body, k = 3, or of a section of a beam, k = 2.
 

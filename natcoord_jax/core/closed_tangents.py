@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from natcoord_jax.core.effect import Motion, Now
+from natcoord_jax.core.effect import Motion, StepContext
 from natcoord_jax.core.together import instances_last, place_together
 from natcoord_jax.maths.vectors import cross
 
@@ -29,7 +29,7 @@ def stiffness(
     start: Float[Array, "k *m 3 n"],
     middle: Float[Array, "k *m 3 n"],
     moved: Float[Array, "k *m 3 n"],
-    now: Now,
+    now: StepContext,
     curvature: Float[Array, "n p p"],
 ) -> tuple[Float[Array, "n x x"], Float[Array, "k *m 3 n"]]:
     """Second derivatives -d f/d(D x), of x = 3 k m components, and the forces f.
@@ -65,7 +65,7 @@ def stiffness(
 
 
 def tangents_together(
-    potential: Any, place: Float[Array, "n k *m 4"], motion: Motion, now: Now, *, turning: bool
+    potential: Any, place: Float[Array, "n k *m 4"], motion: Motion, now: StepContext, *, turning: bool
 ) -> Float[Array, "n k 1 r k 1 r"]:
     """Derivatives of the wrenches of a potential by the twists, see `Effect.tangents`; for one stage.
 

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.core.arguments import is_a
-from natcoord_jax.core.effect import Effect, Motion, Now, Response, replace_fields
+from natcoord_jax.core.effect import Effect, Motion, Response, StepContext, replace_fields
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.joint import Joint
 from natcoord_jax.core.kinds import NAME
@@ -80,7 +80,7 @@ class Constraint(Effect):
         points = np.any(np.asarray(place)[..., ::4] != 0, axis=-1, keepdims=True)
         return tuple("m" if np.any(x * points) else "-" for x in change)
 
-    def respond(self, place: Array, motion: Motion, now: Now, lam: Array) -> Response:
+    def respond(self, place: Array, motion: Motion, now: StepContext, lam: Array) -> Response:
         """Rates G(Q_i) V_i, of quadratic residuals the discrete derivative (57); forces G^T lambda_i."""
 
         def stage(x: Array, rates: Array, held: Array, multipliers: Array) -> tuple[Array, Array]:
@@ -152,7 +152,7 @@ class VelocityConstraint(Effect):
         """Metres, as of points."""
         return ("m",) * self.multipliers
 
-    def respond(self, place: Array, motion: Motion, now: Now, lam: Array) -> Response:
+    def respond(self, place: Array, motion: Motion, now: StepContext, lam: Array) -> Response:
         """The rates, and the forces and torques that do no work along motions without them."""
 
         def stage(x, rates, spin, held, multipliers):

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from natcoord_jax.core.arguments import is_a
-from natcoord_jax.core.effect import Effect, Motion, Now, Response
+from natcoord_jax.core.effect import Effect, Motion, Response, StepContext
 from natcoord_jax.core.gradient import averaged_gradient, cancelling_energy
 from natcoord_jax.core.joint import Frame, frames_at
 from natcoord_jax.core.kinds import JOINT, NAME, Several
@@ -126,18 +126,18 @@ class CoordinateEffect(Effect):
 
     @abc.abstractmethod
     def generalised(
-        self, rates: Float[Array, "s c"], now: Now, lam: Float[Array, "s m"]
+        self, rates: Float[Array, "s c"], now: StepContext, lam: Float[Array, "s m"]
     ) -> tuple[Float[Array, "s c"], Float[Array, "s m"], Float[Array, " s"]]:
         """Generalised forces [N m or N], constraint rates and power, from the rates of the coordinates."""
 
-    def respond(self, place: Array, motion: Motion, now: Now, lam: Array) -> Response:
+    def respond(self, place: Array, motion: Motion, now: StepContext, lam: Array) -> Response:
         """Unit loads of the coordinates times the generalised forces."""
         loads = [
             axis.unit_load(pair_motion(place[k], motion, 2 * k), now.h) for k, axis in enumerate(self.axes)
         ]
         rates = jnp.stack([load.rate for load in loads], axis=-1)
         forces, rows, power = self.generalised(rates, now, lam)
-        if motion.levers is not None:
+        if motion.force_rows is not None:
             held, still = motion.held, jnp.zeros_like(now.h)
             loads = [
                 axis.unit_load(pair_motion(place[k], held, 2 * k), still) for k, axis in enumerate(self.axes)
@@ -176,7 +176,7 @@ class CoordinatePotential(CoordinateEffect):
     def energy(self, coordinate: Float[Array, ""]) -> Float[Array, ""]:
         """Energy [J] of the continuous coordinate [rad or m]."""
 
-    def generalised(self, rates: Array, now: Now, lam: Array) -> tuple[Array, Array, Array]:
+    def generalised(self, rates: Array, now: StepContext, lam: Array) -> tuple[Array, Array, Array]:
         """Averaged gradient of the energy along the step."""
         gradient = averaged_gradient(
             lambda c: self.energy(c[0]), now.coordinates, now.h * rates, now.tableau, self.degree
@@ -216,7 +216,7 @@ class CoordinateForce(CoordinateEffect):
     def force(self, rate: Float[Array, ""], inputs: Array, t: Float[Array, ""]) -> Float[Array, ""]:
         """Generalised force [N m or N] on the child, its opposite on the parent."""
 
-    def generalised(self, rates: Array, now: Now, lam: Array) -> tuple[Array, Array, Array]:
+    def generalised(self, rates: Array, now: StepContext, lam: Array) -> tuple[Array, Array, Array]:
         """The force at every stage; its power is force times rate, exactly."""
         forces = jax.vmap(self.force)(rates[:, 0], now.stage_inputs, now.times)
         return forces[:, None], jnp.zeros((len(now.tableau.b), 0)), forces * rates[:, 0]
@@ -237,7 +237,7 @@ class CoordinateInertia(CoordinateEffect):
     def inertia_of(self) -> Float[Array, ""]:
         """Inertia [kg m^2 or kg] along the coordinate."""
 
-    def generalised(self, rates: Array, now: Now, lam: Array) -> tuple[Array, Array, Array]:
+    def generalised(self, rates: Array, now: StepContext, lam: Array) -> tuple[Array, Array, Array]:
         """Inertia impulse -I sum_j (A^-1)_ij (r_j - r_0) with the stored rate r_0."""
         forces = -self.inertia_of() * now.tableau.differentiated(rates - now.rates)
         return forces, jnp.zeros((forces.shape[0], 0)), jnp.zeros(forces.shape[0])
@@ -288,7 +288,7 @@ class CoordinateConstraint(CoordinateEffect):
         """That of the coordinates; metres where a relation has angles and displacements."""
         return ("m" if any(axis.unit == "m" for axis in self.axes) else "rad",)
 
-    def generalised(self, rates: Array, now: Now, lam: Array) -> tuple[Array, Array, Array]:
+    def generalised(self, rates: Array, now: StepContext, lam: Array) -> tuple[Array, Array, Array]:
         """Impulses a lambda; the row asks the coordinates at the end of the step to obey the relation.
 
         Without a step (h = 0, the projection of velocities) it asks for the rate of the relation.

@@ -35,24 +35,24 @@ class Motion(eqx.Module):
         rows: rows at the stages.
         rates: their velocities at the stages [1/s times that].
         spin: angular velocities at the stages [rad/s].
-        levers: rows on which forces of potentials and constraints take hold; None: those at the stages.
+        force_rows: rows on which forces of potentials and constraints take hold; None: those at the stages.
     """
 
     start: Float[Array, "*n k 4 3"]
     rows: Float[Array, "s *n k 4 3"]
     rates: Float[Array, "s *n k 4 3"]
     spin: Float[Array, "s *n k 3"]
-    levers: Float[Array, "s *n k 4 3"] | None = None
+    force_rows: Float[Array, "s *n k 4 3"] | None = None
 
     @property
     def held(self) -> "Motion":
         """The motion with all rows where forces take hold."""
-        if self.levers is None:
+        if self.force_rows is None:
             return self
-        return Motion(self.levers[0], self.levers, self.rates, self.spin)
+        return Motion(self.force_rows[0], self.force_rows, self.rates, self.spin)
 
 
-class Now(eqx.Module):
+class StepContext(eqx.Module):
     """What else an effect (or `n` equal ones) may depend on during a step.
 
     Attributes:
@@ -111,7 +111,7 @@ class Effect(Part):
         works: whether its power enters the work account of the state (non-potential effects).
         stores: whether it stores potential energy.
         elastic: whether its oscillations can be damped numerically: it gives `strain_rates` and `curvature`,
-            and adds `Now.stress` to its gradients.
+            and adds `StepContext.stress` to its gradients.
         rotors: number of stored coordinate rates per instance.
         shared: whether one module serves all instances, instead of one with stacked numbers.
         couples: whether bodies of neighbouring markers become neighbours in the spanning tree where no joint
@@ -186,7 +186,7 @@ class Effect(Part):
         return {}
 
     @abc.abstractmethod
-    def respond(self, place: Array, motion: Motion, now: Now, lam: Float[Array, "s m"]) -> Response:
+    def respond(self, place: Array, motion: Motion, now: StepContext, lam: Float[Array, "s m"]) -> Response:
         """Forces, torques, constraint rates and power over a step.
 
         Args:
@@ -196,7 +196,9 @@ class Effect(Part):
             lam: its multipliers times the step [N s or N m s].
         """
 
-    def responses(self, place: Array, motion: Motion, now: Now, lam: Float[Array, "n s m"]) -> Response:
+    def responses(
+        self, place: Array, motion: Motion, now: StepContext, lam: Float[Array, "n s m"]
+    ) -> Response:
         """Responses of `n` instances with stacked numbers; leading axis n.
 
         By default `respond` of each of them. Where that is slow, write it for all of them at once.
@@ -208,17 +210,19 @@ class Effect(Part):
             lam: of the instances.
         """
 
-        def one(effect, place, inputs, coordinates, rates, stress, start, rows, row_rates, spin, levers, lam):
-            alone = Now(now.t, now.h, inputs, coordinates, rates, now.tableau, stress)
-            return effect.respond(place, Motion(start, rows, row_rates, spin, levers), alone, lam)
+        def one(
+            effect, place, inputs, coordinates, rates, stress, start, rows, row_rates, spin, force_rows, lam
+        ):
+            alone = StepContext(now.t, now.h, inputs, coordinates, rates, now.tableau, stress)
+            return effect.respond(place, Motion(start, rows, row_rates, spin, force_rows), alone, lam)
 
         axes = (None if self.shared else 0, 0, 0, 0, 0, 0, 0, 1, 1, 1, 1, 0)
         numbers = self, place, now.inputs, now.coordinates, now.rates, now.stress
-        moving = motion.start, motion.rows, motion.rates, motion.spin, motion.levers
+        moving = motion.start, motion.rows, motion.rates, motion.spin, motion.force_rows
         return jax.vmap(one, in_axes=axes)(*numbers, *moving, lam)
 
     def tangents(
-        self, place: Array, motion: Motion, now: Now, lam: Float[Array, "n s m"], *, turning: bool
+        self, place: Array, motion: Motion, now: StepContext, lam: Float[Array, "n s m"], *, turning: bool
     ) -> Float[Array, "n k s r k s r"] | None:
         """Derivatives of the wrenches on the bodies by their twists, nearly, of `n` instances, in formulas.
 
@@ -229,7 +233,7 @@ class Effect(Part):
         """
         return None
 
-    def linearised(self, place: Array, motion: Motion, now: Now, lam: Float[Array, "s m"]) -> Any:
+    def linearised(self, place: Array, motion: Motion, now: StepContext, lam: Float[Array, "s m"]) -> Any:
         """Something with a `respond` that is nearly this effect's, and nearly its derivative, at this motion.
 
         Newton's iteration takes its Jacobian from it; an effect that is expensive to differentiate can

@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from natcoord_jax.core.checks import as_array, is_concrete
+from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.effect import Effect, replace_fields
-from natcoord_jax.core.host import on_host
 from natcoord_jax.core.markers import Attachment, Marker, Point
 from natcoord_jax.core.nodes import NodeSet, NodeUnion
 from natcoord_jax.core.potential import place_markers
@@ -71,7 +71,7 @@ class Elements(eqx.Module):
         return found
 
 
-@on_host
+@eager_numpy
 def _assembled(effect: Effect, place: Array, rows: Array) -> Effect:
     def one(effect: Effect, place: Array, rows: Array) -> Effect:
         return effect.assembled_at(place_markers(place, rows))
@@ -79,7 +79,7 @@ def _assembled(effect: Effect, place: Array, rows: Array) -> Effect:
     return jax.vmap(one)(effect, place, rows)
 
 
-@on_host
+@eager_numpy
 def _flaws(effect: Effect) -> dict[str, Array]:
     return jax.vmap(lambda e: e.flaws())(effect)
 

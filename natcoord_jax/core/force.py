@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from natcoord_jax.core.arguments import is_a
-from natcoord_jax.core.effect import Effect, Motion, Now, Response
+from natcoord_jax.core.effect import Effect, Motion, Response, StepContext
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.joint import Joint
 from natcoord_jax.core.kinds import NAME
@@ -75,7 +75,7 @@ class Force(Effect):
             t: time of the stage [s].
         """
 
-    def respond(self, place: Array, motion: Motion, now: Now, lam: Array) -> Response:
+    def respond(self, place: Array, motion: Motion, now: StepContext, lam: Array) -> Response:
         """The load at every stage."""
         x, rates = place_markers(place, motion.rows), place_markers(place, motion.rates)
         load = jax.vmap(self.load)(x, rates, now.stage_inputs, now.times)
@@ -99,7 +99,7 @@ class Field(Effect):
     def acceleration(self) -> Float[Array, "3"]:
         """Uniform acceleration [m/s^2]."""
 
-    def respond(self, place: Array, motion: Motion, now: Now, lam: Array) -> Response:
+    def respond(self, place: Array, motion: Motion, now: StepContext, lam: Array) -> Response:
         """Force rows m_a0 g, exact for every method because the potential is linear."""
         forces = place[:, 0, None] * self.acceleration()
         stages = now.tableau.stages

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.core.arguments import is_a
-from natcoord_jax.core.effect import Effect, Motion, Now, Response
+from natcoord_jax.core.effect import Effect, Motion, Response, StepContext
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.kinds import BODY, NAME
 from natcoord_jax.core.numeric import COMPONENTS, Directions
@@ -138,7 +138,7 @@ class Joint(Effect):
         change = jax.jacfwd(from_points)(jnp.stack([parent.point, child.point]))
         return tuple("m" if np.any(x) else "-" for x in np.asarray(change))
 
-    def respond(self, place: Array, motion: Motion, now: Now, lam: Array) -> Response:
+    def respond(self, place: Array, motion: Motion, now: StepContext, lam: Array) -> Response:
         """Rates G(Q_i) V_i: for quadratic g the discrete derivative (57); and forces G^T lambda_i."""
 
         def constraint(rows: Float[Array, "2 4 3"]) -> Float[Array, " m"]:

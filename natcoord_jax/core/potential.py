@@ -11,17 +11,17 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from natcoord_jax.core.arguments import is_a
+from natcoord_jax.core.chunks import chunked
 from natcoord_jax.core.closed_tangents import tangents_together
-from natcoord_jax.core.effect import Effect, Motion, Now, Response
+from natcoord_jax.core.effect import Effect, Motion, Response, StepContext
 from natcoord_jax.core.gradient import averaged_coupling, averaged_gradient, cancelling_energy, gradient_of
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.joint import Joint
 from natcoord_jax.core.kinds import NAME
 from natcoord_jax.core.markers import Attachment, Marker, Markers
-from natcoord_jax.core.pieces import in_pieces
 from natcoord_jax.core.together import instances_last, place_together, steps_together
 from natcoord_jax.maths.collocation import Tableau
-from natcoord_jax.maths.settled import settled
+from natcoord_jax.maths.materialise import materialised
 
 
 def place_markers(place: Float[Array, "k *m w"], rows: Float[Array, "*s b 4 3"]) -> Float[Array, "*out"]:
@@ -101,7 +101,7 @@ class Potential(Effect):
         """Gradient by the marker vectors from that by the invariants."""
         return jax.vjp(self.invariants, x)[1](gradient)[0]
 
-    def respond(self, place: Array, motion: Motion, now: Now, lam: Array) -> Response:
+    def respond(self, place: Array, motion: Motion, now: StepContext, lam: Array) -> Response:
         """Forces -D pi^T S_i with the averaged gradients S_i, D pi where forces take hold."""
         start = self.invariants(place_markers(place, motion.start))
 
@@ -111,12 +111,12 @@ class Potential(Effect):
 
         return _response(self, gradient, place, motion, now)
 
-    def responses(self, place: Array, motion: Motion, now: Now, lam: Array) -> Response:
+    def responses(self, place: Array, motion: Motion, now: StepContext, lam: Array) -> Response:
         """Forces of all instances, at once if they can be."""
-        as_usual = motion.levers is None and now.stress is None and not now.tableau.variational
+        as_usual = motion.force_rows is None and now.stress is None and not now.tableau.variational
         if not (self.together and as_usual):
             return super().responses(place, motion, now, lam)
-        return in_pieces(responses_together, self, place, motion, now)
+        return chunked(responses_together, self, place, motion, now)
 
     def averaged(
         self, start: Float[Array, "p *n"], steps: Float[Array, "s p *n"], tableau: Tableau
@@ -126,14 +126,16 @@ class Potential(Effect):
         given = self.energy, start, steps, tableau, self.degree, points
         return averaged_gradient(*given, self.slope, self.units)
 
-    def tangents(self, place: Array, motion: Motion, now: Now, lam: Array, *, turning: bool) -> Array | None:
+    def tangents(
+        self, place: Array, motion: Motion, now: StepContext, lam: Array, *, turning: bool
+    ) -> Array | None:
         """In formulas for one stage, of what takes many instances at once on markers of single bodies."""
         several = motion.spin.shape[-2] > place.shape[1]
         if not self.together or several or now.tableau.stages > 1 or now.stress is not None:
             return None
-        return in_pieces(partial(tangents_together, turning=turning), self, place, motion, now)
+        return chunked(partial(tangents_together, turning=turning), self, place, motion, now)
 
-    def linearised(self, place: Array, motion: Motion, now: Now, lam: Array) -> "LinearisedPotential":
+    def linearised(self, place: Array, motion: Motion, now: StepContext, lam: Array) -> "LinearisedPotential":
         """The potential with gradients that are linear in the steps of the invariants."""
         start = self.invariants(place_markers(place, motion.start))
         steps = _steps(self, place, motion, now)
@@ -179,7 +181,7 @@ class LinearisedPotential(eqx.Module):
     gradient: Float[Array, "s p"]
     curvature: Float[Array, "p p"]
 
-    def respond(self, place: Array, motion: Motion, now: Now, lam: Array) -> Response:
+    def respond(self, place: Array, motion: Motion, now: StepContext, lam: Array) -> Response:
         """The response with linear gradients."""
         coupling = averaged_coupling(now.tableau.stages)
 
@@ -190,19 +192,19 @@ class LinearisedPotential(eqx.Module):
         return _response(self.potential, gradient, place, motion, now)
 
 
-def _steps(potential: Potential, place: Array, motion: Motion, now: Now) -> Float[Array, "s p"]:
+def _steps(potential: Potential, place: Array, motion: Motion, now: StepContext) -> Float[Array, "s p"]:
     """Step times the rates of the invariants at the stages."""
     x, rates = place_markers(place, motion.rows), place_markers(place, motion.rates)
     return jax.vmap(lambda xi, vi: jax.jvp(potential.invariants, (xi,), (vi,))[1])(x, now.h * rates)
 
 
 def _response(
-    potential: Potential, gradient: Callable[[Array], Array], place: Array, motion: Motion, now: Now
+    potential: Potential, gradient: Callable[[Array], Array], place: Array, motion: Motion, now: StepContext
 ) -> Response:
     """Forces -D pi^T S_i with gradients S_i of the steps of the invariants, D pi where forces take hold."""
     x, rates = place_markers(place, motion.rows), place_markers(place, motion.rates)
     given = gradient(_steps(potential, place, motion, now))
-    held = x if motion.levers is None else place_markers(place, motion.levers)
+    held = x if motion.force_rows is None else place_markers(place, motion.force_rows)
     forces = -jax.vmap(potential.pulled_back)(held, given)
     return marker_response(place, forces, None, rates, motion)
 
@@ -233,14 +235,14 @@ def marker_response(
     return Response(on_rows, torques, jnp.zeros((stages, 0)), power)
 
 
-def responses_together(potential: Potential, place: Array, motion: Motion, now: Now) -> Response:
+def responses_together(potential: Potential, place: Array, motion: Motion, now: StepContext) -> Response:
     """Responses of many instances, whose axis is the last in all that is computed."""
     potential, place, start = instances_last((potential, place, motion.start))
     x = place_together(place, instances_last(motion.rows, 1))
     rates = place_together(place, instances_last(motion.rates, 1))
     steps = steps_together(potential, x, now.h * rates)
-    begun, steps = settled((potential.invariants(place_together(place, start)), steps))
-    given = settled(potential.averaged(begun, steps, now.tableau))
+    begun, steps = materialised((potential.invariants(place_together(place, start)), steps))
+    given = materialised(potential.averaged(begun, steps, now.tableau))
     forces = -jax.vmap(potential.pulled_back)(x, given)
     power = jnp.sum(forces * rates, axis=tuple(range(1, forces.ndim - 1)))
     on_rows = place[..., None, :] * forces[..., None, :, :]

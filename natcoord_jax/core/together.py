@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from natcoord_jax.maths.settled import settled
+from natcoord_jax.maths.materialise import materialised
 
 
 def instances_last(x: Any, axis: int = 0) -> Any:
@@ -21,7 +21,7 @@ def place_together(place: Float[Array, "k *m w n"], rows: Float[Array, "*s b 4 3
         rows = rows.reshape(*rows.shape[:-4], place.shape[0], 4 * several, *rows.shape[-2:])
     if place.ndim == 4:
         rows = rows[..., None, :, :, :]
-    return settled(jnp.sum(place[..., None, :] * rows, axis=-3))
+    return materialised(jnp.sum(place[..., None, :] * rows, axis=-3))
 
 
 def steps_together(

@@ -1,5 +1,7 @@
 """Bodies that bounce and collide."""
 
+from typing import Any
+
 import numpy as np
 
 import natcoord_jax as nc
@@ -24,7 +26,7 @@ def bouncing_balls(restitutions: tuple[float, ...] = (1.0, 0.8, 0.5)) -> Example
                 name=f"ball {k + 1}",
             )
         )
-        lossy = {} if restitution == 1 else {"restitution": restitution, "speed": speed}
+        lossy: dict[str, Any] = {} if restitution == 1 else {"restitution": restitution, "speed": speed}
         scene.add(nc.Contact(ball, floor, stiffness=2e4, name=f"bounce {k + 1}", **lossy))
     system, state = scene.compile()
     fall = float(np.sqrt(2 * height / GRAVITY))

@@ -4,8 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import natcoord_jax as nc
+from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.handles import Handle
-from natcoord_jax.core.host import on_host
 from natcoord_jax.gallery.example import Example
 from natcoord_jax.maths.rotations import frame_from_axis
 
@@ -64,7 +64,7 @@ def bricard() -> Example:
     for k in range(5):
         start, end = corners[k], corners[k + 1]
         # Third body axis along the rod, a solid of 0.1 m x 0.1 m x 1 m.
-        orientation = np.asarray(on_host(frame_from_axis)(end - start)).T
+        orientation = np.asarray(eager_numpy(frame_from_axis)(end - start)).T
         rod = nc.RigidBody(
             shape=nc.Box((0.1, 0.1, 1.0)),
             density=100.0,
@@ -109,7 +109,7 @@ def slider_crank() -> Example:
             com=(0, 0, 0.15),
             shape=nc.Cylinder(0.008, 0.3),
             position=pin,
-            orientation=np.asarray(on_host(frame_from_axis)(along)).T,
+            orientation=np.asarray(eager_numpy(frame_from_axis)(along)).T,
             name="rod",
         )
     )

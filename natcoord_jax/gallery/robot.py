@@ -12,8 +12,8 @@ from jaxtyping import Array, Float
 import natcoord_jax as nc
 from natcoord_jax.assembly.system import System
 from natcoord_jax.core.checks import as_array
+from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.handles import Handle
-from natcoord_jax.core.host import on_host
 from natcoord_jax.core.results import Result
 from natcoord_jax.core.state import State, Trajectory
 from natcoord_jax.gallery.example import Example
@@ -79,7 +79,7 @@ def way(t: Float[Array, ""]) -> Float[Array, "7"]:
 
 
 def _turn(axis: np.ndarray, angle: float) -> np.ndarray:
-    return np.asarray(on_host(from_axis_angle)(as_array(axis), as_array(angle)))
+    return np.asarray(eager_numpy(from_axis_angle)(as_array(axis), as_array(angle)))
 
 
 def _robot(scene: nc.Scene) -> Handle:

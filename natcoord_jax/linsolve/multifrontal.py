@@ -20,7 +20,7 @@ from natcoord_jax.linsolve.blocks import BlockMatrix, Entries
 from natcoord_jax.linsolve.graph import Graph
 from natcoord_jax.linsolve.inverse import inverses
 from natcoord_jax.linsolve.ordering import Groups, dissection, rounds
-from natcoord_jax.linsolve.rehearsal import natural, rehearse
+from natcoord_jax.linsolve.pivot_analysis import analyse_pivots, natural
 from natcoord_jax.linsolve.schedule import Bucket, Level, schedule
 from natcoord_jax.linsolve.symbolic import Front, Sizes, amalgamated, estimate, fronts_of, top_merged
 
@@ -138,7 +138,7 @@ def plan(
     if values is None:
         pivots = natural(graph, fronts)
     else:
-        fronts, pivots = rehearse(graph, fronts, entries, values)
+        fronts, pivots = analyse_pivots(graph, fronts, entries, values)
     _, buckets = estimate(fronts, Sizes(graph))
     return Multifrontal(schedule(graph, fronts, pivots, buckets, entries, tiles))
 

@@ -12,8 +12,8 @@ from natcoord_jax.assembly.reduced import ReducedStep
 from natcoord_jax.assembly.system import System
 from natcoord_jax.assembly.violations import constrained, misses, worst_violation
 from natcoord_jax.core.checks import as_array, at_top_level
+from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.effect import replace_fields
-from natcoord_jax.core.host import on_host
 from natcoord_jax.core.results import Result
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import gauss
@@ -112,7 +112,7 @@ def admitted(system: System, state: State) -> State:
     return jax.tree.map(lambda x: jnp.where((gap <= 1.0) & (moving_along | (code == 0)), x, jnp.nan), state)
 
 
-_with_admissible_velocities = on_host(with_admissible_velocities)
+_with_admissible_velocities = eager_numpy(with_admissible_velocities)
 
 
 def _tiny_step(system: System, state: State) -> ReducedStep:
@@ -120,7 +120,7 @@ def _tiny_step(system: System, state: State) -> ReducedStep:
     return ReducedStep.prepare(system, state, inputs, jnp.asarray(1e-9), gauss(1))
 
 
-@on_host
+@eager_numpy
 def _jacobian(system: System, state: State):
     step = _tiny_step(system, state)
     return step.jacobian(step.guess())
@@ -157,7 +157,7 @@ def check_inertia(system: System, state: State) -> None:
         )
 
 
-_with_admissible_positions = on_host(with_admissible_positions)
+_with_admissible_positions = eager_numpy(with_admissible_positions)
 
 
 def find_redundancy(system: System, state: State) -> tuple[int, tuple[str, ...]]:

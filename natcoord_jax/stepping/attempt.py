@@ -11,32 +11,32 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
 from natcoord_jax.assembly.equations import prepare, starting
+from natcoord_jax.assembly.frozen_kick import Lagging
 from natcoord_jax.assembly.kick import Kick
-from natcoord_jax.assembly.lag import Lagging
-from natcoord_jax.assembly.outset import Outset
 from natcoord_jax.assembly.response import Evaluation
+from natcoord_jax.assembly.start_cache import StartCache
 from natcoord_jax.assembly.tangent_space import driven
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.rows import row, with_row
-from natcoord_jax.stepping.course import Course, Setting, after_attempt
+from natcoord_jax.stepping.difference_jacobian import DifferenceJacobian
 from natcoord_jax.stepping.differences import evaluated, told
+from natcoord_jax.stepping.energy_check import sound
 from natcoord_jax.stepping.factors import Factors, factors_of
 from natcoord_jax.stepping.newton import Iterate, any_lane, judge, refreshed
-from natcoord_jax.stepping.probe import Probe
 from natcoord_jax.stepping.remainder import remainder, with_remainder
+from natcoord_jax.stepping.rollout_state import RolloutProblem, RolloutState, after_attempt
 from natcoord_jax.stepping.step import end_of_step
-from natcoord_jax.stepping.watch import sound
 
 
-class Carried(eqx.Module):
+class LoopCarry(eqx.Module):
     """What goes from one attempt to the next.
 
     Attributes:
         count: complete slots.
         course: where the rollout stands, its state left out.
         state: the state in one array: fewer operations than one for every field.
-        outset: what the equations need of that state.
+        start_cache: what the equations need of that state.
         factors: of a Jacobian.
         probe: what Jacobians by differences are formed with; None: they have formulas.
         record: fields of `Slots`, for every slot; the states in one array.
@@ -45,17 +45,17 @@ class Carried(eqx.Module):
     """
 
     count: Int[Array, ""]
-    course: Course
+    course: RolloutState
     state: Float[Array, " numbers"]
-    outset: Outset
+    start_cache: StartCache
     factors: Factors
-    probe: Probe | None
+    probe: DifferenceJacobian | None
     record: tuple[Array, ...]
     first: Int[Array, ""]
-    asked: "Asked | None"
+    asked: "RefactorRequest | None"
 
 
-class Asked(eqx.Module):
+class RefactorRequest(eqx.Module):
     """What is known where new factors are wanted.
 
     Attributes:
@@ -73,7 +73,7 @@ class Asked(eqx.Module):
     here: Bool[Array, ""]
 
 
-class Solving(eqx.Module):
+class NewtonCarry(eqx.Module):
     """Where the equations of an attempt stand, from one evaluation to the next.
 
     Attributes:
@@ -91,7 +91,7 @@ class Solving(eqx.Module):
     it: Iterate
     lagging: Lagging | None
     factors: Factors
-    probe: Probe | None
+    probe: DifferenceJacobian | None
     found: Evaluation
     residual: Float[Array, " unknowns"]
     ending: Bool[Array, ""]
@@ -99,7 +99,9 @@ class Solving(eqx.Module):
     here: Bool[Array, ""]
 
 
-def attempt(setting: Setting, unpack: Callable[[Array], State], apart: bool, carried: Carried) -> Carried:
+def attempt(
+    setting: RolloutProblem, unpack: Callable[[Array], State], apart: bool, carried: LoopCarry
+) -> LoopCarry:
     """One attempt at a (sub)step, to its end; if apart, no further than to where new factors are wanted.
 
     What does not change from one evaluation to the next is outside of the loop over these, where the compiler
@@ -107,7 +109,7 @@ def attempt(setting: Setting, unpack: Callable[[Array], State], apart: bool, car
     """
     course = with_state(carried.course, unpack(carried.state))
     u, h, index = setting.situation(course)
-    equations = prepare(setting.system, course.state, u, h, setting.plan.tableau, carried.outset)
+    equations = prepare(setting.system, course.state, u, h, setting.plan.tableau, carried.start_cache)
     start = _unsolved(equations, carried)
     evaluate = partial(_evaluation, setting, course, equations, apart)
     solving = jax.lax.while_loop(lambda s: ~(s.ending | s.wanting), evaluate, start)
@@ -131,38 +133,40 @@ def attempt(setting: Setting, unpack: Callable[[Array], State], apart: bool, car
         if after.trial is not None:
             record = _taken_back(record, carried.count - 1 - carried.first, after.trial.undone, x)
         record = tuple(with_row(b, carried.count - carried.first, r) for b, r in zip(record, slot))
-        outset = _outset_after(setting, after, accepted, carried.outset, found.kick)
-        if after.lagging is not None and outset.tangents is not None:
+        start_cache = _outset_after(setting, after, accepted, carried.start_cache, found.kick)
+        if after.lagging is not None and start_cache.tangents is not None:
             # A kick that is not normal would change momenta.
-            held = outset.tangents.with_system(setting.system).normal(after.lagging.held)
+            held = start_cache.tangents.with_system(setting.system).normal(after.lagging.held)
             after = eqx.tree_at(lambda c: c.lagging.held, after, held)
         factors = _kept(setting, equations, before, after, factors, solving.probe)
-        return jnp.array(False), with_state(after, None), x, outset, record, factors
+        return jnp.array(False), with_state(after, None), x, start_cache, record, factors
 
-    carry = solving.ending, begun, carried.state, carried.outset, carried.record, solving.factors
+    carry = solving.ending, begun, carried.state, carried.start_cache, carried.record, solving.factors
     if apart:
         # A loop of no or one trip leaves what it carries where it is; a conditional would copy it.
         carry = jax.lax.while_loop(lambda carry: carry[0], ended, carry)
     else:
         carry = ended(carry)
-    _, after, x, outset, record, factors = carry
+    _, after, x, start_cache, record, factors = carry
     asked = None
     if apart:
-        asked = Asked(solving.wanting, solving.residual, found.size, found.loads, solving.here)
+        asked = RefactorRequest(solving.wanting, solving.residual, found.size, found.loads, solving.here)
     count = carried.count + solving.ending
-    return Carried(count, after, x, outset, factors, solving.probe, record, carried.first, asked)
+    return LoopCarry(count, after, x, start_cache, factors, solving.probe, record, carried.first, asked)
 
 
-def _unsolved(equations: Any, carried: Carried) -> Solving:
+def _unsolved(equations: Any, carried: LoopCarry) -> NewtonCarry:
     """Before the first evaluation."""
     course, no = carried.course, jnp.array(False)
     shapes = jax.eval_shape(lambda y: equations.evaluate(y).without_system(), course.it.y)
     blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
     given = course.it, course.lagging, carried.factors, carried.probe
-    return Solving(*given, blank, blank.residual, no, no, no)
+    return NewtonCarry(*given, blank, blank.residual, no, no, no)
 
 
-def _evaluation(setting: Setting, course: Course, equations: Any, apart: bool, solving: Solving) -> Solving:
+def _evaluation(
+    setting: RolloutProblem, course: RolloutState, equations: Any, apart: bool, solving: NewtonCarry
+) -> NewtonCarry:
     """One evaluation of the equations, and what follows from it.
 
     If apart, new factors are asked for, but not made.
@@ -170,7 +174,7 @@ def _evaluation(setting: Setting, course: Course, equations: Any, apart: bool, s
     it, lagging, factors, probe = solving.it, solving.lagging, solving.factors, solving.probe
     over = setting.over(course)
     lag = setting.lag(replace_fields(course, it=it, lagging=lagging))
-    equations = replace_fields(equations, outset=replace_fields(equations.outset, lag=lag))
+    equations = replace_fields(equations, start_cache=replace_fields(equations.start_cache, lag=lag))
     if probe is None:
         found = equations.evaluate(it.y)
     else:
@@ -194,18 +198,23 @@ def _evaluation(setting: Setting, course: Course, equations: Any, apart: bool, s
         probe = probe.asked(wanting & ~astray, any_lane(it.rounds), setting.plan.tableau.stages)
         wanting = jnp.array(False)
     elif not apart:
-        asked = Asked(wanting, residual, found.size, found.loads, here)
+        asked = RefactorRequest(wanting, residual, found.size, found.loads, here)
 
         def renewed(carry: tuple) -> tuple:
             _, it, factors = carry
             return jnp.array(False), *renewed_at(setting, equations, it, factors, asked)
 
         wanting, it, factors = jax.lax.while_loop(lambda carry: carry[0], renewed, (wanting, it, factors))
-    return Solving(it, lagging, factors, probe, found.without_system(), residual, ending, wanting, here)
+    return NewtonCarry(it, lagging, factors, probe, found.without_system(), residual, ending, wanting, here)
 
 
 def _kept(
-    setting: Setting, equations: Any, before: Course, after: Course, factors: Factors, probe: Probe | None
+    setting: RolloutProblem,
+    equations: Any,
+    before: RolloutState,
+    after: RolloutState,
+    factors: Factors,
+    probe: DifferenceJacobian | None,
 ) -> Factors:
     """Factors after an attempt."""
     # An attempt for comparison leaves the run where it is, and factors that serve.
@@ -219,7 +228,7 @@ def _kept(
     return factors
 
 
-def _judging(equations: Any, it: Iterate, probe: Probe | None) -> tuple[int, dict[str, Any]]:
+def _judging(equations: Any, it: Iterate, probe: DifferenceJacobian | None) -> tuple[int, dict[str, Any]]:
     """Cost of new factors, in corrections, and options of `judge`."""
     cost = equations.renewal if probe is None else max(equations.renewal, it.y.shape[0] // 2)
     alike = False if probe is None else probe.alike
@@ -227,7 +236,7 @@ def _judging(equations: Any, it: Iterate, probe: Probe | None) -> tuple[int, dic
 
 
 def renewed_at(
-    setting: Setting, equations: Any, it: Iterate, factors: Factors, asked: Asked
+    setting: RolloutProblem, equations: Any, it: Iterate, factors: Factors, asked: RefactorRequest
 ) -> tuple[Iterate, Factors]:
     """New factors by formulas, and the iteration with them."""
     _, options = _judging(equations, it, None)
@@ -241,8 +250,8 @@ def renewed_at(
 
 
 def _outset_after(
-    setting: Setting, after: Course, accepted: Array, known: Outset, kick: Kick | None
-) -> Outset:
+    setting: RolloutProblem, after: RolloutState, accepted: Array, known: StartCache, kick: Kick | None
+) -> StartCache:
     """What is known of the state that the next attempt starts from."""
     tangents = None
     if kick is not None and known.tangents is not None and setting.tolerance is None:
@@ -261,6 +270,6 @@ def _taken_back(record: tuple, index: Array, undone: Array, x: Array) -> tuple:
     return states, *others, accepted, finished
 
 
-def with_state(course: Course, state: State | None) -> Course:
+def with_state(course: RolloutState, state: State | None) -> RolloutState:
     """The course with another state, or without."""
     return replace_fields(course, state=state)

@@ -13,17 +13,17 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from natcoord_jax.assembly.block_tangent_space import Tangents
 from natcoord_jax.assembly.equations import kind_of
 from natcoord_jax.assembly.momentum import row_weights
-from natcoord_jax.assembly.separate import Tangents
 from natcoord_jax.assembly.system import System
 from natcoord_jax.core.state import State
-from natcoord_jax.stepping.correcting import Correcting
 from natcoord_jax.stepping.factors import Factors
-from natcoord_jax.stepping.in_turn import Fixed, Going, InTurn
+from natcoord_jax.stepping.linear_iteration import LinearIteration
 from natcoord_jax.stepping.newton import any_lane
 from natcoord_jax.stepping.plan import Plan
-from natcoord_jax.stepping.record import Changes, Numbers, Record, Slot
+from natcoord_jax.stepping.record import Parameters, ParameterTangents, Record, Slot
+from natcoord_jax.stepping.slot_sweep import Fixed, SlotSweep, SweepCarry
 
 MANY = 8
 """Bodies from which on only what the corrections ask for is pulled back until the solution is expected, if
@@ -32,7 +32,7 @@ of that of small systems, whose programs compile for half as long again. With mo
 grow too large for one kernel, which costs more than that."""
 
 
-class Backward(InTurn):
+class Backward(SlotSweep):
     """The way back.
 
     It carries the cotangents of the state after a slot, of the tangent space there for schemes with kicks,
@@ -40,7 +40,8 @@ class Backward(InTurn):
 
     Args:
         plan: of the rollout.
-        forced: whether the multipliers of all slots and the cotangents of their ends are kept, see `Changes`.
+        forced: whether the multipliers of all slots and the cotangents of their ends are kept, see
+            `ParameterTangents`.
     """
 
     def __init__(self, plan: Plan, forced: bool = False):
@@ -49,7 +50,7 @@ class Backward(InTurn):
         super().__init__(plan, 1 if plan.tableau.kick else 2)
         self.forced = forced
 
-    def cotangents(self, record: Record, given: tuple[State, Array]) -> Changes:
+    def cotangents(self, record: Record, given: tuple[State, Array]) -> ParameterTangents:
         """Cotangents of what varies, of the slots' inputs, and of the first state.
 
         Args:
@@ -58,7 +59,7 @@ class Backward(InTurn):
         """
         return self.every(record, given)
 
-    def following(self, kernel: Callable, record: Record, given: tuple[State, Array]) -> Changes:
+    def following(self, kernel: Callable, record: Record, given: tuple[State, Array]) -> ParameterTangents:
         """Cotangents of everything."""
         numbers, slots = record.numbers, record.slots
         y, before_all = slots.y[-1], jax.tree.map(lambda x: x[0], slots.before)
@@ -70,15 +71,15 @@ class Backward(InTurn):
         c, (u_bar, forced_bar) = self.in_rounds(kernel, fixed, slots, given, start, like)
         state_bar, tangents_bar, varied_bar = c.own
         if tangents_bar is None:
-            return Changes(varied_bar, u_bar, state_bar, forced_bar)
+            return ParameterTangents(varied_bar, u_bar, state_bar, forced_bar)
         varied_bar, state_bar = kernel(self._before_all, numbers, before_all, c)
-        return Changes(varied_bar, u_bar, state_bar, forced_bar)
+        return ParameterTangents(varied_bar, u_bar, state_bar, forced_bar)
 
-    def _no_change(self, numbers: Numbers, state: State) -> Tangents | None:
+    def _no_change(self, numbers: Parameters, state: State) -> Tangents | None:
         shapes = jax.eval_shape(partial(self.admitted, numbers, numbers.varied), state)
         return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
 
-    def _before_all(self, numbers: Numbers, state: State, c: Going) -> tuple[list[Array], State]:
+    def _before_all(self, numbers: Parameters, state: State, c: SweepCarry) -> tuple[list[Array], State]:
         """Cotangents of what varies and of the first state, with those of the tangent space there."""
         state_bar, tangents_bar, varied_bar = c.own
         _, pull = jax.vjp(partial(self.admitted, numbers), numbers.varied, state)
@@ -98,7 +99,7 @@ class Backward(InTurn):
         return (before_bar, tangents_bar, varied_bar), found
 
     def solving(
-        self, fixed: Fixed, slot: Slot, arrived: State, given: tuple[State, Array], c: Going
+        self, fixed: Fixed, slot: Slot, arrived: State, given: tuple[State, Array], c: SweepCarry
     ) -> Callable:
         """How the cotangents of one slot are found.
 
@@ -118,7 +119,7 @@ class Backward(InTurn):
 
         _, pull = jax.vjp(partial(self.outcome, numbers, slot), *at_slot, slot.y)
 
-        def solve(lam: Array, learnt: Any, at: Correcting) -> tuple:
+        def solve(lam: Array, learnt: Any, at: LinearIteration) -> tuple:
             ends: Any = arrived, tangents_bar
             ends = jax.tree.map(lambda x: jnp.where(at.forming, 0.0, x), ends)
 

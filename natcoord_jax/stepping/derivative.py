@@ -26,14 +26,21 @@ from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import Tableau
 from natcoord_jax.stepping import linear_pair
 from natcoord_jax.stepping.backward import Backward
-from natcoord_jax.stepping.correcting import STALL_ROUND_OFF, sizes_by_mass
 from natcoord_jax.stepping.error_control import Tolerance
 from natcoord_jax.stepping.forward import Forward
-from natcoord_jax.stepping.in_turn import Fixed
+from natcoord_jax.stepping.linear_iteration import STALL_ROUND_OFF, sizes_by_mass
 from natcoord_jax.stepping.one_kernel import lane_by_lane, on_cpu
 from natcoord_jax.stepping.plan import Plan, Slots
-from natcoord_jax.stepping.record import Changes, Numbers, Record, Slot, instantiated, zero_tangent
+from natcoord_jax.stepping.record import (
+    Parameters,
+    ParameterTangents,
+    Record,
+    Slot,
+    instantiated,
+    zero_tangent,
+)
 from natcoord_jax.stepping.rollout import Ending, run
+from natcoord_jax.stepping.slot_sweep import Fixed
 from natcoord_jax.stepping.step import advance, linear_solver
 
 CHUNK = 32
@@ -72,7 +79,7 @@ def _traced_once(plan: Plan, *numbers: Any) -> tuple[Slots, Ending]:
 
 
 @dataclass(frozen=True)
-class Rule(linear_pair.Pair):
+class Rule(linear_pair.LinearWithTranspose):
     """The tangents of a rollout and their transpose; hashable, without traced values.
 
     How both change with the record follows from what they are at every slot: the tangents of a slot solve
@@ -95,14 +102,14 @@ class Rule(linear_pair.Pair):
         return self.plan.tableau
 
     def outcome(
-        self, numbers: Numbers, slot: Slot, varied: list[Array], state: State, u: Any, y: Array
+        self, numbers: Parameters, slot: Slot, varied: list[Array], state: State, u: Any, y: Array
     ) -> tuple[Array, State]:
         """Residual of the slot's equations and the state at its end."""
         system, parameters, dt = numbers.whole(varied)
         u = slot.inputs(self.plan, system, parameters, state) if u is None else u
         return advance(system, state, u, slot.fraction * dt, y, self.tableau)[:2]
 
-    def prepared(self, numbers: Numbers, varied_dot: list[Array], slot: Slot, u_dot: Any) -> tuple:
+    def prepared(self, numbers: Parameters, varied_dot: list[Array], slot: Slot, u_dot: Any) -> tuple:
         """Linear maps of one slot: from (state, unknowns), of everything else's change, and the solver."""
         at = partial(self.outcome, numbers, slot)
         _, along = jax.linearize(lambda state, y: at(numbers.varied, state, slot.u, y), slot.before, slot.y)
@@ -113,19 +120,19 @@ class Rule(linear_pair.Pair):
         h = slot.fraction * dt
         return along, linear_solver(system, slot.before, u, h, slot.y, self.tableau, along), forcing
 
-    def forward(self, residuals: Record, arguments: Changes) -> tuple[State, Array]:
+    def forward(self, residuals: Record, arguments: ParameterTangents) -> tuple[State, Array]:
         """Tangents of the states after all slots and of their unknowns."""
         if not on_cpu():
             return self.with_jacobians(residuals, arguments)
         return Forward(self.plan).tangents(residuals, arguments)
 
-    def forward_many(self, residuals: Record, arguments: Changes) -> tuple[State, Array]:
+    def forward_many(self, residuals: Record, arguments: ParameterTangents) -> tuple[State, Array]:
         """The same of several directions: by Jacobians if they are so many that it takes less time."""
         directions, unknowns = arguments.state.q.shape[0], residuals.slots.y.shape[-1]
         forward = self.with_jacobians if JACOBIANS_FROM * unknowns <= directions else self.forward
         return jax.vmap(partial(forward, residuals))(arguments)
 
-    def with_jacobians(self, residuals: Record, arguments: Changes) -> tuple[State, Array]:
+    def with_jacobians(self, residuals: Record, arguments: ParameterTangents) -> tuple[State, Array]:
         """The same by Jacobians of all slots, which serve any number of directions."""
         slots, masses = residuals.slots, Fixed.of(self.tableau, residuals).masses
         system, _, dt = residuals.numbers.whole(residuals.numbers.varied)
@@ -153,12 +160,16 @@ class Rule(linear_pair.Pair):
         maps = _in_chunks(each, (slots, arguments.u), slots.y.shape[0])
         return jax.lax.scan(body, arguments.state, (maps, slots.accepted, arguments.forced))[1]
 
-    def backward(self, residuals: Record, cotangents: tuple[State, Array]) -> Changes:
+    def backward(self, residuals: Record, cotangents: tuple[State, Array]) -> ParameterTangents:
         """The transpose, see `backward`."""
         return Backward(self.plan, self.forced).cotangents(residuals, cotangents)
 
     def forward_changed(
-        self, residuals: Record, changes: Record, arguments: Changes, arguments_dot: Changes
+        self,
+        residuals: Record,
+        changes: Record,
+        arguments: ParameterTangents,
+        arguments_dot: ParameterTangents,
     ) -> tuple[tuple[State, Array], tuple[State, Array]]:
         """The tangents, and their change with the record and with what they are linear in."""
         numbers, slots = residuals.numbers, residuals.slots
@@ -167,7 +178,7 @@ class Rule(linear_pair.Pair):
         before_dot = _before_each(arguments.state, found[0])
 
         def change(slot: Slot, slot_dot: Slot, u_dot: Any, state_dot: State, y_dot: Array) -> tuple:
-            def tangents(numbers: Numbers, slot: Slot) -> tuple[Array, State]:
+            def tangents(numbers: Parameters, slot: Slot) -> tuple[Array, State]:
                 at = numbers.varied, slot.before, slot.u, slot.y
                 by = arguments.varied, state_dot, u_dot, y_dot
                 return jax.jvp(partial(self.outcome, numbers, slot), at, by)[1]
@@ -184,16 +195,16 @@ class Rule(linear_pair.Pair):
 
     def backward_changed(
         self, residuals: Record, changes: Record, cotangents: tuple[State, Array], cotangents_dot: tuple
-    ) -> tuple[Changes, Changes]:
+    ) -> tuple[ParameterTangents, ParameterTangents]:
         """The cotangents, and their change with the record and with what they are linear in."""
         numbers, slots = residuals.numbers, residuals.slots
         first = jax.tree.map(lambda x: x[0], slots.before)
-        plain = Changes(numbers.varied, slots.u, first)
+        plain = ParameterTangents(numbers.varied, slots.u, first)
         whole = replace_fields(plain, forced=(slots.y, slots.before))
         found = linear_pair.transposed(Rule(self.plan, True), residuals, cotangents, whole)
 
         def change(slot: Slot, slot_dot: Slot, forced: tuple[Array, State]) -> tuple:
-            def pulled(numbers: Numbers, slot: Slot) -> tuple:
+            def pulled(numbers: Parameters, slot: Slot) -> tuple:
                 at = numbers.varied, slot.before, slot.u, slot.y
                 return jax.vjp(partial(self.outcome, numbers, slot), *at)[1](forced)
 
@@ -210,7 +221,7 @@ class Rule(linear_pair.Pair):
         sums = jax.tree.map(jnp.add, (changed.varied, changed.u, changed.state), more)
         if not self.forced:
             found = replace_fields(found, forced=None)
-        return found, Changes(sums[0], sums[1], sums[2], changed.forced)
+        return found, ParameterTangents(sums[0], sums[1], sums[2], changed.forced)
 
 
 def _before_each(first: State, after: State) -> State:
@@ -272,9 +283,9 @@ def _run_slots_jvp(plan: Plan, primals: tuple, tangents: tuple):
             within(x[slots.step], slots.done, slots.fraction)
             for x in (parameters, instantiated(parameters_dot, parameters))
         )
-        numbers, varied_dot = Numbers.of((system, None, dt), (system_dot, None, dt_dot))
+        numbers, varied_dot = Parameters.of((system, None, dt), (system_dot, None, dt_dot))
     else:
-        numbers, varied_dot = Numbers.of((system, parameters, dt), (system_dot, parameters_dot, dt_dot))
+        numbers, varied_dot = Parameters.of((system, parameters, dt), (system_dot, parameters_dot, dt_dot))
     before = _before_each(state, slots.states)
     # Attempts that failed may hold anything: their maps are formed at rest, and then not used.
     sound = jnp.where(slots.accepted[:, None], slots.y, 0.0)
@@ -283,7 +294,7 @@ def _run_slots_jvp(plan: Plan, primals: tuple, tangents: tuple):
         Slot(before, sound, u, slots.step, slots.fraction, slots.done, slots.accepted),
         ending.factors,
     )
-    changes, outputs = Changes(varied_dot, u_dot, state_dot), (slots.states, slots.y)
+    changes, outputs = ParameterTangents(varied_dot, u_dot, state_dot), (slots.states, slots.y)
     states_dot, y_dot = linear_pair.apply(Rule(plan), record, changes, outputs)
     last_dot = jax.tree.map(lambda x: x[-1], states_dot)
     slots_dot = jax.tree.map(zero_tangent, slots)

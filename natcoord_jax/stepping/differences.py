@@ -8,27 +8,32 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from natcoord_jax.assembly.equations import prepare
-from natcoord_jax.assembly.lag import Lag
-from natcoord_jax.assembly.outset import Outset
+from natcoord_jax.assembly.frozen_kick import FrozenKick
 from natcoord_jax.assembly.response import Evaluation
+from natcoord_jax.assembly.start_cache import StartCache
 from natcoord_jax.core.effect import replace_fields
-from natcoord_jax.stepping.course import Course, Setting
+from natcoord_jax.stepping.difference_jacobian import DifferenceJacobian, matrix_of
 from natcoord_jax.stepping.factors import Factors, new_factors
 from natcoord_jax.stepping.newton import Iterate, any_lane, refreshed
-from natcoord_jax.stepping.probe import Probe, matrix_of
+from natcoord_jax.stepping.rollout_state import RolloutProblem, RolloutState
 
 
-def first_probe(setting: Setting, course: Course, outset: Outset) -> Probe:
+def first_probe(setting: RolloutProblem, course: RolloutState, start_cache: StartCache) -> DifferenceJacobian:
     """What Jacobians by differences are formed with, before the first."""
     u, h, _ = setting.situation(course)
-    near = replace_fields(outset, lag=setting.lag(course))
+    near = replace_fields(start_cache, lag=setting.lag(course))
     equations = prepare(setting.system, course.state, u, h, setting.plan.tableau, near)
-    return Probe.first(equations, course.it.y)
+    return DifferenceJacobian.first(equations, course.it.y)
 
 
 def evaluated(
-    setting: Setting, equations: Any, probe: Probe, found: Evaluation, it: Iterate, factors: Factors
-) -> tuple[Probe, Evaluation, Iterate, Factors]:
+    setting: RolloutProblem,
+    equations: Any,
+    probe: DifferenceJacobian,
+    found: Evaluation,
+    it: Iterate,
+    factors: Factors,
+) -> tuple[DifferenceJacobian, Evaluation, Iterate, Factors]:
     """The equations at the unknowns at hand, and everywhere a Jacobian asks for if one is to be formed.
 
     Args:
@@ -49,8 +54,8 @@ def evaluated(
 
 
 def told(
-    lag: Lag | None, making: Array, at_end: Array | bool = True, moving: Array | bool = True
-) -> Lag | None:
+    lag: FrozenKick | None, making: Array, at_end: Array | bool = True, moving: Array | bool = True
+) -> FrozenKick | None:
     """What an evaluation is told of the kick where it may be one of those that a Jacobian asks for.
 
     In these kicks are held, or found anew where they are in every evaluation; multipliers do not change them.
@@ -64,17 +69,19 @@ def told(
     if lag is None:
         return None
     due = jnp.where(making, (at_end | moving) & any_lane(lag.everywhere), lag.due)
-    return Lag(lag.held, due, lag.everywhere, making & ~lag.everywhere)
+    return FrozenKick(lag.held, due, lag.everywhere, making & ~lag.everywhere)
 
 
 def _at(equations: Any, making: Array, y: Array, at_end: Array, moving: Array) -> Evaluation:
     """The equations at unknowns of the probe."""
-    lag = told(equations.outset.lag, making, at_end, moving)
-    near = replace_fields(equations, outset=replace_fields(equations.outset, lag=lag))
+    lag = told(equations.start_cache.lag, making, at_end, moving)
+    near = replace_fields(equations, start_cache=replace_fields(equations.start_cache, lag=lag))
     return near.evaluate(y).without_system()
 
 
-def _renewed(equations: Any, probe: Probe, it: Iterate, factors: Factors) -> tuple[Iterate, Factors]:
+def _renewed(
+    equations: Any, probe: DifferenceJacobian, it: Iterate, factors: Factors
+) -> tuple[Iterate, Factors]:
     """New factors where a Jacobian has been formed by differences, and the iteration with them."""
 
     def whole(columns: Array) -> tuple:

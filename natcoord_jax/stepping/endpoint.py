@@ -16,13 +16,13 @@ from natcoord_jax.core.callables import Function
 from natcoord_jax.core.checks import at_top_level
 from natcoord_jax.core.closures import with_callables
 from natcoord_jax.core.state import State
-from natcoord_jax.stepping.course import Setting
 from natcoord_jax.stepping.newton import TOLERANCE
 from natcoord_jax.stepping.one_kernel import apart, as_one_kernel, in_one_array, plainly
 from natcoord_jax.stepping.plan import Plan
 from natcoord_jax.stepping.rollout import run_to_the_end
-from natcoord_jax.stepping.rounds import in_parts
+from natcoord_jax.stepping.rollout_state import RolloutProblem
 from natcoord_jax.stepping.scheme import Scheme
+from natcoord_jax.stepping.two_kernel_loop import in_parts
 from natcoord_jax.xla.effort import FULL, accepted
 
 MOST = 1 << 30
@@ -82,7 +82,7 @@ def _program(structure: Any, kinds: tuple, scheme: Scheme, tolerance: float) -> 
 
     def end(kernel: Callable, numbers: Array, dt: Array, steps: Array) -> Endpoint:
         system, state, inputs = jax.tree.unflatten(structure, apart(numbers, kinds))
-        course = run_to_the_end(Setting(system, (dt, inputs), dt, None, plan, steps), state, kernel)
+        course = run_to_the_end(RolloutProblem(system, (dt, inputs), dt, None, plan, steps), state, kernel)
         return Endpoint(course.state, course.code, course.step, course.iterations, course.taken)
 
     def run(*numbers: Array) -> Endpoint:

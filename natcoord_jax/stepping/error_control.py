@@ -150,7 +150,7 @@ class Trial(eqx.Module):
         return eqx.tree_at(lambda t: t.left, self, jnp.where(anew, left, self.left))
 
 
-class Verdict(eqx.Module):
+class StepDecision(eqx.Module):
     """What follows from an attempt.
 
     Attributes:
@@ -182,7 +182,7 @@ def follow(
     solved: Bool[Array, ""],
     over: Bool[Array, ""],
     tableau: Tableau,
-) -> Verdict:
+) -> StepDecision:
     """What follows from an attempt.
 
     Args:
@@ -219,7 +219,7 @@ def follow(
         jnp.where(anew, failed, trial.repeated),
         trial.left,
     ).beginning(done, anew)
-    return Verdict(
+    return StepDecision(
         trial=following,
         state=state,
         done=jnp.where(phase == SECOND, done + 0.5 * following.length, done),

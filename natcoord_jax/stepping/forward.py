@@ -12,19 +12,19 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from natcoord_jax.assembly.block_tangent_space import Tangents
 from natcoord_jax.assembly.equations import kind_of
-from natcoord_jax.assembly.separate import Tangents
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
-from natcoord_jax.stepping.correcting import Correcting
-from natcoord_jax.stepping.in_turn import Fixed, Going, InTurn
+from natcoord_jax.stepping.linear_iteration import LinearIteration
 from natcoord_jax.stepping.newton import any_lane
-from natcoord_jax.stepping.past import Past
 from natcoord_jax.stepping.plan import Plan
-from natcoord_jax.stepping.record import Changes, Numbers, Record, Slot
+from natcoord_jax.stepping.predictor import Predictor
+from natcoord_jax.stepping.record import Parameters, ParameterTangents, Record, Slot
+from natcoord_jax.stepping.slot_sweep import Fixed, SlotSweep, SweepCarry
 
 
-class Forward(InTurn):
+class Forward(SlotSweep):
     """The way forth.
 
     It carries the tangents of the state before a slot, of the tangent space there for schemes with kicks, and
@@ -39,7 +39,7 @@ class Forward(InTurn):
     def __init__(self, plan: Plan):
         super().__init__(plan, 1)
 
-    def tangents(self, record: Record, given: Changes) -> tuple[State, Array]:
+    def tangents(self, record: Record, given: ParameterTangents) -> tuple[State, Array]:
         """Tangents of the states after all slots and of their unknowns.
 
         Args:
@@ -50,18 +50,20 @@ class Forward(InTurn):
         given = replace_fields(given, u=_reversed(given.u), forced=_reversed(given.forced))
         return _reversed(self.every(record, given))
 
-    def following(self, kernel: Callable, record: Record, given: Changes) -> tuple[State, Array]:
+    def following(self, kernel: Callable, record: Record, given: ParameterTangents) -> tuple[State, Array]:
         """Tangents of everything."""
         numbers, slots = record.numbers, record.slots
         y, before_all = slots.y[-1], jax.tree.map(lambda x: x[-1], slots.before)
         fixed, tangents_dot = Fixed.of(self.tableau, record, given.varied), None
         if self.tableau.kick:
             tangents_dot = kernel(self._first, (numbers, given.varied), before_all, given.state)
-        own = given.state, tangents_dot, Past.of(jnp.zeros_like(y))
+        own = given.state, tangents_dot, Predictor.of(jnp.zeros_like(y))
         start, like = (y, record.factors, own), (slots.before, slots.y)
         return self.in_rounds(kernel, fixed, slots, (given.u, given.forced), start, like)[1]
 
-    def _first(self, fixed: tuple[Numbers, list[Array]], state: State, state_dot: State) -> Tangents | None:
+    def _first(
+        self, fixed: tuple[Parameters, list[Array]], state: State, state_dot: State
+    ) -> Tangents | None:
         """Change of the tangent space in the first state."""
         numbers, varied_dot = fixed
         at = partial(self.admitted, numbers)
@@ -78,7 +80,7 @@ class Forward(InTurn):
         end_dot, tangents_dot, past = jax.tree.map(keep, (end_dot, tangents_dot, past), own)
         return (end_dot, tangents_dot, past), (end_dot, keep(y_dot, jnp.zeros_like(y_dot)))
 
-    def solving(self, fixed: Fixed, slot: Slot, arrived: tuple, given: tuple, c: Going) -> Callable:
+    def solving(self, fixed: Fixed, slot: Slot, arrived: tuple, given: tuple, c: SweepCarry) -> Callable:
         """How the tangents of one slot are found.
 
         Those of its unknowns solve J y_dot = -r. Their guess is extrapolated from those of the slots before,
@@ -99,7 +101,7 @@ class Forward(InTurn):
         foreseen = jnp.where(jnp.all(jnp.isfinite(foreseen)), foreseen, 0.0)
         fresh = (c.at.count == 0) & (c.at.rounds == 0) & c.factors.usable
 
-        def solve(y_dot: Array, learnt: Any, at: Correcting) -> tuple:
+        def solve(y_dot: Array, learnt: Any, at: LinearIteration) -> tuple:
             forming = at.forming
 
             def trip(carry: tuple) -> tuple:

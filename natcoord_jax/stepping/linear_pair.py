@@ -39,7 +39,7 @@ def along(function: Callable, at: tuple, changes: tuple) -> tuple[Any, Any]:
     return jax.jvp(of_varied, tuple(leaves[k] for k in varied), tuple(every[k] for k in varied))
 
 
-class Pair(ABC):
+class LinearWithTranspose(ABC):
     """A linear function of arguments after residuals, and its transpose; without traced values.
 
     The programs of `forward` and `backward` need not be differentiable. Those of their changes are where the
@@ -93,7 +93,7 @@ class Side:
     shapes: tuple[jax.ShapeDtypeStruct, ...]
 
 
-def apply(pair: Pair, residuals: Any, arguments: Any, outputs: Any) -> Any:
+def apply(pair: LinearWithTranspose, residuals: Any, arguments: Any, outputs: Any) -> Any:
     """Value of a linear function, differentiable in every mode.
 
     Args:
@@ -105,12 +105,12 @@ def apply(pair: Pair, residuals: Any, arguments: Any, outputs: Any) -> Any:
     return _bound(pair, residuals, arguments, outputs, 0)
 
 
-def transposed(pair: Pair, residuals: Any, cotangents: Any, arguments: Any) -> Any:
+def transposed(pair: LinearWithTranspose, residuals: Any, cotangents: Any, arguments: Any) -> Any:
     """Value of its transpose, where `arguments` is like what the function is of."""
     return _bound(pair, residuals, cotangents, arguments, 1)
 
 
-def _bound(pair: Pair, residuals: Any, given: Any, outputs: Any, number: int) -> Any:
+def _bound(pair: LinearWithTranspose, residuals: Any, given: Any, outputs: Any, number: int) -> Any:
     """The function, number 0, or its transpose, number 1."""
     res, res_tree = jax.tree.flatten(residuals)
     own, own_tree = jax.tree.flatten(given)

@@ -31,7 +31,7 @@ def instantiated(tangents: Any, primals: Any) -> Any:
     return jax.tree.map(lambda t, p: zero_tangent(p) if is_zero(t) else t, tangents, primals, is_leaf=is_zero)
 
 
-class Numbers(eqx.Module):
+class Parameters(eqx.Module):
     """What a rollout depends on besides its first state, apart into what varies and what does not.
 
     Attributes:
@@ -47,7 +47,7 @@ class Numbers(eqx.Module):
     structure: Any = eqx.field(static=True)
 
     @classmethod
-    def of(cls, numbers: tuple, tangents: tuple) -> tuple["Numbers", list[Array]]:
+    def of(cls, numbers: tuple, tangents: tuple) -> tuple["Parameters", list[Array]]:
         """Split by the tangents, and the tangents of what varies."""
         leaves, structure = jax.tree.flatten(numbers)
         changes = jax.tree.leaves(tangents, is_leaf=is_zero)
@@ -85,16 +85,16 @@ class Slot(eqx.Module):
 class Record(eqx.Module):
     """All that the derivative is taken at."""
 
-    numbers: Numbers
+    numbers: Parameters
     slots: Slot
     factors: Factors
 
 
-class Changes(eqx.Module):
+class ParameterTangents(eqx.Module):
     """Tangents that those of all slots are linear in, or their cotangents.
 
     Attributes:
-        varied: of `Numbers.varied`.
+        varied: of `Parameters.varied`.
         u: of the slots' inputs.
         state: of the first state.
         forced: of the slots' residuals and their ends, in addition; None: there are none.

@@ -19,19 +19,19 @@ from natcoord_jax.assembly.system import System
 from natcoord_jax.core.results import Result
 from natcoord_jax.core.state import State
 from natcoord_jax.stepping.attempt import with_state
-from natcoord_jax.stepping.course import Course, Setting
 from natcoord_jax.stepping.error_control import Tolerance
 from natcoord_jax.stepping.factors import Factors
 from natcoord_jax.stepping.newton import any_lane
 from natcoord_jax.stepping.one_kernel import as_one_kernel
 from natcoord_jax.stepping.plan import Plan, Slots
-from natcoord_jax.stepping.rounds import all_slots
+from natcoord_jax.stepping.rollout_state import RolloutProblem, RolloutState
+from natcoord_jax.stepping.two_kernel_loop import all_slots
 
 
 class Ending(eqx.Module):
     """Where a rollout ended, and the factors it ended with."""
 
-    course: Course
+    course: RolloutState
     factors: Factors
 
 
@@ -49,7 +49,7 @@ def run(
 
     The plan has room for its steps, of which the first are made: as many as `steps` says, or all.
     """
-    setting = Setting(
+    setting = RolloutProblem(
         system, parameters, dt, tolerance, plan, plan.steps if steps is None else steps, event=event
     )
     found, unpack = all_slots(setting, state)
@@ -77,7 +77,7 @@ def run(
     return slots, Ending(_judged(course, setting.steps), factors)
 
 
-def run_to_the_end(setting: Setting, state: State, kernel: Callable = as_one_kernel) -> Course:
+def run_to_the_end(setting: RolloutProblem, state: State, kernel: Callable = as_one_kernel) -> RolloutState:
     """Where a rollout of any number of steps ends: one program for all numbers, and nothing recorded.
 
     Without derivatives. At most as many steps are made as the plan has.
@@ -91,7 +91,7 @@ def run_to_the_end(setting: Setting, state: State, kernel: Callable = as_one_ker
     return _judged(with_state(found.course, unpack(found.state)), setting.steps)
 
 
-def _judged(course: Course, steps: Any) -> Course:
+def _judged(course: RolloutState, steps: Any) -> RolloutState:
     """With the code of a run that used up its substeps, and no culprit in one that went well."""
     short = (course.step < steps) & ~course.stopped
     code = jnp.where(short, int(Result.MAX_SUBSTEPS), course.code)

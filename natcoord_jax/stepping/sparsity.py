@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from natcoord_jax.assembly.full import elements
-from natcoord_jax.assembly.outset import Outset
 from natcoord_jax.assembly.reduced import NOTHING
 from natcoord_jax.assembly.sparse import SparseStep, nodes_of
+from natcoord_jax.assembly.start_cache import StartCache
 from natcoord_jax.assembly.system import System
 from natcoord_jax.core.checks import is_concrete
 from natcoord_jax.core.compiled import briefly
@@ -40,7 +40,7 @@ def _resting(system: System, state: State, pattern: BlockPattern) -> BlockMatrix
     """The matrix for a vanishing step: inertias and constraints."""
     zero = jnp.zeros((), state.q.dtype)
     inputs = jnp.zeros(len(system.structure.inputs), state.q.dtype)
-    outset: Outset = NOTHING
-    equations = SparseStep.prepare(system, state, inputs, zero, gauss(1), outset)
+    start_cache: StartCache = NOTHING
+    equations = SparseStep.prepare(system, state, inputs, zero, gauss(1), start_cache)
     matrix = pattern.assemble(*equations.jacobian(equations.guess()))
     return regularised(matrix, inertias_of(matrix, equations.balances))

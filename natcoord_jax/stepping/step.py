@@ -7,14 +7,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from natcoord_jax.assembly.block_tangent_space import Tangents
 from natcoord_jax.assembly.coordinates import stage_rates
 from natcoord_jax.assembly.end_impulses import released
 from natcoord_jax.assembly.equations import prepare, starting
 from natcoord_jax.assembly.form import dense_solver
 from natcoord_jax.assembly.kick import Kick, ends_of
-from natcoord_jax.assembly.outset import Outset
 from natcoord_jax.assembly.response import Evaluation
-from natcoord_jax.assembly.separate import Tangents
+from natcoord_jax.assembly.start_cache import StartCache
 from natcoord_jax.assembly.system import Group, System
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import Tableau
@@ -45,16 +45,16 @@ def advance_between(
     The tangent space at the start is given, so that a chain of steps is a function of every one of them once;
     without a system in it, as it is carried along. None for schemes without kicks.
     """
-    outset = starting(system, state, tableau, tangents, later=tangents is None)
-    residual, after, _, kick = _advanced(system, state, outset, u, h, y, tableau)
+    start_cache = starting(system, state, tableau, tangents, later=tangents is None)
+    residual, after, _, kick = _advanced(system, state, start_cache, u, h, y, tableau)
     return residual, after, None if kick is None else kick.after.without_system()
 
 
 def _advanced(
-    system: System, state: State, outset: Outset, u: Array, h: Array, y: Array, tableau: Tableau
+    system: System, state: State, start_cache: StartCache, u: Array, h: Array, y: Array, tableau: Tableau
 ) -> tuple[Array, State, Array, Kick | None]:
     """Residual, state at the end, largest half turn, and the kick."""
-    equations = prepare(system, state, u, h, tableau, outset)
+    equations = prepare(system, state, u, h, tableau, start_cache)
     found = equations.evaluate(y)
     after, half_turn = end_of_step(system, state, h, equations.groups, found, tableau)
     return found.residual, after, half_turn, found.kick

@@ -7,7 +7,7 @@ import numpy as np
 from natcoord_jax.assembly.system import System
 from natcoord_jax.control import bounds
 from natcoord_jax.control.solution import Solution
-from natcoord_jax.core.host import on_host
+from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.viz.curves import ROUND_OFF, components, coordinates
 from natcoord_jax.viz.panels import Curve, Panel
 
@@ -28,7 +28,7 @@ def limits_of(solution: Solution) -> dict[str, set[float]]:
     return found
 
 
-@on_host
+@eager_numpy
 def _missing(goal, system, state):
     return goal.residual(system, state)
 

@@ -144,7 +144,7 @@ def test_newton_starved(order, monkeypatch):
 
     The pendulum at rest has nothing to do with it: the other one's hinge is named.
     """
-    from natcoord_jax.stepping import course, newton
+    from natcoord_jax.stepping import newton
 
     released = 1 if order == 2 else 0
     system, state = apart(released)

@@ -8,7 +8,7 @@ from jaxtyping import Array
 
 from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.coordinate import CoordinateEffect
-from natcoord_jax.core.effect import Now
+from natcoord_jax.core.effect import StepContext
 from natcoord_jax.core.force import Force, Load
 from natcoord_jax.core.kinds import JOINT, Several
 from natcoord_jax.core.markers import Markers
@@ -62,7 +62,7 @@ class AffineActuator(CoordinateEffect):
     inputs: ClassVar[int] = 1
     works: ClassVar[bool] = True
 
-    def generalised(self, rates: Array, now: Now, lam: Array) -> tuple[Array, Array, Array]:
+    def generalised(self, rates: Array, now: StepContext, lam: Array) -> tuple[Array, Array, Array]:
         """The force at every stage, along the gear; its power is force times velocity, exactly."""
         gear = jnp.asarray(self.gear, float)
         gain, bias = jnp.unstack(jnp.asarray(self.gain)), jnp.unstack(jnp.asarray(self.bias))

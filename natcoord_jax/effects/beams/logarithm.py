@@ -18,8 +18,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.maths.components import Triple, rows_of
+from natcoord_jax.maths.materialise import materialised
 from natcoord_jax.maths.rotations import arctan_coefficients
-from natcoord_jax.maths.settled import settled
 from natcoord_jax.maths.vectors import quotient
 
 
@@ -50,16 +50,17 @@ class Logarithm(eqx.Module):
         axial, trace, place = Triple.of(invariants[:3]), invariants[3], Triple.of(invariants[4:])
         factor = quotient(2.0 * jnp.ones_like(trace), 1.0 + trace)
         k = axial * factor
-        k, place, factor = settled((k, place, factor))
-        x = settled(0.25 * k.dot(k))
+        k, place, factor = materialised((k, place, factor))
+        x = materialised(0.25 * k.dot(k))
         (f0, f1, f2), (_, _, slope) = jax.jvp(arctan_coefficients, (x,), (jnp.ones_like(x),))
-        f0, f1, f2, slope = settled((f0, f1, f2, slope))
+        f0, f1, f2, slope = materialised((f0, f1, f2, slope))
         near = 1.0 / (1.0 + x)
         first, middle = 0.5 * (f1 - near), 0.5 * (3.0 * f2 - near)
         coefficients = f0, 0.25 * f1, first, 0.25 * middle
         second = 0.5 * (middle + near * near), 0.125 * (3.0 * slope + near * near)
-        turn, shift = settled(_logarithm(k, place, f0, 0.25 * f1))
-        return cls(k, place, factor, *settled((coefficients, second)), turn, shift)
+        turn, shift = materialised(_logarithm(k, place, f0, 0.25 * f1))
+        coefficients, second = materialised((coefficients, second))
+        return cls(k, place, factor, coefficients, second, turn, shift)
 
     def gradient(self, resultants: Float[Array, "6 *n"]) -> Float[Array, "7 *n"]:
         """Gradient by the invariants of the work of forces and moments."""
@@ -104,10 +105,10 @@ class Logarithm(eqx.Module):
             return rows_of(shift, turn * 0.0)
 
         units = jnp.eye(3, dtype=like.dtype)
-        turned, work = settled(jax.vmap(by_k)(units))
-        columns = settled(jnp.concatenate([turned, jax.vmap(by_place)(units)]))
-        pulled = settled(jnp.sum(moduli[None] * columns[:, None], axis=2))
-        both = settled(jnp.sum(columns[:, None] * pulled[None], axis=2))
+        turned, work = materialised(jax.vmap(by_k)(units))
+        columns = materialised(jnp.concatenate([turned, jax.vmap(by_place)(units)]))
+        pulled = materialised(jnp.sum(moduli[None] * columns[:, None], axis=2))
+        both = materialised(jnp.sum(columns[:, None] * pulled[None], axis=2))
         mixed = jnp.swapaxes(work[:, 3:], 0, 1)
         lower = jnp.concatenate([mixed, jnp.zeros_like(mixed)], axis=1)
         gradient = _work_gradient(self.k, *self.coefficients, self.place, force, moment)[0]
@@ -121,7 +122,7 @@ class Logarithm(eqx.Module):
             along = jnp.sum(k * x[:, :3], axis=1, keepdims=True)
             return jnp.concatenate([g * x[:, :3], -0.5 * g * along, x[:, 3:]], axis=1)
 
-        square = spread(settled(jnp.swapaxes(spread(settled(both)), 0, 1)))
+        square = spread(materialised(jnp.swapaxes(spread(materialised(both)), 0, 1)))
         # The second derivatives of k by axial part and trace, times the gradient.
         zero = jnp.zeros_like(g)
         half = -0.25 * g * g * gradient.dot(self.k)

@@ -13,11 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from natcoord_jax.core.effect import Motion, Now
+from natcoord_jax.core.effect import Motion, StepContext
 from natcoord_jax.core.potential import Potential
 from natcoord_jax.core.together import instances_last, place_together, steps_together
 from natcoord_jax.maths.components import Triple, combination, rows_of, turned_midway
-from natcoord_jax.maths.settled import settled
+from natcoord_jax.maths.materialise import materialised
 
 PLACES = np.array([0, 1, 2, 3, 4, 5, 0, 1, 2, 6, 7, 8])
 """Rows and columns of both bodies' wrenches and twists: of nine numbers, the first three serve both."""
@@ -55,7 +55,7 @@ class Pair:
 
     def _turned(self, side: int, spin: Triple) -> tuple[Triple, list[Triple]]:
         half = spin * (0.5 * self.h)
-        return settled(
+        return materialised(
             (turned_midway(half, self.arms[side]), [turned_midway(half, d) for d in self.axes[side]])
         )
 
@@ -72,7 +72,7 @@ class Pair:
         reach = self.apart + drift * (0.5 * self.h) + arm_b
         relative = spins[0] - spins[1]
         moving = drift + spins[1].cross(arm_b) - spins[0].cross(reach)
-        turning = settled(
+        turning = materialised(
             [
                 a3.cross(b2) - a2.cross(b3),
                 a1.cross(b3) - a3.cross(b1),
@@ -80,17 +80,17 @@ class Pair:
                 a1.cross(b1) + a2.cross(b2) + a3.cross(b3),
             ]
         )
-        reach, moving = settled((reach, moving))
+        reach, moving = materialised((reach, moving))
         rates = [g.dot(relative) for g in turning] + [a.dot(moving) for a in (a1, a2, a3)]
-        given = settled(gradient(settled(rows_of(*rates) * self.h)))
+        given = materialised(gradient(materialised(rows_of(*rates) * self.h)))
         torque = combination(list(given[:4]), turning)
         force = combination(list(given[4:]), [a1, a2, a3])
-        torque, force = settled((torque, force))
+        torque, force = materialised((torque, force))
         return rows_of(force, reach.cross(force) - torque, torque - arm_b.cross(force))
 
 
 def tangents_of_pairs(
-    potential: Expanded, place: Array, motion: Motion, now: Now
+    potential: Expanded, place: Array, motion: Motion, now: StepContext
 ) -> Float[Array, "n 2 1 6 2 1 6"]:
     """Derivatives of the wrenches of a potential between two attachments by the twists, for one stage.
 
@@ -101,8 +101,8 @@ def tangents_of_pairs(
     x, rows = place_together(place, start), instances_last((motion.rows, motion.rates), 1)
     begun = potential.invariants(x)
     steps = steps_together(potential, *(place_together(place, r) for r in (rows[0], now.h * rows[1])))
-    steps = settled(steps[0])
-    middle, curvature = settled(potential.expansion(begun + 0.5 * steps))
+    steps = materialised(steps[0])
+    middle, curvature = materialised(potential.expansion(begun + 0.5 * steps))
     pair = Pair(x, start, now.h)
     drift = Triple.of(rows[1][0, 1, 0] - rows[1][0, 0, 0])
     spin = jnp.moveaxis(motion.spin[0], 0, -1)

@@ -16,19 +16,19 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.checks import as_array
-from natcoord_jax.core.effect import Motion, Now
+from natcoord_jax.core.chunks import chunked
+from natcoord_jax.core.effect import Motion, StepContext
 from natcoord_jax.core.force import Force, Load
 from natcoord_jax.core.kinds import FunctionOf
 from natcoord_jax.core.markers import Markers
 from natcoord_jax.core.numeric import Number, Numbers, Vector
-from natcoord_jax.core.pieces import in_pieces
 from natcoord_jax.core.potential import place_markers
 from natcoord_jax.effects.beams.logarithm import Logarithm
 from natcoord_jax.effects.beams.pairs import Expanded, tangents_of_pairs
 from natcoord_jax.effects.beams.readings import BeamReadings
 from natcoord_jax.maths.components import Triple, combination, rows_of
+from natcoord_jax.maths.materialise import materialised
 from natcoord_jax.maths.rotations import logarithm_of_motion
-from natcoord_jax.maths.settled import settled
 
 LAW = FunctionOf("of the strains (6,) to the energy per length [J/m]")
 
@@ -148,7 +148,7 @@ class BeamElement(Expanded):
     def slope(self, invariants: Float[Array, "7 *n"]) -> Float[Array, "7 *n"]:
         """Gradient of the energy by the invariants."""
         motion = Logarithm.of(invariants)
-        return settled(motion.gradient(self._resultants_at(motion)))
+        return materialised(motion.gradient(self._resultants_at(motion)))
 
     def energy_curvature(self, invariants: Float[Array, "7 *n"]) -> Float[Array, "7 7 *n"]:
         """Second derivatives of the energy by the invariants."""
@@ -165,13 +165,15 @@ class BeamElement(Expanded):
         return rows_of(motion.shift, motion.turn) / self.length - self.reference
 
     def _resultants_at(self, motion: Logarithm) -> Float[Array, "6 *n"]:
-        return settled(self.resultants(settled(self._strains_at(motion))))
+        return materialised(self.resultants(materialised(self._strains_at(motion))))
 
-    def tangents(self, place: Array, motion: Motion, now: Now, lam: Array, *, turning: bool) -> Array | None:
+    def tangents(
+        self, place: Array, motion: Motion, now: StepContext, lam: Array, *, turning: bool
+    ) -> Array | None:
         """Derivatives of the wrenches by the twists for one stage; more are left to the general way."""
         if now.tableau.stages > 1:
             return None
-        return in_pieces(tangents_of_pairs, self, place, motion, now)
+        return chunked(tangents_of_pairs, self, place, motion, now)
 
 
 class NonlinearBeamElement(BeamElement):

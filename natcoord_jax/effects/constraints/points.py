@@ -10,16 +10,16 @@ from jaxtyping import Array
 from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.checks import as_array, positive
 from natcoord_jax.core.constraint import Constraint
+from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.handles import Handle
-from natcoord_jax.core.host import on_host
 from natcoord_jax.core.joint import Joint
 from natcoord_jax.core.markers import Attachment, Direction, Marker, Markers
 from natcoord_jax.core.numeric import Number
 from natcoord_jax.maths.rotations import frame_from_axis
 from natcoord_jax.maths.vectors import dot
 
-_triad = on_host(frame_from_axis)
+_triad = eager_numpy(frame_from_axis)
 
 
 def perpendicular(along: Marker) -> tuple[Marker, Marker]:

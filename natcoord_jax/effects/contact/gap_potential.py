@@ -15,8 +15,8 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.checks import as_array
-from natcoord_jax.core.effect import Effect, Motion, Now, Response, replace_fields
-from natcoord_jax.core.host import on_host
+from natcoord_jax.core.eager_numpy import eager_numpy
+from natcoord_jax.core.effect import Effect, Motion, Response, StepContext, replace_fields
 from natcoord_jax.core.kinds import NAME, Choice, of
 from natcoord_jax.core.markers import Markers
 from natcoord_jax.core.numeric import Number
@@ -40,7 +40,7 @@ def damping_of(restitution: Any, speed: Any) -> Array:
     return _damping(as_array(restitution, float), as_array(speed, float))
 
 
-@on_host
+@eager_numpy
 def _damping(restitution: Array, speed: Array) -> Array:
     def missing(u: Array) -> Array:
         # With d = u / e, u in (0, 1): the left side grows beyond all bounds as u does to 1.
@@ -111,7 +111,7 @@ class GapPotential(Potential):
             return 0.4 * self.stiffness * overlap**2 * _root(overlap)
         return 0.5 * self.stiffness * overlap**2
 
-    def linearised(self, place: Array, motion: Motion, now: Now, lam: Array) -> "GapPotential":
+    def linearised(self, place: Array, motion: Motion, now: StepContext, lam: Array) -> "GapPotential":
         """Itself: what is soft in the middle of a step may be stiff at its end."""
         return self
 
@@ -156,7 +156,7 @@ class ContactLoss(Effect):
         """Markers of the contact."""
         return self.markers
 
-    def respond(self, place: Array, motion: Motion, now: Now, lam: Array) -> Response:
+    def respond(self, place: Array, motion: Motion, now: StepContext, lam: Array) -> Response:
         """Force of the contact times the speed at which its gap closes; together they never pull."""
         x, rates = place_markers(place, motion.rows), place_markers(place, motion.rates)
         flow = jax.vmap(lambda xi, vi: jax.jvp(self.contact.invariants, (xi,), (vi,))[1])(x, rates)

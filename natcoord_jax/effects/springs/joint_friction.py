@@ -8,7 +8,7 @@ from jaxtyping import Array
 
 from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.coordinate import CoordinateForce
-from natcoord_jax.core.effect import Motion, Now, Response
+from natcoord_jax.core.effect import Motion, Response, StepContext
 from natcoord_jax.core.force import Force, Load
 from natcoord_jax.core.markers import Markers
 from natcoord_jax.core.numeric import Number
@@ -69,7 +69,7 @@ class SphericalDamper(Force):
         """Nothing that follows from the markers alone."""
         return Load(None, jnp.zeros_like(x))
 
-    def respond(self, place: Array, motion: Motion, now: Now, lam: Array) -> Response:
+    def respond(self, place: Array, motion: Motion, now: StepContext, lam: Array) -> Response:
         """Equal and opposite torques, from the angular velocities of the bodies."""
         rates = place_markers(place, motion.rates)
         torque = self.damping * (motion.spin[:, 1] - motion.spin[:, 0])

@@ -46,7 +46,7 @@ def layouts(equations: Any) -> tuple[Layout, Layout]:
     return Layout(together, places[0]), Layout(apart, measure)
 
 
-class Probe(eqx.Module):
+class DifferenceJacobian(eqx.Module):
     """What Jacobians by differences are formed with; the same in all lanes but for its numbers.
 
     Columns are found right before the residual itself, by the same code: a second copy of it would compile
@@ -65,13 +65,13 @@ class Probe(eqx.Module):
     moved: Float[Array, "rows unknowns"]
 
     @classmethod
-    def first(cls, equations: Any, y: Float[Array, " unknowns"]) -> "Probe":
+    def first(cls, equations: Any, y: Float[Array, " unknowns"]) -> "DifferenceJacobian":
         """Before the first Jacobian of the equations of a step, with so many unknowns."""
         size, no = layouts(equations)[1].measure.size, jnp.array(False)
         moved = jnp.zeros((size + 1, *y.shape), y.dtype)
         return cls(no, jnp.array(equations.tableau.stages > 1), jnp.array(0), moved)
 
-    def asked(self, wanting: Bool[Array, ""], rounds: Int[Array, ""], stages: int) -> "Probe":
+    def asked(self, wanting: Bool[Array, ""], rounds: Int[Array, ""], stages: int) -> "DifferenceJacobian":
         """After an evaluation.
 
         Args:
@@ -84,7 +84,7 @@ class Probe(eqx.Module):
             again = wanting & (rounds > 0)
             failures = failures + (again & alike)
             alike = jnp.where(wanting, ~again & (failures < FAILURES), alike)
-        return Probe(wanting, alike, failures, self.moved)
+        return DifferenceJacobian(wanting, alike, failures, self.moved)
 
     def evaluated(
         self,
@@ -92,7 +92,7 @@ class Probe(eqx.Module):
         y: Float[Array, " unknowns"],
         evaluate: Callable[[Array, Array, Array], Any],
         found: Any,
-    ) -> tuple["Probe", Any]:
+    ) -> tuple["DifferenceJacobian", Any]:
         """With the equations evaluated: everywhere a Jacobian asks for, if it is to be formed, and at y.
 
         Args:
@@ -121,7 +121,7 @@ class Probe(eqx.Module):
 
         start = jnp.where(self.making, 0, last), self.moved, found
         _, moved, found = jax.lax.while_loop(going, point, start)
-        return Probe(self.making, self.alike, self.failures, moved), found
+        return DifferenceJacobian(self.making, self.alike, self.failures, moved), found
 
     def columns(self, equations: Any, y: Float[Array, " unknowns"]) -> Float[Array, "columns unknowns"]:
         """Columns of the Jacobian, one a row, in the order of the layout."""

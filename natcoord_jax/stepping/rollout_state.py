@@ -8,18 +8,18 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from natcoord_jax.assembly.equations import prepare
-from natcoord_jax.assembly.lag import FEWEST, Lag, Lagging, from_body_axes, in_body_axes
-from natcoord_jax.assembly.outset import Outset
+from natcoord_jax.assembly.frozen_kick import FEWEST, FrozenKick, Lagging, from_body_axes, in_body_axes
+from natcoord_jax.assembly.start_cache import StartCache
 from natcoord_jax.assembly.system import System
 from natcoord_jax.assembly.tangent_space import Velocity
 from natcoord_jax.core.results import Result
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.rows import part
-from natcoord_jax.stepping.error_control import Tolerance, Trial, Verdict, follow
+from natcoord_jax.stepping.error_control import StepDecision, Tolerance, Trial, follow
 from natcoord_jax.stepping.factors import Factors, no_factors
 from natcoord_jax.stepping.newton import Iterate, any_lane, begin
-from natcoord_jax.stepping.past import Past
 from natcoord_jax.stepping.plan import Plan
+from natcoord_jax.stepping.predictor import Predictor
 
 SMALLEST_FRACTION = 1.0 / 2**16
 """A step is given up when a substep of this fraction of it fails, if slots have not run out before."""
@@ -28,7 +28,7 @@ LARGEST_HALF_TURN = 10.0
 """Tangent of half the largest rotation of a body in one (sub)step, 169 degrees: beyond lies the pole."""
 
 
-class Course(eqx.Module):
+class RolloutState(eqx.Module):
     """Where a rollout stands: carried from slot to slot.
 
     Attributes:
@@ -53,7 +53,7 @@ class Course(eqx.Module):
 
     state: State
     it: Iterate
-    past: Past
+    past: Predictor
     step: Int[Array, ""]
     done: Float[Array, ""]
     fraction: Float[Array, ""]
@@ -70,7 +70,7 @@ class Course(eqx.Module):
     left: Float[Array, " rates"]
 
 
-class Setting(eqx.Module):
+class RolloutProblem(eqx.Module):
     """What stays the same over a rollout.
 
     Attributes:
@@ -93,22 +93,24 @@ class Setting(eqx.Module):
     first: Int[Array, ""] | int = 0
     event: Any = None
 
-    def near(self, course: Course, steps: int) -> "Setting":
+    def near(self, course: RolloutState, steps: int) -> "RolloutProblem":
         """With the inputs of the next steps only."""
         if self.plan.control is not None or self.parameters.shape[0] <= steps:
             return self
         first = jnp.minimum(course.step, self.parameters.shape[0] - steps)
         some = part(self.parameters, first, steps)
-        return Setting(self.system, some, self.dt, self.tolerance, self.plan, self.steps, first, self.event)
+        return RolloutProblem(
+            self.system, some, self.dt, self.tolerance, self.plan, self.steps, first, self.event
+        )
 
-    def over(self, course: Course) -> Bool[Array, ""]:
+    def over(self, course: RolloutState) -> Bool[Array, ""]:
         """Whether the rollout has ended."""
         over = course.stopped | (course.step >= self.steps)
         if self.tolerance is None:
             return over
         return over | (course.taken >= self.steps + self.plan.extra)
 
-    def lag(self, course: Course) -> Lag | None:
+    def lag(self, course: RolloutState) -> FrozenKick | None:
         """What the evaluation of the equations is told of the kick, if there is any."""
         lagging, it, over = course.lagging, course.it, self.over(course)
         if lagging is None:
@@ -117,9 +119,9 @@ class Setting(eqx.Module):
         # Lanes that are done wait for the others; the last evaluation has the kicks of all.
         wanted = any_lane(lagging.wanted(it) & going) | ~any_lane(going)
         closed = (lagging.closed > 0) & ~over
-        return Lag(lagging.held, wanted, closed, jnp.zeros_like(closed))
+        return FrozenKick(lagging.held, wanted, closed, jnp.zeros_like(closed))
 
-    def situation(self, course: Course) -> tuple[Array, Array, Array]:
+    def situation(self, course: RolloutState) -> tuple[Array, Array, Array]:
         """Inputs, length and number of the (sub)step at hand."""
         h = jnp.where(self.over(course), 1e-3, course.fraction * self.dt)
         index = jnp.minimum(course.step, self.steps - 1)
@@ -128,7 +130,7 @@ class Setting(eqx.Module):
         return u, h, index
 
 
-def start_of(setting: Setting, state: State) -> tuple[Course, Factors, Outset]:
+def start_of(setting: RolloutProblem, state: State) -> tuple[RolloutState, Factors, StartCache]:
     """The first attempt, factors that are none, and what is known of the first state."""
     dt, plan = setting.dt, setting.plan
     u = plan.inputs(setting.system, setting.parameters, jnp.array(0), state, jnp.zeros(()), jnp.ones(()))
@@ -145,10 +147,12 @@ def start_of(setting: Setting, state: State) -> tuple[Course, Factors, Outset]:
         lagging = Lagging.begin(
             Velocity(jnp.zeros_like(state.q.reshape(-1, 4, 3)), jnp.zeros_like(state.rates))
         )
-    course = Course(
+    course = RolloutState(
         state=state,
         it=it,
-        past=Past.of(it.y if lagging is None else jnp.concatenate([it.y, in_body_axes(state, lagging.held)])),
+        past=Predictor.of(
+            it.y if lagging is None else jnp.concatenate([it.y, in_body_axes(state, lagging.held)])
+        ),
         step=zero,
         done=nought,
         fraction=nought + 1.0,
@@ -164,16 +168,16 @@ def start_of(setting: Setting, state: State) -> tuple[Course, Factors, Outset]:
         lagging=lagging,
         left=left,
     )
-    return course, factors, equations.outset
+    return course, factors, equations.start_cache
 
 
-def _halve(course: Course, after: State, solved: Array, over: Array) -> Verdict:
+def _halve(course: RolloutState, after: State, solved: Array, over: Array) -> StepDecision:
     """Substeps without error control: a failed attempt is repeated with half its length."""
     accepted = solved & ~over
     state = jax.tree.map(lambda x, y: jnp.where(accepted, x, y), after, course.state)
     done = course.done + jnp.where(accepted, course.fraction, 0.0)
     halved = 0.5 * course.fraction
-    return Verdict(
+    return StepDecision(
         trial=None,
         state=state,
         done=done,
@@ -186,13 +190,13 @@ def _halve(course: Course, after: State, solved: Array, over: Array) -> Verdict:
 
 
 def after_attempt(
-    setting: Setting,
-    course: Course,
+    setting: RolloutProblem,
+    course: RolloutState,
     inertias: Array,
     found: tuple[State, Array],
     left: Float[Array, " rates"],
     kick: Velocity | None = None,
-) -> Course:
+) -> RolloutState:
     """The end of an attempt: what is attempted next, and from where.
 
     Args:
@@ -240,18 +244,20 @@ def after_attempt(
         kicks = in_body_axes(course.state, kick)
         solution = jnp.concatenate([it.y, kicks])
         inertias = jnp.concatenate([inertias, jnp.zeros_like(kicks)])
-    alone = Past(course.past.differences, jnp.ones_like(course.past.known), jnp.zeros_like(course.past.order))
+    alone = Predictor(
+        course.past.differences, jnp.ones_like(course.past.known), jnp.zeros_like(course.past.order)
+    )
     if trial is not None:
         alone = alone.beginning_with(solution, solved)
     followed = course.past.followed_by(solution, inertias)
     past = jax.tree.map(lambda x, y: jnp.where(kept, x, y), followed, alone)
     same = fraction == course.fraction
-    past = Past(past.differences, jnp.where(same, past.known, 1), jnp.where(same, past.order, 0))
+    past = Predictor(past.differences, jnp.where(same, past.known, 1), jnp.where(same, past.order, 0))
     guess, lagging = past.guess, course.lagging
     sound = jnp.all(jnp.isfinite(guess))
     if lagging is not None:
         lagging = lagging.beginning(from_body_axes(verdict.state, jnp.where(sound, guess[size:], 0.0)))
-    return Course(
+    return RolloutState(
         state=verdict.state,
         it=begin(jnp.where(sound, guess[:size], it.start), few=trial is not None),
         past=past,

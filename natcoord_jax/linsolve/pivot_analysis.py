@@ -29,7 +29,7 @@ def natural(graph: Graph, fronts: list[Front]) -> list[Pivots]:
     return [Pivots(*[front_unknowns(graph, f)[0]] * 2) for f in fronts]
 
 
-def rehearse(
+def analyse_pivots(
     graph: Graph, fronts: list[Front], entries: Entries, values: np.ndarray
 ) -> tuple[list[Front], list[Pivots]]:
     """Eliminate front by front.

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from natcoord_jax.assembly.balances import loops_of, relations_of, rotors_of
+from natcoord_jax.assembly.equations_of_motion import loops_of, relations_of, rotors_of
 from natcoord_jax.assembly.momentum import inertia, weighs_only, wrench
 from natcoord_jax.assembly.rates import joint_axes, row_rates
 from natcoord_jax.assembly.system import System

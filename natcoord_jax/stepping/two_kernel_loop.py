@@ -16,18 +16,18 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from natcoord_jax.assembly.equations import kind_of, prepare
-from natcoord_jax.assembly.outset import Outset
+from natcoord_jax.assembly.start_cache import StartCache
 from natcoord_jax.assembly.system import System
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.rows import with_part
-from natcoord_jax.stepping.attempt import Asked, Carried, attempt, renewed_at, with_state
-from natcoord_jax.stepping.course import Course, Setting, start_of
+from natcoord_jax.stepping.attempt import LoopCarry, RefactorRequest, attempt, renewed_at, with_state
 from natcoord_jax.stepping.differences import first_probe
 from natcoord_jax.stepping.error_control import Tolerance
 from natcoord_jax.stepping.factors import Factors
 from natcoord_jax.stepping.newton import Iterate, any_lane
 from natcoord_jax.stepping.one_kernel import as_one_kernel
 from natcoord_jax.stepping.plan import Plan
+from natcoord_jax.stepping.rollout_state import RolloutProblem, RolloutState, start_of
 
 PARTS = 4
 """Bodies from which on new factors are made in a kernel of their own."""
@@ -40,8 +40,8 @@ ATTEMPTS = 2
 
 
 def all_slots(
-    setting: Setting, state: State, kernel: Callable = as_one_kernel
-) -> tuple[Carried, Callable[[Array], State]]:
+    setting: RolloutProblem, state: State, kernel: Callable = as_one_kernel
+) -> tuple[LoopCarry, Callable[[Array], State]]:
     """The loop over all evaluations of the equations.
 
     Args:
@@ -65,66 +65,68 @@ def in_parts(system: System, plan: Plan, tolerance: Tolerance | None) -> bool:
     return kind.by_formulas and tolerance is None and len(system.structure.bodies) >= PARTS
 
 
-def _start(setting: Setting, unpack: Callable[[Array], State], x: Array) -> tuple[Course, Factors, Outset]:
-    course, factors, outset = start_of(setting, unpack(x))
-    return with_state(course, None), factors, outset
+def _start(
+    setting: RolloutProblem, unpack: Callable[[Array], State], x: Array
+) -> tuple[RolloutState, Factors, StartCache]:
+    course, factors, start_cache = start_of(setting, unpack(x))
+    return with_state(course, None), factors, start_cache
 
 
-def _unfinished(setting: Setting, length: int, carried: Carried) -> Array:
+def _unfinished(setting: RolloutProblem, length: int, carried: LoopCarry) -> Array:
     # Of fewer steps than there is room for in the record, as many attempts are made as with room for these.
     attempts = 1 if setting.tolerance is None else ATTEMPTS
     unused = attempts * (setting.plan.steps - setting.steps) if setting.plan.recorded else 0
     return (carried.count < length - unused) & any_lane(~setting.over(carried.course))
 
 
-def _record(course: Course, x: Array, rows: int) -> tuple[Array, ...]:
+def _record(course: RolloutState, x: Array, rows: int) -> tuple[Array, ...]:
     """Room for so many slots."""
     slot = x, course.it.y, course.step, course.fraction, course.done, course.stopped, course.step
     return tuple(jnp.zeros((rows, *x.shape), x.dtype) for x in slot)
 
 
 def _every_slot(
-    setting: Setting,
+    setting: RolloutProblem,
     unpack: Callable[[Array], State],
     length: int,
     x: Array,
-) -> Carried:
+) -> LoopCarry:
     """All slots, in one loop."""
     # In the kernel, too: a few dozen fusions before it would take longer than the first steps.
-    course, factors, outset = _start(setting, unpack, x)
+    course, factors, start_cache = _start(setting, unpack, x)
     plan = setting.plan
     probe = None
     if kind_of(setting.system, plan.tableau).by_differences:
-        probe = first_probe(setting, with_state(course, unpack(x)), outset)
+        probe = first_probe(setting, with_state(course, unpack(x)), start_cache)
     # A row beyond the last goes to the last.
     record = _record(course, x, length if plan.recorded else 1)
-    start = Carried(jnp.array(0), course, x, outset, factors, probe, record, jnp.array(0), None)
+    start = LoopCarry(jnp.array(0), course, x, start_cache, factors, probe, record, jnp.array(0), None)
     going = partial(_unfinished, setting, length)
     return jax.lax.while_loop(going, partial(attempt, setting, unpack, False), start)
 
 
 def _by_rounds(
-    setting: Setting,
+    setting: RolloutProblem,
     unpack: Callable[[Array], State],
     length: int,
     x: Array,
-) -> Carried:
+) -> LoopCarry:
     """All slots, in rounds of a kernel that goes on until it needs new factors, and one that makes them.
 
     One kernel for both would compile twice as long; the slots of a round have a record of their own, so that
     what travels between kernels does not grow with the number of slots.
     """
     plan = setting.plan
-    course, factors, outset = _start(setting, unpack, x)
+    course, factors, start_cache = _start(setting, unpack, x)
     rows = CHUNK if plan.recorded else 1
 
-    def situated(setting: Setting, carried: Carried) -> Any:
+    def situated(setting: RolloutProblem, carried: LoopCarry) -> Any:
         state = unpack(carried.state)
         u, h, _ = setting.situation(with_state(carried.course, state))
-        return prepare(setting.system, state, u, h, plan.tableau, carried.outset)
+        return prepare(setting.system, state, u, h, plan.tableau, carried.start_cache)
 
-    def attempts(near: Setting, carried: Carried) -> Carried:
-        def going(c: Carried) -> Array:
+    def attempts(near: RolloutProblem, carried: LoopCarry) -> LoopCarry:
+        def going(c: LoopCarry) -> Array:
             assert c.asked is not None
             return _unfinished(near, length, c) & ~c.asked.wanting & (c.count < c.first + CHUNK)
 
@@ -132,12 +134,12 @@ def _by_rounds(
         begun = eqx.tree_at(lambda c: (c.record, c.first), carried, (room, carried.count))
         return jax.lax.while_loop(going, partial(attempt, near, unpack, True), begun)
 
-    def renewal(near: Setting, carried: Carried) -> tuple[Iterate, Factors]:
+    def renewal(near: RolloutProblem, carried: LoopCarry) -> tuple[Iterate, Factors]:
         assert carried.asked is not None
         equations = situated(near, carried)
         return renewed_at(near, equations, carried.course.it, carried.factors, carried.asked)
 
-    def round_of(carry: tuple[Carried, tuple[Array, ...]]) -> tuple:
+    def round_of(carry: tuple[LoopCarry, tuple[Array, ...]]) -> tuple:
         carried, record = carry
         near = setting.near(carried.course, CHUNK)
         found = as_one_kernel(partial(attempts, near), carried)
@@ -148,21 +150,21 @@ def _by_rounds(
             record = tuple(jnp.where(some, part, whole) for whole, part in zip(record, found.record))
         found = eqx.tree_at(lambda c: c.record, found, ())
 
-        def renewed(found: Carried) -> tuple[Iterate, Factors]:
+        def renewed(found: LoopCarry) -> tuple[Iterate, Factors]:
             return as_one_kernel(partial(renewal, near), found)
 
-        def kept(found: Carried) -> tuple[Iterate, Factors]:
+        def kept(found: LoopCarry) -> tuple[Iterate, Factors]:
             return found.course.it, found.factors
 
         it, factors = jax.lax.cond(found.asked.wanting, renewed, kept, found)
         made = it, factors, jnp.array(False)
         return eqx.tree_at(lambda c: (c.course.it, c.factors, c.asked.wanting), found, made), record
 
-    start = Carried(jnp.array(0), course, x, outset, factors, None, (), jnp.array(0), None)
+    start = LoopCarry(jnp.array(0), course, x, start_cache, factors, None, (), jnp.array(0), None)
     like = jax.eval_shape(lambda c: situated(setting, c).evaluate(c.course.it.y), start)
     like = like.residual, like.size, like.loads
     residual, size, loads = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), like)
-    asked = Asked(jnp.array(False), residual, size, loads, jnp.array(False))
+    asked = RefactorRequest(jnp.array(False), residual, size, loads, jnp.array(False))
     start = eqx.tree_at(lambda c: c.asked, start, asked, is_leaf=lambda x: x is None)
     # The slots of the last round may end before its room does.
     record = _record(course, x, length + CHUNK if plan.recorded else 1)

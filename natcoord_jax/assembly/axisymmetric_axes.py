@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from natcoord_jax.core.host import on_host
+from natcoord_jax.core.eager_numpy import eager_numpy
 
 POLE = np.array([0.48, 0.6, 0.64])
 """The axes are those at the pole, turned to the axis of symmetry the shortest way: which is undetermined, and
@@ -54,7 +54,7 @@ def ball_axes(
     return jnp.where(found[..., None, None], following, own)
 
 
-@on_host
+@eager_numpy
 def symmetries(
     mass: Float[Array, "bodies 4 4"],
     frames: Float[Array, "bodies 2 4 4"],

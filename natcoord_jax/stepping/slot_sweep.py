@@ -14,21 +14,21 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from natcoord_jax.assembly.block_tangent_space import Tangents, tangents_at
 from natcoord_jax.assembly.equations import kind_of, prepare
 from natcoord_jax.assembly.reduced import NOTHING
-from natcoord_jax.assembly.separate import Tangents, tangents_at
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
 from natcoord_jax.linsolve.learning import learns
 from natcoord_jax.maths.collocation import Tableau
 from natcoord_jax.maths.rows import part, row, with_part, with_row
-from natcoord_jax.stepping.correcting import Correcting
 from natcoord_jax.stepping.factors import Factors, factors_of
+from natcoord_jax.stepping.linear_iteration import LinearIteration
 from natcoord_jax.stepping.newton import any_lane
 from natcoord_jax.stepping.one_kernel import in_few_kernels, lane_by_lane
-from natcoord_jax.stepping.past import Past
 from natcoord_jax.stepping.plan import Plan
-from natcoord_jax.stepping.record import Numbers, Record, Slot
+from natcoord_jax.stepping.predictor import Predictor
+from natcoord_jax.stepping.record import Parameters, Record, Slot
 from natcoord_jax.stepping.step import advance_between
 from natcoord_jax.xla.tracing import traced_once
 
@@ -46,7 +46,7 @@ class Fixed(eqx.Module):
         unknowns: of a slot.
     """
 
-    numbers: Numbers
+    numbers: Parameters
     masses: Float[Array, " balances"]
     changes: list[Array] | None
     unknowns: int = eqx.field(static=True)
@@ -62,12 +62,12 @@ class Fixed(eqx.Module):
         return cls(numbers, equations.least_inertias(), changes, slots.y.shape[-1])
 
 
-class Going(eqx.Module):
+class SweepCarry(eqx.Module):
     """What goes from slot to slot.
 
     Attributes:
         left: slots that are not done.
-        own: what is carried besides the solutions, see `InTurn`.
+        own: what is carried besides the solutions, see `SlotSweep`.
         pasts: solutions of the slots that are done, dealt out in turn; the first guesses the next.
         solution: of the system of the last slot that is not done.
         at: where it stands.
@@ -77,14 +77,14 @@ class Going(eqx.Module):
 
     left: Int[Array, ""]
     own: Any
-    pasts: tuple[Past, ...]
+    pasts: tuple[Predictor, ...]
     solution: Float[Array, " unknowns"]
-    at: Correcting
+    at: LinearIteration
     factors: Factors
     stuck: Bool[Array, ""]
 
 
-class InTurn(ABC):
+class SlotSweep(ABC):
     """Slots from the last one to the first; hashable, without traced values.
 
     Args:
@@ -105,7 +105,7 @@ class InTurn(ABC):
         """What arrives at a slot, of what is carried and of its row of what is given."""
 
     @abstractmethod
-    def solving(self, fixed: "Fixed", slot: Slot, arrived: Any, given: Any, c: Going) -> Callable:
+    def solving(self, fixed: "Fixed", slot: Slot, arrived: Any, given: Any, c: SweepCarry) -> Callable:
         """How the system of one slot is solved, as far as the factors at hand go.
 
         Returns:
@@ -129,7 +129,7 @@ class InTurn(ABC):
     def following(self, kernel: Callable, record: Record, given: Any) -> Any:
         """Everything, with what computes a function of its arguments in a kernel."""
 
-    def admitted(self, numbers: Numbers, varied: list[Array], state: State) -> Tangents | None:
+    def admitted(self, numbers: Parameters, varied: list[Array], state: State) -> Tangents | None:
         """What the constraints admit in a state, for schemes that ask for it."""
         if not self.tableau.kick:
             return None
@@ -137,7 +137,7 @@ class InTurn(ABC):
 
     def outcome(
         self,
-        numbers: Numbers,
+        numbers: Parameters,
         slot: Slot,
         varied: list[Array],
         state: State,
@@ -162,7 +162,7 @@ class InTurn(ABC):
         given: Any,
         start: tuple[Array, Factors, Any],
         like: Any,
-    ) -> tuple[Going, Any]:
+    ) -> tuple[SweepCarry, Any]:
         """In rounds: of a kernel that goes on until it needs new factors, and one that makes them.
 
         A round sees a few slots, so that what travels between kernels does not grow with their number.
@@ -180,7 +180,7 @@ class InTurn(ABC):
         y, factors, own = start
         places = y.shape[0] if learns(factors.solver) else 0
 
-        def round_of(carry: tuple[Going, Any, Array]) -> tuple[Going, Any, Array]:
+        def round_of(carry: tuple[SweepCarry, Any, Array]) -> tuple[SweepCarry, Any, Array]:
             c, found, matrix = carry
             first = jnp.maximum(c.left - rows, 0)
             near = jax.tree.map(lambda x: part(x, first, rows), (slots, given, found))
@@ -197,12 +197,12 @@ class InTurn(ABC):
             c, near_found, matrix = kernel(self._several, fixed, first, *near, c, matrix)
             return c, jax.tree.map(lambda x, y: with_part(x, first, y), found, near_found), matrix
 
-        first = Going(
+        first = SweepCarry(
             left=jnp.array(count),
             own=own,
-            pasts=(Past.of(jnp.zeros_like(y)),) * self.stride,
+            pasts=(Predictor.of(jnp.zeros_like(y)),) * self.stride,
             solution=jnp.zeros_like(y),
-            at=Correcting.first(y, factors, self._formed_first(fixed, factors)),
+            at=LinearIteration.first(y, factors, self._formed_first(fixed, factors)),
             factors=factors,
             stuck=jnp.array(False),
         )
@@ -217,11 +217,11 @@ class InTurn(ABC):
         return fixed.unknowns if rows else 0
 
     def _several(
-        self, fixed: "Fixed", first: Array, slots: Slot, given: Any, found: Any, c: Going, matrix: Array
-    ) -> tuple[Going, Any, Array]:
+        self, fixed: "Fixed", first: Array, slots: Slot, given: Any, found: Any, c: SweepCarry, matrix: Array
+    ) -> tuple[SweepCarry, Any, Array]:
         """Slots from the last one back, down to the first given here or to one that needs new factors."""
 
-        def one(carry: tuple[Going, Any, Array]) -> tuple[Going, Any, Array]:
+        def one(carry: tuple[SweepCarry, Any, Array]) -> tuple[SweepCarry, Any, Array]:
             c, found, matrix = carry
             here = c.left - 1 - first
             slot, own_given = jax.tree.map(lambda x: row(x, here), (slots, given))
@@ -242,18 +242,18 @@ class InTurn(ABC):
             found = jax.tree.map(lambda rows, x: with_row(rows, here, x), found, found_here)
             guess = pasts[0].guess
             guess = jnp.where(jnp.all(jnp.isfinite(guess)), guess, 0.0)
-            following = Correcting.first(solution, factors, self._formed_first(fixed, factors))
+            following = LinearIteration.first(solution, factors, self._formed_first(fixed, factors))
             aged = factors.aged()
-            done = Going(c.left - 1, carried, pasts, guess, following, aged, stuck)
+            done = SweepCarry(c.left - 1, carried, pasts, guess, following, aged, stuck)
             waiting = replace_fields(c, solution=solution, at=at, factors=factors, stuck=stuck)
             return jax.tree.map(partial(jnp.where, stuck), waiting, done), found, matrix
 
-        def going(carry: tuple[Going, Any, Array]) -> Array:
+        def going(carry: tuple[SweepCarry, Any, Array]) -> Array:
             return (carry[0].left > first) & ~carry[0].stuck
 
         return jax.lax.while_loop(going, one, (c, found, matrix))
 
-    def _formed(self, solving: Callable, start: tuple[Array, Any, Correcting], matrix: Array) -> tuple:
+    def _formed(self, solving: Callable, start: tuple[Array, Any, LinearIteration], matrix: Array) -> tuple:
         """The system of a slot solved; or, where factors do not serve, its matrix formed for new ones.
 
         It is formed by the products that corrections are made with, so that it is that of the slot exactly,

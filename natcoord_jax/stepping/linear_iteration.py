@@ -39,7 +39,7 @@ ROUNDS = 3
 """Factorisations for one system."""
 
 
-class Correcting(eqx.Module):
+class LinearIteration(eqx.Module):
     """Where the solution of a transposed system stands.
 
     It is solved where an evaluation at the solution says so, never before: factors of another system, and
@@ -79,7 +79,7 @@ class Correcting(eqx.Module):
     last: Bool[Array, ""]
 
     @classmethod
-    def first(cls, lam: Float[Array, " unknowns"], factors: Factors, most: int) -> "Correcting":
+    def first(cls, lam: Float[Array, " unknowns"], factors: Factors, most: int) -> "LinearIteration":
         """Before the first correction, where so many rows of the matrix are to be formed for new factors."""
         memory, learning = min(MEMORY, lam.size), learns(factors.solver)
         nought, no = jnp.array(0), jnp.array(False)
@@ -105,7 +105,7 @@ class Correcting(eqx.Module):
 
     def formed(
         self, asked: Bool[Array, ""], matrix: Float[Array, "n unknowns"], product: Float[Array, " unknowns"]
-    ) -> tuple["Correcting", Float[Array, "n unknowns"]]:
+    ) -> tuple["LinearIteration", Float[Array, "n unknowns"]]:
         """With one more row, if that was asked for."""
         place = jnp.minimum(self.rows, matrix.shape[0] - 1)
         matrix = with_row(matrix, place, jnp.where(asked, product, row(matrix, place)))
@@ -116,11 +116,11 @@ class Correcting(eqx.Module):
         """Whether to go on with the factors at hand."""
         return ~self.done & ~self.wanting
 
-    def unless(self, failed: Bool[Array, ""]) -> "Correcting":
+    def unless(self, failed: Bool[Array, ""]) -> "LinearIteration":
         """Done, if it is that of an attempt that failed: there is nothing to solve."""
         return eqx.tree_at(lambda c: c.done, self, self.done | failed)
 
-    def refreshed(self, most: int) -> "Correcting":
+    def refreshed(self, most: int) -> "LinearIteration":
         """With new factors; for the next ones, so many rows of the matrix are to be formed."""
         nought, no = jnp.zeros_like(self.count), jnp.zeros_like(self.last)
         known = jnp.zeros_like(self.known)
@@ -152,7 +152,7 @@ class Correcting(eqx.Module):
         patience: int,
         whole: Array,
         transposed: bool = True,
-    ) -> tuple["Correcting", Factors]:
+    ) -> tuple["LinearIteration", Factors]:
         """After an evaluation: done, or moving on by a correction, or in want of new factors.
 
         Args:
@@ -200,7 +200,7 @@ class Correcting(eqx.Module):
         moving = ~slow & ~done
         count = self.count + 1
         rounds = self.rounds, self.rows, self.most
-        found = Correcting(*made, correction, count, *rounds, done, slow, moving, last)
+        found = LinearIteration(*made, correction, count, *rounds, done, slow, moving, last)
         stay = eqx.tree_at(lambda c: c.moving, self, jnp.zeros_like(self.moving))
         return jax.tree.map(partial(jnp.where, ~self.going), stay, found), factors
 

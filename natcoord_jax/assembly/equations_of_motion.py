@@ -76,7 +76,7 @@ def relative_rates(
     return jnp.concatenate(none + turning), jnp.concatenate(none + found)
 
 
-class Gains(eqx.Module):
+class Accelerations(eqx.Module):
     """What belongs to a motion, either as rates or, one derivative higher, as accelerations.
 
     Attributes:
@@ -90,7 +90,7 @@ class Gains(eqx.Module):
     constraints: Float[Array, "*u constraints"]
 
 
-class Balances(eqx.Module):
+class EquationsOfMotion(eqx.Module):
     """Inertia and constraints of a system at given rows.
 
     Attributes:
@@ -110,7 +110,7 @@ class Balances(eqx.Module):
     constraints: tuple[Float[Array, "c bodies_and_ground 3"], Float[Array, "c bodies_and_ground 3"]]
 
     @classmethod
-    def at(cls, system: System, state: State) -> "Balances":
+    def at(cls, system: System, state: State) -> "EquationsOfMotion":
         """The balances of a state."""
         rows = state.q.reshape(-1, 4, 3)
         still = jnp.zeros((rows.shape[0] + 1, 3), rows.dtype)
@@ -126,25 +126,25 @@ class Balances(eqx.Module):
         velocity, spin = self.free
         return jnp.einsum("buc,u->bc", velocity, w), jnp.einsum("buc,u->bc", spin, w)
 
-    def rates(self, w: Float[Array, " unknowns"]) -> Gains:
+    def rates(self, w: Float[Array, " unknowns"]) -> Accelerations:
         """Rates of everything."""
         velocity, spin = self.twists(w)
         moving = row_rates(self.rows, velocity, spin)
         relative = relative_rates(self.system, self.rows, with_rest(velocity), with_rest(spin), self.t)
-        return Gains(moving, *relative)
+        return Accelerations(moving, *relative)
 
-    def bias(self, w: Float[Array, " unknowns"]) -> Gains:
+    def bias(self, w: Float[Array, " unknowns"]) -> Accelerations:
         """Accelerations of everything while the rates of the free motions stay as they are."""
 
         def composed(rows, t):
             velocity, spin = twists(self.system, rows, w)
             relative = relative_rates(self.system, rows, with_rest(velocity), with_rest(spin), t)
-            return Gains(row_rates(rows, velocity, spin), *relative)
+            return Accelerations(row_rates(rows, velocity, spin), *relative)
 
         moving = row_rates(self.rows, *self.twists(w))
         return jax.jvp(composed, (self.rows, self.t), (moving, jnp.ones_like(self.t)))[1]
 
-    def columns(self) -> Gains:
+    def columns(self) -> Accelerations:
         """Accelerations of everything per unit of w', leading axis the unknowns."""
         velocity, spin = self.free
         at_rest = jnp.zeros_like(velocity[:, 0])
@@ -152,15 +152,15 @@ class Balances(eqx.Module):
         def relative(velocity: Array, spin: Array) -> tuple[Array, Array]:
             return relative_rates(self.system, self.rows, with_rest(velocity), with_rest(spin), self.t)
 
-        def column(velocity: Array, spin: Array) -> Gains:
+        def column(velocity: Array, spin: Array) -> Accelerations:
             # Of what drives prescribe nothing: one motion of the tree at a time, of which there are fewer
             # than velocities of bodies.
             found = jax.jvp(relative, (at_rest, at_rest), (velocity, spin))[1]
-            return Gains(row_rates(self.rows, velocity, spin), *found)
+            return Accelerations(row_rates(self.rows, velocity, spin), *found)
 
         return jax.vmap(column, in_axes=1)(velocity, spin)
 
-    def inertial(self, gains: Gains) -> Twists:
+    def inertial(self, gains: Accelerations) -> Twists:
         """Forces and torques that give bodies and rotors their accelerations."""
         impulses = inertia(self.system.mass, gains.rows)
         force, torque = (x[0] for x in wrench(impulses[None], self.rows[None, :, 1:]))
@@ -218,7 +218,7 @@ class Balances(eqx.Module):
 
 def constraint_matrix(system: System, state: State) -> Float[Array, "c unknowns"]:
     """Rates of relations and loops per unit rate of each free motion of the tree."""
-    return Balances.at(system, state).columns().constraints.T
+    return EquationsOfMotion.at(system, state).columns().constraints.T
 
 
 def _weighted(lam: Array, loads: tuple[Array, Array]) -> Twists:

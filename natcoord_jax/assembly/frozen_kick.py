@@ -49,7 +49,7 @@ BEHIND = 3.0
 """The kick is due when it misses as much as a third of what the stages may."""
 
 
-class Lag(eqx.Module):
+class FrozenKick(eqx.Module):
     """What an evaluation of the equations is told.
 
     Attributes:
@@ -105,7 +105,7 @@ class Lagging(eqx.Module):
         # An iteration that waits for factors begins anew elsewhere.
         return it.last | it.wanting | (self.closed > 0) | (told & (stages <= BEHIND * behind))
 
-    def jumped(self, kick: Any, lag: Lag, it: Any) -> Bool[Array, ""]:
+    def jumped(self, kick: Any, lag: FrozenKick, it: Any) -> Bool[Array, ""]:
         """Whether the kick has changed so much that corrections of the stages do not compare.
 
         Nothing is so little that the last one may be left out: it would have the same sign in every step.

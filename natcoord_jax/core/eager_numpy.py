@@ -1,8 +1,8 @@
 """Small calculations in NumPy: what is done once costs no compilation.
 
 An operation of JAX that is called from Python is a program of its own, which takes tens of milliseconds to
-compile for every new shape, and setting up a scene needs hundreds of them. A function wrapped by `on_host`
-is traced instead, and its operations are evaluated by NumPy one after the other. Inside of a transformation
+compile for every new shape, and setting up a scene needs hundreds of them. What `eager_numpy` wraps is traced
+instead, and its operations are evaluated by NumPy one after the other. Inside of a transformation
 it is the function itself, so that there is one formulation only.
 """
 
@@ -30,7 +30,7 @@ LARGE = 1_000_000
 F = TypeVar("F", bound=Callable[..., Any])
 
 
-def on_host(function: F) -> F:
+def eager_numpy(function: F) -> F:
     """The function, evaluated by NumPy where nothing is being traced, and compiled for large arrays.
 
     Args:
@@ -44,8 +44,8 @@ def on_host(function: F) -> F:
     Example:
         >>> import jax; jax.config.update("jax_enable_x64", True)
         >>> import jax.numpy as jnp
-        >>> from natcoord_jax.core.host import on_host
-        >>> float(on_host(lambda x: jnp.sum(x**2))(jnp.array([3.0, 4.0])))
+        >>> from natcoord_jax.core.eager_numpy import eager_numpy
+        >>> float(eager_numpy(lambda x: jnp.sum(x**2))(jnp.array([3.0, 4.0])))
         25.0
     """
     programs: dict[Any, tuple[ClosedJaxpr, Any]] = {}

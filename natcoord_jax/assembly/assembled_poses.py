@@ -7,9 +7,9 @@ from jaxtyping import Array, Float
 from natcoord_jax.assembly.bodies import Bodies, joined
 from natcoord_jax.core.bodies import POINT, TRIAD
 from natcoord_jax.core.checks import as_array
+from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.handles import ground as ground_handle
-from natcoord_jax.core.host import on_host
 from natcoord_jax.core.joint import Joint
 from natcoord_jax.core.kinds import short
 from natcoord_jax.core.markers import Attachment, Interpolated, Marker
@@ -116,22 +116,22 @@ def _pose_weights(position, rotation, point: Array, triad: Array) -> Float[Array
     return jnp.stack([_weights(position, rotation, point, True), *directions])
 
 
-_marker_weights = on_host(_weights)
+_marker_weights = eager_numpy(_weights)
 
 
-@on_host
+@eager_numpy
 def _attachment_weights(position, rotation, point: Array, axes: Float[Array, "3 3"]) -> Float[Array, "4 4"]:
     return _pose_weights(position, rotation, point, axes.T)
 
 
-@on_host
+@eager_numpy
 def _joint_weights(joint: Joint, positions, rotations, points, triad) -> Float[Array, "2 4 4"]:
     turned, shift = joint.zeroed(triad)
     given = zip(positions, rotations, (points[0] + shift, points[1]), (turned, triad))
     return jnp.stack([_pose_weights(*pose) for pose in given])
 
 
-_triad = on_host(frame_from_axis)
+_triad = eager_numpy(frame_from_axis)
 
 
 def joint_triad(joint: Joint) -> Float[Array, "3 3"]:

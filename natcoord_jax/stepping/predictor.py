@@ -9,7 +9,7 @@ ORDER = 7
 corrections a step where motion is smooth; elsewhere a lower one is chosen."""
 
 
-class Past(eqx.Module):
+class Predictor(eqx.Module):
     """Solutions of the last steps, as backward differences, from which the next is guessed.
 
     The sum of the differences up to an order extrapolates by a polynomial of that order; what it misses is
@@ -26,15 +26,15 @@ class Past(eqx.Module):
     order: Int[Array, ""]
 
     @classmethod
-    def of(cls, y: Float[Array, " unknowns"]) -> "Past":
+    def of(cls, y: Float[Array, " unknowns"]) -> "Predictor":
         """One solution."""
         rest = (jnp.zeros_like(y),) * ORDER
         return cls((y, *rest), jnp.array(1), jnp.array(0))
 
-    def beginning_with(self, y: Float[Array, " unknowns"], solved: Bool[Array, ""]) -> "Past":
+    def beginning_with(self, y: Float[Array, " unknowns"], solved: Bool[Array, ""]) -> "Predictor":
         """With the solution of an attempt that was made for comparison, if there is one."""
         first, *rest = self.differences
-        return Past((jnp.where(solved, y, first), *rest), self.known, self.order)
+        return Predictor((jnp.where(solved, y, first), *rest), self.known, self.order)
 
     @property
     def guess(self) -> Float[Array, " unknowns"]:
@@ -42,11 +42,11 @@ class Past(eqx.Module):
         terms = [jnp.where(k <= self.order, d, 0.0) for k, d in enumerate(self.differences)]
         return sum(terms[1:], terms[0])
 
-    def followed_by(self, y: Float[Array, " unknowns"], inertias: Float[Array, " unknowns"]) -> "Past":
+    def followed_by(self, y: Float[Array, " unknowns"], inertias: Float[Array, " unknowns"]) -> "Predictor":
         """The past after a step with the solution `y`."""
         found = [y]
         for difference in self.differences:
             found.append(found[-1] - difference)
         errors = jnp.stack([jnp.sum(inertias * d**2) for d in found[1:]])
         errors = jnp.where(jnp.arange(ORDER + 1) < self.known, errors, jnp.inf)
-        return Past(tuple(found[:-1]), jnp.minimum(self.known + 1, ORDER + 1), jnp.argmin(errors))
+        return Predictor(tuple(found[:-1]), jnp.minimum(self.known + 1, ORDER + 1), jnp.argmin(errors))

@@ -9,7 +9,7 @@ ROW = 4
 """Entries that a receiver adds up at once."""
 
 
-class Collection(eqx.Module):
+class SegmentSum(eqx.Module):
     """How bodies (or other receivers) add up what is meant for them.
 
     Receivers gather, since scattering would not compile into one kernel. Where one of them has many entries
@@ -24,7 +24,7 @@ class Collection(eqx.Module):
     rows: Int[Array | np.ndarray, "receivers _"] | None
 
     @classmethod
-    def of(cls, receivers: np.ndarray, count: int) -> "Collection":
+    def of(cls, receivers: np.ndarray, count: int) -> "SegmentSum":
         """Collection for the receivers of all entries; what goes beyond the last one falls away."""
         flat = np.asarray(receivers).reshape(-1)
         order = np.argsort(flat, kind="stable")

@@ -20,7 +20,7 @@ except ImportError:  # an experimental module of JAX: without it everything runs
 T = TypeVar("T")
 
 
-def settled(x: T) -> T:
+def materialised(x: T) -> T:
     """The same arrays, which the compiler finishes before it goes on; differentiable in every mode."""
     if _attributed is None or jax.default_backend() != "cpu":
         return x

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from natcoord_jax.assembly.balances import rotors_of
+from natcoord_jax.assembly.equations_of_motion import rotors_of
 from natcoord_jax.assembly.momentum import inertia, motion
 from natcoord_jax.assembly.system import System
 from natcoord_jax.core.state import State

@@ -19,9 +19,9 @@ from natcoord_jax.assembly.tree import gather_slots
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.checks import as_array
 from natcoord_jax.core.coordinate import pair_motion
+from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.effect import Motion, replace_fields
 from natcoord_jax.core.handles import Handle
-from natcoord_jax.core.host import on_host
 from natcoord_jax.core.kinds import of
 from natcoord_jax.core.numeric import Number
 from natcoord_jax.core.state import STATE, State, Trajectory
@@ -166,7 +166,7 @@ def with_coordinate(
     return _with_coordinate(system, state, body, tuple(places.tolist()), index, as_array(value, float), rate)
 
 
-@on_host
+@eager_numpy
 def _with_coordinate(
     system: System, state: State, body: int, at: tuple[int, ...], index: int, value: Array, rate: Array | None
 ) -> State:
@@ -237,7 +237,7 @@ def random_state(
     return _displaced(system, state, change, rates * jax.random.normal(second, (size,), dtype))
 
 
-@on_host
+@eager_numpy
 def _displaced(
     system: System, state: State, change: Float[Array, "1 unknowns"], w: Float[Array, " unknowns"]
 ) -> State:

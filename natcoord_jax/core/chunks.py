@@ -7,14 +7,18 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from natcoord_jax.core.effect import Motion, Now, replace_fields
+from natcoord_jax.core.effect import Motion, StepContext, replace_fields
 
 PIECE = 64
 """Largest number of instances in a piece."""
 
 
-def in_pieces(
-    function: Callable[[Any, Array, Motion, Now], Any], effect: Any, place: Array, motion: Motion, now: Now
+def chunked(
+    function: Callable[[Any, Array, Motion, StepContext], Any],
+    effect: Any,
+    place: Array,
+    motion: Motion,
+    now: StepContext,
 ) -> Any:
     """What a function gives for all instances of an effect; leading axis n, of the stacked numbers, too.
 

@@ -3,15 +3,15 @@
 import equinox as eqx
 from jaxtyping import Array, Float
 
+from natcoord_jax.assembly.block_tangent_space import Tangents, tangents_at
 from natcoord_jax.assembly.dissipation import Damping
-from natcoord_jax.assembly.lag import Lag
-from natcoord_jax.assembly.separate import Tangents, tangents_at
+from natcoord_jax.assembly.frozen_kick import FrozenKick
 from natcoord_jax.assembly.system import System
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import Tableau
 
 
-class Outset(eqx.Module):
+class StartCache(eqx.Module):
     """Found once a step, and carried along while its equations are solved.
 
     Attributes:
@@ -25,7 +25,7 @@ class Outset(eqx.Module):
     projector: Float[Array, "m m"] | None
     tangents: Tangents | None
     damping: Damping | None = None
-    lag: Lag | None = None
+    lag: FrozenKick | None = None
 
     @classmethod
     def of(
@@ -36,7 +36,7 @@ class Outset(eqx.Module):
         projector: Array | None,
         tangents: Tangents | None = None,
         later: bool = False,
-    ) -> "Outset":
+    ) -> "StartCache":
         """With the tangent space of a state.
 
         Args:
