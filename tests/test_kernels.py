@@ -15,7 +15,7 @@ from natcoord_jax import gallery
 from natcoord_jax.maths.collocation import _inverse
 from natcoord_jax.maths.projectors import range_projector
 from natcoord_jax.maths.vectors import cross, skew
-from natcoord_jax.stepping import linear_pair, one_kernel, rewriting
+from natcoord_jax.stepping import linear_pair, one_kernel, rewriting, two_kernel_loop
 from natcoord_jax.stepping.endpoint import endpoints
 from natcoord_jax.stepping.one_kernel import as_one_kernel, in_few_kernels, lane_by_lane
 from natcoord_jax.stepping.plan import Plan
@@ -168,7 +168,7 @@ def test_rounds_of_two_kernels_are_the_loop_in_one(monkeypatch, recorded):
     plan = Plan(steps, 64, 1e-15, None, recorded=recorded)
 
     def found(parts):
-        monkeypatch.setattr(rounds, "PARTS", parts)
+        monkeypatch.setattr(two_kernel_loop, "PARTS", parts)
 
         def one(speed):
             moving = eqx.tree_at(lambda s: s.v, state, speed * state.v)

@@ -13,6 +13,7 @@ import pytest
 from tolerances import EXACT_GRADIENT, SAME_GRADIENT
 
 import natcoord_jax as nc
+from natcoord_jax.stepping import linear_iteration
 
 
 class Brake(nc.JointDamper):
@@ -201,7 +202,7 @@ def test_a_step_repeated_at_the_end_of_a_round():
 )
 def test_what_cannot_be_solved_is_no_number(bounce, monkeypatch, mode):
     """A derivative whose linear systems are not solved is NaN, in every mode, and not some number."""
-    monkeypatch.setattr(correcting, "CORRECTIONS", 0)
+    monkeypatch.setattr(linear_iteration, "CORRECTIONS", 0)
     monkeypatch.setattr("natcoord_jax.stepping.derivative.UNSOLVED", -1.0)
     jax.clear_caches()
     if mode == "reverse":
