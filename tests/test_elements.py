@@ -18,7 +18,8 @@ from natcoord_jax.assembly.full import FullStep
 from natcoord_jax.assembly.reduced import NOTHING
 from natcoord_jax.gallery import continua
 from natcoord_jax.maths.collocation import gauss
-from natcoord_jax.viz.outline import element_faces, is_node, with_ground
+from natcoord_jax.viz.parts import scenery_of
+from natcoord_jax.viz.skins import drawn_bodies
 
 
 def net(count, *, kind="points", solver=None):
@@ -436,6 +437,7 @@ def test_pictures_show_surfaces():
     """Of a plate all its faces, of a block those outside; nodes are no bodies to be drawn."""
     for name, counts, faces in (("plate", (3, 2), 6), ("block", (2, 2, 2), 24)):
         example = gallery.load(name, counts=counts)
-        rows = with_ground(np.asarray(example.state.q)[None])
-        assert element_faces(example.system, rows).shape == (1, faces, 4, 3)
-        assert all(is_node(example.system, body) for body in example.system.structure.bodies)
+        drawn = scenery_of(example.system, example.simulate(steps=1), np.array([0, 1]), colour="energy")
+        (skin,) = drawn.skins
+        assert skin.faces.shape == (faces, 4) and skin.points.shape[0] == 2
+        assert skin.values.shape == (2, faces) and not drawn_bodies(example.system)
