@@ -13,8 +13,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from natcoord_jax.assembly.element_matrices import dense, rates_of, touches
 from natcoord_jax.assembly.equations_of_motion import loads
-from natcoord_jax.assembly.full import FullStep, dense, rates_of, touches
+from natcoord_jax.assembly.full import FullStep
 from natcoord_jax.assembly.local import body_motion
 from natcoord_jax.assembly.local_rates import TWIST
 from natcoord_jax.assembly.momentum import wrench

@@ -5,7 +5,6 @@ bodies and effects. Systems that are no tree, too large for the reduced form and
 are solved so, densely; for all others it is an independent way to the same trajectory.
 """
 
-from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -16,6 +15,7 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.block_tangent_space import Tangents
 from natcoord_jax.assembly.diagnostics import rows_with_ground
+from natcoord_jax.assembly.element_matrices import dense, rates_of, touches
 from natcoord_jax.assembly.form import Form
 from natcoord_jax.assembly.grain import cancelling_size
 from natcoord_jax.assembly.kick import kicked
@@ -34,7 +34,6 @@ from natcoord_jax.assembly.response import (
 )
 from natcoord_jax.assembly.start_cache import StartCache
 from natcoord_jax.assembly.system import Group, System
-from natcoord_jax.core.checks import is_concrete
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import Tableau, gauss
 from natcoord_jax.maths.projectors import range_projector
@@ -274,53 +273,3 @@ class FullStep(Form):
             motion.rates[:, :, 0],
             motion.spin,
         )
-
-
-def touches(group: Group) -> bool:
-    """Whether a group has anything to do with bodies."""
-    return group.count > 0 and group.bodies.shape[1] > 0
-
-
-def rates_of(group: Group) -> int:
-    """Components of the twists of its bodies that a group has to do with: of points there is no spin."""
-    return TWIST if group.turning else TWIST // 2
-
-
-def elements(system: System, stages: int = 1) -> list[Array | np.ndarray]:
-    """The unknowns that each element of the Jacobian touches; on the host where the numbers are known.
-
-    Args:
-        system: compiled system.
-        stages: of the collocation method.
-
-    Returns:
-        An array (count, width) for the bodies and for each group with bodies, in the order of
-        `FullStep.matrices`; the number of unknowns stands for what is fixed.
-    """
-    groups = tuple(g for g in (*system.effects, *system.joints) if touches(g))
-    tables = [group.bodies for group in groups]
-    xp: Any = jnp
-    if is_concrete(system.local_rates, tables):
-        xp, tables = np, [np.asarray(table) for table in tables]
-    first = stages * system.local_rates.count
-    size = first + stages * sum(g.count * g.multipliers for g in groups)
-    places = system.local_rates.places(stages, size, xp)
-    found = [places[:-1].reshape(places.shape[0] - 1, -1)]
-    for group, table in zip(groups, tables):
-        count, rows = group.count, stages * group.multipliers
-        lams = first + np.arange(count * rows, dtype=np.int32).reshape(count, rows)
-        first += count * rows
-        touched = places[table][..., : rates_of(group)].reshape(count, -1)
-        found.append(xp.concatenate([touched, lams], axis=1))
-    return found
-
-
-def dense(
-    system: System, matrices: Sequence[Float[Array, "_ _ _"]], size: int, stages: int = 1
-) -> Float[Array, "n n"]:
-    """The dense matrix of element matrices, see `elements`."""
-    # What is fixed goes beyond the matrix and is cut off.
-    matrix = jnp.zeros((size + 1, size + 1), matrices[0].dtype)
-    for touched, local in zip(elements(system, stages), matrices, strict=True):
-        matrix = matrix.at[touched[:, :, None], touched[:, None, :]].add(local)
-    return matrix[:size, :size]

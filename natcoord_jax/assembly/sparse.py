@@ -11,7 +11,8 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from natcoord_jax.assembly.full import FullStep, touches
+from natcoord_jax.assembly.element_matrices import touches
+from natcoord_jax.assembly.full import FullStep
 from natcoord_jax.assembly.system import System
 from natcoord_jax.linsolve.blocks import BlockMatrix
 from natcoord_jax.linsolve.saddle import inertias_of, regularised

@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from natcoord_jax.assembly.full import elements
+from natcoord_jax.assembly.element_matrices import elements
 from natcoord_jax.assembly.reduced import NOTHING
 from natcoord_jax.assembly.sparse import SparseStep, nodes_of
 from natcoord_jax.assembly.start_cache import StartCache
