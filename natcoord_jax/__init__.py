@@ -106,7 +106,6 @@ from natcoord_jax.effects.beams import (
 from natcoord_jax.effects.constraints import PointOnLine, PointOnPlane, PointOnPoint, PointSum, Rod, Rolling
 from natcoord_jax.effects.contact import (
     CapsuleOnCapsule,
-    ContactLoss,
     EllipsoidOnPlane,
     GapPotential,
     SphereOnBox,
@@ -180,7 +179,6 @@ __all__ = [
     "ComputedTorque",
     "Constraint",
     "Contact",
-    "ContactLoss",
     "Continuation",
     "Coupling",
     "Cylinder",

@@ -69,7 +69,8 @@ ON_JOINT = lambda w: {"joint": [w.hinge], "coordinate": [0], "name": NAME}  # no
 MARKED = lambda markers: {"markers": [markers], "name": NAME}  # noqa: E731
 RUN = lambda w: {"system": [w.system], "state": [w.state]}  # noqa: E731
 GAP = lambda markers: {  # noqa: E731
-    **MARKED(markers), "stiffness": NUMBER, "law": ["linear", "hertz"],
+    **MARKED(markers), "stiffness": NUMBER, "law": ["linear", "hertz"], "restitution": NUMBER,
+    "speed": NUMBER,
 }  # fmt: skip
 METAL, SQUARE = [nc.Elastic(E=1.0)], np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0.0)])
 PLACED = {
@@ -164,10 +165,6 @@ CALLS = {
     "Contact": lambda w: {
         "one": [w.body], "other": [nc.Plane(), w.body], "stiffness": NUMBER, "restitution": NUMBER,
         "speed": NUMBER, "law": ["linear", "hertz"], "name": NAME,
-    },
-    "ContactLoss": lambda w: {
-        **MARKED(w.ends), "contact": [nc.SphereOnSphere(w.ends, radii=(1.0, 1.0), stiffness=1.0)],
-        "damping": NUMBER,
     },
     "SphereOnPlane": lambda w: {**GAP((w.ends[0], w.direction, w.point)), "radius": NUMBER},
     "SphereOnSphere": lambda w: {**GAP(w.ends), "radii": [(1.0, 1.0)]},

@@ -118,6 +118,20 @@ def test_numbers_follow_those_that_are_set():
         system.set(part, thickness=jnp.ones(3))
 
 
+@pytest.mark.parametrize(
+    ("numbers", "message"),
+    [
+        ({"thickness": -0.1}, "shell 'body': thickness is negative"),
+        ({"nu": 0.6}, "shell 'body': element 0 has Poisson's ratio nu"),
+        ({"E": -1.0}, "material.E is negative"),
+    ],
+)
+def test_impossible_numbers_are_not_set(numbers, message):
+    scene, part = body("shell")
+    with pytest.raises(ValueError, match=message):
+        scene.compile()[0].set(part, **numbers)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("number", ["thickness", "E", "density", "reference"])
 def test_gradients_by_the_numbers_of_a_shell(number):

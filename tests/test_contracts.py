@@ -146,11 +146,6 @@ TABLE = {
     nc.SphereOnSphere: Entry(
         lambda p: nc.SphereOnSphere(p.ends, radii=(1.0, 0.9), stiffness=9.0, law="hertz")
     ),
-    nc.ContactLoss: Entry(
-        lambda p: nc.ContactLoss(
-            p.ends, contact=nc.SphereOnSphere(p.ends, radii=(1.0, 0.9), stiffness=9.0), damping=0.2
-        )
-    ),
     nc.CapsuleOnCapsule: Entry(
         lambda p: nc.CapsuleOnCapsule((*p.eight[:2], *p.eight[5:7]), radii=(0.6, 0.7), stiffness=9.0)
     ),

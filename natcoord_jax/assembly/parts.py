@@ -1,5 +1,6 @@
 """Numbers of the parts of a system, by name: read, and set in a copy."""
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -11,6 +12,7 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.masses import with_masses
 from natcoord_jax.assembly.system import Group, System
+from natcoord_jax.core.arguments import DECLARED
 from natcoord_jax.core.checks import as_array, is_concrete
 from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.effect import Effect, replace_fields
@@ -174,7 +176,44 @@ def set_numbers(system: System, part: Names, values: dict[str, Any]) -> System:
             leaf, row, _ = found[field]
             leaves[leaf] = _with_row(jnp.asarray(leaves[leaf]), row, value)
         system = _renewed(system, jax.tree.unflatten(structure, leaves), name, set(given))
+        _check_signs(system, name, given)
     return system
+
+
+def _check_signs(after: System, name: str, given: dict[str, Any]) -> None:
+    """Refuse numbers that an effect would have refused when it was made, and elements that cannot be."""
+    for group in after.effects:
+        if name not in group.names and name not in group.labels:
+            continue
+        for field, value in given.items():
+            kind = _declared(group.effect, field)
+            sign = getattr(kind, "sign", "")
+            if sign and is_concrete(value) and np.any(np.asarray(value) < 0):
+                raise ValueError(
+                    f"{group.effect.kind} {name!r}: {field} is negative, {np.min(np.asarray(value)):g}; pass "
+                    f"{'a positive number' if sign == 'positive' else 'a number that is not negative'}"
+                )
+        for said, wrong in _flaws(group.effect).items() if group.lanes else ():
+            if is_concrete(wrong) and np.any(np.asarray(wrong)):
+                number = int(np.flatnonzero(np.asarray(wrong))[0])
+                raise ValueError(f"{group.effect.kind} {name!r}: element {number} {said}")
+
+
+@eager_numpy
+def _flaws(effect: Effect) -> dict[str, Array]:
+    return jax.vmap(lambda e: e.flaws())(effect)
+
+
+def _declared(module: Any, path: str) -> Any:
+    """What a number of a part was declared to be, if it was."""
+    owner, _, rest = path.partition(".")
+    fields = {f.name: f for f in dataclasses.fields(module)}
+    if owner not in fields:
+        return None
+    if rest:
+        inner = getattr(module, owner)
+        return _declared(inner, rest) if dataclasses.is_dataclass(inner) else None
+    return fields[owner].metadata.get(DECLARED)
 
 
 def _renewed(before: System, after: System, name: str, given: set[str]) -> System:

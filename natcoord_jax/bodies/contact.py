@@ -21,13 +21,11 @@ from natcoord_jax.core.numeric import COMPONENTS, Directions, Number
 from natcoord_jax.core.recipe import Builder, Recipe
 from natcoord_jax.effects.contact import (
     CapsuleOnCapsule,
-    ContactLoss,
     EllipsoidOnPlane,
     GapPotential,
     SphereOnBox,
     SphereOnPlane,
     SphereOnSphere,
-    damping_of,
 )
 
 
@@ -136,14 +134,17 @@ class Contact(Recipe):
     momentum are exact, at impacts of any number of bodies, too.
 
     There are gaps for spheres, capsules, boxes (by their corners), ellipsoids, points and the nodes of shells
-    and solids on planes; for spheres, capsules and points on each other; for spheres and points on boxes.
+    and solids on planes; for spheres and capsules on each other and on points and nodes; for spheres and
+    points on boxes. A shell or a solid is touched at its nodes only: what is smaller than its cells slips
+    through. Where a step is longer than a body, it may pass another without ever overlapping with it.
 
     Attributes:
         one: handle of a body with a shape, of a point mass or a node, or of a shell or a solid.
         other: `nc.Plane`, or another handle of that kind.
         stiffness: k [N/m] of each contact: of each corner of a box on a plane, of each node; with law="hertz"
             [N/m^1.5], for spheres 4/3 E* sqrt(R).
-        restitution: part of the closing speed that is left after an impact [-]; 1: nothing is lost.
+        restitution: part of the closing speed that is left after an impact [-], where no other force acts
+            (weight in a soft contact takes some more of it); None: nothing is lost.
         speed: of the impact that `restitution` is of [m/s]; less is lost of slower ones.
         law: force proportional to the overlap, "linear", or to its power 3/2, "hertz".
         name: of the contact; several gaps are called "name[0]" and so on.
@@ -167,7 +168,7 @@ class Contact(Recipe):
     one: Handle = eqx.field(static=True, metadata=is_a(SOLID))
     other: Any = eqx.field(metadata=is_a(SIDE))
     stiffness: Any = eqx.field(kw_only=True, metadata=is_a(Number("positive")))
-    restitution: Any = eqx.field(default=1.0, kw_only=True, metadata=is_a(Number("positive")))
+    restitution: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Number("positive")))
     speed: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Number("positive")))
     law: str = eqx.field(
         default="linear", kw_only=True, static=True, metadata=is_a(Choice(("linear", "hertz")))
@@ -177,35 +178,17 @@ class Contact(Recipe):
     kind = "contact"
 
     def add_to(self, scene: Builder, name: str) -> tuple[Handle, ...]:
-        """Add its gaps, and what impacts lose; handles of the gaps."""
-        if self.one == self.other:
+        """Add its gaps; their handles."""
+        plane = self.other.body if isinstance(self.other, Plane) else self.other
+        if self.one == plane:
             raise ValueError(f"contact {name!r}: {self.one.name!r} would be in contact with itself")
-        law, damping = {"stiffness": self.stiffness, "law": self.law}, self._damping(name)
+        law = {"stiffness": self.stiffness, "law": self.law}
+        if self.restitution is not None:
+            law |= {"restitution": self.restitution, "speed": self.speed}
         solids = self._solids(scene, self.one, name)
         gaps = [gap for solid in solids for gap in self._gaps(scene, solid, law, name)]
-        handles = []
-        for k, gap in enumerate(gaps):
-            said = name if len(gaps) == 1 else f"{name}[{k}]"
-            handles.append(scene.add(replace_fields(gap, name=said)))
-            if damping is not None:
-                scene.add(ContactLoss(gap.markers, contact=gap, damping=damping, name=f"{said} loss"))
-        return tuple(handles)
-
-    def _damping(self, name: str) -> Any:
-        """For the restitution; None: nothing is lost."""
-        if is_concrete(self.restitution) and float(self.restitution) > 1:
-            raise ValueError(
-                f"contact {name!r}: restitution [-] is {float(self.restitution):g}; pass a number up to 1: "
-                "an impact gives nothing"
-            )
-        if self.speed is None:
-            if not is_concrete(self.restitution) or float(self.restitution) < 1:
-                raise ValueError(
-                    f"contact {name!r}: restitution [-] is that of one speed, since slower impacts lose "
-                    "less; pass `speed` [m/s], too"
-                )
-            return None
-        return damping_of(self.restitution, self.speed)
+        named = (name if len(gaps) == 1 else f"{name}[{k}]" for k in range(len(gaps)))
+        return tuple(scene.add(replace_fields(gap, name=said)) for gap, said in zip(gaps, named))
 
     def _gaps(self, scene: Builder, solid: _Solid, law: dict[str, Any], name: str) -> list[GapPotential]:
         if isinstance(self.other, Plane):
@@ -213,6 +196,11 @@ class Contact(Recipe):
         found: list[GapPotential] = []
         for second in self._solids(scene, self.other, name):
             gaps = _between(solid, second, law)
+            if solid.shape is None and second.shape is None:
+                raise ValueError(
+                    f"contact {name!r}: {solid.handle.name!r} and {second.handle.name!r} are points, which "
+                    "do not overlap; give one of them a shape"
+                )
             if gaps is None:
                 shapes = [type(s.shape).__name__ for s in (solid, second)]
                 raise ValueError(

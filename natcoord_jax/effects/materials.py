@@ -46,6 +46,11 @@ class Elastic(Part):
                 "cannot change, and such a material needs a pressure of its own"
             )
 
+    def flaws(self) -> dict[str, Array]:
+        """What may be wrong with its numbers, see `Effect.flaws`."""
+        said = "has Poisson's ratio nu [-] not between -1 and 1/2: pass one between them"
+        return {said: (self.nu <= -1.0) | (self.nu >= 0.5)}
+
     @property
     def shear_modulus(self) -> Any:
         """G [N/m^2]."""

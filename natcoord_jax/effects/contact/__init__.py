@@ -1,6 +1,5 @@
 """Contact between surfaces."""
 
-from natcoord_jax.effects.contact.gap_potential import ContactLoss as ContactLoss
 from natcoord_jax.effects.contact.gap_potential import GapPotential as GapPotential
 from natcoord_jax.effects.contact.gap_potential import damping_of as damping_of
 from natcoord_jax.effects.contact.pairs import CapsuleOnCapsule as CapsuleOnCapsule

@@ -2,7 +2,8 @@
 
 The gap is a function of invariants of the markers, so that energy, momentum and angular momentum are exact in
 contact as everywhere. An overlap never holds more than the energy there is: the penetration is bounded by
-that whatever the step. What impacts lose is an effect of its own, there only where it is asked for.
+that whatever the step. What impacts lose is a part of the force that grows with the speed at which the gap
+closes; it is there only where a restitution is asked for.
 """
 
 import abc
@@ -11,16 +12,16 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.core.arguments import is_a
-from natcoord_jax.core.checks import as_array
+from natcoord_jax.core.checks import as_array, is_concrete
 from natcoord_jax.core.eager_numpy import eager_numpy
-from natcoord_jax.core.effect import Effect, Motion, Response, StepContext, replace_fields
-from natcoord_jax.core.kinds import NAME, Choice, of
-from natcoord_jax.core.markers import Markers
+from natcoord_jax.core.effect import Motion, Response, StepContext, replace_fields
+from natcoord_jax.core.kinds import Choice
 from natcoord_jax.core.numeric import Number
-from natcoord_jax.core.potential import Potential, marker_response, place_markers
+from natcoord_jax.core.potential import Potential, place_markers
 from natcoord_jax.maths.vectors import positive_part
 
 HERTZ = "hertz"
@@ -79,10 +80,18 @@ class ContactReadings(eqx.Module):
 class GapPotential(Potential):
     """Base of contacts between two surfaces: subclass it and give `invariants` and `gap`.
 
+    With a restitution, what impacts lose is the work in its account, which is never positive.
+
     Attributes:
         markers: that the invariants are of.
         stiffness: k [N/m] of the linear law, force k d of an overlap d; of Hertz' law [N/m^1.5], k d^1.5.
         law: "linear" or "hertz".
+        restitution: part of the closing speed that is left after an impact [-], above 0 up to 1; None: all.
+        speed: of the impact that `restitution` is of [m/s].
+        damping: part of the force per closing speed [s/m], follows from the two.
+
+    Raises:
+        ValueError: for a restitution above one, or one without the speed that it is of.
 
     Example:
         >>> import natcoord_jax as nc
@@ -95,10 +104,62 @@ class GapPotential(Potential):
 
     stiffness: Any = eqx.field(kw_only=True, metadata=is_a(Number("positive")))
     law: str = eqx.field(default="linear", kw_only=True, static=True, metadata=is_a(LAW))
+    restitution: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Number("positive")))
+    speed: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Number("positive")))
+    damping: Any = eqx.field(default=None, init=False)
 
     kind: ClassVar[str] = "contact"
+    derived: ClassVar[tuple[str, ...]] = ("damping",)
     drawn: ClassVar[bool] = False
     silent: ClassVar[bool] = False
+
+    def __check_init__(self) -> None:
+        """Refuse what gives energy, and a restitution of no speed."""
+        value = self.restitution
+        if value is not None and is_concrete(value) and np.any(np.asarray(value) > 1):
+            raise ValueError(
+                f"{type(self).__name__}: restitution [-] is {value}; pass a number up to 1: an impact "
+                "gives nothing"
+            )
+        if (value is None) != (self.speed is None):
+            raise ValueError(
+                f"{type(self).__name__}: restitution [-] is that of one speed, since slower impacts lose "
+                "less; pass `restitution` and `speed` [m/s], or neither"
+            )
+
+    @property
+    def works(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Whether anything is lost, which its account then has."""
+        return self.restitution is not None
+
+    def assembled_at(self, x: Array) -> "GapPotential":
+        """With its damping."""
+        return self.renewed()
+
+    def renewed(self) -> "GapPotential":
+        """With the damping for its restitution."""
+        if self.restitution is None:
+            return self
+        return replace_fields(self, damping=damping_of(self.restitution, self.speed))
+
+    def respond(self, place: Array, motion: Motion, now: StepContext, lam: Array) -> Response:
+        """That of the potential, and more of it where the gap closes; together they never pull."""
+        found = super().respond(place, motion, now, lam)
+        if self.damping is None:
+            return found
+        x, rates = place_markers(place, motion.rows), place_markers(place, motion.rates)
+        flow = jax.vmap(lambda xi, vi: jax.jvp(self.invariants, (xi,), (vi,))[1])(x, rates)
+        start: Any = self.invariants(place_markers(place, motion.start))
+        closing = self._closing(start, jnp.asarray(now.tableau.b) @ flow, now.h)
+        factor = 1.0 + jnp.maximum(self.damping * closing, -1.0)
+        forces: Any = found.forces
+        return replace_fields(found, forces=factor * forces, power=factor * found.power)
+
+    def _closing(self, start: Any, flow: Any, h: Any) -> Any:
+        """Mean rate at which the gap closes in the step [m/s]; at one instant the rate."""
+        moving = h > 0
+        mean = (self.gap(start) - self.gap(start + h * flow)) / jnp.where(moving, h, 1.0)
+        return jnp.where(moving, mean, -jax.jvp(self.gap, (start,), (flow,))[1])
 
     @abc.abstractmethod
     def gap(self, invariants: Float[Array, " p"]) -> Float[Array, ""]:
@@ -122,57 +183,6 @@ class GapPotential(Potential):
         overlap = positive_part(-gap)
         force = self.stiffness * overlap * (_root(overlap) if self.law == HERTZ else 1.0)
         return ContactReadings(gap, force, energy)
-
-
-def _without_markers(contact: GapPotential) -> GapPotential:
-    return replace_fields(contact, markers=None, name=None)
-
-
-CONTACT = of("a contact, as nc.SphereOnPlane(...)", GapPotential)
-
-
-class ContactLoss(Effect):
-    """What impacts lose: a part of the force of a contact that grows with the speed at which its gap closes.
-
-    It does work on the bodies that is never positive, by the change of the gap in a step, and pushes where
-    the contact does, so that momentum and angular momentum are kept.
-
-    Attributes:
-        markers: those of the contact.
-        contact: a contact with the same markers.
-        damping: part of its force per closing speed [s/m], see `damping_of`.
-    """
-
-    markers: Any = eqx.field(metadata=is_a(Markers()))
-    contact: GapPotential = eqx.field(kw_only=True, metadata=is_a(CONTACT), converter=_without_markers)
-    damping: Any = eqx.field(kw_only=True, metadata=is_a(Number("not negative")))
-    name: Any = eqx.field(default=None, kw_only=True, metadata=is_a(NAME))
-
-    kind: ClassVar[str] = "contact loss"
-    drawn: ClassVar[bool] = False
-    works: ClassVar[bool] = True
-
-    def attach(self, find: Any) -> Any:
-        """Markers of the contact."""
-        return self.markers
-
-    def respond(self, place: Array, motion: Motion, now: StepContext, lam: Array) -> Response:
-        """Force of the contact times the speed at which its gap closes; together they never pull."""
-        x, rates = place_markers(place, motion.rows), place_markers(place, motion.rates)
-        flow = jax.vmap(lambda xi, vi: jax.jvp(self.contact.invariants, (xi,), (vi,))[1])(x, rates)
-        start = self.contact.invariants(place_markers(place, motion.start))
-        stress = self.contact.averaged(start, now.h * flow, now.tableau)
-        part = self.damping * self._closing(start, jnp.asarray(now.tableau.b) @ flow, now.h)
-        part = jnp.maximum(part, -1.0)
-        held = place_markers(place, motion.held.rows)
-        forces = -part * jax.vmap(self.contact.pulled_back)(held, stress)
-        return marker_response(place, forces, None, rates, motion)
-
-    def _closing(self, start: Array, flow: Array, h: Array) -> Array:
-        """Mean rate at which the gap closes in the step [m/s]; at one instant the rate."""
-        gap, moving = self.contact.gap, h > 0
-        mean = (gap(start) - gap(start + h * flow)) / jnp.where(moving, h, 1.0)
-        return jnp.where(moving, mean, -jax.jvp(gap, (start,), (flow,))[1])
 
 
 def _root(x: Array) -> Array:

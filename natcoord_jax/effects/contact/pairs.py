@@ -13,8 +13,8 @@ from natcoord_jax.effects.contact.gap_potential import GapPotential
 from natcoord_jax.maths.vectors import dot
 
 RADIUS = Number("not negative")
-PARALLEL = 1e-12
-"""Squared sine of the angle between segments below which any point of the shorter overlap is nearest."""
+TOWARDS_MIDDLE = 1e-3
+"""How much nearest points of two segments are drawn to their middles: those of parallel ones are so told."""
 
 
 def _length(square: Array) -> Array:
@@ -97,25 +97,28 @@ class CapsuleOnCapsule(GapPotential):
 
 
 def segment_distance_square(products: Float[Array, "6"]) -> Float[Array, ""]:
-    """Least square of the distance of two segments r + s d_1 - t d_2 with s and t from 0 to 1.
+    """Square of the distance of two segments r + s d_1 - t d_2 with s and t from 0 to 1, nearly the least.
 
-    Source: C. Ericson, Real-Time Collision Detection, 2005, section 5.1.9; here with derivatives, of the
-    nearest points too.
+    The nearest points of parallel segments are no points: they jump from end to end as these turn. So what is
+    least here is the square of the distance and a little of how far the points are from the middles of the
+    segments, `TOWARDS_MIDDLE` of the product of their lengths.
+
+    Source: C. Ericson, Real-Time Collision Detection, 2005, section 5.1.9, for the limits; here with
+    derivatives, of the nearest points too.
 
     Args:
         products: d_1.d_1, d_2.d_2, d_1.d_2, d_1.r, d_2.r and r.r.
     """
     a, e, b, c, f, square = products
-    sine = a * e - b * b
-    slanted, long, other = sine > PARALLEL * a * e, a > 0, e > 0
-    s = jnp.where(slanted, jnp.clip((b * f - c * e) / jnp.where(slanted, sine, 1.0), 0.0, 1.0), 0.5)
-    t = jnp.where(other, (b * s + f) / jnp.where(other, e, 1.0), 0.0)
-    inside = jnp.clip(t, 0.0, 1.0)
-    # Where the second end is beyond its segment, or there is none, the first point is that nearest to it.
-    again = jnp.clip((b * inside - c) / jnp.where(long, a, 1.0), 0.0, 1.0)
-    s = jnp.where(long, jnp.where((t == inside) & slanted & other, s, again), 0.0)
-    # (Parallel segments: from the nearest point of the first once more to the second.)
-    t = jnp.where(other, jnp.clip((b * s + f) / jnp.where(other, e, 1.0), 0.0, 1.0), 0.0)
+    little = TOWARDS_MIDDLE * (a + e)
+    stiff_s, stiff_t = a + little, e + little
+    some = little > 0
+    determinant = jnp.where(some, stiff_s * stiff_t - b * b, 1.0)
+    # Least of a s^2 + e t^2 - 2 b s t + 2 c s - 2 f t + little ((s - 1/2)^2 + (t - 1/2)^2).
+    pull_s, pull_t = 0.5 * little - c, 0.5 * little + f
+    s = jnp.clip((stiff_t * pull_s + b * pull_t) / determinant, 0.0, 1.0)
+    t = jnp.clip((b * s + pull_t) / jnp.where(some, stiff_t, 1.0), 0.0, 1.0)
+    s = jnp.clip((b * t + pull_s) / jnp.where(some, stiff_s, 1.0), 0.0, 1.0)
     return square + a * s * s + e * t * t + 2 * (c * s - f * t - b * s * t)
 
 

@@ -233,7 +233,10 @@ class ShellElement(Potential):
 
     def flaws(self) -> dict[str, Array]:
         """Corners that are no corners."""
-        return {"is degenerate or turned over: list its nodes in turn round it": jnp.min(self.areas) <= 0.0}
+        return {
+            "is degenerate or turned over: list its nodes in turn round it": jnp.min(self.areas) <= 0.0,
+            **self.material.flaws(),
+        }
 
     def invariants(self, x: Float[Array, "4 m 3 *n"]) -> Float[Array, "16 *n"]:
         """Membrane [m^2], curvature [m] and shear [m]."""

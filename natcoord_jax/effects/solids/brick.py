@@ -158,7 +158,7 @@ class Brick(Potential):
     def flaws(self) -> dict[str, Array]:
         """Corners that are no corners."""
         said = "is degenerate or turned inside out: list four nodes in turn round one face, then those above"
-        return {said: jnp.min(self.volumes) <= 0.0}
+        return {said: jnp.min(self.volumes) <= 0.0, **self.material.flaws()}
 
     def invariants(self, x: Float[Array, "8 3 *n"]) -> Float[Array, "48 *n"]:
         """Strains of Green and Lagrange at the Gauss points [-]."""
