@@ -19,7 +19,7 @@ README = ROOT / "README.md"
 PAGES = sorted(
     page.relative_to(DOCS).as_posix()
     for page in DOCS.rglob("*.md")
-    if not page.relative_to(DOCS).parts[0] in ("_build", "notebooks")
+    if page.relative_to(DOCS).parts[0] not in ("_build", "notebooks")
 )
 MODULES = sorted(
     module.name
@@ -36,7 +36,7 @@ names = {"__name__": "page"}
 for number, block in enumerate(blocks_of(Path(sys.argv[2]))):
     exec(compile(block, f"{sys.argv[2]}, block {number + 1}", "exec"), names)
 if sys.argv[2].endswith("README.md"):
-    assert names["energies"].shape == (3,) and names["heavier"] is not None
+    assert names["angles"].shape == (32,) and names["by_mass"] != 0
     assert names["gradient"].shape == names["torques"].shape
 """
 
@@ -66,6 +66,23 @@ def test_page_runs(page: str, tmp_path: Path):
     run_page(DOCS / page, tmp_path)
 
 
+def test_readme_has_figures_of_the_pages():
+    """Every figure of the README's table is on a page, with what it was measured on."""
+
+    def figures(text: str) -> set[str]:
+        return set(re.findall(r"(?<![\w.])\d[\d.]*(?:e-?\d+)?(?![\w.]*\d)", text.replace(" 000", "000")))
+
+    table = [line for line in README.read_text("utf-8").splitlines() if line.startswith("| ")]
+    pages = "".join(page.read_text("utf-8") for page in sorted((DOCS / "howto").glob("*.md")))
+    assert len(table) >= 10
+    missing = figures("\n".join(table)) - figures(pages)
+    assert not missing, f"figures of the README that no page has: {missing}"
+
+
+def test_readme_is_short():
+    assert 120 <= len(README.read_text("utf-8").splitlines()) <= 160
+
+
 def test_links_lead_somewhere():
     for page in (README, *(DOCS / page for page in PAGES)):
         for target in re.findall(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", page.read_text("utf-8")):
@@ -86,7 +103,18 @@ def test_pages_build(tmp_path: Path):
     """As HTML, without a warning."""
     for package in ("sphinx", "furo", "myst_nb"):
         pytest.importorskip(package, reason='pages are built with: python -m pip install ".[docs]"')
-    command = [sys.executable, "-m", "sphinx", "-W", "-E", "-q", "-b", "html", str(DOCS), str(tmp_path / "html")]
+    command = [
+        sys.executable,
+        "-m",
+        "sphinx",
+        "-W",
+        "-E",
+        "-q",
+        "-b",
+        "html",
+        str(DOCS),
+        str(tmp_path / "html"),
+    ]
     run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert run.returncode == 0, run.stderr[-3000:]
     assert (tmp_path / "html" / "index.html").exists()
