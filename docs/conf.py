@@ -50,6 +50,12 @@ def bring_notebooks(app) -> None:
             shutil.copyfile(file, copy)
 
 
+def lead_to_copies(app, docname: str, source: list[str]) -> None:
+    """Links to notebooks, which are true in the repository, lead to their copies here."""
+    up = "../" * docname.count("/")
+    source[0] = source[0].replace(f"]({up}../notebooks/", f"]({up}notebooks/")
+
+
 def keep_signs(app, what, name, obj, options, lines: list[str]) -> None:
     """Let `|u|`, `*` and a trailing `_` in docstrings stand for themselves, as they do in plain text."""
     for k, line in enumerate(lines):
@@ -71,5 +77,6 @@ def keep_types(app, what, name, obj, options, lines: list[str]) -> None:
 def setup(app) -> None:
     """Connect what is above, before and after napoleon."""
     app.connect("builder-inited", bring_notebooks)
+    app.connect("source-read", lead_to_copies)
     app.connect("autodoc-process-docstring", keep_signs, priority=100)
     app.connect("autodoc-process-docstring", keep_types, priority=900)
