@@ -1,32 +1,123 @@
-"""What the documentation shows runs: blocks of the README, examples in docstrings."""
+"""What the documentation shows runs: blocks of the README and of the pages, examples in docstrings."""
 
 import doctest
 import importlib
+import os
 import pkgutil
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
-import natcoord_jax
+import natcoord_jax as nc
 
-README = Path(__file__).resolve().parents[1] / "README.md"
-BLOCKS = re.findall(r"```python\n(.*?)```", README.read_text("utf-8"), re.DOTALL)
+ROOT = Path(__file__).resolve().parents[1]
+DOCS = ROOT / "docs"
+README = ROOT / "README.md"
+PAGES = sorted(
+    page.relative_to(DOCS).as_posix()
+    for page in DOCS.rglob("*.md")
+    if page.relative_to(DOCS).parts[0] not in ("_build", "notebooks")
+)
 MODULES = sorted(
     module.name
-    for module in pkgutil.walk_packages(natcoord_jax.__path__, "natcoord_jax.")
+    for module in pkgutil.walk_packages(nc.__path__, "natcoord_jax.")
     if not module.name.endswith("__main__")
 )
+RUN = """
+import sys
+from pathlib import Path
+sys.path.insert(0, sys.argv[1])
+sys.path.insert(0, sys.argv[1] + "/tests")
+from test_docs import blocks_of
+names = {"__name__": "page"}
+for number, block in enumerate(blocks_of(Path(sys.argv[2]))):
+    exec(compile(block, f"{sys.argv[2]}, block {number + 1}", "exec"), names)
+if sys.argv[2].endswith("README.md"):
+    assert names["angles"].shape == (32,) and names["by_mass"] != 0
+    assert names["gradient"].shape == names["torques"].shape
+"""
+
+
+def blocks_of(page: Path) -> list[str]:
+    """The Python blocks of a page."""
+    return re.findall(r"^```python\n(.*?)^```", page.read_text("utf-8"), re.DOTALL | re.MULTILINE)
+
+
+def run_page(page: Path, folder: Path) -> None:
+    """All blocks of a page, in one process of their own, with the current folder for what they write."""
+    env = os.environ | {"JAX_PLATFORMS": "cpu", "MPLBACKEND": "agg"}
+    command = [sys.executable, "-c", RUN, str(ROOT), str(page)]
+    run = subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr[-3000:]
 
 
 @pytest.mark.slow
-def test_readme_runs():
-    assert len(BLOCKS) >= 3, "README.md shows no code"
-    names: dict = {"__name__": "readme"}
-    for number, block in enumerate(BLOCKS):
-        exec(compile(block, f"README.md, block {number + 1}", "exec"), names)
-    assert names["energies"].shape == (3,) and names["slower"] != 0
-    assert names["gradient"].shape == names["torques"].shape
+def test_readme_runs(tmp_path: Path):
+    assert len(blocks_of(README)) >= 3, "README.md shows no code"
+    run_page(README, tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", [page for page in PAGES if blocks_of(DOCS / page)])
+def test_page_runs(page: str, tmp_path: Path):
+    run_page(DOCS / page, tmp_path)
+
+
+def test_readme_has_figures_of_the_pages():
+    """Every figure of the README's table is on a page, with what it was measured on."""
+
+    def figures(text: str) -> set[str]:
+        return set(re.findall(r"(?<![\w.])\d[\d.]*(?:e-?\d+)?(?![\w.]*\d)", text.replace(" 000", "000")))
+
+    table = [line for line in README.read_text("utf-8").splitlines() if line.startswith("| ")]
+    pages = "".join(page.read_text("utf-8") for page in sorted((DOCS / "howto").glob("*.md")))
+    assert len(table) >= 10
+    missing = figures("\n".join(table)) - figures(pages)
+    assert not missing, f"figures of the README that no page has: {missing}"
+
+
+def test_readme_is_short():
+    assert 120 <= len(README.read_text("utf-8").splitlines()) <= 160
+
+
+def test_links_lead_somewhere():
+    for page in (README, *(DOCS / page for page in PAGES)):
+        for target in re.findall(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", page.read_text("utf-8")):
+            if not target.startswith(("http:", "https:", "mailto:")):
+                assert (page.parent / target).exists(), f"{page.relative_to(ROOT)} links to {target}"
+
+
+def test_reference_is_complete():
+    """Every public name has its entry in the reference."""
+    pages = "".join((DOCS / page).read_text("utf-8") for page in PAGES if page.startswith("api/"))
+    listed = set(re.findall(r"^\.\. auto(?:class|function|data):: (\w+)$", pages, re.MULTILINE))
+    modules = set(re.findall(r"^## (\w+): ", pages, re.MULTILINE))
+    assert set(nc.__all__) <= listed | modules, set(nc.__all__) - listed - modules
+
+
+@pytest.mark.slow
+def test_pages_build(tmp_path: Path):
+    """As HTML, without a warning."""
+    for package in ("sphinx", "furo", "myst_nb"):
+        pytest.importorskip(package, reason='pages are built with: python -m pip install ".[docs]"')
+    command = [
+        sys.executable,
+        "-m",
+        "sphinx",
+        "-W",
+        "-E",
+        "-q",
+        "-b",
+        "html",
+        str(DOCS),
+        str(tmp_path / "html"),
+    ]
+    run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr[-3000:]
+    assert (tmp_path / "html" / "index.html").exists()
 
 
 @pytest.mark.parametrize("name", MODULES)
