@@ -302,3 +302,16 @@ def test_ties_that_do_not_meet_are_refused():
         scene.add(nc.Tie(blocks[1].face("x0"), blocks[0].face("x1")))
     with pytest.raises(ValueError, match="do not meet at node"):
         scene.add(nc.Tie(blocks[2].face("x0"), blocks[0].face("x1")))
+
+
+def test_traced_numbers_go_in_by_set():
+    """A scene with elements is compiled outside of traced functions, and says so."""
+
+    def built(thickness):
+        scene = nc.Scene()
+        part = scene.add(square(thickness=thickness))
+        scene.add(nc.Clamp(nc.ground, part.set("left")))
+        return scene.compile()[1].q
+
+    with pytest.raises(ValueError, match="outside of jit and grad, and pass what varies by system.set"):
+        jax.jit(built)(0.1)

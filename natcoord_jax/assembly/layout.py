@@ -16,7 +16,7 @@ from natcoord_jax.assembly.grouping import Instance, bare, families
 from natcoord_jax.assembly.rates import row_rates
 from natcoord_jax.assembly.system import CoordinateGroup
 from natcoord_jax.core.bodies import DIRECTOR, TRIAD
-from natcoord_jax.core.checks import as_array
+from natcoord_jax.core.checks import as_array, is_concrete
 from natcoord_jax.core.coordinate import Coordinate, CoordinateEffect
 from natcoord_jax.core.eager_numpy import eager_numpy, stacked
 from natcoord_jax.core.effect import Effect, replace_fields
@@ -85,7 +85,13 @@ class Layout:
         for members, owner in self.bodies.clamped(name):
             numbers[members] = self.poses.of(owner)
             for k in members:
-                rows[k] = np.asarray(self.poses.held(Handle("body", f"{name}[{k}]", owner.scene)))
+                held = self.poses.held(Handle("body", f"{name}[{k}]", owner.scene))
+                if not is_concrete(held):
+                    raise ValueError(
+                        f"nodes {name!r}: some are clamped, and the scene is compiled in a traced function; "
+                        "compile it outside of jit and grad, and pass what varies by system.set"
+                    )
+                rows[k] = np.asarray(held)
         return numbers, rows
 
     def masses(self) -> Float[Array, "bodies 4 4"]:

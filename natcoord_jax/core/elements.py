@@ -57,6 +57,11 @@ class Elements(eqx.Module):
             ValueError: for an element that cannot be, with its number and its nodes.
         """
         n = len(self)
+        if not is_concrete(bare, self.each):
+            raise ValueError(
+                f"{label}: their numbers are traced; compile the scene outside of jit and grad, and pass "
+                "what varies by system.set"
+            )
         given = jax.tree.map(lambda x: np.broadcast_to(np.asarray(x), (n, *np.shape(x))), bare)
         given = replace_fields(given, **{key: as_array(value, float) for key, value in self.each.items()})
         if type(bare).assembled_at is Effect.assembled_at:

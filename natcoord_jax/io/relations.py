@@ -127,7 +127,10 @@ def list_the_rest(model: Any, notes: Notes) -> None:
     """What a robot has no place for."""
     contacts = int(np.sum((model.geom_contype != 0) | (model.geom_conaffinity != 0)))
     if contacts > 1 or model.npair:
-        notes.left_out(f"contact of {contacts} geoms", "there is no contact in this simulator yet")
+        notes.left_out(
+            f"contact of {contacts} geoms",
+            "contacts of a file are not read; add nc.Contact between its bodies",
+        )
     for tendon in range(model.ntendon):
         name = model.tendon(tendon).name or f"tendon {tendon + 1}"
         acting = ("stiffness", "damping", "frictionloss", "armature", "limited")

@@ -164,6 +164,10 @@ def scenery_of(
         *beam_skins(system, states, rows, saved, colour, beams),
         *element_skins(system, states, rows, saved, colour),
     ]
+    unknown = set() if isinstance(colour, str) else set(colour) - {skin.name for skin in skins}
+    if unknown:
+        known = sorted(skin.name for skin in skins)
+        raise ValueError(f"colour: nothing with elements is called {sorted(unknown)[0]!r}; there is {known}")
     meshes = bodies_of(system, drawn_bodies(system))
     scale = _scale(system, meshes, rows, skins)
     given = np.asarray(trajectory.inputs)
