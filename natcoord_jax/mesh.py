@@ -141,11 +141,11 @@ def cleaned(
         <mesh: 6 nodes, 2 quadrilaterals>
     """
     place = np.asarray(nodes, float)
-    found = _places(place)[np.asarray(cells)]
+    first = _places(place)
+    found = first[np.asarray(cells)]
     kept = np.unique(found)
     number = np.full(len(place), -1)
     number[kept] = np.arange(len(kept))
-    first = _places(place)
 
     def renumbered(x: Any) -> np.ndarray:
         return number[first[np.asarray(x, int)]]

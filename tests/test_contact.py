@@ -95,6 +95,31 @@ def test_restitution_follows_what_is_set():
         assert float(run(system.set("bounce", **changed))) == pytest.approx(expected, abs=0.01)
 
 
+@pytest.mark.parametrize("numbers", [{"restitution": 1.2}, {"restitution": 0.0}, {"stiffness": 0.0}])
+def test_what_would_give_energy_is_not_set(numbers):
+    scene = nc.Scene()
+    ball = scene.add(nc.RigidBody(**BALL, position=(0, 0, 0.2)))
+    scene.add(nc.Contact(ball, FLOOR, stiffness=2e4, restitution=0.5, speed=1.0, name="bounce"))
+    with pytest.raises(ValueError, match=f"sphere on plane 'bounce'.*{next(iter(numbers))}"):
+        scene.compile()[0].set("bounce", **numbers)
+
+
+@pytest.mark.parametrize(
+    "scheme",
+    [nc.EnergyMomentum(), nc.EnergyMomentum(kick=True), nc.EnergyMomentum(order=4), nc.Dissipative()],
+)
+def test_losses_are_booked_once(scheme):
+    """By every scheme that books: what an impact loses is the contact's, what damping takes is not."""
+    scene = nc.Scene()
+    scene.add(nc.Gravity())
+    ball = scene.add(nc.RigidBody(**BALL, position=(0, 0, 0.3)))
+    scene.add(nc.Contact(ball, FLOOR, stiffness=2e4, restitution=0.6, speed=2.0, name="bounce"))
+    system, state = scene.compile()
+    trajectory = nc.simulate(system, state, dt=2e-3, steps=300, scheme=scheme)
+    assert nc.balance(system, trajectory).energy.max() <= STIFF
+    assert float(system.work(trajectory)["bounce"][-1]) < -0.5
+
+
 def test_elastic_impact_at_large_steps():
     """Not resolved at all, and still nothing is lost: the speed is that before."""
     assert collision(1e-3) == pytest.approx(10.0, rel=1e-9)

@@ -8,6 +8,7 @@ import tolerances as tol
 from differences import assert_v_shaped
 
 import natcoord_jax as nc
+from natcoord_jax.analysis import static_equations
 
 METAL = nc.Elastic(E=2e5, nu=0.3, density=1200.0)
 
@@ -121,9 +122,9 @@ def test_numbers_follow_those_that_are_set():
 @pytest.mark.parametrize(
     ("numbers", "message"),
     [
-        ({"thickness": -0.1}, "shell 'body': thickness is negative"),
-        ({"nu": 0.6}, "shell 'body': element 0 has Poisson's ratio nu"),
-        ({"E": -1.0}, "material.E is negative"),
+        ({"thickness": -0.1}, "shell 'body': thickness is -0.1; pass positive"),
+        ({"nu": 0.6}, "element 0 of shell 'body' has Poisson's ratio nu"),
+        ({"E": -1.0}, "material.E is -1; pass positive"),
     ],
 )
 def test_impossible_numbers_are_not_set(numbers, message):
@@ -292,6 +293,35 @@ def test_a_tie_in_motion(amplitude):
     assert system.constraint_errors(trajectory).position.max() <= 1e-12
     stored = np.asarray(system.energy(trajectory).stores["fine"])
     assert stored.max() >= 1e-3 * float(system.energy(state).kinetic)
+
+
+@pytest.mark.slow
+def test_statics_of_tied_meshes_by_the_sparse_plan(monkeypatch):
+    """With multipliers, as the dense matrix has them; with gradients."""
+    scene = nc.Scene()
+    scene.add(nc.Gravity())
+    one = scene.add(nc.Solid(nc.mesh.box((1.0, 0.8, 0.8), (3, 3, 3)), material=METAL))
+    fine = nc.mesh.box((1.0, 0.8, 0.8), (3, 4, 4))
+    two = scene.add(nc.Solid(fine, material=METAL, position=(1, 0, 0), name="fine"))
+    scene.add(nc.Tie(two.face("x0"), one.face("x1")))
+    scene.add(nc.Clamp(nc.ground, one.set("x0")))
+    system, state = scene.compile()
+    assert system.structure.solver == "sparse" and system.local_rates.count > static_equations.DENSE
+    tip = system.body_index(two.nearest((2, 0, 0)))
+
+    def height(E):
+        return nc.equilibrium(system.set("fine", E=E), state, steps=2).state.q[4 * tip, 2]
+
+    found, used = [], []
+    plan = static_equations.factorised
+    monkeypatch.setattr(static_equations, "factorised", lambda *given: used.append(1) or plan(*given))
+    for most in (static_equations.DENSE, 10**6):
+        monkeypatch.setattr(static_equations, "DENSE", most)
+        jax.clear_caches()
+        before = len(used)
+        found.append(jnp.stack(jax.value_and_grad(height)(2e5)))
+        assert (len(used) > before) == (most != 10**6), "not the way that was meant"
+    np.testing.assert_allclose(*found, rtol=1e-9)
 
 
 def test_ties_that_do_not_meet_are_refused():

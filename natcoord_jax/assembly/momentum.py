@@ -111,7 +111,7 @@ class Balance(eqx.Module):
         torque: the same about the reference points [N m s].
         size: of the terms [sqrt(J)].
         rows: rates of all constraints.
-        power: of each group (instances, s) [W].
+        power: of each group, without what it releases from its store (instances, s) [W].
     """
 
     force: Float[Array, "s bodies 3"]
@@ -159,7 +159,7 @@ def momentum_balance(
             torque = turning if torque is None else torque + turning
             size = size + jnp.sum(weights[:, 1] * turning**2)
         rows.append(answer.rows.reshape(-1))
-        power.append(answer.power)
+        power.append(answer.power if answer.released is None else answer.power - answer.released)
     force, moment = wrench(momentum, at.held[:, :-1, 1:])
     moment = moment if torque is None else moment - torque
     return Balance(force, moment, jnp.sqrt(size), jnp.concatenate(rows), power)

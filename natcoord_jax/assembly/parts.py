@@ -16,6 +16,7 @@ from natcoord_jax.core.arguments import DECLARED
 from natcoord_jax.core.checks import as_array, is_concrete
 from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.effect import Effect, replace_fields
+from natcoord_jax.core.flaws import first_flaw
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.names import listed
 
@@ -188,20 +189,17 @@ def _check_signs(after: System, name: str, given: dict[str, Any]) -> None:
         for field, value in given.items():
             kind = _declared(group.effect, field)
             sign = getattr(kind, "sign", "")
-            if sign and is_concrete(value) and np.any(np.asarray(value) < 0):
-                raise ValueError(
-                    f"{group.effect.kind} {name!r}: {field} is negative, {np.min(np.asarray(value)):g}; pass "
-                    f"{'a positive number' if sign == 'positive' else 'a number that is not negative'}"
-                )
-        for said, wrong in _flaws(group.effect).items() if group.lanes else ():
-            if is_concrete(wrong) and np.any(np.asarray(wrong)):
-                number = int(np.flatnonzero(np.asarray(wrong))[0])
-                raise ValueError(f"{group.effect.kind} {name!r}: element {number} {said}")
-
-
-@eager_numpy
-def _flaws(effect: Effect) -> dict[str, Array]:
-    return jax.vmap(lambda e: e.flaws())(effect)
+            if not sign or not is_concrete(value):
+                continue
+            least = float(np.min(np.asarray(value), initial=np.inf))
+            if least < 0 or (least == 0 and sign == "positive"):
+                wanted = "positive numbers" if sign == "positive" else "numbers that are not negative"
+                raise ValueError(f"{group.effect.kind} {name!r}: {field} is {least:g}; pass {wanted}")
+        flaw = first_flaw(group.effect) if group.lanes else None
+        if flaw is not None:
+            number, said = flaw
+            of_them = f"element {number} of " if group.is_set else ""
+            raise ValueError(f"{of_them}{group.effect.kind} {name!r} {said}")
 
 
 def _declared(module: Any, path: str) -> Any:

@@ -92,12 +92,14 @@ class Response(eqx.Module):
         torques: torques on its bodies [N m], in the rows the contravariant forces (61); None: there are none.
         rows: rates of its constraints, which the step sets to zero.
         power: power delivered to the bodies [W], for work accounts.
+        released: the part of it that comes from what is stored, which is in no account; None: none.
     """
 
     forces: Float[Array, "*n s k 4 3"] | None
     torques: Float[Array, "*n s k 3"] | None
     rows: Float[Array, "*n s m"]
     power: Float[Array, "*n s"]
+    released: Float[Array, "*n s"] | None = None
 
 
 class Effect(Part):

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float, Int
 from natcoord_jax.core.checks import as_array, is_concrete
 from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.effect import Effect, replace_fields
+from natcoord_jax.core.flaws import first_flaw
 from natcoord_jax.core.markers import Attachment, Marker, Point
 from natcoord_jax.core.nodes import NodeSet, NodeUnion
 from natcoord_jax.core.potential import place_markers
@@ -67,12 +68,12 @@ class Elements(eqx.Module):
         if type(bare).assembled_at is Effect.assembled_at:
             return given
         found = _assembled(given, as_array(weights), rows)
-        for said, wrong in _flaws(found).items():
-            if is_concrete(wrong) and np.any(wrong):
-                number = int(np.flatnonzero(wrong)[0])
-                raise ValueError(
-                    f"{label}: element {number}, on the nodes {self.connectivity[number].tolist()}, {said}"
-                )
+        flaw = first_flaw(found)
+        if flaw is not None:
+            number, said = flaw
+            raise ValueError(
+                f"{label}: element {number}, on the nodes {self.connectivity[number].tolist()}, {said}"
+            )
         return found
 
 
@@ -82,11 +83,6 @@ def _assembled(effect: Effect, place: Array, rows: Array) -> Effect:
         return effect.assembled_at(place_markers(place, rows))
 
     return jax.vmap(one)(effect, place, rows)
-
-
-@eager_numpy
-def _flaws(effect: Effect) -> dict[str, Array]:
-    return jax.vmap(lambda e: e.flaws())(effect)
 
 
 def on(

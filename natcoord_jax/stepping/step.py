@@ -9,7 +9,6 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.block_tangent_space import Tangents
 from natcoord_jax.assembly.coordinates import stage_rates
-from natcoord_jax.assembly.diagnostics import group_energies
 from natcoord_jax.assembly.end_impulses import released
 from natcoord_jax.assembly.equations import prepare, starting
 from natcoord_jax.assembly.form import dense_solver
@@ -17,7 +16,6 @@ from natcoord_jax.assembly.kick import Kick, ends_of
 from natcoord_jax.assembly.response import Evaluation
 from natcoord_jax.assembly.start_cache import StartCache
 from natcoord_jax.assembly.system import Group, System
-from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import Tableau
 
@@ -101,10 +99,6 @@ def end_of_step(
             done = (1.0 if group.effect.impulsive else h) * (power @ b)
             if group.multipliers and extra is not None:
                 done = done + extra[relation : relation + group.count]
-            if group.effect.stores:
-                # What it stores is in the energy already; the account has what it loses.
-                moved = replace_fields(state, q=q, coordinates=coordinates, rates=rotors)
-                done = done + group_energies(system, group, moved) - group_energies(system, group, state)
             working.append(jnp.sum(done, keepdims=True) if group.is_set else done)
         if group.multipliers and group.source != "joint":
             relation += group.count * group.multipliers

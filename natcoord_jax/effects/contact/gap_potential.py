@@ -132,6 +132,13 @@ class GapPotential(Potential):
         """Whether anything is lost, which its account then has."""
         return self.restitution is not None
 
+    def flaws(self) -> dict[str, Array]:
+        """A restitution that gives energy, or none."""
+        if self.restitution is None:
+            return {}
+        said = "has a restitution [-] that is not above 0 and up to 1: an impact gives nothing"
+        return {said: (self.restitution <= 0.0) | (self.restitution > 1.0)}
+
     def assembled_at(self, x: Array) -> "GapPotential":
         """With its damping."""
         return self.renewed()
@@ -153,7 +160,8 @@ class GapPotential(Potential):
         closing = self._closing(start, jnp.asarray(now.tableau.b) @ flow, now.h)
         factor = 1.0 + jnp.maximum(self.damping * closing, -1.0)
         forces: Any = found.forces
-        return replace_fields(found, forces=factor * forces, power=factor * found.power)
+        given = found.power
+        return replace_fields(found, forces=factor * forces, power=factor * given, released=given)
 
     def _closing(self, start: Any, flow: Any, h: Any) -> Any:
         """Mean rate at which the gap closes in the step [m/s]; at one instant the rate."""
