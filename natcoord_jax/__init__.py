@@ -107,6 +107,8 @@ from natcoord_jax.effects.constraints import PointOnLine, PointOnPlane, PointOnP
 from natcoord_jax.effects.contact import (
     CapsuleOnCapsule,
     EllipsoidOnPlane,
+    Gap,
+    GapConstraint,
     GapPotential,
     SphereOnBox,
     SphereOnPlane,
@@ -203,6 +205,8 @@ __all__ = [
     "Fixed",
     "Force",
     "Frame",
+    "Gap",
+    "GapConstraint",
     "GapPotential",
     "Gravity",
     "Growth",

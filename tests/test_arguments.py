@@ -166,11 +166,18 @@ CALLS = {
         "one": [w.body], "other": [nc.Plane(), w.body], "stiffness": NUMBER, "restitution": NUMBER,
         "speed": NUMBER, "law": ["linear", "hertz"], "name": NAME,
     },
-    "SphereOnPlane": lambda w: {**GAP((w.ends[0], w.direction, w.point)), "radius": NUMBER},
-    "SphereOnSphere": lambda w: {**GAP(w.ends), "radii": [(1.0, 1.0)]},
-    "CapsuleOnCapsule": lambda w: {**GAP(w.ends * 2), "radii": [(1.0, 1.0)]},
-    "EllipsoidOnPlane": lambda w: {**GAP((w.ends[0], w.direction, w.point, *w.triad)), "semi_axes": V},
-    "SphereOnBox": lambda w: {**GAP((*w.ends, *w.triad)), "size": V, "radius": NUMBER},
+    "GapPotential": lambda w: {
+        **MARKED(w.ends), "gap": [nc.SphereOnSphere(radii=(1.0, 1.0))], "stiffness": NUMBER, "restitution": NUMBER,
+        "speed": NUMBER, "law": ["linear", "hertz"],
+    },
+    "GapConstraint": lambda w: {
+        **MARKED(w.ends), "gap": [nc.SphereOnSphere(radii=(1.0, 1.0))], "restitution": NUMBER
+    },
+    "SphereOnPlane": lambda w: {"radius": NUMBER},
+    "SphereOnSphere": lambda w: {"radii": [(1.0, 1.0)]},
+    "CapsuleOnCapsule": lambda w: {"radii": [(1.0, 1.0)]},
+    "EllipsoidOnPlane": lambda w: {"semi_axes": V},
+    "SphereOnBox": lambda w: {"size": V, "radius": NUMBER},
     "FacePressure": lambda w: {**MARKED(w.ends * 2), "pressure": [1.0, f]},
     "Pressure": lambda w: {"surface": [w.shell], "pressure": [1.0, f], "name": NAME},
     "PointSum": lambda w: {**MARKED(w.ends), "weights": [(1.0, -1.0)]},
@@ -393,7 +400,7 @@ MADE = {
     "Optima", "Outcome", "Result", "SimulationError", "Solution", "State", "Surface", "System",
     "Trajectory",
 }  # fmt: skip
-BASES = {"Constraint", "Field", "Force", "GapPotential", "Joint", "Potential", "VelocityConstraint"}
+BASES = {"Constraint", "Field", "Force", "Gap", "Joint", "Potential", "VelocityConstraint"}
 IN_MODULES = {
     "cost": nc.cost, "goal": nc.goal, "bounds": nc.bounds, "inputs": nc.inputs, "mesh": nc.mesh,
 }  # fmt: skip

@@ -100,7 +100,7 @@ def test_what_would_give_energy_is_not_set(numbers):
     scene = nc.Scene()
     ball = scene.add(nc.RigidBody(**BALL, position=(0, 0, 0.2)))
     scene.add(nc.Contact(ball, FLOOR, stiffness=2e4, restitution=0.5, speed=1.0, name="bounce"))
-    with pytest.raises(ValueError, match=f"sphere on plane 'bounce'.*{next(iter(numbers))}"):
+    with pytest.raises(ValueError, match=f"contact 'bounce'.*{next(iter(numbers))}"):
         scene.compile()[0].set("bounce", **numbers)
 
 

@@ -140,24 +140,13 @@ TABLE = {
         lambda p: nc.ShellElement(p.four, thickness=0.1, material=nc.Elastic(E=300.0, nu=0.3))
     ),
     nc.Brick: Entry(lambda p: nc.Brick(p.eight, material=nc.Elastic(E=50.0, nu=0.3))),
-    nc.SphereOnPlane: Entry(
-        lambda p: nc.SphereOnPlane((p.ends[0], p.triad[2], p.ends[1]), radius=2.0, stiffness=9.0)
-    ),
-    nc.SphereOnSphere: Entry(
-        lambda p: nc.SphereOnSphere(p.ends, radii=(1.0, 0.9), stiffness=9.0, law="hertz")
-    ),
-    nc.CapsuleOnCapsule: Entry(
-        lambda p: nc.CapsuleOnCapsule((*p.eight[:2], *p.eight[5:7]), radii=(0.6, 0.7), stiffness=9.0)
-    ),
-    nc.EllipsoidOnPlane: Entry(
-        lambda p: nc.EllipsoidOnPlane(
-            (p.ends[0], p.triad[2], p.ends[1], *(nc.Direction(p.two, a) for a in np.eye(3))),
-            semi_axes=(2.0, 2.2, 2.4),
-            stiffness=9.0,
+    nc.GapPotential: Entry(
+        lambda p: nc.GapPotential(
+            (*p.eight[:2], *p.eight[5:7]), nc.CapsuleOnCapsule(radii=(0.6, 0.7)), stiffness=9.0
         )
     ),
-    nc.SphereOnBox: Entry(
-        lambda p: nc.SphereOnBox((*p.ends, *p.triad), size=(0.2, 0.3, 0.1), radius=1.5, stiffness=9.0)
+    nc.GapConstraint: Entry(
+        lambda p: nc.GapConstraint(p.ends, nc.SphereOnSphere(radii=(0.1, 0.1)), restitution=0.5)
     ),
     nc.FacePressure: Entry(
         lambda p: nc.FacePressure((*p.eight[:2], *p.eight[5:7]), pressure=jnp.sin), inside=False

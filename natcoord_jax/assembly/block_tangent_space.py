@@ -95,6 +95,10 @@ class SeparateTangents(eqx.Module):
         """Components of a velocity along the frames, X P^T M v."""
         return jnp.sum(self.frame * self.pulled(self.impulse(v).rows)[:, None], axis=-1)
 
+    def answer(self, impulse: Velocity) -> Float[Array, "bodies m"]:
+        """Components along the frames of what impulses on the rows bring about."""
+        return jnp.sum(self.frame * self.pulled(impulse.rows)[:, None], axis=-1)
+
     def along(self, y: Float[Array, "bodies m"]) -> Velocity:
         """Velocity with given components along the frames."""
         w = jnp.sum(self.frame * y[:, :, None], axis=1)[:, :, None]

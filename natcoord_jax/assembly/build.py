@@ -15,6 +15,7 @@ from natcoord_jax.assembly.diagnostics import rows_with_ground
 from natcoord_jax.assembly.graph import make_tree
 from natcoord_jax.assembly.grouping import element_group, stack
 from natcoord_jax.assembly.layout import Layout
+from natcoord_jax.assembly.impacts import with_mobilities
 from natcoord_jax.assembly.local_rates import LocalRates
 from natcoord_jax.assembly.masses import with_masses
 from natcoord_jax.assembly.system import Structure, System
@@ -50,6 +51,7 @@ def build(
     multipliers = sum(g.count * g.multipliers for g in groups)
     relations = multipliers
     multipliers += sum(g.count * g.multipliers for g in joint_groups if not g.in_tree)
+    inequalities = sum(g.count * g.multipliers for g in groups if g.effect.unilateral)
     # A director is as long as it was: one constraint; a triad has six.
     internal = sum({3: 6, 2: 1, 0: 0}[len(own)] for own in bodies.rotations)
     structure = Structure(
@@ -62,10 +64,11 @@ def build(
         unknowns=len(tree.slot_of),
         multipliers=multipliers,
         solver=solver or choose_solver(tree, multipliers, joint_groups, groups, len(bodies)),
-        constraints=internal + relations + sum(g.count * g.multipliers for g in joint_groups),
+        constraints=internal + relations - inequalities + sum(g.count * g.multipliers for g in joint_groups),
         points=compact([k for k, own in enumerate(layout.rotations) if own == POINT]),
         directors=compact([k for k, own in enumerate(layout.rotations) if own == DIRECTOR]),
-        dofs=len(tree.slot_of) - multipliers,
+        inequalities=inequalities,
+        dofs=len(tree.slot_of) - multipliers + inequalities,
         shapes=tuple(_drawn(bodies.shapes[k]) for k in layout.order),
     )
     masses = layout.masses()
@@ -85,7 +88,7 @@ def build(
         structure,
     )
     state = layout.state()
-    system = jax.tree.map(as_array, with_symmetries(system, state))
+    system = with_mobilities(jax.tree.map(as_array, with_symmetries(system, state)), state)
     return system, with_readings(system, state)
 
 

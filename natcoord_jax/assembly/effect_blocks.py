@@ -65,9 +65,8 @@ def with_multipliers(
     spread, gather, rest = joints
     bodies, width, _ = spread.shape
     count, s = layout.slots.shape[1], layout.stages
-    on_node, on_parent, by_node, by_parent = (
-        layout.by_node(layout.by_multiplier(parts)) for parts in zip(*every)
-    )
+    *parts, own = zip(*every)
+    on_node, on_parent, by_node, by_parent = (layout.by_node(layout.by_multiplier(x)) for x in parts)
     on_node, on_parent = (
         jnp.moveaxis(x, 1, 2).reshape(bodies, width, count * s) for x in (-on_node, -on_parent)
     )
@@ -78,7 +77,7 @@ def with_multipliers(
     by_parent = jnp.concatenate([by_parent, jnp.zeros((bodies, count * s, rest.shape[2] - width))], axis=2)
     columns = gather @ on_node
     columns = jnp.concatenate([columns[:, :width] + on_parent, columns[:, width:]], axis=1)
-    corner = unused[:, :, None] * jnp.eye(count * s)
+    corner = unused[:, :, None] * jnp.eye(count * s) + _by_multipliers(layout, own)
     rows = by_node @ spread + by_parent
     rest = jnp.concatenate(
         [jnp.concatenate([rest, columns], axis=2), jnp.concatenate([rows, corner], axis=2)], axis=1
@@ -86,3 +85,22 @@ def with_multipliers(
     spread = jnp.concatenate([spread, jnp.zeros((bodies, width, count * s))], axis=2)
     gather = jnp.concatenate([gather, jnp.zeros((bodies, count * s, width))], axis=1)
     return spread, gather, rest
+
+
+def _by_multipliers(
+    layout: NodeLayout, every: Sequence[Float[Array, "n m s s m"]]
+) -> Float[Array, "bodies k k"]:
+    """Rates of the constraints of each node by its multipliers: of one instance those of itself alone."""
+    most = max(m for _, m in layout.groups)
+    padded = [jnp.pad(x, ((0, 0),) * 4 + ((0, most - x.shape[4]),)) for x in every if x.shape[1]]
+    found = layout.by_node(layout.by_multiplier(padded))
+    first, total = np.zeros(layout.places.shape[0] + 1, int), 0
+    for n, m in layout.groups:
+        first[total : total + n * m] = total + np.repeat(np.arange(n) * m, m)
+        total += n * m
+    first[total] = -most - 1  # of an unused place: no multiplier is its own
+    slots = jnp.asarray(layout.slots)
+    own = slots[:, None, :, None] == jnp.asarray(first)[slots][:, :, None, None] + np.arange(most)
+    bodies, count = slots.shape
+    blocks = jnp.einsum("bamnk,back->bamcn", found, own.astype(found.dtype))
+    return blocks.reshape(bodies, count * layout.stages, count * layout.stages)

@@ -103,7 +103,7 @@ def _work(
 
     done, position = [], 0
     for group, power in zip(groups, found.power):
-        if group.multipliers and group.source != "joint":
+        if group.holds and group.source != "joint":
             size = group.count * group.multipliers
             here, position = impulses[position : position + size], position + size
             if group.source == "coordinates":

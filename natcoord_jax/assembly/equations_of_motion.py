@@ -29,7 +29,7 @@ def with_rest(x: Float[Array, "bodies *k"]) -> Float[Array, "bodies_and_ground *
 
 def relations_of(system: System) -> list[Group]:
     """Relations between joint coordinates and constraints on markers, the first of the constraints."""
-    return [g for g in system.effects if g.multipliers]
+    return [g for g in system.effects if g.holds]
 
 
 def loops_of(system: System) -> list[Group]:

@@ -23,7 +23,12 @@ from natcoord_jax.assembly.local import body_balance, body_motion, jacobians
 from natcoord_jax.assembly.local_rates import TWIST
 from natcoord_jax.assembly.momentum import least_inertias, momentum_balance
 from natcoord_jax.assembly.reduced import NOTHING
-from natcoord_jax.assembly.redundancy import at_every_stage, project_multipliers, project_rows
+from natcoord_jax.assembly.redundancy import (
+    at_every_stage,
+    held_multipliers,
+    project_multipliers,
+    project_rows,
+)
 from natcoord_jax.assembly.response import (
     Evaluation,
     GroupData,
@@ -90,7 +95,7 @@ class FullStep(Form):
             no_inputs = jnp.zeros(len(system.structure.inputs), state.q.dtype)
             resting = cls.prepare(system, state, no_inputs, jnp.zeros((), state.q.dtype), gauss(1), NOTHING)
             matrix = resting.jacobian(jnp.zeros(resting.unknowns, state.q.dtype))
-            rows = matrix[resting.balances :, : resting.balances]
+            rows = matrix[resting.balances :, : resting.balances][held_multipliers(resting.groups)]
             in_tree = sum(g.count * g.multipliers for g in system.joints if g.in_tree)
             projector = range_projector(rows, rank + in_tree)
             projector = at_every_stage(projector, resting.groups, tableau.stages)
@@ -175,7 +180,8 @@ class FullStep(Form):
         balances = self.system.local_rates.balances(wrenches, self.start[:-1])
         rows = project_rows(found.rows, y, self.balances, self.start_cache.projector)
         residual = jnp.concatenate([balances, rows])
-        return Evaluation(residual, found.size, at, found.power, (found.force, found.torque), kick)
+        asked = multipliers if self.system.structure.inequalities else None
+        return Evaluation(residual, found.size, at, found.power, (found.force, found.torque), kick, asked)
 
     def body_jacobians(self, twists: Float[Array, "bodies s 6"]) -> Float[Array, "bodies n n"]:
         """Jacobians of the bodies' own balances."""
@@ -232,7 +238,8 @@ class FullStep(Form):
         idle = (jnp.eye(count, dtype=matrix.dtype) - self.start_cache.projector) / (1.0 + count)
         matrix = matrix.at[:first, first:].set(matrix[:first, first:] @ self.start_cache.projector)
         matrix = matrix.at[first:, :first].set(self.start_cache.projector @ matrix[first:, :first])
-        return matrix.at[first:, first:].set(idle)
+        own = self.start_cache.projector @ matrix[first:, first:] @ self.start_cache.projector
+        return matrix.at[first:, first:].set(own + idle)
 
     def inertias(self, matrix: Float[Array, "unknowns unknowns"]) -> Float[Array, " balances"]:
         """Inertias of the rates."""

@@ -191,7 +191,7 @@ def instant_of(system: System, state: State, u: Float[Array, " inputs"]) -> Inst
     """Accelerations and reactions of one state."""
     balances = EquationsOfMotion.at(system, state)
     w = tree_rates(system, state)
-    solve = _with_constraints if system.structure.multipliers else _without_constraints
+    solve = _with_constraints if system.structure.held else _without_constraints
     gains, applied, lam = solve(system, state, u, balances, w)
     forces, torques = _reactions(balances, gains, applied, lam)
     return Instant(gains.rows.reshape(-1, 3), forces, torques, _named(balances, lam))

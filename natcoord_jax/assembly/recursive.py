@@ -175,7 +175,7 @@ class RecursiveStep(ReducedStep):
         ):
             if group.source == "mass":
                 continue
-            (by_twist, by_lam), (g_by_twist, _) = jacobians(
+            (by_twist, by_lam), (g_by_twist, g_by_lam) = jacobians(
                 group, where, self.tableau, at.start[group.bodies], every[group.bodies], lam, exact=exact
             )
             places = seated(group.bodies, own.shape[0])
@@ -183,7 +183,7 @@ class RecursiveStep(ReducedStep):
             own = own - seats.nodes.collect(both) - seats.parents.collect(above)
             coupled.append((seats.nodes.collect(upward), seats.nodes.collect(downward)))
             if group.multipliers:
-                bordered.append(borders(by_lam, g_by_twist, places))
+                bordered.append((*borders(by_lam, g_by_twist, places), jnp.moveaxis(g_by_lam, 1, 2)))
         return own, coupled, bordered
 
     def _own(self, twists: Float[Array, "s bodies 6"]) -> Float[Array, "bodies n n"]:

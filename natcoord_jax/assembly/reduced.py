@@ -25,6 +25,7 @@ from natcoord_jax.assembly.kick import kicked
 from natcoord_jax.assembly.momentum import least_inertias, momentum_balance
 from natcoord_jax.assembly.redundancy import (
     at_every_stage,
+    contact_mobilities,
     places_by_stage,
     project_multipliers,
     project_rows,
@@ -248,6 +249,8 @@ class ReducedStep(Form):
         rows = project_rows(found.rows, y, self.balances, self.start_cache.projector)
         residual = jnp.concatenate([generalised.reshape(-1), rows])
         asked = (situations, multipliers) if self.tableau.variational else damped
+        if self.system.structure.inequalities:
+            asked = multipliers
         return Evaluation(residual, found.size, at, found.power, (found.force, found.torque), kick, asked)
 
     def damped(self, at: StageKinematics) -> Damped:
@@ -368,4 +371,11 @@ class ReducedStep(Form):
         turning = jnp.ones((self.start.shape[0], 3), mass.dtype)
         scales = jnp.concatenate([turning, extent * turning, turning[:, :1]], axis=1)
         rates = PROBE / self.h * scales.reshape(-1)[self.system.tree.slot_of]
-        return jnp.concatenate([jnp.tile(rates, self.tableau.stages), 1.0 + jnp.abs(y[self.balances :])])
+        multipliers = 1.0 + jnp.abs(y[self.balances :])
+        if self.system.structure.inequalities:
+            # Those of contacts by as little, and downwards: the smaller of gap and impulse vanishes, and where
+            # both do, that is the impulse.
+            speed, mobility = PROBE / self.h * extent, contact_mobilities(self)
+            lower = -2.0 * speed / jnp.where(mobility > 0, mobility, 1.0)
+            multipliers = jnp.where(mobility > 0, lower, multipliers)
+        return jnp.concatenate([jnp.tile(rates, self.tableau.stages), multipliers])

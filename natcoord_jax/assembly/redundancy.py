@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -30,12 +31,20 @@ def project_rows(rows: Array, y: Array, balances: int, projector: Array | None) 
 
 
 def at_every_stage(projector: Float[Array, "m m"], groups: Sequence[Group], stages: int) -> Array:
-    """A projector of one stage for the multipliers of all."""
-    if stages == 1:
+    """A projector of one stage for the multipliers of all; those of inequalities stay as they are."""
+    held = held_multipliers(groups)
+    if stages == 1 and held.all():
         return projector
     every = places_by_stage(groups, stages)
-    full = jnp.zeros((every.size, every.size), projector.dtype)
+    full = jnp.eye(every.size, dtype=projector.dtype)
+    every = every[:, held]
     return full.at[every[:, :, None], every[:, None, :]].set(projector)
+
+
+def held_multipliers(groups: Sequence[Group]) -> np.ndarray:
+    """Which of the multipliers of one stage are of equations."""
+    parts = [np.full(group.count * group.multipliers, group.holds) for group in groups]
+    return np.concatenate([np.zeros(0, bool), *parts])
 
 
 def places_by_stage(groups: Sequence[Group], stages: int) -> np.ndarray:
@@ -47,3 +56,13 @@ def places_by_stage(groups: Sequence[Group], stages: int) -> np.ndarray:
         places.append(np.moveaxis(here, 1, 0).reshape(stages, -1))
         position += here.size
     return np.concatenate(places, axis=1)
+
+
+def contact_mobilities(equations: Any) -> Float[Array, " multipliers"]:
+    """What unit impulses of contacts do [1/kg], for the multipliers of all stages; 0 for those of equations."""
+    stages, parts = equations.tableau.stages, [jnp.zeros(0)]
+    for group in equations.groups:
+        shape = group.count, stages, group.multipliers
+        own = group.effect.mobility[:, None, None] if group.effect.unilateral else 0.0
+        parts.append(jnp.broadcast_to(own, shape).reshape(-1))
+    return jnp.concatenate(parts)

@@ -112,7 +112,7 @@ class Evaluation(eqx.Module):
         loads: forces and torques missing in the balances of all bodies, see `momentum.Balance`.
         kick: of the step, if the method has any.
         given: what else the end of the step asks for: situations and multipliers of the groups for the
-            variational scheme, what is damped for a dissipative one.
+            variational scheme, what is damped for a dissipative one, multipliers where there are contacts.
     """
 
     residual: Float[Array, " unknowns"]

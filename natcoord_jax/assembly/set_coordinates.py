@@ -186,7 +186,7 @@ def _with_coordinate(
     inside = (carried(system)[:, body] > 0)[:, None, None]
     v = jnp.where(inside, moving, state.v.reshape(-1, 4, 3))
     found = replace_fields(state, q=rows.reshape(-1, 3), v=v.reshape(-1, 3), coordinates=coordinates)
-    if system.structure.multipliers:
+    if system.structure.held:
         held = jnp.zeros((2, *coordinates.shape)) if state.held is None else state.held
         chosen = jnp.array([1.0, 0.0 if rate is None else 1.0])
         at = places[index]
@@ -226,7 +226,7 @@ def random_state(
         >>> bool(system.constraint_errors(state).position < 1e-13)
         True
     """
-    if system.structure.multipliers:
+    if system.structure.held:
         raise ValueError(
             "random_state needs a system without loops, drives and couplings; move the state of this one "
             "with with_coordinate and project it with nc.assemble"

@@ -89,6 +89,11 @@ class Group(Stacked):
         """Multipliers of one instance and stage."""
         return self.effect.multipliers
 
+    @property
+    def holds(self) -> bool:
+        """Whether they are of equations, which hold at any time."""
+        return self.multipliers > 0 and not self.effect.unilateral
+
 
 class CoordinateGroup(eqx.Module):
     """Joint coordinates of one description: joints, their bodies and places in the state."""
@@ -132,6 +137,7 @@ class Structure:
         rotors: number of stored rates.
         unknowns: number of tree unknowns (degrees of freedom of the spanning tree).
         multipliers: number of Lagrange multipliers that are solved for.
+        inequalities: how many of them are of contacts.
         solver: "reduced", "recursive", "sparse" or "full".
         constraints: number of constraints, internal ones of rigid bodies included.
         dofs: degrees of freedom: unknowns less the structural rank of the remaining constraints.
@@ -156,10 +162,16 @@ class Structure:
     rank: int | None = None
     points: Sequence[int] = ()
     directors: Sequence[int] = ()
+    inequalities: int = 0
     dofs: int = field(default=0, compare=False)
     redundant: tuple[str, ...] = field(default=(), compare=False)
     notes: tuple[str, ...] = field(default=(), compare=False)
     shapes: tuple[Any, ...] = field(default=(), compare=False, repr=False)
+
+    @property
+    def held(self) -> int:
+        """Multipliers of equations."""
+        return self.multipliers - self.inequalities
 
 
 class System(eqx.Module):

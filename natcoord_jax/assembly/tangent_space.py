@@ -116,6 +116,10 @@ class TangentSpace(eqx.Module):
         """Components of a velocity along the frame, X P^T M v."""
         return self.admissible.frame @ self.pulled(self.impulse(v))
 
+    def answer(self, impulse: Velocity) -> Float[Array, " u"]:
+        """Components along the frame of what impulses on the rows bring about, as far as it is admitted."""
+        return self.admissible.within(self.admissible.frame @ self.pulled(impulse))
+
     def along(self, y: Float[Array, " u"]) -> Velocity:
         """Velocity with given components along the frame."""
         return self.spread(self.admissible.frame.T @ y)

@@ -64,7 +64,12 @@ class ConstraintErrors(eqx.Module):
 
 def constrained(system: System) -> tuple[Group, ...]:
     """All groups with constraints: relations between coordinates, then joints."""
-    return (*(g for g in system.effects if g.multipliers), *(g for g in system.joints if g.multipliers))
+    return (*(g for g in system.effects if g.holds), *(g for g in system.joints if g.multipliers))
+
+
+def contacts(system: System) -> tuple[Group, ...]:
+    """All groups with inequalities."""
+    return tuple(g for g in system.effects if g.effect.unilateral)
 
 
 def violations_of(system: System, groups: tuple[Group, ...], state: State) -> list[Float[Array, "n m"]]:
@@ -108,7 +113,7 @@ def largest(groups: list[Array]) -> Float[Array, ""]:
 
 
 def _relations(system: System) -> tuple[Group, ...]:
-    return tuple(g for g in system.effects if g.multipliers)
+    return tuple(g for g in system.effects if g.holds)
 
 
 @over_states
@@ -153,7 +158,7 @@ def misses(system: System, state: State) -> tuple[Array, Array]:
     """Largest violation of any joint or relation and of their rates, in terms of `GAP` times the size."""
     groups = constrained(system)
     gap, rate = (
-        largest(violations_of(system, groups, state)),
+        largest(violations_of(system, (*groups, *contacts(system)), state)),
         largest(violation_rates_of(system, groups, state)),
     )
     return gap / (GAP * position_size(state)), rate / (GAP * rate_size(state))
@@ -162,6 +167,11 @@ def misses(system: System, state: State) -> tuple[Array, Array]:
 @eager_numpy
 def _position_violations(system: System, state: State) -> tuple[list[Array], Array]:
     return violations_of(system, constrained(system), state), position_size(state)
+
+
+@eager_numpy
+def _overlaps(system: System, state: State) -> tuple[list[Array], Array]:
+    return violations_of(system, contacts(system), state), position_size(state)
 
 
 @eager_numpy
@@ -192,13 +202,22 @@ class Violation:
 
 
 def worst_violation(
-    system: System, state: State, *, rates: bool = False, allowed: float = GAP
+    system: System,
+    state: State,
+    *,
+    rates: bool = False,
+    allowed: float = GAP,
+    overlaps: bool = False,
 ) -> Violation | None:
-    """The largest violation (or rate of one) of a concrete state beyond what is allowed, per unit of size."""
-    groups = constrained(system)
+    """The largest violation (or rate of one) of a concrete state beyond what is allowed, per unit of size.
+
+    Of constraints, or overlaps of surfaces in contact.
+    """
+    groups = contacts(system) if overlaps else constrained(system)
     if not groups:
         return None
-    listed, size = (_rate_violations if rates else _position_violations)(system, state)
+    find = _overlaps if overlaps else _rate_violations if rates else _position_violations
+    listed, size = find(system, state)
     found = [np.abs(np.asarray(x)) for x in listed]
     sizes = [np.max(x) for x in found]
     worst = int(np.argmax(sizes))

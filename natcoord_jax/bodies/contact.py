@@ -13,7 +13,6 @@ from natcoord_jax.core.arguments import Part, is_a
 from natcoord_jax.core.bodies import Body
 from natcoord_jax.core.checks import as_array, is_concrete
 from natcoord_jax.core.eager_numpy import stacked
-from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.handles import Handle, ground
 from natcoord_jax.core.kinds import BODY, NAME, Choice, HandleOf, of
 from natcoord_jax.core.markers import Direction, Marker, Point
@@ -22,6 +21,8 @@ from natcoord_jax.core.recipe import Builder, Recipe
 from natcoord_jax.effects.contact import (
     CapsuleOnCapsule,
     EllipsoidOnPlane,
+    Gap,
+    GapConstraint,
     GapPotential,
     SphereOnBox,
     SphereOnPlane,
@@ -91,35 +92,39 @@ class _Solid:
         return self.point((0.0, 0.0, -half)), self.point((0.0, 0.0, half))
 
 
-def _on_plane(solid: _Solid, plane: Plane, law: dict[str, Any]) -> list[GapPotential]:
+Pair = tuple[Gap, tuple[Marker, ...]]
+"""A gap, and what it is of."""
+
+
+def _on_plane(solid: _Solid, plane: Plane) -> list[Pair]:
     """A solid on a plane."""
     table, shape = plane.markers(), solid.shape
     if isinstance(shape, Box):
         corners = (0.5 * shape.size * corner for corner in CORNERS)
-        return [SphereOnPlane((*table, solid.point(corner)), **law) for corner in corners]
+        return [(SphereOnPlane(), (*table, solid.point(corner))) for corner in corners]
     if isinstance(shape, Capsule):
-        return [SphereOnPlane((*table, end), radius=shape.radius, **law) for end in solid.ends()]
+        return [(SphereOnPlane(radius=shape.radius), (*table, end)) for end in solid.ends()]
     if isinstance(shape, Ellipsoid):
         markers = (*table, solid.point(), *solid.axes())
-        return [EllipsoidOnPlane(markers, semi_axes=shape.semi_axes, **law)]
-    return [SphereOnPlane((*table, solid.point()), radius=solid.radius, **law)]
+        return [(EllipsoidOnPlane(semi_axes=shape.semi_axes), markers)]
+    return [(SphereOnPlane(radius=solid.radius), (*table, solid.point()))]
 
 
-def _between(one: _Solid, other: _Solid, law: dict[str, Any]) -> list[GapPotential] | None:
+def _between(one: _Solid, other: _Solid) -> list[Pair] | None:
     """Two solids; None: there is no gap for them."""
     if isinstance(other.shape, Box) and not isinstance(one.shape, Box):
-        return _between(other, one, law)
+        return _between(other, one)
     if isinstance(one.shape, Box):
         if other.shape is not None and not isinstance(other.shape, Sphere):
             return None
         markers = one.point(), other.point(), *one.axes()
-        return [SphereOnBox(markers, size=one.shape.size, radius=other.radius, **law)]
+        return [(SphereOnBox(size=one.shape.size, radius=other.radius), markers)]
     if any(isinstance(s.shape, Ellipsoid) for s in (one, other)):
         return None
     radii = stacked([as_array(s.radius, float) for s in (one, other)])
     if isinstance(one.shape, Capsule) or isinstance(other.shape, Capsule):
-        return [CapsuleOnCapsule((*one.ends(), *other.ends()), radii=radii, **law)]
-    return [SphereOnSphere((one.point(), other.point()), radii=radii, **law)]
+        return [(CapsuleOnCapsule(radii=radii), (*one.ends(), *other.ends()))]
+    return [(SphereOnSphere(radii=radii), (one.point(), other.point()))]
 
 
 SHAPES = "nc.Sphere, nc.Capsule, nc.Box, nc.Ellipsoid or a point"
@@ -167,8 +172,8 @@ class Contact(Recipe):
 
     one: Handle = eqx.field(static=True, metadata=is_a(SOLID))
     other: Any = eqx.field(metadata=is_a(SIDE))
-    stiffness: Any = eqx.field(kw_only=True, metadata=is_a(Number("positive")))
-    restitution: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Number("positive")))
+    stiffness: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Number("positive")))
+    restitution: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Number("not negative")))
     speed: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Number("positive")))
     law: str = eqx.field(
         default="linear", kw_only=True, static=True, metadata=is_a(Choice(("linear", "hertz")))
@@ -182,20 +187,28 @@ class Contact(Recipe):
         plane = self.other.body if isinstance(self.other, Plane) else self.other
         if self.one == plane:
             raise ValueError(f"contact {name!r}: {self.one.name!r} would be in contact with itself")
+        solids = self._solids(scene, self.one, name)
+        pairs = [pair for solid in solids for pair in self._pairs(scene, solid, name)]
+        named = (name if len(pairs) == 1 else f"{name}[{k}]" for k in range(len(pairs)))
+        return tuple(scene.add(self._effect(markers, gap, said)) for (gap, markers), said in zip(pairs, named))
+
+    def _effect(self, markers: tuple[Marker, ...], gap: Gap, name: str) -> GapPotential | GapConstraint:
+        """What keeps one gap open."""
+        if self.stiffness is None:
+            return GapConstraint(
+                markers, gap, restitution=1.0 if self.restitution is None else self.restitution, name=name
+            )
         law = {"stiffness": self.stiffness, "law": self.law}
         if self.restitution is not None:
             law |= {"restitution": self.restitution, "speed": self.speed}
-        solids = self._solids(scene, self.one, name)
-        gaps = [gap for solid in solids for gap in self._gaps(scene, solid, law, name)]
-        named = (name if len(gaps) == 1 else f"{name}[{k}]" for k in range(len(gaps)))
-        return tuple(scene.add(replace_fields(gap, name=said)) for gap, said in zip(gaps, named))
+        return GapPotential(markers, gap, **law, name=name)
 
-    def _gaps(self, scene: Builder, solid: _Solid, law: dict[str, Any], name: str) -> list[GapPotential]:
+    def _pairs(self, scene: Builder, solid: _Solid, name: str) -> list[Pair]:
         if isinstance(self.other, Plane):
-            return _on_plane(solid, self.other, law)
-        found: list[GapPotential] = []
+            return _on_plane(solid, self.other)
+        found: list[Pair] = []
         for second in self._solids(scene, self.other, name):
-            gaps = _between(solid, second, law)
+            gaps = _between(solid, second)
             if solid.shape is None and second.shape is None:
                 raise ValueError(
                     f"contact {name!r}: {solid.handle.name!r} and {second.handle.name!r} are points, which "

@@ -108,6 +108,7 @@ class Effect(Part):
     Class attributes:
         kind: name of the scope its operations carry in the compiled program.
         multipliers: number of Lagrange multipliers per instance and stage.
+        unilateral: whether the multipliers are those of inequalities: nothing is held until it is reached.
         inputs: number of input channels per instance.
         impulsive: whether forces, torques and power of its response are times the step (impulses, work).
         works: whether its power enters the work account of the state (non-potential effects).
@@ -127,6 +128,7 @@ class Effect(Part):
 
     kind: ClassVar[str] = "effect"
     multipliers: ClassVar[int] = 0
+    unilateral: ClassVar[bool] = False
     inputs: ClassVar[int] = 0
     impulsive: ClassVar[bool] = False
     works: ClassVar[bool] = False

@@ -218,13 +218,10 @@ def marker_response(
 ) -> Response:
     """Response of forces [N] on markers and torques [N m] on their bodies."""
     stages = rates.shape[0]
-    power, on_rows = jnp.zeros(stages, rates.dtype), None
+    power, found = jnp.zeros(stages, rates.dtype), None
     if forces is not None:
         power = power + jnp.sum(forces * rates, axis=tuple(range(1, forces.ndim)))
-        on_rows = place[..., None] * forces[..., None, :]
-        if place.ndim == 3:
-            on_rows = jnp.sum(on_rows, axis=-3)
-        on_rows = on_rows.reshape(stages, -1, 4, 3)
+        found = on_rows(place, forces)
     if torques is not None:
         if motion.spin.shape[-2] > place.shape[0]:
             raise ValueError(
@@ -232,7 +229,15 @@ def marker_response(
                 "or forces on points between nodes"
             )
         power = power + jnp.sum(torques * motion.spin, axis=(-1, -2))
-    return Response(on_rows, torques, jnp.zeros((stages, 0)), power)
+    return Response(found, torques, jnp.zeros((stages, 0)), power)
+
+
+def on_rows(place: Float[Array, "k *m w"], forces: Float[Array, "s k *m 3"]) -> Float[Array, "s b 4 3"]:
+    """Forces on the rows of the bodies of markers."""
+    found = place[..., None] * forces[..., None, :]
+    if place.ndim == 3:
+        found = jnp.sum(found, axis=-3)
+    return found.reshape(forces.shape[0], -1, 4, 3)
 
 
 def responses_together(potential: Potential, place: Array, motion: Motion, now: StepContext) -> Response:

@@ -8,9 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from natcoord_jax.assembly.diagnostics import unknown_name
-from natcoord_jax.assembly.reduced import ReducedStep
+from natcoord_jax.assembly.reduced import ReducedStep, active_groups
+from natcoord_jax.assembly.redundancy import held_multipliers
 from natcoord_jax.assembly.system import System
-from natcoord_jax.assembly.violations import constrained, misses, worst_violation
+from natcoord_jax.assembly.violations import GAP, constrained, misses, worst_violation
 from natcoord_jax.core.checks import as_array, at_top_level
 from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.effect import replace_fields
@@ -30,6 +31,7 @@ def check_gaps(system: System, state: State) -> None:
     Raises:
         ValueError: with the part, and by how much.
     """
+    check_overlaps(system, state, GAP)
     worst = worst_violation(system, state)
     if worst is None:
         return
@@ -46,6 +48,20 @@ def check_gaps(system: System, state: State) -> None:
     )
 
 
+def check_overlaps(system: System, state: State, allowed: float) -> None:
+    """Refuse surfaces that overlap at the start.
+
+    Raises:
+        ValueError: with the contact, and by how much.
+    """
+    worst = worst_violation(system, state, overlaps=True, allowed=allowed)
+    if worst is not None:
+        raise ValueError(
+            f"the surfaces of {worst} overlap by {worst.size:.3g} {worst.unit} at the start; move the bodies "
+            "apart, or give the contact a stiffness, with which surfaces may overlap"
+        )
+
+
 def check_obeyed(system: System, state: State) -> None:
     """Refuse to start from positions that the constraints forbid; those of tracers pass, and pure trees.
 
@@ -59,6 +75,7 @@ def check_obeyed(system: System, state: State) -> None:
         return
     if _obeyed and all(seen() is now for seen, now in zip(_obeyed[0], (system, state))):
         return
+    check_overlaps(system, state, LEFT_OPEN)
     worst = worst_violation(system, state, allowed=LEFT_OPEN)
     if worst is not None:
         raise ValueError(
@@ -103,7 +120,7 @@ def admitted(system: System, state: State) -> State:
     Returns:
         The state, with velocities that obey the constraints; all NaN where positions do not.
     """
-    if not constrained(system):
+    if not system.structure.multipliers and not constrained(system):
         return state
     gap, rate = misses(system, state)
     moving_along = rate <= 1.0
@@ -143,7 +160,7 @@ def check_inertia(system: System, state: State) -> None:
         return
     count = system.structure.unknowns
     matrix = np.asarray(_jacobian(system, state))
-    balance, rows = matrix[:count, :count], matrix[count:, :count]
+    balance, rows = matrix[:count, :count], matrix[count:, :count][held_multipliers(active_groups(system))]
     free = np.eye(count)
     if len(rows):
         _, sizes, vectors = np.linalg.svd(rows)
@@ -167,8 +184,9 @@ def find_redundancy(system: System, state: State) -> tuple[int, tuple[str, ...]]
     start only (a flat parallelogram) is no redundancy.
     """
     count = system.structure.unknowns
-    if system.structure.multipliers == 0:
+    if system.structure.held == 0:
         return 0, ()
+    held = held_multipliers(active_groups(system))
     best, names = -1, ()
     random = np.random.default_rng(0)
     for attempt in range(3):
@@ -179,13 +197,14 @@ def find_redundancy(system: System, state: State) -> tuple[int, tuple[str, ...]]
                 continue
         else:
             state_now = state
-        rows = np.asarray(_jacobian(system, state_now))[count:, :count]
+        rows = np.asarray(_jacobian(system, state_now))[count:, :count][held]
         rank, dependent = _rank(rows)
         if not dependent:
             return rank, ()
         if rank > best:
             best = rank
-            names = tuple(dict.fromkeys(unknown_name(system, count + r) for r in dependent))
+            places = count + np.flatnonzero(held)[dependent]
+            names = tuple(dict.fromkeys(unknown_name(system, int(r)) for r in places))
     return best, names
 
 

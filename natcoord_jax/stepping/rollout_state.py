@@ -12,8 +12,10 @@ from natcoord_jax.assembly.frozen_kick import FEWEST, FrozenKick, Lagging, from_
 from natcoord_jax.assembly.start_cache import StartCache
 from natcoord_jax.assembly.system import System
 from natcoord_jax.assembly.tangent_space import Velocity
+from natcoord_jax.assembly.violations import contacts
 from natcoord_jax.core.results import Result
 from natcoord_jax.core.state import State
+from natcoord_jax.maths.collocation import Tableau
 from natcoord_jax.maths.rows import part
 from natcoord_jax.stepping.error_control import StepDecision, Tolerance, Trial, follow
 from natcoord_jax.stepping.factors import Factors, no_factors
@@ -130,9 +132,25 @@ class RolloutProblem(eqx.Module):
         return u, h, index
 
 
+def check_contacts(system: System, tableau: Tableau) -> None:
+    """Refuse schemes for which impacts are not defined.
+
+    Raises:
+        ValueError: with a contact, and what to do.
+    """
+    if tableau.stages == 1 and not tableau.variational and not tableau.dissipative:
+        return
+    for group in contacts(system):
+        raise ValueError(
+            f"{group.effect.kind} {group.labels[0]!r} is a constraint with impacts, for steps of one stage; "
+            "pass scheme=nc.EnergyMomentum(), or give the contact a stiffness, which makes it a potential"
+        )
+
+
 def start_of(setting: RolloutProblem, state: State) -> tuple[RolloutState, Factors, StartCache]:
     """The first attempt, factors that are none, and what is known of the first state."""
     dt, plan = setting.dt, setting.plan
+    check_contacts(setting.system, plan.tableau)
     u = plan.inputs(setting.system, setting.parameters, jnp.array(0), state, jnp.zeros(()), jnp.ones(()))
     equations = prepare(setting.system, state, u, dt, plan.tableau)
     few = setting.tolerance is not None

@@ -12,10 +12,12 @@ from natcoord_jax.assembly.coordinates import stage_rates
 from natcoord_jax.assembly.end_impulses import released
 from natcoord_jax.assembly.equations import prepare, starting
 from natcoord_jax.assembly.form import dense_solver
+from natcoord_jax.assembly.impacts import after_impacts
 from natcoord_jax.assembly.kick import Kick, ends_of
 from natcoord_jax.assembly.response import Evaluation
 from natcoord_jax.assembly.start_cache import StartCache
 from natcoord_jax.assembly.system import Group, System
+from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import Tableau
 
@@ -93,21 +95,24 @@ def end_of_step(
             rotors = rotors + tableau.gained(turning[:, jnp.concatenate(carrying)] - rotors)
     else:
         v, rotors = ends.velocity.rows.reshape(state.v.shape), ends.velocity.rotors
+    after = State(state.t + h, q, v, coordinates, rotors, work, state.dissipated, state.held)
+    lost = {}
+    if system.structure.inequalities:
+        after, lost = after_impacts(system, state, after, h, groups, found)
     working, relation = [], 0
-    for group, power in zip(groups, found.power):
+    for number, (group, power) in enumerate(zip(groups, found.power)):
         if group.effect.works:
-            done = (1.0 if group.effect.impulsive else h) * (power @ b)
-            if group.multipliers and extra is not None:
+            done = (1.0 if group.effect.impulsive else h) * (power @ b) + lost.get(number, 0.0)
+            if group.holds and extra is not None:
                 done = done + extra[relation : relation + group.count]
             working.append(jnp.sum(done, keepdims=True) if group.is_set else done)
-        if group.multipliers and group.source != "joint":
+        if group.holds and group.source != "joint":
             relation += group.count * group.multipliers
     # The same of the work account.
-    work = work + jnp.concatenate(working) if working else work
-    dissipated = state.dissipated
+    after = replace_fields(after, work=work + jnp.concatenate(working) if working else work)
     if tableau.dissipative:
-        dissipated = found.given.loss + (0.0 if dissipated is None else dissipated)
-    after = State(state.t + h, q, v, coordinates, rotors, work, dissipated, state.held)
+        dissipated = found.given.loss + (0.0 if state.dissipated is None else state.dissipated)
+        after = replace_fields(after, dissipated=dissipated)
     half_turn = _half_turn(at.spin[:, :bodies], h, tableau)
     if ends is not None:
         half_turn = jnp.where(ends.sound, half_turn, jnp.inf)

@@ -1,5 +1,7 @@
 """Contact between surfaces."""
 
+from natcoord_jax.effects.contact.gap import Gap as Gap
+from natcoord_jax.effects.contact.gap_constraint import GapConstraint as GapConstraint
 from natcoord_jax.effects.contact.gap_potential import GapPotential as GapPotential
 from natcoord_jax.effects.contact.gap_potential import damping_of as damping_of
 from natcoord_jax.effects.contact.pairs import CapsuleOnCapsule as CapsuleOnCapsule

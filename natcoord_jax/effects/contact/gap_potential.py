@@ -6,7 +6,6 @@ that whatever the step. What impacts lose is a part of the force that grows with
 closes; it is there only where a restitution is asked for.
 """
 
-import abc
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -15,16 +14,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from natcoord_jax.core.arguments import is_a
+from natcoord_jax.core.arguments import is_a, require
 from natcoord_jax.core.checks import as_array, is_concrete
 from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.effect import Motion, Response, StepContext, replace_fields
-from natcoord_jax.core.kinds import Choice
+from natcoord_jax.core.kinds import Choice, of
 from natcoord_jax.core.numeric import Number
 from natcoord_jax.core.potential import Potential, place_markers
+from natcoord_jax.effects.contact.gap import Gap
 from natcoord_jax.maths.vectors import positive_part
 
 HERTZ = "hertz"
+GAP = of("a gap, as nc.SphereOnPlane(radius=0.1)", Gap)
 LAW = Choice(("linear", HERTZ))
 
 
@@ -78,12 +79,13 @@ class ContactReadings(eqx.Module):
 
 
 class GapPotential(Potential):
-    """Base of contacts between two surfaces: subclass it and give `invariants` and `gap`.
+    """Contact by an energy of the gap between two surfaces, where they overlap.
 
     With a restitution, what impacts lose is the work in its account, which is never positive.
 
     Attributes:
-        markers: that the invariants are of.
+        markers: that the gap is of.
+        gap: between the surfaces, as `nc.SphereOnPlane(radius=0.1)`, or one of your own, see `nc.Gap`.
         stiffness: k [N/m] of the linear law, force k d of an overlap d; of Hertz' law [N/m^1.5], k d^1.5.
         law: "linear" or "hertz".
         restitution: part of the closing speed that is left after an impact [-], above 0 up to 1; None: all.
@@ -91,17 +93,17 @@ class GapPotential(Potential):
         damping: part of the force per closing speed [s/m], follows from the two.
 
     Raises:
-        ValueError: for a restitution above one, or one without the speed that it is of.
+        ValueError: for other markers than the gap takes, a restitution above one, or one without the speed
+            that it is of.
 
     Example:
         >>> import natcoord_jax as nc
-        >>> class PointAboveGround(nc.GapPotential):
-        ...     def invariants(self, x):
-        ...         return (x[1] @ (x[2] - x[0]))[None]
-        ...     def gap(self, invariants):
-        ...         return invariants[0]
+        >>> floor = nc.Point(nc.ground), nc.Direction(nc.ground, (0, 0, 1))
+        >>> gap = nc.SphereOnPlane(radius=0.1)
+        >>> contact = nc.GapPotential((*floor, nc.Point(nc.ground, (0, 0, 1))), gap, stiffness=1e5)
     """
 
+    gap: Gap = eqx.field(metadata=is_a(GAP))
     stiffness: Any = eqx.field(kw_only=True, metadata=is_a(Number("positive")))
     law: str = eqx.field(default="linear", kw_only=True, static=True, metadata=is_a(LAW))
     restitution: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Number("positive")))
@@ -114,7 +116,8 @@ class GapPotential(Potential):
     silent: ClassVar[bool] = False
 
     def __check_init__(self) -> None:
-        """Refuse what gives energy, and a restitution of no speed."""
+        """Refuse markers of another gap, what gives energy, and a restitution of no speed."""
+        require(self, "markers", self.gap.markers)
         value = self.restitution
         if value is not None and is_concrete(value) and np.any(np.asarray(value) > 1):
             raise ValueError(
@@ -166,16 +169,16 @@ class GapPotential(Potential):
     def _closing(self, start: Any, flow: Any, h: Any) -> Any:
         """Mean rate at which the gap closes in the step [m/s]; at one instant the rate."""
         moving = h > 0
-        mean = (self.gap(start) - self.gap(start + h * flow)) / jnp.where(moving, h, 1.0)
-        return jnp.where(moving, mean, -jax.jvp(self.gap, (start,), (flow,))[1])
+        mean = (self.gap.distance(start) - self.gap.distance(start + h * flow)) / jnp.where(moving, h, 1.0)
+        return jnp.where(moving, mean, -jax.jvp(self.gap.distance, (start,), (flow,))[1])
 
-    @abc.abstractmethod
-    def gap(self, invariants: Float[Array, " p"]) -> Float[Array, ""]:
-        """Distance of the surfaces, negative where they overlap [m]."""
+    def invariants(self, x: Float[Array, "k 3"]) -> Float[Array, " p"]:
+        """Those of the gap."""
+        return self.gap.invariants(x)
 
     def energy(self, invariants: Float[Array, " p"]) -> Float[Array, ""]:
         """Energy [J]."""
-        overlap = positive_part(-self.gap(invariants))
+        overlap = positive_part(-self.gap.distance(invariants))
         if self.law == HERTZ:
             return 0.4 * self.stiffness * overlap**2 * _root(overlap)
         return 0.5 * self.stiffness * overlap**2
@@ -187,7 +190,7 @@ class GapPotential(Potential):
     def readings(self, place: Array, rows: Array) -> ContactReadings:
         """Gap and force."""
         invariants = self.invariants(place_markers(place, rows))
-        gap, energy = self.gap(invariants), self.energy(invariants)
+        gap, energy = self.gap.distance(invariants), self.energy(invariants)
         overlap = positive_part(-gap)
         force = self.stiffness * overlap * (_root(overlap) if self.law == HERTZ else 1.0)
         return ContactReadings(gap, force, energy)

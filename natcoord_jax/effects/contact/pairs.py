@@ -1,4 +1,4 @@
-"""Gaps between pairs of shapes, as functions of invariants of their markers."""
+"""Gaps between pairs of shapes."""
 
 from typing import Any, ClassVar
 
@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.markers import Markers
 from natcoord_jax.core.numeric import Number, Numbers
-from natcoord_jax.effects.contact.gap_potential import GapPotential
+from natcoord_jax.effects.contact.gap import Gap
 from natcoord_jax.maths.vectors import dot
 
 RADIUS = Number("not negative")
@@ -22,68 +22,93 @@ def _length(square: Array) -> Array:
     return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
 
 
-class SphereOnPlane(GapPotential):
+def _unit(vector: Float[Array, "3"]) -> Float[Array, "3"]:
+    """Its direction; of nothing nothing."""
+    size = _length(dot(vector, vector))
+    return vector / jnp.where(size > 0, size, 1.0)
+
+
+def _between(one: Float[Array, "3"], other: Float[Array, "3"], radii: Float[Array, "2"]) -> tuple[Array, Array]:
+    """The middle of the gap between two spheres, and the direction from the first to the second."""
+    normal = _unit(other - one)
+    return 0.5 * (one + other + (radii[0] - radii[1]) * normal), normal
+
+
+class SphereOnPlane(Gap):
     """A sphere, or a point, above a plane.
 
+    Markers: a point of the plane, its normal as a direction of the same body, and the centre.
+
     Attributes:
-        markers: a point of the plane, its normal as a direction of the same body, and the centre.
         radius: of the sphere [m].
 
     Example:
         >>> import natcoord_jax as nc
         >>> floor = nc.Point(nc.ground), nc.Direction(nc.ground, (0, 0, 1))
-        >>> contact = nc.SphereOnPlane((*floor, nc.Point(nc.ground, (0, 0, 1))), stiffness=1e5, radius=0.1)
+        >>> gap = nc.SphereOnPlane(radius=0.1)
+        >>> contact = nc.GapPotential((*floor, nc.Point(nc.ground, (0, 0, 1))), gap, stiffness=1e5)
     """
 
-    markers: Any = eqx.field(metadata=is_a(Markers(1, 1, more=True)))
     radius: Any = eqx.field(default=0.0, kw_only=True, metadata=is_a(RADIUS))
 
-    kind: ClassVar[str] = "sphere on plane"
+    markers: ClassVar[Markers] = Markers(1, 1, more=True)
+    degree: ClassVar[int] = 1
+    sides: ClassVar[tuple[int, int]] = (0, 2)
 
     def invariants(self, x: Float[Array, "3 3"]) -> Float[Array, "1"]:
         """Height of the centre [m]."""
         return dot(x[1], x[2] - x[0])[None]
 
-    def gap(self, invariants: Float[Array, "1"]) -> Float[Array, ""]:
+    def distance(self, invariants: Float[Array, "1"]) -> Float[Array, ""]:
         """Height less radius."""
         return invariants[0] - self.radius
 
+    def contact(self, x: Float[Array, "3 3"]) -> tuple[Array, Array]:
+        """The lowest point of the sphere."""
+        normal = _unit(x[1])
+        return x[2] - self.radius * normal, normal
 
-class SphereOnSphere(GapPotential):
+
+class SphereOnSphere(Gap):
     """Two spheres.
 
+    Markers: their centres.
+
     Attributes:
-        markers: their centres.
         radii: of both (2,) [m].
     """
 
-    markers: Any = eqx.field(metadata=is_a(Markers(2)))
     radii: Any = eqx.field(kw_only=True, metadata=is_a(Numbers((2,), "not negative")))
 
-    kind: ClassVar[str] = "sphere on sphere"
+    markers: ClassVar[Markers] = Markers(2)
 
     def invariants(self, x: Float[Array, "2 3"]) -> Float[Array, "1"]:
         """Square of the distance [m^2]."""
         apart = x[1] - x[0]
         return dot(apart, apart)[None]
 
-    def gap(self, invariants: Float[Array, "1"]) -> Float[Array, ""]:
+    def distance(self, invariants: Float[Array, "1"]) -> Float[Array, ""]:
         """Distance less radii."""
         return _length(invariants[0]) - jnp.sum(self.radii)
 
+    def contact(self, x: Float[Array, "2 3"]) -> tuple[Array, Array]:
+        """On the line of centres, in the middle of the gap."""
+        return _between(x[0], x[1], self.radii)
 
-class CapsuleOnCapsule(GapPotential):
+
+class CapsuleOnCapsule(Gap):
     """Two capsules: all that is within a radius of a segment. With a segment of no length, a sphere.
 
+    Markers: both ends of the first segment, and of the second.
+
     Attributes:
-        markers: both ends of the first segment, and of the second.
         radii: of both (2,) [m].
     """
 
-    markers: Any = eqx.field(metadata=is_a(Markers(4)))
     radii: Any = eqx.field(kw_only=True, metadata=is_a(Numbers((2,), "not negative")))
 
-    kind: ClassVar[str] = "capsule on capsule"
+    markers: ClassVar[Markers] = Markers(4)
+    sides: ClassVar[tuple[int, int]] = (0, 2)
 
     def invariants(self, x: Float[Array, "4 3"]) -> Float[Array, "6"]:
         """Products of the segments and of what is between their first ends [m^2]."""
@@ -91,13 +116,18 @@ class CapsuleOnCapsule(GapPotential):
         pairs = (one, one), (other, other), (one, other), (one, apart), (other, apart), (apart, apart)
         return jnp.stack([dot(u, v) for u, v in pairs])
 
-    def gap(self, invariants: Float[Array, "6"]) -> Float[Array, ""]:
+    def distance(self, invariants: Float[Array, "6"]) -> Float[Array, ""]:
         """Distance of the nearest points less radii."""
         return _length(segment_distance_square(invariants)) - jnp.sum(self.radii)
 
+    def contact(self, x: Float[Array, "4 3"]) -> tuple[Array, Array]:
+        """On the line between the nearest points, in the middle of the gap."""
+        s, t = nearest_points(self.invariants(x))
+        return _between(x[0] + s * (x[1] - x[0]), x[2] + t * (x[3] - x[2]), self.radii)
 
-def segment_distance_square(products: Float[Array, "6"]) -> Float[Array, ""]:
-    """Square of the distance of two segments r + s d_1 - t d_2 with s and t from 0 to 1, nearly the least.
+
+def nearest_points(products: Float[Array, "6"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Where on two segments r + s d_1 - t d_2 with s and t from 0 to 1 they are nearest, nearly.
 
     The nearest points of parallel segments are no points: they jump from end to end as these turn. So what is
     least here is the square of the distance and a little of how far the points are from the middles of the
@@ -109,7 +139,7 @@ def segment_distance_square(products: Float[Array, "6"]) -> Float[Array, ""]:
     Args:
         products: d_1.d_1, d_2.d_2, d_1.d_2, d_1.r, d_2.r and r.r.
     """
-    a, e, b, c, f, square = products
+    a, e, b, c, f, _ = products
     little = TOWARDS_MIDDLE * (a + e)
     stiff_s, stiff_t = a + little, e + little
     some = little > 0
@@ -119,53 +149,75 @@ def segment_distance_square(products: Float[Array, "6"]) -> Float[Array, ""]:
     s = jnp.clip((stiff_t * pull_s + b * pull_t) / determinant, 0.0, 1.0)
     t = jnp.clip((b * s + pull_t) / jnp.where(some, stiff_t, 1.0), 0.0, 1.0)
     s = jnp.clip((b * t + pull_s) / jnp.where(some, stiff_s, 1.0), 0.0, 1.0)
+    return s, t
+
+
+def segment_distance_square(products: Float[Array, "6"]) -> Float[Array, ""]:
+    """Square of the distance of the nearest points of two segments, see `nearest_points`."""
+    a, e, b, c, f, square = products
+    s, t = nearest_points(products)
     return square + a * s * s + e * t * t + 2 * (c * s - f * t - b * s * t)
 
 
-class EllipsoidOnPlane(GapPotential):
+class EllipsoidOnPlane(Gap):
     """An ellipsoid above a plane.
 
+    Markers: a point of the plane and its normal, the centre, and the directions of the axes.
+
     Attributes:
-        markers: a point of the plane and its normal, the centre, and the directions of the axes.
         semi_axes: (3,) [m].
     """
 
-    markers: Any = eqx.field(metadata=is_a(Markers(1, 1, more=True)))
     semi_axes: Any = eqx.field(kw_only=True, metadata=is_a(Numbers((3,), "positive")))
 
-    kind: ClassVar[str] = "ellipsoid on plane"
+    markers: ClassVar[Markers] = Markers(1, 1, more=True)
+    sides: ClassVar[tuple[int, int]] = (0, 2)
 
     def invariants(self, x: Float[Array, "6 3"]) -> Float[Array, "4"]:
         """Height of the centre [m], and cosines of the axes with the normal [-]."""
         return jnp.stack([dot(x[1], x[2] - x[0]), *(dot(x[1], axis) for axis in x[3:6])])
 
-    def gap(self, invariants: Float[Array, "4"]) -> Float[Array, ""]:
+    def distance(self, invariants: Float[Array, "4"]) -> Float[Array, ""]:
         """Height less what the ellipsoid reaches along the normal (its support function)."""
         return invariants[0] - _length(jnp.sum((self.semi_axes * invariants[1:]) ** 2))
 
+    def contact(self, x: Float[Array, "6 3"]) -> tuple[Array, Array]:
+        """The lowest point of the ellipsoid."""
+        normal = _unit(x[1])
+        cosines = x[3:6] @ normal
+        size = _length(jnp.sum((self.semi_axes * cosines) ** 2))
+        return x[2] - (self.semi_axes**2 * cosines / jnp.where(size > 0, size, 1.0)) @ x[3:6], normal
 
-class SphereOnBox(GapPotential):
+
+class SphereOnBox(Gap):
     """A sphere beside a box, with round edges as the sphere sees them.
 
+    Markers: the centre of the box, the centre of the sphere, and three directions of the box.
+
     Attributes:
-        markers: the centre of the box, the centre of the sphere, and three directions of the box.
         size: edges of the box (3,) [m].
         radius: of the sphere [m].
     """
 
-    markers: Any = eqx.field(metadata=is_a(Markers(2, 3)))
     size: Any = eqx.field(kw_only=True, metadata=is_a(Numbers((3,), "positive")))
     radius: Any = eqx.field(kw_only=True, metadata=is_a(RADIUS))
 
-    kind: ClassVar[str] = "sphere on box"
+    markers: ClassVar[Markers] = Markers(2, 3)
+    sides: ClassVar[tuple[int, int]] = (0, 1)
 
     def invariants(self, x: Float[Array, "5 3"]) -> Float[Array, "3"]:
         """Place of the sphere in the axes of the box [m]."""
         apart = x[1] - x[0]
         return jnp.stack([dot(axis, apart) for axis in x[2:5]])
 
-    def gap(self, invariants: Float[Array, "3"]) -> Float[Array, ""]:
+    def distance(self, invariants: Float[Array, "3"]) -> Float[Array, ""]:
         """Distance from the box less radius; inside of it to the nearest face."""
         beyond = jnp.abs(invariants) - 0.5 * self.size
         outside = _length(jnp.sum(jnp.where(beyond > 0, beyond, 0.0) ** 2))
         return jnp.where(outside > 0, outside, jnp.max(beyond)) - self.radius
+
+    def contact(self, x: Float[Array, "5 3"]) -> tuple[Array, Array]:
+        """The point of the box that is nearest to a sphere outside of it."""
+        place, half = self.invariants(x), 0.5 * self.size
+        nearest = x[0] + jnp.clip(place, -half, half) @ x[2:5]
+        return nearest, _unit(x[1] - nearest)

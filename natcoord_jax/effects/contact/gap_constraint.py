@@ -1,0 +1,121 @@
+"""Contact as a constraint: a gap between two surfaces that does not become negative (65), (66)."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from natcoord_jax.core.arguments import is_a, require
+from natcoord_jax.core.effect import Effect, Motion, Response, StepContext, replace_fields
+from natcoord_jax.core.handles import Handle
+from natcoord_jax.core.joint import Joint
+from natcoord_jax.core.kinds import NAME
+from natcoord_jax.core.markers import Attachment, Marker, Markers
+from natcoord_jax.core.numeric import Number
+from natcoord_jax.core.potential import marker_response, on_rows, place_markers
+from natcoord_jax.effects.contact.gap import Gap
+from natcoord_jax.effects.contact.gap_potential import GAP
+
+
+class GapReadings(eqx.Module):
+    """What goes on in a contact that is a constraint.
+
+    Attributes:
+        gap: between the surfaces [m].
+    """
+
+    gap: Float[Array, "*t"]
+
+
+class GapConstraint(Effect):
+    """A gap between two surfaces that does not become negative, with impacts.
+
+    Where it would, a force pushes the surfaces apart, along the gradient of the gap averaged over the step:
+    they end the step touching, whatever its length, and momentum and angular momentum are exact. What that
+    force takes from the motion an impact gives back at the end of the step, a part `restitution` of the
+    speed, wherever in the step the surfaces met; with 1 energy is exact, too, for any number of impacts at
+    once (`natcoord_jax.assembly.impacts` has the law). What is lost is in its account.
+
+    For schemes of one stage, `nc.EnergyMomentum()`. Derivatives are those of the program: where an impact
+    falls within a step they are not those of the motion, which `nc.GapPotential` has.
+
+    Attributes:
+        markers: that the gap is of.
+        gap: between the surfaces, as `nc.SphereOnPlane(radius=0.1)`, or one of your own, see `nc.Gap`.
+        restitution: part of the closing speed that is left after an impact [-], from 0 to 1.
+        name: optional name.
+        mobility: change of the speed of closing by a unit impulse [1/kg], follows from the masses at compile;
+            weighs gaps against impulses while a step is solved.
+
+    Raises:
+        ValueError: for other markers than the gap takes.
+
+    Example:
+        >>> import natcoord_jax as nc
+        >>> floor = nc.Point(nc.ground), nc.Direction(nc.ground, (0, 0, 1))
+        >>> gap = nc.SphereOnPlane(radius=0.1)
+        >>> contact = nc.GapConstraint((*floor, nc.Point(nc.ground, (0, 0, 1))), gap, restitution=0.5)
+    """
+
+    markers: Any = eqx.field(metadata=is_a(Markers()))
+    gap: Gap = eqx.field(metadata=is_a(GAP))
+    restitution: Any = eqx.field(default=1.0, kw_only=True, metadata=is_a(Number("not negative")))
+    name: Any = eqx.field(default=None, kw_only=True, metadata=is_a(NAME))
+    mobility: Any = eqx.field(default=None, init=False)
+
+    kind: ClassVar[str] = "hard contact"
+    multipliers: ClassVar[int] = 1
+    unilateral: ClassVar[bool] = True
+    impulsive: ClassVar[bool] = True
+    works: ClassVar[bool] = True
+    silent: ClassVar[bool] = False
+    drawn: ClassVar[bool] = False
+
+    def __check_init__(self) -> None:
+        """Refuse markers of another gap."""
+        require(self, "markers", self.gap.markers)
+
+    def attach(self, find: Callable[[Handle], tuple[Joint, Array]]) -> Sequence[Marker | Attachment]:
+        """Markers of the constraint."""
+        return self.markers
+
+    def assembled_at(self, x: Array) -> "GapConstraint":
+        """With a mobility, which is found when the masses are known."""
+        return replace_fields(self, mobility=jnp.ones(()))
+
+    def violation(self, place: Array, rows: Array, coordinates: Array, t: Array) -> Array:
+        """How far the surfaces overlap, negative."""
+        distance = self.gap.distance(self.gap.invariants(place_markers(place, rows)))
+        return jnp.where(distance < 0, distance, 0.0)[None]
+
+    def violation_units(self, place: Array, rows: Array) -> tuple[str, ...]:
+        """Metres."""
+        return ("m",)
+
+    def lever(self, place: Array, rows: Array) -> Float[Array, "k 4 3"]:
+        """Forces on the rows of the bodies per unit multiplier, the gradient of the gap."""
+        return on_rows(place, self.gap.gradient(place_markers(place, rows))[None])[0]
+
+    def respond(self, place: Array, motion: Motion, now: StepContext, lam: Array) -> Response:
+        """The gap at the end of the step or the impulse, whichever is smaller, vanishes (66)."""
+        start = self.gap.invariants(place_markers(place, motion.start))
+        x, rates = place_markers(place, motion.rows), place_markers(place, motion.rates)
+        flow = jax.vmap(lambda xi, vi: jax.jvp(self.gap.invariants, (xi,), (vi,))[1])(x, rates)
+        gradient = self.gap.averaged(start, now.h * flow, now.tableau)
+        forces = jax.vmap(lambda xi, g, m: m * jax.vjp(self.gap.invariants, xi)[1](g)[0])(
+            x, gradient, lam[:, 0]
+        )
+        found = marker_response(place, forces, None, rates, motion)
+        moving = now.h > 0
+        before = jnp.where(moving, self.gap.distance(start) / jnp.where(moving, now.h, 1.0), 0.0)
+        ahead = before + jnp.sum(gradient * flow, axis=-1)
+        # An impulse changes the mean speed of a step by half of what it changes the speed by.
+        pushed = 0.5 * self.mobility * lam[:, 0]
+        return replace_fields(found, rows=jnp.where(pushed < ahead, pushed, ahead)[:, None])
+
+    def readings(self, place: Array, rows: Array) -> GapReadings:
+        """The gap."""
+        return GapReadings(self.gap.distance(self.gap.invariants(place_markers(place, rows))))

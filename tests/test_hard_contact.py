@@ -1,0 +1,247 @@
+"""Contact as a constraint: impacts of any number of bodies, rest, joints, derivatives, wrong input."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import tolerances as tol
+from differences import assert_v_shaped
+
+import natcoord_jax as nc
+from natcoord_jax.maths.impact_law import impact_impulses
+
+FLOOR = nc.Plane(normal=(0, 0, 1))
+BALL = {"shape": nc.Sphere(0.1), "density": 1 / (4 / 3 * np.pi * 1e-3)}  # of 1 kg
+
+
+def dropped(restitution=1.0, solver=None, height=1.0, **given):
+    """A ball above a floor."""
+    scene = nc.Scene()
+    scene.add(nc.Gravity())
+    ball = scene.add(nc.RigidBody(**BALL, position=(0, 0, height + 0.1), name="ball", **given))
+    scene.add(nc.Contact(ball, FLOOR, restitution=restitution, name="bounce"))
+    return scene.compile(solver=solver)
+
+
+def heights(system, trajectory):
+    return np.asarray(system.sense(trajectory, "bounce").gap)
+
+
+@pytest.mark.parametrize("h", [0.05, 0.01, 0.002])
+@pytest.mark.parametrize("restitution", [1.0, 0.5, 0.0])
+def test_bouncing_ball(h, restitution):
+    """Rebounds as high as asked for, wherever in a step the impact falls; what is lost is booked."""
+    system, state = dropped(restitution)
+    trajectory = nc.simulate(system, state, dt=h, steps=round(3.0 / h))
+    assert nc.balance(system, trajectory).energy.max() <= tol.ENERGY_OF_A_SMALL_SCENE
+    z, t = heights(system, trajectory), np.asarray(trajectory.t)
+    assert z.min() >= -1e-14
+    second = z[(t > 0.46) & (t < 1.3)].max()
+    # The top falls between two states, and what the weight does in the step of an impact is not the impact's.
+    assert abs(second - restitution**2) <= 1.2 * h**2 * 9.81 / 8 + 0.02 * h
+    lost = float(system.work(trajectory)["bounce"][-1])
+    assert lost <= tol.ENERGY_OF_A_SMALL_SCENE
+    if restitution == 1.0:
+        assert lost >= -tol.ENERGY_OF_A_SMALL_SCENE * 100
+    else:
+        # At rest in the end, with the whole of the energy lost.
+        assert np.abs(np.asarray(trajectory.v)[-1]).max() <= 1e-9
+        assert lost == pytest.approx(-9.81, rel=1e-12)
+
+
+@pytest.mark.parametrize("restitution", [1.0, 0.5])
+def test_all_forms_agree(restitution):
+    found = []
+    for solver in ("reduced", "full", "recursive", "sparse"):
+        system, state = dropped(restitution, solver, angular_velocity=(0.3, 2.0, 0.1), velocity=(1.0, 0, 0))
+        found.append(np.asarray(nc.simulate(system, state, dt=0.01, steps=150).q))
+    for other in found[1:]:
+        np.testing.assert_allclose(other, found[0], atol=1e-11)
+
+
+def test_resting_ball_is_untouched():
+    """At gap zero, at rest, for a thousand steps; whatever falls beside it."""
+    scene = nc.Scene()
+    scene.add(nc.Gravity())
+    still = scene.add(nc.RigidBody(**BALL, position=(0, 0, 0.1), name="still"))
+    falling = scene.add(nc.RigidBody(**BALL, position=(1, 0, 0.5)))
+    scene.add(nc.Contact(still, FLOOR, restitution=0.7))
+    scene.add(nc.Contact(falling, FLOOR, restitution=0.7))
+    system, state = scene.compile()
+    trajectory = nc.simulate(system, state, dt=2e-3, steps=1000)
+    assert np.abs(np.asarray(system.sense(trajectory, still).velocity)).max() <= 1e-15
+    assert np.abs(np.asarray(system.sense(trajectory, still).position) - (0, 0, 0.1)).max() <= 1e-15
+
+
+@pytest.mark.parametrize("restitution", [1.0, 0.6])
+def test_box_falls_on_four_corners(restitution):
+    """Redundant contacts that close at once: no corner is first, and the box does not begin to turn."""
+    scene = nc.Scene()
+    scene.add(nc.Gravity())
+    box = scene.add(nc.RigidBody(shape=nc.Box((0.4, 0.6, 0.2)), density=100.0, position=(0, 0, 0.5)))
+    scene.add(nc.Contact(box, FLOOR, restitution=restitution))
+    system, state = scene.compile()
+    trajectory = nc.simulate(system, state, dt=4e-3, steps=300)
+    assert nc.balance(system, trajectory).energy.max() <= tol.ENERGY_OF_A_SMALL_SCENE
+    # A tilt of rounding grows with every bounce, by the time of flight over the step.
+    spin = np.abs(np.asarray(system.sense(trajectory, box).angular_velocity)).max(axis=1)
+    assert spin[:150].max() <= 1e-12 and spin.max() <= 1e-4
+    z = np.asarray(system.sense(trajectory, box).position)[:, 2]
+    assert z.min() >= 0.1 - 1e-12
+    top = z[80:200].max() - 0.1
+    assert top == pytest.approx(0.4 * restitution**2, abs=2e-3)
+
+
+def test_tumbling_box_keeps_its_energy():
+    """Corners that meet the floor one by one and two by two, at 20 rad/s; no energy is made in any step."""
+    scene = nc.Scene()
+    scene.add(nc.Gravity())
+    box = scene.add(
+        nc.RigidBody(
+            shape=nc.Box((0.4, 0.6, 0.2)),
+            density=100.0,
+            position=(0, 0, 0.6),
+            velocity=(1.0, 0.2, -1.0),
+            angular_velocity=(3.0, -2.0, 1.0),
+        )
+    )
+    scene.add(nc.Contact(box, FLOOR))
+    system, state = scene.compile()
+    trajectory = nc.simulate(system, state, dt=2e-3, steps=1000)
+    energy = np.asarray(system.energy(trajectory).total)
+    assert np.abs(energy - energy[0]).max() <= tol.ENERGY_OF_A_SMALL_SCENE * energy[0] * 10
+    momentum = np.asarray(system.momentum(trajectory))[:, :2]
+    assert np.abs(momentum - momentum[0]).max() <= 1e-12 * np.abs(momentum).max()
+
+
+def test_cradle_with_gaps():
+    """The sequence of impacts through four gaps that steps resolve: the last ball has all of the speed."""
+    scene = nc.Scene()
+    balls = [
+        scene.add(nc.RigidBody(**BALL, position=(0.201 * k - 0.01 * (k == 0), 0, 0), velocity=(float(k == 0), 0, 0)))
+        for k in range(5)
+    ]
+    for one, other in zip(balls, balls[1:]):
+        scene.add(nc.Contact(one, other))
+    system, state = scene.compile()
+    trajectory = nc.simulate(system, state, dt=5e-4, steps=60)
+    final = [float(system.sense(trajectory, ball).velocity[-1, 0]) for ball in balls]
+    np.testing.assert_allclose(final, [0, 0, 0, 0, 1], atol=1e-12)
+    found = nc.balance(system, trajectory)
+    assert found.energy.max() <= tol.ENERGY_OF_A_SMALL_SCENE
+    assert found.momentum.max() <= tol.MOMENTUM_OF_A_SMALL_SCENE
+
+
+def test_oblique_impact_keeps_momenta():
+    """Two capsules in space, each of which turns: energy, momentum and angular momentum through an impact."""
+    scene = nc.Scene()
+    given = {"shape": nc.Capsule(radius=0.1, length=0.6), "density": 200.0}
+    one = scene.add(nc.RigidBody(**given, position=(-0.5, 0.1, 0), velocity=(1.0, 0, 0), angular_velocity=(2, 1, 0)))
+    other = scene.add(nc.RigidBody(**given, position=(0.5, 0, 0.2), velocity=(-1.0, 0, 0.1), angular_velocity=(0, -3, 1)))
+    scene.add(nc.Contact(one, other, name="impact"))
+    system, state = scene.compile()
+    trajectory = nc.simulate(system, state, dt=5e-3, steps=200)
+    gap = np.asarray(system.sense(trajectory, "impact").gap)
+    assert gap.min() <= 1e-12 and gap[-1] > 0.1
+    found = nc.balance(system, trajectory)
+    for drift in (found.energy, found.momentum, found.angular_momentum):
+        assert drift.max() <= tol.ENERGY_OF_A_SMALL_SCENE
+
+
+@pytest.mark.parametrize("restitution", [1.0, 0.5])
+def test_pendulum_hits_a_wall(restitution):
+    """A body on a joint: it is the inertia about the joint that an impact meets."""
+    scene = nc.Scene()
+    ball = scene.add(nc.RigidBody(**BALL, position=(1.0, 0, 0), name="bob"))
+    hinge = scene.add(nc.Revolute(nc.ground, ball, axis=(0, 0, 1), point=(0, 0, 0)))
+    wall = nc.Plane(normal=(0, -1, 0), point=(0, 0.6, 0))
+    scene.add(nc.Contact(ball, wall, restitution=restitution))
+    system, state = scene.compile()
+    state = system.with_coordinate(state, hinge, 0.0, rate=2.0)
+    trajectory = nc.simulate(system, state, dt=7e-3, steps=100, scheme=nc.EnergyMomentum(kick=True))
+    assert nc.balance(system, trajectory).energy.max() <= tol.ENERGY_OF_A_SMALL_SCENE
+    rate = np.asarray(system.sense(trajectory, hinge).rates)[:, 0]
+    assert rate[-1] == pytest.approx(-2.0 * restitution, rel=1e-12)
+
+
+def test_derivatives_of_the_program():
+    """In every mode, where no difference crosses a change of contacts; in a batch of other contacts, too."""
+    system, state = dropped(0.8)
+
+    def end(x):
+        moved = eqx.tree_at(lambda s: s.v, state, state.v.at[0, 2].add(x))
+        return nc.simulate(system, moved, dt=0.01, steps=90, throw=False).q[-1, 0, 2]
+
+    assert_v_shaped(end, 0.013, 1.0, jax.grad(end)(0.013))
+
+
+def random_impacts(random, contacts=4):
+    """Contacts of one body in a plane, that all push to one side and depend on each other."""
+    levers = np.column_stack([np.ones(contacts), random.normal(size=(contacts, 2))])
+    return levers @ levers.T, levers @ random.normal(size=3), 0.2 * random.random(contacts)
+
+
+def energy_of(impulses, matrix, rates):
+    return impulses @ rates + 0.5 * impulses @ matrix @ impulses
+
+
+def test_impact_law():
+    """Elastic impacts give back what was taken, contact by contact; others lose (1 - e^2) of the difference."""
+    random = np.random.default_rng(0)
+    for _ in range(50):
+        matrix, rates, work = random_impacts(random)
+        active = jnp.asarray(random.random(4) < 0.8)
+        given = [jnp.asarray(x) for x in (matrix, rates, jnp.where(active, work, 0.0))]
+
+        def law(e, given=given, active=active):
+            return np.asarray(impact_impulses(*given, jnp.full(4, e), active, active))
+
+        elastic, half, plastic = law(1.0), law(0.5), law(0.0)
+        assert (elastic[np.asarray(active)] > 0).all() and not elastic[~np.asarray(active)].any()
+        done = elastic * (rates + 0.5 * matrix @ elastic)
+        np.testing.assert_allclose(done, given[2], atol=1e-10)
+        energies = [energy_of(x, matrix, rates) for x in (elastic, half, plastic)]
+        assert energies[0] - energies[1] == pytest.approx(0.75 * (energies[0] - energies[2]), rel=1e-9)
+
+
+def test_restitutions_that_differ_make_no_energy():
+    """What each contact would do alone may give energy together: then less of it is given back."""
+    random, limited = np.random.default_rng(1), 0
+    for _ in range(100):
+        matrix, rates, work = random_impacts(random, 3)
+        active, e = jnp.ones(3, bool), jnp.asarray(random.integers(0, 2, 3).astype(float))
+        found = np.asarray(impact_impulses(*map(jnp.asarray, (matrix, rates, work)), e, active, active))
+        gained = energy_of(found, matrix, rates) - work.sum()
+        assert gained <= 1e-10
+        limited += gained > -1e-9 and 0 < e.sum() < 3
+    assert limited > 0
+
+
+def test_impact_law_is_differentiable():
+    random = np.random.default_rng(2)
+    matrix, rates, work = (jnp.asarray(x) for x in random_impacts(random))
+    on, e = jnp.array([True, True, False, True]), jnp.array([0.9, 0.5, 0.3, 0.0])
+
+    def velocity(x):
+        shifted = matrix * (1 + x[0]), rates + x[1], work * (1 + x[2])
+        return matrix @ impact_impulses(*shifted, e, on, on)
+
+    x, along = jnp.array([0.1, -0.2, 0.3]), jnp.array([0.5, 0.2, -0.3])
+    assert_v_shaped(velocity, x, along, jax.jvp(velocity, (x,), (along,))[1])
+    slope = jax.grad(lambda x: jnp.sum(velocity(x) ** 2))
+    assert_v_shaped(slope, x, along, jax.jvp(slope, (x,), (along,))[1])
+
+
+@pytest.mark.parametrize(
+    "scheme", [nc.EnergyMomentum(order=4), nc.VariationalMidpoint(), nc.Dissipative()], ids=str
+)
+def test_schemes_without_impacts_are_refused(scheme):
+    system, state = dropped()
+    with pytest.raises(ValueError, match="hard contact 'bounce'.*EnergyMomentum"):
+        nc.simulate(system, state, dt=0.01, steps=5, scheme=scheme)
+
+
+def test_overlap_at_the_start_is_refused():
+    with pytest.raises(ValueError, match="hard contact 'bounce' overlap by 0.05 m"):
+        dropped(height=-0.05)
