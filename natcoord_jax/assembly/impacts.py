@@ -2,7 +2,7 @@
 
 A gap that a step would have made negative is zero at its end (66), by an impulse that takes some energy with
 it, more or less by where in the step the surfaces met. `natcoord_jax.maths.impact_law` says what velocities
-follow: those of the restitution that is asked for, wherever that was.
+follow: those of the restitution that is asked for, wherever that was. Then friction stops what slip it can.
 """
 
 from collections.abc import Sequence
@@ -21,39 +21,53 @@ from natcoord_jax.assembly.tangent_space import Velocity
 from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
-from natcoord_jax.maths.impact_law import impact_impulses
+from natcoord_jax.maths.impact_law import friction_impulses, impact_impulses
+from natcoord_jax.maths.vectors import positive_part
 
 TOUCHING = 1e-12
 """Gap at the start of a step, per unit of size of the places, up to which surfaces have met before: what the
 last step has left of a gap that it closed."""
 
 
-class Answers:
-    """What impulses along the gaps do to the velocities of one configuration."""
+def levers(system: System, groups: Sequence[Group], state: State, name: str) -> Float[Array, "c bodies 4 3"]:
+    """Forces on the rows of all bodies that unit impulses at contacts are, by a method of the effects."""
+    rows, found = rows_with_ground(state.q), []
+    for group in groups:
+        each = jax.vmap(lambda effect, place, rows: getattr(effect, name)(place, rows))
+        forces = each(group.effect, group_places(system, group), rows[group.bodies])
+        several = forces.shape[1]
+        whole = jnp.zeros((group.count, several, *rows.shape), rows.dtype)
+        at = np.arange(group.count)[:, None, None], np.arange(several)[:, None], group.bodies[:, None]
+        found.append(whole.at[at].add(forces)[:, :, :-1].reshape(-1, *rows[:-1].shape))
+    return jnp.concatenate(found)
 
-    def __init__(self, system: System, groups: Sequence[Group], state: State) -> None:
-        self.space: Any = tangents_at(system, state)
-        rows = rows_with_ground(state.q)
-        levers = []
-        for group in groups:
-            each = jax.vmap(lambda effect, place, rows: effect.lever(place, rows))
-            found = each(group.effect, group_places(system, group), rows[group.bodies])
-            whole = jnp.zeros((group.count, *rows.shape), rows.dtype)
-            index = jnp.arange(group.count)[:, None], group.bodies
-            levers.append(whole.at[index].add(found)[:, :-1])
-        still = jnp.zeros((sum(g.count for g in groups), *state.rates.shape), rows.dtype)
-        self.impulses = Velocity(jnp.concatenate(levers), still)
-        self.along = jax.vmap(self.space.answer)(self.impulses)
+
+class Answers:
+    """What impulses at contacts do to the velocities of one configuration.
+
+    Attributes:
+        space: of the velocities that the constraints admit.
+        along: what unit impulses do, in its frame, one a row.
+    """
+
+    def __init__(self, space: Any, rows: Float[Array, "c bodies 4 3"], rotors: Array) -> None:
+        self.space = space
+        still = jnp.zeros((rows.shape[0], *rotors.shape), rows.dtype)
+        self.along = jax.vmap(space.answer)(Velocity(rows, still))
+
+    @property
+    def flat(self) -> Float[Array, "c u"]:
+        """The same, one vector a row."""
+        return self.along.reshape(self.along.shape[0], -1)
 
     @property
     def matrix(self) -> Float[Array, "c c"]:
         """W = G M^-1 G^T."""
-        flat = self.along.reshape(self.along.shape[0], -1)
-        return flat @ flat.T
+        return self.flat @ self.flat.T
 
     def rates(self, velocity: Velocity) -> Float[Array, " c"]:
-        """gamma: work of a unit impulse on a velocity."""
-        return self.along.reshape(self.along.shape[0], -1) @ self.space.framed(velocity).reshape(-1)
+        """gamma: work of unit impulses on a velocity."""
+        return self.flat @ self.space.framed(velocity).reshape(-1)
 
     def pushed(self, velocity: Velocity, impulses: Float[Array, " c"]) -> Velocity:
         """A velocity after impulses."""
@@ -84,38 +98,62 @@ def after_impacts(
         found: solved equations of the step.
     """
     numbers = [k for k, group in enumerate(groups) if group.effect.unilateral]
-    these = [groups[k] for k in numbers]
+    these, lam = [groups[k] for k in numbers], [found.given[k][:, 0] for k in numbers]
     # Of the multipliers of a contact the first is that of the gap.
-    lam = jnp.concatenate([found.given[k][:, 0, 0] for k in numbers])
-    taken = -jnp.concatenate([found.power[k][:, 0] for k in numbers])
+    pushed = jnp.concatenate([x[:, 0] for x in lam])
     # As in the equations: what is left of the impulse of an open contact may be of either sign.
     mobility = jnp.concatenate([group.effect.mobility for group in these])
-    active = 0.5 * mobility * lam > gaps(system, these, end) / h
-    none = jnp.zeros_like(lam)
+    active = 0.5 * mobility * pushed > gaps(system, these, end) / h
+    none = jnp.zeros_like(pushed)
 
     def impacts() -> tuple[Array, Array, Array]:
-        return _impacts(system, start, end, these, active, taken)
+        return _impacts(system, start, end, h, these, active, lam)
 
     v, rotors, done = jax.lax.cond(jnp.any(active), impacts, lambda: (end.v, end.rates, none))
-    parts = np.split(np.arange(lam.size), np.cumsum([group.count for group in these])[:-1])
-    return replace_fields(end, v=v, rates=rotors), {k: done[part] for k, part in zip(numbers, parts)}
+    return replace_fields(end, v=v, rates=rotors), dict(zip(numbers, _by_group(these, done)))
+
+
+def _by_group(groups: Sequence[Group], every: Array) -> list[Array]:
+    return [every[part] for part in np.split(np.arange(every.shape[0]), np.cumsum([g.count for g in groups])[:-1])]
 
 
 def _impacts(
-    system: System, start: State, end: State, groups: Sequence[Group], active: Array, taken: Array
+    system: System,
+    start: State,
+    end: State,
+    h: Array,
+    groups: Sequence[Group],
+    active: Float[Array, " c"],
+    lam: Sequence[Float[Array, "n m"]],
 ) -> tuple[Array, Array, Array]:
     """Velocities and rates of rotors after impacts of the active contacts, and their work."""
-    answers = Answers(system, groups, end)
-    size = 1.0 + jnp.max(jnp.abs(start.q))
-    met = active & (gaps(system, groups, start) > TOUCHING * size)
+    space = tangents_at(system, end)
+    answers = Answers(space, levers(system, groups, end, "pushes"), end.rates)
+    before, pushed = gaps(system, groups, start), jnp.concatenate([x[:, 0] for x in lam])
+    met = active & (before > TOUCHING * (1.0 + jnp.max(jnp.abs(start.q))))
+    work = jnp.where(met & (pushed > 0), pushed * before / h, 0.0)
     restitution = jnp.concatenate([group.effect.restitution for group in groups])
-    work = jnp.where(met & (taken > 0), taken, 0.0)
     velocity = Velocity(end.v.reshape(-1, 4, 3), end.rates)
     rates, matrix = answers.rates(velocity), answers.matrix
     impulses = impact_impulses(matrix, rates, work, restitution, active, met)
-    after = answers.pushed(velocity, impulses)
+    velocity = answers.pushed(velocity, impulses)
     done = impulses * (rates + 0.5 * matrix @ impulses)
-    return after.rows.reshape(end.v.shape), after.rotors, done
+    parts = zip(groups, lam, *(_by_group(groups, x) for x in (active, impulses, done)))
+    rubbing, finished = [], []
+    for group, own, on, pushes, work in parts:
+        finished.append(work)
+        if group.effect.friction is not None:
+            most = group.effect.friction * jnp.where(on, positive_part(own[:, 0] + pushes), 0.0)
+            rubbing.append((group, own[:, 1:], most))
+    if rubbing:
+        these, held, most = zip(*rubbing)
+        answers = Answers(space, levers(system, these, end, "rubs"), end.rates)
+        given = answers.matrix, answers.rates(velocity), jnp.concatenate(held), jnp.concatenate(most)
+        stopping, stopped = friction_impulses(*given)
+        velocity = answers.pushed(velocity, stopping)
+        lost = iter(_by_group(these, stopped))
+        finished = [w + (0.0 if g.effect.friction is None else next(lost)) for g, w in zip(groups, finished)]
+    return velocity.rows.reshape(end.v.shape), velocity.rotors, jnp.concatenate(finished)
 
 
 def with_mobilities(system: System, state: State) -> System:
@@ -123,18 +161,19 @@ def with_mobilities(system: System, state: State) -> System:
     groups = [group for group in system.effects if group.effect.unilateral]
     if not groups:
         return system
-    own = jnp.diagonal(_matrix(system, state))
-    effects, first = [], 0
-    for group in system.effects:
-        if group.effect.unilateral:
-            here = own[first : first + group.count]
-            first += group.count
-            effect = replace_fields(group.effect, mobility=jnp.where(here > 0, here, 1.0))
-            group = replace_fields(group, effect=effect)
-        effects.append(group)
-    return replace_fields(system, effects=tuple(effects))
+    own = iter(_by_group(groups, _own_mobilities(system, state)))
+    effects = tuple(
+        replace_fields(group, effect=replace_fields(group.effect, mobility=next(own)))
+        if group.effect.unilateral
+        else group
+        for group in system.effects
+    )
+    return replace_fields(system, effects=effects)
 
 
 @eager_numpy
-def _matrix(system: System, state: State) -> Array:
-    return Answers(system, [group for group in system.effects if group.effect.unilateral], state).matrix
+def _own_mobilities(system: System, state: State) -> Float[Array, " c"]:
+    groups = [group for group in system.effects if group.effect.unilateral]
+    forces = levers(system, groups, state, "pushes")
+    found = jnp.diagonal(Answers(tangents_at(system, state), forces, state.rates).matrix)
+    return jnp.where(found > 0, found, 1.0)

@@ -174,6 +174,7 @@ class Contact(Recipe):
     other: Any = eqx.field(metadata=is_a(SIDE))
     stiffness: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Number("positive")))
     restitution: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Number("not negative")))
+    friction: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Number("not negative")))
     speed: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Number("positive")))
     law: str = eqx.field(
         default="linear", kw_only=True, static=True, metadata=is_a(Choice(("linear", "hertz")))
@@ -195,9 +196,8 @@ class Contact(Recipe):
     def _effect(self, markers: tuple[Marker, ...], gap: Gap, name: str) -> GapPotential | GapConstraint:
         """What keeps one gap open."""
         if self.stiffness is None:
-            return GapConstraint(
-                markers, gap, restitution=1.0 if self.restitution is None else self.restitution, name=name
-            )
+            restitution = 1.0 if self.restitution is None else self.restitution
+            return GapConstraint(markers, gap, restitution=restitution, friction=self.friction, name=name)
         law = {"stiffness": self.stiffness, "law": self.law}
         if self.restitution is not None:
             law |= {"restitution": self.restitution, "speed": self.speed}

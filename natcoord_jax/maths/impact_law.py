@@ -26,6 +26,9 @@ REFINEMENTS = 3
 MOST = 60
 """Iterations of Newton's method for elastic impulses; ten are the most seen."""
 
+PROJECTIONS = 10
+"""Of impulses of friction; one is enough for a single contact."""
+
 WITHIN = 0.95
 """Part of the way to where an impulse vanishes that one iteration may go."""
 
@@ -134,3 +137,42 @@ def impact_impulses(
     excess = needed > room
     part = jnp.where(excess, safe_sqrt(room / jnp.where(excess, needed, 1.0)), 1.0)
     return jnp.where(active, plastic + part * change, 0.0)
+
+
+def friction_impulses(
+    matrix: Float[Array, "3c 3c"],
+    slip: Float[Array, " 3c"],
+    held: Float[Array, "c 3"],
+    most: Float[Array, " c"],
+) -> tuple[Float[Array, " 3c"], Float[Array, " c"]]:
+    """Impulses that stop slip as far as friction can [N s], and their work [J].
+
+    Of all that are within the cones of friction those of the least kinetic energy, nearly: projected gradients,
+    each with the length at which the energy is least. So none of them adds energy.
+
+    Args:
+        matrix: W of the directions of slip [1/kg].
+        slip: velocities of slip by components, three a contact [m/s].
+        held: impulses of friction in the step already.
+        most: mu times the impulses along the normals.
+    """
+    count = most.shape[0]
+    # Half the trace of the block of a contact, in a plane.
+    own = 0.5 * jnp.sum(jnp.diagonal(matrix).reshape(count, 3), axis=1)
+    inverse = jnp.where(own > 0, 1.0 / jnp.where(own > 0, own, 1.0), 0.0)[:, None]
+
+    def trip(_: Array, found: Float[Array, "c 3"]) -> Float[Array, "c 3"]:
+        moving = (slip + matrix @ found.reshape(-1)).reshape(count, 3)
+        wanted = held + found - inverse * moving
+        square = jnp.sum(wanted**2, axis=1)
+        beyond = square > most**2
+        shorter = most / jnp.where(beyond, jnp.sqrt(jnp.where(beyond, square, 1.0)), 1.0)
+        change = jnp.where(beyond[:, None], shorter[:, None] * wanted, wanted) - held - found
+        along = -jnp.sum(moving * change)
+        needed = change.reshape(-1) @ (matrix @ change.reshape(-1))
+        some = (along > 0) & (needed > 0)
+        return found + jnp.where(some, jnp.minimum(along / jnp.where(some, needed, 1.0), 1.0), 0.0) * change
+
+    found = jax.lax.fori_loop(0, PROJECTIONS, trip, jnp.zeros_like(held)).reshape(-1)
+    done = found * (slip + 0.5 * matrix @ found)
+    return found, jnp.sum(done.reshape(count, 3), axis=1)

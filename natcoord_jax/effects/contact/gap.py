@@ -47,15 +47,8 @@ class Gap(Part):
         """Distance of the surfaces, negative where they overlap [m]."""
 
     def contact(self, x: Float[Array, "k 3"]) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
-        """Where the surfaces touch [m], and the unit normal from the first to the second; for friction.
-
-        Raises:
-            NotImplementedError: for gaps that do not say it.
-        """
-        raise NotImplementedError(
-            f"{type(self).__name__} does not say where its surfaces touch, which friction acts at; give it a "
-            "method `contact`"
-        )
+        """Where the surfaces touch [m], and the unit normal from the first to the second; for friction."""
+        raise NotImplementedError(f"{type(self).__name__} does not say where its surfaces touch")
 
     def gradient(self, x: Float[Array, "k 3"]) -> Float[Array, "k 3"]:
         """Of the distance by the marker vectors [-]."""

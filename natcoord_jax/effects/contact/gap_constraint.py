@@ -18,6 +18,7 @@ from natcoord_jax.core.numeric import Number
 from natcoord_jax.core.potential import marker_response, on_rows, place_markers
 from natcoord_jax.effects.contact.gap import Gap
 from natcoord_jax.effects.contact.gap_potential import GAP
+from natcoord_jax.maths.vectors import cross, dot, positive_part
 
 
 class GapReadings(eqx.Module):
@@ -39,6 +40,11 @@ class GapConstraint(Effect):
     speed, wherever in the step the surfaces met; with 1 energy is exact, too, for any number of impacts at
     once (`natcoord_jax.assembly.impacts` has the law). What is lost is in its account.
 
+    With friction a force of slip acts where the surfaces touch, f sqrt(|u|^2 + eps^2) = -mu N u of the velocity
+    u with which the second slips on the first: at most mu N, and against it. At the end of a step slip that
+    friction can stop is stopped, so that what sticks is at rest. Under a load that it holds a contact creeps,
+    more slowly than eps, the regularisation.
+
     For schemes of one stage, `nc.EnergyMomentum()`. Derivatives are those of the program: where an impact
     falls within a step they are not those of the motion, which `nc.GapPotential` has.
 
@@ -46,12 +52,14 @@ class GapConstraint(Effect):
         markers: that the gap is of.
         gap: between the surfaces, as `nc.SphereOnPlane(radius=0.1)`, or one of your own, see `nc.Gap`.
         restitution: part of the closing speed that is left after an impact [-], from 0 to 1.
+        friction: coefficient mu [-]; None: there is none.
+        regularisation: eps [m/s].
         name: optional name.
         mobility: change of the speed of closing by a unit impulse [1/kg], follows from the masses at compile;
             weighs gaps against impulses while a step is solved.
 
     Raises:
-        ValueError: for other markers than the gap takes.
+        ValueError: for other markers than the gap takes, and for friction of a gap without a point of contact.
 
     Example:
         >>> import natcoord_jax as nc
@@ -63,11 +71,12 @@ class GapConstraint(Effect):
     markers: Any = eqx.field(metadata=is_a(Markers()))
     gap: Gap = eqx.field(metadata=is_a(GAP))
     restitution: Any = eqx.field(default=1.0, kw_only=True, metadata=is_a(Number("not negative")))
+    friction: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Number("not negative")))
+    regularisation: Any = eqx.field(default=1e-5, kw_only=True, metadata=is_a(Number("positive")))
     name: Any = eqx.field(default=None, kw_only=True, metadata=is_a(NAME))
     mobility: Any = eqx.field(default=None, init=False)
 
     kind: ClassVar[str] = "hard contact"
-    multipliers: ClassVar[int] = 1
     unilateral: ClassVar[bool] = True
     impulsive: ClassVar[bool] = True
     works: ClassVar[bool] = True
@@ -75,8 +84,18 @@ class GapConstraint(Effect):
     drawn: ClassVar[bool] = False
 
     def __check_init__(self) -> None:
-        """Refuse markers of another gap."""
+        """Refuse markers of another gap, and friction where no one knows at which point."""
         require(self, "markers", self.gap.markers)
+        if self.friction is not None and type(self.gap).contact is Gap.contact:
+            raise ValueError(
+                f"{type(self).__name__}: friction [-] acts where surfaces touch, which "
+                f"{type(self.gap).__name__} does not say; give it a method `contact`"
+            )
+
+    @property
+    def multipliers(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Impulse along the normal, and with friction that of slip by its components."""
+        return 1 if self.friction is None else 4
 
     def attach(self, find: Callable[[Handle], tuple[Joint, Array]]) -> Sequence[Marker | Attachment]:
         """Markers of the constraint."""
@@ -95,9 +114,18 @@ class GapConstraint(Effect):
         """Metres."""
         return ("m",)
 
-    def lever(self, place: Array, rows: Array) -> Float[Array, "k 4 3"]:
-        """Forces on the rows of the bodies per unit multiplier, the gradient of the gap."""
-        return on_rows(place, self.gap.gradient(place_markers(place, rows))[None])[0]
+    def pushes(self, place: Array, rows: Array) -> Float[Array, "1 k 4 3"]:
+        """Forces on the rows of the bodies per unit impulse along the gradient of the gap."""
+        return on_rows(place, self.gap.gradient(place_markers(place, rows))[None])
+
+    def rubs(self, place: Array, rows: Array) -> Float[Array, "3 k 4 3"]:
+        """The same of impulses against slip, by components."""
+        x = place_markers(place, rows)
+        still = jnp.zeros_like(x), jnp.zeros((rows.shape[0], 3), x.dtype)
+        forces, torques = jax.jacrev(lambda v, w: self.slip(x, v, w), argnums=(0, 1))(*still)
+        # On orthonormal directors.
+        turning = 0.5 * cross(torques[:, :, None], rows[:, 1:])
+        return on_rows(place, forces) + jnp.pad(turning, ((0, 0), (0, 0), (1, 0), (0, 0)))
 
     def respond(self, place: Array, motion: Motion, now: StepContext, lam: Array) -> Response:
         """The gap at the end of the step or the impulse, whichever is smaller, vanishes (66)."""
@@ -108,13 +136,32 @@ class GapConstraint(Effect):
         forces = jax.vmap(lambda xi, g, m: m * jax.vjp(self.gap.invariants, xi)[1](g)[0])(
             x, gradient, lam[:, 0]
         )
-        found = marker_response(place, forces, None, rates, motion)
+        torques = None
         moving = now.h > 0
         before = jnp.where(moving, self.gap.distance(start) / jnp.where(moving, now.h, 1.0), 0.0)
         ahead = before + jnp.sum(gradient * flow, axis=-1)
         # An impulse changes the mean speed of a step by half of what it changes the speed by.
         pushed = 0.5 * self.mobility * lam[:, 0]
-        return replace_fields(found, rows=jnp.where(pushed < ahead, pushed, ahead)[:, None])
+        found = jnp.where(pushed < ahead, pushed, ahead)[:, None]
+        if self.friction is not None:
+            # What is along the normal by rounding, or while a step is being solved, is no friction.
+            along = lam[0, 1:]
+            slip, pulled = jax.vjp(lambda v, w: self.slip(x[0], v, w), rates[0], motion.spin[0])
+            rubbing, torques = (y[None] for y in pulled(along))
+            forces = forces + rubbing
+            speed = jnp.sqrt(dot(slip, slip) + self.regularisation**2)
+            missing = along * speed + self.friction * positive_part(lam[0, 0]) * slip
+            found = jnp.concatenate([found, self.mobility * missing[None]], axis=1)
+        return replace_fields(marker_response(place, forces, torques, rates, motion), rows=found)
+
+    def slip(
+        self, x: Float[Array, "k 3"], rates: Float[Array, "k 3"], spin: Float[Array, "k 3"]
+    ) -> Float[Array, "3"]:
+        """Velocity with which the second surface slips on the first [m/s]."""
+        point, normal = self.gap.contact(x)
+        first, second = (rates[k] + cross(spin[k], point - x[k]) for k in self.gap.sides)
+        relative = second - first
+        return relative - dot(normal, relative) * normal
 
     def readings(self, place: Array, rows: Array) -> GapReadings:
         """The gap."""
