@@ -86,9 +86,10 @@ def test_box_falls_on_four_corners(restitution):
     assert nc.balance(system, trajectory).energy.max() <= tol.ENERGY_OF_A_SMALL_SCENE
     # A tilt of rounding grows with every bounce, by the time of flight over the step.
     spin = np.abs(np.asarray(system.sense(trajectory, box).angular_velocity)).max(axis=1)
-    assert spin[:150].max() <= 1e-12 and spin.max() <= 1e-4
+    assert spin[:150].max() <= 1e-12 and spin[:250].max() <= 1e-6
     z = np.asarray(system.sense(trajectory, box).position)[:, 2]
-    assert z.min() >= 0.1 - 1e-12
+    # Of several contacts each gives way by a part in 10^9 of the way of a step.
+    assert z.min() >= 0.1 - 1e-9 * 4.5 * 4e-3
     top = z[80:200].max() - 0.1
     assert top == pytest.approx(0.4 * restitution**2, abs=2e-3)
 
@@ -119,7 +120,9 @@ def test_cradle_with_gaps():
     """The sequence of impacts through four gaps that steps resolve: the last ball has all of the speed."""
     scene = nc.Scene()
     balls = [
-        scene.add(nc.RigidBody(**BALL, position=(0.201 * k - 0.01 * (k == 0), 0, 0), velocity=(float(k == 0), 0, 0)))
+        scene.add(
+            nc.RigidBody(**BALL, position=(0.201 * k - 0.01 * (k == 0), 0, 0), velocity=(float(k == 0), 0, 0))
+        )
         for k in range(5)
     ]
     for one, other in zip(balls, balls[1:]):
@@ -137,8 +140,12 @@ def test_oblique_impact_keeps_momenta():
     """Two capsules in space, each of which turns: energy, momentum and angular momentum through an impact."""
     scene = nc.Scene()
     given = {"shape": nc.Capsule(radius=0.1, length=0.6), "density": 200.0}
-    one = scene.add(nc.RigidBody(**given, position=(-0.5, 0.1, 0), velocity=(1.0, 0, 0), angular_velocity=(2, 1, 0)))
-    other = scene.add(nc.RigidBody(**given, position=(0.5, 0, 0.2), velocity=(-1.0, 0, 0.1), angular_velocity=(0, -3, 1)))
+    one = scene.add(
+        nc.RigidBody(**given, position=(-0.5, 0.1, 0), velocity=(1.0, 0, 0), angular_velocity=(2, 1, 0))
+    )
+    other = scene.add(
+        nc.RigidBody(**given, position=(0.5, 0, 0.2), velocity=(-1.0, 0, 0.1), angular_velocity=(0, -3, 1))
+    )
     scene.add(nc.Contact(one, other, name="impact"))
     system, state = scene.compile()
     trajectory = nc.simulate(system, state, dt=5e-3, steps=200)
@@ -165,6 +172,103 @@ def test_pendulum_hits_a_wall(restitution):
     assert rate[-1] == pytest.approx(-2.0 * restitution, rel=1e-12)
 
 
+def sliding(h, friction, speed, *, seconds, tilt=0.0, shape=None, solver=None):
+    """A point mass or a body on a plane; times, places and speeds along it."""
+    scene = nc.Scene()
+    scene.add(nc.Gravity(vector=(-9.81 * np.sin(tilt), 0, -9.81 * np.cos(tilt))))
+    if shape is None:
+        body = scene.add(nc.PointMass(mass=1.0, velocity=(speed, 0, 0)))
+    else:
+        body = scene.add(
+            nc.RigidBody(shape=shape, density=300.0, position=(0, 0, 0.1), velocity=(speed, 0, 0))
+        )
+    scene.add(nc.Contact(body, FLOOR, restitution=0.0, friction=friction, name="rubs"))
+    system, state = scene.compile(solver=solver)
+    trajectory = nc.simulate(system, state, dt=h, steps=round(seconds / h))
+    assert int(trajectory.steps_rejected) == 0
+    assert nc.balance(system, trajectory).energy.max() <= tol.ENERGY_OF_A_SMALL_SCENE
+    energy = np.asarray(system.energy(trajectory).total)
+    assert np.diff(energy).max() <= 1e-13 * energy[0]
+    at = system.sense(trajectory, body)
+    return np.asarray(trajectory.t), np.asarray(at.position)[:, 0], np.asarray(at.velocity)[:, 0]
+
+
+@pytest.mark.parametrize(("h", "place"), [(0.05, 7e-4), (0.01, 1e-6)])
+def test_friction_stops_what_slides(h, place):
+    """After v / (mu g), within a step, at v^2 / (2 mu g); then it rests, exactly."""
+    t, x, v = sliding(h, 0.3, 2.0, seconds=1.0)
+    assert abs(x[-1] - 4 / (2 * 0.3 * 9.81)) <= place
+    stopped = t[np.abs(v) <= 1e-15][0]
+    assert 0.679579 <= stopped <= 0.679579 + h
+    assert np.abs(v[t >= stopped]).max() <= 1e-15
+
+
+@pytest.mark.parametrize("solver", ["full", "recursive", "sparse"])
+def test_friction_on_a_slope(solver):
+    """Thrown up a slope of tangent 0.7: a coefficient of 0.8 holds it, with 0.5 it slides back."""
+    tilt = np.arctan(0.7)
+    _, x, _ = sliding(0.01, 0.8, 3.0, seconds=1.2, tilt=tilt, solver=solver)
+    assert x[-1] == pytest.approx(0.373289, abs=3e-5)
+    _, x, _ = sliding(0.002, 0.5, 3.0, seconds=1.2, tilt=tilt, solver=solver)
+    assert x[-1] == pytest.approx(-0.1684, abs=1.5e-3)
+
+
+def test_sliding_turns_around_at_long_steps():
+    """Newton's iteration finds the step in which slip changes its sign."""
+    _, x, _ = sliding(0.05, 0.5, 3.0, seconds=1.2, tilt=np.arctan(0.7))
+    assert x[-1] == pytest.approx(-0.1146, abs=1e-3)
+
+
+def test_sphere_begins_to_roll():
+    """With five sevenths of its speed, whatever the coefficient."""
+    t, _, v = sliding(0.01, 0.3, 2.0, seconds=0.6, shape=nc.Sphere(0.1))
+    assert v[-1] == pytest.approx(2.0 * 5 / 7, rel=1e-12)
+    rolls = t[np.abs(v - 2.0 * 5 / 7) <= 1e-9][0]
+    assert 2 * 2.0 / (7 * 0.3 * 9.81) <= rolls <= 2 * 2.0 / (7 * 0.3 * 9.81) + 0.011
+
+
+def test_box_slides_on_four_corners():
+    """Dependent contacts share load and friction evenly: it does not turn, and stops where a point does."""
+    _, x, v = sliding(0.01, 0.9, 3.0, seconds=0.6, shape=nc.Box((0.3, 0.3, 0.2)))
+    assert x[-1] == pytest.approx(9 / (2 * 0.9 * 9.81), abs=1e-4)
+    assert abs(v[-1]) <= 1e-10
+
+
+def test_friction_between_bodies_keeps_momenta():
+    """Two balls in space that meet off their centres, with spin: what rubs turns one as much as the other."""
+    scene = nc.Scene()
+    one = scene.add(
+        nc.RigidBody(**BALL, position=(-0.3, 0.05, 0), velocity=(1.0, 0, 0), angular_velocity=(0, 3, 20))
+    )
+    other = scene.add(
+        nc.RigidBody(**BALL, position=(0.3, 0, 0), velocity=(-1.0, 0, 0), angular_velocity=(5, 0, 1))
+    )
+    scene.add(nc.Contact(one, other, restitution=0.8, friction=0.4, name="impact"))
+    system, state = scene.compile()
+    trajectory = nc.simulate(system, state, dt=5e-3, steps=150)
+    found = nc.balance(system, trajectory)
+    for drift in (found.energy, found.momentum, found.angular_momentum):
+        assert drift.max() <= tol.ENERGY_OF_A_SMALL_SCENE
+    assert float(system.work(trajectory)["impact"][-1]) < -0.1
+    assert abs(np.asarray(system.sense(trajectory, other).angular_velocity)[-1, 2] - 1.0) > 1.0
+
+
+@pytest.mark.parametrize("count", [3, pytest.param(10, marks=pytest.mark.slow)])
+def test_stack_of_boxes_stands(count):
+    """Ten seconds, dependent contacts one upon the other: nothing moves by more than rounding."""
+    scene = nc.Scene()
+    scene.add(nc.Gravity())
+    below, given = nc.ground, {"restitution": 0.0, "friction": 0.5}
+    for k in range(count):
+        box = scene.add(nc.RigidBody(shape=nc.Box((0.2,) * 3), density=500.0, position=(0, 0, 0.1 + 0.2 * k)))
+        scene.add(nc.Contact(box, nc.Plane(normal=(0, 0, 1), point=(0, 0, 0.2 * k), body=below), **given))
+        below = box
+    system, state = scene.compile()
+    trajectory = nc.simulate(system, state, dt=5e-3, steps=2000)
+    assert np.abs(np.asarray(trajectory.q) - np.asarray(state.q)).max() <= 1e-9
+    assert int(trajectory.steps_rejected) == 0
+
+
 def test_derivatives_of_the_program():
     """In every mode, where no difference crosses a change of contacts; in a batch of other contacts, too."""
     system, state = dropped(0.8)
@@ -174,6 +278,31 @@ def test_derivatives_of_the_program():
         return nc.simulate(system, moved, dt=0.01, steps=90, throw=False).q[-1, 0, 2]
 
     assert_v_shaped(end, 0.013, 1.0, jax.grad(end)(0.013))
+    slope = jax.grad(end)
+    assert_v_shaped(slope, 0.013, 1.0, jax.jvp(slope, (0.013,), (1.0,))[1])
+    starts = jnp.linspace(-0.3, 0.4, 5)
+    together = jax.vmap(jax.value_and_grad(end))(starts)
+    apart = [jax.value_and_grad(end)(x) for x in starts]
+    np.testing.assert_allclose(np.stack(together), np.array(apart).T, rtol=1e-9, atol=1e-12)
+
+
+def test_derivatives_through_friction():
+    """By the speed at the start and by the coefficient, through impact, slip and rest."""
+    scene = nc.Scene()
+    scene.add(nc.Gravity())
+    ball = scene.add(nc.RigidBody(**BALL, position=(0, 0, 0.15), velocity=(1.0, 0.2, 0), name="ball"))
+    scene.add(nc.Contact(ball, FLOOR, restitution=0.5, friction=0.2, name="rubs"))
+    system, state = scene.compile()
+
+    def end(x):
+        moved = eqx.tree_at(lambda s: s.v, state, state.v.at[0].add(x[0] * jnp.array([1.0, -0.3, 0.2])))
+        rough = system.set("rubs", friction=0.2 + x[1])
+        return nc.simulate(rough, moved, dt=0.01, steps=30, throw=False).q[-1, 0]
+
+    x, along = jnp.array([0.02, 0.01]), jnp.array([0.6, 0.3])
+    assert_v_shaped(end, x, along, jax.jvp(end, (x,), (along,))[1])
+    total = lambda x: jnp.sum(end(x))  # noqa: E731
+    assert_v_shaped(total, x, along, jax.grad(total)(x) @ along)
 
 
 def random_impacts(random, contacts=4):

@@ -14,8 +14,8 @@ from natcoord_jax.assembly.coordinates import coordinate_values, state_rates
 from natcoord_jax.assembly.diagnostics import rows_with_ground
 from natcoord_jax.assembly.graph import make_tree
 from natcoord_jax.assembly.grouping import element_group, stack
-from natcoord_jax.assembly.layout import Layout
 from natcoord_jax.assembly.impacts import with_mobilities
+from natcoord_jax.assembly.layout import Layout
 from natcoord_jax.assembly.local_rates import LocalRates
 from natcoord_jax.assembly.masses import with_masses
 from natcoord_jax.assembly.system import Structure, System

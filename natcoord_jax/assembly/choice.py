@@ -36,6 +36,8 @@ def choose_solver(
 ) -> str:
     """Form of the equations: small systems reduced, large trees recursive, everything else full."""
     unknowns, depth = len(tree.slot_of), len(tree.levels)
+    if any(group.effect.bends for group in effects):
+        depth = DEPTH_LIMIT + 1  # no form whose Jacobian is found by differences
     if unknowns + multipliers <= REDUCED_LIMIT and depth <= DEPTH_LIMIT:
         return "reduced"
     neighbour = np.asarray(tree.neighbour)

@@ -114,7 +114,9 @@ def after_impacts(
 
 
 def _by_group(groups: Sequence[Group], every: Array) -> list[Array]:
-    return [every[part] for part in np.split(np.arange(every.shape[0]), np.cumsum([g.count for g in groups])[:-1])]
+    return [
+        every[part] for part in np.split(np.arange(every.shape[0]), np.cumsum([g.count for g in groups])[:-1])
+    ]
 
 
 def _impacts(
@@ -131,7 +133,7 @@ def _impacts(
     answers = Answers(space, levers(system, groups, end, "pushes"), end.rates)
     before, pushed = gaps(system, groups, start), jnp.concatenate([x[:, 0] for x in lam])
     met = active & (before > TOUCHING * (1.0 + jnp.max(jnp.abs(start.q))))
-    work = jnp.where(met & (pushed > 0), pushed * before / h, 0.0)
+    work = jnp.where(met, positive_part(pushed * (before - gaps(system, groups, end)) / h), 0.0)
     restitution = jnp.concatenate([group.effect.restitution for group in groups])
     velocity = Velocity(end.v.reshape(-1, 4, 3), end.rates)
     rates, matrix = answers.rates(velocity), answers.matrix

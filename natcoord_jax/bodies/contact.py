@@ -58,6 +58,9 @@ def _size(vector: Array) -> Array:
     return (vector @ vector) ** 0.5
 
 
+SHARED = 1e-9
+"""Compliance of contacts with several gaps, which may depend on each other."""
+
 SOLID = HandleOf("body") | of(
     "what scene.add(nc.Shell(...)) or scene.add(nc.Solid(...)) returned", MeshHandle
 )
@@ -191,13 +194,19 @@ class Contact(Recipe):
         solids = self._solids(scene, self.one, name)
         pairs = [pair for solid in solids for pair in self._pairs(scene, solid, name)]
         named = (name if len(pairs) == 1 else f"{name}[{k}]" for k in range(len(pairs)))
-        return tuple(scene.add(self._effect(markers, gap, said)) for (gap, markers), said in zip(pairs, named))
+        several = len(pairs) > 1
+        return tuple(
+            scene.add(self._effect(markers, gap, said, several)) for (gap, markers), said in zip(pairs, named)
+        )
 
-    def _effect(self, markers: tuple[Marker, ...], gap: Gap, name: str) -> GapPotential | GapConstraint:
-        """What keeps one gap open."""
+    def _effect(
+        self, markers: tuple[Marker, ...], gap: Gap, name: str, several: bool
+    ) -> GapPotential | GapConstraint:
+        """What keeps one gap open, of several or alone."""
         if self.stiffness is None:
             restitution = 1.0 if self.restitution is None else self.restitution
-            return GapConstraint(markers, gap, restitution=restitution, friction=self.friction, name=name)
+            given = {"restitution": restitution, "friction": self.friction, "compliance": SHARED * several}
+            return GapConstraint(markers, gap, **given, name=name)
         law = {"stiffness": self.stiffness, "law": self.law}
         if self.restitution is not None:
             law |= {"restitution": self.restitution, "speed": self.speed}

@@ -109,6 +109,7 @@ class Effect(Part):
         kind: name of the scope its operations carry in the compiled program.
         multipliers: number of Lagrange multipliers per instance and stage.
         unilateral: whether the multipliers are those of inequalities: nothing is held until it is reached.
+        bends: whether it changes its slope within changes of motion by which Jacobians are found as differences.
         inputs: number of input channels per instance.
         impulsive: whether forces, torques and power of its response are times the step (impulses, work).
         works: whether its power enters the work account of the state (non-potential effects).
@@ -129,6 +130,7 @@ class Effect(Part):
     kind: ClassVar[str] = "effect"
     multipliers: ClassVar[int] = 0
     unilateral: ClassVar[bool] = False
+    bends: ClassVar[bool] = False
     inputs: ClassVar[int] = 0
     impulsive: ClassVar[bool] = False
     works: ClassVar[bool] = False

@@ -93,7 +93,7 @@ def elastic_impulses(
 
 
 def _stiffness(own: Array, work: Array, impulse: Array) -> Array:
-    """s / L^2, and what keeps a singular W from showing."""
+    """S / L^2, and what keeps a singular W from showing."""
     return work / impulse**2 + 1e-12 * own
 
 

@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 from natcoord_jax.assembly.equations import prepare, starting
 from natcoord_jax.assembly.frozen_kick import Lagging
 from natcoord_jax.assembly.kick import Kick
+from natcoord_jax.assembly.redundancy import contact_impulses, contact_weights
 from natcoord_jax.assembly.response import Evaluation
 from natcoord_jax.assembly.start_cache import StartCache
 from natcoord_jax.assembly.tangent_space import driven
@@ -126,7 +127,8 @@ def attempt(
         steady = sound(equations, before.it.y, *missed, *given)
         before = eqx.tree_at(lambda c: c.it.converged, before, before.it.converged & steady)
         left = remainder(equations, solving.residual, factors.inertias)
-        after = after_attempt(setting, before, factors.inertias, ends, left, kick)
+        impulses = contact_impulses(equations)
+        after = after_attempt(setting, before, factors.inertias, ends, left, kick, impulses)
         accepted = after.taken > before.taken
         x = ravel_pytree(after.state)[0]
         slot = x, before.it.y, index, before.fraction, before.done, accepted, after.step
@@ -232,7 +234,10 @@ def _judging(equations: Any, it: Iterate, probe: DifferenceJacobian | None) -> t
     """Cost of new factors, in corrections, and options of `judge`."""
     cost = equations.renewal if probe is None else max(equations.renewal, it.y.shape[0] // 2)
     alike = False if probe is None else probe.alike
-    return cost, {"balances": driven(equations.system), "patience": cost, "alike": alike}
+    options = {"balances": driven(equations.system), "patience": cost, "alike": alike}
+    if equations.system.structure.inequalities:
+        options["contacts"] = contact_weights(equations)
+    return cost, options
 
 
 def renewed_at(

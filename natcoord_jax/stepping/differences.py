@@ -97,7 +97,7 @@ def _renewed(
             made = whole(columns)
         else:
             made = jax.lax.cond(probe.alike, alike, whole, columns)
-        return jnp.array(False), refreshed(it), new_factors(equations, made, factors.noise, equations.grain)
+        return jnp.array(False), refreshed(it), new_factors(made, factors.noise, equations.grain)
 
     # A loop of no or one trip, as at the end of a step.
     _, it, factors = jax.lax.while_loop(lambda carry: carry[0], renewed, (probe.making, it, factors))

@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from natcoord_jax.assembly.redundancy import contact_mobilities
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.linsolve.learning import learns
 
@@ -38,7 +37,7 @@ class Factors(eqx.Module):
 
     Attributes:
         solver: `solve(right)` applies them.
-        inertias: inertias of the unknowns; of the impulses of contacts [1/kg], 0 for other multipliers.
+        inertias: inertias of the unknowns, 0 for multipliers.
         usable: whether there are any.
         fresh: whether they belong to the step that is being solved.
         least: fewest corrections that a step has needed with them.
@@ -131,17 +130,12 @@ def factors_of(
     equations: Any, matrix: Any, noise: Array | float = 0.0, grain: Array | float = 0.0
 ) -> Factors:
     """Factors of a Jacobian."""
-    return new_factors(equations, equations.factorised(matrix), noise, grain)
+    return new_factors(equations.factorised(matrix), noise, grain)
 
 
-def new_factors(
-    equations: Any, made: tuple[Any, Array], noise: Array | float = 0.0, grain: Array | float = 0.0
-) -> Factors:
+def new_factors(made: tuple[Any, Array], noise: Array | float = 0.0, grain: Array | float = 0.0) -> Factors:
     """Factors that have just been made, with the inertias of the unknowns."""
     solver, inertias = made
-    if equations.system.structure.inequalities:
-        # What is left of the impulse of an open contact moves bodies, too.
-        inertias = inertias.at[equations.balances :].add(contact_mobilities(equations))
     yes, noise = jnp.array(True), jnp.asarray(noise, inertias.dtype)
     grain, unknown = jnp.asarray(grain, inertias.dtype), jnp.ones_like(noise)
     never = jnp.array(NEVER), jnp.array(0)

@@ -177,6 +177,7 @@ def judge(
     jumped: Bool[Array, ""] | bool = False,
     whole: Bool[Array, ""] | bool = True,
     alike: Bool[Array, ""] | bool = False,
+    contacts: Float[Array, " unknowns"] | None = None,
 ) -> tuple[Iterate, Factors]:
     """What follows from one evaluation of the equations at `it.y`.
 
@@ -193,6 +194,8 @@ def judge(
         whole: whether they are all that the end of a step asks for; if not, the next evaluation is the last.
         alike: whether the last factors that were made take stages for alike. Corrections by them may shrink
             slowly, which is no sign of rounding.
+        contacts: weights of the rows of contacts, which count as well: what is left of the impulse of an open
+            one moves bodies. (Of its correction, what contacts that depend on each other share is rounding.)
 
     Returns:
         Converged; or moved by one correction; or in want of new factors, when corrections shrink too slowly
@@ -209,6 +212,8 @@ def judge(
     if balances:
         real = factors.inertias > 0
         energies = energies + jnp.where(real, residual**2 / jnp.where(real, factors.inertias, 1.0), 0.0)
+    if contacts is not None:
+        energies = energies + contacts * residual**2
     correction = jnp.sqrt(jnp.sum(energies))
     first = (it.count == 0) | jumped
     ratio = correction / jnp.where(it.correction > 0, it.correction, 1.0)

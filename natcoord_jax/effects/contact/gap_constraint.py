@@ -18,7 +18,7 @@ from natcoord_jax.core.numeric import Number
 from natcoord_jax.core.potential import marker_response, on_rows, place_markers
 from natcoord_jax.effects.contact.gap import Gap
 from natcoord_jax.effects.contact.gap_potential import GAP
-from natcoord_jax.maths.vectors import cross, dot, positive_part
+from natcoord_jax.maths.vectors import cross, dot, positive_part, safe_norm
 
 
 class GapReadings(eqx.Module):
@@ -54,6 +54,9 @@ class GapConstraint(Effect):
         restitution: part of the closing speed that is left after an impact [-], from 0 to 1.
         friction: coefficient mu [-]; None: there is none.
         regularisation: eps [m/s].
+        compliance: speed with which it gives way, in terms of that which its impulse makes [-]. Some 1e-9 lets
+            contacts that depend on each other, as the corners of a box, share a load evenly, where it would be
+            left to the rounding of their places which of them carry it.
         name: optional name.
         mobility: change of the speed of closing by a unit impulse [1/kg], follows from the masses at compile;
             weighs gaps against impulses while a step is solved.
@@ -73,6 +76,7 @@ class GapConstraint(Effect):
     restitution: Any = eqx.field(default=1.0, kw_only=True, metadata=is_a(Number("not negative")))
     friction: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Number("not negative")))
     regularisation: Any = eqx.field(default=1e-5, kw_only=True, metadata=is_a(Number("positive")))
+    compliance: Any = eqx.field(default=0.0, kw_only=True, metadata=is_a(Number("not negative")))
     name: Any = eqx.field(default=None, kw_only=True, metadata=is_a(NAME))
     mobility: Any = eqx.field(default=None, init=False)
 
@@ -96,6 +100,11 @@ class GapConstraint(Effect):
     def multipliers(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Impulse along the normal, and with friction that of slip by its components."""
         return 1 if self.friction is None else 4
+
+    @property
+    def bends(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Friction does, where slip changes its sign."""
+        return self.friction is not None
 
     def attach(self, find: Callable[[Handle], tuple[Joint, Array]]) -> Sequence[Marker | Attachment]:
         """Markers of the constraint."""
@@ -142,6 +151,7 @@ class GapConstraint(Effect):
         ahead = before + jnp.sum(gradient * flow, axis=-1)
         # An impulse changes the mean speed of a step by half of what it changes the speed by.
         pushed = 0.5 * self.mobility * lam[:, 0]
+        ahead = ahead + self.compliance * pushed
         found = jnp.where(pushed < ahead, pushed, ahead)[:, None]
         if self.friction is not None:
             # What is along the normal by rounding, or while a step is being solved, is no friction.
@@ -149,8 +159,14 @@ class GapConstraint(Effect):
             slip, pulled = jax.vjp(lambda v, w: self.slip(x[0], v, w), rates[0], motion.spin[0])
             rubbing, torques = (y[None] for y in pulled(along))
             forces = forces + rubbing
+            most = self.friction * positive_part(lam[0, 0])
             speed = jnp.sqrt(dot(slip, slip) + self.regularisation**2)
-            missing = along * speed + self.friction * positive_part(lam[0, 0]) * slip
+            # Where the speed changes, an impulse beyond the cone counts as one on it: then Newton's iteration
+            # finds its way from anywhere. At the solution none is beyond.
+            size = safe_norm(along)
+            within = jnp.where(size > most, most / jnp.where(size > most, size, 1.0), 1.0) * along
+            fixed = jax.lax.stop_gradient(speed)
+            missing = along * fixed + within * (speed - fixed) + most * slip
             found = jnp.concatenate([found, self.mobility * missing[None]], axis=1)
         return replace_fields(marker_response(place, forces, torques, rates, motion), rows=found)
 

@@ -28,7 +28,9 @@ def _unit(vector: Float[Array, "3"]) -> Float[Array, "3"]:
     return vector / jnp.where(size > 0, size, 1.0)
 
 
-def _between(one: Float[Array, "3"], other: Float[Array, "3"], radii: Float[Array, "2"]) -> tuple[Array, Array]:
+def _between(
+    one: Float[Array, "3"], other: Float[Array, "3"], radii: Float[Array, "2"]
+) -> tuple[Array, Array]:
     """The middle of the gap between two spheres, and the direction from the first to the second."""
     normal = _unit(other - one)
     return 0.5 * (one + other + (radii[0] - radii[1]) * normal), normal
