@@ -164,14 +164,15 @@ CALLS = {
     "Plane": lambda w: {"normal": V, "point": V, "body": [w.body]},
     "Contact": lambda w: {
         "one": [w.body], "other": [nc.Plane(), w.body], "stiffness": NUMBER, "restitution": NUMBER,
-        "speed": NUMBER, "law": ["linear", "hertz"], "name": NAME,
+        "friction": NUMBER, "speed": NUMBER, "law": ["linear", "hertz"], "name": NAME,
     },
     "GapPotential": lambda w: {
-        **MARKED(w.ends), "gap": [nc.SphereOnSphere(radii=(1.0, 1.0))], "stiffness": NUMBER, "restitution": NUMBER,
-        "speed": NUMBER, "law": ["linear", "hertz"],
+        **MARKED(w.ends), "gap": [nc.SphereOnSphere(radii=(1.0, 1.0))], "stiffness": NUMBER,
+        "restitution": NUMBER, "speed": NUMBER, "law": ["linear", "hertz"],
     },
     "GapConstraint": lambda w: {
-        **MARKED(w.ends), "gap": [nc.SphereOnSphere(radii=(1.0, 1.0))], "restitution": NUMBER
+        **MARKED(w.ends), "gap": [nc.SphereOnSphere(radii=(1.0, 1.0))], "restitution": NUMBER,
+        "friction": NUMBER, "regularisation": NUMBER, "compliance": NUMBER,
     },
     "SphereOnPlane": lambda w: {"radius": NUMBER},
     "SphereOnSphere": lambda w: {"radii": [(1.0, 1.0)]},

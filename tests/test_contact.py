@@ -136,6 +136,74 @@ def test_damping_for_a_restitution():
     assert float(jax.grad(lambda e: damping_of(e, 1.0))(1.0)) == -1.5
 
 
+def on_plane(axes, points, turned=False):
+    """A point of a plane and its normal, and a point of a body, with its axes if it is turned."""
+    return np.stack([points[0], axes[0][0], points[1], *(axes[1] if turned else ())])
+
+
+GAPS = {
+    nc.SphereOnPlane: (nc.SphereOnPlane(radius=0.3), (0, 2), (2,), on_plane),
+    nc.EllipsoidOnPlane: (
+        nc.EllipsoidOnPlane(semi_axes=np.array([0.2, 0.3, 0.4])),
+        (0, 2),
+        (2,),
+        lambda axes, points: on_plane(axes, points, turned=True),
+    ),
+    nc.SphereOnSphere: (
+        nc.SphereOnSphere(radii=np.array([0.2, 0.3])),
+        (0, 1),
+        (1,),
+        lambda axes, points: points[:2],
+    ),
+    nc.CapsuleOnCapsule: (
+        nc.CapsuleOnCapsule(radii=np.array([0.2, 0.3])),
+        (0, 1, 2, 3),
+        (2, 3),
+        lambda axes, points: points,
+    ),
+    nc.SphereOnBox: (
+        nc.SphereOnBox(size=np.array([0.3, 0.5, 0.7]), radius=0.2),
+        (0, 1),
+        (1,),
+        lambda axes, points: np.stack([*points[:2], *axes[0]]),
+    ),
+}
+"""Gaps; which of their markers are points, and which of these the second body's; markers somewhere."""
+
+
+def test_every_gap_has_its_contract():
+    public = [x for x in vars(nc).values() if isinstance(x, type) and issubclass(x, nc.Gap)]
+    assert set(public) - {nc.Gap} == set(GAPS)
+
+
+@pytest.mark.parametrize("gap", GAPS, ids=lambda gap: gap.__name__)
+def test_contract_of_gaps(gap):
+    """Frame-indifferent, also of what is no motion; its change in a step of a radian is foretold exactly."""
+    made, points, second, markers = GAPS[gap]
+    random = np.random.default_rng(4)
+    for _ in range(20):
+        axes = [np.linalg.qr(random.normal(size=(3, 3)))[0] for _ in range(3)]
+        x = markers(axes, random.normal(size=(4, 3)))
+        point = np.isin(np.arange(len(x)), points)
+        moved = x @ axes[2].T + point[:, None] * random.normal(size=3)
+        value = float(made.distance(made.invariants(jnp.asarray(x))))
+        assert float(made.distance(made.invariants(jnp.asarray(moved)))) == pytest.approx(value, abs=1e-13)
+        # At the middle of a step directions are no unit vectors.
+        middle = jnp.asarray(x + 0.2 * random.normal(size=x.shape))
+        forces = np.asarray(made.gradient(middle))
+        assert np.abs(forces[point].sum(axis=0)).max() <= 1e-12
+        assert np.abs(np.cross(middle, forces).sum(axis=0)).max() <= 1e-12
+        start, flow = jax.jvp(made.invariants, (middle,), (jnp.asarray(random.normal(size=x.shape)),))
+        foretold = made.averaged(start, flow[None], nc.EnergyMomentum().tableau)[0] @ flow
+        change = made.distance(start + flow) - made.distance(start)
+        assert float(foretold) == pytest.approx(float(change), abs=1e-12)
+        # The second body is pushed along the normal. (The nearest points of segments are drawn to their
+        # middles a little.)
+        _, normal = made.contact(jnp.asarray(x))
+        pushed = np.asarray(made.gradient(jnp.asarray(x)))[list(second)].sum(axis=0)
+        np.testing.assert_allclose(pushed, normal, atol=2e-2 if gap is nc.CapsuleOnCapsule else 1e-12)
+
+
 def test_distance_of_segments():
     """Against the least of many; degenerate and parallel ones, too; derivatives against differences."""
     random = np.random.default_rng(0)

@@ -120,10 +120,8 @@ def test_cradle_with_gaps():
     """The sequence of impacts through four gaps that steps resolve: the last ball has all of the speed."""
     scene = nc.Scene()
     balls = [
-        scene.add(
-            nc.RigidBody(**BALL, position=(0.201 * k - 0.01 * (k == 0), 0, 0), velocity=(float(k == 0), 0, 0))
-        )
-        for k in range(5)
+        scene.add(nc.RigidBody(**BALL, position=(x, 0, 0), velocity=(speed, 0, 0)))
+        for x, speed in ((-0.01, 1.0), (0.201, 0.0), (0.402, 0.0), (0.603, 0.0), (0.804, 0.0))
     ]
     for one, other in zip(balls, balls[1:]):
         scene.add(nc.Contact(one, other))
@@ -316,7 +314,7 @@ def energy_of(impulses, matrix, rates):
 
 
 def test_impact_law():
-    """Elastic impacts give back what was taken, contact by contact; others lose (1 - e^2) of the difference."""
+    """Elastic impacts give back what was taken, contact by contact; others lose 1 - e^2 of the difference."""
     random = np.random.default_rng(0)
     for _ in range(50):
         matrix, rates, work = random_impacts(random)
@@ -374,3 +372,29 @@ def test_schemes_without_impacts_are_refused(scheme):
 def test_overlap_at_the_start_is_refused():
     with pytest.raises(ValueError, match="hard contact 'bounce' overlap by 0.05 m"):
         dropped(height=-0.05)
+
+
+def test_what_closed_contacts_do_not_say_is_refused():
+    """Equilibria, vibrations, and accelerations while a contact is closed; above the floor a ball falls."""
+    system, state = dropped(height=0.0)
+    for ask, given in ((nc.equilibrium, {}), (nc.modes, {}), (nc.load_path, {"arc": 0.1, "steps": 3})):
+        with pytest.raises(ValueError, match="hard contact 'bounce'.*stiffness"):
+            ask(system, state, **given)
+    with pytest.raises(ValueError, match="closed contacts of a system with hard contact 'bounce'"):
+        system.instant(state)
+    system, state = dropped(height=0.1)
+    assert float(system.instant(state).accelerations[0, 2]) == -9.81
+
+
+def test_friction_needs_a_point_of_contact():
+    class PointAboveGround(nc.Gap):
+        def invariants(self, x):
+            return (x[1] @ (x[2] - x[0]))[None]
+
+        def distance(self, invariants):
+            return invariants[0]
+
+    above = nc.Point(nc.ground), nc.Direction(nc.ground, (0, 0, 1)), nc.Point(nc.ground, (0, 0, 1))
+    with pytest.raises(ValueError, match="PointAboveGround does not say.*contact"):
+        nc.GapConstraint(above, PointAboveGround(), friction=0.3)
+    assert nc.GapConstraint(above, PointAboveGround()).multipliers == 1

@@ -19,6 +19,7 @@ from natcoord_jax.analysis.statics import (
     largest,
 )
 from natcoord_jax.assembly.system import SYSTEM, System
+from natcoord_jax.assembly.violations import refuse_contacts
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.callables import Function
 from natcoord_jax.core.checks import as_array, at_top_level, is_concrete, positive
@@ -192,6 +193,7 @@ def load_path(
     positive(arc, "load path: arc", "-")
     count = len(system.structure.inputs)
     channels = Function.of(inputs, state.t) if inputs is not None else _Zero(count)
+    refuse_contacts(system, "a path of equilibria")
     sizes = as_array(arc, float), as_array(scale, float)
     with_derivatives = not at_top_level(system, state, sizes)
     found = _followed(system, state, *sizes, steps, channels, with_derivatives)

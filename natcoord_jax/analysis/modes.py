@@ -23,6 +23,7 @@ from natcoord_jax.assembly.momentum import inertia, wrench
 from natcoord_jax.assembly.projection import TWIST, constraint_matrix
 from natcoord_jax.assembly.rates import row_rates
 from natcoord_jax.assembly.system import SYSTEM, System
+from natcoord_jax.assembly.violations import refuse_contacts
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.checks import is_concrete, numbers
 from natcoord_jax.core.compiled import briefly
@@ -230,6 +231,7 @@ def modes(
         >>> float(nc.modes(system, state).frequencies[0].round(9))
         2.0
     """
+    refuse_contacts(system, "vibration")
     given = jnp.zeros(3) if rotation is None else numbers(rotation, (3,), "modes: rotation", "rad/s")
     channels = len(system.structure.inputs)
     u = jnp.zeros(channels) if inputs is None else numbers(inputs, (channels,), "modes: inputs", "N, N m")

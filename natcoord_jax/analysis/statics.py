@@ -9,6 +9,7 @@ from jaxtyping import Array, Float, Int
 
 from natcoord_jax.analysis.static_equations import Static
 from natcoord_jax.assembly.system import SYSTEM, System
+from natcoord_jax.assembly.violations import refuse_contacts
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.checks import at_top_level, is_concrete
 from natcoord_jax.core.compiled import briefly
@@ -221,6 +222,7 @@ def equilibrium(
         >>> round(float(system.sense(found.state, beam.end).position[2]), 5)  # 0.00167 with many elements
         0.00164
     """
+    refuse_contacts(system, "equilibrium")
     values = jnp.asarray(loads, float)
     if values.ndim == 0:
         values = values * jnp.arange(1, steps + 1) / steps

@@ -18,6 +18,7 @@ from natcoord_jax.assembly.diagnostics import group_places, rows_with_ground
 from natcoord_jax.assembly.response import Evaluation
 from natcoord_jax.assembly.system import Group, System
 from natcoord_jax.assembly.tangent_space import Velocity
+from natcoord_jax.assembly.violations import contact_gaps
 from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
@@ -75,15 +76,6 @@ class Answers:
         return Velocity(velocity.rows + change.rows, velocity.rotors + change.rotors)
 
 
-def gaps(system: System, groups: Sequence[Group], state: State) -> Float[Array, " c"]:
-    """Gaps of contacts [m]."""
-    rows, found = rows_with_ground(state.q), []
-    for group in groups:
-        each = jax.vmap(lambda effect, place, rows: effect.readings(place, rows).gap)
-        found.append(each(group.effect, group_places(system, group), rows[group.bodies]))
-    return jnp.concatenate(found)
-
-
 def after_impacts(
     system: System, start: State, end: State, h: Array, groups: Sequence[Group], found: Evaluation
 ) -> tuple[State, dict[int, Array]]:
@@ -102,8 +94,7 @@ def after_impacts(
     # Of the multipliers of a contact the first is that of the gap.
     pushed = jnp.concatenate([x[:, 0] for x in lam])
     # As in the equations: what is left of the impulse of an open contact may be of either sign.
-    mobility = jnp.concatenate([group.effect.mobility for group in these])
-    active = 0.5 * mobility * pushed > gaps(system, these, end) / h
+    active = 0.5 * _numbers(these, "mobility") * pushed > contact_gaps(system, these, end) / h
     none = jnp.zeros_like(pushed)
 
     def impacts() -> tuple[Array, Array, Array]:
@@ -114,9 +105,12 @@ def after_impacts(
 
 
 def _by_group(groups: Sequence[Group], every: Array) -> list[Array]:
-    return [
-        every[part] for part in np.split(np.arange(every.shape[0]), np.cumsum([g.count for g in groups])[:-1])
-    ]
+    ends = np.cumsum([group.count for group in groups])
+    return [every[part] for part in np.split(np.arange(every.shape[0]), ends[:-1])]
+
+
+def _numbers(groups: Sequence[Group], name: str) -> Float[Array, " c"]:
+    return jnp.concatenate([getattr(group.effect, name) for group in groups])
 
 
 def _impacts(
@@ -131,10 +125,10 @@ def _impacts(
     """Velocities and rates of rotors after impacts of the active contacts, and their work."""
     space = tangents_at(system, end)
     answers = Answers(space, levers(system, groups, end, "pushes"), end.rates)
-    before, pushed = gaps(system, groups, start), jnp.concatenate([x[:, 0] for x in lam])
+    before, pushed = contact_gaps(system, groups, start), jnp.concatenate([x[:, 0] for x in lam])
     met = active & (before > TOUCHING * (1.0 + jnp.max(jnp.abs(start.q))))
-    work = jnp.where(met, positive_part(pushed * (before - gaps(system, groups, end)) / h), 0.0)
-    restitution = jnp.concatenate([group.effect.restitution for group in groups])
+    work = jnp.where(met, positive_part(pushed * (before - contact_gaps(system, groups, end)) / h), 0.0)
+    restitution = _numbers(groups, "restitution")
     velocity = Velocity(end.v.reshape(-1, 4, 3), end.rates)
     rates, matrix = answers.rates(velocity), answers.matrix
     impulses = impact_impulses(matrix, rates, work, restitution, active, met)

@@ -10,6 +10,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.diagnostics import states_of
@@ -23,6 +24,8 @@ from natcoord_jax.assembly.equations_of_motion import (
 from natcoord_jax.assembly.rates import Twists, tree_rates
 from natcoord_jax.assembly.reading import Source
 from natcoord_jax.assembly.system import System
+from natcoord_jax.assembly.violations import GAP, contact_gaps, contacts, position_size, refuse_contacts
+from natcoord_jax.core.checks import is_concrete
 from natcoord_jax.core.compiled import compiled
 from natcoord_jax.core.state import State, Trajectory
 
@@ -193,6 +196,11 @@ def instant_of(system: System, state: State, u: Float[Array, " inputs"]) -> Inst
     w = tree_rates(system, state)
     solve = _with_constraints if system.structure.held else _without_constraints
     gains, applied, lam = solve(system, state, u, balances, w)
+    these = contacts(system)
+    if these:
+        # What closed contacts do at an instant depends on what follows.
+        closed = jnp.any(contact_gaps(system, these, state) <= GAP * position_size(state))
+        gains, lam = jax.tree.map(lambda x: jnp.where(closed, jnp.nan, x), (gains, lam))
     forces, torques = _reactions(balances, gains, applied, lam)
     return Instant(gains.rows.reshape(-1, 3), forces, torques, _named(balances, lam))
 
@@ -233,6 +241,10 @@ def instant(system: System, motion: State | Trajectory, inputs: Any = None) -> I
             that starts there), and at the last state those of the last step; of a state, zero.
 
     Raises:
-        ValueError: for a wrong shape of the inputs.
+        ValueError: for a wrong shape of the inputs, and where a contact that is a constraint is closed
+            (inside jit: accelerations and reactions are then no numbers).
     """
-    return instants(Source.of(system, motion, inputs_along(system, motion, inputs)))
+    found = instants(Source.of(system, motion, inputs_along(system, motion, inputs)))
+    if contacts(system) and is_concrete(found) and np.isnan(np.asarray(found.accelerations)).any():
+        refuse_contacts(system, "an instant with closed contacts")
+    return found

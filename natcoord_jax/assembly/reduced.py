@@ -373,8 +373,8 @@ class ReducedStep(Form):
         rates = PROBE / self.h * scales.reshape(-1)[self.system.tree.slot_of]
         multipliers = 1.0 + jnp.abs(y[self.balances :])
         if self.system.structure.inequalities:
-            # Those of contacts by as little, and downwards: the smaller of gap and impulse vanishes, and where
-            # both do, that is the impulse.
+            # Those of contacts by as little, and downwards: the smaller of gap and impulse vanishes, and
+            # where both do, that is the impulse.
             speed, mobility = PROBE / self.h * extent, contact_mobilities(self)
             lower = -2.0 * speed / jnp.where(mobility > 0, mobility, 1.0)
             multipliers = jnp.where(mobility > 0, lower, multipliers)

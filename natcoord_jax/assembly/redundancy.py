@@ -59,7 +59,7 @@ def places_by_stage(groups: Sequence[Group], stages: int) -> np.ndarray:
 
 
 def contact_mobilities(equations: Any) -> Float[Array, " multipliers"]:
-    """What unit impulses of contacts do [1/kg], for the multipliers of all stages; 0 for those of equations."""
+    """What unit impulses of contacts do [1/kg], for all multipliers; 0 for those of equations."""
     stages, parts = equations.tableau.stages, [jnp.zeros(0)]
     for group in equations.groups:
         shape = group.count, stages, group.multipliers

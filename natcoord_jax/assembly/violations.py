@@ -1,6 +1,7 @@
 """By how much a state misses the constraints: of bodies, joints, and relations between joint coordinates."""
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import equinox as eqx
@@ -70,6 +71,28 @@ def constrained(system: System) -> tuple[Group, ...]:
 def contacts(system: System) -> tuple[Group, ...]:
     """All groups with inequalities."""
     return tuple(g for g in system.effects if g.effect.unilateral)
+
+
+def contact_gaps(system: System, groups: Sequence[Group], state: State) -> Float[Array, " c"]:
+    """Gaps of contacts [m]."""
+    rows, found = rows_with_ground(state.q), []
+    for group in groups:
+        each = jax.vmap(lambda effect, place, rows: effect.readings(place, rows).gap)
+        found.append(each(group.effect, group_places(system, group), rows[group.bodies]))
+    return jnp.concatenate(found)
+
+
+def refuse_contacts(system: System, what: str) -> None:
+    """Refuse to ask of contacts what they have no answer to.
+
+    Raises:
+        ValueError: with a contact, and what to do.
+    """
+    for group in contacts(system):
+        raise ValueError(
+            f"{what} of a system with {group.effect.kind} {group.labels[0]!r} is not defined: which contacts "
+            "are closed, it does not say; give the contact a stiffness, which makes it a potential"
+        )
 
 
 def violations_of(system: System, groups: tuple[Group, ...], state: State) -> list[Float[Array, "n m"]]:

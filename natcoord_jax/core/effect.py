@@ -109,7 +109,7 @@ class Effect(Part):
         kind: name of the scope its operations carry in the compiled program.
         multipliers: number of Lagrange multipliers per instance and stage.
         unilateral: whether the multipliers are those of inequalities: nothing is held until it is reached.
-        bends: whether it changes its slope within changes of motion by which Jacobians are found as differences.
+        bends: whether its slope changes within the differences that Jacobians may be found by.
         inputs: number of input channels per instance.
         impulsive: whether forces, torques and power of its response are times the step (impulses, work).
         works: whether its power enters the work account of the state (non-potential effects).

@@ -147,8 +147,8 @@ def friction_impulses(
 ) -> tuple[Float[Array, " 3c"], Float[Array, " c"]]:
     """Impulses that stop slip as far as friction can [N s], and their work [J].
 
-    Of all that are within the cones of friction those of the least kinetic energy, nearly: projected gradients,
-    each with the length at which the energy is least. So none of them adds energy.
+    Of all within the cones of friction those of the least kinetic energy, nearly: projected gradients, each
+    with the length at which the energy is least. So none of them adds energy.
 
     Args:
         matrix: W of the directions of slip [1/kg].

@@ -278,7 +278,7 @@ def after_attempt(
     past = Predictor(past.differences, jnp.where(same, past.known, 1), jnp.where(same, past.order, 0))
     guess, lagging = past.guess, course.lagging
     if impulses is not None:
-        # Those of the last step: what contacts that depend on each other share at will would grow in polynomials.
+        # Those of the last step: what dependent contacts share at will would grow in polynomials.
         guess = jnp.where(impulses, past.differences[0], guess)
     sound = jnp.all(jnp.isfinite(guess))
     if lagging is not None:

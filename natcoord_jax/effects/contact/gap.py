@@ -57,5 +57,5 @@ class Gap(Part):
     def averaged(
         self, start: Float[Array, " p"], steps: Float[Array, "s p"], tableau: Tableau
     ) -> Float[Array, "s p"]:
-        """Gradient by the invariants, averaged along a step so that it foretells the gap at its end exactly."""
+        """Gradient by the invariants, averaged along a step: it foretells the gap at its end exactly."""
         return averaged_gradient(self.distance, start, steps, tableau, self.degree)

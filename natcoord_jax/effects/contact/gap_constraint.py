@@ -40,10 +40,10 @@ class GapConstraint(Effect):
     speed, wherever in the step the surfaces met; with 1 energy is exact, too, for any number of impacts at
     once (`natcoord_jax.assembly.impacts` has the law). What is lost is in its account.
 
-    With friction a force of slip acts where the surfaces touch, f sqrt(|u|^2 + eps^2) = -mu N u of the velocity
-    u with which the second slips on the first: at most mu N, and against it. At the end of a step slip that
-    friction can stop is stopped, so that what sticks is at rest. Under a load that it holds a contact creeps,
-    more slowly than eps, the regularisation.
+    With friction a force of slip acts where the surfaces touch, f sqrt(|u|^2 + eps^2) = -mu N u of the
+    velocity u with which the second slips on the first: at most mu N, and against it. At the end of a step
+    slip that friction can stop is stopped, so that what sticks is at rest. Under a load that it holds a
+    contact creeps, more slowly than eps, the regularisation.
 
     For schemes of one stage, `nc.EnergyMomentum()`. Derivatives are those of the program: where an impact
     falls within a step they are not those of the motion, which `nc.GapPotential` has.
@@ -54,15 +54,15 @@ class GapConstraint(Effect):
         restitution: part of the closing speed that is left after an impact [-], from 0 to 1.
         friction: coefficient mu [-]; None: there is none.
         regularisation: eps [m/s].
-        compliance: speed with which it gives way, in terms of that which its impulse makes [-]. Some 1e-9 lets
-            contacts that depend on each other, as the corners of a box, share a load evenly, where it would be
-            left to the rounding of their places which of them carry it.
+        compliance: speed with which it gives way, in terms of that which its impulse makes [-]. Some 1e-9
+            lets contacts that depend on each other, as the corners of a box, share a load evenly, where it
+            would be left to the rounding of their places which of them carry it.
         name: optional name.
         mobility: change of the speed of closing by a unit impulse [1/kg], follows from the masses at compile;
             weighs gaps against impulses while a step is solved.
 
     Raises:
-        ValueError: for other markers than the gap takes, and for friction of a gap without a point of contact.
+        ValueError: for other markers than the gap takes, and friction of a gap without a point of contact.
 
     Example:
         >>> import natcoord_jax as nc
