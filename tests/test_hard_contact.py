@@ -9,6 +9,7 @@ import tolerances as tol
 from differences import assert_v_shaped
 
 import natcoord_jax as nc
+from natcoord_jax import gallery
 from natcoord_jax.maths.impact_law import impact_impulses
 
 FLOOR = nc.Plane(normal=(0, 0, 1))
@@ -398,3 +399,38 @@ def test_friction_needs_a_point_of_contact():
     with pytest.raises(ValueError, match="PointAboveGround does not say.*contact"):
         nc.GapConstraint(above, PointAboveGround(), friction=0.3)
     assert nc.GapConstraint(above, PointAboveGround()).multipliers == 1
+
+
+def test_a_thrown_box_comes_to_rest():
+    """Long flights, in which the impulses of friction decay beyond the smallest numbers, and then impacts."""
+    scene = nc.Scene()
+    scene.add(nc.Gravity())
+    die = nc.RigidBody(
+        shape=nc.Box((0.1,) * 3),
+        density=600.0,
+        position=(0, 0, 0.3),
+        velocity=(1.0, -0.3, 0.5),
+        angular_velocity=(2.0, -1.0, 6.0),
+    )
+    scene.add(nc.Contact(scene.add(die), FLOOR, restitution=0.4, friction=0.4))
+    system, state = scene.compile()
+    trajectory = nc.simulate(system, state, dt=1e-3, steps=2500)
+    assert nc.balance(system, trajectory).energy.max() <= tol.ENERGY_OF_A_SMALL_SCENE
+    assert np.abs(np.asarray(trajectory.v)[-1]).max() <= 1e-3
+    energy = np.asarray(system.energy(trajectory).total)
+    assert np.diff(energy).max() <= 1e-13 * energy[0]
+
+
+@pytest.mark.slow
+def test_rattleback_turns_back():
+    """One way it spins on; the other way it begins to rattle and turns back, having lost little."""
+    reversed_, onward = (gallery.load("rattleback", spin=spin) for spin in (-5.0, 5.0))
+    spins = []
+    for example in (reversed_, onward):
+        trajectory = nc.simulate(example.system, example.state, dt=example.dt, steps=example.steps)
+        spins.append(np.asarray(example.system.sense(trajectory, "stone").angular_velocity)[:, 2])
+        energy = np.asarray(example.system.energy(trajectory).total)
+        assert 0.95 * energy[0] <= energy[-1] <= energy[0]
+        assert np.diff(energy).max() <= 1e-13 * energy[0]
+    assert spins[0][-1] > 4.0
+    assert spins[1].min() > 4.5

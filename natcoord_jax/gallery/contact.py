@@ -78,3 +78,65 @@ def tumbling_capsules() -> Example:
             scene.add(nc.Contact(one, two, stiffness=3e4, name=f"impact {j + 1} {i + 1}"))
     system, state = scene.compile()
     return Example("tumbling_capsules", "capsules and balls", system, state, 2e-3, 1000)
+
+
+def rattleback(spin: float = -5.0, tilt: float = 0.5) -> Example:
+    """A stone that does not like to turn one way: it begins to rattle, and turns back.
+
+    Half axes, moments and the product of inertia of T. R. Kane and D. A. Levinson, Realistic mathematical
+    modeling of the rattleback, Int. J. Non-Linear Mechanics 17 (1982) 175-186.
+
+    Args:
+        spin: at the start [rad/s].
+        tilt: about the long axis [degrees].
+    """
+    semi_axes, below = np.array([0.2, 0.03, 0.02]), 0.01
+    inertia = np.array([[2.0, -0.2, 0.0], [-0.2, 16.0, 0.0], [0.0, 0.0, 17.0]]) * 1e-4
+    angle = np.deg2rad(tilt)
+    turned = np.array([[1, 0, 0], [0, np.cos(angle), -np.sin(angle)], [0, np.sin(angle), np.cos(angle)]])
+    height = float(np.linalg.norm(semi_axes * turned[2]))
+    scene = nc.Scene()
+    scene.add(nc.Gravity(vector=(0, 0, -GRAVITY)))
+    stone = scene.add(
+        nc.RigidBody(
+            mass=1.0,
+            inertia=inertia,
+            position=(0, 0, height) - below * turned[:, 2],
+            orientation=turned,
+            angular_velocity=(0, 0, spin),
+            name="stone",
+        )
+    )
+    table = nc.Point(nc.ground), nc.Direction(nc.ground, (0, 0, 1))
+    centre = nc.Point(stone, (0, 0, below), local=True)
+    axes = (nc.Direction(stone, axis, local=True) for axis in np.eye(3))
+    gap = nc.EllipsoidOnPlane(semi_axes=semi_axes)
+    scene.add(nc.GapConstraint((*table, centre, *axes), gap, restitution=0.0, friction=1.0, name="table"))
+    system, state = scene.compile()
+    return Example("rattleback", "a rattleback", system, state, 2e-3, 6000, facts={"spin": spin})
+
+
+def dice() -> Example:
+    """Boxes that are thrown on a floor: they bounce, rub, tumble and come to rest."""
+    scene, floor = nc.Scene(), nc.Plane(normal=(0, 0, 1))
+    scene.add(nc.Gravity(vector=(0, 0, -GRAVITY)))
+    throws = (
+        ((0.0, 0.0, 0.3), (2.0, -1.0, 6.0)),
+        ((0.3, 0.2, 0.45), (-4.0, 5.0, 3.0)),
+        (
+            (-0.3, 0.3, 0.6),
+            (6.0, 3.0, -5.0),
+        ),
+    )
+    for k, (place, spin) in enumerate(throws):
+        die = nc.RigidBody(
+            shape=nc.Box((0.1, 0.1, 0.1)),
+            density=600.0,
+            position=place,
+            velocity=(1.0, 0.4 * k - 0.3, 0.5),
+            angular_velocity=spin,
+            name=f"die {k + 1}",
+        )
+        scene.add(nc.Contact(scene.add(die), floor, restitution=0.4, friction=0.4, name=f"floor {k + 1}"))
+    system, state = scene.compile()
+    return Example("dice", "dice on a floor", system, state, 1e-3, 2000)

@@ -18,7 +18,7 @@ from natcoord_jax.core.numeric import Number
 from natcoord_jax.core.potential import marker_response, on_rows, place_markers
 from natcoord_jax.effects.contact.gap import Gap
 from natcoord_jax.effects.contact.gap_potential import GAP
-from natcoord_jax.maths.vectors import cross, dot, positive_part, safe_norm
+from natcoord_jax.maths.vectors import cross, dot, positive_part
 
 
 class GapReadings(eqx.Module):
@@ -163,8 +163,10 @@ class GapConstraint(Effect):
             speed = jnp.sqrt(dot(slip, slip) + self.regularisation**2)
             # Where the speed changes, an impulse beyond the cone counts as one on it: then Newton's iteration
             # finds its way from anywhere. At the solution none is beyond.
-            size = safe_norm(along)
-            within = jnp.where(size > most, most / jnp.where(size > most, size, 1.0), 1.0) * along
+            square = dot(along, along)
+            # (What decays in open contacts has squares that are no normal numbers in the end.)
+            beyond = (square > most**2) & (square > jnp.finfo(square.dtype).tiny)
+            within = jnp.where(beyond, most / jnp.sqrt(jnp.where(beyond, square, 1.0)), 1.0) * along
             fixed = jax.lax.stop_gradient(speed)
             missing = along * fixed + within * (speed - fixed) + most * slip
             found = jnp.concatenate([found, self.mobility * missing[None]], axis=1)
