@@ -150,6 +150,7 @@ from natcoord_jax.stepping.one_step import linearise, step
 from natcoord_jax.stepping.scheme import EnergyMomentum
 from natcoord_jax.stepping.simulate import simulate
 from natcoord_jax.stepping.variational import VariationalMidpoint
+from natcoord_jax.storage import load, save
 
 if TYPE_CHECKING:
     __version__: str
@@ -295,6 +296,7 @@ __all__ = [
     "jit",
     "keep_programs",
     "linearise",
+    "load",
     "load_guess",
     "load_path",
     "mesh",
@@ -307,6 +309,7 @@ __all__ = [
     "random_state",
     "receding_horizon",
     "regulator",
+    "save",
     "set_effort",
     "simulate",
     "step",

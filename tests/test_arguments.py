@@ -246,8 +246,11 @@ CALLS = {
     "Scene.compile": lambda w: {"assemble": FLAG, "solver": ["reduced"], "t": NUMBER},
     "simulate": lambda w: {
         **RUN(w), **STEPPED, "throw": FLAG, "until": [f], "checkpoint": FLAG, "newton_tol": NUMBER,
-        "extra_substeps": WHOLE, "rtol": NUMBER, "atol": NUMBER,
+        "extra_substeps": WHOLE, "rtol": NUMBER, "atol": NUMBER, "progress": FLAG, "store": [None, "file"],
+        "resume": FLAG,
     },
+    "save": lambda w: {"path": ["file"], "x": wrong()},
+    "load": lambda w: {"path": ["file"]},
     "step": lambda w: {
         **RUN(w), "u": [np.ones(1)], "dt": [0.1], "newton_tol": NUMBER, "scheme": [nc.EnergyMomentum()]
     },

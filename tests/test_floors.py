@@ -30,6 +30,7 @@ FLOORS = (
     "effects",
     "assembly",
     "bodies",
+    "storage",
     "stepping",
     "scene",
     "io",
@@ -45,6 +46,7 @@ BLIND = {
     "core": {"linsolve"},
     "effects": {"linsolve"},
     "assembly": {"effects", "bodies"},
+    "storage": {"effects", "bodies"},
     "stepping": {"effects", "bodies"},
 }
 # ``import natcoord_jax`` reaches every floor at once, so it is left to those above all others.
