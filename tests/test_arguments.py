@@ -251,6 +251,10 @@ CALLS = {
     },
     "save": lambda w: {"path": ["file"], "x": wrong()},
     "load": lambda w: {"path": ["file"]},
+    "sweep": lambda w: {
+        "function": [f], "axes": [{"x": V[0]}], "store": [None, "folder"], "executor": wrong(),
+        "block": [None, 1], "buckets": [(), []], "progress": FLAG,
+    },
     "step": lambda w: {
         **RUN(w), "u": [np.ones(1)], "dt": [0.1], "newton_tol": NUMBER, "scheme": [nc.EnergyMomentum()]
     },
@@ -393,7 +397,8 @@ CALLS = {
 MADE = {
     "Accuracy", "Balance", "BeamHandle", "Check", "ComputedTorque", "Continuation", "DerivativeError",
     "Equilibrium", "Feedback", "Frame", "Growth", "Load", "MeshHandle", "Modes", "Nodes", "NonlinearProgram",
-    "Optima", "Outcome", "Result", "SimulationError", "Solution", "State", "Surface", "System",
+    "Optima", "Outcome", "Result", "SimulationError", "Solution", "State", "Steps", "Surface", "Sweep",
+    "System",
     "Trajectory",
 }  # fmt: skip
 BASES = {"Constraint", "Field", "Force", "GapPotential", "Joint", "Potential", "VelocityConstraint"}

@@ -34,6 +34,7 @@ FLOORS = (
     "stepping",
     "scene",
     "io",
+    "sweeps",
     "analysis",
     "control",
     "viz",

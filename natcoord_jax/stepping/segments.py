@@ -150,7 +150,7 @@ def in_segments(run: Run, *, progress: bool, store: Path | None, resume: bool) -
             rows.commit(totals, _written(blank))
     if totals["result"] == Result.INTERRUPTED:
         totals["result"] = Result.SUCCESSFUL
-    with _bar(run.steps, int(totals["steps"]), progress) as show, _interruptions() as interrupted:
+    with progress_bar(run.steps, int(totals["steps"]), progress) as show, _interruptions() as interrupted:
         totals = _go_on(run, static, blank, rows, totals, show, interrupted)
     if store is not None:
         stream.close(store, int(totals["saved"]))
@@ -277,7 +277,7 @@ def _interruptions() -> Iterator[threading.Event]:
 
 
 @contextmanager
-def _bar(steps: int, begun: int, progress: bool) -> Iterator[Any]:
+def progress_bar(total: int, begun: int, progress: bool, unit: str = "step") -> Iterator[Any]:
     """A bar on the terminal, or in a notebook; nothing where nobody sees it."""
     seen = sys.stderr is not None and (sys.stderr.isatty() or "ipykernel" in sys.modules)
     if not (progress and seen):
@@ -288,5 +288,5 @@ def _bar(steps: int, begun: int, progress: bool) -> Iterator[Any]:
     except ImportError as error:
         line = 'python -m pip install "natcoord-jax[store]"'
         raise ImportError(f"the bar is drawn by tqdm; install it with: {line}") from error
-    with tqdm(total=steps, initial=begun, unit="step", unit_scale=True) as bar:
+    with tqdm(total=total, initial=begun, unit=unit, unit_scale=True) as bar:
         yield bar.update

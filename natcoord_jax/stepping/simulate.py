@@ -16,7 +16,7 @@ from natcoord_jax.core.callables import Function
 from natcoord_jax.core.checks import as_array, at_top_level, is_concrete
 from natcoord_jax.core.compiled import compiled
 from natcoord_jax.core.effect import replace_fields
-from natcoord_jax.core.kinds import FLAG, FunctionOf
+from natcoord_jax.core.kinds import FLAG, FunctionOf, of
 from natcoord_jax.core.numeric import Number, Whole
 from natcoord_jax.core.state import STATE, State, Trajectory
 from natcoord_jax.stepping import one_kernel
@@ -24,7 +24,7 @@ from natcoord_jax.stepping.admissibility import check_obeyed
 from natcoord_jax.stepping.checked import INPUTS, STEP, check_state, checked_inputs, checked_step
 from natcoord_jax.stepping.error_control import Tolerance
 from natcoord_jax.stepping.newton import TOLERANCE
-from natcoord_jax.stepping.room import cut, in_host_memory, room_for, with_room
+from natcoord_jax.stepping.room import Steps, cut, in_host_memory, room_for, with_room
 from natcoord_jax.stepping.saved_states import rollout
 from natcoord_jax.stepping.scheme import SCHEME, SECOND_ORDER, Scheme
 from natcoord_jax.stepping.segments import Run, in_segments
@@ -49,7 +49,7 @@ def _simulate(
     system=SYSTEM,
     state=STATE,
     dt=STEP,
-    steps=Whole(1),
+    steps=Whole(1) | of("nc.Steps(number, most)", Steps),
     inputs=INPUTS,
     save_every=Whole(1),
     throw=FLAG,
@@ -69,7 +69,7 @@ def simulate(
     state: State,
     *,
     dt: Any,
-    steps: int | None = None,
+    steps: int | Steps | None = None,
     inputs: Any = None,
     save_every: int = 1,
     throw: bool = True,
@@ -104,7 +104,7 @@ def simulate(
             `assemble`. The run starts at its time: `Scene.compile(t=...)` and `State.at_time` set another
             than zero.
         dt: step [s].
-        steps: number of steps; may be left out when `inputs` is an array.
+        steps: number of steps; may be left out when `inputs` is an array. A traced one: `nc.Steps`.
         inputs: array (steps, inputs) [N, N m], held over each step; (inputs,) for constant ones; or a
             function (t, state) -> (inputs,), evaluated at the start of each (sub)step, for which velocities
             obey the constraints (see `System.tangent`). None: zero. Held inputs that stand for smooth ones
@@ -170,7 +170,11 @@ def simulate(
     state = scheme.started(replace_fields(state, held=None))
     step = checked_step(dt)
     inputs, until = Function.of(handing(inputs), state.t, state), Function.of(handing(until), state)
+    bounded = steps if isinstance(steps, Steps) else None
+    steps = steps.most if isinstance(steps, Steps) else steps
     checked, count = checked_inputs(system, inputs, steps, scheme.stages)
+    if bounded is not None and (save_every > 1 or checkpoint or progress or store is not None):
+        raise ValueError("steps: nc.Steps goes with every state saved, in one piece, without a checkpoint")
     if count % save_every:
         raise ValueError(f"save_every is {save_every}; pass a positive divisor of steps = {count}")
     tolerance = Tolerance.of(rtol, atol)
@@ -186,7 +190,9 @@ def simulate(
         return trajectory
     room, made = count, None
     spare = save_every == 1 and not checkpoint and in_host_memory()
-    if spare and at_top_level(system, state, inputs, step, until):
+    if bounded is not None:
+        made = bounded.made
+    elif spare and at_top_level(system, state, inputs, step, until):
         room, made = room_for(count), as_array(count, int)
         checked = with_room(checked, count, room)
     if extra_substeps is None:
@@ -204,6 +210,8 @@ def simulate(
             stacklevel=2,
         )
         trajectory = _simulate(system, state, checked, step, tolerance, made, static)
+    if bounded is not None:
+        trajectory = bounded.judged(trajectory)
     if count < room:
         trajectory = cut(trajectory, count)
     if throw and is_concrete(trajectory.result):
