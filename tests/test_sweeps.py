@@ -171,7 +171,11 @@ def test_two_processes_of_a_job_share_it(tmp_path):
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     processes = [started("share", tmp_path / "sweep", k, port) for k in range(2)]
-    told = [process.communicate(timeout=120)[0] for process in processes]
+    try:
+        told = [process.communicate(timeout=120)[0] for process in processes]
+    finally:
+        for process in processes:
+            process.kill()
     assert [x.split()[-1] for x in told] == ["2", "2"]
     is_whole(nc.Sweep(tmp_path / "sweep"))
 

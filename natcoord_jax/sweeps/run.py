@@ -107,7 +107,8 @@ def sweep(
     found = _table(function, grid, store)
     todo = [int(k) for k in np.flatnonzero(~found.done_blocks)]
     if executor is None:
-        todo = todo[jax.process_index() :: jax.process_count()]
+        # By number, not by place in the list, of which the others may have done some already.
+        todo = [k for k in todo if k % jax.process_count() == jax.process_index()]
     with progress_bar(grid.rows, int(found.done.sum()), progress, "row") as show:
         if executor is None:
             for number in todo:
