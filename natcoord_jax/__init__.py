@@ -149,9 +149,12 @@ from natcoord_jax.scene import Scene
 from natcoord_jax.stepping.assemble import assemble
 from natcoord_jax.stepping.dissipative import Dissipative
 from natcoord_jax.stepping.one_step import linearise, step
+from natcoord_jax.stepping.room import Steps
 from natcoord_jax.stepping.scheme import EnergyMomentum
 from natcoord_jax.stepping.simulate import simulate
 from natcoord_jax.stepping.variational import VariationalMidpoint
+from natcoord_jax.storage import load, save
+from natcoord_jax.sweeps import Sweep, sweep
 
 if TYPE_CHECKING:
     __version__: str
@@ -271,7 +274,9 @@ __all__ = [
     "SphericalTorque",
     "Spring",
     "State",
+    "Steps",
     "Surface",
+    "Sweep",
     "System",
     "Tie",
     "Trajectory",
@@ -299,6 +304,7 @@ __all__ = [
     "jit",
     "keep_programs",
     "linearise",
+    "load",
     "load_guess",
     "load_path",
     "mesh",
@@ -311,9 +317,11 @@ __all__ = [
     "random_state",
     "receding_horizon",
     "regulator",
+    "save",
     "set_effort",
     "simulate",
     "step",
+    "sweep",
     "tangent_growth",
     "to_nlp",
     "transfer",

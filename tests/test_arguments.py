@@ -254,7 +254,14 @@ CALLS = {
     "Scene.compile": lambda w: {"assemble": FLAG, "solver": ["reduced"], "t": NUMBER},
     "simulate": lambda w: {
         **RUN(w), **STEPPED, "throw": FLAG, "until": [f], "checkpoint": FLAG, "newton_tol": NUMBER,
-        "extra_substeps": WHOLE, "rtol": NUMBER, "atol": NUMBER,
+        "extra_substeps": WHOLE, "rtol": NUMBER, "atol": NUMBER, "progress": FLAG, "store": [None, "file"],
+        "resume": FLAG,
+    },
+    "save": lambda w: {"path": ["file"], "x": wrong()},
+    "load": lambda w: {"path": ["file"]},
+    "sweep": lambda w: {
+        "function": [f], "axes": [{"x": V[0]}], "store": [None, "folder"], "executor": wrong(),
+        "block": [None, 1], "buckets": [(), []], "progress": FLAG,
     },
     "step": lambda w: {
         **RUN(w), "u": [np.ones(1)], "dt": [0.1], "newton_tol": NUMBER, "scheme": [nc.EnergyMomentum()]
@@ -398,7 +405,8 @@ CALLS = {
 MADE = {
     "Accuracy", "Balance", "BeamHandle", "Check", "ComputedTorque", "Continuation", "DerivativeError",
     "Equilibrium", "Feedback", "Frame", "Growth", "Load", "MeshHandle", "Modes", "Nodes", "NonlinearProgram",
-    "Optima", "Outcome", "Result", "SimulationError", "Solution", "State", "Surface", "System",
+    "Optima", "Outcome", "Result", "SimulationError", "Solution", "State", "Steps", "Surface", "Sweep",
+    "System",
     "Trajectory",
 }  # fmt: skip
 BASES = {"Constraint", "Field", "Force", "Gap", "Joint", "Potential", "VelocityConstraint"}

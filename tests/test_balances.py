@@ -1,5 +1,6 @@
 """Conservation over very many steps, and the balances of stores, losses, drives, inputs and loads."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -311,3 +312,14 @@ def test_impulse_of_torques_is_the_change_of_angular_momentum():
     change = np.diff(found.spins.sum(1), axis=0)
     scale = np.max(np.linalg.norm(found.spins.sum(1), axis=1)) + np.sum(np.abs(inputs)) * dt
     assert relative(np.max(np.abs(change - impulses)), scale) <= tol.STEP_BALANCE
+
+
+def test_a_batch_has_the_balances_of_its_lanes():
+    scene = nc.Scene()
+    scene.add(nc.RigidBody(mass=1.0, inertia=(1.0, 2.0, 3.0), angular_velocity=(0, 1, 0.1)))
+    system, state = scene.compile()
+    runs = jax.vmap(lambda dt: nc.simulate(system, state, dt=dt, steps=3))(jnp.array([0.1, 0.2]))
+    found = nc.balance(system, runs)
+    assert found.energy.shape == found.momentum.shape == (2, 4) and found.axes == 3
+    for k in range(2):
+        np.testing.assert_array_equal(found.angular_momentum[k], nc.balance(system, runs[k]).angular_momentum)

@@ -30,9 +30,11 @@ FLOORS = (
     "effects",
     "assembly",
     "bodies",
+    "storage",
     "stepping",
     "scene",
     "io",
+    "sweeps",
     "analysis",
     "control",
     "viz",
@@ -45,6 +47,7 @@ BLIND = {
     "core": {"linsolve"},
     "effects": {"linsolve"},
     "assembly": {"effects", "bodies"},
+    "storage": {"effects", "bodies"},
     "stepping": {"effects", "bodies"},
 }
 # ``import natcoord_jax`` reaches every floor at once, so it is left to those above all others.

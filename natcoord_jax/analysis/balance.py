@@ -45,9 +45,9 @@ class Balance(eqx.Module):
         note: why something is missing, or "".
     """
 
-    energy: Float[np.ndarray, " saved"]
-    momentum: Float[np.ndarray, " saved"] | None
-    angular_momentum: Float[np.ndarray, " saved"] | None
+    energy: Float[np.ndarray, "*lanes saved"]
+    momentum: Float[np.ndarray, "*lanes saved"] | None
+    angular_momentum: Float[np.ndarray, "*lanes saved"] | None
     directions: int
     axes: int
     note: str
@@ -156,21 +156,35 @@ def _relative(error: np.ndarray, scale: float) -> np.ndarray:
     return error / scale if scale > 0 else np.zeros_like(error)
 
 
+def _of_lanes(lanes: list[Balance]) -> Balance:
+    """Errors of all lanes of a batch; none where one of them has none."""
+
+    def stacked(errors: list[Any]) -> Any:
+        return None if any(x is None for x in errors) else np.stack(errors)
+
+    return Balance(
+        np.stack([lane.energy for lane in lanes]),
+        stacked([lane.momentum for lane in lanes]),
+        stacked([lane.angular_momentum for lane in lanes]),
+        min(lane.directions for lane in lanes),
+        min(lane.axes for lane in lanes),
+        "; ".join(dict.fromkeys(lane.note for lane in lanes if lane.note)),
+    )
+
+
 @checked(system=SYSTEM, trajectory=TRAJECTORY)
 def balance(system: System, trajectory: Trajectory) -> Balance:
     """Errors of the balances of energy, momentum and angular momentum along a trajectory.
 
     Args:
         system: compiled system.
-        trajectory: of one lane, computed with it, every step saved.
+        trajectory: computed with it, every step saved; of a batch, too.
 
     Returns:
         The relative errors; see `Balance` for their scales. Momenta are left out, with a note, where the
         trajectory does not hold every step (`save_every`, steps repeated in substeps) and impulses act,
-        because these are then unknown.
-
-    Raises:
-        ValueError: for a trajectory of a batch.
+        because these are then unknown. Of a batch the errors of all lanes, (lanes, saved), along the
+        fewest directions and axes that any of them has.
 
     Example:
         >>> import jax; jax.config.update("jax_enable_x64", True)
@@ -183,7 +197,7 @@ def balance(system: System, trajectory: Trajectory) -> Balance:
         (3, True)
     """
     if trajectory.t.ndim != 1:
-        raise ValueError(f"balance takes one lane, not a batch of shape {trajectory.t.shape[:-1]}")
+        return _of_lanes([balance(system, lane) for lane in trajectory])
     saved = trajectory.t.shape[0]
     if saved == 1:
         return Balance(np.zeros(1), np.zeros(1), np.zeros(1), 3, 3, "no step was made")

@@ -15,11 +15,12 @@ class Result(IntEnum):
     MAX_SUBSTEPS = 6
     BAD_STEP = 7
     TOLERANCE_NOT_MET = 8
+    INTERRUPTED = 9
 
     @property
     def ok(self) -> bool:
         """Whether the trajectory is valid to its end."""
-        return self in (Result.SUCCESSFUL, Result.EVENT)
+        return self in (Result.SUCCESSFUL, Result.EVENT, Result.INTERRUPTED)
 
 
 REASONS = {
@@ -32,6 +33,7 @@ REASONS = {
     Result.MAX_SUBSTEPS: "more substeps were needed than `extra_substeps` allows",
     Result.BAD_STEP: "the step dt is not a positive finite number [s]",
     Result.TOLERANCE_NOT_MET: "no substep is short enough for the error that `rtol` and `atol` tolerate",
+    Result.INTERRUPTED: "the run was interrupted from the keyboard",
 }
 
 REMEDIES = {
@@ -42,6 +44,7 @@ REMEDIES = {
     Result.MAX_SUBSTEPS: "use a smaller dt or allow more `extra_substeps`",
     Result.BAD_STEP: "pass dt > 0",
     Result.TOLERANCE_NOT_MET: "use a larger `rtol` or `atol`; 1e-13 of the motion is round-off",
+    Result.INTERRUPTED: "what was stored by `store` goes on with `resume=True`",
 }
 
 

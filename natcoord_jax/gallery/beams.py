@@ -39,6 +39,14 @@ def cantilever(elements: int = 16) -> Example:
     return Example("cantilever", "a clamped rod", system, state, 2e-3, 500, facts={"beam": beam})
 
 
+def _pull(t):
+    return jnp.where(t < 2.5, jnp.array([8.0, 0.0, 0.0]), 0.0)
+
+
+def _turn(t):
+    return jnp.where(t < 2.5, jnp.array([0.0, 0.0, -80.0]), 0.0)
+
+
 def flying_spaghetti(elements: int = 10) -> Example:
     """A free beam that a force and a moment set in motion (reference case B17)."""
     section = nc.Section.of_numbers(EA=1e4, GA=1e4, EI=100.0, GJ=100.0, density=1.0, rotary=10.0)
@@ -46,13 +54,10 @@ def flying_spaghetti(elements: int = 10) -> Example:
     scene = nc.Scene()
     beam = scene.add(nc.Beam(section, ends, elements=elements, second=(0, 0, 1), name="beam"))
 
-    def until(t):
-        return jnp.where(t < 2.5, 1.0, 0.0)
-
     tip = nc.Point(beam.end, ends[1])
     axes = tuple(nc.Direction(beam.end, e) for e in np.eye(3))
-    scene.add(nc.PointForce((tip,), force=lambda t: until(t) * jnp.array([8.0, 0, 0]), name="force"))
-    scene.add(nc.BodyTorque(axes, torque=lambda t: until(t) * jnp.array([0, 0, -80.0]), name="moment"))
+    scene.add(nc.PointForce((tip,), force=_pull, name="force"))
+    scene.add(nc.BodyTorque(axes, torque=_turn, name="moment"))
     system, state = scene.compile()
     facts = {"beam": beam, "momentum": (20.0, 0.0, 0.0)}
     return Example("flying_spaghetti", "a free beam in flight", system, state, 0.1, 150, facts=facts)

@@ -16,23 +16,26 @@ import jax.numpy as jnp
 from jaxtyping import Array, Int
 
 from natcoord_jax.assembly.system import System
+from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.results import Result
 from natcoord_jax.core.state import State
-from natcoord_jax.stepping.attempt import with_state
+from natcoord_jax.stepping.attempt import LoopCarry, with_state
 from natcoord_jax.stepping.error_control import Tolerance
 from natcoord_jax.stepping.factors import Factors
 from natcoord_jax.stepping.newton import any_lane
 from natcoord_jax.stepping.one_kernel import as_one_kernel
 from natcoord_jax.stepping.plan import Plan, Slots
 from natcoord_jax.stepping.rollout_state import RolloutProblem, RolloutState
+from natcoord_jax.stepping.taken_up import TakenUp
 from natcoord_jax.stepping.two_kernel_loop import all_slots
 
 
 class Ending(eqx.Module):
-    """Where a rollout ended, and the factors it ended with."""
+    """Where a rollout ended, the factors it ended with, and what another one can take up, if asked for."""
 
     course: RolloutState
     factors: Factors
+    carried: LoopCarry | None = None
 
 
 def run(
@@ -44,15 +47,17 @@ def run(
     tolerance: Tolerance | None,
     event: Any = None,
     steps: Int[Array, ""] | None = None,
+    taken_up: TakenUp | None = None,
 ) -> tuple[Slots, Ending]:
     """All slots of a rollout and where it ended; without derivatives (see `derivative`).
 
-    The plan has room for its steps, of which the first are made: as many as `steps` says, or all.
+    The plan has room for its steps, of which the first are made: as many as `steps` says, or all. What is
+    taken up goes on, and can be taken up in turn.
     """
     setting = RolloutProblem(
         system, parameters, dt, tolerance, plan, plan.steps if steps is None else steps, event=event
     )
-    found, unpack = all_slots(setting, state)
+    found, unpack = all_slots(setting, state, taken_up=taken_up)
     course, (states, *rest) = with_state(found.course, unpack(found.state)), found.record
     count, factors, slots = found.count, found.factors, Slots(jax.vmap(unpack)(states), *rest)
     if tolerance is not None:
@@ -74,7 +79,8 @@ def run(
             slots.accepted & ~unused,
         ),
     )
-    return slots, Ending(_judged(course, setting.steps), factors)
+    carried = None if taken_up is None else replace_fields(found, record=())
+    return slots, Ending(_judged(course, setting.steps), factors, carried)
 
 
 def run_to_the_end(setting: RolloutProblem, state: State, kernel: Callable = as_one_kernel) -> RolloutState:

@@ -1,149 +1,35 @@
 """The public entrance: a rollout."""
 
-import math
+import os
 import warnings
 from collections.abc import Callable
-from functools import partial
+from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 from jaxtyping import Array
 
-from natcoord_jax.assembly.reading import handing, reads_velocities
+from natcoord_jax.assembly.reading import handing
 from natcoord_jax.assembly.system import SYSTEM, System
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.callables import Function
 from natcoord_jax.core.checks import as_array, at_top_level, is_concrete
 from natcoord_jax.core.compiled import compiled
 from natcoord_jax.core.effect import replace_fields
-from natcoord_jax.core.kinds import FLAG, FunctionOf
+from natcoord_jax.core.kinds import FLAG, FunctionOf, of
 from natcoord_jax.core.numeric import Number, Whole
-from natcoord_jax.core.results import Result
 from natcoord_jax.core.state import STATE, State, Trajectory
 from natcoord_jax.stepping import one_kernel
 from natcoord_jax.stepping.admissibility import check_obeyed
 from natcoord_jax.stepping.checked import INPUTS, STEP, check_state, checked_inputs, checked_step
-from natcoord_jax.stepping.derivative import run_slots
 from natcoord_jax.stepping.error_control import Tolerance
 from natcoord_jax.stepping.newton import TOLERANCE
-from natcoord_jax.stepping.plan import Control, Event, Plan, Slots
-from natcoord_jax.stepping.room import cut, in_host_memory, room_for, with_room
+from natcoord_jax.stepping.room import Steps, cut, in_host_memory, room_for, with_room
+from natcoord_jax.stepping.saved_states import rollout
 from natcoord_jax.stepping.scheme import SCHEME, SECOND_ORDER, Scheme
+from natcoord_jax.stepping.segments import Run, in_segments
 from natcoord_jax.stepping.turns import warn_of_far_turns
-
-SEGMENT = 512
-"""Longest segment of a rollout that does not save every step, or that is checkpointed."""
-
-
-def _segments(steps: int, save_every: int, checkpoint: bool) -> int:
-    """Steps per segment: all, or the largest divisor that keeps saved steps and memory in step."""
-    if save_every == 1 and not checkpoint:
-        return steps
-    limit = max(save_every, min(SEGMENT, 2 * math.isqrt(steps)) if checkpoint else SEGMENT)
-    lengths = [m for m in range(save_every, limit + 1, save_every) if steps % m == 0]
-    return max(lengths)
-
-
-def _ends(slots: Slots, every: int, steps: int) -> Array:
-    """Slots at which every `every`-th step is complete; the last slot for steps that never were."""
-    wanted = jnp.arange(every, steps + 1, every)
-    return jnp.minimum(jnp.searchsorted(slots.finished, wanted), slots.finished.shape[0] - 1)
-
-
-def _rollout(
-    system: System,
-    state: State,
-    inputs: Any,
-    dt: Array,
-    steps: int,
-    save_every: int,
-    checkpoint: bool,
-    tolerance: float,
-    extra_substeps: int,
-    until: Callable | None,
-    scheme: Scheme,
-    *,
-    allowed: Tolerance | None,
-    made: Array | None,
-) -> Trajectory:
-    tableau, control_reads = scheme.tableau, False
-    length = _segments(steps, save_every, checkpoint)
-    if callable(inputs):
-        control, every_segment = Control.of(inputs)
-        at_start = partial(control, every_segment, jnp.array(0), state.t, fraction=jnp.ones(()))
-        control_reads = scheme.loose and reads_velocities(lambda x: at_start(state=x), state)
-        pieces = jax.tree.map(lambda x: jnp.broadcast_to(x, (steps // length, *x.shape)), every_segment)
-    else:
-        control, pieces = None, inputs.reshape(steps // length, length, *inputs.shape[1:])
-    event, limit = (None, None) if until is None else Event.of(until)
-    event_reads = scheme.loose and event is not None and reads_velocities(partial(event, limit), state)
-    plan = Plan(
-        length, extra_substeps, tolerance, control, event, tableau,
-        control_reads=control_reads, event_reads=event_reads,
-    )  # fmt: skip
-
-    def segment(carry, parameters):
-        state, code, failed = carry
-        slots, ending = run_slots(plan, system, state, parameters, dt, allowed, limit, made)
-        course = ending.course
-        running = code == int(Result.SUCCESSFUL)
-        keep = partial(jnp.where, running)
-        picked = _ends(slots, save_every, length)
-        saved = jax.tree.map(lambda x: x[picked], slots.states)
-        if steps != length:
-            saved = jax.tree.map(lambda x, s: jnp.where(running, x, s), saved, state)
-        after = jax.tree.map(keep, course.state, state)
-        starts = jax.tree.map(lambda one, x: jnp.concatenate([one[None], x])[picked], state, slots.states)
-        # Beyond the end of a run that failed there are the inputs of the step that failed.
-        beyond = jnp.arange(save_every, length + 1, save_every) > course.step
-        number = jnp.where(beyond, jnp.minimum(course.step, length - 1), slots.step[picked])
-        starts = jax.tree.map(
-            lambda x, last: jax.vmap(jnp.where, (0, None, 0))(beyond, last, x), starts, course.state
-        )
-        whole = jnp.zeros(()), jnp.ones(())
-        used = jax.vmap(lambda k, s: plan.inputs(system, parameters, k, s, *whole))(number, starts)
-        if used.ndim == 3:
-            used = jnp.einsum("j,kji->ki", jnp.asarray(tableau.b), used)
-        code = keep(course.code, code)
-        worst = keep(course.worst, failed[2])
-        failed = (failed[0] + jnp.where(running, course.step, 0), keep(course.state.t, failed[1]), worst)
-        counts = (
-            course.residual, course.taken, course.rejected, course.iterations, course.iterations_max
-        )  # fmt: skip
-        counts = jax.tree.map(lambda x: jnp.where(running, x, jnp.zeros_like(x)), counts)
-        return (after, code, failed), (saved, used, counts)
-
-    nought = jnp.array(0)
-    first = (state, nought, (nought, state.t, nought - 1))
-    if checkpoint:
-        segment = jax.checkpoint(segment)
-    if steps == length:
-        carry, outputs = segment(first, jax.tree.map(lambda x: x[0], pieces))
-        outputs = jax.tree.map(lambda x: x[None], outputs)
-    else:
-        carry, outputs = jax.lax.scan(segment, first, pieces)
-    _, code, (failed_step, failed_time, worst) = carry
-    saved, used, (residual, taken, rejected, iterations, iterations_max) = outputs
-    states = jax.tree.map(
-        lambda x0, x: jnp.concatenate([x0[None], x.reshape(x.shape[0] * x.shape[1], *x.shape[2:])]),
-        state,
-        saved,
-    )
-    return Trajectory(
-        states,
-        used.reshape(used.shape[0] * used.shape[1], used.shape[2]),
-        code,
-        failed_step,
-        failed_time,
-        worst,
-        jnp.max(residual),
-        jnp.sum(taken),
-        jnp.sum(rejected),
-        jnp.sum(iterations),
-        jnp.max(iterations_max),
-        scheme,
-    )
+from natcoord_jax.storage.archive import PATH
 
 
 @compiled
@@ -156,14 +42,14 @@ def _simulate(
     made: Array | None,
     static: Any,
 ) -> Trajectory:
-    return _rollout(system, state, inputs, dt, *static, allowed=tolerance, made=made)
+    return rollout(system, state, inputs, dt, *static, allowed=tolerance, made=made)[0]
 
 
 @checked(
     system=SYSTEM,
     state=STATE,
     dt=STEP,
-    steps=Whole(1),
+    steps=Whole(1) | of("nc.Steps(number, most)", Steps),
     inputs=INPUTS,
     save_every=Whole(1),
     throw=FLAG,
@@ -174,13 +60,16 @@ def _simulate(
     scheme=SCHEME,
     rtol=Number("not negative"),
     atol=Number("not negative"),
+    progress=FLAG,
+    store=PATH,
+    resume=FLAG,
 )
 def simulate(
     system: System,
     state: State,
     *,
     dt: Any,
-    steps: int | None = None,
+    steps: int | Steps | None = None,
     inputs: Any = None,
     save_every: int = 1,
     throw: bool = True,
@@ -191,6 +80,9 @@ def simulate(
     scheme: Scheme = SECOND_ORDER,
     rtol: Any = None,
     atol: Any = None,
+    progress: bool = False,
+    store: str | os.PathLike | None = None,
+    resume: bool = False,
 ) -> Trajectory:
     """Simulate with the energy-momentum step (57), its relatives of higher order, or another scheme.
 
@@ -212,7 +104,7 @@ def simulate(
             `assemble`. The run starts at its time: `Scene.compile(t=...)` and `State.at_time` set another
             than zero.
         dt: step [s].
-        steps: number of steps; may be left out when `inputs` is an array.
+        steps: number of steps; may be left out when `inputs` is an array. A traced one: `nc.Steps`.
         inputs: array (steps, inputs) [N, N m], held over each step; (inputs,) for constant ones; or a
             function (t, state) -> (inputs,), evaluated at the start of each (sub)step, for which velocities
             obey the constraints (see `System.tangent`). None: zero. Held inputs that stand for smooth ones
@@ -237,9 +129,21 @@ def simulate(
             None: as many substeps as steps.
         atol: the same in metres (directors: 1; velocities: per second); as large as `rtol` by default.
             Derivatives hold the lengths of the substeps fixed.
+        progress: show a bar with speed and time left, where a terminal or a notebook is. The run is made in
+            segments, with the same states, and an interruption from the keyboard (Ctrl-C) ends it after the
+            segment at hand, some quarter of a second: what was reached is returned, with the code
+            INTERRUPTED. A second one raises KeyboardInterrupt as always. For calls outside of
+            transformations only.
+        store: file (HDF5, as "run.h5") that states are written to as they are made, in such segments; the
+            trajectory that is returned reads them from there, so that memory stays bounded. `nc.load` reads
+            it in another process, ParaView shows bodies and elements in it (VTKHDF). It ends with the last
+            state that was reached.
+        resume: go on with what is in `store`, if there is anything, after a run that was killed or
+            interrupted: with the last whole segment, to the same bits.
 
     Returns:
-        Trajectory with `steps / save_every + 1` saved states.
+        Trajectory with `steps / save_every + 1` saved states; fewer of a run that was interrupted, or that
+        ended early and is in a file.
 
     Warns:
         UserWarning: in an eager call, of a joint that turns so far in a step that its rate and its angle tell
@@ -266,13 +170,29 @@ def simulate(
     state = scheme.started(replace_fields(state, held=None))
     step = checked_step(dt)
     inputs, until = Function.of(handing(inputs), state.t, state), Function.of(handing(until), state)
+    bounded = steps if isinstance(steps, Steps) else None
+    steps = steps.most if isinstance(steps, Steps) else steps
     checked, count = checked_inputs(system, inputs, steps, scheme.stages)
+    if bounded is not None and (save_every > 1 or checkpoint or progress or store is not None):
+        raise ValueError("steps: nc.Steps goes with every state saved, in one piece, without a checkpoint")
     if count % save_every:
         raise ValueError(f"save_every is {save_every}; pass a positive divisor of steps = {count}")
     tolerance = Tolerance.of(rtol, atol)
+    if progress or store is not None or resume:
+        run = Run(
+            system, state, checked, step, tolerance, newton_tol, extra_substeps, until, scheme, count,
+            int(save_every), checkpoint,
+        )  # fmt: skip
+        traced = not at_top_level(system, state, inputs, step, until)
+        trajectory = _long(run, traced, progress, store, resume)
+        if throw:
+            system.raise_on_failure(trajectory)
+        return trajectory
     room, made = count, None
     spare = save_every == 1 and not checkpoint and in_host_memory()
-    if spare and at_top_level(system, state, inputs, step, until):
+    if bounded is not None:
+        made = bounded.made
+    elif spare and at_top_level(system, state, inputs, step, until):
         room, made = room_for(count), as_array(count, int)
         checked = with_room(checked, count, room)
     if extra_substeps is None:
@@ -290,6 +210,8 @@ def simulate(
             stacklevel=2,
         )
         trajectory = _simulate(system, state, checked, step, tolerance, made, static)
+    if bounded is not None:
+        trajectory = bounded.judged(trajectory)
     if count < room:
         trajectory = cut(trajectory, count)
     if throw and is_concrete(trajectory.result):
@@ -297,3 +219,21 @@ def simulate(
     if tolerance is None:
         warn_of_far_turns(system, trajectory, step, int(save_every))
     return trajectory
+
+
+def _long(
+    run: Run, traced: bool, progress: bool, store: str | os.PathLike | None, resume: bool
+) -> Trajectory:
+    """A run in segments.
+
+    Raises:
+        ValueError: within a transformation, for `resume` without a file, or a file that is there already.
+    """
+    if traced:
+        raise ValueError("progress and store are for calls from Python, outside of jit, vmap and grad")
+    path = None if store is None else Path(store)
+    if path is None and resume:
+        raise ValueError("resume goes on with what is in a file; pass its name as `store`")
+    if path is not None and path.exists() and not resume:
+        raise ValueError(f"{path} is there already; pass resume=True to go on with it, or another name")
+    return in_segments(run, progress=progress, store=path, resume=resume)

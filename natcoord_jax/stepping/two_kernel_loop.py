@@ -18,6 +18,7 @@ from jaxtyping import Array
 from natcoord_jax.assembly.equations import kind_of, prepare
 from natcoord_jax.assembly.start_cache import StartCache
 from natcoord_jax.assembly.system import System
+from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.rows import with_part
 from natcoord_jax.stepping.attempt import LoopCarry, RefactorRequest, attempt, renewed_at, with_state
@@ -28,6 +29,7 @@ from natcoord_jax.stepping.newton import Iterate, any_lane
 from natcoord_jax.stepping.one_kernel import as_one_kernel
 from natcoord_jax.stepping.plan import Plan
 from natcoord_jax.stepping.rollout_state import RolloutProblem, RolloutState, start_of
+from natcoord_jax.stepping.taken_up import TakenUp, going_on
 
 PARTS = 4
 """Bodies from which on new factors are made in a kernel of their own."""
@@ -40,7 +42,10 @@ ATTEMPTS = 2
 
 
 def all_slots(
-    setting: RolloutProblem, state: State, kernel: Callable = as_one_kernel
+    setting: RolloutProblem,
+    state: State,
+    kernel: Callable = as_one_kernel,
+    taken_up: TakenUp | None = None,
 ) -> tuple[LoopCarry, Callable[[Array], State]]:
     """The loop over all evaluations of the equations.
 
@@ -48,6 +53,7 @@ def all_slots(
         setting: of the rollout.
         state: the first.
         kernel: what runs the loop where it is one kernel, see `in_parts`; `plainly` in that of the caller.
+        taken_up: the loop that this one goes on with.
     """
     plan = setting.plan
     length = plan.steps + plan.extra
@@ -55,8 +61,8 @@ def all_slots(
         length = ATTEMPTS * length
     packed, unpack = ravel_pytree(state)
     if in_parts(setting.system, plan, setting.tolerance):
-        return _by_rounds(setting, unpack, length, packed), unpack
-    return kernel(partial(_every_slot, setting, unpack, length), packed), unpack
+        return _by_rounds(setting, unpack, length, packed, taken_up), unpack
+    return kernel(partial(_every_slot, setting, unpack, length), packed, taken_up), unpack
 
 
 def in_parts(system: System, plan: Plan, tolerance: Tolerance | None) -> bool:
@@ -85,24 +91,53 @@ def _record(course: RolloutState, x: Array, rows: int) -> tuple[Array, ...]:
     return tuple(jnp.zeros((rows, *x.shape), x.dtype) for x in slot)
 
 
+def first_carry(setting: RolloutProblem, state: State) -> LoopCarry:
+    """What the loop begins with, its record left out."""
+    packed, unpack = ravel_pytree(state)
+    parts = in_parts(setting.system, setting.plan, setting.tolerance)
+    return (_first_of_rounds if parts else _first)(setting, unpack, packed)
+
+
+def _first(setting: RolloutProblem, unpack: Callable[[Array], State], x: Array) -> LoopCarry:
+    course, factors, start_cache = _start(setting, unpack, x)
+    probe = None
+    if kind_of(setting.system, setting.plan.tableau).by_differences:
+        probe = first_probe(setting, with_state(course, unpack(x)), start_cache)
+    return LoopCarry(jnp.array(0), course, x, start_cache, factors, probe, (), jnp.array(0), None)
+
+
 def _every_slot(
     setting: RolloutProblem,
     unpack: Callable[[Array], State],
     length: int,
     x: Array,
+    taken_up: TakenUp | None,
 ) -> LoopCarry:
     """All slots, in one loop."""
     # In the kernel, too: a few dozen fusions before it would take longer than the first steps.
-    course, factors, start_cache = _start(setting, unpack, x)
-    plan = setting.plan
-    probe = None
-    if kind_of(setting.system, plan.tableau).by_differences:
-        probe = first_probe(setting, with_state(course, unpack(x)), start_cache)
+    start = going_on(_first(setting, unpack, x), taken_up)
     # A row beyond the last goes to the last.
-    record = _record(course, x, length if plan.recorded else 1)
-    start = LoopCarry(jnp.array(0), course, x, start_cache, factors, probe, record, jnp.array(0), None)
+    record = _record(start.course, start.state, length if setting.plan.recorded else 1)
+    start = replace_fields(start, record=record)
     going = partial(_unfinished, setting, length)
     return jax.lax.while_loop(going, partial(attempt, setting, unpack, False), start)
+
+
+def _situated(setting: RolloutProblem, unpack: Callable[[Array], State], carried: LoopCarry) -> Any:
+    """The equations of the attempt at hand."""
+    state = unpack(carried.state)
+    u, h, _ = setting.situation(with_state(carried.course, state))
+    return prepare(setting.system, state, u, h, setting.plan.tableau, carried.start_cache)
+
+
+def _first_of_rounds(setting: RolloutProblem, unpack: Callable[[Array], State], x: Array) -> LoopCarry:
+    course, factors, start_cache = _start(setting, unpack, x)
+    start = LoopCarry(jnp.array(0), course, x, start_cache, factors, None, (), jnp.array(0), None)
+    like = jax.eval_shape(lambda c: _situated(setting, unpack, c).evaluate(c.course.it.y), start)
+    like = like.residual, like.size, like.loads
+    residual, size, loads = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), like)
+    asked = RefactorRequest(jnp.array(False), residual, size, loads, jnp.array(False))
+    return eqx.tree_at(lambda c: c.asked, start, asked, is_leaf=lambda x: x is None)
 
 
 def _by_rounds(
@@ -110,6 +145,7 @@ def _by_rounds(
     unpack: Callable[[Array], State],
     length: int,
     x: Array,
+    taken_up: TakenUp | None,
 ) -> LoopCarry:
     """All slots, in rounds of a kernel that goes on until it needs new factors, and one that makes them.
 
@@ -117,13 +153,7 @@ def _by_rounds(
     what travels between kernels does not grow with the number of slots.
     """
     plan = setting.plan
-    course, factors, start_cache = _start(setting, unpack, x)
     rows = CHUNK if plan.recorded else 1
-
-    def situated(setting: RolloutProblem, carried: LoopCarry) -> Any:
-        state = unpack(carried.state)
-        u, h, _ = setting.situation(with_state(carried.course, state))
-        return prepare(setting.system, state, u, h, plan.tableau, carried.start_cache)
 
     def attempts(near: RolloutProblem, carried: LoopCarry) -> LoopCarry:
         def going(c: LoopCarry) -> Array:
@@ -136,7 +166,7 @@ def _by_rounds(
 
     def renewal(near: RolloutProblem, carried: LoopCarry) -> tuple[Iterate, Factors]:
         assert carried.asked is not None
-        equations = situated(near, carried)
+        equations = _situated(near, unpack, carried)
         return renewed_at(near, equations, carried.course.it, carried.factors, carried.asked)
 
     def round_of(carry: tuple[LoopCarry, tuple[Array, ...]]) -> tuple:
@@ -160,14 +190,9 @@ def _by_rounds(
         made = it, factors, jnp.array(False)
         return eqx.tree_at(lambda c: (c.course.it, c.factors, c.asked.wanting), found, made), record
 
-    start = LoopCarry(jnp.array(0), course, x, start_cache, factors, None, (), jnp.array(0), None)
-    like = jax.eval_shape(lambda c: situated(setting, c).evaluate(c.course.it.y), start)
-    like = like.residual, like.size, like.loads
-    residual, size, loads = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), like)
-    asked = RefactorRequest(jnp.array(False), residual, size, loads, jnp.array(False))
-    start = eqx.tree_at(lambda c: c.asked, start, asked, is_leaf=lambda x: x is None)
+    start = going_on(_first_of_rounds(setting, unpack, x), taken_up)
     # The slots of the last round may end before its room does.
-    record = _record(course, x, length + CHUNK if plan.recorded else 1)
+    record = _record(start.course, start.state, length + CHUNK if plan.recorded else 1)
     found, record = jax.lax.while_loop(
         lambda carry: _unfinished(setting, length, carry[0]), round_of, (start, record)
     )

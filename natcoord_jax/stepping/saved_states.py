@@ -1,0 +1,174 @@
+"""A rollout as a trajectory: which states are saved, and the inputs and codes that go with them."""
+
+import math
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from natcoord_jax.assembly.reading import reads_velocities
+from natcoord_jax.assembly.system import System
+from natcoord_jax.core.results import Result
+from natcoord_jax.core.state import State, Trajectory
+from natcoord_jax.stepping.attempt import LoopCarry
+from natcoord_jax.stepping.derivative import run_slots
+from natcoord_jax.stepping.error_control import Tolerance
+from natcoord_jax.stepping.plan import Control, Event, Plan, Slots
+from natcoord_jax.stepping.rollout import run
+from natcoord_jax.stepping.rollout_state import RolloutProblem
+from natcoord_jax.stepping.scheme import Scheme
+from natcoord_jax.stepping.taken_up import TakenUp
+from natcoord_jax.stepping.two_kernel_loop import first_carry
+
+SEGMENT = 512
+"""Longest segment of a rollout that does not save every step, or that is checkpointed."""
+
+
+def segment_length(steps: int, save_every: int, checkpoint: bool) -> int:
+    """Steps per segment: all, or the largest divisor that keeps saved steps and memory in step."""
+    if save_every == 1 and not checkpoint:
+        return steps
+    limit = max(save_every, min(SEGMENT, 2 * math.isqrt(steps)) if checkpoint else SEGMENT)
+    lengths = [m for m in range(save_every, limit + 1, save_every) if steps % m == 0]
+    return max(lengths)
+
+
+def _ends(slots: Slots, every: int, steps: int) -> Array:
+    """Slots at which every `every`-th step is complete; the last slot for steps that never were."""
+    wanted = jnp.arange(every, steps + 1, every)
+    return jnp.minimum(jnp.searchsorted(slots.finished, wanted), slots.finished.shape[0] - 1)
+
+
+def planned(
+    state: State,
+    inputs: Any,
+    length: int,
+    tolerance: float,
+    extra_substeps: int,
+    until: Callable | None,
+    scheme: Scheme,
+) -> tuple[Plan, Any, Any]:
+    """What is static about so many steps, the parameters of the inputs, and the numbers of the event."""
+    control, event, parameters, limit = None, None, inputs, None
+    control_reads = event_reads = False
+    if callable(inputs):
+        control, parameters = Control.of(inputs)
+        at_start = partial(control, parameters, jnp.array(0), state.t, fraction=jnp.ones(()))
+        control_reads = scheme.loose and reads_velocities(lambda x: at_start(state=x), state)
+    if until is not None:
+        event, limit = Event.of(until)
+        event_reads = scheme.loose and reads_velocities(partial(event, limit), state)
+    plan = Plan(
+        length, extra_substeps, tolerance, control, event, scheme.tableau,
+        control_reads=control_reads, event_reads=event_reads,
+    )  # fmt: skip
+    return plan, parameters, limit
+
+
+def nothing_before(
+    system: System,
+    state: State,
+    inputs: Any,
+    dt: Array,
+    length: int,
+    *rest: Any,
+    allowed: Tolerance | None,
+) -> TakenUp:
+    """What a run takes up that begins anew: zeros."""
+    plan, parameters, limit = planned(state, inputs, length, *rest)
+    setting = RolloutProblem(system, parameters, dt, allowed, plan, length, event=limit)
+    shapes = jax.eval_shape(partial(first_carry, setting), state)
+    return TakenUp(jnp.array(True), jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes))
+
+
+def rollout(
+    system: System,
+    state: State,
+    inputs: Any,
+    dt: Array,
+    steps: int,
+    save_every: int,
+    checkpoint: bool,
+    tolerance: float,
+    extra_substeps: int,
+    until: Callable | None,
+    scheme: Scheme,
+    *,
+    allowed: Tolerance | None,
+    made: Array | None,
+    taken_up: TakenUp | None = None,
+) -> tuple[Trajectory, LoopCarry | None]:
+    """A rollout and, if it takes up another one (then of one segment), what the next can take up."""
+    length, tableau = segment_length(steps, save_every, checkpoint), scheme.tableau
+    plan, parameters, limit = planned(state, inputs, length, tolerance, extra_substeps, until, scheme)
+    if plan.control is None:
+        pieces = parameters.reshape(steps // length, length, *parameters.shape[1:])
+    else:
+        pieces = jax.tree.map(lambda x: jnp.broadcast_to(x, (steps // length, *x.shape)), parameters)
+
+    def segment(carry, parameters):
+        state, code, failed = carry
+        given = plan, system, state, parameters, dt, allowed, limit, made
+        slots, ending = run_slots(*given) if taken_up is None else run(*given, taken_up)
+        course = ending.course
+        running = code == int(Result.SUCCESSFUL)
+        keep = partial(jnp.where, running)
+        picked = _ends(slots, save_every, length)
+        saved = jax.tree.map(lambda x: x[picked], slots.states)
+        if steps != length:
+            saved = jax.tree.map(lambda x, s: jnp.where(running, x, s), saved, state)
+        after = jax.tree.map(keep, course.state, state)
+        starts = jax.tree.map(lambda one, x: jnp.concatenate([one[None], x])[picked], state, slots.states)
+        # Beyond the end of a run that failed there are the inputs of the step that failed.
+        beyond = jnp.arange(save_every, length + 1, save_every) > course.step
+        number = jnp.where(beyond, jnp.minimum(course.step, length - 1), slots.step[picked])
+        starts = jax.tree.map(
+            lambda x, last: jax.vmap(jnp.where, (0, None, 0))(beyond, last, x), starts, course.state
+        )
+        whole = jnp.zeros(()), jnp.ones(())
+        used = jax.vmap(lambda k, s: plan.inputs(system, parameters, k, s, *whole))(number, starts)
+        if used.ndim == 3:
+            used = jnp.einsum("j,kji->ki", jnp.asarray(tableau.b), used)
+        code = keep(course.code, code)
+        worst = keep(course.worst, failed[2])
+        failed = (failed[0] + jnp.where(running, course.step, 0), keep(course.state.t, failed[1]), worst)
+        counts = (
+            course.residual, course.taken, course.rejected, course.iterations, course.iterations_max
+        )  # fmt: skip
+        counts = jax.tree.map(lambda x: jnp.where(running, x, jnp.zeros_like(x)), counts)
+        return (after, code, failed), (saved, used, counts, ending.carried)
+
+    nought = jnp.array(0)
+    first = (state, nought, (nought, state.t, nought - 1))
+    if checkpoint:
+        segment = jax.checkpoint(segment)
+    if steps == length:
+        carry, outputs = segment(first, jax.tree.map(lambda x: x[0], pieces))
+        outputs = jax.tree.map(lambda x: x[None], outputs)
+    else:
+        carry, outputs = jax.lax.scan(segment, first, pieces)
+    _, code, (failed_step, failed_time, worst) = carry
+    saved, used, (residual, taken, rejected, iterations, iterations_max), carried = outputs
+    states = jax.tree.map(
+        lambda x0, x: jnp.concatenate([x0[None], x.reshape(x.shape[0] * x.shape[1], *x.shape[2:])]),
+        state,
+        saved,
+    )
+    trajectory = Trajectory(
+        states,
+        used.reshape(used.shape[0] * used.shape[1], used.shape[2]),
+        code,
+        failed_step,
+        failed_time,
+        worst,
+        jnp.max(residual),
+        jnp.sum(taken),
+        jnp.sum(rejected),
+        jnp.sum(iterations),
+        jnp.max(iterations_max),
+        scheme,
+    )
+    return trajectory, None if carried is None else jax.tree.map(lambda x: x[0], carried)
