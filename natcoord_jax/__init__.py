@@ -30,6 +30,7 @@ from natcoord_jax.bodies import (
     Cylinder,
     DirectorInterpolation,
     Ellipsoid,
+    Fold,
     Gas,
     LineLoad,
     MeshHandle,
@@ -126,6 +127,7 @@ from natcoord_jax.effects.joints import (
     Spherical,
     Universal,
 )
+from natcoord_jax.effects.laminates import Laminate, Orthotropic
 from natcoord_jax.effects.loads import (
     BodyTorque,
     EnclosedGas,
@@ -135,7 +137,7 @@ from natcoord_jax.effects.loads import (
     PointForce,
 )
 from natcoord_jax.effects.materials import Elastic
-from natcoord_jax.effects.shells import ShellElement
+from natcoord_jax.effects.shells import MembraneElement, MembraneTriangle, ShellElement, ShellTriangle
 from natcoord_jax.effects.solids import Brick
 from natcoord_jax.effects.springs import (
     Armature,
@@ -210,6 +212,7 @@ __all__ = [
     "Feedback",
     "Field",
     "Fixed",
+    "Fold",
     "Force",
     "Frame",
     "GapPotential",
@@ -225,8 +228,11 @@ __all__ = [
     "JointSpring",
     "JointStops",
     "JointTorque",
+    "Laminate",
     "LineLoad",
     "Load",
+    "MembraneElement",
+    "MembraneTriangle",
     "MeshHandle",
     "Modes",
     "Nodes",
@@ -235,6 +241,7 @@ __all__ = [
     "NonlinearSpring",
     "Optima",
     "OptimalControl",
+    "Orthotropic",
     "Outcome",
     "PairTorque",
     "Parameter",
@@ -265,6 +272,7 @@ __all__ = [
     "Shell",
     "SimulationError",
     "ShellElement",
+    "ShellTriangle",
     "Solid",
     "Solution",
     "Sphere",

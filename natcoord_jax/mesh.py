@@ -24,8 +24,9 @@ class Mesh:
 
     Attributes:
         nodes: positions (n, 3) [m].
-        cells: numbers of the nodes of each cell (m, 4) in turn round a quadrilateral; (m, 8) of a hexahedron
-            four in turn round one face, then those above them.
+        cells: numbers of the nodes of each cell (m, 4) in turn round a quadrilateral, of a triangle the last
+            one twice; (m, 3) of triangles alone, kept in that form; (m, 8) of a hexahedron four in turn round
+            one face, then those above them.
         sets: numbers of nodes by name, as of edges and faces.
         faces: corners (f, 4) of the faces of hexahedra by name, in turn as seen from outside.
 
@@ -49,7 +50,10 @@ class Mesh:
     def __post_init__(self) -> None:
         nodes = np.asarray(self.nodes, float) if is_concrete(self.nodes) else self.nodes
         object.__setattr__(self, "nodes", nodes)
-        object.__setattr__(self, "cells", np.asarray(self.cells))
+        cells = np.asarray(self.cells)
+        if cells.ndim == 2 and cells.shape[1] == 3:
+            cells = cells[:, [0, 1, 2, 2]]
+        object.__setattr__(self, "cells", cells)
         if nodes.ndim != 2 or nodes.shape[1] != 3:
             raise ValueError(f"mesh: nodes [m] has shape {nodes.shape}; pass (n, 3)")
         if self.cells.ndim != 2 or self.cells.shape[1] not in KINDS or self.cells.dtype.kind not in "iu":

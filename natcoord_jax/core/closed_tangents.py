@@ -7,6 +7,8 @@ gradient that follows the invariants at the end with half the curvature H of the
 of the vectors along the step, which end where the derivatives of the invariants are G_1,
 
     d f = -1/2 (G_m^T H G_1 + sum_i S_i Q_i) d(D x).
+
+A viscosity C adds C D pi / h to S, and 2 C / h to H.
 """
 
 import math
@@ -54,6 +56,11 @@ def stiffness(
 
     steps = jax.jvp(potential.invariants, (middle,), (moved,))[1]
     stress = potential.averaged(potential.invariants(start), steps[None], now.tableau)[0]
+    viscosity = potential.viscosity
+    if viscosity is not None:
+        rate = 1.0 / jnp.where(now.h > 0, now.h, 1.0)
+        stress = stress + rate * jnp.sum(viscosity * steps[None], axis=1)
+        curvature = curvature + 2.0 * rate * jnp.moveaxis(viscosity, -1, 0)
     # Of each vector one component tells all.
     firsts = units[::3]
     pulled = jax.vmap(lambda e: potential.pulled_back(jnp.broadcast_to(e, start.shape), stress))(firsts)

@@ -197,7 +197,10 @@ class Effect(Part):
         return self
 
     def lumped_mass(self) -> Float[Array, "k *m"] | None:
-        """Mass that it brings to its marker vectors, points [kg] and directions [kg m^2]; None: none."""
+        """Mass that it brings to its marker vectors, points [kg] and directions [kg m^2]; None: none.
+
+        Or, for each node, the matrix (k, m, m) of these and of what is between them [kg m].
+        """
         return None
 
     def flaws(self) -> dict[str, Array]:
