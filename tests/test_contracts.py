@@ -139,6 +139,19 @@ TABLE = {
     nc.ShellElement: Entry(
         lambda p: nc.ShellElement(p.four, thickness=0.1, material=nc.Elastic(E=300.0, nu=0.3))
     ),
+    nc.MembraneElement: Entry(
+        lambda p: nc.MembraneElement(
+            (*p.eight[:2], *p.eight[5:7]), thickness=0.1, material=nc.Elastic(E=300.0)
+        )
+    ),
+    nc.ShellTriangle: Entry(
+        lambda p: nc.ShellTriangle(
+            p.four[:3], thickness=0.1, material=nc.Elastic(E=300.0, nu=0.3), prestress=(9.0, 4.0, 1.0)
+        )
+    ),
+    nc.MembraneTriangle: Entry(
+        lambda p: nc.MembraneTriangle((*p.eight[:2], p.eight[5]), thickness=0.1, material=nc.Elastic(E=300.0))
+    ),
     nc.Brick: Entry(lambda p: nc.Brick(p.eight, material=nc.Elastic(E=50.0, nu=0.3))),
     nc.SphereOnPlane: Entry(
         lambda p: nc.SphereOnPlane((p.ends[0], p.triad[2], p.ends[1]), radius=2.0, stiffness=9.0)
