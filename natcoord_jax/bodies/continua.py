@@ -205,7 +205,7 @@ class Shell(_Continuum):
                 f"shell {name!r}: thickness [m] has shape {thick.shape}; pass one number, or "
                 f"{(len(self.mesh.cells),)} for the cells"
             )
-        own = {"each": {"thickness": thick}} if thick.ndim else {"thickness": thick}
+        own: dict[str, Any] = {"each": {"thickness": thick}} if thick.ndim else {"thickness": thick}
         if self.direction is not None:
             own["direction"] = _turned(as_array(self.direction, float)[None], turned)[0]
         own |= {key: getattr(self, key) for key in ("material", "offset", "prestress", "damping", "membrane")}

@@ -144,8 +144,9 @@ class Laminate(Part):
         turned = [_turned(plane, shear, angles[k]) for k in range(count)]
         planes, shears = (jnp.stack(x) for x in zip(*turned))
         moments = [(ends[1:] ** k - ends[:-1] ** k) / k for k in (1, 2, 3)]
-        sums = [jnp.einsum("k,kij->ij", m, planes) for m in moments]
-        return Sheet(*sums, jnp.einsum("k,kij->ij", moments[0], shears), planes[jnp.array([0, -1])])
+        stretch, couple, bend = (jnp.einsum("k,kij->ij", m, planes) for m in moments)
+        slide = jnp.einsum("k,kij->ij", moments[0], shears)
+        return Sheet(stretch, couple, bend, slide, planes[jnp.array([0, -1])])
 
 
 def _turned(
