@@ -30,6 +30,8 @@ from natcoord_jax.bodies import (
     Cylinder,
     DirectorInterpolation,
     Ellipsoid,
+    Fold,
+    Gas,
     LineLoad,
     MeshHandle,
     Nodes,
@@ -127,9 +129,17 @@ from natcoord_jax.effects.joints import (
     Spherical,
     Universal,
 )
-from natcoord_jax.effects.loads import BodyTorque, FacePressure, Gravity, PairTorque, PointForce
+from natcoord_jax.effects.laminates import Laminate, Orthotropic
+from natcoord_jax.effects.loads import (
+    BodyTorque,
+    EnclosedGas,
+    FacePressure,
+    Gravity,
+    PairTorque,
+    PointForce,
+)
 from natcoord_jax.effects.materials import Elastic
-from natcoord_jax.effects.shells import ShellElement
+from natcoord_jax.effects.shells import MembraneElement, MembraneTriangle, ShellElement, ShellTriangle
 from natcoord_jax.effects.solids import Brick
 from natcoord_jax.effects.springs import (
     Armature,
@@ -200,17 +210,20 @@ __all__ = [
     "Elastic",
     "Ellipsoid",
     "EllipsoidOnPlane",
+    "EnclosedGas",
     "EnergyMomentum",
     "Equilibrium",
     "FacePressure",
     "Feedback",
     "Field",
     "Fixed",
+    "Fold",
     "Force",
     "Frame",
     "Gap",
     "GapConstraint",
     "GapPotential",
+    "Gas",
     "Gravity",
     "Growth",
     "Guess",
@@ -222,8 +235,11 @@ __all__ = [
     "JointSpring",
     "JointStops",
     "JointTorque",
+    "Laminate",
     "LineLoad",
     "Load",
+    "MembraneElement",
+    "MembraneTriangle",
     "MeshHandle",
     "Modes",
     "Nodes",
@@ -232,6 +248,7 @@ __all__ = [
     "NonlinearSpring",
     "Optima",
     "OptimalControl",
+    "Orthotropic",
     "Outcome",
     "PairTorque",
     "Parameter",
@@ -262,6 +279,7 @@ __all__ = [
     "Shell",
     "SimulationError",
     "ShellElement",
+    "ShellTriangle",
     "Solid",
     "Solution",
     "Sphere",

@@ -72,7 +72,13 @@ GAP = lambda markers: {  # noqa: E731
     **MARKED(markers), "stiffness": NUMBER, "law": ["linear", "hertz"], "restitution": NUMBER,
     "speed": NUMBER,
 }  # fmt: skip
+GAS = dict.fromkeys(("gauge_pressure", "ambient", "exponent", "volume"), [1.0])
 METAL, SQUARE = [nc.Elastic(E=1.0)], np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0.0)])
+LAYER = {
+    "thickness": [1.0], "material": METAL, "direction": [np.array((1.0, 0, 0))], "offset": [1.0],
+    "prestress": [np.ones(3)], "damping": [1.0],
+}  # fmt: skip
+MEMBRANE = ["hybrid", "hybrid mitc4+"]
 PLACED = {
     "material": METAL, "position": V, "orientation": [np.eye(3)], "velocity": V, "angular_velocity": V,
     "name": NAME,
@@ -153,12 +159,27 @@ CALLS = {
     "BodyTorque": lambda w: {**MARKED((w.direction,)), "torque": [np.ones(3), f], "following": [False]},
     "PairTorque": lambda w: {**MARKED(w.triad[:2]), "torque": [1.0, f]},
     "ShellElement": lambda w: {
-        **MARKED(w.attached * 2), "thickness": NUMBER, "material": METAL, "reference": [np.ones((4, 2, 3))]
+        **MARKED(w.attached * 2), **LAYER, "reference": [np.ones((4, 2, 3))], "membrane": MEMBRANE
+    },
+    "MembraneElement": lambda w: {
+        **MARKED(w.ends * 2), **LAYER, "reference": [np.ones((4, 3))], "membrane": MEMBRANE
+    },
+    "ShellTriangle": lambda w: {
+        **MARKED((w.attached * 2)[:3]), **LAYER, "reference": [np.ones((3, 2, 3))]
+    },
+    "MembraneTriangle": lambda w: {**MARKED((w.ends * 2)[:3]), **LAYER, "reference": [np.ones((3, 3))]},
+    "Orthotropic": lambda w: {
+        **dict.fromkeys(("E1", "E2", "G12", "G13", "G23", "density"), [1.0]), "nu12": [0.3]
+    },
+    "Laminate": lambda w: {"material": METAL, "angles": [(0.0, 1.0)], "fractions": [(0.4, 0.6)]},
+    "Fold": lambda w: {
+        "one": [w.nodes], "other": [w.nodes], "velocity": V, "angular_velocity": V, "name": NAME
     },
     "Brick": lambda w: {**MARKED(w.ends * 4), "material": METAL, "reference": [np.ones((8, 3))]},
     "Elastic": lambda w: {"E": NUMBER, "nu": [0.3], "density": NUMBER},
     "Shell": lambda w: {
-        "mesh": [nc.mesh.rectangle((1.0, 1.0), (1, 1))], "thickness": NUMBER, "directors": PLACES, **PLACED
+        "mesh": [nc.mesh.rectangle((1.0, 1.0), (1, 1))], "directors": PLACES, **PLACED, **LAYER,
+        "bending": FLAG, "membrane": MEMBRANE,
     },
     "Capsule": lambda w: {"radius": NUMBER, "length": NUMBER},
     "Plane": lambda w: {"normal": V, "point": V, "body": [w.body]},
@@ -181,6 +202,8 @@ CALLS = {
     "SphereOnBox": lambda w: {"size": V, "radius": NUMBER},
     "FacePressure": lambda w: {**MARKED(w.ends * 2), "pressure": [1.0, f]},
     "Pressure": lambda w: {"surface": [w.shell], "pressure": [1.0, f], "name": NAME},
+    "EnclosedGas": lambda w: {**MARKED(w.ends * 2), "faces": [np.array([[0, 1, 2, 3]])], **GAS},
+    "Gas": lambda w: {"surface": [w.shell, (w.shell,)], "name": NAME, **GAS},
     "PointSum": lambda w: {**MARKED(w.ends), "weights": [(1.0, -1.0)]},
     "Tie": lambda w: {"one": [w.shell.face()], "other": [w.shell.face()], "name": NAME},
     "Scene.move_nodes": lambda w: {"nodes": [w.nodes], "positions": PLACES},

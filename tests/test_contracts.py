@@ -139,6 +139,19 @@ TABLE = {
     nc.ShellElement: Entry(
         lambda p: nc.ShellElement(p.four, thickness=0.1, material=nc.Elastic(E=300.0, nu=0.3))
     ),
+    nc.MembraneElement: Entry(
+        lambda p: nc.MembraneElement(
+            (*p.eight[:2], *p.eight[5:7]), thickness=0.1, material=nc.Elastic(E=300.0)
+        )
+    ),
+    nc.ShellTriangle: Entry(
+        lambda p: nc.ShellTriangle(
+            p.four[:3], thickness=0.1, material=nc.Elastic(E=300.0, nu=0.3), prestress=(9.0, 4.0, 1.0)
+        )
+    ),
+    nc.MembraneTriangle: Entry(
+        lambda p: nc.MembraneTriangle((*p.eight[:2], p.eight[5]), thickness=0.1, material=nc.Elastic(E=300.0))
+    ),
     nc.Brick: Entry(lambda p: nc.Brick(p.eight, material=nc.Elastic(E=50.0, nu=0.3))),
     nc.GapPotential: Entry(
         lambda p: nc.GapPotential(
@@ -150,6 +163,11 @@ TABLE = {
     ),
     nc.FacePressure: Entry(
         lambda p: nc.FacePressure((*p.eight[:2], *p.eight[5:7]), pressure=jnp.sin), inside=False
+    ),
+    nc.EnclosedGas: Entry(
+        lambda p: nc.EnclosedGas(
+            p.eight, faces=np.array(nc.mesh.HEXAHEDRON), gauge_pressure=0.0, ambient=30.0
+        )
     ),
     nc.PointOnPlane: Entry(lambda p: nc.PointOnPlane((p.ends[0], p.triad[2], p.ends[1]), distance=0.2)),
     nc.PointOnLine: Entry(lambda p: nc.PointOnLine((p.ends[0], p.triad[2], p.ends[1]))),

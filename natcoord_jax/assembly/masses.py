@@ -1,5 +1,7 @@
 """Mass that effects bring to the bodies that they are on, as elements of shells and solids do."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -34,11 +36,14 @@ def _with_masses(
     weights: Float[Array, "n k *m 4"],
 ) -> Float[Array, "bodies 4 4"]:
     def brought(effect: Effect) -> Array:
-        lumps = jax.vmap(lambda e: e.lumped_mass())(effect)
-        return lumps.reshape(*bodies.shape, -1)
+        lumps: Any = jax.vmap(lambda e: e.lumped_mass())(effect)
+        # Between vectors of a node there is mass where its point is not in the middle.
+        if lumps.ndim == 4:
+            return lumps
+        return lumps.reshape(*bodies.shape, -1, 1) * jnp.eye(max(1, lumps.size // bodies.size))
 
     lumps = brought(effect) if before is None else brought(effect) - brought(before)
     # What has mass comes first: of an attachment the point, or it and the first axis.
     rows = weights.reshape(*bodies.shape, -1, 4)[:, :, : lumps.shape[2]]
-    blocks = jnp.einsum("nkm,nkma,nkmb->nkab", lumps, rows, rows)
+    blocks = jnp.einsum("nkml,nkma,nklb->nkab", lumps, rows, rows)
     return masses.at[bodies].add(blocks, mode="drop")

@@ -4,22 +4,24 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 from natcoord_jax.bodies.nodes import Nodes
+from natcoord_jax.bodies.normals import check_folds, normals_at
 from natcoord_jax.bodies.rigid import Orientation, orientation
 from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.checks import as_array, is_concrete, require_double
 from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.handles import Handle
-from natcoord_jax.core.kinds import NAME, of
+from natcoord_jax.core.kinds import FLAG, NAME, Choice, of
 from natcoord_jax.core.nodes import NodeSet
-from natcoord_jax.core.numeric import COMPONENTS, Number, Numbers
+from natcoord_jax.core.numeric import COMPONENTS, Directions, Number, Numbers
 from natcoord_jax.core.recipe import Builder, Recipe
 from natcoord_jax.effects.materials import Elastic
-from natcoord_jax.effects.shells import ShellElement
+from natcoord_jax.effects.shells import MembraneElement, MembraneTriangle, ShellElement, ShellTriangle
+from natcoord_jax.effects.shells.layer import MATERIAL as LAYER
+from natcoord_jax.effects.shells.quadrilateral import MEMBRANES
 from natcoord_jax.effects.solids import Brick
 from natcoord_jax.maths.vectors import cross
 from natcoord_jax.mesh import Mesh
@@ -27,9 +29,6 @@ from natcoord_jax.mesh import Mesh
 MESH = of("a mesh, as nc.mesh.box(...)", Mesh)
 MATERIAL = of("a material, as nc.Elastic(...)", Elastic)
 MOVING = COMPONENTS | Numbers((None, 3))
-
-FOLD = 45.0
-"""Angle [degrees] between cells and their mean normal at a node beyond which a surface is folded there."""
 
 
 @dataclass(frozen=True)
@@ -100,16 +99,6 @@ def _placed(
     return position + arms, velocity + cross(spin, arms)
 
 
-@eager_numpy
-def _normals(nodes: Float[Array, "n 3"], cells: Int[np.ndarray, "m 4"]) -> Float[Array, "n 3"]:
-    """Mean normals of the cells at the nodes, by their areas."""
-    corners = nodes[cells]
-    areas = cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
-    total = jnp.zeros_like(nodes).at[cells].add(areas[:, None])
-    size = jnp.sqrt(jnp.sum(total**2, axis=1, keepdims=True))
-    return total / jnp.where(size > 0, size, 1.0)
-
-
 class _Continuum(Recipe):
     """What shells and solids have in common."""
 
@@ -147,7 +136,7 @@ class _Continuum(Recipe):
 
 
 class Shell(_Continuum):
-    """A shell on a mesh of quadrilaterals: nodes with a director through the thickness, and their elements.
+    """A shell on a mesh of quadrilaterals and triangles: nodes with a director, and their elements.
 
     Attributes:
         mesh: of its mid-surface.
@@ -158,7 +147,16 @@ class Shell(_Continuum):
         velocity: of the origin of the mesh (3,), or of every node besides its rotation (n, 3) [m/s].
         angular_velocity: as of a rigid body [rad/s].
         directors: at the nodes (n, 3), in the axes of the mesh [-]; default: mean normals of the cells.
-        name: of the elements; the nodes are called "name nodes".
+        direction: in the axes of the mesh, that, projected on the surface, is the first axis of the material
+            and of what is read [-]; default: in every element half way between its sides.
+        offset: of the middle of the thickness from the mesh, along the directors [m]; default: none.
+        prestress: resultants per length 11, 22, 12 that are there without strain [N/m]; default: none.
+        damping: time by which viscous stresses are their stiffness times the rates of strain [s]; default:
+            none. What is lost is in the work account of the shell.
+        bending: whether it resists bending; if not, its nodes are points without directors.
+        membrane: "hybrid", or "hybrid mitc4+", softer on coarse curved meshes; see `nc.ShellElement`.
+        name: of the elements; the nodes are called "name nodes". Triangles beside quadrilaterals are a set
+            of their own, "name triangles".
 
     Raises:
         ValueError: when it is added: for a surface that is folded, with the node.
@@ -180,6 +178,13 @@ class Shell(_Continuum):
     """
 
     thickness: Any = eqx.field(kw_only=True, metadata=is_a(Number("positive") | Numbers((None,), "positive")))
+    material: Any = eqx.field(kw_only=True, metadata=is_a(LAYER))
+    direction: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Directions()))
+    offset: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Number()))
+    prestress: Any = eqx.field(default=None, kw_only=True, metadata=is_a(COMPONENTS))
+    damping: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Number("not negative")))
+    bending: bool = eqx.field(default=True, kw_only=True, static=True, metadata=is_a(FLAG))
+    membrane: str = eqx.field(default="hybrid", kw_only=True, static=True, metadata=is_a(Choice(MEMBRANES)))
     directors: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Numbers((None, 3))))
 
     kind = "shell"
@@ -188,39 +193,48 @@ class Shell(_Continuum):
     def add_to(self, scene: Builder, name: str) -> MeshHandle:
         """Add nodes and elements."""
         places, velocities, turned, spin = self._pose(name)
-        along = self.directors
-        if along is None:
-            along = _normals(as_array(self.mesh.nodes, float), self.mesh.cells)
-            self._check_folds(along, name)
-        directors = _turned(as_array(along, float), turned)
-        moving = {"velocity": velocities, "angular_velocity": spin, "name": f"{name} nodes"}
-        nodes = scene.add(Nodes.directors(places, directors, **moving))
+        moving = {"velocity": velocities, "name": f"{name} nodes"}
+        if self.bending:
+            directors = _turned(as_array(self._directors(name), float), turned)
+            nodes = scene.add(Nodes.directors(places, directors, angular_velocity=spin, **moving))
+        else:
+            nodes = scene.add(Nodes.points(places, **moving))
         thick = as_array(self.thickness, float)
         if thick.ndim and thick.shape != (len(self.mesh.cells),):
             raise ValueError(
                 f"shell {name!r}: thickness [m] has shape {thick.shape}; pass one number, or "
                 f"{(len(self.mesh.cells),)} for the cells"
             )
-        own = {"each": {"thickness": thick}} if thick.ndim else {"thickness": thick}
-        elements = ShellElement.on(nodes, self.mesh.cells, material=self.material, name=name, **own)
-        return self._handle(scene, nodes, elements)
+        own: dict[str, Any] = {"each": {"thickness": thick}} if thick.ndim else {"thickness": thick}
+        if self.direction is not None:
+            own["direction"] = _turned(as_array(self.direction, float)[None], turned)[0]
+        own |= {key: getattr(self, key) for key in ("material", "offset", "prestress", "damping", "membrane")}
+        cells = self.mesh.cells
+        three = cells[:, 2] == cells[:, 3]
+        if three.all():
+            return self._handle(scene, nodes, self._elements(nodes, three, name, own))
+        if three.any():
+            scene.add(self._elements(nodes, three, f"{name} triangles", own))
+        return self._handle(scene, nodes, self._elements(nodes, ~three, name, own))
 
-    def _check_folds(self, normals: Array, name: str) -> None:
-        if not is_concrete(normals, self.mesh.nodes):
-            return
-        corners = np.asarray(self.mesh.nodes)[self.mesh.cells]
-        own = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
-        size = np.linalg.norm(own, axis=1)
-        if np.any(size == 0):
-            raise ValueError(f"shell {name!r}: cell {int(np.argmin(size))} of the mesh has no area")
-        cosines = np.sum((own / size[:, None])[:, None] * np.asarray(normals)[self.mesh.cells], axis=2)
-        if cosines.min() < np.cos(np.radians(FOLD)):
-            node = int(self.mesh.cells.flat[np.argmin(cosines)])
-            raise ValueError(
-                f"shell {name!r}: at node {node} the surface is folded, or its cells are listed in turn one "
-                "way and the other; list all of them the same way, pass `directors` (n, 3), or make one "
-                "shell of each side of the fold and join them"
-            )
+    def _elements(self, nodes: NodeSet, some: np.ndarray, name: str, own: dict[str, Any]) -> Any:
+        """On some of the cells, which are all triangles or all quadrilaterals."""
+        cells = self.mesh.cells[some]
+        if "each" in own:
+            own = own | {"each": {key: value[some] for key, value in own["each"].items()}}
+        if cells[0, 2] == cells[0, 3]:
+            cells, own = cells[:, :3], {key: value for key, value in own.items() if key != "membrane"}
+            kind: Any = ShellTriangle if self.bending else MembraneTriangle
+        else:
+            kind = ShellElement if self.bending else MembraneElement
+        return kind.on(nodes, cells, name=name, **own)
+
+    def _directors(self, name: str) -> Any:
+        if self.directors is not None:
+            return self.directors
+        found = normals_at(as_array(self.mesh.nodes, float), self.mesh.cells)
+        check_folds(self.mesh, found, name)
+        return found
 
 
 @eager_numpy

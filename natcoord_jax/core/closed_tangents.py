@@ -7,6 +7,8 @@ gradient that follows the invariants at the end with half the curvature H of the
 of the vectors along the step, which end where the derivatives of the invariants are G_1,
 
     d f = -1/2 (G_m^T H G_1 + sum_i S_i Q_i) d(D x).
+
+A viscosity C adds C D pi / h to S, and 2 C / h to H.
 """
 
 import math
@@ -54,6 +56,11 @@ def stiffness(
 
     steps = jax.jvp(potential.invariants, (middle,), (moved,))[1]
     stress = potential.averaged(potential.invariants(start), steps[None], now.tableau)[0]
+    viscosity = potential.viscosity
+    if viscosity is not None:
+        rate = 1.0 / jnp.where(now.h > 0, now.h, 1.0)
+        stress = stress + rate * jnp.sum(viscosity * steps[None], axis=1)
+        curvature = curvature + 2.0 * rate * jnp.moveaxis(viscosity, -1, 0)
     # Of each vector one component tells all.
     firsts = units[::3]
     pulled = jax.vmap(lambda e: potential.pulled_back(jnp.broadcast_to(e, start.shape), stress))(firsts)
@@ -112,6 +119,24 @@ def by_twists(
         weights = place[..., 0]
         found = jnp.einsum("nam,namxbly,nbl->naxby", weights, blocks, weights)
         return -h * found[:, :, None, :, :, None]
+    across, along, middle = twist_maps(place, motion, h)
+    found = -h * jnp.einsum("namux,namxbly,nblvy->naubv", across, blocks, along)
+    # What turns the directors also turns the arms of the forces on them.
+    arms = jnp.einsum("nkmi,nkmx->nkix", place[..., 1:], forces)
+    turned = jnp.sum(cross(middle, arms[:, :, None]), axis=3)
+    own = jnp.zeros((n, k, 6, 6), place.dtype).at[:, :, 3:, 3:].set(jnp.swapaxes(turned, 2, 3))
+    found = found + own[:, :, :, None] * jnp.eye(k)[:, None, :, None]
+    return found[:, :, None, :, :, None]
+
+
+def twist_maps(
+    place: Float[Array, "n k m 4"], motion: Motion, h: Float[Array, ""]
+) -> tuple[Float[Array, "n k m 6 3"], Float[Array, "n k m 6 3"], Float[Array, "n k 3 3 3"]]:
+    """Velocities of marker vectors by the twists of their bodies, as they are and as increments follow them.
+
+    And derivatives of the directors in the middle of the step by the spin, see `_turned_by`.
+    """
+    n, k, m = place.shape[:3]
     unit = jnp.eye(3, dtype=place.dtype)
     spin, directors, start = motion.spin[0], motion.rows[0, :, :, 1:], motion.start[:, :, 1:]
     # Velocities of the rows for a unit angular velocity, as they are; and as increments follow the twist,
@@ -129,13 +154,7 @@ def by_twists(
         )
         for x in (pulls, moves)
     )
-    found = -h * jnp.einsum("namux,namxbly,nblvy->naubv", across, blocks, along)
-    # What turns the directors also turns the arms of the forces on them.
-    arms = jnp.einsum("nkmi,nkmx->nkix", place[..., 1:], forces)
-    turned = jnp.sum(cross(middle, arms[:, :, None]), axis=3)
-    own = jnp.zeros((n, k, 6, 6), place.dtype).at[:, :, 3:, 3:].set(jnp.swapaxes(turned, 2, 3))
-    found = found + own[:, :, :, None] * jnp.eye(k)[:, None, :, None]
-    return found[:, :, None, :, :, None]
+    return across, along, middle
 
 
 def _turned_by(

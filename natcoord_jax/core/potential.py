@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.chunks import chunked
 from natcoord_jax.core.closed_tangents import tangents_together
-from natcoord_jax.core.effect import Effect, Motion, Response, StepContext
+from natcoord_jax.core.effect import Effect, Motion, Response, StepContext, replace_fields
 from natcoord_jax.core.gradient import averaged_coupling, averaged_gradient, cancelling_energy, gradient_of
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.joint import Joint
@@ -96,6 +96,14 @@ class Potential(Effect):
     def energy_curvature(self, invariants: Float[Array, " p"]) -> Float[Array, "p p"]:
         """Second derivatives of the energy by the invariants; for Newton's Jacobian."""
         return jax.hessian(self.energy)(invariants)
+
+    @property
+    def viscosity(self) -> Float[Array, "p p *n"] | None:
+        """Stresses by rates of the invariants, symmetric and not negative; None: nothing is lost.
+
+        What is lost is the work in the account of the effect: `works` must then be true.
+        """
+        return None
 
     def pulled_back(self, x: Float[Array, "k *m 3"], gradient: Float[Array, " p"]) -> Float[Array, "k *m 3"]:
         """Gradient by the marker vectors from that by the invariants."""
@@ -206,7 +214,13 @@ def _response(
     given = gradient(_steps(potential, place, motion, now))
     held = x if motion.force_rows is None else place_markers(place, motion.force_rows)
     forces = -jax.vmap(potential.pulled_back)(held, given)
-    return marker_response(place, forces, None, rates, motion)
+    viscosity = potential.viscosity
+    if viscosity is None:
+        return marker_response(place, forces, None, rates, motion)
+    flow = jax.vmap(lambda xi, vi: jax.jvp(potential.invariants, (xi,), (vi,))[1])(x, rates)
+    stored = jnp.sum(forces * rates, axis=tuple(range(1, forces.ndim)))
+    forces = forces - jax.vmap(potential.pulled_back)(held, flow @ viscosity)
+    return replace_fields(marker_response(place, forces, None, rates, motion), released=stored)
 
 
 def marker_response(
@@ -250,9 +264,16 @@ def responses_together(potential: Potential, place: Array, motion: Motion, now: 
     given = materialised(potential.averaged(begun, steps, now.tableau))
     forces = -jax.vmap(potential.pulled_back)(x, given)
     power = jnp.sum(forces * rates, axis=tuple(range(1, forces.ndim - 1)))
+    viscosity, released = potential.viscosity, None
+    if viscosity is not None:
+        released = power.T
+        flow = steps_together(potential, x, rates)
+        viscous = -jax.vmap(potential.pulled_back)(x, jnp.sum(viscosity * flow[:, None], axis=2))
+        power = power + jnp.sum(viscous * rates, axis=tuple(range(1, forces.ndim - 1)))
+        forces = forces + viscous
     on_rows = place[..., None, :] * forces[..., None, :, :]
     if place.ndim == 4:
         on_rows = jnp.sum(on_rows, axis=-4)
     on_rows = on_rows.reshape(on_rows.shape[0], -1, 4, *on_rows.shape[-2:])
     nothing = jnp.zeros((power.shape[1], now.tableau.stages, 0), power.dtype)
-    return Response(jnp.moveaxis(on_rows, -1, 0), None, nothing, power.T)
+    return Response(jnp.moveaxis(on_rows, -1, 0), None, nothing, power.T, released)

@@ -15,6 +15,30 @@ SHEAR = 5.0 / 6.0
 """Shear coefficient of a homogeneous plate."""
 
 
+class Sheet(eqx.Module):
+    """What a layer of a material resists with, per area of its surface.
+
+    Attributes:
+        membrane: resultants by strains 11, 22, 12 [N/m].
+        coupling: resultants by curvatures, and moments by strains [N].
+        bending: moments by curvatures [N m].
+        shear: by shears 13 and 23 [N/m].
+        faces: stresses by strains at the sides against and along the director [N/m^2].
+    """
+
+    membrane: Float[Array, "3 3"]
+    coupling: Float[Array, "3 3"]
+    bending: Float[Array, "3 3"]
+    shear: Float[Array, "2 2"]
+    faces: Float[Array, "2 3 3"]
+
+    def shifted(self, offset: Any) -> "Sheet":
+        """The same about a surface from which the middle of the layer is at a distance along the director."""
+        coupling = self.coupling + offset * self.membrane
+        bending = self.bending + 2 * offset * self.coupling + offset**2 * self.membrane
+        return Sheet(self.membrane, coupling, bending, self.shear, self.faces)
+
+
 class Elastic(Part):
     """An isotropic material whose stresses are linear in the strains of Green and Lagrange.
 
@@ -68,6 +92,12 @@ class Elastic(Part):
         plane = jnp.array([[1.0, 0, 0], [0, 1.0, 0], [0, 0, 0.5]])
         plane = plane + nu * jnp.array([[0, 1.0, 0], [1.0, 0, 0], [0, 0, -0.5]])
         return self.E / (1 - nu**2) * plane
+
+    def sheet(self, thickness: Any) -> Sheet:
+        """A layer of it."""
+        h, plane = thickness, self.plane_stress()
+        shear = h * self.transverse_shear()
+        return Sheet(h * plane, jnp.zeros((3, 3)), h**3 / 12 * plane, shear, jnp.stack([plane, plane]))
 
     def transverse_shear(self) -> Float[Array, "2 2"]:
         """Mean shear stresses across a layer by shears 13 and 23, with the shear coefficient [N/m^2]."""

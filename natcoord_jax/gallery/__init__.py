@@ -49,6 +49,7 @@ SCENES: Mapping[str, Callable[..., Example]] = {
     "plate": plate,
     "block": block,
     "solar_panels": solar_panels,
+    "inflated_ball": inflated_ball,
     "bouncing_balls": bouncing_balls,
     "newton_cradle": newton_cradle,
     "tumbling_capsules": tumbling_capsules,

@@ -1,0 +1,121 @@
+"""What elements of shells and membranes have in common: an energy that is quadratic in their invariants."""
+
+import abc
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from natcoord_jax.core.arguments import is_a
+from natcoord_jax.core.effect import replace_fields
+from natcoord_jax.core.kinds import of
+from natcoord_jax.core.numeric import COMPONENTS, Directions, Number
+from natcoord_jax.core.potential import Potential
+from natcoord_jax.effects.laminates import Laminate, Orthotropic
+from natcoord_jax.effects.materials import Elastic, Sheet
+from natcoord_jax.effects.shells.readings import ShellReadings, readings_of
+
+MATERIAL = of("a material, as nc.Elastic(...)", Elastic, Orthotropic, Laminate)
+
+
+class LayerElement(Potential):
+    """Base of elements of a layer: a subclass gives `invariants`, `matrices` and `areas_of`."""
+
+    thickness: Any = eqx.field(kw_only=True, metadata=is_a(Number("positive")))
+    material: Any = eqx.field(kw_only=True, metadata=is_a(MATERIAL))
+    direction: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Directions()))
+    offset: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Number()))
+    prestress: Any = eqx.field(default=None, kw_only=True, metadata=is_a(COMPONENTS))
+    damping: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Number("not negative")))
+    reference: Any = eqx.field(default=None, kw_only=True)
+    stiffness: Any = eqx.field(default=None, init=False)
+    rest: Any = eqx.field(default=None, init=False)
+    pull: Any = eqx.field(default=None, init=False)
+    areas: Any = eqx.field(default=None, init=False)
+
+    degree: ClassVar[int | None] = 2
+    together: ClassVar[bool] = True
+    derived: ClassVar[tuple[str, ...]] = ("stiffness", "rest", "pull", "areas")
+    silent: ClassVar[bool] = False
+    bends: ClassVar[bool] = True
+
+    @abc.abstractmethod
+    def matrices(self, x: Float[Array, "k 3"]) -> Any:
+        """Integrals over the element without stress: `stiffness`, `membrane`, `stretching`."""
+
+    @abc.abstractmethod
+    def areas_of(self, x: Float[Array, "k 3"]) -> Float[Array, " k"]:
+        """Areas that its nodes stand for [m^2]."""
+
+    @property
+    def works(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Whether anything is lost, which its account then has."""
+        return self.damping is not None
+
+    @property
+    def viscosity(self) -> Float[Array, "p p *n"] | None:
+        """Stiffness times the time of the damping."""
+        return None if self.damping is None else self.damping * self.stiffness
+
+    def assembled_at(self, x: Float[Array, "k *m 3"]) -> "LayerElement":
+        """With the assembled pose as the one without stress, unless another is given."""
+        given = (x[:, :2] if self.bends else x) if self.reference is None else self.reference
+        return replace_fields(self, reference=given).renewed()
+
+    def renewed(self) -> "LayerElement":
+        """With the stiffness and the invariants of the pose without stress."""
+        points = self.reference[:, 0] if self.bends else self.reference
+        found, pull = self.matrices(points), None
+        stiffness, rest = found.stiffness if self.bends else found.membrane, self.invariants(self.reference)
+        if self.prestress is not None:
+            pull = jnp.zeros_like(rest)
+            pull = pull.at[: found.stretching.shape[1]].set(jnp.asarray(self.prestress) @ found.stretching)
+        areas = self.areas_of(points)
+        return replace_fields(self, stiffness=stiffness, rest=rest, pull=pull, areas=areas)
+
+    def sheet(self) -> Sheet:
+        """What it resists with, about its nodes."""
+        found = self.material.sheet(self.thickness)
+        return found if self.offset is None else found.shifted(self.offset)
+
+    def lumped_mass(self) -> Float[Array, "k *m"]:
+        """Of the points [kg] and of the directors [kg m^2], and between them [kg m] if there is an offset."""
+        h = self.thickness
+        each = self.material.density * h * self.areas
+        if not self.bends:
+            return each
+        if self.offset is None:
+            return jnp.stack([each, h**2 / 12 * each], axis=1)
+        z = self.offset
+        rows = (each, z * each), (z * each, (h**2 / 12 + z**2) * each)
+        return jnp.stack([jnp.stack(row, axis=1) for row in rows], axis=1)
+
+    def flaws(self) -> dict[str, Array]:
+        """Corners that are no corners."""
+        return {
+            "is degenerate or turned over: list its nodes in turn round it": jnp.min(self.areas) <= 0.0,
+            "has no first axis: direction [-] is normal to it": ~jnp.all(jnp.isfinite(self.stiffness)),
+            **self.material.flaws(),
+        }
+
+    def energy(self, invariants: Float[Array, "p *n"]) -> Float[Array, "*n"]:
+        """Energy [J]."""
+        strain = invariants - self.rest
+        found = 0.5 * jnp.sum(self.stiffness * strain[:, None] * strain[None], axis=(0, 1))
+        return found if self.pull is None else found + jnp.sum(self.pull * strain, axis=0)
+
+    def slope(self, invariants: Float[Array, "p *n"]) -> Float[Array, "p *n"]:
+        """Stresses conjugate to the invariants."""
+        found = jnp.sum(self.stiffness * (invariants - self.rest)[None], axis=1)
+        return found if self.pull is None else found + self.pull
+
+    def energy_curvature(self, invariants: Float[Array, " p"]) -> Float[Array, "p p"]:
+        """The constant stiffness."""
+        return self.stiffness
+
+    def read(self, strain: Array, curvature: Array, shear: Array, energy: Array) -> ShellReadings:
+        """What its sensor shows."""
+        offset = 0.0 if self.offset is None else self.offset
+        pull = jnp.zeros(3) if self.prestress is None else jnp.asarray(self.prestress)
+        return readings_of(self.sheet(), 0.5 * self.thickness, offset, strain, curvature, shear, energy, pull)
