@@ -112,6 +112,7 @@ from natcoord_jax.effects.contact import (
     SphereOnPlane,
     SphereOnSphere,
 )
+from natcoord_jax.effects.hyperelastic import Hyperelastic
 from natcoord_jax.effects.joints import (
     Coupling,
     Cylindrical,
@@ -127,8 +128,23 @@ from natcoord_jax.effects.joints import (
 )
 from natcoord_jax.effects.loads import BodyTorque, FacePressure, Gravity, PairTorque, PointForce
 from natcoord_jax.effects.materials import Elastic
+from natcoord_jax.effects.rubber import (
+    CompressibleMooneyRivlin,
+    MooneyRivlin,
+    NeoHooke,
+    Ogden,
+    TransverselyIsotropic,
+)
 from natcoord_jax.effects.shells import ShellElement
-from natcoord_jax.effects.solids import Brick
+from natcoord_jax.effects.solids import (
+    Brick,
+    Hexahedron8,
+    Hexahedron20,
+    Hexahedron27,
+    Hexahedron27P1,
+    Tetrahedron10,
+    Tetrahedron10P0,
+)
 from natcoord_jax.effects.springs import (
     Armature,
     Damper,
@@ -172,6 +188,18 @@ __all__ = [
     "Box",
     "Check",
     "Brick",
+    "Tetrahedron10P0",
+    "Tetrahedron10",
+    "Hexahedron27P1",
+    "Hexahedron27",
+    "Hexahedron20",
+    "Hexahedron8",
+    "Hyperelastic",
+    "TransverselyIsotropic",
+    "Ogden",
+    "NeoHooke",
+    "MooneyRivlin",
+    "CompressibleMooneyRivlin",
     "Capsule",
     "CapsuleOnCapsule",
     "CircularSection",
