@@ -26,8 +26,8 @@ class Mesh:
     Attributes:
         nodes: positions (n, 3) [m].
         cells: numbers of the nodes of each cell (m, 4) in turn round a quadrilateral; (m, 8) of a hexahedron
-            four in turn round one face, then those above them; (m, 20) or (m, 27) of a hexahedron and (m, 10) of
-            a tetrahedron with nodes in the middles of edges, or of faces and the cell, too, in VTK's order.
+            four in turn round one face, then those above them; (m, 20) or (m, 27) of a hexahedron and (m,
+            10) of a tetrahedron with nodes in the middles of edges, or of faces and the cell, too, as in VTK.
         sets: numbers of nodes by name, as of edges and faces.
         faces: nodes (f, 4), or (f, 8), (f, 9), (f, 6), of the faces of such cells by name: corners in turn as
             seen from outside, middles of edges, the middle of the face.

@@ -6,8 +6,8 @@ means C_m and G_m, so that an energy changes by
 
     Delta w = S : Delta C / 2,  S = 2 [D_C w + D_G w x C_m + (D_c w + p / (J_0 + J_1)) (C_m x C_m + G_m) / 3],
 
-p = Delta U / Delta J, wherever D_C w : Delta C + D_G w : Delta G + D_c w Delta c = Delta w, which products and
-scalar quotients give (P. Betsch, A. Janz, C. Hesch, Comput. Methods Appl. Mech. Eng. 335 (2018) 660-696).
+p = Delta U / Delta J, wherever D_C w : Delta C + D_G w : Delta G + D_c w Delta c = Delta w, which products
+and scalar quotients give (P. Betsch, A. Janz, C. Hesch, Comput. Methods Appl. Mech. Eng. 335 (2018) 660-696).
 """
 
 import abc
@@ -71,8 +71,8 @@ class Hyperelastic(Part):
         density: [kg/m^3].
 
     Class attributes:
-        split: whether `energy` does not change when all lengths are stretched alike, so that all that a change
-            of volume costs is in `volumetric`: elements for nearly incompressible materials ask for it.
+        split: whether `energy` does not change when all lengths are stretched alike, so that all that a
+            change of volume costs is in `volumetric`: elements for nearly incompressible materials ask for it.
 
     Example:
         >>> import jax; jax.config.update("jax_enable_x64", True)
@@ -126,9 +126,9 @@ class Hyperelastic(Part):
         def points(law: "Hyperelastic", *given: Array) -> Array:
             return jax.vmap(lambda *x: law.energy(*x), in_axes=-1)(*given)
 
-        return jax.vmap(points, in_axes=-1, out_axes=-1)(self, *given) if tensors.c.ndim > 1 else points(
-            self, *given
-        )  # fmt: skip
+        if tensors.c.ndim == 1:
+            return points(self, *given)
+        return jax.vmap(points, in_axes=-1, out_axes=-1)(self, *given)
 
     def distortion_stress(
         self, start: Float[Array, "6 *n"], step: Float[Array, "6 *n"]

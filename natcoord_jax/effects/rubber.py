@@ -199,7 +199,8 @@ class TransverselyIsotropic(ClosedHyperelastic):
 
     Example:
         >>> import natcoord_jax as nc
-        >>> tendon = nc.TransverselyIsotropic(E=1e6, nu=0.45, fibre_stiffness=2e7, direction=(1, 0, 0), density=1100)
+        >>> gel = dict(E=1e6, nu=0.45, density=1100.0)
+        >>> tendon = nc.TransverselyIsotropic(**gel, fibre_stiffness=2e7, direction=(1, 0, 0))
     """
 
     E: Any = eqx.field(kw_only=True, metadata=is_a(Number("positive")))
@@ -225,32 +226,27 @@ class TransverselyIsotropic(ClosedHyperelastic):
         """With fibres that are turned with the body."""
         return replace_fields(self, direction=rotation @ as_array(self.direction, float))
 
-    def _fibre(self) -> Float[Array, "6 *n"]:
-        """The dyad of the direction, by components."""
+    def _fibre(self, like: Float[Array, "6 *n"]) -> Float[Array, "6 *n"]:
+        """The dyad of the direction, by components, with as many axes as another tensor."""
         a = jnp.stack([jnp.asarray(self.direction[k]) for k in range(3)])
         a = a / jnp.sqrt(jnp.sum(a * a, axis=0))
-        return jnp.stack([a[i] * a[j] for i, j in PAIRS])
+        dyad = jnp.stack([a[i] * a[j] for i, j in PAIRS])
+        return dyad.reshape(6, *(1,) * (like.ndim - dyad.ndim), *dyad.shape[1:])
 
     def _stretch(self, tensors: Tensors) -> Float[Array, "*n"]:
         """Squared, of the fibres."""
-        fibre = self._fibre()
-        return contracted(
-            fibre.reshape(6, *(1,) * (tensors.C.ndim - fibre.ndim), *fibre.shape[1:]), tensors.C
-        )
+        return contracted(self._fibre(tensors.C), tensors.C)
 
     def distortion(self, tensors: Tensors) -> Float[Array, "*n"]:
         """Energy per volume but that of the volume [J/m^3]."""
-        return (
-            self.matrix.distortion(tensors) + self.fibre_stiffness / 8 * (self._stretch(tensors) - 1.0) ** 2
-        )
+        stretch = self._stretch(tensors) - 1.0
+        return self.matrix.distortion(tensors) + self.fibre_stiffness / 8 * stretch * stretch
 
     def quotients(self, begun: Tensors, ended: Tensors) -> tuple[Any, Any, Any]:
         """Of the matrix, and of the square of a . C a - 1."""
         by_C, by_G, by_c = self.matrix.quotients(begun, ended)
-        fibre = self._fibre()
-        fibre = fibre.reshape(6, *(1,) * (by_C.ndim - fibre.ndim), *fibre.shape[1:])
         pull = self.fibre_stiffness / 8 * (self._stretch(begun) + self._stretch(ended) - 2.0)
-        return by_C + pull * fibre, by_G, by_c
+        return by_C + pull * self._fibre(by_C), by_G, by_c
 
     def volumetric(self, J: Float[Array, "*n"]) -> Float[Array, "*n"]:
         """Energy per volume of a change of volume [J/m^3]."""

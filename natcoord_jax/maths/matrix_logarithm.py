@@ -15,7 +15,7 @@ from natcoord_jax.maths.symmetric import cofactor, contracted, unit_like
 ROOTS = 3
 """Square roots that are taken before the logarithm is a quadrature."""
 TURNS = 9
-"""Of the iteration for a square root, which converges quadratically: enough for eigenvalues of 1e-3 to 1e3."""
+"""Of the iteration for a square root; with it a logarithm is exact for eigenvalues from 1e-2 to 1e2."""
 POINTS, WEIGHTS = (0.5 * (x + shift) for x, shift in zip(np.polynomial.legendre.leggauss(10), (1.0, 0.0)))
 HALVINGS = 6
 """Of an exponent, before its exponential is a series."""
@@ -52,7 +52,7 @@ def _root(a: Float[Array, "6 *n"]) -> Float[Array, "6 *n"]:
 
 
 def logarithm(a: Float[Array, "6 *n"]) -> Float[Array, "6 *n"]:
-    """Of a positive definite matrix, ln a = 8 times the integral of (x - 1) / (1 + t (x - 1)), x = a^(1/8)."""
+    """Of a positive definite matrix: 8 times the integral of (x - 1) / (1 + t (x - 1)), x = a^(1/8)."""
     for _ in range(ROOTS):
         a = _root(a)
     away = a - unit_like(a)

@@ -79,10 +79,14 @@ class SolidElement(Potential):
     projected: ClassVar[int] = 0
 
     def __check_init__(self) -> None:
+        if len(self.markers) != self.count:
+            raise ValueError(
+                f"{type(self).__name__}: has {len(self.markers)} markers; pass {self.count} nc.Point"
+            )
         if self.projected and not self.material.split:
             raise ValueError(
-                f"{type(self).__name__}: the energy of {type(self.material).__name__} does not split off that of "
-                "a change of volume, which this element needs; pass one that does, as nc.NeoHooke or "
+                f"{type(self).__name__}: the energy of {type(self.material).__name__} does not split off that "
+                "of a change of volume, which this element needs; pass one that does, as nc.NeoHooke or "
                 "nc.MooneyRivlin, or take an element without projected volumes"
             )
 
@@ -119,8 +123,8 @@ class SolidElement(Potential):
     def flaws(self) -> dict[str, Array]:
         """Corners that are no corners."""
         said = (
-            "is degenerate or turned inside out: list its nodes in the order of nc.mesh.Mesh, middles of edges "
-            "near their middles"
+            "is degenerate or turned inside out: list its nodes in the order of nc.mesh.Mesh, middles of "
+            "edges near their middles"
         )
         return {said: jnp.min(self.volumes) <= 0.0, **self.material.flaws()}
 
@@ -163,7 +167,7 @@ class SolidElement(Potential):
     def averaged(
         self, start: Float[Array, "p *n"], steps: Float[Array, "s p *n"], tableau: Tableau
     ) -> Float[Array, "s p *n"]:
-        """Averaged gradients: of one stage by products and quotients, of more by quadrature along the step."""
+        """Averaged gradients: of one stage by products and quotients, of more by quadrature."""
         if tableau.stages > 1 or tableau.variational:
             degree = self.material.degree
             return averaged_gradient(self.energy, start, steps, tableau, degree, None, self.slope)
