@@ -100,11 +100,11 @@ class Surface:
 
     Attributes:
         handle: of the solid or the shell.
-        faces: numbers of the nodes round each of them (f, 4), in turn as seen from outside.
+        faces: numbers of the nodes of each of them (f, 4), (f, 6), (f, 8) or (f, 9), as of `nc.mesh.Mesh`.
     """
 
     handle: MeshHandle
-    faces: Int[np.ndarray, "f 4"]
+    faces: Int[np.ndarray, "f k"]
 
     def __repr__(self) -> str:
         return f"<{len(self.faces)} faces of {self.handle.name!r}>"
