@@ -126,7 +126,16 @@ from natcoord_jax.effects.joints import (
     Spherical,
     Universal,
 )
-from natcoord_jax.effects.loads import BodyTorque, FacePressure, Gravity, PairTorque, PointForce
+from natcoord_jax.effects.loads import (
+    BodyTorque,
+    FacePressure,
+    FacePressure6,
+    FacePressure8,
+    FacePressure9,
+    Gravity,
+    PairTorque,
+    PointForce,
+)
 from natcoord_jax.effects.materials import Elastic
 from natcoord_jax.effects.rubber import (
     CompressibleMooneyRivlin,

@@ -72,7 +72,7 @@ class Hyperelastic(Part):
 
     Class attributes:
         split: whether `energy` does not change when all lengths are stretched alike, so that all that a
-            change of volume costs is in `volumetric`: elements for nearly incompressible materials ask for it.
+            change of volume costs is in `volumetric`; elements for nearly incompressible materials need it.
 
     Example:
         >>> import jax; jax.config.update("jax_enable_x64", True)

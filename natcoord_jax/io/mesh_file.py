@@ -29,8 +29,8 @@ def read_mesh(file: str | Path) -> Mesh:
     """A mesh from a file of gmsh, or another that gmsh reads (.msh, .inp, .bdf, .unv, .vtk).
 
     The cells are those of the highest dimension that there are. Physical groups of volumes become parts, of
-    surfaces of a volume faces and sets of nodes, of curves and points sets of nodes, under their names; groups
-    without a name under their number. Nodes that no cell has, as the centres of arcs, are left out.
+    surfaces of a volume faces and sets of nodes, of curves and points sets of nodes, under their names;
+    groups without a name under their number. Nodes that no cell has, as the centres of arcs, are left out.
 
     Args:
         file: its path.
@@ -114,12 +114,14 @@ def _kind_of_cells(model: Any, file: str) -> tuple[int, int]:
         wrong = [cell for cell in found.values() if cell not in KNOWN]
         if wrong:
             said = REMEDIES.get(wrong[0], f"there are no elements for them; {HEXAHEDRA}")
-            raise ValueError(f"io.read_mesh: {file!r} has cells '{wrong[0][0]}' of {wrong[0][1]} nodes: {said}")
+            raise ValueError(
+                f"io.read_mesh: {file!r} has cells '{wrong[0][0]}' of {wrong[0][1]} nodes: {said}"
+            )
         if len(found) > 1:
             both = " and ".join(f"'{name}' of {count} nodes" for name, count in found.values())
             raise ValueError(
-                f"io.read_mesh: {file!r} has cells {both}; a mesh has cells of one kind: mesh it with one, or "
-                "save them to files of their own and join them by nc.Tie"
+                f"io.read_mesh: {file!r} has cells {both}; a mesh has cells of one kind: mesh it with one, "
+                "or save them to files of their own and join them by nc.Tie"
             )
         return dimension, kinds[0]
     raise ValueError(
@@ -135,5 +137,7 @@ def _faces(model: Any, group: int, number: np.ndarray, outside: Int[np.ndarray, 
         for kind, corners in zip(*model.mesh.getElements(2, entity)[::2]):
             if model.mesh.getElementProperties(kind)[3] == width:
                 own.append(number[np.asarray(corners, int)].reshape(-1, width))
-    known = {tuple(row) for row in np.sort(np.concatenate([np.zeros((0, width), int), *own]), axis=1).tolist()}
+    known = {
+        tuple(row) for row in np.sort(np.concatenate([np.zeros((0, width), int), *own]), axis=1).tolist()
+    }
     return outside[[tuple(row) in known for row in np.sort(outside, axis=1).tolist()]]

@@ -53,22 +53,26 @@ def _root(a: Float[Array, "6 *n"]) -> Float[Array, "6 *n"]:
 
 def logarithm(a: Float[Array, "6 *n"]) -> Float[Array, "6 *n"]:
     """Of a positive definite matrix: 8 times the integral of (x - 1) / (1 + t (x - 1)), x = a^(1/8)."""
-    for _ in range(ROOTS):
-        a = _root(a)
+    a = jax.lax.scan(lambda x, _: (_root(x), None), a, None, length=ROOTS)[0]
     away = a - unit_like(a)
-    total = jnp.zeros_like(a)
-    for point, weight in zip(POINTS, WEIGHTS):
-        total = total + weight * _inverse(unit_like(a) + point * away)
+
+    def point(total: Array, at: tuple[Array, Array]) -> tuple[Array, None]:
+        return total + at[1] * _inverse(unit_like(a) + at[0] * away), None
+
+    total = jax.lax.scan(point, jnp.zeros_like(a), (jnp.asarray(POINTS), jnp.asarray(WEIGHTS)))[0]
     return 2.0**ROOTS * _product(away, total)
 
 
 def exponential_less_one(a: Float[Array, "6 *n"]) -> Float[Array, "6 *n"]:
     """exp(a) - 1, to the digits of a small a."""
     small = a / 2.0**HALVINGS
-    total, power = small, small
-    for k in range(2, TERMS):
-        power = _product(power, small) / k
-        total = total + power
-    for _ in range(HALVINGS):
-        total = 2.0 * total + _product(total, total)
-    return total
+
+    # Loops, since compilers work out unrolled products anew for each component of the next.
+    def term(total: Array, k: Array) -> tuple[Array, None]:
+        return (small + _product(small, total)) / k, None
+
+    def squared(total: Array, _: None) -> tuple[Array, None]:
+        return 2.0 * total + _product(total, total), None
+
+    total = jax.lax.scan(term, jnp.zeros_like(a), jnp.arange(TERMS, 0, -1, dtype=a.dtype))[0]
+    return jax.lax.scan(squared, total, None, length=HALVINGS)[0]

@@ -22,7 +22,7 @@ CELL_OF_FACE = {6: 10, 8: 20, 9: 27}
 
 @lru_cache
 def face_table(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Shape functions (g, k) of a face of so many nodes, derivatives (g, k, 2), weights: exact for its normal."""
+    """Shape functions (g, k) of a face of so many nodes, derivatives (g, k, 2), and weights."""
     whole = CELLS[CELL_OF_FACE[count]]
     # The face z = 0 of a tetrahedron, or z = 1 of a hexahedron, and its polynomials.
     face = np.array(whole.faces[0 if count == 6 else 1])
@@ -77,21 +77,51 @@ class CurvedFacePressure(Force):
 
 
 class FacePressure6(CurvedFacePressure):
-    """A pressure on a triangle of six points, as a face of `nc.Tetrahedron10` is."""
+    """A pressure on a triangle of six points, as a face of `nc.Tetrahedron10` is.
+
+    Attributes:
+        markers: as of `nc.mesh.Mesh.faces`; the pressure pushes inwards.
+        pressure: [N/m^2], or a function of time [s] to it.
+
+    Example:
+        >>> import natcoord_jax as nc
+        >>> points = tuple(nc.Point(nc.ground, (x, 0.0, 0.0)) for x in range(6))
+        >>> wind = nc.FacePressure6(points, pressure=500.0)
+    """
 
     kind: ClassVar[str] = "pressure on six points"
     count: ClassVar[int] = 6
 
 
 class FacePressure8(CurvedFacePressure):
-    """A pressure on a quadrilateral of eight points, as a face of `nc.Hexahedron20` is."""
+    """A pressure on a quadrilateral of eight points, as a face of `nc.Hexahedron20` is.
+
+    Attributes:
+        markers: as of `nc.mesh.Mesh.faces`; the pressure pushes inwards.
+        pressure: [N/m^2], or a function of time [s] to it.
+
+    Example:
+        >>> import natcoord_jax as nc
+        >>> points = tuple(nc.Point(nc.ground, (x, 0.0, 0.0)) for x in range(8))
+        >>> wind = nc.FacePressure8(points, pressure=500.0)
+    """
 
     kind: ClassVar[str] = "pressure on eight points"
     count: ClassVar[int] = 8
 
 
 class FacePressure9(CurvedFacePressure):
-    """A pressure on a quadrilateral of nine points, as a face of `nc.Hexahedron27` is."""
+    """A pressure on a quadrilateral of nine points, as a face of `nc.Hexahedron27` is.
+
+    Attributes:
+        markers: as of `nc.mesh.Mesh.faces`; the pressure pushes inwards.
+        pressure: [N/m^2], or a function of time [s] to it.
+
+    Example:
+        >>> import natcoord_jax as nc
+        >>> points = tuple(nc.Point(nc.ground, (x, 0.0, 0.0)) for x in range(9))
+        >>> wind = nc.FacePressure9(points, pressure=500.0)
+    """
 
     kind: ClassVar[str] = "pressure on nine points"
     count: ClassVar[int] = 9

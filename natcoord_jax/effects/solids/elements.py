@@ -85,8 +85,8 @@ class SolidElement(Potential):
             )
         if self.projected and not self.material.split:
             raise ValueError(
-                f"{type(self).__name__}: the energy of {type(self.material).__name__} does not split off that "
-                "of a change of volume, which this element needs; pass one that does, as nc.NeoHooke or "
+                f"{type(self).__name__}: the energy of {type(self.material).__name__} does not split off "
+                "that of a change of volume, which this element needs; pass one that does, as nc.NeoHooke or "
                 "nc.MooneyRivlin, or take an element without projected volumes"
             )
 
@@ -174,6 +174,21 @@ class SolidElement(Potential):
         found = self.mean_stress(self.by_point(start), self.by_point(steps[0]))
         return (self.volumes * found).reshape(steps.shape)
 
+    def cancelling(self, place: Array, rows: Array, coordinates: Array) -> tuple[Array, Array]:
+        """Stiffness times strains, of which the stresses are differences; the distance of the nodes."""
+        x = place_markers(place, rows)
+        strain = self.by_point(self.invariants(x))
+
+        def stress(strain: Array) -> Array:
+            return jax.grad(lambda e: jnp.sum(self.material.energy_density(e)))(strain)
+
+        work = jnp.zeros_like(self.volumes)
+        for k in range(6):
+            along = jnp.zeros_like(strain).at[k].set(1.0)
+            work = work + jnp.abs(jax.jvp(stress, (strain,), (along,))[1][k]) * strain[k] ** 2
+        reach = jnp.sqrt(jnp.max(jnp.sum((x - x[0]) ** 2, axis=-1)))
+        return jnp.sum(self.volumes * work), reach
+
     def tangents(
         self, place: Array, motion: Motion, now: StepContext, lam: Array, *, turning: bool
     ) -> Array | None:
@@ -201,7 +216,20 @@ class SolidElement(Potential):
 
 
 class Hexahedron8(SolidElement):
-    """A brick of eight points, of any material; it locks in bending, unlike `nc.Brick`."""
+    """A brick of eight points, of any material; it locks in bending, unlike `nc.Brick`.
+
+    Attributes:
+        markers: its nodes, in the order of `nc.mesh.Mesh`.
+        material: as `nc.Elastic` or `nc.NeoHooke`.
+        reference: points without stress [m]; None: those of the assembled pose.
+
+    Example:
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import natcoord_jax as nc
+        >>> mesh = nc.mesh.box((1.0, 0.2, 0.2), (2, 1, 1), element="hexahedron8")
+        >>> rubber = nc.NeoHooke(E=1e6, nu=0.45, density=1100.0)
+        >>> block = nc.Solid(mesh, material=rubber, element="Hexahedron8")
+    """
 
     kind: ClassVar[str] = "hexahedron8"
     count: ClassVar[int] = 8
@@ -209,7 +237,20 @@ class Hexahedron8(SolidElement):
 
 
 class Hexahedron20(SolidElement):
-    """A brick of twenty points, with 27 points of quadrature."""
+    """A brick of twenty points, with 27 points of quadrature.
+
+    Attributes:
+        markers: its nodes, in the order of `nc.mesh.Mesh`.
+        material: as `nc.Elastic` or `nc.NeoHooke`.
+        reference: points without stress [m]; None: those of the assembled pose.
+
+    Example:
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import natcoord_jax as nc
+        >>> mesh = nc.mesh.box((1.0, 0.2, 0.2), (2, 1, 1), element="hexahedron20")
+        >>> rubber = nc.NeoHooke(E=1e6, nu=0.45, density=1100.0)
+        >>> block = nc.Solid(mesh, material=rubber, element="Hexahedron20")
+    """
 
     kind: ClassVar[str] = "hexahedron20"
     count: ClassVar[int] = 20
@@ -217,7 +258,20 @@ class Hexahedron20(SolidElement):
 
 
 class Hexahedron27(SolidElement):
-    """A brick of 27 points."""
+    """A brick of 27 points.
+
+    Attributes:
+        markers: its nodes, in the order of `nc.mesh.Mesh`.
+        material: as `nc.Elastic` or `nc.NeoHooke`.
+        reference: points without stress [m]; None: those of the assembled pose.
+
+    Example:
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import natcoord_jax as nc
+        >>> mesh = nc.mesh.box((1.0, 0.2, 0.2), (2, 1, 1), element="hexahedron27")
+        >>> rubber = nc.NeoHooke(E=1e6, nu=0.45, density=1100.0)
+        >>> block = nc.Solid(mesh, material=rubber, element="Hexahedron27")
+    """
 
     kind: ClassVar[str] = "hexahedron27"
     count: ClassVar[int] = 27
@@ -225,7 +279,20 @@ class Hexahedron27(SolidElement):
 
 
 class Hexahedron27P1(SolidElement):
-    """A brick of 27 points with linear volumes, for nearly incompressible materials."""
+    """A brick of 27 points with linear volumes, for nearly incompressible materials.
+
+    Attributes:
+        markers: its nodes, in the order of `nc.mesh.Mesh`.
+        material: one that splits off the energy of a change of volume, as `nc.NeoHooke`.
+        reference: points without stress [m]; None: those of the assembled pose.
+
+    Example:
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import natcoord_jax as nc
+        >>> mesh = nc.mesh.box((1.0, 0.2, 0.2), (2, 1, 1), element="hexahedron27")
+        >>> rubber = nc.NeoHooke(E=1e6, nu=0.45, density=1100.0)
+        >>> block = nc.Solid(mesh, material=rubber, element="Hexahedron27P1")
+    """
 
     kind: ClassVar[str] = "hexahedron27P1"
     count: ClassVar[int] = 27
@@ -234,7 +301,20 @@ class Hexahedron27P1(SolidElement):
 
 
 class Tetrahedron10(SolidElement):
-    """A tetrahedron of ten points, with four points of quadrature."""
+    """A tetrahedron of ten points, with four points of quadrature.
+
+    Attributes:
+        markers: its nodes, in the order of `nc.mesh.Mesh`.
+        material: as `nc.Elastic` or `nc.NeoHooke`.
+        reference: points without stress [m]; None: those of the assembled pose.
+
+    Example:
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import natcoord_jax as nc
+        >>> mesh = nc.mesh.box((1.0, 0.2, 0.2), (2, 1, 1), element="tetrahedron10")
+        >>> rubber = nc.NeoHooke(E=1e6, nu=0.45, density=1100.0)
+        >>> block = nc.Solid(mesh, material=rubber, element="Tetrahedron10")
+    """
 
     kind: ClassVar[str] = "tetrahedron10"
     count: ClassVar[int] = 10
@@ -242,7 +322,20 @@ class Tetrahedron10(SolidElement):
 
 
 class Tetrahedron10P0(SolidElement):
-    """A tetrahedron of ten points with one volume, for nearly incompressible materials."""
+    """A tetrahedron of ten points with one volume, for nearly incompressible materials.
+
+    Attributes:
+        markers: its nodes, in the order of `nc.mesh.Mesh`.
+        material: one that splits off the energy of a change of volume, as `nc.NeoHooke`.
+        reference: points without stress [m]; None: those of the assembled pose.
+
+    Example:
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import natcoord_jax as nc
+        >>> mesh = nc.mesh.box((1.0, 0.2, 0.2), (2, 1, 1), element="tetrahedron10")
+        >>> rubber = nc.NeoHooke(E=1e6, nu=0.45, density=1100.0)
+        >>> block = nc.Solid(mesh, material=rubber, element="Tetrahedron10P0")
+    """
 
     kind: ClassVar[str] = "tetrahedron10P0"
     count: ClassVar[int] = 10
