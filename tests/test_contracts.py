@@ -85,7 +85,11 @@ class Parts:
         """Points of a distorted cell of a solid, some on each body."""
         nodes = CELLS[count].nodes
         bend = 0.03 * np.sin(3.0 * np.roll(nodes, 1, axis=1))
-        places = nodes * np.array([1.0, 0.9, 1.1]) + bend + np.array([0.4, 0.0, -0.8])
+        places = (
+            (2.0 if count == 10 else 1.0) * nodes * np.array([1.0, 0.9, 1.1])
+            + bend
+            + np.array([0.4, 0.0, -0.8])
+        )
         return tuple(nc.Point(self.one if x[2] < 0 else self.two, x0) for x, x0 in zip(nodes - 0.1, places))
 
     @property

@@ -10,6 +10,8 @@ import tolerances as tol
 import natcoord_jax as nc
 import natcoord_jax.io
 from natcoord_jax.core.cells import TETRAHEDRON_EDGES
+from natcoord_jax.core.force import Load
+from natcoord_jax.effects.loads.curved_pressure import face_table
 from natcoord_jax.maths.symmetric import PAIRS
 
 FIRST, SECOND = np.array(PAIRS).T
@@ -183,3 +185,88 @@ def test_a_block_in_motion(element, law):
 def test_every_element_and_law_in_motion(element, law):
     system, state = tumbling(element, law)
     conserved(system, nc.simulate(system, state, dt=0.01, steps=1000))
+
+
+# --- statics ----------------------------------------------------------------------------------------------
+
+
+class NodeLoad(nc.Force):
+    """A dead force on a node that grows with the load parameter."""
+
+    force: jax.Array = eqx.field(kw_only=True)
+    kind = "node load"
+
+    def load(self, x, rate, inputs, t):
+        return Load(t * self.force[None], None)
+
+
+def held(scene, part, nodes, axis):
+    """Nodes that stay in their plane normal to an axis."""
+    table = nc.Point(nc.ground), nc.Direction(nc.ground, np.eye(3)[axis])
+    for node in nodes:
+        place = np.asarray(part.nodes.positions)[int(node)]
+        scene.add(nc.PointOnPlane((*table, nc.Point(part.nodes[int(node)])), distance=float(place[axis])))
+
+
+def consistent(nodes, faces, traction):
+    """Forces on nodes of a constant traction on faces of eight or nine nodes, or of four."""
+    forces = np.zeros_like(nodes)
+    for face in faces:
+        x = nodes[face]
+        if len(face) == 4:
+            area = 0.5 * np.linalg.norm(np.cross(x[2] - x[0], x[3] - x[1]))
+            forces[face] += 0.25 * area * traction
+        else:
+            values, slopes, weights = face_table(len(face))
+            one, other = (np.einsum("gk,kx->gx", slopes[:, :, k], x) for k in (0, 1))
+            areas = weights * np.linalg.norm(np.cross(one, other), axis=1)
+            forces[face] += np.outer(values.T @ areas, traction)
+    return forces
+
+
+def cook(element, count, nu):
+    """Cook's membrane in plane strain: how far the middle of the loaded edge moves up [mm]."""
+    box = nc.mesh.box((1.0, 1.0, 1.0), (count, count, 1), element=ELEMENTS[element])
+    u, v, w = box.nodes.T
+    nodes = np.stack([48 * u, 44 * u + v * (44 - 28 * u), w], axis=1)
+    mesh = nc.mesh.Mesh(nodes, box.cells, box.sets, box.faces)
+    scene = nc.Scene()
+    rubber = nc.NeoHooke(E=2 * 0.4225 * (1 + nu), nu=nu, density=1.0)
+    part = scene.add(nc.Solid(mesh, material=rubber, element=element))
+    scene.add(nc.Clamp(nc.ground, part.set("x0")))
+    layers = np.union1d(mesh.sets["z0"], mesh.sets["z1"])
+    held(scene, part, np.setdiff1d(layers, mesh.sets["x0"]), 2)
+    forces = consistent(nodes, mesh.faces["x1"], np.array([0.0, 1 / 16, 0.0]))
+    loaded = np.flatnonzero(forces[:, 1])
+    scene.add(NodeLoad.on(part.nodes, loaded[:, None], each={"force": forces[loaded]}))
+    system, state = scene.compile()
+    end = nc.equilibrium(system, state, steps=2 if nu < 0.4 else 8).state
+    middle = part.nearest((48.0, 52.0, 0.0))
+    return float(system.sense(end, middle).position[1]) - 52.0
+
+
+COOK = [
+    ("Hexahedron8", 2, 0.3, 8.638),
+    ("Hexahedron27P1", 2, 0.4999, 11.889),
+]
+COOK_SLOW = [
+    ("Hexahedron8", 4, 0.3, 12.071),
+    ("Hexahedron8", 8, 0.3, 13.863),
+    ("Hexahedron20", 2, 0.3, 13.913),
+    ("Hexahedron27", 2, 0.3, 14.302),
+    ("Hexahedron27", 4, 0.3, 14.649),
+    ("Hexahedron27P1", 2, 0.3, 14.663),
+    ("Hexahedron8", 4, 0.4999, 4.11),
+    ("Hexahedron27P1", 4, 0.4999, 11.954),
+]
+
+
+@pytest.mark.parametrize(("element", "count", "nu", "published"), COOK)
+def test_cooks_membrane(element, count, nu, published):
+    assert cook(element, count, nu) == pytest.approx(published, abs=tol.COOK)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("element", "count", "nu", "published"), COOK_SLOW)
+def test_cooks_membrane_on_finer_meshes(element, count, nu, published):
+    assert cook(element, count, nu) == pytest.approx(published, abs=tol.COOK)

@@ -152,3 +152,6 @@ GOLDEN_GRADIENT = 1e-9
 # Blocks of some elements over 1000 steps that strain them by tens of per cent; found: 4e-14 and 2e-14.
 ENERGY_OF_A_SOLID = 1e-11
 MOMENTUM_OF_A_SOLID = 1e-12
+
+# Cook's membrane, as independent codes and prototypes give it on the same mesh to three or four digits [mm].
+COOK = 6e-3
