@@ -6,9 +6,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import tolerances as tol
+from differences import assert_v_shaped
 
 import natcoord_jax as nc
 import natcoord_jax.io
+from natcoord_jax.bodies.surface_load import LOADS
 from natcoord_jax.core.cells import TETRAHEDRON_EDGES
 from natcoord_jax.core.force import Load
 from natcoord_jax.effects.loads.curved_pressure import face_table
@@ -270,3 +272,216 @@ def test_cooks_membrane(element, count, nu, published):
 @pytest.mark.parametrize(("element", "count", "nu", "published"), COOK_SLOW)
 def test_cooks_membrane_on_finer_meshes(element, count, nu, published):
     assert cook(element, count, nu) == pytest.approx(published, abs=tol.COOK)
+
+
+def cylinder(law, element, counts, pressure):
+    """How far the inside of a thick cylinder in plane strain moves under pressure [m]: radius 1 to 2."""
+    box = nc.mesh.box((1.0, 1.0, 1.0), counts, element=ELEMENTS[element])
+    u, v, w = box.nodes.T
+    angle = 0.5 * np.pi * v
+    nodes = np.stack([(1 + u) * np.cos(angle), (1 + u) * np.sin(angle), 0.2 * w], axis=1)
+    mesh = nc.mesh.Mesh(nodes, box.cells, box.sets, box.faces)
+    scene = nc.Scene()
+    part = scene.add(nc.Solid(mesh, material=law, element=element))
+    for name, axis in (("y0", 1), ("y1", 0)):
+        held(scene, part, mesh.sets[name], axis)
+    held(scene, part, np.union1d(mesh.sets["z0"], mesh.sets["z1"]), 2)
+    scene.add(nc.Pressure(part.face("x0"), lambda t: pressure * t))
+    system, state = scene.compile()
+    end = nc.equilibrium(system, state, steps=2).state
+    return float(system.sense(end, part.nearest((1.0, 0.0, 0.0))).position[0]) - 1.0
+
+
+def exact_cylinder(law, pressure):
+    """The same by a polynomial of high degree for the radius, at which the energy is stationary."""
+    x, weights = np.polynomial.legendre.leggauss(24)
+    radius, weights = 1.5 + 0.5 * x, 0.5 * weights
+    powers = np.polynomial.legendre.legvander(x, 10)
+    slopes = np.stack([2 * np.polynomial.legendre.Legendre.basis(k).deriv()(x) for k in range(11)], axis=1)
+    inside = np.polynomial.legendre.legvander(np.array([-1.0]), 10)[0]
+
+    def energy(a):
+        stretches = jnp.stack([1 + slopes @ a, 1 + powers @ a / radius, jnp.ones(24)])
+        strain = jnp.concatenate([0.5 * (stretches**2 - 1), jnp.zeros((3, 24))])
+        return jnp.sum(weights * radius * law.energy_density(strain)) - 0.5 * pressure * (1 + inside @ a) ** 2
+
+    a = jnp.zeros(11)
+    for _ in range(12):
+        a = a - jnp.linalg.solve(jax.hessian(energy)(a), jax.grad(energy)(a))
+    assert np.abs(jax.grad(energy)(a)).max() < 1e-12 * max(1.0, pressure)
+    return float(inside @ a)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("element", "law", "pressure"),
+    [
+        ("Hexahedron20", nc.NeoHooke(E=1.0, nu=0.3, density=1.0), 0.15),
+        ("Hexahedron27", nc.CompressibleMooneyRivlin(c10=0.15, c01=0.05, density=1.0), 0.15),
+        ("Hexahedron27P1", nc.NeoHooke(E=1.0, nu=0.4999, density=1.0), 0.12),
+        ("Tetrahedron10P0", nc.MooneyRivlin(c10=0.1, c01=0.06, bulk_modulus=50.0, density=1.0), 0.1),
+    ],
+)
+def test_thick_cylinder_under_pressure(element, law, pressure):
+    """Against the exact solution, with large strains; the error falls as it should."""
+    exact = exact_cylinder(law, pressure)
+    assert exact > 0.1, "strains are small"
+    coarse, fine = (cylinder(law, element, (n, 2 * n, 1), pressure) - exact for n in (1, 2))
+    assert abs(fine) <= tol.CYLINDER * exact
+    assert abs(coarse) >= 3.5 * abs(fine)
+
+
+# --- dynamics against others ------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_a_beam_of_bricks_falls():
+    """Clamped, under its weight (case V05 of the references): how high its tip is at two times."""
+    metal = nc.Elastic(E=2.1e7, nu=0.3, density=500.0)
+    scene = nc.Scene()
+    part = scene.add(nc.Solid(nc.mesh.box((1.0, 0.1, 0.01), (10, 1, 1)), material=metal))
+    scene.add(nc.Clamp(nc.ground, part.set("x0")))
+    scene.add(nc.Gravity())
+    system, state = scene.compile()
+    trajectory = nc.simulate(system, state, dt=2.5e-3, steps=200)
+    tip = system.body_index(part.nearest((1.0, 0.1, 0.01)))
+    height = np.asarray(trajectory.q)[[100, 200], 4 * tip, 2] - 0.01
+    np.testing.assert_allclose(height, (-0.3793, -0.8826), atol=tol.FALLING_BEAM)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("element", "number"), [("Hexahedron27P1", "E"), ("Tetrahedron10", "reference")])
+def test_gradients(element, number):
+    """Of where a corner is after some steps, by a modulus and by the shape without stress; V-shaped."""
+    mesh = nc.mesh.box((1.0, 0.5, 0.5), (1, 1, 1), element=ELEMENTS[element])
+    scene = nc.Scene()
+    part = scene.add(nc.Solid(mesh, material=nc.NeoHooke(E=1e4, nu=0.4, density=DENSITY), element=element))
+    scene.add(nc.Clamp(nc.ground, part.set("x0")))
+    scene.add(nc.Gravity())
+    system, state = scene.compile()
+    tip = system.body_index(part.nearest((1.0, 0.5, 0.5)))
+    given = system.get(part, number)
+
+    def last(factor):
+        changed = system.set(part, **{number: factor * given})
+        return nc.simulate(changed, state, dt=5e-3, steps=10).q[-1, 4 * tip, 2]
+
+    one, last = jnp.asarray(1.0), jax.jit(last)
+    assert_v_shaped(last, one, one, jax.grad(last)(one))
+
+
+# --- input ------------------------------------------------------------------------------------------------
+
+
+def pushed(mesh, faces):
+    """What a pressure of one pushes on faces in all [N]."""
+    load = LOADS[faces.shape[1]]
+    one = load([nc.Point(nc.ground, x) for x in mesh.nodes[faces[0]]], pressure=1.0)
+    return sum(
+        np.asarray(one.load(jnp.asarray(mesh.nodes[f]), None, None, 0.0).forces).sum(axis=0) for f in faces
+    )
+
+
+@pytest.mark.parametrize("element", ["hexahedron8", "hexahedron20", "hexahedron27", "tetrahedron10"])
+def test_boxes(element):
+    """Their volume, faces from outside, and the force of a pressure on all of them, which is none."""
+    mesh = nc.mesh.box((1.0, 2.0, 0.5), (2, 1, 1), element=element)
+    scene = nc.Scene()
+    scene.add(nc.Solid(mesh, material=LAWS["neo-Hooke"]))
+    masses = np.asarray(scene.compile()[0].mass)[:, 0, 0]
+    assert masses.sum() == pytest.approx(DENSITY, rel=1e-12)
+    assert masses.min() > 0
+    np.testing.assert_allclose(pushed(mesh, mesh.faces["x1"]), (-1.0, 0, 0), atol=1e-13)
+    np.testing.assert_allclose(pushed(mesh, mesh.outside), 0.0, atol=1e-13)
+    assert sum(len(x) for x in mesh.faces.values()) == len(mesh.outside)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: nc.NeoHooke(E=1.0, nu=0.5), r"nu \[-\] is 0.5; pass a number between -1 and 1/2, as 0.4999"),
+        (lambda: nc.Ogden(moduli=(1.0,), exponents=(1.0, 2.0), bulk_modulus=1.0), "as many of both"),
+        (
+            lambda: nc.TransverselyIsotropic(E=1.0, nu=0.3, fibre_stiffness=1.0, direction=(0, 0, 0)),
+            r"direction \[-\] of the fibres is zero",
+        ),
+        (lambda: solid("hexahedron27", element="Hexahedron20"), "Hexahedron20 is no element for <mesh"),
+        (lambda: solid("hexahedron8", element="Brick"), "keep Brick to nc.Elastic"),
+        (
+            lambda: solid("hexahedron27", element="Hexahedron27P1", material=LAWS["elastic"]),
+            "Elastic does not split off",
+        ),
+        (lambda: solid("hexahedron20", turn=True), "element 0, .* is degenerate or turned inside out"),
+        (lambda: nc.mesh.Mesh(np.eye(4, 3), [[0, 1, 2, 3, 0]]), r"\(m, 10\) of tetrahedra"),
+        (lambda: nc.mesh.box((1, 1, 1), (1, 1, 1)).part("rubber"), "there is no part 'rubber'; it has none"),
+    ],
+)
+def test_wrong_input_is_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def solid(mesh, turn=False, material=LAWS["neo-Hooke"], **given):
+    mesh = nc.mesh.box((1, 1, 1), (1, 1, 1), element=mesh)
+    if turn:
+        mesh = nc.mesh.Mesh(mesh.nodes * np.array([1.0, 1.0, -1.0]), mesh.cells)
+    scene = nc.Scene()
+    scene.add(nc.Solid(mesh, material=material, **given))
+    return scene.compile()
+
+
+# --- files ------------------------------------------------------------------------------------------------
+
+
+def written(folder, order, layers=0, serendipity=False):
+    """A file of gmsh: a box of tetrahedra, or of hexahedra in layers, with groups."""
+    gmsh = pytest.importorskip("gmsh")
+    gmsh.initialize(interruptible=False)
+    gmsh.option.setNumber("General.Terminal", 0)
+    gmsh.option.setNumber("Mesh.MeshSizeMin", 0.5)
+    gmsh.option.setNumber("Mesh.MeshSizeMax", 0.6)
+    gmsh.option.setNumber("Mesh.SecondOrderIncomplete", serendipity)
+    kernel, mesh = gmsh.model.occ, gmsh.model.mesh
+    plate = kernel.addRectangle(0, 0, 0, 1, 0.5)
+    kernel.extrude([(2, plate)], 0, 0, 0.5, numElements=[layers] if layers else [], recombine=bool(layers))
+    kernel.synchronize()
+    if layers:
+        mesh.setTransfiniteSurface(plate)
+        mesh.setRecombine(2, plate)
+    for _, face in gmsh.model.getEntities(2):
+        place = kernel.getCenterOfMass(2, face)[0]
+        if min(place, 1 - place) < 1e-6:
+            gmsh.model.addPhysicalGroup(2, [face], name="held" if place < 0.5 else "pushed")
+    gmsh.model.addPhysicalGroup(1, [1], 7)
+    gmsh.model.addPhysicalGroup(3, [1], name="rubber")
+    mesh.generate(3)
+    mesh.setOrder(order)
+    gmsh.write(str(folder / "part.msh"))
+    gmsh.finalize()
+    return folder / "part.msh"
+
+
+@pytest.mark.parametrize(
+    ("order", "layers", "serendipity", "nodes"),
+    [(2, 0, False, 10), (1, 1, False, 8), (2, 1, True, 20), (2, 1, False, 27)],
+)
+def test_a_mesh_of_gmsh(tmp_path, order, layers, serendipity, nodes):
+    """Nodes in our order: the volume is right, and a pressure on a face by its name shortens it."""
+    mesh = nc.io.read_mesh(written(tmp_path, order, layers, serendipity))
+    assert mesh.cells.shape[1] == nodes
+    assert sorted(mesh.faces) == ["held", "pushed"]
+    assert sorted(mesh.sets) == ["7", "held", "pushed"]
+    np.testing.assert_array_equal(mesh.nodes[mesh.sets["held"]][:, 0], 0.0)
+    assert len(mesh.part("rubber").cells) == len(mesh.cells)
+    scene = nc.Scene()
+    scene.add(nc.Solid(mesh, material=LAWS["neo-Hooke"]))
+    assert float(scene.compile()[0].mass[:, 0, 0].sum()) == pytest.approx(250.0, rel=1e-9)
+    np.testing.assert_allclose(pushed(mesh, mesh.faces["pushed"]), (-0.25, 0, 0), atol=1e-13)
+    np.testing.assert_allclose(pushed(mesh, mesh.outside), 0.0, atol=1e-13)
+
+
+def test_meshes_that_cannot_be_read(tmp_path):
+    with pytest.raises(ValueError, match="Tetrahedron.* of 4 nodes: .*ElementOrder = 2"):
+        nc.io.read_mesh(written(tmp_path, 1))
+    with pytest.raises(ValueError, match="there is no file"):
+        nc.io.read_mesh(tmp_path / "none.msh")

@@ -155,3 +155,8 @@ MOMENTUM_OF_A_SOLID = 1e-12
 
 # Cook's membrane, as independent codes and prototypes give it on the same mesh to three or four digits [mm].
 COOK = 6e-3
+
+# Thick cylinders of two by four quadratic elements under pressure that widens them by a tenth and more.
+CYLINDER = 5e-3
+# Tip of a beam of ten bricks, beside a prototype with consistent masses and smaller steps [m].
+FALLING_BEAM = 1e-2
