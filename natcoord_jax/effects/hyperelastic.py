@@ -24,6 +24,7 @@ from natcoord_jax.core.arguments import Part, is_a
 from natcoord_jax.core.gradient import averaged_gradient
 from natcoord_jax.core.numeric import Number
 from natcoord_jax.maths.collocation import gauss
+from natcoord_jax.maths.materialise import materialised
 from natcoord_jax.maths.symmetric import PAIRS, UNIT, cofactor, contracted, full, tensor_cross
 
 CLOSE = 1e-3
@@ -48,8 +49,9 @@ def tensors_of(strain: Float[Array, "6 *n"]) -> Tensors:
     """Of strains of Green and Lagrange 11, 22, 33, and the angles 12, 23, 13."""
     unit = jnp.reshape(jnp.array(UNIT, strain.dtype), (6, *(1,) * (strain.ndim - 1)))
     right = unit + strain * (1.0 + unit)
-    other = cofactor(right)
-    return Tensors(right, other, contracted(other, right) / 3.0)
+    # Each is an array of its own: fused into what follows, it would be worked out anew for each component.
+    other = materialised(cofactor(right))
+    return Tensors(right, other, materialised(contracted(other, right) / 3.0))
 
 
 def log_quotient(a: Float[Array, "*n"], b: Float[Array, "*n"]) -> Float[Array, "*n"]:
@@ -172,7 +174,8 @@ class Hyperelastic(Part):
         given = self.pressure(before, after) if pressure is None else pressure
         middle = 0.5 * (begun.C + ended.C)
         whole = tensor_cross(middle, middle) + 0.5 * (begun.G + ended.G)
-        return self.distortion_stress(start, step) + 2.0 / 3.0 * given / (before + after) * whole
+        share = materialised(2.0 / 3.0 * given / (before + after))
+        return self.distortion_stress(start, step) + share * whole
 
 
 class ClosedHyperelastic(Hyperelastic):
@@ -196,7 +199,7 @@ class ClosedHyperelastic(Hyperelastic):
     ) -> Float[Array, "6 *n"]:
         """By the cascade."""
         begun, ended = tensors_of(start), tensors_of(start + step)
-        by_C, by_G, by_c = self.quotients(begun, ended)
+        by_C, by_G, by_c = materialised(self.quotients(begun, ended))
         middle = 0.5 * (begun.C + ended.C)
         whole = tensor_cross(middle, middle) + 0.5 * (begun.G + ended.G)
         found = by_C + by_c / 3.0 * whole
