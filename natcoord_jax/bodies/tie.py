@@ -98,7 +98,7 @@ def _numbered(surface: Surface) -> tuple[Any, np.ndarray]:
     """Nodes of a surface, and its faces by their numbers among them."""
     if surface.faces.shape[1] in (6, 8):
         raise ValueError(
-            f"tie: faces of {surface.handle.name!r} have {surface.faces.shape[1]} nodes, and only those of four "
+            f"tie: faces of {surface.handle.name!r} have {surface.faces.shape[1]} nodes; only those of four "
             "or nine are tied; take hexahedra of 8 or 27 nodes, as nc.mesh.box(..., element='hexahedron27')"
         )
     # Of nine nodes: the four pieces between neighbours, on which positions are taken as bilinear.

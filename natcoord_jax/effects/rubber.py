@@ -211,7 +211,8 @@ class TransverselyIsotropic(ClosedHyperelastic):
     @property
     def matrix(self) -> NeoHooke:
         """The material between the fibres."""
-        return NeoHooke(E=self.E, nu=self.nu, density=self.density)
+        # As a copy: the numbers may be those of many elements.
+        return replace_fields(NeoHooke(E=1.0, nu=0.0), E=self.E, nu=self.nu, density=self.density)
 
     def __check_init__(self) -> None:
         self.matrix.__check_init__()
