@@ -116,6 +116,7 @@ from natcoord_jax.effects.contact import (
     SphereOnPlane,
     SphereOnSphere,
 )
+from natcoord_jax.effects.hyperelastic import Hyperelastic
 from natcoord_jax.effects.joints import (
     Coupling,
     Cylindrical,
@@ -134,13 +135,31 @@ from natcoord_jax.effects.loads import (
     BodyTorque,
     EnclosedGas,
     FacePressure,
+    FacePressure6,
+    FacePressure8,
+    FacePressure9,
     Gravity,
     PairTorque,
     PointForce,
 )
 from natcoord_jax.effects.materials import Elastic
+from natcoord_jax.effects.rubber import (
+    CompressibleMooneyRivlin,
+    MooneyRivlin,
+    NeoHooke,
+    Ogden,
+    TransverselyIsotropic,
+)
 from natcoord_jax.effects.shells import MembraneElement, MembraneTriangle, ShellElement, ShellTriangle
-from natcoord_jax.effects.solids import Brick
+from natcoord_jax.effects.solids import (
+    Brick,
+    Hexahedron8,
+    Hexahedron20,
+    Hexahedron27,
+    Hexahedron27P1,
+    Tetrahedron10,
+    Tetrahedron10P0,
+)
 from natcoord_jax.effects.springs import (
     Armature,
     Damper,
@@ -187,6 +206,18 @@ __all__ = [
     "Box",
     "Check",
     "Brick",
+    "Tetrahedron10P0",
+    "Tetrahedron10",
+    "Hexahedron27P1",
+    "Hexahedron27",
+    "Hexahedron20",
+    "Hexahedron8",
+    "Hyperelastic",
+    "TransverselyIsotropic",
+    "Ogden",
+    "NeoHooke",
+    "MooneyRivlin",
+    "CompressibleMooneyRivlin",
     "Capsule",
     "CapsuleOnCapsule",
     "CircularSection",
@@ -214,6 +245,9 @@ __all__ = [
     "EnergyMomentum",
     "Equilibrium",
     "FacePressure",
+    "FacePressure6",
+    "FacePressure8",
+    "FacePressure9",
     "Feedback",
     "Field",
     "Fixed",

@@ -7,14 +7,16 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from natcoord_jax.core.arguments import checked
+from natcoord_jax.core.cells import CELLS
 from natcoord_jax.core.checks import is_concrete
-from natcoord_jax.core.kinds import Several, of
+from natcoord_jax.core.kinds import Choice, Several, of
+from natcoord_jax.core.lattice import ELEMENTS, cells_of_box
 from natcoord_jax.core.numeric import Number, Numbers, Whole
 from natcoord_jax.maths.places import places
 
 NAMED = of("a dictionary of names", dict)
 
-HEXAHEDRON = ((0, 3, 2, 1), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7))
+HEXAHEDRON = CELLS[8].faces
 """Corners of the six faces of a hexahedron, in turn as seen from outside."""
 
 
@@ -26,9 +28,12 @@ class Mesh:
         nodes: positions (n, 3) [m].
         cells: numbers of the nodes of each cell (m, 4) in turn round a quadrilateral, of a triangle the last
             one twice; (m, 3) of triangles alone, kept in that form; (m, 8) of a hexahedron four in turn round
-            one face, then those above them.
+            one face, then those above them; (m, 20) or (m, 27) of a hexahedron and (m, 10) of a tetrahedron
+            with nodes in the middles of edges, or of faces and the cell, too, as in VTK.
         sets: numbers of nodes by name, as of edges and faces.
-        faces: corners (f, 4) of the faces of hexahedra by name, in turn as seen from outside.
+        faces: nodes (f, 4), or (f, 8), (f, 9), (f, 6), of the faces of such cells by name: corners in turn as
+            seen from outside, middles of edges, the middle of the face.
+        parts: numbers of cells by name.
 
     Raises:
         ValueError: for cells of nodes that there are not, nodes without a cell, or two at the same place.
@@ -46,6 +51,7 @@ class Mesh:
     cells: Int[np.ndarray, "m k"]
     sets: dict[str, np.ndarray] = field(default_factory=dict)
     faces: dict[str, np.ndarray] = field(default_factory=dict)
+    parts: dict[str, np.ndarray] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         nodes = np.asarray(self.nodes, float) if is_concrete(self.nodes) else self.nodes
@@ -59,7 +65,8 @@ class Mesh:
         if self.cells.ndim != 2 or self.cells.shape[1] not in KINDS or self.cells.dtype.kind not in "iu":
             raise ValueError(
                 f"mesh: cells has shape {self.cells.shape} of {self.cells.dtype}; pass whole numbers (m, 4) "
-                "of quadrilaterals or (m, 8) of hexahedra"
+                "of quadrilaterals, (m, 3) of triangles, (m, 8), (m, 20) or (m, 27) of hexahedra, or (m, 10) "
+                "of tetrahedra"
             )
         _check(nodes, self.cells)
 
@@ -68,14 +75,31 @@ class Mesh:
         return f"<mesh: {len(self.nodes)} nodes, {len(self.cells)} {KINDS[self.cells.shape[1]]}{named}>"
 
     @property
-    def outside(self) -> Int[np.ndarray, "f 4"]:
-        """Faces of hexahedra that belong to one cell only, in turn as seen from outside."""
-        every = np.concatenate([self.cells[:, list(face)] for face in HEXAHEDRON])
+    def outside(self) -> Int[np.ndarray, "f k"]:
+        """Faces of cells of solids that belong to one cell only, in turn as seen from outside."""
+        every = np.concatenate([self.cells[:, list(face)] for face in CELLS[self.cells.shape[1]].faces])
         _, first, count = np.unique(np.sort(every, axis=1), axis=0, return_index=True, return_counts=True)
         return every[np.sort(first[count == 1])]
 
+    def part(self, name: str) -> "Mesh":
+        """The cells of a part alone, as a mesh with what it has of the sets and faces.
 
-KINDS = {4: "quadrilaterals", 8: "hexahedra"}
+        Raises:
+            ValueError: for a name that there is not, naming those that there are.
+        """
+        if name not in self.parts:
+            raise ValueError(f"mesh: there is no part {name!r}; it has {sorted(self.parts) or 'none'}")
+        cells = self.cells[self.parts[name]]
+        kept = np.unique(cells)
+        number = np.full(len(self.nodes), -1)
+        number[kept] = np.arange(len(kept))
+        sets = {key: number[np.intersect1d(x, kept)] for key, x in self.sets.items()}
+        faces = {key: number[x[np.isin(x, kept).all(axis=1)]] for key, x in self.faces.items()}
+        mine = {key: x for key, x in sets.items() if len(x)}
+        return Mesh(self.nodes[kept], number[cells], mine, {key: x for key, x in faces.items() if len(x)})
+
+
+KINDS = {4: "quadrilaterals", **{count: cell.name for count, cell in CELLS.items()}}
 
 
 def _check(nodes: Any, cells: np.ndarray) -> None:
@@ -171,13 +195,19 @@ def rectangle(size: Any, counts: tuple[int, int]) -> Mesh:
     return Mesh(nodes.reshape(-1, 3), np.stack(corners, axis=-1).reshape(-1, 4), sets)
 
 
-@checked("mesh.box", size=Numbers((3,), sign="positive"), counts=Several(Whole(1), 3, 3))
-def box(size: Any, counts: tuple[int, int, int]) -> Mesh:
+@checked(
+    "mesh.box",
+    size=Numbers((3,), sign="positive"),
+    counts=Several(Whole(1), 3, 3),
+    element=Choice(tuple(ELEMENTS)),
+)
+def box(size: Any, counts: tuple[int, int, int], element: str = "hexahedron8") -> Mesh:
     """A box from the origin along x, y and z.
 
     Args:
         size: along x, y and z [m].
-        counts: of hexahedra along x, y and z.
+        counts: of hexahedra along x, y and z, or of boxes of six tetrahedra.
+        element: "hexahedron8", "hexahedron20", "hexahedron27" or "tetrahedron10", by the number of nodes.
 
     Returns:
         A mesh with sets and faces "x0", "x1", "y0", "y1", "z0" and "z1".
@@ -188,20 +218,19 @@ def box(size: Any, counts: tuple[int, int, int]) -> Mesh:
         >>> nc.mesh.box((1.0, 0.5, 0.5), (4, 2, 2))
         <mesh: 45 nodes, 16 hexahedra; x0, x1, y0, y1, z0, z1>
     """
-    nodes = np.stack(np.meshgrid(*_lines(size, counts), indexing="ij"), axis=-1)
-    number = np.arange(nodes[..., 0].size).reshape(nodes.shape[:3])
-    low, high = slice(None, -1), slice(1, None)
-    around = (low, low), (high, low), (high, high), (low, high)
-    corners = [number[a, b, c] for c in (low, high) for a, b in around]
-    cells = np.stack(corners, axis=-1).reshape(-1, 8)
+    points, cells = cells_of_box(counts, element)
+    lines = _lines(size, [n - 1 for n in points])
+    nodes = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, 3)
+    kept, cells = np.unique(cells, return_inverse=True)
+    nodes, cells = nodes[kept], cells.reshape(-1, CELLS[ELEMENTS[element]].nodes.shape[0])
     sets = {
-        f"{axis}{end}": np.take(number, -end, axis=k).reshape(-1)
+        f"{axis}{end}": np.flatnonzero(nodes[:, k] == lines[k][-end])
         for k, axis in enumerate("xyz")
         for end in (0, 1)
     }
-    mesh = Mesh(nodes.reshape(-1, 3), cells, sets)
-    faces = {name: mesh.outside[np.isin(mesh.outside, x).all(axis=1)] for name, x in sets.items()}
-    return Mesh(mesh.nodes, cells, sets, faces)
+    outside = Mesh(nodes, cells, sets).outside
+    faces = {name: outside[np.isin(outside, x).all(axis=1)] for name, x in sets.items()}
+    return Mesh(nodes, cells, sets, faces)
 
 
 @checked(

@@ -79,6 +79,7 @@ LAYER = {
     "prestress": [np.ones(3)], "damping": [1.0],
 }  # fmt: skip
 MEMBRANE = ["hybrid", "hybrid mitc4+"]
+RUBBER = [nc.NeoHooke(E=1.0, nu=0.4)]
 PLACED = {
     "material": METAL, "position": V, "orientation": [np.eye(3)], "velocity": V, "angular_velocity": V,
     "name": NAME,
@@ -176,6 +177,32 @@ CALLS = {
         "one": [w.nodes], "other": [w.nodes], "velocity": V, "angular_velocity": V, "name": NAME
     },
     "Brick": lambda w: {**MARKED(w.ends * 4), "material": METAL, "reference": [np.ones((8, 3))]},
+    **{
+        name: lambda w, count=count: {
+            **MARKED((w.ends * 14)[:count]), "material": METAL,
+            "reference": [np.ones((count, 3))],
+        }
+        for name, count in (
+            ("Hexahedron8", 8), ("Hexahedron20", 20), ("Hexahedron27", 27), ("Tetrahedron10", 10),
+        )
+    },
+    **{
+        name: lambda w, count=count: {
+            **MARKED((w.ends * 14)[:count]), "material": RUBBER, "reference": [np.ones((count, 3))]
+        }
+        for name, count in (("Hexahedron27P1", 27), ("Tetrahedron10P0", 10))
+    },
+    "NeoHooke": lambda w: {"E": NUMBER, "nu": [0.3], "density": NUMBER},
+    "MooneyRivlin": lambda w: {"c10": NUMBER, "c01": NUMBER, "bulk_modulus": NUMBER, "density": NUMBER},
+    "CompressibleMooneyRivlin": lambda w: {
+        "c10": NUMBER, "c01": NUMBER, "volume_stiffness": NUMBER, "density": NUMBER,
+    },
+    "Ogden": lambda w: {
+        "moduli": [np.ones(2)], "exponents": [np.ones(2)], "bulk_modulus": NUMBER, "density": NUMBER,
+    },
+    "TransverselyIsotropic": lambda w: {
+        "E": NUMBER, "nu": [0.3], "fibre_stiffness": NUMBER, "direction": V, "density": NUMBER,
+    },
     "Elastic": lambda w: {"E": NUMBER, "nu": [0.3], "density": NUMBER},
     "Shell": lambda w: {
         "mesh": [nc.mesh.rectangle((1.0, 1.0), (1, 1))], "directors": PLACES, **PLACED, **LAYER,
@@ -201,15 +228,20 @@ CALLS = {
     "EllipsoidOnPlane": lambda w: {"semi_axes": V},
     "SphereOnBox": lambda w: {"size": V, "radius": NUMBER},
     "FacePressure": lambda w: {**MARKED(w.ends * 2), "pressure": [1.0, f]},
+    "FacePressure6": lambda w: {**MARKED(w.ends * 3), "pressure": [1.0, f]},
+    "FacePressure8": lambda w: {**MARKED(w.ends * 4), "pressure": [1.0, f]},
+    "FacePressure9": lambda w: {**MARKED((w.ends * 5)[:9]), "pressure": [1.0, f]},
     "Pressure": lambda w: {"surface": [w.shell], "pressure": [1.0, f], "name": NAME},
     "EnclosedGas": lambda w: {**MARKED(w.ends * 2), "faces": [np.array([[0, 1, 2, 3]])], **GAS},
     "Gas": lambda w: {"surface": [w.shell, (w.shell,)], "name": NAME, **GAS},
     "PointSum": lambda w: {**MARKED(w.ends), "weights": [(1.0, -1.0)]},
     "Tie": lambda w: {"one": [w.shell.face()], "other": [w.shell.face()], "name": NAME},
     "Scene.move_nodes": lambda w: {"nodes": [w.nodes], "positions": PLACES},
-    "Solid": lambda w: {"mesh": [nc.mesh.box((1.0, 1.0, 1.0), (1, 1, 1))], **PLACED},
+    "Solid": lambda w: {
+        "mesh": [nc.mesh.box((1.0, 1.0, 1.0), (1, 1, 1))], "element": [None, "Hexahedron8"], **PLACED
+    },
     "mesh.rectangle": lambda w: {"size": [(1.0, 1.0)], "counts": [(2, 2)]},
-    "mesh.box": lambda w: {"size": V, "counts": [(2, 2, 2)]},
+    "mesh.box": lambda w: {"size": V, "counts": [(2, 2, 2)], "element": ["hexahedron8"]},
     "mesh.cylinder": lambda w: {"radius": NUMBER, "length": NUMBER, "counts": [(4, 2)]},
     "mesh.sphere": lambda w: {"radius": NUMBER, "count": WHOLE},
     "mesh.cleaned": lambda w: {
@@ -398,6 +430,7 @@ CALLS = {
     "io.load": lambda w: {
         "source": [nc.io.PENDULUM], "leave_out": [("limits",)], "floating": FLAG, "motors": FLAG
     },
+    "io.read_mesh": lambda w: {"file": ["part.msh"]},
     "io.save_mjcf": lambda w: {**RUN(w), "file": [None, "file.xml"], "name": NAME},
     "cost.Effort": lambda w: {"weight": NUMBER},
     "cost.Duration": lambda w: {"weight": NUMBER},
@@ -433,6 +466,16 @@ MADE = {
     "Trajectory",
 }  # fmt: skip
 BASES = {"Constraint", "Field", "Force", "Gap", "Joint", "Potential", "VelocityConstraint"}
+BASES = {
+    "Constraint",
+    "Field",
+    "Force",
+    "GapPotential",
+    "Hyperelastic",
+    "Joint",
+    "Potential",
+    "VelocityConstraint",
+}
 IN_MODULES = {
     "cost": nc.cost, "goal": nc.goal, "bounds": nc.bounds, "inputs": nc.inputs, "mesh": nc.mesh,
 }  # fmt: skip
@@ -476,7 +519,7 @@ def test_everything_public_is_in_the_table():
         methods = inspect.getmembers(cls, inspect.isfunction)
         names |= {f"{cls.__name__}.{n}" for n, _ in methods if n[0] != "_"}
     names |= {"Section.of_numbers", "Section.of_axis_along_first"}
-    names |= {"io.load", "io.save_mjcf"}
+    names |= {"io.load", "io.read_mesh", "io.save_mjcf"}
     names |= {"Nodes.points", "Nodes.directors", "Nodes.triads"}
     # What `System.set` takes are numbers of the part by name, see `test_parts`.
     assert names - BASES_IN_MODULES - {"System.set"} == set(CALLS)

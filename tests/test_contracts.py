@@ -28,6 +28,7 @@ from natcoord_jax.assembly.build import build
 from natcoord_jax.assembly.diagnostics import group_places, rows_with_ground
 from natcoord_jax.assembly.reduced import ReducedStep
 from natcoord_jax.assembly.response import gather, respond, situation
+from natcoord_jax.core.cells import CELLS
 from natcoord_jax.core.coordinate import CoordinateEffect
 from natcoord_jax.core.effect import Effect, replace_fields
 from natcoord_jax.core.joint import frames_at
@@ -79,6 +80,17 @@ class Parts:
         places = (0.0, -0.4, -1.2), (0.9, -0.3, -1.1), (0.8, 0.4, -1.3), (-0.1, 0.3, -1.2)
         axes, bodies = np.roll(np.eye(3), 1, axis=1), (self.one, self.two, self.two, self.one)
         return tuple(nc.Attachment(b, x, axes) for b, x in zip(bodies, places))
+
+    def cell(self, count):
+        """Points of a distorted cell of a solid, some on each body."""
+        nodes = CELLS[count].nodes
+        bend = 0.03 * np.sin(3.0 * np.roll(nodes, 1, axis=1))
+        places = (
+            (2.0 if count == 10 else 1.0) * nodes * np.array([1.0, 0.9, 1.1])
+            + bend
+            + np.array([0.4, 0.0, -0.8])
+        )
+        return tuple(nc.Point(self.one if x[2] < 0 else self.two, x0) for x, x0 in zip(nodes - 0.1, places))
 
     @property
     def eight(self):
@@ -153,6 +165,29 @@ TABLE = {
         lambda p: nc.MembraneTriangle((*p.eight[:2], p.eight[5]), thickness=0.1, material=nc.Elastic(E=300.0))
     ),
     nc.Brick: Entry(lambda p: nc.Brick(p.eight, material=nc.Elastic(E=50.0, nu=0.3))),
+    **{
+        element: Entry(lambda p, e=element, count=count, law=law: e(p.cell(count), material=law))
+        for element, count, law in (
+            (nc.Hexahedron8, 8, nc.CompressibleMooneyRivlin(c10=8.0, c01=3.0, volume_stiffness=9.0)),
+            (nc.Hexahedron20, 20, nc.NeoHooke(E=50.0, nu=0.3)),
+            (nc.Hexahedron27, 27, nc.Elastic(E=50.0, nu=0.3)),
+            (nc.Hexahedron27P1, 27, nc.NeoHooke(E=50.0, nu=0.4)),
+            (nc.Tetrahedron10, 10, nc.MooneyRivlin(c10=8.0, c01=3.0, bulk_modulus=60.0)),
+            (nc.Tetrahedron10P0, 10, nc.NeoHooke(E=50.0, nu=0.4)),
+        )
+    },
+    nc.FacePressure6: Entry(
+        lambda p: nc.FacePressure6([p.cell(10)[k] for k in (0, 1, 2, 4, 5, 6)], pressure=jnp.sin),
+        inside=False,
+    ),
+    nc.FacePressure8: Entry(
+        lambda p: nc.FacePressure8([p.cell(20)[k] for k in CELLS[20].faces[2]], pressure=jnp.sin),
+        inside=False,
+    ),
+    nc.FacePressure9: Entry(
+        lambda p: nc.FacePressure9([p.cell(27)[k] for k in CELLS[27].faces[2]], pressure=jnp.sin),
+        inside=False,
+    ),
     nc.GapPotential: Entry(
         lambda p: nc.GapPotential(
             (*p.eight[:2], *p.eight[5:7]), nc.CapsuleOnCapsule(radii=(0.6, 0.7)), stiffness=9.0

@@ -18,16 +18,35 @@ from natcoord_jax.core.kinds import FLAG, NAME, Choice, of
 from natcoord_jax.core.nodes import NodeSet
 from natcoord_jax.core.numeric import COMPONENTS, Directions, Number, Numbers
 from natcoord_jax.core.recipe import Builder, Recipe
+from natcoord_jax.effects.hyperelastic import Hyperelastic
 from natcoord_jax.effects.materials import Elastic
 from natcoord_jax.effects.shells import MembraneElement, MembraneTriangle, ShellElement, ShellTriangle
 from natcoord_jax.effects.shells.layer import MATERIAL as LAYER
 from natcoord_jax.effects.shells.quadrilateral import MEMBRANES
-from natcoord_jax.effects.solids import Brick
+from natcoord_jax.effects.solids import (
+    Brick,
+    Hexahedron8,
+    Hexahedron20,
+    Hexahedron27,
+    Hexahedron27P1,
+    SolidElement,
+    Tetrahedron10,
+    Tetrahedron10P0,
+)
 from natcoord_jax.maths.vectors import cross
 from natcoord_jax.mesh import Mesh
 
 MESH = of("a mesh, as nc.mesh.box(...)", Mesh)
 MATERIAL = of("a material, as nc.Elastic(...)", Elastic)
+SOLID_MATERIAL = of("a material, as nc.Elastic(...) or nc.NeoHooke(...)", Elastic, Hyperelastic)
+SOLID_ELEMENTS = {
+    8: (Brick, Hexahedron8),
+    10: (Tetrahedron10, Tetrahedron10P0),
+    20: (Hexahedron20,),
+    27: (Hexahedron27, Hexahedron27P1),
+}
+"""Elements by the number of nodes of a cell."""
+ELEMENT = Choice(tuple(e.__name__ for elements in SOLID_ELEMENTS.values() for e in elements))
 MOVING = COMPONENTS | Numbers((None, 3))
 
 
@@ -80,11 +99,11 @@ class Surface:
 
     Attributes:
         handle: of the solid or the shell.
-        faces: numbers of the nodes round each of them (f, 4), in turn as seen from outside.
+        faces: numbers of the nodes of each of them (f, 4), (f, 6), (f, 8) or (f, 9), as of `nc.mesh.Mesh`.
     """
 
     handle: MeshHandle
-    faces: Int[np.ndarray, "f 4"]
+    faces: Int[np.ndarray, "f k"]
 
     def __repr__(self) -> str:
         return f"<{len(self.faces)} faces of {self.handle.name!r}>"
@@ -110,15 +129,15 @@ class _Continuum(Recipe):
     angular_velocity: Any = eqx.field(default=(0.0, 0.0, 0.0), kw_only=True, metadata=is_a(COMPONENTS))
     name: str | None = eqx.field(default=None, kw_only=True, static=True, metadata=is_a(NAME))
 
-    corners: ClassVar[int] = 0
+    corners: ClassVar[tuple[int, ...]] = ()
 
     def _pose(self, name: str) -> tuple[Array, Array, Array, Array]:
         """Places and velocities of the nodes, rotation of the mesh, angular velocity."""
         require_double(f"{self.kind} {name!r}")
-        if self.mesh.cells.shape[1] != self.corners:
+        if self.mesh.cells.shape[1] not in self.corners:
             raise ValueError(
                 f"{self.kind} {name!r}: {self.mesh!r} has cells of {self.mesh.cells.shape[1]} nodes; pass "
-                f"one with {self.corners}"
+                f"one with {' or '.join(map(str, self.corners))}"
             )
         if is_concrete(self.material.density) and not np.all(np.asarray(self.material.density) > 0):
             raise ValueError(
@@ -188,7 +207,7 @@ class Shell(_Continuum):
     directors: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Numbers((None, 3))))
 
     kind = "shell"
-    corners: ClassVar[int] = 4
+    corners: ClassVar[tuple[int, ...]] = (4,)
 
     def add_to(self, scene: Builder, name: str) -> MeshHandle:
         """Add nodes and elements."""
@@ -243,11 +262,15 @@ def _turned(vectors: Float[Array, "n 3"], rotation: Float[Array, "3 3"]) -> Floa
 
 
 class Solid(_Continuum):
-    """A solid on a mesh of hexahedra: nodes that are points, and elements between them.
+    """A solid on a mesh of hexahedra or tetrahedra: nodes that are points, and elements between them.
 
     Attributes:
-        mesh: of hexahedra.
-        material: as `nc.Elastic(...)`, with a density.
+        mesh: of hexahedra of 8, 20 or 27 nodes or tetrahedra of 10.
+        material: as `nc.Elastic(...)` or `nc.NeoHooke(...)`, with a density.
+        element: name of the class of the elements. Default: on hexahedra of eight nodes "Brick", which does
+            not lock in bending, for `nc.Elastic`, else "Hexahedron8"; on others "Hexahedron20",
+            "Hexahedron27" or "Tetrahedron10", and "Hexahedron27P1" or "Tetrahedron10P0", which nearly
+            incompressible materials need, for materials that split off the energy of a change of volume.
         position: of the origin of the mesh [m].
         orientation: of the mesh: a rotation matrix, a quaternion (w, x, y, z) or a pair (axis, angle [rad]).
         velocity: of the origin of the mesh (3,), or of every node besides its rotation (n, 3) [m/s].
@@ -266,11 +289,39 @@ class Solid(_Continuum):
         48
     """
 
+    material: Any = eqx.field(kw_only=True, metadata=is_a(SOLID_MATERIAL))
+    element: str | None = eqx.field(default=None, kw_only=True, static=True, metadata=is_a(ELEMENT))
+
     kind = "solid"
-    corners: ClassVar[int] = 8
+    corners: ClassVar[tuple[int, ...]] = tuple(SOLID_ELEMENTS)
+
+    def _element(self, name: str) -> type[Brick] | type[SolidElement]:
+        """The class of the elements.
+
+        Raises:
+            ValueError: for one of another number of nodes, or of other materials.
+        """
+        fitting = SOLID_ELEMENTS[self.mesh.cells.shape[1]]
+        if self.element is None:
+            first = fitting[0]
+            simple = isinstance(self.material, Elastic) if first is Brick else not self.material.split
+            return first if simple else fitting[-1]
+        found = [e for e in fitting if e.__name__ == self.element]
+        if not found:
+            raise ValueError(
+                f"solid {name!r}: {self.element} is no element for {self.mesh!r}; pass one of "
+                f"{[e.__name__ for e in fitting]}"
+            )
+        if found[0] is Brick and not isinstance(self.material, Elastic):
+            raise ValueError(
+                f"solid {name!r}: its enhanced strains keep Brick to nc.Elastic(...); pass Hexahedron8, or a "
+                "mesh of hexahedra with 20 or 27 nodes"
+            )
+        return found[0]
 
     def add_to(self, scene: Builder, name: str) -> MeshHandle:
         """Add nodes and elements."""
-        places, velocities, _, _ = self._pose(name)
+        places, velocities, turned, _ = self._pose(name)
+        element, material = self._element(name), self.material.turned(turned)
         nodes = scene.add(Nodes.points(places, velocity=velocities, name=f"{name} nodes"))
-        return self._handle(scene, nodes, Brick.on(nodes, self.mesh.cells, material=self.material, name=name))
+        return self._handle(scene, nodes, element.on(nodes, self.mesh.cells, material=material, name=name))

@@ -10,9 +10,12 @@ from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.kinds import NAME, FunctionOf, of
 from natcoord_jax.core.numeric import Number
 from natcoord_jax.core.recipe import Builder, Recipe
-from natcoord_jax.effects.loads import FacePressure
+from natcoord_jax.effects.loads import FacePressure, FacePressure6, FacePressure8, FacePressure9
 
 SURFACE = of("what scene.add(nc.Shell(...)) or nc.Solid(...) returned, or faces of it", MeshHandle, Surface)
+
+LOADS = {4: FacePressure, 6: FacePressure6, 8: FacePressure8, 9: FacePressure9}
+"""By the number of nodes of a face."""
 
 
 class Pressure(Recipe):
@@ -46,4 +49,5 @@ class Pressure(Recipe):
         """Add a load to every face."""
         surface = self.surface.face() if isinstance(self.surface, MeshHandle) else self.surface
         nodes = surface.handle.nodes
-        return scene.add(FacePressure.on(nodes, surface.faces, pressure=self.pressure, name=name))
+        load = LOADS[surface.faces.shape[1]]
+        return scene.add(load.on(nodes, surface.faces, pressure=self.pressure, name=name))

@@ -8,6 +8,7 @@ import numpy as np
 from natcoord_jax.bodies.continua import Surface
 from natcoord_jax.bodies.mortar import overlap
 from natcoord_jax.core.arguments import is_a
+from natcoord_jax.core.cells import pieces
 from natcoord_jax.core.checks import is_concrete
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.kinds import NAME, of
@@ -95,8 +96,15 @@ class Tie(Recipe):
 
 def _numbered(surface: Surface) -> tuple[Any, np.ndarray]:
     """Nodes of a surface, and its faces by their numbers among them."""
-    used, faces = np.unique(surface.faces, return_inverse=True)
-    return surface.handle.nodes[used], faces.reshape(surface.faces.shape)
+    if surface.faces.shape[1] in (6, 8):
+        raise ValueError(
+            f"tie: faces of {surface.handle.name!r} have {surface.faces.shape[1]} nodes; only those of four "
+            "or nine are tied; take hexahedra of 8 or 27 nodes, as nc.mesh.box(..., element='hexahedron27')"
+        )
+    # Of nine nodes: the four pieces between neighbours, on which positions are taken as bilinear.
+    four = np.array([piece for face in surface.faces.tolist() for piece in pieces(tuple(face))])
+    used, faces = np.unique(four, return_inverse=True)
+    return surface.handle.nodes[used], faces.reshape(four.shape)
 
 
 def _sparse(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -1,6 +1,6 @@
 """Elastic materials of shells and solids."""
 
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -62,6 +62,8 @@ class Elastic(Part):
     density: Any = eqx.field(default=0.0, kw_only=True, metadata=is_a(Number("not negative")))
 
     kind = "material"
+    split: ClassVar[bool] = False
+    degree: ClassVar[int | None] = 2
 
     def __check_init__(self) -> None:
         if is_concrete(self.nu) and np.ndim(self.nu) == 0 and not -1.0 < float(self.nu) < 0.5:
@@ -85,6 +87,24 @@ class Elastic(Part):
         first = self.E * self.nu / ((1 + self.nu) * (1 - 2 * self.nu))
         unit = jnp.diag(jnp.array([2.0, 2, 2, 1, 1, 1]))
         return self.shear_modulus * unit + first * jnp.zeros((6, 6)).at[:3, :3].set(1.0)
+
+    def mean_stress(
+        self, start: Float[Array, "6 *n"], step: Float[Array, "6 *n"], pressure: Any = None
+    ) -> Float[Array, "6 *n"]:
+        """Stress of Piola and Kirchhoff in the middle of a step of the strains, as of `nc.Hyperelastic`."""
+        strain = start + 0.5 * step
+        first = self.E * self.nu / ((1 + self.nu) * (1 - 2 * self.nu)) * (strain[0] + strain[1] + strain[2])
+        return self.shear_modulus * jnp.concatenate([2 * strain[:3], strain[3:]]) + jnp.concatenate(
+            [jnp.broadcast_to(first, strain[:3].shape), jnp.zeros_like(strain[3:])]
+        )
+
+    def energy_density(self, strain: Float[Array, "6 *n"], project: Any = None) -> Float[Array, "*n"]:
+        """Energy per volume [J/m^3], as of `nc.Hyperelastic`."""
+        return 0.5 * jnp.sum(strain * self.mean_stress(strain, jnp.zeros_like(strain)), axis=0)
+
+    def turned(self, rotation: Any) -> "Elastic":
+        """As it is: all directions are alike."""
+        return self
 
     def plane_stress(self) -> Float[Array, "3 3"]:
         """Stresses by strains 11, 22, 12 of a layer without stress across it [N/m^2]."""

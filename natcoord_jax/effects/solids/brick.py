@@ -45,7 +45,7 @@ SHAPES = np.array([np.prod(1 + CORNERS * at, axis=1) / 8 for at in POINTS])
 CENTRE = _slopes(np.zeros(3))
 
 
-def _inverse(jacobian: Float[Array, "3 3"]) -> tuple[Float[Array, "3 3"], Float[Array, ""]]:
+def inverse_and_volume(jacobian: Float[Array, "3 3"]) -> tuple[Float[Array, "3 3"], Float[Array, ""]]:
     """Inverse and determinant; by formulas, thousands at once."""
     a, b, c = jacobian.T
     rows = jnp.stack([cross(b, c), cross(c, a), cross(a, b)])
@@ -129,11 +129,11 @@ class Brick(Potential):
     def renewed(self) -> "Brick":
         """With the gradients and the stiffness of the pose without stress."""
         x, law = self.reference, self.material.stiffness()
-        inverse, size = _inverse(x.T @ CENTRE)
+        inverse, size = inverse_and_volume(x.T @ CENTRE)
         turned = _strains(inverse)
         gradients, volumes, blocks, mixed, soft = [], [], [], [], jnp.zeros((9, 9))
         for slopes, at in zip(SLOPES, POINTS):
-            inverse, volume = _inverse(x.T @ slopes)
+            inverse, volume = inverse_and_volume(x.T @ slopes)
             gradients.append(slopes @ inverse)
             volumes.append(volume)
             modes = np.zeros((6, 9))

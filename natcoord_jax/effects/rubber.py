@@ -1,0 +1,319 @@
+"""Hyperelastic laws of rubber and of what is reinforced by fibres."""
+
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from natcoord_jax.core.arguments import is_a
+from natcoord_jax.core.checks import as_array, is_concrete
+from natcoord_jax.core.effect import replace_fields
+from natcoord_jax.core.numeric import COMPONENTS, Number, Numbers
+from natcoord_jax.effects.hyperelastic import ClosedHyperelastic, Hyperelastic, Tensors, log_quotient
+from natcoord_jax.maths.matrix_logarithm import exponential_less_one, logarithm
+from natcoord_jax.maths.symmetric import PAIRS, contracted, trace, unit_like
+
+POISSON = "has Poisson's ratio nu [-] not between -1 and 1/2: pass one between them, as 0.4999 for rubber"
+
+
+def _cubic(begun: Tensors, ended: Tensors) -> tuple[Array, Array, Array, Array]:
+    """Cube roots of the determinants, the change of the first by c, and the mean of its inverse."""
+    before, after = jnp.cbrt(begun.c), jnp.cbrt(ended.c)
+    change = 1.0 / (before * before + before * after + after * after)
+    return before, after, change, 0.5 * (1.0 / before + 1.0 / after)
+
+
+def _volume_energy(bulk_modulus: Any, J: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """K (J^2 - 1 - 2 ln J) / 4: without limit where the volume goes to nothing or to infinity."""
+    return 0.25 * bulk_modulus * (J * J - 1.0 - 2.0 * jnp.log(J))
+
+
+def _volume_pressure(
+    bulk_modulus: Any, before: Float[Array, "*n"], after: Float[Array, "*n"]
+) -> Float[Array, "*n"]:
+    """Its change by that of J."""
+    return 0.25 * bulk_modulus * (before + after - 2.0 * log_quotient(before, after))
+
+
+class NeoHooke(ClosedHyperelastic):
+    """Rubber whose chains resist stretch alone: mu/2 (J^(-2/3) tr C - 3) + K/4 (J^2 - 1 - 2 ln J).
+
+    Attributes:
+        E: Young's modulus at small strains [N/m^2].
+        nu: Poisson's ratio at small strains [-], between -1 and 1/2, as 0.4999.
+        density: [kg/m^3].
+
+    Example:
+        >>> import natcoord_jax as nc
+        >>> rubber = nc.NeoHooke(E=1.2675, nu=0.4999, density=1e-9)
+        >>> print(f"{rubber.shear_modulus:.4f} {rubber.bulk_modulus:.1f}")
+        0.4226 2112.5
+    """
+
+    E: Any = eqx.field(kw_only=True, metadata=is_a(Number("positive")))
+    nu: Any = eqx.field(kw_only=True, metadata=is_a(Number()))
+
+    split: ClassVar[bool] = True
+
+    def __check_init__(self) -> None:
+        if is_concrete(self.nu) and np.ndim(self.nu) == 0 and not -1.0 < float(self.nu) < 0.5:
+            raise ValueError(
+                f"{type(self).__name__}: nu [-] is {float(self.nu):g}; pass a number between -1 and 1/2, as "
+                "0.4999 for rubber: at 1/2 no pressure would be enough to change the volume"
+            )
+
+    def flaws(self) -> dict[str, Array]:
+        """Poisson's ratios that cannot be."""
+        return {POISSON: (self.nu <= -1.0) | (self.nu >= 0.5)}
+
+    @property
+    def shear_modulus(self) -> Any:
+        """Mu [N/m^2]."""
+        return self.E / (2 * (1 + self.nu))
+
+    @property
+    def bulk_modulus(self) -> Any:
+        """K [N/m^2]."""
+        return self.E / (3 * (1 - 2 * self.nu))
+
+    def distortion(self, tensors: Tensors) -> Float[Array, "*n"]:
+        """Energy per volume of a change of shape [J/m^3]."""
+        return 0.5 * self.shear_modulus * (trace(tensors.C) / jnp.cbrt(tensors.c) - 3.0)
+
+    def quotients(self, begun: Tensors, ended: Tensors) -> tuple[Any, Any, Any]:
+        """Of the product c^(-1/3) tr C."""
+        before, after, change, inverse = _cubic(begun, ended)
+        half = 0.5 * self.shear_modulus
+        by_c = -0.5 * half * (trace(begun.C) + trace(ended.C)) * change / (before * after)
+        return half * inverse * unit_like(begun.C), None, by_c
+
+    def volumetric(self, J: Float[Array, "*n"]) -> Float[Array, "*n"]:
+        """Energy per volume of a change of volume [J/m^3]."""
+        return _volume_energy(self.bulk_modulus, J)
+
+    def pressure(self, before: Float[Array, "*n"], after: Float[Array, "*n"]) -> Float[Array, "*n"]:
+        """Its change by that of the ratio of volumes [N/m^2]."""
+        return _volume_pressure(self.bulk_modulus, before, after)
+
+
+class MooneyRivlin(ClosedHyperelastic):
+    """Rubber: c10 (J^(-2/3) tr C - 3) + c01 (J^(-4/3) tr G - 3) + K/4 (J^2 - 1 - 2 ln J), G = cof C.
+
+    Attributes:
+        c10: [N/m^2], not negative.
+        c01: [N/m^2], not negative; the shear modulus is 2 (c10 + c01).
+        bulk_modulus: K [N/m^2].
+        density: [kg/m^3].
+
+    Example:
+        >>> import natcoord_jax as nc
+        >>> rubber = nc.MooneyRivlin(c10=3e5, c01=1e5, bulk_modulus=4e7, density=1100.0)
+    """
+
+    c10: Any = eqx.field(kw_only=True, metadata=is_a(Number("not negative")))
+    c01: Any = eqx.field(kw_only=True, metadata=is_a(Number("not negative")))
+    bulk_modulus: Any = eqx.field(kw_only=True, metadata=is_a(Number("positive")))
+
+    split: ClassVar[bool] = True
+
+    def distortion(self, tensors: Tensors) -> Float[Array, "*n"]:
+        """Energy per volume of a change of shape [J/m^3]."""
+        root = jnp.cbrt(tensors.c)
+        first, second = trace(tensors.C) / root - 3.0, trace(tensors.G) / (root * root) - 3.0
+        return self.c10 * first + self.c01 * second
+
+    def quotients(self, begun: Tensors, ended: Tensors) -> tuple[Any, Any, Any]:
+        """Of the products c^(-1/3) tr C and c^(-2/3) tr G."""
+        before, after, change, inverse = _cubic(begun, ended)
+        both = before * after
+        squared = 0.5 * (1.0 / (before * before) + 1.0 / (after * after))
+        by_c = self.c10 * (trace(begun.C) + trace(ended.C)) * change / both
+        by_c = by_c + self.c01 * (trace(begun.G) + trace(ended.G)) * change * (before + after) / (both * both)
+        unit = unit_like(begun.C)
+        return self.c10 * inverse * unit, self.c01 * squared * unit, -0.5 * by_c
+
+    def volumetric(self, J: Float[Array, "*n"]) -> Float[Array, "*n"]:
+        """Energy per volume of a change of volume [J/m^3]."""
+        return _volume_energy(self.bulk_modulus, J)
+
+    def pressure(self, before: Float[Array, "*n"], after: Float[Array, "*n"]) -> Float[Array, "*n"]:
+        """Its change by that of the ratio of volumes [N/m^2]."""
+        return _volume_pressure(self.bulk_modulus, before, after)
+
+
+class CompressibleMooneyRivlin(ClosedHyperelastic):
+    """Foam and soft tissue: c10 (tr C - 3) + c01 (tr G - 3) - (2 c10 + 4 c01) ln J + k/2 (J - 1)^2.
+
+    P. G. Ciarlet, G. Geymonat, C. R. Acad. Sci. Paris 295 (1982) 423-426; polyconvex. Without k, Poisson's
+    ratio at small strains is that of c10 and c01 alone: 1/4 for c01 = 0.
+
+    Attributes:
+        c10: [N/m^2], not negative.
+        c01: [N/m^2], not negative; the shear modulus is 2 (c10 + c01).
+        volume_stiffness: k [N/m^2].
+        density: [kg/m^3].
+
+    Example:
+        >>> import natcoord_jax as nc
+        >>> foam = nc.CompressibleMooneyRivlin(c10=4e4, c01=1e4, density=200.0)
+    """
+
+    c10: Any = eqx.field(kw_only=True, metadata=is_a(Number("not negative")))
+    c01: Any = eqx.field(kw_only=True, metadata=is_a(Number("not negative")))
+    volume_stiffness: Any = eqx.field(default=0.0, kw_only=True, metadata=is_a(Number("not negative")))
+
+    def distortion(self, tensors: Tensors) -> Float[Array, "*n"]:
+        """Energy per volume but that of the volume [J/m^3]."""
+        return self.c10 * (trace(tensors.C) - 3.0) + self.c01 * (trace(tensors.G) - 3.0)
+
+    def quotients(self, begun: Tensors, ended: Tensors) -> tuple[Any, Any, Any]:
+        """Linear: the derivatives."""
+        unit = unit_like(begun.C)
+        return self.c10 * unit, self.c01 * unit, 0.0
+
+    def volumetric(self, J: Float[Array, "*n"]) -> Float[Array, "*n"]:
+        """Energy per volume of a change of volume [J/m^3]."""
+        balance = 2.0 * self.c10 + 4.0 * self.c01
+        return 0.5 * self.volume_stiffness * (J - 1.0) ** 2 - balance * jnp.log(J)
+
+    def pressure(self, before: Float[Array, "*n"], after: Float[Array, "*n"]) -> Float[Array, "*n"]:
+        """Its change by that of the ratio of volumes [N/m^2]."""
+        balance = 2.0 * self.c10 + 4.0 * self.c01
+        return self.volume_stiffness * (0.5 * (before + after) - 1.0) - balance * log_quotient(before, after)
+
+
+class TransverselyIsotropic(ClosedHyperelastic):
+    """A neo-Hookean matrix with fibres along one direction: the matrix's energy + k/8 (a . C a - 1)^2.
+
+    The standard reinforcing model (G. Y. Qiu, T. J. Pence, J. Elasticity 49 (1997) 1-30); fibres resist
+    compression as they do tension.
+
+    Attributes:
+        E: Young's modulus of the matrix at small strains [N/m^2].
+        nu: its Poisson's ratio [-], between -1 and 1/2.
+        fibre_stiffness: k, what the fibres add to Young's modulus along them [N/m^2].
+        direction: of the fibres, in the axes of the mesh [-].
+        density: [kg/m^3].
+
+    Example:
+        >>> import natcoord_jax as nc
+        >>> gel = dict(E=1e6, nu=0.45, density=1100.0)
+        >>> tendon = nc.TransverselyIsotropic(**gel, fibre_stiffness=2e7, direction=(1, 0, 0))
+    """
+
+    E: Any = eqx.field(kw_only=True, metadata=is_a(Number("positive")))
+    nu: Any = eqx.field(kw_only=True, metadata=is_a(Number()))
+    fibre_stiffness: Any = eqx.field(kw_only=True, metadata=is_a(Number("not negative")))
+    direction: Any = eqx.field(kw_only=True, metadata=is_a(COMPONENTS))
+
+    @property
+    def matrix(self) -> NeoHooke:
+        """The material between the fibres."""
+        # As a copy: the numbers may be those of many elements.
+        return replace_fields(NeoHooke(E=1.0, nu=0.0), E=self.E, nu=self.nu, density=self.density)
+
+    def __check_init__(self) -> None:
+        self.matrix.__check_init__()
+        if is_concrete(self.direction) and not np.any(np.asarray(self.direction)):
+            raise ValueError("TransverselyIsotropic: direction [-] of the fibres is zero; pass one")
+
+    def flaws(self) -> dict[str, Array]:
+        """Those of the matrix."""
+        return self.matrix.flaws()
+
+    def turned(self, rotation: Float[Array, "3 3"]) -> "TransverselyIsotropic":
+        """With fibres that are turned with the body."""
+        return replace_fields(self, direction=rotation @ as_array(self.direction, float))
+
+    def _fibre(self, like: Float[Array, "6 *n"]) -> Float[Array, "6 *n"]:
+        """The dyad of the direction, by components, with as many axes as another tensor."""
+        a = jnp.stack([jnp.asarray(self.direction[k]) for k in range(3)])
+        a = a / jnp.sqrt(jnp.sum(a * a, axis=0))
+        dyad = jnp.stack([a[i] * a[j] for i, j in PAIRS])
+        return dyad.reshape(6, *(1,) * (like.ndim - dyad.ndim), *dyad.shape[1:])
+
+    def _stretch(self, tensors: Tensors) -> Float[Array, "*n"]:
+        """Squared, of the fibres."""
+        return contracted(self._fibre(tensors.C), tensors.C)
+
+    def distortion(self, tensors: Tensors) -> Float[Array, "*n"]:
+        """Energy per volume but that of the volume [J/m^3]."""
+        stretch = self._stretch(tensors) - 1.0
+        return self.matrix.distortion(tensors) + self.fibre_stiffness / 8 * stretch * stretch
+
+    def quotients(self, begun: Tensors, ended: Tensors) -> tuple[Any, Any, Any]:
+        """Of the matrix, and of the square of a . C a - 1."""
+        by_C, by_G, by_c = self.matrix.quotients(begun, ended)
+        pull = self.fibre_stiffness / 8 * (self._stretch(begun) + self._stretch(ended) - 2.0)
+        return by_C + pull * self._fibre(by_C), by_G, by_c
+
+    def volumetric(self, J: Float[Array, "*n"]) -> Float[Array, "*n"]:
+        """Energy per volume of a change of volume [J/m^3]."""
+        return self.matrix.volumetric(J)
+
+    def pressure(self, before: Float[Array, "*n"], after: Float[Array, "*n"]) -> Float[Array, "*n"]:
+        """Its change by that of the ratio of volumes [N/m^2]."""
+        return self.matrix.pressure(before, after)
+
+
+class Ogden(Hyperelastic):
+    """Rubber: sum_p mu_p / alpha_p (l_1^alpha_p + l_2^alpha_p + l_3^alpha_p - 3) + K/4 (J^2 - 1 - 2 ln J).
+
+    l_i are the principal stretches over J^(1/3). R. W. Ogden, Proc. R. Soc. Lond. A 326 (1972) 565-584.
+
+    Attributes:
+        moduli: mu_p [N/m^2], (p,).
+        exponents: alpha_p [-], (p,), none zero; the shear modulus is half the sum of mu_p alpha_p.
+        bulk_modulus: K [N/m^2].
+        density: [kg/m^3].
+
+    Example:
+        >>> import natcoord_jax as nc
+        >>> law = dict(moduli=(6.3e5, 1.2e3, -1e4), exponents=(1.3, 5.0, -2.0))
+        >>> rubber = nc.Ogden(**law, bulk_modulus=2e7, density=1100.0)
+    """
+
+    moduli: Any = eqx.field(kw_only=True, metadata=is_a(Numbers((None,))))
+    exponents: Any = eqx.field(kw_only=True, metadata=is_a(Numbers((None,))))
+    bulk_modulus: Any = eqx.field(kw_only=True, metadata=is_a(Number("positive")))
+
+    split: ClassVar[bool] = True
+
+    def __check_init__(self) -> None:
+        if is_concrete(self.moduli, self.exponents):
+            moduli, exponents = np.asarray(self.moduli), np.asarray(self.exponents)
+            if moduli.shape != exponents.shape:
+                raise ValueError(
+                    f"Ogden: moduli [N/m^2] has shape {moduli.shape}, exponents [-] {exponents.shape}; pass "
+                    "as many of both"
+                )
+
+    def flaws(self) -> dict[str, Array]:
+        """Stiffnesses that are none."""
+        shear = jnp.sum(jnp.asarray(self.moduli) * jnp.asarray(self.exponents))
+        said = "has no shear modulus: the sum of moduli times exponents must be positive, no exponent zero"
+        return {said: (shear <= 0) | jnp.any(jnp.asarray(self.exponents) == 0)}
+
+    def energy(self, C: Array, G: Array, c: Array) -> Array:
+        """Energy per volume of a change of shape [J/m^3]."""
+        first, second = np.array(PAIRS).T
+        return self.distortion(Tensors(C[first, second], G[first, second], c))
+
+    def distortion(self, tensors: Tensors) -> Float[Array, "*n"]:
+        """Energy per volume of a change of shape [J/m^3]."""
+        logarithms = logarithm(tensors.C / jnp.cbrt(tensors.c))
+        total = jnp.zeros_like(tensors.c)
+        for k in range(len(self.exponents)):
+            modulus, exponent = self.moduli[k], self.exponents[k]
+            total = total + modulus / exponent * trace(exponential_less_one(0.5 * exponent * logarithms))
+        return total
+
+    def volumetric(self, J: Float[Array, "*n"]) -> Float[Array, "*n"]:
+        """Energy per volume of a change of volume [J/m^3]."""
+        return _volume_energy(self.bulk_modulus, J)
+
+    def pressure(self, before: Float[Array, "*n"], after: Float[Array, "*n"]) -> Float[Array, "*n"]:
+        """Its change by that of the ratio of volumes [N/m^2]."""
+        return _volume_pressure(self.bulk_modulus, before, after)

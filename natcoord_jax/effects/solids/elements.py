@@ -1,0 +1,343 @@
+"""Elements of solids of any hyperelastic material, by tables of shape functions and quadrature points.
+
+The invariants are the strains of Green and Lagrange at the quadrature points, quadratic in the coordinates of
+the nodes. Elements for nearly incompressible materials take the ratio of volumes J in the energy U(J) as its
+projection on polynomials of their own, in the reference volume: that is the mixed method of displacements,
+pressures and dilatations with the latter two eliminated (J. C. Simo, R. L. Taylor, K. S. Pister, Comput.
+Methods Appl. Mech. Eng. 51 (1985) 177-208).
+"""
+
+from functools import lru_cache, partial
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from natcoord_jax.core.arguments import is_a
+from natcoord_jax.core.cells import CELLS, shapes
+from natcoord_jax.core.chunks import chunked
+from natcoord_jax.core.effect import Motion, StepContext, replace_fields
+from natcoord_jax.core.gradient import averaged_gradient
+from natcoord_jax.core.kinds import of
+from natcoord_jax.core.markers import Markers
+from natcoord_jax.core.numeric import Numbers
+from natcoord_jax.core.potential import Potential, place_markers
+from natcoord_jax.effects.hyperelastic import Hyperelastic, tensors_of
+from natcoord_jax.effects.materials import Elastic
+from natcoord_jax.effects.solids.brick import SolidReadings, inverse_and_volume
+from natcoord_jax.effects.solids.tangents import solid_tangents
+from natcoord_jax.maths.collocation import Tableau
+from natcoord_jax.maths.symmetric import PAIRS, full
+
+MATERIAL = of("a material, as nc.Elastic(...) or nc.NeoHooke(...)", Elastic, Hyperelastic)
+
+
+@lru_cache
+def quadrature(nodes: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points (g, 3) and weights (g,) for elements of so many nodes: all their modes have stiffness."""
+    if nodes == 10:
+        far, near = (5 + 3 * np.sqrt(5)) / 20, (5 - np.sqrt(5)) / 20
+        return np.full((4, 3), near) + (far - near) * np.eye(4, 3, -1), np.full(4, 1 / 24)
+    x, w = np.polynomial.legendre.leggauss(2 if nodes == 8 else 3)
+    points = np.stack(np.meshgrid(x, x, x, indexing="ij"), axis=-1).reshape(-1, 3)
+    return points, np.einsum("i,j,k->ijk", w, w, w).reshape(-1)
+
+
+class SolidElement(Potential):
+    """Base of elements of solids: a subclass says of how many nodes, and what the volumes are projected on.
+
+    The element brings its mass to its nodes, in proportion to the integrals of the squared shape functions
+    (E. Hinton, T. Rock, O. C. Zienkiewicz, Earthq. Eng. Struct. Dyn. 4 (1976) 245-249): none is negative.
+
+    Attributes:
+        markers: its nodes, in the order of `nc.mesh.Mesh`.
+        material: as `nc.Elastic` or `nc.NeoHooke`.
+        reference: points (k, 3) without stress [m]; None: those of the assembled pose.
+        gradients: derivatives of the shape functions at the quadrature points [1/m], follow from the others.
+        volumes: of the quadrature points [m^3], follow from the others.
+        modes: orthonormal functions there that volumes are projected on, follow from the others.
+
+    Class attributes:
+        count: number of nodes.
+        projected: number of these functions: 1, then linear ones; none: volumes are not projected.
+    """
+
+    markers: Any = eqx.field(metadata=is_a(Markers()))
+    material: Any = eqx.field(kw_only=True, metadata=is_a(MATERIAL))
+    reference: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Numbers((None, 3))))
+    gradients: Any = eqx.field(default=None, init=False)
+    volumes: Any = eqx.field(default=None, init=False)
+    modes: Any = eqx.field(default=None, init=False)
+
+    together: ClassVar[bool] = True
+    derived: ClassVar[tuple[str, ...]] = ("gradients", "volumes", "modes")
+    silent: ClassVar[bool] = False
+    count: ClassVar[int]
+    projected: ClassVar[int] = 0
+
+    def __check_init__(self) -> None:
+        if len(self.markers) != self.count:
+            raise ValueError(
+                f"{type(self).__name__}: has {len(self.markers)} markers; pass {self.count} nc.Point"
+            )
+        if self.projected and not self.material.split:
+            raise ValueError(
+                f"{type(self).__name__}: the energy of {type(self.material).__name__} does not split off "
+                "that of a change of volume, which this element needs; pass one that does, as nc.NeoHooke or "
+                "nc.MooneyRivlin, or take an element without projected volumes"
+            )
+
+    def assembled_at(self, x: Float[Array, "k 3"]) -> "SolidElement":
+        """With the assembled pose as the one without stress, unless another is given."""
+        return replace_fields(self, reference=x if self.reference is None else self.reference).renewed()
+
+    def renewed(self) -> "SolidElement":
+        """With what follows from the pose without stress."""
+        points, weights = quadrature(self.count)
+        values, slopes = shapes(CELLS[self.count], points)
+        gradients, volumes = [], []
+        for slope, weight in zip(slopes, weights):
+            inverse, volume = inverse_and_volume(self.reference.T @ slope)
+            gradients.append(slope @ inverse)
+            volumes.append(weight * volume)
+        volume = jnp.stack(volumes)
+        places = values @ self.reference
+        places = places - volume @ places / jnp.sum(volume)
+        functions = [jnp.ones_like(volume), *places.T][: self.projected]
+        modes: list[Array] = []
+        for function in functions:
+            for mode in modes:
+                function = function - (volume * mode) @ function * mode
+            modes.append(function / jnp.sqrt(jnp.abs(volume) @ function**2))
+        stacked = jnp.stack(modes, axis=1) if modes else jnp.zeros((len(volumes), 0))
+        return replace_fields(self, gradients=jnp.stack(gradients), volumes=volume, modes=stacked)
+
+    def lumped_mass(self) -> Float[Array, " k"]:
+        """Of the points [kg]."""
+        share = shapes(CELLS[self.count], quadrature(self.count)[0])[0].T ** 2 @ self.volumes
+        return self.material.density * jnp.sum(self.volumes) * share / jnp.sum(share)
+
+    def flaws(self) -> dict[str, Array]:
+        """Corners that are no corners."""
+        said = (
+            "is degenerate or turned inside out: list its nodes in the order of nc.mesh.Mesh, middles of "
+            "edges near their middles"
+        )
+        return {said: jnp.min(self.volumes) <= 0.0, **self.material.flaws()}
+
+    def invariants(self, x: Float[Array, "k 3 *n"]) -> Float[Array, "p *n"]:
+        """Strains of Green and Lagrange at the quadrature points, component by component [-]."""
+        f = jnp.sum(self.gradients[:, :, :, None] * x[None, :, None], axis=1)
+        found = []
+        for i, j in PAIRS:
+            product = jnp.sum(f[:, i] * f[:, j], axis=1)
+            found.append(0.5 * (product - 1.0) if i == j else product)
+        return jnp.concatenate(found)
+
+    def by_point(self, invariants: Float[Array, "p *n"]) -> Float[Array, "6 g *n"]:
+        """Components at the quadrature points."""
+        return invariants.reshape(6, -1, *invariants.shape[1:])
+
+    def project(self, values: Float[Array, "g *n"]) -> Float[Array, "g *n"]:
+        """Values at the quadrature points made functions that the element has; symmetric in its volume."""
+        if not self.projected:
+            return values
+        shares = jnp.sum(self.modes * (self.volumes * values)[:, None], axis=0)
+        return jnp.sum(self.modes * shares[None], axis=1)
+
+    def energy(self, invariants: Float[Array, "p *n"]) -> Float[Array, "*n"]:
+        """Energy [J]."""
+        found = self.material.energy_density(self.by_point(invariants), self.project)
+        return jnp.sum(self.volumes * found, axis=0)
+
+    def mean_stress(self, start: Float[Array, "6 g *n"], step: Float[Array, "6 g *n"]) -> Array:
+        """Stress of Piola and Kirchhoff whose work over a step is the change of energy [N/m^2]."""
+        return self.material.mean_stress(start, step, self.mean_pressure(start, step))
+
+    def mean_pressure(self, start: Float[Array, "6 g *n"], step: Float[Array, "6 g *n"]) -> Array | None:
+        """Change of the energy of volumes by them, projected; None: the material finds it."""
+        if not self.projected:
+            return None
+        before, after = (jnp.sqrt(tensors_of(x).c) for x in (start, start + step))
+        return self.project(self.material.pressure(self.project(before), self.project(after)))
+
+    def averaged(
+        self, start: Float[Array, "p *n"], steps: Float[Array, "s p *n"], tableau: Tableau
+    ) -> Float[Array, "s p *n"]:
+        """Averaged gradients: of one stage by products and quotients, of more by quadrature."""
+        if tableau.stages > 1 or tableau.variational:
+            degree = self.material.degree
+            return averaged_gradient(self.energy, start, steps, tableau, degree, None, self.slope)
+        found = self.mean_stress(self.by_point(start), self.by_point(steps[0]))
+        return (self.volumes * found).reshape(steps.shape)
+
+    def cancelling(self, place: Array, rows: Array, coordinates: Array) -> tuple[Array, Array]:
+        """Stiffness times strains, of which the stresses are differences; the distance of the nodes."""
+        x = place_markers(place, rows)
+        strain = self.by_point(self.invariants(x))
+
+        def stress(strain: Array) -> Array:
+            return jax.grad(lambda e: jnp.sum(self.material.energy_density(e)))(strain)
+
+        work = jnp.zeros_like(self.volumes)
+        for k in range(6):
+            along = jnp.zeros_like(strain).at[k].set(1.0)
+            work = work + jnp.abs(jax.jvp(stress, (strain,), (along,))[1][k]) * strain[k] ** 2
+        reach = jnp.sqrt(jnp.max(jnp.sum((x - x[0]) ** 2, axis=-1)))
+        return jnp.sum(self.volumes * work), reach
+
+    def tangents(
+        self, place: Array, motion: Motion, now: StepContext, lam: Array, *, turning: bool
+    ) -> Array | None:
+        """In formulas for one stage."""
+        several = motion.spin.shape[-2] > place.shape[1]
+        if several or now.tableau.stages > 1 or now.tableau.variational or now.stress is not None:
+            return None
+        return chunked(partial(solid_tangents, turning=turning), self, place, motion, now)
+
+    def readings(self, place: Array, rows: Array) -> SolidReadings:
+        """Strains and stresses on average over the element."""
+        x = place_markers(place, rows)
+        found = self.invariants(x)
+        strain = self.by_point(found)
+        stress = full(self.by_point(jax.grad(self.energy)(found)))
+        f = jnp.einsum("gkj,ki->ijg", self.gradients, x)
+        volume = jnp.sum(self.volumes * jnp.sqrt(tensors_of(strain).c))
+        cauchy = jnp.einsum("ikg,klg,jlg->ij", f, stress, f) / volume
+        away = cauchy - jnp.trace(cauchy) / 3.0 * jnp.eye(3)
+        square = 1.5 * jnp.sum(away**2)
+        equivalent = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
+        return SolidReadings(
+            strain @ self.volumes / jnp.sum(self.volumes), cauchy, equivalent, self.energy(found)
+        )
+
+
+class Hexahedron8(SolidElement):
+    """A brick of eight points, of any material; it locks in bending, unlike `nc.Brick`.
+
+    Attributes:
+        markers: its nodes, in the order of `nc.mesh.Mesh`.
+        material: as `nc.Elastic` or `nc.NeoHooke`.
+        reference: points without stress [m]; None: those of the assembled pose.
+
+    Example:
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import natcoord_jax as nc
+        >>> mesh = nc.mesh.box((1.0, 0.2, 0.2), (2, 1, 1), element="hexahedron8")
+        >>> rubber = nc.NeoHooke(E=1e6, nu=0.45, density=1100.0)
+        >>> block = nc.Solid(mesh, material=rubber, element="Hexahedron8")
+    """
+
+    kind: ClassVar[str] = "hexahedron8"
+    count: ClassVar[int] = 8
+    faces: ClassVar[tuple[tuple[int, ...], ...]] = CELLS[8].facets
+
+
+class Hexahedron20(SolidElement):
+    """A brick of twenty points, with 27 points of quadrature.
+
+    Attributes:
+        markers: its nodes, in the order of `nc.mesh.Mesh`.
+        material: as `nc.Elastic` or `nc.NeoHooke`.
+        reference: points without stress [m]; None: those of the assembled pose.
+
+    Example:
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import natcoord_jax as nc
+        >>> mesh = nc.mesh.box((1.0, 0.2, 0.2), (2, 1, 1), element="hexahedron20")
+        >>> rubber = nc.NeoHooke(E=1e6, nu=0.45, density=1100.0)
+        >>> block = nc.Solid(mesh, material=rubber, element="Hexahedron20")
+    """
+
+    kind: ClassVar[str] = "hexahedron20"
+    count: ClassVar[int] = 20
+    faces: ClassVar[tuple[tuple[int, ...], ...]] = CELLS[20].facets
+
+
+class Hexahedron27(SolidElement):
+    """A brick of 27 points.
+
+    Attributes:
+        markers: its nodes, in the order of `nc.mesh.Mesh`.
+        material: as `nc.Elastic` or `nc.NeoHooke`.
+        reference: points without stress [m]; None: those of the assembled pose.
+
+    Example:
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import natcoord_jax as nc
+        >>> mesh = nc.mesh.box((1.0, 0.2, 0.2), (2, 1, 1), element="hexahedron27")
+        >>> rubber = nc.NeoHooke(E=1e6, nu=0.45, density=1100.0)
+        >>> block = nc.Solid(mesh, material=rubber, element="Hexahedron27")
+    """
+
+    kind: ClassVar[str] = "hexahedron27"
+    count: ClassVar[int] = 27
+    faces: ClassVar[tuple[tuple[int, ...], ...]] = CELLS[27].facets
+
+
+class Hexahedron27P1(SolidElement):
+    """A brick of 27 points with linear volumes, for nearly incompressible materials.
+
+    Attributes:
+        markers: its nodes, in the order of `nc.mesh.Mesh`.
+        material: one that splits off the energy of a change of volume, as `nc.NeoHooke`.
+        reference: points without stress [m]; None: those of the assembled pose.
+
+    Example:
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import natcoord_jax as nc
+        >>> mesh = nc.mesh.box((1.0, 0.2, 0.2), (2, 1, 1), element="hexahedron27")
+        >>> rubber = nc.NeoHooke(E=1e6, nu=0.45, density=1100.0)
+        >>> block = nc.Solid(mesh, material=rubber, element="Hexahedron27P1")
+    """
+
+    kind: ClassVar[str] = "hexahedron27P1"
+    count: ClassVar[int] = 27
+    projected: ClassVar[int] = 4
+    faces: ClassVar[tuple[tuple[int, ...], ...]] = CELLS[27].facets
+
+
+class Tetrahedron10(SolidElement):
+    """A tetrahedron of ten points, with four points of quadrature.
+
+    Attributes:
+        markers: its nodes, in the order of `nc.mesh.Mesh`.
+        material: as `nc.Elastic` or `nc.NeoHooke`.
+        reference: points without stress [m]; None: those of the assembled pose.
+
+    Example:
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import natcoord_jax as nc
+        >>> mesh = nc.mesh.box((1.0, 0.2, 0.2), (2, 1, 1), element="tetrahedron10")
+        >>> rubber = nc.NeoHooke(E=1e6, nu=0.45, density=1100.0)
+        >>> block = nc.Solid(mesh, material=rubber, element="Tetrahedron10")
+    """
+
+    kind: ClassVar[str] = "tetrahedron10"
+    count: ClassVar[int] = 10
+    faces: ClassVar[tuple[tuple[int, ...], ...]] = CELLS[10].facets
+
+
+class Tetrahedron10P0(SolidElement):
+    """A tetrahedron of ten points with one volume, for nearly incompressible materials.
+
+    Attributes:
+        markers: its nodes, in the order of `nc.mesh.Mesh`.
+        material: one that splits off the energy of a change of volume, as `nc.NeoHooke`.
+        reference: points without stress [m]; None: those of the assembled pose.
+
+    Example:
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import natcoord_jax as nc
+        >>> mesh = nc.mesh.box((1.0, 0.2, 0.2), (2, 1, 1), element="tetrahedron10")
+        >>> rubber = nc.NeoHooke(E=1e6, nu=0.45, density=1100.0)
+        >>> block = nc.Solid(mesh, material=rubber, element="Tetrahedron10P0")
+    """
+
+    kind: ClassVar[str] = "tetrahedron10P0"
+    count: ClassVar[int] = 10
+    projected: ClassVar[int] = 1
+    faces: ClassVar[tuple[tuple[int, ...], ...]] = CELLS[10].facets

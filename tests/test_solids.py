@@ -1,0 +1,495 @@
+"""Solids: hyperelastic laws, quadratic elements, nearly incompressible materials, and meshes of gmsh."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import tolerances as tol
+from differences import assert_v_shaped
+
+import natcoord_jax as nc
+import natcoord_jax.io
+from natcoord_jax.bodies.surface_load import LOADS
+from natcoord_jax.core.cells import TETRAHEDRON_EDGES
+from natcoord_jax.core.force import Load
+from natcoord_jax.effects.loads.curved_pressure import face_table
+from natcoord_jax.maths.symmetric import PAIRS
+
+FIRST, SECOND = np.array(PAIRS).T
+DENSITY = 1000.0
+
+
+class Gent(nc.Hyperelastic):
+    """A law of one's own (A. N. Gent, Rubber Chem. Technol. 69 (1996) 59-61), with a volume term apart."""
+
+    mu: float = eqx.field(default=4e3, kw_only=True)
+    split = True
+
+    def energy(self, C, G, c):
+        return -10.0 * self.mu * jnp.log1p(-(jnp.trace(C) * c ** (-1 / 3) - 3.0) / 20.0)
+
+    def volumetric(self, J):
+        return self.mu * jnp.log(J) ** 2
+
+
+class Tissue(nc.Hyperelastic):
+    """Another, that depends on all of its arguments at once."""
+
+    mu: float = eqx.field(default=2e3, kw_only=True)
+
+    def energy(self, C, G, c):
+        mixed = jnp.trace(C) * jnp.trace(G) / 9.0 - 1.0 + (C[0, 1] - C[1, 2]) ** 2
+        return self.mu * (mixed + 0.25 * (c - 1.0) ** 2 - jnp.log(c))
+
+
+SMALL = {"E": 1e4, "nu": 0.3, "density": DENSITY}
+LAWS = {
+    "elastic": nc.Elastic(**SMALL),
+    "neo-Hooke": nc.NeoHooke(**SMALL),
+    "Mooney-Rivlin": nc.MooneyRivlin(c10=1.5e3, c01=5e2, bulk_modulus=8e3, density=DENSITY),
+    "compressible": nc.CompressibleMooneyRivlin(c10=1.5e3, c01=5e2, volume_stiffness=1e3, density=DENSITY),
+    "Ogden": nc.Ogden(
+        moduli=(3e3, 20.0, -100.0), exponents=(1.3, 5.0, -2.0), bulk_modulus=8e3, density=DENSITY
+    ),
+    "fibres": nc.TransverselyIsotropic(**SMALL, fibre_stiffness=2e4, direction=(1.0, 2.0, 0.5)),
+    "Gent": Gent(density=DENSITY),
+    "tissue": Tissue(density=DENSITY),
+}
+ELEMENTS = {
+    "Brick": "hexahedron8",
+    "Hexahedron8": "hexahedron8",
+    "Hexahedron20": "hexahedron20",
+    "Hexahedron27": "hexahedron27",
+    "Hexahedron27P1": "hexahedron27",
+    "Tetrahedron10": "tetrahedron10",
+    "Tetrahedron10P0": "tetrahedron10",
+}
+PAIRED = [("Brick", "elastic")]
+PAIRED += [(e, "elastic") for e in ELEMENTS if e != "Brick" and "P" not in e]
+PAIRED += [(e, "neo-Hooke") for e in ELEMENTS if e != "Brick"]
+PAIRED += [("Hexahedron8", law) for law in LAWS if law not in ("elastic", "neo-Hooke")]
+PAIRED += [("Hexahedron27P1", "Ogden"), ("Hexahedron27P1", "Gent"), ("Tetrahedron10P0", "Mooney-Rivlin")]
+
+
+def inner_moved(mesh, size):
+    """A mesh whose inner nodes are moved at random, of tetrahedra such that edges stay straight."""
+    random = np.random.default_rng(1)
+    low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
+    inner = np.all((mesh.nodes > low + 1e-9) & (mesh.nodes < high - 1e-9), axis=1)
+    nodes = mesh.nodes + inner[:, None] * size * random.uniform(-1, 1, mesh.nodes.shape)
+    if mesh.cells.shape[1] == 10:
+        for k, (a, b) in enumerate(TETRAHEDRON_EDGES):
+            nodes[mesh.cells[:, 4 + k]] = 0.5 * (nodes[mesh.cells[:, a]] + nodes[mesh.cells[:, b]])
+    assert not np.allclose(nodes, mesh.nodes), "nothing was moved"
+    return nc.mesh.Mesh(nodes, mesh.cells, mesh.sets, mesh.faces)
+
+
+def placed(system, part, places):
+    """A start with the nodes of a part at given places."""
+    system, state = system.compile()
+    rows = np.asarray(state.q).reshape(-1, 4, 3).copy()
+    rows[:, 0] = places
+    return system, nc.State(**{**vars(state), "q": jnp.asarray(rows.reshape(-1, 3))})
+
+
+def density_of(law, f):
+    """Energy per volume by a deformation gradient."""
+    strain = (0.5 * (f.T @ f - jnp.eye(3)))[FIRST, SECOND] * np.where(FIRST == SECOND, 1.0, 2.0)
+    return law.energy_density(strain[:, None])[0]
+
+
+@pytest.mark.parametrize(("element", "law"), PAIRED)
+def test_patch(element, law):
+    """A uniform deformation of a distorted mesh: no forces on inner nodes, and the stress of the law."""
+    mesh = inner_moved(nc.mesh.box((1.0, 0.8, 0.6), (2, 2, 2), element=ELEMENTS[element]), 0.05)
+    scene = nc.Scene()
+    part = scene.add(nc.Solid(mesh, material=LAWS[law], element=element))
+    gradient = np.array([(1.1, 0.2, -0.1), (0.05, 0.9, 0.15), (0.0, -0.1, 1.2)])
+    system, state = placed(scene, part, mesh.nodes @ gradient.T)
+    forces = jax.grad(lambda q: system.energy(nc.State(**{**vars(state), "q": q})).total)(state.q)
+    forces = np.asarray(forces).reshape(-1, 4, 3)[:, 0]
+    low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
+    inner = np.all((mesh.nodes > low + 1e-9) & (mesh.nodes < high - 1e-9), axis=1)
+    assert inner.any()
+    assert np.abs(forces[inner]).max() <= 10 * tol.INDIFFERENCE * np.abs(forces).max()
+    first = jax.grad(lambda f: density_of(LAWS[law], f))(jnp.asarray(gradient))
+    stress = first @ gradient.T / np.linalg.det(gradient)
+    found = system.sense(state, part)
+    assert np.abs(found.stress - stress).max() <= 100 * tol.INDIFFERENCE * np.abs(stress).max()
+    energy = 0.48 * density_of(LAWS[law], jnp.asarray(gradient))
+    assert float(system.energy(state).total) == pytest.approx(float(energy), rel=tol.INDIFFERENCE)
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_work_of_the_stress_of_a_step(law):
+    """It is the change of energy, however large the step; of a small one the stress is the derivative."""
+    random = np.random.default_rng(2)
+    law = LAWS[law]
+
+    def energy(strain):
+        return law.energy_density(strain[:, None])[0]
+
+    for size in (0.3, 1e-4):
+        f = np.eye(3) + 0.2 * random.normal(size=(2, 3, 3)) * np.array([1.0, size])[:, None, None]
+        f[1] = f[0] + size * (f[1] - np.eye(3))
+        start, end = (
+            jnp.asarray((0.5 * (x.T @ x - np.eye(3)))[FIRST, SECOND] * np.where(FIRST == SECOND, 1, 2))
+            for x in f
+        )
+        stress = law.mean_stress(start[:, None], (end - start)[:, None])[:, 0]
+        scale = float(jnp.sum(jnp.abs(stress * (end - start))))
+        assert abs(float(stress @ (end - start) - energy(end) + energy(start))) <= 1e-11 * 1e4 * max(
+            1e-5, scale * 1e-3
+        )
+    at = jax.grad(energy)(start)
+    limit = law.mean_stress(start[:, None], jnp.zeros((6, 1)))[:, 0]
+    np.testing.assert_allclose(limit, at, rtol=1e-9, atol=1e-6)
+    np.testing.assert_allclose(jax.grad(energy)(jnp.zeros(6)), 0.0, atol=1e-9)
+    shear = jax.hessian(energy)(jnp.zeros(6))
+    assert np.linalg.eigvalsh(shear).min() > 0
+
+
+def tumbling(element, law, **given):
+    """A block that flies, turns and is shaken."""
+    size = 1 if ELEMENTS[element] != "hexahedron8" else 2
+    mesh = nc.mesh.box((1.0, 0.5, 0.5), (size, 1, 1), element=ELEMENTS[element])
+    shaken = 0.6 * np.random.default_rng(0).normal(size=mesh.nodes.shape)
+    scene = nc.Scene()
+    scene.add(
+        nc.Solid(
+            mesh, material=LAWS[law], element=element, velocity=shaken, angular_velocity=(1, 2, 3), **given
+        )
+    )
+    return scene.compile()
+
+
+def conserved(system, trajectory):
+    found = nc.balance(system, trajectory)
+    assert found.energy.max() <= tol.ENERGY_OF_A_SOLID
+    assert found.momentum.max() <= tol.MOMENTUM_OF_A_SOLID
+    assert found.angular_momentum.max() <= tol.MOMENTUM_OF_A_SOLID
+    energy = system.energy(trajectory)
+    stored = np.asarray(energy.total - energy.kinetic)
+    assert stored.max() >= 0.02 * float(energy.total[0]), "it hardly moves"
+
+
+@pytest.mark.parametrize(
+    ("element", "law"), [("Hexahedron8", "neo-Hooke"), ("Hexahedron8", "tissue"), ("Tetrahedron10P0", "Gent")]
+)
+def test_a_block_in_motion(element, law):
+    system, state = tumbling(element, law)
+    conserved(system, nc.simulate(system, state, dt=0.02, steps=50))
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize(("element", "law"), PAIRED)
+def test_every_element_and_law_in_motion(element, law):
+    system, state = tumbling(element, law)
+    conserved(system, nc.simulate(system, state, dt=0.01, steps=1000))
+
+
+# --- statics ----------------------------------------------------------------------------------------------
+
+
+class NodeLoad(nc.Force):
+    """A dead force on a node that grows with the load parameter."""
+
+    force: jax.Array = eqx.field(kw_only=True)
+    kind = "node load"
+
+    def load(self, x, rate, inputs, t):
+        return Load(t * self.force[None], None)
+
+
+def held(scene, part, nodes, axis):
+    """Nodes that stay in their plane normal to an axis."""
+    table = nc.Point(nc.ground), nc.Direction(nc.ground, np.eye(3)[axis])
+    for node in nodes:
+        place = np.asarray(part.nodes.positions)[int(node)]
+        scene.add(nc.PointOnPlane((*table, nc.Point(part.nodes[int(node)])), distance=float(place[axis])))
+
+
+def consistent(nodes, faces, traction):
+    """Forces on nodes of a constant traction on faces of eight or nine nodes, or of four."""
+    forces = np.zeros_like(nodes)
+    for face in faces:
+        x = nodes[face]
+        if len(face) == 4:
+            area = 0.5 * np.linalg.norm(np.cross(x[2] - x[0], x[3] - x[1]))
+            forces[face] += 0.25 * area * traction
+        else:
+            values, slopes, weights = face_table(len(face))
+            one, other = (np.einsum("gk,kx->gx", slopes[:, :, k], x) for k in (0, 1))
+            areas = weights * np.linalg.norm(np.cross(one, other), axis=1)
+            forces[face] += np.outer(values.T @ areas, traction)
+    return forces
+
+
+def cook(element, count, nu):
+    """Cook's membrane in plane strain: how far the middle of the loaded edge moves up [mm]."""
+    box = nc.mesh.box((1.0, 1.0, 1.0), (count, count, 1), element=ELEMENTS[element])
+    u, v, w = box.nodes.T
+    nodes = np.stack([48 * u, 44 * u + v * (44 - 28 * u), w], axis=1)
+    mesh = nc.mesh.Mesh(nodes, box.cells, box.sets, box.faces)
+    scene = nc.Scene()
+    rubber = nc.NeoHooke(E=2 * 0.4225 * (1 + nu), nu=nu, density=1.0)
+    part = scene.add(nc.Solid(mesh, material=rubber, element=element))
+    scene.add(nc.Clamp(nc.ground, part.set("x0")))
+    layers = np.union1d(mesh.sets["z0"], mesh.sets["z1"])
+    held(scene, part, np.setdiff1d(layers, mesh.sets["x0"]), 2)
+    forces = consistent(nodes, mesh.faces["x1"], np.array([0.0, 1 / 16, 0.0]))
+    loaded = np.flatnonzero(forces[:, 1])
+    scene.add(NodeLoad.on(part.nodes, loaded[:, None], each={"force": forces[loaded]}))
+    system, state = scene.compile()
+    end = nc.equilibrium(system, state, steps=2 if nu < 0.4 else 8).state
+    middle = part.nearest((48.0, 52.0, 0.0))
+    return float(system.sense(end, middle).position[1]) - 52.0
+
+
+COOK = [
+    ("Hexahedron8", 2, 0.3, 8.638),
+    ("Hexahedron27P1", 2, 0.4999, 11.889),
+]
+COOK_SLOW = [
+    ("Hexahedron8", 4, 0.3, 12.071),
+    ("Hexahedron20", 2, 0.3, 13.913),
+    ("Hexahedron27", 2, 0.3, 14.302),
+]
+COOK_FINEST = [
+    ("Hexahedron8", 8, 0.3, 13.863),
+    ("Hexahedron27", 4, 0.3, 14.649),
+    ("Hexahedron27P1", 2, 0.3, 14.663),
+    ("Hexahedron8", 4, 0.4999, 4.11),
+    ("Hexahedron27P1", 4, 0.4999, 11.954),
+]
+
+
+@pytest.mark.parametrize(("element", "count", "nu", "published"), COOK)
+def test_cooks_membrane(element, count, nu, published):
+    assert cook(element, count, nu) == pytest.approx(published, abs=tol.COOK)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("element", "count", "nu", "published"), COOK_SLOW)
+def test_cooks_membrane_on_finer_meshes(element, count, nu, published):
+    assert cook(element, count, nu) == pytest.approx(published, abs=tol.COOK)
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize(("element", "count", "nu", "published"), COOK_FINEST)
+def test_cooks_membrane_on_the_finest_meshes(element, count, nu, published):
+    assert cook(element, count, nu) == pytest.approx(published, abs=tol.COOK)
+
+
+def cylinder(law, element, counts, pressure):
+    """How far the inside of a thick cylinder in plane strain moves under pressure [m]: radius 1 to 2."""
+    box = nc.mesh.box((1.0, 1.0, 1.0), counts, element=ELEMENTS[element])
+    u, v, w = box.nodes.T
+    angle = 0.5 * np.pi * v
+    nodes = np.stack([(1 + u) * np.cos(angle), (1 + u) * np.sin(angle), 0.2 * w], axis=1)
+    mesh = nc.mesh.Mesh(nodes, box.cells, box.sets, box.faces)
+    scene = nc.Scene()
+    part = scene.add(nc.Solid(mesh, material=law, element=element))
+    for name, axis in (("y0", 1), ("y1", 0)):
+        held(scene, part, mesh.sets[name], axis)
+    held(scene, part, np.union1d(mesh.sets["z0"], mesh.sets["z1"]), 2)
+    scene.add(nc.Pressure(part.face("x0"), lambda t: pressure * t))
+    system, state = scene.compile()
+    end = nc.equilibrium(system, state, steps=2).state
+    return float(system.sense(end, part.nearest((1.0, 0.0, 0.0))).position[0]) - 1.0
+
+
+def exact_cylinder(law, pressure):
+    """The same by a polynomial of high degree for the radius, at which the energy is stationary."""
+    x, weights = np.polynomial.legendre.leggauss(24)
+    radius, weights = 1.5 + 0.5 * x, 0.5 * weights
+    powers = np.polynomial.legendre.legvander(x, 10)
+    slopes = np.stack([2 * np.polynomial.legendre.Legendre.basis(k).deriv()(x) for k in range(11)], axis=1)
+    inside = np.polynomial.legendre.legvander(np.array([-1.0]), 10)[0]
+
+    def energy(a):
+        stretches = jnp.stack([1 + slopes @ a, 1 + powers @ a / radius, jnp.ones(24)])
+        strain = jnp.concatenate([0.5 * (stretches**2 - 1), jnp.zeros((3, 24))])
+        return jnp.sum(weights * radius * law.energy_density(strain)) - 0.5 * pressure * (1 + inside @ a) ** 2
+
+    a = jnp.zeros(11)
+    for _ in range(12):
+        a = a - jnp.linalg.solve(jax.hessian(energy)(a), jax.grad(energy)(a))
+    assert np.abs(jax.grad(energy)(a)).max() < 1e-12 * max(1.0, pressure)
+    return float(inside @ a)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("element", "law", "pressure"),
+    [
+        ("Hexahedron20", nc.NeoHooke(E=1.0, nu=0.3, density=1.0), 0.15),
+        ("Hexahedron27", nc.CompressibleMooneyRivlin(c10=0.15, c01=0.05, density=1.0), 0.15),
+        ("Hexahedron27P1", nc.NeoHooke(E=1.0, nu=0.4999, density=1.0), 0.12),
+        ("Tetrahedron10P0", nc.MooneyRivlin(c10=0.1, c01=0.06, bulk_modulus=50.0, density=1.0), 0.1),
+    ],
+)
+def test_thick_cylinder_under_pressure(element, law, pressure):
+    """Against the exact solution, with large strains; the error falls."""
+    exact = exact_cylinder(law, pressure)
+    assert exact > 0.1, "strains are small"
+    coarse, fine = (cylinder(law, element, (n, 2 * n, 1), pressure) - exact for n in (1, 2))
+    assert abs(fine) <= tol.CYLINDER * exact
+    assert abs(coarse) >= 2.0 * abs(fine)
+
+
+# --- dynamics against others ------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_a_beam_of_bricks_falls():
+    """Clamped, under its weight (case V05 of the references): how high its tip is at two times."""
+    metal = nc.Elastic(E=2.1e7, nu=0.3, density=500.0)
+    scene = nc.Scene()
+    part = scene.add(nc.Solid(nc.mesh.box((1.0, 0.1, 0.01), (10, 1, 1)), material=metal))
+    scene.add(nc.Clamp(nc.ground, part.set("x0")))
+    scene.add(nc.Gravity())
+    system, state = scene.compile()
+    trajectory = nc.simulate(system, state, dt=2.5e-3, steps=200)
+    tip = system.body_index(part.nearest((1.0, 0.1, 0.01)))
+    height = np.asarray(trajectory.q)[[100, 200], 4 * tip, 2] - 0.01
+    np.testing.assert_allclose(height, (-0.3793, -0.8826), atol=tol.FALLING_BEAM)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("element", "number"), [("Hexahedron27P1", "E"), ("Tetrahedron10", "reference")])
+def test_gradients(element, number):
+    """Of where a corner is after some steps, by a modulus and by the shape without stress; V-shaped."""
+    mesh = nc.mesh.box((1.0, 0.5, 0.5), (1, 1, 1), element=ELEMENTS[element])
+    scene = nc.Scene()
+    part = scene.add(nc.Solid(mesh, material=nc.NeoHooke(E=1e4, nu=0.4, density=DENSITY), element=element))
+    scene.add(nc.Clamp(nc.ground, part.set("x0")))
+    scene.add(nc.Gravity())
+    system, state = scene.compile()
+    tip = system.body_index(part.nearest((1.0, 0.5, 0.5)))
+    given = system.get(part, number)
+
+    def last(factor):
+        changed = system.set(part, **{number: factor * given})
+        return nc.simulate(changed, state, dt=5e-3, steps=10).q[-1, 4 * tip, 2]
+
+    one, last = jnp.asarray(1.0), jax.jit(last)
+    assert_v_shaped(last, one, one, jax.grad(last)(one))
+
+
+# --- input ------------------------------------------------------------------------------------------------
+
+
+def pushed(mesh, faces):
+    """What a pressure of one pushes on faces in all [N]."""
+    load = LOADS[faces.shape[1]]
+    one = load([nc.Point(nc.ground, x) for x in mesh.nodes[faces[0]]], pressure=1.0)
+    return sum(
+        np.asarray(one.load(jnp.asarray(mesh.nodes[f]), None, None, 0.0).forces).sum(axis=0) for f in faces
+    )
+
+
+@pytest.mark.parametrize("element", ["hexahedron8", "hexahedron20", "hexahedron27", "tetrahedron10"])
+def test_boxes(element):
+    """Their volume, faces from outside, and the force of a pressure on all of them, which is none."""
+    mesh = nc.mesh.box((1.0, 2.0, 0.5), (2, 1, 1), element=element)
+    scene = nc.Scene()
+    scene.add(nc.Solid(mesh, material=LAWS["neo-Hooke"]))
+    masses = np.asarray(scene.compile()[0].mass)[:, 0, 0]
+    assert masses.sum() == pytest.approx(DENSITY, rel=1e-12)
+    assert masses.min() > 0
+    np.testing.assert_allclose(pushed(mesh, mesh.faces["x1"]), (-1.0, 0, 0), atol=1e-13)
+    np.testing.assert_allclose(pushed(mesh, mesh.outside), 0.0, atol=1e-13)
+    assert sum(len(x) for x in mesh.faces.values()) == len(mesh.outside)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: nc.NeoHooke(E=1.0, nu=0.5), r"nu \[-\] is 0.5; pass a number between -1 and 1/2, as 0.4999"),
+        (lambda: nc.Ogden(moduli=(1.0,), exponents=(1.0, 2.0), bulk_modulus=1.0), "as many of both"),
+        (
+            lambda: nc.TransverselyIsotropic(E=1.0, nu=0.3, fibre_stiffness=1.0, direction=(0, 0, 0)),
+            r"direction \[-\] of the fibres is zero",
+        ),
+        (lambda: solid("hexahedron27", element="Hexahedron20"), "Hexahedron20 is no element for <mesh"),
+        (lambda: solid("hexahedron8", element="Brick"), "keep Brick to nc.Elastic"),
+        (
+            lambda: solid("hexahedron27", element="Hexahedron27P1", material=LAWS["elastic"]),
+            "Elastic does not split off",
+        ),
+        (lambda: solid("hexahedron20", turn=True), "element 0, .* is degenerate or turned inside out"),
+        (lambda: nc.mesh.Mesh(np.eye(4, 3), [[0, 1, 2, 3, 0]]), r"\(m, 10\) of tetrahedra"),
+        (lambda: nc.mesh.box((1, 1, 1), (1, 1, 1)).part("rubber"), "there is no part 'rubber'; it has none"),
+    ],
+)
+def test_wrong_input_is_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def solid(mesh, turn=False, material=LAWS["neo-Hooke"], **given):
+    mesh = nc.mesh.box((1, 1, 1), (1, 1, 1), element=mesh)
+    if turn:
+        mesh = nc.mesh.Mesh(mesh.nodes * np.array([1.0, 1.0, -1.0]), mesh.cells)
+    scene = nc.Scene()
+    scene.add(nc.Solid(mesh, material=material, **given))
+    return scene.compile()
+
+
+# --- files ------------------------------------------------------------------------------------------------
+
+
+def written(folder, order, layers=0, serendipity=False):
+    """A file of gmsh: a box of tetrahedra, or of hexahedra in layers, with groups."""
+    gmsh = pytest.importorskip("gmsh")
+    gmsh.initialize(interruptible=False)
+    gmsh.option.setNumber("General.Terminal", 0)
+    gmsh.option.setNumber("Mesh.MeshSizeMin", 0.5)
+    gmsh.option.setNumber("Mesh.MeshSizeMax", 0.6)
+    gmsh.option.setNumber("Mesh.SecondOrderIncomplete", serendipity)
+    kernel, mesh = gmsh.model.occ, gmsh.model.mesh
+    plate = kernel.addRectangle(0, 0, 0, 1, 0.5)
+    kernel.extrude([(2, plate)], 0, 0, 0.5, numElements=[layers] if layers else [], recombine=bool(layers))
+    kernel.synchronize()
+    if layers:
+        mesh.setTransfiniteSurface(plate)
+        mesh.setRecombine(2, plate)
+    for _, face in gmsh.model.getEntities(2):
+        place = kernel.getCenterOfMass(2, face)[0]
+        if min(place, 1 - place) < 1e-6:
+            gmsh.model.addPhysicalGroup(2, [face], name="held" if place < 0.5 else "pushed")
+    gmsh.model.addPhysicalGroup(1, [1], 7)
+    gmsh.model.addPhysicalGroup(3, [1], name="rubber")
+    mesh.generate(3)
+    mesh.setOrder(order)
+    gmsh.write(str(folder / "part.msh"))
+    gmsh.finalize()
+    return folder / "part.msh"
+
+
+@pytest.mark.parametrize(
+    ("order", "layers", "serendipity", "nodes"),
+    [(2, 0, False, 10), (1, 1, False, 8), (2, 1, True, 20), (2, 1, False, 27)],
+)
+def test_a_mesh_of_gmsh(tmp_path, order, layers, serendipity, nodes):
+    """Nodes in our order: the volume is right, and a pressure on a face by its name shortens it."""
+    mesh = nc.io.read_mesh(written(tmp_path, order, layers, serendipity))
+    assert mesh.cells.shape[1] == nodes
+    assert sorted(mesh.faces) == ["held", "pushed"]
+    assert sorted(mesh.sets) == ["7", "held", "pushed"]
+    np.testing.assert_array_equal(mesh.nodes[mesh.sets["held"]][:, 0], 0.0)
+    assert len(mesh.part("rubber").cells) == len(mesh.cells)
+    scene = nc.Scene()
+    scene.add(nc.Solid(mesh, material=LAWS["neo-Hooke"]))
+    assert float(scene.compile()[0].mass[:, 0, 0].sum()) == pytest.approx(250.0, rel=1e-9)
+    np.testing.assert_allclose(pushed(mesh, mesh.faces["pushed"]), (-0.25, 0, 0), atol=1e-13)
+    np.testing.assert_allclose(pushed(mesh, mesh.outside), 0.0, atol=1e-13)
+
+
+def test_meshes_that_cannot_be_read(tmp_path):
+    with pytest.raises(ValueError, match="Tetrahedron.* of 4 nodes: .*ElementOrder = 2"):
+        nc.io.read_mesh(written(tmp_path, 1))
+    with pytest.raises(ValueError, match="there is no file"):
+        nc.io.read_mesh(tmp_path / "none.msh")
