@@ -106,8 +106,10 @@ from natcoord_jax.effects.beams import (
 from natcoord_jax.effects.constraints import PointOnLine, PointOnPlane, PointOnPoint, PointSum, Rod, Rolling
 from natcoord_jax.effects.contact import (
     CapsuleOnCapsule,
+    DiscreteGap,
     EllipsoidOnPlane,
     GapPotential,
+    NodeOnFacets,
     SphereOnBox,
     SphereOnPlane,
     SphereOnSphere,
@@ -189,6 +191,7 @@ __all__ = [
     "DirectorDamping",
     "DirectorElement",
     "DirectorInterpolation",
+    "DiscreteGap",
     "Dissipative",
     "Distance",
     "Drive",
@@ -220,6 +223,7 @@ __all__ = [
     "MeshHandle",
     "Modes",
     "Nodes",
+    "NodeOnFacets",
     "NonlinearBeamElement",
     "NonlinearProgram",
     "NonlinearSpring",

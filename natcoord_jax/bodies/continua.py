@@ -40,10 +40,14 @@ class MeshHandle(Handle):
         nodes: of the mesh, a set that is indexed, sliced and selected by position; joints, loads, springs and
             sensors take its nodes as any body.
         mesh: as it was given.
+        material: of it.
+        thickness: of a shell at its cells (cells,) [m]; None: it is a solid.
     """
 
     nodes: NodeSet = field(compare=False)
     mesh: Mesh = field(compare=False)
+    material: Any = field(compare=False, repr=False, default=None)
+    thickness: Any = field(compare=False, repr=False, default=None)
 
     def set(self, name: str) -> NodeSet:
         """The nodes of a set of the mesh, as "left".
@@ -141,9 +145,9 @@ class _Continuum(Recipe):
         given = as_array(self.position, float), turned, as_array(self.velocity, float), spin
         return *_placed(as_array(self.mesh.nodes, float), *given), turned, spin
 
-    def _handle(self, scene: Builder, nodes: NodeSet, elements: Any) -> MeshHandle:
+    def _handle(self, scene: Builder, nodes: NodeSet, elements: Any, thickness: Any = None) -> MeshHandle:
         found = scene.add(elements)
-        return MeshHandle(found.kind, found.name, found.scene, nodes, self.mesh)
+        return MeshHandle(found.kind, found.name, found.scene, nodes, self.mesh, self.material, thickness)
 
 
 class Shell(_Continuum):
@@ -203,7 +207,8 @@ class Shell(_Continuum):
             )
         own = {"each": {"thickness": thick}} if thick.ndim else {"thickness": thick}
         elements = ShellElement.on(nodes, self.mesh.cells, material=self.material, name=name, **own)
-        return self._handle(scene, nodes, elements)
+        each = as_array(np.broadcast_to(thick, (len(self.mesh.cells),))) if is_concrete(thick) else thick
+        return self._handle(scene, nodes, elements, each)
 
     def _check_folds(self, normals: Array, name: str) -> None:
         if not is_concrete(normals, self.mesh.nodes):
