@@ -44,9 +44,9 @@ class Contact(Recipe):
     There are gaps for spheres, capsules, boxes (by their corners), ellipsoids, points, beams and the nodes of
     shells and solids on planes; for spheres, capsules and beams on each other and on points and nodes; for
     spheres, points and nodes on boxes; and for surfaces of shells and solids on each other, nodes of either
-    on the facets of the other, each with half the stiffness. Other shapes touch a shell or a solid at its nodes
-    only: what is smaller than its cells slips through. Where a step is longer than a body, it may pass another
-    without ever overlapping with it.
+    on the facets of the other, each with half the stiffness. Other shapes touch a shell or a solid at its
+    nodes only: what is smaller than its cells slips through. Where a step is longer than a body, it may pass
+    another without ever overlapping with it.
 
     Shells are touched from both sides, where their thickness ends; solids from outside, best at all that is
     outside, since at the end of a surface nodes slip off it. Which facets a node may touch is settled

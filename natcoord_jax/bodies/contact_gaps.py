@@ -14,7 +14,7 @@ from natcoord_jax.bodies.contact_sides import (
     Strand,
 )
 from natcoord_jax.bodies.continua import Surface
-from natcoord_jax.bodies.node_surface import node_surface_gaps
+from natcoord_jax.bodies.node_surface import surface_gaps
 from natcoord_jax.bodies.shapes import CORNERS, Box, Capsule, Ellipsoid, Sphere
 from natcoord_jax.core.checks import as_array
 from natcoord_jax.core.eager_numpy import stacked
@@ -126,7 +126,7 @@ def _segments(one: SegmentSide, other: SegmentSide, law: Law, name: str) -> Gaps
 
 
 def _surfaces(one: MeshSide, other: MeshSide, law: Law, name: str) -> Gaps:
-    return [*node_surface_gaps(one, other, law, name), *node_surface_gaps(other, one, law, name)]
+    return [surface_gaps(one, other, law, name)]
 
 
 TABLE: dict[tuple[type, type], Callable[..., Gaps]] = {

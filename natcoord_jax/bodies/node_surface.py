@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from natcoord_jax.bodies.contact_sides import MeshSide
+from natcoord_jax.core.elements import Elements
 from natcoord_jax.core.nodes import NodeUnion
 from natcoord_jax.effects.contact import NodeOnFacets
 
@@ -13,38 +14,38 @@ CANDIDATES = 16
 """Facets that a node may touch, by default."""
 
 
-def node_surface_gaps(slave: MeshSide, master: MeshSide, law: dict[str, Any], name: str) -> list[Any]:
-    """Gaps of the nodes of one surface on the facets of another, with half the stiffness of the nodes.
+def surface_gaps(one: MeshSide, other: MeshSide, law: dict[str, Any], name: str) -> Elements:
+    """Gaps of the nodes of each of two surfaces on the facets of the other, with half the stiffness of each.
 
-    The other half is that of the same contact the other way round: so no surface has a part of its own.
+    So no surface has a part of its own, and edges are touched from both sides.
 
     Args:
-        slave: whose nodes.
-        master: whose facets.
+        one: surface.
+        other: surface.
         law: numbers of the contact; stiffness None: that of the elements; "candidates": facets of each node.
-        name: of the contact, for messages.
+        name: of the contact.
     """
     law = dict(law)
-    most = law.pop("candidates", None) or CANDIDATES
-    numbers, used = slave.numbers, master.numbers
-    facets = np.searchsorted(used, master.surface.faces)
-    places = np.asarray(master.surface.handle.nodes.positions)[used]
-    nodes = np.asarray(slave.surface.handle.nodes.positions)[numbers]
-    thick, stiff = slave.of_nodes()
-    if law["stiffness"] is None:
-        law["stiffness"] = stiff
-    near = _nearest(nodes, places[facets], min(most, len(facets)))
-    connectivity, local, ends = _patches(facets, near, len(numbers))
-    beneath = master.of_nodes()[0].max() if master.shell else 0.0
-    each = {
-        "facets": local,
-        "open": ends,
-        "thickness": thick + beneath,
-        "stiffness": 0.5 * np.broadcast_to(law.pop("stiffness"), len(numbers)),
-    }
-    union = NodeUnion((slave.surface.handle.nodes[numbers], master.surface.handle.nodes[used]))
-    given = {"each": each, "two_sided": master.shell, **law}
-    return [NodeOnFacets.on(union, connectivity, **given)]
+    most = min(law.pop("candidates", None) or CANDIDATES, max(len(s.surface.faces) for s in (one, other)))
+    given = law.pop("stiffness")
+    sides = (one, other), (other, one)
+    first = 0, len(one.numbers)
+    patches = [_patches(a, b, most, first, k) for k, (a, b) in enumerate(sides)]
+    width = max(table.shape[1] for table, _, _ in patches)
+    # What fills up repeats the last node, so that both ways are alike.
+    tables = [np.pad(table, ((0, 0), (0, width - table.shape[1])), mode="edge") for table, _, _ in patches]
+    each: dict[str, list[Any]] = {"facets": [], "open": [], "thickness": [], "stiffness": [], "two_sided": []}
+    for (slave, master), (_, facets, ends) in zip(sides, patches):
+        thick, stiff = slave.of_nodes()
+        beneath = master.of_nodes()[0].max() if master.shell else 0.0
+        each["facets"].append(facets)
+        each["open"].append(ends)
+        each["thickness"].append(thick + beneath)
+        each["stiffness"].append(0.5 * (stiff if given is None else np.full(len(thick), float(given))))
+        each["two_sided"].append(np.full(len(thick), float(master.shell)))
+    union = NodeUnion(tuple(s.surface.handle.nodes[s.numbers] for s in (one, other)))
+    numbers = {key: np.concatenate(values) for key, values in each.items()}
+    return NodeOnFacets.on(union, np.concatenate(tables), each=numbers, **law)
 
 
 def _nearest(
@@ -52,27 +53,39 @@ def _nearest(
 ) -> Int[np.ndarray, "n k"]:
     """Numbers of the facets whose middles are the nearest to each node."""
     apart = nodes[:, None] - corners.mean(axis=1)
-    return np.argsort(np.sum(apart**2, axis=2), axis=1, kind="stable")[:, :most]
+    found = np.argsort(np.sum(apart**2, axis=2), axis=1, kind="stable")[:, :most]
+    return np.pad(found, ((0, 0), (0, most - found.shape[1])), mode="edge")
 
 
 def _patches(
-    facets: Int[np.ndarray, "f 4"], near: Int[np.ndarray, "n k"], first: int
+    slave: MeshSide, master: MeshSide, most: int, first: tuple[int, int], turn: int
 ) -> tuple[Int[np.ndarray, "n m"], Int[np.ndarray, "n k 4"], Float[np.ndarray, "n k 4"]]:
-    """For each node the nodes of its facets, these by their places among them, and which edges are ends.
+    """For each node itself and the nodes of its facets, the facets by places among them, and which edges end.
 
     Args:
-        facets: of the whole surface.
-        near: numbers of those of each node.
-        first: number of the surface's first node among all.
+        slave: whose nodes.
+        master: whose facets.
+        most: facets of each node; a smaller surface repeats some.
+        first: numbers of the first nodes of both surfaces, in the order in which they are numbered.
+        turn: 0 where the slave is the first of them, else 1.
     """
+    facets = np.searchsorted(master.numbers, master.surface.faces)
+    places = np.asarray(master.surface.handle.nodes.positions)[master.numbers]
+    nodes = np.asarray(slave.surface.handle.nodes.positions)[slave.numbers]
+    near = _nearest(nodes, places[facets], most)
     corners = facets[near]
     unique = [np.unique(x) for x in corners]
     width = max(map(len, unique))
-    # What fills up repeats the last node.
     table = np.stack([np.pad(x, (0, width - len(x)), mode="edge") for x in unique])
     local = np.stack([np.searchsorted(x, c) for x, c in zip(unique, corners)]) + 1
     edges = np.sort(np.stack([corners, np.roll(corners, -1, axis=2)], axis=-1), axis=-1)
-    edges = edges.reshape(len(near), -1, 2)
-    shared = np.stack([np.sum((e[:, None] == e[None]).all(axis=2), axis=1) for e in edges])
-    connectivity = np.concatenate([np.arange(len(near))[:, None], first + table], axis=1)
-    return connectivity, local, (shared == 1).reshape(local.shape).astype(float)
+    ends = [_alone(e, f) for e, f in zip(edges, near)]
+    own = first[turn] + np.arange(len(near))
+    return np.concatenate([own[:, None], first[1 - turn] + table], axis=1), local, np.stack(ends)
+
+
+def _alone(edges: Int[np.ndarray, "k 4 2"], facets: Int[np.ndarray, " k"]) -> Float[np.ndarray, "k 4"]:
+    """Which edges of facets belong to no other of them."""
+    same = (edges[:, :, None, None] == edges).all(axis=-1)
+    others = same & (facets[:, None] != facets)[:, None, :, None]
+    return (~others.any(axis=(2, 3))).astype(float)

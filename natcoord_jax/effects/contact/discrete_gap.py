@@ -3,7 +3,7 @@
 A force that does exactly the work of an energy V(g) of a gap g, and neither pushes nor turns as a whole, is
 -[V(g_1) - V(g_0)] / (g_1 - g_0) times a discrete derivative of the gap,
 
-    D g = G_m + [g(q_1) - g(q_0) - G_m . (q_1 - q_0)] c / |Delta pi|^2,    c = D pi(q_m)^T Delta pi,           (1)
+    D g = G_m + [g(q_1) - g(q_0) - G_m . (q_1 - q_0)] c / |Delta pi|^2,    c = D pi(q_m)^T Delta pi,
 
 with any lever G_m in the middle of the step whose sum and moment vanish, and squares of distances pi, whose
 derivatives have neither as well. Both gaps are those of the places themselves: whatever facet is the nearest
@@ -30,14 +30,28 @@ from natcoord_jax.core.potential import marker_response, place_markers
 from natcoord_jax.effects.contact.law import ContactLaw, ContactReadings
 
 RIGID = 1e-20
-"""Square of the change of distances, relative to theirs, below which the points have moved as a rigid body."""
+"""Square of the change of distances, relative to theirs, below which the points move as a rigid body."""
 
 OVERLAPPING = 1e-6
 """Overlap at the start, relative to the size of the facets, that is more than rounding of places."""
 
 
+class Measured(eqx.Module):
+    """A gap at one place of its points.
+
+    Attributes:
+        gap: of the surfaces, negative where they overlap [m].
+        lever: covector whose sum and moment vanish, near enough the derivative of the gap [-].
+        between: numbers of the points whose distances carry the correction of the lever.
+    """
+
+    gap: Float[Array, ""]
+    lever: Float[Array, "k 3"]
+    between: Int[Array, " p"]
+
+
 class DiscreteGap(ContactLaw):
-    """Base of contacts of points: subclass it and give `gap`, a lever, and the points that it is between.
+    """Base of contacts of points: subclass it and give what is `measured` of them.
 
     Unlike that of `GapPotential`, the gap may be any function of the points that does not change when all of
     them move as a rigid body.
@@ -58,16 +72,12 @@ class DiscreteGap(ContactLaw):
         return self.markers
 
     @abc.abstractmethod
+    def measured(self, x: Float[Array, "k 3"]) -> Measured:
+        """Gap, lever, and the points that they are between."""
+
     def gap(self, x: Float[Array, "k 3"]) -> Float[Array, ""]:
         """Distance of the surfaces, negative where they overlap [m]."""
-
-    def lever(self, x: Float[Array, "k 3"]) -> Float[Array, "k 3"]:
-        """Covector whose sum and moment vanish, near enough the derivative of the gap [-]."""
-        return jax.grad(self.gap)(x)
-
-    def between(self, x: Float[Array, "k 3"]) -> Int[Array, " p"]:
-        """Numbers of the points whose distances carry the correction of the lever; all of them."""
-        return jnp.arange(x.shape[0])
+        return self.measured(x).gap
 
     def assembled_at(self, x: Float[Array, "k 3"]) -> "DiscreteGap":
         """With its damping, and the gap that it starts with in terms of the size of all."""
@@ -85,8 +95,8 @@ class DiscreteGap(ContactLaw):
         start, rates = place_markers(place, motion.start), place_markers(place, motion.rates)
         stages = place_markers(place, motion.rows if motion.force_rows is None else motion.force_rows)
         weights = jnp.asarray(now.tableau.b)
-        gaps, derivatives = self._discrete(start, stages, now.h * rates, weights)
-        elastic = self.mean_force(*gaps)
+        begun, ended, derivatives = self._discrete(start, stages, now.h * rates, weights)
+        elastic = self.mean_force(begun.gap, ended.gap)
         flow = jnp.einsum("i,ikx,ikx->", weights, derivatives, rates)
         forces = elastic * derivatives
         given = jnp.sum(forces * rates, axis=(1, 2))
@@ -99,22 +109,22 @@ class DiscreteGap(ContactLaw):
 
     def _discrete(
         self, start: Array, stages: Float[Array, "s k 3"], moved: Float[Array, "s k 3"], weights: Array
-    ) -> tuple[tuple[Array, Array], Float[Array, "s k 3"]]:
-        """Gaps at both ends of a step, and the discrete derivatives at its stages."""
-        increment = jnp.einsum("i,ikx->kx", weights, moved)
-        gaps = self.gap(start), self.gap(start + increment)
-        levers = jax.vmap(self.lever)(stages)
+    ) -> tuple[Measured, Measured, Float[Array, "s k 3"]]:
+        """What is measured at both ends of a step, and the discrete derivatives at its stages."""
+        end = start + jnp.einsum("i,ikx->kx", weights, moved)
+        every = jax.vmap(self.measured)(jnp.concatenate([start[None], end[None], stages]))
+        begun, ended, first = (jax.tree.map(lambda y, k=k: y[k], every) for k in range(3))
+        levers, at = every.lever[2:], first.between
         # Pairs of points, and by how much the squares of their distances change along the whole step.
-        at = self.between(stages[0])
         apart, parting = _apart(stages, at), _apart(moved, at)
         changes = 2.0 * jnp.einsum("i,iabx,iabx->ab", weights, apart, parting)
         square, scale = jnp.sum(changes**2), jnp.sum(jnp.sum(apart[0] ** 2, axis=2) ** 2)
         loose = square > RIGID * scale
-        missing = gaps[1] - gaps[0] - jnp.einsum("i,ikx,ikx->", weights, levers, moved)
+        missing = ended.gap - begun.gap - jnp.einsum("i,ikx,ikx->", weights, levers, moved)
         factor = jnp.where(loose, missing / jnp.where(loose, square, 1.0), 0.0)
         # Every pair is there twice: half of the sum, and both of its points.
         carried = 4.0 * factor * jnp.einsum("ab,iabx->iax", changes, apart)
-        return gaps, levers.at[:, at].add(carried)
+        return begun, ended, levers.at[:, at].add(carried)
 
     def tangents(
         self, place: Array, motion: Motion, now: StepContext, lam: Array, *, turning: bool
@@ -126,16 +136,16 @@ class DiscreteGap(ContactLaw):
         def one(effect: Any, place: Array, start: Array, middle: Array, rates: Array) -> tuple[Array, Array]:
             x, rate = (place_markers(place, y)[None] for y in (middle, rates))
             begun = place_markers(place, start)
-            (before, after), found = effect._discrete(begun, x, now.h * rate, jnp.ones(1))
+            first, last, found = effect._discrete(begun, x, now.h * rate, jnp.ones(1))
             moving = now.h > 0
 
             def force(after: Array) -> Array:
-                speed = (before - after) / jnp.where(moving, now.h, 1.0)
-                return effect.mean_force(before, after) * effect._lossy(jnp.where(moving, speed, 0.0))
+                speed = (first.gap - after) / jnp.where(moving, now.h, 1.0)
+                return effect.mean_force(first.gap, after) * effect._lossy(jnp.where(moving, speed, 0.0))
 
-            size, slope = jax.value_and_grad(force)(after)
-            follows = effect.lever(begun + now.h * rate[0]).reshape(-1)
-            return -slope * found[0].reshape(-1)[:, None] * follows, size * found[0]
+            size, slope = jax.value_and_grad(force)(last.gap)
+            along = found[0].reshape(-1)
+            return -slope * along[:, None] * last.lever.reshape(-1), size * found[0]
 
         stiffness, forces = jax.vmap(one)(self, place, motion.start, motion.rows[0], motion.rates[0])
         return by_twists(stiffness, forces[:, :, None], place[:, :, None], motion, now.h, turning)

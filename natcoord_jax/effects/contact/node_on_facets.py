@@ -9,9 +9,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from natcoord_jax.core.arguments import is_a
-from natcoord_jax.core.kinds import FLAG
 from natcoord_jax.core.numeric import Number, Numbers
-from natcoord_jax.effects.contact.discrete_gap import DiscreteGap
+from natcoord_jax.effects.contact.discrete_gap import DiscreteGap, Measured
 from natcoord_jax.maths.vectors import cross, dot, safe_norm
 
 XI, ETA = np.array([-1.0, 1.0, 1.0, -1.0]), np.array([-1.0, -1.0, 1.0, 1.0])
@@ -99,10 +98,10 @@ class NodeOnFacets(DiscreteGap):
     Attributes:
         markers: the node, then nodes of the facets.
         facets: numbers among the markers of the corners of each facet (f, 4), in turn as seen from outside.
-        open: whether each edge of each facet is an end of the surface (f, 4), from which no node is pushed
-            back in that has gone round it.
+        open: 1 for each edge of each facet that is an end of the surface (f, 4), round which nodes go behind
+            it without being pushed back; else 0.
         thickness: distance of the node from the facets at which they touch [m]: that of both, halved.
-        two_sided: whether the facets are touched from both sides, as those of shells are.
+        two_sided: 1 where facets are touched from both sides, as those of shells are, 0 where from outside.
 
     Source: T. A. Laursen, Computational Contact and Impact Mechanics, 2002, for the gap.
 
@@ -116,47 +115,27 @@ class NodeOnFacets(DiscreteGap):
     facets: Any = eqx.field(kw_only=True, metadata=is_a(Numbers((None, 4))))
     open: Any = eqx.field(default=1.0, kw_only=True, metadata=is_a(Number() | Numbers((None, 4))))
     thickness: Any = eqx.field(default=0.0, kw_only=True, metadata=is_a(Number("not negative")))
-    two_sided: bool = eqx.field(default=False, kw_only=True, static=True, metadata=is_a(FLAG))
+    two_sided: Any = eqx.field(default=0.0, kw_only=True, metadata=is_a(Number("not negative")))
 
     kind: ClassVar[str] = "node on facets"
 
-    def _nearest(self, x: Float[Array, "k 3"]) -> tuple[Nearest, Int[Array, ""]]:
-        """The nearest point of all facets, and of which it is."""
-        found = jax.vmap(nearest_point, in_axes=(None, 0))(x[0], x[self._corners])
-        best = jnp.argmin(dot(found.apart, found.apart))
-        return jax.tree.map(lambda y: y[best], found), best
-
-    @property
-    def _corners(self) -> Int[Array, "f 4"]:
-        return jnp.asarray(self.facets).astype(int)
-
-    def _signed(self, x: Float[Array, "k 3"]) -> tuple[Array, Array, Nearest, Array]:
-        """Distance, negative behind the surface, and the direction in which it grows."""
-        at, facet = self._nearest(x)
+    def measured(self, x: Float[Array, "k 3"]) -> Measured:
+        """Distance from the nearest facet less thickness, and the direction in which it grows."""
+        facets = jnp.asarray(self.facets).astype(int)
+        every = jax.vmap(nearest_point, in_axes=(None, 0))(x[0], x[facets])
+        best = jnp.argmin(dot(every.apart, every.apart))
+        at = jax.tree.map(lambda y: y[best], every)
         distance, height = safe_norm(at.apart), dot(at.normal, at.apart)
         direction = at.apart / jnp.where(distance > 0, distance, 1.0)
-        if self.two_sided:
-            return distance, direction, at, facet
-        ends = jnp.broadcast_to(jnp.asarray(self.open), (self._corners.shape[0], 4))[facet, at.edge] > 0
-        side = jnp.where((height < 0) & ~((at.edge >= 0) & ends), -1.0, 1.0)
-        within = at.edge < 0
-        return (
-            jnp.where(within, height, side * distance),
-            jnp.where(within, at.normal, side * direction),
-            at,
-            facet,
+        ends = jnp.broadcast_to(jnp.asarray(self.open), facets.shape)[best, at.edge] > 0
+        within, both = at.edge < 0, jnp.asarray(self.two_sided) > 0
+        side = jnp.where((height < 0) & (within | ~ends) & ~both, -1.0, 1.0)
+        # The normal has a direction where the node is on the facet, too.
+        signed = within & ~both
+        distance = jnp.where(signed, height, side * distance)
+        direction = jnp.where(signed, at.normal, side * direction)
+        corners = facets[best]
+        lever = jnp.zeros_like(x).at[0].set(direction).at[corners].add(-at.weights[:, None] * direction)
+        return Measured(
+            distance - self.thickness, lever, jnp.concatenate([jnp.zeros(1, corners.dtype), corners])
         )
-
-    def gap(self, x: Float[Array, "k 3"]) -> Float[Array, ""]:
-        """Distance from the nearest facet less thickness."""
-        return self._signed(x)[0] - self.thickness
-
-    def lever(self, x: Float[Array, "k 3"]) -> Float[Array, "k 3"]:
-        """Its derivative: the direction at the node, and shares of it at the corners."""
-        _, direction, at, facet = self._signed(x)
-        corners = -at.weights[:, None] * direction
-        return jnp.zeros_like(x).at[0].set(direction).at[self._corners[facet]].add(corners)
-
-    def between(self, x: Float[Array, "k 3"]) -> Int[Array, "5"]:
-        """The node and the corners of the nearest facet."""
-        return jnp.concatenate([jnp.zeros(1, int), self._corners[self._nearest(x)[1]]])
