@@ -30,6 +30,7 @@ from natcoord_jax.bodies import (
     Cylinder,
     DirectorInterpolation,
     Ellipsoid,
+    Gas,
     LineLoad,
     MeshHandle,
     Nodes,
@@ -127,7 +128,14 @@ from natcoord_jax.effects.joints import (
     Spherical,
     Universal,
 )
-from natcoord_jax.effects.loads import BodyTorque, FacePressure, Gravity, PairTorque, PointForce
+from natcoord_jax.effects.loads import (
+    BodyTorque,
+    EnclosedGas,
+    FacePressure,
+    Gravity,
+    PairTorque,
+    PointForce,
+)
 from natcoord_jax.effects.materials import Elastic
 from natcoord_jax.effects.shells import ShellElement
 from natcoord_jax.effects.solids import Brick
@@ -198,6 +206,7 @@ __all__ = [
     "Elastic",
     "Ellipsoid",
     "EllipsoidOnPlane",
+    "EnclosedGas",
     "EnergyMomentum",
     "Equilibrium",
     "FacePressure",
@@ -207,6 +216,7 @@ __all__ = [
     "Force",
     "Frame",
     "GapPotential",
+    "Gas",
     "Gravity",
     "Growth",
     "Guess",

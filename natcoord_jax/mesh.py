@@ -10,14 +10,12 @@ from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.checks import is_concrete
 from natcoord_jax.core.kinds import Several, of
 from natcoord_jax.core.numeric import Number, Numbers, Whole
+from natcoord_jax.maths.places import places
 
 NAMED = of("a dictionary of names", dict)
 
 HEXAHEDRON = ((0, 3, 2, 1), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7))
 """Corners of the six faces of a hexahedron, in turn as seen from outside."""
-
-SAME = 1e-9
-"""Distance relative to the extent of the mesh up to which nodes are at the same place."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,27 +96,12 @@ def _check(nodes: Any, cells: np.ndarray) -> None:
 
 def _twins(nodes: Float[np.ndarray, "n 3"]) -> tuple[int, int] | None:
     """Two nodes at the same place, if there are any."""
-    number = _places(nodes)
+    number = places(nodes)
     first = np.unique(number, return_index=True)[1]
     later = np.setdiff1d(np.arange(len(nodes)), first)
     if not later.size:
         return None
     return int(np.flatnonzero(number == number[later[0]])[0]), int(later[0])
-
-
-def _places(nodes: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
-    """Numbers of places, equal for nodes at the same one."""
-    size = SAME * max(float(np.ptp(nodes, axis=0).max(initial=0.0)), 1e-300)
-    # Rounded to a grid of twice the distance, and again to one shifted by half: neighbours that one grid
-    # parts share a place in the other, unless they are a diagonal apart.
-    found = np.arange(len(nodes))
-    for shift in (0.0, 0.5):
-        _, number = np.unique(np.floor(nodes / (2 * size) + shift), axis=0, return_inverse=True)
-        number = number.reshape(-1)
-        least = np.full(number.max(initial=-1) + 1, len(nodes))
-        np.minimum.at(least, number, found)
-        found = least[number]
-    return found
 
 
 @checked("mesh.cleaned", nodes=Numbers((None, 3)), cells=Numbers((None, None)), sets=NAMED, faces=NAMED)
@@ -141,7 +124,7 @@ def cleaned(
         <mesh: 6 nodes, 2 quadrilaterals>
     """
     place = np.asarray(nodes, float)
-    first = _places(place)
+    first = places(place)
     found = first[np.asarray(cells)]
     kept = np.unique(found)
     number = np.full(len(place), -1)

@@ -72,6 +72,7 @@ GAP = lambda markers: {  # noqa: E731
     **MARKED(markers), "stiffness": NUMBER, "law": ["linear", "hertz"], "restitution": NUMBER,
     "speed": NUMBER,
 }  # fmt: skip
+GAS = dict.fromkeys(("gauge_pressure", "ambient", "exponent", "volume"), [1.0])
 METAL, SQUARE = [nc.Elastic(E=1.0)], np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0.0)])
 PLACED = {
     "material": METAL, "position": V, "orientation": [np.eye(3)], "velocity": V, "angular_velocity": V,
@@ -173,6 +174,8 @@ CALLS = {
     "SphereOnBox": lambda w: {**GAP((*w.ends, *w.triad)), "size": V, "radius": NUMBER},
     "FacePressure": lambda w: {**MARKED(w.ends * 2), "pressure": [1.0, f]},
     "Pressure": lambda w: {"surface": [w.shell], "pressure": [1.0, f], "name": NAME},
+    "EnclosedGas": lambda w: {**MARKED(w.ends * 2), "faces": [np.array([[0, 1, 2, 3]])], **GAS},
+    "Gas": lambda w: {"surface": [w.shell, (w.shell,)], "name": NAME, **GAS},
     "PointSum": lambda w: {**MARKED(w.ends), "weights": [(1.0, -1.0)]},
     "Tie": lambda w: {"one": [w.shell.face()], "other": [w.shell.face()], "name": NAME},
     "Scene.move_nodes": lambda w: {"nodes": [w.nodes], "positions": PLACES},

@@ -162,6 +162,11 @@ TABLE = {
     nc.FacePressure: Entry(
         lambda p: nc.FacePressure((*p.eight[:2], *p.eight[5:7]), pressure=jnp.sin), inside=False
     ),
+    nc.EnclosedGas: Entry(
+        lambda p: nc.EnclosedGas(
+            p.eight, faces=np.array(nc.mesh.HEXAHEDRON), gauge_pressure=0.0, ambient=30.0
+        )
+    ),
     nc.PointOnPlane: Entry(lambda p: nc.PointOnPlane((p.ends[0], p.triad[2], p.ends[1]), distance=0.2)),
     nc.PointOnLine: Entry(lambda p: nc.PointOnLine((p.ends[0], p.triad[2], p.ends[1]))),
     nc.PointOnPoint: Entry(

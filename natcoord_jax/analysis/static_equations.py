@@ -13,7 +13,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from natcoord_jax.assembly.element_matrices import dense, rates_of, touches
+from natcoord_jax.assembly.element_matrices import bodies_of_elements, dense, rates_of, touches
 from natcoord_jax.assembly.equations_of_motion import loads
 from natcoord_jax.assembly.full import FullStep
 from natcoord_jax.assembly.local import body_motion
@@ -30,6 +30,7 @@ from natcoord_jax.assembly.violations import violations_of
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
 from natcoord_jax.linsolve.dense import Inverse
+from natcoord_jax.linsolve.products import Products, WithProducts
 from natcoord_jax.linsolve.sparse import factorised
 from natcoord_jax.maths.collocation import gauss
 from natcoord_jax.maths.elimination import pivoted_inverse
@@ -143,29 +144,32 @@ class Static(eqx.Module):
 
     def matrices(
         self, y: Float[Array, " unknowns"], weight: Array | float = 0.0
-    ) -> list[Float[Array, "_ _ _"]]:
-        """Jacobian of the residual at displacements zero: matrices of bodies and single effects.
+    ) -> tuple[list[Float[Array, "_ _ _"]], Products | None]:
+        """Jacobian of the residual at displacements zero: matrices of bodies and effects, and products.
 
         They are those of a step of the body system without mass: a step's forces are those of its middle,
         which moves by half the displacement. With a `weight` [1/s^2] that times the inertia is added to them
         (four times, to be exact), as of a short step.
         """
         system = replace_fields(self.system, mass=(NO_MASS + weight) * self.system.mass)
-        resting = self.displaced(jnp.zeros_like(y))
+        here = self.displaced(jnp.zeros_like(y))
         step = FullStep.prepare(
-            system, resting, self.inputs, jnp.ones((), y.dtype), gauss(1), StartCache(None, None)
+            system, here, self.inputs, jnp.ones((), y.dtype), gauss(1), StartCache(None, None)
         )
         # Times of a step of length one, shifted to that of the load.
         situations = tuple(eqx.tree_at(lambda s: s.t, where, where.t - 0.5) for where in step.situations)
         step = eqx.tree_at(lambda s: s.situations, step, situations)
-        every = step.matrices(y.at[: self.balances].set(0.0), exact=False)
-        return [x.at[:, :width, :width].multiply(2.0) for x, width in zip(every, self._widths)]
+        resting = y.at[: self.balances].set(0.0)
+        every, products = step.matrices(resting, exact=False), step.products(resting)
+        if products is not None:
+            products = replace_fields(products, columns=2.0 * products.columns)
+        return [x.at[:, :w, :w].multiply(2.0) for x, w in zip(every, self._widths)], products
 
     @property
     def _widths(self) -> list[int]:
         """Components of twists among the unknowns of each element; multipliers follow them."""
         groups = (g for g in (*self.system.effects, *self.system.joints) if touches(g))
-        return [TWIST, *(rates_of(g) * g.bodies.shape[1] for g in groups)]
+        return [TWIST, *(rates_of(g) * bodies_of_elements(g).shape[1] for g in groups)]
 
     def solver(self, y: Float[Array, " unknowns"], weight: Array | float = 0.0) -> Any:
         """What solves equations with the Jacobian at displacements zero, slightly regularised.
@@ -173,13 +177,14 @@ class Static(eqx.Module):
         Returns:
             An object with `solve(right)` and `transpose()`.
         """
-        given, sparsity = self.matrices(y, weight), self.system.sparsity
+        (given, products), sparsity = self.matrices(y, weight), self.system.sparsity
         pulls = (jnp.max(jnp.abs(x[:, w:, :w]), initial=1e-300) for x, w in zip(given, self._widths))
         arms = functools.reduce(jnp.maximum, pulls)
         if sparsity is not None and self.unknowns > DENSE:
             matrix: Any = sparsity.pattern.assemble(*given)
-            return factorised(sparsity.plan, matrix.with_diagonal(self._shifts(matrix.diagonal(), arms)))
-        matrix = dense(self.system, given, self.unknowns)
+            found = factorised(sparsity.plan, matrix.with_diagonal(self._shifts(matrix.diagonal(), arms)))
+            return found if products is None else WithProducts.of(found, products)
+        matrix = dense(self.system, given, self.unknowns, products=products)
         return Inverse(pivoted_inverse(matrix + jnp.diag(self._shifts(jnp.diagonal(matrix), arms))))
 
     def _shifts(self, diagonal: Float[Array, " unknowns"], arms: Array) -> Float[Array, " unknowns"]:

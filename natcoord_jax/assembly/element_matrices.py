@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 from natcoord_jax.assembly.local_rates import TWIST
 from natcoord_jax.assembly.system import Group, System
 from natcoord_jax.core.checks import is_concrete
+from natcoord_jax.linsolve.products import Products
 
 
 def touches(group: Group) -> bool:
@@ -20,6 +21,16 @@ def touches(group: Group) -> bool:
 def rates_of(group: Group) -> int:
     """Components of the twists of its bodies that a group has to do with: of points there is no spin."""
     return TWIST if group.turning else TWIST // 2
+
+
+def bodies_of_elements(group: Group) -> Array | np.ndarray:
+    """Bodies of the matrices of a group: those of its instances, or of their parts."""
+    if not group.effect.spread:
+        return group.bodies
+    xp: Any = np if is_concrete(group.bodies, group.effect.parts) else jnp
+    parts = xp.asarray(group.effect.parts)
+    table = xp.take_along_axis(xp.asarray(group.bodies), parts.reshape(group.count, -1), axis=1)
+    return table.reshape(-1, parts.shape[-1])
 
 
 def elements(system: System, stages: int = 1) -> list[Array | np.ndarray]:
@@ -34,7 +45,7 @@ def elements(system: System, stages: int = 1) -> list[Array | np.ndarray]:
         `FullStep.matrices`; the number of unknowns stands for what is fixed.
     """
     groups = tuple(g for g in (*system.effects, *system.joints) if touches(g))
-    tables = [group.bodies for group in groups]
+    tables = [bodies_of_elements(group) for group in groups]
     xp: Any = jnp
     if is_concrete(system.local_rates, tables):
         xp, tables = np, [np.asarray(table) for table in tables]
@@ -43,7 +54,7 @@ def elements(system: System, stages: int = 1) -> list[Array | np.ndarray]:
     places = system.local_rates.places(stages, size, xp)
     found = [places[:-1].reshape(places.shape[0] - 1, -1)]
     for group, table in zip(groups, tables):
-        count, rows = group.count, stages * group.multipliers
+        count, rows = table.shape[0], stages * group.multipliers
         lams = first + np.arange(count * rows, dtype=np.int32).reshape(count, rows)
         first += count * rows
         touched = places[table][..., : rates_of(group)].reshape(count, -1)
@@ -52,11 +63,16 @@ def elements(system: System, stages: int = 1) -> list[Array | np.ndarray]:
 
 
 def dense(
-    system: System, matrices: Sequence[Float[Array, "_ _ _"]], size: int, stages: int = 1
+    system: System,
+    matrices: Sequence[Float[Array, "_ _ _"]],
+    size: int,
+    stages: int = 1,
+    products: Products | None = None,
 ) -> Float[Array, "n n"]:
-    """The dense matrix of element matrices, see `elements`."""
+    """The dense matrix of element matrices, see `elements`, and of products."""
     # What is fixed goes beyond the matrix and is cut off.
     matrix = jnp.zeros((size + 1, size + 1), matrices[0].dtype)
     for touched, local in zip(elements(system, stages), matrices, strict=True):
         matrix = matrix.at[touched[:, :, None], touched[:, None, :]].add(local)
-    return matrix[:size, :size]
+    matrix = matrix[:size, :size]
+    return matrix if products is None else matrix + products.to_dense()

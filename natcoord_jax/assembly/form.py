@@ -27,6 +27,11 @@ class Form(eqx.Module):
     renewal: ClassVar[int] = 6
 
     @property
+    def exact_by_formulas(self) -> bool:
+        """Whether `jacobian` is, for this system."""
+        return self.by_formulas
+
+    @property
     def dependent(self) -> bool:
         """Whether constraints may depend on each other."""
         return True

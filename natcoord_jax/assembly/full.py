@@ -32,9 +32,11 @@ from natcoord_jax.assembly.response import (
     situation,
     stations,
 )
+from natcoord_jax.assembly.spread import part_matrices, products
 from natcoord_jax.assembly.start_cache import StartCache
 from natcoord_jax.assembly.system import Group, System
 from natcoord_jax.core.state import State
+from natcoord_jax.linsolve.products import Products
 from natcoord_jax.maths.collocation import Tableau, gauss
 from natcoord_jax.maths.projectors import range_projector
 from natcoord_jax.maths.vectors import cross
@@ -195,9 +197,12 @@ class FullStep(Form):
     ) -> Float[Array, "unknowns unknowns"]:
         """Jacobian, put together from those of bodies, effects and joints."""
         y = project_multipliers(y, self.balances, self.start_cache.projector)
-        return self._projected(
-            dense(self.system, self.matrices(y, exact), self.unknowns, self.tableau.stages)
-        )
+        given = self.matrices(y, exact), self.unknowns, self.tableau.stages, self.products(y)
+        return self._projected(dense(self.system, *given))
+
+    def products(self, y: Float[Array, " unknowns"]) -> Products | None:
+        """What effects on many bodies add to `matrices`."""
+        return products(self, self._with_ground(self.split(y)[0]))
 
     def matrices(self, y: Float[Array, " unknowns"], exact: bool) -> list[Float[Array, "_ _ _"]]:
         """Jacobians of the bodies and of the instances of each group, by the unknowns in `elements`."""
@@ -206,6 +211,9 @@ class FullStep(Form):
         found = [self.body_jacobians(twists)]
         for group, where, lam in zip(self.groups, self.situations, multipliers):
             if not touches(group):
+                continue
+            if group.effect.spread:
+                found.append(part_matrices(self, group, where, every))
                 continue
             bodies, rates = group.bodies, rates_of(group)
             (by_twist, by_lam), (g_by_twist, g_by_lam) = jacobians(

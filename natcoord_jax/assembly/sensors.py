@@ -364,7 +364,8 @@ def sense(
     if any(_tells(group, names[0]) for group in system.effects):
         found = _readings(system, states, names)
         axis = states.t.ndim
-        whole = isinstance(part, tuple) or any(g.is_set and names[0] in g.labels for g in system.effects)
+        sets = (g for g in system.effects if g.is_set and not g.effect.spread)
+        whole = isinstance(part, tuple) or any(names[0] in g.labels for g in sets)
         return found if whole else jax.tree.map(lambda x: jnp.take(x, 0, axis), found)
     name = names[0]
     if name in system.structure.bodies:

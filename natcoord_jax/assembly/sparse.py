@@ -13,8 +13,10 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.assembly.element_matrices import touches
 from natcoord_jax.assembly.full import FullStep
+from natcoord_jax.assembly.spread import spreads
 from natcoord_jax.assembly.system import System
 from natcoord_jax.linsolve.blocks import BlockMatrix
+from natcoord_jax.linsolve.products import WithProducts
 from natcoord_jax.linsolve.saddle import inertias_of, regularised
 from natcoord_jax.linsolve.sparse import SparseSolver, factorised
 
@@ -24,13 +26,20 @@ class SparseStep(FullStep):
 
     by_formulas = True
 
+    @property
+    def exact_by_formulas(self) -> bool:
+        """Not with effects on many bodies, of which small parts are left out."""
+        return not spreads(self.system)
+
     def factorised(self, matrix: Any) -> tuple[Any, Float[Array, " unknowns"]]:
         """Factors of a sparse matrix, of a dense one with several stages, and inertias of the unknowns."""
         if self.tableau.stages > 1:
             return super().factorised(matrix)
+        matrix, products = matrix if spreads(self.system) else (matrix, None)
         whole = self._assembled(matrix)
         inertias = inertias_of(whole, self.balances)
-        return factorised(self.system.sparsity.plan, regularised(whole, inertias)), inertias
+        found: Any = factorised(self.system.sparsity.plan, regularised(whole, inertias))
+        return found if products is None else WithProducts.of(found, products), inertias
 
     def differentiable(self, matrix: Any) -> Any:
         """The same, refined and differentiable."""
@@ -49,15 +58,19 @@ class SparseStep(FullStep):
         """Shapes of the elements' matrices."""
         return super().like_tangent(y) if self.tableau.stages > 1 else jax.eval_shape(self.tangent, y)
 
-    def tangent(self, y: Float[Array, " unknowns"], loads: Any = None) -> Array | tuple[Array, ...]:
+    def tangent(self, y: Float[Array, " unknowns"], loads: Any = None) -> Any:
         """The Jacobian nearly, from linearised effects: what Newton's iteration needs."""
         return self.jacobian(y, exact=False)
 
-    def jacobian(self, y: Float[Array, " unknowns"], *, exact: bool = True) -> Array | tuple[Array, ...]:
-        """Jacobian: matrices of the elements as `elements` lists them; with several stages, dense."""
+    def jacobian(self, y: Float[Array, " unknowns"], *, exact: bool = True) -> Any:
+        """Jacobian: matrices of the elements as `elements` lists them, and products, if there are any.
+
+        With several stages, dense.
+        """
         if self.tableau.stages > 1:
             return super().jacobian(y, exact=exact)
-        return tuple(self.matrices(y, exact))
+        matrices, products = tuple(self.matrices(y, exact)), self.products(y)
+        return matrices if products is None else (matrices, products)
 
 
 def nodes_of(system: System) -> np.ndarray:

@@ -8,6 +8,7 @@ from natcoord_jax.bodies.continua import MeshHandle as MeshHandle
 from natcoord_jax.bodies.continua import Shell as Shell
 from natcoord_jax.bodies.continua import Solid as Solid
 from natcoord_jax.bodies.continua import Surface as Surface
+from natcoord_jax.bodies.gas import Gas as Gas
 from natcoord_jax.bodies.interpolation import DirectorInterpolation as DirectorInterpolation
 from natcoord_jax.bodies.interpolation import RelativeMotion as RelativeMotion
 from natcoord_jax.bodies.line_load import LineLoad as LineLoad

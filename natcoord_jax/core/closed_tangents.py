@@ -112,6 +112,24 @@ def by_twists(
         weights = place[..., 0]
         found = jnp.einsum("nam,namxbly,nbl->naxby", weights, blocks, weights)
         return -h * found[:, :, None, :, :, None]
+    across, along, middle = twist_maps(place, motion, h)
+    found = -h * jnp.einsum("namux,namxbly,nblvy->naubv", across, blocks, along)
+    # What turns the directors also turns the arms of the forces on them.
+    arms = jnp.einsum("nkmi,nkmx->nkix", place[..., 1:], forces)
+    turned = jnp.sum(cross(middle, arms[:, :, None]), axis=3)
+    own = jnp.zeros((n, k, 6, 6), place.dtype).at[:, :, 3:, 3:].set(jnp.swapaxes(turned, 2, 3))
+    found = found + own[:, :, :, None] * jnp.eye(k)[:, None, :, None]
+    return found[:, :, None, :, :, None]
+
+
+def twist_maps(
+    place: Float[Array, "n k m 4"], motion: Motion, h: Float[Array, ""]
+) -> tuple[Float[Array, "n k m 6 3"], Float[Array, "n k m 6 3"], Float[Array, "n k 3 3 3"]]:
+    """Velocities of marker vectors by the twists of their bodies, as they are and as increments follow them.
+
+    And derivatives of the directors in the middle of the step by the spin, see `_turned_by`.
+    """
+    n, k, m = place.shape[:3]
     unit = jnp.eye(3, dtype=place.dtype)
     spin, directors, start = motion.spin[0], motion.rows[0, :, :, 1:], motion.start[:, :, 1:]
     # Velocities of the rows for a unit angular velocity, as they are; and as increments follow the twist,
@@ -129,13 +147,7 @@ def by_twists(
         )
         for x in (pulls, moves)
     )
-    found = -h * jnp.einsum("namux,namxbly,nblvy->naubv", across, blocks, along)
-    # What turns the directors also turns the arms of the forces on them.
-    arms = jnp.einsum("nkmi,nkmx->nkix", place[..., 1:], forces)
-    turned = jnp.sum(cross(middle, arms[:, :, None]), axis=3)
-    own = jnp.zeros((n, k, 6, 6), place.dtype).at[:, :, 3:, 3:].set(jnp.swapaxes(turned, 2, 3))
-    found = found + own[:, :, :, None] * jnp.eye(k)[:, None, :, None]
-    return found[:, :, None, :, :, None]
+    return across, along, middle
 
 
 def _turned_by(

@@ -102,6 +102,20 @@ class Response(eqx.Module):
     released: Float[Array, "*n s"] | None = None
 
 
+class SpreadTangents(eqx.Module):
+    """Derivatives of the wrenches on many bodies by their twists: sparse ones, and a product.
+
+    Attributes:
+        parts: of the markers of each part, of all instances one after the other.
+        columns: wrenches on all bodies that go with a number that all twists change,
+        rows: the derivatives of that number.
+    """
+
+    parts: Float[Array, "nf p s r p s r"]
+    columns: Float[Array, "n k s r"]
+    rows: Float[Array, "n k s r"]
+
+
 class Effect(Part):
     """Base of everything that acts on bodies.
 
@@ -118,6 +132,8 @@ class Effect(Part):
         shared: whether one module serves all instances, instead of one with stacked numbers.
         couples: whether bodies of neighbouring markers become neighbours in the spanning tree where no joint
             makes them so: elements of beams do, of which a chain then is a chain of bodies.
+        spread: whether it is on so many bodies that its derivatives are not to be one dense matrix, as those
+            of the gas in a shell: it gives `parts` and `spread_tangents`. Without multipliers.
         silent: whether it has no sensor.
         faces: numbers of the nodes round each face of an element, four each, for pictures.
         vectors: of each node of an element made by `on`: 1 for its point, 2 with a director, 4 with a triad.
@@ -135,6 +151,7 @@ class Effect(Part):
     rotors: ClassVar[int] = 0
     shared: ClassVar[bool] = False
     couples: ClassVar[bool] = False
+    spread: ClassVar[bool] = False
     silent: ClassVar[bool] = True
     faces: ClassVar[tuple[tuple[int, ...], ...]] = ()
     vectors: ClassVar[int] = 1
@@ -234,6 +251,17 @@ class Effect(Part):
         None, the default: they are found by differentiating the response of `linearised`.
         """
         return None
+
+    @property
+    def parts(self) -> Any:
+        """Of an effect that is `spread`: numbers of the markers that belong together (parts, markers)."""
+        return None
+
+    def spread_tangents(
+        self, place: Array, motion: Motion, now: StepContext, *, turning: bool
+    ) -> SpreadTangents:
+        """Of an effect that is `spread`, for `n` instances with one stage: see `tangents`, nearly."""
+        raise NotImplementedError
 
     def linearised(self, place: Array, motion: Motion, now: StepContext, lam: Float[Array, "s m"]) -> Any:
         """Something with a `respond` that is nearly this effect's, and nearly its derivative, at this motion.

@@ -9,7 +9,7 @@ from typing import Any
 
 from natcoord_jax.gallery.beams import cantilever, flying_spaghetti, rope
 from natcoord_jax.gallery.contact import bouncing_balls, newton_cradle, tumbling_capsules
-from natcoord_jax.gallery.continua import block, plate, solar_panels
+from natcoord_jax.gallery.continua import block, inflated_ball, plate, solar_panels
 from natcoord_jax.gallery.example import Example
 from natcoord_jax.gallery.loops import bricard, four_bar, slider_crank
 from natcoord_jax.gallery.manoeuvres import reorientation_example
@@ -49,6 +49,7 @@ SCENES: Mapping[str, Callable[..., Example]] = {
     "plate": plate,
     "block": block,
     "solar_panels": solar_panels,
+    "inflated_ball": inflated_ball,
     "bouncing_balls": bouncing_balls,
     "newton_cradle": newton_cradle,
     "tumbling_capsules": tumbling_capsules,

@@ -1,5 +1,6 @@
 """Shells and solids in free flight, and wings of shells on a hub."""
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
@@ -63,3 +64,24 @@ def solar_panels(counts: tuple[int, int] = (6, 2), torque: float = 2.0) -> Examp
     return Example(
         "solar_panels", "a spacecraft with flexible panels", system, state, 0.01, 400, control=control
     )
+
+
+def inflated_ball(count: int = 4) -> Example:
+    """A tennis ball of rubber, inflated by statics, that is thrown on the floor with a spin and bounces."""
+    radius, thickness, height = 0.033, 3.5e-3, 0.05
+    scene = nc.Scene()
+    rubber = nc.Elastic(E=5e6, nu=0.45, density=1100.0)
+    mesh = nc.mesh.sphere(radius, count)
+    ball = scene.add(
+        nc.Shell(mesh, thickness=thickness, material=rubber, position=(0, 0, height), name="ball")
+    )
+    scene.add(nc.Gas(ball, gauge_pressure=8e4, exponent=1.4, name="air"))
+    scene.add(nc.Contact(ball, nc.Plane(), stiffness=2e4))
+    system, state = scene.compile()
+    state = nc.equilibrium(system, state, steps=1).state
+    rows = jnp.reshape(state.q, (-1, 4, 3))
+    arms = rows.at[:, 0].add(-jnp.mean(rows[:, 0], axis=0))
+    rates = jnp.cross(jnp.array([0.0, 60.0, 0.0]), arms).at[:, 0].add(jnp.array([2.0, 0.0, -10.0]))
+    state = eqx.tree_at(lambda s: (s.v, s.t), state, (rates.reshape(-1, 3), jnp.zeros(())))
+    facts = {"dofs": 5 * len(mesh.nodes), "gauge_pressure": 8e4}
+    return Example("inflated_ball", "a ball with gas that bounces", system, state, 5e-5, 400, facts=facts)

@@ -42,5 +42,5 @@ def _resting(system: System, state: State, pattern: BlockPattern) -> BlockMatrix
     inputs = jnp.zeros(len(system.structure.inputs), state.q.dtype)
     start_cache: StartCache = NOTHING
     equations = SparseStep.prepare(system, state, inputs, zero, gauss(1), start_cache)
-    matrix = pattern.assemble(*equations.jacobian(equations.guess()))
+    matrix = pattern.assemble(*equations.matrices(equations.guess(), exact=True))
     return regularised(matrix, inertias_of(matrix, equations.balances))

@@ -141,7 +141,7 @@ def linear_solver(
         along: linear map of (state, unknowns) to (residual, state at the end), for dense Jacobians.
     """
     equations = prepare(system, state, u, h, tableau)
-    if equations.by_formulas and not tableau.kick:
+    if equations.exact_by_formulas and not tableau.kick:
         return equations.differentiable(equations.jacobian(y))
     at_rest = jax.tree.map(jnp.zeros_like, state)
     columns = jax.vmap(lambda unit: along(at_rest, unit)[0], out_axes=1)(jnp.eye(y.shape[0], dtype=y.dtype))

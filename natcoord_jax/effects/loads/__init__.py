@@ -1,5 +1,6 @@
 """Gravity, forces and torques given by the user."""
 
+from natcoord_jax.effects.loads.gas import EnclosedGas as EnclosedGas
 from natcoord_jax.effects.loads.gravity import Gravity as Gravity
 from natcoord_jax.effects.loads.point_loads import (
     BodyTorque as BodyTorque,
