@@ -178,42 +178,54 @@ class MeshSide(Side):
 
     @property
     def shell(self) -> bool:
-        """Whether it is touched from both sides."""
+        """Whether it has a thickness."""
         return self.surface.handle.thickness is not None
+
+    @property
+    def two_sided(self) -> bool:
+        """Whether it is touched from both sides."""
+        return self.shell and not self.surface.one_sided
 
     @property
     def numbers(self) -> np.ndarray:
         """Of the nodes of its faces, each once."""
         return np.unique(self.surface.faces)
 
-    def of_nodes(self) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-        """Half thickness [m] and normal stiffness [N/m] at the nodes.
+    @property
+    def half_thickness(self) -> Float[np.ndarray, " n"]:
+        """Of a shell at its nodes, the largest of their cells; of a solid zero [m]."""
+        handle, faces = self.surface.handle, self.surface.faces
+        thick = np.zeros(len(handle.nodes))
+        if self.shell:
+            depth = np.asarray(handle.thickness)[_behind(faces, handle.mesh.cells)]
+            np.maximum.at(thick, faces, 0.5 * np.broadcast_to(depth[:, None], faces.shape))
+        return thick[self.numbers]
+
+    @property
+    def stiffness(self) -> Float[np.ndarray, " n"]:
+        """Along the normal at the nodes [N/m].
 
         A node has a quarter of each of its faces, and these the modulus of the material over how thick the
         element behind them is.
         """
         handle, faces = self.surface.handle, self.surface.faces
         places = np.asarray(handle.nodes.positions)
-        x = places[faces]
+        x, cells = places[faces], _behind(faces, handle.mesh.cells)
         normal = 0.5 * np.cross(x[:, 2] - x[:, 0], x[:, 3] - x[:, 1])
         area = np.linalg.norm(normal, axis=1)
-        cells = _behind(faces, handle.mesh.cells)
+        inwards = x.mean(axis=1) - places[handle.mesh.cells[cells]].mean(axis=1)
+        depth = 2 * np.abs(np.sum(inwards * normal, axis=1)) / area
         if self.shell:
             depth = np.asarray(handle.thickness)[cells]
-        else:
-            inwards = x.mean(axis=1) - places[handle.mesh.cells[cells]].mean(axis=1)
-            depth = 2 * np.abs(np.sum(inwards * normal, axis=1)) / area
-        total, thick = np.zeros(len(places)), np.zeros(len(places))
+        total = np.zeros(len(places))
         np.add.at(total, faces, (0.25 * float(handle.material.E) * area / depth)[:, None])
-        if self.shell:
-            np.maximum.at(thick, faces, 0.5 * np.broadcast_to(depth[:, None], faces.shape))
-        return thick[self.numbers], total[self.numbers]
+        return total[self.numbers]
 
     @property
     def parts(self) -> Sequence[Side]:
         """Its nodes, as balls of the thickness there."""
         nodes = self.surface.handle.nodes[self.numbers]
-        given = zip(nodes, *self.of_nodes())
+        given = zip(nodes, self.half_thickness, self.stiffness)
         return [SegmentSide.ball(Point(node), t, k) for node, t, k in given]
 
 

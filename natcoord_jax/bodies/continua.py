@@ -73,6 +73,20 @@ class MeshHandle(Handle):
             raise ValueError(f"{self.name!r} has no faces {name!r}; its mesh has {known}")
         return Surface(self, self.mesh.faces[name])
 
+    def surface(self, side: str) -> "Surface":
+        """A shell as it is touched from one side: "outside", where its directors point, or "inside".
+
+        Raises:
+            ValueError: for a solid, or another side.
+        """
+        turns = {"outside": 1, "inside": -1}
+        if self.thickness is None or side not in turns:
+            raise ValueError(
+                f"{self.name!r}: there is no side {side!r}; pass 'outside' or 'inside' of a shell, and take "
+                "face(...) of a solid"
+            )
+        return Surface(self, self.mesh.cells[:, :: turns[side]], one_sided=True)
+
     def nearest(self, position: Any) -> Handle:
         """The node nearest to a position in the assembled pose [m]."""
         away = np.asarray(self.nodes.positions) - np.asarray(position, float)
@@ -86,10 +100,12 @@ class Surface:
     Attributes:
         handle: of the solid or the shell.
         faces: numbers of the nodes round each of them (f, 4), in turn as seen from outside.
+        one_sided: whether a shell is touched from outside only.
     """
 
     handle: MeshHandle
     faces: Int[np.ndarray, "f 4"]
+    one_sided: bool = False
 
     def __repr__(self) -> str:
         return f"<{len(self.faces)} faces of {self.handle.name!r}>"

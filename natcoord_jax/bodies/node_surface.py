@@ -36,13 +36,13 @@ def surface_gaps(one: MeshSide, other: MeshSide, law: dict[str, Any], name: str)
     tables = [np.pad(table, ((0, 0), (0, width - table.shape[1])), mode="edge") for table, _, _ in patches]
     each: dict[str, list[Any]] = {"facets": [], "open": [], "thickness": [], "stiffness": [], "two_sided": []}
     for (slave, master), (_, facets, ends) in zip(sides, patches):
-        thick, stiff = slave.of_nodes()
-        beneath = master.of_nodes()[0].max() if master.shell else 0.0
+        thick = slave.half_thickness
+        stiff = slave.stiffness if given is None else np.full(len(thick), float(given))
         each["facets"].append(facets)
         each["open"].append(ends)
-        each["thickness"].append(thick + beneath)
-        each["stiffness"].append(0.5 * (stiff if given is None else np.full(len(thick), float(given))))
-        each["two_sided"].append(np.full(len(thick), float(master.shell)))
+        each["thickness"].append(thick + master.half_thickness.max())
+        each["stiffness"].append(0.5 * stiff)
+        each["two_sided"].append(np.full(len(thick), float(master.two_sided)))
     union = NodeUnion(tuple(s.surface.handle.nodes[s.numbers] for s in (one, other)))
     numbers = {key: np.concatenate(values) for key, values in each.items()}
     return NodeOnFacets.on(union, np.concatenate(tables), each=numbers, **law)
