@@ -14,7 +14,7 @@ from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.bodies import Body
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.handles import Handle
-from natcoord_jax.core.kinds import NAME, Choice, HandleOf, of
+from natcoord_jax.core.kinds import FLAG, NAME, Choice, HandleOf, of
 from natcoord_jax.core.markers import Point
 from natcoord_jax.core.numeric import Number, Whole
 from natcoord_jax.core.recipe import Builder, Recipe
@@ -63,6 +63,8 @@ class Contact(Recipe):
             (weight in a soft contact takes some more of it); None: nothing is lost.
         speed: of the impact that `restitution` is of [m/s]; less is lost of slower ones.
         law: force proportional to the overlap, "linear", or to its power 3/2, "hertz".
+        one_pass: of two surfaces, let the nodes of `one` alone touch the facets of `other`, with all of the
+            stiffness: for a fine surface, or one that folds, on a coarse one.
         candidates: number of facets that a node may touch; default 16.
         name: of the contact; several gaps are called "name[0]" and so on.
 
@@ -91,6 +93,7 @@ class Contact(Recipe):
     law: str = eqx.field(
         default="linear", kw_only=True, static=True, metadata=is_a(Choice(("linear", "hertz")))
     )
+    one_pass: bool = eqx.field(default=False, kw_only=True, static=True, metadata=is_a(FLAG))
     candidates: int | None = eqx.field(default=None, kw_only=True, static=True, metadata=is_a(Whole(1)))
     name: str | None = eqx.field(default=None, kw_only=True, static=True, metadata=is_a(NAME))
 
@@ -108,6 +111,8 @@ class Contact(Recipe):
             law |= {"restitution": self.restitution, "speed": self.speed}
         if self.candidates is not None:
             law |= {"candidates": self.candidates}
+        if self.one_pass:
+            law |= {"one_pass": True}
         one, other = (_side(scene, given, name) for given in (self.one, self.other))
         gaps = gaps_between(one, other, law, name)
         named = [name] if len(gaps) == 1 else [f"{name}[{k}]" for k in range(len(gaps))]

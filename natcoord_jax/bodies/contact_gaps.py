@@ -26,6 +26,9 @@ from natcoord_jax.effects.contact import (
     SphereOnSphere,
 )
 
+OF_SURFACES = "candidates", "one_pass"
+"""Options that contacts of other sides have no use for."""
+
 Law = dict[str, Any]
 Gaps = list[Any]
 
@@ -57,6 +60,7 @@ def gaps_between(one: Side, other: Side, law: Law, name: str) -> Gaps:
 
 def _stiff(law: Law, name: str, *sides: Side) -> Law:
     """The law with the stiffness of the sides, where none is given."""
+    law = {key: value for key, value in law.items() if key not in OF_SURFACES}
     if law["stiffness"] is not None:
         return law
     own = [s.stiffness for s in sides if isinstance(s, SegmentSide) and s.stiffness is not None]

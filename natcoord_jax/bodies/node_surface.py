@@ -17,18 +17,20 @@ CANDIDATES = 16
 def surface_gaps(one: MeshSide, other: MeshSide, law: dict[str, Any], name: str) -> Elements:
     """Gaps of the nodes of each of two surfaces on the facets of the other, with half the stiffness of each.
 
-    So no surface has a part of its own, and edges are touched from both sides.
+    So no surface has a part of its own. In one pass, nodes of the first on facets of the second only.
 
     Args:
         one: surface.
         other: surface.
-        law: numbers of the contact; stiffness None: that of the elements; "candidates": facets of each node.
+        law: numbers of the contact; stiffness None: that of the elements; "candidates": facets of each node;
+            "one_pass": whether nodes of the first surface only are touched.
         name: of the contact.
     """
     law = dict(law)
     most = min(law.pop("candidates", None) or CANDIDATES, max(len(s.surface.faces) for s in (one, other)))
     given = law.pop("stiffness")
-    sides = (one, other), (other, one)
+    passes = 1 if law.pop("one_pass", False) else 2
+    sides = ((one, other), (other, one))[:passes]
     first = 0, len(one.numbers)
     patches = [_patches(a, b, most, first, k) for k, (a, b) in enumerate(sides)]
     width = max(table.shape[1] for table, _, _ in patches)
@@ -41,7 +43,7 @@ def surface_gaps(one: MeshSide, other: MeshSide, law: dict[str, Any], name: str)
         each["facets"].append(facets)
         each["open"].append(ends)
         each["thickness"].append(thick + master.half_thickness.max())
-        each["stiffness"].append(0.5 * stiff)
+        each["stiffness"].append(stiff / passes)
         each["two_sided"].append(np.full(len(thick), float(master.two_sided)))
     union = NodeUnion(tuple(s.surface.handle.nodes[s.numbers] for s in (one, other)))
     numbers = {key: np.concatenate(values) for key, values in each.items()}

@@ -35,7 +35,7 @@ GAUGE, EXPONENT = 83e3, 1.2
 """Pressure of the gas above that of the air [N/m^2], and its exponent."""
 
 FRICTION = 2.0
-"""Damping of the ball's wall along the edges and diagonals of its mesh [N s/m], by its rebound from a plate."""
+"""Damping along edges and diagonals of the mesh of the wall [N s/m], by its rebound from a plate."""
 
 
 @dataclass(frozen=True)
