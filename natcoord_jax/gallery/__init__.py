@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from natcoord_jax.gallery.beams import cantilever, flying_spaghetti, rope
-from natcoord_jax.gallery.contact import bouncing_balls, newton_cradle, tumbling_capsules
+from natcoord_jax.gallery.contact import bouncing_balls, colliding_blocks, newton_cradle, tumbling_capsules
 from natcoord_jax.gallery.continua import block, inflated_ball, plate, solar_panels
 from natcoord_jax.gallery.example import Example
 from natcoord_jax.gallery.loops import bricard, four_bar, slider_crank
@@ -54,6 +54,7 @@ SCENES: Mapping[str, Callable[..., Example]] = {
     "bouncing_balls": bouncing_balls,
     "newton_cradle": newton_cradle,
     "tumbling_capsules": tumbling_capsules,
+    "colliding_blocks": colliding_blocks,
     "robot_cable": robot_cable,
     "plugging": plugging,
     "tennis": tennis,
