@@ -172,6 +172,13 @@ CALLS = {
     "CapsuleOnCapsule": lambda w: {**GAP(w.ends * 2), "radii": [(1.0, 1.0)]},
     "EllipsoidOnPlane": lambda w: {**GAP((w.ends[0], w.direction, w.point, *w.triad)), "semi_axes": V},
     "SphereOnBox": lambda w: {**GAP((*w.ends, *w.triad)), "size": V, "radius": NUMBER},
+    "NodeOnFacets": lambda w: {
+        **GAP((*w.ends * 2, w.ends[0])),
+        "facets": [((1, 2, 3, 4),)],
+        "open": [1.0],
+        "thickness": NUMBER,
+        "two_sided": [0.0, 1.0],
+    },
     "FacePressure": lambda w: {**MARKED(w.ends * 2), "pressure": [1.0, f]},
     "Pressure": lambda w: {"surface": [w.shell], "pressure": [1.0, f], "name": NAME},
     "EnclosedGas": lambda w: {**MARKED(w.ends * 2), "faces": [np.array([[0, 1, 2, 3]])], **GAS},
@@ -396,7 +403,16 @@ MADE = {
     "Optima", "Outcome", "Result", "SimulationError", "Solution", "State", "Surface", "System",
     "Trajectory",
 }  # fmt: skip
-BASES = {"Constraint", "Field", "Force", "GapPotential", "Joint", "Potential", "VelocityConstraint"}
+BASES = {
+    "Constraint",
+    "DiscreteGap",
+    "Field",
+    "Force",
+    "GapPotential",
+    "Joint",
+    "Potential",
+    "VelocityConstraint",
+}
 IN_MODULES = {
     "cost": nc.cost, "goal": nc.goal, "bounds": nc.bounds, "inputs": nc.inputs, "mesh": nc.mesh,
 }  # fmt: skip

@@ -159,6 +159,11 @@ TABLE = {
     nc.SphereOnBox: Entry(
         lambda p: nc.SphereOnBox((*p.ends, *p.triad), size=(0.2, 0.3, 0.1), radius=1.5, stiffness=9.0)
     ),
+    nc.NodeOnFacets: Entry(
+        lambda p: nc.NodeOnFacets(
+            (p.ends[1], *p.eight[:4]), facets=[(1, 2, 3, 4)], thickness=2.0, two_sided=1.0, stiffness=9.0
+        )
+    ),
     nc.FacePressure: Entry(
         lambda p: nc.FacePressure((*p.eight[:2], *p.eight[5:7]), pressure=jnp.sin), inside=False
     ),
