@@ -165,7 +165,7 @@ CALLS = {
     "Plane": lambda w: {"normal": V, "point": V, "body": [w.body]},
     "Contact": lambda w: {
         "one": [w.body], "other": [nc.Plane(), w.body], "stiffness": NUMBER, "restitution": NUMBER,
-        "speed": NUMBER, "law": ["linear", "hertz"], "name": NAME,
+        "speed": NUMBER, "law": ["linear", "hertz"], "name": NAME, "one_pass": FLAG, "candidates": WHOLE,
     },
     "SphereOnPlane": lambda w: {**GAP((w.ends[0], w.direction, w.point)), "radius": NUMBER},
     "SphereOnSphere": lambda w: {**GAP(w.ends), "radii": [(1.0, 1.0)]},
