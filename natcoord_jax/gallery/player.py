@@ -257,7 +257,7 @@ def add_player(scene: nc.Scene) -> Player:
     return player
 
 
-def _body(name: str, segment: Segment, placed: Placement) -> nc.RigidBody:
+def _body(name: str, segment: Segment, placed: Placement) -> Any:
     """One of the bodies, its third axis along it."""
     start, end = np.asarray(segment.start, float), np.asarray(segment.end, float)
     along = end - start

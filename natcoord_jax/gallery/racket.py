@@ -124,7 +124,7 @@ def add_racket(scene: nc.Scene, hand: Any, placed: Any, grip: Any, throat: Any, 
     return Racket((handle, one, other), nodes, Surface(bed, cells, one_sided=True), placed(middle))
 
 
-def _through(section: nc.CircularSection, points: Place, **options: Any) -> nc.Beam:
+def _through(section: nc.Section, points: Place, **options: Any) -> nc.Beam:
     """A beam with a node at each of some points."""
     arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
     return nc.Beam(section, points, elements=1, stations=(arc / arc[-1])[1:-1], damping=2e-5, **options)

@@ -82,7 +82,8 @@ class DiscreteGap(ContactLaw):
     def assembled_at(self, x: Float[Array, "k 3"]) -> "DiscreteGap":
         """With its damping, and the gap that it starts with in terms of the size of all."""
         size = jnp.sqrt(jnp.max(jnp.sum((x - x[0]) ** 2, axis=1)))
-        return replace_fields(self.renewed(), initial=self.gap(x) / size)
+        damped: Any = self.renewed()
+        return replace_fields(damped, initial=self.gap(x) / size)
 
     def flaws(self) -> dict[str, Array]:
         """A start in penetration."""

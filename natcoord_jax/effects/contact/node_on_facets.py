@@ -13,7 +13,8 @@ from natcoord_jax.core.numeric import Number, Numbers
 from natcoord_jax.effects.contact.discrete_gap import DiscreteGap, Measured
 from natcoord_jax.maths.vectors import cross, dot, safe_norm, safe_sqrt
 
-XI, ETA = np.array([-1.0, 1.0, 1.0, -1.0]), np.array([-1.0, -1.0, 1.0, 1.0])
+XI: Any = np.array([-1.0, 1.0, 1.0, -1.0])
+ETA: Any = np.array([-1.0, -1.0, 1.0, 1.0])
 """Natural coordinates of the corners."""
 
 ITERATIONS = 6
