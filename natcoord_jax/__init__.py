@@ -108,10 +108,12 @@ from natcoord_jax.effects.beams import (
 from natcoord_jax.effects.constraints import PointOnLine, PointOnPlane, PointOnPoint, PointSum, Rod, Rolling
 from natcoord_jax.effects.contact import (
     CapsuleOnCapsule,
+    DiscreteGap,
     EllipsoidOnPlane,
     Gap,
     GapConstraint,
     GapPotential,
+    NodeOnFacets,
     SphereOnBox,
     SphereOnPlane,
     SphereOnSphere,
@@ -235,6 +237,7 @@ __all__ = [
     "DirectorDamping",
     "DirectorElement",
     "DirectorInterpolation",
+    "DiscreteGap",
     "Dissipative",
     "Distance",
     "Drive",
@@ -277,6 +280,7 @@ __all__ = [
     "MeshHandle",
     "Modes",
     "Nodes",
+    "NodeOnFacets",
     "NonlinearBeamElement",
     "NonlinearProgram",
     "NonlinearSpring",

@@ -212,7 +212,8 @@ CALLS = {
     "Plane": lambda w: {"normal": V, "point": V, "body": [w.body]},
     "Contact": lambda w: {
         "one": [w.body], "other": [nc.Plane(), w.body], "stiffness": NUMBER, "restitution": NUMBER,
-        "friction": NUMBER, "speed": NUMBER, "law": ["linear", "hertz"], "name": NAME,
+        "friction": NUMBER, "speed": NUMBER, "law": ["linear", "hertz"], "name": NAME, "one_pass": FLAG,
+        "candidates": WHOLE,
     },
     "GapPotential": lambda w: {
         **MARKED(w.ends), "gap": [nc.SphereOnSphere(radii=(1.0, 1.0))], "stiffness": NUMBER,
@@ -227,6 +228,13 @@ CALLS = {
     "CapsuleOnCapsule": lambda w: {"radii": [(1.0, 1.0)]},
     "EllipsoidOnPlane": lambda w: {"semi_axes": V},
     "SphereOnBox": lambda w: {"size": V, "radius": NUMBER},
+    "NodeOnFacets": lambda w: {
+        **GAP((*w.ends * 2, w.ends[0])),
+        "facets": [((1, 2, 3, 4),)],
+        "open": [1.0],
+        "thickness": NUMBER,
+        "two_sided": [0.0, 1.0],
+    },
     "FacePressure": lambda w: {**MARKED(w.ends * 2), "pressure": [1.0, f]},
     "FacePressure6": lambda w: {**MARKED(w.ends * 3), "pressure": [1.0, f]},
     "FacePressure8": lambda w: {**MARKED(w.ends * 4), "pressure": [1.0, f]},
@@ -465,12 +473,12 @@ MADE = {
     "System",
     "Trajectory",
 }  # fmt: skip
-BASES = {"Constraint", "Field", "Force", "Gap", "Joint", "Potential", "VelocityConstraint"}
 BASES = {
     "Constraint",
+    "DiscreteGap",
     "Field",
     "Force",
-    "GapPotential",
+    "Gap",
     "Hyperelastic",
     "Joint",
     "Potential",

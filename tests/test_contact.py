@@ -9,7 +9,7 @@ from differences import assert_v_shaped
 
 import natcoord_jax as nc
 from natcoord_jax import gallery
-from natcoord_jax.effects.contact.gap_potential import damping_of
+from natcoord_jax.effects.contact.law import damping_of
 from natcoord_jax.effects.contact.pairs import TOWARDS_MIDDLE, segment_distance_square
 from natcoord_jax.viz.links import links
 

@@ -196,6 +196,11 @@ TABLE = {
     nc.GapConstraint: Entry(
         lambda p: nc.GapConstraint(p.ends, nc.SphereOnSphere(radii=(0.1, 0.1)), restitution=0.5)
     ),
+    nc.NodeOnFacets: Entry(
+        lambda p: nc.NodeOnFacets(
+            (p.ends[1], *p.eight[:4]), facets=[(1, 2, 3, 4)], thickness=2.0, two_sided=1.0, stiffness=9.0
+        )
+    ),
     nc.FacePressure: Entry(
         lambda p: nc.FacePressure((*p.eight[:2], *p.eight[5:7]), pressure=jnp.sin), inside=False
     ),

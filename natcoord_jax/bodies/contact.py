@@ -1,164 +1,83 @@
-"""Contact of bodies with shapes, planes, and the nodes of shells and solids: which gaps it is made of."""
+"""Contact of bodies with shapes, planes, beams, and the surfaces of shells and solids."""
 
-from dataclasses import dataclass
 from typing import Any
 
 import equinox as eqx
-import numpy as np
-from jaxtyping import Array
 
-from natcoord_jax.bodies.continua import MeshHandle
-from natcoord_jax.bodies.shapes import CORNERS, Box, Capsule, Ellipsoid, Shape, Sphere
-from natcoord_jax.core.arguments import Part, is_a
+from natcoord_jax.bodies.beam import BeamHandle
+from natcoord_jax.bodies.contact_gaps import gaps_between
+from natcoord_jax.bodies.contact_sides import BeamSide, BodySide, MeshSide, PlaneSide, SegmentSide, Side
+from natcoord_jax.bodies.contact_sides import Plane as Plane
+from natcoord_jax.bodies.continua import MeshHandle, Surface
+from natcoord_jax.bodies.shapes import Box, Capsule, Ellipsoid, Sphere
+from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.bodies import Body
-from natcoord_jax.core.checks import as_array, is_concrete
-from natcoord_jax.core.eager_numpy import stacked
-from natcoord_jax.core.handles import Handle, ground
-from natcoord_jax.core.kinds import BODY, NAME, Choice, HandleOf, of
-from natcoord_jax.core.markers import Direction, Marker, Point
-from natcoord_jax.core.numeric import COMPONENTS, Directions, Number
+from natcoord_jax.core.effect import replace_fields
+from natcoord_jax.core.handles import Handle
+from natcoord_jax.core.kinds import FLAG, NAME, Choice, HandleOf, of
+from natcoord_jax.core.markers import Point
+from natcoord_jax.core.numeric import Number, Whole
 from natcoord_jax.core.recipe import Builder, Recipe
-from natcoord_jax.effects.contact import (
-    CapsuleOnCapsule,
-    EllipsoidOnPlane,
-    Gap,
-    GapConstraint,
-    GapPotential,
-    SphereOnBox,
-    SphereOnPlane,
-    SphereOnSphere,
-)
 
-
-class Plane(Part):
-    """A plane that is part of a body, or of the ground: what is behind it overlaps with it.
-
-    Attributes:
-        normal: towards what it is in contact with, in the world axes of the assembled pose [-].
-        point: any point of it in the assembled pose [m].
-        body: handle of the body.
-
-    Example:
-        >>> import natcoord_jax as nc
-        >>> floor = nc.Plane(normal=(0, 0, 1))
-    """
-
-    normal: Any = eqx.field(default=(0.0, 0.0, 1.0), kw_only=True, metadata=is_a(Directions()))
-    point: Any = eqx.field(default=(0.0, 0.0, 0.0), kw_only=True, metadata=is_a(COMPONENTS))
-    body: Handle = eqx.field(default=ground, kw_only=True, static=True, metadata=is_a(BODY))
-
-    def markers(self) -> tuple[Marker, Marker]:
-        """A point and the unit normal."""
-        normal = as_array(self.normal, float)
-        unit = normal / np.linalg.norm(normal) if is_concrete(normal) else normal / _size(normal)
-        return Point(self.body, self.point), Direction(self.body, unit)
-
-
-def _size(vector: Array) -> Array:
-    return (vector @ vector) ** 0.5
-
-
-SHARED = 1e-9
-"""Compliance of contacts with several gaps, which may depend on each other."""
-
-SOLID = HandleOf("body") | of(
-    "what scene.add(nc.Shell(...)) or scene.add(nc.Solid(...)) returned", MeshHandle
+SOLID = (
+    HandleOf("body")
+    | of(
+        "what scene.add(nc.Shell(...)) or scene.add(nc.Solid(...)) returned, or faces of it",
+        MeshHandle,
+        Surface,
+    )
+    | of("what scene.add(nc.Beam(...)) returned", BeamHandle)
 )
 SIDE = SOLID | of("nc.Plane(...)", Plane)
-
-
-@dataclass(frozen=True)
-class _Solid:
-    """A shape on a body: what it is, and its markers in the axes of the body."""
-
-    handle: Handle
-    shape: Shape | None
-    centre: Any
-
-    def point(self, place: Any = (0.0, 0.0, 0.0)) -> Marker:
-        """A point of it, from its centre."""
-        return Point(self.handle, self.centre + as_array(place, float), local=True)
-
-    def axes(self) -> tuple[Marker, ...]:
-        """Its own."""
-        return tuple(Direction(self.handle, axis, local=True) for axis in np.eye(3))
-
-    @property
-    def radius(self) -> Any:
-        """Of a sphere or a capsule; of a point zero."""
-        shape: Any = self.shape
-        return 0.0 if shape is None else shape.radius
-
-    def ends(self) -> tuple[Marker, Marker]:
-        """Of the segment that a capsule is round, or twice the centre of a sphere."""
-        half = 0.5 * self.shape.length if isinstance(self.shape, Capsule) else 0.0
-        return self.point((0.0, 0.0, -half)), self.point((0.0, 0.0, half))
-
-
-Pair = tuple[Gap, tuple[Marker, ...]]
-"""A gap, and what it is of."""
-
-
-def _on_plane(solid: _Solid, plane: Plane) -> list[Pair]:
-    """A solid on a plane."""
-    table, shape = plane.markers(), solid.shape
-    if isinstance(shape, Box):
-        corners = (0.5 * shape.size * corner for corner in CORNERS)
-        return [(SphereOnPlane(), (*table, solid.point(corner))) for corner in corners]
-    if isinstance(shape, Capsule):
-        return [(SphereOnPlane(radius=shape.radius), (*table, end)) for end in solid.ends()]
-    if isinstance(shape, Ellipsoid):
-        markers = (*table, solid.point(), *solid.axes())
-        return [(EllipsoidOnPlane(semi_axes=shape.semi_axes), markers)]
-    return [(SphereOnPlane(radius=solid.radius), (*table, solid.point()))]
-
-
-def _between(one: _Solid, other: _Solid) -> list[Pair] | None:
-    """Two solids; None: there is no gap for them."""
-    if isinstance(other.shape, Box) and not isinstance(one.shape, Box):
-        return _between(other, one)
-    if isinstance(one.shape, Box):
-        if other.shape is not None and not isinstance(other.shape, Sphere):
-            return None
-        markers = one.point(), other.point(), *one.axes()
-        return [(SphereOnBox(size=one.shape.size, radius=other.radius), markers)]
-    if any(isinstance(s.shape, Ellipsoid) for s in (one, other)):
-        return None
-    radii = stacked([as_array(s.radius, float) for s in (one, other)])
-    if isinstance(one.shape, Capsule) or isinstance(other.shape, Capsule):
-        return [(CapsuleOnCapsule(radii=radii), (*one.ends(), *other.ends()))]
-    return [(SphereOnSphere(radii=radii), (one.point(), other.point()))]
-
 
 SHAPES = "nc.Sphere, nc.Capsule, nc.Box, nc.Ellipsoid or a point"
 
 
 class Contact(Recipe):
-    """Contact of a body with a plane or with another body, without friction.
+    """Contact of a body with a plane or with another body.
 
-    The surfaces may overlap a little: an energy of the overlap pushes them apart. At an impact of speed v a
-    mass m goes v sqrt(m / stiffness) deep, whatever the step; a contact lasts pi sqrt(m / stiffness), and for
-    rebounds and gradients that are good to 5 % it wants six steps of that. Energy, momentum and angular
-    momentum are exact, at impacts of any number of bodies, too.
+    Without a stiffness, rigid bodies do not overlap (`nc.GapConstraint`): impacts leave a part `restitution`
+    of the speed of closing, whatever the step, and surfaces may rub (`friction`). Energy is exact but for
+    what impacts and friction lose, which is in the account of the contact. That is for steps of order two,
+    and derivatives are those of the program.
 
-    There are gaps for spheres, capsules, boxes (by their corners), ellipsoids, points and the nodes of shells
-    and solids on planes; for spheres and capsules on each other and on points and nodes; for spheres and
-    points on boxes. A shell or a solid is touched at its nodes only: what is smaller than its cells slips
-    through. Where a step is longer than a body, it may pass another without ever overlapping with it.
+    With a stiffness, and where shells and solids are touched, the surfaces may overlap a little: an energy of
+    the overlap pushes them apart. At an impact of speed v a mass m goes v sqrt(m / stiffness) deep, whatever
+    the step; a contact lasts pi sqrt(m / stiffness), and for rebounds and gradients that are good to 5 % it
+    wants six steps of that. Energy, momentum and angular momentum are exact, at impacts of any number of
+    bodies, too.
+
+    There are gaps for spheres, capsules, boxes (by their corners), ellipsoids, points, beams and the nodes of
+    shells and solids on planes; for spheres, capsules and beams on each other and on points and nodes; for
+    spheres, points and nodes on boxes; and for surfaces of shells and solids on each other, nodes of either
+    on the facets of the other, each with half the stiffness. Other shapes touch a shell or a solid at its
+    nodes only: what is smaller than its cells slips through. Where a step is longer than a body, it may pass
+    another without ever overlapping with it.
+
+    Shells are touched from both sides, where their thickness ends; solids from outside, best at all that is
+    outside, since at the end of a surface nodes slip off it. Which facets a node may touch is settled
+    where the scene is compiled: those `candidates` that are the nearest to it in the assembled pose.
 
     Attributes:
-        one: handle of a body with a shape, of a point mass or a node, or of a shell or a solid.
-        other: `nc.Plane`, or another handle of that kind.
+        one: handle of a body with a shape, of a point mass or a node, of a beam, of a shell or a solid, or
+            faces of these, as block.face("x1").
+        other: `nc.Plane`, or another of that kind.
         stiffness: k [N/m] of each contact: of each corner of a box on a plane, of each node; with law="hertz"
-            [N/m^1.5], for spheres 4/3 E* sqrt(R).
-        restitution: part of the closing speed that is left after an impact [-], where no other force acts
-            (weight in a soft contact takes some more of it); None: nothing is lost.
-        speed: of the impact that `restitution` is of [m/s]; less is lost of slower ones.
+            [N/m^1.5], for spheres 4/3 E* sqrt(R). None: that of the elements at a node of a shell or a solid
+            along their normal, modulus times area over thickness; of rigid bodies none, they do not overlap.
+        restitution: part of the closing speed that is left after an impact [-]; None: nothing is lost. With a
+            stiffness above 0, and where no other force acts (weight in a soft contact takes some more of it).
+        friction: coefficient [-], of contacts without a stiffness; None: there is none.
+        speed: with a stiffness, of the impact that `restitution` is of [m/s]; less is lost of slower ones.
         law: force proportional to the overlap, "linear", or to its power 3/2, "hertz".
+        one_pass: of two surfaces, let the nodes of `one` alone touch the facets of `other`, with all of the
+            stiffness: for a fine surface, or one that folds, on a coarse one.
+        candidates: number of facets that a node may touch; default 16.
         name: of the contact; several gaps are called "name[0]" and so on.
 
     Raises:
-        ValueError: when it is added: for shapes that there is no gap for.
+        ValueError: when it is added: for shapes that there is no gap for, a surface against itself, or no
+            stiffness. When the scene is compiled: for surfaces that overlap from the start.
 
     Example:
         >>> import jax; jax.config.update("jax_enable_x64", True)
@@ -173,7 +92,7 @@ class Contact(Recipe):
         True
     """
 
-    one: Handle = eqx.field(static=True, metadata=is_a(SOLID))
+    one: Any = eqx.field(static=True, metadata=is_a(SOLID))
     other: Any = eqx.field(metadata=is_a(SIDE))
     stiffness: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Number("positive")))
     restitution: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Number("not negative")))
@@ -182,74 +101,71 @@ class Contact(Recipe):
     law: str = eqx.field(
         default="linear", kw_only=True, static=True, metadata=is_a(Choice(("linear", "hertz")))
     )
+    one_pass: bool = eqx.field(default=False, kw_only=True, static=True, metadata=is_a(FLAG))
+    candidates: int | None = eqx.field(default=None, kw_only=True, static=True, metadata=is_a(Whole(1)))
     name: str | None = eqx.field(default=None, kw_only=True, static=True, metadata=is_a(NAME))
 
     kind = "contact"
 
     def add_to(self, scene: Builder, name: str) -> tuple[Handle, ...]:
         """Add its gaps; their handles."""
-        plane = self.other.body if isinstance(self.other, Plane) else self.other
-        if self.one == plane:
-            raise ValueError(f"contact {name!r}: {self.one.name!r} would be in contact with itself")
-        solids = self._solids(scene, self.one, name)
-        pairs = [pair for solid in solids for pair in self._pairs(scene, solid, name)]
-        named = (name if len(pairs) == 1 else f"{name}[{k}]" for k in range(len(pairs)))
-        several = len(pairs) > 1
-        return tuple(
-            scene.add(self._effect(markers, gap, said, several)) for (gap, markers), said in zip(pairs, named)
-        )
-
-    def _effect(
-        self, markers: tuple[Marker, ...], gap: Gap, name: str, several: bool
-    ) -> GapPotential | GapConstraint:
-        """What keeps one gap open, of several or alone."""
-        if self.stiffness is None:
-            restitution = 1.0 if self.restitution is None else self.restitution
-            given = {"restitution": restitution, "friction": self.friction, "compliance": SHARED * several}
-            return GapConstraint(markers, gap, **given, name=name)
+        if _owner(self.one) == _owner(self.other):
+            raise ValueError(
+                f"contact {name!r}: {_owner(self.one).name!r} would be in contact with itself, for which "
+                "there is no gap; pass two different parts"
+            )
         law = {"stiffness": self.stiffness, "law": self.law}
-        if self.restitution is not None:
-            law |= {"restitution": self.restitution, "speed": self.speed}
-        return GapPotential(markers, gap, **law, name=name)
+        for option in ("restitution", "friction", "speed", "candidates"):
+            if getattr(self, option) is not None:
+                law[option] = getattr(self, option)
+        if self.one_pass:
+            law |= {"one_pass": True}
+        one, other = (_side(scene, given, name) for given in (self.one, self.other))
+        gaps = gaps_between(one, other, law, name)
+        named = [name] if len(gaps) == 1 else [f"{name}[{k}]" for k in range(len(gaps))]
+        return tuple(scene.add(replace_fields(gap, name=said)) for gap, said in zip(gaps, named))
 
-    def _pairs(self, scene: Builder, solid: _Solid, name: str) -> list[Pair]:
-        if isinstance(self.other, Plane):
-            return _on_plane(solid, self.other)
-        found: list[Pair] = []
-        for second in self._solids(scene, self.other, name):
-            gaps = _between(solid, second)
-            if solid.shape is None and second.shape is None:
-                raise ValueError(
-                    f"contact {name!r}: {solid.handle.name!r} and {second.handle.name!r} are points, which "
-                    "do not overlap; give one of them a shape"
-                )
-            if gaps is None:
-                shapes = [type(s.shape).__name__ for s in (solid, second)]
-                raise ValueError(
-                    f"contact {name!r}: there is no gap between {shapes[0]} {solid.handle.name!r} and "
-                    f"{shapes[1]} {second.handle.name!r}; model one of them by spheres or capsules"
-                )
-            found += gaps
-        return found
 
-    def _solids(self, scene: Builder, handle: Handle, name: str) -> list[_Solid]:
-        """What a handle stands for."""
-        if isinstance(handle, MeshHandle):
-            return [_Solid(node, None, np.zeros(3)) for node in handle.nodes]
-        part = scene.find(handle, f"contact {name!r}")
-        if not isinstance(part, Body):
+def _owner(given: Any) -> Any:
+    """The part that a side belongs to."""
+    if isinstance(given, Plane):
+        return given.body
+    return given.handle if isinstance(given, Surface) else given
+
+
+def _side(scene: Builder, given: Any, name: str) -> Side:
+    """What is passed for a side."""
+    if isinstance(given, Plane):
+        return PlaneSide(given.body, Plane, given)
+    if isinstance(given, BeamHandle):
+        return BeamSide.of(given, name)
+    if isinstance(given, MeshHandle | Surface):
+        surface = given.face() if isinstance(given, MeshHandle) else given
+        return MeshSide(surface.handle, Surface, surface)
+    part = scene.find(given, f"contact {name!r}")
+    if not isinstance(part, Body):
+        raise ValueError(f"contact {name!r}: {given!r} has no surface; pass nc.Plane(body=...) for a plane")
+    if part.shape is None:
+        if part.oriented:
             raise ValueError(
-                f"contact {name!r}: {handle!r} has no surface; pass nc.Plane(body=...) for a plane"
+                f"contact {name!r}: {given.name!r} has no shape; give it one: {SHAPES} (nc.PointMass)"
             )
-        if part.shape is None:
-            if part.oriented:
-                raise ValueError(
-                    f"contact {name!r}: {handle.name!r} has no shape; give it one: {SHAPES} (nc.PointMass)"
-                )
-            return [_Solid(handle, None, np.zeros(3))]
-        if not isinstance(part.shape.shape, Sphere | Capsule | Box | Ellipsoid):
-            raise ValueError(
-                f"contact {name!r}: {handle.name!r} is a {type(part.shape.shape).__name__}; there are gaps "
-                f"for {SHAPES}"
-            )
-        return [_Solid(handle, part.shape.shape, part.shape.centre)]
+        return SegmentSide.ball(Point(given))
+    return _shaped(given, part.shape.shape, part.shape.centre, name)
+
+
+def _shaped(handle: Handle, shape: Any, centre: Any, name: str) -> Side:
+    """A body with a shape."""
+    body = BodySide(handle, type(shape), shape, centre)
+    if isinstance(shape, Sphere):
+        return SegmentSide.ball(body.point(), shape.radius)
+    if isinstance(shape, Capsule):
+        half = 0.5 * shape.length
+        return SegmentSide(
+            handle, Capsule, (body.point((0, 0, -half)), body.point((0, 0, half))), shape.radius
+        )
+    if not isinstance(shape, Box | Ellipsoid):
+        raise ValueError(
+            f"contact {name!r}: {handle.name!r} is a {type(shape).__name__}; there are gaps for {SHAPES}"
+        )
+    return body

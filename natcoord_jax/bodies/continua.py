@@ -58,10 +58,14 @@ class MeshHandle(Handle):
         nodes: of the mesh, a set that is indexed, sliced and selected by position; joints, loads, springs and
             sensors take its nodes as any body.
         mesh: as it was given.
+        material: of it.
+        thickness: of a shell at its cells (cells,) [m]; None: it is a solid.
     """
 
     nodes: NodeSet = field(compare=False)
     mesh: Mesh = field(compare=False)
+    material: Any = field(compare=False, repr=False, default=None)
+    thickness: Any = field(compare=False, repr=False, default=None)
 
     def set(self, name: str) -> NodeSet:
         """The nodes of a set of the mesh, as "left".
@@ -87,6 +91,20 @@ class MeshHandle(Handle):
             raise ValueError(f"{self.name!r} has no faces {name!r}; its mesh has {known}")
         return Surface(self, self.mesh.faces[name])
 
+    def surface(self, side: str) -> "Surface":
+        """A shell as it is touched from one side: "outside", where its directors point, or "inside".
+
+        Raises:
+            ValueError: for a solid, or another side.
+        """
+        turns = {"outside": 1, "inside": -1}
+        if self.thickness is None or side not in turns:
+            raise ValueError(
+                f"{self.name!r}: there is no side {side!r}; pass 'outside' or 'inside' of a shell, and take "
+                "face(...) of a solid"
+            )
+        return Surface(self, self.mesh.cells[:, :: turns[side]], one_sided=True)
+
     def nearest(self, position: Any) -> Handle:
         """The node nearest to a position in the assembled pose [m]."""
         away = np.asarray(self.nodes.positions) - np.asarray(position, float)
@@ -100,10 +118,12 @@ class Surface:
     Attributes:
         handle: of the solid or the shell.
         faces: numbers of the nodes of each of them (f, 4), (f, 6), (f, 8) or (f, 9), as of `nc.mesh.Mesh`.
+        one_sided: whether a shell is touched from outside only.
     """
 
     handle: MeshHandle
     faces: Int[np.ndarray, "f k"]
+    one_sided: bool = False
 
     def __repr__(self) -> str:
         return f"<{len(self.faces)} faces of {self.handle.name!r}>"
@@ -149,9 +169,9 @@ class _Continuum(Recipe):
         given = as_array(self.position, float), turned, as_array(self.velocity, float), spin
         return *_placed(as_array(self.mesh.nodes, float), *given), turned, spin
 
-    def _handle(self, scene: Builder, nodes: NodeSet, elements: Any) -> MeshHandle:
+    def _handle(self, scene: Builder, nodes: NodeSet, elements: Any, thickness: Any = None) -> MeshHandle:
         found = scene.add(elements)
-        return MeshHandle(found.kind, found.name, found.scene, nodes, self.mesh)
+        return MeshHandle(found.kind, found.name, found.scene, nodes, self.mesh, self.material, thickness)
 
 
 class Shell(_Continuum):
@@ -229,12 +249,13 @@ class Shell(_Continuum):
             own["direction"] = _turned(as_array(self.direction, float)[None], turned)[0]
         own |= {key: getattr(self, key) for key in ("material", "offset", "prestress", "damping", "membrane")}
         cells = self.mesh.cells
+        each = as_array(np.broadcast_to(thick, (len(cells),))) if is_concrete(thick) else thick
         three = cells[:, 2] == cells[:, 3]
         if three.all():
-            return self._handle(scene, nodes, self._elements(nodes, three, name, own))
+            return self._handle(scene, nodes, self._elements(nodes, three, name, own), each)
         if three.any():
             scene.add(self._elements(nodes, three, f"{name} triangles", own))
-        return self._handle(scene, nodes, self._elements(nodes, ~three, name, own))
+        return self._handle(scene, nodes, self._elements(nodes, ~three, name, own), each)
 
     def _elements(self, nodes: NodeSet, some: np.ndarray, name: str, own: dict[str, Any]) -> Any:
         """On some of the cells, which are all triangles or all quadrilaterals."""

@@ -8,7 +8,14 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from natcoord_jax.gallery.beams import cantilever, flying_spaghetti, rope
-from natcoord_jax.gallery.contact import bouncing_balls, dice, newton_cradle, rattleback, tumbling_capsules
+from natcoord_jax.gallery.contact import (
+    bouncing_balls,
+    colliding_blocks,
+    dice,
+    newton_cradle,
+    rattleback,
+    tumbling_capsules,
+)
 from natcoord_jax.gallery.continua import block, inflated_ball, plate, solar_panels
 from natcoord_jax.gallery.example import Example
 from natcoord_jax.gallery.loops import bricard, four_bar, slider_crank
@@ -20,6 +27,7 @@ from natcoord_jax.gallery.robot import robot_cable
 from natcoord_jax.gallery.rolling import bicycle
 from natcoord_jax.gallery.spacecraft import spacecraft
 from natcoord_jax.gallery.stiff import mass_ladder, stiff_chain
+from natcoord_jax.gallery.tennis import tennis
 from natcoord_jax.gallery.tops import dzhanibekov, fast_top, free_body, heavy_top
 from natcoord_jax.gallery.trees import binary_tree, chain, robot_arm
 
@@ -55,8 +63,10 @@ SCENES: Mapping[str, Callable[..., Example]] = {
     "tumbling_capsules": tumbling_capsules,
     "rattleback": rattleback,
     "dice": dice,
+    "colliding_blocks": colliding_blocks,
     "robot_cable": robot_cable,
     "plugging": plugging,
+    "tennis": tennis,
 }
 
 __all__ = ["SCENES", "Example", "describe", "load"]

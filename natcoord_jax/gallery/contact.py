@@ -140,3 +140,33 @@ def dice() -> Example:
         scene.add(nc.Contact(scene.add(die), floor, restitution=0.4, friction=0.4, name=f"floor {k + 1}"))
     system, state = scene.compile()
     return Example("dice", "dice on a floor", system, state, 1e-3, 2000)
+
+
+def colliding_blocks() -> Example:
+    """Two rubber blocks collide face to face, corner first, nodes of each on the facets of the other."""
+    scene, rubber = nc.Scene(), nc.Elastic(E=1e4, nu=0.3, density=1.0)
+    tilt = (1.0, 0.6, 0.0), 0.29
+    spin, middle = np.array([0.0, 0.3, 0.8]), np.array([1.0, 1.0, 0.3])
+    one = scene.add(
+        nc.Solid(
+            nc.mesh.box((1, 1, 1), (2, 2, 2)),
+            material=rubber,
+            position=(0.02, 0.2, 0.19),
+            orientation=tilt,
+            velocity=(1.0, 0.5, -4.0),
+            name="upper",
+        )
+    )
+    other = scene.add(
+        nc.Solid(
+            nc.mesh.box((2, 2, 0.6), (2, 2, 1)),
+            material=rubber,
+            position=(-0.55, -0.45, -0.65),
+            velocity=np.array([0, 0, 2.0]) - np.cross(spin, middle),
+            angular_velocity=spin,
+            name="lower",
+        )
+    )
+    scene.add(nc.Contact(one.face("z0"), other.face("z1"), name="impact"))
+    system, state = scene.compile()
+    return Example("colliding_blocks", "rubber blocks that collide", system, state, 4e-3, 100)

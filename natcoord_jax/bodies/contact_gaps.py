@@ -1,0 +1,173 @@
+"""Which gap there is between two kinds of sides: one table, to which a kind is added by its own lines."""
+
+from collections.abc import Callable
+from typing import Any
+
+from natcoord_jax.bodies.contact_sides import (
+    BeamSide,
+    BodySide,
+    MeshSide,
+    Plane,
+    PlaneSide,
+    SegmentSide,
+    Side,
+    Strand,
+)
+from natcoord_jax.bodies.continua import Surface
+from natcoord_jax.bodies.node_surface import surface_gaps
+from natcoord_jax.bodies.shapes import CORNERS, Box, Capsule, Ellipsoid, Sphere
+from natcoord_jax.core.checks import as_array
+from natcoord_jax.core.eager_numpy import stacked
+from natcoord_jax.core.effect import replace_fields
+from natcoord_jax.core.markers import Marker
+from natcoord_jax.effects.contact import (
+    CapsuleOnCapsule,
+    EllipsoidOnPlane,
+    Gap,
+    GapConstraint,
+    GapPotential,
+    SphereOnBox,
+    SphereOnPlane,
+    SphereOnSphere,
+)
+
+OF_SURFACES = "candidates", "one_pass"
+"""Options that contacts of other sides have no use for."""
+
+OF_CONSTRAINTS = "restitution", "friction"
+"""Options of contacts without a stiffness."""
+
+SHARED = 1e-9
+"""Compliance of contacts with several gaps, which may depend on each other."""
+
+Law = dict[str, Any]
+Gaps = list[Any]
+
+
+def gaps_between(one: Side, other: Side, law: Law, name: str) -> Gaps:
+    """Gaps of two sides, or of the simpler ones that stand for them.
+
+    Args:
+        one: side.
+        other: side.
+        law: numbers of the contact; stiffness None: that of the sides.
+        name: of the contact, for messages.
+
+    Raises:
+        ValueError: for kinds that there is no gap for, and numbers that do not go together.
+    """
+    for first, second in ((one, other), (other, one)):
+        make = TABLE.get((first.kind, second.kind))
+        if make is not None:
+            return make(first, second, law, name)
+    for whole, rest in ((one, other), (other, one)):
+        if whole.parts:
+            return [gap for part in whole.parts for gap in gaps_between(part, rest, law, name)]
+    raise ValueError(
+        f"contact {name!r}: there is no gap between {one.named} and {other.named}; model one of them by "
+        "spheres or capsules"
+    )
+
+
+def _kept_open(gap: Gap, markers: tuple[Marker, ...], law: Law, name: str, *sides: Side) -> Any:
+    """A potential with the stiffness that is given or that of the sides; a constraint where there is none."""
+    law = {key: value for key, value in law.items() if key not in OF_SURFACES}
+    own = [s.stiffness for s in sides if isinstance(s, SegmentSide) and s.stiffness is not None]
+    stiffness = law.pop("stiffness") if law["stiffness"] is not None or not own else min(own)
+    if stiffness is not None:
+        if "friction" in law:
+            raise ValueError(
+                f"contact {name!r}: friction [-] is for contacts of rigid bodies without a stiffness; leave "
+                "one of them out"
+            )
+        return GapPotential(markers, gap, stiffness=stiffness, **law)
+    if "speed" in law or law["law"] != "linear":
+        raise ValueError(
+            f"contact {name!r}: speed [m/s] and law are of contacts with a stiffness [N/m]; pass "
+            "`stiffness`, or leave them out"
+        )
+    return GapConstraint(markers, gap, **{key: law[key] for key in OF_CONSTRAINTS if key in law})
+
+
+def _sharing(gaps: Gaps) -> Gaps:
+    """Gaps of one body, which may depend on each other."""
+    return [replace_fields(g, compliance=SHARED) if isinstance(g, GapConstraint) else g for g in gaps]
+
+
+def _ball_on_plane(ball: SegmentSide, plane: PlaneSide, law: Law, name: str) -> Gaps:
+    markers = *plane.plane.markers(), ball.ends[0]
+    return [_kept_open(SphereOnPlane(radius=ball.radius), markers, law, name, ball, plane)]
+
+
+def _segment_on_plane(segment: SegmentSide, plane: PlaneSide, law: Law, name: str) -> Gaps:
+    balls = (SegmentSide.ball(end, segment.radius) for end in segment.ends)
+    return _sharing([gap for ball in balls for gap in _ball_on_plane(ball, plane, law, name)])
+
+
+def _beam_on_plane(beam: BeamSide, plane: PlaneSide, law: Law, name: str) -> Gaps:
+    return [gap for ball in beam.balls for gap in _ball_on_plane(ball, plane, law, name)]
+
+
+def _box_on_plane(box: BodySide, plane: PlaneSide, law: Law, name: str) -> Gaps:
+    shape: Any = box.shape
+    corners = [SegmentSide.ball(box.point(0.5 * shape.size * corner)) for corner in CORNERS]
+    return _sharing([gap for ball in corners for gap in _ball_on_plane(ball, plane, law, name)])
+
+
+def _ellipsoid_on_plane(ellipsoid: BodySide, plane: PlaneSide, law: Law, name: str) -> Gaps:
+    shape: Any = ellipsoid.shape
+    markers = *plane.plane.markers(), ellipsoid.point(), *ellipsoid.axes()
+    return [_kept_open(EllipsoidOnPlane(semi_axes=shape.semi_axes), markers, law, name)]
+
+
+def _ball_on_box(ball: SegmentSide, box: BodySide, law: Law, name: str) -> Gaps:
+    shape: Any = box.shape
+    markers = box.point(), ball.ends[0], *box.axes()
+    return [_kept_open(SphereOnBox(size=shape.size, radius=ball.radius), markers, law, name, ball, box)]
+
+
+def _radii(one: SegmentSide, other: SegmentSide, name: str) -> Any:
+    """Of both.
+
+    Raises:
+        ValueError: for two points.
+    """
+    if all(isinstance(s.radius, float) and s.radius == 0.0 for s in (one, other)):
+        raise ValueError(
+            f"contact {name!r}: {one.handle.name!r} and {other.handle.name!r} are points, which do not "
+            "overlap; give one of them a shape"
+        )
+    return stacked([as_array(s.radius, float) for s in (one, other)])
+
+
+def _balls(one: SegmentSide, other: SegmentSide, law: Law, name: str) -> Gaps:
+    radii = _radii(one, other, name)
+    return [_kept_open(SphereOnSphere(radii=radii), (one.ends[0], other.ends[0]), law, name, one, other)]
+
+
+def _segments(one: SegmentSide, other: SegmentSide, law: Law, name: str) -> Gaps:
+    radii = _radii(one, other, name)
+    return [_kept_open(CapsuleOnCapsule(radii=radii), (*one.ends, *other.ends), law, name, one, other)]
+
+
+def _surfaces(one: MeshSide, other: MeshSide, law: Law, name: str) -> Gaps:
+    if "friction" in law:
+        raise ValueError(
+            f"contact {name!r}: there is no friction [-] between surfaces of shells and solids yet"
+        )
+    return [surface_gaps(one, other, law, name)]
+
+
+TABLE: dict[tuple[type, type], Callable[..., Gaps]] = {
+    (Sphere, Plane): _ball_on_plane,
+    (Capsule, Plane): _segment_on_plane,
+    (Strand, Plane): _beam_on_plane,
+    (Box, Plane): _box_on_plane,
+    (Ellipsoid, Plane): _ellipsoid_on_plane,
+    (Sphere, Box): _ball_on_box,
+    (Sphere, Sphere): _balls,
+    (Sphere, Capsule): _segments,
+    (Capsule, Capsule): _segments,
+    (Surface, Surface): _surfaces,
+}
+"""The gap of each pair of kinds, in one order."""

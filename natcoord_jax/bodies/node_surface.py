@@ -1,0 +1,93 @@
+"""Nodes of one surface on the facets of another, as arrays."""
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from natcoord_jax.bodies.contact_sides import MeshSide
+from natcoord_jax.core.elements import Elements
+from natcoord_jax.core.nodes import NodeUnion
+from natcoord_jax.effects.contact import NodeOnFacets
+
+CANDIDATES = 16
+"""Facets that a node may touch, by default."""
+
+
+def surface_gaps(one: MeshSide, other: MeshSide, law: dict[str, Any], name: str) -> Elements:
+    """Gaps of the nodes of each of two surfaces on the facets of the other, with half the stiffness of each.
+
+    So no surface has a part of its own. In one pass, nodes of the first on facets of the second only.
+
+    Args:
+        one: surface.
+        other: surface.
+        law: numbers of the contact; stiffness None: that of the elements; "candidates": facets of each node;
+            "one_pass": whether nodes of the first surface only are touched.
+        name: of the contact.
+    """
+    law = dict(law)
+    most = min(law.pop("candidates", None) or CANDIDATES, max(len(s.surface.faces) for s in (one, other)))
+    given = law.pop("stiffness")
+    passes = 1 if law.pop("one_pass", False) else 2
+    sides = ((one, other), (other, one))[:passes]
+    first = 0, len(one.numbers)
+    patches = [_patches(a, b, most, first, k) for k, (a, b) in enumerate(sides)]
+    width = max(table.shape[1] for table, _, _ in patches)
+    # What fills up repeats the last node, so that both ways are alike.
+    tables = [np.pad(table, ((0, 0), (0, width - table.shape[1])), mode="edge") for table, _, _ in patches]
+    each: dict[str, list[Any]] = {"facets": [], "open": [], "thickness": [], "stiffness": [], "two_sided": []}
+    for (slave, master), (_, facets, ends) in zip(sides, patches):
+        thick = slave.half_thickness
+        stiff = slave.stiffness if given is None else np.full(len(thick), float(given))
+        each["facets"].append(facets)
+        each["open"].append(ends)
+        each["thickness"].append(thick + master.half_thickness.max())
+        each["stiffness"].append(stiff / passes)
+        each["two_sided"].append(np.full(len(thick), float(master.two_sided)))
+    union = NodeUnion(tuple(s.surface.handle.nodes[s.numbers] for s in (one, other)))
+    numbers = {key: np.concatenate(values) for key, values in each.items()}
+    return NodeOnFacets.on(union, np.concatenate(tables), each=numbers, **law)
+
+
+def _nearest(
+    nodes: Float[np.ndarray, "n 3"], corners: Float[np.ndarray, "f 4 3"], most: int
+) -> Int[np.ndarray, "n k"]:
+    """Numbers of the facets whose middles are the nearest to each node."""
+    apart = nodes[:, None] - corners.mean(axis=1)
+    found = np.argsort(np.sum(apart**2, axis=2), axis=1, kind="stable")[:, :most]
+    return np.pad(found, ((0, 0), (0, most - found.shape[1])), mode="edge")
+
+
+def _patches(
+    slave: MeshSide, master: MeshSide, most: int, first: tuple[int, int], turn: int
+) -> tuple[Int[np.ndarray, "n m"], Int[np.ndarray, "n k 4"], Float[np.ndarray, "n k 4"]]:
+    """For each node itself and the nodes of its facets, the facets by places among them, and which edges end.
+
+    Args:
+        slave: whose nodes.
+        master: whose facets.
+        most: facets of each node; a smaller surface repeats some.
+        first: numbers of the first nodes of both surfaces, in the order in which they are numbered.
+        turn: 0 where the slave is the first of them, else 1.
+    """
+    facets = np.searchsorted(master.numbers, master.surface.faces)
+    places = np.asarray(master.surface.handle.nodes.positions)[master.numbers]
+    nodes = np.asarray(slave.surface.handle.nodes.positions)[slave.numbers]
+    near = _nearest(nodes, places[facets], most)
+    corners = facets[near]
+    unique = [np.unique(x) for x in corners]
+    width = max(map(len, unique))
+    table = np.stack([np.pad(x, (0, width - len(x)), mode="edge") for x in unique])
+    local = np.stack([np.searchsorted(x, c) for x, c in zip(unique, corners)]) + 1
+    edges = np.sort(np.stack([corners, np.roll(corners, -1, axis=2)], axis=-1), axis=-1)
+    ends = [_alone(e, f) for e, f in zip(edges, near)]
+    own = first[turn] + np.arange(len(near))
+    return np.concatenate([own[:, None], first[1 - turn] + table], axis=1), local, np.stack(ends)
+
+
+def _alone(edges: Int[np.ndarray, "k 4 2"], facets: Int[np.ndarray, " k"]) -> Float[np.ndarray, "k 4"]:
+    """Which edges of facets belong to no other of them."""
+    same = (edges[:, :, None, None] == edges).all(axis=-1)
+    others = same & (facets[:, None] != facets)[:, None, :, None]
+    return (~others.any(axis=(2, 3))).astype(float)

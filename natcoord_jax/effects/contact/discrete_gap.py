@@ -1,0 +1,166 @@
+"""Contact as an energy of a gap that is no function of a few invariants: of surfaces, as they are meshed.
+
+A force that does exactly the work of an energy V(g) of a gap g, and neither pushes nor turns as a whole, is
+-[V(g_1) - V(g_0)] / (g_1 - g_0) times a discrete derivative of the gap,
+
+    D g = G_m + [g(q_1) - g(q_0) - G_m . (q_1 - q_0)] c / |Delta pi|^2,    c = D pi(q_m)^T Delta pi,
+
+with any lever G_m in the middle of the step whose sum and moment vanish, and squares of distances pi, whose
+derivatives have neither as well. Both gaps are those of the places themselves: whatever facet is the nearest
+there, it is the same function at the end of a step and at the start of the next.
+"""
+
+import abc
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from natcoord_jax.core.arguments import is_a
+from natcoord_jax.core.closed_tangents import by_twists
+from natcoord_jax.core.effect import Motion, Response, StepContext, replace_fields
+from natcoord_jax.core.handles import Handle
+from natcoord_jax.core.joint import Joint
+from natcoord_jax.core.kinds import NAME
+from natcoord_jax.core.markers import Attachment, Marker, Markers
+from natcoord_jax.core.potential import marker_response, place_markers
+from natcoord_jax.effects.contact.law import ContactLaw, ContactReadings
+
+RIGID = 1e-20
+"""Square of the change of distances, relative to theirs, below which the points move as a rigid body."""
+
+OVERLAPPING = 1e-6
+"""Overlap at the start, relative to the size of the facets, that is more than rounding of places."""
+
+
+class Measured(eqx.Module):
+    """A gap at one place of its points.
+
+    Attributes:
+        gap: of the surfaces, negative where they overlap [m].
+        lever: covector whose sum and moment vanish, near enough the derivative of the gap [-].
+        between: numbers of the points whose distances carry the correction of the lever.
+    """
+
+    gap: Float[Array, ""]
+    lever: Float[Array, "k 3"]
+    between: Int[Array, " p"]
+
+
+class DiscreteGap(ContactLaw):
+    """Base of contacts of points: subclass it and give what is `measured` of them.
+
+    Unlike that of `GapPotential`, the gap may be any function of the points that does not change when all of
+    them move as a rigid body.
+
+    Attributes:
+        markers: points that the gap is between.
+        name: optional name.
+    """
+
+    markers: Any = eqx.field(metadata=is_a(Markers()))
+    name: Any = eqx.field(default=None, kw_only=True, metadata=is_a(NAME))
+    initial: Any = eqx.field(default=None, init=False)
+
+    derived: ClassVar[tuple[str, ...]] = ("damping", "initial")
+
+    def attach(self, find: Callable[[Handle], tuple[Joint, Array]]) -> Sequence[Marker | Attachment]:
+        """Its points."""
+        return self.markers
+
+    @abc.abstractmethod
+    def measured(self, x: Float[Array, "k 3"]) -> Measured:
+        """Gap, lever, and the points that they are between."""
+
+    def gap(self, x: Float[Array, "k 3"]) -> Float[Array, ""]:
+        """Distance of the surfaces, negative where they overlap [m]."""
+        return self.measured(x).gap
+
+    def assembled_at(self, x: Float[Array, "k 3"]) -> "DiscreteGap":
+        """With its damping, and the gap that it starts with in terms of the size of all."""
+        size = jnp.sqrt(jnp.max(jnp.sum((x - x[0]) ** 2, axis=1)))
+        damped: Any = self.renewed()
+        return replace_fields(damped, initial=self.gap(x) / size)
+
+    def flaws(self) -> dict[str, Array]:
+        """A start in penetration."""
+        said = "starts in penetration, with energy that nothing put there; move the surfaces apart"
+        found = super().flaws()
+        return found if self.initial is None else found | {said: self.initial < -OVERLAPPING}
+
+    def respond(self, place: Array, motion: Motion, now: StepContext, lam: Array) -> Response:
+        """The force of the law along the discrete derivative of the gap, and more of it where it closes."""
+        start, rates = place_markers(place, motion.start), place_markers(place, motion.rates)
+        stages = place_markers(place, motion.rows if motion.force_rows is None else motion.force_rows)
+        weights = jnp.asarray(now.tableau.b)
+        begun, ended, derivatives = self._discrete(start, stages, now.h * rates, weights)
+        elastic = self.mean_force(begun.gap, ended.gap)
+        flow = jnp.einsum("i,ikx,ikx->", weights, derivatives, rates)
+        forces = elastic * derivatives
+        given = jnp.sum(forces * rates, axis=(1, 2))
+        found = marker_response(place, self._lossy(-flow) * forces, None, rates, motion)
+        return found if self.damping is None else replace_fields(found, released=given)
+
+    def _lossy(self, closing: Float[Array, ""]) -> Any:
+        """Factor of the force at a closing speed [m/s]; together they never pull."""
+        return 1.0 if self.damping is None else 1.0 + jnp.maximum(self.damping * closing, -1.0)
+
+    def _discrete(
+        self, start: Array, stages: Float[Array, "s k 3"], moved: Float[Array, "s k 3"], weights: Array
+    ) -> tuple[Measured, Measured, Float[Array, "s k 3"]]:
+        """What is measured at both ends of a step, and the discrete derivatives at its stages."""
+        end = start + jnp.einsum("i,ikx->kx", weights, moved)
+        every = jax.vmap(self.measured)(jnp.concatenate([start[None], end[None], stages]))
+        begun, ended, first = (jax.tree.map(lambda y, k=k: y[k], every) for k in range(3))
+        levers, at = every.lever[2:], first.between
+        # Pairs of points, and by how much the squares of their distances change along the whole step.
+        apart, parting = _apart(stages, at), _apart(moved, at)
+        changes = 2.0 * jnp.einsum("i,iabx,iabx->ab", weights, apart, parting)
+        square, scale = jnp.sum(changes**2), jnp.sum(jnp.sum(apart[0] ** 2, axis=2) ** 2)
+        loose = square > RIGID * scale
+        missing = ended.gap - begun.gap - jnp.einsum("i,ikx,ikx->", weights, levers, moved)
+        factor = jnp.where(loose, missing / jnp.where(loose, square, 1.0), 0.0)
+        # Every pair is there twice: half of the sum, and both of its points.
+        carried = 4.0 * factor * jnp.einsum("ab,iabx->iax", changes, apart)
+        return begun, ended, levers.at[:, at].add(carried)
+
+    def tangents(
+        self, place: Array, motion: Motion, now: StepContext, lam: Array, *, turning: bool
+    ) -> Array | None:
+        """Those of the size of the force; its direction hardly changes."""
+        if motion.spin.shape[-2] > place.shape[1] or now.tableau.stages > 1 or place.ndim > 3:
+            return None
+
+        def one(effect: Any, place: Array, start: Array, middle: Array, rates: Array) -> tuple[Array, Array]:
+            x, rate = (place_markers(place, y)[None] for y in (middle, rates))
+            begun = place_markers(place, start)
+            first, last, found = effect._discrete(begun, x, now.h * rate, jnp.ones(1))
+            moving = now.h > 0
+
+            def force(after: Array) -> Array:
+                speed = (first.gap - after) / jnp.where(moving, now.h, 1.0)
+                return effect.mean_force(first.gap, after) * effect._lossy(jnp.where(moving, speed, 0.0))
+
+            size, slope = jax.value_and_grad(force)(last.gap)
+            along = found[0].reshape(-1)
+            return -slope * along[:, None] * last.lever.reshape(-1), size * found[0]
+
+        stiffness, forces = jax.vmap(one)(self, place, motion.start, motion.rows[0], motion.rates[0])
+        return by_twists(stiffness, forces[:, :, None], place[:, :, None], motion, now.h, turning)
+
+    def stored(self, place: Array, rows: Array, coordinates: Array, rates: Array) -> Array:
+        """Energy [J]."""
+        return self.stored_at(self.gap(place_markers(place, rows)))
+
+    def readings(self, place: Array, rows: Array) -> ContactReadings:
+        """Gap and force."""
+        return self.readings_at(self.gap(place_markers(place, rows)))
+
+
+def _apart(x: Float[Array, "s k 3"], at: Int[Array, " p"]) -> Float[Array, "s p p 3"]:
+    """Differences of pairs of points."""
+    some = x[:, at]
+    return some[:, :, None] - some[:, None]

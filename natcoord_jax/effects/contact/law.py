@@ -1,0 +1,169 @@
+"""What is the same of all contacts: the law of an overlap, what impacts lose, what a sensor shows."""
+
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from natcoord_jax.core.arguments import is_a
+from natcoord_jax.core.checks import as_array, is_concrete
+from natcoord_jax.core.eager_numpy import eager_numpy
+from natcoord_jax.core.effect import Effect, replace_fields
+from natcoord_jax.core.kinds import Choice
+from natcoord_jax.core.numeric import Number
+from natcoord_jax.maths.vectors import positive_part
+
+HERTZ = "hertz"
+LAW = Choice(("linear", HERTZ))
+
+
+def damping_of(restitution: Any, speed: Any) -> Array:
+    """Part of the force per closing speed [s/m] with which an impact of this speed keeps this part of it.
+
+    A force Q (1 + a v) of a closing speed v, whatever Q is as a function of the gap, lets a mass rebound with
+    the part e of its speed v_0 for the root d = a v_0 of (1 + d) / (1 - e d) = exp(d (1 + e)).
+
+    Args:
+        restitution: e, above 0 up to 1 [-].
+        speed: v_0 of the impact [m/s].
+    """
+    return _damping(as_array(restitution, float), as_array(speed, float))
+
+
+@eager_numpy
+def _damping(restitution: Array, speed: Array) -> Array:
+    def missing(u: Array) -> Array:
+        # With d = u / e, u in (0, 1): the left side grows beyond all bounds as u does to 1.
+        d = u / restitution
+        return jnp.log1p(d) - jnp.log1p(-u) - d * (1 + restitution)
+
+    # Bisection: positive beyond the root, negative before it, zero at 0; 60 halvings are a double's digits.
+    low, high = jnp.zeros_like(restitution) + 1e-12, jnp.ones_like(restitution) - 1e-15
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        beyond = missing(middle) > 0
+        low, high = jnp.where(beyond, low, middle), jnp.where(beyond, middle, high)
+    # One step of Newton's method gives the root its derivatives.
+    root = jax.lax.stop_gradient(high)
+    slope = 1 / (restitution + root) + 1 / (1 - root) - (1 + restitution) / restitution
+    lossy = restitution < 1
+    change = missing(root) / jnp.where(lossy, slope, 1.0)
+    # Towards 1 the root is 3 (1 - e) / 2.
+    return jnp.where(lossy, (root - change) / restitution, 1.5 * (1 - restitution)) / speed
+
+
+class ContactReadings(eqx.Module):
+    """What goes on in a contact.
+
+    Attributes:
+        gap: between the surfaces; negative where they overlap [m].
+        force: that pushes them apart, without what is lost [N].
+        energy: stored [J].
+    """
+
+    gap: Float[Array, "*t"]
+    force: Float[Array, "*t"]
+    energy: Float[Array, "*t"]
+
+
+class ContactLaw(Effect):
+    """Base of contacts: how much a force an overlap has, and how much of an impact is left.
+
+    With a restitution, what impacts lose is the work in its account, which is never positive.
+
+    Attributes:
+        stiffness: k [N/m] of the linear law, force k d of an overlap d; of Hertz' law [N/m^1.5], k d^1.5.
+        law: "linear" or "hertz".
+        restitution: part of the closing speed that is left after an impact [-], above 0 up to 1; None: all.
+        speed: of the impact that `restitution` is of [m/s].
+        damping: part of the force per closing speed [s/m], follows from the two.
+
+    Raises:
+        ValueError: for a restitution above one, or one without the speed that it is of.
+    """
+
+    stiffness: Any = eqx.field(kw_only=True, metadata=is_a(Number("positive")))
+    law: str = eqx.field(default="linear", kw_only=True, static=True, metadata=is_a(LAW))
+    restitution: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Number("positive")))
+    speed: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Number("positive")))
+    damping: Any = eqx.field(default=None, init=False)
+
+    kind: ClassVar[str] = "contact"
+    derived: ClassVar[tuple[str, ...]] = ("damping",)
+    stores: ClassVar[bool] = True
+    drawn: ClassVar[bool] = False
+    silent: ClassVar[bool] = False
+
+    def __check_init__(self) -> None:
+        """Refuse what gives energy, and a restitution of no speed."""
+        value = self.restitution
+        if value is not None and is_concrete(value) and np.any(np.asarray(value) > 1):
+            raise ValueError(
+                f"{type(self).__name__}: restitution [-] is {value}; pass a number up to 1: an impact "
+                "gives nothing"
+            )
+        if (value is None) != (self.speed is None):
+            raise ValueError(
+                f"{type(self).__name__}: restitution [-] is that of one speed, since slower impacts lose "
+                "less; pass `restitution` and `speed` [m/s], or neither"
+            )
+
+    @property
+    def works(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Whether anything is lost, which its account then has."""
+        return self.restitution is not None
+
+    def flaws(self) -> dict[str, Array]:
+        """A restitution that gives energy, or none."""
+        if self.restitution is None:
+            return {}
+        said = "has a restitution [-] that is not above 0 and up to 1: an impact gives nothing"
+        return {said: (self.restitution <= 0.0) | (self.restitution > 1.0)}
+
+    def assembled_at(self, x: Array) -> "ContactLaw":
+        """With its damping."""
+        return self.renewed()
+
+    def renewed(self) -> "ContactLaw":
+        """With the damping for its restitution."""
+        if self.restitution is None:
+            return self
+        return replace_fields(self, damping=damping_of(self.restitution, self.speed))
+
+    def stored_at(self, gap: Float[Array, ""]) -> Float[Array, ""]:
+        """Energy of a gap [J]."""
+        overlap = positive_part(-gap)
+        if self.law == HERTZ:
+            return 0.4 * self.stiffness * overlap**2 * _root(overlap)
+        return 0.5 * self.stiffness * overlap**2
+
+    def mean_force(self, before: Float[Array, ""], after: Float[Array, ""]) -> Float[Array, ""]:
+        """What the energy of the overlap grows by from one gap to another, per what the gap falls by [N].
+
+        Without a difference of energies, whose digits cancel where the gap hardly changes.
+        """
+        both = (before < 0) & (after < 0)
+        change = jnp.where(before == after, 1.0, before - after)
+        one, two = positive_part(-before), positive_part(-after)
+        share = jnp.where(both, 1.0, (two - one) / change)
+        if self.law != HERTZ:
+            return 0.5 * self.stiffness * (one + two) * share
+        # (a^5 - b^5) / (a^2 - b^2) of the roots.
+        a, b = _root(one), _root(two)
+        powers = one**2 + one * a * b + one * two + a * b * two + two**2
+        some = a + b > 0
+        return 0.4 * self.stiffness * share * jnp.where(some, powers / jnp.where(some, a + b, 1.0), 0.0)
+
+    def readings_at(self, gap: Float[Array, ""]) -> ContactReadings:
+        """What a sensor shows at a gap."""
+        overlap = positive_part(-gap)
+        force = self.stiffness * overlap * (_root(overlap) if self.law == HERTZ else 1.0)
+        return ContactReadings(gap, force, self.stored_at(gap))
+
+
+def _root(x: Array) -> Array:
+    """Root of what is not negative, with derivatives that are zero at zero."""
+    return jnp.where(x > 0, jnp.sqrt(jnp.where(x > 0, x, 1.0)), 0.0)
