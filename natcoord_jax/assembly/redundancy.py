@@ -36,8 +36,10 @@ def at_every_stage(projector: Float[Array, "m m"], groups: Sequence[Group], stag
     if stages == 1 and held.all():
         return projector
     every = places_by_stage(groups, stages)
-    full = jnp.eye(every.size, dtype=projector.dtype)
-    every = every[:, held]
+    full = jnp.zeros((every.size, every.size), projector.dtype)
+    if not held.all():
+        full = jnp.eye(every.size, dtype=projector.dtype)
+        every = every[:, held]
     return full.at[every[:, :, None], every[:, None, :]].set(projector)
 
 

@@ -17,6 +17,7 @@ from natcoord_jax.core.handles import Handle, ground
 from natcoord_jax.core.kinds import BODY
 from natcoord_jax.core.markers import Direction, Marker, Point
 from natcoord_jax.core.numeric import COMPONENTS, Directions
+from natcoord_jax.effects.materials import Elastic
 
 
 class Plane(Part):
@@ -209,10 +210,10 @@ class MeshSide(Side):
         element behind them is.
         """
         handle, faces = self.surface.handle, self.surface.faces
-        if not hasattr(handle.material, "E"):
+        if not isinstance(handle.material, Elastic):
             raise ValueError(
-                f"contact with {handle.name!r}: its material has no modulus E [Pa] to take a stiffness [N/m] "
-                "from; pass stiffness="
+                f"contact with {handle.name!r}: its material has no one modulus E [Pa] to take a stiffness "
+                "[N/m] from; pass stiffness="
             )
         places = np.asarray(handle.nodes.positions)
         x, cells = places[faces], _behind(faces, handle.mesh.cells)

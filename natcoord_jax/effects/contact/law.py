@@ -91,7 +91,7 @@ class ContactLaw(Effect):
     speed: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Number("positive")))
     damping: Any = eqx.field(default=None, init=False)
 
-    kind: ClassVar[str] = "contact"
+    kind: ClassVar[str] = "soft contact"
     derived: ClassVar[tuple[str, ...]] = ("damping",)
     stores: ClassVar[bool] = True
     drawn: ClassVar[bool] = False
