@@ -139,3 +139,12 @@ def test_startup(tmp_path):
     assert 0 < run["value"] < run["gradient"] and run["gradient"] < run["gradient by jax.jit"]
     assert results["command_line"][1] < results["command_line"][0]
     assert "second time" in text
+
+
+def test_contact(tmp_path):
+    results, text = _results("contact", tmp_path, written="contact")
+    mine = [run for run in results["runs"] if run["code"] == "natcoord_jax"]
+    for run in mine:
+        assert run.keys() >= TIMES | {"ms_per_second"}
+        assert run["apex_error"] < 1e-9 and run["energy_error"] < 1e-12
+    assert len(results["runs"]) > len(mine) and "exact" in text

@@ -1,0 +1,182 @@
+"""Impacts and rest beside MuJoCo: a bouncing ball, balls on a floor, and derivatives through an impact.
+
+usage: python -m benchmarks.contact [--quick] [--output FOLDER] [--no-peers]
+
+A ball of 1 kg falls 1 m on a floor and keeps all of its speed. The second apex should be as high as it began;
+`apex error` is what is missing [m], `energy error` what of the energy is made or lost in 3 s, `depth` how far
+it goes into the floor [m]. natcoord_jax keeps the gap open by a constraint with an impact law; MuJoCo by a
+spring of its constraint solver (solref -k 0), and by its default. Times are those of compiled programs (of
+MuJoCo: of `mj_step` in C) per second of motion, so that steps of all lengths compare.
+
+Balls with friction and restitution on a floor: time of a step and ball, in one scene and in batches.
+
+The derivative of the height after 1 s of a ball that falls 1 m by the height at the start is exactly 1.2842
+for a restitution of 1 (with the speed 0.3 m/s at the start).
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import natcoord_jax as nc
+from benchmarks import common
+
+STEPS_OF_BALL = (0.02, 0.01, 0.005, 0.002, 0.001, 0.0005)
+SPRINGS = (None, 1e4, 1e6)
+"""Stiffness per mass of MuJoCo's contact [1/s^2]; None: its default."""
+ENOUGH = 1e-3
+"""Error of the second apex [m] at which times are compared."""
+EXACT = 1.284175
+COLUMNS = {
+    "code": ("code", ""),
+    "dt": ("step s", "g"),
+    "apex_error": ("apex error m", ".1e"),
+    "energy_error": ("energy error", ".1e"),
+    "depth": ("depth m", ".1e"),
+    "ms_per_second": ("ms/s", ".3g"),
+}
+
+
+def ball(count: int = 1, **contact: Any) -> tuple[nc.System, nc.State]:
+    """Balls side by side, one metre above a floor."""
+    scene, floor = nc.Scene(), nc.Plane(normal=(0, 0, 1))
+    scene.add(nc.Gravity())
+    for k in range(count):
+        shape = {"shape": nc.Sphere(0.1), "density": 1 / (4 / 3 * np.pi * 1e-3)}
+        one = scene.add(nc.RigidBody(**shape, position=(0.5 * k, 0, 1.1), velocity=(0.3 * (count > 1), 0, 0)))
+        scene.add(nc.Contact(one, floor, **contact))
+    return scene.compile()
+
+
+def judged(t: np.ndarray, z: np.ndarray, energy: np.ndarray) -> dict[str, float]:
+    """Errors of a run that began one metre above the floor."""
+    second = z[(t > 0.46) & (t < 1.34)]
+    peak = int(np.argmax(second))
+    top = float(second[peak])
+    if 0 < peak < len(second) - 1:  # between the states, on the parabola through three of them
+        a, b, c = second[peak - 1 : peak + 2]
+        top = float(b + (a - c) ** 2 / (8 * (2 * b - a - c)))
+    drift = np.abs(energy - energy[0]).max() / 9.81
+    return {"apex_error": abs(top - 1.0), "energy_error": float(drift), "depth": float(max(0.0, -z.min()))}
+
+
+def ours(dt: float, repeats: int) -> dict[str, Any]:
+    """The ball of natcoord_jax."""
+    system, state = ball()
+    steps = round(3.0 / dt)
+    trajectory = nc.simulate(system, state, dt=dt, steps=steps)
+    z = np.asarray(trajectory.q)[:, 0, 2] - 0.1
+    found = judged(np.asarray(trajectory.t), z, np.asarray(system.energy(trajectory).total))
+    run = jax.jit(lambda s: nc.simulate(system, s, dt=dt, steps=steps, save_every=steps).q[-1])
+    timing = common.timed(lambda: run(state).block_until_ready(), steps, repeats)
+    return {
+        "code": "natcoord_jax",
+        "dt": dt,
+        **found,
+        **timing,
+        "ms_per_second": timing["us_per_step"] / dt / 1e3,
+    }
+
+
+def mujocos(dt: float, spring: float | None, repeats: int) -> dict[str, Any]:
+    """The ball of MuJoCo."""
+    import mujoco
+
+    soft = "" if spring is None else f'solref="{-spring:g} 0"'
+    model = mujoco.MjModel.from_xml_string(f"""<mujoco><option timestep="{dt}" integrator="implicitfast"/>
+        <worldbody><geom type="plane" size="5 5 1" {soft}/><body pos="0 0 1.1"><freejoint/>
+        <geom type="sphere" size="0.1" mass="1" {soft}/></body></worldbody></mujoco>""")
+    model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_ENERGY
+    data, steps = mujoco.MjData(model), round(3.0 / dt)
+    z, energy = [1.0], [9.81 * 1.1]
+    for _ in range(steps):
+        mujoco.mj_step(model, data)
+        z.append(data.qpos[2] - 0.1)
+        energy.append(9.81 * data.qpos[2] + 0.5 * float(data.qvel[:3] @ data.qvel[:3]))
+    found = judged(dt * np.arange(steps + 1), np.array(z), np.array(energy))
+    model.opt.enableflags = 0
+
+    def run() -> None:
+        mujoco.mj_resetData(model, data)
+        mujoco.mj_step(model, data, nstep=steps)
+
+    timing = common.timed(run, steps, repeats)
+    name = "MuJoCo" if spring is None else f"MuJoCo, spring {spring:g}"
+    return {"code": name, "dt": dt, **found, **timing, "ms_per_second": timing["us_per_step"] / dt / 1e3}
+
+
+def many(count: int, lanes: int, repeats: int) -> dict[str, Any]:
+    """Balls that bounce, slide and roll."""
+    system, state = ball(count, restitution=0.6, friction=0.3)
+    steps, dt = 200, 5e-3
+
+    def run(shift: Any) -> Any:
+        start = eqx.tree_at(lambda s: s.q, state, state.q.at[::4, 2].add(shift))
+        return nc.simulate(system, start, dt=dt, steps=steps, save_every=steps).q[-1]
+
+    program = jax.jit(jax.vmap(run) if lanes > 1 else run)
+    shift = jnp.linspace(0.0, 0.2, lanes) if lanes > 1 else jnp.zeros(())
+    timing = common.timed(lambda: program(shift).block_until_ready(), steps * lanes * count, repeats)
+    return {"balls": count, "lanes": lanes, **timing}
+
+
+def derivatives() -> list[dict[str, Any]]:
+    """Of the height after one second by that at the start."""
+    found = []
+    for dt in (0.01, 0.0025):
+        for name, contact in (("constraint", {}), ("spring 1e4", {"stiffness": 1e4})):
+            system, state = ball(**contact)
+
+            def height(x: Any, system: Any = system, state: Any = state, dt: float = dt) -> Any:
+                moved = state.q.at[0, 2].add(x), state.v.at[0, 2].set(0.3)
+                start = eqx.tree_at(lambda s: (s.q, s.v), state, moved)
+                return nc.simulate(system, start, dt=dt, steps=round(1 / dt)).q[-1, 0, 2]
+
+            found.append({"contact": name, "dt": dt, "slope": float(jax.grad(height)(0.0)), "exact": EXACT})
+    return found
+
+
+def fastest(runs: list[dict[str, Any]], code: str) -> float | None:
+    """Time per second of motion of the fastest run that is accurate enough [ms]."""
+    enough = [r["ms_per_second"] for r in runs if r["code"].startswith(code) and r["apex_error"] <= ENOUGH]
+    return min(enough, default=None)
+
+
+def main() -> None:
+    """Run and print."""
+    options = common.peer_parser("Impacts and rest beside MuJoCo.", "nothing").parse_args()
+    common.on_one_core()
+    quick = options.quick
+    jax.config.update("jax_enable_x64", True)
+    results = common.circumstances("contact", quick=quick)
+    repeats, steps = (2, STEPS_OF_BALL[1:3]) if quick else (7, STEPS_OF_BALL)
+    runs = [ours(dt, repeats) for dt in steps]
+    if not options.no_peers:
+        runs += [mujocos(dt, spring, repeats) for spring in SPRINGS for dt in steps]
+    print(common.columns(runs, COLUMNS))
+    sizes = ((1, 1), (10, 1)) if quick else ((1, 1), (10, 1), (100, 1), (1, 256), (10, 256))
+    balls = [many(count, lanes, repeats) for count, lanes in sizes]
+    for run in balls:
+        print(f"{run['balls']} balls, {run['lanes']} lanes: {run['us_per_step']:.2f} us a step and ball, "
+              f"compiled in {run['compile_s']:.1f} s")  # fmt: skip
+    slopes = derivatives()
+    for line in slopes:
+        print(f"slope, {line['contact']}, step {line['dt']:g} s: {line['slope']:.4f} (exact {line['exact']})")
+    mine, other = fastest(runs, "natcoord_jax"), fastest(runs, "MuJoCo")
+    ratio = None if mine is None or other is None else mine / other
+    ten = next((r["compile_s"] for r in balls if r["balls"] == 10 and r["lanes"] == 1), None)
+    targets = [
+        common.target(f"time over MuJoCo's at an apex error of {ENOUGH:g} m", ratio, 1.0),
+        common.target("energy error at any step", max(r["energy_error"] for r in runs[: len(steps)]), 1e-12),
+        common.target("compile, ten contacts", ten, 20.0, "s"),
+    ]
+    results |= {"runs": runs, "balls": balls, "derivatives": slopes, "targets": targets}
+    print(f"\n{common.environment_line(results)}\n\n{common.show_targets(targets)}")
+    common.write(results, None, common.folder(options))
+
+
+if __name__ == "__main__":
+    main()
