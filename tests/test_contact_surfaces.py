@@ -187,7 +187,7 @@ def _two(scene, **placing):
 
 def test_wrong_surfaces_are_refused():
     scene = nc.Scene()
-    one, two = _two(scene, position=(0, 0, 0.9))
+    one, two = _two(scene, position=(0.3, 0.2, 0.9))
     with pytest.raises(ValueError, match="'solid 1' would be in contact with itself"):
         scene.add(nc.Contact(one.face("z1"), one.face("z0")))
     with pytest.raises(ValueError, match=r"stiffness.*positive"):
@@ -195,8 +195,12 @@ def test_wrong_surfaces_are_refused():
     with pytest.raises(ValueError, match="no side 'outside'"):
         one.surface("outside")
     ball = scene.add(nc.RigidBody(shape=nc.Sphere(0.1), density=1.0, position=(3, 0, 0)))
-    with pytest.raises(ValueError, match="have no elements to take a stiffness"):
-        scene.add(nc.Contact(ball, FLOOR))
+    with pytest.raises(ValueError, match="friction .* without a stiffness"):
+        scene.add(nc.Contact(ball, FLOOR, stiffness=1e4, friction=0.3))
+    with pytest.raises(ValueError, match="no friction .* between surfaces"):
+        scene.add(nc.Contact(one.face("z1"), two.face("z0"), friction=0.3))
+    with pytest.raises(ValueError, match="speed .* of contacts with a stiffness"):
+        scene.add(nc.Contact(ball, FLOOR, restitution=0.5, speed=1.0))
     scene.add(nc.Contact(one.face("z1"), two.face("z0")))
     with pytest.raises(ValueError, match="starts in penetration"):
         scene.compile()

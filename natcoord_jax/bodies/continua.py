@@ -29,10 +29,10 @@ from natcoord_jax.effects.solids import (
     Hexahedron20,
     Hexahedron27,
     Hexahedron27P1,
-    SolidElement,
     Tetrahedron10,
     Tetrahedron10P0,
 )
+from natcoord_jax.effects.solids.elements import SolidElement
 from natcoord_jax.maths.vectors import cross
 from natcoord_jax.mesh import Mesh
 

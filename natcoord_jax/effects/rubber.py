@@ -49,7 +49,7 @@ class NeoHooke(ClosedHyperelastic):
         >>> import natcoord_jax as nc
         >>> rubber = nc.NeoHooke(E=1.2675, nu=0.4999, density=1e-9)
         >>> print(f"{rubber.shear_modulus:.4f} {rubber.bulk_modulus:.1f}")
-        0.4226 2112.5
+        0.4225 2112.5
     """
 
     E: Any = eqx.field(kw_only=True, metadata=is_a(Number("positive")))

@@ -231,7 +231,7 @@ class Hexahedron8(SolidElement):
         >>> block = nc.Solid(mesh, material=rubber, element="Hexahedron8")
     """
 
-    kind: ClassVar[str] = "hexahedron8"
+    kind: ClassVar[str] = "hexahedron"
     count: ClassVar[int] = 8
     faces: ClassVar[tuple[tuple[int, ...], ...]] = CELLS[8].facets
 
@@ -252,7 +252,7 @@ class Hexahedron20(SolidElement):
         >>> block = nc.Solid(mesh, material=rubber, element="Hexahedron20")
     """
 
-    kind: ClassVar[str] = "hexahedron20"
+    kind: ClassVar[str] = "serendipity hexahedron"
     count: ClassVar[int] = 20
     faces: ClassVar[tuple[tuple[int, ...], ...]] = CELLS[20].facets
 
@@ -273,7 +273,7 @@ class Hexahedron27(SolidElement):
         >>> block = nc.Solid(mesh, material=rubber, element="Hexahedron27")
     """
 
-    kind: ClassVar[str] = "hexahedron27"
+    kind: ClassVar[str] = "quadratic hexahedron"
     count: ClassVar[int] = 27
     faces: ClassVar[tuple[tuple[int, ...], ...]] = CELLS[27].facets
 
@@ -294,7 +294,7 @@ class Hexahedron27P1(SolidElement):
         >>> block = nc.Solid(mesh, material=rubber, element="Hexahedron27P1")
     """
 
-    kind: ClassVar[str] = "hexahedron27P1"
+    kind: ClassVar[str] = "quadratic hexahedron with linear pressure"
     count: ClassVar[int] = 27
     projected: ClassVar[int] = 4
     faces: ClassVar[tuple[tuple[int, ...], ...]] = CELLS[27].facets
@@ -316,7 +316,7 @@ class Tetrahedron10(SolidElement):
         >>> block = nc.Solid(mesh, material=rubber, element="Tetrahedron10")
     """
 
-    kind: ClassVar[str] = "tetrahedron10"
+    kind: ClassVar[str] = "quadratic tetrahedron"
     count: ClassVar[int] = 10
     faces: ClassVar[tuple[tuple[int, ...], ...]] = CELLS[10].facets
 
@@ -337,7 +337,7 @@ class Tetrahedron10P0(SolidElement):
         >>> block = nc.Solid(mesh, material=rubber, element="Tetrahedron10P0")
     """
 
-    kind: ClassVar[str] = "tetrahedron10P0"
+    kind: ClassVar[str] = "quadratic tetrahedron with constant pressure"
     count: ClassVar[int] = 10
     projected: ClassVar[int] = 1
     faces: ClassVar[tuple[tuple[int, ...], ...]] = CELLS[10].facets
