@@ -124,6 +124,7 @@ def test_beams_alone(tmp_path):
         assert run["result"] == "successful" and run["energy_balance"] < 1e-11
 
 
+@pytest.mark.exhaustive
 def test_shells_alone(tmp_path):
     results, _ = _results("shells", tmp_path, "--no-peers", written="shells")
     for run in results["runs"]:
