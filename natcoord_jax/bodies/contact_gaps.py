@@ -73,7 +73,8 @@ def _kept_open(gap: Gap, markers: tuple[Marker, ...], law: Law, name: str, *side
     """A potential with the stiffness that is given or that of the sides; a constraint where there is none."""
     law = {key: value for key, value in law.items() if key not in OF_SURFACES}
     own = [s.stiffness for s in sides if isinstance(s, SegmentSide) and s.stiffness is not None]
-    stiffness = law.pop("stiffness") if law["stiffness"] is not None or not own else min(own)
+    given = law.pop("stiffness")
+    stiffness = given if given is not None else min(own, default=None)
     if stiffness is not None:
         if "friction" in law:
             raise ValueError(
