@@ -15,6 +15,9 @@ from natcoord_jax.gallery.racket import RADIUS, SEMI_AXES, THICKNESS, add_ball, 
 GRIP, THROAT = (0.0, -0.84, 1.42), (0.0, -1.12, 1.42)
 """Of the racket on the player who stands upright [m]."""
 
+CLEARANCE = 0.02
+"""Between ball and strings where the scene is assembled [m]."""
+
 GRAVITY = 9.81
 HAND = "right hand"
 
@@ -73,7 +76,12 @@ def tennis(count: int = 3, speed: float = 15.0) -> Example:
     player = add_player(scene)
     racket = add_racket(scene, player.bodies[HAND], player.placed[HAND], GRIP, THROAT, Z)
     place, velocity = _flight(speed)
-    ball = add_ball(scene, count, position=place, velocity=velocity)
+    # Assembled in front of the strings, turned as it will hit them, so that its nodes know their facets.
+    there, here = placements(float(TIMES[3]))[HAND], player.placed[HAND]
+    middle = np.add(THROAT, SEMI_AXES[0] * np.array([0.0, -1.0, 0.0]))
+    turned = here.rotation @ there.rotation.T
+    before = here(middle) + (RADIUS + THICKNESS + CLEARANCE) * (here.rotation @ X)
+    ball = add_ball(scene, count, position=before, orientation=turned, velocity=velocity)
     given = {"stiffness": 1e5, "candidates": 9, "one_pass": True}
     scene.add(nc.Contact(ball.surface("outside"), racket.bed, name="impact", **given))
     system, state = scene.compile()

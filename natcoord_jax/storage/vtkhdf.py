@@ -93,8 +93,8 @@ def _elements(system: System) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
 def _kind(group: Group) -> int | None:
     if group.weights is None:
         return None
-    if group.effect.faces:
-        return QUADRILATERAL if len(group.effect.faces) == 1 else HEXAHEDRON
+    if type(group.effect).faces:
+        return QUADRILATERAL if len(type(group.effect).faces) == 1 else HEXAHEDRON
     chained = group.effect.couples and group.effect.stores and np.ndim(group.weights) == 4
     return LINE if chained else None
 

@@ -47,7 +47,7 @@ def places_of(group: Group, rows: Float[np.ndarray, "t bodies 4 3"]) -> Float[np
 def _chains(system: System) -> list[Group]:
     """Effects between frames of bodies that make a chain of these and store energy: elements of beams."""
     groups = (g for g in system.effects if g.effect.couples and g.effect.stores)
-    return [g for g in groups if g.weights is not None and g.weights.ndim == 4 and not g.effect.faces]
+    return [g for g in groups if g.weights is not None and g.weights.ndim == 4 and not type(g.effect).faces]
 
 
 def _beam_of(element: str) -> str:
@@ -110,11 +110,13 @@ def element_skins(
     system: System, states: State, rows: np.ndarray, saved: np.ndarray, colouring: Colouring
 ) -> Iterator[Skin]:
     """Faces of shells, and those of solids that no two of them share, by name of the elements."""
-    for number, group in enumerate(g for g in system.effects if g.effect.faces and g.weights is not None):
+    for number, group in enumerate(
+        g for g in system.effects if type(g.effect).faces and g.weights is not None
+    ):
         weights, bodies = markers_of(group)
         own = weights if weights.ndim == 4 else weights[:, :, 0]
         places = np.einsum("nkba,tnkbac->tnkc", own, rows[:, bodies])
-        corners = np.array(group.effect.faces)
+        corners = np.array(type(group.effect).faces)
         # A node is a body with weights: nodes that are clamped to one body have its number.
         keys = np.concatenate([bodies, own.reshape(*bodies.shape[:2], -1)], axis=-1)
         _, first, back = np.unique(
