@@ -252,7 +252,7 @@ def test_friction_between_bodies_keeps_momenta():
     assert abs(np.asarray(system.sense(trajectory, other).angular_velocity)[-1, 2] - 1.0) > 1.0
 
 
-@pytest.mark.parametrize("count", [3, pytest.param(10, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [3, pytest.param(10, marks=pytest.mark.exhaustive)])
 def test_stack_of_boxes_stands(count):
     """Ten seconds, dependent contacts one upon the other: nothing moves by more than rounding."""
     scene = nc.Scene()

@@ -517,7 +517,7 @@ def test_gradients_of_a_frequency():
     np.testing.assert_allclose(powers, (1.0, 0.5, -0.5), atol=2e-3)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_thickness_for_stiffness_at_given_mass():
     """A cantilever that is stiffest at its end has a thickness as the root of the bending moment."""
     count = 8

@@ -357,7 +357,7 @@ def test_a_beam_of_bricks_falls():
     np.testing.assert_allclose(height, (-0.3793, -0.8826), atol=tol.FALLING_BEAM)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(("element", "number"), [("Hexahedron27P1", "E"), ("Tetrahedron10", "reference")])
 def test_gradients(element, number):
     """Of where a corner is after some steps, by a modulus and by the shape without stress; V-shaped."""
