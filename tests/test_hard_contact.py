@@ -437,3 +437,11 @@ def test_rattleback_turns_back():
         assert np.diff(energy).max() <= 1e-13 * energy[0]
     assert spins[0][-1] > 4.0
     assert spins[1].min() > 4.5
+
+
+def test_restitution_that_gives_energy_is_refused():
+    """Where a contact is made, and where its numbers are set."""
+    with pytest.raises(ValueError, match="restitution .* 1.5; pass a number from 0 to 1"):
+        dropped(1.5)
+    with pytest.raises(ValueError, match="'bounce' has a restitution .* above 1"):
+        dropped(0.5)[0].set("bounce", restitution=1.5)

@@ -6,9 +6,11 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.core.arguments import is_a, require
+from natcoord_jax.core.checks import is_concrete
 from natcoord_jax.core.effect import Effect, Motion, Response, StepContext, replace_fields
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.joint import Joint
@@ -62,7 +64,8 @@ class GapConstraint(Effect):
             weighs gaps against impulses while a step is solved.
 
     Raises:
-        ValueError: for other markers than the gap takes, and friction of a gap without a point of contact.
+        ValueError: for other markers than the gap takes, a restitution above 1, and friction of a gap without a
+            point of contact.
 
     Example:
         >>> import natcoord_jax as nc
@@ -88,13 +91,22 @@ class GapConstraint(Effect):
     drawn: ClassVar[bool] = False
 
     def __check_init__(self) -> None:
-        """Refuse markers of another gap, and friction where no one knows at which point."""
+        """Refuse markers of another gap, what gives energy, and friction where no one knows at which point."""
         require(self, "markers", self.gap.markers)
+        if is_concrete(self.restitution) and np.any(np.asarray(self.restitution) > 1):
+            raise ValueError(
+                f"{type(self).__name__}: restitution [-] is {self.restitution}; pass a number from 0 to 1: an "
+                "impact gives nothing"
+            )
         if self.friction is not None and type(self.gap).contact is Gap.contact:
             raise ValueError(
                 f"{type(self).__name__}: friction [-] acts where surfaces touch, which "
                 f"{type(self.gap).__name__} does not say; give it a method `contact`"
             )
+
+    def flaws(self) -> dict[str, Array]:
+        """A restitution that gives energy."""
+        return {"has a restitution [-] above 1: an impact gives nothing": self.restitution > 1.0}
 
     @property
     def multipliers(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
