@@ -64,8 +64,8 @@ class GapConstraint(Effect):
             weighs gaps against impulses while a step is solved.
 
     Raises:
-        ValueError: for other markers than the gap takes, a restitution above 1, and friction of a gap without a
-            point of contact.
+        ValueError: for other markers than the gap takes, a restitution above 1, and friction of a gap without
+            a point of contact.
 
     Example:
         >>> import natcoord_jax as nc
@@ -91,12 +91,12 @@ class GapConstraint(Effect):
     drawn: ClassVar[bool] = False
 
     def __check_init__(self) -> None:
-        """Refuse markers of another gap, what gives energy, and friction where no one knows at which point."""
+        """Refuse markers of another gap, what gives energy, and friction at no one knows which point."""
         require(self, "markers", self.gap.markers)
         if is_concrete(self.restitution) and np.any(np.asarray(self.restitution) > 1):
             raise ValueError(
-                f"{type(self).__name__}: restitution [-] is {self.restitution}; pass a number from 0 to 1: an "
-                "impact gives nothing"
+                f"{type(self).__name__}: restitution [-] is {self.restitution}; pass a number from 0 to 1: "
+                "an impact gives nothing"
             )
         if self.friction is not None and type(self.gap).contact is Gap.contact:
             raise ValueError(
