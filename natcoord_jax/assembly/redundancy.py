@@ -75,12 +75,3 @@ def contact_weights(equations: Any) -> Float[Array, " unknowns"]:
     mobility = contact_mobilities(equations)
     weights = jnp.where(mobility > 0, 1.0 / jnp.where(mobility > 0, mobility, 1.0), 0.0)
     return jnp.concatenate([jnp.zeros(equations.balances), weights])
-
-
-def contact_impulses(equations: Any) -> np.ndarray | None:
-    """Which unknowns are impulses of contacts; None: there are none."""
-    if not equations.system.structure.inequalities:
-        return None
-    sizes = [group.count * equations.tableau.stages * group.multipliers for group in equations.groups]
-    found = [np.full(size, group.effect.unilateral) for group, size in zip(equations.groups, sizes)]
-    return np.concatenate([np.zeros(equations.balances, bool), *found])

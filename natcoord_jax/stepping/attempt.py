@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 from natcoord_jax.assembly.equations import prepare, starting
 from natcoord_jax.assembly.frozen_kick import Lagging
 from natcoord_jax.assembly.kick import Kick
-from natcoord_jax.assembly.redundancy import contact_impulses, contact_weights
+from natcoord_jax.assembly.redundancy import contact_weights
 from natcoord_jax.assembly.response import Evaluation
 from natcoord_jax.assembly.start_cache import StartCache
 from natcoord_jax.assembly.tangent_space import driven
@@ -127,8 +127,7 @@ def attempt(
         steady = sound(equations, before.it.y, *missed, *given)
         before = eqx.tree_at(lambda c: c.it.converged, before, before.it.converged & steady)
         left = remainder(equations, solving.residual, factors.inertias)
-        impulses = contact_impulses(equations)
-        after = after_attempt(setting, before, factors.inertias, ends, left, kick, impulses)
+        after = after_attempt(setting, before, factors.inertias, ends, left, kick)
         accepted = after.taken > before.taken
         x = ravel_pytree(after.state)[0]
         slot = x, before.it.y, index, before.fraction, before.done, accepted, after.step

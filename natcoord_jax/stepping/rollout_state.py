@@ -5,7 +5,6 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from natcoord_jax.assembly.equations import prepare
@@ -215,7 +214,6 @@ def after_attempt(
     found: tuple[State, Array],
     left: Float[Array, " rates"],
     kick: Velocity | None = None,
-    impulses: np.ndarray | None = None,
 ) -> RolloutState:
     """The end of an attempt: what is attempted next, and from where.
 
@@ -226,7 +224,6 @@ def after_attempt(
         found: state at the end of the attempt, and its largest half turn.
         left: impulse that it leaves to the next.
         kick: of the attempt.
-        impulses: which unknowns are impulses of contacts; None: there are none.
     """
     plan, it, over = setting.plan, course.it, setting.over(course)
     new, half_turn = found
@@ -258,8 +255,6 @@ def after_attempt(
         trial = trial.beginning(done, complete).leaving(left, verdict.accepted | verdict.failed)
         fraction = jnp.where(complete, trial.length, fraction)
     kept, worked = verdict.change > 0, jnp.where(over, 0, it.total)
-    if impulses is not None:
-        inertias = jnp.where(impulses, 0.0, inertias)
     # Guesses hold for steps of one length: another length begins anew from the last solution.
     solution, size = it.y, it.y.shape[0]
     if kick is not None:
@@ -277,9 +272,6 @@ def after_attempt(
     same = fraction == course.fraction
     past = Predictor(past.differences, jnp.where(same, past.known, 1), jnp.where(same, past.order, 0))
     guess, lagging = past.guess, course.lagging
-    if impulses is not None:
-        # Those of the last step: what dependent contacts share at will would grow in polynomials.
-        guess = jnp.where(impulses, past.differences[0], guess)
     sound = jnp.all(jnp.isfinite(guess))
     if lagging is not None:
         lagging = lagging.beginning(from_body_axes(verdict.state, jnp.where(sound, guess[size:], 0.0)))
