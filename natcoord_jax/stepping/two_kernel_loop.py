@@ -68,7 +68,8 @@ def all_slots(
 def in_parts(system: System, plan: Plan, tolerance: Tolerance | None) -> bool:
     """Whether new factors are made in a kernel of their own: one for all would compile for too long."""
     kind = kind_of(system, plan.tableau)
-    return kind.by_formulas and tolerance is None and len(system.structure.bodies) >= PARTS
+    large = len(system.structure.bodies) >= PARTS or system.structure.solver == "sparse"
+    return kind.by_formulas and tolerance is None and large
 
 
 def _start(
