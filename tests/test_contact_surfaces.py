@@ -154,11 +154,10 @@ def test_beam_falls_on_a_beam_and_on_the_floor():
     two = scene.add(nc.Beam(section, [(0, -0.4, 0.1), (0, 0.4, 0.1)], elements=3, name="two"))
     scene.add(nc.Contact(one, two, stiffness=2e3, name="cross"))
     for beam in (one, two):
-        scene.add(nc.Contact(beam, FLOOR, stiffness=2e3))
+        scene.add(nc.Contact(beam, FLOOR, stiffness=2e4))
     system, state = scene.compile()
     trajectory = nc.simulate(system, state, dt=2e-3, steps=250)
-    # In one step, as the beams meet, Newton's iteration ends at some 1e-12 of the energy.
-    assert nc.balance(system, trajectory).energy.max() <= tol.ENERGY_OF_A_SMALL_SCENE * 100
+    assert nc.balance(system, trajectory).energy.max() <= tol.ENERGY_OF_A_SMALL_SCENE * 10
     stored = sum(np.asarray(x) for name, x in system.energy(trajectory).stores.items() if "cross" in name)
     assert stored.max() > 1e-3
     heights = [np.asarray(system.sense(trajectory, node).position)[:, 2].min() for node in one.nodes]
