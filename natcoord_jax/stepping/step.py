@@ -102,7 +102,9 @@ def end_of_step(
     working, relation = [], 0
     for number, (group, power) in enumerate(zip(groups, found.power)):
         if group.effect.works:
-            done = (1.0 if group.effect.impulsive else h) * (power @ b) + lost.get(number, 0.0)
+            done = (1.0 if group.effect.impulsive else h) * (power @ b)
+            if number in lost:
+                done = done + lost[number]
             if group.holds and extra is not None:
                 done = done + extra[relation : relation + group.count]
             working.append(jnp.sum(done, keepdims=True) if group.is_set else done)
