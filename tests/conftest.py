@@ -45,6 +45,7 @@ Every program takes a few hundred, and a process that runs out of them crashes i
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--check-types", action="store_true", help="check shapes and types at run time")
+    parser.addoption("--plain", action="store_true", help="without what xla/ does to programs")
     parser.addoption("--write-golden", action="store_true", help="write the file of test_golden.py anew")
     parser.addoption("--hunt-seeds", type=int, help="random numbers of each structure in test_hunt.py")
 
@@ -57,6 +58,12 @@ def pytest_configure(config: pytest.Config) -> None:
     if config.option.check_types:
         hook = install_import_hook("natcoord_jax", "beartype.beartype")
         config.add_cleanup(hook.uninstall)
+    if config.option.plain:
+        from natcoord_jax.core import eager_numpy
+        from natcoord_jax.xla import materialise, one_kernel
+
+        one_kernel._attributed = materialise._attributed = None
+        eager_numpy.at_top_level = lambda *values: False
 
 
 @pytest.fixture(autouse=True)

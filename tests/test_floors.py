@@ -54,6 +54,8 @@ BLIND = {
 THROUGH_THE_ROOF = {"gallery", "cli"}
 # Third parties that linsolve may use beside the standard library.
 LINSOLVE_TOOLS = {"jax", "jaxlib", "equinox", "jaxtyping", "numpy"}
+# What JAX and XLA may change without notice; whoever imports it elsewhere than in xla/ is found here.
+UNSTABLE = ("jax._src", "jax.experimental", "jax.extend", "jax.interpreters", "jaxlib")
 PLOTTING = {"matplotlib", "mpl_toolkits"}
 HEAVY = ("matplotlib", "mujoco", "optax", "scipy.optimize")
 
@@ -126,7 +128,7 @@ def breaches(module: str, source: str, *, is_package: bool = False) -> list[str]
     package = module if is_package else module.rpartition(".")[0]
     for line, target in imports(tree, package):
         ours = target.split(".")[0] == PACKAGE
-        reason = _inside(module, floor, target) if ours else _outside(floor, target.split(".")[0])
+        reason = _inside(module, floor, target) if ours else _outside(floor, target)
         if reason:
             found.append(f"line {line}: imports {target}, but {reason}")
     return found
@@ -151,8 +153,11 @@ def _inside(module: str, floor: str, target: str) -> str:
     return ""
 
 
-def _outside(floor: str, library: str) -> str:
-    """Why a floor may not import this library; empty if it may."""
+def _outside(floor: str, target: str) -> str:
+    """Why a floor may not import this from a library; empty if it may."""
+    library = target.split(".")[0]
+    if floor != "xla" and f"{target}.".startswith(tuple(f"{name}." for name in UNSTABLE)):
+        return "what JAX may change without notice is met in xla and nowhere else"
     if library in PLOTTING and floor != "viz":
         return "matplotlib lives in viz and nowhere else"
     if floor == "linsolve" and library not in LINSOLVE_TOOLS | sys.stdlib_module_names:
@@ -189,6 +194,8 @@ def test_floors(file: Path):
         ("linsolve.dense", "from ..core import state", "core lies above linsolve"),
         ("effects.loads.gravity", "from natcoord_jax.linsolve import dense", "must not know linsolve"),
         ("linsolve.dense", "import scipy.linalg", "nothing else"),
+        ("stepping.newton", "from jax.extend import core as jex", "xla and nowhere else"),
+        ("core.marker", "import jaxlib.xla_client", "xla and nowhere else"),
         ("analysis.energy", "import matplotlib.pyplot as plt", "lives in viz"),
         ("helpers", "", "is on no floor"),
     ],

@@ -1,5 +1,6 @@
 """Loops compiled into one kernel compute what they compute otherwise; what does not fit is left as it is."""
 
+import re
 from functools import partial
 
 import equinox as eqx
@@ -15,11 +16,12 @@ from natcoord_jax import gallery
 from natcoord_jax.maths.collocation import _inverse
 from natcoord_jax.maths.projectors import range_projector
 from natcoord_jax.maths.vectors import cross, skew
-from natcoord_jax.stepping import linear_pair, one_kernel, rewriting, two_kernel_loop
+from natcoord_jax.stepping import two_kernel_loop
 from natcoord_jax.stepping.endpoint import endpoints
-from natcoord_jax.stepping.one_kernel import as_one_kernel, in_few_kernels, lane_by_lane
 from natcoord_jax.stepping.plan import Plan
 from natcoord_jax.stepping.rollout import run
+from natcoord_jax.xla import linear_pair, one_kernel, rewriting
+from natcoord_jax.xla.one_kernel import as_one_kernel, in_few_kernels, lane_by_lane
 
 MARK = "xla_cpu_small_call"
 MATRIX = np.random.default_rng(1).normal(size=(6, 6))
@@ -66,6 +68,20 @@ def test_one_kernel_computes_the_same(name):
     several = jax.jit(jax.vmap(lambda x: lane_by_lane(lambda x: as_one_kernel(plain, x), x)))
     assert MARK in several.lower(lanes).as_text(), "lanes are not compiled into one kernel"
     np.testing.assert_allclose(several(lanes), jax.vmap(plain)(lanes), rtol=1e-13, atol=1e-13)
+
+
+def test_the_compiler_heeds_the_mark(monkeypatch):
+    """What is marked is one function of machine code; without a word, it could be dozens again."""
+
+    def functions(attributes):
+        monkeypatch.setattr(one_kernel, "ATTRIBUTES", attributes)
+        looped = _looped(BODIES["product"])
+        compiled = jax.jit(lambda x: as_one_kernel(looped, x)).lower(jnp.ones((6, 6))).compile()
+        code = compiled.runtime_executable().serialize()
+        return re.findall(rb"xla_metadata_call[.\d]*_kernel\b", code)
+
+    assert functions(one_kernel.ATTRIBUTES)
+    assert not functions({"inlineable": "false"}), "the mark is not what makes one function of it"
 
 
 @pytest.mark.parametrize("largest", (one_kernel.LARGEST, 0))

@@ -21,7 +21,7 @@ import natcoord_jax as nc
 from natcoord_jax.assembly.equations import prepare
 from natcoord_jax.assembly.reduced import ReducedStep
 from natcoord_jax.maths.collocation import gauss
-from natcoord_jax.stepping import rewriting
+from natcoord_jax.xla import rewriting
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "natcoord_jax" / "effects"

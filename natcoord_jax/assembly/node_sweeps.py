@@ -19,8 +19,8 @@ from natcoord_jax.assembly.diagnostics import rows_with_ground
 from natcoord_jax.assembly.sweeps import JointData, relative_motion, turning
 from natcoord_jax.assembly.tree import JointGeometry, Level, Tree, TreeMotion, combine, joined
 from natcoord_jax.maths.collocation import Tableau, rotate_stages
-from natcoord_jax.maths.rows import add_at, row, with_row
 from natcoord_jax.maths.vectors import cross
+from natcoord_jax.xla.rows import add_at, row, with_row
 
 
 class Geometry(NamedTuple):

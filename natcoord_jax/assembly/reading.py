@@ -22,7 +22,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.interpreters import partial_eval
 from jaxtyping import Array, Bool, Float
 
 from natcoord_jax.assembly.diagnostics import rows_with_ground, states_of
@@ -39,6 +38,7 @@ from natcoord_jax.core.state import State, Trajectory
 from natcoord_jax.linsolve.tree import TreeBlocks, factor, handed_up, passed_down
 from natcoord_jax.maths.elimination import definite_inverse, definite_solution
 from natcoord_jax.maths.vectors import cross, skew
+from natcoord_jax.xla.tracing import depends
 
 SHIFT = 1e-12
 """Compliance that is added to constraints, relative, and refined away where they are independent. Where they
@@ -269,5 +269,4 @@ def reads_velocities(function: Callable[[State], Any], state: State) -> bool:
     def of_velocities(v: Array, rates: Array) -> Any:
         return function(replace_fields(state, v=v, rates=rates))
 
-    program = jax.make_jaxpr(of_velocities)(state.v, state.rates).jaxpr
-    return bool(np.any(partial_eval.dce_jaxpr(program, [True] * len(program.outvars))[1]))
+    return depends(of_velocities, state.v, state.rates)

@@ -21,7 +21,7 @@ from natcoord_jax.control.linearisation import first_gradient, nodes_before
 from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.control.riccati import Weighted
 from natcoord_jax.control.transcription import Node, Unknowns, end, entering, first_node, slices, stage
-from natcoord_jax.stepping.one_kernel import scan_in_one_kernel
+from natcoord_jax.xla.one_kernel import scan_in_one_kernel
 
 
 class Change(eqx.Module):

@@ -26,7 +26,7 @@ from natcoord_jax.control.transcription import (
     unpacked,
 )
 from natcoord_jax.stepping.derivative import UNSOLVED
-from natcoord_jax.stepping.one_kernel import scan_in_one_kernel
+from natcoord_jax.xla.one_kernel import scan_in_one_kernel
 
 
 class Multipliers(eqx.Module):

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from natcoord_jax.control.iterate import Model
-from natcoord_jax.stepping.one_kernel import scan_in_one_kernel
+from natcoord_jax.xla.one_kernel import scan_in_one_kernel
 
 REACH = (1e-8, 1e-3)
 """Eigenvalues of the goal's compliance below this fraction of the largest count as zero: of a motion that

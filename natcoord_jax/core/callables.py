@@ -15,7 +15,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from natcoord_jax.core.programs import LIBRARIES, Signature, signature
+from natcoord_jax.xla.programs import LIBRARIES, Signature, signature
 
 
 class Function(eqx.Module):

@@ -23,7 +23,7 @@ import numpy as np
 
 from natcoord_jax.core.callables import Function, Looked, facts, mapped, name_of, own_methods
 from natcoord_jax.core.checks import as_array, is_concrete
-from natcoord_jax.core.programs import Program, Signature, signature, traced
+from natcoord_jax.xla.programs import Program, Signature, signature, traced
 
 REMEMBERED = 512
 """Calls of programs whose callables are remembered."""

@@ -5,9 +5,9 @@ from functools import partial, wraps
 from typing import Any, TypeVar
 
 from natcoord_jax.core.closures import with_callables
-from natcoord_jax.core.reported import Passage
 from natcoord_jax.xla.effort import Effort
 from natcoord_jax.xla.jit import programs_of
+from natcoord_jax.xla.reported import Passage
 
 F = TypeVar("F", bound=Callable[..., Any])
 

@@ -21,7 +21,7 @@ from natcoord_jax.core.kinds import NAME
 from natcoord_jax.core.markers import Attachment, Marker, Markers
 from natcoord_jax.core.together import instances_last, place_together, steps_together
 from natcoord_jax.maths.collocation import Tableau
-from natcoord_jax.maths.materialise import materialised
+from natcoord_jax.xla.materialise import materialised
 
 
 def place_markers(place: Float[Array, "k *m w"], rows: Float[Array, "*s b 4 3"]) -> Float[Array, "*out"]:

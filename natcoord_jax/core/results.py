@@ -2,6 +2,8 @@
 
 from enum import IntEnum
 
+from natcoord_jax.xla.reported import DerivativeError as DerivativeError
+
 
 class Result(IntEnum):
     """How a step or a rollout ended."""
@@ -60,7 +62,3 @@ class SimulationError(RuntimeError):
         super().__init__(message)
         self.result = result
         self.trajectory = trajectory
-
-
-class DerivativeError(ArithmeticError):
-    """A derivative of a run that is none, raised where it is taken outside of `jit`; within, it is NaN."""

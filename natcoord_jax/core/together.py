@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from natcoord_jax.maths.materialise import materialised
+from natcoord_jax.xla.materialise import materialised
 
 
 def instances_last(x: Any, axis: int = 0) -> Any:

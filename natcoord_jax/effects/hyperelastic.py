@@ -24,7 +24,7 @@ from natcoord_jax.core.arguments import Part, is_a
 from natcoord_jax.core.gradient import averaged_gradient
 from natcoord_jax.core.numeric import Number
 from natcoord_jax.maths.collocation import gauss
-from natcoord_jax.maths.materialise import materialised
+from natcoord_jax.xla.materialise import materialised
 from natcoord_jax.maths.symmetric import PAIRS, UNIT, cofactor, contracted, full, tensor_cross
 
 CLOSE = 1e-3

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from natcoord_jax.maths.rows import part, with_part
+from natcoord_jax.xla.rows import part, with_part
 
 UNBLOCKED = 16
 SMALL = 8

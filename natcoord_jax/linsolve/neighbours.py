@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int
 
 from natcoord_jax.linsolve.tree import applied, passed_down, product, transposed
 from natcoord_jax.maths.elimination import definite_inverse
-from natcoord_jax.maths.rows import add_at, row
+from natcoord_jax.xla.rows import add_at, row
 
 
 class NeighbourBlocks(eqx.Module):

@@ -20,7 +20,7 @@ from jaxtyping import Array, Float, Int
 
 from natcoord_jax.linsolve.dense import bordered_inverse
 from natcoord_jax.linsolve.refinement import refined_solve
-from natcoord_jax.maths.rows import add_at, row
+from natcoord_jax.xla.rows import add_at, row
 
 
 def applied(matrix: Float[Array, "*n r c"], vector: Float[Array, "*n 1 c"]) -> Float[Array, "*n r"]:

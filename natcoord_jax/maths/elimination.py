@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from natcoord_jax.maths.rows import part, with_part
+from natcoord_jax.xla.rows import part, with_part
 
 LOOPED = 48
 """Largest size for elimination written as a loop of rank-one updates, which compiles into one kernel and runs

@@ -19,7 +19,6 @@ from natcoord_jax.assembly.start_cache import StartCache
 from natcoord_jax.assembly.tangent_space import driven
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
-from natcoord_jax.maths.rows import row, with_row
 from natcoord_jax.stepping.difference_jacobian import DifferenceJacobian
 from natcoord_jax.stepping.differences import evaluated, told
 from natcoord_jax.stepping.energy_check import sound
@@ -28,6 +27,7 @@ from natcoord_jax.stepping.newton import Iterate, any_lane, judge, refreshed
 from natcoord_jax.stepping.remainder import remainder, with_remainder
 from natcoord_jax.stepping.rollout_state import RolloutProblem, RolloutState, after_attempt
 from natcoord_jax.stepping.step import end_of_step
+from natcoord_jax.xla.rows import row, with_row
 
 
 class LoopCarry(eqx.Module):

@@ -24,12 +24,10 @@ from natcoord_jax.assembly.system import System
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import Tableau
-from natcoord_jax.stepping import linear_pair
 from natcoord_jax.stepping.backward import Backward
 from natcoord_jax.stepping.error_control import Tolerance
 from natcoord_jax.stepping.forward import Forward
 from natcoord_jax.stepping.linear_iteration import STALL_ROUND_OFF, sizes_by_mass
-from natcoord_jax.stepping.one_kernel import lane_by_lane, on_cpu
 from natcoord_jax.stepping.plan import Plan, Slots
 from natcoord_jax.stepping.record import (
     Parameters,
@@ -42,6 +40,8 @@ from natcoord_jax.stepping.record import (
 from natcoord_jax.stepping.rollout import Ending, run
 from natcoord_jax.stepping.slot_sweep import Fixed
 from natcoord_jax.stepping.step import advance, linear_solver
+from natcoord_jax.xla import linear_pair
+from natcoord_jax.xla.one_kernel import lane_by_lane, on_cpu
 
 CHUNK = 32
 """Slots whose Jacobians are formed together."""

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from natcoord_jax.maths.rows import with_row
+from natcoord_jax.xla.rows import with_row
 
 FAILURES = 3
 """Jacobians with stages taken for alike that were not good enough, after which none is tried."""

@@ -17,13 +17,13 @@ from natcoord_jax.core.checks import at_top_level
 from natcoord_jax.core.closures import with_callables
 from natcoord_jax.core.state import State
 from natcoord_jax.stepping.newton import TOLERANCE
-from natcoord_jax.stepping.one_kernel import apart, as_one_kernel, in_one_array, plainly
 from natcoord_jax.stepping.plan import Plan
 from natcoord_jax.stepping.rollout import run_to_the_end
 from natcoord_jax.stepping.rollout_state import RolloutProblem
 from natcoord_jax.stepping.scheme import Scheme
 from natcoord_jax.stepping.two_kernel_loop import in_parts
 from natcoord_jax.xla.effort import FULL, accepted
+from natcoord_jax.xla.one_kernel import apart, as_one_kernel, in_one_array, plainly
 
 MOST = 1 << 30
 """Steps that one program can make."""

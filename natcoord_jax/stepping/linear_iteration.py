@@ -9,8 +9,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from natcoord_jax.linsolve.learning import MEMORY, SPEED, across, learns, learnt
-from natcoord_jax.maths.rows import row, with_row
 from natcoord_jax.stepping.factors import Factors
+from natcoord_jax.xla.rows import row, with_row
 
 CLOSE = 1e-12
 """Error of the solution of a transposed system relative to its size."""

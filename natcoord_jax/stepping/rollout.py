@@ -23,11 +23,11 @@ from natcoord_jax.stepping.attempt import LoopCarry, with_state
 from natcoord_jax.stepping.error_control import Tolerance
 from natcoord_jax.stepping.factors import Factors
 from natcoord_jax.stepping.newton import any_lane
-from natcoord_jax.stepping.one_kernel import as_one_kernel
 from natcoord_jax.stepping.plan import Plan, Slots
 from natcoord_jax.stepping.rollout_state import RolloutProblem, RolloutState
 from natcoord_jax.stepping.taken_up import TakenUp
 from natcoord_jax.stepping.two_kernel_loop import all_slots
+from natcoord_jax.xla.one_kernel import as_one_kernel
 
 
 class Ending(eqx.Module):

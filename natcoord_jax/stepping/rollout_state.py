@@ -16,12 +16,12 @@ from natcoord_jax.assembly.violations import contacts
 from natcoord_jax.core.results import Result
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import Tableau
-from natcoord_jax.maths.rows import part
 from natcoord_jax.stepping.error_control import StepDecision, Tolerance, Trial, follow
 from natcoord_jax.stepping.factors import Factors, no_factors
 from natcoord_jax.stepping.newton import Iterate, any_lane, begin
 from natcoord_jax.stepping.plan import Plan
 from natcoord_jax.stepping.predictor import Predictor
+from natcoord_jax.xla.rows import part
 
 SMALLEST_FRACTION = 1.0 / 2**16
 """A step is given up when a substep of this fraction of it fails, if slots have not run out before."""

@@ -19,7 +19,6 @@ from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.kinds import FLAG, FunctionOf, of
 from natcoord_jax.core.numeric import Number, Whole
 from natcoord_jax.core.state import STATE, State, Trajectory
-from natcoord_jax.stepping import one_kernel
 from natcoord_jax.stepping.admissibility import check_obeyed
 from natcoord_jax.stepping.checked import INPUTS, STEP, check_state, checked_inputs, checked_step
 from natcoord_jax.stepping.error_control import Tolerance
@@ -30,6 +29,7 @@ from natcoord_jax.stepping.scheme import SCHEME, SECOND_ORDER, Scheme
 from natcoord_jax.stepping.segments import Run, in_segments
 from natcoord_jax.stepping.turns import warn_of_far_turns
 from natcoord_jax.storage.archive import PATH
+from natcoord_jax.xla import one_kernel
 
 
 @compiled

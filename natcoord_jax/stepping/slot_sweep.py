@@ -21,15 +21,15 @@ from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
 from natcoord_jax.linsolve.learning import learns
 from natcoord_jax.maths.collocation import Tableau
-from natcoord_jax.maths.rows import part, row, with_part, with_row
 from natcoord_jax.stepping.factors import Factors, factors_of
 from natcoord_jax.stepping.linear_iteration import LinearIteration
 from natcoord_jax.stepping.newton import any_lane
-from natcoord_jax.stepping.one_kernel import in_few_kernels, lane_by_lane
 from natcoord_jax.stepping.plan import Plan
 from natcoord_jax.stepping.predictor import Predictor
 from natcoord_jax.stepping.record import Parameters, Record, Slot
 from natcoord_jax.stepping.step import advance_between
+from natcoord_jax.xla.one_kernel import in_few_kernels, lane_by_lane
+from natcoord_jax.xla.rows import part, row, with_part, with_row
 from natcoord_jax.xla.tracing import traced_once
 
 CHUNK = 32

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jax.core import Tracer, eval_context
 from jax.extend.core import get_opaque_trace_state, jaxpr_as_fun
+from jax.interpreters import partial_eval
 
 
 def is_concrete(*values: Any) -> bool:
@@ -36,3 +37,9 @@ def traced_once(function: Callable, *examples: Any) -> tuple[Callable, Any]:
         return jax.tree.unflatten(structure, run(*jax.tree.leaves(arguments)))
 
     return call, jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+
+
+def depends(function: Callable, *arguments: Any) -> bool:
+    """Whether what a function gives depends on any of its arguments, as its program has it."""
+    program = jax.make_jaxpr(function)(*arguments).jaxpr
+    return any(partial_eval.dce_jaxpr(program, [True] * len(program.outvars))[1])

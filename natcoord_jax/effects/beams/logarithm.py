@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.maths.components import Triple, rows_of
-from natcoord_jax.maths.materialise import materialised
+from natcoord_jax.xla.materialise import materialised
 from natcoord_jax.maths.rotations import arctan_coefficients
 from natcoord_jax.maths.vectors import quotient
 

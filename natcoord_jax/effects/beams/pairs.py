@@ -17,7 +17,7 @@ from natcoord_jax.core.effect import Motion, StepContext
 from natcoord_jax.core.potential import Potential
 from natcoord_jax.core.together import instances_last, place_together, steps_together
 from natcoord_jax.maths.components import Triple, combination, rows_of, turned_midway
-from natcoord_jax.maths.materialise import materialised
+from natcoord_jax.xla.materialise import materialised
 
 PLACES = np.array([0, 1, 2, 3, 4, 5, 0, 1, 2, 6, 7, 8])
 """Rows and columns of both bodies' wrenches and twists: of nine numbers, the first three serve both."""

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend import core as jex
 
-from natcoord_jax.core.checks import is_concrete
+from natcoord_jax.xla.tracing import is_concrete
 
 FEW = 1000
 """Integers up to which an array of them, as of indices, is part of the program, and not an argument."""

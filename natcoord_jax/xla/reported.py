@@ -17,7 +17,9 @@ from jax.extend import core as jex
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array
 
-from natcoord_jax.core.results import DerivativeError
+
+class DerivativeError(ArithmeticError):
+    """A derivative of a run that is none, raised where it is taken outside of `jit`; within, it is NaN."""
 
 
 @dataclass

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jax.extend import core as jex
 from jaxtyping import Array
 
-from natcoord_jax.maths.rows import part, row
+from natcoord_jax.xla.rows import part, row
 
 PRODUCT_LIMIT = 1 << 15
 """Multiplications up to which a product of matrices is written as a sum."""

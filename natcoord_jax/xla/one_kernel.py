@@ -23,9 +23,9 @@ import jax.numpy as jnp
 from jax.extend import core as jex
 from jaxtyping import Array, Float
 
-from natcoord_jax.stepping import rewriting
-from natcoord_jax.stepping.rewriting import Flat, known, operations
+from natcoord_jax.xla import rewriting
 from natcoord_jax.xla.kernels import KERNEL
+from natcoord_jax.xla.rewriting import Flat, known, operations
 
 try:
     from jax.experimental.scheduling_groups import xla_metadata_call as _attributed

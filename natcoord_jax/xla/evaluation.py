@@ -1,0 +1,122 @@
+"""Traced programs evaluated by NumPy, one operation after the other, without a compilation."""
+
+from collections.abc import Sequence
+from typing import Any
+from weakref import WeakKeyDictionary
+
+import jax.numpy as jnp
+import numpy as np
+from jax.extend.core import ClosedJaxpr as ClosedJaxpr
+from jax.extend.core import Jaxpr, Literal
+
+from natcoord_jax.xla.numpy_operations import OPERATIONS
+
+
+def evaluate(program: ClosedJaxpr, arguments: Sequence[Any]) -> list[np.ndarray]:
+    """Values of a traced program for given arrays."""
+    return _run(program.jaxpr, program.consts, arguments)
+
+
+def _run(jaxpr: Jaxpr, constants: Sequence[Any], arguments: Sequence[Any]) -> list[Any]:
+    known: dict[Any, np.ndarray] = {}
+
+    def know(variables: Sequence[Any], values: Sequence[Any]) -> None:
+        for variable, value in zip(variables, values, strict=True):
+            known[variable] = np.asarray(value, variable.aval.dtype)
+
+    def value_of(atom: Any) -> np.ndarray:
+        if isinstance(atom, Literal):
+            literal: Any = atom
+            return np.asarray(literal.val, literal.aval.dtype)
+        return known[atom]
+
+    know([*jaxpr.constvars, *jaxpr.invars], [*constants, *arguments])
+    for equation, done in zip(jaxpr.eqns, _last_uses(jaxpr)):
+        know(equation.outvars, _apply(equation, [value_of(atom) for atom in equation.invars]))
+        for variable in done:
+            del known[variable]
+    return [value_of(atom) for atom in jaxpr.outvars]
+
+
+_LAST_USES: WeakKeyDictionary[Jaxpr, list[list[Any]]] = WeakKeyDictionary()
+
+
+def _last_uses(jaxpr: Jaxpr) -> list[list[Any]]:
+    """Variables that are not needed beyond each equation: long trajectories make large arrays."""
+    if jaxpr not in _LAST_USES:
+        needed = {id(atom) for atom in jaxpr.outvars}
+        done: list[list[Any]] = []
+        for equation in reversed(jaxpr.eqns):
+            last = {id(x): x for x in (*equation.outvars, *equation.invars) if not isinstance(x, Literal)}
+            done.append([x for key, x in last.items() if key not in needed])
+            needed.update(last)
+        _LAST_USES[jaxpr] = done[::-1]
+    return _LAST_USES[jaxpr]
+
+
+def _apply(equation: Any, operands: list[np.ndarray]) -> Sequence[Any]:
+    name, given = equation.primitive.name, equation.params
+    inner = next((given[key] for key in INNER if isinstance(given.get(key), ClosedJaxpr)), None)
+    if name in CALLS and inner is not None:
+        return evaluate(inner, operands)
+    if name in FLOWS:
+        return FLOWS[name](given, operands)
+    known = OPERATIONS.get(name)
+    result = NotImplemented if known is None else known(*operands, **given)
+    if result is not NotImplemented:
+        return [result]
+    found = equation.primitive.bind(*map(jnp.asarray, operands), **given)
+    return found if equation.primitive.multiple_results else [found]
+
+
+CALLS = frozenset("jit pjit custom_jvp_call custom_vjp_call custom_vmap_call closed_call".split())
+"""Operations that are programs with a name."""
+
+INNER = "jaxpr", "call_jaxpr", "call"
+"""Where they keep them."""
+
+
+def _scan(given: dict[str, Any], operands: list[np.ndarray]) -> list[np.ndarray]:
+    if "ft_in" in given:  # since JAX 0.11
+        fixed, carried, _ = (len(list(part)) for part in given["ft_in"].unpack())
+    else:
+        fixed, carried = given["num_consts"], given["num_carry"]
+    constants, state = operands[:fixed], operands[fixed : fixed + carried]
+    listed, body = operands[fixed + carried :], given["jaxpr"]
+    order = range(given["length"])
+    made: list[list[Any]] = []
+    for k in reversed(order) if given["reverse"] else order:
+        results = evaluate(body, [*constants, *state, *(x[k] for x in listed)])
+        state = results[:carried]
+        made.append(results[carried:])
+    if given["reverse"]:
+        made.reverse()
+    empty = [np.zeros((0, *v.aval.shape), v.aval.dtype) for v in body.jaxpr.outvars[carried:]]
+    return [*state, *([np.stack(x) for x in zip(*made)] if made else empty)]
+
+
+def _while(given: dict[str, Any], operands: list[np.ndarray]) -> list[np.ndarray]:
+    of_test, of_body = given["cond_nconsts"], given["body_nconsts"]
+    test, body = operands[:of_test], operands[of_test : of_test + of_body]
+    state = operands[of_test + of_body :]
+    while evaluate(given["cond_jaxpr"], [*test, *state])[0]:
+        state = evaluate(given["body_jaxpr"], [*body, *state])
+    return state
+
+
+def _cond(given: dict[str, Any], operands: list[np.ndarray]) -> list[np.ndarray]:
+    branches = given["branches"]
+    return evaluate(branches[int(np.clip(operands[0], 0, len(branches) - 1))], operands[1:])
+
+
+def _split(given: dict[str, Any], operands: list[np.ndarray]) -> list[np.ndarray]:
+    return np.split(operands[0], np.cumsum(given["sizes"])[:-1], given["axis"])
+
+
+def _unstack(given: dict[str, Any], operands: list[np.ndarray]) -> list[np.ndarray]:
+    # Of a vector these are numbers of NumPy, which are no arrays.
+    return [np.asarray(x) for x in np.moveaxis(operands[0], given["axis"], 0)]
+
+
+FLOWS = {"scan": _scan, "while": _while, "cond": _cond, "split": _split, "unstack": _unstack}
+"""Operations with several results, by name."""
