@@ -17,9 +17,6 @@ from natcoord_jax.analysis import (
     modes,
     tangent_growth,
 )
-from natcoord_jax.assembly.set_coordinates import random_state
-from natcoord_jax.assembly.system import System
-from natcoord_jax.assembly.transfer import transfer
 from natcoord_jax.bodies import (
     Beam,
     BeamHandle,
@@ -176,6 +173,8 @@ from natcoord_jax.effects.springs import (
     SphericalSpring,
     Spring,
 )
+from natcoord_jax.reading.set_coordinates import random_state
+from natcoord_jax.reading.transfer import transfer
 from natcoord_jax.scene import Scene
 from natcoord_jax.stepping.assemble import assemble
 from natcoord_jax.stepping.dissipative import Dissipative
@@ -186,6 +185,7 @@ from natcoord_jax.stepping.simulate import simulate
 from natcoord_jax.stepping.variational import VariationalMidpoint
 from natcoord_jax.storage import load, save
 from natcoord_jax.sweeps import Sweep, sweep
+from natcoord_jax.system import System
 
 if TYPE_CHECKING:
     __version__: str

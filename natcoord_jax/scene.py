@@ -10,10 +10,9 @@ import jax
 import numpy as np
 from jaxtyping import Array
 
-from natcoord_jax.assembly.build import build
-from natcoord_jax.assembly.system import System
 from natcoord_jax.bodies.nodes import Nodes
 from natcoord_jax.bodies.rigid import Orientation
+from natcoord_jax.build import build
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.bodies import Body
 from natcoord_jax.core.checks import as_array, is_concrete, require_double
@@ -36,6 +35,7 @@ from natcoord_jax.stepping.admissibility import (
 )
 from natcoord_jax.stepping.assemble import assemble as assemble_state
 from natcoord_jax.stepping.sparsity import with_sparsity
+from natcoord_jax.system import System
 
 PART = of(
     "a body, a joint, an effect, a beam, nodes or elements, as nc.RigidBody(...)",

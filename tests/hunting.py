@@ -16,8 +16,8 @@ import plain
 from hunting_effects import STEPS, Chance
 
 import natcoord_jax as nc
-from natcoord_jax.assembly.coordinates import state_rates
 from natcoord_jax.core.eager_numpy import eager_numpy
+from natcoord_jax.mechanics.coordinates import state_rates
 from natcoord_jax.stepping.derivative import run_slots
 from natcoord_jax.stepping.error_control import Tolerance
 from natcoord_jax.stepping.newton import TOLERANCE

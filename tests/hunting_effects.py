@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 
 import natcoord_jax as nc
-from natcoord_jax.assembly.response import body_rows
-from natcoord_jax.assembly.tangent_space import TangentSpace, Velocity
 from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.effect import replace_fields
+from natcoord_jax.mechanics.response import body_rows
+from natcoord_jax.mechanics.tangent_space import TangentSpace, Velocity
 
 STEPS = 40
 """Of most scenes."""

@@ -18,11 +18,11 @@ import optax
 import pytest
 
 import natcoord_jax as nc
-from natcoord_jax.assembly.system import System
 from natcoord_jax.control.iterate import Options
 from natcoord_jax.control.solution import Solution
 from natcoord_jax.control.transcription import Unknowns
 from natcoord_jax.core.handles import Handle
+from natcoord_jax.system import System
 
 
 @cache

@@ -11,13 +11,13 @@ import pytest
 import tolerances as tol
 
 import natcoord_jax as nc
-from natcoord_jax.assembly.local import jacobians
-from natcoord_jax.assembly.response import body_rows, ground_rows, situation
 from natcoord_jax.core.effect import Effect, Motion, StepContext, replace_fields
 from natcoord_jax.core.gradient import gradient_of
 from natcoord_jax.core.potential import Potential, place_markers
 from natcoord_jax.maths.collocation import gauss
 from natcoord_jax.maths.rotations import arctan_coefficients, from_rotation_vector
+from natcoord_jax.mechanics.local import jacobians
+from natcoord_jax.mechanics.response import body_rows, ground_rows, situation
 
 ELEMENTS = 3
 STEP = 0.3

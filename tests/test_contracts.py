@@ -20,14 +20,12 @@ import numpy as np
 import pytest
 import tolerances as tol
 from differences import assert_v_shaped, difference_errors
+from natcoord_jax.model.rows import group_places, rows_with_ground
 from scenes import AXIS, JOINTS, SECOND, SPECIAL, with_multipliers
 
 import natcoord_jax as nc
 import natcoord_jax.effects
-from natcoord_jax.assembly.build import build
-from natcoord_jax.assembly.diagnostics import group_places, rows_with_ground
-from natcoord_jax.assembly.reduced import ReducedStep
-from natcoord_jax.assembly.response import gather, respond, situation
+from natcoord_jax.build import build
 from natcoord_jax.core.cells import CELLS
 from natcoord_jax.core.coordinate import CoordinateEffect
 from natcoord_jax.core.effect import Effect, replace_fields
@@ -35,6 +33,8 @@ from natcoord_jax.core.joint import frames_at
 from natcoord_jax.core.potential import place_markers
 from natcoord_jax.maths.collocation import gauss
 from natcoord_jax.maths.rotations import from_rotation_vector
+from natcoord_jax.mechanics.reduced import ReducedStep
+from natcoord_jax.mechanics.response import gather, respond, situation
 from natcoord_jax.stepping.step import advance
 
 TABLEAU = gauss(1)

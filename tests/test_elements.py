@@ -13,11 +13,11 @@ from differences import assert_v_shaped
 import natcoord_jax as nc
 from natcoord_jax import gallery
 from natcoord_jax.analysis import balance, static_equations
-from natcoord_jax.assembly.build import build
-from natcoord_jax.assembly.full import FullStep
-from natcoord_jax.assembly.reduced import NOTHING
+from natcoord_jax.build import build
 from natcoord_jax.gallery import continua
 from natcoord_jax.maths.collocation import gauss
+from natcoord_jax.mechanics.full import FullStep
+from natcoord_jax.mechanics.reduced import NOTHING
 from natcoord_jax.viz.parts import scenery_of
 from natcoord_jax.viz.skins import drawn_bodies
 

@@ -8,7 +8,8 @@ from jax import lax
 
 import natcoord_jax as nc
 from natcoord_jax.core.checks import as_array, at_top_level
-from natcoord_jax.core.eager_numpy import FLOWS, eager_numpy
+from natcoord_jax.core.eager_numpy import eager_numpy
+from natcoord_jax.xla.evaluation import FLOWS
 
 X = jnp.asarray(np.random.default_rng(0).normal(size=(4, 3)))
 PLACES = jnp.array([2, 0, 3])

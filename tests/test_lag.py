@@ -12,10 +12,10 @@ import pytest
 
 import natcoord_jax as nc
 from natcoord_jax import gallery
-from natcoord_jax.assembly.equations import prepare
-from natcoord_jax.assembly.frozen_kick import MOST_RENEWALS, SPANS, Lagging, from_body_axes, in_body_axes
-from natcoord_jax.assembly.kick import Kick
-from natcoord_jax.assembly.tangent_space import Velocity
+from natcoord_jax.mechanics.equations import prepare
+from natcoord_jax.mechanics.frozen_kick import MOST_RENEWALS, SPANS, Lagging, from_body_axes, in_body_axes
+from natcoord_jax.mechanics.kick import Kick
+from natcoord_jax.mechanics.tangent_space import Velocity
 from natcoord_jax.stepping.derivative import run_slots
 from natcoord_jax.stepping.newton import begin
 from natcoord_jax.stepping.plan import Plan

@@ -18,9 +18,9 @@ from scenes import pair
 
 import natcoord_jax as nc
 from natcoord_jax import gallery
-from natcoord_jax.assembly.coordinates import state_rates
-from natcoord_jax.assembly.reading import reads_velocities
-from natcoord_jax.assembly.violations import joint_residuals
+from natcoord_jax.mechanics.coordinates import state_rates
+from natcoord_jax.mechanics.violations import joint_residuals
+from natcoord_jax.reading.tangent_states import reads_velocities
 
 AXES = [(0, 0, 1), (0, 1, 0), (0, 1, 0), (0, 0, 1), (0, 1, 0), (0, 0, 1)]
 LENGTHS, MASSES = (0.3, 0.4, 0.35, 0.2, 0.15, 0.1), (5, 4, 3, 1.5, 1, 0.5)

@@ -9,7 +9,7 @@ from scenes import pair, with_multipliers
 
 import natcoord_jax as nc
 from natcoord_jax import gallery
-from natcoord_jax.assembly.equations import prepare
+from natcoord_jax.mechanics.equations import prepare
 from natcoord_jax.stepping import attempt
 from natcoord_jax.stepping import remainder as subject
 

@@ -7,7 +7,7 @@ import pytest
 
 import natcoord_jax as nc
 from natcoord_jax import gallery
-from natcoord_jax.assembly.axisymmetric_axes import POLE, ball_axes, symmetries
+from natcoord_jax.model.axisymmetric_axes import POLE, ball_axes, symmetries
 
 FRAME = np.stack([np.eye(4)] * 2)
 AXES = np.array([[0.36, 0.48, 0.8], [0.8, -0.6, 0.0], [0.48, 0.64, -0.6]])

@@ -8,9 +8,9 @@ import tolerances as tol
 
 import natcoord_jax as nc
 from natcoord_jax import gallery
-from natcoord_jax.assembly import block_tangent_space
-from natcoord_jax.assembly.block_tangent_space import SeparateTangents, tangents_at
-from natcoord_jax.assembly.tangent_space import TangentSpace, Velocity
+from natcoord_jax.mechanics import block_tangent_space
+from natcoord_jax.mechanics.block_tangent_space import SeparateTangents, tangents_at
+from natcoord_jax.mechanics.tangent_space import TangentSpace, Velocity
 
 
 def mixed():

@@ -9,9 +9,9 @@ import pytest
 
 import natcoord_jax as nc
 from natcoord_jax import gallery
-from natcoord_jax.assembly.equations import prepare
 from natcoord_jax.linsolve.stages import complex_inverse, fitted, modes_of, stagewise_inverse
 from natcoord_jax.maths.collocation import gauss
+from natcoord_jax.mechanics.equations import prepare
 from natcoord_jax.stepping.difference_jacobian import FAILURES, DifferenceJacobian, matrix_of
 from natcoord_jax.stepping.newton import newton
 

@@ -18,9 +18,9 @@ import tolerances as tol
 from test_contracts import TABLE, answering, inputs_of, random_motion, stage
 
 import natcoord_jax as nc
-from natcoord_jax.assembly.equations import prepare
-from natcoord_jax.assembly.reduced import ReducedStep
 from natcoord_jax.maths.collocation import gauss
+from natcoord_jax.mechanics.equations import prepare
+from natcoord_jax.mechanics.reduced import ReducedStep
 from natcoord_jax.xla import rewriting
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -9,17 +9,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from natcoord_jax.model.rows import row_rates
 
 import natcoord_jax as nc
 from natcoord_jax import gallery
-from natcoord_jax.assembly.block_tangent_space import tangents_at
-from natcoord_jax.assembly.equations_of_motion import constraint_matrix
-from natcoord_jax.assembly.momentum import inertia, spatial_inertia, wrench
-from natcoord_jax.assembly.rates import row_rates
-from natcoord_jax.assembly.reduced import NOTHING, ReducedStep, at_rest
-from natcoord_jax.assembly.tangent_space import TangentSpace
 from natcoord_jax.maths.collocation import gauss
 from natcoord_jax.maths.direct_rotation import nearest_orthogonal
+from natcoord_jax.mechanics.block_tangent_space import tangents_at
+from natcoord_jax.mechanics.equations_of_motion import constraint_matrix
+from natcoord_jax.mechanics.momentum import inertia, spatial_inertia, wrench
+from natcoord_jax.mechanics.reduced import NOTHING, ReducedStep, at_rest
+from natcoord_jax.mechanics.tangent_space import TangentSpace
 
 
 def driven_four_bar():

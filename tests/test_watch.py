@@ -9,7 +9,7 @@ import pytest
 from scenes import pair, with_multipliers
 
 import natcoord_jax as nc
-from natcoord_jax.assembly.equations import prepare
+from natcoord_jax.mechanics.equations import prepare
 from natcoord_jax.stepping import energy_check as subject
 from natcoord_jax.stepping.factors import factors_of
 from natcoord_jax.stepping.newton import TOLERANCE, newton

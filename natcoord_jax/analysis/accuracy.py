@@ -11,14 +11,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from natcoord_jax.assembly.system import SYSTEM, System
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.kinds import FunctionOf, Several, of
 from natcoord_jax.core.numeric import Number, Vector, Whole
 from natcoord_jax.core.results import Result
 from natcoord_jax.core.state import STATE, State
+from natcoord_jax.model.model import SYSTEM
 from natcoord_jax.stepping.endpoint import Endpoint, endpoints
 from natcoord_jax.stepping.scheme import ORDER, EnergyMomentum
+from natcoord_jax.system import System
 
 ORDERS = (2, 4, 6, 8, 10)
 TARGETS = (1e-2, 1e-4, 1e-6, 1e-8, 1e-10)

@@ -16,15 +16,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from natcoord_jax.assembly.diagnostics import body_momenta
-from natcoord_jax.assembly.response import StageKinematics, body_rows, gather, respond, situation, stations
-from natcoord_jax.assembly.system import SYSTEM, Group, System
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.effect import Motion, Response
 from natcoord_jax.core.state import TRAJECTORY, State, Trajectory
 from natcoord_jax.maths.collocation import gauss
 from natcoord_jax.maths.vectors import cross, safe_divide
+from natcoord_jax.mechanics.energies import body_momenta
+from natcoord_jax.mechanics.response import StageKinematics, body_rows, gather, respond, situation, stations
+from natcoord_jax.model.groups import Group
+from natcoord_jax.model.model import SYSTEM
+from natcoord_jax.system import System
 
 REACTION_FREE = 1e-12
 """A rigid motion counts as free of reactions when their mean square power is below this share: far above the

@@ -8,16 +8,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from natcoord_jax.assembly.system import SYSTEM, System
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.compiled import compiled
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.numeric import Whole
 from natcoord_jax.core.results import Result
 from natcoord_jax.core.state import STATE, State
+from natcoord_jax.model.model import SYSTEM
 from natcoord_jax.stepping.checked import INPUTS, STEP, checked_inputs, checked_step
 from natcoord_jax.stepping.scheme import SCHEME, SECOND_ORDER, Scheme
 from natcoord_jax.stepping.simulate import simulate
+from natcoord_jax.system import System
 
 DIGITS = 16
 """Decades after which rounding of the start is as large as the motion."""

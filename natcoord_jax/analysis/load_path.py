@@ -18,8 +18,6 @@ from natcoord_jax.analysis.statics import (
     extent_of,
     largest,
 )
-from natcoord_jax.assembly.system import SYSTEM, System
-from natcoord_jax.assembly.violations import refuse_contacts
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.callables import Function
 from natcoord_jax.core.checks import as_array, at_top_level, is_concrete, positive
@@ -29,6 +27,9 @@ from natcoord_jax.core.kinds import FLAG, FunctionOf
 from natcoord_jax.core.numeric import Number, Whole
 from natcoord_jax.core.results import REASONS, Result, SimulationError
 from natcoord_jax.core.state import STATE, State
+from natcoord_jax.mechanics.violations import refuse_contacts
+from natcoord_jax.model.model import SYSTEM
+from natcoord_jax.system import System
 
 
 class _Point(eqx.Module):

@@ -18,12 +18,6 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from natcoord_jax.analysis.static_equations import Static
-from natcoord_jax.assembly.equations_of_motion import loads, relative_rates, rotors_of, with_rest
-from natcoord_jax.assembly.momentum import inertia, wrench
-from natcoord_jax.assembly.projection import TWIST, constraint_matrix
-from natcoord_jax.assembly.rates import row_rates
-from natcoord_jax.assembly.system import SYSTEM, System
-from natcoord_jax.assembly.violations import refuse_contacts
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.checks import is_concrete, numbers
 from natcoord_jax.core.compiled import briefly
@@ -31,6 +25,13 @@ from natcoord_jax.core.kinds import FLAG
 from natcoord_jax.core.numeric import COMPONENTS, Vector, Whole
 from natcoord_jax.core.state import STATE, State
 from natcoord_jax.maths.vectors import cross
+from natcoord_jax.mechanics.equations_of_motion import loads, relative_rates, rotors_of, with_rest
+from natcoord_jax.mechanics.momentum import inertia, wrench
+from natcoord_jax.mechanics.projection import TWIST, constraint_matrix
+from natcoord_jax.mechanics.violations import refuse_contacts
+from natcoord_jax.model.model import SYSTEM
+from natcoord_jax.model.rows import row_rates
+from natcoord_jax.system import System
 
 BALANCE = 1e-6
 """Largest unbalanced force, relative to the largest force on a body, of what counts as steady."""

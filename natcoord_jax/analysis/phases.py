@@ -7,11 +7,12 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from natcoord_jax.assembly.diagnostics import Energy
-from natcoord_jax.assembly.system import SYSTEM, System
 from natcoord_jax.core.arguments import Part, is_a
 from natcoord_jax.core.kinds import Several
 from natcoord_jax.core.state import TRAJECTORY, Trajectory
+from natcoord_jax.model.model import SYSTEM
+from natcoord_jax.reading.diagnostics import Energy
+from natcoord_jax.system import System
 
 
 class Phases(Part):

@@ -13,20 +13,6 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from natcoord_jax.assembly.element_matrices import bodies_of_elements, dense, rates_of, touches
-from natcoord_jax.assembly.equations_of_motion import loads
-from natcoord_jax.assembly.full import FullStep
-from natcoord_jax.assembly.local import body_motion
-from natcoord_jax.assembly.local_rates import TWIST
-from natcoord_jax.assembly.momentum import wrench
-from natcoord_jax.assembly.node_sweeps import sweep_nodes
-from natcoord_jax.assembly.projection import nearest_coordinates
-from natcoord_jax.assembly.rates import row_rates
-from natcoord_jax.assembly.response import gather, respond, situation, stations
-from natcoord_jax.assembly.start_cache import StartCache
-from natcoord_jax.assembly.system import Group, System
-from natcoord_jax.assembly.tree import gather_slots, start_rates
-from natcoord_jax.assembly.violations import violations_of
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
 from natcoord_jax.linsolve.dense import Inverse
@@ -34,6 +20,21 @@ from natcoord_jax.linsolve.products import Products, WithProducts
 from natcoord_jax.linsolve.sparse import factorised
 from natcoord_jax.maths.collocation import gauss
 from natcoord_jax.maths.elimination import pivoted_inverse
+from natcoord_jax.mechanics.element_matrices import bodies_of_elements, dense, rates_of, touches
+from natcoord_jax.mechanics.equations_of_motion import loads
+from natcoord_jax.mechanics.full import FullStep
+from natcoord_jax.mechanics.local import body_motion
+from natcoord_jax.mechanics.momentum import wrench
+from natcoord_jax.mechanics.node_sweeps import sweep_nodes
+from natcoord_jax.mechanics.projection import nearest_coordinates
+from natcoord_jax.mechanics.response import gather, respond, situation, stations
+from natcoord_jax.mechanics.start_cache import StartCache
+from natcoord_jax.mechanics.violations import violations_of
+from natcoord_jax.model.groups import Group
+from natcoord_jax.model.local_rates import TWIST
+from natcoord_jax.model.rows import row_rates
+from natcoord_jax.model.tree import gather_slots, start_rates
+from natcoord_jax.system import System
 
 NO_MASS = 1e-30
 """Factor on masses that leaves them no weight in the equations, but tells bodies from point masses."""

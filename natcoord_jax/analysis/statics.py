@@ -8,8 +8,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from natcoord_jax.analysis.static_equations import Static
-from natcoord_jax.assembly.system import SYSTEM, System
-from natcoord_jax.assembly.violations import refuse_contacts
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.checks import at_top_level, is_concrete
 from natcoord_jax.core.compiled import briefly
@@ -19,6 +17,9 @@ from natcoord_jax.core.numeric import Number, Numbers, Vector, Whole
 from natcoord_jax.core.results import REASONS, Result, SimulationError
 from natcoord_jax.core.state import STATE, State
 from natcoord_jax.linsolve.refinement import refined_solve
+from natcoord_jax.mechanics.violations import refuse_contacts
+from natcoord_jax.model.model import SYSTEM
+from natcoord_jax.system import System
 
 ITERATIONS = 40
 """Newton iterations for one load."""

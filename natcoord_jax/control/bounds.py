@@ -13,7 +13,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from natcoord_jax.assembly.system import System
 from natcoord_jax.core.arguments import Part, is_a
 from natcoord_jax.core.callables import Function
 from natcoord_jax.core.checks import is_concrete
@@ -21,6 +20,7 @@ from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.kinds import BODY_NAME, JOINT_NAME, NAME, FunctionOf, HandleOf, Several, of
 from natcoord_jax.core.numeric import Directions, Number, Numbers, Whole
 from natcoord_jax.core.state import State
+from natcoord_jax.system import System
 
 LIMIT = Number(infinite=True) | Numbers((None,), infinite=True)
 EXCESS = FunctionOf("(state, u, t) -> number or vector")

@@ -9,9 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from natcoord_jax.assembly.coordinates import state_rates
-from natcoord_jax.assembly.reading import tangent
-from natcoord_jax.assembly.system import SYSTEM, System
 from natcoord_jax.control.inverse import followed, places_of
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.compiled import compiled
@@ -19,7 +16,11 @@ from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.kinds import JOINT_NAME, Several
 from natcoord_jax.core.numeric import Number, Numbers
 from natcoord_jax.core.state import STATE, State
+from natcoord_jax.mechanics.coordinates import state_rates
+from natcoord_jax.model.model import SYSTEM
+from natcoord_jax.reading.tangent_states import tangent
 from natcoord_jax.stepping.checked import STEP
+from natcoord_jax.system import System
 
 
 class ComputedTorque(eqx.Module):

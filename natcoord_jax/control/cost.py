@@ -7,13 +7,13 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from natcoord_jax.assembly.system import System
 from natcoord_jax.control.goal import GOAL
 from natcoord_jax.core.arguments import Part, is_a
 from natcoord_jax.core.callables import Function
 from natcoord_jax.core.kinds import FunctionOf, Several, of
 from natcoord_jax.core.numeric import Number, Vector
 from natcoord_jax.core.state import State
+from natcoord_jax.system import System
 
 WEIGHTS = Number() | Vector(None)
 RUNNING = FunctionOf("(state, u, t) -> cost per second")

@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from natcoord_jax.assembly.system import SYSTEM, System
 from natcoord_jax.control.guess import GUESS, unknowns_of
 from natcoord_jax.control.iterate import Iterate, Options
 from natcoord_jax.control.problem import PROBLEM, OptimalControl, numeric
@@ -20,7 +19,9 @@ from natcoord_jax.core.compiled import compiled
 from natcoord_jax.core.kinds import Several
 from natcoord_jax.core.numeric import Number, Numbers, Vector, Whole
 from natcoord_jax.core.state import State, Trajectory
+from natcoord_jax.model.model import SYSTEM
 from natcoord_jax.stepping.simulate import simulate
+from natcoord_jax.system import System
 
 
 class Feedback(eqx.Module):

@@ -13,7 +13,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from natcoord_jax.assembly.system import System
 from natcoord_jax.control.tangent import steady_rates
 from natcoord_jax.core.arguments import Part, is_a
 from natcoord_jax.core.callables import Function
@@ -22,6 +21,7 @@ from natcoord_jax.core.kinds import BODY_NAME, JOINT_NAME, NAME, FunctionOf, Sev
 from natcoord_jax.core.numeric import COMPONENTS, Number, Numbers, Whole
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.rotations import angular_velocity, from_quaternion, to_rotation_vector
+from natcoord_jax.system import System
 
 ROTATION = Numbers((4,)) | Numbers((3, 3))
 RESIDUAL = FunctionOf("(state) -> number or vector")

@@ -9,8 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from natcoord_jax.assembly.equations import prepare, starting
-from natcoord_jax.assembly.system import SYSTEM, System
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.compiled import briefly
 from natcoord_jax.core.handles import Handle
@@ -18,8 +16,11 @@ from natcoord_jax.core.kinds import JOINT_NAME, Several
 from natcoord_jax.core.numeric import Numbers
 from natcoord_jax.core.state import STATE, State
 from natcoord_jax.maths.collocation import gauss
+from natcoord_jax.mechanics.equations import prepare, starting
+from natcoord_jax.model.model import SYSTEM
 from natcoord_jax.stepping.checked import STEP
 from natcoord_jax.stepping.step import end_of_step
+from natcoord_jax.system import System
 
 MIDPOINT = gauss(1)
 LEAST_ROUNDS, MOST_ROUNDS = 3, 30

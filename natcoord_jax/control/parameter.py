@@ -8,11 +8,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from natcoord_jax.assembly.system import System
 from natcoord_jax.core.arguments import Part, is_a
 from natcoord_jax.core.callables import Function
 from natcoord_jax.core.kinds import FLAG, NAME, FunctionOf, Several
 from natcoord_jax.core.numeric import Number, Whole
+from natcoord_jax.system import System
 
 
 class Parameter(Part):

@@ -8,8 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from natcoord_jax.assembly.system import SYSTEM, System
-from natcoord_jax.assembly.tree import SLOTS
 from natcoord_jax.control.bounds import BOUND, Bound
 from natcoord_jax.control.cost import COST, Cost
 from natcoord_jax.control.goal import GOAL, Goal
@@ -20,7 +18,10 @@ from natcoord_jax.core.checks import is_concrete
 from natcoord_jax.core.kinds import FLAG, Several, of
 from natcoord_jax.core.numeric import Number, Numbers, Whole
 from natcoord_jax.core.state import STATE, State
+from natcoord_jax.model.model import SYSTEM
+from natcoord_jax.model.tree import SLOTS
 from natcoord_jax.stepping.assemble import assemble
+from natcoord_jax.system import System
 
 PARAMETERS = Several(of("nc.Parameter(...)", Parameter))
 

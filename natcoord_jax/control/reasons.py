@@ -5,8 +5,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from natcoord_jax.assembly.diagnostics import explain
-from natcoord_jax.assembly.system import System
 from natcoord_jax.control.bounds import Bound
 from natcoord_jax.control.iterate import Iterate
 from natcoord_jax.control.problem import OptimalControl
@@ -14,7 +12,9 @@ from natcoord_jax.control.results import Outcome
 from natcoord_jax.control.transcription import held_inputs
 from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.state import State
+from natcoord_jax.reading.diagnostics import explain
 from natcoord_jax.stepping.simulate import simulate
+from natcoord_jax.system import System
 
 AT_BOUND = 1e-9
 """Excess, in half a range, that is rounding."""

@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from natcoord_jax.assembly.system import System
 from natcoord_jax.control.goal import Goal
 from natcoord_jax.control.guess import Guess, free_of_swings
 from natcoord_jax.control.iterate import Iterate
@@ -24,6 +23,7 @@ from natcoord_jax.core.kinds import of
 from natcoord_jax.core.numeric import Whole
 from natcoord_jax.core.state import State, Trajectory
 from natcoord_jax.stepping.simulate import simulate
+from natcoord_jax.system import System
 
 FILE = of("the name of a file", str, Path)
 

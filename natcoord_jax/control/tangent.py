@@ -12,12 +12,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from natcoord_jax.assembly.coordinates import coordinate_rates, state_rates
-from natcoord_jax.assembly.diagnostics import rows_with_ground
-from natcoord_jax.assembly.rates import null_space, row_rates, tree_rates, twists
-from natcoord_jax.assembly.system import System
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
+from natcoord_jax.mechanics.coordinates import coordinate_rates, state_rates
+from natcoord_jax.mechanics.rates import null_space, tree_rates, twists
+from natcoord_jax.model.rows import row_rates, rows_with_ground
+from natcoord_jax.system import System
 
 SMALL = 1e-13
 """Regularisation of the inertia of the free motions, relative; motions without inertia are left alone."""

@@ -24,8 +24,8 @@ from natcoord_jax.core.arguments import Part, is_a
 from natcoord_jax.core.gradient import averaged_gradient
 from natcoord_jax.core.numeric import Number
 from natcoord_jax.maths.collocation import gauss
-from natcoord_jax.xla.materialise import materialised
 from natcoord_jax.maths.symmetric import PAIRS, UNIT, cofactor, contracted, full, tensor_cross
+from natcoord_jax.xla.materialise import materialised
 
 CLOSE = 1e-3
 """Relative distance of two volumes up to which the quotient of their logarithms is a series."""

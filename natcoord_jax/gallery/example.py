@@ -8,9 +8,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 import natcoord_jax as nc
-from natcoord_jax.assembly.system import System
 from natcoord_jax.core.state import State, Trajectory
 from natcoord_jax.stepping.scheme import Scheme
+from natcoord_jax.system import System
 
 
 @dataclass(frozen=True)

@@ -13,10 +13,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 import natcoord_jax as nc
-from natcoord_jax.assembly.system import System
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.state import State
 from natcoord_jax.gallery.example import Example
+from natcoord_jax.system import System
 
 UPPER, FORE = 0.4, 0.35
 """Lengths of the links [m]."""

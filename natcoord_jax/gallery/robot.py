@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 import natcoord_jax as nc
-from natcoord_jax.assembly.system import System
 from natcoord_jax.core.checks import as_array
 from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.handles import Handle
@@ -19,6 +18,7 @@ from natcoord_jax.core.state import State, Trajectory
 from natcoord_jax.gallery.example import Example
 from natcoord_jax.gallery.trees import ROBOT
 from natcoord_jax.maths.rotations import from_axis_angle
+from natcoord_jax.system import System
 
 # Links of the KUKA LWR 4+: height of the frame above the foot with the arm upright [m], mass [kg], centre of
 # mass (y, z) from there [m], inertia about it (xx, yy, zz, yz) [kg m^2]; products with x vanish. The numbers

@@ -4,11 +4,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from natcoord_jax.assembly.system import System
 from natcoord_jax.core.checks import as_array, is_concrete
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
 from natcoord_jax.io.motion import at_rest, link_poses
+from natcoord_jax.system import System
 
 if TYPE_CHECKING:
     from natcoord_jax.io.robot import RobotHandle

@@ -7,7 +7,6 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
-from natcoord_jax.assembly.system import System
 from natcoord_jax.bodies.rigid import orientation as rotation_of
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.handles import Handle
@@ -17,6 +16,7 @@ from natcoord_jax.core.state import State
 from natcoord_jax.io import building, placing
 from natcoord_jax.io.description import Description, FrameData, JointData, Keyframe
 from natcoord_jax.io.notes import Note, in_words
+from natcoord_jax.system import System
 
 
 @dataclass(frozen=True)

@@ -7,13 +7,14 @@ from xml.etree.ElementTree import Element, SubElement
 import jax
 import numpy as np
 
-from natcoord_jax.assembly.system import Group, System
 from natcoord_jax.effects.actuators import AffineActuator, JointForce, JointTorque, WrenchInput
 from natcoord_jax.effects.constraints import PointOnPoint
 from natcoord_jax.effects.joints import Coupling, Fixed, Revolute, Spherical
 from natcoord_jax.effects.loads import Gravity
 from natcoord_jax.effects.springs import Armature, JointDamper, JointFriction, JointSpring, JointStops
 from natcoord_jax.io.notes import Notes
+from natcoord_jax.model.groups import Group
+from natcoord_jax.system import System
 
 Joints = dict[tuple[str, int], Element]
 

@@ -4,11 +4,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from natcoord_jax.assembly.coordinates import state_rates
-from natcoord_jax.assembly.system import System
 from natcoord_jax.core.state import State
 from natcoord_jax.effects.joints import Cylindrical, Fixed, Planar, Prismatic, Revolute, Spherical, Universal
 from natcoord_jax.io.masses import quaternion
+from natcoord_jax.mechanics.coordinates import state_rates
+from natcoord_jax.system import System
 
 JOINTS: dict[type, tuple[tuple[str, int, int], ...]] = {
     Fixed: (),

@@ -7,18 +7,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from natcoord_jax.assembly.diagnostics import unknown_name
-from natcoord_jax.assembly.reduced import ReducedStep, active_groups
-from natcoord_jax.assembly.redundancy import held_multipliers
-from natcoord_jax.assembly.system import System
-from natcoord_jax.assembly.violations import GAP, constrained, misses, worst_violation
 from natcoord_jax.core.checks import as_array, at_top_level
 from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.results import Result
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import gauss
+from natcoord_jax.mechanics.reduced import ReducedStep, active_groups
+from natcoord_jax.mechanics.redundancy import held_multipliers
+from natcoord_jax.mechanics.violations import GAP, constrained, misses, worst_violation
+from natcoord_jax.reading.diagnostics import unknown_name
 from natcoord_jax.stepping.assemble import with_admissible_positions, with_admissible_velocities
+from natcoord_jax.system import System
 
 LEFT_OPEN = 1e-6
 """Largest violation [m, rad, -], per unit of size, of a state that a run may start from: what is left by one

@@ -7,11 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from natcoord_jax.assembly.coordinates import state_rates
-from natcoord_jax.assembly.projection import Projection, gap_rates, twists_of
-from natcoord_jax.assembly.rates import row_rates
-from natcoord_jax.assembly.system import SYSTEM, System
-from natcoord_jax.assembly.violations import GAP, rate_size, worst_violation
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.checks import is_concrete
 from natcoord_jax.core.compiled import briefly
@@ -20,7 +15,13 @@ from natcoord_jax.core.results import REASONS, Result, SimulationError
 from natcoord_jax.core.state import STATE, State
 from natcoord_jax.maths.elimination import definite_inverse
 from natcoord_jax.maths.rotations import orthonormalise
+from natcoord_jax.mechanics.coordinates import state_rates
+from natcoord_jax.mechanics.projection import Projection, gap_rates, twists_of
+from natcoord_jax.mechanics.violations import GAP, rate_size, worst_violation
+from natcoord_jax.model.model import SYSTEM
+from natcoord_jax.model.rows import row_rates
 from natcoord_jax.stepping.closing import closed
+from natcoord_jax.system import System
 
 DAMPING = 1e-14
 """Of velocities, see `Projection`; what it leaves is projected again."""

@@ -10,15 +10,15 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
-from natcoord_jax.assembly.equations import prepare, starting
-from natcoord_jax.assembly.frozen_kick import Lagging
-from natcoord_jax.assembly.kick import Kick
-from natcoord_jax.assembly.redundancy import contact_weights
-from natcoord_jax.assembly.response import Evaluation
-from natcoord_jax.assembly.start_cache import StartCache
-from natcoord_jax.assembly.tangent_space import driven
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
+from natcoord_jax.mechanics.equations import prepare, starting
+from natcoord_jax.mechanics.frozen_kick import Lagging
+from natcoord_jax.mechanics.kick import Kick
+from natcoord_jax.mechanics.redundancy import contact_weights
+from natcoord_jax.mechanics.response import Evaluation
+from natcoord_jax.mechanics.start_cache import StartCache
+from natcoord_jax.mechanics.tangent_space import driven
 from natcoord_jax.stepping.difference_jacobian import DifferenceJacobian
 from natcoord_jax.stepping.differences import evaluated, told
 from natcoord_jax.stepping.energy_check import sound

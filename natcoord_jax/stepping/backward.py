@@ -13,17 +13,17 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from natcoord_jax.assembly.block_tangent_space import Tangents
-from natcoord_jax.assembly.equations import kind_of
-from natcoord_jax.assembly.momentum import row_weights
-from natcoord_jax.assembly.system import System
 from natcoord_jax.core.state import State
+from natcoord_jax.mechanics.block_tangent_space import Tangents
+from natcoord_jax.mechanics.equations import kind_of
+from natcoord_jax.mechanics.momentum import row_weights
 from natcoord_jax.stepping.factors import Factors
 from natcoord_jax.stepping.linear_iteration import LinearIteration
 from natcoord_jax.stepping.newton import any_lane
 from natcoord_jax.stepping.plan import Plan
 from natcoord_jax.stepping.record import Parameters, ParameterTangents, Record, Slot
 from natcoord_jax.stepping.slot_sweep import Fixed, SlotSweep, SweepCarry
+from natcoord_jax.system import System
 
 MANY = 8
 """Bodies from which on only what the corrections ask for is pulled back until the solution is expected, if

@@ -6,11 +6,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from natcoord_jax.assembly.system import System
 from natcoord_jax.core.checks import as_array, at_top_level
 from natcoord_jax.core.kinds import FunctionOf
 from natcoord_jax.core.numeric import Number, Numbers
 from natcoord_jax.core.state import State
+from natcoord_jax.system import System
 
 STEP = Number("positive", instead=" (jax.vmap takes several)")
 INPUTS = Numbers(("...", None)) | FunctionOf("(t, state) -> inputs")

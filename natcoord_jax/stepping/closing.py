@@ -1,7 +1,7 @@
 """Closing the constraints of a state, by damped Gauss-Newton steps from wherever it is.
 
 Every step turns and shifts the bodies at least expense of mass to where the linearised constraints close
-(`natcoord_jax.assembly.projection`). It goes no farther than the reach found so far: bodies turn by 1.5 rad,
+(`natcoord_jax.mechanics.projection`). It goes no farther than the reach found so far: bodies turn by 1.5 rad,
 then by twice as much where the constraints answer as foreseen, so that angles of many turns are counted and
 reached. A step that makes matters worse is taken back and damped. Where nothing helps any more, coordinates
 that were set are let go, then the bodies are shaken, which leaves positions where a gap has no slope.
@@ -18,17 +18,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from natcoord_jax.assembly.coordinates import coordinate_rates
-from natcoord_jax.assembly.diagnostics import rows_with_ground
-from natcoord_jax.assembly.projection import Projection, gaps, moved
-from natcoord_jax.assembly.rates import row_rates
-from natcoord_jax.assembly.system import System
-from natcoord_jax.assembly.violations import GAP, position_size
 from natcoord_jax.core.results import Result
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.elimination import definite_solution
 from natcoord_jax.maths.vectors import largest, safe_norm
+from natcoord_jax.mechanics.coordinates import coordinate_rates
+from natcoord_jax.mechanics.projection import Projection, gaps, moved
+from natcoord_jax.mechanics.violations import GAP, position_size
+from natcoord_jax.model.rows import row_rates, rows_with_ground
 from natcoord_jax.stepping.newton import any_lane
+from natcoord_jax.system import System
 
 TRIPS = 400
 """Steps, those included that are taken back."""

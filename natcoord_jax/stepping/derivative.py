@@ -19,11 +19,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from natcoord_jax.assembly.momentum import row_weights
-from natcoord_jax.assembly.system import System
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import Tableau
+from natcoord_jax.mechanics.momentum import row_weights
 from natcoord_jax.stepping.backward import Backward
 from natcoord_jax.stepping.error_control import Tolerance
 from natcoord_jax.stepping.forward import Forward
@@ -40,6 +39,7 @@ from natcoord_jax.stepping.record import (
 from natcoord_jax.stepping.rollout import Ending, run
 from natcoord_jax.stepping.slot_sweep import Fixed
 from natcoord_jax.stepping.step import advance, linear_solver
+from natcoord_jax.system import System
 from natcoord_jax.xla import linear_pair
 from natcoord_jax.xla.one_kernel import lane_by_lane, on_cpu
 

@@ -7,11 +7,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from natcoord_jax.assembly.equations import prepare
-from natcoord_jax.assembly.frozen_kick import FrozenKick
-from natcoord_jax.assembly.response import Evaluation
-from natcoord_jax.assembly.start_cache import StartCache
 from natcoord_jax.core.effect import replace_fields
+from natcoord_jax.mechanics.equations import prepare
+from natcoord_jax.mechanics.frozen_kick import FrozenKick
+from natcoord_jax.mechanics.response import Evaluation
+from natcoord_jax.mechanics.start_cache import StartCache
 from natcoord_jax.stepping.difference_jacobian import DifferenceJacobian, matrix_of
 from natcoord_jax.stepping.factors import Factors, new_factors
 from natcoord_jax.stepping.newton import Iterate, any_lane, refreshed

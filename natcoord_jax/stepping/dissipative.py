@@ -21,7 +21,7 @@ class Dissipative(Scheme):
     as omega h grows beyond all bounds; with the default, by 0.84 at omega h = 10, by 0.998 at six steps a
     period and by 1 - 3e-7 at sixty. The damping is of third order in omega h, the scheme of order two; with
     rho = 1 it is (57). Velocities obey their constraints as accurately as the scheme is, as those of (57) do.
-    The equations are in `natcoord_jax.assembly.dissipation`.
+    The equations are in `natcoord_jax.mechanics.dissipation`.
 
     What is dissipated is in `State.dissipated` [J] and, as "numerical dissipation", in `System.work`.
 

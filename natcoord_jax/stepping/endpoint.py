@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from natcoord_jax.assembly.system import System
 from natcoord_jax.core.callables import Function
 from natcoord_jax.core.checks import at_top_level
 from natcoord_jax.core.closures import with_callables
@@ -22,6 +21,7 @@ from natcoord_jax.stepping.rollout import run_to_the_end
 from natcoord_jax.stepping.rollout_state import RolloutProblem
 from natcoord_jax.stepping.scheme import Scheme
 from natcoord_jax.stepping.two_kernel_loop import in_parts
+from natcoord_jax.system import System
 from natcoord_jax.xla.effort import FULL, accepted
 from natcoord_jax.xla.one_kernel import apart, as_one_kernel, in_one_array, plainly
 

@@ -14,11 +14,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from natcoord_jax.assembly.equations_of_motion import rotors_of
-from natcoord_jax.assembly.momentum import inertia, motion
-from natcoord_jax.assembly.system import System
 from natcoord_jax.core.state import State
+from natcoord_jax.mechanics.equations_of_motion import rotors_of
+from natcoord_jax.mechanics.momentum import inertia, motion
 from natcoord_jax.stepping.newton import RESTING, TOLERANCE
+from natcoord_jax.system import System
 
 UNSOUND = 1e-12
 """Work of the residual in terms of the energy of the motion, twice, beyond which a step is refused."""

@@ -12,10 +12,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from natcoord_jax.assembly.block_tangent_space import Tangents
-from natcoord_jax.assembly.equations import kind_of
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
+from natcoord_jax.mechanics.block_tangent_space import Tangents
+from natcoord_jax.mechanics.equations import kind_of
 from natcoord_jax.stepping.linear_iteration import LinearIteration
 from natcoord_jax.stepping.newton import any_lane
 from natcoord_jax.stepping.plan import Plan

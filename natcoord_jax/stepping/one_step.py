@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from natcoord_jax.assembly.system import SYSTEM, System
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.checks import is_concrete
 from natcoord_jax.core.compiled import compiled
@@ -17,11 +16,13 @@ from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.numeric import Number, Vector
 from natcoord_jax.core.results import REASONS, REMEDIES, Result, SimulationError
 from natcoord_jax.core.state import STATE, State
+from natcoord_jax.model.model import SYSTEM
 from natcoord_jax.stepping.checked import STEP, check_state, checked_inputs, checked_step
 from natcoord_jax.stepping.derivative import run_slots
 from natcoord_jax.stepping.newton import TOLERANCE
 from natcoord_jax.stepping.plan import Plan
 from natcoord_jax.stepping.scheme import SCHEME, SECOND_ORDER, Scheme
+from natcoord_jax.system import System
 
 CHANNELS = Vector(None)
 

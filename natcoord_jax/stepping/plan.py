@@ -10,10 +10,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from natcoord_jax.assembly.reading import tangent
-from natcoord_jax.assembly.system import System
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import Tableau, gauss
+from natcoord_jax.reading.tangent_states import tangent
+from natcoord_jax.system import System
 
 
 @dataclass(frozen=True)

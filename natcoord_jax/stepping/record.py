@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from natcoord_jax.assembly.system import System
 from natcoord_jax.core.state import State
 from natcoord_jax.stepping.factors import Factors
 from natcoord_jax.stepping.plan import Plan
+from natcoord_jax.system import System
 
 
 def zero_tangent(x: Array) -> Array | np.ndarray:

@@ -13,8 +13,8 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from natcoord_jax.assembly.momentum import motion
 from natcoord_jax.maths.vectors import safe_divide
+from natcoord_jax.mechanics.momentum import motion
 
 ROUNDING = 1e-14
 """Impulse in terms of the momenta (energy norm) up to which it is handed on. What stiff forces leave is more,

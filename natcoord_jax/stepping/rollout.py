@@ -15,7 +15,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int
 
-from natcoord_jax.assembly.system import System
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.results import Result
 from natcoord_jax.core.state import State
@@ -27,6 +26,7 @@ from natcoord_jax.stepping.plan import Plan, Slots
 from natcoord_jax.stepping.rollout_state import RolloutProblem, RolloutState
 from natcoord_jax.stepping.taken_up import TakenUp
 from natcoord_jax.stepping.two_kernel_loop import all_slots
+from natcoord_jax.system import System
 from natcoord_jax.xla.one_kernel import as_one_kernel
 
 

@@ -7,20 +7,20 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from natcoord_jax.assembly.equations import prepare
-from natcoord_jax.assembly.frozen_kick import FEWEST, FrozenKick, Lagging, from_body_axes, in_body_axes
-from natcoord_jax.assembly.start_cache import StartCache
-from natcoord_jax.assembly.system import System
-from natcoord_jax.assembly.tangent_space import Velocity
-from natcoord_jax.assembly.violations import contacts
 from natcoord_jax.core.results import Result
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import Tableau
+from natcoord_jax.mechanics.equations import prepare
+from natcoord_jax.mechanics.frozen_kick import FEWEST, FrozenKick, Lagging, from_body_axes, in_body_axes
+from natcoord_jax.mechanics.start_cache import StartCache
+from natcoord_jax.mechanics.tangent_space import Velocity
+from natcoord_jax.mechanics.violations import contacts
 from natcoord_jax.stepping.error_control import StepDecision, Tolerance, Trial, follow
 from natcoord_jax.stepping.factors import Factors, no_factors
 from natcoord_jax.stepping.newton import Iterate, any_lane, begin
 from natcoord_jax.stepping.plan import Plan
 from natcoord_jax.stepping.predictor import Predictor
+from natcoord_jax.system import System
 from natcoord_jax.xla.rows import part
 
 SMALLEST_FRACTION = 1.0 / 2**16

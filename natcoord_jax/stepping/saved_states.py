@@ -9,10 +9,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from natcoord_jax.assembly.reading import reads_velocities
-from natcoord_jax.assembly.system import System
 from natcoord_jax.core.results import Result
 from natcoord_jax.core.state import State, Trajectory
+from natcoord_jax.reading.tangent_states import reads_velocities
 from natcoord_jax.stepping.attempt import LoopCarry
 from natcoord_jax.stepping.derivative import run_slots
 from natcoord_jax.stepping.error_control import Tolerance
@@ -22,6 +21,7 @@ from natcoord_jax.stepping.rollout_state import RolloutProblem
 from natcoord_jax.stepping.scheme import Scheme
 from natcoord_jax.stepping.taken_up import TakenUp
 from natcoord_jax.stepping.two_kernel_loop import first_carry
+from natcoord_jax.system import System
 
 SEGMENT = 512
 """Longest segment of a rollout that does not save every step, or that is checkpointed."""

@@ -18,7 +18,6 @@ import jax
 import numpy as np
 from jaxtyping import Array
 
-from natcoord_jax.assembly.system import System
 from natcoord_jax.core.checks import as_array
 from natcoord_jax.core.compiled import briefly, compiled
 from natcoord_jax.core.results import Result
@@ -29,6 +28,7 @@ from natcoord_jax.stepping.saved_states import nothing_before, rollout, segment_
 from natcoord_jax.stepping.taken_up import TakenUp
 from natcoord_jax.storage import stream
 from natcoord_jax.storage.vtkhdf import geometry_of
+from natcoord_jax.system import System
 
 PATIENCE = 0.25
 """Time of a segment [s]: so long it takes until an interruption is heard."""

@@ -9,8 +9,6 @@ from typing import Any
 import jax
 from jaxtyping import Array
 
-from natcoord_jax.assembly.reading import handing
-from natcoord_jax.assembly.system import SYSTEM, System
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.callables import Function
 from natcoord_jax.core.checks import as_array, at_top_level, is_concrete
@@ -19,6 +17,8 @@ from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.kinds import FLAG, FunctionOf, of
 from natcoord_jax.core.numeric import Number, Whole
 from natcoord_jax.core.state import STATE, State, Trajectory
+from natcoord_jax.model.model import SYSTEM
+from natcoord_jax.reading.tangent_states import handing
 from natcoord_jax.stepping.admissibility import check_obeyed
 from natcoord_jax.stepping.checked import INPUTS, STEP, check_state, checked_inputs, checked_step
 from natcoord_jax.stepping.error_control import Tolerance
@@ -29,6 +29,7 @@ from natcoord_jax.stepping.scheme import SCHEME, SECOND_ORDER, Scheme
 from natcoord_jax.stepping.segments import Run, in_segments
 from natcoord_jax.stepping.turns import warn_of_far_turns
 from natcoord_jax.storage.archive import PATH
+from natcoord_jax.system import System
 from natcoord_jax.xla import one_kernel
 
 

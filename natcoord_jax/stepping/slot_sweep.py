@@ -14,13 +14,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from natcoord_jax.assembly.block_tangent_space import Tangents, tangents_at
-from natcoord_jax.assembly.equations import kind_of, prepare
-from natcoord_jax.assembly.reduced import NOTHING
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
 from natcoord_jax.linsolve.learning import learns
 from natcoord_jax.maths.collocation import Tableau
+from natcoord_jax.mechanics.block_tangent_space import Tangents, tangents_at
+from natcoord_jax.mechanics.equations import kind_of, prepare
+from natcoord_jax.mechanics.reduced import NOTHING
 from natcoord_jax.stepping.factors import Factors, factors_of
 from natcoord_jax.stepping.linear_iteration import LinearIteration
 from natcoord_jax.stepping.newton import any_lane

@@ -4,11 +4,6 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from natcoord_jax.assembly.element_matrices import elements
-from natcoord_jax.assembly.reduced import NOTHING
-from natcoord_jax.assembly.sparse import SparseStep, nodes_of
-from natcoord_jax.assembly.start_cache import StartCache
-from natcoord_jax.assembly.system import System
 from natcoord_jax.core.checks import is_concrete
 from natcoord_jax.core.compiled import briefly
 from natcoord_jax.core.effect import replace_fields
@@ -17,6 +12,11 @@ from natcoord_jax.linsolve.blocks import BlockMatrix, BlockPattern, block_patter
 from natcoord_jax.linsolve.saddle import inertias_of, regularised
 from natcoord_jax.linsolve.sparse import Plan, choose
 from natcoord_jax.maths.collocation import gauss
+from natcoord_jax.mechanics.element_matrices import elements
+from natcoord_jax.mechanics.reduced import NOTHING
+from natcoord_jax.mechanics.sparse import SparseStep, nodes_of
+from natcoord_jax.mechanics.start_cache import StartCache
+from natcoord_jax.system import System
 
 
 class Sparsity(eqx.Module):

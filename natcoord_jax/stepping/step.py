@@ -7,19 +7,20 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from natcoord_jax.assembly.block_tangent_space import Tangents
-from natcoord_jax.assembly.coordinates import stage_rates
-from natcoord_jax.assembly.end_impulses import released
-from natcoord_jax.assembly.equations import prepare, starting
-from natcoord_jax.assembly.form import dense_solver
-from natcoord_jax.assembly.impacts import after_impacts
-from natcoord_jax.assembly.kick import Kick, ends_of
-from natcoord_jax.assembly.response import Evaluation
-from natcoord_jax.assembly.start_cache import StartCache
-from natcoord_jax.assembly.system import Group, System
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import Tableau
+from natcoord_jax.mechanics.block_tangent_space import Tangents
+from natcoord_jax.mechanics.coordinates import stage_rates
+from natcoord_jax.mechanics.end_impulses import released
+from natcoord_jax.mechanics.equations import prepare, starting
+from natcoord_jax.mechanics.form import dense_solver
+from natcoord_jax.mechanics.impacts import after_impacts
+from natcoord_jax.mechanics.kick import Kick, ends_of
+from natcoord_jax.mechanics.response import Evaluation
+from natcoord_jax.mechanics.start_cache import StartCache
+from natcoord_jax.model.groups import Group
+from natcoord_jax.system import System
 
 
 def advance(

@@ -5,9 +5,9 @@ import warnings
 import numpy as np
 from jaxtyping import Array, Float
 
-from natcoord_jax.assembly.system import System
 from natcoord_jax.core.checks import is_concrete
 from natcoord_jax.core.state import Trajectory
+from natcoord_jax.system import System
 
 FAR = {1: 1.0}
 """Turn in a step [rad] by number of stages from which on the rate shown is off: by a tenth for one stage."""

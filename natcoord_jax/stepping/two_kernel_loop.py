@@ -15,11 +15,10 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
-from natcoord_jax.assembly.equations import kind_of, prepare
-from natcoord_jax.assembly.start_cache import StartCache
-from natcoord_jax.assembly.system import System
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
+from natcoord_jax.mechanics.equations import kind_of, prepare
+from natcoord_jax.mechanics.start_cache import StartCache
 from natcoord_jax.stepping.attempt import LoopCarry, RefactorRequest, attempt, renewed_at, with_state
 from natcoord_jax.stepping.differences import first_probe
 from natcoord_jax.stepping.error_control import Tolerance
@@ -28,6 +27,7 @@ from natcoord_jax.stepping.newton import Iterate, any_lane
 from natcoord_jax.stepping.plan import Plan
 from natcoord_jax.stepping.rollout_state import RolloutProblem, RolloutState, start_of
 from natcoord_jax.stepping.taken_up import TakenUp, going_on
+from natcoord_jax.system import System
 from natcoord_jax.xla.one_kernel import as_one_kernel
 from natcoord_jax.xla.rows import with_part
 

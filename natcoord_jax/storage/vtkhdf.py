@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from natcoord_jax.assembly.system import Group, System
+from natcoord_jax.model.groups import Group
+from natcoord_jax.system import System
 
 VERTEX, LINE, QUADRILATERAL, HEXAHEDRON = 1, 3, 9, 12
 """VTK's numbers of the kinds of cells."""

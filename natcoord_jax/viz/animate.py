@@ -14,7 +14,6 @@ from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 
 from natcoord_jax.analysis.phases import Phases
-from natcoord_jax.assembly.system import System
 from natcoord_jax.bodies.beam import BeamHandle
 from natcoord_jax.control.solution import Solution
 from natcoord_jax.core.arguments import checked
@@ -22,6 +21,7 @@ from natcoord_jax.core.kinds import NAME, Several, of
 from natcoord_jax.core.markers import Marker
 from natcoord_jax.core.numeric import Whole
 from natcoord_jax.core.state import TRAJECTORY, Trajectory
+from natcoord_jax.system import System
 from natcoord_jax.viz.colours import STOPS, limits
 from natcoord_jax.viz.motion import BEAMS, COLOURS, MOVING, even_times, phases_of, scenery_at
 from natcoord_jax.viz.scenery import Scenery

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from natcoord_jax.analysis.balance import balance
-from natcoord_jax.assembly.system import System
 from natcoord_jax.core.state import Trajectory
+from natcoord_jax.system import System
 from natcoord_jax.viz.panels import Curve, Panel
 
 AXES = "xyz"

@@ -5,9 +5,9 @@ from typing import Any
 import jax
 import numpy as np
 
-from natcoord_jax.assembly.system import System
 from natcoord_jax.core.force import Force
 from natcoord_jax.core.state import State
+from natcoord_jax.system import System
 from natcoord_jax.viz.outline import arrow, bar, coil
 from natcoord_jax.viz.scenery import RED, STEEL, Solid
 from natcoord_jax.viz.skins import markers_of, places_of

@@ -7,11 +7,11 @@ import jax
 import numpy as np
 
 from natcoord_jax.analysis.phases import Phases
-from natcoord_jax.assembly.system import System
 from natcoord_jax.bodies.beam import BeamHandle
 from natcoord_jax.control.solution import Solution
 from natcoord_jax.core.kinds import Choice, Several, of
 from natcoord_jax.core.state import Trajectory
+from natcoord_jax.system import System
 from natcoord_jax.viz.parts import scenery_of
 from natcoord_jax.viz.scenery import Scenery, joined
 

@@ -9,8 +9,8 @@ from collections.abc import Iterable
 import numpy as np
 from jaxtyping import Float
 
-from natcoord_jax.assembly.system import System
 from natcoord_jax.bodies.shapes import Box, Cylinder, Ellipsoid, Placed, Sphere, Surface
+from natcoord_jax.system import System
 
 THINNEST = 0.03
 """Least edge of a solid, relative to its longest: plates and rods stay visible."""

@@ -7,11 +7,11 @@ from typing import Any
 import jax
 import numpy as np
 
-from natcoord_jax.assembly.system import System
 from natcoord_jax.bodies.beam import BeamHandle
 from natcoord_jax.bodies.shapes import Surface
 from natcoord_jax.core.markers import Marker
 from natcoord_jax.core.state import Trajectory
+from natcoord_jax.system import System
 from natcoord_jax.viz.links import between, forces, links
 from natcoord_jax.viz.outline import ball, bar, bodies_of, marked, within
 from natcoord_jax.viz.scenery import DARK, PALETTE, Scenery, Solid, Trace

@@ -7,13 +7,13 @@ from matplotlib.figure import Figure
 
 from natcoord_jax.analysis.accuracy import Accuracy
 from natcoord_jax.analysis.phases import Phases
-from natcoord_jax.assembly.system import System
 from natcoord_jax.bodies.beam import BeamHandle
 from natcoord_jax.control.solution import Solution
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.kinds import of
 from natcoord_jax.core.numeric import Vector
 from natcoord_jax.core.state import TRAJECTORY, Trajectory
+from natcoord_jax.system import System
 from natcoord_jax.viz.curves import as_bands, in_turn, panels_of
 from natcoord_jax.viz.motion import BEAMS, lane, lanes_of
 from natcoord_jax.viz.panels import plot_panels

@@ -6,11 +6,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from natcoord_jax.assembly.diagnostics import group_energies, over_states
-from natcoord_jax.assembly.system import Group, System
 from natcoord_jax.bodies.beam import BeamHandle
 from natcoord_jax.core.names import Names
 from natcoord_jax.core.state import State
+from natcoord_jax.mechanics.energies import group_energies
+from natcoord_jax.model.groups import Group
+from natcoord_jax.model.rows import over_states
+from natcoord_jax.system import System
 from natcoord_jax.viz.scenery import PALETTE, Skin
 
 RIM = 12

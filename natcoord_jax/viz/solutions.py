@@ -4,10 +4,10 @@ import re
 
 import numpy as np
 
-from natcoord_jax.assembly.system import System
 from natcoord_jax.control import bounds
 from natcoord_jax.control.solution import Solution
 from natcoord_jax.core.eager_numpy import eager_numpy
+from natcoord_jax.system import System
 from natcoord_jax.viz.curves import ROUND_OFF, components, coordinates
 from natcoord_jax.viz.panels import Curve, Panel
 

@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 
 from natcoord_jax.analysis.phases import Phases
-from natcoord_jax.assembly.system import System
 from natcoord_jax.bodies.beam import BeamHandle
 from natcoord_jax.control.solution import Solution
 from natcoord_jax.core.arguments import checked
@@ -25,6 +24,7 @@ from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.kinds import FLAG, NAME, HandleOf, of
 from natcoord_jax.core.markers import Marker
 from natcoord_jax.core.state import TRAJECTORY, Trajectory
+from natcoord_jax.system import System
 from natcoord_jax.viz.animate import POINTS, pace_of
 from natcoord_jax.viz.motion import BEAMS, COLOURS, MOVING, even_times, lane, lanes_of, scenery_at, title_of
 from natcoord_jax.viz.packed import bytes_of_a_picture, page

@@ -19,7 +19,7 @@ from motions import SECOND_AND_FOURTH, one_body, simulate
 
 import natcoord_jax as nc
 from natcoord_jax import gallery
-from natcoord_jax.assembly.equations import prepare
+from natcoord_jax.mechanics.equations import prepare
 from natcoord_jax.stepping.endpoint import endpoints
 
 pytestmark = pytest.mark.slow

@@ -18,9 +18,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.maths.components import Triple, rows_of
-from natcoord_jax.xla.materialise import materialised
 from natcoord_jax.maths.rotations import arctan_coefficients
 from natcoord_jax.maths.vectors import quotient
+from natcoord_jax.xla.materialise import materialised
 
 
 class Logarithm(eqx.Module):

@@ -27,8 +27,8 @@ from natcoord_jax.effects.beams.logarithm import Logarithm
 from natcoord_jax.effects.beams.pairs import Expanded, tangents_of_pairs
 from natcoord_jax.effects.beams.readings import BeamReadings
 from natcoord_jax.maths.components import Triple, combination, rows_of
-from natcoord_jax.xla.materialise import materialised
 from natcoord_jax.maths.rotations import logarithm_of_motion
+from natcoord_jax.xla.materialise import materialised
 
 LAW = FunctionOf("of the strains (6,) to the energy per length [J/m]")
 

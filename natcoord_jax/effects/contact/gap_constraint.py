@@ -40,7 +40,7 @@ class GapConstraint(Effect):
     they end the step touching, whatever its length, and momentum and angular momentum are exact. What that
     force takes from the motion an impact gives back at the end of the step, a part `restitution` of the
     speed, wherever in the step the surfaces met; with 1 energy is exact, too, for any number of impacts at
-    once (`natcoord_jax.assembly.impacts` has the law). What is lost is in its account.
+    once (`natcoord_jax.mechanics.impacts` has the law). What is lost is in its account.
 
     With friction a force of slip acts where the surfaces touch, f sqrt(|u|^2 + eps^2) = -mu N u of the
     velocity u with which the second slips on the first: at most mu N, and against it. At the end of a step

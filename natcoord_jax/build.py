@@ -1,0 +1,135 @@
+"""Compilation: from named parts to a system and its initial state."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from natcoord_jax.core.bodies import DIRECTOR, POINT, Body
+from natcoord_jax.core.checks import as_array, is_concrete
+from natcoord_jax.core.eager_numpy import eager_numpy
+from natcoord_jax.core.effect import Effect, replace_fields
+from natcoord_jax.core.elements import Elements
+from natcoord_jax.core.joint import Joint
+from natcoord_jax.core.names import compact
+from natcoord_jax.core.nodes import Clamp
+from natcoord_jax.core.state import State
+from natcoord_jax.mechanics.coordinates import coordinate_values, state_rates
+from natcoord_jax.mechanics.impacts import with_mobilities
+from natcoord_jax.model.axisymmetric_axes import symmetries
+from natcoord_jax.model.bodies import Bodies
+from natcoord_jax.model.choice import choose_solver, elimination_order
+from natcoord_jax.model.graph import make_tree
+from natcoord_jax.model.grouping import element_group, stack
+from natcoord_jax.model.layout import Layout
+from natcoord_jax.model.local_rates import LocalRates
+from natcoord_jax.model.masses import with_masses
+from natcoord_jax.model.model import Structure
+from natcoord_jax.model.rows import rows_with_ground
+from natcoord_jax.system import System
+
+
+def build(
+    singles: dict[str, Body],
+    joints: dict[str, Joint],
+    effects: dict[str, Effect],
+    solver: str | None,
+    sets: dict[str, Any] | None = None,
+    elements: dict[str, Elements] | None = None,
+    clamps: Sequence[Clamp] = (),
+) -> tuple[System, State]:
+    """Number bodies along the spanning tree, group equal kinds, and lay out the state."""
+    bodies = Bodies(singles, sets or {}, clamps)
+    layout = Layout(bodies, joints, effects)
+    instances = [layout.effect_instance(name, effect) for name, effect in effects.items()]
+    layout.number_accounts(instances)
+    turning = np.array([*map(bool, layout.rotations), False])
+    joint_groups, groups = stack(layout.joint_instances(), turning), stack(instances, turning)
+    groups += tuple(element_group(layout, name, part, turning) for name, part in (elements or {}).items())
+    tree = make_tree(layout.spanning, layout.motions())
+    multipliers = sum(g.count * g.multipliers for g in groups)
+    relations = multipliers
+    multipliers += sum(g.count * g.multipliers for g in joint_groups if not g.in_tree)
+    inequalities = sum(g.count * g.multipliers for g in groups if g.effect.unilateral)
+    # A director is as long as it was: one constraint; a triad has six.
+    internal = sum({3: 6, 2: 1, 0: 0}[len(own)] for own in bodies.rotations)
+    structure = Structure(
+        bodies=layout.ordered_names,
+        joints=layout.ordered_joints,
+        inputs=tuple(layout.inputs),
+        works=tuple(layout.works),
+        coordinates=tuple((name, k) for name, k, _ in layout.coordinates),
+        rotors=len(layout.rotors),
+        unknowns=len(tree.slot_of),
+        multipliers=multipliers,
+        solver=solver or choose_solver(tree, multipliers, joint_groups, groups, len(bodies)),
+        constraints=internal + relations - inequalities + sum(g.count * g.multipliers for g in joint_groups),
+        points=compact([k for k, own in enumerate(layout.rotations) if own == POINT]),
+        directors=compact([k for k, own in enumerate(layout.rotations) if own == DIRECTOR]),
+        inequalities=inequalities,
+        dofs=len(tree.slot_of) - multipliers + inequalities,
+        shapes=tuple(_drawn(bodies.shapes[k]) for k in layout.order),
+    )
+    masses = layout.masses()
+    for group in groups:
+        masses = with_masses(masses, group)
+    system = System(
+        masses,
+        layout.frames(),
+        layout.joint_bodies(),
+        tree,
+        LocalRates.of(layout.rotations),
+        joint_groups,
+        groups,
+        layout.coordinate_groups(),
+        layout.coordinate_order(),
+        elimination_order(layout, groups, joint_groups) if structure.solver == "recursive" else None,
+        structure,
+    )
+    state = layout.state()
+    system = with_mobilities(jax.tree.map(as_array, with_symmetries(system, state)), state)
+    return system, with_readings(system, state)
+
+
+def _drawn(shape: Any) -> Any:
+    """A shape by numbers of NumPy, which are no part of the program; None for one that is traced."""
+    return jax.tree.map(np.asarray, shape) if is_concrete(shape) else None
+
+
+def with_symmetries(system: System, state: State) -> System:
+    """The system with the axes of bodies that are round, turn freely, and that nothing is fixed to.
+
+    Along axes that do not spin with a body, what is fixed to it off its axis would go round.
+    """
+    tree, count = system.tree, len(system.structure.bodies)
+    single = tree.ball & ~np.isin(np.arange(count), tree.parent)
+    if tree.directed is not None:
+        single = single & ~tree.directed
+    for group in (*system.effects, *system.joints):
+        if group.effect.elastic or (group.source == "joint" and not group.in_tree):
+            single = single & ~np.isin(np.arange(count), group.bodies)
+    if not single.any():
+        return system
+    rows = state.q.reshape(-1, 4, 3)
+    found = symmetries(system.mass, tree.frames(system.frames), rows, jnp.asarray(single))
+    return replace_fields(system, tree=replace_fields(tree, symmetry=found))
+
+
+def with_readings(system: System, state: State) -> State:
+    """The state with lengths as they are, and rotors turning with their joints; angles count from zero."""
+    return _with_readings(system, state) if system.coordinates else state
+
+
+@eager_numpy
+def _with_readings(system: System, state: State) -> State:
+    values, rates = coordinate_values(system, rows_with_ground(state.q)), state_rates(system, state)
+    coordinates, rotors = state.coordinates, state.rates
+    for group in system.coordinates:
+        if group.axis.unit != "rad":
+            coordinates = coordinates.at[group.index].set(values[group.index])
+    for group in system.effects:
+        if group.effect.rotors:
+            rotors = rotors.at[group.rotors[:, 0]].set(rates[group.coordinates[:, 0]])
+    return replace_fields(state, coordinates=coordinates, rates=rotors)

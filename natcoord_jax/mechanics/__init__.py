@@ -1,0 +1,1 @@
+"""Equations of a model: kinematics, residuals, blocks, tangent spaces; functions of arrays, no iteration."""

@@ -1,0 +1,291 @@
+"""Equations of a step in the local null space: six rates a body, multipliers for every joint.
+
+The most general form: any joint, any loop, any coupling. The Jacobian is assembled from those of single
+bodies and effects. Systems that are no tree, too large for the reduced form and too small for the sparse one
+are solved so, densely; for all others it is an independent way to the same trajectory.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from natcoord_jax.core.state import State
+from natcoord_jax.linsolve.products import Products
+from natcoord_jax.maths.collocation import Tableau, gauss
+from natcoord_jax.maths.projectors import range_projector
+from natcoord_jax.maths.vectors import cross
+from natcoord_jax.mechanics.block_tangent_space import Tangents
+from natcoord_jax.mechanics.element_matrices import dense, rates_of, touches
+from natcoord_jax.mechanics.form import Form
+from natcoord_jax.mechanics.grain import cancelling_size
+from natcoord_jax.mechanics.kick import kicked
+from natcoord_jax.mechanics.local import body_balance, body_motion, jacobians
+from natcoord_jax.mechanics.momentum import least_inertias, momentum_balance
+from natcoord_jax.mechanics.reduced import NOTHING
+from natcoord_jax.mechanics.redundancy import (
+    at_every_stage,
+    held_multipliers,
+    project_multipliers,
+    project_rows,
+)
+from natcoord_jax.mechanics.response import (
+    Evaluation,
+    GroupData,
+    StageKinematics,
+    body_rows,
+    situation,
+    stations,
+)
+from natcoord_jax.mechanics.spread import part_matrices, products
+from natcoord_jax.mechanics.start_cache import StartCache
+from natcoord_jax.model.groups import Group
+from natcoord_jax.model.local_rates import TWIST
+from natcoord_jax.model.model import Model
+from natcoord_jax.model.rows import rows_with_ground
+
+
+class FullStep(Form):
+    """One step with multipliers for every joint: all that does not depend on the unknowns."""
+
+    system: Model
+    state: State
+    start: Float[Array, "bodies_and_ground 4 3"]
+    velocity: Float[Array, "bodies 4 3"]
+    situations: tuple[GroupData, ...]
+    h: Float[Array, ""]
+    start_cache: StartCache
+    tableau: Tableau = eqx.field(static=True)
+
+    @classmethod
+    def prepare(
+        cls,
+        system: Model,
+        state: State,
+        u: Array,
+        h: Array,
+        tableau: Tableau,
+        start_cache: StartCache | None = None,
+    ) -> "FullStep":
+        """Gather what the step needs, once; see `ReducedStep.prepare`."""
+        groups = (*system.effects, *system.joints)
+        return cls(
+            system,
+            state,
+            rows_with_ground(state.q),
+            body_rows(state.v),
+            tuple(situation(system, g, state, u, h) for g in groups),
+            h,
+            cls.starting(system, state, tableau) if start_cache is None else start_cache,
+            tableau,
+        )
+
+    @classmethod
+    def starting(
+        cls,
+        system: Model,
+        state: State,
+        tableau: Tableau,
+        tangents: Tangents | None = None,
+        later: bool = False,
+    ) -> StartCache:
+        """What a step needs of its start, see `StartCache.of`."""
+        projector, rank = None, system.structure.rank
+        if rank is not None:
+            no_inputs = jnp.zeros(len(system.structure.inputs), state.q.dtype)
+            resting = cls.prepare(system, state, no_inputs, jnp.zeros((), state.q.dtype), gauss(1), NOTHING)
+            matrix = resting.jacobian(jnp.zeros(resting.unknowns, state.q.dtype))
+            rows = matrix[resting.balances :, : resting.balances][held_multipliers(resting.groups)]
+            in_tree = sum(g.count * g.multipliers for g in system.joints if g.in_tree)
+            projector = range_projector(rows, rank + in_tree)
+            projector = at_every_stage(projector, resting.groups, tableau.stages)
+        return StartCache.of(system, state, tableau, projector, tangents, later)
+
+    @property
+    def groups(self) -> tuple[Group, ...]:
+        """All groups, in the order of their multipliers."""
+        return (*self.system.effects, *self.system.joints)
+
+    @property
+    def bodies(self) -> int:
+        """Number of bodies."""
+        return self.velocity.shape[0]
+
+    @property
+    def dependent(self) -> bool:
+        """Whether constraints depend on each other."""
+        return self.system.structure.rank is not None
+
+    @property
+    def balances(self) -> int:
+        """Number of balance equations."""
+        return self.system.local_rates.count * self.tableau.stages
+
+    @property
+    def grain(self) -> Float[Array, ""]:
+        """Size of the terms that cancel in the forces [sqrt(J)]."""
+        return cancelling_size(self.system, self.groups, self.situations, self.state, self.h)
+
+    def _blocks(self) -> list[tuple[int, int]]:
+        """First unknown and size of the multipliers of each group."""
+        blocks, position = [], self.balances
+        for group in self.groups:
+            size = group.count * self.tableau.stages * group.multipliers
+            blocks.append((position, size))
+            position += size
+        return blocks
+
+    @property
+    def unknowns(self) -> int:
+        """Number of unknowns."""
+        last = self._blocks()[-1] if self.groups else (self.balances, 0)
+        return sum(last)
+
+    def split(self, y: Float[Array, " unknowns"]) -> tuple[Array, list[Array]]:
+        """Twists (bodies, s, 6) and multipliers of each group (n, s, m)."""
+        s = self.tableau.stages
+        twists = self.system.local_rates.twists(y[: self.balances], self.start[:-1])
+        multipliers = [
+            y[first : first + size].reshape(group.count, s, group.multipliers)
+            for group, (first, size) in zip(self.groups, self._blocks())
+        ]
+        return twists, multipliers
+
+    def _with_ground(self, twists: Array) -> Array:
+        return jnp.concatenate([twists, jnp.zeros_like(twists[:1])])
+
+    def residual(self, y: Float[Array, " unknowns"]) -> tuple[Float[Array, " unknowns"], Float[Array, ""]]:
+        """Residual [N s, N m s; m/s, 1/s for constraints] and the size of its terms [sqrt(J)]."""
+        found = self.evaluate(y)
+        return found.residual, found.size
+
+    def evaluate(self, y: Float[Array, " unknowns"]) -> Evaluation:
+        """Residual, and what the end of the step needs."""
+        twists, multipliers = self.split(project_multipliers(y, self.balances, self.start_cache.projector))
+        at = self._stations(twists)
+        velocity, situations, kick = kicked(
+            self.system,
+            self.state,
+            self.start_cache.tangents,
+            self.start_cache.lag,
+            self.groups,
+            self.situations,
+            at,
+            self.h,
+            self.tableau,
+        )
+        given = self.system, self.groups, situations, at, velocity
+        found = momentum_balance(*given, multipliers, self.h, self.tableau)
+        wrenches = jnp.moveaxis(jnp.concatenate([found.force, found.torque], axis=-1), 0, 1)
+        balances = self.system.local_rates.balances(wrenches, self.start[:-1])
+        rows = project_rows(found.rows, y, self.balances, self.start_cache.projector)
+        residual = jnp.concatenate([balances, rows])
+        asked = multipliers if self.system.structure.inequalities else None
+        return Evaluation(residual, found.size, at, found.power, (found.force, found.torque), kick, asked)
+
+    def body_jacobians(self, twists: Float[Array, "bodies s 6"]) -> Float[Array, "bodies n n"]:
+        """Jacobians of the bodies' own balances."""
+        width = TWIST * self.tableau.stages
+        local = jax.vmap(jax.jacfwd(body_balance, argnums=3), in_axes=(0, 0, 0, 0, None, None))
+        found = local(self.system.mass, self.start[:-1], self.velocity, twists, self.h, self.tableau)
+        along = self.system.local_rates.blocks(np.arange(self.bodies)[:, None], self.start)
+        found = along(along(found[:, None, :, :, None], 1), 4)
+        return found.reshape(self.bodies, width, width)
+
+    def tangent(self, y: Float[Array, " unknowns"], loads: Any = None) -> Float[Array, "unknowns unknowns"]:
+        """The Jacobian nearly, from linearised effects: what Newton's iteration needs."""
+        return self.jacobian(y, exact=False)
+
+    def jacobian(
+        self, y: Float[Array, " unknowns"], *, exact: bool = True
+    ) -> Float[Array, "unknowns unknowns"]:
+        """Jacobian, put together from those of bodies, effects and joints."""
+        y = project_multipliers(y, self.balances, self.start_cache.projector)
+        given = self.matrices(y, exact), self.unknowns, self.tableau.stages, self.products(y)
+        return self._projected(dense(self.system, *given))
+
+    def products(self, y: Float[Array, " unknowns"]) -> Products | None:
+        """What effects on many bodies add to `matrices`."""
+        return products(self, self._with_ground(self.split(y)[0]))
+
+    def matrices(self, y: Float[Array, " unknowns"], exact: bool) -> list[Float[Array, "_ _ _"]]:
+        """Jacobians of the bodies and of the instances of each group, by the unknowns in `elements`."""
+        twists, multipliers = self.split(y)
+        every = self._with_ground(twists)
+        found = [self.body_jacobians(twists)]
+        for group, where, lam in zip(self.groups, self.situations, multipliers):
+            if not touches(group):
+                continue
+            if group.effect.spread:
+                found.append(part_matrices(self, group, where, every))
+                continue
+            bodies, rates = group.bodies, rates_of(group)
+            (by_twist, by_lam), (g_by_twist, g_by_lam) = jacobians(
+                group, where, self.tableau, self.start[bodies], every[bodies][..., :rates], lam, exact=exact
+            )
+            if group.turning:
+                along = self.system.local_rates.blocks(bodies, self.start)
+                by_twist, by_lam, g_by_twist = along(by_twist, 1), along(by_lam, 1), along(g_by_twist, 3)
+                by_twist = along(by_twist, 4)
+            count, width = group.count, bodies.shape[1] * self.tableau.stages * rates
+            rows = self.tableau.stages * group.multipliers
+            above = [-by_twist.reshape(count, width, width), -by_lam.reshape(count, width, rows)]
+            below = [g_by_twist.reshape(count, rows, width), g_by_lam.reshape(count, rows, rows)]
+            whole = [jnp.concatenate(parts, axis=2) for parts in (above, below)]
+            found.append(jnp.concatenate(whole, axis=1) if rows else above[0])
+        return found
+
+    def _projected(self, matrix: Array) -> Array:
+        """Columns of multipliers and rows of constraints in the range of the constraints."""
+        if self.start_cache.projector is None:
+            return matrix
+        first = self.balances
+        count = matrix.shape[0] - first
+        idle = (jnp.eye(count, dtype=matrix.dtype) - self.start_cache.projector) / (1.0 + count)
+        matrix = matrix.at[:first, first:].set(matrix[:first, first:] @ self.start_cache.projector)
+        matrix = matrix.at[first:, :first].set(self.start_cache.projector @ matrix[first:, :first])
+        own = self.start_cache.projector @ matrix[first:, first:] @ self.start_cache.projector
+        return matrix.at[first:, first:].set(own + idle)
+
+    def inertias(self, matrix: Float[Array, "unknowns unknowns"]) -> Float[Array, " balances"]:
+        """Inertias of the rates."""
+        return jnp.abs(jnp.diagonal(matrix))[: self.balances]
+
+    def least_inertias(self) -> Float[Array, " balances"]:
+        """Inertias that the rates have at least, by the mass of their bodies; the same in every step."""
+        own = jnp.repeat(least_inertias(self.system.mass), 3, axis=1)
+        stages = jnp.diagonal(jnp.asarray(self.tableau.a_inverse, own.dtype))
+        return self.system.local_rates.picked(own[:, None, :] * stages[:, None])
+
+    def guess(self) -> Float[Array, " unknowns"]:
+        """Rates at the start, repeated for every stage; multipliers zero."""
+        start = self.start[:-1]
+        spin = 0.5 * jnp.sum(cross(start[:, 1:], self.velocity[:, 1:]), axis=1)
+        twists = jnp.concatenate([self.velocity[:, 0], spin], axis=1)
+        return self.repeated(self.system.local_rates.balances(twists[:, None], start))
+
+    def by_stage(self, y: Float[Array, " unknowns"]) -> Float[Array, "s rates"]:
+        """Rates among the unknowns, or balances among the equations."""
+        return self.system.local_rates.by_stage(y[: self.balances], self.tableau.stages)
+
+    def repeated(self, w: Float[Array, " rates"]) -> Float[Array, " unknowns"]:
+        """The same at all stages; multipliers zero."""
+        rates = self.system.local_rates.repeated(w, self.tableau.stages)
+        return jnp.concatenate([rates, jnp.zeros(self.unknowns - self.balances, w.dtype)])
+
+    def motion_of(self, y: Float[Array, " unknowns"]) -> StageKinematics:
+        """Stage motion of all bodies."""
+        return self._stations(self.split(y)[0])
+
+    def _stations(self, twists: Float[Array, "bodies s 6"]) -> StageKinematics:
+        motion = body_motion(self.start[:-1], twists, self.h, self.tableau)
+        return stations(
+            self.start[:-1],
+            motion.rows[:, :, 0],
+            motion.rows[:, :, 1:],
+            motion.rates[:, :, 0],
+            motion.spin,
+        )

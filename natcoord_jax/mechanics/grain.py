@@ -1,0 +1,75 @@
+"""How finely the equations of a step are resolved: the size of the terms that cancel in their forces.
+
+A stiff part at rest, or nearly, has no forces by whose size its equations could be said to be solved. But
+these are differences of stiffness times places, and rounded as those are: a steel bar of one metre does not
+know its length to better than 1e-16 m, or its force to better than 1e-16 of what would stretch it to twice
+the length. Motion that is less than that is nothing but rounding.
+"""
+
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from natcoord_jax.core.state import State
+from natcoord_jax.maths.vectors import safe_divide
+from natcoord_jax.mechanics.momentum import row_weights
+from natcoord_jax.mechanics.response import GroupData
+from natcoord_jax.model.groups import Group
+from natcoord_jax.model.model import Model
+from natcoord_jax.model.rows import rows_with_ground
+
+STIFF = 4.0
+"""Energy, twice, of the corrections that a force makes over its energy where the step is too long to resolve
+the oscillation: its inertia in the equations is h^2/4 times the stiffness then."""
+
+UNRESISTED = 1e200
+"""Reciprocal inertia of what turns without any, but for its stiffness."""
+
+
+def cancelling_size(
+    system: Model,
+    groups: Sequence[Group],
+    situations: Sequence[GroupData],
+    state: State,
+    h: Float[Array, ""],
+) -> Float[Array, ""]:
+    """Size of the terms that cancel in the forces at the start of a step [sqrt(J)], as of those of a balance.
+
+    Args:
+        system: compiled system.
+        groups: that act.
+        situations: of the groups.
+        state: at the start.
+        h: step [s].
+    """
+    rows, total = rows_with_ground(state.q), jnp.zeros((), state.q.dtype)
+    by_force, by_torque = _mobilities(system)
+    for group, where in zip(groups, situations):
+        index = group.bodies
+
+        def one(effect, *given):
+            return effect.cancelling(*given)
+
+        axes = None if group.effect.shared else 0, 0, 0, 0
+        with jax.named_scope(group.effect.kind.replace(" ", "_")):
+            found = jax.vmap(one, in_axes=axes)(group.effect, where.place, rows[index], where.coordinates)
+        if found is None:
+            continue
+        energy, reach = found
+        along = jnp.sum(safe_divide(by_force[index], reach[:, None] ** 2) + by_torque[index], axis=1)
+        total = total + jnp.sum(jnp.minimum((h * energy) ** 2 * along, STIFF * energy))
+    return jnp.sqrt(total)
+
+
+def _mobilities(system: Model) -> tuple[Float[Array, " bodies_and_ground"], ...]:
+    """Reciprocal inertia of each body against a force, and against a torque."""
+    weights = row_weights(system.mass)[:, :2]
+    # What turns without inertia, and is no point, turns as far as its stiffness lets it.
+    turns = np.ones(len(system.structure.bodies), bool)
+    turns[list(system.structure.points)] = False
+    turning = jnp.where((weights[:, 1] == 0) & turns, UNRESISTED, weights[:, 1])
+    still = jnp.zeros(1, weights.dtype)
+    return jnp.concatenate([weights[:, 0], still]), jnp.concatenate([turning, still])

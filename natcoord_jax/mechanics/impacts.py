@@ -1,0 +1,176 @@
+"""Impacts at the end of a step: what contacts have taken from the motion, and what they give back.
+
+A gap that a step would have made negative is zero at its end (66), by an impulse that takes some energy with
+it, more or less by where in the step the surfaces met. `natcoord_jax.maths.impact_law` says what velocities
+follow: those of the restitution that is asked for, wherever that was. Then friction stops what slip it can.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from natcoord_jax.core.eager_numpy import eager_numpy
+from natcoord_jax.core.effect import replace_fields
+from natcoord_jax.core.state import State
+from natcoord_jax.maths.impact_law import friction_impulses, impact_impulses
+from natcoord_jax.maths.vectors import positive_part
+from natcoord_jax.mechanics.block_tangent_space import tangents_at
+from natcoord_jax.mechanics.response import Evaluation
+from natcoord_jax.mechanics.tangent_space import Velocity
+from natcoord_jax.mechanics.violations import contact_gaps
+from natcoord_jax.model.groups import Group
+from natcoord_jax.model.model import Model, SomeModel
+from natcoord_jax.model.rows import group_places, rows_with_ground
+
+TOUCHING = 1e-12
+"""Gap at the start of a step, per unit of size of the places, up to which surfaces have met before: what the
+last step has left of a gap that it closed."""
+
+
+def levers(system: Model, groups: Sequence[Group], state: State, name: str) -> Float[Array, "c bodies 4 3"]:
+    """Forces on the rows of all bodies that unit impulses at contacts are, by a method of the effects."""
+    rows, found = rows_with_ground(state.q), []
+    for group in groups:
+        each = jax.vmap(lambda effect, place, rows: getattr(effect, name)(place, rows))
+        forces = each(group.effect, group_places(system, group), rows[group.bodies])
+        several = forces.shape[1]
+        whole = jnp.zeros((group.count, several, *rows.shape), rows.dtype)
+        at = np.arange(group.count)[:, None, None], np.arange(several)[:, None], group.bodies[:, None]
+        found.append(whole.at[at].add(forces)[:, :, :-1].reshape(-1, *rows[:-1].shape))
+    return jnp.concatenate(found)
+
+
+class Answers:
+    """What impulses at contacts do to the velocities of one configuration.
+
+    Attributes:
+        space: of the velocities that the constraints admit.
+        along: what unit impulses do, in its frame, one a row.
+    """
+
+    def __init__(self, space: Any, rows: Float[Array, "c bodies 4 3"], rotors: Array) -> None:
+        self.space = space
+        still = jnp.zeros((rows.shape[0], *rotors.shape), rows.dtype)
+        self.along = jax.vmap(space.answer)(Velocity(rows, still))
+
+    @property
+    def flat(self) -> Float[Array, "c u"]:
+        """The same, one vector a row."""
+        return self.along.reshape(self.along.shape[0], -1)
+
+    @property
+    def matrix(self) -> Float[Array, "c c"]:
+        """W = G M^-1 G^T; as a sum, which is no call into a library."""
+        return jnp.sum(self.flat[:, None] * self.flat[None], axis=-1)
+
+    def rates(self, velocity: Velocity) -> Float[Array, " c"]:
+        """gamma: work of unit impulses on a velocity."""
+        return self.flat @ self.space.framed(velocity).reshape(-1)
+
+    def pushed(self, velocity: Velocity, impulses: Float[Array, " c"]) -> Velocity:
+        """A velocity after impulses."""
+        change = self.space.along(jnp.tensordot(impulses, self.along, 1))
+        return Velocity(velocity.rows + change.rows, velocity.rotors + change.rotors)
+
+
+def after_impacts(
+    system: Model, start: State, end: State, h: Array, groups: Sequence[Group], found: Evaluation
+) -> tuple[State, dict[int, Array]]:
+    """The state after the impacts at the end of a step of one stage, and their work [J] by number of group.
+
+    Args:
+        system: compiled system.
+        start: state at the start of the step.
+        end: at its end.
+        h: step [s].
+        groups: that act.
+        found: solved equations of the step.
+    """
+    numbers = [k for k, group in enumerate(groups) if group.effect.unilateral]
+    these, lam = [groups[k] for k in numbers], [found.given[k][:, 0] for k in numbers]
+    # Of the multipliers of a contact the first is that of the gap.
+    pushed = jnp.concatenate([x[:, 0] for x in lam])
+    # As in the equations: what is left of the impulse of an open contact may be of either sign.
+    active = 0.5 * _numbers(these, "mobility") * pushed > contact_gaps(system, these, end) / h
+    none = jnp.zeros_like(pushed)
+
+    def impacts() -> tuple[Array, Array, Array]:
+        return _impacts(system, start, end, h, these, active, lam)
+
+    v, rotors, done = jax.lax.cond(jnp.any(active), impacts, lambda: (end.v, end.rates, none))
+    return replace_fields(end, v=v, rates=rotors), dict(zip(numbers, _by_group(these, done)))
+
+
+def _by_group(groups: Sequence[Group], every: Array) -> list[Array]:
+    ends = np.cumsum([group.count for group in groups])
+    return [every[part] for part in np.split(np.arange(every.shape[0]), ends[:-1])]
+
+
+def _numbers(groups: Sequence[Group], name: str) -> Float[Array, " c"]:
+    return jnp.concatenate([getattr(group.effect, name) for group in groups])
+
+
+def _impacts(
+    system: Model,
+    start: State,
+    end: State,
+    h: Array,
+    groups: Sequence[Group],
+    active: Float[Array, " c"],
+    lam: Sequence[Float[Array, "n m"]],
+) -> tuple[Array, Array, Array]:
+    """Velocities and rates of rotors after impacts of the active contacts, and their work."""
+    space = tangents_at(system, end)
+    answers = Answers(space, levers(system, groups, end, "pushes"), end.rates)
+    before, pushed = contact_gaps(system, groups, start), jnp.concatenate([x[:, 0] for x in lam])
+    met = active & (before > TOUCHING * (1.0 + jnp.max(jnp.abs(start.q))))
+    work = jnp.where(met, positive_part(pushed * (before - contact_gaps(system, groups, end)) / h), 0.0)
+    restitution = _numbers(groups, "restitution")
+    velocity = Velocity(end.v.reshape(-1, 4, 3), end.rates)
+    rates, matrix = answers.rates(velocity), answers.matrix
+    impulses = impact_impulses(matrix, rates, work, restitution, active, met)
+    velocity = answers.pushed(velocity, impulses)
+    done = impulses * (rates + 0.5 * matrix @ impulses)
+    parts = zip(groups, lam, *(_by_group(groups, x) for x in (active, impulses, done)))
+    rubbing, finished = [], []
+    for group, own, on, pushes, work in parts:
+        finished.append(work)
+        if group.effect.friction is not None:
+            most = group.effect.friction * jnp.where(on, positive_part(own[:, 0] + pushes), 0.0)
+            rubbing.append((group, own[:, 1:], most))
+    if rubbing:
+        these, held, most = zip(*rubbing)
+        answers = Answers(space, levers(system, these, end, "rubs"), end.rates)
+        given = answers.matrix, answers.rates(velocity), jnp.concatenate(held), jnp.concatenate(most)
+        stopping, stopped = friction_impulses(*given)
+        velocity = answers.pushed(velocity, stopping)
+        lost = iter(_by_group(these, stopped))
+        finished = [w + (0.0 if g.effect.friction is None else next(lost)) for g, w in zip(groups, finished)]
+    return velocity.rows.reshape(end.v.shape), velocity.rotors, jnp.concatenate(finished)
+
+
+def with_mobilities(system: SomeModel, state: State) -> SomeModel:
+    """The system with what unit impulses do at its contacts, at one state."""
+    groups = [group for group in system.effects if group.effect.unilateral]
+    if not groups:
+        return system
+    own = iter(_by_group(groups, _own_mobilities(system, state)))
+    effects = tuple(
+        replace_fields(group, effect=replace_fields(group.effect, mobility=next(own)))
+        if group.effect.unilateral
+        else group
+        for group in system.effects
+    )
+    return replace_fields(system, effects=effects)
+
+
+@eager_numpy
+def _own_mobilities(system: Model, state: State) -> Float[Array, " c"]:
+    groups = [group for group in system.effects if group.effect.unilateral]
+    forces = levers(system, groups, state, "pushes")
+    found = jnp.diagonal(Answers(tangents_at(system, state), forces, state.rates).matrix)
+    return jnp.where(found > 0, found, 1.0)

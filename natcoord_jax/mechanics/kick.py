@@ -1,0 +1,252 @@
+"""Isometric kicks along the normals of the constraints, which keep velocities tangent at any order.
+
+Collocation keeps positions on the constraints, not velocities. Before the stages the velocity v_0 gets a
+normal part n_0, after them it gives it back:
+
+    v_+ = v_0 + n_0,    v_1 = v_- - sigma U n_0,    sigma = -R(infinity),
+
+with U an isometry (in the metric of the mass) from the normals at q_0 to those at q_1, and n_0 such that v_1
+is tangent. |U n_0| = |n_0|, so the energy is untouched; normals carry neither momentum nor angular momentum.
+With frames P^ of the tangents that are orthonormal in the metric, and K = P^_0^T M P^_1,
+
+    U n = n - (P^_0 + P^_1) (1 + K^T)^-1 P^_1^T M n,
+
+whose inverse is the same with the ends exchanged. n_0 follows without iteration from c = sum beta_i V_i,
+d = sigma c - v_0, b_0 = P^_0^T M d and b_1 = P^_1^T M d:
+
+    (1 + 2 K + K K^T) u = K b_1 - b_0,    n_0 = 1/2 (d - P^_1 (b_1 - 2 u - K^T u) + P^_0 u).
+
+Frames are functions of the configuration: P X^T with the null space P of the spanning tree and X its inverse
+Cholesky factor, X P^T M P X^T = 1. Where constraints close loops, the tangents are a subspace of that; its
+basis at q_1 is that at q_0 moved by the direct rotation between the two subspaces, so that no basis has to be
+chosen, and redundant constraints are no special case.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from natcoord_jax.core.effect import replace_fields
+from natcoord_jax.core.state import State
+from natcoord_jax.maths.collocation import Tableau
+from natcoord_jax.mechanics.block_tangent_space import Tangents, tangents_at
+from natcoord_jax.mechanics.coordinates import stage_rates
+from natcoord_jax.mechanics.frozen_kick import NEGLIGIBLE, NEGLIGIBLE_ENERGY, FrozenKick
+from natcoord_jax.mechanics.response import GroupData, StageKinematics
+from natcoord_jax.mechanics.tangent_space import Velocity
+from natcoord_jax.model.groups import Group
+from natcoord_jax.model.model import Model
+from natcoord_jax.xla.tracing import traced_once
+
+LARGEST = 0.51
+"""Kinetic energy of a kick in terms of that of the motion, twice, beyond which a step is refused. A drive
+that sets in motion at once what was at rest has 0.5 exactly, and must not depend on rounding."""
+
+UNSOUND = 1e-11
+"""Energy made by kicks in terms of that of the motion, beyond which a step is refused."""
+
+
+class Kick(eqx.Module):
+    """The kick of a step, and what is admitted at its ends.
+
+    Attributes:
+        kick: that the stages begin with.
+        before: tangent space at the start of the step.
+        after: at its end.
+        exact: the kick that belongs to the stages; the same, but for what is negligible.
+        change: by which it differs from that which was held before, if that is not negligible [sqrt(J)].
+        motion: size of the velocities at the ends [sqrt(J)].
+    """
+
+    kick: Velocity
+    before: Tangents
+    after: Tangents
+    exact: Velocity
+    change: Float[Array, ""]
+    motion: Float[Array, ""]
+
+    def without_system(self) -> "Kick":
+        """To be carried along; `with_system` puts the rest back."""
+        return replace_fields(self, before=self.before.without_system(), after=self.after.without_system())
+
+    def with_system(self, system: Model) -> "Kick":
+        """Ready for use."""
+        return replace_fields(
+            self, before=self.before.with_system(system), after=self.after.with_system(system)
+        )
+
+
+class Ends(eqx.Module):
+    """The end of a step with kicks.
+
+    Attributes:
+        velocity: v_1.
+        work: of the constraints at the ends of the step, drives being the only ones that do any [J].
+        sound: whether the kicks are small against the motion and leave the energy alone. Far off, where the
+            tangents at the two ends are nearly orthogonal, the equations have solutions that are neither.
+    """
+
+    velocity: Velocity
+    work: Float[Array, " c"]
+    sound: Bool[Array, ""]
+
+
+def end_of(state: State, at: StageKinematics, h: Array, tableau: Tableau) -> State:
+    """Positions and time at the end of a step; nothing else of it is of use."""
+    rows = at.start[:-1] + h * jnp.tensordot(jnp.asarray(tableau.b), at.rates[:, :-1], 1)
+    q = rows.reshape(-1, 3)
+    return State(state.t + h, q, q, state.coordinates, state.rates, state.work)
+
+
+def rotor_rates(
+    system: Model, groups: Sequence[Group], at: StageKinematics, h: Array
+) -> Float[Array, "s rotors"]:
+    """Rates at the stages of the joint coordinates that carry rotors."""
+    carrying = [g.coordinates[:, 0] for g in groups if g.effect.rotors]
+    if not carrying:
+        return jnp.zeros((at.rates.shape[0], 0), at.rates.dtype)
+    return stage_rates(system, at, h)[:, jnp.concatenate(carrying)]
+
+
+def kick_of(
+    system: Model,
+    state: State,
+    before: Tangents | None,
+    groups: Sequence[Group],
+    at: StageKinematics,
+    h: Array,
+    tableau: Tableau,
+    lag: FrozenKick | None = None,
+) -> Kick:
+    """The kick that belongs to given stages.
+
+    Args:
+        system: compiled system.
+        state: at the start of the step.
+        before: tangent space there; None: found together with that at the end.
+        groups: that act.
+        at: stage motion.
+        h: step [s].
+        tableau: the collocation method.
+        lag: with the kick at hand, which serves if it differs by nothing but what is negligible.
+    """
+    beta, sigma = jnp.asarray(tableau.beta), tableau.reflection
+    end = end_of(state, at, h, tableau)
+    if before is None:
+        before, after = _both(system, state, end)
+    else:
+        after = tangents_at(system, end)
+    drift = after.drift
+    carried = jnp.tensordot(beta, at.rates[:, :-1], 1), beta @ rotor_rates(system, groups, at, h)
+    d = Velocity(
+        sigma * (carried[0] - drift.rows) - state.v.reshape(-1, 4, 3),
+        sigma * (carried[1] - drift.rotors) - state.rates,
+    )
+    first, last = before.shares(after, d)  # pyright: ignore[reportArgumentType]  (they are of one kind)
+    found = Velocity(0.5 * (d.rows + first.rows - last.rows), 0.5 * (d.rotors + first.rotors - last.rotors))
+    if lag is None:
+        return Kick(found, before, after, found, jnp.zeros_like(h), jnp.zeros_like(h))
+    change = Velocity(found.rows - lag.held.rows, found.rotors - lag.held.rotors)
+    motion = jnp.maximum(before.energy(Velocity(state.v.reshape(-1, 4, 3), state.rates)), before.energy(d))
+    size, kick, motion = (jnp.sqrt(2.0 * x) for x in (before.energy(change), before.energy(found), motion))
+    serves = (size <= NEGLIGIBLE * motion) & (size * kick <= NEGLIGIBLE_ENERGY * motion**2)
+    kept = (serves & ~lag.everywhere) | lag.held_fast
+    used = jax.tree.map(lambda x, y: jnp.where(kept, x, y), lag.held, found)
+    return Kick(used, before, after, found, jnp.where(serves, 0.0, size), motion)
+
+
+def _both(system: Model, start: State, end: State) -> tuple[Tangents, Tangents]:
+    """The tangent spaces of two states by one program for both, half as long as two."""
+
+    def at(q: Array, t: Array) -> Tangents:
+        return tangents_at(system, replace_fields(end, q=q, v=q, t=t)).without_system()
+
+    found = jax.vmap(at)(jnp.stack([start.q, end.q]), jnp.stack([start.t, end.t]))
+    parts, structure = jax.tree.flatten(found)
+    before, after = (jax.tree.unflatten(structure, x) for x in zip(*map(jnp.unstack, parts)))
+    return before.with_system(system), after.with_system(system)
+
+
+def ends_of(
+    system: Model,
+    state: State,
+    groups: Sequence[Group],
+    at: StageKinematics,
+    kick: Kick,
+    h: Array,
+    tableau: Tableau,
+) -> Ends:
+    """The velocity at the end of a step: that of its stages, less the kick taken back."""
+    rates, turning = at.rates[:, :-1], rotor_rates(system, groups, at, h)
+    before, after = kick.before, kick.after
+    v = Velocity(state.v.reshape(-1, 4, 3), state.rates)
+    start = Velocity(v.rows + kick.kick.rows, v.rotors + kick.kick.rotors)
+    last = Velocity(
+        start.rows + tableau.gained(rates - start.rows),
+        start.rotors + tableau.gained(turning - start.rotors),
+    )
+    end = after.projected(last)
+    back = Velocity(end.rows - last.rows, end.rotors - last.rotors)
+    work = before.work(kick.kick) + after.work(back)
+    moving = jnp.maximum(before.energy(start), after.energy(end))
+    missing = before.energy(start) - before.energy(v) + after.energy(end) - after.energy(last) - jnp.sum(work)
+    small = 2.0 * before.energy(kick.kick) <= LARGEST * moving
+    return Ends(end, work, small & (jnp.abs(missing) <= UNSOUND * moving))
+
+
+def kicked(
+    system: Model,
+    state: State,
+    tangents: Tangents | None,
+    lag: FrozenKick | None,
+    groups: Sequence[Group],
+    situations: Sequence[GroupData],
+    at: StageKinematics,
+    h: Array,
+    tableau: Tableau,
+) -> tuple[Array, Sequence[GroupData], Kick | None]:
+    """What the stages begin with: velocities of rows, situations with rates of rotors; and the kick.
+
+    Where the kick lags behind the stages and is not due, it is that which is held, and nothing else of it is
+    of use.
+    """
+    velocity = state.v.reshape(-1, 4, 3)
+    if not tableau.kick:
+        return velocity, situations, None
+    before = None if tangents is None else tangents.with_system(system)
+    if lag is None:
+        found = kick_of(system, state, before, groups, at, h, tableau)
+    else:
+        found = _lagging(lag, system, state, before, groups, at, h, tableau)
+    moved = with_rotors(groups, situations, state.rates + found.kick.rotors)
+    return velocity + found.kick.rows, moved, found
+
+
+def _lagging(lag: FrozenKick, system: Model, *given: Any) -> Kick:
+    """The kick, found anew if it is due."""
+
+    def anew() -> Kick:
+        return kick_of(system, *given, lag=lag).without_system()
+
+    def renewed(_: tuple[Array, Kick]) -> tuple[Array, Kick]:
+        return jnp.array(False), anew()
+
+    anew, blank = traced_once(anew)
+    start = eqx.tree_at(lambda found: (found.kick, found.exact), blank, (lag.held, lag.held))
+    # A loop of no or one trip leaves what it carries where it is; a conditional would copy it.
+    _, found = jax.lax.while_loop(lambda carry: carry[0], renewed, (lag.due, start))
+    return found.with_system(system)
+
+
+def with_rotors(
+    groups: Sequence[Group], situations: Sequence[GroupData], rotors: Float[Array, " rotors"]
+) -> list[GroupData]:
+    """Situations with other rates of the rotors at the start of the step."""
+    return [
+        replace_fields(where, rates=rotors[group.rotors]) if group.effect.rotors else where
+        for group, where in zip(groups, situations)
+    ]

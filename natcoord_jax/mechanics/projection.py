@@ -1,0 +1,196 @@
+"""The constraints of a state linearised: which small motions close them, at least expense of mass.
+
+All positions and velocities enter as twists of the bodies (velocities of the reference points, angular
+velocities). Of the twists w with G w = -g the one of least kinetic energy is w = -M^-1 G^T (G M^-1 G^T)^-1 g.
+Every constraint is measured by the root of the energy that closing it alone takes, so that metres, radians
+and cosines compare. Where constraints depend on each other, or where one of them is nearly singular, the
+damping mu in G M^-1 G^T + mu decides (Levenberg 1944, Marquardt 1963).
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from natcoord_jax.core.effect import replace_fields
+from natcoord_jax.core.joint import frames_at
+from natcoord_jax.core.state import State
+from natcoord_jax.maths.elimination import definite_inverse
+from natcoord_jax.maths.rotations import from_rotation_vector
+from natcoord_jax.mechanics.coordinates import coordinate_values, velocities_with_ground
+from natcoord_jax.mechanics.violations import constrained, violation_rates_of, violations_of
+from natcoord_jax.model.model import Model
+from natcoord_jax.model.rows import group_places, row_rates, rows_with_ground
+
+TWIST = 6
+"""Components of a twist."""
+
+
+def inertias(system: Model, rows: Float[Array, "bodies 4 3"]) -> Float[Array, "bodies 6 6"]:
+    """Inertia of every body against its twist, made regular.
+
+    Ideal rods get a small inertia about their axis, and nodes without rotary inertia one like that of a
+    point mass; these only weigh how a gap is shared.
+    """
+    moment = system.mass[:, 1:, 1:]
+    size = jnp.trace(moment, axis1=1, axis2=2)
+    filled = moment + jnp.where(size > 0, 1e-3 * size, 1.0)[:, None, None] * jnp.eye(3)
+    mass = system.mass.at[:, 1:, 1:].set(filled)
+    moving = _unit_motions(rows)
+    return jnp.einsum("bixc,bij,bjxd->bcd", moving, mass, moving)
+
+
+def _unit_motions(rows: Float[Array, "*n 4 3"]) -> Float[Array, "*n 4 3 6"]:
+    """Velocities of the rows of bodies for unit twists."""
+    flat = rows.reshape(-1, 4, 3)
+    unit = jnp.broadcast_to(jnp.eye(TWIST)[:, None], (TWIST, flat.shape[0], TWIST))
+    found = jax.vmap(lambda w: row_rates(flat, w[:, :3], w[:, 3:]))(unit)
+    return jnp.moveaxis(found, 0, -1).reshape(*rows.shape, TWIST)
+
+
+def _along_twists(
+    instances: Any, place: Any, rows: Float[Array, "n k 4 3"], t: Array, rate_of: Any
+) -> Float[Array, "n m k6"]:
+    """Derivatives of what `rate_of` finds from velocities of rows and spins, by the twists of its bodies."""
+    count, bodies = rows.shape[:2]
+    unit = jnp.eye(TWIST * bodies).reshape(-1, bodies, TWIST)
+
+    def one(effect, place, rows):
+        def along(w):
+            return rate_of(effect, place, rows, row_rates(rows, w[:, :3], w[:, 3:]), w[:, 3:], t)
+
+        return jax.vmap(along, out_axes=1)(unit)
+
+    return jax.vmap(one)(instances, place, rows)
+
+
+def _scattered(block: Float[Array, "n m k6"], bodies: Any, count: int) -> Float[Array, "nm count6"]:
+    """Local derivatives as rows over the twists of all bodies; those of the ground are dropped."""
+    n, m, width = block.shape
+    columns = (bodies[:, :, None] * TWIST + jnp.arange(TWIST)).reshape(n, width)
+    whole = jnp.zeros((n, m, count * TWIST), block.dtype)
+    instance, row = jnp.arange(n)[:, None, None], jnp.arange(m)[None, :, None]
+    return whole.at[instance, row, columns[:, None, :]].add(block, mode="drop").reshape(n * m, -1)
+
+
+def constraint_matrix(system: Model, state: State) -> Float[Array, "m twists"]:
+    """G: derivatives of the rates of all constraints by the twists of the bodies."""
+    rows, count = rows_with_ground(state.q), len(system.structure.bodies)
+    found = [jnp.zeros((0, TWIST * count), state.q.dtype)]
+    for group in constrained(system):
+        block = _along_twists(
+            group.effect,
+            group_places(system, group),
+            rows[group.bodies],
+            state.t,
+            lambda e, place, rows, rates, spin, t: e.violation_rate(place, rows, rates, spin, t, 0.0),
+        )
+        found.append(_scattered(block, group.bodies, count))
+    return jnp.concatenate(found)
+
+
+def coordinate_matrix(system: Model, state: State) -> Float[Array, "coordinates twists"]:
+    """Derivatives of the rates of all joint coordinates by the twists of the bodies."""
+    rows, count = rows_with_ground(state.q), len(system.structure.bodies)
+    found = jnp.zeros((len(system.structure.coordinates), TWIST * count), state.q.dtype)
+    for group in system.coordinates:
+        bodies = jnp.asarray(system.joint_bodies)[group.joints]
+
+        def rate(_, place, rows, rates, spin, t, axis=group.axis):
+            return axis.rate(*frames_at(place, rows), *frames_at(place, rates), spin[1] - spin[0])[None]
+
+        block = _along_twists(group, system.frames[group.joints], rows[bodies], state.t, rate)
+        found = found.at[group.index].set(_scattered(block, bodies, count))
+    return found
+
+
+class Projection(eqx.Module):
+    """Linearised constraints of a state.
+
+    Attributes:
+        matrix: their derivatives by the twists of the bodies, in units of `scale`.
+        impulses: twists that unit multipliers of them make.
+        scale: root of the energy that one unit of violation takes, inverse [1/sqrt(J) times its unit].
+    """
+
+    matrix: Float[Array, "m twists"]
+    impulses: Float[Array, "twists m"]
+    scale: Float[Array, " m"]
+
+    @classmethod
+    def of(cls, system: Model, state: State, held: Float[Array, " coordinates"] | None) -> "Projection":
+        """At the positions of a state.
+
+        Args:
+            system: compiled system.
+            state: whose directors are orthonormal.
+            held: coordinates that are constraints as well, where it is 1; None: there are none.
+        """
+        matrix = constraint_matrix(system, state)
+        if held is not None:
+            matrix = jnp.concatenate([matrix, held[:, None] * coordinate_matrix(system, state)])
+        inverse = jax.vmap(definite_inverse)(inertias(system, state.q.reshape(-1, 4, 3)))
+        by_body = matrix.reshape(matrix.shape[0], inverse.shape[0], TWIST)
+        impulses = jnp.einsum("bcd,mbd->bcm", inverse, by_body).reshape(matrix.shape[::-1])
+        stiffness = jnp.einsum("mt,tm->m", matrix, impulses)
+        scale = jnp.sqrt(jnp.where(stiffness > 0, stiffness, 1.0))
+        return cls(matrix / scale[:, None], impulses / scale, scale)
+
+    def damped(self, damping: Array | float) -> Float[Array, "m m"]:
+        """The damped matrix of the constraints."""
+        return self.matrix @ self.impulses + damping * jnp.eye(self.scale.shape[0])
+
+
+def gaps(
+    system: Model, state: State, held: Float[Array, " coordinates"] | None, wanted: Array
+) -> Float[Array, " m"]:
+    """Violations of all constraints, held coordinates included: these shall be as wanted."""
+    found = [x.reshape(-1) for x in violations_of(system, constrained(system), state)]
+    found += [] if held is None else [held * (state.coordinates - wanted)]
+    return jnp.concatenate([jnp.zeros(0), *found])
+
+
+def gap_rates(system: Model, state: State) -> Float[Array, " m"]:
+    """Rates of the violations of all joints and relations."""
+    found = violation_rates_of(system, constrained(system), state)
+    return jnp.concatenate([jnp.zeros(0), *(x.reshape(-1) for x in found)])
+
+
+def moved(
+    system: Model, state: State, twist: Float[Array, "bodies 6"], increments: Float[Array, " coordinates"]
+) -> State:
+    """State after the bodies have been shifted, and turned about their reference points.
+
+    Args:
+        system: compiled system.
+        state: before.
+        twist: shifts [m] and rotation vectors [rad].
+        increments: of the joint coordinates to first order, by which whole turns are told.
+    """
+    rows = state.q.reshape(-1, 4, 3)
+    directors = jnp.einsum("bij,bkj->bki", from_rotation_vector(twist[:, 3:]), rows[:, 1:])
+    q = jnp.concatenate([rows[:, :1] + twist[:, None, :3], directors], axis=1).reshape(-1, 3)
+    expected = replace_fields(state, q=q, coordinates=state.coordinates + increments)
+    return replace_fields(expected, coordinates=nearest_coordinates(system, expected))
+
+
+def nearest_coordinates(system: Model, state: State) -> Array:
+    """Joint coordinates of the positions, each angle taken in the turn nearest to the stored one."""
+    values = coordinate_values(system, rows_with_ground(state.q))
+    for group in system.coordinates:
+        if group.axis.unit == "rad":
+            turns = jnp.round((state.coordinates - values)[group.index] / (2 * jnp.pi))
+            values = values.at[group.index].add(2 * jnp.pi * turns)
+    return values
+
+
+def twists_of(system: Model, state: State) -> Float[Array, "bodies 6"]:
+    """Twists of the bodies nearest to the velocities of their rows, in the metric of the mass."""
+    rows, v = (x.reshape(-1, 4, 3) for x in (state.q, state.v))
+    _, spin = velocities_with_ground(state.v, rows_with_ground(state.q))
+    rigid = jnp.concatenate([v[:, 0], spin[:-1]], axis=1)
+    rest = v - row_rates(rows, rigid[:, :3], rigid[:, 3:])
+    pushed = jnp.einsum("bixc,bij,bjx->bc", _unit_motions(rows), system.mass, rest)
+    return rigid + jnp.einsum("bcd,bd->bc", jax.vmap(definite_inverse)(inertias(system, rows)), pushed)

@@ -1,0 +1,376 @@
+"""Equations of a step in the joint null space: rates of the spanning tree and multipliers of loops.
+
+Unknowns y: mean rates w of the tree's free motions, stage by stage, then the multipliers (times the step)
+of the joints that close loops and of relations between coordinates. Residual: the momentum balance of the
+step (57) projected on the free motions, P^T [M sum_j (A^-1)_ij (V_j - v_0) - h F_i - G_i^T lambda_i],
+then the rates of the constraints. Working with rates and multipliers times h keeps the equations of one
+size as h goes to zero.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from natcoord_jax.core.effect import replace_fields
+from natcoord_jax.core.state import State
+from natcoord_jax.linsolve.dense import Inverse
+from natcoord_jax.linsolve.stages import fitted, stagewise_inverse
+from natcoord_jax.maths.collocation import Tableau, gauss
+from natcoord_jax.maths.projectors import range_projector
+from natcoord_jax.maths.vectors import dot
+from natcoord_jax.mechanics.block_tangent_space import Tangents, tangents_at
+from natcoord_jax.mechanics.dissipation import Damped, Damping
+from natcoord_jax.mechanics.equations_of_motion import constraint_matrix
+from natcoord_jax.mechanics.form import Form
+from natcoord_jax.mechanics.grain import cancelling_size
+from natcoord_jax.mechanics.kick import kicked
+from natcoord_jax.mechanics.momentum import least_inertias, momentum_balance
+from natcoord_jax.mechanics.redundancy import (
+    at_every_stage,
+    contact_mobilities,
+    places_by_stage,
+    project_multipliers,
+    project_rows,
+)
+from natcoord_jax.mechanics.response import (
+    Evaluation,
+    GroupData,
+    StageKinematics,
+    body_rows,
+    situation,
+    stations,
+)
+from natcoord_jax.mechanics.start_cache import StartCache
+from natcoord_jax.mechanics.sweeps import sweep_motion, turned_directors
+from natcoord_jax.mechanics.tangent_space import TangentSpace
+from natcoord_jax.model.axisymmetric_axes import frame_axes
+from natcoord_jax.model.groups import Group
+from natcoord_jax.model.model import Model
+from natcoord_jax.model.tree import SLOTS, TreeMotion, gather_slots, project, start_rates
+
+NOTHING = StartCache(None, None)
+"""Of the start of a step that is used for its constraints alone."""
+
+PROBE = 1e-6
+"""Change of a rotation [rad] that gives a column of the Jacobian."""
+
+
+def active_groups(system: Model) -> tuple[Group, ...]:
+    """Groups that take part in the equations: all effects and the joints that close loops."""
+    return (*system.effects, *(g for g in system.joints if not g.in_tree))
+
+
+def at_rest(step: Any) -> Any:
+    """The same equations for a step of length zero and one stage, where they are linear."""
+    situations = [
+        replace_fields(where, inputs=where.inputs[:, 0]) if where.inputs.ndim == 3 else where
+        for where in step.situations
+    ]
+    return replace_fields(
+        step,
+        h=jnp.zeros_like(step.h),
+        situations=tuple(situations),
+        start_cache=NOTHING,
+        tableau=gauss(1),
+    )
+
+
+class ReducedStep(Form):
+    """One step in the joint null space: all that does not depend on the unknowns, and the equations."""
+
+    by_differences = True
+
+    system: Model
+    state: State
+    start: Float[Array, "bodies 4 3"]
+    velocity: Float[Array, "bodies 4 3"]
+    frames: Float[Array, "bodies 2 4 4"]
+    situations: tuple[GroupData, ...]
+    h: Float[Array, ""]
+    start_cache: StartCache
+    tableau: Tableau = eqx.field(static=True)
+
+    @classmethod
+    def prepare(
+        cls,
+        system: Model,
+        state: State,
+        u: Array,
+        h: Array,
+        tableau: Tableau,
+        start_cache: StartCache | None = None,
+    ) -> "ReducedStep":
+        """Gather what the step needs, once.
+
+        Args:
+            system: compiled system.
+            state: at the start.
+            u: inputs.
+            h: step [s].
+            tableau: the collocation method.
+            start_cache: what is known of the start, see `starting`; None: found here.
+        """
+        return cls(
+            system,
+            state,
+            body_rows(state.q),
+            body_rows(state.v),
+            system.tree.frames(system.frames),
+            tuple(situation(system, g, state, u, h) for g in active_groups(system)),
+            h,
+            cls.starting(system, state, tableau) if start_cache is None else start_cache,
+            tableau,
+        )
+
+    @classmethod
+    def starting(
+        cls,
+        system: Model,
+        state: State,
+        tableau: Tableau,
+        tangents: Tangents | None = None,
+        later: bool = False,
+    ) -> StartCache:
+        """What a step needs of its start, see `StartCache.of`."""
+        projector, rank = None, system.structure.rank
+        if rank is not None:
+            if isinstance(tangents, TangentSpace) and tangents.admissible.range is not None:
+                projector = tangents.admissible.range
+            else:
+                projector = range_projector(constraint_matrix(system, state), rank)
+            projector = at_every_stage(projector, active_groups(system), tableau.stages)
+        return StartCache.of(system, state, tableau, projector, tangents, later)
+
+    @property
+    def groups(self) -> tuple[Group, ...]:
+        """Groups with a part in the equations, in the order of their multipliers."""
+        return active_groups(self.system)
+
+    @property
+    def dependent(self) -> bool:
+        """Whether constraints depend on each other."""
+        return self.system.structure.rank is not None
+
+    @property
+    def balances(self) -> int:
+        """Number of balance equations; the rest are constraints."""
+        return self.system.structure.unknowns * self.tableau.stages
+
+    @property
+    def grain(self) -> Float[Array, ""]:
+        """Size of the terms that cancel in the forces [sqrt(J)]."""
+        return cancelling_size(self.system, self.groups, self.situations, self.state, self.h)
+
+    def split(self, y: Float[Array, " unknowns"]) -> tuple[Array, list[Array]]:
+        """Rates (s, unknowns) and multipliers of each active group (n, s, m)."""
+        s, position = self.tableau.stages, self.balances
+        w, multipliers = y[:position].reshape(s, -1), []
+        if position == 0:
+            w = y[:0].reshape(s, 0)
+        for group in active_groups(self.system):
+            shape = (group.count, s, group.multipliers)
+            size = group.count * s * group.multipliers
+            multipliers.append(y[position : position + size].reshape(shape))
+            position += size
+        return w, multipliers
+
+    def motion(self, w: Float[Array, "s unknowns"]) -> tuple[TreeMotion, Any]:
+        """Stage motion of the bodies at given rates, and the geometry of the joints."""
+        slots = gather_slots(self.system.tree, w)
+        turned = None
+        if self._swings:
+            # Another basis of the same motion: derivatives need not know how it turns.
+            turned = turned_directors(self.start, self.velocity, self.h, self.tableau)
+            turned = jax.lax.stop_gradient(turned)
+        given = self.frames, self.start, slots, self.h, self.tableau, turned
+        return sweep_motion(self.system.tree, *given)
+
+    @property
+    def _swings(self) -> bool:
+        """Whether the axes of free bodies' rates turn with them within a step of several stages.
+
+        Along these, springs between the bodies act nearly alike at all stages, however stiff they are.
+        """
+        elastic = any(group.effect.elastic for group in self.groups)
+        return elastic and self.tableau.stages > 1 and bool(self.system.tree.free.members)
+
+    def generalised(
+        self, geometry: Any, force: Float[Array, "s bodies 3"], torque: Float[Array, "s bodies 3"]
+    ) -> Float[Array, "s unknowns"]:
+        """Generalised forces of the free motions from forces and torques at the reference points."""
+        return project(self.system.tree, geometry, force, torque)[0]
+
+    def stations(self, motion: TreeMotion) -> StageKinematics:
+        """Motion as the effects see it."""
+        a = self.h * jnp.asarray(self.tableau.a, motion.velocity.dtype)
+        points = self.start[:, 0] + jnp.sum(a[:, :, None, None] * motion.velocity, axis=1)
+        return stations(self.start, points, motion.directors, motion.velocity, motion.spin)
+
+    def residual(self, y: Float[Array, " unknowns"]) -> tuple[Float[Array, " unknowns"], Float[Array, ""]]:
+        """Residual [N s, N m s; m/s, 1/s for constraints] and the size of its terms [sqrt(J)]."""
+        found = self.evaluate(y)
+        return found.residual, found.size
+
+    def evaluate(self, y: Float[Array, " unknowns"]) -> Evaluation:
+        """Residual, and what the end of the step needs."""
+        system = self.system
+        w, multipliers = self.split(project_multipliers(y, self.balances, self.start_cache.projector))
+        motion, geometry = self.motion(w)
+        at = self.stations(motion)
+        if self.tableau.variational:
+            at, geometry = replace_fields(at, force_rows=at.start[None]), at_rest(self).motion(w)[1]
+        velocity, situations, kick = kicked(
+            self.system,
+            self.state,
+            self.start_cache.tangents,
+            self.start_cache.lag,
+            self.groups,
+            self.situations,
+            at,
+            self.h,
+            self.tableau,
+        )
+        damped = None
+        if self.tableau.dissipative:
+            damped = self.damped(at)
+            velocity, situations = damped.started(self.groups, situations)
+        given = system, self.groups, situations, at, velocity
+        found = momentum_balance(*given, multipliers, self.h, self.tableau)
+        generalised = self.generalised(geometry, found.force, found.torque)
+        rows = project_rows(found.rows, y, self.balances, self.start_cache.projector)
+        residual = jnp.concatenate([generalised.reshape(-1), rows])
+        asked = (situations, multipliers) if self.tableau.variational else damped
+        if self.system.structure.inequalities:
+            asked = multipliers
+        return Evaluation(residual, found.size, at, found.power, (found.force, found.torque), kick, asked)
+
+    def damped(self, at: StageKinematics) -> Damped:
+        """What numerical dissipation does in the step."""
+        damping = self.start_cache.damping
+        damping = Damping.at(self.system, self.state) if damping is None else damping.with_system(self.system)
+        return damping.over(self.state, self.groups, at, self.h, self.tableau)
+
+    def guess(self) -> Float[Array, " unknowns"]:
+        """Rates of the velocities at the start, repeated for every stage; multipliers zero."""
+        return self.repeated(start_rates(self.system.tree, self.frames, self.start, self.velocity))
+
+    def by_stage(self, y: Float[Array, " unknowns"]) -> Float[Array, "s rates"]:
+        """Rates among the unknowns, or balances among the equations."""
+        return y[: self.balances].reshape(self.tableau.stages, -1)
+
+    def repeated(self, w: Float[Array, " rates"]) -> Float[Array, " unknowns"]:
+        """The same at all stages; multipliers zero."""
+        idle = jnp.zeros(self.system.structure.multipliers * self.tableau.stages, w.dtype)
+        return jnp.concatenate([jnp.tile(w, self.tableau.stages), idle])
+
+    def jacobian(self, y: Float[Array, " unknowns"]) -> Float[Array, "unknowns unknowns"]:
+        """Exact Jacobian of the residual."""
+        return jax.jacfwd(lambda x: self.residual(x)[0])(y)
+
+    def tangent(self, y: Float[Array, " unknowns"], loads: Any = None) -> Any:
+        """What Newton's iteration takes for the Jacobian where it does not form it by differences."""
+        return self.jacobian(y)
+
+    @property
+    def stage_places(self) -> np.ndarray:
+        """Places (s, n) among the unknowns of the rates and multipliers of each stage."""
+        stages, count = self.tableau.stages, self.system.structure.unknowns
+        rates = np.arange(stages * count).reshape(stages, count)
+        return np.concatenate([rates, self.balances + places_by_stage(self.groups, stages)], axis=1)
+
+    def factorised_alike(
+        self, columns: Float[Array, "n unknowns"]
+    ) -> tuple[Inverse, Float[Array, " unknowns"]]:
+        """Factors as of `factorised`, with what changes little within a step taken for constant.
+
+        Args:
+            columns: what changes do that are the same at all stages, one a row.
+        """
+        places, count = self.stage_places, self.system.structure.unknowns
+        size = places.size
+        alike = jnp.moveaxis(columns[:, places], 0, -1)
+        own = self.own_inertia()
+        inertia = jnp.zeros(alike.shape[1:], alike.dtype).at[:count, :count].set(own)
+        damping, stiffness = fitted(alike, inertia, count, self.tableau)
+        stages = jnp.asarray(np.stack([np.diag(self.tableau.a_inverse), np.diag(self.tableau.a)]))
+        found = stages[0, :, None] * jnp.diagonal(inertia) + jnp.diagonal(damping)
+        found = (found + stages[1, :, None] * jnp.diagonal(stiffness))[:, :count]
+        inertias = self._at_least(jnp.abs(found).reshape(-1))
+        inverse = stagewise_inverse(
+            inertia, damping, stiffness, inertias[:count], self.tableau, dependent=self.dependent
+        )
+        whole = jnp.zeros((size, size), inverse.dtype)
+        whole = whole.at[places[:, :, None, None], places[None, None, :, :]].set(inverse)
+        return Inverse(whole), jnp.zeros(size, inverse.dtype).at[: self.balances].set(inertias)
+
+    def own_inertia(self) -> Float[Array, "unknowns unknowns"]:
+        """Inertia of the free motions at the start of the step, P^T M P."""
+        tangents = self.start_cache.tangents
+        if tangents is None:
+            tangents = tangents_at(self.system, self.state)
+        tangents = tangents.with_system(self.system)
+        tree = self.system.tree
+        body, kind, axis = tree.slot_of // SLOTS, tree.slot_of % SLOTS // 3, tree.slot_of % SLOTS % 3
+        above = jnp.concatenate([self.start[:, 1:], jnp.eye(3, dtype=self.start.dtype)[None]])[tree.parent]
+        parent = frame_axes(self.frames[:, 0, 1:, 1:], above[None])[0][body, axis]
+        own = tree.ball_axes(self.frames, self.start[:, 1:])[0][body, axis]
+        # There rates are along the axes of the parent, here those of balls along their own.
+        together = (body[:, None] == body) & (kind[:, None] == kind)
+        cosines = jnp.where(together, dot(parent[:, None], own), 0.0)
+        balls = tree.ball if tree.directed is None else tree.ball & ~tree.directed
+        turned = jnp.where(balls[body], cosines, jnp.eye(body.size, dtype=cosines.dtype))
+        return turned.T @ tangents.inertia @ turned
+
+    def inertias(self, matrix: Float[Array, "unknowns unknowns"]) -> Float[Array, " balances"]:
+        """Inertias of the rates, from the Jacobian and from the mass.
+
+        Kicks take up what moves against constraints: in the Jacobian the inertia of a rate that is
+        prescribed, or that loops forbid, is missing.
+        """
+        return self._at_least(jnp.abs(jnp.diagonal(matrix))[: self.balances])
+
+    def least_inertias(self) -> Float[Array, " balances"]:
+        """Inertias that the rates have at least, by the mass of their own bodies; the same in every step."""
+        body, slot = self.system.tree.slot_of // SLOTS, self.system.tree.slot_of % SLOTS
+        kind = jnp.where((slot < 3) | (slot == SLOTS - 1), 1, 0)
+        return self._by_stage(least_inertias(self.system.mass)[body, kind])
+
+    def _at_least(self, found: Float[Array, " balances"]) -> Float[Array, " balances"]:
+        """Inertias, none less than that of the mass at its stage."""
+        if self.start_cache.tangents is None:
+            return found
+        return jnp.maximum(found, self._by_stage(jnp.diagonal(self.own_inertia())))
+
+    def _by_stage(self, inertias: Float[Array, " rates"]) -> Float[Array, " balances"]:
+        """Of the mass at every stage."""
+        stages = jnp.diagonal(jnp.asarray(self.tableau.a_inverse, inertias.dtype))
+        return (stages[:, None] * inertias).reshape(-1)
+
+    def probes(self, y: Float[Array, " unknowns"]) -> Float[Array, " unknowns"]:
+        """Changes of the unknowns that give columns of the Jacobian as quotients of differences.
+
+        Small against a radian and against the extent of the system, so that the equations are
+        nearly linear in them. In multipliers they are linear exactly; there a change as large as the
+        multiplier itself loses no digits, which constraints on a light part between heavy ones cannot spare.
+        """
+        mass = self.system.mass
+        total = mass[:, 0, 0]
+        gyration = jnp.trace(mass[:, 1:, 1:], axis1=1, axis2=2) / jnp.where(total > 0, total, 1.0)
+        apart = jnp.max(jnp.abs(self.start[:, 0] - self.start[0, 0]))
+        extent = jnp.sqrt(jnp.max(gyration)) + jnp.max(jnp.abs(self.frames[:, :, 0, 1:])) + apart
+        extent = jnp.where(extent > 0, extent, 1.0)
+        turning = jnp.ones((self.start.shape[0], 3), mass.dtype)
+        scales = jnp.concatenate([turning, extent * turning, turning[:, :1]], axis=1)
+        rates = PROBE / self.h * scales.reshape(-1)[self.system.tree.slot_of]
+        multipliers = 1.0 + jnp.abs(y[self.balances :])
+        if self.system.structure.inequalities:
+            # Those of contacts by as little, and downwards: the smaller of gap and impulse vanishes, and
+            # where both do, that is the impulse.
+            speed, mobility = PROBE / self.h * extent, contact_mobilities(self)
+            lower = -2.0 * speed / jnp.where(mobility > 0, mobility, 1.0)
+            multipliers = jnp.where(mobility > 0, lower, multipliers)
+        return jnp.concatenate([jnp.tile(rates, self.tableau.stages), multipliers])

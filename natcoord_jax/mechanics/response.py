@@ -1,0 +1,146 @@
+"""Evaluation of all effects on a given motion: gather, respond (vmapped over equal kinds), scatter."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from natcoord_jax.core.effect import Motion, Response, StepContext, replace_fields
+from natcoord_jax.core.state import State
+from natcoord_jax.maths.collocation import Tableau
+from natcoord_jax.maths.vectors import cross
+from natcoord_jax.model.groups import Group
+from natcoord_jax.model.model import Model
+from natcoord_jax.model.rows import group_places
+
+
+def ground_rows(like: Array) -> Float[Array, "1 4 3"]:
+    """Rows of the ground: the origin and the world axes."""
+    return jnp.concatenate([jnp.zeros((1, 3)), jnp.eye(3)]).astype(like.dtype)[None]
+
+
+def body_rows(q: Float[Array, "*s rows 3"]) -> Float[Array, "*s bodies 4 3"]:
+    """Rows by body."""
+    return q.reshape(*q.shape[:-2], q.shape[-2] // 4, 4, 3)
+
+
+class StageKinematics(eqx.Module):
+    """Motion of all bodies and, last, the ground; `force_rows` as in `Motion`."""
+
+    start: Float[Array, "bodies_and_ground 4 3"]
+    rows: Float[Array, "s bodies_and_ground 4 3"]
+    rates: Float[Array, "s bodies_and_ground 4 3"]
+    spin: Float[Array, "s bodies_and_ground 3"]
+    force_rows: Float[Array, "s bodies_and_ground 4 3"] | None = None
+
+    @property
+    def held(self) -> Float[Array, "s bodies_and_ground 4 3"]:
+        """Rows on which forces take hold."""
+        return self.rows if self.force_rows is None else self.force_rows
+
+
+def stations(
+    start: Float[Array, "bodies 4 3"],
+    points: Float[Array, "s bodies 3"],
+    directors: Float[Array, "s bodies 3 3"],
+    velocity: Float[Array, "s bodies 3"],
+    spin: Float[Array, "s bodies 3"],
+) -> StageKinematics:
+    """Motion with the ground appended; director rates are spin x director."""
+    ground = ground_rows(start)
+    stages = points.shape[0]
+    rows = jnp.concatenate([points[:, :, None], directors], axis=2)
+    rates = jnp.concatenate([velocity[:, :, None], cross(spin[:, :, None], directors)], axis=2)
+    still = jnp.zeros((stages, 1, 4, 3), start.dtype)
+    return StageKinematics(
+        jnp.concatenate([start, ground]),
+        jnp.concatenate([rows, jnp.broadcast_to(ground, still.shape)], axis=1),
+        jnp.concatenate([rates, still], axis=1),
+        jnp.concatenate([spin, still[:, :, 0]], axis=1),
+    )
+
+
+class GroupData(eqx.Module):
+    """What a group needs besides the motion: places, inputs, coordinates, rates, time, step, extra stress."""
+
+    place: Array
+    inputs: Array
+    coordinates: Array
+    rates: Array
+    t: Float[Array, ""]
+    h: Float[Array, ""]
+    stress: Float[Array, "n s p"] | None = None
+
+
+def situation(system: Model, group: Group, state: State, u: Array, h: Array) -> GroupData:
+    """Gather what a group needs at the start of a step."""
+    return GroupData(
+        group_places(system, group),
+        jnp.moveaxis(u[..., group.inputs], -2, 0),
+        state.coordinates[group.coordinates],
+        state.rates[group.rotors],
+        state.t,
+        h,
+    )
+
+
+def respond(
+    group: Group, where: GroupData, motion: Motion, lam: Float[Array, "n s m"], tableau: Tableau
+) -> Response:
+    """Responses of all instances of a group; leading axis `n`."""
+    now = StepContext(where.t, where.h, where.inputs, where.coordinates, where.rates, tableau, where.stress)
+    with jax.named_scope(group.effect.kind.replace(" ", "_")):
+        return group.effect.responses(where.place, motion, now, lam)
+
+
+def gather(group: Group, at: StageKinematics) -> Motion:
+    """Motion of the bodies of a group: start (n, k, ...), stage quantities (s, n, k, ...)."""
+    index = group.bodies
+    force_rows = None if at.force_rows is None else at.force_rows[:, index]
+    return Motion(at.start[index], at.rows[:, index], at.rates[:, index], at.spin[:, index], force_rows)
+
+
+class Evaluation(eqx.Module):
+    """The equations of a step at given unknowns, and the motion that goes with them.
+
+    Attributes:
+        residual: [N s, N m s; m/s, 1/s for constraints].
+        size: of the terms of the residual [sqrt(J)].
+        at: stage motion of all bodies.
+        power: power of each group, for work accounts (instances, s).
+        loads: forces and torques missing in the balances of all bodies, see `momentum.Balance`.
+        kick: of the step, if the method has any.
+        given: what else the end of the step asks for: situations and multipliers of the groups for the
+            variational scheme, what is damped for a dissipative one, multipliers where there are contacts.
+    """
+
+    residual: Float[Array, " unknowns"]
+    size: Float[Array, ""]
+    at: StageKinematics
+    power: list[Float[Array, "_ s"]]
+    loads: tuple[Float[Array, "s bodies 3"], Float[Array, "s bodies 3"]]
+    kick: Any = None
+    given: Any = None
+
+    def without_system(self) -> "Evaluation":
+        """To be carried along; `with_system` puts the rest back."""
+        return self if self.kick is None else replace_fields(self, kick=self.kick.without_system())
+
+    def with_system(self, system: Model) -> "Evaluation":
+        """Ready for use."""
+        return self if self.kick is None else replace_fields(self, kick=self.kick.with_system(system))
+
+
+def collect(group: Group, loads: Float[Array, "n s k *rest"]) -> Float[Array, "bodies s *rest"]:
+    """Sum of the loads of all instances by body; those on the ground fall away."""
+    if group.source == "mass":
+        return loads[:, :, 0]
+    by_place = jnp.moveaxis(loads, 2, 1)
+    return group.acting.collect(by_place.reshape(-1, *by_place.shape[2:]))
+
+
+def no_multipliers(group: Group, tableau: Tableau, dtype) -> Array:
+    """Multipliers of a group that has none."""
+    return jnp.zeros((group.count, tableau.stages, group.effect.multipliers), dtype)

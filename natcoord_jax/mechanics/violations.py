@@ -1,0 +1,181 @@
+"""By how much a state misses the constraints: of bodies, joints, and relations between joint coordinates."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from natcoord_jax.core.eager_numpy import eager_numpy
+from natcoord_jax.core.state import State
+from natcoord_jax.mechanics.coordinates import velocities_with_ground
+from natcoord_jax.model.groups import Group
+from natcoord_jax.model.model import Model
+from natcoord_jax.model.rows import group_places, rows_with_ground
+
+GAP = 1e-9
+"""Largest violation [m, rad, -] and rate of it taken for round-off of printed data, per unit of size."""
+
+
+def constrained(system: Model) -> tuple[Group, ...]:
+    """All groups with constraints: relations between coordinates, then joints."""
+    return (*(g for g in system.effects if g.holds), *(g for g in system.joints if g.multipliers))
+
+
+def contacts(system: Model) -> tuple[Group, ...]:
+    """All groups with inequalities."""
+    return tuple(g for g in system.effects if g.effect.unilateral)
+
+
+def contact_gaps(system: Model, groups: Sequence[Group], state: State) -> Float[Array, " c"]:
+    """Gaps of contacts [m]."""
+    rows, found = rows_with_ground(state.q), []
+    for group in groups:
+        each = jax.vmap(lambda effect, place, rows: effect.readings(place, rows).gap)
+        found.append(each(group.effect, group_places(system, group), rows[group.bodies]))
+    return jnp.concatenate(found)
+
+
+def refuse_contacts(system: Model, what: str) -> None:
+    """Refuse to ask of contacts what they have no answer to.
+
+    Raises:
+        ValueError: with a contact, and what to do.
+    """
+    for group in contacts(system):
+        raise ValueError(
+            f"{what} of a system with {group.effect.kind} {group.labels[0]!r} is not defined: which contacts "
+            "are closed, it does not say; give the contact a stiffness, which makes it a potential"
+        )
+
+
+def violations_of(system: Model, groups: tuple[Group, ...], state: State) -> list[Float[Array, "n m"]]:
+    """Violations of the constraints of some groups."""
+    rows, found = rows_with_ground(state.q), []
+    for group in groups:
+        given = group_places(system, group), rows[group.bodies], state.coordinates[group.coordinates]
+        found.append(jax.vmap(lambda e, *x: e.violation(*x, state.t))(group.effect, *given))
+    return found
+
+
+def violation_rates_of(
+    system: Model, groups: tuple[Group, ...], state: State, passing: float = 1.0
+) -> list[Float[Array, "n m"]]:
+    """Rates of the violations; with `passing` 0, of those at a fixed time."""
+    rows, found = rows_with_ground(state.q), []
+    rates, spin = velocities_with_ground(state.v, rows)
+    for group in groups:
+        given = (x[group.bodies] for x in (rows, rates, spin))
+        every = jax.vmap(lambda e, *x: e.violation_rate(*x, state.t, passing))
+        found.append(every(group.effect, group_places(system, group), *given))
+    return found
+
+
+def joint_residuals(system: Model, state: State) -> list[tuple[Group, Array, Array]]:
+    """Residual and rate of every joint's constraints, by group."""
+    groups = system.joints
+    values, rates = violations_of(system, groups, state), violation_rates_of(system, groups, state)
+    return list(zip(groups, values, rates))
+
+
+@eager_numpy
+def residuals(system: Model, state: State) -> list[tuple[Array, Array]]:
+    """Residual and rate of every joint's constraints, in the order of the groups."""
+    return [(value, rate) for _, value, rate in joint_residuals(system, state)]
+
+
+def largest(groups: list[Array]) -> Float[Array, ""]:
+    """Largest absolute value in any of the arrays, zero without any; NaN where there is one."""
+    return jnp.max(jnp.concatenate([jnp.zeros(1), *(jnp.abs(x).reshape(-1) for x in groups)]))
+
+
+def position_size(state: State) -> Float[Array, ""]:
+    """What violations of positions are compared with."""
+    return 1.0 + jnp.max(jnp.abs(state.q)) + jnp.max(jnp.abs(state.coordinates), initial=0.0)
+
+
+def rate_size(state: State) -> Float[Array, ""]:
+    """What their rates are compared with."""
+    return 1.0 + jnp.max(jnp.abs(state.v))
+
+
+def misses(system: Model, state: State) -> tuple[Array, Array]:
+    """Largest violation of any joint or relation and of their rates, in terms of `GAP` times the size."""
+    groups = constrained(system)
+    gap, rate = (
+        largest(violations_of(system, (*groups, *contacts(system)), state)),
+        largest(violation_rates_of(system, groups, state)),
+    )
+    return gap / (GAP * position_size(state)), rate / (GAP * rate_size(state))
+
+
+@eager_numpy
+def _position_violations(system: Model, state: State) -> tuple[list[Array], Array]:
+    return violations_of(system, constrained(system), state), position_size(state)
+
+
+@eager_numpy
+def _overlaps(system: Model, state: State) -> tuple[list[Array], Array]:
+    return violations_of(system, contacts(system), state), position_size(state)
+
+
+@eager_numpy
+def _rate_violations(system: Model, state: State) -> tuple[list[Array], Array]:
+    return violation_rates_of(system, constrained(system), state), rate_size(state)
+
+
+@dataclass(frozen=True)
+class Violation:
+    """The constraint that a state violates most.
+
+    Attributes:
+        kind: of the part.
+        name: of the part.
+        size: of the violation, or of its rate.
+        unit: of the size.
+        is_joint: whether the part is a joint.
+    """
+
+    kind: str
+    name: str
+    size: float
+    unit: str
+    is_joint: bool
+
+    def __str__(self) -> str:
+        return f"{'joint' if self.is_joint else self.kind} {self.name!r}"
+
+
+def worst_violation(
+    system: Model,
+    state: State,
+    *,
+    rates: bool = False,
+    allowed: float = GAP,
+    overlaps: bool = False,
+) -> Violation | None:
+    """The largest violation (or rate of one) of a concrete state beyond what is allowed, per unit of size.
+
+    Of constraints, or overlaps of surfaces in contact.
+    """
+    groups = contacts(system) if overlaps else constrained(system)
+    if not groups:
+        return None
+    find = _overlaps if overlaps else _rate_violations if rates else _position_violations
+    listed, size = find(system, state)
+    found = [np.abs(np.asarray(x)) for x in listed]
+    sizes = [np.max(x) for x in found]
+    worst = int(np.argmax(sizes))
+    if not sizes[worst] > allowed * float(size):
+        return None
+    group = groups[worst]
+    instance, row = np.unravel_index(np.argmax(found[worst]), found[worst].shape)
+    places, rows = group_places(system, group)[instance], rows_with_ground(state.q)[group.bodies[instance]]
+    alone = jax.tree.map(lambda x: x[instance], group.effect)
+    unit = alone.violation_units(places, rows)[row]
+    if rates:
+        unit = "1/s" if unit == "-" else f"{unit}/s"
+    is_joint = group.source == "joint"
+    return Violation(group.effect.kind, group.names[int(instance)], float(sizes[worst]), unit, is_joint)

@@ -1,0 +1,152 @@
+"""Where bodies and joints are in the assembled scene."""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from natcoord_jax.core.bodies import POINT, TRIAD
+from natcoord_jax.core.checks import as_array
+from natcoord_jax.core.eager_numpy import eager_numpy
+from natcoord_jax.core.handles import Handle
+from natcoord_jax.core.handles import ground as ground_handle
+from natcoord_jax.core.joint import Joint
+from natcoord_jax.core.kinds import short
+from natcoord_jax.core.markers import Attachment, Interpolated, Marker
+from natcoord_jax.maths.rotations import frame_from_axis
+from natcoord_jax.model.bodies import Bodies, joined
+from natcoord_jax.xla.tracing import at_top_level
+
+
+class Poses:
+    """Assembled poses of all bodies and the ground, in scene order."""
+
+    def __init__(self, bodies: Bodies):
+        self.names, self._bodies = bodies.names, bodies
+        ground = as_array(np.zeros((1, 3))), as_array(np.eye(3)[None])
+        given = bodies.every("position"), bodies.every("rotation")
+        self.position, self.rotation = (joined(x, y) for x, y in zip(given, ground))
+
+    def of(self, handle: Handle) -> int:
+        """Number of a body; the number of bodies for the ground.
+
+        Raises:
+            ValueError: for a node that is clamped to one.
+        """
+        if handle.name in self._bodies.owners:
+            owner = self._bodies.owners[handle.name]
+            raise ValueError(
+                f"node {handle.name!r} is clamped to {owner.name!r}; join that to others instead"
+            )
+        return len(self.names) if handle == ground_handle else self.names.index(handle.name)
+
+    def carrier(self, handle: Handle) -> int:
+        """Number of a body, or of that which a node is clamped to."""
+        return self.of(self._bodies.owners.get(handle.name, handle))
+
+    def held(self, handle: Handle) -> Float[Array, "4 4"] | None:
+        """Rows of a clamped node as weights of those of the body that it is clamped to; None of others."""
+        if handle.name not in self._bodies.owners:
+            return None
+        body = self.carrier(handle)
+        return _attachment_weights(self.position[body], self.rotation[body], *self._bodies.pose(handle.name))
+
+    def weights(self, marker: Marker | Attachment) -> Float[Array, "*m w"]:
+        """Weights of a marker: (4,) of a point or a direction, (4, 4) of an attachment.
+
+        Of a marker between nodes there are four for each of them.
+        """
+        own = self._own_weights(marker)
+        self._check(marker, own)
+        handles = marker.handles if isinstance(marker, Marker) else (marker.body,)
+        held = [self.held(handle) for handle in handles]
+        if all(rows is None for rows in held):
+            return own
+        parts = zip(np.split(np.asarray(own), len(held), axis=-1), held)
+        return as_array(
+            np.concatenate([x if rows is None else x @ np.asarray(rows) for x, rows in parts], -1)
+        )
+
+    def _check(self, marker: Marker | Attachment, own: Array) -> None:
+        """Refuse what a node does not carry along: points have no directions, directors one.
+
+        Raises:
+            ValueError: naming the node, and what it carries.
+        """
+        rotations = self._bodies.rotations_of(marker.body)
+        if rotations == TRIAD or not at_top_level(own):
+            return
+        beyond = np.asarray(own).reshape(-1, 4)[:, 1 if rotations == POINT else 2 :]
+        if np.abs(beyond).max() > 1e-9 * np.abs(np.asarray(own)).max():
+            name = marker.body.name
+            carried = "itself" if rotations == POINT else "itself and its director"
+            kind = "point" if rotations == POINT else "director"
+            raise ValueError(
+                f"{short(marker)}: {name!r} is a {kind} and carries {carried} only; pass nc.Point({name}) or "
+                "join a rigid body to it"
+            )
+
+    def _own_weights(self, marker: Marker | Attachment) -> Float[Array, "*m w"]:
+        if isinstance(marker, Interpolated):
+            row = np.eye(4)[0 if marker.is_point else 1]
+            return as_array(np.kron(np.asarray(marker.vector), row))
+        if isinstance(marker, Attachment):
+            point, axes = as_array(marker.point, float), as_array(marker.axes, float)
+            return _attachment_weights(*self._pose(marker), point, axes)
+        return _marker_weights(*self._pose(marker), as_array(marker.vector, float), marker.is_point)
+
+    def _pose(self, marker: Marker | Attachment) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
+        """Pose of the frame that the vectors of a marker are given relative to."""
+        if not marker.local and marker.body.name in self._bodies.owners:
+            return self._bodies.pose(marker.body.name)
+        body = len(self.names) if marker.local else self.of(marker.body)
+        return self.position[body], self.rotation[body]
+
+
+def _weights(
+    position: Float[Array, "3"], rotation: Float[Array, "3 3"], vector: Float[Array, "3"], is_point: bool
+) -> Float[Array, "4"]:
+    """Weights of the material point at a world position, or of the direction along a world vector."""
+    local = rotation.T @ (vector - position if is_point else vector)
+    return jnp.concatenate([jnp.full(1, 1.0 if is_point else 0.0), local])
+
+
+def _pose_weights(position, rotation, point: Array, triad: Array) -> Float[Array, "4 4"]:
+    """Weights of a point and of three directions, one a row."""
+    directions = [_weights(position, rotation, axis, False) for axis in triad]
+    return jnp.stack([_weights(position, rotation, point, True), *directions])
+
+
+_marker_weights = eager_numpy(_weights)
+
+
+@eager_numpy
+def _attachment_weights(position, rotation, point: Array, axes: Float[Array, "3 3"]) -> Float[Array, "4 4"]:
+    return _pose_weights(position, rotation, point, axes.T)
+
+
+@eager_numpy
+def _joint_weights(joint: Joint, positions, rotations, points, triad) -> Float[Array, "2 4 4"]:
+    turned, shift = joint.zeroed(triad)
+    given = zip(positions, rotations, (points[0] + shift, points[1]), (turned, triad))
+    return jnp.stack([_pose_weights(*pose) for pose in given])
+
+
+_triad = eager_numpy(frame_from_axis)
+
+
+def joint_triad(joint: Joint) -> Float[Array, "3 3"]:
+    """The triad of the joint in the assembled pose, one vector a row."""
+    axis, second = (None if x is None else as_array(x, float) for x in (joint.axis, joint.second))
+    return _triad(axis, second)
+
+
+def joint_frames(joint: Joint, poses: Poses) -> Float[Array, "2 4 4"]:
+    """Weights of point and triad on parent and child (44-47)."""
+    parent, child = poses.of(joint.parent), poses.of(joint.child)
+    triad = joint_triad(joint)
+    at_parent, at_child = joint.anchors()
+    at_parent = poses.position[parent if joint.apart else child] if at_parent is None else at_parent
+    at_child = poses.position[child] if at_child is None else at_child
+    positions, rotations = zip(*((poses.position[b], poses.rotation[b]) for b in (parent, child)))
+    points = as_array(at_parent, float), as_array(at_child, float)
+    return _joint_weights(joint, positions, rotations, points, triad)

@@ -1,0 +1,107 @@
+"""Groups of equal kinds of effects and of joint coordinates, stacked."""
+
+from collections.abc import Sequence
+from typing import ClassVar
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from natcoord_jax.core.callables import Stacked
+from natcoord_jax.core.coordinate import Coordinate
+from natcoord_jax.core.effect import Effect
+from natcoord_jax.core.names import Names
+from natcoord_jax.model.segment_sum import SegmentSum
+
+
+class Group(Stacked):
+    """All instances of one kind of effect, stacked.
+
+    Attributes:
+        effect: the effect with stacked numbers.
+        weights: marker weights (n, k, 4), or (n, k, 4, 4) of attachments, of effects on markers, else None.
+        bodies: bodies of each instance; the number of bodies stands for the ground.
+        joints: joints of effects that sit on joints.
+        inputs: input channels.
+        coordinates: joint coordinates in the state.
+        rotors: stored rates in the state.
+        works: entries of the work account.
+        acting: how bodies collect what acts on them.
+        count: number of instances.
+        names: of the instances.
+        in_tree: joints of the spanning tree, whose multipliers are not needed.
+        source: where the place of the effect comes from: "markers", "joint", "coordinates" or "mass".
+        turning: whether any of the bodies turns; points do not.
+    """
+
+    effect: Effect
+    weights: Float[Array, "n k *m 4"] | None
+    bodies: Int[Array | np.ndarray, "n k"]
+    joints: Int[Array | np.ndarray, "n j"]
+    inputs: Int[Array | np.ndarray, "n i"]
+    coordinates: Int[Array | np.ndarray, "n c"]
+    rotors: Int[Array | np.ndarray, "n r"]
+    works: Int[Array | np.ndarray, "n w"]
+    acting: SegmentSum
+    count: int = eqx.field(static=True)
+    names: Sequence[str] = eqx.field(static=True)
+    source: str = eqx.field(static=True)
+    in_tree: bool = eqx.field(static=True, default=False)
+    turning: bool = eqx.field(static=True, default=True)
+
+    stacked: ClassVar[str] = "effect"
+
+    @property
+    def lanes(self) -> tuple[int, ...]:
+        """Instances, where each has numbers of its own, after the systems of a batch."""
+        batch = np.shape(self.bodies)[:-2]
+        return batch if self.effect.shared or self.source == "mass" else (*batch, self.count)
+
+    @property
+    def is_set(self) -> bool:
+        """Whether they were added as a set, which has one name and one account."""
+        return isinstance(self.names, Names)
+
+    @property
+    def labels(self) -> Sequence[str]:
+        """Names of the instances; of a set its own."""
+        return [name for name, _ in self.names.runs] if isinstance(self.names, Names) else self.names
+
+    @property
+    def multipliers(self) -> int:
+        """Multipliers of one instance and stage."""
+        return self.effect.multipliers
+
+    @property
+    def holds(self) -> bool:
+        """Whether they are of equations, which hold at any time."""
+        return self.multipliers > 0 and not self.effect.unilateral
+
+
+class CoordinateGroup(eqx.Module):
+    """Joint coordinates of one description: joints, their bodies and places in the state."""
+
+    axis: Coordinate = eqx.field(static=True)
+    joints: Int[Array | np.ndarray, " n"]
+    index: Int[Array | np.ndarray, " n"]
+
+
+class Seats(eqx.Module):
+    """Nodes and parents of the instances of a group, whose blocks they collect."""
+
+    nodes: SegmentSum
+    parents: SegmentSum
+
+
+class Elimination(eqx.Module):
+    """Places in the nodes of the tree for recursive elimination.
+
+    Attributes:
+        slots: multipliers of each node, padded with their total number.
+        places: of each multiplier, in the flattened slots.
+        seats: of the instances of each effect group.
+    """
+
+    slots: Int[Array | np.ndarray, "bodies m"]
+    places: Int[Array | np.ndarray, " multipliers"]
+    seats: tuple[Seats, ...]

@@ -1,0 +1,353 @@
+"""The layout of a system: numbers of bodies, joints, coordinates and channels, and the initial state."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from natcoord_jax.core.bodies import DIRECTOR, TRIAD
+from natcoord_jax.core.checks import as_array, is_concrete
+from natcoord_jax.core.coordinate import Coordinate, CoordinateEffect
+from natcoord_jax.core.eager_numpy import eager_numpy, stacked
+from natcoord_jax.core.effect import Effect, replace_fields
+from natcoord_jax.core.force import Field
+from natcoord_jax.core.handles import Handle, ground
+from natcoord_jax.core.joint import Joint, frames_at
+from natcoord_jax.core.markers import Attachment, Marker
+from natcoord_jax.core.names import names_of
+from natcoord_jax.core.potential import place_markers
+from natcoord_jax.core.state import State
+from natcoord_jax.model.assembled_poses import Poses, joint_frames, joint_triad
+from natcoord_jax.model.bodies import Bodies
+from natcoord_jax.model.graph import Edge, spanning_tree
+from natcoord_jax.model.grouping import Instance, bare, families
+from natcoord_jax.model.groups import CoordinateGroup
+from natcoord_jax.model.rows import row_rates
+from natcoord_jax.xla.tracing import at_top_level
+
+JOINT_FIELDS = ("parent", "child", "point", "axis", "second", "name", "parent_point")
+
+
+def _edge(joint: Joint, poses: Poses, sets: int) -> Edge:
+    pair = poses.of(joint.parent), poses.of(joint.child)
+    # Nodes of sets are free: what joins them keeps its multipliers.
+    free = joint.free and min(pair) >= sets
+    return Edge(*pair, joint.rotations, joint.translations, joint.child_rotation, free)
+
+
+def _couplings(effects: dict[str, Effect], poses: Poses, sets: int) -> list[tuple[int, int]]:
+    """Pairs of neighbouring bodies of the effects that make neighbours of them, but for nodes of sets."""
+    found = []
+    for effect in effects.values():
+        if effect.couples:
+            markers: Any = getattr(effect, "markers", ())
+            listed = [poses.carrier(handle) for m in markers for handle in getattr(m, "handles", (m.body,))]
+            found += [pair for pair in pairwise(listed) if min(pair) >= sets]
+    return found
+
+
+class Layout:
+    """Numbers of everything: bodies along the tree, joints with those of the tree first, channels."""
+
+    def __init__(self, bodies: Bodies, joints: dict[str, Joint], effects: dict[str, Effect]):
+        self.bodies, self.joints = bodies, joints
+        self.poses = Poses(bodies)
+        self.names = list(joints)
+        self.edges = [_edge(j, self.poses, bodies.sets) for j in joints.values()]
+        couplings = _couplings(effects, self.poses, bodies.sets)
+        self.spanning = spanning_tree(len(bodies), self.edges, couplings, bodies.sets)
+        self.order = np.array(self.spanning.order, int)
+        self.body_number = np.argsort(np.append(self.order, len(bodies)))
+        carriers = self.spanning.carrier
+        loops = [j for j in range(len(self.names)) if j not in carriers]
+        self.joint_order = [*carriers, *loops]
+        self.joint_number = {self.names[j]: i for i, j in enumerate(self.joint_order) if j >= 0}
+        self.coordinates: list[tuple[str, int, Coordinate]] = []
+        for name, joint in joints.items():
+            self.coordinates += [(name, k, axis) for k, axis in enumerate(joint.coordinates)]
+        self.coordinate_number = {(name, k): i for i, (name, k, _) in enumerate(self.coordinates)}
+        self.inputs: list[str] = []
+        self.works: list[str] = []
+        self.rotors: list[int] = []
+
+    def body(self, handle: Handle) -> int:
+        """Number of a body in the system."""
+        return int(self.body_number[self.poses.of(handle)])
+
+    def nodes(self, name: str) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n 4 4"]]:
+        """Of all nodes of a set their body's number in the scene, and their rows as weights of its rows."""
+        numbers = self.bodies.places(name)
+        rows = np.broadcast_to(np.eye(4), (len(numbers), 4, 4)).copy()
+        for members, owner in self.bodies.clamped(name):
+            numbers[members] = self.poses.of(owner)
+            for k in members:
+                held = self.poses.held(Handle("body", f"{name}[{k}]", owner.scene))
+                if not is_concrete(held):
+                    raise ValueError(
+                        f"nodes {name!r}: some are clamped, and the scene is compiled in a traced function; "
+                        "compile it outside of jit and grad, and pass what varies by system.set"
+                    )
+                rows[k] = np.asarray(held)
+        return numbers, rows
+
+    def masses(self) -> Float[Array, "bodies 4 4"]:
+        """Mass blocks of the bodies, with those of what is clamped to them, in the order of the system."""
+        found = self.bodies.every("mass_block")
+        for name, clamps in ((name, self.bodies.clamped(name)) for name in self.bodies.with_clamps):
+            for members, owner in clamps:
+                if owner != ground:
+                    rows, own = self.nodes(name)[1][members], self.bodies.node_masses(name, members)
+                    found = _with_masses(found, as_array(self.poses.of(owner)), as_array(rows), own)
+        return as_array(np.asarray(found)[self.order]) if at_top_level(found) else found[self.order]
+
+    def every(self, field: str) -> Array:
+        """A field of all bodies, in the order of the system."""
+        found = self.bodies.every(field)
+        return as_array(np.asarray(found)[self.order]) if at_top_level(found) else found[self.order]
+
+    @property
+    def rotations(self) -> list[tuple[int, ...]]:
+        """Own axes about which the bodies turn, in the order of the system."""
+        return [self.bodies.rotations[k] for k in self.order]
+
+    @property
+    def ordered_names(self) -> Sequence[str]:
+        """Names of the bodies, in the order of the system: sets come first there, too."""
+        sets = [run for run in self.bodies.runs if run[1] is not None]
+        return names_of([*sets, *((self.bodies.names[int(k)], None) for k in self.order[self.bodies.sets :])])
+
+    @property
+    def ordered_joints(self) -> Sequence[str]:
+        """Names of the joints, those of the tree first; none of free bodies."""
+        sets = self.bodies.sets
+        names = [(self.names[j] if j >= 0 else "", None) for j in self.joint_order[sets:]]
+        return names_of([("", (range(sets),)), *names] if sets else names)
+
+    def motions(self) -> list[Edge]:
+        """Free motion of each body relative to its parent in the tree."""
+        motions = []
+        for own, carrier in zip(self.rotations, self.spanning.carrier):
+            every = tuple(range(3))
+            edge = self.edges[carrier] if carrier >= 0 else Edge(0, 0, every, every, False, True)
+            if own != TRIAD:
+                rotations = own if carrier < 0 else ()
+                edge = replace(edge, rotations=rotations, child_rotation=False, own_axes=bool(rotations))
+            motions.append(edge)
+        return motions
+
+    def frames(self) -> Float[Array, "joints 2 4 4"]:
+        """Frames of all joints; a free body's coincide with its reference frame and the ground's."""
+        free = as_array(np.stack([np.eye(4)] * 2))
+        listed = list(self.joints.values())
+        return stacked([joint_frames(listed[j], self.poses) if j >= 0 else free for j in self.joint_order])
+
+    def joint_bodies(self) -> np.ndarray:
+        """Parent and child of every joint, as the scene names them."""
+        rows = []
+        for number, j in enumerate(self.joint_order):
+            if j >= 0:
+                edge = self.edges[j]
+                rows.append([self.body_number[edge.parent], self.body_number[edge.child]])
+            else:
+                rows.append([len(self.bodies), number])
+        return np.array(rows, np.int32).reshape(-1, 2)
+
+    def joint_instances(self) -> list[Instance]:
+        """Constraints of all joints."""
+        instances = []
+        for name, joint in self.joints.items():
+            self._check_joint(name, joint)
+            frames = _frames_at(joint_frames(joint, self.poses), self._rows(joint.parent, joint.child))
+            ready = joint.initialise(*frames)
+            instances.append(
+                Instance(
+                    name,
+                    bare(ready, JOINT_FIELDS, f"joint {name!r}"),
+                    "joint",
+                    [self.body(joint.parent), self.body(joint.child)],
+                    joints=[self.joint_number[name]],
+                    in_tree=self.joint_number[name] < len(self.bodies),
+                )
+            )
+        return instances
+
+    def _check_joint(self, name: str, joint: Joint) -> None:
+        """Refuse joints of directors that need more axes than these have.
+
+        Raises:
+            ValueError: naming joint and node.
+        """
+        for handle in (joint.parent, joint.child):
+            # A ball joint and a distance are between points; all others hold axes, a fixed one, too.
+            axes = joint.needs_axis or joint.multipliers > 3
+            if axes and self.bodies.rotations_of(handle) == DIRECTOR:
+                kind = type(joint).__name__
+                raise ValueError(
+                    f"joint {name!r}: {handle.name!r} has a director only, no axes that a {kind} joint could "
+                    "hold; clamp it to a rigid body (nc.Clamp) and join that"
+                )
+
+    def _rows(self, *handles: Handle) -> Float[Array, "n 4 3"]:
+        """Rows of bodies in the assembled pose."""
+        return self.rows_at(np.array([self.poses.of(handle) for handle in handles]))
+
+    def rows_at(self, numbers: np.ndarray) -> Float[Array, "*n 4 3"]:
+        """The same by their numbers in the scene."""
+        flat = numbers.reshape(-1)
+        given = (self.poses.position, self.poses.rotation)
+        picked = (as_array(np.asarray(x)[flat]) if at_top_level(x) else x[flat] for x in given)
+        return _rows(*picked).reshape(*numbers.shape, 4, 3)
+
+    def effect_instance(self, name: str, effect: Effect) -> Instance:
+        """Where an effect sits, and its channels."""
+        label = f"effect {name!r}"
+        if isinstance(effect, Field):
+            instance = Instance(name, bare(effect, ("name",), label), "mass", [])
+        elif isinstance(effect, CoordinateEffect):
+            instance = self._on_coordinates(name, effect, label)
+        else:
+            instance = self._on_markers(name, effect, label)
+        count = effect.inputs
+        instance.inputs = list(range(len(self.inputs), len(self.inputs) + count))
+        self.inputs += [name] if count == 1 else [f"{name}[{k}]" for k in range(count)]
+        return instance
+
+    def _angles(self) -> Float[Array, " coordinates"]:
+        """Joint coordinates in the assembled pose, as far as they are angles."""
+        found = [self.joints[name].assembled(k) for name, k, _ in self.coordinates]
+        return stacked([as_array(x, float) for x in found]) if found else as_array(np.zeros(0))
+
+    def number_accounts(self, instances: list[Instance]) -> None:
+        """Places in the work account and among the stored rates: one piece of the state for each group."""
+        for instance in (x for family in families(instances) for x in family):
+            if instance.effect.works:
+                instance.works = [len(self.works)]
+                self.works.append(instance.name)
+            if instance.effect.rotors:
+                instance.rotors = [len(self.rotors)]
+                self.rotors += instance.coordinates
+
+    def _on_markers(self, name: str, effect: Any, label: str) -> Instance:
+        markers = effect.attach(
+            lambda handle: (self.joints[handle.name], joint_triad(self.joints[handle.name]))
+        )
+        kinds = Marker, Attachment
+        if not isinstance(markers, tuple | list) or not any(
+            all(isinstance(m, kind) for m in markers) for kind in kinds
+        ):
+            raise ValueError(
+                f"{label}: markers must be a tuple of nc.Point and nc.Direction, or one of nc.Attachment, "
+                f"not {markers!r}"
+            )
+        weights, bodies = self._weighted(markers)
+        if type(effect).assembled_at is not Effect.assembled_at:
+            effect = effect.assembled_at(_place_markers(weights, self.rows_at(np.array(bodies))))
+        drop = [f for f in ("markers", "name", "joint") if f in type(effect).__dataclass_fields__]
+        numbers = [int(self.body_number[b]) for b in bodies]
+        return Instance(name, bare(effect, drop, label), "markers", numbers, weights=weights)
+
+    def _weighted(self, markers: Any) -> tuple[Array, list[int]]:
+        """Weights of markers (k, ..., 4 b), and numbers in the scene of the b bodies of each in turn.
+
+        What has fewer bodies than others has the ground for the rest, without weight.
+        """
+        own = [[self.poses.carrier(handle) for handle in getattr(m, "handles", (m.body,))] for m in markers]
+        most = max(map(len, own))
+        weights = [self.poses.weights(m) for m in markers]
+        if most > 1:
+            weights = [_padded(w, 4 * most) for w in weights]
+        rest = len(self.bodies)
+        return stacked(weights), [b for x in own for b in (*x, *(rest,) * (most - len(x)))]
+
+    def _on_coordinates(self, name: str, effect: CoordinateEffect, label: str) -> Instance:
+        many = isinstance(effect.joint, tuple)
+        handles = effect.joint if many else (effect.joint,)
+        given = effect.coordinate
+        indices = given if isinstance(given, tuple | list) else (given,) * len(handles)
+        if len(indices) != len(handles):
+            raise ValueError(
+                f"{label}: {len(indices)} coordinate indices for {len(handles)} joints; pass one for each, "
+                "or one integer for all"
+            )
+        numbers, bodies, axes = [], [], []
+        for handle, index in zip(handles, indices):
+            joint = self.joints[handle.name]
+            if not 0 <= index < len(joint.coordinates):
+                raise ValueError(
+                    f"{label}: joint {handle.name!r} has {len(joint.coordinates)} coordinates, "
+                    f"no number {index}; a {type(joint).__name__} joint counts them from 0"
+                )
+            numbers.append(self.coordinate_number[(handle.name, index)])
+            bodies += [self.body(joint.parent), self.body(joint.child)]
+            axes.append(joint.coordinates[index])
+        stripped = bare(replace_fields(effect, axes=tuple(axes)), ("joint", "coordinate", "name"), label)
+        joints = [self.joint_number[h.name] for h in handles]
+        return Instance(name, stripped, "coordinates", bodies, joints=joints, coordinates=numbers)
+
+    def coordinate_groups(self) -> tuple[CoordinateGroup, ...]:
+        """Joint coordinates by description."""
+        families: dict[Coordinate, list[int]] = {}
+        for i, (_, _, axis) in enumerate(self.coordinates):
+            families.setdefault(axis, []).append(i)
+        groups = []
+        for axis, members in families.items():
+            joints = [self.joint_number[self.coordinates[i][0]] for i in members]
+            groups.append(CoordinateGroup(axis, np.array(joints, np.int32), np.array(members, np.int32)))
+        return tuple(groups)
+
+    def coordinate_order(self) -> np.ndarray:
+        """Place of each coordinate among those of all groups, one group after the other."""
+        listed = [group.index for group in self.coordinate_groups()]
+        return np.argsort(np.concatenate([np.zeros(0, np.int32), *listed])).astype(np.int32)
+
+    def state(self) -> State:
+        """Initial state: coordinates count from the assembled pose."""
+        q, v = _rows_and_velocities(*(self.every(name) for name in MOTION))
+        return State(
+            as_array(0.0),
+            q,
+            v,
+            self._angles(),
+            *(as_array(np.zeros(len(x))) for x in (self.rotors, self.works)),
+        )
+
+
+MOTION = "position", "rotation", "velocity", "angular_velocity"
+"""What the rows of a body and their velocities are made of."""
+
+_frames_at = eager_numpy(frames_at)
+
+
+@eager_numpy
+def _with_masses(
+    blocks: Array, body: Array, rows: Float[Array, "n 4 4"], own: Float[Array, "n 4 4"]
+) -> Array:
+    return blocks.at[body].add(jnp.einsum("nai,nab,nbj->ij", rows, own, rows))
+
+
+@eager_numpy
+def _padded(weights: Float[Array, "*m w"], width: int) -> Float[Array, "*m width"]:
+    return jnp.concatenate([weights, jnp.zeros((*weights.shape[:-1], width - weights.shape[-1]))], axis=-1)
+
+
+_place_markers = eager_numpy(place_markers)
+
+
+def _stacked_rows(points: Float[Array, "n 3"], rotations: Float[Array, "n 3 3"]) -> Float[Array, "n 4 3"]:
+    return jnp.concatenate([points[:, None], rotations.swapaxes(1, 2)], axis=1)
+
+
+_rows = eager_numpy(_stacked_rows)
+
+
+@eager_numpy
+def _rows_and_velocities(
+    points: Array, rotations: Array, velocities: Array, spins: Array
+) -> tuple[Float[Array, "rows 3"], Float[Array, "rows 3"]]:
+    rows = _stacked_rows(points, rotations)
+    rates = row_rates(rows, velocities, spins)
+    return rows.reshape(-1, 3), rates.reshape(-1, 3)

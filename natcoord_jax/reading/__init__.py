@@ -1,0 +1,1 @@
+"""What is read of a motion: energies, sensors, accelerations and reactions, errors, reports."""

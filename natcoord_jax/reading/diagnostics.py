@@ -1,0 +1,148 @@
+"""Energies, momenta and constraint errors of a state or of a whole trajectory, and how a run ended."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from natcoord_jax.core.checks import require_double
+from natcoord_jax.core.results import REASONS, REMEDIES, Result, SimulationError
+from natcoord_jax.core.state import State, Trajectory
+from natcoord_jax.mechanics.energies import body_momenta, group_energies
+from natcoord_jax.model.model import Model
+from natcoord_jax.model.rows import over_states
+
+
+class Energy(eqx.Module):
+    """Energies of a state, or along a trajectory [J].
+
+    Attributes:
+        kinetic: of the bodies (1).
+        stores: stored energy by name of the effect: springs, gravity, rotors.
+    """
+
+    kinetic: Float[Array, "*t"]
+    stores: dict[str, Float[Array, "*t"]]
+
+    @property
+    def potential(self) -> Float[Array, "*t"]:
+        """Sum of the stores."""
+        require_double("Energy.potential")
+        return sum(self.stores.values(), jnp.zeros_like(self.kinetic))
+
+    @property
+    def total(self) -> Float[Array, "*t"]:
+        """Kinetic energy and stores."""
+        require_double("Energy.total")
+        return self.kinetic + self.potential
+
+
+@over_states
+def energy(system: Model, state: State) -> Energy:
+    """Energies (1) and stores."""
+    v = state.v.reshape(-1, 4, 3)
+    kinetic = 0.5 * jnp.sum(system.mass[..., None] * v[:, :, None] * v[:, None])
+    stores = {}
+    for group in system.effects:
+        if group.effect.stores:
+            values = group_energies(system, group, state)
+            if len(group.labels) < values.shape[0]:
+                values = jnp.sum(values)[None]
+            stores |= dict(zip(group.labels, values))
+    return Energy(kinetic, stores)
+
+
+@over_states
+def momentum(system: Model, state: State) -> Float[Array, "3"]:
+    """Momentum."""
+    return jnp.sum(body_momenta(system, state)[0], axis=0)
+
+
+@over_states
+def angular_momentum(system: Model, state: State) -> Float[Array, "3"]:
+    """Angular momentum about the origin (55)."""
+    return jnp.sum(body_momenta(system, state)[1], axis=0)
+
+
+def unknown_name(system: Model, index: int, stages: int = 1) -> str:
+    """Name of the part that an unknown of the equations of a step with so many stages belongs to."""
+    structure = system.structure
+    if index < structure.unknowns * stages:
+        body = int(np.asarray(system.tree.slot_of)[index % structure.unknowns]) // 7
+        joint = structure.joints[body]
+        return f"joint {joint!r}" if joint else f"body {structure.bodies[body]!r}"
+    index -= structure.unknowns * stages
+    for group in (*system.effects, *(g for g in system.joints if not g.in_tree)):
+        each = stages * group.multipliers
+        if index < group.count * each:
+            return f"{group.effect.kind} {group.names[index // each]!r}"
+        index -= group.count * each
+    return "an unknown"
+
+
+def explain(system: Model, trajectory: Trajectory) -> str:
+    """How a run ended, in words: result, step, time, and the part with the worst residual by name.
+
+    Of a batch, how many lanes failed for which reason at which part, and the first of each.
+    """
+    if np.ndim(trajectory.result):
+        return _explain_lanes(system, trajectory)
+    result = Result(int(trajectory.result))
+    if result == Result.SUCCESSFUL:
+        return REASONS[result]
+    where = f" in step {int(trajectory.failed_step)} at t = {float(trajectory.failed_time):.6g} s"
+    return REASONS[result] + where + _culprit(system, trajectory) + _remedy(result)
+
+
+def _remedy(result: Result) -> str:
+    return f"; {REMEDIES[result]}" if result in REMEDIES else ""
+
+
+def _culprit(system: Model, trajectory: Trajectory) -> str:
+    """The part that a run failed at, as far as it is known."""
+    result = Result(int(trajectory.result))
+    # The first interval without an end holds the inputs of the step that failed.
+    failed = int(np.argmax(np.diff(np.asarray(trajectory.t)) == 0))
+    broken = ~np.isfinite(np.asarray(trajectory.inputs)[failed])
+    if result == Result.NONFINITE and broken.any():
+        # Such a number spoils all unknowns of the step, of which the first would be named.
+        names = [repr(name) for name, bad in zip(system.structure.inputs, broken) if bad]
+        return f"; not finite: the input {', '.join(names)}"
+    if int(trajectory.failed_part) >= 0:
+        stages = trajectory.scheme.stages if trajectory.scheme is not None else 1
+        return f"; worst residual at {unknown_name(system, int(trajectory.failed_part), stages)}"
+    return ""
+
+
+def _explain_lanes(system: Model, batch: Trajectory) -> str:
+    """A line for each reason and part, the most frequent first."""
+    batch = jax.tree.map(np.asarray, batch)
+    shape = batch.result.shape
+    found: dict[tuple[Result, str], list[tuple[int, ...]]] = {}
+    for place in np.ndindex(*shape):
+        result = Result(int(batch.result[place]))
+        if result != Result.SUCCESSFUL:
+            lane = jax.tree.map(lambda x, place=place: x[place], batch)
+            found.setdefault((result, _culprit(system, lane)), []).append(place)
+    failed = sum(len(lanes) for (result, _), lanes in found.items() if not result.ok)
+    lines = [f"{failed or 'none'} of {batch.result.size} lanes failed"]
+    for (result, culprit), lanes in sorted(found.items(), key=lambda item: -len(item[1])):
+        first = lanes[0]
+        name = first[0] if len(first) == 1 else first
+        step, t = int(batch.failed_step[first]), float(batch.failed_time[first])
+        at = f"first lane {name} in step {step} at t = {t:.6g} s"
+        lines.append(f"{len(lanes)}: {REASONS[result]}{culprit}; {at}{_remedy(result)}")
+    return "\n".join(lines)
+
+
+def raise_on_failure(system: Model, trajectory: Trajectory) -> None:
+    """Raise for a concrete trajectory that failed.
+
+    Raises:
+        SimulationError: with step, time, the worst part by name and the remedy.
+    """
+    codes = np.asarray(trajectory.result)
+    bad = [int(c) for c in codes.reshape(-1) if not Result(int(c)).ok]
+    if bad:
+        raise SimulationError(explain(system, trajectory), Result(bad[0]), trajectory)

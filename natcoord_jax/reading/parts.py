@@ -1,0 +1,289 @@
+"""Numbers of the parts of a system, by name: read, and set in a copy."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from natcoord_jax.core.arguments import DECLARED
+from natcoord_jax.core.checks import as_array, is_concrete
+from natcoord_jax.core.eager_numpy import eager_numpy
+from natcoord_jax.core.effect import Effect, replace_fields
+from natcoord_jax.core.flaws import first_flaw
+from natcoord_jax.core.handles import Handle
+from natcoord_jax.core.names import listed
+from natcoord_jax.model.groups import Group
+from natcoord_jax.model.masses import with_masses
+from natcoord_jax.model.model import Model, SomeModel
+
+Names = Handle | str | Sequence[Handle | str]
+
+BODY = "mass", "com", "inertia"
+"""What the mass block of a body is made of."""
+
+
+class Place(NamedTuple):
+    """Where a number of a part is: the leaf of the system, its row (None: all of it), and the part's kind."""
+
+    leaf: int
+    row: int | None
+    kind: str
+
+
+def _names(part: Names) -> tuple[str, ...]:
+    listed = [part] if isinstance(part, Handle | str) else part
+    return tuple(x.name if isinstance(x, Handle) else x for x in listed)
+
+
+def _numbered(system: SomeModel) -> SomeModel:
+    """The system with the numbers of its leaves instead of these."""
+    leaves, structure = jax.tree.flatten(system)
+    return jax.tree.unflatten(structure, range(len(leaves)))
+
+
+def _in_group(group: Group, numbered: Group, name: str) -> dict[str, Place]:
+    """Floating numbers of an effect, or of the relation of a joint."""
+    row = group.names.index(name) if group.lanes and name in group.names else None
+    kind = f"{group.effect.kind} {name!r}"
+    paths, _ = jax.tree_util.tree_flatten_with_path(group.effect)
+    leaves = jax.tree.leaves(numbered.effect)
+    found = {
+        jax.tree_util.keystr(path, simple=True, separator="."): Place(leaf, row, kind)
+        for (path, value), leaf in zip(paths, leaves, strict=True)
+        if eqx.is_inexact_array(value)
+    }
+    if group.weights is not None:
+        leaf: Any = numbered.weights
+        found["weights"] = Place(leaf, row, kind)
+    return found
+
+
+def places(system: Model, name: str) -> dict[str, Place]:
+    """Where the numbers of a part are, by name of its field.
+
+    Raises:
+        ValueError: for a name that is no part of the system.
+    """
+    numbered, structure = _numbered(system), system.structure
+    found: dict[str, Place] = {}
+    if name in structure.bodies:
+        leaf: Any = numbered.mass
+        return {"mass_block": Place(leaf, structure.bodies.index(name), f"body {name!r}")}
+    if name and name in structure.joints:
+        leaf = numbered.frames
+        found["frames"] = Place(leaf, structure.joints.index(name), f"joint {name!r}")
+    groups = zip((*system.joints, *system.effects), (*numbered.joints, *numbered.effects), strict=True)
+    for group, same in groups:
+        if name in group.names or name in group.labels:
+            return found | _in_group(group, same, name)
+    joints = [n for n in structure.joints if n]
+    bodies, effects = listed(structure.bodies), [n for g in system.effects for n in listed(g.names)]
+    raise ValueError(
+        f"this system has no part {name!r}; it has the bodies {bodies}, the joints {joints} "
+        f"and the effects {effects}"
+    )
+
+
+def _fields(system: Model, name: str, found: dict[str, Place]) -> list[str]:
+    """What can be read and set of a part."""
+    if "mass_block" not in found:
+        return list(found)
+    index = system.structure.bodies.index(name)
+    return ["mass_block", *BODY[: 1 if index in system.structure.points else 3]]
+
+
+def _value(system: Model, place: Place) -> Array:
+    leaf = jnp.asarray(jax.tree.leaves(system)[place.leaf])
+    return leaf if place.row is None else leaf[place.row]
+
+
+@eager_numpy
+def _parted(block: Float[Array, "4 4"]) -> dict[str, Array]:
+    """Mass [kg], centre of mass [m] and inertia about it [kg m^2] of a mass block (15)."""
+    mass = block[0, 0]
+    known = mass != 0
+    com = jnp.where(known, block[0, 1:] / jnp.where(known, mass, 1.0), 0.0)
+    moment = block[1:, 1:] - mass * jnp.outer(com, com)
+    return {"mass": mass, "com": com, "inertia": jnp.trace(moment) * jnp.eye(3) - moment}
+
+
+@eager_numpy
+def _block(mass: Array, com: Float[Array, "3"], inertia: Float[Array, "3 3"]) -> Float[Array, "4 4"]:
+    """The mass block (15) of these."""
+    moment = 0.5 * jnp.trace(inertia) * jnp.eye(3) - inertia + mass * jnp.outer(com, com)
+    first = mass * com
+    return jnp.block([[mass[None, None], first[None]], [first[:, None], moment]])
+
+
+@eager_numpy
+def _for_all(value: Array, shape: tuple[int, ...]) -> Array:
+    return jnp.broadcast_to(value, shape)
+
+
+@eager_numpy
+def _with_row(leaf: Array, row: int | None, value: Array) -> Array:
+    return value if row is None else leaf.at[row].set(value)
+
+
+@eager_numpy
+def _diagonal(values: Float[Array, "3"]) -> Float[Array, "3 3"]:
+    return jnp.diag(values)
+
+
+def get(system: Model, part: Names, field: str | None = None) -> Any:
+    """Numbers of a part, or one of them; see `System.get`."""
+    if not isinstance(part, Handle | str):
+        each = [get(system, name, field) for name in _names(part)]
+        return jax.tree.map(lambda *x: jnp.stack(x), *each)
+    (name,) = _names(part)
+    found = places(system, name)
+    known = _fields(system, name, found)
+    values = {key: _value(system, place) for key, place in found.items()}
+    if "mass_block" in found:
+        values |= _parted(values["mass_block"])
+    values = {key: values[key] for key in known}
+    if field is None:
+        return values
+    field = _whole_name(field, known)
+    _check(name, known, field, next(iter(found.values()), None))
+    return values[field]
+
+
+def set_numbers(system: SomeModel, part: Names, values: dict[str, Any]) -> SomeModel:
+    """A copy with other numbers in a part or in several; see `System.set`."""
+    names = _names(part)
+    many = not isinstance(part, Handle | str)
+    if not values:
+        raise ValueError(f"nothing to set in {list(names)}: pass numbers by the name of their field")
+    for k, name in enumerate(names):
+        found = places(system, name)
+        known = _fields(system, name, found)
+        kind = next(iter(found.values()), None)
+        now = get(system, name)
+        given = {}
+        for field, value in ((_whole_name(field, known), value) for field, value in values.items()):
+            _check(name, known, field, kind)
+            label = f"{name!r}: {field}"
+            every = found[field].row is None if field in found else False
+            given[field] = _fitting(value, now[field], k if many else None, len(names), label, every=every)
+        if "mass_block" in found:
+            given = _as_block(name, now, given)
+        leaves, structure = jax.tree.flatten(system)
+        for field, value in given.items():
+            leaf, row, _ = found[field]
+            leaves[leaf] = _with_row(jnp.asarray(leaves[leaf]), row, value)
+        system = _renewed(system, jax.tree.unflatten(structure, leaves), name, set(given))
+        _check_signs(system, name, given)
+    return system
+
+
+def _check_signs(after: Model, name: str, given: dict[str, Any]) -> None:
+    """Refuse numbers that an effect would have refused when it was made, and elements that cannot be."""
+    for group in after.effects:
+        if name not in group.names and name not in group.labels:
+            continue
+        for field, value in given.items():
+            kind = _declared(group.effect, field)
+            sign = getattr(kind, "sign", "")
+            if not sign or not is_concrete(value):
+                continue
+            least = float(np.min(np.asarray(value), initial=np.inf))
+            if least < 0 or (least == 0 and sign == "positive"):
+                wanted = "positive numbers" if sign == "positive" else "numbers that are not negative"
+                raise ValueError(f"{group.effect.kind} {name!r}: {field} is {least:g}; pass {wanted}")
+        flaw = first_flaw(group.effect) if group.lanes else None
+        if flaw is not None:
+            number, said = flaw
+            of_them = f"element {number} of " if group.is_set else ""
+            raise ValueError(f"{of_them}{group.effect.kind} {name!r} {said}")
+
+
+def _declared(module: Any, path: str) -> Any:
+    """What a number of a part was declared to be, if it was."""
+    owner, _, rest = path.partition(".")
+    fields = {f.name: f for f in dataclasses.fields(module)}
+    if owner not in fields:
+        return None
+    if rest:
+        inner = getattr(module, owner)
+        return _declared(inner, rest) if dataclasses.is_dataclass(inner) else None
+    return fields[owner].metadata.get(DECLARED)
+
+
+def _renewed(before: Model, after: SomeModel, name: str, given: set[str]) -> SomeModel:
+    """The system with what follows from the numbers of an effect that have been set, masses included."""
+    effects, mass = list(after.effects), after.mass
+    for number, (old, group) in enumerate(zip(before.effects, after.effects)):
+        if name not in group.names and name not in group.labels:
+            continue
+        kind = type(group.effect)
+        if kind.renewed is not Effect.renewed and not given <= {*kind.derived, "weights"}:
+            row = group.names.index(name) if group.lanes and name in group.names else None
+            effects[number] = replace_fields(group, effect=_anew(group.effect, row))
+        mass = with_masses(mass, effects[number], old.effect)
+    return replace_fields(after, effects=tuple(effects), mass=mass)
+
+
+@eager_numpy
+def _anew(effect: Effect, row: int | None) -> Effect:
+    """All instances renewed, or one of them."""
+    if row is None:
+        return jax.vmap(lambda e: e.renewed())(effect)
+    one = jax.tree.map(lambda x: x[row], effect).renewed()
+    return jax.tree.map(lambda x, y: x.at[row].set(y), effect, one)
+
+
+def _as_block(name: str, now: dict[str, Array], given: dict[str, Array]) -> dict[str, Array]:
+    """The mass block of what is given, and of what is kept."""
+    if "mass_block" in given:
+        if len(given) > 1:
+            raise ValueError(f"body {name!r}: pass mass_block, or some of {list(BODY)}, not both")
+        return given
+    if "mass" in given and is_concrete(given["mass"]) and not float(given["mass"]) > 0:
+        raise ValueError(f"body {name!r}: mass [kg] is {float(given['mass']):g}; pass a positive number")
+    if "inertia" not in now:
+        return {"mass_block": now["mass_block"].at[0, 0].set(given["mass"])}
+    return {"mass_block": _block(*(given.get(key, now[key]) for key in BODY))}
+
+
+def _whole_name(field: str, known: list[str]) -> str:
+    """Name of a number of a part: "E" stands for "material.E" where there is no other."""
+    ends = [key for key in known if key.endswith(f".{field}")]
+    return ends[0] if field not in known and len(ends) == 1 else field
+
+
+def _check(name: str, known: list[str], field: str, place: Place | None) -> None:
+    if field not in known:
+        label = repr(name) if place is None else place.kind
+        raise ValueError(
+            f"the {label} has no number {field!r}; it has {known}. What a function closes over is not among "
+            "them: change it where it is, the next call sees it"
+        )
+
+
+def _fitting(value: Any, now: Array, k: int | None, count: int, label: str, *, every: bool = False) -> Array:
+    """A value of the shape of the one that is there; of several parts one for all, or one for each.
+
+    Of a set, `every`, one for all elements will do as well.
+    """
+    array = as_array(value, float)
+    if label.endswith(": inertia") and array.shape[-1:] == (3,) and array.shape in ((3,), (count, 3)):
+        # (Three numbers for three bodies are a matrix, or rows of diagonals: the matrix is square itself.)
+        if array.ndim == 1:
+            array = _diagonal(array)
+        elif k is not None and count != 3:
+            return _diagonal(array[k])
+    if every and k is None and array.shape == now.shape[1:]:
+        array = _for_all(array, now.shape)
+    shapes = [now.shape] + ([(count, *now.shape)] if k is not None else [])
+    if array.shape not in shapes:
+        wanted = " or ".join(map(str, shapes))
+        raise ValueError(f"{label} has shape {array.shape}; pass shape {wanted}")
+    if is_concrete(array) and np.any(np.isnan(np.asarray(array))):
+        raise ValueError(f"{label} is not a number: {np.asarray(array)}; pass finite numbers")
+    return array if array.shape == now.shape else array[k]
