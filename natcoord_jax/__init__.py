@@ -76,6 +76,7 @@ from natcoord_jax.control import (
     regulator,
     to_nlp,
 )
+from natcoord_jax.core.bodies import NodeKind
 from natcoord_jax.core.constraint import Constraint, VelocityConstraint
 from natcoord_jax.core.force import Field, Force, Load
 from natcoord_jax.core.handles import ground
@@ -279,6 +280,7 @@ __all__ = [
     "MembraneTriangle",
     "MeshHandle",
     "Modes",
+    "NodeKind",
     "Nodes",
     "NodeOnFacets",
     "NonlinearBeamElement",

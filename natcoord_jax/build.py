@@ -45,7 +45,7 @@ def build(
     layout = Layout(bodies, joints, effects)
     instances = [layout.effect_instance(name, effect) for name, effect in effects.items()]
     layout.number_accounts(instances)
-    turning = np.array([*map(bool, layout.rotations), False])
+    turning = np.array([*(bool(kind.turns) for kind in layout.kinds), False])
     joint_groups, groups = stack(layout.joint_instances(), turning), stack(instances, turning)
     groups += tuple(element_group(layout, name, part, turning) for name, part in (elements or {}).items())
     tree = make_tree(layout.spanning, layout.motions())
@@ -53,8 +53,7 @@ def build(
     relations = multipliers
     multipliers += sum(g.count * g.multipliers for g in joint_groups if not g.in_tree)
     inequalities = sum(g.count * g.multipliers for g in groups if g.effect.unilateral)
-    # A director is as long as it was: one constraint; a triad has six.
-    internal = sum({3: 6, 2: 1, 0: 0}[len(own)] for own in bodies.rotations)
+    internal = sum(kind.constraints for kind in bodies.kinds)
     structure = Structure(
         bodies=layout.ordered_names,
         joints=layout.ordered_joints,
@@ -66,8 +65,8 @@ def build(
         multipliers=multipliers,
         solver=solver or choose_solver(tree, multipliers, joint_groups, groups, len(bodies)),
         constraints=internal + relations - inequalities + sum(g.count * g.multipliers for g in joint_groups),
-        points=compact([k for k, own in enumerate(layout.rotations) if own == POINT]),
-        directors=compact([k for k, own in enumerate(layout.rotations) if own == DIRECTOR]),
+        points=compact([k for k, own in enumerate(layout.kinds) if own == POINT]),
+        directors=compact([k for k, own in enumerate(layout.kinds) if own == DIRECTOR]),
         inequalities=inequalities,
         dofs=len(tree.slot_of) - multipliers + inequalities,
         shapes=tuple(_drawn(bodies.shapes[k]) for k in layout.order),
@@ -80,7 +79,7 @@ def build(
         layout.frames(),
         layout.joint_bodies(),
         tree,
-        LocalRates.of(layout.rotations),
+        LocalRates.of(layout.kinds),
         joint_groups,
         groups,
         layout.coordinate_groups(),

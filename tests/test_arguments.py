@@ -468,7 +468,8 @@ CALLS = {
 # What calls return or hand over, and bases: nobody is to make these by hand.
 MADE = {
     "Accuracy", "Balance", "BeamHandle", "Check", "ComputedTorque", "Continuation", "DerivativeError",
-    "Equilibrium", "Feedback", "Frame", "Growth", "Load", "MeshHandle", "Modes", "Nodes", "NonlinearProgram",
+    "Equilibrium", "Feedback", "Frame", "Growth", "Load", "MeshHandle", "Modes", "NodeKind", "Nodes",
+    "NonlinearProgram",
     "Optima", "Outcome", "Result", "SimulationError", "Solution", "State", "Steps", "Surface", "Sweep",
     "System",
     "Trajectory",

@@ -1,6 +1,8 @@
 """Nodes and elements by the thousands, shells and solids: handles, statics, modes and conservation."""
 
+import dataclasses
 import time
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -446,3 +448,43 @@ def test_pictures_show_surfaces():
         (skin,) = drawn.skins
         assert skin.faces.shape == (faces, 4) and skin.points.shape[0] == 2
         assert skin.values.shape == (2, faces) and not drawn_bodies(example.system)
+
+
+WHEEL = nc.NodeKind("wheel", turns=(2,), rows=4)
+"""A node of one's own: it moves, and turns about its third axis, which keeps its direction."""
+
+
+def _wheel(node, solver=None):
+    motion: Any = {"com": (0.1, 0.2, 0.0), "velocity": (0.3, 0.0, 0.1), "angular_velocity": (0.0, 0.0, 2.0)}
+    scene, body = nc.Scene(), nc.RigidBody(mass=2.0, inertia=(1.0, 2.0, 3.0), **motion)
+    body = scene.add(dataclasses.replace(body, node=node or body.node))
+    held = nc.Direction(nc.ground, (1, 0, 0)), nc.Direction(nc.ground, (0, 1, 0))
+    if node is None:
+        scene.add(HeldDirector((*held, nc.Direction(body, (0, 0, 1)))))
+    scene.add(nc.Spring((nc.Point(nc.ground, (1, 0, 0)), nc.Point(body, (0, 0.5, 0.1))), stiffness=10.0))
+    return scene.compile(solver=solver)
+
+
+@pytest.mark.parametrize("order", [2, 4])
+def test_a_kind_of_node_of_ones_own(order):
+    """Four rates in all forms of the equations, and the motion of a body whose axis a constraint holds."""
+    scheme, ends = nc.EnergyMomentum(order=order), []
+    for solver in ("reduced", "recursive", "full", "sparse"):
+        system, state = _wheel(WHEEL, solver)
+        assert (system.structure.unknowns, system.structure.dofs) == (4, 4)
+        trajectory = nc.simulate(system, state, dt=0.05, steps=40, scheme=scheme)
+        energy = system.energy(trajectory).total
+        assert np.ptp(energy) < 1e-13 * energy[0]
+        assert system.constraint_errors(trajectory).position.max() < 1e-14
+        assert np.all(trajectory.q[:, 3] == jnp.array([0.0, 0.0, 1.0]))
+        ends.append(trajectory.q[-1])
+    np.testing.assert_allclose(ends[1:], [ends[0]] * 3, atol=1e-11)
+    system, state = _wheel(None)
+    held = nc.simulate(system, state, dt=0.05 / 8, steps=320, scheme=scheme).q[-1]
+    assert np.abs(held - ends[0]).max() < {2: 1e-2, 4: 2e-6}[order]
+
+
+@pytest.mark.parametrize("given", [{"turns": (2, 0)}, {"turns": (3,)}, {"rows": 0}])
+def test_wrong_kinds_of_nodes_are_refused(given):
+    with pytest.raises(ValueError, match="'wheel': a node turns"):
+        nc.NodeKind("wheel", **({"turns": (2,), "rows": 4} | given))

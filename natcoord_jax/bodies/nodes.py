@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.core.arguments import checked
-from natcoord_jax.core.bodies import DIRECTOR, POINT, TRIAD, Body
+from natcoord_jax.core.bodies import DIRECTOR, POINT, TRIAD, Body, NodeKind
 from natcoord_jax.core.checks import as_array, is_concrete
 from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.kinds import NAME
@@ -29,7 +29,7 @@ class Nodes(eqx.Module):
         rotation: directors as columns (n, 3, 3) [-].
         velocity: (n, 3) [m/s].
         angular_velocity: (n, 3) [rad/s].
-        rotations: own axes about which they turn, see `Body`.
+        node: what they carry and how they turn.
         name: of the set, or None.
     """
 
@@ -38,7 +38,7 @@ class Nodes(eqx.Module):
     rotation: Float[Array, "n 3 3"]
     velocity: Float[Array, "n 3"]
     angular_velocity: Float[Array, "n 3"]
-    rotations: tuple[int, ...] = eqx.field(static=True)
+    node: NodeKind = eqx.field(static=True)
     name: str | None = eqx.field(static=True)
 
     def body(self, number: int) -> Body:
@@ -49,7 +49,7 @@ class Nodes(eqx.Module):
             self.rotation[number],
             self.velocity[number],
             self.angular_velocity[number],
-            self.rotations,
+            self.node,
             None,
             None,
         )

@@ -1,5 +1,6 @@
 """What a scene needs to know of a body."""
 
+from dataclasses import dataclass
 from typing import Any
 
 import equinox as eqx
@@ -8,8 +9,56 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.core.eager_numpy import eager_numpy
 
-TRIAD, DIRECTOR, POINT = (0, 1, 2), (1, 2), ()
-"""Axes about which nodes turn."""
+
+@dataclass(frozen=True)
+class NodeKind:
+    """What a node carries, and what of it moves.
+
+    A point moves along three directions; its node turns about some of its own axes besides, the first, second
+    and third director. Rates are counted from that, and all forms of the equations follow it.
+
+    A node of one's own is a body with another kind, `dataclasses.replace(nc.RigidBody(...), node=kind)`.
+
+    Attributes:
+        name: in messages.
+        turns: own axes about which it turns.
+        rows: vectors that it carries: its point, then directors; effects can be on these only.
+
+    Raises:
+        ValueError: for other axes or another number of rows.
+
+    Example:
+        >>> import natcoord_jax as nc
+        >>> wheel = nc.NodeKind("wheel", turns=(2,), rows=4)
+        >>> wheel.rates, wheel.constraints
+        (4, 8)
+    """
+
+    name: str
+    turns: tuple[int, ...]
+    rows: int
+
+    def __post_init__(self) -> None:
+        if sorted({*self.turns} & {0, 1, 2}) != list(self.turns) or not 1 <= self.rows <= 4:
+            raise ValueError(
+                f"NodeKind {self.name!r}: a node turns about some of its axes 0, 1, 2, in this order, and "
+                f"carries 1 to 4 rows; got turns={self.turns!r}, rows={self.rows!r}"
+            )
+
+    @property
+    def rates(self) -> int:
+        """Velocities of a node."""
+        return 3 + len(self.turns)
+
+    @property
+    def constraints(self) -> int:
+        """Constraints between its components, which all motions obey."""
+        return 3 * self.rows - self.rates
+
+
+POINT = NodeKind("point", (), 1)
+DIRECTOR = NodeKind("director", (1, 2), 2)
+TRIAD = NodeKind("triad", (0, 1, 2), 4)
 
 
 class Body(eqx.Module):
@@ -21,8 +70,7 @@ class Body(eqx.Module):
         rotation: directors as columns [-].
         velocity: of the reference point [m/s].
         angular_velocity: world components [rad/s].
-        rotations: axes of its own about which it turns: all of a body, none of a point mass, and those normal
-            to the first of a director.
+        node: what it carries and how it turns.
         shape: what to draw: something with a `surface`, or None.
         name: name, or None.
     """
@@ -32,14 +80,14 @@ class Body(eqx.Module):
     rotation: Float[Array, "3 3"]
     velocity: Float[Array, "3"]
     angular_velocity: Float[Array, "3"]
-    rotations: tuple[int, ...] = eqx.field(static=True)
+    node: NodeKind = eqx.field(static=True)
     shape: Any
     name: str | None = eqx.field(static=True)
 
     @property
     def oriented(self) -> bool:
         """Whether it is a body that turns about all axes."""
-        return self.rotations == TRIAD
+        return self.node == TRIAD
 
 
 @eager_numpy

@@ -4,7 +4,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from natcoord_jax.core.bodies import POINT, TRIAD
 from natcoord_jax.core.checks import as_array
 from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.handles import Handle
@@ -72,17 +71,14 @@ class Poses:
         Raises:
             ValueError: naming the node, and what it carries.
         """
-        rotations = self._bodies.rotations_of(marker.body)
-        if rotations == TRIAD or not at_top_level(own):
-            return
-        beyond = np.asarray(own).reshape(-1, 4)[:, 1 if rotations == POINT else 2 :]
-        if np.abs(beyond).max() > 1e-9 * np.abs(np.asarray(own)).max():
+        kind = self._bodies.kind_of(marker.body)
+        beyond = np.asarray(own).reshape(-1, 4)[:, kind.rows :] if at_top_level(own) else np.zeros((0, 0))
+        if beyond.size and np.abs(beyond).max() > 1e-9 * np.abs(np.asarray(own)).max():
             name = marker.body.name
-            carried = "itself" if rotations == POINT else "itself and its director"
-            kind = "point" if rotations == POINT else "director"
+            carried = ("itself", "itself and its director", "itself and two directors")[kind.rows - 1]
             raise ValueError(
-                f"{short(marker)}: {name!r} is a {kind} and carries {carried} only; pass nc.Point({name}) or "
-                "join a rigid body to it"
+                f"{short(marker)}: {name!r} is a {kind.name} and carries {carried} only; pass "
+                f"nc.Point({name}) or join a rigid body to it"
             )
 
     def _own_weights(self, marker: Marker | Attachment) -> Float[Array, "*m w"]:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from natcoord_jax.core.bodies import TRIAD, Body
+from natcoord_jax.core.bodies import TRIAD, Body, NodeKind
 from natcoord_jax.core.checks import as_array
 from natcoord_jax.core.eager_numpy import stacked
 from natcoord_jax.core.handles import Handle
@@ -24,7 +24,7 @@ class Bodies:
     Attributes:
         names: of all.
         sets: number of nodes in sets.
-        rotations: own axes about which each turns, see `Body`.
+        kinds: what each carries and how it turns.
         shapes: what to draw.
     """
 
@@ -40,12 +40,12 @@ class Bodies:
         kept = [(name, ranges_of(numbers)) for name, numbers in self._kept.items()]
         self.runs: list[Run] = [*kept, *((name, None) for name in singles)]
         self.names = names_of(self.runs)
-        self.rotations = [sets[name].rotations for name, numbers in self._kept.items() for _ in numbers]
-        self.rotations += [body.rotations for body in singles.values()]
+        self.kinds = [sets[name].node for name, numbers in self._kept.items() for _ in numbers]
+        self.kinds += [body.node for body in singles.values()]
         self.shapes = [None] * self.sets + [body.shape for body in singles.values()]
 
     def __len__(self) -> int:
-        return len(self.rotations)
+        return len(self.kinds)
 
     def every(self, field: str) -> Array:
         """A field of all bodies, leading axis their number."""
@@ -55,12 +55,12 @@ class Bodies:
             parts.append(stacked([getattr(body, field) for body in self._singles.values()]))
         return parts[0] if len(parts) == 1 else joined(*parts)
 
-    def rotations_of(self, handle: Handle) -> tuple[int, ...]:
-        """Own axes about which a body, or a node, turns."""
+    def kind_of(self, handle: Handle) -> NodeKind:
+        """What a body, or a node of a set, carries and how it turns."""
         if handle.name in self._singles:
-            return self._singles[handle.name].rotations
+            return self._singles[handle.name].node
         nodes = self._sets.get(handle.name.rpartition("[")[0])
-        return TRIAD if nodes is None else nodes.rotations
+        return TRIAD if nodes is None else nodes.node
 
     def pose(self, name: str) -> tuple[Array, Array]:
         """Place and directors of a node of a set, clamped or not."""

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from natcoord_jax.core.bodies import DIRECTOR, TRIAD
+from natcoord_jax.core.bodies import POINT, TRIAD, NodeKind
 from natcoord_jax.core.checks import as_array, is_concrete
 from natcoord_jax.core.coordinate import Coordinate, CoordinateEffect
 from natcoord_jax.core.eager_numpy import eager_numpy, stacked
@@ -110,9 +110,9 @@ class Layout:
         return as_array(np.asarray(found)[self.order]) if at_top_level(found) else found[self.order]
 
     @property
-    def rotations(self) -> list[tuple[int, ...]]:
-        """Own axes about which the bodies turn, in the order of the system."""
-        return [self.bodies.rotations[k] for k in self.order]
+    def kinds(self) -> list[NodeKind]:
+        """What bodies carry and how they turn, in the order of the system."""
+        return [self.bodies.kinds[k] for k in self.order]
 
     @property
     def ordered_names(self) -> Sequence[str]:
@@ -130,11 +130,11 @@ class Layout:
     def motions(self) -> list[Edge]:
         """Free motion of each body relative to its parent in the tree."""
         motions = []
-        for own, carrier in zip(self.rotations, self.spanning.carrier):
+        for own, carrier in zip(self.kinds, self.spanning.carrier):
             every = tuple(range(3))
             edge = self.edges[carrier] if carrier >= 0 else Edge(0, 0, every, every, False, True)
             if own != TRIAD:
-                rotations = own if carrier < 0 else ()
+                rotations = own.turns if carrier < 0 else ()
                 edge = replace(edge, rotations=rotations, child_rotation=False, own_axes=bool(rotations))
             motions.append(edge)
         return motions
@@ -184,10 +184,10 @@ class Layout:
         for handle in (joint.parent, joint.child):
             # A ball joint and a distance are between points; all others hold axes, a fixed one, too.
             axes = joint.needs_axis or joint.multipliers > 3
-            if axes and self.bodies.rotations_of(handle) == DIRECTOR:
-                kind = type(joint).__name__
+            if axes and self.bodies.kind_of(handle) not in (POINT, TRIAD):
+                kind, node = type(joint).__name__, self.bodies.kind_of(handle).name
                 raise ValueError(
-                    f"joint {name!r}: {handle.name!r} has a director only, no axes that a {kind} joint could "
+                    f"joint {name!r}: {handle.name!r} has a {node} only, no axes that a {kind} joint could "
                     "hold; clamp it to a rigid body (nc.Clamp) and join that"
                 )
 

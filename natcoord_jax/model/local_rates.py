@@ -13,6 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from natcoord_jax.core.bodies import TRIAD, NodeKind
+
 TWIST = 6
 """Components of a twist."""
 
@@ -35,12 +37,12 @@ class LocalRates(eqx.Module):
     count: int = eqx.field(static=True)
 
     @classmethod
-    def of(cls, rotations: Sequence[tuple[int, ...]]) -> "LocalRates":
-        """Of nodes that turn about these of their axes; on the host."""
-        bodies, every = len(rotations), (0, 1, 2)
-        if all(own == every for own in rotations):
+    def of(cls, kinds: Sequence[NodeKind]) -> "LocalRates":
+        """Of nodes of these kinds; on the host."""
+        bodies = len(kinds)
+        if all(kind == TRIAD for kind in kinds):
             return cls(None, None, None, bodies, TWIST * bodies)
-        turning = np.array([[k in own for k in every] for own in rotations])
+        turning = np.array([[k in kind.turns for k in TRIAD.turns] for kind in kinds])
         present = np.concatenate([np.ones_like(turning), turning], axis=1)
         count = int(present.sum())
         place = np.full(present.shape, count, np.int32)
