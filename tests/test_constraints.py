@@ -1,5 +1,8 @@
 """Constraints on markers, and rolling: exact motions, all forms and schemes, statics, modes, derivatives."""
 
+import math
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -201,6 +204,35 @@ def test_modes_of_what_rolls():
     found = np.asarray(nc.modes(system, state).frequencies)
     expected = (100.0 / (1.4 * float(system.mass[0, 0, 0]))) ** 0.5
     np.testing.assert_allclose(found, [0.0, expected, expected], atol=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("part", [0.2, 0.5])
+def test_a_coin_stays_upright_when_it_is_fast(part):
+    """A thin disc leans as Routh's linear equation says: 5/4 lean'' = (g / r - 3 spin^2) lean.
+
+    Upright it is stable from v^2 = g r / 3 on (E. J. Routh, Advanced Rigid Dynamics, 1884, article 244).
+    """
+    radius, mass, gravity, rate = 0.1, 2.0, 9.81, 1e-3
+    spin, tilt = math.sqrt(part * gravity / radius), ((1, 0, 0), math.pi / 2)
+    inertia = mass * radius**2 * np.array([0.25, 0.25, 0.5])
+    scene = nc.Scene()
+    scene.add(nc.Gravity(vector=(0, 0, -gravity)))
+    place, moving = (0, 0, radius), (spin * radius, -rate * radius, 0)
+    motion: Any = {"position": place, "orientation": tilt, "velocity": moving}
+    coin = scene.add(nc.RigidBody(mass=mass, inertia=inertia, angular_velocity=(rate, spin, 0), **motion))
+    axis = nc.Direction(coin, (0, 0, 1), local=True)
+    scene.add(nc.Rolling((*TABLE, nc.Point(coin), axis), radius=radius))
+    system, state = scene.compile()
+    trajectory = nc.simulate(system, state, dt=2.5e-3, steps=200)
+    lean = np.abs(np.asarray(trajectory.q).reshape(-1, 4, 3)[:, 3, 2])
+    square, times = (3 * spin**2 - gravity / radius) / 1.25, 2.5e-3 * np.arange(201)
+    root = math.sqrt(abs(square))
+    assert (square > 0) == (part > 1 / 3)
+    expected = np.abs((np.sin if square > 0 else np.sinh)(root * times)) * rate / root
+    np.testing.assert_allclose(lean, expected, atol=5e-3 * expected.max())
+    energy = np.asarray(system.energy(trajectory).total)
+    assert np.ptp(energy) <= tol.ENERGY * energy[0]
 
 
 @pytest.mark.slow
