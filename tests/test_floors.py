@@ -67,6 +67,20 @@ UNSTABLE = ("jax._src", "jax.experimental", "jax.extend", "jax.interpreters", "j
 PLOTTING = {"matplotlib", "mpl_toolkits"}
 HEAVY = ("matplotlib", "mujoco", "optax", "scipy.optimize")
 
+LONGEST, LONGEST_FUNCTION = 300, 50
+"""Lines of a file, and of a function without its docstring."""
+LONGER = {
+    "analysis/accuracy.py", "analysis/statics.py", "bodies/continua.py", "core/coordinate.py",
+    "core/effect.py", "effects/rubber.py", "effects/solids/elements.py", "mechanics/reduced.py",
+    "model/layout.py", "reading/sensors.py", "scene.py", "stepping/derivative.py", "xla/rewriting.py",
+}  # fmt: skip
+"""Files that are longer still; none joins them, and what was cut leaves the list."""
+LONGER_FUNCTIONS = {
+    "_by_rounds", "_curved", "after_attempt", "arm", "averaged_gradient", "build", "concluded",
+    "conjugate_residuals", "continuation", "costates", "descend", "end_of_step", "factored", "improved",
+    "judge", "model", "rollout", "search", "simulate", "spanning_tree",
+}  # fmt: skip
+
 FILES = sorted(SOURCE.rglob("*.py"))
 
 
@@ -182,6 +196,23 @@ def test_floors(file: Path):
     found = breaches(module_name(file), file.read_text("utf-8"), is_package=file.name == "__init__.py")
     if found:
         pytest.fail(f"{file.relative_to(ROOT).as_posix()}\n  " + "\n  ".join(found), pytrace=False)
+
+
+def test_files_and_functions_can_be_read_at_once():
+    """Long ones are known by name; the list only shrinks."""
+    files, functions = set(), set()
+    for file in FILES:
+        text = file.read_text("utf-8")
+        if text.count("\n") > LONGEST and file.name != "__init__.py":
+            files.add(file.relative_to(SOURCE).as_posix())
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, ast.FunctionDef):
+                told = ast.get_docstring(node, clean=False)
+                lines = (node.end_lineno or 0) - node.lineno + 1
+                if lines - (told.count("\n") + 1 if told else 0) > LONGEST_FUNCTION:
+                    functions.add(node.name)
+    assert files == LONGER, files ^ LONGER
+    assert functions == LONGER_FUNCTIONS, functions ^ LONGER_FUNCTIONS
 
 
 @pytest.mark.parametrize(
