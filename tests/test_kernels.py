@@ -1,7 +1,10 @@
 """Loops compiled into one kernel compute what they compute otherwise; what does not fit is left as it is."""
 
 import re
+import subprocess
+import sys
 from functools import partial
+from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -466,3 +469,13 @@ def test_gradients_of_stiff_and_coarse_steps_are_solved_to_the_end():
     forward = jax.jvp(end, (one,), (one,))[1]
     np.testing.assert_allclose(jax.grad(end)(one), forward, rtol=tol.EXACT_GRADIENT)
     np.testing.assert_allclose(forward, difference, rtol=1e-5)
+
+
+@pytest.mark.slow
+def test_all_goes_on_without_what_is_done_to_programs():
+    """A choice of tests passes with neither kernels nor evaluation by NumPy: only time depends on them."""
+    chosen = "(hung_pair and revolute and tree) or (free_pair and screw and tree) or a_rod"
+    files = [str(Path(__file__).with_name(name)) for name in ("test_conservation.py", "test_constraints.py")]
+    command = [sys.executable, "-m", "pytest", "-q", "-n0", "--plain", *files, "-k", chosen]
+    run = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert run.returncode == 0 and "3 passed" in run.stdout, run.stdout[-2000:]
