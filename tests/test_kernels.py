@@ -24,6 +24,7 @@ from natcoord_jax.stepping.rollout import run
 MARK = "xla_cpu_small_call"
 MATRIX = np.random.default_rng(1).normal(size=(6, 6))
 INDEX = np.array([[4, 0], [1, 1], [0, 5], [1, 1]])
+ROWS = np.array([[4, 0, 9], [1, 1, 0], [0, 5, 1], [2, 1, 2], [3, 3, 3], [5, 4, 0]])
 
 
 def _looped(body):
@@ -43,6 +44,7 @@ BODIES = {
     "update": lambda x: x.at[2, 1].set(0.5).at[1:3].add(x[3:5]),
     "updates at equal places": lambda x: x.at[INDEX[:, 0], INDEX[:, 1]].add(0.1 * x[0, :4]),
     "beyond the end": lambda x: x.at[jnp.array([2, 9])].add(1.0),
+    "updates of a batch": lambda x: jax.vmap(lambda x, k: x.at[k].add(0.1 * x[:3]))(x, ROWS),
     "rows": lambda x: x.at[jnp.array([3, 3, 1])].add(0.1 * x[:3]),
     "branch": lambda x: jax.lax.cond(x[0, 0] > 0, lambda x: 0.5 * x, lambda x: x + 1.0, x),
     "projector": lambda x: range_projector(x[:, :3], 2),
@@ -252,16 +254,8 @@ def test_products_with_vectors_of_middle_length(length):
     assert "reduce-window" not in program.lower(a, x).compile().as_text()
 
 
-SCATTERED = pytest.mark.xfail(reason="forces on nodes of facets are summed by scattering: several kernels")
-
-
-def marks_of(name):
-    """Scenes beside the usual ones are slow; those with gas and contact of surfaces are not there yet."""
-    return [pytest.mark.slow, *([SCATTERED] if name in ("inflated_ball", "colliding_blocks") else [])]
-
-
 @pytest.mark.parametrize(
-    "name", [n if n in USUAL else pytest.param(n, marks=marks_of(n)) for n in gallery.SCENES]
+    "name", [n if n in USUAL else pytest.param(n, marks=pytest.mark.slow) for n in gallery.SCENES]
 )
 def test_every_scene_of_the_gallery_runs_in_one_kernel(name):
     example = gallery.load(name)

@@ -6,6 +6,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from natcoord_jax.maths.elimination import pivoted_inverse
+
 
 class Products(eqx.Module):
     """A sum of products of columns and rows.
@@ -54,7 +56,7 @@ class WithProducts(eqx.Module):
     def of(cls, factors: Any, products: Products) -> "WithProducts":
         """Of factors without the products."""
         solved = jnp.stack([factors.solve(column) for column in products.columns])
-        small = jnp.linalg.inv(jnp.eye(len(solved), dtype=solved.dtype) + products.rows @ solved.T)
+        small = pivoted_inverse(jnp.eye(len(solved), dtype=solved.dtype) + products.rows @ solved.T)
         return cls(factors, solved, products.rows, small)
 
     def solve(self, right: Float[Array, " n"]) -> Float[Array, " n"]:

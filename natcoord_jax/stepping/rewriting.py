@@ -161,9 +161,7 @@ def _apply(equation: Any, given: list[Any]) -> list[Any]:
         if found is not None:
             return [found]
     if name in ("scatter", "scatter-add"):
-        found = _update(name, given, params)
-        if found is not None:
-            return [found]
+        return [_update(name, given, params)]
     if name in REDUCTIONS:
         x, axes = given[0], params["axes"]
         if math.prod(x.shape) >= REDUCTION_LIMIT:
@@ -276,26 +274,29 @@ def _reduced(operation: Callable, x: Array, axes: Sequence[Any]) -> Array:
     return x
 
 
-def _update(name: str, given: list[Any], params: dict[str, Any]) -> Array | None:
-    """A scatter as updates of slices, one window after the other; None for one with batch dimensions."""
+def _update(name: str, given: list[Any], params: dict[str, Any]) -> Array:
+    """A scatter as updates of slices, one window after the other."""
     operand, indices, updates = given
     numbers = params["dimension_numbers"]
-    if numbers.operand_batching_dims or numbers.scatter_indices_batching_dims:
-        return None
+    batches = numbers.scatter_indices_batching_dims
+    counted = [jax.lax.broadcasted_iota(indices.dtype, indices.shape[:-1], k)[..., None] for k in batches]
+    indices = jnp.concatenate([indices, *counted], axis=-1)
+    targets = (*numbers.scatter_dims_to_operand_dims, *numbers.operand_batching_dims)
+    single = (*numbers.inserted_window_dims, *numbers.operand_batching_dims)
     windows = numbers.update_window_dims
     others = [k for k in range(updates.ndim) if k not in windows]
     updates = jnp.transpose(updates, (*others, *windows)).astype(operand.dtype)
     sizes = iter(updates.shape[len(others) :])
-    shape = [1 if k in numbers.inserted_window_dims else next(sizes) for k in range(operand.ndim)]
+    shape = [1 if k in single else next(sizes) for k in range(operand.ndim)]
     count = math.prod(updates.shape[: len(others)])
-    updates, places = updates.reshape(count, *shape), indices.reshape(count, -1)
     if 0 in updates.shape or 0 in operand.shape:
         return operand
+    updates, places = updates.reshape(count, *shape), indices.reshape(count, -1)
 
     def one(k: Any, total: Array) -> Array:
         window, place = row(updates, k), row(places, k)
         starts = [jnp.zeros((), place.dtype)] * operand.ndim
-        for n, dim in enumerate(numbers.scatter_dims_to_operand_dims):
+        for n, dim in enumerate(targets):
             starts[dim] = place[n]
         now = jax.lax.dynamic_slice(total, starts, shape, allow_negative_indices=False)
         if name == "scatter-add":
