@@ -14,7 +14,7 @@ from natcoord_jax.assembly.coordinates import coordinate_values, state_rates
 from natcoord_jax.assembly.diagnostics import rows_with_ground
 from natcoord_jax.assembly.graph import make_tree
 from natcoord_jax.assembly.grouping import element_group, stack
-from natcoord_jax.assembly.impacts import with_mobilities
+from natcoord_jax.assembly.impacts import untouched, with_mobilities
 from natcoord_jax.assembly.layout import Layout
 from natcoord_jax.assembly.local_rates import LocalRates
 from natcoord_jax.assembly.masses import with_masses
@@ -87,7 +87,7 @@ def build(
         elimination_order(layout, groups, joint_groups) if structure.solver == "recursive" else None,
         structure,
     )
-    state = layout.state()
+    state = replace_fields(layout.state(), contacts=untouched(system))
     system = with_mobilities(jax.tree.map(as_array, with_symmetries(system, state)), state)
     return system, with_readings(system, state)
 

@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float
 
 from natcoord_jax.assembly.coordinates import coordinate_values
 from natcoord_jax.assembly.diagnostics import rows_with_ground
+from natcoord_jax.assembly.impacts import untouched
 from natcoord_jax.assembly.system import System
 from natcoord_jax.core.checks import is_concrete
 from natcoord_jax.core.effect import replace_fields
@@ -102,6 +103,7 @@ def in_layout(old: System, state: State, new: System, onto: State | None) -> Sta
         _merged(rotor_names(new), rotor_names(old), state.rates, rates),
         _merged(new.structure.works, old.structure.works, state.work, rest[3]),
         state.dissipated,
+        contacts=untouched(new) if onto is None else onto.contacts,
     )
 
 

@@ -5,7 +5,7 @@ from typing import Any
 import equinox as eqx
 
 from natcoord_jax.bodies.beam import BeamHandle
-from natcoord_jax.bodies.contact_gaps import gaps_between
+from natcoord_jax.bodies.contact_gaps import gaps_between, gaps_within
 from natcoord_jax.bodies.contact_sides import BeamSide, BodySide, MeshSide, PlaneSide, SegmentSide, Side
 from natcoord_jax.bodies.contact_sides import Plane as Plane
 from natcoord_jax.bodies.continua import MeshHandle, Surface
@@ -72,6 +72,8 @@ class Contact(Recipe):
         law: force proportional to the overlap, "linear", or to its power 3/2, "hertz".
         one_pass: of two surfaces, let the nodes of `one` alone touch the facets of `other`, with all of the
             stiffness: for a fine surface, or one that folds, on a coarse one.
+        self_contact: of a beam that is passed twice: its segments touch each other, those that are farther
+            apart along it than half a turn about its own section.
         candidates: number of facets that a node may touch; default 16.
         name: of the contact; several gaps are called "name[0]" and so on.
 
@@ -102,6 +104,7 @@ class Contact(Recipe):
         default="linear", kw_only=True, static=True, metadata=is_a(Choice(("linear", "hertz")))
     )
     one_pass: bool = eqx.field(default=False, kw_only=True, static=True, metadata=is_a(FLAG))
+    self_contact: bool = eqx.field(default=False, kw_only=True, static=True, metadata=is_a(FLAG))
     candidates: int | None = eqx.field(default=None, kw_only=True, static=True, metadata=is_a(Whole(1)))
     name: str | None = eqx.field(default=None, kw_only=True, static=True, metadata=is_a(NAME))
 
@@ -109,10 +112,13 @@ class Contact(Recipe):
 
     def add_to(self, scene: Builder, name: str) -> tuple[Handle, ...]:
         """Add its gaps; their handles."""
-        if _owner(self.one) == _owner(self.other):
+        itself = _owner(self.one) == _owner(self.other)
+        if itself != self.self_contact or (itself and not isinstance(self.one, BeamHandle)):
             raise ValueError(
                 f"contact {name!r}: {_owner(self.one).name!r} would be in contact with itself, for which "
-                "there is no gap; pass two different parts"
+                "there is no gap; pass two different parts, or twice a beam with self_contact=True"
+                if itself
+                else f"contact {name!r}: self_contact=True is for a beam with itself; pass it twice"
             )
         law = {"stiffness": self.stiffness, "law": self.law}
         for option in ("restitution", "friction", "speed", "candidates"):
@@ -121,7 +127,7 @@ class Contact(Recipe):
         if self.one_pass:
             law |= {"one_pass": True}
         one, other = (_side(scene, given, name) for given in (self.one, self.other))
-        gaps = gaps_between(one, other, law, name)
+        gaps = gaps_within(one, law, name) if itself else gaps_between(one, other, law, name)
         named = [name] if len(gaps) == 1 else [f"{name}[{k}]" for k in range(len(gaps))]
         return tuple(scene.add(replace_fields(gap, name=said)) for gap, said in zip(gaps, named))
 

@@ -3,6 +3,8 @@
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
+
 from natcoord_jax.bodies.contact_sides import (
     BeamSide,
     BodySide,
@@ -23,6 +25,7 @@ from natcoord_jax.core.markers import Marker
 from natcoord_jax.effects.contact import (
     CapsuleOnCapsule,
     EllipsoidOnPlane,
+    FrictionalGapPotential,
     Gap,
     GapConstraint,
     GapPotential,
@@ -69,18 +72,46 @@ def gaps_between(one: Side, other: Side, law: Law, name: str) -> Gaps:
     )
 
 
+def gaps_within(beam: Side, law: Law, name: str) -> Gaps:
+    """Gaps of the segments of a beam with each other, but for those that are near along it.
+
+    Args:
+        beam: side.
+        law: numbers of the contact.
+        name: of the contact, for messages.
+
+    Raises:
+        ValueError: for a beam so short that none of its segments can touch another.
+    """
+    assert isinstance(beam, BeamSide)
+    parts = beam.parts
+    along = np.concatenate([[0.0], np.cumsum(beam.lengths)])
+    pairs = [
+        (i, j)
+        for i, j in zip(*np.triu_indices(len(parts), 1))
+        if along[j] - along[i + 1] > np.pi * beam.radius
+    ]
+    if not pairs:
+        raise ValueError(
+            f"contact {name!r}: {beam.named} is too short to touch itself: no two of its {len(parts)} segments "
+            f"are farther apart along it than half a turn about its section, {np.pi * beam.radius:.3g} m"
+        )
+    return [gap for i, j in pairs for gap in gaps_between(parts[i], parts[j], law, name)]
+
+
 def _kept_open(gap: Gap, markers: tuple[Marker, ...], law: Law, name: str, *sides: Side) -> Any:
     """A potential with the stiffness that is given or that of the sides; a constraint where there is none."""
     law = {key: value for key, value in law.items() if key not in OF_SURFACES}
     own = [s.stiffness for s in sides if isinstance(s, SegmentSide) and s.stiffness is not None]
     given = law.pop("stiffness")
     stiffness = given if given is not None else min(own, default=None)
-    if stiffness is not None:
-        if "friction" in law:
+    if stiffness is not None and "friction" in law:
+        if own:
             raise ValueError(
-                f"contact {name!r}: friction [-] is for contacts of rigid bodies without a stiffness; leave "
-                "one of them out"
+                f"contact {name!r}: there is no friction [-] on nodes of shells and solids yet; leave it out"
             )
+        return FrictionalGapPotential(markers, gap, stiffness=stiffness, **law)
+    if stiffness is not None:
         return GapPotential(markers, gap, stiffness=stiffness, **law)
     if "speed" in law or law["law"] != "linear":
         raise ValueError(

@@ -162,6 +162,12 @@ class BeamSide(Side):
         return [SegmentSide(ends[0].body, Capsule, ends, self.radius) for ends in pairs]
 
     @property
+    def lengths(self) -> Float[np.ndarray, " n"]:
+        """Of its segments [m]."""
+        places = np.array([np.asarray(point.vector, float) for point in self.points])
+        return np.linalg.norm(np.diff(places, axis=0), axis=1)
+
+    @property
     def balls(self) -> list[SegmentSide]:
         """Its nodes, for contacts with planes."""
         return [SegmentSide.ball(point, self.radius) for point in self.points]

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from natcoord_jax.assembly.impacts import with_mobilities
 from natcoord_jax.assembly.system import SYSTEM, System
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.checks import is_concrete
@@ -71,6 +72,7 @@ def step(
     """
     check_state(system, state)
     state = scheme.started(replace_fields(state, held=None))
+    system = with_mobilities(system, state)
     h = checked_step(dt)
     inputs, _ = checked_inputs(system, None if u is None else jnp.asarray(u, float)[None], 1)
     after, code = _one_step(system, state, inputs[0], h, newton_tol, 16, scheme.tableau)

@@ -9,6 +9,7 @@ from typing import Any
 import jax
 from jaxtyping import Array
 
+from natcoord_jax.assembly.impacts import with_mobilities
 from natcoord_jax.assembly.reading import handing
 from natcoord_jax.assembly.system import SYSTEM, System
 from natcoord_jax.core.arguments import checked
@@ -168,6 +169,7 @@ def simulate(
     check_state(system, state)
     check_obeyed(system, state)
     state = scheme.started(replace_fields(state, held=None))
+    system = with_mobilities(system, state)
     step = checked_step(dt)
     inputs, until = Function.of(handing(inputs), state.t, state), Function.of(handing(until), state)
     bounded = steps if isinstance(steps, Steps) else None

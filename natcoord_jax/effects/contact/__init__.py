@@ -1,6 +1,7 @@
 """Contact between surfaces."""
 
 from natcoord_jax.effects.contact.discrete_gap import DiscreteGap as DiscreteGap
+from natcoord_jax.effects.contact.frictional_potential import FrictionalGapPotential as FrictionalGapPotential
 from natcoord_jax.effects.contact.gap import Gap as Gap
 from natcoord_jax.effects.contact.gap_constraint import GapConstraint as GapConstraint
 from natcoord_jax.effects.contact.gap_potential import GapPotential as GapPotential
