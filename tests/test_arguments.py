@@ -473,9 +473,10 @@ CALLS = {
 
 # What calls return or hand over, and bases: nobody is to make these by hand.
 MADE = {
-    "Accuracy", "Balance", "BeamHandle", "Check", "ComputedTorque", "Contacts", "Continuation", "DerivativeError",
-    "Equilibrium", "Feedback", "Frame", "Growth", "Load", "MeshHandle", "Modes", "Nodes", "NonlinearProgram",
-    "Optima", "Outcome", "Result", "SimulationError", "Solution", "State", "Steps", "Surface", "Sweep",
+    "Accuracy", "Balance", "BeamHandle", "Check", "ComputedTorque", "Contacts", "Continuation",
+    "DerivativeError", "Equilibrium", "Feedback", "Frame", "Growth", "Load", "MeshHandle", "Modes",
+    "Nodes", "NonlinearProgram", "Optima", "Outcome", "Result", "SimulationError", "Solution", "State",
+    "Steps", "Surface", "Sweep",
     "System",
     "Trajectory",
 }  # fmt: skip

@@ -11,7 +11,7 @@ FLOOR = nc.Plane(normal=(0, 0, 1))
 
 @pytest.mark.slow
 def test_bouncing_ball_on_a_spring():
-    """K08 of the reference cases: 0.5 s of bounces, exact by pieces; order two through five changes of contact."""
+    """K08 of the reference cases: 0.5 s of bounces, exact by pieces; order two through six changes."""
     scene = nc.Scene()
     scene.add(nc.Gravity())
     ball = nc.RigidBody(
@@ -124,7 +124,7 @@ def test_hertz_impact():
     assert deepest == pytest.approx(approach, rel=2e-3)
     lasts = np.ptp(np.asarray(trajectory.t)[np.asarray(felt.gap) < 0]) + duration / 100
     assert lasts == pytest.approx(duration, rel=0.02)
-    # p_0 = 3 F / (2 pi a^2) of the area of contact, a^2 = R d (K. L. Johnson, Contact Mechanics, 1985, (4.22)).
+    # p_0 = 3 F / (2 pi a^2), a^2 = R d (K. L. Johnson, Contact Mechanics, 1985, equations (4.22) to (4.24)).
     pressure = 1.5 * force / (np.pi * half * deepest)
     assert pressure == pytest.approx((6 * force * modulus**2 / (np.pi**3 * half**2)) ** (1 / 3), rel=0.02)
     assert nc.contacts(system, trajectory).steps_in_contact[0] == pytest.approx(100, abs=2)
@@ -132,7 +132,7 @@ def test_hertz_impact():
 
 @pytest.mark.parametrize(("h", "stop"), [(0.01, 1e-4), (0.002, 5e-6)])
 def test_pendulum_that_rubs_on_a_table(h, stop):
-    """R23: a mass on a rod of 0.4 m slides round on a table; it stays at that distance and stops at v^2 / (2 mu g)."""
+    """R23: a mass on a rod of 0.4 m slides round on a table, always as far away; it stops where it should."""
     scene = nc.Scene()
     scene.add(nc.Gravity())
     mass = scene.add(nc.PointMass(mass=1.0, position=(0.4, 0, 0), velocity=(0, 2.0, 0), name="mass"))
@@ -150,7 +150,7 @@ def test_pendulum_that_rubs_on_a_table(h, stop):
 
 @pytest.mark.slow
 def test_top_on_a_table_with_friction():
-    """A top with a round end rises, and its friction leaves Jellett's integral alone, to order two at least."""
+    """A top with a round end rises, and friction leaves Jellett's integral alone, to order two at least."""
     radius, below, inertia = 0.02, 0.004, np.diag([2.4e-6, 2.4e-6, 2.8e-6])
     drifts = []
     scene = nc.Scene()
@@ -183,6 +183,52 @@ def test_top_on_a_table_with_friction():
         assert nc.balance(system, trajectory).energy.max() <= tol.ENERGY_OF_A_SMALL_SCENE
     assert axes[-1, 2, 2] > axes[0, 2, 2] + 1e-3
     assert drifts[1] <= 2e-6 and drifts[0] >= 4 * drifts[1]
+
+
+def chain_on_a_drum(links=20, length=0.1, radius=0.3, own=0.02, longer=2):
+    """Links over a drum, more of them on one side; names of contacts, of the first and the last link."""
+    scene = nc.Scene()
+    scene.add(nc.Gravity())
+    shape = nc.Capsule(radius=radius, length=1.0)
+    drum = scene.add(nc.RigidBody(shape=shape, density=1000.0, orientation=((1, 0, 0), np.pi / 2)))
+    scene.add(nc.Fixed(nc.ground, drum))
+    # Links that are on the drum touch it with their middles.
+    far = np.hypot(radius + own, length / 2) * 1.0001
+    turn = 2 * np.arcsin(length / 2 / far)
+    over = int(np.pi // turn) + 1
+    angles = np.pi / 2 + (over / 2 - np.arange(over + 1)) * turn
+    pins = [far * np.array([np.cos(a), 0, np.sin(a)]) for a in angles]
+    below = length * np.array([0, 0, 1.0])
+    first = (links - over) // 2 + longer
+    pins = [pins[0] - k * below for k in range(first, 0, -1)] + pins
+    pins += [pins[-1] - k * below for k in range(1, links - over - first + 1)]
+    before, names = None, []
+    for k, (start, end) in enumerate(zip(pins, pins[1:])):
+        along = (end - start) / length
+        tilt = (0, 1, 0), np.arctan2(along[0], along[2])
+        given = {"position": (start + end) / 2, "orientation": tilt, "name": f"link {k}"}
+        link = scene.add(nc.RigidBody(shape=nc.Capsule(radius=own, length=length), density=500.0, **given))
+        if before is not None:
+            scene.add(nc.Revolute(before, link, point=start, axis=(0, 1, 0)))
+        names.append(f"rubs {k}")
+        scene.add(nc.Contact(drum, link, restitution=0.0, friction=0.5, name=names[-1]))
+        before = link
+    return *scene.compile(), names, ("link 0", f"link {links - 1}")
+
+
+@pytest.mark.exhaustive
+def test_chain_on_a_drum():
+    """Twenty links: friction holds more of them on one side than on the other; with little they slip off."""
+    system, state, names, ends = chain_on_a_drum()
+    for friction, holds in ((0.5, True), (0.02, False)):
+        run = system.set(names, friction=friction)
+        trajectory = nc.simulate(run, state, dt=5e-3, steps=100)
+        energy = np.asarray(run.energy(trajectory).total)
+        assert np.diff(energy).max() <= 1e-12 * np.abs(energy).max()
+        assert nc.balance(run, trajectory).energy.max() <= tol.ENERGY_OF_A_SMALL_SCENE
+        moved = [np.ptp(np.asarray(run.sense(trajectory, end).position), axis=0)[2] for end in ends]
+        assert max(moved) <= 5e-3 if holds else min(moved) >= 0.05
+        assert nc.contacts(run, trajectory).gap.min() >= -1e-9
 
 
 @pytest.mark.slow

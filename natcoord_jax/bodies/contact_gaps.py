@@ -93,8 +93,9 @@ def gaps_within(beam: Side, law: Law, name: str) -> Gaps:
     ]
     if not pairs:
         raise ValueError(
-            f"contact {name!r}: {beam.named} is too short to touch itself: no two of its {len(parts)} segments "
-            f"are farther apart along it than half a turn about its section, {np.pi * beam.radius:.3g} m"
+            f"contact {name!r}: {beam.named} is too short to touch itself: no two of its {len(parts)} "
+            "segments are farther apart along it than half a turn about its section, "
+            f"{np.pi * beam.radius:.3g} m"
         )
     return [gap for i, j in pairs for gap in gaps_between(parts[i], parts[j], law, name)]
 

@@ -21,9 +21,9 @@ GAP = of("a gap, as nc.SphereOnPlane(radius=0.1)", Gap)
 class Rubbing(Effect):
     """Base of contacts whose multipliers are an impulse along the normal and those of friction.
 
-    A force of slip acts where the surfaces touch, f sqrt(|u|^2 + eps^2) = -mu N u of the velocity u with which
-    the second slips on the first: at most mu N, and against it. At the end of a step slip that friction can
-    stop is stopped (`natcoord_jax.assembly.impacts`).
+    A force of slip acts where the surfaces touch, f sqrt(|u|^2 + eps^2) = -mu N u of the velocity u with
+    which the second slips on the first: at most mu N, and against it. At the end of a step slip that friction
+    can stop is stopped (`natcoord_jax.assembly.impacts`).
 
     Attributes:
         gap: between the surfaces.

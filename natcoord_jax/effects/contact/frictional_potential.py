@@ -40,8 +40,8 @@ class FrictionalGapPotential(Rubbing, ContactLaw):
         mobility: change of the speed of closing by a unit impulse [1/kg], follows from the masses.
 
     Raises:
-        ValueError: for other markers than the gap takes, a gap without a point of contact, a restitution above
-            one, or one without the speed that it is of.
+        ValueError: for other markers than the gap takes, a gap without a point of contact, a restitution
+            above one, or one without the speed that it is of.
 
     Example:
         >>> import natcoord_jax as nc
@@ -76,7 +76,7 @@ class FrictionalGapPotential(Rubbing, ContactLaw):
         return jnp.zeros(1)
 
     def respond(self, place: Array, motion: Motion, now: StepContext, lam: Array) -> Response:
-        """The impulse along the normal is that of the energy's mean force; friction is at most mu times it."""
+        """The impulse along the normal is that of the energy's mean force, friction at most mu times it."""
         start, flow = self.gap.invariants(place_markers(place, motion.start)), self.flow(place, motion)
         gradient = self.gap.averaged(start, now.h * flow, now.tableau)
         before, closing = self.gap.distance(start), -jnp.sum(gradient * flow)
