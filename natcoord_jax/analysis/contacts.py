@@ -74,7 +74,9 @@ class Contacts(eqx.Module):
     @property
     def steps_in_contact(self) -> Float[np.ndarray, " c"]:
         """Intervals of the shortest stay in each contact that begins and ends; infinite without one."""
-        flags = np.moveaxis(self.active, -2, -1)
+        # What is open at the start has not begun, whatever the first interval brings.
+        first = ~self.active[..., :1, :] | (self.gap[..., :1, :] > 0)
+        flags = np.moveaxis(np.concatenate([~first, self.active], axis=-2), -2, -1)
         flat = flags.reshape(-1, *flags.shape[-2:])
         shortest = np.full(len(self.names), np.inf)
         for lane in flat:

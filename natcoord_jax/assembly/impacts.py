@@ -126,7 +126,9 @@ def _by_group(groups: Sequence[Group], every: Array) -> list[Array]:
 
 
 def _numbers(groups: Sequence[Group], name: str) -> Float[Array, " c"]:
-    return jnp.concatenate([getattr(group.effect, name) for group in groups])
+    """A number of all contacts; zero where there is none."""
+    each = ((group.count, getattr(group.effect, name)) for group in groups)
+    return jnp.concatenate([jnp.zeros(count) if value is None else value for count, value in each])
 
 
 def _bouncing(groups: Sequence[Group]) -> np.ndarray:

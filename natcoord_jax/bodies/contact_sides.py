@@ -134,10 +134,12 @@ class BeamSide(Side):
     Attributes:
         points: its nodes.
         radius: within which its section is [m].
+        name: of the beam.
     """
 
     points: tuple[Marker, ...]
     radius: Any
+    name: str
 
     @staticmethod
     def of(beam: BeamHandle, name: str) -> "BeamSide":
@@ -153,7 +155,12 @@ class BeamSide(Side):
             )
         radius = np.linalg.norm(np.asarray(beam.outline), axis=1).max()
         points = tuple(Point(a.body, a.point) for a in beam.attachments)
-        return BeamSide(beam.nodes[0], Strand, points, float(radius))
+        return BeamSide(beam.nodes[0], Strand, points, float(radius), beam.name)
+
+    @property
+    def named(self) -> str:
+        """For messages."""
+        return f"beam {self.name!r}"
 
     @property
     def parts(self) -> Sequence[Side]:
