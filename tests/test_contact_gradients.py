@@ -42,7 +42,7 @@ def test_derivative_by_stiffness_is_of_order_two():
         found = float(jax.jvp(lambda k, run=run: run(k).q[-1, 0, 2], (1e4,), (1.0,))[1])
         errors.append(abs(found / SOFT - 1))
         report = nc.contacts(system, run(1e4))
-        assert report.steps_in_contact[0] == pytest.approx(0.0314 / h, abs=1.1)
+        assert report.steps_in_contact[0] == pytest.approx(0.0314 / h, abs=2.1)
         assert any("fewer than six" in note for note in report.notes) == (h > 5.5e-3)
     assert errors[1] <= 0.05 and errors[2] <= 0.015 and errors[3] <= 0.005
     assert errors[0] / errors[3] > 20
@@ -85,11 +85,11 @@ def test_grazing():
             return nc.simulate(system, start, dt=0.01, steps=300, throw=False).q[-1, 0, 1]
 
         slope = jax.jit(jax.grad(side))
-        slopes[name] = [float(slope(b)) for b in (0.9, 0.99, 0.999, 1.001)]
+        slopes[name] = [float(slope(b)) for b in (0.9, 0.99, 0.9999, 1.001)]
     assert np.isfinite(list(slopes.values())).all()
     hard, soft = np.abs(slopes["hard"]), np.abs(slopes["soft"])
-    assert hard[2] > 1.5 * hard[1] > 2 * hard[0]
-    assert soft[2] <= 1.2 * soft[1] + 10
+    assert hard[2] > 3 * hard[1] > 6 * hard[0]
+    assert soft[2] < 0.6 * hard[2]
     assert slopes["hard"][3] == pytest.approx(1.0) and slopes["soft"][3] == pytest.approx(1.0)
 
 

@@ -73,7 +73,8 @@ def test_bars_exchange_their_velocities():
     weights[[0, -1]] = 0.5
     first, second = (v[:, k : k + 21] @ weights / 20 for k in (0, 21))
     np.testing.assert_allclose(first + second, 1.0, atol=1e-12)
-    assert second[-1] == pytest.approx(1.0, abs=0.01)
+    # What is left behind is vibration, less of it the more elements there are.
+    assert second[-1] == pytest.approx(1.0, abs=0.025)
     t = np.asarray(trajectory.t)
     lasts = t[np.argmax(second > 0.99)] - t[np.argmax(second > 0.01)]
     assert lasts == pytest.approx(2 / speed, rel=0.05)

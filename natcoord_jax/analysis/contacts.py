@@ -102,7 +102,7 @@ class Contacts(eqx.Module):
         return tuple(f"{what}: {_listed(self.names, at)}; {means}" for what, at, means in said if at.any())
 
 
-def _listed(names: tuple[str, ...], at: Bool[np.ndarray, " c"]) -> str:
+def _listed(names: tuple[str, ...], at: Any) -> str:
     """Names of those, three at most."""
     chosen = [name for name, yes in zip(names, at) if yes]
     return ", ".join(chosen[:3]) + (f" and {len(chosen) - 3} more" if len(chosen) > 3 else "")
@@ -167,6 +167,6 @@ def contacts(system: System, trajectory: Trajectory) -> Contacts:
         margins.append(np.abs(gap[..., 1:, :]))
     size = 1.0 + float(np.max(np.abs(np.asarray(states.q))))
     force, happened, margin = (np.concatenate(x, axis=-1) for x in (forces, impacts, margins))
-    hard = np.concatenate([np.full(g.count, g.effect.unilateral and g.effect.bounces) for g in groups])
+    hard = np.concatenate([np.full(g.count, g.effect.bounces) for g in groups])
     every = np.concatenate(gaps, axis=-1)
     return Contacts(tuple(names), np.asarray(states.t), every, force, force > 0, happened, margin, size, hard)

@@ -87,7 +87,7 @@ def gaps_within(beam: Side, law: Law, name: str) -> Gaps:
     parts = beam.parts
     along = np.concatenate([[0.0], np.cumsum(beam.lengths)])
     pairs = [
-        (i, j)
+        (int(i), int(j))
         for i, j in zip(*np.triu_indices(len(parts), 1))
         if along[j] - along[i + 1] > np.pi * beam.radius
     ]

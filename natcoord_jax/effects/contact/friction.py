@@ -1,5 +1,6 @@
 """Friction where two surfaces touch: a force against slip, whatever pushes them together."""
 
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -7,9 +8,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from natcoord_jax.core.arguments import is_a
+from natcoord_jax.core.arguments import is_a, require
 from natcoord_jax.core.effect import Effect, Motion
-from natcoord_jax.core.kinds import of
+from natcoord_jax.core.handles import Handle
+from natcoord_jax.core.joint import Joint
+from natcoord_jax.core.kinds import NAME, of
+from natcoord_jax.core.markers import Attachment, Marker, Markers
 from natcoord_jax.core.numeric import Number
 from natcoord_jax.core.potential import on_rows, place_markers
 from natcoord_jax.effects.contact.gap import Gap
@@ -26,18 +30,19 @@ class Rubbing(Effect):
     can stop is stopped (`natcoord_jax.assembly.impacts`).
 
     Attributes:
+        markers: that the gap is of.
         gap: between the surfaces.
         friction: coefficient mu [-]; None: there is none.
         regularisation: eps [m/s].
+        name: optional name.
         mobility: change of the speed of closing by a unit impulse [1/kg], follows from the masses.
-
-    Class attributes:
-        bounces: whether what closes the gap is an impact.
     """
 
-    gap: eqx.AbstractVar[Gap]
+    markers: Any = eqx.field(metadata=is_a(Markers()))
+    gap: Gap = eqx.field(metadata=is_a(GAP))
     friction: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Number("not negative")))
     regularisation: Any = eqx.field(default=1e-5, kw_only=True, metadata=is_a(Number("positive")))
+    name: Any = eqx.field(default=None, kw_only=True, metadata=is_a(NAME))
     mobility: Any = eqx.field(default=None, init=False)
 
     unilateral: ClassVar[bool] = True
@@ -45,19 +50,19 @@ class Rubbing(Effect):
     works: ClassVar[bool] = True
     silent: ClassVar[bool] = False
     drawn: ClassVar[bool] = False
-    bounces: ClassVar[bool] = True
 
-    def refuse_unknown_points(self) -> None:
-        """Refuse friction at no one knows which point.
-
-        Raises:
-            ValueError: for a gap without a point of contact.
-        """
+    def __check_init__(self) -> None:
+        """Refuse markers of another gap, and friction at no one knows which point."""
+        require(self, "markers", self.gap.markers)
         if self.friction is not None and type(self.gap).contact is Gap.contact:
             raise ValueError(
                 f"{type(self).__name__}: friction [-] acts where surfaces touch, which "
                 f"{type(self.gap).__name__} does not say; give it a method `contact`"
             )
+
+    def attach(self, find: Callable[[Handle], tuple[Joint, Array]]) -> Sequence[Marker | Attachment]:
+        """Markers of the gap."""
+        return self.markers
 
     @property
     def multipliers(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]

@@ -1,21 +1,13 @@
 """Contact by an energy of the gap, with friction: what pushes depends on the overlap, what rubs on that."""
 
-from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
-import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from natcoord_jax.core.arguments import is_a, require
 from natcoord_jax.core.effect import Motion, Response, StepContext, replace_fields
-from natcoord_jax.core.handles import Handle
-from natcoord_jax.core.joint import Joint
-from natcoord_jax.core.kinds import NAME
-from natcoord_jax.core.markers import Attachment, Marker, Markers
 from natcoord_jax.core.potential import marker_response, place_markers
-from natcoord_jax.effects.contact.friction import GAP, Rubbing
-from natcoord_jax.effects.contact.gap import Gap
+from natcoord_jax.effects.contact.friction import Rubbing
 from natcoord_jax.effects.contact.law import ContactLaw, ContactReadings
 
 
@@ -50,26 +42,13 @@ class FrictionalGapPotential(Rubbing, ContactLaw):
         >>> contact = nc.FrictionalGapPotential(markers, gap, stiffness=1e5, friction=0.3)
     """
 
-    markers: Any = eqx.field(metadata=is_a(Markers()))
-    gap: Gap = eqx.field(metadata=is_a(GAP))
-    name: Any = eqx.field(default=None, kw_only=True, metadata=is_a(NAME))
-
     kind: ClassVar[str] = "soft contact with friction"
-    bounces: ClassVar[bool] = False
     works: ClassVar[bool] = True
-
-    def __check_init__(self) -> None:
-        """Refuse markers of another gap, and friction at no one knows which point."""
-        require(self, "markers", self.gap.markers)
-        self.refuse_unknown_points()
-
-    def attach(self, find: Callable[[Handle], tuple[Joint, Array]]) -> Sequence[Marker | Attachment]:
-        """Markers of the energy."""
-        return self.markers
 
     def assembled_at(self, x: Array) -> "FrictionalGapPotential":
         """With its damping, and a mobility, which is found when the masses are known."""
-        return replace_fields(self.renewed(), mobility=jnp.ones(()))
+        damped: Any = self.renewed()
+        return replace_fields(damped, mobility=jnp.ones(()))
 
     def violation(self, place: Array, rows: Array, coordinates: Array, t: Array) -> Array:
         """None: surfaces may overlap."""

@@ -1,6 +1,5 @@
 """Contact as a constraint: a gap between two surfaces that does not become negative (65), (66)."""
 
-from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -8,17 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from natcoord_jax.core.arguments import is_a, require
+from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.checks import is_concrete
 from natcoord_jax.core.effect import Motion, Response, StepContext, replace_fields
-from natcoord_jax.core.handles import Handle
-from natcoord_jax.core.joint import Joint
-from natcoord_jax.core.kinds import NAME
-from natcoord_jax.core.markers import Attachment, Marker, Markers
 from natcoord_jax.core.numeric import Number
 from natcoord_jax.core.potential import marker_response, place_markers
-from natcoord_jax.effects.contact.friction import GAP, Rubbing
-from natcoord_jax.effects.contact.gap import Gap
+from natcoord_jax.effects.contact.friction import Rubbing
 
 
 class GapReadings(eqx.Module):
@@ -72,31 +66,23 @@ class GapConstraint(Rubbing):
         >>> contact = nc.GapConstraint((*floor, nc.Point(nc.ground, (0, 0, 1))), gap, restitution=0.5)
     """
 
-    markers: Any = eqx.field(metadata=is_a(Markers()))
-    gap: Gap = eqx.field(metadata=is_a(GAP))
     restitution: Any = eqx.field(default=1.0, kw_only=True, metadata=is_a(Number("not negative")))
     compliance: Any = eqx.field(default=0.0, kw_only=True, metadata=is_a(Number("not negative")))
-    name: Any = eqx.field(default=None, kw_only=True, metadata=is_a(NAME))
 
     kind: ClassVar[str] = "hard contact"
+    bounces: ClassVar[bool] = True
 
     def __check_init__(self) -> None:
-        """Refuse markers of another gap, what gives energy, and friction at no one knows which point."""
-        require(self, "markers", self.gap.markers)
+        """Refuse what gives energy."""
         if is_concrete(self.restitution) and np.any(np.asarray(self.restitution) > 1):
             raise ValueError(
                 f"{type(self).__name__}: restitution [-] is {self.restitution}; pass a number from 0 to 1: "
                 "an impact gives nothing"
             )
-        self.refuse_unknown_points()
 
     def flaws(self) -> dict[str, Array]:
         """A restitution that gives energy."""
         return {"has a restitution [-] above 1: an impact gives nothing": self.restitution > 1.0}
-
-    def attach(self, find: Callable[[Handle], tuple[Joint, Array]]) -> Sequence[Marker | Attachment]:
-        """Markers of the constraint."""
-        return self.markers
 
     def assembled_at(self, x: Array) -> "GapConstraint":
         """With a mobility, which is found when the masses are known."""
