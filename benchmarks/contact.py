@@ -9,7 +9,7 @@ spring of its constraint solver (solref -k 0), and by its default; Exudyn by a s
 compiled programs (of MuJoCo: of `mj_step` in C) per second of motion, so that steps of all lengths compare.
 
 Balls with friction and restitution on a floor, that bounce or rest: time of a step and ball, in one scene and
-in batches, in turn with MuJoCo (one scene, in C) or MJX (lanes, in JAX), whose balls keep no part of the speed.
+in batches, in turn with MuJoCo (one scene, in C) or MJX (lanes, in JAX), which keep none of the speed.
 
 The derivative of the height after 1 s of a ball that falls 1 m by the height at the start is exactly 1.2842
 for a restitution of 1 (with the speed 0.3 m/s at the start).

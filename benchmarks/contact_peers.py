@@ -1,6 +1,7 @@
 """The scenes of `benchmarks.contact` in MuJoCo, MJX and Exudyn: a bouncing ball, and balls on a floor."""
 
 from collections.abc import Callable
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -58,7 +59,8 @@ def exudyn_ball(dt: float, spring: float, repeats: int) -> tuple[str, Any, dict[
     The time is that of `SolveDynamic` as a whole, which sets up each run anew.
     """
     import exudyn as exu
-    from exudyn import itemInterface as items
+
+    items: Any = import_module("exudyn.itemInterface")
 
     steps, motion = round(3.0 / dt), []
 

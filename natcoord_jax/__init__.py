@@ -110,6 +110,7 @@ from natcoord_jax.effects.beams import (
 from natcoord_jax.effects.constraints import PointOnLine, PointOnPlane, PointOnPoint, PointSum, Rod, Rolling
 from natcoord_jax.effects.contact import (
     CapsuleOnCapsule,
+    DiscOnPlane,
     DiscreteGap,
     EllipsoidOnPlane,
     FrictionalGapPotential,
@@ -241,6 +242,7 @@ __all__ = [
     "DirectorDamping",
     "DirectorElement",
     "DirectorInterpolation",
+    "DiscOnPlane",
     "DiscreteGap",
     "Dissipative",
     "Distance",

@@ -229,6 +229,7 @@ CALLS = {
         "regularisation": NUMBER,
     },
     "SphereOnPlane": lambda w: {"radius": NUMBER},
+    "DiscOnPlane": lambda w: {"radius": NUMBER},
     "SphereOnSphere": lambda w: {"radii": [(1.0, 1.0)]},
     "CapsuleOnCapsule": lambda w: {"radii": [(1.0, 1.0)]},
     "EllipsoidOnPlane": lambda w: {"semi_axes": V},

@@ -111,7 +111,11 @@ def test_lanes_with_other_contacts():
 
     starts = jnp.linspace(0.0, 0.5, 64)
     together = jax.jit(jax.vmap(jax.value_and_grad(end)))(starts)
-    assert len(np.unique(np.asarray(jax.vmap(run)(starts).states.contacts)[:, -1, 0, 2])) >= 3
+    every = jax.jit(jax.vmap(run))(starts)
+    report, impacts = nc.contacts(system, every), np.asarray(every.states.contacts)[:, -1, 0, 2]
+    assert len(np.unique(impacts)) >= 3
+    np.testing.assert_array_equal(report.impacts.sum(axis=(1, 2)), impacts)
+    np.testing.assert_allclose(report.gap[..., 0], np.asarray(every.q)[:, :, 0, 2] - 0.1, atol=1e-14)
     alone = jax.jit(jax.value_and_grad(end))
     for k in range(0, 64, 9):
         np.testing.assert_allclose([x[k] for x in together], alone(starts[k]), rtol=1e-9, atol=1e-11)

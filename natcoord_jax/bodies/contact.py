@@ -9,7 +9,7 @@ from natcoord_jax.bodies.contact_gaps import gaps_between, gaps_within
 from natcoord_jax.bodies.contact_sides import BeamSide, BodySide, MeshSide, PlaneSide, SegmentSide, Side
 from natcoord_jax.bodies.contact_sides import Plane as Plane
 from natcoord_jax.bodies.continua import MeshHandle, Surface
-from natcoord_jax.bodies.shapes import Box, Capsule, Ellipsoid, Sphere
+from natcoord_jax.bodies.shapes import Box, Capsule, Cylinder, Ellipsoid, Sphere
 from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.bodies import Body
 from natcoord_jax.core.effect import replace_fields
@@ -30,7 +30,7 @@ SOLID = (
 )
 SIDE = SOLID | of("nc.Plane(...)", Plane)
 
-SHAPES = "nc.Sphere, nc.Capsule, nc.Box, nc.Ellipsoid or a point"
+SHAPES = "nc.Sphere, nc.Capsule, nc.Box, nc.Cylinder, nc.Ellipsoid or a point"
 
 
 class Contact(Recipe):
@@ -47,7 +47,8 @@ class Contact(Recipe):
     wants six steps of that. Energy, momentum and angular momentum are exact, at impacts of any number of
     bodies, too.
 
-    There are gaps for spheres, capsules, boxes (by their corners), ellipsoids, points, beams and the nodes of
+    There are gaps for spheres, capsules, boxes (by their corners), cylinders (without a
+    stiffness), ellipsoids, points, beams and the nodes of
     shells and solids on planes; for spheres, capsules and beams on each other and on points and nodes; for
     spheres, points and nodes on boxes; and for surfaces of shells and solids on each other, nodes of either
     on the facets of the other, each with half the stiffness. Other shapes touch a shell or a solid at its
@@ -67,7 +68,7 @@ class Contact(Recipe):
             along their normal, modulus times area over thickness; of rigid bodies none, they do not overlap.
         restitution: part of the closing speed that is left after an impact [-]; None: nothing is lost. With a
             stiffness above 0, and where no other force acts (weight in a soft contact takes some more of it).
-        friction: coefficient [-], of contacts without a stiffness; None: there is none.
+        friction: coefficient [-], of rigid bodies, points and beams; None: there is none.
         speed: with a stiffness, of the impact that `restitution` is of [m/s]; less is lost of slower ones.
         law: force proportional to the overlap, "linear", or to its power 3/2, "hertz".
         one_pass: of two surfaces, let the nodes of `one` alone touch the facets of `other`, with all of the
@@ -170,7 +171,7 @@ def _shaped(handle: Handle, shape: Any, centre: Any, name: str) -> Side:
         return SegmentSide(
             handle, Capsule, (body.point((0, 0, -half)), body.point((0, 0, half))), shape.radius
         )
-    if not isinstance(shape, Box | Ellipsoid):
+    if not isinstance(shape, Box | Cylinder | Ellipsoid):
         raise ValueError(
             f"contact {name!r}: {handle.name!r} is a {type(shape).__name__}; there are gaps for {SHAPES}"
         )

@@ -17,13 +17,14 @@ from natcoord_jax.bodies.contact_sides import (
 )
 from natcoord_jax.bodies.continua import Surface
 from natcoord_jax.bodies.node_surface import surface_gaps
-from natcoord_jax.bodies.shapes import CORNERS, Box, Capsule, Ellipsoid, Sphere
+from natcoord_jax.bodies.shapes import CORNERS, Box, Capsule, Cylinder, Ellipsoid, Sphere
 from natcoord_jax.core.checks import as_array
 from natcoord_jax.core.eager_numpy import stacked
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.markers import Marker
 from natcoord_jax.effects.contact import (
     CapsuleOnCapsule,
+    DiscOnPlane,
     EllipsoidOnPlane,
     FrictionalGapPotential,
     Gap,
@@ -153,6 +154,25 @@ def _ellipsoid_on_plane(ellipsoid: BodySide, plane: PlaneSide, law: Law, name: s
     return [_kept_open(EllipsoidOnPlane(semi_axes=shape.semi_axes), markers, law, name)]
 
 
+def _cylinder_on_plane(cylinder: BodySide, plane: PlaneSide, law: Law, name: str) -> Gaps:
+    """The lowest points of both rims, for what rolls, and four points of each, for what stands."""
+    if law["stiffness"] is not None:
+        raise ValueError(
+            f"contact {name!r}: a stiffness [N/m] of {cylinder.named} would be that of several points "
+            "where it stands, and of one where it lies; leave it out, or take an nc.Capsule"
+        )
+    shape: Any = cylinder.shape
+    axis, found = cylinder.axes()[2], []
+    for end in (-0.5, 0.5):
+        middle = np.array([0.0, 0.0, 1.0]) * end * shape.length
+        markers = *plane.plane.markers(), cylinder.point(middle), axis
+        found.append(_kept_open(DiscOnPlane(radius=shape.radius), markers, law, name))
+        for corner in ((1, 0, 0), (0, 1, 0), (-1, 0, 0), (0, -1, 0)):
+            ball = SegmentSide.ball(cylinder.point(middle + shape.radius * np.array(corner)))
+            found += _ball_on_plane(ball, plane, law, name)
+    return _sharing(found)
+
+
 def _ball_on_box(ball: SegmentSide, box: BodySide, law: Law, name: str) -> Gaps:
     shape: Any = box.shape
     markers = box.point(), ball.ends[0], *box.axes()
@@ -197,6 +217,7 @@ TABLE: dict[tuple[type, type], Callable[..., Gaps]] = {
     (Strand, Plane): _beam_on_plane,
     (Box, Plane): _box_on_plane,
     (Ellipsoid, Plane): _ellipsoid_on_plane,
+    (Cylinder, Plane): _cylinder_on_plane,
     (Sphere, Box): _ball_on_box,
     (Sphere, Sphere): _balls,
     (Sphere, Capsule): _segments,

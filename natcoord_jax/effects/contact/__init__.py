@@ -8,6 +8,7 @@ from natcoord_jax.effects.contact.gap_potential import GapPotential as GapPotent
 from natcoord_jax.effects.contact.law import damping_of as damping_of
 from natcoord_jax.effects.contact.node_on_facets import NodeOnFacets as NodeOnFacets
 from natcoord_jax.effects.contact.pairs import CapsuleOnCapsule as CapsuleOnCapsule
+from natcoord_jax.effects.contact.pairs import DiscOnPlane as DiscOnPlane
 from natcoord_jax.effects.contact.pairs import EllipsoidOnPlane as EllipsoidOnPlane
 from natcoord_jax.effects.contact.pairs import SphereOnBox as SphereOnBox
 from natcoord_jax.effects.contact.pairs import SphereOnPlane as SphereOnPlane
