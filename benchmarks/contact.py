@@ -71,7 +71,8 @@ def judged(t: np.ndarray, z: np.ndarray, energy: np.ndarray) -> dict[str, float]
     if 0 < peak < len(second) - 1:  # between the states, on the parabola through three of them
         a, b, c = second[peak - 1 : peak + 2]
         top = float(b + (a - c) ** 2 / (8 * (2 * b - a - c)))
-    drift = np.abs(energy - energy[0]).max() / 9.81
+    # What a spring holds while it is touched is in no account of these: it is judged in the air.
+    drift = np.abs(energy - energy[0])[z > -1e-9].max() / 9.81
     return {"apex_error": abs(top - 1.0), "energy_error": float(drift), "depth": float(max(0.0, -z.min()))}
 
 
@@ -163,7 +164,7 @@ def main() -> None:
     quick = options.quick
     jax.config.update("jax_enable_x64", True)
     results = common.circumstances("contact", quick=quick)
-    repeats, steps = (2, STEPS_OF_BALL[1:3]) if quick else (7, STEPS_OF_BALL)
+    repeats, steps = (2, STEPS_OF_BALL[1:3]) if quick else (5, STEPS_OF_BALL)
     runs = [ours(dt, repeats) for dt in steps]
     peers = not options.no_peers
     if peers:
@@ -172,7 +173,7 @@ def main() -> None:
         runs += [peers_ball(make(dt, k, repeats), dt) for make, k in given for dt in steps]
     print(common.columns(runs, COLUMNS))
     sizes = SIZES[:2] if quick else SIZES
-    balls = [run for size in sizes for run in many(*size, repeats, peers=peers)]
+    balls = [run for size in sizes for run in many(*size, min(3, repeats), peers=peers)]
     print(common.columns(balls, COLUMNS_OF_BALLS))
     slopes = derivatives()
     if peers:
