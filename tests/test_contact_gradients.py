@@ -82,14 +82,14 @@ def test_grazing():
         def side(b, system=system, state=state):
             given = state.q.at[0, 1].add(b), state.v.at[0, 0].set(1.0)
             start = eqx.tree_at(lambda s: (s.q, s.v), state, given)
-            return nc.simulate(system, start, dt=0.01, steps=300, throw=False).q[-1, 0, 1]
+            return nc.simulate(system, start, dt=2e-3, steps=1500, throw=False).q[-1, 0, 1]
 
         slope = jax.jit(jax.grad(side))
-        slopes[name] = [float(slope(b)) for b in (0.9, 0.99, 0.9999, 1.001)]
+        slopes[name] = [float(slope(b)) for b in (0.9, 0.99, 0.99999, 1.001)]
     assert np.isfinite(list(slopes.values())).all()
     hard, soft = np.abs(slopes["hard"]), np.abs(slopes["soft"])
     assert hard[2] > 3 * hard[1] > 6 * hard[0]
-    assert soft[2] < 0.6 * hard[2]
+    assert soft[2] < 0.5 * hard[2]
     assert slopes["hard"][3] == pytest.approx(1.0) and slopes["soft"][3] == pytest.approx(1.0)
 
 
