@@ -17,7 +17,7 @@ from natcoord_jax.core.names import compact
 from natcoord_jax.core.nodes import Clamp
 from natcoord_jax.core.state import State
 from natcoord_jax.mechanics.coordinates import coordinate_values, state_rates
-from natcoord_jax.mechanics.impacts import with_mobilities
+from natcoord_jax.mechanics.impacts import untouched, with_mobilities
 from natcoord_jax.model.axisymmetric_axes import symmetries
 from natcoord_jax.model.bodies import Bodies
 from natcoord_jax.model.choice import choose_solver, elimination_order
@@ -87,7 +87,7 @@ def build(
         elimination_order(layout, groups, joint_groups) if structure.solver == "recursive" else None,
         structure,
     )
-    state = layout.state()
+    state = replace_fields(layout.state(), contacts=untouched(system))
     system = with_mobilities(jax.tree.map(as_array, with_symmetries(system, state)), state)
     return system, with_readings(system, state)
 

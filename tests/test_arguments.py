@@ -213,7 +213,7 @@ CALLS = {
     "Contact": lambda w: {
         "one": [w.body], "other": [nc.Plane(), w.body], "stiffness": NUMBER, "restitution": NUMBER,
         "friction": NUMBER, "speed": NUMBER, "law": ["linear", "hertz"], "name": NAME, "one_pass": FLAG,
-        "candidates": WHOLE,
+        "candidates": WHOLE, "self_contact": FLAG,
     },
     "GapPotential": lambda w: {
         **MARKED(w.ends), "gap": [nc.SphereOnSphere(radii=(1.0, 1.0))], "stiffness": NUMBER,
@@ -223,7 +223,13 @@ CALLS = {
         **MARKED(w.ends), "gap": [nc.SphereOnSphere(radii=(1.0, 1.0))], "restitution": NUMBER,
         "friction": NUMBER, "regularisation": NUMBER, "compliance": NUMBER,
     },
+    "FrictionalGapPotential": lambda w: {
+        **MARKED(w.ends), "gap": [nc.SphereOnSphere(radii=(1.0, 1.0))], "stiffness": NUMBER,
+        "restitution": NUMBER, "speed": NUMBER, "law": ["linear", "hertz"], "friction": NUMBER,
+        "regularisation": NUMBER,
+    },
     "SphereOnPlane": lambda w: {"radius": NUMBER},
+    "DiscOnPlane": lambda w: {"radius": NUMBER},
     "SphereOnSphere": lambda w: {"radii": [(1.0, 1.0)]},
     "CapsuleOnCapsule": lambda w: {"radii": [(1.0, 1.0)]},
     "EllipsoidOnPlane": lambda w: {"semi_axes": V},
@@ -342,6 +348,7 @@ CALLS = {
         "steps": [(2,)],
         "targets": [(1.0,)], "repeats": WHOLE, "limit_s": NUMBER,
     },
+    "contacts": lambda w: {"system": [w.system], "trajectory": [w.trajectory]},
     "balance": lambda w: {"system": [w.system], "trajectory": [w.trajectory]},
     "equilibrium": lambda w: {
         **RUN(w), "loads": NUMBER, "inputs": [f, np.ones(1)], "steps": WHOLE, "throw": FLAG
@@ -467,10 +474,10 @@ CALLS = {
 
 # What calls return or hand over, and bases: nobody is to make these by hand.
 MADE = {
-    "Accuracy", "Balance", "BeamHandle", "Check", "ComputedTorque", "Continuation", "DerivativeError",
-    "Equilibrium", "Feedback", "Frame", "Growth", "Load", "MeshHandle", "Modes", "NodeKind", "Nodes",
-    "NonlinearProgram",
-    "Optima", "Outcome", "Result", "SimulationError", "Solution", "State", "Steps", "Surface", "Sweep",
+    "Accuracy", "Balance", "BeamHandle", "Check", "ComputedTorque", "Contacts", "Continuation",
+    "DerivativeError", "Equilibrium", "Feedback", "Frame", "Growth", "Load", "MeshHandle", "Modes",
+    "NodeKind", "Nodes", "NonlinearProgram", "Optima", "Outcome", "Result", "SimulationError", "Solution",
+    "State", "Steps", "Surface", "Sweep",
     "System",
     "Trajectory",
 }  # fmt: skip

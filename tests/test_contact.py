@@ -149,6 +149,12 @@ GAPS = {
         (2,),
         lambda axes, points: on_plane(axes, points, turned=True),
     ),
+    nc.DiscOnPlane: (
+        nc.DiscOnPlane(radius=0.3),
+        (0, 2),
+        (2,),
+        lambda axes, points: on_plane(axes, points, turned=True)[:4],
+    ),
     nc.SphereOnSphere: (
         nc.SphereOnSphere(radii=np.array([0.2, 0.3])),
         (0, 1),
@@ -391,5 +397,7 @@ def test_shapes_without_a_gap_are_refused():
     one, two, can = (scene.add(nc.RigidBody(shape=shape, density=1.0)) for shape in made)
     with pytest.raises(ValueError, match="no gap between Box 'body 1' and Box 'body 2'"):
         scene.add(nc.Contact(one, two, stiffness=1.0))
-    with pytest.raises(ValueError, match="is a Cylinder; there are gaps for"):
+    with pytest.raises(ValueError, match="no gap between Box 'body 1' and Cylinder 'body 3'"):
+        scene.add(nc.Contact(one, can, stiffness=1.0))
+    with pytest.raises(ValueError, match="stiffness .* of Cylinder 'body 3' would be"):
         scene.add(nc.Contact(can, FLOOR, stiffness=1.0))

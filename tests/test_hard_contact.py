@@ -226,6 +226,32 @@ def test_sphere_begins_to_roll():
     assert 2 * 2.0 / (7 * 0.3 * 9.81) <= rolls <= 2 * 2.0 / (7 * 0.3 * 9.81) + 0.011
 
 
+def test_cylinder_begins_to_roll():
+    """With two thirds of its speed: it lies on the lowest points of both rims."""
+    scene = nc.Scene()
+    scene.add(nc.Gravity())
+    roll = nc.RigidBody(
+        shape=nc.Cylinder(0.1, 0.3),
+        density=300.0,
+        position=(0, 0, 0.1),
+        orientation=((1, 0, 0), np.pi / 2),
+        velocity=(2.0, 0, 0),
+        name="roll",
+    )
+    roll = scene.add(roll)
+    scene.add(nc.Contact(roll, FLOOR, restitution=0.0, friction=0.3))
+    system, state = scene.compile()
+    trajectory = nc.simulate(system, state, dt=0.01, steps=80)
+    assert nc.balance(system, trajectory).energy.max() <= tol.ENERGY_OF_A_SMALL_SCENE
+    assert float(system.sense(trajectory, roll).velocity[-1, 0]) == pytest.approx(2.0 * 2 / 3, rel=1e-9)
+    # Let fall on its end, the same one stands.
+    rows = jnp.concatenate([jnp.array([[0.0, 0.0, 0.2]]), jnp.eye(3)])
+    still = eqx.tree_at(lambda s: (s.q, s.v), state, (rows, jnp.zeros_like(rows)))
+    trajectory = nc.simulate(system, still, dt=0.01, steps=80)
+    assert np.abs(np.asarray(trajectory.v)[-1]).max() <= 1e-9
+    assert float(system.sense(trajectory, roll).position[-1, 2]) == pytest.approx(0.15, abs=1e-9)
+
+
 def test_box_slides_on_four_corners():
     """Dependent contacts share load and friction evenly: it does not turn, and stops where a point does."""
     _, x, v = sliding(0.01, 0.9, 3.0, seconds=0.6, shape=nc.Box((0.3, 0.3, 0.2)))

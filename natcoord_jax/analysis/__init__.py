@@ -2,6 +2,7 @@
 
 from natcoord_jax.analysis.accuracy import Accuracy, accuracy
 from natcoord_jax.analysis.balance import Balance, balance
+from natcoord_jax.analysis.contacts import Contacts, contacts
 from natcoord_jax.analysis.growth import Growth, tangent_growth
 from natcoord_jax.analysis.load_path import load_path
 from natcoord_jax.analysis.modes import Modes, modes
@@ -11,12 +12,14 @@ from natcoord_jax.analysis.statics import Equilibrium, equilibrium
 __all__ = [
     "Accuracy",
     "Balance",
+    "Contacts",
     "Equilibrium",
     "Growth",
     "Modes",
     "Phases",
     "accuracy",
     "balance",
+    "contacts",
     "equilibrium",
     "load_path",
     "modes",

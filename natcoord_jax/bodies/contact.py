@@ -5,11 +5,11 @@ from typing import Any
 import equinox as eqx
 
 from natcoord_jax.bodies.beam import BeamHandle
-from natcoord_jax.bodies.contact_gaps import gaps_between
+from natcoord_jax.bodies.contact_gaps import gaps_between, gaps_within
 from natcoord_jax.bodies.contact_sides import BeamSide, BodySide, MeshSide, PlaneSide, SegmentSide, Side
 from natcoord_jax.bodies.contact_sides import Plane as Plane
 from natcoord_jax.bodies.continua import MeshHandle, Surface
-from natcoord_jax.bodies.shapes import Box, Capsule, Ellipsoid, Sphere
+from natcoord_jax.bodies.shapes import Box, Capsule, Cylinder, Ellipsoid, Sphere
 from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.bodies import Body
 from natcoord_jax.core.effect import replace_fields
@@ -30,7 +30,7 @@ SOLID = (
 )
 SIDE = SOLID | of("nc.Plane(...)", Plane)
 
-SHAPES = "nc.Sphere, nc.Capsule, nc.Box, nc.Ellipsoid or a point"
+SHAPES = "nc.Sphere, nc.Capsule, nc.Box, nc.Cylinder, nc.Ellipsoid or a point"
 
 
 class Contact(Recipe):
@@ -47,7 +47,8 @@ class Contact(Recipe):
     wants six steps of that. Energy, momentum and angular momentum are exact, at impacts of any number of
     bodies, too.
 
-    There are gaps for spheres, capsules, boxes (by their corners), ellipsoids, points, beams and the nodes of
+    There are gaps for spheres, capsules, boxes (by their corners), cylinders (without a
+    stiffness), ellipsoids, points, beams and the nodes of
     shells and solids on planes; for spheres, capsules and beams on each other and on points and nodes; for
     spheres, points and nodes on boxes; and for surfaces of shells and solids on each other, nodes of either
     on the facets of the other, each with half the stiffness. Other shapes touch a shell or a solid at its
@@ -67,11 +68,13 @@ class Contact(Recipe):
             along their normal, modulus times area over thickness; of rigid bodies none, they do not overlap.
         restitution: part of the closing speed that is left after an impact [-]; None: nothing is lost. With a
             stiffness above 0, and where no other force acts (weight in a soft contact takes some more of it).
-        friction: coefficient [-], of contacts without a stiffness; None: there is none.
+        friction: coefficient [-], of rigid bodies, points and beams; None: there is none.
         speed: with a stiffness, of the impact that `restitution` is of [m/s]; less is lost of slower ones.
         law: force proportional to the overlap, "linear", or to its power 3/2, "hertz".
         one_pass: of two surfaces, let the nodes of `one` alone touch the facets of `other`, with all of the
             stiffness: for a fine surface, or one that folds, on a coarse one.
+        self_contact: of a beam that is passed twice: its segments touch each other, those that are farther
+            apart along it than half a turn about its own section.
         candidates: number of facets that a node may touch; default 16.
         name: of the contact; several gaps are called "name[0]" and so on.
 
@@ -102,6 +105,7 @@ class Contact(Recipe):
         default="linear", kw_only=True, static=True, metadata=is_a(Choice(("linear", "hertz")))
     )
     one_pass: bool = eqx.field(default=False, kw_only=True, static=True, metadata=is_a(FLAG))
+    self_contact: bool = eqx.field(default=False, kw_only=True, static=True, metadata=is_a(FLAG))
     candidates: int | None = eqx.field(default=None, kw_only=True, static=True, metadata=is_a(Whole(1)))
     name: str | None = eqx.field(default=None, kw_only=True, static=True, metadata=is_a(NAME))
 
@@ -109,10 +113,13 @@ class Contact(Recipe):
 
     def add_to(self, scene: Builder, name: str) -> tuple[Handle, ...]:
         """Add its gaps; their handles."""
-        if _owner(self.one) == _owner(self.other):
+        itself = _owner(self.one) == _owner(self.other)
+        if itself != self.self_contact or (itself and not isinstance(self.one, BeamHandle)):
             raise ValueError(
                 f"contact {name!r}: {_owner(self.one).name!r} would be in contact with itself, for which "
-                "there is no gap; pass two different parts"
+                "there is no gap; pass two different parts, or twice a beam with self_contact=True"
+                if itself
+                else f"contact {name!r}: self_contact=True is for a beam with itself; pass it twice"
             )
         law = {"stiffness": self.stiffness, "law": self.law}
         for option in ("restitution", "friction", "speed", "candidates"):
@@ -121,7 +128,7 @@ class Contact(Recipe):
         if self.one_pass:
             law |= {"one_pass": True}
         one, other = (_side(scene, given, name) for given in (self.one, self.other))
-        gaps = gaps_between(one, other, law, name)
+        gaps = gaps_within(one, law, name) if itself else gaps_between(one, other, law, name)
         named = [name] if len(gaps) == 1 else [f"{name}[{k}]" for k in range(len(gaps))]
         return tuple(scene.add(replace_fields(gap, name=said)) for gap, said in zip(gaps, named))
 
@@ -164,7 +171,7 @@ def _shaped(handle: Handle, shape: Any, centre: Any, name: str) -> Side:
         return SegmentSide(
             handle, Capsule, (body.point((0, 0, -half)), body.point((0, 0, half))), shape.radius
         )
-    if not isinstance(shape, Box | Ellipsoid):
+    if not isinstance(shape, Box | Cylinder | Ellipsoid):
         raise ValueError(
             f"contact {name!r}: {handle.name!r} is a {type(shape).__name__}; there are gaps for {SHAPES}"
         )

@@ -3,6 +3,8 @@
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
+
 from natcoord_jax.bodies.contact_sides import (
     BeamSide,
     BodySide,
@@ -15,14 +17,16 @@ from natcoord_jax.bodies.contact_sides import (
 )
 from natcoord_jax.bodies.continua import Surface
 from natcoord_jax.bodies.node_surface import surface_gaps
-from natcoord_jax.bodies.shapes import CORNERS, Box, Capsule, Ellipsoid, Sphere
+from natcoord_jax.bodies.shapes import CORNERS, Box, Capsule, Cylinder, Ellipsoid, Sphere
 from natcoord_jax.core.checks import as_array
 from natcoord_jax.core.eager_numpy import stacked
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.markers import Marker
 from natcoord_jax.effects.contact import (
     CapsuleOnCapsule,
+    DiscOnPlane,
     EllipsoidOnPlane,
+    FrictionalGapPotential,
     Gap,
     GapConstraint,
     GapPotential,
@@ -69,18 +73,47 @@ def gaps_between(one: Side, other: Side, law: Law, name: str) -> Gaps:
     )
 
 
+def gaps_within(beam: Side, law: Law, name: str) -> Gaps:
+    """Gaps of the segments of a beam with each other, but for those that are near along it.
+
+    Args:
+        beam: side.
+        law: numbers of the contact.
+        name: of the contact, for messages.
+
+    Raises:
+        ValueError: for a beam so short that none of its segments can touch another.
+    """
+    assert isinstance(beam, BeamSide)
+    parts = beam.parts
+    along = np.concatenate([[0.0], np.cumsum(beam.lengths)])
+    pairs = [
+        (int(i), int(j))
+        for i, j in zip(*np.triu_indices(len(parts), 1))
+        if along[j] - along[i + 1] > np.pi * beam.radius
+    ]
+    if not pairs:
+        raise ValueError(
+            f"contact {name!r}: {beam.named} is too short to touch itself: no two of its {len(parts)} "
+            "segments are farther apart along it than half a turn about its section, "
+            f"{np.pi * beam.radius:.3g} m"
+        )
+    return [gap for i, j in pairs for gap in gaps_between(parts[i], parts[j], law, name)]
+
+
 def _kept_open(gap: Gap, markers: tuple[Marker, ...], law: Law, name: str, *sides: Side) -> Any:
     """A potential with the stiffness that is given or that of the sides; a constraint where there is none."""
     law = {key: value for key, value in law.items() if key not in OF_SURFACES}
     own = [s.stiffness for s in sides if isinstance(s, SegmentSide) and s.stiffness is not None]
     given = law.pop("stiffness")
     stiffness = given if given is not None else min(own, default=None)
-    if stiffness is not None:
-        if "friction" in law:
+    if stiffness is not None and "friction" in law:
+        if own:
             raise ValueError(
-                f"contact {name!r}: friction [-] is for contacts of rigid bodies without a stiffness; leave "
-                "one of them out"
+                f"contact {name!r}: there is no friction [-] on nodes of shells and solids yet; leave it out"
             )
+        return FrictionalGapPotential(markers, gap, stiffness=stiffness, **law)
+    if stiffness is not None:
         return GapPotential(markers, gap, stiffness=stiffness, **law)
     if "speed" in law or law["law"] != "linear":
         raise ValueError(
@@ -119,6 +152,25 @@ def _ellipsoid_on_plane(ellipsoid: BodySide, plane: PlaneSide, law: Law, name: s
     shape: Any = ellipsoid.shape
     markers = *plane.plane.markers(), ellipsoid.point(), *ellipsoid.axes()
     return [_kept_open(EllipsoidOnPlane(semi_axes=shape.semi_axes), markers, law, name)]
+
+
+def _cylinder_on_plane(cylinder: BodySide, plane: PlaneSide, law: Law, name: str) -> Gaps:
+    """The lowest points of both rims, for what rolls, and four points of each, for what stands."""
+    if law["stiffness"] is not None:
+        raise ValueError(
+            f"contact {name!r}: a stiffness [N/m] of {cylinder.named} would be that of several points "
+            "where it stands, and of one where it lies; leave it out, or take an nc.Capsule"
+        )
+    shape: Any = cylinder.shape
+    axis, found = cylinder.axes()[2], []
+    for end in (-0.5, 0.5):
+        middle = np.array([0.0, 0.0, 1.0]) * end * shape.length
+        markers = *plane.plane.markers(), cylinder.point(middle), axis
+        found.append(_kept_open(DiscOnPlane(radius=shape.radius), markers, law, name))
+        for corner in ((1, 0, 0), (0, 1, 0), (-1, 0, 0), (0, -1, 0)):
+            ball = SegmentSide.ball(cylinder.point(middle + shape.radius * np.array(corner)))
+            found += _ball_on_plane(ball, plane, law, name)
+    return _sharing(found)
 
 
 def _ball_on_box(ball: SegmentSide, box: BodySide, law: Law, name: str) -> Gaps:
@@ -165,6 +217,7 @@ TABLE: dict[tuple[type, type], Callable[..., Gaps]] = {
     (Strand, Plane): _beam_on_plane,
     (Box, Plane): _box_on_plane,
     (Ellipsoid, Plane): _ellipsoid_on_plane,
+    (Cylinder, Plane): _cylinder_on_plane,
     (Sphere, Box): _ball_on_box,
     (Sphere, Sphere): _balls,
     (Sphere, Capsule): _segments,

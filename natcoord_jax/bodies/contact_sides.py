@@ -134,10 +134,12 @@ class BeamSide(Side):
     Attributes:
         points: its nodes.
         radius: within which its section is [m].
+        name: of the beam.
     """
 
     points: tuple[Marker, ...]
     radius: Any
+    name: str
 
     @staticmethod
     def of(beam: BeamHandle, name: str) -> "BeamSide":
@@ -153,13 +155,24 @@ class BeamSide(Side):
             )
         radius = np.linalg.norm(np.asarray(beam.outline), axis=1).max()
         points = tuple(Point(a.body, a.point) for a in beam.attachments)
-        return BeamSide(beam.nodes[0], Strand, points, float(radius))
+        return BeamSide(beam.nodes[0], Strand, points, float(radius), beam.name)
+
+    @property
+    def named(self) -> str:
+        """For messages."""
+        return f"beam {self.name!r}"
 
     @property
     def parts(self) -> Sequence[Side]:
         """Its segments."""
         pairs = zip(self.points, self.points[1:])
         return [SegmentSide(ends[0].body, Capsule, ends, self.radius) for ends in pairs]
+
+    @property
+    def lengths(self) -> Float[np.ndarray, " n"]:
+        """Of its segments [m]."""
+        places = np.array([np.asarray(point.vector, float) for point in self.points])
+        return np.linalg.norm(np.diff(places, axis=0), axis=1)
 
     @property
     def balls(self) -> list[SegmentSide]:

@@ -123,6 +123,7 @@ class Effect(Part):
         kind: name of the scope its operations carry in the compiled program.
         multipliers: number of Lagrange multipliers per instance and stage.
         unilateral: whether the multipliers are those of inequalities: nothing is held until it is reached.
+        bounces: whether what an inequality stops is an impact, with an impulse at the end of the step.
         bends: whether its slope changes within the differences that Jacobians may be found by.
         inputs: number of input channels per instance.
         impulsive: whether forces, torques and power of its response are times the step (impulses, work).
@@ -146,6 +147,7 @@ class Effect(Part):
     kind: ClassVar[str] = "effect"
     multipliers: ClassVar[int] = 0
     unilateral: ClassVar[bool] = False
+    bounces: ClassVar[bool] = False
     bends: ClassVar[bool] = False
     inputs: ClassVar[int] = 0
     impulsive: ClassVar[bool] = False

@@ -30,6 +30,9 @@ class State(eqx.Module):
         held: which joint coordinates (first row) and which of their rates (second) `with_coordinate` has set,
             1 or 0: `assemble` keeps these where the constraints allow it, and forgets them. None: none; a
             tree without drives and couplings never has any.
+        contacts: of each contact without a stiffness, or with friction, the impulses so far of steps and of
+            impacts at their ends [N s], and the number of impacts, as `nc.contacts` reads them; None: there
+            are no such contacts.
     """
 
     t: Float[Array, "*batch"]
@@ -40,6 +43,7 @@ class State(eqx.Module):
     work: Float[Array, "*batch works"]
     dissipated: Float[Array, "*batch"] | None = None
     held: Float[Array, "*batch 2 coordinates"] | None = None
+    contacts: Float[Array, "*batch contacts 3"] | None = None
 
     def at_time(self, t: Any) -> "State":
         """The same positions and velocities at another time, from which a simulation then starts.

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from natcoord_jax.core.checks import as_array
 from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
@@ -95,14 +96,29 @@ def after_impacts(
     # Of the multipliers of a contact the first is that of the gap.
     pushed = jnp.concatenate([x[:, 0] for x in lam])
     # As in the equations: what is left of the impulse of an open contact may be of either sign.
-    active = 0.5 * _numbers(these, "mobility") * pushed > contact_gaps(system, these, end) / h
+    bouncing = _bouncing(these)
+    reach = jnp.where(bouncing, contact_gaps(system, these, end) / h, 0.0)
+    active = 0.5 * _numbers(these, "mobility") * pushed > reach
     none = jnp.zeros_like(pushed)
 
-    def impacts() -> tuple[Array, Array, Array]:
+    def impacts() -> tuple[Array, Array, Array, Array, Array]:
         return _impacts(system, start, end, h, these, active, lam)
 
-    v, rotors, done = jax.lax.cond(jnp.any(active), impacts, lambda: (end.v, end.rates, none))
-    return replace_fields(end, v=v, rates=rotors), dict(zip(numbers, _by_group(these, done)))
+    def nothing() -> tuple[Array, Array, Array, Array, Array]:
+        return end.v, end.rates, none, none, none
+
+    v, rotors, done, struck, met = jax.lax.cond(jnp.any(active), impacts, nothing)
+    after = replace_fields(end, v=v, rates=rotors)
+    if start.contacts is not None:
+        happened = jnp.stack([jnp.where(active, positive_part(pushed), 0.0), struck, met], axis=1)
+        after = replace_fields(after, contacts=start.contacts + happened)
+    return after, dict(zip(numbers, _by_group(these, done)))
+
+
+def untouched(system: Model) -> Float[Array, "c 3"] | None:
+    """`State.contacts` before anything has touched; None without contacts that have impacts."""
+    count = sum(group.count for group in system.effects if group.effect.unilateral)
+    return as_array(np.zeros((count, 3))) if count else None
 
 
 def _by_group(groups: Sequence[Group], every: Array) -> list[Array]:
@@ -111,7 +127,14 @@ def _by_group(groups: Sequence[Group], every: Array) -> list[Array]:
 
 
 def _numbers(groups: Sequence[Group], name: str) -> Float[Array, " c"]:
-    return jnp.concatenate([getattr(group.effect, name) for group in groups])
+    """A number of all contacts; zero where there is none."""
+    each = ((group.count, getattr(group.effect, name)) for group in groups)
+    return jnp.concatenate([jnp.zeros(count) if value is None else value for count, value in each])
+
+
+def _bouncing(groups: Sequence[Group]) -> np.ndarray:
+    """Which contacts have impacts; others push by an energy, and rub."""
+    return np.concatenate([np.full(group.count, group.effect.bounces) for group in groups])
 
 
 def _impacts(
@@ -122,11 +145,12 @@ def _impacts(
     groups: Sequence[Group],
     active: Float[Array, " c"],
     lam: Sequence[Float[Array, "n m"]],
-) -> tuple[Array, Array, Array]:
-    """Velocities and rates of rotors after impacts of the active contacts, and their work."""
+) -> tuple[Array, Array, Array, Array, Array]:
+    """After impacts of active contacts: velocities, rates of rotors, work, impulses, and which have met."""
     space = tangents_at(system, end)
     answers = Answers(space, levers(system, groups, end, "pushes"), end.rates)
     before, pushed = contact_gaps(system, groups, start), jnp.concatenate([x[:, 0] for x in lam])
+    on, active = active, active & _bouncing(groups)
     met = active & (before > TOUCHING * (1.0 + jnp.max(jnp.abs(start.q))))
     work = jnp.where(met, positive_part(pushed * (before - contact_gaps(system, groups, end)) / h), 0.0)
     restitution = _numbers(groups, "restitution")
@@ -135,7 +159,7 @@ def _impacts(
     impulses = impact_impulses(matrix, rates, work, restitution, active, met)
     velocity = answers.pushed(velocity, impulses)
     done = impulses * (rates + 0.5 * matrix @ impulses)
-    parts = zip(groups, lam, *(_by_group(groups, x) for x in (active, impulses, done)))
+    parts = zip(groups, lam, *(_by_group(groups, x) for x in (on, impulses, done)))
     rubbing, finished = [], []
     for group, own, on, pushes, work in parts:
         finished.append(work)
@@ -150,15 +174,16 @@ def _impacts(
         velocity = answers.pushed(velocity, stopping)
         lost = iter(_by_group(these, stopped))
         finished = [w + (0.0 if g.effect.friction is None else next(lost)) for g, w in zip(groups, finished)]
-    return velocity.rows.reshape(end.v.shape), velocity.rotors, jnp.concatenate(finished)
+    account = jnp.concatenate(finished), impulses, met.astype(impulses.dtype)
+    return velocity.rows.reshape(end.v.shape), velocity.rotors, *account
 
 
 def with_mobilities(system: SomeModel, state: State) -> SomeModel:
-    """The system with what unit impulses do at its contacts, at one state."""
+    """The system with what unit impulses do at its contacts, at one state: of the masses that it has now."""
     groups = [group for group in system.effects if group.effect.unilateral]
     if not groups:
         return system
-    own = iter(_by_group(groups, _own_mobilities(system, state)))
+    own = iter(_by_group(groups, mobilities(system, state)))
     effects = tuple(
         replace_fields(group, effect=replace_fields(group.effect, mobility=next(own)))
         if group.effect.unilateral
@@ -169,7 +194,12 @@ def with_mobilities(system: SomeModel, state: State) -> SomeModel:
 
 
 @eager_numpy
-def _own_mobilities(system: Model, state: State) -> Float[Array, " c"]:
+def mobilities(system: Model, state: State) -> Float[Array, " c"]:
+    """What unit impulses do at each contact that has impacts, to the speed at which it closes [1/kg].
+
+    They weigh rows of equations against each other, so that no derivative goes through them.
+    """
+    system, state = jax.lax.stop_gradient((system, state))
     groups = [group for group in system.effects if group.effect.unilateral]
     forces = levers(system, groups, state, "pushes")
     found = jnp.diagonal(Answers(tangents_at(system, state), forces, state.rates).matrix)

@@ -45,9 +45,14 @@ def refuse_contacts(system: Model, what: str) -> None:
         ValueError: with a contact, and what to do.
     """
     for group in contacts(system):
+        remedy = (
+            "which contacts are closed, it does not say; give the contact a stiffness, which makes it a "
+            "potential"
+            if group.effect.bounces
+            else "which way friction acts, it does not say; leave out the friction"
+        )
         raise ValueError(
-            f"{what} of a system with {group.effect.kind} {group.labels[0]!r} is not defined: which contacts "
-            "are closed, it does not say; give the contact a stiffness, which makes it a potential"
+            f"{what} of a system with {group.effect.kind} {group.labels[0]!r} is not defined: {remedy}"
         )
 
 

@@ -13,6 +13,7 @@ from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.handles import ground
 from natcoord_jax.core.state import State
 from natcoord_jax.mechanics.coordinates import coordinate_values
+from natcoord_jax.mechanics.impacts import untouched
 from natcoord_jax.model.model import Model, SomeModel
 from natcoord_jax.model.rows import rows_with_ground
 
@@ -102,6 +103,7 @@ def in_layout(old: Model, state: State, new: Model, onto: State | None) -> State
         _merged(rotor_names(new), rotor_names(old), state.rates, rates),
         _merged(new.structure.works, old.structure.works, state.work, rest[3]),
         state.dissipated,
+        contacts=untouched(new) if onto is None else onto.contacts,
     )
 
 

@@ -16,6 +16,7 @@ from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.numeric import Number, Vector
 from natcoord_jax.core.results import REASONS, REMEDIES, Result, SimulationError
 from natcoord_jax.core.state import STATE, State
+from natcoord_jax.mechanics.impacts import with_mobilities
 from natcoord_jax.model.model import SYSTEM
 from natcoord_jax.stepping.checked import STEP, check_state, checked_inputs, checked_step
 from natcoord_jax.stepping.derivative import run_slots
@@ -72,6 +73,7 @@ def step(
     """
     check_state(system, state)
     state = scheme.started(replace_fields(state, held=None))
+    system = with_mobilities(system, state)
     h = checked_step(dt)
     inputs, _ = checked_inputs(system, None if u is None else jnp.asarray(u, float)[None], 1)
     after, code = _one_step(system, state, inputs[0], h, newton_tol, 16, scheme.tableau)

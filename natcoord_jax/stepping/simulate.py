@@ -17,6 +17,7 @@ from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.kinds import FLAG, FunctionOf, of
 from natcoord_jax.core.numeric import Number, Whole
 from natcoord_jax.core.state import STATE, State, Trajectory
+from natcoord_jax.mechanics.impacts import with_mobilities
 from natcoord_jax.model.model import SYSTEM
 from natcoord_jax.reading.tangent_states import handing
 from natcoord_jax.stepping.admissibility import check_obeyed
@@ -169,6 +170,7 @@ def simulate(
     check_state(system, state)
     check_obeyed(system, state)
     state = scheme.started(replace_fields(state, held=None))
+    system = with_mobilities(system, state)
     step = checked_step(dt)
     inputs, until = Function.of(handing(inputs), state.t, state), Function.of(handing(until), state)
     bounded = steps if isinstance(steps, Steps) else None

@@ -1,26 +1,18 @@
 """Contact as a constraint: a gap between two surfaces that does not become negative (65), (66)."""
 
-from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from natcoord_jax.core.arguments import is_a, require
+from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.checks import is_concrete
-from natcoord_jax.core.effect import Effect, Motion, Response, StepContext, replace_fields
-from natcoord_jax.core.handles import Handle
-from natcoord_jax.core.joint import Joint
-from natcoord_jax.core.kinds import NAME
-from natcoord_jax.core.markers import Attachment, Marker, Markers
+from natcoord_jax.core.effect import Motion, Response, StepContext, replace_fields
 from natcoord_jax.core.numeric import Number
-from natcoord_jax.core.potential import marker_response, on_rows, place_markers
-from natcoord_jax.effects.contact.gap import Gap
-from natcoord_jax.effects.contact.gap_potential import GAP
-from natcoord_jax.maths.vectors import cross, dot, positive_part
+from natcoord_jax.core.potential import marker_response, place_markers
+from natcoord_jax.effects.contact.friction import Rubbing
 
 
 class GapReadings(eqx.Module):
@@ -33,7 +25,7 @@ class GapReadings(eqx.Module):
     gap: Float[Array, "*t"]
 
 
-class GapConstraint(Effect):
+class GapConstraint(Rubbing):
     """A gap between two surfaces that does not become negative, with impacts.
 
     Where it would, a force pushes the surfaces apart, along the gradient of the gap averaged over the step:
@@ -74,53 +66,23 @@ class GapConstraint(Effect):
         >>> contact = nc.GapConstraint((*floor, nc.Point(nc.ground, (0, 0, 1))), gap, restitution=0.5)
     """
 
-    markers: Any = eqx.field(metadata=is_a(Markers()))
-    gap: Gap = eqx.field(metadata=is_a(GAP))
     restitution: Any = eqx.field(default=1.0, kw_only=True, metadata=is_a(Number("not negative")))
-    friction: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Number("not negative")))
-    regularisation: Any = eqx.field(default=1e-5, kw_only=True, metadata=is_a(Number("positive")))
     compliance: Any = eqx.field(default=0.0, kw_only=True, metadata=is_a(Number("not negative")))
-    name: Any = eqx.field(default=None, kw_only=True, metadata=is_a(NAME))
-    mobility: Any = eqx.field(default=None, init=False)
 
     kind: ClassVar[str] = "hard contact"
-    unilateral: ClassVar[bool] = True
-    impulsive: ClassVar[bool] = True
-    works: ClassVar[bool] = True
-    silent: ClassVar[bool] = False
-    drawn: ClassVar[bool] = False
+    bounces: ClassVar[bool] = True
 
     def __check_init__(self) -> None:
-        """Refuse markers of another gap, what gives energy, and friction at no one knows which point."""
-        require(self, "markers", self.gap.markers)
+        """Refuse what gives energy."""
         if is_concrete(self.restitution) and np.any(np.asarray(self.restitution) > 1):
             raise ValueError(
                 f"{type(self).__name__}: restitution [-] is {self.restitution}; pass a number from 0 to 1: "
                 "an impact gives nothing"
             )
-        if self.friction is not None and type(self.gap).contact is Gap.contact:
-            raise ValueError(
-                f"{type(self).__name__}: friction [-] acts where surfaces touch, which "
-                f"{type(self.gap).__name__} does not say; give it a method `contact`"
-            )
 
     def flaws(self) -> dict[str, Array]:
         """A restitution that gives energy."""
         return {"has a restitution [-] above 1: an impact gives nothing": self.restitution > 1.0}
-
-    @property
-    def multipliers(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Impulse along the normal, and with friction that of slip by its components."""
-        return 1 if self.friction is None else 4
-
-    @property
-    def bends(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Friction does, where slip changes its sign."""
-        return self.friction is not None
-
-    def attach(self, find: Callable[[Handle], tuple[Joint, Array]]) -> Sequence[Marker | Attachment]:
-        """Markers of the constraint."""
-        return self.markers
 
     def assembled_at(self, x: Array) -> "GapConstraint":
         """With a mobility, which is found when the masses are known."""
@@ -131,33 +93,11 @@ class GapConstraint(Effect):
         distance = self.gap.distance(self.gap.invariants(place_markers(place, rows)))
         return jnp.where(distance < 0, distance, 0.0)[None]
 
-    def violation_units(self, place: Array, rows: Array) -> tuple[str, ...]:
-        """Metres."""
-        return ("m",)
-
-    def pushes(self, place: Array, rows: Array) -> Float[Array, "1 k 4 3"]:
-        """Forces on the rows of the bodies per unit impulse along the gradient of the gap."""
-        return on_rows(place, self.gap.gradient(place_markers(place, rows))[None])
-
-    def rubs(self, place: Array, rows: Array) -> Float[Array, "3 k 4 3"]:
-        """The same of impulses against slip, by components."""
-        x = place_markers(place, rows)
-        still = jnp.zeros_like(x), jnp.zeros((rows.shape[0], 3), x.dtype)
-        forces, torques = jax.jacrev(lambda v, w: self.slip(x, v, w), argnums=(0, 1))(*still)
-        # On orthonormal directors.
-        turning = 0.5 * cross(torques[:, :, None], rows[:, 1:])
-        return on_rows(place, forces) + jnp.pad(turning, ((0, 0), (0, 0), (1, 0), (0, 0)))
-
     def respond(self, place: Array, motion: Motion, now: StepContext, lam: Array) -> Response:
         """The gap at the end of the step or the impulse, whichever is smaller, vanishes (66)."""
-        start = self.gap.invariants(place_markers(place, motion.start))
-        x, rates = place_markers(place, motion.rows), place_markers(place, motion.rates)
-        flow = jax.vmap(lambda xi, vi: jax.jvp(self.gap.invariants, (xi,), (vi,))[1])(x, rates)
+        start, flow = self.gap.invariants(place_markers(place, motion.start)), self.flow(place, motion)
         gradient = self.gap.averaged(start, now.h * flow, now.tableau)
-        forces = jax.vmap(lambda xi, g, m: m * jax.vjp(self.gap.invariants, xi)[1](g)[0])(
-            x, gradient, lam[:, 0]
-        )
-        torques = None
+        forces, torques = self.pushing(place, motion, gradient, lam[:, 0]), None
         moving = now.h > 0
         before = jnp.where(moving, self.gap.distance(start) / jnp.where(moving, now.h, 1.0), 0.0)
         ahead = before + jnp.sum(gradient * flow, axis=-1)
@@ -166,32 +106,10 @@ class GapConstraint(Effect):
         ahead = ahead + self.compliance * pushed
         found = jnp.where(pushed < ahead, pushed, ahead)[:, None]
         if self.friction is not None:
-            # What is along the normal by rounding, or while a step is being solved, is no friction.
-            along = lam[0, 1:]
-            slip, pulled = jax.vjp(lambda v, w: self.slip(x[0], v, w), rates[0], motion.spin[0])
-            rubbing, torques = (y[None] for y in pulled(along))
-            forces = forces + rubbing
-            most = self.friction * positive_part(lam[0, 0])
-            speed = jnp.sqrt(dot(slip, slip) + self.regularisation**2)
-            # Where the speed changes, an impulse beyond the cone counts as one on it: then Newton's iteration
-            # finds its way from anywhere. At the solution none is beyond.
-            square = dot(along, along)
-            # (What decays in open contacts has squares that are no normal numbers in the end.)
-            beyond = (square > most**2) & (square > jnp.finfo(square.dtype).tiny)
-            within = jnp.where(beyond, most / jnp.sqrt(jnp.where(beyond, square, 1.0)), 1.0) * along
-            fixed = jax.lax.stop_gradient(speed)
-            missing = along * fixed + within * (speed - fixed) + most * slip
-            found = jnp.concatenate([found, self.mobility * missing[None]], axis=1)
+            rubbing, torques, missing = self.rubbing(place, motion, lam)
+            forces, found = forces + rubbing, jnp.concatenate([found, missing], axis=1)
+        rates = place_markers(place, motion.rates)
         return replace_fields(marker_response(place, forces, torques, rates, motion), rows=found)
-
-    def slip(
-        self, x: Float[Array, "k 3"], rates: Float[Array, "k 3"], spin: Float[Array, "k 3"]
-    ) -> Float[Array, "3"]:
-        """Velocity with which the second surface slips on the first [m/s]."""
-        point, normal = self.gap.contact(x)
-        first, second = (rates[k] + cross(spin[k], point - x[k]) for k in self.gap.sides)
-        relative = second - first
-        return relative - dot(normal, relative) * normal
 
     def readings(self, place: Array, rows: Array) -> GapReadings:
         """The gap."""

@@ -15,12 +15,10 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.core.arguments import is_a, require
 from natcoord_jax.core.effect import Motion, Response, StepContext, replace_fields
-from natcoord_jax.core.kinds import of
 from natcoord_jax.core.potential import Potential, place_markers
+from natcoord_jax.effects.contact.friction import GAP
 from natcoord_jax.effects.contact.gap import Gap
 from natcoord_jax.effects.contact.law import ContactLaw, ContactReadings
-
-GAP = of("a gap, as nc.SphereOnPlane(radius=0.1)", Gap)
 
 
 class GapPotential(ContactLaw, Potential):

@@ -27,6 +27,9 @@ BEYOND = 1.4
 BLEND = 0.2
 """Of the natural coordinates, on both sides of an edge, in which they do."""
 
+AT_END = 1e-6
+"""Natural coordinates by which a node at the very end of a surface may be beyond it, by rounding."""
+
 LEVEL = 0.3
 """Difference of heights above two facets, in terms of their size, at which only the nearer one counts."""
 
@@ -176,7 +179,7 @@ def _share(at: Nearest, ends: Float[Array, "4"]) -> Float[Array, ""]:
     smooth = smooth**2 * (3.0 - 2.0 * smooth)
     # The edges at xi = 1 and -1 are those from corners 1 and 3, at eta = 1 and -1 from corners 2 and 0.
     end = jnp.where(at.natural > 0, ends[jnp.array([1, 2])], ends[jnp.array([3, 0])])
-    return jnp.prod(jnp.where(end, jnp.where(beyond < 0, 1.0, 0.0), smooth))
+    return jnp.prod(jnp.where(end, jnp.where(beyond < AT_END, 1.0, 0.0), smooth))
 
 
 def _level(every: Nearest) -> Float[Array, " f"]:

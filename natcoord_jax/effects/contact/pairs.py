@@ -191,6 +191,37 @@ class EllipsoidOnPlane(Gap):
         return x[2] - (self.semi_axes**2 * cosines / jnp.where(size > 0, size, 1.0)) @ x[3:6], normal
 
 
+class DiscOnPlane(Gap):
+    """The lowest point of the rim of a disc above a plane; two of them make a cylinder.
+
+    Where the disc lies flat, every point of the rim is the lowest, and the gap has a corner as a function of
+    its tilt, with a derivative that is that of the centre there. What stands needs points of the rim besides.
+
+    Markers: a point of the plane and its normal, the centre, and the direction of the axis.
+
+    Attributes:
+        radius: of the disc [m].
+    """
+
+    radius: Any = eqx.field(kw_only=True, metadata=is_a(RADIUS))
+
+    markers: ClassVar[Markers] = Markers(1, 1, more=True)
+    sides: ClassVar[tuple[int, int]] = (0, 2)
+
+    def invariants(self, x: Float[Array, "4 3"]) -> Float[Array, "2"]:
+        """Height of the centre [m], and the cosine of the axis with the normal [-]."""
+        return jnp.stack([dot(x[1], x[2] - x[0]), dot(x[1], x[3])])
+
+    def distance(self, invariants: Float[Array, "2"]) -> Float[Array, ""]:
+        """Height less what the rim reaches below the centre."""
+        return invariants[0] - self.radius * _length(1.0 - invariants[1] ** 2)
+
+    def contact(self, x: Float[Array, "4 3"]) -> tuple[Array, Array]:
+        """The lowest point of the rim; of a disc that lies flat its centre."""
+        normal = _unit(x[1])
+        return x[2] - self.radius * _unit(normal - dot(normal, x[3]) * x[3]), normal
+
+
 class SphereOnBox(Gap):
     """A sphere beside a box, with round edges as the sphere sees them.
 

@@ -1,0 +1,119 @@
+"""Friction in contacts by an energy of the gap: what slides, sticks and rolls, momenta, derivatives."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import tolerances as tol
+from differences import assert_v_shaped
+
+import natcoord_jax as nc
+
+FLOOR = nc.Plane(normal=(0, 0, 1))
+STIFF = {"stiffness": 1e6, "restitution": 0.3, "speed": 0.5}
+BALL = {"shape": nc.Sphere(0.1), "density": 1 / (4 / 3 * np.pi * 1e-3)}  # of 1 kg
+
+
+def resting(body, *, tilt=0.0, friction=0.3, weight=9.81):
+    """A body on a plane that its weight has pressed in already; gravity may be tilted."""
+    scene = nc.Scene()
+    scene.add(nc.Gravity(vector=(-weight * np.sin(tilt), 0, -weight * np.cos(tilt))))
+    handle = scene.add(body)
+    scene.add(nc.Contact(handle, FLOOR, friction=friction, name="rubs", **STIFF))
+    return *scene.compile(), handle
+
+
+def assert_lossy(system, trajectory):
+    """Energy balances, and no step gains any."""
+    assert nc.balance(system, trajectory).energy.max() <= tol.ENERGY_OF_A_SMALL_SCENE
+    energy = np.asarray(system.energy(trajectory).total)
+    assert np.diff(energy).max() <= 1e-13 * np.abs(energy).max()
+
+
+@pytest.mark.parametrize("h", [0.01, 2e-3])
+def test_what_slides_stops(h):
+    """A mass of 1 kg: after v / (mu g), at v^2 / (2 mu g); then it rests, exactly."""
+    sunk = 9.81 / 1e6
+    mass = nc.PointMass(mass=1.0, position=(0, 0, -sunk), velocity=(2.0, 0, 0))
+    system, state, _ = resting(mass)
+    trajectory = nc.simulate(system, state, dt=h, steps=round(0.9 / h))
+    assert_lossy(system, trajectory)
+    assert float(trajectory.q[-1, 0, 0]) == pytest.approx(4 / (2 * 0.3 * 9.81), abs=2e-6)
+    assert np.abs(np.asarray(trajectory.v)[-1, 0, 0]) <= 1e-12
+    force = nc.contacts(system, trajectory).force[:, 0]
+    np.testing.assert_allclose(force, 9.81, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("friction", "place", "off"), [(0.8, 0.373289, 3e-5), (0.5, -0.1684, 1.5e-3)])
+def test_slope(friction, place, off):
+    """Thrown up a slope of tangent 0.7: held by a coefficient of 0.8, slides back with 0.5."""
+    tilt = np.arctan(0.7)
+    sunk = 9.81 * np.cos(tilt) / 1e6
+    mass = nc.PointMass(mass=1.0, position=(0, 0, -sunk), velocity=(3.0, 0, 0))
+    system, state, _ = resting(mass, tilt=tilt, friction=friction)
+    trajectory = nc.simulate(system, state, dt=2e-3, steps=600)
+    assert_lossy(system, trajectory)
+    assert float(trajectory.q[-1, 0, 0]) == pytest.approx(place, abs=off)
+
+
+def test_sphere_begins_to_roll():
+    """With five sevenths of its speed, after bounces that it loses some of."""
+    ball = nc.RigidBody(**BALL, position=(0, 0, 0.101), velocity=(2.0, 0, 0))
+    system, state, ball = resting(ball)
+    trajectory = nc.simulate(system, state, dt=2e-3, steps=300)
+    assert_lossy(system, trajectory)
+    assert float(system.sense(trajectory, ball).velocity[-1, 0]) == pytest.approx(2.0 * 5 / 7, rel=1e-9)
+
+
+def test_momenta():
+    """Two balls in space that meet off their centres: what rubs turns one as much as the other."""
+    scene = nc.Scene()
+    spins = (0, 3, 20), (5, 0, 1)
+    given = {"position": (-0.3, 0.05, 0), "velocity": (1.0, 0, 0), "angular_velocity": spins[0]}
+    one = scene.add(nc.RigidBody(**BALL, **given))
+    given = {"position": (0.3, 0, 0), "velocity": (-1.0, 0, 0), "angular_velocity": spins[1]}
+    other = scene.add(nc.RigidBody(**BALL, **given))
+    scene.add(nc.Contact(one, other, stiffness=1e4, friction=0.4, name="impact"))
+    system, state = scene.compile()
+    trajectory = nc.simulate(system, state, dt=2e-3, steps=250)
+    found = nc.balance(system, trajectory)
+    for drift in (found.energy, found.momentum, found.angular_momentum):
+        assert drift.max() <= tol.ENERGY_OF_A_SMALL_SCENE
+    assert float(system.work(trajectory)["impact"][-1]) < -0.05
+    turned = np.asarray(system.sense(trajectory, other).angular_velocity)
+    assert abs(turned[-1, 2] - turned[0, 2]) > 1.0
+
+
+@pytest.mark.slow
+def test_derivatives():
+    """By the speed at the start, the coefficient and the stiffness, through a bounce with slip."""
+    ball = nc.RigidBody(**BALL, position=(0, 0, 0.12), velocity=(1.0, 0.2, -0.5))
+    system, state, _ = resting(ball)
+
+    def end(x):
+        moved = eqx.tree_at(lambda s: s.v, state, state.v.at[0].add(x[0] * jnp.array([1.0, -0.3, 0.2])))
+        rough = system.set("rubs", friction=0.2 + x[1], stiffness=2e4 * (1 + x[2]))
+        return nc.simulate(rough, moved, dt=2e-3, steps=60, throw=False).q[-1, 0]
+
+    x, along = jnp.array([0.02, 0.01, 0.1]), jnp.array([0.6, 0.3, 0.5])
+    assert_v_shaped(end, x, along, jax.jvp(end, (x,), (along,))[1])
+    total = lambda x: jnp.sum(end(x))  # noqa: E731
+    assert_v_shaped(total, x, along, jax.grad(total)(x) @ along)
+
+
+def test_refused():
+    """What has no friction yet, and who cannot step with it, by name."""
+    ball = nc.RigidBody(**BALL, position=(0, 0, 0.12))
+    system, state, _ = resting(ball)
+    with pytest.raises(ValueError, match="soft contact with friction 'rubs'.*EnergyMomentum"):
+        nc.simulate(system, state, dt=0.01, steps=2, scheme=nc.EnergyMomentum(order=4))
+    with pytest.raises(ValueError, match="'rubs' is not defined.*leave out the friction"):
+        nc.equilibrium(system, state)
+    with pytest.raises(ValueError, match="'rubs' has a restitution"):
+        system.set("rubs", restitution=1.5)
+    with pytest.raises(ValueError, match="no contacts; add nc.Contact"):
+        empty = nc.Scene()
+        empty.add(nc.PointMass(mass=1.0))
+        alone, start = empty.compile()
+        nc.contacts(alone, nc.simulate(alone, start, dt=0.1, steps=1))
