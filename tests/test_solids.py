@@ -378,6 +378,56 @@ def test_gradients(element, number):
     assert_v_shaped(last, one, one, jax.grad(last)(one))
 
 
+# --- inside out -------------------------------------------------------------------------------------------
+
+
+def crushed(material, element="hexahedron8"):
+    """A block that is held at one end and pushed at the other by twice its modulus."""
+    scene = nc.Scene()
+    mesh = nc.mesh.box((1.0, 0.5, 0.5), (3, 1, 1), element=element)
+    block = scene.add(nc.Solid(mesh, material=material, name="block"))
+    scene.add(nc.Clamp(nc.ground, block.set("x0")))
+    scene.add(nc.Pressure(block.face("x1"), 2e4))
+    return scene.compile()
+
+
+def volumes(system, state):
+    """Smallest ratios of volumes in the elements."""
+    (group,) = (g for g in system.effects if g.has_volumes)
+    rows = state.q.reshape(-1, 4, 3)
+    ground = np.zeros((1, 4, 3))
+    return np.asarray(
+        group.effect.volume_ratios(group.weights, jnp.concatenate([rows, ground])[group.bodies])
+    )
+
+
+@pytest.mark.parametrize(
+    ("element", "kind"),
+    [
+        ("hexahedron8", "brick"),
+        pytest.param("hexahedron20", "serendipity hexahedron", marks=pytest.mark.slow),
+    ],
+)
+def test_an_element_that_is_turned_inside_out_ends_the_run(element, kind):
+    """Saint Venant and Kirchhoff's material resists no compression; the result names body and element."""
+    system, state = crushed(LAWS["elastic"], element)
+    found = nc.simulate(system, state, dt=0.01, steps=40, throw=False)
+    assert nc.Result(int(found.result)) is nc.Result.INVERTED
+    said = system.explain(found)
+    assert said.startswith("an element was turned inside out in step") and f"{kind} 'block[2]'" in said
+    assert volumes(system, found[-1]).min() > 0.0, "the last state is not sound"
+    with pytest.raises(nc.SimulationError, match="turned inside out"):
+        nc.equilibrium(system, state, steps=1)
+
+
+def test_a_step_that_turns_an_element_inside_out_is_repeated_in_parts():
+    """Rubber resists, if steps are short enough to feel it."""
+    system, state = crushed(LAWS["neo-Hooke"])
+    found = nc.simulate(system, state, dt=0.01, steps=40)
+    assert int(found.steps_rejected) > 0
+    assert min(volumes(system, s).min() for s in found) > 0.0
+
+
 # --- input ------------------------------------------------------------------------------------------------
 
 

@@ -18,6 +18,7 @@ from natcoord_jax.analysis.statics import (
     extent_of,
     largest,
 )
+from natcoord_jax.assembly.inversion import code_of
 from natcoord_jax.assembly.system import SYSTEM, System
 from natcoord_jax.assembly.violations import refuse_contacts
 from natcoord_jax.core.arguments import checked
@@ -240,6 +241,7 @@ def _followed(
         point = path.next(now, lam, direction, arc)
         failed = jnp.where(point.finite, int(Result.MAX_ITERATIONS), int(Result.NONFINITE))
         code = jnp.where(point.done, int(Result.SUCCESSFUL), failed)
+        code = code_of(fixed, point.state, code)
         code = jnp.where(alive, code, int(Result.DIVERGED))
         good = code == int(Result.SUCCESSFUL)
         reached = point.state, point.lam, point.direction

@@ -19,9 +19,10 @@ from natcoord_jax.core.kinds import of
 from natcoord_jax.core.markers import Markers
 from natcoord_jax.core.numeric import Numbers
 from natcoord_jax.core.potential import Potential, place_markers
+from natcoord_jax.core.together import instances_last, place_together
 from natcoord_jax.effects.materials import Elastic
 from natcoord_jax.maths.elimination import definite_inverse
-from natcoord_jax.maths.vectors import cross
+from natcoord_jax.maths.vectors import cross, dot
 
 CORNERS = np.array([(-1, -1, -1), (1, -1, -1), (1, 1, -1), (-1, 1, -1)], float)
 CORNERS = np.concatenate([CORNERS, CORNERS * np.array([1, 1, -1])])
@@ -61,6 +62,16 @@ def _strains(inverse: Float[Array, "3 3"]) -> Float[Array, "6 6"]:
         halves = [0.5 if k != m else 1.0 for k, m in PAIRS]
         rows.append(jnp.stack([x * half for x, half in zip(row, halves)]) * (1.0 if i == j else 2.0))
     return jnp.stack(rows)
+
+
+def smallest_volume_ratios(
+    gradients: Float[Array, "n g k 3"], place: Array, rows: Array
+) -> Float[Array, " n"]:
+    """Smallest determinants of the deformation gradients of elements, see `Effect.volume_ratios`."""
+    last, weights, rows = instances_last((gradients, place, rows))
+    x = place_together(weights, rows)
+    f = jnp.moveaxis(jnp.sum(last[:, :, :, None] * x[None, :, None], axis=1), -1, 1)
+    return jnp.min(dot(f[:, :, 0], cross(f[:, :, 1], f[:, :, 2])), axis=0)
 
 
 class SolidReadings(eqx.Module):
@@ -159,6 +170,10 @@ class Brick(Potential):
         """Corners that are no corners."""
         said = "is degenerate or turned inside out: list four nodes in turn round one face, then those above"
         return {said: jnp.min(self.volumes) <= 0.0, **self.material.flaws()}
+
+    def volume_ratios(self, place: Array, rows: Array) -> Float[Array, " n"]:
+        """Smallest of the Gauss points of each of `n` elements."""
+        return smallest_volume_ratios(self.gradients, place, rows)
 
     def invariants(self, x: Float[Array, "8 3 *n"]) -> Float[Array, "48 *n"]:
         """Strains of Green and Lagrange at the Gauss points [-]."""

@@ -27,7 +27,7 @@ from natcoord_jax.core.numeric import Numbers
 from natcoord_jax.core.potential import Potential, place_markers
 from natcoord_jax.effects.hyperelastic import Hyperelastic, tensors_of
 from natcoord_jax.effects.materials import Elastic
-from natcoord_jax.effects.solids.brick import SolidReadings, inverse_and_volume
+from natcoord_jax.effects.solids.brick import SolidReadings, inverse_and_volume, smallest_volume_ratios
 from natcoord_jax.effects.solids.tangents import solid_tangents
 from natcoord_jax.maths.collocation import Tableau
 from natcoord_jax.maths.symmetric import PAIRS, full
@@ -127,6 +127,10 @@ class SolidElement(Potential):
             "edges near their middles"
         )
         return {said: jnp.min(self.volumes) <= 0.0, **self.material.flaws()}
+
+    def volume_ratios(self, place: Array, rows: Array) -> Float[Array, " n"]:
+        """Smallest of the quadrature points of each of `n` elements."""
+        return smallest_volume_ratios(self.gradients, place, rows)
 
     def invariants(self, x: Float[Array, "k 3 *n"]) -> Float[Array, "p *n"]:
         """Strains of Green and Lagrange at the quadrature points, component by component [-]."""
