@@ -22,7 +22,7 @@ from natcoord_jax.core.potential import Potential, place_markers
 from natcoord_jax.core.together import instances_last, place_together
 from natcoord_jax.effects.materials import Elastic
 from natcoord_jax.maths.elimination import definite_inverse
-from natcoord_jax.maths.vectors import cross, dot
+from natcoord_jax.maths.vectors import cross, dot, safe_sqrt
 
 CORNERS = np.array([(-1, -1, -1), (1, -1, -1), (1, 1, -1), (-1, 1, -1)], float)
 CORNERS = np.concatenate([CORNERS, CORNERS * np.array([1, 1, -1])])
@@ -72,6 +72,12 @@ def smallest_volume_ratios(
     x = place_together(weights, rows)
     f = jnp.moveaxis(jnp.sum(last[:, :, :, None] * x[None, :, None], axis=1), -1, 1)
     return jnp.min(dot(f[:, :, 0], cross(f[:, :, 1], f[:, :, 2])), axis=0)
+
+
+def von_mises(stress: Float[Array, "3 3"]) -> Float[Array, ""]:
+    """Equivalent stress; its derivative where there is no shear is zero."""
+    away = stress - jnp.trace(stress) / 3.0 * jnp.eye(3)
+    return safe_sqrt(1.5 * jnp.sum(away**2))
 
 
 class SolidReadings(eqx.Module):
@@ -209,7 +215,4 @@ class Brick(Potential):
         deformation = deformation / jnp.sum(self.volumes)
         volume = deformation[:, 0] @ cross(deformation[:, 1], deformation[:, 2])
         stress = deformation @ pulled @ deformation.T / volume
-        away = stress - jnp.trace(stress) / 3.0 * jnp.eye(3)
-        square = 1.5 * jnp.sum(away**2)
-        equivalent = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
-        return SolidReadings(strain, stress, equivalent, self.energy(found))
+        return SolidReadings(strain, stress, von_mises(stress), self.energy(found))
