@@ -179,12 +179,15 @@ class SolidElement(Potential):
         def stress(strain: Array) -> Array:
             return jax.grad(lambda e: jnp.sum(self.material.energy_density(e)))(strain)
 
-        work = jnp.zeros_like(self.volumes)
-        for k in range(6):
-            along = jnp.zeros_like(strain).at[k].set(1.0)
-            work = work + jnp.abs(jax.jvp(stress, (strain,), (along,))[1][k]) * strain[k] ** 2
+        def work(unit: Array) -> Array:
+            along = jnp.broadcast_to(unit[:, None], strain.shape)
+            found = jnp.abs(jax.jvp(stress, (strain,), (along,))[1])
+            return jnp.sum(unit[:, None] * found * strain**2, axis=0)
+
+        # One copy of the derivatives for all components: laws of one's own may be long.
+        found = jnp.sum(jax.vmap(work)(jnp.eye(6)), axis=0)
         reach = jnp.sqrt(jnp.max(jnp.sum((x - x[0]) ** 2, axis=-1)))
-        return jnp.sum(self.volumes * work), reach
+        return jnp.sum(self.volumes * found), reach
 
     def tangents(
         self, place: Array, motion: Motion, now: StepContext, lam: Array, *, turning: bool
