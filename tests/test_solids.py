@@ -488,9 +488,10 @@ def test_an_l_shape_tumbles(element, law, dt, steps, momentum):
     assert (int(found.steps_rejected) > 0) == (element == "Hexahedron27P1" and dt > 0.05)
     assert nc.balance(system, found).energy.max() <= tol.ENERGY_OF_A_SOLID
     free = found[round(1.0 / dt) :]
-    conserved(system, free)
-    turning = np.asarray(system.angular_momentum(free))[0]
-    np.testing.assert_allclose(turning, momentum, rtol=tol.L_SHAPE)
+    # Not by the accounts of loads: they have none for steps in parts.
+    turning = np.asarray(system.angular_momentum(free))
+    assert np.ptp(turning, axis=0).max() <= tol.MOMENTUM_OF_A_SOLID * np.linalg.norm(turning[0])
+    np.testing.assert_allclose(turning[0], momentum, rtol=tol.L_SHAPE)
 
 
 # --- inside out -------------------------------------------------------------------------------------------
