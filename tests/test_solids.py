@@ -171,7 +171,7 @@ def conserved(system, trajectory):
     assert found.angular_momentum.max() <= tol.MOMENTUM_OF_A_SOLID
     energy = system.energy(trajectory)
     stored = np.asarray(energy.total - energy.kinetic)
-    assert stored.max() >= 0.02 * float(energy.total[0]), "it hardly moves"
+    assert stored.max() >= 0.02 * float(energy.total.max()), "it hardly moves"
 
 
 @pytest.mark.parametrize(
@@ -258,10 +258,21 @@ COOK_SLOW = [
 ]
 COOK_FINEST = [
     ("Hexahedron8", 8, 0.3, 13.863),
+    ("Hexahedron8", 16, 0.3, 14.485),
+    ("Hexahedron20", 4, 0.3, 14.563),
+    ("Hexahedron20", 8, 0.3, 14.689),
     ("Hexahedron27", 4, 0.3, 14.649),
+    ("Hexahedron27", 8, 0.3, 14.714),
     ("Hexahedron27P1", 2, 0.3, 14.663),
+    ("Hexahedron27P1", 4, 0.3, 14.735),
+    ("Hexahedron27P1", 8, 0.3, 14.739),
+    ("Hexahedron8", 2, 0.4999, 4.01),
     ("Hexahedron8", 4, 0.4999, 4.11),
+    ("Hexahedron8", 8, 0.4999, 4.21),
+    ("Hexahedron27", 2, 0.4999, 7.99),
+    ("Hexahedron27", 4, 0.4999, 10.10),
     ("Hexahedron27P1", 4, 0.4999, 11.954),
+    ("Hexahedron27P1", 8, 0.4999, 11.974),
 ]
 
 
@@ -282,61 +293,108 @@ def test_cooks_membrane_on_the_finest_meshes(element, count, nu, published):
     assert cook(element, count, nu) == pytest.approx(published, abs=tol.COOK)
 
 
-def cylinder(law, element, counts, pressure):
-    """How far the inside of a thick cylinder in plane strain moves under pressure [m]: radius 1 to 2."""
-    box = nc.mesh.box((1.0, 1.0, 1.0), counts, element=ELEMENTS[element])
+SHAPES = {"cylinder": 2, "sphere": 3}
+"""Dimensions in which it is round: stretches along them are alike."""
+
+
+def piece(shape, element, count, law):
+    """A piece between planes of symmetry of what is 1 m thick about a hole of radius 1 m, and its scene.
+
+    As wide as one element, it has the exact solution of the whole, by few elements.
+    """
+    angle = 0.25 * np.pi / count
+    box = nc.mesh.box((1.0, 1.0, 1.0), (count, 1, 1), element=ELEMENTS[element])
     u, v, w = box.nodes.T
-    angle = 0.5 * np.pi * v
-    nodes = np.stack([(1 + u) * np.cos(angle), (1 + u) * np.sin(angle), 0.2 * w], axis=1)
+    along = np.stack([np.ones_like(v), np.tan(angle * v), np.tan(angle * w) * (shape == "sphere")], axis=1)
+    nodes = (1.0 + u)[:, None] * along / np.linalg.norm(along, axis=1, keepdims=True)
+    nodes[:, 2] += w / count * (shape == "cylinder")
     mesh = nc.mesh.Mesh(nodes, box.cells, box.sets, box.faces)
     scene = nc.Scene()
     part = scene.add(nc.Solid(mesh, material=law, element=element))
-    for name, axis in (("y0", 1), ("y1", 0)):
-        held(scene, part, mesh.sets[name], axis)
-    held(scene, part, np.union1d(mesh.sets["z0"], mesh.sets["z1"]), 2)
+    aside = (-np.sin(angle), np.cos(angle), 0.0)
+    normals = {"y0": (0, 1, 0), "y1": aside, "z0": (0, 0, 1), "z1": np.array(aside)[[0, 2, 1]]}
+    if shape == "cylinder":
+        normals["z1"] = normals["z0"]
+    for name, normal in normals.items():
+        table = nc.Point(nc.ground), nc.Direction(nc.ground, normal)
+        for node in mesh.sets[name]:
+            distance = float(nodes[node] @ normal)
+            scene.add(nc.PointOnPlane((*table, nc.Point(part.nodes[int(node)])), distance=distance))
+    return scene, part, nodes
+
+
+def widened(shape, law, element, count, pressure):
+    """Root mean square of what nodes are moved wrongly by, under a pressure in the hole [m]."""
+    scene, part, nodes = piece(shape, element, count, law)
     scene.add(nc.Pressure(part.face("x0"), lambda t: pressure * t))
     system, state = scene.compile()
     end = nc.equilibrium(system, state, steps=2).state
-    return float(system.sense(end, part.nearest((1.0, 0.0, 0.0))).position[0]) - 1.0
+    found = np.asarray(end.q).reshape(-1, 4, 3)[:, 0]
+    radial = nodes * (np.arange(3) < SHAPES[shape])
+    radius = np.linalg.norm(radial, axis=1, keepdims=True)
+    moved = np.polynomial.legendre.legval(2 * radius - 3, widening(shape, law, pressure))
+    return np.sqrt(np.mean((found - nodes - moved / radius * radial) ** 2))
 
 
-def exact_cylinder(law, pressure):
-    """The same by a polynomial of high degree for the radius, at which the energy is stationary."""
-    x, weights = np.polynomial.legendre.leggauss(24)
-    radius, weights = 1.5 + 0.5 * x, 0.5 * weights
-    powers = np.polynomial.legendre.legvander(x, 10)
-    slopes = np.stack([2 * np.polynomial.legendre.Legendre.basis(k).deriv()(x) for k in range(11)], axis=1)
-    inside = np.polynomial.legendre.legvander(np.array([-1.0]), 10)[0]
+def widening(shape, law, pressure):
+    """The exact one by radius: a polynomial of high degree at which the energy is stationary."""
+    x, weights = np.polynomial.legendre.leggauss(40)
+    radius, weights, degree, round_in = 1.5 + 0.5 * x, 0.5 * weights, 17, SHAPES[shape]
+    powers = np.polynomial.legendre.legvander(x, degree - 1)
+    slopes = 2 * np.polynomial.legendre.legval(x, np.polynomial.legendre.legder(np.eye(degree))).T
+    inside = np.polynomial.legendre.legvander(np.array([-1.0]), degree - 1)[0]
 
     def energy(a):
-        stretches = jnp.stack([1 + slopes @ a, 1 + powers @ a / radius, jnp.ones(24)])
-        strain = jnp.concatenate([0.5 * (stretches**2 - 1), jnp.zeros((3, 24))])
-        return jnp.sum(weights * radius * law.energy_density(strain)) - 0.5 * pressure * (1 + inside @ a) ** 2
+        around = 1 + powers @ a / radius
+        stretches = jnp.stack([1 + slopes @ a, around, around if round_in == 3 else jnp.ones_like(around)])
+        strain = jnp.concatenate([0.5 * (stretches**2 - 1), jnp.zeros((3, len(x)))])
+        stored = jnp.sum(weights * radius ** (round_in - 1) * law.energy_density(strain))
+        return stored - pressure / round_in * (1 + inside @ a) ** round_in
 
-    a = jnp.zeros(11)
+    a = jnp.zeros(degree)
     for _ in range(12):
-        a = a - jnp.linalg.solve(jax.hessian(energy)(a), jax.grad(energy)(a))
-    assert np.abs(jax.grad(energy)(a)).max() < 1e-12 * max(1.0, pressure)
-    return float(inside @ a)
+        change = jnp.linalg.solve(jax.hessian(energy)(a), jax.grad(energy)(a))
+        a = a - change
+    assert np.abs(change).max() < 1e-10
+    assert inside @ a > 0.1, "strains are small"
+    return np.asarray(a)
+
+
+SOFT = nc.NeoHooke(E=1.0, nu=0.3, density=1.0)
+NEARLY_INCOMPRESSIBLE = nc.NeoHooke(E=1.0, nu=0.4999, density=1.0)
+FOAM = nc.CompressibleMooneyRivlin(c10=0.15, c01=0.05, density=1.0)
+RUBBER = nc.MooneyRivlin(c10=0.1, c01=0.06, bulk_modulus=50.0, density=1.0)
+THICK = [
+    ("cylinder", "Hexahedron8", SOFT, 0.15, 2.0),
+    ("cylinder", "Hexahedron20", SOFT, 0.15, 3.0),
+    ("cylinder", "Tetrahedron10", SOFT, 0.15, 3.0),
+    ("cylinder", "Tetrahedron10P0", RUBBER, 0.1, 2.0),
+    ("sphere", "Hexahedron8", SOFT, 0.15, 2.0),
+]
+THICK_OF_27_NODES = [
+    ("cylinder", "Hexahedron27", FOAM, 0.15, 3.0),
+    ("cylinder", "Hexahedron27P1", NEARLY_INCOMPRESSIBLE, 0.12, 3.0),
+    ("sphere", "Hexahedron27P1", NEARLY_INCOMPRESSIBLE, 0.15, 3.0),
+]
+
+
+def check_order(shape, element, law, pressure, order):
+    """Against the exact solution, with large strains: errors fall as theory says, or faster."""
+    coarse, fine = (widened(shape, law, element, n, pressure) for n in (2, 4))
+    assert np.log2(coarse / fine) >= order - tol.ORDER_TOLERANCE
+    assert fine <= tol.THICK_WALL[order]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("element", "law", "pressure"),
-    [
-        ("Hexahedron20", nc.NeoHooke(E=1.0, nu=0.3, density=1.0), 0.15),
-        ("Hexahedron27", nc.CompressibleMooneyRivlin(c10=0.15, c01=0.05, density=1.0), 0.15),
-        ("Hexahedron27P1", nc.NeoHooke(E=1.0, nu=0.4999, density=1.0), 0.12),
-        ("Tetrahedron10P0", nc.MooneyRivlin(c10=0.1, c01=0.06, bulk_modulus=50.0, density=1.0), 0.1),
-    ],
-)
-def test_thick_cylinder_under_pressure(element, law, pressure):
-    """Against the exact solution, with large strains; the error falls."""
-    exact = exact_cylinder(law, pressure)
-    assert exact > 0.1, "strains are small"
-    coarse, fine = (cylinder(law, element, (n, 2 * n, 1), pressure) - exact for n in (1, 2))
-    assert abs(fine) <= tol.CYLINDER * exact
-    assert abs(coarse) >= 2.0 * abs(fine)
+@pytest.mark.parametrize(("shape", "element", "law", "pressure", "order"), THICK)
+def test_thick_walls_under_pressure(shape, element, law, pressure, order):
+    check_order(shape, element, law, pressure, order)
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize(("shape", "element", "law", "pressure", "order"), THICK_OF_27_NODES)
+def test_thick_walls_of_elements_of_27_nodes(shape, element, law, pressure, order):
+    check_order(shape, element, law, pressure, order)
 
 
 # --- dynamics against others ------------------------------------------------------------------------------
@@ -376,6 +434,114 @@ def test_gradients(element, number):
 
     one, last = jnp.asarray(1.0), jax.jit(last)
     assert_v_shaped(last, one, one, jax.grad(last)(one))
+
+
+class Pulse(nc.Force):
+    """A dead force on a node that grows for half a second and fades in as long."""
+
+    force: jax.Array = eqx.field(kw_only=True)
+    kind = "pulse"
+
+    def load(self, x, rate, inputs, t):
+        return Load(jnp.maximum(jnp.minimum(t, 1.0 - t), 0.0) * self.force[None], None)
+
+
+def l_shape(element, law):
+    """A block like an L of four elements, pushed on two end faces, then free (case V04 of the references)."""
+    cells = [nc.mesh.box(size, count, element=ELEMENTS[element])
+             for size, count in (((6.0, 3.0, 3.0), (2, 1, 1)), ((3.0, 7.0, 3.0), (1, 2, 1)))]  # fmt: skip
+    both = np.concatenate([cells[0].nodes, cells[1].nodes + np.array([0.0, 3.0, 0.0])])
+    mesh = nc.mesh.cleaned(both, np.concatenate([cells[0].cells, cells[1].cells + len(cells[0].nodes)]))
+    traction, x = np.array([256.0, 512.0, 768.0]) / 9, mesh.nodes
+    forces = np.zeros_like(x)
+    for sign, axis, place in ((1, 0, 6.0), (-1, 1, 10.0)):
+        faces = mesh.outside[np.all(x[mesh.outside, axis] == place, axis=1)]
+        forces += consistent(x, faces, sign * traction)
+    scene = nc.Scene()
+    part = scene.add(nc.Solid(mesh, material=law, element=element))
+    loaded = np.flatnonzero(np.any(forces, axis=1))
+    scene.add(Pulse.on(part.nodes, loaded[:, None], each={"force": forces[loaded]}))
+    return scene.compile()
+
+
+MU = 997.5
+STRETCHING = nc.CompressibleMooneyRivlin(c10=5 / 12 * MU, c01=MU / 12, density=10.0)
+RUBBERS = [nc.NeoHooke(E=2 * MU * (1 + nu), nu=nu, density=10.0) for nu in (0.495469, 0.4999)]
+TUMBLING = [
+    ("Hexahedron8", STRETCHING, 0.25, 200, (-1645.3, -856.7, 1119.6)),
+    ("Hexahedron20", STRETCHING, 0.25, 200, (-1650.2, -853.8, 1119.3)),
+    ("Hexahedron27P1", RUBBERS[0], 0.25, 40, (-1650.3, -853.0, 1118.8)),
+    ("Hexahedron27P1", RUBBERS[1], 0.02, 100, (-1650.3, -853.0, 1118.8)),
+    ("Hexahedron27P1", RUBBERS[1], 0.1, 50, (-1650.3, -853.0, 1118.8)),
+]
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize(("element", "law", "dt", "steps", "momentum"), TUMBLING)
+def test_an_l_shape_tumbles(element, law, dt, steps, momentum):
+    """Angular momentum as of a prototype with consistent masses; nearly incompressible rubber as well.
+
+    The longest steps of the latter are repeated in parts, again and again.
+    """
+    system, state = l_shape(element, law)
+    found = nc.simulate(system, state, dt=dt, steps=steps, extra_substeps=400)
+    assert (int(found.steps_rejected) > 0) == (element == "Hexahedron27P1" and dt > 0.05)
+    assert nc.balance(system, found).energy.max() <= tol.ENERGY_OF_A_SOLID
+    free = found[round(1.0 / dt) :]
+    # Not by the accounts of loads: they have none for steps in parts.
+    turning = np.asarray(system.angular_momentum(free))
+    assert np.ptp(turning, axis=0).max() <= tol.MOMENTUM_OF_A_SOLID * np.linalg.norm(turning[0])
+    np.testing.assert_allclose(turning[0], momentum, rtol=tol.L_SHAPE)
+
+
+# --- inside out -------------------------------------------------------------------------------------------
+
+
+def crushed(material, element="hexahedron8"):
+    """A block that is held at one end and pushed at the other by twice its modulus."""
+    scene = nc.Scene()
+    mesh = nc.mesh.box((1.0, 0.5, 0.5), (3, 1, 1), element=element)
+    block = scene.add(nc.Solid(mesh, material=material, name="block"))
+    scene.add(nc.Clamp(nc.ground, block.set("x0")))
+    scene.add(nc.Pressure(block.face("x1"), 2e4))
+    return scene.compile()
+
+
+def volumes(system, state):
+    """Smallest ratios of volumes in the elements."""
+    (group,) = (g for g in system.effects if g.has_volumes)
+    rows = state.q.reshape(-1, 4, 3)
+    ground = np.zeros((1, 4, 3))
+    return np.asarray(
+        group.effect.volume_ratios(group.weights, jnp.concatenate([rows, ground])[group.bodies])
+    )
+
+
+@pytest.mark.parametrize(
+    ("element", "kind"),
+    [
+        ("hexahedron8", "brick"),
+        pytest.param("hexahedron20", "serendipity hexahedron", marks=pytest.mark.slow),
+    ],
+)
+def test_an_element_that_is_turned_inside_out_ends_the_run(element, kind):
+    """Saint Venant and Kirchhoff's material resists no compression; the result names body and element."""
+    system, state = crushed(LAWS["elastic"], element)
+    found = nc.simulate(system, state, dt=0.01, steps=40, throw=False)
+    assert nc.Result(int(found.result)) is nc.Result.INVERTED
+    said = system.explain(found)
+    assert said.startswith("an element was turned inside out in step") and f"{kind} 'block[2]'" in said
+    assert volumes(system, found[-1]).min() > 0.0, "the last state is not sound"
+    with pytest.raises(nc.SimulationError, match="turned inside out"):
+        nc.equilibrium(system, state, steps=1)
+
+
+def test_a_step_that_turns_an_element_inside_out_is_repeated_in_parts():
+    """Rubber resists, if steps are short enough to feel it."""
+    system, state = crushed(LAWS["neo-Hooke"])
+    found = nc.simulate(system, state, dt=0.01, steps=40)
+    assert int(found.steps_rejected) > 0
+    assert min(volumes(system, s).min() for s in found) > 0.0
 
 
 # --- input ------------------------------------------------------------------------------------------------

@@ -110,7 +110,7 @@ def _listed(names: tuple[str, ...], at: Any) -> str:
     return ", ".join(chosen[:3]) + (f" and {len(chosen) - 3} more" if len(chosen) > 3 else "")
 
 
-def _touching(system: System) -> list[Group]:
+def _touching(system: Model) -> list[Group]:
     """Contacts without a stiffness, in the order of `State.contacts`, then others."""
     every = system.effects
     laws = [g for g in every if isinstance(g.effect, ContactLaw) and not g.effect.unilateral]
@@ -125,7 +125,7 @@ def _gaps(system: Model, state: State) -> list[Array]:
 
 
 @checked(system=SYSTEM, trajectory=TRAJECTORY)
-def contacts(system: Model, trajectory: Trajectory) -> Contacts:
+def contacts(system: System, trajectory: Trajectory) -> Contacts:
     """Gaps, forces and impacts along a trajectory, and the margins within which its derivatives hold.
 
     Args:

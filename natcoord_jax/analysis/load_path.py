@@ -27,6 +27,7 @@ from natcoord_jax.core.kinds import FLAG, FunctionOf
 from natcoord_jax.core.numeric import Number, Whole
 from natcoord_jax.core.results import REASONS, Result, SimulationError
 from natcoord_jax.core.state import STATE, State
+from natcoord_jax.mechanics.inversion import code_of
 from natcoord_jax.mechanics.violations import refuse_contacts
 from natcoord_jax.model.model import SYSTEM
 from natcoord_jax.system import System
@@ -241,6 +242,7 @@ def _followed(
         point = path.next(now, lam, direction, arc)
         failed = jnp.where(point.finite, int(Result.MAX_ITERATIONS), int(Result.NONFINITE))
         code = jnp.where(point.done, int(Result.SUCCESSFUL), failed)
+        code = code_of(fixed, point.state, code)
         code = jnp.where(alive, code, int(Result.DIVERGED))
         good = code == int(Result.SUCCESSFUL)
         reached = point.state, point.lam, point.direction

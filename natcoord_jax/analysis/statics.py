@@ -17,6 +17,7 @@ from natcoord_jax.core.numeric import Number, Numbers, Vector, Whole
 from natcoord_jax.core.results import REASONS, Result, SimulationError
 from natcoord_jax.core.state import STATE, State
 from natcoord_jax.linsolve.refinement import refined_solve
+from natcoord_jax.mechanics.inversion import code_of
 from natcoord_jax.mechanics.violations import refuse_contacts
 from natcoord_jax.model.model import SYSTEM
 from natcoord_jax.system import System
@@ -208,7 +209,8 @@ def equilibrium(
         method fails the code says so, and later states repeat the last one.
 
     Raises:
-        SimulationError: in an eager call, if Newton's method fails, with the load.
+        SimulationError: in an eager call, if Newton's method fails or turns an element of a solid inside out,
+            with the load.
 
     Example:
         >>> import jax; jax.config.update("jax_enable_x64", True)
@@ -287,7 +289,8 @@ def _equilibria(
         # Loads belong to the search as well; `differentiable` is given them again.
         begin = replace_fields(now, t=jax.lax.stop_gradient(value))
         search = _solve(still[0], begin, lam, jax.lax.stop_gradient(u))
-        code = jnp.where(alive, _code(search), int(Result.DIVERGED))
+        code = code_of(still[0], search.state, _code(search))
+        code = jnp.where(alive, code, int(Result.DIVERGED))
         good = code == int(Result.SUCCESSFUL)
         reached = jax.tree.map(lambda a, b: jnp.where(good, a, b), (search.state, search.lam), (now, lam))
         return (*reached, good), (*reached, code, search.count)

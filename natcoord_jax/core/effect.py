@@ -213,6 +213,15 @@ class Effect(Part):
         """What may be wrong with its numbers, as the rest of a sentence about it, and whether it is."""
         return {}
 
+    def volume_ratios(
+        self, place: Float[Array, "n *place"], rows: Float[Array, "n b 4 3"]
+    ) -> Float[Array, " n"] | None:
+        """Smallest ratio of volumes (now over without stress) in each of `n` elements; None: they have none.
+
+        A step that ends where one is not positive is repeated in parts, and at last ends the run.
+        """
+        return None
+
     @abc.abstractmethod
     def respond(self, place: Array, motion: Motion, now: StepContext, lam: Float[Array, "s m"]) -> Response:
         """Forces, torques, constraint rates and power over a step.

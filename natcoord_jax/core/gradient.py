@@ -88,17 +88,19 @@ def averaged_gradient(
     rounded = largest(jnp.sum(jnp.abs(gradient) * scale, axis=1))
     sizes = jnp.abs(before) + jnp.abs(after) + jnp.abs(captured) + rounded
     noise = 16 * epsilon * sizes
-    relevant = (jnp.abs(missing) > noise) & (jnp.sum(weights * relative**2, axis=(0, 1)) > LEAST**2)
+    # An energy that is not a number, whatever its slope is, is no rounding and makes the step fail.
+    rounding = jnp.abs(missing) <= noise
+    irrelevant = rounding | (jnp.sum(weights * relative**2, axis=(0, 1)) <= LEAST**2)
     # What is irrelevant must not reach a quotient: its derivatives need not be finite. Nor is any energy or
     # stiffness squared, of which laws that decay exponentially have 1e-260.
     # A step that is rounding of its invariant tells no stiffness either.
-    moving = relevant & (moved > SPREAD * epsilon * beside)
-    stiffness = jnp.where(moving, safe_divide(changed, jnp.where(moving, moved, 1.0)), 0.0)
+    still = irrelevant | (moved <= SPREAD * epsilon * beside)
+    stiffness = jnp.where(still, 0.0, safe_divide(changed, jnp.where(still, 1.0, moved)))
     stiff = stiffness * steps
     enough = jnp.sum(weights * stiff * steps, axis=(0, 1)) > jnp.abs(missing)
-    share = jnp.where(enough, stiff, jnp.where(relevant, relative * inverse, 0.0))
+    share = jnp.where(enough, stiff, jnp.where(irrelevant, 0.0, relative * inverse))
     measure = jnp.sum(weights * share * steps, axis=(0, 1))
-    factor = safe_divide(jnp.where(relevant, missing, 0.0), jnp.where(relevant, measure, 1.0))
+    factor = safe_divide(jnp.where(rounding, 0.0, missing), jnp.where(irrelevant, 1.0, measure))
     return gradient + factor * share
 
 

@@ -18,6 +18,7 @@ class Result(IntEnum):
     BAD_STEP = 7
     TOLERANCE_NOT_MET = 8
     INTERRUPTED = 9
+    INVERTED = 10
 
     @property
     def ok(self) -> bool:
@@ -36,6 +37,7 @@ REASONS = {
     Result.BAD_STEP: "the step dt is not a positive finite number [s]",
     Result.TOLERANCE_NOT_MET: "no substep is short enough for the error that `rtol` and `atol` tolerate",
     Result.INTERRUPTED: "the run was interrupted from the keyboard",
+    Result.INVERTED: "an element was turned inside out",
 }
 
 REMEDIES = {
@@ -47,6 +49,7 @@ REMEDIES = {
     Result.BAD_STEP: "pass dt > 0",
     Result.TOLERANCE_NOT_MET: "use a larger `rtol` or `atol`; 1e-13 of the motion is round-off",
     Result.INTERRUPTED: "what was stored by `store` goes on with `resume=True`",
+    Result.INVERTED: "use a smaller dt, a finer mesh, or a material that resists, as nc.NeoHooke",
 }
 
 

@@ -85,7 +85,8 @@ class Trajectory(eqx.Module):
         failed_step: index of the step that failed or ended the run, or the number of steps.
         failed_time: time [s] at the start of the (sub)step that failed, or the end time.
         failed_part: number of the unknown with the largest correction in the last attempt that failed, named
-            by `System.explain`; -1 where the run went well.
+            by `System.explain`; -1 where the run went well, -2 less the number of an element that was turned
+            inside out.
         residual: size of that residual, or the largest accepted one (relative).
         steps_taken: accepted (sub)steps.
         steps_rejected: (sub)steps that were repeated in shorter ones.

@@ -77,6 +77,11 @@ class Group(Stacked):
         """Whether they are of equations, which hold at any time."""
         return self.multipliers > 0 and not self.effect.unilateral
 
+    @property
+    def has_volumes(self) -> bool:
+        """Whether they can be turned inside out."""
+        return type(self.effect).volume_ratios is not Effect.volume_ratios
+
 
 class CoordinateGroup(eqx.Module):
     """Joint coordinates of one description: joints, their bodies and places in the state."""

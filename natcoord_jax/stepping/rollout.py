@@ -80,7 +80,7 @@ def run(
         ),
     )
     carried = None if taken_up is None else replace_fields(found, record=())
-    return slots, Ending(_judged(course, setting.steps), factors, carried)
+    return slots, Ending(_judged(system, course, setting.steps), factors, carried)
 
 
 def run_to_the_end(setting: RolloutProblem, state: State, kernel: Callable = as_one_kernel) -> RolloutState:
@@ -94,13 +94,17 @@ def run_to_the_end(setting: RolloutProblem, state: State, kernel: Callable = as_
         kernel: see `all_slots`.
     """
     found, unpack = all_slots(setting, state, kernel)
-    return _judged(with_state(found.course, unpack(found.state)), setting.steps)
+    return _judged(setting.system, with_state(found.course, unpack(found.state)), setting.steps)
 
 
-def _judged(course: RolloutState, steps: Any) -> RolloutState:
+def _judged(system: System, course: RolloutState, steps: Any) -> RolloutState:
     """With the code of a run that used up its substeps, and no culprit in one that went well."""
     short = (course.step < steps) & ~course.stopped
-    code = jnp.where(short, int(Result.MAX_SUBSTEPS), course.code)
+    cause = int(Result.MAX_SUBSTEPS)
+    if any(group.has_volumes for group in system.effects):
+        # Substeps become ever shorter on the way to where an element is turned inside out.
+        cause = jnp.where(course.worst < -1, int(Result.INVERTED), cause)
+    code = jnp.where(short, cause, course.code)
     well = (code == int(Result.SUCCESSFUL)) | (code == int(Result.EVENT))
     worst = jnp.where(well, -1, course.worst)
     return eqx.tree_at(lambda c: (c.code, c.worst), course, (code, worst))

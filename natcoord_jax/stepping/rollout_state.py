@@ -12,6 +12,7 @@ from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import Tableau
 from natcoord_jax.mechanics.equations import prepare
 from natcoord_jax.mechanics.frozen_kick import FEWEST, FrozenKick, Lagging, from_body_axes, in_body_axes
+from natcoord_jax.mechanics.inversion import first_inverted
 from natcoord_jax.mechanics.start_cache import StartCache
 from natcoord_jax.mechanics.tangent_space import Velocity
 from natcoord_jax.mechanics.violations import contacts
@@ -42,7 +43,8 @@ class RolloutState(eqx.Module):
         fraction: part of it that is attempted.
         code: result.
         stopped: whether the run has ended before its time.
-        worst: unknown with the largest correction in the last attempt that failed, -1 without one.
+        worst: unknown with the largest correction in the last attempt that failed, -1 without one; -2
+            less the number of the first element that was turned inside out.
         taken: accepted (sub)steps.
         rejected: (sub)steps that were repeated in parts.
         iterations: corrections in all attempts.
@@ -230,6 +232,10 @@ def after_attempt(
     finite = jnp.all(jnp.isfinite(new.q)) & jnp.all(jnp.isfinite(new.v))
     code = jnp.where((it.code == 0) & ~finite, int(Result.NONFINITE), it.code)
     code = jnp.where((code == 0) & (half_turn > LARGEST_HALF_TURN), int(Result.DIVERGED), code)
+    worst, inverted = it.worst, first_inverted(setting.system, new)
+    if inverted is not None:
+        worst = jnp.where((code == 0) & (inverted >= 0), -2 - inverted, worst)
+        code = jnp.where(worst < -1, int(Result.INVERTED), code)
     solved = code == int(Result.SUCCESSFUL)
     origin = course.state
     if course.trial is None or setting.tolerance is None:
@@ -284,7 +290,7 @@ def after_attempt(
         fraction=fraction,
         code=result,
         stopped=stopped,
-        worst=jnp.where(verdict.hopeless | verdict.failed, it.worst, course.worst),
+        worst=jnp.where(verdict.hopeless | verdict.failed, worst, course.worst),
         taken=course.taken + verdict.change,
         rejected=course.rejected + verdict.failed,
         iterations=course.iterations + worked,

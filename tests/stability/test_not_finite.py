@@ -99,6 +99,35 @@ def test_a_run_comes_back(solver, order, rtol, event):
         assert int(found.failed_step) == (2 if what == "torque" else 0), what
 
 
+class Undefined(nc.Potential):
+    """A spring whose energy is none beyond a length, where its slope is a number (zero)."""
+
+    def invariants(self, x):
+        """The squared length."""
+        return ((x[1] - x[0]) @ (x[1] - x[0]))[None]
+
+    def energy(self, invariants):
+        """As far as it is known."""
+        return jnp.where(invariants[0] < 4.0, invariants[0], jnp.nan)
+
+
+@pytest.mark.parametrize("speed", [0.0, 1.0])
+@pytest.mark.parametrize("kind", ["joint", "markers"])
+def test_an_energy_that_is_none(kind, speed):
+    """Of a law whose slope is a number: the first step says so, at rest as in motion."""
+    scene = nc.Scene()
+    inertia = {"mass": 1.0, "inertia": (1.0, 1.0, 1.0)}
+    ball = scene.add(nc.RigidBody(**inertia, position=(2.5, 0, 0), velocity=(speed, 0, 0)))
+    if kind == "joint":
+        slider = scene.add(nc.Prismatic(nc.ground, ball, axis=(1, 0, 0)))
+        scene.add(nc.JointPotential(slider, law=lambda c: jnp.where(c > 10.0, c, jnp.nan)))
+    else:
+        scene.add(Undefined((nc.Point(nc.ground), nc.Point(ball))))
+    found = nc.simulate(*scene.compile(), dt=0.01, steps=4, throw=False)
+    assert Result(int(found.result)) is Result.NONFINITE
+    assert int(found.failed_step) == 0
+
+
 def test_other_lanes_are_untouched():
     """A batch with a lane that is not finite: the others are what they are alone."""
     system, state, _ = arms("reduced")

@@ -96,14 +96,7 @@ class FacePressure6(CurvedFacePressure):
 class FacePressure8(CurvedFacePressure):
     """A pressure on a quadrilateral of eight points, as a face of `nc.Hexahedron20` is.
 
-    Attributes:
-        markers: as of `nc.mesh.Mesh.faces`; the pressure pushes inwards.
-        pressure: [N/m^2], or a function of time [s] to it.
-
-    Example:
-        >>> import natcoord_jax as nc
-        >>> points = tuple(nc.Point(nc.ground, (x, 0.0, 0.0)) for x in range(8))
-        >>> wind = nc.FacePressure8(points, pressure=500.0)
+    Its fields are those of `nc.FacePressure6`, the pressure in [N/m^2].
     """
 
     kind: ClassVar[str] = "pressure on eight points"
@@ -113,14 +106,7 @@ class FacePressure8(CurvedFacePressure):
 class FacePressure9(CurvedFacePressure):
     """A pressure on a quadrilateral of nine points, as a face of `nc.Hexahedron27` is.
 
-    Attributes:
-        markers: as of `nc.mesh.Mesh.faces`; the pressure pushes inwards.
-        pressure: [N/m^2], or a function of time [s] to it.
-
-    Example:
-        >>> import natcoord_jax as nc
-        >>> points = tuple(nc.Point(nc.ground, (x, 0.0, 0.0)) for x in range(9))
-        >>> wind = nc.FacePressure9(points, pressure=500.0)
+    Its fields are those of `nc.FacePressure6`, the pressure in [N/m^2].
     """
 
     kind: ClassVar[str] = "pressure on nine points"

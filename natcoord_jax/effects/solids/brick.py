@@ -19,9 +19,10 @@ from natcoord_jax.core.kinds import of
 from natcoord_jax.core.markers import Markers
 from natcoord_jax.core.numeric import Numbers
 from natcoord_jax.core.potential import Potential, place_markers
+from natcoord_jax.core.together import instances_last, place_together
 from natcoord_jax.effects.materials import Elastic
 from natcoord_jax.maths.elimination import definite_inverse
-from natcoord_jax.maths.vectors import cross
+from natcoord_jax.maths.vectors import cross, dot, safe_sqrt
 
 CORNERS = np.array([(-1, -1, -1), (1, -1, -1), (1, 1, -1), (-1, 1, -1)], float)
 CORNERS = np.concatenate([CORNERS, CORNERS * np.array([1, 1, -1])])
@@ -61,6 +62,22 @@ def _strains(inverse: Float[Array, "3 3"]) -> Float[Array, "6 6"]:
         halves = [0.5 if k != m else 1.0 for k, m in PAIRS]
         rows.append(jnp.stack([x * half for x, half in zip(row, halves)]) * (1.0 if i == j else 2.0))
     return jnp.stack(rows)
+
+
+def smallest_volume_ratios(
+    gradients: Float[Array, "n g k 3"], place: Array, rows: Array
+) -> Float[Array, " n"]:
+    """Smallest determinants of the deformation gradients of elements, see `Effect.volume_ratios`."""
+    last, weights, rows = instances_last((gradients, place, rows))
+    x = place_together(weights, rows)
+    f = jnp.moveaxis(jnp.sum(last[:, :, :, None] * x[None, :, None], axis=1), -1, 1)
+    return jnp.min(dot(f[:, :, 0], cross(f[:, :, 1], f[:, :, 2])), axis=0)
+
+
+def von_mises(stress: Float[Array, "3 3"]) -> Float[Array, ""]:
+    """Equivalent stress; its derivative where there is no shear is zero."""
+    away = stress - jnp.trace(stress) / 3.0 * jnp.eye(3)
+    return safe_sqrt(1.5 * jnp.sum(away**2))
 
 
 class SolidReadings(eqx.Module):
@@ -160,6 +177,10 @@ class Brick(Potential):
         said = "is degenerate or turned inside out: list four nodes in turn round one face, then those above"
         return {said: jnp.min(self.volumes) <= 0.0, **self.material.flaws()}
 
+    def volume_ratios(self, place: Array, rows: Array) -> Float[Array, " n"]:
+        """Smallest of the Gauss points of each of `n` elements."""
+        return smallest_volume_ratios(self.gradients, place, rows)
+
     def invariants(self, x: Float[Array, "8 3 *n"]) -> Float[Array, "48 *n"]:
         """Strains of Green and Lagrange at the Gauss points [-]."""
         # Deformation gradients: (point, axis, component of place).
@@ -194,7 +215,4 @@ class Brick(Potential):
         deformation = deformation / jnp.sum(self.volumes)
         volume = deformation[:, 0] @ cross(deformation[:, 1], deformation[:, 2])
         stress = deformation @ pulled @ deformation.T / volume
-        away = stress - jnp.trace(stress) / 3.0 * jnp.eye(3)
-        square = 1.5 * jnp.sum(away**2)
-        equivalent = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
-        return SolidReadings(strain, stress, equivalent, self.energy(found))
+        return SolidReadings(strain, stress, von_mises(stress), self.energy(found))

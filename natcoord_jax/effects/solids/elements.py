@@ -7,17 +7,16 @@ pressures and dilatations with the latter two eliminated (J. C. Simo, R. L. Tayl
 Methods Appl. Mech. Eng. 51 (1985) 177-208).
 """
 
-from functools import lru_cache, partial
+from functools import partial
 from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.core.arguments import is_a
-from natcoord_jax.core.cells import CELLS, shapes
+from natcoord_jax.core.cells import CELLS, quadrature, shapes
 from natcoord_jax.core.chunks import chunked
 from natcoord_jax.core.effect import Motion, StepContext, replace_fields
 from natcoord_jax.core.gradient import averaged_gradient
@@ -27,23 +26,17 @@ from natcoord_jax.core.numeric import Numbers
 from natcoord_jax.core.potential import Potential, place_markers
 from natcoord_jax.effects.hyperelastic import Hyperelastic, tensors_of
 from natcoord_jax.effects.materials import Elastic
-from natcoord_jax.effects.solids.brick import SolidReadings, inverse_and_volume
+from natcoord_jax.effects.solids.brick import (
+    SolidReadings,
+    inverse_and_volume,
+    smallest_volume_ratios,
+    von_mises,
+)
 from natcoord_jax.effects.solids.tangents import solid_tangents
 from natcoord_jax.maths.collocation import Tableau
 from natcoord_jax.maths.symmetric import PAIRS, full
 
 MATERIAL = of("a material, as nc.Elastic(...) or nc.NeoHooke(...)", Elastic, Hyperelastic)
-
-
-@lru_cache
-def quadrature(nodes: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points (g, 3) and weights (g,) for elements of so many nodes: all their modes have stiffness."""
-    if nodes == 10:
-        far, near = (5 + 3 * np.sqrt(5)) / 20, (5 - np.sqrt(5)) / 20
-        return np.full((4, 3), near) + (far - near) * np.eye(4, 3, -1), np.full(4, 1 / 24)
-    x, w = np.polynomial.legendre.leggauss(2 if nodes == 8 else 3)
-    points = np.stack(np.meshgrid(x, x, x, indexing="ij"), axis=-1).reshape(-1, 3)
-    return points, np.einsum("i,j,k->ijk", w, w, w).reshape(-1)
 
 
 class SolidElement(Potential):
@@ -128,6 +121,10 @@ class SolidElement(Potential):
         )
         return {said: jnp.min(self.volumes) <= 0.0, **self.material.flaws()}
 
+    def volume_ratios(self, place: Array, rows: Array) -> Float[Array, " n"]:
+        """Smallest of the quadrature points of each of `n` elements."""
+        return smallest_volume_ratios(self.gradients, place, rows)
+
     def invariants(self, x: Float[Array, "k 3 *n"]) -> Float[Array, "p *n"]:
         """Strains of Green and Lagrange at the quadrature points, component by component [-]."""
         f = jnp.sum(self.gradients[:, :, :, None] * x[None, :, None], axis=1)
@@ -182,12 +179,15 @@ class SolidElement(Potential):
         def stress(strain: Array) -> Array:
             return jax.grad(lambda e: jnp.sum(self.material.energy_density(e)))(strain)
 
-        work = jnp.zeros_like(self.volumes)
-        for k in range(6):
-            along = jnp.zeros_like(strain).at[k].set(1.0)
-            work = work + jnp.abs(jax.jvp(stress, (strain,), (along,))[1][k]) * strain[k] ** 2
+        def work(unit: Array) -> Array:
+            along = jnp.broadcast_to(unit[:, None], strain.shape)
+            found = jnp.abs(jax.jvp(stress, (strain,), (along,))[1])
+            return jnp.sum(unit[:, None] * found * strain**2, axis=0)
+
+        # One copy of the derivatives for all components: laws of one's own may be long.
+        found = jnp.sum(jax.vmap(work)(jnp.eye(6)), axis=0)
         reach = jnp.sqrt(jnp.max(jnp.sum((x - x[0]) ** 2, axis=-1)))
-        return jnp.sum(self.volumes * work), reach
+        return jnp.sum(self.volumes * found), reach
 
     def tangents(
         self, place: Array, motion: Motion, now: StepContext, lam: Array, *, turning: bool
@@ -207,11 +207,8 @@ class SolidElement(Potential):
         f = jnp.einsum("gkj,ki->ijg", self.gradients, x)
         volume = jnp.sum(self.volumes * jnp.sqrt(tensors_of(strain).c))
         cauchy = jnp.einsum("ikg,klg,jlg->ij", f, stress, f) / volume
-        away = cauchy - jnp.trace(cauchy) / 3.0 * jnp.eye(3)
-        square = 1.5 * jnp.sum(away**2)
-        equivalent = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
         return SolidReadings(
-            strain @ self.volumes / jnp.sum(self.volumes), cauchy, equivalent, self.energy(found)
+            strain @ self.volumes / jnp.sum(self.volumes), cauchy, von_mises(cauchy), self.energy(found)
         )
 
 
@@ -239,17 +236,7 @@ class Hexahedron8(SolidElement):
 class Hexahedron20(SolidElement):
     """A brick of twenty points, with 27 points of quadrature.
 
-    Attributes:
-        markers: its nodes, in the order of `nc.mesh.Mesh`.
-        material: as `nc.Elastic` or `nc.NeoHooke`.
-        reference: points without stress [m]; None: those of the assembled pose.
-
-    Example:
-        >>> import jax; jax.config.update("jax_enable_x64", True)
-        >>> import natcoord_jax as nc
-        >>> mesh = nc.mesh.box((1.0, 0.2, 0.2), (2, 1, 1), element="hexahedron20")
-        >>> rubber = nc.NeoHooke(E=1e6, nu=0.45, density=1100.0)
-        >>> block = nc.Solid(mesh, material=rubber, element="Hexahedron20")
+    Its fields, in [m] where they are lengths, are those of `nc.Hexahedron8`.
     """
 
     kind: ClassVar[str] = "serendipity hexahedron"
@@ -260,17 +247,7 @@ class Hexahedron20(SolidElement):
 class Hexahedron27(SolidElement):
     """A brick of 27 points.
 
-    Attributes:
-        markers: its nodes, in the order of `nc.mesh.Mesh`.
-        material: as `nc.Elastic` or `nc.NeoHooke`.
-        reference: points without stress [m]; None: those of the assembled pose.
-
-    Example:
-        >>> import jax; jax.config.update("jax_enable_x64", True)
-        >>> import natcoord_jax as nc
-        >>> mesh = nc.mesh.box((1.0, 0.2, 0.2), (2, 1, 1), element="hexahedron27")
-        >>> rubber = nc.NeoHooke(E=1e6, nu=0.45, density=1100.0)
-        >>> block = nc.Solid(mesh, material=rubber, element="Hexahedron27")
+    Its fields, in [m] where they are lengths, are those of `nc.Hexahedron8`.
     """
 
     kind: ClassVar[str] = "quadratic hexahedron"
@@ -303,17 +280,7 @@ class Hexahedron27P1(SolidElement):
 class Tetrahedron10(SolidElement):
     """A tetrahedron of ten points, with four points of quadrature.
 
-    Attributes:
-        markers: its nodes, in the order of `nc.mesh.Mesh`.
-        material: as `nc.Elastic` or `nc.NeoHooke`.
-        reference: points without stress [m]; None: those of the assembled pose.
-
-    Example:
-        >>> import jax; jax.config.update("jax_enable_x64", True)
-        >>> import natcoord_jax as nc
-        >>> mesh = nc.mesh.box((1.0, 0.2, 0.2), (2, 1, 1), element="tetrahedron10")
-        >>> rubber = nc.NeoHooke(E=1e6, nu=0.45, density=1100.0)
-        >>> block = nc.Solid(mesh, material=rubber, element="Tetrahedron10")
+    Its fields, in [m] where they are lengths, are those of `nc.Hexahedron8`.
     """
 
     kind: ClassVar[str] = "quadratic tetrahedron"
@@ -324,17 +291,7 @@ class Tetrahedron10(SolidElement):
 class Tetrahedron10P0(SolidElement):
     """A tetrahedron of ten points with one volume, for nearly incompressible materials.
 
-    Attributes:
-        markers: its nodes, in the order of `nc.mesh.Mesh`.
-        material: one that splits off the energy of a change of volume, as `nc.NeoHooke`.
-        reference: points without stress [m]; None: those of the assembled pose.
-
-    Example:
-        >>> import jax; jax.config.update("jax_enable_x64", True)
-        >>> import natcoord_jax as nc
-        >>> mesh = nc.mesh.box((1.0, 0.2, 0.2), (2, 1, 1), element="tetrahedron10")
-        >>> rubber = nc.NeoHooke(E=1e6, nu=0.45, density=1100.0)
-        >>> block = nc.Solid(mesh, material=rubber, element="Tetrahedron10P0")
+    Its fields, in [m] where they are lengths, are those of `nc.Hexahedron27P1`.
     """
 
     kind: ClassVar[str] = "quadratic tetrahedron with constant pressure"
