@@ -29,6 +29,8 @@ from natcoord_jax.bodies import (
     Contact,
     Cylinder,
     DirectorInterpolation,
+    Edge,
+    EdgeLoad,
     Ellipsoid,
     Fold,
     Gas,
@@ -135,6 +137,7 @@ from natcoord_jax.effects.joints import (
 from natcoord_jax.effects.laminates import Laminate, Orthotropic
 from natcoord_jax.effects.loads import (
     BodyTorque,
+    EdgeSegment,
     EnclosedGas,
     FacePressure,
     FacePressure6,
@@ -241,6 +244,9 @@ __all__ = [
     "Dissipative",
     "Distance",
     "Drive",
+    "Edge",
+    "EdgeLoad",
+    "EdgeSegment",
     "Elastic",
     "Ellipsoid",
     "EllipsoidOnPlane",
