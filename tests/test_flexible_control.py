@@ -7,7 +7,7 @@ import pytest
 
 import natcoord_jax as nc
 from natcoord_jax import gallery
-from natcoord_jax.gallery import panel_slew
+from natcoord_jax.gallery.panel_slew import as_a_rigid_body
 from natcoord_jax.gallery.plugging import along_a_smooth_path, joint_angles
 
 pytestmark = pytest.mark.exhaustive
@@ -66,7 +66,7 @@ def test_a_spacecraft_and_its_panels_come_to_rest():
     assert found is not None and found.ok, found.explain()
     assert max(abs(x) for x in found.missing.values()) < 1e-9
     problem, left = found.problem, []
-    for inputs in (panel_slew.as_a_rigid_body(found.problem), found.inputs):
+    for inputs in (as_a_rigid_body(found.problem), found.inputs):
         trajectory = nc.simulate(problem.system, problem.state, dt=problem.dt, inputs=inputs)
         energy = np.asarray(problem.system.energy(trajectory).total)
         left.append(energy[-1] / energy.max())
