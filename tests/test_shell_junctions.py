@@ -43,7 +43,7 @@ def hub_plate_fold_plate():
     wall = scene.add(nc.Shell(MESH, **THIN, position=(1, 0, 0), orientation=up, name="wall"))
     scene.add(nc.Clamp(hub, floor.set("left")))
     scene.add(nc.Fold(floor.set("right"), wall.set("left"), name="fold"))
-    pushed(scene, wall.set("right")[0], (4.0, 3.0, 2.0))
+    pushed(scene, wall.set("right")[0], (1.0, 0.7, 0.5))
     return scene
 
 
