@@ -28,6 +28,8 @@ from natcoord_jax.bodies import (
     Contact,
     Cylinder,
     DirectorInterpolation,
+    Edge,
+    EdgeLoad,
     Ellipsoid,
     Fold,
     Gas,
@@ -137,6 +139,7 @@ from natcoord_jax.effects.joints import (
 from natcoord_jax.effects.laminates import Laminate, Orthotropic
 from natcoord_jax.effects.loads import (
     BodyTorque,
+    EdgeSegment,
     EnclosedGas,
     FacePressure,
     FacePressure6,
@@ -248,6 +251,9 @@ __all__ = [
     "Dissipative",
     "Distance",
     "Drive",
+    "Edge",
+    "EdgeLoad",
+    "EdgeSegment",
     "Elastic",
     "Ellipsoid",
     "EllipsoidOnPlane",

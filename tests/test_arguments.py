@@ -245,6 +245,14 @@ CALLS = {
     "FacePressure6": lambda w: {**MARKED(w.ends * 3), "pressure": [1.0, f]},
     "FacePressure8": lambda w: {**MARKED(w.ends * 4), "pressure": [1.0, f]},
     "FacePressure9": lambda w: {**MARKED((w.ends * 5)[:9]), "pressure": [1.0, f]},
+    "EdgeSegment": lambda w: {
+        **MARKED(w.attached), "force": [np.ones(3), f], "moment": [np.ones(3), f], "following": FLAG,
+        "length": NUMBER,
+    },
+    "EdgeLoad": lambda w: {
+        "edge": [w.shell.edge("right")], "force": [np.ones(3), f], "moment": [np.ones(3), f],
+        "following": FLAG, "name": NAME,
+    },
     "Pressure": lambda w: {"surface": [w.shell], "pressure": [1.0, f], "name": NAME},
     "EnclosedGas": lambda w: {**MARKED(w.ends * 2), "faces": [np.array([[0, 1, 2, 3]])], **GAS},
     "Gas": lambda w: {"surface": [w.shell, (w.shell,)], "name": NAME, **GAS},
@@ -475,10 +483,9 @@ CALLS = {
 # What calls return or hand over, and bases: nobody is to make these by hand.
 MADE = {
     "Accuracy", "Balance", "BeamHandle", "Check", "ComputedTorque", "Contacts", "Continuation",
-    "DerivativeError", "Equilibrium", "Feedback", "Frame", "Growth", "Load", "MeshHandle", "Modes",
+    "DerivativeError", "Edge", "Equilibrium", "Feedback", "Frame", "Growth", "Load", "MeshHandle", "Modes",
     "NodeKind", "Nodes", "NonlinearProgram", "Optima", "Outcome", "Result", "SimulationError", "Solution",
-    "State", "Steps", "Surface", "Sweep",
-    "System",
+    "State", "Steps", "Surface", "Sweep", "System",
     "Trajectory",
 }  # fmt: skip
 BASES = {

@@ -209,6 +209,10 @@ TABLE = {
     nc.FacePressure: Entry(
         lambda p: nc.FacePressure((*p.eight[:2], *p.eight[5:7]), pressure=jnp.sin), inside=False
     ),
+    nc.EdgeSegment: Entry(
+        lambda p: nc.EdgeSegment(p.four[:2], force=_wave, moment=(0.3, 0.2, 0.0), following=True),
+        inside=False,
+    ),
     nc.EnclosedGas: Entry(
         lambda p: nc.EnclosedGas(
             p.eight, faces=np.array(nc.mesh.HEXAHEDRON), gauge_pressure=0.0, ambient=30.0

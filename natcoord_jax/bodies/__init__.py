@@ -4,10 +4,12 @@ from natcoord_jax.bodies.beam import Beam as Beam
 from natcoord_jax.bodies.beam import BeamHandle as BeamHandle
 from natcoord_jax.bodies.contact import Contact as Contact
 from natcoord_jax.bodies.contact import Plane as Plane
+from natcoord_jax.bodies.continua import Edge as Edge
 from natcoord_jax.bodies.continua import MeshHandle as MeshHandle
 from natcoord_jax.bodies.continua import Shell as Shell
 from natcoord_jax.bodies.continua import Solid as Solid
 from natcoord_jax.bodies.continua import Surface as Surface
+from natcoord_jax.bodies.edge_load import EdgeLoad as EdgeLoad
 from natcoord_jax.bodies.fold import Fold as Fold
 from natcoord_jax.bodies.gas import Gas as Gas
 from natcoord_jax.bodies.interpolation import DirectorInterpolation as DirectorInterpolation

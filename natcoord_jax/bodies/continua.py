@@ -60,12 +60,14 @@ class MeshHandle(Handle):
         mesh: as it was given.
         material: of it.
         thickness: of a shell at its cells (cells,) [m]; None: it is a solid.
+        bends: whether its nodes have directors: a shell that resists bending.
     """
 
     nodes: NodeSet = field(compare=False)
     mesh: Mesh = field(compare=False)
     material: Any = field(compare=False, repr=False, default=None)
     thickness: Any = field(compare=False, repr=False, default=None)
+    bends: bool = field(compare=False, repr=False, default=False)
 
     def set(self, name: str) -> NodeSet:
         """The nodes of a set of the mesh, as "left".
@@ -90,6 +92,23 @@ class MeshHandle(Handle):
             known = sorted(self.mesh.faces) or "none by name"
             raise ValueError(f"{self.name!r} has no faces {name!r}; its mesh has {known}")
         return Surface(self, self.mesh.faces[name])
+
+    def edge(self, name: str) -> "Edge":
+        """The edge of a shell along a set of its nodes, as "right".
+
+        Raises:
+            ValueError: for a name that there is not, a set without an edge, a solid, or a membrane.
+        """
+        nodes = self.set(name).numbers
+        if not self.bends:
+            raise ValueError(f"{self.name!r} has no edges with directors; take those of a shell that bends")
+        sides = self.mesh.edges
+        sides = sides[np.isin(sides, nodes).all(axis=1)]
+        if not len(sides):
+            raise ValueError(
+                f"{self.name!r}: the nodes {name!r} are no edge: none of them are neighbours on the outline"
+            )
+        return Edge(self, sides)
 
     def surface(self, side: str) -> "Surface":
         """A shell as it is touched from one side: "outside", where its directors point, or "inside".
@@ -127,6 +146,22 @@ class Surface:
 
     def __repr__(self) -> str:
         return f"<{len(self.faces)} faces of {self.handle.name!r}>"
+
+
+@dataclass(frozen=True, eq=False)
+class Edge:
+    """A part of the outline of a shell.
+
+    Attributes:
+        handle: of the shell.
+        sides: numbers of the nodes of each side of a cell on it (s, 2), in turn round the cell.
+    """
+
+    handle: MeshHandle
+    sides: Int[np.ndarray, "s 2"]
+
+    def __repr__(self) -> str:
+        return f"<{len(self.sides)} sides of {self.handle.name!r}>"
 
 
 @eager_numpy
@@ -169,9 +204,12 @@ class _Continuum(Recipe):
         given = as_array(self.position, float), turned, as_array(self.velocity, float), spin
         return *_placed(as_array(self.mesh.nodes, float), *given), turned, spin
 
-    def _handle(self, scene: Builder, nodes: NodeSet, elements: Any, thickness: Any = None) -> MeshHandle:
+    def _handle(
+        self, scene: Builder, nodes: NodeSet, elements: Any, thickness: Any = None, *, bends: bool = False
+    ) -> MeshHandle:
         found = scene.add(elements)
-        return MeshHandle(found.kind, found.name, found.scene, nodes, self.mesh, self.material, thickness)
+        own = nodes, self.mesh, self.material, thickness, bends
+        return MeshHandle(found.kind, found.name, found.scene, *own)
 
 
 class Shell(_Continuum):
@@ -251,11 +289,10 @@ class Shell(_Continuum):
         cells = self.mesh.cells
         each = as_array(np.broadcast_to(thick, (len(cells),))) if is_concrete(thick) else thick
         three = cells[:, 2] == cells[:, 3]
-        if three.all():
-            return self._handle(scene, nodes, self._elements(nodes, three, name, own), each)
-        if three.any():
+        if three.any() and not three.all():
             scene.add(self._elements(nodes, three, f"{name} triangles", own))
-        return self._handle(scene, nodes, self._elements(nodes, ~three, name, own), each)
+        main = self._elements(nodes, three if three.all() else ~three, name, own)
+        return self._handle(scene, nodes, main, each, bends=self.bending)
 
     def _elements(self, nodes: NodeSet, some: np.ndarray, name: str, own: dict[str, Any]) -> Any:
         """On some of the cells, which are all triangles or all quadrilaterals."""

@@ -21,6 +21,7 @@ from natcoord_jax.gallery.example import Example
 from natcoord_jax.gallery.loops import bricard, four_bar, slider_crank
 from natcoord_jax.gallery.manoeuvres import reorientation_example
 from natcoord_jax.gallery.open_tree import open_tree
+from natcoord_jax.gallery.panel_slew import panel_slew
 from natcoord_jax.gallery.pendulums import double_pendulum, pendulum, torsion_spring
 from natcoord_jax.gallery.plugging import plugging
 from natcoord_jax.gallery.robot import robot_cable
@@ -56,6 +57,7 @@ SCENES: Mapping[str, Callable[..., Example]] = {
     "plate": plate,
     "block": block,
     "solar_panels": solar_panels,
+    "panel_slew": panel_slew,
     "inflated_ball": inflated_ball,
     "bouncing_balls": bouncing_balls,
     "newton_cradle": newton_cradle,
