@@ -36,14 +36,8 @@ def surface_gaps(one: MeshSide, other: MeshSide, law: dict[str, Any], name: str)
     width = max(table.shape[1] for table, *_ in patches)
     # What fills up repeats the last node, so that both ways are alike.
     tables = [np.pad(table, ((0, 0), (0, width - table.shape[1])), mode="edge") for table, *_ in patches]
-    each: dict[str, list[Any]] = {
-        "facets": [],
-        "open": [],
-        "beyond": [],
-        "thickness": [],
-        "stiffness": [],
-        "two_sided": [],
-    }
+    fields = "facets", "open", "beyond", "thickness", "stiffness", "two_sided"
+    each: dict[str, list[Any]] = {field: [] for field in fields}
     for (slave, master), (_, facets, ends, beyond) in zip(sides, patches):
         thick = slave.half_thickness
         stiff = slave.stiffness if given is None else np.full(len(thick), float(given))
@@ -70,8 +64,9 @@ def _nearest(
 def _patches(
     slave: MeshSide, master: MeshSide, most: int, first: tuple[int, int], turn: int
 ) -> tuple[Int[np.ndarray, "n m"], Int[np.ndarray, "n k 4"], Float[np.ndarray, "n k 4"], np.ndarray]:
-    """For each node itself and the nodes of its facets, the facets by places among them, which edges end,
-    and how far the surface goes on beyond these (n, k, 4) [m].
+    """For each node itself and the nodes of its facets, the facets by places among them, and their edges.
+
+    Of these, which end, and how far the surface goes on beyond them (n, k, 4) [m].
 
     Args:
         slave: whose nodes.

@@ -37,7 +37,7 @@ def warn_of_uncovered(system: System, trajectory: Trajectory) -> None:
         look = over_states(lambda system, state, group=group: _uncovered(system, group, state))
         part = max(1, AT_ONCE // group.count)
         for start in range(0, len(trajectory.t), part):
-            states = jax.tree.map(lambda x, k=start: x[k : k + part], trajectory.states)
+            states = jax.tree.map(lambda x, k=slice(start, start + part): x[k], trajectory.states)
             found = {said: np.asarray(x) for said, x in look(system, states).items()}
             seen = {said: x for said, x in found.items() if x.any()}
             for said, x in seen.items():
