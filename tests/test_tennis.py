@@ -75,9 +75,8 @@ def test_the_impact_is_as_measured(short):
     assert found.before[0] == pytest.approx(-INCOMING, abs=1e-9) and 20.0 < closing < 30.0
     assert 4e-3 <= found.dwell <= 5.2e-3
     assert 1000.0 < found.force < 2500.0
-    # The ball leaves the moving racket, of which the hand gives way.
-    assert found.after[0] > found.racket[0]
-    assert 0.3 < (found.after[0] - found.racket[0]) / closing < 0.9
+    # Of a racket in a hand, which gives way, a ball rebounds with some 0.4 of the closing speed.
+    assert 0.3 < (found.after[0] - found.racket[0]) / closing < 0.5
 
 
 @pytest.mark.exhaustive

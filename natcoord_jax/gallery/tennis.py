@@ -31,6 +31,12 @@ HIT, END = float(TIMES[3]), float(TIMES[-1])
 STEP = 0.01
 """Of the swing [s]."""
 
+ROOM = 256
+"""Steps that one program has room for, so that it serves strokes of other lengths, too."""
+
+SUBSTEPS = 2000
+"""Beyond one a step: while the racket swings to and fro after the impact, steps of the swing are too long."""
+
 SPANS = ((HIT - 0.005, None), (HIT + 0.012, 1e-4), (HIT + 0.05, 5e-4), (END, None))
 """Ends of the phases [s] and their steps [s]; None: that of the run. A contact lasts 5 ms and the ball rings
 for some 30 ms."""
@@ -132,8 +138,8 @@ def _phases(
         if count > 0:
             plan.append((count, (end - begin) / count))
             begin = end
-    # One program for all of them.
-    most, found, now = max(count for count, _ in plan), [], state
+    most, found, now = max(ROOM, *(count for count, _ in plan)), [], state
+    options = {"extra_substeps": SUBSTEPS} | options
     for count, step in plan:
         run = nc.simulate(system, now, dt=step, steps=nc.Steps(count, most), **options)
         found.append(cut(run, count))
