@@ -232,6 +232,7 @@ CALLS = {
         **GAP((*w.ends * 2, w.ends[0])),
         "facets": [((1, 2, 3, 4),)],
         "open": [1.0],
+        "beyond": [1.0],
         "thickness": NUMBER,
         "two_sided": [0.0, 1.0],
     },
