@@ -226,17 +226,12 @@ def placements(t: float) -> dict[str, Placement]:
 
 
 def twist_of(name: str, t: float) -> tuple[np.ndarray, np.ndarray]:
-    """Velocity of what is at the origin [m/s] and angular velocity [rad/s] of a segment at a time [s].
-
-    Good to 1e-8: of differences in time.
-    """
+    """Velocity at the origin [m/s] and angular velocity [rad/s] of a segment at a time [s], to 1e-8."""
     step = 1e-5
-    before, after = placements(t - step)[name], placements(t + step)[name]
-    rotation = placements(t)[name].rotation
-    turning = (after.rotation - before.rotation) @ rotation.T / (2 * step)
+    before, here, after = (placements(t + dt)[name] for dt in (-step, 0.0, step))
+    turning = (after.rotation - before.rotation) @ here.rotation.T / (2 * step)
     spin = np.array([turning[2, 1], turning[0, 2], turning[1, 0]])
-    shift = placements(t)[name].shift
-    return (after.shift - before.shift) / (2 * step) - np.cross(spin, shift), spin
+    return (after.shift - before.shift) / (2 * step) - np.cross(spin, here.shift), spin
 
 
 @dataclass(frozen=True)
