@@ -56,7 +56,7 @@ def test_animation_as_html_file_and_mp4(run, tmp_path):
     assert film.read_bytes()[4:8] == b"ftyp" and film.stat().st_size < 3e6
 
 
-def test_pictures_look_into_a_box(run):
+def test_pictures_look_into_a_box(run, tmp_path):
     """What is outside at a time is not drawn then, and does not widen the picture."""
     phases = nc.Phases((run[0],), (run[1],))
     times = np.asarray(run[1].t)
@@ -71,6 +71,8 @@ def test_pictures_look_into_a_box(run):
     expected = ((places >= ends[0]) & (places <= ends[1])).all(axis=2).T
     np.testing.assert_array_equal(there, expected)
     assert 0 < there.sum() < there.size
+    page = nc.view(*run, file=tmp_path / "nothing.html", within=((50.0, 50.0, 50.0), (51.0, 51.0, 51.0)))
+    assert page.stat().st_size > 1000
 
 
 def test_animation_refuses_other_files(run):

@@ -193,6 +193,9 @@ def scenery_of(
         *links(system, rows, scale),
         *forces(system, states, rows, inputs, scale),
     ]
+    if within is not None:
+        solids = [s for s in solids if np.isfinite(s.rows).any()]
+        skins = [s for s in skins if np.isfinite(s.points).any()]
     start = jax.tree.map(lambda x: x[0], trajectory.states)
     paths = [np.asarray(system.sense(states, point, state=start).position) for point in traces]
     lines = [
