@@ -37,7 +37,7 @@ ROOM = 256
 SUBSTEPS = 2000
 """Beyond one a step: while the racket swings to and fro after the impact, steps of the swing are too long."""
 
-SPANS = ((HIT - 0.005, None), (HIT + 0.012, 1e-4), (HIT + 0.05, 5e-4), (END, None))
+SPANS = ((HIT - 0.005, None), (HIT + 0.012, 1e-4), (HIT + 0.05, 5e-4), (END, 1e-3))
 """Ends of the phases [s] and their steps [s]; None: that of the run. A contact lasts 5 ms and the ball rings
 for some 30 ms."""
 
