@@ -229,7 +229,8 @@ def _run(arguments: argparse.Namespace) -> int:
 
 def _drawn(example: gallery.Example) -> dict[str, Any]:
     """How a scene is drawn."""
-    return {"title": example.description, "beams": example.beams, "traces": example.traces}
+    drawn = {"beams": example.beams, "traces": example.traces, "within": example.within}
+    return {"title": example.description, **drawn}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from natcoord_jax.core.arguments import checked
-from natcoord_jax.core.cells import CELLS
+from natcoord_jax.core.cells import CELLS, met_once
 from natcoord_jax.core.checks import is_concrete
 from natcoord_jax.core.kinds import Choice, Several, of
 from natcoord_jax.core.lattice import ELEMENTS, cells_of_box
@@ -78,13 +78,13 @@ class Mesh:
     def outside(self) -> Int[np.ndarray, "f k"]:
         """Faces of cells of solids that belong to one cell only, in turn as seen from outside."""
         faces = CELLS[self.cells.shape[1]].faces
-        return _once(np.concatenate([self.cells[:, list(face)] for face in faces]))
+        return met_once(np.concatenate([self.cells[:, list(face)] for face in faces]))
 
     @property
     def edges(self) -> Int[np.ndarray, "s 2"]:
         """Sides of quadrilaterals and triangles that belong to one cell only, in turn round it."""
         every = np.concatenate([self.cells[:, [k, (k + 1) % 4]] for k in range(4)])
-        return _once(every[every[:, 0] != every[:, 1]])
+        return met_once(every[every[:, 0] != every[:, 1]])
 
     def part(self, name: str) -> "Mesh":
         """The cells of a part alone, as a mesh with what it has of the sets and faces.
@@ -102,11 +102,6 @@ class Mesh:
         faces = {key: number[x[np.isin(x, kept).all(axis=1)]] for key, x in self.faces.items()}
         mine = {key: x for key, x in sets.items() if len(x)}
         return Mesh(self.nodes[kept], number[cells], mine, {key: x for key, x in faces.items() if len(x)})
-
-
-def _once(faces: Int[np.ndarray, "f k"]) -> Int[np.ndarray, "f k"]:
-    _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
-    return faces[np.sort(first[count == 1])]
 
 
 KINDS = {4: "quadrilaterals", **{count: cell.name for count, cell in CELLS.items()}}

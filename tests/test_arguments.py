@@ -238,6 +238,7 @@ CALLS = {
         **GAP((*w.ends * 2, w.ends[0])),
         "facets": [((1, 2, 3, 4),)],
         "open": [1.0],
+        "beyond": [1.0],
         "thickness": NUMBER,
         "two_sided": [0.0, 1.0],
     },
@@ -372,11 +373,12 @@ CALLS = {
     "animate": lambda w: {
         "system": [w.system], "trajectory": [w.trajectory], "file": ["film.gif"], "fps": WHOLE,
         "beams": [(w.beam,)], "traces": [(w.point,)], "title": NAME, "colour": ["energy", {}],
+        "within": [((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))],
     },
     "view": lambda w: {
         "system": [w.system], "trajectory": [w.trajectory], "file": ["view.html"], "title": NAME,
         "follow": [w.body, "body"], "traces": [(w.point,)], "colour": ["energy", {}], "beams": [(w.beam,)],
-        "live": FLAG,
+        "live": FLAG, "within": [((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))],
     },
     **{
         f"System.{name}": lambda w: {"motion": [w.state]}

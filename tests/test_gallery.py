@@ -14,7 +14,7 @@ from natcoord_jax.gallery.spacecraft import TABLE, TORQUE, compare_torques
 
 # Compiling takes all the time: the small scenes by default, the rest with the slow tests.
 QUICK = ("spacecraft", "double_pendulum", "heavy_top")
-ELSEWHERE = ("plugging", "panel_slew", "reorientation", "robot_cable")
+ELSEWHERE = ("plugging", "panel_slew", "reorientation", "robot_cable", "tennis")
 """Scenes that have tests of their own, and take long."""
 # Balances after a few steps of round-off, relative; loops and drives are solved a little less sharply.
 BALANCE = 1e-11

@@ -273,9 +273,12 @@ def test_products_with_vectors_of_middle_length(length):
     assert "reduce-window" not in program.lower(a, x).compile().as_text()
 
 
-@pytest.mark.parametrize(
-    "name", [n if n in USUAL else pytest.param(n, marks=pytest.mark.slow) for n in gallery.SCENES]
-)
+def _marked(name):
+    mark = pytest.mark.exhaustive if name == "tennis" else pytest.mark.slow
+    return name if name in USUAL else pytest.param(name, marks=mark)
+
+
+@pytest.mark.parametrize("name", [_marked(name) for name in gallery.SCENES])
 def test_every_scene_of_the_gallery_runs_in_one_kernel(name):
     example = gallery.load(name)
     # Any torques do: those of a problem of control take longer to find than the kernel to compile.

@@ -56,6 +56,25 @@ def test_animation_as_html_file_and_mp4(run, tmp_path):
     assert film.read_bytes()[4:8] == b"ftyp" and film.stat().st_size < 3e6
 
 
+def test_pictures_look_into_a_box(run, tmp_path):
+    """What is outside at a time is not drawn then, and does not widen the picture."""
+    phases = nc.Phases((run[0],), (run[1],))
+    times = np.asarray(run[1].t)
+    places = np.asarray(run[1].q).reshape(len(times), -1, 4, 3)[:, :, 0]
+    # The second rod leaves it half way.
+    axis = np.abs(places[-1, 1] - places[0, 1]).argmax()
+    ends = np.full((2, 3), 1e3) * [[-1.0], [1.0]]
+    ends[int(places[-1, 1, axis] > places[0, 1, axis]), axis] = places[len(times) // 2, 1, axis]
+    box = tuple(map(tuple, ends))
+    seen = [s for s in scenery_at(phases, times, within=box).solids if s.kind == "body"]
+    there = np.isfinite([s.rows[:, 0, 0] for s in seen])
+    expected = ((places >= ends[0]) & (places <= ends[1])).all(axis=2).T
+    np.testing.assert_array_equal(there, expected)
+    assert 0 < there.sum() < there.size
+    page = nc.view(*run, file=tmp_path / "nothing.html", within=((50.0, 50.0, 50.0), (51.0, 51.0, 51.0)))
+    assert page.stat().st_size > 1000
+
+
 def test_animation_refuses_other_files(run):
     with pytest.raises(ValueError, match=r"\.gif, \.mp4, \.html"):
         nc.animate(*run, file="film.avi")

@@ -58,7 +58,10 @@ def test_every_scene_comes_back(name, tmp_path, programs):
     round_trip(name, tmp_path / "scene.nc", programs)
 
 
-@pytest.mark.parametrize("name", gallery.SCENES)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=pytest.mark.exhaustive) if n == "tennis" else n for n in gallery.SCENES],
+)
 def test_every_structure_comes_back(name, tmp_path):
     example = gallery.load(name)
     system = again(example.system, tmp_path / "scene.nc")

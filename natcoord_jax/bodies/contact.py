@@ -57,7 +57,8 @@ class Contact(Recipe):
 
     Shells are touched from both sides, where their thickness ends; solids from outside, best at all that is
     outside, since at the end of a surface nodes slip off it. Which facets a node may touch is settled
-    where the scene is compiled: those `candidates` that are the nearest to it in the assembled pose.
+    where the scene is compiled: those `candidates` that are the nearest to it in the assembled pose. Of a
+    node that leaves them where the surface goes on, so that it may pass through, a run warns by name.
 
     Attributes:
         one: handle of a body with a shape, of a point mass or a node, of a beam, of a shell or a solid, or

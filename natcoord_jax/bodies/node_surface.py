@@ -33,15 +33,17 @@ def surface_gaps(one: MeshSide, other: MeshSide, law: dict[str, Any], name: str)
     sides = ((one, other), (other, one))[:passes]
     first = 0, len(one.numbers)
     patches = [_patches(a, b, most, first, k) for k, (a, b) in enumerate(sides)]
-    width = max(table.shape[1] for table, _, _ in patches)
+    width = max(table.shape[1] for table, *_ in patches)
     # What fills up repeats the last node, so that both ways are alike.
-    tables = [np.pad(table, ((0, 0), (0, width - table.shape[1])), mode="edge") for table, _, _ in patches]
-    each: dict[str, list[Any]] = {"facets": [], "open": [], "thickness": [], "stiffness": [], "two_sided": []}
-    for (slave, master), (_, facets, ends) in zip(sides, patches):
+    tables = [np.pad(table, ((0, 0), (0, width - table.shape[1])), mode="edge") for table, *_ in patches]
+    fields = "facets", "open", "beyond", "thickness", "stiffness", "two_sided"
+    each: dict[str, list[Any]] = {field: [] for field in fields}
+    for (slave, master), (_, facets, ends, beyond) in zip(sides, patches):
         thick = slave.half_thickness
         stiff = slave.stiffness if given is None else np.full(len(thick), float(given))
         each["facets"].append(facets)
         each["open"].append(ends)
+        each["beyond"].append(beyond)
         each["thickness"].append(thick + master.half_thickness.max())
         each["stiffness"].append(stiff / passes)
         each["two_sided"].append(np.full(len(thick), float(master.two_sided)))
@@ -61,8 +63,10 @@ def _nearest(
 
 def _patches(
     slave: MeshSide, master: MeshSide, most: int, first: tuple[int, int], turn: int
-) -> tuple[Int[np.ndarray, "n m"], Int[np.ndarray, "n k 4"], Float[np.ndarray, "n k 4"]]:
-    """For each node itself and the nodes of its facets, the facets by places among them, and which edges end.
+) -> tuple[Int[np.ndarray, "n m"], Int[np.ndarray, "n k 4"], Float[np.ndarray, "n k 4"], np.ndarray]:
+    """For each node itself and the nodes of its facets, the facets by places among them, and their edges.
+
+    Of these, which end, and how far the surface goes on beyond them (n, k, 4) [m].
 
     Args:
         slave: whose nodes.
@@ -80,10 +84,23 @@ def _patches(
     width = max(map(len, unique))
     table = np.stack([np.pad(x, (0, width - len(x)), mode="edge") for x in unique])
     local = np.stack([np.searchsorted(x, c) for x, c in zip(unique, corners)]) + 1
-    edges = np.sort(np.stack([corners, np.roll(corners, -1, axis=2)], axis=-1), axis=-1)
-    ends = [_alone(e, f) for e, f in zip(edges, near)]
+    edges = np.sort(_edges(corners), axis=-1)
+    ends = np.stack([_alone(e, f) for e, f in zip(edges, near)])
     own = first[turn] + np.arange(len(near))
-    return np.concatenate([own[:, None], first[1 - turn] + table], axis=1), local, np.stack(ends)
+    goes_on = (ends > 0) & _shared(np.sort(_edges(facets), axis=-1))[near]
+    beyond = np.where(goes_on, np.linalg.norm(np.ptp(places, axis=0)), 0.0)
+    return np.concatenate([own[:, None], first[1 - turn] + table], axis=1), local, ends, beyond
+
+
+def _edges(corners: Int[np.ndarray, "*n 4"]) -> Int[np.ndarray, "*n 4 2"]:
+    """Both ends of the edges of facets."""
+    return np.stack([corners, np.roll(corners, -1, axis=-1)], axis=-1)
+
+
+def _shared(edges: Int[np.ndarray, "f 4 2"]) -> np.ndarray:
+    """Which edges of all facets of a surface belong to two of them (f, 4); those without length to none."""
+    _, number, count = np.unique(edges.reshape(-1, 2), axis=0, return_inverse=True, return_counts=True)
+    return (count > 1)[number.reshape(-1)].reshape(edges.shape[:2]) & (edges[..., 0] != edges[..., 1])
 
 
 def _alone(edges: Int[np.ndarray, "k 4 2"], facets: Int[np.ndarray, " k"]) -> Float[np.ndarray, "k 4"]:

@@ -222,6 +222,13 @@ class Effect(Part):
         """
         return None
 
+    def uncovered(self, place: Array, rows: Float[Array, "k 4 3"]) -> dict[str, Array]:
+        """What it does not see at a state though it should, as the rest of a sentence, and whether it is so.
+
+        Eager runs look after it at the states that are saved, and warn.
+        """
+        return {}
+
     @abc.abstractmethod
     def respond(self, place: Array, motion: Motion, now: StepContext, lam: Float[Array, "s m"]) -> Response:
         """Forces, torques, constraint rates and power over a step.

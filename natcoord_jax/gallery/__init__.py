@@ -28,6 +28,7 @@ from natcoord_jax.gallery.robot import robot_cable
 from natcoord_jax.gallery.rolling import bicycle
 from natcoord_jax.gallery.spacecraft import spacecraft
 from natcoord_jax.gallery.stiff import mass_ladder, stiff_chain
+from natcoord_jax.gallery.tennis import tennis
 from natcoord_jax.gallery.tops import dzhanibekov, fast_top, free_body, heavy_top
 from natcoord_jax.gallery.trees import binary_tree, chain, robot_arm
 
@@ -67,6 +68,7 @@ SCENES: Mapping[str, Callable[..., Example]] = {
     "colliding_blocks": colliding_blocks,
     "robot_cable": robot_cable,
     "plugging": plugging,
+    "tennis": tennis,
 }
 
 __all__ = ["SCENES", "Example", "describe", "load"]

@@ -36,6 +36,7 @@ class Example:
             with given inputs; `system` and `state` are then those of its start.
         beams: whose sections pictures draw.
         traces: points whose paths pictures draw.
+        within: corners of the box that pictures look into (2, 3) [m]; None: they show all.
 
     Example:
         >>> import jax; jax.config.update("jax_enable_x64", True)
@@ -60,6 +61,7 @@ class Example:
     phases: Callable[..., nc.Phases] | None = None
     beams: Sequence[nc.BeamHandle] = ()
     traces: Sequence[Any] = ()
+    within: Any = None
 
     @property
     def t_end(self) -> float:

@@ -34,8 +34,10 @@ RUBBER = {"E": 4e6, "nu": 0.45}
 GAUGE, EXPONENT = 83e3, 1.2
 """Pressure of the gas above that of the air [N/m^2], and its exponent."""
 
-FRICTION = 2.0
-"""Damping along edges and diagonals of the mesh of the wall [N s/m], by its rebound from a plate."""
+RELAXATION = 3.5e-4
+"""Time of the viscous stresses of the wall [s], see `nc.Shell`. None was found published: this is the one
+with which balls of four and five cells along an edge rebound from a plate at 7 m/s as real ones do, with
+0.744 and 0.754 of their speed; three cells are too few for that, 0.69."""
 
 
 @dataclass(frozen=True)
@@ -153,13 +155,8 @@ def add_ball(scene: nc.Scene, count: int = 3, **placing: Any) -> MeshHandle:
     mesh = nc.mesh.sphere(RADIUS, count)
     density = BALL_MASS / (4 * np.pi * RADIUS**2 * THICKNESS)
     felt = nc.Elastic(**RUBBER, density=density)
-    ball = scene.add(nc.Shell(mesh, thickness=THICKNESS, material=felt, name="ball", **placing))
+    ball = scene.add(
+        nc.Shell(mesh, thickness=THICKNESS, material=felt, damping=RELAXATION, name="ball", **placing)
+    )
     scene.add(nc.Gas(ball, gauge_pressure=GAUGE, exponent=EXPONENT, name="gas"))
-    scene.add(nc.Damper.on(ball.nodes, _links(mesh.cells), damping=FRICTION * 3 / count, name="wall"))
     return ball
-
-
-def _links(cells: np.ndarray) -> np.ndarray:
-    """Edges and diagonals of quadrilaterals."""
-    pairs = [cells[:, [k, (k + 1) % 4]] for k in range(4)] + [cells[:, [0, 2]], cells[:, [1, 3]]]
-    return np.unique(np.sort(np.concatenate(pairs), axis=1), axis=0)

@@ -100,6 +100,7 @@ def _judged(phases: nc.Phases) -> dict[str, Any]:
     total, last = np.asarray(valid.energy().total), valid.trajectories[-1]
     balances = [nc.balance(*pair) for pair in valid.pairs]
     errors = [system.constraint_errors(run) for system, run in valid.pairs]
+    changed = [one is not other for one, other in zip(phases.systems, phases.systems[1:])]
     taken = sum(int(run.steps_taken) for run in runs)
     ended = Result(int(runs[-1].result))
     return {
@@ -110,7 +111,7 @@ def _judged(phases: nc.Phases) -> dict[str, Any]:
         "newton_iterations_max": max(int(run.iterations_max) for run in runs),
         "energy_initial": float(total[0]),
         "energy_final": float(total[-1]),
-        "energy_lost_at_changes": [float(x) for x in valid.losses()],
+        "energy_lost_at_changes": [float(x) for x, changes in zip(valid.losses(), changed) if changes],
         "dissipated": None if last.states.dissipated is None else float(last.states.dissipated[-1]),
         "energy_error_max": _largest([b.energy for b in balances]),
         "momentum_error_max": _largest([b.momentum for b in balances]),

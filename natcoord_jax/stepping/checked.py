@@ -10,6 +10,8 @@ from natcoord_jax.core.checks import as_array, at_top_level
 from natcoord_jax.core.kinds import FunctionOf
 from natcoord_jax.core.numeric import Number, Numbers
 from natcoord_jax.core.state import State
+from natcoord_jax.maths.collocation import Tableau
+from natcoord_jax.mechanics.violations import contacts
 from natcoord_jax.system import System
 
 STEP = Number("positive", instead=" (jax.vmap takes several)")
@@ -81,4 +83,19 @@ def check_state(system: System, state: State) -> None:
         raise ValueError(
             f"system or state has numbers of type {', '.join(sorted(single))}; natcoord_jax needs double "
             "precision: use the system and state that `compile` returned, and cast results instead"
+        )
+
+
+def check_contacts(system: System, tableau: Tableau) -> None:
+    """Refuse schemes for which impacts are not defined.
+
+    Raises:
+        ValueError: with a contact, and what to do.
+    """
+    if tableau.stages == 1 and not tableau.variational and not tableau.dissipative:
+        return
+    for group in contacts(system):
+        raise ValueError(
+            f"{group.effect.kind} {group.labels[0]!r} is a constraint with impacts, for steps of one stage; "
+            "pass scheme=nc.EnergyMomentum(), or give the contact a stiffness, which makes it a potential"
         )

@@ -9,13 +9,12 @@ from jaxtyping import Array, Bool, Float, Int
 
 from natcoord_jax.core.results import Result
 from natcoord_jax.core.state import State
-from natcoord_jax.maths.collocation import Tableau
 from natcoord_jax.mechanics.equations import prepare
 from natcoord_jax.mechanics.frozen_kick import FEWEST, FrozenKick, Lagging, from_body_axes, in_body_axes
 from natcoord_jax.mechanics.inversion import first_inverted
 from natcoord_jax.mechanics.start_cache import StartCache
 from natcoord_jax.mechanics.tangent_space import Velocity
-from natcoord_jax.mechanics.violations import contacts
+from natcoord_jax.stepping.checked import check_contacts
 from natcoord_jax.stepping.error_control import StepDecision, Tolerance, Trial, follow
 from natcoord_jax.stepping.factors import Factors, no_factors
 from natcoord_jax.stepping.newton import Iterate, any_lane, begin
@@ -132,21 +131,6 @@ class RolloutProblem(eqx.Module):
         given = index if self.plan.control is not None else index - self.first
         u = self.plan.inputs(self.system, self.parameters, given, course.state, course.done, course.fraction)
         return u, h, index
-
-
-def check_contacts(system: System, tableau: Tableau) -> None:
-    """Refuse schemes for which impacts are not defined.
-
-    Raises:
-        ValueError: with a contact, and what to do.
-    """
-    if tableau.stages == 1 and not tableau.variational and not tableau.dissipative:
-        return
-    for group in contacts(system):
-        raise ValueError(
-            f"{group.effect.kind} {group.labels[0]!r} is a constraint with impacts, for steps of one stage; "
-            "pass scheme=nc.EnergyMomentum(), or give the contact a stiffness, which makes it a potential"
-        )
 
 
 def start_of(setting: RolloutProblem, state: State) -> tuple[RolloutState, Factors, StartCache]:

@@ -29,6 +29,7 @@ from natcoord_jax.stepping.saved_states import rollout
 from natcoord_jax.stepping.scheme import SCHEME, SECOND_ORDER, Scheme
 from natcoord_jax.stepping.segments import Run, in_segments
 from natcoord_jax.stepping.turns import warn_of_far_turns
+from natcoord_jax.stepping.uncovered import warn_of_uncovered
 from natcoord_jax.storage.archive import PATH
 from natcoord_jax.system import System
 from natcoord_jax.xla import one_kernel
@@ -151,6 +152,7 @@ def simulate(
         UserWarning: in an eager call, of a joint that turns so far in a step that its rate and its angle tell
             different things, with the step to take: at order two from a radian on. What spins faster than
             half a turn in a step has no angle.
+        And of a node in contact with a surface that has left the facets that it may touch, at a saved state.
 
     Raises:
         ValueError: for a wrong dt, steps, tolerance, shape of inputs or state, a state that violates a
@@ -190,6 +192,8 @@ def simulate(
         trajectory = _long(run, traced, progress, store, resume)
         if throw:
             system.raise_on_failure(trajectory)
+        if store is None:
+            warn_of_uncovered(system, trajectory)
         return trajectory
     room, made = count, None
     spare = save_every == 1 and not checkpoint and in_host_memory()
@@ -221,6 +225,7 @@ def simulate(
         system.raise_on_failure(trajectory)
     if tolerance is None:
         warn_of_far_turns(system, trajectory, step, int(save_every))
+    warn_of_uncovered(system, trajectory)
     return trajectory
 
 

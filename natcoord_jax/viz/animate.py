@@ -23,7 +23,7 @@ from natcoord_jax.core.numeric import Whole
 from natcoord_jax.core.state import TRAJECTORY, Trajectory
 from natcoord_jax.system import System
 from natcoord_jax.viz.colours import STOPS, limits
-from natcoord_jax.viz.motion import BEAMS, COLOURS, MOVING, even_times, phases_of, scenery_at
+from natcoord_jax.viz.motion import BEAMS, BOX, COLOURS, MOVING, even_times, phases_of, scenery_at
 from natcoord_jax.viz.scenery import Scenery
 from natcoord_jax.viz.skins import Colouring
 from natcoord_jax.viz.stage import Stage
@@ -107,6 +107,7 @@ def _write(film: FuncAnimation, file: Path, fps: int) -> None:
     traces=POINTS,
     title=NAME,
     colour=COLOURS,
+    within=BOX,
 )
 def animate(
     system: System | Phases | Solution,
@@ -118,6 +119,7 @@ def animate(
     traces: Sequence[Marker] = (),
     title: str = "",
     colour: Colouring = "energy",
+    within: Any = None,
 ) -> Inline | Path:
     """A film of a trajectory: true shapes, joints, ground, and the time.
 
@@ -136,6 +138,8 @@ def animate(
         traces: points whose paths are drawn.
         title: above the film.
         colour: of beams, shells and solids, see `nc.view`.
+        within: two corners of the box (2, 3) [m] that is looked into: what is outside is not drawn then, as a
+            ball on its way; None: all is seen.
 
     Returns:
         HTML that a notebook shows with player controls, or the path of the file.
@@ -153,7 +157,7 @@ def animate(
     t = np.asarray(phases.t)
     pace = pace_of(t)
     wanted = max(2, int((t[-1] - t[0]) / pace * fps) + 1)
-    options = {"beams": beams, "traces": traces, "title": title, "colour": colour}
+    options = {"beams": beams, "traces": traces, "title": title, "colour": colour, "within": within}
     scenery = scenery_at(phases, even_times(t, wanted), **options)
     figure, stage = _stage(scenery)
     try:

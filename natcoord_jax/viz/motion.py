@@ -10,6 +10,7 @@ from natcoord_jax.analysis.phases import Phases
 from natcoord_jax.bodies.beam import BeamHandle
 from natcoord_jax.control.solution import Solution
 from natcoord_jax.core.kinds import Choice, Several, of
+from natcoord_jax.core.numeric import Numbers
 from natcoord_jax.core.state import Trajectory
 from natcoord_jax.system import System
 from natcoord_jax.viz.parts import scenery_of
@@ -19,6 +20,7 @@ MOVING = of(
     "a system, as scene.compile() returned it, nc.Phases(...), or a solution", System, Phases, Solution
 )
 COLOURS = Choice(("energy", "parts")) | of("values of the elements, by name", Mapping)
+BOX = Numbers((2, 3))
 BEAMS = Several(of("what scene.add(nc.Beam(...)) returned", BeamHandle))
 
 

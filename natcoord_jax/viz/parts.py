@@ -13,7 +13,8 @@ from natcoord_jax.core.markers import Marker
 from natcoord_jax.core.state import Trajectory
 from natcoord_jax.system import System
 from natcoord_jax.viz.links import between, forces, links
-from natcoord_jax.viz.outline import ball, bar, bodies_of, marked, within
+from natcoord_jax.viz.outline import ball, bar, bodies_of, marked
+from natcoord_jax.viz.outline import within as inside_of
 from natcoord_jax.viz.scenery import DARK, PALETTE, Scenery, Solid, Trace
 from natcoord_jax.viz.skins import (
     Colouring,
@@ -78,7 +79,7 @@ def _bodies(system: System, meshes: Meshes, rows: np.ndarray, scale: float) -> l
         found.append(Solid(names[k], "body", points, faces, rows[:, k], colour, shade))
         sides = [(j, side) for j in _named_joints(system) for side in (0, 1) if pairs[j, side] == k]
         ends = [frames[j, side, 0, 1:] for j, side in sides]
-        arms = [bar(0.007 * scale, centre, end) for end in ends if not within(own, end)]
+        arms = [bar(0.007 * scale, centre, end) for end in ends if not inside_of(own, end)]
         if arms:
             points, faces = merged(arms)
             found.append(Solid(names[k], "arm", points, faces, rows[:, k], colour, np.full(len(faces), 0.85)))
@@ -134,7 +135,19 @@ def _scale(system: System, meshes: Meshes, rows: np.ndarray, skins: Sequence[Any
     for k, mesh in meshes.items():
         if mesh is not None:
             points.append(rows[0, k, 0] + mesh[0][0] @ rows[0, k, 1:])
-    return float(np.linalg.norm(np.ptp(np.concatenate([p.reshape(-1, 3) for p in points]), axis=0))) or 1.0
+    every = np.concatenate([p.reshape(-1, 3) for p in points])
+    every = every[np.isfinite(every).all(axis=1)]
+    return float(np.linalg.norm(np.ptp(every, axis=0))) or 1.0 if len(every) else 1.0
+
+
+def _seen(rows: np.ndarray, box: Any) -> np.ndarray:
+    """Rows of bodies (t, bodies and ground, 4, 3), those outside of a box not there."""
+    if box is None:
+        return rows
+    lower, upper = np.asarray(box, float)
+    inside = ((rows[:, :, 0] >= lower) & (rows[:, :, 0] <= upper)).all(axis=-1)
+    inside[:, -1] = True  # the ground, on which the sides of springs and joints may be
+    return np.where(inside[:, :, None, None], rows, np.nan)
 
 
 def scenery_of(
@@ -146,6 +159,7 @@ def scenery_of(
     traces: Sequence[Marker] = (),
     colour: Colouring = "parts",
     title: str = "",
+    within: Any = None,
 ) -> Scenery:
     """What there is to draw of a trajectory of one lane.
 
@@ -157,9 +171,10 @@ def scenery_of(
         traces: points whose paths are drawn.
         colour: "energy", "parts", or values of elements by name, see `nc.view`.
         title: one line.
+        within: corners of the box (2, 3) [m] that is looked into; None: all is seen.
     """
     states = jax.tree.map(lambda x: x[saved], trajectory.states)
-    rows = with_ground(np.asarray(states.q))
+    rows = _seen(with_ground(np.asarray(states.q)), within)
     skins = [
         *beam_skins(system, states, rows, saved, colour, beams),
         *element_skins(system, states, rows, saved, colour),
@@ -178,6 +193,9 @@ def scenery_of(
         *links(system, rows, scale),
         *forces(system, states, rows, inputs, scale),
     ]
+    if within is not None:
+        solids = [s for s in solids if np.isfinite(s.rows).any()]
+        skins = [s for s in skins if np.isfinite(s.points).any()]
     start = jax.tree.map(lambda x: x[0], trajectory.states)
     paths = [np.asarray(system.sense(states, point, state=start).position) for point in traces]
     lines = [

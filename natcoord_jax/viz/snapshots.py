@@ -26,6 +26,7 @@ def plot_snapshots(
     *,
     beams: Sequence[BeamHandle] = (),
     caption: str = "",
+    within: Any = None,
 ) -> Figure:
     """Pictures of a motion at some times, with diagrams below.
 
@@ -35,9 +36,12 @@ def plot_snapshots(
         panels: the diagrams.
         beams: handles of beams, whose sections are drawn.
         caption: what there is to see, below the pictures.
+        within: two corners of the box (2, 3) [m] that is looked into; None: all is seen.
     """
     end = float(phases.t[-1])
-    scenery = scenery_at(phases, np.array([t for t in times if t <= end + 1e-9 * (1 + end)]), beams=beams)
+    scenery = scenery_at(
+        phases, np.array([t for t in times if t <= end + 1e-9 * (1 + end)]), beams=beams, within=within
+    )
     frames = range(len(scenery.t))
     rows = -(-len(frames) // COLUMNS)
     wide = 2 if len(panels) == 4 else min(len(panels), MOST_IN_A_ROW)

@@ -26,7 +26,17 @@ from natcoord_jax.core.markers import Marker
 from natcoord_jax.core.state import TRAJECTORY, Trajectory
 from natcoord_jax.system import System
 from natcoord_jax.viz.animate import POINTS, pace_of
-from natcoord_jax.viz.motion import BEAMS, COLOURS, MOVING, even_times, lane, lanes_of, scenery_at, title_of
+from natcoord_jax.viz.motion import (
+    BEAMS,
+    BOX,
+    COLOURS,
+    MOVING,
+    even_times,
+    lane,
+    lanes_of,
+    scenery_at,
+    title_of,
+)
 from natcoord_jax.viz.packed import bytes_of_a_picture, page
 from natcoord_jax.viz.scenery import Scenery
 from natcoord_jax.viz.skins import Colouring
@@ -131,6 +141,7 @@ def open_file(file: Path) -> None:
     traces=POINTS,
     colour=COLOURS,
     beams=BEAMS,
+    within=BOX,
     live=FLAG,
 )
 def view(
@@ -143,6 +154,7 @@ def view(
     traces: Sequence[Marker] = (),
     colour: Colouring = "energy",
     beams: Sequence[BeamHandle] = (),
+    within: Any = None,
     live: bool = False,
 ) -> "View | Path | Any":
     """A motion in three dimensions: turn it, play it, scrub it.
@@ -164,6 +176,8 @@ def view(
         colour: of beams, shells and solids: "energy", stored per length [J/m], area [J/m^2] or volume
             [J/m^3]; "parts"; or values of the elements by name, shape (elements,) or (saved, elements).
         beams: handles of beams, whose sections are drawn as given; the others are round.
+        within: two corners of the box (2, 3) [m] that is looked into: what is outside is not drawn; None:
+            all is seen.
         live: serve it by viser (the extra `viz3d`) instead, with no limit of size: for what runs on another
             machine. Of what is returned, `.wait()` stays until it is interrupted, `.stop()` ends it.
 
@@ -198,6 +212,7 @@ def view(
         "traces": traces,
         "colour": colour,
         "beams": beams,
+        "within": within,
     }
     first = lane(phases, 0) if np.ndim(phases.trajectories[0].t) == 2 else phases
     pace = pace_of(np.concatenate([np.ravel(part.t) for part in first.trajectories]))

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float, Int
 
 from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.numeric import Number, Numbers
+from natcoord_jax.core.potential import place_markers
 from natcoord_jax.effects.contact.discrete_gap import DiscreteGap, Measured
 from natcoord_jax.maths.vectors import cross, dot, safe_norm, safe_sqrt
 
@@ -32,6 +33,12 @@ AT_END = 1e-6
 
 LEVEL = 0.3
 """Difference of heights above two facets, in terms of their size, at which only the nearer one counts."""
+
+
+LEFT = (
+    "has left the facets that it may touch, which are those that were nearest in the assembled pose, so that "
+    "a contact is missed; pass more `candidates` to nc.Contact, or assemble the parts where they meet"
+)
 
 
 class Nearest(eqx.Module):
@@ -69,6 +76,17 @@ def _slopes(natural: Float[Array, "2"], corners: Float[Array, "4 3"]) -> tuple[A
     return by_xi @ corners, by_eta @ corners
 
 
+def nearest_on_edges(point: Float[Array, "3"], corners: Float[Array, "4 3"]) -> Float[Array, "4 4"]:
+    """Weights of the corners in the nearest point of each edge."""
+    along = jnp.roll(corners, -1, axis=0) - corners
+    length = dot(along, along)
+    some = length > 0
+    share = jnp.clip(dot(point - corners, along) / jnp.where(some, length, 1.0), 0.0, 1.0)
+    share = jnp.where(some, share, 0.0)
+    unit = np.eye(4)
+    return jnp.asarray(unit) + share[:, None] * (np.roll(unit, -1, axis=0) - unit)
+
+
 def nearest_point(point: Float[Array, "3"], corners: Float[Array, "4 3"]) -> Nearest:
     """The nearest point of a bilinear facet, within it or on an edge.
 
@@ -95,13 +113,7 @@ def nearest_point(point: Float[Array, "3"], corners: Float[Array, "4 3"]) -> Nea
         step = jnp.stack([c * u - b * v, a * v - b * u]) / volume
         natural = jnp.where(regular, jnp.clip(natural + step, -BEYOND, BEYOND), natural)
     inside = shapes(natural)
-    along = jnp.roll(corners, -1, axis=0) - corners
-    length = dot(along, along)
-    some = length > 0
-    share = jnp.clip(dot(point - corners, along) / jnp.where(some, length, 1.0), 0.0, 1.0)
-    share = jnp.where(some, share, 0.0)
-    unit = np.eye(4)
-    edges = unit + share[:, None] * (np.roll(unit, -1, axis=0) - unit)
+    edges = nearest_on_edges(point, corners)
     apart = point - jnp.concatenate([inside[None], edges]) @ corners
     squares = dot(apart, apart)
     best = jnp.argmin(squares[1:])
@@ -128,6 +140,8 @@ class NodeOnFacets(DiscreteGap):
         facets: numbers among the markers of the corners of each facet (f, 4), in turn as seen from outside.
         open: 1 for each edge of each facet that is an end of the surface (f, 4), round which nodes go behind
             it without being pushed back; else 0.
+        beyond: how far the surface goes on beyond each edge of each facet where it does so with facets that
+            are not among these (f, 4) [m]; else 0. See `uncovered`.
         thickness: distance of the node from the facets at which they touch [m]: that of both, halved.
         two_sided: 1 where facets are touched from both sides, as those of shells are, 0 where from outside.
 
@@ -142,6 +156,9 @@ class NodeOnFacets(DiscreteGap):
 
     facets: Any = eqx.field(kw_only=True, metadata=is_a(Numbers((None, 4))))
     open: Any = eqx.field(default=1.0, kw_only=True, metadata=is_a(Number() | Numbers((None, 4))))
+    beyond: Any = eqx.field(
+        default=0.0, kw_only=True, metadata=is_a(Number("not negative") | Numbers((None, 4)))
+    )
     thickness: Any = eqx.field(default=0.0, kw_only=True, metadata=is_a(Number("not negative")))
     two_sided: Any = eqx.field(default=0.0, kw_only=True, metadata=is_a(Number("not negative")))
 
@@ -170,6 +187,22 @@ class NodeOnFacets(DiscreteGap):
         behind = (at.height < 0) & ~both & (at.edge >= 0) & ~ends[best, at.edge]
         aside = jnp.where(at.edge < 0, heights[best], jnp.where(behind, -1.0, 1.0) * safe_norm(at.apart))
         return (jnp.sum(shares * heights) + rest * aside) / (jnp.sum(shares) + rest), facets[best]
+
+    def uncovered(self, place: Array, rows: Float[Array, "k 4 3"]) -> dict[str, Array]:
+        """Whether the node is beside its facets, where the surface goes on, and not in front of it."""
+        x = place_markers(place, rows)
+        facets = jnp.asarray(self.facets).astype(int)
+        every = jax.vmap(nearest_point, in_axes=(None, 0))(x[0], x[facets])
+        squares = dot(every.apart, every.apart)
+        best = jnp.argmin(squares)
+        apart = x[0] - jax.vmap(nearest_on_edges, in_axes=(None, 0))(x[0], x[facets]) @ x[facets]
+        to_edges = dot(apart, apart)
+        beyond = jnp.broadcast_to(jnp.asarray(self.beyond), to_edges.shape)
+        beside = jnp.any((to_edges <= squares[best] * (1 + 1e-9)) & (to_edges < beyond**2))
+        both = jnp.asarray(self.two_sided) > 0
+        height = every.height[best]
+        reached = jnp.where(both, jnp.abs(height), height) < self.thickness
+        return {LEFT: beside & reached}
 
 
 def _share(at: Nearest, ends: Float[Array, "4"]) -> Float[Array, ""]:
