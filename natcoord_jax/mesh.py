@@ -10,7 +10,7 @@ from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.cells import CELLS, met_once
 from natcoord_jax.core.checks import is_concrete
 from natcoord_jax.core.kinds import Choice, Several, of
-from natcoord_jax.core.lattice import ELEMENTS, cells_of_box
+from natcoord_jax.core.lattice import ELEMENTS, cells_of_box, divisions
 from natcoord_jax.core.numeric import Number, Numbers, Whole
 from natcoord_jax.maths.places import places
 
@@ -171,10 +171,6 @@ def cleaned(
     return Mesh(place[kept], number[found], named, {k: renumbered(x) for k, x in (faces or {}).items()})
 
 
-def _lines(size: Any, counts: Any) -> list[np.ndarray]:
-    return [np.linspace(0.0, float(length), int(count) + 1) for length, count in zip(size, counts)]
-
-
 @checked("mesh.rectangle", size=Numbers((2,), sign="positive"), counts=Several(Whole(1), 2, 2))
 def rectangle(size: Any, counts: tuple[int, int]) -> Mesh:
     """A rectangle in the plane z = 0, from the origin along x and y.
@@ -192,7 +188,7 @@ def rectangle(size: Any, counts: tuple[int, int]) -> Mesh:
         >>> nc.mesh.rectangle((1.0, 0.5), (16, 8))
         <mesh: 153 nodes, 128 quadrilaterals; bottom, left, right, top>
     """
-    x, y = _lines(size, counts)
+    x, y = divisions(size, counts)
     nodes = np.stack([*np.meshgrid(x, y, indexing="ij"), np.zeros((len(x), len(y)))], axis=-1)
     number = np.arange(nodes[..., 0].size).reshape(nodes.shape[:2])
     corners = number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]
@@ -224,7 +220,7 @@ def box(size: Any, counts: tuple[int, int, int], element: str = "hexahedron8") -
         <mesh: 45 nodes, 16 hexahedra; x0, x1, y0, y1, z0, z1>
     """
     points, cells = cells_of_box(counts, element)
-    lines = _lines(size, [n - 1 for n in points])
+    lines = divisions(size, [n - 1 for n in points])
     nodes = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, 3)
     kept, cells = np.unique(cells, return_inverse=True)
     nodes, cells = nodes[kept], cells.reshape(-1, CELLS[ELEMENTS[element]].nodes.shape[0])

@@ -1,6 +1,7 @@
 """Cells of a box on a lattice of points."""
 
 from itertools import permutations
+from typing import Any
 
 import numpy as np
 from jaxtyping import Int
@@ -37,3 +38,8 @@ def cells_of_box(counts: tuple[int, int, int], element: str) -> tuple[tuple[int,
     corners = order * np.stack(np.meshgrid(*map(np.arange, counts), indexing="ij"), axis=-1).reshape(-1, 1, 3)
     places = corners[:, :, None] + own
     return size, np.ravel_multi_index(np.moveaxis(places, -1, 0), size).reshape(-1, own.shape[1])
+
+
+def divisions(size: Any, counts: Any) -> list[np.ndarray]:
+    """Places along each axis of a lattice with so many cells."""
+    return [np.linspace(0.0, float(length), int(count) + 1) for length, count in zip(size, counts)]
