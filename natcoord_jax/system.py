@@ -1,4 +1,4 @@
-"""The compiled system: arrays as leaves, structure static and hashable."""
+"""The compiled system: what can be asked of a model."""
 
 from collections.abc import Sequence
 from typing import Any
