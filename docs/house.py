@@ -43,7 +43,7 @@ def main() -> None:
     axes.set(xlim=(-900, 16000), xlabel="lines; a floor imports from those below it only", yticks=[])
     axes.spines[["top", "right", "left"]].set_visible(False)
     axes.set_xticks(range(0, 8001, 2000))
-    figure.savefig(ROOT / "docs" / "house.svg", metadata={"Date": None})
+    figure.savefig(ROOT / "docs" / "house.svg", metadata={"Date": None, "Creator": None})
 
 
 if __name__ == "__main__":
