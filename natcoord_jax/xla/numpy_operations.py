@@ -215,6 +215,7 @@ OPERATIONS: dict[str, Callable[..., Any]] = {
             "ge": np.greater_equal,
             "copy": np.array,
             "copy_p": np.array,
+            "stop_gradient": np.array,
             "clamp": lambda low, x, high: np.minimum(np.maximum(x, low), high),
         }.items()
     },
