@@ -1,5 +1,7 @@
 """Contact of surfaces of shells and solids, and of beams: conservation, contract of a gap, wrong input."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -97,6 +99,18 @@ def test_a_node_that_leaves_its_facets_is_seen(at, two_sided, left):
     rows[:, 0] = np.concatenate([[at], corners])
     (seen,) = contact.uncovered(jnp.asarray(np.eye(4)[np.zeros(7, int)]), jnp.asarray(rows)).values()
     assert bool(seen) == left
+
+
+@pytest.mark.parametrize("aside", [0.3, 2.0, 30.0])
+def test_a_node_beside_its_facets_is_not_behind_them(aside):
+    """Far away it crosses their plane, and nothing happens: the gap has no jump there."""
+    beyond = np.zeros((2, 4))
+    beyond[1, 1] = 2.0
+    ends = np.array([(1, 0, 1, 1), (1, 0, 1, 0)])
+    contact = dataclasses.replace(node_on_two_facets(beyond=beyond), open=ends)
+    corners = np.concatenate([SQUARE, SQUARE[1:3] + (1.0, 0.0, 0.0)])
+    above, below = (contact.gap(jnp.asarray([(2.0 + aside, 0.5, z), *corners])) for z in (1e-6, -1e-6))
+    assert abs(above - aside) < 1e-9 and abs(below - aside) < 1e-9
 
 
 @pytest.mark.slow

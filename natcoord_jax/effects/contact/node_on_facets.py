@@ -184,7 +184,9 @@ class NodeOnFacets(DiscreteGap):
         shares = jax.vmap(_share)(every, ends) * _level(every)
         rest = jnp.maximum(1.0 - jnp.sum(shares), 0.0)
         heights = jnp.where(both, jnp.abs(every.height), every.height)
-        behind = (at.height < 0) & ~both & (at.edge >= 0) & ~ends[best, at.edge]
+        # Beside all of its facets a node is not behind them, wherever the surface goes on: see `uncovered`.
+        beside = ends | (jnp.broadcast_to(jnp.asarray(self.beyond), facets.shape) > 0)
+        behind = (at.height < 0) & ~both & (at.edge >= 0) & ~beside[best, at.edge]
         aside = jnp.where(at.edge < 0, heights[best], jnp.where(behind, -1.0, 1.0) * safe_norm(at.apart))
         return (jnp.sum(shares * heights) + rest * aside) / (jnp.sum(shares) + rest), facets[best]
 
