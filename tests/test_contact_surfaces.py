@@ -113,6 +113,21 @@ def test_a_node_beside_its_facets_is_not_behind_them(aside):
     assert abs(above - aside) < 1e-9 and abs(below - aside) < 1e-9
 
 
+def test_a_node_far_from_warped_facets():
+    """It is as far as their nearest edge, before and behind their planes, however they are warped."""
+    random = np.random.default_rng(3)
+    facets = node_on_two_facets()
+    contact = jax.jit(lambda x: facets.gap(x))
+    for _ in range(50):
+        direction = random.normal(size=3) * (1.0, 1.0, 0.3)
+        at = 50.0 * direction / np.linalg.norm(direction)
+        x = places(random, at)
+        line = np.linspace(0.0, 1.0, 201)[:, None]
+        every = [(1 - line) * x[a] + line * x[b] for f in FACETS for a, b in zip(f, (*f[1:], f[0]))]
+        nearest = np.linalg.norm(np.concatenate(every) - at, axis=1).min()
+        assert abs(contact(x) - nearest) < 0.02
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("sideways", [0.0, 3.0])
 def test_a_run_warns_of_a_node_that_leaves_its_facets(sideways, recwarn):

@@ -105,7 +105,10 @@ def nearest_point(point: Float[Array, "3"], corners: Float[Array, "4 3"]) -> Nea
         natural = jax.lax.stop_gradient(natural) if k == ITERATIONS - 2 else natural
         one, two = _slopes(natural, corners)
         apart = point - shapes(natural) @ corners
-        a, b, c = dot(one, one), dot(one, two) - dot(apart, warp), dot(two, two)
+        a, flat, c = dot(one, one), dot(one, two), dot(two, two)
+        b = flat - dot(apart, warp)
+        # Where the node is farther than the facet is curved, the second derivatives lead away.
+        b = jnp.where(a * c - b * b > 1e-6 * a * c, b, flat)
         volume = a * c - b * b
         regular = volume > 1e-6 * a * c
         volume = jnp.where(regular, volume, 1.0)
