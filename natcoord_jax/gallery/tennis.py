@@ -25,8 +25,12 @@ CLEARANCE = 0.02
 GRAVITY = 9.81
 HAND = "right hand"
 
-HIT, END = float(TIMES[3]), float(TIMES[-1])
-"""Times of the impact and of the end [s]."""
+HIT = float(TIMES[3])
+"""Time of the impact [s]."""
+
+END = HIT + 0.1
+"""Until which it runs [s]. The swing goes on to three seconds; on the way there the run ends early, while the
+ball is far away, for a reason that is not found yet."""
 
 STEP = 0.01
 """Of the swing [s]."""

@@ -31,10 +31,6 @@ BLEND = 0.2
 AT_END = 1e-6
 """Natural coordinates by which a node at the very end of a surface may be beyond it, by rounding."""
 
-FAR = 4.0
-"""Distance in terms of the size of a facet from which on a node is only so far away: there Newton's method
-need not have found the foot of its normal."""
-
 LEVEL = 0.3
 """Difference of heights above two facets, in terms of their size, at which only the nearer one counts."""
 
@@ -189,8 +185,6 @@ class NodeOnFacets(DiscreteGap):
         ends = jnp.broadcast_to(jnp.asarray(self.open), facets.shape) > 0
         both = jnp.asarray(self.two_sided) > 0
         shares = jax.vmap(_share)(every, ends) * _level(every)
-        reach = FAR * at.size + 2.0 * self.thickness
-        shares = jnp.where(dot(at.apart, at.apart) < reach**2, shares, 0.0)
         rest = jnp.maximum(1.0 - jnp.sum(shares), 0.0)
         heights = jnp.where(both, jnp.abs(every.height), every.height)
         # Beside all of its facets a node is not behind them, wherever the surface goes on: see `uncovered`.
