@@ -113,6 +113,13 @@ def test_a_node_beside_its_facets_is_not_behind_them(aside):
     assert abs(above - aside) < 1e-9 and abs(below - aside) < 1e-9
 
 
+def test_a_node_at_the_very_end_counts():
+    """Rounding puts one that is level with the end of a surface beyond it, where it would go through."""
+    corners = np.concatenate([SQUARE, SQUARE[1:3] + (1.0, 0.0, 0.0)])
+    gaps = [node_on_two_facets().gap(jnp.asarray([(x, 0.5, -0.01), *corners])) for x in (2 + 1e-12, 2 + 1e-3)]
+    np.testing.assert_allclose(gaps, [-0.01, np.hypot(1e-3, 0.01)], rtol=1e-9)
+
+
 def test_a_node_far_from_warped_facets():
     """It is as far as their nearest edge, before and behind their planes, however they are warped."""
     random = np.random.default_rng(3)
