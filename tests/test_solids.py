@@ -368,8 +368,7 @@ THICK = [
     ("cylinder", "Hexahedron8", SOFT, 0.15, 2.0),
     ("cylinder", "Hexahedron20", SOFT, 0.15, 3.0),
     ("cylinder", "Tetrahedron10", SOFT, 0.15, 3.0),
-    # Volumes that are constant in each allow an order of two in the limit: 1.87 is seen here.
-    ("cylinder", "Tetrahedron10P0", RUBBER, 0.1, 1.9),
+    ("cylinder", "Tetrahedron10P0", RUBBER, 0.1, 2.0),
     ("sphere", "Hexahedron8", SOFT, 0.15, 2.0),
 ]
 THICK_OF_27_NODES = [
@@ -381,7 +380,9 @@ THICK_OF_27_NODES = [
 
 def check_order(shape, element, law, pressure, order):
     """Against the exact solution, with large strains: errors fall as theory says, or faster."""
-    coarse, fine = (widened(shape, law, element, n, pressure) for n in (2, 4))
+    # Volumes that are constant in each element allow two only, and finer meshes to see it: 1.87, then 1.98.
+    counts = (4, 8) if element == "Tetrahedron10P0" else (2, 4)
+    coarse, fine = (widened(shape, law, element, n, pressure) for n in counts)
     assert np.log2(coarse / fine) >= order - tol.ORDER_TOLERANCE
     assert fine <= tol.THICK_WALL[order]
 
