@@ -10,11 +10,11 @@ import pytest
 import tolerances as tol
 from accounts import account, rows
 from differences import alternation
-from natcoord_jax.model.rows import rows_with_ground
 from scenes import JOINTS, pair, with_multipliers
 
 import natcoord_jax as nc
 from natcoord_jax.mechanics.coordinates import coordinate_values
+from natcoord_jax.model.rows import rows_with_ground
 
 STEPS, DT = 1000, 0.02
 FORMS = ("tree", "multipliers")

@@ -8,12 +8,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from natcoord_jax.model.rows import rows_with_ground
 
 import natcoord_jax as nc
 from natcoord_jax.core.joint import frames_at
 from natcoord_jax.mechanics.coordinates import coordinate_values
 from natcoord_jax.mechanics.equations_of_motion import loads
+from natcoord_jax.model.rows import rows_with_ground
 
 ROUND_OFF = 1e-13
 EQUATIONS = 1e-9  # accelerations and reactions relative to their size: one dense solve

@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from natcoord_jax.model.rows import row_rates
 
 import natcoord_jax as nc
 from natcoord_jax import gallery
@@ -20,6 +19,7 @@ from natcoord_jax.mechanics.equations_of_motion import constraint_matrix
 from natcoord_jax.mechanics.momentum import inertia, spatial_inertia, wrench
 from natcoord_jax.mechanics.reduced import NOTHING, ReducedStep, at_rest
 from natcoord_jax.mechanics.tangent_space import TangentSpace
+from natcoord_jax.model.rows import row_rates
 
 
 def driven_four_bar():
