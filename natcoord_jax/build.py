@@ -25,7 +25,7 @@ from natcoord_jax.model.graph import make_tree
 from natcoord_jax.model.grouping import element_group, stack
 from natcoord_jax.model.layout import Layout
 from natcoord_jax.model.local_rates import LocalRates
-from natcoord_jax.model.masses import with_masses
+from natcoord_jax.model.masses import mass_of
 from natcoord_jax.model.model import Structure
 from natcoord_jax.model.rows import rows_with_ground
 from natcoord_jax.system import System
@@ -54,6 +54,8 @@ def build(
     multipliers += sum(g.count * g.multipliers for g in joint_groups if not g.in_tree)
     inequalities = sum(g.count * g.multipliers for g in groups if g.effect.unilateral)
     internal = sum(kind.constraints for kind in bodies.kinds)
+    masses, between = mass_of(layout.masses(), groups, turning[:-1])
+    coupled = between is not None
     structure = Structure(
         bodies=layout.ordered_names,
         joints=layout.ordered_joints,
@@ -63,7 +65,7 @@ def build(
         rotors=len(layout.rotors),
         unknowns=len(tree.slot_of),
         multipliers=multipliers,
-        solver=solver or choose_solver(tree, multipliers, joint_groups, groups, len(bodies)),
+        solver=solver or choose_solver(tree, multipliers, joint_groups, groups, len(bodies), coupled),
         constraints=internal + relations - inequalities + sum(g.count * g.multipliers for g in joint_groups),
         points=compact([k for k, own in enumerate(layout.kinds) if own == POINT]),
         directors=compact([k for k, own in enumerate(layout.kinds) if own == DIRECTOR]),
@@ -71,9 +73,6 @@ def build(
         dofs=len(tree.slot_of) - multipliers + inequalities,
         shapes=tuple(_drawn(bodies.shapes[k]) for k in layout.order),
     )
-    masses = layout.masses()
-    for group in groups:
-        masses = with_masses(masses, group)
     system = System(
         masses,
         layout.frames(),
@@ -84,8 +83,9 @@ def build(
         groups,
         layout.coordinate_groups(),
         layout.coordinate_order(),
-        elimination_order(layout, groups, joint_groups) if structure.solver == "recursive" else None,
+        elimination_order(layout, groups, joint_groups, coupled) if structure.solver == "recursive" else None,
         structure,
+        mass_between=between,
     )
     state = replace_fields(layout.state(), contacts=untouched(system))
     system = with_mobilities(jax.tree.map(as_array, with_symmetries(system, state)), state)

@@ -73,10 +73,12 @@ GAP = lambda markers: {  # noqa: E731
     "speed": NUMBER,
 }  # fmt: skip
 GAS = dict.fromkeys(("gauge_pressure", "ambient", "exponent", "volume"), [1.0])
+PAIRED = [np.ones((2, 4, 2, 4))]
+MASS = ["lumped", "consistent"]
 METAL, SQUARE = [nc.Elastic(E=1.0)], np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0.0)])
 LAYER = {
     "thickness": [1.0], "material": METAL, "direction": [np.array((1.0, 0, 0))], "offset": [1.0],
-    "prestress": [np.ones(3)], "damping": [1.0],
+    "prestress": [np.ones(3)], "damping": [1.0], "mass": MASS,
 }  # fmt: skip
 MEMBRANE = ["hybrid", "hybrid mitc4+"]
 RUBBER = [nc.NeoHooke(E=1.0, nu=0.4)]
@@ -132,7 +134,7 @@ CALLS = {
     "Beam": lambda w: {
         "section": [w.section], "curve": [np.eye(3), f], "elements": WHOLE, "length": NUMBER, "second": V,
         "twist": [0.1, f], "start": [w.body], "end": [w.body], "stations": [(0.5,)],
-        "damping": NUMBER, "law": [f],
+        "damping": NUMBER, "law": [f], "mass": MASS,
         "interpolation": [nc.RelativeMotion()], "velocity": V, "angular_velocity": V, "name": NAME,
     },
     "LineLoad": lambda w: {
@@ -176,11 +178,13 @@ CALLS = {
     "Fold": lambda w: {
         "one": [w.nodes], "other": [w.nodes], "velocity": V, "angular_velocity": V, "name": NAME
     },
-    "Brick": lambda w: {**MARKED(w.ends * 4), "material": METAL, "reference": [np.ones((8, 3))]},
+    "Brick": lambda w: {
+        **MARKED(w.ends * 4), "material": METAL, "mass": MASS, "reference": [np.ones((8, 3))]
+    },
     **{
         name: lambda w, count=count: {
             **MARKED((w.ends * 14)[:count]), "material": METAL,
-            "reference": [np.ones((count, 3))],
+            "reference": [np.ones((count, 3))], "mass": MASS,
         }
         for name, count in (
             ("Hexahedron8", 8), ("Hexahedron20", 20), ("Hexahedron27", 27), ("Tetrahedron10", 10),
@@ -188,7 +192,8 @@ CALLS = {
     },
     **{
         name: lambda w, count=count: {
-            **MARKED((w.ends * 14)[:count]), "material": RUBBER, "reference": [np.ones((count, 3))]
+            **MARKED((w.ends * 14)[:count]), "material": RUBBER, "reference": [np.ones((count, 3))],
+            "mass": MASS,
         }
         for name, count in (("Hexahedron27P1", 27), ("Tetrahedron10P0", 10))
     },
@@ -261,7 +266,8 @@ CALLS = {
     "Tie": lambda w: {"one": [w.shell.face()], "other": [w.shell.face()], "name": NAME},
     "Scene.move_nodes": lambda w: {"nodes": [w.nodes], "positions": PLACES},
     "Solid": lambda w: {
-        "mesh": [nc.mesh.box((1.0, 1.0, 1.0), (1, 1, 1))], "element": [None, "Hexahedron8"], **PLACED
+        "mesh": [nc.mesh.box((1.0, 1.0, 1.0), (1, 1, 1))], "element": [None, "Hexahedron8"], "mass": MASS,
+        **PLACED,
     },
     "mesh.rectangle": lambda w: {"size": [(1.0, 1.0)], "counts": [(2, 2)]},
     "mesh.box": lambda w: {"size": V, "counts": [(2, 2, 2)], "element": ["hexahedron8"]},
@@ -312,14 +318,17 @@ CALLS = {
     "BodyTorqueInput": lambda w: MARKED(w.triad),
     "BodyForceInput": lambda w: MARKED((w.point, w.direction)),
     "BeamElement": lambda w: {
-        **MARKED(w.attached), "length": NUMBER, "stiffness": MATRIX, "reference": [np.ones(6)]
+        **MARKED(w.attached), "length": NUMBER, "stiffness": MATRIX, "reference": [np.ones(6)],
+        "inertia": PAIRED,
     },
     "NonlinearBeamElement": lambda w: {
-        **MARKED(w.attached), "length": NUMBER, "stiffness": MATRIX, "reference": [np.ones(6)], "law": [f]
+        **MARKED(w.attached), "length": NUMBER, "stiffness": MATRIX, "reference": [np.ones(6)], "law": [f],
+        "inertia": PAIRED,
     },
     "BeamDamping": lambda w: {**MARKED(w.attached), "length": NUMBER, "viscosity": MATRIX},
     "DirectorElement": lambda w: {
-        **MARKED(w.attached), **SHAPES, "stiffness": MATRIX, "reference": [np.ones((2, 6))]
+        **MARKED(w.attached), **SHAPES, "stiffness": MATRIX, "reference": [np.ones((2, 6))],
+        "inertia": PAIRED,
     },
     "DirectorDamping": lambda w: {**MARKED(w.attached), **SHAPES, "viscosity": MATRIX},
     # runs and analysis

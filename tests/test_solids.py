@@ -448,7 +448,7 @@ class Pulse(nc.Force):
         return Load(jnp.maximum(jnp.minimum(t, 1.0 - t), 0.0) * self.force[None], None)
 
 
-def l_shape(element, law):
+def l_shape(element, law, mass="lumped"):
     """A block like an L of four elements, pushed on two end faces, then free (case V04 of the references)."""
     cells = [nc.mesh.box(size, count, element=ELEMENTS[element])
              for size, count in (((6.0, 3.0, 3.0), (2, 1, 1)), ((3.0, 7.0, 3.0), (1, 2, 1)))]  # fmt: skip
@@ -460,7 +460,7 @@ def l_shape(element, law):
         faces = mesh.outside[np.all(x[mesh.outside, axis] == place, axis=1)]
         forces += consistent(x, faces, sign * traction)
     scene = nc.Scene()
-    part = scene.add(nc.Solid(mesh, material=law, element=element))
+    part = scene.add(nc.Solid(mesh, material=law, element=element, mass=mass))
     loaded = np.flatnonzero(np.any(forces, axis=1))
     scene.add(Pulse.on(part.nodes, loaded[:, None], each={"force": forces[loaded]}))
     return scene.compile()

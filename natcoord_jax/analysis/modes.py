@@ -89,7 +89,7 @@ class _Steady(eqx.Module):
             spin[:, None], cross(spin[:, None], rows[:, 1:])
         )
         accelerations = jnp.concatenate([gain[:, None], directors], axis=1)
-        impulses = inertia(self.system.mass, accelerations)
+        impulses = inertia(self.system, accelerations)
         inertial = wrench(impulses[None], rows[None, :, 1:])
         applied = loads(self.system, state, self.inputs, velocity, spin)
         pulled = static.constraint_loads(state, y)
@@ -114,7 +114,7 @@ class _Steady(eqx.Module):
         rows = self.state.q.reshape(-1, 4, 3)
 
         def inertial(gains: Array) -> Array:
-            impulses = inertia(self.system.mass, row_rates(rows, *self._apart(gains)))
+            impulses = inertia(self.system, row_rates(rows, *self._apart(gains)))
             parts = [x[0] for x in wrench(impulses[None], rows[None, :, 1:])]
             return self._balances(parts)
 

@@ -152,7 +152,9 @@ class Static(eqx.Module):
         which moves by half the displacement. With a `weight` [1/s^2] that times the inertia is added to them
         (four times, to be exact), as of a short step.
         """
-        system = replace_fields(self.system, mass=(NO_MASS + weight) * self.system.mass)
+        scale, between = NO_MASS + weight, self.system.mass_between
+        between = None if between is None else between.times(scale)
+        system = replace_fields(self.system, mass=scale * self.system.mass, mass_between=between)
         here = self.displaced(jnp.zeros_like(y))
         step = FullStep.prepare(
             system, here, self.inputs, jnp.ones((), y.dtype), gauss(1), StartCache(None, None)
@@ -170,7 +172,9 @@ class Static(eqx.Module):
     def _widths(self) -> list[int]:
         """Components of twists among the unknowns of each element; multipliers follow them."""
         groups = (g for g in (*self.system.effects, *self.system.joints) if touches(g))
-        return [TWIST, *(rates_of(g) * bodies_of_elements(g).shape[1] for g in groups)]
+        between = self.system.mass_between
+        coupled = [] if between is None else [2 * between.rates]
+        return [TWIST, *coupled, *(rates_of(g) * bodies_of_elements(g).shape[1] for g in groups)]
 
     def solver(self, y: Float[Array, " unknowns"], weight: Array | float = 0.0) -> Any:
         """What solves equations with the Jacobian at displacements zero, slightly regularised.

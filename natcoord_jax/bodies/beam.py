@@ -21,6 +21,7 @@ from natcoord_jax.core.kinds import BODY, NAME, FunctionOf, of
 from natcoord_jax.core.markers import Attachment
 from natcoord_jax.core.numeric import COMPONENTS, Directions, Number, Numbers, Vector, Whole
 from natcoord_jax.core.recipe import Builder, Recipe, pose_of
+from natcoord_jax.effects.materials import MASS
 
 SECTION = of("nc.CircularSection(...), nc.Section.of_numbers(...) or another section", Section)
 CURVE = Numbers((None, 3)) | FunctionOf("of arc length [m] to the position, together with length=")
@@ -85,8 +86,8 @@ class BeamHandle:
 class Beam(Recipe):
     """Geometrically exact beam (Simo-Reissner) along a curve, unstressed as it is given.
 
-    Mass is lumped at the nodes: by default the inertia of n equal elements about an end is too large by the
-    factor 1 + 1 / (2 n^2), see `RelativeMotion`.
+    With mass lumped at the nodes the inertia of n equal elements about an end is by default too large by the
+    factor 1 + 1 / (2 n^2), see `RelativeMotion`; with a consistent mass that of a straight beam is exact.
 
     Attributes:
         section: `Section`, d_1 and d_2 across, d_3 along the tangent.
@@ -99,6 +100,8 @@ class Beam(Recipe):
         start: handle of a body, or `ground`, that the first node is rigidly part of; None: a node of its own.
         end: the same of the last node.
         stations: fractions of the length at which nodes are wanted, to attach something to.
+        mass: "lumped" at the nodes; or "consistent": that of the motion interpolated between them, linearly
+            for `RelativeMotion`, which couples the accelerations of neighbours.
         damping: time t [s] of internal damping C_v = t C (Kelvin-Voigt); None: none.
         law: energy per length [J/m] as a function of the strains (6,), on top of the section's; None: none.
         interpolation: of which elements it is made; default `RelativeMotion()`, else
@@ -129,6 +132,7 @@ class Beam(Recipe):
     end: Any = eqx.field(default=None, kw_only=True, metadata=is_a(BODY))
     stations: Sequence[float] = eqx.field(default=(), kw_only=True, metadata=is_a(Vector(None)))
     damping: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Number("not negative")))
+    mass: str = eqx.field(default="lumped", kw_only=True, static=True, metadata=is_a(MASS))
     law: Any = eqx.field(default=None, kw_only=True, metadata=is_a(LAW))
     interpolation: Interpolation = eqx.field(
         default=RelativeMotion(), kw_only=True, metadata=is_a(INTERPOLATION)
@@ -154,7 +158,7 @@ class Beam(Recipe):
         nodes = self._nodes(scene, curve, lumps, name, label)
         places = zip(nodes, apart(curve.points, len(nodes)), apart(curve.frames, len(nodes)))
         attachments = [Attachment(*place) for place in places]
-        material = Material(self.section, self.law, self._damping(label))
+        material = Material(self.section, self.law, self._damping(label), self.mass)
         elements, others = self.interpolation.effects(material, attachments, curve, spans, name)
         handles = tuple(scene.add(element) for element in elements)
         for effect in others:
@@ -176,6 +180,8 @@ class Beam(Recipe):
         count = len(lumps)
         spin = numbers(self.angular_velocity, (3,), f"{label}: angular_velocity", "rad/s")
         drift = numbers(self.velocity, (3,), f"{label}: velocity", "m/s")
+        if self.mass == "consistent":
+            lumps = jnp.zeros_like(lumps)
         blocks, velocities = _lumps_and_velocities(self.section, lumps, curve.points, drift, spin)
         columns = (blocks, curve.points, curve.frames, velocities)
         held = {0: self.start, count - 1: self.end}

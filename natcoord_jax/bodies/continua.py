@@ -19,7 +19,7 @@ from natcoord_jax.core.nodes import NodeSet
 from natcoord_jax.core.numeric import COMPONENTS, Directions, Number, Numbers
 from natcoord_jax.core.recipe import Builder, Recipe
 from natcoord_jax.effects.hyperelastic import Hyperelastic
-from natcoord_jax.effects.materials import Elastic
+from natcoord_jax.effects.materials import MASS, Elastic
 from natcoord_jax.effects.shells import MembraneElement, MembraneTriangle, ShellElement, ShellTriangle
 from natcoord_jax.effects.shells.layer import MATERIAL as LAYER
 from natcoord_jax.effects.shells.quadrilateral import MEMBRANES
@@ -182,6 +182,7 @@ class _Continuum(Recipe):
     orientation: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Orientation()))
     velocity: Any = eqx.field(default=(0.0, 0.0, 0.0), kw_only=True, metadata=is_a(MOVING))
     angular_velocity: Any = eqx.field(default=(0.0, 0.0, 0.0), kw_only=True, metadata=is_a(COMPONENTS))
+    mass: str = eqx.field(default="lumped", kw_only=True, static=True, metadata=is_a(MASS))
     name: str | None = eqx.field(default=None, kw_only=True, static=True, metadata=is_a(NAME))
 
     corners: ClassVar[tuple[int, ...]] = ()
@@ -223,6 +224,8 @@ class Shell(_Continuum):
         orientation: of the mesh: a rotation matrix, a quaternion (w, x, y, z) or a pair (axis, angle [rad]).
         velocity: of the origin of the mesh (3,), or of every node besides its rotation (n, 3) [m/s].
         angular_velocity: as of a rigid body [rad/s].
+        mass: "lumped" at the nodes; or "consistent": that of the motion that the elements interpolate, which
+            has the exact moments of inertia and couples the accelerations of neighbours.
         directors: at the nodes (n, 3), in the axes of the mesh [-]; default: mean normals of the cells.
         direction: in the axes of the mesh, that, projected on the surface, is the first axis of the material
             and of what is read [-]; default: in every element half way between its sides.
@@ -285,7 +288,10 @@ class Shell(_Continuum):
         own: dict[str, Any] = {"each": {"thickness": thick}} if thick.ndim else {"thickness": thick}
         if self.direction is not None:
             own["direction"] = _turned(as_array(self.direction, float)[None], turned)[0]
-        own |= {key: getattr(self, key) for key in ("material", "offset", "prestress", "damping", "membrane")}
+        own |= {
+            key: getattr(self, key)
+            for key in ("material", "offset", "prestress", "damping", "membrane", "mass")
+        }
         cells = self.mesh.cells
         each = as_array(np.broadcast_to(thick, (len(cells),))) if is_concrete(thick) else thick
         three = cells[:, 2] == cells[:, 3]
@@ -333,6 +339,7 @@ class Solid(_Continuum):
         orientation: of the mesh: a rotation matrix, a quaternion (w, x, y, z) or a pair (axis, angle [rad]).
         velocity: of the origin of the mesh (3,), or of every node besides its rotation (n, 3) [m/s].
         angular_velocity: as of a rigid body [rad/s].
+        mass: "lumped" or "consistent", see `nc.Shell`.
         name: of the elements; the nodes are called "name nodes".
 
     Example:
@@ -382,4 +389,6 @@ class Solid(_Continuum):
         places, velocities, turned, _ = self._pose(name)
         element, material = self._element(name), self.material.turned(turned)
         nodes = scene.add(Nodes.points(places, velocity=velocities, name=f"{name} nodes"))
-        return self._handle(scene, nodes, element.on(nodes, self.mesh.cells, material=material, name=name))
+        return self._handle(
+            scene, nodes, element.on(nodes, self.mesh.cells, material=material, mass=self.mass, name=name)
+        )

@@ -32,6 +32,9 @@ from natcoord_jax.maths.lagrange import LOBATTO, gauss_legendre, lagrange, lobat
 HALF_TURN = -0.99
 """Cosine of the turn over an element below which it is half a turn, nearly: 172 degrees."""
 
+LINEAR = np.array([[2.0, 1.0], [1.0, 2.0]]) / 6.0
+"""Integrals of the products of two linear shape functions over a unit of length."""
+
 COILED = 0.2
 """Distance of the ends of an element over its length below which it is a coil; half a circle has 0.64."""
 
@@ -46,11 +49,31 @@ class Material(eqx.Module):
         section: stiffness and inertia.
         law: energy per length of the strains, on top of the linear one, or None.
         damping: time [s] that makes the viscosity from the stiffness, or None for no damping at all.
+        mass: "lumped", which the nodes have, or "consistent", which the elements bring.
     """
 
     section: Section
     law: Any
     damping: Any
+    mass: str = eqx.field(static=True)
+
+    def inertias(
+        self, lengths: Float[Array, " e"], overlaps: Float[np.ndarray, "k k"]
+    ) -> Float[Array, "e k 4 k 4"] | None:
+        """Consistent masses of elements of so many lengths [m]; None: masses are lumped.
+
+        Args:
+            lengths: of the elements.
+            overlaps: integrals of the products of the shape functions over a unit of length.
+        """
+        return _inertias(self.section, lengths, overlaps) if self.mass == "consistent" else None
+
+
+@eager_numpy
+def _inertias(section: Section, lengths: Array, overlaps: Any) -> Float[Array, "e k 4 k 4"]:
+    return (
+        lengths[:, None, None, None, None] * overlaps[:, None, :, None] * section.lump(jnp.ones(()))[:, None]
+    )
 
 
 class Interpolation(Part):
@@ -82,7 +105,9 @@ def frames_of(curve: ReferenceCurve) -> Float[Array, "n 4 3"]:
 
 
 def apart(stacked: Any, count: int) -> list[Any]:
-    """Items of a stacked array; concrete ones without compiled calls."""
+    """Items of a stacked array, or nothing of each; concrete ones without compiled calls."""
+    if stacked is None:
+        return [None] * count
     if is_concrete(stacked):
         return [as_array(x) for x in np.asarray(stacked)]
     return [stacked[i] for i in range(count)]
@@ -117,14 +142,16 @@ class RelativeMotion(Interpolation):
         lengths, references = _strains_of_pairs(curve)
         _check_turns(curve, name)
         stiffness, elements, dampings = material.section.stiffness, [], []
-        rows = zip(spans, apart(lengths, len(spans)), apart(references, len(spans)))
-        for number, ((a, b), length, reference) in enumerate(rows):
+        inertias = material.inertias(lengths, LINEAR)
+        rows = zip(spans, *(apart(x, len(spans)) for x in (lengths, references, inertias)))
+        for number, ((a, b), length, reference, inertia) in enumerate(rows):
             given = {
                 "markers": (nodes[a], nodes[b]),
                 "name": f"{name}/element {number}",
                 "length": length,
                 "stiffness": stiffness,
                 "reference": reference,
+                "inertia": inertia,
             }
             made = (
                 BeamElement(**given)
@@ -175,6 +202,13 @@ def _check_turns(curve: ReferenceCurve, name: str) -> None:
 def _shares(arc: Float[Array, " n"], order: int, spans: Any) -> Float[Array, " n"]:
     shares = jnp.diff(arc[::order])[:, None] * jnp.asarray(lobatto(order)[1])
     return jnp.zeros_like(arc).at[spans].add(shares)
+
+
+def _overlaps(order: int) -> Float[np.ndarray, "k k"]:
+    """Integrals of the products of the Lagrange functions over a unit of length."""
+    points, shares = gauss_legendre(order + 1)
+    values = lagrange(lobatto(order)[0], points)[0]
+    return (values.T * shares) @ values
 
 
 @eager_numpy
@@ -243,12 +277,13 @@ class DirectorInterpolation(Interpolation):
             raise ValueError(f"beam {name!r}: law= needs interpolation=nc.RelativeMotion()")
         values, slopes, weights, references = _interpolated(curve, self.order, np.array(spans))
         stiffness, elements, dampings = material.section.stiffness, [], []
-        rows = zip(spans, *(apart(x, len(spans)) for x in (slopes, weights, references)))
-        for number, (span, slope, weight, reference) in enumerate(rows):
+        inertias = material.inertias(jnp.sum(weights, axis=1), _overlaps(self.order))
+        rows = zip(spans, *(apart(x, len(spans)) for x in (slopes, weights, references, inertias)))
+        for number, (span, slope, weight, reference, inertia) in enumerate(rows):
             markers = tuple(nodes[i] for i in span)
             shape = {"values": values, "slopes": slope, "weights": weight}
             made = {"name": f"{name}/element {number}", "stiffness": stiffness, "reference": reference}
-            elements.append(DirectorElement(markers, **shape, **made))
+            elements.append(DirectorElement(markers, **shape, **made, inertia=inertia))
             if material.damping is not None:
                 viscosity = material.damping * stiffness
                 damper = DirectorDamping(

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
 from natcoord_jax.mechanics.coordinates import coordinate_rates, state_rates
+from natcoord_jax.mechanics.momentum import inertia
 from natcoord_jax.mechanics.rates import null_space, tree_rates, twists
 from natcoord_jax.model.rows import row_rates, rows_with_ground
 from natcoord_jax.system import System
@@ -42,7 +43,10 @@ def _rotor_places(system: System) -> Array:
 
 def _with_mass(system: System, rates: Array) -> Array:
     """Velocities of rows times the mass matrix, trailing axes kept."""
-    return jnp.einsum("bij,bj...->bi...", system.mass, rates.reshape(-1, 4, 3, *rates.shape[2:]))
+    by_body = rates.reshape(-1, 4, 3, *rates.shape[2:])
+    return jnp.moveaxis(
+        inertia(system, jnp.moveaxis(by_body, (0, 1, 2), (-3, -2, -1))), (-3, -2, -1), (0, 1, 2)
+    )
 
 
 def _free_motions(system: System, rows: Array) -> tuple[Any, Any]:

@@ -202,10 +202,11 @@ class Effect(Part):
         """This effect with its `derived` numbers as the others ask for; called when others have been set."""
         return self
 
-    def lumped_mass(self) -> Float[Array, "k *m"] | None:
+    def mass_matrix(self) -> Float[Array, "k *m"] | None:
         """Mass that it brings to its marker vectors, points [kg] and directions [kg m^2]; None: none.
 
-        Or, for each node, the matrix (k, m, m) of these and of what is between them [kg m].
+        Or, for each node, the matrix (k, m, m) of these and of what is between them [kg m]; or one matrix
+        (k, m, k, m) of all of them, with what is between the nodes.
         """
         return None
 

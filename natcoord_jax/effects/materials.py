@@ -9,8 +9,11 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.core.arguments import Part, is_a
 from natcoord_jax.core.checks import is_concrete
+from natcoord_jax.core.kinds import Choice
 from natcoord_jax.core.numeric import Number
 
+MASS = Choice(("lumped", "consistent"))
+"""How elements carry their mass."""
 SHEAR = 5.0 / 6.0
 """Shear coefficient of a homogeneous plate."""
 

@@ -16,7 +16,7 @@ from natcoord_jax.core.state import State
 from natcoord_jax.maths.elimination import inverse_cholesky
 from natcoord_jax.maths.vectors import cross
 from natcoord_jax.mechanics.equations_of_motion import loops_of, relations_of, rotors_of
-from natcoord_jax.mechanics.momentum import inertia, weighs_only, wrench
+from natcoord_jax.mechanics.momentum import inertia_alone, weighs_only, wrench
 from natcoord_jax.mechanics.rates import joint_axes
 from natcoord_jax.mechanics.tangent_space import TangentSpace, Velocity, driven, isometric
 from natcoord_jax.model.model import Model
@@ -56,7 +56,7 @@ class SeparateTangents(eqx.Module):
         velocity = jnp.where(turning, cross(axis, (rows[:, 0] - points)[:, None]), axis)
         spin = jnp.where(turning, axis, 0.0)
         columns = jnp.concatenate([velocity[:, :, None], cross(spin[:, :, None], rows[:, None, 1:])], axis=2)
-        impulses = jax.vmap(inertia, in_axes=(None, 1), out_axes=1)(system.mass, columns)
+        impulses = jax.vmap(inertia_alone, in_axes=(None, 1), out_axes=1)(system.mass, columns)
         blank = jnp.zeros((rows.shape[0], slots.size, slots.size), rows.dtype)
         space = cls(system, rows, velocity, spin, impulses, blank, blank)
         massless = weighs_only(system.mass)
@@ -77,7 +77,7 @@ class SeparateTangents(eqx.Module):
     def impulse(self, v: Velocity) -> Velocity:
         """M v."""
         assert self.system is not None
-        return Velocity(inertia(self.system.mass, v.rows), v.rotors)
+        return Velocity(inertia_alone(self.system.mass, v.rows), v.rotors)
 
     def energy(self, v: Velocity) -> Float[Array, ""]:
         """Kinetic energy [J]."""
@@ -152,7 +152,8 @@ Tangents = TangentSpace | SeparateTangents
 def separate(system: Model) -> bool:
     """Whether the constraints admit velocities body by body."""
     apart = len(system.tree.levels) == 1 and len(system.structure.bodies) > 1
-    return apart and not (relations_of(system) or loops_of(system) or rotors_of(system))
+    coupled = system.mass_between is not None or relations_of(system) or loops_of(system)
+    return apart and not (coupled or rotors_of(system))
 
 
 def tangents_at(system: Model, state: State) -> Tangents:

@@ -42,8 +42,8 @@ def elements(system: Model, stages: int = 1) -> list[Array | np.ndarray]:
         stages: of the collocation method.
 
     Returns:
-        An array (count, width) for the bodies and for each group with bodies, in the order of
-        `FullStep.matrices`; the number of unknowns stands for what is fixed.
+        An array (count, width) for the bodies, for the mass between them if there is any, and for each group
+        with bodies, in the order of `FullStep.matrices`; the number of unknowns stands for what is fixed.
     """
     groups = tuple(g for g in (*system.effects, *system.joints) if touches(g))
     tables = [bodies_of_elements(group) for group in groups]
@@ -54,6 +54,9 @@ def elements(system: Model, stages: int = 1) -> list[Array | np.ndarray]:
     size = first + stages * sum(g.count * g.multipliers for g in groups)
     places = system.local_rates.places(stages, size, xp)
     found = [places[:-1].reshape(places.shape[0] - 1, -1)]
+    if system.mass_between is not None:
+        rates = system.mass_between.rates
+        found.append(places[system.mass_between.bodies][..., :rates].reshape(-1, 2 * stages * rates))
     for group, table in zip(groups, tables):
         count, rows = table.shape[0], stages * group.multipliers
         lams = first + np.arange(count * rows, dtype=np.int32).reshape(count, rows)

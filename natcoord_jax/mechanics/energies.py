@@ -6,6 +6,7 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.vectors import cross
+from natcoord_jax.mechanics.momentum import inertia
 from natcoord_jax.model.groups import Group
 from natcoord_jax.model.model import Model
 from natcoord_jax.model.rows import group_places, rows_with_ground
@@ -32,5 +33,5 @@ def group_energies(system: Model, group: Group, state: State) -> Float[Array, " 
 def body_momenta(system: Model, state: State) -> tuple[Float[Array, "bodies 3"], Float[Array, "bodies 3"]]:
     """Momentum and angular momentum about the origin of every body (24, 32)."""
     q, v = state.q.reshape(-1, 4, 3), state.v.reshape(-1, 4, 3)
-    impulse = jnp.sum(system.mass[..., None] * v[:, None], axis=2)
+    impulse = inertia(system, v)
     return impulse[:, 0], jnp.sum(cross(q, impulse), axis=1)

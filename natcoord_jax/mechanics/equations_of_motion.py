@@ -163,7 +163,7 @@ class EquationsOfMotion(eqx.Module):
 
     def inertial(self, gains: Accelerations) -> Twists:
         """Forces and torques that give bodies and rotors their accelerations."""
-        impulses = inertia(self.system.mass, gains.rows)
+        impulses = inertia(self.system, gains.rows)
         force, torque = (x[0] for x in wrench(impulses[None], self.rows[None, :, 1:]))
         groups = rotors_of(self.system)
         if groups:

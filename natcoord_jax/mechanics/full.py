@@ -24,6 +24,7 @@ from natcoord_jax.mechanics.form import Form
 from natcoord_jax.mechanics.grain import cancelling_size
 from natcoord_jax.mechanics.kick import kicked
 from natcoord_jax.mechanics.local import body_balance, body_motion, jacobians
+from natcoord_jax.mechanics.mass_between import pair_matrices
 from natcoord_jax.mechanics.momentum import least_inertias, momentum_balance
 from natcoord_jax.mechanics.reduced import NOTHING
 from natcoord_jax.mechanics.redundancy import (
@@ -216,6 +217,8 @@ class FullStep(Form):
         twists, multipliers = self.split(y)
         every = self._with_ground(twists)
         found = [self.body_jacobians(twists)]
+        if self.system.mass_between is not None:
+            found.append(pair_matrices(self, self.system.mass_between, twists))
         for group, where, lam in zip(self.groups, self.situations, multipliers):
             if not touches(group):
                 continue

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from natcoord_jax.core.effect import Motion, Response, StepContext
 from natcoord_jax.maths.collocation import Tableau, rotate_stages
 from natcoord_jax.maths.vectors import cross
-from natcoord_jax.mechanics.momentum import stage_momentum
+from natcoord_jax.mechanics.momentum import inertia_alone, stage_changes
 from natcoord_jax.mechanics.response import GroupData, respond
 from natcoord_jax.model.groups import Group
 from natcoord_jax.model.local_rates import TWIST
@@ -51,7 +51,7 @@ def body_balance(
 ) -> Float[Array, "s 6"]:
     """Change of momentum of one body as a wrench."""
     motion = body_motion(start[None], twist[None], h, tableau)
-    momentum = stage_momentum(mass[None], motion.rates - velocity[None, None], tableau)
+    momentum = inertia_alone(mass[None], stage_changes(motion.rates - velocity[None, None], tableau))
     return wrenches(momentum, jnp.zeros_like(motion.spin), motion)[0]
 
 

@@ -13,10 +13,16 @@ from natcoord_jax.model.groups import Group
 from natcoord_jax.model.model import Model
 
 
-def inertia(
+def inertia(system: Model, rates: Float[Array, "*s bodies 4 3"]) -> Float[Array, "*s bodies 4 3"]:
+    """Rows of M v."""
+    found = inertia_alone(system.mass, rates)
+    return found if system.mass_between is None else found + system.mass_between.momenta(rates)
+
+
+def inertia_alone(
     mass: Float[Array, "bodies 4 4"], rates: Float[Array, "*s bodies 4 3"]
 ) -> Float[Array, "*s bodies 4 3"]:
-    """Rows of m v."""
+    """Rows of m v of each body by itself."""
     return jnp.sum(mass[:, :, :, None] * rates[..., None, :, :], axis=-2)
 
 
@@ -92,16 +98,14 @@ def least_inertias(mass: Float[Array, "bodies 4 4"]) -> Float[Array, "bodies 2"]
 
 def motion(mass: Float[Array, "bodies 4 4"], rates: Float[Array, "bodies 4 3"]) -> Float[Array, ""]:
     """Energy of the bodies' motion, twice, within a small factor: each row by its own mass [J]."""
-    return jnp.sum(row_weights(mass)[..., None] * inertia(mass, rates) ** 2)
+    return jnp.sum(row_weights(mass)[..., None] * inertia_alone(mass, rates) ** 2)
 
 
-def stage_momentum(
-    mass: Float[Array, "bodies 4 4"], difference: Float[Array, "s bodies 4 3"], tableau: Tableau
-) -> Float[Array, "s bodies 4 3"]:
-    """M sum_j (A^-1)_ij (V_j - v_0)."""
+def stage_changes(difference: Float[Array, "s bodies 4 3"], tableau: Tableau) -> Float[Array, "s bodies 4 3"]:
+    """sum_j (A^-1)_ij (V_j - v_0)."""
     if tableau.stages == 1:
-        return inertia(mass, tableau.a_inverse[0][0] * difference)
-    return inertia(mass, tableau.differentiated(difference))
+        return tableau.a_inverse[0][0] * difference
+    return tableau.differentiated(difference)
 
 
 class Balance(eqx.Module):
@@ -144,9 +148,9 @@ def momentum_balance(
         h: step [s].
         tableau: the collocation method.
     """
-    momentum = stage_momentum(system.mass, at.rates[:, :-1] - velocity, tableau)
+    momentum = inertia(system, stage_changes(at.rates[:, :-1] - velocity, tableau))
     weights = row_weights(system.mass)[..., None]
-    size = jnp.sum(weights * (momentum**2 + 4 * inertia(system.mass, velocity) ** 2))
+    size = jnp.sum(weights * (momentum**2 + 4 * inertia(system, velocity) ** 2))
     torque, rows, power = None, [jnp.zeros(0, velocity.dtype)], []
     for group, where, lam in zip(groups, situations, multipliers):
         answer = respond(group, where, gather(group, at), lam, tableau)

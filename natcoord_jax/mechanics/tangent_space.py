@@ -142,7 +142,7 @@ class TangentSpace(eqx.Module):
     def impulse(self, v: Velocity) -> Velocity:
         """M v."""
         assert self.system is not None
-        return Velocity(inertia(self.system.mass, v.rows), self.inertias * v.rotors)
+        return Velocity(inertia(self.system, v.rows), self.inertias * v.rotors)
 
     def energy(self, v: Velocity) -> Float[Array, ""]:
         """Kinetic energy [J]."""
@@ -198,6 +198,9 @@ class TangentSpace(eqx.Module):
             bodies = bodies + idle[:, None, None] * turning
         momenta = jnp.einsum("bij,bju->biu", bodies, other.motions)
         found = jnp.einsum("biu,biw->uw", self.motions, momenta)
+        if self.system.mass_between is not None:
+            between = self.system.mass_between.momenta(other.columns)
+            found = found + jnp.einsum("ubjc,wbjc->uw", self.columns, between)
         if self.inertias.shape[0]:
             found = found + (self.turning * self.inertias) @ other.turning.T
         return found

@@ -32,16 +32,21 @@ def adjacent(group: Group, neighbour: np.ndarray) -> bool:
 
 
 def choose_solver(
-    tree: Tree, multipliers: int, joints: tuple[Group, ...], effects: tuple[Group, ...], bodies: int
+    tree: Tree,
+    multipliers: int,
+    joints: tuple[Group, ...],
+    effects: tuple[Group, ...],
+    bodies: int,
+    mass_between: bool,
 ) -> str:
     """Form of the equations: small systems reduced, large trees recursive, everything else full."""
     unknowns, depth = len(tree.slot_of), len(tree.levels)
-    if any(group.effect.bends for group in effects):
+    if mass_between or any(group.effect.bends for group in effects):
         depth = DEPTH_LIMIT + 1  # no form whose Jacobian is found by differences
     if unknowns + multipliers <= REDUCED_LIMIT and depth <= DEPTH_LIMIT:
         return "reduced"
     neighbour = np.asarray(tree.neighbour)
-    open_tree = multipliers == 0 and all(g.in_tree for g in joints)
+    open_tree = multipliers == 0 and not mass_between and all(g.in_tree for g in joints)
     if open_tree and all(adjacent(g, neighbour) for g in effects):
         return "recursive"
     if unknowns + multipliers <= LOOP_LIMIT and depth <= DEPTH_LIMIT:
@@ -50,17 +55,20 @@ def choose_solver(
     return "full" if every <= FULL_LIMIT else "sparse"
 
 
-def elimination_order(layout: Layout, effects: tuple[Group, ...], joints: tuple[Group, ...]) -> Elimination:
+def elimination_order(
+    layout: Layout, effects: tuple[Group, ...], joints: tuple[Group, ...], mass_between: bool
+) -> Elimination:
     """Where multipliers and blocks sit in the nodes of the tree.
 
     Raises:
         ValueError: if the system is no open tree with couplings between neighbours.
     """
     neighbour, bodies = np.array(layout.spanning.neighbour), len(layout.bodies)
-    if not all(g.in_tree for g in joints) or not all(adjacent(g, neighbour) for g in effects):
+    fitting = all(g.in_tree for g in joints) and all(adjacent(g, neighbour) for g in effects)
+    if mass_between or not fitting:
         raise ValueError(
-            'solver="recursive" needs an open tree whose effects couple a body with its parent at most; '
-            'use solver="full" or None'
+            'solver="recursive" needs an open tree whose effects couple a body with its parent at most, '
+            'without mass between bodies; use solver="full" or None'
         )
     owned: list[list[int]] = [[] for _ in range(bodies)]
     seats, total = [], 0

@@ -1,49 +1,181 @@
-"""Mass that effects bring to the bodies that they are on, as elements of shells and solids do."""
+"""Mass that effects bring to the nodes that they are on, and between them, as elements do."""
 
+from collections.abc import Sequence
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from natcoord_jax.core.checks import as_array
 from natcoord_jax.core.eager_numpy import eager_numpy
-from natcoord_jax.core.effect import Effect
+from natcoord_jax.core.effect import Effect, replace_fields
 from natcoord_jax.model.groups import Group
+from natcoord_jax.model.local_rates import TWIST
+from natcoord_jax.model.segment_sum import SegmentSum
+
+BETWEEN = 4
+"""Axes of a mass matrix that couples nodes."""
 
 
-def with_masses(
-    masses: Float[Array, "bodies 4 4"], group: Group, before: Effect | None = None
-) -> Float[Array, "bodies 4 4"]:
-    """With what effects bring to their bodies; what sits on the ground is lost.
+class MassBetween(eqx.Module):
+    """Blocks of the mass matrix off its diagonal.
+
+    Attributes:
+        bodies: two different ones, of each block once.
+        blocks: between their rows: of the first along the rows, of the second along the columns.
+        held: sums of blocks between the rows of each body and what sits on the ground: it has no part in
+            motions, but has a weight.
+        places: where the blocks of each group of effects go (n, k, k), beyond the last one those that are
+            none or that another is the transpose of; None: it has none.
+        acting: how bodies collect what the blocks give them, the first of all blocks before the second.
+        turning: whether any of the bodies turns; points do not.
+    """
+
+    bodies: Int[Array | np.ndarray, "pairs 2"]
+    blocks: Float[Array, "pairs 4 4"]
+    held: Float[Array, "bodies 4 4"]
+    places: tuple[Int[Array | np.ndarray, "n k k"] | None, ...]
+    acting: SegmentSum
+    turning: bool = eqx.field(static=True)
+
+    @property
+    def rates(self) -> int:
+        """Components of the twists of two bodies that blocks have to do with: of points there is no spin."""
+        return TWIST if self.turning else TWIST // 2
+
+    def momenta(self, rates: Float[Array, "*s bodies 4 3"]) -> Float[Array, "*s bodies 4 3"]:
+        """What they add to the momenta of the bodies."""
+        first, second = self.bodies[:, 0], self.bodies[:, 1]
+        onto_first = jnp.sum(self.blocks[:, :, :, None] * rates[..., second, None, :, :], axis=-2)
+        onto_second = jnp.sum(self.blocks[:, :, :, None] * rates[..., first, :, None, :], axis=-3)
+        parts = jnp.moveaxis(jnp.concatenate([onto_first, onto_second], axis=-3), -3, 0)
+        return jnp.moveaxis(self.acting.collect(parts), 0, -3)
+
+    def times(self, factor: Array | float) -> "MassBetween":
+        """So many times as much."""
+        return replace_fields(self, blocks=factor * self.blocks, held=factor * self.held)
+
+    @property
+    def of_uniform_motion(self) -> Float[Array, "bodies 4 4"]:
+        """Sums of the blocks in the rows of each body: momenta of a motion that is the same everywhere."""
+        both = jnp.concatenate([self.blocks, jnp.swapaxes(self.blocks, 1, 2)])
+        return self.held + self.acting.collect(both)
+
+
+def _axes(group: Group) -> int:
+    """Axes of what effects bring, see `Effect.mass_matrix`; 0: nothing."""
+    if group.weights is None or type(group.effect).mass_matrix is Effect.mass_matrix:
+        return 0
+    found = jax.eval_shape(jax.vmap(lambda e: e.mass_matrix()), group.effect)
+    return 0 if found is None else found.ndim - 1
+
+
+def mass_of(
+    masses: Float[Array, "bodies 4 4"], groups: Sequence[Group], turning: np.ndarray
+) -> tuple[Float[Array, "bodies 4 4"], MassBetween | None]:
+    """Masses with all that effects bring; what sits on the ground is lost.
+
+    Args:
+        masses: m (15) of the bodies without them.
+        groups: of all effects.
+        turning: which bodies turn.
+    """
+    between = _between(groups, turning)
+    for number in range(len(groups)):
+        masses, between = with_mass(masses, between, groups, number)
+    return masses, between
+
+
+def with_mass(
+    masses: Float[Array, "bodies 4 4"],
+    between: MassBetween | None,
+    groups: Sequence[Group],
+    number: int,
+    before: Effect | None = None,
+) -> tuple[Float[Array, "bodies 4 4"], MassBetween | None]:
+    """With what the effects of a group bring.
 
     Args:
         masses: m (15) of all bodies.
-        group: of the effects.
+        between: mass between them.
+        groups: of all effects.
+        number: of the group.
         before: what they were when what they brought was added; None: nothing has been.
     """
-    if group.weights is None or type(group.effect).lumped_mass is Effect.lumped_mass:
-        return masses
-    return _with_masses(masses, group.bodies, group.effect, before, group.weights)
+    group = groups[number]
+    if not _axes(group):
+        return masses, between
+    places = None if between is None else between.places[number]
+    old = None if before is None else replace_fields(group, effect=before)
+    alone, blocks, held = _added(masses, between, places, group, old)
+    if between is not None:
+        between = replace_fields(between, blocks=blocks, held=held)
+    return alone, between
+
+
+def _between(groups: Sequence[Group], turning: np.ndarray) -> MassBetween | None:
+    """The pairs of bodies between which there is mass, none yet."""
+    count = len(turning)
+    pairs = [_pairs(group) if _axes(group) == BETWEEN else None for group in groups]
+    numbers = [None if p is None else p[..., 0] * (count + 1) + p[..., 1] for p in pairs]
+    given = [n[_first(p, count)] for n, p in zip(numbers, pairs) if n is not None and p is not None]
+    if not given:
+        return None
+    unique = np.unique(np.concatenate(given))
+    places = tuple(
+        None
+        if n is None or p is None
+        else np.where(_first(p, count), np.searchsorted(unique, n), len(unique)).astype(np.int32)
+        for n, p in zip(numbers, pairs)
+    )
+    bodies = np.stack([unique // (count + 1), unique % (count + 1)], axis=1).astype(np.int32)
+    none, unheld = (as_array(np.zeros((n, 4, 4))) for n in (len(bodies), count))
+    acting = SegmentSum.of(bodies.T, count)
+    return MassBetween(bodies, none, unheld, places, acting, bool(turning[bodies].any()))
+
+
+def _pairs(group: Group) -> Int[np.ndarray, "n k k 2"]:
+    """Bodies that the blocks of each instance of a group are between."""
+    table = np.asarray(group.bodies)
+    return np.stack(np.broadcast_arrays(table[:, :, None], table[:, None]), axis=-1)
+
+
+def _first(pairs: Int[np.ndarray, "n k k 2"], count: int) -> np.ndarray:
+    """Which of them are different bodies, the smaller number first."""
+    return (pairs[..., 0] < pairs[..., 1]) & (pairs[..., 1] < count)
 
 
 @eager_numpy
-def _with_masses(
+def _added(
     masses: Float[Array, "bodies 4 4"],
-    bodies: Int[Array | np.ndarray, "n k"],
-    effect: Effect,
-    before: Effect | None,
-    weights: Float[Array, "n k *m 4"],
-) -> Float[Array, "bodies 4 4"]:
-    def brought(effect: Effect) -> Array:
-        lumps: Any = jax.vmap(lambda e: e.lumped_mass())(effect)
-        # Between vectors of a node there is mass where its point is not in the middle.
-        if lumps.ndim == 4:
-            return lumps
-        return lumps.reshape(*bodies.shape, -1, 1) * jnp.eye(max(1, lumps.size // bodies.size))
-
-    lumps = brought(effect) if before is None else brought(effect) - brought(before)
+    between: MassBetween | None,
+    places: Int[Array | np.ndarray, "n k k"] | None,
+    group: Group,
+    before: Group | None,
+) -> tuple[Float[Array, "bodies 4 4"], Any, Any]:
+    """Masses of bodies, between them, and between them and the ground, with what a group brings."""
+    bodies, weights = group.bodies, group.weights
+    assert weights is not None
+    rows = weights.reshape(*bodies.shape, -1, 4)
+    found: Any = jax.vmap(lambda e: e.mass_matrix())(group.effect)
+    if before is not None:
+        found = found - jax.vmap(lambda e: e.mass_matrix())(before.effect)
+    blocks: Any = None if between is None else between.blocks
+    held: Any = None if between is None else between.held
     # What has mass comes first: of an attachment the point, or it and the first axis.
-    rows = weights.reshape(*bodies.shape, -1, 4)[:, :, : lumps.shape[2]]
-    blocks = jnp.einsum("nkml,nkma,nklb->nkab", lumps, rows, rows)
-    return masses.at[bodies].add(blocks, mode="drop")
+    if places is None:
+        # Between vectors of a node there is mass where its point is not in the middle.
+        if found.ndim < 4:
+            found = found.reshape(*bodies.shape, -1, 1) * jnp.eye(max(1, found.size // bodies.size))
+        rows = rows[:, :, : found.shape[2]]
+        own = jnp.einsum("nkml,nkma,nklb->nkab", found, rows, rows)
+        return masses.at[bodies].add(own, mode="drop"), blocks, held
+    rows, ground = rows[:, :, : found.shape[2]], masses.shape[0]
+    every = jnp.einsum("nkilj,nkia,nljb->nklab", found, rows, rows)
+    one, other = bodies[:, :, None], bodies[:, None]
+    alone, lost = (jnp.where(other == x, one, ground) for x in (one, ground))
+    masses, held = (x.at[at].add(every, mode="drop") for x, at in ((masses, alone), (held, lost)))
+    return masses, blocks.at[places].add(every, mode="drop"), held

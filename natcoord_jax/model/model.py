@@ -14,6 +14,7 @@ from natcoord_jax.core.kinds import BODY_NAME, JOINT_NAME, NAME, HandleOf, of
 from natcoord_jax.core.names import listed
 from natcoord_jax.model.groups import CoordinateGroup, Elimination, Group
 from natcoord_jax.model.local_rates import LocalRates
+from natcoord_jax.model.masses import MassBetween
 from natcoord_jax.model.tree import Tree
 
 
@@ -82,6 +83,7 @@ class Model(eqx.Module):
         coordinate_order: place of each coordinate among those of all groups, one group after the other.
         elimination: order of recursive elimination, only where it is the solver.
         structure: what is static.
+        mass_between: mass between bodies, as consistent masses of elements have it; None: there is none.
         sparsity: pattern and plan of the sparse Jacobian, only where it is the solver.
     """
 
@@ -96,6 +98,7 @@ class Model(eqx.Module):
     coordinate_order: Int[Array | np.ndarray, " coordinates"]
     elimination: Elimination | None
     structure: Structure = eqx.field(static=True)
+    mass_between: MassBetween | None = None
     sparsity: Any = None
 
     @checked("System.body_index", body=BODY_NAME)

@@ -51,7 +51,8 @@ def rows_with_ground(rows: Float[Array, "bodies4 3"]) -> Float[Array, "bodies_an
 def group_places(system: Model, group: Group) -> Array:
     """How the instances of a group sit on their bodies: weights, joint frames or mass blocks."""
     if group.source == "mass":
-        return system.mass
+        between = system.mass_between
+        return system.mass if between is None else system.mass + between.of_uniform_motion
     if group.source == "markers":
         assert group.weights is not None
         return group.weights

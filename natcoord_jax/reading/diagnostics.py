@@ -10,6 +10,7 @@ from natcoord_jax.core.checks import require_double
 from natcoord_jax.core.results import REASONS, REMEDIES, Result, SimulationError
 from natcoord_jax.core.state import State, Trajectory
 from natcoord_jax.mechanics.energies import body_momenta, group_energies
+from natcoord_jax.mechanics.momentum import inertia
 from natcoord_jax.model.model import Model
 from natcoord_jax.model.rows import over_states
 
@@ -42,7 +43,7 @@ class Energy(eqx.Module):
 def energy(system: Model, state: State) -> Energy:
     """Energies (1) and stores."""
     v = state.v.reshape(-1, 4, 3)
-    kinetic = 0.5 * jnp.sum(system.mass[..., None] * v[:, :, None] * v[:, None])
+    kinetic = 0.5 * jnp.sum(v * inertia(system, v))
     stores = {}
     for group in system.effects:
         if group.effect.stores:

@@ -18,7 +18,7 @@ from natcoord_jax.core.flaws import first_flaw
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.names import listed
 from natcoord_jax.model.groups import Group
-from natcoord_jax.model.masses import with_masses
+from natcoord_jax.model.masses import with_mass
 from natcoord_jax.model.model import Model, SomeModel
 
 Names = Handle | str | Sequence[Handle | str]
@@ -217,7 +217,7 @@ def _declared(module: Any, path: str) -> Any:
 
 def _renewed(before: Model, after: SomeModel, name: str, given: set[str]) -> SomeModel:
     """The system with what follows from the numbers of an effect that have been set, masses included."""
-    effects, mass = list(after.effects), after.mass
+    effects, mass, between = list(after.effects), after.mass, after.mass_between
     for number, (old, group) in enumerate(zip(before.effects, after.effects)):
         if name not in group.names and name not in group.labels:
             continue
@@ -225,8 +225,8 @@ def _renewed(before: Model, after: SomeModel, name: str, given: set[str]) -> Som
         if kind.renewed is not Effect.renewed and not given <= {*kind.derived, "weights"}:
             row = group.names.index(name) if group.lanes and name in group.names else None
             effects[number] = replace_fields(group, effect=_anew(group.effect, row))
-        mass = with_masses(mass, effects[number], old.effect)
-    return replace_fields(after, effects=tuple(effects), mass=mass)
+        mass, between = with_mass(mass, between, effects, number, old.effect)
+    return replace_fields(after, effects=tuple(effects), mass=mass, mass_between=between)
 
 
 @eager_numpy

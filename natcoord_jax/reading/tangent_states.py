@@ -83,7 +83,7 @@ def _along_the_tree(system: Model, state: State, v: Velocity) -> Velocity:
         twists = passed_down(across, jnp.sum(own * w[:, None], axis=2), parent)[:-1]
         return row_rates(rows, twists[:, :3], twists[:, 3:])
 
-    lost = inertia(system.mass, v.rows - moving(w))
+    lost = inertia(system, v.rows - moving(w))
     loads = jnp.concatenate([x[0] for x in wrench(lost[None], rows[None, :, 1:])], axis=1)
     upward = jnp.swapaxes(across, 1, 2)
     loads = loads + handed_up(upward, jnp.sum(upward * loads[:, None], axis=2), parent)

@@ -83,6 +83,6 @@ def sound(
     rounding = ROUNDING * size * (jnp.sqrt(moving) + ROUNDING * size)
     allowed = max(tolerance / TOLERANCE, 1.0) * (UNSOUND * moving + rounding)
     rows = before.q.reshape(-1, 4, 3)
-    places = jnp.sum(rows * inertia(system.mass, rows))
+    places = jnp.sum(rows * inertia(system, rows))
     near = ((equations.h * correction) ** 2 <= PLACES**2 * places) | (correction <= RESTING * grain)
     return near | (unbalanced_work(equations, y, residual) <= allowed)

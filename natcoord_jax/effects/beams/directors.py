@@ -47,6 +47,8 @@ class DirectorElement(Potential):
         weights: of the Gauss points [m].
         stiffness: C, shape (6, 6) [N, N m, N m^2], for (Gamma_1, Gamma_2, Gamma_3, K_1, K_2, K_3).
         reference: strains of the unstressed shape, shape (points, 6) [-, 1/m].
+        inertia: mass of the points and directors of the nodes (nodes, 4, nodes, 4) [kg, kg m, kg m^2], which
+            couples them; None: what the nodes sit on has it.
     """
 
     markers: Any = eqx.field(metadata=is_a(Markers(attachments=0)))
@@ -55,11 +57,16 @@ class DirectorElement(Potential):
     weights: Any = eqx.field(kw_only=True, metadata=is_a(Vector(None)))
     stiffness: Any = eqx.field(kw_only=True, metadata=is_a(Numbers((6, 6))))
     reference: Any = eqx.field(kw_only=True, metadata=is_a(Numbers((None, 6))))
+    inertia: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Numbers((None, 4, None, 4))))
 
     kind: ClassVar[str] = "director element"
     couples: ClassVar[bool] = True
     silent: ClassVar[bool] = False
     degree: ClassVar[int | None] = 2
+
+    def mass_matrix(self) -> Float[Array, "k 4 k 4"] | None:
+        """Of the nodes."""
+        return self.inertia
 
     def readings(self, place: Array, rows: Array) -> BeamReadings:
         """Strains and section forces at the Gauss points."""

@@ -88,6 +88,8 @@ class BeamElement(Expanded):
         reference: strains (1 + Gamma, K) of the unstressed shape, shape (6,) [-, 1/m]; (0, 0, 1, 0, 0, 0)
             for a straight one.
         stiffness: C, shape (6, 6) [N, N m, N m^2], for (Gamma_1, Gamma_2, Gamma_3, K_1, K_2, K_3).
+        inertia: mass of the points and directors of both frames (2, 4, 2, 4) [kg, kg m, kg m^2], which
+            couples them; None: what the frames sit on has it.
 
     Example:
         >>> import natcoord_jax as nc
@@ -103,6 +105,7 @@ class BeamElement(Expanded):
     reference: Any = eqx.field(
         default=(0.0, 0.0, 1.0, 0.0, 0.0, 0.0), kw_only=True, converter=as_array, metadata=is_a(Vector(6))
     )
+    inertia: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Numbers((2, 4, 2, 4))))
 
     kind: ClassVar[str] = "beam element"
     couples: ClassVar[bool] = True
@@ -110,6 +113,10 @@ class BeamElement(Expanded):
     together: ClassVar[bool] = True
     points: ClassVar[int | None] = 2
     units: ClassVar[tuple[int, ...] | None] = (4, 3)
+
+    def mass_matrix(self) -> Float[Array, "2 4 2 4"] | None:
+        """Of the frames."""
+        return self.inertia
 
     def invariants(self, x: Array) -> Array:
         """Relative rotation [-] and place [m] of the second frame in the first."""

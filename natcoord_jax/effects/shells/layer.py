@@ -13,14 +13,14 @@ from natcoord_jax.core.kinds import of
 from natcoord_jax.core.numeric import COMPONENTS, Directions, Number
 from natcoord_jax.core.potential import Potential
 from natcoord_jax.effects.laminates import Laminate, Orthotropic
-from natcoord_jax.effects.materials import Elastic, Sheet
+from natcoord_jax.effects.materials import MASS, Elastic, Sheet
 from natcoord_jax.effects.shells.readings import ShellReadings, readings_of
 
 MATERIAL = of("a material, as nc.Elastic(...)", Elastic, Orthotropic, Laminate)
 
 
 class LayerElement(Potential):
-    """Base of elements of a layer: a subclass gives `invariants`, `matrices` and `areas_of`."""
+    """Base of elements of a layer: a subclass gives `invariants`, `matrices` and `overlaps_of`."""
 
     thickness: Any = eqx.field(kw_only=True, metadata=is_a(Number("positive")))
     material: Any = eqx.field(kw_only=True, metadata=is_a(MATERIAL))
@@ -28,15 +28,16 @@ class LayerElement(Potential):
     offset: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Number()))
     prestress: Any = eqx.field(default=None, kw_only=True, metadata=is_a(COMPONENTS))
     damping: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Number("not negative")))
+    mass: str = eqx.field(default="lumped", kw_only=True, static=True, metadata=is_a(MASS))
     reference: Any = eqx.field(default=None, kw_only=True)
     stiffness: Any = eqx.field(default=None, init=False)
     rest: Any = eqx.field(default=None, init=False)
     pull: Any = eqx.field(default=None, init=False)
-    areas: Any = eqx.field(default=None, init=False)
+    overlaps: Any = eqx.field(default=None, init=False)
 
     degree: ClassVar[int | None] = 2
     together: ClassVar[bool] = True
-    derived: ClassVar[tuple[str, ...]] = ("stiffness", "rest", "pull", "areas")
+    derived: ClassVar[tuple[str, ...]] = ("stiffness", "rest", "pull", "overlaps")
     silent: ClassVar[bool] = False
     bends: ClassVar[bool] = True
 
@@ -45,8 +46,13 @@ class LayerElement(Potential):
         """Integrals over the element without stress: `stiffness`, `membrane`, `stretching`."""
 
     @abc.abstractmethod
-    def areas_of(self, x: Float[Array, "k 3"]) -> Float[Array, " k"]:
+    def overlaps_of(self, x: Float[Array, "k 3"]) -> Float[Array, "k k"]:
+        """Integrals of the products of the shape functions of its nodes [m^2]."""
+
+    @property
+    def areas(self) -> Float[Array, " k"]:
         """Areas that its nodes stand for [m^2]."""
+        return jnp.sum(self.overlaps, axis=-1)
 
     @property
     def works(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -71,25 +77,22 @@ class LayerElement(Potential):
         if self.prestress is not None:
             pull = jnp.zeros_like(rest)
             pull = pull.at[: found.stretching.shape[1]].set(jnp.asarray(self.prestress) @ found.stretching)
-        areas = self.areas_of(points)
-        return replace_fields(self, stiffness=stiffness, rest=rest, pull=pull, areas=areas)
+        overlaps = self.overlaps_of(points)
+        return replace_fields(self, stiffness=stiffness, rest=rest, pull=pull, overlaps=overlaps)
 
     def sheet(self) -> Sheet:
         """What it resists with, about its nodes."""
         found = self.material.sheet(self.thickness)
         return found if self.offset is None else found.shifted(self.offset)
 
-    def lumped_mass(self) -> Float[Array, "k *m"]:
+    def mass_matrix(self) -> Float[Array, "k m *m"]:
         """Of the points [kg] and of the directors [kg m^2], and between them [kg m] if there is an offset."""
-        h = self.thickness
-        each = self.material.density * h * self.areas
-        if not self.bends:
-            return each
-        if self.offset is None:
-            return jnp.stack([each, h**2 / 12 * each], axis=1)
-        z = self.offset
-        rows = (each, z * each), (z * each, (h**2 / 12 + z**2) * each)
-        return jnp.stack([jnp.stack(row, axis=1) for row in rows], axis=1)
+        h, z = self.thickness, 0.0 if self.offset is None else self.offset
+        across = jnp.array([[1.0, z], [z, h**2 / 12 + z**2]]) if self.bends else jnp.ones((1, 1))
+        across = self.material.density * h * across
+        if self.mass == "consistent":
+            return self.overlaps[:, None, :, None] * across[:, None]
+        return self.areas[:, None, None] * across
 
     def flaws(self) -> dict[str, Array]:
         """Corners that are no corners."""

@@ -22,12 +22,12 @@ from natcoord_jax.effects.shells.stiffness import (
     EDGES,
     QuadrilateralMatrices,
     QuadrilateralSurface,
-    areas_of,
     cartesian,
     derivatives_of,
     dot,
     natural_shears,
     natural_strains,
+    overlaps_of,
 )
 
 MEMBRANES = ("hybrid", "hybrid mitc4+")
@@ -50,9 +50,9 @@ class Quadrilateral(LayerElement):
         """Integrals over the element."""
         return QuadrilateralMatrices(x, self.sheet(), self.direction, self.membrane == MEMBRANES[1])
 
-    def areas_of(self, x: Float[Array, "4 3"]) -> Float[Array, "4"]:
+    def overlaps_of(self, x: Float[Array, "4 3"]) -> Float[Array, "4 4"]:
         """Of its nodes."""
-        return areas_of(x)
+        return overlaps_of(x)
 
 
 class ShellElement(Quadrilateral):
@@ -77,7 +77,8 @@ class ShellElement(Quadrilateral):
         stiffness: by the invariants, follows from the others.
         rest: invariants without stress, follow from the others.
         pull: stresses of the prestress, follow from the others.
-        areas: that the nodes stand for [m^2], follow from the others.
+        mass: "lumped" at the nodes, or "consistent": between them, too, that of the interpolated motion.
+        overlaps: integrals of products of the shape functions [m^2], follow from the others.
 
     Example:
         >>> import jax; jax.config.update("jax_enable_x64", True)
@@ -134,6 +135,7 @@ class MembraneElement(Quadrilateral):
         prestress: resultants per length 11, 22, 12 that are there without strain [N/m]; default: none.
         damping: see `nc.ShellElement` [s].
         membrane: see `nc.ShellElement`.
+        mass: see `nc.ShellElement`.
         reference: points (4, 3) without strain [m]; None: those of the assembled pose.
 
     Example:

@@ -158,11 +158,11 @@ class QuadrilateralMatrices:
         self.membrane = self.stiffness[:6, :6]
 
 
-def areas_of(x: Float[Array, "4 3"]) -> Float[Array, "4"]:
-    """Areas that the nodes of an element stand for [m^2]."""
+def overlaps_of(x: Float[Array, "4 3"]) -> Float[Array, "4 4"]:
+    """Integrals of the products of the shape functions [m^2]."""
     surface = QuadrilateralSurface(x)
     areas = jnp.stack([surface.at(xi, eta)[1] for xi, eta in POINTS])
-    return jnp.asarray(SHAPES).T @ areas
+    return (jnp.asarray(SHAPES.T) * areas) @ SHAPES
 
 
 def dot(u: Array, v: Array) -> Array:

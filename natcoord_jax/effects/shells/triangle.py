@@ -76,9 +76,9 @@ class Triangle(LayerElement):
         """Integrals over the element."""
         return TriangleMatrices(x, self.sheet(), self.direction)
 
-    def areas_of(self, x: Float[Array, "3 3"]) -> Float[Array, "3"]:
+    def overlaps_of(self, x: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
         """Of its nodes."""
-        return jnp.full(3, jacobian_of(x, None)[1] / 6.0)
+        return jacobian_of(x, None)[1] / 24.0 * (np.ones((3, 3)) + np.eye(3))
 
 
 def membrane_invariants(place: Float[Array, "3 3 *n"]) -> tuple[Array, Array, Array]:
@@ -100,6 +100,7 @@ class ShellTriangle(Triangle):
         offset: see `nc.ShellElement` [m].
         prestress: see `nc.ShellElement` [N/m].
         damping: see `nc.ShellElement` [s].
+        mass: see `nc.ShellElement`.
         reference: points and directors (3, 2, 3) without stress [m, -]; None: those of the assembled pose.
 
     Example:
@@ -151,6 +152,7 @@ class MembraneTriangle(Triangle):
         offset: must be None: there is no director along which it would be.
         prestress: see `nc.ShellElement` [N/m].
         damping: see `nc.ShellElement` [s].
+        mass: see `nc.ShellElement`.
         reference: points (3, 3) without strain [m]; None: those of the assembled pose.
 
     Example:

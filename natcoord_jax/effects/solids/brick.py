@@ -20,7 +20,8 @@ from natcoord_jax.core.markers import Markers
 from natcoord_jax.core.numeric import Numbers
 from natcoord_jax.core.potential import Potential, place_markers
 from natcoord_jax.core.together import instances_last, place_together
-from natcoord_jax.effects.materials import Elastic
+from natcoord_jax.effects.materials import MASS, Elastic
+from natcoord_jax.effects.solids.mass import consistent_mass
 from natcoord_jax.maths.elimination import definite_inverse
 from natcoord_jax.maths.vectors import cross, dot, safe_sqrt
 
@@ -100,11 +101,10 @@ class SolidReadings(eqx.Module):
 class Brick(Potential):
     """A hexahedron of eight points, of a Saint Venant-Kirchhoff material, stress-free as assembled.
 
-    The element brings its mass to its nodes.
-
     Attributes:
         markers: the eight nodes: four in turn round one face, then those above them.
         material: as `nc.Elastic`.
+        mass: "lumped" at the nodes, or "consistent": between them, too, that of the interpolated motion.
         reference: points (8, 3) without stress [m]; None: those of the assembled pose.
         gradients: derivatives of the shape functions at the Gauss points [1/m], follow from the others.
         stiffness: by the strains there [J], follows from the others.
@@ -125,6 +125,7 @@ class Brick(Potential):
 
     markers: Any = eqx.field(metadata=is_a(Markers(8)))
     material: Any = eqx.field(kw_only=True, metadata=is_a(of("a material, as nc.Elastic(...)", Elastic)))
+    mass: str = eqx.field(default="lumped", kw_only=True, static=True, metadata=is_a(MASS))
     reference: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Numbers((8, 3))))
     gradients: Any = eqx.field(default=None, init=False)
     stiffness: Any = eqx.field(default=None, init=False)
@@ -168,8 +169,10 @@ class Brick(Potential):
         found = {"gradients": jnp.stack(gradients), "volumes": jnp.stack(volumes), "stiffness": stiffness}
         return replace_fields(self, **found)
 
-    def lumped_mass(self) -> Float[Array, "8"]:
+    def mass_matrix(self) -> Float[Array, "8 *m"]:
         """Of the points [kg]."""
+        if self.mass == "consistent":
+            return consistent_mass(8, self.reference, self.material.density)
         return self.material.density * (SHAPES.T @ self.volumes)
 
     def flaws(self) -> dict[str, Array]:

@@ -25,13 +25,14 @@ from natcoord_jax.core.markers import Markers
 from natcoord_jax.core.numeric import Numbers
 from natcoord_jax.core.potential import Potential, place_markers
 from natcoord_jax.effects.hyperelastic import Hyperelastic, tensors_of
-from natcoord_jax.effects.materials import Elastic
+from natcoord_jax.effects.materials import MASS, Elastic
 from natcoord_jax.effects.solids.brick import (
     SolidReadings,
     inverse_and_volume,
     smallest_volume_ratios,
     von_mises,
 )
+from natcoord_jax.effects.solids.mass import consistent_mass, lumped_mass
 from natcoord_jax.effects.solids.tangents import solid_tangents
 from natcoord_jax.maths.collocation import Tableau
 from natcoord_jax.maths.symmetric import PAIRS, full
@@ -42,12 +43,10 @@ MATERIAL = of("a material, as nc.Elastic(...) or nc.NeoHooke(...)", Elastic, Hyp
 class SolidElement(Potential):
     """Base of elements of solids: a subclass says of how many nodes, and what the volumes are projected on.
 
-    The element brings its mass to its nodes, in proportion to the integrals of the squared shape functions
-    (E. Hinton, T. Rock, O. C. Zienkiewicz, Earthq. Eng. Struct. Dyn. 4 (1976) 245-249): none is negative.
-
     Attributes:
         markers: its nodes, in the order of `nc.mesh.Mesh`.
         material: as `nc.Elastic` or `nc.NeoHooke`.
+        mass: "lumped" at the nodes, or "consistent": between them, too, that of the interpolated motion.
         reference: points (k, 3) without stress [m]; None: those of the assembled pose.
         gradients: derivatives of the shape functions at the quadrature points [1/m], follow from the others.
         volumes: of the quadrature points [m^3], follow from the others.
@@ -60,6 +59,7 @@ class SolidElement(Potential):
 
     markers: Any = eqx.field(metadata=is_a(Markers()))
     material: Any = eqx.field(kw_only=True, metadata=is_a(MATERIAL))
+    mass: str = eqx.field(default="lumped", kw_only=True, static=True, metadata=is_a(MASS))
     reference: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Numbers((None, 3))))
     gradients: Any = eqx.field(default=None, init=False)
     volumes: Any = eqx.field(default=None, init=False)
@@ -108,17 +108,16 @@ class SolidElement(Potential):
         stacked = jnp.stack(modes, axis=1) if modes else jnp.zeros((len(volumes), 0))
         return replace_fields(self, gradients=jnp.stack(gradients), volumes=volume, modes=stacked)
 
-    def lumped_mass(self) -> Float[Array, " k"]:
+    def mass_matrix(self) -> Float[Array, "k *m"]:
         """Of the points [kg]."""
-        share = shapes(CELLS[self.count], quadrature(self.count)[0])[0].T ** 2 @ self.volumes
-        return self.material.density * jnp.sum(self.volumes) * share / jnp.sum(share)
+        if self.mass == "consistent":
+            return consistent_mass(self.count, self.reference, self.material.density)
+        return lumped_mass(self.count, self.volumes, self.material.density)
 
     def flaws(self) -> dict[str, Array]:
         """Corners that are no corners."""
-        said = (
-            "is degenerate or turned inside out: list its nodes in the order of nc.mesh.Mesh, middles of "
-            "edges near their middles"
-        )
+        said = "is degenerate or turned inside out: list its nodes in the order of nc.mesh.Mesh, middles of "
+        said += "edges near their middles"
         return {said: jnp.min(self.volumes) <= 0.0, **self.material.flaws()}
 
     def volume_ratios(self, place: Array, rows: Array) -> Float[Array, " n"]:
@@ -218,6 +217,7 @@ class Hexahedron8(SolidElement):
     Attributes:
         markers: its nodes, in the order of `nc.mesh.Mesh`.
         material: as `nc.Elastic` or `nc.NeoHooke`.
+        mass: "lumped" at the nodes, or "consistent": between them, too, that of the interpolated motion.
         reference: points without stress [m]; None: those of the assembled pose.
 
     Example:
