@@ -246,3 +246,29 @@ def test_without_it_nothing_changes():
     assert system.mass_between is None
     none = replace_fields(system, mass_between=None)
     assert jax.tree.structure(none) == jax.tree.structure(system)
+
+
+class Light(nc.ShellElement):
+    """A shell whose directors have no mass."""
+
+    kind = "light shell"
+
+    def mass_matrix(self):
+        """Of the points."""
+        return self.material.density * self.thickness * self.areas
+
+
+def test_directors_without_mass():
+    """They turn as the stresses ask for; energy and momenta of a flying plate stay exact."""
+    scene, mesh = nc.Scene(), nc.mesh.rectangle((1.0, 0.5), (3, 2))
+    spin = np.array([1.0, 0.5, 2.0])
+    moving = dict(velocity=np.cross(spin, mesh.nodes), angular_velocity=spin)
+    nodes = scene.add(nc.Nodes.directors(mesh.nodes, (0, 0, 1.0), **moving))
+    scene.add(Light.on(nodes, mesh.cells, thickness=0.02, material=nc.Elastic(E=2e7, nu=0.3, density=1000.0)))
+    system, state = scene.compile()
+    assert float(jnp.max(jnp.abs(system.mass[:, 1:, 1:]))) == 0.0
+    trajectory = nc.simulate(system, state, dt=0.01, steps=200)
+    assert nc.balance(system, trajectory).energy.max() <= tol.ENERGY_OF_A_SOLID
+    turning = np.asarray(system.angular_momentum(trajectory))
+    assert np.ptp(turning, axis=0).max() <= tol.MOMENTUM_OF_A_SOLID * np.linalg.norm(turning[0])
+    assert float(trajectory.iterations) <= 6 * 200

@@ -298,6 +298,40 @@ def test_frequency_of_shells():
     np.testing.assert_allclose(lowest, 9.958, atol=5e-4)
 
 
+class StiffShell(nc.ShellElement):
+    """A shell of twice the energy."""
+
+    kind = "stiff shell"
+
+    def energy(self, invariants):
+        """Twice that of others."""
+        return 2.0 * super().energy(invariants)
+
+    def slope(self, invariants):
+        """Twice that of others."""
+        return 2.0 * super().slope(invariants)
+
+    def energy_curvature(self, invariants):
+        """Twice that of others."""
+        return 2.0 * self.stiffness
+
+
+def test_an_element_of_ones_own_on_the_base_of_another():
+    """Numbers that follow from the pose are there for its methods: it bends half as far."""
+    mesh, sags = nc.mesh.rectangle((1.0, 0.5), (3, 1)), []
+    for element in (nc.ShellElement, StiffShell):
+        scene = nc.Scene()
+        nodes = scene.add(nc.Nodes.directors(mesh.nodes, (0, 0, 1.0)))
+        metal = nc.Elastic(E=2e9, nu=0.3, density=1000.0)
+        scene.add(element.on(nodes, mesh.cells, thickness=0.02, material=metal))
+        scene.add(nc.Clamp(nc.ground, nodes.where(lambda x: x[:, 0] < x[:, 0].min() + 1e-9)))
+        scene.add(nc.PointForce((nc.Point(nodes[3]),), force=(0, 0, 1e-4)))
+        system, state = scene.compile()
+        end = nc.equilibrium(system, state).state
+        sags.append(float(np.abs(np.asarray(end.q - state.q)[:, 2]).max()))
+    assert sags[0] == pytest.approx(2.0 * sags[1], rel=1e-6)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("analysis", ["statics", "path"])
 def test_large_statics_are_solved_by_the_sparse_plan(analysis, monkeypatch):

@@ -9,13 +9,15 @@ from collections.abc import Callable, Hashable
 from functools import lru_cache, partial
 from inspect import unwrap
 from types import FunctionType
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import equinox as eqx
 import jax
 import numpy as np
 
 from natcoord_jax.xla.programs import LIBRARIES, Signature, signature
+
+M = TypeVar("M", bound=eqx.Module)
 
 
 class Function(eqx.Module):
@@ -39,6 +41,14 @@ class Function(eqx.Module):
         if isinstance(value, eqx.Module) or not callable(value):
             return value
         return cls(value, (signature("", (examples, {}))[0],) if examples else ())
+
+
+def replace_fields(module: M, **fields: Any) -> M:
+    """Copy of a module with other values in some fields, whatever its constructor takes."""
+    fresh = object.__new__(type(module))
+    for field in dataclasses.fields(module):
+        object.__setattr__(fresh, field.name, fields.get(field.name, getattr(module, field.name)))
+    return fresh
 
 
 class Stacked(eqx.Module):

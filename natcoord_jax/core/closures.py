@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from natcoord_jax.core.callables import Function, Looked, facts, mapped, name_of, own_methods
+from natcoord_jax.core.callables import Function, Looked, facts, mapped, name_of, own_methods, replace_fields
 from natcoord_jax.core.checks import as_array, is_concrete
 from natcoord_jax.xla.programs import Program, Signature, signature, traced
 
@@ -154,9 +154,10 @@ class Seen(eqx.Module):
 
 
 class Slot(eqx.Module):
-    """A callable among arguments: which one it is, and its numbers."""
+    """A callable among arguments: which one it is, its numbers, and what of it has got another structure."""
 
     leaves: list[Any]
+    grown: dict[str, Any]
     position: int = eqx.field(static=True)
 
 
@@ -167,9 +168,24 @@ def _slotted(call: Call, tree: Any) -> Any:
         seen = x.seen if isinstance(x, Looked) else x
         if not isinstance(seen, Seen) or seen.origin.call is not call:
             return x
-        return Slot([] if x is seen else _own_leaves(x), seen.origin.position)
+        position = seen.origin.position
+        if x is seen:
+            return Slot([], {}, position)
+        grown = _grown(x, seen.origin.part)
+        before = {name: getattr(seen.origin.part, name) for name in grown}
+        return Slot(_own_leaves(replace_fields(x, **before) if grown else x), grown, position)
 
     return jax.tree.map(slot, tree, is_leaf=lambda x: isinstance(x, Seen | Looked))
+
+
+def _grown(module: Looked, part: Any) -> dict[str, Any]:
+    """Fields that have been given numbers since a module was seen, as those that follow from others."""
+    found = {}
+    for name in (field.name for field in dataclasses.fields(part) if not field.metadata.get("static")):
+        now, before = getattr(module, name), getattr(part, name)
+        if before is None and now is not None:
+            found[name] = now
+    return found
 
 
 def _own_leaves(module: Looked) -> list[Any]:
@@ -183,7 +199,8 @@ def _called(part: Any, method: str, call: Call, arguments: Any) -> Any:
     def whole(x: Any) -> Any:
         if not isinstance(x, Slot):
             return x
-        return jax.tree.unflatten(jax.tree.structure(call.parts[x.position]), x.leaves)
+        found = jax.tree.unflatten(jax.tree.structure(call.parts[x.position]), x.leaves)
+        return replace_fields(found, **x.grown) if x.grown else found
 
     args, kwargs = jax.tree.map(whole, arguments, is_leaf=lambda x: isinstance(x, Slot))
     return getattr(type(part), method)(*args, **kwargs) if method else part(*args, **kwargs)

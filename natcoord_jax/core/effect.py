@@ -5,8 +5,7 @@ with forces on those rows, torques, constraint rates and power. It never sees th
 """
 
 import abc
-import dataclasses
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -14,17 +13,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from natcoord_jax.core.arguments import Part
+from natcoord_jax.core.callables import replace_fields as replace_fields
 from natcoord_jax.maths.collocation import Tableau
-
-M = TypeVar("M", bound=eqx.Module)
-
-
-def replace_fields(module: M, **fields: Any) -> M:
-    """Copy of a module with other values in some fields, whatever its constructor takes."""
-    fresh = object.__new__(type(module))
-    for field in dataclasses.fields(module):
-        object.__setattr__(fresh, field.name, fields.get(field.name, getattr(module, field.name)))
-    return fresh
 
 
 class Motion(eqx.Module):
