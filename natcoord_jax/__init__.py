@@ -87,6 +87,7 @@ from natcoord_jax.core.handles import ground
 from natcoord_jax.core.jit import jit, keep_programs, set_effort
 from natcoord_jax.core.joint import Frame, Joint
 from natcoord_jax.core.markers import Attachment, Direction, Point
+from natcoord_jax.core.mixed_potential import MixedPotential
 from natcoord_jax.core.nodes import Clamp
 from natcoord_jax.core.potential import Potential
 from natcoord_jax.core.results import DerivativeError, Result, SimulationError
@@ -292,6 +293,7 @@ __all__ = [
     "MembraneElement",
     "MembraneTriangle",
     "MeshHandle",
+    "MixedPotential",
     "Modes",
     "NodeKind",
     "Nodes",

@@ -507,6 +507,7 @@ BASES = {
     "Gap",
     "Hyperelastic",
     "Joint",
+    "MixedPotential",
     "Potential",
     "VelocityConstraint",
 }

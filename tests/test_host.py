@@ -50,6 +50,7 @@ CASES = {
     "loops": lambda x: (
         lax.scan(lambda s, y: (s + y, s * y), x[0], x, reverse=True),
         lax.while_loop(lambda s: jnp.sum(s) < 9.0, lambda s: s + 1.0, x[0]),
+        jax.vmap(lambda row: lax.while_loop(lambda s: jnp.sum(s) < 9.0, lambda s: s + 1.0, row))(x),
         lax.fori_loop(0, 3, lambda k, s: s * x[k, 0], 1.0),
         lax.cond(x[0, 0] > 0, jnp.sin, jnp.cos, x[1]),
     ),

@@ -99,9 +99,14 @@ def _while(given: dict[str, Any], operands: list[np.ndarray]) -> list[np.ndarray
     of_test, of_body = given["cond_nconsts"], given["body_nconsts"]
     test, body = operands[:of_test], operands[of_test : of_test + of_body]
     state = operands[of_test + of_body :]
-    while evaluate(given["cond_jaxpr"], [*test, *state])[0]:
-        state = evaluate(given["body_jaxpr"], [*body, *state])
-    return state
+    while True:
+        (going,) = evaluate(given["cond_jaxpr"], [*test, *state])
+        if not np.any(going):
+            return state
+        found = evaluate(given["body_jaxpr"], [*body, *state])
+        # Of many loops at once those that have ended stay as they are.
+        lanes = (np.reshape(going, going.shape + (1,) * (x.ndim - going.ndim)) for x in found)
+        state = [np.where(on, x, old) if going.ndim else x for on, x, old in zip(lanes, found, state)]
 
 
 def _cond(given: dict[str, Any], operands: list[np.ndarray]) -> list[np.ndarray]:

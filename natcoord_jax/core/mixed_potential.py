@@ -1,0 +1,114 @@
+"""Potentials with unknowns of their own, as pressures and enhanced strains in elements."""
+
+import abc
+from typing import ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from natcoord_jax.core.potential import Potential, place_markers
+from natcoord_jax.maths.elimination import definite_inverse, definite_solution
+
+ITERATIONS = 30
+"""Most of Newton's method for the unknowns of an element."""
+
+SETTLED = 1e-12
+"""Change of the unknowns, relative, after which one more step leaves rounding only."""
+
+
+class MixedReadings(eqx.Module):
+    """What the sensor of an element with unknowns of its own shows.
+
+    Attributes:
+        own: its unknowns.
+        energy: stored [J].
+    """
+
+    own: Float[Array, "*t own"]
+    energy: Float[Array, "*t"]
+
+
+class MixedPotential(Potential):
+    """Base of potentials with unknowns that nothing else sees, as the pressure in an element.
+
+    Give `invariants`, and `mixed_energy` of these and of the unknowns. The energy is its stationary value: a
+    minimum, as by enhanced strains, or a saddle, as by pressures. Elements solve for their unknowns by
+    themselves, so that the equations of the system do not have them; `system.sense` shows them. Energy and
+    momenta are kept as by any potential.
+
+    By the rule that derivatives of a stationary value need those of the unknowns to a lower order only, one
+    more step of Newton's method, from the solution, makes first to third derivatives exact.
+
+    Attributes:
+        markers: see `nc.Potential`.
+
+    Class attributes:
+        unknowns: number of unknowns of an element.
+
+    Example:
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import natcoord_jax as nc
+        >>> class Series(nc.MixedPotential):
+        ...     '''Two springs one after the other, with a point between them that has no mass.'''
+        ...     unknowns = 1
+        ...     def invariants(self, x):
+        ...         return ((x[1] - x[0]) @ (x[1] - x[0]))[None]
+        ...     def mixed_energy(self, invariants, own):
+        ...         return 0.5 * 300.0 * own[0] ** 2 + 0.5 * 600.0 * (invariants[0] - own[0]) ** 2
+        >>> scene = nc.Scene()
+        >>> ball = scene.add(nc.PointMass(mass=1.0, position=(1, 0, 0)))
+        >>> both = scene.add(Series((nc.Point(nc.ground), nc.Point(ball))))
+        >>> system, state = scene.compile()
+        >>> print(system.sense(state, both).own.round(6), system.sense(state, both).energy.round(6))
+        [0.666667] 100.0
+    """
+
+    silent: ClassVar[bool] = False
+    unknowns: ClassVar[int]
+
+    @abc.abstractmethod
+    def mixed_energy(self, invariants: Float[Array, " p"], own: Float[Array, " own"]) -> Float[Array, ""]:
+        """Energy [J], stationary in the unknowns; its second derivatives by them are quasi-definite."""
+
+    def begun(self, invariants: Float[Array, " p"]) -> Float[Array, " own"]:
+        """Where the search for the unknowns begins."""
+        return jnp.zeros(self.unknowns, invariants.dtype)
+
+    def own_unknowns(self, invariants: Float[Array, " p"]) -> Float[Array, " own"]:
+        """The unknowns, with their derivatives; NaN where none are found, by which a run fails."""
+        still, place = jax.lax.stop_gradient((self, invariants))
+
+        def trip(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+            own, _, count = carry
+            step, reach = still.change(place, own), still.reach(place, own)
+            return own + step, jnp.all(jnp.abs(step) <= SETTLED * (jnp.abs(own) + reach)), count + 1
+
+        def searching(carry: tuple[Array, Array, Array]) -> Array:
+            return ~carry[1] & (carry[2] < ITERATIONS)
+
+        first = still.begun(place), jnp.array(False), jnp.array(0)
+        found, settled, _ = jax.lax.while_loop(searching, trip, first)
+        found = jnp.where(settled, found, jnp.nan)
+        return found + self.change(invariants, found)
+
+    def change(self, invariants: Float[Array, " p"], own: Float[Array, " own"]) -> Float[Array, " own"]:
+        """A step of Newton's method for the unknowns."""
+        slope, bend = jax.grad(self.mixed_energy, 1), jax.hessian(self.mixed_energy, 1)
+        return -definite_solution(bend(invariants, own), slope(invariants, own))
+
+    def reach(self, invariants: Float[Array, " p"], own: Float[Array, " own"]) -> Float[Array, " own"]:
+        """How far the unknowns would change if the invariants did by all of themselves, term by term."""
+        mixed = jax.jacfwd(jax.grad(self.mixed_energy, 1), 0)(invariants, own)
+        inverse = definite_inverse(jax.hessian(self.mixed_energy, 1)(invariants, own))
+        return jnp.abs(inverse) @ (jnp.abs(mixed) @ jnp.abs(invariants))
+
+    def energy(self, invariants: Float[Array, " p"]) -> Float[Array, ""]:
+        """Stationary value [J]."""
+        return self.mixed_energy(invariants, self.own_unknowns(invariants))
+
+    def readings(self, place: Array, rows: Array) -> MixedReadings:
+        """The unknowns and the energy."""
+        invariants = self.invariants(place_markers(place, rows))
+        return MixedReadings(self.own_unknowns(invariants), self.energy(invariants))
