@@ -171,3 +171,25 @@ def name_of(part: Any) -> str:
     if code is None:
         return f"a {type(part).__name__}"
     return f"the function {code.co_name!r} ({code.co_filename}, line {code.co_firstlineno})"
+
+
+def looked(module: Any, seen: Any) -> Any:
+    """A module whose methods are those that were seen."""
+    cls = _looked_class(type(module))
+    fresh = object.__new__(cls)
+    for field in dataclasses.fields(module):
+        object.__setattr__(fresh, field.name, getattr(module, field.name))
+    object.__setattr__(fresh, "seen", seen)
+    return fresh
+
+
+@lru_cache(maxsize=4096)
+def _looked_class(cls: type) -> type:
+    def method(name: str) -> Callable[..., Any]:
+        def call(self: Any, *args: Any, **kwargs: Any) -> Any:
+            return self.seen.call(name, (self, *args), kwargs)
+
+        return call
+
+    names = {name: method(name) for name in own_methods(cls)}
+    return type(cls)(cls.__name__, (cls, Looked), {"__module__": cls.__module__, **names})

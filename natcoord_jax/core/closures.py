@@ -13,7 +13,7 @@ import dataclasses
 import hashlib
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Sequence
-from functools import lru_cache, partial
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -21,7 +21,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from natcoord_jax.core.callables import Function, Looked, facts, mapped, name_of, own_methods, replace_fields
+from natcoord_jax.core.callables import (
+    Function,
+    Looked,
+    facts,
+    looked,
+    mapped,
+    name_of,
+    own_methods,
+    replace_fields,
+)
 from natcoord_jax.core.checks import as_array, is_concrete
 from natcoord_jax.xla.programs import Program, Signature, signature, traced
 
@@ -220,28 +229,6 @@ def _content(x: Any) -> Hashable:
     return array.shape, array.dtype.str, content if len(content) < 100 else hashlib.sha256(content).digest()
 
 
-def _looked(module: Any, seen: Seen) -> Any:
-    """A module whose methods are those that were seen."""
-    cls = _looked_class(type(module))
-    fresh = object.__new__(cls)
-    for field in dataclasses.fields(module):
-        object.__setattr__(fresh, field.name, getattr(module, field.name))
-    object.__setattr__(fresh, "seen", seen)
-    return fresh
-
-
-@lru_cache(maxsize=4096)
-def _looked_class(cls: type) -> type:
-    def method(name: str) -> Callable[..., Any]:
-        def call(self: Any, *args: Any, **kwargs: Any) -> Any:
-            return self.seen.call(name, (self, *args), kwargs)
-
-        return call
-
-    names = {name: method(name) for name in own_methods(cls)}
-    return type(cls)(cls.__name__, (cls, Looked), {"__module__": cls.__module__, **names})
-
-
 KNOWN: OrderedDict[Hashable, dict[int, dict[Signature, Any]]] = OrderedDict()
 """How callables are called, by program and by what it is called with."""
 
@@ -282,7 +269,7 @@ def with_callables(program: Hashable, run: Callable[..., Any], arguments: tuple)
 
         def seen(part: Any, lanes: tuple[int, ...], call: Call = call, count: Any = count) -> Any:
             found = call.seen(next(count), lanes)
-            return _looked(part, found) if own_methods(type(part)) else found
+            return looked(part, found) if own_methods(type(part)) else found
 
         arguments_now = mapped(arguments, seen, [])
         call.running = True
