@@ -19,7 +19,7 @@ import tolerances as tol
 
 import natcoord_jax as nc
 from natcoord_jax import gallery
-from natcoord_jax.xla import effort, waiting
+from natcoord_jax.xla import effort, kept, waiting
 
 OURS = "XLA_FLAGS", "JAX_COMPILATION_CACHE_DIR", "NATCOORD_JAX_EFFORT"
 """What of the environment is that of the tests."""
@@ -375,6 +375,18 @@ def test_programs_outlast_the_process(lasting, tmp_path):
     assert int(second[2]) > int(first[2]), "nothing of what JAX keeps was found"
     assert second[3:] == ["True", "True"], "full effort was made again"
     assert list(tmp_path.glob("*/full/*"))
+
+
+def test_a_folder_without_a_name_is_none(tmp_path, monkeypatch):
+    """As JAX takes an environment variable that is set to nothing."""
+    monkeypatch.chdir(tmp_path)
+    before = jax.config.jax_compilation_cache_dir
+    jax.config.update("jax_compilation_cache_dir", "")
+    try:
+        kept.put(b"request", b"program")
+        assert kept.get(b"request") is None and not list(tmp_path.iterdir())
+    finally:
+        jax.config.update("jax_compilation_cache_dir", before)
 
 
 def test_programs_are_kept_whole_or_not_at_all(lasting, tmp_path):
