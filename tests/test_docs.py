@@ -7,6 +7,7 @@ import pkgutil
 import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -88,6 +89,22 @@ def test_links_lead_somewhere():
         for target in re.findall(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", page.read_text("utf-8")):
             if not target.startswith(("http:", "https:", "mailto:")):
                 assert (page.parent / target).exists(), f"{page.relative_to(ROOT)} links to {target}"
+
+
+def test_the_page_of_an_index_has_no_dead_links():
+    """There nothing is beside the README: pyproject.toml makes names of its links to files."""
+    text = README.read_text("utf-8")
+    hook = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["hatch"]["metadata"]["hooks"]
+    for change in hook["fancy-pypi-readme"]["substitutions"]:
+        text = re.sub(change["pattern"], change["replacement"], text)
+    assert all(target.startswith("https:") for target in re.findall(r"\]\(([^)]*)\)", text))
+    assert "![" not in text and "`docs/start.md`" in text and "](https://docs.jax.dev)" in text
+
+
+def test_every_page_is_linked_from_the_readme():
+    text = README.read_text("utf-8")
+    missing = [page for page in PAGES if page.startswith("howto/") and f"docs/{page}" not in text]
+    assert not missing
 
 
 def test_reference_is_complete():
