@@ -354,7 +354,9 @@ def test_a_clamped_node_is_refused_with_what_to_ask_instead():
     system, state = scene.compile()
     node = block.nearest((0, 0, 0))
     for asked in (node, nc.Point(node)):
-        with pytest.raises(ValueError, match=r"'block nodes\[0\]' is clamped: it moves with what it is clamped"):
+        with pytest.raises(
+            ValueError, match=r"'block nodes\[0\]' is clamped: it moves with what it is clamped"
+        ):
             system.sense(state, asked)
     with pytest.raises(ValueError, match="cannot sense 'brick'") as refused:
         system.sense(state, "brick")

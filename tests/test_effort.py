@@ -150,6 +150,29 @@ def test_it_is_transformed_as_others_are(traces):
     assert float(closed) == 6.0, "closed over a number that is being differentiated"
 
 
+def test_lanes_are_compiled_as_all_else(improved):
+    """`jax.vmap` outside of a program: little effort first, and full effort takes over; nested, too."""
+    x, y = jnp.linspace(0.0, 1.0, 6).reshape(2, 3), jnp.array(2.0)
+
+    @partial(nc.jit, effort="tiers")
+    def function(x, y):
+        return {"sum": x + y, "sine": y * jnp.sin(x)}
+
+    for _ in range(3):
+        one = jax.vmap(function, in_axes=(1, None))(x, y)
+        np.testing.assert_allclose(one["sum"], (x + y).T)
+        both = jax.vmap(jax.vmap(lambda a: function(a, y)["sine"]))(x)
+        np.testing.assert_allclose(both, y * np.sin(x), rtol=1e-14)
+        slopes = jax.vmap(jax.grad(lambda a: function(a, y)["sine"]))(x[0])
+        np.testing.assert_allclose(slopes, y * np.cos(x[0]), rtol=1e-14)
+        of_all = jax.grad(lambda y: jax.vmap(lambda a: function(a, y)["sine"])(x[0]).sum())(y)
+        np.testing.assert_allclose(of_all, np.sin(x[0]).sum(), rtol=1e-14)
+        np.testing.assert_allclose(jax.jit(jax.vmap(lambda a: function(a, y)["sine"]))(x[0]), both[0])
+    assert waited(lambda: jax.vmap(function, (1, None))(x, y) and improved), "not with full effort"
+    mean = nc.jit(lambda a: a - jax.lax.pmean(a, "lanes"))
+    np.testing.assert_allclose(jax.vmap(mean, axis_name="lanes")(x[0]), x[0] - x[0].mean(), atol=1e-15)
+
+
 def test_static_arguments_by_number_and_by_name():
     def power(x, n, *, negative=False):
         assert isinstance(n, int) and isinstance(negative, bool)
