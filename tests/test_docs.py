@@ -2,6 +2,7 @@
 
 import doctest
 import importlib
+import json
 import os
 import pkgutil
 import re
@@ -105,6 +106,15 @@ def test_every_page_is_linked_from_the_readme():
     text = README.read_text("utf-8")
     missing = [page for page in PAGES if page.startswith("howto/") and f"docs/{page}" not in text]
     assert not missing
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "notebooks").glob("*.ipynb")), ids=lambda path: path.stem)
+def test_a_notebook_shows_what_it_is_about_moving(path: Path):
+    """As it is stored: with a view in three dimensions, and below 1 MB."""
+    assert path.stat().st_size < 1e6
+    cells = json.loads(path.read_text("utf-8"))["cells"]
+    outputs = [out.get("data", {}) for cell in cells for out in cell.get("outputs", [])]
+    assert any("<iframe" in "".join(data.get("text/html", "")) for data in outputs)
 
 
 def test_reference_is_complete():
