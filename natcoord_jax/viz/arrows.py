@@ -13,6 +13,7 @@ from natcoord_jax.analysis.contacts import contacts, touching
 from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.force import Force
 from natcoord_jax.core.state import State, Trajectory
+from natcoord_jax.effects.contact import DiscreteGap
 from natcoord_jax.maths.collocation import gauss
 from natcoord_jax.mechanics.response import gather, motion_between, no_multipliers, respond, situation
 from natcoord_jax.model.groups import Group
@@ -130,7 +131,9 @@ def pushes(
     """Normal forces of contacts, on average over the step before; of several gaps their sum at its middle."""
     groups = touching(system)
     unknown = trajectory.states.contacts is None and any(g.effect.unilateral for g in groups)
-    if not groups or len(trajectory) < 2 or unknown:
+    # Gaps of surfaces are searched for among facets, for thousands of nodes: a film would wait for that.
+    surfaces = any(isinstance(g.effect, DiscreteGap) for g in groups)
+    if not groups or len(trajectory) < 2 or unknown or surfaces:
         return []
     steps = np.maximum(saved, 1)[:, None] + np.array([-1, 0])
     pairs = dataclasses.replace(trajectory, states=jax.tree.map(lambda x: x[steps], trajectory.states))

@@ -28,7 +28,6 @@ from natcoord_jax.core.kinds import NAME
 from natcoord_jax.core.markers import Attachment, Marker, Markers
 from natcoord_jax.core.potential import marker_response, place_markers
 from natcoord_jax.effects.contact.law import ContactLaw, ContactReadings
-from natcoord_jax.maths.vectors import unit
 
 RIGID = 1e-20
 """Square of the change of distances, relative to theirs, below which the points move as a rigid body."""
@@ -159,11 +158,6 @@ class DiscreteGap(ContactLaw):
     def readings(self, place: Array, rows: Array) -> ContactReadings:
         """Gap and force."""
         return self.readings_at(self.gap(place_markers(place, rows)))
-
-    def touch(self, place: Array, rows: Array) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
-        """The first of its points [m], and the direction in which it is pushed."""
-        x = place_markers(place, rows)
-        return x[0], unit(self.measured(x).lever[0])
 
 
 def _apart(x: Float[Array, "s k 3"], at: Int[Array, " p"]) -> Float[Array, "s p p 3"]:
