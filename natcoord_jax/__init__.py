@@ -1,6 +1,11 @@
 """natcoord_jax: differentiable simulation of flexible multibody systems in natural coordinates."""
 
+import gc
 from typing import TYPE_CHECKING, Any
+
+# What is imported stays: to look through all of it for garbage meanwhile takes a quarter of the time.
+_collecting = gc.isenabled()
+gc.disable()
 
 from natcoord_jax import mesh
 from natcoord_jax.analysis import (
@@ -200,6 +205,9 @@ if TYPE_CHECKING:
     __version__: str
     from natcoord_jax import io
     from natcoord_jax.viz import animate, plot, view
+
+if _collecting:
+    gc.enable()
 
 __all__ = [
     "Accuracy",

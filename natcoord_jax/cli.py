@@ -249,7 +249,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print("\n".join(f"{name:<{width}}  {gallery.describe(name)}" for name in gallery.SCENES))
         return 0
     # (Where the environment names a folder of JAX's own, that is meant.)
-    if parsed.keep_programs and jax.config.jax_compilation_cache_dir is None:  # pyright: ignore[reportAttributeAccessIssue]
+    if parsed.keep_programs and not jax.config.jax_compilation_cache_dir:  # pyright: ignore[reportAttributeAccessIssue]
         nc.keep_programs()
     try:
         return _accuracy(parsed) if parsed.command == "accuracy" else _run(parsed)

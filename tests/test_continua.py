@@ -345,3 +345,19 @@ def test_traced_numbers_go_in_by_set():
 
     with pytest.raises(ValueError, match="outside of jit and grad, and pass what varies by system.set"):
         jax.jit(built)(0.1)
+
+
+def test_a_clamped_node_is_refused_with_what_to_ask_instead():
+    scene, rubber = nc.Scene(), nc.Elastic(E=1e6, nu=0.3, density=1000.0)
+    block = scene.add(nc.Solid(nc.mesh.box((1, 1, 0.5), (1, 1, 1)), material=rubber, name="block"))
+    scene.add(nc.Clamp(nc.ground, block.set("z0")))
+    system, state = scene.compile()
+    node = block.nearest((0, 0, 0))
+    for asked in (node, nc.Point(node)):
+        with pytest.raises(
+            ValueError, match=r"'block nodes\[0\]' is clamped: it moves with what it is clamped"
+        ):
+            system.sense(state, asked)
+    with pytest.raises(ValueError, match="cannot sense 'brick'") as refused:
+        system.sense(state, "brick")
+    assert "clamped" not in str(refused.value)

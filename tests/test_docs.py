@@ -2,11 +2,13 @@
 
 import doctest
 import importlib
+import json
 import os
 import pkgutil
 import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -88,6 +90,31 @@ def test_links_lead_somewhere():
         for target in re.findall(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", page.read_text("utf-8")):
             if not target.startswith(("http:", "https:", "mailto:")):
                 assert (page.parent / target).exists(), f"{page.relative_to(ROOT)} links to {target}"
+
+
+def test_the_page_of_an_index_has_no_dead_links():
+    """There nothing is beside the README: pyproject.toml makes names of its links to files."""
+    text = README.read_text("utf-8")
+    hook = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["hatch"]["metadata"]["hooks"]
+    for change in hook["fancy-pypi-readme"]["substitutions"]:
+        text = re.sub(change["pattern"], change["replacement"], text)
+    assert all(target.startswith("https:") for target in re.findall(r"\]\(([^)]*)\)", text))
+    assert "![" not in text and "`docs/start.md`" in text and "](https://docs.jax.dev)" in text
+
+
+def test_every_page_is_linked_from_the_readme():
+    text = README.read_text("utf-8")
+    missing = [page for page in PAGES if page.startswith("howto/") and f"docs/{page}" not in text]
+    assert not missing
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "notebooks").glob("*.ipynb")), ids=lambda path: path.stem)
+def test_a_notebook_shows_what_it_is_about_moving(path: Path):
+    """As it is stored: with a view in three dimensions, and below 1 MB."""
+    assert path.stat().st_size < 1e6
+    cells = json.loads(path.read_text("utf-8"))["cells"]
+    outputs = [out.get("data", {}) for cell in cells for out in cell.get("outputs", [])]
+    assert any("<iframe" in "".join(data.get("text/html", "")) for data in outputs)
 
 
 def test_reference_is_complete():

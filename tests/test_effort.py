@@ -19,7 +19,7 @@ import tolerances as tol
 
 import natcoord_jax as nc
 from natcoord_jax import gallery
-from natcoord_jax.xla import effort, waiting
+from natcoord_jax.xla import effort, kept, waiting
 
 OURS = "XLA_FLAGS", "JAX_COMPILATION_CACHE_DIR", "NATCOORD_JAX_EFFORT"
 """What of the environment is that of the tests."""
@@ -148,6 +148,29 @@ def test_it_is_transformed_as_others_are(traces):
     np.testing.assert_allclose(jax.grad(lambda y: compiled(1.0, y))(3.0), jnp.sin(1.0))
     closed = jax.grad(lambda y: nc.jit(lambda: y**2)())(3.0)
     assert float(closed) == 6.0, "closed over a number that is being differentiated"
+
+
+def test_lanes_are_compiled_as_all_else(improved):
+    """`jax.vmap` outside of a program: little effort first, and full effort takes over; nested, too."""
+    x, y = jnp.linspace(0.0, 1.0, 6).reshape(2, 3), jnp.array(2.0)
+
+    @partial(nc.jit, effort="tiers")
+    def function(x, y):
+        return {"sum": x + y, "sine": y * jnp.sin(x)}
+
+    for _ in range(3):
+        one = jax.vmap(function, in_axes=(1, None))(x, y)
+        np.testing.assert_allclose(one["sum"], (x + y).T)
+        both = jax.vmap(jax.vmap(lambda a: function(a, y)["sine"]))(x)
+        np.testing.assert_allclose(both, y * np.sin(x), rtol=1e-14)
+        slopes = jax.vmap(jax.grad(lambda a: function(a, y)["sine"]))(x[0])
+        np.testing.assert_allclose(slopes, y * np.cos(x[0]), rtol=1e-14)
+        of_all = jax.grad(lambda y: jax.vmap(lambda a: function(a, y)["sine"])(x[0]).sum())(y)
+        np.testing.assert_allclose(of_all, np.sin(x[0]).sum(), rtol=1e-14)
+        np.testing.assert_allclose(jax.jit(jax.vmap(lambda a: function(a, y)["sine"]))(x[0]), both[0])
+    assert waited(lambda: jax.vmap(function, (1, None))(x, y) and improved), "not with full effort"
+    mean = nc.jit(lambda a: a - jax.lax.pmean(a, "lanes"))
+    np.testing.assert_allclose(jax.vmap(mean, axis_name="lanes")(x[0]), x[0] - x[0].mean(), atol=1e-15)
 
 
 def test_static_arguments_by_number_and_by_name():
@@ -375,6 +398,18 @@ def test_programs_outlast_the_process(lasting, tmp_path):
     assert int(second[2]) > int(first[2]), "nothing of what JAX keeps was found"
     assert second[3:] == ["True", "True"], "full effort was made again"
     assert list(tmp_path.glob("*/full/*"))
+
+
+def test_a_folder_without_a_name_is_none(tmp_path, monkeypatch):
+    """As JAX takes an environment variable that is set to nothing."""
+    monkeypatch.chdir(tmp_path)
+    before = jax.config.jax_compilation_cache_dir
+    jax.config.update("jax_compilation_cache_dir", "")
+    try:
+        kept.put(b"request", b"program")
+        assert kept.get(b"request") is None and not list(tmp_path.iterdir())
+    finally:
+        jax.config.update("jax_compilation_cache_dir", before)
 
 
 def test_programs_are_kept_whole_or_not_at_all(lasting, tmp_path):

@@ -14,6 +14,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 PACKAGE = "natcoord_jax"
@@ -276,6 +277,21 @@ def test_import_is_light_and_changes_no_setting():
     changed, heavy = json.loads(run.stdout.splitlines()[-1])
     assert not changed, f"import {PACKAGE} changes settings of JAX: {', '.join(changed)}"
     assert not heavy, f"import {PACKAGE} loads {', '.join(heavy)}; import them where they are used"
+
+
+@pytest.mark.slow
+def test_import_takes_less_than_half_a_second(tmp_path):
+    """Above what JAX takes, of the processor; on a machine on which JAX takes long, in proportion."""
+    program = (
+        "import time; begun = time.process_time(); import jax; between = time.process_time()\n"
+        f"import {PACKAGE}; print(between - begun, time.process_time() - between)\n"
+        "import gc; assert gc.isenabled()"
+    )
+    env = os.environ | {"PYTHONPYCACHEPREFIX": str(tmp_path), "PYTHONDONTWRITEBYTECODE": ""}
+    command = [sys.executable, "-c", program]
+    runs = [subprocess.run(command, cwd=ROOT, env=env, capture_output=True, text=True) for _ in range(6)]
+    own, ours = np.array([run.stdout.split() for run in runs[1:]], float).min(axis=0)  # The first compiles.
+    assert ours < max(0.5, 1.25 * own), f"{ours:.2f} s, where JAX takes {own:.2f} s"
 
 
 def test_public_names_have_docstrings():

@@ -14,7 +14,7 @@ import pytest  # noqa: E402
 
 import natcoord_jax as nc  # noqa: E402
 from natcoord_jax import gallery  # noqa: E402
-from natcoord_jax.viz.motion import scenery_at  # noqa: E402
+from natcoord_jax.viz.motion import GHOSTLY, lanes_of, scenery_at, together  # noqa: E402
 from natcoord_jax.viz.outline import bodies_of  # noqa: E402
 from natcoord_jax.viz.panels import Curve, Panel, draw  # noqa: E402
 from natcoord_jax.viz.parts import seats  # noqa: E402
@@ -149,8 +149,35 @@ def test_batches_are_bands(run):
     figure = nc.plot(system, batch)
     [angles] = [axes for axes in figure.axes if axes.get_title() == "joint angles"]
     assert len(angles.lines) == 2 and len(angles.collections) == 2
-    with pytest.raises(ValueError, match="one lane for pictures, not a batch"):
-        nc.plot(system, batch, times=(0.0,))
+    figure = nc.plot(system, batch, times=(0.0, 0.02))
+    assert len(figure.subfigs[0].axes) == 2
+
+
+def test_a_batch_is_filmed_with_ghosts(run, tmp_path):
+    """From vmap, of runs of different steps: each where it is at that time, at rest at its own end."""
+    example = gallery.load("double_pendulum")
+
+    def of(dt):
+        return nc.simulate(example.system, example.state, dt=dt, steps=10)
+
+    system, batch = example.system, jax.vmap(of)(jnp.array([0.005, 0.01]))
+    shown = together(lanes_of(system, batch, "animate"), np.linspace(0, 0.1, 11))
+    rods = [s for s in shown.solids if s.name == "rod 2" and s.kind == "body"]
+    assert [s.alpha for s in rods] == [1.0, GHOSTLY]
+    places = np.asarray(batch.q)[:, :, 4]
+    np.testing.assert_allclose(rods[1].rows[:, 0], places[1], atol=1e-12)
+    np.testing.assert_allclose(rods[0].rows[6:, 0], places[[0] * 5, 10], atol=1e-12)
+    film = nc.animate(system, batch, file=tmp_path / "batch.gif", fps=5)
+    assert film.read_bytes()[:3] == b"GIF"
+    # Bands are at times, not at numbers of steps: at 0.05 s the first run is at its end.
+    figure = nc.plot(system, batch)
+    [angles] = [axes for axes in figure.axes if axes.get_title() == "joint angles"]
+    own = np.asarray(system.sense(batch, "hinge 1").angle)
+    t, middle = angles.lines[0].get_data()
+    assert t[5] == pytest.approx(0.05) and middle[5] == pytest.approx(0.5 * (own[0, 10] + own[1, 5]))
+    assert middle[10] == pytest.approx(own[1, 10])
+    assert nc.balance(system, batch).energy.shape == (2, 11)
+    assert system.explain(batch) == "none of 2 lanes failed"
 
 
 def test_solutions_show_their_bounds_and_goals():

@@ -117,6 +117,56 @@ def test_surfaces_springs_forces_and_traces(sheet):
     assert view.ground == pytest.approx(np.asarray(trajectory.q)[:, ::4, 2].min())
 
 
+def test_contacts_and_motors_have_arrows():
+    """Two balls at rest carry their weights; motors turn about their axes and push along them."""
+    scene = nc.Scene()
+    scene.add(nc.Gravity())
+    for name, x, density in (("light", 0.0, 400.0), ("heavy", 1.0, 800.0)):
+        ball = nc.RigidBody(shape=nc.Sphere(0.1), density=density, position=(x, 0, 0.1), name=name)
+        scene.add(nc.Contact(scene.add(ball), nc.Plane(), restitution=0.0, name=f"floor of {name}"))
+    rod = scene.add(nc.RigidBody(mass=1.0, inertia=(0.1, 0.1, 0.1), com=(0.3, 0, 0), name="rod"))
+    hinge = scene.add(nc.Revolute(nc.ground, rod, axis=(0, 1, 0), name="hinge"))
+    scene.add(nc.JointTorque(hinge, name="motor"))
+    car = scene.add(nc.RigidBody(mass=1.0, inertia=(0.1, 0.1, 0.1), position=(0, 2, 0), name="car"))
+    rail = scene.add(nc.Prismatic(nc.ground, car, point=(0, 2, 0), axis=(1, 0, 0), name="rail"))
+    scene.add(nc.JointForce(rail, name="push"))
+    servo = nc.AffineActuator((hinge,), gain=(2.0, 0, 0), bias=(0, -2.0, 0), name="servo")
+    scene.add(servo)
+    system, state = scene.compile()
+    given = jnp.tile(jnp.array([3.0, -4.0, 0.5]), (8, 1))
+    trajectory = nc.simulate(system, state, dt=0.01, inputs=given)
+    shown = motion.scenery_at(nc.Phases((system,), (trajectory,)), np.asarray(trajectory.t))
+    arrows = {s.name: s.rows for s in shown.solids if s.kind == "force"}
+    assert list(arrows) == ["push", "motor", "servo", "floor of light", "floor of heavy"]
+    one, two = arrows["floor of light"], arrows["floor of heavy"]
+    np.testing.assert_allclose(two[2:, 0], [[1.0, 0, 0]] * 7, atol=1e-9)
+    np.testing.assert_allclose(two[2:, 3], 2 * one[2:, 3], atol=1e-9)
+    assert np.all(one[2:, 3, 2] > 0) and np.abs(one[2:, 3, :2]).max() < 1e-12
+    place = system.structure.bodies.index("car")
+    np.testing.assert_allclose(arrows["push"][:, 0], np.asarray(trajectory.q)[:, 4 * place], atol=1e-12)
+    assert np.all(arrows["push"][:, 3, 0] < 0) and np.abs(arrows["push"][:, 3, 1:]).max() < 1e-12
+    # A turning arrow is as wide as it is long: 3 N m of the motor, 2 (0.5 - angle) of the servo.
+    angle = np.asarray(system.sense(trajectory, hinge).angle)
+    np.testing.assert_allclose(arrows["servo"][:, 3] / arrows["motor"][0, 3, 1],
+                               np.outer(2 * (0.5 - angle) / 3, [0, 1, 0]), atol=1e-12)  # fmt: skip
+    np.testing.assert_allclose(np.linalg.norm(arrows["motor"][:, 1], axis=1), arrows["motor"][:, 3, 1])
+
+
+def test_gaps_of_a_contact_have_one_arrow():
+    """A block of rubber on the floor: one arrow, from below its middle."""
+    scene = nc.Scene()
+    scene.add(nc.Gravity())
+    rubber = nc.Elastic(E=1e6, nu=0.3, density=1000.0)
+    block = scene.add(nc.Solid(nc.mesh.box((1, 1, 0.5), (1, 1, 1)), material=rubber, name="block"))
+    scene.add(nc.Contact(block.face("z0"), nc.Plane(), stiffness=1e5, name="floor"))
+    system, state = scene.compile()
+    trajectory = nc.simulate(system, state, dt=0.01, steps=3)
+    shown = motion.scenery_at(nc.Phases((system,), (trajectory,)), np.asarray(trajectory.t))
+    [force] = [s for s in shown.solids if s.kind == "force"]
+    assert force.name == "floor" and force.rows[3, 3, 2] > 0
+    np.testing.assert_allclose(force.rows[1:, 0, :2], 0.5, atol=1e-9)
+
+
 def test_values_of_elements_that_are_handed_over(sheet, tmp_path):
     system, trajectory = sheet
     nc.view(system, trajectory, file=tmp_path / "a.html", colour={"plate": [1.0, 3.0]})
@@ -133,10 +183,9 @@ def test_batches_are_lanes(run, tmp_path):
     batch = jax.tree.map(lambda x: jnp.stack([x] * 20), trajectory)
     text = nc.view(system, batch, file=tmp_path / "batch.html").read_text("utf-8")
     assert scene_of(text)[0]["lanes"] == 16
-    with pytest.raises(ValueError, match="animate takes one lane"):
-        nc.animate(system, batch)
-    with pytest.raises(ValueError, match=r"batch with one axis, not of shape \(2, 20\)"):
-        nc.view(system, jax.tree.map(lambda x: jnp.stack([x] * 2), batch), file=tmp_path / "batch.html")
+    pairs = jax.tree.map(lambda x: jnp.stack([x] * 2), batch)
+    text = nc.view(system, pairs, file=tmp_path / "batch.html").read_text("utf-8")
+    assert scene_of(text)[0]["lanes"] == 16
 
 
 def test_phases_with_joints_that_come_and_go():

@@ -23,7 +23,7 @@ from natcoord_jax.core.state import TRAJECTORY, State, Trajectory
 from natcoord_jax.maths.collocation import gauss
 from natcoord_jax.maths.vectors import cross, safe_divide
 from natcoord_jax.mechanics.energies import body_momenta
-from natcoord_jax.mechanics.response import StageKinematics, body_rows, gather, respond, situation, stations
+from natcoord_jax.mechanics.response import gather, motion_between, respond, situation
 from natcoord_jax.model.groups import Group
 from natcoord_jax.model.model import SYSTEM
 from natcoord_jax.system import System
@@ -67,18 +67,6 @@ class Balance(eqx.Module):
         return "\n".join(["Balance: largest relative errors [-]", *lines])
 
 
-def _midpoint(before: State, after: State, h: Array) -> StageKinematics:
-    """Motion over a step as the effects saw it: mid-point rows, mean velocities, spins of the mid-points."""
-    start, rates = body_rows(before.q), body_rows(0.5 * (before.v + after.v))
-    middle = (start + 0.5 * h * rates)[:, 1:]
-    d1, d2, d3 = middle[:, 0], middle[:, 1], middle[:, 2]
-    dual = jnp.stack([cross(d2, d3), cross(d3, d1), cross(d1, d2)], axis=1)
-    volume = jnp.sum(d1 * dual[:, 0], axis=-1)
-    spin = 0.5 * jnp.sum(cross(dual, rates[:, 1:]), axis=1) / volume[:, None]
-    points = (start + 0.5 * h * rates)[:, 0]
-    return stations(start, points[None], middle[None], rates[None, :, 0], spin[None])
-
-
 def _resultants(bodies: int, group: Group, motion: Motion, answer: Response) -> Float[Array, "n 6"]:
     """Force and torque about the origin that each instance of a group puts on the bodies (not the ground)."""
     moving = (group.bodies < bodies)[..., None]
@@ -95,7 +83,7 @@ def _step(system: System, midpoint: bool, before: State, after: State, u: Array)
     """Impulse (6,) of all that is known in a step, and Gram matrix (6, 6) of the reactions."""
     bodies, tableau = len(system.structure.bodies), gauss(1)
     h = after.t - before.t
-    at = _midpoint(before, after, h)
+    at = motion_between(before, after, h)
     impulse, gram = jnp.zeros(6), jnp.zeros((6, 6))
     for group in (*system.effects, *system.joints):
         where, motion = situation(system, group, before, u, h), gather(group, at)

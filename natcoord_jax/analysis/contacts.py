@@ -110,7 +110,7 @@ def _listed(names: tuple[str, ...], at: Any) -> str:
     return ", ".join(chosen[:3]) + (f" and {len(chosen) - 3} more" if len(chosen) > 3 else "")
 
 
-def _touching(system: Model) -> list[Group]:
+def touching(system: Model) -> list[Group]:
     """Contacts without a stiffness, in the order of `State.contacts`, then others."""
     every = system.effects
     laws = [g for g in every if isinstance(g.effect, ContactLaw) and not g.effect.unilateral]
@@ -121,7 +121,7 @@ def _touching(system: Model) -> list[Group]:
 def _gaps(system: Model, state: State) -> list[Array]:
     rows = rows_with_ground(state.q)
     each = jax.vmap(lambda effect, place, rows: effect.readings(place, rows).gap)
-    return [each(g.effect, group_places(system, g), rows[g.bodies]) for g in _touching(system)]
+    return [each(g.effect, group_places(system, g), rows[g.bodies]) for g in touching(system)]
 
 
 @checked(system=SYSTEM, trajectory=TRAJECTORY)
@@ -135,7 +135,7 @@ def contacts(system: System, trajectory: Trajectory) -> Contacts:
     Raises:
         ValueError: for a system without contacts, and states that do not know of their impulses.
     """
-    groups = _touching(system)
+    groups = touching(system)
     if not groups:
         raise ValueError("this system has no contacts; add nc.Contact(...) to its scene")
     states, gaps = trajectory.states, [np.asarray(x) for x in _gaps(system, trajectory)]

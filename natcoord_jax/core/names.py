@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -93,6 +94,15 @@ class Names(Sequence):
         if found is None:
             raise ValueError(f"there is no {value!r}")
         return found
+
+
+def clamped(names: Sequence[str], name: Any) -> str:
+    """What is to be said of a node of a set that is none of the bodies; nothing of others."""
+    owner, _, rest = str(name).rpartition("[")
+    runs = names.runs if isinstance(names, Names) else ()
+    if name in names or not rest[:-1].isdigit() or owner not in [set_ for set_, ranges in runs if ranges]:
+        return ""
+    return f"; {name!r} is clamped: it moves with what it is clamped to, so ask that, or nc.Point of it"
 
 
 Run = tuple[str, tuple[range, ...] | None]

@@ -62,6 +62,18 @@ def stations(
     )
 
 
+def motion_between(before: State, after: State, h: Array) -> StageKinematics:
+    """Motion over a step as the effects saw it: mid-point rows, mean velocities, spins of the mid-points."""
+    start, rates = body_rows(before.q), body_rows(0.5 * (before.v + after.v))
+    middle = (start + 0.5 * h * rates)[:, 1:]
+    d1, d2, d3 = middle[:, 0], middle[:, 1], middle[:, 2]
+    dual = jnp.stack([cross(d2, d3), cross(d3, d1), cross(d1, d2)], axis=1)
+    volume = jnp.sum(d1 * dual[:, 0], axis=-1)
+    spin = 0.5 * jnp.sum(cross(dual, rates[:, 1:]), axis=1) / volume[:, None]
+    points = (start + 0.5 * h * rates)[:, 0]
+    return stations(start, points[None], middle[None], rates[None, :, 0], spin[None])
+
+
 class GroupData(eqx.Module):
     """What a group needs besides the motion: places, inputs, coordinates, rates, time, step, extra stress."""
 

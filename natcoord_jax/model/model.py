@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Int
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.kinds import BODY_NAME, JOINT_NAME, NAME, HandleOf, of
-from natcoord_jax.core.names import listed
+from natcoord_jax.core.names import clamped, listed
 from natcoord_jax.model.groups import CoordinateGroup, Elimination, Group
 from natcoord_jax.model.local_rates import LocalRates
 from natcoord_jax.model.masses import MassBetween
@@ -139,5 +139,5 @@ SomeModel = TypeVar("SomeModel", bound=Model)
 def _index(names: Sequence[str], part: Handle | str, kind: str) -> int:
     name = part.name if isinstance(part, Handle) else part
     if name not in names or not name:
-        raise ValueError(f"this system has no {kind} {name!r}; it has {listed(names)}")
+        raise ValueError(f"this system has no {kind} {name!r}; it has {listed(names)}{clamped(names, name)}")
     return names.index(name)

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 from natcoord_jax.core.compiled import compiled
 from natcoord_jax.core.handles import Handle, ground
 from natcoord_jax.core.markers import Interpolated, Marker
+from natcoord_jax.core.names import clamped
 from natcoord_jax.core.names import listed as listed_names
 from natcoord_jax.core.state import State, Trajectory
 from natcoord_jax.maths.rotations import angular_velocity, to_quaternion
@@ -382,4 +383,5 @@ def sense(
     raise ValueError(
         f"cannot sense {part!r}: pass a body ({listed_names(system.structure.bodies)}), a joint "
         f"({[n for n in system.structure.joints if n]}), nc.Point or nc.Direction"
+        + clamped(system.structure.bodies, name)
     )

@@ -23,7 +23,17 @@ from natcoord_jax.core.numeric import Whole
 from natcoord_jax.core.state import TRAJECTORY, Trajectory
 from natcoord_jax.system import System
 from natcoord_jax.viz.colours import STOPS, limits
-from natcoord_jax.viz.motion import BEAMS, BOX, COLOURS, MOVING, even_times, phases_of, scenery_at
+from natcoord_jax.viz.motion import (
+    BEAMS,
+    BOX,
+    COLOURS,
+    MOVING,
+    even_times,
+    lanes_of,
+    longest_of,
+    runs_of,
+    together,
+)
 from natcoord_jax.viz.scenery import Scenery
 from natcoord_jax.viz.skins import Colouring
 from natcoord_jax.viz.stage import Stage
@@ -129,7 +139,8 @@ def animate(
     Args:
         system: compiled system; or a motion in phases or a solution of an optimal control problem, which need
             no trajectory.
-        trajectory: of one lane, computed with it.
+        trajectory: computed with it; of a batch the first run is shown and the others are its ghosts, 16
+            of them at most.
         file: where to write it, a .gif, a .mp4 (by the program ffmpeg) or a .html with a player, below 3 MB;
             None: return HTML for a notebook instead.
         fps: pictures per second; fewer where the file would become too large.
@@ -145,20 +156,20 @@ def animate(
         HTML that a notebook shows with player controls, or the path of the file.
 
     Raises:
-        ValueError: for a trajectory of a batch, or none, or another kind of file.
+        ValueError: for no trajectory, or another kind of file.
         RuntimeError: for an mp4 without ffmpeg.
     """
-    phases = phases_of(system, trajectory, "animate")
+    phases = lanes_of(system, trajectory, "animate")
     suffix = ".html" if file is None else Path(file).suffix.lower()
     if suffix not in SUFFIXES:
         raise ValueError(
             f"animate writes {', '.join(SUFFIXES)}, not {str(file)!r}; pass a name that ends in one of these"
         )
-    t = np.asarray(phases.t)
+    t = longest_of(runs_of(phases))
     pace = pace_of(t)
     wanted = max(2, int((t[-1] - t[0]) / pace * fps) + 1)
     options = {"beams": beams, "traces": traces, "title": title, "colour": colour, "within": within}
-    scenery = scenery_at(phases, even_times(t, wanted), **options)
+    scenery = together(phases, even_times(t, wanted), **options)
     figure, stage = _stage(scenery)
     try:
         stage.show(0, caption_of(pace))

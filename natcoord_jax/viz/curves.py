@@ -145,7 +145,10 @@ def in_turn(phases: Sequence[list[Panel]]) -> list[Panel]:
 
 
 def as_bands(runs: Sequence[list[Panel]]) -> list[Panel]:
-    """Panels of the runs of a batch as one: the median, and the band between the least and the largest."""
+    """Panels of the runs of a batch as one: the median, and the band between the least and the largest.
+
+    At the times of the run that ends last: runs may differ in their steps and ends, and count until theirs.
+    """
     panels: dict[str, dict[str, list[Curve]]] = {}
     first = {panel.title: panel for run in reversed(runs) for panel in run}
     for panel in (panel for run in runs for panel in run):
@@ -155,8 +158,13 @@ def as_bands(runs: Sequence[list[Panel]]) -> list[Panel]:
     for title, curves in panels.items():
         bands = []
         for same in curves.values():
-            values = np.stack([curve.values for curve in same])
-            middle, band = np.median(values, axis=0), (values.min(axis=0), values.max(axis=0))
-            bands.append(same[0]._replace(values=middle, band=band))
+            t = max((curve.t for curve in same), key=lambda t: t[-1])
+            there = [t <= c.t[-1] + 1e-9 * (1 + np.abs(t)) for c in same]
+            values = [np.where(ok, np.interp(t, c.t, c.values), np.nan) for ok, c in zip(there, same)]
+            middle, band = (
+                np.nanmedian(values, axis=0),
+                (np.nanmin(values, axis=0), np.nanmax(values, axis=0)),
+            )
+            bands.append(same[0]._replace(t=t, values=middle, band=band))
         found.append(first[title]._replace(curves=bands))
     return found

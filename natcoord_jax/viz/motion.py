@@ -1,5 +1,6 @@
 """Which states of a motion are drawn: of one trajectory, or of phases one after the other."""
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -24,38 +25,59 @@ BOX = Numbers((2, 3))
 BEAMS = Several(of("what scene.add(nc.Beam(...)) returned", BeamHandle))
 
 
-def phases_of(system: System | Phases | Solution, trajectory: Trajectory | None, user: str) -> Phases:
-    """A motion in phases, of which a trajectory is one.
-
-    Raises:
-        ValueError: for a trajectory of a batch, or none.
-    """
-    phases = lanes_of(system, trajectory, user)
-    for part in phases.trajectories:
-        if part.t.ndim != 1:
-            raise ValueError(f"{user} takes one lane, not a batch of shape {part.t.shape[:-1]}")
-    return phases
+MOST_LANES = 16
+"""More runs of a batch than this are not shown: every so many are."""
+GHOSTLY = 0.07
+"""How opaque faces of the other runs of a batch are beside the first: several lie behind each other."""
 
 
 def lanes_of(system: System | Phases | Solution, trajectory: Trajectory | None, user: str) -> Phases:
-    """The same, of a batch as well.
+    """A motion in phases, of which a trajectory is one; a batch has one axis, whatever it came with.
 
     Raises:
         ValueError: for no trajectory.
     """
     if isinstance(system, Phases):
-        return system
-    if isinstance(system, Solution):
-        return Phases((system.system,), (system.trajectory,))
-    if trajectory is None:
+        found = system
+    elif isinstance(system, Solution):
+        found = Phases((system.system,), (system.trajectory,))
+    elif trajectory is None:
         raise ValueError(f"{user} needs the system and a trajectory, or nc.Phases")
-    return Phases((system,), (trajectory,))
+    else:
+        found = Phases((system,), (trajectory,))
+    lanes = found.trajectories[0].t.shape[:-1]
+    if len(lanes) <= 1:
+        return found
+
+    def flat(x: Any) -> Any:
+        return x.reshape(math.prod(lanes), *x.shape[len(lanes) :])
+
+    return Phases(found.systems, tuple(jax.tree.map(flat, part) for part in found.trajectories))
+
+
+def is_batch(phases: Phases) -> bool:
+    """Whether it has several runs."""
+    return np.ndim(phases.trajectories[0].t) > 1
 
 
 def lane(phases: Phases, number: int) -> Phases:
     """One lane of a batch in phases."""
     picked = tuple(jax.tree.map(lambda x: x[number], part) for part in phases.trajectories)
     return Phases(phases.systems, picked)
+
+
+def runs_of(phases: Phases, most: int = MOST_LANES) -> list[Phases]:
+    """The runs of a batch that are shown, evenly chosen; of one run itself."""
+    if not is_batch(phases):
+        return [phases]
+    count = len(phases.trajectories[0].t)
+    chosen = np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
+    return [lane(phases, int(k)) for k in chosen]
+
+
+def longest_of(runs: Sequence[Phases]) -> np.ndarray:
+    """Times [s] of the run that ends last."""
+    return np.asarray(max((run.t for run in runs), key=lambda t: float(t[-1])))
 
 
 def scenery_at(phases: Phases, times: np.ndarray, **options: Any) -> Scenery:
@@ -75,6 +97,20 @@ def scenery_at(phases: Phases, times: np.ndarray, **options: Any) -> Scenery:
             nearest = np.abs(np.asarray(trajectory.t)[:, None] - wanted).argmin(axis=0)
             found.append(scenery_of(system, trajectory, nearest, **options))
     return joined(found)
+
+
+def together(phases: Phases, times: np.ndarray, **options: Any) -> Scenery:
+    """The runs of a batch in one picture, the first as it is and the others as ghosts.
+
+    Runs may differ in their ends: all are shown at the same times, and rest at their own ends.
+    """
+    first, *others = [scenery_at(run, times, **options)._replace(t=times) for run in runs_of(phases)]
+    solids = [s._replace(alpha=GHOSTLY) for other in others for s in other.solids if s.kind != "force"]
+    skins = [s._replace(alpha=GHOSTLY) for other in others for s in other.skins]
+    heights = [s.ground for s in (first, *others) if s.ground is not None]
+    return first._replace(
+        solids=first.solids + solids, skins=first.skins + skins, ground=min(heights, default=None)
+    )
 
 
 def even_times(t: np.ndarray, count: int) -> np.ndarray:

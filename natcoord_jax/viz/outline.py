@@ -154,3 +154,13 @@ def arrow() -> Surface:
     """An arrow along the third axis, from 0 to 1, of radius one across."""
     path = np.array([[0, 0, 0], [0, 0, 0.7], [0, 0, 0.701], [0, 0, 1.0]])
     return tube(path, np.array([0.4, 0.4, 1.0, 0.02]), 10)
+
+
+def turning_arrow() -> Surface:
+    """An arrow around the third axis, right-handed, of radius one."""
+    angle = np.concatenate([np.linspace(0.0, 1.3 * np.pi, 14), [1.3 * np.pi, 1.55 * np.pi]])
+    thick = np.concatenate([np.full(14, 0.09), [0.26, 0.01]])
+    # A tube along the third axis, bent: its ends and faces stay what they are.
+    straight, faces = tube(np.stack([0 * angle, 0 * angle, np.arange(16.0)], axis=1), thick, 8)
+    turn, out = angle[np.round(straight[:, 2]).astype(int)], 1 + straight[:, 0]
+    return np.stack([out * np.cos(turn), out * np.sin(turn), straight[:, 1]], axis=1), faces

@@ -12,7 +12,8 @@ from natcoord_jax.bodies.shapes import Surface
 from natcoord_jax.core.markers import Marker
 from natcoord_jax.core.state import Trajectory
 from natcoord_jax.system import System
-from natcoord_jax.viz.links import between, forces, links
+from natcoord_jax.viz.arrows import loads, pushes
+from natcoord_jax.viz.links import between, links
 from natcoord_jax.viz.outline import ball, bar, bodies_of, marked
 from natcoord_jax.viz.outline import within as inside_of
 from natcoord_jax.viz.scenery import DARK, PALETTE, Scenery, Solid, Trace
@@ -191,7 +192,8 @@ def scenery_of(
         *_bodies(system, meshes, rows, scale),
         *_joints(system, rows, scale),
         *links(system, rows, scale),
-        *forces(system, states, rows, inputs, scale),
+        *loads(system, states, rows, inputs, scale),
+        *pushes(system, trajectory, saved, rows, scale),
     ]
     if within is not None:
         solids = [s for s in solids if np.isfinite(s.rows).any()]

@@ -73,6 +73,7 @@ function start(data) {
   for (const name of scene.bodies) $("follow").add(new Option(name, name));
   $("follow").value = state.follow = scene.follow;
   $("lanes").hidden = $("ghostly").hidden = scene.lanes === 1; $("lane").max = scene.lanes - 1;
+  $("forceful").hidden = !scene.solids.some(s => s.kind === "force");
   const bodies = scene.solids.filter(s => s.kind === "body");
   const swatches = [...bodies, ...scene.skins.filter(s => !s.values), ...scene.traces];
   const css = c => `rgb(${c.map(x => Math.round(255 * x))})`;
@@ -153,8 +154,8 @@ function start(data) {
   const lane = (k, place, alpha, shadow) => {
     gl.uniform1f(at.alpha, alpha);
     for (const s of scene.solids) {
-      const m = frame(s, k, place);
-      if (m && !(shadow && s.kind === "force")) solid(s, shadow ? times(shadow, m) : m, !shadow && alpha === 1);
+      const m = s.kind === "force" ? null : frame(s, k, place);
+      if (m) solid(s, shadow ? times(shadow, m) : m, !shadow && alpha === 1);
     }
     gl.uniformMatrix4fv(at.model, false, shadow || ONE);
     for (const s of scene.skins) {
@@ -208,6 +209,12 @@ function start(data) {
       gl.depthMask(false);
       for (let k = 0; k < scene.lanes; k++) if (k !== state.lane) lane(k, place, 0.2);
       gl.depthMask(true);
+    }
+    // Forces are seen through what they act on.
+    gl.clear(gl.DEPTH_BUFFER_BIT); gl.uniform1f(at.alpha, 1);
+    for (const s of scene.solids.filter(s => s.kind === "force" && $("forces").checked)) {
+      const m = frame(s, state.lane, place);
+      if (m) solid(s, m);
     }
     $("time").textContent = `t = ${(scene.times[0] + state.now).toFixed(scene.digits)} s` + lattice;
     $("place").value = end > 0 ? state.now / end : 0; $("which").textContent = `${state.lane + 1} of ${scene.lanes}`;

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 
-import numpy as np
 from matplotlib.figure import Figure
 
 from natcoord_jax.analysis.accuracy import Accuracy
@@ -15,7 +14,7 @@ from natcoord_jax.core.numeric import Vector
 from natcoord_jax.core.state import TRAJECTORY, Trajectory
 from natcoord_jax.system import System
 from natcoord_jax.viz.curves import as_bands, in_turn, panels_of
-from natcoord_jax.viz.motion import BEAMS, lane, lanes_of
+from natcoord_jax.viz.motion import BEAMS, is_batch, lanes_of, runs_of
 from natcoord_jax.viz.panels import plot_panels
 from natcoord_jax.viz.snapshots import plot_snapshots
 from natcoord_jax.viz.solutions import solution_panels
@@ -44,16 +43,16 @@ def plot(
     Args:
         system: compiled system; or a motion in phases, a solution of an optimal control problem, with its
             bounds and goals, or what `accuracy` found, which need no trajectory.
-        trajectory: computed with it, of one lane; or of a batch with one axis, whose curves are medians in
-            bands from the least to the largest.
-        times: of pictures of the motion above the diagrams [s], of one lane; None: no pictures.
+        trajectory: computed with it; curves of a batch are medians in bands from the least to the largest.
+        times: of pictures of the motion above the diagrams [s], of a batch of its first run with the others
+            as ghosts; None: no pictures.
         beams: handles of beams, whose sections are drawn in the pictures; others are round.
 
     Returns:
         The figure.
 
     Raises:
-        ValueError: for no trajectory, a batch of several axes, or times without a motion of one lane.
+        ValueError: for no trajectory, or times without a motion.
 
     Example:
         >>> import jax; jax.config.update("jax_enable_x64", True)
@@ -70,13 +69,6 @@ def plot(
     if isinstance(system, Accuracy):
         return plot_accuracy(system)
     phases = lanes_of(system, trajectory, "plot")
-    shape = np.shape(phases.trajectories[0].t)[:-1]
-    if len(shape) > 1 or (shape and times is not None):
-        wanted = "one lane for pictures" if times is not None else "a batch with one axis"
-        raise ValueError(f"plot takes {wanted}, not a batch of shape {shape}; pick some of its lanes")
-    if shape:
-        chosen = np.unique(np.linspace(0, shape[0] - 1, min(shape[0], MOST_LANES)).round().astype(int))
-        runs = [lane(phases, int(k)) for k in chosen]
-        return plot_panels(as_bands([in_turn([panels_of(*pair) for pair in run.pairs]) for run in runs]))
-    panels = in_turn([panels_of(*pair) for pair in phases.pairs])
+    drawn = [in_turn([panels_of(*pair) for pair in run.pairs]) for run in runs_of(phases, MOST_LANES)]
+    panels = as_bands(drawn) if is_batch(phases) else drawn[0]
     return plot_panels(panels) if times is None else plot_snapshots(phases, times, panels, beams=beams)

@@ -16,7 +16,7 @@ PALETTE: tuple[Colour, ...] = (
     (0.27, 0.48, 0.71), (0.93, 0.56, 0.23), (0.35, 0.63, 0.36), (0.80, 0.33, 0.34), (0.56, 0.47, 0.68),
     (0.55, 0.44, 0.38), (0.85, 0.53, 0.72), (0.75, 0.68, 0.28), (0.36, 0.68, 0.74), (0.50, 0.53, 0.56),
 )  # fmt: skip
-DARK, STEEL, RED = (0.16, 0.18, 0.21), (0.42, 0.45, 0.49), (0.85, 0.16, 0.12)
+DARK, STEEL, RED, GREEN = (0.16, 0.18, 0.21), (0.42, 0.45, 0.49), (0.85, 0.16, 0.12), (0.05, 0.55, 0.25)
 
 
 TRAVELS = 1.5
@@ -35,6 +35,7 @@ class Solid(NamedTuple):
         colour: red, green, blue, 0 to 1.
         shade: brightness of each face (faces,).
         rigid: whether the vectors are of length one and at right angles.
+        alpha: how opaque it is in figures and films, 0 to 1.
     """
 
     name: str
@@ -45,6 +46,7 @@ class Solid(NamedTuple):
     colour: Colour
     shade: np.ndarray
     rigid: bool = True
+    alpha: float = 1.0
 
     @property
     def corners(self) -> np.ndarray:
@@ -63,6 +65,7 @@ class Skin(NamedTuple):
         values: of the faces (t, faces), or None.
         label: what these are, with their unit.
         edges: whether its mesh is drawn.
+        alpha: as of a `Solid`.
     """
 
     name: str
@@ -72,6 +75,7 @@ class Skin(NamedTuple):
     values: np.ndarray | None = None
     label: str = ""
     edges: bool = True
+    alpha: float = 1.0
 
 
 class Trace(NamedTuple):

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from natcoord_jax.analysis.phases import Phases
 from natcoord_jax.bodies.beam import BeamHandle
-from natcoord_jax.viz.motion import scenery_at
+from natcoord_jax.viz.motion import longest_of, runs_of, together
 from natcoord_jax.viz.panels import Panel, draw, shown_once
 from natcoord_jax.viz.stage import Stage
 
@@ -31,15 +31,15 @@ def plot_snapshots(
     """Pictures of a motion at some times, with diagrams below.
 
     Args:
-        phases: the motion.
+        phases: the motion; of a batch the first run with the others as ghosts.
         times: of the snapshots [s]; those after the end are left out.
         panels: the diagrams.
         beams: handles of beams, whose sections are drawn.
         caption: what there is to see, below the pictures.
         within: two corners of the box (2, 3) [m] that is looked into; None: all is seen.
     """
-    end = float(phases.t[-1])
-    scenery = scenery_at(
+    end = float(longest_of(runs_of(phases))[-1])
+    scenery = together(
         phases, np.array([t for t in times if t <= end + 1e-9 * (1 + end)]), beams=beams, within=within
     )
     frames = range(len(scenery.t))

@@ -26,24 +26,25 @@ class Faces:
         self.scenery, eye = scenery, scenery.eye()
         light = eye + 0.7 * scenery.up + 0.4 * np.cross(scenery.up, eye)
         self.light = light / np.linalg.norm(light)
-        start, faces, colours, edges = 0, [np.zeros((0, 4), int)], [np.zeros((0, 3))], [np.zeros(0, bool)]
+        start, faces, colours, edges = 0, [np.zeros((0, 4), int)], [np.zeros((0, 4))], [np.zeros(0, bool)]
         for solid in scenery.solids:
             cut = [(four, shade) for face, shade in zip(solid.faces, solid.shade) for four in _fours(face)]
             faces.append(start + np.array([four for four, _ in cut]))
-            colours.append(np.outer([shade for _, shade in cut], solid.colour))
+            lit = np.outer([shade for _, shade in cut], solid.colour)
+            colours.append(np.pad(lit, ((0, 0), (0, 1)), constant_values=solid.alpha))
             edges.append(np.zeros(len(cut), bool))
             start += len(solid.points)
         self.skins = sum(map(len, faces))
         for skin in scenery.skins:
             faces.append(start + skin.faces)
-            colours.append(np.tile(skin.colour, (len(skin.faces), 1)))
+            colours.append(np.tile((*skin.colour, skin.alpha), (len(skin.faces), 1)))
             edges.append(np.full(len(skin.faces), skin.edges))
             start += skin.points.shape[1]
         self.faces = np.concatenate(faces)
         self.colours, self.edges = np.concatenate(colours), np.concatenate(edges)
 
     def at(self, frame: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Corners of the faces that are there (n, 4, 3), colours of faces and edges in the light (n, 3)."""
+        """Corners of the faces that are there (n, 4, 3), colours of faces and edges in the light (n, 4)."""
         scenery = self.scenery
         corners = [s.rows[frame, 0] + s.points @ s.rows[frame, 1:] for s in scenery.solids]
         corners += [s.points[frame] for s in scenery.skins]
@@ -51,14 +52,16 @@ class Faces:
         base, done = self.colours.copy(), self.skins
         for skin in scenery.skins:
             if skin.values is not None:
-                base[done : done + len(skin.faces)] = along_map(skin.values[frame], skin.values)
+                base[done : done + len(skin.faces), :3] = along_map(skin.values[frame], skin.values)
             done += len(skin.faces)
         normals = np.cross(points[:, 2] - points[:, 0], points[:, 3] - points[:, 1])
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
         lit = AMBIENT + (1 - AMBIENT) * np.abs(normals @ self.light)
         there = np.isfinite(lit)
-        colours = np.clip(base * lit[:, None], 0, 1)[there]
-        return points[there], colours, np.where(self.edges[there, None], 0.6, 1.0) * colours
+        base[:, :3] = np.clip(base[:, :3] * lit[:, None], 0, 1)
+        edges = base.copy()
+        edges[:, :3] *= np.where(self.edges, 0.6, 1.0)[:, None]
+        return points[there], base[there], edges[there]
 
 
 def _fours(face: np.ndarray) -> list[list[int]]:

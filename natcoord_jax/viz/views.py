@@ -32,8 +32,9 @@ from natcoord_jax.viz.motion import (
     COLOURS,
     MOVING,
     even_times,
-    lane,
     lanes_of,
+    longest_of,
+    runs_of,
     scenery_at,
     title_of,
 )
@@ -44,8 +45,6 @@ from natcoord_jax.viz.skins import Colouring
 LIMIT = 2_900_000
 """Most bytes of a file."""
 MOST_PICTURES, FEWEST_PICTURES = 600, 8
-MOST_LANES = 16
-"""More runs of a batch than this are not shown: every so many are."""
 
 
 class View:
@@ -73,16 +72,9 @@ class View:
 
 def _sceneries(phases: Phases, count: int, options: Mapping[str, Any]) -> list[Scenery]:
     """What there is to draw, one of each run that is shown, at so many times."""
-    shape = np.shape(phases.trajectories[0].t)[:-1]
-    if len(shape) > 1:
-        raise ValueError(f"view takes a batch with one axis, not of shape {shape}; pick some of its lanes")
-    if not shape:
-        return [scenery_at(phases, even_times(np.asarray(phases.t), count), **options)]
-    chosen = np.unique(np.linspace(0, shape[0] - 1, min(shape[0], MOST_LANES)).round().astype(int))
-    runs = [lane(phases, int(k)) for k in chosen]
+    runs = runs_of(phases)
     # Runs may differ in their ends: all are shown over the times of the longest, and rest at their own ends.
-    longest = np.asarray(max((run.t for run in runs), key=lambda t: float(t[-1])))
-    times = even_times(longest, count)
+    times = even_times(longest_of(runs), count)
     return [scenery_at(run, times, **options)._replace(t=times) for run in runs]
 
 
@@ -160,15 +152,16 @@ def view(
     """A motion in three dimensions: turn it, play it, scrub it.
 
     Bodies have their shapes, or the plainest solid with their inertia, with arms to their joints; joints have
-    their axes; springs are coils, forces arrows; beams are swept with their section. There is a ground where
-    there is gravity. In a notebook the view is shown where it is returned; from a script it is written to a
+    their axes; springs are coils; loads and motors are red arrows, which turn where they are torques, normal
+    forces of contacts green ones; beams are swept with their section. There is a ground where there is
+    gravity. In a notebook the view is shown where it is returned; from a script it is written to a
     file, which the browser opens if there is a display.
 
     Args:
         system: compiled system; or a motion in phases or a solution of an optimal control problem, which need
             no trajectory.
-        trajectory: computed with it, of one lane or of a batch with one axis: then a slider chooses the run
-            and the others are ghosts, 16 of them at most.
+        trajectory: computed with it, of one lane or of a batch: then a slider chooses the run and the
+            others are ghosts, 16 of them at most.
         file: where to write it, one .html below 3 MB that needs no network; None: see above.
         title: in its corner.
         follow: body that the camera moves along with.
@@ -185,8 +178,8 @@ def view(
         A `View`; the path of the file; or what is served, with its `address`.
 
     Raises:
-        ValueError: for no trajectory, a batch of several axes, another kind of file, a body that there is
-            not, or meshes that do not fit into the file.
+        ValueError: for no trajectory, another kind of file, a body that there is not, or meshes that do not
+            fit into the file.
         ImportError: for `live` without viser.
 
     Example:
@@ -214,8 +207,7 @@ def view(
         "beams": beams,
         "within": within,
     }
-    first = lane(phases, 0) if np.ndim(phases.trajectories[0].t) == 2 else phases
-    pace = pace_of(np.concatenate([np.ravel(part.t) for part in first.trajectories]))
+    pace = pace_of(longest_of(runs_of(phases)))
     if live:
         from natcoord_jax.viz.live import Live
 

@@ -17,10 +17,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import export
+from jax.extend.core import Primitive
+from jax.interpreters import batching
 
 from natcoord_jax.xla.elsewhere import Compilation, elsewhere
 from natcoord_jax.xla.kernels import without_kernels
-from natcoord_jax.xla.tracing import at_top_level
+from natcoord_jax.xla.tracing import at_top_level, in_lanes
 from natcoord_jax.xla.waiting import told
 
 Effort = Literal["tiers", "quick", "full"]
@@ -161,9 +163,11 @@ class Programs:
             return function(static, donated, kept)
 
         within.__name__ = within.__qualname__ = name
-        self.name, self.effort, self.function = name, effort, function
+        self.name, self.function = name, function
+        self.effort: Effort | None = effort
         self.within = jax.jit(within, static_argnums=0, donate_argnums=1)
         self.known: dict[Hashable, Program] = {}
+        self.of_lanes: dict[tuple, Programs] = {}
         _every.add(self)
 
     def __call__(self, static: Hashable, donated: list[Any], kept: list[Any]) -> Any:
@@ -171,6 +175,8 @@ class Programs:
         arrays = [*donated, *kept]
         if _looked_into():
             return self.within(static, *([jnp.asarray(x) for x in given] for given in (donated, kept)))
+        if not donated and in_lanes(arrays):
+            return self._of_lanes(static, kept)
         if not at_top_level(arrays) or not _alone(arrays):
             return self.within(static, donated, kept)
         effort: Any = self.effort or _default[0]
@@ -185,6 +191,35 @@ class Programs:
                 program = Program(partial(self.function, static), self.name, shapes, effort)
             self.known[key] = program
         return program(donated, kept)
+
+    def _of_lanes(self, static: Hashable, kept: list[Any]) -> Any:
+        """Within `jax.vmap`, outside of all else: one program of all lanes, compiled as any other."""
+        made: list[Any] = []
+
+        def every(arrays: Sequence[Any], axes: tuple) -> list[Any]:
+            if axes not in self.of_lanes:
+
+                def lanes(static: Any, donated: list, kept: list) -> Any:
+                    return jax.vmap(partial(self.function, static, donated), in_axes=(list(axes),))(kept)
+
+                self.of_lanes[axes] = Programs(self.name, lanes, self.effort)
+            found, rest = self.of_lanes[axes](static, [], list(arrays))
+            made.append(rest)
+            return found
+
+        return _lanes.bind(*kept, every=every), made[0]
+
+
+_lanes = Primitive("lanes")
+_lanes.multiple_results = True
+
+
+def _all_lanes(arrays: Sequence[Any], axes: Sequence[Any], *, every: Callable) -> tuple[list, list]:
+    found = every(arrays, tuple(axes))
+    return found, [0] * len(found)
+
+
+batching.primitive_batchers[_lanes] = _all_lanes
 
 
 _every: weakref.WeakSet[Programs] = weakref.WeakSet()

@@ -74,7 +74,8 @@ def put(request: bytes, found: bytes) -> None:
 
 def _path(request: bytes) -> Path | None:
     folder = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
-    if folder is None or "://" in folder:
+    # An environment variable that is set to nothing is not set.
+    if not folder or "://" in folder:
         return None
     versions = jax.__version__, jaxlib.version.__version__, os.environ.get("XLA_FLAGS"), processor()
     return Path(folder) / FULL / hashlib.sha256(repr(versions).encode() + request).hexdigest()

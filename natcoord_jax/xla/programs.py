@@ -51,7 +51,7 @@ class Program:
     """A traced function; equal to another one if both compute the same from arguments and constants.
 
     Attributes:
-        jaxpr: its equations, with a place for each constant.
+        jaxpr: its equations, whose first arguments are the constants.
         kept: constants that are part of it; None for those that are arguments.
         axes: numbers of axes of the others.
         made: structure of its results, and what of them is no array.
@@ -60,7 +60,7 @@ class Program:
 
     def __init__(self, jaxpr: Any, kept: Sequence[Any], made: tuple[Any, tuple]):
         self.jaxpr, self.kept, self.made = jaxpr, kept, made
-        self.axes = tuple(x.aval.ndim for x, k in zip(jaxpr.constvars, kept) if k is None)
+        self.axes = tuple(x.aval.ndim for x, k in zip(jaxpr.invars, kept) if k is None)
         values = tuple(None if x is None else _content(x) for x in kept)
         self.key = made, values, _compared(jaxpr)
         self._hash = hash(self.key)
@@ -75,7 +75,7 @@ class Program:
         """Its results."""
         given = iter(constants)
         every = [next(given) if x is None else x for x in self.kept]
-        found = iter(jex.jaxpr_as_fun(jex.ClosedJaxpr(self.jaxpr, every))(*arguments))
+        found = iter(jex.jaxpr_as_fun(jex.ClosedJaxpr(self.jaxpr, ()))(*every, *arguments))
         structure, fixed = self.made
         return jax.tree.unflatten(structure, [next(found) if x is None else x.value for x in fixed])
 
@@ -123,7 +123,7 @@ def traced(function: Callable[[Any], Any], of: Signature) -> tuple[Program, list
 
 
 def _lifted(program: Any, consts: Sequence[Any]) -> tuple[Any, list[Any]]:
-    """The program with the numbers written in it among its constants, and these."""
+    """The program of its constants and its arguments, and the constants, with the numbers written in it."""
     variables, values = list(program.constvars), list(consts)
 
     def lift(x: Any) -> Any:
@@ -142,7 +142,8 @@ def _lifted(program: Any, consts: Sequence[Any]) -> tuple[Any, list[Any]]:
 
     equations = [lifted(equation) for equation in program.eqns]
     results = [lift(x) for x in program.outvars]
-    return program.replace(constvars=variables, eqns=equations, outvars=results), values
+    given = [*variables, *program.invars]
+    return program.replace(constvars=[], invars=given, eqns=equations, outvars=results), values
 
 
 def _is_nought(x: Any) -> bool:

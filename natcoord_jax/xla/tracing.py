@@ -1,10 +1,12 @@
 """Whether something is being traced, and functions that are traced once."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import cache
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.core import Tracer, eval_context
 from jax.extend.core import get_opaque_trace_state, jaxpr_as_fun
 from jax.interpreters import partial_eval
@@ -23,6 +25,25 @@ with eval_context():
 def at_top_level(*values: Any) -> bool:
     """Whether nothing is being traced: neither the values nor the function around them."""
     return get_opaque_trace_state() == TOP_LEVEL and is_concrete(values)
+
+
+@cache
+def _lane() -> tuple[type, Any]:
+    """The class of values within `jax.vmap`, and what an axis without a name is called there."""
+    found: list[Any] = []
+    with eval_context():
+        jax.vmap(found.append)(np.zeros(1))
+    return type(found[0]), found[0]._trace.axis_data.name
+
+
+def in_lanes(values: Sequence[Any]) -> bool:
+    """Whether some values are lanes of `jax.vmap` without a name, and nothing else is done with any."""
+    if is_concrete(values):
+        return False
+    kind, unnamed = _lane()
+    lanes = [isinstance(x, kind) and x._trace.axis_data.name is unnamed for x in values]
+    inner = [x.val if lane else x for x, lane in zip(values, lanes)]
+    return any(lanes) and (is_concrete(inner) or in_lanes(inner))
 
 
 def traced_once(function: Callable, *examples: Any) -> tuple[Callable, Any]:

@@ -91,6 +91,10 @@ class Rubbing(Effect):
         turning = 0.5 * cross(torques[:, :, None], rows[:, 1:])
         return on_rows(place, forces) + jnp.pad(turning, ((0, 0), (0, 0), (1, 0), (0, 0)))
 
+    def touch(self, place: Array, rows: Array) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+        """Where the surfaces touch [m], and the direction in which the second is pushed."""
+        return self.gap.touch(place_markers(place, rows))
+
     def flow(self, place: Array, motion: Motion) -> Float[Array, "s p"]:
         """Rates of the invariants at the stages of a step."""
         x, rates = place_markers(place, motion.rows), place_markers(place, motion.rates)

@@ -10,6 +10,7 @@ from natcoord_jax.core.arguments import Part
 from natcoord_jax.core.gradient import averaged_gradient
 from natcoord_jax.core.markers import Markers
 from natcoord_jax.maths.collocation import Tableau
+from natcoord_jax.maths.vectors import unit
 
 
 class Gap(Part):
@@ -49,6 +50,13 @@ class Gap(Part):
     def contact(self, x: Float[Array, "k 3"]) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
         """Where the surfaces touch [m], and the unit normal from the first to the second; for friction."""
         raise NotImplementedError(f"{type(self).__name__} does not say where its surfaces touch")
+
+    def touch(self, x: Float[Array, "k 3"]) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+        """The same for pictures; of gaps that do not say it a point of the second, and how it is pushed."""
+        if type(self).contact is not Gap.contact:
+            return self.contact(x)
+        second = self.sides[1]
+        return x[second], unit(self.gradient(x)[second])
 
     def gradient(self, x: Float[Array, "k 3"]) -> Float[Array, "k 3"]:
         """Of the distance by the marker vectors [-]."""

@@ -88,3 +88,7 @@ class GapPotential(ContactLaw, Potential):
     def readings(self, place: Array, rows: Array) -> ContactReadings:
         """Gap and force."""
         return self.readings_at(self.gap.distance(self.invariants(place_markers(place, rows))))
+
+    def touch(self, place: Array, rows: Array) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+        """Where the surfaces touch [m], and the direction in which the second is pushed."""
+        return self.gap.touch(place_markers(place, rows))

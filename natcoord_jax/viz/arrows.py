@@ -1,0 +1,150 @@
+"""Arrows: forces and torques of loads and motors, and forces of contacts."""
+
+import dataclasses
+from collections.abc import Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from natcoord_jax.analysis.contacts import contacts, touching
+from natcoord_jax.core.eager_numpy import eager_numpy
+from natcoord_jax.core.force import Force
+from natcoord_jax.core.state import State, Trajectory
+from natcoord_jax.effects.contact import DiscreteGap
+from natcoord_jax.maths.collocation import gauss
+from natcoord_jax.mechanics.response import gather, motion_between, no_multipliers, respond, situation
+from natcoord_jax.model.groups import Group
+from natcoord_jax.system import System
+from natcoord_jax.viz.links import frame_along
+from natcoord_jax.viz.outline import arrow, turning_arrow
+from natcoord_jax.viz.scenery import GREEN, RED, Colour, Solid
+from natcoord_jax.viz.skins import markers_of, places_of
+
+LONGEST, WIDEST = 0.2, 0.09
+"""Length of the largest force and radius of the largest torque, relative to the scene."""
+NOTHING = 1e-6
+"""What is less than this, relative to the largest of its kind, is not drawn."""
+
+
+class Acting(NamedTuple):
+    """A force [N] or a torque [N m] at a place [m], each (t, 3)."""
+
+    name: str
+    place: np.ndarray
+    vector: np.ndarray
+
+
+def _drawn(acting: Sequence[Acting], scale: float, colour: Colour, *, turning: bool = False) -> list[Solid]:
+    """Arrows; the largest of all has the full size."""
+    sizes = [float(np.nan_to_num(np.abs(a.vector)).max(initial=0.0)) for a in acting]
+    largest = max(sizes, default=0.0)
+    points, faces = turning_arrow() if turning else arrow()
+    found = []
+    for (name, place, vector), size in zip(acting, sizes):
+        if size > NOTHING * largest:
+            along = (WIDEST if turning else LONGEST) * scale / largest * vector
+            wide = np.linalg.norm(along, axis=1, keepdims=True) if turning else 0.014 * scale
+            rows = frame_along(place, along, wide)
+            found.append(Solid(name, "force", points, faces, rows, colour, np.ones(len(faces)), rigid=False))
+    return found
+
+
+def _of_force(system: System, group: Group, states: State, rows: np.ndarray, inputs: np.ndarray) -> Any:
+    """Forces at the points of a load, and torques at the centres of the bodies that it turns."""
+    x, given = places_of(group, rows), inputs[:, np.asarray(group.inputs)]
+    each = jax.vmap(lambda effect, x, u, t: effect.load(x, 0 * x, u, t),
+                    in_axes=(None if group.effect.shared else 0, 0, 0, None))  # fmt: skip
+    found = jax.vmap(each, in_axes=(None, 0, 0, 0))(group.effect, x, given, np.asarray(states.t))
+    loads, turning = np.asarray(found.forces), np.asarray(found.torques)
+    weights, bodies = markers_of(group)
+    forces, torques, mass, names = [], [], np.asarray(system.mass), list(group.names)
+    if found.forces is not None:
+        at = np.isclose(weights[..., 0].sum(axis=-1), 1.0)
+        forces = [Acting(names[n], x[:, n, k], loads[:, n, k]) for n, k in np.argwhere(at)]
+    for n in range(0 if found.torques is None else group.count):
+        on = [k for k in range(x.shape[2]) if bodies[n, k, 0] < len(mass) and np.any(turning[:, n, k])]
+        # Of a torque between two bodies, that on the second.
+        for k in on[-1:] if np.allclose(turning[:, n].sum(axis=1), 0.0) else on:
+            block, body = mass[bodies[n, k, 0]], rows[:, bodies[n, k, 0]]
+            centre = np.append(1.0, block[0, 1:] / block[0, 0]) if block[0, 0] > 0 else np.eye(4)[0]
+            torques.append(Acting(names[n], centre @ body, turning[:, n, k]))
+    return forces, torques
+
+
+def _of_motor(system: System, group: Group, states: State, inputs: np.ndarray) -> Any:
+    """Forces and torques of an input on joint coordinates, on the child of each joint at its point."""
+
+    @eager_numpy
+    @partial(jax.vmap, in_axes=(0, 0))
+    def on_frames(state: State, u: Any) -> tuple[Any, Any, Any]:
+        """In a step of length zero: forces, torques about the points of the frames, and these."""
+        still = jnp.zeros(())
+        motion = gather(group, motion_between(state, state, still))
+        where = situation(system, group, state, u, still)
+        answer = respond(group, where, motion, no_multipliers(group, gauss(1), u.dtype), gauss(1))
+        body = motion.rows[0]
+        points = jnp.einsum("nka,nkac->nkc", where.place[..., 0, :].reshape(*body.shape[:2], 4), body)
+        on_rows = jnp.zeros_like(body) if answer.forces is None else answer.forces[:, 0]
+        turning = jnp.zeros_like(points) if answer.torques is None else answer.torques[:, 0]
+        turning = turning + jnp.sum(jnp.cross(body, on_rows), axis=2) - jnp.cross(points, on_rows[:, :, 0])
+        return on_rows[:, :, 0], turning, points
+
+    force, torque, points = map(np.asarray, on_frames(states, jnp.asarray(inputs)))
+    children = [(n, k) for n in range(group.count) for k in range(1, points.shape[2], 2)]
+    forces, torques = (
+        [Acting(group.names[n], points[:, n, k], found[:, n, k]) for n, k in children]
+        for found in (force, torque)
+    )
+    return forces, torques
+
+
+def loads(system: System, states: State, rows: np.ndarray, inputs: np.ndarray, scale: float) -> list[Solid]:
+    """Forces and torques of loads and inputs: straight arrows, and turning ones."""
+    forces, torques = [], []
+    for group in system.effects:
+        marked = group.weights is not None and group.weights.ndim == 3
+        if isinstance(group.effect, Force) and marked:
+            found = _of_force(system, group, states, rows, inputs)
+        elif group.effect.inputs and group.source == "coordinates":
+            found = _of_motor(system, group, states, inputs)
+        else:
+            continue
+        forces += found[0]
+        torques += found[1]
+    return _drawn(forces, scale, RED) + _drawn(torques, scale, RED, turning=True)
+
+
+def _touch(group: Group, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where the contacts of a group are, and how their second bodies are pushed (t, n, 3)."""
+    each = jax.vmap(lambda effect, place, rows: effect.touch(place, rows))
+    along = jax.vmap(lambda rows: each(group.effect, group.weights, rows))
+    place, normal = eager_numpy(along)(jnp.asarray(rows[:, np.asarray(group.bodies)]))
+    return np.asarray(place), np.asarray(normal)
+
+
+def pushes(
+    system: System, trajectory: Trajectory, saved: np.ndarray, rows: np.ndarray, scale: float
+) -> list[Solid]:
+    """Normal forces of contacts, on average over the step before; of several gaps their sum at its middle."""
+    groups = touching(system)
+    unknown = trajectory.states.contacts is None and any(g.effect.unilateral for g in groups)
+    # Gaps of surfaces are searched for among facets, for thousands of nodes: a film would wait for that.
+    surfaces = any(isinstance(g.effect, DiscreteGap) for g in groups)
+    if not groups or len(trajectory) < 2 or unknown or surfaces:
+        return []
+    steps = np.maximum(saved, 1)[:, None] + np.array([-1, 0])
+    pairs = dataclasses.replace(trajectory, states=jax.tree.map(lambda x: x[steps], trajectory.states))
+    found = contacts(system, pairs)
+    places, normals = (np.concatenate(x, axis=1) for x in zip(*(_touch(group, rows) for group in groups)))
+    # Gaps of a contact that has several are called "name[0]" and so on.
+    owners = np.array([name.rpartition("[")[0] if name.endswith("]") else name for name in found.names])
+    acting = []
+    for name in dict.fromkeys(owners.tolist()):
+        force = found.force[:, 0, owners == name, None]
+        total = force.sum(axis=1)
+        middle = (force * places[:, owners == name]).sum(axis=1) / np.where(total > 0, total, np.nan)
+        acting.append(Acting(name, middle, (force * normals[:, owners == name]).sum(axis=1)))
+    return _drawn(acting, scale, GREEN)
