@@ -93,6 +93,8 @@ def in_few_kernels(function: Callable, *arguments: Any) -> Any:
 
     whole = partial(function, written_out)
     program, shapes = jax.make_jaxpr(whole, return_shape=True)(*arguments)
+    if mean_size(program.jaxpr) > WIDE:
+        return _flat(_as_it_is, program, shapes, arguments)
     if operations(program.jaxpr) > LARGEST:
         return function(apart, *arguments)
     return _flat(_kernel, program, shapes, arguments)
