@@ -119,7 +119,7 @@ class SolidElement(Potential):
             "is degenerate or turned inside out: list its nodes in the order of nc.mesh.Mesh, middles of "
             "edges near their middles"
         )
-        return {said: jnp.min(self.volumes) <= 0.0, **self.material.flaws()}
+        return {said: ~(jnp.min(self.volumes) > 0.0), **self.material.flaws()}
 
     def volume_ratios(self, place: Array, rows: Array) -> Float[Array, " n"]:
         """Smallest of the quadrature points of each of `n` elements."""
