@@ -42,9 +42,8 @@ MATERIAL = of("a material, as nc.Elastic(...) or nc.NeoHooke(...)", Elastic, Hyp
 class SolidElement(Potential):
     """Base of elements of solids: a subclass says of how many nodes, and what the volumes are projected on.
 
-    Masses of nodes are in proportion to the integrals of the squared shape functions (E. Hinton, T. Rock,
-    O. C. Zienkiewicz, Earthq. Eng. Struct. Dyn. 4 (1976) 245-249), none negative. Those of 27 nodes are exact
-    for the inertia of a box; a cube of eight has 3, one of twenty 2.2 times as much.
+    Masses of nodes are as the integrals of the squared shape functions (E. Hinton et al., Earthq. Eng.
+    Struct. Dyn. 4 (1976) 245-249), none negative: exact for the inertia of a box with 27, not with 8 or 20.
 
     Attributes:
         markers: its nodes, in the order of `nc.mesh.Mesh`.
