@@ -288,7 +288,6 @@ COOK_FINEST = [
     ("Hexahedron8", 2, 0.4999, 4.01),
     ("Hexahedron8", 4, 0.4999, 4.11),
     ("Hexahedron8", 8, 0.4999, 4.21),
-    ("Hexahedron8", 16, 0.4999, 4.52),
     ("Hexahedron27", 2, 0.4999, 7.99),
     ("Hexahedron27", 4, 0.4999, 10.10),
     ("Hexahedron27P1", 4, 0.4999, 11.954),
