@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.cells import CELLS, met_once
@@ -12,7 +12,7 @@ from natcoord_jax.core.checks import is_concrete
 from natcoord_jax.core.kinds import Choice, Several, of
 from natcoord_jax.core.lattice import ELEMENTS, cells_of_box, divisions
 from natcoord_jax.core.numeric import Number, Numbers, Whole
-from natcoord_jax.maths.places import places
+from natcoord_jax.maths.places import places, twins
 
 NAMED = of("a dictionary of names", dict)
 
@@ -112,6 +112,16 @@ def _check(nodes: Any, cells: np.ndarray) -> None:
         raise ValueError(
             f"mesh: cells has nodes from {cells.min()} to {cells.max()}; there are 0 to {len(nodes) - 1}"
         )
+    order = np.sort(cells, axis=1)
+    own = np.sum(order[:, 1:] == order[:, :-1], axis=1)
+    if cells.shape[1] == 4:
+        own = own - (cells[:, 2] == cells[:, 3])
+    if own.any():
+        cell = int(np.argmax(own > 0))
+        raise ValueError(
+            f"mesh: cell {cell} has a node twice: {cells[cell].tolist()}; list each once, of a triangle the "
+            "last one twice"
+        )
     unused = np.setdiff1d(np.arange(len(nodes)), cells)
     if unused.size:
         raise ValueError(
@@ -119,22 +129,12 @@ def _check(nodes: Any, cells: np.ndarray) -> None:
             "(`nc.mesh.cleaned` does)"
         )
     if is_concrete(nodes):
-        twins = _twins(np.asarray(nodes))
-        if twins is not None:
+        both = twins(np.asarray(nodes))
+        if both is not None:
             raise ValueError(
-                f"mesh: nodes {twins[0]} and {twins[1]} are at the same place, so that the cells on them are "
+                f"mesh: nodes {both[0]} and {both[1]} are at the same place, so that the cells on them are "
                 "not joined; merge them (`nc.mesh.cleaned` does)"
             )
-
-
-def _twins(nodes: Float[np.ndarray, "n 3"]) -> tuple[int, int] | None:
-    """Two nodes at the same place, if there are any."""
-    number = places(nodes)
-    first = np.unique(number, return_index=True)[1]
-    later = np.setdiff1d(np.arange(len(nodes)), first)
-    if not later.size:
-        return None
-    return int(np.flatnonzero(number == number[later[0]])[0]), int(later[0])
 
 
 @checked("mesh.cleaned", nodes=Numbers((None, 3)), cells=Numbers((None, None)), sets=NAMED, faces=NAMED)

@@ -72,7 +72,8 @@ def skin_on_block():
     block = scene.add(nc.Solid(box, material=foam, position=(0, 0, -0.2), name="block"))
     skin = scene.add(nc.Shell(top, **THIN, name="skin"))
     scene.add(nc.Tie(skin.face(), block.face("z1"), name="seam"))
-    pushed(scene, skin.set("right")[0], (1.0, 3.0, 8.0))
+    # Of two and a half times as much, steps are repeated in parts, more often than they may be in a thousand.
+    pushed(scene, skin.set("right")[0], (0.4, 1.2, 3.2))
     return scene
 
 
@@ -85,11 +86,8 @@ def ball_with_gas():
     return scene
 
 
-@pytest.mark.parametrize(
-    ("make", "steps"),
-    [(hub_plate_fold_plate, 1000), (plate_on_beam, 1000), (skin_on_block, 100), (ball_with_gas, 100)],
-)
-def test_all_is_kept_through_what_is_joined(make, steps):
+@pytest.mark.parametrize("make", [hub_plate_fold_plate, plate_on_beam, skin_on_block, ball_with_gas])
+def test_all_is_kept_through_what_is_joined(make, steps=1000):
     """Energy, momentum and angular momentum; it bends, and junctions stay closed."""
     dt = 50 * period(0.25)
     system, state = make().compile(assemble=True)

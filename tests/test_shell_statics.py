@@ -73,18 +73,27 @@ def test_cylinder_pulled_out():
         np.testing.assert_allclose(moved[:, round(20 * load) - 1], values, rtol=0.03)
 
 
+def test_pinched_cylinder():
+    """S06: between rigid diaphragms it buckles on the way; 83.102 and 34.272, missed by 0.8 and 3.1 %."""
+    foil = nc.Elastic(E=3e4, nu=0.3, density=1.0)
+    system, state, nodes = eighth((40, 40), 100.0, 200.0, foil, 1.0, -12e3, diaphragm=True)
+    found = nc.equilibrium(system, state, steps=20).states
+    moved = [place_of(system, found, node) - place_of(system, state, node) for node in nodes[:2]]
+    np.testing.assert_allclose((-moved[0][-1, 0], moved[1][-1, 1]), (83.78, 35.33), atol=0.02)
+    for load, value in {0.05: 9.561, 0.1: 23.164, 0.2: 56.373, 0.5: 73.79, 0.7: 78.451, 1.0: 83.102}.items():
+        assert -moved[0][round(20 * load) - 1, 0] == pytest.approx(value, rel=0.03)
+
+
 def test_half_cylinder_pushed_at_its_free_end():
-    """S07, isotropic: it snaps; 171.505, missed by 0.5 %, by 4 % at the first loads."""
+    """S07, isotropic: it snaps; 171.505, missed by 0.5 %.
+
+    By 3.4 % at a tenth of the load, which is the mesh: 8.0 % with 12 x 12, and 4.3 instead of 2 % at 0.2.
+    """
     system, state, node = clamped_half((20, 20))
     found = nc.equilibrium(system, state, steps=40)
     sag = place_of(system, state, node)[1] - place_of(system, found.states, node)[:, 1]
     np.testing.assert_allclose(sag[-1], 172.30, atol=0.02)
-    for load, value in {
-        0.1: 16.1,
-        0.2: 37.582,
-        0.4: 113.704,
-        0.6: 144.185,
-        0.8: 160.015,
-        1.0: 171.505,
-    }.items():
-        assert sag[round(40 * load) - 1] == pytest.approx(value, rel=0.04)
+    published = {0.2: 37.582, 0.4: 113.704, 0.6: 144.185, 0.8: 160.015, 1.0: 171.505}
+    for load, value in published.items():
+        assert sag[round(40 * load) - 1] == pytest.approx(value, rel=0.03 if load in (0.2, 1.0) else 0.04)
+    np.testing.assert_allclose(sag[3] / 16.1, 1.0 - 0.034, atol=1e-3)

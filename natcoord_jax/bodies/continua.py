@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from natcoord_jax.bodies.nodes import Nodes
-from natcoord_jax.bodies.normals import check_folds, normals_at
+from natcoord_jax.bodies.normals import check_folds, check_turns, normals_at
 from natcoord_jax.bodies.rigid import Orientation, orientation
 from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.checks import as_array, is_concrete, require_double
@@ -83,9 +83,12 @@ class MeshHandle(Handle):
         """Faces of a solid by their name in the mesh, as "x1"; without one all that are outside, or a shell.
 
         Raises:
-            ValueError: for a name that there is not, naming those that there are.
+            ValueError: for a name that there is not, naming those that there are, and for a shell whose cells
+                are listed in turn one way and the other.
         """
         shell = self.mesh.cells.shape[1] == 4
+        if shell:
+            check_turns(self.mesh, self.name)
         if name is None:
             return Surface(self, self.mesh.cells if shell else self.mesh.outside)
         if name not in self.mesh.faces:

@@ -37,7 +37,11 @@ def check_folds(mesh: Mesh, normals: Array, name: str) -> None:
     own = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
     size = np.linalg.norm(own, axis=1)
     if np.any(size == 0):
-        raise ValueError(f"shell {name!r}: cell {int(np.argmin(size))} of the mesh has no area")
+        cell = int(np.argmin(size))
+        raise ValueError(
+            f"shell {name!r}: cell {cell} of the mesh, of the nodes {mesh.cells[cell].tolist()}, has no "
+            "area; list its nodes in turn round it, or leave it out"
+        )
     cosines = np.sum((own / size[:, None])[:, None] * np.asarray(normals)[mesh.cells], axis=2)
     if cosines.min() < np.cos(np.radians(FOLD)):
         node = int(mesh.cells.flat[np.argmin(cosines)])
@@ -45,4 +49,22 @@ def check_folds(mesh: Mesh, normals: Array, name: str) -> None:
             f"shell {name!r}: at node {node} the surface is folded, or its cells are listed in turn one "
             "way and the other; list all of them the same way, pass `directors` (n, 3), or make one "
             "shell of each side of the fold and join them by nc.Fold"
+        )
+
+
+def check_turns(mesh: Mesh, name: str) -> None:
+    """Refuse surfaces whose two sides are not told apart: what presses on one would not.
+
+    Raises:
+        ValueError: with two cells.
+    """
+    sides = np.stack([mesh.cells, np.roll(mesh.cells, -1, axis=1)], axis=2)
+    owner = np.repeat(np.arange(len(sides)), 4)[(sides[:, :, 0] != sides[:, :, 1]).ravel()]
+    sides = sides[sides[:, :, 0] != sides[:, :, 1]]
+    _, number, count = np.unique(sides, axis=0, return_inverse=True, return_counts=True)
+    if count.max() > 1:
+        one, other = owner[number.ravel() == np.argmax(count)][:2]
+        raise ValueError(
+            f"shell {name!r}: cells {one} and {other} of the mesh are listed in turn one way and the other; "
+            "list all of them the same way, so that the surface has two sides"
         )

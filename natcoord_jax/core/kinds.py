@@ -90,7 +90,9 @@ class Either(Kind):
             if found[-1] is None:
                 return None
         telling = [text for text in found if text != is_other(value)]
-        return (telling or found)[0]
+        # Where the shape is that of one kind, it is not what is wrong.
+        fitting = [text for text in telling if not text.startswith("has shape")]
+        return (fitting or telling or found)[0]
 
 
 def is_other(value: Any) -> str:

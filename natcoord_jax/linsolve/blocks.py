@@ -157,10 +157,10 @@ def block_pattern(nodes: np.ndarray, elements: list[np.ndarray]) -> tuple[BlockP
     for array in (nodes, tiles_rows, tiles_columns, *slots):
         digest.update(np.ascontiguousarray(array, np.int32).tobytes() + str(array.shape).encode())
     pattern = BlockPattern(
-        jnp.asarray(tiles_rows, jnp.int32),
-        jnp.asarray(tiles_columns, jnp.int32),
+        jnp.asarray(tiles_rows.astype(np.int32)),
+        jnp.asarray(tiles_columns.astype(np.int32)),
         tuple(jnp.asarray(s) for s in slots),
-        jnp.asarray(diagonal, jnp.int32),
+        jnp.asarray(diagonal.astype(np.int32)),
         n,
         digest.hexdigest()[:16],
     )

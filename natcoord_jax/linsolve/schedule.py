@@ -214,4 +214,5 @@ def _bucket(members: list[int], fronts: list[Front], maps: _Maps, run: int) -> B
 
 
 def _indices(array: np.ndarray) -> Int[Array, "..."]:
-    return jnp.asarray(array, jnp.int32)
+    # Converted by NumPy: by JAX, each shape would compile a program.
+    return jnp.asarray(np.asarray(array, np.int32))

@@ -20,3 +20,13 @@ def places(nodes: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
         np.minimum.at(least, number, found)
         found = least[number]
     return found
+
+
+def twins(nodes: Float[np.ndarray, "n 3"]) -> tuple[int, int] | None:
+    """Two nodes at the same place, if there are any."""
+    number = places(nodes)
+    first = np.unique(number, return_index=True)[1]
+    later = np.setdiff1d(np.arange(len(nodes)), first)
+    if not later.size:
+        return None
+    return int(np.flatnonzero(number == number[later[0]])[0]), int(later[0])

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from natcoord_jax.core.bodies import POINT, TRIAD, NodeKind
+from natcoord_jax.core.bodies import TRIAD, NodeKind
 from natcoord_jax.core.checks import as_array, is_concrete
 from natcoord_jax.core.coordinate import Coordinate, CoordinateEffect
 from natcoord_jax.core.eager_numpy import eager_numpy, stacked
@@ -176,7 +176,7 @@ class Layout:
         return instances
 
     def _check_joint(self, name: str, joint: Joint) -> None:
-        """Refuse joints of directors that need more axes than these have.
+        """Refuse joints of points and directors that need more axes than these have.
 
         Raises:
             ValueError: naming joint and node.
@@ -184,7 +184,7 @@ class Layout:
         for handle in (joint.parent, joint.child):
             # A ball joint and a distance are between points; all others hold axes, a fixed one, too.
             axes = joint.needs_axis or joint.multipliers > 3
-            if axes and self.bodies.kind_of(handle) not in (POINT, TRIAD):
+            if axes and self.bodies.kind_of(handle) is not TRIAD:
                 kind, node = type(joint).__name__, self.bodies.kind_of(handle).name
                 raise ValueError(
                     f"joint {name!r}: {handle.name!r} has a {node} only, no axes that a {kind} joint could "

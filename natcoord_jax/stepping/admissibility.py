@@ -143,6 +143,15 @@ def _jacobian(system: System, state: State):
     return step.jacobian(step.guess())
 
 
+@eager_numpy
+def _constraint_rows(system: System, state: State):
+    """Derivatives of the constraints by the rates, row by row: there are fewer of them than rates."""
+    step, count = _tiny_step(system, state), system.structure.unknowns
+    guess = step.guess()
+    constraints, pull = jax.vjp(lambda y: step.residual(y)[0][count:], guess)
+    return jax.vmap(lambda unit: pull(unit)[0][:count])(jnp.eye(len(constraints)))
+
+
 def check_inertia(system: System, state: State) -> None:
     """Refuse a free motion that moves no mass.
 
@@ -183,7 +192,6 @@ def find_redundancy(system: System, state: State) -> tuple[int, tuple[str, ...]]
     The rank is the largest over the start and two perturbed admissible configurations: a deficiency at the
     start only (a flat parallelogram) is no redundancy.
     """
-    count = system.structure.unknowns
     if system.structure.held == 0:
         return 0, ()
     held = held_multipliers(active_groups(system))
@@ -197,13 +205,13 @@ def find_redundancy(system: System, state: State) -> tuple[int, tuple[str, ...]]
                 continue
         else:
             state_now = state
-        rows = np.asarray(_jacobian(system, state_now))[count:, :count][held]
+        rows = np.asarray(_constraint_rows(system, state_now))[held]
         rank, dependent = _rank(rows)
         if not dependent:
             return rank, ()
         if rank > best:
             best = rank
-            places = count + np.flatnonzero(held)[dependent]
+            places = system.structure.unknowns + np.flatnonzero(held)[dependent]
             names = tuple(dict.fromkeys(unknown_name(system, int(r)) for r in places))
     return best, names
 
@@ -219,6 +227,8 @@ def _rank(rows: np.ndarray) -> tuple[int, list[int]]:
     """Rank, and rows that depend on earlier ones, so that later joints are named."""
     sizes = np.linalg.svd(rows, compute_uv=False)
     rank = int(np.sum(sizes > 1e-9 * max(sizes[0], 1e-300))) if sizes.size else 0
+    if rank == len(rows):
+        return rank, []
     largest = np.max(np.linalg.norm(rows, axis=1), initial=1e-300)
     basis: list[np.ndarray] = []
     dependent = []

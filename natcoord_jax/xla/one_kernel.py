@@ -4,7 +4,8 @@ XLA's CPU backend calls a kernel for every fusion, at some forty nanoseconds eac
 is a few hundred kernels of a few dozen numbers: the calls cost several times what the arithmetic does. A
 call that carries the attribute `xla_cpu_small_call` is compiled into one function instead, loops included
 (the compiler's own pass does so with tiny loops). That works for programs without calls into libraries,
-and only if every argument is used; so
+and only if every argument is used. Programs of large arrays gain nothing by it and are left as they are; in
+others
 
 - small products are rewritten as sums, scatters as updates of slices, long reductions as loops,
 - a program that holds anything else than the operations known to work is left as it is,
@@ -25,7 +26,7 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.xla import rewriting
 from natcoord_jax.xla.kernels import KERNEL
-from natcoord_jax.xla.rewriting import Flat, known, operations
+from natcoord_jax.xla.rewriting import Flat, known, mean_size, operations
 
 try:
     from jax.experimental.scheduling_groups import xla_metadata_call as _attributed
@@ -34,6 +35,10 @@ except ImportError:  # an experimental module of JAX: without it everything runs
 
 LARGEST = 6800
 """Operations of a program that still compiles quickly in one piece: the time grows faster than the size."""
+
+WIDE = 300
+"""Numbers that an operation finds on average from which on calls cost next to nothing beside it: the program
+compiles in half the time as it is, its products by a library, and runs as fast."""
 
 ATTRIBUTES = {KERNEL: "true", "inlineable": "false"}
 """Compiled as one function; kept as a call until then."""
@@ -50,7 +55,13 @@ def as_one_kernel(function: Callable, *arguments: Any) -> Any:
     """
     if not on_cpu():
         return function(*arguments)
-    return _flat(_kernel, *jax.make_jaxpr(function, return_shape=True)(*arguments), arguments)
+    program, shapes = jax.make_jaxpr(function, return_shape=True)(*arguments)
+    wide = mean_size(program.jaxpr) > WIDE
+    return _flat(_as_it_is if wide else _kernel, program, shapes, arguments)
+
+
+def _as_it_is(function: Callable) -> Callable:
+    return function
 
 
 def in_few_kernels(function: Callable, *arguments: Any) -> Any:
@@ -75,13 +86,15 @@ def in_few_kernels(function: Callable, *arguments: Any) -> Any:
         return parts[key]
 
     def written_out(part: Callable, *given: Any) -> Any:
-        return _flat(lambda flat: flat, *traced(part, given), given)
+        return _flat(_as_it_is, *traced(part, given), given)
 
     def apart(part: Callable, *given: Any) -> Any:
         return _flat(_kernel, *traced(part, given), given)
 
     whole = partial(function, written_out)
     program, shapes = jax.make_jaxpr(whole, return_shape=True)(*arguments)
+    if mean_size(program.jaxpr) > WIDE:
+        return _flat(_as_it_is, program, shapes, arguments)
     if operations(program.jaxpr) > LARGEST:
         return function(apart, *arguments)
     return _flat(_kernel, program, shapes, arguments)

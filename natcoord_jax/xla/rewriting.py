@@ -92,6 +92,23 @@ def operations(program: Any) -> int:
     return sum(1 + sum(map(operations, _inner_programs(equation))) for equation in _needed(program))
 
 
+def mean_size(program: Any) -> float:
+    """Numbers that an operation of a program finds on average."""
+    count, numbers = _sizes(program)
+    return numbers / max(count, 1)
+
+
+def _sizes(program: Any) -> tuple[int, int]:
+    """Operations without programs in them, and the numbers that they find."""
+    count, numbers = 0, 0
+    for equation in _needed(program):
+        inner = [_sizes(x) for x in _inner_programs(equation)]
+        here = 1, sum(math.prod(x.aval.shape) for x in equation.outvars)
+        for a, b in inner or [here]:
+            count, numbers = count + a, numbers + b
+    return count, numbers
+
+
 def _needed(program: Any) -> list[Any]:
     """Equations of a program that its outputs need."""
     wanted, found = set(map(id, program.outvars)), []

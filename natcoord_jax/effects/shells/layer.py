@@ -15,6 +15,13 @@ from natcoord_jax.core.potential import Potential
 from natcoord_jax.effects.laminates import Laminate, Orthotropic
 from natcoord_jax.effects.materials import MASS, Elastic, Sheet
 from natcoord_jax.effects.shells.readings import ShellReadings, readings_of
+from natcoord_jax.maths.vectors import cross, dot
+
+FLAT = 1e-9
+"""Area at a corner, in squares of the sides, up to which an element is degenerate there."""
+
+BESIDE = 0.1
+"""Cosine of the angle between normal and directors at least: along the surface there is no thickness."""
 
 MATERIAL = of("a material, as nc.Elastic(...)", Elastic, Orthotropic, Laminate)
 
@@ -95,12 +102,24 @@ class LayerElement(Potential):
         return self.areas[:, None, None] * across
 
     def flaws(self) -> dict[str, Array]:
-        """Corners that are no corners."""
-        return {
-            "is degenerate or turned over: list its nodes in turn round it": jnp.min(self.areas) <= 0.0,
-            "has no first axis: direction [-] is normal to it": ~jnp.all(jnp.isfinite(self.stiffness)),
-            **self.material.flaws(),
+        """Corners that are no corners, and directors along the surface."""
+        x = self.reference[:, 0] if self.bends else self.reference
+        sides = jnp.roll(x, -1, axis=0) - x
+        corners = cross(jnp.roll(sides, 1, axis=0), sides)
+        normal = jnp.sum(corners, axis=0)
+        length = jnp.sqrt(dot(normal, normal))
+        flat = jnp.min(dot(corners, normal)) <= FLAT * jnp.sum(sides**2) * length
+        found = {
+            "is degenerate or not convex: list its nodes in turn round it, each once": flat,
+            "has no first axis: direction [-] is normal to it": ~flat
+            & ~jnp.all(jnp.isfinite(self.stiffness)),
         }
+        if self.bends:
+            away = dot(self.reference[:, 1], normal) / jnp.where(length > 0, length, 1.0)
+            beside = ~(jnp.all(away > BESIDE) | jnp.all(away < -BESIDE))
+            said = "has directors along it, or to both of its sides: pass such as are near its normals"
+            found[said] = ~flat & beside
+        return found | self.material.flaws()
 
     def energy(self, invariants: Float[Array, "p *n"]) -> Float[Array, "*n"]:
         """Energy [J]."""

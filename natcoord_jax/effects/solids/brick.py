@@ -178,7 +178,7 @@ class Brick(Potential):
     def flaws(self) -> dict[str, Array]:
         """Corners that are no corners."""
         said = "is degenerate or turned inside out: list four nodes in turn round one face, then those above"
-        return {said: jnp.min(self.volumes) <= 0.0, **self.material.flaws()}
+        return {said: ~(jnp.min(self.volumes) > 0.0), **self.material.flaws()}
 
     def volume_ratios(self, place: Array, rows: Array) -> Float[Array, " n"]:
         """Smallest of the Gauss points of each of `n` elements."""

@@ -118,7 +118,7 @@ class SolidElement(Potential):
         """Corners that are no corners."""
         said = "is degenerate or turned inside out: list its nodes in the order of nc.mesh.Mesh, middles of "
         said += "edges near their middles"
-        return {said: jnp.min(self.volumes) <= 0.0, **self.material.flaws()}
+        return {said: ~(jnp.min(self.volumes) > 0.0), **self.material.flaws()}
 
     def volume_ratios(self, place: Array, rows: Array) -> Float[Array, " n"]:
         """Smallest of the quadrature points of each of `n` elements."""
