@@ -31,10 +31,6 @@ BLEND = 0.2
 AT_END = 1e-6
 """Natural coordinates by which a node at the very end of a surface may be beyond it, by rounding."""
 
-FOCUS = 0.5
-"""Product of the factors 1 - height * curvature below which a facet counts less: at zero the node is at its
-focal surface, beyond which no foot of a normal is near, and the iteration may end anywhere."""
-
 LEVEL = 0.3
 """Difference of heights above two facets, in terms of their size, at which only the nearer one counts."""
 
@@ -53,11 +49,9 @@ class Nearest(eqx.Module):
         apart: from it to the point that it is the nearest to [m].
         normal: of the facet there, of unit length [-].
         edge: on which it is, by the number of the edge's first corner; -1: within the facet.
-        squares: of the distances from the nearest points of the edges [m^2].
-        front: whether the node is in front of the facet at the nearest point.
+        to_edges: squares of the distances from the nearest points of the edges [m^2].
         natural: coordinates of the foot of the normal, which may be a little beyond the edges.
         height: of the node above it [m].
-        focus: product of the factors 1 - height * curvature of both principal curvatures there [-].
         size: of the facet [m].
     """
 
@@ -65,11 +59,9 @@ class Nearest(eqx.Module):
     apart: Float[Array, "3"]
     normal: Float[Array, "3"]
     edge: Int[Array, ""]
-    squares: Float[Array, "4"]
-    front: Bool[Array, ""]
+    to_edges: Float[Array, "4"]
     natural: Float[Array, "2"]
     height: Float[Array, ""]
-    focus: Float[Array, ""]
     size: Float[Array, ""]
 
 
@@ -132,27 +124,13 @@ def nearest_point(point: Float[Array, "3"], corners: Float[Array, "4 3"]) -> Nea
     within = jnp.all(jnp.abs(natural) < 1.0) & (squares[0] <= squares[1:][best] * (1 + 1e-12))
     weights = jnp.where(within, inside, edges[best])
     apart = jnp.where(within, apart[0], apart[1:][best])
-    edge = jnp.where(within, -1, best)
-    front = dot(_normal(jnp.stack([XI, ETA]) @ weights, corners)[0], apart) >= 0
-    normal, size = _normal(natural, corners)
     one, two = _slopes(natural, corners)
-    from_foot = point - inside @ corners
-    bent = dot(one, two) - dot(from_foot, warp)
-    area = size**2
-    some = area > 0
-    focus = (dot(one, one) * dot(two, two) - bent**2) / jnp.where(some, area, 1.0)
-    focus = jnp.where(some, focus, 0.0)
-    height = dot(normal, from_foot)
-    return Nearest(
-        weights, apart, normal, edge, squares[1:], front, natural, height, focus, 2.0 * safe_sqrt(size)
-    )
-
-
-def _normal(natural: Float[Array, "2"], corners: Float[Array, "4 3"]) -> tuple[Array, Array]:
-    """Unit normal of a facet, and a quarter of its area where it is even [m^2]."""
-    normal = cross(*_slopes(natural, corners))
+    normal = cross(one, two)
     size = safe_norm(normal)
-    return normal / jnp.where(size > 0, size, 1.0), size
+    normal = normal / jnp.where(size > 0, size, 1.0)
+    height = dot(normal, point - inside @ corners)
+    edge = jnp.where(within, -1, best)
+    return Nearest(weights, apart, normal, edge, squares[1:], natural, height, 2.0 * safe_sqrt(size))
 
 
 class NodeOnFacets(DiscreteGap):
@@ -210,10 +188,11 @@ class NodeOnFacets(DiscreteGap):
         rest = jnp.maximum(1.0 - jnp.sum(shares), 0.0)
         heights = jnp.where(both, jnp.abs(every.height), every.height)
         # Beside all of its facets a node is not behind them, wherever the surface goes on: see `uncovered`.
-        # (A corner is part of several edges: the node is beside if any of them is an end.)
+        # A corner is part of several edges, of which one that is an end decides.
         ending = ends | (jnp.broadcast_to(jnp.asarray(self.beyond), facets.shape) > 0)
-        beside = (at.edge >= 0) & jnp.any(ending & _as_near(every.squares, dot(at.apart, at.apart)))
-        aside = jnp.where(at.front | both | beside, 1.0, -1.0) * safe_norm(at.apart)
+        beside = (at.edge >= 0) & jnp.any(ending & _nearest(every))
+        behind = (at.height < 0) & ~both & ~beside
+        aside = jnp.where(behind, -1.0, 1.0) * safe_norm(at.apart)
         return (jnp.sum(shares * heights) + rest * aside) / (jnp.sum(shares) + rest), facets[best]
 
     def uncovered(self, place: Array, rows: Float[Array, "k 4 3"]) -> dict[str, Array]:
@@ -221,35 +200,27 @@ class NodeOnFacets(DiscreteGap):
         x = place_markers(place, rows)
         facets = jnp.asarray(self.facets).astype(int)
         every = jax.vmap(nearest_point, in_axes=(None, 0))(x[0], x[facets])
-        squares = dot(every.apart, every.apart)
-        best = jnp.argmin(squares)
         beyond = jnp.broadcast_to(jnp.asarray(self.beyond), facets.shape)
-        beside = jnp.any(_as_near(every.squares, squares[best]) & (every.squares < beyond**2))
+        beside = jnp.any(_nearest(every) & (every.to_edges < beyond**2))
         both = jnp.asarray(self.two_sided) > 0
-        height = every.height[best]
+        height = every.height[jnp.argmin(dot(every.apart, every.apart))]
         reached = jnp.where(both, jnp.abs(height), height) < self.thickness
         return {LEFT: beside & reached}
 
 
-def _as_near(squares: Float[Array, "f 4"], least: Float[Array, ""]) -> Bool[Array, "f 4"]:
-    """Which edges are the nearest, but for rounding."""
-    return squares <= least * (1 + 1e-9)
+def _nearest(every: Nearest) -> Bool[Array, "f 4"]:
+    """Which edges of all facets are the nearest, but for rounding."""
+    return every.to_edges <= jnp.min(dot(every.apart, every.apart)) * (1 + 1e-9)
 
 
 def _share(at: Nearest, ends: Float[Array, "4"]) -> Float[Array, ""]:
     """How much a facet counts where it passes nodes on to its neighbours: smoothly from one to none."""
     beyond = jnp.abs(at.natural) - 1.0
-    smooth = _smooth(0.5 * (BLEND - beyond) / BLEND)
+    smooth = jnp.clip(0.5 * (BLEND - beyond) / BLEND, 0.0, 1.0)
+    smooth = smooth**2 * (3.0 - 2.0 * smooth)
     # The edges at xi = 1 and -1 are those from corners 1 and 3, at eta = 1 and -1 from corners 2 and 0.
     end = jnp.where(at.natural > 0, ends[jnp.array([1, 2])], ends[jnp.array([3, 0])])
-    inside = jnp.prod(jnp.where(end, jnp.where(beyond < AT_END, 1.0, 0.0), smooth))
-    return inside * _smooth(at.focus / FOCUS)
-
-
-def _smooth(x: Array) -> Array:
-    """From none below zero to one above one, without corners."""
-    x = jnp.clip(x, 0.0, 1.0)
-    return x**2 * (3.0 - 2.0 * x)
+    return jnp.prod(jnp.where(end, jnp.where(beyond < AT_END, 1.0, 0.0), smooth))
 
 
 def _level(every: Nearest) -> Float[Array, " f"]:
