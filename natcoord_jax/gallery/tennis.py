@@ -158,17 +158,17 @@ def figure(racket: Racket, ball: Any, phases: nc.Phases) -> Any:
     t, parts = np.asarray(phases.t), strain_energies(phases)
     total = Curve("all", t, np.sum(list(parts.values()), axis=0))
     near = (t > HIT - 0.005) & (t < HIT + 0.02)
-    ms, zoomed = 1e3 * (t[near] - HIT), {"abscissa": f"t - {HIT:g} s [ms]"}
+    ms, since = 1e3 * (t[near] - HIT), f"t - {HIT:g} s [ms]"
     close = [Curve(name, ms, values[near]) for name, values in parts.items()]
     speed = np.linalg.norm(flight_of(phases, ball), axis=1)
-    drives = sum(np.asarray(w) for name, w in phases.work().items() if "drive" in name)
+    drives = np.sum([np.asarray(w) for name, w in phases.work().items() if "drive" in name], axis=0)
     books = [np.asarray(nc.balance(system, run).energy) for system, run in phases.pairs]
     panels = [
         Panel("strain energy of racket and ball", "[J]", [total]),
-        Panel("of each at the impact", "[J]", close, **zoomed),
+        Panel("of each at the impact", "[J]", close, abscissa=since),
         Panel("force of the strings on the ball", "[N]", [Curve("force", ms, force_on_ball(phases)[near])],
-              **zoomed),
-        Panel("speed of the ball", "[m/s]", [Curve("speed", ms, speed[near])], **zoomed),
+              abscissa=since),
+        Panel("speed of the ball", "[m/s]", [Curve("speed", ms, speed[near])], abscissa=since),
         Panel("work of the drives", "[J]", [Curve("work", t, drives)]),
         Panel("balance of energy, with that work", "[-]", [Curve("balance", t, np.concatenate(books))],
               logarithmic=True),
