@@ -2,7 +2,7 @@
 
 import pytest
 
-SLOW = ("02", "03", "04", "05", "06", "07", "08", "10", "11", "12", "13", "14", "15", "16", "17", "19")
+SLOW = ("02", "03", "04", "05", "06", "07", "08", "10", "11", "12", "13", "14", "15", "16", "17", "18", "19")
 """Numbers of the notebooks that take long: all but the first, and the ninth, which takes longest."""
 
 

@@ -120,19 +120,54 @@ def test_a_node_at_the_very_end_counts():
     np.testing.assert_allclose(gaps, [-0.01, np.hypot(1e-3, 0.01)], rtol=1e-9)
 
 
-def test_a_node_far_from_warped_facets():
-    """It is as far as their nearest edge, before and behind their planes, however they are warped."""
-    random = np.random.default_rng(3)
-    facets = node_on_two_facets()
-    contact = jax.jit(lambda x: facets.gap(x))
-    for _ in range(50):
-        direction = random.normal(size=3) * (1.0, 1.0, 0.3)
-        at = 50.0 * direction / np.linalg.norm(direction)
-        x = places(random, at)
-        line = np.linspace(0.0, 1.0, 201)[:, None]
-        every = [(1 - line) * x[a] + line * x[b] for f in FACETS for a, b in zip(f, (*f[1:], f[0]))]
-        nearest = np.linalg.norm(np.concatenate(every) - at, axis=1).min()
-        assert abs(contact(x) - nearest) < 0.02
+def warped_patch(random, warp):
+    """Nine facets in a plane but for the warp, each with its corners in turn from any of them on."""
+    line = np.linspace(-1.5, 1.5, 4)
+    corners = np.array([(x, y, 0.0) for x in line for y in line]) + warp * random.normal(size=(16, 3))
+    facets = np.array([(k, k + 4, k + 5, k + 1) for k in (0, 1, 2, 4, 5, 6, 8, 9, 10)])
+    facets = np.array([np.roll(facet, random.integers(4)) for facet in facets])
+    edges = [frozenset(pair) for facet in facets for pair in zip(facet, np.roll(facet, -1))]
+    ends = np.array([edges.count(edge) == 1 for edge in edges], float).reshape(9, 4)
+    return corners, {"facets": facets + 1, "open": ends}
+
+
+@pytest.mark.parametrize("warp", [0.0, 0.01, 0.05])
+def test_a_node_far_from_warped_facets(warp):
+    """It is as far as their nearest point, in front, beside, or behind all but their ends."""
+    random, line = np.random.default_rng(3), np.linspace(-1, 1, 9)
+    corners, given = warped_patch(random, warp)
+    markers = tuple(nc.Point(nc.ground, (k, 0, 0)) for k in range(17))
+    contact = nc.NodeOnFacets(markers, stiffness=1.0, **given)
+    inside = np.array([shapes(np.array([u, v])) for u in line for v in line])
+    surface = np.einsum("sk,fkx->fsx", inside, corners[given["facets"] - 1]).reshape(-1, 3)
+    direction = random.normal(size=(5000, 3)) * (1.0, 1.0, 0.7)
+    direction /= np.linalg.norm(direction, axis=1)[:, None]
+    near = random.uniform(-1.5, 1.5, (5000, 3)) * (1, 1, 0)
+    at = near + 10.0 ** random.uniform(0, 2, (5000, 1)) * direction
+    apart = np.linalg.norm(at[:, None] - surface, axis=2)
+    end = 1.5 - np.abs(surface[apart.argmin(axis=1), :2]).max(axis=1) < 0.3
+    out = np.linalg.norm(at[:, :2] - np.clip(at[:, :2], -1.5, 1.5), axis=1)
+    ahead = at[:, 2] > np.where(out > 0.5, -0.7 * out, 0.5)
+    behind = (at[:, 2] < -0.5) & ~end
+    assert ahead.sum() > 1000 and behind.sum() > 100
+    gaps = jax.jit(jax.vmap(lambda x: contact.gap(jnp.concatenate([x[None], corners]))))(jnp.asarray(at))
+    expected = np.where(behind, -1.0, 1.0) * apart.min(axis=1)
+    clear = ahead | behind
+    np.testing.assert_allclose(gaps[clear], expected[clear], rtol=0.02)
+
+
+@pytest.mark.slow
+def test_a_body_flies_past_a_surface():
+    """Far beside it and across its plane, where a corner that two facets share is nearest: nothing pushes."""
+    corners, given = warped_patch(np.random.default_rng(5), 0.05)
+    scene, place, velocity = nc.Scene(), (-6.0, 0.6, 1.0), (0.0, 0.0, -2.0)
+    body = scene.add(nc.RigidBody(mass=1.0, inertia=(1, 1, 1), position=place, velocity=velocity))
+    markers = nc.Point(body, place), *(nc.Point(nc.ground, x) for x in corners)
+    scene.add(nc.NodeOnFacets(markers, stiffness=1e5, **given))
+    system, state = scene.compile()
+    trajectory = nc.simulate(system, state, dt=0.01, steps=100)
+    straight = np.asarray(place) + np.asarray(trajectory.t)[:, None] * velocity
+    np.testing.assert_allclose(system.sense(trajectory, body).position, straight, atol=1e-12)
 
 
 @pytest.mark.slow

@@ -8,6 +8,8 @@ from jaxtyping import Float
 
 import natcoord_jax as nc
 from natcoord_jax.bodies.continua import MeshHandle, Surface
+from natcoord_jax.core.checks import as_array
+from natcoord_jax.core.effect import replace_fields
 
 Place = Float[np.ndarray, "n 3"]
 
@@ -160,3 +162,35 @@ def add_ball(scene: nc.Scene, count: int = 3, **placing: Any) -> MeshHandle:
     )
     scene.add(nc.Gas(ball, gauge_pressure=GAUGE, exponent=EXPONENT, name="gas"))
     return ball
+
+
+Part = tuple[nc.System, nc.State]
+"""A part of a scene, alone, and a state of it."""
+
+
+def clamped_racket(placed: Any, grip: Any, throat: Any, width: Any) -> Part:
+    """A racket that is clamped at the grip, in equilibrium with the tension of its strings."""
+    scene = nc.Scene()
+    add_racket(scene, nc.ground, placed, grip, throat, width)
+    system, state = scene.compile()
+    return system, nc.equilibrium(system, state, steps=1).state
+
+
+def inflated_ball(count: int, place: Any, velocity: Any) -> Part:
+    """A ball in equilibrium with its gas, flying."""
+    scene = nc.Scene()
+    add_ball(scene, count, velocity=velocity)
+    system, state = scene.compile()
+    # At the origin, where places are rounded least.
+    q = np.array(nc.equilibrium(system, state, steps=1).state.q)
+    q[::4] += place
+    return system, replace_fields(state, q=as_array(q))
+
+
+def with_part(state: nc.State, system: nc.System, part: Part) -> nc.State:
+    """A state of a system in which the bodies of a part are as they are there, by name."""
+    q, v = np.array(state.q), np.array(state.v)
+    for k, name in enumerate(part[0].structure.bodies):
+        rows = slice(4 * system.body_index(name), 4 * system.body_index(name) + 4)
+        q[rows], v[rows] = (x[4 * k : 4 * k + 4] for x in (part[1].q, part[1].v))
+    return replace_fields(state, q=as_array(q), v=as_array(v))

@@ -13,7 +13,18 @@ from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.results import Result
 from natcoord_jax.gallery.example import Example
 from natcoord_jax.gallery.player import TIMES, X, Z, add_player, placements, twist_of
-from natcoord_jax.gallery.racket import RADIUS, SEMI_AXES, THICKNESS, Racket, add_ball, add_racket
+from natcoord_jax.gallery.racket import (
+    RADIUS,
+    SEMI_AXES,
+    THICKNESS,
+    Part,
+    Racket,
+    add_ball,
+    add_racket,
+    clamped_racket,
+    inflated_ball,
+    with_part,
+)
 from natcoord_jax.stepping.room import cut
 
 GRIP, THROAT = (0.0, -0.84, 1.42), (0.0, -1.12, 1.42)
@@ -28,9 +39,8 @@ HAND = "right hand"
 HIT = float(TIMES[3])
 """Time of the impact [s]."""
 
-END = HIT + 0.1
-"""Until which it runs [s]. The swing goes on to three seconds; on the way there the run ends early, while the
-ball is far away, for a reason that is not found yet."""
+END = float(TIMES[-1])
+"""Until which it runs [s]."""
 
 STEP = 0.01
 """Of the swing [s]."""
@@ -45,10 +55,10 @@ SPANS = ((HIT - 0.005, None), (HIT + 0.012, 1e-4), (HIT + 0.05, 5e-4), (END, 1e-
 """Ends of the phases [s] and their steps [s]; None: that of the run. A contact lasts 5 ms and the ball rings
 for some 30 ms."""
 
-SNAPSHOTS = (0.0, 1.1, 1.8, 1.95, 2.0, 2.006, 2.3, 3.0)
+SNAPSHOTS = (0.0, 1.1, 1.8, 1.95, 2.002, 2.03, 2.3, 2.6)
 """Times of the snapshots [s]."""
 
-COURT = (-1.5, -2.0, -0.1), (2.0, 1.5, 2.5)
+COURT = (-1.3, -1.4, -0.05), (1.7, 1.1, 1.9)
 """Corners of the box that pictures look into [m]: the ball comes from 30 m away."""
 
 
@@ -72,17 +82,27 @@ class Stroke(NamedTuple):
 
 def stroke(phases: nc.Phases, ball: Any, hit: float = HIT) -> Stroke:
     """What the impact of a run was like."""
-    pushed = [np.asarray(s.sense(run, "impact").force).sum(axis=1) for s, run in phases.pairs]
-    force, t = np.concatenate(pushed), np.asarray(phases.t)
+    force, t = force_on_ball(phases), np.asarray(phases.t)
     touching = force[:-1] > 0
+    flight = flight_of(phases, ball)
+    speed, spin = twist_of(HAND, hit)
+    racket = speed + np.cross(spin, placements(hit)[HAND](_middle()))
+    return Stroke(float(np.diff(t)[touching].sum()), float(force.max()), flight[0], flight[-1], racket)
+
+
+def force_on_ball(phases: nc.Phases) -> Float[np.ndarray, " t"]:
+    """Of the strings [N]."""
+    parts = [np.asarray(system.sense(run, "impact").force).sum(axis=1) for system, run in phases.pairs]
+    return np.concatenate(parts)
+
+
+def flight_of(phases: nc.Phases, ball: Any) -> Float[np.ndarray, "t 3"]:
+    """Velocity of the centre of mass of the ball [m/s]."""
     system = phases.systems[0]
     numbers = np.array([system.body_index(node) for node in ball.nodes])
     mass = np.asarray(system.mass)[numbers, 0, 0]
-    ends = phases.trajectories[0].states.v[0], phases.trajectories[-1].states.v[-1]
-    before, after = (mass @ np.asarray(v)[4 * numbers] / mass.sum() for v in ends)
-    speed, spin = twist_of(HAND, hit)
-    racket = speed + np.cross(spin, placements(hit)[HAND](_middle()))
-    return Stroke(float(np.diff(t)[touching].sum()), float(force.max()), before, after, racket)
+    v = np.concatenate([np.asarray(run.states.v)[:, 4 * numbers] for run in phases.trajectories])
+    return np.einsum("k,tkx->tx", mass / mass.sum(), v)
 
 
 def _middle() -> np.ndarray:
@@ -99,36 +119,14 @@ def _flight(speed: float, start: float) -> tuple[np.ndarray, np.ndarray]:
     return place - velocity * ahead + np.array([0.0, 0.0, 0.5 * GRAVITY * ahead**2]), velocity
 
 
-def _racket_at_rest(placed: Any, start: float) -> tuple[nc.System, nc.State]:
+def _racket_at_rest(placed: Any, start: float) -> Part:
     """The racket alone, in equilibrium with the tension of its strings, moving as the hand does."""
-    scene = nc.Scene()
-    add_racket(scene, nc.ground, placed, GRIP, THROAT, Z)
-    system, state = scene.compile()
-    q = np.asarray(nc.equilibrium(system, state, steps=1).state.q)
+    system, state = clamped_racket(placed, GRIP, THROAT, Z)
+    q = np.asarray(state.q)
     speed, spin = twist_of(HAND, start)
     v = np.cross(spin, q)
     v[::4] += speed
-    return system, replace_fields(state, q=as_array(q), v=as_array(v))
-
-
-def _inflated(count: int, place: Any, velocity: Any) -> tuple[nc.System, nc.State]:
-    """The ball alone, in equilibrium with its gas, flying."""
-    scene = nc.Scene()
-    add_ball(scene, count, velocity=velocity)
-    system, state = scene.compile()
-    # At the origin, where places are rounded least.
-    q = np.array(nc.equilibrium(system, state, steps=1).state.q)
-    q[::4] += place
-    return system, replace_fields(state, q=as_array(q))
-
-
-def _with(state: nc.State, system: nc.System, part: nc.System, rest: nc.State) -> nc.State:
-    """A state of a system in which the bodies of a part are as they are there, by name."""
-    q, v = np.array(state.q), np.array(state.v)
-    for k, name in enumerate(part.structure.bodies):
-        rows = slice(4 * system.body_index(name), 4 * system.body_index(name) + 4)
-        q[rows], v[rows] = rest.q[4 * k : 4 * k + 4], rest.v[4 * k : 4 * k + 4]
-    return replace_fields(state, q=as_array(q), v=as_array(v))
+    return system, replace_fields(state, v=as_array(v))
 
 
 def _phases(
@@ -153,30 +151,41 @@ def _phases(
     return nc.Phases((system,) * len(found), tuple(found))
 
 
-def figure(racket: Racket, phases: nc.Phases) -> Any:
-    """Figures 10 and 11 of the paper: snapshots, and the strain energy of what is flexible; the force."""
+def figure(racket: Racket, ball: Any, phases: nc.Phases) -> Any:
+    """Figures 9 to 11 of the paper: snapshots, and the strain energy of what is flexible; force and speed."""
     from natcoord_jax.viz import Curve, Panel, plot_snapshots
 
-    t, stores = np.asarray(phases.t), phases.energy().stores
-    rest = ("gravity 1", "impact", "ball", "gas", "net")
-    parts = {
-        "frame": sum(np.asarray(x) for name, x in stores.items() if name not in rest),
-        "strings": np.asarray(stores["net"]),
-        "ball": np.asarray(stores["ball"]) + np.asarray(stores["gas"]),
-    }
-    parts = {name: values - values[0] for name, values in parts.items()}
+    t, parts = np.asarray(phases.t), strain_energies(phases)
     total = Curve("all", t, np.sum(list(parts.values()), axis=0))
     near = (t > HIT - 0.005) & (t < HIT + 0.02)
-    ms = 1e3 * (t[near] - HIT)
+    ms, since = 1e3 * (t[near] - HIT), f"t - {HIT:g} s [ms]"
     close = [Curve(name, ms, values[near]) for name, values in parts.items()]
-    force = np.concatenate([np.asarray(s.sense(x, "impact").force).sum(axis=1) for s, x in phases.pairs])
+    speed = np.linalg.norm(flight_of(phases, ball), axis=1)
+    drives = np.sum([np.asarray(w) for name, w in phases.work().items() if "drive" in name], axis=0)
+    books = [np.asarray(nc.balance(system, run).energy) for system, run in phases.pairs]
     panels = [
         Panel("strain energy of racket and ball", "[J]", [total]),
-        Panel("of each at the impact", "[J]", close, abscissa=f"t - {HIT:g} s [ms]"),
-        Panel("force of the strings on the ball", "[N]", [Curve("force", ms, force[near])],
-              abscissa=f"t - {HIT:g} s [ms]"),
+        Panel("of each at the impact", "[J]", close, abscissa=since),
+        Panel("force of the strings on the ball", "[N]", [Curve("force", ms, force_on_ball(phases)[near])],
+              abscissa=since),
+        Panel("speed of the ball", "[m/s]", [Curve("speed", ms, speed[near])], abscissa=since),
+        Panel("work of the drives", "[J]", [Curve("work", t, drives)]),
+        Panel("balance of energy, with that work", "[-]", [Curve("balance", t, np.concatenate(books))],
+              logarithmic=True),
     ]  # fmt: skip
     return plot_snapshots(phases, SNAPSHOTS, panels, beams=racket.beams, within=COURT)
+
+
+def strain_energies(phases: nc.Phases) -> dict[str, Float[np.ndarray, " t"]]:
+    """Of frame, strings and ball, from what they are at first [J]."""
+    stores = {name: np.asarray(x) for name, x in phases.energy().stores.items()}
+    rest = "gravity 1", "impact", "ball", "gas", "net"
+    parts = {
+        "frame": np.sum([x for name, x in stores.items() if name not in rest], axis=0),
+        "strings": stores["net"],
+        "ball": stores["ball"] + stores["gas"],
+    }
+    return {name: values - values[0] for name, values in parts.items()}
 
 
 def tennis(count: int = 3, speed: float = 15.0, start: float = 0.0, end: float = END) -> Example:
@@ -204,8 +213,8 @@ def tennis(count: int = 3, speed: float = 15.0, start: float = 0.0, end: float =
     # Velocities are those of the drives and, of what is flexible, as set below.
     system, state = scene.compile(assemble=True, t=start)
     place, velocity = _flight(speed, start)
-    for part, rest in (_racket_at_rest(here, start), _inflated(count, place, velocity)):
-        state = _with(state, system, part, rest)
+    for part in (_racket_at_rest(here, start), inflated_ball(count, place, velocity)):
+        state = with_part(state, system, part)
     facts = {"ball": ball, "racket": racket, "player": player, "impact": HIT}
     return Example(
         "tennis",
@@ -216,7 +225,7 @@ def tennis(count: int = 3, speed: float = 15.0, start: float = 0.0, end: float =
         round((end - start) / STEP),
         facts=facts,
         phases=partial(_phases, system, state, start=start),
-        figure=partial(figure, racket),
+        figure=partial(figure, racket, ball),
         beams=racket.beams,
         within=COURT,
     )

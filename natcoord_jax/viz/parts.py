@@ -112,7 +112,9 @@ def _joints(system: System, rows: np.ndarray, scale: float) -> list[Solid]:
             mesh = _glyph(joint, 0.011 * scale)
             if mesh is not None:
                 shade = np.ones(len(mesh[1]))
-                found.append(Solid(names[j], "joint", *mesh, places[0], DARK, shade))
+                # A rail is part of the first body; what moves in a plane shows on the second.
+                at = places[1 if len(joint.translations) > 1 else 0]
+                found.append(Solid(names[j], "joint", *mesh, at, DARK, shade))
     return found
 
 

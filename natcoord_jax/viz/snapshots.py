@@ -51,7 +51,7 @@ def plot_snapshots(
     above, below = halves
     for frame in frames:
         axes = above.add_subplot(rows, COLUMNS, frame + 1, projection="3d")
-        Stage(axes, scenery, labelled=False, zoom=1.25).show(frame, "t = {:g} s")
+        Stage(axes, scenery, labelled=False, zoom=1.25).show(frame, "t = {:.4g} s")
     if caption:
         below.suptitle(caption, fontsize=10, x=0.02, ha="left")
     grid = list(below.subplots(-(-len(panels) // wide), wide, squeeze=False).flat)

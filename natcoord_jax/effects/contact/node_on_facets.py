@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.numeric import Number, Numbers
@@ -49,8 +49,8 @@ class Nearest(eqx.Module):
         apart: from it to the point that it is the nearest to [m].
         normal: of the facet there, of unit length [-].
         edge: on which it is, by the number of the edge's first corner; -1: within the facet.
+        to_edges: squares of the distances from the nearest points of the edges [m^2].
         natural: coordinates of the foot of the normal, which may be a little beyond the edges.
-        foot: its weights of the corners.
         height: of the node above it [m].
         size: of the facet [m].
     """
@@ -59,8 +59,8 @@ class Nearest(eqx.Module):
     apart: Float[Array, "3"]
     normal: Float[Array, "3"]
     edge: Int[Array, ""]
+    to_edges: Float[Array, "4"]
     natural: Float[Array, "2"]
-    foot: Float[Array, "4"]
     height: Float[Array, ""]
     size: Float[Array, ""]
 
@@ -130,7 +130,7 @@ def nearest_point(point: Float[Array, "3"], corners: Float[Array, "4 3"]) -> Nea
     normal = normal / jnp.where(size > 0, size, 1.0)
     height = dot(normal, point - inside @ corners)
     edge = jnp.where(within, -1, best)
-    return Nearest(weights, apart, normal, edge, natural, inside, height, 2.0 * safe_sqrt(size))
+    return Nearest(weights, apart, normal, edge, squares[1:], natural, height, 2.0 * safe_sqrt(size))
 
 
 class NodeOnFacets(DiscreteGap):
@@ -188,9 +188,11 @@ class NodeOnFacets(DiscreteGap):
         rest = jnp.maximum(1.0 - jnp.sum(shares), 0.0)
         heights = jnp.where(both, jnp.abs(every.height), every.height)
         # Beside all of its facets a node is not behind them, wherever the surface goes on: see `uncovered`.
-        beside = ends | (jnp.broadcast_to(jnp.asarray(self.beyond), facets.shape) > 0)
-        behind = (at.height < 0) & ~both & (at.edge >= 0) & ~beside[best, at.edge]
-        aside = jnp.where(at.edge < 0, heights[best], jnp.where(behind, -1.0, 1.0) * safe_norm(at.apart))
+        # A corner is part of several edges, of which one that is an end decides.
+        ending = ends | (jnp.broadcast_to(jnp.asarray(self.beyond), facets.shape) > 0)
+        beside = (at.edge >= 0) & jnp.any(ending & _nearest(every))
+        behind = (at.height < 0) & ~both & ~beside
+        aside = jnp.where(behind, -1.0, 1.0) * safe_norm(at.apart)
         return (jnp.sum(shares * heights) + rest * aside) / (jnp.sum(shares) + rest), facets[best]
 
     def uncovered(self, place: Array, rows: Float[Array, "k 4 3"]) -> dict[str, Array]:
@@ -198,16 +200,17 @@ class NodeOnFacets(DiscreteGap):
         x = place_markers(place, rows)
         facets = jnp.asarray(self.facets).astype(int)
         every = jax.vmap(nearest_point, in_axes=(None, 0))(x[0], x[facets])
-        squares = dot(every.apart, every.apart)
-        best = jnp.argmin(squares)
-        apart = x[0] - jax.vmap(nearest_on_edges, in_axes=(None, 0))(x[0], x[facets]) @ x[facets]
-        to_edges = dot(apart, apart)
-        beyond = jnp.broadcast_to(jnp.asarray(self.beyond), to_edges.shape)
-        beside = jnp.any((to_edges <= squares[best] * (1 + 1e-9)) & (to_edges < beyond**2))
+        beyond = jnp.broadcast_to(jnp.asarray(self.beyond), facets.shape)
+        beside = jnp.any(_nearest(every) & (every.to_edges < beyond**2))
         both = jnp.asarray(self.two_sided) > 0
-        height = every.height[best]
+        height = every.height[jnp.argmin(dot(every.apart, every.apart))]
         reached = jnp.where(both, jnp.abs(height), height) < self.thickness
         return {LEFT: beside & reached}
+
+
+def _nearest(every: Nearest) -> Bool[Array, "f 4"]:
+    """Which edges of all facets are the nearest, but for rounding."""
+    return every.to_edges <= jnp.min(dot(every.apart, every.apart)) * (1 + 1e-9)
 
 
 def _share(at: Nearest, ends: Float[Array, "4"]) -> Float[Array, ""]:
