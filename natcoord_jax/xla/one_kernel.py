@@ -38,7 +38,8 @@ LARGEST = 6800
 
 WIDE = 300
 """Numbers that an operation finds on average from which on calls cost next to nothing beside it: the program
-compiles in half the time as it is, its products by a library, and runs as fast."""
+compiles in half the time as it is, its products by a library. Plates of 64 and 256 shells run as fast, a
+block of rubber of few elements a sixth slower."""
 
 ATTRIBUTES = {KERNEL: "true", "inlineable": "false"}
 """Compiled as one function; kept as a call until then."""
