@@ -95,30 +95,14 @@ def test_strain_energy_jumps_at_the_impact(short):
 
 
 @pytest.mark.exhaustive
-def test_a_shot_is_aimed():
-    """At a place and a speed, by derivatives through drives, racket and contact; differences confirm them."""
-    made = shot()
-
-    @nc.jit
-    def look(swing):
-        landing = made.landing(swing)
-        return landing, landing
-
-    slopes = nc.jit(jax.jacfwd(look, has_aux=True))
-    swing = jnp.array([10.0, 0.2])
-    by_swing, found = slopes(swing)
-    for k, step in enumerate((1e-5, 1e-6)):
-        change = step * jnp.eye(2)[k]
-        difference = (slopes(swing + change)[1] - slopes(swing - change)[1]) / (2 * step)
-        np.testing.assert_allclose(by_swing[:, k], difference, rtol=1e-6)
-    target = found + jnp.array([1.5, -0.7])
-    for _ in range(6):
-        swing = swing - jnp.linalg.solve(by_swing, found - target)
-        by_swing, found = slopes(swing)
-    np.testing.assert_allclose(found, target, rtol=1e-9)
+def test_a_shot():
+    """The driven hand works, energy is in the books, and an open face sends the ball up and away."""
+    made, swing = shot(), jnp.array([10.0, 0.3])
     system, _ = made.started(swing)
     run = made.run(swing)
     assert nc.balance(system, run).energy.max() <= 1e-9
-    assert sum(abs(float(w[-1])) for name, w in system.work(run).items() if name in ("swing", "face")) > 1.0
+    assert float(system.work(run)["swing"][-1]) > 1.0
     force = np.asarray(system.sense(run, "impact").force).sum(axis=1)
     assert force.max() > 500.0 and force[0] == 0.0 and force[-1] == 0.0
+    _, velocity = made.flight(run)
+    assert velocity[0] > 10.0 and velocity[2] > 5.0
