@@ -21,7 +21,7 @@ import natcoord_jax as nc
 from natcoord_jax.maths.collocation import gauss
 from natcoord_jax.mechanics.equations import prepare
 from natcoord_jax.mechanics.reduced import ReducedStep
-from natcoord_jax.xla import rewriting
+from natcoord_jax.xla import one_kernel, rewriting
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "natcoord_jax" / "effects"
@@ -190,8 +190,9 @@ def test_program_size_does_not_grow_with_bodies(solver, monkeypatch):
         return {n: len(program(n, solver).as_text().splitlines()) for n in arms}
 
     # Long sums are written as loops, a few lines each, see `test_program_size_of_large_scenes`; those of
-    # middle length in two or a few pieces.
+    # middle length in two or a few pieces; and programs of large arrays are left as they are.
     jax.clear_caches()
+    monkeypatch.setattr(one_kernel, "WIDE", np.inf)
     monkeypatch.setattr(rewriting, "REDUCTION_LIMIT", np.inf)
     monkeypatch.setattr(rewriting, "FEW", 0)
     lines = sizes((8, 40))
