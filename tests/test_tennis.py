@@ -106,3 +106,29 @@ def test_a_shot():
     assert force.max() > 500.0 and force[0] == 0.0 and force[-1] == 0.0
     _, velocity = made.flight(run)
     assert velocity[0] > 10.0 and velocity[2] > 5.0
+
+
+@pytest.mark.exhaustive
+def test_a_shot_is_aimed():
+    """At a place and a speed, by derivatives through drives, racket and contact; differences confirm them."""
+    made = shot()
+
+    @nc.jit
+    def slopes(swing):
+        def look(swing):
+            landing = made.landing(swing)
+            return landing, landing
+
+        return jax.jacfwd(look, has_aux=True)(swing)
+
+    landing, swing = nc.jit(made.landing), jnp.array([10.0, 0.2])
+    by_swing, found = slopes(swing)
+    for k in range(2):
+        change = 1e-6 * jnp.eye(2)[k]
+        difference = (landing(swing + change) - landing(swing - change)) / 2e-6
+        np.testing.assert_allclose(by_swing[:, k], difference, rtol=1e-6)
+    target = found + jnp.array([1.5, -0.7])
+    for _ in range(5):
+        swing = swing - jnp.linalg.solve(by_swing, found - target)
+        by_swing, found = slopes(swing)
+    np.testing.assert_allclose(found, target, rtol=1e-9)
