@@ -139,7 +139,7 @@ def _between(groups: Sequence[Group], turning: np.ndarray) -> MassBetween | None
 
 def _pairs(group: Group) -> Int[np.ndarray, "n k k 2"]:
     """Bodies that the blocks of each instance of a group are between."""
-    table = np.asarray(group.bodies)
+    table = np.asarray(group.bodies, np.int64)
     return np.stack(np.broadcast_arrays(table[:, :, None], table[:, None]), axis=-1)
 
 
