@@ -306,12 +306,18 @@ def exported() -> set[type]:
 
 def test_every_effect_is_in_the_table():
     missing = {e.__name__ for e in exported() - set(TABLE)}
-    assert not missing, f"add these effects to the table of contracts: {sorted(missing)}"
+    assert not missing, f"add these effects to TABLE in tests/test_contracts.py: {sorted(missing)}"
+
+
+def test_every_joint_is_in_the_scenes():
+    """By that list the tests of all joints find them: here, and of conservation, orders and schemes."""
+    missing = {e.__name__ for e in TABLE if issubclass(e, nc.Joint)} - {j.__name__ for j in JOINTS.values()}
+    assert not missing, f"add these joints to JOINTS in tests/scenes.py: {sorted(missing)}"
 
 
 def test_every_effect_is_public():
     hidden = {e.__name__ for e in exported() if getattr(nc, e.__name__, None) is not e}
-    assert not hidden, f"these effects are not reachable as nc.…: {sorted(hidden)}"
+    assert not hidden, f"add to the imports and __all__ of natcoord_jax/__init__.py: {sorted(hidden)}"
 
 
 def test_kinds_tell_effects_apart():
@@ -325,7 +331,9 @@ def test_kinds_tell_effects_apart():
 @EFFECTS
 def test_docstrings_say_units(effect):
     """A unit in brackets; numbers without any are marked [-]."""
-    assert re.search(r"\[[^\]]*\b(m|rad|s|kg|N|J)\b[^\]]*\]", effect.__doc__ or ""), effect.__doc__
+    assert re.search(r"\[[^\]]*\b(m|rad|s|kg|N|J)\b[^\]]*\]", effect.__doc__ or ""), (
+        f"say in the docstring of the class of {effect.__name__} the units of its numbers, in brackets"
+    )
 
 
 @pytest.mark.parametrize("effect", [e for e in TABLE if issubclass(e, nc.Joint)], ids=lambda e: e.__name__)

@@ -344,3 +344,83 @@ def test_traced_step_that_is_not_positive(breaking):
     system, state = breaking
     result = jax.jit(lambda dt: nc.simulate(system, state, dt=dt, steps=2).result)(-0.1)
     assert int(result) == int(Result.BAD_STEP)
+
+
+# --- effects of one's own ---------------------------------------------------------------------------------
+
+
+class Pin(nc.Joint):
+    """Slides along the first axis and turns about the third: not the same with parent and child exchanged."""
+
+    multipliers, rotations, translations, free = 4, (2,), (0,), True
+
+    def residual(self, parent, child):
+        u, third = child.point - parent.point, child.axes[2]
+        return jnp.stack(
+            [parent.axes[1] @ u, parent.axes[2] @ u, parent.axes[0] @ third, parent.axes[1] @ third]
+        )
+
+
+@pytest.mark.parametrize(
+    "described",
+    [
+        {},
+        {"rotations": (0, 1, 2), "translations": (2,), "multipliers": 2},
+        {"rotations": (0, 1), "translations": ()},
+        {"rotations": (2,), "translations": (2,), "multipliers": 3},
+    ],
+    ids=["pin in a slot", "ball in a slot", "two rotations", "too few multipliers"],
+)
+def test_free_motions_that_the_tree_does_not_know(described):
+    scene = nc.Scene()
+    joint = type("Own", (Pin,), described)
+    scene.add(joint(nc.ground, scene.add(body()), name="pin"))
+    rejected(scene.compile, "'pin'", "free = False", "Own")
+
+
+class OwnJoint(nc.Joint):
+    multipliers = 1
+
+    def residual(self, parent, child):
+        return parent.axes[2] @ (child.point - parent.point)
+
+
+class OwnConstraint(nc.Constraint):
+    def residual(self, x):
+        return (x[1] @ x[1] - x[0] @ x[0] - 1.0)[None]
+
+
+class OwnPotential(nc.Potential):
+    def invariants(self, x):
+        return (x[1] - x[0]) @ (x[1] - x[0])
+
+    def energy(self, invariants):
+        return invariants
+
+
+class OwnEnergy(OwnPotential):
+    def invariants(self, x):
+        return super().invariants(x)[None]
+
+
+class OwnForce(nc.Force):
+    def load(self, x, rate, inputs, t):
+        return nc.Load(-rate[0], None)
+
+
+OWN = {
+    "joint": (lambda a, ends: OwnJoint(nc.ground, a), "OwnJoint.residual", "value[None]"),
+    "constraint": (lambda a, ends: OwnConstraint(ends), "OwnConstraint.residual", "multipliers = 1"),
+    "invariants": (lambda a, ends: OwnPotential(ends), "OwnPotential.invariants", "value[None]"),
+    "energy": (lambda a, ends: OwnEnergy(ends), "OwnEnergy.energy", "(1,)"),
+    "force": (lambda a, ends: OwnForce(ends), "OwnForce.load", "(2, 3)"),
+}
+
+
+@pytest.mark.parametrize("case", OWN)
+def test_shapes_that_effects_of_ones_own_return(case):
+    make, *words = OWN[case]
+    scene = nc.Scene()
+    arm = scene.add(body())
+    scene.add(make(arm, (nc.Point(nc.ground), nc.Point(arm, (1.0, 0.0, 0.0)))))
+    rejected(lambda: nc.step(*scene.compile(), dt=0.1), *words)

@@ -212,8 +212,14 @@ def test_files_and_functions_can_be_read_at_once():
                 lines = (node.end_lineno or 0) - node.lineno + 1
                 if lines - (told.count("\n") + 1 if told else 0) > LONGEST_FUNCTION:
                     functions.add(node.name)
-    assert files == LONGER, files ^ LONGER
-    assert functions == LONGER_FUNCTIONS, functions ^ LONGER_FUNCTIONS
+    long, short = files - LONGER, LONGER - files
+    assert not long, f"split these files, of more than {LONGEST} lines: {sorted(long)}"
+    assert not short, f"no longer longer than {LONGEST} lines, so they leave LONGER: {sorted(short)}"
+    long, short = functions - LONGER_FUNCTIONS, LONGER_FUNCTIONS - functions
+    assert not long, f"split these functions, of more than {LONGEST_FUNCTION} lines: {sorted(long)}"
+    assert not short, (
+        f"no longer longer than {LONGEST_FUNCTION} lines, so they leave the list: {sorted(short)}"
+    )
 
 
 @pytest.mark.parametrize(

@@ -93,6 +93,24 @@ def check_fields(module: Any, label: str) -> None:
             raise ValueError(f"{what} is not finite: {getattr(module, field.name)}; pass finite numbers")
 
 
+def equations(found: Any, part: Any, method: str) -> Any:
+    """What a method of a part returns, if it is one number for each multiplier.
+
+    Raises:
+        ValueError: naming part, method, shape and remedy.
+    """
+    shape = jnp.shape(found)
+    if shape != (part.multipliers,):
+        count = int(np.prod(shape))
+        remedy = f"; declare `multipliers = {count}`, the number of equations"
+        if len(shape) != 1:
+            remedy = "; make it an array of shape (multipliers,), of a single equation `value[None]`"
+        raise ValueError(
+            f"{type(part).__name__}.{method} has shape {shape}, and multipliers is {part.multipliers}{remedy}"
+        )
+    return found
+
+
 def positive(value: Any, what: str, unit: str) -> Array:
     """Value as a positive finite scalar.
 

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.core.arguments import is_a
+from natcoord_jax.core.checks import equations
 from natcoord_jax.core.effect import Effect, Motion, Response, StepContext, replace_fields
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.joint import Joint
@@ -65,13 +66,14 @@ class Constraint(Effect):
 
     def violation(self, place: Array, rows: Array, coordinates: Array, t: Array) -> Array:
         """The residual."""
-        return self.residual(place_markers(place, rows))
+        return equations(self.residual(place_markers(place, rows)), self, "residual")
 
     def violation_rate(
         self, place: Array, rows: Array, rates: Array, spin: Array, t: Array, passing: Any
     ) -> Array:
         """That of the residual."""
-        return jax.jvp(self.residual, (place_markers(place, rows),), (place_markers(place, rates),))[1]
+        rate = jax.jvp(self.residual, (place_markers(place, rows),), (place_markers(place, rates),))[1]
+        return equations(rate, self, "residual")
 
     def violation_units(self, place: Array, rows: Array) -> tuple[str, ...]:
         """Metres where the residual depends on where points are."""
@@ -85,7 +87,7 @@ class Constraint(Effect):
 
         def stage(x: Array, rates: Array, held: Array, multipliers: Array) -> tuple[Array, Array]:
             rate = jax.jvp(self.residual, (x,), (rates,))[1]
-            return rate, jax.vjp(self.residual, held)[1](multipliers)[0]
+            return equations(rate, self, "residual"), jax.vjp(self.residual, held)[1](multipliers)[0]
 
         x, rates, held = (place_markers(place, q) for q in (motion.rows, motion.rates, motion.held.rows))
         found, forces = jax.vmap(stage)(x, rates, held, lam)
@@ -146,7 +148,8 @@ class VelocityConstraint(Effect):
         self, place: Array, rows: Array, rates: Array, spin: Array, t: Array, passing: Any
     ) -> Array:
         """What the velocities leave."""
-        return self.rate(place_markers(place, rows), place_markers(place, rates), spin)
+        rate = self.rate(place_markers(place, rows), place_markers(place, rates), spin)
+        return equations(rate, self, "rate")
 
     def violation_units(self, place: Array, rows: Array) -> tuple[str, ...]:
         """Metres, as of points."""
@@ -156,7 +159,7 @@ class VelocityConstraint(Effect):
         """The rates, and the forces and torques that do no work along motions without them."""
 
         def stage(x, rates, spin, held, multipliers):
-            given = self.rate(x, rates, spin)
+            given = equations(self.rate(x, rates, spin), self, "rate")
             return given, *jax.vjp(lambda v, w: self.rate(held, v, w), rates, spin)[1](multipliers)
 
         x, rates, held = (place_markers(place, q) for q in (motion.rows, motion.rates, motion.held.rows))

@@ -79,6 +79,11 @@ class Force(Effect):
         """The load at every stage."""
         x, rates = place_markers(place, motion.rows), place_markers(place, motion.rates)
         load = jax.vmap(self.load)(x, rates, now.stage_inputs, now.times)
+        if load.forces is not None and load.forces.shape != x.shape:
+            raise ValueError(
+                f"{type(self).__name__}.load: forces have shape {load.forces.shape[1:]}; give one for each "
+                f"marker vector, {x.shape[1:]}, or None"
+            )
         return marker_response(place, load.forces, load.torques, rates, motion)
 
 

@@ -140,6 +140,10 @@ def gradient_of(
 ) -> Float[Array, "p *n"]:
     """Gradient of a function of the invariants, of one instance or of many at once (last axis)."""
     value, pulled = jax.vjp(energy, invariants)
+    if jnp.shape(value) != invariants.shape[1:]:
+        owner = getattr(energy, "__self__", None)
+        whose = "an energy" if owner is None else f"{type(owner).__name__}.energy"
+        raise ValueError(f"{whose} has shape {value.shape}; make it a number, as `invariants[0]` is")
     return pulled(jnp.ones_like(value))[0]
 
 

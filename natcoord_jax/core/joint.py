@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.core.arguments import is_a
+from natcoord_jax.core.checks import equations
 from natcoord_jax.core.effect import Effect, Motion, Response, StepContext
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.kinds import BODY, NAME
@@ -120,13 +121,14 @@ class Joint(Effect):
 
     def violation(self, place: Array, rows: Array, coordinates: Array, t: Array) -> Array:
         """The residual."""
-        return self.residual(*frames_at(place, rows))
+        return equations(self.residual(*frames_at(place, rows)), self, "residual")
 
     def violation_rate(
         self, place: Array, rows: Array, rates: Array, spin: Array, t: Array, passing: Any
     ) -> Array:
         """That of the residual."""
-        return jax.jvp(lambda x: self.residual(*frames_at(place, x)), (rows,), (rates,))[1]
+        rate = jax.jvp(lambda x: self.residual(*frames_at(place, x)), (rows,), (rates,))[1]
+        return equations(rate, self, "residual")
 
     def violation_units(self, place: Array, rows: Array) -> tuple[str, ...]:
         """Metres where a constraint depends on where the points are."""
@@ -146,7 +148,7 @@ class Joint(Effect):
 
         def stage(rows, rates, held, multiplier):
             g_rate = jax.jvp(constraint, (rows,), (rates,))[1]
-            return g_rate, jax.vjp(constraint, held)[1](multiplier)[0]
+            return equations(g_rate, self, "residual"), jax.vjp(constraint, held)[1](multiplier)[0]
 
         g_rates, forces = jax.vmap(stage)(motion.rows, motion.rates, motion.held.rows, lam)
         return Response(forces, None, g_rates, jnp.zeros(now.tableau.stages))

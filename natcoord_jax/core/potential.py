@@ -112,6 +112,11 @@ class Potential(Effect):
     def respond(self, place: Array, motion: Motion, now: StepContext, lam: Array) -> Response:
         """Forces -D pi^T S_i with the averaged gradients S_i, D pi where forces take hold."""
         start = self.invariants(place_markers(place, motion.start))
+        if start.ndim != 1:
+            raise ValueError(
+                f"{type(self).__name__}.invariants has shape {start.shape}; make it one axis of invariants, "
+                "of a single one `value[None]`"
+            )
 
         def gradient(steps: Float[Array, "s p"]) -> Float[Array, "s p"]:
             found = self.averaged(start, steps, now.tableau)

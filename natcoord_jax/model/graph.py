@@ -31,6 +31,18 @@ class Edge:
         last = (6,) if self.child_rotation else ()
         return (*self.rotations, *(3 + k for k in self.translations), *last)
 
+    @property
+    def carries(self) -> bool:
+        """Whether the tree knows these motions, and the same ones with parent and child exchanged."""
+        turning, sliding = set(self.rotations), set(self.translations)
+        whole = sliding in (set(), {0, 1, 2})
+        if self.child_rotation:
+            return turning == {2} and whole
+        if len(turning) == 1:
+            across = {0, 1, 2} - turning
+            return sliding & across in (set(), across)
+        return not turning or (len(turning) == 3 and whole)
+
 
 @dataclass(frozen=True)
 class Spanning:

@@ -32,11 +32,19 @@ from natcoord_jax.xla.tracing import at_top_level
 JOINT_FIELDS = ("parent", "child", "point", "axis", "second", "name", "parent_point")
 
 
-def _edge(joint: Joint, poses: Poses, sets: int) -> Edge:
+def _edge(name: str, joint: Joint, poses: Poses, sets: int) -> Edge:
     pair = poses.of(joint.parent), poses.of(joint.child)
     # Nodes of sets are free: what joins them keeps its multipliers.
     free = joint.free and min(pair) >= sets
-    return Edge(*pair, joint.rotations, joint.translations, joint.child_rotation, free)
+    edge = Edge(*pair, joint.rotations, joint.translations, joint.child_rotation, free)
+    if joint.free and not (edge.carries and len(edge.slots) == 6 - joint.multipliers):
+        also = " and about the child's first axis" if joint.child_rotation else ""
+        raise ValueError(
+            f"joint {name!r}: a tree cannot hold a joint of {joint.multipliers} multipliers that turns "
+            f"about axes {joint.rotations}{also} and slides along axes {joint.translations}; declare "
+            f"`free = False` in {type(joint).__name__}, which keeps its multipliers"
+        )
+    return edge
 
 
 def _couplings(effects: dict[str, Effect], poses: Poses, sets: int) -> list[tuple[int, int]]:
@@ -57,7 +65,7 @@ class Layout:
         self.bodies, self.joints = bodies, joints
         self.poses = Poses(bodies)
         self.names = list(joints)
-        self.edges = [_edge(j, self.poses, bodies.sets) for j in joints.values()]
+        self.edges = [_edge(name, j, self.poses, bodies.sets) for name, j in joints.items()]
         couplings = _couplings(effects, self.poses, bodies.sets)
         self.spanning = spanning_tree(len(bodies), self.edges, couplings, bodies.sets)
         self.order = np.array(self.spanning.order, int)

@@ -296,7 +296,9 @@ def _readings(system: Model, states: State, names: tuple[str, ...]) -> Any:
         raise ValueError(f"{missing[0]!r} is of another kind than {names[0]!r}: sense them one by one")
     if group.effect.silent:
         raise ValueError(
-            f"the {group.effect.kind} {names[0]!r} has no sensor; elements of beams, shells and solids do"
+            f"the {group.effect.kind} {names[0]!r} has no sensor; use those of the bodies that it acts on, "
+            "of a constraint `system.instant(...).multipliers`; a class of your own has one if you give it "
+            "`silent = False` and `readings`"
         )
     if group.is_set and names[0] in group.labels:
         chosen = jnp.arange(group.count)
