@@ -222,7 +222,7 @@ def test_surfaces_that_enclose_nothing_are_refused():
     turned = scene.add(
         nc.Shell(nc.mesh.Mesh(sphere.nodes, cells), thickness=1e-3, material=RUBBER, directors=directors)
     )
-    with pytest.raises(ValueError, match="faces in turn one way and the other"):
+    with pytest.raises(ValueError, match="in turn one way and the other"):
         scene.add(nc.Gas(turned, gauge_pressure=1.0))
     ball = scene.add(shell_of(sphere))
     scene.add(nc.Gas(ball, gauge_pressure=-2e5))

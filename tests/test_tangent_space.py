@@ -16,7 +16,7 @@ from natcoord_jax.maths.collocation import gauss
 from natcoord_jax.maths.direct_rotation import nearest_orthogonal
 from natcoord_jax.mechanics.block_tangent_space import tangents_at
 from natcoord_jax.mechanics.equations_of_motion import constraint_matrix
-from natcoord_jax.mechanics.momentum import inertia, spatial_inertia, wrench
+from natcoord_jax.mechanics.momentum import inertia_alone, spatial_inertia, wrench
 from natcoord_jax.mechanics.reduced import NOTHING, ReducedStep, at_rest
 from natcoord_jax.mechanics.tangent_space import TangentSpace
 from natcoord_jax.model.rows import row_rates
@@ -93,7 +93,7 @@ def test_momenta_of_bodies_are_those_of_their_rows(scene):
     root = rng.normal(size=(3, 4, 4))
     mass = jnp.asarray(root @ root.swapaxes(1, 2))
     velocity, spin = (jnp.asarray(rng.normal(size=(3, 3))) for _ in range(2))
-    moved = inertia(mass, row_rates(others, velocity, spin))
+    moved = inertia_alone(mass, row_rates(others, velocity, spin))
     expected = jnp.concatenate([x[0] for x in wrench(moved[None], rows[None, :, 1:])], axis=1)
     bodies = spatial_inertia(mass, rows[:, 1:], others[:, 1:])
     found = jnp.einsum("bij,bj->bi", bodies, jnp.concatenate([velocity, spin], axis=1))
