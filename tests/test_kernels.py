@@ -289,10 +289,7 @@ def _marked(name):
     return name if name in USUAL else pytest.param(name, marks=mark)
 
 
-WIDE_SCENES = {"block", "inflated_ball", "colliding_blocks", "tennis"}
-"""Their arrays are so large that calls do not matter: they compile in half the time as they are."""
-
-
+@pytest.mark.usefixtures("of_any_width")
 @pytest.mark.parametrize("name", [_marked(name) for name in gallery.SCENES])
 def test_every_scene_of_the_gallery_runs_in_one_kernel(name):
     example = gallery.load(name)
@@ -301,7 +298,7 @@ def test_every_scene_of_the_gallery_runs_in_one_kernel(name):
         example.inputs(4) if example.problem is None else jnp.ones((4, len(example.system.structure.inputs)))
     )
     run = jax.jit(lambda s, x: nc.simulate(s, x, dt=example.dt, steps=4, inputs=inputs))
-    assert (MARK in run.lower(example.system, example.state).as_text()) == (name not in WIDE_SCENES)
+    assert MARK in run.lower(example.system, example.state).as_text()
 
 
 @pytest.mark.parametrize("size", [8, 40])
