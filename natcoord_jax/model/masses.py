@@ -26,8 +26,8 @@ class MassBetween(eqx.Module):
     Attributes:
         bodies: two different ones, of each block once.
         blocks: between their rows: of the first along the rows, of the second along the columns.
-        held: sums of blocks between the rows of each body and what sits on the ground: it has no part in
-            motions, but has a weight.
+        uniform: sums of the blocks in the rows of each body, momenta of a motion that is the same everywhere;
+            with what sits on the ground, which has no part in motions, but has a weight.
         places: where the blocks of each group of effects go (n, k, k), beyond the last one those that are
             none or that another is the transpose of; None: it has none.
         acting: how bodies collect what the blocks give them, the first of all blocks before the second.
@@ -36,7 +36,7 @@ class MassBetween(eqx.Module):
 
     bodies: Int[Array | np.ndarray, "pairs 2"]
     blocks: Float[Array, "pairs 4 4"]
-    held: Float[Array, "bodies 4 4"]
+    uniform: Float[Array, "bodies 4 4"]
     places: tuple[Int[Array | np.ndarray, "n k k"] | None, ...]
     acting: SegmentSum
     turning: bool = eqx.field(static=True)
@@ -56,13 +56,7 @@ class MassBetween(eqx.Module):
 
     def times(self, factor: Array | float) -> "MassBetween":
         """So many times as much."""
-        return replace_fields(self, blocks=factor * self.blocks, held=factor * self.held)
-
-    @property
-    def of_uniform_motion(self) -> Float[Array, "bodies 4 4"]:
-        """Sums of the blocks in the rows of each body: momenta of a motion that is the same everywhere."""
-        both = jnp.concatenate([self.blocks, jnp.swapaxes(self.blocks, 1, 2)])
-        return self.held + self.acting.collect(both)
+        return replace_fields(self, blocks=factor * self.blocks, uniform=factor * self.uniform)
 
 
 def _axes(group: Group) -> int:
@@ -110,9 +104,9 @@ def with_mass(
         return masses, between
     places = None if between is None else between.places[number]
     old = None if before is None else replace_fields(group, effect=before)
-    alone, blocks, held = _added(masses, between, places, group, old)
+    alone, blocks, uniform = _added(masses, between, places, group, old)
     if between is not None:
-        between = replace_fields(between, blocks=blocks, held=held)
+        between = replace_fields(between, blocks=blocks, uniform=uniform)
     return alone, between
 
 
@@ -132,9 +126,9 @@ def _between(groups: Sequence[Group], turning: np.ndarray) -> MassBetween | None
         for n, p in zip(numbers, pairs)
     )
     bodies = np.stack([unique // (count + 1), unique % (count + 1)], axis=1).astype(np.int32)
-    none, unheld = (as_array(np.zeros((n, 4, 4))) for n in (len(bodies), count))
+    none, still = (as_array(np.zeros((n, 4, 4))) for n in (len(bodies), count))
     acting = SegmentSum.of(bodies.T, count)
-    return MassBetween(bodies, none, unheld, places, acting, bool(turning[bodies].any()))
+    return MassBetween(bodies, none, still, places, acting, bool(turning[bodies].any()))
 
 
 def _pairs(group: Group) -> Int[np.ndarray, "n k k 2"]:
@@ -156,7 +150,7 @@ def _added(
     group: Group,
     before: Group | None,
 ) -> tuple[Float[Array, "bodies 4 4"], Any, Any]:
-    """Masses of bodies, between them, and between them and the ground, with what a group brings."""
+    """Masses of bodies, between them, and sums of these, with what a group brings."""
     bodies, weights = group.bodies, group.weights
     assert weights is not None
     rows = weights.reshape(*bodies.shape, -1, 4)
@@ -164,7 +158,7 @@ def _added(
     if before is not None:
         found = found - jax.vmap(lambda e: e.mass_matrix())(before.effect)
     blocks: Any = None if between is None else between.blocks
-    held: Any = None if between is None else between.held
+    uniform: Any = None if between is None else between.uniform
     # What has mass comes first: of an attachment the point, or it and the first axis.
     if places is None:
         # Between vectors of a node there is mass where its point is not in the middle.
@@ -172,10 +166,10 @@ def _added(
             found = found.reshape(*bodies.shape, -1, 1) * jnp.eye(max(1, found.size // bodies.size))
         rows = rows[:, :, : found.shape[2]]
         own = jnp.einsum("nkml,nkma,nklb->nkab", found, rows, rows)
-        return masses.at[bodies].add(own, mode="drop"), blocks, held
+        return masses.at[bodies].add(own, mode="drop"), blocks, uniform
     rows, ground = rows[:, :, : found.shape[2]], masses.shape[0]
     every = jnp.einsum("nkilj,nkia,nljb->nklab", found, rows, rows)
     one, other = bodies[:, :, None], bodies[:, None]
-    alone, lost = (jnp.where(other == x, one, ground) for x in (one, ground))
-    masses, held = (x.at[at].add(every, mode="drop") for x, at in ((masses, alone), (held, lost)))
-    return masses, blocks.at[places].add(every, mode="drop"), held
+    alone, apart = (jnp.where(own, one, ground) for own in (one == other, one != other))
+    masses, uniform = (x.at[at].add(every, mode="drop") for x, at in ((masses, alone), (uniform, apart)))
+    return masses, blocks.at[places].add(every, mode="drop"), uniform

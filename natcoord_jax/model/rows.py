@@ -52,7 +52,7 @@ def group_places(system: Model, group: Group) -> Array:
     """How the instances of a group sit on their bodies: weights, joint frames or mass blocks."""
     if group.source == "mass":
         between = system.mass_between
-        return system.mass if between is None else system.mass + between.of_uniform_motion
+        return system.mass if between is None else system.mass + between.uniform
     if group.source == "markers":
         assert group.weights is not None
         return group.weights
