@@ -40,11 +40,11 @@ class Segment:
     """
 
     parent: str
-    start: tuple[float, float, float]
-    end: tuple[float, float, float]
+    start: tuple[float | int, ...]
+    end: tuple[float | int, ...]
     mass: float
     centre: float
-    gyration: tuple[float, float, float]
+    gyration: tuple[float | int, ...]
     axes: tuple[Any, ...]
     angles: Any
     radius: float
