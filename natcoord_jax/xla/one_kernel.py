@@ -38,8 +38,8 @@ LARGEST = 6800
 
 WIDE = 300
 """Numbers that an operation finds on average from which on calls cost next to nothing beside it: the program
-compiles in two thirds of the time or less as it is, its products by a library. Forty arms of a star run as fast
-(means of 150 and 560), blocks of 32 bricks 1.4 and 1.9 times as fast (450 to 6700)."""
+compiles in two thirds of the time or less as it is, its products by a library. Forty arms of a star run as
+fast (means of 150 and 560), blocks of 32 bricks 1.4 and 1.9 times as fast (450 to 6700)."""
 
 ATTRIBUTES = {KERNEL: "true", "inlineable": "false"}
 """Compiled as one function; kept as a call until then."""
