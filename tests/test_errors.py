@@ -13,7 +13,7 @@ import natcoord_jax as nc
 from natcoord_jax.core.results import Result, SimulationError
 
 ROOT = Path(__file__).resolve().parents[1]
-REMEDY = r"(pass|use|add|check|give|move|declare|make|allow)\b"
+REMEDY = r"(pass|use|add|check|give|move|declare|make|allow|clamp)\b"
 
 
 def body(**changes):
@@ -383,6 +383,35 @@ class OwnJoint(nc.Joint):
 
     def residual(self, parent, child):
         return parent.axes[2] @ (child.point - parent.point)
+
+
+class Bowl(nc.Joint):
+    multipliers = 1
+
+    def residual(self, parent, child):
+        x, y, z = parent.axes @ (child.point - parent.point)
+        return ((x**2 + y**2) / 2 - z)[None]
+
+
+def test_joints_of_nodes_that_carry_no_axes():
+    """Asked of a node is what the constraints are made of, no more; where that is missing it is refused."""
+    at = {"mass": 1.0, "position": (0.3, 0.0, 0.045), "name": "ball"}
+
+    def joined(joint, point=None, swapped=False):
+        scene = nc.Scene()
+        ball = scene.add(nc.PointMass(**at))
+        pair = (ball, nc.ground) if swapped else (nc.ground, ball)
+        scene.add(joint(*pair, point=point, name="own"))
+        return scene.compile()
+
+    bowl = type("Bowl", (Bowl,), {"anchors": lambda self: ((0.0, 0.0, 0.0), self.point)})
+    system, state = joined(bowl)
+    trajectory = nc.simulate(system, state, dt=1e-2, steps=20)
+    assert np.abs(system.constraint_errors(trajectory).position).max() < 1e-12
+    rejected(
+        lambda: joined(Bowl, swapped=True), "'own'", "'ball' has a point only", "a Bowl joint could hold"
+    )
+    rejected(lambda: joined(bowl, (0.3, 0.0, 0.0)), "'own'", "'ball' has a point only", "0.045 m beside it")
 
 
 class OwnConstraint(nc.Constraint):

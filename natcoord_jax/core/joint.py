@@ -89,7 +89,6 @@ class Joint(Effect):
     translations: ClassVar[tuple[int, ...]] = ()
     free: ClassVar[bool] = False
     coordinates: ClassVar[tuple[Any, ...]] = ()
-    needs_axis: ClassVar[bool] = True
     apart: ClassVar[bool] = False
 
     @abc.abstractmethod

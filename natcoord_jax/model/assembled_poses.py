@@ -1,19 +1,26 @@
 """Where bodies and joints are in the assembled scene."""
 
+from collections.abc import Sequence
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from natcoord_jax.core.checks import as_array
+from natcoord_jax.core.bodies import TRIAD, NodeKind
+from natcoord_jax.core.checks import as_array, is_concrete
 from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.handles import ground as ground_handle
-from natcoord_jax.core.joint import Joint
+from natcoord_jax.core.joint import Frame, Joint
 from natcoord_jax.core.kinds import short
 from natcoord_jax.core.markers import Attachment, Interpolated, Marker
 from natcoord_jax.maths.rotations import frame_from_axis
 from natcoord_jax.model.bodies import Bodies, joined
 from natcoord_jax.xla.tracing import at_top_level
+
+SAME = 1e-9
+"""Part of its distance up to which a point is in the place of another."""
 
 
 class Poses:
@@ -73,7 +80,7 @@ class Poses:
         """
         kind = self._bodies.kind_of(marker.body)
         beyond = np.asarray(own).reshape(-1, 4)[:, kind.rows :] if at_top_level(own) else np.zeros((0, 0))
-        if beyond.size and np.abs(beyond).max() > 1e-9 * np.abs(np.asarray(own)).max():
+        if beyond.size and np.abs(beyond).max() > SAME * np.abs(np.asarray(own)).max():
             name = marker.body.name
             carried = ("itself", "itself and its director", "itself and two directors")[kind.rows - 1]
             raise ValueError(
@@ -146,3 +153,44 @@ def joint_frames(joint: Joint, poses: Poses) -> Float[Array, "2 4 4"]:
     positions, rotations = zip(*((poses.position[b], poses.rotation[b]) for b in (parent, child)))
     points = as_array(at_parent, float), as_array(at_child, float)
     return _joint_weights(joint, positions, rotations, points, triad)
+
+
+def check_joint(
+    name: str, joint: Joint, kinds: Sequence[NodeKind], place: Float[Array, "2 4 4"], frames: Sequence[Frame]
+) -> None:
+    """Refuse joints of points and directors that need more than these carry along.
+
+    Args:
+        name: of the joint.
+        joint: joint.
+        kinds: of the nodes of parent and child.
+        place: weights of point and triad on both (44-47).
+        frames: of both, in the assembled pose.
+
+    Raises:
+        ValueError: naming joint and node.
+    """
+    for side, (handle, kind) in enumerate(zip((joint.parent, joint.child), kinds)):
+        if kind is TRIAD:
+            continue
+        node = f"joint {name!r}: {handle.name!r} has a {kind.name} only, no axes that"
+        remedy = "clamp it to a rigid body (nc.Clamp) and join that"
+        uses = _uses_axes(joint, frames, side)
+        if is_concrete(uses) and bool(uses):
+            raise ValueError(f"{node} a {type(joint).__name__} joint could hold; {remedy}")
+        # The first row has the point's weights, of the node's own point and of its directors.
+        weights = np.asarray(place)[side, 0] if is_concrete(place) else np.zeros(4)
+        beside = float(np.linalg.norm(weights[kind.rows :]))
+        if beside > SAME * np.linalg.norm(weights):
+            raise ValueError(
+                f"{node} could carry the point of the joint, which is {beside:.6g} m beside it; give the "
+                f"joint the position of the node, or {remedy}"
+            )
+
+
+@eager_numpy
+def _uses_axes(joint: Joint, frames: Sequence[Frame], side: int) -> Any:
+    """Whether the axes on a side enter the constraints: axes that are no numbers make these none."""
+    unknown = Frame(frames[side].point, jnp.full((3, 3), jnp.nan))
+    parent, child = (unknown if k == side else frame for k, frame in enumerate(frames))
+    return jnp.any(jnp.isnan(joint.residual(parent, child)))

@@ -21,7 +21,7 @@ from natcoord_jax.core.markers import Attachment, Marker
 from natcoord_jax.core.names import names_of
 from natcoord_jax.core.potential import place_markers
 from natcoord_jax.core.state import State
-from natcoord_jax.model.assembled_poses import Poses, joint_frames, joint_triad
+from natcoord_jax.model.assembled_poses import Poses, check_joint, joint_frames, joint_triad
 from natcoord_jax.model.bodies import Bodies
 from natcoord_jax.model.graph import Edge, spanning_tree
 from natcoord_jax.model.grouping import Instance, bare, families
@@ -168,8 +168,10 @@ class Layout:
         """Constraints of all joints."""
         instances = []
         for name, joint in self.joints.items():
-            self._check_joint(name, joint)
-            frames = _frames_at(joint_frames(joint, self.poses), self._rows(joint.parent, joint.child))
+            place = joint_frames(joint, self.poses)
+            frames = _frames_at(place, self._rows(joint.parent, joint.child))
+            kinds = [self.bodies.kind_of(handle) for handle in (joint.parent, joint.child)]
+            check_joint(name, joint, kinds, place, frames)
             ready = joint.initialise(*frames)
             instances.append(
                 Instance(
@@ -182,22 +184,6 @@ class Layout:
                 )
             )
         return instances
-
-    def _check_joint(self, name: str, joint: Joint) -> None:
-        """Refuse joints of points and directors that need more axes than these have.
-
-        Raises:
-            ValueError: naming joint and node.
-        """
-        for handle in (joint.parent, joint.child):
-            # A ball joint and a distance are between points; all others hold axes, a fixed one, too.
-            axes = joint.needs_axis or joint.multipliers > 3
-            if axes and self.bodies.kind_of(handle) is not TRIAD:
-                kind, node = type(joint).__name__, self.bodies.kind_of(handle).name
-                raise ValueError(
-                    f"joint {name!r}: {handle.name!r} has a {node} only, no axes that a {kind} joint could "
-                    "hold; clamp it to a rigid body (nc.Clamp) and join that"
-                )
 
     def _rows(self, *handles: Handle) -> Float[Array, "n 4 3"]:
         """Rows of bodies in the assembled pose."""

@@ -43,7 +43,6 @@ class Fixed(Joint):
     kind: ClassVar[str] = "fixed joint"
     multipliers: ClassVar[int] = 6
     free: ClassVar[bool] = True
-    needs_axis: ClassVar[bool] = False
 
     def residual(self, parent: Frame, child: Frame) -> Array:
         """Coincident points [m], parallel triads [-]."""
@@ -57,7 +56,6 @@ class Spherical(Joint):
     multipliers: ClassVar[int] = 3
     rotations: ClassVar[tuple[int, ...]] = (0, 1, 2)
     free: ClassVar[bool] = True
-    needs_axis: ClassVar[bool] = False
 
     def residual(self, parent: Frame, child: Frame) -> Array:
         """Coincident points [m]."""
@@ -232,7 +230,6 @@ class Distance(Joint):
 
     kind: ClassVar[str] = "distance joint"
     multipliers: ClassVar[int] = 1
-    needs_axis: ClassVar[bool] = False
     apart: ClassVar[bool] = True
     coordinates: ClassVar[tuple[Coordinate, ...]] = (Separation(),)
 
