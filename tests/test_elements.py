@@ -19,7 +19,7 @@ from natcoord_jax.build import build
 from natcoord_jax.gallery import continua
 from natcoord_jax.maths.collocation import gauss
 from natcoord_jax.mechanics.full import FullStep
-from natcoord_jax.mechanics.reduced import NOTHING
+from natcoord_jax.mechanics.start_cache import NOTHING
 from natcoord_jax.viz.parts import scenery_of
 from natcoord_jax.viz.skins import drawn_bodies
 

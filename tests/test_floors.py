@@ -72,7 +72,7 @@ LONGEST, LONGEST_FUNCTION = 300, 50
 """Lines of a file, and of a function without its docstring."""
 LONGER = {
     "analysis/accuracy.py", "analysis/statics.py", "bodies/continua.py", "core/coordinate.py",
-    "core/effect.py", "effects/rubber.py", "mechanics/reduced.py",
+    "core/effect.py", "effects/rubber.py",
     "model/layout.py", "reading/sensors.py", "scene.py", "stepping/derivative.py", "xla/rewriting.py",
 }  # fmt: skip
 """Files that are longer still; none joins them, and what was cut leaves the list."""

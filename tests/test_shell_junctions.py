@@ -72,8 +72,7 @@ def skin_on_block():
     block = scene.add(nc.Solid(box, material=foam, position=(0, 0, -0.2), name="block"))
     skin = scene.add(nc.Shell(top, **THIN, name="skin"))
     scene.add(nc.Tie(skin.face(), block.face("z1"), name="seam"))
-    # Of two and a half times as much, steps are repeated in parts, more often than they may be in a thousand.
-    pushed(scene, skin.set("right")[0], (0.4, 1.2, 3.2))
+    pushed(scene, skin.set("right")[0], (1.0, 3.0, 8.0))
     return scene
 
 
@@ -91,7 +90,12 @@ def test_all_is_kept_through_what_is_joined(make, steps=1000):
     """Energy, momentum and angular momentum; it bends, and junctions stay closed."""
     dt = 50 * period(0.25)
     system, state = make().compile(assemble=True)
-    trajectory = nc.simulate(system, state, dt=dt, steps=steps)
+    # In the skin energy wanders into oscillations that the step does not resolve: some steps in a hundred are
+    # repeated in parts there. In these the push's impulse is not known, so momenta are those of the flight.
+    more = {"extra_substeps": 2000}
+    push = nc.simulate(system, state, dt=dt, steps=int(np.ceil(2.0 / dt)), **more)
+    trajectory = nc.simulate(system, push.states[-1], dt=dt, steps=steps, **more)
+    assert nc.balance(system, push).energy.max() <= ENERGY
     found = nc.balance(system, trajectory)
     assert found.energy.max() <= ENERGY
     assert found.momentum.max() <= MOMENTUM

@@ -17,7 +17,8 @@ from natcoord_jax.maths.direct_rotation import nearest_orthogonal
 from natcoord_jax.mechanics.block_tangent_space import tangents_at
 from natcoord_jax.mechanics.equations_of_motion import constraint_matrix
 from natcoord_jax.mechanics.momentum import inertia_alone, spatial_inertia, wrench
-from natcoord_jax.mechanics.reduced import NOTHING, ReducedStep, at_rest
+from natcoord_jax.mechanics.reduced import ReducedStep, at_rest
+from natcoord_jax.mechanics.start_cache import NOTHING
 from natcoord_jax.mechanics.tangent_space import TangentSpace
 from natcoord_jax.model.rows import row_rates
 

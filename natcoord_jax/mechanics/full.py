@@ -7,7 +7,6 @@ are solved so, densely; for all others it is an independent way to the same traj
 
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,69 +19,39 @@ from natcoord_jax.maths.projectors import range_projector
 from natcoord_jax.maths.vectors import cross
 from natcoord_jax.mechanics.block_tangent_space import Tangents
 from natcoord_jax.mechanics.element_matrices import dense, rates_of, touches
-from natcoord_jax.mechanics.form import Form
-from natcoord_jax.mechanics.grain import cancelling_size
-from natcoord_jax.mechanics.kick import kicked
 from natcoord_jax.mechanics.local import body_balance, body_motion, jacobians
 from natcoord_jax.mechanics.mass_between import pair_matrices
-from natcoord_jax.mechanics.momentum import least_inertias, momentum_balance
-from natcoord_jax.mechanics.reduced import NOTHING
+from natcoord_jax.mechanics.momentum import least_inertias
 from natcoord_jax.mechanics.redundancy import (
     at_every_stage,
     held_multipliers,
     project_multipliers,
-    project_rows,
 )
 from natcoord_jax.mechanics.response import (
-    Evaluation,
-    GroupData,
     StageKinematics,
-    body_rows,
-    situation,
     stations,
 )
 from natcoord_jax.mechanics.spread import part_matrices, products
-from natcoord_jax.mechanics.start_cache import StartCache
+from natcoord_jax.mechanics.start_cache import NOTHING, StartCache
+from natcoord_jax.mechanics.step_equations import StepEquations
 from natcoord_jax.model.groups import Group
 from natcoord_jax.model.local_rates import TWIST
 from natcoord_jax.model.model import Model
 from natcoord_jax.model.rows import rows_with_ground
 
 
-class FullStep(Form):
+class FullStep(StepEquations):
     """One step with multipliers for every joint: all that does not depend on the unknowns."""
 
-    system: Model
-    state: State
-    start: Float[Array, "bodies_and_ground 4 3"]
-    velocity: Float[Array, "bodies 4 3"]
-    situations: tuple[GroupData, ...]
-    h: Float[Array, ""]
-    start_cache: StartCache
-    tableau: Tableau = eqx.field(static=True)
+    @classmethod
+    def groups_of(cls, system: Model) -> tuple[Group, ...]:
+        """All groups, in the order of their multipliers."""
+        return (*system.effects, *system.joints)
 
     @classmethod
-    def prepare(
-        cls,
-        system: Model,
-        state: State,
-        u: Array,
-        h: Array,
-        tableau: Tableau,
-        start_cache: StartCache | None = None,
-    ) -> "FullStep":
-        """Gather what the step needs, once; see `ReducedStep.prepare`."""
-        groups = (*system.effects, *system.joints)
-        return cls(
-            system,
-            state,
-            rows_with_ground(state.q),
-            body_rows(state.v),
-            tuple(situation(system, g, state, u, h) for g in groups),
-            h,
-            cls.starting(system, state, tableau) if start_cache is None else start_cache,
-            tableau,
-        )
+    def geometry_of(cls, system: Model, state: State) -> dict[str, Array]:
+        """Rows at the start, those of the ground last."""
+        return {"start": rows_with_ground(state.q)}
 
     @classmethod
     def starting(
@@ -106,86 +75,34 @@ class FullStep(Form):
         return StartCache.of(system, state, tableau, projector, tangents, later)
 
     @property
-    def groups(self) -> tuple[Group, ...]:
-        """All groups, in the order of their multipliers."""
-        return (*self.system.effects, *self.system.joints)
-
-    @property
     def bodies(self) -> int:
         """Number of bodies."""
         return self.velocity.shape[0]
-
-    @property
-    def dependent(self) -> bool:
-        """Whether constraints depend on each other."""
-        return self.system.structure.rank is not None
 
     @property
     def balances(self) -> int:
         """Number of balance equations."""
         return self.system.local_rates.count * self.tableau.stages
 
-    @property
-    def grain(self) -> Float[Array, ""]:
-        """Size of the terms that cancel in the forces [sqrt(J)]."""
-        return cancelling_size(self.system, self.groups, self.situations, self.state, self.h)
+    def rates(self, y: Float[Array, " balances"]) -> Float[Array, "bodies s 6"]:
+        """Twists of the bodies."""
+        return self.system.local_rates.twists(y, self.start[:-1])
 
-    def _blocks(self) -> list[tuple[int, int]]:
-        """First unknown and size of the multipliers of each group."""
-        blocks, position = [], self.balances
-        for group in self.groups:
-            size = group.count * self.tableau.stages * group.multipliers
-            blocks.append((position, size))
-            position += size
-        return blocks
+    def moved(self, w: Float[Array, "bodies s 6"]) -> tuple[StageKinematics, None]:
+        """Stage motion of all bodies."""
+        motion = body_motion(self.start[:-1], w, self.h, self.tableau)
+        points, directors = motion.rows[:, :, 0], motion.rows[:, :, 1:]
+        return stations(self.start[:-1], points, directors, motion.rates[:, :, 0], motion.spin), None
 
-    @property
-    def unknowns(self) -> int:
-        """Number of unknowns."""
-        last = self._blocks()[-1] if self.groups else (self.balances, 0)
-        return sum(last)
-
-    def split(self, y: Float[Array, " unknowns"]) -> tuple[Array, list[Array]]:
-        """Twists (bodies, s, 6) and multipliers of each group (n, s, m)."""
-        s = self.tableau.stages
-        twists = self.system.local_rates.twists(y[: self.balances], self.start[:-1])
-        multipliers = [
-            y[first : first + size].reshape(group.count, s, group.multipliers)
-            for group, (first, size) in zip(self.groups, self._blocks())
-        ]
-        return twists, multipliers
+    def balance(
+        self, geometry: None, force: Float[Array, "s bodies 3"], torque: Float[Array, "s bodies 3"]
+    ) -> Float[Array, " balances"]:
+        """Wrenches along the rates of every body."""
+        wrenches = jnp.moveaxis(jnp.concatenate([force, torque], axis=-1), 0, 1)
+        return self.system.local_rates.balances(wrenches, self.start[:-1])
 
     def _with_ground(self, twists: Array) -> Array:
         return jnp.concatenate([twists, jnp.zeros_like(twists[:1])])
-
-    def residual(self, y: Float[Array, " unknowns"]) -> tuple[Float[Array, " unknowns"], Float[Array, ""]]:
-        """Residual [N s, N m s; m/s, 1/s for constraints] and the size of its terms [sqrt(J)]."""
-        found = self.evaluate(y)
-        return found.residual, found.size
-
-    def evaluate(self, y: Float[Array, " unknowns"]) -> Evaluation:
-        """Residual, and what the end of the step needs."""
-        twists, multipliers = self.split(project_multipliers(y, self.balances, self.start_cache.projector))
-        at = self._stations(twists)
-        velocity, situations, kick = kicked(
-            self.system,
-            self.state,
-            self.start_cache.tangents,
-            self.start_cache.lag,
-            self.groups,
-            self.situations,
-            at,
-            self.h,
-            self.tableau,
-        )
-        given = self.system, self.groups, situations, at, velocity
-        found = momentum_balance(*given, multipliers, self.h, self.tableau)
-        wrenches = jnp.moveaxis(jnp.concatenate([found.force, found.torque], axis=-1), 0, 1)
-        balances = self.system.local_rates.balances(wrenches, self.start[:-1])
-        rows = project_rows(found.rows, y, self.balances, self.start_cache.projector)
-        residual = jnp.concatenate([balances, rows])
-        asked = multipliers if self.system.structure.inequalities else None
-        return Evaluation(residual, found.size, at, found.power, (found.force, found.torque), kick, asked)
 
     def body_jacobians(self, twists: Float[Array, "bodies s 6"]) -> Float[Array, "bodies n n"]:
         """Jacobians of the bodies' own balances."""
@@ -276,19 +193,4 @@ class FullStep(Form):
 
     def repeated(self, w: Float[Array, " rates"]) -> Float[Array, " unknowns"]:
         """The same at all stages; multipliers zero."""
-        rates = self.system.local_rates.repeated(w, self.tableau.stages)
-        return jnp.concatenate([rates, jnp.zeros(self.unknowns - self.balances, w.dtype)])
-
-    def motion_of(self, y: Float[Array, " unknowns"]) -> StageKinematics:
-        """Stage motion of all bodies."""
-        return self._stations(self.split(y)[0])
-
-    def _stations(self, twists: Float[Array, "bodies s 6"]) -> StageKinematics:
-        motion = body_motion(self.start[:-1], twists, self.h, self.tableau)
-        return stations(
-            self.start[:-1],
-            motion.rows[:, :, 0],
-            motion.rows[:, :, 1:],
-            motion.rates[:, :, 0],
-            motion.spin,
-        )
+        return self.with_multipliers(self.system.local_rates.repeated(w, self.tableau.stages))

@@ -1,15 +1,11 @@
 """Equations of a step in the joint null space: rates of the spanning tree and multipliers of loops.
 
-Unknowns y: mean rates w of the tree's free motions, stage by stage, then the multipliers (times the step)
-of the joints that close loops and of relations between coordinates. Residual: the momentum balance of the
-step (57) projected on the free motions, P^T [M sum_j (A^-1)_ij (V_j - v_0) - h F_i - G_i^T lambda_i],
-then the rates of the constraints. Working with rates and multipliers times h keeps the equations of one
-size as h goes to zero.
+Unknowns y: mean rates w of the tree's free motions, stage by stage, then the multipliers of the joints that
+close loops and of relations between coordinates.
 """
 
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -23,37 +19,26 @@ from natcoord_jax.maths.collocation import Tableau, gauss
 from natcoord_jax.maths.projectors import range_projector
 from natcoord_jax.maths.vectors import dot
 from natcoord_jax.mechanics.block_tangent_space import Tangents, tangents_at
-from natcoord_jax.mechanics.dissipation import Damped, Damping
 from natcoord_jax.mechanics.equations_of_motion import constraint_matrix
-from natcoord_jax.mechanics.form import Form
-from natcoord_jax.mechanics.grain import cancelling_size
-from natcoord_jax.mechanics.kick import kicked
-from natcoord_jax.mechanics.momentum import least_inertias, momentum_balance
+from natcoord_jax.mechanics.momentum import least_inertias
 from natcoord_jax.mechanics.redundancy import (
     at_every_stage,
     contact_mobilities,
     places_by_stage,
-    project_multipliers,
-    project_rows,
 )
 from natcoord_jax.mechanics.response import (
-    Evaluation,
-    GroupData,
     StageKinematics,
     body_rows,
-    situation,
     stations,
 )
-from natcoord_jax.mechanics.start_cache import StartCache
+from natcoord_jax.mechanics.start_cache import NOTHING, StartCache
+from natcoord_jax.mechanics.step_equations import StepEquations
 from natcoord_jax.mechanics.sweeps import sweep_motion, turned_directors
 from natcoord_jax.mechanics.tangent_space import TangentSpace
 from natcoord_jax.model.axisymmetric_axes import frame_axes
 from natcoord_jax.model.groups import Group
 from natcoord_jax.model.model import Model
 from natcoord_jax.model.tree import SLOTS, TreeMotion, gather_slots, project, start_rates
-
-NOTHING = StartCache(None, None)
-"""Of the start of a step that is used for its constraints alone."""
 
 PROBE = 1e-6
 """Change of a rotation [rad] that gives a column of the Jacobian."""
@@ -79,52 +64,22 @@ def at_rest(step: Any) -> Any:
     )
 
 
-class ReducedStep(Form):
+class ReducedStep(StepEquations):
     """One step in the joint null space: all that does not depend on the unknowns, and the equations."""
 
     by_differences = True
 
-    system: Model
-    state: State
-    start: Float[Array, "bodies 4 3"]
-    velocity: Float[Array, "bodies 4 3"]
     frames: Float[Array, "bodies 2 4 4"]
-    situations: tuple[GroupData, ...]
-    h: Float[Array, ""]
-    start_cache: StartCache
-    tableau: Tableau = eqx.field(static=True)
 
     @classmethod
-    def prepare(
-        cls,
-        system: Model,
-        state: State,
-        u: Array,
-        h: Array,
-        tableau: Tableau,
-        start_cache: StartCache | None = None,
-    ) -> "ReducedStep":
-        """Gather what the step needs, once.
+    def groups_of(cls, system: Model) -> tuple[Group, ...]:
+        """Those that take part in the equations."""
+        return active_groups(system)
 
-        Args:
-            system: compiled system.
-            state: at the start.
-            u: inputs.
-            h: step [s].
-            tableau: the collocation method.
-            start_cache: what is known of the start, see `starting`; None: found here.
-        """
-        return cls(
-            system,
-            state,
-            body_rows(state.q),
-            body_rows(state.v),
-            system.tree.frames(system.frames),
-            tuple(situation(system, g, state, u, h) for g in active_groups(system)),
-            h,
-            cls.starting(system, state, tableau) if start_cache is None else start_cache,
-            tableau,
-        )
+    @classmethod
+    def geometry_of(cls, system: Model, state: State) -> dict[str, Array]:
+        """Rows at the start, and the frames of the joints of the tree."""
+        return {"start": body_rows(state.q), "frames": system.tree.frames(system.frames)}
 
     @classmethod
     def starting(
@@ -146,37 +101,27 @@ class ReducedStep(Form):
         return StartCache.of(system, state, tableau, projector, tangents, later)
 
     @property
-    def groups(self) -> tuple[Group, ...]:
-        """Groups with a part in the equations, in the order of their multipliers."""
-        return active_groups(self.system)
-
-    @property
-    def dependent(self) -> bool:
-        """Whether constraints depend on each other."""
-        return self.system.structure.rank is not None
-
-    @property
     def balances(self) -> int:
         """Number of balance equations; the rest are constraints."""
         return self.system.structure.unknowns * self.tableau.stages
 
-    @property
-    def grain(self) -> Float[Array, ""]:
-        """Size of the terms that cancel in the forces [sqrt(J)]."""
-        return cancelling_size(self.system, self.groups, self.situations, self.state, self.h)
+    def rates(self, y: Float[Array, " balances"]) -> Float[Array, "s unknowns"]:
+        """Rates of the tree, stage by stage."""
+        return y.reshape(self.tableau.stages, self.system.structure.unknowns)
 
-    def split(self, y: Float[Array, " unknowns"]) -> tuple[Array, list[Array]]:
-        """Rates (s, unknowns) and multipliers of each active group (n, s, m)."""
-        s, position = self.tableau.stages, self.balances
-        w, multipliers = y[:position].reshape(s, -1), []
-        if position == 0:
-            w = y[:0].reshape(s, 0)
-        for group in active_groups(self.system):
-            shape = (group.count, s, group.multipliers)
-            size = group.count * s * group.multipliers
-            multipliers.append(y[position : position + size].reshape(shape))
-            position += size
-        return w, multipliers
+    def moved(self, w: Float[Array, "s unknowns"]) -> tuple[StageKinematics, Any]:
+        """Motion as the effects see it, and the geometry of the joints where forces take hold."""
+        motion, geometry = self.motion(w)
+        at = self.stations(motion)
+        if self.tableau.variational:
+            return replace_fields(at, force_rows=at.start[None]), at_rest(self).motion(w)[1]
+        return at, geometry
+
+    def balance(
+        self, geometry: Any, force: Float[Array, "s bodies 3"], torque: Float[Array, "s bodies 3"]
+    ) -> Float[Array, " balances"]:
+        """Those of the tree, stage by stage."""
+        return self.generalised(geometry, force, torque).reshape(-1)
 
     def motion(self, w: Float[Array, "s unknowns"]) -> tuple[TreeMotion, Any]:
         """Stage motion of the bodies at given rates, and the geometry of the joints."""
@@ -210,50 +155,6 @@ class ReducedStep(Form):
         points = self.start[:, 0] + jnp.sum(a[:, :, None, None] * motion.velocity, axis=1)
         return stations(self.start, points, motion.directors, motion.velocity, motion.spin)
 
-    def residual(self, y: Float[Array, " unknowns"]) -> tuple[Float[Array, " unknowns"], Float[Array, ""]]:
-        """Residual [N s, N m s; m/s, 1/s for constraints] and the size of its terms [sqrt(J)]."""
-        found = self.evaluate(y)
-        return found.residual, found.size
-
-    def evaluate(self, y: Float[Array, " unknowns"]) -> Evaluation:
-        """Residual, and what the end of the step needs."""
-        system = self.system
-        w, multipliers = self.split(project_multipliers(y, self.balances, self.start_cache.projector))
-        motion, geometry = self.motion(w)
-        at = self.stations(motion)
-        if self.tableau.variational:
-            at, geometry = replace_fields(at, force_rows=at.start[None]), at_rest(self).motion(w)[1]
-        velocity, situations, kick = kicked(
-            self.system,
-            self.state,
-            self.start_cache.tangents,
-            self.start_cache.lag,
-            self.groups,
-            self.situations,
-            at,
-            self.h,
-            self.tableau,
-        )
-        damped = None
-        if self.tableau.dissipative:
-            damped = self.damped(at)
-            velocity, situations = damped.started(self.groups, situations)
-        given = system, self.groups, situations, at, velocity
-        found = momentum_balance(*given, multipliers, self.h, self.tableau)
-        generalised = self.generalised(geometry, found.force, found.torque)
-        rows = project_rows(found.rows, y, self.balances, self.start_cache.projector)
-        residual = jnp.concatenate([generalised.reshape(-1), rows])
-        asked = (situations, multipliers) if self.tableau.variational else damped
-        if self.system.structure.inequalities:
-            asked = multipliers
-        return Evaluation(residual, found.size, at, found.power, (found.force, found.torque), kick, asked)
-
-    def damped(self, at: StageKinematics) -> Damped:
-        """What numerical dissipation does in the step."""
-        damping = self.start_cache.damping
-        damping = Damping.at(self.system, self.state) if damping is None else damping.with_system(self.system)
-        return damping.over(self.state, self.groups, at, self.h, self.tableau)
-
     def guess(self) -> Float[Array, " unknowns"]:
         """Rates of the velocities at the start, repeated for every stage; multipliers zero."""
         return self.repeated(start_rates(self.system.tree, self.frames, self.start, self.velocity))
@@ -264,8 +165,7 @@ class ReducedStep(Form):
 
     def repeated(self, w: Float[Array, " rates"]) -> Float[Array, " unknowns"]:
         """The same at all stages; multipliers zero."""
-        idle = jnp.zeros(self.system.structure.multipliers * self.tableau.stages, w.dtype)
-        return jnp.concatenate([jnp.tile(w, self.tableau.stages), idle])
+        return self.with_multipliers(jnp.tile(w, self.tableau.stages))
 
     def jacobian(self, y: Float[Array, " unknowns"]) -> Float[Array, "unknowns unknowns"]:
         """Exact Jacobian of the residual."""

@@ -54,3 +54,7 @@ class StartCache(eqx.Module):
         if tangents is None:
             tangents = tangents_at(system, state).without_system()
         return cls(projector, tangents)
+
+
+NOTHING = StartCache(None, None)
+"""Of the start of a step that is used for its constraints alone."""

@@ -20,7 +20,7 @@ from natcoord_jax.linsolve.learning import learns
 from natcoord_jax.maths.collocation import Tableau
 from natcoord_jax.mechanics.block_tangent_space import Tangents, tangents_at
 from natcoord_jax.mechanics.equations import kind_of, prepare
-from natcoord_jax.mechanics.reduced import NOTHING
+from natcoord_jax.mechanics.start_cache import NOTHING
 from natcoord_jax.stepping.factors import Factors, factors_of
 from natcoord_jax.stepping.linear_iteration import LinearIteration
 from natcoord_jax.stepping.newton import any_lane

@@ -13,9 +13,8 @@ from natcoord_jax.linsolve.saddle import inertias_of, regularised
 from natcoord_jax.linsolve.sparse import Plan, choose
 from natcoord_jax.maths.collocation import gauss
 from natcoord_jax.mechanics.element_matrices import elements
-from natcoord_jax.mechanics.reduced import NOTHING
 from natcoord_jax.mechanics.sparse import SparseStep, nodes_of
-from natcoord_jax.mechanics.start_cache import StartCache
+from natcoord_jax.mechanics.start_cache import NOTHING, StartCache
 from natcoord_jax.system import System
 
 

@@ -1,0 +1,189 @@
+"""Equations of a step: what they are in every null space, and what a null space adds.
+
+Unknowns y: mean rates of the free motions, then the multipliers (times the step) of each group of
+constraints. Residual: the momentum balance of the step (57) projected on the free motions,
+P^T [M sum_j (A^-1)_ij (V_j - v_0) - h F_i - G_i^T lambda_i], then the rates of the constraints. Working with
+rates and multipliers times h keeps the equations of one size as h goes to zero.
+"""
+
+from abc import abstractmethod
+from typing import Any, Self
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from natcoord_jax.core.state import State
+from natcoord_jax.maths.collocation import Tableau
+from natcoord_jax.mechanics.block_tangent_space import Tangents
+from natcoord_jax.mechanics.dissipation import Damped, Damping
+from natcoord_jax.mechanics.form import Form
+from natcoord_jax.mechanics.grain import cancelling_size
+from natcoord_jax.mechanics.kick import kicked
+from natcoord_jax.mechanics.momentum import momentum_balance
+from natcoord_jax.mechanics.redundancy import project_multipliers, project_rows
+from natcoord_jax.mechanics.response import Evaluation, GroupData, StageKinematics, body_rows, situation
+from natcoord_jax.mechanics.start_cache import StartCache
+from natcoord_jax.model.groups import Group
+from natcoord_jax.model.model import Model
+
+
+class StepEquations(Form):
+    """One step: all that does not depend on the unknowns, and the equations.
+
+    Attributes:
+        system: compiled system.
+        state: at the start.
+        start: rows of the bodies there; a form may have those of the ground behind them.
+        velocity: of the rows there.
+        situations: of the groups, in the order of their multipliers.
+        h: step [s].
+        start_cache: what is known of the start.
+        tableau: the collocation method.
+    """
+
+    system: Model
+    state: State
+    start: Float[Array, "bodies 4 3"]
+    velocity: Float[Array, "bodies 4 3"]
+    situations: tuple[GroupData, ...]
+    h: Float[Array, ""]
+    start_cache: StartCache
+    tableau: Tableau = eqx.field(static=True)
+
+    @classmethod
+    def prepare(
+        cls,
+        system: Model,
+        state: State,
+        u: Array,
+        h: Array,
+        tableau: Tableau,
+        start_cache: StartCache | None = None,
+    ) -> Self:
+        """Gather what the step needs, once.
+
+        Args:
+            system: compiled system.
+            state: at the start.
+            u: inputs.
+            h: step [s].
+            tableau: the collocation method.
+            start_cache: what is known of the start, see `starting`; None: found here.
+        """
+        return cls(
+            system=system,
+            state=state,
+            velocity=body_rows(state.v),
+            situations=tuple(situation(system, g, state, u, h) for g in cls.groups_of(system)),
+            h=h,
+            start_cache=cls.starting(system, state, tableau) if start_cache is None else start_cache,
+            tableau=tableau,
+            **cls.geometry_of(system, state),
+        )
+
+    @classmethod
+    @abstractmethod
+    def groups_of(cls, system: Model) -> tuple[Group, ...]:
+        """Groups with a part in the equations, in the order of their multipliers."""
+
+    @classmethod
+    @abstractmethod
+    def geometry_of(cls, system: Model, state: State) -> dict[str, Array]:
+        """`start`, and fields that a form has besides."""
+
+    @classmethod
+    @abstractmethod
+    def starting(
+        cls,
+        system: Model,
+        state: State,
+        tableau: Tableau,
+        tangents: Tangents | None = None,
+        later: bool = False,
+    ) -> StartCache:
+        """What a step needs of its start, see `StartCache.of`."""
+
+    @property
+    @abstractmethod
+    def balances(self) -> int:
+        """Number of balance equations; the rest are constraints."""
+
+    @abstractmethod
+    def rates(self, y: Float[Array, " balances"]) -> Array:
+        """Rates of the free motions as the form arranges them."""
+
+    @abstractmethod
+    def moved(self, w: Array) -> tuple[StageKinematics, Any]:
+        """Motion at given rates as the effects see it, and the geometry that `balance` asks for."""
+
+    @abstractmethod
+    def balance(
+        self, geometry: Any, force: Float[Array, "s bodies 3"], torque: Float[Array, "s bodies 3"]
+    ) -> Float[Array, " balances"]:
+        """Generalised forces of the free motions from forces and torques at the reference points."""
+
+    @property
+    def groups(self) -> tuple[Group, ...]:
+        """Groups with a part in the equations, in the order of their multipliers."""
+        return self.groups_of(self.system)
+
+    @property
+    def dependent(self) -> bool:
+        """Whether constraints depend on each other."""
+        return self.system.structure.rank is not None
+
+    @property
+    def grain(self) -> Float[Array, ""]:
+        """Size of the terms that cancel in the forces [sqrt(J)]."""
+        return cancelling_size(self.system, self.groups, self.situations, self.state, self.h)
+
+    @property
+    def unknowns(self) -> int:
+        """Number of unknowns."""
+        return self.balances + self.tableau.stages * sum(g.count * g.multipliers for g in self.groups)
+
+    def split(self, y: Float[Array, " unknowns"]) -> tuple[Array, list[Array]]:
+        """Rates, see `rates`, and multipliers of each group (n, s, m)."""
+        position, multipliers = self.balances, []
+        for group in self.groups:
+            shape = group.count, self.tableau.stages, group.multipliers
+            size = group.count * self.tableau.stages * group.multipliers
+            multipliers.append(y[position : position + size].reshape(shape))
+            position += size
+        return self.rates(y[: self.balances]), multipliers
+
+    def with_multipliers(self, rates: Float[Array, " balances"]) -> Float[Array, " unknowns"]:
+        """Unknowns of given rates, with multipliers of zero."""
+        return jnp.concatenate([rates, jnp.zeros(self.unknowns - self.balances, rates.dtype)])
+
+    def residual(self, y: Float[Array, " unknowns"]) -> tuple[Float[Array, " unknowns"], Float[Array, ""]]:
+        """Residual [N s, N m s; m/s, 1/s for constraints] and the size of its terms [sqrt(J)]."""
+        found = self.evaluate(y)
+        return found.residual, found.size
+
+    def evaluate(self, y: Float[Array, " unknowns"]) -> Evaluation:
+        """Residual, and what the end of the step needs."""
+        cache, tableau = self.start_cache, self.tableau
+        w, multipliers = self.split(project_multipliers(y, self.balances, cache.projector))
+        at, geometry = self.moved(w)
+        before = self.system, self.state, cache.tangents, cache.lag, self.groups, self.situations
+        velocity, situations, kick = kicked(*before, at, self.h, tableau)
+        asked: Any = multipliers if self.system.structure.inequalities else None
+        if tableau.dissipative:
+            asked = self.damped(at)
+            velocity, situations = asked.started(self.groups, situations)
+        elif tableau.variational:
+            asked = situations, multipliers
+        given = self.system, self.groups, situations, at, velocity
+        found = momentum_balance(*given, multipliers, self.h, tableau)
+        balance = self.balance(geometry, found.force, found.torque)
+        rows = project_rows(found.rows, y, self.balances, cache.projector)
+        residual = jnp.concatenate([balance, rows])
+        return Evaluation(residual, found.size, at, found.power, (found.force, found.torque), kick, asked)
+
+    def damped(self, at: StageKinematics) -> Damped:
+        """What numerical dissipation does in the step."""
+        damping = self.start_cache.damping
+        damping = Damping.at(self.system, self.state) if damping is None else damping.with_system(self.system)
+        return damping.over(self.state, self.groups, at, self.h, self.tableau)
