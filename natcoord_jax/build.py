@@ -54,7 +54,7 @@ def build(
     multipliers += sum(g.count * g.multipliers for g in joint_groups if not g.in_tree)
     inequalities = sum(g.count * g.multipliers for g in groups if g.effect.unilateral)
     internal = sum(kind.constraints for kind in bodies.kinds)
-    masses, between = mass_of(layout.masses(), groups, turning[:-1])
+    masses, between = mass_of(layout.masses(), groups, np.array([kind.rows for kind in layout.kinds]))
     coupled = between is not None
     structure = Structure(
         bodies=layout.ordered_names,

@@ -25,21 +25,30 @@ class MassBetween(eqx.Module):
 
     Attributes:
         bodies: two different ones, of each block once.
-        blocks: between their rows: of the first along the rows, of the second along the columns.
+        blocks: between the vectors that the nodes carry, their points first: of the first body along the
+            rows, of the second along the columns.
         uniform: sums of the blocks in the rows of each body, momenta of a motion that is the same everywhere;
             with what sits on the ground, which has no part in motions, but has a weight.
         places: where the blocks of each group of effects go (n, k, k), beyond the last one those that are
             none or that another is the transpose of; None: it has none.
         acting: how bodies collect what the blocks give them, the first of all blocks before the second.
-        turning: whether any of the bodies turns; points do not.
     """
 
     bodies: Int[Array | np.ndarray, "pairs 2"]
-    blocks: Float[Array, "pairs 4 4"]
+    blocks: Float[Array, "pairs r r"]
     uniform: Float[Array, "bodies 4 4"]
     places: tuple[Int[Array | np.ndarray, "n k k"] | None, ...]
     acting: SegmentSum
-    turning: bool = eqx.field(static=True)
+
+    @property
+    def rows(self) -> int:
+        """Vectors of a body that have mass together with those of another."""
+        return self.blocks.shape[-1]
+
+    @property
+    def turning(self) -> bool:
+        """Whether bodies turn; points do not."""
+        return self.rows > 1
 
     @property
     def rates(self) -> int:
@@ -48,11 +57,12 @@ class MassBetween(eqx.Module):
 
     def momenta(self, rates: Float[Array, "*s bodies 4 3"]) -> Float[Array, "*s bodies 4 3"]:
         """What they add to the momenta of the bodies."""
-        first, second = self.bodies[:, 0], self.bodies[:, 1]
-        onto_first = jnp.sum(self.blocks[:, :, :, None] * rates[..., second, None, :, :], axis=-2)
-        onto_second = jnp.sum(self.blocks[:, :, :, None] * rates[..., first, :, None, :], axis=-3)
+        first, second = (rates[..., bodies, : self.rows, :] for bodies in self.bodies.T)
+        onto_first = jnp.sum(self.blocks[:, :, :, None] * second[..., None, :, :], axis=-2)
+        onto_second = jnp.sum(self.blocks[:, :, :, None] * first[..., :, None, :], axis=-3)
         parts = jnp.moveaxis(jnp.concatenate([onto_first, onto_second], axis=-3), -3, 0)
-        return jnp.moveaxis(self.acting.collect(parts), 0, -3)
+        found = jnp.moveaxis(self.acting.collect(parts), 0, -3)
+        return jnp.zeros_like(rates).at[..., : self.rows, :].set(found)
 
     def times(self, factor: Array | float) -> "MassBetween":
         """So many times as much."""
@@ -68,16 +78,16 @@ def _axes(group: Group) -> int:
 
 
 def mass_of(
-    masses: Float[Array, "bodies 4 4"], groups: Sequence[Group], turning: np.ndarray
+    masses: Float[Array, "bodies 4 4"], groups: Sequence[Group], rows: np.ndarray
 ) -> tuple[Float[Array, "bodies 4 4"], MassBetween | None]:
     """Masses with all that effects bring; what sits on the ground is lost.
 
     Args:
         masses: m (15) of the bodies without them.
         groups: of all effects.
-        turning: which bodies turn.
+        rows: vectors that the node of each body carries.
     """
-    between = _between(groups, turning)
+    between = _between(groups, rows)
     for number in range(len(groups)):
         masses, between = with_mass(masses, between, groups, number)
     return masses, between
@@ -110,9 +120,9 @@ def with_mass(
     return alone, between
 
 
-def _between(groups: Sequence[Group], turning: np.ndarray) -> MassBetween | None:
+def _between(groups: Sequence[Group], rows: np.ndarray) -> MassBetween | None:
     """The pairs of bodies between which there is mass, none yet."""
-    count = len(turning)
+    count = len(rows)
     pairs = [_pairs(group) if _axes(group) == BETWEEN else None for group in groups]
     numbers = [None if p is None else p[..., 0] * (count + 1) + p[..., 1] for p in pairs]
     given = [n[_first(p, count)] for n, p in zip(numbers, pairs) if n is not None and p is not None]
@@ -126,9 +136,9 @@ def _between(groups: Sequence[Group], turning: np.ndarray) -> MassBetween | None
         for n, p in zip(numbers, pairs)
     )
     bodies = np.stack([unique // (count + 1), unique % (count + 1)], axis=1).astype(np.int32)
-    none, still = (as_array(np.zeros((n, 4, 4))) for n in (len(bodies), count))
-    acting = SegmentSum.of(bodies.T, count)
-    return MassBetween(bodies, none, still, places, acting, bool(turning[bodies].any()))
+    most = int(rows[bodies].max(initial=1))
+    none, still = as_array(np.zeros((len(bodies), most, most))), as_array(np.zeros((count, 4, 4)))
+    return MassBetween(bodies, none, still, places, SegmentSum.of(bodies.T, count))
 
 
 def _pairs(group: Group) -> Int[np.ndarray, "n k k 2"]:
@@ -172,4 +182,5 @@ def _added(
     one, other = bodies[:, :, None], bodies[:, None]
     alone, apart = (jnp.where(own, one, ground) for own in (one == other, one != other))
     masses, uniform = (x.at[at].add(every, mode="drop") for x, at in ((masses, alone), (uniform, apart)))
-    return masses, blocks.at[places].add(every, mode="drop"), uniform
+    carried = blocks.shape[-1]
+    return masses, blocks.at[places].add(every[..., :carried, :carried], mode="drop"), uniform
