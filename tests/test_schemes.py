@@ -11,10 +11,12 @@ import pytest
 import tolerances as tol
 from accounts import account
 from scenes import JOINTS, pair, with_multipliers
+from test_constraints import SCHEMES as OF_CONSTRAINTS
 
 import natcoord_jax as nc
 from natcoord_jax import cli, gallery
 from natcoord_jax.stepping.endpoint import endpoints
+from natcoord_jax.stepping.scheme import SCHEME, Scheme
 
 VARIATIONAL = nc.VariationalMidpoint()
 DISSIPATIVE = nc.Dissipative(spectral_radius=0.5)
@@ -476,3 +478,12 @@ def test_command_line(name, tmp_path, capsys):
 def test_options_that_cannot_be_meant(options, said, capsys):
     assert cli.main(["run", "double_pendulum", *options]) == 2
     assert said in capsys.readouterr().err
+
+
+def test_every_scheme_is_entered_everywhere():
+    """On the command line, in the message that offers schemes, and in the tests that all schemes pass."""
+    every = {x for x in vars(nc).values() if isinstance(x, type) and issubclass(x, Scheme)} - {Scheme}
+    assert {type(cli.choose_scheme(name, None, None)) for name in cli.SCHEMES} == every
+    assert {type(x) for x in (nc.EnergyMomentum(), *SCHEMES.values())} == every
+    assert {type(x) for x in OF_CONSTRAINTS.values()} == every
+    assert all(f"nc.{x.__name__}(" in SCHEME.wanted for x in every)
