@@ -66,6 +66,12 @@ def pytest_configure(config: pytest.Config) -> None:
         eager_numpy.at_top_level = lambda *values: False
 
 
+def pytest_itemcollected(item: pytest.Item) -> None:
+    """What is exhaustive for one of its parameters is not slow besides."""
+    if item.get_closest_marker("exhaustive"):
+        item.own_markers[:] = [mark for mark in item.own_markers if mark.name != "slow"]
+
+
 @pytest.fixture(autouse=True)
 def _room_for_programs():
     yield

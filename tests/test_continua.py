@@ -279,8 +279,9 @@ def node_place(part, node):
     return np.asarray(part.nodes.positions)[int(node.name.split("[")[1][:-1])]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("amplitude", [0.0, 0.06])
+@pytest.mark.parametrize(
+    "amplitude", [pytest.param(0.0, marks=pytest.mark.exhaustive), pytest.param(0.06, marks=pytest.mark.slow)]
+)
 def test_a_tie_in_motion(amplitude):
     """On flat and on curved surfaces energy, momentum and angular momentum are exact, and it stays closed."""
     scene, _, _ = tied(amplitude, angular_velocity=(0.5, 0.3, 2.0))

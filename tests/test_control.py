@@ -759,7 +759,7 @@ def test_a_motion_that_is_none_violates_its_equations():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", ["shooting", "lifted"])
+@pytest.mark.parametrize("method", ["shooting", pytest.param("lifted", marks=pytest.mark.exhaustive)])
 def test_a_saddle_is_left_by_a_start_from_it(method):
     """A turn by 120 degrees about a principal axis costs less off it; by a hinge, it costs least along it."""
     scene, angle = nc.Scene(), np.radians(120)

@@ -134,7 +134,7 @@ def test_a_step_that_a_bound_cuts_in_half_is_not_corrected(made):
 # Reasons
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_limits_that_are_too_narrow_are_told_with_what_they_would_have_to_be(made):
     found = nc.optimise(turn(made, 0.75 * LEAST), progress=False)
     assert found.outcome is nc.Outcome.UNREACHABLE, found.explain()
@@ -163,7 +163,7 @@ def test_a_motion_that_cannot_be_simulated_is_told_with_its_step(pendulum):
     assert "step" in found.reason and "t = " in found.reason, found.explain()
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_guess_that_cannot_be_simulated_is_left(pendulum):
     found = nc.optimise(swing_up(pendulum, cost=nc.cost.Effort()), np.full((60, 1), 1e7), progress=False)
     assert found.ok and found.cost == pytest.approx(5.6284862, rel=1e-7), found.explain()

@@ -332,8 +332,10 @@ def test_an_element_of_ones_own_on_the_base_of_another():
     assert sags[0] == pytest.approx(2.0 * sags[1], rel=1e-6)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("analysis", ["statics", "path"])
+@pytest.mark.parametrize(
+    "analysis",
+    [pytest.param("statics", marks=pytest.mark.slow), pytest.param("path", marks=pytest.mark.exhaustive)],
+)
 def test_large_statics_are_solved_by_the_sparse_plan(analysis, monkeypatch):
     """As the dense matrix does, with gradients."""
     system, state, tip = cantilever(42, force=2.0)

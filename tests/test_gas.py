@@ -176,7 +176,7 @@ def test_a_step_with_gas_is_differentiated_exactly():
     )
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_cavity_of_a_solid_and_a_dissipative_scheme():
     """Faces of a solid enclose a gas as a shell does; numerical damping takes energy, none from the gas."""
     cube = nc.mesh.box((3.0, 3.0, 3.0), (3, 3, 3))

@@ -344,7 +344,7 @@ def flying(kind):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["mixed", "damped"])
+@pytest.mark.parametrize("kind", [pytest.param("mixed", marks=pytest.mark.exhaustive), "damped"])
 def test_hub_plate_fold_plate(kind):
     """Energy, momentum and angular momentum are exact for every element and through all junctions."""
     system, state = flying(kind).compile()

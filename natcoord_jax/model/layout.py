@@ -170,9 +170,9 @@ class Layout:
         for name, joint in self.joints.items():
             place = joint_frames(joint, self.poses)
             frames = _frames_at(place, self._rows(joint.parent, joint.child))
-            kinds = [self.bodies.kind_of(handle) for handle in (joint.parent, joint.child)]
-            check_joint(name, joint, kinds, place, frames)
             ready = joint.initialise(*frames)
+            kinds = [self.bodies.kind_of(handle) for handle in (joint.parent, joint.child)]
+            check_joint(name, ready, kinds, place, frames)
             instances.append(
                 Instance(
                     name,

@@ -99,7 +99,7 @@ def test_a_rod_at_rest_or_hardly_moving(elements, end):
     [
         pytest.param(nc.EnergyMomentum(order=4), id="fourth", marks=pytest.mark.exhaustive),
         pytest.param(nc.VariationalMidpoint(), id="variational", marks=pytest.mark.slow),
-        pytest.param(nc.Dissipative(), id="dissipative", marks=pytest.mark.slow),
+        pytest.param(nc.Dissipative(), id="dissipative", marks=pytest.mark.exhaustive),
     ],
 )
 def test_other_schemes_at_rest(scheme):

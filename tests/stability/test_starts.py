@@ -102,7 +102,7 @@ def collapsed(length: float):
 @pytest.mark.parametrize(
     "order, length",
     [
-        pytest.param(2, 0.0, marks=pytest.mark.slow),
+        pytest.param(2, 0.0, marks=pytest.mark.exhaustive),
         pytest.param(2, 0.5, marks=pytest.mark.slow),
         pytest.param(4, 0.0, marks=pytest.mark.exhaustive),
     ],
