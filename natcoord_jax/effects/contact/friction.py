@@ -36,6 +36,8 @@ class Rubbing(Effect):
         regularisation: eps [m/s].
         name: optional name.
         mobility: change of the speed of closing by a unit impulse [1/kg], follows from the masses.
+        free: whether nothing pushes in the step at hand, which ends where the gap closes; of schemes that
+            locate impacts. None: of others.
     """
 
     markers: Any = eqx.field(metadata=is_a(Markers()))
@@ -44,6 +46,7 @@ class Rubbing(Effect):
     regularisation: Any = eqx.field(default=1e-5, kw_only=True, metadata=is_a(Number("positive")))
     name: Any = eqx.field(default=None, kw_only=True, metadata=is_a(NAME))
     mobility: Any = eqx.field(default=None, init=False)
+    free: Any = eqx.field(default=None, init=False)
 
     unilateral: ClassVar[bool] = True
     impulsive: ClassVar[bool] = True

@@ -40,7 +40,8 @@ class GapConstraint(Rubbing):
     contact creeps, more slowly than eps, the regularisation.
 
     For schemes of one stage, `nc.EnergyMomentum()`. Derivatives are those of the program: where an impact
-    falls within a step they are not those of the motion, which `nc.GapPotential` has.
+    falls within a step they are not those of the motion, unless the scheme locates impacts,
+    `nc.EnergyMomentum(max_events=8)`.
 
     Attributes:
         markers: that the gap is of.
@@ -104,7 +105,8 @@ class GapConstraint(Rubbing):
         # An impulse changes the mean speed of a step by half of what it changes the speed by.
         pushed = 0.5 * self.mobility * lam[:, 0]
         ahead = ahead + self.compliance * pushed
-        found = jnp.where(pushed < ahead, pushed, ahead)[:, None]
+        open_ahead = pushed < ahead if self.free is None else (pushed < ahead) | self.free
+        found = jnp.where(open_ahead, pushed, ahead)[:, None]
         if self.friction is not None:
             rubbing, torques, missing = self.rubbing(place, motion, lam)
             forces, found = forces + rubbing, jnp.concatenate([found, missing], axis=1)
