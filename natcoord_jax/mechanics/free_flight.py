@@ -52,9 +52,9 @@ def meeting(system: Model, groups: Sequence[Group], state: State) -> Bool[Array,
     return (gap <= touch(state)) & (rate < 0)
 
 
-def apart(system: Model, state: State, dt: Array) -> Bool[Array, " c"]:
-    """Contacts that are open at the start of a part of a step of length dt, or that open there."""
-    gap, rate = gaps_and_rates(system, bouncing_groups(system), state, state.v)
+def apart(system: Model, groups: Sequence[Group], state: State, dt: Array) -> Bool[Array, " c"]:
+    """Contacts that are open at the start of a (part of a) step of length dt, or that open there."""
+    gap, rate = gaps_and_rates(system, groups, state, state.v)
     return (gap > touch(state)) | (rate * dt > touch(state, SLOW))
 
 

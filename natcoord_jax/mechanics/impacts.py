@@ -21,7 +21,7 @@ from natcoord_jax.maths.collocation import Tableau
 from natcoord_jax.maths.impact_law import collision_impulses, friction_impulses, impact_impulses
 from natcoord_jax.maths.vectors import positive_part
 from natcoord_jax.mechanics.block_tangent_space import tangents_at
-from natcoord_jax.mechanics.free_flight import meeting, touch
+from natcoord_jax.mechanics.free_flight import apart, meeting, touch
 from natcoord_jax.mechanics.response import Evaluation
 from natcoord_jax.mechanics.tangent_space import Velocity
 from natcoord_jax.mechanics.violations import contact_gaps
@@ -165,7 +165,7 @@ def _impacts(
     answers = Answers(space, levers(system, groups, end, "pushes"), end.rates)
     before, pushed = contact_gaps(system, groups, start), jnp.concatenate([x[:, 0] for x in lam])
     on, active = active, active & _bouncing(groups)
-    met = active & (before > touch(start))
+    met = active & (before > touch(start) if hit is None else apart(system, groups, start, h))
     work = jnp.where(met, positive_part(pushed * (before - contact_gaps(system, groups, end)) / h), 0.0)
     restitution = _numbers(groups, "restitution")
     velocity = Velocity(end.v.reshape(-1, 4, 3), end.rates)

@@ -32,7 +32,7 @@ from natcoord_jax.mechanics.violations import contact_gaps
 from natcoord_jax.system import System
 
 FLIGHT, WHOLE = -1, -2
-"""What ends a part of a step instead of a contact: nothing yet, or nothing more, by the law of whole steps."""
+"""What ends a part of a step instead of a contact: nothing yet; nothing more, by the law of whole steps."""
 
 TRIES = 30
 """Attempts at one part of a step; three or four are the rule."""
@@ -114,7 +114,9 @@ class ImpactSearch(eqx.Module):
 
     def system(self, system: System, state: State, dt: Array) -> System:
         """The system whose equations the attempt at hand solves."""
-        return in_free_flight(system, apart(system, state, dt) & (self.event != WHOLE))
+        return in_free_flight(
+            system, apart(system, bouncing_groups(system), state, dt) & (self.event != WHOLE)
+        )
 
     def after(
         self,
@@ -195,7 +197,9 @@ def part_of_step(
     if slot.event is None:
         return system, slot.fraction * dt
     fixed = jax.lax.stop_gradient
-    system = in_free_flight(system, fixed(apart(system, state, dt)) & (slot.event != WHOLE))
+    system = in_free_flight(
+        system, fixed(apart(system, bouncing_groups(system), state, dt)) & (slot.event != WHOLE)
+    )
     rest = dt - state.elapsed
     share = slot.fraction / (1.0 - slot.done)
     length = fixed(slot.fraction * dt) + share * (rest - fixed(rest))

@@ -247,6 +247,9 @@ class SlotSweep(ABC):
             guess = jnp.where(jnp.all(jnp.isfinite(guess)), guess, 0.0)
             following = LinearIteration.first(solution, factors, self._formed_first(fixed, factors))
             aged = factors.aged()
+            if slot.event is not None:
+                # The time of an impact is in its own equations only: elsewhere its factors leave an error.
+                aged = replace_fields(aged, usable=aged.usable & (slot.event < 0))
             done = SweepCarry(c.left - 1, carried, pasts, guess, following, aged, stuck)
             waiting = replace_fields(c, solution=solution, at=at, factors=factors, stuck=stuck)
             return jax.tree.map(partial(jnp.where, stuck), waiting, done), found, matrix
