@@ -96,7 +96,7 @@ def test_comes_to_rest(restitution):
     assert int(found.result) == 0
     assert (
         np.abs(np.asarray(found.v)[-5:]).max() <= 1e-13
-        and np.abs(np.asarray(found.q)[-5:, 0, 2]).max() <= 1e-12
+        and np.abs(np.asarray(found.q)[-5:, 0, 2]).max() <= 1e-11
     )
     balance = nc.balance(system, found)
     assert balance.energy.max() <= tol.ENERGY_OF_A_SMALL_SCENE
@@ -166,7 +166,7 @@ def test_collision_at_the_end_of_a_seesaw():
     top = nc.Point(beam, (0.9, 0, 0.1)), nc.Direction(beam, (0, 0, 1)), nc.Point(ball)
     scene.add(nc.GapConstraint(top, nc.SphereOnPlane(radius=0.0)))
     system, state = scene.compile()
-    found = nc.simulate(system, state, dt=0.1, steps=3, scheme=LOCATED)
+    found = nc.simulate(system, state, dt=0.02, steps=15, scheme=LOCATED)
     spin = np.asarray(system.sense(found, beam).angular_velocity)[-1]
     assert spin[1] > 0.1
     assert nc.balance(system, found).energy.max() <= tol.ENERGY_OF_A_SMALL_SCENE
@@ -212,7 +212,7 @@ def test_derivatives_of_a_drop():
 
 @pytest.mark.slow
 def test_lanes_with_other_impacts():
-    """64 drops from other heights, of none to five bounces: each lane has the derivative of its own motion."""
+    """64 drops from other heights, of none to five bounces: each has the derivative of its own motion."""
     system, state = drop(speed=0.0)
 
     def end(by):
@@ -226,3 +226,106 @@ def test_lanes_with_other_impacts():
     assert len(np.unique(number)) >= 4
     np.testing.assert_allclose(height, exact[0], atol=1e-11)
     np.testing.assert_allclose(slope, np.stack(exact[1:], axis=1), rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.exhaustive
+def test_derivatives_where_surfaces_graze():
+    """A throw at a ceiling: steeper the more slowly it is met, finite at the top, and flagged there."""
+    scene = nc.Scene()
+    scene.add(nc.Gravity())
+    mass = scene.add(nc.PointMass(mass=1.0, position=(0.5, 0, 0), velocity=(0, 0, 0.0), name="mass"))
+    scene.add(nc.Contact(mass, nc.Plane(normal=(0, 0, -1), point=(0, 0, 1.0)), name="ceiling"))
+    system, state = scene.compile()
+
+    def run(v):
+        return nc.simulate(system, begun(state, (0.0, v)), dt=0.02, steps=40, scheme=LOCATED, throw=False)
+
+    slope = jax.jit(jax.jacfwd(lambda v: run(v).q[-1, 0, 2]))
+    top = np.sqrt(2 * G)
+    for faster in (1e-2, 1e-4, 1e-6):
+        v = top * (1 + faster)
+        w = np.sqrt(v**2 - 2 * G)
+        # It falls as if it had been thrown later by twice the time that it would have been beyond.
+        late = 0.8 + 2 * w / G
+        assert float(slope(v)) == pytest.approx(late + (v - G * late) * 2 * v / (w * G), rel=1e-7)
+    for beside in (-1e-6, -1e-15, 0.0, 1e-15, 1e-13):
+        assert np.isfinite(slope(top * (1 + beside)))
+    assert float(slope(top * (1 - 1e-6))) == pytest.approx(0.8, abs=1e-12)
+
+
+@pytest.mark.exhaustive
+def test_throw_that_hits_after_two_bounces():
+    """Spin, friction, two speeds for two coordinates of a target, by Newton's method through both bounces."""
+    scene = nc.Scene()
+    scene.add(nc.Gravity())
+    ball = nc.RigidBody(**BALL, position=(0, 0, 1.0), angular_velocity=(0, 10, 0), name="ball")
+    scene.add(nc.Contact(scene.add(ball), FLOOR, restitution=0.8, friction=0.3, name="floor"))
+    system, state = scene.compile()
+
+    def thrown(speeds):
+        moving = eqx.tree_at(lambda s: s.v, state, state.v.at[0, ::2].add(speeds))
+        return nc.simulate(system, moving, dt=0.02, steps=70, scheme=LOCATED, throw=False)
+
+    def miss(speeds):
+        return thrown(speeds).q[-1, 0, ::2] - jnp.array([3.0, 0.35])
+
+    miss, slope, speeds = jax.jit(miss), jax.jit(jax.jacfwd(miss)), jnp.array([1.5, 1.0])
+    for _ in range(15):
+        change = -jnp.linalg.solve(slope(speeds), miss(speeds))
+        speeds = speeds + change * jnp.minimum(1.0, 0.5 / jnp.max(jnp.abs(change)))
+    assert np.abs(miss(speeds)).max() <= 1e-12
+    report = nc.contacts(system, thrown(speeds))
+    assert report.impacts.sum() == 2 and report.notes == ()
+    along = jnp.array([1.0, 0.5])
+    assert_v_shaped(miss, speeds, along, slope(speeds) @ along)
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("kick", [None, True])
+def test_derivatives_of_a_joint(kick):
+    """A pendulum meets a wall; the gap is no straight function of how long a part of a step is."""
+    scene = nc.Scene()
+    ball = scene.add(nc.RigidBody(**BALL, position=(1.0, 0, 0), name="bob"))
+    hinge = scene.add(nc.Revolute(nc.ground, ball, axis=(0, 0, 1), point=(0, 0, 0)))
+    scene.add(nc.Contact(ball, nc.Plane(normal=(0, -1, 0), point=(0, 0.6, 0)), restitution=0.7))
+    system, state = scene.compile()
+
+    def run(rate):
+        start = system.with_coordinate(state, hinge, 0.0, rate=rate)
+        scheme = nc.EnergyMomentum(kick=kick, max_events=4)
+        return nc.simulate(system, start, dt=0.07, steps=10, scheme=scheme, throw=False)
+
+    found = run(2.0)
+    assert float(system.sense(found, hinge).rates[-1, 0]) == pytest.approx(-1.4, rel=1e-12)
+    assert nc.balance(system, found).energy.max() <= tol.ENERGY_OF_A_SMALL_SCENE
+    angle = jax.jit(lambda rate: run(rate).states.coordinates[-1, 0])
+    slope = jax.jit(jax.grad(angle))
+    assert_v_shaped(angle, 2.0, 1.0, slope(2.0))
+    if kick is None:
+        bend = jax.jit(lambda rate: jax.jvp(slope, (rate,), (1.0,))[1])
+        assert_v_shaped(slope, 2.0, 1.0, bend(2.0))
+
+
+def test_wrong_input():
+    system, state = drop()
+    with pytest.raises(ValueError, match="impacts are located at order 2: leave out"):
+        nc.EnergyMomentum(order=4, max_events=4)
+    with pytest.raises(ValueError, match="rtol and atol make substeps .* leave out one of the two"):
+        nc.simulate(system, state, dt=0.01, steps=2, scheme=LOCATED, rtol=1e-6)
+    scene = nc.Scene()
+    scene.add(nc.PointMass(mass=1.0, name="mass"))
+    with pytest.raises(ValueError, match="max_events .* has no such contact; leave it out"):
+        nc.simulate(*scene.compile(), dt=0.01, steps=2, scheme=LOCATED)
+
+
+def test_states_go_from_scheme_to_scheme():
+    """A run goes on with whole steps, and the other way round; one step at a time is the same."""
+    system, state = drop()
+    found = nc.simulate(system, state, dt=0.05, steps=12, scheme=LOCATED)
+    back = nc.simulate(system, found[-1], dt=0.05, steps=2)
+    again = nc.simulate(system, back[-1], dt=0.05, steps=2, scheme=LOCATED)
+    assert back.states.contacts.shape[-1] == 3 and again.states.contacts.shape[-1] == 4
+    one = state
+    for _ in range(12):
+        one = nc.step(system, one, dt=0.05, scheme=LOCATED)
+    np.testing.assert_allclose(np.asarray(one.q), np.asarray(found.q)[-1], atol=1e-14)

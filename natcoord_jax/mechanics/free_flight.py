@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float
 
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
+from natcoord_jax.effects.contact.friction import FREE, RESTING
 from natcoord_jax.mechanics.violations import contact_gaps
 from natcoord_jax.model.groups import Group
 from natcoord_jax.model.model import Model, SomeModel
@@ -58,14 +59,24 @@ def apart(system: Model, groups: Sequence[Group], state: State, dt: Array) -> Bo
     return (gap > touch(state)) | (rate * dt > touch(state, SLOW))
 
 
-def in_free_flight(system: SomeModel, free: Bool[Array, " c"]) -> SomeModel:
-    """The system with these contacts not pushing in the part of a step at hand."""
-    ends = np.cumsum([group.count for group in bouncing_groups(system)])
-    own = iter(jnp.split(free, ends[:-1]))
+def in_free_flight(system: SomeModel, state: State, dt: Array, free: Bool[Array, ""]) -> SomeModel:
+    """The system with its contacts as they are in a part of a step: those that are apart do not push.
+
+    Args:
+        system: compiled system.
+        state: at the start of the part.
+        dt: step [s].
+        free: whether the part ends where one closes; if not, they may push as in whole steps.
+    """
+    groups = bouncing_groups(system)
+    closed = contact_gaps(system, groups, state) <= touch(state)
+    phase = jnp.where(free & apart(system, groups, state, dt), FREE, jnp.where(closed, RESTING, 0))
+    ends = np.cumsum([group.count for group in groups])
+    own = iter(jnp.split(phase, ends[:-1]))
 
     def told(group: Any) -> Any:
         if not (group.effect.unilateral and group.effect.bounces):
             return group
-        return replace_fields(group, effect=replace_fields(group.effect, free=next(own)))
+        return replace_fields(group, effect=replace_fields(group.effect, phase=next(own)))
 
     return replace_fields(system, effects=tuple(told(group) for group in system.effects))

@@ -17,6 +17,7 @@ from natcoord_jax.core.checks import as_array
 from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
+from natcoord_jax.effects.contact.friction import FREE, RESTING
 from natcoord_jax.maths.collocation import Tableau
 from natcoord_jax.maths.impact_law import collision_impulses, friction_impulses, impact_impulses
 from natcoord_jax.maths.vectors import positive_part
@@ -102,11 +103,15 @@ def after_impacts(
     pushed = jnp.concatenate([x[:, 0] for x in lam])
     # As in the equations: what is left of the impulse of an open contact may be of either sign.
     bouncing = _bouncing(these)
-    reach = jnp.where(bouncing, contact_gaps(system, these, end) / h, 0.0)
+    ahead = contact_gaps(system, these, end)
+    if tableau.max_events:
+        phase = _numbers(these, "phase")
+        ahead = ahead - jnp.where(phase == RESTING, positive_part(contact_gaps(system, these, start)), 0.0)
+    reach = jnp.where(bouncing, ahead / h, 0.0)
     active = 0.5 * _numbers(these, "mobility") * pushed > reach
     hit = None
     if tableau.max_events:
-        free = _numbers(these, "free") > 0
+        free = phase == FREE
         active, hit = active & ~free, free & meeting(system, these, end)
     none = jnp.zeros_like(pushed)
 

@@ -15,12 +15,12 @@ from jaxtyping import Array, Bool, Float, Int
 
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
+from natcoord_jax.effects.contact.friction import FREE
 from natcoord_jax.maths.collocation import Tableau
 from natcoord_jax.mechanics.equations import prepare
 from natcoord_jax.mechanics.free_flight import (
     CLOSED,
     SLOW,
-    apart,
     bouncing_groups,
     gaps_and_rates,
     in_free_flight,
@@ -37,7 +37,7 @@ FLIGHT, WHOLE = -1, -2
 TRIES = 30
 """Attempts at one part of a step; three or four are the rule."""
 
-COMPLETE = 1e-14
+COMPLETE = 1e-12
 """Part of a step that may be missing in the sum of its parts."""
 
 
@@ -66,7 +66,7 @@ class Ahead(eqx.Module):
         after = replace_fields(state, q=state.q + h * rates)
         begun = gaps_and_rates(system, groups, state, state.v)
         ended = gaps_and_rates(system, groups, after, 2.0 * rates - state.v)
-        free = jnp.concatenate([group.effect.free for group in groups])
+        free = jnp.concatenate([group.effect.phase == FREE for group in groups])
         slow = touch(after, SLOW) / dt
         return cls(free, (begun[0], ended[0]), (begun[1], ended[1]), touch(after, CLOSED), slow)
 
@@ -114,9 +114,7 @@ class ImpactSearch(eqx.Module):
 
     def system(self, system: System, state: State, dt: Array) -> System:
         """The system whose equations the attempt at hand solves."""
-        return in_free_flight(
-            system, apart(system, bouncing_groups(system), state, dt) & (self.event != WHOLE)
-        )
+        return in_free_flight(system, state, dt, self.event != WHOLE)
 
     def after(
         self,
@@ -197,9 +195,7 @@ def part_of_step(
     if slot.event is None:
         return system, slot.fraction * dt
     fixed = jax.lax.stop_gradient
-    system = in_free_flight(
-        system, fixed(apart(system, bouncing_groups(system), state, dt)) & (slot.event != WHOLE)
-    )
+    system = in_free_flight(system, state, dt, slot.event != WHOLE)
     rest = dt - state.elapsed
     share = slot.fraction / (1.0 - slot.done)
     length = fixed(slot.fraction * dt) + share * (rest - fixed(rest))
