@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.state import TRAJECTORY, State, Trajectory
 from natcoord_jax.effects.contact.law import ContactLaw
+from natcoord_jax.mechanics.free_flight import gaps_and_rates, lowest
 from natcoord_jax.mechanics.impacts import mobilities
 from natcoord_jax.model.groups import Group
 from natcoord_jax.model.model import SYSTEM, Model
@@ -126,6 +127,12 @@ def _gaps(system: Model, state: State) -> list[Array]:
     return [each(g.effect, group_places(system, g), rows[g.bodies]) for g in touching(system)]
 
 
+@over_states
+def _rates(system: Model, state: State) -> Array:
+    groups = [g for g in system.effects if g.effect.unilateral]
+    return gaps_and_rates(system, groups, state, state.v)[1]
+
+
 @checked(system=SYSTEM, trajectory=TRAJECTORY)
 def contacts(system: System, trajectory: Trajectory) -> Contacts:
     """Gaps, forces and impacts along a trajectory, and the margins within which its derivatives hold.
@@ -158,9 +165,18 @@ def contacts(system: System, trajectory: Trajectory) -> Contacts:
         insides.append(inside)
         start: Any = jax.tree.map(lambda x: x[(0,) * states.t.ndim], states)
         after = np.concatenate([x[..., 1:, :] for x in gaps[: len(impulsive)]], axis=-1)
-        held = 0.5 * np.asarray(mobilities(system, start)) * steps * moving
+        halves = 0.5 * np.asarray(mobilities(system, start))
+        held = halves * steps * moving
         bounces = np.concatenate([np.full(g.count, g.effect.bounces) for g in impulsive])
-        margins.append(np.where(bounces & (steps > 0), held, np.abs(after)))
+        # What comes near within an interval is nearest there, or would be as deep as its impact is fast.
+        before = np.concatenate([x[..., :-1, :] for x in gaps[: len(impulsive)]], axis=-1)
+        rates = _rates(system, trajectory)
+        begun, ended = rates[..., :-1, :], rates[..., 1:, :]
+        least = np.abs(np.asarray(lowest(jnp.asarray(before), begun, ended, jnp.asarray(moving))))
+        change = np.abs(np.asarray(begun)) + np.abs(np.asarray(ended))
+        deep = 0.5 * moving * (halves * struck) ** 2 / np.where(change > 0, change, 1.0)
+        least = np.where(impacts[0] > 0, np.where(change > 0, deep, np.inf), least)
+        margins.append(np.where(bounces & (steps > 0), held, np.minimum(least, np.abs(after))))
     for group, gap in zip(soft, gaps[len(impulsive) :]):
         effect: Any = group.effect
         law = jax.vmap(lambda e, before, after: e.mean_force(before, after))

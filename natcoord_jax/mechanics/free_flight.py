@@ -47,6 +47,19 @@ def gaps_and_rates(
     return jax.jvp(gaps, (state.q,), (v,))
 
 
+def lowest(gap: Array, begun: Array, ended: Array, h: Array) -> Array:
+    """Least gap [m] between two instants, of those that fall at the first and rise at the second; else inf.
+
+    Args:
+        gap: at the first [m].
+        begun: rate there [m/s], which changes evenly.
+        ended: at the second.
+        h: between them [s].
+    """
+    dips = (begun < 0) & (ended > 0)
+    return jnp.where(dips, gap - 0.5 * h * begun**2 / jnp.where(dips, ended - begun, 1.0), jnp.inf)
+
+
 def meeting(system: Model, groups: Sequence[Group], state: State) -> Bool[Array, " c"]:
     """Contacts that touch and close."""
     gap, rate = gaps_and_rates(system, groups, state, state.v)

@@ -177,7 +177,7 @@ def _impacts(
     rates, matrix = answers.rates(velocity), answers.matrix
     impulses = impact_impulses(matrix, rates, work, restitution, active, met)
     if hit is not None:
-        touching = _bouncing(groups) & (contact_gaps(system, groups, end) <= touch(end))
+        touching = jnp.asarray(_bouncing(groups)) & (contact_gaps(system, groups, end) <= touch(end))
         collision = collision_impulses(matrix, rates, restitution, touching)
         impulses, on = jnp.where(jnp.any(hit), collision, impulses), on | hit
     velocity = answers.pushed(velocity, impulses)

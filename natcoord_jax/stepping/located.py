@@ -24,11 +24,13 @@ from natcoord_jax.mechanics.free_flight import (
     bouncing_groups,
     gaps_and_rates,
     in_free_flight,
+    lowest,
     touch,
 )
 from natcoord_jax.mechanics.reduced import NOTHING
 from natcoord_jax.mechanics.response import StageKinematics
 from natcoord_jax.mechanics.violations import contact_gaps
+from natcoord_jax.stepping.error_control import StepDecision
 from natcoord_jax.system import System
 
 FLIGHT, WHOLE = -1, -2
@@ -50,6 +52,7 @@ class Ahead(eqx.Module):
         rate: of the gaps there, before impacts [m/s].
         touching: gap at which contacts have met at its end.
         slow: speed up to which they have met slowly.
+        h: length of the attempt [s].
     """
 
     free: Bool[Array, " c"]
@@ -57,34 +60,51 @@ class Ahead(eqx.Module):
     rate: tuple[Float[Array, " c"], Float[Array, " c"]]
     touching: Float[Array, ""]
     slow: Float[Array, ""]
+    h: Float[Array, ""]
+
+    @property
+    def late(self) -> Bool[Array, " c"]:
+        """Which have closed before its end."""
+        return self.free & ((self.gap[1] < 0) | self.dips)
+
+    @property
+    def dips(self) -> Bool[Array, " c"]:
+        """Which have been closed within it and are open again, by the parabolas through what is known."""
+        return self.free & (lowest(self.gap[0], *self.rate, self.h) < 0)
+
+    @property
+    def hit(self) -> Bool[Array, " c"]:
+        """Which close at its end."""
+        near = (self.gap[1] >= 0) & (self.gap[1] <= self.touching)
+        return self.free & near & (self.rate[1] < 0)
 
     @classmethod
     def of(cls, system: System, state: State, at: StageKinematics, h: Array, dt: Array) -> "Ahead":
         """Of an attempt that is solved."""
-        groups = bouncing_groups(system)
+        groups: Any = bouncing_groups(system)
         rates = at.rates[0, : len(system.structure.bodies)].reshape(state.q.shape)
         after = replace_fields(state, q=state.q + h * rates)
         begun = gaps_and_rates(system, groups, state, state.v)
         ended = gaps_and_rates(system, groups, after, 2.0 * rates - state.v)
         free = jnp.concatenate([group.effect.phase == FREE for group in groups])
         slow = touch(after, SLOW) / dt
-        return cls(free, (begun[0], ended[0]), (begun[1], ended[1]), touch(after, CLOSED), slow)
+        return cls(free, (begun[0], ended[0]), (begun[1], ended[1]), touch(after, CLOSED), slow, h)
 
-    def crossings(self, h: Array) -> Float[Array, " c"]:
-        """When gaps close [s] that are negative after h, by the parabolas through what is known."""
+    def crossings(self) -> Float[Array, " c"]:
+        """When late gaps close [s], by the parabolas through what is known."""
         gap, rate = self.gap[0] - 0.5 * self.touching, self.rate[0]
-        bend = (self.gap[1] - self.gap[0] - rate * h) / h**2
+        bend = (self.gap[1] - self.gap[0] - rate * self.h) / self.h**2
         root = jnp.sqrt(jnp.maximum(rate**2 - 4.0 * bend * gap, 0.0))
         falling = rate < 0
         below = jnp.where(falling, root - rate, 2.0 * bend)
         found = jnp.where(falling, 2.0 * gap, -rate - root) / jnp.where(below != 0, below, 1.0)
         return jnp.where(below != 0, found, jnp.inf)
 
-    def nearer(self, h: Array) -> Float[Array, " c"]:
-        """The same by the speed at which they close at h."""
+    def nearer(self) -> Float[Array, " c"]:
+        """The same by the speed at which they close at its end."""
         closing = self.rate[1] < 0
         more = (0.5 * self.touching - self.gap[1]) / jnp.where(closing, self.rate[1], 1.0)
-        return jnp.where(closing, h + more, jnp.inf)
+        return jnp.where(closing, self.h + more, jnp.inf)
 
 
 class ImpactSearch(eqx.Module):
@@ -117,13 +137,7 @@ class ImpactSearch(eqx.Module):
         return in_free_flight(system, state, dt, self.event != WHOLE)
 
     def after(
-        self,
-        ahead: Ahead,
-        fraction: Array,
-        done: Array,
-        dt: Array,
-        most: int,
-        solved: Bool[Array, ""],
+        self, ahead: Ahead, fraction: Array, done: Array, most: int, solved: Bool[Array, ""]
     ) -> tuple["ImpactSearch", Bool[Array, ""], Float[Array, ""]]:
         """What follows from an attempt: where the search stands, whether it is the part, the next part.
 
@@ -131,48 +145,73 @@ class ImpactSearch(eqx.Module):
             ahead: contacts in the attempt.
             fraction: part of the step that it takes.
             done: part before it.
-            dt: step [s].
             most: impacts that are located in a step.
             solved: whether the equations of the attempt are.
         """
-        h = fraction * dt
-        late = ahead.free & (ahead.gap[1] < 0)
-        hit = ahead.free & ~late & (ahead.gap[1] <= ahead.touching) & (ahead.rate[1] < 0)
-        overshot, met = jnp.any(late), jnp.any(hit)
-        searching = self.event >= 0
-        # Of several that close, the first; of none, that which was sought.
-        sought = jnp.where(overshot, late, jnp.arange(late.shape[0]) == self.event)
-        when = jnp.where(searching, ahead.nearer(h), ahead.crossings(h))
-        when = jnp.where(sought, when, jnp.inf)
-        row = jnp.argmin(when)
-        fast = jnp.any(hit & (ahead.rate[1] < -ahead.slow))
-        some = overshot | met
-        given_up = some & ((self.count >= most) | (self.tries >= TRIES) | (~overshot & ~fast))
-        given_up = (given_up | (searching & (self.tries >= TRIES))) & (self.event != WHOLE)
-        right = ~overshot & (met | ~searching)
-        accepted = solved & (((self.event == WHOLE) | right) & ~given_up)
-        early, shortest = jnp.where(overshot, self.early, fraction), jnp.where(overshot, fraction, self.late)
-        guess = when[row] / dt
-        guess = jnp.where((guess > early) & (guess < shortest), guess, 0.5 * (early + shortest))
-        # What rises and falls within one part has no speed on average that would tell when: up to its top.
-        rising = ~searching & (ahead.rate[0][row] * guess * dt > ahead.gap[0][row])
-        event = jnp.where(given_up, WHOLE, jnp.where(rising, FLIGHT, row))
-        following = jnp.where(given_up, 1.0 - done, jnp.where(rising, 0.5 * guess, guess))
+        searching, whole = self.event >= 0, self.event == WHOLE
+        overshot, met = jnp.any(ahead.late), jnp.any(ahead.hit)
+        slowly = met & ~overshot & ~jnp.any(ahead.hit & (ahead.rate[1] < -ahead.slow))
+        given_up = (overshot | met) & ((self.count >= most) | slowly)
+        given_up = (given_up | (self.tries >= TRIES)) & ~whole
+        accepted = solved & (whole | (~overshot & (met | ~searching) & ~given_up))
+        over = accepted & (1.0 - done - fraction <= COMPLETE)
         anew = accepted | ~solved
-        rest = 1.0 - done - fraction
-        over = accepted & (rest <= COMPLETE)
-        kept = jnp.where((self.event == WHOLE) & ~over, WHOLE, FLIGHT)
-        ended = jnp.where(met, jnp.argmax(hit), jnp.where(searching, FLIGHT, self.event))
+        nearer, following = self._nearer(ahead, fraction)
+        again, kept = anew | given_up, jnp.where(whole & ~over, WHOLE, FLIGHT)
         search = ImpactSearch(
-            jnp.where(anew, kept, event),
-            jnp.where(accepted, ended, FLIGHT),
-            jnp.where(anew | rising | given_up, 0.0, early),
-            jnp.where(anew | rising | given_up, 1.0, shortest),
+            jnp.where(anew, kept, jnp.where(given_up, WHOLE, nearer.event)),
+            jnp.where(met, jnp.argmax(ahead.hit), jnp.where(searching, FLIGHT, self.event)),
+            jnp.where(again, 0.0, nearer.early),
+            jnp.where(again, 1.0, nearer.late),
             jnp.where(over, 0, self.count + (accepted & met)),
             jnp.where(anew, 0, self.tries + 1),
         )
-        following = jnp.where(accepted, jnp.where(over, 1.0, rest), following)
+        following = jnp.where(given_up, 1.0 - done, following)
+        following = jnp.where(accepted, jnp.where(over, 1.0, 1.0 - done - fraction), following)
         return search, accepted, jnp.where(solved, following, 0.5 * fraction)
+
+    def _nearer(self, ahead: Ahead, fraction: Array) -> tuple["ImpactSearch", Float[Array, ""]]:
+        """The search with what an attempt that was too long or too short says, and the next part to try."""
+        searching, overshot = self.event >= 0, jnp.any(ahead.late)
+        # Of several that close, the first; of none, that which was sought.
+        sought = jnp.where(overshot, ahead.late, jnp.arange(ahead.late.shape[0]) == self.event)
+        when = jnp.where(searching & ~ahead.dips, ahead.nearer(), ahead.crossings())
+        when = jnp.where(sought, when, jnp.inf)
+        row = jnp.argmin(when)
+        early, late = jnp.where(overshot, self.early, fraction), jnp.where(overshot, fraction, self.late)
+        guess = fraction * when[row] / ahead.h
+        guess = jnp.where((guess > early) & (guess < late), guess, 0.5 * (early + late))
+        # What rises and falls within one part has no speed on average that would tell when: up to its top.
+        rising = ~searching & (ahead.rate[0][row] * guess * ahead.h > ahead.gap[0][row] * fraction)
+        search = replace_fields(
+            self,
+            event=jnp.where(rising, FLIGHT, row),
+            early=jnp.where(rising, 0.0, early),
+            late=jnp.where(rising, 1.0, late),
+        )
+        return search, jnp.where(rising, 0.5, 1.0) * guess
+
+
+def with_impacts(
+    search: ImpactSearch, ahead: Ahead, found: StepDecision, before: Any, most: int, solved: Any
+) -> tuple[ImpactSearch, StepDecision]:
+    """A decision with the search for impacts: an attempt that goes beyond the next one is made anew.
+
+    Args:
+        search: where it stands.
+        ahead: contacts in the attempt.
+        found: what is decided without.
+        before: where the rollout stands.
+        most: impacts that are located in a step.
+        solved: whether the attempt's equations are.
+    """
+    search, accepted, fraction = search.after(ahead, before.fraction, before.done, most, solved)
+    done = before.done + jnp.where(accepted, before.fraction, 0.0)
+    state = jax.tree.map(lambda x, y: jnp.where(accepted, x, y), found.state, before.state)
+    state = replace_fields(state, elapsed=jnp.where(done > 1.0 - COMPLETE, 0.0, state.elapsed))
+    change = jnp.where(accepted, 1, 0)
+    given = {"state": state, "done": done, "fraction": fraction, "change": change, "accepted": accepted}
+    return search, replace_fields(found, **given)
 
 
 def part_of_step(
@@ -192,7 +231,7 @@ def part_of_step(
         tableau: of the scheme.
         slot: the record.
     """
-    if slot.event is None:
+    if slot.event is None or state.elapsed is None:
         return system, slot.fraction * dt
     fixed = jax.lax.stop_gradient
     system = in_free_flight(system, state, dt, slot.event != WHOLE)

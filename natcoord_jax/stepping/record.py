@@ -85,9 +85,10 @@ class Slot(eqx.Module):
 
     def settled(self, after: State) -> State:
         """The state at its end, where the step at hand may be the next."""
-        if self.event is None:
+        elapsed = after.elapsed
+        if self.event is None or elapsed is None:
             return after
-        return replace_fields(after, elapsed=jnp.where(self.completes, 0.0, after.elapsed))
+        return replace_fields(after, elapsed=jnp.where(self.completes, 0.0, elapsed))
 
     def inputs(self, plan: Plan, system: System, parameters: Any, state: State) -> Float[Array, " inputs"]:
         """Its inputs, those that a control decides at a state."""

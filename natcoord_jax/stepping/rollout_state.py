@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.results import Result
 from natcoord_jax.core.state import State
 from natcoord_jax.mechanics.equations import prepare
@@ -18,7 +17,7 @@ from natcoord_jax.mechanics.tangent_space import Velocity
 from natcoord_jax.stepping.checked import check_contacts
 from natcoord_jax.stepping.error_control import StepDecision, Tolerance, Trial, follow
 from natcoord_jax.stepping.factors import Factors, no_factors
-from natcoord_jax.stepping.located import COMPLETE, Ahead, ImpactSearch
+from natcoord_jax.stepping.located import COMPLETE, Ahead, ImpactSearch, with_impacts
 from natcoord_jax.stepping.newton import Iterate, any_lane, begin
 from natcoord_jax.stepping.plan import Plan
 from natcoord_jax.stepping.predictor import Predictor
@@ -198,28 +197,6 @@ def _halve(course: RolloutState, after: State, solved: Array, over: Array) -> St
     )
 
 
-def _located(
-    setting: RolloutProblem, course: RolloutState, found: StepDecision, ahead: Ahead, solved: Array
-) -> tuple[ImpactSearch, StepDecision]:
-    """The same with the search for impacts: an attempt that goes beyond the next one is made anew."""
-    assert course.search is not None
-    given = course.fraction, course.done, setting.dt, setting.plan.tableau.max_events, solved
-    search, accepted, fraction = course.search.after(ahead, *given)
-    over = setting.over(course)
-    state = jax.tree.map(lambda x, y: jnp.where(accepted, x, y), found.state, course.state)
-    done = course.done + jnp.where(accepted, course.fraction, 0.0)
-    elapsed = jnp.where(done > 1.0 - COMPLETE, 0.0, state.elapsed)
-    decided = replace_fields(
-        found,
-        state=replace_fields(state, elapsed=elapsed),
-        done=done,
-        fraction=jnp.where(over, course.fraction, fraction),
-        change=jnp.where(accepted, 1, 0),
-        accepted=accepted,
-    )
-    return search, decided
-
-
 def after_attempt(
     setting: RolloutProblem,
     course: RolloutState,
@@ -259,7 +236,8 @@ def after_attempt(
         code = jnp.where(solved, int(Result.TOLERANCE_NOT_MET), code)
     search, nearly = course.search, 1e-9
     if search is not None and ahead is not None:
-        search, verdict = _located(setting, course, verdict, ahead, solved & ~over)
+        most = plan.tableau.max_events
+        search, verdict = with_impacts(search, ahead, verdict, course, most, solved & ~over)
         nearly = COMPLETE
     complete = verdict.accepted & (verdict.done > 1.0 - nearly)
     stopped = course.stopped | verdict.hopeless
