@@ -228,7 +228,7 @@ def test_lanes_with_other_impacts():
     np.testing.assert_allclose(slope, np.stack(exact[1:], axis=1), rtol=1e-10, atol=1e-10)
 
 
-@pytest.mark.exhaustive
+@pytest.mark.slow
 def test_derivatives_where_surfaces_graze():
     """A throw at a ceiling: steeper the more slowly it is met, finite at the top, and flagged there."""
     scene = nc.Scene()

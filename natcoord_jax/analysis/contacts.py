@@ -41,7 +41,8 @@ class Contacts(eqx.Module):
         active: whether they have pushed in an interval.
         impacts: how many impacts an interval has; of contacts without a stiffness.
         inside: how many of these are inside a step, not located where they happen.
-        margin: by how much gaps would have to change for contacts to open that are active, or to close [m].
+        margin: by how much gaps would have to change for contacts to open that are active, or to close, also
+            within an interval [m].
         size: of all places, which margins are compared with [m].
         hard: which contacts have no stiffness.
 
