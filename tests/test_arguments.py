@@ -357,7 +357,7 @@ CALLS = {
     "assemble": RUN,
     "transfer": lambda w: {**RUN(w), "into": [w.system], "onto": [w.state]},
     "random_state": lambda w: {**RUN(w), "key": [jax.random.key(0)], "coordinates": NUMBER, "rates": NUMBER},
-    "EnergyMomentum": lambda w: {"order": [2], "kick": FLAG},
+    "EnergyMomentum": lambda w: {"order": [2], "kick": FLAG, "max_events": WHOLE},
     "Dissipative": lambda w: {"spectral_radius": NUMBER},
     "VariationalMidpoint": lambda w: {},
     "Phases": lambda w: {"systems": [(w.system,)], "trajectories": [(w.trajectory,)]},

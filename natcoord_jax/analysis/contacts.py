@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.state import TRAJECTORY, State, Trajectory
 from natcoord_jax.effects.contact.law import ContactLaw
+from natcoord_jax.mechanics.free_flight import gaps_and_rates, lowest
 from natcoord_jax.mechanics.impacts import mobilities
 from natcoord_jax.model.groups import Group
 from natcoord_jax.model.model import SYSTEM, Model
@@ -39,7 +40,9 @@ class Contacts(eqx.Module):
             their impacts, of others what the energy of the gap gives.
         active: whether they have pushed in an interval.
         impacts: how many impacts an interval has; of contacts without a stiffness.
-        margin: by how much gaps would have to change for contacts to open that are active, or to close [m].
+        inside: how many of these are inside a step, not located where they happen.
+        margin: by how much gaps would have to change for contacts to open that are active, or to close, also
+            within an interval [m].
         size: of all places, which margins are compared with [m].
         hard: which contacts have no stiffness.
 
@@ -64,6 +67,7 @@ class Contacts(eqx.Module):
     force: Float[np.ndarray, "*lanes intervals c"]
     active: Bool[np.ndarray, "*lanes intervals c"]
     impacts: Float[np.ndarray, "*lanes intervals c"]
+    inside: Float[np.ndarray, "*lanes intervals c"]
     margin: Float[np.ndarray, "*lanes intervals c"]
     size: float
     hard: Bool[np.ndarray, " c"]
@@ -94,7 +98,7 @@ class Contacts(eqx.Module):
         """Where derivatives are those of the program but may not be those of the motion; empty if nowhere."""
         lanes = tuple(range(self.active.ndim - 1))
         grazing = (self.margin < GRAZING * self.size).any(axis=lanes)
-        inside = (self.impacts > 0).any(axis=lanes)
+        inside = (self.inside > 0).any(axis=lanes)
         short = ~self.hard & (self.steps_in_contact < RESOLVED)
         said = (
             ("impact inside a step", inside, "derivatives are those of the program"),
@@ -124,6 +128,12 @@ def _gaps(system: Model, state: State) -> list[Array]:
     return [each(g.effect, group_places(system, g), rows[g.bodies]) for g in touching(system)]
 
 
+@over_states
+def _rates(system: Model, state: State) -> Array:
+    groups = [g for g in system.effects if g.effect.unilateral]
+    return gaps_and_rates(system, groups, state, state.v)[1]
+
+
 @checked(system=SYSTEM, trajectory=TRAJECTORY)
 def contacts(system: System, trajectory: Trajectory) -> Contacts:
     """Gaps, forces and impacts along a trajectory, and the margins within which its derivatives hold.
@@ -141,7 +151,7 @@ def contacts(system: System, trajectory: Trajectory) -> Contacts:
     states, gaps = trajectory.states, [np.asarray(x) for x in _gaps(system, trajectory)]
     span = np.diff(np.asarray(states.t), axis=-1)[..., None]
     moving = np.where(span > 0, span, 1.0)
-    names, forces, impacts, margins = [], [], [], []
+    names, forces, impacts, insides, margins = [], [], [], [], []
     soft = [g for g in groups if not g.effect.unilateral]  # whose impulses states do not know
     impulsive = groups[: len(groups) - len(soft)]
     for group in groups:
@@ -150,14 +160,24 @@ def contacts(system: System, trajectory: Trajectory) -> Contacts:
     if impulsive:
         if states.contacts is None:
             raise ValueError("states of this trajectory have no impulses of contacts; simulate it again")
-        steps, struck, count = np.moveaxis(np.diff(np.asarray(states.contacts), axis=-3), -1, 0)
+        steps, struck, inside, *located = np.moveaxis(np.diff(np.asarray(states.contacts), axis=-3), -1, 0)
         forces.append((steps + struck) / moving)
-        impacts.append(count)
+        impacts.append(sum(located, inside))
+        insides.append(inside)
         start: Any = jax.tree.map(lambda x: x[(0,) * states.t.ndim], states)
         after = np.concatenate([x[..., 1:, :] for x in gaps[: len(impulsive)]], axis=-1)
-        held = 0.5 * np.asarray(mobilities(system, start)) * steps * moving
+        halves = 0.5 * np.asarray(mobilities(system, start))
+        held = halves * steps * moving
         bounces = np.concatenate([np.full(g.count, g.effect.bounces) for g in impulsive])
-        margins.append(np.where(bounces & (steps > 0), held, np.abs(after)))
+        # What comes near within an interval is nearest there, or would be as deep as its impact is fast.
+        before = np.concatenate([x[..., :-1, :] for x in gaps[: len(impulsive)]], axis=-1)
+        rates = _rates(system, trajectory)
+        begun, ended = rates[..., :-1, :], rates[..., 1:, :]
+        least = np.abs(np.asarray(lowest(jnp.asarray(before), begun, ended, jnp.asarray(moving))))
+        change = np.abs(np.asarray(begun)) + np.abs(np.asarray(ended))
+        deep = 0.5 * moving * (halves * struck) ** 2 / np.where(change > 0, change, 1.0)
+        least = np.where(impacts[0] > 0, np.where(change > 0, deep, np.inf), least)
+        margins.append(np.where(bounces & (steps > 0), held, np.minimum(least, np.abs(after))))
     for group, gap in zip(soft, gaps[len(impulsive) :]):
         effect: Any = group.effect
         law = jax.vmap(lambda e, before, after: e.mean_force(before, after))
@@ -166,9 +186,12 @@ def contacts(system: System, trajectory: Trajectory) -> Contacts:
         found = jax.vmap(law, in_axes=(None, 1, 1), out_axes=1)(effect, *flat)
         forces.append(np.moveaxis(np.asarray(found).reshape(before.shape), 0, -1))
         impacts.append(np.zeros_like(forces[-1]))
+        insides.append(impacts[-1])
         margins.append(np.abs(gap[..., 1:, :]))
     size = 1.0 + float(np.max(np.abs(np.asarray(states.q))))
-    force, happened, margin = (np.concatenate(x, axis=-1) for x in (forces, impacts, margins))
+    measured = forces, impacts, insides, margins
+    force, happened, inside, margin = (np.concatenate(x, axis=-1) for x in measured)
     hard = np.concatenate([np.full(g.count, g.effect.bounces) for g in groups])
     every = np.concatenate(gaps, axis=-1)
-    return Contacts(tuple(names), np.asarray(states.t), every, force, force > 0, happened, margin, size, hard)
+    t, active = np.asarray(states.t), force > 0
+    return Contacts(tuple(names), t, every, force, active, happened, inside, margin, size, hard)

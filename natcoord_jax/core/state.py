@@ -32,7 +32,9 @@ class State(eqx.Module):
             tree without drives and couplings never has any.
         contacts: of each contact without a stiffness, or with friction, the impulses so far of steps and of
             impacts at their ends [N s], and the number of impacts, as `nc.contacts` reads them; None: there
-            are no such contacts.
+            are no such contacts. Of a scheme that locates impacts also how many of them it has located.
+        elapsed: time since the start of the step at hand, of a scheme that locates impacts [s]; zero in what
+            is saved. None: of others.
     """
 
     t: Float[Array, "*batch"]
@@ -43,7 +45,8 @@ class State(eqx.Module):
     work: Float[Array, "*batch works"]
     dissipated: Float[Array, "*batch"] | None = None
     held: Float[Array, "*batch 2 coordinates"] | None = None
-    contacts: Float[Array, "*batch contacts 3"] | None = None
+    contacts: Float[Array, "*batch contacts counts"] | None = None
+    elapsed: Float[Array, "*batch"] | None = None
 
     def at_time(self, t: Any) -> "State":
         """The same positions and velocities at another time, from which a simulation then starts.

@@ -36,6 +36,8 @@ class Tableau:
     """Whether forces take hold at both ends of the step instead of at its mid-point."""
     spectral_radius: float = 1.0
     """What is left of an infinitely fast oscillation after a step; below 1, fast oscillations are damped."""
+    max_events: int = 0
+    """Impacts that a step is split at, at most."""
 
     @property
     def tangent(self) -> bool:
@@ -44,8 +46,11 @@ class Tableau:
 
     @property
     def separable(self) -> bool:
-        """Whether the equations of a step couple a body with its neighbours only."""
-        return not self.variational and not self.dissipative
+        """Whether the equations of a step couple a body with its neighbours only.
+
+        The time of an impact, which ends a part of a step, is that of all of them.
+        """
+        return not self.variational and not self.dissipative and not self.max_events
 
     @property
     def dissipative(self) -> bool:

@@ -26,6 +26,9 @@ REFINEMENTS = 3
 MOST = 60
 """Iterations of Newton's method for elastic impulses; ten are the most seen."""
 
+NEGLIGIBLE = 1e-12
+"""Rate of closing in terms of the largest that asks for no impulse."""
+
 PROJECTIONS = 10
 """Of impulses of friction; one is enough for a single contact."""
 
@@ -137,6 +140,58 @@ def impact_impulses(
     excess = needed > room
     part = jnp.where(excess, safe_sqrt(room / jnp.where(excess, needed, 1.0)), 1.0)
     return jnp.where(active, plastic + part * change, 0.0)
+
+
+def pressing_impulses(
+    matrix: Float[Array, "c c"], rates: Float[Array, " c"], on: Bool[Array, " c"]
+) -> Float[Array, " c"]:
+    """Impulses that end the closing of contacts and pull at none: L >= 0, gamma + W L >= 0, one of them 0.
+
+    Which contacts push is found by changing all at once that are on the wrong side; derivatives hold it.
+
+    Args:
+        matrix: W [1/kg].
+        rates: gamma [m/s].
+        on: contacts that may push.
+    """
+    own = jnp.where(on, jnp.diagonal(matrix), 1.0)
+    fixed, given = jax.lax.stop_gradient((_taken(matrix, on), jnp.where(on, rates, 0.0)))
+
+    def trip(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        pushing, count, _ = carry
+        found = semidefinite_solution(_taken(fixed, pushing), jnp.where(pushing, -given, 0.0))
+        left = (given + fixed @ found) / own
+        after = on & jnp.where(pushing, found > 0, left < -NEGLIGIBLE * jnp.max(jnp.abs(given / own)))
+        return after, count + 1, jnp.any(after != pushing)
+
+    start = on & (rates < 0), jnp.array(0), jnp.array(True)
+    pushing = jax.lax.while_loop(lambda c: c[2] & (c[1] < MOST), trip, start)[0]
+    return semidefinite_solution(_taken(matrix, pushing), jnp.where(pushing, -rates, 0.0))
+
+
+def collision_impulses(
+    matrix: Float[Array, "c c"],
+    rates: Float[Array, " c"],
+    restitution: Float[Array, " c"],
+    on: Bool[Array, " c"],
+) -> Float[Array, " c"]:
+    """Impulses of contacts that touch, at the instant at which some of them meet [N s].
+
+    With no work taken before, L_E = 2 L_P: every contact that pushes separates at the part e of the speed at
+    which it has closed, and (1 - e^2) of the energy of a plastic impact is lost.
+
+    Args:
+        matrix: W [1/kg].
+        rates: gamma [m/s].
+        restitution: e [-] of each.
+        on: contacts that touch.
+    """
+    plastic = pressing_impulses(matrix, rates, on)
+    change = restitution * plastic
+    room, needed = plastic @ (matrix @ plastic), change @ (matrix @ change)
+    excess = needed > room
+    part = jnp.where(excess, safe_sqrt(room / jnp.where(excess, needed, 1.0)), 1.0)
+    return plastic + part * change
 
 
 def friction_impulses(

@@ -11,25 +11,24 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from natcoord_jax.core.checks import as_array
 from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
-from natcoord_jax.maths.impact_law import friction_impulses, impact_impulses
+from natcoord_jax.effects.contact.friction import FREE, RESTING
+from natcoord_jax.maths.collocation import Tableau
+from natcoord_jax.maths.impact_law import collision_impulses, friction_impulses, impact_impulses
 from natcoord_jax.maths.vectors import positive_part
 from natcoord_jax.mechanics.block_tangent_space import tangents_at
+from natcoord_jax.mechanics.free_flight import apart, meeting, touch
 from natcoord_jax.mechanics.response import Evaluation
 from natcoord_jax.mechanics.tangent_space import Velocity
 from natcoord_jax.mechanics.violations import contact_gaps
 from natcoord_jax.model.groups import Group
 from natcoord_jax.model.model import Model, SomeModel
 from natcoord_jax.model.rows import group_places, rows_with_ground
-
-TOUCHING = 1e-12
-"""Gap at the start of a step, per unit of size of the places, up to which surfaces have met before: what the
-last step has left of a gap that it closed."""
 
 
 def levers(system: Model, groups: Sequence[Group], state: State, name: str) -> Float[Array, "c bodies 4 3"]:
@@ -79,7 +78,13 @@ class Answers:
 
 
 def after_impacts(
-    system: Model, start: State, end: State, h: Array, groups: Sequence[Group], found: Evaluation
+    system: Model,
+    start: State,
+    end: State,
+    h: Array,
+    groups: Sequence[Group],
+    found: Evaluation,
+    tableau: Tableau,
 ) -> tuple[State, dict[int, Array]]:
     """The state after the impacts at the end of a step of one stage, and their work [J] by number of group.
 
@@ -90,6 +95,7 @@ def after_impacts(
         h: step [s].
         groups: that act.
         found: solved equations of the step.
+        tableau: of the scheme.
     """
     numbers = [k for k, group in enumerate(groups) if group.effect.unilateral]
     these, lam = [groups[k] for k in numbers], [found.given[k][:, 0] for k in numbers]
@@ -97,20 +103,32 @@ def after_impacts(
     pushed = jnp.concatenate([x[:, 0] for x in lam])
     # As in the equations: what is left of the impulse of an open contact may be of either sign.
     bouncing = _bouncing(these)
-    reach = jnp.where(bouncing, contact_gaps(system, these, end) / h, 0.0)
+    ahead = contact_gaps(system, these, end)
+    if tableau.max_events:
+        phase = _numbers(these, "phase")
+        ahead = ahead - jnp.where(phase == RESTING, positive_part(contact_gaps(system, these, start)), 0.0)
+    reach = jnp.where(bouncing, ahead / h, 0.0)
     active = 0.5 * _numbers(these, "mobility") * pushed > reach
+    hit = None
+    if tableau.max_events:
+        free = phase == FREE
+        active, hit = active & ~free, free & meeting(system, these, end)
     none = jnp.zeros_like(pushed)
 
     def impacts() -> tuple[Array, Array, Array, Array, Array]:
-        return _impacts(system, start, end, h, these, active, lam)
+        return _impacts(system, start, end, h, these, active, hit, lam)
 
     def nothing() -> tuple[Array, Array, Array, Array, Array]:
         return end.v, end.rates, none, none, none
 
-    v, rotors, done, struck, met = jax.lax.cond(jnp.any(active), impacts, nothing)
+    some = active if hit is None else active | hit
+    v, rotors, done, struck, met = jax.lax.cond(jnp.any(some), impacts, nothing)
     after = replace_fields(end, v=v, rates=rotors)
     if start.contacts is not None:
-        happened = jnp.stack([jnp.where(active, positive_part(pushed), 0.0), struck, met], axis=1)
+        happened = [jnp.where(active, positive_part(pushed), 0.0), struck, met]
+        if hit is not None:
+            happened.append(hit.astype(met.dtype))
+        happened = jnp.stack(happened, axis=1)
         after = replace_fields(after, contacts=start.contacts + happened)
     return after, dict(zip(numbers, _by_group(these, done)))
 
@@ -127,7 +145,7 @@ def _by_group(groups: Sequence[Group], every: Array) -> list[Array]:
 
 
 def _numbers(groups: Sequence[Group], name: str) -> Float[Array, " c"]:
-    """A number of all contacts; zero where there is none."""
+    """A number, or a truth, of all contacts; zero where there is none."""
     each = ((group.count, getattr(group.effect, name)) for group in groups)
     return jnp.concatenate([jnp.zeros(count) if value is None else value for count, value in each])
 
@@ -143,7 +161,8 @@ def _impacts(
     end: State,
     h: Array,
     groups: Sequence[Group],
-    active: Float[Array, " c"],
+    active: Bool[Array, " c"],
+    hit: Bool[Array, " c"] | None,
     lam: Sequence[Float[Array, "n m"]],
 ) -> tuple[Array, Array, Array, Array, Array]:
     """After impacts of active contacts: velocities, rates of rotors, work, impulses, and which have met."""
@@ -151,12 +170,16 @@ def _impacts(
     answers = Answers(space, levers(system, groups, end, "pushes"), end.rates)
     before, pushed = contact_gaps(system, groups, start), jnp.concatenate([x[:, 0] for x in lam])
     on, active = active, active & _bouncing(groups)
-    met = active & (before > TOUCHING * (1.0 + jnp.max(jnp.abs(start.q))))
+    met = active & (before > touch(start) if hit is None else apart(system, groups, start, h))
     work = jnp.where(met, positive_part(pushed * (before - contact_gaps(system, groups, end)) / h), 0.0)
     restitution = _numbers(groups, "restitution")
     velocity = Velocity(end.v.reshape(-1, 4, 3), end.rates)
     rates, matrix = answers.rates(velocity), answers.matrix
     impulses = impact_impulses(matrix, rates, work, restitution, active, met)
+    if hit is not None:
+        touching = jnp.asarray(_bouncing(groups)) & (contact_gaps(system, groups, end) <= touch(end))
+        collision = collision_impulses(matrix, rates, restitution, touching)
+        impulses, on = jnp.where(jnp.any(hit), collision, impulses), on | hit
     velocity = answers.pushed(velocity, impulses)
     done = impulses * (rates + 0.5 * matrix @ impulses)
     parts = zip(groups, lam, *(_by_group(groups, x) for x in (on, impulses, done)))

@@ -23,6 +23,7 @@ from natcoord_jax.stepping.difference_jacobian import DifferenceJacobian
 from natcoord_jax.stepping.differences import evaluated, told
 from natcoord_jax.stepping.energy_check import sound
 from natcoord_jax.stepping.factors import Factors, factors_of
+from natcoord_jax.stepping.located import Ahead
 from natcoord_jax.stepping.newton import Iterate, any_lane, judge, refreshed
 from natcoord_jax.stepping.remainder import remainder, with_remainder
 from natcoord_jax.stepping.rollout_state import RolloutProblem, RolloutState, after_attempt
@@ -110,7 +111,10 @@ def attempt(
     """
     course = with_state(carried.course, unpack(carried.state))
     u, h, index = setting.situation(course)
-    equations = prepare(setting.system, course.state, u, h, setting.plan.tableau, carried.start_cache)
+    system = setting.system
+    if course.search is not None:
+        system = course.search.system(system, course.state, setting.dt)
+    equations = prepare(system, course.state, u, h, setting.plan.tableau, carried.start_cache)
     start = _unsolved(equations, carried)
     evaluate = partial(_evaluation, setting, course, equations, apart)
     solving = jax.lax.while_loop(lambda s: ~(s.ending | s.wanting), evaluate, start)
@@ -120,17 +124,22 @@ def attempt(
     def ended(carry: tuple) -> tuple:
         _, before, x, _, record, factors = carry
         before = with_state(before, unpack(x))
-        ends = end_of_step(setting.system, before.state, h, equations.groups, found, setting.plan.tableau)
+        ends = end_of_step(system, before.state, h, equations.groups, found, setting.plan.tableau)
         kick = None if before.lagging is None else found.kick.exact
         missed = solving.residual, found.size, before.it.correction
         given = ends[0], setting.plan.tolerance, factors.grain
         steady = sound(equations, before.it.y, *missed, *given)
         before = eqx.tree_at(lambda c: c.it.converged, before, before.it.converged & steady)
         left = remainder(equations, solving.residual, factors.inertias)
-        after = after_attempt(setting, before, factors.inertias, ends, left, kick)
+        ahead = None
+        if before.search is not None:
+            ahead = Ahead.of(system, before.state, found.at, h, setting.dt)
+        after = after_attempt(setting, before, factors.inertias, ends, left, kick, ahead)
         accepted = after.taken > before.taken
         x = ravel_pytree(after.state)[0]
         slot = x, before.it.y, index, before.fraction, before.done, accepted, after.step
+        if after.search is not None:
+            slot = *slot, after.search.ended
         if after.trial is not None:
             record = _taken_back(record, carried.count - 1 - carried.first, after.trial.undone, x)
         record = tuple(with_row(b, carried.count - carried.first, r) for b, r in zip(record, slot))
@@ -152,7 +161,12 @@ def attempt(
     asked = None
     if apart:
         asked = RefactorRequest(solving.wanting, solving.residual, found.size, found.loads, solving.here)
-    count = carried.count + solving.ending
+    ending = solving.ending
+    if after.search is not None:
+        # Attempts that look for an impact leave no record.
+        before = carried.course
+        ending = ending & any_lane((after.taken > before.taken) | (after.rejected > before.rejected))
+    count = carried.count + ending
     return LoopCarry(count, after, x, start_cache, factors, solving.probe, record, carried.first, asked)
 
 

@@ -87,11 +87,16 @@ def check_state(system: System, state: State) -> None:
 
 
 def check_contacts(system: System, tableau: Tableau) -> None:
-    """Refuse schemes for which impacts are not defined.
+    """Refuse schemes for which impacts are not defined, and to locate some where there are none.
 
     Raises:
         ValueError: with a contact, and what to do.
     """
+    if tableau.max_events and not any(group.effect.bounces for group in contacts(system)):
+        raise ValueError(
+            "max_events of the scheme locates impacts, which contacts without a stiffness have; this system "
+            "has no such contact; leave it out, or leave out the stiffness of a contact"
+        )
     if tableau.stages == 1 and not tableau.variational and not tableau.dissipative:
         return
     for group in contacts(system):

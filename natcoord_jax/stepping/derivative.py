@@ -27,6 +27,7 @@ from natcoord_jax.stepping.backward import Backward
 from natcoord_jax.stepping.error_control import Tolerance
 from natcoord_jax.stepping.forward import Forward
 from natcoord_jax.stepping.linear_iteration import STALL_ROUND_OFF, sizes_by_mass
+from natcoord_jax.stepping.located import part_of_step
 from natcoord_jax.stepping.plan import Plan, Slots
 from natcoord_jax.stepping.record import (
     Parameters,
@@ -107,7 +108,9 @@ class Rule(linear_pair.LinearWithTranspose):
         """Residual of the slot's equations and the state at its end."""
         system, parameters, dt = numbers.whole(varied)
         u = slot.inputs(self.plan, system, parameters, state) if u is None else u
-        return advance(system, state, u, slot.fraction * dt, y, self.tableau)[:2]
+        system, h = part_of_step(system, state, u, dt, y, self.tableau, slot)
+        residual, after, _ = advance(system, state, u, h, y, self.tableau)
+        return residual, slot.settled(after)
 
     def prepared(self, numbers: Parameters, varied_dot: list[Array], slot: Slot, u_dot: Any) -> tuple:
         """Linear maps of one slot: from (state, unknowns), of everything else's change, and the solver."""
@@ -291,7 +294,7 @@ def _run_slots_jvp(plan: Plan, primals: tuple, tangents: tuple):
     sound = jnp.where(slots.accepted[:, None], slots.y, 0.0)
     record = Record(
         numbers,
-        Slot(before, sound, u, slots.step, slots.fraction, slots.done, slots.accepted),
+        Slot(before, sound, u, slots.step, slots.fraction, slots.done, slots.accepted, slots.event),
         ending.factors,
     )
     changes, outputs = ParameterTangents(varied_dot, u_dot, state_dot), (slots.states, slots.y)

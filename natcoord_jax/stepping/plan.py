@@ -115,6 +115,8 @@ class Slots(eqx.Module):
         done: the part of the step before it.
         accepted: whether the attempt succeeded.
         finished: steps completed after the slot.
+        event: number of the contact that closes at the end of the slot, see `located`; None: of schemes that
+            do not look for it.
     """
 
     states: State
@@ -124,6 +126,7 @@ class Slots(eqx.Module):
     done: Float[Array, "*slots"]
     accepted: Bool[Array, "*slots"]
     finished: Int[Array, "*slots"]
+    event: Int[Array, "*slots"] | None = None
 
     def accepted_first(self, most: int) -> tuple["Slots", Int[Array, ""]]:
         """The accepted slots only, filled up to `most`, and how many they are."""

@@ -8,8 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
 from natcoord_jax.stepping.factors import Factors
+from natcoord_jax.stepping.located import COMPLETE
 from natcoord_jax.stepping.plan import Plan
 from natcoord_jax.system import System
 
@@ -74,6 +76,19 @@ class Slot(eqx.Module):
     fraction: Float[Array, "*slots"]
     done: Float[Array, "*slots"]
     accepted: Bool[Array, "*slots"]
+    event: Int[Array, "*slots"] | None = None
+
+    @property
+    def completes(self) -> Bool[Array, "*slots"]:
+        """Whether it is the last part of its step, where impacts are located."""
+        return self.done + self.fraction > 1.0 - COMPLETE
+
+    def settled(self, after: State) -> State:
+        """The state at its end, where the step at hand may be the next."""
+        elapsed = after.elapsed
+        if self.event is None or elapsed is None:
+            return after
+        return replace_fields(after, elapsed=jnp.where(self.completes, 0.0, elapsed))
 
     def inputs(self, plan: Plan, system: System, parameters: Any, state: State) -> Float[Array, " inputs"]:
         """Its inputs, those that a control decides at a state."""

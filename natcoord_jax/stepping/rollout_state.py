@@ -17,6 +17,7 @@ from natcoord_jax.mechanics.tangent_space import Velocity
 from natcoord_jax.stepping.checked import check_contacts
 from natcoord_jax.stepping.error_control import StepDecision, Tolerance, Trial, follow
 from natcoord_jax.stepping.factors import Factors, no_factors
+from natcoord_jax.stepping.located import COMPLETE, Ahead, ImpactSearch, with_impacts
 from natcoord_jax.stepping.newton import Iterate, any_lane, begin
 from natcoord_jax.stepping.plan import Plan
 from natcoord_jax.stepping.predictor import Predictor
@@ -52,6 +53,7 @@ class RolloutState(eqx.Module):
         trial: where a substep with error control stands.
         lagging: what is known of the kick; None for schemes without.
         left: impulse that the last (sub)step left to the next, see `remainder`.
+        search: where the search for impacts stands; None for schemes that do not locate them.
     """
 
     state: State
@@ -71,6 +73,7 @@ class RolloutState(eqx.Module):
     trial: Trial | None
     lagging: Lagging | None
     left: Float[Array, " rates"]
+    search: ImpactSearch | None = None
 
 
 class RolloutProblem(eqx.Module):
@@ -171,6 +174,7 @@ def start_of(setting: RolloutProblem, state: State) -> tuple[RolloutState, Facto
         trial=None if setting.tolerance is None else Trial.first(state, left),
         lagging=lagging,
         left=left,
+        search=ImpactSearch.first() if plan.tableau.max_events else None,
     )
     return course, factors, equations.start_cache
 
@@ -200,6 +204,7 @@ def after_attempt(
     found: tuple[State, Array],
     left: Float[Array, " rates"],
     kick: Velocity | None = None,
+    ahead: Ahead | None = None,
 ) -> RolloutState:
     """The end of an attempt: what is attempted next, and from where.
 
@@ -210,6 +215,7 @@ def after_attempt(
         found: state at the end of the attempt, and its largest half turn.
         left: impulse that it leaves to the next.
         kick: of the attempt.
+        ahead: contacts in it, where impacts are located.
     """
     plan, it, over = setting.plan, course.it, setting.over(course)
     new, half_turn = found
@@ -228,7 +234,12 @@ def after_attempt(
         origin = course.trial.origin
         verdict = follow(setting.tolerance, course.trial, course.state, new, solved, over, plan.tableau)
         code = jnp.where(solved, int(Result.TOLERANCE_NOT_MET), code)
-    complete = verdict.accepted & (verdict.done > 1.0 - 1e-9)
+    search, nearly = course.search, 1e-9
+    if search is not None and ahead is not None:
+        most = plan.tableau.max_events
+        search, verdict = with_impacts(search, ahead, verdict, course, most, solved & ~over)
+        nearly = COMPLETE
+    complete = verdict.accepted & (verdict.done > 1.0 - nearly)
     stopped = course.stopped | verdict.hopeless
     result = jnp.where(verdict.hopeless, code, course.code)
     if plan.event is not None:
@@ -283,4 +294,5 @@ def after_attempt(
         trial=trial,
         lagging=lagging,
         left=left,
+        search=search,
     )

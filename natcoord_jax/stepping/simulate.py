@@ -123,7 +123,8 @@ def simulate(
             the floor of round-off; larger values are faster and let energy and momentum drift in proportion.
         extra_substeps: how many substeps may be made beyond one a step (per segment of at most 512 steps
             where not every step is saved); by default 16, for steps that fail and are repeated in parts, and
-            with error control 256 or eight a step (that there is room for). A gradient takes time for all.
+            with error control 256 or eight a step (that there is room for). Where impacts are located each
+            takes one or two; by default there are 64, or one a step. A gradient takes time for all.
         scheme: `EnergyMomentum`, by default that of order two; `VariationalMidpoint`; `Dissipative`.
         rtol: error that a substep may have, relative: steps are made in as few substeps as keep to it, of
             lengths found on the way. Inputs change at the ends of steps, states are saved there, and what
@@ -156,7 +157,8 @@ def simulate(
 
     Raises:
         ValueError: for a wrong dt, steps, tolerance, shape of inputs or state, a state that violates a
-            constraint, with its name and size, or a function that cannot be seen.
+            constraint, with its name and size, a function that cannot be seen, or impacts to locate in a run
+            with error control or without contacts that have any.
         SimulationError: if the run fails and `throw` holds; it carries the trajectory computed so far.
 
     Example:
@@ -183,6 +185,11 @@ def simulate(
     if count % save_every:
         raise ValueError(f"save_every is {save_every}; pass a positive divisor of steps = {count}")
     tolerance = Tolerance.of(rtol, atol)
+    if tolerance is not None and scheme.tableau.max_events:
+        raise ValueError(
+            "rtol and atol make substeps of their own lengths, and max_events of the scheme splits steps at "
+            "impacts; leave out one of the two"
+        )
     if progress or store is not None or resume:
         run = Run(
             system, state, checked, step, tolerance, newton_tol, extra_substeps, until, scheme, count,
@@ -204,6 +211,8 @@ def simulate(
         checked = with_room(checked, count, room)
     if extra_substeps is None:
         extra_substeps = 16 if tolerance is None else max(256, 8 * room)
+        if scheme.tableau.max_events:
+            extra_substeps = max(64, room)
     static = (room, int(save_every), checkpoint, newton_tol, int(extra_substeps), until, scheme)
     try:
         trajectory = _simulate(system, state, checked, step, tolerance, made, static)

@@ -23,6 +23,7 @@ from natcoord_jax.mechanics.equations import kind_of, prepare
 from natcoord_jax.mechanics.start_cache import NOTHING
 from natcoord_jax.stepping.factors import Factors, factors_of
 from natcoord_jax.stepping.linear_iteration import LinearIteration
+from natcoord_jax.stepping.located import part_of_step
 from natcoord_jax.stepping.newton import any_lane
 from natcoord_jax.stepping.plan import Plan
 from natcoord_jax.stepping.predictor import Predictor
@@ -148,7 +149,9 @@ class SlotSweep(ABC):
         """Residual of a slot's equations, the state at its end, and what the constraints admit there."""
         system, parameters, dt = numbers.whole(varied)
         u = slot.inputs(self.plan, system, parameters, state) if u is None else u
-        return advance_between(system, state, tangents, u, slot.fraction * dt, y, self.tableau)
+        system, h = part_of_step(system, state, u, dt, y, self.tableau, slot)
+        residual, after, tangents = advance_between(system, state, tangents, u, h, y, self.tableau)
+        return residual, slot.settled(after), tangents
 
     def every(self, record: Record, given: Any) -> Any:
         """Everything: in one kernel for all slots, or one for each part if that takes too long to compile."""
@@ -244,6 +247,9 @@ class SlotSweep(ABC):
             guess = jnp.where(jnp.all(jnp.isfinite(guess)), guess, 0.0)
             following = LinearIteration.first(solution, factors, self._formed_first(fixed, factors))
             aged = factors.aged()
+            if slot.event is not None:
+                # The time of an impact is in its own equations only: elsewhere its factors leave an error.
+                aged = replace_fields(aged, usable=aged.usable & (slot.event < 0))
             done = SweepCarry(c.left - 1, carried, pasts, guess, following, aged, stuck)
             waiting = replace_fields(c, solution=solution, at=at, factors=factors, stuck=stuck)
             return jax.tree.map(partial(jnp.where, stuck), waiting, done), found, matrix

@@ -99,7 +99,7 @@ def end_of_step(
     after = State(state.t + h, q, v, coordinates, rotors, work, state.dissipated, state.held)
     lost = {}
     if system.structure.inequalities:
-        after, lost = after_impacts(system, state, after, h, groups, found)
+        after, lost = after_impacts(system, state, after, h, groups, found, tableau)
     working, relation = [], 0
     for number, (group, power) in enumerate(zip(groups, found.power)):
         if group.effect.works:
@@ -113,6 +113,8 @@ def end_of_step(
             relation += group.count * group.multipliers
     # The same of the work account.
     after = replace_fields(after, work=work + jnp.concatenate(working) if working else work)
+    if state.elapsed is not None:
+        after = replace_fields(after, elapsed=state.elapsed + h)
     if tableau.dissipative:
         dissipated = found.given.loss + (0.0 if state.dissipated is None else state.dissipated)
         after = replace_fields(after, dissipated=dissipated)

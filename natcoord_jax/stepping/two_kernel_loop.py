@@ -89,6 +89,8 @@ def _unfinished(setting: RolloutProblem, length: int, carried: LoopCarry) -> Arr
 def _record(course: RolloutState, x: Array, rows: int) -> tuple[Array, ...]:
     """Room for so many slots."""
     slot = x, course.it.y, course.step, course.fraction, course.done, course.stopped, course.step
+    if course.search is not None:
+        slot = *slot, course.search.ended
     return tuple(jnp.zeros((rows, *x.shape), x.dtype) for x in slot)
 
 

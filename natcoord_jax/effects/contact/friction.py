@@ -19,6 +19,9 @@ from natcoord_jax.core.potential import on_rows, place_markers
 from natcoord_jax.effects.contact.gap import Gap
 from natcoord_jax.maths.vectors import cross, dot, positive_part
 
+FREE, RESTING = 1, 2
+"""What contacts do in a part of a step, where impacts are located."""
+
 GAP = of("a gap, as nc.SphereOnPlane(radius=0.1)", Gap)
 
 
@@ -36,6 +39,8 @@ class Rubbing(Effect):
         regularisation: eps [m/s].
         name: optional name.
         mobility: change of the speed of closing by a unit impulse [1/kg], follows from the masses.
+        phase: in the part of a step at hand of schemes that locate impacts, `FREE` where nothing pushes until
+            the gap closes, at its end, `RESTING` where it is closed, 0 elsewhere. None: of other schemes.
     """
 
     markers: Any = eqx.field(metadata=is_a(Markers()))
@@ -44,6 +49,7 @@ class Rubbing(Effect):
     regularisation: Any = eqx.field(default=1e-5, kw_only=True, metadata=is_a(Number("positive")))
     name: Any = eqx.field(default=None, kw_only=True, metadata=is_a(NAME))
     mobility: Any = eqx.field(default=None, init=False)
+    phase: Any = eqx.field(default=None, init=False)
 
     unilateral: ClassVar[bool] = True
     impulsive: ClassVar[bool] = True

@@ -12,7 +12,7 @@ from natcoord_jax.core.checks import is_concrete
 from natcoord_jax.core.effect import Motion, Response, StepContext, replace_fields
 from natcoord_jax.core.numeric import Number
 from natcoord_jax.core.potential import marker_response, place_markers
-from natcoord_jax.effects.contact.friction import Rubbing
+from natcoord_jax.effects.contact.friction import FREE, RESTING, Rubbing
 
 
 class GapReadings(eqx.Module):
@@ -40,7 +40,8 @@ class GapConstraint(Rubbing):
     contact creeps, more slowly than eps, the regularisation.
 
     For schemes of one stage, `nc.EnergyMomentum()`. Derivatives are those of the program: where an impact
-    falls within a step they are not those of the motion, which `nc.GapPotential` has.
+    falls within a step they are not those of the motion, unless the scheme locates impacts,
+    `nc.EnergyMomentum(max_events=8)`.
 
     Attributes:
         markers: that the gap is of.
@@ -99,12 +100,17 @@ class GapConstraint(Rubbing):
         gradient = self.gap.averaged(start, now.h * flow, now.tableau)
         forces, torques = self.pushing(place, motion, gradient, lam[:, 0]), None
         moving = now.h > 0
-        before = jnp.where(moving, self.gap.distance(start) / jnp.where(moving, now.h, 1.0), 0.0)
+        gap = self.gap.distance(start)
+        if self.phase is not None:
+            # What an impact has left open does not close in no time.
+            gap = jnp.where(self.phase == RESTING, jnp.minimum(gap, 0.0), gap)
+        before = jnp.where(moving, gap / jnp.where(moving, now.h, 1.0), 0.0)
         ahead = before + jnp.sum(gradient * flow, axis=-1)
         # An impulse changes the mean speed of a step by half of what it changes the speed by.
         pushed = 0.5 * self.mobility * lam[:, 0]
         ahead = ahead + self.compliance * pushed
-        found = jnp.where(pushed < ahead, pushed, ahead)[:, None]
+        free = pushed < ahead if self.phase is None else (pushed < ahead) | (self.phase == FREE)
+        found = jnp.where(free, pushed, ahead)[:, None]
         if self.friction is not None:
             rubbing, torques, missing = self.rubbing(place, motion, lam)
             forces, found = forces + rubbing, jnp.concatenate([found, missing], axis=1)
