@@ -218,7 +218,7 @@ CALLS = {
     "Contact": lambda w: {
         "one": [w.body], "other": [nc.Plane(), w.body], "stiffness": NUMBER, "restitution": NUMBER,
         "friction": NUMBER, "speed": NUMBER, "law": ["linear", "hertz"], "name": NAME, "one_pass": FLAG,
-        "candidates": WHOLE, "self_contact": FLAG,
+        "candidates": WHOLE, "self_contact": FLAG, "rounding": NUMBER,
     },
     "GapPotential": lambda w: {
         **MARKED(w.ends), "gap": [nc.SphereOnSphere(radii=(1.0, 1.0))], "stiffness": NUMBER,
@@ -239,6 +239,8 @@ CALLS = {
     "CapsuleOnCapsule": lambda w: {"radii": [(1.0, 1.0)]},
     "EllipsoidOnPlane": lambda w: {"semi_axes": V},
     "SphereOnBox": lambda w: {"size": V, "radius": NUMBER},
+    "CornersOnBox": lambda w: {"size": V, "corner": V, "rounding": NUMBER},
+    "EdgesOnEdges": lambda w: {"sizes": [np.ones((2, 3))], "skew": [(1.0, -1.0)], "rounding": NUMBER},
     "NodeOnFacets": lambda w: {
         **GAP((*w.ends * 2, w.ends[0])),
         "facets": [((1, 2, 3, 4),)],

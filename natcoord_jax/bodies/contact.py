@@ -50,8 +50,9 @@ class Contact(Recipe):
     There are gaps for spheres, capsules, boxes (by their corners), cylinders (without a
     stiffness), ellipsoids, points, beams and the nodes of
     shells and solids on planes; for spheres, capsules and beams on each other and on points and nodes; for
-    spheres, points and nodes on boxes; and for surfaces of shells and solids on each other, nodes of either
-    on the facets of the other, each with half the stiffness. Other shapes touch a shell or a solid at its
+    spheres, points and nodes on boxes; for boxes on each other, with edges and corners that are a little
+    round; and for surfaces of shells and solids on each other, nodes of either on the facets of the other,
+    each with half the stiffness. Other shapes touch a shell or a solid at its
     nodes only: what is smaller than its cells slips through. Where a step is longer than a body, it may pass
     another without ever overlapping with it.
 
@@ -76,6 +77,9 @@ class Contact(Recipe):
             stiffness: for a fine surface, or one that folds, on a coarse one.
         self_contact: of a beam that is passed twice: its segments touch each other, those that are farther
             apart along it than half a turn about its own section.
+        rounding: of two boxes, radius of their edges and corners where they touch each other [m], below half
+            of the shortest edge; None: a fiftieth of that. Edges that move by more than two of these in a
+            step, or overlap by as much in a soft contact, pass each other.
         candidates: number of facets that a node may touch; default 16.
         name: of the contact; several gaps are called "name[0]" and so on.
 
@@ -107,6 +111,7 @@ class Contact(Recipe):
     )
     one_pass: bool = eqx.field(default=False, kw_only=True, static=True, metadata=is_a(FLAG))
     self_contact: bool = eqx.field(default=False, kw_only=True, static=True, metadata=is_a(FLAG))
+    rounding: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Number("positive")))
     candidates: int | None = eqx.field(default=None, kw_only=True, static=True, metadata=is_a(Whole(1)))
     name: str | None = eqx.field(default=None, kw_only=True, static=True, metadata=is_a(NAME))
 
@@ -123,7 +128,7 @@ class Contact(Recipe):
                 else f"contact {name!r}: self_contact=True is for a beam with itself; pass it twice"
             )
         law = {"stiffness": self.stiffness, "law": self.law}
-        for option in ("restitution", "friction", "speed", "candidates"):
+        for option in ("restitution", "friction", "speed", "candidates", "rounding"):
             if getattr(self, option) is not None:
                 law[option] = getattr(self, option)
         if self.one_pass:
