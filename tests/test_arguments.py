@@ -219,6 +219,7 @@ CALLS = {
         "one": [w.body], "other": [nc.Plane(), w.body], "stiffness": NUMBER, "restitution": NUMBER,
         "friction": NUMBER, "speed": NUMBER, "law": ["linear", "hertz"], "name": NAME, "one_pass": FLAG,
         "candidates": WHOLE, "self_contact": FLAG, "rounding": NUMBER,
+        "all_pairs_of": [(w.body,)], "ignore": [[(w.body, w.body)]],
     },
     "GapPotential": lambda w: {
         **MARKED(w.ends), "gap": [nc.SphereOnSphere(radii=(1.0, 1.0))], "stiffness": NUMBER,
@@ -339,6 +340,7 @@ CALLS = {
         "part": [nc.PointMass(mass=1.0)], "name": [None], "position": [None], "orientation": [None]
     },
     "Scene.add_mass": lambda w: {"handle": [w.body], "block": [np.zeros((4, 4))]},
+    "Scene.joined": lambda w: {"one": [w.body], "other": [w.body]},
     "Scene.find": lambda w: {"handle": [w.body, w.hinge], "user": NAME},
     "Scene.compile": lambda w: {"assemble": FLAG, "solver": ["reduced"], "t": NUMBER},
     "simulate": lambda w: {

@@ -163,3 +163,23 @@ def test_rounding_that_is_refused(shapes, given, message):
         scene.add(nc.Contact(one, other, **given))
     with pytest.raises(ValueError, match="size"):
         nc.Box((1.0, 0.0, 1.0))
+
+
+def test_a_capsule_falls_across_an_edge():
+    """Neither of its ends is above the box: an edge holds it, and energy and momenta are kept."""
+    scene = nc.Scene()
+    box = scene.add(
+        nc.RigidBody(shape=nc.Box((0.3, 0.3, 0.3)), density=500.0, orientation=((0, 1, 0), np.pi / 4))
+    )
+    given = {"position": (0, 0.05, 0.3), "velocity": (0, 0, -2.0), "orientation": ((0, 1, 0), np.pi / 2)}
+    rod = scene.add(nc.RigidBody(shape=nc.Capsule(radius=0.03, length=1.0), density=500.0, **given))
+    scene.add(nc.Contact(box, rod, stiffness=2e4))
+    system, state = scene.compile()
+    gaps = nc.contacts(system, trajectory := nc.simulate(system, state, dt=1e-3, steps=100)).gap
+    assert gaps[0].min() == pytest.approx(0.3 - 0.15 * np.sqrt(2) - 0.03, rel=1e-3)
+    assert -0.03 < gaps.min() < 0 < gaps[-1].min()
+    found = nc.balance(system, trajectory)
+    # While the contact is closed, places that are rounded to 1e-14 m are worth that times the force.
+    assert found.energy.max() <= 1e-11 and found.energy[-1] <= 10 * tol.ENERGY_OF_A_SMALL_SCENE
+    assert found.momentum.max() <= tol.MOMENTUM_OF_A_SMALL_SCENE
+    assert found.angular_momentum.max() <= 10 * tol.MOMENTUM_OF_A_SMALL_SCENE

@@ -1,7 +1,7 @@
 """Which gap there is between two kinds of sides: one table, to which a kind is added by its own lines."""
 
 from collections.abc import Callable
-from itertools import product
+from itertools import combinations, product
 from typing import Any
 
 import jax.numpy as jnp
@@ -188,6 +188,19 @@ def _ball_on_box(ball: SegmentSide, box: BodySide, law: Law, name: str) -> Gaps:
     return [_kept_open(SphereOnBox(size=shape.size, radius=ball.radius), markers, law, name, ball, box)]
 
 
+def _segment_on_box(segment: SegmentSide, box: BodySide, law: Law, name: str) -> Gaps:
+    """Its ends on the box, and the edges of the box on it."""
+    shape: Any = box.shape
+    balls = (SegmentSide.ball(end, segment.radius) for end in segment.ends)
+    found = [gap for ball in balls for gap in _ball_on_box(ball, box, law, name)]
+    corners = [box.point(0.5 * shape.size * corner) for corner in CORNERS]
+    for one, other in combinations(range(len(CORNERS)), 2):
+        if np.sum(CORNERS[one] != CORNERS[other]) == 1:
+            edge = SegmentSide(box.handle, Capsule, (corners[one], corners[other]), 0.0)
+            found += _segments(segment, edge, law, name)
+    return _sharing(found)
+
+
 def _box_on_box(one: BodySide, other: BodySide, law: Law, name: str) -> Gaps:
     """Corners of either on the other, opposite ones together, and edges on edges."""
     law, boxes = dict(law), (one, other)
@@ -259,6 +272,7 @@ TABLE: dict[tuple[type, type], Callable[..., Gaps]] = {
     (Ellipsoid, Plane): _ellipsoid_on_plane,
     (Cylinder, Plane): _cylinder_on_plane,
     (Sphere, Box): _ball_on_box,
+    (Capsule, Box): _segment_on_box,
     (Box, Box): _box_on_box,
     (Sphere, Sphere): _balls,
     (Sphere, Capsule): _segments,

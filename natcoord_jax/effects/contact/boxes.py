@@ -189,7 +189,7 @@ class EdgesOnEdges(BetweenBoxes):
         return jnp.concatenate([middles, -middles]), jnp.concatenate([half, half])
 
     def _nearest(self, middles, halves, others, other_halves) -> tuple[Array, Array, Array]:
-        """Distances of all pairs of edges, those without a crossing by `rounding` more, and nearest points."""
+        """Distances of all pairs of edges, those without a crossing by `rounding` more, and where."""
         one, other = (2.0 * halves)[:, None], (2.0 * other_halves)[None]
         begin, end = (middles - halves)[:, None], (others - other_halves)[None]
         apart = begin - end
