@@ -113,13 +113,16 @@ def _kept_open(gap: Gap, markers: tuple[Marker, ...], law: Law, name: str, *side
     law = {key: value for key, value in law.items() if key not in OF_SURFACES}
     if "rounding" in law:
         raise ValueError(f"contact {name!r}: rounding [m] is that of the edges of two boxes; leave it out")
-    own = [s.stiffness for s in sides if isinstance(s, SegmentSide) and s.stiffness is not None]
+    balls = [s for s in sides if isinstance(s, SegmentSide)]
+    own = [s.stiffness for s in balls if s.stiffness is not None]
     given = law.pop("stiffness")
     stiffness = given if given is not None else min(own, default=None)
     if stiffness is not None and "friction" in law:
-        if own:
+        # A node does not turn, or not about its director: what rubs at another place than it would be lost.
+        if own and (any(np.asarray(s.radius) > 0 for s in balls) or not isinstance(gap, SphereOnPlane)):
             raise ValueError(
-                f"contact {name!r}: there is no friction [-] on nodes of shells and solids yet; leave it out"
+                f"contact {name!r}: there is no friction [-] on nodes of shells and solids yet but those of "
+                "solids on planes; leave it out"
             )
         return FrictionalGapPotential(markers, gap, stiffness=stiffness, **law)
     if stiffness is not None:
