@@ -116,8 +116,10 @@ from natcoord_jax.effects.beams import (
 from natcoord_jax.effects.constraints import PointOnLine, PointOnPlane, PointOnPoint, PointSum, Rod, Rolling
 from natcoord_jax.effects.contact import (
     CapsuleOnCapsule,
+    CornersOnBox,
     DiscOnPlane,
     DiscreteGap,
+    EdgesOnEdges,
     EllipsoidOnPlane,
     FrictionalGapPotential,
     Gap,
@@ -246,6 +248,7 @@ __all__ = [
     "Contact",
     "Contacts",
     "Continuation",
+    "CornersOnBox",
     "Coupling",
     "Cylinder",
     "Cylindrical",
@@ -263,6 +266,7 @@ __all__ = [
     "Edge",
     "EdgeLoad",
     "EdgeSegment",
+    "EdgesOnEdges",
     "Elastic",
     "Ellipsoid",
     "EllipsoidOnPlane",

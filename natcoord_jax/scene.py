@@ -165,6 +165,11 @@ class Scene:
     def _stores(self) -> tuple[dict[str, Any], ...]:
         return self.bodies, self.joints, self.effects, self.recipes, self.nodes, self.elements, self.clamps
 
+    @checked("Scene.joined", one=BODY, other=BODY)
+    def joined(self, one: Handle, other: Handle) -> bool:
+        """Whether a joint that was added before is between two bodies."""
+        return any({one, other} == {joint.parent, joint.child} for joint in self.joints.values())
+
     def _free_name(self, label: str) -> str:
         numbered = (f"{label} {k}" for k in itertools.count(1))
         return next(name for name in numbered if not any(name in store for store in self._stores()))

@@ -218,7 +218,8 @@ CALLS = {
     "Contact": lambda w: {
         "one": [w.body], "other": [nc.Plane(), w.body], "stiffness": NUMBER, "restitution": NUMBER,
         "friction": NUMBER, "speed": NUMBER, "law": ["linear", "hertz"], "name": NAME, "one_pass": FLAG,
-        "candidates": WHOLE, "self_contact": FLAG,
+        "candidates": WHOLE, "self_contact": FLAG, "rounding": NUMBER,
+        "all_pairs_of": [(w.body,)], "ignore": [[(w.body, w.body)]],
     },
     "GapPotential": lambda w: {
         **MARKED(w.ends), "gap": [nc.SphereOnSphere(radii=(1.0, 1.0))], "stiffness": NUMBER,
@@ -239,6 +240,8 @@ CALLS = {
     "CapsuleOnCapsule": lambda w: {"radii": [(1.0, 1.0)]},
     "EllipsoidOnPlane": lambda w: {"semi_axes": V},
     "SphereOnBox": lambda w: {"size": V, "radius": NUMBER},
+    "CornersOnBox": lambda w: {"size": V, "corner": V, "rounding": NUMBER},
+    "EdgesOnEdges": lambda w: {"sizes": [np.ones((2, 3))], "skew": [(1.0, -1.0)], "rounding": NUMBER},
     "NodeOnFacets": lambda w: {
         **GAP((*w.ends * 2, w.ends[0])),
         "facets": [((1, 2, 3, 4),)],
@@ -337,6 +340,7 @@ CALLS = {
         "part": [nc.PointMass(mass=1.0)], "name": [None], "position": [None], "orientation": [None]
     },
     "Scene.add_mass": lambda w: {"handle": [w.body], "block": [np.zeros((4, 4))]},
+    "Scene.joined": lambda w: {"one": [w.body], "other": [w.body]},
     "Scene.find": lambda w: {"handle": [w.body, w.hinge], "user": NAME},
     "Scene.compile": lambda w: {"assemble": FLAG, "solver": ["reduced"], "t": NUMBER},
     "simulate": lambda w: {

@@ -173,6 +173,20 @@ GAPS = {
         (1,),
         lambda axes, points: np.stack([*points[:2], *axes[0]]),
     ),
+    nc.CornersOnBox: (
+        nc.CornersOnBox(size=np.array([0.3, 0.5, 0.7]), corner=np.array([0.2, -0.3, 0.1]), rounding=0.02),
+        (0, 1),
+        (1,),
+        lambda axes, points: np.stack([*points[:2], *axes[0], *axes[1]]),
+    ),
+    nc.EdgesOnEdges: (
+        nc.EdgesOnEdges(
+            sizes=np.array([[0.3, 0.5, 0.7], [0.4, 0.6, 0.2]]), skew=np.array([1.0, -1.0]), rounding=0.02
+        ),
+        (0, 1),
+        (1,),
+        lambda axes, points: np.stack([*points[:2], *axes[0], *axes[1]]),
+    ),
 }
 """Gaps; which of their markers are points, and which of these the second body's; markers somewhere."""
 
@@ -205,9 +219,10 @@ def test_contract_of_gaps(gap):
         assert float(foretold) == pytest.approx(float(change), abs=1e-12)
         # The second body is pushed along the normal. (The nearest points of segments are drawn to their
         # middles a little.)
+        tolerance = 2e-2 if gap in (nc.CapsuleOnCapsule, nc.EdgesOnEdges) else 1e-12
         _, normal = made.contact(jnp.asarray(x))
         pushed = np.asarray(made.gradient(jnp.asarray(x)))[list(second)].sum(axis=0)
-        np.testing.assert_allclose(pushed, normal, atol=2e-2 if gap is nc.CapsuleOnCapsule else 1e-12)
+        np.testing.assert_allclose(pushed, normal, atol=tolerance)
 
 
 def test_distance_of_segments():
@@ -393,9 +408,9 @@ def test_wrong_input_is_refused(make, message):
 
 def test_shapes_without_a_gap_are_refused():
     scene = nc.Scene()
-    made = [nc.Box((1, 1, 1)), nc.Box((1, 1, 1)), nc.Cylinder(0.1, 0.2)]
+    made = [nc.Box((1, 1, 1)), nc.Ellipsoid((1, 1, 1)), nc.Cylinder(0.1, 0.2)]
     one, two, can = (scene.add(nc.RigidBody(shape=shape, density=1.0)) for shape in made)
-    with pytest.raises(ValueError, match="no gap between Box 'body 1' and Box 'body 2'"):
+    with pytest.raises(ValueError, match="no gap between Box 'body 1' and Ellipsoid 'body 2'"):
         scene.add(nc.Contact(one, two, stiffness=1.0))
     with pytest.raises(ValueError, match="no gap between Box 'body 1' and Cylinder 'body 3'"):
         scene.add(nc.Contact(one, can, stiffness=1.0))

@@ -117,3 +117,53 @@ def test_refused():
         empty.add(nc.PointMass(mass=1.0))
         alone, start = empty.compile()
         nc.contacts(alone, nc.simulate(alone, start, dt=0.1, steps=1))
+
+
+RUBBER = nc.Elastic(E=1e6, nu=0.3, density=1000.0)
+
+
+@pytest.mark.slow
+def test_a_block_of_solid_elements_slides_and_stops():
+    """Its nodes rub on a plane: it stops where a point does, but for how it gives way, and no step gains."""
+    scene = nc.Scene()
+    scene.add(nc.Gravity())
+    mesh = nc.mesh.box((0.2, 0.2, 0.1), (2, 2, 1))
+    block = scene.add(nc.Solid(mesh, material=RUBBER, velocity=(1.0, 0, 0)))
+    scene.add(nc.Contact(block.face("z0"), FLOOR, friction=0.3))
+    system, state = scene.compile()
+    trajectory = nc.simulate(system, state, dt=2e-3, steps=300)
+    assert_lossy(system, trajectory)
+    points = slice(None, None, 4)
+    moved = np.mean((np.asarray(trajectory.q)[-1] - np.asarray(trajectory.q)[0])[points, 0])
+    assert moved == pytest.approx(1.0 / (2 * 0.3 * 9.81), rel=2e-3)
+    # What is left is how the block shakes on the nodes that hold it.
+    assert np.abs(np.mean(np.asarray(trajectory.v)[-60:, points, 0], axis=1)).max() < 0.01
+
+
+@pytest.mark.slow
+def test_nodes_that_rub_keep_momenta():
+    """A block thrown at a table that flies and turns: what rubs turns both."""
+    scene = nc.Scene()
+    table = scene.add(nc.RigidBody(mass=2.0, inertia=(0.05, 0.05, 0.1), angular_velocity=(0.1, 0.2, 3.0)))
+    given = {"material": RUBBER, "velocity": (0.5, 0.2, -1.0), "position": (-0.1, -0.1, 0.02)}
+    block = scene.add(nc.Solid(nc.mesh.box((0.2, 0.2, 0.1), (1, 1, 1)), **given))
+    plane = nc.Plane(normal=(0, 0, 1), body=table)
+    scene.add(nc.Contact(block.face("z0"), plane, stiffness=1e4, friction=0.4, name="rubs"))
+    system, state = scene.compile()
+    trajectory = nc.simulate(system, state, dt=1e-3, steps=60)
+    assert_lossy(system, trajectory)
+    for momentum in (system.momentum(trajectory), system.angular_momentum(trajectory)):
+        assert np.ptp(np.asarray(momentum), axis=0).max() <= tol.MOMENTUM_OF_A_SMALL_SCENE
+    lost = [float(work[-1]) for name, work in system.work(trajectory).items() if name.startswith("rubs")]
+    assert sum(lost) < -1e-3
+
+
+def test_nodes_that_do_not_rub():
+    """Where they would do so beside themselves, as those of shells do, and on spheres; refused by name."""
+    scene = nc.Scene()
+    plate = scene.add(nc.Shell(nc.mesh.rectangle((0.2, 0.2), (1, 1)), thickness=0.02, material=RUBBER))
+    block = scene.add(nc.Solid(nc.mesh.box((0.2, 0.2, 0.1), (1, 1, 1)), material=RUBBER))
+    ball = scene.add(nc.RigidBody(**BALL, position=(0, 0, 1)))
+    for part, other in ((plate, FLOOR), (block, ball)):
+        with pytest.raises(ValueError, match="no friction .* but those of solids on planes; leave it out"):
+            scene.add(nc.Contact(part, other, friction=0.3))

@@ -148,50 +148,61 @@ def contacts(system: System, trajectory: Trajectory) -> Contacts:
     groups = touching(system)
     if not groups:
         raise ValueError("this system has no contacts; add nc.Contact(...) to its scene")
-    states, gaps = trajectory.states, [np.asarray(x) for x in _gaps(system, trajectory)]
-    span = np.diff(np.asarray(states.t), axis=-1)[..., None]
-    moving = np.where(span > 0, span, 1.0)
-    names, forces, impacts, insides, margins = [], [], [], [], []
+    gaps = [np.asarray(x) for x in _gaps(system, trajectory)]
     soft = [g for g in groups if not g.effect.unilateral]  # whose impulses states do not know
-    impulsive = groups[: len(groups) - len(soft)]
+    first = len(groups) - len(soft)
+    measured = [_of_law(group, gap) for group, gap in zip(soft, gaps[first:])]
+    if first:
+        measured.insert(0, _of_impulses(system, trajectory, groups[:first], gaps[:first]))
+    names = []
     for group in groups:
         names += [group.names[k] if len(group.names) == group.count else f"{group.labels[0]}[{k}]"
                   for k in range(group.count)]  # fmt: skip
-    if impulsive:
-        if states.contacts is None:
-            raise ValueError("states of this trajectory have no impulses of contacts; simulate it again")
-        steps, struck, inside, *located = np.moveaxis(np.diff(np.asarray(states.contacts), axis=-3), -1, 0)
-        forces.append((steps + struck) / moving)
-        impacts.append(sum(located, inside))
-        insides.append(inside)
-        start: Any = jax.tree.map(lambda x: x[(0,) * states.t.ndim], states)
-        after = np.concatenate([x[..., 1:, :] for x in gaps[: len(impulsive)]], axis=-1)
-        halves = 0.5 * np.asarray(mobilities(system, start))
-        held = halves * steps * moving
-        bounces = np.concatenate([np.full(g.count, g.effect.bounces) for g in impulsive])
-        # What comes near within an interval is nearest there, or would be as deep as its impact is fast.
-        before = np.concatenate([x[..., :-1, :] for x in gaps[: len(impulsive)]], axis=-1)
-        rates = _rates(system, trajectory)
-        begun, ended = rates[..., :-1, :], rates[..., 1:, :]
-        least = np.abs(np.asarray(lowest(jnp.asarray(before), begun, ended, jnp.asarray(moving))))
-        change = np.abs(np.asarray(begun)) + np.abs(np.asarray(ended))
-        deep = 0.5 * moving * (halves * struck) ** 2 / np.where(change > 0, change, 1.0)
-        least = np.where(impacts[0] > 0, np.where(change > 0, deep, np.inf), least)
-        margins.append(np.where(bounces & (steps > 0), held, np.minimum(least, np.abs(after))))
-    for group, gap in zip(soft, gaps[len(impulsive) :]):
-        effect: Any = group.effect
-        law = jax.vmap(lambda e, before, after: e.mean_force(before, after))
-        before, after = (np.moveaxis(x, -1, 0) for x in (gap[..., :-1, :], gap[..., 1:, :]))
-        flat = [jnp.asarray(x.reshape(group.count, -1)) for x in (before, after)]
-        found = jax.vmap(law, in_axes=(None, 1, 1), out_axes=1)(effect, *flat)
-        forces.append(np.moveaxis(np.asarray(found).reshape(before.shape), 0, -1))
-        impacts.append(np.zeros_like(forces[-1]))
-        insides.append(impacts[-1])
-        margins.append(np.abs(gap[..., 1:, :]))
-    size = 1.0 + float(np.max(np.abs(np.asarray(states.q))))
-    measured = forces, impacts, insides, margins
-    force, happened, inside, margin = (np.concatenate(x, axis=-1) for x in measured)
+    force, impacts, inside, margin = (np.concatenate(x, axis=-1) for x in zip(*measured))
     hard = np.concatenate([np.full(g.count, g.effect.bounces) for g in groups])
-    every = np.concatenate(gaps, axis=-1)
+    states, every = trajectory.states, np.concatenate(gaps, axis=-1)
+    size = 1.0 + float(np.max(np.abs(np.asarray(states.q))))
     t, active = np.asarray(states.t), force > 0
-    return Contacts(tuple(names), t, every, force, active, happened, inside, margin, size, hard)
+    return Contacts(tuple(names), t, every, force, active, impacts, inside, margin, size, hard)
+
+
+def _of_impulses(
+    system: System, trajectory: Trajectory, groups: list[Group], gaps: list[np.ndarray]
+) -> tuple[np.ndarray, ...]:
+    """Forces, impacts, those that are not located, and margins of contacts without a stiffness.
+
+    Raises:
+        ValueError: for states that do not know of their impulses.
+    """
+    states = trajectory.states
+    if states.contacts is None:
+        raise ValueError("states of this trajectory have no impulses of contacts; simulate it again")
+    span = np.diff(np.asarray(states.t), axis=-1)[..., None]
+    moving = np.where(span > 0, span, 1.0)
+    steps, struck, inside, *located = np.moveaxis(np.diff(np.asarray(states.contacts), axis=-3), -1, 0)
+    impacts = inside + np.sum(located, axis=0) if located else inside
+    every = np.concatenate(gaps, axis=-1)
+    before, after = every[..., :-1, :], every[..., 1:, :]
+    start: Any = jax.tree.map(lambda x: x[(0,) * states.t.ndim], states)
+    halves = 0.5 * np.asarray(mobilities(system, start))
+    bounces = np.concatenate([np.full(g.count, g.effect.bounces) for g in groups])
+    # What comes near within an interval is nearest there, or would be as deep as its impact is fast.
+    rates = _rates(system, trajectory)
+    begun, ended = rates[..., :-1, :], rates[..., 1:, :]
+    least = np.abs(np.asarray(lowest(jnp.asarray(before), begun, ended, jnp.asarray(moving))))
+    change = np.abs(np.asarray(begun)) + np.abs(np.asarray(ended))
+    deep = 0.5 * moving * (halves * struck) ** 2 / np.where(change > 0, change, 1.0)
+    least = np.where(impacts > 0, np.where(change > 0, deep, np.inf), least)
+    margin = np.where(bounces & (steps > 0), halves * steps * moving, np.minimum(least, np.abs(after)))
+    return (steps + struck) / moving, impacts, inside, margin
+
+
+def _of_law(group: Group, gap: np.ndarray) -> tuple[np.ndarray, ...]:
+    """The same of a group of contacts with a stiffness."""
+    effect: Any = group.effect
+    law = jax.vmap(lambda e, before, after: e.mean_force(before, after))
+    before, after = (np.moveaxis(x, -1, 0) for x in (gap[..., :-1, :], gap[..., 1:, :]))
+    flat = [jnp.asarray(x.reshape(group.count, -1)) for x in (before, after)]
+    found = jax.vmap(law, in_axes=(None, 1, 1), out_axes=1)(effect, *flat)
+    force = np.moveaxis(np.asarray(found).reshape(before.shape), 0, -1)
+    return force, np.zeros_like(force), np.zeros_like(force), np.abs(gap[..., 1:, :])

@@ -1,5 +1,6 @@
 """Contact of bodies with shapes, planes, beams, and the surfaces of shells and solids."""
 
+from itertools import combinations
 from typing import Any
 
 import equinox as eqx
@@ -14,7 +15,7 @@ from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.bodies import Body
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.handles import Handle
-from natcoord_jax.core.kinds import FLAG, NAME, Choice, HandleOf, of
+from natcoord_jax.core.kinds import BODY, FLAG, NAME, Choice, HandleOf, Several, of
 from natcoord_jax.core.markers import Point
 from natcoord_jax.core.numeric import Number, Whole
 from natcoord_jax.core.recipe import Builder, Recipe
@@ -30,11 +31,19 @@ SOLID = (
 )
 SIDE = SOLID | of("nc.Plane(...)", Plane)
 
+MOST = 2000
+"""Gaps of all pairs of some bodies that are made one by one."""
+
 SHAPES = "nc.Sphere, nc.Capsule, nc.Box, nc.Cylinder, nc.Ellipsoid or a point"
 
 
+def _tuple(given: Any) -> Any:
+    """What is static is hashable."""
+    return tuple(map(_tuple, given)) if isinstance(given, list | tuple) else given
+
+
 class Contact(Recipe):
-    """Contact of a body with a plane or with another body.
+    """Contact of a body with a plane or with another body, or of some bodies with each other.
 
     Without a stiffness, rigid bodies do not overlap (`nc.GapConstraint`): impacts leave a part `restitution`
     of the speed of closing, whatever the step, and surfaces may rub (`friction`). Energy is exact but for
@@ -47,13 +56,13 @@ class Contact(Recipe):
     wants six steps of that. Energy, momentum and angular momentum are exact, at impacts of any number of
     bodies, too.
 
-    There are gaps for spheres, capsules, boxes (by their corners), cylinders (without a
-    stiffness), ellipsoids, points, beams and the nodes of
-    shells and solids on planes; for spheres, capsules and beams on each other and on points and nodes; for
-    spheres, points and nodes on boxes; and for surfaces of shells and solids on each other, nodes of either
-    on the facets of the other, each with half the stiffness. Other shapes touch a shell or a solid at its
-    nodes only: what is smaller than its cells slips through. Where a step is longer than a body, it may pass
-    another without ever overlapping with it.
+    There are gaps for spheres, capsules, boxes (by their corners), cylinders (without a stiffness),
+    ellipsoids, points, beams and the nodes of shells and solids on planes; for spheres, capsules and beams on
+    each other and on points and nodes; for spheres, points, nodes, capsules and beams on boxes; for boxes on
+    each other, with edges and corners that are a little round; and for surfaces of shells and solids on each
+    other, nodes of either on the facets of the other, each with half the stiffness. Other shapes touch a
+    shell or a solid at its nodes only: what is smaller than its cells slips through. Where a step is longer
+    than a body, it may pass another without ever overlapping with it.
 
     Shells are touched from both sides, where their thickness ends; solids from outside, best at all that is
     outside, since at the end of a surface nodes slip off it. Which facets a node may touch is settled
@@ -64,24 +73,33 @@ class Contact(Recipe):
         one: handle of a body with a shape, of a point mass or a node, of a beam, of a shell or a solid, or
             faces of these, as block.face("x1").
         other: `nc.Plane`, or another of that kind.
+        all_pairs_of: instead of these, handles of bodies that are in contact each with each other, but for
+            pairs that a joint is between which was added before.
+        ignore: pairs of them that are not, as [(one, other)].
         stiffness: k [N/m] of each contact: of each corner of a box on a plane, of each node; with law="hertz"
             [N/m^1.5], for spheres 4/3 E* sqrt(R). None: that of the elements at a node of a shell or a solid
             along their normal, modulus times area over thickness; of rigid bodies none, they do not overlap.
         restitution: part of the closing speed that is left after an impact [-]; None: nothing is lost. With a
             stiffness above 0, and where no other force acts (weight in a soft contact takes some more of it).
-        friction: coefficient [-], of rigid bodies, points and beams; None: there is none.
+        friction: coefficient [-], of rigid bodies, points, beams, and of nodes of solids on planes; None:
+            there is none.
         speed: with a stiffness, of the impact that `restitution` is of [m/s]; less is lost of slower ones.
         law: force proportional to the overlap, "linear", or to its power 3/2, "hertz".
         one_pass: of two surfaces, let the nodes of `one` alone touch the facets of `other`, with all of the
             stiffness: for a fine surface, or one that folds, on a coarse one.
         self_contact: of a beam that is passed twice: its segments touch each other, those that are farther
             apart along it than half a turn about its own section.
+        rounding: of two boxes, radius of their edges and corners where they touch each other [m], below half
+            of the shortest edge; None: a fiftieth of that. Edges that move by more than two of these in a
+            step, or overlap by as much in a soft contact, may pass each other.
         candidates: number of facets that a node may touch; default 16.
-        name: of the contact; several gaps are called "name[0]" and so on.
+        name: of the contact; several gaps are called "name[0]" and so on, those of all pairs
+            "name[one, other]" or "name[one, other, 0]" by the names of the bodies.
 
     Raises:
-        ValueError: when it is added: for shapes that there is no gap for, a surface against itself, or no
-            stiffness. When the scene is compiled: for surfaces that overlap from the start.
+        ValueError: when it is added: for shapes that there is no gap for, a surface against itself, no
+            stiffness, or more than 2000 gaps of all pairs of bodies. When the scene is compiled: for surfaces
+            that overlap from the start.
 
     Example:
         >>> import jax; jax.config.update("jax_enable_x64", True)
@@ -96,8 +114,14 @@ class Contact(Recipe):
         True
     """
 
-    one: Any = eqx.field(static=True, metadata=is_a(SOLID))
-    other: Any = eqx.field(metadata=is_a(SIDE))
+    one: Any = eqx.field(default=None, static=True, metadata=is_a(SOLID))
+    other: Any = eqx.field(default=None, metadata=is_a(SIDE))
+    all_pairs_of: Any = eqx.field(
+        default=None, kw_only=True, static=True, converter=_tuple, metadata=is_a(Several(BODY))
+    )
+    ignore: Any = eqx.field(
+        default=(), kw_only=True, static=True, converter=_tuple, metadata=is_a(Several(Several(BODY, 2, 2)))
+    )
     stiffness: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Number("positive")))
     restitution: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Number("not negative")))
     friction: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Number("not negative")))
@@ -107,6 +131,7 @@ class Contact(Recipe):
     )
     one_pass: bool = eqx.field(default=False, kw_only=True, static=True, metadata=is_a(FLAG))
     self_contact: bool = eqx.field(default=False, kw_only=True, static=True, metadata=is_a(FLAG))
+    rounding: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Number("positive")))
     candidates: int | None = eqx.field(default=None, kw_only=True, static=True, metadata=is_a(Whole(1)))
     name: str | None = eqx.field(default=None, kw_only=True, static=True, metadata=is_a(NAME))
 
@@ -114,6 +139,12 @@ class Contact(Recipe):
 
     def add_to(self, scene: Builder, name: str) -> tuple[Handle, ...]:
         """Add its gaps; their handles."""
+        if self.all_pairs_of is not None:
+            return self._add_pairs(scene, name)
+        if self.one is None or self.other is None:
+            raise ValueError(
+                f"contact {name!r} is of what with what? Pass two sides, or bodies by all_pairs_of=[...]"
+            )
         itself = _owner(self.one) == _owner(self.other)
         if itself != self.self_contact or (itself and not isinstance(self.one, BeamHandle)):
             raise ValueError(
@@ -122,16 +153,67 @@ class Contact(Recipe):
                 if itself
                 else f"contact {name!r}: self_contact=True is for a beam with itself; pass it twice"
             )
-        law = {"stiffness": self.stiffness, "law": self.law}
-        for option in ("restitution", "friction", "speed", "candidates"):
-            if getattr(self, option) is not None:
-                law[option] = getattr(self, option)
-        if self.one_pass:
-            law |= {"one_pass": True}
+        law = self._law()
         one, other = (_side(scene, given, name) for given in (self.one, self.other))
         gaps = gaps_within(one, law, name) if itself else gaps_between(one, other, law, name)
         named = [name] if len(gaps) == 1 else [f"{name}[{k}]" for k in range(len(gaps))]
         return tuple(scene.add(replace_fields(gap, name=said)) for gap, said in zip(gaps, named))
+
+    def _law(self) -> dict[str, Any]:
+        """Numbers and options of its gaps, as far as they are given."""
+        law = {"stiffness": self.stiffness, "law": self.law}
+        for option in ("restitution", "friction", "speed", "candidates", "rounding"):
+            if getattr(self, option) is not None:
+                law[option] = getattr(self, option)
+        return law | ({"one_pass": True} if self.one_pass else {})
+
+    def _add_pairs(self, scene: Builder, name: str) -> tuple[Handle, ...]:
+        """Add the gaps of all pairs of bodies; their handles."""
+        law, made = self._law(), []
+        sides = {handle: _side(scene, handle, name) for handle in self.all_pairs_of}
+        for one, other in self._pairs(scene, name):
+            said = f"{one.name}, {other.name}"
+            boxes = sides[one].kind is sides[other].kind is Box
+            own = law if boxes else {key: value for key, value in law.items() if key != "rounding"}
+            gaps = gaps_between(sides[one], sides[other], own, f"{name}[{said}]")
+            several = len(gaps) > 1
+            made += [
+                (f"{name}[{said}, {k}]" if several else f"{name}[{said}]", g) for k, g in enumerate(gaps)
+            ]
+            if len(made) > MOST:
+                raise ValueError(
+                    f"contact {name!r}: all pairs of {len(sides)} bodies have more than {MOST} gaps, each of "
+                    "which is made and looked at in every step; pass fewer bodies, or more pairs to `ignore`"
+                )
+        return tuple(scene.add(replace_fields(gap, name=said)) for said, gap in made)
+
+    def _pairs(self, scene: Builder, name: str) -> list[tuple[Handle, Handle]]:
+        """Pairs of bodies that may touch."""
+        bodies = self.all_pairs_of
+        if self.one is not None or self.other is not None or self.self_contact:
+            raise ValueError(
+                f"contact {name!r}: all_pairs_of is instead of two sides and of self_contact; pass one "
+                "or the other"
+            )
+        if len(set(bodies)) < max(2, len(bodies)):
+            raise ValueError(
+                f"contact {name!r}: all_pairs_of has {len(bodies)} bodies, {len(set(bodies))} of them "
+                "different; pass two or more, each once"
+            )
+        strange = next((x for pair in self.ignore for x in pair if x not in bodies), None)
+        if strange is not None:
+            raise ValueError(
+                f"contact {name!r}: ignore names {strange.name!r}, which is not in all_pairs_of; pass "
+                "pairs of those bodies"
+            )
+        ignored = {frozenset(pair) for pair in self.ignore}
+        pairs = [p for p in combinations(bodies, 2) if frozenset(p) not in ignored and not scene.joined(*p)]
+        if not pairs:
+            raise ValueError(
+                f"contact {name!r}: all pairs of all_pairs_of are ignored or have a joint between them; "
+                "leave it out, or ignore fewer"
+            )
+        return pairs
 
 
 def _owner(given: Any) -> Any:

@@ -1,8 +1,10 @@
 """Which gap there is between two kinds of sides: one table, to which a kind is added by its own lines."""
 
 from collections.abc import Callable
+from itertools import combinations, product
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
 from natcoord_jax.bodies.contact_sides import (
@@ -18,13 +20,15 @@ from natcoord_jax.bodies.contact_sides import (
 from natcoord_jax.bodies.continua import Surface
 from natcoord_jax.bodies.node_surface import surface_gaps
 from natcoord_jax.bodies.shapes import CORNERS, Box, Capsule, Cylinder, Ellipsoid, Sphere
-from natcoord_jax.core.checks import as_array
-from natcoord_jax.core.eager_numpy import stacked
+from natcoord_jax.core.checks import as_array, is_concrete
+from natcoord_jax.core.eager_numpy import eager_numpy, stacked
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.markers import Marker
 from natcoord_jax.effects.contact import (
     CapsuleOnCapsule,
+    CornersOnBox,
     DiscOnPlane,
+    EdgesOnEdges,
     EllipsoidOnPlane,
     FrictionalGapPotential,
     Gap,
@@ -40,6 +44,9 @@ OF_SURFACES = "candidates", "one_pass"
 
 OF_CONSTRAINTS = "restitution", "friction"
 """Options of contacts without a stiffness."""
+
+ROUNDING = 0.02
+"""Radius of edges and corners of boxes on boxes, of the shortest edge."""
 
 SHARED = 1e-9
 """Compliance of contacts with several gaps, which may depend on each other."""
@@ -104,13 +111,18 @@ def gaps_within(beam: Side, law: Law, name: str) -> Gaps:
 def _kept_open(gap: Gap, markers: tuple[Marker, ...], law: Law, name: str, *sides: Side) -> Any:
     """A potential with the stiffness that is given or that of the sides; a constraint where there is none."""
     law = {key: value for key, value in law.items() if key not in OF_SURFACES}
-    own = [s.stiffness for s in sides if isinstance(s, SegmentSide) and s.stiffness is not None]
+    if "rounding" in law:
+        raise ValueError(f"contact {name!r}: rounding [m] is that of the edges of two boxes; leave it out")
+    balls = [s for s in sides if isinstance(s, SegmentSide)]
+    own = [s.stiffness for s in balls if s.stiffness is not None]
     given = law.pop("stiffness")
     stiffness = given if given is not None else min(own, default=None)
     if stiffness is not None and "friction" in law:
-        if own:
+        # A node does not turn, or not about its director: what rubs at another place than it would be lost.
+        if own and (any(np.asarray(s.radius) > 0 for s in balls) or not isinstance(gap, SphereOnPlane)):
             raise ValueError(
-                f"contact {name!r}: there is no friction [-] on nodes of shells and solids yet; leave it out"
+                f"contact {name!r}: there is no friction [-] on nodes of shells and solids yet but those of "
+                "solids on planes; leave it out"
             )
         return FrictionalGapPotential(markers, gap, stiffness=stiffness, **law)
     if stiffness is not None:
@@ -179,6 +191,50 @@ def _ball_on_box(ball: SegmentSide, box: BodySide, law: Law, name: str) -> Gaps:
     return [_kept_open(SphereOnBox(size=shape.size, radius=ball.radius), markers, law, name, ball, box)]
 
 
+def _segment_on_box(segment: SegmentSide, box: BodySide, law: Law, name: str) -> Gaps:
+    """Its ends on the box, and the edges of the box on it."""
+    shape: Any = box.shape
+    balls = (SegmentSide.ball(end, segment.radius) for end in segment.ends)
+    found = [gap for ball in balls for gap in _ball_on_box(ball, box, law, name)]
+    corners = [box.point(0.5 * shape.size * corner) for corner in CORNERS]
+    for one, other in combinations(range(len(CORNERS)), 2):
+        if np.sum(CORNERS[one] != CORNERS[other]) == 1:
+            edge = SegmentSide(box.handle, Capsule, (corners[one], corners[other]), 0.0)
+            found += _segments(segment, edge, law, name)
+    return _sharing(found)
+
+
+def _box_on_box(one: BodySide, other: BodySide, law: Law, name: str) -> Gaps:
+    """Corners of either on the other, opposite ones together, and edges on edges."""
+    law, boxes = dict(law), (one, other)
+    sizes: Any = stacked([box.shape.size for box in boxes])  # pyright: ignore[reportAttributeAccessIssue]
+    rounding = law.pop("rounding", None)
+    rounding = _rounding(sizes) if rounding is None else rounding
+    known = is_concrete(sizes) and is_concrete(rounding)
+    if known and 2 * float(rounding) >= (least := float(np.min(sizes))):
+        raise ValueError(
+            f"contact {name!r}: rounding [m] is {float(rounding):.6g}, but edges of the boxes are as short "
+            f"as {least:.6g} m; pass less than half of that"
+        )
+    found = []
+    for k, (box, rest) in enumerate((boxes, boxes[::-1])):
+        markers = box.point(), rest.point(), *box.axes(), *rest.axes()
+        for corner in CORNERS[len(CORNERS) // 2 :]:
+            tip = 0.5 * sizes[1 - k] * corner
+            gap = CornersOnBox(size=sizes[k], corner=tip, rounding=rounding)
+            found.append(_kept_open(gap, markers, law, name))
+    markers = one.point(), other.point(), *one.axes(), *other.axes()
+    for skew in product((-1.0, 1.0), repeat=2):
+        gap = EdgesOnEdges(sizes=sizes, skew=skew, rounding=rounding)
+        found.append(_kept_open(gap, markers, law, name))
+    return _sharing(found)
+
+
+@eager_numpy
+def _rounding(sizes: Any) -> Any:
+    return ROUNDING * jnp.min(sizes)
+
+
 def _radii(one: SegmentSide, other: SegmentSide, name: str) -> Any:
     """Of both.
 
@@ -219,6 +275,8 @@ TABLE: dict[tuple[type, type], Callable[..., Gaps]] = {
     (Ellipsoid, Plane): _ellipsoid_on_plane,
     (Cylinder, Plane): _cylinder_on_plane,
     (Sphere, Box): _ball_on_box,
+    (Capsule, Box): _segment_on_box,
+    (Box, Box): _box_on_box,
     (Sphere, Sphere): _balls,
     (Sphere, Capsule): _segments,
     (Capsule, Capsule): _segments,

@@ -19,6 +19,9 @@ from natcoord_jax.core.kinds import NAME
 from natcoord_jax.core.markers import Attachment, Marker, Markers
 from natcoord_jax.core.potential import marker_response, place_markers
 
+FREE, RESTING = 1, 2
+"""What inequalities do in a part of a step, where impacts are located."""
+
 
 class Constraint(Effect):
     """Base of constraints on markers of any number of bodies: subclass it and give `residual`.

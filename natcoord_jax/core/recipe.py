@@ -23,6 +23,10 @@ class Builder(Protocol):
         """The part behind a handle; None for the ground."""
         ...
 
+    def joined(self, one: Handle, other: Handle) -> bool:
+        """Whether a joint that was added before is between two bodies."""
+        ...
+
     def move_nodes(self, nodes: NodeSet, positions: Any) -> None:
         """Put some nodes of a set elsewhere in the assembled pose."""
         ...

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from natcoord_jax.core.constraint import FREE, RESTING
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
-from natcoord_jax.effects.contact.friction import FREE, RESTING
 from natcoord_jax.mechanics.violations import contact_gaps
 from natcoord_jax.model.groups import Group
 from natcoord_jax.model.model import Model, SomeModel

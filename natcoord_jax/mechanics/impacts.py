@@ -14,10 +14,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from natcoord_jax.core.checks import as_array
+from natcoord_jax.core.constraint import FREE, RESTING
 from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
-from natcoord_jax.effects.contact.friction import FREE, RESTING
 from natcoord_jax.maths.collocation import Tableau
 from natcoord_jax.maths.impact_law import collision_impulses, friction_impulses, impact_impulses
 from natcoord_jax.maths.vectors import positive_part

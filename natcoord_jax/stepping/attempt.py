@@ -131,9 +131,8 @@ def attempt(
         steady = sound(equations, before.it.y, *missed, *given)
         before = eqx.tree_at(lambda c: c.it.converged, before, before.it.converged & steady)
         left = remainder(equations, solving.residual, factors.inertias)
-        ahead = None
-        if before.search is not None:
-            ahead = Ahead.of(system, before.state, found.at, h, setting.dt)
+        looking = before.search is not None
+        ahead = Ahead.of(system, before.state, found.at, h, setting.dt) if looking else None
         after = after_attempt(setting, before, factors.inertias, ends, left, kick, ahead)
         accepted = after.taken > before.taken
         x = ravel_pytree(after.state)[0]
@@ -144,10 +143,7 @@ def attempt(
             record = _taken_back(record, carried.count - 1 - carried.first, after.trial.undone, x)
         record = tuple(with_row(b, carried.count - carried.first, r) for b, r in zip(record, slot))
         start_cache = _outset_after(setting, after, accepted, carried.start_cache, found.kick)
-        if after.lagging is not None and start_cache.tangents is not None:
-            # A kick that is not normal would change momenta.
-            held = start_cache.tangents.with_system(setting.system).normal(after.lagging.held)
-            after = eqx.tree_at(lambda c: c.lagging.held, after, held)
+        after = _with_normal_kick(setting, after, start_cache)
         factors = _kept(setting, equations, before, after, factors, solving.probe)
         return jnp.array(False), with_state(after, None), x, start_cache, record, factors
 
@@ -161,13 +157,23 @@ def attempt(
     asked = None
     if apart:
         asked = RefactorRequest(solving.wanting, solving.residual, found.size, found.loads, solving.here)
-    ending = solving.ending
-    if after.search is not None:
-        # Attempts that look for an impact leave no record.
-        before = carried.course
-        ending = ending & any_lane((after.taken > before.taken) | (after.rejected > before.rejected))
-    count = carried.count + ending
+    count = carried.count + (solving.ending & _leaves_record(carried.course, after))
     return LoopCarry(count, after, x, start_cache, factors, solving.probe, record, carried.first, asked)
+
+
+def _with_normal_kick(setting: RolloutProblem, after: RolloutState, start_cache: Any) -> RolloutState:
+    """With the kick at hand along the normals: another one would change momenta."""
+    if after.lagging is None or start_cache.tangents is None:
+        return after
+    held = start_cache.tangents.with_system(setting.system).normal(after.lagging.held)
+    return eqx.tree_at(lambda c: c.lagging.held, after, held)
+
+
+def _leaves_record(before: RolloutState, after: RolloutState) -> Bool[Array, ""] | bool:
+    """Attempts that look for an impact leave none."""
+    if after.search is None:
+        return True
+    return any_lane((after.taken > before.taken) | (after.rejected > before.rejected))
 
 
 def _unsolved(equations: Any, carried: LoopCarry) -> NewtonCarry:

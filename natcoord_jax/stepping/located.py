@@ -13,9 +13,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from natcoord_jax.core.constraint import FREE
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
-from natcoord_jax.effects.contact.friction import FREE
 from natcoord_jax.maths.collocation import Tableau
 from natcoord_jax.mechanics.equations import prepare
 from natcoord_jax.mechanics.free_flight import (
@@ -27,8 +27,8 @@ from natcoord_jax.mechanics.free_flight import (
     lowest,
     touch,
 )
-from natcoord_jax.mechanics.reduced import NOTHING
 from natcoord_jax.mechanics.response import StageKinematics
+from natcoord_jax.mechanics.start_cache import NOTHING
 from natcoord_jax.mechanics.violations import contact_gaps
 from natcoord_jax.stepping.error_control import StepDecision
 from natcoord_jax.system import System

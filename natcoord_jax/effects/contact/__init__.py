@@ -1,5 +1,8 @@
 """Contact between surfaces."""
 
+from natcoord_jax.effects.contact.boxes import CornersOnBox as CornersOnBox
+from natcoord_jax.effects.contact.boxes import EdgesOnEdges as EdgesOnEdges
+from natcoord_jax.effects.contact.boxes import SphereOnBox as SphereOnBox
 from natcoord_jax.effects.contact.discrete_gap import DiscreteGap as DiscreteGap
 from natcoord_jax.effects.contact.frictional_potential import FrictionalGapPotential as FrictionalGapPotential
 from natcoord_jax.effects.contact.gap import Gap as Gap
@@ -10,6 +13,5 @@ from natcoord_jax.effects.contact.node_on_facets import NodeOnFacets as NodeOnFa
 from natcoord_jax.effects.contact.pairs import CapsuleOnCapsule as CapsuleOnCapsule
 from natcoord_jax.effects.contact.pairs import DiscOnPlane as DiscOnPlane
 from natcoord_jax.effects.contact.pairs import EllipsoidOnPlane as EllipsoidOnPlane
-from natcoord_jax.effects.contact.pairs import SphereOnBox as SphereOnBox
 from natcoord_jax.effects.contact.pairs import SphereOnPlane as SphereOnPlane
 from natcoord_jax.effects.contact.pairs import SphereOnSphere as SphereOnSphere

@@ -19,9 +19,6 @@ from natcoord_jax.core.potential import on_rows, place_markers
 from natcoord_jax.effects.contact.gap import Gap
 from natcoord_jax.maths.vectors import cross, dot, positive_part
 
-FREE, RESTING = 1, 2
-"""What contacts do in a part of a step, where impacts are located."""
-
 GAP = of("a gap, as nc.SphereOnPlane(radius=0.1)", Gap)
 
 

@@ -17,14 +17,14 @@ TOWARDS_MIDDLE = 1e-3
 """How much nearest points of two segments are drawn to their middles: those of parallel ones are so told."""
 
 
-def _length(square: Array) -> Array:
+def length(square: Array) -> Array:
     """Root of a square, with derivatives that are zero where it is."""
     return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
 
 
-def _unit(vector: Float[Array, "3"]) -> Float[Array, "3"]:
+def direction(vector: Float[Array, "3"]) -> Float[Array, "3"]:
     """Its direction; of nothing nothing."""
-    size = _length(dot(vector, vector))
+    size = length(dot(vector, vector))
     return vector / jnp.where(size > 0, size, 1.0)
 
 
@@ -32,7 +32,7 @@ def _between(
     one: Float[Array, "3"], other: Float[Array, "3"], radii: Float[Array, "2"]
 ) -> tuple[Array, Array]:
     """The middle of the gap between two spheres, and the direction from the first to the second."""
-    normal = _unit(other - one)
+    normal = direction(other - one)
     return 0.5 * (one + other + (radii[0] - radii[1]) * normal), normal
 
 
@@ -67,7 +67,7 @@ class SphereOnPlane(Gap):
 
     def contact(self, x: Float[Array, "3 3"]) -> tuple[Array, Array]:
         """The lowest point of the sphere."""
-        normal = _unit(x[1])
+        normal = direction(x[1])
         return x[2] - self.radius * normal, normal
 
 
@@ -91,7 +91,7 @@ class SphereOnSphere(Gap):
 
     def distance(self, invariants: Float[Array, "1"]) -> Float[Array, ""]:
         """Distance less radii."""
-        return _length(invariants[0]) - jnp.sum(self.radii)
+        return length(invariants[0]) - jnp.sum(self.radii)
 
     def contact(self, x: Float[Array, "2 3"]) -> tuple[Array, Array]:
         """On the line of centres, in the middle of the gap."""
@@ -120,7 +120,7 @@ class CapsuleOnCapsule(Gap):
 
     def distance(self, invariants: Float[Array, "6"]) -> Float[Array, ""]:
         """Distance of the nearest points less radii."""
-        return _length(segment_distance_square(invariants)) - jnp.sum(self.radii)
+        return length(segment_distance_square(invariants)) - jnp.sum(self.radii)
 
     def contact(self, x: Float[Array, "4 3"]) -> tuple[Array, Array]:
         """On the line between the nearest points, in the middle of the gap."""
@@ -128,21 +128,24 @@ class CapsuleOnCapsule(Gap):
         return _between(x[0] + s * (x[1] - x[0]), x[2] + t * (x[3] - x[2]), self.radii)
 
 
-def nearest_points(products: Float[Array, "6"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+def nearest_points(
+    products: Float[Array, "6 *n"], towards_middle: float = TOWARDS_MIDDLE
+) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
     """Where on two segments r + s d_1 - t d_2 with s and t from 0 to 1 they are nearest, nearly.
 
     The nearest points of parallel segments are no points: they jump from end to end as these turn. So what is
     least here is the square of the distance and a little of how far the points are from the middles of the
-    segments, `TOWARDS_MIDDLE` of the product of their lengths.
+    segments, in terms of the squares of their lengths.
 
     Source: C. Ericson, Real-Time Collision Detection, 2005, section 5.1.9, for the limits; here with
     derivatives, of the nearest points too.
 
     Args:
-        products: d_1.d_1, d_2.d_2, d_1.d_2, d_1.r, d_2.r and r.r.
+        products: d_1.d_1, d_2.d_2, d_1.d_2, d_1.r, d_2.r and r.r, of any number of pairs.
+        towards_middle: how much of that.
     """
     a, e, b, c, f, _ = products
-    little = TOWARDS_MIDDLE * (a + e)
+    little = towards_middle * (a + e)
     stiff_s, stiff_t = a + little, e + little
     some = little > 0
     determinant = jnp.where(some, stiff_s * stiff_t - b * b, 1.0)
@@ -181,13 +184,13 @@ class EllipsoidOnPlane(Gap):
 
     def distance(self, invariants: Float[Array, "4"]) -> Float[Array, ""]:
         """Height less what the ellipsoid reaches along the normal (its support function)."""
-        return invariants[0] - _length(jnp.sum((self.semi_axes * invariants[1:]) ** 2))
+        return invariants[0] - length(jnp.sum((self.semi_axes * invariants[1:]) ** 2))
 
     def contact(self, x: Float[Array, "6 3"]) -> tuple[Array, Array]:
         """The lowest point of the ellipsoid."""
-        normal = _unit(x[1])
+        normal = direction(x[1])
         cosines = x[3:6] @ normal
-        size = _length(jnp.sum((self.semi_axes * cosines) ** 2))
+        size = length(jnp.sum((self.semi_axes * cosines) ** 2))
         return x[2] - (self.semi_axes**2 * cosines / jnp.where(size > 0, size, 1.0)) @ x[3:6], normal
 
 
@@ -214,43 +217,9 @@ class DiscOnPlane(Gap):
 
     def distance(self, invariants: Float[Array, "2"]) -> Float[Array, ""]:
         """Height less what the rim reaches below the centre."""
-        return invariants[0] - self.radius * _length(1.0 - invariants[1] ** 2)
+        return invariants[0] - self.radius * length(1.0 - invariants[1] ** 2)
 
     def contact(self, x: Float[Array, "4 3"]) -> tuple[Array, Array]:
         """The lowest point of the rim; of a disc that lies flat its centre."""
-        normal = _unit(x[1])
-        return x[2] - self.radius * _unit(normal - dot(normal, x[3]) * x[3]), normal
-
-
-class SphereOnBox(Gap):
-    """A sphere beside a box, with round edges as the sphere sees them.
-
-    Markers: the centre of the box, the centre of the sphere, and three directions of the box.
-
-    Attributes:
-        size: edges of the box (3,) [m].
-        radius: of the sphere [m].
-    """
-
-    size: Any = eqx.field(kw_only=True, metadata=is_a(Numbers((3,), "positive")))
-    radius: Any = eqx.field(kw_only=True, metadata=is_a(RADIUS))
-
-    markers: ClassVar[Markers] = Markers(2, 3)
-    sides: ClassVar[tuple[int, int]] = (0, 1)
-
-    def invariants(self, x: Float[Array, "5 3"]) -> Float[Array, "3"]:
-        """Place of the sphere in the axes of the box [m]."""
-        apart = x[1] - x[0]
-        return jnp.stack([dot(axis, apart) for axis in x[2:5]])
-
-    def distance(self, invariants: Float[Array, "3"]) -> Float[Array, ""]:
-        """Distance from the box less radius; inside of it to the nearest face."""
-        beyond = jnp.abs(invariants) - 0.5 * self.size
-        outside = _length(jnp.sum(jnp.where(beyond > 0, beyond, 0.0) ** 2))
-        return jnp.where(outside > 0, outside, jnp.max(beyond)) - self.radius
-
-    def contact(self, x: Float[Array, "5 3"]) -> tuple[Array, Array]:
-        """The point of the box that is nearest to a sphere outside of it."""
-        place, half = self.invariants(x), 0.5 * self.size
-        nearest = x[0] + jnp.clip(place, -half, half) @ x[2:5]
-        return nearest, _unit(x[1] - nearest)
+        normal = direction(x[1])
+        return x[2] - self.radius * direction(normal - dot(normal, x[3]) * x[3]), normal
