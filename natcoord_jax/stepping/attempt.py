@@ -111,9 +111,8 @@ def attempt(
     """
     course = with_state(carried.course, unpack(carried.state))
     u, h, index = setting.situation(course)
-    system = setting.system
-    if course.search is not None:
-        system = course.search.system(system, course.state, setting.dt)
+    search = course.search
+    system = setting.system if search is None else search.system(setting.system, course.state, setting.dt)
     equations = prepare(system, course.state, u, h, setting.plan.tableau, carried.start_cache)
     start = _unsolved(equations, carried)
     evaluate = partial(_evaluation, setting, course, equations, apart)
@@ -131,8 +130,7 @@ def attempt(
         steady = sound(equations, before.it.y, *missed, *given)
         before = eqx.tree_at(lambda c: c.it.converged, before, before.it.converged & steady)
         left = remainder(equations, solving.residual, factors.inertias)
-        looking = before.search is not None
-        ahead = Ahead.of(system, before.state, found.at, h, setting.dt) if looking else None
+        ahead = None if search is None else Ahead.of(system, before.state, found.at, h, setting.dt)
         after = after_attempt(setting, before, factors.inertias, ends, left, kick, ahead)
         accepted = after.taken > before.taken
         x = ravel_pytree(after.state)[0]
@@ -154,10 +152,9 @@ def attempt(
     else:
         carry = ended(carry)
     _, after, x, start_cache, record, factors = carry
-    asked = None
-    if apart:
-        asked = RefactorRequest(solving.wanting, solving.residual, found.size, found.loads, solving.here)
-    count = carried.count + (solving.ending & _leaves_record(carried.course, after))
+    wanted = solving.wanting, solving.residual, found.size, found.loads, solving.here
+    asked = RefactorRequest(*wanted) if apart else None
+    count = carried.count + _recorded(solving.ending, carried.course, after)
     return LoopCarry(count, after, x, start_cache, factors, solving.probe, record, carried.first, asked)
 
 
@@ -169,11 +166,11 @@ def _with_normal_kick(setting: RolloutProblem, after: RolloutState, start_cache:
     return eqx.tree_at(lambda c: c.lagging.held, after, held)
 
 
-def _leaves_record(before: RolloutState, after: RolloutState) -> Bool[Array, ""] | bool:
-    """Attempts that look for an impact leave none."""
+def _recorded(ending: Bool[Array, ""], before: RolloutState, after: RolloutState) -> Bool[Array, ""]:
+    """Whether an attempt that ends leaves a record: those that look for an impact leave none."""
     if after.search is None:
-        return True
-    return any_lane((after.taken > before.taken) | (after.rejected > before.rejected))
+        return ending
+    return ending & any_lane((after.taken > before.taken) | (after.rejected > before.rejected))
 
 
 def _unsolved(equations: Any, carried: LoopCarry) -> NewtonCarry:
