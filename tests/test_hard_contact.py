@@ -75,6 +75,18 @@ def test_resting_ball_is_untouched():
     assert np.abs(np.asarray(system.sense(trajectory, still).position) - (0, 0, 0.1)).max() <= 1e-15
 
 
+def test_a_point_comes_to_rest_at_the_origin():
+    """Where it has neither a speed nor a place that rounding could be compared with."""
+    scene = nc.Scene()
+    scene.add(nc.Gravity())
+    stone = scene.add(nc.PointMass(mass=0.1, position=(0, 0, 0.2)))
+    scene.add(nc.Contact(stone, FLOOR, restitution=0.0))
+    system, state = scene.compile()
+    trajectory = nc.simulate(system, state, dt=0.01, steps=1000)
+    assert np.abs(np.asarray(trajectory.q)[30:, 0]).max() <= 1e-15
+    assert int(trajectory.steps_rejected) <= 4
+
+
 @pytest.mark.parametrize("restitution", [1.0, 0.6])
 def test_box_falls_on_four_corners(restitution):
     """Redundant contacts that close at once: no corner is first, and the box does not begin to turn."""

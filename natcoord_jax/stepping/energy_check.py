@@ -30,6 +30,10 @@ PLACES = 1e-11
 """Displacement, relative to the places, that a step may miss whatever work that is: stiff parts feel how
 their places are rounded."""
 
+UNFELT = 1e-17
+"""Correction, relative to the terms of the equations, that is none: their rounding alone is twenty times
+as large. What rests at the origin has neither motion nor a place to compare its corrections with."""
+
 
 def unbalanced_work(
     equations: Any, y: Float[Array, " unknowns"], residual: Float[Array, " unknowns"]
@@ -80,9 +84,12 @@ def sound(
     before, system = equations.state, equations.system
     moving = jnp.maximum(motion_of(system, before), motion_of(system, after))
     # Forces that are large, but at rest, are rounded, too.
-    rounding = ROUNDING * size * (jnp.sqrt(moving) + ROUNDING * size)
-    allowed = max(tolerance / TOLERANCE, 1.0) * (UNSOUND * moving + rounding)
+    rounding = ROUNDING * size
+    allowed = UNSOUND * moving + rounding * (jnp.sqrt(moving) + rounding)
+    if tolerance > TOLERANCE:
+        allowed = tolerance / TOLERANCE * allowed
     rows = before.q.reshape(-1, 4, 3)
     places = jnp.sum(rows * inertia(system, rows))
-    near = ((equations.h * correction) ** 2 <= PLACES**2 * places) | (correction <= RESTING * grain)
+    near = (equations.h * correction) ** 2 <= PLACES**2 * places
+    near = near | (correction <= RESTING * grain + UNFELT / ROUNDING * rounding)
     return near | (unbalanced_work(equations, y, residual) <= allowed)
