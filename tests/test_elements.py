@@ -380,7 +380,9 @@ def test_tangents_in_formulas_are_exact(make):
 
 
 def _continuum(name):
-    example = {"plate": continua.plate, "block": continua.block}[name]((2,) * (2 + (name == "block")))
+    example = {"plate": continua.flying_plate, "block": continua.tumbling_block}[name](
+        (2,) * (2 + (name == "block"))
+    )
     return example.system, example.state
 
 
@@ -437,7 +439,7 @@ def test_wrong_clamps_are_refused():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["plate", "block"])
+@pytest.mark.parametrize("name", ["flying_plate", "tumbling_block"])
 def test_continua_keep_what_they_should(name):
     """Energy, momentum and angular momentum over 1000 steps, with a good part of the energy stored."""
     example = gallery.load(name)
@@ -478,7 +480,7 @@ def test_what_a_node_does_not_carry_is_refused():
 
 def test_pictures_show_surfaces():
     """Of a plate all its faces, of a block those outside; nodes are no bodies to be drawn."""
-    for name, counts, faces in (("plate", (3, 2), 6), ("block", (2, 2, 2), 24)):
+    for name, counts, faces in (("flying_plate", (3, 2), 6), ("tumbling_block", (2, 2, 2), 24)):
         example = gallery.load(name, counts=counts)
         drawn = scenery_of(example.system, example.simulate(steps=1), np.array([0, 1]), colour="energy")
         (skin,) = drawn.skins

@@ -196,7 +196,7 @@ def test_vtk_reads_elements_and_bodies(tmp_path):
     io = pytest.importorskip("vtkmodules.vtkIOHDF")
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
-    for name, kinds in (("plate", {1, 9}), ("block", {1, 12}), ("rope", {1, 3})):
+    for name, kinds in (("flying_plate", {1, 9}), ("tumbling_block", {1, 12}), ("rope", {1, 3})):
         example = gallery.load(name)
         path = tmp_path / f"{name}.h5"
         trajectory = nc.simulate(example.system, example.state, dt=example.dt, steps=2, store=path)

@@ -9,14 +9,14 @@ from typing import Any
 
 from natcoord_jax.gallery.beams import cantilever, flying_spaghetti, rope
 from natcoord_jax.gallery.contact import (
-    bouncing_balls,
+    bouncing_ball,
     colliding_blocks,
     dice,
     newton_cradle,
     rattleback,
     tumbling_capsules,
 )
-from natcoord_jax.gallery.continua import block, inflated_ball, plate, solar_panels
+from natcoord_jax.gallery.continua import flying_plate, inflated_ball, solar_panels, tumbling_block
 from natcoord_jax.gallery.example import Example
 from natcoord_jax.gallery.loops import bricard, four_bar, slider_crank
 from natcoord_jax.gallery.manoeuvres import reorientation_example
@@ -55,12 +55,12 @@ SCENES: Mapping[str, Callable[..., Example]] = {
     "rope": rope,
     "cantilever": cantilever,
     "flying_spaghetti": flying_spaghetti,
-    "plate": plate,
-    "block": block,
+    "flying_plate": flying_plate,
+    "tumbling_block": tumbling_block,
     "solar_panels": solar_panels,
     "panel_slew": panel_slew,
     "inflated_ball": inflated_ball,
-    "bouncing_balls": bouncing_balls,
+    "bouncing_ball": bouncing_ball,
     "newton_cradle": newton_cradle,
     "tumbling_capsules": tumbling_capsules,
     "rattleback": rattleback,

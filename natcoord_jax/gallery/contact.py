@@ -10,7 +10,7 @@ from natcoord_jax.gallery.example import Example
 GRAVITY = 9.81
 
 
-def bouncing_balls(restitutions: tuple[float, ...] = (1.0, 0.8, 0.5)) -> Example:
+def bouncing_ball(restitutions: tuple[float, ...] = (1.0, 0.8, 0.5)) -> Example:
     """Balls that are dropped on a floor and keep different parts of their speed at an impact."""
     scene = nc.Scene()
     scene.add(nc.Gravity(vector=(0, 0, -GRAVITY)))
@@ -31,7 +31,7 @@ def bouncing_balls(restitutions: tuple[float, ...] = (1.0, 0.8, 0.5)) -> Example
     system, state = scene.compile()
     fall = float(np.sqrt(2 * height / GRAVITY))
     facts = {"fall": fall, "apexes": tuple(e**2 * height for e in restitutions)}
-    return Example("bouncing_balls", "balls on a floor", system, state, 1e-3, 2500, facts=facts)
+    return Example("bouncing_ball", "balls on a floor", system, state, 1e-3, 2500, facts=facts)
 
 
 def newton_cradle(balls: int = 5, raised: float = 0.8) -> Example:

@@ -9,7 +9,7 @@ import natcoord_jax as nc
 from natcoord_jax.gallery.example import Example
 
 
-def plate(counts: tuple[int, int] = (6, 3)) -> Example:
+def flying_plate(counts: tuple[int, int] = (6, 3)) -> Example:
     """A rubber plate that tumbles and bends, of shell elements."""
     size, thickness = (1.0, 0.5), 0.05
     mesh = nc.mesh.rectangle(size, counts)
@@ -23,10 +23,10 @@ def plate(counts: tuple[int, int] = (6, 3)) -> Example:
     scene.add(nc.Shell(mesh, **given, name="plate"))
     system, state = scene.compile()
     facts = {"dofs": 5 * len(mesh.nodes), "mass": 1000.0 * thickness * float(np.prod(size))}
-    return Example("plate", "a plate of shells", system, state, 1e-3, 1000, facts=facts)
+    return Example("flying_plate", "a plate of shells", system, state, 1e-3, 1000, facts=facts)
 
 
-def block(counts: tuple[int, int, int] = (4, 2, 2)) -> Example:
+def tumbling_block(counts: tuple[int, int, int] = (4, 2, 2)) -> Example:
     """A rubber block that tumbles and is stretched, of bricks."""
     size, spin = (1.0, 0.5, 0.5), np.array([0.5, 0.3, 4.0])
     mesh = nc.mesh.box(size, counts)
@@ -37,7 +37,7 @@ def block(counts: tuple[int, int, int] = (4, 2, 2)) -> Example:
     scene.add(nc.Solid(mesh, material=rubber, velocity=velocity, angular_velocity=spin, name="block"))
     system, state = scene.compile()
     facts = {"dofs": 3 * len(mesh.nodes), "mass": 1000.0 * float(np.prod(size))}
-    return Example("block", "a block of bricks", system, state, 2e-3, 1000, facts=facts)
+    return Example("tumbling_block", "a block of bricks", system, state, 2e-3, 1000, facts=facts)
 
 
 def solar_panels(counts: tuple[int, int] = (6, 2), torque: float = 2.0) -> Example:
