@@ -7,7 +7,7 @@ rates and multipliers times h keeps the equations of one size as h goes to zero.
 """
 
 from abc import abstractmethod
-from typing import Any, Self
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -26,6 +26,8 @@ from natcoord_jax.mechanics.response import Evaluation, GroupData, StageKinemati
 from natcoord_jax.mechanics.start_cache import StartCache
 from natcoord_jax.model.groups import Group
 from natcoord_jax.model.model import Model
+
+SomeStep = TypeVar("SomeStep", bound="StepEquations")
 
 
 class StepEquations(Form):
@@ -53,14 +55,14 @@ class StepEquations(Form):
 
     @classmethod
     def prepare(
-        cls,
+        cls: type["SomeStep"],
         system: Model,
         state: State,
         u: Array,
         h: Array,
         tableau: Tableau,
         start_cache: StartCache | None = None,
-    ) -> Self:
+    ) -> "SomeStep":
         """Gather what the step needs, once.
 
         Args:
