@@ -147,7 +147,7 @@ def test_elements_of_every_kind_fly():
     assert np.ptp(turning, axis=0).max() <= tol.MOMENTUM_OF_A_SOLID * np.linalg.norm(turning[0])
 
 
-@pytest.mark.parametrize("stages", [1, 2])
+@pytest.mark.parametrize("stages", [1, pytest.param(2, marks=pytest.mark.exhaustive)])
 @pytest.mark.parametrize("points", [False, True])
 def test_the_jacobian_is_that_of_the_residual(stages, points):
     if points:

@@ -65,7 +65,7 @@ def test_all_pairs_are_those_by_hand():
     assert met and met <= {f"all[{a}, {b}]" for a, b in combinations([f"body {k}" for k in range(6)], 2)}
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_mixed_shapes_keep_what_they_should():
     """Spheres, capsules and boxes in space that fly at each other: momenta and energy."""
     scene = nc.Scene()

@@ -296,7 +296,7 @@ def test_a_tie_in_motion(amplitude):
     assert stored.max() >= 1e-3 * float(system.energy(state).kinetic)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_statics_of_tied_meshes_by_the_sparse_plan(monkeypatch):
     """With multipliers, as the dense matrix has them; with gradients."""
     scene = nc.Scene()

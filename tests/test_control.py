@@ -275,7 +275,7 @@ def nc_gallery(name):
 # The solver's derivatives
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_shooting_converges_quadratically_at_coarse_steps():
     """A double pendulum, a quarter of a radian a step: the curvature of projected steps is far off."""
     scene = nc.Scene()
@@ -671,7 +671,7 @@ def test_another_solver_gets_the_same_problem():
     assert np.asarray(program.inputs(x)).shape == (6, 3) and program.free(x) == {}
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_least_time_of_a_swing_up_is_found_cold():
     """The cart-pole, |f| <= 10 N: IPOPT finds 1.14568 s on the same equations, from the same start."""
     scene = nc.Scene()

@@ -197,7 +197,7 @@ def test_limits_hold_for_all_attempts(made):
     assert late.outcome is nc.Outcome.TIME_LIMIT
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_switch_within_a_step_is_told(made):
     """Of a turn in least time, halfway: in the middle of the middle step, if their number is odd."""
     options = {"cost": nc.cost.Duration(), "free_time": (0.1, 5.0), "steps": 11, "dt": 0.1}
@@ -230,7 +230,7 @@ def test_other_numbers_and_an_equal_scene_compile_nothing(made, monkeypatch):
 # Several starts, and paths
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_several_starts_are_tallied(made):
     found = nc.multi_start(turn(made, 20.0), starts=4, spread=3.0)
     assert len(found) == 1 and found.outcomes == [nc.Outcome.OPTIMAL] * 4

@@ -136,7 +136,7 @@ def test_a_ball_is_inflated():
     assert larger ** (1 / 3) - 1 == pytest.approx(stretch, rel=0.1)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_gradients_with_gas():
     """Of the volume by the pressure in statics, of a place by it in dynamics; V-shaped."""
     system, state, _, air = held_ball(2)

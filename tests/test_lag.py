@@ -36,7 +36,7 @@ NOISE = {"open_tree": 3e-14, "four_bar": 3e-14, "stiff_chain": 1e-12}
     "name",
     [
         "four_bar",
-        pytest.param("stiff_chain", marks=pytest.mark.slow),
+        pytest.param("stiff_chain", marks=pytest.mark.exhaustive),
         pytest.param("open_tree", marks=pytest.mark.exhaustive),
     ],
 )

@@ -113,6 +113,7 @@ def test_what_it_keeps(runs):
     assert np.ptp(turning, axis=0).max() <= tol.MOMENTUM_OF_A_SOLID * np.linalg.norm(turning[0])
 
 
+@pytest.mark.exhaustive
 def test_its_derivatives():
     """Of the end of a run by the bulk modulus, first and second, and beside the closed form."""
     slopes = []

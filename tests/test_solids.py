@@ -69,7 +69,8 @@ PAIRED = [("Brick", "elastic")]
 PAIRED += [(e, "elastic") for e in ELEMENTS if e != "Brick" and "P" not in e]
 PAIRED += [(e, "neo-Hooke") for e in ELEMENTS if e != "Brick"]
 PAIRED += [("Hexahedron8", law) for law in LAWS if law not in ("elastic", "neo-Hooke")]
-PAIRED += [("Hexahedron27P1", "Ogden"), ("Hexahedron27P1", "Gent"), ("Tetrahedron10P0", "Mooney-Rivlin")]
+PAIRED += [pytest.param("Hexahedron27P1", "Ogden", marks=pytest.mark.exhaustive)]
+PAIRED += [("Hexahedron27P1", "Gent"), ("Tetrahedron10P0", "Mooney-Rivlin")]
 
 
 def inner_moved(mesh, size):
@@ -387,10 +388,10 @@ FOAM = nc.CompressibleMooneyRivlin(c10=0.15, c01=0.05, density=1.0)
 RUBBER = nc.MooneyRivlin(c10=0.1, c01=0.06, bulk_modulus=50.0, density=1.0)
 THICK = [
     ("cylinder", "Tetrahedron10", SOFT, 0.15, 3.0),
-    ("cylinder", "Tetrahedron10P0", RUBBER, 0.1, 2.0),
     ("sphere", "Hexahedron8", SOFT, 0.15, 2.0),
 ]
 THICK_FOR_LONG = [
+    ("cylinder", "Tetrahedron10P0", RUBBER, 0.1, 2.0),
     ("cylinder", "Hexahedron8", SOFT, 0.15, 2.0),
     ("cylinder", "Hexahedron20", SOFT, 0.15, 3.0),
     ("cylinder", "Hexahedron27", FOAM, 0.15, 3.0),

@@ -88,7 +88,7 @@ def braked(brake, friction):
     return *scene.compile(), hinge
 
 
-@pytest.mark.parametrize("order", [2, pytest.param(4, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("order", [2, pytest.param(4, marks=pytest.mark.exhaustive)])
 def test_a_brake_is_put_on(order):
     """The motion is linear in the rate at the start: its angle is its own derivative by it."""
     system, state, hinge = braked(True, False)
@@ -143,7 +143,7 @@ def chain(links, solver):
 @pytest.mark.parametrize(
     "links, solver",
     [
-        pytest.param(3, "reduced", marks=pytest.mark.slow),
+        pytest.param(3, "reduced", marks=pytest.mark.exhaustive),
         pytest.param(4, "recursive", marks=pytest.mark.exhaustive),
         pytest.param(3, "full", marks=pytest.mark.exhaustive),
         pytest.param(3, "sparse", marks=pytest.mark.exhaustive),
