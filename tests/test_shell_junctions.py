@@ -94,7 +94,7 @@ def test_all_is_kept_through_what_is_joined(make, steps=1000):
     # repeated in parts there. In these the push's impulse is not known, so momenta are those of the flight.
     more = {"extra_substeps": 2000}
     push = nc.simulate(system, state, dt=dt, steps=int(np.ceil(2.0 / dt)), **more)
-    trajectory = nc.simulate(system, push.states[-1], dt=dt, steps=steps, **more)
+    trajectory = nc.simulate(system, push[-1], dt=dt, steps=steps, **more)
     assert nc.balance(system, push).energy.max() <= ENERGY
     found = nc.balance(system, trajectory)
     assert found.energy.max() <= ENERGY
