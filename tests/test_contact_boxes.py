@@ -19,7 +19,8 @@ TURNS = {
 LAWS = {
     "soft": {"stiffness": 2e4},
     "hard": {"restitution": 1.0},
-    "soft with friction": {"stiffness": 2e4, "friction": 0.3},
+    # Of a smaller radius edges overlap by two of them, and touch where their distance has no direction.
+    "soft with friction": {"stiffness": 2e4, "friction": 0.3, "rounding": 0.02},
     "hard with friction": {"restitution": 0.5, "friction": 0.3},
 }
 RESTS = {"restitution": 0.0, "friction": 0.5}
@@ -46,7 +47,7 @@ def test_a_box_falls_on_a_box(turn, law):
     system, state, brick = falling(TURNS[turn], LAWS[law])
     trajectory = nc.simulate(system, state, dt=2e-3, steps=200)
     found = nc.balance(system, trajectory)
-    assert found.energy.max() <= (1e-10 if law == "soft with friction" else tol.ENERGY_OF_A_SMALL_SCENE)
+    assert found.energy.max() <= tol.ENERGY_OF_A_SMALL_SCENE
     assert found.momentum.max() <= tol.MOMENTUM_OF_A_SMALL_SCENE
     assert found.angular_momentum.max() <= 10 * tol.MOMENTUM_OF_A_SMALL_SCENE
     energy = np.asarray(system.energy(trajectory).total)

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.core.state import State
 from natcoord_jax.linsolve.products import Products
-from natcoord_jax.maths.collocation import Tableau, gauss
+from natcoord_jax.maths.collocation import gauss
 from natcoord_jax.maths.projectors import range_projector
 from natcoord_jax.maths.vectors import cross
 from natcoord_jax.mechanics.block_tangent_space import Tangents
@@ -23,7 +23,6 @@ from natcoord_jax.mechanics.local import body_balance, body_motion, jacobians
 from natcoord_jax.mechanics.mass_between import pair_matrices
 from natcoord_jax.mechanics.momentum import least_inertias
 from natcoord_jax.mechanics.redundancy import (
-    at_every_stage,
     held_multipliers,
     project_multipliers,
 )
@@ -32,7 +31,7 @@ from natcoord_jax.mechanics.response import (
     stations,
 )
 from natcoord_jax.mechanics.spread import part_matrices, products
-from natcoord_jax.mechanics.start_cache import NOTHING, StartCache
+from natcoord_jax.mechanics.start_cache import NOTHING
 from natcoord_jax.mechanics.step_equations import StepEquations
 from natcoord_jax.model.groups import Group
 from natcoord_jax.model.local_rates import TWIST
@@ -54,25 +53,14 @@ class FullStep(StepEquations):
         return {"start": rows_with_ground(state.q)}
 
     @classmethod
-    def starting(
-        cls,
-        system: Model,
-        state: State,
-        tableau: Tableau,
-        tangents: Tangents | None = None,
-        later: bool = False,
-    ) -> StartCache:
-        """What a step needs of its start, see `StartCache.of`."""
-        projector, rank = None, system.structure.rank
-        if rank is not None:
-            no_inputs = jnp.zeros(len(system.structure.inputs), state.q.dtype)
-            resting = cls.prepare(system, state, no_inputs, jnp.zeros((), state.q.dtype), gauss(1), NOTHING)
-            matrix = resting.jacobian(jnp.zeros(resting.unknowns, state.q.dtype))
-            rows = matrix[resting.balances :, : resting.balances][held_multipliers(resting.groups)]
-            in_tree = sum(g.count * g.multipliers for g in system.joints if g.in_tree)
-            projector = range_projector(rows, rank + in_tree)
-            projector = at_every_stage(projector, resting.groups, tableau.stages)
-        return StartCache.of(system, state, tableau, projector, tangents, later)
+    def held_range(cls, system: Model, state: State, rank: int, tangents: Tangents | None) -> Array:
+        """From the rows of the Jacobian of a step of no length."""
+        no_inputs = jnp.zeros(len(system.structure.inputs), state.q.dtype)
+        resting = cls.prepare(system, state, no_inputs, jnp.zeros((), state.q.dtype), gauss(1), NOTHING)
+        matrix = resting.jacobian(jnp.zeros(resting.unknowns, state.q.dtype))
+        rows = matrix[resting.balances :, : resting.balances][held_multipliers(resting.groups)]
+        in_tree = sum(g.count * g.multipliers for g in system.joints if g.in_tree)
+        return range_projector(rows, rank + in_tree)
 
     @property
     def bodies(self) -> int:
@@ -94,7 +82,7 @@ class FullStep(StepEquations):
         points, directors = motion.rows[:, :, 0], motion.rows[:, :, 1:]
         return stations(self.start[:-1], points, directors, motion.rates[:, :, 0], motion.spin), None
 
-    def balance(
+    def generalised(
         self, geometry: None, force: Float[Array, "s bodies 3"], torque: Float[Array, "s bodies 3"]
     ) -> Float[Array, " balances"]:
         """Wrenches along the rates of every body."""

@@ -15,14 +15,13 @@ from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
 from natcoord_jax.linsolve.dense import Inverse
 from natcoord_jax.linsolve.stages import fitted, stagewise_inverse
-from natcoord_jax.maths.collocation import Tableau, gauss
+from natcoord_jax.maths.collocation import gauss
 from natcoord_jax.maths.projectors import range_projector
 from natcoord_jax.maths.vectors import dot
 from natcoord_jax.mechanics.block_tangent_space import Tangents, tangents_at
 from natcoord_jax.mechanics.equations_of_motion import constraint_matrix
 from natcoord_jax.mechanics.momentum import least_inertias
 from natcoord_jax.mechanics.redundancy import (
-    at_every_stage,
     contact_mobilities,
     places_by_stage,
 )
@@ -31,7 +30,7 @@ from natcoord_jax.mechanics.response import (
     body_rows,
     stations,
 )
-from natcoord_jax.mechanics.start_cache import NOTHING, StartCache
+from natcoord_jax.mechanics.start_cache import NOTHING
 from natcoord_jax.mechanics.step_equations import StepEquations
 from natcoord_jax.mechanics.sweeps import sweep_motion, turned_directors
 from natcoord_jax.mechanics.tangent_space import TangentSpace
@@ -82,23 +81,11 @@ class ReducedStep(StepEquations):
         return {"start": body_rows(state.q), "frames": system.tree.frames(system.frames)}
 
     @classmethod
-    def starting(
-        cls,
-        system: Model,
-        state: State,
-        tableau: Tableau,
-        tangents: Tangents | None = None,
-        later: bool = False,
-    ) -> StartCache:
-        """What a step needs of its start, see `StartCache.of`."""
-        projector, rank = None, system.structure.rank
-        if rank is not None:
-            if isinstance(tangents, TangentSpace) and tangents.admissible.range is not None:
-                projector = tangents.admissible.range
-            else:
-                projector = range_projector(constraint_matrix(system, state), rank)
-            projector = at_every_stage(projector, active_groups(system), tableau.stages)
-        return StartCache.of(system, state, tableau, projector, tangents, later)
+    def held_range(cls, system: Model, state: State, rank: int, tangents: Tangents | None) -> Array:
+        """That of the tangent space, if it is known."""
+        if isinstance(tangents, TangentSpace) and tangents.admissible.range is not None:
+            return tangents.admissible.range
+        return range_projector(constraint_matrix(system, state), rank)
 
     @property
     def balances(self) -> int:
@@ -116,12 +103,6 @@ class ReducedStep(StepEquations):
         if self.tableau.variational:
             return replace_fields(at, force_rows=at.start[None]), at_rest(self).motion(w)[1]
         return at, geometry
-
-    def balance(
-        self, geometry: Any, force: Float[Array, "s bodies 3"], torque: Float[Array, "s bodies 3"]
-    ) -> Float[Array, " balances"]:
-        """Those of the tree, stage by stage."""
-        return self.generalised(geometry, force, torque).reshape(-1)
 
     def motion(self, w: Float[Array, "s unknowns"]) -> tuple[TreeMotion, Any]:
         """Stage motion of the bodies at given rates, and the geometry of the joints."""

@@ -21,7 +21,7 @@ from natcoord_jax.mechanics.form import Form
 from natcoord_jax.mechanics.grain import cancelling_size
 from natcoord_jax.mechanics.kick import kicked
 from natcoord_jax.mechanics.momentum import momentum_balance
-from natcoord_jax.mechanics.redundancy import project_multipliers, project_rows
+from natcoord_jax.mechanics.redundancy import at_every_stage, project_multipliers, project_rows
 from natcoord_jax.mechanics.response import Evaluation, GroupData, StageKinematics, body_rows, situation
 from natcoord_jax.mechanics.start_cache import StartCache
 from natcoord_jax.model.groups import Group
@@ -96,6 +96,10 @@ class StepEquations(Form):
 
     @classmethod
     @abstractmethod
+    def held_range(cls, system: Model, state: State, rank: int, tangents: Tangents | None) -> Array:
+        """Projector on the range of the constraints of one stage, which depend on each other."""
+
+    @classmethod
     def starting(
         cls,
         system: Model,
@@ -105,6 +109,11 @@ class StepEquations(Form):
         later: bool = False,
     ) -> StartCache:
         """What a step needs of its start, see `StartCache.of`."""
+        projector, rank = None, system.structure.rank
+        if rank is not None:
+            projector = cls.held_range(system, state, rank, tangents)
+            projector = at_every_stage(projector, cls.groups_of(system), tableau.stages)
+        return StartCache.of(system, state, tableau, projector, tangents, later)
 
     @property
     @abstractmethod
@@ -117,13 +126,16 @@ class StepEquations(Form):
 
     @abstractmethod
     def moved(self, w: Array) -> tuple[StageKinematics, Any]:
-        """Motion at given rates as the effects see it, and the geometry that `balance` asks for."""
+        """Motion at given rates as the effects see it, and the geometry that `generalised` asks for."""
 
     @abstractmethod
-    def balance(
+    def generalised(
         self, geometry: Any, force: Float[Array, "s bodies 3"], torque: Float[Array, "s bodies 3"]
-    ) -> Float[Array, " balances"]:
-        """Generalised forces of the free motions from forces and torques at the reference points."""
+    ) -> Array:
+        """Generalised forces of the free motions from forces and torques at the reference points.
+
+        In the order of the balances.
+        """
 
     @property
     def groups(self) -> tuple[Group, ...]:
@@ -179,9 +191,9 @@ class StepEquations(Form):
             asked = situations, multipliers
         given = self.system, self.groups, situations, at, velocity
         found = momentum_balance(*given, multipliers, self.h, tableau)
-        balance = self.balance(geometry, found.force, found.torque)
+        balances = self.generalised(geometry, found.force, found.torque).reshape(-1)
         rows = project_rows(found.rows, y, self.balances, cache.projector)
-        residual = jnp.concatenate([balance, rows])
+        residual = jnp.concatenate([balances, rows])
         return Evaluation(residual, found.size, at, found.power, (found.force, found.torque), kick, asked)
 
     def damped(self, at: StageKinematics) -> Damped:

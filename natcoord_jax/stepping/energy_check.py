@@ -91,5 +91,5 @@ def sound(
     rows = before.q.reshape(-1, 4, 3)
     places = jnp.sum(rows * inertia(system, rows))
     near = (equations.h * correction) ** 2 <= PLACES**2 * places
-    near = near | (correction <= RESTING * grain + UNFELT / ROUNDING * rounding)
+    near = near | (correction <= RESTING * grain + UNFELT * size)
     return near | (unbalanced_work(equations, y, residual) <= allowed)
