@@ -323,3 +323,21 @@ def test_a_batch_has_the_balances_of_its_lanes():
     assert found.energy.shape == found.momentum.shape == (2, 4) and found.axes == 3
     for k in range(2):
         np.testing.assert_array_equal(found.angular_momentum[k], nc.balance(system, runs[k]).angular_momentum)
+
+
+@pytest.mark.parametrize("weight", [0.0, 9.81])
+def test_momenta_are_judged_where_not_every_step_is_there(weight):
+    """Where only internal forces act: their resultants are rounding. Impulses of others are not known."""
+    scene = nc.Scene()
+    scene.add(nc.Gravity(vector=(0, 0, -weight)))
+    one = scene.add(nc.RigidBody(mass=1.0, inertia=(0.1, 0.2, 0.2), angular_velocity=(1, 0, 2)))
+    other = scene.add(nc.RigidBody(mass=2.0, inertia=(0.1, 0.2, 0.2), position=(1, 0, 0), velocity=(0, 1, 0)))
+    scene.add(nc.Spring((nc.Point(one, (0.1, 0.2, 0)), nc.Point(other)), stiffness=50.0))
+    system, state = scene.compile()
+    found = nc.balance(system, nc.simulate(system, state, dt=DT, steps=100, save_every=5))
+    assert found.energy.max() <= tol.ENERGY_OF_A_SMALL_SCENE
+    if weight:
+        assert found.momentum is None and "not every step" in found.note
+    else:
+        assert found.momentum.max() <= tol.MOMENTUM_OF_A_SMALL_SCENE and found.directions == 3
+        assert found.angular_momentum.max() <= tol.MOMENTUM_OF_A_SMALL_SCENE and found.axes == 3

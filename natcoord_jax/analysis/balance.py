@@ -28,6 +28,9 @@ from natcoord_jax.model.groups import Group
 from natcoord_jax.model.model import SYSTEM
 from natcoord_jax.system import System
 
+INTERNAL = 1e-12
+"""Impulse in a step, relative to the momenta of the bodies, up to which what acts has no resultant."""
+
 REACTION_FREE = 1e-12
 """A rigid motion counts as free of reactions when their mean square power is below this share: far above the
 round-off of the eigenvalues, and with 1e-6 in amplitude far below any real constraint."""
@@ -142,6 +145,12 @@ def _free_motions(gram: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return mix.T[~turning] @ free, (mix.T[turning] @ free) / rates[turning, None]
 
 
+def _acted_on(account: dict[str, Any]) -> bool:
+    """Whether what is known to act has a resultant: that of internal forces is rounding."""
+    scales = np.repeat([np.max(account["momentum_scale"]), np.max(account["angular_scale"])], 3)
+    return bool(np.any(np.abs(account["impulses"]) > INTERNAL * scales))
+
+
 def _relative(error: np.ndarray, scale: float) -> np.ndarray:
     return error / scale if scale > 0 else np.zeros_like(error)
 
@@ -193,7 +202,7 @@ def balance(system: System, trajectory: Trajectory) -> Balance:
         return Balance(np.zeros(1), np.zeros(1), np.zeros(1), 3, 3, "no step was made")
     account = jax.tree.map(np.asarray, _account(system, trajectory))
     energy = _relative(np.abs(account["energy"]), np.max(account["energy_scale"]))
-    if int(trajectory.steps_taken) > saved - 1 and np.any(account["impulses"]):
+    if int(trajectory.steps_taken) > saved - 1 and _acted_on(account):
         return Balance(energy, None, None, 0, 0, "momenta: not every step is in the trajectory")
     impulse = np.concatenate([np.zeros((1, 6)), np.cumsum(account["impulses"], axis=0)])
     change = account["momenta"] - account["momenta"][0] - impulse
