@@ -154,7 +154,11 @@ def test_derivatives_through_an_impact_of_edges():
     ("shapes", "given", "message"),
     [
         ([nc.Box((1, 1, 0.1))] * 2, {"rounding": 0.05}, r"rounding \[m\] is 0.05, but .* as short as 0.1 m"),
-        ([nc.Sphere(0.1), nc.Box((1, 1, 1))], {"rounding": 0.01}, "is that of the edges of two boxes"),
+        (
+            [nc.Sphere(0.1), nc.Box((1, 1, 1))],
+            {"rounding": 0.01},
+            "rounding is an option of the edges of two boxes; leave",
+        ),
     ],
 )
 def test_rounding_that_is_refused(shapes, given, message):

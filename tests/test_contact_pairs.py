@@ -117,3 +117,11 @@ def test_too_many_pairs_are_refused():
         scene.add(nc.Contact(all_pairs_of=many[2:]))
     with pytest.raises(ValueError, match="are points, which do not overlap"):
         scene.add(nc.Contact(all_pairs_of=many[:2]))
+
+
+@pytest.mark.parametrize("option", [{"candidates": 4}, {"one_pass": True}])
+def test_options_of_surfaces_are_refused_where_none_touch(option):
+    scene = nc.Scene()
+    found = bodies(scene, 2)
+    with pytest.raises(ValueError, match="is an option of two surfaces; leave it out"):
+        scene.add(nc.Contact(all_pairs_of=found, **option))

@@ -39,8 +39,8 @@ from natcoord_jax.effects.contact import (
     SphereOnSphere,
 )
 
-OF_SURFACES = "candidates", "one_pass"
-"""Options that contacts of other sides have no use for."""
+OF_SOME = {"rounding": "the edges of two boxes", "candidates": "two surfaces", "one_pass": "two surfaces"}
+"""Options that contacts of other sides have no use for, and whose they are."""
 
 OF_CONSTRAINTS = "restitution", "friction"
 """Options of contacts without a stiffness."""
@@ -110,9 +110,9 @@ def gaps_within(beam: Side, law: Law, name: str) -> Gaps:
 
 def _kept_open(gap: Gap, markers: tuple[Marker, ...], law: Law, name: str, *sides: Side) -> Any:
     """A potential with the stiffness that is given or that of the sides; a constraint where there is none."""
-    law = {key: value for key, value in law.items() if key not in OF_SURFACES}
-    if "rounding" in law:
-        raise ValueError(f"contact {name!r}: rounding [m] is that of the edges of two boxes; leave it out")
+    law = dict(law)
+    for option in OF_SOME.keys() & law:
+        raise ValueError(f"contact {name!r}: {option} is an option of {OF_SOME[option]}; leave it out")
     balls = [s for s in sides if isinstance(s, SegmentSide)]
     own = [s.stiffness for s in balls if s.stiffness is not None]
     given = law.pop("stiffness")
