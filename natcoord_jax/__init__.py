@@ -130,6 +130,7 @@ from natcoord_jax.effects.contact import (
     SphereOnPlane,
     SphereOnSphere,
 )
+from natcoord_jax.effects.fibres import TransverselyIsotropic
 from natcoord_jax.effects.hyperelastic import Hyperelastic
 from natcoord_jax.effects.joints import (
     Coupling,
@@ -158,13 +159,7 @@ from natcoord_jax.effects.loads import (
     PointForce,
 )
 from natcoord_jax.effects.materials import Elastic
-from natcoord_jax.effects.rubber import (
-    CompressibleMooneyRivlin,
-    MooneyRivlin,
-    NeoHooke,
-    Ogden,
-    TransverselyIsotropic,
-)
+from natcoord_jax.effects.rubber import CompressibleMooneyRivlin, MooneyRivlin, NeoHooke, Ogden
 from natcoord_jax.effects.shells import MembraneElement, MembraneTriangle, ShellElement, ShellTriangle
 from natcoord_jax.effects.solids import (
     Brick,

@@ -1,8 +1,6 @@
 """The scene: bodies, joints and effects by name, and their compilation to a system and a state."""
 
-import dataclasses
 import itertools
-import warnings
 from typing import Any
 
 import equinox as eqx
@@ -26,15 +24,8 @@ from natcoord_jax.core.nodes import Clamp, NodeSet
 from natcoord_jax.core.numeric import COMPONENTS, Number, Numbers
 from natcoord_jax.core.recipe import Recipe
 from natcoord_jax.core.state import State
-from natcoord_jax.stepping.admissibility import (
-    admitted,
-    check_gaps,
-    check_inertia,
-    find_redundancy,
-    project_velocities,
-)
 from natcoord_jax.stepping.assemble import assemble as assemble_state
-from natcoord_jax.stepping.sparsity import with_sparsity
+from natcoord_jax.stepping.prepared import prepared
 from natcoord_jax.system import System
 
 PART = of(
@@ -294,43 +285,4 @@ class Scene:
         state = state.at_time(t)
         if assemble:
             state = assemble_state(system, state)
-        if not is_concrete(system, state):
-            state = state if assemble else admitted(system, state)
-            return with_sparsity(system, state) if system.structure.solver == "sparse" else system, state
-        check_inertia(system, state)
-        if not assemble:
-            check_gaps(system, state)
-            state = project_velocities(system, state)
-        rank, redundant = find_redundancy(system, state)
-        if redundant and system.structure.solver == "sparse":
-            # Dependent constraints are projected out of a dense matrix.
-            dense = dataclasses.replace(system.structure, solver="full")
-            system = replace_fields(system, structure=dense)
-        notes = size_notes(system)
-        for note in notes:
-            warnings.warn(note, stacklevel=2)
-        structure = dataclasses.replace(
-            system.structure,
-            dofs=system.structure.unknowns - rank,
-            redundant=redundant,
-            notes=notes,
-            rank=rank if redundant else None,
-        )
-        system = replace_fields(system, structure=structure)
-        return with_sparsity(system, state) if structure.solver == "sparse" else system, state
-
-
-DENSE_LIMIT = 300
-"""Unknowns beyond which a dense solution is worth a warning."""
-
-
-def size_notes(system: System) -> tuple[str, ...]:
-    """Warnings about the cost of a system."""
-    structure = system.structure
-    unknowns = 6 * len(structure.bodies) + sum(g.count * g.multipliers for g in system.joints)
-    if structure.solver == "full" and unknowns > DENSE_LIMIT:
-        return (
-            f"{unknowns} unknowns in loops or couplings across the tree are solved densely: time per step "
-            "grows with the third power of their number",
-        )
-    return ()
+        return prepared(system, state, assembled=assemble)

@@ -13,7 +13,8 @@ import tolerances as tol
 
 import natcoord_jax as nc
 from natcoord_jax import cli, gallery
-from natcoord_jax.analysis.accuracy import FALLING, FLAT, ROUND_OFF, SAMPLES, Accuracy, Row, drift, note_of
+from natcoord_jax.analysis.accuracy import FALLING, FLAT, ROUND_OFF, SAMPLES, drift, note_of
+from natcoord_jax.analysis.accuracy_table import Accuracy, Row
 
 
 @cache

@@ -11,8 +11,9 @@ import pytest
 import tolerances as tol
 
 import natcoord_jax as nc
-from natcoord_jax.core.effect import Effect, Motion, StepContext, replace_fields
+from natcoord_jax.core.effect import Effect, replace_fields
 from natcoord_jax.core.gradient import gradient_of
+from natcoord_jax.core.motion import Motion, StepContext
 from natcoord_jax.core.potential import Potential, place_markers
 from natcoord_jax.maths.collocation import gauss
 from natcoord_jax.maths.rotations import arctan_coefficients, from_rotation_vector

@@ -70,12 +70,6 @@ HEAVY = ("matplotlib", "mujoco", "optax", "scipy.optimize")
 
 LONGEST, LONGEST_FUNCTION = 300, 50
 """Lines of a file, and of a function without its docstring."""
-LONGER = {
-    "analysis/accuracy.py", "analysis/statics.py", "bodies/continua.py", "core/coordinate.py",
-    "core/effect.py", "effects/rubber.py",
-    "model/layout.py", "reading/sensors.py", "scene.py", "stepping/derivative.py", "xla/rewriting.py",
-}  # fmt: skip
-"""Files that are longer still; none joins them, and what was cut leaves the list."""
 LONGER_FUNCTIONS = {
     "_by_rounds", "_curved", "after_attempt", "arm", "averaged_gradient", "build", "concluded",
     "conjugate_residuals", "continuation", "costates", "descend", "end_of_step", "factored", "improved",
@@ -200,7 +194,7 @@ def test_floors(file: Path):
 
 
 def test_files_and_functions_can_be_read_at_once():
-    """Long ones are known by name; the list only shrinks."""
+    """No file is long; long functions are known by name, and the list only shrinks."""
     files, functions = set(), set()
     for file in FILES:
         text = file.read_text("utf-8")
@@ -212,9 +206,7 @@ def test_files_and_functions_can_be_read_at_once():
                 lines = (node.end_lineno or 0) - node.lineno + 1
                 if lines - (told.count("\n") + 1 if told else 0) > LONGEST_FUNCTION:
                     functions.add(node.name)
-    long, short = files - LONGER, LONGER - files
-    assert not long, f"split these files, of more than {LONGEST} lines: {sorted(long)}"
-    assert not short, f"no longer longer than {LONGEST} lines, so they leave LONGER: {sorted(short)}"
+    assert not files, f"split these files, of more than {LONGEST} lines: {sorted(files)}"
     long, short = functions - LONGER_FUNCTIONS, LONGER_FUNCTIONS - functions
     assert not long, f"split these functions, of more than {LONGEST_FUNCTION} lines: {sorted(long)}"
     assert not short, (

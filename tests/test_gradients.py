@@ -18,9 +18,10 @@ from differences import assert_v_shaped
 import natcoord_jax as nc
 from natcoord_jax import gallery
 from natcoord_jax.stepping.backward import Backward
-from natcoord_jax.stepping.derivative import CHUNK, Rule, run_slots
+from natcoord_jax.stepping.derivative import Rule, run_slots
 from natcoord_jax.stepping.newton import TOLERANCE
 from natcoord_jax.stepping.plan import Plan
+from natcoord_jax.stepping.slot_chunks import CHUNK
 from natcoord_jax.stepping.step import advance
 
 STEPS = 12

@@ -21,7 +21,7 @@ import natcoord_jax as nc
 from natcoord_jax.maths.collocation import gauss
 from natcoord_jax.mechanics.equations import prepare
 from natcoord_jax.mechanics.reduced import ReducedStep
-from natcoord_jax.xla import one_kernel, rewriting
+from natcoord_jax.xla import expansions, one_kernel
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "natcoord_jax" / "effects"
@@ -193,8 +193,8 @@ def test_program_size_does_not_grow_with_bodies(solver, monkeypatch):
     # middle length in two or a few pieces; and programs of large arrays are left as they are.
     jax.clear_caches()
     monkeypatch.setattr(one_kernel, "WIDE", np.inf)
-    monkeypatch.setattr(rewriting, "REDUCTION_LIMIT", np.inf)
-    monkeypatch.setattr(rewriting, "FEW", 0)
+    monkeypatch.setattr(expansions, "REDUCTION_LIMIT", np.inf)
+    monkeypatch.setattr(expansions, "FEW", 0)
     lines = sizes((8, 40))
     assert abs(lines[40] - lines[8]) <= 0.01 * lines[8], f"lines by number of arms: {lines}"
 

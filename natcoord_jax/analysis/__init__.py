@@ -1,6 +1,7 @@
 """What is computed from systems and trajectories after a run."""
 
-from natcoord_jax.analysis.accuracy import Accuracy, accuracy
+from natcoord_jax.analysis.accuracy import accuracy
+from natcoord_jax.analysis.accuracy_table import Accuracy
 from natcoord_jax.analysis.balance import Balance, balance
 from natcoord_jax.analysis.contacts import Contacts, contacts
 from natcoord_jax.analysis.growth import Growth, tangent_growth

@@ -9,15 +9,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from natcoord_jax.analysis.static_equations import Static
-from natcoord_jax.analysis.statics import (
+from natcoord_jax.analysis.static_search import (
     FLOOR,
     ITERATIONS,
     TOLERANCE,
-    Equilibrium,
-    differentiable,
     extent_of,
     largest,
 )
+from natcoord_jax.analysis.statics import Equilibrium, differentiable
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.callables import Function
 from natcoord_jax.core.checks import as_array, at_top_level, is_concrete, positive

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from natcoord_jax.analysis.static_equations import Static
+from natcoord_jax.analysis.static_search import code_of_search, search_equilibrium
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.checks import at_top_level, is_concrete
 from natcoord_jax.core.compiled import briefly
@@ -21,27 +22,6 @@ from natcoord_jax.mechanics.inversion import code_of
 from natcoord_jax.mechanics.violations import refuse_contacts
 from natcoord_jax.model.model import SYSTEM
 from natcoord_jax.system import System
-
-ITERATIONS = 40
-"""Newton iterations for one load."""
-
-DOWNHILL = 400
-"""Further iterations with inertia where those have failed."""
-
-SHORT, LONG = 0.1, 0.4
-"""Corrections (relative to the extent; radians) below which inertia fades, and above which it grows."""
-
-NO_WEIGHT = 1e-9
-"""Part of the first inertia that no longer slows Newton's method."""
-
-LARGEST_TURN = 0.5
-"""Largest Cayley vector of a body in one iteration: about one radian."""
-
-TOLERANCE = 1e-11
-"""Last correction, relative to the extent of the system and to one radian; the error is its square."""
-
-FLOOR = 1e-7
-"""Corrections that stop shrinking below this have reached the floor of round-off of a stiff system."""
 
 INPUTS_OF_LOAD = Numbers(("...", None)) | FunctionOf("of the load parameter to the inputs (inputs,)")
 
@@ -72,79 +52,6 @@ class Equilibrium(eqx.Module):
     def state(self) -> State:
         """The last state."""
         return jax.tree.map(lambda x: x[-1], self.states)
-
-
-class _Search(eqx.Module):
-    """Where Newton's iteration stands.
-
-    Of the inertia added to the stiffness, `weight` [1/s^2] is what is added, `heaviest` what it begins with.
-    """
-
-    state: State
-    lam: Array
-    weight: Array
-    heaviest: Array
-    correction: Array
-    count: Array
-    done: Array
-
-
-def extent_of(system: System, state: State) -> Array:
-    """Extent of the system with the ground's origin [m]; never zero."""
-    points = jnp.max(jnp.abs(state.q.reshape(-1, 4, 3)[:, 0]), initial=0.0)
-    moment = jnp.sum(jnp.trace(system.mass[:, 1:, 1:], axis1=1, axis2=2)) / jnp.sum(system.mass[:, 0, 0])
-    return points + jnp.where(moment > 0, jnp.sqrt(jnp.where(moment > 0, moment, 1.0)), 1e-300)
-
-
-def largest(system: System, change: Float[Array, " balances"], extent: Array) -> tuple[Array, Array]:
-    """Largest displacement relative to the extent, and largest rotation."""
-    moved, turned = (jnp.max(jnp.abs(x), initial=0.0) for x in system.local_rates.parts(change))
-    return moved / extent, turned
-
-
-def _solve(system: System, state: State, lam: Array, inputs: Array) -> _Search:
-    """Newton's method from a configuration and multipliers; every iteration counts from where it is.
-
-    Where it fails, it begins again with inertia added to the stiffness, which keeps corrections short and
-    leads downhill, to a stable equilibrium, as time steps with all velocities forgotten would; the inertia
-    fades as corrections do (pseudo-transient continuation).
-    """
-    extent = extent_of(system, state)
-
-    def trip(search: _Search) -> _Search:
-        static, slowed = Static(system, search.state, inputs), search.weight > 0
-        y = jnp.concatenate([jnp.zeros(static.balances), search.lam])
-        residual = static.residual(y)
-        pull = jnp.max(jnp.abs(residual[: static.balances]))
-        begun = pull / (jnp.mean(system.mass[:, 0, 0]) * SHORT * extent)
-        heaviest = jnp.where(search.count == 0, begun, search.heaviest)
-        change = -static.solver(y, search.weight).solve(residual)
-        moved, turned = largest(system, change[: static.balances], extent)
-        correction = jnp.maximum(moved, turned)
-        finite = jnp.all(jnp.isfinite(change))
-        # No body moves or turns too far at once: shortened, or repeated with more inertia.
-        too_far = ~finite | (slowed & (correction > LONG))
-        allowed = jnp.minimum(2 * LARGEST_TURN / jnp.maximum(turned, 1e-300), 1 / jnp.maximum(moved, 1e-300))
-        short = jnp.where(slowed, 1.0, jnp.minimum(1.0, allowed))
-        stalled = (search.count > 0) & (correction > 0.5 * search.correction) & (correction <= FLOOR)
-        free = search.weight <= NO_WEIGHT * heaviest
-        done = ((correction <= TOLERANCE) | stalled) & (short == 1.0) & finite & free
-        after = static.moved_along_tree(short * change), search.lam + short * change[static.balances :]
-        after = jax.tree.map(lambda a, b: jnp.where(too_far, a, b), (search.state, search.lam), after)
-        lighter = jnp.where(correction < SHORT, 0.25, 1.0)
-        weight = search.weight * jnp.where(too_far, 4.0, lighter)
-        lost = ~slowed & ~done & (~finite | (search.count + 1 >= ITERATIONS))
-        now, pulls = jax.tree.map(lambda a, b: jnp.where(lost, a, b), (state, lam), after)
-        weight = jnp.where(lost, heaviest, weight)
-        return _Search(now, pulls, weight, heaviest, correction, search.count + 1, done)
-
-    nought = jnp.zeros(())
-    start = _Search(state, lam, nought, nought, nought, jnp.array(0), jnp.array(False))
-    return jax.lax.while_loop(lambda s: ~s.done & (s.count < ITERATIONS + DOWNHILL), trip, start)
-
-
-def _code(search: _Search) -> Array:
-    return jnp.where(search.done, int(Result.SUCCESSFUL), int(Result.MAX_ITERATIONS))
 
 
 def differentiable(system: System, state: State, lam: Array, inputs: Array) -> tuple[State, Array]:
@@ -288,8 +195,8 @@ def _equilibria(
         value, u = load
         # Loads belong to the search as well; `differentiable` is given them again.
         begin = replace_fields(now, t=jax.lax.stop_gradient(value))
-        search = _solve(still[0], begin, lam, jax.lax.stop_gradient(u))
-        code = code_of(still[0], search.state, _code(search))
+        search = search_equilibrium(still[0], begin, lam, jax.lax.stop_gradient(u))
+        code = code_of(still[0], search.state, code_of_search(search))
         code = jnp.where(alive, code, int(Result.DIVERGED))
         good = code == int(Result.SUCCESSFUL)
         reached = jax.tree.map(lambda a, b: jnp.where(good, a, b), (search.state, search.lam), (now, lam))

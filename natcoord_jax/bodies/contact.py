@@ -9,7 +9,7 @@ from natcoord_jax.bodies.beam import BeamHandle
 from natcoord_jax.bodies.contact_gaps import gaps_between, gaps_within
 from natcoord_jax.bodies.contact_sides import BeamSide, BodySide, MeshSide, PlaneSide, SegmentSide, Side
 from natcoord_jax.bodies.contact_sides import Plane as Plane
-from natcoord_jax.bodies.continua import MeshHandle, Surface
+from natcoord_jax.bodies.mesh_handle import MeshHandle, Surface
 from natcoord_jax.bodies.shapes import Box, Capsule, Cylinder, Ellipsoid, Sphere
 from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.bodies import Body

@@ -17,7 +17,7 @@ from natcoord_jax.bodies.contact_sides import (
     Side,
     Strand,
 )
-from natcoord_jax.bodies.continua import Surface
+from natcoord_jax.bodies.mesh_handle import Surface
 from natcoord_jax.bodies.node_surface import surface_gaps
 from natcoord_jax.bodies.shapes import CORNERS, Box, Capsule, Cylinder, Ellipsoid, Sphere
 from natcoord_jax.core.checks import as_array, is_concrete

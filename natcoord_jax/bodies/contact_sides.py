@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.bodies.beam import BeamHandle
-from natcoord_jax.bodies.continua import Surface
+from natcoord_jax.bodies.mesh_handle import Surface
 from natcoord_jax.bodies.shapes import Capsule, Shape, Sphere
 from natcoord_jax.core.arguments import Part, is_a
 from natcoord_jax.core.checks import as_array, is_concrete

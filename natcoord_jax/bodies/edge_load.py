@@ -5,7 +5,7 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
-from natcoord_jax.bodies.continua import Edge
+from natcoord_jax.bodies.mesh_handle import Edge
 from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.kinds import FLAG, NAME, of

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int
 
-from natcoord_jax.bodies.continua import MeshHandle
+from natcoord_jax.bodies.mesh_handle import MeshHandle
 from natcoord_jax.bodies.surface_load import SURFACE
 from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.checks import is_concrete

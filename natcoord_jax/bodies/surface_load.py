@@ -4,7 +4,7 @@ from typing import Any
 
 import equinox as eqx
 
-from natcoord_jax.bodies.continua import MeshHandle, Surface
+from natcoord_jax.bodies.mesh_handle import MeshHandle, Surface
 from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.kinds import NAME, FunctionOf, of

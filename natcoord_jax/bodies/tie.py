@@ -5,7 +5,7 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
-from natcoord_jax.bodies.continua import Surface
+from natcoord_jax.bodies.mesh_handle import Surface
 from natcoord_jax.bodies.mortar import overlap
 from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.cells import pieces

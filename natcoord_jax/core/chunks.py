@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from natcoord_jax.core.effect import Motion, StepContext, replace_fields
+from natcoord_jax.core.effect import replace_fields
+from natcoord_jax.core.motion import Motion, StepContext
 
 PIECE = 64
 """Largest number of instances in a piece."""

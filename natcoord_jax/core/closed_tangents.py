@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from natcoord_jax.core.effect import Motion, StepContext
+from natcoord_jax.core.motion import Motion, StepContext
 from natcoord_jax.core.together import instances_last, place_together
 from natcoord_jax.maths.vectors import cross
 

@@ -12,11 +12,12 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.checks import equations
-from natcoord_jax.core.effect import Effect, Motion, Response, StepContext, replace_fields
+from natcoord_jax.core.effect import Effect, replace_fields
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.joint import Joint
 from natcoord_jax.core.kinds import NAME
 from natcoord_jax.core.markers import Attachment, Marker, Markers
+from natcoord_jax.core.motion import Motion, Response, StepContext
 from natcoord_jax.core.potential import marker_response, place_markers
 
 FREE, RESTING = 1, 2

@@ -16,9 +16,10 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.checks import equations
-from natcoord_jax.core.effect import Effect, Motion, Response, StepContext
+from natcoord_jax.core.effect import Effect
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.kinds import BODY, NAME
+from natcoord_jax.core.motion import Motion, Response, StepContext
 from natcoord_jax.core.numeric import COMPONENTS, Directions
 
 

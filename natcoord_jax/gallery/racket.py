@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 import natcoord_jax as nc
-from natcoord_jax.bodies.continua import MeshHandle, Surface
+from natcoord_jax.bodies.mesh_handle import MeshHandle, Surface
 from natcoord_jax.core.checks import as_array
 from natcoord_jax.core.effect import replace_fields
 

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 import natcoord_jax as nc
-from natcoord_jax.bodies.continua import MeshHandle
+from natcoord_jax.bodies.mesh_handle import MeshHandle
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.gallery.racket import (
     RADIUS,

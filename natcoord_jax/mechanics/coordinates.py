@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.core.coordinate import pair_motion
-from natcoord_jax.core.effect import Motion
 from natcoord_jax.core.joint import Frame, frames_at
+from natcoord_jax.core.motion import Motion
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.rotations import angular_velocity
 from natcoord_jax.mechanics.response import StageKinematics

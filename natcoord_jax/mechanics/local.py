@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from natcoord_jax.core.effect import Motion, Response, StepContext
+from natcoord_jax.core.motion import Motion, Response, StepContext
 from natcoord_jax.maths.collocation import Tableau, rotate_stages
 from natcoord_jax.maths.vectors import cross
 from natcoord_jax.mechanics.momentum import inertia_alone, stage_changes

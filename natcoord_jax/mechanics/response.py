@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from natcoord_jax.core.effect import Motion, Response, StepContext, replace_fields
+from natcoord_jax.core.effect import replace_fields
+from natcoord_jax.core.motion import Motion, Response, StepContext
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import Tableau
 from natcoord_jax.maths.vectors import cross

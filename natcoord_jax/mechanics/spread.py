@@ -5,7 +5,7 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from natcoord_jax.core.effect import SpreadTangents, StepContext
+from natcoord_jax.core.motion import SpreadTangents, StepContext
 from natcoord_jax.linsolve.products import Products
 from natcoord_jax.mechanics.element_matrices import bodies_of_elements, rates_of
 from natcoord_jax.mechanics.local import body_motion, whole

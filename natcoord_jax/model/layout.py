@@ -2,10 +2,8 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import pairwise
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
@@ -22,40 +20,15 @@ from natcoord_jax.core.names import names_of
 from natcoord_jax.core.potential import place_markers
 from natcoord_jax.core.state import State
 from natcoord_jax.model.assembled_poses import Poses, check_joint, joint_frames, joint_triad
+from natcoord_jax.model.assembled_rows import padded, rows_and_velocities, rows_of_poses, with_masses
 from natcoord_jax.model.bodies import Bodies
+from natcoord_jax.model.edges import coupled_pairs, edge_of
 from natcoord_jax.model.graph import Edge, spanning_tree
 from natcoord_jax.model.grouping import Instance, bare, families
 from natcoord_jax.model.groups import CoordinateGroup
-from natcoord_jax.model.rows import row_rates
 from natcoord_jax.xla.tracing import at_top_level
 
 JOINT_FIELDS = ("parent", "child", "point", "axis", "second", "name", "parent_point")
-
-
-def _edge(name: str, joint: Joint, poses: Poses, sets: int) -> Edge:
-    pair = poses.of(joint.parent), poses.of(joint.child)
-    # Nodes of sets are free: what joins them keeps its multipliers.
-    free = joint.free and min(pair) >= sets
-    edge = Edge(*pair, joint.rotations, joint.translations, joint.child_rotation, free)
-    if joint.free and not (edge.carries and len(edge.slots) == 6 - joint.multipliers):
-        also = " and about the child's first axis" if joint.child_rotation else ""
-        raise ValueError(
-            f"joint {name!r}: a tree cannot hold a joint of {joint.multipliers} multipliers that turns "
-            f"about axes {joint.rotations}{also} and slides along axes {joint.translations}; declare "
-            f"`free = False` in {type(joint).__name__}, which keeps its multipliers"
-        )
-    return edge
-
-
-def _couplings(effects: dict[str, Effect], poses: Poses, sets: int) -> list[tuple[int, int]]:
-    """Pairs of neighbouring bodies of the effects that make neighbours of them, but for nodes of sets."""
-    found = []
-    for effect in effects.values():
-        if effect.couples:
-            markers: Any = getattr(effect, "markers", ())
-            listed = [poses.carrier(handle) for m in markers for handle in getattr(m, "handles", (m.body,))]
-            found += [pair for pair in pairwise(listed) if min(pair) >= sets]
-    return found
 
 
 class Layout:
@@ -65,8 +38,8 @@ class Layout:
         self.bodies, self.joints = bodies, joints
         self.poses = Poses(bodies)
         self.names = list(joints)
-        self.edges = [_edge(name, j, self.poses, bodies.sets) for name, j in joints.items()]
-        couplings = _couplings(effects, self.poses, bodies.sets)
+        self.edges = [edge_of(name, j, self.poses, bodies.sets) for name, j in joints.items()]
+        couplings = coupled_pairs(effects, self.poses, bodies.sets)
         self.spanning = spanning_tree(len(bodies), self.edges, couplings, bodies.sets)
         self.order = np.array(self.spanning.order, int)
         self.body_number = np.argsort(np.append(self.order, len(bodies)))
@@ -109,7 +82,7 @@ class Layout:
             for members, owner in clamps:
                 if owner != ground:
                     rows, own = self.nodes(name)[1][members], self.bodies.node_masses(name, members)
-                    found = _with_masses(found, as_array(self.poses.of(owner)), as_array(rows), own)
+                    found = with_masses(found, as_array(self.poses.of(owner)), as_array(rows), own)
         return as_array(np.asarray(found)[self.order]) if at_top_level(found) else found[self.order]
 
     def every(self, field: str) -> Array:
@@ -194,7 +167,7 @@ class Layout:
         flat = numbers.reshape(-1)
         given = (self.poses.position, self.poses.rotation)
         picked = (as_array(np.asarray(x)[flat]) if at_top_level(x) else x[flat] for x in given)
-        return _rows(*picked).reshape(*numbers.shape, 4, 3)
+        return rows_of_poses(*picked).reshape(*numbers.shape, 4, 3)
 
     def effect_instance(self, name: str, effect: Effect) -> Instance:
         """Where an effect sits, and its channels."""
@@ -253,7 +226,7 @@ class Layout:
         most = max(map(len, own))
         weights = [self.poses.weights(m) for m in markers]
         if most > 1:
-            weights = [_padded(w, 4 * most) for w in weights]
+            weights = [padded(w, 4 * most) for w in weights]
         rest = len(self.bodies)
         return stacked(weights), [b for x in own for b in (*x, *(rest,) * (most - len(x)))]
 
@@ -300,7 +273,7 @@ class Layout:
 
     def state(self) -> State:
         """Initial state: coordinates count from the assembled pose."""
-        q, v = _rows_and_velocities(*(self.every(name) for name in MOTION))
+        q, v = rows_and_velocities(*(self.every(name) for name in MOTION))
         return State(
             as_array(0.0),
             q,
@@ -316,32 +289,4 @@ MOTION = "position", "rotation", "velocity", "angular_velocity"
 _frames_at = eager_numpy(frames_at)
 
 
-@eager_numpy
-def _with_masses(
-    blocks: Array, body: Array, rows: Float[Array, "n 4 4"], own: Float[Array, "n 4 4"]
-) -> Array:
-    return blocks.at[body].add(jnp.einsum("nai,nab,nbj->ij", rows, own, rows))
-
-
-@eager_numpy
-def _padded(weights: Float[Array, "*m w"], width: int) -> Float[Array, "*m width"]:
-    return jnp.concatenate([weights, jnp.zeros((*weights.shape[:-1], width - weights.shape[-1]))], axis=-1)
-
-
 _place_markers = eager_numpy(place_markers)
-
-
-def _stacked_rows(points: Float[Array, "n 3"], rotations: Float[Array, "n 3 3"]) -> Float[Array, "n 4 3"]:
-    return jnp.concatenate([points[:, None], rotations.swapaxes(1, 2)], axis=1)
-
-
-_rows = eager_numpy(_stacked_rows)
-
-
-@eager_numpy
-def _rows_and_velocities(
-    points: Array, rotations: Array, velocities: Array, spins: Array
-) -> tuple[Float[Array, "rows 3"], Float[Array, "rows 3"]]:
-    rows = _stacked_rows(points, rotations)
-    rates = row_rates(rows, velocities, spins)
-    return rows.reshape(-1, 3), rates.reshape(-1, 3)

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.core.compiled import compiled
-from natcoord_jax.core.handles import Handle, ground
+from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.markers import Interpolated, Marker
 from natcoord_jax.core.names import clamped
 from natcoord_jax.core.names import listed as listed_names
@@ -21,10 +21,11 @@ from natcoord_jax.core.state import State, Trajectory
 from natcoord_jax.maths.rotations import angular_velocity, to_quaternion
 from natcoord_jax.maths.vectors import cross
 from natcoord_jax.mechanics.coordinates import state_rates
-from natcoord_jax.model.groups import Group
 from natcoord_jax.model.model import Model
-from natcoord_jax.model.rows import group_places, over_states, rows_with_ground, states_of
+from natcoord_jax.model.rows import states_of
+from natcoord_jax.reading.effect_readings import readings, tells
 from natcoord_jax.reading.instant import inputs_along, instants
+from natcoord_jax.reading.markers import MarkerSensor, marker_weights, weighted
 from natcoord_jax.reading.tangent_states import Source, over_source
 
 
@@ -165,46 +166,6 @@ class JointSensor(eqx.Module):
         return torque if self.lever is None else torque + cross(self.lever, found.forces[..., self.index, :])
 
 
-class MarkerSensor(eqx.Module):
-    """Motion of a material point, or of a direction fixed in a body.
-
-    Attributes:
-        position: of the point [m], or the direction itself [-].
-        weights: of the rows of the body (7, 46).
-        body: number of the body; the number of bodies is the ground. Of a marker between nodes all of them.
-        source: what the sensor looks at.
-    """
-
-    position: Float[Array, "*t 3"]
-    weights: Float[Array, "*b 4"]
-    body: int | tuple[int, ...] = eqx.field(static=True)
-    source: Source = eqx.field(repr=False)
-
-    @property
-    def velocity(self) -> Float[Array, "*t 3"]:
-        """Time derivative of the position [m/s, 1/s]."""
-        return _weighted(self.weights, self.source.read.v, self.body)
-
-    @property
-    def acceleration(self) -> Float[Array, "*t 3"]:
-        """Second time derivative [m/s^2, 1/s^2]."""
-        return _weighted(self.weights, instants(self.source).accelerations, self.body)
-
-
-def _weighted(
-    weights: Float[Array, "*l 4"], rows: Float[Array, "*t rows 3"], body: int | tuple[int, ...]
-) -> Float[Array, "*t 3"]:
-    """Marker vector sum_a w_a q_a; zero on the ground, whose rows do not move."""
-    if isinstance(body, tuple):
-        return sum((_weighted(w, rows, b) for w, b in zip(weights, body)), jnp.zeros_like(rows[..., 0, :]))
-    if 4 * body >= rows.shape[-2]:
-        return jnp.zeros_like(rows[..., 0, :])
-    own = rows[..., 4 * body : 4 * body + 4, :]
-    missing = own.ndim - 1 - weights.ndim
-    weights = weights.reshape(*weights.shape[:-1], *(1,) * missing, 4)
-    return jnp.sum(weights[..., None] * own, axis=-2)
-
-
 def _continuous(quaternions: Float[Array, "*t 4"], along: bool) -> Float[Array, "*t 4"]:
     """Signs chosen so that neighbours along the last leading axis are close to each other."""
     if not along:
@@ -257,79 +218,16 @@ def joint_coordinates(system: Model, joint: Handle | str) -> tuple[int, list[int
     return index, places, tuple(axis.unit for axis in kind.coordinates)
 
 
-def marker_weights(system: Model, marker: Marker, state: State | None) -> tuple[Float[Array, "4"], int]:
-    """Weights of a marker and the number of its body; the number of bodies is the ground.
-
-    Raises:
-        ValueError: for a marker in world coordinates without the state they refer to.
-    """
-    vector = jnp.asarray(marker.vector, float)
-    head = jnp.ones(1) if marker.is_point else jnp.zeros(1)
-    if marker.body == ground:
-        return jnp.concatenate([head, vector]), len(system.structure.bodies)
-    body = system.body_index(marker.body)
-    if not marker.local:
-        if state is None:
-            raise ValueError(
-                f"the marker on {marker.body!r} is in world coordinates of the assembled pose: pass that "
-                "pose as `state=` (the initial state), or the marker with local=True"
-            )
-        rows = state.q[4 * body : 4 * body + 4]
-        vector = rows[1:] @ (vector - rows[0] if marker.is_point else vector)
-    return jnp.concatenate([head, vector]), body
-
-
-def _tells(group: Group, name: str) -> bool:
-    """Whether a name is that of an effect of a group, or of the set of them."""
-    return name in group.names or name in group.labels
-
-
-def _readings(system: Model, states: State, names: tuple[str, ...]) -> Any:
-    """What effects of one kind, or all of a set, tell of themselves, along an axis before that of quantities.
-
-    Raises:
-        ValueError: for effects of several kinds, or of one that tells nothing.
-    """
-    number, group = next((k, g) for k, g in enumerate(system.effects) if _tells(g, names[0]))
-    missing = [name for name in names if not _tells(group, name)]
-    if missing:
-        raise ValueError(f"{missing[0]!r} is of another kind than {names[0]!r}: sense them one by one")
-    if group.effect.silent:
-        raise ValueError(
-            f"the {group.effect.kind} {names[0]!r} has no sensor; use those of the bodies that it acts on, "
-            "of a constraint `system.instant(...).multipliers`; a class of your own has one if you give it "
-            "`silent = False` and `readings`"
-        )
-    if group.is_set and names[0] in group.labels:
-        chosen = jnp.arange(group.count)
-    else:
-        chosen = jnp.array([group.names.index(name) for name in names])
-    return _all_readings(system, states, number, chosen)
-
-
-@compiled
-def _all_readings(system: Model, states: State, number: int, chosen: Array) -> Any:
-    group = system.effects[number]
-    places = group_places(system, group)[chosen]
-    effects = jax.tree.map(lambda x: x[chosen], group.effect)
-
-    def one(system: Model, state: State) -> Any:
-        rows = rows_with_ground(state.q)[group.bodies[chosen]]
-        return jax.vmap(lambda effect, place, rows: effect.readings(place, rows))(effects, places, rows)
-
-    return over_states(one)(system, states)
-
-
 def _lever(system: Model, states: State, index: int, about: Any, state: State | None) -> Array:
     """From a point to that of a joint on its child."""
     child, weights = int(np.asarray(system.joint_bodies)[index, 1]), system.frames[index, 1, 0]
-    joint = weights[1:] if child == len(system.structure.bodies) else _weighted(weights, states.q, child)
+    joint = weights[1:] if child == len(system.structure.bodies) else weighted(weights, states.q, child)
     if isinstance(about, Marker):
         if not about.is_point:
             raise ValueError(f"about is a direction, {about!r}; pass a point [m], or nc.Point")
         weights, body = marker_weights(system, about, state)
         still = body == len(system.structure.bodies)
-        return joint - (weights[1:] if still else _weighted(weights, states.q, body))
+        return joint - (weights[1:] if still else weighted(weights, states.q, body))
     point, leading = jnp.asarray(about, float), states.t.shape
     if point.shape not in ((3,), (*leading, 3)):
         raise ValueError(f"about [m] has shape {point.shape}; pass (3,) or {(*leading, 3)}, or nc.Point")
@@ -354,19 +252,19 @@ def sense(
     if isinstance(part, Interpolated):
         bodies = tuple(system.body_index(handle) for handle in part.bodies)
         weights = jnp.outer(jnp.asarray(part.vector, float), jnp.eye(4)[0 if part.is_point else 1])
-        return MarkerSensor(_weighted(weights, states.q, bodies), weights, bodies, source)
+        return MarkerSensor(weighted(weights, states.q, bodies), weights, bodies, source)
     if isinstance(part, Marker):
         weights, body = marker_weights(system, part, state)
         if body == len(system.structure.bodies):
             still = jnp.broadcast_to(weights[1:], (*states.t.shape, 3))
             return MarkerSensor(still, weights, body, source)
-        return MarkerSensor(_weighted(weights, states.q, body), weights, body, source)
+        return MarkerSensor(weighted(weights, states.q, body), weights, body, source)
     if isinstance(part, tuple) and not part:
         raise ValueError("cannot sense nothing: the tuple of elements is empty")
     listed = part if isinstance(part, tuple) else (part,)
     names = tuple(x.name if isinstance(x, Handle) else x for x in listed)
-    if any(_tells(group, names[0]) for group in system.effects):
-        found = _readings(system, states, names)
+    if any(tells(group, names[0]) for group in system.effects):
+        found = readings(system, states, names)
         axis = states.t.ndim
         sets = (g for g in system.effects if g.is_set and not g.effect.spread)
         whole = isinstance(part, tuple) or any(names[0] in g.labels for g in sets)

@@ -11,9 +11,10 @@ from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.checks import as_array
 from natcoord_jax.core.coordinate import pair_motion
 from natcoord_jax.core.eager_numpy import eager_numpy
-from natcoord_jax.core.effect import Motion, replace_fields
+from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.kinds import of
+from natcoord_jax.core.motion import Motion
 from natcoord_jax.core.numeric import Number
 from natcoord_jax.core.state import STATE, State, Trajectory
 from natcoord_jax.maths.collocation import gauss

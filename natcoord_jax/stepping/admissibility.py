@@ -109,7 +109,7 @@ def project_velocities(system: System, state: State) -> State:
     warnings.warn(
         f"initial velocities violate {worst} by {worst.size:.3g} {worst.unit}; they were projected onto the "
         f"constraints, which changed row velocities by up to {change:.3g} m/s (directors: 1/s)",
-        stacklevel=4,
+        stacklevel=5,
     )
     return projected
 

@@ -9,7 +9,6 @@ Jacobian then serves all of them. Recorded outputs are differentiated by the sam
 them is made of the same two programs, see `Rule`: derivatives of any order are exact, in every mode.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -38,14 +37,12 @@ from natcoord_jax.stepping.record import (
     zero_tangent,
 )
 from natcoord_jax.stepping.rollout import Ending, run
+from natcoord_jax.stepping.slot_chunks import in_chunks
 from natcoord_jax.stepping.slot_sweep import Fixed
 from natcoord_jax.stepping.step import advance, linear_solver
 from natcoord_jax.system import System
 from natcoord_jax.xla import linear_pair
 from natcoord_jax.xla.one_kernel import lane_by_lane, on_cpu
-
-CHUNK = 32
-"""Slots whose Jacobians are formed together."""
 
 JACOBIANS_FROM = 0.5
 """Directions, in terms of the number of unknowns, from which on Jacobians of all slots save time. Measured:
@@ -160,7 +157,7 @@ class Rule(linear_pair.LinearWithTranspose):
             return end, (end, jnp.where(accepted, y_dot, 0.0))
 
         each = partial(self.prepared, residuals.numbers, arguments.varied)
-        maps = _in_chunks(each, (slots, arguments.u), slots.y.shape[0])
+        maps = in_chunks(each, (slots, arguments.u), slots.y.shape[0])
         return jax.lax.scan(body, arguments.state, (maps, slots.accepted, arguments.forced))[1]
 
     def backward(self, residuals: Record, cotangents: tuple[State, Array]) -> ParameterTangents:
@@ -190,7 +187,7 @@ class Rule(linear_pair.LinearWithTranspose):
             return _if(slot.accepted, more)
 
         given = slots, changes.slots, arguments.u, before_dot, found[1]
-        forced = _in_chunks(change, given, slots.y.shape[0])
+        forced = in_chunks(change, given, slots.y.shape[0])
         if arguments_dot.forced is not None:
             forced = jax.tree.map(jnp.add, forced, arguments_dot.forced)
         arguments_dot = replace_fields(arguments_dot, forced=forced)
@@ -215,7 +212,7 @@ class Rule(linear_pair.LinearWithTranspose):
             return _if(slot.accepted, more)
 
         given = slots, changes.slots, found.forced
-        varied, before, u, y = _in_chunks(change, given, slots.y.shape[0], summed=True)
+        varied, before, u, y = in_chunks(change, given, slots.y.shape[0], summed=True)
         # What changes the cotangent of a state changes that of the end of the slot before.
         ends = jax.tree.map(lambda x: jnp.concatenate([x[1:], jnp.zeros_like(x[:1])]), before)
         given = jax.tree.map(jnp.add, cotangents_dot, (ends, y))
@@ -235,41 +232,6 @@ def _before_each(first: State, after: State) -> State:
 def _if(accepted: Array, changes: Any) -> Any:
     """Changes of what a slot contributes, none if its attempt failed: its maps may not even be numbers."""
     return jax.tree.map(lambda x: jnp.where(accepted, x, 0.0), changes)
-
-
-def _in_chunks(function: Callable, slots: tuple, length: int, summed: bool = False) -> Any:
-    """The function of every slot, vmapped in chunks whose temporaries stay in the cache.
-
-    If summed, its first output is added up, so that not all of them are there at once.
-    """
-    every = jax.vmap(lambda x: function(*x))
-    if length <= CHUNK:
-        found = every(slots)
-        return (_total(found[0]), *found[1:]) if summed else found
-    chunks = -(-length // CHUNK)
-    padding = jnp.minimum(jnp.arange(chunks * CHUNK), length - 1)
-
-    def chunked(x: Array) -> Array:
-        return x[padding].reshape(chunks, CHUNK, *x.shape[1:])
-
-    def adding(x: tuple) -> tuple:
-        chunk, slots = x
-        first, *others = every(slots)
-        real = chunk * CHUNK + jnp.arange(CHUNK) < length
-        first = jax.tree.map(lambda x: jnp.where(real.reshape(-1, *(1,) * (x.ndim - 1)), x, 0.0), first)
-        return _total(first), *others
-
-    if summed:
-        first, *found = jax.lax.map(adding, (jnp.arange(chunks), jax.tree.map(chunked, slots)))
-    else:
-        first, found = (), jax.lax.map(every, jax.tree.map(chunked, slots))
-    found = jax.tree.map(lambda x: x.reshape(chunks * CHUNK, *x.shape[2:])[:length], found)
-    return (_total(first), *found) if summed else found
-
-
-def _total(parts: Any) -> Any:
-    """The sum along the first axis."""
-    return jax.tree.map(lambda x: jnp.sum(x, axis=0), parts)
 
 
 @partial(run_slots.defjvp, symbolic_zeros=True)

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from matplotlib.figure import Figure
 
-from natcoord_jax.analysis.accuracy import Accuracy
+from natcoord_jax.analysis.accuracy_table import Accuracy
 from natcoord_jax.analysis.phases import Phases
 from natcoord_jax.bodies.beam import BeamHandle
 from natcoord_jax.control.solution import Solution

@@ -3,7 +3,7 @@
 import matplotlib.pyplot as plt
 from matplotlib.figure import Figure
 
-from natcoord_jax.analysis.accuracy import Accuracy
+from natcoord_jax.analysis.accuracy_table import Accuracy
 
 
 def plot_accuracy(found: Accuracy) -> Figure:

@@ -8,10 +8,10 @@ from jaxtyping import Array
 
 from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.coordinate import CoordinateEffect
-from natcoord_jax.core.effect import StepContext
 from natcoord_jax.core.force import Force, Load
 from natcoord_jax.core.kinds import JOINT, Several
 from natcoord_jax.core.markers import Markers
+from natcoord_jax.core.motion import StepContext
 from natcoord_jax.core.numeric import Number, Numbers, Vector
 
 UNBOUNDED = Number(infinite=True)

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from natcoord_jax.core.effect import Motion, StepContext
+from natcoord_jax.core.motion import Motion, StepContext
 from natcoord_jax.core.potential import Potential
 from natcoord_jax.core.together import instances_last, place_together, steps_together
 from natcoord_jax.maths.components import Triple, combination, rows_of, turned_midway

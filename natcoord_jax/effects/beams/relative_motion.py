@@ -17,10 +17,10 @@ from jaxtyping import Array, Float
 from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.checks import as_array
 from natcoord_jax.core.chunks import chunked
-from natcoord_jax.core.effect import Motion, StepContext
 from natcoord_jax.core.force import Force, Load
 from natcoord_jax.core.kinds import FunctionOf
 from natcoord_jax.core.markers import Markers
+from natcoord_jax.core.motion import Motion, StepContext
 from natcoord_jax.core.numeric import Number, Numbers, Vector
 from natcoord_jax.core.potential import place_markers
 from natcoord_jax.effects.beams.logarithm import Logarithm

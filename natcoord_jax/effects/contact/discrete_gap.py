@@ -21,11 +21,12 @@ from jaxtyping import Array, Float, Int
 
 from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.closed_tangents import by_twists
-from natcoord_jax.core.effect import Motion, Response, StepContext, replace_fields
+from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.joint import Joint
 from natcoord_jax.core.kinds import NAME
 from natcoord_jax.core.markers import Attachment, Marker, Markers
+from natcoord_jax.core.motion import Motion, Response, StepContext
 from natcoord_jax.core.potential import marker_response, place_markers
 from natcoord_jax.effects.contact.law import ContactLaw, ContactReadings
 

@@ -9,11 +9,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from natcoord_jax.core.arguments import is_a, require
-from natcoord_jax.core.effect import Effect, Motion
+from natcoord_jax.core.effect import Effect
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.joint import Joint
 from natcoord_jax.core.kinds import NAME, of
 from natcoord_jax.core.markers import Attachment, Marker, Markers
+from natcoord_jax.core.motion import Motion
 from natcoord_jax.core.numeric import Number
 from natcoord_jax.core.potential import on_rows, place_markers
 from natcoord_jax.effects.contact.gap import Gap

@@ -5,7 +5,8 @@ from typing import Any, ClassVar
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from natcoord_jax.core.effect import Motion, Response, StepContext, replace_fields
+from natcoord_jax.core.effect import replace_fields
+from natcoord_jax.core.motion import Motion, Response, StepContext
 from natcoord_jax.core.potential import marker_response, place_markers
 from natcoord_jax.effects.contact.friction import Rubbing
 from natcoord_jax.effects.contact.law import ContactLaw, ContactReadings

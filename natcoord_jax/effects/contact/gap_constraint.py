@@ -10,7 +10,8 @@ from jaxtyping import Array, Float
 from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.checks import is_concrete
 from natcoord_jax.core.constraint import FREE, RESTING
-from natcoord_jax.core.effect import Motion, Response, StepContext, replace_fields
+from natcoord_jax.core.effect import replace_fields
+from natcoord_jax.core.motion import Motion, Response, StepContext
 from natcoord_jax.core.numeric import Number
 from natcoord_jax.core.potential import marker_response, place_markers
 from natcoord_jax.effects.contact.friction import Rubbing

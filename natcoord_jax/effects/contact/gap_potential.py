@@ -14,7 +14,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from natcoord_jax.core.arguments import is_a, require
-from natcoord_jax.core.effect import Motion, Response, StepContext, replace_fields
+from natcoord_jax.core.effect import replace_fields
+from natcoord_jax.core.motion import Motion, Response, StepContext
 from natcoord_jax.core.potential import Potential, place_markers
 from natcoord_jax.effects.contact.friction import GAP
 from natcoord_jax.effects.contact.gap import Gap

@@ -7,8 +7,9 @@ from typing import ClassVar
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from natcoord_jax.core.coordinate import Coordinate, PairMotion, UnitLoad, unit_load_of
+from natcoord_jax.core.coordinate import Coordinate
 from natcoord_jax.core.joint import Frame
+from natcoord_jax.core.unit_loads import PairMotion, UnitLoad, unit_load_of
 from natcoord_jax.maths.rotations import arctan_quotient
 from natcoord_jax.maths.vectors import cross, dot, safe_divide, safe_norm, safe_sqrt
 

@@ -15,9 +15,10 @@ from jaxtyping import Array, Float, Int
 
 from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.closed_tangents import by_twists, twist_maps
-from natcoord_jax.core.effect import Effect, Motion, Response, SpreadTangents, StepContext, replace_fields
+from natcoord_jax.core.effect import Effect, replace_fields
 from natcoord_jax.core.kinds import NAME
 from natcoord_jax.core.markers import Markers
+from natcoord_jax.core.motion import Motion, Response, SpreadTangents, StepContext
 from natcoord_jax.core.numeric import Number, Numbers
 from natcoord_jax.core.potential import marker_response, place_markers
 from natcoord_jax.effects.loads.pressure import ETA, XI, follower_loads

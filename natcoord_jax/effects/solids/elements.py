@@ -18,10 +18,11 @@ from jaxtyping import Array, Float
 from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.cells import CELLS, quadrature, shapes
 from natcoord_jax.core.chunks import chunked
-from natcoord_jax.core.effect import Motion, StepContext, replace_fields
+from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.gradient import averaged_gradient
 from natcoord_jax.core.kinds import of
 from natcoord_jax.core.markers import Markers
+from natcoord_jax.core.motion import Motion, StepContext
 from natcoord_jax.core.numeric import Numbers
 from natcoord_jax.core.potential import Potential, place_markers
 from natcoord_jax.effects.hyperelastic import Hyperelastic, tensors_of
@@ -90,8 +91,7 @@ class SolidElement(Potential):
     def renewed(self) -> "SolidElement":
         """With what follows from the pose without stress."""
         points, weights = quadrature(self.count)
-        values, slopes = shapes(CELLS[self.count], points)
-        gradients, volumes = [], []
+        (values, slopes), gradients, volumes = shapes(CELLS[self.count], points), [], []
         for slope, weight in zip(slopes, weights):
             inverse, volume = inverse_and_volume(self.reference.T @ slope)
             gradients.append(slope @ inverse)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from natcoord_jax.core.closed_tangents import HALF, by_twists
-from natcoord_jax.core.effect import Motion, StepContext
+from natcoord_jax.core.motion import Motion, StepContext
 from natcoord_jax.core.together import instances_last, place_together
 from natcoord_jax.effects.hyperelastic import tensors_of
 from natcoord_jax.maths.symmetric import PAIRS, full

@@ -8,9 +8,9 @@ from jaxtyping import Array
 
 from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.coordinate import CoordinateForce
-from natcoord_jax.core.effect import Motion, Response, StepContext
 from natcoord_jax.core.force import Force, Load
 from natcoord_jax.core.markers import Markers
+from natcoord_jax.core.motion import Motion, Response, StepContext
 from natcoord_jax.core.numeric import Number
 from natcoord_jax.core.potential import marker_response, place_markers
 

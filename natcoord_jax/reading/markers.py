@@ -1,0 +1,74 @@
+"""Material points and directions: where they are and how they move."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from natcoord_jax.core.handles import ground
+from natcoord_jax.core.markers import Marker
+from natcoord_jax.core.state import State
+from natcoord_jax.model.model import Model
+from natcoord_jax.reading.instant import instants
+from natcoord_jax.reading.tangent_states import Source
+
+
+class MarkerSensor(eqx.Module):
+    """Motion of a material point, or of a direction fixed in a body.
+
+    Attributes:
+        position: of the point [m], or the direction itself [-].
+        weights: of the rows of the body (7, 46).
+        body: number of the body; the number of bodies is the ground. Of a marker between nodes all of them.
+        source: what the sensor looks at.
+    """
+
+    position: Float[Array, "*t 3"]
+    weights: Float[Array, "*b 4"]
+    body: int | tuple[int, ...] = eqx.field(static=True)
+    source: Source = eqx.field(repr=False)
+
+    @property
+    def velocity(self) -> Float[Array, "*t 3"]:
+        """Time derivative of the position [m/s, 1/s]."""
+        return weighted(self.weights, self.source.read.v, self.body)
+
+    @property
+    def acceleration(self) -> Float[Array, "*t 3"]:
+        """Second time derivative [m/s^2, 1/s^2]."""
+        return weighted(self.weights, instants(self.source).accelerations, self.body)
+
+
+def weighted(
+    weights: Float[Array, "*l 4"], rows: Float[Array, "*t rows 3"], body: int | tuple[int, ...]
+) -> Float[Array, "*t 3"]:
+    """Marker vector sum_a w_a q_a; zero on the ground, whose rows do not move."""
+    if isinstance(body, tuple):
+        return sum((weighted(w, rows, b) for w, b in zip(weights, body)), jnp.zeros_like(rows[..., 0, :]))
+    if 4 * body >= rows.shape[-2]:
+        return jnp.zeros_like(rows[..., 0, :])
+    own = rows[..., 4 * body : 4 * body + 4, :]
+    missing = own.ndim - 1 - weights.ndim
+    weights = weights.reshape(*weights.shape[:-1], *(1,) * missing, 4)
+    return jnp.sum(weights[..., None] * own, axis=-2)
+
+
+def marker_weights(system: Model, marker: Marker, state: State | None) -> tuple[Float[Array, "4"], int]:
+    """Weights of a marker and the number of its body; the number of bodies is the ground.
+
+    Raises:
+        ValueError: for a marker in world coordinates without the state they refer to.
+    """
+    vector = jnp.asarray(marker.vector, float)
+    head = jnp.ones(1) if marker.is_point else jnp.zeros(1)
+    if marker.body == ground:
+        return jnp.concatenate([head, vector]), len(system.structure.bodies)
+    body = system.body_index(marker.body)
+    if not marker.local:
+        if state is None:
+            raise ValueError(
+                f"the marker on {marker.body!r} is in world coordinates of the assembled pose: pass that "
+                "pose as `state=` (the initial state), or the marker with local=True"
+            )
+        rows = state.q[4 * body : 4 * body + 4]
+        vector = rows[1:] @ (vector - rows[0] if marker.is_point else vector)
+    return jnp.concatenate([head, vector]), body
