@@ -111,7 +111,7 @@ def with_symmetries(system: System, state: State) -> System:
             single = single & ~np.isin(np.arange(count), group.bodies)
     if not single.any():
         return system
-    rows = state.q.reshape(-1, 4, 3)
+    rows = state.rows
     found = symmetries(system.mass, tree.frames(system.frames), rows, jnp.asarray(single))
     return replace_fields(system, tree=replace_fields(tree, symmetry=found))
 

@@ -214,6 +214,37 @@ def test_files_and_functions_can_be_read_at_once():
     )
 
 
+def rows_by_hand(source: str) -> list[int]:
+    """Lines where an array gets the shape of the rows of nodes by its numbers, (..., 4, 3)."""
+    ends = [
+        (node.lineno, node.elts if isinstance(node, ast.Tuple) else node.args)
+        for node in ast.walk(ast.parse(source))
+        if isinstance(node, ast.Tuple | ast.Call)
+    ]
+    return [
+        line
+        for line, given in ends
+        if len(given) > 2 and [getattr(x, "value", None) for x in given[-2:]] == [4, 3]
+    ]
+
+
+@pytest.mark.parametrize(
+    "floor", ["core", "model", "mechanics", "stepping", "reading", "analysis", "control"]
+)
+def test_one_file_knows_how_rows_are_stored(floor):
+    """The others take `NODE` and `by_node` of `core/bodies.py`, or `State.rows`."""
+    found = {}
+    for file in sorted((SOURCE / floor).rglob("*.py")):
+        lines = rows_by_hand(file.read_text("utf-8"))
+        if lines:
+            found[file.relative_to(SOURCE).as_posix()] = lines
+    assert not found, f"rows of nodes by their numbers, in these lines: {found}"
+
+
+def test_rows_by_hand_are_seen():
+    assert rows_by_hand("x = q.reshape(-1, 4, 3)\ny = jnp.zeros((2, 4, 3))\nz = jnp.zeros((4, 3))") == [1, 2]
+
+
 @pytest.mark.parametrize(
     ("module", "source", "fragment"),
     [

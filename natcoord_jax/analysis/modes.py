@@ -75,10 +75,10 @@ class _Steady(eqx.Module):
         static = Static(self.system, self.state, self.inputs)
         y = jnp.concatenate([x, self.lam])
         state = static.displaced(y)
-        rows = state.q.reshape(-1, 4, 3)
+        rows = state.rows
         (moved, _), (v_rel, w_rel) = self._apart(x), self._apart(rates)
         first = rows.shape[0]
-        origin = self.state.q.reshape(-1, 4, 3)[:, 0]
+        origin = self.state.rows[:, 0]
         about = self._steady_velocity(origin)
         velocity = about + v_rel + cross(self.rotation, moved)
         spin = jnp.broadcast_to(self.rotation, (first, 3)) + w_rel
@@ -97,21 +97,21 @@ class _Steady(eqx.Module):
         return self._balances(parts)
 
     def _apart(self, x: Array) -> tuple[Array, Array]:
-        rows = self.state.q.reshape(-1, 4, 3)
+        rows = self.state.rows
         every = self.system.local_rates.twists(x, rows)[:, 0]
         return every[:, :3], every[:, 3:]
 
     def _balances(self, forces_and_torques: Sequence[Array]) -> Array:
         wrenches = jnp.concatenate(forces_and_torques, axis=1)[:, None]
-        return self.system.local_rates.balances(wrenches, self.state.q.reshape(-1, 4, 3))
+        return self.system.local_rates.balances(wrenches, self.state.rows)
 
     def _steady_velocity(self, points: Array) -> Array:
-        v = self.state.v.reshape(-1, 4, 3)[:, 0]
+        v = self.state.row_rates[:, 0]
         return jnp.where(jnp.any(self.rotation != 0), v, jnp.zeros_like(points))
 
     def mass_matrix(self) -> Array:
         """Inertia of displacements and rotations of all bodies, rotors included."""
-        rows = self.state.q.reshape(-1, 4, 3)
+        rows = self.state.rows
 
         def inertial(gains: Array) -> Array:
             impulses = inertia(self.system, row_rates(rows, *self._apart(gains)))
@@ -183,7 +183,7 @@ def _damped(mass: Array, damping: Array, stiffness: Array) -> tuple[Array, Array
 
 @briefly
 def _problem(system: System, state: State, inputs: Array, rotation: Array) -> tuple[Array, ...]:
-    rates, start = system.local_rates, state.q.reshape(-1, 4, 3)
+    rates, start = system.local_rates, state.rows
     # By their rates: what velocities alone obey has no gaps.
     by_twist = constraint_matrix(system, state).reshape(-1, rates.bodies, 1, TWIST)
     rows = jax.vmap(lambda row: rates.balances(row, start))(by_twist)
@@ -274,7 +274,7 @@ def _ordered(
     else:
         kept = jnp.argsort(jnp.abs(s))
     kept = kept[:count]
-    rows = state.q.reshape(-1, 4, 3)
+    rows = state.rows
     parts = jax.vmap(lambda w: system.local_rates.twists(w, rows)[:, 0])(moved[kept])
     turned = jnp.cross(parts[:, :, None, 3:], rows[None, :, 1:])
     shapes = jnp.concatenate([parts[:, :, None, :3], turned], axis=2).reshape(len(kept), -1, 3)

@@ -13,6 +13,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from natcoord_jax.core.bodies import NODE
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
 from natcoord_jax.linsolve.dense import Inverse
@@ -76,13 +77,13 @@ class Static(eqx.Module):
 
     def displaced(self, y: Float[Array, " unknowns"]) -> State:
         """The state at rest after the displacements in `y`."""
-        rows = self.state.q.reshape(-1, 4, 3)
+        rows = self.state.rows
         twists = self.twists(y)[:, None]
         return self._at(rows + body_motion(rows, twists, jnp.ones((), rows.dtype), gauss(1)).rates[0])
 
     def twists(self, y: Float[Array, " unknowns"]) -> Float[Array, "bodies 6"]:
         """Displacements and rotations of all bodies."""
-        rows = self.state.q.reshape(-1, 4, 3)
+        rows = self.state.rows
         return self.system.local_rates.twists(y[: self.balances], rows)[:, 0]
 
     def moved_along_tree(self, y: Float[Array, " unknowns"]) -> State:
@@ -91,7 +92,7 @@ class Static(eqx.Module):
         Neighbours that turn far together stay together, so that Newton's method does not stretch a stiff
         beam that it bends; the joints of the tree stay closed.
         """
-        system, rows = self.system, self.state.q.reshape(-1, 4, 3)
+        system, rows = self.system, self.state.rows
         velocity, spin = jnp.split(self.twists(y), 2, axis=1)
         tree, h = system.tree.chained(), jnp.ones((), rows.dtype)
         frames = tree.frames(system.frames)
@@ -109,20 +110,20 @@ class Static(eqx.Module):
     def residual(self, y: Float[Array, " unknowns"]) -> Float[Array, " unknowns"]:
         """Unbalanced forces [N] and torques [N m], with opposite sign, and gaps [m, -]."""
         state = self.displaced(y)
-        rows = state.q.reshape(-1, 4, 3)
+        rows = state.rows
         still = jnp.zeros_like(rows[:, 0])
         force, torque = loads(self.system, state, self.inputs, still, still)
         pulled = self.constraint_loads(state, y)
         sums = -(jnp.concatenate([force, torque], axis=1) + jnp.concatenate(pulled, axis=1))
-        balances = self.system.local_rates.balances(sums[:, None], self.state.q.reshape(-1, 4, 3))
+        balances = self.system.local_rates.balances(sums[:, None], self.state.rows)
         return jnp.concatenate([balances, self.gaps(state)])
 
     def constraint_loads(self, state: State, y: Array) -> tuple[Array, Array]:
         """Forces and torques of the multipliers on all bodies."""
-        rows, tableau = state.q.reshape(-1, 4, 3), gauss(1)
+        rows, tableau = state.rows, gauss(1)
         still = jnp.zeros((1, rows.shape[0], 3), rows.dtype)
         at = stations(rows, rows[None, :, 0], rows[None, :, 1:], still, still)
-        on_rows = jnp.zeros((rows.shape[0] + 1, 4, 3), rows.dtype)
+        on_rows = jnp.zeros((rows.shape[0] + 1, *NODE), rows.dtype)
         torques = jnp.zeros((rows.shape[0] + 1, 3), rows.dtype)
         position = self.balances
         for group in self.groups:

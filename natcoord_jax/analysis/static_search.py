@@ -49,7 +49,7 @@ class Search(eqx.Module):
 
 def extent_of(system: System, state: State) -> Array:
     """Extent of the system with the ground's origin [m]; never zero."""
-    points = jnp.max(jnp.abs(state.q.reshape(-1, 4, 3)[:, 0]), initial=0.0)
+    points = jnp.max(jnp.abs(state.rows[:, 0]), initial=0.0)
     moment = jnp.sum(jnp.trace(system.mass[:, 1:, 1:], axis1=1, axis2=2)) / jnp.sum(system.mass[:, 0, 0])
     return points + jnp.where(moment > 0, jnp.sqrt(jnp.where(moment > 0, moment, 1.0)), 1e-300)
 

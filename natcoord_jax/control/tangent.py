@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from natcoord_jax.core.bodies import NODE
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
 from natcoord_jax.mechanics.coordinates import coordinate_rates, state_rates
@@ -27,7 +28,7 @@ SMALL = 1e-13
 def _moving(system: System, rows: Array, velocity: Array, spin: Array) -> tuple[Array, Array]:
     """Velocities of rows, and rates of joint coordinates, of a motion of all bodies."""
     moving = row_rates(rows, velocity, spin)
-    still = jnp.zeros((1, 4, 3), rows.dtype)
+    still = jnp.zeros((1, *NODE), rows.dtype)
     every = jnp.concatenate([spin, still[:, 0]])
     rates = coordinate_rates(
         system, rows_with_ground(rows.reshape(-1, 3)), jnp.concatenate([moving, still]), every
@@ -68,7 +69,7 @@ def steady_rates(system: System, state: State) -> Float[Array, " n"]:
     Unlike the relative rates of joints it sees nothing of velocities normal to the constraints, so that
     rates vanish together with momenta.
     """
-    rows = state.q.reshape(-1, 4, 3)
+    rows = state.rows
     rates_of, along = _free_motions(system, rows)
     units = jnp.eye(system.structure.unknowns, dtype=rows.dtype)
     inertia = jax.vmap(lambda unit: along(_with_mass(system, rates_of(unit).reshape(-1, 3))))(units)
@@ -85,7 +86,7 @@ def split(
     Where these momenta vanish, the rates are those of `steady_rates`: the projection as an equation for its
     result.
     """
-    rows = state.q.reshape(-1, 4, 3)
+    rows = state.rows
     both = jnp.stack([w, worth])
     velocity, spin = (jnp.einsum("bnc,kn->kbc", x, both) for x in null_space(system, rows))
     moving, virtual = jax.vmap(row_rates, in_axes=(None, 0, 0))(rows, velocity, spin)
@@ -108,7 +109,7 @@ def tangent_maps(
         left inverse of Z that keeps momenta, the projection in the metric of the mass; and the inverse of
         the inertia of the free motions.
     """
-    rows, w = state.q.reshape(-1, 4, 3), tree_rates(system, state)
+    rows, w = state.rows, tree_rates(system, state)
     velocity, spin = null_space(system, rows)
     count, size = velocity.shape[1], state.q.size
 

@@ -60,6 +60,14 @@ POINT = NodeKind("point", (), 1)
 DIRECTOR = NodeKind("director", (1, 2), 2)
 TRIAD = NodeKind("triad", (0, 1, 2), 4)
 
+NODE = (TRIAD.rows, 3)
+"""Shape of the rows of a node in arrays: as those of a triad; what others do not carry is not used."""
+
+
+def by_node(vectors: Float[Any, "*_ rows 3"]) -> Float[Any, "*_ nodes 4 3"]:
+    """Vectors of all rows, node by node."""
+    return vectors.reshape(*vectors.shape[:-2], -1, *NODE)
+
 
 class Body(eqx.Module):
     """Rows and mass of a body in its assembled pose.

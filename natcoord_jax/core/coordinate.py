@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from natcoord_jax.core.arguments import is_a
+from natcoord_jax.core.bodies import NODE
 from natcoord_jax.core.effect import Effect
 from natcoord_jax.core.gradient import averaged_gradient, cancelling_energy
 from natcoord_jax.core.joint import Frame, frames_at
@@ -224,7 +225,7 @@ class CoordinateConstraint(CoordinateEffect):
         self, place: Array, rows: Array, rates: Array, spin: Array, t: Array, passing: Any
     ) -> Array:
         """That of both sides."""
-        frames, moving = (jax.vmap(frames_at)(place, x.reshape(-1, 2, 4, 3)) for x in (rows, rates))
+        frames, moving = (jax.vmap(frames_at)(place, x.reshape(-1, 2, *NODE)) for x in (rows, rates))
         relative = spin[1::2] - spin[::2]
         found = []
         for k, axis in enumerate(self.axes):

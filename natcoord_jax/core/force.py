@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from natcoord_jax.core.arguments import is_a
+from natcoord_jax.core.bodies import NODE
 from natcoord_jax.core.effect import Effect
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.joint import Joint
@@ -109,7 +110,7 @@ class Field(Effect):
         """Force rows m_a0 g, exact for every method because the potential is linear."""
         forces = place[:, 0, None] * self.acceleration()
         stages = now.tableau.stages
-        forces = jnp.broadcast_to(forces, (stages, 1, 4, 3))
+        forces = jnp.broadcast_to(forces, (stages, 1, *NODE))
         power = jnp.sum(forces * motion.rates, axis=(1, 2, 3))
         return Response(forces, None, jnp.zeros((stages, 0)), power)
 

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from natcoord_jax.core.arguments import is_a
+from natcoord_jax.core.bodies import NODE
 from natcoord_jax.core.chunks import chunked
 from natcoord_jax.core.closed_tangents import tangents_together
 from natcoord_jax.core.effect import Effect, replace_fields
@@ -29,7 +30,7 @@ def place_markers(place: Float[Array, "k *m w"], rows: Float[Array, "*s b 4 3"])
     """Marker vectors x_k = sum_a w_ka q_a, of the rows of one body or of several; of attachments four."""
     several = rows.shape[-3] // place.shape[0]
     if several > 1:
-        rows = rows.reshape(*rows.shape[:-3], place.shape[0], 4 * several, 3)
+        rows = rows.reshape(*rows.shape[:-3], place.shape[0], NODE[0] * several, 3)
     if place.ndim == 3:
         rows = rows[..., None, :, :]
     return jnp.sum(place[..., None] * rows, axis=-2)
@@ -257,7 +258,7 @@ def on_rows(place: Float[Array, "k *m w"], forces: Float[Array, "s k *m 3"]) -> 
     found = place[..., None] * forces[..., None, :]
     if place.ndim == 3:
         found = jnp.sum(found, axis=-3)
-    return found.reshape(forces.shape[0], -1, 4, 3)
+    return found.reshape(forces.shape[0], -1, *NODE)
 
 
 def responses_together(potential: Potential, place: Array, motion: Motion, now: StepContext) -> Response:

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from natcoord_jax.core.bodies import by_node
 from natcoord_jax.core.checks import numbers
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.kinds import of, short
@@ -47,6 +48,16 @@ class State(eqx.Module):
     held: Float[Array, "*batch 2 coordinates"] | None = None
     contacts: Float[Array, "*batch contacts counts"] | None = None
     elapsed: Float[Array, "*batch"] | None = None
+
+    @property
+    def rows(self) -> Float[Array, "*batch bodies 4 3"]:
+        """Rows body by body: the reference point [m], then the directors [-]."""
+        return by_node(self.q)
+
+    @property
+    def row_rates(self) -> Float[Array, "*batch bodies 4 3"]:
+        """Velocities of the rows body by body, as `v` has them."""
+        return by_node(self.v)
 
     def at_time(self, t: Any) -> "State":
         """The same positions and velocities at another time, from which a simulation then starts.

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from natcoord_jax.core.bodies import NODE
 from natcoord_jax.xla.materialise import materialised
 
 
@@ -18,7 +19,7 @@ def place_together(place: Float[Array, "k *m w n"], rows: Float[Array, "*s b 4 3
     """Marker vectors of many instances, see `place_markers`."""
     several = rows.shape[-4] // place.shape[0]
     if several > 1:
-        rows = rows.reshape(*rows.shape[:-4], place.shape[0], 4 * several, *rows.shape[-2:])
+        rows = rows.reshape(*rows.shape[:-4], place.shape[0], NODE[0] * several, *rows.shape[-2:])
     if place.ndim == 4:
         rows = rows[..., None, :, :, :]
     return materialised(jnp.sum(place[..., None, :] * rows, axis=-3))

@@ -79,7 +79,7 @@ def inflated_ball(count: int = 4) -> Example:
     scene.add(nc.Contact(ball, nc.Plane(), stiffness=2e4))
     system, state = scene.compile()
     state = nc.equilibrium(system, state, steps=1).state
-    rows = jnp.reshape(state.q, (-1, 4, 3))
+    rows = state.rows
     arms = rows.at[:, 0].add(-jnp.mean(rows[:, 0], axis=0))
     rates = jnp.cross(jnp.array([0.0, 60.0, 0.0]), arms).at[:, 0].add(jnp.array([2.0, 0.0, -10.0]))
     state = eqx.tree_at(lambda s: (s.v, s.t), state, (rates.reshape(-1, 3), jnp.zeros(())))

@@ -105,7 +105,7 @@ def problem(
 
 def as_a_rigid_body(problem: nc.OptimalControl) -> Float[Array, "steps inputs"]:
     """Torques that turn a rigid spacecraft by least effort, were it about a principal axis [N m]."""
-    rows = np.asarray(problem.state.q).reshape(-1, 4, 3)
+    rows = np.asarray(problem.state.rows)
     second = np.einsum("bix,bij,bjy->xy", rows, np.asarray(problem.system.mass), rows)
     inertia = np.trace(second) * np.eye(3) - second
     t = (np.arange(problem.steps) + 0.5) / problem.steps

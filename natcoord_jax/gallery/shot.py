@@ -84,12 +84,12 @@ class Shot:
         # Places turn about the grip, directors about themselves.
         about = np.zeros((4, 3))
         about[0] = GRIP
-        rows = self.state.q.reshape(-1, 4, 3)
+        rows = self.state.rows
         turn = from_rotation_vector(angle * TURNING)
         q = jnp.where(turned, (rows - about) @ turn.T + about, rows)
         ahead = np.zeros((4, 3))
         ahead[0] = AHEAD
-        v = jnp.where(swung, speed * ahead, self.state.v.reshape(-1, 4, 3))
+        v = jnp.where(swung, speed * ahead, self.state.row_rates)
         system = self.system.set("swing", **{"function.rate": speed})
         system = system.set("face", **{"function.start": angle})
         # Of the slider and the hinge.

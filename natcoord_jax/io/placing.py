@@ -32,7 +32,7 @@ def with_positions(robot: "RobotHandle", system: System, state: State, positions
         )
     q = _given(positions, file.positions, f"{label}: positions", "rad, m")
     v = _given(rates, np.zeros(file.rate_count), f"{label}: rates", "rad/s, m/s")
-    rows, moving = (np.array(x).reshape(-1, 4, 3) for x in (state.q, state.v))
+    rows, moving = (np.array(x) for x in (state.rows, state.row_rates))
     poses = link_poses(file, at_rest(*robot.place), q, v)
     for handles, frames in zip(robot.parts.carriers, poses):
         for handle, pose in zip(handles, frames):

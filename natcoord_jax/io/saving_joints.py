@@ -117,7 +117,7 @@ def _kind_of(system: System, number: int) -> type | None:
 
 def _hung(system: System, state: State, number: int, parent: int) -> Hung:
     """One body with its joints."""
-    name, rows = system.structure.bodies[number], np.asarray(state.q).reshape(-1, 4, 3)
+    name, rows = system.structure.bodies[number], np.asarray(state.rows)
     kind = _kind_of(system, number)
     if kind is None:
         return _free(system, state, number)
@@ -132,7 +132,7 @@ def _hung(system: System, state: State, number: int, parent: int) -> Hung:
     # Seen from the child, motions come in the reverse order, and the other way round.
     for made, axis, index in JOINTS[kind] if forward else JOINTS[kind][::-1]:
         if index < 0:
-            position, rate = _ball(rows, np.asarray(state.v).reshape(-1, 4, 3), number, parent, body)
+            position, rate = _ball(rows, np.asarray(state.row_rates), number, parent, body)
             body.joints.append(HungBy(joint, made, own[0], own[1][axis], None, position, rate))
             continue
         place = places[(joint, index)]
@@ -158,7 +158,7 @@ def _between(above: tuple, own: tuple) -> tuple[np.ndarray, np.ndarray]:
 
 def _free(system: System, state: State, number: int) -> Hung:
     """A body that floats, at where it is."""
-    rows, rates = (np.asarray(x).reshape(-1, 4, 3)[number] for x in (state.q, state.v))
+    rows, rates = (np.asarray(x)[number] for x in (state.rows, state.row_rates))
     axes = rows[1:].T
     spin = 0.5 * np.sum(np.cross(rows[1:], rates[1:]), axis=0)
     name = system.structure.bodies[number]

@@ -48,7 +48,7 @@ class SeparateTangents(eqx.Module):
     @classmethod
     def at(cls, system: Model, state: State) -> "SeparateTangents":
         """The tangent spaces of a state; its velocities play no part."""
-        rows, slots = state.q.reshape(-1, 4, 3), np.array(system.tree.slots, int)
+        rows, slots = state.rows, np.array(system.tree.slots, int)
         axes, points = joint_axes(system, rows)
         turning = ((slots < 3) | (slots == SLOTS - 1))[:, None]
         present = (system.tree.slot_index[:, slots] < system.tree.slot_of.shape[0])[..., None]

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from natcoord_jax.core.bodies import NODE, by_node
 from natcoord_jax.core.coordinate import pair_motion
 from natcoord_jax.core.joint import Frame, frames_at
 from natcoord_jax.core.motion import Motion
@@ -27,7 +28,7 @@ def velocities_with_ground(
     v: Float[Array, "rows 3"], rows: Float[Array, "bodies_and_ground 4 3"]
 ) -> tuple[Float[Array, "bodies_and_ground 4 3"], Float[Array, "bodies_and_ground 3"]]:
     """Velocities of the rows and angular velocities by body, the resting ground last."""
-    rates = jnp.concatenate([v.reshape(-1, 4, 3), jnp.zeros((1, 4, 3), v.dtype)])
+    rates = jnp.concatenate([by_node(v), jnp.zeros((1, *NODE), v.dtype)])
     return rates, angular_velocity(rows[:, 1:], rates[:, 1:])
 
 

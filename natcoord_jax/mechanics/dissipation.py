@@ -28,6 +28,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from natcoord_jax.core.bodies import NODE
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.motion import Motion
 from natcoord_jax.core.state import State
@@ -91,7 +92,7 @@ class Damping(eqx.Module):
         """That of a state; its velocities play no part."""
         space = TangentSpace.at(system, state)
         rows, unit = rows_with_ground(state.q), space.columns
-        still = jnp.zeros((unit.shape[0], 1, 4, 3), unit.dtype)
+        still = jnp.zeros((unit.shape[0], 1, *NODE), unit.dtype)
         moving = jnp.concatenate([unit, still], axis=1)
         turning = jnp.concatenate([jnp.swapaxes(space.free[1], 0, 1), still[:, :, 0]], axis=1)
         groups = elastic_of(system)
@@ -120,7 +121,7 @@ class Damping(eqx.Module):
         """
         space, rho = self.space, tableau.spectral_radius
         strength, part = ONSET * h**2, (1.0 - rho) / (1.0 + rho)
-        v = Velocity(state.v.reshape(-1, 4, 3), state.rates)
+        v = Velocity(state.row_rates, state.rates)
         known = space.admissible
         assert space.system is not None and known.lift is not None and known.prescribed is not None
         w = known.frame.T @ known.within(space.framed(v)) + space.drift_rates

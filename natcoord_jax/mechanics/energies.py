@@ -32,6 +32,6 @@ def group_energies(system: Model, group: Group, state: State) -> Float[Array, " 
 
 def body_momenta(system: Model, state: State) -> tuple[Float[Array, "bodies 3"], Float[Array, "bodies 3"]]:
     """Momentum and angular momentum about the origin of every body (24, 32)."""
-    q, v = state.q.reshape(-1, 4, 3), state.v.reshape(-1, 4, 3)
+    q, v = state.rows, state.row_rates
     impulse = inertia(system, v)
     return impulse[:, 0], jnp.sum(cross(q, impulse), axis=1)

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from natcoord_jax.core.bodies import NODE
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import gauss
 from natcoord_jax.maths.vectors import cross
@@ -113,7 +114,7 @@ class EquationsOfMotion(eqx.Module):
     @classmethod
     def at(cls, system: Model, state: State) -> "EquationsOfMotion":
         """The balances of a state."""
-        rows = state.q.reshape(-1, 4, 3)
+        rows = state.rows
         still = jnp.zeros((rows.shape[0] + 1, 3), rows.dtype)
 
         def rates(velocity, spin):
@@ -229,9 +230,9 @@ def _weighted(lam: Array, loads: tuple[Array, Array]) -> Twists:
 
 def loads(system: Model, state: State, u: Array, velocity: Array, spin: Array) -> Twists:
     """Forces and torques of all effects but rotors and relations: what they do in a step of length zero."""
-    rows, tableau = state.q.reshape(-1, 4, 3), gauss(1)
+    rows, tableau = state.rows, gauss(1)
     at = stations(rows, rows[None, :, 0], rows[None, :, 1:], velocity[None], spin[None])
-    on_rows = jnp.zeros((rows.shape[0] + 1, 4, 3), rows.dtype)
+    on_rows = jnp.zeros((rows.shape[0] + 1, *NODE), rows.dtype)
     torques = jnp.zeros((rows.shape[0] + 1, 3), rows.dtype)
     for group in system.effects:
         if not group.effect.impulsive:

@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from natcoord_jax.core.bodies import by_node
 from natcoord_jax.core.state import State
 from natcoord_jax.mechanics.tangent_space import Velocity
 
@@ -155,14 +156,14 @@ class Lagging(eqx.Module):
 
 def in_body_axes(state: State, kick: Velocity) -> Float[Array, " numbers"]:
     """Components of a kick along the directors of its bodies, and rates of rotors."""
-    directors = state.q.reshape(-1, 4, 3)[:, 1:]
+    directors = state.rows[:, 1:]
     components = jnp.sum(kick.rows[:, :, None, :] * directors[:, None, :, :], axis=-1)
     return jnp.concatenate([components.reshape(-1), kick.rotors])
 
 
 def from_body_axes(state: State, numbers: Float[Array, " numbers"]) -> Velocity:
     """The kick with such components."""
-    directors = state.q.reshape(-1, 4, 3)[:, 1:]
-    size = directors.shape[0] * 12
-    components = numbers[:size].reshape(-1, 4, 3)
+    directors = state.rows[:, 1:]
+    size = state.q.size
+    components = by_node(numbers[:size].reshape(-1, 3))
     return Velocity(jnp.sum(components[..., None] * directors[:, None], axis=2), numbers[size:])

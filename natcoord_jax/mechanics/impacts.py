@@ -173,7 +173,7 @@ def _impacts(
     met = active & (before > touch(start) if hit is None else apart(system, groups, start, h))
     work = jnp.where(met, positive_part(pushed * (before - contact_gaps(system, groups, end)) / h), 0.0)
     restitution = _numbers(groups, "restitution")
-    velocity = Velocity(end.v.reshape(-1, 4, 3), end.rates)
+    velocity = Velocity(end.row_rates, end.rates)
     rates, matrix = answers.rates(velocity), answers.matrix
     impulses = impact_impulses(matrix, rates, work, restitution, active, met)
     if hit is not None:

@@ -143,7 +143,7 @@ def kick_of(
     drift = after.drift
     carried = jnp.tensordot(beta, at.rates[:, :-1], 1), beta @ rotor_rates(system, groups, at, h)
     d = Velocity(
-        sigma * (carried[0] - drift.rows) - state.v.reshape(-1, 4, 3),
+        sigma * (carried[0] - drift.rows) - state.row_rates,
         sigma * (carried[1] - drift.rotors) - state.rates,
     )
     first, last = before.shares(after, d)  # pyright: ignore[reportArgumentType]  (they are of one kind)
@@ -151,7 +151,7 @@ def kick_of(
     if lag is None:
         return Kick(found, before, after, found, jnp.zeros_like(h), jnp.zeros_like(h))
     change = Velocity(found.rows - lag.held.rows, found.rotors - lag.held.rotors)
-    motion = jnp.maximum(before.energy(Velocity(state.v.reshape(-1, 4, 3), state.rates)), before.energy(d))
+    motion = jnp.maximum(before.energy(Velocity(state.row_rates, state.rates)), before.energy(d))
     size, kick, motion = (jnp.sqrt(2.0 * x) for x in (before.energy(change), before.energy(found), motion))
     serves = (size <= NEGLIGIBLE * motion) & (size * kick <= NEGLIGIBLE_ENERGY * motion**2)
     kept = (serves & ~lag.everywhere) | lag.held_fast
@@ -183,7 +183,7 @@ def ends_of(
     """The velocity at the end of a step: that of its stages, less the kick taken back."""
     rates, turning = at.rates[:, :-1], rotor_rates(system, groups, at, h)
     before, after = kick.before, kick.after
-    v = Velocity(state.v.reshape(-1, 4, 3), state.rates)
+    v = Velocity(state.row_rates, state.rates)
     start = Velocity(v.rows + kick.kick.rows, v.rotors + kick.kick.rotors)
     last = Velocity(
         start.rows + tableau.gained(rates - start.rows),
@@ -214,7 +214,7 @@ def kicked(
     Where the kick lags behind the stages and is not due, it is that which is held, and nothing else of it is
     of use.
     """
-    velocity = state.v.reshape(-1, 4, 3)
+    velocity = state.row_rates
     if not tableau.kick:
         return velocity, situations, None
     before = None if tangents is None else tangents.with_system(system)

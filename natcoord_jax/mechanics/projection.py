@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from natcoord_jax.core.bodies import NODE
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.joint import frames_at
 from natcoord_jax.core.state import State
@@ -44,7 +45,7 @@ def inertias(system: Model, rows: Float[Array, "bodies 4 3"]) -> Float[Array, "b
 
 def _unit_motions(rows: Float[Array, "*n 4 3"]) -> Float[Array, "*n 4 3 6"]:
     """Velocities of the rows of bodies for unit twists."""
-    flat = rows.reshape(-1, 4, 3)
+    flat = rows.reshape(-1, *NODE)
     unit = jnp.broadcast_to(jnp.eye(TWIST)[:, None], (TWIST, flat.shape[0], TWIST))
     found = jax.vmap(lambda w: row_rates(flat, w[:, :3], w[:, 3:]))(unit)
     return jnp.moveaxis(found, 0, -1).reshape(*rows.shape, TWIST)
@@ -131,7 +132,7 @@ class Projection(eqx.Module):
         matrix = constraint_matrix(system, state)
         if held is not None:
             matrix = jnp.concatenate([matrix, held[:, None] * coordinate_matrix(system, state)])
-        inverse = jax.vmap(definite_inverse)(inertias(system, state.q.reshape(-1, 4, 3)))
+        inverse = jax.vmap(definite_inverse)(inertias(system, state.rows))
         by_body = matrix.reshape(matrix.shape[0], inverse.shape[0], TWIST)
         impulses = jnp.einsum("bcd,mbd->bcm", inverse, by_body).reshape(matrix.shape[::-1])
         stiffness = jnp.einsum("mt,tm->m", matrix, impulses)
@@ -169,7 +170,7 @@ def moved(
         twist: shifts [m] and rotation vectors [rad].
         increments: of the joint coordinates to first order, by which whole turns are told.
     """
-    rows = state.q.reshape(-1, 4, 3)
+    rows = state.rows
     directors = jnp.einsum("bij,bkj->bki", from_rotation_vector(twist[:, 3:]), rows[:, 1:])
     q = jnp.concatenate([rows[:, :1] + twist[:, None, :3], directors], axis=1).reshape(-1, 3)
     expected = replace_fields(state, q=q, coordinates=state.coordinates + increments)
@@ -188,7 +189,7 @@ def nearest_coordinates(system: Model, state: State) -> Array:
 
 def twists_of(system: Model, state: State) -> Float[Array, "bodies 6"]:
     """Twists of the bodies nearest to the velocities of their rows, in the metric of the mass."""
-    rows, v = (x.reshape(-1, 4, 3) for x in (state.q, state.v))
+    rows, v = state.rows, state.row_rates
     _, spin = velocities_with_ground(state.v, rows_with_ground(state.q))
     rigid = jnp.concatenate([v[:, 0], spin[:-1]], axis=1)
     rest = v - row_rates(rows, rigid[:, :3], rigid[:, 3:])

@@ -27,7 +27,6 @@ from natcoord_jax.mechanics.redundancy import (
 )
 from natcoord_jax.mechanics.response import (
     StageKinematics,
-    body_rows,
     stations,
 )
 from natcoord_jax.mechanics.start_cache import NOTHING
@@ -78,7 +77,7 @@ class ReducedStep(StepEquations):
     @classmethod
     def geometry_of(cls, system: Model, state: State) -> dict[str, Array]:
         """Rows at the start, and the frames of the joints of the tree."""
-        return {"start": body_rows(state.q), "frames": system.tree.frames(system.frames)}
+        return {"start": state.rows, "frames": system.tree.frames(system.frames)}
 
     @classmethod
     def held_range(cls, system: Model, state: State, rank: int, tangents: Tangents | None) -> Array:

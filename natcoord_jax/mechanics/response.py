@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from natcoord_jax.core.bodies import NODE
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.motion import Motion, Response, StepContext
 from natcoord_jax.core.state import State
@@ -20,11 +21,6 @@ from natcoord_jax.model.rows import group_places
 def ground_rows(like: Array) -> Float[Array, "1 4 3"]:
     """Rows of the ground: the origin and the world axes."""
     return jnp.concatenate([jnp.zeros((1, 3)), jnp.eye(3)]).astype(like.dtype)[None]
-
-
-def body_rows(q: Float[Array, "*s rows 3"]) -> Float[Array, "*s bodies 4 3"]:
-    """Rows by body."""
-    return q.reshape(*q.shape[:-2], q.shape[-2] // 4, 4, 3)
 
 
 class StageKinematics(eqx.Module):
@@ -54,7 +50,7 @@ def stations(
     stages = points.shape[0]
     rows = jnp.concatenate([points[:, :, None], directors], axis=2)
     rates = jnp.concatenate([velocity[:, :, None], cross(spin[:, :, None], directors)], axis=2)
-    still = jnp.zeros((stages, 1, 4, 3), start.dtype)
+    still = jnp.zeros((stages, 1, *NODE), start.dtype)
     return StageKinematics(
         jnp.concatenate([start, ground]),
         jnp.concatenate([rows, jnp.broadcast_to(ground, still.shape)], axis=1),
@@ -65,7 +61,7 @@ def stations(
 
 def motion_between(before: State, after: State, h: Array) -> StageKinematics:
     """Motion over a step as the effects saw it: mid-point rows, mean velocities, spins of the mid-points."""
-    start, rates = body_rows(before.q), body_rows(0.5 * (before.v + after.v))
+    start, rates = before.rows, 0.5 * (before.row_rates + after.row_rates)
     middle = (start + 0.5 * h * rates)[:, 1:]
     d1, d2, d3 = middle[:, 0], middle[:, 1], middle[:, 2]
     dual = jnp.stack([cross(d2, d3), cross(d3, d1), cross(d1, d2)], axis=1)

@@ -22,7 +22,7 @@ from natcoord_jax.mechanics.grain import cancelling_size
 from natcoord_jax.mechanics.kick import kicked
 from natcoord_jax.mechanics.momentum import momentum_balance
 from natcoord_jax.mechanics.redundancy import at_every_stage, project_multipliers, project_rows
-from natcoord_jax.mechanics.response import Evaluation, GroupData, StageKinematics, body_rows, situation
+from natcoord_jax.mechanics.response import Evaluation, GroupData, StageKinematics, situation
 from natcoord_jax.mechanics.start_cache import StartCache
 from natcoord_jax.model.groups import Group
 from natcoord_jax.model.model import Model
@@ -76,7 +76,7 @@ class StepEquations(Form):
         return cls(
             system=system,
             state=state,
-            velocity=body_rows(state.v),
+            velocity=state.row_rates,
             situations=tuple(situation(system, g, state, u, h) for g in cls.groups_of(system)),
             h=h,
             start_cache=cls.starting(system, state, tableau) if start_cache is None else start_cache,

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from natcoord_jax.core.bodies import TRIAD, NodeKind
+from natcoord_jax.core.bodies import NODE, TRIAD, NodeKind
 from natcoord_jax.core.checks import as_array, is_concrete
 from natcoord_jax.core.coordinate import Coordinate, CoordinateEffect
 from natcoord_jax.core.eager_numpy import eager_numpy, stacked
@@ -167,7 +167,7 @@ class Layout:
         flat = numbers.reshape(-1)
         given = (self.poses.position, self.poses.rotation)
         picked = (as_array(np.asarray(x)[flat]) if at_top_level(x) else x[flat] for x in given)
-        return rows_of_poses(*picked).reshape(*numbers.shape, 4, 3)
+        return rows_of_poses(*picked).reshape(*numbers.shape, *NODE)
 
     def effect_instance(self, name: str, effect: Effect) -> Instance:
         """Where an effect sits, and its channels."""
@@ -226,7 +226,7 @@ class Layout:
         most = max(map(len, own))
         weights = [self.poses.weights(m) for m in markers]
         if most > 1:
-            weights = [padded(w, 4 * most) for w in weights]
+            weights = [padded(w, TRIAD.rows * most) for w in weights]
         rest = len(self.bodies)
         return stacked(weights), [b for x in own for b in (*x, *(rest,) * (most - len(x)))]
 

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from natcoord_jax.core.bodies import by_node
 from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.state import State, Trajectory
 from natcoord_jax.maths.vectors import cross
@@ -45,7 +46,7 @@ def over_states(
 def rows_with_ground(rows: Float[Array, "bodies4 3"]) -> Float[Array, "bodies_and_ground 4 3"]:
     """Rows by body, with those of the ground last."""
     ground = jnp.concatenate([jnp.zeros((1, 3)), jnp.eye(3)]).astype(rows.dtype)
-    return jnp.concatenate([rows.reshape(-1, 4, 3), ground[None]])
+    return jnp.concatenate([by_node(rows), ground[None]])
 
 
 def group_places(system: Model, group: Group) -> Array:

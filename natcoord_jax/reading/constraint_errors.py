@@ -63,7 +63,7 @@ def _relations(system: Model) -> tuple[Group, ...]:
 
 @over_states
 def _values(system: Model, state: State) -> tuple[Array, Array, Array]:
-    d = state.q.reshape(-1, 4, 3)[:, 1:]
+    d = state.rows[:, 1:]
     gram = jnp.einsum("bik,bjk->bij", d, d) - jnp.eye(3)
     joints, relations = (
         largest(violations_of(system, groups, state)) for groups in (system.joints, _relations(system))
@@ -73,7 +73,7 @@ def _values(system: Model, state: State) -> tuple[Array, Array, Array]:
 
 @over_source
 def _rates(system: Model, state: State) -> tuple[Array, Array, Array]:
-    d, rates = (x.reshape(-1, 4, 3)[:, 1:] for x in (state.q, state.v))
+    d, rates = state.rows[:, 1:], state.row_rates[:, 1:]
     mixed = jnp.einsum("bik,bjk->bij", d, rates)
     joints, relations = (
         largest(violation_rates_of(system, groups, state)) for groups in (system.joints, _relations(system))

@@ -42,7 +42,7 @@ class Energy(eqx.Module):
 @over_states
 def energy(system: Model, state: State) -> Energy:
     """Energies (1) and stores."""
-    v = state.v.reshape(-1, 4, 3)
+    v = state.row_rates
     kinetic = 0.5 * jnp.sum(v * inertia(system, v))
     stores = {}
     for group in system.effects:

@@ -4,6 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from natcoord_jax.core.bodies import by_node
 from natcoord_jax.core.handles import ground
 from natcoord_jax.core.markers import Marker
 from natcoord_jax.core.state import State
@@ -44,9 +45,10 @@ def weighted(
     """Marker vector sum_a w_a q_a; zero on the ground, whose rows do not move."""
     if isinstance(body, tuple):
         return sum((weighted(w, rows, b) for w, b in zip(weights, body)), jnp.zeros_like(rows[..., 0, :]))
-    if 4 * body >= rows.shape[-2]:
+    nodes = by_node(rows)
+    if body >= nodes.shape[-3]:
         return jnp.zeros_like(rows[..., 0, :])
-    own = rows[..., 4 * body : 4 * body + 4, :]
+    own = nodes[..., body, :, :]
     missing = own.ndim - 1 - weights.ndim
     weights = weights.reshape(*weights.shape[:-1], *(1,) * missing, 4)
     return jnp.sum(weights[..., None] * own, axis=-2)
@@ -69,6 +71,6 @@ def marker_weights(system: Model, marker: Marker, state: State | None) -> tuple[
                 f"the marker on {marker.body!r} is in world coordinates of the assembled pose: pass that "
                 "pose as `state=` (the initial state), or the marker with local=True"
             )
-        rows = state.q[4 * body : 4 * body + 4]
+        rows = state.rows[body]
         vector = rows[1:] @ (vector - rows[0] if marker.is_point else vector)
     return jnp.concatenate([head, vector]), body

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from natcoord_jax.core.bodies import by_node
 from natcoord_jax.core.compiled import compiled
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.markers import Interpolated, Marker
@@ -66,14 +67,14 @@ class BodySensor(eqx.Module):
     @property
     def acceleration(self) -> Float[Array, "*t 3"]:
         """Acceleration of the reference point [m/s^2]."""
-        return instants(self.source).accelerations[..., 4 * self.index, :]
+        return by_node(instants(self.source).accelerations)[..., self.index, 0, :]
 
     @property
     def angular_acceleration(self) -> Float[Array, "*t 3"]:
         """Angular acceleration, world components [rad/s^2]."""
-        first = 4 * self.index + 1
         directors = jnp.swapaxes(self.rotation, -1, -2)
-        return angular_velocity(directors, instants(self.source).accelerations[..., first : first + 3, :])
+        own = by_node(instants(self.source).accelerations)[..., self.index, 1:, :]
+        return angular_velocity(directors, own)
 
 
 class JointSensor(eqx.Module):
@@ -184,8 +185,7 @@ def _centres(mass: Float[Array, "bodies 4 4"]) -> Float[Array, "bodies 4"]:
 
 @compiled
 def _body_pose(system: Model, states: State, index: Array, along: bool) -> tuple[Array, ...]:
-    shape = (*states.t.shape, len(system.structure.bodies), 4, 3)
-    rows = states.q.reshape(shape)[..., index, :, :]
+    rows = states.rows[..., index, :, :]
     rotation = jnp.swapaxes(rows[..., 1:, :], -1, -2)
     mass = _centres(system.mass)[index]
     quaternion = _continuous(to_quaternion(rotation), along)
@@ -195,7 +195,7 @@ def _body_pose(system: Model, states: State, index: Array, along: bool) -> tuple
 @over_source
 def _body_rates(system: Model, state: State) -> tuple[Array, Array, Array]:
     """Velocities of the reference points, angular velocities and velocities of the centres of mass."""
-    rows, rates = state.q.reshape(-1, 4, 3), state.v.reshape(-1, 4, 3)
+    rows, rates = state.rows, state.row_rates
     shares = _centres(system.mass)
     return rates[:, 0], angular_velocity(rows[:, 1:], rates[:, 1:]), jnp.sum(shares[..., None] * rates, 1)
 

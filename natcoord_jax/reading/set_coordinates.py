@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.core.arguments import checked
+from natcoord_jax.core.bodies import NODE
 from natcoord_jax.core.checks import as_array
 from natcoord_jax.core.coordinate import pair_motion
 from natcoord_jax.core.eager_numpy import eager_numpy
@@ -75,7 +76,7 @@ def _joint_motions(
 
     def unit(slot):
         velocity, spin = (x.at[:, slot].get(mode="fill", fill_value=0.0) for x in (velocities, spins))
-        moving = jnp.concatenate([row_rates(rows, velocity, spin), jnp.zeros((1, 4, 3), rows.dtype)])
+        moving = jnp.concatenate([row_rates(rows, velocity, spin), jnp.zeros((1, *NODE), rows.dtype)])
         rates = coordinate_rates(system, extended, moving, jnp.concatenate([spin, still]))
         return rates[places], velocity[body], spin[body]
 
@@ -139,7 +140,7 @@ def _moved(
 
     The turn is about the joint's point on its child, so that displacements along axes of the parent stay.
     """
-    rows = state.q.reshape(-1, 4, 3)
+    rows = state.rows
     rates, velocities, spins, _ = _joint_motions(system, rows, body, places)
     slots = _slot_rates(rates, changes)
     turn, shift = slots @ spins, slots @ velocities
@@ -185,7 +186,7 @@ def _with_coordinate(
     w = w.at[slots].add(_slot_rates(rates, wanted - rates @ own), mode="drop")
     moving = row_rates(rows, *twists(system, rows, w))
     inside = (carried(system)[:, body] > 0)[:, None, None]
-    v = jnp.where(inside, moving, state.v.reshape(-1, 4, 3))
+    v = jnp.where(inside, moving, state.row_rates)
     found = replace_fields(state, q=rows.reshape(-1, 3), v=v.reshape(-1, 3), coordinates=coordinates)
     if system.structure.held:
         held = jnp.zeros((2, *coordinates.shape)) if state.held is None else state.held
@@ -244,7 +245,7 @@ def _displaced(
 ) -> State:
     """State after one kinematic step of unit size with the rates `change`, moving with the rates w."""
     tableau, h = gauss(1), jnp.ones(())
-    rows = state.q.reshape(-1, 4, 3)
+    rows = state.rows
     slots = gather_slots(system.tree, change)
     motion, _ = sweep_motion(system.tree, system.tree.frames(system.frames), rows, slots, h, tableau)
     points = rows[:, 0] + 0.5 * motion.velocity

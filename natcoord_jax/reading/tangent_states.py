@@ -54,7 +54,7 @@ def tangent(system: Model, state: State) -> State:
     if not system.structure.unknowns:
         return replace_fields(state, v=jnp.zeros_like(state.v), rates=jnp.zeros_like(state.rates))
     find = _along_the_tree if _by_body(system) else _together
-    found = find(system, state, Velocity(state.v.reshape(-1, 4, 3), state.rates))
+    found = find(system, state, Velocity(state.row_rates, state.rates))
     return replace_fields(state, v=found.rows.reshape(state.v.shape), rates=found.rotors)
 
 
@@ -73,7 +73,7 @@ def _less(v: Velocity, other: Velocity) -> Velocity:
 
 def _along_the_tree(system: Model, state: State, v: Velocity) -> Velocity:
     """By elimination from body to body, at a cost in proportion to their number."""
-    tree, rows = system.tree, state.q.reshape(-1, 4, 3)
+    tree, rows = system.tree, state.rows
     blocks, present = _spatial(system, rows)
     across, own = blocks.spread[:, :, :6], blocks.spread[:, :, 6:]
     places, parent = jnp.asarray(tree.slot_index)[:, np.array(tree.slots, int)], blocks.parent

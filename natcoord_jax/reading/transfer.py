@@ -10,7 +10,6 @@ from natcoord_jax.core.compiled import briefly
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import STATE, State
 from natcoord_jax.mechanics.coordinates import state_rates
-from natcoord_jax.mechanics.response import body_rows
 from natcoord_jax.mechanics.tangent_space import TangentSpace, Velocity
 from natcoord_jax.mechanics.violations import residuals
 from natcoord_jax.model.model import SYSTEM, Model, SomeModel
@@ -109,7 +108,7 @@ def _transferred(system: Model, state: State, into: SomeModel, onto: State | Non
 def _after_impact(system: Model, into: Model, moved: State, closes: Bool[Array, ""]) -> State:
     """The state with velocities that the joints admit, if any closes."""
     rates = _rotor_rates(system, into, moved) if into.structure.rotors else moved.rates
-    found = TangentSpace.at(into, moved).projected(Velocity(body_rows(moved.v), rates))
+    found = TangentSpace.at(into, moved).projected(Velocity(moved.row_rates, rates))
     v = jnp.where(closes, found.rows.reshape(moved.v.shape), moved.v)
     return replace_fields(moved, v=v, rates=jnp.where(closes, found.rotors, moved.rates))
 

@@ -217,7 +217,7 @@ def find_redundancy(system: System, state: State) -> tuple[int, tuple[str, ...]]
 
 
 def _disturbed(state: State, random: np.random.Generator) -> State:
-    q = np.asarray(state.q).reshape(-1, 4, 3)
+    q = np.asarray(state.rows)
     noise = 0.05 * random.normal(size=q.shape)
     noise[:, 0] *= max(np.max(np.abs(q[:, 0])), 1e-3)
     return replace_fields(state, q=as_array((q + noise).reshape(-1, 3)), v=as_array(np.zeros(state.v.shape)))

@@ -46,7 +46,7 @@ def with_admissible_positions(system: System, state: State) -> tuple[State, Arra
 
     Bodies keep their velocities and angular velocities.
     """
-    rows = state.q.reshape(-1, 4, 3)
+    rows = state.rows
     squared = jnp.concatenate([rows[:, :1], orthonormalise(rows[:, 1:])], axis=1).reshape(-1, 3)
     state = replace_fields(state, q=squared)
     twists = twists_of(system, state)
@@ -56,7 +56,7 @@ def with_admissible_positions(system: System, state: State) -> tuple[State, Arra
 
 def _moving(state: State, twists: Array) -> State:
     """The state with velocities from the twists of its bodies."""
-    rates = row_rates(state.q.reshape(-1, 4, 3), twists[:, :3], twists[:, 3:])
+    rates = row_rates(state.rows, twists[:, :3], twists[:, 3:])
     return replace_fields(state, v=rates.reshape(-1, 3))
 
 

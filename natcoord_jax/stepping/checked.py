@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from natcoord_jax.core.bodies import TRIAD
 from natcoord_jax.core.checks import as_array, at_top_level
 from natcoord_jax.core.kinds import FunctionOf
 from natcoord_jax.core.numeric import Number, Numbers
@@ -72,7 +73,7 @@ def check_state(system: System, state: State) -> None:
     Raises:
         ValueError: if its shape or the precision of its numbers says that it does not.
     """
-    expected = 4 * len(system.structure.bodies)
+    expected = TRIAD.rows * len(system.structure.bodies)
     if state.q.shape != (expected, 3) or state.v.shape != (expected, 3):
         raise ValueError(
             f"state.q has shape {state.q.shape}, state.v {state.v.shape}; this system has shape "

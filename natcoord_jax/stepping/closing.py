@@ -117,7 +117,7 @@ def _step(system: System, origin: State, state: State, manner: Manner) -> Outcom
     turned = largest(safe_norm(twist[:, 3:]))
     limited = turned > manner.reach
     twist = jnp.where(limited, manner.reach / jnp.where(limited, turned, 1.0), 1.0) * twist
-    points = state.q.reshape(-1, 4, 3)[:, 0]
+    points = state.rows[:, 0]
     extent = largest(jnp.abs(points - jnp.mean(points, axis=0)).reshape(-1)) + 0.1
     size = jnp.concatenate([jnp.full(3, extent), jnp.ones(3, extent.dtype)])
     shaken = jnp.asarray(_shakes(points.shape[0]))[manner.shake] * size

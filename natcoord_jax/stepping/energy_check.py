@@ -52,7 +52,7 @@ def unbalanced_work(
 
 def motion_of(system: System, state: State) -> Float[Array, ""]:
     """Energy of the motion, twice, rotors included, within a small factor [J]."""
-    moving = motion(system.mass, state.v.reshape(-1, 4, 3))
+    moving = motion(system.mass, state.row_rates)
     for group in rotors_of(system):
         inertias = jax.vmap(lambda effect: effect.inertia_of())(group.effect)
         moving = moving + jnp.sum(inertias * state.rates[group.rotors] ** 2)
@@ -88,7 +88,7 @@ def sound(
     allowed = UNSOUND * moving + rounding * (jnp.sqrt(moving) + rounding)
     if tolerance > TOLERANCE:
         allowed = tolerance / TOLERANCE * allowed
-    rows = before.q.reshape(-1, 4, 3)
+    rows = before.rows
     places = jnp.sum(rows * inertia(system, rows))
     near = (equations.h * correction) ** 2 <= PLACES**2 * places
     near = near | (correction <= RESTING * grain + UNFELT * size)

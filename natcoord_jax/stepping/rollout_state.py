@@ -151,9 +151,7 @@ def start_of(setting: RolloutProblem, state: State) -> tuple[RolloutState, Facto
     lagging = None
     structure = setting.system.structure
     if plan.tableau.kick and structure.unknowns + structure.multipliers >= FEWEST:
-        lagging = Lagging.begin(
-            Velocity(jnp.zeros_like(state.q.reshape(-1, 4, 3)), jnp.zeros_like(state.rates))
-        )
+        lagging = Lagging.begin(Velocity(jnp.zeros_like(state.rows), jnp.zeros_like(state.rates)))
     course = RolloutState(
         state=state,
         it=it,

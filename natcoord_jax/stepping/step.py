@@ -73,7 +73,7 @@ def end_of_step(
     """
     at = found.at
     bodies = len(system.structure.bodies)
-    rates = at.rates[:, :bodies].reshape(tableau.stages, 4 * bodies, 3)
+    rates = at.rates[:, :bodies].reshape(tableau.stages, -1, 3)
     b = jnp.asarray(tableau.b)
     q = state.q + h * jnp.tensordot(b, rates, 1)
     coordinates, work = state.coordinates, state.work

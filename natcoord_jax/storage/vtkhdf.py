@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from natcoord_jax.core.bodies import NODE
 from natcoord_jax.model.groups import Group
 from natcoord_jax.system import System
 
@@ -48,7 +49,7 @@ class Points:
         """Put some times in their places."""
         g = self.geometry
         ground = np.concatenate([np.zeros((1, 3)), np.eye(3)])
-        q = np.concatenate([q, np.broadcast_to(ground, (len(q), 4, 3))], axis=1)
+        q = np.concatenate([q, np.broadcast_to(ground, (len(q), *NODE))], axis=1)
         x = np.einsum("pk,tpkc->tpc", g.weights, q[:, g.rows])
         count = len(g.rows)
         self.places[first * count : (first + len(x)) * count] = x.reshape(-1, 3)
@@ -64,7 +65,7 @@ def geometry_of(system: System) -> Geometry:
         key = bodies.tobytes(), shares.tobytes()
         if key not in keys:
             keys[key] = len(rows)
-            rows.append((4 * bodies[:, None] + np.arange(4)).reshape(-1))
+            rows.append((NODE[0] * bodies[:, None] + np.arange(NODE[0])).reshape(-1))
             weights.append(shares.reshape(-1))
         return keys[key]
 
@@ -86,9 +87,9 @@ def _elements(system: System) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
         if kind is not None:
             weights, bodies = np.asarray(group.weights, float), np.asarray(group.bodies)
             weights = weights if weights.ndim == 3 else weights[:, :, 0]
-            each = weights.shape[-1] // 4
+            each = weights.shape[-1] // NODE[0]
             shape = *weights.shape[:2], each
-            yield kind, bodies.reshape(shape).astype(np.int64), weights.reshape(*shape, 4)
+            yield kind, bodies.reshape(shape).astype(np.int64), weights.reshape(*shape, NODE[0])
 
 
 def _kind(group: Group) -> int | None:

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from natcoord_jax.bodies.beam import BeamHandle
+from natcoord_jax.core.bodies import NODE, by_node
 from natcoord_jax.core.names import Names
 from natcoord_jax.core.state import State
 from natcoord_jax.mechanics.energies import group_energies
@@ -26,8 +27,8 @@ Colouring = str | Mapping[str, Any]
 def with_ground(q: Float[np.ndarray, "t rows 3"]) -> Float[np.ndarray, "t bodies_and_ground 4 3"]:
     """Rows by body, those of the ground last."""
     ground = np.concatenate([np.zeros((1, 3)), np.eye(3)])
-    rows = q.reshape(len(q), -1, 4, 3)
-    return np.concatenate([rows, np.broadcast_to(ground, (len(q), 1, 4, 3))], axis=1)
+    rows = by_node(q)
+    return np.concatenate([rows, np.broadcast_to(ground, (len(q), 1, *NODE))], axis=1)
 
 
 def markers_of(group: Group) -> tuple[np.ndarray, np.ndarray]:

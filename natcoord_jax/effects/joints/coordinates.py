@@ -7,6 +7,7 @@ from typing import ClassVar
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from natcoord_jax.core.bodies import NODE
 from natcoord_jax.core.coordinate import Coordinate
 from natcoord_jax.core.joint import Frame
 from natcoord_jax.core.unit_loads import PairMotion, UnitLoad, unit_load_of
@@ -156,7 +157,7 @@ class Displacement(Coordinate):
         u = pair.child.point - pair.parent.point
         rate_u = pair.child_rate.point - pair.parent_rate.point
         a, rate_a = pair.parent.axes[:, self.axis], pair.parent_rate.axes[:, self.axis]
-        forces = jnp.zeros((a.shape[0], 2, 4, 3), a.dtype)
+        forces = jnp.zeros((a.shape[0], 2, *NODE), a.dtype)
         forces = forces.at[:, 0, 0].set(-a).at[:, 1, 0].set(a).at[:, 0, 1 + self.axis].set(u)
         return UnitLoad(dot(a, rate_u) + dot(rate_a, u), forces, None)
 
@@ -192,7 +193,7 @@ class Separation(Coordinate):
         rate_u = (pair.child_rate.point - pair.parent_rate.point)[0]
         end = safe_norm(u + 0.5 * h * rate_u)
         direction = 2.0 * safe_divide(u, (start + end)[None])
-        forces = jnp.zeros((1, 2, 4, 3), direction.dtype)
+        forces = jnp.zeros((1, 2, *NODE), direction.dtype)
         forces = forces.at[0, 0, 0].set(-direction).at[0, 1, 0].set(direction)
         return UnitLoad(dot(direction, rate_u)[None], forces, None)
 
