@@ -1,11 +1,14 @@
 """Sparse linear solvers against dense ones: every structure, both directions, every mode of derivative."""
 
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from benchmarks import patterns
+from benchmarks.fronts import fronts
 from natcoord_jax.linsolve import symbolic
 from natcoord_jax.linsolve.blocks import block_pattern
 from natcoord_jax.linsolve.conjugate_residuals import conjugate_residuals
@@ -307,3 +310,17 @@ def test_conjugate_residuals_solve_in_as_many_directions_as_differ(limit):
     assert bool(found.there) == (limit == 5) == bool(left <= 1e-12)
     # What comes along belongs to the solution, affine as it is.
     np.testing.assert_allclose(found.more, 2.0 * found.solution["x"][:3] + 1.0, rtol=1e-10)
+
+
+@pytest.mark.parametrize(("shape", "row"), [
+    ((32, 32), "| plate 32 × 32 | 5 445 | 10 MB | 0.24 Gflop | 250 |"),
+    ((8, 8, 8), "| block 8 × 8 × 8 | 2 187 | 7 MB | 0.25 Gflop | 351 |"),
+])  # fmt: skip
+def test_what_fronts_hold_is_what_the_page_says(shape, row):
+    text = (Path(__file__).resolve().parents[1] / "docs/howto/large_systems.md").read_text("utf-8")
+    found = fronts(shape)
+    assert row in text
+    cells = row.strip("| ").split(" | ")[1:]
+    told = [float("".join(c for c in cell if c.isdigit() or c == ".")) for cell in cells]
+    own = found["unknowns"], 1e-6 * found["factors"], 1e-9 * found["operations"], found["largest"]
+    np.testing.assert_allclose(told, own, rtol=0.06)
