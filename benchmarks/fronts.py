@@ -10,7 +10,7 @@ import numpy as np
 from natcoord_jax.linsolve.blocks import block_pattern
 from natcoord_jax.linsolve.graph import graph_of
 from natcoord_jax.linsolve.multifrontal import cheapest
-from natcoord_jax.linsolve.symbolic import Sizes
+from natcoord_jax.linsolve.symbolic import Sizes, estimate
 
 PLATES = ((32, 32), (64, 64), (128, 128), (192, 192))
 BLOCKS = ((8, 8, 8), (16, 16, 16), (24, 24, 24))
@@ -31,23 +31,30 @@ def grid(shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def fronts(shape: tuple[int, ...]) -> dict[str, float]:
-    """Of the plan for a plate or a block: unknowns, bytes of factors, operations, rows of the largest front.
+    """What the plan for a plate or a block holds and costs.
 
-    A front of p pivots and b rows that it leaves holds p^2 + 2 p b numbers, and takes 2 p^3 operations for
+    Batches are of fronts of about one size, which are eliminated together: what compiling costs. A front of p pivots and b rows that it leaves holds p^2 + 2 p b numbers, and takes 2 p^3 operations for
     its inverse and 4 p^2 b + 2 p b^2 for the products.
+
+    Args:
+        shape: cells along each edge.
+
+    Returns:
+        Unknowns, bytes of factors, operations of a factorisation, rows of the largest front, batches.
     """
     cells, places = grid(shape)
     own = UNKNOWNS[len(shape)]
     elements = (cells[:, :, None] * own + np.arange(own)).reshape(len(cells), -1)
     _, entries = block_pattern(np.repeat(np.arange(len(places)), own), [elements])
     graph = graph_of(entries)
-    sizes = Sizes(graph)
-    p, b = np.array([sizes.of(front) for front in cheapest(graph, places)], float).T
+    sizes, plan = Sizes(graph), cheapest(graph, places)
+    p, b = np.array([sizes.of(front) for front in plan], float).T
     return {
         "unknowns": own * len(places),
         "factors": 8 * float(np.sum(p**2 + 2 * p * b)),
         "operations": float(np.sum(2 * p**3 + 4 * p**2 * b + 2 * p * b**2)),
         "largest": int(np.max(p + b)),
+        "batches": sum(map(len, estimate(plan, sizes)[1])),
     }
 
 

@@ -324,3 +324,9 @@ def test_what_fronts_hold_is_what_the_page_says(shape, row):
     told = [float("".join(c for c in cell if c.isdigit() or c == ".")) for cell in cells]
     own = found["unknowns"], 1e-6 * found["factors"], 1e-9 * found["operations"], found["largest"]
     np.testing.assert_allclose(told, own, rtol=0.06)
+
+
+@pytest.mark.parametrize("shape", [(32, 32), (24, 6, 6)])
+def test_plans_of_meshes_compile_in_time(shape):
+    """A batch of fronts takes about half a second of the compiler, and another to be differentiated."""
+    assert fronts(shape)["batches"] <= 20

@@ -117,7 +117,7 @@ def estimate(fronts: list[Front], sizes: Sizes) -> tuple[float, list[list[list[i
     depth = depths(fronts)
     shape = [sizes.of(f) for f in fronts]
     # Where the work is much, a bucket more costs little time, but still its time of compiling.
-    overhead = max(cost.BUCKET, 0.01 * sum(float(cost.front(*s)) for s in shape))
+    overhead = max(cost.BUCKET, 0.05 * sum(float(cost.front(*s)) for s in shape))
     total, levels = 0.0, []
     for level in range(int(depth.max(initial=0)) + 1):
         own = np.nonzero(depth == level)[0]
