@@ -33,8 +33,9 @@ def grid(shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
 def fronts(shape: tuple[int, ...]) -> dict[str, float]:
     """What the plan for a plate or a block holds and costs.
 
-    Batches are of fronts of about one size, which are eliminated together: what compiling costs. A front of p pivots and b rows that it leaves holds p^2 + 2 p b numbers, and takes 2 p^3 operations for
-    its inverse and 4 p^2 b + 2 p b^2 for the products.
+    Batches are of fronts of about one size, which are eliminated together: what compiling costs. A front of
+    p pivots and b rows that it leaves holds p^2 + 2 p b numbers, and takes 2 p^3 operations for its inverse
+    and 4 p^2 b + 2 p b^2 for the products.
 
     Args:
         shape: cells along each edge.
