@@ -1,5 +1,7 @@
 """The form of the equations with a sparse Jacobian: same trajectory and derivatives as the dense one."""
 
+import warnings
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -114,3 +116,20 @@ def test_frames_of_beams_move_alike():
     assert "sparse, multifrontal" in system.report()
     assert np.max(np.abs(paths["full"] - paths["full"][0])) > 0.01
     assert np.max(np.abs(paths["full"] - paths["sparse"])) <= 1e-10
+
+
+@pytest.mark.parametrize("scheme", [nc.EnergyMomentum(order=4), nc.Dissipative(), nc.VariationalMidpoint()])
+def test_a_mesh_that_is_solved_densely_warns(scheme):
+    scene = nc.Scene()
+    metal = nc.Elastic(E=1e6, nu=0.3, density=1e3)
+    scene.add(nc.Solid(nc.mesh.box((1, 0.25, 0.25), (20, 3, 3)), material=metal))
+    system, state = scene.compile()
+
+    def run(scheme):
+        jax.eval_shape(lambda: nc.simulate(system, state, dt=1e-3, steps=1, scheme=scheme, throw=False))
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        run(nc.EnergyMomentum())
+    with pytest.warns(UserWarning, match=r"solves the (1008|2016) unknowns of a step densely"):
+        run(scheme)

@@ -1,5 +1,6 @@
 """What is given to a rollout, looked at before anything is compiled."""
 
+import warnings
 from typing import Any
 
 import jax.numpy as jnp
@@ -13,6 +14,7 @@ from natcoord_jax.core.numeric import Number, Numbers
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import Tableau
 from natcoord_jax.mechanics.violations import contacts
+from natcoord_jax.stepping.scheme import Scheme
 from natcoord_jax.system import System
 
 STEP = Number("positive", instead=" (jax.vmap takes several)")
@@ -104,4 +106,27 @@ def check_contacts(system: System, tableau: Tableau) -> None:
         raise ValueError(
             f"{group.effect.kind} {group.labels[0]!r} is a constraint with impacts, for steps of one stage; "
             "pass scheme=nc.EnergyMomentum(), or give the contact a stiffness, which makes it a potential"
+        )
+
+
+DENSE_LIMIT = 1000
+"""Unknowns of a step beyond which a dense solution is worth a warning."""
+
+
+def warn_of_dense_steps(system: System, scheme: Scheme) -> None:
+    """Warn of schemes that solve densely what steps of one stage solve by fronts or along the tree.
+
+    Args:
+        system: compiled system.
+        scheme: that the run asks for.
+    """
+    structure, tableau = system.structure, scheme.tableau
+    in_null_space = tableau.variational or tableau.dissipative
+    sparse = ("sparse", "recursive") if in_null_space else ("sparse",)
+    unknowns = tableau.stages * (structure.unknowns + structure.multipliers)
+    if structure.solver in sparse and (in_null_space or tableau.stages > 1) and unknowns > DENSE_LIMIT:
+        warnings.warn(
+            f"{scheme!r} solves the {unknowns} unknowns of a step densely, in a time that grows with the "
+            "third power of their number; steps of nc.EnergyMomentum() take hardly more than in proportion",
+            stacklevel=4,
         )

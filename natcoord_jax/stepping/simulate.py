@@ -21,7 +21,14 @@ from natcoord_jax.mechanics.impacts import with_mobilities
 from natcoord_jax.model.model import SYSTEM
 from natcoord_jax.reading.tangent_states import handing
 from natcoord_jax.stepping.admissibility import check_obeyed
-from natcoord_jax.stepping.checked import INPUTS, STEP, check_state, checked_inputs, checked_step
+from natcoord_jax.stepping.checked import (
+    INPUTS,
+    STEP,
+    check_state,
+    checked_inputs,
+    checked_step,
+    warn_of_dense_steps,
+)
 from natcoord_jax.stepping.error_control import Tolerance
 from natcoord_jax.stepping.newton import TOLERANCE
 from natcoord_jax.stepping.room import Steps, cut, in_host_memory, room_for, with_room
@@ -190,6 +197,7 @@ def simulate(
             "rtol and atol make substeps of their own lengths, and max_events of the scheme splits steps at "
             "impacts; leave out one of the two"
         )
+    warn_of_dense_steps(system, scheme)
     if progress or store is not None or resume:
         run = Run(
             system, state, checked, step, tolerance, newton_tol, extra_substeps, until, scheme, count,
