@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import natcoord_jax as nc
+from natcoord_jax.core.bodies import by_node
 from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.effect import replace_fields
-from natcoord_jax.mechanics.response import body_rows
 from natcoord_jax.mechanics.tangent_space import TangentSpace, Velocity
 
 STEPS = 40
@@ -187,7 +187,7 @@ class Chance(np.random.Generator):
 
 @eager_numpy
 def _projected(system: nc.System, state: nc.State, v: Any) -> nc.State:
-    free = TangentSpace.at(system, state).projected(Velocity(body_rows(v), state.rates))
+    free = TangentSpace.at(system, state).projected(Velocity(by_node(v), state.rates))
     return replace_fields(state, v=free.rows.reshape(state.v.shape), rates=free.rotors)
 
 

@@ -18,7 +18,7 @@ from natcoord_jax.core.potential import Potential, place_markers
 from natcoord_jax.maths.collocation import gauss
 from natcoord_jax.maths.rotations import arctan_coefficients, from_rotation_vector
 from natcoord_jax.mechanics.local import jacobians
-from natcoord_jax.mechanics.response import body_rows, ground_rows, situation
+from natcoord_jax.mechanics.response import ground_rows, situation
 
 ELEMENTS = 3
 STEP = 0.3
@@ -55,7 +55,7 @@ def moving(law, stages):
     system, state = compiled(law)
     (group,) = system.effects
     where = situation(system, group, state, jnp.zeros(0), jnp.asarray(STEP))
-    rows = jnp.concatenate([body_rows(state.q), ground_rows(state.q)])
+    rows = jnp.concatenate([state.rows, ground_rows(state.q)])
     twists = np.random.default_rng(4).normal(size=(len(rows), stages, 6))
     twists[-1] = 0.0
     return group, where, rows[group.bodies], jnp.asarray(twists)[group.bodies]

@@ -80,6 +80,7 @@ def test_shells_have_their_exact_inertia(triangles, offset):
 FORMS = ("full", "sparse", "reduced")
 
 
+@pytest.mark.slow
 def test_all_forms_give_the_same_motion():
     """A heavy rod that hangs on the ground falls; elimination along the tree is refused."""
     found = []
@@ -134,6 +135,7 @@ def test_all_schemes_keep_momenta(part, scheme):
         assert np.ptp(energy) <= 1e-12 * energy[0]
 
 
+@pytest.mark.slow
 def test_elements_of_every_kind_fly():
     """A plate, a block and a rod in one scene, some of them on the sparse plan, over a thousand steps."""
     scene = nc.Scene()
@@ -147,6 +149,7 @@ def test_elements_of_every_kind_fly():
     assert np.ptp(turning, axis=0).max() <= tol.MOMENTUM_OF_A_SOLID * np.linalg.norm(turning[0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stages", [1, pytest.param(2, marks=pytest.mark.exhaustive)])
 @pytest.mark.parametrize("points", [False, True])
 def test_the_jacobian_is_that_of_the_residual(stages, points):
@@ -182,6 +185,7 @@ def test_accelerations_and_reactions_are_those_of_a_short_step():
     np.testing.assert_allclose(np.asarray(now.accelerations).reshape(gained.shape), gained, rtol=0, atol=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("mass", "side"), [("lumped", -1), ("consistent", 1)])
 def test_frequencies_converge_from_both_sides(mass, side):
     """Of a rod along its axis, c / 4 l: lumped masses are too slow by (k h)^2 / 24, consistent too fast."""
@@ -195,6 +199,7 @@ def test_frequencies_converge_from_both_sides(mass, side):
     assert np.log2(errors[0] / errors[1]) == pytest.approx(2.0, abs=0.05)
 
 
+@pytest.mark.slow
 def test_masses_are_leaves():
     """A density that is set is as one that is given, for any number of systems; its derivative is exact."""
 

@@ -37,6 +37,7 @@ def falling(turn, law):
     return *scene.compile(), brick
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("turn", TURNS)
 @pytest.mark.parametrize(
     "law",

@@ -50,6 +50,7 @@ def test_nearest_points():
             assert np.linalg.norm(np.cross(near.apart, near.normal)) <= 1e-14
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("two_sided", [0.0, 1.0])
 @pytest.mark.parametrize("at", [(0.4, 0.5, 0.05), (0.97, 0.6, 0.04), (1.02, 0.5, -0.03), (-0.05, 0.5, 0.05)])
 def test_contract_of_a_gap(two_sided, at):

@@ -557,6 +557,7 @@ def turned(asymmetric, axis, degrees):
     return nc.OptimalControl(*asymmetric, dt=1 / 20, steps=20, cost=nc.cost.Effort(), goal=goal)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["shooting", pytest.param("lifted", marks=pytest.mark.exhaustive)])
 @pytest.mark.parametrize("axis", [(1, 0, 0), (0, 1, 0), (1, 1, 0), (1, 2, 3)])
 def test_turns_by_any_angle_are_found_from_rest(asymmetric, axis, method):
@@ -646,6 +647,7 @@ def test_keep_out_cone_is_gone_around():
     assert found.cost > 1.05 * 12 * 9.0 * (np.pi / 2) ** 2
 
 
+@pytest.mark.slow
 def test_another_solver_gets_the_same_problem():
     """Derivatives of `nc.to_nlp` against differences; at a solution its constraints hold."""
     problem = manoeuvres.turn(6)
@@ -748,6 +750,7 @@ def test_inertia_is_that_of_the_whole_model(seed):
     assert np.max(np.abs(found - exact)) <= 1e-8 * np.max(np.abs(exact))
 
 
+@pytest.mark.slow
 def test_a_motion_that_is_none_violates_its_equations():
     """The cost may be a number all the same, such as a time: no step may lead there."""
     problem = numeric(manoeuvres.two_masses(4, fastest=True))

@@ -108,6 +108,7 @@ def test_a_soft_goal_costs_what_missing_it_does(made):
     np.testing.assert_allclose(np.asarray(iterate.unknowns.coefficients)[:, 0], exact, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_first_coefficients_of_inputs_move_in_a_restoration(made):
     """They are no parameters: only time and what is free besides stays as it is."""
     problem = numeric(turn(made, inputs=nc.inputs.piecewise_linear(5)))
@@ -118,6 +119,7 @@ def test_first_coefficients_of_inputs_move_in_a_restoration(made):
     assert coefficients[0] > 0.1 * coefficients.max()
 
 
+@pytest.mark.slow
 def test_a_step_that_a_bound_cuts_in_half_is_not_corrected(made):
     """Twice its length is a whole one, and was none."""
     problem = numeric(turn(made, 20.0))
@@ -145,6 +147,7 @@ def test_limits_that_are_too_narrow_are_told_with_what_they_would_have_to_be(mad
     assert nc.optimise(turn(made, 1.5 * 0.75 * LEAST), progress=False).ok
 
 
+@pytest.mark.slow
 def test_what_is_no_number_is_named(made):
     root = nc.cost.Running(lambda state, u, t: jnp.sqrt(0.5 - t) + u[0] ** 2)
     found = nc.optimise(turn(made, cost=root), progress=False, method="shooting")
@@ -190,6 +193,7 @@ def test_multipliers_that_grow_without_end_are_divergence(made):
     assert "largest multiplier: rest of 'disc'" in text
 
 
+@pytest.mark.slow
 def test_limits_hold_for_all_attempts(made):
     found = nc.optimise(turn(made, 0.75 * LEAST), progress=False, max_iterations=25)
     assert not found.ok and len(found.history) <= 25
@@ -265,6 +269,7 @@ def test_a_path_is_followed_as_far_as_there_are_solutions(made):
     assert np.all(np.diff(costs) > -1e-9 * costs[0])
 
 
+@pytest.mark.slow
 def test_a_path_reaches_its_end(made):
     def further(problem, s):
         goal = nc.goal.Coordinate("hinge", 1.0 + s) & nc.goal.Rest()

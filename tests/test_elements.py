@@ -151,6 +151,7 @@ INSIDE = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", ["pin", *(pytest.param(x, marks=pytest.mark.slow) for x in INSIDE if x != "pin")]
 )
@@ -362,6 +363,7 @@ def test_large_statics_are_solved_by_the_sparse_plan(analysis, monkeypatch):
     np.testing.assert_allclose(*found, rtol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "make", [lambda: winged()[:2], lambda: _continuum("plate"), lambda: _continuum("block")]
 )

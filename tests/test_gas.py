@@ -82,6 +82,7 @@ def test_factors_with_products():
     np.testing.assert_allclose(found.transpose().solve(right), np.linalg.solve(whole.T, right), rtol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("exponent", [1.0, 1.4, 0.0])
 def test_a_ball_keeps_what_it_has(exponent):
     """Energy, momentum and angular momentum, while the gas takes up a part of the energy."""

@@ -51,6 +51,7 @@ def test_bouncing_ball(h, restitution):
         assert lost == pytest.approx(-9.81, rel=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("restitution", [1.0, 0.5])
 def test_all_forms_agree(restitution):
     found = []
@@ -214,6 +215,7 @@ def test_friction_stops_what_slides(h, place):
     assert np.abs(v[t >= stopped]).max() <= 1e-15
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", ["full", "recursive", "sparse"])
 def test_friction_on_a_slope(solver):
     """Thrown up a slope of tangent 0.7: a coefficient of 0.8 holds it, with 0.5 it slides back."""
@@ -238,6 +240,7 @@ def test_sphere_begins_to_roll():
     assert 2 * 2.0 / (7 * 0.3 * 9.81) <= rolls <= 2 * 2.0 / (7 * 0.3 * 9.81) + 0.011
 
 
+@pytest.mark.slow
 def test_cylinder_begins_to_roll():
     """With two thirds of its speed: it lies on the lowest points of both rims."""
     scene = nc.Scene()
@@ -306,6 +309,7 @@ def test_stack_of_boxes_stands(count):
     assert int(trajectory.steps_rejected) == 0
 
 
+@pytest.mark.slow
 def test_derivatives_of_the_program():
     """In every mode, where no difference crosses a change of contacts; in a batch of other contacts, too."""
     system, state = dropped(0.8)
@@ -323,6 +327,7 @@ def test_derivatives_of_the_program():
     np.testing.assert_allclose(np.stack(together), np.array(apart).T, rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_derivatives_through_friction():
     """By the speed at the start and by the coefficient, through impact, slip and rest."""
     scene = nc.Scene()
@@ -384,6 +389,7 @@ def test_restitutions_that_differ_make_no_energy():
     assert limited > 0
 
 
+@pytest.mark.slow
 def test_impact_law_is_differentiable():
     random = np.random.default_rng(2)
     matrix, rates, work = (jnp.asarray(x) for x in random_impacts(random))

@@ -72,6 +72,7 @@ def machine():
     return scene.compile()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("order", "kick"), EVERY_ORDER)
 def test_a_machine_with_motor_drive_damper_and_spring(order, kick):
     """Energy is the work done, momenta are kept, velocities are tangent with kicks."""

@@ -176,6 +176,7 @@ def test_goes_on_when_the_compiler_refuses(monkeypatch):
     np.testing.assert_allclose(trajectory.v[-1, 0], wanted, rtol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("recorded", [True, pytest.param(False, marks=pytest.mark.exhaustive)])
 def test_rounds_of_two_kernels_are_the_loop_in_one(monkeypatch, recorded):
     """Slots, inputs and factors travel between the kernels; more slots than a round has, and substeps."""

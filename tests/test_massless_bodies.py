@@ -51,6 +51,7 @@ def rows(system, x):
     return np.asarray(x).reshape(*x.shape[:-2], -1, 4, 3)[..., which, :, :]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver, order", [("reduced", 2), ("recursive", 4)])
 def test_two_hinges_are_a_universal_joint(solver, order):
     found = []

@@ -50,6 +50,7 @@ def arm():
     return *scene.compile(), hinges
 
 
+@pytest.mark.slow
 def test_rates_of_a_controlled_arm_do_not_alternate():
     """What a controller answers to would be its own noise: 3.6 of 22 rad/s at the longest step, otherwise."""
     system, state, hinges = arm()
@@ -200,6 +201,7 @@ def pendulum():
     return *scene.compile(), hinge
 
 
+@pytest.mark.slow
 def test_derivatives_through_a_controller_that_reads_rates():
     """By its gain, by the mass, which is in the projection, too, and by the start; both ways."""
     system, state, hinge = pendulum()

@@ -95,6 +95,7 @@ def test_what_has_no_name_is_refused(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_trajectories_problems_and_solutions_come_back(tmp_path):
     system, state = swing()
     trajectory = nc.simulate(system, state, dt=0.05, steps=4, scheme=nc.EnergyMomentum(order=2))

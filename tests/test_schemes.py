@@ -371,6 +371,7 @@ def fourth_order_difference(f):
     return (8 * (values[2] - values[1]) - (values[3] - values[0])) / (12 * STEP)
 
 
+@pytest.mark.slow
 @BOTH
 def test_gradient_against_differences(scheme):
     loss = loss_of(scheme)

@@ -292,6 +292,7 @@ def test_rigid_motions_only_cost_nothing(kind):
     assert np.abs(np.asarray(forces(system, state, rows))).max() <= 1e-12 * 2e5 * 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("regular", [True, False])
 def test_plates_do_not_lock(regular):
     """Clamped square plate under its weight, from thick to very thin: 0.00126532 q L^4 / D of Kirchhoff."""

@@ -122,6 +122,7 @@ def test_patch(element, law):
     assert float(system.energy(state).total) == pytest.approx(float(energy), rel=tol.INDIFFERENCE)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("law", LAWS)
 def test_work_of_the_stress_of_a_step(law):
     """It is the change of energy, however large the step; of a small one the stress is the derivative."""
@@ -298,6 +299,7 @@ COOK_FINEST = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("element", "count", "nu", "published"), COOK)
 def test_cooks_membrane(element, count, nu, published):
     assert cook(element, count, nu) == pytest.approx(published, abs=tol.COOK)

@@ -503,6 +503,7 @@ def test_a_system_that_corrections_do_not_solve_is_reported(turntable, mode, mon
         MODES[mode](end, jnp.ones(1))
 
 
+@pytest.mark.slow
 def test_control_says_that_a_step_has_no_derivative(turntable, monkeypatch):
     system, state = turntable
     problem = nc.OptimalControl(
@@ -524,6 +525,7 @@ def test_descent_ends_where_there_is_no_slope(turntable):
     assert np.all(np.isfinite(solution.inputs))
 
 
+@pytest.mark.slow
 def test_known_tangents_and_unknown_ones_pass_side_by_side(turntable):
     """The gradient of a directional derivative along a direction that is fixed, several of them at once."""
     system, state = turntable

@@ -197,6 +197,7 @@ def test_a_step_repeated_at_the_end_of_a_round():
         np.testing.assert_allclose(forward(1.0, 1e5, place), -1.0, atol=EXACT_GRADIENT)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "mode", ["reverse", *(pytest.param(x, marks=pytest.mark.slow) for x in ("forward", "many"))]
 )

@@ -67,6 +67,7 @@ def test_energy_changes_by_the_work_of_the_residual(solved):
     assert found >= 0.999 * abs(change)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tolerance, allowed", [(TOLERANCE, 1e-12), (1e-8, 1e-4)])
 def test_only_what_is_solved_is_sound(solved, tolerance, allowed):
     """Errors well below what is allowed pass, larger ones do not; a larger tolerance allows more."""
