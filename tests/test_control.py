@@ -10,7 +10,7 @@ import optax
 import pytest
 
 import natcoord_jax as nc
-from natcoord_jax.control import conditions, line_search, proposal, sequential
+from natcoord_jax.control import improvement, line_search, proposal, sequential
 from natcoord_jax.control.costates import Multipliers
 from natcoord_jax.control.guess import unknowns_of
 from natcoord_jax.control.inputs import Spline
@@ -588,7 +588,7 @@ def test_check_tells_a_saddle_from_a_minimum(asymmetric, monkeypatch):
     assert verdict.kind == "minimum" and "minimum" in str(verdict)
     assert verdict.curvature * 2 * found.dt == pytest.approx(least, rel=0.02)
     assert np.linalg.norm(verdict.direction) == pytest.approx(1.0)
-    monkeypatch.setattr(conditions, "STILL", 0.0)  # nothing is drawn aside
+    monkeypatch.setattr(improvement, "STILL", 0.0)  # nothing is drawn aside
     jax.clear_caches()
     stuck = nc.optimise(problem, method="shooting", progress=False, max_iterations=6)
     assert not stuck.ok and stuck.iterate.errors.stationarity < 1e-2

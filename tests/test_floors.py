@@ -5,7 +5,7 @@ it is loaded. Only ``natcoord_jax/__init__.py``, which gathers the public names,
 """
 
 import ast
-import importlib
+import importlib.util
 import inspect
 import json
 import os
@@ -337,3 +337,41 @@ def _documented(thing: object) -> bool:
     doc = (thing.__doc__ or "").strip()
     # A dataclass without a docstring is given its signature for one.
     return bool(doc) and not (inspect.isclass(thing) and doc.startswith(f"{thing.__name__}("))
+
+
+def missing_names(source: str) -> list[str]:
+    """What is taken from modules of the package, by import, attribute or replacement, and is not there."""
+    modules, missing, tree = {}, [], ast.parse(source)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("natcoord_jax"):
+            for name in node.names:
+                whole = importlib.import_module(node.module or "")
+                found = f"{node.module}.{name.name}"
+                if importlib.util.find_spec(found) if hasattr(whole, "__path__") else None:
+                    modules[name.asname or name.name] = importlib.import_module(found)
+                elif not hasattr(whole, name.name):
+                    missing.append(found)
+    for node in ast.walk(tree):
+        owner, name = None, ""
+        if isinstance(node, ast.Attribute):
+            owner, name = node.value, node.attr
+        elif isinstance(node, ast.Call) and getattr(node.func, "attr", "") == "setattr":
+            owner, name = node.args[0], getattr(node.args[1], "value", "")
+        module = modules.get(owner.id) if isinstance(owner, ast.Name) else None
+        if module is not None and not hasattr(module, name):
+            missing.append(f"{module.__name__}.{name}")
+    return missing
+
+
+@pytest.mark.parametrize("file", sorted(Path(__file__).parent.rglob("*.py")), ids=lambda file: file.stem)
+def test_what_tests_take_is_there(file: Path):
+    """Of those, too, that only the exhaustive suite runs."""
+    assert not missing_names(file.read_text("utf-8"))
+
+
+def test_missing_names_are_seen():
+    source = (
+        "from natcoord_jax.stepping import newton, none\nnewton.absent\npatch.setattr(newton, 'gone', 1)\n"
+    )
+    names = ("none", "newton.absent", "newton.gone")
+    assert missing_names(source) == [f"natcoord_jax.stepping.{name}" for name in names]
