@@ -71,7 +71,7 @@ HEAVY = ("matplotlib", "mujoco", "optax", "scipy.optimize")
 LONGEST, LONGEST_FUNCTION = 300, 50
 """Lines of a file, and of a function without its docstring."""
 LONGER_FUNCTIONS = {
-    "_by_rounds", "_curved", "after_attempt", "arm", "averaged_gradient", "build", "concluded",
+    "_by_rounds", "_curved", "arm", "averaged_gradient", "build", "concluded",
     "conjugate_residuals", "continuation", "costates", "descend", "end_of_step", "factored", "improved",
     "judge", "model", "rollout", "search", "simulate", "spanning_tree",
 }  # fmt: skip

@@ -19,6 +19,7 @@ from natcoord_jax.mechanics.redundancy import contact_weights
 from natcoord_jax.mechanics.response import Evaluation
 from natcoord_jax.mechanics.start_cache import StartCache
 from natcoord_jax.mechanics.tangent_space import driven
+from natcoord_jax.stepping.after_attempt import after_attempt
 from natcoord_jax.stepping.difference_jacobian import DifferenceJacobian
 from natcoord_jax.stepping.differences import evaluated, told
 from natcoord_jax.stepping.energy_check import sound
@@ -26,7 +27,7 @@ from natcoord_jax.stepping.factors import Factors, factors_of
 from natcoord_jax.stepping.located import Ahead
 from natcoord_jax.stepping.newton import Iterate, any_lane, judge, refreshed
 from natcoord_jax.stepping.remainder import remainder, with_remainder
-from natcoord_jax.stepping.rollout_state import RolloutProblem, RolloutState, after_attempt
+from natcoord_jax.stepping.rollout_state import RolloutProblem, RolloutState
 from natcoord_jax.stepping.step import end_of_step
 from natcoord_jax.xla.rows import row, with_row
 

@@ -20,7 +20,7 @@ from motions import SECOND_AND_FOURTH, simulate
 
 import natcoord_jax as nc
 from natcoord_jax.core.results import Result, SimulationError
-from natcoord_jax.stepping import rollout_state
+from natcoord_jax.stepping import after_attempt
 
 ROOT = Path(__file__).resolve().parents[2]
 STEP, SICK, STEPS = 0.001, 500, 600
@@ -151,7 +151,7 @@ def test_newton_starved(order, monkeypatch):
     system, state = apart(released)
     monkeypatch.setattr(newton, "NEWTON_ROUNDS", 1)
     monkeypatch.setattr(newton, "CHORD_ITERATIONS", 1)
-    monkeypatch.setattr(rollout_state, "SMALLEST_FRACTION", 1.0)
+    monkeypatch.setattr(after_attempt, "SMALLEST_FRACTION", 1.0)
     jax.clear_caches()
     try:
         with pytest.raises(
