@@ -87,12 +87,13 @@ def _followed(
 
 
 def _ended(
-    setting: RolloutProblem, course: RolloutState, verdict: StepDecision, origin: State, code: Array
+    setting: RolloutProblem, course: RolloutState, verdict: StepDecision, code: Array
 ) -> tuple[Bool[Array, ""], Int[Array, ""]]:
     """Whether the run is over, for good or by its event, and its code."""
     plan, stopped = setting.plan, course.stopped | verdict.hopeless
     result = jnp.where(verdict.hopeless, code, course.code)
     if plan.event is not None:
+        origin = course.state if course.trial is None else course.trial.origin
         before, after = (plan.indicator(setting.system, setting.event, x) for x in (origin, verdict.state))
         crossed = verdict.accepted & (before * after <= 0) & (before != 0)
         stopped, result = stopped | crossed, jnp.where(crossed, int(Result.EVENT), result)
@@ -135,11 +136,10 @@ def after_attempt(
     """
     tableau, it, over = setting.plan.tableau, course.it, setting.over(course)
     code, worst = _looked_at(setting.system, it, *found)
-    solved, origin = code == int(Result.SUCCESSFUL), course.state
+    solved = code == int(Result.SUCCESSFUL)
     if course.trial is None or setting.tolerance is None:
         verdict = _halve(course, found[0], solved, over)
     else:
-        origin = course.trial.origin
         verdict = follow(setting.tolerance, course.trial, course.state, found[0], solved, over, tableau)
         code = jnp.where(solved, int(Result.TOLERANCE_NOT_MET), code)
     search, nearly = course.search, 1e-9
@@ -147,11 +147,12 @@ def after_attempt(
         most, nearly = tableau.max_events, COMPLETE
         search, verdict = with_impacts(search, ahead, verdict, course, most, solved & ~over)
     complete = verdict.accepted & (verdict.done > 1.0 - nearly)
-    stopped, result = _ended(setting, course, verdict, origin, code)
+    stopped, result = _ended(setting, course, verdict, code)
     done, fraction, trial, left = _next_part(course, verdict, complete, left)
     kept, worked, size = verdict.change > 0, jnp.where(over, 0, it.total), it.y.shape[0]
-    past = _followed(course, it, inertias, kick, trial, solved, kept, fraction)
-    guess, lagging, sound = past.guess, course.lagging, jnp.all(jnp.isfinite(past.guess))
+    past, lagging = _followed(course, it, inertias, kick, trial, solved, kept, fraction), course.lagging
+    guess = past.guess
+    sound = jnp.all(jnp.isfinite(guess))
     if lagging is not None:
         lagging = lagging.beginning(from_body_axes(verdict.state, jnp.where(sound, guess[size:], 0.0)))
     return RolloutState(
