@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from natcoord_jax.core.arguments import Part
 from natcoord_jax.core.callables import replace_fields as replace_fields
@@ -53,6 +53,7 @@ class StepContext(eqx.Module):
         rates: their stored rates (rotors only) [rad/s or m/s].
         tableau: the collocation method.
         stress: what numerical dissipation adds to the gradients of an elastic effect; None: nothing.
+        neighbours: what `Effect.neighbours` has found at the start of the step; None: it looks for none.
     """
 
     t: Float[Array, ""]
@@ -62,6 +63,7 @@ class StepContext(eqx.Module):
     rates: Float[Array, "*n r"]
     tableau: Tableau = eqx.field(static=True)
     stress: Float[Array, "*n s p"] | None = None
+    neighbours: Any = None
 
     @property
     def times(self) -> Float[Array, " s"]:
@@ -92,18 +94,36 @@ class Response(eqx.Module):
     released: Float[Array, "*n s"] | None = None
 
 
+class NeighbourTangents(eqx.Module):
+    """Derivatives of the forces on markers by the velocities of others, which are others in every step.
+
+    Attributes:
+        others: numbers of the other markers.
+        stiffness: minus the derivatives of the force on a marker by the velocity of each of these.
+        across: velocities of the markers by the twists of their bodies.
+        along: the same as their increments follow twists, see `core.closed_tangents`.
+    """
+
+    others: Int[Array, "n k m"]
+    stiffness: Float[Array, "n k m 3 3"]
+    across: Float[Array, "n k s r 3"]
+    along: Float[Array, "n k s r 3"]
+
+
 class SpreadTangents(eqx.Module):
-    """Derivatives of the wrenches on many bodies by their twists: sparse ones, and a product.
+    """Derivatives of the wrenches on many bodies by their twists: sparse ones, and others.
 
     Attributes:
         parts: of the markers of each part, of all instances one after the other.
-        columns: wrenches on all bodies that go with a number that all twists change,
+        columns: wrenches on all bodies that go with a number that all twists change; None: there is none,
         rows: the derivatives of that number.
+        neighbours: what there is besides between markers that are neighbours; None: nothing.
     """
 
     parts: Float[Array, "nf p s r p s r"]
-    columns: Float[Array, "n k s r"]
-    rows: Float[Array, "n k s r"]
+    columns: Float[Array, "n k s r"] | None = None
+    rows: Float[Array, "n k s r"] | None = None
+    neighbours: NeighbourTangents | None = None
 
 
 class Effect(Part):
@@ -220,6 +240,42 @@ class Effect(Part):
         """
         return {}
 
+    def neighbours(
+        self, place: Array, rows: Float[Array, "k 4 3"], rates: Float[Array, "k 4 3"], h: Float[Array, ""]
+    ) -> Any:
+        """What it looks up once, at the start of a step, and finds in `StepContext`; None: nothing.
+
+        Without derivatives: numbers of what is near, say.
+
+        Args:
+            place: see `respond`.
+            rows: of its bodies at the start.
+            rates: their velocities there.
+            h: step [s].
+        """
+        return None
+
+    def missed(
+        self, place: Array, found: Any, start: Array, rates: Array, end: Array, h: Float[Array, ""]
+    ) -> Int[Array, "2 2"]:
+        """Of an effect that looks up its neighbours: a pair of markers which it may have missed in a step.
+
+        A step with such a pair is repeated in parts, and at last ends the run.
+
+        Args:
+            place: see `respond`.
+            found: its neighbours.
+            start: rows of its bodies at the start.
+            rates: their velocities there.
+            end: rows at the end.
+            h: step [s].
+
+        Returns:
+            Numbers of two markers that have moved beyond where was looked, and of two that there was no room
+            for; -1 where there are none.
+        """
+        raise NotImplementedError
+
     @abc.abstractmethod
     def respond(self, place: Array, motion: Motion, now: StepContext, lam: Float[Array, "s m"]) -> Response:
         """Forces, torques, constraint rates and power over a step.
@@ -246,13 +302,13 @@ class Effect(Part):
         """
 
         def one(
-            effect, place, inputs, coordinates, rates, stress, start, rows, row_rates, spin, force_rows, lam
+            effect, place, inputs, coordinates, rates, stress, near, start, rows, row_rates, spin, held, lam
         ):
-            alone = StepContext(now.t, now.h, inputs, coordinates, rates, now.tableau, stress)
-            return effect.respond(place, Motion(start, rows, row_rates, spin, force_rows), alone, lam)
+            alone = StepContext(now.t, now.h, inputs, coordinates, rates, now.tableau, stress, near)
+            return effect.respond(place, Motion(start, rows, row_rates, spin, held), alone, lam)
 
-        axes = (None if self.shared else 0, 0, 0, 0, 0, 0, 0, 1, 1, 1, 1, 0)
-        numbers = self, place, now.inputs, now.coordinates, now.rates, now.stress
+        axes = (None if self.shared else 0, 0, 0, 0, 0, 0, 0, 0, 1, 1, 1, 1, 0)
+        numbers = self, place, now.inputs, now.coordinates, now.rates, now.stress, now.neighbours
         moving = motion.start, motion.rows, motion.rates, motion.spin, motion.force_rows
         return jax.vmap(one, in_axes=axes)(*numbers, *moving, lam)
 

@@ -10,8 +10,8 @@ from jaxtyping import Array, Bool, Float, Int
 from natcoord_jax.core.results import Result
 from natcoord_jax.core.state import State
 from natcoord_jax.mechanics.equations import prepare
+from natcoord_jax.mechanics.failures import result_of
 from natcoord_jax.mechanics.frozen_kick import FEWEST, FrozenKick, Lagging, from_body_axes, in_body_axes
-from natcoord_jax.mechanics.inversion import first_inverted
 from natcoord_jax.mechanics.start_cache import StartCache
 from natcoord_jax.mechanics.tangent_space import Velocity
 from natcoord_jax.stepping.checked import check_contacts
@@ -205,6 +205,7 @@ def after_attempt(
     left: Float[Array, " rates"],
     kick: Velocity | None = None,
     ahead: Ahead | None = None,
+    failure: Int[Array, ""] | None = None,
 ) -> RolloutState:
     """The end of an attempt: what is attempted next, and from where.
 
@@ -216,16 +217,17 @@ def after_attempt(
         left: impulse that it leaves to the next.
         kick: of the attempt.
         ahead: contacts in it, where impacts are located.
+        failure: what is wrong with a solution, see `mechanics.failures`.
     """
     plan, it, over = setting.plan, course.it, setting.over(course)
     new, half_turn = found
     finite = jnp.all(jnp.isfinite(new.q)) & jnp.all(jnp.isfinite(new.v))
     code = jnp.where((it.code == 0) & ~finite, int(Result.NONFINITE), it.code)
     code = jnp.where((code == 0) & (half_turn > LARGEST_HALF_TURN), int(Result.DIVERGED), code)
-    worst, inverted = it.worst, first_inverted(setting.system, new)
-    if inverted is not None:
-        worst = jnp.where((code == 0) & (inverted >= 0), -2 - inverted, worst)
-        code = jnp.where(worst < -1, int(Result.INVERTED), code)
+    worst = it.worst
+    if failure is not None:
+        worst = jnp.where((code == 0) & (failure >= 0), -2 - failure, worst)
+        code = jnp.where(worst < -1, result_of(setting.system, -2 - worst), code)
     solved = code == int(Result.SUCCESSFUL)
     origin = course.state
     if course.trial is None or setting.tolerance is None:
