@@ -301,14 +301,12 @@ class Effect(Part):
             lam: of the instances.
         """
 
-        def one(
-            effect, place, inputs, coordinates, rates, stress, near, start, rows, row_rates, spin, held, lam
-        ):
-            alone = StepContext(now.t, now.h, inputs, coordinates, rates, now.tableau, stress, near)
+        def one(effect, place, inputs, coordinates, rates, more, start, rows, row_rates, spin, held, lam):
+            alone = StepContext(now.t, now.h, inputs, coordinates, rates, now.tableau, *more)
             return effect.respond(place, Motion(start, rows, row_rates, spin, held), alone, lam)
 
-        axes = (None if self.shared else 0, 0, 0, 0, 0, 0, 0, 0, 1, 1, 1, 1, 0)
-        numbers = self, place, now.inputs, now.coordinates, now.rates, now.stress, now.neighbours
+        axes = (None if self.shared else 0, 0, 0, 0, 0, 0, 0, 1, 1, 1, 1, 0)
+        numbers = self, place, now.inputs, now.coordinates, now.rates, (now.stress, now.neighbours)
         moving = motion.start, motion.rows, motion.rates, motion.spin, motion.force_rows
         return jax.vmap(one, in_axes=axes)(*numbers, *moving, lam)
 

@@ -3,7 +3,8 @@
 Space is cut into cells as wide as the widest reach, so that what is near a sphere is in its cell or in one
 next to it. Cells are sorted by a number for their column, which is hashed, and their height in it: the three
 cells of a column that matter are one run of the sorted spheres, and nine such runs are looked through.
-Columns next to a sphere that share a number are looked through once. Every array has a size that is known beforehand.
+Columns next to a sphere that share a number are looked through once. Every array has a size that is known
+beforehand.
 
 Source: M. Teschner et al., Optimized spatial hashing for collision detection of deformable objects,
 Vision, Modeling and Visualization 2003, section 4, for the hash.

@@ -67,7 +67,7 @@ def products(step: Any, twists: Float[Array, "bodies s 6"]) -> tuple[Products | 
         touched = places[jnp.asarray(group.bodies)][..., : rates_of(group)]
         if found.neighbours is not None:
             couplings += _couplings(step, group, where.h, touched, found.neighbours)
-        if found.columns is None:
+        if found.columns is None or found.rows is None:
             continue
         touched = touched.reshape(group.count, -1)
         along = step.system.local_rates.blocks(group.bodies, step.start)
@@ -91,10 +91,12 @@ def _couplings(
     across, along = (x[:, :, 0] for x in maps)
     every = touched, across, along, found.others, h * found.stiffness
     # What is many is the last axis, so that what is computed is wide.
-    return [
-        NeighbourCouplings(
-            *(jnp.transpose(x[k]) if x.ndim < 5 else x[k].transpose(2, 3, 1, 0) for x in every),
-            size=step.unknowns,
-        )
-        for k in range(group.count)
-    ]
+    given = [jnp.moveaxis(x, 1, -1) for x in every]
+
+    def one(k: int) -> NeighbourCouplings:
+        places, across, along, others, stiffness = (x[k] for x in given)
+        across, along = (jnp.moveaxis(x, 1, 0) for x in (across, along))
+        stiffness = jnp.moveaxis(stiffness, 0, 2)
+        return NeighbourCouplings(places, across, along, others, stiffness, size=step.unknowns)
+
+    return [one(k) for k in range(group.count)]

@@ -1,9 +1,9 @@
 """Contact of many spheres by the energy of their overlaps, of which only those that are near are looked at.
 
-Neighbours are found once, at the start of a step, within what each sphere would pass in it at its velocity and
-a skin for what it may stray from that way. What strays farther is reported, and the step is repeated in parts.
-Every pair is evaluated from both of its sides: each sphere sums up its own neighbours, in a fixed order, and
-what one gets the other gets with the other sign, to the last digit.
+Neighbours are found once, at the start of a step, within what each sphere would pass in it at its velocity
+and a skin for what it may stray from that way. What strays farther is reported, and the step is repeated in
+parts. Every pair is evaluated from both of its sides: each sphere sums up its own neighbours, and what one
+gets the other gets with the other sign, to the last digit.
 """
 
 from typing import Any, ClassVar
@@ -12,7 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.closed_tangents import by_twists, twist_maps
@@ -86,9 +86,7 @@ class SphereContacts(ContactLaw):
 
     def assembled_at(self, x: Float[Array, "k 3"]) -> "SphereContacts":
         """With its damping and its skin."""
-        ignored = (
-            jnp.zeros((0, 2), jnp.int32) if self.ignored is None else jnp.asarray(self.ignored, jnp.int32)
-        )
+        ignored = jnp.asarray(np.zeros((0, 2)) if self.ignored is None else self.ignored, jnp.int32)
         skin = SKIN * jnp.max(self.radii) if self.skin is None else self.skin
         whole: Any = replace_fields(self, ignored=ignored, skin=skin)
         return whole.renewed()
@@ -100,10 +98,14 @@ class SphereContacts(ContactLaw):
         # What all have in common brings none nearer to another.
         reach = 0.5 * safe_norm(way - jnp.mean(way, axis=0))
         found = near_spheres(centres, self.radii + reach + 0.5 * self.skin, self.capacity)
-        one = jnp.arange(found.others.shape[0])[:, None, None]
-        other, (first, second) = found.others[..., None], self.ignored.T
-        apart = ((one == first) & (other == second)) | ((one == second) & (other == first))
-        return replace_fields(found, near=found.near & ~jnp.any(apart, axis=-1))
+        one = jnp.arange(place.shape[0])[:, None]
+        return replace_fields(found, near=found.near & self._meet(one, found.others))
+
+    def _meet(self, one: Int[Array, "*n"], other: Int[Array, "*n"]) -> Bool[Array, "*n"]:
+        """Whether pairs are in contact, if they touch."""
+        one, other, (first, second) = one[..., None], other[..., None], self.ignored.T
+        ignored = ((one == first) & (other == second)) | ((one == second) & (other == first))
+        return ~jnp.any(ignored, axis=-1)
 
     def missed(
         self, place: Array, found: Neighbours, start: Array, rates: Array, end: Array, h: Array
@@ -121,15 +123,12 @@ class SphereContacts(ContactLaw):
     def stored(self, place: Array, rows: Array, coordinates: Array, rates: Array) -> Float[Array, ""]:
         """Energy [J], of all pairs, whether anyone has found them."""
         x = place_markers(place, rows)
-        numbers = jnp.arange(x.shape[0])
-        first, second = self.ignored.T
+        every = jnp.arange(x.shape[0])
 
         def one(number: Array, energy: Array) -> Array:
             square = jnp.sum((x - x[number]) ** 2, axis=1)
-            apart = (numbers[:, None] == second) & (number == first)
-            later = (numbers > number) & ~jnp.any(apart | (numbers[:, None] == first) & (number == second), 1)
             found = self.stored_at(length(square) - self.radii - self.radii[number])
-            return energy + jnp.sum(jnp.where(later, found, 0.0))
+            return energy + jnp.sum(jnp.where((every > number) & self._meet(number, every), found, 0.0))
 
         return jax.lax.fori_loop(0, x.shape[0], one, jnp.zeros((), x.dtype))
 
@@ -137,7 +136,7 @@ class SphereContacts(ContactLaw):
         """On each sphere what its neighbours push it by, along the mean of the line between them."""
         self._check(now)
         near = now.neighbours
-        middle, rates = place_markers(place, motion.rows[0]), place_markers(place, motion.rates)
+        rates = place_markers(place, motion.rates)
         given = self._between(near, place_markers(place, motion.start), now.h * rates[0])
         elastic, whole = self._pushes(*given, rates[0][near.others] - rates[0][:, None])
         forces = -jnp.sum(whole, axis=1)[None]
