@@ -70,7 +70,7 @@ def near_spheres(centres: Float[Array, "n 3"], sizes: Float[Array, " n"], room: 
     first = jnp.searchsorted(keys, key(beside, height - 1))
     beyond = jnp.searchsorted(keys, key(beside, height + 1), side="right")
     first, count = materialised((first, jnp.where(again, 0, beyond - first)))
-    most = 3 * room // 2
+    most = 3 * room // 2 + 1  # with the sphere itself
     at = first[..., None] + jnp.arange(most)
     inside = jnp.arange(most) < count[..., None]
     at = jnp.minimum(at, n - 1)
