@@ -97,15 +97,18 @@ class Response(eqx.Module):
 class NeighbourTangents(eqx.Module):
     """Derivatives of the forces on markers by the velocities of others, which are others in every step.
 
+    Of each two, either is a neighbour of the other, and has the same stiffness.
+
     Attributes:
         others: numbers of the other markers.
-        stiffness: minus the derivatives of the force on a marker by the velocity of each of these.
+        stiffness: minus the derivatives of the components of the force on a marker by those of the velocity
+            of each of these.
         across: velocities of the markers by the twists of their bodies.
         along: the same as their increments follow twists, see `core.closed_tangents`.
     """
 
-    others: Int[Array, "n k m"]
-    stiffness: Float[Array, "n k m 3 3"]
+    others: Int[Array, "n m k"]
+    stiffness: Float[Array, "n 3 3 m k"]
     across: Float[Array, "n k s r 3"]
     along: Float[Array, "n k s r 3"]
 

@@ -88,15 +88,7 @@ def _couplings(
     if group.turning:
         along = step.system.local_rates.blocks(group.bodies, step.start)
         maps = tuple(along(x, 1) for x in maps)
-    across, along = (x[:, :, 0] for x in maps)
-    every = touched, across, along, found.others, h * found.stiffness
     # What is many is the last axis, so that what is computed is wide.
-    given = [jnp.moveaxis(x, 1, -1) for x in every]
-
-    def one(k: int) -> NeighbourCouplings:
-        places, across, along, others, stiffness = (x[k] for x in given)
-        across, along = (jnp.moveaxis(x, 1, 0) for x in (across, along))
-        stiffness = jnp.moveaxis(stiffness, 0, 2)
-        return NeighbourCouplings(places, across, along, others, stiffness, size=step.unknowns)
-
-    return [one(k) for k in range(group.count)]
+    across, along = (jnp.transpose(x[:, :, 0], (0, 3, 2, 1)) for x in maps)
+    every = jnp.swapaxes(touched, 1, 2), across, along, found.others, h * found.stiffness
+    return [NeighbourCouplings(*(x[k] for x in every), size=step.unknowns) for k in range(group.count)]

@@ -31,7 +31,7 @@ from natcoord_jax.core.potential import marker_response, place_markers
 from natcoord_jax.effects.contact.law import ContactLaw
 from natcoord_jax.effects.contact.pairs import length
 from natcoord_jax.maths.near_spheres import Neighbours, near_spheres
-from natcoord_jax.maths.vectors import dot, safe_norm
+from natcoord_jax.maths.vectors import safe_norm
 
 ROOM = 16
 """Neighbours that a sphere has room for: twelve equal ones can touch it."""
@@ -135,15 +135,14 @@ class SphereContacts(ContactLaw):
     def respond(self, place: Array, motion: Motion, now: StepContext, lam: Array) -> Response:
         """On each sphere what its neighbours push it by, along the mean of the line between them."""
         self._check(now)
-        near = now.neighbours
         rates = place_markers(place, motion.rates)
-        given = self._between(near, place_markers(place, motion.start), now.h * rates[0])
-        elastic, whole = self._pushes(*given, rates[0][near.others] - rates[0][:, None])
-        forces = -jnp.sum(whole, axis=1)[None]
-        found = marker_response(place, forces, None, rates, motion)
+        near, velocity = now.neighbours, rates[0].T
+        given = self._between(near, place_markers(place, motion.start).T, now.h * velocity)
+        elastic, factor = self._pushes(*given, _apart(velocity, near))
+        found = marker_response(place, -jnp.sum(factor * elastic, axis=1).T[None], None, rates, motion)
         if self.damping is None:
             return found
-        return replace_fields(found, released=-jnp.sum(jnp.sum(elastic, axis=1) * rates, axis=(1, 2)))
+        return replace_fields(found, released=-jnp.sum(jnp.sum(elastic, axis=1) * velocity)[None])
 
     def _check(self, now: StepContext) -> None:
         if now.tableau.stages > 1 or now.tableau.variational:
@@ -152,31 +151,34 @@ class SphereContacts(ContactLaw):
                 "only; pass scheme=nc.EnergyMomentum() or nc.Dissipative(), or list the pairs of fewer bodies"
             )
 
-    def _between(self, near: Neighbours, start: Array, moved: Array) -> tuple[Array, Array, Array]:
+    def _between(
+        self, near: Neighbours, start: Float[Array, "3 n"], moved: Float[Array, "3 n"]
+    ) -> tuple[Float[Array, "3 room n"], Float[Array, "3 room n"], Float[Array, "room n"]]:
         """From each sphere to its neighbours at the start, its change in the step, and the sum of radii.
 
         The sum is zero where there is no neighbour: what has no size does not overlap.
         """
-        others = near.others
-        radii = jnp.where(near.near, self.radii[others] + self.radii[:, None], 0.0)
-        return start[others] - start[:, None], moved[others] - moved[:, None], radii
+        radii = jnp.where(near.near.T, self.radii[near.others.T] + self.radii, 0.0)
+        return _apart(start, near), _apart(moved, near), radii
 
-    def _pushes(self, start: Array, moved: Array, radii: Array, flow: Array) -> tuple[Array, Array]:
-        """Mean forces on neighbours [N], of the energy and with what impacts lose.
+    def _pushes(
+        self, start: Array, moved: Array, radii: Array, flow: Array
+    ) -> tuple[Float[Array, "3 room n"], Float[Array, "*room n"]]:
+        """Mean forces of the energy on neighbours [N], and the factor by which impacts change them.
 
         Along u = 2 r_m / (|r_0| + |r_1|) with the vectors r from one to the other at the start, in the middle
         and at the end of the step: the distance changes by u . (r_1 - r_0), exactly.
         """
         middle = start + 0.5 * moved
-        square = dot(start, start)
-        begun, ended = length(square), length(square + 2.0 * dot(middle, moved))
+        square = jnp.sum(start * start, axis=0)
+        begun, ended = length(square), length(square + 2.0 * jnp.sum(middle * moved, axis=0))
         both = begun + ended
-        along = 2.0 * middle / jnp.where(both > 0, both, 1.0)[..., None]
+        along = 2.0 * middle / jnp.where(both > 0, both, 1.0)
         before = begun - radii
-        elastic = self.mean_force(before, before + dot(along, moved))[..., None] * along
+        elastic = self.mean_force(before, before + jnp.sum(along * moved, axis=0)) * along
         if self.damping is None:
-            return elastic, elastic
-        return elastic, (1.0 + jnp.maximum(-self.damping * dot(along, flow), -1.0))[..., None] * elastic
+            return elastic, jnp.ones(())
+        return elastic, 1.0 + jnp.maximum(-self.damping * jnp.sum(along * flow, axis=0), -1.0)
 
     @property
     def parts(self) -> Int[np.ndarray, "n k 1"]:
@@ -191,15 +193,16 @@ class SphereContacts(ContactLaw):
         n, k = place.shape[:2]
 
         def one(contact: "SphereContacts", near: Neighbours, place: Array, start: Array, rates: Array) -> Any:
-            velocity = place_markers(place, rates)
-            start, moved, radii = contact._between(near, place_markers(place, start), now.h * velocity)
+            velocity = place_markers(place, rates).T
+            begun, moved, radii = contact._between(near, place_markers(place, start).T, now.h * velocity)
             rate = 1.0 / jnp.where(now.h > 0, now.h, 1.0)
 
             def pushes(moved: Array) -> Array:
-                return contact._pushes(start, moved, radii, rate * moved)[1]
+                elastic, factor = contact._pushes(begun, moved, radii, rate * moved)
+                return factor * elastic
 
-            units = jnp.broadcast_to(jnp.eye(3)[:, None, None], (3, *moved.shape))
-            slopes = jax.vmap(lambda unit: jax.jvp(pushes, (moved,), (unit,))[1], out_axes=-1)(units)
+            units = jnp.broadcast_to(jnp.eye(3)[..., None, None], (3, *moved.shape))
+            slopes = jax.vmap(lambda unit: jax.jvp(pushes, (moved,), (unit,))[1], out_axes=1)(units)
             return -jnp.sum(pushes(moved), axis=1), slopes
 
         given = now.neighbours, place, motion.start, motion.rates[0]
@@ -210,13 +213,18 @@ class SphereContacts(ContactLaw):
 
         every = Motion(alone(motion.start), *(alone(x, 1) for x in (motion.rows, motion.rates, motion.spin)))
         own = alone(place)[:, :, None]
-        stiffness, pushed = -jnp.sum(slopes, axis=2).reshape(-1, 3, 3), forces.reshape(-1, 1, 1, 3)
+        stiffness = -jnp.moveaxis(jnp.sum(slopes, axis=3), -1, 1).reshape(-1, 3, 3)
+        pushed = jnp.swapaxes(forces, 1, 2).reshape(-1, 1, 1, 3)
         parts = by_twists(stiffness, pushed, own, every, now.h, turning)
         if turning:
             across, along, _ = twist_maps(own, every, now.h)
         else:
             across = along = own[..., :1, None] * jnp.eye(3)
         maps = (x.reshape(n, k, 1, -1, 3) for x in (across, along))
-        return SpreadTangents(
-            parts, neighbours=NeighbourTangents(now.neighbours.others, now.h * slopes, *maps)
-        )
+        others = jnp.swapaxes(now.neighbours.others, 1, 2)
+        return SpreadTangents(parts, neighbours=NeighbourTangents(others, now.h * slopes, *maps))
+
+
+def _apart(x: Float[Array, "3 n"], near: Neighbours) -> Float[Array, "3 room n"]:
+    """What neighbours have more than the spheres whose they are."""
+    return x[:, near.others.T] - x[:, None]
