@@ -220,6 +220,7 @@ HARD = "capacity and skin .* of spheres and points with a stiffness"
     [
         ({"capacity": 4, "stiffness": None}, HARD),
         ({"skin": 0.1, "friction": 0.3}, HARD),
+        ({"capacity": 3, "one_pass": True}, "one_pass is no option of spheres"),
         ({"capacity": 0}, "capacity"),
         ({"skin": -0.1}, "skin"),
     ],

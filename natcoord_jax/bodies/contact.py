@@ -4,25 +4,22 @@ from itertools import combinations
 from typing import Any
 
 import equinox as eqx
-import numpy as np
 
 from natcoord_jax.bodies.beam import BeamHandle
 from natcoord_jax.bodies.contact_gaps import gaps_between, gaps_within
 from natcoord_jax.bodies.contact_sides import BeamSide, BodySide, MeshSide, PlaneSide, SegmentSide, Side
 from natcoord_jax.bodies.contact_sides import Plane as Plane
+from natcoord_jax.bodies.contact_spheres import are_searched, sphere_contacts
 from natcoord_jax.bodies.continua import MeshHandle, Surface
 from natcoord_jax.bodies.shapes import Box, Capsule, Cylinder, Ellipsoid, Sphere
 from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.bodies import Body
-from natcoord_jax.core.checks import as_array
-from natcoord_jax.core.eager_numpy import stacked
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.kinds import BODY, FLAG, NAME, Choice, HandleOf, Several, of
 from natcoord_jax.core.markers import Point
 from natcoord_jax.core.numeric import Number, Whole
 from natcoord_jax.core.recipe import Builder, Recipe
-from natcoord_jax.effects.contact.spheres import ROOM, SphereContacts
 
 SOLID = (
     HandleOf("body")
@@ -37,9 +34,6 @@ SIDE = SOLID | of("nc.Plane(...)", Plane)
 
 MOST = 2000
 """Gaps of all pairs of some bodies that are made one by one."""
-
-MANY = 50
-"""Spheres from which on neighbours are looked for."""
 
 SHAPES = "nc.Sphere, nc.Capsule, nc.Box, nc.Cylinder, nc.Ellipsoid or a point"
 
@@ -71,6 +65,9 @@ class Contact(Recipe):
     shell or a solid at its nodes only: what is smaller than its cells slips through. Where a step is longer
     than a body, it may pass another without ever overlapping with it.
 
+    Of fifty spheres or more in `all_pairs_of`, with a stiffness and without friction, only neighbours are
+    looked at, see `nc.SphereContacts`; they are one contact with one name, and no sensor shows its pairs.
+
     Shells are touched from both sides, where their thickness ends; solids from outside, best at all that is
     outside, since at the end of a surface nodes slip off it. Which facets a node may touch is settled
     where the scene is compiled: those `candidates` that are the nearest to it in the assembled pose. Of a
@@ -100,16 +97,18 @@ class Contact(Recipe):
             of the shortest edge; None: a fiftieth of that. Edges that move by more than two of these in a
             step, or overlap by as much in a soft contact, may pass each other.
         candidates: number of facets that a node may touch; default 16.
-        capacity: of all pairs of spheres, neighbours that each has room for; default 16. Neighbours are then
-            looked for in every step, as they are without it from 50 spheres on.
+        capacity: of all pairs of spheres, neighbours that each has room for; default 16. Given, they are
+            looked for of fewer than 50 spheres, too.
         skin: by how much two of them together may stray in a step from where their velocities take them [m];
-            default a quarter of the largest radius. Steps in which one strays farther are made in parts.
+            default a quarter of the largest radius. Steps in which one strays by half of it are made in
+            parts.
         name: of the contact; several gaps are called "name[0]" and so on, those of all pairs
             "name[one, other]" or "name[one, other, 0]" by the names of the bodies.
 
     Raises:
         ValueError: when it is added: for shapes that there is no gap for, a surface against itself, no
-            stiffness, or more than 2000 gaps of all pairs of bodies. When the scene is compiled: for surfaces
+            stiffness, or more than 2000 gaps of all pairs of bodies; for a capacity or skin of others than
+            spheres. When the scene is compiled: for surfaces
             that overlap from the start.
 
     Example:
@@ -184,9 +183,11 @@ class Contact(Recipe):
         """Add the gaps of all pairs of bodies; their handles."""
         law, made = self._law(), []
         sides = {handle: _side(scene, handle, name) for handle in self.all_pairs_of}
-        pairs = self._pairs(scene, name)
-        if self._searches(list(sides.values()), name):
-            return (scene.add(self._of_spheres(list(sides.values()), pairs, name)),)
+        pairs, every = self._pairs(scene, name), list(sides.values())
+        asked = {"capacity": self.capacity, "skin": self.skin}
+        search = {key: value for key, value in asked.items() if value is not None}
+        if are_searched(every, law, search, name):
+            return (scene.add(sphere_contacts(every, pairs, law, search, name)),)
         for one, other in pairs:
             said = f"{one.name}, {other.name}"
             boxes = sides[one].kind is sides[other].kind is Box
@@ -202,43 +203,6 @@ class Contact(Recipe):
                     "which is made and looked at in every step; pass fewer bodies, or more pairs to `ignore`"
                 )
         return tuple(scene.add(replace_fields(gap, name=said)) for said, gap in made)
-
-    def _searches(self, sides: list[Side], name: str) -> bool:
-        """Whether neighbours are looked for, instead of a list of all pairs.
-
-        Raises:
-            ValueError: where that is asked for, but is not possible.
-        """
-        asked = self.capacity is not None or self.skin is not None
-        balls = all(side.kind is Sphere for side in sides)
-        possible = balls and self.stiffness is not None and self.friction is None
-        if asked and not possible:
-            raise ValueError(
-                f"contact {name!r}: capacity and skin [m] are of spheres and points with a stiffness [N/m] "
-                "and without friction, whose neighbours are looked for; leave them out, and all pairs are "
-                "listed"
-            )
-        return possible and (asked or len(sides) >= MANY)
-
-    def _of_spheres(self, sides: list[Any], pairs: list[tuple[Handle, Handle]], name: str) -> SphereContacts:
-        """Contacts of spheres that look for their neighbours."""
-        number = {side.handle: k for k, side in enumerate(sides)}
-        kept = {frozenset(pair) for pair in pairs}
-        ignored = [
-            (number[one], number[other])
-            for one, other in combinations(number, 2)
-            if frozenset((one, other)) not in kept
-        ]
-        options = {"restitution": self.restitution, "speed": self.speed, "skin": self.skin, "law": self.law}
-        return SphereContacts(
-            tuple(side.ends[0] for side in sides),
-            radii=stacked([as_array(side.radius, float) for side in sides]),
-            ignored=np.array(ignored, float).reshape(-1, 2),
-            stiffness=self.stiffness,
-            capacity=ROOM if self.capacity is None else self.capacity,
-            name=name,
-            **options,
-        )
 
     def _pairs(self, scene: Builder, name: str) -> list[tuple[Handle, Handle]]:
         """Pairs of bodies that may touch."""

@@ -8,8 +8,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from natcoord_jax.core.callables import replace_fields
-
 ENOUGH = 1e-6
 """Part of the residual that an iteration may leave: Newton's makes up for it with the next correction."""
 
@@ -57,7 +55,7 @@ class NeighbourCouplings(eqx.Module):
 
     def times(self, factor: float) -> "NeighbourCouplings":
         """Multiplied by a number."""
-        return replace_fields(self, stiffness=factor * self.stiffness)
+        return eqx.tree_at(lambda x: x.stiffness, self, factor * self.stiffness)
 
     def around(self, factors: Any) -> "WithCouplings":
         """Factors of the sum of a matrix and these, from those of the matrix."""

@@ -126,9 +126,8 @@ def attempt(
         before = with_state(before, unpack(x))
         ends = end_of_step(system, before.state, h, equations.groups, found, setting.plan.tableau)
         kick = None if before.lagging is None else found.kick.exact
-        missed = solving.residual, found.size, before.it.correction
-        given = ends[0], setting.plan.tolerance, factors.grain
-        steady = sound(equations, before.it.y, *missed, *given)
+        given = solving.residual, found.size, before.it.correction, ends[0], setting.plan.tolerance
+        steady = sound(equations, before.it.y, *given, factors.grain)
         before = eqx.tree_at(lambda c: c.it.converged, before, before.it.converged & steady)
         left = remainder(equations, solving.residual, factors.inertias)
         ahead = None if search is None else Ahead.of(system, before.state, found.at, h, setting.dt)
