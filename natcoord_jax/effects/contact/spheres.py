@@ -63,6 +63,7 @@ class SphereContacts(ContactLaw):
             by a scheme of another order.
 
     Example:
+        >>> import jax; jax.config.update("jax_enable_x64", True)
         >>> import natcoord_jax as nc
         >>> import numpy as np
         >>> centres = tuple(nc.Point(nc.ground, (0.25 * k, 0, 0)) for k in range(3))
