@@ -2,8 +2,9 @@
 
 Neighbours are found once, at the start of a step, within what each sphere would pass in it at its velocity
 and a skin for what it may stray from that way. What strays farther is reported, and the step is repeated in
-parts. Every pair is evaluated from both of its sides: each sphere sums up its own neighbours, and what one
-gets the other gets with the other sign, to the last digit.
+parts. To keep neighbours over some steps would save a seventh of the time at most. Every pair is evaluated
+from both of its sides: each sphere sums up its own neighbours, and what one gets the other gets with the
+other sign, to the last digit.
 """
 
 from typing import Any, ClassVar
