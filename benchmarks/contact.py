@@ -11,10 +11,15 @@ compiled programs (of MuJoCo: of `mj_step` in C) per second of motion, so that s
 Balls with friction and restitution on a floor, that bounce or rest: time of a step and ball, in one scene and
 in batches, in turn with MuJoCo (one scene, in C) or MJX (lanes, in JAX), which keep none of the speed.
 
+A cloud of balls that collide in free flight, each with a stiffness: time of a step with neighbours that are
+looked for, with a gap of every pair (up to 60 balls), and of MuJoCo, whose contact has the same stiffness per
+mass and no damping; and what of the energy is made or lost.
+
 The derivative of the height after 1 s of a ball that falls 1 m by the height at the start is exactly 1.2842
 for a restitution of 1 (with the speed 0.3 m/s at the start).
 """
 
+from itertools import combinations
 from typing import Any
 
 import equinox as eqx
@@ -33,6 +38,12 @@ ENOUGH = 1e-3
 EXACT = 1.284175
 SIZES = (1, 1), (10, 1), (100, 1), (1, 256), (10, 256), (1, 4096)
 """Balls and lanes."""
+CLOUDS = 60, 100, 400
+"""Balls of clouds."""
+LISTED = 60
+"""Balls up to which all pairs are listed, too."""
+SOFT = 5e4
+"""Stiffness of their contact per mass [1/s^2]."""
 COLUMNS = {
     "code": ("code", ""),
     "dt": ("step s", "g"),
@@ -48,6 +59,14 @@ COLUMNS_OF_BALLS = {
     "lanes": ("lanes", ""),
     "us_per_step": ("us/step/ball", ".3g"),
     "over_first": ("over ours", ".2g"),
+    "compile_s": ("compile s", ".1f"),
+}
+COLUMNS_OF_CLOUDS = {
+    "code": ("code", ""),
+    "balls": ("balls", ""),
+    "us_per_step": ("us/step", ".4g"),
+    "over_first": ("over ours", ".2g"),
+    "energy_error": ("energy error", ".1e"),
     "compile_s": ("compile s", ".1f"),
 }
 
@@ -135,6 +154,49 @@ def many(count: int, lanes: int, repeats: int, *, peers: bool) -> list[dict[str,
     return found
 
 
+def cloud(places: np.ndarray, velocities: np.ndarray, *, listed: bool) -> tuple[nc.System, nc.State]:
+    """Balls of a kilogram with contact of each with each, by neighbours or by a gap of every pair."""
+    scene = nc.Scene()
+    shape = {"shape": nc.Sphere(0.1), "density": 1 / (4 / 3 * np.pi * 1e-3)}
+    balls = [scene.add(nc.RigidBody(**shape, position=x, velocity=v)) for x, v in zip(places, velocities)]
+    if listed:
+        for one, other in combinations(balls, 2):
+            scene.add(nc.Contact(one, other, stiffness=SOFT))
+    else:
+        scene.add(nc.Contact(all_pairs_of=balls, stiffness=SOFT, capacity=16))
+    return scene.compile()
+
+
+def clouds(count: int, repeats: int, *, peers: bool) -> list[dict[str, Any]]:
+    """A cloud in all the ways there are, in turn."""
+    random, edge = np.random.default_rng(1), int(np.ceil(count ** (1 / 3)))
+    lattice = np.stack(np.meshgrid(*[np.arange(edge)] * 3), axis=-1).reshape(-1, 3)[:count]
+    places = 0.23 * lattice + 0.01 * random.normal(size=(count, 3))
+    velocities, dt, steps = random.normal(size=(count, 3)), 1e-3, 200
+    names, runs, calls = [], [], []
+    for listed in (False, True)[: 1 + (count <= LISTED)]:
+        system, state = cloud(places, velocities, listed=listed)
+        run = jax.jit(lambda s, n=system: nc.simulate(n, s, dt=dt, steps=steps, save_every=steps).states)
+        calls.append(lambda run=run, state=state: jax.block_until_ready(run(state)))
+        names.append("natcoord_jax, all pairs" if listed else "natcoord_jax")
+        runs.append((system, state, run))
+    if peers:
+        run, error = contact_peers.mujoco_cloud(places, velocities, dt, steps, SOFT)
+        names, calls = [*names, "MuJoCo"], [*calls, run]
+    timings = common.timed_in_turn(calls, steps, repeats)
+    errors = [_energy_error(*run) for run in runs] + ([error] if peers else [])
+    given = zip(names, errors, timings)
+    return [{"code": n, "balls": count, "energy_error": e, **timing} for n, e, timing in given]
+
+
+def _energy_error(system: nc.System, state: nc.State, run: Any) -> float:
+    """What of the energy a run makes or loses."""
+    before, after = (
+        float(system.energy(s).total) for s in (state, jax.tree.map(lambda x: x[-1], run(state)))
+    )
+    return abs(after - before) / before
+
+
 def derivatives() -> list[dict[str, Any]]:
     """Of the height after one second by that at the start."""
     found = []
@@ -175,6 +237,9 @@ def main() -> None:
     sizes = SIZES[:2] if quick else SIZES
     balls = [run for size in sizes for run in many(*size, min(3, repeats), peers=peers)]
     print(common.columns(balls, COLUMNS_OF_BALLS))
+    sizes = CLOUDS[:2] if quick else CLOUDS
+    flying = [run for count in sizes for run in clouds(count, min(3, repeats), peers=peers)]
+    print(common.columns(flying, COLUMNS_OF_CLOUDS))
     slopes = derivatives()
     if peers:
         slope = contact_peers.mjx_slope(0.005)
@@ -189,7 +254,7 @@ def main() -> None:
         common.target("energy error at any step", max(r["energy_error"] for r in runs[: len(steps)]), 1e-12),
         common.target("compile, ten contacts", ten, 20.0, "s"),
     ]
-    results |= {"runs": runs, "balls": balls, "derivatives": slopes, "targets": targets}
+    results |= {"runs": runs, "balls": balls, "clouds": flying, "derivatives": slopes, "targets": targets}
     print(f"\n{common.environment_line(results)}\n\n{common.show_targets(targets)}")
     common.write(results, None, common.folder(options))
 

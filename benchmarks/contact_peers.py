@@ -111,6 +111,38 @@ def mujoco_many(count: int, dt: float, steps: int, resting: bool) -> Callable[[]
     return run
 
 
+def mujoco_cloud(
+    places: np.ndarray, velocities: np.ndarray, dt: float, steps: int, spring: float
+) -> tuple[Callable[[], object], float]:
+    """Steps of balls that collide in free flight, and what their energy has changed by, relatively.
+
+    The energy is that of the motion, and at the end of overlaps, by the spring.
+    """
+    import mujoco
+
+    balls = "".join(
+        f'<body pos="{x} {y} {z}"><freejoint/><geom type="sphere" size="0.1" mass="1" '
+        f'solref="{-spring:g} 0"/></body>'
+        for x, y, z in places
+    )
+    options = f'<option timestep="{dt}" integrator="implicitfast" gravity="0 0 0"/><size memory="64M"/>'
+    model = mujoco.MjModel.from_xml_string(f"<mujoco>{options}<worldbody>{balls}</worldbody></mujoco>")
+    data = mujoco.MjData(model)
+
+    def run() -> None:
+        mujoco.mj_resetData(model, data)
+        data.qvel.reshape(-1, 6)[:, :3] = velocities
+        mujoco.mj_step(model, data, nstep=steps)
+
+    run()
+    apart = np.linalg.norm(data.qpos.reshape(-1, 7)[:, None, :3] - data.qpos.reshape(-1, 7)[:, :3], axis=-1)
+    overlap = np.maximum(0.2 - apart, 0.0)[np.triu_indices(len(places), 1)]
+    mujoco.mj_energyVel(model, data)
+    before = 0.5 * np.sum(velocities**2)
+    after = float(data.energy[1]) + 0.5 * spring * float(np.sum(overlap**2))
+    return run, abs(after - before) / before
+
+
 def mjx_many(count: int, lanes: int, dt: float, steps: int, resting: bool) -> Callable[[], object]:
     """The same in lanes of MJX."""
     import jax

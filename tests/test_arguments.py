@@ -219,7 +219,7 @@ CALLS = {
         "one": [w.body], "other": [nc.Plane(), w.body], "stiffness": NUMBER, "restitution": NUMBER,
         "friction": NUMBER, "speed": NUMBER, "law": ["linear", "hertz"], "name": NAME, "one_pass": FLAG,
         "candidates": WHOLE, "self_contact": FLAG, "rounding": NUMBER,
-        "all_pairs_of": [(w.body,)], "ignore": [[(w.body, w.body)]],
+        "capacity": WHOLE, "skin": NUMBER, "all_pairs_of": [(w.body,)], "ignore": [[(w.body, w.body)]],
     },
     "GapPotential": lambda w: {
         **MARKED(w.ends), "gap": [nc.SphereOnSphere(radii=(1.0, 1.0))], "stiffness": NUMBER,
@@ -228,6 +228,11 @@ CALLS = {
     "GapConstraint": lambda w: {
         **MARKED(w.ends), "gap": [nc.SphereOnSphere(radii=(1.0, 1.0))], "restitution": NUMBER,
         "friction": NUMBER, "regularisation": NUMBER, "compliance": NUMBER,
+    },
+    "SphereContacts": lambda w: {
+        **MARKED(w.ends), "radii": [(1.0, 1.0)], "ignored": [np.array([[0, 1]])], "capacity": WHOLE,
+        "skin": NUMBER, "stiffness": NUMBER, "restitution": NUMBER, "speed": NUMBER,
+        "law": ["linear", "hertz"],
     },
     "FrictionalGapPotential": lambda w: {
         **MARKED(w.ends), "gap": [nc.SphereOnSphere(radii=(1.0, 1.0))], "stiffness": NUMBER,

@@ -196,6 +196,11 @@ TABLE = {
     nc.GapConstraint: Entry(
         lambda p: nc.GapConstraint(p.ends, nc.SphereOnSphere(radii=(0.1, 0.1)), restitution=0.5)
     ),
+    nc.SphereContacts: Entry(
+        lambda p: nc.SphereContacts(
+            (*p.ends, nc.Point(p.one, (0.3, 0.1, -1.0))), radii=(0.9, 1.0, 0.5), stiffness=9.0, skin=50.0
+        )
+    ),
     nc.FrictionalGapPotential: Entry(
         lambda p: nc.FrictionalGapPotential(
             p.ends, nc.SphereOnSphere(radii=(0.6, 0.7)), stiffness=9.0, friction=0.3

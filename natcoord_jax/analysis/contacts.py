@@ -118,6 +118,7 @@ def touching(system: Model) -> list[Group]:
     """Contacts without a stiffness, in the order of `State.contacts`, then others."""
     every = system.effects
     laws = [g for g in every if isinstance(g.effect, ContactLaw) and not g.effect.unilateral]
+    laws = [g for g in laws if not g.effect.spread]
     return [g for g in every if g.effect.unilateral] + laws
 
 
@@ -137,6 +138,8 @@ def _rates(system: Model, state: State) -> Array:
 @checked(system=SYSTEM, trajectory=TRAJECTORY)
 def contacts(system: System, trajectory: Trajectory) -> Contacts:
     """Gaps, forces and impacts along a trajectory, and the margins within which its derivatives hold.
+
+    Of many spheres that look for their neighbours (`nc.SphereContacts`) nothing is told.
 
     Args:
         system: compiled system, with contacts.

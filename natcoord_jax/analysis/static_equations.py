@@ -17,7 +17,8 @@ from natcoord_jax.core.bodies import NODE
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
 from natcoord_jax.linsolve.dense import Inverse
-from natcoord_jax.linsolve.products import Products, WithProducts
+from natcoord_jax.linsolve.neighbour_couplings import NeighbourCouplings
+from natcoord_jax.linsolve.products import Products
 from natcoord_jax.linsolve.sparse import factorised
 from natcoord_jax.maths.collocation import gauss
 from natcoord_jax.maths.elimination import pivoted_inverse
@@ -146,7 +147,7 @@ class Static(eqx.Module):
 
     def matrices(
         self, y: Float[Array, " unknowns"], weight: Array | float = 0.0
-    ) -> tuple[list[Float[Array, "_ _ _"]], Products | None]:
+    ) -> tuple[list[Float[Array, "_ _ _"]], tuple[Products | NeighbourCouplings, ...]]:
         """Jacobian of the residual at displacements zero: matrices of bodies and effects, and products.
 
         They are those of a step of the body system without mass: a step's forces are those of its middle,
@@ -165,9 +166,8 @@ class Static(eqx.Module):
         step = eqx.tree_at(lambda s: s.situations, step, situations)
         resting = y.at[: self.balances].set(0.0)
         every, products = step.matrices(resting, exact=False), step.products(resting)
-        if products is not None:
-            products = replace_fields(products, columns=2.0 * products.columns)
-        return [x.at[:, :w, :w].multiply(2.0) for x, w in zip(every, self._widths)], products
+        doubled = [x.at[:, :w, :w].multiply(2.0) for x, w in zip(every, self._widths)]
+        return doubled, tuple(product.times(2.0) for product in products)
 
     @property
     def _widths(self) -> list[int]:
@@ -189,7 +189,9 @@ class Static(eqx.Module):
         if sparsity is not None and self.unknowns > DENSE:
             matrix: Any = sparsity.pattern.assemble(*given)
             found = factorised(sparsity.plan, matrix.with_diagonal(self._shifts(matrix.diagonal(), arms)))
-            return found if products is None else WithProducts.of(found, products)
+            for product in products:
+                found = product.around(found)
+            return found
         matrix = dense(self.system, given, self.unknowns, products=products)
         return Inverse(pivoted_inverse(matrix + jnp.diag(self._shifts(jnp.diagonal(matrix), arms))))
 

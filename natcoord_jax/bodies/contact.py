@@ -9,6 +9,7 @@ from natcoord_jax.bodies.beam import BeamHandle
 from natcoord_jax.bodies.contact_gaps import gaps_between, gaps_within
 from natcoord_jax.bodies.contact_sides import BeamSide, BodySide, MeshSide, PlaneSide, SegmentSide, Side
 from natcoord_jax.bodies.contact_sides import Plane as Plane
+from natcoord_jax.bodies.contact_spheres import are_searched, sphere_contacts
 from natcoord_jax.bodies.mesh_handle import MeshHandle, Surface
 from natcoord_jax.bodies.shapes import Box, Capsule, Cylinder, Ellipsoid, Sphere
 from natcoord_jax.core.arguments import is_a
@@ -64,6 +65,9 @@ class Contact(Recipe):
     shell or a solid at its nodes only: what is smaller than its cells slips through. Where a step is longer
     than a body, it may pass another without ever overlapping with it.
 
+    Of fifty spheres or more in `all_pairs_of`, with a stiffness and without friction, only neighbours are
+    looked at, see `nc.SphereContacts`; they are one contact with one name, and no sensor shows its pairs.
+
     Shells are touched from both sides, where their thickness ends; solids from outside, best at all that is
     outside, since at the end of a surface nodes slip off it. Which facets a node may touch is settled
     where the scene is compiled: those `candidates` that are the nearest to it in the assembled pose. Of a
@@ -93,12 +97,18 @@ class Contact(Recipe):
             of the shortest edge; None: a fiftieth of that. Edges that move by more than two of these in a
             step, or overlap by as much in a soft contact, may pass each other.
         candidates: number of facets that a node may touch; default 16.
+        capacity: of all pairs of spheres, neighbours that each has room for; default 16. Given, they are
+            looked for of fewer than 50 spheres, too.
+        skin: by how much two of them together may stray in a step from where their velocities take them [m];
+            default a quarter of the largest radius. Steps in which one strays by half of it are made in
+            parts.
         name: of the contact; several gaps are called "name[0]" and so on, those of all pairs
             "name[one, other]" or "name[one, other, 0]" by the names of the bodies.
 
     Raises:
         ValueError: when it is added: for shapes that there is no gap for, a surface against itself, no
-            stiffness, or more than 2000 gaps of all pairs of bodies. When the scene is compiled: for surfaces
+            stiffness, or more than 2000 gaps of all pairs of bodies; for a capacity or skin of others than
+            spheres. When the scene is compiled: for surfaces
             that overlap from the start.
 
     Example:
@@ -133,6 +143,8 @@ class Contact(Recipe):
     self_contact: bool = eqx.field(default=False, kw_only=True, static=True, metadata=is_a(FLAG))
     rounding: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Number("positive")))
     candidates: int | None = eqx.field(default=None, kw_only=True, static=True, metadata=is_a(Whole(1)))
+    capacity: int | None = eqx.field(default=None, kw_only=True, static=True, metadata=is_a(Whole(1)))
+    skin: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Number("positive")))
     name: str | None = eqx.field(default=None, kw_only=True, static=True, metadata=is_a(NAME))
 
     kind = "contact"
@@ -171,7 +183,12 @@ class Contact(Recipe):
         """Add the gaps of all pairs of bodies; their handles."""
         law, made = self._law(), []
         sides = {handle: _side(scene, handle, name) for handle in self.all_pairs_of}
-        for one, other in self._pairs(scene, name):
+        pairs, every = self._pairs(scene, name), list(sides.values())
+        asked = {"capacity": self.capacity, "skin": self.skin}
+        search = {key: value for key, value in asked.items() if value is not None}
+        if are_searched(every, law, search, name):
+            return (scene.add(sphere_contacts(every, pairs, law, search, name)),)
+        for one, other in pairs:
             said = f"{one.name}, {other.name}"
             boxes = sides[one].kind is sides[other].kind is Box
             own = law if boxes else {key: value for key, value in law.items() if key != "rounding"}

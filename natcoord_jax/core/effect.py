@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from natcoord_jax.core.arguments import Part
 from natcoord_jax.core.callables import replace_fields as replace_fields
@@ -130,6 +130,42 @@ class Effect(Part):
         """
         return {}
 
+    def neighbours(
+        self, place: Array, rows: Float[Array, "k 4 3"], rates: Float[Array, "k 4 3"], h: Float[Array, ""]
+    ) -> Any:
+        """What it looks up once, at the start of a step, and finds in `StepContext`; None: nothing.
+
+        Without derivatives: numbers of what is near, say.
+
+        Args:
+            place: see `respond`.
+            rows: of its bodies at the start.
+            rates: their velocities there.
+            h: step [s].
+        """
+        return None
+
+    def missed(
+        self, place: Array, found: Any, start: Array, rates: Array, end: Array, h: Float[Array, ""]
+    ) -> Int[Array, "2 2"]:
+        """Of an effect that looks up its neighbours: a pair of markers which it may have missed in a step.
+
+        A step with such a pair is repeated in parts, and at last ends the run.
+
+        Args:
+            place: see `respond`.
+            found: its neighbours.
+            start: rows of its bodies at the start.
+            rates: their velocities there.
+            end: rows at the end.
+            h: step [s].
+
+        Returns:
+            Numbers of two markers that have moved beyond where was looked, and of two that there was no room
+            for; -1 where there are none.
+        """
+        raise NotImplementedError
+
     @abc.abstractmethod
     def respond(self, place: Array, motion: Motion, now: StepContext, lam: Float[Array, "s m"]) -> Response:
         """Forces, torques, constraint rates and power over a step.
@@ -155,14 +191,12 @@ class Effect(Part):
             lam: of the instances.
         """
 
-        def one(
-            effect, place, inputs, coordinates, rates, stress, start, rows, row_rates, spin, force_rows, lam
-        ):
-            alone = StepContext(now.t, now.h, inputs, coordinates, rates, now.tableau, stress)
-            return effect.respond(place, Motion(start, rows, row_rates, spin, force_rows), alone, lam)
+        def one(effect, place, inputs, coordinates, rates, more, start, rows, row_rates, spin, held, lam):
+            alone = StepContext(now.t, now.h, inputs, coordinates, rates, now.tableau, *more)
+            return effect.respond(place, Motion(start, rows, row_rates, spin, held), alone, lam)
 
         axes = (None if self.shared else 0, 0, 0, 0, 0, 0, 0, 1, 1, 1, 1, 0)
-        numbers = self, place, now.inputs, now.coordinates, now.rates, now.stress
+        numbers = self, place, now.inputs, now.coordinates, now.rates, (now.stress, now.neighbours)
         moving = motion.start, motion.rows, motion.rates, motion.spin, motion.force_rows
         return jax.vmap(one, in_axes=axes)(*numbers, *moving, lam)
 

@@ -1,8 +1,10 @@
 """What effects see of the motion over a step, and what they answer."""
 
+from typing import Any
+
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from natcoord_jax.core.callables import replace_fields as replace_fields
 from natcoord_jax.maths.collocation import Tableau
@@ -44,6 +46,7 @@ class StepContext(eqx.Module):
         rates: their stored rates (rotors only) [rad/s or m/s].
         tableau: the collocation method.
         stress: what numerical dissipation adds to the gradients of an elastic effect; None: nothing.
+        neighbours: what `Effect.neighbours` has found at the start of the step; None: it looks for none.
     """
 
     t: Float[Array, ""]
@@ -53,6 +56,7 @@ class StepContext(eqx.Module):
     rates: Float[Array, "*n r"]
     tableau: Tableau = eqx.field(static=True)
     stress: Float[Array, "*n s p"] | None = None
+    neighbours: Any = None
 
     @property
     def times(self) -> Float[Array, " s"]:
@@ -83,15 +87,36 @@ class Response(eqx.Module):
     released: Float[Array, "*n s"] | None = None
 
 
+class NeighbourTangents(eqx.Module):
+    """Derivatives of the forces on markers by the velocities of others, which are others in every step.
+
+    Of each two, either is a neighbour of the other, and has the same stiffness.
+
+    Attributes:
+        others: numbers of the other markers.
+        stiffness: minus the derivatives of the components of the force on a marker by those of the velocity
+            of each of these.
+        across: velocities of the markers by the twists of their bodies.
+        along: the same as their increments follow twists, see `core.closed_tangents`.
+    """
+
+    others: Int[Array, "n m k"]
+    stiffness: Float[Array, "n 3 3 m k"]
+    across: Float[Array, "n k s r 3"]
+    along: Float[Array, "n k s r 3"]
+
+
 class SpreadTangents(eqx.Module):
-    """Derivatives of the wrenches on many bodies by their twists: sparse ones, and a product.
+    """Derivatives of the wrenches on many bodies by their twists: sparse ones, and others.
 
     Attributes:
         parts: of the markers of each part, of all instances one after the other.
-        columns: wrenches on all bodies that go with a number that all twists change,
+        columns: wrenches on all bodies that go with a number that all twists change; None: there is none,
         rows: the derivatives of that number.
+        neighbours: what there is besides between markers that are neighbours; None: nothing.
     """
 
     parts: Float[Array, "nf p s r p s r"]
-    columns: Float[Array, "n k s r"]
-    rows: Float[Array, "n k s r"]
+    columns: Float[Array, "n k s r"] | None = None
+    rows: Float[Array, "n k s r"] | None = None
+    neighbours: NeighbourTangents | None = None

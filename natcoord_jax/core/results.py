@@ -19,6 +19,8 @@ class Result(IntEnum):
     TOLERANCE_NOT_MET = 8
     INTERRUPTED = 9
     INVERTED = 10
+    MISSED = 11
+    OVERFLOW = 12
 
     @property
     def ok(self) -> bool:
@@ -38,6 +40,8 @@ REASONS = {
     Result.TOLERANCE_NOT_MET: "no substep is short enough for the error that `rtol` and `atol` tolerate",
     Result.INTERRUPTED: "the run was interrupted from the keyboard",
     Result.INVERTED: "an element was turned inside out",
+    Result.MISSED: "bodies have moved in a step beyond where contacts were looked for",
+    Result.OVERFLOW: "a body has more neighbours than its contact has room for",
 }
 
 REMEDIES = {
@@ -50,6 +54,8 @@ REMEDIES = {
     Result.TOLERANCE_NOT_MET: "use a larger `rtol` or `atol`; 1e-13 of the motion is round-off",
     Result.INTERRUPTED: "what was stored by `store` goes on with `resume=True`",
     Result.INVERTED: "use a smaller dt, a finer mesh, or a material that resists, as nc.NeoHooke",
+    Result.MISSED: "use a smaller dt, or a larger `skin` of the nc.Contact",
+    Result.OVERFLOW: "pass a larger `capacity` to the nc.Contact, or a smaller dt or `skin`",
 }
 
 

@@ -24,6 +24,14 @@ class Products(eqx.Module):
         """The matrix."""
         return self.columns.T @ self.rows
 
+    def times(self, factor: float) -> "Products":
+        """Multiplied by a number."""
+        return Products(factor * self.columns, self.rows)
+
+    def around(self, factors: Any) -> "WithProducts":
+        """Factors of the sum of a matrix and these, from those of the matrix."""
+        return WithProducts.of(factors, self)
+
 
 class WithProducts(eqx.Module):
     """Factors of A, made into those of A + U V^T, to be applied in an iteration.

@@ -73,7 +73,9 @@ def choose(
     even = len(weights) * weights.max() ** 2 <= UNEVEN * np.sum(weights**2)
     if name == "block tridiagonal" and path is None:
         raise ValueError('the nodes are no chain: some node sees more than two; pass "multifrontal"')
-    if path is not None and (name == "block tridiagonal" or (name is None and even)):
+    # Nodes that see no other are a chain, too, but need not wait for each other.
+    linked = any(graph.neighbours)
+    if path is not None and (name == "block tridiagonal" or (name is None and even and linked)):
         return block_tridiagonal.plan(path, entries, tiles)
     values = None if matrix is None else entries.values(matrix.tiles)
     return multifrontal.plan(graph, entries, tiles, values=values, coordinates=coordinates)

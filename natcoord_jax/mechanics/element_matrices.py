@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.core.checks import is_concrete
+from natcoord_jax.linsolve.neighbour_couplings import NeighbourCouplings
 from natcoord_jax.linsolve.products import Products
 from natcoord_jax.model.groups import Group
 from natcoord_jax.model.local_rates import TWIST
@@ -71,7 +72,7 @@ def dense(
     matrices: Sequence[Float[Array, "_ _ _"]],
     size: int,
     stages: int = 1,
-    products: Products | None = None,
+    products: Sequence[Products | NeighbourCouplings] = (),
 ) -> Float[Array, "n n"]:
     """The dense matrix of element matrices, see `elements`, and of products."""
     # What is fixed goes beyond the matrix and is cut off.
@@ -79,4 +80,4 @@ def dense(
     for touched, local in zip(elements(system, stages), matrices, strict=True):
         matrix = matrix.at[touched[:, :, None], touched[:, None, :]].add(local)
     matrix = matrix[:size, :size]
-    return matrix if products is None else matrix + products.to_dense()
+    return sum((product.to_dense() for product in products), matrix)

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.core.state import State
+from natcoord_jax.linsolve.neighbour_couplings import NeighbourCouplings
 from natcoord_jax.linsolve.products import Products
 from natcoord_jax.maths.collocation import gauss
 from natcoord_jax.maths.projectors import range_projector
@@ -113,7 +114,7 @@ class FullStep(StepEquations):
         given = self.matrices(y, exact), self.unknowns, self.tableau.stages, self.products(y)
         return self._projected(dense(self.system, *given))
 
-    def products(self, y: Float[Array, " unknowns"]) -> Products | None:
+    def products(self, y: Float[Array, " unknowns"]) -> tuple[Products | NeighbourCouplings, ...]:
         """What effects on many bodies add to `matrices`."""
         return products(self, self._with_ground(self.split(y)[0]))
 

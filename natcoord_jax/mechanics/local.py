@@ -15,7 +15,7 @@ from natcoord_jax.core.motion import Motion, Response, StepContext
 from natcoord_jax.maths.collocation import Tableau, rotate_stages
 from natcoord_jax.maths.vectors import cross
 from natcoord_jax.mechanics.momentum import inertia_alone, stage_changes
-from natcoord_jax.mechanics.response import GroupData, respond
+from natcoord_jax.mechanics.response import GroupData, respond, step_context
 from natcoord_jax.model.groups import Group
 from natcoord_jax.model.local_rates import TWIST
 
@@ -130,9 +130,7 @@ def _linearised_jacobians(
 ) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
     rates = twists.shape[-1]
     with jax.named_scope(group.effect.kind.replace(" ", "_")):
-        now = StepContext(
-            where.t, where.h, where.inputs, where.coordinates, where.rates, tableau, where.stress
-        )
+        now = step_context(where, tableau)
         motion = body_motion(start, whole(twists), where.h, tableau)
         found = group.effect.tangents(where.place, motion, now, lam, turning=rates == TWIST)
         if found is not None:

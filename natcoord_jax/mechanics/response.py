@@ -15,7 +15,7 @@ from natcoord_jax.maths.collocation import Tableau
 from natcoord_jax.maths.vectors import cross
 from natcoord_jax.model.groups import Group
 from natcoord_jax.model.model import Model
-from natcoord_jax.model.rows import group_places
+from natcoord_jax.model.rows import group_places, rows_with_ground
 
 
 def ground_rows(like: Array) -> Float[Array, "1 4 3"]:
@@ -72,7 +72,10 @@ def motion_between(before: State, after: State, h: Array) -> StageKinematics:
 
 
 class GroupData(eqx.Module):
-    """What a group needs besides the motion: places, inputs, coordinates, rates, time, step, extra stress."""
+    """What a group needs besides the motion: places, inputs, coordinates, rates, time, step, extra stress.
+
+    And what it has looked up at the start of the step, see `Effect.neighbours`.
+    """
 
     place: Array
     inputs: Array
@@ -81,6 +84,7 @@ class GroupData(eqx.Module):
     t: Float[Array, ""]
     h: Float[Array, ""]
     stress: Float[Array, "n s p"] | None = None
+    neighbours: Any = None
 
 
 def situation(system: Model, group: Group, state: State, u: Array, h: Array) -> GroupData:
@@ -92,14 +96,36 @@ def situation(system: Model, group: Group, state: State, u: Array, h: Array) -> 
         state.rates[group.rotors],
         state.t,
         h,
+        neighbours=neighbours_of(system, group, state, h) if group.searches else None,
     )
+
+
+def neighbours_of(system: Model, group: Group, state: State, h: Array) -> Any:
+    """What the instances of a group look up at the start of a step."""
+    place, rows, rates, h = jax.lax.stop_gradient((group_places(system, group), *group_rows(group, state), h))
+    return jax.vmap(lambda effect, *given: effect.neighbours(*given, h))(
+        jax.lax.stop_gradient(group.effect), place, rows, rates
+    )
+
+
+def group_rows(group: Group, state: State) -> tuple[Float[Array, "n k 4 3"], Float[Array, "n k 4 3"]]:
+    """Rows of the bodies of a group, and their velocities."""
+    still = jnp.zeros((1, *NODE), state.v.dtype)
+    rates = jnp.concatenate([state.row_rates, still])
+    return rows_with_ground(state.q)[group.bodies], rates[group.bodies]
+
+
+def step_context(where: GroupData, tableau: Tableau) -> StepContext:
+    """What all instances of a group may depend on."""
+    given = where.inputs, where.coordinates, where.rates, tableau, where.stress, where.neighbours
+    return StepContext(where.t, where.h, *given)
 
 
 def respond(
     group: Group, where: GroupData, motion: Motion, lam: Float[Array, "n s m"], tableau: Tableau
 ) -> Response:
     """Responses of all instances of a group; leading axis `n`."""
-    now = StepContext(where.t, where.h, where.inputs, where.coordinates, where.rates, tableau, where.stress)
+    now = step_context(where, tableau)
     with jax.named_scope(group.effect.kind.replace(" ", "_")):
         return group.effect.responses(where.place, motion, now, lam)
 

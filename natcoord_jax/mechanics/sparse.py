@@ -12,7 +12,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.linsolve.blocks import BlockMatrix
-from natcoord_jax.linsolve.products import WithProducts
 from natcoord_jax.linsolve.saddle import inertias_of, regularised
 from natcoord_jax.linsolve.sparse import SparseSolver, factorised
 from natcoord_jax.mechanics.element_matrices import touches
@@ -35,11 +34,13 @@ class SparseStep(FullStep):
         """Factors of a sparse matrix, of a dense one with several stages, and inertias of the unknowns."""
         if self.tableau.stages > 1:
             return super().factorised(matrix)
-        matrix, products = matrix if spreads(self.system) else (matrix, None)
+        matrix, products = matrix if spreads(self.system) else (matrix, ())
         whole = self._assembled(matrix)
         inertias = inertias_of(whole, self.balances)
         found: Any = factorised(self.system.sparsity.plan, regularised(whole, inertias))
-        return found if products is None else WithProducts.of(found, products), inertias
+        for product in products:
+            found = product.around(found)
+        return found, inertias
 
     def differentiable(self, matrix: Any) -> Any:
         """The same, refined and differentiable."""
@@ -70,7 +71,7 @@ class SparseStep(FullStep):
         if self.tableau.stages > 1:
             return super().jacobian(y, exact=exact)
         matrices, products = tuple(self.matrices(y, exact)), self.products(y)
-        return matrices if products is None else (matrices, products)
+        return (matrices, products) if products else matrices
 
 
 def nodes_of(system: Model) -> np.ndarray:

@@ -3,12 +3,14 @@
 from typing import Any
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
-from natcoord_jax.core.motion import SpreadTangents, StepContext
+from natcoord_jax.core.motion import NeighbourTangents, SpreadTangents
+from natcoord_jax.linsolve.neighbour_couplings import NeighbourCouplings
 from natcoord_jax.linsolve.products import Products
 from natcoord_jax.mechanics.element_matrices import bodies_of_elements, rates_of
 from natcoord_jax.mechanics.local import body_motion, whole
+from natcoord_jax.mechanics.response import step_context
 from natcoord_jax.model.groups import Group
 from natcoord_jax.model.model import Model
 
@@ -26,7 +28,7 @@ def _tangents(step: Any, group: Group, where: Any, twists: Float[Array, "bodies 
         where.h,
         step.tableau,
     )
-    now = StepContext(where.t, where.h, where.inputs, where.coordinates, where.rates, step.tableau)
+    now = step_context(where, step.tableau)
     return group.effect.spread_tangents(where.place, motion, now, turning=group.turning)
 
 
@@ -47,7 +49,7 @@ def part_matrices(step: Any, group: Group, where: Any, twists: Array) -> Float[A
     return -where.h * found.reshape(-1, width, width)
 
 
-def products(step: Any, twists: Float[Array, "bodies s 6"]) -> Products | None:
+def products(step: Any, twists: Float[Array, "bodies s 6"]) -> tuple[Products | NeighbourCouplings, ...]:
     """Of all groups, by all unknowns.
 
     Args:
@@ -55,18 +57,38 @@ def products(step: Any, twists: Float[Array, "bodies s 6"]) -> Products | None:
         twists: of all bodies and the ground.
     """
     if not spreads(step.system):
-        return None
+        return ()
     places = step.system.local_rates.places(1, step.unknowns)[:, 0]
-    columns, rows = [], []
+    columns, rows, couplings = [], [], []
     for group, where in zip(step.groups, step.situations):
         if not group.effect.spread:
             continue
         found = _tangents(step, group, where, twists)
-        touched = places[jnp.asarray(group.bodies)][..., : rates_of(group)].reshape(group.count, -1)
+        touched = places[jnp.asarray(group.bodies)][..., : rates_of(group)]
+        if found.neighbours is not None:
+            couplings += _couplings(step, group, where.h, touched, found.neighbours)
+        if found.columns is None or found.rows is None:
+            continue
+        touched = touched.reshape(group.count, -1)
         along = step.system.local_rates.blocks(group.bodies, step.start)
         for kept, given, scale in ((columns, found.columns, -where.h), (rows, found.rows, 1.0)):
             given = along(given, 1) if group.turning else given
             each = jnp.arange(group.count)[:, None]
             zero = jnp.zeros((group.count, step.unknowns + 1), given.dtype)
             kept.append(zero.at[each, touched].add(scale * given.reshape(group.count, -1))[:, :-1])
-    return Products(jnp.concatenate(columns), jnp.concatenate(rows))
+    dense = (Products(jnp.concatenate(columns), jnp.concatenate(rows)),) if columns else ()
+    return *dense, *couplings
+
+
+def _couplings(
+    step: Any, group: Group, h: Array, touched: Int[Array, "n k r"], found: NeighbourTangents
+) -> list[NeighbourCouplings]:
+    """Of what is near in this step, of each instance; the balances have minus the impulses."""
+    maps = found.across, found.along
+    if group.turning:
+        along = step.system.local_rates.blocks(group.bodies, step.start)
+        maps = tuple(along(x, 1) for x in maps)
+    # What is many is the last axis, so that what is computed is wide.
+    across, along = (jnp.transpose(x[:, :, 0], (0, 3, 2, 1)) for x in maps)
+    every = jnp.swapaxes(touched, 1, 2), across, along, found.others, h * found.stiffness
+    return [NeighbourCouplings(*(x[k] for x in every), size=step.unknowns) for k in range(group.count)]

@@ -82,6 +82,11 @@ class Group(Stacked):
         """Whether they can be turned inside out."""
         return type(self.effect).volume_ratios is not Effect.volume_ratios
 
+    @property
+    def searches(self) -> bool:
+        """Whether they look up their neighbours at the start of a step."""
+        return type(self.effect).neighbours is not Effect.neighbours
+
 
 class CoordinateGroup(eqx.Module):
     """Joint coordinates of one description: joints, their bodies and places in the state."""

@@ -10,6 +10,7 @@ from natcoord_jax.core.checks import require_double
 from natcoord_jax.core.results import REASONS, REMEDIES, Result, SimulationError
 from natcoord_jax.core.state import State, Trajectory
 from natcoord_jax.mechanics.energies import body_momenta, group_energies
+from natcoord_jax.mechanics.failures import failure
 from natcoord_jax.mechanics.momentum import inertia
 from natcoord_jax.model.model import Model
 from natcoord_jax.model.rows import over_states
@@ -82,16 +83,6 @@ def unknown_name(system: Model, index: int, stages: int = 1) -> str:
     return "an unknown"
 
 
-def inverted_name(system: Model, number: int) -> str:
-    """Name of an element by this number."""
-    for group in system.effects:
-        if group.has_volumes:
-            if number < group.count:
-                return f"{group.effect.kind} {group.names[number]!r}"
-            number -= group.count
-    return "an element"
-
-
 def explain(system: Model, trajectory: Trajectory) -> str:
     """How a run ended, in words: result, step, time, and the part with the worst residual by name.
 
@@ -120,8 +111,8 @@ def _culprit(system: Model, trajectory: Trajectory) -> str:
         # Such a number spoils all unknowns of the step, of which the first would be named.
         names = [repr(name) for name, bad in zip(system.structure.inputs, broken) if bad]
         return f"; not finite: the input {', '.join(names)}"
-    if result == Result.INVERTED:
-        return f": {inverted_name(system, -2 - int(trajectory.failed_part))}"
+    if int(trajectory.failed_part) < -1:
+        return f": {failure(system, -2 - int(trajectory.failed_part))[1]}"
     if int(trajectory.failed_part) >= 0:
         stages = trajectory.scheme.stages if trajectory.scheme is not None else 1
         return f"; worst residual at {unknown_name(system, int(trajectory.failed_part), stages)}"

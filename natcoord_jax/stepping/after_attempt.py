@@ -6,8 +6,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from natcoord_jax.core.results import Result
 from natcoord_jax.core.state import State
+from natcoord_jax.mechanics.failures import result_of
 from natcoord_jax.mechanics.frozen_kick import from_body_axes, in_body_axes
-from natcoord_jax.mechanics.inversion import first_inverted
 from natcoord_jax.mechanics.tangent_space import Velocity
 from natcoord_jax.stepping.error_control import StepDecision, Trial, follow
 from natcoord_jax.stepping.located import COMPLETE, Ahead, with_impacts
@@ -42,16 +42,16 @@ def _halve(course: RolloutState, after: State, solved: Array, over: Array) -> St
 
 
 def _looked_at(
-    system: System, it: Iterate, new: State, half_turn: Float[Array, ""]
+    system: System, it: Iterate, new: State, half_turn: Float[Array, ""], failure: Array | None
 ) -> tuple[Int[Array, ""], Int[Array, ""]]:
     """Code of an attempt, and the number of what is worst about it, with what its end says."""
     finite = jnp.all(jnp.isfinite(new.q)) & jnp.all(jnp.isfinite(new.v))
     code = jnp.where((it.code == 0) & ~finite, int(Result.NONFINITE), it.code)
     code = jnp.where((code == 0) & (half_turn > LARGEST_HALF_TURN), int(Result.DIVERGED), code)
-    worst, inverted = it.worst, first_inverted(system, new)
-    if inverted is not None:
-        worst = jnp.where((code == 0) & (inverted >= 0), -2 - inverted, worst)
-        code = jnp.where(worst < -1, int(Result.INVERTED), code)
+    worst = it.worst
+    if failure is not None:
+        worst = jnp.where((code == 0) & (failure >= 0), -2 - failure, worst)
+        code = jnp.where(worst < -1, result_of(system, -2 - worst), code)
     return code, worst
 
 
@@ -122,6 +122,7 @@ def after_attempt(
     left: Float[Array, " rates"],
     kick: Velocity | None = None,
     ahead: Ahead | None = None,
+    failure: Int[Array, ""] | None = None,
 ) -> RolloutState:
     """The end of an attempt: what is attempted next, and from where.
 
@@ -133,25 +134,25 @@ def after_attempt(
         left: impulse that it leaves to the next.
         kick: of the attempt.
         ahead: contacts in it, where impacts are located.
+        failure: what is wrong with a solution, see `mechanics.failures`.
     """
     tableau, it, over = setting.plan.tableau, course.it, setting.over(course)
-    code, worst = _looked_at(setting.system, it, *found)
+    code, worst = _looked_at(setting.system, it, *found, failure)
     solved = code == int(Result.SUCCESSFUL)
     if course.trial is None or setting.tolerance is None:
         verdict = _halve(course, found[0], solved, over)
     else:
         verdict = follow(setting.tolerance, course.trial, course.state, found[0], solved, over, tableau)
         code = jnp.where(solved, int(Result.TOLERANCE_NOT_MET), code)
-    search, nearly = course.search, 1e-9
+    search = course.search
     if search is not None and ahead is not None:
-        most, nearly = tableau.max_events, COMPLETE
-        search, verdict = with_impacts(search, ahead, verdict, course, most, solved & ~over)
-    complete = verdict.accepted & (verdict.done > 1.0 - nearly)
+        search, verdict = with_impacts(search, ahead, verdict, course, tableau.max_events, solved & ~over)
+    complete = verdict.accepted & (verdict.done > 1.0 - (1e-9 if search is None else COMPLETE))
     stopped, result = _ended(setting, course, verdict, code)
     done, fraction, trial, left = _next_part(course, verdict, complete, left)
-    kept, worked, size = verdict.change > 0, jnp.where(over, 0, it.total), it.y.shape[0]
+    kept, size = verdict.change > 0, it.y.shape[0]
     past, lagging = _followed(course, it, inertias, kick, trial, solved, kept, fraction), course.lagging
-    guess = past.guess
+    guess, worked = past.guess, jnp.where(over, 0, it.total)
     sound = jnp.all(jnp.isfinite(guess))
     if lagging is not None:
         lagging = lagging.beginning(from_body_axes(verdict.state, jnp.where(sound, guess[size:], 0.0)))

@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
 from natcoord_jax.mechanics.equations import prepare, starting
+from natcoord_jax.mechanics.failures import first_failure
 from natcoord_jax.mechanics.frozen_kick import Lagging
 from natcoord_jax.mechanics.kick import Kick
 from natcoord_jax.mechanics.redundancy import contact_weights
@@ -126,13 +127,13 @@ def attempt(
         before = with_state(before, unpack(x))
         ends = end_of_step(system, before.state, h, equations.groups, found, setting.plan.tableau)
         kick = None if before.lagging is None else found.kick.exact
-        missed = solving.residual, found.size, before.it.correction
-        given = ends[0], setting.plan.tolerance, factors.grain
-        steady = sound(equations, before.it.y, *missed, *given)
+        given = solving.residual, found.size, before.it.correction, ends[0], setting.plan.tolerance
+        steady = sound(equations, before.it.y, *given, factors.grain)
         before = eqx.tree_at(lambda c: c.it.converged, before, before.it.converged & steady)
         left = remainder(equations, solving.residual, factors.inertias)
         ahead = None if search is None else Ahead.of(system, before.state, found.at, h, setting.dt)
-        after = after_attempt(setting, before, factors.inertias, ends, left, kick, ahead)
+        failure = first_failure(equations, ends[0])
+        after = after_attempt(setting, before, factors.inertias, ends, left, kick, ahead, failure)
         accepted = after.taken > before.taken
         x = ravel_pytree(after.state)[0]
         slot = x, before.it.y, index, before.fraction, before.done, accepted, after.step

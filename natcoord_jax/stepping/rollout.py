@@ -18,6 +18,7 @@ from jaxtyping import Array, Int
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.results import Result
 from natcoord_jax.core.state import State
+from natcoord_jax.mechanics.failures import can_fail, result_of
 from natcoord_jax.stepping.attempt import LoopCarry, with_state
 from natcoord_jax.stepping.error_control import Tolerance
 from natcoord_jax.stepping.factors import Factors
@@ -101,9 +102,9 @@ def _judged(system: System, course: RolloutState, steps: Any) -> RolloutState:
     """With the code of a run that used up its substeps, and no culprit in one that went well."""
     short = (course.step < steps) & ~course.stopped
     cause = int(Result.MAX_SUBSTEPS)
-    if any(group.has_volumes for group in system.effects):
+    if can_fail(system):
         # Substeps become ever shorter on the way to where an element is turned inside out.
-        cause = jnp.where(course.worst < -1, int(Result.INVERTED), cause)
+        cause = jnp.where(course.worst < -1, result_of(system, -2 - course.worst), cause)
     code = jnp.where(short, cause, course.code)
     well = (code == int(Result.SUCCESSFUL)) | (code == int(Result.EVENT))
     worst = jnp.where(well, -1, course.worst)

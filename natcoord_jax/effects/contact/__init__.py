@@ -15,3 +15,4 @@ from natcoord_jax.effects.contact.pairs import DiscOnPlane as DiscOnPlane
 from natcoord_jax.effects.contact.pairs import EllipsoidOnPlane as EllipsoidOnPlane
 from natcoord_jax.effects.contact.pairs import SphereOnPlane as SphereOnPlane
 from natcoord_jax.effects.contact.pairs import SphereOnSphere as SphereOnSphere
+from natcoord_jax.effects.contact.spheres import SphereContacts as SphereContacts

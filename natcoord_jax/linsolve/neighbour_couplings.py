@@ -1,0 +1,131 @@
+"""Sparse matrices with couplings that are elsewhere in every step: solved by an iteration around the rest."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+ENOUGH = 1e-6
+"""Part of the residual that an iteration may leave: Newton's makes up for it with the next correction."""
+
+MOST = 50
+"""Turns of one iteration."""
+
+
+class NeighbourCouplings(eqx.Module):
+    """What points have to do with their neighbours: sums over these of across_i stiffness_ij along_j^T.
+
+    Each of two points is a neighbour of the other, with the same stiffness.
+
+    Attributes:
+        places: unknowns of each point; `size` where there is none.
+        across: equations of a point by the components of the force on it.
+        along: components of the displacement of a point by its unknowns.
+        others: numbers of neighbours.
+        stiffness: components of forces by those of displacements.
+        size: number of unknowns.
+    """
+
+    places: Int[Array, "r p"]
+    across: Float[Array, "3 r p"]
+    along: Float[Array, "3 r p"]
+    others: Int[Array, "m p"]
+    stiffness: Float[Array, "3 3 m p"]
+    size: int = eqx.field(static=True)
+
+    def apply(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
+        """Product with a vector."""
+        own = jnp.concatenate([x, jnp.zeros(1, x.dtype)])[self.places]
+        moved = jnp.sum(self.along * own, axis=1)
+        forces = jnp.sum(self.stiffness * moved[:, self.others], axis=(1, 2))
+        found = jnp.sum(self.across * forces[:, None], axis=0)
+        return jnp.zeros(self.size + 1, x.dtype).at[self.places].add(found)[:-1]
+
+    def transpose(self) -> "NeighbourCouplings":
+        """The transposed matrix."""
+        turned = self.along, self.across, self.others, jnp.swapaxes(self.stiffness, 0, 1)
+        return NeighbourCouplings(self.places, *turned, size=self.size)
+
+    def to_dense(self) -> Float[Array, "n n"]:
+        """The matrix."""
+        return jax.vmap(self.apply, out_axes=1)(jnp.eye(self.size, dtype=self.across.dtype))
+
+    def times(self, factor: float) -> "NeighbourCouplings":
+        """Multiplied by a number."""
+        return eqx.tree_at(lambda x: x.stiffness, self, factor * self.stiffness)
+
+    def around(self, factors: Any) -> "WithCouplings":
+        """Factors of the sum of a matrix and these, from those of the matrix."""
+        return WithCouplings(factors, self)
+
+
+class WithCouplings(eqx.Module):
+    """Factors of A, and couplings B: they solve with A + B by an iteration on 1 + A^-1 B.
+
+    Attributes:
+        factors: of A.
+        couplings: B.
+
+    Example:
+        >>> import jax; jax.config.update("jax_enable_x64", True)
+        >>> import jax.numpy as jnp
+        >>> from natcoord_jax.linsolve.dense import Inverse
+        >>> places, maps = jnp.array([[0, 1]]), jnp.zeros((3, 1, 2)).at[0].set(1.0)
+        >>> stiffness = jnp.zeros((3, 3, 1, 2)).at[0, 0].set(-0.5)
+        >>> two = NeighbourCouplings(places, maps, maps, jnp.array([[1, 0]]), stiffness, size=2)
+        >>> two.to_dense().tolist()
+        [[0.0, -0.5], [-0.5, 0.0]]
+        >>> two.around(Inverse(jnp.eye(2))).solve(jnp.array([0.0, 1.5])).round(5).tolist()
+        [1.0, 2.0]
+    """
+
+    factors: Any
+    couplings: NeighbourCouplings
+
+    def solve(self, right: Float[Array, " n"]) -> Float[Array, " n"]:
+        """Solution for a right-hand side, nearly."""
+        return stabilised(
+            lambda x: x + self.factors.solve(self.couplings.apply(x)), self.factors.solve(right)
+        )
+
+    def transpose(self) -> "WithCouplings":
+        """Factors of the transposed matrix."""
+        return WithCouplings(self.factors.transpose(), self.couplings.transpose())
+
+
+def stabilised(apply: Callable[[Array], Array], right: Float[Array, " n"]) -> Float[Array, " n"]:
+    """Solution x of apply(x) = right, nearly, of a linear function that is not far from the identity.
+
+    Source: H. A. van der Vorst, Bi-CGSTAB, SIAM J. Sci. Stat. Comput. 13 (1992) 631-644.
+
+    Args:
+        apply: the function.
+        right: what it is to be; the first guess of the solution, too.
+    """
+    whole = jnp.sum(right * right)
+
+    def quotient(a: Array, b: Array) -> Array:
+        return jnp.where(b != 0, a / jnp.where(b != 0, b, 1.0), 0.0)
+
+    def turn(carry: tuple) -> tuple:
+        count, x, r, first, p, along = carry
+        image = apply(p)
+        step = quotient(along, jnp.sum(first * image))
+        s = r - step * image
+        t = apply(s)
+        second = quotient(jnp.sum(t * s), jnp.sum(t * t))
+        x, r = x + step * p + second * s, s - second * t
+        following = jnp.sum(first * r)
+        kept = quotient(following * step, along * second)
+        return count + 1, x, r, first, r + kept * (p - second * image), following
+
+    def going(carry: tuple) -> Array:
+        count, _, r, *_ = carry
+        return (count < MOST) & (jnp.sum(r * r) > ENOUGH**2 * whole)
+
+    begun = right - apply(right)
+    start = jnp.zeros((), jnp.int32), right, begun, begun, begun, jnp.sum(begun * begun)
+    return jax.lax.while_loop(going, turn, start)[1]

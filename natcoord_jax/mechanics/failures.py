@@ -1,0 +1,94 @@
+"""What is wrong with a step though its equations are solved: an element inside out, neighbours overlooked.
+
+One number tells what it is: first come the elements that can be inside out, then, for each instance of an
+effect that looks for neighbours, pairs of its markers that it has missed, then those it had no room for.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Int
+
+from natcoord_jax.core.results import Result
+from natcoord_jax.core.state import State
+from natcoord_jax.mechanics.inversion import first_inverted
+from natcoord_jax.mechanics.response import group_rows
+from natcoord_jax.model.groups import Group
+from natcoord_jax.model.model import Model
+
+KINDS = Result.MISSED, Result.OVERFLOW
+
+
+def can_fail(system: Model) -> bool:
+    """Whether there is anything of the kind."""
+    return any(group.has_volumes or group.searches for group in system.effects)
+
+
+def first_failure(equations: Any, after: State) -> Int[Array, ""] | None:
+    """Number of the first failure of a step; -1: there is none, None: there cannot be.
+
+    Args:
+        equations: of the step.
+        after: state at its end.
+    """
+    system: Model = equations.system
+    if not can_fail(system):
+        return None
+    inverted = first_inverted(system, after)
+    found = jnp.array(-1) if inverted is None else inverted
+    first = sum(group.count for group in system.effects if group.has_volumes)
+    for group, where in zip(equations.groups, equations.situations):
+        if group.searches:
+            missed = _missed(system, group, where, equations.state, after)
+            found = jnp.where((found < 0) & (missed >= 0), first + missed, found)
+            first += _numbers(group)
+    return found
+
+
+def _numbers(group: Group) -> int:
+    return group.count * len(KINDS) * group.bodies.shape[1] ** 2
+
+
+def _missed(system: Model, group: Group, where: Any, before: State, after: State) -> Int[Array, ""]:
+    """Number of the first pair, within a group."""
+    rows, rates = group_rows(group, before)
+    pairs = jax.vmap(lambda effect, *given: effect.missed(*given, where.h))(
+        group.effect, where.place, where.neighbours, rows, rates, group_rows(group, after)[0]
+    )
+    size = group.bodies.shape[1]
+    numbers = (np.arange(group.count * len(KINDS)).reshape(-1, len(KINDS)) * size + pairs[..., 0]) * size
+    numbers, wrong = (numbers + pairs[..., 1]).reshape(-1), pairs[..., 0].reshape(-1) >= 0
+    return jnp.where(jnp.any(wrong), numbers[jnp.argmax(wrong)], -1)
+
+
+def failure(system: Model, number: int) -> tuple[Result, str]:
+    """Result code and name of a failure by its number; on the host."""
+    for group in system.effects:
+        if group.has_volumes:
+            if number < group.count:
+                return Result.INVERTED, f"{group.effect.kind} {group.names[number]!r}"
+            number -= group.count
+    for group in system.effects:
+        if group.searches:
+            if number < _numbers(group):
+                size = group.bodies.shape[1]
+                which, one, other = np.unravel_index(number, (group.count * len(KINDS), size, size))
+                instance, kind = divmod(int(which), len(KINDS))
+                bodies = [system.structure.bodies[int(group.bodies[instance, k])] for k in (one, other)]
+                return KINDS[kind], f"{bodies[0]!r} and {bodies[1]!r} in {group.names[instance]!r}"
+            number -= _numbers(group)
+    return Result.INVERTED, "an element"
+
+
+def result_of(system: Model, number: Int[Array, ""]) -> Int[Array, ""]:
+    """Result code of a failure by its number."""
+    first = sum(group.count for group in system.effects if group.has_volumes)
+    code = jnp.array(int(Result.INVERTED))
+    for group in system.effects:
+        if group.searches:
+            kind = (number - first) // group.bodies.shape[1] ** 2 % len(KINDS)
+            code = jnp.where(number >= first, jnp.array([int(k) for k in KINDS])[kind], code)
+            first += _numbers(group)
+    return code
