@@ -9,6 +9,7 @@ from natcoord_jax.effects.contact.gap import Gap as Gap
 from natcoord_jax.effects.contact.gap_constraint import GapConstraint as GapConstraint
 from natcoord_jax.effects.contact.gap_potential import GapPotential as GapPotential
 from natcoord_jax.effects.contact.law import damping_of as damping_of
+from natcoord_jax.effects.contact.mortar_gap import MortarGap as MortarGap
 from natcoord_jax.effects.contact.node_on_facets import NodeOnFacets as NodeOnFacets
 from natcoord_jax.effects.contact.pairs import CapsuleOnCapsule as CapsuleOnCapsule
 from natcoord_jax.effects.contact.pairs import DiscOnPlane as DiscOnPlane
