@@ -81,8 +81,8 @@ class Contact(Recipe):
             along their normal, modulus times area over thickness; of rigid bodies none, they do not overlap.
         restitution: part of the closing speed that is left after an impact [-]; None: nothing is lost. With a
             stiffness above 0, and where no other force acts (weight in a soft contact takes some more of it).
-        friction: coefficient [-], of rigid bodies, points, beams, and of nodes of solids on planes; None:
-            there is none.
+        friction: coefficient [-], of rigid bodies, points, beams, nodes of solids on planes, and of surfaces
+            by their nodes; None: there is none.
         speed: with a stiffness, of the impact that `restitution` is of [m/s]; less is lost of slower ones.
         law: force proportional to the overlap, "linear", or to its power 3/2, "hertz".
         method: of two surfaces, "nodes" of each on the facets of the other, or "mortar": gaps of the facets

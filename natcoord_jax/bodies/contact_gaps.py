@@ -264,14 +264,14 @@ def _segments(one: SegmentSide, other: SegmentSide, law: Law, name: str) -> Gaps
 
 
 def _surfaces(one: MeshSide, other: MeshSide, law: Law, name: str) -> Gaps:
-    if "friction" in law:
-        raise ValueError(
-            f"contact {name!r}: there is no friction [-] between surfaces of shells and solids yet"
-        )
     method = law.get("method")
     law = {key: value for key, value in law.items() if key != "method"}
     if method is None:
         return [surface_gaps(one, other, law, name)]
+    if "friction" in law:
+        raise ValueError(
+            f"contact {name!r}: a mortar has no friction [-] yet; leave it out, or take method='nodes'"
+        )
     if "one_pass" in law:
         raise ValueError(
             f"contact {name!r}: a mortar has one pass, the mean gaps of the first surface; leave out one_pass"

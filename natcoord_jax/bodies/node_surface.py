@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 from natcoord_jax.bodies.contact_sides import MeshSide
 from natcoord_jax.core.elements import Elements
 from natcoord_jax.core.nodes import NodeUnion
-from natcoord_jax.effects.contact import NodeOnFacets
+from natcoord_jax.effects.contact import FrictionalNodeOnFacets, NodeOnFacets
 
 CANDIDATES = 16
 """Facets that a node may touch, by default."""
@@ -49,7 +49,8 @@ def surface_gaps(one: MeshSide, other: MeshSide, law: dict[str, Any], name: str)
         each["two_sided"].append(np.full(len(thick), float(master.two_sided)))
     union = NodeUnion(tuple(s.surface.handle.nodes[s.numbers] for s in (one, other)))
     numbers = {key: np.concatenate(values) for key, values in each.items()}
-    return NodeOnFacets.on(union, np.concatenate(tables), each=numbers, **law)
+    kind = FrictionalNodeOnFacets if "friction" in law else NodeOnFacets
+    return kind.on(union, np.concatenate(tables), each=numbers, **law)
 
 
 def _nearest(

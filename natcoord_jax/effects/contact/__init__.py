@@ -4,6 +4,7 @@ from natcoord_jax.effects.contact.boxes import CornersOnBox as CornersOnBox
 from natcoord_jax.effects.contact.boxes import EdgesOnEdges as EdgesOnEdges
 from natcoord_jax.effects.contact.boxes import SphereOnBox as SphereOnBox
 from natcoord_jax.effects.contact.discrete_gap import DiscreteGap as DiscreteGap
+from natcoord_jax.effects.contact.frictional_node import FrictionalNodeOnFacets as FrictionalNodeOnFacets
 from natcoord_jax.effects.contact.frictional_potential import FrictionalGapPotential as FrictionalGapPotential
 from natcoord_jax.effects.contact.gap import Gap as Gap
 from natcoord_jax.effects.contact.gap_constraint import GapConstraint as GapConstraint
