@@ -32,7 +32,7 @@ def gap_at(node, x, **options):
     return nc.MortarGap(tuple(nc.Point(nc.ground, p) for p in x), **given | options), x
 
 
-@pytest.mark.parametrize("node", [0, 4])
+@pytest.mark.parametrize("node", [pytest.param(0, marks=pytest.mark.slow), 4])
 def test_contract_of_a_gap(node):
     """Frame-indifferent; a lever without sum and moment that does the work of the gap in a large step."""
     random = np.random.default_rng(1)
@@ -51,6 +51,7 @@ def test_contract_of_a_gap(node):
         assert np.abs(np.sum(np.cross(middle, lever), axis=0)).max() <= 1e-13
 
 
+@pytest.mark.slow
 def test_derivatives_of_the_gap():
     """Nothing is held in the second ones; those in Newton's method are nearly these."""
     random = np.random.default_rng(2)
@@ -184,6 +185,16 @@ def test_wrong_surfaces_are_refused():
     plate = scene.add(nc.Shell(nc.mesh.rectangle((1, 1), (1, 1)), **given))
     with pytest.raises(ValueError, match="one side of 'shell 1'.*surface"):
         scene.add(nc.Contact(plate, two.face("z1"), method="mortar"))
+
+
+@pytest.mark.slow
+def test_gaps_of_shells_and_solids():
+    """Between the side of a shell, where its thickness ends, and a solid, and between solids."""
+    scene = nc.Scene()
+    mesh = nc.mesh.box((1, 1, 1), (1, 1, 1))
+    one, two = (scene.add(nc.Solid(mesh, material=RUBBER, position=(0, 0, z))) for z in (0.0, 1.01))
+    given = {"thickness": 0.01, "material": RUBBER, "position": (0, 0, 3)}
+    plate = scene.add(nc.Shell(nc.mesh.rectangle((1, 1), (1, 1)), **given))
     scene.add(nc.Contact(plate.surface("inside"), two.face("z1"), method="mortar", name="above"))
     scene.add(nc.Contact(one.face("z1"), two.face("z0"), method="mortar", name="between"))
     system, state = scene.compile()
