@@ -152,11 +152,6 @@ def test_blocks_collide():
 
 
 @pytest.mark.exhaustive
-def test_blocks_collide_and_fly_on():
-    assert_kept(*blocks((2, 2, 2), (3, 3, 1)), dt=12e-3, steps=500)
-
-
-@pytest.mark.exhaustive
 def test_gradients_through_a_contact():
     """Of the program, by stiffness and by how fast blocks of one element meet: V-shaped."""
     system, state = blocks((1, 1, 1), (1, 1, 1))
