@@ -218,7 +218,7 @@ CALLS = {
     "Contact": lambda w: {
         "one": [w.body], "other": [nc.Plane(), w.body], "stiffness": NUMBER, "restitution": NUMBER,
         "friction": NUMBER, "speed": NUMBER, "law": ["linear", "hertz"], "name": NAME, "one_pass": FLAG,
-        "candidates": WHOLE, "self_contact": FLAG, "rounding": NUMBER,
+        "candidates": WHOLE, "method": ["nodes", "mortar"], "self_contact": FLAG, "rounding": NUMBER,
         "capacity": WHOLE, "skin": NUMBER, "all_pairs_of": [(w.body,)], "ignore": [[(w.body, w.body)]],
     },
     "GapPotential": lambda w: {
@@ -239,6 +239,10 @@ CALLS = {
         "restitution": NUMBER, "speed": NUMBER, "law": ["linear", "hertz"], "friction": NUMBER,
         "regularisation": NUMBER,
     },
+    "FrictionalNodeOnFacets": lambda w: {
+        **GAP((*w.ends * 2, w.ends[0])), "facets": [((1, 2, 3, 4),)], "open": [1.0], "beyond": [1.0],
+        "thickness": NUMBER, "two_sided": [0.0, 1.0], "friction": NUMBER, "regularisation": NUMBER,
+    },
     "SphereOnPlane": lambda w: {"radius": NUMBER},
     "DiscOnPlane": lambda w: {"radius": NUMBER},
     "SphereOnSphere": lambda w: {"radii": [(1.0, 1.0)]},
@@ -247,6 +251,10 @@ CALLS = {
     "SphereOnBox": lambda w: {"size": V, "radius": NUMBER},
     "CornersOnBox": lambda w: {"size": V, "corner": V, "rounding": NUMBER},
     "EdgesOnEdges": lambda w: {"sizes": [np.ones((2, 3))], "skew": [(1.0, -1.0)], "rounding": NUMBER},
+    "MortarGap": lambda w: {
+        **GAP(w.ends * 4), "facets": [((0, 1, 2, 3),)], "others": [((4, 5, 6, 7),)], "rims": [0.0, (1.0,)],
+        "open": [0.0, 1.0], "thickness": NUMBER,
+    },
     "NodeOnFacets": lambda w: {
         **GAP((*w.ends * 2, w.ends[0])),
         "facets": [((1, 2, 3, 4),)],

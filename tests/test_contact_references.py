@@ -238,7 +238,7 @@ def test_patch_of_blocks():
     """K07: blocks of 2 x 2 on 3 x 3 elements under a pressure: all of it is handed on, but not evenly.
 
     In one pass stresses are off by two thirds of the pressure, in two by hundredths (here on average over
-    elements); only a mortar, as of `nc.Tie`, is exact.
+    elements); only a mortar is exact, see `test_contact_mortar`.
     """
     scene, material = nc.Scene(), nc.Elastic(E=1e5, nu=0.0, density=1.0)
     low = scene.add(nc.Solid(nc.mesh.box((1, 1, 0.5), (3, 3, 1)), material=material, name="low"))

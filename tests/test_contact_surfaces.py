@@ -312,8 +312,8 @@ def test_wrong_surfaces_are_refused():
     ball = scene.add(nc.RigidBody(shape=nc.Sphere(0.1), density=1.0, position=(3, 0, 0)))
     with pytest.raises(ValueError, match="no friction .* on nodes of shells and solids"):
         scene.add(nc.Contact(one, ball, friction=0.3))
-    with pytest.raises(ValueError, match="no friction .* between surfaces"):
-        scene.add(nc.Contact(one.face("z1"), two.face("z0"), friction=0.3))
+    with pytest.raises(ValueError, match="a mortar has no friction .*method='nodes'"):
+        scene.add(nc.Contact(one.face("z1"), two.face("z0"), friction=0.3, method="mortar"))
     with pytest.raises(ValueError, match="speed .* of contacts with a stiffness"):
         scene.add(nc.Contact(ball, FLOOR, restitution=0.5, speed=1.0))
     scene.add(nc.Contact(one.face("z1"), two.face("z0")))

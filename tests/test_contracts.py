@@ -206,6 +206,22 @@ TABLE = {
             p.ends, nc.SphereOnSphere(radii=(0.6, 0.7)), stiffness=9.0, friction=0.3
         )
     ),
+    nc.FrictionalNodeOnFacets: Entry(
+        lambda p: nc.FrictionalNodeOnFacets(
+            (p.ends[1], *p.eight[:4]),
+            facets=[(1, 2, 3, 4)],
+            thickness=2.0,
+            two_sided=1.0,
+            stiffness=9.0,
+            friction=0.3,
+            regularisation=0.01,
+        )
+    ),
+    nc.MortarGap: Entry(
+        lambda p: nc.MortarGap(
+            p.eight, facets=[(0, 1, 2, 3)], others=[(7, 6, 5, 4)], thickness=4.0, stiffness=9.0
+        )
+    ),
     nc.NodeOnFacets: Entry(
         lambda p: nc.NodeOnFacets(
             (p.ends[1], *p.eight[:4]), facets=[(1, 2, 3, 4)], thickness=2.0, two_sided=1.0, stiffness=9.0

@@ -85,10 +85,14 @@ class Contact(Recipe):
             along their normal, modulus times area over thickness; of rigid bodies none, they do not overlap.
         restitution: part of the closing speed that is left after an impact [-]; None: nothing is lost. With a
             stiffness above 0, and where no other force acts (weight in a soft contact takes some more of it).
-        friction: coefficient [-], of rigid bodies, points, beams, and of nodes of solids on planes; None:
-            there is none.
+        friction: coefficient [-], of rigid bodies, points, beams, nodes of solids on planes, and of surfaces
+            by their nodes; None: there is none.
         speed: with a stiffness, of the impact that `restitution` is of [m/s]; less is lost of slower ones.
         law: force proportional to the overlap, "linear", or to its power 3/2, "hertz".
+        method: of two surfaces, "nodes" of each on the facets of the other, or "mortar": gaps of the facets
+            of `one` over those of `other`, on average at each node of `one`. It costs more, and a uniform
+            pressure passes exactly from one mesh to the other. Take the finer surface for `one`, and for
+            `stiffness` one per area [N/m^3].
         one_pass: of two surfaces, let the nodes of `one` alone touch the facets of `other`, with all of the
             stiffness: for a fine surface, or one that folds, on a coarse one.
         self_contact: of a beam that is passed twice: its segments touch each other, those that are farther
@@ -139,6 +143,9 @@ class Contact(Recipe):
     law: str = eqx.field(
         default="linear", kw_only=True, static=True, metadata=is_a(Choice(("linear", "hertz")))
     )
+    method: str = eqx.field(
+        default="nodes", kw_only=True, static=True, metadata=is_a(Choice(("nodes", "mortar")))
+    )
     one_pass: bool = eqx.field(default=False, kw_only=True, static=True, metadata=is_a(FLAG))
     self_contact: bool = eqx.field(default=False, kw_only=True, static=True, metadata=is_a(FLAG))
     rounding: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Number("positive")))
@@ -177,6 +184,7 @@ class Contact(Recipe):
         for option in ("restitution", "friction", "speed", "candidates", "rounding"):
             if getattr(self, option) is not None:
                 law[option] = getattr(self, option)
+        law |= {"method": self.method} if self.method != "nodes" else {}
         return law | ({"one_pass": True} if self.one_pass else {})
 
     def _add_pairs(self, scene: Builder, name: str) -> tuple[Handle, ...]:

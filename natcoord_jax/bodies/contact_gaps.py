@@ -18,6 +18,7 @@ from natcoord_jax.bodies.contact_sides import (
     Strand,
 )
 from natcoord_jax.bodies.mesh_handle import Surface
+from natcoord_jax.bodies.mortar_surface import mortar_gaps
 from natcoord_jax.bodies.node_surface import surface_gaps
 from natcoord_jax.bodies.shapes import CORNERS, Box, Capsule, Cylinder, Ellipsoid, Sphere
 from natcoord_jax.core.checks import as_array, is_concrete
@@ -39,7 +40,10 @@ from natcoord_jax.effects.contact import (
     SphereOnSphere,
 )
 
-OF_SOME = {"rounding": "the edges of two boxes", "candidates": "two surfaces", "one_pass": "two surfaces"}
+OF_SOME = {
+    "rounding": "the edges of two boxes",
+    **dict.fromkeys(("candidates", "one_pass", "method"), "two surfaces"),
+}
 """Options that contacts of other sides have no use for, and whose they are."""
 
 OF_CONSTRAINTS = "restitution", "friction"
@@ -260,11 +264,19 @@ def _segments(one: SegmentSide, other: SegmentSide, law: Law, name: str) -> Gaps
 
 
 def _surfaces(one: MeshSide, other: MeshSide, law: Law, name: str) -> Gaps:
+    method = law.get("method")
+    law = {key: value for key, value in law.items() if key != "method"}
+    if method is None:
+        return [surface_gaps(one, other, law, name)]
     if "friction" in law:
         raise ValueError(
-            f"contact {name!r}: there is no friction [-] between surfaces of shells and solids yet"
+            f"contact {name!r}: a mortar has no friction [-] yet; leave it out, or take method='nodes'"
         )
-    return [surface_gaps(one, other, law, name)]
+    if "one_pass" in law:
+        raise ValueError(
+            f"contact {name!r}: a mortar has one pass, the mean gaps of the first surface; leave out one_pass"
+        )
+    return [mortar_gaps(one, other, law, name)]
 
 
 TABLE: dict[tuple[type, type], Callable[..., Gaps]] = {

@@ -216,11 +216,11 @@ class MeshSide(Side):
         return thick[self.numbers]
 
     @property
-    def stiffness(self) -> Float[np.ndarray, " n"]:
-        """Along the normal at the nodes [N/m].
+    def _areas_and_moduli(self) -> tuple[Float[np.ndarray, " f"], Float[np.ndarray, " f"]]:
+        """Of the faces [m^2], and the modulus of the material over how thick the elements behind are [N/m^3].
 
-        A node has a quarter of each of its faces, and these the modulus of the material over how thick the
-        element behind them is.
+        Raises:
+            ValueError: for a material without a modulus.
         """
         handle, faces = self.surface.handle, self.surface.faces
         if not isinstance(handle.material, Elastic):
@@ -236,9 +236,21 @@ class MeshSide(Side):
         depth = 2 * np.abs(np.sum(inwards * normal, axis=1)) / area
         if self.shell:
             depth = np.asarray(handle.thickness)[cells]
-        total = np.zeros(len(places))
-        np.add.at(total, faces, (0.25 * float(handle.material.E) * area / depth)[:, None])
+        return area, float(handle.material.E) / depth
+
+    @property
+    def stiffness(self) -> Float[np.ndarray, " n"]:
+        """Along the normal at the nodes, which have a quarter of each of their faces [N/m]."""
+        area, modulus = self._areas_and_moduli
+        total = np.zeros(len(self.surface.handle.nodes))
+        np.add.at(total, self.surface.faces, (0.25 * modulus * area)[:, None])
         return total[self.numbers]
+
+    @property
+    def stiffness_per_area(self) -> float:
+        """Along the normal, the mean of all faces [N/m^3]."""
+        area, modulus = self._areas_and_moduli
+        return float(modulus @ area / area.sum())
 
     @property
     def parts(self) -> Sequence[Side]:

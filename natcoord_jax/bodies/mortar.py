@@ -10,17 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
+from natcoord_jax.maths.triangle import TRIANGLE, WEIGHTS
+
 CORNERS = np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)])
 """Natural coordinates of a quadrilateral's corners."""
-
-# Seven points of a triangle, exact to degree five (Radon 1948): barycentric coordinates and weights.
-_A, _B = (6 - np.sqrt(15)) / 21, (6 + np.sqrt(15)) / 21
-_WA, _WB = (155 - np.sqrt(15)) / 1200, (155 + np.sqrt(15)) / 1200
-TRIANGLE = np.array(
-    [(1 / 3, 1 / 3, 1 / 3)]
-    + [np.roll((1 - 2 * a, a, a), k) for a in (_A, _B) for k in range(3)]
-)  # fmt: skip
-WEIGHTS = np.array([9 / 40] + [w for w in (_WA, _WB) for _ in range(3)])
 
 NEAR = 0.3
 """Distance of two facets, in terms of the size of the first, beyond which they do not meet."""

@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 from natcoord_jax.bodies.contact_sides import MeshSide
 from natcoord_jax.core.elements import Elements
 from natcoord_jax.core.nodes import NodeUnion
-from natcoord_jax.effects.contact import NodeOnFacets
+from natcoord_jax.effects.contact import FrictionalNodeOnFacets, NodeOnFacets
 
 CANDIDATES = 16
 """Facets that a node may touch, by default."""
@@ -32,13 +32,13 @@ def surface_gaps(one: MeshSide, other: MeshSide, law: dict[str, Any], name: str)
     passes = 1 if law.pop("one_pass", False) else 2
     sides = ((one, other), (other, one))[:passes]
     first = 0, len(one.numbers)
-    patches = [_patches(a, b, most, first, k) for k, (a, b) in enumerate(sides)]
-    width = max(table.shape[1] for table, *_ in patches)
+    found = [patches(a, b, most, first, k) for k, (a, b) in enumerate(sides)]
+    width = max(table.shape[1] for table, *_ in found)
     # What fills up repeats the last node, so that both ways are alike.
-    tables = [np.pad(table, ((0, 0), (0, width - table.shape[1])), mode="edge") for table, *_ in patches]
+    tables = [np.pad(table, ((0, 0), (0, width - table.shape[1])), mode="edge") for table, *_ in found]
     fields = "facets", "open", "beyond", "thickness", "stiffness", "two_sided"
     each: dict[str, list[Any]] = {field: [] for field in fields}
-    for (slave, master), (_, facets, ends, beyond) in zip(sides, patches):
+    for (slave, master), (_, facets, ends, beyond) in zip(sides, found):
         thick = slave.half_thickness
         stiff = slave.stiffness if given is None else np.full(len(thick), float(given))
         each["facets"].append(facets)
@@ -49,7 +49,8 @@ def surface_gaps(one: MeshSide, other: MeshSide, law: dict[str, Any], name: str)
         each["two_sided"].append(np.full(len(thick), float(master.two_sided)))
     union = NodeUnion(tuple(s.surface.handle.nodes[s.numbers] for s in (one, other)))
     numbers = {key: np.concatenate(values) for key, values in each.items()}
-    return NodeOnFacets.on(union, np.concatenate(tables), each=numbers, **law)
+    kind = FrictionalNodeOnFacets if "friction" in law else NodeOnFacets
+    return kind.on(union, np.concatenate(tables), each=numbers, **law)
 
 
 def _nearest(
@@ -61,7 +62,7 @@ def _nearest(
     return np.pad(found, ((0, 0), (0, most - found.shape[1])), mode="edge")
 
 
-def _patches(
+def patches(
     slave: MeshSide, master: MeshSide, most: int, first: tuple[int, int], turn: int
 ) -> tuple[Int[np.ndarray, "n m"], Int[np.ndarray, "n k 4"], Float[np.ndarray, "n k 4"], np.ndarray]:
     """For each node itself and the nodes of its facets, the facets by places among them, and their edges.

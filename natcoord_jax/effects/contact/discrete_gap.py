@@ -76,6 +76,10 @@ class DiscreteGap(ContactLaw):
     def measured(self, x: Float[Array, "k 3"]) -> Measured:
         """Gap, lever, and the points that they are between."""
 
+    def turned(self, x: Float[Array, "k 3"]) -> Float[Array, "k 3 k 3"] | None:
+        """Derivatives of the lever by the points, nearly, for Newton's method; None: it hardly changes."""
+        return None
+
     def gap(self, x: Float[Array, "k 3"]) -> Float[Array, ""]:
         """Distance of the surfaces, negative where they overlap [m]."""
         return self.measured(x).gap
@@ -131,7 +135,7 @@ class DiscreteGap(ContactLaw):
     def tangents(
         self, place: Array, motion: Motion, now: StepContext, lam: Array, *, turning: bool
     ) -> Array | None:
-        """Those of the size of the force; its direction hardly changes."""
+        """Those of the size of the force, and of its direction where it says how its lever turns."""
         if motion.spin.shape[-2] > place.shape[1] or now.tableau.stages > 1 or place.ndim > 3:
             return None
 
@@ -146,8 +150,12 @@ class DiscreteGap(ContactLaw):
                 return effect.mean_force(first.gap, after) * effect._lossy(jnp.where(moving, speed, 0.0))
 
             size, slope = jax.value_and_grad(force)(last.gap)
-            along = found[0].reshape(-1)
-            return -slope * along[:, None] * last.lever.reshape(-1), size * found[0]
+            along, turned = found[0].reshape(-1), effect.turned(x[0])
+            stiffness = -slope * along[:, None] * last.lever.reshape(-1)
+            if turned is not None:
+                # The middle of a step moves by half of what its end does.
+                stiffness = stiffness - 0.5 * size * turned.reshape(stiffness.shape)
+            return stiffness, size * found[0]
 
         stiffness, forces = jax.vmap(one)(self, place, motion.start, motion.rows[0], motion.rates[0])
         return by_twists(stiffness, forces[:, :, None], place[:, :, None], motion, now.h, turning)

@@ -120,16 +120,7 @@ class Rubbing(Effect):
         along = lam[0, 1:]
         slip, pulled = jax.vjp(lambda v, w: self.slip(x[0], v, w), rates[0], motion.spin[0])
         forces, torques = (y[None] for y in pulled(along))
-        most = self.friction * positive_part(lam[0, 0])
-        speed = jnp.sqrt(dot(slip, slip) + self.regularisation**2)
-        # Where the speed changes, an impulse beyond the cone counts as one on it: then Newton's iteration
-        # finds its way from anywhere. At the solution none is beyond.
-        square = dot(along, along)
-        # (What decays in open contacts has squares that are no normal numbers in the end.)
-        beyond = (square > most**2) & (square > jnp.finfo(square.dtype).tiny)
-        within = jnp.where(beyond, most / jnp.sqrt(jnp.where(beyond, square, 1.0)), 1.0) * along
-        fixed = jax.lax.stop_gradient(speed)
-        missing = along * fixed + within * (speed - fixed) + most * slip
+        missing = missing_friction(along, slip, self.friction * lam[0, 0], self.regularisation)
         return forces, torques, self.mobility * missing[None]
 
     def slip(
@@ -140,3 +131,29 @@ class Rubbing(Effect):
         first, second = (rates[k] + cross(spin[k], point - x[k]) for k in self.gap.sides)
         relative = second - first
         return relative - dot(normal, relative) * normal
+
+
+def missing_friction(
+    along: Float[Array, "3"],
+    slip: Float[Array, "3"],
+    most: Float[Array, ""],
+    regularisation: Float[Array, ""],
+) -> Float[Array, "3"]:
+    """What is missing of the law of friction f sqrt(|u|^2 + eps^2) = -mu N u: zero where it is obeyed.
+
+    Args:
+        along: impulse against slip, f.
+        slip: velocity u.
+        most: mu times the impulse along the normal; negative counts as none.
+        regularisation: eps.
+    """
+    most = positive_part(most)
+    speed = jnp.sqrt(dot(slip, slip) + regularisation**2)
+    # Where the speed changes, an impulse beyond the cone counts as one on it: then Newton's iteration
+    # finds its way from anywhere. At the solution none is beyond.
+    square = dot(along, along)
+    # (What decays in open contacts has squares that are no normal numbers in the end.)
+    beyond = (square > most**2) & (square > jnp.finfo(square.dtype).tiny)
+    within = jnp.where(beyond, most / jnp.sqrt(jnp.where(beyond, square, 1.0)), 1.0) * along
+    fixed = jax.lax.stop_gradient(speed)
+    return along * fixed + within * (speed - fixed) + most * slip

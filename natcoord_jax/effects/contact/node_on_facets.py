@@ -70,7 +70,7 @@ def shapes(natural: Float[Array, "2"]) -> Float[Array, "4"]:
     return 0.25 * (1 + XI * natural[0]) * (1 + ETA * natural[1])
 
 
-def _slopes(natural: Float[Array, "2"], corners: Float[Array, "4 3"]) -> tuple[Array, Array]:
+def slopes_at(natural: Float[Array, "2"], corners: Float[Array, "4 3"]) -> tuple[Array, Array]:
     """Derivatives of the place by the natural coordinates."""
     by_xi, by_eta = 0.25 * XI * (1 + ETA * natural[1]), 0.25 * ETA * (1 + XI * natural[0])
     return by_xi @ corners, by_eta @ corners
@@ -103,7 +103,7 @@ def nearest_point(point: Float[Array, "3"], corners: Float[Array, "4 3"]) -> Nea
         # What the last two steps start from need not follow: each of them doubles the order to which the
         # coordinates do.
         natural = jax.lax.stop_gradient(natural) if k == ITERATIONS - 2 else natural
-        one, two = _slopes(natural, corners)
+        one, two = slopes_at(natural, corners)
         apart = point - shapes(natural) @ corners
         a, flat, c = dot(one, one), dot(one, two), dot(two, two)
         b = flat - dot(apart, warp)
@@ -124,7 +124,7 @@ def nearest_point(point: Float[Array, "3"], corners: Float[Array, "4 3"]) -> Nea
     within = jnp.all(jnp.abs(natural) < 1.0) & (squares[0] <= squares[1:][best] * (1 + 1e-12))
     weights = jnp.where(within, inside, edges[best])
     apart = jnp.where(within, apart[0], apart[1:][best])
-    one, two = _slopes(natural, corners)
+    one, two = slopes_at(natural, corners)
     normal = cross(one, two)
     size = safe_norm(normal)
     normal = normal / jnp.where(size > 0, size, 1.0)
