@@ -430,4 +430,8 @@ def __getattr__(name: str) -> Any:
         from importlib import import_module
 
         return import_module("natcoord_jax.io")
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from difflib import get_close_matches
+
+    near = get_close_matches(name, __all__)
+    meant = f"; did you mean {' or '.join(near)}?" if near else ""
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}{meant}")

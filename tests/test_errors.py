@@ -453,3 +453,26 @@ def test_shapes_that_effects_of_ones_own_return(case):
     arm = scene.add(body())
     scene.add(make(arm, (nc.Point(nc.ground), nc.Point(arm, (1.0, 0.0, 0.0)))))
     rejected(lambda: nc.step(*scene.compile(), dt=0.1), *words)
+
+
+@pytest.mark.parametrize("given", [jnp.ones(2), 1.0, jnp.ones(0)], ids=["two", "a number", "none"])
+def test_functions_of_inputs_give_as_many_as_there_are(given):
+    """Of another number one would drive several motors, or be left out."""
+    scene = nc.Scene()
+    arm = scene.add(nc.RigidBody(mass=1.0, inertia=(1.0, 1.0, 1.0)))
+    hinge = scene.add(nc.Revolute(nc.ground, arm, point=(0, 0, 0), axis=(0, 0, 1)))
+    scene.add(nc.JointTorque(hinge, name="motor"))
+    system, state = scene.compile()
+    with pytest.raises(ValueError, match=r"inputs gives shape .* \['motor'\].* give shape \(1,\)"):
+        nc.simulate(system, state, dt=0.1, steps=1, inputs=lambda t, state: given)
+
+
+def test_names_that_are_nearly_right_are_told():
+    with pytest.raises(AttributeError, match="no attribute 'RevoluteJoint'; did you mean Revolute?"):
+        _ = nc.RevoluteJoint  # pyright: ignore[reportAttributeAccessIssue]
+    scene = nc.Scene()
+    box = scene.add(nc.RigidBody(shape=nc.Box((1, 1, 1)), density=1.0, position=(0, 0, 2)))
+    scene.add(nc.Contact(box, nc.Plane(), name="hit"))
+    system, state = scene.compile()
+    with pytest.raises(ValueError, match=r"'hit' is 8 effects, 'hit\[0\]' to 'hit\[7\]'"):
+        system.sense(state, "hit")

@@ -203,7 +203,7 @@ def balance(system: System, trajectory: Trajectory) -> Balance:
     account = jax.tree.map(np.asarray, _account(system, trajectory))
     energy = _relative(np.abs(account["energy"]), np.max(account["energy_scale"]))
     if int(trajectory.steps_taken) > saved - 1 and _acted_on(account):
-        return Balance(energy, None, None, 0, 0, "momenta: not every step is in the trajectory")
+        return Balance(energy, None, None, 0, 0, "momenta: some steps were made in parts or not saved")
     impulse = np.concatenate([np.zeros((1, 6)), np.cumsum(account["impulses"], axis=0)])
     change = account["momenta"] - account["momenta"][0] - impulse
     along, about = _free_motions(account["gram"])

@@ -17,7 +17,7 @@ import numpy as np
 
 from natcoord_jax.core.checks import as_array, at_top_level
 from natcoord_jax.core.closures import with_callables
-from natcoord_jax.xla.evaluation import ClosedJaxpr, evaluate
+from natcoord_jax.xla.evaluation import ClosedJaxpr, evaluate, numbers_made
 
 REMEMBERED = 256
 """Programs of one function that are kept."""
@@ -25,11 +25,14 @@ REMEMBERED = 256
 LARGE = 1_000_000
 """Numbers from which on the time of NumPy is more than that of the compiler: one million, some 0.3 s."""
 
+MUCH = 100_000_000
+"""Numbers that are made from which on the same holds, in loops over many states, say."""
+
 F = TypeVar("F", bound=Callable[..., Any])
 
 
 def eager_numpy(function: F) -> F:
-    """The function, evaluated by NumPy where nothing is being traced, and compiled for large arrays.
+    """The function, evaluated by NumPy where nothing is being traced, and compiled where they are large.
 
     Args:
         function: of pytrees, pure and without checks of values (traced, it sees none). Arrays are numbers
@@ -69,6 +72,8 @@ def eager_numpy(function: F) -> F:
             if lasting:
                 programs[key] = traced
         program, made = traced
+        if lasting and numbers_made(program) > MUCH:
+            return compiled(*arguments)
         with np.errstate(all="ignore"):
             found = evaluate(program, arrays)
         return jax.tree.unflatten(made, [as_array(x) for x in found])

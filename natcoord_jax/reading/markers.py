@@ -68,8 +68,9 @@ def marker_weights(system: Model, marker: Marker, state: State | None) -> tuple[
     if not marker.local:
         if state is None:
             raise ValueError(
-                f"the marker on {marker.body!r} is in world coordinates of the assembled pose: pass that "
-                "pose as `state=` (the initial state), or the marker with local=True"
+                f"the marker on {marker.body!r} is in world coordinates of the assembled pose: pass "
+                "local=True with the marker if you mean those of the body, else that pose as `state=` (the "
+                "initial state)"
             )
         rows = state.rows[body]
         vector = rows[1:] @ (vector - rows[0] if marker.is_point else vector)

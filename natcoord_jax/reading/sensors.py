@@ -284,4 +284,13 @@ def sense(
         f"cannot sense {part!r}: pass a body ({listed_names(system.structure.bodies)}), a joint "
         f"({[n for n in system.structure.joints if n]}), nc.Point or nc.Direction"
         + clamped(system.structure.bodies, name)
+        + _numbered(system, name)
     )
+
+
+def _numbered(system: Model, name: str) -> str:
+    """What there is of effects that are called by a name and a number, as the gaps of a contact."""
+    found = [x for group in system.effects for x in group.names if x.startswith(f"{name}[")]
+    if not found:
+        return ""
+    return f"; {name!r} is {len(found)} effects, {found[0]!r} to {found[-1]!r}: pass one, or a tuple of them"

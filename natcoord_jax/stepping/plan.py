@@ -47,11 +47,21 @@ class Plan:
     def inputs(
         self, system: System, parameters: Any, step: Array, state: State, done: Array, fraction: Array
     ) -> Float[Array, " inputs"] | Float[Array, "s inputs"]:
-        """Inputs of a (sub)step that starts at a state, after a part `done` of its step."""
+        """Inputs of a (sub)step that starts at a state, after a part `done` of its step.
+
+        Raises:
+            ValueError: for a function that gives another number of inputs than the system has.
+        """
         if self.control is None:
             return self.within_step(parameters[step], done, fraction)
         state = tangent(system, state) if self.control_reads else state
-        return self.control(parameters, step, state.t, state, fraction)
+        given, names = self.control(parameters, step, state.t, state, fraction), system.structure.inputs
+        if given.shape not in ((len(names),), (self.tableau.stages, len(names))):
+            raise ValueError(
+                f"inputs gives shape {given.shape}; this system has the input channels {list(names)}: "
+                f"let the function (t, state) give shape ({len(names)},)"
+            )
+        return given
 
     def indicator(self, system: System, numbers: Any, state: State) -> Array:
         """What ends the run when its sign changes, with the numbers of the event."""

@@ -1,5 +1,6 @@
 """Traced programs evaluated by NumPy, one operation after the other, without a compilation."""
 
+import math
 from collections.abc import Sequence
 from typing import Any
 from weakref import WeakKeyDictionary
@@ -36,6 +37,16 @@ def _run(jaxpr: Jaxpr, constants: Sequence[Any], arguments: Sequence[Any]) -> li
         for variable in done:
             del known[variable]
     return [value_of(atom) for atom in jaxpr.outvars]
+
+
+def numbers_made(program: ClosedJaxpr) -> int:
+    """How many numbers its evaluation makes, those of loops of known length as often as they are made."""
+    found = 0
+    for equation in program.jaxpr.eqns:
+        inner = [equation.params[key] for key in INNER if isinstance(equation.params.get(key), ClosedJaxpr)]
+        found += equation.params.get("length", 1) * sum(map(numbers_made, inner))
+        found += sum(math.prod(x.aval.shape) for x in equation.outvars) if not inner else 0
+    return found
 
 
 _LAST_USES: WeakKeyDictionary[Jaxpr, list[list[Any]]] = WeakKeyDictionary()
