@@ -282,15 +282,13 @@ def sense(
         return JointSensor(chosen, units, name, index, tuple(places), source, lever)
     raise ValueError(
         f"cannot sense {part!r}: pass a body ({listed_names(system.structure.bodies)}), a joint "
-        f"({[n for n in system.structure.joints if n]}), nc.Point or nc.Direction"
-        + clamped(system.structure.bodies, name)
-        + _numbered(system, name)
+        f"({[n for n in system.structure.joints if n]}), nc.Point or nc.Direction" + _hint(system, name)
     )
 
 
-def _numbered(system: Model, name: str) -> str:
-    """What there is of effects that are called by a name and a number, as the gaps of a contact."""
+def _hint(system: Model, name: str) -> str:
+    """Of the name of clamped nodes, or one that effects have with a number, as the gaps of a contact."""
     found = [x for group in system.effects for x in group.names if x.startswith(f"{name}[")]
     if not found:
-        return ""
+        return clamped(system.structure.bodies, name)
     return f"; {name!r} is {len(found)} effects, {found[0]!r} to {found[-1]!r}: pass one, or a tuple of them"
