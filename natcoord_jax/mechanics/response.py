@@ -62,6 +62,9 @@ def stations(
 def motion_between(before: State, after: State, h: Array) -> StageKinematics:
     """Motion over a step as the effects saw it: mid-point rows, mean velocities, spins of the mid-points."""
     start, rates = before.rows, 0.5 * (before.row_rates + after.row_rates)
+    if before.contacts is not None:
+        # At the end of a step impacts and what stops slip change velocities, but not where bodies are.
+        rates = (after.rows - start) / jnp.where(h > 0, h, 1.0)
     middle = (start + 0.5 * h * rates)[:, 1:]
     d1, d2, d3 = middle[:, 0], middle[:, 1], middle[:, 2]
     dual = jnp.stack([cross(d2, d3), cross(d3, d1), cross(d1, d2)], axis=1)
