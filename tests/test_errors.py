@@ -465,6 +465,12 @@ def test_functions_of_inputs_give_as_many_as_there_are(given):
     system, state = scene.compile()
     with pytest.raises(ValueError, match=r"inputs gives shape .* \['motor'\].* give shape \(1,\)"):
         nc.simulate(system, state, dt=0.1, steps=1, inputs=lambda t, state: given)
+    for options, wanted in (
+        ({"inputs": lambda t: given}, r"\(t, state\)"),
+        ({"until": lambda: 0.0}, "of the state"),
+    ):
+        with pytest.raises(ValueError, match=f"takes other arguments; pass .*{wanted}"):
+            nc.simulate(system, state, dt=0.1, steps=1, **options)
 
 
 def test_names_that_are_nearly_right_are_told():

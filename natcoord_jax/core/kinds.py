@@ -1,6 +1,7 @@
 """Kinds of arguments: numbers, functions, handles, and combinations of them."""
 
 import dataclasses
+import inspect
 from functools import singledispatch
 from typing import Any
 
@@ -142,9 +143,11 @@ class FunctionOf(Kind):
 
     Attributes:
         signature: what it takes and returns, for the message.
+        count: of what it takes; None: not looked at.
     """
 
     signature: str
+    count: int | None = None
 
     @property
     def wanted(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -152,8 +155,23 @@ class FunctionOf(Kind):
         return f"a function {self.signature}"
 
     def complaint(self, value: Any) -> str | None:
-        """Whether it can be called."""
-        return None if callable(value) and not isinstance(value, type) else is_other(value)
+        """Whether it can be called, with as many arguments."""
+        if not callable(value) or isinstance(value, type):
+            return is_other(value)
+        return None if self.count is None or _takes(value, self.count) else "takes other arguments"
+
+
+def _takes(function: Any, count: int) -> bool:
+    """Whether a function can be called with so many arguments, as far as it tells."""
+    try:
+        signature = inspect.signature(function)
+    except (TypeError, ValueError):
+        return True
+    try:
+        signature.bind(*(None,) * count)
+    except TypeError:
+        return False
+    return True
 
 
 @dataclasses.dataclass(frozen=True)

@@ -18,7 +18,7 @@ from natcoord_jax.stepping.scheme import Scheme
 from natcoord_jax.system import System
 
 STEP = Number("positive", instead=" (jax.vmap takes several)")
-INPUTS = Numbers(("...", None)) | FunctionOf("(t, state) -> inputs")
+INPUTS = Numbers(("...", None)) | FunctionOf("(t, state) -> inputs", 2)
 """What arguments may be."""
 
 

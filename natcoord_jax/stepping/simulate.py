@@ -63,7 +63,7 @@ def _simulate(
     inputs=INPUTS,
     save_every=Whole(1),
     throw=FLAG,
-    until=FunctionOf("of the state to a number, whose sign changes"),
+    until=FunctionOf("of the state to a number, whose sign changes", 1),
     checkpoint=FLAG,
     newton_tol=Number("positive"),
     extra_substeps=Whole(0),
