@@ -145,7 +145,7 @@ def assert_kept(system, state, *, dt, steps):
     assert float(energy.stores["impact"][-1]) == 0.0
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_blocks_collide():
     """At 12 ms, more than a wave takes through the upper one: two fifths of the energy are stored."""
     assert_kept(*blocks((2, 2, 1), (2, 2, 1)), dt=12e-3, steps=15)
@@ -182,7 +182,7 @@ def test_wrong_surfaces_are_refused():
         scene.add(nc.Contact(plate, two.face("z1"), method="mortar"))
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_gaps_of_shells_and_solids():
     """Between the side of a shell, where its thickness ends, and a solid, and between solids."""
     scene = nc.Scene()
