@@ -152,11 +152,11 @@ def test_work_of_the_stress_of_a_step(law):
     assert np.linalg.eigvalsh(shear).min() > 0
 
 
-def tumbling(element, law, **given):
-    """A block that flies, turns and is shaken."""
+def tumbling(element, law, shake=0.6, **given):
+    """A block that flies, turns and is shaken [m/s]."""
     size = 1 if ELEMENTS[element] != "hexahedron8" else 2
     mesh = nc.mesh.box((1.0, 0.5, 0.5), (size, 1, 1), element=ELEMENTS[element])
-    shaken = 0.6 * np.random.default_rng(0).normal(size=mesh.nodes.shape)
+    shaken = shake * np.random.default_rng(0).normal(size=mesh.nodes.shape)
     scene = nc.Scene()
     scene.add(
         nc.Solid(
@@ -192,7 +192,8 @@ def test_a_block_in_motion(element, law):
 @pytest.mark.exhaustive
 @pytest.mark.parametrize(("element", "law"), PAIRED)
 def test_every_element_and_law_in_motion(element, law):
-    system, state = tumbling(element, law)
+    # The law of Saint Venant does not resist being turned inside out, which hard shakes bring about.
+    system, state = tumbling(element, law, shake=0.3 if law == "elastic" else 0.6)
     conserved(system, nc.simulate(system, state, dt=0.01, steps=1000))
 
 
