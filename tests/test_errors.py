@@ -1,15 +1,18 @@
 """Bad input: one ValueError each, naming the part, the quantity with its unit, and the remedy."""
 
+import re
 import subprocess
 import sys
 from pathlib import Path
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import natcoord_jax as nc
+from natcoord_jax import gallery
 from natcoord_jax.core.results import Result, SimulationError
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -344,6 +347,37 @@ def test_traced_step_that_is_not_positive(breaking):
     system, state = breaking
     result = jax.jit(lambda dt: nc.simulate(system, state, dt=dt, steps=2).result)(-0.1)
     assert int(result) == int(Result.BAD_STEP)
+
+
+def test_traced_starts_that_violate_a_loop_or_a_contact():
+    """What eager calls refuse is a code in a program: the lane ends at its start, and the others go on."""
+    example = gallery.load("four_bar")
+    system, state = example.system, example.state
+
+    def run(off):
+        moved = eqx.tree_at(lambda s: s.q, state, state.q.at[4, 2].add(off))
+        return nc.simulate(system, moved, dt=example.dt, steps=3)
+
+    runs = jax.vmap(run)(jnp.array([0.0, 1e-8, 1e-3]))
+    assert list(np.asarray(runs.result)) == [0, 0, int(Result.BAD_START)]
+    assert np.array_equal(runs.q[2], np.broadcast_to(runs.q[2, 0], runs.q[2].shape))
+    assert re.search(
+        r"violate.*joint 'foot 1' by 0.001 m.*lane 2 in step 0.*nc.assemble", system.explain(runs)
+    )
+    with pytest.raises(nc.SimulationError, match="start violate.*nc.assemble"):
+        nc.step(system, eqx.tree_at(lambda s: s.q, state, state.q.at[4, 2].add(1e-3)), dt=example.dt)
+
+    scene = nc.Scene()
+    ball = scene.add(nc.RigidBody(shape=nc.Sphere(0.1), density=1.0, position=(0, 0, 1)))
+    scene.add(nc.Contact(ball, nc.Plane(normal=(0, 0, 1)), restitution=1.0, name="floor"))
+    system, state = scene.compile()
+    low = jnp.array([0, 0, -1.0]) * jnp.array([1.0, 0, 0, 0])[:, None]
+    sunk = jax.jit(
+        lambda: nc.simulate(system, eqx.tree_at(lambda s: s.q, state, state.q + low), dt=0.1, steps=1)
+    )
+    trajectory = sunk()
+    assert int(trajectory.result) == int(Result.BAD_START)
+    assert "'floor" in system.explain(trajectory) and "0.1 m" in system.explain(trajectory)
 
 
 # --- effects of one's own ---------------------------------------------------------------------------------

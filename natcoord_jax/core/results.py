@@ -21,6 +21,7 @@ class Result(IntEnum):
     INVERTED = 10
     MISSED = 11
     OVERFLOW = 12
+    BAD_START = 13
 
     @property
     def ok(self) -> bool:
@@ -42,6 +43,7 @@ REASONS = {
     Result.INVERTED: "an element was turned inside out",
     Result.MISSED: "bodies have moved in a step beyond where contacts were looked for",
     Result.OVERFLOW: "a body has more neighbours than its contact has room for",
+    Result.BAD_START: "the positions at the start violate the constraints",
 }
 
 REMEDIES = {
@@ -55,6 +57,7 @@ REMEDIES = {
     Result.INTERRUPTED: "what was stored by `store` goes on with `resume=True`",
     Result.INVERTED: "use a smaller dt, a finer mesh, or a material that resists, as nc.NeoHooke",
     Result.MISSED: "use a smaller dt, or a larger `skin` of the nc.Contact",
+    Result.BAD_START: "pass nc.assemble(system, state)",
     Result.OVERFLOW: "pass a larger `capacity` to the nc.Contact, or a smaller dt or `skin`",
 }
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.state import State
@@ -17,6 +17,10 @@ from natcoord_jax.model.rows import group_places, rows_with_ground
 
 GAP = 1e-9
 """Largest violation [m, rad, -] and rate of it taken for round-off of printed data, per unit of size."""
+
+LEFT_OPEN = 1e-6
+"""Largest violation [m, rad, -], per unit of size, of a state that a run may start from: what is left by one
+with a loose `newton_tol`."""
 
 
 def constrained(system: Model) -> tuple[Group, ...]:
@@ -114,6 +118,16 @@ def misses(system: Model, state: State) -> tuple[Array, Array]:
         largest(violation_rates_of(system, groups, state)),
     )
     return gap / (GAP * position_size(state)), rate / (GAP * rate_size(state))
+
+
+def is_open(system: Model, state: State) -> Bool[Array, ""]:
+    """Whether positions violate loops, relations or contacts by more than a run may start with.
+
+    Those that are not numbers miss nothing: the first step finds them.
+    """
+    groups = (*(g for g in constrained(system) if not g.in_tree), *contacts(system))
+    found = violations_of(system, groups, state)
+    return largest(found) > LEFT_OPEN * position_size(state)
 
 
 @eager_numpy

@@ -12,6 +12,7 @@ from natcoord_jax.core.state import State, Trajectory
 from natcoord_jax.mechanics.energies import body_momenta, group_energies
 from natcoord_jax.mechanics.failures import failure
 from natcoord_jax.mechanics.momentum import inertia
+from natcoord_jax.mechanics.violations import LEFT_OPEN, worst_violation
 from natcoord_jax.model.model import Model
 from natcoord_jax.model.rows import over_states
 
@@ -104,6 +105,11 @@ def _remedy(result: Result) -> str:
 def _culprit(system: Model, trajectory: Trajectory) -> str:
     """The part that a run failed at, as far as it is known."""
     result = Result(int(trajectory.result))
+    if result == Result.BAD_START:
+        start = jax.tree.map(lambda x: x[0], trajectory.states)
+        every = (worst_violation(system, start, allowed=LEFT_OPEN, overlaps=x) for x in (False, True))
+        # (There is none where each lane has numbers of its own for the system.)
+        return "".join(f": {worst} by {worst.size:.3g} {worst.unit}" for worst in every if worst is not None)
     # The first interval without an end holds the inputs of the step that failed.
     failed = int(np.argmax(np.diff(np.asarray(trajectory.t)) == 0))
     broken = ~np.isfinite(np.asarray(trajectory.inputs)[failed])

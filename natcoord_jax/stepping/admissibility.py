@@ -15,14 +15,10 @@ from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import gauss
 from natcoord_jax.mechanics.reduced import ReducedStep, active_groups
 from natcoord_jax.mechanics.redundancy import held_multipliers
-from natcoord_jax.mechanics.violations import GAP, constrained, misses, worst_violation
+from natcoord_jax.mechanics.violations import GAP, LEFT_OPEN, constrained, misses, worst_violation
 from natcoord_jax.reading.diagnostics import unknown_name
 from natcoord_jax.stepping.assemble import with_admissible_positions, with_admissible_velocities
 from natcoord_jax.system import System
-
-LEFT_OPEN = 1e-6
-"""Largest violation [m, rad, -], per unit of size, of a state that a run may start from: what is left by one
-with a loose `newton_tol`."""
 
 
 def check_gaps(system: System, state: State) -> None:

@@ -12,6 +12,7 @@ from natcoord_jax.mechanics.equations import prepare
 from natcoord_jax.mechanics.frozen_kick import FEWEST, FrozenKick, Lagging, in_body_axes
 from natcoord_jax.mechanics.start_cache import StartCache
 from natcoord_jax.mechanics.tangent_space import Velocity
+from natcoord_jax.mechanics.violations import is_open
 from natcoord_jax.stepping.checked import check_contacts
 from natcoord_jax.stepping.error_control import Tolerance, Trial
 from natcoord_jax.stepping.factors import Factors, no_factors
@@ -140,8 +141,13 @@ def start_of(setting: RolloutProblem, state: State) -> tuple[RolloutState, Facto
     it, factors = begin(guess, few), no_factors(equations)
     zero, nought = jnp.array(0), jnp.zeros((), state.q.dtype)
     bad = ~(jnp.isfinite(dt) & (dt > 0))
+    code = jnp.where(bad, int(Result.BAD_STEP), int(Result.SUCCESSFUL))
     lagging = None
     structure = setting.system.structure
+    if structure.multipliers:
+        # (In trees, positions follow from coordinates, which may be any.)
+        open_ = is_open(setting.system, state)
+        bad, code = bad | open_, jnp.where(open_, int(Result.BAD_START), code)
     if plan.tableau.kick and structure.unknowns + structure.multipliers >= FEWEST:
         lagging = Lagging.begin(Velocity(jnp.zeros_like(state.rows), jnp.zeros_like(state.rates)))
     course = RolloutState(
@@ -153,7 +159,7 @@ def start_of(setting: RolloutProblem, state: State) -> tuple[RolloutState, Facto
         step=zero,
         done=nought,
         fraction=nought + 1.0,
-        code=jnp.where(bad, int(Result.BAD_STEP), int(Result.SUCCESSFUL)),
+        code=code,
         stopped=bad,
         worst=zero - 1,
         taken=zero,
