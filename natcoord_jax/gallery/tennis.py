@@ -1,5 +1,6 @@
 """A tennis player who hits a ball: driven rigid bodies, a racket of beams and strings, a ball of a shell."""
 
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -8,11 +9,12 @@ import numpy as np
 from jaxtyping import Float
 
 import natcoord_jax as nc
+from natcoord_jax.bodies.mesh_handle import MeshHandle
 from natcoord_jax.core.checks import as_array
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.results import Result
 from natcoord_jax.gallery.example import Example
-from natcoord_jax.gallery.player import TIMES, X, Z, add_player, placements, twist_of
+from natcoord_jax.gallery.player import Player, add_player, placements, twist_of
 from natcoord_jax.gallery.racket import (
     RADIUS,
     SEMI_AXES,
@@ -25,6 +27,7 @@ from natcoord_jax.gallery.racket import (
     inflated_ball,
     with_part,
 )
+from natcoord_jax.gallery.segments import IMPACT, TIMES, X, Z
 from natcoord_jax.stepping.room import cut
 
 GRIP, THROAT = (0.0, -0.84, 1.42), (0.0, -1.12, 1.42)
@@ -36,7 +39,7 @@ CLEARANCE = 0.02
 GRAVITY = 9.81
 HAND = "right hand"
 
-HIT = float(TIMES[3])
+HIT = float(TIMES[IMPACT])
 """Time of the impact [s]."""
 
 END = float(TIMES[-1])
@@ -188,18 +191,27 @@ def strain_energies(phases: nc.Phases) -> dict[str, Float[np.ndarray, " t"]]:
     return {name: values - values[0] for name, values in parts.items()}
 
 
-def tennis(count: int = 3, speed: float = 15.0, start: float = 0.0, end: float = END) -> Example:
-    """A tennis player of 19 rigid bodies hits a ball with a racket of beams and strings (8.3 of the paper).
+@dataclass(frozen=True)
+class Assembled:
+    """Player, racket and ball before the impact.
 
-    The motion of the player is driven through a forehand; the impact is at two seconds. The run is in
-    phases, of which that of the impact has small steps. Started later, the racket moves as a rigid body.
-
-    Args:
-        count: of cells of the ball along each edge of the cube that its mesh is made of.
-        speed: of the ball that comes [m/s].
-        start: time at which the run begins [s].
-        end: and ends [s].
+    Attributes:
+        system: compiled system.
+        state: at the start.
+        ball: its handle.
+        racket: its handles.
+        player: its handles.
     """
+
+    system: nc.System
+    state: nc.State
+    ball: MeshHandle
+    racket: Racket
+    player: Player
+
+
+def assembled(count: int, speed: float, start: float) -> Assembled:
+    """Player, racket and ball; for the arguments see `tennis`."""
     scene = nc.Scene()
     scene.add(nc.Gravity(vector=(0, 0, -GRAVITY)))
     player = add_player(scene, start)
@@ -215,7 +227,24 @@ def tennis(count: int = 3, speed: float = 15.0, start: float = 0.0, end: float =
     place, velocity = _flight(speed, start)
     for part in (_racket_at_rest(here, start), inflated_ball(count, place, velocity)):
         state = with_part(state, system, part)
-    facts = {"ball": ball, "racket": racket, "player": player, "impact": HIT}
+    return Assembled(system, state, ball, racket, player)
+
+
+def tennis(count: int = 3, speed: float = 15.0, start: float = 0.0, end: float = END) -> Example:
+    """A tennis player of 19 rigid bodies hits a ball with a racket of beams and strings (8.3 of the paper).
+
+    The motion of the player is driven through a forehand; the impact is at two seconds. The run is in
+    phases, of which that of the impact has small steps. Started later, the racket moves as a rigid body.
+
+    Args:
+        count: of cells of the ball along each edge of the cube that its mesh is made of.
+        speed: of the ball that comes [m/s].
+        start: time at which the run begins [s].
+        end: and ends [s].
+    """
+    made = assembled(count, speed, start)
+    system, state, ball, racket = made.system, made.state, made.ball, made.racket
+    facts = {"ball": ball, "racket": racket, "player": made.player, "impact": HIT}
     return Example(
         "tennis",
         "a tennis player",
