@@ -23,6 +23,7 @@ from natcoord_jax.model.bodies import Bodies
 from natcoord_jax.model.choice import choose_solver, elimination_order
 from natcoord_jax.model.graph import make_tree
 from natcoord_jax.model.grouping import element_group, stack
+from natcoord_jax.model.islands import contact_islands
 from natcoord_jax.model.layout import Layout
 from natcoord_jax.model.local_rates import LocalRates
 from natcoord_jax.model.masses import mass_of
@@ -70,6 +71,7 @@ def build(
         points=compact([k for k, own in enumerate(layout.kinds) if own == POINT]),
         directors=compact([k for k, own in enumerate(layout.kinds) if own == DIRECTOR]),
         inequalities=inequalities,
+        islands=contact_islands(groups, joint_groups, len(layout.ordered_names), coupled),
         dofs=len(tree.slot_of) - multipliers + inequalities,
         shapes=tuple(_drawn(bodies.shapes[k]) for k in layout.order),
     )

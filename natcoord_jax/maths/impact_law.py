@@ -196,10 +196,10 @@ def collision_impulses(
 
 def friction_impulses(
     matrix: Float[Array, "3c 3c"],
-    slip: Float[Array, " 3c"],
+    slip: Float[Array, "c 3"],
     held: Float[Array, "c 3"],
     most: Float[Array, " c"],
-) -> tuple[Float[Array, " 3c"], Float[Array, " c"]]:
+) -> tuple[Float[Array, "c 3"], Float[Array, " c"]]:
     """Impulses that stop slip as far as friction can [N s], and their work [J].
 
     Of all within the cones of friction those of the least kinetic energy, nearly: projected gradients, each
@@ -207,7 +207,7 @@ def friction_impulses(
 
     Args:
         matrix: W of the directions of slip [1/kg].
-        slip: velocities of slip by components, three a contact [m/s].
+        slip: velocities of slip [m/s].
         held: impulses of friction in the step already.
         most: mu times the impulses along the normals.
     """
@@ -217,7 +217,7 @@ def friction_impulses(
     inverse = jnp.where(own > 0, 1.0 / jnp.where(own > 0, own, 1.0), 0.0)[:, None]
 
     def trip(_: Array, found: Float[Array, "c 3"]) -> Float[Array, "c 3"]:
-        moving = (slip + matrix @ found.reshape(-1)).reshape(count, 3)
+        moving = slip + (matrix @ found.reshape(-1)).reshape(count, 3)
         wanted = held + found - inverse * moving
         square = jnp.sum(wanted**2, axis=1)
         beyond = square > most**2
@@ -228,6 +228,6 @@ def friction_impulses(
         some = (along > 0) & (needed > 0)
         return found + jnp.where(some, jnp.minimum(along / jnp.where(some, needed, 1.0), 1.0), 0.0) * change
 
-    found = jax.lax.fori_loop(0, PROJECTIONS, trip, jnp.zeros_like(held)).reshape(-1)
-    done = found * (slip + 0.5 * matrix @ found)
-    return found, jnp.sum(done.reshape(count, 3), axis=1)
+    found = jax.lax.fori_loop(0, PROJECTIONS, trip, jnp.zeros_like(held))
+    done = found * (slip + 0.5 * (matrix @ found.reshape(-1)).reshape(count, 3))
+    return found, jnp.sum(done, axis=1)

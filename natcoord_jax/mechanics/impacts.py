@@ -5,7 +5,7 @@ it, more or less by where in the step the surfaces met. `natcoord_jax.maths.impa
 follow: those of the restitution that is asked for, wherever that was. Then friction stops what slip it can.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
@@ -21,27 +21,15 @@ from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import Tableau
 from natcoord_jax.maths.impact_law import collision_impulses, friction_impulses, impact_impulses
 from natcoord_jax.maths.vectors import positive_part
-from natcoord_jax.mechanics.block_tangent_space import tangents_at
+from natcoord_jax.mechanics.block_tangent_space import Tangents, tangents_at
 from natcoord_jax.mechanics.free_flight import apart, meeting, touch
 from natcoord_jax.mechanics.response import Evaluation
 from natcoord_jax.mechanics.tangent_space import Velocity
 from natcoord_jax.mechanics.violations import contact_gaps
 from natcoord_jax.model.groups import Group
+from natcoord_jax.model.islands import IslandOrder
 from natcoord_jax.model.model import Model, SomeModel
 from natcoord_jax.model.rows import group_places, rows_with_ground
-
-
-def levers(system: Model, groups: Sequence[Group], state: State, name: str) -> Float[Array, "c bodies 4 3"]:
-    """Forces on the rows of all bodies that unit impulses at contacts are, by a method of the effects."""
-    rows, found = rows_with_ground(state.q), []
-    for group in groups:
-        each = jax.vmap(lambda effect, place, rows: getattr(effect, name)(place, rows))
-        forces = each(group.effect, group_places(system, group), rows[group.bodies])
-        several = forces.shape[1]
-        whole = jnp.zeros((group.count, several, *rows.shape), rows.dtype)
-        at = np.arange(group.count)[:, None, None], np.arange(several)[:, None], group.bodies[:, None]
-        found.append(whole.at[at].add(forces)[:, :, :-1].reshape(-1, *rows[:-1].shape))
-    return jnp.concatenate(found)
 
 
 class Answers:
@@ -52,20 +40,27 @@ class Answers:
         along: what unit impulses do, in its frame, one a row.
     """
 
-    def __init__(self, space: Any, rows: Float[Array, "c bodies 4 3"], rotors: Array) -> None:
+    def __init__(self, space: Tangents, system: Model, groups: Sequence[Group], state: State, name: str):
+        """Of impulses along forces on the rows of the bodies, by a method of the effects."""
         self.space = space
-        still = jnp.zeros((rows.shape[0], *rotors.shape), rows.dtype)
-        self.along = jax.vmap(space.answer)(Velocity(rows, still))
+        rows, found = rows_with_ground(state.q), []
+        for group in groups:
+            each = jax.vmap(lambda effect, place, rows: getattr(effect, name)(place, rows))
+            forces = each(group.effect, group_places(system, group), rows[group.bodies])
+            bodies = jnp.repeat(group.bodies, forces.shape[1], axis=0)
+            found.append(space.answers(forces.reshape(-1, *forces.shape[2:]), bodies))
+        self.along = jnp.concatenate(found)
 
     @property
     def flat(self) -> Float[Array, "c u"]:
         """The same, one vector a row."""
         return self.along.reshape(self.along.shape[0], -1)
 
-    @property
-    def matrix(self) -> Float[Array, "c c"]:
-        """W = G M^-1 G^T; as a sum, which is no call into a library."""
-        return jnp.sum(self.flat[:, None] * self.flat[None], axis=-1)
+    def matrices(self, order: IslandOrder, each: int = 1) -> Float[Array, "islands m m"]:
+        """W = G M^-1 G^T of each island, of so many impulses a contact; sums, which call no library."""
+        flat = order.split(self.flat.reshape(-1, each, self.flat.shape[-1]))
+        flat = flat.reshape(flat.shape[0], -1, flat.shape[-1])
+        return jnp.sum(flat[:, :, None] * flat[:, None], axis=-1)
 
     def rates(self, velocity: Velocity) -> Float[Array, " c"]:
         """gamma: work of unit impulses on a velocity."""
@@ -139,7 +134,7 @@ def untouched(system: Model) -> Float[Array, "c 3"] | None:
     return as_array(np.zeros((count, 3))) if count else None
 
 
-def _by_group(groups: Sequence[Group], every: Array) -> list[Array]:
+def _by_group(groups: Sequence[Group], every: Any) -> list[Any]:
     ends = np.cumsum([group.count for group in groups])
     return [every[part] for part in np.split(np.arange(every.shape[0]), ends[:-1])]
 
@@ -167,38 +162,54 @@ def _impacts(
 ) -> tuple[Array, Array, Array, Array, Array]:
     """After impacts of active contacts: velocities, rates of rotors, work, impulses, and which have met."""
     space = tangents_at(system, end)
-    answers = Answers(space, levers(system, groups, end, "pushes"), end.rates)
+    answers = Answers(space, system, groups, end, "pushes")
     before, pushed = contact_gaps(system, groups, start), jnp.concatenate([x[:, 0] for x in lam])
     on, active = active, active & _bouncing(groups)
     met = active & (before > touch(start) if hit is None else apart(system, groups, start, h))
     work = jnp.where(met, positive_part(pushed * (before - contact_gaps(system, groups, end)) / h), 0.0)
     restitution = _numbers(groups, "restitution")
     velocity = Velocity(end.row_rates, end.rates)
-    rates, matrix = answers.rates(velocity), answers.matrix
-    impulses = impact_impulses(matrix, rates, work, restitution, active, met)
+    order = IslandOrder(system.structure.islands, range(len(on)))
+    rates, matrices = answers.rates(velocity), answers.matrices(order)
+
+    def law(impulses: Callable[..., Array], *given: Array) -> Array:
+        return order.joined(jax.vmap(impulses)(matrices, *map(order.split, given)))
+
+    impulses = law(impact_impulses, rates, work, restitution, active, met)
     if hit is not None:
         touching = jnp.asarray(_bouncing(groups)) & (contact_gaps(system, groups, end) <= touch(end))
-        collision = collision_impulses(matrix, rates, restitution, touching)
+        collision = law(collision_impulses, rates, restitution, touching)
         impulses, on = jnp.where(jnp.any(hit), collision, impulses), on | hit
     velocity = answers.pushed(velocity, impulses)
-    done = impulses * (rates + 0.5 * matrix @ impulses)
-    parts = zip(groups, lam, *(_by_group(groups, x) for x in (on, impulses, done)))
+    done = impulses * (rates + 0.5 * law(jnp.matmul, impulses))
+    parts = zip(groups, lam, *(_by_group(groups, x) for x in (on, impulses, done, np.arange(len(on)))))
     rubbing, finished = [], []
-    for group, own, on, pushes, work in parts:
+    for group, own, on, pushes, work, numbers in parts:
         finished.append(work)
         if group.effect.friction is not None:
             most = group.effect.friction * jnp.where(on, positive_part(own[:, 0] + pushes), 0.0)
-            rubbing.append((group, own[:, 1:], most))
+            rubbing.append((group, own[:, 1:], most, numbers))
     if rubbing:
-        these, held, most = zip(*rubbing)
-        answers = Answers(space, levers(system, these, end, "rubs"), end.rates)
-        given = answers.matrix, answers.rates(velocity), jnp.concatenate(held), jnp.concatenate(most)
-        stopping, stopped = friction_impulses(*given)
-        velocity = answers.pushed(velocity, stopping)
-        lost = iter(_by_group(these, stopped))
+        velocity, lost = _after_friction(system, end, space, velocity, rubbing)
         finished = [w + (0.0 if g.effect.friction is None else next(lost)) for g, w in zip(groups, finished)]
     account = jnp.concatenate(finished), impulses, met.astype(impulses.dtype)
     return velocity.rows.reshape(end.v.shape), velocity.rotors, *account
+
+
+def _after_friction(
+    system: Model, end: State, space: Any, velocity: Velocity, rubbing: list[tuple[Group, Any, Any, Any]]
+) -> tuple[Velocity, Iterator[Array]]:
+    """The velocity after what friction stops, and its work by group.
+
+    Of each group impulses of friction in the step already, the most that there may be, and its contacts.
+    """
+    groups, held, most, numbers = zip(*rubbing)
+    answers = Answers(space, system, groups, end, "rubs")
+    order = IslandOrder(system.structure.islands, np.concatenate(numbers))
+    slip = answers.rates(velocity).reshape(-1, 3)
+    given = map(order.split, (slip, jnp.concatenate(held), jnp.concatenate(most)))
+    stopping, work = map(order.joined, jax.vmap(friction_impulses)(answers.matrices(order, 3), *given))
+    return answers.pushed(velocity, stopping.reshape(-1)), iter(_by_group(groups, work))
 
 
 def with_mobilities(system: SomeModel, state: State) -> SomeModel:
@@ -224,6 +235,6 @@ def mobilities(system: Model, state: State) -> Float[Array, " c"]:
     """
     system, state = jax.lax.stop_gradient((system, state))
     groups = [group for group in system.effects if group.effect.unilateral]
-    forces = levers(system, groups, state, "pushes")
-    found = jnp.diagonal(Answers(tangents_at(system, state), forces, state.rates).matrix)
+    answers = Answers(tangents_at(system, state), system, groups, state, "pushes")
+    found = jnp.sum(answers.flat**2, axis=-1)
     return jnp.where(found > 0, found, 1.0)

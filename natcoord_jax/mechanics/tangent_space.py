@@ -7,7 +7,8 @@ Cholesky factor, X P^T M P X^T = 1. Where constraints close loops, the tangents 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, Float, Int
 
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
@@ -119,6 +120,13 @@ class TangentSpace(eqx.Module):
     def answer(self, impulse: Velocity) -> Float[Array, " u"]:
         """Components along the frame of what impulses on the rows bring about, as far as it is admitted."""
         return self.admissible.within(self.admissible.frame @ self.pulled(impulse))
+
+    def answers(self, forces: Float[Array, "n k 4 3"], bodies: Int[Array, "n k"]) -> Float[Array, "n u"]:
+        """The same of impulses on the rows of few bodies each; the ground, whose number is last, has none."""
+        none = jnp.zeros((bodies.shape[0], *self.rows.shape), forces.dtype)
+        rows = none.at[np.arange(bodies.shape[0])[:, None], bodies].add(forces, mode="drop")
+        still = jnp.zeros((bodies.shape[0], self.turning.shape[1]), forces.dtype)
+        return jax.vmap(self.answer)(Velocity(rows, still))
 
     def along(self, y: Float[Array, " u"]) -> Velocity:
         """Velocity with given components along the frame."""

@@ -13,6 +13,7 @@ from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.kinds import BODY_NAME, JOINT_NAME, NAME, HandleOf, of
 from natcoord_jax.core.names import clamped, listed
 from natcoord_jax.model.groups import CoordinateGroup, Elimination, Group
+from natcoord_jax.model.islands import Islands
 from natcoord_jax.model.local_rates import LocalRates
 from natcoord_jax.model.masses import MassBetween
 from natcoord_jax.model.tree import Tree
@@ -32,6 +33,7 @@ class Structure:
         unknowns: number of tree unknowns (degrees of freedom of the spanning tree).
         multipliers: number of Lagrange multipliers that are solved for.
         inequalities: how many of them are of contacts.
+        islands: numbers of the contacts that have impacts or rub, by what an impact at one of them reaches.
         solver: "reduced", "recursive", "sparse" or "full".
         constraints: number of constraints, internal ones of rigid bodies included.
         dofs: degrees of freedom: unknowns less the structural rank of the remaining constraints.
@@ -57,6 +59,7 @@ class Structure:
     points: Sequence[int] = ()
     directors: Sequence[int] = ()
     inequalities: int = 0
+    islands: Islands = ()
     dofs: int = field(default=0, compare=False)
     redundant: tuple[str, ...] = field(default=(), compare=False)
     notes: tuple[str, ...] = field(default=(), compare=False)
