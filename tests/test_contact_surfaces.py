@@ -11,6 +11,8 @@ from differences import assert_v_shaped
 
 import natcoord_jax as nc
 from natcoord_jax import gallery
+from natcoord_jax.bodies.contact_sides import MeshSide
+from natcoord_jax.bodies.mesh_handle import Surface
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.effects.contact.node_on_facets import nearest_point, shapes
 from natcoord_jax.gallery.racket import add_ball
@@ -121,6 +123,18 @@ def test_a_node_at_the_very_end_counts():
     np.testing.assert_allclose(gaps, [-0.01, np.hypot(1e-3, 0.01)], rtol=1e-9)
 
 
+def test_a_node_that_is_out_on_the_other_side_is_not_behind():
+    """Of a body of half a metre: inside it is pushed back, below it is as far as it is."""
+    corners = np.concatenate([SQUARE, SQUARE[1:3] + (1.0, 0.0, 0.0)])
+    contact = node_on_two_facets(depth=np.array([0.5, 0.5]))
+    gaps = [contact.gap(jnp.asarray([(0.9, 0.5, z), *corners])) for z in (-0.4, -0.6)]
+    np.testing.assert_allclose(gaps, [-0.4, 0.6], rtol=1e-12)
+    block = nc.Scene().add(
+        nc.Solid(nc.mesh.box((1, 1, 0.5), (2, 2, 1)), material=nc.Elastic(E=1.0, density=1.0))
+    )
+    np.testing.assert_allclose(MeshSide(block.nodes[0], Surface, block.face("z1")).depth, 0.5, rtol=1e-12)
+
+
 def warped_patch(random, warp):
     """Nine facets in a plane but for the warp, each with its corners in turn from any of them on."""
     line = np.linspace(-1.5, 1.5, 4)
@@ -208,6 +222,30 @@ def assert_kept(system, trajectory, *, momentum=True):
     if momentum:
         assert found.momentum.max() <= 1e-12
         assert found.angular_momentum.max() <= 1e-12
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("dt", [4e-3, 12e-3])
+def test_blocks_collide_and_fly_on(dt):
+    """Five hundred steps, some longer than a wave takes: they turn over, and nodes are behind each other."""
+    scene, rubber = nc.Scene(), nc.Elastic(E=1e4, nu=0.3, density=1.0)
+    spin, middle = np.array([0.0, 0.3, 0.8]), np.array([1.0, 1.0, 0.3])
+    given = {
+        "position": (0.02, 0.2, 0.19),
+        "orientation": ((1.0, 0.6, 0.0), 0.29),
+        "velocity": (1.0, 0.5, -4.0),
+    }
+    one = scene.add(nc.Solid(nc.mesh.box((1, 1, 1), (2, 2, 1)), material=rubber, **given))
+    given = {"position": (-0.55, -0.45, -0.65), "velocity": np.array([0, 0, 2.0]) - np.cross(spin, middle)}
+    given |= {"angular_velocity": spin}
+    other = scene.add(nc.Solid(nc.mesh.box((2, 2, 0.6), (2, 2, 1)), material=rubber, **given))
+    scene.add(nc.Contact(one.face("z0"), other.face("z1"), name="impact"))
+    system, state = scene.compile()
+    trajectory = nc.simulate(system, state, dt=dt, steps=500)
+    assert_kept(system, trajectory)
+    stores = system.energy(trajectory).stores["impact"]
+    assert float(stores.max()) >= 0.2 * float(system.energy(trajectory).kinetic[0])
+    assert float(stores[-1]) == 0.0
 
 
 @pytest.mark.slow

@@ -216,6 +216,17 @@ class MeshSide(Side):
         return thick[self.numbers]
 
     @property
+    def depth(self) -> Float[np.ndarray, " f"]:
+        """How far a solid reaches behind each face [m]; a shell that is touched from one side has no end."""
+        if self.shell:
+            return np.full(len(self.surface.faces), 1e300)
+        places = np.asarray(self.surface.handle.nodes.positions)
+        corners = places[self.surface.faces[:, :4]]
+        normals = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        return np.sum(normals * corners.mean(axis=1), axis=1) - np.min(normals @ places.T, axis=1)
+
+    @property
     def _areas_and_moduli(self) -> tuple[Float[np.ndarray, " f"], Float[np.ndarray, " f"]]:
         """Of the faces [m^2], and the modulus of the material over how thick the elements behind are [N/m^3].
 

@@ -40,7 +40,7 @@ def mortar_gaps(one: MeshSide, other: MeshSide, law: dict[str, Any], name: str) 
     table, facets = _fans(corners, len(places))
     beside = others[np.searchsorted(other.numbers, other.surface.faces)]
     most = law.pop("candidates", None) or max(CANDIDATES, _below(places, table, beside))
-    masters, local, ends, beyond = patches(one, other, min(most, len(beside)), (0, len(places)), 0)
+    masters, local, ends, beyond, _ = patches(one, other, min(most, len(beside)), (0, len(places)), 0)
     area = np.sum(_areas(places[table[np.arange(len(table))[:, None, None], facets]], facets == 0), axis=1)
     given = law.pop("stiffness")
     stiffness = min(s.stiffness_per_area for s in (one, other)) if given is None else float(given)

@@ -36,14 +36,15 @@ def surface_gaps(one: MeshSide, other: MeshSide, law: dict[str, Any], name: str)
     width = max(table.shape[1] for table, *_ in found)
     # What fills up repeats the last node, so that both ways are alike.
     tables = [np.pad(table, ((0, 0), (0, width - table.shape[1])), mode="edge") for table, *_ in found]
-    fields = "facets", "open", "beyond", "thickness", "stiffness", "two_sided"
+    fields = "facets", "open", "beyond", "depth", "thickness", "stiffness", "two_sided"
     each: dict[str, list[Any]] = {field: [] for field in fields}
-    for (slave, master), (_, facets, ends, beyond) in zip(sides, found):
+    for (slave, master), (_, facets, ends, beyond, near) in zip(sides, found):
         thick = slave.half_thickness
         stiff = slave.stiffness if given is None else np.full(len(thick), float(given))
         each["facets"].append(facets)
         each["open"].append(ends)
         each["beyond"].append(beyond)
+        each["depth"].append(master.depth[near])
         each["thickness"].append(thick + master.half_thickness.max())
         each["stiffness"].append(stiff / passes)
         each["two_sided"].append(np.full(len(thick), float(master.two_sided)))
@@ -64,10 +65,13 @@ def _nearest(
 
 def patches(
     slave: MeshSide, master: MeshSide, most: int, first: tuple[int, int], turn: int
-) -> tuple[Int[np.ndarray, "n m"], Int[np.ndarray, "n k 4"], Float[np.ndarray, "n k 4"], np.ndarray]:
-    """For each node itself and the nodes of its facets, the facets by places among them, and their edges.
+) -> tuple[
+    Int[np.ndarray, "n m"], Int[np.ndarray, "n k 4"], Float[np.ndarray, "n k 4"], np.ndarray, np.ndarray
+]:
+    """For each node itself and the nodes of its facets (n, m), and facets by places among them (n, k, 4).
 
-    Of these, which end, and how far the surface goes on beyond them (n, k, 4) [m].
+    Of their edges which end, and how far the surface goes on beyond them (n, k, 4) [m]; last the numbers of
+    the facets on their surface (n, k).
 
     Args:
         slave: whose nodes.
@@ -90,7 +94,7 @@ def patches(
     own = first[turn] + np.arange(len(near))
     goes_on = (ends > 0) & _shared(np.sort(_edges(facets), axis=-1))[near]
     beyond = np.where(goes_on, np.linalg.norm(np.ptp(places, axis=0)), 0.0)
-    return np.concatenate([own[:, None], first[1 - turn] + table], axis=1), local, ends, beyond
+    return np.concatenate([own[:, None], first[1 - turn] + table], axis=1), local, ends, beyond, near
 
 
 def _edges(corners: Int[np.ndarray, "*n 4"]) -> Int[np.ndarray, "*n 4 2"]:

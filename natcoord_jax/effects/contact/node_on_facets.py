@@ -145,6 +145,8 @@ class NodeOnFacets(DiscreteGap):
             it without being pushed back; else 0.
         beyond: how far the surface goes on beyond each edge of each facet where it does so with facets that
             are not among these (f, 4) [m]; else 0. See `uncovered`.
+        depth: how far the body reaches behind each facet (f,) [m]; a node that is farther behind is out again
+            on its other side, and is not pushed back through it.
         thickness: distance of the node from the facets at which they touch [m]: that of both, halved.
         two_sided: 1 where facets are touched from both sides, as those of shells are, 0 where from outside.
 
@@ -161,6 +163,9 @@ class NodeOnFacets(DiscreteGap):
     open: Any = eqx.field(default=1.0, kw_only=True, metadata=is_a(Number() | Numbers((None, 4))))
     beyond: Any = eqx.field(
         default=0.0, kw_only=True, metadata=is_a(Number("not negative") | Numbers((None, 4)))
+    )
+    depth: Any = eqx.field(
+        default=1e300, kw_only=True, metadata=is_a(Number("positive") | Numbers((None,), "positive"))
     )
     thickness: Any = eqx.field(default=0.0, kw_only=True, metadata=is_a(Number("not negative")))
     two_sided: Any = eqx.field(default=0.0, kw_only=True, metadata=is_a(Number("not negative")))
@@ -186,12 +191,13 @@ class NodeOnFacets(DiscreteGap):
         both = jnp.asarray(self.two_sided) > 0
         shares = jax.vmap(_share)(every, ends) * _level(every)
         rest = jnp.maximum(1.0 - jnp.sum(shares), 0.0)
-        heights = jnp.where(both, jnp.abs(every.height), every.height)
+        out = every.height < -jnp.broadcast_to(jnp.asarray(self.depth), every.height.shape)
+        heights = jnp.where(both | out, jnp.abs(every.height), every.height)
         # Beside all of its facets a node is not behind them, wherever the surface goes on: see `uncovered`.
         # A corner is part of several edges, of which one that is an end decides.
         ending = ends | (jnp.broadcast_to(jnp.asarray(self.beyond), facets.shape) > 0)
         beside = (at.edge >= 0) & jnp.any(ending & _nearest(every))
-        behind = (at.height < 0) & ~both & ~beside
+        behind = (at.height < 0) & ~both & ~beside & ~out[best]
         aside = jnp.where(behind, -1.0, 1.0) * safe_norm(at.apart)
         return (jnp.sum(shares * heights) + rest * aside) / (jnp.sum(shares) + rest), facets[best]
 
@@ -203,8 +209,10 @@ class NodeOnFacets(DiscreteGap):
         beyond = jnp.broadcast_to(jnp.asarray(self.beyond), facets.shape)
         beside = jnp.any(_nearest(every) & (every.to_edges < beyond**2))
         both = jnp.asarray(self.two_sided) > 0
-        height = every.height[jnp.argmin(dot(every.apart, every.apart))]
-        reached = jnp.where(both, jnp.abs(height), height) < self.thickness
+        best = jnp.argmin(dot(every.apart, every.apart))
+        height = every.height[best]
+        out = height < -jnp.broadcast_to(jnp.asarray(self.depth), every.height.shape)[best]
+        reached = jnp.where(both | out, jnp.abs(height), height) < self.thickness
         return {LEFT: beside & reached}
 
 
