@@ -7,7 +7,7 @@ import equinox as eqx
 
 from natcoord_jax.bodies.beam import BeamHandle
 from natcoord_jax.bodies.contact_gaps import gaps_between, gaps_within
-from natcoord_jax.bodies.contact_search import are_searched, searched_contacts
+from natcoord_jax.bodies.contact_search import are_searched, searched_contacts, what_a_search_wants
 from natcoord_jax.bodies.contact_sides import BeamSide, BodySide, MeshSide, PlaneSide, SegmentSide, Side
 from natcoord_jax.bodies.contact_sides import Plane as Plane
 from natcoord_jax.bodies.mesh_handle import MeshHandle, Surface
@@ -197,7 +197,7 @@ class Contact(Recipe):
         search = {key: value for key, value in asked.items() if value is not None}
         if are_searched(every, law, search, name):
             return (scene.add(searched_contacts(every, pairs, law, search, name)),)
-        for one, other in pairs:
+        for left, (one, other) in zip(range(len(pairs))[::-1], pairs):
             said = f"{one.name}, {other.name}"
             boxes = sides[one].kind is sides[other].kind is Box
             own = law if boxes else {key: value for key, value in law.items() if key != "rounding"}
@@ -206,10 +206,11 @@ class Contact(Recipe):
             made += [
                 (f"{name}[{said}, {k}]" if several else f"{name}[{said}]", g) for k, g in enumerate(gaps)
             ]
-            if len(made) > MOST:
+            if len(made) + left > MOST:
                 raise ValueError(
                     f"contact {name!r}: all pairs of {len(sides)} bodies have more than {MOST} gaps, each of "
-                    "which is made and looked at in every step; pass fewer bodies, or more pairs to `ignore`"
+                    "which is made and looked at in every step; pass fewer bodies, or more pairs to "
+                    f"`ignore`. To have near ones looked for instead: {what_a_search_wants(every, law)}"
                 )
         return tuple(scene.add(replace_fields(gap, name=said)) for said, gap in made)
 

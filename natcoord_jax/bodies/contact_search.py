@@ -29,15 +29,31 @@ def are_searched(sides: Sequence[Side], law: dict[str, Any], search: dict[str, A
     Raises:
         ValueError: where that is asked for, but is not possible.
     """
-    simple = all(side.kind in (Sphere, Capsule) for side in sides)
-    possible = simple and law["stiffness"] is not None and "friction" not in law
-    if search and not possible:
+    missing = what_a_search_wants(sides, law)
+    if search and missing:
         raise ValueError(
-            f"contact {name!r}: capacity and skin [m] are of spheres, capsules and points with a stiffness "
-            "[N/m] and without friction, whose neighbours are looked for; leave them out, and all pairs are "
-            "listed"
+            f"contact {name!r}: capacity and skin [m] are of a search for neighbours, which there is of "
+            f"spheres, capsules and points with a stiffness [N/m] and without friction; {missing}, or leave "
+            "them out, and all pairs are listed"
         )
-    return possible and (bool(search) or len(sides) >= MANY)
+    return not missing and (bool(search) or len(sides) >= MANY)
+
+
+def what_a_search_wants(sides: Sequence[Side], law: dict[str, Any]) -> str:
+    """What is to be changed before neighbours can be looked for; nothing where they can.
+
+    A force of friction is an unknown of its own while it is there, and what stops slip at the end of a step
+    sees all contacts at once: both want equations whose number changes from step to step.
+
+    Args:
+        sides: that are in contact each with each.
+        law: numbers of the contact.
+    """
+    strange = next((side for side in sides if side.kind not in (Sphere, Capsule)), None)
+    wants = [] if strange is None else [f"make {strange.named} of spheres and capsules"]
+    wants += ["pass `stiffness` [N/m]"] if law["stiffness"] is None else []
+    wants += ["leave out `friction` [-]"] if "friction" in law else []
+    return ", ".join(wants)
 
 
 def searched_contacts(
