@@ -115,6 +115,7 @@ from natcoord_jax.effects.beams import (
 )
 from natcoord_jax.effects.constraints import PointOnLine, PointOnPlane, PointOnPoint, PointSum, Rod, Rolling
 from natcoord_jax.effects.contact import (
+    CapsuleContacts,
     CapsuleOnCapsule,
     CornersOnBox,
     DiscOnPlane,
@@ -128,7 +129,6 @@ from natcoord_jax.effects.contact import (
     GapPotential,
     MortarGap,
     NodeOnFacets,
-    SphereContacts,
     SphereOnBox,
     SphereOnPlane,
     SphereOnSphere,
@@ -353,7 +353,7 @@ __all__ = [
     "SphereOnBox",
     "SphereOnPlane",
     "SphereOnSphere",
-    "SphereContacts",
+    "CapsuleContacts",
     "Spherical",
     "SphericalDamper",
     "SphericalSpring",

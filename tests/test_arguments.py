@@ -229,7 +229,7 @@ CALLS = {
         **MARKED(w.ends), "gap": [nc.SphereOnSphere(radii=(1.0, 1.0))], "restitution": NUMBER,
         "friction": NUMBER, "regularisation": NUMBER, "compliance": NUMBER,
     },
-    "SphereContacts": lambda w: {
+    "CapsuleContacts": lambda w: {
         **MARKED(w.ends), "radii": [(1.0, 1.0)], "ignored": [np.array([[0, 1]])], "capacity": WHOLE,
         "skin": NUMBER, "stiffness": NUMBER, "restitution": NUMBER, "speed": NUMBER,
         "law": ["linear", "hertz"],

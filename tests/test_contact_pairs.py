@@ -119,6 +119,25 @@ def test_too_many_pairs_are_refused():
         scene.add(nc.Contact(all_pairs_of=many[:2]))
 
 
+@pytest.mark.parametrize(
+    ("law", "words"),
+    [
+        ({}, "looked for instead: pass `stiffness` .N/m.$"),
+        ({"stiffness": 1e4, "friction": 0.3}, "looked for instead: leave out `friction` .-.$"),
+        ({"friction": 0.3}, "looked for instead: pass `stiffness` .N/m., leave out `friction` .-.$"),
+    ],
+)
+def test_what_has_no_search_is_told(law, words):
+    """What to change of a hundred capsules, so that only near ones are looked at."""
+    scene, link = nc.Scene(), {"shape": nc.Capsule(0.1, 0.2), "density": 1.0}
+    links = [scene.add(nc.RigidBody(**link, position=(k, 1, 0))) for k in range(100)]
+    with pytest.raises(ValueError, match=words):
+        scene.add(nc.Contact(all_pairs_of=links, **law))
+    box = scene.add(nc.RigidBody(shape=nc.Box((1, 1, 1)), density=1.0, name="crate"))
+    with pytest.raises(ValueError, match="make Box 'crate' of spheres and capsules"):
+        scene.add(nc.Contact(all_pairs_of=[*links, box], **law))
+
+
 @pytest.mark.parametrize("option", [{"candidates": 4}, {"one_pass": True}])
 def test_options_of_surfaces_are_refused_where_none_touch(option):
     scene = nc.Scene()

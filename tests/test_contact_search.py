@@ -11,7 +11,7 @@ import tolerances as tol
 from differences import assert_v_shaped
 
 import natcoord_jax as nc
-from natcoord_jax.effects.contact.spheres import SphereContacts
+from natcoord_jax.effects.contact.capsules import CapsuleContacts
 from natcoord_jax.linsolve.multifrontal import Multifrontal
 from natcoord_jax.maths.collocation import gauss
 from natcoord_jax.maths.near_spheres import near_spheres
@@ -110,7 +110,7 @@ def test_a_cloud_keeps_what_it_should():
     Balls do not wait for each other where equations are solved, and Newton's method sees who pushes whom.
     """
     system, state = cloud(100)
-    assert [type(group.effect) for group in system.effects] == [SphereContacts]
+    assert [type(group.effect) for group in system.effects] == [CapsuleContacts]
     assert isinstance(system.sparsity.plan, Multifrontal)
     trajectory = nc.simulate(system, state, dt=1e-3, steps=150)
     assert int(trajectory.iterations) <= 7 * 150
@@ -224,7 +224,7 @@ def test_small_scenes_list_their_pairs():
     assert np.abs(np.asarray(nc.simulate(system, state, dt=1e-3, steps=3).v)).max() == 0.0
 
 
-HARD = "capacity and skin .* of spheres and points with a stiffness"
+HARD = "capacity and skin .* of spheres, capsules and points with a stiffness"
 
 
 @pytest.mark.parametrize(

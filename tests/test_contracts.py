@@ -196,9 +196,18 @@ TABLE = {
     nc.GapConstraint: Entry(
         lambda p: nc.GapConstraint(p.ends, nc.SphereOnSphere(radii=(0.1, 0.1)), restitution=0.5)
     ),
-    nc.SphereContacts: Entry(
-        lambda p: nc.SphereContacts(
-            (*p.ends, nc.Point(p.one, (0.3, 0.1, -1.0))), radii=(0.9, 1.0, 0.5), stiffness=9.0, skin=50.0
+    nc.CapsuleContacts: Entry(
+        lambda p: nc.CapsuleContacts(
+            (
+                *p.ends,
+                nc.Point(p.one, (0.3, 0.1, -1.0)),
+                nc.Point(p.one, (0.4, 0.9, 0.2)),
+                p.ends[1],
+                nc.Point(p.one, (0.1, 0.2, -0.4)),
+            ),
+            radii=(0.9, 1.0, 0.5),
+            stiffness=9.0,
+            skin=50.0,
         )
     ),
     nc.FrictionalGapPotential: Entry(

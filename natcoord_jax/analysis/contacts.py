@@ -139,7 +139,7 @@ def _rates(system: Model, state: State) -> Array:
 def contacts(system: System, trajectory: Trajectory) -> Contacts:
     """Gaps, forces and impacts along a trajectory, and the margins within which its derivatives hold.
 
-    Of many spheres that look for their neighbours (`nc.SphereContacts`) nothing is told.
+    Of many bodies that look for their neighbours (`nc.CapsuleContacts`) nothing is told.
 
     Args:
         system: compiled system, with contacts.

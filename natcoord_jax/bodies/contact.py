@@ -7,9 +7,9 @@ import equinox as eqx
 
 from natcoord_jax.bodies.beam import BeamHandle
 from natcoord_jax.bodies.contact_gaps import gaps_between, gaps_within
+from natcoord_jax.bodies.contact_search import are_searched, searched_contacts, what_a_search_wants
 from natcoord_jax.bodies.contact_sides import BeamSide, BodySide, MeshSide, PlaneSide, SegmentSide, Side
 from natcoord_jax.bodies.contact_sides import Plane as Plane
-from natcoord_jax.bodies.contact_spheres import are_searched, sphere_contacts
 from natcoord_jax.bodies.mesh_handle import MeshHandle, Surface
 from natcoord_jax.bodies.shapes import Box, Capsule, Cylinder, Ellipsoid, Sphere
 from natcoord_jax.core.arguments import is_a
@@ -65,8 +65,9 @@ class Contact(Recipe):
     shell or a solid at its nodes only: what is smaller than its cells slips through. Where a step is longer
     than a body, it may pass another without ever overlapping with it.
 
-    Of fifty spheres or more in `all_pairs_of`, with a stiffness and without friction, only neighbours are
-    looked at, see `nc.SphereContacts`; they are one contact with one name, and no sensor shows its pairs.
+    Of fifty spheres and capsules or more in `all_pairs_of`, with a stiffness and without friction, only
+    neighbours are looked at, see `nc.CapsuleContacts`; they are one contact with one name, and no sensor
+    shows its pairs.
 
     Shells are touched from both sides, where their thickness ends; solids from outside, best at all that is
     outside, since at the end of a surface nodes slip off it. Which facets a node may touch is settled
@@ -101,8 +102,8 @@ class Contact(Recipe):
             of the shortest edge; None: a fiftieth of that. Edges that move by more than two of these in a
             step, or overlap by as much in a soft contact, may pass each other.
         candidates: number of facets that a node may touch; default 16.
-        capacity: of all pairs of spheres, neighbours that each has room for; default 16. Given, they are
-            looked for of fewer than 50 spheres, too.
+        capacity: of all pairs of spheres and capsules, neighbours that each has room for; default 16. Given,
+            they are looked for of fewer than 50, too.
         skin: by how much two of them together may stray in a step from where their velocities take them [m];
             default a quarter of the largest radius. Steps in which one strays by half of it are made in
             parts.
@@ -112,7 +113,7 @@ class Contact(Recipe):
     Raises:
         ValueError: when it is added: for shapes that there is no gap for, a surface against itself, no
             stiffness, or more than 2000 gaps of all pairs of bodies; for a capacity or skin of others than
-            spheres. When the scene is compiled: for surfaces
+            spheres and capsules. When the scene is compiled: for surfaces
             that overlap from the start.
 
     Example:
@@ -195,8 +196,8 @@ class Contact(Recipe):
         asked = {"capacity": self.capacity, "skin": self.skin}
         search = {key: value for key, value in asked.items() if value is not None}
         if are_searched(every, law, search, name):
-            return (scene.add(sphere_contacts(every, pairs, law, search, name)),)
-        for one, other in pairs:
+            return (scene.add(searched_contacts(every, pairs, law, search, name)),)
+        for left, (one, other) in zip(range(len(pairs))[::-1], pairs):
             said = f"{one.name}, {other.name}"
             boxes = sides[one].kind is sides[other].kind is Box
             own = law if boxes else {key: value for key, value in law.items() if key != "rounding"}
@@ -205,10 +206,11 @@ class Contact(Recipe):
             made += [
                 (f"{name}[{said}, {k}]" if several else f"{name}[{said}]", g) for k, g in enumerate(gaps)
             ]
-            if len(made) > MOST:
+            if len(made) + left > MOST:
                 raise ValueError(
                     f"contact {name!r}: all pairs of {len(sides)} bodies have more than {MOST} gaps, each of "
-                    "which is made and looked at in every step; pass fewer bodies, or more pairs to `ignore`"
+                    "which is made and looked at in every step; pass fewer bodies, or more pairs to "
+                    f"`ignore`. To have near ones looked for instead: {what_a_search_wants(every, law)}"
                 )
         return tuple(scene.add(replace_fields(gap, name=said)) for said, gap in made)
 

@@ -4,10 +4,11 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from natcoord_jax.core.callables import replace_fields as replace_fields
 from natcoord_jax.maths.collocation import Tableau
+from natcoord_jax.maths.near_spheres import Pairs
 
 
 class Motion(eqx.Module):
@@ -88,22 +89,22 @@ class Response(eqx.Module):
 
 
 class NeighbourTangents(eqx.Module):
-    """Derivatives of the forces on markers by the velocities of others, which are others in every step.
+    """Derivatives of the forces on things by the velocities of others, which are others in every step.
 
-    Of each two, either is a neighbour of the other, and has the same stiffness.
+    Each thing is one of the `parts` of the effect, of one body, with `w` components of forces and velocities.
 
     Attributes:
-        others: numbers of the other markers.
-        stiffness: minus the derivatives of the components of the force on a marker by those of the velocity
-            of each of these.
-        across: velocities of the markers by the twists of their bodies.
+        pairs: of things that are near each other, for each of `n` instances.
+        stiffness: of each pair minus the derivatives of the force on the first by the velocity of the second,
+            and of that on the second by the velocity of the first.
+        across: velocities of the things by the twists of their bodies.
         along: the same as their increments follow twists, see `core.closed_tangents`.
     """
 
-    others: Int[Array, "n m k"]
-    stiffness: Float[Array, "n 3 3 m k"]
-    across: Float[Array, "n k s r 3"]
-    along: Float[Array, "n k s r 3"]
+    pairs: Pairs
+    stiffness: Float[Array, "n 2 w w p"]
+    across: Float[Array, "n k s r w"]
+    along: Float[Array, "n k s r w"]
 
 
 class SpreadTangents(eqx.Module):

@@ -8,6 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from natcoord_jax.maths.near_spheres import Pairs
+
 ENOUGH = 1e-6
 """Part of the residual that an iteration may leave: Newton's makes up for it with the next correction."""
 
@@ -16,38 +18,48 @@ MOST = 50
 
 
 class NeighbourCouplings(eqx.Module):
-    """What points have to do with their neighbours: sums over these of across_i stiffness_ij along_j^T.
+    """What things have to do with their neighbours: sums over these of across_i stiffness_ij along_j^T.
 
-    Each of two points is a neighbour of the other, with the same stiffness.
+    Each has `w` components of displacements and forces.
 
     Attributes:
-        places: unknowns of each point; `size` where there is none.
-        across: equations of a point by the components of the force on it.
-        along: components of the displacement of a point by its unknowns.
-        others: numbers of neighbours.
-        stiffness: components of forces by those of displacements.
+        places: unknowns of each; `size` where there is none.
+        across: equations of each by the components of the force on it.
+        along: components of its displacement by its unknowns.
+        pairs: of those that are neighbours.
+        stiffness: of each pair, of the first by the displacement of the second, and the other way round.
         size: number of unknowns.
     """
 
-    places: Int[Array, "r p"]
-    across: Float[Array, "3 r p"]
-    along: Float[Array, "3 r p"]
-    others: Int[Array, "m p"]
-    stiffness: Float[Array, "3 3 m p"]
+    places: Int[Array, "r n"]
+    across: Float[Array, "w r n"]
+    along: Float[Array, "w r n"]
+    pairs: Pairs
+    stiffness: Float[Array, "2 w w p"]
     size: int = eqx.field(static=True)
+
+    def product(self) -> Callable[[Float[Array, " n"]], Float[Array, " n"]]:
+        """The product with vectors, to be taken many times: each has what its neighbours do at hand."""
+        others = self.pairs.seated(self.pairs.both[::-1])
+        stiffness = self.pairs.seated(jnp.moveaxis(self.stiffness, 0, 2))
+
+        def apply(x: Float[Array, " n"]) -> Float[Array, " n"]:
+            own = jnp.concatenate([x, jnp.zeros(1, x.dtype)])[self.places]
+            moved = jnp.sum(self.along * own, axis=1)
+            forces = jnp.sum(stiffness * moved[:, others], axis=(1, 2))
+            found = jnp.sum(self.across * forces[:, None], axis=0)
+            return jnp.zeros(self.size + 1, x.dtype).at[self.places].add(found)[:-1]
+
+        return apply
 
     def apply(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
         """Product with a vector."""
-        own = jnp.concatenate([x, jnp.zeros(1, x.dtype)])[self.places]
-        moved = jnp.sum(self.along * own, axis=1)
-        forces = jnp.sum(self.stiffness * moved[:, self.others], axis=(1, 2))
-        found = jnp.sum(self.across * forces[:, None], axis=0)
-        return jnp.zeros(self.size + 1, x.dtype).at[self.places].add(found)[:-1]
+        return self.product()(x)
 
     def transpose(self) -> "NeighbourCouplings":
         """The transposed matrix."""
-        turned = self.along, self.across, self.others, jnp.swapaxes(self.stiffness, 0, 1)
-        return NeighbourCouplings(self.places, *turned, size=self.size)
+        turned = jnp.swapaxes(self.stiffness[::-1], 1, 2)
+        return NeighbourCouplings(self.places, self.along, self.across, self.pairs, turned, size=self.size)
 
     def to_dense(self) -> Float[Array, "n n"]:
         """The matrix."""
@@ -74,8 +86,10 @@ class WithCouplings(eqx.Module):
         >>> import jax.numpy as jnp
         >>> from natcoord_jax.linsolve.dense import Inverse
         >>> places, maps = jnp.array([[0, 1]]), jnp.zeros((3, 1, 2)).at[0].set(1.0)
-        >>> stiffness = jnp.zeros((3, 3, 1, 2)).at[0, 0].set(-0.5)
-        >>> two = NeighbourCouplings(places, maps, maps, jnp.array([[1, 0]]), stiffness, size=2)
+        >>> stiffness = jnp.zeros((2, 3, 3, 1)).at[:, 0, 0].set(-0.5)
+        >>> seats, none = jnp.array([[0, 1]]), jnp.array([-1, -1])
+        >>> pair = Pairs(jnp.array([[0], [1]]), jnp.array([True]), seats, none)
+        >>> two = NeighbourCouplings(places, maps, maps, pair, stiffness, size=2)
         >>> two.to_dense().tolist()
         [[0.0, -0.5], [-0.5, 0.0]]
         >>> two.around(Inverse(jnp.eye(2))).solve(jnp.array([0.0, 1.5])).round(5).tolist()
@@ -87,9 +101,8 @@ class WithCouplings(eqx.Module):
 
     def solve(self, right: Float[Array, " n"]) -> Float[Array, " n"]:
         """Solution for a right-hand side, nearly."""
-        return stabilised(
-            lambda x: x + self.factors.solve(self.couplings.apply(x)), self.factors.solve(right)
-        )
+        product = self.couplings.product()
+        return stabilised(lambda x: x + self.factors.solve(product(x)), self.factors.solve(right))
 
     def transpose(self) -> "WithCouplings":
         """Factors of the transposed matrix."""

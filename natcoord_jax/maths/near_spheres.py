@@ -44,6 +44,32 @@ class Neighbours(eqx.Module):
     left_out: Int[Array, "2"]
 
 
+class Pairs(eqx.Module):
+    """Pairs of things that are near each other, each once, for `n` things.
+
+    Attributes:
+        both: numbers of the two; 0 and 0 where there is no pair.
+        there: whether there is one.
+        seats: of each thing, its places in the list of all that are first in a pair, followed by that of all
+            that are second; `2 p` where there is none.
+        left_out: two things for which there was no room; -1 where there was room for all.
+    """
+
+    both: Int[Array, "2 p"]
+    there: Bool[Array, " p"]
+    seats: Int[Array, "room n"]
+    left_out: Int[Array, "2"]
+
+    def seated(self, x: Float[Array, "*k 2 p"]) -> Float[Array, "*k room n"]:
+        """For each thing what either of its pairs has for it; zero where there is none."""
+        flat = x.reshape(*x.shape[:-2], -1)
+        return jnp.concatenate([flat, jnp.zeros_like(flat[..., :1])], axis=-1)[..., self.seats]
+
+    def summed(self, x: Float[Array, "*k 2 p"]) -> Float[Array, "*k n"]:
+        """The sum of it."""
+        return jnp.sum(self.seated(x), axis=-2)
+
+
 def near_spheres(centres: Float[Array, "n 3"], sizes: Float[Array, " n"], room: int) -> Neighbours:
     """Spheres that touch.
 
@@ -76,7 +102,7 @@ def near_spheres(centres: Float[Array, "n 3"], sizes: Float[Array, " n"], room: 
     at = jnp.minimum(at, n - 1)
     apart = sum((w[at] - w[:, None, None]) ** 2 for w in (x, y, z))
     near = inside & (apart <= (sizes[at] + sizes[:, None, None]) ** 2) & (at != jnp.arange(n)[:, None, None])
-    place, there = _picked(first, materialised(near), room)
+    place, there = picked(first, materialised(near), room)
     # Of a run that is too long any of the last will do for a name.
     lacking = there[:, room] | jnp.any(count > most, axis=1)
     one = jnp.argmax(lacking)
@@ -87,7 +113,7 @@ def near_spheres(centres: Float[Array, "n 3"], sizes: Float[Array, " n"], room: 
     return Neighbours(others, there[back, :room], left_out)
 
 
-def _picked(
+def picked(
     first: Int[Array, "n runs"], near: Bool[Array, "n runs most"], room: int
 ) -> tuple[Int[Array, "n more"], Bool[Array, "n more"]]:
     """Places of those that are near, one after the other, and of one more; whether there are so many.
@@ -106,3 +132,20 @@ def _picked(
     rank = slot - (upto - count)[each, run]
     before = jnp.sum(within[each, run] <= rank[..., None], axis=-1, dtype=jnp.int32)
     return first[each, run] + before, slot < upto[:, -1:]
+
+
+def each_once(found: Neighbours) -> Pairs:
+    """Pairs of neighbours, of which either has the other: half as many as there is room for at most."""
+    n, room = found.others.shape
+    size, one = n * room // 2, jnp.arange(n, dtype=jnp.int32)[:, None]
+    mine = found.near & (found.others > one)
+    upto = materialised(jnp.cumsum(mine.reshape(-1), dtype=jnp.int32))
+    there = jnp.arange(size) < upto[-1]
+    at = jnp.searchsorted(upto, jnp.arange(1, size + 1, dtype=jnp.int32)).astype(jnp.int32)
+    at = jnp.where(there, at, 0)
+    both = jnp.where(there, jnp.stack([at // room, found.others.reshape(-1)[at]]), 0)
+    # What is second in a pair has its number from the list of the first.
+    number = (upto - 1).reshape(n, room)
+    mirrored = jnp.argmax(found.near[found.others] & (found.others[found.others] == one[..., None]), axis=-1)
+    seats = jnp.where(mine, number, size + number[found.others, mirrored])
+    return Pairs(both, there, jnp.where(found.near, seats, 2 * size).T, found.left_out)

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
@@ -64,12 +65,11 @@ def products(step: Any, twists: Float[Array, "bodies s 6"]) -> tuple[Products | 
         if not group.effect.spread:
             continue
         found = _tangents(step, group, where, twists)
-        touched = places[jnp.asarray(group.bodies)][..., : rates_of(group)]
         if found.neighbours is not None:
-            couplings += _couplings(step, group, where.h, touched, found.neighbours)
+            couplings += _couplings(step, group, where.h, places, found.neighbours)
         if found.columns is None or found.rows is None:
             continue
-        touched = touched.reshape(group.count, -1)
+        touched = places[jnp.asarray(group.bodies)][..., : rates_of(group)].reshape(group.count, -1)
         along = step.system.local_rates.blocks(group.bodies, step.start)
         for kept, given, scale in ((columns, found.columns, -where.h), (rows, found.rows, 1.0)):
             given = along(given, 1) if group.turning else given
@@ -81,14 +81,16 @@ def products(step: Any, twists: Float[Array, "bodies s 6"]) -> tuple[Products | 
 
 
 def _couplings(
-    step: Any, group: Group, h: Array, touched: Int[Array, "n k r"], found: NeighbourTangents
+    step: Any, group: Group, h: Array, places: Int[Array, "bodies r"], found: NeighbourTangents
 ) -> list[NeighbourCouplings]:
     """Of what is near in this step, of each instance; the balances have minus the impulses."""
-    maps = found.across, found.along
+    bodies, maps = bodies_of_elements(group).reshape(group.count, -1), (found.across, found.along)
     if group.turning:
-        along = step.system.local_rates.blocks(group.bodies, step.start)
+        along = step.system.local_rates.blocks(bodies, step.start)
         maps = tuple(along(x, 1) for x in maps)
+    touched = places[jnp.asarray(bodies)][..., : rates_of(group)]
     # What is many is the last axis, so that what is computed is wide.
     across, along = (jnp.transpose(x[:, :, 0], (0, 3, 2, 1)) for x in maps)
-    every = jnp.swapaxes(touched, 1, 2), across, along, found.others, h * found.stiffness
-    return [NeighbourCouplings(*(x[k] for x in every), size=step.unknowns) for k in range(group.count)]
+    every = jnp.swapaxes(touched, 1, 2), across, along, found.pairs, h * found.stiffness
+    each = (jax.tree.map(lambda x, k=k: x[k], every) for k in range(group.count))
+    return [NeighbourCouplings(*given, size=step.unknowns) for given in each]

@@ -3,6 +3,7 @@
 from natcoord_jax.effects.contact.boxes import CornersOnBox as CornersOnBox
 from natcoord_jax.effects.contact.boxes import EdgesOnEdges as EdgesOnEdges
 from natcoord_jax.effects.contact.boxes import SphereOnBox as SphereOnBox
+from natcoord_jax.effects.contact.capsules import CapsuleContacts as CapsuleContacts
 from natcoord_jax.effects.contact.discrete_gap import DiscreteGap as DiscreteGap
 from natcoord_jax.effects.contact.frictional_node import FrictionalNodeOnFacets as FrictionalNodeOnFacets
 from natcoord_jax.effects.contact.frictional_potential import FrictionalGapPotential as FrictionalGapPotential
@@ -17,4 +18,3 @@ from natcoord_jax.effects.contact.pairs import DiscOnPlane as DiscOnPlane
 from natcoord_jax.effects.contact.pairs import EllipsoidOnPlane as EllipsoidOnPlane
 from natcoord_jax.effects.contact.pairs import SphereOnPlane as SphereOnPlane
 from natcoord_jax.effects.contact.pairs import SphereOnSphere as SphereOnSphere
-from natcoord_jax.effects.contact.spheres import SphereContacts as SphereContacts
