@@ -4,6 +4,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from natcoord_jax.maths.elimination import definite_solution
+
 POLISHING = 9
 """Newton-Schulz iterations for the direct rotation of subspaces: enough for cosines from 0.4 on."""
 
@@ -52,3 +54,12 @@ def _nearest_orthogonal_jvp(primals: tuple, tangents: tuple) -> tuple:
         return jax.lax.fori_loop(0, POLISHING, lambda _, x: _polished(x)[0], x)
 
     return nearest_orthogonal(*primals), jax.jvp(every, primals, tangents)[1]
+
+
+def isometric(
+    cosines: Float[Array, "u u"], b0: Float[Array, " u"], b1: Float[Array, " u"]
+) -> tuple[Float[Array, " u"], Float[Array, " u"]]:
+    """U and b_1 - 2 u - K^T u of the isometric kick, see `natcoord_jax.mechanics.kick`."""
+    matrix = jnp.eye(b0.shape[0], dtype=b0.dtype) + 2.0 * cosines + cosines @ cosines.T
+    u = definite_solution(matrix, cosines @ b1 - b0)
+    return u, b1 - 2.0 * u - cosines.T @ u

@@ -13,12 +13,13 @@ from jaxtyping import Array, Float, Int
 
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
+from natcoord_jax.maths.direct_rotation import isometric
 from natcoord_jax.maths.elimination import inverse_cholesky
 from natcoord_jax.maths.vectors import cross
 from natcoord_jax.mechanics.equations_of_motion import loops_of, relations_of, rotors_of
 from natcoord_jax.mechanics.momentum import inertia_alone, weighs_only, wrench
 from natcoord_jax.mechanics.rates import joint_axes
-from natcoord_jax.mechanics.tangent_space import TangentSpace, Velocity, driven, isometric
+from natcoord_jax.mechanics.tangent_space import TangentSpace, Velocity, driven
 from natcoord_jax.model.model import Model
 from natcoord_jax.model.rows import row_rates
 from natcoord_jax.model.tree import SLOTS

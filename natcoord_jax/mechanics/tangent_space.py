@@ -12,8 +12,8 @@ from jaxtyping import Array, Float, Int
 
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
-from natcoord_jax.maths.direct_rotation import direct_rotation
-from natcoord_jax.maths.elimination import definite_solution, inverse_cholesky
+from natcoord_jax.maths.direct_rotation import direct_rotation, isometric
+from natcoord_jax.maths.elimination import inverse_cholesky
 from natcoord_jax.maths.projectors import pseudo_inverse, range_projector
 from natcoord_jax.mechanics.equations_of_motion import Accelerations, EquationsOfMotion
 from natcoord_jax.mechanics.momentum import inertia, spatial_inertia, weighs_only, wrench
@@ -257,15 +257,6 @@ class TangentSpace(eqx.Module):
 
         w = rates(momentum) + self.drift_rates
         return self.spread(w + rates(momentum - self.pulled(self.impulse(self.spread(w)))))
-
-
-def isometric(
-    cosines: Float[Array, "u u"], b0: Float[Array, " u"], b1: Float[Array, " u"]
-) -> tuple[Float[Array, " u"], Float[Array, " u"]]:
-    """U and b_1 - 2 u - K^T u, see `kick`."""
-    matrix = jnp.eye(b0.shape[0], dtype=b0.dtype) + 2.0 * cosines + cosines @ cosines.T
-    u = definite_solution(matrix, cosines @ b1 - b0)
-    return u, b1 - 2.0 * u - cosines.T @ u
 
 
 def rotor_inertias(system: Model) -> Float[Array, " rotors"]:
