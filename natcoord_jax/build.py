@@ -71,6 +71,7 @@ def build(
         directors=compact([k for k, own in enumerate(layout.kinds) if own == DIRECTOR]),
         inequalities=inequalities,
         dofs=len(tree.slot_of) - multipliers + inequalities,
+        clamped=bodies.held,
         shapes=tuple(_drawn(bodies.shapes[k]) for k in layout.order),
     )
     system = System(
