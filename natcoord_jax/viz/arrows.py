@@ -131,8 +131,9 @@ def _touching(effects: Any, places: Any, rows: Any) -> tuple[Any, Any]:
 
 def _touch(group: Group, rows: np.ndarray, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Where some contacts of a group are, and how what is in front of them is pushed (t, n, 3)."""
-    given = jax.tree.map(lambda x: as_array(np.asarray(x)[chosen]), (group.effect, group.weights))
-    place, normal = _touching(*given, as_array(rows[:, np.asarray(group.bodies)[chosen]]))
+    given = group.effect, group.weights
+    effects, places = jax.tree.map(lambda x: as_array(np.asarray(x)[chosen]), given)
+    place, normal = _touching(effects, places, as_array(rows[:, np.asarray(group.bodies)[chosen]]))
     return np.asarray(place), np.asarray(normal)
 
 
