@@ -73,6 +73,7 @@ def build(
         inequalities=inequalities,
         islands=contact_islands(groups, joint_groups, len(layout.ordered_names), coupled),
         dofs=len(tree.slot_of) - multipliers + inequalities,
+        clamped=bodies.held,
         shapes=tuple(_drawn(bodies.shapes[k]) for k in layout.order),
     )
     system = System(

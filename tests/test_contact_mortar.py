@@ -7,6 +7,7 @@ import pytest
 from differences import assert_v_shaped
 
 import natcoord_jax as nc
+from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.effects.contact.segments import segment
 from natcoord_jax.maths.rotations import from_rotation_vector
@@ -62,6 +63,18 @@ def test_derivatives_of_the_gap():
     assert_v_shaped(lever, x, direction, along)
     nearly = jnp.tensordot(jax.jit(lambda x: contact.turned(x))(x), direction, 2)
     assert np.linalg.norm(nearly - along) <= 0.1 * np.linalg.norm(along)
+
+
+@pytest.mark.parametrize("node", [0, 4])
+def test_all_of_the_force_is_shown_at_the_node(node):
+    """Of a flat surface that is covered: along its normal, whole, though the node has a part of it only."""
+    above = np.asarray(FINE.nodes) + (0.3, 0.05, -0.01)
+    contact, x = gap_at(node, np.concatenate([above, np.asarray(COARSE.nodes)]))
+    weights = np.tile(np.eye(4)[0], (len(x), 1))
+    rows = np.concatenate([x[:, None], np.tile(np.eye(3), (len(x), 1, 1))], axis=1)
+    place, push = eager_numpy(lambda w, rows: contact.touch(w, rows))(weights, rows)
+    np.testing.assert_array_equal(place, x[0])
+    np.testing.assert_allclose(push, [0, 0, 1], atol=1e-12)
 
 
 def test_areas():

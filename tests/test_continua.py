@@ -363,3 +363,20 @@ def test_a_clamped_node_is_refused_with_what_to_ask_instead():
     with pytest.raises(ValueError, match="cannot sense 'brick'") as refused:
         system.sense(state, "brick")
     assert "clamped" not in str(refused.value)
+
+
+def test_the_report_counts_what_is_clamped_and_to_what():
+    scene = nc.Scene()
+    hand = scene.add(nc.RigidBody(mass=1.0, inertia=(1.0, 1.0, 1.0), name="hand"))
+    mesh = nc.mesh.rectangle((1, 1), (2, 2))
+    sheet = scene.add(nc.Shell(mesh, thickness=0.01, material=METAL, name="sheet"))
+    scene.add(nc.PointMass(mass=1.0, name="bead"))
+    assert "clamped           none" in scene.compile()[0].report()
+    left = sheet.set("left")
+    scene.add(nc.Clamp(nc.ground, left[:1]))
+    scene.add(nc.Clamp(nc.ground, left[1:]))
+    scene.add(nc.Clamp(hand, sheet.set("right")[:2]))
+    said = scene.compile()[0].report().splitlines()
+    assert "bodies            6 (6 free)" in said
+    named = "3 of 9 nodes of 'sheet nodes' to 'ground', 2 of 9 nodes of 'sheet nodes' to 'hand'"
+    assert f"clamped           {named}" in said

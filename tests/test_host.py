@@ -89,13 +89,92 @@ def test_operations_with_several_results_give_arrays(name):
     assert found and all(isinstance(x, np.ndarray) for x in found)
 
 
-def test_inside_of_transformations_it_is_the_function_itself():
+def test_transformed_it_is_the_function_itself():
     square = eager_numpy(lambda x: jnp.sum(x**2))
     assert at_top_level()
     np.testing.assert_allclose(jax.grad(square)(X), 2 * X)
     np.testing.assert_allclose(jax.jit(square)(X), jnp.sum(X**2))
     np.testing.assert_allclose(jax.vmap(square)(X), jnp.sum(X**2, axis=1))
     assert not jax.jit(lambda x: x * at_top_level())(1.0)
+
+
+@pytest.mark.parametrize("case", sorted({*CASES} - {"by lanes", "taken apart"}))
+def test_lanes_outside_of_programs_are_evaluated_all_at_once(case):
+    """Could go wrong: lanes along another axis, and what is not in lanes; `jax.vmap` in another one, too."""
+    of_two = eager_numpy(lambda x, y: CASES[case](x * y))
+    many, factor = jnp.stack([X, 2 * X, -X], axis=1), jnp.asarray(1.5)
+    expected = jax.jit(jax.vmap(lambda x: CASES[case](x * 1.5), in_axes=1))(many)
+    found = jax.vmap(of_two, in_axes=(1, None))(many, factor)
+    nested = jax.vmap(jax.vmap(of_two, in_axes=(0, None)), in_axes=(None, 0))(X[None], factor[None])
+    one = jax.tree.map(lambda x: x[0, 0], nested)
+    for want, have in zip(jax.tree.leaves(expected), jax.tree.leaves(found), strict=True):
+        assert isinstance(have, jax.Array) and (want.shape, want.dtype) == (have.shape, have.dtype)
+        np.testing.assert_allclose(have, want, rtol=1e-13, atol=1e-14)
+    for want, have in zip(jax.tree.leaves(expected), jax.tree.leaves(one), strict=True):
+        np.testing.assert_allclose(have, want[0], rtol=1e-13, atol=1e-14)
+
+
+def test_derivatives_outside_of_programs_are_programs_as_a_whole(programs):
+    def long(x):
+        for _ in range(5):
+            x = jnp.sin(x[::-1]) * jnp.tanh(x) + x[0]
+        return x.sum()
+
+    given = jnp.asarray(np.linspace(0.1, 0.2, 17))
+    del programs[:]
+    slope = jax.grad(eager_numpy(long))(given)
+    assert len(programs) <= 4, programs
+    np.testing.assert_allclose(slope, jax.jit(jax.grad(long))(given), rtol=1e-12)
+
+
+def test_what_is_closed_over_may_be_traced():
+    """Could go wrong: arguments that are known, or lanes, and a function that reads what is neither."""
+
+    def both(x, y):
+        return jnp.sum(eager_numpy(lambda z: z * x)(y))
+
+    np.testing.assert_allclose(jax.grad(lambda x: both(x, X))(2.0), jnp.sum(X))
+    np.testing.assert_allclose(jax.vmap(lambda x: both(x, X))(X[:, 0]), X[:, 0] * jnp.sum(X), rtol=1e-14)
+    np.testing.assert_allclose(jax.vmap(both)(X[:, 0], X), X[:, 0] * jnp.sum(X, axis=1), rtol=1e-14)
+    slope = jax.grad(lambda x: jnp.sum(jax.vmap(lambda y: both(x, y))(X)))(2.0)
+    np.testing.assert_allclose(slope, jnp.sum(X))
+
+
+def test_a_program_within_lanes_is_a_program():
+    """Could go wrong: values in lanes that a program reads are no lanes there."""
+    square = eager_numpy(lambda x: jnp.sum(x**2))
+    for compiled in jax.jit, nc.jit:
+        found = jax.vmap(lambda x, compiled=compiled: compiled(lambda y: square(x) + y)(1.0))(X)
+        np.testing.assert_allclose(found, jnp.sum(X**2, axis=1) + 1.0)
+    inner = nc.jit(jnp.sin)
+    found = jax.vmap(lambda x: jax.jit(lambda: inner(x))())(X)
+    np.testing.assert_allclose(found, jnp.sin(X), rtol=1e-15)
+
+
+def test_states_in_lanes_compile_next_to_nothing(programs):
+    """Could go wrong: setting a joint in each of some states, one operation after the other."""
+    scene, body = nc.Scene(), nc.ground
+    for k in range(5):
+        link = nc.RigidBody(mass=1.0, inertia=(1.0, 2.0, 2.5), position=(k, 0.0, 0.0))
+        child = scene.add(link)
+        scene.add(nc.Revolute(body, child, point=(k - 0.5, 0, 0), axis=(0, 1, 0), name=f"hinge {k}"))
+        body = child
+    system, state = scene.compile()
+    angles = jnp.asarray(np.linspace(0.0, 1.0, 9))
+
+    def posed(angle):
+        return system.with_coordinate(state, "hinge 1", angle, rate=2.0)
+
+    del programs[:]
+    states = jax.vmap(posed)(angles)
+    energy = jax.vmap(system.energy)(states).total
+    assert len(programs) <= 30, programs
+    before = len(programs)
+    jax.grad(lambda angle: system.energy(posed(angle)).total)(0.3)
+    assert len(programs) - before <= 12, programs[before:]
+    for have, want in zip(jax.tree.leaves(states), jax.tree.leaves(jax.jit(jax.vmap(posed))(angles))):
+        np.testing.assert_allclose(have, want, rtol=1e-12, atol=1e-13)
+    np.testing.assert_allclose(energy[3], system.energy(posed(angles[3])).total, rtol=1e-12)
 
 
 def test_numbers_of_python_are_no_arrays():

@@ -1,6 +1,7 @@
 """The view in three dimensions: what is in its file, and what a browser makes of it."""
 
 import base64
+import dataclasses
 import json
 import re
 import shutil
@@ -14,12 +15,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 import natcoord_jax as nc
 from natcoord_jax import gallery
 from natcoord_jax.viz import motion
 from natcoord_jax.viz.packed import Blob, triangles
 from natcoord_jax.viz.scenery import PALETTE
+from natcoord_jax.viz.stage import Stage
 
 CHROMIUM = next((p for p in ("chromium", "chromium-browser", "google-chrome") if shutil.which(p)), None)
 FLAGS = (
@@ -165,6 +168,84 @@ def test_gaps_of_a_contact_have_one_arrow():
     [force] = [s for s in shown.solids if s.kind == "force"]
     assert force.name == "floor" and force.rows[3, 3, 2] > 0
     np.testing.assert_allclose(force.rows[1:, 0, :2], 0.5, atol=1e-9)
+
+
+def momentum(system, trajectory, body):
+    """Of the nodes of a solid (t, 3), without what is clamped."""
+    nodes = [k for k, name in enumerate(system.structure.bodies) if name.startswith(body)]
+    mass = np.asarray(system.mass)[nodes, 0, 0]
+    return np.einsum("n,tnx->tx", mass, np.asarray(trajectory.states.row_rates)[:, nodes, 0])
+
+
+@pytest.mark.slow
+def test_nodes_on_surfaces_have_arrows_that_are_the_force_together(monkeypatch):
+    """A block falls flat on another: what changes its momentum, on four nodes, and the strongest of them."""
+    scene, rubber = nc.Scene(), nc.Elastic(E=1e4, nu=0.3, density=1.0)
+    given = {"material": rubber, "velocity": (0, 0, -2.0), "position": (0.3, 0.2, 1.001)}
+    upper = scene.add(nc.Solid(nc.mesh.box((1, 0.8, 1), (1, 1, 1)), **given, name="upper"))
+    lower = scene.add(nc.Solid(nc.mesh.box((2, 2, 1), (1, 1, 1)), material=rubber, name="lower"))
+    contact = nc.Contact(upper.face("z0"), lower.face("z1"), one_pass=True, name="impact")
+    scene.add(contact)
+    system, state = scene.compile()
+    trajectory = nc.simulate(system, state, dt=2e-3, steps=12)
+    phases, times = nc.Phases((system,), (trajectory,)), np.asarray(trajectory.t)
+    largest = nc.contacts(system, trajectory).force.max()
+
+    def arrows():
+        return [s for s in motion.scenery_at(phases, times).solids if s.kind == "force"]
+
+    shown = arrows()
+    assert [s.name for s in shown] == ["impact"] * 4
+    rows = np.stack([s.rows for s in shown])[:, 1:]
+    there = np.isfinite(rows).all(axis=(2, 3))
+    long = np.linalg.norm(rows[:, :, 3], axis=-1)
+    found = np.nan_to_num(rows[:, :, 3]).sum(axis=0) * largest / long[there].max()
+    wanted = np.diff(momentum(system, trajectory, "upper"), axis=0) / 2e-3
+    assert wanted[:, 2].max() > 10.0 and there.any(axis=0).sum() > 5
+    np.testing.assert_allclose(found, wanted, atol=0.01 * wanted.max())
+    nodes = np.asarray(trajectory.states.rows)[1:, :, 0]
+    apart = np.linalg.norm(nodes - rows[:, :, None, 0], axis=-1).min(axis=2)
+    assert apart[there].max() < 1e-12, "an arrow that begins at no node"
+    assert np.all(np.linalg.norm(rows[:, :, 1], axis=-1)[there] < 0.21 * long[there]), "discs"
+    monkeypatch.setattr("natcoord_jax.viz.arrows.STRONGEST", 2)
+    strongest = np.sort(np.nanmax(long, axis=1))[-2:]
+    kept = [np.nanmax(np.linalg.norm(s.rows[:, 3], axis=1)) for s in arrows()]
+    np.testing.assert_allclose(np.sort(kept), strongest, rtol=1e-12)
+
+
+def test_forces_are_drawn_over_what_they_are_inside_of(sheet):
+    """Could go wrong: one list of faces, in which those of a body hide the force of a contact below it."""
+    system, trajectory = sheet
+    shown = motion.scenery_at(nc.Phases((system,), (trajectory,)), np.asarray(trajectory.t))
+    stage = Stage(Figure().add_subplot(projection="3d"), shown)
+    stage.show(0)
+    bodies, forces = stage.drawn
+    assert forces.get_zorder() > bodies.get_zorder()
+    count = sum(len(face) // 2 for s in shown.solids if s.kind == "force" for face in s.faces)
+    assert 0 < len(stage.layers[1].at(0)[0]) <= count
+
+
+def test_a_run_without_the_contacts_of_others_is_shown_with_them(tmp_path):
+    """Could go wrong: forces that act in one run of a batch, taken for those of another one."""
+    scene = nc.Scene()
+    scene.add(nc.Gravity())
+    ball = nc.RigidBody(shape=nc.Sphere(0.1), density=400.0, position=(0, 0, 0.5), name="ball")
+    scene.add(nc.Contact(scene.add(ball), nc.Plane(), restitution=0.5, name="floor"))
+    system, state = scene.compile()
+    heights = jnp.array([5.0, 0.3])
+
+    def run(height):
+        moved = dataclasses.replace(state, q=state.q.at[0, 2].set(height))
+        return nc.simulate(system, moved, dt=0.01, steps=40)
+
+    trajectory = jax.vmap(run)(heights)
+    for k, order in enumerate(([0, 1], [1, 0])):
+        both = jax.tree.map(lambda x, order=order: x[jnp.array(order)], trajectory)
+        nc.view(system, both, file=tmp_path / "a.html")
+        shown, data = scene_of((tmp_path / "a.html").read_text("utf-8"))
+        [force] = [s for s in shown["solids"] if s["kind"] == "force"]
+        rows = numbers(data, force["rows"]).reshape(2, -1, 12)
+        assert np.isnan(rows[k]).all() and np.isfinite(rows[1 - k]).any()
 
 
 def test_values_of_elements_that_are_handed_over(sheet, tmp_path):

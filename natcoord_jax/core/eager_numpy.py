@@ -2,11 +2,13 @@
 
 An operation of JAX that is called from Python is a program of its own, which takes tens of milliseconds to
 compile for every new shape, and setting up a scene needs hundreds of them. What `eager_numpy` wraps is traced
-instead, and its operations are evaluated by NumPy one after the other. Inside of a transformation
-it is the function itself, so that there is one formulation only.
+instead, and its operations are evaluated by NumPy one after the other, those of all lanes of `jax.vmap` at
+once. Where a derivative is taken it is compiled as a whole. Inside of a program it is the function itself, so
+that there is one formulation only.
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from functools import wraps
 from typing import Any, TypeVar
 
@@ -18,6 +20,7 @@ import numpy as np
 from natcoord_jax.core.checks import as_array, at_top_level
 from natcoord_jax.core.closures import with_callables
 from natcoord_jax.xla.evaluation import ClosedJaxpr, evaluate, numbers_made
+from natcoord_jax.xla.tracing import at_once, in_lanes, in_program, is_concrete, jaxpr_as_fun
 
 REMEMBERED = 256
 """Programs of one function that are kept."""
@@ -32,7 +35,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 
 def eager_numpy(function: F) -> F:
-    """The function, evaluated by NumPy where nothing is being traced, and compiled where they are large.
+    """The function, evaluated by NumPy outside of programs, and compiled where arrays are large.
 
     Args:
         function: of pytrees, pure and without checks of values (traced, it sees none). Arrays are numbers
@@ -49,40 +52,72 @@ def eager_numpy(function: F) -> F:
         >>> float(eager_numpy(lambda x: jnp.sum(x**2))(jnp.array([3.0, 4.0])))
         25.0
     """
-    programs: dict[Any, tuple[ClosedJaxpr, Any]] = {}
-    compiled = eqx.filter_jit(function)
-
-    def run(*arguments: Any) -> Any:
-        leaves, structure = jax.tree.flatten(arguments)
-        given, rest = [x for x in leaves if _is_array(x)], [x for x in leaves if not _is_array(x)]
-        if not at_top_level(leaves) or not all(map(_is_numeric, given)):
-            return function(*arguments)
-        # What is no array and no plain value may have changed since: a function by what it reads.
-        lasting = all(isinstance(x, PLAIN) for x in rest)
-        if lasting and sum(x.size for x in given) > LARGE:
-            return compiled(*arguments)
-        arrays = [np.asarray(x) for x in given]
-        # The representation tells 0.0 from -0.0, and 1 from True.
-        key = structure, *((x.shape, x.dtype) if _is_array(x) else repr(x) for x in leaves)
-        traced = programs.get(key) if lasting else None
-        if traced is None:
-            traced = _traced(function, leaves, structure)
-            if len(programs) >= REMEMBERED:
-                programs.clear()
-            if lasting:
-                programs[key] = traced
-        program, made = traced
-        if lasting and numbers_made(program) > MUCH:
-            return compiled(*arguments)
-        with np.errstate(all="ignore"):
-            found = evaluate(program, arrays)
-        return jax.tree.unflatten(made, [as_array(x) for x in found])
+    run = _evaluated(function)
 
     @wraps(function)
     def call(*arguments: Any) -> Any:
         return with_callables(function, run, arguments)
 
     return call  # pyright: ignore[reportReturnType]
+
+
+def _evaluated(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The same, of arguments without callables."""
+    known: dict[Any, Traced] = {}
+    compiled = eqx.filter_jit(function)
+
+    def run(*arguments: Any) -> Any:
+        leaves, structure = jax.tree.flatten(arguments)
+        given, rest = [x for x in leaves if _is_array(x)], [x for x in leaves if not _is_array(x)]
+        if in_program(leaves) or not all(map(_is_numeric, given)):
+            return function(*arguments)
+        # What is no array and no plain value may have changed since: a function by what it reads.
+        lasting, concrete = all(isinstance(x, PLAIN) for x in rest), is_concrete(given)
+        if not concrete and not in_lanes(given):
+            return compiled(*arguments) if lasting else function(*arguments)
+        if lasting and concrete and sum(x.size for x in given) > LARGE:
+            return compiled(*arguments)
+        # The representation tells 0.0 from -0.0, and 1 from True.
+        key = structure, *((x.shape, x.dtype) if _is_array(x) else repr(x) for x in leaves)
+        traced = known.get(key) if lasting else None
+        if traced is None:
+            traced = _traced(function, leaves, structure)
+            if not is_concrete(traced.program.consts):  # (What it closes over is being traced.)
+                return function(*arguments)
+            if len(known) >= REMEMBERED:
+                known.clear()
+            if lasting:
+                known[key] = traced
+        if not concrete:
+            return jax.tree.unflatten(traced.structure, at_once(traced.in_lanes, given))
+        if lasting and numbers_made(traced.program) > MUCH:
+            return compiled(*arguments)
+        with np.errstate(all="ignore"):
+            found = evaluate(traced.program, [np.asarray(x) for x in given])
+        return jax.tree.unflatten(traced.structure, [as_array(x) for x in found])
+
+    return run
+
+
+@dataclass
+class Traced:
+    """The program of a function.
+
+    Attributes:
+        program: of the arrays among the arguments.
+        structure: of what the function gives.
+        of_lanes: functions of all lanes, by the axis that these are along in each array.
+    """
+
+    program: ClosedJaxpr
+    structure: Any
+    of_lanes: dict[tuple, Callable[..., Any]] = field(default_factory=dict)
+
+    def in_lanes(self, arrays: Sequence[Any], axes: tuple) -> list[Any]:
+        """What it gives in all lanes of `jax.vmap`."""
+        if axes not in self.of_lanes:
+            self.of_lanes[axes] = _evaluated(jax.vmap(jaxpr_as_fun(self.program), in_axes=axes))
+        return self.of_lanes[axes](*arrays)
 
 
 def stacked(items: Sequence[Any]) -> Any:
@@ -105,14 +140,12 @@ def _is_numeric(array: Any) -> bool:
     return jnp.issubdtype(array.dtype, np.number) or jnp.issubdtype(array.dtype, np.bool_)
 
 
-def _traced(function: Callable[..., Any], leaves: list[Any], structure: Any) -> tuple[ClosedJaxpr, Any]:
-    """Program of the arrays among the leaves, and the structure of what it gives."""
-
+def _traced(function: Callable[..., Any], leaves: list[Any], structure: Any) -> Traced:
     def of_arrays(*given: Any) -> Any:
         rest = iter(given)
         every = [next(rest) if _is_array(x) else x for x in leaves]
         return function(*jax.tree.unflatten(structure, every))
 
-    arrays = [np.asarray(x) for x in leaves if _is_array(x)]
+    arrays = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in leaves if _is_array(x)]
     program, shapes = jax.make_jaxpr(of_arrays, return_shape=True)(*arrays)
-    return program, jax.tree.structure(shapes)
+    return Traced(program, jax.tree.structure(shapes))

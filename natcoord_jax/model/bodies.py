@@ -85,6 +85,15 @@ class Bodies:
         """Names of the sets of which nodes are clamped."""
         return sorted({clamp.nodes.name for clamp in self._clamps})
 
+    @property
+    def held(self) -> tuple[tuple[str, str, int, int], ...]:
+        """Names of a set and of what nodes of it are clamped to, how many these are, and of how many."""
+        counts: dict[tuple[str, str], int] = {}
+        for clamp in self._clamps:
+            pair = clamp.nodes.name, clamp.body.name
+            counts[pair] = counts.get(pair, 0) + len(clamp.nodes)
+        return tuple((*pair, n, len(self._sets[pair[0]].position)) for pair, n in counts.items())
+
     def node_masses(self, name: str, numbers: np.ndarray) -> Array:
         """Mass blocks of some nodes of a set."""
         return picked(self._sets[name].mass_blocks, numbers)

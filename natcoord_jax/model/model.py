@@ -40,6 +40,7 @@ class Structure:
         rank: structural rank of the constraints outside the tree where some are redundant, else None.
         points: numbers of the bodies that are point masses, without orientation.
         directors: numbers of the nodes with one director.
+        clamped: of nodes that are clamped, set and body by name, how many they are, and of how many.
         redundant: names of joints and relations whose constraints depend on the others.
         notes: findings of the compilation for the report.
         shapes: what to draw of the bodies, in their order; None: what has their inertia.
@@ -61,6 +62,7 @@ class Structure:
     inequalities: int = 0
     islands: Islands = ()
     dofs: int = field(default=0, compare=False)
+    clamped: tuple[tuple[str, str, int, int], ...] = field(default=(), compare=False)
     redundant: tuple[str, ...] = field(default=(), compare=False)
     notes: tuple[str, ...] = field(default=(), compare=False)
     shapes: tuple[Any, ...] = field(default=(), compare=False, repr=False)

@@ -17,7 +17,7 @@ def _count(names: Counter) -> str:
 
 
 def report(system: Model) -> str:
-    """Contents, unknowns before and after reduction, the solver and why, redundant joints, warnings."""
+    """Contents, what is clamped, unknowns before and after reduction, the solver and why, warnings."""
     structure = system.structure
     bodies = len(structure.bodies)
     joints, loops = Counter(), Counter()
@@ -30,8 +30,10 @@ def report(system: Model) -> str:
     tree = sum(g.count * g.multipliers for g in system.joints if g.in_tree)
     natural = 12 * bodies - 9 * len(structure.points) - 6 * len(structure.directors)
     plan = f", {system.sparsity.plan.name}" if system.sparsity is not None else ""
+    held = [f"{n} of {every} nodes of {name!r} to {owner!r}" for name, owner, n, every in structure.clamped]
     lines = [
         f"bodies            {bodies} ({free} free)",
+        f"clamped           {', '.join(held) or 'none'}",
         f"joints, tree      {_count(joints)}",
         f"joints, loops     {_count(loops)}",
         f"effects           {_count(effects)}",

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from natcoord_jax.analysis.contacts import contacts, touching
+from natcoord_jax.core.checks import as_array
 from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.force import Force
 from natcoord_jax.core.state import State, Trajectory
@@ -29,6 +30,10 @@ NOTHING = 1e-6
 """What is less than this, relative to the largest of its kind, is not drawn."""
 
 
+STRONGEST = 24
+"""Arrows of a contact of surfaces."""
+
+
 class Acting(NamedTuple):
     """A force [N] or a torque [N m] at a place [m], each (t, 3)."""
 
@@ -46,7 +51,8 @@ def _drawn(acting: Sequence[Acting], scale: float, colour: Colour, *, turning: b
     for (name, place, vector), size in zip(acting, sizes):
         if size > NOTHING * largest:
             along = (WIDEST if turning else LONGEST) * scale / largest * vector
-            wide = np.linalg.norm(along, axis=1, keepdims=True) if turning else 0.014 * scale
+            long = np.linalg.norm(along, axis=1, keepdims=True)
+            wide = long if turning else np.minimum(0.014 * scale, 0.2 * long)
             rows = frame_along(place, along, wide)
             found.append(Solid(name, "force", points, faces, rows, colour, np.ones(len(faces)), rigid=False))
     return found
@@ -117,34 +123,66 @@ def loads(system: System, states: State, rows: np.ndarray, inputs: np.ndarray, s
     return _drawn(forces, scale, RED) + _drawn(torques, scale, RED, turning=True)
 
 
-def _touch(group: Group, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where the contacts of a group are, and how their second bodies are pushed (t, n, 3)."""
+@eager_numpy
+def _touching(effects: Any, places: Any, rows: Any) -> tuple[Any, Any]:
     each = jax.vmap(lambda effect, place, rows: effect.touch(place, rows))
-    along = jax.vmap(lambda rows: each(group.effect, group.weights, rows))
-    place, normal = eager_numpy(along)(jnp.asarray(rows[:, np.asarray(group.bodies)]))
+    return jax.vmap(lambda rows: each(effects, places, rows))(rows)
+
+
+def _touch(group: Group, rows: np.ndarray, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where some contacts of a group are, and how what is in front of them is pushed (t, n, 3)."""
+    given = group.effect, group.weights
+    effects, places = jax.tree.map(lambda x: as_array(np.asarray(x)[chosen]), given)
+    place, normal = _touching(effects, places, as_array(rows[:, np.asarray(group.bodies)[chosen]]))
     return np.asarray(place), np.asarray(normal)
+
+
+def _of_surfaces(group: Group, names: np.ndarray, force: np.ndarray, rows: np.ndarray) -> list[Acting]:
+    """The strongest nodes on surfaces: passes push against each other, so that a sum would be none."""
+    found, most = [], force.max(axis=0)
+    for name in dict.fromkeys(names.tolist()):
+        own = np.flatnonzero((names == name) & (most > 0))
+        chosen = own[np.argsort(-most[own], kind="stable")[:STRONGEST]]
+        if chosen.size:
+            places, normals = _touch(group, rows, chosen)
+            acting = force[:, chosen, None] * normals
+            found += [Acting(name, places[:, k], acting[:, k]) for k in range(chosen.size)]
+    return found
+
+
+def _of_gaps(names: np.ndarray, force: np.ndarray, places: np.ndarray, normals: np.ndarray) -> list[Acting]:
+    """Of several gaps of a contact their sum, at its middle."""
+    acting = []
+    for name in dict.fromkeys(names.tolist()):
+        own = force[:, names == name, None]
+        total = own.sum(axis=1)
+        middle = (own * places[:, names == name]).sum(axis=1) / np.where(total > 0, total, np.nan)
+        acting.append(Acting(name, middle, (own * normals[:, names == name]).sum(axis=1)))
+    return acting
 
 
 def pushes(
     system: System, trajectory: Trajectory, saved: np.ndarray, rows: np.ndarray, scale: float
 ) -> list[Solid]:
-    """Normal forces of contacts, on average over the step before; of several gaps their sum at its middle."""
+    """Normal forces of contacts, on average over the step before; of surfaces they are on nodes."""
     groups = touching(system)
     unknown = trajectory.states.contacts is None and any(g.effect.unilateral for g in groups)
-    # Gaps of surfaces are searched for among facets, for thousands of nodes: a film would wait for that.
-    surfaces = any(isinstance(g.effect, DiscreteGap) for g in groups)
-    if not groups or len(trajectory) < 2 or unknown or surfaces:
+    if not groups or len(trajectory) < 2 or unknown:
         return []
     steps = np.maximum(saved, 1)[:, None] + np.array([-1, 0])
     pairs = dataclasses.replace(trajectory, states=jax.tree.map(lambda x: x[steps], trajectory.states))
     found = contacts(system, pairs)
-    places, normals = (np.concatenate(x, axis=1) for x in zip(*(_touch(group, rows) for group in groups)))
     # Gaps of a contact that has several are called "name[0]" and so on.
     owners = np.array([name.rpartition("[")[0] if name.endswith("]") else name for name in found.names])
-    acting = []
-    for name in dict.fromkeys(owners.tolist()):
-        force = found.force[:, 0, owners == name, None]
-        total = force.sum(axis=1)
-        middle = (force * places[:, owners == name]).sum(axis=1) / np.where(total > 0, total, np.nan)
-        acting.append(Acting(name, middle, (force * normals[:, owners == name]).sum(axis=1)))
+    ends = np.cumsum([group.count for group in groups])
+    acting, others = [], []
+    for group, some in zip(groups, np.split(np.arange(len(owners)), ends[:-1])):
+        if isinstance(group.effect, DiscreteGap):
+            acting += _of_surfaces(group, owners[some], found.force[:, 0, some], rows)
+        else:
+            others.append((some, *_touch(group, rows, np.arange(group.count))))
+    if others:
+        chosen = np.concatenate([some for some, *_ in others])
+        places, normals = (np.concatenate(x, axis=1) for x in list(zip(*others))[1:])
+        acting = _of_gaps(owners[chosen], found.force[:, 0, chosen], places, normals) + acting
     return _drawn(acting, scale, GREEN)

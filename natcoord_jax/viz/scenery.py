@@ -189,6 +189,27 @@ def joined(parts: Sequence[Scenery]) -> Scenery:
     return Scenery(times, solids, skins, traces, parts[0].up, min(heights, default=None), parts[0].title)
 
 
+def matched(runs: Sequence[Scenery]) -> list[Scenery]:
+    """Runs of a batch with the same parts: what one lacks, as a force that never acts, is not there."""
+    solids = [_filled(same) for same in _alike(runs, lambda run: run.solids)]
+    skins = [_filled(same) for same in _alike(runs, lambda run: run.skins)]
+    return [
+        run._replace(solids=[same[k] for same in solids], skins=[same[k] for same in skins])
+        for k, run in enumerate(runs)
+    ]
+
+
+def _filled(same: list) -> list:
+    """With what is missing at all times instead of None."""
+    first = _first(same)
+    nowhere = {
+        name: np.full_like(getattr(first, name), np.nan)
+        for name in (("rows",) if isinstance(first, Solid) else ("points", "values"))
+        if getattr(first, name) is not None
+    }
+    return [first._replace(**nowhere) if one is None else one for one in same]
+
+
 def _joined_skin(same: list[Skin | None], counts: list[int]) -> Skin:
     first = _first(same)
     values = None

@@ -22,8 +22,8 @@ class Faces:
     One collection draws them all: matplotlib sorts faces by distance within one, not across several.
     """
 
-    def __init__(self, scenery: Scenery):
-        self.scenery, eye = scenery, scenery.eye()
+    def __init__(self, scenery: Scenery, eye: np.ndarray):
+        self.scenery = scenery
         light = eye + 0.7 * scenery.up + 0.4 * np.cross(scenery.up, eye)
         self.light = light / np.linalg.norm(light)
         start, faces, colours, edges = 0, [np.zeros((0, 4), int)], [np.zeros((0, 4))], [np.zeros(0, bool)]
@@ -86,9 +86,13 @@ class Stage:
     def __init__(self, axes: Any, scenery: Scenery, *, labelled: bool = True, zoom: float = 1.0):
         self.axes, self.scenery = axes, scenery
         self.order = list(_axes_of(scenery.up))
-        self.faces = Faces(scenery)
         axes.computed_zorder = False
-        eye = scenery.eye()[self.order]
+        eye = scenery.eye()
+        # Forces are drawn over all else, as in views: those of contacts are between bodies, or inside.
+        forces = [s for s in scenery.solids if s.kind == "force"]
+        bodies = scenery._replace(solids=[s for s in scenery.solids if s.kind != "force"])
+        self.layers = [Faces(bodies, eye), Faces(scenery._replace(solids=forces, skins=[]), eye)]
+        eye = eye[self.order]
         axes.set_proj_type("persp", focal_length=1.6)
         self._fit(zoom)
         axes.view_init(np.degrees(np.arcsin(eye[2])), np.degrees(np.arctan2(eye[1], eye[0])))
@@ -108,7 +112,10 @@ class Stage:
             axes.add_collection3d(self.lattice)
             axes.grid(False)
         self._look_at(0)
-        self.solid = axes.add_collection3d(Poly3DCollection([np.zeros((3, 3))], linewidths=0.3, zorder=2))
+        self.drawn = [
+            axes.add_collection3d(Poly3DCollection([np.zeros((3, 3))], linewidths=0.3, zorder=2 + 2 * k))
+            for k in range(len(self.layers))
+        ]
         self.lines = [
             axes.plot([], [], [], color=trace.colour, linewidth=1.0, zorder=3)[0] for trace in scenery.traces
         ]
@@ -152,10 +159,11 @@ class Stage:
         """Move everything to a picture of the scenery."""
         if self.travels:
             self._look_at(frame)
-        corners, colours, edges = self.faces.at(frame)
-        self.solid.set_verts(corners[:, :, self.order] if len(corners) else np.zeros((1, 3, 3)))
-        self.solid.set_facecolor(colours)
-        self.solid.set_edgecolor(edges)
+        for faces, drawn in zip(self.layers, self.drawn):
+            corners, colours, edges = faces.at(frame)
+            drawn.set_verts(corners[:, :, self.order] if len(corners) else np.zeros((1, 3, 3)))
+            drawn.set_facecolor(colours)
+            drawn.set_edgecolor(edges)
         for line, trace in zip(self.lines, self.scenery.traces):
             line.set_data_3d(*trace.points[: frame + 1, self.order].T)
         time = caption.format(self.scenery.t[frame])

@@ -39,7 +39,7 @@ from natcoord_jax.viz.motion import (
     title_of,
 )
 from natcoord_jax.viz.packed import bytes_of_a_picture, page
-from natcoord_jax.viz.scenery import Scenery
+from natcoord_jax.viz.scenery import Scenery, matched
 from natcoord_jax.viz.skins import Colouring
 
 LIMIT = 2_900_000
@@ -75,7 +75,7 @@ def _sceneries(phases: Phases, count: int, options: Mapping[str, Any]) -> list[S
     runs = runs_of(phases)
     # Runs may differ in their ends: all are shown over the times of the longest, and rest at their own ends.
     times = even_times(longest_of(runs), count)
-    return [scenery_at(run, times, **options)._replace(t=times) for run in runs]
+    return matched([scenery_at(run, times, **options)._replace(t=times) for run in runs])
 
 
 def _page(phases: Phases, follow: str, pace: float, limit: int, options: Mapping[str, Any]) -> str:
@@ -153,9 +153,9 @@ def view(
 
     Bodies have their shapes, or the plainest solid with their inertia, with arms to their joints; joints have
     their axes; springs are coils; loads and motors are red arrows, which turn where they are torques, normal
-    forces of contacts green ones; beams are swept with their section. There is a ground where there is
-    gravity. In a notebook the view is shown where it is returned; from a script it is written to a
-    file, which the browser opens if there is a display.
+    forces of contacts green ones, of surfaces on their nodes; beams are swept with their section. There is a
+    ground where there is gravity. In a notebook the view is shown where it is returned; from a script it is
+    written to a file, which the browser opens if there is a display.
 
     Args:
         system: compiled system; or a motion in phases or a solution of an optimal control problem, which need

@@ -17,12 +17,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import export
-from jax.extend.core import Primitive
-from jax.interpreters import batching
 
 from natcoord_jax.xla.elsewhere import Compilation, elsewhere
 from natcoord_jax.xla.kernels import without_kernels
-from natcoord_jax.xla.tracing import at_top_level, in_lanes
+from natcoord_jax.xla.tracing import at_once, at_top_level, in_lanes
 from natcoord_jax.xla.waiting import told
 
 Effort = Literal["tiers", "quick", "full"]
@@ -207,19 +205,7 @@ class Programs:
             made.append(rest)
             return found
 
-        return _lanes.bind(*kept, every=every), made[0]
-
-
-_lanes = Primitive("lanes")
-_lanes.multiple_results = True
-
-
-def _all_lanes(arrays: Sequence[Any], axes: Sequence[Any], *, every: Callable) -> tuple[list, list]:
-    found = every(arrays, tuple(axes))
-    return found, [0] * len(found)
-
-
-batching.primitive_batchers[_lanes] = _all_lanes
+        return at_once(every, kept), made[0]
 
 
 _every: weakref.WeakSet[Programs] = weakref.WeakSet()

@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer, eval_context
-from jax.extend.core import get_opaque_trace_state, jaxpr_as_fun
-from jax.interpreters import partial_eval
+from jax.extend.core import Primitive, get_opaque_trace_state, jaxpr_as_fun
+from jax.interpreters import batching, partial_eval
 
 
 def is_concrete(*values: Any) -> bool:
@@ -28,6 +28,29 @@ def at_top_level(*values: Any) -> bool:
 
 
 @cache
+def _making() -> type:
+    """The class of traces that make a program."""
+    found: list[type] = []
+    with eval_context():
+        jax.make_jaxpr(lambda x: found.append(type(x._trace)))(np.zeros(()))
+    return found[0]
+
+
+def in_program(*values: Any) -> bool:
+    """Whether a program is being made, of the values or around; `jax.vmap` and `jax.grad` alone make none.
+
+    Within these each operation is a program of its own.
+    """
+    tracers = [x for x in jax.tree.leaves(values) if isinstance(x, Tracer)]
+    for trace in (get_opaque_trace_state()._trace_ref(), *(x._trace for x in tracers)):
+        while trace is not None:
+            if isinstance(trace, _making()):
+                return True
+            trace = getattr(trace, "parent_trace", None)
+    return False
+
+
+@cache
 def _lane() -> tuple[type, Any]:
     """The class of values within `jax.vmap`, and what an axis without a name is called there."""
     found: list[Any] = []
@@ -38,12 +61,39 @@ def _lane() -> tuple[type, Any]:
 
 def in_lanes(values: Sequence[Any]) -> bool:
     """Whether some values are lanes of `jax.vmap` without a name, and nothing else is done with any."""
+    return not in_program(values) and _are_lanes(values)
+
+
+def _are_lanes(values: Sequence[Any]) -> bool:
     if is_concrete(values):
         return False
     kind, unnamed = _lane()
     lanes = [isinstance(x, kind) and x._trace.axis_data.name is unnamed for x in values]
     inner = [x.val if lane else x for x, lane in zip(values, lanes)]
-    return any(lanes) and (is_concrete(inner) or in_lanes(inner))
+    return any(lanes) and (is_concrete(inner) or _are_lanes(inner))
+
+
+def at_once(function: Callable[[Sequence[Any], tuple], Sequence[Any]], values: Sequence[Any]) -> list[Any]:
+    """What a function gives for all lanes of some values at once, where they are `in_lanes`.
+
+    Args:
+        function: of the values with all lanes, and of the axis of these in each, to arrays with lanes along
+            the first axis.
+        values: arrays, some of them in lanes.
+    """
+    return _at_once.bind(*values, function=function)
+
+
+_at_once = Primitive("at_once")
+_at_once.multiple_results = True
+
+
+def _of_all(values: Sequence[Any], axes: Sequence[Any], *, function: Callable) -> tuple[list, list]:
+    found = list(function(values, tuple(axes)))
+    return found, [0] * len(found)
+
+
+batching.primitive_batchers[_at_once] = _of_all
 
 
 def traced_once(function: Callable, *examples: Any) -> tuple[Callable, Any]:

@@ -84,6 +84,11 @@ class DiscreteGap(ContactLaw):
         """Distance of the surfaces, negative where they overlap [m]."""
         return self.measured(x).gap
 
+    def touch(self, place: Array, rows: Array) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+        """Its first point [m], and the force on the side of that by the force of the law [-]."""
+        x = place_markers(place, rows)
+        return x[0], self.measured(x).lever[0]
+
     def assembled_at(self, x: Float[Array, "k 3"]) -> "DiscreteGap":
         """With its damping, and the gap that it starts with in terms of the size of all."""
         size = jnp.sqrt(jnp.max(jnp.sum((x - x[0]) ** 2, axis=1)))

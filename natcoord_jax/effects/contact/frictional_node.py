@@ -74,11 +74,6 @@ class FrictionalNodeOnFacets(NodeOnFacets):
         x = place_markers(place, rows)
         return on_rows(place, jax.jacrev(lambda v: self.slip(x, v))(jnp.zeros_like(x)))
 
-    def touch(self, place: Array, rows: Array) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
-        """The node [m], and the direction in which it is pushed."""
-        x = place_markers(place, rows)
-        return x[0], unit(self.measured(x).lever[0])
-
     def slip(self, x: Float[Array, "k 3"], rates: Float[Array, "k 3"]) -> Float[Array, "3"]:
         """Velocity with which the node slips on the nearest facet [m/s]."""
         facets = jnp.asarray(self.facets).astype(int)

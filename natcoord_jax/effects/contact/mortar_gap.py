@@ -92,6 +92,12 @@ class MortarGap(DiscreteGap):
         """The mean gap, its derivative, and all nodes."""
         return Measured(*jax.value_and_grad(self._mean)(x), jnp.arange(len(x)))
 
+    def touch(self, place: Array, rows: Array) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+        """The node [m], and the force on the corners of the facets at it by the force of the law [-]."""
+        x = place_markers(place, rows)
+        own = jnp.zeros(len(x)).at[self._numbers()[0].reshape(-1)].set(1.0)
+        return x[0], own @ self.measured(x).lever
+
     def turned(self, x: Float[Array, "k 3"]) -> Float[Array, "k 3 k 3"]:
         """Second derivatives of the gap: of pairs of facets by their own corners, with few points."""
         own, of, other, ends = self._numbers()
