@@ -142,7 +142,7 @@ def test_a_cloud_keeps_what_it_should():
     assert stored.max() > 0.05 * np.asarray(system.energy(trajectory).kinetic).max()
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_derivatives_and_lanes():
     """Where they are after collisions by how fast one of them is, in both modes and in a batch."""
     system, state = links(5, capacity=4)
