@@ -8,7 +8,7 @@ REASONS = {
     "reduced": "few unknowns: joint null space along the tree, one dense matrix kept over many steps",
     "recursive": "a large open tree: joint null space, eliminated recursively from leaves to root",
     "sparse": "many loops or couplings: six rates a body, all multipliers, one sparse matrix",
-    "full": "loops or couplings across a large tree: six rates a body, all multipliers, one dense matrix",
+    "full": "loops, or couplings across a tree: six rates a body, all multipliers, one dense matrix",
 }
 
 

@@ -1,6 +1,7 @@
 """The store of a sweep: a group of Zarr arrays, with a row for every variant."""
 
 import json
+import math
 import os
 import time
 from collections import Counter
@@ -77,6 +78,10 @@ class Sweep:
         self.grid = Grid(axes, tuple(about["buckets"]), int(about["block"]))
         self.names: list[str] = list(about["names"])
         self.about = about
+
+    def __repr__(self) -> str:
+        done, rows = int(self.done.sum()), math.prod(self.shape)
+        return f"<sweep: {done} of {rows} rows done, axes of {self.shape}; {', '.join(self.names)}>"
 
     @property
     def shape(self) -> tuple[int, ...]:
