@@ -36,7 +36,7 @@ def started(*command, **env):
 def is_whole(found):
     """Every row is there, with the value that is due."""
     assert found.complete and found.done.all()
-    assert repr(found) == "<sweep: 140 of 140 rows done, axes of (20, 7); sum, pair>"
+    assert repr(found) == "<sweep: 140 of 140 rows done, axes of (20, 7); pair, sum>"
     np.testing.assert_array_equal(found["sum"], SUMS)
     np.testing.assert_array_equal(found["pair"][..., 1], np.broadcast_to(LINE["y"], (20, 7)))
 
