@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.effect import replace_fields
@@ -63,6 +63,16 @@ def _strains(inverse: Float[Array, "3 3"]) -> Float[Array, "6 6"]:
         halves = [0.5 if k != m else 1.0 for k, m in PAIRS]
         rows.append(jnp.stack([x * half for x, half in zip(row, halves)]) * (1.0 if i == j else 2.0))
     return jnp.stack(rows)
+
+
+FLAT = 1e-12
+"""Volume at a quadrature point, in cubes of the extent of an element, up to which it is that of a flat one."""
+
+
+def is_degenerate(volumes: Float[Array, " n"], reference: Float[Array, "k 3"]) -> Bool[Array, ""]:
+    """Whether any of the volumes at the quadrature points is none, or negative, or no number."""
+    extent = jnp.max(jnp.max(reference, axis=0) - jnp.min(reference, axis=0))
+    return ~(jnp.min(volumes) > FLAT * extent**3)
 
 
 def smallest_volume_ratios(
@@ -178,7 +188,7 @@ class Brick(Potential):
     def flaws(self) -> dict[str, Array]:
         """Corners that are no corners."""
         said = "is degenerate or turned inside out: list four nodes in turn round one face, then those above"
-        return {said: ~(jnp.min(self.volumes) > 0.0), **self.material.flaws()}
+        return {said: is_degenerate(self.volumes, self.reference), **self.material.flaws()}
 
     def volume_ratios(self, place: Array, rows: Array) -> Float[Array, " n"]:
         """Smallest of the Gauss points of each of `n` elements."""

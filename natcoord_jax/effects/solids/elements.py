@@ -30,6 +30,7 @@ from natcoord_jax.effects.materials import MASS, Elastic
 from natcoord_jax.effects.solids.brick import (
     SolidReadings,
     inverse_and_volume,
+    is_degenerate,
     smallest_volume_ratios,
     von_mises,
 )
@@ -118,7 +119,7 @@ class SolidElement(Potential):
         """Corners that are no corners."""
         said = "is degenerate or turned inside out: list its nodes in the order of nc.mesh.Mesh, middles of "
         said += "edges near their middles"
-        return {said: ~(jnp.min(self.volumes) > 0.0), **self.material.flaws()}
+        return {said: is_degenerate(self.volumes, self.reference), **self.material.flaws()}
 
     def volume_ratios(self, place: Array, rows: Array) -> Float[Array, " n"]:
         """Smallest of the quadrature points of each of `n` elements."""
