@@ -66,7 +66,7 @@ def _strains(inverse: Float[Array, "3 3"]) -> Float[Array, "6 6"]:
 
 
 FLAT = 1e-12
-"""Volume at a quadrature point, in cubes of the extent of an element, up to which it is that of a flat one."""
+"""Volume at a quadrature point, in cubes of the extent of an element, up to which that is flat."""
 
 
 def is_degenerate(volumes: Float[Array, " n"], reference: Float[Array, "k 3"]) -> Bool[Array, ""]:
