@@ -187,6 +187,7 @@ def test_wrong_markers():
         nc.CapsuleContacts((nc.Point(one),) * 3, radii=(0.1, 0.1), stiffness=1.0)
 
 
+@pytest.mark.exhaustive
 def test_too_many_neighbours_are_told():
     """By name, with what to do."""
     with pytest.raises(nc.SimulationError, match="'link [0-9]+' and 'link [0-9]+' in 'all'") as told:
