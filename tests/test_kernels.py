@@ -80,22 +80,6 @@ def test_one_kernel_computes_the_same(name):
     np.testing.assert_allclose(several(lanes), jax.vmap(plain)(lanes), rtol=1e-13, atol=1e-13)
 
 
-def test_operations_in_loops_count_as_often_as_they_run():
-    """A tree of many bodies: its loops are of small operations, whose calls cost more than their numbers."""
-
-    def at_once(x):
-        return jnp.sin(x) * x + jnp.cos(x)
-
-    def along(x):
-        return jax.lax.scan(lambda passed, own: (jnp.sin(passed) + own, passed), x[0], at_once(x))
-
-    x = jnp.ones((500, 6))
-    assert rewriting.mean_size(jax.make_jaxpr(at_once)(x).jaxpr) == 3000
-    assert rewriting.mean_size(jax.make_jaxpr(along)(x).jaxpr) < 30
-    assert MARK not in jax.jit(lambda x: as_one_kernel(at_once, x)).lower(x).as_text()
-    assert MARK in jax.jit(lambda x: as_one_kernel(along, x)).lower(x).as_text()
-
-
 def test_the_compiler_heeds_the_mark(monkeypatch):
     """What is marked is one function of machine code; without a word, it could be dozens again."""
 

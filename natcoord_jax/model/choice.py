@@ -7,10 +7,8 @@ from natcoord_jax.model.layout import Layout
 from natcoord_jax.model.segment_sum import SegmentSum
 from natcoord_jax.model.tree import Tree
 
-REDUCED_LIMIT = 24
-"""Unknowns up to which a tree is solved densely in one piece: an ant of 14 takes 22 us a step, and 35
-recursively, which also compiles for twice as long; humanoids of 23 and 27 take 144 and 201 instead of 106 and
-126."""
+REDUCED_LIMIT = 32
+"""Unknowns up to which a tree is solved densely in one piece."""
 
 LOOP_LIMIT = 40
 """Unknowns up to which a system with loops is solved in the joint null space."""

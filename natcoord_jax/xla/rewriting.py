@@ -57,7 +57,7 @@ def operations(program: Any) -> int:
 
 
 def mean_size(program: Any) -> float:
-    """Numbers that an operation of a program finds on average; in loops each counts as often as it runs."""
+    """Numbers that an operation of a program finds on average."""
     count, numbers = _sizes(program)
     return numbers / max(count, 1)
 
@@ -68,9 +68,8 @@ def _sizes(program: Any) -> tuple[int, int]:
     for equation in _needed(program):
         inner = [_sizes(x) for x in _inner_programs(equation)]
         here = 1, sum(math.prod(x.aval.shape) for x in equation.outvars)
-        times = equation.params["length"] if equation.primitive.name == "scan" else 1
         for a, b in inner or [here]:
-            count, numbers = count + times * a, numbers + times * b
+            count, numbers = count + a, numbers + b
     return count, numbers
 
 
