@@ -117,7 +117,7 @@ class SolidElement(Potential):
 
     def flaws(self) -> dict[str, Array]:
         """Corners that are no corners."""
-        said = "is degenerate or turned inside out: list its nodes in the order of nc.mesh.Mesh, edges halved"
+        said = "is degenerate or turned inside out: list nodes as in nc.mesh.Mesh, those of edges midway"
         return {said: is_degenerate(self.volumes, self.reference), **self.material.flaws()}
 
     def volume_ratios(self, place: Array, rows: Array) -> Float[Array, " n"]:
