@@ -55,36 +55,6 @@ from natcoord_jax.bodies import (
     Tie,
     TubularSection,
 )
-from natcoord_jax.control import (
-    Check,
-    ComputedTorque,
-    Continuation,
-    Feedback,
-    Guess,
-    NonlinearProgram,
-    Optima,
-    OptimalControl,
-    Outcome,
-    Parameter,
-    Solution,
-    bounds,
-    check,
-    computed_torque,
-    continuation,
-    cost,
-    descend,
-    goal,
-    inputs,
-    inverse_dynamics,
-    load_guess,
-    multi_start,
-    optimise,
-    optimise_jit,
-    optimum,
-    receding_horizon,
-    regulator,
-    to_nlp,
-)
 from natcoord_jax.core.bodies import NodeKind
 from natcoord_jax.core.constraint import Constraint, VelocityConstraint
 from natcoord_jax.core.force import Field, Force, Load
@@ -204,6 +174,36 @@ from natcoord_jax.system import System
 if TYPE_CHECKING:
     __version__: str
     from natcoord_jax import io
+    from natcoord_jax.control import (
+        Check,
+        ComputedTorque,
+        Continuation,
+        Feedback,
+        Guess,
+        NonlinearProgram,
+        Optima,
+        OptimalControl,
+        Outcome,
+        Parameter,
+        Solution,
+        bounds,
+        check,
+        computed_torque,
+        continuation,
+        cost,
+        descend,
+        goal,
+        inputs,
+        inverse_dynamics,
+        load_guess,
+        multi_start,
+        optimise,
+        optimise_jit,
+        optimum,
+        receding_horizon,
+        regulator,
+        to_nlp,
+    )
     from natcoord_jax.viz import animate, plot, view
 
 if _collecting:
@@ -417,19 +417,19 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """Pictures and readers of files are loaded when first asked for; the version is looked up then."""
+    """Control, pictures and readers of files are loaded when first asked for; the version is looked up."""
     if name == "__version__":
         from importlib.metadata import version
 
         return version("natcoord_jax")
+    from importlib import import_module
+
+    if name in ("control", "io"):
+        return import_module(f"natcoord_jax.{name}")
     if name in ("animate", "plot", "view"):
-        from natcoord_jax import viz
-
-        return getattr(viz, name)
-    if name == "io":
-        from importlib import import_module
-
-        return import_module("natcoord_jax.io")
+        return getattr(import_module("natcoord_jax.viz"), name)
+    if name in __all__:
+        return getattr(import_module("natcoord_jax.control"), name)
     from difflib import get_close_matches
 
     near = get_close_matches(name, __all__)

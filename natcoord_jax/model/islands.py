@@ -25,7 +25,7 @@ def contact_islands(groups: Sequence[Group], joints: Sequence[Group], bodies: in
     if coupled or any(not g.effect.unilateral and (g.multipliers or g.rotors.size) for g in groups):
         return (tuple(range(len(contacts))),) if contacts else ()
     joined = [pair for group in joints for pair in np.asarray(group.bodies)]
-    root = np.arange(bodies + 1)
+    root = list(range(bodies + 1))
 
     def found(body: int) -> int:
         while root[body] != body:
@@ -35,7 +35,8 @@ def contact_islands(groups: Sequence[Group], joints: Sequence[Group], bodies: in
 
     for pair in (*joined, *contacts):
         own = [found(int(body)) for body in pair if body < bodies]
-        root[own] = min(own, default=bodies)
+        for body in own:
+            root[body] = min(own)
     parts: dict[int, list[int]] = {}
     for number, pair in enumerate(contacts):
         parts.setdefault(found(int(min(pair))), []).append(number)
