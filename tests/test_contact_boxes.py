@@ -115,12 +115,16 @@ def test_boxes_on_boxes_stand(stack):
 
 
 @pytest.mark.exhaustive
-@pytest.mark.parametrize(("count", "steps"), [(3, 400), (5, 10)])
-def test_a_stack_of_boxes_stands(count, steps):
-    """Each on the one below, which it meets at its own corners and at those of the other at once."""
-    system, state, _ = on_top([(0.2,) * 3] * count, [(0, 0, 0.1 + 0.2 * k) for k in range(count)])
-    trajectory = nc.simulate(system, state, dt=5e-3, steps=steps)
+def test_a_stack_of_ten_boxes_stands():
+    """For ten seconds, each on the one below, which it meets at its own corners and at those of the other.
+
+    With a tenth of the compliance that they have, which of them carry the load changes from step to step,
+    and the eighth ends the run.
+    """
+    system, state, _ = on_top([(0.2,) * 3] * 10, [(0, 0, 0.1 + 0.2 * k) for k in range(10)])
+    trajectory = nc.simulate(system, state, dt=5e-3, steps=2000)
     assert np.abs(np.asarray(trajectory.q) - np.asarray(state.q)).max() <= 1e-9
+    assert int(trajectory.steps_rejected) == 0
 
 
 @pytest.mark.slow

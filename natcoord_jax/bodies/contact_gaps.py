@@ -52,7 +52,7 @@ OF_CONSTRAINTS = "restitution", "friction"
 ROUNDING = 0.02
 """Radius of edges and corners of boxes on boxes, of the shortest edge."""
 
-SHARED = 1e-9
+SHARED = 1e-8
 """Compliance of contacts with several gaps, which may depend on each other."""
 
 Law = dict[str, Any]
