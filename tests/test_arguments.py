@@ -241,8 +241,8 @@ CALLS = {
     },
     "FrictionalNodeOnFacets": lambda w: {
         **GAP((*w.ends * 2, w.ends[0])), "facets": [((1, 2, 3, 4),)], "open": [1.0], "beyond": [1.0],
-        "depth": [1.0, (1.0,)], "thickness": NUMBER, "two_sided": [0.0, 1.0], "friction": NUMBER,
-        "regularisation": NUMBER,
+        "patch": [(0.0,)], "depth": [1.0, (1.0,)], "thickness": NUMBER, "two_sided": [0.0, 1.0],
+        "friction": NUMBER, "regularisation": NUMBER,
     },
     "SphereOnPlane": lambda w: {"radius": NUMBER},
     "DiscOnPlane": lambda w: {"radius": NUMBER},
@@ -261,6 +261,7 @@ CALLS = {
         "facets": [((1, 2, 3, 4),)],
         "open": [1.0],
         "beyond": [1.0],
+        "patch": [(0.0,)],
         "depth": [1.0, (1.0,)],
         "thickness": NUMBER,
         "two_sided": [0.0, 1.0],

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from natcoord_jax.bodies.contact_sides import MeshSide
+from natcoord_jax.bodies.sharp_edges import sharp_edges
 from natcoord_jax.core.elements import Elements
 from natcoord_jax.core.nodes import NodeUnion
 from natcoord_jax.effects.contact import FrictionalNodeOnFacets, NodeOnFacets
@@ -36,22 +37,34 @@ def surface_gaps(one: MeshSide, other: MeshSide, law: dict[str, Any], name: str)
     width = max(table.shape[1] for table, *_ in found)
     # What fills up repeats the last node, so that both ways are alike.
     tables = [np.pad(table, ((0, 0), (0, width - table.shape[1])), mode="edge") for table, *_ in found]
-    fields = "facets", "open", "beyond", "depth", "thickness", "stiffness", "two_sided"
+    fields = "facets", "open", "beyond", "patch", "depth", "thickness", "stiffness", "two_sided"
     each: dict[str, list[Any]] = {field: [] for field in fields}
     for (slave, master), (_, facets, ends, beyond, near) in zip(sides, found):
+        sharp, patch = _smooth(master)
         thick = slave.half_thickness
         stiff = slave.stiffness if given is None else np.full(len(thick), float(given))
         each["facets"].append(facets)
-        each["open"].append(ends)
+        each["open"].append(np.maximum(ends, sharp[near]))
         each["beyond"].append(beyond)
+        each["patch"].append(patch[near])
         each["depth"].append(master.depth[near])
         each["thickness"].append(thick + master.half_thickness.max())
         each["stiffness"].append(stiff / passes)
         each["two_sided"].append(np.full(len(thick), float(master.two_sided)))
     union = NodeUnion(tuple(s.surface.handle.nodes[s.numbers] for s in (one, other)))
     numbers = {key: np.concatenate(values) for key, values in each.items()}
+    if not numbers["patch"].any():
+        del numbers["patch"]
     kind = FrictionalNodeOnFacets if "friction" in law else NodeOnFacets
     return kind.on(union, np.concatenate(tables), each=numbers, **law)
+
+
+def _smooth(master: MeshSide) -> tuple[np.ndarray, np.ndarray]:
+    """Sharp edges of facets, and patches between them; of what has two sides there are none."""
+    facets = np.searchsorted(master.numbers, master.surface.faces)
+    if master.two_sided:
+        return np.zeros(facets.shape, bool), np.zeros(len(facets), int)
+    return sharp_edges(facets, np.asarray(master.surface.handle.nodes.positions)[master.numbers])
 
 
 def _nearest(

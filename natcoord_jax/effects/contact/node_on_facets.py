@@ -145,6 +145,8 @@ class NodeOnFacets(DiscreteGap):
             it without being pushed back; else 0.
         beyond: how far the surface goes on beyond each edge of each facet where it does so with facets that
             are not among these (f, 4) [m]; else 0. See `uncovered`.
+        patch: number of the patch of the surface that each facet is of (f,): at sharp edges, which end it as
+            those that are `open` do, the nearest patch counts alone. None: the surface is smooth.
         depth: how far the body reaches behind each facet (f,) [m]; a node that is farther behind is out again
             on its other side, and is not pushed back through it.
         thickness: distance of the node from the facets at which they touch [m]: that of both, halved.
@@ -164,6 +166,7 @@ class NodeOnFacets(DiscreteGap):
     beyond: Any = eqx.field(
         default=0.0, kw_only=True, metadata=is_a(Number("not negative") | Numbers((None, 4)))
     )
+    patch: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Numbers((None,))))
     depth: Any = eqx.field(
         default=1e300, kw_only=True, metadata=is_a(Number("positive") | Numbers((None,), "positive"))
     )
@@ -189,7 +192,10 @@ class NodeOnFacets(DiscreteGap):
         at = jax.tree.map(lambda y: y[best], every)
         ends = jnp.broadcast_to(jnp.asarray(self.open), facets.shape) > 0
         both = jnp.asarray(self.two_sided) > 0
-        shares = jax.vmap(_share)(every, ends) * _level(every)
+        shares = jax.vmap(_share)(every, ends)
+        shares = shares * (
+            _level(every) if self.patch is None else _level(every, self.patch == self.patch[best])
+        )
         rest = jnp.maximum(1.0 - jnp.sum(shares), 0.0)
         out = every.height < -jnp.broadcast_to(jnp.asarray(self.depth), every.height.shape)
         heights = jnp.where(both | out, jnp.abs(every.height), every.height)
@@ -231,8 +237,9 @@ def _share(at: Nearest, ends: Float[Array, "4"]) -> Float[Array, ""]:
     return jnp.prod(jnp.where(end, jnp.where(beyond < AT_END, 1.0, 0.0), smooth))
 
 
-def _level(every: Nearest) -> Float[Array, " f"]:
-    """How much facets count by how near they are."""
+def _level(every: Nearest, some: Bool[Array, " f"] | None = None) -> Float[Array, " f"]:
+    """How much facets, or some of them, count by how near they are."""
     heights = jnp.abs(every.height)
-    higher = (heights - jnp.min(heights)) / (LEVEL * jnp.where(every.size > 0, every.size, 1.0))
-    return jnp.exp(-(higher**2))
+    least = jnp.min(heights if some is None else jnp.where(some, heights, jnp.inf))
+    higher = (heights - least) / (LEVEL * jnp.where(every.size > 0, every.size, 1.0))
+    return jnp.exp(-(higher**2)) if some is None else jnp.where(some, jnp.exp(-(higher**2)), 0.0)
