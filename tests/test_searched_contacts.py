@@ -105,9 +105,9 @@ def test_what_is_far_is_not_told():
     assert repr(found) == "least margin 0.03 m of 1 contacts"
 
 
-def test_a_lane_that_has_failed_hides_nothing():
-    """Could go wrong: the least of gaps that are no numbers is none."""
-    system, trajectory = row((-0.01,), capacity=4)
+def test_a_lane_that_has_failed_brings_nothing_near():
+    """Could go wrong: the gap of places that are no numbers is one of no distance."""
+    system, trajectory = row((-0.01, 0.5), capacity=4)
     lost = eqx.tree_at(lambda t: t.states.q, trajectory, jnp.nan * trajectory.states.q)
     both = jax.tree.map(lambda *x: jnp.stack(x), trajectory, lost)
     found, alone = nc.contacts(system, both), nc.contacts(system, trajectory)

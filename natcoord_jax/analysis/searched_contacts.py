@@ -82,7 +82,8 @@ def _may_touch(law: CapsuleContacts) -> Int[np.ndarray, "2 p"]:
 
 
 def _nearest(law: CapsuleContacts, ends: Float[Array, "s v 3 n"]) -> Int[np.ndarray, "2 p"]:
-    """Pairs that come within the skin in any state."""
+    """Pairs that come within the skin in any state; after a failure states may be no numbers."""
+    ends = ends[np.isfinite(np.asarray(ends)).all(axis=(1, 2, 3))]
     pairs = _may_touch(law)
     filled = np.pad(pairs, ((0, 0), (0, -pairs.shape[1] % BLOCK)))
     blocks = np.moveaxis(filled.reshape(2, -1, BLOCK), 0, 1)
@@ -92,11 +93,11 @@ def _nearest(law: CapsuleContacts, ends: Float[Array, "s v 3 n"]) -> Int[np.ndar
 
 @eager_numpy
 def _least(law: CapsuleContacts, ends: Any, blocks: Any) -> Float[Array, "b p"]:
-    """Least gap of pairs in all states; states that are no numbers, after a failure, do not count."""
+    """Least gap of pairs in all states."""
 
     def least(pairs: Array) -> Array:
         def nearer(found: Array, at: Array) -> tuple[Array, None]:
-            return jnp.fmin(found, law.gaps(at, pairs)), None
+            return jnp.minimum(found, law.gaps(at, pairs)), None
 
         return jax.lax.scan(nearer, jnp.full(BLOCK, jnp.inf), ends)[0]
 
