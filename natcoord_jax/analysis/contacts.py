@@ -1,5 +1,6 @@
 """What contacts do along a trajectory, and where its derivatives stop to be those of the motion."""
 
+import math
 from typing import Any
 
 import equinox as eqx
@@ -8,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from natcoord_jax.analysis.searched_contacts import NearPairs, mean_force, near_pairs, searching
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.state import TRAJECTORY, State, Trajectory
 from natcoord_jax.effects.contact.law import ContactLaw
@@ -32,8 +34,12 @@ class Contacts(eqx.Module):
     program where d |dq/dp| is less than the margin. That is the derivative of the motion, too, where no note
     says otherwise.
 
+    Of a contact of many bodies that looks for its pairs (`nc.CapsuleContacts`) there are those that come
+    within its skin at a saved time, each as if it was listed. Gaps of all others are larger than that, and so
+    are their margins.
+
     Attributes:
-        names: of the contacts.
+        names: of the contacts; of pairs that are looked for "name[one, other]", by their bodies.
         t: saved times [s].
         gap: of the surfaces at the saved times, negative where they overlap [m].
         force: that pushes them apart on average over each interval [N]; of contacts without a stiffness with
@@ -74,7 +80,9 @@ class Contacts(eqx.Module):
 
     def __repr__(self) -> str:
         """The least margin, and what is to be said of derivatives."""
-        least = f"least margin {np.min(self.margin):.2g} m of {len(self.names)} contacts"
+        least = "no bodies have come within the skin of their contact"
+        if self.names:
+            least = f"least margin {np.min(self.margin):.2g} m of {len(self.names)} contacts"
         return "\n".join((least, *self.notes))
 
     @property
@@ -83,7 +91,7 @@ class Contacts(eqx.Module):
         # What is open at the start has not begun, whatever the first interval brings.
         first = ~self.active[..., :1, :] | (self.gap[..., :1, :] > 0)
         flags = np.moveaxis(np.concatenate([~first, self.active], axis=-2), -2, -1)
-        flat = flags.reshape(-1, *flags.shape[-2:])
+        flat = flags.reshape(math.prod(flags.shape[:-2]), *flags.shape[-2:])
         shortest = np.full(len(self.names), np.inf)
         for lane in flat:
             for k, on in enumerate(lane):
@@ -115,7 +123,7 @@ def _listed(names: tuple[str, ...], at: Any) -> str:
 
 
 def touching(system: Model) -> list[Group]:
-    """Contacts without a stiffness, in the order of `State.contacts`, then others."""
+    """Contacts without a stiffness, in the order of `State.contacts`, then others that are listed."""
     every = system.effects
     laws = [g for g in every if isinstance(g.effect, ContactLaw) and not g.effect.unilateral]
     laws = [g for g in laws if not g.effect.spread]
@@ -139,7 +147,8 @@ def _rates(system: Model, state: State) -> Array:
 def contacts(system: System, trajectory: Trajectory) -> Contacts:
     """Gaps, forces and impacts along a trajectory, and the margins within which its derivatives hold.
 
-    Of many bodies that look for their neighbours (`nc.CapsuleContacts`) nothing is told.
+    Of pairs that are looked for, memory is by the number of those that come near, see `Contacts`, and time by
+    that of all: with 200 capsules and 500 states two seconds, with spheres less than one.
 
     Args:
         system: compiled system, with contacts.
@@ -149,7 +158,7 @@ def contacts(system: System, trajectory: Trajectory) -> Contacts:
         ValueError: for a system without contacts, and states that do not know of their impulses.
     """
     groups = touching(system)
-    if not groups:
+    if not groups and not searching(system):
         raise ValueError("this system has no contacts; add nc.Contact(...) to its scene")
     gaps = [np.asarray(x) for x in _gaps(system, trajectory)]
     soft = [g for g in groups if not g.effect.unilateral]  # whose impulses states do not know
@@ -161,8 +170,14 @@ def contacts(system: System, trajectory: Trajectory) -> Contacts:
     for group in groups:
         names += [group.names[k] if len(group.names) == group.count else f"{group.labels[0]}[{k}]"
                   for k in range(group.count)]  # fmt: skip
+    searched = near_pairs(system, trajectory)
+    for found in searched:
+        names += found.names
+        gaps.append(found.gap)
+        measured.append(_of_pairs(found))
     force, impacts, inside, margin = (np.concatenate(x, axis=-1) for x in zip(*measured))
-    hard = np.concatenate([np.full(g.count, g.effect.bounces) for g in groups])
+    hard = np.zeros(len(names), bool)
+    hard[: sum(g.count for g in groups)] = [g.effect.bounces for g in groups for _ in range(g.count)]
     states, every = trajectory.states, np.concatenate(gaps, axis=-1)
     size = 1.0 + float(np.max(np.abs(np.asarray(states.q))))
     t, active = np.asarray(states.t), force > 0
@@ -209,3 +224,10 @@ def _of_law(group: Group, gap: np.ndarray) -> tuple[np.ndarray, ...]:
     found = jax.vmap(law, in_axes=(None, 1, 1), out_axes=1)(effect, *flat)
     force = np.moveaxis(np.asarray(found).reshape(before.shape), 0, -1)
     return force, np.zeros_like(force), np.zeros_like(force), np.abs(gap[..., 1:, :])
+
+
+def _of_pairs(found: NearPairs) -> tuple[np.ndarray, ...]:
+    """The same of pairs that have been looked for."""
+    before, after = found.gap[..., :-1, :], found.gap[..., 1:, :]
+    force = np.asarray(mean_force(found.law, before, after))
+    return force, np.zeros_like(force), np.zeros_like(force), np.abs(after)

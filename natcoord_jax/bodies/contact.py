@@ -66,8 +66,8 @@ class Contact(Recipe):
     than a body, it may pass another without ever overlapping with it.
 
     Of fifty spheres and capsules or more in `all_pairs_of`, with a stiffness and without friction, only
-    neighbours are looked at, see `nc.CapsuleContacts`; they are one contact with one name, and no sensor
-    shows its pairs.
+    neighbours are looked at, see `nc.CapsuleContacts`; they are one contact with one name and without a
+    sensor. `nc.contacts` tells of those of its pairs that come near, as if they were listed.
 
     Shells are touched from both sides, where their thickness ends; solids from outside, best at all that is
     outside, since at the end of a surface nodes slip off it. Which facets a node may touch is settled

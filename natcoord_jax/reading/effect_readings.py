@@ -31,6 +31,7 @@ def readings(system: Model, states: State, names: tuple[str, ...]) -> Any:
     if group.effect.silent:
         raise ValueError(
             f"the {group.effect.kind} {names[0]!r} has no sensor; use those of the bodies that it acts on, "
+            "of a contact that looks for its pairs `nc.contacts(system, trajectory)`, "
             "of a constraint `system.instant(...).multipliers`; a class of your own has one if you give it "
             "`silent = False` and `readings`"
         )

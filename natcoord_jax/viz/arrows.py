@@ -1,6 +1,7 @@
 """Arrows: forces and torques of loads and motors, and forces of contacts."""
 
 import dataclasses
+import re
 from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple
@@ -10,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from natcoord_jax.analysis.contacts import contacts, touching
+from natcoord_jax.analysis.searched_contacts import capsules, near_pairs, searching, touch
 from natcoord_jax.core.checks import as_array
 from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.force import Force
@@ -31,7 +33,7 @@ NOTHING = 1e-6
 
 
 STRONGEST = 24
-"""Arrows of a contact of surfaces."""
+"""Arrows of a contact of surfaces, and of one that looks for its pairs."""
 
 
 class Acting(NamedTuple):
@@ -150,6 +152,30 @@ def _of_surfaces(group: Group, names: np.ndarray, force: np.ndarray, rows: np.nd
     return found
 
 
+def _of_searched(system: System, pairs: Trajectory, states: State, force: np.ndarray) -> list[Acting]:
+    """The strongest pairs of each contact that looks for them."""
+    acting, begin = [], 0
+    every = [ends[:, k] for ends in capsules(system, states) for k in range(ends.shape[1])]
+    for found, ends in zip(near_pairs(system, pairs), every):
+        own = force[:, begin : begin + len(found.names)]
+        begin += len(found.names)
+        most = own.max(axis=0)
+        chosen = np.argsort(-most, kind="stable")[:STRONGEST]
+        chosen = chosen[most[chosen] > 0]
+        places, normals = map(np.asarray, touch(found.law, ends, found.pairs[:, chosen]))
+        acting += [
+            Acting(found.names[n], places[:, k], own[:, n, None] * normals[:, k])
+            for k, n in enumerate(chosen)
+        ]
+    return acting
+
+
+def _owner(name: str) -> str:
+    """The contact that a gap is of: those with several call them "name[0]", or "name[one, other, 0]"."""
+    numbered = re.fullmatch(r"(.*)\[\d+\]|(.*\[.+, .+), \d+\]", name)
+    return name if numbered is None else numbered[1] or f"{numbered[2]}]"
+
+
 def _of_gaps(names: np.ndarray, force: np.ndarray, places: np.ndarray, normals: np.ndarray) -> list[Acting]:
     """Of several gaps of a contact their sum, at its middle."""
     acting = []
@@ -165,18 +191,17 @@ def pushes(
     system: System, trajectory: Trajectory, saved: np.ndarray, rows: np.ndarray, scale: float
 ) -> list[Solid]:
     """Normal forces of contacts, on average over the step before; of surfaces they are on nodes."""
-    groups = touching(system)
+    groups, searched = touching(system), searching(system)
     unknown = trajectory.states.contacts is None and any(g.effect.unilateral for g in groups)
-    if not groups or len(trajectory) < 2 or unknown:
+    if not groups + searched or len(trajectory) < 2 or unknown:
         return []
     steps = np.maximum(saved, 1)[:, None] + np.array([-1, 0])
     pairs = dataclasses.replace(trajectory, states=jax.tree.map(lambda x: x[steps], trajectory.states))
     found = contacts(system, pairs)
-    # Gaps of a contact that has several are called "name[0]" and so on.
-    owners = np.array([name.rpartition("[")[0] if name.endswith("]") else name for name in found.names])
-    ends = np.cumsum([group.count for group in groups])
+    ends = np.cumsum([0, *(group.count for group in groups)])
+    owners = np.array([_owner(name) for name in found.names[: ends[-1]]])
     acting, others = [], []
-    for group, some in zip(groups, np.split(np.arange(len(owners)), ends[:-1])):
+    for group, some in zip(groups, np.split(np.arange(len(owners)), ends[1:-1])):
         if isinstance(group.effect, DiscreteGap):
             acting += _of_surfaces(group, owners[some], found.force[:, 0, some], rows)
         else:
@@ -185,4 +210,7 @@ def pushes(
         chosen = np.concatenate([some for some, *_ in others])
         places, normals = (np.concatenate(x, axis=1) for x in list(zip(*others))[1:])
         acting = _of_gaps(owners[chosen], found.force[:, 0, chosen], places, normals) + acting
+    if searched:
+        states = jax.tree.map(lambda x: x[saved], trajectory.states)
+        acting += _of_searched(system, pairs, states, found.force[:, 0, ends[-1] :])
     return _drawn(acting, scale, GREEN)

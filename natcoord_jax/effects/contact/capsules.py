@@ -25,6 +25,7 @@ from natcoord_jax.core.potential import marker_response, place_markers
 from natcoord_jax.effects.contact.law import ContactLaw
 from natcoord_jax.effects.contact.near_capsules import near_capsules
 from natcoord_jax.effects.contact.pair_distance import Pushes, distance, products, rates_of, vectors
+from natcoord_jax.effects.contact.pairs import CapsuleOnCapsule, SphereOnSphere
 from natcoord_jax.maths.near_spheres import Pairs, each_once
 from natcoord_jax.maths.vectors import safe_norm
 
@@ -110,6 +111,23 @@ class CapsuleContacts(ContactLaw):
     def _ends(self, x: Float[Array, "k 3"]) -> Float[Array, "v 3 n"]:
         """Centres of spheres, or both ends of segments."""
         return jnp.swapaxes(x.reshape(-1, self.radii.shape[0], 3), 1, 2)
+
+    def ends(self, place: Array, rows: Array) -> Float[Array, "v 3 n"]:
+        """Centres of spheres, or both ends of segments, of bodies with these rows [m]."""
+        return self._ends(place_markers(place, rows))
+
+    def gaps(self, ends: Float[Array, "v 3 n"], pairs: Int[Array, "2 p"]) -> Float[Array, " p"]:
+        """Between the surfaces of pairs; negative where they overlap [m]."""
+        found = vectors(ends, pairs)
+        return distance(products(found, found)) - jnp.sum(self.radii[pairs], axis=0)
+
+    def touch(
+        self, ends: Float[Array, "v 3 n"], pairs: Int[Array, "2 p"]
+    ) -> tuple[Float[Array, "p 3"], Float[Array, "p 3"]]:
+        """Where the surfaces of pairs touch [m], and the directions in which the second ones are pushed."""
+        both = jnp.transpose(ends[..., pairs], (3, 2, 0, 1)).reshape(pairs.shape[1], 2 * ends.shape[0], 3)
+        kind = SphereOnSphere if ends.shape[0] == 1 else CapsuleOnCapsule
+        return jax.vmap(lambda x, radii: kind(radii=radii).touch(x))(both, self.radii[pairs].T)
 
     def neighbours(self, place: Array, rows: Array, rates: Array, h: Array) -> Pairs:
         """Those that may touch each other in a step, half of the skin off their ways at most."""

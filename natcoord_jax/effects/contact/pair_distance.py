@@ -36,7 +36,7 @@ def vectors(ends: Float[Array, "v 3 n"], pairs: Int[Array, "2 p"]) -> Float[Arra
         ends: of each segment, or points.
         pairs: numbers of two of them.
     """
-    both = jnp.moveaxis(ends[..., pairs], 2, 0).reshape(-1, 3, pairs.shape[-1])
+    both = jnp.moveaxis(ends[..., pairs], 2, 0).reshape(2 * ends.shape[0], 3, pairs.shape[-1])
     return jnp.sum(VECTORS[ends.shape[0]][..., None, None] * both, axis=1)
 
 
