@@ -54,7 +54,8 @@ def test_a_box_falls_on_a_box(turn, law):
     energy = np.asarray(system.energy(trajectory).total)
     assert np.diff(energy).max() <= 1e-13
     gaps = nc.contacts(system, trajectory).gap
-    assert gaps.min() >= (-1e-11 if "hard" in law else -0.02)
+    # By the compliance with which they share a load.
+    assert gaps.min() >= (-1e-10 if "hard" in law else -0.02)
     assert np.asarray(system.sense(trajectory, brick).velocity)[-1, 2] > 0.1
 
 
