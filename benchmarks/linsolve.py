@@ -100,7 +100,7 @@ def measure(name: str, repeats: int, peers_python: str | None) -> dict[str, Any]
         nonlocal made
         pattern, entries = block_pattern(system.nodes, list(system.elements))
         matrix = pattern.assemble(*map(jnp.asarray, system.matrices))
-        plan = choose(pattern, entries, matrix=matrix, coordinates=system.coordinates)
+        plan = choose(pattern, entries, matrices=[matrix], coordinates=system.coordinates)
         made = plan, matrix, len(entries.rows)
 
     found["analysis_s"] = common.seconds(analyse, time.process_time)

@@ -14,6 +14,7 @@ from natcoord_jax.linsolve.blocks import block_pattern
 from natcoord_jax.linsolve.conjugate_residuals import conjugate_residuals
 from natcoord_jax.linsolve.graph import graph_of
 from natcoord_jax.linsolve.ordering import dissection, rounds
+from natcoord_jax.linsolve.pivot_analysis import pivot_order
 from natcoord_jax.linsolve.sparse import SparseSolver, choose, factorised
 
 # Solutions of well-conditioned systems by two eliminations.
@@ -44,7 +45,7 @@ class Case:
         self.locals = tuple(map(jnp.asarray, system.matrices))
         self.matrix = self.pattern.assemble(*self.locals)
         self.plan = choose(
-            self.pattern, self.entries, matrix=self.matrix, coordinates=system.coordinates, name=name
+            self.pattern, self.entries, matrices=[self.matrix], coordinates=system.coordinates, name=name
         )
         self.dense = system.dense()
         self.right = jnp.asarray(np.random.default_rng(7).standard_normal(system.size))
@@ -121,6 +122,17 @@ def test_structure_chooses_the_solver(cases):
         cases("ring", "block tridiagonal")
     with pytest.raises(ValueError, match="no solver"):
         cases("ring", "lu")
+
+
+def test_an_order_of_pivots_serves_all_matrices():
+    """Exchanged rows would suit the first alone better, but have pivots of zero in the second."""
+    weak, other = np.array([[1.1e-9, 0.7], [1.3, 0.2]]), np.eye(2)
+    crossed = np.array([[0.0, 1.0], [1.0, 0.0]])
+    assert pivot_order(weak[None])[0].tolist() == [1, 0]
+    rows, inverses = pivot_order(np.stack([weak, other]))
+    assert rows.tolist() == [0, 1]
+    np.testing.assert_allclose(inverses @ np.stack([weak, other]), np.stack([np.eye(2)] * 2), atol=1e-6)
+    assert pivot_order(np.stack([crossed, other]))[1] is None
 
 
 def test_an_unknown_without_an_element_is_refused():

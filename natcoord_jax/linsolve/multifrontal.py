@@ -131,7 +131,8 @@ def plan(
         graph: of the matrix.
         entries: of the matrix.
         tiles: number of places in the tiles.
-        values: of the entries, for a rehearsal that settles the order of the pivots; default: natural.
+        values: of the entries, of each matrix (matrices, entries) of a rehearsal that settles the order of
+            the pivots; default: natural.
         coordinates: positions of the nodes (N, dimensions).
     """
     fronts = cheapest(graph, coordinates)

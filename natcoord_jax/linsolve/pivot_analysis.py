@@ -2,7 +2,8 @@
 
 Pivots are taken in their natural order, balances before constraints, wherever that is accurate: it stays so
 when bodies turn. Where it is not, rows are exchanged within the front; where that does not help either, the
-front is merged into its parent, whose other pivots will.
+front is merged into its parent, whose other pivots will. The numbers may be those of several matrices, as
+with contacts closed and open: an order is accurate if it is so for each of them.
 """
 
 from typing import NamedTuple
@@ -38,7 +39,7 @@ def analyse_pivots(
         graph: of the matrix.
         fronts: children before parents.
         entries: of the matrix.
-        values: of the entries.
+        values: of the entries, for each matrix that the order is to serve (matrices, entries).
 
     Returns:
         The fronts, bad ones merged, and the pivots of each.
@@ -56,24 +57,25 @@ def analyse_pivots(
     for k, f in enumerate(fronts):
         pivots = np.concatenate([*extra[k], unknowns[k][0]]).astype(int)
         whole = np.concatenate([pivots, unknowns[k][1]])
-        matrix = np.zeros((len(whole),) * 2)
+        matrix = np.zeros((len(values), len(whole), len(whole)))
         place = dict(zip(whole.tolist(), range(len(whole))))
         own = pieces[k]
         i = [place[r] for r in entries.rows[own].tolist()]
         j = [place[c] for c in entries.columns[own].tolist()]
-        np.add.at(matrix, (i, j), values[own])
+        for each, numbers in zip(matrix, values[:, own]):
+            np.add.at(each, (i, j), numbers)
         for which, part in handed[k]:
             at = [place[u] for u in which.tolist()]
-            matrix[np.ix_(at, at)] += part
+            matrix[:, *np.ix_(at, at)] += part
         p = len(pivots)
-        rows, inverse = pivot_order(matrix[:p, :p])
+        rows, inverse = pivot_order(matrix[:, :p, :p])
         order_of.append(Pivots(pivots, pivots[rows]))
         if f.parent >= 0 and inverse is None:
             into[k] = f.parent
             extra[f.parent].append(pivots)
             handed[f.parent].append((whole, matrix))
         elif f.parent >= 0 and inverse is not None:
-            schur = matrix[p:, p:] - matrix[p:, :p] @ (inverse @ matrix[:p, p:])
+            schur = matrix[:, p:, p:] - matrix[:, p:, :p] @ (inverse @ matrix[:, :p, p:])
             handed[f.parent].append((whole[p:], schur))
     kept = [k for k in range(len(fronts)) if into[k] == k]
     return merged(fronts, into), [order_of[k] for k in kept]
@@ -86,19 +88,37 @@ def front_unknowns(graph: Graph, front: Front) -> tuple[np.ndarray, np.ndarray]:
     return pivots, np.concatenate([*none, *(graph.atoms[a] for a in sorted(front.boundary))])
 
 
-def pivot_order(block: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
-    """Order of the rows in which pivots on the diagonal invert a block, and the inverse; None: none does."""
-    natural = np.arange(len(block))
-    size = np.abs(block).max(axis=1, initial=0.0)
-    scale = 1.0 / np.where(size > 0, size, 1.0)
-    for rows, accepted in ((natural, NATURAL), (_exchanged(block * scale[:, None]), BAD)):
+def pivot_order(blocks: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+    """Order of the rows in which pivots on the diagonal invert each of some blocks, and the inverses.
+
+    None for the inverses where no order is found that does.
+    """
+    natural = np.arange(blocks.shape[-1])
+    inverses = _inverses(blocks, natural, NATURAL)
+    if inverses is not None:
+        return natural, inverses
+    for block in blocks:
+        size = np.abs(block).max(axis=1, initial=0.0)
+        rows = _exchanged(block / np.where(size > 0, size, 1.0)[:, None])
+        inverses = _inverses(blocks, rows, BAD)
+        if inverses is not None:
+            return rows, inverses
+    return natural, None
+
+
+def _inverses(blocks: np.ndarray, rows: np.ndarray, accepted: float) -> np.ndarray | None:
+    """Inverses with pivots on the diagonal of these rows; None if one is not accurate."""
+    found = []
+    for block in blocks:
+        size = np.abs(block).max(axis=1, initial=0.0)
+        scale = 1.0 / np.where(size > 0, size, 1.0)
         inverse = _inverse(block[rows])
         error = np.abs((block[rows] @ inverse - np.eye(len(block))) * scale[rows][:, None] / scale[rows])
-        if np.all(np.isfinite(inverse)) and error.max(initial=0.0) <= accepted:
-            back = np.empty_like(inverse)
-            back[:, rows] = inverse
-            return rows, back
-    return natural, None
+        if not (np.all(np.isfinite(inverse)) and error.max(initial=0.0) <= accepted):
+            return None
+        found.append(np.empty_like(inverse))
+        found[-1][:, rows] = inverse
+    return np.stack(found)
 
 
 def _inverse(block: np.ndarray) -> np.ndarray:

@@ -1,5 +1,6 @@
 """Solvers of sparse linear equations, chosen by static structure, differentiable in every mode."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -45,7 +46,7 @@ def choose(
     pattern: BlockPattern,
     entries: Entries,
     *,
-    matrix: BlockMatrix | None = None,
+    matrices: Sequence[BlockMatrix] = (),
     coordinates: np.ndarray | None = None,
     name: str | None = None,
 ) -> Plan:
@@ -54,8 +55,8 @@ def choose(
     Args:
         pattern: of the matrices.
         entries: of the pattern.
-        matrix: a typical one, for a rehearsal that settles the order of the pivots in the fronts. Default:
-            pivots on the diagonal, balances before the constraints of the same node.
+        matrices: typical ones, for a rehearsal that settles the order of the pivots in the fronts. Without
+            any, pivots are on the diagonal, balances before the constraints of the same node.
         coordinates: positions of the nodes (N, dimensions), by which meshes are dissected.
         name: of the solver: "dense", "block tridiagonal" or "multifrontal"; default: chosen.
 
@@ -77,7 +78,7 @@ def choose(
     linked = any(graph.neighbours)
     if path is not None and (name == "block tridiagonal" or (name is None and even and linked)):
         return block_tridiagonal.plan(path, entries, tiles)
-    values = None if matrix is None else entries.values(matrix.tiles)
+    values = np.array([entries.values(matrix.tiles) for matrix in matrices]) if matrices else None
     return multifrontal.plan(graph, entries, tiles, values=values, coordinates=coordinates)
 
 
