@@ -165,6 +165,7 @@ def test_arc_tangent_coefficients_keep_their_digits():
             assert abs(Decimal(float(found)) / value - 1) < 1e-15
 
 
+@pytest.mark.slow
 def test_forces_of_elements_that_hardly_move_have_the_right_derivatives():
     """Rounding along a step is no stiffness: what is missing to the energy is nothing but rounding, too.
 

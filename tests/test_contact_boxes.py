@@ -70,7 +70,7 @@ def crossing(law, rounding=0.01):
     return *scene.compile(), other
 
 
-@pytest.mark.parametrize("law", ["soft", "hard"])
+@pytest.mark.parametrize("law", ["soft", pytest.param("hard", marks=pytest.mark.slow)])
 def test_crossing_edges_do_not_pass(law):
     """No corner is near: edges meet where they are round, and all of the speed passes on."""
     system, state, other = crossing({"stiffness": 1e6} if law == "soft" else LAWS[law])

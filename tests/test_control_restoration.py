@@ -173,12 +173,14 @@ def test_a_guess_that_cannot_be_simulated_is_left(pendulum):
     assert found.attempts[0].outcome is nc.Outcome.SIMULATION_FAILED
 
 
+@pytest.mark.slow
 def test_what_stalls_says_how_far_it_got(made):
     found = nc.optimise(turn(made, 0.75 * LEAST), method="shooting", progress=False)
     assert found.outcome is nc.Outcome.STALLED, found.explain()
     assert "steps in a row made nothing better" in found.reason and "'hinge'" in found.reason
 
 
+@pytest.mark.slow
 def test_multipliers_that_grow_without_end_are_divergence(made):
     """By name; the judgement alone, as no problem is known that gets there on every machine."""
     problem = numeric(turn(made))
@@ -286,6 +288,7 @@ def test_a_path_reaches_its_end(made):
 # Where coordinates count from
 
 
+@pytest.mark.slow
 def test_rates_of_a_guess_are_named_in_their_order():
     scene = nc.Scene()
     base = scene.add(nc.RigidBody(mass=1.0, inertia=(1.0, 2.0, 2.5), name="base"))

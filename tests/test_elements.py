@@ -505,7 +505,7 @@ def _wheel(node, solver=None):
     return scene.compile(solver=solver)
 
 
-@pytest.mark.parametrize("order", [2, 4])
+@pytest.mark.parametrize("order", [2, pytest.param(4, marks=pytest.mark.slow)])
 def test_a_kind_of_node_of_ones_own(order):
     """Four rates in all forms of the equations, and the motion of a body whose axis a constraint holds."""
     scheme, ends = nc.EnergyMomentum(order=order), []
