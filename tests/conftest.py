@@ -36,10 +36,11 @@ jax.config.update("jax_compilation_cache_dir", CACHE)
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
 
 MAPS = Path("/proc/self/maps")
-MOST_MAPS = 20_000
+MOST_MAPS = 10_000
 """Regions of memory of one process at which its compiled programs are given up; Linux ends it at 65 530.
 
-Every program takes a few hundred, and a process that runs out of them crashes in the compiler.
+Every program takes a few hundred, and a process that runs out of them crashes in the compiler. Ten thousand
+are some 5 GB, and two processes have room on a machine of 16 GB.
 """
 
 
