@@ -1,5 +1,6 @@
 """Settings of the test-suite: double precision, a cache of compiled programs, checks of types."""
 
+import ctypes
 import gc
 import os
 from importlib.metadata import version
@@ -35,12 +36,12 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_compilation_cache_dir", CACHE)
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
 
-MAPS = Path("/proc/self/maps")
-MOST_MAPS = 10_000
-"""Regions of memory of one process at which its compiled programs are given up; Linux ends it at 65 530.
+MAPS, MEMORY = Path("/proc/self/maps"), Path("/proc/self/statm")
+MOST_MAPS, MOST_PAGES = 20_000, 750_000
+"""Regions and pages of memory (3 GB) of one process at which its compiled programs are given up.
 
-Every program takes a few hundred, and a process that runs out of them crashes in the compiler. Ten thousand
-are some 5 GB, and two processes have room on a machine of 16 GB.
+Every program takes a few hundred regions, of which Linux allows 65 530: a process that runs out of them
+crashes in the compiler. What compilers have freed stays with the process until it is asked back.
 """
 
 
@@ -77,8 +78,17 @@ def pytest_itemcollected(item: pytest.Item) -> None:
 @pytest.fixture(autouse=True)
 def _room_for_programs():
     yield
-    if MAPS.exists() and MAPS.read_bytes().count(b"\n") > MOST_MAPS:
+    if not MAPS.exists():
+        return
+    if MAPS.read_bytes().count(b"\n") > MOST_MAPS or int(MEMORY.read_text().split()[1]) > MOST_PAGES:
+        from natcoord_jax.xla.effort import forget
+
         jax.clear_caches()
+        forget()
+        gc.collect()
+        trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+        if trim is not None:  # (of glibc)
+            trim(0)
 
 
 @pytest.fixture

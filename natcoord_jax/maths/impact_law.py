@@ -29,9 +29,6 @@ MOST = 60
 NEGLIGIBLE = 1e-12
 """Rate of closing in terms of the largest that asks for no impulse."""
 
-PROJECTIONS = 10
-"""Of impulses of friction; one is enough for a single contact."""
-
 WITHIN = 0.95
 """Part of the way to where an impulse vanishes that one iteration may go."""
 
@@ -55,7 +52,7 @@ def _semidefinite_solution_jvp(primals: tuple, tangents: tuple) -> tuple[Array, 
     return found, semidefinite_solution(matrix, right_dot - matrix_dot @ found)
 
 
-def _taken(matrix: Array, on: Bool[Array, " c"]) -> Array:
+def held_alone(matrix: Float[Array, "c c"], on: Bool[Array, " c"]) -> Float[Array, "c c"]:
     """The matrix of those contacts alone, one on the diagonal of the others."""
     both = on[:, None] & on[None, :]
     return jnp.where(both, matrix, jnp.diag(jnp.where(on, 0.0, 1.0).astype(matrix.dtype)))
@@ -73,7 +70,7 @@ def elastic_impulses(
         work: s [J], not negative; where it is zero, the rate is negative.
         on: contacts that take part.
     """
-    matrix, rates, work = _taken(matrix, on), jnp.where(on, rates, 0.0), jnp.where(on, work, 0.0)
+    matrix, rates, work = held_alone(matrix, on), jnp.where(on, rates, 0.0), jnp.where(on, work, 0.0)
     own = jnp.diagonal(matrix)
     alone = (jnp.sqrt(rates**2 + 2 * own * work) - rates) / own
     start = jnp.where(on, jnp.maximum(alone, 1e-9 * jnp.max(alone)), 0.0)
@@ -106,7 +103,7 @@ def _elastic_impulses_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array
     matrix_dot, rates_dot, work_dot, _ = tangents
     found = elastic_impulses(matrix, rates, work, on)
     safe = jnp.where(on, found, 1.0)
-    own = _taken(matrix, on)
+    own = held_alone(matrix, on)
     missing = 0.5 * matrix_dot @ found + rates_dot - work_dot / safe
     stiff = 0.5 * own + jnp.diag(jnp.where(on, _stiffness(jnp.diagonal(own), work, safe), 0.0))
     return found, -definite_solution(stiff, jnp.where(on, missing, 0.0))
@@ -119,8 +116,8 @@ def impact_impulses(
     restitution: Float[Array, " c"],
     active: Bool[Array, " c"],
     met: Bool[Array, " c"],
-) -> Float[Array, " c"]:
-    """Impulses of the contacts at the end of a step [N s].
+) -> tuple[Float[Array, " c"], Float[Array, " c"]]:
+    """Impulses of the contacts at the end of a step [N s]: plastic ones, and all of them.
 
     Args:
         matrix: W [1/kg].
@@ -130,7 +127,7 @@ def impact_impulses(
         active: contacts that have pushed.
         met: those among them that were open before. The others lose speed across the contact alone.
     """
-    held = _taken(matrix, active)
+    held = held_alone(matrix, active)
     plastic = -semidefinite_solution(held, jnp.where(active, rates, 0.0))
     elastic = elastic_impulses(matrix, rates, work, met & ((work > 0) | (rates < 0)))
     change = jnp.where(active, restitution * (elastic - plastic), 0.0)
@@ -139,7 +136,8 @@ def impact_impulses(
     needed = 0.5 * change @ (held @ change)
     excess = needed > room
     part = jnp.where(excess, safe_sqrt(room / jnp.where(excess, needed, 1.0)), 1.0)
-    return jnp.where(active, plastic + part * change, 0.0)
+    plastic = jnp.where(active, plastic, 0.0)
+    return plastic, plastic + part * change
 
 
 def pressing_impulses(
@@ -155,18 +153,18 @@ def pressing_impulses(
         on: contacts that may push.
     """
     own = jnp.where(on, jnp.diagonal(matrix), 1.0)
-    fixed, given = jax.lax.stop_gradient((_taken(matrix, on), jnp.where(on, rates, 0.0)))
+    fixed, given = jax.lax.stop_gradient((held_alone(matrix, on), jnp.where(on, rates, 0.0)))
 
     def trip(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         pushing, count, _ = carry
-        found = semidefinite_solution(_taken(fixed, pushing), jnp.where(pushing, -given, 0.0))
+        found = semidefinite_solution(held_alone(fixed, pushing), jnp.where(pushing, -given, 0.0))
         left = (given + fixed @ found) / own
         after = on & jnp.where(pushing, found > 0, left < -NEGLIGIBLE * jnp.max(jnp.abs(given / own)))
         return after, count + 1, jnp.any(after != pushing)
 
     start = on & (rates < 0), jnp.array(0), jnp.array(True)
     pushing = jax.lax.while_loop(lambda c: c[2] & (c[1] < MOST), trip, start)[0]
-    return semidefinite_solution(_taken(matrix, pushing), jnp.where(pushing, -rates, 0.0))
+    return semidefinite_solution(held_alone(matrix, pushing), jnp.where(pushing, -rates, 0.0))
 
 
 def collision_impulses(
@@ -174,8 +172,8 @@ def collision_impulses(
     rates: Float[Array, " c"],
     restitution: Float[Array, " c"],
     on: Bool[Array, " c"],
-) -> Float[Array, " c"]:
-    """Impulses of contacts that touch, at the instant at which some of them meet [N s].
+) -> tuple[Float[Array, " c"], Float[Array, " c"]]:
+    """Impulses of contacts that touch, at the instant at which some of them meet [N s]: plastic ones, all.
 
     With no work taken before, L_E = 2 L_P: every contact that pushes separates at the part e of the speed at
     which it has closed, and (1 - e^2) of the energy of a plastic impact is lost.
@@ -191,43 +189,4 @@ def collision_impulses(
     room, needed = plastic @ (matrix @ plastic), change @ (matrix @ change)
     excess = needed > room
     part = jnp.where(excess, safe_sqrt(room / jnp.where(excess, needed, 1.0)), 1.0)
-    return plastic + part * change
-
-
-def friction_impulses(
-    matrix: Float[Array, "3c 3c"],
-    slip: Float[Array, "c 3"],
-    held: Float[Array, "c 3"],
-    most: Float[Array, " c"],
-) -> tuple[Float[Array, "c 3"], Float[Array, " c"]]:
-    """Impulses that stop slip as far as friction can [N s], and their work [J].
-
-    Of all within the cones of friction those of the least kinetic energy, nearly: projected gradients, each
-    with the length at which the energy is least. So none of them adds energy.
-
-    Args:
-        matrix: W of the directions of slip [1/kg].
-        slip: velocities of slip [m/s].
-        held: impulses of friction in the step already.
-        most: mu times the impulses along the normals.
-    """
-    count = most.shape[0]
-    # Half the trace of the block of a contact, in a plane.
-    own = 0.5 * jnp.sum(jnp.diagonal(matrix).reshape(count, 3), axis=1)
-    inverse = jnp.where(own > 0, 1.0 / jnp.where(own > 0, own, 1.0), 0.0)[:, None]
-
-    def trip(_: Array, found: Float[Array, "c 3"]) -> Float[Array, "c 3"]:
-        moving = slip + (matrix @ found.reshape(-1)).reshape(count, 3)
-        wanted = held + found - inverse * moving
-        square = jnp.sum(wanted**2, axis=1)
-        beyond = square > most**2
-        shorter = most / jnp.where(beyond, jnp.sqrt(jnp.where(beyond, square, 1.0)), 1.0)
-        change = jnp.where(beyond[:, None], shorter[:, None] * wanted, wanted) - held - found
-        along = -jnp.sum(moving * change)
-        needed = change.reshape(-1) @ (matrix @ change.reshape(-1))
-        some = (along > 0) & (needed > 0)
-        return found + jnp.where(some, jnp.minimum(along / jnp.where(some, needed, 1.0), 1.0), 0.0) * change
-
-    found = jax.lax.fori_loop(0, PROJECTIONS, trip, jnp.zeros_like(held))
-    done = found * (slip + 0.5 * (matrix @ found.reshape(-1)).reshape(count, 3))
-    return found, jnp.sum(done, axis=1)
+    return plastic, plastic + part * change

@@ -2,10 +2,11 @@
 
 A gap that a step would have made negative is zero at its end (66), by an impulse that takes some energy with
 it, more or less by where in the step the surfaces met. `natcoord_jax.maths.impact_law` says what velocities
-follow: those of the restitution that is asked for, wherever that was. Then friction stops what slip it can.
+follow: those of the restitution that is asked for, wherever that was; and `natcoord_jax.maths.friction_law`
+what slip friction stops at the same time.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -19,7 +20,8 @@ from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import Tableau
-from natcoord_jax.maths.impact_law import collision_impulses, friction_impulses, impact_impulses
+from natcoord_jax.maths.friction_law import impulses_with_friction, without_friction
+from natcoord_jax.maths.impact_law import collision_impulses, impact_impulses
 from natcoord_jax.maths.vectors import positive_part
 from natcoord_jax.mechanics.block_tangent_space import Tangents, tangents_at
 from natcoord_jax.mechanics.free_flight import apart, meeting, touch
@@ -38,6 +40,7 @@ class Answers:
     Attributes:
         space: of the velocities that the constraints admit.
         along: what unit impulses do, in its frame, one a row.
+        each: number of these of a contact.
     """
 
     def __init__(self, space: Tangents, system: Model, groups: Sequence[Group], state: State, name: str):
@@ -47,7 +50,8 @@ class Answers:
         for group in groups:
             each = jax.vmap(lambda effect, place, rows: getattr(effect, name)(place, rows))
             forces = each(group.effect, group_places(system, group), rows[group.bodies])
-            bodies = jnp.repeat(group.bodies, forces.shape[1], axis=0)
+            self.each = forces.shape[1]
+            bodies = jnp.repeat(group.bodies, self.each, axis=0)
             found.append(space.answers(forces.reshape(-1, *forces.shape[2:]), bodies))
         self.along = jnp.concatenate(found)
 
@@ -56,11 +60,14 @@ class Answers:
         """The same, one vector a row."""
         return self.along.reshape(self.along.shape[0], -1)
 
-    def matrices(self, order: IslandOrder, each: int = 1) -> Float[Array, "islands m m"]:
-        """W = G M^-1 G^T of each island, of so many impulses a contact; sums, which call no library."""
-        flat = order.split(self.flat.reshape(-1, each, self.flat.shape[-1]))
-        flat = flat.reshape(flat.shape[0], -1, flat.shape[-1])
-        return jnp.sum(flat[:, :, None] * flat[:, None], axis=-1)
+    def by_island(self, order: IslandOrder) -> Float[Array, "islands m u"]:
+        """The same, island by island."""
+        flat = order.split(self.flat.reshape(-1, self.each, self.flat.shape[-1]))
+        return flat.reshape(flat.shape[0], -1, flat.shape[-1])
+
+    def matrices(self, order: IslandOrder, others: "Answers") -> Float[Array, "islands m n"]:
+        """W = G M^-1 H^T of each island: rates at these by impulses at others. Sums call no library."""
+        return jnp.sum(self.by_island(order)[:, :, None] * others.by_island(order)[:, None], axis=-1)
 
     def rates(self, velocity: Velocity) -> Float[Array, " c"]:
         """gamma: work of unit impulses on a velocity."""
@@ -161,55 +168,48 @@ def _impacts(
     lam: Sequence[Float[Array, "n m"]],
 ) -> tuple[Array, Array, Array, Array, Array]:
     """After impacts of active contacts: velocities, rates of rotors, work, impulses, and which have met."""
-    space = tangents_at(system, end)
-    answers = Answers(space, system, groups, end, "pushes")
-    before, pushed = contact_gaps(system, groups, start), jnp.concatenate([x[:, 0] for x in lam])
-    on, active = active, active & _bouncing(groups)
+    space, bouncing = tangents_at(system, end), jnp.asarray(_bouncing(groups))
+    pushes = Answers(space, system, groups, end, "pushes")
+    # With friction it has three multipliers besides that of the gap.
+    held = jnp.concatenate([jnp.pad(x, ((0, 0), (0, 4 - x.shape[1]))) for x in lam])
+    before = contact_gaps(system, groups, start)
+    shut = (before - contact_gaps(system, groups, end)) / h
+    on, active = active, active & bouncing
     met = active & (before > touch(start) if hit is None else apart(system, groups, start, h))
-    work = jnp.where(met, positive_part(pushed * (before - contact_gaps(system, groups, end)) / h), 0.0)
-    restitution = _numbers(groups, "restitution")
     velocity = Velocity(end.row_rates, end.rates)
     order = IslandOrder(system.structure.islands, range(len(on)))
-    rates, matrices = answers.rates(velocity), answers.matrices(order)
+    rates, normal = pushes.rates(velocity), pushes.matrices(order, pushes)
 
-    def law(impulses: Callable[..., Array], *given: Array) -> Array:
-        return order.joined(jax.vmap(impulses)(matrices, *map(order.split, given)))
+    def law(impulses: Callable[..., Any], matrices: Sequence[Array], *given: Array) -> Any:
+        return jax.tree.map(order.joined, jax.vmap(impulses)(*matrices, *map(order.split, given)))
 
-    impulses = law(impact_impulses, rates, work, restitution, active, met)
+    def work(pushed: Float[Array, " c"]) -> Float[Array, " c"]:
+        return jnp.where(met, positive_part(pushed * shut), 0.0)
+
+    pushed, room = held[:, 0], work(held[:, 0])
+    rubs, mixed = None, None
+    effects: list[Any] = [group.effect for group in groups]
+    if any(effect.friction is not None for effect in effects):
+        rubs = Answers(space, system, groups, end, "rubs")
+        mixed = rubs.matrices(order, pushes)
+        pushed = law(without_friction, (normal, mixed), held, active)
+    restitution, friction = _numbers(groups, "restitution"), _numbers(groups, "friction")
+    plastic, impulses = law(impact_impulses, (normal,), rates, work(pushed), restitution, active, met)
     if hit is not None:
-        touching = jnp.asarray(_bouncing(groups)) & (contact_gaps(system, groups, end) <= touch(end))
-        collision = law(collision_impulses, rates, restitution, touching)
-        impulses, on = jnp.where(jnp.any(hit), collision, impulses), on | hit
-    velocity = answers.pushed(velocity, impulses)
-    done = impulses * (rates + 0.5 * law(jnp.matmul, impulses))
-    parts = zip(groups, lam, *(_by_group(groups, x) for x in (on, impulses, done, np.arange(len(on)))))
-    rubbing, finished = [], []
-    for group, own, on, pushes, work, numbers in parts:
-        finished.append(work)
-        if group.effect.friction is not None:
-            most = group.effect.friction * jnp.where(on, positive_part(own[:, 0] + pushes), 0.0)
-            rubbing.append((group, own[:, 1:], most, numbers))
-    if rubbing:
-        velocity, lost = _after_friction(system, end, space, velocity, rubbing)
-        finished = [w + (0.0 if g.effect.friction is None else next(lost)) for g, w in zip(groups, finished)]
-    account = jnp.concatenate(finished), impulses, met.astype(impulses.dtype)
-    return velocity.rows.reshape(end.v.shape), velocity.rotors, *account
-
-
-def _after_friction(
-    system: Model, end: State, space: Any, velocity: Velocity, rubbing: list[tuple[Group, Any, Any, Any]]
-) -> tuple[Velocity, Iterator[Array]]:
-    """The velocity after what friction stops, and its work by group.
-
-    Of each group impulses of friction in the step already, the most that there may be, and its contacts.
-    """
-    groups, held, most, numbers = zip(*rubbing)
-    answers = Answers(space, system, groups, end, "rubs")
-    order = IslandOrder(system.structure.islands, np.concatenate(numbers))
-    slip = answers.rates(velocity).reshape(-1, 3)
-    given = map(order.split, (slip, jnp.concatenate(held), jnp.concatenate(most)))
-    stopping, work = map(order.joined, jax.vmap(friction_impulses)(answers.matrices(order, 3), *given))
-    return answers.pushed(velocity, stopping.reshape(-1)), iter(_by_group(groups, work))
+        touching = bouncing & (contact_gaps(system, groups, end) <= touch(end))
+        collision, some = law(collision_impulses, (normal,), rates, restitution, touching), jnp.any(hit)
+        plastic, impulses = jnp.where(some, collision[0], plastic), jnp.where(some, collision[1], impulses)
+        room, on = jnp.where(some, 0.0, room), on | hit
+    if rubs is None or mixed is None:
+        done = impulses * (rates + 0.5 * law(jnp.matmul, (normal,), impulses))
+    else:
+        slip = rubs.rates(velocity).reshape(-1, 3)
+        matrices = normal, mixed, rubs.matrices(order, rubs)
+        given = rates, slip, held, friction, plastic, impulses, on, bouncing, room
+        found, done = law(impulses_with_friction, matrices, *given)
+        impulses, velocity = found[:, 0], rubs.pushed(velocity, found[:, 1:].reshape(-1))
+    velocity = pushes.pushed(velocity, impulses)
+    return velocity.rows.reshape(end.v.shape), velocity.rotors, done, impulses, met.astype(done.dtype)
 
 
 def with_mobilities(system: SomeModel, state: State) -> SomeModel:

@@ -88,6 +88,8 @@ class Rubbing(Effect):
 
     def rubs(self, place: Array, rows: Array) -> Float[Array, "3 k 4 3"]:
         """The same of impulses against slip, by components."""
+        if self.friction is None:
+            return jnp.zeros((3, *rows.shape), rows.dtype)
         x = place_markers(place, rows)
         still = jnp.zeros_like(x), jnp.zeros((rows.shape[0], 3), x.dtype)
         forces, torques = jax.jacrev(lambda v, w: self.slip(x, v, w), argnums=(0, 1))(*still)

@@ -1,0 +1,184 @@
+"""The impulses of friction at any number of contacts at once, together with those along the normals.
+
+What friction stops changes the rates at which surfaces close, and impulses along the normals change slip, but
+for what is hit in line with its centre. So contacts that push keep the rates that the law of impacts
+(`natcoord_jax.maths.impact_law`) has given them: with W of normals (n) and of slip (t), impulses f of
+friction come with impulses -X f along the normals, X = W_nn^+ W_nt, and act on slip by W_tt - W_tn X. Of
+impulses within the cones of friction, which depend on f thereby, those are looked for that stop slip, or
+oppose it: Coulomb's law with Newton's restitution. What is hit off its centre that law may give energy
+(W. J. Stronge, Impact Mechanics, 2000); impulses stop short of that.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from natcoord_jax.maths.impact_law import held_alone, semidefinite_solution
+from natcoord_jax.maths.vectors import positive_part, safe_sqrt
+
+ROUNDS = 16
+"""Of what friction does at all contacts at once; one or two are enough for a single contact."""
+
+PLANE = 1e-9
+"""Determinant in terms of the square of the trace below which impulses in one direction alone change slip."""
+
+
+def impulses_with_friction(
+    normal: Float[Array, "c c"],
+    mixed: Float[Array, "3c c"],
+    tangential: Float[Array, "3c 3c"],
+    rates: Float[Array, " c"],
+    slip: Float[Array, "c 3"],
+    held: Float[Array, "c 4"],
+    friction: Float[Array, " c"],
+    plastic: Float[Array, " c"],
+    smooth: Float[Array, " c"],
+    on: Bool[Array, " c"],
+    bouncing: Bool[Array, " c"],
+    room: Float[Array, " c"],
+) -> tuple[Float[Array, "c 4"], Float[Array, " c"]]:
+    """Impulses along the normals and of friction [N s], and their work [J].
+
+    Args:
+        normal: W_nn [1/kg].
+        mixed: W_tn.
+        tangential: W_tt.
+        rates: of the gaps [m/s].
+        slip: velocities of slip [m/s].
+        held: impulses in the step already, along the normal and of friction.
+        friction: mu [-].
+        plastic: impulses of the law of impacts without restitution.
+        smooth: those of the restitutions that are asked for, without friction.
+        on: contacts that touch.
+        bouncing: those that have impacts.
+        room: energy that each may give [J].
+    """
+    pressed = jnp.where(on, positive_part(held[:, 0] + smooth), 0.0)
+    taken = normal_changes(normal, mixed, bouncing & (pressed > 0))
+    slipping = slip + (mixed @ smooth).reshape(slip.shape)
+    rubbing = friction_impulses(tangential - mixed @ taken, taken, slipping, held[:, 1:], pressed, friction)
+    rubbing = rubbing.reshape(-1)
+    matrix = jnp.block([[normal, mixed.T], [mixed, tangential]])
+    given = jnp.concatenate([rates, slip.reshape(-1)])
+    safe, wanted = jnp.pad(plastic, (0, rubbing.size)), jnp.concatenate([smooth - taken @ rubbing, rubbing])
+    found = without_gain(matrix, given, safe, wanted, jnp.sum(room))
+    done = found * (given + 0.5 * matrix @ found)
+    count = rates.shape[0]
+
+    def each(x: Array) -> Array:
+        return jnp.concatenate([x[:count, None], x[count:].reshape(count, 3)], axis=1)
+
+    return each(found), jnp.sum(each(done), axis=1)
+
+
+def normal_changes(
+    normal: Float[Array, "c c"], mixed: Float[Array, "3c c"], holding: Bool[Array, " c"]
+) -> Float[Array, "c 3c"]:
+    """X: what impulses of friction take from those along the normals of contacts that hold their rates.
+
+    Args:
+        normal: W_nn [1/kg].
+        mixed: W_tn.
+        holding: contacts that do.
+    """
+    right = jnp.where(holding[:, None], mixed.T, 0.0)
+    return semidefinite_solution(held_alone(normal, holding), right)
+
+
+def without_friction(
+    normal: Float[Array, "c c"],
+    mixed: Float[Array, "3c c"],
+    held: Float[Array, "c 4"],
+    active: Bool[Array, " c"],
+) -> Float[Array, " c"]:
+    """Impulses along the normals that would have closed the gaps in a step without friction [N s].
+
+    Args:
+        normal: W_nn [1/kg].
+        mixed: W_tn.
+        held: impulses that have done so with friction, along the normal and of friction.
+        active: contacts whose gaps these closed.
+    """
+    return held[:, 0] + normal_changes(normal, mixed, active) @ held[:, 1:].reshape(-1)
+
+
+def friction_impulses(
+    matrix: Float[Array, "3c 3c"],
+    taken: Float[Array, "c 3c"],
+    slip: Float[Array, "c 3"],
+    held: Float[Array, "c 3"],
+    pressed: Float[Array, " c"],
+    friction: Float[Array, " c"],
+) -> Float[Array, "c 3"]:
+    """Impulses that stop slip as far as friction can [N s].
+
+    Args:
+        matrix: W_tt - W_tn X [1/kg].
+        taken: X, see `normal_changes`.
+        slip: velocities of slip [m/s].
+        held: impulses of friction in the step already.
+        pressed: impulses along the normals.
+        friction: mu [-].
+    """
+    count = pressed.shape[0]
+    number = jnp.arange(count)
+    own = matrix.reshape(count, 3, count, 3)[number, :, number]
+    slope = taken.reshape(count, count, 3)[number, number]
+    trace = jnp.trace(own, axis1=1, axis2=2)
+    # Of the block, in the plane of slip: two of its three principal values.
+    product = 0.5 * (trace**2 - jnp.sum(own**2, axis=(1, 2)))
+    plane = product > PLANE * trace**2
+    length = jnp.where(trace > 0, 1.0 / jnp.where(trace > 0, trace, 1.0), 0.0)
+    over = jnp.where(plane, 1.0 / jnp.where(plane, product, 1.0), 0.0)
+
+    def trip(_: Array, found: Float[Array, "c 3"]) -> Float[Array, "c 3"]:
+        moving = slip + (matrix @ found.reshape(-1)).reshape(count, 3)
+        total = held + found
+        turned = trace[:, None] * moving - jnp.sum(own * moving[:, None], axis=2)
+        stopping = jnp.where(plane[:, None], over[:, None] * turned, length[:, None] * moving)
+        sticking = total - stopping
+        # What the contact's own friction leaves of the impulse along its normal.
+        alone = pressed - taken @ found.reshape(-1) + jnp.sum(slope * total, axis=1)
+        most = friction * positive_part(alone - jnp.sum(slope * sticking, axis=1))
+        sticks = jnp.sum(sticking**2, axis=1) <= most**2
+        wanted = total - 2.0 * length[:, None] * moving
+        square = jnp.sum(wanted**2, axis=1)
+        some = square > 0
+        along = jnp.where(some[:, None], wanted, 0.0) / jnp.sqrt(jnp.where(some, square, 1.0))[:, None]
+        less = 1.0 + friction * jnp.sum(slope * along, axis=1)
+        # (Where friction would press more than it takes, as a jamming rod does, it grows step by step.)
+        at_most = friction * positive_part(alone) / jnp.where(less > 0.1, less, 1.0)
+        change = jnp.where(sticks[:, None], sticking, at_most[:, None] * along) - total
+        falls = -jnp.sum(moving * change)
+        needed = change.reshape(-1) @ (matrix @ change.reshape(-1))
+        short = (falls > 0) & (needed > falls)
+        return found + jnp.where(short, falls / jnp.where(short, needed, 1.0), 1.0) * change
+
+    return jax.lax.fori_loop(0, ROUNDS, trip, jnp.zeros_like(held))
+
+
+def without_gain(
+    matrix: Float[Array, "m m"],
+    rates: Float[Array, " m"],
+    safe: Float[Array, " m"],
+    wanted: Float[Array, " m"],
+    room: Float[Array, ""],
+) -> Float[Array, " m"]:
+    """The impulses that are wanted, or that part of the way to them from safe ones at which energy is kept.
+
+    Args:
+        matrix: W of all impulses [1/kg].
+        rates: of what they do work on [m/s].
+        safe: impulses that take energy [N s].
+        wanted: those that are wanted.
+        room: energy that they may give [J].
+    """
+    change = wanted - safe
+    pushed = matrix @ safe
+    given = safe @ (rates + 0.5 * pushed)
+    slope, curvature = change @ (rates + pushed), change @ (matrix @ change)
+    too_much = given + slope + 0.5 * curvature > room
+    left = positive_part(room - given)
+    curved = jnp.where(too_much & (curvature > 0), curvature, 1.0)
+    part = (safe_sqrt(slope**2 + 2.0 * curvature * left) - slope) / curved
+    return safe + jnp.where(too_much, jnp.clip(part, 0.0, 1.0), 1.0) * change
