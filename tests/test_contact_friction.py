@@ -231,3 +231,36 @@ def test_an_impact_with_friction_gives_no_energy():
         energy = np.asarray(system.energy(trajectory).total)
         assert np.diff(energy).max() <= 1e-12 * energy[0]
         assert nc.balance(system, trajectory).energy.max() <= tol.ENERGY_OF_A_SMALL_SCENE
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scheme", [nc.EnergyMomentum(), nc.EnergyMomentum(max_events=4)])
+def test_a_box_rocks_from_edge_to_edge(scheme):
+    """It goes on about the other edge, which rests, with the moment of momentum that it has about it."""
+    half, height, tilt, h = 0.1, 0.2, np.radians(5.0), 2e-4
+    lever = half * np.sin(tilt) + height * np.cos(tilt)
+    scene = nc.Scene()
+    scene.add(nc.Gravity())
+    box = nc.RigidBody(
+        shape=nc.Box((2 * half, 2 * half, 2 * height)),
+        density=1000.0,
+        position=(height * np.sin(tilt) - half * np.cos(tilt), 0, lever),
+        orientation=((0, 1, 0), tilt),
+    )
+    handle = scene.add(box)
+    scene.add(nc.Contact(handle, FLOOR, restitution=0.0, friction=0.6))
+    system, state = scene.compile()
+    trajectory = nc.simulate(system, state, dt=h, steps=600, scheme=scheme)
+    # About an edge, by mass.
+    own = (half**2 + height**2) / 3
+    inertia = own + half**2 + height**2
+    falling = np.sqrt(2 * 9.81 * (lever - height) / inertia)
+    kept = (own + height**2 - half**2) / inertia
+    turning = -np.asarray(system.sense(trajectory, handle).angular_velocity)[:, 1]
+    hit = int(np.argmax(turning))
+    slowing = 9.81 * half / inertia * h  # in a step
+    assert turning[hit] == pytest.approx(falling, abs=slowing)
+    assert turning[hit + 1] == pytest.approx(kept * falling, abs=1.5 * slowing)
+    edge = system.sense(trajectory, nc.Point(handle, (-half, half, -height), local=True))
+    assert np.abs(np.asarray(edge.velocity)[hit + 1 :]).max() <= 1e-3
+    assert np.diff(np.asarray(system.energy(trajectory).total)).max() <= 1e-12

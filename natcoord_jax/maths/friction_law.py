@@ -19,6 +19,9 @@ from natcoord_jax.maths.vectors import positive_part, safe_sqrt
 ROUNDS = 16
 """Of what friction does at all contacts at once; one or two are enough for a single contact."""
 
+PARTING = 1e-9
+"""Rate in terms of the largest before beyond which a contact without an impulse opens."""
+
 PLANE = 1e-9
 """Determinant in terms of the square of the trace below which impulses in one direction alone change slip."""
 
@@ -54,7 +57,10 @@ def impulses_with_friction(
         room: energy that each may give [J].
     """
     pressed = jnp.where(on, positive_part(held[:, 0] + smooth), 0.0)
-    taken = normal_changes(normal, mixed, bouncing & (pressed > 0))
+    after = rates + normal @ smooth
+    # What has pushed until the impact, and parts by it, does not pull.
+    parting = (smooth <= 0) & (after > PARTING * jnp.max(jnp.abs(rates)))
+    taken = normal_changes(normal, mixed, bouncing & (pressed > 0) & ~parting)
     slipping = slip + (mixed @ smooth).reshape(slip.shape)
     rubbing = friction_impulses(tangential - mixed @ taken, taken, slipping, held[:, 1:], pressed, friction)
     rubbing = rubbing.reshape(-1)

@@ -180,9 +180,6 @@ def _impacts(
     order = IslandOrder(system.structure.islands, range(len(on)))
     rates, normal = pushes.rates(velocity), pushes.matrices(order, pushes)
 
-    def law(impulses: Callable[..., Any], matrices: Sequence[Array], *given: Array) -> Any:
-        return jax.tree.map(order.joined, jax.vmap(impulses)(*matrices, *map(order.split, given)))
-
     def work(pushed: Float[Array, " c"]) -> Float[Array, " c"]:
         return jnp.where(met, positive_part(pushed * shut), 0.0)
 
@@ -192,24 +189,30 @@ def _impacts(
     if any(effect.friction is not None for effect in effects):
         rubs = Answers(space, system, groups, end, "rubs")
         mixed = rubs.matrices(order, pushes)
-        pushed = law(without_friction, (normal, mixed), held, active)
-    restitution, friction = _numbers(groups, "restitution"), _numbers(groups, "friction")
-    plastic, impulses = law(impact_impulses, (normal,), rates, work(pushed), restitution, active, met)
+        pushed = _by_island(order, without_friction, (normal, mixed), held, active)
+    restitution = _numbers(groups, "restitution")
+    given = rates, work(pushed), restitution, active, met
+    plastic, impulses = _by_island(order, impact_impulses, (normal,), *given)
     if hit is not None:
-        touching = bouncing & (contact_gaps(system, groups, end) <= touch(end))
-        collision, some = law(collision_impulses, (normal,), rates, restitution, touching), jnp.any(hit)
-        plastic, impulses = jnp.where(some, collision[0], plastic), jnp.where(some, collision[1], impulses)
+        touching, some = bouncing & (contact_gaps(system, groups, end) <= touch(end)), jnp.any(hit)
+        at_once = _by_island(order, collision_impulses, (normal,), rates, restitution, touching)
+        plastic, impulses = (jnp.where(some, x, y) for x, y in zip(at_once, (plastic, impulses)))
         room, on = jnp.where(some, 0.0, room), on | hit
     if rubs is None or mixed is None:
-        done = impulses * (rates + 0.5 * law(jnp.matmul, (normal,), impulses))
+        done = impulses * (rates + 0.5 * _by_island(order, jnp.matmul, (normal,), impulses))
     else:
-        slip = rubs.rates(velocity).reshape(-1, 3)
-        matrices = normal, mixed, rubs.matrices(order, rubs)
+        slip, friction = rubs.rates(velocity).reshape(-1, 3), _numbers(groups, "friction")
         given = rates, slip, held, friction, plastic, impulses, on, bouncing, room
-        found, done = law(impulses_with_friction, matrices, *given)
+        matrices = normal, mixed, rubs.matrices(order, rubs)
+        found, done = _by_island(order, impulses_with_friction, matrices, *given)
         impulses, velocity = found[:, 0], rubs.pushed(velocity, found[:, 1:].reshape(-1))
     velocity = pushes.pushed(velocity, impulses)
     return velocity.rows.reshape(end.v.shape), velocity.rotors, done, impulses, met.astype(done.dtype)
+
+
+def _by_island(order: IslandOrder, law: Callable[..., Any], matrices: Sequence[Array], *given: Array) -> Any:
+    """What a law says of each contact by the matrices of its island."""
+    return jax.tree.map(order.joined, jax.vmap(law)(*matrices, *map(order.split, given)))
 
 
 def with_mobilities(system: SomeModel, state: State) -> SomeModel:
