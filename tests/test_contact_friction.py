@@ -264,3 +264,29 @@ def test_a_box_rocks_from_edge_to_edge(scheme):
     edge = system.sense(trajectory, nc.Point(handle, (-half, half, -height), local=True))
     assert np.abs(np.asarray(edge.velocity)[hit + 1 :]).max() <= 1e-3
     assert np.diff(np.asarray(system.energy(trajectory).total)).max() <= 1e-12
+
+
+@pytest.mark.slow
+def test_a_disc_that_stands_on_its_face_spins_down():
+    """As slowly as four points of its rim and its centre let it, which share the load by their mobilities."""
+    radius, length = 0.1, 0.05
+    tilting = 12 * radius**2 / (3 * radius**2 + length**2)
+    share = 4 / (4 + 1 + tilting)
+    for speed in (0.0, 1.0):
+        scene = nc.Scene()
+        scene.add(nc.Gravity())
+        given = {"velocity": (speed, 0, 0), "angular_velocity": (0, 0, 5.0)}
+        disc = nc.RigidBody(
+            shape=nc.Cylinder(radius, length), density=1e3, position=(0, 0, length / 2), **given
+        )
+        disc = scene.add(disc)
+        scene.add(nc.Contact(disc, FLOOR, friction=0.2))
+        system, state = scene.compile()
+        trajectory = nc.simulate(system, state, dt=1e-3, steps=320)
+        energy = np.asarray(system.energy(trajectory).total)
+        assert np.diff(energy).max() <= 1e-12 * energy[0]
+        if speed == 0.0:
+            moving = system.sense(trajectory, disc)
+            spin, place = np.asarray(moving.angular_velocity)[:, 2], np.asarray(moving.position)[-1]
+            assert spin[60] == pytest.approx(5.0 - 0.06 * share * 2 * 0.2 * 9.81 / radius, rel=1e-6)
+            assert np.abs(spin[290:]).max() <= 1e-9 and np.abs(place[:2]).max() <= 1e-9

@@ -13,6 +13,7 @@ from natcoord_jax.effects.contact.gap import Gap
 from natcoord_jax.maths.vectors import dot
 
 RADIUS = Number("not negative")
+FLAT = 1e-6  # [rad] tilt of a disc below which friction is nearer to its centre than to its rim
 TOWARDS_MIDDLE = 1e-3
 """How much nearest points of two segments are drawn to their middles: those of parallel ones are so told."""
 
@@ -220,6 +221,7 @@ class DiscOnPlane(Gap):
         return invariants[0] - self.radius * length(1.0 - invariants[1] ** 2)
 
     def contact(self, x: Float[Array, "4 3"]) -> tuple[Array, Array]:
-        """The lowest point of the rim; of a disc that lies flat its centre."""
+        """The lowest point of the rim; of a disc that lies flat its centre, lest rounding choose a point."""
         normal = direction(x[1])
-        return x[2] - self.radius * direction(normal - dot(normal, x[3]) * x[3]), normal
+        down = dot(normal, x[3]) * x[3] - normal
+        return x[2] + self.radius * down / jnp.sqrt(dot(down, down) + FLAT**2), normal
