@@ -152,7 +152,9 @@ def contacts(system: System, trajectory: Trajectory) -> Contacts:
 
     Args:
         system: compiled system, with contacts.
-        trajectory: of it, with any leading axes and all steps saved (`save_every=1`).
+        trajectory: of it, with any leading axes and all steps saved (`save_every=1`). Of some of the states
+            alone, impulses of contacts without a stiffness are whole, and forces of the others are those by
+            the gaps at the saved times.
 
     Raises:
         ValueError: for a system without contacts, and states that do not know of their impulses.
