@@ -9,6 +9,8 @@ import tolerances as tol
 from differences import assert_v_shaped
 
 import natcoord_jax as nc
+from natcoord_jax.maths.friction_law import impulses_with_friction
+from natcoord_jax.maths.impact_law import collision_impulses
 
 FLOOR = nc.Plane(normal=(0, 0, 1))
 STIFF = {"stiffness": 1e6, "restitution": 0.3, "speed": 0.5}
@@ -290,3 +292,24 @@ def test_a_disc_that_stands_on_its_face_spins_down():
             spin, place = np.asarray(moving.angular_velocity)[:, 2], np.asarray(moving.position)[-1]
             assert spin[60] == pytest.approx(5.0 - 0.06 * share * 2 * 0.2 * 9.81 / radius, rel=1e-6)
             assert np.abs(spin[290:]).max() <= 1e-9 and np.abs(place[:2]).max() <= 1e-9
+
+
+def test_law_of_impacts_with_friction():
+    """At four points of a rigid body, off its centre: none pulls, energy never rises, one is in its cone."""
+    rng, law = np.random.default_rng(1), jax.jit(impulses_with_friction)
+    for count in (1, 4):
+        for _ in range(20):
+            points = rng.normal(size=(count, 3)) * (1, 1, 0) - (0, 0, 1)
+            turns = np.cross(points[:, None], np.eye(3)[None])
+            levers = np.concatenate([np.tile(np.eye(3), (count, 1, 1)), turns], axis=2)
+            levers = levers / np.sqrt([1, 1, 1, *rng.uniform(0.2, 1, 3)])
+            along, across = levers[:, 2], (levers * np.diag([1, 1, 0]).sum(0)[:, None]).reshape(-1, 6)
+            velocity, on = rng.normal(size=6) - 2 * np.eye(6)[2], jnp.ones(count, bool)
+            normal, rates = jnp.asarray(along @ along.T), jnp.asarray(along @ velocity)
+            slip = jnp.asarray((across @ velocity).reshape(count, 3))
+            smooth = collision_impulses(normal, rates, jnp.full(count, 0.5), on)
+            given = slip, jnp.zeros((count, 4)), jnp.full(count, 0.4), *smooth, on, on, jnp.zeros(count)
+            found, work = law(normal, across @ along.T, across @ across.T, rates, *given)
+            assert found[:, 0].min() >= 0 and work.sum() <= 1e-12
+            if count == 1:
+                assert np.linalg.norm(found[0, 1:]) <= 0.4 * found[0, 0] + 1e-12

@@ -5,7 +5,8 @@ for what is hit in line with its centre. So contacts that push keep the rates th
 (`natcoord_jax.maths.impact_law`) has given them: with W of normals (n) and of slip (t), impulses f of
 friction come with impulses -X f along the normals, X = W_nn^+ W_nt, and act on slip by W_tt - W_tn X. Of
 impulses within the cones of friction, which depend on f thereby, those are looked for that stop slip, or
-oppose it: Coulomb's law with Newton's restitution. What is hit off its centre that law may give energy
+oppose it: Coulomb's law with Newton's restitution. (Of several contacts nearly so: after the rounds that are
+made some may be a few hundredths beyond their cones.) What is hit off its centre that law may give energy
 (W. J. Stronge, Impact Mechanics, 2000); impulses stop short of that.
 """
 
@@ -60,10 +61,19 @@ def impulses_with_friction(
     after = rates + normal @ smooth
     # What has pushed until the impact, and parts by it, does not pull.
     parting = (smooth <= 0) & (after > PARTING * jnp.max(jnp.abs(rates)))
-    taken = normal_changes(normal, mixed, bouncing & (pressed > 0) & ~parting)
     slipping = slip + (mixed @ smooth).reshape(slip.shape)
-    rubbing = friction_impulses(tangential - mixed @ taken, taken, slipping, held[:, 1:], pressed, friction)
-    rubbing = rubbing.reshape(-1)
+    moving = normal, mixed, tangential, slipping, held[:, 1:], pressed, friction
+    # Which of them hold is found apart from derivatives, which hold it, as `pressing_impulses` has it.
+    fixed, start = jax.lax.stop_gradient(moving), bouncing & (pressed > 0) & ~parting
+
+    def trip(carry: tuple[Array, Array]) -> tuple[Array, Array]:
+        taken, rubbing = _changes(*fixed, carry[0])
+        # A contact does not pull to hold its rate: it keeps the impulse that it has.
+        holding = carry[0] & (fixed[5] - taken @ rubbing >= 0)
+        return holding, jnp.any(holding != carry[0])
+
+    holding = jax.lax.while_loop(lambda c: c[1], trip, (start, jnp.any(start)))[0]
+    taken, rubbing = _changes(*moving, holding)
     matrix = jnp.block([[normal, mixed.T], [mixed, tangential]])
     given = jnp.concatenate([rates, slip.reshape(-1)])
     safe, wanted = jnp.pad(plastic, (0, rubbing.size)), jnp.concatenate([smooth - taken @ rubbing, rubbing])
@@ -75,6 +85,22 @@ def impulses_with_friction(
         return jnp.concatenate([x[:count, None], x[count:].reshape(count, 3)], axis=1)
 
     return each(found), jnp.sum(each(done), axis=1)
+
+
+def _changes(
+    normal: Array,
+    mixed: Array,
+    tangential: Array,
+    slip: Array,
+    held: Array,
+    pressed: Array,
+    friction: Array,
+    holding: Bool[Array, " c"],
+) -> tuple[Float[Array, "c 3c"], Float[Array, " 3c"]]:
+    """X of the contacts that hold their rates, and impulses of friction with these."""
+    taken = normal_changes(normal, mixed, holding)
+    found = friction_impulses(tangential - mixed @ taken, taken, slip, held, pressed, friction)
+    return taken, found.reshape(-1)
 
 
 def normal_changes(
