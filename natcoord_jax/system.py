@@ -122,7 +122,8 @@ class System(Model):
         """Numbers of a part by name.
 
         Args:
-            part: handle or name of a body, a joint or an effect; or several of one kind, stacked.
+            part: handle or name of a body, a joint or an effect; or several of one kind, stacked. A name that
+                parts share, as "floor" is that of "floor[0]" and so on, stands for all of them.
             field: name of the number; None: all of them, in a dictionary. Of a body "mass" [kg], "com" [m]
                 and "inertia" about it [kg m^2] in body axes, or all of it as "mass_block" (15); of an effect
                 its fields, "field.number" for those of a module in a field, and "weights" of its markers
@@ -148,7 +149,8 @@ class System(Model):
 
         Raises:
             ValueError: for a part or a number that there is not, naming those that there are, or a shape
-                that does not fit.
+                that does not fit; for a number that the part refuses, as a negative stiffness. Where that
+                is traced it becomes not a number, and a run with it ends with `Result.NONFINITE`.
 
         Example:
             >>> import jax; jax.config.update("jax_enable_x64", True)

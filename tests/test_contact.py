@@ -396,6 +396,8 @@ def test_gradients_through_a_bounce():
         (lambda ball, bare: nc.Contact(ball, FLOOR, stiffness=1.0, restitution=1.2, speed=1.0), "up to 1"),
         (lambda ball, bare: nc.Contact(ball, FLOOR, stiffness=1.0, restitution=0.5), r"is that of one speed"),
         (lambda ball, bare: nc.Contact(ball, "floor", stiffness=1.0), "other is 'floor'"),
+        (lambda ball, bare: nc.Contact(ball, FLOOR, restitution=2.0), "^contact 'contact 1': restitution"),
+        (lambda ball, bare: nc.Contact(FLOOR, FLOOR), "'ground' would be in contact with itself"),
     ],
 )
 def test_wrong_input_is_refused(make, message):

@@ -13,6 +13,7 @@ from natcoord_jax.maths.friction_law import impulses_with_friction
 from natcoord_jax.maths.impact_law import collision_impulses
 
 FLOOR = nc.Plane(normal=(0, 0, 1))
+LYING = [[0, 0, 1], [0, 1, 0], [-1, 0, 0]]
 STIFF = {"stiffness": 1e6, "restitution": 0.3, "speed": 0.5}
 BALL = {"shape": nc.Sphere(0.1), "density": 1 / (4 / 3 * np.pi * 1e-3)}  # of 1 kg
 
@@ -313,3 +314,25 @@ def test_law_of_impacts_with_friction():
             assert found[:, 0].min() >= 0 and work.sum() <= 1e-12
             if count == 1:
                 assert np.linalg.norm(found[0, 1:]) <= 0.4 * found[0, 0] + 1e-12
+
+
+@pytest.mark.parametrize("shape", [nc.Box((0.2, 0.2, 0.2)), nc.Capsule(0.1, 0.2)])
+def test_derivatives_where_contacts_share_a_load(shape):
+    """What each bears is known by compliance alone: forward, reverse and differences agree nevertheless."""
+    scene = nc.Scene()
+    scene.add(nc.Gravity())
+    start = {"position": (0, 0, 0.3), "velocity": (1.0, 0.2, 0), "orientation": LYING}
+    body = scene.add(nc.RigidBody(shape=shape, density=100.0, **start))
+    scene.add(nc.Contact(body, FLOOR, restitution=0.5, friction=0.3, name="rubs"))
+    system, state = scene.compile()
+
+    @jax.jit
+    def place(friction):
+        changed = system.set("rubs", friction=friction)
+        return nc.simulate(changed, state, dt=0.01, steps=24).q[jnp.array([21, 22, 24]), 0, :2]
+
+    forward, reverse = jax.jit(jax.jacfwd(place))(0.3), jax.jit(jax.jacrev(place))(0.3)
+    assert np.all(np.abs(forward[:, 0]) > 1e-3)
+    np.testing.assert_allclose(reverse, forward, rtol=1e-8, atol=1e-10)
+    differences = (place(0.3 + 1e-4) - place(0.3 - 1e-4)) / 2e-4
+    np.testing.assert_allclose(forward, differences, rtol=1e-5, atol=1e-7)

@@ -103,7 +103,7 @@ def test_set_compiles_nothing_and_is_differentiable(compiled):
         (lambda s: s.set("spring 0", stiffness=(1.0, 2.0)), r"stiffness has shape \(2,\); pass shape \(\)"),
         (lambda s: s.set(["spring 0", "spring 1"], stiffness=(1, 2, 3)), r"pass shape \(\) or \(2,\)"),
         (lambda s: s.set("bead", inertia=(1.0, 1.0, 1.0)), "'bead' has no number 'inertia'"),
-        (lambda s: s.set("body", mass=-1.0), "pass a positive number"),
+        (lambda s: s.set("body", mass=-1.0), r"'body': mass \[kg\] is -1; pass positive"),
         (lambda s: s.set("body", mass=1.0, mass_block=np.eye(4)), "not both"),
         (lambda s: s.set("spring 0", stiffness=np.nan), "pass finite"),
         (lambda s: s.set("spring 0"), "nothing to set"),
@@ -113,6 +113,61 @@ def test_set_compiles_nothing_and_is_differentiable(compiled):
 def test_what_is_wrong_is_named(compiled, change, message):
     with pytest.raises(ValueError, match=message):
         change(compiled[0])
+
+
+@pytest.mark.parametrize(
+    ("part", "numbers", "bad"),
+    [
+        ("spring 0", "stiffness", -1.0),
+        ("body", "mass", 0.0),
+        ("contact", "friction", -0.3),
+        ("contact", "restitution", 1.5),
+    ],
+)
+def test_what_would_be_refused_ends_a_run_inside_of_jit(landing, part, numbers, bad):
+    """A number that is refused where it is known is not a number where it is traced, of its own lane only."""
+    system, state = landing
+    with pytest.raises(ValueError, match=part):
+        system.set(part, **{numbers: bad})
+
+    def run(value):
+        return nc.simulate(system.set(part, **{numbers: value}), state, dt=0.01, steps=40)
+
+    runs = jax.jit(jax.vmap(run))(jnp.array([bad, 0.5]))
+    assert list(np.asarray(runs.result)) == [int(nc.Result.NONFINITE), int(nc.Result.SUCCESSFUL)]
+    assert "lane 0" in system.explain(runs)
+    slope = jax.jit(jax.grad(lambda value: run(value).q[-1, 0, 2]))(0.5)
+    assert np.isfinite(slope)
+
+
+@pytest.fixture(scope="module")
+def landing():
+    """A box that slides where it lands, on a spring."""
+    scene = nc.Scene()
+    scene.add(nc.Gravity())
+    shape = nc.Box((0.2, 0.2, 0.2))
+    body = scene.add(
+        nc.RigidBody(shape=shape, density=100.0, position=(0, 0, 0.3), velocity=(1, 0, 0), name="body")
+    )
+    scene.add(
+        nc.Spring(
+            (nc.Point(nc.ground, (0, 0, 2.0)), nc.Point(body)), stiffness=0.5, length=1.0, name="spring 0"
+        )
+    )
+    scene.add(nc.Contact(nc.Plane(normal=(0, 0, 1)), body, restitution=0.5, friction=0.3, name="contact"))
+    return scene.compile()
+
+
+def test_a_name_that_parts_share_is_all_of_them(landing):
+    """The gaps of a contact, which a user never named."""
+    system, _ = landing
+    changed = system.set("contact", friction=0.4, restitution=0.1)
+    assert np.array_equal(changed.get("contact", "friction"), [0.4] * 8)
+    assert float(changed.get("contact[3]", "restitution")) == 0.1
+    each = system.set("contact", friction=np.linspace(0.1, 0.8, 8))
+    assert float(each.get("contact[7]", "friction")) == 0.8
+    with pytest.raises(ValueError, match="no part 'contac'"):
+        system.set("contac", friction=0.4)
 
 
 def test_starting_at_another_time():

@@ -76,8 +76,8 @@ class Contact(Recipe):
 
     Attributes:
         one: handle of a body with a shape, of a point mass or a node, of a beam, of a shell or a solid, or
-            faces of these, as block.face("x1").
-        other: `nc.Plane`, or another of that kind.
+            faces of these, as block.face("x1"); or `nc.Plane`.
+        other: another of these.
         all_pairs_of: instead of these, handles of bodies that are in contact each with each other, but for
             pairs that a joint is between which was added before.
         ignore: pairs of them that are not, as [(one, other)].
@@ -129,7 +129,7 @@ class Contact(Recipe):
         True
     """
 
-    one: Any = eqx.field(default=None, static=True, metadata=is_a(SOLID))
+    one: Any = eqx.field(default=None, metadata=is_a(SIDE))
     other: Any = eqx.field(default=None, metadata=is_a(SIDE))
     all_pairs_of: Any = eqx.field(
         default=None, kw_only=True, static=True, converter=_tuple, metadata=is_a(Several(BODY))

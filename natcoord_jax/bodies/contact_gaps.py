@@ -7,6 +7,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from natcoord_jax.bodies.contact_law import Law, kept_open
 from natcoord_jax.bodies.contact_sides import (
     BeamSide,
     BodySide,
@@ -24,30 +25,17 @@ from natcoord_jax.bodies.shapes import CORNERS, Box, Capsule, Cylinder, Ellipsoi
 from natcoord_jax.core.checks import as_array, is_concrete
 from natcoord_jax.core.eager_numpy import eager_numpy, stacked
 from natcoord_jax.core.effect import replace_fields
-from natcoord_jax.core.markers import Marker
 from natcoord_jax.effects.contact import (
     CapsuleOnCapsule,
     CornersOnBox,
     DiscOnPlane,
     EdgesOnEdges,
     EllipsoidOnPlane,
-    FrictionalGapPotential,
-    Gap,
     GapConstraint,
-    GapPotential,
     SphereOnBox,
     SphereOnPlane,
     SphereOnSphere,
 )
-
-OF_SOME = {
-    "rounding": "the edges of two boxes",
-    **dict.fromkeys(("candidates", "one_pass", "method"), "two surfaces"),
-}
-"""Options that contacts of other sides have no use for, and whose they are."""
-
-OF_CONSTRAINTS = "restitution", "friction"
-"""Options of contacts without a stiffness."""
 
 ROUNDING = 0.02
 """Radius of edges and corners of boxes on boxes, of the shortest edge."""
@@ -58,7 +46,6 @@ SHARED = 1e-9
 STACKED = 1e-8
 """The same of boxes on boxes, of whose gaps twice as many share a load, in stacks of ten."""
 
-Law = dict[str, Any]
 Gaps = list[Any]
 
 
@@ -115,33 +102,6 @@ def gaps_within(beam: Side, law: Law, name: str) -> Gaps:
     return [gap for i, j in pairs for gap in gaps_between(parts[i], parts[j], law, name)]
 
 
-def _kept_open(gap: Gap, markers: tuple[Marker, ...], law: Law, name: str, *sides: Side) -> Any:
-    """A potential with the stiffness that is given or that of the sides; a constraint where there is none."""
-    law = dict(law)
-    for option in OF_SOME.keys() & law:
-        raise ValueError(f"contact {name!r}: {option} is an option of {OF_SOME[option]}; leave it out")
-    balls = [s for s in sides if isinstance(s, SegmentSide)]
-    own = [s.stiffness for s in balls if s.stiffness is not None]
-    given = law.pop("stiffness")
-    stiffness = given if given is not None else min(own, default=None)
-    if stiffness is not None and "friction" in law:
-        # A node does not turn, or not about its director: what rubs at another place than it would be lost.
-        if own and (any(np.asarray(s.radius) > 0 for s in balls) or not isinstance(gap, SphereOnPlane)):
-            raise ValueError(
-                f"contact {name!r}: there is no friction [-] on nodes of shells and solids yet but those of "
-                "solids on planes; leave it out"
-            )
-        return FrictionalGapPotential(markers, gap, stiffness=stiffness, **law)
-    if stiffness is not None:
-        return GapPotential(markers, gap, stiffness=stiffness, **law)
-    if "speed" in law or law["law"] != "linear":
-        raise ValueError(
-            f"contact {name!r}: speed [m/s] and law are of contacts with a stiffness [N/m]; pass "
-            "`stiffness`, or leave them out"
-        )
-    return GapConstraint(markers, gap, **{key: law[key] for key in OF_CONSTRAINTS if key in law})
-
-
 def _sharing(gaps: Gaps, compliance: float = SHARED) -> Gaps:
     """Gaps of one body, which may depend on each other."""
     return [replace_fields(g, compliance=compliance) if isinstance(g, GapConstraint) else g for g in gaps]
@@ -149,7 +109,7 @@ def _sharing(gaps: Gaps, compliance: float = SHARED) -> Gaps:
 
 def _ball_on_plane(ball: SegmentSide, plane: PlaneSide, law: Law, name: str) -> Gaps:
     markers = *plane.plane.markers(), ball.ends[0]
-    return [_kept_open(SphereOnPlane(radius=ball.radius), markers, law, name, ball, plane)]
+    return [kept_open(SphereOnPlane(radius=ball.radius), markers, law, name, ball, plane)]
 
 
 def _segment_on_plane(segment: SegmentSide, plane: PlaneSide, law: Law, name: str) -> Gaps:
@@ -170,7 +130,7 @@ def _box_on_plane(box: BodySide, plane: PlaneSide, law: Law, name: str) -> Gaps:
 def _ellipsoid_on_plane(ellipsoid: BodySide, plane: PlaneSide, law: Law, name: str) -> Gaps:
     shape: Any = ellipsoid.shape
     markers = *plane.plane.markers(), ellipsoid.point(), *ellipsoid.axes()
-    return [_kept_open(EllipsoidOnPlane(semi_axes=shape.semi_axes), markers, law, name)]
+    return [kept_open(EllipsoidOnPlane(semi_axes=shape.semi_axes), markers, law, name)]
 
 
 def _cylinder_on_plane(cylinder: BodySide, plane: PlaneSide, law: Law, name: str) -> Gaps:
@@ -185,7 +145,7 @@ def _cylinder_on_plane(cylinder: BodySide, plane: PlaneSide, law: Law, name: str
     for end in (-0.5, 0.5):
         middle = np.array([0.0, 0.0, 1.0]) * end * shape.length
         markers = *plane.plane.markers(), cylinder.point(middle), axis
-        found.append(_kept_open(DiscOnPlane(radius=shape.radius), markers, law, name))
+        found.append(kept_open(DiscOnPlane(radius=shape.radius), markers, law, name))
         for corner in ((1, 0, 0), (0, 1, 0), (-1, 0, 0), (0, -1, 0)):
             ball = SegmentSide.ball(cylinder.point(middle + shape.radius * np.array(corner)))
             found += _ball_on_plane(ball, plane, law, name)
@@ -195,7 +155,7 @@ def _cylinder_on_plane(cylinder: BodySide, plane: PlaneSide, law: Law, name: str
 def _ball_on_box(ball: SegmentSide, box: BodySide, law: Law, name: str) -> Gaps:
     shape: Any = box.shape
     markers = box.point(), ball.ends[0], *box.axes()
-    return [_kept_open(SphereOnBox(size=shape.size, radius=ball.radius), markers, law, name, ball, box)]
+    return [kept_open(SphereOnBox(size=shape.size, radius=ball.radius), markers, law, name, ball, box)]
 
 
 def _segment_on_box(segment: SegmentSide, box: BodySide, law: Law, name: str) -> Gaps:
@@ -229,11 +189,11 @@ def _box_on_box(one: BodySide, other: BodySide, law: Law, name: str) -> Gaps:
         for corner in CORNERS[len(CORNERS) // 2 :]:
             tip = 0.5 * sizes[1 - k] * corner
             gap = CornersOnBox(size=sizes[k], corner=tip, rounding=rounding)
-            found.append(_kept_open(gap, markers, law, name))
+            found.append(kept_open(gap, markers, law, name))
     markers = one.point(), other.point(), *one.axes(), *other.axes()
     for skew in product((-1.0, 1.0), repeat=2):
         gap = EdgesOnEdges(sizes=sizes, skew=skew, rounding=rounding)
-        found.append(_kept_open(gap, markers, law, name))
+        found.append(kept_open(gap, markers, law, name))
     return _sharing(found, STACKED)
 
 
@@ -258,12 +218,12 @@ def _radii(one: SegmentSide, other: SegmentSide, name: str) -> Any:
 
 def _balls(one: SegmentSide, other: SegmentSide, law: Law, name: str) -> Gaps:
     radii = _radii(one, other, name)
-    return [_kept_open(SphereOnSphere(radii=radii), (one.ends[0], other.ends[0]), law, name, one, other)]
+    return [kept_open(SphereOnSphere(radii=radii), (one.ends[0], other.ends[0]), law, name, one, other)]
 
 
 def _segments(one: SegmentSide, other: SegmentSide, law: Law, name: str) -> Gaps:
     radii = _radii(one, other, name)
-    return [_kept_open(CapsuleOnCapsule(radii=radii), (*one.ends, *other.ends), law, name, one, other)]
+    return [kept_open(CapsuleOnCapsule(radii=radii), (*one.ends, *other.ends), law, name, one, other)]
 
 
 def _surfaces(one: MeshSide, other: MeshSide, law: Law, name: str) -> Gaps:

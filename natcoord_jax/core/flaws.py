@@ -1,10 +1,12 @@
 """What is wrong with stacked effects, where their numbers are known."""
 
+from functools import reduce
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Bool
 
 from natcoord_jax.core.checks import is_concrete
 from natcoord_jax.core.eager_numpy import eager_numpy
@@ -23,6 +25,18 @@ def first_flaw(effect: Effect) -> tuple[int, str] | None:
         if is_concrete(wrong) and np.any(np.asarray(wrong)):
             return int(np.flatnonzero(np.asarray(wrong))[0]), said
     return None
+
+
+def traced_flaws(effect: Effect) -> Bool[Array, " n"] | None:
+    """With which of stacked instances something is wrong, as far as that is traced; None: nothing is.
+
+    Args:
+        effect: instances, leading axis of all numbers.
+    """
+    if type(effect).flaws is Effect.flaws:
+        return None
+    traced = [wrong for wrong in _flaws(effect).values() if not is_concrete(wrong)]
+    return reduce(jnp.logical_or, traced) if traced else None
 
 
 @eager_numpy

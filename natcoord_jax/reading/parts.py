@@ -1,6 +1,5 @@
 """Numbers of the parts of a system, by name: read, and set in a copy."""
 
-import dataclasses
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -10,16 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from natcoord_jax.core.arguments import DECLARED
 from natcoord_jax.core.checks import as_array, is_concrete
 from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.effect import Effect, replace_fields
-from natcoord_jax.core.flaws import first_flaw
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.names import listed
 from natcoord_jax.model.groups import Group
 from natcoord_jax.model.masses import with_mass
 from natcoord_jax.model.model import Model, SomeModel
+from natcoord_jax.reading.admissible import as_signed, signed, without_flaws
 
 Names = Handle | str | Sequence[Handle | str]
 
@@ -38,6 +36,15 @@ class Place(NamedTuple):
 def _names(part: Names) -> tuple[str, ...]:
     listed = [part] if isinstance(part, Handle | str) else part
     return tuple(x.name if isinstance(x, Handle) else x for x in listed)
+
+
+def _several(system: Model, part: Names) -> Names:
+    """The parts "name[0]" and so on of a name that is no part itself: of a contact with several gaps, say."""
+    if not isinstance(part, str) or part in system.structure.bodies:
+        return part
+    known = [n for g in (*system.joints, *system.effects) for n in (*g.names, *g.labels)]
+    parts = [] if part in known else [n for n in dict.fromkeys(known) if n.startswith(f"{part}[")]
+    return parts or part
 
 
 def _numbered(system: SomeModel) -> SomeModel:
@@ -137,6 +144,7 @@ def _diagonal(values: Float[Array, "3"]) -> Float[Array, "3 3"]:
 
 def get(system: Model, part: Names, field: str | None = None) -> Any:
     """Numbers of a part, or one of them; see `System.get`."""
+    part = _several(system, part)
     if not isinstance(part, Handle | str):
         each = [get(system, name, field) for name in _names(part)]
         return jax.tree.map(lambda *x: jnp.stack(x), *each)
@@ -156,6 +164,7 @@ def get(system: Model, part: Names, field: str | None = None) -> Any:
 
 def set_numbers(system: SomeModel, part: Names, values: dict[str, Any]) -> SomeModel:
     """A copy with other numbers in a part or in several; see `System.set`."""
+    part = _several(system, part)
     names = _names(part)
     many = not isinstance(part, Handle | str)
     if not values:
@@ -171,6 +180,7 @@ def set_numbers(system: SomeModel, part: Names, values: dict[str, Any]) -> SomeM
             label = f"{name!r}: {field}"
             every = found[field].row is None if field in found else False
             given[field] = _fitting(value, now[field], k if many else None, len(names), label, every=every)
+        given = as_signed(system, name, given)
         if "mass_block" in found:
             given = _as_block(name, now, given)
         leaves, structure = jax.tree.flatten(system)
@@ -178,41 +188,8 @@ def set_numbers(system: SomeModel, part: Names, values: dict[str, Any]) -> SomeM
             leaf, row, _ = found[field]
             leaves[leaf] = _with_row(jnp.asarray(leaves[leaf]), row, value)
         system = _renewed(system, jax.tree.unflatten(structure, leaves), name, set(given))
-        _check_signs(system, name, given)
+        system = without_flaws(system, name, [found[field][:2] for field in given])
     return system
-
-
-def _check_signs(after: Model, name: str, given: dict[str, Any]) -> None:
-    """Refuse numbers that an effect would have refused when it was made, and elements that cannot be."""
-    for group in after.effects:
-        if name not in group.names and name not in group.labels:
-            continue
-        for field, value in given.items():
-            kind = _declared(group.effect, field)
-            sign = getattr(kind, "sign", "")
-            if not sign or not is_concrete(value):
-                continue
-            least = float(np.min(np.asarray(value), initial=np.inf))
-            if least < 0 or (least == 0 and sign == "positive"):
-                wanted = "positive numbers" if sign == "positive" else "numbers that are not negative"
-                raise ValueError(f"{group.effect.kind} {name!r}: {field} is {least:g}; pass {wanted}")
-        flaw = first_flaw(group.effect) if group.lanes else None
-        if flaw is not None:
-            number, said = flaw
-            of_them = f"element {number} of " if group.is_set else ""
-            raise ValueError(f"{of_them}{group.effect.kind} {name!r} {said}")
-
-
-def _declared(module: Any, path: str) -> Any:
-    """What a number of a part was declared to be, if it was."""
-    owner, _, rest = path.partition(".")
-    fields = {f.name: f for f in dataclasses.fields(module)}
-    if owner not in fields:
-        return None
-    if rest:
-        inner = getattr(module, owner)
-        return _declared(inner, rest) if dataclasses.is_dataclass(inner) else None
-    return fields[owner].metadata.get(DECLARED)
 
 
 def _renewed(before: Model, after: SomeModel, name: str, given: set[str]) -> SomeModel:
@@ -244,8 +221,8 @@ def _as_block(name: str, now: dict[str, Array], given: dict[str, Array]) -> dict
         if len(given) > 1:
             raise ValueError(f"body {name!r}: pass mass_block, or some of {list(BODY)}, not both")
         return given
-    if "mass" in given and is_concrete(given["mass"]) and not float(given["mass"]) > 0:
-        raise ValueError(f"body {name!r}: mass [kg] is {float(given['mass']):g}; pass a positive number")
+    if "mass" in given:
+        given = {**given, "mass": signed(given["mass"], "positive", f"body {name!r}: mass [kg]")}
     if "inertia" not in now:
         return {"mass_block": now["mass_block"].at[0, 0].set(given["mass"])}
     return {"mass_block": _block(*(given.get(key, now[key]) for key in BODY))}

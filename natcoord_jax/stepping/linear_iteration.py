@@ -32,6 +32,10 @@ error by masses alone: rounding leaves as much as is allowed."""
 STALL = 1e-10
 """Corrections that stop shrinking below this have reached the floor of round-off."""
 
+SHARED_STALL = 1e-6
+"""The same where the residual is that of rounding, as contacts that share a load leave it: what each of them
+bears is known by their compliance alone, to fewer digits than what they bear together."""
+
 CORRECTIONS = 30
 """Corrections with one factorisation."""
 
@@ -182,11 +186,12 @@ class LinearIteration(eqx.Module):
         floor = jnp.maximum(STALL * size, STALL_ROUND_OFF * whole)
         # With factors of another system, corrections that stop shrinking may be these factors' fault.
         own = self.rounds > 0
-        stalled = ~first & (ratio > 0.5) & (entire <= floor) & own
         within = entire <= jnp.where(self.last, SURPRISE, 1.0) * allowed
         size_by_mass, missing = sizes_by_mass(lam, residual, masses)
         close_by_mass = (CLOSE if transposed else CLOSE_FORWARD) * size_by_mass
         sure = missing <= SURPRISE * jnp.maximum(close_by_mass, ROUND_OFF * whole)
+        floor = jnp.where(sure, jnp.maximum(floor, SHARED_STALL * size), floor)
+        stalled = ~first & (ratio > 0.5) & (entire <= floor) & own
         done = (within | stalled) & (own | sure) & finite & factors.usable
         following = correction * factors.left_by(ratio, first)
         compares = self.going & ~first & (self.correction > allowed) & finite
