@@ -32,10 +32,6 @@ error by masses alone: rounding leaves as much as is allowed."""
 STALL = 1e-10
 """Corrections that stop shrinking below this have reached the floor of round-off."""
 
-SHARED_STALL = 1e-6
-"""The same where the residual is that of rounding, as contacts that share a load leave it: what each of them
-bears is known by their compliance alone, to fewer digits than what they bear together."""
-
 CORRECTIONS = 30
 """Corrections with one factorisation."""
 
@@ -190,8 +186,9 @@ class LinearIteration(eqx.Module):
         size_by_mass, missing = sizes_by_mass(lam, residual, masses)
         close_by_mass = (CLOSE if transposed else CLOSE_FORWARD) * size_by_mass
         sure = missing <= SURPRISE * jnp.maximum(close_by_mass, ROUND_OFF * whole)
-        floor = jnp.where(sure, jnp.maximum(floor, SHARED_STALL * size), floor)
-        stalled = ~first & (ratio > 0.5) & (entire <= floor) & own
+        # Of contacts that share a load each bears what its compliance says, to fewer digits than the floor:
+        # where the residual is that of rounding, nothing gets nearer.
+        stalled = ~first & (ratio > 0.5) & own & (sure | (entire <= floor))
         done = (within | stalled) & (own | sure) & finite & factors.usable
         following = correction * factors.left_by(ratio, first)
         compares = self.going & ~first & (self.correction > allowed) & finite
