@@ -178,6 +178,7 @@ class LinearIteration(eqx.Module):
         correction, entire = _size(made[1], weights), _size(change, weights)
         ratio = correction / jnp.where(self.correction > 0, self.correction, 1.0)
         first = self.count == 0
+        later = ~first
         finite = jnp.isfinite(correction) & jnp.isfinite(size)
         floor = jnp.maximum(STALL * size, STALL_ROUND_OFF * whole)
         # With factors of another system, corrections that stop shrinking may be these factors' fault.
@@ -188,15 +189,15 @@ class LinearIteration(eqx.Module):
         sure = missing <= SURPRISE * jnp.maximum(close_by_mass, ROUND_OFF * whole)
         # Of contacts that share a load each bears what its compliance says, to fewer digits than the floor:
         # where the residual is that of rounding, nothing gets nearer.
-        stalled = ~first & (ratio > 0.5) & own & (sure | (entire <= floor))
+        stalled = later & (ratio > 0.5) & own & (sure | (entire <= floor))
         done = (within | stalled) & (own | sure) & finite & factors.usable
         following = correction * factors.left_by(ratio, first)
-        compares = self.going & ~first & (self.correction > allowed) & finite
+        compares = self.going & later & (self.correction > allowed) & finite
         factors = factors.having_left(ratio, compares)
         last = following <= allowed
         late = correction * ratio ** (patience * (SPEED if learns(solver) else 1)) > allowed
         # Formulas leave out what is mostly small, and no others would take more of it in.
-        slow = ~first & ((ratio > 0.5) | late) & ~(own & (not learns(solver)))
+        slow = later & ((ratio > 0.5) | late) & ~(own & (not learns(solver)))
         slow = slow | (self.count >= CORRECTIONS) | ~finite | ~factors.usable
         slow = slow & ~done
         moving = ~slow & ~done
