@@ -41,7 +41,7 @@ def falling(turn, law):
 @pytest.mark.parametrize("turn", TURNS)
 @pytest.mark.parametrize(
     "law",
-    ["soft", "hard", *(pytest.param(f"{x} with friction", marks=pytest.mark.slow) for x in ("soft", "hard"))],
+    ["soft", "hard", "hard with friction", pytest.param("soft with friction", marks=pytest.mark.exhaustive)],
 )
 def test_a_box_falls_on_a_box(turn, law):
     """Energy but for what is booked, momentum and angular momentum, on a face, an edge and a corner."""
