@@ -54,7 +54,14 @@ def test_nearest_points():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("two_sided", [0.0, 1.0])
-@pytest.mark.parametrize("at", [(0.4, 0.5, 0.05), (0.97, 0.6, 0.04), (1.02, 0.5, -0.03), (-0.05, 0.5, 0.05)])
+@pytest.mark.parametrize(
+    "at",
+    [
+        (0.4, 0.5, 0.05),
+        (1.02, 0.5, -0.03),
+        *(pytest.param(x, marks=pytest.mark.exhaustive) for x in ((0.97, 0.6, 0.04), (-0.05, 0.5, 0.05))),
+    ],
+)
 def test_contract_of_a_gap(two_sided, at):
     """Frame-indifferent; a lever without sum and moment that is its derivative, within, at edges and ends."""
     random = np.random.default_rng(1)
