@@ -321,8 +321,7 @@ def test_import_takes_less_than_half_a_second(tmp_path):
     runs = [subprocess.run(command, cwd=ROOT, env=env, capture_output=True, text=True) for _ in range(11)]
     own, ours = np.array([run.stdout.split() for run in runs[1:]], float).T  # The first compiles.
     # What else the machine does slows either part of a run: the fastest of both may be of different runs.
-    quick = ours < np.maximum(0.5, 1.25 * own)
-    assert quick.any(), f"{ours} s, where JAX takes {own} s"
+    assert np.median(ours / np.maximum(0.5, 1.25 * own)) < 1, f"{ours} s, where JAX takes {own} s"
 
 
 def test_public_names_have_docstrings():

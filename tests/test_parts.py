@@ -120,6 +120,7 @@ REFUSED = {
     ("body", "mass"): 0.0,
     ("contact", "friction"): -0.3,
     ("contact", "restitution"): 1.5,
+    ("soft", "restitution"): 1.5,
 }
 
 
@@ -132,6 +133,9 @@ def landing(shape):
     ends = nc.Point(nc.ground, (0, 0, 2.0)), nc.Point(body)
     scene.add(nc.Spring(ends, stiffness=0.5, length=1.0, name="spring 0"))
     scene.add(nc.Contact(nc.Plane(normal=(0, 0, 1)), body, restitution=0.5, friction=0.3, name="contact"))
+    soft = {"stiffness": 1e3, "restitution": 0.5, "speed": 1.0, "name": "soft"}
+    ball = scene.add(nc.PointMass(mass=1.0, position=(5, 0, 0.2)))
+    scene.add(nc.Contact(ball, nc.Plane(normal=(0, 0, 1)), **soft))
     return scene.compile()
 
 
@@ -148,10 +152,10 @@ def test_what_would_be_refused_ends_a_run_inside_of_jit():
             changed = changed.set(part, **{field: value})
         return nc.simulate(changed, state, dt=0.01, steps=40)
 
-    good, bad = np.full(4, 0.5), np.array(list(REFUSED.values()))
-    runs = jax.jit(jax.vmap(run))(np.where(np.eye(5, 4, dtype=bool), bad, good))
+    good, bad = np.full(5, 0.5), np.array(list(REFUSED.values()))
+    runs = jax.jit(jax.vmap(run))(np.where(np.eye(6, 5, dtype=bool), bad, good))
     failed, well = int(nc.Result.NONFINITE), int(nc.Result.SUCCESSFUL)
-    assert list(np.asarray(runs.result)) == [failed, failed, failed, failed, well]
+    assert list(np.asarray(runs.result)) == [failed] * 5 + [well]
 
 
 def test_a_name_that_parts_share_is_all_of_them():

@@ -5,15 +5,17 @@ with the code that says so; a spring that pushes because a search went below zer
 """
 
 import dataclasses
-from collections.abc import Sequence
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool
 
 from natcoord_jax.core.arguments import DECLARED
 from natcoord_jax.core.checks import is_concrete
+from natcoord_jax.core.effect import Effect, replace_fields
 from natcoord_jax.core.flaws import first_flaw, traced_flaws
 from natcoord_jax.model.groups import Group
 from natcoord_jax.model.model import Model, SomeModel
@@ -51,33 +53,38 @@ def signed(value: Any, sign: str, label: str) -> Any:
     return value
 
 
-def without_flaws(system: SomeModel, name: str, places: Sequence[tuple[int, int | None]]) -> SomeModel:
-    """The system, where an effect is one that can be.
+def without_flaws(system: SomeModel, name: str) -> SomeModel:
+    """The system after numbers of a part were set, where an effect is one that can be.
 
-    Args:
-        system: after its numbers were set.
-        name: of the effect.
-        places: leaf and row of these numbers.
+    Where what is wrong with an instance is traced, none of its numbers is a number: what follows from those
+    that were set may look sound.
 
     Raises:
         ValueError: for an effect that cannot be, with what is wrong, where it is known.
     """
-    for group in _groups(system, name):
-        flaw = first_flaw(group.effect) if group.lanes else None
-        if flaw is not None:
-            number, said = flaw
-            of_them = f"element {number} of " if group.is_set else ""
-            raise ValueError(f"{of_them}{group.effect.kind} {name!r} {said}")
-        wrong = traced_flaws(group.effect) if group.lanes else None
-        if wrong is None:
+    effects = list(system.effects)
+    for number, group in enumerate(effects):
+        if not group.lanes or (name not in group.names and name not in group.labels):
             continue
-        leaves, structure = jax.tree.flatten(system)
-        for leaf, row in places:
-            value = leaves[leaf]
-            bad = wrong if row is None else wrong & (jnp.arange(len(wrong)) == row)
-            leaves[leaf] = jnp.where(bad.reshape(-1, *[1] * (value.ndim - 1)), jnp.nan, value)
-        system = jax.tree.unflatten(structure, leaves)
-    return system
+        flaw = first_flaw(group.effect)
+        if flaw is not None:
+            element, said = flaw
+            of_them = f"element {element} of " if group.is_set else ""
+            raise ValueError(f"{of_them}{group.effect.kind} {name!r} {said}")
+        wrong = traced_flaws(group.effect)
+        if wrong is not None:
+            effects[number] = replace_fields(group, effect=_spoiled(group.effect, wrong))
+    return replace_fields(system, effects=tuple(effects))
+
+
+def _spoiled(effect: Effect, wrong: Bool[Array, " n"]) -> Effect:
+    """Stacked instances, without numbers where something is wrong."""
+
+    def spoiled(x: Any) -> Any:
+        bad = wrong.reshape(-1, *[1] * (np.ndim(x) - 1))
+        return jnp.where(bad, jnp.nan, x) if eqx.is_inexact_array(x) else x
+
+    return jax.tree.map(spoiled, effect)
 
 
 def _groups(system: Model, name: str) -> list[Group]:

@@ -188,7 +188,7 @@ def set_numbers(system: SomeModel, part: Names, values: dict[str, Any]) -> SomeM
             leaf, row, _ = found[field]
             leaves[leaf] = _with_row(jnp.asarray(leaves[leaf]), row, value)
         system = _renewed(system, jax.tree.unflatten(structure, leaves), name, set(given))
-        system = without_flaws(system, name, [found[field][:2] for field in given])
+        system = without_flaws(system, name)
     return system
 
 
