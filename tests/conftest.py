@@ -1,40 +1,29 @@
-"""Settings of the test-suite: double precision, a cache of compiled programs, checks of types."""
+"""Settings of the test-suite: double precision, compiler flags by lane, a cache of programs, durations."""
 
 import ctypes
 import gc
+import json
 import os
+import shutil
+import tempfile
 from importlib.metadata import version
 from pathlib import Path
-
-# A third of the time to compile, for programs that are run briefly; read when the first one is compiled.
-# Flags from outside come last and win: XLA_FLAGS=--xla_backend_optimization_level=3 tests what users run.
-os.environ["XLA_FLAGS"] = (
-    # Compilers from JAX 0.11 on do not have this, and end a process that asks for it.
-    ("--xla_cpu_use_fusion_emitters=false " if version("jaxlib").startswith("0.10.") else "")
-    + "--xla_disable_hlo_passes=while-loop-invariant-code-motion,simplify-while-loops,"
-    + f"while-loop-trip-count-annotator --xla_backend_optimization_level=0 {os.environ.get('XLA_FLAGS', '')}"
-)
-
-# With these, a second program with full effort would be the first again.
-os.environ.setdefault("NATCOORD_JAX_EFFORT", "quick")
 
 import jax
 import pytest
 from jaxtyping import install_import_hook
 
-# Tracing makes millions of small objects that live on: looking through them all takes a tenth of the time.
-gc.set_threshold(200_000, 50, 100)
-
 ROOT = Path(__file__).resolve().parents[1]
+DURATIONS = Path(__file__).with_name("durations.json")
 CACHE = os.environ.get("JAX_COMPILATION_CACHE_DIR") or str(ROOT / ".pytest_cache" / "jax")
 
-# Notebooks and command lines run in processes of their own and share the cache through the environment.
-os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", CACHE)
-# Single operations called from Python are programs, too: 30 ms each to compile, hundreds in every process.
-os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
-jax.config.update("jax_enable_x64", True)
-jax.config.update("jax_compilation_cache_dir", CACHE)
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+QUICK = (
+    # Compilers from JAX 0.11 on do not have this, and end a process that asks for it.
+    ("--xla_cpu_use_fusion_emitters=false " if version("jaxlib").startswith("0.10.") else "")
+    + "--xla_disable_hlo_passes=while-loop-invariant-code-motion,simplify-while-loops,"
+    + "while-loop-trip-count-annotator --xla_backend_optimization_level=0"
+)
+"""Compiler flags of the default lane: a third of the time to compile, for programs that are run briefly."""
 
 MAPS, MEMORY = Path("/proc/self/maps"), Path("/proc/self/statm")
 MOST_MAPS, MOST_PAGES = 20_000, 750_000
@@ -44,19 +33,33 @@ Every program takes a few hundred regions, of which Linux allows 65 530: a proce
 crashes in the compiler. What compilers have freed stays with the process until it is asked back.
 """
 
+# Tracing makes millions of small objects that live on: looking through them all takes a tenth of the time.
+gc.set_threshold(200_000, 50, 100)
+
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--check-types", action="store_true", help="check shapes and types at run time")
     parser.addoption("--plain", action="store_true", help="without what xla/ does to programs")
     parser.addoption("--write-golden", action="store_true", help="write the file of test_golden.py anew")
     parser.addoption("--hunt-seeds", type=int, help="random numbers of each structure in test_hunt.py")
+    parser.addoption(
+        "--compile",
+        choices=("quick", "user"),
+        help="compiler flags: quick, or those of users; by default quick in the default lane only",
+    )
+    parser.addoption(
+        "--write-durations",
+        action="store_true",
+        help=f"enter what the tests take in {DURATIONS.name}, with an empty cache of programs",
+    )
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Check shapes and types of every annotated function, from the first import on, if asked to.
+    """Choose compiler flags and cache before the first program is compiled, and check types if asked to.
 
     Checks take a quarter of the time to trace; `test_types.py` makes them for some scenes.
     """
+    _set_up_jax(config)
     if config.option.check_types:
         hook = install_import_hook("natcoord_jax", "beartype.beartype")
         config.add_cleanup(hook.uninstall)
@@ -69,10 +72,101 @@ def pytest_configure(config: pytest.Config) -> None:
         eager_numpy.in_program = lambda *values: True
 
 
+def _set_up_jax(config: pytest.Config) -> None:
+    if (config.option.compile or ("quick" if _is_default_lane(config) else "user")) == "quick":
+        # Flags from outside come last and win.
+        os.environ["XLA_FLAGS"] = f"{QUICK} {os.environ.get('XLA_FLAGS', '')}"
+        # With these flags, a second program with full effort would be the first again.
+        os.environ.setdefault("NATCOORD_JAX_EFFORT", "quick")
+    else:
+        os.environ.setdefault("NATCOORD_JAX_EFFORT", "full")
+    cache = CACHE
+    if config.option.write_durations and not _is_worker(config):
+        cache = tempfile.mkdtemp()
+        config.add_cleanup(lambda: shutil.rmtree(cache, ignore_errors=True))
+        os.environ["JAX_COMPILATION_CACHE_DIR"] = cache
+    # Notebooks and command lines run in processes of their own and share the cache through the environment.
+    os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", cache)
+    # Single operations called from Python are programs, too: 30 ms each to compile, hundreds in a process.
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+    jax.config.update("jax_enable_x64", True)
+    jax.config.update("jax_compilation_cache_dir", cache)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+
+
+def _is_default_lane(config: pytest.Config) -> bool:
+    """Whether the lane of `pytest` without a choice of marks is run."""
+    return "not slow" in (config.option.markexpr or "")
+
+
+def _is_worker(config: pytest.Config) -> bool:
+    return hasattr(config, "workerinput")
+
+
 def pytest_itemcollected(item: pytest.Item) -> None:
-    """What is exhaustive for one of its parameters is not slow besides."""
+    """What is exhaustive for one of its parameters is not slow besides; some tests are in two lanes."""
     if item.get_closest_marker("exhaustive"):
         item.own_markers[:] = [mark for mark in item.own_markers if mark.name != "slow"]
+    elif item.get_closest_marker("users") and not _is_default_lane(item.config):
+        item.add_marker(pytest.mark.slow)
+
+
+# --- durations ----------------------------------------------------------------------------------------------
+
+_begun = pytest.StashKey[float]()
+_seconds: dict[str, dict[str, float]] = {}
+
+
+def _processor_seconds() -> float:
+    """Processor time of this process and of the children that have ended: other work does not disturb it."""
+    times = os.times()
+    return times.user + times.system + times.children_user + times.children_system
+
+
+def lane_of(item: pytest.Item) -> str:
+    """Name of the lane that a test is in."""
+    lanes = ("gpu", "benchmark", "exhaustive", "slow")
+    return next((lane for lane in lanes if item.get_closest_marker(lane)), "default")
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    item.stash[_begun] = _processor_seconds()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo):
+    report = yield
+    if report.when == "teardown":
+        seconds = round(_processor_seconds() - item.stash[_begun], 2)
+        report.user_properties = [*report.user_properties, ("duration", (lane_of(item), seconds))]
+    return report
+
+
+def pytest_runtest_logreport(report: pytest.TestReport) -> None:
+    for name, entry in report.user_properties:
+        if name == "duration":
+            lane, seconds = entry
+            _seconds.setdefault(lane, {})[report.nodeid] = seconds
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    if not session.config.option.write_durations or _is_worker(session.config):
+        return
+    entries = json.loads(DURATIONS.read_text()) if DURATIONS.exists() else {}
+    measured = {test for lane in _seconds.values() for test in lane}
+    lanes = sorted(entries.keys() | _seconds.keys())
+    merged = {
+        lane: {
+            **{test: s for test, s in entries.get(lane, {}).items() if test not in measured},
+            **_seconds.get(lane, {}),
+        }
+        for lane in lanes
+    }
+    DURATIONS.write_text(json.dumps(merged, indent=0, sort_keys=True) + "\n")
+
+
+# --- memory, programs ---------------------------------------------------------------------------------------
 
 
 @pytest.fixture(autouse=True)
@@ -94,12 +188,12 @@ def _room_for_programs():
 @pytest.fixture
 def programs():
     """Programs that are compiled."""
-    found = []
+    names = []
 
-    def count(name, seconds, **given):
+    def count(name, seconds, **properties):
         if name.endswith("backend_compile_duration"):
-            found.append(given.get("fun_name"))
+            names.append(properties.get("fun_name"))
 
     jax.monitoring.register_event_duration_secs_listener(count)
-    yield found
+    yield names
     jax.monitoring.unregister_event_duration_listener(count)
