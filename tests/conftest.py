@@ -2,7 +2,6 @@
 
 import ctypes
 import gc
-import json
 import os
 import shutil
 import tempfile
@@ -10,11 +9,11 @@ from importlib.metadata import version
 from pathlib import Path
 
 import jax
+import lanes
 import pytest
 from jaxtyping import install_import_hook
 
 ROOT = Path(__file__).resolve().parents[1]
-DURATIONS = Path(__file__).with_name("durations.json")
 CACHE = os.environ.get("JAX_COMPILATION_CACHE_DIR") or str(ROOT / ".pytest_cache" / "jax")
 
 QUICK = (
@@ -50,7 +49,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--write-durations",
         action="store_true",
-        help=f"enter what the tests take in {DURATIONS.name}, with an empty cache of programs",
+        help="enter what the tests take in durations.json, with an empty cache of programs",
     )
 
 
@@ -111,6 +110,17 @@ def pytest_itemcollected(item: pytest.Item) -> None:
         item.add_marker(pytest.mark.slow)
 
 
+@pytest.hookimpl(trylast=True)
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Files that take long come first: the last one would keep a single core busy at the end."""
+    seconds = {t: s for tests in lanes.seconds_by_lane().values() for t, s in tests.items()}
+    files: dict[str, float] = {}
+    for item in items:
+        file = item.nodeid.partition("::")[0]
+        files[file] = files.get(file, 0.0) + seconds.get(item.nodeid, lanes.UNMEASURED)
+    items.sort(key=lambda item: -files[item.nodeid.partition("::")[0]])
+
+
 # --- durations ----------------------------------------------------------------------------------------------
 
 _begun = pytest.StashKey[float]()
@@ -125,8 +135,8 @@ def _processor_seconds() -> float:
 
 def lane_of(item: pytest.Item) -> str:
     """Name of the lane that a test is in."""
-    lanes = ("gpu", "benchmark", "exhaustive", "slow")
-    return next((lane for lane in lanes if item.get_closest_marker(lane)), "default")
+    marks = ("gpu", "benchmark", "exhaustive", "slow")
+    return next((mark for mark in marks if item.get_closest_marker(mark)), "default")
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -139,7 +149,8 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo):
     report = yield
     if report.when == "teardown":
         seconds = round(_processor_seconds() - item.stash[_begun], 2)
-        report.user_properties = [*report.user_properties, ("duration", (lane_of(item), seconds))]
+        lane = lane_of(item)
+        report.user_properties = [*report.user_properties, ("duration", (lane, seconds))]
     return report
 
 
@@ -153,17 +164,9 @@ def pytest_runtest_logreport(report: pytest.TestReport) -> None:
 def pytest_sessionfinish(session: pytest.Session) -> None:
     if not session.config.option.write_durations or _is_worker(session.config):
         return
-    entries = json.loads(DURATIONS.read_text()) if DURATIONS.exists() else {}
-    measured = {test for lane in _seconds.values() for test in lane}
-    lanes = sorted(entries.keys() | _seconds.keys())
-    merged = {
-        lane: {
-            **{test: s for test, s in entries.get(lane, {}).items() if test not in measured},
-            **_seconds.get(lane, {}),
-        }
-        for lane in lanes
-    }
-    DURATIONS.write_text(json.dumps(merged, indent=0, sort_keys=True) + "\n")
+    chosen = session.config.args_source.name == "ARGS" or session.config.option.keyword
+    lanes.enter(_seconds, all_of_lane=not chosen)
+    lanes.write()
 
 
 # --- memory, programs ---------------------------------------------------------------------------------------

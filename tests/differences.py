@@ -37,6 +37,22 @@ def difference_errors(f: Callable, x: Any, direction: Any, derivative: Any, step
     return np.array(found)
 
 
+def lanes_along(x: np.ndarray, direction: np.ndarray, steps=STEPS) -> list[np.ndarray]:
+    """Points of central differences for a batch: all ahead of `x`, then all behind it."""
+    return [x + sign * step * direction for sign in (1.0, -1.0) for step in steps]
+
+
+def errors_of_lanes(lanes: Any, derivative: Any, steps=STEPS) -> np.ndarray:
+    """Errors of central differences by the values at `lanes_along`, relative to the derivative."""
+    exact = flat(derivative)
+    scale = np.max(np.abs(exact))
+    assert scale > 0 and np.all(np.isfinite(exact)), "the derivative is zero or not finite: nothing is tested"
+    values = np.concatenate([np.reshape(x, (len(x), -1)) for x in jax.tree.leaves(lanes)], axis=1)
+    ahead, behind = np.split(values, 2)
+    differences = (ahead - behind) / (2.0 * np.asarray(steps)[:, None])
+    return np.max(np.abs(differences - exact), axis=1) / scale
+
+
 def assert_v_shaped(
     f: Callable, x: Any, direction: Any, derivative: Any, *, polynomial: bool = False, steps=STEPS
 ) -> None:
@@ -50,7 +66,11 @@ def assert_v_shaped(
         polynomial: `f` is at most quadratic along the direction: there is no truncation, hence no fall.
         steps: of the differences, falling.
     """
-    errors = difference_errors(f, x, direction, derivative, steps)
+    assert_v_of_errors(difference_errors(f, x, direction, derivative, steps), polynomial, steps)
+
+
+def assert_v_of_errors(errors: np.ndarray, polynomial: bool = False, steps=STEPS) -> None:
+    """The same of errors by step."""
     best = int(np.argmin(errors))
     report = "\n".join(f"  step {s:.0e}: error {e:.1e}" for s, e in zip(steps, errors, strict=True))
     assert errors[best] <= tol.DIFFERENCE_BEST, f"differences disagree with the derivative:\n{report}"

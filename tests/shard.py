@@ -1,11 +1,10 @@
 """One of several parts of the exhaustive lane, whose result is kept in the repository.
 
 usage: python -m tests.shard K/N [-- OPTIONS OF PYTEST]
-       python -m tests.shard --table
 
 Files of tests are dealt out to N shards of about equal processor time, by `durations.json`; a file stays in
 one piece, since its tests share compiled programs. The result goes to `exhaustive.json`: commit, date,
-numbers of passed and failed tests, names of these, seconds. `--table` prints what is kept.
+numbers of passed and failed tests, names of these, seconds; and to the table in CONTRIBUTING.md.
 """
 
 import argparse
@@ -17,12 +16,11 @@ from collections import defaultdict
 from pathlib import Path
 from xml.etree import ElementTree
 
-FOLDER = Path(__file__).parent
+FOLDER = Path(__file__).resolve().parent
 ROOT = FOLDER.parent
-DURATIONS = FOLDER / "durations.json"
-RESULTS = FOLDER / "exhaustive.json"
-UNMEASURED = 60.0
-"""Processor seconds that a test is taken for before it has been measured."""
+sys.path.insert(0, str(FOLDER))
+
+import lanes  # noqa: E402
 
 
 def tests_of_lane() -> list[str]:
@@ -39,7 +37,7 @@ def shards(tests: list[str], seconds: dict[str, float], count: int) -> list[list
     files = defaultdict(list)
     for test in tests:
         files[test.partition("::")[0]].append(test)
-    times = {file: sum(seconds.get(test, UNMEASURED) for test in files[file]) for file in files}
+    times = {file: sum(seconds.get(test, lanes.UNMEASURED) for test in files[file]) for file in files}
     dealt: list[list[str]] = [[] for _ in range(count)]
     loads = [0.0] * count
     for file in sorted(files, key=lambda file: (-times[file], file)):
@@ -74,36 +72,24 @@ def run_shard(tests: list[str], options: list[str]) -> dict:
     }
 
 
-def table(results: dict[str, dict]) -> str:
-    """The kept results as a table in Markdown."""
-    rows = ["| shard | commit | date | passed | failed | seconds |", "|---|---|---|---|---|---|"]
-    for shard, r in sorted(results.items()):
-        failed = ", ".join(f"`{name}`" for name in r["failed"]) or "0"
-        rows.append(f"| {shard} | {r['commit']} | {r['date']} | {r['passed']} | {failed} | {r['seconds']} |")
-    return "\n".join(rows)
-
-
 def main() -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("shard", nargs="?", metavar="K/N", help="which one, from 1, of how many")
-    parser.add_argument("--table", action="store_true", help="print the kept results")
+    parser.add_argument("shard", metavar="K/N", help="which one, from 1, of how many")
     parser.add_argument("options", nargs="*", help="of pytest, after --")
-    given = parser.parse_args()
-    results = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
-    if given.table:
-        print(table(results))
-        return
-    part, _, count = (given.shard or "").partition("/")
+    arguments = parser.parse_args()
+    results = json.loads(lanes.EXHAUSTIVE.read_text()) if lanes.EXHAUSTIVE.exists() else {}
+    part, _, count = arguments.shard.partition("/")
     if not (part.isdigit() and count.isdigit() and 1 <= int(part) <= int(count)):
         parser.error("say which shard, as 2/8")
-    seconds = json.loads(DURATIONS.read_text()).get("exhaustive", {}) if DURATIONS.exists() else {}
+    seconds = lanes.seconds_by_lane().get("exhaustive", {})
     tests = shards(tests_of_lane(), seconds, int(count))[int(part) - 1]
     if not tests:
-        raise SystemExit(f"shard {given.shard} has no tests")
-    results[given.shard] = run_shard(tests, given.options)
-    RESULTS.write_text(json.dumps(results, indent=1, sort_keys=True) + "\n")
-    sys.exit(1 if results[given.shard]["failed"] else 0)
+        raise SystemExit(f"shard {arguments.shard} has no tests")
+    results[arguments.shard] = run_shard(tests, arguments.options)
+    lanes.EXHAUSTIVE.write_text(json.dumps(results, indent=1, sort_keys=True) + "\n")
+    lanes.write()
+    sys.exit(1 if results[arguments.shard]["failed"] else 0)
 
 
 if __name__ == "__main__":

@@ -19,12 +19,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import tolerances as tol
-from differences import assert_v_shaped, difference_errors
+from differences import STEPS, assert_v_of_errors, assert_v_shaped, errors_of_lanes, lanes_along
 from scenes import AXIS, JOINTS, SECOND, SPECIAL, with_multipliers
 
 import natcoord_jax as nc
 import natcoord_jax.effects
-from natcoord_jax.build import build
 from natcoord_jax.core.cells import CELLS
 from natcoord_jax.core.coordinate import CoordinateEffect
 from natcoord_jax.core.effect import Effect, replace_fields
@@ -38,6 +37,7 @@ from natcoord_jax.model.rows import group_places, rows_with_ground
 from natcoord_jax.stepping.step import advance
 
 TABLEAU = gauss(1)
+pytestmark = pytest.mark.users
 SEEDS = (0, 1, 2)
 
 
@@ -358,17 +358,14 @@ def test_kinds_tell_effects_apart():
     assert not shared, f"several effects share the kinds {shared}"
 
 
-@EFFECTS
-def test_docstrings_say_units(effect):
+def test_docstrings_say_units():
     """A unit in brackets; numbers without any are marked [-]."""
-    assert re.search(r"\[[^\]]*\b(m|rad|s|kg|N|J)\b[^\]]*\]", effect.__doc__ or ""), (
-        f"say in the docstring of the class of {effect.__name__} the units of its numbers, in brackets"
-    )
-
-
-@pytest.mark.parametrize("effect", [e for e in TABLE if issubclass(e, nc.Joint)], ids=lambda e: e.__name__)
-def test_joints_document_their_residual(effect):
-    assert re.search(r"\[(m|-)", effect.residual.__doc__ or "") or effect is nc.Screw
+    unit = r"\[[^\]]*\b(m|rad|s|kg|N|J)\b[^\]]*\]"
+    silent = [e.__name__ for e in TABLE if not re.search(unit, e.__doc__ or "")]
+    assert not silent, f"say in the docstrings of these classes the units of their numbers: {silent}"
+    joints = [e for e in TABLE if issubclass(e, nc.Joint) and e is not nc.Screw]
+    silent = [e.__name__ for e in joints if not re.search(r"\[(m|-)", e.residual.__doc__ or "")]
+    assert not silent, f"say in the docstrings of `residual` of these joints its units: {silent}"
 
 
 # --- what an effect answers to a motion -------------------------------------------------------------------
@@ -376,7 +373,7 @@ def test_joints_document_their_residual(effect):
 
 @cache
 def stage(effect: type, in_tree: bool = False):
-    """A pair with an effect: system (not checked, which would cost a compilation), state and group.
+    """A pair with an effect: system, state and group.
 
     A joint under test keeps its multipliers, so that it may be shown motions that it would not allow; or it
     is `in_tree`, and all motions are free ones.
@@ -395,7 +392,7 @@ def stage(effect: type, in_tree: bool = False):
     )
     if entry.make:
         scene.add(entry.make(parts))
-    system, state = build(scene.bodies, scene.joints, scene.effects, None)
+    system, state = scene.compile()
     group = next(g for g in (*system.effects, *system.joints) if isinstance(g.effect, effect))
     return system, state, group
 
@@ -404,9 +401,27 @@ def inputs_of(system):
     return 0.5 + jnp.arange(len(system.structure.inputs))
 
 
-@cache
-def answering(effect: type, in_tree: bool = False):
-    """Compiled: from rates of the free motions and multipliers to the answer and the motion."""
+@dataclass
+class Answers:
+    """What an effect answers to random motions, one a lane.
+
+    Attributes:
+        forces: on the rows of its bodies (lanes, bodies, 4, 3).
+        torques: on its bodies (lanes, bodies, 3).
+        answer: all that it answers.
+        motion: of its bodies.
+        stored: energies before and after the step (lanes, 2).
+    """
+
+    forces: Any
+    torques: Any
+    answer: Any
+    motion: Any
+    stored: Any
+
+
+def respond_to(effect: type, in_tree: bool = False):
+    """The function from rates of the free motions and multipliers to the answer and the motion."""
     system, state, group = stage(effect, in_tree)
     u, h = inputs_of(system), jnp.ones(())
     step = ReducedStep.prepare(system, state, u, h, TABLEAU)
@@ -418,7 +433,7 @@ def answering(effect: type, in_tree: bool = False):
         multipliers = jnp.broadcast_to(lam, (group.count, 1, group.multipliers))
         return respond(group, where, motion, multipliers, TABLEAU), motion
 
-    return jax.jit(answer), group
+    return answer
 
 
 def random_motion(effect: type, seed: int, in_tree: bool = False):
@@ -427,125 +442,158 @@ def random_motion(effect: type, seed: int, in_tree: bool = False):
     rng = np.random.default_rng(seed)
     w = rng.normal(size=system.structure.unknowns)
     w *= 1.2 / np.linalg.norm(w[:6])
-    return jnp.asarray(w), jnp.asarray(rng.normal(size=group.multipliers))
+    return w, rng.normal(size=group.multipliers)
 
 
-def impulses(answer, motion):
-    """Impulses on rows and angular impulses of the first instance over the step of one second."""
-    forces = answer.forces if answer.forces is not None else jnp.zeros_like(motion.rows)
-    forces = forces.reshape(motion.start.shape[0], -1, 4, 3)[0]
-    torques = jnp.zeros_like(forces[:, 0]) if answer.torques is None else answer.torques[0, 0]
-    return np.asarray(forces), np.asarray(torques)
+def directions_of(effect: type):
+    """Where differences are taken, a motion and rest, and a direction."""
+    w, lam = random_motion(effect, 3)
+    return (w, np.zeros_like(w)), np.random.default_rng(4).normal(size=w.shape), lam
+
+
+@cache
+def answers(effect: type, in_tree: bool = False) -> Answers:
+    """One program for all motions of an effect: those of the seeds, then those of the differences."""
+    motions = [random_motion(effect, seed, in_tree) for seed in SEEDS]
+    if not in_tree:
+        starts, direction, lam = directions_of(effect)
+        motions += [(w, lam) for start in starts for w in (start, *lanes_along(start, direction))]
+    system, state, _ = stage(effect, in_tree)
+
+    def energies(w):
+        if not effect.stores:
+            return jnp.zeros(2)
+        y = jnp.zeros(system.structure.unknowns + system.structure.multipliers).at[: len(w)].set(w)
+        after = advance(system, state, inputs_of(system), jnp.ones(()), y, TABLEAU)[1]
+        return jnp.stack([system.energy(s).potential for s in (state, after)])
+
+    def of_lane(w, lam):
+        return *respond_to(effect, in_tree)(w, lam), energies(w)
+
+    lanes = jax.jit(jax.vmap(of_lane))(*(np.stack(x) for x in zip(*motions, strict=True)))
+    response, motion, stored = jax.tree.map(np.asarray, lanes)
+    forces = np.zeros_like(motion.rows) if response.forces is None else response.forces
+    forces = forces.reshape(*motion.start.shape[:2], -1, 4, 3)[:, 0]
+    torques = np.zeros_like(forces[:, :, 0]) if response.torques is None else response.torques[:, 0, 0]
+    return Answers(forces, torques, response, motion, stored)
+
+
+def scale_of(a: Answers, seed: int) -> float:
+    return np.sum(np.abs(a.forces[seed])) + np.sum(np.abs(a.torques[seed]))
 
 
 @pytest.mark.parametrize("effect", [e for e in TABLE if e.elastic], ids=lambda e: e.__name__)
-def test_elastic_effects_tell_what_cancels(effect):
+def test_elastic_effects_say_what_cancels(effect):
     """At rest their forces are rounded as stiffness times invariants, of which they are differences, are."""
     system, state, group = stage(effect)
     one = jax.tree.map(lambda x: x[0], group.effect)
     place, rows = group_places(system, group)[0], rows_with_ground(state.q)[group.bodies[0]]
-    given = place, rows, state.coordinates[group.coordinates[0]] + 0.3
-    told = one.cancelling(*given)
-    assert told is not None, "a stiff part of this kind could not be told from an unsolved step"
-    coordinate = issubclass(effect, CoordinateEffect)
-    invariants = given[2] if coordinate else one.invariants(place_markers(place, rows))
-    stiffness = jnp.diag(one.curvature(*given))
-    energy, reach = map(float, told)
-    assert energy >= (1 - tol.STIFFNESS_BY_ENERGIES) * float(jnp.sum(jnp.abs(stiffness) * invariants**2)) > 0
+    coordinate = state.coordinates[group.coordinates[0]] + 0.3
+
+    def numbers(rows, coordinate):
+        scales = one.cancelling(place, rows, coordinate)
+        assert scales is not None, "a stiff part of this kind could not be told from an unsolved step"
+        by_coordinate = issubclass(effect, CoordinateEffect)
+        invariants = coordinate if by_coordinate else one.invariants(place_markers(place, rows))
+        return *scales, jnp.diag(one.curvature(place, rows, coordinate)), invariants
+
+    energy, reach, stiffness, invariants = jax.jit(numbers)(rows, coordinate)
+    assert energy >= (1 - tol.STIFFNESS_BY_ENERGIES) * np.sum(np.abs(stiffness) * invariants**2) > 0
     assert 0 < reach <= 10, "of the size of the scene"
 
 
 @EFFECTS
 def test_power_is_force_times_velocity(effect):
     """What goes into the work account, or the constraints' multipliers times their rates."""
-    respond_to, _ = answering(effect)
+    a = answers(effect)
     for seed in SEEDS:
-        answer, motion = respond_to(*random_motion(effect, seed))
-        forces, torques = impulses(answer, motion)
-        power = np.sum(forces * motion.rates[0, 0]) + np.sum(torques * motion.spin[0, 0])
-        scale = np.sum(np.abs(forces)) + np.sum(np.abs(torques))
+        power = np.sum(a.forces[seed] * a.motion.rates[seed, 0, 0])
+        power += np.sum(a.torques[seed] * a.motion.spin[seed, 0, 0])
+        scale = scale_of(a, seed)
         assert scale > 0.01, "the effect does nothing here"
         if effect.rotors:  # what a rotor takes is not lost: it is stored
             continue
         if effect.works or effect.stores:
-            assert abs(power - float(answer.power[0, 0])) <= tol.INDIFFERENCE * scale
+            assert abs(power - a.answer.power[seed, 0, 0]) <= tol.INDIFFERENCE * scale
         else:
             lam = random_motion(effect, seed)[1]
-            assert abs(power - float(lam @ answer.rows[0, 0])) <= tol.INDIFFERENCE * scale
+            assert abs(power - lam @ a.answer.rows[seed, 0, 0]) <= tol.INDIFFERENCE * scale
 
 
 @pytest.mark.parametrize("effect", [e for e in TABLE if TABLE[e].inside], ids=lambda e: e.__name__)
 def test_what_acts_inside_moves_nothing_as_a_whole(effect):
     """No resultant force, no resultant torque about any point."""
     in_tree = issubclass(effect, nc.Joint) and effect.free  # its points must coincide
-    respond_to, _ = answering(effect, in_tree)
+    a = answers(effect, in_tree)
     for seed in SEEDS:
-        answer, motion = respond_to(*random_motion(effect, seed, in_tree))
-        forces, torques = impulses(answer, motion)
-        rows = np.asarray(motion.rows)[0, 0]
-        scale = np.sum(np.abs(forces)) + np.sum(np.abs(torques))
-        assert np.max(np.abs(forces[:, 0].sum(0))) <= tol.INDIFFERENCE * scale
-        turning = np.cross(rows, forces).sum((0, 1)) + torques.sum(0)
+        rows = a.motion.rows[seed, 0, 0]
+        scale = scale_of(a, seed)
+        assert np.max(np.abs(a.forces[seed][:, 0].sum(0))) <= tol.INDIFFERENCE * scale
+        turning = np.cross(rows, a.forces[seed]).sum((0, 1)) + a.torques[seed].sum(0)
         assert np.max(np.abs(turning)) <= tol.INDIFFERENCE * scale * (1 + np.max(np.abs(rows)))
 
 
 @pytest.mark.parametrize("effect", STORING, ids=lambda e: e.__name__)
 def test_stores_give_what_they_lose(effect):
     """Over a step of one radian: minus the work on the bodies is the change of the stored energy, exactly."""
-    system, state, _ = stage(effect)
-    respond_to, _ = answering(effect)
-    total = jax.jit(lambda s: system.energy(s).potential)
+    a = answers(effect)
     for seed in SEEDS:
-        w, lam = random_motion(effect, seed)
-        answer, motion = respond_to(w, lam)
-        forces, torques = impulses(answer, motion)
         if issubclass(effect, nc.Field):  # an instance for every body
-            work = np.sum(np.asarray(answer.forces)[:, 0] * motion.rates[0])
+            work = np.sum(a.answer.forces[seed][:, 0] * a.motion.rates[seed][0])
         else:
-            work = np.sum(forces * motion.rates[0, 0]) + np.sum(torques * motion.spin[0, 0])
-        before, after = float(total(state)), float(total(after_step(effect, w)))
+            work = np.sum(a.forces[seed] * a.motion.rates[seed, 0, 0])
+            work += np.sum(a.torques[seed] * a.motion.spin[seed, 0, 0])
+        before, after = a.stored[seed]
         assert abs(after - before) > 1e-3
         assert abs(after - before + work) <= tol.STEP_BALANCE * (1 + abs(after) + abs(before))
 
 
-def after_step(effect: type, w):
-    """The state at the end of the step."""
-    system, state, _ = stage(effect)
-    y = jnp.zeros(system.structure.unknowns + system.structure.multipliers).at[: len(w)].set(w)
-    return advance(system, state, inputs_of(system), jnp.ones(()), y, TABLEAU)[1]
+def response_of(effect: type, lam):
+    """The function from a motion to the arrays of the answer that depend on it."""
 
+    def f(w):
+        response, motion = respond_to(effect)(w, lam)
+        return response.forces, response.torques, response.rows, motion.rates
 
-@EFFECTS
-def test_batch_equals_loop(effect):
-    respond_to, _ = answering(effect)
-    motions = [random_motion(effect, seed) for seed in SEEDS]
-    batch = jax.vmap(respond_to)(*(jnp.stack(x) for x in zip(*motions, strict=True)))
-    loop = [respond_to(*motion) for motion in motions]
-    for one, many in zip(jax.tree.leaves(loop[1]), jax.tree.leaves(batch), strict=True):
-        assert np.allclose(one, many[1], rtol=1e-12, atol=1e-12)
+    return f
 
 
 @EFFECTS
 def test_derivatives_equal_differences(effect):
-    """Of forces, torques and constraint rates with respect to the motion, in both modes; at rest, too."""
-    respond_to, _ = answering(effect)
-    w, lam = random_motion(effect, 3)
+    """Of forces, torques and constraint rates with respect to the motion; at rest, too.
 
-    def f(w):
-        answer, motion = respond_to(w, lam)
-        return answer.forces, answer.torques, answer.rows, motion.rates
-
-    direction = jnp.asarray(np.random.default_rng(4).normal(size=w.shape))
-    for at in (w, jnp.zeros_like(w)):
-        derivative = jax.jvp(f, (at,), (direction,))[1]
-        if at is w:
-            assert_v_shaped(f, at, direction, derivative)
+    Differences are lanes of a batch, the derivative is of one motion alone: both have the same value.
+    """
+    (moving, rest), direction, lam = directions_of(effect)
+    derivative = jax.jit(lambda w: jax.jvp(response_of(effect, lam), (w,), (direction,)))
+    a, count = answers(effect), 1 + 2 * len(STEPS)
+    lanes = jax.tree.leaves((a.answer.forces, a.answer.torques, a.answer.rows, a.motion.rates))
+    for number, w in enumerate((moving, rest)):
+        value, ahead = derivative(w)
+        first = len(SEEDS) + number * count
+        for alone, lane in zip(jax.tree.leaves(value), lanes, strict=True):
+            assert np.allclose(alone, lane[first], rtol=1e-12, atol=1e-12)
+        errors = errors_of_lanes([x[first + 1 : first + count] for x in lanes], ahead)
+        if w is moving:
+            assert_v_of_errors(errors)
         else:  # there may be nothing of second order
-            assert np.min(difference_errors(f, at, direction, derivative)) <= tol.DIFFERENCE_BEST
-        weights = jax.tree.map(jnp.cos, derivative)
-        back = jax.vjp(f, at)[1](weights)[0] @ direction
-        pairs = zip(*map(jax.tree.leaves, (weights, derivative)), strict=True)
-        ahead = sum(jnp.vdot(a, b) for a, b in pairs)
+            assert np.min(errors) <= tol.DIFFERENCE_BEST
+
+
+@pytest.mark.slow
+@EFFECTS
+def test_reverse_derivatives_are_transposed_forward_ones(effect):
+    (moving, rest), direction, lam = directions_of(effect)
+
+    @jax.jit
+    def products(w):
+        _, ahead = jax.jvp(response_of(effect, lam), (w,), (direction,))
+        weights = jax.tree.map(jnp.cos, ahead)
+        back = jax.vjp(response_of(effect, lam), w)[1](weights)[0] @ direction
+        return back, sum(map(jnp.vdot, jax.tree.leaves(weights), jax.tree.leaves(ahead)))
+
+    for w in (moving, rest):
+        back, ahead = products(w)
         assert abs(back - ahead) <= tol.SAME_GRADIENT * abs(ahead)
 
 

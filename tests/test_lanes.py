@@ -1,32 +1,32 @@
 """The lanes of the suite: each takes as long as it may, and every test of the default lane is measured."""
 
-import json
-
+import lanes
 import pytest
-from conftest import DURATIONS, lane_of
+from conftest import lane_of
 from shard import shards
 
-CORES = 2
-BUSY = 0.9
-"""Part of the time of the cores that tests have: workers start, and the last file keeps one of them."""
-MINUTES = {"default": 5, "slow": 25}
 
-
-@pytest.mark.parametrize("lane", MINUTES)
+@pytest.mark.parametrize("lane", lanes.MINUTES)
 def test_a_lane_fits_its_budget(lane):
-    seconds = json.loads(DURATIONS.read_text())[lane]
+    seconds = lanes.seconds_by_lane()[lane]
     slowest = sorted(seconds, key=seconds.get)[-10:]
-    assert sum(seconds.values()) <= BUSY * CORES * 60 * MINUTES[lane], (
+    assert sum(seconds.values()) <= lanes.BUSY * lanes.CORES * 60 * lanes.MINUTES[lane], (
         f"the {lane} lane takes {sum(seconds.values()):.0f} s of the processor; make its slowest tests "
         f"cheaper, or move them to a slower lane: {[(test, seconds[test]) for test in slowest]}"
     )
 
 
 def test_every_default_test_is_measured(request):
-    seconds = json.loads(DURATIONS.read_text())["default"]
+    seconds = lanes.seconds_by_lane()["default"]
     tests = [item.nodeid for item in request.session.items if lane_of(item) == "default"]
     missing = [test for test in tests if test not in seconds]
     assert not missing, f"run `pytest --write-durations` on the files of these tests: {missing}"
+
+
+def test_tables_are_those_of_the_durations():
+    page = lanes.PAGE.read_text("utf-8")
+    assert all(f"<!-- {name} -->" in page for name in lanes.TABLES)
+    assert page == lanes.written(page), "run `python -m tests.lanes`"
 
 
 def test_shards_hold_every_test_once_and_no_file_twice():
