@@ -12,7 +12,7 @@ from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.xla.evaluation import FLOWS
 
 X = jnp.asarray(np.random.default_rng(0).normal(size=(4, 3)))
-PLACES = jnp.array([2, 0, 3])
+PLACES = jnp.asarray(np.array([2, 0, 3]))
 
 
 def beam(curve):
