@@ -77,8 +77,18 @@ def test_readme_runs(tmp_path: Path):
     run_page(README, tmp_path)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("page", [page for page in PAGES if blocks_of(DOCS / page)])
+# A minute of the processor each, or more, as users compile them; pages that were measured take some 20 s.
+LONG_PAGES = ("howto/optimal_control.md", "howto/shells_solids_contact.md")
+
+
+@pytest.mark.parametrize(
+    "page",
+    [
+        pytest.param(page, marks=pytest.mark.exhaustive if page in LONG_PAGES else pytest.mark.slow)
+        for page in PAGES
+        if blocks_of(DOCS / page)
+    ],
+)
 def test_page_runs(page: str, tmp_path: Path):
     run_page(DOCS / page, tmp_path)
 
