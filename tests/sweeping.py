@@ -2,6 +2,7 @@
 
 import sys
 import time
+from functools import cache
 from pathlib import Path
 
 import jax
@@ -17,7 +18,9 @@ if sys.argv[1:2] == ["share"] and not jax.distributed.is_initialized():
     jax.distributed.initialize(f"127.0.0.1:{sys.argv[4]}", 2, int(sys.argv[3]))
 
 
-def _swing():
+@cache
+def swing():
+    """A pendulum with a motor, and its state; asked for outside of programs before sweeps of `angle`."""
     scene = nc.Scene()
     scene.add(nc.Gravity())
     arm = scene.add(nc.RigidBody(mass=1.0, inertia=(0.1, 0.2, 0.1), com=(0.5, 0.0, 0.0), name="arm"))
@@ -26,13 +29,11 @@ def _swing():
     return scene.compile()
 
 
-SYSTEM, STATE = _swing()
-
-
 def angle(mass, torque, dt, steps):
     """Angle of a pendulum after some time, and how the run ended; a torque that is no number fails."""
-    system = SYSTEM.set("arm", mass=mass)
-    run = nc.simulate(system, STATE, dt=dt, steps=steps, inputs=lambda t, state: jnp.full(1, torque))
+    system, state = swing()
+    system = system.set("arm", mass=mass)
+    run = nc.simulate(system, state, dt=dt, steps=steps, inputs=lambda t, state: jnp.full(1, torque))
     return {"angle": run.states.coordinates[-1, 0], "result": run.result}
 
 
@@ -78,7 +79,8 @@ if __name__ == "__main__":
     {
         "slowly": lambda: sweeping.slowly(given[0]),
         "share": lambda: sweeping.share(given[0]),
-        "devices": lambda: print(
-            len(jax.local_devices()), nc.sweep(sweeping.angle, store=given[0], **SWEEP).explain()
+        "devices": lambda: (
+            sweeping.swing()
+            and print(len(jax.local_devices()), nc.sweep(sweeping.angle, store=given[0], **SWEEP).explain())
         ),
     }[command]()

@@ -16,7 +16,7 @@ from natcoord_jax import gallery
 
 ROOT = Path(__file__).resolve().parents[1]
 STEPS = 20
-SCALES = jnp.array([0.2, 1.0, 3.0])
+SCALES = np.array([0.2, 1.0, 3.0])
 
 
 @pytest.fixture(scope="module")

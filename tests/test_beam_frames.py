@@ -17,7 +17,7 @@ from natcoord_jax.core.effect import replace_fields
 LINEAR = 1e-6
 """Of what theory of first order says, for loads that turn a section by some 1e-4 radians."""
 BENDING, SHEAR, STRETCH = 2.0, 5e3, 1e7
-BOTH = jnp.array([1.0, -1.0])
+BOTH = np.array([1.0, -1.0])
 
 
 def section(**numbers):

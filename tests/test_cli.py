@@ -86,48 +86,53 @@ def test_run_of_high_order(tmp_path):
         assert 0 <= report[key] <= 1e-11, key
 
 
-@pytest.mark.parametrize(
-    ("options", "steps", "dt"),
-    [
-        ([], None, None),
-        (["--steps", "50"], 50, 0.1),
-        (["--dt", "0.1"], 50, 0.1),
-        (["--steps", "7", "--dt", "0.3"], 7, 0.3),
-    ],
-)
-def test_steps_and_dt(options, steps, dt):
-    example = gallery.load("pendulum")
-    parsed = cli.parser().parse_args(["run", "pendulum", *options])
-    expected = (steps or example.steps, dt or example.dt)
-    assert cli.choose_steps(example, parsed.steps, parsed.dt) == pytest.approx(expected)
+CHOICES = [
+    ([], None, None),
+    (["--steps", "50"], 50, 0.1),
+    (["--dt", "0.1"], 50, 0.1),
+    (["--steps", "7", "--dt", "0.3"], 7, 0.3),
+]
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        ["run", "merry_go_round"],
-        ["run", "pendulum", "--dt", "0.3"],
-        ["run", "pendulum", "--dt", "-1"],
-        ["run", "pendulum", "--dt", "nan"],
-        ["run", "pendulum", "--steps", "0"],
-        ["run", "pendulum", "--steps", "many"],
-        ["run", "pendulum", "--json", "no_such_folder/report.json"],
-        ["run", "pendulum", "--plot", "figure.xyz"],
-        ["run", "pendulum", "--speed", "3"],
-        ["run", "pendulum", "--rtol", "-1e-3"],
-        ["run", "pendulum", "--atol", "1e-3"],
-        ["run"],
-        [],
-    ],
-)
-def test_bad_options_give_one_line_and_code_2(arguments, capsys):
-    try:
-        code = cli.main(arguments)
-    except SystemExit as stop:
-        code = stop.code
-    captured = capsys.readouterr()
-    assert code == 2
-    assert len(captured.err.splitlines()) == 1 and captured.out == ""
+def test_steps_and_dt():
+    example, wrong = gallery.load("pendulum"), []
+    for options, steps, dt in CHOICES:
+        parsed = cli.parser().parse_args(["run", "pendulum", *options])
+        choice = cli.choose_steps(example, parsed.steps, parsed.dt)
+        expected = (steps or example.steps, dt or example.dt)
+        if choice != pytest.approx(expected):
+            wrong.append(f"{options} give {choice}, not {expected}")
+    assert not wrong, "\n".join(wrong)
+
+
+BAD_OPTIONS = [
+    ["run", "merry_go_round"],
+    ["run", "pendulum", "--dt", "0.3"],
+    ["run", "pendulum", "--dt", "-1"],
+    ["run", "pendulum", "--dt", "nan"],
+    ["run", "pendulum", "--steps", "0"],
+    ["run", "pendulum", "--steps", "many"],
+    ["run", "pendulum", "--json", "no_such_folder/report.json"],
+    ["run", "pendulum", "--plot", "figure.xyz"],
+    ["run", "pendulum", "--speed", "3"],
+    ["run", "pendulum", "--rtol", "-1e-3"],
+    ["run", "pendulum", "--atol", "1e-3"],
+    ["run"],
+    [],
+]
+
+
+def test_bad_options_give_one_line_and_code_2(capsys):
+    wrong = []
+    for arguments in BAD_OPTIONS:
+        try:
+            code = cli.main(arguments)
+        except SystemExit as stop:
+            code = stop.code
+        captured = capsys.readouterr()
+        if code != 2 or len(captured.err.splitlines()) != 1 or captured.out:
+            wrong.append(f"{arguments} give code {code}, errors {captured.err!r}, output {captured.out!r}")
+    assert not wrong, "\n".join(wrong)
 
 
 def test_a_run_that_fails_says_why_and_writes_what_it_has(tmp_path, capsys):

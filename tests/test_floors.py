@@ -12,6 +12,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -79,6 +80,19 @@ LONGER_FUNCTIONS = {
 FILES = sorted(SOURCE.rglob("*.py"))
 
 
+@cache
+def parsed(file: Path) -> ast.Module:
+    """The syntax tree of a source file; several rules read it."""
+    return ast.parse(file.read_text("utf-8"))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _trees_are_dropped():
+    """Trees are millions of objects, of no use to the tests of other files."""
+    yield
+    parsed.cache_clear()
+
+
 def module_name(file: Path) -> str:
     """Dotted name of a source file; a folder's ``__init__.py`` bears the name of the folder."""
     parts = file.relative_to(ROOT).with_suffix("").parts
@@ -125,30 +139,29 @@ def _absolute(target: str, package: str) -> str:
     return ".".join([*parts[: len(parts) - level + 1], *filter(None, [target[level:]])])
 
 
-def breaches(module: str, source: str, *, is_package: bool = False) -> list[str]:
+def breaches(module: str, tree: ast.AST, *, is_package: bool = False) -> list[str]:
     """Every rule that a module breaks, in words.
 
     Args:
         module: dotted name of the module.
-        source: its text.
+        tree: its parsed source.
         is_package: whether it is the ``__init__.py`` of a folder.
     """
-    tree = ast.parse(source)
-    found = [
+    wrong = [
         f"line {node.lineno}: hasattr; an effect declares what it is, so ask for that"
         for node in ast.walk(tree)
         if isinstance(node, ast.Name) and node.id == "hasattr"
     ]
     floor = floor_of(module)
     if floor and floor not in FLOORS:
-        return [*found, f"'{floor}' is on no floor; the floors are {' < '.join(FLOORS)}"]
+        return [*wrong, f"'{floor}' is on no floor; the floors are {' < '.join(FLOORS)}"]
     package = module if is_package else module.rpartition(".")[0]
     for line, target in imports(tree, package):
         ours = target.split(".")[0] == PACKAGE
         reason = _inside(module, floor, target) if ours else _outside(floor, target)
         if reason:
-            found.append(f"line {line}: imports {target}, but {reason}")
-    return found
+            wrong.append(f"line {line}: imports {target}, but {reason}")
+    return wrong
 
 
 def _inside(module: str, floor: str, target: str) -> str:
@@ -186,109 +199,122 @@ def test_the_package_is_there():
     assert FILES, f"no source found under {PACKAGE}/"
 
 
-@pytest.mark.parametrize("file", FILES, ids=lambda file: file.relative_to(ROOT).as_posix())
-def test_floors(file: Path):
-    found = breaches(module_name(file), file.read_text("utf-8"), is_package=file.name == "__init__.py")
-    if found:
-        pytest.fail(f"{file.relative_to(ROOT).as_posix()}\n  " + "\n  ".join(found), pytrace=False)
+def test_floors():
+    """No module imports from a floor above its own, nor breaks one of the other rules."""
+    wrong = [
+        f"{file.relative_to(ROOT).as_posix()}, {breach}"
+        for file in FILES
+        for breach in breaches(module_name(file), parsed(file), is_package=file.name == "__init__.py")
+    ]
+    assert not wrong, "\n".join(wrong)
 
 
 def test_files_and_functions_can_be_read_at_once():
     """No file is long; long functions are known by name, and the list only shrinks."""
-    files, functions = set(), set()
+    wrong, long = [], set()
     for file in FILES:
-        text = file.read_text("utf-8")
-        if text.count("\n") > LONGEST and file.name != "__init__.py":
-            files.add(file.relative_to(SOURCE).as_posix())
-        for node in ast.walk(ast.parse(text)):
+        name = file.relative_to(SOURCE).as_posix()
+        length = file.read_text("utf-8").count("\n")
+        if length > LONGEST and file.name != "__init__.py":
+            wrong.append(f"{name} has {length} lines: split it, at most {LONGEST}")
+        for node in ast.walk(parsed(file)):
             if isinstance(node, ast.FunctionDef):
-                told = ast.get_docstring(node, clean=False)
-                lines = (node.end_lineno or 0) - node.lineno + 1
-                if lines - (told.count("\n") + 1 if told else 0) > LONGEST_FUNCTION:
-                    functions.add(node.name)
-    assert not files, f"split these files, of more than {LONGEST} lines: {sorted(files)}"
-    long, short = functions - LONGER_FUNCTIONS, LONGER_FUNCTIONS - functions
-    assert not long, f"split these functions, of more than {LONGEST_FUNCTION} lines: {sorted(long)}"
-    assert not short, (
-        f"no longer longer than {LONGEST_FUNCTION} lines, so they leave the list: {sorted(short)}"
-    )
+                doc = ast.get_docstring(node, clean=False)
+                lines = (node.end_lineno or 0) - node.lineno + 1 - (doc.count("\n") + 1 if doc else 0)
+                if lines > LONGEST_FUNCTION:
+                    long.add(node.name)
+                    if node.name not in LONGER_FUNCTIONS:
+                        place = f"{name}, line {node.lineno}: {node.name} has {lines} lines"
+                        wrong.append(f"{place}: split it, at most {LONGEST_FUNCTION}")
+    wrong += [
+        f"{name} is no longer longer than {LONGEST_FUNCTION} lines: it leaves LONGER_FUNCTIONS"
+        for name in sorted(LONGER_FUNCTIONS - long)
+    ]
+    assert not wrong, "\n".join(wrong)
 
 
-def rows_by_hand(source: str) -> list[int]:
+def rows_by_hand(tree: ast.AST) -> list[int]:
     """Lines where an array gets the shape of the rows of nodes by its numbers, (..., 4, 3)."""
     ends = [
         (node.lineno, node.elts if isinstance(node, ast.Tuple) else node.args)
-        for node in ast.walk(ast.parse(source))
+        for node in ast.walk(tree)
         if isinstance(node, ast.Tuple | ast.Call)
     ]
     return [
         line
-        for line, given in ends
-        if len(given) > 2 and [getattr(x, "value", None) for x in given[-2:]] == [4, 3]
+        for line, items in ends
+        if len(items) > 2 and [getattr(x, "value", None) for x in items[-2:]] == [4, 3]
     ]
 
 
-@pytest.mark.parametrize(
-    "floor", ["core", "model", "mechanics", "stepping", "reading", "analysis", "control"]
-)
-def test_one_file_knows_how_rows_are_stored(floor):
+def test_one_file_knows_how_rows_are_stored():
     """The others take `NODE` and `by_node` of `core/bodies.py`, or `State.rows`."""
-    found = {}
-    for file in sorted((SOURCE / floor).rglob("*.py")):
-        lines = rows_by_hand(file.read_text("utf-8"))
-        if lines:
-            found[file.relative_to(SOURCE).as_posix()] = lines
-    assert not found, f"rows of nodes by their numbers, in these lines: {found}"
+    floors = {"core", "model", "mechanics", "stepping", "reading", "analysis", "control"}
+    wrong = [
+        f"{file.relative_to(ROOT).as_posix()}, line {line}: rows of nodes by their numbers; take by_node"
+        for file in FILES
+        if file.relative_to(SOURCE).parts[0] in floors
+        for line in rows_by_hand(parsed(file))
+    ]
+    assert not wrong, "\n".join(wrong)
 
 
 def test_rows_by_hand_are_seen():
-    assert rows_by_hand("x = q.reshape(-1, 4, 3)\ny = jnp.zeros((2, 4, 3))\nz = jnp.zeros((4, 3))") == [1, 2]
+    source = "x = q.reshape(-1, 4, 3)\ny = jnp.zeros((2, 4, 3))\nz = jnp.zeros((4, 3))"
+    assert rows_by_hand(ast.parse(source)) == [1, 2]
 
 
-@pytest.mark.parametrize(
-    ("module", "source", "fragment"),
-    [
-        ("core.marker", "from natcoord_jax.effects.joints import Revolute", "effects lies above core"),
-        ("core.marker", "from ..scene import Scene", "scene lies above core"),
-        ("core.marker", "def f():\n    from .. import viz", "viz lies above core"),
-        ("core.marker", "importlib.import_module('natcoord_jax.viz')", "viz lies above core"),
-        ("core.marker", "importlib.import_module('..viz', __package__)", "viz lies above core"),
-        ("core.marker", "import natcoord_jax as nc", "not the whole package"),
-        ("core.marker", "from natcoord_jax import Scene", "not the whole package"),
-        ("core.marker", "hasattr(object, 'x')", "hasattr"),
-        ("effects.joints.screw", "from ..springs import linear", "must not import other effects"),
-        ("effects.joints.screw", "from natcoord_jax.effects import Spring", "must not import other effects"),
-        ("mechanics.groups", "from natcoord_jax.effects.joints import Revolute", "must not know effects"),
-        ("stepping.newton", "from ..bodies import rigid", "must not know bodies"),
-        ("linsolve.dense", "from ..core import state", "core lies above linsolve"),
-        ("effects.loads.gravity", "from natcoord_jax.linsolve import dense", "must not know linsolve"),
-        ("linsolve.dense", "import scipy.linalg", "nothing else"),
-        ("stepping.newton", "from jax.extend import core as jex", "xla and nowhere else"),
-        ("core.marker", "import jaxlib.xla_client", "xla and nowhere else"),
-        ("analysis.energy", "import matplotlib.pyplot as plt", "lives in viz"),
-        ("helpers", "", "is on no floor"),
-    ],
-)
-def test_a_breach_is_seen(module: str, source: str, fragment: str):
-    found = breaches(f"{PACKAGE}.{module}", source)
-    assert len(found) == 1 and fragment in found[0], found
+BREACHES = [
+    ("core.marker", "from natcoord_jax.effects.joints import Revolute", "effects lies above core"),
+    ("core.marker", "from ..scene import Scene", "scene lies above core"),
+    ("core.marker", "def f():\n    from .. import viz", "viz lies above core"),
+    ("core.marker", "importlib.import_module('natcoord_jax.viz')", "viz lies above core"),
+    ("core.marker", "importlib.import_module('..viz', __package__)", "viz lies above core"),
+    ("core.marker", "import natcoord_jax as nc", "not the whole package"),
+    ("core.marker", "from natcoord_jax import Scene", "not the whole package"),
+    ("core.marker", "hasattr(object, 'x')", "hasattr"),
+    ("effects.joints.screw", "from ..springs import linear", "must not import other effects"),
+    ("effects.joints.screw", "from natcoord_jax.effects import Spring", "must not import other effects"),
+    ("mechanics.groups", "from natcoord_jax.effects.joints import Revolute", "must not know effects"),
+    ("stepping.newton", "from ..bodies import rigid", "must not know bodies"),
+    ("linsolve.dense", "from ..core import state", "core lies above linsolve"),
+    ("effects.loads.gravity", "from natcoord_jax.linsolve import dense", "must not know linsolve"),
+    ("linsolve.dense", "import scipy.linalg", "nothing else"),
+    ("stepping.newton", "from jax.extend import core as jex", "xla and nowhere else"),
+    ("core.marker", "import jaxlib.xla_client", "xla and nowhere else"),
+    ("analysis.energy", "import matplotlib.pyplot as plt", "lives in viz"),
+    ("helpers", "", "is on no floor"),
+]
 
 
-@pytest.mark.parametrize(
-    ("module", "source"),
-    [
-        ("core.marker", "from ..maths import rotations\nfrom .state import State"),
-        ("effects.joints.screw", "from .revolute import Revolute\nfrom ...core.marker import Marker"),
-        ("linsolve.dense", "import math\nimport jax.numpy as jnp\nfrom natcoord_jax.maths import norms"),
-        ("stepping.newton", "from natcoord_jax.linsolve.dense import solve"),
-        ("scene", "from . import bodies, effects, stepping"),
-        ("viz.plot", "import matplotlib.pyplot as plt\nimport natcoord_jax.analysis.energy"),
-        ("gallery.spacecraft", "import natcoord_jax as nc"),
-        ("__main__", "from natcoord_jax.cli import main"),
-    ],
-)
-def test_what_is_allowed_passes(module: str, source: str):
-    assert breaches(f"{PACKAGE}.{module}", source) == []
+def test_a_breach_is_seen():
+    wrong = []
+    for module, source, fragment in BREACHES:
+        seen = breaches(f"{PACKAGE}.{module}", ast.parse(source))
+        if len(seen) != 1 or fragment not in seen[0]:
+            wrong.append(f"{source!r} in {module} gives {seen}, not one breach with '{fragment}'")
+    assert not wrong, "\n".join(wrong)
+
+
+ALLOWED = [
+    ("core.marker", "from ..maths import rotations\nfrom .state import State"),
+    ("effects.joints.screw", "from .revolute import Revolute\nfrom ...core.marker import Marker"),
+    ("linsolve.dense", "import math\nimport jax.numpy as jnp\nfrom natcoord_jax.maths import norms"),
+    ("stepping.newton", "from natcoord_jax.linsolve.dense import solve"),
+    ("scene", "from . import bodies, effects, stepping"),
+    ("viz.plot", "import matplotlib.pyplot as plt\nimport natcoord_jax.analysis.energy"),
+    ("gallery.spacecraft", "import natcoord_jax as nc"),
+    ("__main__", "from natcoord_jax.cli import main"),
+]
+
+
+def test_what_is_allowed_passes():
+    wrong = [
+        f"{source!r} in {module}: {breach}"
+        for module, source in ALLOWED
+        for breach in breaches(f"{PACKAGE}.{module}", ast.parse(source))
+    ]
+    assert not wrong, "\n".join(wrong)
 
 
 def test_import_is_light_and_changes_no_setting():
@@ -364,10 +390,14 @@ def missing_names(source: str) -> list[str]:
     return missing
 
 
-@pytest.mark.parametrize("file", sorted(Path(__file__).parent.rglob("*.py")), ids=lambda file: file.stem)
-def test_what_tests_take_is_there(file: Path):
+def test_what_tests_take_is_there():
     """Of those, too, that only the exhaustive suite runs."""
-    assert not missing_names(file.read_text("utf-8"))
+    wrong = [
+        f"{file.relative_to(ROOT).as_posix()} takes {name}, which is not there"
+        for file in sorted(Path(__file__).parent.rglob("*.py"))
+        for name in missing_names(file.read_text("utf-8"))
+    ]
+    assert not wrong, "\n".join(wrong)
 
 
 def test_missing_names_are_seen():

@@ -27,22 +27,24 @@ from natcoord_jax.stepping.step import advance
 STEPS = 12
 
 
+NUMBERS = {
+    "inputs": np.random.default_rng(0).normal(size=(STEPS, 1)),
+    "mass": 1.3,
+    "inertia": (0.20, 0.12, 0.25),
+    "joint position": (0.1, 0.9, -0.2),
+    "axis": (0.2, 0.1, 1.0),
+    "stiffness": 8.0,
+    "coil": 1.5,
+    "damping": 0.3,
+    "gravity": (0.3, -0.2, -9.81),
+    "initial spin": 1.1,
+    "dt": 0.06,
+}
+
+
 def numbers():
     """Everything that can be differentiated, as one tree."""
-    rng = np.random.default_rng(0)
-    return {
-        "inputs": jnp.asarray(rng.normal(size=(STEPS, 1))),
-        "mass": jnp.array(1.3),
-        "inertia": jnp.array([0.20, 0.12, 0.25]),
-        "joint position": jnp.array([0.1, 0.9, -0.2]),
-        "axis": jnp.array([0.2, 0.1, 1.0]),
-        "stiffness": jnp.array(8.0),
-        "coil": jnp.array(1.5),
-        "damping": jnp.array(0.3),
-        "gravity": jnp.array([0.3, -0.2, -9.81]),
-        "initial spin": jnp.array(1.1),
-        "dt": jnp.array(0.06),
-    }
+    return {name: jnp.array(x) for name, x in NUMBERS.items()}
 
 
 def built(p):
@@ -131,7 +133,7 @@ def total(gradient, d):
 # --- first derivatives ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", numbers())
+@pytest.mark.parametrize("name", NUMBERS)
 def test_jvp_and_gradient_against_differences(name):
     p, d = numbers(), direction(name)
     ahead = tangent(p, d)

@@ -12,7 +12,7 @@ from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.xla.evaluation import FLOWS
 
 X = jnp.asarray(np.random.default_rng(0).normal(size=(4, 3)))
-PLACES = jnp.array([2, 0, 3])
+PLACES = jnp.asarray(np.array([2, 0, 3]))
 
 
 def beam(curve):
@@ -60,33 +60,56 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("case", CASES)
-def test_results_are_those_of_jax(case):
-    """Could go wrong: an operation that NumPy defines differently, at a corner."""
-    expected, found = CASES[case](X), eager_numpy(CASES[case])(X)
-    for want, have in zip(jax.tree.leaves(expected), jax.tree.leaves(found), strict=True):
+def assert_same(results, expected):
+    """Arrays of JAX, of the same shapes and types, with the same numbers."""
+    for have, want in zip(jax.tree.leaves(results), jax.tree.leaves(expected), strict=True):
         assert isinstance(have, jax.Array)
         assert (want.shape, want.dtype) == (have.shape, have.dtype)
         np.testing.assert_allclose(have, want, rtol=1e-13, atol=1e-14)
 
 
-@pytest.mark.parametrize("name", FLOWS)
-def test_operations_with_several_results_give_arrays(name):
-    """Could go wrong: numbers of NumPy, which the elements of a vector are."""
-    found = []
-    of_numpy = FLOWS[name]
+def assert_all_pass(check, cases):
+    """A check of one case passes for all of them; those that do not are listed."""
+    wrong = []
+    for case in cases:
+        try:
+            check(case)
+        except Exception as error:
+            wrong.append(f"{case}: {error!r}")
+    assert not wrong, "\n".join(wrong)
 
-    def noting(given, operands):
-        results = of_numpy(given, operands)
-        found.extend(results)
-        return results
+
+def test_results_are_those_of_jax():
+    """Could go wrong: an operation that NumPy defines differently, at a corner."""
+    assert_all_pass(lambda case: assert_same(eager_numpy(CASES[case])(X), CASES[case](X)), CASES)
+
+
+def test_operations_with_several_results_give_arrays():
+    """Could go wrong: numbers of NumPy, which the elements of a vector are."""
+    noted = {name: [] for name in FLOWS}
+
+    def noting(name, of_numpy):
+        def flow(parameters, operands):
+            results = of_numpy(parameters, operands)
+            noted[name].extend(results)
+            return results
+
+        return flow
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(FLOWS, name, noting)
+        for name, of_numpy in tuple(FLOWS.items()):
+            patch.setitem(FLOWS, name, noting(name, of_numpy))
         for case in ("loops", "taken apart"):
             eager_numpy(CASES[case])(X)
         eager_numpy(lambda x: jnp.split(x, 3))(X[0])
-    assert found and all(isinstance(x, np.ndarray) for x in found)
+    wrong = [f"{name} is never met" for name, results in noted.items() if not results]
+    wrong += [
+        f"{name} gives {result!r}, no array of NumPy"
+        for name, results in noted.items()
+        for result in results
+        if not isinstance(result, np.ndarray)
+    ]
+    assert not wrong, "\n".join(wrong)
 
 
 def test_transformed_it_is_the_function_itself():
@@ -98,20 +121,20 @@ def test_transformed_it_is_the_function_itself():
     assert not jax.jit(lambda x: x * at_top_level())(1.0)
 
 
-@pytest.mark.parametrize("case", sorted({*CASES} - {"by lanes", "taken apart"}))
-def test_lanes_outside_of_programs_are_evaluated_all_at_once(case):
+def test_lanes_outside_of_programs_are_evaluated_all_at_once():
     """Could go wrong: lanes along another axis, and what is not in lanes; `jax.vmap` in another one, too."""
-    of_two = eager_numpy(lambda x, y: CASES[case](x * y))
     many, factor = jnp.stack([X, 2 * X, -X], axis=1), jnp.asarray(1.5)
-    expected = jax.jit(jax.vmap(lambda x: CASES[case](x * 1.5), in_axes=1))(many)
-    found = jax.vmap(of_two, in_axes=(1, None))(many, factor)
-    nested = jax.vmap(jax.vmap(of_two, in_axes=(0, None)), in_axes=(None, 0))(X[None], factor[None])
-    one = jax.tree.map(lambda x: x[0, 0], nested)
-    for want, have in zip(jax.tree.leaves(expected), jax.tree.leaves(found), strict=True):
-        assert isinstance(have, jax.Array) and (want.shape, want.dtype) == (have.shape, have.dtype)
-        np.testing.assert_allclose(have, want, rtol=1e-13, atol=1e-14)
-    for want, have in zip(jax.tree.leaves(expected), jax.tree.leaves(one), strict=True):
-        np.testing.assert_allclose(have, want[0], rtol=1e-13, atol=1e-14)
+
+    def check(case):
+        of_two = eager_numpy(lambda x, y: CASES[case](x * y))
+        expected = jax.jit(jax.vmap(lambda x: CASES[case](x * 1.5), in_axes=1))(many)
+        assert_same(jax.vmap(of_two, in_axes=(1, None))(many, factor), expected)
+        nested = jax.vmap(jax.vmap(of_two, in_axes=(0, None)), in_axes=(None, 0))(X[None], factor[None])
+        one = jax.tree.map(lambda x: x[0, 0], nested)
+        for want, have in zip(jax.tree.leaves(expected), jax.tree.leaves(one), strict=True):
+            np.testing.assert_allclose(have, want[0], rtol=1e-13, atol=1e-14)
+
+    assert_all_pass(check, sorted({*CASES} - {"by lanes", "taken apart"}))
 
 
 def test_derivatives_outside_of_programs_are_programs_as_a_whole(programs):

@@ -24,9 +24,9 @@ from natcoord_jax.reading.tangent_states import reads_velocities
 
 AXES = [(0, 0, 1), (0, 1, 0), (0, 1, 0), (0, 0, 1), (0, 1, 0), (0, 0, 1)]
 LENGTHS, MASSES = (0.3, 0.4, 0.35, 0.2, 0.15, 0.1), (5, 4, 3, 1.5, 1, 0.5)
-TARGET = jnp.array([0.5, 0.6, -0.8, 0.3, 0.7, 0.2])
-STIFFNESS = jnp.array([5.0, 200, 100, 0.5, 3, 0.1])
-DAMPING = jnp.array([0.3, 20, 10, 0.05, 0.3, 0.01])
+TARGET = np.array([0.5, 0.6, -0.8, 0.3, 0.7, 0.2])
+STIFFNESS = np.array([5.0, 200, 100, 0.5, 3, 0.1])
+DAMPING = np.array([0.3, 20, 10, 0.05, 0.3, 0.01])
 ROTOR = 0.7
 
 

@@ -8,17 +8,18 @@ import socket
 import subprocess
 import sys
 import time
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 import pytest
-from sweeping import AXES, LINE, LINES, STATE, SWEEP, SYSTEM, angle, line
+from sweeping import AXES, LINE, LINES, SWEEP, angle, line, swing
 
 import natcoord_jax as nc
 from natcoord_jax.sweeps import run as running
 from natcoord_jax.sweeps.grid import Grid
 
-pytest.importorskip("zarr")
+pytestmark = pytest.mark.skipif(find_spec("zarr") is None, reason="no zarr: install the extra store")
 TESTS = Path(__file__).parent
 ENV = os.environ | {"PYTHONPATH": os.pathsep.join([str(TESTS.parent), str(TESTS)])}
 SUMS = LINE["x"][:, None] + LINE["y"]
@@ -60,6 +61,7 @@ def test_rows_are_in_blocks_of_one_bucket():
 
 @pytest.mark.slow
 def test_variants_are_those_of_single_runs(tmp_path, programs):
+    system, state = swing()
     found = nc.sweep(angle, store=tmp_path / "sweep", **SWEEP)
     assert sum(name == "jit(lanes)" for name in programs) == 2  # (one program a bucket)
     for k, (dt, steps) in enumerate(zip(*AXES["dt", "steps"])):
@@ -70,7 +72,7 @@ def test_variants_are_those_of_single_runs(tmp_path, programs):
                     assert code is nc.Result.NONFINITE
                     continue
                 given = {"dt": dt, "steps": int(steps), "inputs": np.array([torque])}
-                run = nc.simulate(SYSTEM.set("arm", mass=mass), STATE, **given)
+                run = nc.simulate(system.set("arm", mass=mass), state, **given)
                 assert code is nc.Result.SUCCESSFUL
                 last = run.states.coordinates[-1, 0]
                 np.testing.assert_allclose(found["angle"][k, i, j], last, rtol=1e-12)
@@ -158,10 +160,11 @@ def test_two_dask_workers_one_of_which_is_killed(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_lanes_go_to_all_devices(tmp_path):
-    flags = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count=2"
+    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2"
     process = started("devices", tmp_path / "two", XLA_FLAGS=flags)
     told, _ = process.communicate()
     assert process.returncode == 0 and told.startswith("2 36 of 36 rows are done")
+    swing()
     one = nc.sweep(angle, store=tmp_path / "one", **SWEEP)
     np.testing.assert_allclose(nc.Sweep(tmp_path / "two")["angle"], one["angle"], rtol=1e-12)
 
@@ -195,12 +198,13 @@ def test_what_does_not_fit_is_refused(tmp_path):
 
 
 def test_steps_are_traced_up_to_a_largest_number():
-    whole = nc.simulate(SYSTEM, STATE, dt=0.01, steps=7)
-    some = nc.simulate(SYSTEM, STATE, dt=0.01, steps=nc.Steps(7, 64))
+    system, state = swing()
+    whole = nc.simulate(system, state, dt=0.01, steps=7)
+    some = nc.simulate(system, state, dt=0.01, steps=nc.Steps(7, 64))
     np.testing.assert_allclose(some.q[:8], whole.q, rtol=1e-13, atol=1e-13)
     np.testing.assert_array_equal(some.q[8:], np.broadcast_to(some.q[7], (57, 4, 3)))
     assert int(some.result) == 0 and int(some.steps_taken) == 7
-    many = nc.simulate(SYSTEM, STATE, dt=0.01, steps=nc.Steps(65, 64), throw=False)
+    many = nc.simulate(system, state, dt=0.01, steps=nc.Steps(65, 64), throw=False)
     assert nc.Result(int(many.result)) is nc.Result.MAX_SUBSTEPS
     with pytest.raises(ValueError, match="every state saved"):
-        nc.simulate(SYSTEM, STATE, dt=0.01, steps=nc.Steps(10, 20), save_every=5)
+        nc.simulate(system, state, dt=0.01, steps=nc.Steps(10, 20), save_every=5)

@@ -25,7 +25,7 @@ def test_shapes_and_types():
     run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert run.returncode == 0, run.stdout[-3000:]
     passed = re.search(r"(\d+) passed", run.stdout)
-    assert passed and int(passed[1]) > len(SCENES) and "skipped" not in run.stdout
+    assert passed and int(passed[1]) == 2 and "skipped" not in run.stdout
 
 
 @pytest.fixture
@@ -41,12 +41,17 @@ def test_a_wrong_shape_is_found():
 
 
 @pytest.mark.usefixtures("checked")
-@pytest.mark.parametrize("name", SCENES)
-def test_every_scene(name):
-    example = gallery.load(name)
-    inputs = example.inputs(2, 1e-3)
+def test_scenes_pass():
+    wrong = []
+    for name in SCENES:
+        example = gallery.load(name)
+        inputs = example.inputs(2, 1e-3)
 
-    def speed(state):
-        return jnp.sum(nc.simulate(example.system, state, dt=1e-3, inputs=inputs).v[-1] ** 2)
+        def speed(state, example=example, inputs=inputs):
+            return jnp.sum(nc.simulate(example.system, state, dt=1e-3, inputs=inputs).v[-1] ** 2)
 
-    assert jax.jit(speed).trace(example.state).jaxpr
+        try:
+            assert jax.jit(speed).trace(example.state).jaxpr
+        except TypeCheckError as error:
+            wrong.append(f"{name}: {error}")
+    assert not wrong, "\n".join(wrong)
