@@ -24,6 +24,7 @@ from scenes import AXIS, JOINTS, SECOND, SPECIAL, with_multipliers
 
 import natcoord_jax as nc
 import natcoord_jax.effects
+from natcoord_jax.build import build
 from natcoord_jax.core.cells import CELLS
 from natcoord_jax.core.coordinate import CoordinateEffect
 from natcoord_jax.core.effect import Effect, replace_fields
@@ -379,7 +380,7 @@ def test_joints_document_their_residual():
 
 @cache
 def stage(effect: type, in_tree: bool = False):
-    """A pair with an effect: system, state and group.
+    """A pair with an effect: system (not checked: some would be refused as they start), state and group.
 
     A joint under test keeps its multipliers, so that it may be shown motions that it would not allow; or it
     is `in_tree`, and all motions are free ones.
@@ -398,7 +399,7 @@ def stage(effect: type, in_tree: bool = False):
     )
     if entry.make:
         scene.add(entry.make(parts))
-    system, state = scene.compile()
+    system, state = build(scene.bodies, scene.joints, scene.effects, None)
     group = next(g for g in (*system.effects, *system.joints) if isinstance(g.effect, effect))
     return system, state, group
 
@@ -467,10 +468,15 @@ def answers(effect: type, in_tree: bool = False) -> Answers:
     system, state, _ = stage(effect, in_tree)
 
     def energies(w):
-        if not effect.stores:
+        if effect not in STORING:
             return jnp.zeros(2)
-        y = jnp.zeros(system.structure.unknowns + system.structure.multipliers).at[: len(w)].set(w)
-        after = advance(system, state, inputs_of(system), jnp.ones(()), y, TABLEAU)[1]
+        if issubclass(effect, CoordinateEffect):  # its coordinates are summed up over the steps
+            y = jnp.zeros(system.structure.unknowns + system.structure.multipliers).at[: len(w)].set(w)
+            after = advance(system, state, inputs_of(system), jnp.ones(()), y, TABLEAU)[1]
+        else:
+            step = ReducedStep.prepare(system, state, inputs_of(system), jnp.ones(()), TABLEAU)
+            rates = step.stations(step.motion(w[None])[0]).rates[0, :-1].reshape(-1, 3)
+            after = replace_fields(state, q=state.q + rates)
         return jnp.stack([system.energy(s).potential for s in (state, after)])
 
     def of_lane(w, lam):
@@ -488,6 +494,7 @@ def scale_of(a: Answers, seed: int) -> float:
     return np.sum(np.abs(a.forces[seed])) + np.sum(np.abs(a.torques[seed]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("effect", [e for e in TABLE if e.elastic], ids=lambda e: e.__name__)
 def test_elastic_effects_say_what_cancels(effect):
     """At rest their forces are rounded as stiffness times invariants, of which they are differences, are."""
@@ -564,7 +571,11 @@ def response_of(effect: type, lam):
     return f
 
 
-@EFFECTS
+@pytest.mark.parametrize(
+    "effect",
+    [pytest.param(e, marks=pytest.mark.slow if e is nc.MortarGap else ()) for e in TABLE],
+    ids=[e.__name__ for e in TABLE],
+)
 def test_derivatives_equal_differences(effect):
     """Of forces, torques and constraint rates with respect to the motion; at rest, too.
 

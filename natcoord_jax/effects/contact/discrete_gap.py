@@ -21,6 +21,7 @@ from jaxtyping import Array, Float, Int
 
 from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.closed_tangents import by_twists
+from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.joint import Joint
@@ -91,9 +92,8 @@ class DiscreteGap(ContactLaw):
 
     def assembled_at(self, x: Float[Array, "k 3"]) -> "DiscreteGap":
         """With its damping, and the gap that it starts with in terms of the size of all."""
-        size = jnp.sqrt(jnp.max(jnp.sum((x - x[0]) ** 2, axis=1)))
         damped: Any = self.renewed()
-        return replace_fields(damped, initial=self.gap(x) / size)
+        return replace_fields(damped, initial=_relative_gap(self, x))
 
     def flaws(self) -> dict[str, Array]:
         """A start in penetration."""
@@ -178,3 +178,9 @@ def _apart(x: Float[Array, "s k 3"], at: Int[Array, " p"]) -> Float[Array, "s p 
     """Differences of pairs of points."""
     some = x[:, at]
     return some[:, :, None] - some[:, None]
+
+
+@eager_numpy
+def _relative_gap(gap: DiscreteGap, x: Float[Array, "k 3"]) -> Float[Array, ""]:
+    """The gap in terms of the size of all."""
+    return gap.gap(x) / jnp.sqrt(jnp.max(jnp.sum((x - x[0]) ** 2, axis=1)))

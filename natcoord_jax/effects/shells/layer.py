@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from natcoord_jax.core.arguments import is_a
+from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.kinds import of
 from natcoord_jax.core.numeric import COMPONENTS, Directions, Number
@@ -74,7 +75,7 @@ class LayerElement(Potential):
     def assembled_at(self, x: Float[Array, "k *m 3"]) -> "LayerElement":
         """With the assembled pose as the one without stress, unless another is given."""
         given = (x[:, :2] if self.bends else x) if self.reference is None else self.reference
-        return replace_fields(self, reference=given).renewed()
+        return _renewed(replace_fields(self, reference=given))
 
     def renewed(self) -> "LayerElement":
         """With the stiffness and the invariants of the pose without stress."""
@@ -141,3 +142,8 @@ class LayerElement(Potential):
         offset = 0.0 if self.offset is None else self.offset
         pull = jnp.zeros(3) if self.prestress is None else jnp.asarray(self.prestress)
         return readings_of(self.sheet(), 0.5 * self.thickness, offset, strain, curvature, shear, energy, pull)
+
+
+@eager_numpy
+def _renewed(element: LayerElement) -> LayerElement:
+    return element.renewed()
