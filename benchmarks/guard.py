@@ -1,0 +1,436 @@
+"""What a step takes, beside fixed peers, and whether that is more than it was at its best.
+
+usage: python -m benchmarks.guard [--scene NAME ...] [--all] [--minutes M] [--keep] [--table] [--results JSON]
+
+Scenes, numbers of steps, value and gradient, one lane and 64 (`benchmarks.guard_scenes`): cells. All programs
+are compiled from nothing with full effort, by one process on each core; then, one at a time, each runs in
+turn with its scene's peer on the same core. The figure of a cell is the median ratio of processor times a
+step: machines get faster and slower, and both sides of a round do so together. `best` keeps the least ratio
+of each cell that a commit has reached, by peer, its version and the kind of processor.
+
+Exit status 1, with a table, if
+
+- a ratio is more than 1.15 of the best kept one, and is so again when it is measured anew for longer,
+- a program takes more than 1.3 of the best kept processor seconds to compile, in units of a loop of Python
+  that runs before and after, and does so again when it is compiled anew,
+- a program fails, or a run does not reach its end.
+
+2 if nothing was measured, else 0. Cells that the time did not suffice for are named, and are no failure. Of a
+kind of processor that nothing is kept of, ratios are compared with the best of any other, which only warns.
+Warned of, too, are scenes whose steps take longer where there are more of them: the best kept would hide it
+if it had been so at the start.
+
+Without `--keep` nothing is written; with it, the record of this run and what it improved, and the table in
+docs/guard.md. Regressions are not kept. `--all` measures all cells, in hours.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from threading import Lock, Thread
+from typing import Any
+
+from benchmarks import common
+from benchmarks.guard_scenes import ALL, DEFAULT, NUMBERS, SCENES, Cell
+
+RESULTS = common.RESULTS / "guard.json"
+PAGE = common.ROOT / "docs" / "guard.md"
+BEGIN, END = "<!-- table of benchmarks.guard -->\n", "<!-- end of the table -->\n"
+SLOWER = 1.15
+"""Ratio over the best kept one from which on a cell fails."""
+DEARER = 1.3
+"""The same of what compiling costs, which is measured once and on both cores at a time."""
+LONGER = 1.6
+"""Time a step over that in the run of the next smaller number of steps, from 100 on, that is warned of."""
+SHARE = 0.72
+"""Of the minutes, for compiling."""
+AGAIN = 4.0
+"""Span of the second measurement [s]."""
+BATCH = 70
+"""Cells that are compiled before any is timed: programs take memory."""
+KEY = ("scene", "kind", "lanes", "steps", "peer", "processor")
+
+
+class Worker:
+    """A process on one core that compiles and times cells, see `benchmarks.guard_cells`."""
+
+    def __init__(self, core: int | None):
+        def pinned() -> None:
+            if core is not None:
+                os.sched_setaffinity(0, {core})
+
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "benchmarks.guard_cells"],
+            cwd=common.ROOT,
+            env=os.environ | common.ONE_THREAD,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            preexec_fn=pinned if sys.platform == "linux" else None,
+        )
+
+    def ask(self, do: str, cell: Cell, **options: Any) -> dict[str, Any]:
+        """The answer to a request; a process that died is an error."""
+        assert self.process.stdin and self.process.stdout
+        try:
+            print(json.dumps({"do": do, "cell": cell} | options), file=self.process.stdin, flush=True)
+            line = self.process.stdout.readline()
+        except OSError:
+            line = ""
+        return json.loads(line) if line else {"error": f"the process ended: {self.process.poll()}"}
+
+    def close(self) -> None:
+        """End the process."""
+        assert self.process.stdin
+        try:
+            self.process.stdin.close()
+        except OSError:
+            pass
+        self.process.kill()
+        self.process.wait()
+
+
+def cores() -> list[int | None]:
+    """At most two."""
+    return sorted(os.sched_getaffinity(0))[:2] if sys.platform == "linux" else [None]
+
+
+Answers = dict[Cell, dict[str, Any]]
+
+
+def compile_all(workers: Sequence[Worker], cells: Sequence[Cell], until: float) -> tuple[Answers, dict]:
+    """Compile cells on all cores; what was answered, and who has the program."""
+    queue, lock = deque(cells), Lock()
+    answers: Answers = {}
+    owners: dict[Cell, Worker] = {}
+
+    def work(worker: Worker) -> None:
+        while time.monotonic() < until:
+            with lock:
+                if not queue:
+                    return
+                cell = queue.popleft()
+            found = worker.ask("compile", cell)
+            with lock:
+                answers[cell], owners[cell] = found, worker
+            cost = found.get("error") or f"{found['compile_s']:.1f} s"
+            print(f"compiled {words(cell)}: {cost}", flush=True)
+
+    threads = [Thread(target=work, args=(worker,)) for worker in workers]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    return answers, owners
+
+
+def measure(cells: Sequence[Cell], until: float, compiling_until: float, judge: Callable) -> list[dict]:
+    """Records of cells, those without a time among them.
+
+    Args:
+        cells: what is to be measured.
+        until: no cell is begun later, by the monotonic clock.
+        compiling_until: the same for compiling.
+        judge: faults of a record, for which it is measured again.
+    """
+    workers = [Worker(core) for core in cores()]
+    records = []
+    try:
+        answers, owners = compile_all(workers, cells, compiling_until)
+        for cell in cells:
+            record = cell._asdict() | answers.get(cell, {"missed": "no time to compile"})
+            if time.monotonic() >= until:
+                record = cell._asdict() | {"missed": "no time to measure"}
+            elif cell in owners and "error" not in record:
+                record |= owners[cell].ask("time", cell)
+                if "error" not in record and judge(record):
+                    record |= _again(owners[cell], cell, judge(record))
+            records.append(record)
+            print(line(record), flush=True)
+    finally:
+        for worker in workers:
+            worker.close()
+    return records
+
+
+def _again(worker: Worker, cell: Cell, faults: list[str]) -> dict[str, Any]:
+    """The second measurement of what is too much, of which the smaller cost to compile counts."""
+    found: dict[str, Any] = {"again": True}
+    if any("compile" in fault for fault in faults):
+        found |= worker.ask("compile", cell)
+    return found | worker.ask("time", cell, span=AGAIN)
+
+
+def words(cell: Cell) -> str:
+    """A cell in words."""
+    lanes = "" if cell.lanes == 1 else f", {cell.lanes} lanes"
+    return f"{cell.scene}, {cell.kind}{lanes}, {cell.steps} steps"
+
+
+def cell_of(record: dict[str, Any]) -> Cell:
+    """Which cell a record is of."""
+    return Cell(*(record[name] for name in Cell._fields))
+
+
+def line(record: dict[str, Any]) -> str:
+    """A record in one line."""
+    reason = record.get("error") or record.get("missed")
+    if reason:
+        return f"{words(cell_of(record))}: {reason}"
+    return (
+        f"{words(cell_of(record))}: {record['us_per_step']:.3g} us a step, ratio {record['ratio']:.3g} "
+        f"({record['ratio_quartiles'][0]:.3g} to {record['ratio_quartiles'][1]:.3g})"
+        f"{', measured twice' * record.get('again', False)}"
+    )
+
+
+def key(record: dict[str, Any]) -> tuple:
+    """By which ratios are compared."""
+    return tuple(record[name] for name in KEY)
+
+
+def cost(record: dict[str, Any]) -> float:
+    """What a program costs to compile, in units of the loop of Python beside."""
+    return record["compile_s"] / record["pace_s"]
+
+
+def kept_for(record: dict[str, Any], best: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
+    """The best of the same cell, peer and processor; else the least of other processors; else none."""
+    alike = [b for b in best if key(b)[:-1] == key(record)[:-1]]
+    same = [b for b in alike if b["processor"] == record["processor"]]
+    return min(same or alike, key=lambda b: b["ratio"], default=None)
+
+
+def faults(record: dict[str, Any], best: Sequence[dict[str, Any]]) -> list[str]:
+    """What is worse than it was: "time" and "compile", or nothing.
+
+    Args:
+        record: of a cell, with its peer and processor.
+        best: the ones kept.
+    """
+    kept = kept_for(record, best)
+    if kept is None:
+        return []
+    found = []
+    if record["ratio"] > SLOWER * kept["ratio"]:
+        found.append("time")
+    if cost(record) > DEARER * kept["compile_cost"]:
+        found.append("compile")
+    return found
+
+
+def improved(
+    best: Sequence[dict[str, Any]], records: Sequence[dict[str, Any]], commit: str | None
+) -> list[dict[str, Any]]:
+    """The best ones after a run: of each cell the least ratio and the least cost, with their commits."""
+    found = {key(b): dict(b) for b in best}
+    for record in records:
+        if "ratio" not in record:
+            continue
+        new = found.setdefault(key(record), {name: record[name] for name in KEY})
+        if record["ratio"] < new.get("ratio", float("inf")):
+            new |= {"ratio": record["ratio"], "commit": commit}
+        if cost(record) < new.get("compile_cost", float("inf")):
+            new |= {"compile_cost": cost(record), "compile_commit": commit}
+    return [found[k] for k in sorted(found)]
+
+
+def growing(records: Sequence[dict[str, Any]]) -> list[str]:
+    """Warnings of scenes whose steps take longer where there are more of them."""
+    times = {cell_of(r): r["us_per_step"] for r in records if "ratio" in r}
+    found = []
+    for cell, us in times.items():
+        smaller = [n for n in NUMBERS if 100 <= n < cell.steps and cell._replace(steps=n) in times]
+        before = times[cell._replace(steps=smaller[-1])] if smaller else us
+        if us > LONGER * before:
+            found.append(f"{words(cell)}: {us / before:.2g} times as long a step as with {smaller[-1]}")
+    return found
+
+
+def table(results: dict[str, Any]) -> str:
+    """The last record as a table of Markdown."""
+    if not results["records"]:
+        return ""
+    last = results["records"][-1]
+    rows: dict[tuple, dict[int, dict]] = {}
+    for cell in last["cells"]:
+        if "ratio" in cell:
+            place = cell["scene"], cell["kind"], cell["lanes"]
+            rows.setdefault(place, {})[cell["steps"]] = cell
+    lines = [
+        "| scene, peer | what | " + " | ".join(f"{n}" for n in NUMBERS) + " | compile s |",
+        "|---|---|" + "---|" * (len(NUMBERS) + 1),
+    ]
+    before = ""
+    for (scene, kind, lanes), found in sorted(rows.items(), key=lambda row: list(SCENES).index(row[0][0])):
+        one = next(iter(found.values()))
+        head = "" if scene == before else f"{scene}; {one['peer']}"
+        what = kind + ("" if lanes == 1 else f", {lanes} lanes")
+        times = [
+            f"{found[n]['us_per_step']:.3g} ({found[n]['ratio']:.2g})" if n in found else "" for n in NUMBERS
+        ]
+        most = max(c["compile_s"] for c in found.values())
+        lines.append(f"| {head} | {what} | " + " | ".join(times) + f" | {most:.1f} |")
+        before = scene
+    commit = (last["commit"] or "?")[:8] + "+" * last["uncommitted_changes"]
+    versions = ", ".join(f"{name} {last['versions'][name]}" for name in ("jax", "numpy"))
+    about = f"{last['machine']['processor']}, one core; commit {commit}, {last['date'][:10]}; {versions}."
+    return "\n".join([*lines, "", about]) + "\n"
+
+
+def load(file: Path) -> dict[str, Any]:
+    """What is kept; nothing where there is no file."""
+    return json.loads(file.read_text("utf-8")) if file.exists() else {"best": [], "records": []}
+
+
+def dumped(results: dict[str, Any]) -> str:
+    """JSON with a cell a line."""
+
+    def listed(items: Sequence[Any], indent: str) -> str:
+        return (
+            "[\n"
+            + ",\n".join(indent + json.dumps(x, allow_nan=False) for x in items)
+            + "\n"
+            + indent[1:]
+            + "]"
+        )
+
+    records = []
+    for record in results["records"]:
+        cells = listed(record["cells"], "   ")
+        rest = json.dumps({k: v for k, v in record.items() if k != "cells"}, allow_nan=False)
+        records.append(f'  {rest[:-1]}, "cells": {cells}}}')
+    return (
+        '{\n "best": '
+        + listed(results["best"], "  ")
+        + ',\n "records": [\n'
+        + ",\n".join(records)
+        + "\n ]\n}\n"
+    )
+
+
+def with_table(page: str, text: str) -> str:
+    """A page with this table in the place that it has for it."""
+    before, _, after = page.partition(BEGIN)
+    return before + BEGIN + text + END + after.partition(END)[2]
+
+
+def keep(results: dict[str, Any], record: dict[str, Any], file: Path) -> None:
+    """Write a record and what it improved, and the table on the page if this is the file of the checkout."""
+    commit = record["commit"] and record["commit"] + "+" * record["uncommitted_changes"]
+    results["best"] = improved(results["best"], record["cells"], commit)
+    results["records"].append(record)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(dumped(results), "utf-8")
+    if file == RESULTS:
+        PAGE.write_text(with_table(PAGE.read_text("utf-8"), table(results)), "utf-8")
+    print(f"wrote {file}")
+
+
+def report(records: Sequence[dict[str, Any]], best: Sequence[dict[str, Any]]) -> int:
+    """Print what is worse than it was, and what was not measured; the exit status."""
+    measured = [r for r in records if "ratio" in r]
+    rows, failed = [("cell", "ratio", "best", "compile", "best", "at")], False
+    for record in measured:
+        found, kept = faults(record, best), kept_for(record, best)
+        if not found or kept is None:
+            continue
+        same = kept["processor"] == record["processor"]
+        failed |= same
+        numbers = record["ratio"], kept["ratio"], cost(record), kept["compile_cost"]
+        at = f"{(kept['commit'] or '?')[:8]}{'' if same else ', another processor: only a warning'}"
+        rows.append((words(cell_of(record)), *(f"{x:.3g}" for x in numbers), at))
+    if len(rows) > 1:
+        print(f"\nWORSE THAN THE BEST (times {SLOWER}, compile {DEARER}):\n{common.aligned(rows)}")
+    new = [r for r in measured if kept_for(r, best) is None]
+    if new:
+        print(f"\n{len(new)} cells have nothing to be compared with")
+    if growing(records):
+        print("\nWARNING, slower with more steps:\n" + "\n".join(growing(records)))
+    missed = [r for r in records if "ratio" not in r]
+    if missed:
+        print("\nNOT MEASURED:\n" + "\n".join(map(line, missed)))
+    if not measured:
+        return 2
+    return int(failed or any("error" in r for r in records))
+
+
+def left_out(cells: Sequence[Cell]) -> str:
+    """What there is besides of the same scenes, in words."""
+    rows: dict[tuple, list[str]] = {}
+    chosen = {cell.scene for cell in cells}
+    for cell in ALL:
+        if cell not in cells and cell.scene in chosen:
+            rows.setdefault((cell.kind, cell.lanes, cell.steps), []).append(cell.scene)
+    return "\n".join(
+        f"  {kind}, {lanes} lane{'s' * (lanes > 1)}, {steps} steps: {'; '.join(scenes)}"
+        for (kind, lanes, steps), scenes in rows.items()
+    )
+
+
+def batches(cells: Sequence[Cell]) -> list[list[Cell]]:
+    """Cells that one set of processes measures: scene by scene, or all together."""
+    if len(cells) <= BATCH:
+        return [list(cells)]
+    return [[c for c in cells if c.scene == scene] for scene in dict.fromkeys(c.scene for c in cells)]
+
+
+def in_order(cells: Sequence[Cell], best: Sequence[dict[str, Any]]) -> list[Cell]:
+    """What compiles for longest first, so that the cores end together."""
+    costs = {cell_of(b): b["compile_cost"] for b in best}
+    return sorted(cells, key=lambda cell: -costs.get(cell, 0.0))
+
+
+def spent() -> float:
+    """Processor seconds of this process and of those it has started and that have ended."""
+    return sum(os.times()[:4])
+
+
+def main() -> int:
+    """Run; the exit status."""
+    options = argparse.ArgumentParser(description="Times a step beside fixed peers, and the best kept ones.")
+    options.add_argument("--scene", nargs="+", choices=tuple(SCENES), metavar="NAME", help=", ".join(SCENES))
+    options.add_argument("--all", action="store_true", help="all cells, without a limit of time")
+    options.add_argument("--minutes", type=float, default=10.0, help="at most; default 10")
+    options.add_argument(
+        "--keep", action="store_true", help="write the record, and what is better than before"
+    )
+    options.add_argument("--table", action="store_true", help="only print the table of what is kept")
+    options.add_argument("--results", type=Path, default=RESULTS, metavar="JSON", help="what is kept")
+    given = options.parse_args()
+    results = load(given.results)
+    if given.table:
+        print(table(results), end="")
+        return 0
+    start, budget = time.monotonic(), float("inf") if given.all else 60 * given.minutes
+    cells = [c for c in (ALL if given.all else DEFAULT) if not given.scene or c.scene in given.scene]
+    print(f"{len(cells)} cells; not among them:\n{left_out(cells)}\n", flush=True)
+    record: dict[str, Any] = common.circumstances("guard", quick=False)
+    processor, best = record["machine"]["processor"], results["best"]
+    record["cells"] = []
+
+    def judge(cell: dict[str, Any]) -> list[str]:
+        return faults(cell | {"processor": processor}, best)
+
+    for batch in batches(cells):
+        compiling = start + SHARE * budget
+        record["cells"] += measure(in_order(batch, best), start + 0.97 * budget, compiling, judge)
+    order = {cell: k for k, cell in enumerate(ALL)}
+    record["cells"].sort(key=lambda r: order[cell_of(r)])
+    record["cells"] = [r | {"processor": processor} for r in record["cells"]]
+    record |= {"wall_s": time.monotonic() - start, "processor_s": spent()}
+    status = report(record["cells"], best)
+    print(f"\n{record['wall_s']:.0f} s, {record['processor_s']:.0f} s of the processor; exit status {status}")
+    if given.keep and status != 2:
+        keep(results, record, given.results)
+    return status
+
+
+if __name__ == "__main__":
+    sys.exit(main())
