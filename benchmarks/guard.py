@@ -30,10 +30,9 @@ import os
 import subprocess
 import sys
 import time
-from collections import deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from threading import Lock, Thread
+from threading import Barrier, BrokenBarrierError, Lock, Thread
 from typing import Any
 
 from benchmarks import common
@@ -50,6 +49,8 @@ LONGER = 1.6
 """Time a step over that in the run of the next smaller number of steps, from 100 on, that is warned of."""
 SHARE = 0.72
 """Of the minutes, for compiling."""
+PATIENCE = 20.0
+"""How long the other core is waited for after that [s]."""
 AGAIN = 4.0
 """Span of the second measurement [s]."""
 BATCH = 70
@@ -101,62 +102,85 @@ def cores() -> list[int | None]:
     return sorted(os.sched_getaffinity(0))[:2] if sys.platform == "linux" else [None]
 
 
-Answers = dict[Cell, dict[str, Any]]
-
-
-def compile_all(workers: Sequence[Worker], cells: Sequence[Cell], until: float) -> tuple[Answers, dict]:
-    """Compile cells on all cores; what was answered, and who has the program."""
-    queue, lock = deque(cells), Lock()
-    answers: Answers = {}
-    owners: dict[Cell, Worker] = {}
-
-    def work(worker: Worker) -> None:
-        while time.monotonic() < until:
-            with lock:
-                if not queue:
-                    return
-                cell = queue.popleft()
-            found = worker.ask("compile", cell)
-            with lock:
-                answers[cell], owners[cell] = found, worker
-            cost = found.get("error") or f"{found['compile_s']:.1f} s"
-            print(f"compiled {words(cell)}: {cost}", flush=True)
-
-    threads = [Thread(target=work, args=(worker,)) for worker in workers]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    return answers, owners
-
-
-def measure(cells: Sequence[Cell], until: float, compiling_until: float, judge: Callable) -> list[dict]:
-    """Records of cells, those without a time among them.
+class Run:
+    """Cells on their way: a thread for each process compiles them, and times its own, one at a time.
 
     Args:
-        cells: what is to be measured.
-        until: no cell is begun later, by the monotonic clock.
-        compiling_until: the same for compiling.
+        cells: what is to be measured, in this order.
+        costs: what cells are known to cost to compile, see `cost`.
+        until: no cell is timed later, by the monotonic clock.
+        compiling_until: none is compiled that would not be done by then, as far as that is known.
         judge: faults of a record, for which it is measured again.
     """
-    workers = [Worker(core) for core in cores()]
-    records = []
-    try:
-        answers, owners = compile_all(workers, cells, compiling_until)
-        for cell in cells:
-            record = cell._asdict() | answers.get(cell, {"missed": "no time to compile"})
-            if time.monotonic() >= until:
-                record = cell._asdict() | {"missed": "no time to measure"}
-            elif cell in owners and "error" not in record:
-                record |= owners[cell].ask("time", cell)
-                if "error" not in record and judge(record):
-                    record |= _again(owners[cell], cell, judge(record))
-            records.append(record)
-            print(line(record), flush=True)
-    finally:
-        for worker in workers:
-            worker.close()
-    return records
+
+    def __init__(
+        self,
+        cells: Sequence[Cell],
+        costs: dict[Cell, float],
+        until: float,
+        compiling_until: float,
+        judge: Callable[[dict[str, Any]], list[str]],
+    ):
+        self.queue, self.costs, self.judge = list(cells), costs, judge
+        self.until, self.compiling_until = until, compiling_until
+        self.records = {cell: cell._asdict() | {"missed": "no time to compile"} for cell in cells}
+        self.workers = [Worker(core) for core in cores()]
+        self.choosing, self.timing = Lock(), Lock()
+        self.compiled = Barrier(len(self.workers))
+
+    def measured(self) -> list[dict[str, Any]]:
+        """Records of all cells, of those without a time, too."""
+        threads = [Thread(target=self._work, args=(worker,)) for worker in self.workers]
+        try:
+            for thread in threads:
+                thread.start()
+            for thread in threads:
+                thread.join()
+        finally:
+            for worker in self.workers:
+                worker.close()
+        return list(self.records.values())
+
+    def _next(self, seconds_per_cost: float) -> Cell | None:
+        """The first cell that there is time to compile."""
+        with self.choosing:
+            room = self.compiling_until - time.monotonic()
+            cell = next((c for c in self.queue if seconds_per_cost * self.costs.get(c, 0.0) <= room), None)
+            if cell is None or room <= 0:
+                return None
+            self.queue.remove(cell)
+            return cell
+
+    def _work(self, worker: Worker) -> None:
+        ready, pace = [], 0.0
+        while cell := self._next(pace):
+            begun = time.monotonic()
+            found = worker.ask("compile", cell)
+            self.records[cell] = cell._asdict() | found
+            if "error" in found:
+                print(line(self.records[cell]), flush=True)
+                continue
+            ready.append(cell)
+            pace = (time.monotonic() - begun) / cost(found)
+            print(f"compiled {words(cell)}: {found['compile_s']:.1f} s", flush=True)
+        # Times are taken while no other core compiles, but for one that is late.
+        try:
+            self.compiled.wait(max(0.0, self.compiling_until - time.monotonic()) + PATIENCE)
+        except BrokenBarrierError:
+            pass
+        for cell in ready:
+            with self.timing:
+                self._time(worker, cell)
+
+    def _time(self, worker: Worker, cell: Cell) -> None:
+        record = self.records[cell]
+        if time.monotonic() >= self.until:
+            record["missed"] = "no time to measure"
+        else:
+            record |= worker.ask("time", cell)
+            if "error" not in record and self.judge(record):
+                record |= _again(worker, cell, self.judge(record))
+        print(line(record), flush=True)
 
 
 def _again(worker: Worker, cell: Cell, faults: list[str]) -> dict[str, Any]:
@@ -381,12 +405,6 @@ def batches(cells: Sequence[Cell]) -> list[list[Cell]]:
     return [[c for c in cells if c.scene == scene] for scene in dict.fromkeys(c.scene for c in cells)]
 
 
-def in_order(cells: Sequence[Cell], best: Sequence[dict[str, Any]]) -> list[Cell]:
-    """What compiles for longest first, so that the cores end together."""
-    costs = {cell_of(b): b["compile_cost"] for b in best}
-    return sorted(cells, key=lambda cell: -costs.get(cell, 0.0))
-
-
 def spent() -> float:
     """Processor seconds of this process and of those it has started and that have ended."""
     return sum(os.times()[:4])
@@ -418,9 +436,12 @@ def main() -> int:
     def judge(cell: dict[str, Any]) -> list[str]:
         return faults(cell | {"processor": processor}, best)
 
+    costs = {cell_of(b): b["compile_cost"] for b in best}
     for batch in batches(cells):
-        compiling = start + SHARE * budget
-        record["cells"] += measure(in_order(batch, best), start + 0.97 * budget, compiling, judge)
+        # What compiles for longest comes first, so that the cores end together.
+        batch.sort(key=lambda cell: -costs.get(cell, 0.0))
+        run = Run(batch, costs, start + 0.97 * budget, start + SHARE * budget, judge)
+        record["cells"] += run.measured()
     order = {cell: k for k, cell in enumerate(ALL)}
     record["cells"].sort(key=lambda r: order[cell_of(r)])
     record["cells"] = [r | {"processor": processor} for r in record["cells"]]

@@ -14,8 +14,8 @@ ALL, DEFAULT, SCENES = scenes.ALL, scenes.DEFAULT, scenes.SCENES
 
 RECORD = {
     "scene": "heavy top", "kind": "value", "lanes": 1, "steps": 100, "peer": "Exudyn 1",
-    "processor": "a chip", "us_per_step": 2.0, "peer_us_per_step": 8.0, "ratio": 0.25, "ratio_quartiles": [0.2, 0.3], "rounds": 9,
-    "compile_s": 4.0, "pace_s": 0.02,
+    "processor": "a chip", "us_per_step": 2.0, "peer_us_per_step": 8.0, "ratio": 0.25,
+    "ratio_quartiles": [0.2, 0.3], "rounds": 9, "compile_s": 4.0, "pace_s": 0.02,
 }  # fmt: skip
 BEST = guard.improved([], [RECORD], "abc")
 
@@ -41,7 +41,9 @@ def test_what_it_is_compared_with(capsys):
 
 
 def test_what_was_not_measured_is_named(capsys):
-    late = dict(zip(scenes.Cell._fields, scenes.Cell("rope, 64", "value", 1, 10))) | {"missed": "no time to compile"}
+    late = dict(zip(scenes.Cell._fields, scenes.Cell("rope, 64", "value", 1, 10))) | {
+        "missed": "no time to compile"
+    }
     assert guard.report([late], BEST) == 2
     assert guard.report([late, RECORD], BEST) == 0
     assert guard.report([late | {"error": "ValueError: it is"}, RECORD], BEST) == 1
