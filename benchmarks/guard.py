@@ -1,6 +1,7 @@
 """What a step takes, beside fixed peers, and whether that is more than it was at its best.
 
-usage: python -m benchmarks.guard [--scene NAME ...] [--all] [--minutes M] [--keep] [--table] [--results JSON]
+usage: python -m benchmarks.guard [--scene NAME ...] [--steps N ...] [--all] [--minutes M] [--keep]
+       [--table] [--results JSON]
 
 Scenes, numbers of steps, value and gradient, one lane and 64 (`benchmarks.guard_scenes`): cells. All programs
 are compiled from nothing with full effort, by one process on each core; then, one at a time, each runs in
@@ -277,35 +278,50 @@ def growing(records: Sequence[dict[str, Any]]) -> list[str]:
     return found
 
 
+def newest(results: dict[str, Any]) -> dict[Cell, tuple[dict[str, Any], dict[str, Any]]]:
+    """Of each cell the last measurement on the processor of the last record, and the record that has it."""
+    found = {}
+    for record in results["records"]:
+        for cell in record["cells"]:
+            if "ratio" in cell and cell["processor"] == results["records"][-1]["machine"]["processor"]:
+                found[cell_of(cell)] = cell, record
+    return found
+
+
+def _about(record: dict[str, Any]) -> str:
+    """Circumstances of a record, in words."""
+    commit = (record["commit"] or "?")[:8] + "+" * record["uncommitted_changes"]
+    versions = ", ".join(f"{name} {record['versions'][name]}" for name in ("jax", "numpy"))
+    return f"{record['date'][:10]}, commit {commit}, {versions}"
+
+
 def table(results: dict[str, Any]) -> str:
-    """The last record as a table of Markdown."""
-    if not results["records"]:
+    """The last measurement of each cell, as a table of Markdown; nothing where there is none."""
+    cells = newest(results)
+    if not cells:
         return ""
-    last = results["records"][-1]
     rows: dict[tuple, dict[int, dict]] = {}
-    for cell in last["cells"]:
-        if "ratio" in cell:
-            place = cell["scene"], cell["kind"], cell["lanes"]
-            rows.setdefault(place, {})[cell["steps"]] = cell
+    for cell, (record, _) in cells.items():
+        rows.setdefault(cell[:3], {})[cell.steps] = record
     lines = [
         "| scene, peer | what | " + " | ".join(f"{n}" for n in NUMBERS) + " | compile s |",
         "|---|---|" + "---|" * (len(NUMBERS) + 1),
     ]
     before = ""
-    for (scene, kind, lanes), found in sorted(rows.items(), key=lambda row: list(SCENES).index(row[0][0])):
-        one = next(iter(found.values()))
-        head = "" if scene == before else f"{scene}; {one['peer']}"
+    order = list(dict.fromkeys(cell[:3] for cell in ALL))
+    for scene, kind, lanes in sorted(rows, key=order.index):
+        found = rows[scene, kind, lanes]
+        peer = "" if scene == before else f"{scene}; {next(iter(found.values()))['peer']}"
         what = kind + ("" if lanes == 1 else f", {lanes} lanes")
         times = [
             f"{found[n]['us_per_step']:.3g} ({found[n]['ratio']:.2g})" if n in found else "" for n in NUMBERS
         ]
         most = max(c["compile_s"] for c in found.values())
-        lines.append(f"| {head} | {what} | " + " | ".join(times) + f" | {most:.1f} |")
+        lines.append(f"| {peer} | {what} | " + " | ".join(times) + f" | {most:.1f} |")
         before = scene
-    commit = (last["commit"] or "?")[:8] + "+" * last["uncommitted_changes"]
-    versions = ", ".join(f"{name} {last['versions'][name]}" for name in ("jax", "numpy"))
-    about = f"{last['machine']['processor']}, one core; commit {commit}, {last['date'][:10]}; {versions}."
-    return "\n".join([*lines, "", about]) + "\n"
+    processor = results["records"][-1]["machine"]["processor"]
+    abouts = dict.fromkeys(_about(record) for _, record in cells.values())
+    return "\n".join([*lines, "", f"{processor}, one core; {'; '.join(abouts)}."]) + "\n"
 
 
 def load(file: Path) -> dict[str, Any]:
@@ -414,6 +430,7 @@ def main() -> int:
     """Run; the exit status."""
     options = argparse.ArgumentParser(description="Times a step beside fixed peers, and the best kept ones.")
     options.add_argument("--scene", nargs="+", choices=tuple(SCENES), metavar="NAME", help=", ".join(SCENES))
+    options.add_argument("--steps", nargs="+", type=int, choices=NUMBERS, metavar="N", help="only these")
     options.add_argument("--all", action="store_true", help="all cells, without a limit of time")
     options.add_argument("--minutes", type=float, default=10.0, help="at most; default 10")
     options.add_argument(
@@ -427,7 +444,11 @@ def main() -> int:
         print(table(results), end="")
         return 0
     start, budget = time.monotonic(), float("inf") if given.all else 60 * given.minutes
-    cells = [c for c in (ALL if given.all else DEFAULT) if not given.scene or c.scene in given.scene]
+    cells = [
+        c
+        for c in (ALL if given.all else DEFAULT)
+        if c.scene in (given.scene or SCENES) and c.steps in (given.steps or NUMBERS)
+    ]
     print(f"{len(cells)} cells; not among them:\n{left_out(cells)}\n", flush=True)
     record: dict[str, Any] = common.circumstances("guard", quick=False)
     processor, best = record["machine"]["processor"], results["best"]

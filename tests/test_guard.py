@@ -91,6 +91,22 @@ def test_what_is_kept_is_consistent(tmp_path):
     assert guard.load(tmp_path / "none.json") == {"best": [], "records": []}
 
 
+def test_the_table_has_the_last_of_each_cell():
+    about = {"date": "2000-01-01T", "commit": "abc", "uncommitted_changes": False}
+    about |= {"machine": {"processor": "a chip"}, "versions": {"jax": "1", "numpy": "2"}}
+    longer = RECORD | {"steps": 1000, "us_per_step": 3.0}
+    elsewhere = about | {"machine": {"processor": "another"}, "cells": [RECORD | {"processor": "another"}]}
+    records = [
+        about | {"cells": [RECORD, longer]},
+        elsewhere,
+        about | {"cells": [RECORD | {"us_per_step": 1.5}]},
+    ]
+    text = guard.table({"best": [], "records": records})
+    assert "| heavy top; Exudyn 1 | value |  | 1.5 (0.25) | 3 (0.25) |  | 4.0 |" in text
+    assert text.endswith("a chip, one core; 2000-01-01, commit abc, jax 1, numpy 2.\n")
+    assert guard.table({"best": [], "records": []}) == ""
+
+
 def test_the_page_shows_what_is_kept():
     page = guard.PAGE.read_text("utf-8")
     assert page == guard.with_table(page, guard.table(guard.load(guard.RESULTS)))
