@@ -150,8 +150,8 @@ def many(count: int, lanes: int, repeats: int, *, peers: bool) -> list[dict[str,
             names.append("MJX")
         timings = common.timed_in_turn(calls, steps * lanes * count, repeats)
         given = {"motion": motion, "balls": count, "lanes": lanes, "dt": dt, "steps": steps}
-        own = common.about(dt, steps), {}
-        found += [{"code": n, **given, **a, **timing} for n, a, timing in zip(names, own, timings)]
+        of_ours = common.about(dt, steps), {}
+        found += [{"code": n, **given, **a, **timing} for n, a, timing in zip(names, of_ours, timings)]
     return found
 
 

@@ -52,6 +52,8 @@ SHARE = 0.72
 """Of the minutes, for compiling."""
 PATIENCE = 20.0
 """How long the other core is waited for after that [s]."""
+LAST = 15.0
+"""How long after the last time to begin a measurement what still runs is ended [s]."""
 AGAIN = 4.0
 """Span of the second measurement [s]."""
 BATCH = 70
@@ -128,6 +130,7 @@ class Run:
         self.workers = [Worker(core) for core in cores()]
         self.choosing, self.timing = Lock(), Lock()
         self.compiled = Barrier(len(self.workers))
+        self.late = False
 
     def measured(self) -> list[dict[str, Any]]:
         """Records of all cells, of those without a time, too."""
@@ -136,10 +139,13 @@ class Run:
             for thread in threads:
                 thread.start()
             for thread in threads:
-                thread.join()
+                thread.join(_room(self.until + LAST))
+            self.late = any(thread.is_alive() for thread in threads)
         finally:
             for worker in self.workers:
                 worker.close()
+        for thread in threads:
+            thread.join()
         return list(self.records.values())
 
     def _next(self, seconds_per_cost: float) -> Cell | None:
@@ -156,17 +162,21 @@ class Run:
         ready, pace = [], 0.0
         while cell := self._next(pace):
             begun = time.monotonic()
-            found = worker.ask("compile", cell)
-            self.records[cell] = cell._asdict() | found
-            if "error" in found:
+            answer = worker.ask("compile", cell)
+            if self.late:
+                return
+            self.records[cell] = cell._asdict() | answer
+            if "error" in answer:
                 print(line(self.records[cell]), flush=True)
+                if worker.process.poll() is not None:
+                    break
                 continue
             ready.append(cell)
-            pace = (time.monotonic() - begun) / cost(found)
-            print(f"compiled {words(cell)}: {found['compile_s']:.1f} s", flush=True)
+            pace = (time.monotonic() - begun) / cost(answer)
+            print(f"compiled {words(cell)}: {answer['compile_s']:.1f} s", flush=True)
         # Times are taken while no other core compiles, but for one that is late.
         try:
-            self.compiled.wait(max(0.0, self.compiling_until - time.monotonic()) + PATIENCE)
+            self.compiled.wait(_room(self.compiling_until + PATIENCE))
         except BrokenBarrierError:
             pass
         for cell in ready:
@@ -175,21 +185,28 @@ class Run:
 
     def _time(self, worker: Worker, cell: Cell) -> None:
         record = self.records[cell]
-        if time.monotonic() >= self.until:
-            record["missed"] = "no time to measure"
-        else:
+        if time.monotonic() < self.until:
             record |= worker.ask("time", cell)
             if "error" not in record and self.judge(record):
                 record |= _again(worker, cell, self.judge(record))
+            if self.late:  # and the process was ended
+                record.pop("error", None)
+        if "ratio" not in record and "error" not in record:
+            record["missed"] = "no time to measure"
         print(line(record), flush=True)
 
 
-def _again(worker: Worker, cell: Cell, faults: list[str]) -> dict[str, Any]:
-    """The second measurement of what is too much, of which the smaller cost to compile counts."""
-    found: dict[str, Any] = {"again": True}
-    if any("compile" in fault for fault in faults):
-        found |= worker.ask("compile", cell)
-    return found | worker.ask("time", cell, span=AGAIN)
+def _room(until: float) -> float | None:
+    """Seconds until then; None: as long as it takes."""
+    return None if until == float("inf") else max(0.0, until - time.monotonic())
+
+
+def _again(worker: Worker, cell: Cell, names: list[str]) -> dict[str, Any]:
+    """The second measurement of what is too much, which is the one that counts."""
+    answer: dict[str, Any] = {"again": True}
+    if "compile" in names:
+        answer |= worker.ask("compile", cell)
+    return answer | worker.ask("time", cell, span=AGAIN)
 
 
 def words(cell: Cell) -> str:
@@ -242,50 +259,50 @@ def faults(record: dict[str, Any], best: Sequence[dict[str, Any]]) -> list[str]:
     kept = kept_for(record, best)
     if kept is None:
         return []
-    found = []
+    names = []
     if record["ratio"] > SLOWER * kept["ratio"]:
-        found.append("time")
+        names.append("time")
     if cost(record) > DEARER * kept["compile_cost"]:
-        found.append("compile")
-    return found
+        names.append("compile")
+    return names
 
 
 def improved(
     best: Sequence[dict[str, Any]], records: Sequence[dict[str, Any]], commit: str | None
 ) -> list[dict[str, Any]]:
     """The best ones after a run: of each cell the least ratio and the least cost, with their commits."""
-    found = {key(b): dict(b) for b in best}
+    by_key = {key(b): dict(b) for b in best}
     for record in records:
         if "ratio" not in record:
             continue
-        new = found.setdefault(key(record), {name: record[name] for name in KEY})
+        new = by_key.setdefault(key(record), {name: record[name] for name in KEY})
         if record["ratio"] < new.get("ratio", float("inf")):
             new |= {"ratio": record["ratio"], "commit": commit}
         if cost(record) < new.get("compile_cost", float("inf")):
             new |= {"compile_cost": cost(record), "compile_commit": commit}
-    return [found[k] for k in sorted(found)]
+    return [by_key[k] for k in sorted(by_key)]
 
 
 def growing(records: Sequence[dict[str, Any]]) -> list[str]:
     """Warnings of scenes whose steps take longer where there are more of them."""
     times = {cell_of(r): r["us_per_step"] for r in records if "ratio" in r}
-    found = []
+    warnings = []
     for cell, us in times.items():
         smaller = [n for n in NUMBERS if 100 <= n < cell.steps and cell._replace(steps=n) in times]
         before = times[cell._replace(steps=smaller[-1])] if smaller else us
         if us > LONGER * before:
-            found.append(f"{words(cell)}: {us / before:.2g} times as long a step as with {smaller[-1]}")
-    return found
+            warnings.append(f"{words(cell)}: {us / before:.2g} times as long a step as with {smaller[-1]}")
+    return warnings
 
 
 def newest(results: dict[str, Any]) -> dict[Cell, tuple[dict[str, Any], dict[str, Any]]]:
     """Of each cell the last measurement on the processor of the last record, and the record that has it."""
-    found = {}
+    cells = {}
     for record in results["records"]:
         for cell in record["cells"]:
             if "ratio" in cell and cell["processor"] == results["records"][-1]["machine"]["processor"]:
-                found[cell_of(cell)] = cell, record
-    return found
+                cells[cell_of(cell)] = cell, record
+    return cells
 
 
 def _about(record: dict[str, Any]) -> str:
@@ -310,13 +327,11 @@ def table(results: dict[str, Any]) -> str:
     before = ""
     order = list(dict.fromkeys(cell[:3] for cell in ALL))
     for scene, kind, lanes in sorted(rows, key=order.index):
-        found = rows[scene, kind, lanes]
-        peer = "" if scene == before else f"{scene}; {next(iter(found.values()))['peer']}"
+        row = rows[scene, kind, lanes]
+        peer = "" if scene == before else f"{scene}; {next(iter(row.values()))['peer']}"
         what = kind + ("" if lanes == 1 else f", {lanes} lanes")
-        times = [
-            f"{found[n]['us_per_step']:.3g} ({found[n]['ratio']:.2g})" if n in found else "" for n in NUMBERS
-        ]
-        most = max(c["compile_s"] for c in found.values())
+        times = [f"{row[n]['us_per_step']:.3g} ({row[n]['ratio']:.2g})" if n in row else "" for n in NUMBERS]
+        most = max(c["compile_s"] for c in row.values())
         lines.append(f"| {peer} | {what} | " + " | ".join(times) + f" | {most:.1f} |")
         before = scene
     processor = results["records"][-1]["machine"]["processor"]
@@ -344,8 +359,8 @@ def dumped(results: dict[str, Any]) -> str:
     records = []
     for record in results["records"]:
         cells = listed(record["cells"], "   ")
-        rest = json.dumps({k: v for k, v in record.items() if k != "cells"}, allow_nan=False)
-        records.append(f'  {rest[:-1]}, "cells": {cells}}}')
+        head = json.dumps({k: v for k, v in record.items() if k != "cells"}, allow_nan=False)
+        records.append(f'  {head[:-1]}, "cells": {cells}}}')
     return (
         '{\n "best": '
         + listed(results["best"], "  ")
@@ -378,8 +393,8 @@ def report(records: Sequence[dict[str, Any]], best: Sequence[dict[str, Any]]) ->
     measured = [r for r in records if "ratio" in r]
     rows, failed = [("cell", "ratio", "best", "compile", "best", "at")], False
     for record in measured:
-        found, kept = faults(record, best), kept_for(record, best)
-        if not found or kept is None:
+        names, kept = faults(record, best), kept_for(record, best)
+        if not names or kept is None:
             continue
         same = kept["processor"] == record["processor"]
         failed |= same
@@ -438,16 +453,16 @@ def main() -> int:
     )
     options.add_argument("--table", action="store_true", help="only print the table of what is kept")
     options.add_argument("--results", type=Path, default=RESULTS, metavar="JSON", help="what is kept")
-    given = options.parse_args()
-    results = load(given.results)
-    if given.table:
+    chosen = options.parse_args()
+    results = load(chosen.results)
+    if chosen.table:
         print(table(results), end="")
         return 0
-    start, budget = time.monotonic(), float("inf") if given.all else 60 * given.minutes
+    start, budget = time.monotonic(), float("inf") if chosen.all else 60 * chosen.minutes
     cells = [
         c
-        for c in (ALL if given.all else DEFAULT)
-        if c.scene in (given.scene or SCENES) and c.steps in (given.steps or NUMBERS)
+        for c in (ALL if chosen.all else DEFAULT)
+        if c.scene in (chosen.scene or SCENES) and c.steps in (chosen.steps or NUMBERS)
     ]
     print(f"{len(cells)} cells; not among them:\n{left_out(cells)}\n", flush=True)
     record: dict[str, Any] = common.circumstances("guard", quick=False)
@@ -469,8 +484,8 @@ def main() -> int:
     record |= {"wall_s": time.monotonic() - start, "processor_s": spent()}
     status = report(record["cells"], best)
     print(f"\n{record['wall_s']:.0f} s, {record['processor_s']:.0f} s of the processor; exit status {status}")
-    if given.keep and status != 2:
-        keep(results, record, given.results)
+    if chosen.keep and status != 2:
+        keep(results, record, chosen.results)
     return status
 
 

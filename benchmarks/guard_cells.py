@@ -89,8 +89,8 @@ def function_of(cell: Cell, subject: Subject) -> tuple[Callable, list[Any]]:
         return jnp.sum(trajectory.v[-1] ** 2), trajectory.result
 
     def gradient(leaves: list[Any], v: Any, inputs: Any) -> tuple[Any, list[Any]]:
-        (found, result), by_v = jax.value_and_grad(loss, has_aux=True)(v, leaves, inputs)
-        return result, [found, by_v]
+        (squares, result), by_v = jax.value_and_grad(loss, has_aux=True)(v, leaves, inputs)
+        return result, [squares, by_v]
 
     function = value if cell.kind == "value" else gradient
     if cell.lanes > 1:
@@ -115,10 +115,10 @@ def compiled(cell: Cell, subject: Subject) -> Program:
     program = jax.jit(function).lower(*arguments).compile(options)
     spent = time.process_time() - start
     after = pace()
-    result, found = jax.block_until_ready(program(*arguments))
+    result, numbers = jax.block_until_ready(program(*arguments))
     if np.any(np.asarray(result)):
         raise FloatingPointError("the run does not reach its end")
-    if not all(bool(jnp.all(jnp.isfinite(x))) for x in found if jnp.issubdtype(x.dtype, jnp.floating)):
+    if not all(bool(jnp.all(jnp.isfinite(x))) for x in numbers if jnp.issubdtype(x.dtype, jnp.floating)):
         raise FloatingPointError("numbers are not finite")
     run = lambda: jax.block_until_ready(program(*arguments))  # noqa: E731
     return Program(run, cell.steps * cell.lanes, spent, (before + after) / 2)
@@ -189,10 +189,10 @@ def main() -> None:
     desk = Desk()
     for line in sys.stdin:
         try:
-            found = desk.answer(json.loads(line))
+            answer = desk.answer(json.loads(line))
         except Exception as error:
-            found = {"error": f"{type(error).__name__}: {error}"}
-        print(json.dumps(found), file=answers, flush=True)
+            answer = {"error": f"{type(error).__name__}: {error}"}
+        print(json.dumps(answer), file=answers, flush=True)
 
 
 if __name__ == "__main__":

@@ -221,8 +221,8 @@ def own_batch(example: gallery.Example, lanes: int, steps: int, repeats: int) ->
     call = rollout.batch(part, values)
     timing = common.timed(call, steps * lanes, repeats)
     failed = int(np.count_nonzero(call().result))
-    given = {"lanes": lanes, "varied": part} | rollout.about
-    return {"code": OWN, **given, **timing, "failed_lanes": failed}
+    about = {"lanes": lanes, "varied": part} | rollout.about
+    return {"code": OWN, **about, **timing, "failed_lanes": failed}
 
 
 def available(peers: tuple[Peer, ...], python: str) -> tuple[Peer, ...]:

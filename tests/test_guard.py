@@ -3,6 +3,8 @@
 import json
 import subprocess
 import sys
+import threading
+import time
 from pathlib import Path
 
 import pytest
@@ -21,14 +23,14 @@ BEST = guard.improved([], [RECORD], "abc")
 
 
 @pytest.mark.parametrize(
-    ("times", "dearer", "found"),
+    ("times", "dearer", "faults"),
     [(1.0, 1.0, []), (1.1, 1.25, []), (1.2, 1.0, ["time"]), (0.5, 1.4, ["compile"])],
 )
-def test_what_is_worse_is_named(times, dearer, found, capsys):
+def test_what_is_worse_is_named(times, dearer, faults, capsys):
     record = RECORD | {"ratio": 0.25 * times, "compile_s": 4.0 * dearer}
-    assert guard.faults(record, BEST) == found
-    assert guard.report([record], BEST) == (1 if found else 0)
-    assert ("WORSE" in capsys.readouterr().out) == bool(found)
+    assert guard.faults(record, BEST) == faults
+    assert guard.report([record], BEST) == (1 if faults else 0)
+    assert ("WORSE" in capsys.readouterr().out) == bool(faults)
 
 
 def test_what_it_is_compared_with(capsys):
@@ -48,6 +50,40 @@ def test_what_was_not_measured_is_named(capsys):
     assert guard.report([late, RECORD], BEST) == 0
     assert guard.report([late | {"error": "ValueError: it is"}, RECORD], BEST) == 1
     assert "rope, 64, value, 10 steps: no time to compile" in capsys.readouterr().out
+
+
+class Stub:
+    """Instead of a process: one scene compiles until it is ended, one fails."""
+
+    def __init__(self, core):
+        self.process, self.ended = self, threading.Event()
+
+    def poll(self):
+        return None
+
+    def ask(self, do, cell, **options):
+        if cell.scene == "open tree":
+            self.ended.wait()
+        if self.ended.is_set() or cell.scene == "rope, 64":
+            return {"error": "ValueError: no"}
+        return {"compile_s": 1.0, "pace_s": 1.0} if do == "compile" else RECORD
+
+    def close(self):
+        self.ended.set()
+
+
+def test_what_compiles_for_too_long_is_ended_and_the_others_are_timed(monkeypatch):
+    monkeypatch.setattr(guard, "Worker", Stub)
+    monkeypatch.setattr(guard, "cores", lambda: [0, 1])
+    monkeypatch.setattr(guard, "PATIENCE", 0.1)
+    monkeypatch.setattr(guard, "LAST", 0.1)
+    cells = [scenes.Cell(s, "value", 1, 10) for s in ("open tree", "rope, 64", "heavy top", "block")]
+    now, dear = time.monotonic(), {cells[3]: 1e9}
+    run = guard.Run(cells, dear, now + 2.0, now + 1.0, lambda record: [])
+    records = {record["scene"]: record for record in run.measured()}
+    assert records["open tree"]["missed"] and "error" not in records["open tree"]
+    assert records["rope, 64"]["error"] and records["block"]["missed"] == "no time to compile"
+    assert records["heavy top"]["ratio"] == 0.25 and "missed" not in records["heavy top"]
 
 
 def test_only_what_is_better_is_kept():
