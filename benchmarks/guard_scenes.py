@@ -130,7 +130,7 @@ def _hinge(axis: str, damping: float = 1.0) -> str:
 
 
 def humanoid_mjcf() -> str:
-    """A humanoid of fourteen bodies and 27 rates, without contact: it is thrown, and its joints are springs."""
+    """A humanoid of fourteen bodies and 27 rates, without contact: it is thrown, its joints are springs."""
     sides = ""
     arms = ""
     for side, y in (("left", 1), ("right", -1)):
