@@ -86,8 +86,16 @@ def runs_of(
         timing = common.timed(lambda dt=dt: jax.block_until_ready(run(dt)), STEPS * lanes, plan["repeats"])
         ends = run(dt)
         finite = all(bool(jnp.all(jnp.isfinite(x))) for x in jax.tree.leaves(ends))
-        row = {"code": code, "lanes": lanes, "steps": steps, "error": errors[steps], "finite": finite}
+        row = {
+            "code": code,
+            "lanes": lanes,
+            "steps": steps,
+            "dt": dt,
+            "error": errors[steps],
+            "finite": finite,
+        }
         if code != MJX:
+            row |= {"scheme": code.removeprefix(f"{OWN}, "), "effort": "full"}
             row |= {"failed_lanes": int(jnp.sum(ends[1] != 0)), "repeated_steps": int(jnp.sum(ends[2]))}
         del timing["compile_s"]  # of the first of them only
         found.append(row | {"one_core_us_per_step": alone[steps]} | timing)

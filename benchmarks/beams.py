@@ -65,7 +65,7 @@ def measure(scene: str, elements: int, steps: int, repeats: int, gradient: bool)
         "scene": scene,
         "elements": elements,
         "solver": example.system.structure.solver,
-        "steps": steps,
+        **run.about,
         **timing,
         "us_per_step_and_element": timing["us_per_step"] / elements,
         "build_s": built,
@@ -102,7 +102,7 @@ def own_error(scene: str, elements: int, steps: int, reference: np.ndarray) -> d
     timing = common.timed(run.run, steps, 5)
     error = float(np.max(np.abs(tip(example, run.run()) - reference)))
     wall = 1e-6 * timing["us_per_step"] * steps
-    return {"code": "natcoord_jax", "elements": elements, "steps": steps, "wall_s": wall, "error": error}
+    return {"code": "natcoord_jax", "elements": elements, **run.about, "wall_s": wall, "error": error}
 
 
 def comparison(scene: str, python: str, quick: bool) -> dict[str, Any]:

@@ -139,6 +139,14 @@ def timed_in_turn(
     return found
 
 
+def about(dt: float, steps: int, order: int = 2) -> dict[str, Any]:
+    """What a time a step of ours is of: scheme, step [s], number of steps, and effort to compile.
+
+    Times are those of programs with full effort, never of the quick ones that `nc.simulate` begins with.
+    """
+    return {"scheme": f"energy-momentum, order {order}", "dt": dt, "steps": steps, "effort": "full"}
+
+
 def target(name: str, measured: float | None, limit: float, unit: str = "") -> dict[str, Any]:
     """One line of the table of targets: reached when `measured` is at most `limit`; None: not measured."""
     reached = None if measured is None else bool(measured <= limit)

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array
 
 import natcoord_jax as nc
+from benchmarks import common
 
 PARTS = ("system", "state", "inputs", "dt")
 
@@ -21,7 +22,8 @@ PARTS = ("system", "state", "inputs", "dt")
 class Rollout:
     """A rollout, each of its programs compiled at its first call.
 
-    A selection of arrays is one of `PARTS` or "all"; it means the floating ones.
+    A selection of arrays is one of `PARTS` or "all"; it means the floating ones. `about` is what results say
+    of it.
 
     Args:
         system: compiled system.
@@ -33,6 +35,7 @@ class Rollout:
 
     def __init__(self, system: nc.System, state: nc.State, inputs: Array, dt: float, order: int = 2):
         self._scheme = nc.EnergyMomentum(order=order)
+        self.about = common.about(float(dt), len(inputs), order)
         whole = (system, state, jnp.asarray(inputs), jnp.asarray(dt, float))
         self._leaves, self._structure = jax.tree.flatten(whole)
         owners = [part for part, tree in zip(PARTS, whole, strict=True) for _ in jax.tree.leaves(tree)]

@@ -106,7 +106,7 @@ def ours(dt: float, repeats: int) -> dict[str, Any]:
     timing = common.timed(lambda: run(state).block_until_ready(), steps, repeats)
     return {
         "code": "natcoord_jax",
-        "dt": dt,
+        **common.about(dt, steps),
         **found,
         **timing,
         "ms_per_second": timing["us_per_step"] / dt / 1e3,
@@ -149,8 +149,9 @@ def many(count: int, lanes: int, repeats: int, *, peers: bool) -> list[dict[str,
             calls.append(contact_peers.mjx_many(count, lanes, dt, steps, resting))
             names.append("MJX")
         timings = common.timed_in_turn(calls, steps * lanes * count, repeats)
-        given = {"motion": motion, "balls": count, "lanes": lanes}
-        found += [{"code": name, **given, **timing} for name, timing in zip(names, timings)]
+        given = {"motion": motion, "balls": count, "lanes": lanes, "dt": dt, "steps": steps}
+        of_ours = common.about(dt, steps), {}
+        found += [{"code": n, **given, **a, **timing} for n, a, timing in zip(names, of_ours, timings)]
     return found
 
 
@@ -185,8 +186,12 @@ def clouds(count: int, repeats: int, *, peers: bool) -> list[dict[str, Any]]:
         names, calls = [*names, "MuJoCo"], [*calls, run]
     timings = common.timed_in_turn(calls, steps, repeats)
     errors = [_energy_error(*run) for run in runs] + ([error] if peers else [])
-    given = zip(names, errors, timings)
-    return [{"code": n, "balls": count, "energy_error": e, **timing} for n, e, timing in given]
+    of_ours = common.about(dt, steps)
+    return [
+        {"code": n, "balls": count, "dt": dt, "steps": steps, "energy_error": e, **timing}
+        | (of_ours if n.startswith("natcoord_jax") else {})
+        for n, e, timing in zip(names, errors, timings)
+    ]
 
 
 def _energy_error(system: nc.System, state: nc.State, run: Any) -> float:

@@ -6,8 +6,8 @@ usage: python -m benchmarks.control_starts [--starts N] [--problems NAME ...] [-
 Every problem is solved from the default start and from random ones: smooth random inputs and rates about it,
 see `natcoord_jax.control.guess.scattered`. IPOPT gets the functions of `nc.to_nlp` at the same unknowns, so
 that equations, bounds and exact derivatives are the same and only the solver differs; its matrices are dense,
-and its times are listed for orders of magnitude only. Times of both are without compilation. A file that
-exists keeps what it has of other problems.
+and its times are listed for orders of magnitude only. Times of both are without compilation, ours those of
+programs with full effort. A file that exists keeps what it has of other problems.
 """
 
 import argparse
@@ -295,6 +295,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--json", type=Path)
     given = parser.parse_args(arguments)
     jax.config.update("jax_enable_x64", True)
+    nc.set_effort("full")
     known = json.loads(given.json.read_text()) if given.json and given.json.exists() else {}
     results = known.get("problems", {})
     for name in given.problems:
@@ -304,7 +305,8 @@ def main(arguments: list[str] | None = None) -> None:
         # Compiled before it is timed.
         solved(problem, guesses[0], given.method, 2)
         ours = [solved(problem, guess, given.method, given.limit) for guess in guesses]
-        results[name] = {"natcoord_jax": summary(ours) | {"runs": ours}}
+        about = common.about(float(problem.dt), problem.steps)
+        results[name] = {"natcoord_jax": about | summary(ours) | {"runs": ours}}
         if not given.no_peers:
             theirs = [solved_by_ipopt(problem, guess, given.patience) for guess in guesses]
             results[name]["IPOPT"] = summary(theirs) | {"runs": theirs}
@@ -318,8 +320,8 @@ def main(arguments: list[str] | None = None) -> None:
                 flush=True,
             )
         if given.json:
-            about = common.circumstances("control_starts", quick=False)
-            given.json.write_text(json.dumps(about | {"problems": results}, indent=1) + "\n")
+            now = common.circumstances("control_starts", quick=False)
+            given.json.write_text(json.dumps(now | {"problems": results}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

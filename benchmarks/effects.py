@@ -130,6 +130,7 @@ def measure(
     trajectory = rollout.run()
     return {
         "effect": name,
+        **rollout.about,
         "unknowns": structure.unknowns,
         "multipliers": structure.multipliers,
         "program": len(lowered.as_text().splitlines()),

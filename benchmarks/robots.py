@@ -9,8 +9,9 @@ with MuJoCo's, which runs without what it has as soft constraints. Differences a
 number of each; `condition` is the largest condition number of the mass matrix at these states. Some URDF of
 what walks and flies are read with a root that floats, too.
 
-A humanoid flies freely for 1000 steps, beside MuJoCo's RK4 with the same step. Torques of inverse dynamics:
-those that MuJoCo finds for random accelerations at random states bring these about here.
+A humanoid flies freely for 1000 steps, beside MuJoCo's RK4 with the same step: time a step of the program
+with full effort, and `first_s`, the first run as a user waits for it, by the quick program. Torques of
+inverse dynamics: those that MuJoCo finds for random accelerations at random states bring these about here.
 """
 
 import sysconfig
@@ -24,7 +25,7 @@ import mujoco
 import numpy as np
 
 import natcoord_jax as nc
-from benchmarks import common
+from benchmarks import common, compiled
 from tests.robots import HARD, accelerations_of, agreement, comparable, inputs_of, off, random_data
 
 SITE = Path(sysconfig.get_paths()["purelib"])
@@ -116,18 +117,15 @@ def fly(package: str, name: str, steps: int) -> dict[str, Any]:
     rates = np.random.default_rng(0).normal(size=robot.description.rate_count)
     state = handle.state(system, state, None, rates)
     once = common.seconds(lambda: jax.block_until_ready(nc.simulate(system, state, dt=STEP, steps=steps)))
-    run = nc.simulate(system, state, dt=STEP, steps=steps)
-    again = min(
-        common.seconds(lambda: jax.block_until_ready(nc.simulate(system, state, dt=STEP, steps=steps)))
-        for _ in range(3)
-    )
-    kept = nc.balance(system, run)
+    rollout = compiled.Rollout(system, state, np.zeros((steps, len(system.structure.inputs))), STEP)
+    timing = common.timed(rollout.run, steps, 3)
+    kept = nc.balance(system, rollout.run())
     peer = beside(robot, rates, steps)
     return {
-        "file": name, "joints": len(robot.joints), "unknowns": system.structure.unknowns, "steps": steps,
-        "dt": STEP, "energy": float(np.max(kept.energy)), "momentum": float(np.max(kept.momentum)),
+        "file": name, "joints": len(robot.joints), "unknowns": system.structure.unknowns,
+        **rollout.about, "energy": float(np.max(kept.energy)), "momentum": float(np.max(kept.momentum)),
         "angular_momentum": float(np.max(kept.angular_momentum)), "first_s": once,
-        "us_per_step": 1e6 * again / steps, "mujoco_rk4_us_per_step": 1e6 * peer["seconds"] / steps,
+        **timing, "mujoco_rk4_us_per_step": 1e6 * peer["seconds"] / steps,
         "mujoco_rk4_energy": peer["energy"],
     }  # fmt: skip
 

@@ -57,7 +57,7 @@ def measure(count: int, steps: int, repeats: int, gradient: bool) -> dict[str, A
     found = {
         "elements": f"{count} x {count}",
         "unknowns": system.structure.unknowns,
-        "steps": steps,
+        **run.about,
         **timing,
         "build_s": built,
         "newton_iterations_mean": int(trajectory.iterations) / int(trajectory.steps_taken),

@@ -57,6 +57,7 @@ def measure(refinement: int, name: str, repeats: int) -> dict[str, Any]:
         "code": f"natcoord_jax, {name}",
         "mesh": f"{8 * refinement} x {2 * refinement} x {2 * refinement}",
         "unknowns": system.structure.unknowns,
+        **rollout.about,
         "build_s": built,
         "newton_iterations_mean": int(trajectory.iterations) / max(int(trajectory.steps_taken), 1),
         "energy_balance": float(np.ptp(total) / kinetic.max()),
@@ -81,6 +82,7 @@ def gradient(refinement: int, name: str) -> dict[str, Any]:
     return {
         "mesh": f"{8 * refinement} x {2 * refinement} x {2 * refinement}",
         "code": f"natcoord_jax, {name}",
+        **common.about(DT, STEPS),
         "value_compile_s": value["compile_s"],
         "gradient_compile_s": found["compile_s"],
         "over_value": found["over_first"],

@@ -165,7 +165,7 @@ def own_run(model: str, example: gallery.Example, steps: int, repeats: int) -> d
     constraints = system.constraint_errors(trajectory)
     return {
         "code": OWN,
-        "steps": steps,
+        **rollout.about,
         "h": example.t_end / steps,
         "settings": {"scheme": "energy-momentum (57)", "solver": system.structure.solver},
         **timing,
@@ -185,7 +185,8 @@ def own_gradient(
 
     Under `tangent`, the same of value and one tangent, in forward mode.
     """
-    value, both, along, count = _rollout(example, steps, order).loss(part)
+    rollout = _rollout(example, steps, order)
+    value, both, along, count = rollout.loss(part)
     forward, backward, tangent = common.timed_in_turn((value, both, along), steps, repeats)
     over_forward = backward.pop("over_first")
     _, gradient = both()
@@ -193,7 +194,7 @@ def own_gradient(
         "code": OWN,
         "with_respect_to": part,
         "parameters": count,
-        "steps": steps,
+        **rollout.about,
         **backward,
         "forward_us_per_step": forward["us_per_step"],
         "forward_compile_s": forward["compile_s"],
@@ -220,7 +221,8 @@ def own_batch(example: gallery.Example, lanes: int, steps: int, repeats: int) ->
     call = rollout.batch(part, values)
     timing = common.timed(call, steps * lanes, repeats)
     failed = int(np.count_nonzero(call().result))
-    return {"code": OWN, "lanes": lanes, "steps": steps, "varied": part, **timing, "failed_lanes": failed}
+    about = {"lanes": lanes, "varied": part} | rollout.about
+    return {"code": OWN, **about, **timing, "failed_lanes": failed}
 
 
 def available(peers: tuple[Peer, ...], python: str) -> tuple[Peer, ...]:

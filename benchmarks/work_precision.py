@@ -198,7 +198,8 @@ def own_runs(model: str, plan: Plan) -> list[dict[str, Any]]:
             drift = drift_of(system, start, end.state)
             newton = int(end.iterations) / steps
             code = f"{OWN}, order {order}"
-            found.append({"code": code, "steps": steps, **timing, **errors, "drift": drift, "newton": newton})
+            about = common.about(t_end / steps, steps, order)
+            found.append({"code": code, **about, **timing, **errors, "drift": drift, "newton": newton})
         print(f"{model}: order {order} done", flush=True)
     return found
 

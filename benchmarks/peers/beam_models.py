@@ -15,6 +15,7 @@ import io
 import json
 import sys
 import time
+from collections.abc import Callable
 
 import numpy as np
 
@@ -36,15 +37,18 @@ def section_of(name: str) -> dict[str, float]:
     }
 
 
-def exudyn(name: str, elements: int, steps: int, t_end: float) -> tuple[float, np.ndarray]:
-    """Wall time of the run [s] and the place of the tip."""
+def exudyn_rollout(
+    name: str, elements: int, steps: int, t_end: float
+) -> tuple[Callable[[], None], Callable[[], np.ndarray]]:
+    """A run that is ready to be timed, and what reads the place of the tip."""
     sys.exudynFast = True  # the documented switch to the module without range checks; it prints a line
     with contextlib.redirect_stdout(io.StringIO()):
         import exudyn as exu
         from exudyn import itemInterface as items  # noqa: N813
         from exudyn.utilities import eulerParameters0
     data, s = DATA[name], section_of(name)
-    mbs = exu.SystemContainer().AddSystem()
+    container = exu.SystemContainer()  # owns the system: it must outlive it
+    mbs = container.AddSystem()
     section = exu.BeamSection()
     shear = s["k"] * s["G"] * s["A"]
     bending = data["E"] * s["I"]
@@ -87,10 +91,19 @@ def exudyn(name: str, elements: int, steps: int, t_end: float) -> tuple[float, n
     settings.timeIntegration.newton.useModifiedNewton = True
     settings.linearSolverType = exu.LinearSolverType.EigenSparse
     settings.timeIntegration.generalizedAlpha.spectralRadius = 0.9
+
+    def call(container=container) -> None:
+        mbs.SolveDynamic(settings)
+
+    return call, lambda: np.array(mbs.GetNodeOutput(nodes[-1], exu.OutputVariableType.Position))
+
+
+def exudyn(name: str, elements: int, steps: int, t_end: float) -> tuple[float, np.ndarray]:
+    """Wall time of the run [s] and the place of the tip."""
+    call, tip = exudyn_rollout(name, elements, steps, t_end)
     start = time.perf_counter()
-    mbs.SolveDynamic(settings)
-    wall = time.perf_counter() - start
-    return wall, np.array(mbs.GetNodeOutput(nodes[-1], exu.OutputVariableType.Position))
+    call()
+    return time.perf_counter() - start, tip()
 
 
 def elastica(name: str, elements: int, steps: int, t_end: float) -> tuple[float, np.ndarray]:

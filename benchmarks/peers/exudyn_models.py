@@ -20,6 +20,7 @@ usage: python -m benchmarks.peers.exudyn_models MODEL STEPS [formulation=redunda
 import contextlib
 import io
 import sys
+from collections.abc import Callable
 from importlib.metadata import version
 from typing import Any
 
@@ -325,6 +326,29 @@ def _settings(
         settings.solution.sensors.writePeriod = t_end / records
     settings.cleanUpMemory = False
     return settings
+
+
+def rollout(source, steps: int, t_end: float) -> Callable[[], None]:
+    """A run of rigid bodies and constraints at the default settings of `run`, ready to be timed.
+
+    Args:
+        source: the data, as a module of `benchmarks.peers`.
+        steps: number of steps.
+        t_end: [s].
+    """
+    container = exu.SystemContainer()  # owns the system: it must outlive it
+    mbs = container.AddSystem()
+    _build_redundant(source, mbs, "RotationRotationVector", redundant=False)
+    mbs.Assemble()
+    options: dict[str, Any] = {"linear_solver": "EigenDense", "jacobian_per_step": True}
+    fixed: dict[str, Any] = {"spectral_radius": 0.9, "singular": False, "records": 0}
+    settings = _settings(steps, t_end, "GeneralizedAlpha", **options, **fixed)
+    settings.timeIntegration.reuseConstantMassMatrix = True
+
+    def call(container=container) -> None:
+        mbs.SolveDynamic(settings)
+
+    return call
 
 
 def run(

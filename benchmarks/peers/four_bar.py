@@ -51,15 +51,24 @@ def _bar(number):
     return _rod(f"bar_{number}", inertia, (x + 0.5, 1.0, 0.0), number, (x, 1.0, 0.0), velocity, 0.0)
 
 
-BODIES = [_upright(0), _upright(1), _upright(2), _bar(0), _bar(1)]
-LOOPS = [
-    dict(
-        kind="revolute",
-        body_a=k + 1,
-        body_b=k + 3,
-        point=(k + 1.0, 1.0, 0.0),
-        axes=(_AXIS,),
-        independent=(1, 1, 0, 0, 0, 0),
-    )
-    for k in range(2)
-]
+def bodies_of(bars):
+    """The uprights, then the bars."""
+    return [_upright(k) for k in range(bars + 1)] + [_bar(k) for k in range(bars)]
+
+
+def loops_of(bars):
+    """The hinge at the right end of each bar."""
+    return [
+        dict(
+            kind="revolute",
+            body_a=k + 1,
+            body_b=bars + 1 + k,
+            point=(k + 1.0, 1.0, 0.0),
+            axes=(_AXIS,),
+            independent=(1, 1, 0, 0, 0, 0),
+        )
+        for k in range(bars)
+    ]
+
+
+BODIES, LOOPS = bodies_of(2), loops_of(2)
