@@ -171,7 +171,7 @@ def test_forms_give_one_trajectory(name, scheme):
             assert float(nc.balance(system, trajectory).energy.max()) <= energy
         result.append(placed(system, trajectory, watched))
         counts.append(int(trajectory.iterations))
-    assert np.max(np.abs(result[0] - result[0][0])) > 0.01
+    assert np.max(np.abs(result[0] - result[0][0])) > 1e-3, "nothing moves: nothing is tested"
     for other, solver in zip(result[1:], solvers[1:]):
         assert np.max(np.abs(other - result[0])) <= tol.SAME_TRAJECTORY, solver
     if name == "soft rod":
