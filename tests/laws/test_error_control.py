@@ -111,7 +111,8 @@ def number(run):
     def value(angle, rtol):
         result = run(system, system.with_coordinate(state, "hinge 2", angle), rtol)
         counts = result.steps_taken, result.steps_rejected
-        return jnp.sum(result.q[-1, 4] ** 2 + result.v[-1, 4] ** 3), counts
+        # Velocities of order two have parts across the constraints, which converge as steps do not.
+        return jnp.sum(result.q[-1] ** 3), counts
 
     return value
 
