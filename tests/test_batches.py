@@ -31,36 +31,39 @@ def run(example, scale):
 @pytest.mark.skipif(jax.default_backend() != "cpu", reason="lanes are worked through together elsewhere")
 def test_a_lane_is_as_if_it_were_alone(pendulum):
     """Neither a digit nor an iteration depends on the other lanes, whose steps are far longer or shorter."""
-    together = jax.vmap(lambda scale: run(pendulum, scale))(SCALES)
+    lanes = jax.vmap(lambda scale: run(pendulum, scale))(SCALES)
     alone = [run(pendulum, scale) for scale in SCALES]
-    counts = [int(found.iterations) for found in alone]
+    counts = [int(result.iterations) for result in alone]
     assert len(set(counts)) > 1, "all lanes need the same: this shows nothing"
-    assert together.iterations.tolist() == counts
-    for lane, found in enumerate(alone):
-        np.testing.assert_array_equal(together.states.q[lane], found.states.q)
-        np.testing.assert_array_equal(together.states.v[lane], found.states.v)
+    assert lanes.iterations.tolist() == counts
+    for lane, result in enumerate(alone):
+        np.testing.assert_array_equal(lanes.states.q[lane], result.states.q)
+        np.testing.assert_array_equal(lanes.states.v[lane], result.states.v)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.skipif(jax.default_backend() != "cpu", reason="lanes are worked through together elsewhere")
 def test_a_gradient_is_as_if_it_were_alone(pendulum):
     slope = jax.jit(jax.grad(lambda scale: jnp.sum(run(pendulum, scale).states.q[-1] ** 3)))
     np.testing.assert_array_equal(jax.vmap(slope)(SCALES), [slope(scale) for scale in SCALES])
 
 
+@pytest.mark.exhaustive
 def test_batches_of_batches(pendulum):
     """Lanes of lanes, and lanes that differ in some arguments only."""
 
     def end(system, scale):
-        found = nc.simulate(system, pendulum.state, dt=scale * pendulum.dt, steps=STEPS)
-        return found.states.q[-1]
+        result = nc.simulate(system, pendulum.state, dt=scale * pendulum.dt, steps=STEPS)
+        return result.states.q[-1]
 
     several = jax.vmap(jax.vmap(end, in_axes=(None, 0)), in_axes=(None, 1))
     grid = SCALES[:, None] * jnp.array([1.0, 0.5])
-    found = several(pendulum.system, grid)
-    assert found.shape == (2, 3, *pendulum.state.q.shape)
-    np.testing.assert_allclose(found[1, 2], end(pendulum.system, grid[2, 1]), rtol=1e-13, atol=1e-13)
+    result = several(pendulum.system, grid)
+    assert result.shape == (2, 3, *pendulum.state.q.shape)
+    np.testing.assert_allclose(result[1, 2], end(pendulum.system, grid[2, 1]), rtol=1e-13, atol=1e-13)
 
 
+@pytest.mark.slow
 def test_lanes_on_several_cores():
     """What the page on batches says of cores, with as many devices as it asks for."""
     page = (ROOT / "docs" / "howto" / "batches.md").read_text("utf-8")

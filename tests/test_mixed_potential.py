@@ -31,8 +31,8 @@ class Tetrahedron(nc.Potential):
 
     def invariants(self, x):
         """Right Cauchy-Green tensor."""
-        edges, rest = (x[1:] - x[0]).T, (self.reference[1:] - self.reference[0]).T
-        a, b, c = rest.T
+        edges, relaxed = (x[1:] - x[0]).T, (self.reference[1:] - self.reference[0]).T
+        a, b, c = relaxed.T
         volume = a @ jnp.cross(b, c)
         inverse = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)]) / volume
         f = edges @ inverse
@@ -66,9 +66,9 @@ class PressureTetrahedron(Tetrahedron, nc.MixedPotential):
     unknowns = 1
     energy = nc.MixedPotential.energy
 
-    def mixed_energy(self, invariants, own):
+    def mixed_energy(self, invariants, unknown):
         """A saddle: stationary where the pressure is K (J - 1)."""
-        (pressure,) = own
+        (pressure,) = unknown
         stretched = pressure * (self.ratio(invariants) - 1.0) - 0.5 * pressure**2 / self.bulk
         return self.shape_energy(invariants) + self.volume * stretched
 
@@ -85,13 +85,14 @@ def two(element, bulk=2e4):
 @pytest.fixture(scope="module")
 def runs():
     """Both ways, the same steps."""
-    found = {}
+    result = {}
     for element in (Tetrahedron, PressureTetrahedron):
         system, state = two(element)
-        found[element] = system, nc.simulate(system, state, dt=5e-3, steps=60)
-    return found
+        result[element] = system, nc.simulate(system, state, dt=5e-3, steps=60)
+    return result
 
 
+@pytest.mark.exhaustive
 def test_a_pressure_in_an_element_is_that_of_its_volume(runs):
     """The same motion as of the energy with the pressure eliminated by hand, and the sensor shows it."""
     (plain, one), (system, other) = runs[Tetrahedron], runs[PressureTetrahedron]
@@ -99,13 +100,14 @@ def test_a_pressure_in_an_element_is_that_of_its_volume(runs):
     shown = system.sense(other, "cells")
     rows = np.asarray(other.q).reshape(-1, 5, 4, 3)[:, :, 0]
     for cell, corners in enumerate(CELLS):
-        edges, rest = (x[..., corners[1:], :] - x[..., corners[:1], :] for x in (rows, CORNERS))
-        ratio = np.linalg.det(edges) / np.linalg.det(rest)
+        edges, relaxed = (x[..., corners[1:], :] - x[..., corners[:1], :] for x in (rows, CORNERS))
+        ratio = np.linalg.det(edges) / np.linalg.det(relaxed)
         np.testing.assert_allclose(shown.own[:, cell, 0], 2e4 * (ratio - 1.0), rtol=0, atol=1e-7)
     assert float(jnp.ptp(shown.own)) > 100.0
     np.testing.assert_allclose(system.energy(other).potential, plain.energy(one).potential, atol=1e-8)
 
 
+@pytest.mark.exhaustive
 def test_what_it_keeps(runs):
     system, trajectory = runs[PressureTetrahedron]
     assert nc.balance(system, trajectory).energy.max() <= tol.ENERGY_OF_A_SOLID
@@ -125,8 +127,8 @@ def test_its_derivatives():
             return nc.simulate(changed, state, dt=5e-3, steps=5, throw=False).q[-1, 4, 2]
 
         slope = jax.jit(jax.grad(end))
-        both = slope(2e4), jax.jit(jax.jvp, static_argnums=0)(slope, (2e4,), (1.0,))[1]
-        slopes.append([float(x) for x in both])
+        numbers = slope(2e4), jax.jit(jax.jvp, static_argnums=0)(slope, (2e4,), (1.0,))[1]
+        slopes.append([float(x) for x in numbers])
         if element is PressureTetrahedron:
             assert_v_shaped(jax.jit(end), jnp.array(2e4), jnp.array(5e3), 5e3 * slope(2e4))
     np.testing.assert_allclose(slopes[1], slopes[0], rtol=1e-7)
@@ -141,11 +143,12 @@ class Lost(nc.MixedPotential):
         """Squared distance."""
         return ((x[1] - x[0]) @ (x[1] - x[0]))[None]
 
-    def mixed_energy(self, invariants, own):
+    def mixed_energy(self, invariants, unknown):
         """Always rising."""
-        return invariants[0] + jnp.exp(own[0])
+        return invariants[0] + jnp.exp(unknown[0])
 
 
+@pytest.mark.slow
 def test_an_energy_that_is_stationary_nowhere_ends_the_run():
     scene = nc.Scene()
     ball = scene.add(nc.PointMass(mass=1.0, position=(1.0, 0, 0)))

@@ -1,9 +1,9 @@
-"""Constraints on markers, and rolling: exact motions, all forms and schemes, statics, modes, derivatives."""
+"""Constraints on markers, and rolling: exact motions, statics, modes and derivatives."""
 
+import dataclasses
 import math
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,28 +14,8 @@ from scipy.linalg import expm
 
 import natcoord_jax as nc
 from natcoord_jax import gallery
-from natcoord_jax.analysis import balance
 
 TABLE = nc.Point(nc.ground), nc.Direction(nc.ground, (0, 0, 1))
-SCHEMES = {
-    "order two": nc.EnergyMomentum(),
-    "with kick": nc.EnergyMomentum(kick=True),
-    "order four": nc.EnergyMomentum(order=4),
-    "variational": nc.VariationalMidpoint(),
-    "dissipative": nc.Dissipative(),
-}
-
-
-def hanging(solver=None):
-    """A body that slides along a wire, and one that hangs from it by a rod."""
-    scene = nc.Scene()
-    scene.add(nc.Gravity())
-    bead = scene.add(nc.RigidBody(mass=2.0, inertia=(0.1, 0.2, 0.25), position=(0.3, 0, 0), name="bead"))
-    bob = scene.add(nc.RigidBody(mass=1.0, inertia=(0.1, 0.2, 0.15), position=(1.3, 0.2, -0.4), name="bob"))
-    wire = nc.Point(nc.ground), nc.Direction(nc.ground, (1, 0.2, 0))
-    scene.add(nc.PointOnLine((*wire, nc.Point(bead, (0.3, 0.06, 0))), name="wire"))
-    scene.add(nc.Rod((nc.Point(bead, (0.5, 0, 0)), nc.Point(bob, (1.2, 0.2, -0.4))), name="rod"))
-    return scene.compile(solver=solver)
 
 
 def pendulum(place=(1.0, 0.0, 0.0), rods=1):
@@ -48,25 +28,7 @@ def pendulum(place=(1.0, 0.0, 0.0), rods=1):
     return scene.compile()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", SCHEMES)
-def test_forms_and_schemes(name):
-    """One trajectory in all forms of the equations, on the constraints; energy is kept where it is."""
-    scheme, found = SCHEMES[name], []
-    for solver in ("reduced", "full", "sparse"):
-        system, state = hanging(solver)
-        trajectory = nc.simulate(system, state, dt=0.02, steps=50, scheme=scheme)
-        errors = system.constraint_errors(trajectory)
-        assert errors.position.max() <= tol.CONSTRAINT_OF_A_SMALL_SCENE
-        assert errors.velocity.max() <= tol.TANGENT_OF_A_SMALL_SCENE
-        if isinstance(scheme, nc.EnergyMomentum):
-            assert balance(system, trajectory).energy.max() <= tol.ENERGY_OF_A_SMALL_SCENE
-        order = [system.body_index(body) for body in ("bead", "bob")]
-        found.append(np.asarray(trajectory.q).reshape(51, 2, 4, 3)[:, order])
-    for other in found[1:]:
-        np.testing.assert_allclose(other, found[0], atol=tol.SAME_TRAJECTORY)
-
-
+@pytest.mark.exhaustive
 def test_a_rod_is_a_distance_joint():
     """Two ways to the same pendulum."""
     system, state = pendulum()
@@ -75,39 +37,11 @@ def test_a_rod_is_a_distance_joint():
     mass = scene.add(nc.PointMass(mass=2.0, position=(1, 0, 0)))
     scene.add(nc.Distance(nc.ground, mass))
     other = scene.compile()
-    one, two = (nc.simulate(*given, dt=0.02, steps=50).q for given in ((system, state), other))
+    one, two = (nc.simulate(*case, dt=0.02, steps=50).q for case in ((system, state), other))
     np.testing.assert_allclose(one[:, 0], two[:, 0], atol=tol.SAME_TRAJECTORY)
 
 
-class SoftRod(nc.Rod):
-    """A rod whose rate follows its multiplier: a damper, as a constraint."""
-
-    compliance = 0.5
-
-    def respond(self, place, motion, now, lam):
-        found = super().respond(place, motion, now, lam)
-        return eqx.tree_at(lambda r: r.rows, found, found.rows + self.compliance * lam / now.h)
-
-
-def test_rows_that_depend_on_multipliers():
-    """In all forms the same, and with few iterations: the derivative by multipliers is in the Jacobian."""
-    found, counts = [], []
-    for solver in ("reduced", "full", "sparse"):
-        scene = nc.Scene()
-        scene.add(nc.Gravity())
-        masses = [scene.add(nc.PointMass(mass=2.0, position=(1.0 + k, 0, 0.2 * k))) for k in range(2)]
-        scene.add(SoftRod((nc.Point(nc.ground), nc.Point(masses[0]))))
-        scene.add(nc.Rod(tuple(map(nc.Point, masses))))
-        system, state = scene.compile(solver=solver)
-        trajectory = nc.simulate(system, state, dt=0.01, steps=50)
-        found.append(np.asarray(trajectory.q)[:, ::4])
-        counts.append(int(trajectory.iterations))
-    for other in found[1:]:
-        np.testing.assert_allclose(other, found[0], atol=tol.SAME_TRAJECTORY)
-    # The rod to the ground gives way: a force over its compliance.
-    assert np.linalg.norm(found[0][-1, 0]) > 1.01 and max(counts) <= 6 * 50
-
-
+@pytest.mark.slow
 def test_reactions_statics_and_modes():
     """A mass of 2 kg on a rod of 1 m: it carries the weight at rest, and swings at sqrt(g / l)."""
     system, state = pendulum((0, 0, -1.0))
@@ -118,6 +52,7 @@ def test_reactions_statics_and_modes():
     np.testing.assert_allclose(moved.q[0], (0, 0, -1), atol=tol.EQUILIBRIUM)
 
 
+@pytest.mark.exhaustive
 def test_redundant_constraints_share_the_load():
     system, state = pendulum(rods=2)
     assert system.structure.redundant == ("rod 'rod 2'",) and system.structure.dofs == 2
@@ -135,7 +70,6 @@ def test_a_gap_is_told_by_name():
     scene.add(nc.PointOnPlane((*TABLE, nc.Point(mass)), name="table"))
     with pytest.raises(ValueError, match="violates point on plane 'table' by 1 m.*assemble=True"):
         scene.compile()
-    assert abs(float(scene.compile(assemble=True)[1].q[0, 2])) <= tol.CONSTRAINT
 
 
 class Circle(nc.Constraint):
@@ -149,6 +83,7 @@ class Circle(nc.Constraint):
         return jnp.stack([x[1] @ arm, 0.5 * (arm @ arm - self.radius**2)])
 
 
+@pytest.mark.exhaustive
 def test_derivatives_of_a_constraint_of_ones_own():
     """Of where a bead on a circle ends by its speed, the radius and its place; in a batch of circles, too."""
     scene = nc.Scene()
@@ -156,13 +91,13 @@ def test_derivatives_of_a_constraint_of_ones_own():
     mass = scene.add(nc.PointMass(mass=1.0, position=(1, 0, 0), velocity=(0, 1.0, 0)))
     scene.add(Circle((*TABLE, nc.Point(mass)), name="circle"))
     system, state = scene.compile()
-    place = [type(g.effect) for g in system.effects].index(Circle)
 
     def end(radius, speed):
-        bigger = eqx.tree_at(lambda s: s.effects[place].effect.radius, system, radius[None])
-        q = state.q.at[0, 0].set(radius)
-        start = eqx.tree_at(lambda s: (s.q, s.v), state, (q, state.v.at[0, 1].set(speed)))
-        return nc.simulate(bigger, start, dt=0.02, steps=20).q[-1, 0] @ jnp.array([1.0, 2.0, 3.0])
+        moved = {"q": state.q.at[0, 0].set(radius), "v": state.v.at[0, 1].set(speed)}
+        start = dataclasses.replace(state, **moved)
+        return nc.simulate(system.set("circle", radius=radius), start, dt=0.02, steps=20).q[
+            -1, 0
+        ] @ jnp.array([1.0, 2.0, 3.0])
 
     at, ahead = jnp.array([1.0, 1.0]), jnp.array([0.6, 0.8])
 
@@ -176,7 +111,7 @@ def test_derivatives_of_a_constraint_of_ones_own():
     np.testing.assert_allclose(many[0], loss(at), rtol=1e-12)
 
 
-@pytest.mark.parametrize("order", [2, pytest.param(4, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("order", [2, pytest.param(4, marks=pytest.mark.exhaustive)])
 def test_a_ball_rolls_down_a_slope(order):
     """With 5/7 of the acceleration of what slides, at its height, without any loss."""
     scene = nc.Scene()
@@ -187,13 +122,14 @@ def test_a_ball_rolls_down_a_slope(order):
     assert system.structure.dofs == 3
     trajectory = nc.simulate(system, state, dt=0.01, steps=100, scheme=nc.EnergyMomentum(order=order))
     np.testing.assert_allclose(trajectory.q[-1, 0], (5 / 14, 0, 0.1), atol=1e-6 if order == 2 else 1e-11)
-    assert balance(system, trajectory).energy.max() <= tol.ENERGY_OF_A_SMALL_SCENE
+    assert nc.balance(system, trajectory).energy.max() <= tol.ENERGY_OF_A_SMALL_SCENE
     # Friction at the contact: 2/7 of the weight along the slope.
     force = system.instant(state).multipliers["contact"]
     mass = float(system.mass[0, 0, 0])
     np.testing.assert_allclose(force, (-2 / 7 * mass, 0, 9.81 * mass), atol=1e-9 * mass)
 
 
+@pytest.mark.exhaustive
 def test_modes_of_what_rolls():
     """A ball on a spring carries its spin along: 7/5 of its mass swings."""
     scene = nc.Scene()
@@ -201,13 +137,13 @@ def test_modes_of_what_rolls():
     scene.add(nc.Rolling((*TABLE, nc.Point(ball)), radius=0.1))
     scene.add(nc.Spring((nc.Point(nc.ground, (0, 0, 0.1)), nc.Point(ball)), stiffness=100.0))
     system, state = scene.compile()
-    found = np.asarray(nc.modes(system, state).frequencies)
+    result = np.asarray(nc.modes(system, state).frequencies)
     expected = (100.0 / (1.4 * float(system.mass[0, 0, 0]))) ** 0.5
-    np.testing.assert_allclose(found, [0.0, expected, expected], atol=1e-6)
+    np.testing.assert_allclose(result, [0.0, expected, expected], atol=1e-6)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("part", [0.2, 0.5])
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("part", [0.2, 0.5])  # numbers: one program
 def test_a_coin_stays_upright_when_it_is_fast(part):
     """A thin disc leans as Routh's linear equation says: 5/4 lean'' = (g / r - 3 spin^2) lean.
 
@@ -235,7 +171,7 @@ def test_a_coin_stays_upright_when_it_is_fast(part):
     assert np.ptp(energy) <= tol.ENERGY * energy[0]
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("speed", [3.5, 5.0, 7.0])
 def test_bicycle(speed):
     """Lean and steer are those of the published linear equations, at stable speeds and at others."""
