@@ -1,6 +1,7 @@
 """Random scenes and the losses that are differentiated: by the library, and by a plain reference.
 
-A `Template` is a structure; a seed gives the numbers. All cases of one template share their programs.
+A `Template` is a structure; a seed gives the numbers. All cases of one template share their programs. Of
+the engine the hunt needs what `hunting_protocol` lists: records of rollouts slot by slot, tangent velocities.
 """
 
 from collections.abc import Callable
@@ -14,14 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 import plain
 from hunting_effects import STEPS, Chance
+from hunting_protocol import Plan, coordinate_rates, plan_of, record
 
 import natcoord_jax as nc
-from natcoord_jax.core.eager_numpy import eager_numpy
-from natcoord_jax.mechanics.coordinates import state_rates
-from natcoord_jax.stepping.derivative import run_slots
-from natcoord_jax.stepping.error_control import Tolerance
-from natcoord_jax.stepping.newton import TOLERANCE
-from natcoord_jax.stepping.plan import Event, Plan
 
 KINDS = "start", "system", "inputs", "step"
 """What changes along the directions of a case."""
@@ -71,9 +67,6 @@ class Case(eqx.Module):
     directions: Any
 
 
-_rates_of = eager_numpy(state_rates)
-
-
 # --- one case ---------------------------------------------------------------------------------------------
 
 
@@ -117,7 +110,7 @@ def _moved(rng: Chance, system: nc.System, state: nc.State, other: nc.State) -> 
     """A change of the state that all constraints admit: further on along the motion, and another motion."""
     along, across = 0.1 * rng.normal(), 0.3 * rng.normal()
     still = jax.tree.map(jnp.zeros_like, state)
-    rates = _rates_of(system, state)
+    rates = coordinate_rates(system, state)
     return eqx.tree_at(
         lambda s: (s.t, s.q, s.coordinates, s.v, s.rates),
         still,
@@ -184,14 +177,8 @@ def simulated(template: Template, checkpoint: bool = False) -> Callable:
     return lambda *given: loss(rollout, *given)
 
 
-def _policy(parameters: Any, step: Any, t: Any, state: nc.State, fraction: Any) -> Any:
-    return parameters(t, state)
-
-
 def _plan(template: Template, inputs: Any) -> Plan:
-    control = _policy if callable(inputs) else None
-    event = None if template.until is None else Event.of(template.until)[0]
-    return Plan(template.steps, template.extra, TOLERANCE, control, event, template.scheme.tableau)
+    return plan_of(template.scheme, template.steps, template.extra, template.until, callable(inputs))
 
 
 def _saved(template: Template, slots: Any, states: nc.State) -> nc.State:
@@ -204,9 +191,8 @@ def recorded(template: Template) -> Callable:
     """The loss by the library, with the records of all slots."""
 
     def rollout(k: int, system: nc.System, state: nc.State, inputs: Any, dt: Any) -> tuple:
-        allowed = Tolerance.of(template.rtol, None)
-        slots, ending = run_slots(_plan(template, inputs), system, state, inputs, dt, allowed)
-        return _saved(template, slots, slots.states), (slots, ending.course.code)
+        slots, code = record(_plan(template, inputs), system, state, inputs, dt, template.rtol)
+        return _saved(template, slots, slots.states), (slots, code)
 
     return lambda *given: loss(rollout, *given)
 

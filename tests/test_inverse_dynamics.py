@@ -1,4 +1,4 @@
-"""Inverse dynamics of systems with parts that no input acts on."""
+"""Inverse dynamics and computed torque: paths are followed, with parts that no input acts on."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -52,8 +52,9 @@ def test_a_passive_joint_moves_as_it_must():
     scene.add(nc.JointForce(rail, name="push"))
     system, state = scene.compile()
     path = 0.8 * smooth(np.linspace(0.0, 1.0, 41)[1:, None])
-    inputs, _ = nc.inverse_dynamics(system, state, path, dt=0.02, joints=[rail])
+    inputs, states = nc.inverse_dynamics(system, state, path, dt=0.02, joints=[rail])
     run = nc.simulate(system, state, dt=0.02, inputs=inputs)
+    np.testing.assert_allclose(states.q, run.q[1:], atol=1e-11)
     np.testing.assert_allclose(system.coordinate(run, rail)[1:], path[:, 0], atol=1e-11)
     assert float(jnp.abs(system.coordinate(run, hinge)).max()) > 0.2
     # Momentum: the push is all that acts along the rail.
