@@ -71,6 +71,7 @@ def test_solution_reports_what_it_is(solution):
     assert solution.multipliers["coordinate 0 of 'hinge' [rad or m]"] == pytest.approx(-price, rel=5e-3)
 
 
+@pytest.mark.exhaustive
 def test_with_its_multipliers_the_simulation_is_stationary(solution):
     """Costates are the gradient of `nc.simulate`: cost and goal pull the inputs in opposite directions."""
     problem, prices = solution.problem, jnp.array(list(solution.multipliers.values()))
