@@ -102,6 +102,7 @@ FOURTH = nc.EnergyMomentum(order=4)
 TEMPLATES = (
     Template("slide", trees.slide),
     Template("disc", trees.disc, more=("checkpointed", "directions")),
+    Template("slide, error control", trees.slide, rtol=1e-4, extra=160),
     Template("taut, error control", trees.taut, rtol=1e-4, extra=160, exhaustive=True),
     Template("taut, until an event", trees.taut, until=trees.event, exhaustive=True),
     Template("driven", trees.driven),

@@ -277,7 +277,7 @@ def test_rates_of_a_guess_are_named_in_their_order():
     assert rates[-1, 3] == pytest.approx(0.5) and 0.0 < rates[0, 3] < 0.5
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_another_solver_gets_the_same_problem(hinged):
     """Derivatives of `nc.to_nlp` against differences, where inputs are splines and time is free."""
     free = {"free_time": (0.5, 2.0), "inputs": nc.inputs.piecewise_linear(3)}
@@ -430,7 +430,7 @@ def test_derivative_of_the_optimum_by_a_parameter(hinged):
 # --- first order ------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_first_order_descent_comes_near(hinged):
     near = nc.descend(rest_to_rest(hinged), iterations=400, rounds=8, progress=False)
     assert near.ok, near.explain()

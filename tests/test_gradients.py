@@ -69,6 +69,13 @@ def two_links(p):
 
 
 SCENES = {"one link": one_link, "two links": two_links}
+LANES = pytest.mark.parametrize(
+    "scene",
+    [
+        pytest.param("one link", marks=pytest.mark.slow),
+        pytest.param("two links", marks=pytest.mark.exhaustive),
+    ],
+)
 
 
 def loss_of(scene):
@@ -140,7 +147,7 @@ def slopes(scene, mode):
     return np.array([run(p, x) for x in d.values()])
 
 
-@pytest.mark.parametrize("scene", ["one link", pytest.param("two links", marks=pytest.mark.exhaustive)])
+@LANES
 def test_derivatives_by_every_number_forward_and_reverse(scene):
     forward = slopes(scene, "forward")
     for (name, d), slope in zip(directions().items(), forward):
@@ -170,7 +177,7 @@ def curvatures(scene, mode):
     return np.array([[total(slope, e) for e in each] for slope in (run(p, d) for d in each)])
 
 
-@pytest.mark.parametrize("scene", ["one link", pytest.param("two links", marks=pytest.mark.exhaustive)])
+@LANES
 def test_second_derivatives_are_symmetric_and_those_of_differences(scene):
     hessian = curvatures(scene, "forward over reverse")
     assert np.max(np.abs(hessian - hessian.T)) <= tol.SAME_GRADIENT * np.max(np.abs(hessian))
@@ -179,14 +186,15 @@ def test_second_derivatives_are_symmetric_and_those_of_differences(scene):
     assert_v_shaped(lambda p: slope(p, all_numbers), numbers(), all_numbers, hessian.sum())
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(
     ("scene", "mode"),
     [
-        pytest.param("one link", "forward over forward", marks=pytest.mark.slow),
-        pytest.param("one link", "reverse over forward", marks=pytest.mark.slow),
-        pytest.param("one link", "reverse over reverse", marks=pytest.mark.slow),
-        pytest.param("two links", "forward over forward", marks=pytest.mark.exhaustive),
-        pytest.param("two links", "reverse over forward", marks=pytest.mark.exhaustive),
+        ("one link", "forward over forward"),
+        ("one link", "reverse over forward"),
+        ("one link", "reverse over reverse"),
+        ("two links", "forward over forward"),
+        ("two links", "reverse over forward"),
     ],
 )
 def test_other_modes_of_second_order_agree_or_are_refused(scene, mode):
@@ -348,7 +356,6 @@ def test_room_for_retries_costs_a_batch_nothing():
 # --- exact gradients --------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
 def test_free_flight_is_exact():
     """x = v t + F t^2 / 2m, exact for the method too: derivatives by everything, twice by the mass."""
 

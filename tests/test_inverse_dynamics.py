@@ -82,6 +82,7 @@ def test_computed_torque_holds_an_unstable_path(flexible_arm):
     assert float(abs(error[0, 0])) > 0.03 and float(abs(error[-1, 0])) < 0.01
 
 
+@pytest.mark.slow
 def test_errors_decay_at_the_bandwidth():
     """On a disc the error is that of the formulas, with a double pole."""
     scene = nc.Scene()
