@@ -54,15 +54,15 @@ class Template:
     @property
     def options(self) -> dict:
         """Of `nc.simulate`."""
-        found = dict(scheme=self.scheme, save_every=self.save_every, until=self.until, rtol=self.rtol)
-        return found | dict(extra_substeps=self.extra, throw=False)
+        made = dict(scheme=self.scheme, save_every=self.save_every, until=self.until, rtol=self.rtol)
+        return made | dict(extra_substeps=self.extra, throw=False)
 
 
 class Case(eqx.Module):
     """Numbers of a template: those that are differentiated, all others, and what is asked."""
 
     numbers: Any
-    rest: Any
+    static: Any
     weights: Any
     directions: Any
 
@@ -89,7 +89,7 @@ def case_of(template: Template, seed: int) -> Case:
         nothing | dict(dt=0.1 * numbers["dt"]),
     ]
     directions = jax.tree.map(lambda *x: jnp.stack(x), *directions)
-    return Case(numbers, tuple(rest for _, rest in parts), tuple(weights), directions)
+    return Case(numbers, tuple(static for _, static in parts), tuple(weights), directions)
 
 
 def _noise(rng: Chance, size: float, x: Any) -> Any:
@@ -134,8 +134,8 @@ def _changed(rng: Chance, system: nc.System) -> nc.System:
     still = jax.tree.map(jnp.zeros_like, system)
     effects = [jax.tree.map(relative, group.effect) for group in system.effects]
     masses = system.mass * jnp.asarray(0.1 * rng.normal(size=(system.mass.shape[0], 1, 1)))
-    found = eqx.tree_at(lambda s: s.mass, still, masses)
-    return eqx.tree_at(lambda s: [g.effect for g in s.effects], found, effects)
+    made = eqx.tree_at(lambda s: s.mass, still, masses)
+    return eqx.tree_at(lambda s: [g.effect for g in s.effects], made, effects)
 
 
 # --- the loss ---------------------------------------------------------------------------------------------
@@ -152,11 +152,11 @@ def score(x: jax.Array, weights: tuple) -> jax.Array:
     return times @ (x @ linear + 0.1 * (x @ bent) ** 2)
 
 
-def loss(rollout: Callable, numbers: Any, rest: Any, weights: Any) -> Any:
+def loss(rollout: Callable, numbers: Any, static: Any, weights: Any) -> Any:
     """A smooth function of all saved states of all phases, and what the rollouts say besides."""
     state, before, total, said = numbers["state"], None, 0.0, []
-    for k, (part, own) in enumerate(zip(numbers["systems"], rest)):
-        system = eqx.combine(part, own)
+    for k, (part, fixed) in enumerate(zip(numbers["systems"], static)):
+        system = eqx.combine(part, fixed)
         if before is not None:
             system, state = nc.transfer(before, state, system)
         saved, more = rollout(k, system, state, numbers["inputs"][k], numbers["dt"])
@@ -171,10 +171,10 @@ def simulated(template: Template, checkpoint: bool = False) -> Callable:
 
     def rollout(k: int, system: nc.System, state: nc.State, inputs: Any, dt: Any) -> tuple:
         options = template.options | dict(checkpoint=checkpoint, steps=template.steps)
-        found = nc.simulate(system, state, dt=dt, inputs=inputs, **options)
-        return jax.tree.map(lambda x: x[1:], found.states), (found.result, found.steps_rejected)
+        made = nc.simulate(system, state, dt=dt, inputs=inputs, **options)
+        return jax.tree.map(lambda x: x[1:], made.states), (made.result, made.steps_rejected)
 
-    return lambda *given: loss(rollout, *given)
+    return lambda *arguments: loss(rollout, *arguments)
 
 
 def _plan(template: Template, inputs: Any) -> Plan:
@@ -194,7 +194,7 @@ def recorded(template: Template) -> Callable:
         slots, code = record(_plan(template, inputs), system, state, inputs, dt, template.rtol)
         return _saved(template, slots, slots.states), (slots, code)
 
-    return lambda *given: loss(rollout, *given)
+    return lambda *arguments: loss(rollout, *arguments)
 
 
 def plainly(template: Template, records: Any, corrections: int = 2) -> Callable:
@@ -207,4 +207,4 @@ def plainly(template: Template, records: Any, corrections: int = 2) -> Callable:
         saved = _saved(template, slots, after)
         return saved, (flat_states(saved), apart)
 
-    return lambda *given: loss(rollout, *given)
+    return lambda *arguments: loss(rollout, *arguments)

@@ -63,12 +63,12 @@ def states(
         constant = plan, *jax.lax.stop_gradient((system, state, u, h))
 
         def residual(y: Array) -> tuple[Array, Array]:
-            left = outcome(*constant, y)[0]
-            return left, left
+            residuals = outcome(*constant, y)[0]
+            return residuals, residuals
 
         def polished(_: int, carry: tuple) -> tuple:
-            matrix, left = jax.jacfwd(residual, has_aux=True)(carry[0])
-            return carry[0] - solution(matrix, left, redundant), matrix
+            matrix, residuals = jax.jacfwd(residual, has_aux=True)(carry[0])
+            return carry[0] - solution(matrix, residuals, redundant), matrix
 
         start = y, jnp.zeros((y.size, y.size))
         y, matrix = jax.lax.stop_gradient(jax.lax.fori_loop(0, POLISH, polished, start))

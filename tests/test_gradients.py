@@ -261,11 +261,11 @@ def test_second_derivative_starting_at_rest(law):
         last = nc.simulate(system, state, dt=0.1, steps=4).q[-1, 0]
         return last @ jnp.array([1.0, 0.5, 0.2]) + jnp.sum(last**3)
 
-    rest, d = jnp.zeros(3), jnp.array([0.7, 0.4, -0.3])
+    still, d = jnp.zeros(3), jnp.array([0.7, 0.4, -0.3])
     slope = jax.jit(lambda x: jax.grad(f)(x) @ d)
-    curvature = jax.jit(lambda x: jax.jvp(jax.grad(f), (x,), (d,))[1] @ d)(rest)
-    assert_v_shaped(slope, rest, d, curvature)
-    again = jax.jit(lambda x: jax.jvp(lambda y: jax.jvp(f, (y,), (d,))[1], (x,), (d,))[1])(rest)
+    curvature = jax.jit(lambda x: jax.jvp(jax.grad(f), (x,), (d,))[1] @ d)(still)
+    assert_v_shaped(slope, still, d, curvature)
+    again = jax.jit(lambda x: jax.jvp(lambda y: jax.jvp(f, (y,), (d,))[1], (x,), (d,))[1])(still)
     assert abs(again - curvature) <= tol.SAME_GRADIENT * abs(curvature)
 
 
@@ -418,8 +418,8 @@ def test_linearise_equals_differences():
     start = nc.step(system, state, u, h)
     a, _ = nc.linearise(system, start, u, p["dt"])
     ahead = jax.jvp(moved, (h,), (jnp.ones(()),))[1]
-    both = jax.jvp(later, (h,), (jnp.ones(()),))[1]
-    assert np.allclose(a @ ahead, both, rtol=1e-8, atol=1e-8 * float(jnp.max(jnp.abs(both))))
+    twice = jax.jvp(later, (h,), (jnp.ones(()),))[1]
+    assert np.allclose(a @ ahead, twice, rtol=1e-8, atol=1e-8 * float(jnp.max(jnp.abs(twice))))
 
 
 @pytest.mark.exhaustive
@@ -479,9 +479,9 @@ def test_where_drives_prescribe_every_motion():
         run = nc.simulate(moved, state, dt=0.05, steps=8, throw=False)
         return jnp.sum(run.v[-1] ** 2)
 
-    both, step = jax.jit(jax.value_and_grad(speed)), 1e-4
-    _, slope = both(jnp.array(1.0))
-    (above, _), (below, _) = both(jnp.array(1.0 + step)), both(jnp.array(1.0 - step))
+    speed_and_slope, step = jax.jit(jax.value_and_grad(speed)), 1e-4
+    _, slope = speed_and_slope(jnp.array(1.0))
+    (above, _), (below, _) = (speed_and_slope(jnp.array(1.0 + x)) for x in (step, -step))
     assert abs(float(slope)) > 0.1
     assert float(slope) == pytest.approx(float(above - below) / (2 * step), rel=tol.DIFFERENCE_BEST)
 

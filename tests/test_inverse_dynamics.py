@@ -61,10 +61,10 @@ def test_a_passive_joint_moves_as_it_must():
     pushed = 0.02 * np.cumsum(inputs[:, 0])
     np.testing.assert_allclose(system.momentum(run)[1:, 0], pushed, atol=1e-10)
     with pytest.raises(ValueError, match="cannot bring about the path in step 0.*joints="):
-        both = np.concatenate([path, path], axis=1)
-        nc.inverse_dynamics(system, state, both, dt=0.02)
+        twice = np.concatenate([path, path], axis=1)
+        nc.inverse_dynamics(system, state, twice, dt=0.02)
     with pytest.raises(ValueError, match=r"shape \(40, 2\).*'rail \[0\]'"):
-        nc.inverse_dynamics(system, state, both, dt=0.02, joints=["rail"])
+        nc.inverse_dynamics(system, state, twice, dt=0.02, joints=["rail"])
 
 
 @pytest.mark.exhaustive

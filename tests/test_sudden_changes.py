@@ -160,7 +160,7 @@ def test_links_hit_their_stops_in_every_form(links, solver):
         run = nc.simulate(other, start, dt=0.01, steps=40, throw=False)
         return jnp.sum(jnp.sin(run.q[-1])) + jnp.sum(run.q[20] ** 2)
 
-    reverse, every = jax.jit(jax.grad(loss, (0, 1))), jax.jit(jax.jacfwd(loss, (0, 1)))
+    reverse, shared = jax.jit(jax.grad(loss, (0, 1))), jax.jit(jax.jacfwd(loss, (0, 1)))
     forward = jax.jit(lambda v, k, dv, dk: jax.jvp(loss, (v, k), (dv, dk))[1])
     rng = np.random.default_rng(0)
     for _ in range(12):
@@ -168,7 +168,7 @@ def test_links_hit_their_stops_in_every_form(links, solver):
         stiffness = 10.0 ** rng.uniform(2, 7)
         terms = [
             jnp.append(a * along, b * stiffness)
-            for a, b in (reverse(rates, stiffness), every(rates, stiffness))
+            for a, b in (reverse(rates, stiffness), shared(rates, stiffness))
         ]
         scale = jnp.max(jnp.abs(terms[1]))
         np.testing.assert_allclose(terms[0] / scale, terms[1] / scale, atol=SAME_GRADIENT)
