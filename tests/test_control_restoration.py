@@ -150,7 +150,12 @@ def test_the_zero_of_coordinates_moves_them_and_nothing_else():
     def run(zero, slide_zero):
         system, state = cart_and_pole(zero, slide_zero)
         assert float(system.coordinate(state, "hinge")) == pytest.approx(-zero, abs=1e-15)
-        trajectory = nc.simulate(system, state, dt=0.01, inputs=np.full((100, 1), 0.5))
+        # Placed by its coordinates, and moving.
+        start = system.with_coordinate(state, "hinge", 0.4 - zero, rate=1.0)
+        start = system.with_coordinate(start, "slide", 0.2 - slide_zero)
+        again = nc.assemble(system, start)
+        assert float(system.coordinate(again, "hinge")) == pytest.approx(0.4 - zero, abs=1e-12)
+        trajectory = nc.simulate(system, start, dt=0.01, inputs=np.full((100, 1), 0.5))
         angle = system.coordinate(trajectory, "hinge") + zero
         return trajectory.states.q, angle, system.coordinate(trajectory, "slide") + slide_zero
 
