@@ -177,7 +177,8 @@ def curvatures(scene, mode):
     return np.array([[total(slope, e) for e in each] for slope in (run(p, d) for d in each)])
 
 
-@LANES
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("scene", SCENES)
 def test_second_derivatives_are_symmetric_and_those_of_differences(scene):
     hessian = curvatures(scene, "forward over reverse")
     assert np.max(np.abs(hessian - hessian.T)) <= tol.SAME_GRADIENT * np.max(np.abs(hessian))

@@ -63,10 +63,8 @@ def bounce():
     return end
 
 
-@pytest.mark.parametrize(
-    "checkpoint",
-    [pytest.param(False, marks=pytest.mark.slow), pytest.param(True, marks=pytest.mark.exhaustive)],
-)
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("checkpoint", [False, True])
 def test_a_mass_bounces_off_a_stop(bounce, checkpoint):
     """It comes back with the rate it had, whatever the stop is: the derivative is -1 by it, 0 by the stop."""
 
