@@ -1,17 +1,16 @@
-"""Notebooks are run as tests; those that compile much are slow ones."""
+"""Notebooks are run as tests: the first by default, some by value in the slow lane, others exhaustively."""
 
 import pytest
 
-SLOW = ("02", "03", "04", "05", "06", "07", "08", "10", "11", "12", "13", "14", "15", "16", "17", "18", "19")
-"""Numbers of the notebooks that take long: all but the first, and the ninth, which takes longest."""
+DEFAULT = ("01",)
+SLOW = ("03", "04", "05", "06", "13", "19")
+"""Torques of a spacecraft, gradients, an effect of one's own, an optimum, identification, contact."""
 
 
 @pytest.hookimpl(tryfirst=True)  # before tests are chosen by their marks
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the slow ones."""
+    """Mark them by their numbers."""
     for item in items:
-        # Many optima, each refined.
-        if item.path.name.startswith("09"):
-            item.add_marker(pytest.mark.exhaustive)
-        elif item.path.suffix == ".ipynb" and item.path.name.startswith(SLOW):
-            item.add_marker(pytest.mark.slow)
+        if item.path.suffix == ".ipynb" and not item.path.name.startswith(DEFAULT):
+            slow = item.path.name.startswith(SLOW)
+            item.add_marker(pytest.mark.slow if slow else pytest.mark.exhaustive)

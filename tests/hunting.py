@@ -1,6 +1,7 @@
 """Random scenes and the losses that are differentiated: by the library, and by a plain reference.
 
-A `Template` is a structure; a seed gives the numbers. All cases of one template share their programs.
+A `Template` is a structure; a seed gives the numbers. All cases of one template share their programs. Of
+the engine the hunt needs what `hunting_protocol` lists: records of rollouts slot by slot, tangent velocities.
 """
 
 from collections.abc import Callable
@@ -14,14 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 import plain
 from hunting_effects import STEPS, Chance
+from hunting_protocol import Plan, coordinate_rates, plan_of, record
 
 import natcoord_jax as nc
-from natcoord_jax.core.eager_numpy import eager_numpy
-from natcoord_jax.mechanics.coordinates import state_rates
-from natcoord_jax.stepping.derivative import run_slots
-from natcoord_jax.stepping.error_control import Tolerance
-from natcoord_jax.stepping.newton import TOLERANCE
-from natcoord_jax.stepping.plan import Event, Plan
 
 KINDS = "start", "system", "inputs", "step"
 """What changes along the directions of a case."""
@@ -58,20 +54,17 @@ class Template:
     @property
     def options(self) -> dict:
         """Of `nc.simulate`."""
-        found = dict(scheme=self.scheme, save_every=self.save_every, until=self.until, rtol=self.rtol)
-        return found | dict(extra_substeps=self.extra, throw=False)
+        made = dict(scheme=self.scheme, save_every=self.save_every, until=self.until, rtol=self.rtol)
+        return made | dict(extra_substeps=self.extra, throw=False)
 
 
 class Case(eqx.Module):
     """Numbers of a template: those that are differentiated, all others, and what is asked."""
 
     numbers: Any
-    rest: Any
+    static: Any
     weights: Any
     directions: Any
-
-
-_rates_of = eager_numpy(state_rates)
 
 
 # --- one case ---------------------------------------------------------------------------------------------
@@ -96,7 +89,7 @@ def case_of(template: Template, seed: int) -> Case:
         nothing | dict(dt=0.1 * numbers["dt"]),
     ]
     directions = jax.tree.map(lambda *x: jnp.stack(x), *directions)
-    return Case(numbers, tuple(rest for _, rest in parts), tuple(weights), directions)
+    return Case(numbers, tuple(static for _, static in parts), tuple(weights), directions)
 
 
 def _noise(rng: Chance, size: float, x: Any) -> Any:
@@ -117,7 +110,7 @@ def _moved(rng: Chance, system: nc.System, state: nc.State, other: nc.State) -> 
     """A change of the state that all constraints admit: further on along the motion, and another motion."""
     along, across = 0.1 * rng.normal(), 0.3 * rng.normal()
     still = jax.tree.map(jnp.zeros_like, state)
-    rates = _rates_of(system, state)
+    rates = coordinate_rates(system, state)
     return eqx.tree_at(
         lambda s: (s.t, s.q, s.coordinates, s.v, s.rates),
         still,
@@ -141,8 +134,8 @@ def _changed(rng: Chance, system: nc.System) -> nc.System:
     still = jax.tree.map(jnp.zeros_like, system)
     effects = [jax.tree.map(relative, group.effect) for group in system.effects]
     masses = system.mass * jnp.asarray(0.1 * rng.normal(size=(system.mass.shape[0], 1, 1)))
-    found = eqx.tree_at(lambda s: s.mass, still, masses)
-    return eqx.tree_at(lambda s: [g.effect for g in s.effects], found, effects)
+    made = eqx.tree_at(lambda s: s.mass, still, masses)
+    return eqx.tree_at(lambda s: [g.effect for g in s.effects], made, effects)
 
 
 # --- the loss ---------------------------------------------------------------------------------------------
@@ -159,11 +152,11 @@ def score(x: jax.Array, weights: tuple) -> jax.Array:
     return times @ (x @ linear + 0.1 * (x @ bent) ** 2)
 
 
-def loss(rollout: Callable, numbers: Any, rest: Any, weights: Any) -> Any:
+def loss(rollout: Callable, numbers: Any, static: Any, weights: Any) -> Any:
     """A smooth function of all saved states of all phases, and what the rollouts say besides."""
     state, before, total, said = numbers["state"], None, 0.0, []
-    for k, (part, own) in enumerate(zip(numbers["systems"], rest)):
-        system = eqx.combine(part, own)
+    for k, (part, fixed) in enumerate(zip(numbers["systems"], static)):
+        system = eqx.combine(part, fixed)
         if before is not None:
             system, state = nc.transfer(before, state, system)
         saved, more = rollout(k, system, state, numbers["inputs"][k], numbers["dt"])
@@ -178,20 +171,14 @@ def simulated(template: Template, checkpoint: bool = False) -> Callable:
 
     def rollout(k: int, system: nc.System, state: nc.State, inputs: Any, dt: Any) -> tuple:
         options = template.options | dict(checkpoint=checkpoint, steps=template.steps)
-        found = nc.simulate(system, state, dt=dt, inputs=inputs, **options)
-        return jax.tree.map(lambda x: x[1:], found.states), (found.result, found.steps_rejected)
+        made = nc.simulate(system, state, dt=dt, inputs=inputs, **options)
+        return jax.tree.map(lambda x: x[1:], made.states), (made.result, made.steps_rejected)
 
-    return lambda *given: loss(rollout, *given)
-
-
-def _policy(parameters: Any, step: Any, t: Any, state: nc.State, fraction: Any) -> Any:
-    return parameters(t, state)
+    return lambda *arguments: loss(rollout, *arguments)
 
 
 def _plan(template: Template, inputs: Any) -> Plan:
-    control = _policy if callable(inputs) else None
-    event = None if template.until is None else Event.of(template.until)[0]
-    return Plan(template.steps, template.extra, TOLERANCE, control, event, template.scheme.tableau)
+    return plan_of(template.scheme, template.steps, template.extra, template.until, callable(inputs))
 
 
 def _saved(template: Template, slots: Any, states: nc.State) -> nc.State:
@@ -204,11 +191,10 @@ def recorded(template: Template) -> Callable:
     """The loss by the library, with the records of all slots."""
 
     def rollout(k: int, system: nc.System, state: nc.State, inputs: Any, dt: Any) -> tuple:
-        allowed = Tolerance.of(template.rtol, None)
-        slots, ending = run_slots(_plan(template, inputs), system, state, inputs, dt, allowed)
-        return _saved(template, slots, slots.states), (slots, ending.course.code)
+        slots, code = record(_plan(template, inputs), system, state, inputs, dt, template.rtol)
+        return _saved(template, slots, slots.states), (slots, code)
 
-    return lambda *given: loss(rollout, *given)
+    return lambda *arguments: loss(rollout, *arguments)
 
 
 def plainly(template: Template, records: Any, corrections: int = 2) -> Callable:
@@ -221,4 +207,4 @@ def plainly(template: Template, records: Any, corrections: int = 2) -> Callable:
         saved = _saved(template, slots, after)
         return saved, (flat_states(saved), apart)
 
-    return lambda *given: loss(rollout, *given)
+    return lambda *arguments: loss(rollout, *arguments)

@@ -6,12 +6,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from hunting_protocol import admitted
 
 import natcoord_jax as nc
-from natcoord_jax.core.bodies import by_node
-from natcoord_jax.core.eager_numpy import eager_numpy
-from natcoord_jax.core.effect import replace_fields
-from natcoord_jax.mechanics.tangent_space import TangentSpace, Velocity
 
 STEPS = 40
 """Of most scenes."""
@@ -185,15 +182,9 @@ class Chance(np.random.Generator):
 # --- starts -----------------------------------------------------------------------------------------------
 
 
-@eager_numpy
-def _projected(system: nc.System, state: nc.State, v: Any) -> nc.State:
-    free = TangentSpace.at(system, state).projected(Velocity(by_node(v), state.rates))
-    return replace_fields(state, v=free.rows.reshape(state.v.shape), rates=free.rotors)
-
-
 def pushed(rng: Chance, system: nc.System, state: nc.State, speed: float = 2.0) -> Any:
     """Of any system: as it is, and two motions that its constraints admit."""
-    return [_projected(system, state, jnp.asarray(speed * rng.normal(size=state.v.shape))) for _ in range(2)]
+    return [admitted(system, state, jnp.asarray(speed * rng.normal(size=state.v.shape))) for _ in range(2)]
 
 
 def started(rng: Chance, system: nc.System, state: nc.State, angle: float = 0.5, speed: float = 2.0) -> Any:

@@ -40,9 +40,9 @@ def ring(rng: Chance):
     scene.add(nc.Distance(b, c, point=(0.8, 0.5, 0.2), parent_point=(0.4, 0.5, 0.1), name="rod"))
     scene.add(rng.dry(crank))
     scene.add(rng.stops(rocker, 1e5))
-    held = nc.Point(nc.ground, (0.3, 0.9, 0)), nc.Point(b, (0.4, 0.5, 0.1))
+    ends = nc.Point(nc.ground, (0.3, 0.9, 0)), nc.Point(b, (0.4, 0.5, 0.1))
     caught = rng.time(dt)
-    scene.add(Latch(held, stiffness=rng.size(1e1, 1e4), caught=caught, free=caught + 10 * dt))
+    scene.add(Latch(ends, stiffness=rng.size(1e1, 1e4), caught=caught, free=caught + 10 * dt))
     system, state = scene.compile()
     return (system,), *pushed(rng, system, state), none(), dt
 
@@ -93,8 +93,8 @@ def grip(rng: Chance):
         return scene.compile()
 
     system, state = scene_of(False)
-    together, _ = scene_of(True)
-    return (system, together), *pushed(rng, system, state), none() * 2, rng.step(0.01)
+    joined, _ = scene_of(True)
+    return (system, joined), *pushed(rng, system, state), none() * 2, rng.step(0.01)
 
 
 FOURTH = nc.EnergyMomentum(order=4)
@@ -102,9 +102,10 @@ FOURTH = nc.EnergyMomentum(order=4)
 TEMPLATES = (
     Template("slide", trees.slide),
     Template("disc", trees.disc, more=("checkpointed", "directions")),
+    Template("slide, error control", trees.slide, rtol=1e-4, extra=160),
     Template("taut, error control", trees.taut, rtol=1e-4, extra=160, exhaustive=True),
     Template("taut, until an event", trees.taut, until=trees.event, exhaustive=True),
-    Template("driven", trees.driven),
+    Template("driven", trees.driven, exhaustive=True),
     Template("switching", trees.switching, more=("batch",)),
     Template("tumbling", trees.tumbling, steps=12, extra=64),
     Template("parallelogram", parallelogram),

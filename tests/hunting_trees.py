@@ -115,10 +115,10 @@ def craft(rng: Chance):
     scene.add(rng.brake(axle, dt))
     scene.add(nc.BodyForceInput((nc.Point(base, (0.3, 0, 0)), nc.Direction(base, (0, 1, 0)))))
     scene.add(nc.BodyTorqueInput(tuple(nc.Direction(base, x) for x in np.eye(3))))
-    held = nc.Point(nc.ground, (0.5, 0, 0)), nc.Point(base, (0.4, 0, 0))
+    ends = nc.Point(nc.ground, (0.5, 0, 0)), nc.Point(base, (0.4, 0, 0))
     caught = rng.time(dt)
     until = caught + dt * rng.uniform(2.0, 20.0)
-    scene.add(Latch(held, stiffness=rng.size(1e1, 1e5), caught=caught, free=until))
+    scene.add(Latch(ends, stiffness=rng.size(1e1, 1e5), caught=caught, free=until))
     system, state = scene.compile()
     return (system,), *pushed(rng, system, state), (rng.jumps(4, 10.0),), dt
 

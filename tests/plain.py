@@ -4,19 +4,19 @@ The same discrete motion: substeps and solutions are those recorded. Every slot'
 more by Newton's iteration with their whole Jacobian, formed by automatic differentiation and decomposed, and
 the last corrections are differentiated as they stand. Nothing is carried from slot to slot but the state,
 and every mode of JAX goes through. What a correction with a constant exact Jacobian leaves of an error is of
-the second order, so `corrections` of them give as many derivatives exactly.
+the second order, so `corrections` of them give as many derivatives exactly. Of the engine it needs, by
+`hunting_protocol`, what one slot solves: (system, state, inputs, length, unknowns) -> (residual, next state).
 """
 
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+from hunting_protocol import Plan, Slots, inputs_of, outcome
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 import natcoord_jax as nc
-from natcoord_jax.stepping.plan import Plan, Slots
-from natcoord_jax.stepping.step import advance
 
 POLISH = 2
 """Corrections before those that are differentiated: recorded solutions are good to round-off already."""
@@ -56,40 +56,32 @@ def states(
     _, unravel = ravel_pytree(first)
 
     def slot(state: nc.State, recorded: Slots) -> tuple:
-        step, done, fraction = recorded.step, recorded.done, recorded.fraction
-        if callable(parameters):
-            u = parameters(state.t, state)
-        else:
-            u = plan.within_step(parameters[step], done, fraction)
-        h = fraction * dt
+        u, h = inputs_of(plan, parameters, state, recorded), recorded.fraction * dt
         y = jnp.where(recorded.accepted, recorded.y, 0.0)
 
-        def outcome(at: tuple, y: Array) -> tuple[Array, nc.State]:
-            return advance(*at, y, plan.tableau)[:2]
-
-        here = system, state, u, h
-        held = jax.lax.stop_gradient(here)
+        at = plan, system, state, u, h
+        constant = plan, *jax.lax.stop_gradient((system, state, u, h))
 
         def residual(y: Array) -> tuple[Array, Array]:
-            found = outcome(held, y)[0]
-            return found, found
+            residuals = outcome(*constant, y)[0]
+            return residuals, residuals
 
         def polished(_: int, carry: tuple) -> tuple:
-            matrix, found = jax.jacfwd(residual, has_aux=True)(carry[0])
-            return carry[0] - solution(matrix, found, redundant), matrix
+            matrix, residuals = jax.jacfwd(residual, has_aux=True)(carry[0])
+            return carry[0] - solution(matrix, residuals, redundant), matrix
 
         start = y, jnp.zeros((y.size, y.size))
         y, matrix = jax.lax.stop_gradient(jax.lax.fori_loop(0, POLISH, polished, start))
 
         def corrected(y: Array, _: None) -> tuple[Array, None]:
-            return y - solution(matrix, outcome(here, y)[0], redundant), None
+            return y - solution(matrix, outcome(*at, y)[0], redundant), None
 
         y, _ = jax.lax.scan(corrected, y, None, length=corrections)
-        end, _ = ravel_pytree(outcome(here, y)[1])
+        end, _ = ravel_pytree(outcome(*at, y)[1])
         # Linearised where the recorded motion is: errors of the two do not grow apart.
-        known, _ = ravel_pytree(recorded.states)
-        apart = jnp.max(jnp.abs(end - known) / (1.0 + jnp.abs(known)))
-        end = known + (end - jax.lax.stop_gradient(end))
+        motion, _ = ravel_pytree(recorded.states)
+        apart = jnp.max(jnp.abs(end - motion) / (1.0 + jnp.abs(motion)))
+        end = motion + (end - jax.lax.stop_gradient(end))
         end = jnp.where(recorded.accepted, end, ravel_pytree(state)[0])
         return unravel(end), (unravel(end), jnp.where(recorded.accepted, apart, 0.0))
 

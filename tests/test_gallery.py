@@ -9,13 +9,12 @@ import tolerances as tol
 
 import natcoord_jax as nc
 from natcoord_jax import gallery
-from natcoord_jax.analysis import balance
 from natcoord_jax.gallery.spacecraft import TABLE, TORQUE, compare_torques
 
-# Compiling takes all the time: the small scenes by default, the rest with the slow tests.
-QUICK = ("spacecraft", "double_pendulum", "heavy_top")
 ELSEWHERE = ("plugging", "panel_slew", "reorientation", "robot_cable", "tennis")
 """Scenes that have tests of their own, and take long."""
+SLOW = ("pendulum", "fast_top", "open_tree", "bicycle", "rattleback")
+"""Scenes that compile quickly and are not among those of `test_golden`."""
 # Balances after a few steps of round-off, relative; loops and drives are solved a little less sharply.
 BALANCE = 1e-11
 # Second-order error of the suggested step in the quantities below [m, rad/s, relative].
@@ -25,33 +24,28 @@ DIGITS = {5: (5e-4, 0.05, 0.5), 10: (0.05, 0.05, 0.5), 20: (0.05, 0.05, 0.05), 4
 DIGITS |= {80: (5e-4, 0.05, 0.005)}
 
 
-def scenes(*, quick: bool):
-    return [name for name in gallery.SCENES if (name in QUICK) == quick and name not in ELSEWHERE]
-
-
-def check(name: str):
-    example = gallery.load(name)
-    assert example.name == name
-    assert gallery.describe(name).endswith(".")
-    trajectory = example.simulate(steps=20)
-    errors = balance(example.system, trajectory)
+def keeps_its_balances(example, trajectory):
+    errors = nc.balance(example.system, trajectory)
     assert errors.energy.max() <= BALANCE
     assert errors.momentum is None or errors.momentum.max() <= BALANCE
     assert errors.angular_momentum is None or errors.angular_momentum.max() <= BALANCE
     assert float(example.system.constraint_errors(trajectory).position.max()) <= BALANCE
-    if "dofs" in example.facts:
-        assert example.system.structure.dofs == example.facts["dofs"]
 
 
-@pytest.mark.parametrize("name", scenes(quick=True))
-def test_scene(name: str):
-    check(name)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", scenes(quick=False))
-def test_other_scene(name: str):
-    check(name)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.slow if name in SLOW else pytest.mark.exhaustive)
+        for name in gallery.SCENES
+        if name not in ELSEWHERE
+    ],
+)
+def test_scenes_run_and_keep_their_balances(name):
+    example = gallery.load(name)
+    assert example.name == name
+    assert gallery.describe(name).endswith(".")
+    assert example.system.structure.dofs == example.facts.get("dofs", example.system.structure.dofs)
+    keeps_its_balances(example, example.simulate(steps=20))
 
 
 def test_an_unknown_scene_is_refused():
@@ -62,16 +56,19 @@ def test_an_unknown_scene_is_refused():
 def test_double_pendulum_meets_its_reference():
     example = gallery.load("double_pendulum")
     trajectory = example.simulate(steps=500, dt=0.001)
+    keeps_its_balances(example, trajectory)
     last = np.asarray(trajectory.q)[-1].reshape(-1, 4, 3)[1]
     tip = last[0] + last[1]
     assert tip == pytest.approx(np.array(example.facts["tip"][0.5]), abs=1e-4)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(("name", "time"), [("free_body", 1.0), ("dzhanibekov", 3.0)])
 def test_spinning_bodies_meet_their_references(name: str, time: float):
     example = gallery.load(name)
     steps = 4000
     trajectory = example.simulate(steps=steps, dt=time / steps)
+    keeps_its_balances(example, trajectory)
     q, v = (np.asarray(x)[-1].reshape(4, 3)[1:] for x in (trajectory.q, trajectory.v))
     spin = 0.5 * np.sum(np.cross(q, v), axis=0)
     assert q @ spin == pytest.approx(np.array(example.facts["body rates"][time]), abs=ACCURACY)
@@ -93,6 +90,7 @@ def test_the_stiff_chain_is_that_of_the_peers():
     assert all(float(stored[f"spring {k}"]) > 0 for k in range(1, 6))
 
 
+@pytest.mark.slow
 def test_the_stiff_chain_swings_slowly():
     """Fast modes, of 80 rad a step, stay at rest: springs are stretched as the swing wants, by a micron."""
     example = gallery.load("stiff_chain")
@@ -105,6 +103,7 @@ def test_the_stiff_chain_swings_slowly():
     assert np.max(np.abs(middle - middle[0])) >= 0.5, "it does not swing"
 
 
+@pytest.mark.exhaustive
 def test_torque_formulas_give_the_table_of_the_paper():
     comparisons = {(c.formula, c.steps): c for c in compare_torques()}
     for steps, (energy, wrong_energy, wrong_momentum) in TABLE.items():
@@ -117,13 +116,8 @@ def test_torque_formulas_give_the_table_of_the_paper():
         assert right.t.shape == right.energy.shape == (steps + 1,)
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(x, marks=pytest.mark.slow if x == "four_bar" else pytest.mark.exhaustive)
-        for x in gallery.SCENES
-    ],
-)
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("name", gallery.SCENES)
 def test_modes_of_differentiation_agree(name: str):
     """Forward and reverse, along a change of velocities and one of all masses."""
     example, steps = gallery.load(name), 20

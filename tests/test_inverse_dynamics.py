@@ -1,4 +1,4 @@
-"""Inverse dynamics of systems with parts that no input acts on."""
+"""Inverse dynamics and computed torque: paths are followed, with parts that no input acts on."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -52,18 +52,19 @@ def test_a_passive_joint_moves_as_it_must():
     scene.add(nc.JointForce(rail, name="push"))
     system, state = scene.compile()
     path = 0.8 * smooth(np.linspace(0.0, 1.0, 41)[1:, None])
-    inputs, _ = nc.inverse_dynamics(system, state, path, dt=0.02, joints=[rail])
+    inputs, states = nc.inverse_dynamics(system, state, path, dt=0.02, joints=[rail])
     run = nc.simulate(system, state, dt=0.02, inputs=inputs)
+    np.testing.assert_allclose(states.q, run.q[1:], atol=1e-11)
     np.testing.assert_allclose(system.coordinate(run, rail)[1:], path[:, 0], atol=1e-11)
     assert float(jnp.abs(system.coordinate(run, hinge)).max()) > 0.2
     # Momentum: the push is all that acts along the rail.
     pushed = 0.02 * np.cumsum(inputs[:, 0])
     np.testing.assert_allclose(system.momentum(run)[1:, 0], pushed, atol=1e-10)
     with pytest.raises(ValueError, match="cannot bring about the path in step 0.*joints="):
-        both = np.concatenate([path, path], axis=1)
-        nc.inverse_dynamics(system, state, both, dt=0.02)
+        twice = np.concatenate([path, path], axis=1)
+        nc.inverse_dynamics(system, state, twice, dt=0.02)
     with pytest.raises(ValueError, match=r"shape \(40, 2\).*'rail \[0\]'"):
-        nc.inverse_dynamics(system, state, both, dt=0.02, joints=["rail"])
+        nc.inverse_dynamics(system, state, twice, dt=0.02, joints=["rail"])
 
 
 @pytest.mark.exhaustive
@@ -81,6 +82,7 @@ def test_computed_torque_holds_an_unstable_path(flexible_arm):
     assert float(abs(error[0, 0])) > 0.03 and float(abs(error[-1, 0])) < 0.01
 
 
+@pytest.mark.slow
 def test_errors_decay_at_the_bandwidth():
     """On a disc the error is that of the formulas, with a double pole."""
     scene = nc.Scene()

@@ -39,6 +39,11 @@ REWRITTEN = frozenset(("dot_general", "scatter", "scatter-add", *INLINED))
 """Primitives that may be rewritten in terms of those."""
 
 
+LOOPS = "while", "scan"
+UPDATES = {"dynamic_update_slice": 1, "scatter": 2, "scatter-add": 2}
+"""Operations that change a part of an array in place, and the operand that is this part."""
+
+
 def _inner_programs(equation: Any) -> list[Any]:
     """Programs among the parameters of an equation."""
     found = []
@@ -57,20 +62,32 @@ def operations(program: Any) -> int:
 
 
 def mean_size(program: Any) -> float:
-    """Numbers that an operation of a program finds on average."""
-    count, numbers = _sizes(program)
+    """Numbers that an operation of a program finds on average, of its loops if it has any.
+
+    What is outside of loops runs once, and an update in place finds what it changes: a record of all steps
+    says nothing about the size of one.
+    """
+    outside, inside = _sizes(program)
+    count, numbers = inside if inside[0] else outside
     return numbers / max(count, 1)
 
 
-def _sizes(program: Any) -> tuple[int, int]:
-    """Operations without programs in them, and the numbers that they find."""
-    count, numbers = 0, 0
+def _sizes(program: Any) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Operations without programs in them and the numbers that they find, outside of loops and inside."""
+    outside, inside = [(0, 0)], [(0, 0)]
     for equation in _needed(program):
-        inner = [_sizes(x) for x in _inner_programs(equation)]
-        here = 1, sum(math.prod(x.aval.shape) for x in equation.outvars)
-        for a, b in inner or [here]:
-            count, numbers = count + a, numbers + b
-    return count, numbers
+        parts = [_sizes(x) for x in _inner_programs(equation)]
+        looped = equation.primitive.name in LOOPS
+        (inside if looped else outside).extend(part[0] for part in parts or [((1, _changed(equation)),)])
+        inside.extend(part[1] for part in parts if len(part) > 1)
+    return tuple(map(sum, zip(*outside))), tuple(map(sum, zip(*inside)))  # pyright: ignore[reportReturnType]
+
+
+def _changed(equation: Any) -> int:
+    """Numbers that an operation finds."""
+    place = UPDATES.get(equation.primitive.name)
+    arrays = equation.outvars if place is None else [equation.invars[place]]
+    return sum(math.prod(x.aval.shape) for x in arrays)
 
 
 def _needed(program: Any) -> list[Any]:
