@@ -1,5 +1,6 @@
 """What sweeps are made of in tests, at the top of a module that workers import."""
 
+import os
 import sys
 import time
 from pathlib import Path
@@ -9,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 
 import natcoord_jax as nc
-from natcoord_jax.sweeps import run as running
 
 jax.config.update("jax_enable_x64", True)
 if sys.argv[1:2] == ["share"] and not jax.distributed.is_initialized():
@@ -36,31 +36,40 @@ def angle(mass, torque, dt, steps):
     return {"angle": run.states.coordinates[-1, 0], "result": run.result}
 
 
+WORKED: list[tuple[float, float]] = []
+"""Rows that this process has worked through, in turn."""
+
+
+def _work(x, y):
+    """Takes its time where that is wished for, and breaks down once where a file says so."""
+    time.sleep(float(os.environ.get("SWEEP_SECONDS", 0.0)))
+    flag = Path(os.environ.get("SWEEP_BREAKS", "nowhere"))
+    if x == 5.0 and flag.exists():
+        flag.unlink()
+        raise RuntimeError("this row is broken")
+    WORKED.append((float(x), float(y)))
+    return np.asarray(x + y)
+
+
 def line(x, y):
-    """Something that takes no time."""
-    return {"sum": x + y, "pair": jnp.stack([x, y])}
+    """Something that takes next to no time."""
+    total = jax.pure_callback(_work, jax.ShapeDtypeStruct((), float), x, y, vmap_method="sequential")
+    return {"sum": total, "pair": jnp.stack([x, y])}
+
+
+def rooms(x, steps):
+    """The number of steps that a lane is given, and how many it has room for."""
+    return {"x": x, "number": jnp.asarray(steps.number), "most": jnp.asarray(steps.most)}
 
 
 AXES = {
-    "mass": np.array([1.0, 1.5, 2.0]),
-    "torque": np.array([0.0, 1.0, np.nan, 2.0]),
-    ("dt", "steps"): (np.array([0.02, 0.01, 0.002]), np.array([10, 20, 100])),
+    "mass": np.array([1.0, 1.5]),
+    "torque": np.array([0.0, np.nan, 2.0]),
+    ("dt", "steps"): (np.array([0.02, 0.01]), np.array([10, 20])),
 }
 LINE = {"x": np.arange(20.0), "y": np.arange(7.0)}
 SWEEP = {"axes": AXES, "buckets": ("steps",), "block": 4}
 LINES = {"axes": LINE, "block": 4}
-
-
-def slowly(store):
-    """A sweep that can be killed in the middle."""
-    worked = running._worked
-
-    def slow(*given):
-        time.sleep(0.05)
-        return worked(*given)
-
-    running._worked = slow
-    nc.sweep(line, store=store, **LINES)
 
 
 def share(store):
@@ -74,11 +83,11 @@ if __name__ == "__main__":
     sys.path.insert(0, str(Path(__file__).parent))
     import sweeping
 
-    command, *given = sys.argv[1:]
+    command, *arguments = sys.argv[1:]
     {
-        "slowly": lambda: sweeping.slowly(given[0]),
-        "share": lambda: sweeping.share(given[0]),
+        "line": lambda: nc.sweep(sweeping.line, store=arguments[0], **LINES),
+        "share": lambda: sweeping.share(arguments[0]),
         "devices": lambda: print(
-            len(jax.local_devices()), nc.sweep(sweeping.angle, store=given[0], **SWEEP).explain()
+            len(jax.local_devices()), nc.sweep(sweeping.angle, store=arguments[0], **SWEEP).explain()
         ),
     }[command]()
