@@ -72,6 +72,7 @@ def test_the_file_holds_the_motion(tmp_path):
     np.testing.assert_allclose(page.scene["times"], trajectory.t)
 
 
+@pytest.mark.slow
 def test_surfaces_springs_forces_and_traces(tmp_path):
     system, trajectory, corner = sheet()
     page = Page(nc.view(system, trajectory, file=tmp_path / "a.html", colour="energy", traces=[corner]))
@@ -187,6 +188,7 @@ def test_nodes_on_surfaces_have_arrows_that_are_the_force_together(tmp_path):
     assert np.all(np.linalg.norm(arrows[:, :, 1], axis=-1)[drawn] < 0.21 * long[drawn] + near), "discs"
 
 
+@pytest.mark.slow
 def test_forces_are_drawn_over_what_they_are_inside_of():
     """Could go wrong: one list of faces, in which those of a body hide the force of a contact below it."""
     figure = nc.plot(*sheet()[:2], times=(0.1,))
@@ -220,6 +222,7 @@ def test_a_run_without_the_contacts_of_others_is_shown_with_them(tmp_path):
         assert np.isnan(force.rows[k]).all() and np.isfinite(force.rows[1 - k]).any()
 
 
+@pytest.mark.slow
 def test_values_of_elements_that_are_handed_over(tmp_path):
     system, trajectory, _ = sheet()
     page = Page(nc.view(system, trajectory, file=tmp_path / "a.html", colour={"plate": [1.0, 3.0]}))
