@@ -7,9 +7,6 @@ import mujoco
 import numpy as np
 
 import natcoord_jax as nc
-from natcoord_jax.io.actuation import actuator_name, input_index
-from natcoord_jax.io.links import Poses
-from natcoord_jax.io.motion import at_rest, link_poses
 
 SOFT = ("CONTACT", "LIMIT", "FRICTIONLOSS", "EQUALITY", "CONSTRAINT")
 """What MuJoCo has as soft constraints: switched off on both sides."""
@@ -25,6 +22,17 @@ class Agreement:
     acceleration: float
     condition: float = 1.0
     """Of the mass matrix, the largest."""
+
+
+def actuator_name(model, number):
+    """As our inputs are called."""
+    return model.actuator(number).name or f"actuator {number + 1}"
+
+
+def control_of(data, number):
+    """The control of an actuator, of which MuJoCo has had several for one since 4.0."""
+    addresses = getattr(data.model, "actuator_ctrladr", None)
+    return data.ctrl[number if addresses is None else int(addresses[number])]
 
 
 def comparable(robot):
@@ -60,31 +68,25 @@ def random_data(model, rng):
 
 def inputs_of(robot, system, data, rng):
     """Our inputs for the same: controls or activations, and torques of motors that the file does not have."""
-    model, found = data.model, np.zeros(len(system.structure.inputs))
+    model, values = data.model, np.zeros(len(system.structure.inputs))
     numbers = {actuator_name(model, k): k for k in range(len(model.actuator_trntype))}
     for place, name in enumerate(robot.inputs):
         if name in numbers:
             number = numbers[name]
             active = model.actuator_actadr[number]
-            found[place] = data.ctrl[input_index(model, number)] if active < 0 else data.act[active]
+            values[place] = control_of(data, number) if active < 0 else data.act[active]
         else:
-            found[place] = data.qfrc_applied[robot.joints[name].rate_index] = rng.normal()
-    return found
+            values[place] = data.qfrc_applied[robot.joints[name].rate_index] = rng.normal()
+    return values
 
 
-def columns(robot, positions):
-    """Velocities of the rows of the links per unit of each rate: (rates, links, 4, 3)."""
-    file, base = robot.description, at_rest(np.zeros(3), np.eye(3))
-    unit = np.eye(file.rate_count)
-    return np.array([
-        [poses[-1].rows()[1] for poses in link_poses(file, base, positions, rates)] for rates in unit
-    ])  # fmt: skip
-
-
-def dynamics(robot, system, handle, positions):
+def dynamics(robot, system, handle, start, positions):
     """Mass matrix and gravity torques, from the mass blocks of the compiled system."""
-    velocities = columns(robot, positions)
-    blocks = np.asarray(system.mass)[[system.body_index(bodies[-1]) for bodies in handle.parts.carriers]]
+    velocities = np.array([
+        np.asarray(handle.state(system, start, positions, rates).v).reshape(-1, 4, 3)
+        for rates in np.eye(robot.description.rate_count)
+    ])  # fmt: skip
+    blocks = np.asarray(system.mass)
     mass = np.einsum("ilac,lab,jlbc->ij", velocities, blocks, velocities)
     for joint in robot.joints.values():
         mass[joint.rate_index, joint.rate_index] += joint.armature
@@ -94,18 +96,18 @@ def dynamics(robot, system, handle, positions):
 
 def accelerations_of(robot, data):
     """Second derivatives of the rows of the links (links, 4, 3), from MuJoCo's."""
-    model, found = data.model, []
+    model, rows = data.model, []
     mujoco.mj_rnePostConstraint(model, data)
     kind = mujoco.mjtObj.mjOBJ_XBODY
-    for body in Poses(model).heads:
-        both = np.zeros(6)
-        mujoco.mj_objectAcceleration(model, data, kind, body, both, 0)
-        turning, moving = both[:3].copy(), both[3:] + robot.description.gravity
-        mujoco.mj_objectVelocity(model, data, kind, body, both, 0)
-        spin, axes = both[:3].copy(), data.xmat[body].reshape(3, 3).T
+    for link in robot.description.links:
+        body, twist = model.body(link.name).id, np.zeros(6)
+        mujoco.mj_objectAcceleration(model, data, kind, body, twist, 0)
+        turning, moving = twist[:3].copy(), twist[3:] + robot.description.gravity
+        mujoco.mj_objectVelocity(model, data, kind, body, twist, 0)
+        spin, axes = twist[:3].copy(), data.xmat[body].reshape(3, 3).T
         bent = np.cross(turning, axes) + np.cross(spin, np.cross(spin, axes))
-        found.append(np.vstack([moving, bent]))
-    return np.array(found)
+        rows.append(np.vstack([moving, bent]))
+    return np.array(rows)
 
 
 def off(one, other, least=1e-300):
@@ -119,24 +121,24 @@ def agreement(robot, *, states=10, seed=0):
     scene, rng, model = nc.Scene(), np.random.default_rng(seed), comparable(robot)
     handle = scene.add(robot)
     system, start = scene.compile()
-    found, ours, theirs, inputs = Agreement(0.0, 0.0, 0.0), [], [], []
+    agreed, ours, theirs, inputs = Agreement(0.0, 0.0, 0.0), [], [], []
     for _ in range(states):
         data = random_data(model, rng)
         inputs.append(inputs_of(robot, system, data, rng))
         mujoco.mj_forward(model, data)
         full = np.zeros((model.nv, model.nv))
         mujoco.mj_fullM(model, data, full)
-        mass, gravity = dynamics(robot, system, handle, data.qpos)
-        found.mass = max(found.mass, off(mass, full))
-        found.condition = max(found.condition, float(np.linalg.cond(full)))
+        mass, gravity = dynamics(robot, system, handle, start, data.qpos)
+        agreed.mass = max(agreed.mass, off(mass, full))
+        agreed.condition = max(agreed.condition, float(np.linalg.cond(full)))
         ours.append(handle.state(system, start, data.qpos, data.qvel))
         theirs.append(accelerations_of(robot, data))
         data.qvel[:] = 0.0
         mujoco.mj_forward(model, data)
-        found.gravity = max(found.gravity, off(gravity, data.qfrc_bias, np.max(full)))
-    together = jax.tree.map(lambda *x: np.stack(x), *ours)
-    rows = np.asarray(system.instant(together, np.array(inputs)).accelerations)
+        agreed.gravity = max(agreed.gravity, off(gravity, data.qfrc_bias, np.max(full)))
+    batch = jax.tree.map(lambda *x: np.stack(x), *ours)
+    rows = np.asarray(system.instant(batch, np.array(inputs)).accelerations)
     rows = rows.reshape(states, -1, 4, 3)
-    places = [system.body_index(bodies[-1]) for bodies in handle.parts.carriers]
-    found.acceleration = max(off(a[places], b) for a, b in zip(rows, theirs))
-    return found
+    places = [system.body_index(handle.bodies[link.name]) for link in robot.description.links]
+    agreed.acceleration = max(off(a[places], b) for a, b in zip(rows, theirs))
+    return agreed

@@ -7,10 +7,10 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from pages import Page, still
 from robots import HARD, agreement
 
 import natcoord_jax as nc
-from natcoord_jax.viz.outline import bodies_of
 
 CLOSE = 1e-9
 """What is asked for; it is 1e-14 where inertias are not of very different sizes."""
@@ -130,13 +130,20 @@ def reasons(robot):
 # --- beside MuJoCo ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("text, options", [(RICH, {}), (MACHINE, {"floating": True})], ids=["mjcf", "urdf"])
+@pytest.mark.parametrize(
+    "text, options",
+    [
+        pytest.param(RICH, {}, id="mjcf"),
+        pytest.param(MACHINE, {"floating": True}, id="urdf", marks=pytest.mark.slow),
+    ],
+)
 def test_mass_gravity_and_accelerations_are_mujocos(text, options):
     """At ten random states with velocities, torques and controls, some of them cut off."""
-    found = agreement(nc.io.load(text, leave_out=HARD, **options))
-    assert found.mass < CLOSE and found.gravity < CLOSE and found.acceleration < CLOSE, found
+    off = agreement(nc.io.load(text, leave_out=HARD, **options))
+    assert off.mass < CLOSE and off.gravity < CLOSE and off.acceleration < CLOSE, off
 
 
+@pytest.mark.exhaustive
 def test_torques_of_inverse_dynamics_are_mujocos():
     """Those of the discrete motion approach MuJoCo's at the middle of a step with the square of the step."""
     robot, scene = nc.io.load(ARM, leave_out=HARD), nc.Scene()
@@ -150,12 +157,12 @@ def test_torques_of_inverse_dynamics_are_mujocos():
     size, steps, errors = np.linspace(5.0, 13.0, len(names)), 20, []
     for dt in (0.02, 0.01):
         path = size * (dt * np.arange(1, steps + 1)[:, None]) ** 5
-        given, _ = nc.inverse_dynamics(system, state, path, dt=dt)
+        torques, _ = nc.inverse_dynamics(system, state, path, dt=dt)
         data, t = mujoco.MjData(model), (steps - 0.5) * dt
         data.qpos[places], data.qvel[places] = size * t**5, 5 * size * t**4
         data.qacc[places] = 20 * size * t**3
         mujoco.mj_inverse(model, data)
-        errors.append(np.max(np.abs(np.asarray(given)[-1, channels] - data.qfrc_inverse[places])))
+        errors.append(np.max(np.abs(np.asarray(torques)[-1, channels] - data.qfrc_inverse[places])))
     assert errors[0] < 5e-3 * np.max(np.abs(data.qfrc_inverse))
     # The fourth derivative of the path, by which the error goes, is half as large at half the time.
     assert 7.0 < errors[0] / errors[1] < 9.0
@@ -207,7 +214,7 @@ def humanoid():
 SIDES = (("left", 0.25), ("right", -0.25))
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_humanoid_flies_freely():
     robot = nc.io.load(humanoid())
     scene = nc.Scene()
@@ -225,6 +232,7 @@ def test_a_humanoid_flies_freely():
 # --- part by part -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.exhaustive
 def test_links_that_are_fixed_to_each_other_are_one_body():
     robot = machine()
     assert robot.bodies == ("tower", "boom", "finger", "other finger", "cross", "cup", "odd")
@@ -254,15 +262,16 @@ def test_frames_are_where_mujoco_has_them():
         np.testing.assert_allclose(system.sense(moved, frame.point).position, wanted, atol=1e-14)
     axis = system.sense(moved, handle.sites["thruster"].axes[2])
     np.testing.assert_allclose(axis.position, data.site("thruster").xmat.reshape(3, 3)[:, 2], atol=1e-14)
-    for name, held in handle.joints.items():
+    for name, joint in handle.joints.items():
         if robot.joints[name].has_coordinate:
             place = robot.joints[name].position_index
-            assert float(system.coordinate(moved, held)) == pytest.approx(key.positions[place])
+            assert float(system.coordinate(moved, joint)) == pytest.approx(key.positions[place])
     assert float(system.constraint_errors(moved).velocity.max()) < 1e-14
     with pytest.raises(ValueError, match=r"positions \[rad, m\] has shape \(2,\); pass \(18,\)"):
         handle.state(system, state, [0.0, 0.0])
 
 
+@pytest.mark.exhaustive
 def test_what_follows_another_joint_does():
     scene = nc.Scene()
     crane = scene.add(machine(leave_out=("limits", "friction")))
@@ -297,11 +306,11 @@ LOOP = """
 """
 
 
-def test_equality_constraints_hold():
+def test_equality_constraints_hold_and_are_saved():
     robot = nc.io.load(LOOP)
-    found = reasons(robot)
-    assert found["curved"] == "only linear relations between joints are mapped"
-    assert found["asleep"] == "it is not active in the file"
+    notes = reasons(robot)
+    assert notes["curved"] == "only linear relations between joints are mapped"
+    assert notes["asleep"] == "it is not active in the file"
     scene = nc.Scene()
     handle = scene.add(robot)
     system, state = scene.compile(assemble=True)
@@ -309,6 +318,14 @@ def test_equality_constraints_hold():
     c, d = (float(system.coordinate(state, handle.joints[name])) for name in "cd")
     assert d == pytest.approx(0.1 - 2 * (c - 0.5))
     assert float(system.constraint_errors(state).position.max()) < 1e-12
+    saved = nc.io.save_mjcf(system, state)
+    model = mujoco.MjModel.from_xml_string(saved.text)
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+    mujoco.mj_forward(model, data)
+    assert model.neq == 2  # the weld is the joint by which the load hangs
+    assert np.max(np.abs(data.efc_pos[data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY])) < 1e-10
+    assert "equality constraints: MuJoCo's are soft" in saved.text
 
 
 def test_what_is_not_mapped_is_listed_by_name():
@@ -321,8 +338,8 @@ def test_what_is_not_mapped_is_listed_by_name():
       <actuator><muscle name="muscle" joint="hinge" lengthrange="0.1 1"/>
         <motor name="winch" tendon="wire"/></actuator>
       <sensor><jointpos joint="hinge"/></sensor></mujoco>"""
-    found = reasons(nc.io.load(text))
-    assert set(found) >= {
+    notes = reasons(nc.io.load(text))
+    assert set(notes) >= {
         "socket", "muscle", "winch", "stiffness of wire", "fluid", "1 sensors", "friction loss"
     }  # fmt: skip
     said = str(nc.io.load(text))
@@ -337,19 +354,20 @@ def test_impossible_inertias_are_balanced_and_listed():
     odd = next(one for one in robot.description.links if one.name == "odd")
     np.testing.assert_allclose(np.linalg.eigvalsh(odd.inertia), np.trace(odd.inertia) / 3)
     negative = link("a", moments=(-0.01, 0.02, 0.02)) + link("b") + joint("j", "continuous", "a", "b")
-    found = nc.io.load(f'<robot name="r">{negative}</robot>', floating=True)
-    assert "balances" in reasons(found)["a"]
-    assert found.bodies == ("a", "b")
+    robot = nc.io.load(f'<robot name="r">{negative}</robot>', floating=True)
+    assert "balances" in reasons(robot)["a"]
+    assert robot.bodies == ("a", "b")
 
 
 def test_missing_meshes_and_links_without_mass_are_notes():
-    found = reasons(machine())
-    assert found["package://nowhere/shell.stl"] == "the mesh file is not there; it is not drawn"
-    assert found["wave"].startswith("it moves no mass, and is fixed")
+    notes = reasons(machine())
+    assert notes["package://nowhere/shell.stl"] == "the mesh file is not there; it is not drawn"
+    assert notes["wave"].startswith("it moves no mass, and is fixed")
     assert nc.io.load(MACHINE).joints["lift"].velocity == 2.0
     assert nc.io.load(MACHINE).joints["lift"].effort == (-50.0, 50.0)
 
 
+@pytest.mark.exhaustive
 def test_several_robots_in_one_scene():
     robot = nc.io.load(nc.io.PENDULUM)
     scene = nc.Scene()
@@ -369,17 +387,18 @@ def test_several_robots_in_one_scene():
     assert len([e for e in scene.effects.values() if isinstance(e, nc.Gravity)]) == 1
 
 
-def test_what_is_drawn_is_that_of_the_file():
-    robot = nc.io.load(RICH)
+def test_what_is_drawn_is_that_of_the_file(tmp_path):
+    text = """<mujoco><worldbody><body name="trunk" pos="0 0 1"><freejoint/>
+      <geom type="box" size="0.3 0.2 0.1"/><body name="hip" pos="0.3 0.1 0"><joint axis="1 0 0"/>
+        <geom type="capsule" size="0.05" fromto="0 0 0 0 0 -0.4"/></body></body></worldbody></mujoco>"""
+    robot = nc.io.load(text)
     scene = nc.Scene()
     handle = scene.add(robot)
     system, state = scene.compile()
-    trunk, hip = (system.body_index(handle.bodies[name]) for name in ("trunk", "hip"))
-    drawn = bodies_of(system, (trunk, hip))
-    (points, faces), _ = drawn[trunk]
-    np.testing.assert_allclose(np.ptp(points, axis=0), (0.6, 0.4, 0.2))
-    assert len(faces) == 6
-    assert np.min(drawn[hip][0][0][:, 2]) < -0.44
+    page = Page(nc.view(system, still(system, state), file=tmp_path / "a.html"))
+    trunk, hip = (page.part(handle.bodies[name].name).place for name in ("trunk", "hip"))
+    np.testing.assert_allclose(np.ptp(trunk, axis=0), (0.6, 0.4, 0.2), atol=1e-3)
+    assert np.min(hip[:, 2]) < -0.44
     assert len(robot.description.links[0].surface.colours) == 6
 
 
@@ -465,44 +484,28 @@ def test_what_is_saved_moves_with_mujoco_as_here(tmp_path):
     # The string is not written, so it is made slack here.
     rows = system.set("string", stiffness=0.0).instant(state, inputs).accelerations.reshape(-1, 4, 3)
     for name in system.structure.bodies:
-        number, both = system.body_index(name), np.zeros(6)
+        number, twist = system.body_index(name), np.zeros(6)
         np.testing.assert_allclose(state.q[4 * number], data.body(name).xpos, atol=1e-12)
         kind = mujoco.mjtObj.mjOBJ_XBODY
-        mujoco.mj_objectAcceleration(model, data, kind, data.body(name).id, both, 0)
-        np.testing.assert_allclose(rows[number, 0], both[3:] + model.opt.gravity, rtol=1e-9, atol=1e-9)
-
-
-def test_loops_are_saved_as_equalities():
-    scene = nc.Scene()
-    scene.add(nc.io.load(LOOP))
-    system, state = scene.compile(assemble=True)
-    saved = nc.io.save_mjcf(system, state)
-    model = mujoco.MjModel.from_xml_string(saved.text)
-    data = mujoco.MjData(model)
-    mujoco.mj_resetDataKeyframe(model, data, 0)
-    mujoco.mj_forward(model, data)
-    assert model.neq == 2  # the weld is the joint by which the load hangs
-    assert np.max(np.abs(data.efc_pos[data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY])) < 1e-10
-    assert "equality constraints: MuJoCo's are soft" in saved.text
+        mujoco.mj_objectAcceleration(model, data, kind, data.body(name).id, twist, 0)
+        np.testing.assert_allclose(rows[number, 0], twist[3:] + model.opt.gravity, rtol=1e-9, atol=1e-9)
 
 
 # --- errors -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "source, error, words",
-    [
+def test_errors_say_what_to_do():
+    wrong = [
         ("nowhere.urdf", FileNotFoundError, "there is no file 'nowhere.urdf'"),
         (3, ValueError, "source is an object of type int; pass the path"),
         ("<robot", ValueError, "no XML"),
         ("<html/>", ValueError, "root <html>; pass URDF"),
         ("<mujoco><worldbody><body><joint/></body></worldbody></mujoco>", ValueError, "mass and inertia"),
         ("<mujoco><nonsense/></mujoco>", ValueError, "does not read it"),
-    ],
-)
-def test_errors_say_what_to_do(source, error, words):
-    with pytest.raises(error, match=words):
-        nc.io.load(source)
+    ]
+    for source, error, words in wrong:
+        with pytest.raises(error, match=words):
+            nc.io.load(source)
 
 
 def test_without_mujoco_the_line_to_install_it_is_told(monkeypatch):

@@ -33,40 +33,23 @@ def assert_equal(one, other):
             np.testing.assert_array_equal(x, y)
 
 
-def round_trip(name, path, programs):
-    """A scene comes back with an equal structure and serves the same programs, with the same results."""
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=() if n == "pendulum" else pytest.mark.exhaustive) for n in gallery.SCENES],
+)
+def test_scenes_come_back(name, tmp_path, programs):
+    """With an equal structure: they serve the same programs, with the same results."""
     example = gallery.load(name)
-    system, state = again((example.system, example.state), path)
+    system, state = again((example.system, example.state), tmp_path / "scene.nc")
     assert_equal((system, state), (example.system, example.state))
     assert system.structure == example.system.structure
     assert hash(system.structure) == hash(example.system.structure)
+    assert system.report() == example.system.report()
     before = nc.simulate(example.system, example.state, dt=example.dt, steps=2, throw=False)
     del programs[:]
     after = nc.simulate(system, state, dt=example.dt, steps=2, throw=False)
     assert not programs
     assert_equal(before, after)
-
-
-@pytest.mark.parametrize("name", ["pendulum", "four_bar"])
-def test_scenes_come_back(name, tmp_path, programs):
-    round_trip(name, tmp_path / "scene.nc", programs)
-
-
-@pytest.mark.exhaustive
-@pytest.mark.parametrize("name", [name for name in gallery.SCENES if name not in ("pendulum", "four_bar")])
-def test_every_scene_comes_back(name, tmp_path, programs):
-    round_trip(name, tmp_path / "scene.nc", programs)
-
-
-@pytest.mark.parametrize(
-    "name",
-    [pytest.param(n, marks=pytest.mark.exhaustive) if n == "tennis" else n for n in gallery.SCENES],
-)
-def test_every_structure_comes_back(name, tmp_path):
-    example = gallery.load(name)
-    system = again(example.system, tmp_path / "scene.nc")
-    assert_equal(system, example.system)
-    assert system.structure == example.system.structure and system.report() == example.system.report()
 
 
 def swing(energy=softening):
@@ -81,8 +64,11 @@ def swing(energy=softening):
 def test_laws_of_ones_own_are_found_by_name(tmp_path):
     system, state = swing()
     loaded, start = again((system, state), tmp_path / "swing.nc")
+    assert_equal((loaded, start), (system, state))
     run = {"dt": 0.05, "steps": 4, "inputs": np.ones(1)}
-    assert_equal(nc.simulate(system, state, **run), nc.simulate(loaded, start, **run))
+    trajectory = nc.simulate(system, state, **run)
+    assert_equal(nc.simulate(loaded, start, **run), trajectory)
+    assert_equal(again(trajectory, tmp_path / "run.nc"), trajectory)
     structure = zipfile.ZipFile(tmp_path / "swing.nc").read("structure.json").decode()
     assert f"{__name__}:softening" in structure
 
@@ -95,14 +81,18 @@ def test_what_has_no_name_is_refused(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.slow
-def test_trajectories_problems_and_solutions_come_back(tmp_path):
-    system, state = swing()
-    trajectory = nc.simulate(system, state, dt=0.05, steps=4, scheme=nc.EnergyMomentum(order=2))
-    assert_equal(again(trajectory, tmp_path / "x.nc"), trajectory)
-    problem = nc.OptimalControl(system, state, dt=0.1, steps=3, cost=nc.cost.Effort(), goal=nc.goal.Rest())
+def problem_of(system, state):
+    return nc.OptimalControl(system, state, dt=0.1, steps=3, cost=nc.cost.Effort(), goal=nc.goal.Rest())
+
+
+def test_problems_come_back(tmp_path):
+    problem = problem_of(*swing())
     assert_equal(again(problem, tmp_path / "x.nc"), problem)
-    solution = nc.optimise(problem, max_iterations=2)
+
+
+@pytest.mark.exhaustive
+def test_solutions_come_back(tmp_path):
+    solution = nc.optimise(problem_of(*swing()), max_iterations=2)
     loaded = again(solution, tmp_path / "x.nc")
     np.testing.assert_array_equal(loaded.inputs, solution.inputs)
     assert loaded.explain() == solution.explain() and loaded.outcome == solution.outcome

@@ -16,10 +16,12 @@ import pytest
 
 import natcoord_jax as nc
 from natcoord_jax import gallery
-from natcoord_jax.stepping import segments
 
 LAST_DIGITS = 1e-13
 """A run in one piece is another program, in which the compiler may round some sums otherwise, once a step."""
+STEPS = 40
+PACE = {"seconds": 0.0}
+"""What a step of the motor below takes in addition; segments are then of few steps."""
 
 
 @cache
@@ -36,10 +38,26 @@ def swing():
     return scene.compile()
 
 
-def run(steps=40, **options):
+def run(steps=STEPS, **options):
     system, state = swing()
-    given = {"dt": 0.01, "inputs": np.linspace(0.0, 2.0, 40)[:steps, None]} | options
-    return nc.simulate(system, state, steps=steps, **given)
+    options = {"dt": 0.01, "inputs": np.linspace(0.0, 2.0, STEPS)[:steps, None]} | options
+    return nc.simulate(system, state, steps=steps, **options)
+
+
+def _paced(t):
+    time.sleep(PACE["seconds"])
+    return np.zeros(np.shape(t))
+
+
+class Motor:
+    """Torques that take their time, and are no numbers from a time on: one program for all of these."""
+
+    def __init__(self, end=np.inf):
+        self.end = end
+
+    def __call__(self, t, state):
+        late = jax.pure_callback(_paced, jax.ShapeDtypeStruct((), float), t, vmap_method="broadcast_all")
+        return jnp.where(t > self.end, jnp.nan, 2.0 * jnp.sin(20.0 * t) + late)[None]
 
 
 def assert_same(one, other):
@@ -48,88 +66,85 @@ def assert_same(one, other):
         np.testing.assert_array_equal(np.asarray(x), np.asarray(y))
 
 
-def pace(monkeypatch, seconds):
-    monkeypatch.setattr(segments, "PATIENCE", seconds)
-
-
 OPTIONS = {
     "plain": {},
-    "order four": {"scheme": nc.EnergyMomentum(order=4)},
     "error control": {"rtol": 1e-6},
+    "order four": {"scheme": nc.EnergyMomentum(order=4)},
     "every fifth": {"save_every": 5},
     "event": {"until": lambda state: state.coordinates[0] - 0.1},
     "controller": {"inputs": lambda t, state: np.array([1.0]) - state.coordinates[:1]},
 }
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", OPTIONS)
-def test_states_do_not_depend_on_segments(name, monkeypatch):
-    whole = run(**OPTIONS[name])
-    pace(monkeypatch, 0.0)  # (of one step each, where every step is saved)
-    short = run(progress=True, **OPTIONS[name])
-    pace(monkeypatch, 1e9)
-    long = run(progress=True, **OPTIONS[name])
-    assert_same(short, long)
-    assert int(short.result) == int(whole.result)
-    for x, y in zip(jax.tree.leaves(short), jax.tree.leaves(whole), strict=True):
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=() if name == "plain" else pytest.mark.exhaustive) for name in OPTIONS],
+)
+def test_states_of_segments_are_those_of_one_piece(name, programs):
+    """Segments grow from one step on: of 1, 4, 16 and 19 steps."""
+    options = OPTIONS[name]
+    piece, shown = run(**options), run(progress=True, **options)
+    for x, y in zip(jax.tree.leaves(shown), jax.tree.leaves(piece), strict=True):
         np.testing.assert_allclose(x, y, rtol=LAST_DIGITS, atol=LAST_DIGITS)
+    codes = [[int(getattr(x, n)) for n in ("result", "failed_step")] for x in (shown, piece)]
+    assert codes[0] == codes[1] and (name == "event" or codes[0] == [0, STEPS])
+    if name == "plain":
+        assert not np.any(np.diff(shown.t) <= 0) and not os.isatty(2)
+        # Segments of other lengths, and another number of steps that there is room for, compile nothing.
+        del programs[:]
+        run(30, progress=True)
+        assert not programs
 
 
-def test_states_of_segments_are_those_of_one_piece(monkeypatch, programs):
-    whole = run()
-    pace(monkeypatch, 0.0)
-    short = run(progress=True)
-    np.testing.assert_allclose(short.q, whole.q, rtol=LAST_DIGITS, atol=LAST_DIGITS)
-    np.testing.assert_allclose(short.v, whole.v, rtol=LAST_DIGITS, atol=LAST_DIGITS)
-    counts = [[int(getattr(x, n)) for n in ("result", "failed_step", "steps_taken")] for x in (short, whole)]
-    assert counts[0] == counts[1] == [0, 40, 40]
-    assert not np.any(np.diff(short.t) <= 0) and not os.isatty(2)
-    # Other lengths, and another number of steps that there is room for, compile nothing.
-    pace(monkeypatch, 0.01)
-    del programs[:]
-    run(progress=True)
-    run(30, progress=True)
-    assert not programs
-
-
-def test_an_interruption_returns_what_was_reached(monkeypatch):
-    pace(monkeypatch, 0.05)
-    run(progress=True)  # (compiles)
-    before = signal.getsignal(signal.SIGINT)
-    begun = time.monotonic()
-    threading.Timer(0.5, lambda: os.kill(os.getpid(), signal.SIGINT)).start()
+def test_an_interruption_returns_what_was_reached_and_goes_on_to_the_same_bits(tmp_path, monkeypatch):
+    pytest.importorskip("h5py")
+    path, options = tmp_path / "run.h5", {"inputs": Motor()}
     system, _ = swing()
-    reached = run(progress=True, dt=1e-5, steps=400_000, inputs=np.zeros(1))
-    assert time.monotonic() - begun < 2.5
+    straight = run(progress=True, **options)
+    monkeypatch.setitem(PACE, "seconds", 0.1)
+    before = signal.getsignal(signal.SIGINT)
+    threading.Timer(0.7, lambda: os.kill(os.getpid(), signal.SIGINT)).start()
+    begun = time.monotonic()
+    reached = run(store=path, **options)
+    assert time.monotonic() - begun < 0.1 * STEPS, "it was not interrupted"
     assert signal.getsignal(signal.SIGINT) is before
     assert nc.Result(int(reached.result)) is nc.Result.INTERRUPTED
     count = int(reached.failed_step)
-    assert 0 < count < 400_000 and len(reached) == count + 1
-    assert float(reached.t[-1]) == pytest.approx(1e-5 * count) and np.isfinite(reached.q).all()
+    assert 0 < count < STEPS and len(reached) == count + 1
+    assert float(reached.t[-1]) == pytest.approx(0.01 * count) and np.isfinite(reached.q).all()
     assert "interrupted" in system.explain(reached) and "resume=True" in system.explain(reached)
+    monkeypatch.setitem(PACE, "seconds", 0.0)
+    assert_same(run(store=path, resume=True, **options), straight)
 
 
-def test_what_is_stored_is_what_ran(tmp_path, monkeypatch):
+def test_a_run_that_fails_is_stored_to_its_end(tmp_path):
+    pytest.importorskip("h5py")
+    path, motor = tmp_path / "run.h5", Motor(end=0.165)
+    with pytest.raises(nc.SimulationError, match="step 17.*'motor'") as caught:
+        run(store=path, inputs=motor)
+    stored, shown = nc.load(path), run(inputs=motor, throw=False, progress=True)
+    assert len(stored) < len(shown) == STEPS + 1 and len(caught.value.trajectory) == len(stored)
+    assert_same(shown.q[: len(stored)], stored.q)
+    assert np.all(np.asarray(shown.q[len(stored) :]) == np.asarray(stored.q[-1]))
+
+
+def test_what_is_stored_is_what_ran(tmp_path):
     pytest.importorskip("h5py")
     path = tmp_path / "run.h5"
-    pace(monkeypatch, 0.0)
-    there, shown = run(store=path), run(progress=True)
-    assert_same(there, shown)
+    stored, shown = run(store=path), run(progress=True)
+    assert_same(stored, shown)
     assert_same(nc.load(path), shown)
-    assert isinstance(there.q, np.memmap) and float(there[7].t) == float(shown[7].t)
+    assert isinstance(stored.q, np.memmap) and float(stored[7].t) == float(shown[7].t)
     system, _ = swing()
-    np.testing.assert_array_equal(system.energy(there[3:9]).total, system.energy(shown[3:9]).total)
+    np.testing.assert_array_equal(system.energy(stored[3:9]).total, system.energy(shown[3:9]).total)
     with pytest.raises(ValueError, match="is there already; pass resume=True"):
         run(store=path)
     assert_same(run(store=path, resume=True), shown)  # (nothing is left to do)
     with pytest.raises(ValueError, match="holds another run: dt differ"):
         run(store=path, resume=True, dt=0.02)
-    other = swing()[0].set("upper", mass=2.0)
+    other, inputs = system.set("upper", mass=2.0), np.linspace(0.0, 2.0, STEPS)[:, None]
     with pytest.raises(ValueError, match="holds another run: system differ"):
-        nc.simulate(
-            other, swing()[1], dt=0.01, inputs=np.linspace(0, 2.0, 40)[:, None], store=path, resume=True
-        )
+        nc.simulate(other, swing()[1], dt=0.01, inputs=inputs, store=path, resume=True)
     with pytest.raises(ValueError, match="pass its name as `store`"):
         run(resume=True)
     with pytest.raises(ValueError, match="outside of jit"):
@@ -137,23 +152,17 @@ def test_what_is_stored_is_what_ran(tmp_path, monkeypatch):
 
 
 KILLED = """
-import jax, sys, threading, os, time
+import jax, sys
 jax.config.update("jax_enable_x64", True)
 sys.path[:0] = [sys.argv[1] + "/tests"]
-import numpy as np
-import test_segments
-from natcoord_jax.stepping import segments
-segments.PATIENCE = 0.0
-class Slowly:
-    def is_set(self):
-        time.sleep(0.02)
-        return False
-segments._interruptions = __import__("contextlib").contextmanager(lambda: iter([Slowly()]))
-test_segments.run(store=sys.argv[2])
+import test_segments as tests
+tests.PACE["seconds"] = 0.1
+tests.run(store=sys.argv[2], inputs=tests.Motor())
 """
 
 
-def test_a_killed_run_goes_on_to_the_same_bits(tmp_path, monkeypatch):
+@pytest.mark.slow
+def test_a_killed_run_goes_on_to_the_same_bits(tmp_path):
     """A process is killed in the middle; another one goes on."""
     pytest.importorskip("h5py")
     path = tmp_path / "run.h5"
@@ -168,29 +177,12 @@ def test_a_killed_run_goes_on_to_the_same_bits(tmp_path, monkeypatch):
         process.kill()
         process.wait()
     reached = nc.load(path)
-    assert process.returncode == -signal.SIGKILL and 5 <= len(reached) - 1 < 40
-    pace(monkeypatch, 1e9)
-    assert_same(run(store=path, resume=True), run(progress=True))
+    assert process.returncode == -signal.SIGKILL and 5 <= len(reached) - 1 < STEPS
+    options = {"inputs": Motor()}
+    assert_same(run(store=path, resume=True, **options), run(progress=True, **options))
 
 
-def test_a_run_that_fails_is_stored_to_its_end(tmp_path):
-    pytest.importorskip("h5py")
-    path = tmp_path / "run.h5"
-
-    def inputs(t, state):
-        return jnp.where(t > 0.165, jnp.nan, 0.0)[None]
-
-    with pytest.raises(nc.SimulationError, match="step 17.*'motor'") as caught:
-        run(store=path, inputs=inputs)
-    whole, stored = run(inputs=inputs, throw=False), nc.load(path)
-    assert len(stored) < len(whole) == 41 and len(caught.value.trajectory) == len(stored)
-    shown = run(inputs=inputs, throw=False, progress=True)
-    assert_same(shown.q[: len(stored)], stored.q)
-    np.testing.assert_allclose(shown.q, whole.q, rtol=LAST_DIGITS, atol=LAST_DIGITS)
-    np.testing.assert_array_equal(shown.inputs, whole.inputs)
-
-
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_vtk_reads_elements_and_bodies(tmp_path):
     pytest.importorskip("h5py")
     io = pytest.importorskip("vtkmodules.vtkIOHDF")

@@ -1,17 +1,30 @@
-"""What the hard cases share: runs at every order, and the statistics of a drift."""
+"""What the hard cases share: runs at an order, what they have lost, and the statistics of a drift."""
 
 from dataclasses import dataclass
 from typing import Any
 
-import jax
 import numpy as np
 import pytest
+import tolerances as tol
+from accounts import Account
 from numpy.typing import NDArray
 
 import natcoord_jax as nc
 
-SECOND_AND_FOURTH = pytest.mark.parametrize("order", [2, 4])
-"""The step of the paper, and the first scheme with kicks."""
+
+def orders(**lanes: Any) -> pytest.MarkDecorator:
+    """The step of the paper (`second`), the first scheme with kicks (`fourth`), by the lane of each.
+
+    Args:
+        lanes: name of the mark by the order; "" for the default lane. Orders that are not named are
+            exhaustive.
+    """
+    names = {"second": 2, "fourth": 4}
+    marks = {name: lanes.get(name, "exhaustive") for name in names}
+    return pytest.mark.parametrize(
+        "order",
+        [pytest.param(names[n], marks=[getattr(pytest.mark, m)] if m else []) for n, m in marks.items()],
+    )
 
 
 def simulate(system: Any, state: Any, *, order: int = 2, **options: Any) -> nc.Trajectory:
@@ -19,16 +32,23 @@ def simulate(system: Any, state: Any, *, order: int = 2, **options: Any) -> nc.T
     return nc.simulate(system, state, scheme=nc.EnergyMomentum(order=order), **options)
 
 
-OPTIMISED = {"xla_backend_optimization_level": 3}
-"""What users run with. The suite compiles without (see `conftest.py`); steps then take ten times as long."""
+def losses(laws: Account, **bounds: float) -> dict[str, float]:
+    """What a run has lost beyond its bounds, by law; nothing for a run that obeys all of them.
 
-
-def simulate_long(system: Any, state: Any, **options: Any) -> nc.Trajectory:
-    """A run of so many steps that the time to compile an optimised program is won back."""
-    run = jax.jit(lambda system, state: simulate(system, state, **options), compiler_options=OPTIMISED)
-    trajectory = run(system, state)
-    system.raise_on_failure(trajectory)
-    return trajectory
+    Args:
+        laws: account of the run.
+        bounds: of `energy`, `constraint` and `turned`, where they are others than those of all scenes.
+    """
+    energy, constraint = bounds.get("energy", tol.ENERGY), bounds.get("constraint", tol.CONSTRAINT)
+    errors = {
+        "energy": (laws.energy_error, energy),
+        "directors": (laws.directors, constraint),
+        "joints": (laws.joints, constraint),
+    }
+    lost = {law: error for law, (error, bound) in errors.items() if not error <= bound}
+    if not laws.turned >= bounds.get("turned", 1.0):
+        lost["angle turned, so that nothing is tested"] = laws.turned
+    return lost
 
 
 def one_body(
