@@ -74,11 +74,11 @@ def meeting(pair: str, law: str, *, turn: str = "corner", **numbers: Any) -> tup
     else:
         flying |= {"orientation": TURNS[turn], "angular_velocity": (1.0, 0.5, 2.0)}
         body = scene.add(nc.RigidBody(shape=SHAPES[first], density=500.0, **flying))
-    given = LAWS[law] | numbers
-    if pair == "box, box" and "stiffness" in given and "friction" in given:
+    numbers = LAWS[law] | numbers
+    if pair == "box, box" and "stiffness" in numbers and "friction" in numbers:
         # Of a smaller radius edges overlap by two of them, and touch where their distance has no direction.
-        given["rounding"] = 0.02
-    scene.add(nc.Contact(body, target, name="impact", **given))
+        numbers["rounding"] = 0.02
+    scene.add(nc.Contact(body, target, name="impact", **numbers))
     return scene.compile()
 
 
@@ -88,8 +88,8 @@ def solids(size: int = 1, stiffness: Any = None, **contact: Any) -> tuple[Any, A
     one = scene.add(nc.Solid(mesh, material=RUBBER, angular_velocity=(0, 0, 0.3), name="one"))
     place = {"position": (0.2, 0.1, 1.01), "velocity": (0.6, 0.2, -2.0)}
     other = scene.add(nc.Solid(mesh, material=RUBBER, name="other", **place))
-    given = contact if stiffness is None else {"stiffness": stiffness, **contact}
-    scene.add(nc.Contact(other.face("z0"), one.face("z1"), name="impact", **given))
+    numbers = contact if stiffness is None else {"stiffness": stiffness, **contact}
+    scene.add(nc.Contact(other.face("z0"), one.face("z1"), name="impact", **numbers))
     return scene.compile()
 
 

@@ -1,11 +1,26 @@
 """What contacts keep: energy with what is booked, momentum and angular momentum, by shapes and by law."""
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import tolerances as tol
-from contact_scenes import HARD, LAWS, PAIRS, TURNS, assert_never_gains, lost, meeting, stored
+from contact_scenes import (
+    BALL,
+    FLEXIBLE,
+    FLOOR,
+    HARD,
+    LAWS,
+    PAIRS,
+    TURNS,
+    assert_never_gains,
+    lost,
+    meeting,
+    stored,
+)
 
 import natcoord_jax as nc
+from natcoord_jax import gallery
 
 DEFAULT = {("sphere, sphere", "Hertz"), ("sphere, plane", "hard and rubbing")}
 SLOW = {
@@ -91,9 +106,9 @@ def assert_kept(system, trajectory, part):
     balance = nc.balance(system, trajectory)
     for drift in (balance.energy, balance.momentum, balance.angular_momentum):
         assert drift.max() <= tol.ENERGY_OF_A_STIFF_CONTACT
-    held = stored(system, trajectory)
-    assert held.max() >= part * float(system.energy(trajectory).kinetic[0])
-    assert held[-1] == 0.0
+    stores = stored(system, trajectory)
+    assert stores.max() >= part * float(system.energy(trajectory).kinetic[0])
+    assert stores[-1] == 0.0
 
 
 MESHES = {

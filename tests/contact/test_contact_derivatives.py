@@ -189,8 +189,8 @@ def test_grazing():
         system, state = scene.compile()
 
         def side(b, system=system, state=state):
-            given = state.q.at[0, 1].add(b), state.v.at[0, 0].set(1.0)
-            start = eqx.tree_at(lambda s: (s.q, s.v), state, given)
+            rows = state.q.at[0, 1].add(b), state.v.at[0, 0].set(1.0)
+            start = eqx.tree_at(lambda s: (s.q, s.v), state, rows)
             return nc.simulate(system, start, dt=2e-3, steps=1500, throw=False).q[-1, 0, 1]
 
         slope = jax.jit(jax.grad(side))

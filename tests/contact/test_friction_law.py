@@ -179,8 +179,8 @@ def test_a_block_slides_on_another_and_stops():
     scene.add(nc.Gravity())
     table = scene.add(nc.Solid(nc.mesh.box((0.4, 0.2, 0.1), (2, 1, 1)), material=RUBBER))
     scene.add(nc.Clamp(nc.ground, table.set("z0")))
-    given = {"material": RUBBER, "position": (0.05, 0.05, 0.1), "velocity": (0.8, 0, 0)}
-    block = scene.add(nc.Solid(nc.mesh.box((0.1, 0.1, 0.05), (1, 1, 1)), **given))
+    numbers = {"material": RUBBER, "position": (0.05, 0.05, 0.1), "velocity": (0.8, 0, 0)}
+    block = scene.add(nc.Solid(nc.mesh.box((0.1, 0.1, 0.05), (1, 1, 1)), **numbers))
     scene.add(nc.Contact(block.face("z0"), table.face("z1"), friction=0.3, one_pass=True))
     system, state = scene.compile()
     trajectory = nc.simulate(system, state, dt=2e-3, steps=200)

@@ -48,8 +48,8 @@ def box(size, *, dt, steps=1000, restitution, friction, **start):
 def test_a_box_falls_on_four_corners_and_does_not_turn():
     """Redundant contacts that close at once: no corner is first."""
     for restitution in (1.0, 0.6):
-        given = {"dt": 4e-3, "steps": 300, "restitution": restitution, "friction": 0.0}
-        system, trajectory, at, _ = box((0.4, 0.6, 0.2), position=(0, 0, 0.5), **given)
+        numbers = {"dt": 4e-3, "steps": 300, "restitution": restitution, "friction": 0.0}
+        system, trajectory, at, _ = box((0.4, 0.6, 0.2), position=(0, 0, 0.5), **numbers)
         # A tilt of rounding grows with every bounce, by the time of flight over the step.
         spin = np.abs(np.asarray(at.angular_velocity)).max(axis=1)
         assert spin[:150].max() <= 1e-12 and spin[:250].max() <= 1e-6
@@ -63,8 +63,8 @@ def test_a_box_falls_on_four_corners_and_does_not_turn():
 def test_a_tumbling_box_keeps_its_energy():
     """Corners that meet the floor one by one and two by two, at 20 rad/s; no energy is made in any step."""
     moving = {"velocity": (1.0, 0.2, -1.0), "angular_velocity": (3.0, -2.0, 1.0)}
-    given = {"dt": 2e-3, "restitution": 1.0, "friction": 0.0, "position": (0, 0, 0.6)}
-    system, trajectory, _, _ = box((0.4, 0.6, 0.2), **given, **moving)
+    numbers = {"dt": 2e-3, "restitution": 1.0, "friction": 0.0, "position": (0, 0, 0.6)}
+    system, trajectory, _, _ = box((0.4, 0.6, 0.2), **numbers, **moving)
     energy = np.asarray(system.energy(trajectory).total)
     assert np.abs(energy - energy[0]).max() <= tol.ENERGY_OF_A_STIFF_CONTACT * energy[0]
     momentum = np.asarray(system.momentum(trajectory))[:, :2]
@@ -85,8 +85,8 @@ def test_a_box_slides_on_four_corners():
 def test_a_thrown_box_comes_to_rest():
     """Long flights, in which the impulses of friction decay beyond the smallest numbers, and then impacts."""
     moving = {"velocity": (1.0, -0.3, 0.5), "angular_velocity": (2.0, -1.0, 6.0)}
-    given = {"dt": 2e-3, "restitution": 0.4, "friction": 0.4, "position": (0, 0, 0.3)}
-    _, _, at, _ = box((0.1,) * 3, **given, **moving)
+    numbers = {"dt": 2e-3, "restitution": 0.4, "friction": 0.4, "position": (0, 0, 0.3)}
+    _, _, at, _ = box((0.1,) * 3, **numbers, **moving)
     assert np.abs(np.asarray(at.velocity)[-1]).max() <= 1e-9
     assert np.abs(np.asarray(at.angular_velocity)[-1]).max() <= 1e-8
 
@@ -97,8 +97,8 @@ def test_a_box_rocks_from_edge_to_edge():
     half, height, tilt, h = 0.1, 0.2, np.radians(5.0), 2e-4
     lever = half * np.sin(tilt) + height * np.cos(tilt)
     place = {"position": (height * np.sin(tilt) - half * np.cos(tilt), 0, lever)}
-    given = {"dt": h, "steps": 600, "restitution": 0.0, "friction": 0.6, "orientation": ((0, 1, 0), tilt)}
-    system, trajectory, at, made = box((2 * half, 2 * half, 2 * height), **given, **place)
+    numbers = {"dt": h, "steps": 600, "restitution": 0.0, "friction": 0.6, "orientation": ((0, 1, 0), tilt)}
+    system, trajectory, at, made = box((2 * half, 2 * half, 2 * height), **numbers, **place)
     # About an edge, by mass.
     central = (half**2 + height**2) / 3
     inertia = central + half**2 + height**2

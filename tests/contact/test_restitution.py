@@ -226,8 +226,8 @@ def test_law_of_collisions():
 def rod():
     """A rod that falls on its end, tilted, with friction."""
     scene = nc.Scene()
-    given = {"shape": nc.Capsule(0.02, 0.4), "density": 1000.0, "position": (0, 0, 1.0), "name": "rod"}
-    scene.add(nc.Contact(scene.add(nc.RigidBody(**given)), FLOOR, restitution=0.5, friction=0.6, name="hit"))
+    body = {"shape": nc.Capsule(0.02, 0.4), "density": 1000.0, "position": (0, 0, 1.0), "name": "rod"}
+    scene.add(nc.Contact(scene.add(nc.RigidBody(**body)), FLOOR, restitution=0.5, friction=0.6, name="hit"))
     return scene.compile()
 
 
