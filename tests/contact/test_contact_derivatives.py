@@ -52,11 +52,11 @@ CASES = {
     # Scene, numbers that are changed, step [s], steps, mark.
     "soft": (lambda: drop(stiffness=1e4, restitution=0.8, speed=4.0),
              ("stiffness", "restitution"), 5e-3, 200, ()),
-    "hard": (lambda: drop(restitution=0.8), ("restitution",), 1e-2, 90, SLOW),
+    "hard": (lambda: drop(restitution=0.8), ("restitution",), 1e-2, 90, EXHAUSTIVE),
     "hard and rubbing": (lambda: thrown(restitution=0.5, friction=0.2), ("friction",), 1e-2, 30, EXHAUSTIVE),
     "rubbing": (lambda: thrown(stiffness=2e4, friction=0.2), ("friction", "stiffness"), 2e-3, 60, EXHAUSTIVE),
     "edges": (lambda: meeting("box, box", "soft", turn="edge"), (), 2e-3, 60, EXHAUSTIVE),
-    "surfaces": (lambda: solids(stiffness=2e3), ("stiffness",), 4e-3, 15, SLOW),
+    "surfaces": (lambda: solids(stiffness=2e3), ("stiffness",), 4e-3, 15, EXHAUSTIVE),
     "surfaces that rub": (lambda: solids(stiffness=2e3, friction=0.4, one_pass=True),
                           ("friction",), 4e-3, 10, EXHAUSTIVE),
     "mortar": (lambda: solids(method="mortar"), ("stiffness",), 4e-3, 10, EXHAUSTIVE),
@@ -68,14 +68,13 @@ def outcome(make, numbers, dt, steps):
     """Of a change of the start and of each number: weighted places and speeds at the end."""
     system, state = make()
     weights = jnp.cos(jnp.arange(state.v.size)).reshape(state.v.shape)
-    names = [name for group in system.effects for name in group.names if name.startswith("impact")]
-    values = {name: jnp.asarray(system.get(names[0], name)) for name in numbers}
+    values = {number: jnp.asarray(system.get("impact", number)) for number in numbers}
 
     @jax.jit
     def last(x):
         changed = system
         for k, (number, value) in enumerate(values.items()):
-            changed = changed.set(names, **{number: value * (1 + x[k + 1])})
+            changed = changed.set("impact", **{number: value * (1 + x[k + 1])})
         start = nc.State(**{**vars(state), "v": state.v * (1 + x[0])})
         end = nc.simulate(changed, start, dt=dt, steps=steps, throw=False)
         return jnp.vdot(weights, end.q[-1]) + 0.1 * jnp.vdot(weights, end.v[-1])
@@ -154,7 +153,7 @@ def test_derivative_by_stiffness_is_of_order_two():
     assert errors[0] / errors[3] > 20
 
 
-@SLOW
+@EXHAUSTIVE
 def test_an_impact_inside_a_step_is_told():
     """There the derivative is that of the program, not of the motion; how far differences agree is told."""
     system, state = drop(restitution=1.0)
@@ -222,9 +221,8 @@ def test_lanes_with_other_contacts():
     starts = jnp.linspace(0.0, 0.5, 64)
     lanes = jax.jit(jax.vmap(jax.value_and_grad(end)))(starts)
     motions = jax.jit(jax.vmap(run))(starts)
-    report, impacts = nc.contacts(system, motions), np.asarray(motions.states.contacts)[:, -1, 0, 2]
-    assert len(np.unique(impacts)) >= 3
-    np.testing.assert_array_equal(report.impacts.sum(axis=(1, 2)), impacts)
+    report = nc.contacts(system, motions)
+    assert len(np.unique(report.impacts.sum(axis=(1, 2)))) >= 3
     np.testing.assert_allclose(report.gap[..., 0], np.asarray(motions.q)[:, :, 0, 2] - 0.1, atol=1e-14)
     alone = jax.jit(jax.value_and_grad(end))
     for k in range(0, 64, 9):

@@ -149,10 +149,8 @@ def complaint(make, message):
 
 
 def test_wrong_contacts_are_refused():
-    wrong = []
-    for make, message in WRONG:
-        scene, at = parts()
-        wrong.append(complaint(lambda scene=scene, make=make, at=at: scene.add(make(at)), message))
+    scene, at = parts()
+    wrong = [complaint(lambda make=make: scene.add(make(at)), message) for make, message in WRONG]
     assert not [text for text in wrong if text], "\n".join(text for text in wrong if text)
 
 

@@ -43,8 +43,7 @@ def test_gaps_do_not_know_of_axes_and_push_along_their_normal():
     public = [x for x in vars(nc).values() if isinstance(x, type) and issubclass(x, nc.Gap)]
     assert set(public) - {nc.Gap} == set(GAPS)
     for kind, (gap, points, second, kinds) in GAPS.items():
-        distance = jax.jit(lambda x, gap=gap: gap.distance(gap.invariants(x)))
-        slope = jax.jit(jax.grad(lambda x, gap=gap: gap.distance(gap.invariants(x))))
+        measured = jax.jit(jax.value_and_grad(lambda x, gap=gap: gap.distance(gap.invariants(x))))
         random = np.random.default_rng(4)
         for _ in range(5):
             x = markers(kinds, random)
@@ -52,8 +51,8 @@ def test_gaps_do_not_know_of_axes_and_push_along_their_normal():
             turn = turn * np.sign(np.linalg.det(turn))
             point = np.isin(np.arange(len(x)), points)
             moved = x @ turn.T + point[:, None] * random.normal(size=3)
-            assert float(distance(moved)) == pytest.approx(float(distance(x)), abs=1e-13), kind
-            forces = np.asarray(slope(x))
+            distance, forces = map(np.asarray, measured(x))
+            assert float(measured(moved)[0]) == pytest.approx(float(distance), abs=1e-13), kind
             assert np.abs(forces[point].sum(axis=0)).max() <= 1e-12, kind
             assert np.abs(np.cross(x, forces).sum(axis=0)).max() <= 1e-12, kind
             # (The nearest points of segments are drawn to their middles a little.)

@@ -257,7 +257,7 @@ def row(gaps, floor=False, **contact):
     return system, nc.simulate(system, state, dt=1e-4, steps=3)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_what_is_far_is_not_told():
     """Nothing at all, where no pair has come within the skin; a wider skin tells of more, lost lanes not."""
     system, trajectory = row((0.03, 0.06), capacity=4)

@@ -67,7 +67,7 @@ def test_what_slides_stops_and_what_is_on_a_slope_is_held_or_slides_back(law):
         assert x[-1] == pytest.approx(-0.1146, abs=1e-3)
 
 
-@pytest.mark.parametrize("law", [pytest.param("hard", marks=pytest.mark.slow),
+@pytest.mark.parametrize("law", [pytest.param("hard", marks=EXHAUSTIVE),
                                  pytest.param("soft", marks=EXHAUSTIVE)])  # fmt: skip
 def test_all_forms_agree(law):
     """What slides back on a slope, by every form of the equations."""
@@ -82,7 +82,7 @@ def test_all_forms_agree(law):
 @pytest.mark.parametrize(
     ("shape", "law", "part", "near"),
     [
-        pytest.param(nc.Sphere(0.1), "hard", 5 / 7, 1e-12, marks=pytest.mark.slow, id="sphere, hard"),
+        pytest.param(nc.Sphere(0.1), "hard", 5 / 7, 1e-12, marks=EXHAUSTIVE, id="sphere, hard"),
         pytest.param(nc.Sphere(0.1), "soft", 5 / 7, 1e-9, marks=EXHAUSTIVE, id="sphere, soft"),
         pytest.param(nc.Cylinder(0.1, 0.3), "hard", 2 / 3, 1e-9, marks=EXHAUSTIVE, id="cylinder"),
     ],
@@ -154,7 +154,7 @@ def test_a_disc_that_stands_on_its_face_spins_down():
 RUBBER = nc.Elastic(E=1e6, nu=0.3, density=1000.0)
 
 
-@pytest.mark.slow
+@EXHAUSTIVE
 def test_a_block_of_solid_elements_slides_and_stops():
     """Its nodes rub on a plane: it stops where a point does, but for how it gives way, and no step gains."""
     scene = nc.Scene()

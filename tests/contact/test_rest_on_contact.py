@@ -142,7 +142,7 @@ STACKS = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_boxes_on_boxes_stand():
     """On corners, on edges that cross, and on both: for two seconds nothing moves by more than rounding."""
     for sizes, places, turned in STACKS.values():
