@@ -28,6 +28,7 @@ SLOW = {
     ("ellipsoid, plane", "lossy"),
 }
 SLOW_FLEXIBLE = ("solid, solid: lossy",)
+SMOOTH = ("sphere, sphere", "point, plane", "sphere, plane", "box, box")
 TURNED = ("box", "capsule", "ellipsoid", "cylinder")
 NONE = {("cylinder, plane", law) for law in LAWS if law not in HARD}
 """A stiffness would be that of several points where a cylinder stands, and of one where it lies."""
@@ -46,8 +47,9 @@ CASES = [lane((pair, law)) for pair in PAIRS for law in LAWS if (pair, law) not 
 def test_impacts_keep_what_they_should(pair, law):
     """Flat, on an edge and on a corner, with and without losses; nothing passes through, and all part."""
     restitutions = (1.0, 0.5) if "restitution" in LAWS[law] else (None,)
-    stiff = law not in HARD and pair != "box, box"
+    stiff = law not in HARD and pair not in SMOOTH
     bound = tol.ENERGY_OF_A_STIFF_CONTACT if stiff else tol.ENERGY_OF_A_SMALL_SCENE
+    levers = 10 if pair.endswith("box") else 1
     for turn in TURNS if pair.startswith(TURNED) else ("corner",):
         for restitution in restitutions:
             numbers = {} if restitution is None else {"restitution": restitution}
@@ -55,7 +57,7 @@ def test_impacts_keep_what_they_should(pair, law):
             trajectory = nc.simulate(system, state, dt=2e-3, steps=250)
             balance = assert_never_gains(system, trajectory, bound=bound)
             assert balance.momentum.max() <= tol.MOMENTUM_OF_A_SMALL_SCENE
-            assert balance.angular_momentum.max() <= 10 * tol.MOMENTUM_OF_A_SMALL_SCENE
+            assert balance.angular_momentum.max() <= levers * tol.MOMENTUM_OF_A_SMALL_SCENE
             report = nc.contacts(system, trajectory)
             pushed = np.flatnonzero(report.force.max(axis=1) > 0)
             assert pushed.size and (report.gap[pushed[0] + 1 :].min(axis=1) > 0).any()
