@@ -41,40 +41,39 @@ def segments(kind, count):
     return middle - half, middle + half, radii
 
 
-def overlaps(one, other, radii):
-    """Of each pair, from many points of either: their distance but for half of the spacing of these."""
-    count = 1 if np.array_equal(one, other) else 41
-    along = np.linspace(0.0, 1.0, count)[:, None, None]
-    points = one + along * (other - one)
-    apart = np.full((len(radii), len(radii)), np.inf)
-    for p in points:
-        for r in points:
-            apart = np.minimum(apart, np.linalg.norm(p[:, None] - r, axis=-1))
-    pairs = np.triu_indices(len(radii), 1)
-    return np.maximum(radii[:, None] + radii - apart, 0.0)[pairs]
-
-
-@pytest.mark.parametrize("kind", ["box", "line", "far", pytest.param("capsules", marks=pytest.mark.slow)])
-def test_a_search_sees_all_that_touches(kind):
-    """The energy of spheres and capsules of all sizes is that of all pairs: evenly in a box, in one column of
-    cells, and with one that has flown off."""
-    one, other, radii = segments(kind, 60)
-    scene = nc.Scene()
-    bodies = []
+def energy_of(one, other, radii, **search):
+    """Energy [J] of segments that touch, and names of their contacts."""
+    scene, bodies = nc.Scene(), []
     for a, b, r in zip(one, other, radii):
         length = np.linalg.norm(b - a)
         shape = nc.Capsule(r, length) if length else nc.Sphere(r)
         along = (b - a) / length if length else np.array([0, 0, 1.0])
-        axis = np.cross((0, 0, 1.0), along)
-        turn = {"orientation": (axis, np.arccos(along[2]))} if length else {}
+        turn = {"orientation": (np.cross((0, 0, 1.0), along), np.arccos(along[2]))} if length else {}
         bodies.append(scene.add(nc.RigidBody(shape=shape, density=900.0, position=(a + b) / 2, **turn)))
-    scene.add(nc.Contact(all_pairs_of=bodies, stiffness=STIFFNESS, capacity=24, name="all"))
+    made = scene.add(nc.Contact(all_pairs_of=bodies, stiffness=STIFFNESS, name="all", **search))
     system, state = scene.compile()
-    depths = overlaps(one, other, radii)
-    stored = float(system.energy(state).stores["all"])
-    near = 2e-2 if kind == "capsules" else 1e-9
+    return float(sum(system.energy(state).stores.values())), [handle.name for handle in made]
+
+
+@pytest.mark.parametrize("kind", ["box", "line", "far"])
+def test_a_search_sees_all_spheres_that_touch(kind):
+    """Their energy is that of all pairs: evenly in a box, in one column of cells, with one far off."""
+    one, other, radii = segments(kind, 60)
+    apart = np.linalg.norm(one[:, None] - one, axis=-1)[np.triu_indices(60, 1)]
+    depths = np.maximum((radii[:, None] + radii)[np.triu_indices(60, 1)] - apart, 0.0)
     assert (depths > 0).sum() > 10
-    assert stored == pytest.approx(0.5 * STIFFNESS * np.sum(depths**2), rel=near)
+    energy, names = energy_of(one, other, radii, capacity=24)
+    assert names == ["all"]
+    assert energy == pytest.approx(0.5 * STIFFNESS * np.sum(depths**2), rel=1e-9)
+
+
+@pytest.mark.slow
+def test_a_search_sees_all_capsules_that_touch():
+    """Their energy is that of listed pairs, of which those with small overlaps count."""
+    one, other, radii = segments("capsules", 20)
+    searched, listed = (energy_of(one, other, radii, **search) for search in ({"capacity": 19}, {}))
+    assert len(searched[1]) == 1 and len(listed[1]) == 190
+    assert searched[0] == pytest.approx(listed[0], rel=1e-9) and searched[0] > 1.0
 
 
 # --- the motion and numbers of listed pairs -----------------------------------------------------------------
