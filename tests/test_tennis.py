@@ -27,6 +27,7 @@ def test_nineteen_bodies_have_the_mass_of_the_player():
     assert all(names.index(s.parent) < names.index(name) for name, s in SEGMENTS.items())
 
 
+@pytest.mark.slow
 def test_the_swing_goes_through_its_poses_without_jumps_of_acceleration():
     swing = swings()["right upper arm", 0]
     rate, bend = jax.grad(swing), jax.grad(jax.grad(swing))

@@ -193,6 +193,7 @@ def test_a_part_comes_into_a_larger_system():
     np.testing.assert_array_equal(same.coordinate(after, "hinge"), part.coordinate(state, "hinge"))
 
 
+@pytest.mark.slow
 def test_what_cannot_be_carried_over_is_refused():
     system, before = bodies()
     with pytest.raises(ValueError, match="no bodies.*'caught'"):

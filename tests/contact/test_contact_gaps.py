@@ -37,6 +37,7 @@ def markers(kinds, random):
     return np.stack([random.normal(size=3) if kind == "a" else next(taken[kind]) for kind in kinds])
 
 
+@pytest.mark.slow
 def test_gaps_do_not_know_of_axes_and_push_along_their_normal():
     """The same in other axes; its slope pushes the second body along the normal that it tells, no force and
     no torque in all."""

@@ -57,6 +57,7 @@ def pushes(one, other, radii, **search):
     return np.asarray(system.mass)[:, 0, 0, None] * velocity / dt, [handle.name for handle in made]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["box", "line", "far"])
 def test_a_search_sees_all_spheres_that_touch(kind):
     """They are pushed as by all pairs: evenly in a box, in one column of cells, with one far off."""

@@ -12,6 +12,7 @@ import natcoord_jax as nc
 G = 9.81
 
 
+@pytest.mark.slow
 def test_a_ball_at_rest_is_untouched():
     """At gap zero, for a thousand steps, whatever falls beside it; and what falls comes to rest exactly."""
     scene = nc.Scene()
