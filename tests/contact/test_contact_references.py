@@ -258,7 +258,7 @@ def pressed(**options):
     return max(off)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_patch_of_blocks_by_mortar():
     """A uniform pressure passes exactly."""
     assert pressed(method="mortar", stiffness=1e7) <= 1e-12
