@@ -27,6 +27,7 @@ def test_nineteen_bodies_have_the_mass_of_the_player():
     assert all(names.index(s.parent) < names.index(name) for name, s in SEGMENTS.items())
 
 
+@pytest.mark.slow
 def test_the_swing_goes_through_its_poses_without_jumps_of_acceleration():
     swing = swings()["right upper arm", 0]
     rate, bend = jax.grad(swing), jax.grad(jax.grad(swing))
@@ -62,9 +63,9 @@ def test_the_books_of_the_stroke_balance(short):
         assert float(system.constraint_errors(part).position.max()) <= 1e-9
     work, energy = run.work(), run.energy()
     assert sum(abs(float(w[-1])) for name, w in work.items() if "drive" in name) > 1.0
-    given = sum(np.asarray(w) for w in work.values())
+    worked = sum(np.asarray(w) for w in work.values())
     total = np.asarray(energy.total)
-    np.testing.assert_allclose(total - total[0], given, rtol=0, atol=1e-9 * np.abs(total).max())
+    np.testing.assert_allclose(total - total[0], worked, rtol=0, atol=1e-9 * np.abs(total).max())
     assert float(work["ball"][-1]) < -1.0 and np.diff(np.asarray(work["ball"])).max() <= 1e-12
 
 
@@ -72,13 +73,13 @@ def test_the_books_of_the_stroke_balance(short):
 def test_the_impact_is_as_measured(short):
     """Ball and strings touch for 4 to 5 ms at 20 to 30 m/s; no node leaves the strings that it may touch."""
     example, run = short
-    found = stroke(run, example.facts["ball"])
-    closing = found.racket[0] - found.before[0]
-    assert found.before[0] == pytest.approx(-INCOMING, abs=1e-9) and 20.0 < closing < 30.0
-    assert 4e-3 <= found.dwell <= 5e-3
-    assert 1000.0 < found.force < 2500.0
+    seen = stroke(run, example.facts["ball"])
+    closing = seen.racket[0] - seen.before[0]
+    assert seen.before[0] == pytest.approx(-INCOMING, abs=1e-9) and 20.0 < closing < 30.0
+    assert 4e-3 <= seen.dwell <= 5e-3
+    assert 1000.0 < seen.force < 2500.0
     # Of a racket in a hand, which gives way, a ball rebounds with some 0.4 of the closing speed.
-    assert 0.3 < (found.after[0] - found.racket[0]) / closing < 0.5
+    assert 0.3 < (seen.after[0] - seen.racket[0]) / closing < 0.5
 
 
 @pytest.mark.exhaustive
@@ -100,8 +101,8 @@ def test_a_shot():
     """A swing begins where its drives are, energy is in the books, and an open face sends the ball up."""
     made, swing = shot(), jnp.array([0.5, -0.1, 0.02])
     system, state = made.started(swing)
-    found = system.constraint_errors(state)
-    assert float(found.position) <= 1e-13 and float(found.velocity) <= 1e-12
+    errors = system.constraint_errors(state)
+    assert float(errors.position) <= 1e-13 and float(errors.velocity) <= 1e-12
     run = made.run(swing)
     assert nc.balance(system, run).energy.max() <= 1e-9
     assert abs(float(system.work(run)["right upper arm drive 1"][-1])) > 1.0
@@ -135,9 +136,9 @@ def test_a_shot_is_aimed():
     # of ten metres: from farther away Newton's method takes a step to and fro before it is near. For some
     # swings a step is repeated in halves; for this one none is, so that the last digits can be asked for.
     aimed, swing = jnp.array([0.6, -0.14, 0.02]), jnp.array([0.58, -0.138, 0.0198])
-    target, (by_swing, found) = landing(aimed), slopes(swing)
+    target, (by_swing, landed) = landing(aimed), slopes(swing)
     for _ in range(5):
-        swing = swing - jnp.linalg.solve(by_swing, found - target)
-        by_swing, found = slopes(swing)
-    np.testing.assert_allclose(found, target, rtol=1e-9)
+        swing = swing - jnp.linalg.solve(by_swing, landed - target)
+        by_swing, landed = slopes(swing)
+    np.testing.assert_allclose(landed, target, rtol=1e-9)
     np.testing.assert_allclose(swing, aimed, rtol=1e-7)

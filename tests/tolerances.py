@@ -166,3 +166,10 @@ THICK_WALL = {2.0: 2e-2, 3.0: 1e-4}
 FALLING_BEAM = 1e-4
 # Angular momentum that a pulse gives a soft block of four elements, with lumped and with consistent masses.
 L_SHAPE = 1e-2
+
+# --- contact ----------------------------------------------------------------------------------------------
+
+# Hard contacts with several gaps, by the compliance with which they share a load: of the speed of a step [m].
+SHARED_GAP = 1e-9
+# Contacts so stiff that places are rounded by more of the energy.
+ENERGY_OF_A_STIFF_CONTACT = 10 * ENERGY_OF_A_SMALL_SCENE

@@ -62,10 +62,10 @@ def test_sphere_of_elements_on_a_plane():
     system, state = scene.compile()
     end = nc.equilibrium(system, state, steps=4).state
     top = np.unique(mesh.faces["z1"])
-    found = system.sense(end, tuple(f"top[{k}]" for k in range(len(top))))
-    force = np.asarray(found.force)
+    readings = system.sense(end, tuple(f"top[{k}]" for k in range(len(top))))
+    force = np.asarray(readings.force)
     assert 4 * force.sum() == pytest.approx(FORCE, rel=0.02)
-    assert np.asarray(found.gap).min() > -1e-3 * APPROACH
+    assert np.asarray(readings.gap).min() > -1e-3 * APPROACH
     # Each node has the pressure of what is nearer to it than to others.
     ends = np.concatenate([[0.0], (LINES[1:] + LINES[:-1]) / 2, [LINES[-1]]])
     widths = np.interp(places[top, :2], LINES, np.diff(ends))
