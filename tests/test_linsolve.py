@@ -285,7 +285,7 @@ def test_inverses_of_the_matrix_of_all_stages(order, balances, constraints):
 
 @pytest.mark.parametrize("size", [6, *(pytest.param(n, marks=pytest.mark.exhaustive) for n in (1, 3))])
 def test_inverses_that_learn_solve_in_one_correction_more_than_unknowns(size):
-    """Could go wrong: an update that spoils what was learnt before; something learnt of what tells nothing."""
+    """Could go wrong: an update that spoils what was learnt before; things learnt of what tells nothing."""
     rng = np.random.default_rng(0)
     matrix = np.eye(size) + 0.2 * rng.normal(size=(size, size))
     near = np.linalg.inv(matrix) @ (np.eye(size) + 0.1 * rng.normal(size=(size, size)))

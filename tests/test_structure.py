@@ -257,7 +257,7 @@ class Idle(nc.Force):
 
 
 def test_a_changed_number_never_retraces(programs):
-    """Every leaf of system and state, the step, the inputs; a scene built anew with other numbers."""
+    """Every leaf of system and state, the step, the inputs, also more of them; a scene built anew."""
 
     def scene(mass=1.0, stiffness=2.0, place=0.5):
         made = nc.Scene()
@@ -282,6 +282,7 @@ def test_a_changed_number_never_retraces(programs):
     runs.append(nc.simulate(moved, state, dt=0.1, inputs=jnp.zeros((4, 1)), throw=False))
     later = eqx.tree_at(lambda s: s.t, state, state.t + 1.0)
     runs.append(nc.simulate(system, later, dt=0.1, inputs=jnp.zeros((4, 1))))
+    assert nc.simulate(system, state, dt=0.1, inputs=jnp.zeros((11, 1))).q.shape[0] == 12
     assert "jit(simulate)" not in programs, "a rollout was compiled again"
     assert all(float(jnp.max(jnp.abs(x.q - first.q))) > 0 for x in runs[:-1])
 
