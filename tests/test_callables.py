@@ -103,6 +103,7 @@ def test_a_changed_number_is_seen(programs):
     assert not programs
 
 
+@pytest.mark.exhaustive
 def test_functions_made_anew_share_a_program(programs):
     """Lambdas and partial functions of the same formula."""
 
@@ -118,7 +119,7 @@ def test_functions_made_anew_share_a_program(programs):
         assert answers == pytest.approx(expected, abs=1e-13)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_another_formula_is_seen():
     """What changes the program itself: a switch, an integer, a table of indices."""
     switch, order, picked = [True], [1], np.array([0])
@@ -168,7 +169,7 @@ def test_a_module_of_numbers_that_reads_a_global(programs):
     assert slopes == pytest.approx(expected, rel=1e-8)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_derivatives_through_a_closure():
     """Numbers of a closure, traced or not, under grad, jit and vmap; a changed global is seen in between."""
 
@@ -252,6 +253,7 @@ def test_a_rule_for_derivatives_of_ones_own_is_seen(programs):
 # --- where callables are ----------------------------------------------------------------------------------
 
 
+@pytest.mark.exhaustive
 def test_until(programs):
     """The limit of a terminal event, in a closure and in a global."""
     limit = [0.0]
@@ -267,6 +269,7 @@ def test_until(programs):
         assert k == 1 or not programs
 
 
+@pytest.mark.exhaustive
 def test_equilibria(programs):
     """A load whose size is a global."""
     scene = nc.Scene()
@@ -325,6 +328,7 @@ class Law(eqx.Module):
         return 0.5 * GAINS["module"] * self.stiffness * c**2
 
 
+@pytest.mark.slow
 def test_effects(programs):
     """Functions and methods in every kind of effect, among them two instances that share a program."""
     scene = nc.Scene()
@@ -368,7 +372,7 @@ def test_effects(programs):
     assert np.abs(np.diff(seen[1])).max() > 0
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_costs_goals_and_bounds(programs):
     """Functions and methods in an optimal control problem; a place in the system that a function chooses."""
     system, state = motor()

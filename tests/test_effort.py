@@ -70,7 +70,7 @@ def assert_alike(one, other):
         np.testing.assert_allclose(a, b, rtol=tol.EXACT_GRADIENT, atol=tol.EXACT_GRADIENT)
 
 
-@pytest.mark.parametrize("kind", ["matrices", pytest.param("rollout", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("kind", ["matrices", pytest.param("rollout", marks=pytest.mark.exhaustive)])
 def test_full_effort_takes_over_with_the_same_results(kind, improved):
     example = gallery.load("heavy_top")
     x = example.state if kind == "rollout" else jnp.eye(3) + 0.1 * jnp.arange(9.0).reshape(3, 3)
@@ -292,7 +292,7 @@ def process(more, **env):
     )
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_an_interpreter_ends_while_full_effort_is_under_way():
     run = process("")
     assert run.stdout is not None
@@ -429,7 +429,7 @@ def wheels():
     return example, partial(nc.simulate, example.system, example.state, dt=0.02)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_other_numbers_compile_nothing(wheels, programs):
     """One program serves as long as no more than numbers change, of steps and of inputs, too."""
     example, run = wheels
@@ -449,7 +449,7 @@ def test_other_numbers_compile_nothing(wheels, programs):
     assert programs[before:] == []
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_room_for_more_steps_changes_nothing(wheels):
     example, run = wheels
     torques = jnp.asarray(np.random.default_rng(0).normal(size=(70, 3)))
@@ -460,8 +460,8 @@ def test_room_for_more_steps_changes_nothing(wheels):
         np.testing.assert_allclose(a, b, rtol=0, atol=tol.EXACT_GRADIENT)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("extra", [0, pytest.param(2, marks=pytest.mark.exhaustive)])
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("extra", [0, 2])
 def test_room_for_more_steps_is_no_room_for_more_attempts(extra):
     example = gallery.load("heavy_top")
     options = dict(dt=500.0, steps=3, extra_substeps=extra, throw=False)

@@ -47,7 +47,7 @@ def zero_blocks():
 SYSTEMS = {
     "short chain": (lambda: patterns.chain(3, 5), None, "dense"),
     "chain": (lambda: patterns.chain(16), None, "block tridiagonal"),
-    "ladder": (lambda: patterns.ladder(9), None, "multifrontal"),
+    "ladder": (lambda: patterns.ladder(5), None, "multifrontal"),
     "body chain": (lambda: patterns.body_chain(20), None, "block tridiagonal"),
     "chain by fronts": (lambda: patterns.chain(16), "multifrontal", "multifrontal"),
     "ring": (lambda: patterns.ring(10), None, "multifrontal"),
@@ -57,7 +57,7 @@ SYSTEMS = {
     "shell 8, hinged": (lambda: patterns.shell(8, 8, hinged=True), None, "multifrontal"),
     "zero blocks": (zero_blocks, "multifrontal", "multifrontal"),
 }
-DEFAULT, SLOW = ("short chain", "chain", "ladder"), ("body chain", "ring", "body tree", "zero blocks")
+DEFAULT, SLOW = ("short chain", "chain", "ladder"), ("body tree",)
 
 
 def lane_of(key):
@@ -93,7 +93,7 @@ def in_every_mode(loss, at, along):
     return jax.jvp(loss, at, along), jax.jvp(gradient, at, along)
 
 
-@pytest.mark.parametrize("key", map(lane_of, SYSTEMS))
+@pytest.mark.parametrize("key", [lane_of(key) for key in SYSTEMS])
 def test_all_is_as_of_the_dense_matrix(key):
     """Products and solutions in both directions, derivatives by the numbers of matrix and right-hand side."""
     case = case_of(key)
@@ -183,7 +183,7 @@ def is_singular(plan, matrix, right):
     return solver.singular(solver.solve(right), right)
 
 
-@pytest.mark.parametrize("key", ["chain", pytest.param("ladder", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("key", ["chain", pytest.param("ladder", marks=pytest.mark.exhaustive)])
 def test_a_singular_matrix_is_reported(key):
     """One unknown loses its equation; in a batch, the other lane does not notice."""
     case = case_of(key)
@@ -192,7 +192,7 @@ def test_a_singular_matrix_is_reported(key):
     np.testing.assert_array_equal(lanes(jnp.stack([tiles, case.matrix.tiles])), [True, False])
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_dependent_constraints_are_reported():
     """The same joint twice: the matrix is singular without any zero row."""
     system = patterns.ladder(6)
@@ -209,6 +209,7 @@ def test_dependent_constraints_are_reported():
     assert is_singular(case.plan, case.matrix, case.right)
 
 
+@pytest.mark.exhaustive
 def test_numbers_do_not_retrace_and_structure_does():
     traced = []
 
@@ -266,8 +267,7 @@ def parts(balances, constraints):
     "order, balances, constraints",
     [
         (4, 5, 2),
-        *(pytest.param(10, b, c, marks=pytest.mark.slow) for b, c in ((5, 0), (50, 3))),
-        *(pytest.param(n, 5, c, marks=pytest.mark.exhaustive) for n in (6, 8) for c in (0, 2)),
+        *(pytest.param(n, b, c, marks=pytest.mark.exhaustive) for n, b, c in ((6, 5, 0), (10, 50, 3))),
     ],
 )
 def test_inverses_of_the_matrix_of_all_stages(order, balances, constraints):

@@ -112,7 +112,7 @@ def weighted(system, states):
 
 
 @pytest.mark.parametrize(
-    "kind", ["drive", *(pytest.param(x, marks=pytest.mark.slow) for x in ("rotor", "loops"))]
+    "kind", ["drive", *(pytest.param(x, marks=pytest.mark.exhaustive) for x in ("rotor", "loops"))]
 )
 def test_the_nearest_velocities_that_the_constraints_admit(kind):
     """All that are admitted, no more, and what is left out is across them in the metric of the mass."""
@@ -139,7 +139,7 @@ def test_the_nearest_velocities_that_the_constraints_admit(kind):
         np.testing.assert_allclose(system.rate(trajectory, "first"), wanted, atol=tol.TANGENT)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_from_body_to_body_as_all_at_once():
     for joint in (nc.Universal, nc.Cylindrical, nc.Planar):
         velocities = []
@@ -152,7 +152,7 @@ def test_from_body_to_body_as_all_at_once():
         np.testing.assert_allclose(*velocities, atol=tol.TANGENT_OF_A_SMALL_SCENE)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_step_of_the_paper_as_it_stands():
     """The same states to the last digit, and readings of them as they are."""
     system, state = swinging("rotor")
@@ -165,6 +165,7 @@ def test_the_step_of_the_paper_as_it_stands():
     np.testing.assert_array_equal(system.constraint_errors(paper).velocity, errors)
 
 
+@pytest.mark.exhaustive
 def test_whoever_is_given_a_state_is_given_tangent_velocities():
     """By `state.v`, too."""
     system, state = swinging("rotor")
@@ -188,7 +189,7 @@ def pendulum():
     return *scene.compile(), hinge
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_derivatives_through_a_controller_that_reads_rates():
     """By its gain, by the mass, which is in the projection, too, and by the start; both ways."""
     system, state, hinge = pendulum()
@@ -220,7 +221,7 @@ def test_derivatives_through_a_controller_that_reads_rates():
     np.testing.assert_allclose(tangent, gradient @ along, atol=tol.SAME_GRADIENT * scale)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_lanes_of_a_batch_are_read_as_they_are_alone():
     system, state, hinge = pendulum()
 

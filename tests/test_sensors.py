@@ -164,7 +164,7 @@ def test_reactions_balance_all_bodies():
     assert unbalanced(system, start, state, joints) <= EQUATIONS
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_rates_and_accelerations_are_the_limits_of_short_steps():
     """What changes in a step, over its length: of velocities, and of coordinates, with motors and springs."""
     system, start, _ = menagerie()
@@ -199,7 +199,7 @@ def test_door_on_two_hinges_shares_its_weight():
     np.testing.assert_allclose(low.force + high.force, (0, 0, 40), atol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_redundant_loop_has_finite_reactions():
     """Which balance its bars; and so have their gradients."""
     system, start, joints = loop()
@@ -262,7 +262,8 @@ def motion_between(system, start, one, other, parent, child):
 
 
 @pytest.mark.parametrize(
-    ("kind", "backwards"), [x if x == USUAL else pytest.param(*x, marks=pytest.mark.slow) for x in SETTERS]
+    ("kind", "backwards"),
+    [x if x == USUAL else pytest.param(*x, marks=pytest.mark.exhaustive) for x in SETTERS],
 )
 def test_setters_move_one_coordinate_and_keep_all_else(kind, backwards):
     system, start, handles = chain(kind, backwards=backwards)
@@ -297,7 +298,7 @@ def test_setters_move_one_coordinate_and_keep_all_else(kind, backwards):
         close(system.rate(moved, "hinge"), system.rate(state, "hinge"), 10 * ROUND_OFF)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_random_states_are_valid():
     system, state, _ = menagerie()
     keys = jax.random.split(jax.random.key(6), 5)
@@ -313,7 +314,7 @@ def test_random_states_turn_rotors_along():
     np.testing.assert_allclose(moving.rates[0], system.rate(moving, "hinge"), atol=ROUND_OFF)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_reactions_differentiate_and_batch():
     system, state, bar, pin = pendulum()
 
@@ -335,7 +336,7 @@ def test_reactions_differentiate_and_batch():
     np.testing.assert_allclose(batch.force[:, 0], [force(rate, 1.0) for rate in rates], rtol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_batches_of_trajectories_are_sensed_at_once():
     system, state, bar, pin = pendulum()
     steps = jnp.array([0.01, 0.02])

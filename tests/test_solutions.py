@@ -25,8 +25,8 @@ RUNS = {
 }
 CASES = [
     pytest.param("four_bar", 4),
-    pytest.param("four_bar", 6, marks=pytest.mark.slow),
-    pytest.param("heavy_top", 2, marks=pytest.mark.slow),
+    pytest.param("four_bar", 6, marks=pytest.mark.exhaustive),
+    pytest.param("heavy_top", 2, marks=pytest.mark.exhaustive),
     pytest.param("bricard", 4, marks=pytest.mark.slow),
     pytest.param("bricard", 6, marks=pytest.mark.exhaustive),
     pytest.param("open_tree", 4, marks=pytest.mark.exhaustive),
@@ -75,7 +75,8 @@ def walk(states, system):
     return float(np.sqrt(np.mean((energy - energy[0]) ** 2)) / run.energy_scale)
 
 
-@pytest.mark.parametrize("name", ["heavy_top", pytest.param("double_pendulum", marks=pytest.mark.slow)])
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("name", ["heavy_top", "double_pendulum"])
 def test_rounding_does_not_add_up(name):
     """Energy walks far less than if each step began anew: what rounding leaves of balances is handed on."""
     example, steps, dt = gallery.load(name), 4000, 2e-3
@@ -124,7 +125,7 @@ def bodies_on_springs(far: bool):
     return *scene.compile(), bodies
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_bodies_that_touch_nothing_change_nothing():
     """Bodies that hang on nothing but the ground are solved each with tangents of its own, chains are not."""
     places = []

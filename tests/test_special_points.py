@@ -163,7 +163,7 @@ def energy_of(law):
 
 @pytest.mark.parametrize(
     "name",
-    ["hardening", *(pytest.param(x, marks=pytest.mark.slow) for x in EVEN_LAWS if x != "hardening")],
+    ["hardening", *(pytest.param(x, marks=pytest.mark.exhaustive) for x in EVEN_LAWS if x != "hardening")],
 )
 def test_even_laws_are_smooth_where_points_coincide(name):
     """Against the same law of three components, which has no root: along and across the connecting line."""
@@ -287,6 +287,7 @@ def test_rollouts_from_special_points(order, second):
 # --- what depends on second derivatives --------------------------------------------------------------------
 
 
+@pytest.mark.exhaustive
 def test_modes_of_a_body_on_springs_of_no_length():
     scene = nc.Scene()
     body = scene.add(nc.RigidBody(mass=2.0, inertia=(0.1, 0.2, 0.3)))
@@ -297,6 +298,7 @@ def test_modes_of_a_body_on_springs_of_no_length():
     assert np.allclose(frequencies, np.sort([10.0, 10.0, 10.0, *turning]), rtol=tol.EXACT_GRADIENT)
 
 
+@pytest.mark.exhaustive
 def test_modes_of_a_point_mass_between_springs():
     """Along sqrt(2 k / m), across sqrt(2 k / m (1 - L / d)); its directors do not turn, and are no modes."""
     scene = nc.Scene()
@@ -320,6 +322,7 @@ def test_modes_of_a_point_mass_between_springs():
     assert np.allclose(squares, np.sort([sideways, *along]), rtol=tol.EXACT_GRADIENT)
 
 
+@pytest.mark.exhaustive
 def test_modes_of_a_point_mass_on_a_joint():
     scene = nc.Scene()
     scene.add(nc.Gravity(vector=(0, 0, -10.0)))
@@ -379,6 +382,7 @@ def test_lumped_inertia_of_a_beam_is_what_its_docstring_says(n):
         assert float(inertia) == pytest.approx(6.0 * 4.0 * factor, rel=tol.INDIFFERENCE)
 
 
+@pytest.mark.exhaustive
 def test_a_rotor_that_turns_too_far_in_a_step_is_told():
     """At 2.5 rad a step the rate shows 250 rad/s beside an angle that says 179; with the step that is advised
     both are the same to a percent, and nothing is said."""
@@ -422,7 +426,11 @@ MODES = {
 
 @pytest.mark.parametrize(
     "mode",
-    ["grad", "jvp", *(pytest.param(m, marks=pytest.mark.slow) for m in ("jacrev", "jacfwd", "hessian"))],
+    [
+        "grad",
+        pytest.param("jvp", marks=pytest.mark.exhaustive),
+        *(pytest.param(m, marks=pytest.mark.exhaustive) for m in ("jacrev", "jacfwd", "hessian")),
+    ],
 )
 def test_a_derivative_that_is_none_is_an_error_in_python_and_nan_in_jit(turntable, mode):
     system, state = turntable
@@ -438,6 +446,7 @@ def test_a_derivative_that_is_none_is_an_error_in_python_and_nan_in_jit(turntabl
     assert np.all(np.isfinite(MODES[mode](partial(end, law=jnp.cos), u)))
 
 
+@pytest.mark.exhaustive
 def test_what_is_no_number_before_is_no_fault_of_a_run(turntable):
     system, state = turntable
 
@@ -448,7 +457,7 @@ def test_what_is_no_number_before_is_no_fault_of_a_run(turntable):
     assert np.isnan(jax.grad(lambda u: jnp.sqrt(end(u)) * 0.0)(jnp.zeros(1))[0])
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_control_says_that_a_step_has_no_derivative(turntable, monkeypatch):
     system, state = turntable
     problem = nc.OptimalControl(
@@ -461,6 +470,7 @@ def test_control_says_that_a_step_has_no_derivative(turntable, monkeypatch):
         assert "linearised equations have no solution" in solution.explain()
 
 
+@pytest.mark.exhaustive
 def test_descent_ends_where_there_is_no_slope(turntable):
     system, state = turntable
     rough = nc.cost.Terminal(lambda state: jnp.sqrt(jnp.abs(state.coordinates[0])))
@@ -470,7 +480,7 @@ def test_descent_ends_where_there_is_no_slope(turntable):
     assert np.all(np.isfinite(solution.inputs))
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_known_tangents_and_unknown_ones_pass_side_by_side(turntable):
     """The gradient of a directional derivative along a direction that is fixed, several of them at once."""
     system, state = turntable

@@ -98,11 +98,6 @@ def lowered(scenes: dict[str, str], blocked: list[str]):
     return json.loads(run.stdout.splitlines()[-1])
 
 
-@pytest.fixture(scope="module")
-def everything_imported():
-    return lowered({name: code for name, (code, _) in SCENES.items()}, [])[0]
-
-
 USUAL = ("hinge and motor", "springs")
 
 
@@ -115,14 +110,20 @@ def test_each_effect_module_is_needless_in_a_scene():
 
 
 @pytest.mark.parametrize(
-    "name", [name if name in USUAL else pytest.param(name, marks=pytest.mark.exhaustive) for name in SCENES]
+    "name",
+    [
+        "springs",
+        pytest.param("hinge and motor", marks=pytest.mark.slow),
+        *(pytest.param(name, marks=pytest.mark.exhaustive) for name in SCENES if name not in USUAL),
+    ],
 )
-def test_absent_effects_leave_nothing(everything_imported, name):
+def test_absent_effects_leave_nothing(name):
     """The lowered program, without locations, is the same byte for byte with their modules blocked."""
     blocked = sorted(set(LEAVES) - needed(name))
-    program, loaded = lowered({name: SCENES[name][0]}, blocked)
+    scene = {name: SCENES[name][0]}
+    program, loaded = lowered(scene, blocked)
     assert blocked and not loaded, f"not blocked: {loaded}"
-    assert program[name] == everything_imported[name]
+    assert program == lowered(scene, [])[0]
 
 
 # --- equal kinds ------------------------------------------------------------------------------------------
@@ -149,7 +150,7 @@ def program(arms: int, solver: str):
 
 
 SOLVERS = pytest.mark.parametrize(
-    "solver", ["recursive", *(pytest.param(x, marks=pytest.mark.slow) for x in ("full", "reduced"))]
+    "solver", ["recursive", *(pytest.param(x, marks=pytest.mark.exhaustive) for x in ("full", "reduced"))]
 )
 
 
@@ -183,7 +184,7 @@ def test_compile_time_does_not_grow_with_bodies():
     assert seconds[48] <= 2.5 * seconds[4] + 1.0, f"seconds of compilation by number of arms: {seconds}"
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.filterwarnings("ignore:.*solved densely")
 def test_solvers_give_one_trajectory():
     """Of a star, whose bodies each solver puts in an order of its own."""
@@ -287,6 +288,7 @@ def test_a_changed_number_never_retraces(programs):
     assert all(float(jnp.max(jnp.abs(x.q - first.q))) > 0 for x in runs[:-1])
 
 
+@pytest.mark.exhaustive
 def test_a_scene_of_traced_numbers():
     """Building inside jit gives the numbers of building outside."""
 
