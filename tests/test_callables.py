@@ -103,7 +103,6 @@ def test_a_changed_number_is_seen(programs):
     assert not programs
 
 
-@pytest.mark.exhaustive
 def test_functions_made_anew_share_a_program(programs):
     """Lambdas and partial functions of the same formula."""
 
@@ -253,7 +252,6 @@ def test_a_rule_for_derivatives_of_ones_own_is_seen(programs):
 # --- where callables are ----------------------------------------------------------------------------------
 
 
-@pytest.mark.exhaustive
 def test_until(programs):
     """The limit of a terminal event, in a closure and in a global."""
     limit = [0.0]

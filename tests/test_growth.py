@@ -22,6 +22,7 @@ def upright():
     return scene.compile()
 
 
+@pytest.mark.slow
 def test_an_upright_pendulum_falls_at_its_exponent(upright):
     """Could go wrong: a scale that is left out of the sum. In ten seconds its rounding makes it fall."""
     growth = nc.tangent_growth(*upright, dt=0.01, steps=500, save_every=10)

@@ -5,6 +5,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from jax import lax
 
 import natcoord_jax as nc
@@ -144,6 +145,7 @@ def test_a_program_within_lanes_is_a_program():
     np.testing.assert_allclose(lanes, jnp.sin(X), rtol=1e-15)
 
 
+@pytest.mark.exhaustive
 def test_states_in_lanes_compile_next_to_nothing(programs):
     """Could go wrong: setting a joint in each of some states, one operation after the other."""
     scene, body = nc.Scene(), nc.ground

@@ -183,6 +183,7 @@ def test_rates_and_accelerations_are_the_limits_of_short_steps():
     close(wanted, rates, 1e-6)
 
 
+@pytest.mark.slow
 def test_door_on_two_hinges_shares_its_weight():
     scene = nc.Scene()
     door = scene.add(nc.RigidBody(mass=4.0, inertia=(1.0, 1.0, 0.5), position=(0.5, 0, 0), name="door"))
@@ -214,6 +215,7 @@ def test_redundant_loop_has_finite_reactions():
     assert jnp.all(jnp.isfinite(jax.grad(force)(state.q)))
 
 
+@pytest.mark.exhaustive
 def test_drive_needs_the_torque_of_its_acceleration():
     scene = nc.Scene()
     rotor = scene.add(nc.RigidBody(mass=1.0, inertia=(0.3, 0.3, 0.4)))
@@ -349,6 +351,7 @@ def test_batches_of_trajectories_are_sensed_at_once():
     assert body.quaternion.shape == (2, 5, 4) and body.acceleration.shape == (2, 5, 3)
 
 
+@pytest.mark.exhaustive
 def test_rods_between_point_masses_know_their_length_and_pull():
     scene = nc.Scene()
     a = scene.add(nc.PointMass(mass=2.0, position=(1, 0, 0), velocity=(0, 0, 1.5)))
@@ -374,6 +377,7 @@ def test_rotors_start_with_the_rate_of_their_joint():
     np.testing.assert_allclose(system.energy(state).stores["rotor"], 9.0, atol=1e-12)
 
 
+@pytest.mark.exhaustive
 def test_markers_and_bodies_agree():
     system, state, handles = chain("universal")
     moved = nc.random_state(system, state, jax.random.key(8))
