@@ -326,7 +326,7 @@ class Law(eqx.Module):
         return 0.5 * GAINS["module"] * self.stiffness * c**2
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_effects(programs):
     """Functions and methods in every kind of effect, among them two instances that share a program."""
     scene = nc.Scene()

@@ -79,6 +79,7 @@ def test_results_are_those_of_programs():
     assert not any(wrong.values()), wrong
 
 
+@pytest.mark.exhaustive
 def test_lanes_outside_of_programs_are_evaluated_all_at_once():
     """Could go wrong: lanes along another axis, and what is not in lanes; `jax.vmap` in another one, too."""
     cases = {name: case for name, case in CASES.items() if name not in ("by lanes", "taken apart")}

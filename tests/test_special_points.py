@@ -273,10 +273,10 @@ POINTS = np.array(
 DIRECTIONS = np.array([(0.6, 0.8, 0.0, 0.0), (0.0, 0.0, 0.6, 0.8)])
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(
     ("order", "second"),
-    [(2, False), *(pytest.param(order, True, marks=pytest.mark.exhaustive) for order in (2, 4))],
+    [(2, False), (2, True), (4, True)],
 )
 def test_rollouts_from_special_points(order, second):
     """Reverse, forward and second derivatives of a few steps, along the slide and along the mount."""
@@ -424,14 +424,8 @@ MODES = {
 }
 
 
-@pytest.mark.parametrize(
-    "mode",
-    [
-        "grad",
-        pytest.param("jvp", marks=pytest.mark.exhaustive),
-        *(pytest.param(m, marks=pytest.mark.exhaustive) for m in ("jacrev", "jacfwd", "hessian")),
-    ],
-)
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("mode", MODES)
 def test_a_derivative_that_is_none_is_an_error_in_python_and_nan_in_jit(turntable, mode):
     system, state = turntable
 
@@ -443,8 +437,7 @@ def test_a_derivative_that_is_none_is_an_error_in_python_and_nan_in_jit(turntabl
     with pytest.raises(nc.DerivativeError, match="simulate: a derivative is not a number"):
         MODES[mode](rough, u)
     assert np.all(np.isnan(nc.jit(partial(MODES[mode], rough))(u)))
-    if mode != "grad":  # (of gradients all tests of gradients say so)
-        assert np.all(np.isfinite(MODES[mode](partial(end, law=jnp.cos), u)))
+    assert np.all(np.isfinite(MODES[mode](partial(end, law=jnp.cos), u)))
 
 
 @pytest.mark.exhaustive
