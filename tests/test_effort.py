@@ -20,7 +20,7 @@ import tolerances as tol
 
 import natcoord_jax as nc
 from natcoord_jax import gallery
-from natcoord_jax.xla import effort, kept, waiting
+from natcoord_jax.xla import effort, waiting
 
 OURS = "XLA_FLAGS", "JAX_COMPILATION_CACHE_DIR", "NATCOORD_JAX_EFFORT"
 """What of the environment is that of the tests."""
@@ -42,15 +42,15 @@ def traces():
 @pytest.fixture
 def improved(monkeypatch):
     """Whether each of the programs that full effort was made for has taken over."""
-    found = []
+    answer = []
 
-    def take_over(program, again, whole=effort.Program._take_over):
+    def take_over(program, again, original=effort.Program._take_over):
         before = program.run
-        whole(program, again)
-        found.append(program.run is not before)
+        original(program, again)
+        answer.append(program.run is not before)
 
     monkeypatch.setattr(effort.Program, "_take_over", take_over)
-    return found
+    return answer
 
 
 def programs_named(name):
@@ -64,26 +64,33 @@ def waited(condition, seconds=60.0):
     return condition()
 
 
-def test_full_effort_takes_over_with_the_same_results(improved):
+def assert_alike(one, other):
+    assert jax.tree.structure(one) == jax.tree.structure(other)
+    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other)):
+        np.testing.assert_allclose(a, b, rtol=tol.EXACT_GRADIENT, atol=tol.EXACT_GRADIENT)
+
+
+@pytest.mark.parametrize("kind", ["matrices", pytest.param("rollout", marks=pytest.mark.exhaustive)])
+def test_full_effort_takes_over_with_the_same_results(kind, improved):
     example = gallery.load("heavy_top")
+    x = example.state if kind == "rollout" else jnp.eye(3) + 0.1 * jnp.arange(9.0).reshape(3, 3)
 
     @partial(nc.jit, effort="tiers")
-    def both(state):
-        def cost(state):
-            return jnp.sum(nc.simulate(example.system, state, dt=0.01, steps=20).q[-1] ** 2)
+    def value_and_slope(x):
+        def cost(x):
+            if kind == "rollout":
+                return jnp.sum(nc.simulate(example.system, x, dt=0.01, steps=20).q[-1] ** 2)
+            return jnp.sum(jnp.sin(jnp.linalg.inv(x)))
 
-        return jax.value_and_grad(cost)(state)
+        return jax.value_and_grad(cost)(x)
 
-    first = both(example.state)
+    first = value_and_slope(x)
     assert not improved
-    second = both(example.state)
-    assert waited(lambda: both(example.state) and improved), "never compiled with full effort"
-    after = both(example.state)
+    second = value_and_slope(x)
+    assert waited(lambda: value_and_slope(x) and improved), "never compiled with full effort"
     assert improved == [True]
-    for found in second, after:
-        assert jax.tree.structure(found) == jax.tree.structure(first)
-        for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(first)):
-            np.testing.assert_allclose(a, b, rtol=tol.EXACT_GRADIENT, atol=tol.EXACT_GRADIENT)
+    assert_alike(second, first)
+    assert_alike(value_and_slope(x), first)
 
 
 def test_what_runs_once_is_not_compiled_again(improved):
@@ -126,7 +133,7 @@ def test_a_compiler_that_fails_leaves_the_program_at_hand(improved):
 def test_numbers_of_python_and_weak_ones_compile_nothing_new(traces):
     function, count = traces
     compiled = nc.jit(function)
-    given = [
+    arguments = [
         1.0,
         jnp.array(1.0),
         np.float64(1.0),
@@ -134,8 +141,8 @@ def test_numbers_of_python_and_weak_ones_compile_nothing_new(traces):
         jnp.sin(1.0) / jnp.sin(1.0),
         jnp.asarray(1.0) * 1,
     ]
-    found = [compiled(x) for x in given] + [compiled(1.0, 2.0), compiled(x=1.0, factor=jnp.array(2.0))]
-    np.testing.assert_allclose(found, 2.0 * np.sin(1.0))
+    answer = [compiled(x) for x in arguments] + [compiled(1.0, 2.0), compiled(x=1.0, factor=jnp.array(2.0))]
+    np.testing.assert_allclose(answer, 2.0 * np.sin(1.0))
     assert len(count) == 3, "one for each way to pass the arguments"
 
 
@@ -162,13 +169,13 @@ def test_lanes_are_compiled_as_all_else(improved):
     for _ in range(3):
         one = jax.vmap(function, in_axes=(1, None))(x, y)
         np.testing.assert_allclose(one["sum"], (x + y).T)
-        both = jax.vmap(jax.vmap(lambda a: function(a, y)["sine"]))(x)
-        np.testing.assert_allclose(both, y * np.sin(x), rtol=1e-14)
+        nested = jax.vmap(jax.vmap(lambda a: function(a, y)["sine"]))(x)
+        np.testing.assert_allclose(nested, y * np.sin(x), rtol=1e-14)
         slopes = jax.vmap(jax.grad(lambda a: function(a, y)["sine"]))(x[0])
         np.testing.assert_allclose(slopes, y * np.cos(x[0]), rtol=1e-14)
         of_all = jax.grad(lambda y: jax.vmap(lambda a: function(a, y)["sine"])(x[0]).sum())(y)
         np.testing.assert_allclose(of_all, np.sin(x[0]).sum(), rtol=1e-14)
-        np.testing.assert_allclose(jax.jit(jax.vmap(lambda a: function(a, y)["sine"]))(x[0]), both[0])
+        np.testing.assert_allclose(jax.jit(jax.vmap(lambda a: function(a, y)["sine"]))(x[0]), nested[0])
     assert waited(lambda: jax.vmap(function, (1, None))(x, y) and improved), "not with full effort"
     mean = nc.jit(lambda a: a - jax.lax.pmean(a, "lanes"))
     np.testing.assert_allclose(jax.vmap(mean, axis_name="lanes")(x[0]), x[0] - x[0].mean(), atol=1e-15)
@@ -196,8 +203,8 @@ def test_donated_memory_is_used_again():
 
 def test_leaves_that_are_no_arrays_pass():
     network = eqx.nn.MLP(2, 1, 4, 1, key=jax.random.key(0))
-    found, name = nc.jit(lambda network, x: (network(x), "name"))(network, jnp.ones(2))
-    np.testing.assert_allclose(found, network(jnp.ones(2)))
+    answer, name = nc.jit(lambda network, x: (network(x), "name"))(network, jnp.ones(2))
+    np.testing.assert_allclose(answer, network(jnp.ones(2)))
     assert name == "name"
     slope = nc.jit(eqx.filter_grad(lambda network, x: network(x)[0]))(network, jnp.ones(2))
     assert jax.tree.structure(eqx.filter(slope, eqx.is_array)) is not None
@@ -255,14 +262,6 @@ def test_settings_of_jax_are_followed():
         assert nc.jit(lambda x: x.at[0].set(1.0) if x[0] > 0 else x)(np.array([2.0]))[0] == 1.0
 
 
-def test_options_that_the_compiler_does_not_have_are_left_out():
-    """They come and go with versions of JAX, and one that is not known ends every call."""
-    unknown = {"xla_no_such_option": True}
-    assert effort.accepted(effort.LEAST | unknown) == effort.accepted(effort.LEAST)
-    assert "xla_backend_optimization_level" in effort.accepted(effort.LEAST)
-    assert not effort.accepted(unknown)
-
-
 # --- processes --------------------------------------------------------------------------------------------
 
 PROGRAM = """
@@ -293,6 +292,7 @@ def process(more, **env):
     )
 
 
+@pytest.mark.exhaustive
 def test_an_interpreter_ends_while_full_effort_is_under_way():
     run = process("")
     assert run.stdout is not None
@@ -303,6 +303,7 @@ def test_an_interpreter_ends_while_full_effort_is_under_way():
     assert time.monotonic() - begun < 6.0, "it waited for the compiler"
 
 
+@pytest.mark.exhaustive
 def test_an_interrupt_ends_the_run_and_not_the_compiler():
     run = process(
         """
@@ -319,9 +320,9 @@ except KeyboardInterrupt:
     assert ready == "ready\n"
     time.sleep(0.2)
     run.send_signal(signal.SIGINT)
-    rest, errors = run.communicate(timeout=60)
+    output, errors = run.communicate(timeout=60)
     assert run.returncode == 0 and not errors, errors
-    assert float(rest) == pytest.approx(float(first), rel=1e-9)
+    assert float(output) == pytest.approx(float(first), rel=1e-9)
 
 
 # --- waiting ----------------------------------------------------------------------------------------------
@@ -381,19 +382,20 @@ def lasting(tmp_path):
     """Run twice with full effort in a process of its own, with programs kept."""
 
     def run(more="", check=True):
-        found = subprocess.run(
+        answer = subprocess.run(
             [sys.executable, "-c", LASTING.replace("# here", more), str(tmp_path)],
             cwd=ROOT,
             env={k: v for k, v in os.environ.items() if k not in OURS},
             capture_output=True,
             text=True,
         )
-        assert not check or found.returncode == 0, found.stderr[-2000:]
-        return found
+        assert not check or answer.returncode == 0, answer.stderr[-2000:]
+        return answer
 
     return run
 
 
+@pytest.mark.slow
 def test_programs_outlast_the_process(lasting, tmp_path):
     first, second = lasting().stdout.split(), lasting().stdout.split()
     assert first[0] == second[0] and first[1] == second[1]
@@ -404,18 +406,7 @@ def test_programs_outlast_the_process(lasting, tmp_path):
     assert list(tmp_path.glob("*/full/*"))
 
 
-def test_a_folder_without_a_name_is_none(tmp_path, monkeypatch):
-    """As JAX takes an environment variable that is set to nothing."""
-    monkeypatch.chdir(tmp_path)
-    before = jax.config.jax_compilation_cache_dir
-    jax.config.update("jax_compilation_cache_dir", "")
-    try:
-        kept.put(b"request", b"program")
-        assert kept.get(b"request") is None and not list(tmp_path.iterdir())
-    finally:
-        jax.config.update("jax_compilation_cache_dir", before)
-
-
+@pytest.mark.exhaustive
 def test_programs_are_kept_whole_or_not_at_all(lasting, tmp_path):
     """Killed while it works, and with all files cut in half, it compiles again."""
     killed = lasting("time.sleep(0.5); import os, signal; os.kill(os.getpid(), signal.SIGKILL)", check=False)
@@ -424,9 +415,9 @@ def test_programs_are_kept_whole_or_not_at_all(lasting, tmp_path):
     files = [path for path in tmp_path.rglob("*") if path.is_file()]
     for path in files:
         path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    found = lasting()
-    assert found.stdout.split()[3:] == ["False", "True"]
-    assert "Error reading persistent compilation cache entry" in found.stderr
+    answer = lasting()
+    assert answer.stdout.split()[3:] == ["False", "True"]
+    assert "Error reading persistent compilation cache entry" in answer.stderr
 
 
 # --- fewer programs ---------------------------------------------------------------------------------------
@@ -438,6 +429,7 @@ def wheels():
     return example, partial(nc.simulate, example.system, example.state, dt=0.02)
 
 
+@pytest.mark.exhaustive
 def test_other_numbers_compile_nothing(wheels, programs):
     """One program serves as long as no more than numbers change, of steps and of inputs, too."""
     example, run = wheels
@@ -457,23 +449,25 @@ def test_other_numbers_compile_nothing(wheels, programs):
     assert programs[before:] == []
 
 
+@pytest.mark.exhaustive
 def test_room_for_more_steps_changes_nothing(wheels):
     example, run = wheels
     torques = jnp.asarray(np.random.default_rng(0).normal(size=(70, 3)))
     within = jax.jit(lambda torques: run(inputs=torques))(torques)
-    found = run(inputs=torques)
-    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(within), strict=True):
+    answer = run(inputs=torques)
+    for a, b in zip(jax.tree.leaves(answer), jax.tree.leaves(within), strict=True):
         assert a.shape == b.shape
         np.testing.assert_allclose(a, b, rtol=0, atol=tol.EXACT_GRADIENT)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("extra", [0, 2])
 def test_room_for_more_steps_is_no_room_for_more_attempts(extra):
     example = gallery.load("heavy_top")
     options = dict(dt=500.0, steps=3, extra_substeps=extra, throw=False)
-    found = nc.simulate(example.system, example.state, **options)
+    answer = nc.simulate(example.system, example.state, **options)
     within = jax.jit(lambda state: nc.simulate(example.system, state, **options))(example.state)
-    assert int(found.result) == int(within.result) != 0
-    assert int(found.steps_rejected) == int(within.steps_rejected)
-    assert int(found.failed_step) == int(within.failed_step)
-    np.testing.assert_allclose(found.q, within.q)
+    assert int(answer.result) == int(within.result) != 0
+    assert int(answer.steps_rejected) == int(within.steps_rejected)
+    assert int(answer.failed_step) == int(within.failed_step)
+    np.testing.assert_allclose(answer.q, within.q)

@@ -22,6 +22,7 @@ def upright():
     return scene.compile()
 
 
+@pytest.mark.slow
 def test_an_upright_pendulum_falls_at_its_exponent(upright):
     """Could go wrong: a scale that is left out of the sum. In ten seconds its rounding makes it fall."""
     growth = nc.tangent_growth(*upright, dt=0.01, steps=500, save_every=10)
@@ -33,6 +34,7 @@ def test_an_upright_pendulum_falls_at_its_exponent(upright):
     assert "rounding of its start: nowhere" in growth.explain()
 
 
+@pytest.mark.exhaustive
 def test_it_is_the_size_of_the_derivative(upright):
     """Could go wrong: the tangent of another motion, for instance of one without the inputs."""
     system, state = upright
@@ -49,6 +51,7 @@ def test_it_is_the_size_of_the_derivative(upright):
     assert abs(np.log10(np.linalg.norm(moved) / first) - growth.decades[-1]) < 0.01
 
 
+@pytest.mark.exhaustive
 def test_a_run_that_fails_has_no_growth(upright):
     system, state = upright
     broken = lambda t, state: jnp.full(1, jnp.nan)  # noqa: E731

@@ -10,10 +10,6 @@ import numpy as np
 import pytest
 
 import natcoord_jax as nc
-from natcoord_jax.core.joint import frames_at
-from natcoord_jax.mechanics.coordinates import coordinate_values
-from natcoord_jax.mechanics.equations_of_motion import loads
-from natcoord_jax.model.rows import rows_with_ground
 
 ROUND_OFF = 1e-13
 EQUATIONS = 1e-9  # accelerations and reactions relative to their size: one dense solve
@@ -57,26 +53,29 @@ def chain(*kinds, backwards=False):
     ends = (nc.Point(nc.ground, (2, 2, 0)), nc.Point(last, (1.4 + k, 0.5, 0.3)))
     scene.add(nc.Spring(ends, stiffness=7.0, length=0.3))
     scene.add(nc.Gravity())
-    return scene.compile()
+    return *scene.compile(), {handle.name: handle for handle in bodies}
 
 
-def menagerie():
-    """Every joint that describes its free motion, in both directions, each between two moving bodies."""
-    scene = nc.Scene()
+def menagerie(loaded=True):
+    """Every joint that describes its free motion, in both directions, each between two moving bodies.
+
+    The joints are listed by name, with the bodies on both sides and their point.
+    """
+    scene, joints = nc.Scene(), []
     for k, (kind, backwards) in enumerate(itertools.product(TREE_KINDS, (False, True))):
         y = 3.0 * k
         a = scene.add(body(f"a{k}", (0.5, y, 0.0)))
         b = scene.add(body(f"b{k}", (1.0, y + 0.4, 0.0), orientation=((1, 2, 3), 0.7)))
-        scene.add(nc.Spherical(nc.ground, a, point=(0, y, 0)))
         pair = (b, a) if backwards else (a, b)
-        joint = scene.add(
-            KINDS[kind](*pair, point=(0.8, y + 0.2, 0.1), axis=AXIS, name=f"{kind} of pair {k}")
-        )
-        if KINDS[kind].coordinates:
+        name = f"{kind} of pair {k}"
+        joints += [(f"ball {k}", nc.ground, a, (0, y, 0)), (name, *pair, (0.8, y + 0.2, 0.1))]
+        scene.add(nc.Spherical(nc.ground, a, point=joints[-2][3], name=f"ball {k}"))
+        joint = scene.add(KINDS[kind](*pair, point=joints[-1][3], axis=AXIS, name=name))
+        if loaded and KINDS[kind].coordinates:
             scene.add(nc.JointSpring(joint, stiffness=3.0, rest=0.2))
             scene.add(nc.JointForce(joint))
     scene.add(nc.Gravity())
-    return scene.compile()
+    return *scene.compile(), joints
 
 
 def loop():
@@ -88,69 +87,27 @@ def loop():
     for k in range(4):
         scene.add(nc.Revolute(line[k], line[k + 1], point=points[k], axis=(0, 1, 0), name=f"hinge {k}"))
     scene.add(nc.Gravity())
-    return scene.compile()
+    return *scene.compile(), [(f"hinge {k}", line[k], line[k + 1], points[k]) for k in range(4)]
 
 
-def instant_by_bodies(system, state, u):
-    """Accelerations and wrenches of all joints from six unknowns a body and all constraints, by numpy."""
-    rows, rates = state.q.reshape(-1, 4, 3), state.v.reshape(-1, 4, 3)
-    count = rows.shape[0]
-    spin = 0.5 * jnp.sum(jnp.cross(rows[:, 1:], rates[:, 1:]), axis=1)
-
-    def row_accelerations(x):
-        a, alpha = x.reshape(2, count, 3)
-        turning = jnp.cross(alpha[:, None], rows[:, 1:])
-        turning += jnp.cross(spin[:, None], jnp.cross(spin[:, None], rows[:, 1:]))
-        return jnp.concatenate([a[:, None], turning], axis=1).reshape(-1, 3)
-
-    def residual(q):
-        extended = rows_with_ground(q)
-        return jnp.concatenate(
-            [
-                jax.vmap(lambda e, f, r: e.residual(*frames_at(f, r)))(
-                    g.effect, system.frames[g.joints[:, 0]], extended[g.bodies]
-                ).reshape(-1)
-                for g in system.joints
-            ]
-        )
-
-    def rate(q, v):
-        return jax.jvp(residual, (q,), (v,))[1]
-
-    def constraint(x):
-        return jax.jvp(rate, (state.q, state.v), (state.v, row_accelerations(x)))[1]
-
-    def inertial(x):
-        impulse = jnp.einsum("bij,bjc->bic", system.mass, row_accelerations(x).reshape(-1, 4, 3))
-        return jnp.concatenate(
-            [impulse[:, 0], jnp.sum(jnp.cross(rows[:, 1:], impulse[:, 1:]), axis=1)]
-        ).reshape(-1)
-
-    zero = jnp.zeros(6 * count)
-    mass, jacobian = jax.jacfwd(inertial)(zero), jax.jacfwd(constraint)(zero)
-    applied = jnp.concatenate(loads(system, state, u, rates[:, 0], spin)).reshape(-1)
-    size = jacobian.shape[0]
-    matrix = np.block([[mass, -jacobian.T], [jacobian, np.zeros((size, size))]])
-    right = np.concatenate([applied - inertial(zero), -constraint(zero)])
-    solution = np.linalg.lstsq(matrix, right, rcond=1e-11)[0]
-    return np.asarray(row_accelerations(solution[: 6 * count])), np.asarray(
-        jacobian.T @ solution[6 * count :]
+def unbalanced(system, start, state, joints):
+    """Largest force or torque that Newton's and Euler's laws miss for a body, by its mass and its joints."""
+    rows = np.asarray(state.rows)
+    pulled = (
+        np.asarray(system.instant(state).accelerations).reshape(rows.shape)
+        + np.array([0, 0, 9.81])[None, None] * np.eye(4)[0][None, :, None]
     )
-
-
-def wrenches_on_bodies(system, state, found):
-    """Forces and torques about the reference points that the joints' reactions put on the bodies."""
-    rows = rows_with_ground(state.q)
-    count = len(system.structure.bodies)
-    force, torque = jnp.zeros((count + 1, 3)), jnp.zeros((count + 1, 3))
-    for k, name in enumerate(system.structure.joints):
-        if name:
-            p, c = (int(x) for x in system.joint_bodies[k])
-            point = frames_at(system.frames[k], rows[jnp.array([p, c])])[1].point
-            for b, sign in ((p, -1.0), (c, 1.0)):
-                f, n = sign * found.forces[k], sign * found.torques[k]
-                force, torque = force.at[b].add(f), torque.at[b].add(n + jnp.cross(point - rows[b, 0], f))
-    return np.concatenate([force[:-1], torque[:-1]]).reshape(-1)
+    impulses = np.einsum("bij,bjc->bic", system.mass, pulled)
+    force, torque = impulses[:, 0], np.cross(rows[:, 1:], impulses[:, 1:]).sum(axis=1)
+    for name, parent, child, place in joints:
+        sensor = system.sense(state, name)
+        point = np.asarray(system.sense(state, nc.Point(child, place), state=start).position)
+        for part, sign in ((parent, -1.0), (child, 1.0)):
+            if part is not nc.ground:
+                b = system.body_index(part.name)
+                force[b] -= sign * np.asarray(sensor.force)
+                torque[b] -= sign * (sensor.torque + np.cross(point - rows[b, 0], sensor.force))
+    return np.max(np.abs([force, torque])) / (1 + np.max(np.abs(impulses)))
 
 
 def close(a, b, tolerance):
@@ -183,17 +140,6 @@ def pendulum():
     return (*scene.compile(), bar, pin)
 
 
-def test_pendulum_reaction_after_one_second():
-    system, state, bar, pin = pendulum()
-
-    def force(steps):
-        trajectory = nc.simulate(system, state, dt=1 / steps, steps=steps, save_every=steps)
-        return system.sense(trajectory, pin).force[-1]
-
-    coarse, fine = force(500), force(1000)
-    np.testing.assert_allclose((4 * fine - coarse) / 3, (11.461237566925, 0, 23.227327629495), atol=1e-7)
-
-
 def test_hanging_chain_carries_its_weight():
     scene = nc.Scene()
     upper = scene.add(nc.RigidBody(mass=2.0, inertia=(0.1, 0.1, 0.1), position=(0.3, 0, 0)))
@@ -211,32 +157,33 @@ def test_hanging_chain_carries_its_weight():
 
 
 @pytest.mark.slow
-def test_equations_agree_with_those_of_bodies_and_multipliers():
-    system, state = menagerie()
-    state = nc.random_state(system, state, jax.random.key(3))
+def test_reactions_balance_all_bodies():
+    """Newton's and Euler's laws for every body, joints of all kinds in both directions."""
+    system, start, joints = menagerie(loaded=False)
+    state = nc.random_state(system, start, jax.random.key(3))
+    assert unbalanced(system, start, state, joints) <= EQUATIONS
+
+
+@pytest.mark.exhaustive
+def test_rates_and_accelerations_are_the_limits_of_short_steps():
+    """What changes in a step, over its length: of velocities, and of coordinates, with motors and springs."""
+    system, start, _ = menagerie()
+    state = nc.random_state(system, start, jax.random.key(3))
     u = jnp.linspace(-1.0, 1.0, len(system.structure.inputs))
-    found = system.instant(state, u)
-    accelerations, wrenches = instant_by_bodies(system, state, u)
-    close(found.accelerations, accelerations, EQUATIONS)
-    close(wrenches_on_bodies(system, state, found), wrenches, EQUATIONS)
+
+    @jax.jit
+    @jax.vmap
+    def quotients(h):
+        after = nc.step(system, state, u, h)
+        return (after.v - state.v) / h, (after.coordinates - state.coordinates) / h
+
+    accelerations, rates = ((8 * c - 6 * b + a) / 3 for a, b, c in quotients(1e-3 / 2 ** jnp.arange(3.0)))
+    close(system.instant(state, u).accelerations, accelerations, 1e-6)
+    wanted = [system.rate(state, joint, index=index) for joint, index in system.structure.coordinates]
+    close(wanted, rates, 1e-6)
 
 
-@pytest.mark.slow
-def test_acceleration_is_the_limit_of_short_steps():
-    system, state = chain("screw")
-    u = jnp.array([0.8])
-    state = jax.jit(lambda s: system.with_coordinate(s, "screw", 0.4, rate=1.5))(state)
-    state = jax.jit(lambda s: system.with_coordinate(s, "hinge", -0.3, rate=0.9))(state)
-
-    def quotient(h):
-        return (nc.step(system, state, u, h).v - state.v) / h
-
-    h = 1e-3
-    a, b, c = quotient(h), quotient(h / 2), quotient(h / 4)
-    limit = (8 * c - 6 * b + a) / 3
-    close(system.instant(state, u).accelerations, limit, 1e-6)
-
-
+@pytest.mark.exhaustive
 def test_door_on_two_hinges_shares_its_weight():
     scene = nc.Scene()
     door = scene.add(nc.RigidBody(mass=4.0, inertia=(1.0, 1.0, 0.5), position=(0.5, 0, 0), name="door"))
@@ -251,25 +198,24 @@ def test_door_on_two_hinges_shares_its_weight():
     np.testing.assert_allclose(high.force[2], 20, atol=1e-6)
     np.testing.assert_allclose(low.force[0], -high.force[0], atol=1e-6)
     np.testing.assert_allclose(low.force + high.force, (0, 0, 40), atol=1e-9)
-    close(wrenches_on_bodies(system, state, system.instant(state)), (0, 0, 40, 0, -20 + 20, 0), 1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_redundant_loop_has_finite_reactions():
-    system, state = loop()
-    state = nc.simulate(system, state, dt=0.01, steps=20).states
-    end = jax.tree.map(lambda x: x[-1], state)
-    found = system.instant(end)
-    accelerations, wrenches = instant_by_bodies(system, end, jnp.zeros(0))
-    close(found.accelerations, accelerations, 1e-3)  # the step leaves velocities off the constraints
-    projected = nc.assemble(system, end)
-    accelerations, wrenches = instant_by_bodies(system, projected, jnp.zeros(0))
-    found = system.instant(projected)
-    close(found.accelerations, accelerations, 1e-8)
-    close(wrenches_on_bodies(system, projected, found), wrenches, 1e-8)
-    assert np.all(np.isfinite(found.forces)) and np.max(np.abs(found.forces)) < 200
+    """Which balance its bars; and so have their gradients."""
+    system, start, joints = loop()
+    moved = nc.simulate(system, start, dt=0.01, steps=20).states
+    state = nc.assemble(system, jax.tree.map(lambda x: x[-1], moved))
+    assert unbalanced(system, start, state, joints) <= 1e-8
+    assert np.max(np.abs(system.instant(state).forces)) < 200
+
+    def force(q):
+        return system.instant(eqx.tree_at(lambda s: s.q, state, q)).forces[-1, 2]
+
+    assert jnp.all(jnp.isfinite(jax.grad(force)(state.q)))
 
 
+@pytest.mark.exhaustive
 def test_drive_needs_the_torque_of_its_acceleration():
     scene = nc.Scene()
     rotor = scene.add(nc.RigidBody(mass=1.0, inertia=(0.3, 0.3, 0.4)))
@@ -277,12 +223,13 @@ def test_drive_needs_the_torque_of_its_acceleration():
     scene.add(nc.Drive(hinge, function=lambda t: 3.0 * t**2, name="drive"))
     scene.add(nc.Armature(hinge, inertia=0.1))
     system, state = scene.compile()
-    found = system.instant(state)
-    np.testing.assert_allclose(found.multipliers["drive"], 6.0 * 0.5, atol=1e-9)
+    instant = system.instant(state)
+    np.testing.assert_allclose(instant.multipliers["drive"], 6.0 * 0.5, atol=1e-9)
     np.testing.assert_allclose(system.sense(state, rotor).angular_acceleration, (0, 0, 6), atol=1e-9)
-    np.testing.assert_allclose(found.torques, 0, atol=1e-9)
+    np.testing.assert_allclose(instant.torques, 0, atol=1e-9)
 
 
+@pytest.mark.exhaustive
 def test_wheel_counts_its_turns():
     scene = nc.Scene()
     wheel = scene.add(
@@ -301,28 +248,29 @@ def test_wheel_counts_its_turns():
     np.testing.assert_allclose(quaternion[-1], (-1, 0, 0, 0), atol=1e-11)
 
 
-@pytest.mark.slow
-def test_rates_are_derivatives_of_coordinates():
-    system, state = menagerie()
-    state = nc.random_state(system, state, jax.random.key(2))
-    found, derivative = jax.jit(
-        lambda q, v: jax.jvp(lambda q: coordinate_values(system, rows_with_ground(q)), (q,), (v,))
-    )(state.q, state.v)
-    for k, (joint, index) in enumerate(system.structure.coordinates):
-        close(system.rate(state, joint, index=index), derivative[k], 1e-12)
-        turns = (system.coordinate(state, joint, index=index) - found[k]) / (2 * math.pi)
-        close(turns, jnp.round(turns), 1e-12)
-
-
 SETTERS = [("revolute", True), ("planar", False), ("planar", True), ("universal", True), ("screw", False)]
 
 
+def motion_between(system, start, one, other, parent, child):
+    """Cosine of the angle by which the child has turned in its parent, and what the joint has moved there."""
+
+    def seen(state):
+        base, carried = system.sense(state, parent), system.sense(state, child)
+        point = system.sense(state, nc.Point(child, (0.8, 0.2, 0.1)), state=start).position
+        return base.rotation.T @ carried.rotation, base.rotation.T @ (point - base.position)
+
+    (turn, place), (turned, moved) = seen(one), seen(other)
+    return (jnp.trace(turned @ turn.T) - 1.0) / 2.0, jnp.linalg.norm(moved - place)
+
+
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(("kind", "backwards"), SETTERS)
-def test_setters_move_one_coordinate_and_keep_the_rest(kind, backwards):
-    system, state = chain(kind, backwards=backwards)
-    if kind != "screw":
-        state = nc.random_state(system, state, jax.random.key(5))
+def test_setters_move_one_coordinate_and_keep_all_else(kind, backwards):
+    system, start, handles = chain(kind, backwards=backwards)
+    pair = [handles[name] for name in (("b0", "a") if backwards else ("a", "b0"))]
+    state = start if kind == "screw" else nc.random_state(system, start, jax.random.key(5))
     sensor = system.sense(state, kind)
+    pitch = 0.01 / (2 * math.pi)
     for index in range(len(KINDS[kind].coordinates)):
         setter = jax.jit(lambda s, c, r, k=index: system.with_coordinate(s, kind, c, rate=r, index=k))
         moved = setter(state, 7.5, -1.2)
@@ -331,55 +279,42 @@ def test_setters_move_one_coordinate_and_keep_the_rest(kind, backwards):
         after = system.sense(moved, kind)
         wanted, rates = sensor.coordinates.at[index].set(7.5), sensor.rates.at[index].set(-1.2)
         if kind == "screw":
-            slope = 0.01 / (2 * math.pi)
-            ratio = jnp.array([1.0, slope]) if index == 0 else jnp.array([1 / slope, 1.0])
+            ratio = jnp.array([1.0, pitch]) if index == 0 else jnp.array([1 / pitch, 1.0])
             wanted, rates = 7.5 * ratio, -1.2 * ratio
         close(after.coordinates, wanted, ROUND_OFF)
         close(after.rates, rates, 10 * ROUND_OFF)
-        close(readings(system, moved, kind), wrapped(system, after.coordinates, kind), 10 * ROUND_OFF)
+        # Bodies have turned by the angle and moved by the length that the coordinate says.
+        change = wanted - sensor.coordinates
+        cosine, length = motion_between(system, start, state, moved, *pair)
+        if kind == "screw":
+            expected = jnp.cos(change[0]), jnp.abs(change[1])
+        elif KINDS[kind].coordinates[index].unit == "rad":
+            expected = jnp.cos(change[index]), 0.0
+        else:
+            expected = 1.0, jnp.abs(change[index])
+        close(jnp.stack([cosine, length]), jnp.stack(expected), 100 * ROUND_OFF)
         np.testing.assert_array_equal(system.sense(moved, "a").position, system.sense(state, "a").position)
         close(system.coordinate(moved, "hinge"), system.coordinate(state, "hinge"), ROUND_OFF)
         close(system.rate(moved, "hinge"), system.rate(state, "hinge"), 10 * ROUND_OFF)
 
 
-def axes_of(system, joint):
-    return next(g for g in system.joints if joint in g.names).effect.coordinates
-
-
-def readings(system, state, joint):
-    """Values of the joint's coordinates read from the rows, angles as points of the unit circle."""
-    k = system.joint_index(joint)
-    frames = frames_at(system.frames[k], rows_with_ground(state.q)[system.joint_bodies[k]])
-    return wrapped(system, jnp.stack([axis.value(*frames) for axis in axes_of(system, joint)]), joint)
-
-
-def wrapped(system, coordinates, joint):
-    angles = jnp.array([axis.unit == "rad" for axis in axes_of(system, joint)])
-    return jnp.where(angles, jnp.exp(1j * coordinates), coordinates)
-
-
+@pytest.mark.exhaustive
 def test_random_states_are_valid():
-    system, state = menagerie()
-    found = jax.jit(jax.vmap(lambda key: nc.random_state(system, state, key)))(
-        jax.random.split(jax.random.key(6), 5)
-    )
-    errors = system.constraint_errors(found)
+    system, state, _ = menagerie()
+    keys = jax.random.split(jax.random.key(6), 5)
+    states = jax.jit(jax.vmap(lambda key: nc.random_state(system, state, key)))(keys)
+    errors = system.constraint_errors(states)
     assert jnp.max(errors.position) < ROUND_OFF and jnp.max(errors.velocity) < 10 * ROUND_OFF
-    one = jax.tree.map(lambda x: x[0], found)
-    for joint in dict.fromkeys(name for name, _ in system.structure.coordinates):
-        close(
-            readings(system, one, joint),
-            wrapped(system, system.sense(one, joint).coordinates, joint),
-            ROUND_OFF * 10,
-        )
+    assert jnp.min(jnp.ptp(states.coordinates, axis=0)) > 0.1, "they are all the same"
 
 
 def test_random_states_turn_rotors_along():
-    system, state = chain("universal")
-    found = nc.random_state(system, state, jax.random.key(6))
-    np.testing.assert_allclose(found.rates[0], system.rate(found, "hinge"), atol=ROUND_OFF)
+    system, state, _ = chain("universal")
+    moving = nc.random_state(system, state, jax.random.key(6))
+    np.testing.assert_allclose(moving.rates[0], system.rate(moving, "hinge"), atol=ROUND_OFF)
 
 
+@pytest.mark.exhaustive
 def test_reactions_differentiate_and_batch():
     system, state, bar, pin = pendulum()
 
@@ -401,17 +336,7 @@ def test_reactions_differentiate_and_batch():
     np.testing.assert_allclose(batch.force[:, 0], [force(rate, 1.0) for rate in rates], rtol=1e-12)
 
 
-@pytest.mark.slow
-def test_gradient_of_a_redundant_loop_is_finite():
-    system, state = loop()
-
-    def force(q):
-        moved = nc.State(state.t, q, state.v, state.coordinates, state.rates, state.work)
-        return system.instant(moved).forces[-1, 2]
-
-    assert jnp.all(jnp.isfinite(jax.grad(force)(state.q)))
-
-
+@pytest.mark.exhaustive
 def test_batches_of_trajectories_are_sensed_at_once():
     system, state, bar, pin = pendulum()
     steps = jnp.array([0.01, 0.02])
@@ -424,6 +349,7 @@ def test_batches_of_trajectories_are_sensed_at_once():
     assert body.quaternion.shape == (2, 5, 4) and body.acceleration.shape == (2, 5, 3)
 
 
+@pytest.mark.exhaustive
 def test_rods_between_point_masses_know_their_length_and_pull():
     scene = nc.Scene()
     a = scene.add(nc.PointMass(mass=2.0, position=(1, 0, 0), velocity=(0, 0, 1.5)))
@@ -449,11 +375,12 @@ def test_rotors_start_with_the_rate_of_their_joint():
     np.testing.assert_allclose(system.energy(state).stores["rotor"], 9.0, atol=1e-12)
 
 
+@pytest.mark.exhaustive
 def test_markers_and_bodies_agree():
-    system, state = chain("universal")
+    system, state, handles = chain("universal")
     moved = nc.random_state(system, state, jax.random.key(8))
     sensed = system.sense(moved, "b0", inputs=jnp.array([0.3]))
-    local = nc.Point(nc.core.handles.Handle("body", "b0", 0), (0.2, -0.1, 0.3), local=True)
+    local = nc.Point(handles["b0"], (0.2, -0.1, 0.3), local=True)
     point = system.sense(moved, local, inputs=jnp.array([0.3]))
     arm = sensed.rotation @ jnp.array([0.2, -0.1, 0.3])
     spin, alpha = sensed.angular_velocity, sensed.angular_acceleration
@@ -472,7 +399,7 @@ def test_markers_and_bodies_agree():
 
 
 def test_requests_that_cannot_be_met_say_why():
-    system, state = loop()
+    system, state, _ = loop()
     closing = system.structure.joints[-1]
     with pytest.raises(ValueError, match="assemble"):
         system.with_coordinate(state, closing, 0.1)

@@ -2,7 +2,6 @@
 
 import json
 import os
-import re
 import subprocess
 import sys
 import time
@@ -15,13 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import tolerances as tol
-from test_contracts import TABLE, answering, inputs_of, random_motion, stage
+from test_contracts import answering, random_motion
 
 import natcoord_jax as nc
-from natcoord_jax.maths.collocation import gauss
-from natcoord_jax.mechanics.equations import prepare
-from natcoord_jax.mechanics.reduced import ReducedStep
-from natcoord_jax.xla import expansions, one_kernel
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "natcoord_jax" / "effects"
@@ -103,61 +98,32 @@ def lowered(scenes: dict[str, str], blocked: list[str]):
     return json.loads(run.stdout.splitlines()[-1])
 
 
-@pytest.fixture(scope="module")
-def everything_imported():
-    return lowered({name: code for name, (code, _) in SCENES.items()}, [])[0]
+USUAL = ("hinge and motor", "springs")
 
 
-def test_every_effect_module_is_needless_somewhere():
-    assert not set(LEAVES) - set.union(*(set(LEAVES) - _needed(name) for name in SCENES))
-
-
-def _needed(scene: str) -> set[str]:
+def needed(scene: str) -> set[str]:
     return {"natcoord_jax.effects." + module for module in SCENES[scene][1]}
 
 
-@pytest.mark.parametrize("name", SCENES)
-def test_absent_effects_leave_nothing(everything_imported, name):
+def test_each_effect_module_is_needless_in_a_scene():
+    assert not set.intersection(*map(needed, USUAL))
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "springs",
+        pytest.param("hinge and motor", marks=pytest.mark.slow),
+        *(pytest.param(name, marks=pytest.mark.exhaustive) for name in SCENES if name not in USUAL),
+    ],
+)
+def test_absent_effects_leave_nothing(name):
     """The lowered program, without locations, is the same byte for byte with their modules blocked."""
-    blocked = sorted(set(LEAVES) - _needed(name))
-    found, loaded = lowered({name: SCENES[name][0]}, blocked)
+    blocked = sorted(set(LEAVES) - needed(name))
+    scene = {name: SCENES[name][0]}
+    program, loaded = lowered(scene, blocked)
     assert blocked and not loaded, f"not blocked: {loaded}"
-    assert found[name] == everything_imported[name]
-
-
-def scopes(text: str) -> set[str]:
-    """Kinds of the table whose scope occurs in a program with locations."""
-    return {e.kind for e in TABLE if re.search(rf'[/"(]{e.kind.replace(" ", "_")}[/")]', text)}
-
-
-@pytest.mark.parametrize("effect", TABLE, ids=lambda e: e.__name__)
-def test_scopes_in_the_equations(effect):
-    """In the equations of a scene with one effect its scope is there, and no other one is."""
-    system, state, _ = stage(effect)
-    y = jnp.zeros(system.structure.unknowns + system.structure.multipliers)
-
-    def residual(system, state, y):
-        return ReducedStep.prepare(system, state, inputs_of(system), jnp.ones(()), gauss(1)).residual(y)
-
-    text = jax.jit(residual).lower(system, state, y).as_text(debug_info=True)
-    companions = {nc.Screw: {"coupling"}}
-    expected = {effect.kind} | companions.get(effect, set())
-    if TABLE[effect].joint is nc.Distance:  # keeps its multiplier wherever it is
-        expected.add(nc.Distance.kind)
-    assert scopes(text) == expected
-
-
-def test_scopes_in_the_rollout():
-    """None without effects; those of the effects with them, and joints of the tree never."""
-    scene = nc.Scene()
-    one = scene.add(nc.RigidBody(mass=1.0, inertia=(0.1, 0.2, 0.25)))
-    hinge = scene.add(nc.Revolute(nc.ground, one))
-    bare = scene.compile()
-    scene.add(nc.JointSpring(hinge, stiffness=1.0))
-    scene.add(nc.Gravity())
-    run = jax.jit(lambda system, state: nc.simulate(system, state, dt=0.1, steps=2))
-    assert scopes(run.lower(*bare).as_text(debug_info=True)) == set()
-    assert scopes(run.lower(*scene.compile()).as_text(debug_info=True)) == {"joint spring", "gravity"}
+    assert program == lowered(scene, [])[0]
 
 
 # --- equal kinds ------------------------------------------------------------------------------------------
@@ -183,31 +149,30 @@ def program(arms: int, solver: str):
     return run.lower(*star(arms, solver), jnp.zeros((5, arms)))
 
 
+SOLVERS = pytest.mark.parametrize(
+    "solver",
+    [
+        pytest.param("recursive", marks=pytest.mark.slow),
+        *(pytest.param(x, marks=pytest.mark.exhaustive) for x in ("full", "reduced")),
+    ],
+)
+
+
 @pytest.mark.filterwarnings("ignore:.*solved densely")
-@pytest.mark.parametrize("solver", ["recursive", "full", "reduced"])
-def test_program_size_does_not_grow_with_bodies(solver, monkeypatch):
-    def sizes(arms):
-        return {n: len(program(n, solver).as_text().splitlines()) for n in arms}
-
-    # Long sums are written as loops, a few lines each, see `test_program_size_of_large_scenes`; those of
-    # middle length in two or a few pieces; and programs of large arrays are left as they are.
-    jax.clear_caches()
-    monkeypatch.setattr(one_kernel, "WIDE", np.inf)
-    monkeypatch.setattr(expansions, "REDUCTION_LIMIT", np.inf)
-    monkeypatch.setattr(expansions, "FEW", 0)
-    lines = sizes((8, 40))
-    assert abs(lines[40] - lines[8]) <= 0.01 * lines[8], f"lines by number of arms: {lines}"
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:.*solved densely")
-@pytest.mark.parametrize("solver", ["recursive", "full", "reduced"])
-def test_program_size_of_large_scenes(solver):
+@SOLVERS
+def test_program_size_does_not_grow_with_bodies(solver):
+    """Small programs write out short products and sums, and are shorter or longer for it."""
     lines = {n: len(program(n, solver).as_text().splitlines()) for n in (4, 96)}
     assert lines[96] <= 1.35 * lines[4], f"lines by number of arms: {lines}"
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
+def test_program_size_of_large_arrays_is_the_same():
+    lines = {n: len(program(n, "recursive").as_text().splitlines()) for n in (96, 160)}
+    assert abs(lines[160] - lines[96]) <= 0.01 * lines[96], f"lines by number of arms: {lines}"
+
+
+@pytest.mark.exhaustive
 def test_compile_time_does_not_grow_with_bodies():
     jax.config.update("jax_enable_compilation_cache", False)
     try:
@@ -228,14 +193,16 @@ def test_compile_time_does_not_grow_with_bodies():
     assert seconds[48] <= 2.5 * seconds[4] + 1.0, f"seconds of compilation by number of arms: {seconds}"
 
 
-@pytest.mark.parametrize("solver", ["recursive", "full"])
-def test_solvers_give_one_trajectory(solver):
-    one, other = star(5, "reduced"), star(5, solver)
-    inputs = jnp.sin(jnp.arange(100.0))[:, None] * jnp.arange(1.0, 6.0)
-    a, b = (nc.simulate(*s, dt=0.02, inputs=inputs) for s in (one, other))
-    order = [one[0].body_index(name) for name in other[0].structure.bodies]
-    q = np.asarray(a.q).reshape(101, -1, 4, 3)[:, order]
-    assert np.max(np.abs(q - np.asarray(b.q).reshape(q.shape))) <= tol.SAME_TRAJECTORY
+@pytest.mark.exhaustive
+@pytest.mark.filterwarnings("ignore:.*solved densely")
+def test_solvers_give_one_trajectory():
+    """Of a star, whose bodies each solver puts in an order of its own."""
+    inputs, places = jnp.sin(jnp.arange(100.0))[:, None] * jnp.arange(1.0, 6.0), []
+    for solver in ("reduced", "recursive", "full"):
+        system, state = star(5, solver)
+        rows = np.asarray(nc.simulate(system, state, dt=0.02, inputs=inputs).states.rows)
+        places.append(rows[:, [system.body_index(name) for name in sorted(system.structure.bodies)]])
+    assert np.max(np.abs(places - places[0])) <= tol.SAME_TRAJECTORY
 
 
 def blocks_on_springs(count, closed, solver=None):
@@ -255,16 +222,16 @@ def blocks_on_springs(count, closed, solver=None):
     return scene.compile(solver=solver)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_chains_on_springs_are_solved_along_the_chain():
     system, state = blocks_on_springs(7, closed=False)
     assert system.structure.solver == "recursive"
     assert blocks_on_springs(7, closed=True)[0].structure.solver != "recursive"
-    whole, start = blocks_on_springs(7, closed=False, solver="full")
+    dense, start = blocks_on_springs(7, closed=False, solver="full")
     for order in (2, 4):
         scheme = nc.EnergyMomentum(order)
         a = nc.simulate(system, state, dt=0.02, steps=25, scheme=scheme)
-        b = nc.simulate(whole, start, dt=0.02, steps=25, scheme=scheme)
+        b = nc.simulate(dense, start, dt=0.02, steps=25, scheme=scheme)
         assert jnp.max(jnp.abs(a.q - b.q)) <= tol.SAME_TRAJECTORY
 
 
@@ -282,59 +249,10 @@ def gradient_and_curvature(solver):
 
 
 @pytest.mark.exhaustive
-@pytest.mark.parametrize("solver", ["recursive", "full"])
-def test_solvers_give_one_gradient(solver):
-    for a, b in zip(gradient_and_curvature("reduced"), gradient_and_curvature(solver)):
-        assert jnp.max(jnp.abs(a - b)) <= tol.SAME_GRADIENT * jnp.max(jnp.abs(a))
-
-
-def mixed(stages: int):
-    """A tree with joints of most kinds, springs along it and, for one stage, a drive in it."""
-    scene, random = nc.Scene(), np.random.default_rng(1)
-    scene.add(nc.Gravity())
-    bodies = [scene.add(nc.RigidBody(mass=3.0, inertia=(1.0, 1.2, 1.4), position=(0.1, 0.2, 0.3)))]
-    for kind in (nc.Revolute, nc.Spherical, nc.Universal, nc.Cylindrical, nc.Prismatic, nc.Planar):
-        place, parent = random.normal(size=3), bodies[random.integers(len(bodies))]
-        body = nc.RigidBody(mass=1.0, inertia=(0.3, 0.2, 0.25), position=place, com=(0.1, 0.05, 0.02))
-        bodies.append(scene.add(body))
-        axes = {"axis": (1.0, 0.0, 0.0), "second": (0.0, 1.0, 0.0)} if kind is nc.Universal else {}
-        axes = {"axis": random.normal(size=3)} if kind not in (nc.Universal, nc.Spherical) else axes
-        pair = (bodies[-1], parent) if kind is nc.Cylindrical else (parent, bodies[-1])
-        joint = scene.add(kind(*pair, point=random.normal(size=3), **axes))
-        scene.add(nc.Spring((nc.Point(parent, 0.5 * place), nc.Point(bodies[-1], place)), stiffness=5.0))
-        if stages == 1 and kind is nc.Revolute:
-            scene.add(nc.JointSpring(joint, stiffness=3.0))
-            scene.add(nc.Drive(joint, function=jnp.sin))
-    return scene
-
-
-@pytest.mark.parametrize(
-    "stages", [pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.exhaustive)]
-)
-def test_blocks_along_the_tree_are_the_jacobian(stages):
-    """Of the same residual as the reduced form's; their factors solve with it and its transpose."""
-
-    def numbers(system, state):
-        form = system.structure.solver
-        equations = prepare(system, state, inputs_of(system), jnp.asarray(0.1), gauss(stages))
-        guess = equations.guess()
-        y = guess + 0.3 * jnp.sin(jnp.arange(guess.shape[0]))
-        exact = jax.jacfwd(lambda y: equations.residual(y)[0])(y)
-        same = equations.residual(y)[0], exact
-        if form == "reduced":
-            return same, []
-        matrix = equations.jacobian(y)
-        factors, inertias = equations.factorised(matrix)
-        diagonal = jnp.where(inertias > 0, jnp.abs(jnp.diagonal(exact)), 0.0)
-        solved = equations.differentiable(matrix).solve(exact @ y)
-        errors = solved - y, factors.transpose().solve(exact.T @ y) - y, diagonal - inertias
-        return same, errors
-
-    found = [jax.jit(numbers)(*mixed(stages).compile(solver=s)) for s in ("reduced", "recursive")]
-    for a, b in zip(found[0][0], found[1][0]):
-        assert jnp.max(jnp.abs(a - b)) <= tol.IDENTITY * jnp.max(jnp.abs(a))
-    for error in found[1][1]:
-        assert jnp.max(jnp.abs(error)) <= tol.EXACT_GRADIENT
+def test_solvers_give_one_gradient():
+    for solver in ("recursive", "full"):
+        for a, b in zip(gradient_and_curvature("reduced"), gradient_and_curvature(solver)):
+            assert jnp.max(jnp.abs(a - b)) <= tol.SAME_GRADIENT * jnp.max(jnp.abs(a)), solver
 
 
 # --- numbers are leaves -----------------------------------------------------------------------------------
@@ -349,7 +267,7 @@ class Idle(nc.Force):
 
 
 def test_a_changed_number_never_retraces(programs):
-    """Every leaf of system and state, the step, the inputs; a scene built anew with other numbers."""
+    """Every leaf of system and state, the step, the inputs, also more of them; a scene built anew."""
 
     def scene(mass=1.0, stiffness=2.0, place=0.5):
         made = nc.Scene()
@@ -364,20 +282,22 @@ def test_a_changed_number_never_retraces(programs):
     system, state = scene()
     first = nc.simulate(system, state, dt=0.1, inputs=jnp.zeros((4, 1)))
     assert "jit(simulate)" in programs
-    others = [scene(mass=2.0), scene(stiffness=5.0), scene(place=0.3)]
+    scenes = [scene(mass=2.0), scene(stiffness=5.0), scene(place=0.3)]
     programs.clear()
-    found = [nc.simulate(*s, dt=0.1, inputs=jnp.zeros((4, 1))) for s in others]
-    found.append(nc.simulate(system, state, dt=0.05, inputs=jnp.zeros((4, 1))))
-    found.append(nc.simulate(system, state, dt=0.1, inputs=jnp.ones((4, 1))))
-    floats, rest = eqx.partition(system, eqx.is_inexact_array)
-    moved = eqx.combine(jax.tree.map(lambda x: x * 1.01, floats), rest)
-    found.append(nc.simulate(moved, state, dt=0.1, inputs=jnp.zeros((4, 1)), throw=False))
+    runs = [nc.simulate(*s, dt=0.1, inputs=jnp.zeros((4, 1))) for s in scenes]
+    runs.append(nc.simulate(system, state, dt=0.05, inputs=jnp.zeros((4, 1))))
+    runs.append(nc.simulate(system, state, dt=0.1, inputs=jnp.ones((4, 1))))
+    floats, structure = eqx.partition(system, eqx.is_inexact_array)
+    moved = eqx.combine(jax.tree.map(lambda x: x * 1.01, floats), structure)
+    runs.append(nc.simulate(moved, state, dt=0.1, inputs=jnp.zeros((4, 1)), throw=False))
     later = eqx.tree_at(lambda s: s.t, state, state.t + 1.0)
-    found.append(nc.simulate(system, later, dt=0.1, inputs=jnp.zeros((4, 1))))
+    runs.append(nc.simulate(system, later, dt=0.1, inputs=jnp.zeros((4, 1))))
+    assert nc.simulate(system, state, dt=0.1, inputs=jnp.zeros((11, 1))).q.shape[0] == 12
     assert "jit(simulate)" not in programs, "a rollout was compiled again"
-    assert all(float(jnp.max(jnp.abs(x.q - first.q))) > 0 for x in found[:-1])
+    assert all(float(jnp.max(jnp.abs(x.q - first.q))) > 0 for x in runs[:-1])
 
 
+@pytest.mark.exhaustive
 def test_a_scene_of_traced_numbers():
     """Building inside jit gives the numbers of building outside."""
 

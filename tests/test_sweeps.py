@@ -161,7 +161,7 @@ def test_two_dask_workers_one_of_which_is_killed(tmp_path, monkeypatch):
 
 @pytest.mark.exhaustive
 def test_lanes_go_to_all_devices(tmp_path):
-    flags = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count=2"
+    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2"
     process = started("devices", tmp_path / "two", XLA_FLAGS=flags)
     words, _ = process.communicate()
     assert process.returncode == 0 and words.startswith("2 12 of 12 rows are done")

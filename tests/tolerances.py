@@ -20,6 +20,11 @@ LONG_DIRECTORS = 1e-13
 # One step: balances of single steps, exact up to a few roundings of the largest term.
 STEP_BALANCE = 1e-12
 
+# One step from the same state, solved with what the steps before have left and without: the last correction.
+STEP_ON_ITS_OWN = 1e-14  # found: 9e-16
+# ... of stiff springs, which feel how their ends are rounded.
+STIFF_STEP_ON_ITS_OWN = 1e-12
+
 # Identities that hold exactly in exact arithmetic and take a handful of operations: G(q_mid) P = 0 at a
 # random step of one radian, frame indifference, third differences of a quadratic.
 IDENTITY = 1e-13
