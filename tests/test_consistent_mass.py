@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import tolerances as tol
 from differences import assert_v_shaped
-from test_solids import ELEMENTS, STRETCHING, l_shape
+from flexible_scenes import ELEMENTS, STRETCHING, l_shape
 
 import natcoord_jax as nc
 from natcoord_jax.core.effect import replace_fields

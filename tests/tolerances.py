@@ -163,3 +163,17 @@ THICK_WALL = {2.0: 2e-2, 3.0: 1e-4}
 FALLING_BEAM = 1e-4
 # Angular momentum that a pulse gives a soft block of four elements, with lumped and with consistent masses.
 L_SHAPE = 1e-2
+
+# --- flexible parts (tests/flexible) ------------------------------------------------------------------------
+
+# What is exact in exact arithmetic, relative to its size: some hundred roundings.
+SOME_ROUNDINGS = 1e-13
+# What theory of first order says, for loads that turn a section by some 1e-4 radians.
+FIRST_ORDER = 1e-6
+# Equilibria that are exact for any mesh, in strains and places of one: residuals of stiff stretch, rounded.
+EXACT_STATICS = 1e-12
+# Figures of statics that are printed to four digits behind the point, of places of some metres [m].
+FOUR_DIGITS = 1e-4
+THREE_DIGITS = 2e-3
+# An L of plates beside beam theory, less what eight elements a leg miss.
+FRAME_OF_PLATES = 1.3e-3
