@@ -228,8 +228,8 @@ def l_shape(element, law, mass="lumped"):
         nc.mesh.box(size, count, element=ELEMENTS[element])
         for size, count in (((6.0, 3.0, 3.0), (2, 1, 1)), ((3.0, 7.0, 3.0), (1, 2, 1)))
     ]
-    both = np.concatenate([cells[0].nodes, cells[1].nodes + np.array([0.0, 3.0, 0.0])])
-    mesh = nc.mesh.cleaned(both, np.concatenate([cells[0].cells, cells[1].cells + len(cells[0].nodes)]))
+    nodes = np.concatenate([cells[0].nodes, cells[1].nodes + np.array([0.0, 3.0, 0.0])])
+    mesh = nc.mesh.cleaned(nodes, np.concatenate([cells[0].cells, cells[1].cells + len(cells[0].nodes)]))
     traction, x = np.array([256.0, 512.0, 768.0]) / 9, mesh.nodes
     loads = np.zeros_like(x)
     for sign, axis, place in ((1, 0, 6.0), (-1, 1, 10.0)):

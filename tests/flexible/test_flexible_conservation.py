@@ -190,6 +190,8 @@ class Flight:
 
 STIFF = {"energy": tol.ENERGY, "momentum": tol.MOMENTUM}
 """A thousand steps of 0.07 rad, of stiff joints and slender booms."""
+IN_PARTS = {"extra_substeps": 100}
+TIED = {"stored": 1e-3, "energy": 10 * tol.ENERGY_OF_A_SMALL_SCENE}
 SHAKEN = {"energy": tol.ENERGY_OF_A_SOLID, "momentum": tol.MOMENTUM_OF_A_SOLID}
 
 
@@ -200,15 +202,15 @@ def _block(element, law, **given):
 
 
 FLIGHTS = {
-    "beam": Flight(satellite, 0.035, 1000, stored=0.05, more={"extra_substeps": 100}, **STIFF),
+    "beam": Flight(satellite, 0.035, 1000, stored=0.05, more=IN_PARTS, **STIFF),
     "shell": Flight(winged, 0.01, 100, stored=5e-4),
     "solid": Flight(lambda: tumbling("Hexahedron8", "neo-Hooke"), 0.02, 50, **SHAKEN),
-    "beam, order 4": Flight(satellite, 0.035, 100, 4, "exhaustive", 0.05, more={"extra_substeps": 100}, **STIFF),
+    "beam, order 4": Flight(satellite, 0.035, 100, 4, "exhaustive", 0.05, more=IN_PARTS, **STIFF),
     "beams of directors": Flight(booms_of_every_order, 0.03, 150, lane="slow", **STIFF),
     "loop of beams": Flight(loop_of_beams, 0.02, 300, lane="slow", stored=0.1, **STIFF),
     "folded plates": Flight(lambda: folded(offset=0.01), 0.01, 60, lane="slow", stored=0.01),
     "plate on a beam": Flight(plate_on_a_beam, 0.01, 40, lane="exhaustive", stored=1e-4),
-    "tied solids": Flight(lambda: tied(0.06), 2e-3, 300, lane="slow", stored=1e-3, energy=10 * tol.ENERGY_OF_A_SMALL_SCENE),
+    "tied solids": Flight(lambda: tied(0.06), 2e-3, 300, lane="slow", **TIED),
     "law of one's own": Flight(
         lambda: tumbling("Tetrahedron10P0", "Gent"), 0.02, 50, lane="exhaustive", **SHAKEN),
     "nearly incompressible": Flight(
@@ -224,7 +226,7 @@ FLIGHTS = {
     "mitc4+": Flight(
         lambda: folded(membrane="hybrid mitc4+"), 0.01, 60, lane="exhaustive", stored=0.01
     ),
-    "tied flat solids": Flight(lambda: tied(0.0), 2e-3, 300, lane="exhaustive", stored=1e-3, energy=10 * tol.ENERGY_OF_A_SMALL_SCENE),
+    "tied flat solids": Flight(lambda: tied(0.0), 2e-3, 300, lane="exhaustive", **TIED),
 } | {f"{element} of {law}": _block(element, law) for element, law in PAIRED}  # fmt: skip
 
 
@@ -253,6 +255,7 @@ def test_energy_and_momenta_are_kept_in_flight(name):
 # --- what takes energy, and steps in parts ------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_damping_takes_energy_only_from_strain():
     """The centrifugal stretch of a boom starts an oscillation; steady rotation loses nothing."""
     section = nc.Section.of_numbers(EA=300.0, GA=200.0, EI=1.0, GJ=1.0, density=1.0, rotary=0.02)
