@@ -202,10 +202,11 @@ def _block(element, law, **given):
 
 
 FLIGHTS = {
-    "beam": Flight(satellite, 0.035, 1000, stored=0.05, more=IN_PARTS, **STIFF),
+    "beam": Flight(satellite, 0.035, 200, stored=0.05, more=IN_PARTS, **STIFF),
     "shell": Flight(winged, 0.01, 100, stored=5e-4),
     "solid": Flight(lambda: tumbling("Hexahedron8", "neo-Hooke"), 0.02, 50, **SHAKEN),
     "beam, order 4": Flight(satellite, 0.035, 100, 4, "exhaustive", 0.05, more=IN_PARTS, **STIFF),
+    "beam for long": Flight(satellite, 0.035, 1000, 2, "exhaustive", 0.05, more=IN_PARTS, **STIFF),
     "beams of directors": Flight(booms_of_every_order, 0.03, 150, lane="slow", **STIFF),
     "loop of beams": Flight(loop_of_beams, 0.02, 300, lane="slow", stored=0.1, **STIFF),
     "folded plates": Flight(lambda: folded(offset=0.01), 0.01, 60, lane="slow", stored=0.01),

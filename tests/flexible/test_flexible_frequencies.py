@@ -31,6 +31,7 @@ def strip(count, **more):
     return scene.compile()
 
 
+@pytest.mark.slow
 def test_a_strip_has_the_frequency_of_a_beam_and_its_derivatives():
     """10 Hz; as the thickness, the root of the modulus, and that of one over the density."""
     system, state = strip(4)

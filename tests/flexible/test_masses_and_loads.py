@@ -193,6 +193,7 @@ ROTARY = {"Brick": 3.0, "Hexahedron8": 3.0, "Hexahedron20": 2.2, "Hexahedron27":
 """Inertia of a cube of one element, over the exact one."""
 
 
+@pytest.mark.slow
 def test_lumped_masses_of_solids():
     """Mass and centre are exact, and rotary inertia with 27 nodes; others come to it as fast as shapes do.
 
@@ -226,6 +227,7 @@ def body(kind, **more):
     return scene, scene.add(nc.Solid(mesh, material=METAL, name="body", **more))
 
 
+@pytest.mark.slow
 def test_mass_and_motion_of_what_is_put_somewhere():
     """A rigid body that is turned and spun, not strained."""
     turn, spin = np.array([(0.0, -1, 0), (1, 0, 0), (0, 0, 1)]), np.array([0.2, 0.3, 2.0])

@@ -26,6 +26,7 @@ def mass_of(mesh):
     return np.asarray(scene.compile()[0].mass)[:, 0, 0]
 
 
+@pytest.mark.slow
 def test_boxes_have_their_volume_and_faces_that_close():
     """Faces from outside, and the force of a pressure on all of them, which is none."""
     for element in ("hexahedron8", "hexahedron20", "hexahedron27", "tetrahedron10"):
@@ -73,23 +74,28 @@ def written(folder, order, layers=0, serendipity=False):
     return folder / "part.msh"
 
 
-FILES = {10: (2, 0, False), 8: (1, 1, False), 20: (2, 1, True), 27: (2, 1, False)}
-"""By nodes of a cell."""
+FILES = [
+    (8, (1, 1, False)),
+    pytest.param(10, (2, 0, False), marks=pytest.mark.slow),
+    pytest.param(20, (2, 1, True), marks=pytest.mark.slow),
+    pytest.param(27, (2, 1, False), marks=pytest.mark.slow),
+]
+"""Nodes of a cell, and how it is written."""
 
 
-def test_meshes_of_gmsh(tmp_path):
+@pytest.mark.parametrize(("nodes", "how"), FILES)
+def test_meshes_of_gmsh(tmp_path, nodes, how):
     """Nodes in our order: the volume is right, and a pressure on a face by its name shortens it."""
-    for nodes, how in FILES.items():
-        mesh = nc.io.read_mesh(written(tmp_path, *how))
-        assert mesh.cells.shape[1] == nodes
-        assert sorted(mesh.faces) == ["held", "pushed"]
-        assert sorted(mesh.sets) == ["7", "held", "pushed"]
-        np.testing.assert_array_equal(mesh.nodes[mesh.sets["held"]][:, 0], 0.0)
-        assert len(mesh.part("rubber").cells) == len(mesh.cells)
-        assert mass_of(mesh).sum() == pytest.approx(250.0, rel=1e-9)
-        close = {"atol": tol.SOME_ROUNDINGS, "err_msg": str(nodes)}
-        np.testing.assert_allclose(pushed(mesh, mesh.faces["pushed"]), (-0.25, 0, 0), **close)
-        np.testing.assert_allclose(pushed(mesh, mesh.outside), 0.0, **close)
+    mesh = nc.io.read_mesh(written(tmp_path, *how))
+    assert mesh.cells.shape[1] == nodes
+    assert sorted(mesh.faces) == ["held", "pushed"]
+    assert sorted(mesh.sets) == ["7", "held", "pushed"]
+    np.testing.assert_array_equal(mesh.nodes[mesh.sets["held"]][:, 0], 0.0)
+    assert len(mesh.part("rubber").cells) == len(mesh.cells)
+    assert mass_of(mesh).sum() == pytest.approx(250.0, rel=1e-9)
+    close = {"atol": tol.SOME_ROUNDINGS}
+    np.testing.assert_allclose(pushed(mesh, mesh.faces["pushed"]), (-0.25, 0, 0), **close)
+    np.testing.assert_allclose(pushed(mesh, mesh.outside), 0.0, **close)
 
 
 def test_meshes_that_cannot_be_read(tmp_path):
