@@ -259,7 +259,7 @@ def test_a_quadratic_law_is_linear_elasticity():
 PROFILES = [(None, 1 / 8, 1 / 2), (lambda x: 1.0 - x, 1 / 30, 1 / 6), (lambda x: x, 11 / 120, 1 / 3)]
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_deflection_under_loads_along_a_beam():
     """Of a slender cantilever, in q L^4 / (E I), and in q L^2 / (G A)."""
     load, section = -1e-4, nc.Section.of_numbers(**NUMBERS)

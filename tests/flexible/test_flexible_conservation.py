@@ -207,11 +207,11 @@ FLIGHTS = {
     "solid": Flight(lambda: tumbling("Hexahedron8", "neo-Hooke"), 0.02, 50, **SHAKEN),
     "beam, order 4": Flight(satellite, 0.035, 100, 4, "exhaustive", 0.05, more=IN_PARTS, **STIFF),
     "beam for long": Flight(satellite, 0.035, 1000, 2, "exhaustive", 0.05, more=IN_PARTS, **STIFF),
-    "beams of directors": Flight(booms_of_every_order, 0.03, 150, lane="slow", **STIFF),
-    "loop of beams": Flight(loop_of_beams, 0.02, 300, lane="slow", stored=0.1, **STIFF),
+    "beams of directors": Flight(booms_of_every_order, 0.03, 150, lane="exhaustive", **STIFF),
+    "loop of beams": Flight(loop_of_beams, 0.02, 300, lane="exhaustive", stored=0.1, **STIFF),
     "folded plates": Flight(lambda: folded(offset=0.01), 0.01, 60, lane="slow", stored=0.01),
     "plate on a beam": Flight(plate_on_a_beam, 0.01, 40, lane="exhaustive", stored=1e-4),
-    "tied solids": Flight(lambda: tied(0.06), 2e-3, 300, lane="slow", **TIED),
+    "tied solids": Flight(lambda: tied(0.06), 2e-3, 300, lane="exhaustive", **TIED),
     "law of one's own": Flight(
         lambda: tumbling("Tetrahedron10P0", "Gent"), 0.02, 50, lane="exhaustive", **SHAKEN),
     "nearly incompressible": Flight(
@@ -256,7 +256,7 @@ def test_energy_and_momenta_are_kept_in_flight(name):
 # --- what takes energy, and steps in parts ------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_damping_takes_energy_only_from_strain():
     """The centrifugal stretch of a boom starts an oscillation; steady rotation loses nothing."""
     section = nc.Section.of_numbers(EA=300.0, GA=200.0, EI=1.0, GJ=1.0, density=1.0, rotary=0.02)

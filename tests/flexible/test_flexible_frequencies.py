@@ -48,7 +48,7 @@ def test_a_strip_has_the_frequency_of_a_beam_and_its_derivatives():
     np.testing.assert_allclose(powers, (1.0, 0.5, -0.5), atol=2e-3)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_finer_strip_is_nearer_by_order_two():
     coarse, fine = (float(nc.modes(*strip(n)).frequencies[0]) / (2 * np.pi) for n in (4, 8))
     np.testing.assert_allclose((coarse, fine), (9.834, 9.958), atol=1.5e-3)
@@ -103,7 +103,7 @@ def test_simply_supported_plate():
     assert np.log2(coarse[0] / fine[0]) == pytest.approx(2.0, abs=0.1)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_free_square_plate():
     """13.489, 19.789 and 24.432 by Leissa (J. Sound Vib. 31, 1973); finer series are 0.2 to 1 % below."""
     coarse, fine = (frequencies(square(count)) / 1e3 for count in (4, 8))
@@ -290,7 +290,7 @@ def test_a_mass_on_a_spring_in_rotation():
 FLAPS = {0.0: (3.5160, 22.0345), 2.0: (4.1373, 22.6149), 10.0: (11.2023, 33.6404)}
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_rotating_cantilever():
     """Could go wrong: no stiffening by the centrifugal force, or none of its softening in the plane.
 

@@ -29,10 +29,8 @@ def length(points):
     return np.sum(np.linalg.norm(np.diff(points, axis=-2), axis=-1), axis=-1)
 
 
-ROPES = [pytest.param(4, marks=pytest.mark.slow), pytest.param(32, marks=pytest.mark.exhaustive)]
-
-
-@pytest.mark.parametrize("elements", ROPES)
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("elements", [4, 32])
 def test_a_coarse_rope_does_not_stretch(elements):
     """Four elements keep the length of the fine mesh within 3 %, where interpolated directors double it; the
     tip of the fine mesh is where another code has it at half a second."""

@@ -270,10 +270,8 @@ def test_edges_of_a_mesh():
     assert plate.edge("right").sides.tolist() == [[4, 5]]
 
 
-FOLLOWING = [pytest.param(False, marks=pytest.mark.exhaustive), pytest.param(True, marks=pytest.mark.slow)]
-
-
-@pytest.mark.parametrize("following", FOLLOWING)
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("following", [False, True])
 def test_resultant_of_an_edge_load(following):
     """Momentum and angular momentum of a free plate grow as force and moment say; work is energy."""
     scene = nc.Scene()

@@ -84,15 +84,9 @@ def test_sets_of_constraints():
     np.testing.assert_allclose(lengths, 1 / 3, atol=tol.CONSTRAINT_OF_A_SMALL_SCENE)
 
 
-NETS = [
-    pytest.param("directors", 2, marks=pytest.mark.slow),
-    pytest.param("directors", 4, marks=pytest.mark.exhaustive),
-    pytest.param("points", 2, marks=pytest.mark.exhaustive),
-    pytest.param("points", 4, marks=pytest.mark.exhaustive),
-]
-
-
-@pytest.mark.parametrize(("kind", "order"), NETS)
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("kind", ["points", "directors"])
+@pytest.mark.parametrize("order", [2, 4])
 def test_nodes_move_alike_in_all_forms(kind, order):
     """One trajectory; energy, and the length of directors, to round-off."""
     motions, scheme = [], nc.EnergyMomentum(order=order)
