@@ -178,3 +178,17 @@ L_SHAPE = 1e-2
 SHARED_GAP = 1e-9
 # Contacts so stiff that places are rounded by more of the energy.
 ENERGY_OF_A_STIFF_CONTACT = 10 * ENERGY_OF_A_SMALL_SCENE
+
+# --- flexible parts (tests/flexible) ------------------------------------------------------------------------
+
+# What is exact in exact arithmetic, relative to its size: some hundred roundings.
+SOME_ROUNDINGS = 1e-13
+# What theory of first order says, for loads that turn a section by some 1e-4 radians.
+FIRST_ORDER = 1e-6
+# Equilibria that are exact for any mesh, in strains and places of one: residuals of stiff stretch, rounded.
+EXACT_STATICS = 1e-12
+# Figures of statics that are printed to four digits behind the point, of places of some metres [m].
+FOUR_DIGITS = 1e-4
+THREE_DIGITS = 2e-3
+# An L of plates beside beam theory, less what eight elements a leg miss.
+FRAME_OF_PLATES = 1.3e-3
