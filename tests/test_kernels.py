@@ -199,6 +199,23 @@ def test_scenes_run_in_one_kernel(names, monkeypatch):
 GOLDEN = json.loads(Path(__file__).with_name("golden.json").read_text())
 
 
+def test_a_run_has_as_many_kernels_for_any_number_of_steps():
+    """The record of all steps, which grows with them, says nothing about the size of one."""
+    example = gallery.load("spacecraft")
+
+    def kernels(steps, derivative):
+        def loss(inputs):
+            run = nc.simulate(example.system, example.state, dt=example.dt, inputs=inputs)
+            return jnp.sum(run.v[-1] ** 2)
+
+        function = jax.grad(loss) if derivative else loss
+        return jax.jit(function).lower(example.inputs(steps)).as_text().count(MARK)
+
+    for derivative in (False, True):
+        numbers = {steps: kernels(steps, derivative) for steps in (10, 5000, 100_000)}
+        assert min(numbers.values()) > 0 and len(set(numbers.values())) == 1, f"kernels by steps: {numbers}"
+
+
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("case", ["heavy_top, 4", "four_bar, 2"])
 def test_golden_scenes(case):

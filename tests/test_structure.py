@@ -14,7 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import tolerances as tol
-from test_contracts import answering, random_motion
 
 import natcoord_jax as nc
 
@@ -315,12 +314,15 @@ def test_a_scene_of_traced_numbers():
     assert np.allclose(answer, nc.simulate(*outside, dt=0.05, steps=10).q, atol=tol.INDIFFERENCE)
 
 
-def test_batch_of_motions_shares_one_program():
-    """vmap over seeds of an effect's answer lowers to a program of the size of one."""
-    respond_to, _ = answering(nc.Spring)
-    w, lam = random_motion(nc.Spring, 0)
-    sizes = []
-    for lanes in (2, 64):
-        batch = jax.jit(jax.vmap(respond_to)).lower(jnp.stack([w] * lanes), jnp.stack([lam] * lanes))
-        sizes.append(len(batch.as_text().splitlines()))
-    assert sizes[0] == sizes[1]
+def test_a_batch_of_runs_shares_one_program():
+    """vmap over states lowers to a program of the same size for any number of lanes."""
+    system, state = star(2, "reduced")
+
+    def run(v):
+        return nc.simulate(system, eqx.tree_at(lambda s: s.v, state, v), dt=0.01, steps=2).q
+
+    def size(lanes):
+        program = jax.jit(jax.vmap(run)).lower(jnp.stack([state.v] * lanes))
+        return len(program.as_text().splitlines())
+
+    assert size(2) == size(64)

@@ -39,9 +39,8 @@ REWRITTEN = frozenset(("dot_general", "scatter", "scatter-add", *INLINED))
 """Primitives that may be rewritten in terms of those."""
 
 
-LOOPS = "while", "scan"
-UPDATES = {"dynamic_update_slice": 1, "scatter": 2, "scatter-add": 2}
-"""Operations that change a part of an array in place, and the operand that is this part."""
+AS_AN_OPERAND = {"broadcast_in_dim": 0, "dynamic_update_slice": 1, "scatter": 2, "scatter-add": 2}
+"""Operations that find no more numbers than an operand has: that is repeated, or put into an array."""
 
 
 def _inner_programs(equation: Any) -> list[Any]:
@@ -62,30 +61,26 @@ def operations(program: Any) -> int:
 
 
 def mean_size(program: Any) -> float:
-    """Numbers that an operation of a program finds on average, of its loops if it has any.
+    """Numbers that an operation of a program finds on average.
 
-    What is outside of loops runs once, and an update in place finds what it changes: a record of all steps
-    says nothing about the size of one.
+    The record of all steps, which each step updates in place, says nothing about the size of one.
     """
-    outside, inside = _sizes(program)
-    count, numbers = inside if inside[0] else outside
+    count, numbers = _sizes(program)
     return numbers / max(count, 1)
 
 
-def _sizes(program: Any) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Operations without programs in them and the numbers that they find, outside of loops and inside."""
-    outside, inside = [(0, 0)], [(0, 0)]
+def _sizes(program: Any) -> tuple[int, int]:
+    """Operations without programs in them, and the numbers that they find."""
+    count, numbers = 0, 0
     for equation in _needed(program):
-        parts = [_sizes(x) for x in _inner_programs(equation)]
-        looped = equation.primitive.name in LOOPS
-        (inside if looped else outside).extend(part[0] for part in parts or [((1, _changed(equation)),)])
-        inside.extend(part[1] for part in parts if len(part) > 1)
-    return tuple(map(sum, zip(*outside))), tuple(map(sum, zip(*inside)))  # pyright: ignore[reportReturnType]
+        for a, b in [_sizes(x) for x in _inner_programs(equation)] or [(1, _changed(equation))]:
+            count, numbers = count + a, numbers + b
+    return count, numbers
 
 
 def _changed(equation: Any) -> int:
     """Numbers that an operation finds."""
-    place = UPDATES.get(equation.primitive.name)
+    place = AS_AN_OPERAND.get(equation.primitive.name)
     arrays = equation.outvars if place is None else [equation.invars[place]]
     return sum(math.prod(x.aval.shape) for x in arrays)
 
