@@ -75,6 +75,7 @@ def test_run_with_a_tolerance(tmp_path, capsys):
     assert report["energy_error_max"] <= 1e-11
 
 
+@pytest.mark.slow
 def test_run_of_high_order(tmp_path):
     """Could go wrong: the order is not used; at order two rates of constraints are off by 0.05 m/s."""
     options = ["--order", "6", "--steps", "15", "--dt", "0.1", "--json", "report.json"]

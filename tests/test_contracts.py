@@ -459,7 +459,7 @@ def directions_of(effect: type):
 
 
 @cache
-def answers(effect: type, in_tree: bool = False) -> Answers:
+def answers(effect: type, in_tree: bool) -> Answers:
     """One program for all motions of an effect: those of the seeds, then those of the differences."""
     motions = [random_motion(effect, seed, in_tree) for seed in SEEDS]
     if not in_tree:
@@ -518,7 +518,7 @@ def test_elastic_effects_say_what_cancels(effect):
 @EFFECTS
 def test_power_is_force_times_velocity(effect):
     """What goes into the work account, or the constraints' multipliers times their rates."""
-    a = answers(effect)
+    a = answers(effect, False)
     for seed in SEEDS:
         power = np.sum(a.forces[seed] * a.motion.rates[seed, 0, 0])
         power += np.sum(a.torques[seed] * a.motion.spin[seed, 0, 0])
@@ -549,7 +549,7 @@ def test_what_acts_inside_moves_nothing_as_a_whole(effect):
 @pytest.mark.parametrize("effect", STORING, ids=lambda e: e.__name__)
 def test_stores_give_what_they_lose(effect):
     """Over a step of one radian: minus the work on the bodies is the change of the stored energy, exactly."""
-    a = answers(effect)
+    a = answers(effect, False)
     for seed in SEEDS:
         if issubclass(effect, nc.Field):  # an instance for every body
             work = np.sum(a.answer.forces[seed][:, 0] * a.motion.rates[seed][0])
@@ -583,7 +583,7 @@ def test_derivatives_equal_differences(effect):
     """
     (moving, rest), direction, lam = directions_of(effect)
     derivative = jax.jit(lambda w: jax.jvp(response_of(effect, lam), (w,), (direction,)))
-    a, count = answers(effect), 1 + 2 * len(STEPS)
+    a, count = answers(effect, False), 1 + 2 * len(STEPS)
     lanes = jax.tree.leaves((a.answer.forces, a.answer.torques, a.answer.rows, a.motion.rates))
     for number, w in enumerate((moving, rest)):
         value, ahead = derivative(w)

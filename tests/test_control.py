@@ -94,6 +94,7 @@ def test_check_finds_a_constant_hamiltonian(solution):
     assert verdict.kind == "minimum" and "Hamiltonian" in str(verdict)
 
 
+@pytest.mark.slow
 def test_warm_start_from_solution_and_file(solution, tmp_path):
     again = solved(solution.problem, solution)
     assert len(again.history) <= 2

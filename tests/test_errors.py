@@ -379,6 +379,7 @@ def test_traced_step_that_is_not_positive(breaking):
     assert int(result) == int(Result.BAD_STEP)
 
 
+@pytest.mark.slow
 def test_traced_starts_that_violate_a_loop_or_a_contact():
     """What eager calls refuse is a code in a program: the lane ends at its start, and the others go on."""
     example = gallery.load("four_bar")

@@ -8,7 +8,7 @@ from shard import shards
 
 @pytest.mark.parametrize("lane", lanes.MINUTES)
 def test_a_lane_fits_its_budget(lane):
-    seconds = lanes.seconds_by_lane()[lane]
+    seconds = lanes.seconds_by_lane().get(lane, {})
     slowest = sorted(seconds, key=seconds.get)[-10:]
     assert sum(seconds.values()) <= lanes.BUSY * lanes.CORES * 60 * lanes.MINUTES[lane], (
         f"the {lane} lane takes {sum(seconds.values()):.0f} s of the processor; make its slowest tests "

@@ -122,6 +122,7 @@ def turned(dt, steps):
     return system, trajectory, account(system, trajectory)
 
 
+@pytest.mark.slow
 def test_torsional_spring_over_five_turns():
     """A coil wound by five turns: its energy is that of the angle counted on, to round-off."""
     result = Rotor("coil")

@@ -28,9 +28,9 @@ DEFAULT = {
     ("universal", "multipliers", "order 2"),
     ("revolute", "tree", "order 6"),
     ("revolute", "tree", "variational"),
-    ("revolute", "multipliers", "dissipative"),
 }
 SLOW = {
+    ("revolute", "multipliers", "dissipative"),
     ("screw", "tree", "order 2"),
     ("planar", "tree", "order 4"),
     ("spherical", "multipliers", "dissipative"),
