@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from pages import Page
+from pages import Page, still
 
 import natcoord_jax as nc
 from natcoord_jax import gallery
@@ -268,6 +268,25 @@ def test_a_run_that_broke_down_is_shown_as_far_as_it_went(tmp_path):
     there = np.isfinite(page.part("rod 1").rows[0]).all(axis=(1, 2))
     assert there[:20].all() and not there[20:].any() and 0 < page.scene["size"] < 10
     nc.animate(system, broken, file=tmp_path / "broken.gif", fps=5)
+
+
+TWO_HINGES = """
+<mujoco><worldbody><body name="arm" pos="0 0 1">
+  <joint name="yaw" axis="0 0 1"/><joint name="pitch" axis="0 1 0"/><geom type="box" size="0.5 0.1 0.1"/>
+</body></worldbody></mujoco>
+"""
+
+
+def test_joints_on_a_body_without_mass_stay_where_they_are(tmp_path):
+    """Between two hinges in one link there is a body without a centre of mass to draw them at."""
+    pytest.importorskip("mujoco")
+    (tmp_path / "arm.xml").write_text(TWO_HINGES)
+    scene = nc.Scene()
+    scene.add(nc.io.load(tmp_path / "arm.xml"))
+    system, state = scene.compile()
+    nc.view(system, still(system, state), file=tmp_path / "arm.html")
+    joints = Page(tmp_path / "arm.html").parts("joint")
+    assert len(joints) == 2 and all(np.all(np.isfinite(joint.rows)) for joint in joints)
 
 
 def test_what_it_refuses(tmp_path):

@@ -42,8 +42,8 @@ def _resting(system: System, state: State, pattern: BlockPattern) -> list[BlockM
     start_cache: StartCache = NOTHING
     equations = SparseStep.prepare(system, state, inputs, zero, gauss(1), start_cache)
     held = equations.guess()
-    _, multipliers = equations.split(jnp.arange(held.size))
-    open_ = [x[:, 0, 0] for g, x in zip(equations.groups, multipliers) if g.effect.unilateral]
+    _, multipliers = equations.split(jnp.arange(held.size, dtype=held.dtype))
+    open_ = [x[:, 0, 0].astype(int) for g, x in zip(equations.groups, multipliers) if g.effect.unilateral]
     guesses = [held, *([held.at[jnp.concatenate(open_)].set(-FAR)] if open_ else [])]
     found = [pattern.assemble(*equations.matrices(y, exact=True)) for y in guesses]
     return [regularised(matrix, inertias_of(matrix, equations.balances)) for matrix in found]

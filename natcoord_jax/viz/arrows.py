@@ -22,7 +22,7 @@ from natcoord_jax.mechanics.response import gather, motion_between, no_multiplie
 from natcoord_jax.model.groups import Group
 from natcoord_jax.system import System
 from natcoord_jax.viz.links import frame_along
-from natcoord_jax.viz.outline import arrow, turning_arrow
+from natcoord_jax.viz.outline import arrow, centre_of, turning_arrow
 from natcoord_jax.viz.scenery import GREEN, RED, Colour, Solid
 from natcoord_jax.viz.skins import markers_of, places_of
 
@@ -77,7 +77,7 @@ def _of_force(system: System, group: Group, states: State, rows: np.ndarray, inp
         # Of a torque between two bodies, that on the second.
         for k in on[-1:] if np.allclose(turning[:, n].sum(axis=1), 0.0) else on:
             block, body = mass[bodies[n, k, 0]], rows[:, bodies[n, k, 0]]
-            centre = np.append(1.0, block[0, 1:] / block[0, 0]) if block[0, 0] > 0 else np.eye(4)[0]
+            centre = np.append(1.0, centre_of(block))
             torques.append(Acting(names[n], centre @ body, turning[:, n, k]))
     return forces, torques
 

@@ -31,7 +31,7 @@ def equal_inertia(block: Float[np.ndarray, "4 4"]) -> tuple[Surface, bool]:
     Args:
         block: mass block (15) of the body.
     """
-    centre = block[0, 1:] / block[0, 0]
+    centre = centre_of(block)
     values, axes = np.linalg.eigh(block[1:, 1:] / block[0, 0] - np.outer(centre, centre))
     values = np.maximum(values, 0.0)
     small, middle, large = values
@@ -49,6 +49,11 @@ def equal_inertia(block: Float[np.ndarray, "4 4"]) -> tuple[Surface, bool]:
     size = np.maximum(size, THINNEST * size.max())
     points, faces = shape.surface()
     return (centre + (points * size) @ axes[:, order].T, faces), isinstance(shape, ROUND)
+
+
+def centre_of(block: np.ndarray) -> np.ndarray:
+    """Centre of mass of a body in its axes [m]; of one without mass, between two joints, its point."""
+    return block[0, 1:] / (block[0, 0] or 1.0)
 
 
 def bodies_of(system: System, numbers: Iterable[int]) -> dict[int, tuple[Surface, bool] | None]:

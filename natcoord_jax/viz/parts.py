@@ -14,7 +14,7 @@ from natcoord_jax.core.state import Trajectory
 from natcoord_jax.system import System
 from natcoord_jax.viz.arrows import loads, pushes
 from natcoord_jax.viz.links import between, links
-from natcoord_jax.viz.outline import ball, bar, bodies_of, marked
+from natcoord_jax.viz.outline import ball, bar, bodies_of, centre_of, marked
 from natcoord_jax.viz.outline import within as inside_of
 from natcoord_jax.viz.scenery import DARK, PALETTE, Scenery, Solid, Trace
 from natcoord_jax.viz.skins import (
@@ -60,7 +60,7 @@ def seats(system: System) -> np.ndarray:
         for j in (int(j) for j in np.asarray(group.joints).reshape(-1)):
             side = 1 if pairs[j, 1] < len(mass) else 0
             block, own = mass[pairs[j, side]], frames[j, side]
-            away = block[0, 1:] / block[0, 0] - own[0, 1:]
+            away = centre_of(block) - own[0, 1:]
             along = float(away @ own[3, 1:])
             if abs(along) > np.linalg.norm(away - along * own[3, 1:]):
                 frames[j, :, 0] += along * frames[j, :, 3]
@@ -72,7 +72,7 @@ def _bodies(system: System, meshes: Meshes, rows: np.ndarray, scale: float) -> l
     names, frames = system.structure.bodies, seats(system)
     pairs, mass, found = np.asarray(system.joint_bodies), np.asarray(system.mass), []
     for number, k in enumerate(sorted(meshes, key=lambda k: _natural(names[k]))):
-        centre = mass[k, 0, 1:] / mass[k, 0, 0]
+        centre = centre_of(mass[k])
         mesh, colour = meshes[k], PALETTE[number % len(PALETTE)]
         small, faces = ball(0.02 * scale)
         own, is_round = mesh or ((centre + small, faces), False)
