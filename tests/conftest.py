@@ -59,6 +59,8 @@ def pytest_configure(config: pytest.Config) -> None:
     Checks take a quarter of the time to trace; `test_types.py` makes them for some scenes.
     """
     _set_up_jax(config)
+    if config.option.write_durations:
+        config.pluginmanager.register(Durations())
     if config.option.check_types:
         hook = install_import_hook("natcoord_jax", "beartype.beartype")
         config.add_cleanup(hook.uninstall)
@@ -123,9 +125,6 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 # --- durations ----------------------------------------------------------------------------------------------
 
-_begun = pytest.StashKey[float]()
-_seconds: dict[str, dict[str, float]] = {}
-
 
 def _processor_seconds() -> float:
     """Processor time of this process and of the children that have ended: other work does not disturb it."""
@@ -133,40 +132,36 @@ def _processor_seconds() -> float:
     return times.user + times.system + times.children_user + times.children_system
 
 
-def lane_of(item: pytest.Item) -> str:
-    """Name of the lane that a test is in."""
-    marks = ("gpu", "benchmark", "exhaustive", "slow")
-    return next((mark for mark in marks if item.get_closest_marker(mark)), "default")
+class Durations:
+    """A plugin that measures tests, those of other folders, too, as a plugin of this folder would not."""
 
+    def __init__(self) -> None:
+        self.begun = 0.0
+        self.seconds: dict[str, dict[str, float]] = {}
 
-@pytest.hookimpl(tryfirst=True)
-def pytest_runtest_setup(item: pytest.Item) -> None:
-    item.stash[_begun] = _processor_seconds()
+    @pytest.hookimpl(tryfirst=True)
+    def pytest_runtest_setup(self) -> None:
+        self.begun = _processor_seconds()
 
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_makereport(self, item: pytest.Item, call: pytest.CallInfo):
+        report = yield
+        if report.when == "teardown":
+            entry = lanes.lane_of(item), round(_processor_seconds() - self.begun, 2)
+            report.user_properties = [*report.user_properties, ("duration", entry)]
+        return report
 
-@pytest.hookimpl(wrapper=True)
-def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo):
-    report = yield
-    if report.when == "teardown":
-        seconds = round(_processor_seconds() - item.stash[_begun], 2)
-        lane = lane_of(item)
-        report.user_properties = [*report.user_properties, ("duration", (lane, seconds))]
-    return report
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        for name, entry in report.user_properties:
+            if name == "duration":
+                lane, seconds = entry
+                self.seconds.setdefault(lane, {})[report.nodeid] = seconds
 
-
-def pytest_runtest_logreport(report: pytest.TestReport) -> None:
-    for name, entry in report.user_properties:
-        if name == "duration":
-            lane, seconds = entry
-            _seconds.setdefault(lane, {})[report.nodeid] = seconds
-
-
-def pytest_sessionfinish(session: pytest.Session) -> None:
-    if not session.config.option.write_durations or _is_worker(session.config):
-        return
-    chosen = session.config.args_source.name == "ARGS" or session.config.option.keyword
-    lanes.enter(_seconds, all_of_lane=not chosen)
-    lanes.write()
+    def pytest_sessionfinish(self, session: pytest.Session) -> None:
+        if not _is_worker(session.config):
+            chosen = session.config.args_source.name == "ARGS" or session.config.option.keyword
+            lanes.enter(self.seconds, all_of_lane=not chosen)
+            lanes.write()
 
 
 # --- memory, programs ---------------------------------------------------------------------------------------

@@ -6,6 +6,7 @@ usage: python -m tests.lanes    writes the tables anew
 import json
 import re
 from pathlib import Path
+from typing import Any
 
 FOLDER = Path(__file__).resolve().parent
 DURATIONS = FOLDER / "durations.json"
@@ -19,6 +20,12 @@ MINUTES = {"default": 5, "slow": 25}
 UNMEASURED = 30.0
 """Processor seconds that a test is taken for before it has been measured."""
 SHOWN = 30
+
+
+def lane_of(item: Any) -> str:
+    """Name of the lane that a test is in."""
+    marks = ("gpu", "benchmark", "exhaustive", "slow")
+    return next((mark for mark in marks if item.get_closest_marker(mark)), "default")
 
 
 def seconds_by_lane() -> dict[str, dict[str, float]]:

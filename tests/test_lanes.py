@@ -2,7 +2,6 @@
 
 import lanes
 import pytest
-from conftest import lane_of
 from shard import shards
 
 
@@ -18,7 +17,7 @@ def test_a_lane_fits_its_budget(lane):
 
 def test_every_default_test_is_measured(request):
     seconds = lanes.seconds_by_lane()["default"]
-    tests = [item.nodeid for item in request.session.items if lane_of(item) == "default"]
+    tests = [item.nodeid for item in request.session.items if lanes.lane_of(item) == "default"]
     missing = [test for test in tests if test not in seconds]
     assert not missing, f"run `pytest --write-durations` on the files of these tests: {missing}"
 
