@@ -14,3 +14,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         if item.path.suffix == ".ipynb" and not item.path.name.startswith(DEFAULT):
             slow = item.path.name.startswith(SLOW)
             item.add_marker(pytest.mark.slow if slow else pytest.mark.exhaustive)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item):
+    """What is run once is compiled with least effort by default, too."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("NATCOORD_JAX_EFFORT", "quick")
+        return (yield)

@@ -106,7 +106,7 @@ TEMPLATES = (
     Template("taut, error control", trees.taut, rtol=1e-4, extra=160, exhaustive=True),
     Template("taut, until an event", trees.taut, until=trees.event, exhaustive=True),
     Template("driven", trees.driven, exhaustive=True),
-    Template("switching", trees.switching, more=("batch",)),
+    Template("switching", trees.switching, more=("batch",), exhaustive=True),
     Template("tumbling", trees.tumbling, steps=12, extra=64),
     Template("parallelogram", parallelogram),
     Template("ring", ring, exhaustive=True),

@@ -316,6 +316,12 @@ TABLE = {
     ),
     nc.DirectorDamping: Entry(lambda p: nc.DirectorDamping(p.three, viscosity=STIFFNESS, **SHAPES)),
 }
+REVERSED = (
+    nc.Revolute, nc.Drive, nc.Rod, nc.Rolling, nc.Spring, nc.JointSpring, nc.SphericalSpring, nc.BeamElement,
+    nc.ShellElement, nc.Hexahedron8, nc.EnclosedGas, nc.GapPotential, nc.GapConstraint, nc.PointForce,
+    nc.JointTorque, nc.Damper,
+)  # fmt: skip
+"""One effect of each sort, whose reverse derivatives the slow lane asks for; all are asked exhaustively."""
 EFFECTS = pytest.mark.parametrize("effect", TABLE, ids=lambda effect: effect.__name__)
 JOINT_TYPES = pytest.mark.parametrize("joint", JOINTS.values(), ids=list(JOINTS))
 # (Of contacts with friction the forces are unknowns: what they do is judged along motions.)
@@ -573,7 +579,7 @@ def response_of(effect: type, lam):
 
 @pytest.mark.parametrize(
     "effect",
-    [pytest.param(e, marks=pytest.mark.slow if e is nc.MortarGap else ()) for e in TABLE],
+    [pytest.param(e, marks=pytest.mark.exhaustive if e is nc.MortarGap else ()) for e in TABLE],
     ids=[e.__name__ for e in TABLE],
 )
 def test_derivatives_equal_differences(effect):
@@ -597,8 +603,11 @@ def test_derivatives_equal_differences(effect):
             assert np.min(errors) <= tol.DIFFERENCE_BEST
 
 
-@pytest.mark.slow
-@EFFECTS
+@pytest.mark.parametrize(
+    "effect",
+    [pytest.param(e, marks=pytest.mark.slow if e in REVERSED else pytest.mark.exhaustive) for e in TABLE],
+    ids=[e.__name__ for e in TABLE],
+)
 def test_reverse_derivatives_are_transposed_forward_ones(effect):
     (moving, rest), direction, lam = directions_of(effect)
 

@@ -66,7 +66,8 @@ def blocks_of(page: Path) -> list[str]:
 
 def run_page(page: Path, folder: Path) -> None:
     """All blocks of a page, in one process of their own, with the current folder for what they write."""
-    env = os.environ | {"JAX_PLATFORMS": "cpu", "MPLBACKEND": "agg"}
+    # What is run once is compiled with least effort by default, too.
+    env = os.environ | {"JAX_PLATFORMS": "cpu", "MPLBACKEND": "agg", "NATCOORD_JAX_EFFORT": "quick"}
     command = [sys.executable, "-c", RUN, str(ROOT), str(page)]
     run = subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True)
     assert run.returncode == 0, run.stderr[-3000:]

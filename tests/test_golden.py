@@ -49,11 +49,10 @@ SLOW = {
         "mass_ladder",
         "slider_crank",
         "robot_arm",
-        "rope",
         "cantilever",
     )
 }
-SLOW |= {("heavy_top", 4), ("double_pendulum", 4), ("torsion_spring", 4)}
+SLOW |= {("heavy_top", 4), ("torsion_spring", 4)}
 """The others compile for longer."""
 
 

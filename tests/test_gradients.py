@@ -399,7 +399,7 @@ def test_torque_on_a_rotor_is_exact():
     assert np.max(np.abs(jax.jit(jax.hessian(spin))(u))) <= tol.EXACT_GRADIENT
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_linearise_equals_differences():
     """A and B of a step act on small motions as the step does."""
     p = numbers()

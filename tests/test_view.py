@@ -72,7 +72,7 @@ def test_the_file_holds_the_motion(tmp_path):
     np.testing.assert_allclose(page.scene["times"], trajectory.t)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_surfaces_springs_forces_and_traces(tmp_path):
     system, trajectory, corner = sheet()
     page = Page(nc.view(system, trajectory, file=tmp_path / "a.html", colour="energy", traces=[corner]))

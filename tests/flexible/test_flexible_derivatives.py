@@ -50,7 +50,7 @@ def test_a_rope_that_starts_at_rest_and_unstrained():
 SHELL = ("thickness", "E", "density", "reference")
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_motion_by_the_numbers_of_a_shell():
     """Of where a corner is after some steps, by what its stiffness and masses are made of: one program."""
     scene, mesh = nc.Scene(), nc.mesh.rectangle((1.0, 0.5), (3, 2))

@@ -82,7 +82,7 @@ def sick(solver):
 
 FORMS = [
     pytest.param("reduced", 2, None, False),
-    pytest.param("recursive", 4, 1e-6, False, marks=pytest.mark.slow),
+    pytest.param("recursive", 4, 1e-6, False, marks=pytest.mark.exhaustive),
     pytest.param("reduced", 2, 1e-6, True, marks=pytest.mark.exhaustive),
     pytest.param("reduced", 4, None, False, marks=pytest.mark.exhaustive),
     pytest.param("full", 2, None, False, marks=pytest.mark.exhaustive),
