@@ -7,18 +7,9 @@ import numpy as np
 import pytest
 import tolerances as tol
 from differences import assert_v_shaped
+from flexible_scenes import ELEMENTS
 
 import natcoord_jax as nc
-
-ELEMENTS = {
-    "Brick": "hexahedron8",
-    "Hexahedron8": "hexahedron8",
-    "Hexahedron20": "hexahedron20",
-    "Hexahedron27": "hexahedron27",
-    "Hexahedron27P1": "hexahedron27",
-    "Tetrahedron10": "tetrahedron10",
-    "Tetrahedron10P0": "tetrahedron10",
-}
 
 
 def lane(case, default=()):
