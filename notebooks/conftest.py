@@ -20,5 +20,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def pytest_runtest_protocol(item: pytest.Item):
     """What is run once is compiled with least effort by default, too."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("NATCOORD_JAX_EFFORT", "quick")
+        if item.path.suffix == ".ipynb":  # (Workers ask every `conftest.py` about every test.)
+            patch.setenv("NATCOORD_JAX_EFFORT", "quick")
         return (yield)
