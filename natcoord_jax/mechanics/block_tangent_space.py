@@ -97,20 +97,17 @@ class SeparateTangents(eqx.Module):
         """Components of a velocity along the frames, X P^T M v."""
         return jnp.sum(self.frame * self.pulled(self.impulse(v).rows)[:, None], axis=-1)
 
-    def answer(self, impulse: Velocity) -> Float[Array, "bodies m"]:
-        """Components along the frames of what impulses on the rows bring about."""
-        return jnp.sum(self.frame * self.pulled(impulse.rows)[:, None], axis=-1)
-
     def answers(
         self, forces: Float[Array, "n k 4 3"], bodies: Int[Array, "n k"]
-    ) -> Float[Array, "n bodies m"]:
-        """The same of impulses on the rows of few bodies each, whose others do not answer."""
+    ) -> tuple[Float[Array, "n bodies m"], Float[Array, "n 0"]]:
+        """What impulses on the rows of few bodies each bring about; see `TangentSpace.answers`."""
         rows, frame, velocity, spin = (x[bodies] for x in (self.rows, self.frame, self.velocity, self.spin))
         force, torque = wrench(forces, rows[:, :, 1:])
         pulled = jnp.sum(velocity * force[:, :, None] + spin * torque[:, :, None], axis=-1)
         found = jnp.sum(frame * pulled[:, :, None], axis=-1)
         none = jnp.zeros((bodies.shape[0], self.rows.shape[0], found.shape[-1]), found.dtype)
-        return none.at[np.arange(bodies.shape[0])[:, None], bodies].add(found, mode="drop")
+        answers = none.at[np.arange(bodies.shape[0])[:, None], bodies].add(found, mode="drop")
+        return answers, none[:, 0, :0]
 
     def along(self, y: Float[Array, "bodies m"]) -> Velocity:
         """Velocity with given components along the frames."""

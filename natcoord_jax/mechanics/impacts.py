@@ -24,9 +24,10 @@ from natcoord_jax.maths.friction_law import impulses_with_friction, without_fric
 from natcoord_jax.maths.impact_law import collision_impulses, impact_impulses
 from natcoord_jax.maths.vectors import positive_part
 from natcoord_jax.mechanics.block_tangent_space import Tangents, tangents_at
+from natcoord_jax.mechanics.equations_of_motion import loops_of, relations_of
 from natcoord_jax.mechanics.free_flight import apart, meeting, touch
 from natcoord_jax.mechanics.response import Evaluation
-from natcoord_jax.mechanics.tangent_space import Velocity
+from natcoord_jax.mechanics.tangent_space import Velocity, driven
 from natcoord_jax.mechanics.violations import contact_gaps
 from natcoord_jax.model.groups import Group
 from natcoord_jax.model.islands import IslandOrder
@@ -40,20 +41,21 @@ class Answers:
     Attributes:
         space: of the velocities that the constraints admit.
         along: what unit impulses do, in its frame, one a row.
+        prescribed: work [J] of unit impulses on the motion that each constraint prescribes.
         each: number of these of a contact.
     """
 
     def __init__(self, space: Tangents, system: Model, groups: Sequence[Group], state: State, name: str):
         """Of impulses along forces on the rows of the bodies, by a method of the effects."""
         self.space = space
-        rows, found = rows_with_ground(state.q), []
+        rows, answers = rows_with_ground(state.q), []
         for group in groups:
             each = jax.vmap(lambda effect, place, rows: getattr(effect, name)(place, rows))
             forces = each(group.effect, group_places(system, group), rows[group.bodies])
             self.each = forces.shape[1]
             bodies = jnp.repeat(group.bodies, self.each, axis=0)
-            found.append(space.answers(forces.reshape(-1, *forces.shape[2:]), bodies))
-        self.along = jnp.concatenate(found)
+            answers.append(space.answers(forces.reshape(-1, *forces.shape[2:]), bodies))
+        self.along, self.prescribed = (jnp.concatenate(x) for x in zip(*answers))
 
     @property
     def flat(self) -> Float[Array, "c u"]:
@@ -70,8 +72,8 @@ class Answers:
         return jnp.sum(self.by_island(order)[:, :, None] * others.by_island(order)[:, None], axis=-1)
 
     def rates(self, velocity: Velocity) -> Float[Array, " c"]:
-        """gamma: work of unit impulses on a velocity."""
-        return self.flat @ self.space.framed(velocity).reshape(-1)
+        """gamma: work of unit impulses on a velocity, as far as constraints admit or prescribe it."""
+        return self.flat @ self.space.framed(velocity).reshape(-1) + jnp.sum(self.prescribed, axis=1)
 
     def pushed(self, velocity: Velocity, impulses: Float[Array, " c"]) -> Velocity:
         """A velocity after impulses."""
@@ -87,8 +89,10 @@ def after_impacts(
     groups: Sequence[Group],
     found: Evaluation,
     tableau: Tableau,
-) -> tuple[State, dict[int, Array]]:
-    """The state after the impacts at the end of a step of one stage, and their work [J] by number of group.
+) -> tuple[State, dict[int, Array], Array]:
+    """The state after the impacts at the end of a step of one stage, and work [J].
+
+    That of the impacts by number of group, and of constraints that prescribe motions, which go on.
 
     Args:
         system: compiled system.
@@ -117,14 +121,17 @@ def after_impacts(
         active, hit = active & ~free, free & meeting(system, these, end)
     none = jnp.zeros_like(pushed)
 
-    def impacts() -> tuple[Array, Array, Array, Array, Array]:
+    constraints = (*relations_of(system), *loops_of(system)) if driven(system) else ()
+    drives = jnp.zeros(sum(group.count * group.multipliers for group in constraints))
+
+    def impacts() -> tuple[Array, ...]:
         return _impacts(system, start, end, h, these, active, hit, lam)
 
-    def nothing() -> tuple[Array, Array, Array, Array, Array]:
-        return end.v, end.rates, none, none, none
+    def nothing() -> tuple[Array, ...]:
+        return end.v, end.rates, drives, none, none, none
 
     some = active if hit is None else active | hit
-    v, rotors, done, struck, met = jax.lax.cond(jnp.any(some), impacts, nothing)
+    v, rotors, drives, done, struck, met = jax.lax.cond(jnp.any(some), impacts, nothing)
     after = replace_fields(end, v=v, rates=rotors)
     if start.contacts is not None:
         happened = [jnp.where(active, positive_part(pushed), 0.0), struck, met]
@@ -132,7 +139,7 @@ def after_impacts(
             happened.append(hit.astype(met.dtype))
         happened = jnp.stack(happened, axis=1)
         after = replace_fields(after, contacts=start.contacts + happened)
-    return after, dict(zip(numbers, _by_group(these, done)))
+    return after, dict(zip(numbers, _by_group(these, done))), drives
 
 
 def untouched(system: Model) -> Float[Array, "c 3"] | None:
@@ -166,8 +173,9 @@ def _impacts(
     active: Bool[Array, " c"],
     hit: Bool[Array, " c"] | None,
     lam: Sequence[Float[Array, "n m"]],
-) -> tuple[Array, Array, Array, Array, Array]:
-    """After impacts of active contacts: velocities, rates of rotors, work, impulses, and which have met."""
+) -> tuple[Array, ...]:
+    """After impacts of active contacts: velocities, rates of rotors, work of drives and of contacts,
+    impulses, and which have met."""
     space, bouncing = tangents_at(system, end), jnp.asarray(_bouncing(groups))
     pushes = Answers(space, system, groups, end, "pushes")
     # With friction it has three multipliers besides that of the gap.
@@ -184,7 +192,7 @@ def _impacts(
         return jnp.where(met, positive_part(pushed * shut), 0.0)
 
     pushed, room = held[:, 0], work(held[:, 0])
-    rubs, mixed = None, None
+    rubs, mixed, drives = None, None, 0.0
     effects: list[Any] = [group.effect for group in groups]
     if any(effect.friction is not None for effect in effects):
         rubs = Answers(space, system, groups, end, "rubs")
@@ -205,9 +213,11 @@ def _impacts(
         given = rates, slip, held, friction, plastic, impulses, on, bouncing, room
         matrices = normal, mixed, rubs.matrices(order, rubs)
         found, done = _by_island(order, impulses_with_friction, matrices, *given)
-        impulses, velocity = found[:, 0], rubs.pushed(velocity, found[:, 1:].reshape(-1))
-    velocity = pushes.pushed(velocity, impulses)
-    return velocity.rows.reshape(end.v.shape), velocity.rotors, done, impulses, met.astype(done.dtype)
+        impulses, rubbing = found[:, 0], found[:, 1:].reshape(-1)
+        velocity, drives = rubs.pushed(velocity, rubbing), -rubbing @ rubs.prescribed
+    velocity, drives = pushes.pushed(velocity, impulses), drives - impulses @ pushes.prescribed
+    v, met = velocity.rows.reshape(end.v.shape), met.astype(done.dtype)
+    return v, velocity.rotors, drives, done, impulses, met
 
 
 def _by_island(order: IslandOrder, law: Callable[..., Any], matrices: Sequence[Array], *given: Array) -> Any:

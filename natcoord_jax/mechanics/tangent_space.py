@@ -117,16 +117,23 @@ class TangentSpace(eqx.Module):
         """Components of a velocity along the frame, X P^T M v."""
         return self.admissible.frame @ self.pulled(self.impulse(v))
 
-    def answer(self, impulse: Velocity) -> Float[Array, " u"]:
-        """Components along the frame of what impulses on the rows bring about, as far as it is admitted."""
-        return self.admissible.within(self.admissible.frame @ self.pulled(impulse))
+    def answers(
+        self, forces: Float[Array, "n k 4 3"], bodies: Int[Array, "n k"]
+    ) -> tuple[Float[Array, "n u"], Float[Array, "n c"]]:
+        """The same of impulses on the rows of few bodies each, and their work on what drives prescribe.
 
-    def answers(self, forces: Float[Array, "n k 4 3"], bodies: Int[Array, "n k"]) -> Float[Array, "n u"]:
-        """The same of impulses on the rows of few bodies each; the ground, whose number is last, has none."""
+        The ground, whose number is last, does not answer. The work [J] is that of each impulse on the motion
+        that each constraint asks for; the opposite is done by what drives.
+        """
         none = jnp.zeros((bodies.shape[0], *self.rows.shape), forces.dtype)
         rows = none.at[np.arange(bodies.shape[0])[:, None], bodies].add(forces, mode="drop")
         still = jnp.zeros((bodies.shape[0], self.turning.shape[1]), forces.dtype)
-        return jax.vmap(self.answer)(Velocity(rows, still))
+        pulled = jax.vmap(self.pulled)(Velocity(rows, still))
+        known, none = self.admissible, jnp.zeros((bodies.shape[0], 0), forces.dtype)
+        answers = jax.vmap(lambda x: known.within(known.frame @ x))(pulled)
+        if known.lift is None or known.prescribed is None:
+            return answers, none
+        return answers, (pulled @ known.lift) * known.prescribed
 
     def along(self, y: Float[Array, " u"]) -> Velocity:
         """Velocity with given components along the frame."""
@@ -268,7 +275,7 @@ def rotor_inertias(system: Model) -> Float[Array, " rotors"]:
 
 def driven(system: Model) -> bool:
     """Whether constraints prescribe motions."""
-    return any(group.multipliers and group.effect.works for group in system.effects)
+    return any(group.holds and group.effect.works for group in system.effects)
 
 
 def _admissible(

@@ -99,7 +99,8 @@ def end_of_step(
     after = State(state.t + h, q, v, coordinates, rotors, work, state.dissipated, state.held)
     lost = {}
     if system.structure.inequalities:
-        after, lost = after_impacts(system, state, after, h, groups, found, tableau)
+        after, lost, driving = after_impacts(system, state, after, h, groups, found, tableau)
+        extra = driving if extra is None else extra + driving
     working, relation = [], 0
     for number, (group, power) in enumerate(zip(groups, found.power)):
         if group.effect.works:
