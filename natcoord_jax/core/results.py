@@ -22,6 +22,7 @@ class Result(IntEnum):
     MISSED = 11
     OVERFLOW = 12
     BAD_START = 13
+    JUMPED = 14
 
     @property
     def ok(self) -> bool:
@@ -44,6 +45,7 @@ REASONS = {
     Result.MISSED: "bodies have moved in a step beyond where contacts were looked for",
     Result.OVERFLOW: "a body has more neighbours than its contact has room for",
     Result.BAD_START: "the positions at the start violate the constraints",
+    Result.JUMPED: "a drive jumps from one position to another, or swings to and fro within the shortest step",
 }
 
 REMEDIES = {
@@ -58,6 +60,7 @@ REMEDIES = {
     Result.INVERTED: "use a smaller dt, a finer mesh, or a material that resists, as nc.NeoHooke",
     Result.MISSED: "use a smaller dt, or a larger `skin` of the nc.Contact",
     Result.BAD_START: "pass nc.assemble(system, state)",
+    Result.JUMPED: "give it a function without jumps, as a ramp of some steps, or use a smaller dt",
     Result.OVERFLOW: "pass a larger `capacity` to the nc.Contact, or a smaller dt or `skin`",
 }
 

@@ -25,7 +25,7 @@ from natcoord_jax.mechanics.equations_of_motion import relations_of
 from natcoord_jax.mechanics.kick import Ends, end_of, rotor_rates
 from natcoord_jax.mechanics.momentum import momentum_balance
 from natcoord_jax.mechanics.response import Evaluation, no_multipliers
-from natcoord_jax.mechanics.tangent_space import TangentSpace
+from natcoord_jax.mechanics.tangent_space import TangentSpace, Velocity
 from natcoord_jax.model.groups import Group
 from natcoord_jax.model.model import Model
 
@@ -61,6 +61,12 @@ def released(
     assert space.admissible.lift is not None
     missed = -space.admissible.lift.T @ lost
     return Ends(v, _work(system, groups, found, turning[0], missed), jnp.array(True))
+
+
+def obeying(system: Model, end: State) -> Ends:
+    """The velocity at the end of a step that goes on as drives prescribe, and the work that this takes."""
+    velocity, work = TangentSpace.at(system, end).obeying(Velocity(end.row_rates, end.rates))
+    return Ends(velocity, work, jnp.array(True))
 
 
 def _impulse(

@@ -1,7 +1,8 @@
-"""What is wrong with a step though its equations are solved: an element inside out, neighbours overlooked.
+"""What is wrong with a step though its equations are solved.
 
-One number tells what it is: first come the elements that can be inside out, then, for each instance of an
-effect that looks for neighbours, pairs of its markers that it has missed, then those it had no room for.
+An element inside out, a drive that jumps, neighbours overlooked. One number tells what it is: first come the
+elements that can be inside out, then the drives, then, for each instance of an effect that looks for
+neighbours, pairs of its markers that it has missed, then those it had no room for.
 """
 
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int
+from jaxtyping import Array, Bool, Int
 
 from natcoord_jax.core.results import Result
 from natcoord_jax.core.state import State
@@ -20,10 +21,23 @@ from natcoord_jax.model.model import Model
 
 KINDS = Result.MISSED, Result.OVERFLOW
 
+NEGLIGIBLE = 1e-9
+"""Jump of a drive per radian or unit of size of the places that passes: the rounding of a function."""
+
 
 def can_fail(system: Model) -> bool:
     """Whether there is anything of the kind."""
-    return any(group.has_volumes or group.searches for group in system.effects)
+    return any(group.has_volumes or group.searches for group in system.effects) or bool(_drives(system))
+
+
+def _drives(system: Model) -> list[Group]:
+    return [g for g in system.effects if g.holds and g.effect.works and g.source == "coordinates"]
+
+
+def _before_searches(system: Model) -> tuple[int, int]:
+    """Number of the first drive, and of the first pair that a search can miss."""
+    first = sum(group.count for group in system.effects if group.has_volumes)
+    return first, first + sum(group.count for group in _drives(system))
 
 
 def first_failure(equations: Any, after: State) -> Int[Array, ""] | None:
@@ -38,13 +52,24 @@ def first_failure(equations: Any, after: State) -> Int[Array, ""] | None:
         return None
     inverted = first_inverted(system, after)
     found = jnp.array(-1) if inverted is None else inverted
-    first = sum(group.count for group in system.effects if group.has_volumes)
+    drives, first = _before_searches(system)
+    if first > drives:
+        jumps = jnp.concatenate([_jumps(group, equations) for group in _drives(system)])
+        found = jnp.where((found < 0) & jnp.any(jumps), drives + jnp.argmax(jumps), found)
     for group, where in zip(equations.groups, equations.situations):
         if group.searches:
             missed = _missed(system, group, where, equations.state, after)
             found = jnp.where((found < 0) & (missed >= 0), first + missed, found)
             first += _numbers(group)
     return found
+
+
+def _jumps(group: Group, equations: Any) -> Bool[Array, " n"]:
+    """Which drives jump in a step; by next to nothing, of an angle or of the places, they may."""
+    jump = jax.vmap(lambda effect: effect.jump(equations.state.t, equations.h))(group.effect)
+    angular = all(axis.unit == "rad" for axis in group.effect.axes)
+    size = 1.0 if angular else jnp.max(jnp.abs(equations.state.rows[:, 0]))
+    return jump > NEGLIGIBLE * size
 
 
 def _numbers(group: Group) -> int:
@@ -70,6 +95,10 @@ def failure(system: Model, number: int) -> tuple[Result, str]:
             if number < group.count:
                 return Result.INVERTED, f"{group.effect.kind} {group.names[number]!r}"
             number -= group.count
+    for group in _drives(system):
+        if number < group.count:
+            return Result.JUMPED, f"{group.effect.kind} {group.names[number]!r}"
+        number -= group.count
     for group in system.effects:
         if group.searches:
             if number < _numbers(group):
@@ -84,8 +113,8 @@ def failure(system: Model, number: int) -> tuple[Result, str]:
 
 def result_of(system: Model, number: Int[Array, ""]) -> Int[Array, ""]:
     """Result code of a failure by its number."""
-    first = sum(group.count for group in system.effects if group.has_volumes)
-    code = jnp.array(int(Result.INVERTED))
+    drives, first = _before_searches(system)
+    code = jnp.where(number >= drives, int(Result.JUMPED), int(Result.INVERTED))
     for group in system.effects:
         if group.searches:
             kind = (number - first) // group.bodies.shape[1] ** 2 % len(KINDS)

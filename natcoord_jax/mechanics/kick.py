@@ -22,6 +22,7 @@ basis at q_1 is that at q_0 moved by the direct rotation between the two subspac
 chosen, and redundant constraints are no special case.
 """
 
+import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -48,6 +49,10 @@ that sets in motion at once what was at rest has 0.5 exactly, and must not depen
 
 UNSOUND = 1e-11
 """Energy made by kicks in terms of that of the motion, beyond which a step is refused."""
+
+AT_REST = 1e-9
+"""Way in a step, in terms of the positions, below which a motion is too small for kicks that are unsound: of
+what is held still, velocities are round-off."""
 
 
 class Kick(eqx.Module):
@@ -192,8 +197,10 @@ def ends_of(
     end = after.projected(last)
     back = Velocity(end.rows - last.rows, end.rotors - last.rotors)
     work = before.work(kick.kick) + after.work(back)
-    moving = jnp.maximum(before.energy(start), after.energy(end))
-    missing = before.energy(start) - before.energy(v) + after.energy(end) - after.energy(last) - jnp.sum(work)
+    little = jax.tree.map(lambda x: AT_REST * x / h, Velocity(state.rows, jnp.zeros_like(state.rates)))
+    energies = before.energy(v), before.energy(start), after.energy(last), after.energy(end)
+    moving = jnp.maximum(functools.reduce(jnp.maximum, energies), before.energy(little))
+    missing = energies[1] - energies[0] + energies[3] - energies[2] - jnp.sum(work)
     small = 2.0 * before.energy(kick.kick) <= LARGEST * moving
     return Ends(end, work, small & (jnp.abs(missing) <= UNSOUND * moving))
 

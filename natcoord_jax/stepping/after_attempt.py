@@ -50,7 +50,9 @@ def _looked_at(
     code = jnp.where((code == 0) & (half_turn > LARGEST_HALF_TURN), int(Result.DIVERGED), code)
     worst = it.worst
     if failure is not None:
-        worst = jnp.where((code == 0) & (failure >= 0), -2 - failure, worst)
+        # (A drive that jumps does so whether or not equations have a solution then.)
+        names = (code == 0) | (result_of(system, failure) == int(Result.JUMPED))
+        worst = jnp.where((failure >= 0) & names, -2 - failure, worst)
         code = jnp.where(worst < -1, result_of(system, -2 - worst), code)
     return code, worst
 

@@ -12,13 +12,14 @@ from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import Tableau
 from natcoord_jax.mechanics.block_tangent_space import Tangents
 from natcoord_jax.mechanics.coordinates import stage_rates
-from natcoord_jax.mechanics.end_impulses import released
+from natcoord_jax.mechanics.end_impulses import obeying, released
 from natcoord_jax.mechanics.equations import prepare, starting
 from natcoord_jax.mechanics.form import dense_solver
 from natcoord_jax.mechanics.impacts import after_impacts
 from natcoord_jax.mechanics.kick import Kick, ends_of
 from natcoord_jax.mechanics.response import Evaluation
 from natcoord_jax.mechanics.start_cache import StartCache
+from natcoord_jax.mechanics.tangent_space import driven
 from natcoord_jax.model.groups import Group
 from natcoord_jax.system import System
 
@@ -94,7 +95,10 @@ def end_of_step(
         if carrying:
             # Groups own consecutive pieces of the stored rates, in order.
             rotors = rotors + tableau.gained(turning[:, jnp.concatenate(carrying)] - rotors)
-    else:
+        if not tableau.dissipative and driven(system):
+            ends = obeying(system, State(state.t + h, q, v, coordinates, rotors, work))
+            extra = ends.work
+    if ends is not None:
         v, rotors = ends.velocity.rows.reshape(state.v.shape), ends.velocity.rotors
     after = State(state.t + h, q, v, coordinates, rotors, work, state.dissipated, state.held)
     lost = {}

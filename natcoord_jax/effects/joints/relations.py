@@ -54,6 +54,7 @@ class Coupling(CoordinateConstraint):
     offset: Any = eqx.field(default=0.0, kw_only=True, metadata=is_a(Number()))
 
     kind: ClassVar[str] = "coupling"
+    works: ClassVar[bool] = False
 
     def coefficients(self) -> Array:
         """The factors."""
