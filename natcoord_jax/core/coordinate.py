@@ -24,9 +24,8 @@ from natcoord_jax.core.motion import Motion, Response, StepContext
 from natcoord_jax.core.numeric import Whole
 from natcoord_jax.core.unit_loads import PairMotion, UnitLoad
 
-SAMPLES, BEYOND = 5, 3.0
-"""Instants of a step at which rates of prescribed coordinates are taken, ends included, and how far beyond
-these, in terms of the difference between them, what a coordinate changes by may be."""
+SAMPLES = 5
+"""Instants of a step at which rates of prescribed coordinates are taken, ends included."""
 
 
 @dataclass(frozen=True)
@@ -221,17 +220,11 @@ class CoordinateConstraint(CoordinateEffect):
     def target(self, t: Float[Array, ""]) -> Float[Array, ""]:
         """Right-hand side f(t)."""
 
-    def jump(self, t: Array, h: Array) -> Float[Array, ""]:
-        """By how much the right-hand side changes in a step beyond what its rates in it tell; 0: by nothing.
-
-        The change of a function that steps resolve lies between those of its rates, and that of one with
-        kinks not far from it.
-        """
+    def prescribed(self, t: Array, h: Array) -> tuple[Float[Array, ""], Float[Array, " samples"]]:
+        """By how much the right-hand side changes in a step, and its rates at instants of it, times the step."""
         times = t + h * jnp.linspace(0.0, 1.0, SAMPLES)
-        rates = h * jax.vmap(lambda t: jax.jvp(self.target, (t,), (jnp.ones_like(t),))[1])(times)
-        change, low, high = self.target(times[-1]) - self.target(times[0]), jnp.min(rates), jnp.max(rates)
-        beyond = jnp.abs(change - jnp.clip(change, low, high))
-        return jnp.where(beyond > BEYOND * (high - low), beyond, 0.0)
+        rates = jax.vmap(lambda t: jax.jvp(self.target, (t,), (jnp.ones_like(t),))[1])(times)
+        return self.target(times[-1]) - self.target(times[0]), h * rates
 
     def violation(self, place: Array, rows: Array, coordinates: Array, t: Array) -> Array:
         """Left-hand side less right-hand side."""

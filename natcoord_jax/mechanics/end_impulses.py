@@ -16,16 +16,19 @@ from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import Tableau
-from natcoord_jax.mechanics.equations_of_motion import relations_of
+from natcoord_jax.maths.elimination import definite_solution
+from natcoord_jax.maths.impact_law import semidefinite_solution
+from natcoord_jax.mechanics.equations_of_motion import EquationsOfMotion, relations_of
 from natcoord_jax.mechanics.kick import Ends, end_of, rotor_rates
 from natcoord_jax.mechanics.momentum import momentum_balance
 from natcoord_jax.mechanics.response import Evaluation, no_multipliers
-from natcoord_jax.mechanics.tangent_space import TangentSpace, Velocity
+from natcoord_jax.mechanics.tangent_space import TangentSpace, Velocity, prescribing
 from natcoord_jax.model.groups import Group
 from natcoord_jax.model.model import Model
 
@@ -64,9 +67,27 @@ def released(
 
 
 def obeying(system: Model, end: State) -> Ends:
-    """The velocity at the end of a step that goes on as drives prescribe, and the work that this takes."""
-    velocity, work = TangentSpace.at(system, end).obeying(Velocity(end.row_rates, end.rates))
-    return Ends(velocity, work, jnp.array(True))
+    """The velocity at the end of a step that goes on as drives prescribe, and the work that this takes.
+
+    Collocation moves what is driven by what drives ask for, and reflects its velocity at the mean one of the
+    step: where the rate jumps, it would alternate about what is prescribed for good. What changes is
+    orthogonal to all that is admitted, so that it is nothing to the motion.
+    """
+    balances, drives = EquationsOfMotion.at(system, end), prescribing(system)
+    gains = balances.columns()
+    space, mass = TangentSpace.without_frame(balances, gains)
+    v, matrix = Velocity(end.row_rates, end.rates), gains.constraints.T
+    found = definite_solution(
+        0.5 * (mass + mass.T), jnp.column_stack([matrix.T, space.pulled(space.impulse(v))])
+    )
+    answers, w = found[:, :-1], found[:, -1]
+    missing = jnp.where(drives, -balances.rates(w).constraints, 0.0)
+    impulses = semidefinite_solution(matrix @ answers, missing)
+    change, rates = space.spread(answers @ impulses), matrix @ w
+    work = jnp.where(drives, impulses * (rates + 0.5 * missing), 0.0)
+    # Loops that velocities do not obey quite have a share in it.
+    work = work + drives * (impulses @ (rates + 0.5 * missing) - jnp.sum(work)) / np.sum(drives)
+    return Ends(Velocity(v.rows + change.rows, v.rotors + change.rotors), work, jnp.array(True))
 
 
 def _impulse(

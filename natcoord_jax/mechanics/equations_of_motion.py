@@ -34,6 +34,11 @@ def relations_of(system: Model) -> list[Group]:
     return [g for g in system.effects if g.holds]
 
 
+def drives_of(system: Model) -> list[Group]:
+    """Relations between joint coordinates that prescribe motions."""
+    return [g for g in relations_of(system) if g.effect.works and g.source == "coordinates"]
+
+
 def loops_of(system: Model) -> list[Group]:
     """Joints that close loops, the last of the constraints."""
     return [g for g in system.joints if not g.in_tree]
@@ -78,6 +83,10 @@ def relative_rates(
     return jnp.concatenate(none + turning), jnp.concatenate(none + found)
 
 
+UnitLoads = tuple[Float[Array, "c bodies_and_ground 3"], Float[Array, "c bodies_and_ground 3"]]
+"""Forces and torques on all bodies, by what they belong to."""
+
+
 class Accelerations(eqx.Module):
     """What belongs to a motion, either as rates or, one derivative higher, as accelerations.
 
@@ -100,28 +109,30 @@ class EquationsOfMotion(eqx.Module):
         rows: rows of all bodies.
         t: time [s].
         free: velocities and angular velocities of the bodies per unit rate of each free motion.
-        rotors: derivatives of the rotors' rates with respect to them, and to those of the ground.
-        constraints: the same of the constraints' rates: forces and torques of unit multipliers.
     """
 
     system: Model
     rows: Float[Array, "bodies 4 3"]
     t: Float[Array, ""]
     free: tuple[Float[Array, "bodies unknowns 3"], Float[Array, "bodies unknowns 3"]]
-    rotors: tuple[Float[Array, "rotors bodies_and_ground 3"], Float[Array, "rotors bodies_and_ground 3"]]
-    constraints: tuple[Float[Array, "c bodies_and_ground 3"], Float[Array, "c bodies_and_ground 3"]]
 
     @classmethod
     def at(cls, system: Model, state: State) -> "EquationsOfMotion":
         """The balances of a state."""
-        rows = state.rows
-        still = jnp.zeros((rows.shape[0] + 1, 3), rows.dtype)
+        return cls(system, state.rows, state.t, null_space(system, state.rows))
+
+    @property
+    def unit_loads(self) -> tuple[UnitLoads, UnitLoads]:
+        """Derivatives of the rates of rotors and of constraints by those of all bodies, the ground being last.
+
+        By velocities and by angular velocities: forces and torques of unit multipliers.
+        """
+        still = jnp.zeros((self.rows.shape[0] + 1, 3), self.rows.dtype)
 
         def rates(velocity, spin):
-            return relative_rates(system, rows, velocity, spin, state.t)
+            return relative_rates(self.system, self.rows, velocity, spin, self.t)
 
-        rotors, constraints = jax.jacfwd(rates, argnums=(0, 1))(still, still)
-        return cls(system, rows, state.t, null_space(system, rows), rotors, constraints)
+        return jax.jacfwd(rates, argnums=(0, 1))(still, still)
 
     def twists(self, w: Float[Array, " unknowns"]) -> Twists:
         """Velocities and angular velocities of all bodies from the rates of the tree's free motions."""
@@ -169,13 +180,13 @@ class EquationsOfMotion(eqx.Module):
         groups = rotors_of(self.system)
         if groups:
             inertias = jnp.concatenate([jax.vmap(lambda e: e.inertia_of())(g.effect) for g in groups])
-            pulled = _weighted(inertias * gains.rotors, self.rotors)
+            pulled = _weighted(inertias * gains.rotors, self.unit_loads[0])
             force, torque = force + pulled[0], torque + pulled[1]
         return force, torque
 
     def constrained(self, lam: Float[Array, " c"]) -> Twists:
         """Forces and torques of relations and loops on the bodies."""
-        return _weighted(lam, self.constraints)
+        return _weighted(lam, self.unit_loads[1])
 
     def project(self, force: Array, torque: Array) -> Float[Array, " unknowns"]:
         """Generalised forces of the free motions from forces and torques at the reference points."""
@@ -209,7 +220,7 @@ class EquationsOfMotion(eqx.Module):
             here = slice(position, position + size)
             position += size
             body = jnp.repeat(group.bodies[:, 1], group.multipliers)
-            shares = [lam[here, None] * x[here][jnp.arange(size), body] for x in self.constraints]
+            shares = [lam[here, None] * x[here][jnp.arange(size), body] for x in self.unit_loads[1]]
             f, n = (x.reshape(group.count, group.multipliers, 3).sum(1) for x in shares)
             index = group.joints[:, 0]
             arm = child.point[index] - extended[group.bodies[:, 1], 0]

@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Int
 
 from natcoord_jax.core.results import Result
 from natcoord_jax.core.state import State
+from natcoord_jax.mechanics.equations_of_motion import drives_of
 from natcoord_jax.mechanics.inversion import first_inverted
 from natcoord_jax.mechanics.response import group_rows
 from natcoord_jax.model.groups import Group
@@ -21,23 +22,22 @@ from natcoord_jax.model.model import Model
 
 KINDS = Result.MISSED, Result.OVERFLOW
 
+BEYOND = 3.0
+"""How far beyond its rates in a step, in terms of the difference between them, a drive may change."""
+
 NEGLIGIBLE = 1e-9
 """Jump of a drive per radian or unit of size of the places that passes: the rounding of a function."""
 
 
 def can_fail(system: Model) -> bool:
     """Whether there is anything of the kind."""
-    return any(group.has_volumes or group.searches for group in system.effects) or bool(_drives(system))
-
-
-def _drives(system: Model) -> list[Group]:
-    return [g for g in system.effects if g.holds and g.effect.works and g.source == "coordinates"]
+    return any(group.has_volumes or group.searches for group in system.effects) or bool(drives_of(system))
 
 
 def _before_searches(system: Model) -> tuple[int, int]:
     """Number of the first drive, and of the first pair that a search can miss."""
     first = sum(group.count for group in system.effects if group.has_volumes)
-    return first, first + sum(group.count for group in _drives(system))
+    return first, first + sum(group.count for group in drives_of(system))
 
 
 def first_failure(equations: Any, after: State) -> Int[Array, ""] | None:
@@ -54,7 +54,7 @@ def first_failure(equations: Any, after: State) -> Int[Array, ""] | None:
     found = jnp.array(-1) if inverted is None else inverted
     drives, first = _before_searches(system)
     if first > drives:
-        jumps = jnp.concatenate([_jumps(group, equations) for group in _drives(system)])
+        jumps = jnp.concatenate([_jumps(group, equations) for group in drives_of(system)])
         found = jnp.where((found < 0) & jnp.any(jumps), drives + jnp.argmax(jumps), found)
     for group, where in zip(equations.groups, equations.situations):
         if group.searches:
@@ -65,8 +65,15 @@ def first_failure(equations: Any, after: State) -> Int[Array, ""] | None:
 
 
 def _jumps(group: Group, equations: Any) -> Bool[Array, " n"]:
-    """Which drives jump in a step; by next to nothing, of an angle or of the places, they may."""
-    jump = jax.vmap(lambda effect: effect.jump(equations.state.t, equations.h))(group.effect)
+    """Which drives change in a step by more than rates in it tell.
+
+    The change of a function that steps resolve lies between those of its rates, and that of one with kinks
+    not far from it. By next to nothing, of an angle or of the places, they may jump.
+    """
+    change, rates = jax.vmap(lambda effect: effect.prescribed(equations.state.t, equations.h))(group.effect)
+    low, high = jnp.min(rates, axis=1), jnp.max(rates, axis=1)
+    beyond = jnp.abs(change - jnp.clip(change, low, high))
+    jump = jnp.where(beyond > BEYOND * (high - low), beyond, 0.0)
     angular = all(axis.unit == "rad" for axis in group.effect.axes)
     size = 1.0 if angular else jnp.max(jnp.abs(equations.state.rows[:, 0]))
     return jump > NEGLIGIBLE * size
@@ -95,7 +102,7 @@ def failure(system: Model, number: int) -> tuple[Result, str]:
             if number < group.count:
                 return Result.INVERTED, f"{group.effect.kind} {group.names[number]!r}"
             number -= group.count
-    for group in _drives(system):
+    for group in drives_of(system):
         if number < group.count:
             return Result.JUMPED, f"{group.effect.kind} {group.names[number]!r}"
         number -= group.count

@@ -41,7 +41,6 @@ class Admissible(eqx.Module):
         subspace: projector on what the constraints outside the tree admit, in the frame; None: everything.
         lift: rates of the smallest energy per unit rate of the constraints; None: not asked for.
         prescribed: rates that drives prescribe, zero for all other constraints; None: not asked for.
-        matrix: rates of the constraints per unit rate of the tree; None: not asked for.
         range: projector on the range of the constraints' rates; None: they are independent.
     """
 
@@ -49,7 +48,6 @@ class Admissible(eqx.Module):
     subspace: Float[Array, "u u"] | None
     lift: Float[Array, "u c"] | None
     prescribed: Float[Array, " c"] | None
-    matrix: Float[Array, "c u"] | None = None
     range: Float[Array, "c c"] | None = None
 
     def within(self, y: Float[Array, " u"]) -> Float[Array, " u"]:
@@ -204,27 +202,6 @@ class TangentSpace(eqx.Module):
         """P^T M P."""
         return self.coupled(self)
 
-    def obeying(self, v: Velocity) -> tuple[Velocity, Float[Array, " c"]]:
-        """Velocity with the rates that drives prescribe, nothing else being changed, and their work [J].
-
-        What changes is orthogonal to all that is admitted, so that it is nothing to the motion.
-        """
-        assert self.system is not None
-        known = self.admissible
-        assert known.lift is not None and known.prescribed is not None and known.matrix is not None
-        drives = _prescribed(self.system)
-        w = known.frame.T @ self.framed(v)
-        rates = known.matrix @ w
-        missing = jnp.where(drives, known.prescribed - rates, 0.0)
-        change = known.lift @ missing
-        moved = self.spread(change)
-        impulse = self.pulled(self.impulse(moved))
-        work = jnp.where(drives, (known.lift.T @ impulse) * (rates + 0.5 * missing), 0.0)
-        # Loops that velocities do not obey quite have a share in it.
-        left = impulse @ (w + 0.5 * change) - jnp.sum(work)
-        work = jnp.where(drives, work + left / np.sum(drives), 0.0)
-        return Velocity(v.rows + moved.rows, v.rotors + moved.rotors), work
-
     def coupled(
         self, other: "TangentSpace", idle: Float[Array, " bodies"] | None = None
     ) -> Float[Array, "u u"]:
@@ -301,7 +278,7 @@ def rotor_inertias(system: Model) -> Float[Array, " rotors"]:
     return jnp.concatenate([jnp.zeros(0, system.mass.dtype), *parts])
 
 
-def _prescribed(system: Model) -> np.ndarray:
+def prescribing(system: Model) -> np.ndarray:
     """Which of the constraints of relations and loops prescribe motions."""
     groups = (*relations_of(system), *loops_of(system))
     parts = [np.full(g.count * g.multipliers, g.effect.works) for g in groups]
@@ -310,7 +287,7 @@ def _prescribed(system: Model) -> np.ndarray:
 
 def driven(system: Model) -> bool:
     """Whether constraints prescribe motions."""
-    return bool(np.any(_prescribed(system)))
+    return bool(np.any(prescribing(system)))
 
 
 def _admissible(
@@ -319,7 +296,7 @@ def _admissible(
     """What constraints of loops and relations admit, whose rates are the matrix times those of the tree."""
     if not matrix.shape[0]:
         lift, none = jnp.zeros((matrix.shape[1], 0), matrix.dtype), jnp.zeros(0, matrix.dtype)
-        return Admissible(frame, None, *((lift, none, matrix) if lifted else (None, None)))
+        return Admissible(frame, None, *((lift, none) if lifted else (None, None)))
     framed, unit = frame @ matrix.T, jnp.eye(matrix.shape[1], dtype=matrix.dtype)
     rank, onto, reached = balances.system.structure.rank, None, framed
     if rank is None:
@@ -332,7 +309,7 @@ def _admissible(
     forbidden = range_projector(reached, rank)
     subspace = unit - 0.5 * (forbidden + forbidden.T)
     if not lifted:
-        return Admissible(frame, subspace, None, None, None, onto)
+        return Admissible(frame, subspace, None, None, onto)
     prescribed = -balances.rates(jnp.zeros(matrix.shape[1], matrix.dtype)).constraints
     lift = frame.T @ pseudo_inverse(reached, forbidden, rank).T
-    return Admissible(frame, subspace, lift, prescribed, matrix, onto)
+    return Admissible(frame, subspace, lift, prescribed, onto)

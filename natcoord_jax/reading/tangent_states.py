@@ -123,7 +123,7 @@ def _together(system: Model, state: State, v: Velocity) -> Velocity:
     if not rows.shape[0]:
         return space.spread(w + definite_solution(matrix, impulse))
     # Where all rows vanish, because the tree lets nothing move that they forbid, they are rounding.
-    size = sum(jnp.sum(x**2) for x in balances.constraints)
+    size = sum(jnp.sum(x**2) for x in balances.unit_loads[1])
     gap = -balances.rates(w).constraints
     return space.spread(w + _constrained(matrix, rows, jnp.trace(matrix) / size, impulse, gap))
 
