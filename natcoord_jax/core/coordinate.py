@@ -221,7 +221,7 @@ class CoordinateConstraint(CoordinateEffect):
         """Right-hand side f(t)."""
 
     def prescribed(self, t: Array, h: Array) -> tuple[Float[Array, ""], Float[Array, " samples"]]:
-        """By how much the right-hand side changes in a step, and its rates at instants of it, times the step."""
+        """Change of the right-hand side in a step, and its rates at instants of it, times the step."""
         times = t + h * jnp.linspace(0.0, 1.0, SAMPLES)
         rates = jax.vmap(lambda t: jax.jvp(self.target, (t,), (jnp.ones_like(t),))[1])(times)
         return self.target(times[-1]) - self.target(times[0]), h * rates

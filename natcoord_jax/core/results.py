@@ -45,7 +45,7 @@ REASONS = {
     Result.MISSED: "bodies have moved in a step beyond where contacts were looked for",
     Result.OVERFLOW: "a body has more neighbours than its contact has room for",
     Result.BAD_START: "the positions at the start violate the constraints",
-    Result.JUMPED: "a drive jumps from one position to another, or swings to and fro within the shortest step",
+    Result.JUMPED: "a drive jumps, or swings to and fro within the shortest step",
 }
 
 REMEDIES = {
