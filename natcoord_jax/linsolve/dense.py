@@ -7,6 +7,9 @@ from jaxtyping import Array, Float
 from natcoord_jax.linsolve.refinement import refined_solve
 from natcoord_jax.maths.elimination import definite_inverse, pivoted_inverse
 
+ROUNDING = 1e-14
+"""Part of the largest inertia that is the rounding of none."""
+
 
 def bordered_inverse(matrix: Float[Array, "n n"], visible: int) -> Float[Array, "n n"]:
     """Inverse of [[A, -B^T], [C, E]] with a positive definite A, or one that the constraints make definite.
@@ -54,9 +57,10 @@ def constraint_shifts(
     matrix: Float[Array, "n n"], inertias: Float[Array, " balances"], *, dependent: bool
 ) -> Float[Array, " multipliers"]:
     """Small positive numbers for the diagonal of the constraint rows, see `saddle_inverse`."""
-    definite = inertias.shape[0]
+    definite, most = inertias.shape[0], jnp.max(inertias)
     coupling = jnp.abs(matrix[definite:, :definite])
-    scale = jnp.max(coupling**2 / jnp.where(inertias > 0, inertias, 1.0), axis=1)
+    # (What an ideal rod has about its axis is the rounding of what it has about others.)
+    scale = jnp.max(coupling**2 / jnp.where(inertias > ROUNDING * most, inertias, most), axis=1)
     least = (1.0 if dependent else 1e-16) * jnp.max(scale)
     return 1e-10 * jnp.maximum(jnp.maximum(scale, least), jnp.finfo(matrix.dtype).tiny)
 
