@@ -285,4 +285,4 @@ class Scene:
         state = state.at_time(t)
         if assemble:
             state = assemble_state(system, state)
-        return prepared(system, state, assembled=assemble)
+        return prepared(system, state, assembled=assemble, chosen=solver)

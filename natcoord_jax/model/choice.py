@@ -31,6 +31,11 @@ def adjacent(group: Group, neighbour: np.ndarray) -> bool:
     return True
 
 
+def dense_solver(effects: tuple[Group, ...], mass_between: bool) -> str:
+    """Form with one dense matrix: the smallest, unless its Jacobian may not be found by differences."""
+    return "full" if mass_between or any(group.effect.bends for group in effects) else "reduced"
+
+
 def choose_solver(
     tree: Tree,
     multipliers: int,
@@ -41,8 +46,8 @@ def choose_solver(
 ) -> str:
     """Form of the equations: small systems reduced, large trees recursive, everything else full."""
     unknowns, depth = len(tree.slot_of), len(tree.levels)
-    if mass_between or any(group.effect.bends for group in effects):
-        depth = DEPTH_LIMIT + 1  # no form whose Jacobian is found by differences
+    if dense_solver(effects, mass_between) != "reduced":
+        depth = DEPTH_LIMIT + 1
     if unknowns + multipliers <= REDUCED_LIMIT and depth <= DEPTH_LIMIT:
         return "reduced"
     neighbour = np.asarray(tree.neighbour)

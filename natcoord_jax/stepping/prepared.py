@@ -6,6 +6,7 @@ import warnings
 from natcoord_jax.core.checks import is_concrete
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
+from natcoord_jax.model.choice import dense_solver
 from natcoord_jax.stepping.admissibility import (
     admitted,
     check_gaps,
@@ -20,7 +21,7 @@ DENSE_LIMIT = 300
 """Unknowns beyond which a dense solution is worth a warning."""
 
 
-def prepared(system: System, state: State, *, assembled: bool) -> tuple[System, State]:
+def prepared(system: System, state: State, *, assembled: bool, chosen: str | None) -> tuple[System, State]:
     """A system that was built and its initial state, checked, with its rank and pattern.
 
     Args:
@@ -28,6 +29,7 @@ def prepared(system: System, state: State, *, assembled: bool) -> tuple[System, 
         state: initial state.
         assembled: whether it was projected onto the constraints; otherwise a gap is refused, and velocities
             that do not obey them are projected.
+        chosen: form of the equations that is asked for.
 
     Raises:
         ValueError: for a gap in a joint, or a body without inertia along a free motion.
@@ -41,9 +43,10 @@ def prepared(system: System, state: State, *, assembled: bool) -> tuple[System, 
         state = project_velocities(system, state)
     rank, redundant = find_redundancy(system, state)
     structure = system.structure
-    if redundant and structure.solver == "sparse":
-        # Dependent constraints are projected out of a dense matrix.
-        structure = dataclasses.replace(structure, solver="full")
+    if redundant and chosen in (None, "sparse"):
+        # Dependent constraints are projected out of a dense matrix, the smallest one if there is a choice.
+        solver = dense_solver(system.effects, system.mass_between is not None)
+        structure = dataclasses.replace(structure, solver=solver)
         system = replace_fields(system, structure=structure)
     notes = size_notes(system)
     for note in notes:
