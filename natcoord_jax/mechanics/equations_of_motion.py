@@ -123,9 +123,9 @@ class EquationsOfMotion(eqx.Module):
 
     @property
     def unit_loads(self) -> tuple[UnitLoads, UnitLoads]:
-        """Derivatives of the rates of rotors and of constraints by those of all bodies, the ground being last.
+        """Forces and torques of unit multipliers of rotors and of constraints, on the ground last.
 
-        By velocities and by angular velocities: forces and torques of unit multipliers.
+        Derivatives of their rates by the velocities and by the angular velocities of the bodies.
         """
         still = jnp.zeros((self.rows.shape[0] + 1, 3), self.rows.dtype)
 

@@ -174,8 +174,7 @@ def _impacts(
     hit: Bool[Array, " c"] | None,
     lam: Sequence[Float[Array, "n m"]],
 ) -> tuple[Array, ...]:
-    """After impacts of active contacts: velocities, rates of rotors, work of drives and of contacts,
-    impulses, and which have met."""
+    """After impacts: velocities, rates of rotors, work of drives, work of contacts, impulses, which met."""
     space, bouncing = tangents_at(system, end), jnp.asarray(_bouncing(groups))
     pushes = Answers(space, system, groups, end, "pushes")
     # With friction it has three multipliers besides that of the gap.

@@ -38,14 +38,14 @@ from natcoord_jax.mechanics.block_tangent_space import Tangents, tangents_at
 from natcoord_jax.mechanics.coordinates import stage_rates
 from natcoord_jax.mechanics.frozen_kick import NEGLIGIBLE, NEGLIGIBLE_ENERGY, FrozenKick
 from natcoord_jax.mechanics.response import GroupData, StageKinematics
-from natcoord_jax.mechanics.tangent_space import Velocity
+from natcoord_jax.mechanics.tangent_space import Velocity, driven
 from natcoord_jax.model.groups import Group
 from natcoord_jax.model.model import Model
 from natcoord_jax.xla.tracing import traced_once
 
-LARGEST = 0.51
-"""Kinetic energy of a kick in terms of that of the motion, twice, beyond which a step is refused. A drive
-that sets in motion at once what was at rest has 0.5 exactly, and must not depend on rounding."""
+LARGEST, DRIVEN = 0.51, 2.01
+"""Kinetic energy of a kick in terms of that of the motion, twice, beyond which a step is refused; and
+the same where drives prescribe motions, of which those that turn back at once have 2 exactly."""
 
 UNSOUND = 1e-11
 """Energy made by kicks in terms of that of the motion, beyond which a step is refused."""
@@ -201,7 +201,7 @@ def ends_of(
     energies = before.energy(v), before.energy(start), after.energy(last), after.energy(end)
     moving = jnp.maximum(functools.reduce(jnp.maximum, energies), before.energy(little))
     missing = energies[1] - energies[0] + energies[3] - energies[2] - jnp.sum(work)
-    small = 2.0 * before.energy(kick.kick) <= LARGEST * moving
+    small = 2.0 * before.energy(kick.kick) <= (DRIVEN if driven(system) else LARGEST) * moving
     return Ends(end, work, small & (jnp.abs(missing) <= UNSOUND * moving))
 
 

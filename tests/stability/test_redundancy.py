@@ -110,6 +110,64 @@ def test_rows_added_removed_reordered(name, order, change):
     assert apart <= tol.SAME_TRAJECTORY
 
 
+def scissors(cells: int) -> nc.Scene:
+    """Crossed ideal rods on top of each other: one foot hinged to the ground, the other on a slider."""
+    scene = nc.Scene()
+    scene.add(nc.Gravity())
+    wide, high, rod = 2.0 * np.cos(0.6), 2.0 * np.sin(0.6), {"mass": 1.0, "inertia": (0.0, 0.34, 0.34)}
+    slider = scene.add(nc.RigidBody(mass=0.2, inertia=(0.01,) * 3, position=(wide, 0, 0), name="slider"))
+    scene.add(nc.Prismatic(nc.ground, slider, point=(wide, 0, 0), axis=(1, 0, 0), name="rail"))
+    below = nc.ground, slider
+    for k in range(cells):
+        middle = 0.5 * wide, 0.0, (k + 0.5) * high
+        rods = [scene.add(nc.RigidBody(**rod, position=middle, name=f"rod {k} {n}")) for n in range(2)]
+        scene.add(nc.Revolute(*rods, point=middle, axis=(0, 1, 0), name=f"cross {k}"))
+        for n in range(2):
+            at = n * wide, 0.0, k * high
+            scene.add(nc.Revolute(below[n], rods[n], point=at, axis=(0, 1, 0), name=f"foot {k} {n}"))
+        below = rods[::-1]
+    return scene
+
+
+FRAMES = {
+    "four-bars": (lambda count: gallery.load("four_bar", bars=count), (1, 2, 4, 6, 8, 12, 16, 32)),
+    "scissors": (lambda count: scissors(count).compile(), (2, 5, 10, 20)),
+}
+
+
+@pytest.mark.parametrize(
+    ("kind", "count"),
+    [
+        pytest.param(kind, count, marks=() if (kind, count) == ("four-bars", 8) else pytest.mark.exhaustive)
+        for kind, (_, counts) in FRAMES.items()
+        for count in counts
+    ],
+)
+def test_frames_of_many_dependent_loops(kind, count):
+    """Whatever form of the equations the size chooses: one degree of freedom, errors of round-off."""
+    example = FRAMES[kind][0](count)
+    system, state = (example.system, example.state) if kind == "four-bars" else example
+    assert system.structure.dofs == 1
+    for dt in (1e-4, 1e-3, 1e-2):
+        run = simulate(system, state, dt=dt, steps=150)
+        assert float(np.max(system.constraint_errors(run).joints)) <= 1e-12, dt
+        assert float(np.max(nc.balance(system, run).energy)) <= tol.STEP_BALANCE, dt
+        assert int(np.sum(run.iterations)) <= 5 * 150, dt
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [2, 4])
+def test_six_rates_a_body_and_dependent_loops(count):
+    """Ideal rods have no inertia about their axes, and what rounding leaves of it is none."""
+    scene, places = scissors(count), []
+    for solver in ("full", "reduced"):
+        system, state = scene.compile(solver=solver)
+        run = simulate(system, state, dt=1e-3, steps=150)
+        assert float(np.max(system.constraint_errors(run).joints)) <= 1e-12
+        places.append(np.asarray(system.sense(run, f"rod {count - 1} 0").position))
+    assert np.max(np.abs(places[0] - places[1])) <= tol.SAME_TRAJECTORY
+
+
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("bars", [1, 3])
 @pytest.mark.parametrize("order", [2, 4])
