@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from natcoord_jax.analysis.static_equations import Static
+from natcoord_jax.analysis.static_equations import DENSE, Static
 from natcoord_jax.analysis.static_search import code_of_search, search_equilibrium
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.checks import at_top_level, is_concrete
@@ -60,17 +60,18 @@ def differentiable(system: System, state: State, lam: Array, inputs: Array) -> t
     fixed = jax.lax.stop_gradient(replace_fields(state, t=jnp.zeros_like(state.t)))
     static = Static(system, replace_fields(fixed, t=state.t), inputs)
     at = jax.lax.stop_gradient(jnp.concatenate([jnp.zeros(static.balances), lam]))
-    # It only helps to solve: its derivatives must not reach the root's rule.
-    solver = jax.lax.stop_gradient(static.solver(at))
 
     def tangent_solve(linear: Any, right: Array) -> Array:
+        # The Jacobian itself where it is small; nearly so of large meshes, whose formulas leave parts out.
+        small = static.unknowns <= DENSE
+        solver = static.inverse(jax.jacfwd(linear)(jnp.zeros_like(right))) if small else jax.lax.stop_gradient(static).solver(at)
         return refined_solve(
             linear,
             right,
             solver,
             lambda near, b: near.solve(b),
             lambda near, b: near.transpose().solve(b),
-            rounds=3,
+            rounds=None,
         )
 
     y = jax.lax.custom_root(lambda y: static.residual(y), at, lambda f, start: start, tangent_solve)
