@@ -63,8 +63,10 @@ def differentiable(system: System, state: State, lam: Array, inputs: Array) -> t
 
     def tangent_solve(linear: Any, right: Array) -> Array:
         # The Jacobian itself where it is small; nearly so of large meshes, whose formulas leave parts out.
-        small = static.unknowns <= DENSE
-        solver = static.inverse(jax.jacfwd(linear)(jnp.zeros_like(right))) if small else jax.lax.stop_gradient(static).solver(at)
+        if static.unknowns <= DENSE:
+            solver: Any = static.inverse(jax.jacfwd(linear)(jnp.zeros_like(right)))
+        else:
+            solver = jax.lax.stop_gradient(static).solver(at)
         return refined_solve(
             linear,
             right,

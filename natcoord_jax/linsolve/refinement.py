@@ -14,9 +14,9 @@ MOST = 60
 """Rounds of refinement that goes on until it converges."""
 
 UNSOLVED = 1e-12
-"""Work of the residual along its correction, in terms of that of the right-hand side along the solution, that no
-solution leaves: the square of its relative error. Rounding of structures whose stiffnesses are 1e10 apart
-leaves as much."""
+"""Work of the residual along its correction, in terms of that of the right-hand side along the solution,
+that no solution leaves: the square of its relative error. Rounding of structures whose stiffnesses are 1e10
+apart leaves as much."""
 
 
 def refined_solve(

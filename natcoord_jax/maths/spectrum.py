@@ -1,9 +1,9 @@
 """Eigenvalues and eigenvectors with derivatives of every order, and no number where there is no derivative.
 
 With B = V^-1 A' V the eigenvalues change by the diagonal of B, the eigenvectors by V C, C_ij = B_ij /
-(l_j - l_i). Eigenvectors of eigenvalues that coincide are arbitrary in their span: a change that splits these has
-no derivative, only one to each side, and that is not linear. One that does not split them has, since there B
-is a multiple of the unit matrix.
+(l_j - l_i). Eigenvectors of eigenvalues that coincide are arbitrary in their span: a change that splits these
+has no derivative, only one to each side, and that is not linear. One that does not split them has, since
+there B is a multiple of the unit matrix.
 """
 
 from dataclasses import dataclass
@@ -32,7 +32,7 @@ def spectrum(matrix: Num[Array, "n n"], symmetric: bool) -> tuple[Num[Array, " n
     """Eigenvalues, and eigenvectors in columns, differentiable to any order.
 
     Forward mode is exact where eigenvalues coincide and a change does not split them; where it does, their
-    derivatives are NaN, and so are those of their eigenvectors that leave the span. Reverse mode does not know
+    derivatives are NaN, and so are those of their eigenvectors within the span. Reverse mode does not know
     the change: it is exact for functions that have the same slope by all that coincide, else NaN.
 
     Args:
