@@ -21,9 +21,7 @@ from natcoord_jax.core.joint import frames_at
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.elimination import definite_inverse
 from natcoord_jax.maths.rotations import from_rotation_vector
-from natcoord_jax.mechanics.coordinates import coordinate_values, state_rates, velocities_with_ground
-from natcoord_jax.mechanics.equations_of_motion import rotors_of
-from natcoord_jax.mechanics.tangent_space import rotor_inertias
+from natcoord_jax.mechanics.coordinates import coordinate_values, velocities_with_ground
 from natcoord_jax.mechanics.violations import constrained, violation_rates_of, violations_of
 from natcoord_jax.model.model import Model
 from natcoord_jax.model.rows import group_places, row_rates, rows_with_ground
@@ -36,12 +34,6 @@ SHARE = 1e-3
 
 SLACK = 1e-9
 """The same for velocities, which do not depend on it: each pass leaves that part of what has no inertia."""
-
-DAMPING = 1e-14
-"""Of velocities, see `Projection`; what it leaves is projected again."""
-
-PASSES = 5
-"""Projections of velocities with one inverse."""
 
 
 def fills(system: Model, share: float) -> Float[Array, "bodies 6"]:
@@ -126,7 +118,7 @@ def constraint_matrix(system: Model, state: State) -> Float[Array, "m twists"]:
             group_places(system, group),
             rows[group.bodies],
             state.t,
-            lambda e, place, rows, rates, spin, t: e.violation_rate(place, rows, rates, spin, t, 0.0),
+            lambda e, *at: e.opening_slope(*at),
         )
         found.append(_scattered(block, group.bodies, count))
     return jnp.concatenate(found)
@@ -169,7 +161,7 @@ class Projection(eqx.Module):
             state: whose directors are orthonormal.
             held: coordinates that are constraints as well, where it is 1; None: there are none.
         """
-        matrix = _constraints(system, state, held)
+        matrix = constraints(system, state, held)
         return cls.scaled(matrix, mobility(system, state.rows, fills(system, SHARE))(matrix.T))
 
     @classmethod
@@ -184,7 +176,7 @@ class Projection(eqx.Module):
         return self.matrix @ self.impulses + damping * jnp.eye(self.scale.shape[0])
 
 
-def _constraints(
+def constraints(
     system: Model, state: State, held: Float[Array, " coordinates"] | None
 ) -> Float[Array, "m twists"]:
     """Derivatives of the rates of all constraints, and of coordinates that are held."""
@@ -192,56 +184,6 @@ def _constraints(
     if held is None:
         return matrix
     return jnp.concatenate([matrix, held[:, None] * coordinate_matrix(system, state)])
-
-
-def admissible_twists(
-    system: Model,
-    state: State,
-    twists: Float[Array, "bodies 6"],
-    held: Float[Array, " coordinates"] | None,
-    rates: Float[Array, " coordinates"],
-) -> Float[Array, "bodies 6"]:
-    """Twists that obey the constraints, nearest to the given ones in the metric of the mass, rotors included.
-
-    A rotor is one more body with the rate of its coordinate. What makes the inertias regular weighs changes
-    from one pass to the next only, and is gone in the end.
-
-    Args:
-        system: compiled system.
-        state: its positions obey the constraints.
-        twists: of the bodies, before.
-        held: 1 for coordinates that keep their rates; None: none do.
-        rates: of all coordinates, before: those to keep, and those of rotors.
-    """
-    start, count = moving(state, twists), twists.size
-    matrix, wanted = _constraints(system, state, held), [gap_rates(system, start)]
-    now = state_rates(system, start)
-    wanted += [] if held is None else [held * (now - rates)]
-    turning = [group.coordinates[:, 0] for group in rotors_of(system)]
-    if turning:
-        index, roots = jnp.concatenate(turning), jnp.sqrt(rotor_inertias(system))
-        rotors = roots[:, None] * coordinate_matrix(system, state)[index]
-        matrix = jnp.pad(matrix, ((0, 0), (0, len(roots))))
-        matrix = jnp.concatenate([matrix, jnp.concatenate([rotors, -jnp.eye(len(roots))], axis=1)])
-        wanted.append(roots * (now - rates)[index])
-    fill = fills(system, SLACK)
-    moved_by = mobility(system, state.rows, fill)
-
-    def answer(impulses: Array) -> Array:
-        return jnp.concatenate([moved_by(impulses[:count]), impulses[count:]])
-
-    linear = Projection.scaled(matrix, answer(matrix.T))
-    missing = jnp.concatenate(wanted) / linear.scale
-    inverse = definite_inverse(linear.damped(DAMPING))
-    slack = jnp.pad(fill.reshape(-1), (0, matrix.shape[1] - count))
-    change, multipliers = jnp.zeros(matrix.shape[1], missing.dtype), jnp.zeros_like(missing)
-    for _ in range(PASSES):
-        kept = answer(slack * change)
-        multipliers = multipliers - inverse @ (
-            missing + linear.matrix @ (kept + linear.impulses @ multipliers)
-        )
-        change = kept + linear.impulses @ multipliers
-    return twists + change[:count].reshape(twists.shape)
 
 
 def gaps(

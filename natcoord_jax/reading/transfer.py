@@ -10,6 +10,7 @@ from natcoord_jax.core.checks import is_concrete
 from natcoord_jax.core.compiled import briefly
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import STATE, State
+from natcoord_jax.mechanics.admissible_velocities import with_admissible_velocities
 from natcoord_jax.mechanics.coordinates import state_rates
 from natcoord_jax.mechanics.violations import residuals
 from natcoord_jax.model.model import SYSTEM, Model, SomeModel
@@ -25,7 +26,6 @@ from natcoord_jax.reading.matching import (
     taking_hold,
     with_coordinates_of,
 )
-from natcoord_jax.stepping.assemble import with_admissible_velocities
 
 GAP = 1e-9
 """Largest gap [m, -] of a joint that has closed, per unit of size."""

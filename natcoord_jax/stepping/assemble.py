@@ -14,16 +14,13 @@ from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.results import REASONS, Result, SimulationError
 from natcoord_jax.core.state import STATE, State
 from natcoord_jax.maths.rotations import orthonormalise
+from natcoord_jax.mechanics.admissible_velocities import with_admissible_velocities
 from natcoord_jax.mechanics.coordinates import state_rates
-from natcoord_jax.mechanics.projection import admissible_twists, gap_rates, moving, twists_of
-from natcoord_jax.mechanics.violations import GAP, rate_size, worst_violation
+from natcoord_jax.mechanics.projection import moving, twists_of
+from natcoord_jax.mechanics.violations import GAP, worst_violation
 from natcoord_jax.model.model import SYSTEM
 from natcoord_jax.stepping.closing import closed
 from natcoord_jax.system import System
-
-ENOUGH = 1e3 * GAP
-"""Rates of constraints [m/s, rad/s, 1/s], per unit of size, up to which velocities obey them. Near singular
-positions no projection leaves less."""
 
 
 @briefly
@@ -44,46 +41,6 @@ def with_admissible_positions(system: System, state: State) -> tuple[State, Arra
     twists = twists_of(system, state)
     found, code = closed(system, replace_fields(state, v=jnp.zeros_like(state.v)))
     return moving(found, twists), code
-
-
-def with_admissible_velocities(
-    system: System, state: State, rates: Array | None = None
-) -> tuple[State, Array]:
-    """State whose velocities, projected in the metric of the mass, obey the constraints; a result code.
-
-    Args:
-        system: compiled system.
-        state: its positions obey the constraints.
-        rates: of all joint coordinates, kept where `state.held` says so and had by rotors; None: those of the
-            state.
-    """
-    twists = twists_of(system, state)
-    rates = state_rates(system, state) if rates is None else rates
-    found = moving(state, admissible_twists(system, state, twists, None, rates))
-    allowed = ENOUGH * rate_size(found)
-    if state.held is not None:
-        holding = moving(state, admissible_twists(system, state, twists, state.held[1], rates))
-        missed = state.held[1] * (state_rates(system, holding) - rates)
-        held = _most(gap_rates(system, holding)) <= allowed
-        held = held & (_most(missed) <= ENOUGH * (1.0 + _most(rates)))
-        found = jax.tree.map(lambda x, y: jnp.where(held, x, y), holding, found)
-    code = jnp.where(_most(gap_rates(system, found)) <= allowed, int(Result.SUCCESSFUL), int(Result.SINGULAR))
-    return replace_fields(found, rates=_rotor_rates(system, found)), code
-
-
-def _most(x: Array) -> Array:
-    return jnp.max(jnp.abs(x), initial=0.0)
-
-
-def _rotor_rates(system: System, state: State) -> Array:
-    """Rates of the joint coordinates that carry rotors."""
-    if not state.rates.shape[0]:
-        return state.rates
-    every, rates = state_rates(system, state), state.rates
-    for group in system.effects:
-        if group.effect.rotors:
-            rates = rates.at[group.rotors[:, 0]].set(every[group.coordinates[:, 0]])
-    return rates
 
 
 @checked(system=SYSTEM, state=STATE)
