@@ -211,13 +211,17 @@ def modes(
         inputs: input channels [N, N m]; default zero.
         damped: whether dampers, rotation or loads that follow the motion make the problem unsymmetric;
             default: found out from the numbers, and False inside jit. Undamped frequencies are more accurate
-            and differentiable on every backend; the others need the CPU.
+            and run on every backend; the others need the CPU.
 
     Returns:
-        The slowest modes first. Rigid motions have s = 0, to round-off of the stiffest mode.
+        The slowest modes first. Rigid motions have s = 0, to round-off of the stiffest mode. Differentiable
+        in every mode and order, the pose included. Frequencies that coincide have derivatives in forward
+        mode where a change does not split them; in reverse mode those functions have one that depend on all
+        of them alike, as their mean. What has none is NaN within jit, and raises in an eager call.
 
     Raises:
         ValueError: for a state that is not steady, or a motion without inertia.
+        DerivativeError: for a derivative of frequencies that a change splits, outside of jit.
 
     Example:
         >>> import jax; jax.config.update("jax_enable_x64", True)
