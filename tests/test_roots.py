@@ -146,6 +146,10 @@ def test_frequencies_that_coincide():
     np.testing.assert_allclose(means, (1.0, 1 / 3), rtol=tol.EXACT_GRADIENT)
     _, split, _, _ = answers(4.0, 0.5)
     np.testing.assert_allclose(split, (0, 0, 0.5 / 4.5**0.5), atol=tol.EXACT_GRADIENT)
+    # A root has no derivative at zero but where it stays there.
+    alike, split, _, _ = answers(0.0, 1.0)
+    np.testing.assert_allclose(alike, (np.nan, np.nan, 0.5), rtol=tol.EXACT_GRADIENT)
+    np.testing.assert_allclose(split, (0, 0, 0.5), atol=tol.EXACT_GRADIENT)
 
 
 @pytest.mark.slow

@@ -25,7 +25,7 @@ from natcoord_jax.core.kinds import FLAG
 from natcoord_jax.core.numeric import COMPONENTS, Vector, Whole
 from natcoord_jax.core.state import STATE, State
 from natcoord_jax.maths.projectors import pseudo_inverse, range_projector
-from natcoord_jax.maths.spectrum import spectrum
+from natcoord_jax.maths.spectrum import roots_of_sizes, spectrum
 from natcoord_jax.maths.vectors import cross
 from natcoord_jax.mechanics.equations_of_motion import loads, relative_rates, rotors_of, with_rest
 from natcoord_jax.mechanics.momentum import inertia, wrench
@@ -165,7 +165,7 @@ def _undamped(mass: Array, stiffness: Array) -> tuple[Array, Array]:
     whole = jax.scipy.linalg.solve_triangular(lower, half.T, lower=True)
     squares, vectors = spectrum(0.5 * (whole + whole.T), True)
     shapes = jax.scipy.linalg.solve_triangular(lower.T, vectors, lower=False).T
-    root = jnp.sqrt(jnp.where(squares == 0, 1.0, jnp.abs(squares))) * (squares != 0)
+    root = roots_of_sizes(squares)
     return jnp.where(squares < 0, root + 0j, 1j * root), shapes.astype(complex)
 
 
@@ -217,7 +217,8 @@ def modes(
         The slowest modes first. Rigid motions have s = 0, to round-off of the stiffest mode. Differentiable
         in every mode and order, the pose included. Frequencies that coincide have derivatives in forward
         mode where a change does not split them; in reverse mode those functions have one that depend on all
-        of them alike, as their mean. What has none is NaN within jit, and raises in an eager call.
+        of them alike, as their mean. One that is zero has one in forward mode where it stays zero. What has
+        none is NaN within jit, and raises in an eager call.
 
     Raises:
         ValueError: for a state that is not steady, or a motion without inertia.

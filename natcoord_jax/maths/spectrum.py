@@ -12,7 +12,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Num
+from jaxtyping import Array, Bool, Float, Num
 
 from natcoord_jax.xla import linear_pair
 
@@ -117,3 +117,47 @@ def _differences(x: Num[Array, " n"]) -> Num[Array, "n n"]:
 
 def _larger(x: Num[Array, " n"]) -> Num[Array, "n n"]:
     return jnp.maximum(jnp.abs(x)[None, :], jnp.abs(x)[:, None])
+
+
+@jax.custom_jvp
+def roots_of_sizes(squares: Float[Array, " n"]) -> Float[Array, " n"]:
+    """Square roots of sizes; at zero their derivative is zero where that of the square is, else NaN."""
+    return jnp.sqrt(jnp.abs(squares))
+
+
+@roots_of_sizes.defjvp
+def _roots_of_sizes_jvp(primals: tuple, tangents: tuple) -> tuple:
+    roots = roots_of_sizes(*primals)
+    growing = jnp.where(primals[0] < 0, -1.0, 1.0) * tangents[0]
+    return roots, linear_pair.apply(_RootChange(), roots, growing, roots)
+
+
+@dataclass(frozen=True)
+class _RootChange(linear_pair.LinearWithTranspose):
+    """Change of square roots, linear in that of the squares, after the roots; its own transpose."""
+
+    def forward(self, residuals: Array, arguments: Array) -> Array:
+        """Over twice the root."""
+        some = residuals != 0
+        rounding = MIXED * arguments.shape[0] * jnp.finfo(arguments.dtype).eps
+        still = jnp.abs(arguments) <= rounding * jnp.max(jnp.abs(arguments), initial=0.0)
+        at_zero = jnp.where(still, 0.0, jnp.nan)
+        return jnp.where(some, 0.5 * arguments / jnp.where(some, residuals, 1.0), at_zero)
+
+    def backward(self, residuals: Array, cotangents: Array) -> Array:
+        """The same."""
+        return self.forward(residuals, cotangents)
+
+    def forward_changed(
+        self, residuals: Array, changes: Any, arguments: Array, arguments_dot: Array
+    ) -> tuple[Array, Array]:
+        """The change, and how it changes."""
+        value, moved = (linear_pair.apply(self, residuals, x, residuals) for x in (arguments, arguments_dot))
+        some = residuals != 0
+        return value, moved - jnp.where(some, value * changes / jnp.where(some, residuals, 1.0), 0.0)
+
+    def backward_changed(
+        self, residuals: Array, changes: Any, cotangents: Array, cotangents_dot: Array
+    ) -> tuple[Array, Array]:
+        """The same."""
+        return self.forward_changed(residuals, changes, cotangents, cotangents_dot)
