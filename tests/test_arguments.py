@@ -725,6 +725,18 @@ def test_numbers_may_be_traced_and_of_numpy():
         jax.jit(lambda g: nc.Gravity(vector=jnp.stack([g, g])).vector)(1.0)
 
 
+def test_what_needs_a_value_says_so():
+    """Numbers that are part of the program, and what Python reads."""
+    w = world()
+    for argument, call in (
+        ("newton_tol", lambda x: nc.step(w.system, w.state, dt=0.1, newton_tol=x).q),
+        ("newton_tol", lambda x: nc.simulate(w.system, w.state, dt=0.1, steps=2, newton_tol=x).q),
+        ("trajectory", lambda x: nc.balance(w.system, eqx.tree_at(lambda t: t.t, w.trajectory, x)).energy),
+    ):
+        with pytest.raises(ValueError, match=f"{argument}.* is traced .* needs a value"):
+            jax.jit(call)(1e-9)
+
+
 def test_a_scene_may_be_compiled_twice():
     first, second = (world().scene.compile()[0] for _ in range(2))
     assert eqx.tree_equal(first, second)

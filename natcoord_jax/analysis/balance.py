@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.eager_numpy import eager_numpy
+from natcoord_jax.core.kinds import Concrete
 from natcoord_jax.core.motion import Motion, Response
 from natcoord_jax.core.state import TRAJECTORY, State, Trajectory
 from natcoord_jax.maths.collocation import gauss
@@ -171,7 +172,7 @@ def _of_lanes(lanes: list[Balance]) -> Balance:
     )
 
 
-@checked(system=SYSTEM, trajectory=TRAJECTORY)
+@checked(system=SYSTEM, trajectory=Concrete(TRAJECTORY))
 def balance(system: System, trajectory: Trajectory) -> Balance:
     """Errors of the balances of energy, momentum and angular momentum along a trajectory.
 
