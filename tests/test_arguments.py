@@ -19,6 +19,7 @@ import optax
 import pytest
 
 import natcoord_jax as nc
+from natcoord_jax.control.guess import scattered
 from natcoord_jax.control.iterate import Options
 from natcoord_jax.control.solution import Solution
 from natcoord_jax.control.transcription import Unknowns
@@ -723,6 +724,18 @@ def test_numbers_may_be_traced_and_of_numpy():
     nc.JointSpring(w.hinge, stiffness=np.float64(2.0), coordinate=np.int32(0))
     with pytest.raises(ValueError, match=r"vector.*shape \(2,\)"):
         jax.jit(lambda g: nc.Gravity(vector=jnp.stack([g, g])).vector)(1.0)
+
+
+def test_a_spread_for_each_input_is_that_of_its_guesses():
+    scene = nc.Scene()
+    body = scene.add(nc.RigidBody(mass=1.0, inertia=(1.0, 2.0, 3.0), name="body"))
+    scene.add(nc.BodyTorqueInput(tuple(nc.Direction(body, axis) for axis in np.eye(3)), name="torque"))
+    fields = {"dt": 0.1, "steps": 4, "cost": nc.cost.Effort(), "goal": nc.goal.Rest()}
+    problem, spread = nc.OptimalControl(*scene.compile(), **fields), jnp.array([100.0, 1.0, 0.0])
+    middle = Unknowns(jnp.zeros((4, 3)), jnp.zeros(0), jnp.zeros((4, 6)))
+    made = jax.vmap(lambda key: scattered(problem, middle, key, spread, 0.0).coefficients)
+    sizes = np.std(np.asarray(made(jax.random.split(jax.random.key(0), 200))), axis=(0, 1))
+    assert sizes[2] == 0 and sizes[0] == pytest.approx(100 * sizes[1], rel=0.2) and sizes[1] > 0.1
 
 
 def test_what_needs_a_value_says_so():
