@@ -167,6 +167,28 @@ def test_coordinates_that_a_joint_does_not_have():
         scene.compile()
 
 
+def test_what_there_is_for_joints_without_coordinates_is_named():
+    """A ball turns freely, about no axis of its own; a fixed joint does not move."""
+
+    def build(joint, effect):
+        scene = nc.Scene()
+        place = scene.add(joint(nc.ground, scene.add(body()), name="place"))
+        scene.add(effect(place))
+        scene.compile()
+
+    spring, damper = partial(nc.JointSpring, stiffness=1.0), partial(nc.JointDamper, damping=1.0)
+    servo = lambda joint: nc.AffineActuator((joint,))  # noqa: E731
+    all_rejected(
+        {
+            "spring": (partial(build, nc.Spherical, spring), "'place'", "nc.SphericalSpring"),
+            "damper": (partial(build, nc.Spherical, damper), "'place'", "nc.SphericalDamper"),
+            "motor": (partial(build, nc.Spherical, nc.JointForce), "'place'", "nc.SphericalTorque"),
+            "servo": (partial(build, nc.Spherical, servo), "'place'", "nc.SphericalTorque"),
+            "fixed": (partial(build, nc.Fixed, spring), "'place'", "pass another joint"),
+        }
+    )
+
+
 NUMBERS = {
     "stiffness": (lambda p, j: nc.Spring(p, name="part", stiffness=np.nan), "stiffness", "[N/m]"),
     "coil": (lambda p, j: nc.JointSpring(j, stiffness=np.inf, name="part"), "stiffness"),

@@ -65,6 +65,9 @@ class CoordinateEffect(Effect):
             tuple of indices.
         name: optional name.
         axes: the coordinates' descriptions, filled in at compile.
+
+    Class attributes:
+        on_a_ball: what there is instead for joints that turn freely, which have no coordinate.
     """
 
     joint: Any = eqx.field(metadata=is_a(JOINT | Several(JOINT, 1)))
@@ -73,6 +76,7 @@ class CoordinateEffect(Effect):
     axes: tuple[Coordinate, ...] = eqx.field(default=(), init=False, static=True)
 
     kind: ClassVar[str] = "coordinate effect"
+    on_a_ball: ClassVar[str] = ""
 
     @abc.abstractmethod
     def generalised(

@@ -4,6 +4,7 @@ Rotors with an effect each stand side by side in one scene, whose program serves
 that of a pair with everything that works on it, of which loads and inputs are numbers.
 """
 
+import dataclasses
 from functools import cache
 
 import jax
@@ -510,3 +511,58 @@ def test_momenta_are_judged_where_not_every_step_is_there(weight):
     else:
         assert result.momentum.max() <= tol.MOMENTUM_OF_A_SMALL_SCENE and result.directions == 3
         assert result.angular_momentum.max() <= tol.MOMENTUM_OF_A_SMALL_SCENE and result.axes == 3
+
+
+def test_errors_are_relative_to_what_is_no_rounding():
+    """Bodies that meet head-on have no angular momentum, and one that only turns has no momentum."""
+    scene = nc.Scene()
+    bodies = [
+        nc.RigidBody(mass=1.0 + k, inertia=(0.1, 0.2, 0.3), position=(0.3 + k, 0, 0), name=f"body {k}")
+        for k in range(2)
+    ]
+    bodies = [scene.add(body) for body in bodies]
+    scene.add(nc.Spring(tuple(map(nc.Point, bodies)), stiffness=50.0, length=0.9))
+    system, state = scene.compile()
+    speeds = np.zeros((2, 8, 3))
+    speeds[0, 0] = (1.3, 0.0, 0.0)
+    speeds[1, 5:] = np.cross((0.3, -1.0, 0.4), np.eye(3))
+    starts = jax.vmap(lambda v: dataclasses.replace(state, v=v))(jnp.asarray(speeds))
+    errors = nc.balance(system, jax.vmap(lambda s: nc.simulate(system, s, dt=DT, steps=50))(starts))
+    assert errors.momentum.max() <= tol.MOMENTUM_OF_A_SMALL_SCENE
+    assert errors.angular_momentum.max() <= tol.MOMENTUM_OF_A_SMALL_SCENE
+
+
+def test_states_after_the_end_are_no_steps():
+    """Of a run with error control that an event ends early, and of its parts."""
+    scene = nc.Scene()
+    scene.add(nc.Gravity())
+    scene.add(nc.RigidBody(mass=1.0, inertia=(0.1, 0.2, 0.3), angular_velocity=(0.1, 9.0, 0.2), name="body"))
+    system, state = scene.compile()
+    run = nc.simulate(system, state, dt=0.1, steps=200, until=lambda s: 0.45 - s.t, rtol=1e-5)
+    assert 5 < run.steps_taken < 200
+    for part in (run, run[:4], run[2:60]):
+        errors = nc.balance(system, part)
+        assert errors.momentum is None and "made in parts or not saved" in errors.note
+
+
+class Anchored(nc.Potential):
+    """Three springs along the axes of the world, which no free pair of bodies knows of."""
+
+    def invariants(self, x):
+        return x[1] - x[0]
+
+    def energy(self, stretch):
+        return 5.0 * jnp.array([1.0, 2.0, 3.0]) @ stretch**2
+
+
+def test_what_turns_the_whole_from_within_is_named():
+    scene = nc.Scene()
+    one = scene.add(nc.PointMass(mass=1.0, velocity=(0, 1, 0.3), name="one"))
+    two = scene.add(nc.PointMass(mass=2.0, position=(1, 0, 0), velocity=(0.2, -1, 0), name="two"))
+    scene.add(Anchored((nc.Point(one), nc.Point(two)), name="anchored"))
+    system, state = scene.compile()
+    run = nc.simulate(system, state, dt=0.05, steps=100)
+    turned = np.linalg.norm(system.angular_momentum(run) - system.angular_momentum(state), axis=1).max()
+    errors = nc.balance(system, run)
+    assert f"'anchored' turns the whole by {turned:.2g} N m s" in errors.note
+    assert errors.angular_momentum.max() > 0.1 and errors.momentum.max() <= tol.MOMENTUM_OF_A_SMALL_SCENE
