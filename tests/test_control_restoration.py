@@ -94,6 +94,13 @@ def test_limits_that_are_too_narrow_are_told_with_what_they_would_have_to_be(mad
 
 
 @pytest.mark.exhaustive
+def test_limits_that_hold_are_named_where_a_method_stalls(made):
+    lost = nc.optimise(turn(made, 0.75 * LEAST), method="shooting", progress=False)
+    assert lost.outcome is nc.Outcome.STALLED and "widen limits" in lost.explain()
+    assert "at the limits: input 'motor'" in lost.reason and "of 20 steps" in lost.reason
+
+
+@pytest.mark.exhaustive
 def test_a_guess_that_cannot_be_simulated_is_left(pendulum):
     end = nc.optimise(swing_up(pendulum, cost=nc.cost.Effort()), np.full((60, 1), 1e7), progress=False)
     assert end.ok and end.cost == pytest.approx(5.6284862, rel=1e-7), end.explain()

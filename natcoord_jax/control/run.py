@@ -78,7 +78,8 @@ def optimise(
         max_iterations: limit of iterations, of all attempts together.
         tol: largest gradient of the Lagrangian and complementarity, relative.
         goal_tol: largest violation of goal, bounds and equations.
-        time_limit: limit of time [s], of all attempts together; checked between iterations.
+        time_limit: limit of time [s], of all attempts together; checked between iterations. Compiling does
+            not count.
 
     Returns:
         The solution; `outcome` and `explain()` say how it ended. An interruption by the keyboard returns
