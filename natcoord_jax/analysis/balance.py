@@ -17,7 +17,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.core.arguments import checked
-from natcoord_jax.core.callables import own_methods
 from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.kinds import Concrete
 from natcoord_jax.core.motion import Motion, Response
@@ -27,6 +26,7 @@ from natcoord_jax.maths.vectors import cross, safe_divide
 from natcoord_jax.mechanics.energies import body_momenta
 from natcoord_jax.mechanics.momentum import inertia
 from natcoord_jax.mechanics.response import gather, motion_between, respond, situation
+from natcoord_jax.model.degree import own_class
 from natcoord_jax.model.groups import Group
 from natcoord_jax.model.model import SYSTEM
 from natcoord_jax.system import System
@@ -284,7 +284,7 @@ def balance(system: System, trajectory: Trajectory) -> Balance:
     if saved == 1:
         return Balance(np.zeros(1), np.zeros(1), np.zeros(1), 3, 3, "no step was made")
     groups = (*system.effects, *system.joints)
-    own = {group.labels[0]: bool(own_methods(type(group.effect))) for group in groups}
+    own = {group.labels[0]: own_class(group.effect) is not None for group in groups}
     account = jax.tree.map(np.asarray, _account(system, trajectory, own))
     energy = _relative(np.abs(account["energy"]), np.max(account["energy_scale"]))
     notes = _not_conserved(account)
