@@ -21,7 +21,6 @@ from natcoord_jax.mechanics.impacts import untouched, with_mobilities
 from natcoord_jax.model.axisymmetric_axes import symmetries
 from natcoord_jax.model.bodies import Bodies
 from natcoord_jax.model.choice import choose_solver, elimination_order
-from natcoord_jax.model.degree import check_degrees
 from natcoord_jax.model.graph import make_tree
 from natcoord_jax.model.grouping import element_group, stack
 from natcoord_jax.model.islands import contact_islands
@@ -93,7 +92,6 @@ def build(
     )
     state = replace_fields(layout.state(), contacts=untouched(system))
     system = with_mobilities(jax.tree.map(as_array, with_symmetries(system, state)), state)
-    check_degrees(system, state)
     return system, with_readings(system, state)
 
 

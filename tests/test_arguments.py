@@ -488,6 +488,10 @@ CALLS = {
     },
     "io.read_mesh": lambda w: {"file": ["part.msh"]},
     "io.save_mjcf": lambda w: {**RUN(w), "file": [None, "file.xml"], "name": NAME},
+    "testing.check_effect": lambda w: {
+        "scene": [w.scene], "effect": [w.motor, w.hinge, "motor"], "inside": FLAG, "seeds": WHOLE,
+        "throw": FLAG,
+    },
     "cost.Effort": lambda w: {"weight": NUMBER},
     "cost.Duration": lambda w: {"weight": NUMBER},
     "cost.Running": lambda w: {"function": [f], "weight": NUMBER},
@@ -576,7 +580,7 @@ def test_everything_public_is_in_the_table():
         methods = inspect.getmembers(cls, inspect.isfunction)
         names |= {f"{cls.__name__}.{n}" for n, _ in methods if n[0] != "_"}
     names |= {"Section.of_numbers", "Section.of_axis_along_first"}
-    names |= {"io.load", "io.read_mesh", "io.save_mjcf"}
+    names |= {"io.load", "io.read_mesh", "io.save_mjcf", "testing.check_effect"}
     names |= {"Nodes.points", "Nodes.directors", "Nodes.triads"}
     # What `System.set` takes are numbers of the part by name, see `test_parts`.
     names = names - BASES_IN_MODULES - {"System.set"}

@@ -352,11 +352,11 @@ def test_foreign_attributes_are_noted():
     """As Drake writes them, with and without a declaration of the prefix."""
     fast = joint("j", "revolute", "a", "b").replace("<joint", '<joint drake:acceleration="3" drake:x="1"', 1)
     for name in ('name="r"', 'name="r" xmlns:drake="http://drake.mit.edu"'):
-        more = "<drake:properties/>" + link("b")
+        more = "<drake:properties/>" + link("b").replace("</link>", "<contact/></link>")
         robot = nc.io.load(f"<robot {name}>{link('a')}{more}{fast}</robot>")
         assert robot.bodies == ("b",)
         said = {part for part, reason in reasons(robot).items() if "extensions" in reason}
-        assert said == {"1 <drake:properties>", "1 drake:acceleration", "1 drake:x"}
+        assert said == {"1 <drake:properties>", "1 <contact>", "1 drake:acceleration", "1 drake:x"}
 
 
 def test_impossible_inertias_are_balanced_and_listed():

@@ -13,6 +13,11 @@ READABLE = {".stl", ".obj", ".msh"}
 """Formats of meshes that MuJoCo reads."""
 
 KNOWN = {"link", "joint", "material", "mujoco"}
+PARTS = {
+    "link": {"inertial", "visual", "collision"},
+    "joint": {"origin", "parent", "child", "axis", "limit", "dynamics", "mimic", "calibration"},
+}
+"""What is read of a file, of a link and of a joint; calibration says nothing of the motion."""
 
 
 def prepared(text: str, folder: Path | None, notes: Notes, *, visuals: bool, floating: bool) -> str:
@@ -52,6 +57,8 @@ def prepared(text: str, folder: Path | None, notes: Notes, *, visuals: bool, flo
     if floating:
         _float(root, notes)
     others = Counter(f"<{child.tag}>" for child in root if child.tag not in KNOWN)
+    for kind, tags in PARTS.items():
+        others.update(f"<{x.tag}>" for part in root.findall(kind) for x in part if x.tag not in tags)
     others.update(name for x in root.iter() for name in x.keys() if ":" in name and name[:5] != "xmlns")
     for extension, count in others.items():
         notes.left_out(f"{count} {extension}", "extensions of URDF are not read")

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from natcoord_jax.core.bodies import NODE
 from natcoord_jax.core.callables import own_methods
 from natcoord_jax.core.checks import is_concrete
 from natcoord_jax.core.eager_numpy import eager_numpy
@@ -52,7 +53,7 @@ def third_differences(system: Model, group: Group, state: State, seed: int = 0) 
     lanes = np.resize(lanes, max(lanes.size, 2))
     bodies, rows = np.asarray(group.bodies)[lanes], np.asarray(rows_with_ground(state.q))
     reach = np.max(np.abs(rows[:, 0] - rows[-1, 0]), initial=0.0)
-    steps = np.random.default_rng(seed).normal(size=(*bodies.shape, 4, 3))
+    steps = np.random.default_rng(seed).normal(size=(*bodies.shape, *NODE))
     steps[..., 0, :] *= reach if reach > 0 else 1.0
     # (The ground does not move: what it carries are numbers.)
     steps[bodies == rows.shape[0] - 1] = 0.0
