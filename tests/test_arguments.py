@@ -4,6 +4,7 @@ The table gives for every argument what it takes, by examples. Everything of ano
 a number, nothing, a body, a joint, an object. A new public name, or argument, needs its line.
 """
 
+import dataclasses
 import inspect
 import re
 import traceback
@@ -748,6 +749,8 @@ def test_what_needs_a_value_says_so():
     for argument, call in (
         ("newton_tol", lambda x: nc.step(w.system, w.state, dt=0.1, newton_tol=x).q),
         ("newton_tol", lambda x: nc.simulate(w.system, w.state, dt=0.1, steps=2, newton_tol=x).q),
+        ("tol", lambda x: nc.optimise(w.problem, tol=x).cost),
+        ("problem", lambda x: nc.optimise(dataclasses.replace(w.problem, dt=x)).cost),
         ("trajectory", lambda x: nc.balance(w.system, eqx.tree_at(lambda t: t.t, w.trajectory, x)).energy),
     ):
         with pytest.raises(ValueError, match=f"{argument}.* is traced .* needs a value"):

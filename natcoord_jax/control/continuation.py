@@ -13,7 +13,7 @@ from natcoord_jax.control.results import Outcome
 from natcoord_jax.control.run import METHODS, optimise
 from natcoord_jax.control.solution import Solution
 from natcoord_jax.core.arguments import checked
-from natcoord_jax.core.kinds import FLAG, Choice, FunctionOf, of
+from natcoord_jax.core.kinds import FLAG, Choice, Concrete, FunctionOf, of
 from natcoord_jax.core.numeric import Number, Whole
 from natcoord_jax.xla.waiting import Stopwatch
 
@@ -46,7 +46,7 @@ class Continuation(list[Solution]):
 
 
 @checked(
-    problem=PROBLEM,
+    problem=Concrete(PROBLEM),
     path=FunctionOf("(problem, s) -> problem"),
     guess=GUESS | of("an earlier solution", Solution),
     first=Number("positive"),
@@ -54,9 +54,9 @@ class Continuation(list[Solution]):
     method=Choice(METHODS),
     progress=FLAG,
     max_iterations=Whole(1),
-    tol=Number("positive"),
-    goal_tol=Number("positive"),
-    time_limit=Number("not negative", infinite=True),
+    tol=Concrete(Number("positive")),
+    goal_tol=Concrete(Number("positive")),
+    time_limit=Concrete(Number("not negative", infinite=True)),
 )
 def continuation(
     problem: OptimalControl,

@@ -21,7 +21,7 @@ from natcoord_jax.control.solution import Row, Solution
 from natcoord_jax.control.transcription import Unknowns, end, first_node, held_inputs, packed
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.compiled import compiled
-from natcoord_jax.core.kinds import FLAG, Kind, is_other
+from natcoord_jax.core.kinds import FLAG, Concrete, Kind, is_other
 from natcoord_jax.core.numeric import Number, Whole
 from natcoord_jax.stepping.simulate import simulate
 from natcoord_jax.xla.waiting import Stopwatch
@@ -73,16 +73,16 @@ def _augmented(variables: tuple[Array, Array], problem: OptimalControl, multipli
 
 
 @checked(
-    problem=PROBLEM,
+    problem=Concrete(PROBLEM),
     guess=GUESS,
     optimiser=Optimiser(),
     iterations=Whole(1),
     rounds=Whole(1),
     penalty=Number("positive"),
     growth=Number("positive"),
-    tol=Number("positive"),
+    tol=Concrete(Number("positive")),
     progress=FLAG,
-    time_limit=Number("not negative", infinite=True),
+    time_limit=Concrete(Number("not negative", infinite=True)),
 )
 def descend(
     problem: OptimalControl,

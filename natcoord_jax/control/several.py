@@ -22,7 +22,7 @@ from natcoord_jax.control.transcription import Unknowns
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.checks import for_each
 from natcoord_jax.core.compiled import compiled
-from natcoord_jax.core.kinds import Choice, Several, of
+from natcoord_jax.core.kinds import Choice, Concrete, Several, of
 from natcoord_jax.core.numeric import Number, Vector, Whole
 
 SAME = 1e-3
@@ -59,7 +59,7 @@ class Optima(list[Solution]):
 
 
 @checked(
-    problem=PROBLEM,
+    problem=Concrete(PROBLEM),
     guess=GUESS | of("an earlier solution", Solution) | Several(of("a guess or a solution", Guess, Solution)),
     starts=Whole(1),
     spread=Number("not negative") | Vector(None),
@@ -67,8 +67,8 @@ class Optima(list[Solution]):
     seed=Whole(0),
     method=Choice(METHODS),
     max_iterations=Whole(0),
-    tol=Number("positive"),
-    goal_tol=Number("positive"),
+    tol=Concrete(Number("positive")),
+    goal_tol=Concrete(Number("positive")),
 )
 def multi_start(
     problem: OptimalControl,
