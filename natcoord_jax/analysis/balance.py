@@ -122,29 +122,24 @@ def _step(
         scale = 1.0 if group.effect.impulsive else h
         answer = respond(group, where, motion, lam, tableau)
         known = scale * _resultants(bodies, group, motion, answer)
-        size = scale * _sizes(motion, answer)
-        sizes = sizes + size
-        inside = jnp.zeros((group.count, 1), bool)
-        if own[group.labels[0]]:
-            ends = jnp.asarray(group.bodies)
-            inside = ((ends < bodies).all(axis=1) & (ends.min(axis=1) < ends.max(axis=1)))[:, None]
+        size, ends, name = scale * _sizes(motion, answer), jnp.asarray(group.bodies), group.labels[0]
+        between = (ends < bodies).all(axis=1) & (ends.min(axis=1) < ends.max(axis=1))
+        inside, sizes, share = (own[name] & between)[:, None], sizes + size, jnp.zeros(())
+        outer = jnp.where(inside, 0.0, known)
         if midpoint:
-            impulse = impulse + jnp.sum(jnp.where(inside, 0.0, known), axis=0)
+            impulse = impulse + jnp.sum(outer, axis=0)
         else:
             # Impulses over several stages are not in the trajectory: they count as reactions do.
-            outer = jnp.where(inside, 0.0, known)
             gram = gram + safe_divide(outer.T @ outer, jnp.sum(size) ** 2)
-        shares = jnp.zeros(())
         for number in range(group.multipliers):
             answer = respond(group, where, motion, lam.at[:, :, number].set(1.0), tableau)
             columns = scale * _resultants(bodies, group, motion, answer) - known
-            share = safe_divide(
-                jnp.max(jnp.abs(jnp.where(inside, columns, 0.0))), jnp.sum(_sizes(motion, answer))
-            )
-            shares, columns = jnp.maximum(shares, share), jnp.where(inside, 0.0, columns)
-            gram = gram + columns.T @ columns
-        if own[group.labels[0]]:
-            within[group.labels[0]] = jnp.sum(jnp.where(inside, known, 0.0), axis=0), shares
+            outer = jnp.where(inside, 0.0, columns)
+            gram = gram + outer.T @ outer
+            most = jnp.max(jnp.abs(columns - outer))
+            share = jnp.maximum(share, safe_divide(most, scale * jnp.sum(_sizes(motion, answer))))
+        if own[name]:
+            within[name] = jnp.sum(jnp.where(inside, known, 0.0), axis=0), share
     return _Known(impulse, sizes, gram, within)
 
 
@@ -284,7 +279,10 @@ def balance(system: System, trajectory: Trajectory) -> Balance:
     if saved == 1:
         return Balance(np.zeros(1), np.zeros(1), np.zeros(1), 3, 3, "no step was made")
     groups = (*system.effects, *system.joints)
-    own = {group.labels[0]: own_class(group.effect) is not None for group in groups}
+    own = {
+        g.labels[0]: bool(g.effect.stores or g.multipliers) and own_class(g.effect) is not None
+        for g in groups
+    }
     account = jax.tree.map(np.asarray, _account(system, trajectory, own))
     energy = _relative(np.abs(account["energy"]), np.max(account["energy_scale"]))
     notes = _not_conserved(account)

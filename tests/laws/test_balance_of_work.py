@@ -566,3 +566,36 @@ def test_what_turns_the_whole_from_within_is_named():
     errors = nc.balance(system, run)
     assert f"'anchored' turns the whole by {turned:.2g} N m s" in errors.note
     assert errors.angular_momentum.max() > 0.1 and errors.momentum.max() <= tol.MOMENTUM_OF_A_SMALL_SCENE
+
+
+class Skewed(nc.Constraint):
+    """Keeps what the world has of a distance, which no free pair of bodies knows of."""
+
+    multipliers = 1
+
+    def residual(self, x):
+        return (x[1] - x[0])[:1] - 1.0
+
+
+class Wind(nc.Force):
+    """On both of its points, from outside."""
+
+    def load(self, x, rate, inputs, t):
+        return nc.Load(jnp.broadcast_to(jnp.array([0.0, 0.3, 0.0]), x.shape), None)
+
+
+@pytest.mark.slow
+def test_constraints_that_turn_the_whole_are_named_and_loads_are_not():
+    """What a constraint does to all is no reaction of the ground; a load on two points is from outside."""
+    scene = nc.Scene()
+    one = scene.add(nc.PointMass(mass=1.0, velocity=(0, 1, 0.3), name="one"))
+    two = scene.add(nc.PointMass(mass=2.0, position=(1, 0.5, 0), velocity=(0, -1, 0), name="two"))
+    ends = (nc.Point(one), nc.Point(two))
+    scene.add(nc.Spring(ends, stiffness=5.0, length=0.1))
+    scene.add(Skewed(ends, name="skewed"))
+    scene.add(Wind(ends, name="wind"))
+    system, state = scene.compile()
+    errors = nc.balance(system, nc.simulate(system, state, dt=0.05, steps=50))
+    assert errors.note.startswith("not conserved: reactions of 'skewed' push or turn the whole")
+    assert "wind" not in errors.note and errors.directions == errors.axes == 3
+    assert errors.momentum.max() <= tol.MOMENTUM_OF_A_SMALL_SCENE and errors.angular_momentum.max() > 1e-3
