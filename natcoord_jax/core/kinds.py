@@ -220,32 +220,17 @@ class HandleOf(Kind):
         return None if isinstance(value, Handle) and value.kind == self.part else is_other(value)
 
 
-@dataclasses.dataclass(frozen=True)
-class Concrete(Kind):
-    """A kind that has to have a value: it is part of the program, or read by Python."""
+class Concrete(Either):
+    """What has to have a value: it is part of the program, or read by Python."""
 
-    kind: Kind
-
-    @property
-    def wanted(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """That of the kind."""
-        return self.kind.wanted
-
-    @property
-    def distinct(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """As the kind is."""
-        return self.kind.distinct
-
-    @property
-    def measured(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """As the kind is."""
-        return self.kind.measured
+    def __init__(self, *kinds: Kind):
+        super().__init__(kinds)
 
     def complaint(self, value: Any) -> str | None:
-        """That of the kind, or that it is being traced."""
+        """That of the kinds, or that it is being traced."""
         if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(value)):
             return "is traced by jit, vmap or grad, and needs a value here: call this outside of them"
-        return self.kind.complaint(value)
+        return super().complaint(value)
 
 
 class Anything(Kind):

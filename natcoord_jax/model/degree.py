@@ -20,6 +20,8 @@ from natcoord_jax.model.rows import group_places, rows_with_ground
 
 THIRD = 1e-9
 """Third differences, relative to what they are of, that are no rounding."""
+SMALL = 1e-6
+"""What a number is small in relative to the others: its rounding is then a tenth of that."""
 LANES = 16
 """Instances of a group that are looked at, each along a direction of its own."""
 BINOMIALS = (-1.0, 3.0, -3.0, 1.0)
@@ -61,11 +63,15 @@ def third_differences(system: Model, group: Group, state: State, seed: int = 0) 
     some = jax.tree.map(lambda x: x[lanes], replace_fields(group, acting=None))
     some = replace_fields(some, count=len(lanes), names=())
     values = np.asarray(_four(some, group_places(system, group)[lanes], rows[bodies], steps))
-    begun = np.isfinite(values[:, 0])
-    size = np.max(np.abs(values), axis=(1, 2), initial=0.0)
-    thirds = np.max(np.abs(np.tensordot(values, BINOMIALS, ([1], [0]))), axis=1, where=begun, initial=0.0)
-    found = np.where(np.isnan(thirds), np.inf, thirds) / np.where(size > 0, size, 1.0)
-    return float(np.max(found)), int(lanes[np.argmax(found)])
+    thirds, size = (
+        np.abs(np.tensordot(values, BINOMIALS, ([1], [0]))),
+        np.max(np.abs(values), axis=1, initial=0.0),
+    )
+    # (One that vanishes is rounded as the others are.)
+    size = np.maximum(size, SMALL * np.max(size, axis=1, keepdims=True, initial=0.0))
+    excess = np.where(np.isnan(thirds), np.inf, thirds / np.where(size > 0, size, 1.0))
+    worst = np.max(excess, axis=1, where=np.isfinite(values[:, 0]), initial=0.0)
+    return float(np.max(worst)), int(lanes[np.argmax(worst)])
 
 
 @eager_numpy
