@@ -129,23 +129,22 @@ def _constraint_rates(system: Model, state: State) -> tuple[Array, Array]:
 
 def _beyond_reach(system: Model, trajectory: Trajectory) -> str:
     """Name of a drive that the other constraints stand in the way of where a run failed, or ""."""
-    if np.ndim(system.mass) > 3 or not system.structure.held:
+    # (In small systems: the others are not solved densely, and here neither.)
+    if np.ndim(system.mass) > 3 or not system.structure.held or system.structure.solver != "reduced":
         return ""
     states = (jax.tree.map(lambda x, k=k: x[k], trajectory.states) for k in (0, -1))
     (first, _), (rows, moved) = (map(np.asarray, _constraint_rates(system, state)) for state in states)
     if not np.all(np.isfinite(rows)) or not moved.any():
         return ""
-    sizes, left = [], np.zeros(0)
-    for matrix in (first, rows):
-        lengths = np.linalg.norm(matrix, axis=1, keepdims=True)
-        left, values, _ = np.linalg.svd(matrix / np.where(lengths > 0, lengths, 1.0))
-        sizes.append(values)
-    rank = int(np.sum(sizes[0] > DEPENDENT * sizes[0][0]))
-    if sizes[1][rank - 1] > SINGULAR * sizes[0][rank - 1]:
+    lengths = [np.maximum(np.linalg.norm(x, axis=1), 1e-300) for x in (first, rows)]
+    before = np.linalg.svd(first / lengths[0][:, None], compute_uv=False)
+    left, after, _ = np.linalg.svd(rows / lengths[1][:, None])
+    rank = int(np.sum(before > DEPENDENT * before[0]))
+    if rank == 0 or after[rank - 1] > SINGULAR * before[rank - 1]:
         return ""
     names = [name for g in relations_of(system) for name in g.names for _ in range(g.multipliers)]
-    shares = np.abs(left[: len(names), rank - 1] * moved[: len(names)])
-    return names[int(np.argmax(shares))] if shares.size and shares.max() > 0 else ""
+    shares = np.abs(left[:, rank - 1] * moved / lengths[1])[: len(names)]
+    return names[int(np.argmax(shares))] if shares.max(initial=0.0) > 0 else ""
 
 
 def _culprit(system: Model, trajectory: Trajectory) -> str:
