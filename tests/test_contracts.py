@@ -469,6 +469,24 @@ def test_reverse_derivatives_are_transposed_forward_ones(effect):
     assert contract(effect).reverse <= tol.SAME_GRADIENT
 
 
+WRITTEN = {
+    nc.JointTorque, nc.JointForce, nc.AffineActuator, nc.WrenchInput, nc.JointSpring, nc.JointStops, nc.Armature,
+    nc.JointFriction, nc.Coupling, nc.PointOnPoint,
+}  # fmt: skip
+"""Effects that MJCF has."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("effect", [e for e in TABLE if TABLE[e].make], ids=lambda e: e.__name__)
+def test_every_effect_is_saved_as_mjcf_or_noted(effect):
+    mujoco = pytest.importorskip("mujoco")
+    look = contract(effect)
+    saved = nc.io.save_mjcf(look.system, look.state)
+    mujoco.MjModel.from_xml_string(saved.text)
+    noted = look.name in {note.part for note in saved.notes}
+    assert noted != (effect in WRITTEN or effect is nc.Gravity)
+
+
 # --- joints and potentials --------------------------------------------------------------------------------
 
 
