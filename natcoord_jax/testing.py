@@ -22,8 +22,9 @@ from natcoord_jax.maths.collocation import gauss
 from natcoord_jax.maths.rotations import from_rotation_vector
 from natcoord_jax.mechanics.reduced import ReducedStep
 from natcoord_jax.mechanics.response import gather, respond, situation
-from natcoord_jax.model.degree import third_differences
 from natcoord_jax.model.groups import Group
+from natcoord_jax.model.own_effects import inside as acting_inside
+from natcoord_jax.model.own_effects import third_differences
 from natcoord_jax.model.rows import group_places, rows_with_ground
 from natcoord_jax.scene import Scene
 from natcoord_jax.stepping.step import advance
@@ -59,9 +60,14 @@ class Contract:
         # (Of contacts with friction the forces are unknowns: what they do is judged along motions.)
         self.stores = kind.stores and not kind.unilateral
 
+    @property
+    def _inside(self) -> bool:
+        """Whether all of its instances act between bodies."""
+        return len(acting_inside(self.system, self.group)) == self.group.count
+
     def broken(self, inside: bool | None = None) -> list[str]:
         """What is not kept, with the remedy."""
-        inside = _is_inside(self.system, self.group) if inside is None else inside
+        inside = self._inside if inside is None else inside
         moving, rest = (float(np.min(x)) for x in self.differences)
         said = [
             (self.degree, ROUNDING, "is not at most quadratic: make lengths squares, angles products"),
@@ -244,7 +250,7 @@ class Contract:
         effect, place = jax.tree.map(
             lambda x: x[0], (self.group.effect, group_places(self.system, self.group))
         )
-        if not self.stores or self.group.source != "markers" or not _is_inside(self.system, self.group):
+        if not self.stores or self.group.source != "markers" or not self._inside:
             return 0.0
         rng = np.random.default_rng(8)
         rows = rows_with_ground(self.state.q)[self.group.bodies[0]]
@@ -372,9 +378,3 @@ def check_effect(
     if broken:
         raise AssertionError(f"{type(group.effect).__name__} {name!r} " + "; it ".join(broken))
     return contract
-
-
-def _is_inside(system: System, group: Group) -> bool:
-    ends = np.asarray(group.bodies)
-    several = np.all(ends < len(system.structure.bodies)) and np.all(ends.min(axis=1) < ends.max(axis=1))
-    return bool(several and (group.effect.stores or group.effect.multipliers > 0))

@@ -470,8 +470,8 @@ def test_reverse_derivatives_are_transposed_forward_ones(effect):
 
 
 WRITTEN = {
-    nc.JointTorque, nc.JointForce, nc.AffineActuator, nc.WrenchInput, nc.JointSpring, nc.JointStops, nc.Armature,
-    nc.JointFriction, nc.Coupling, nc.PointOnPoint,
+    nc.JointTorque, nc.JointForce, nc.AffineActuator, nc.WrenchInput, nc.JointSpring, nc.JointStops,
+    nc.Armature, nc.JointFriction, nc.Coupling, nc.PointOnPoint,
 }  # fmt: skip
 """Effects that MJCF has."""
 

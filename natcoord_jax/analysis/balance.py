@@ -26,9 +26,9 @@ from natcoord_jax.maths.vectors import cross, safe_divide
 from natcoord_jax.mechanics.energies import body_momenta
 from natcoord_jax.mechanics.momentum import inertia
 from natcoord_jax.mechanics.response import gather, motion_between, respond, situation
-from natcoord_jax.model.degree import own_class
 from natcoord_jax.model.groups import Group
 from natcoord_jax.model.model import SYSTEM
+from natcoord_jax.model.own_effects import own_class
 from natcoord_jax.system import System
 
 INTERNAL = 1e-12

@@ -548,11 +548,13 @@ def test_states_after_the_end_are_no_steps():
 class Anchored(nc.Potential):
     """Three springs along the axes of the world, which no free pair of bodies knows of."""
 
+    stiffness: float = 5.0
+
     def invariants(self, x):
         return x[1] - x[0]
 
     def energy(self, stretch):
-        return 5.0 * jnp.array([1.0, 2.0, 3.0]) @ stretch**2
+        return self.stiffness * jnp.array([1.0, 2.0, 3.0]) @ stretch**2
 
 
 def test_what_turns_the_whole_from_within_is_named():
@@ -560,7 +562,10 @@ def test_what_turns_the_whole_from_within_is_named():
     one = scene.add(nc.PointMass(mass=1.0, velocity=(0, 1, 0.3), name="one"))
     two = scene.add(nc.PointMass(mass=2.0, position=(1, 0, 0), velocity=(0.2, -1, 0), name="two"))
     scene.add(Anchored((nc.Point(one), nc.Point(two)), name="anchored"))
-    system, state = scene.compile()
+    scene.add(Anchored((nc.Point(nc.ground), nc.Point(one)), stiffness=0.0, name="from outside"))
+    with pytest.warns(UserWarning, match="'anchored' turns all bodies .* marker of nc.ground") as said:
+        system, state = scene.compile()
+    assert len(said) == 1
     run = nc.simulate(system, state, dt=0.05, steps=100)
     turned = np.linalg.norm(system.angular_momentum(run) - system.angular_momentum(state), axis=1).max()
     errors = nc.balance(system, run)
@@ -594,7 +599,8 @@ def test_constraints_that_turn_the_whole_are_named_and_loads_are_not():
     scene.add(nc.Spring(ends, stiffness=5.0, length=0.1))
     scene.add(Skewed(ends, name="skewed"))
     scene.add(Wind(ends, name="wind"))
-    system, state = scene.compile()
+    with pytest.warns(UserWarning, match="'skewed' turns all bodies"):
+        system, state = scene.compile()
     errors = nc.balance(system, nc.simulate(system, state, dt=0.05, steps=50))
     assert errors.note.startswith("not conserved: reactions of 'skewed' push or turn the whole")
     assert "wind" not in errors.note and errors.directions == errors.axes == 3
