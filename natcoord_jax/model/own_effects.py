@@ -64,14 +64,18 @@ def warn_of_resultants(system: Model, state: State) -> None:
         UserWarning: naming the effect, and what to do.
     """
     for group, _ in _own(system, state):
-        moves = _moves_all(system, group, state)
-        if moves:
+        changes, lanes = rigid_changes(system, group, state)
+        for number, (push, turn) in zip(lanes, changes):
+            if max(push, turn) <= THIRD:
+                continue
+            moves = f"{_name(group, number)!r} {'pushes' if push > THIRD else 'turns'}"
             warnings.warn(
                 f"{group.effect.kind} {moves} all bodies that it acts between, as nothing within a system "
                 "does: let it depend on relative positions alone, or give what acts from outside a marker of "
                 "nc.ground",
                 stacklevel=4,
             )
+            break
 
 
 def _some(
@@ -100,21 +104,21 @@ def inside(system: Model, group: Group) -> np.ndarray:
     return np.flatnonzero(between & bool(group.effect.stores or group.effect.multipliers))
 
 
-def _moves_all(system: Model, group: Group, state: State) -> str:
-    """The first effect within a system that pushes or turns it, and which of both; of obeyed constraints."""
+def rigid_changes(system: Model, group: Group, state: State) -> tuple[np.ndarray, np.ndarray]:
+    """Changes (n, 2) of energies or residuals when all that some instances act between is pushed, and turned.
+
+    Relative to the terms that they are sums of; of residuals as far as they are obeyed. And the numbers of
+    the instances, of which there are none where none acts within a system.
+    """
     among = inside(system, group)
     if not among.size or group.source not in ("markers", "joint"):
-        return ""
+        return np.zeros((0, 2)), among[:0]
     given, lanes = _some(system, group, state, among=among)
     work, size, left = (np.asarray(x) for x in _rigid(*given))
     size = np.maximum(size, SMALL * np.max(size, axis=(1, 2), keepdims=True, initial=0.0))
     work, left = (x / np.where(size > 0, size, 1.0) for x in (work, left[..., None]))
-    turns = np.max(work[..., 3:] - left, axis=(1, 2)) > THIRD
-    pushes = np.max(work[..., :3], axis=(1, 2)) > THIRD
-    if not np.any(turns | pushes):
-        return ""
-    number = int(np.argmax(turns | pushes))
-    return f"{_name(group, lanes[number])!r} {'pushes' if pushes[number] else 'turns'}"
+    changes = work[..., :3], np.maximum(work[..., 3:] - left, 0.0)
+    return np.stack([np.max(x, axis=(1, 2)) for x in changes], axis=1), lanes
 
 
 def _name(group: Group, number: int) -> str:
