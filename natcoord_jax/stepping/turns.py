@@ -9,20 +9,14 @@ from natcoord_jax.core.checks import is_concrete
 from natcoord_jax.core.state import Trajectory
 from natcoord_jax.system import System
 
-FAR = {1: 1.0}
-"""Turn in a step [rad] by number of stages from which on the rate shown is off: by a tenth for one stage."""
-
-NEARLY_HALF = 2.5
-"""The same for more stages: by 4 %, and from half a turn on an angle cannot be told from one turned back."""
+FAR = 1.0
+"""Turn in a step [rad] up to which nothing is said: the rate is off by a tenth at order two."""
 
 SAME = 0.03
 """Difference of rate and gain, relative, from which on they tell different things: a drive's are the same."""
 
-MODEST = {1: 0.35}
-"""Turn in a step [rad] that is advised: the rate is within 1 %."""
-
-MODEST_OTHERWISE = 1.0
-"""The same for more stages: within 0.2 %."""
+MODEST = 0.35
+"""Turn in a step [rad] that is advised at order two, with the rate within 1 %; above `FAR`, within 0.2 %."""
 
 
 def _turns(system: System, trajectory: Trajectory, every: int) -> Float[np.ndarray, " coordinates"]:
@@ -55,7 +49,7 @@ def warn_of_far_turns(system: System, trajectory: Trajectory, dt: Float[Array, "
     turns, stages = _turns(system, trajectory, every), trajectory.scheme.stages
     for worst in np.argsort(-turns):
         turn, step, (name, number) = float(turns[worst]), float(dt), system.structure.coordinates[worst]
-        if turn <= FAR.get(stages, NEARLY_HALF):
+        if turn <= FAR:
             return
         rates = np.abs(np.asarray(system.rate(trajectory, name, index=number)))
         gained, shown = turn / step, float(np.max(rates, where=np.isfinite(rates), initial=0.0))
@@ -65,7 +59,7 @@ def warn_of_far_turns(system: System, trajectory: Trajectory, dt: Float[Array, "
         return
     several = sum(joint == name for joint, _ in system.structure.coordinates) > 1
     angle = f"the angle {number} of joint {name!r}" if several else f"joint {name!r}"
-    fitting = MODEST.get(stages, MODEST_OTHERWISE) / max(shown, gained)
+    fitting = (MODEST if stages == 1 else FAR) / max(shown, gained)
     higher = " or a scheme of higher order" if stages == 1 else ""
     warnings.warn(
         f"{angle} turns by {turn:.3g} rad in a step of {step:.4g} s, too far for order "
