@@ -229,7 +229,7 @@ def _not_conserved(account: dict[str, Any]) -> list[str]:
 
 
 def _relative(error: np.ndarray, scale: float) -> np.ndarray:
-    return error / scale if scale > 0 else np.zeros_like(error)
+    return np.zeros_like(error) if scale == 0 else error / scale
 
 
 def _of_lanes(lanes: list[Balance]) -> Balance:
