@@ -302,7 +302,7 @@ class Contract:
             return *scales, jnp.sum(jnp.abs(stiffness) * invariants**2)
 
         energy, reach, whole = (float(x) for x in numbers(rows, coordinate))
-        return energy / whole if whole > 0 else 1.0, reach
+        return 1.0 if whole == 0 else energy / whole, reach
 
 
 EFFECT = JOINT_NAME | HandleOf("effect")

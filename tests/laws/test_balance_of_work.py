@@ -527,9 +527,13 @@ def test_errors_are_relative_to_what_is_no_rounding():
     speeds[0, 0] = (1.3, 0.0, 0.0)
     speeds[1, 5:] = np.cross((0.3, -1.0, 0.4), np.eye(3))
     starts = jax.vmap(lambda v: dataclasses.replace(state, v=v))(jnp.asarray(speeds))
-    errors = nc.balance(system, jax.vmap(lambda s: nc.simulate(system, s, dt=DT, steps=50))(starts))
+    runs = jax.vmap(lambda s: nc.simulate(system, s, dt=DT, steps=50))(starts)
+    errors = nc.balance(system, runs)
     assert errors.momentum.max() <= tol.MOMENTUM_OF_A_SMALL_SCENE
     assert errors.angular_momentum.max() <= tol.MOMENTUM_OF_A_SMALL_SCENE
+    # What is no number is no error of zero.
+    broken = dataclasses.replace(runs[0], states=jax.tree.map(lambda x: x * jnp.nan, runs[0].states))
+    assert np.isnan(nc.balance(system, broken).energy).all()
 
 
 def test_states_after_the_end_are_no_steps():
