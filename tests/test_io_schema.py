@@ -250,3 +250,51 @@ def test_every_actuator_is_an_input_or_a_note(kind):
     robot = nc.io.load(text)
     assert ("new" in robot.inputs) != (kind in ("muscle", "dcmotor", "pid", "adhesion"))
     assert "new" in robot.inputs or "new" in {note.part for note in robot.notes}
+
+
+ELEMENTS = {
+    "(world)body": {
+        "inertial": "read", "joint": "read", "freejoint": "read", "geom": "read", "site": "read",
+        "attach": "read", "camera": "nothing", "light": "nothing", "plugin": "", "flexcomp": "1 flexes",
+    },
+    "tendon": {"fixed": "read", "spatial": "stiffness of new"},
+    "equality": {
+        "connect": "read", "weld": "read", "joint": "read", "tendon": "read", "flex": "", "flexstrain": "",
+    },
+    "contact": {"pair": "contact of", "exclude": "nothing"},
+    "deformable": {"flex": "1 flexes", "skin": "nothing"},
+    "keyframe": {"key": "read"},
+    "custom": dict.fromkeys(("numeric", "text", "tuple"), "nothing"),
+    "extension": {"plugin": ""},
+    "asset": dict.fromkeys(("mesh", "hfield", "skin", "texture", "material", "model"), "read"),
+    "actuator": dict.fromkeys((*ACTUATORS, "general", "orientation", "plugin"), "read"),
+}  # fmt: skip
+"""Elements: read, or of no effect on the motion, or what the note on them begins with (of plugins: none)."""
+OTHERS = set("compiler option size statistic visual default sensor (world)body frame replicate".split())
+UNREAD = {
+    "contact/pair": '<contact><pair geom1="bar" geom2="floor"/></contact>',
+    "tendon/spatial": '<tendon><spatial name="new" stiffness="3"><site site="tip"/><site site="eye"/>'
+    "</spatial></tendon>",
+    "sensor": '<sensor><jointpos joint="hinge"/></sensor>',
+    "(world)body/flexcomp": '<worldbody><flexcomp name="cloth" type="grid" count="3 3 1" dim="2" mass="1" '
+    'spacing="0.1 0.1 0.1" radius="0.01" pos="0 9 0"/></worldbody>',
+}
+
+
+def test_every_element_of_the_schema_is_known():
+    missing = []
+    for path in schema():
+        _, *place = path.split("/")
+        if len(place) == 1 and place[0] not in ELEMENTS and place[0] not in OTHERS:
+            missing.append(path)
+        if len(place) == 2 and place[0] in ELEMENTS and place[1] not in ELEMENTS[place[0]]:
+            missing.append(path)
+    assert not missing, missing
+
+
+@pytest.mark.parametrize("element", UNREAD)
+def test_elements_that_are_not_read_are_noted(element):
+    robot = nc.io.load(BASE.replace("</mujoco>", f"{UNREAD[element]}</mujoco>"))
+    owner, _, name = element.partition("/")
+    begins = ELEMENTS[owner][name] if name else "1 sensors"
+    assert any(note.part.startswith(begins) for note in robot.notes), [note.part for note in robot.notes]
