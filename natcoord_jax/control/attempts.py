@@ -190,7 +190,9 @@ def _unreachable(search: Search, failed: list[Solution], scale: Any) -> Solution
     if problem.bounds.widened(WIDER[0]) is not problem.bounds:
         for factor in WIDER:
             wider = eqx.tree_at(lambda p: p.bounds, problem, problem.bounds.widened(factor))
-            restored = search.run(False, begin, scale=scale, problem=wider)
+            # (What pushes at its limits would as well at wider ones.)
+            start = eqx.tree_at(lambda u: u.coefficients, begin, factor * begin.coefficients)
+            restored = search.run(False, start, scale=scale, problem=wider)
             if restored.ok:
                 reason += f"; with {factor:g} times the limits of the inputs it comes near"
             if restored.outcome is not Outcome.UNREACHABLE or search.left <= 0:
