@@ -173,7 +173,7 @@ from natcoord_jax.system import System
 
 if TYPE_CHECKING:
     __version__: str
-    from natcoord_jax import io
+    from natcoord_jax import io, testing
     from natcoord_jax.control import (
         Check,
         ComputedTorque,
