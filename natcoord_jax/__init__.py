@@ -173,7 +173,7 @@ from natcoord_jax.system import System
 
 if TYPE_CHECKING:
     __version__: str
-    from natcoord_jax import io
+    from natcoord_jax import io, testing
     from natcoord_jax.control import (
         Check,
         ComputedTorque,
@@ -410,6 +410,7 @@ __all__ = [
     "step",
     "sweep",
     "tangent_growth",
+    "testing",
     "to_nlp",
     "transfer",
     "view",
@@ -424,7 +425,7 @@ def __getattr__(name: str) -> Any:
         return version("natcoord_jax")
     from importlib import import_module
 
-    if name in ("control", "io"):
+    if name in ("control", "io", "testing"):
         return import_module(f"natcoord_jax.{name}")
     if name in ("animate", "plot", "view"):
         return getattr(import_module("natcoord_jax.viz"), name)

@@ -24,6 +24,7 @@ from natcoord_jax.core.nodes import Clamp, NodeSet
 from natcoord_jax.core.numeric import COMPONENTS, Number, Numbers
 from natcoord_jax.core.recipe import Recipe
 from natcoord_jax.core.state import State
+from natcoord_jax.model.own_effects import check_degrees, warn_of_resultants
 from natcoord_jax.stepping.assemble import assemble as assemble_state
 from natcoord_jax.stepping.prepared import prepared
 from natcoord_jax.system import System
@@ -274,15 +275,22 @@ class Scene:
                 `System.report`).
             t: time of the initial state [s], at which drives are and loads begin.
 
+        Warns:
+            UserWarning: of velocities that were projected, and of an effect of one's own that pushes or turns
+                from within all bodies that it acts between.
+
         Raises:
             ValueError: for an empty scene, a gap in a joint (with its name and size), a body without inertia
-                along a free motion, or a solver that cannot handle the scene.
+                along a free motion, a solver that cannot handle the scene, or an effect of one's own whose
+                residual or invariants are not at most quadratic (see `nc.testing.check_effect`).
         """
         if not self.bodies and not self.nodes:
             raise ValueError("the scene has no bodies; add one before compiling")
         parts = self.bodies, self.joints, self.effects, solver, self.nodes, self.elements
         system, state = build(*parts, list(self.clamps.values()))
+        check_degrees(system, state)
         state = state.at_time(t)
         if assemble:
             state = assemble_state(system, state)
+        warn_of_resultants(system, state)
         return prepared(system, state, assembled=assemble, chosen=solver)

@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.handles import Handle
-from natcoord_jax.core.kinds import JOINT_NAME, NAME, HandleOf, Several, of
+from natcoord_jax.core.kinds import JOINT_NAME, NAME, Concrete, HandleOf, Several, of
 from natcoord_jax.core.markers import Marker
 from natcoord_jax.core.numeric import Number, Numbers, Whole
 from natcoord_jax.core.state import MOTION, STATE, TRAJECTORY, State, Trajectory
@@ -271,7 +271,7 @@ class System(Model):
         """Contents, unknowns before and after reduction, the solver and why, in words."""
         return reporting.report(self)
 
-    @checked("System.explain", trajectory=TRAJECTORY)
+    @checked("System.explain", trajectory=Concrete(TRAJECTORY))
     def explain(self, trajectory: Trajectory) -> str:
         """How a run ended, in words, with the part of the worst residual by name."""
         return diagnostics.explain(self, trajectory)

@@ -4,6 +4,7 @@ The table gives for every argument what it takes, by examples. Everything of ano
 a number, nothing, a body, a joint, an object. A new public name, or argument, needs its line.
 """
 
+import dataclasses
 import inspect
 import re
 import traceback
@@ -19,6 +20,7 @@ import optax
 import pytest
 
 import natcoord_jax as nc
+from natcoord_jax.control.guess import scattered
 from natcoord_jax.control.iterate import Options
 from natcoord_jax.control.solution import Solution
 from natcoord_jax.control.transcription import Unknowns
@@ -488,6 +490,10 @@ CALLS = {
     },
     "io.read_mesh": lambda w: {"file": ["part.msh"]},
     "io.save_mjcf": lambda w: {**RUN(w), "file": [None, "file.xml"], "name": NAME},
+    "testing.check_effect": lambda w: {
+        "scene": [w.scene], "effect": [w.motor, w.hinge, "motor"], "inside": FLAG, "seeds": WHOLE,
+        "throw": FLAG,
+    },
     "cost.Effort": lambda w: {"weight": NUMBER},
     "cost.Duration": lambda w: {"weight": NUMBER},
     "cost.Running": lambda w: {"function": [f], "weight": NUMBER},
@@ -576,7 +582,7 @@ def test_everything_public_is_in_the_table():
         methods = inspect.getmembers(cls, inspect.isfunction)
         names |= {f"{cls.__name__}.{n}" for n, _ in methods if n[0] != "_"}
     names |= {"Section.of_numbers", "Section.of_axis_along_first"}
-    names |= {"io.load", "io.read_mesh", "io.save_mjcf"}
+    names |= {"io.load", "io.read_mesh", "io.save_mjcf", "testing.check_effect"}
     names |= {"Nodes.points", "Nodes.directors", "Nodes.triads"}
     # What `System.set` takes are numbers of the part by name, see `test_parts`.
     names = names - BASES_IN_MODULES - {"System.set"}
@@ -724,6 +730,32 @@ def test_numbers_may_be_traced_and_of_numpy():
     nc.JointSpring(w.hinge, stiffness=np.float64(2.0), coordinate=np.int32(0))
     with pytest.raises(ValueError, match=r"vector.*shape \(2,\)"):
         jax.jit(lambda g: nc.Gravity(vector=jnp.stack([g, g])).vector)(1.0)
+
+
+def test_a_spread_for_each_input_is_that_of_its_guesses():
+    scene = nc.Scene()
+    body = scene.add(nc.RigidBody(mass=1.0, inertia=(1.0, 2.0, 3.0), name="body"))
+    scene.add(nc.BodyTorqueInput(tuple(nc.Direction(body, axis) for axis in np.eye(3)), name="torque"))
+    fields = {"dt": 0.1, "steps": 4, "cost": nc.cost.Effort(), "goal": nc.goal.Rest()}
+    problem, spread = nc.OptimalControl(*scene.compile(), **fields), jnp.array([100.0, 1.0, 0.0])
+    middle = Unknowns(jnp.zeros((4, 3)), jnp.zeros(0), jnp.zeros((4, 6)))
+    made = jax.vmap(lambda key: scattered(problem, middle, key, spread, 0.0).coefficients)
+    sizes = np.std(np.asarray(made(jax.random.split(jax.random.key(0), 200))), axis=(0, 1))
+    assert sizes[2] == 0 and sizes[0] == pytest.approx(100 * sizes[1], rel=0.2) and sizes[1] > 0.1
+
+
+def test_what_needs_a_value_says_so():
+    """Numbers that are part of the program, and what Python reads."""
+    w = world()
+    for argument, call in (
+        ("newton_tol", lambda x: nc.step(w.system, w.state, dt=0.1, newton_tol=x).q),
+        ("newton_tol", lambda x: nc.simulate(w.system, w.state, dt=0.1, steps=2, newton_tol=x).q),
+        ("tol", lambda x: nc.optimise(w.problem, tol=x).cost),
+        ("problem", lambda x: nc.optimise(dataclasses.replace(w.problem, dt=x)).cost),
+        ("trajectory", lambda x: nc.balance(w.system, eqx.tree_at(lambda t: t.t, w.trajectory, x)).energy),
+    ):
+        with pytest.raises(ValueError, match=f"{argument}.* is traced .* needs a value"):
+            jax.jit(call)(1e-9)
 
 
 def test_a_scene_may_be_compiled_twice():

@@ -206,7 +206,7 @@ def test_whole_numbers_in_a_closure_under_grad():
 
 
 def test_what_cannot_be_seen_is_refused():
-    """Chance, a counter, and a rule for derivatives that JAX does not trace."""
+    """Chance, a counter, a memory, and a rule for derivatives that JAX does not trace."""
     count = [0.0]
 
     def counter(t, state):
@@ -217,11 +217,21 @@ def test_what_cannot_be_seen_is_refused():
     def ruled(t):
         return GAIN * t
 
+    class Integral:
+        value = 0.0
+
+        def __call__(self, t, state):
+            self.value = self.value + t
+            return self.value[None]
+
     ruled.defvjp(lambda t: (GAIN * t, None), lambda _, dy: (GAIN * dy,))
     with pytest.raises(ValueError, match="not the same.*draws random numbers"):
         run(lambda t, s: jnp.array([random.random()]))
     with pytest.raises(ValueError, match="'counter'.*not the same"):
         run(counter)
+    for call in (lambda x: run(Integral()), jax.jit(lambda x: run(Integral()).t + x)):
+        with pytest.raises(ValueError, match="a Integral keeps what it has computed.*nc.step"):
+            call(0.0)
     with pytest.raises(ValueError, match="use jax.custom_jvp"):
         run(lambda t, s: ruled(t)[None])
 

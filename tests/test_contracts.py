@@ -19,27 +19,39 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import tolerances as tol
-from differences import STEPS, assert_v_of_errors, assert_v_shaped, errors_of_lanes, lanes_along
+from differences import assert_v_of_errors
 from scenes import AXIS, JOINTS, SECOND, SPECIAL, with_multipliers
 
 import natcoord_jax as nc
 import natcoord_jax.effects
-from natcoord_jax.build import build
-from natcoord_jax.core.cells import CELLS
-from natcoord_jax.core.coordinate import CoordinateEffect
-from natcoord_jax.core.effect import Effect, replace_fields
-from natcoord_jax.core.joint import frames_at
-from natcoord_jax.core.potential import place_markers
-from natcoord_jax.maths.collocation import gauss
-from natcoord_jax.maths.rotations import from_rotation_vector
-from natcoord_jax.mechanics.reduced import ReducedStep
-from natcoord_jax.mechanics.response import gather, respond, situation
-from natcoord_jax.model.rows import group_places, rows_with_ground
-from natcoord_jax.stepping.step import advance
 
-TABLEAU = gauss(1)
+Effect = nc.Force.__mro__[1]
 pytestmark = pytest.mark.users
-SEEDS = (0, 1, 2)
+
+
+def turned(vector):
+    """Matrix of a turn by a rotation vector."""
+    angle = np.linalg.norm(vector)
+    x, y, z = np.asarray(vector) / angle
+    skew = np.array([(0, -z, y), (z, 0, -x), (-y, x, 0)])
+    return np.eye(3) + np.sin(angle) * skew + (1 - np.cos(angle)) * skew @ skew
+
+
+CORNERS = np.vstack([np.zeros(3), np.eye(3)])
+MIDDLES = [(0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3)]
+
+
+@cache
+def cell_nodes(count):
+    """Nodes of a cell: hexahedra from -1 to 1, and a tetrahedron with the nodes of its edges."""
+    if count == 10:
+        return np.vstack([CORNERS, [CORNERS[list(pair)].mean(axis=0) for pair in MIDDLES]])
+    mesh = nc.mesh.box((2.0, 2.0, 2.0), (1, 1, 1), element=f"hexahedron{count}")
+    return np.asarray(mesh.nodes)[mesh.cells[0]] - 1.0
+
+
+FACES = {6: (0, 1, 2, 4, 5, 6), 8: (0, 1, 5, 4, 8, 17, 12, 16), 9: (0, 1, 5, 4, 8, 17, 12, 16, 22)}
+"""Nodes of a face of a tetrahedron, and of hexahedra of 20 and 27 nodes."""
 
 
 @dataclass
@@ -63,11 +75,8 @@ class Parts:
     @property
     def attached(self):
         """An attachment on each body, with an arm and axes of its own."""
-        turned = from_rotation_vector(jnp.array([0.3, -0.2, 0.5]))
-        first = nc.Attachment(self.one, (0.1, 0.0, -1.2), turned)
-        return first, nc.Attachment(
-            self.two, (0.4, 0.4, -1.9), from_rotation_vector(jnp.array([0.1, 0.4, 0.2]))
-        )
+        first = nc.Attachment(self.one, (0.1, 0.0, -1.2), turned((0.3, -0.2, 0.5)))
+        return first, nc.Attachment(self.two, (0.4, 0.4, -1.9), turned((0.1, 0.4, 0.2)))
 
     @property
     def three(self):
@@ -84,7 +93,7 @@ class Parts:
 
     def cell(self, count):
         """Points of a distorted cell of a solid, some on each body."""
-        nodes = CELLS[count].nodes
+        nodes = cell_nodes(count)
         bend = 0.03 * np.sin(3.0 * np.roll(nodes, 1, axis=1))
         places = (
             (2.0 if count == 10 else 1.0) * nodes * np.array([1.0, 0.9, 1.1])
@@ -178,15 +187,15 @@ TABLE = {
         )
     },
     nc.FacePressure6: Entry(
-        lambda p: nc.FacePressure6([p.cell(10)[k] for k in (0, 1, 2, 4, 5, 6)], pressure=jnp.sin),
+        lambda p: nc.FacePressure6([p.cell(10)[k] for k in FACES[6]], pressure=jnp.sin),
         inside=False,
     ),
     nc.FacePressure8: Entry(
-        lambda p: nc.FacePressure8([p.cell(20)[k] for k in CELLS[20].faces[2]], pressure=jnp.sin),
+        lambda p: nc.FacePressure8([p.cell(20)[k] for k in FACES[8]], pressure=jnp.sin),
         inside=False,
     ),
     nc.FacePressure9: Entry(
-        lambda p: nc.FacePressure9([p.cell(27)[k] for k in CELLS[27].faces[2]], pressure=jnp.sin),
+        lambda p: nc.FacePressure9([p.cell(27)[k] for k in FACES[9]], pressure=jnp.sin),
         inside=False,
     ),
     nc.GapPotential: Entry(
@@ -385,8 +394,8 @@ def test_joints_document_their_residual():
 
 
 @cache
-def stage(effect: type, in_tree: bool = False):
-    """A pair with an effect: system (not checked: some would be refused as they start), state and group.
+def contract(effect: type, in_tree: bool = False):
+    """What `nc.testing.check_effect` sees of an effect in a pair; of what is asked only.
 
     A joint under test keeps its multipliers, so that it may be shown motions that it would not allow; or it
     is `in_tree`, and all motions are free ones.
@@ -400,181 +409,43 @@ def stage(effect: type, in_tree: bool = False):
     parts = Parts(scene.add(one), scene.add(two), None)
     kind = entry.joint if entry.make or in_tree else with_multipliers(entry.joint)
     options = SPECIAL.get(entry.joint, {})
-    parts.joint = scene.add(
+    parts.joint = part = scene.add(
         kind(parts.one, parts.two, point=(0.2, 0.1, -1.3), axis=AXIS, second=SECOND, name="joint", **options)
     )
     if entry.make:
-        scene.add(entry.make(parts))
-    system, state = build(scene.bodies, scene.joints, scene.effects, None)
-    group = next(g for g in (*system.effects, *system.joints) if isinstance(g.effect, effect))
-    return system, state, group
-
-
-def inputs_of(system):
-    return 0.5 + jnp.arange(len(system.structure.inputs))
-
-
-@dataclass
-class Answers:
-    """What an effect answers to random motions, one a lane.
-
-    Attributes:
-        forces: on the rows of its bodies (lanes, bodies, 4, 3).
-        torques: on its bodies (lanes, bodies, 3).
-        answer: all that it answers.
-        motion: of its bodies.
-        stored: energies before and after the step (lanes, 2).
-    """
-
-    forces: Any
-    torques: Any
-    answer: Any
-    motion: Any
-    stored: Any
-
-
-def respond_to(effect: type, in_tree: bool = False):
-    """The function from rates of the free motions and multipliers to the answer and the motion."""
-    system, state, group = stage(effect, in_tree)
-    u, h = inputs_of(system), jnp.ones(())
-    step = ReducedStep.prepare(system, state, u, h, TABLEAU)
-    where = situation(system, group, state, u, h)
-
-    def answer(w, lam):
-        at = step.stations(step.motion(w[None])[0])
-        motion = gather(group, at)
-        multipliers = jnp.broadcast_to(lam, (group.count, 1, group.multipliers))
-        return respond(group, where, motion, multipliers, TABLEAU), motion
-
-    return answer
-
-
-def random_motion(effect: type, seed: int, in_tree: bool = False):
-    """Rates of about one radian and one metre in the step, and random multipliers."""
-    system, _, group = stage(effect, in_tree)
-    rng = np.random.default_rng(seed)
-    w = rng.normal(size=system.structure.unknowns)
-    w *= 1.2 / np.linalg.norm(w[:6])
-    return w, rng.normal(size=group.multipliers)
-
-
-def directions_of(effect: type):
-    """Where differences are taken, a motion and rest, and a direction."""
-    w, lam = random_motion(effect, 3)
-    return (w, np.zeros_like(w)), np.random.default_rng(4).normal(size=w.shape), lam
-
-
-@cache
-def answers(effect: type, in_tree: bool) -> Answers:
-    """One program for all motions of an effect: those of the seeds, then those of the differences."""
-    motions = [random_motion(effect, seed, in_tree) for seed in SEEDS]
-    if not in_tree:
-        starts, direction, lam = directions_of(effect)
-        motions += [(w, lam) for start in starts for w in (start, *lanes_along(start, direction))]
-    system, state, _ = stage(effect, in_tree)
-
-    def energies(w):
-        if effect not in STORING:
-            return jnp.zeros(2)
-        if issubclass(effect, CoordinateEffect):  # its coordinates are summed up over the steps
-            y = jnp.zeros(system.structure.unknowns + system.structure.multipliers).at[: len(w)].set(w)
-            after = advance(system, state, inputs_of(system), jnp.ones(()), y, TABLEAU)[1]
-        else:
-            step = ReducedStep.prepare(system, state, inputs_of(system), jnp.ones(()), TABLEAU)
-            rates = step.stations(step.motion(w[None])[0]).rates[0, :-1].reshape(-1, 3)
-            after = replace_fields(state, q=state.q + rates)
-        return jnp.stack([system.energy(s).potential for s in (state, after)])
-
-    def of_lane(w, lam):
-        return *respond_to(effect, in_tree)(w, lam), energies(w)
-
-    lanes = jax.jit(jax.vmap(of_lane))(*(np.stack(x) for x in zip(*motions, strict=True)))
-    response, motion, stored = jax.tree.map(np.asarray, lanes)
-    forces = np.zeros_like(motion.rows) if response.forces is None else response.forces
-    forces = forces.reshape(*motion.start.shape[:2], -1, 4, 3)[:, 0]
-    torques = np.zeros_like(forces[:, :, 0]) if response.torques is None else response.torques[:, 0, 0]
-    return Answers(forces, torques, response, motion, stored)
-
-
-def scale_of(a: Answers, seed: int) -> float:
-    return np.sum(np.abs(a.forces[seed])) + np.sum(np.abs(a.torques[seed]))
+        part = scene.add(entry.make(parts))
+    return nc.testing.check_effect(scene, part, throw=False)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("effect", [e for e in TABLE if e.elastic], ids=lambda e: e.__name__)
 def test_elastic_effects_say_what_cancels(effect):
     """At rest their forces are rounded as stiffness times invariants, of which they are differences, are."""
-    system, state, group = stage(effect)
-    one = jax.tree.map(lambda x: x[0], group.effect)
-    place, rows = group_places(system, group)[0], rows_with_ground(state.q)[group.bodies[0]]
-    coordinate = state.coordinates[group.coordinates[0]] + 0.3
-
-    def numbers(rows, coordinate):
-        scales = one.cancelling(place, rows, coordinate)
-        assert scales is not None, "a stiff part of this kind could not be told from an unsolved step"
-        by_coordinate = issubclass(effect, CoordinateEffect)
-        invariants = coordinate if by_coordinate else one.invariants(place_markers(place, rows))
-        return *scales, jnp.diag(one.curvature(place, rows, coordinate)), invariants
-
-    energy, reach, stiffness, invariants = jax.jit(numbers)(rows, coordinate)
-    assert energy >= (1 - tol.STIFFNESS_BY_ENERGIES) * np.sum(np.abs(stiffness) * invariants**2) > 0
+    share, reach = contract(effect).cancels
+    assert share >= 1 - tol.STIFFNESS_BY_ENERGIES, "a stiff part could not be told from an unsolved step"
     assert 0 < reach <= 10, "of the size of the scene"
 
 
 @EFFECTS
 def test_power_is_force_times_velocity(effect):
     """What goes into the work account, or the constraints' multipliers times their rates."""
-    a = answers(effect, False)
-    for seed in SEEDS:
-        power = np.sum(a.forces[seed] * a.motion.rates[seed, 0, 0])
-        power += np.sum(a.torques[seed] * a.motion.spin[seed, 0, 0])
-        scale = scale_of(a, seed)
-        assert scale > 0.01, "the effect does nothing here"
-        if effect.rotors:  # what a rotor takes is not lost: it is stored
-            continue
-        if effect.works or effect.stores:
-            assert abs(power - a.answer.power[seed, 0, 0]) <= tol.INDIFFERENCE * scale
-        else:
-            lam = random_motion(effect, seed)[1]
-            assert abs(power - lam @ a.answer.rows[seed, 0, 0]) <= tol.INDIFFERENCE * scale
+    assert contract(effect).size > 0.01, "the effect does nothing here"
+    assert contract(effect).power <= tol.INDIFFERENCE
 
 
 @pytest.mark.parametrize("effect", [e for e in TABLE if TABLE[e].inside], ids=lambda e: e.__name__)
 def test_what_acts_inside_moves_nothing_as_a_whole(effect):
     """No resultant force, no resultant torque about any point."""
     in_tree = issubclass(effect, nc.Joint) and effect.free  # its points must coincide
-    a = answers(effect, in_tree)
-    for seed in SEEDS:
-        rows = a.motion.rows[seed, 0, 0]
-        scale = scale_of(a, seed)
-        assert np.max(np.abs(a.forces[seed][:, 0].sum(0))) <= tol.INDIFFERENCE * scale
-        turning = np.cross(rows, a.forces[seed]).sum((0, 1)) + a.torques[seed].sum(0)
-        assert np.max(np.abs(turning)) <= tol.INDIFFERENCE * scale * (1 + np.max(np.abs(rows)))
+    assert contract(effect, in_tree).push <= tol.INDIFFERENCE
+    assert contract(effect, in_tree).turn <= tol.INDIFFERENCE
 
 
 @pytest.mark.parametrize("effect", STORING, ids=lambda e: e.__name__)
 def test_stores_give_what_they_lose(effect):
     """Over a step of one radian: minus the work on the bodies is the change of the stored energy, exactly."""
-    a = answers(effect, False)
-    for seed in SEEDS:
-        if issubclass(effect, nc.Field):  # an instance for every body
-            work = np.sum(a.answer.forces[seed][:, 0] * a.motion.rates[seed][0])
-        else:
-            work = np.sum(a.forces[seed] * a.motion.rates[seed, 0, 0])
-            work += np.sum(a.torques[seed] * a.motion.spin[seed, 0, 0])
-        before, after = a.stored[seed]
-        assert abs(after - before) > 1e-3
-        assert abs(after - before + work) <= tol.STEP_BALANCE * (1 + abs(after) + abs(before))
-
-
-def response_of(effect: type, lam):
-    """The function from a motion to the arrays of the answer that depend on it."""
-
-    def f(w):
-        response, motion = respond_to(effect)(w, lam)
-        return response.forces, response.torques, response.rows, motion.rates
-
-    return f
+    assert contract(effect).exchanged > 1e-3
+    assert contract(effect).balance <= tol.STEP_BALANCE
 
 
 @pytest.mark.parametrize(
@@ -583,24 +454,10 @@ def response_of(effect: type, lam):
     ids=[e.__name__ for e in TABLE],
 )
 def test_derivatives_equal_differences(effect):
-    """Of forces, torques and constraint rates with respect to the motion; at rest, too.
-
-    Differences are lanes of a batch, the derivative is of one motion alone: both have the same value.
-    """
-    (moving, rest), direction, lam = directions_of(effect)
-    derivative = jax.jit(lambda w: jax.jvp(response_of(effect, lam), (w,), (direction,)))
-    a, count = answers(effect, False), 1 + 2 * len(STEPS)
-    lanes = jax.tree.leaves((a.answer.forces, a.answer.torques, a.answer.rows, a.motion.rates))
-    for number, w in enumerate((moving, rest)):
-        value, ahead = derivative(w)
-        first = len(SEEDS) + number * count
-        for alone, lane in zip(jax.tree.leaves(value), lanes, strict=True):
-            assert np.allclose(alone, lane[first], rtol=1e-12, atol=1e-12)
-        errors = errors_of_lanes([x[first + 1 : first + count] for x in lanes], ahead)
-        if w is moving:
-            assert_v_of_errors(errors)
-        else:  # there may be nothing of second order
-            assert np.min(errors) <= tol.DIFFERENCE_BEST
+    """Of forces, torques and constraint rates with respect to the motion; at rest, too."""
+    moving, rest = contract(effect).differences
+    assert_v_of_errors(moving)
+    assert np.min(rest) <= tol.DIFFERENCE_BEST  # there may be nothing of second order
 
 
 @pytest.mark.parametrize(
@@ -609,41 +466,33 @@ def test_derivatives_equal_differences(effect):
     ids=[e.__name__ for e in TABLE],
 )
 def test_reverse_derivatives_are_transposed_forward_ones(effect):
-    (moving, rest), direction, lam = directions_of(effect)
-
-    @jax.jit
-    def products(w):
-        _, ahead = jax.jvp(response_of(effect, lam), (w,), (direction,))
-        weights = jax.tree.map(jnp.cos, ahead)
-        back = jax.vjp(response_of(effect, lam), w)[1](weights)[0] @ direction
-        return back, sum(map(jnp.vdot, jax.tree.leaves(weights), jax.tree.leaves(ahead)))
-
-    for w in (moving, rest):
-        back, ahead = products(w)
-        assert abs(back - ahead) <= tol.SAME_GRADIENT * abs(ahead)
+    assert contract(effect).reverse <= tol.SAME_GRADIENT
 
 
-# --- joints -----------------------------------------------------------------------------------------------
+WRITTEN = {
+    nc.JointTorque, nc.JointForce, nc.AffineActuator, nc.WrenchInput, nc.JointSpring, nc.JointStops,
+    nc.Armature, nc.JointFriction, nc.Coupling, nc.PointOnPoint,
+}  # fmt: skip
+"""Effects that MJCF has."""
 
 
-RESIDUALS = pytest.mark.parametrize(
-    "joint", [e for e in TABLE if issubclass(e, nc.Joint | nc.Constraint)], ids=lambda e: e.__name__
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("effect", [e for e in TABLE if TABLE[e].make], ids=lambda e: e.__name__)
+def test_every_effect_is_saved_as_mjcf_or_noted(effect):
+    mujoco = pytest.importorskip("mujoco")
+    look = contract(effect)
+    saved = nc.io.save_mjcf(look.system, look.state)
+    mujoco.MjModel.from_xml_string(saved.text)
+    noted = look.name in {note.part for note in saved.notes}
+    assert noted != (effect in WRITTEN or effect is nc.Gravity)
 
 
-@cache
-def constraint(joint: type):
-    """Compiled residual over the rows (k, 4, 3) of its bodies, and rows that obey it."""
-    system, state, group = stage(joint)
-    effect, place = jax.tree.map(lambda x: x[0], (group.effect, group_places(system, group)))
-    rows = rows_with_ground(state.q)[group.bodies[0]]
-    return jax.jit(lambda x: effect.violation(place, x, state.coordinates, state.t)), rows
+# --- joints and potentials --------------------------------------------------------------------------------
 
 
 @JOINT_TYPES
 def test_number_of_constraints(joint):
-    residual, rows = constraint(joint)
-    assert residual(rows).shape == (TABLE[joint].constraints,) == (joint.multipliers,)
+    assert TABLE[joint].constraints == joint.multipliers
     if joint.free:
         motions = len(joint.rotations) + len(joint.translations) + joint.child_rotation
         assert motions == 6 - joint.multipliers
@@ -651,124 +500,77 @@ def test_number_of_constraints(joint):
 
 @JOINT_TYPES
 def test_residual_vanishes_in_the_assembled_pose(joint):
-    residual, rows = constraint(joint)
-    assert np.max(np.abs(residual(rows))) <= tol.IDENTITY
+    look = contract(joint)
+    assert np.max(look.system.constraint_errors(look.state).position) <= tol.IDENTITY
 
 
-@RESIDUALS
-def test_residual_is_at_most_quadratic(joint):
-    """Third differences vanish along any direction, second ones along some do not."""
-    residual, rows = constraint(joint)
-    for seed in SEEDS:
-        step = jnp.asarray(np.random.default_rng(seed).normal(size=rows.shape))
-        g = [residual(rows + k * step) for k in range(4)]
-        scale = max(float(jnp.max(jnp.abs(x))) for x in g)
-        assert np.max(np.abs(g[3] - 3 * g[2] + 3 * g[1] - g[0])) <= tol.IDENTITY * scale
-    linear = joint in (nc.Spherical, nc.PointOnPoint, nc.PointSum)
-    assert linear or np.max(np.abs(g[2] - 2 * g[1] + g[0])) > 1e-3
+SHAPED = pytest.mark.parametrize(
+    "effect",
+    [e for e in TABLE if issubclass(e, nc.Joint | nc.Constraint | nc.Potential)],
+    ids=lambda e: e.__name__,
+)
 
 
-@RESIDUALS
-def test_residual_does_not_see_rigid_motions(joint):
-    """A common rotation of all rows and a common translation of the points change nothing."""
-    residual, rows = constraint(joint)
-    rng = np.random.default_rng(5)
-    rows = rows + jnp.asarray(0.1 * rng.normal(size=rows.shape))
-    turn = from_rotation_vector(jnp.asarray(rng.normal(size=3)))
-    moved = (rows @ turn.T).at[:, 0].add(jnp.asarray(rng.normal(size=3)))
-    seen, unseen = residual(moved), residual(rows)
-    if joint in (
-        nc.Fixed,
-        nc.Spherical,
-        nc.Revolute,
-        nc.Universal,
-        nc.PointOnPoint,
-        nc.PointSum,
-    ):  # the gap is a vector of the world
-        unseen = unseen.at[:3].set(turn @ unseen[:3])
-    assert np.max(np.abs(seen - unseen)) <= tol.INDIFFERENCE
-
-
-@RESIDUALS
-def test_central_differences_of_the_residual_are_exact(joint):
-    """For a quadratic a central difference has no truncation at any step."""
-    residual, rows = constraint(joint)
-    step = jnp.asarray(np.random.default_rng(6).normal(size=rows.shape))
-    derivative = jax.jvp(residual, (rows,), (step,))[1]
-    assert_v_shaped(residual, rows, step, derivative, polynomial=True)
-    whole = 0.5 * (residual(rows + step) - residual(rows - step))
-    assert np.max(np.abs(whole - derivative)) <= tol.INDIFFERENCE
+@SHAPED
+def test_residuals_and_invariants_are_at_most_quadratic(effect):
+    """Third differences vanish along any direction."""
+    assert contract(effect).degree <= tol.IDENTITY
 
 
 @pytest.mark.parametrize("joint", [j for j in JOINTS.values() if j.free], ids=lambda j: j.__name__)
 def test_free_motions_do_not_see_the_constraints(joint):
     """max |G(q_mid) P| at random steps of one radian, and g = 0 at their ends, step after step."""
-    system, state, group = stage(joint, in_tree=True)
-    assert group.in_tree
-    effect, place = jax.tree.map(lambda x: x[0], group.effect), system.frames[group.joints[0, 0]]
-
-    def residual(rows):
-        return effect.residual(*frames_at(place, rows))
-
-    @jax.jit
-    def look(state, w):
-        step = ReducedStep.prepare(system, state, inputs_of(system), jnp.ones(()), TABLEAU)
-
-        def mean(w):
-            motion = gather(group, step.stations(step.motion(w[None])[0]))
-            return motion.rows[0, 0], motion.rates[0, 0]
-
-        rows, rates = mean(w)
-        g_rate = jax.jvp(residual, (rows,), (rates,))[1]
-        everything = step.stations(step.motion(w[None])[0]).rates[0, :-1].reshape(-1, 3)
-        return g_rate, residual(rows + 0.5 * rates), replace_fields(state, q=state.q + everything)
-
-    rng = np.random.default_rng(7)
-    for _ in range(5):
-        w = rng.normal(size=system.structure.unknowns)
-        w[3:6] *= 0.2  # drift of the first body
-        w *= 1.0 / np.linalg.norm(w[:3])
-        g_rate, g, state = look(state, jnp.asarray(w))
-        size = 1.0 + np.max(np.abs(w))
-        assert np.max(np.abs(g_rate), initial=0.0) <= tol.IDENTITY * size**2
-        assert np.max(np.abs(g), initial=0.0) <= tol.IDENTITY * size**2
+    assert contract(joint, in_tree=True).free <= tol.IDENTITY
 
 
-# --- potentials -------------------------------------------------------------------------------------------
-
-POTENTIALS = [e for e in TABLE if issubclass(e, nc.Potential)]
-EVERY_POTENTIAL = pytest.mark.parametrize("potential", POTENTIALS, ids=lambda e: e.__name__)
-
-
-@cache
-def potential_of(effect: type):
-    """Compiled invariants and energy over the marker vectors, and their values at the start."""
-    _, state, group = stage(effect)
-    law = jax.tree.map(lambda x: x[0], group.effect)
-    rows = state.q.reshape(-1, 4, 3)[group.bodies[0]]
-    x = place_markers(group.weights[0], rows)
-    points = group.weights[0][..., 0] > 0
-    return jax.jit(lambda x: law.invariants(x)), jax.jit(lambda x: law.energy(law.invariants(x))), x, points
+@SHAPED
+def test_residuals_and_energies_do_not_see_rigid_motions(effect):
+    assert contract(effect).invariance <= tol.INDIFFERENCE
 
 
-@EVERY_POTENTIAL
-def test_invariants_are_invariant_and_at_most_quadratic(potential):
-    invariants, energy, x, points = potential_of(potential)
-    rng = np.random.default_rng(8)
-    turn = from_rotation_vector(jnp.asarray(rng.normal(size=3)))
-    moved = x @ turn.T + jnp.where(points[..., None], jnp.asarray(rng.normal(size=3)), 0.0)
-    assert np.allclose(invariants(moved), invariants(x), rtol=tol.INDIFFERENCE)
-    assert np.allclose(energy(moved), energy(x), rtol=tol.INDIFFERENCE)
-    step = jnp.asarray(rng.normal(size=x.shape))
-    p = [invariants(x + k * step) for k in range(4)]
-    assert np.max(np.abs(p[3] - 3 * p[2] + 3 * p[1] - p[0])) <= tol.IDENTITY * np.max(np.abs(p[3]))
+# --- effects of one's own ---------------------------------------------------------------------------------
 
 
-@EVERY_POTENTIAL
-def test_gradient_of_the_energy(potential):
-    _, energy, x, _ = potential_of(potential)
-    rng = np.random.default_rng(9)
-    step = jnp.asarray(rng.normal(size=x.shape))
-    # As assembled some are free of stress, and their energy has no slope.
-    x = x + 0.1 * jnp.asarray(rng.normal(size=x.shape))
-    assert_v_shaped(energy, x, step, jnp.vdot(jax.grad(energy)(x), step))
+class Pull(nc.Potential):
+    """A spring that knows the first axis of the world."""
+
+    def invariants(self, x):
+        return (x[1] - x[0])[:1]
+
+    def energy(self, invariants):
+        return 5.0 * invariants[0] ** 2
+
+
+class Push(nc.Force):
+    """On the second of its points alone."""
+
+    def load(self, x, rate, inputs, t):
+        return nc.Load(jnp.stack([jnp.zeros(3), 3.0 * (x[0] - x[1])]), None)
+
+
+class Cut(Push):
+    """A law whose slope JAX is told wrongly: nothing comes through."""
+
+    def load(self, x, rate, inputs, t):
+        stretch = jax.lax.stop_gradient(x[1] - x[0])
+        return nc.Load(jnp.stack([3.0 * stretch, -3.0 * stretch]), None)
+
+
+MISSED = [
+    (Pull, "Pull 'own' is another when .*; it turns the whole"),
+    (Push, "pushes the whole"),
+    (Cut, "has derivatives that are none of its values"),
+]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind, words", MISSED, ids=[kind.__name__ for kind, _ in MISSED])
+def test_what_an_effect_of_ones_own_does_not_keep_is_named(kind, words):
+    scene = nc.Scene()
+    bodies = [nc.RigidBody(mass=1.0, inertia=(1, 2, 2), position=(x, 0.1, x)) for x in (0.0, 1.0)]
+    ends = tuple(nc.Point(scene.add(body), (0.3, 0.2, 0.1), local=True) for body in bodies)
+    own = scene.add(kind(ends, name="own"))
+    with pytest.raises(AssertionError, match=words):
+        nc.testing.check_effect(scene, own, inside=True)
+    with pytest.raises(ValueError, match="no effect 'other'; pass one of.*'own'"):
+        nc.testing.check_effect(scene, "other")

@@ -51,7 +51,8 @@ def rest_to_rest(hinged, limit=None, *, steps=20, angle=1.0, **options):
 
 @pytest.fixture(scope="module")
 def solution(hinged):
-    return solved(rest_to_rest(hinged))
+    # (Compiling takes longer than that, and does not count.)
+    return solved(rest_to_rest(hinged), time_limit=5.0)
 
 
 # --- what a solution says ---------------------------------------------------------------------------------

@@ -94,6 +94,13 @@ def test_limits_that_are_too_narrow_are_told_with_what_they_would_have_to_be(mad
 
 
 @pytest.mark.exhaustive
+def test_limits_that_hold_are_named_where_a_method_stalls(made):
+    lost = nc.optimise(turn(made, 0.75 * LEAST), method="shooting", progress=False)
+    assert lost.outcome is nc.Outcome.STALLED and "widen limits" in lost.explain()
+    assert "at the limits: input 'motor'" in lost.reason and "of 20 steps" in lost.reason
+
+
+@pytest.mark.exhaustive
 def test_a_guess_that_cannot_be_simulated_is_left(pendulum):
     end = nc.optimise(swing_up(pendulum, cost=nc.cost.Effort()), np.full((60, 1), 1e7), progress=False)
     assert end.ok and end.cost == pytest.approx(5.6284862, rel=1e-7), end.explain()
@@ -109,6 +116,37 @@ def test_limits_hold_for_all_attempts(made):
 
 
 # --- several starts ---------------------------------------------------------------------------------------
+
+
+def two_turns(**options):
+    """Two discs on hinges of their own, half a radian from rest to rest."""
+    scene, goal = nc.Scene(), nc.goal.Rest()
+    for name in ("left", "right"):
+        body = scene.add(nc.RigidBody(mass=1.0, inertia=(1.0, 1.0, 2.0), name=name))
+        hinge = scene.add(nc.Revolute(nc.ground, body, name=f"hinge of {name}"))
+        scene.add(nc.JointTorque(hinge, name=f"motor of {name}"))
+        goal = goal & nc.goal.Coordinate(hinge, 0.5)
+    fields = {"dt": 0.1, "steps": 4, "cost": nc.cost.Effort(), "goal": goal}
+    return nc.OptimalControl(*scene.compile(), **(fields | options))
+
+
+@pytest.mark.exhaustive
+def test_starts_of_several_inputs():
+    optima = nc.multi_start(two_turns(), starts=3, spread=np.array([1.0, 3.0]))
+    assert len(optima) == 1 and all(outcome.ok for outcome in optima.outcomes)
+
+
+def test_numbers_for_each_are_as_many_as_there_are():
+    """Another length is refused by name; of one input three weights would have counted it three times."""
+    three = np.array([1.0, 2.0, 3.0])
+    with pytest.raises(ValueError, match=r"spread has shape \(3,\).*each input channel.*\(2,\)"):
+        nc.multi_start(two_turns(), starts=2, spread=three)
+    with pytest.raises(ValueError, match=r"rates has shape \(3,\).*\(2,\)"):
+        nc.multi_start(two_turns(), starts=2, rates=three)
+    with pytest.raises(ValueError, match=r"Effort: weight has shape \(3,\).*input channel"):
+        nc.optimise(two_turns(cost=nc.cost.Effort(weight=three)), progress=False)
+    with pytest.raises(ValueError, match=r"bounds.Input: lower has shape \(3,\)"):
+        nc.optimise(two_turns(bounds=nc.bounds.Input(-three, 1.0)), progress=False)
 
 
 @pytest.mark.exhaustive

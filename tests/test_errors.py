@@ -167,6 +167,28 @@ def test_coordinates_that_a_joint_does_not_have():
         scene.compile()
 
 
+def test_what_there_is_for_joints_without_coordinates_is_named():
+    """A ball turns freely, about no axis of its own; a fixed joint does not move."""
+
+    def build(joint, effect):
+        scene = nc.Scene()
+        place = scene.add(joint(nc.ground, scene.add(body()), name="place"))
+        scene.add(effect(place))
+        scene.compile()
+
+    spring, damper = partial(nc.JointSpring, stiffness=1.0), partial(nc.JointDamper, damping=1.0)
+    servo = lambda joint: nc.AffineActuator((joint,))  # noqa: E731
+    all_rejected(
+        {
+            "spring": (partial(build, nc.Spherical, spring), "'place'", "nc.SphericalSpring"),
+            "damper": (partial(build, nc.Spherical, damper), "'place'", "nc.SphericalDamper"),
+            "motor": (partial(build, nc.Spherical, nc.JointForce), "'place'", "nc.SphericalTorque"),
+            "servo": (partial(build, nc.Spherical, servo), "'place'", "nc.SphericalTorque"),
+            "fixed": (partial(build, nc.Fixed, spring), "'place'", "pass another joint"),
+        }
+    )
+
+
 NUMBERS = {
     "stiffness": (lambda p, j: nc.Spring(p, name="part", stiffness=np.nan), "stiffness", "[N/m]"),
     "coil": (lambda p, j: nc.JointSpring(j, stiffness=np.inf, name="part"), "stiffness"),
@@ -478,6 +500,59 @@ def test_joints_of_nodes_that_carry_no_axes():
         lambda: joined(Bowl, swapped=True), "'own'", "'ball' has a point only", "a Bowl joint could hold"
     )
     rejected(lambda: joined(bowl, (0.3, 0.0, 0.0)), "'own'", "'ball' has a point only", "0.045 m beside it")
+
+
+class Length(nc.Gap):
+    """Of a point from another one, and no square of it."""
+
+    def invariants(self, x):
+        return jnp.sqrt((x[1] - x[0]) @ (x[1] - x[0]))[None]
+
+    def distance(self, invariants):
+        return invariants[0] - 0.1
+
+
+class Stretch(nc.Potential):
+    def invariants(self, x):
+        return Length().invariants(x)
+
+    def energy(self, invariants):
+        return invariants[0] ** 2
+
+
+class Sphere(nc.Constraint):
+    multipliers = 1
+
+    def residual(self, x):
+        return Length().invariants(x) - 1.0
+
+
+def test_what_is_not_quadratic_is_refused():
+    """A bowl that moves is of degree four; what the ground carries is a number."""
+
+    def build(make, parent=None):
+        scene = nc.Scene()
+        first = scene.add(body(position=(1.0, 0.0, 0.0)))
+        second = scene.add(nc.RigidBody(mass=1.0, inertia=(1.0, 1.0, 1.0), name="second"))
+        scene.add(make(parent or first, second))
+        scene.compile(assemble=True)
+
+    def between(kind, *more, **options):
+        return lambda a, b: kind((nc.Point(a), nc.Point(b)), *more, name="own", **options)
+
+    apart = type("Bowl", (Bowl,), {"apart": True})
+    gap = Length(), "Length.invariants"
+    cases = {
+        "joint": (lambda a, b: apart(a, b, name="own"), "Bowl.residual"),
+        "constraint": (between(Sphere), "Sphere.residual"),
+        "potential": (between(Stretch), "Stretch.invariants"),
+        "soft gap": (between(nc.GapPotential, gap[0], stiffness=1.0), gap[1]),
+        "hard gap": (between(nc.GapConstraint, gap[0]), gap[1]),
+    }
+    all_rejected(
+        {case: (partial(build, make), "'own'", words, "quadratic") for case, (make, words) in cases.items()}
+    )
+    build(lambda a, b: apart(a, b, name="own"), nc.ground)
 
 
 class OwnConstraint(nc.Constraint):

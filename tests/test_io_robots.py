@@ -348,6 +348,17 @@ def test_what_is_not_mapped_is_listed_by_name():
     assert any(note.part.startswith("contact of") for note in nc.io.load(text).notes)
 
 
+def test_foreign_attributes_are_noted():
+    """As Drake writes them, with and without a declaration of the prefix."""
+    fast = joint("j", "revolute", "a", "b").replace("<joint", '<joint drake:acceleration="3" drake:x="1"', 1)
+    for name in ('name="r"', 'name="r" xmlns:drake="http://drake.mit.edu"'):
+        more = "<drake:properties/>" + link("b").replace("</link>", "<contact/></link>")
+        robot = nc.io.load(f"<robot {name}>{link('a')}{more}{fast}</robot>")
+        assert robot.bodies == ("b",)
+        said = {part for part, reason in reasons(robot).items() if "extensions" in reason}
+        assert said == {"1 <drake:properties>", "1 <contact>", "1 drake:acceleration", "1 drake:x"}
+
+
 def test_impossible_inertias_are_balanced_and_listed():
     robot = machine()
     assert "balances" in reasons(robot)["odd"]
@@ -468,17 +479,22 @@ def test_what_is_saved_moves_with_mujoco_as_here(tmp_path):
     scene.add(nc.JointDamper(slide, damping=2.0, name="damper"))
     scene.add(nc.Armature(hinge, inertia=0.3, name="rotor"))
     scene.add(nc.JointForce(slide, gear=2.0, name="push"))
+    for name in ("hinge", "cylinder", "cardan", "plane", "slide"):
+        scene.add(nc.JointTorque(joints[name], gear=0.5, name=f"motor of {name}"))
     scene.add(nc.AffineActuator((hinge, slide), gear=(1.0, -2.0), bias=(0.1, -3.0, -0.2), name="pull"))
     scene.add(nc.Spring((nc.Point(nc.ground), nc.Point(bodies[7])), stiffness=1.0, name="string"))
     system, state = scene.compile()
     state = nc.random_state(system, state, key=jax.random.key(0), coordinates=0.5, rates=0.7)
     saved = nc.io.save_mjcf(system, state, tmp_path / "chain.xml")
-    assert [note.part for note in saved.notes] == ["string"]
+    assert [note.part for note in saved.notes] == ["motor of slide", "string"]
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "chain.xml"))
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, 0)
-    inputs = np.array([0.7, -1.3])
-    data.ctrl[[data.actuator(name).id for name in system.structure.inputs]] = inputs
+    driven = [name != "motor of slide" for name in system.structure.inputs]
+    inputs = np.where(driven, np.linspace(0.7, -1.3, len(driven)), 0.0)
+    for name, value in zip(system.structure.inputs, inputs):
+        if value:
+            data.actuator(name).ctrl[0] = value
     mujoco.mj_forward(model, data)
     mujoco.mj_rnePostConstraint(model, data)
     # The string is not written, so it is made slack here.
@@ -491,6 +507,20 @@ def test_what_is_saved_moves_with_mujoco_as_here(tmp_path):
         np.testing.assert_allclose(rows[number, 0], twist[3:] + model.opt.gravity, rtol=1e-9, atol=1e-9)
 
 
+def test_motors_are_saved_and_what_hangs_on_nothing_is_refused():
+    """The README's own scene, and names with quotes."""
+    scene = nc.Scene()
+    rod = scene.add(nc.RigidBody(mass=1.0, inertia=(0.01, 0.09, 0.09), com=(0.5, 0, 0), name='Bob\'s "rod"'))
+    scene.add(
+        nc.JointTorque(scene.add(nc.Revolute(nc.ground, rod, axis=(0, 1, 0), name="hinge")), name="motor")
+    )
+    scene.add(nc.PointOnPoint((nc.Point(nc.ground, (1, 0, 0)), nc.Point(rod, (1, 0, 0))), name="pin"))
+    saved = nc.io.save_mjcf(*scene.compile())
+    model = mujoco.MjModel.from_xml_string(saved.text)
+    assert model.actuator("motor").trnid[0] == model.joint("hinge").id
+    assert model.body(model.site("pin end 2").bodyid[0]).name == 'Bob\'s "rod"'
+
+
 # --- errors -----------------------------------------------------------------------------------------------
 
 
@@ -499,6 +529,11 @@ def test_errors_say_what_to_do():
         ("nowhere.urdf", FileNotFoundError, "there is no file 'nowhere.urdf'"),
         (3, ValueError, "source is an object of type int; pass the path"),
         ("<robot", ValueError, "no XML"),
+        (
+            '<robot xmlns:xacro="x"><xacro:property name="m"/></robot>',
+            ValueError,
+            "xacro robot.xacro > robot",
+        ),
         ("<html/>", ValueError, "root <html>; pass URDF"),
         ("<mujoco><worldbody><body><joint/></body></worldbody></mujoco>", ValueError, "mass and inertia"),
         ("<mujoco><nonsense/></mujoco>", ValueError, "does not read it"),

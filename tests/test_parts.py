@@ -208,6 +208,8 @@ def test_reactions_about_a_point():
         assert np.allclose(system.sense(state, hinge, about=point).torque, needed(point), atol=1e-12)
     tip = nc.Point(beam, (1.0, 0.0, 0.0), local=True)
     assert np.allclose(system.sense(state, hinge, about=tip).torque, needed((2.0, 0.0, 0.0)), atol=1e-12)
+    traced = jax.jit(lambda system, state: system.sense(state, hinge, about=tip).torque)
+    assert np.allclose(traced(system, state), needed((2.0, 0.0, 0.0)), atol=1e-12)
     ground = nc.Point(nc.ground, (0.0, 0.0, 1.0))
     assert np.allclose(system.sense(state, hinge, about=ground).torque, needed((0, 0, 1)), atol=1e-12)
     run = nc.simulate(system, state, dt=0.1, steps=2)

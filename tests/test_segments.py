@@ -20,8 +20,8 @@ from natcoord_jax import gallery
 LAST_DIGITS = 1e-13
 """A run in one piece is another program, in which the compiler may round some sums otherwise, once a step."""
 STEPS = 40
-PACE = {"seconds": 0.0}
-"""What a step of the motor below takes in addition; segments are then of few steps."""
+PACE = {"seconds": 0.0, "dies": np.inf}
+"""What a step of the motor below takes in addition, so that segments are of few steps, and when it dies."""
 
 
 @cache
@@ -46,6 +46,8 @@ def run(steps=STEPS, **options):
 
 def _paced(t):
     time.sleep(PACE["seconds"])
+    if np.any(t > PACE["dies"]):
+        raise KeyError("the motor dies")
     return np.zeros(np.shape(t))
 
 
@@ -115,6 +117,23 @@ def test_an_interruption_returns_what_was_reached_and_goes_on_to_the_same_bits(t
     assert "interrupted" in system.explain(reached) and "resume=True" in system.explain(reached)
     monkeypatch.setitem(PACE, "seconds", 0.0)
     assert_same(run(store=path, resume=True, **options), straight)
+
+
+def test_what_a_killed_run_leaves_is_no_success(tmp_path, monkeypatch):
+    """Not to its end, where it says so: here a controller raises in the middle."""
+    pytest.importorskip("h5py")
+    path, options = tmp_path / "run.h5", {"inputs": Motor()}
+    monkeypatch.setitem(PACE, "dies", 0.105)
+    with pytest.raises(Exception, match="the motor dies"):
+        run(store=path, **options)
+    reached, (system, _) = nc.load(path), swing()
+    count = len(reached) - 1
+    assert nc.Result(int(reached.result)) is nc.Result.INTERRUPTED and 0 < count < 11
+    assert int(reached.failed_step) == count and float(reached.failed_time) == float(reached.t[-1])
+    assert "before its end" in system.explain(reached) and "resume=True" in system.explain(reached)
+    monkeypatch.setitem(PACE, "dies", np.inf)
+    again = run(store=path, resume=True, **options)
+    assert len(again) == STEPS + 1 and nc.Result(int(nc.load(path).result)) is nc.Result.SUCCESSFUL
 
 
 def test_a_run_that_fails_is_stored_to_its_end(tmp_path):

@@ -395,8 +395,12 @@ def test_a_rotor_that_turns_too_far_in_a_step_is_told():
         nc.simulate(system, spinning, dt=0.01, steps=4)
     with pytest.warns(UserWarning, match=r"'hinge' turns by 1\.79 rad"):
         nc.simulate(system, spinning, dt=0.01, steps=4, save_every=2)
+    scene.add(nc.Drive(hinge, function=lambda t: 40.0 * t, name="drive"))
+    driven = scene.compile(assemble=True)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
+        # What a drive turns by more than half a turn has the angle and the rate that are asked for.
+        nc.simulate(*driven, dt=0.1, steps=4)
         run = nc.simulate(system, spinning, dt=0.0014, steps=4)
         jax.jit(lambda s: nc.simulate(system, s, dt=0.01, steps=4).q)(spinning)
     assert float(run.states.coordinates[-1, 0] / run.t[-1]) == pytest.approx(250.0, rel=0.0105)

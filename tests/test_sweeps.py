@@ -50,6 +50,19 @@ def assert_only_the_missing_are_worked_through(store):
     assert sorted(WORKED) == [(LINE["x"][i], LINE["y"][j]) for i, j in np.argwhere(missing)]
 
 
+def test_workers_that_never_begin_are_told_from_lost_ones(tmp_path):
+    """As where a script lacks its guard: going on does not help."""
+
+    class Broken(futures.Executor):
+        def submit(self, function, /, *arguments):
+            raise futures.BrokenExecutor("terminated abruptly")
+
+    with pytest.raises(
+        RuntimeError, match='0 of .* blocks are done: none by this call.*__name__ == "__main__"'
+    ):
+        nc.sweep(line, store=tmp_path / "sweep", executor=Broken(), **LINES)
+
+
 def test_lanes_have_room_for_steps_of_their_bucket():
     """Of 10 to 200 steps: all rows have their values, in blocks of one bucket."""
     steps = np.array([10, 200, 20, 64, 65])

@@ -55,7 +55,7 @@ def drift(system: System, *states: State) -> float:
     scale = np.max(np.sum(sizes, axis=0) + np.sum(np.abs(work), axis=-1))
     balance = np.asarray(energy.total) - np.sum(work, axis=-1)
     error = float(np.max(np.abs(balance - balance[0])))
-    return error / float(scale) if scale > 0 else 0.0
+    return 0.0 if scale == 0 else error / float(scale)
 
 
 def note_of(error: float, before: float, reference_error: float) -> str:

@@ -18,18 +18,24 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.eager_numpy import eager_numpy
+from natcoord_jax.core.kinds import Concrete
 from natcoord_jax.core.motion import Motion, Response
 from natcoord_jax.core.state import TRAJECTORY, State, Trajectory
 from natcoord_jax.maths.collocation import gauss
 from natcoord_jax.maths.vectors import cross, safe_divide
 from natcoord_jax.mechanics.energies import body_momenta
+from natcoord_jax.mechanics.momentum import inertia
 from natcoord_jax.mechanics.response import gather, motion_between, respond, situation
 from natcoord_jax.model.groups import Group
 from natcoord_jax.model.model import SYSTEM
+from natcoord_jax.model.own_effects import own_class
 from natcoord_jax.system import System
 
 INTERNAL = 1e-12
 """Impulse in a step, relative to the momenta of the bodies, up to which what acts has no resultant."""
+
+TURNS = 1e-9
+"""The same of effects that are not the library's, over the run, or relative to their forces."""
 
 REACTION_FREE = 1e-12
 """A rigid motion counts as free of reactions when their mean square power is below this share: far above the
@@ -42,12 +48,15 @@ class Balance(eqx.Module):
     Attributes:
         energy: |E - E_0 - (W - W_0)| / scale; the scale is the largest T + sum |V_store| + sum |W| [-].
         momentum: the same for momentum and impulse, along the directions free of ground reactions; the
-            scale is the largest sum over the bodies of |p_b| [-]. None if there is no such direction.
+            scale is the largest sum over the bodies of sqrt(2 m_b T_b), which is |p_b| where they do not
+            turn, plus the largest impulse in a step [-]. None if there is no such direction.
         angular_momentum: the same for turning about the axes free of reactions; the scale is the largest
-            sum over the bodies of |J_b| plus sum_k integral |u_k| dt [-]. None if there is no such axis.
+            sum over the rows of the bodies of |q_a| |p_a|, of which J is made, plus the largest in a step
+            and sum_k integral |u_k| dt [-]. None if there is no such axis.
         directions: number of directions `momentum` counts, 0 to 3.
         axes: number of axes `angular_momentum` counts, 0 to 3.
-        note: why something is missing, or "".
+        note: why something is missing, and which effects of one's own push or turn the whole from within,
+            by how much; or "".
     """
 
     energy: Float[np.ndarray, "*lanes saved"]
@@ -82,40 +91,87 @@ def _resultants(bodies: int, group: Group, motion: Motion, answer: Response) -> 
     return jnp.sum(jnp.where(moving, jnp.concatenate([force, turning], axis=-1), 0.0), axis=1)
 
 
-def _step(system: System, midpoint: bool, before: State, after: State, u: Array) -> tuple[Array, Array]:
-    """Impulse (6,) of all that is known in a step, and Gram matrix (6, 6) of the reactions."""
+class _Known(eqx.Module):
+    """What is known to act in a step.
+
+    Attributes:
+        impulse: resultant (6,) of what acts from outside.
+        size: of all forces and torques, with their arms (2,).
+        gram: of the reactions (6, 6).
+        within: of each effect of one's own between bodies, its resultant (6,), and what its reactions have
+            of one, relative to them.
+    """
+
+    impulse: Float[Array, "6"]
+    size: Float[Array, "2"]
+    gram: Float[Array, "6 6"]
+    within: dict[str, tuple[Float[Array, "6"], Float[Array, ""]]]
+
+
+def _step(
+    system: System, midpoint: bool, own: dict[str, bool], before: State, after: State, u: Array
+) -> _Known:
+    """What is known of a step; `own` tells by name which groups are not the library's."""
     bodies, tableau = len(system.structure.bodies), gauss(1)
     h = after.t - before.t
     at = motion_between(before, after, h)
-    impulse, gram = jnp.zeros(6), jnp.zeros((6, 6))
+    impulse, sizes, gram, within = jnp.zeros(6), jnp.zeros(2), jnp.zeros((6, 6)), {}
     for group in (*system.effects, *system.joints):
         where, motion = situation(system, group, before, u, h), gather(group, at)
         lam = jnp.zeros((group.count, 1, group.multipliers))
         scale = 1.0 if group.effect.impulsive else h
         answer = respond(group, where, motion, lam, tableau)
         known = scale * _resultants(bodies, group, motion, answer)
+        size, ends, name = scale * _sizes(motion, answer), jnp.asarray(group.bodies), group.labels[0]
+        between = (ends < bodies).all(axis=1) & (ends.min(axis=1) < ends.max(axis=1))
+        inside, sizes, share = (own[name] & between)[:, None], sizes + size, jnp.zeros(())
+        outer = jnp.where(inside, 0.0, known)
         if midpoint:
-            impulse = impulse + jnp.sum(known, axis=0)
+            impulse = impulse + jnp.sum(outer, axis=0)
         else:
             # Impulses over several stages are not in the trajectory: they count as reactions do.
-            parts = [x for x in (answer.forces, answer.torques) if x is not None]
-            size = scale * sum((jnp.sum(jnp.abs(x)) for x in parts), jnp.zeros(()))
-            gram = gram + safe_divide(known.T @ known, size**2)
+            gram = gram + safe_divide(outer.T @ outer, jnp.sum(size) ** 2)
         for number in range(group.multipliers):
             answer = respond(group, where, motion, lam.at[:, :, number].set(1.0), tableau)
             columns = scale * _resultants(bodies, group, motion, answer) - known
-            gram = gram + columns.T @ columns
-    return impulse, gram
+            outer = jnp.where(inside, 0.0, columns)
+            gram = gram + outer.T @ outer
+            most = jnp.max(jnp.abs(columns - outer))
+            share = jnp.maximum(share, safe_divide(most, scale * jnp.sum(_sizes(motion, answer))))
+        if own[name]:
+            within[name] = jnp.sum(jnp.where(inside, known, 0.0), axis=0), share
+    return _Known(impulse, sizes, gram, within)
+
+
+def _sizes(motion: Motion, answer: Response) -> Float[Array, "2"]:
+    """Forces, and torques and forces with their arms about the origin, by their sizes."""
+    force = turning = jnp.zeros(())
+    if answer.forces is not None:
+        parts = jnp.linalg.norm(answer.forces[:, 0], axis=-1)
+        force = jnp.sum(parts[:, :, 0])
+        turning = jnp.sum(parts * jnp.linalg.norm(motion.rows[0], axis=-1))
+    if answer.torques is not None:
+        turning = turning + jnp.sum(jnp.abs(answer.torques))
+    return jnp.stack([force, turning])
+
+
+def _momentum_sizes(system: System, state: State) -> tuple[Array, Array]:
+    """Momenta of what the bodies' energies would have in straight motion, and what angular momenta sum up."""
+    unit = jnp.zeros_like(state.row_rates).at[:, 0, 0].set(1.0)
+    parts, masses = inertia(system, state.row_rates), inertia(system, unit)[:, 0, 0]
+    energies = jnp.abs(jnp.sum(parts * state.row_rates, axis=(1, 2)))
+    norms = jnp.linalg.norm(state.rows, axis=-1) * jnp.linalg.norm(parts, axis=-1)
+    return jnp.sum(jnp.sqrt(masses * energies)), jnp.sum(norms)
 
 
 @eager_numpy
-def _account(system: System, trajectory: Trajectory) -> dict[str, Any]:
+def _account(system: System, trajectory: Trajectory, own: dict[str, bool]) -> dict[str, Any]:
     """All that is needed of the trajectory, at the saved times."""
     states = trajectory.states
     before, after = jax.tree.map(lambda x: x[:-1], states), jax.tree.map(lambda x: x[1:], states)
     midpoint = trajectory.scheme is None or trajectory.scheme.tableau == gauss(1)
-    each = partial(_step, system, midpoint)
-    impulses, grams = jax.vmap(each)(before, after, trajectory.inputs)
+    known = jax.vmap(partial(_step, system, midpoint, own))(before, after, trajectory.inputs)
+    sizes = jax.vmap(lambda s: _momentum_sizes(system, s))(states)
     linear, angular = jax.vmap(lambda s: body_momenta(system, s))(states)
     energy, work = system.energy(trajectory), states.work
     if states.dissipated is not None:
@@ -126,11 +182,13 @@ def _account(system: System, trajectory: Trajectory) -> dict[str, Any]:
         "energy": energy.total - energy.total[0] - jnp.sum(work - work[0], axis=-1),
         "energy_scale": energy.kinetic + stores + jnp.sum(jnp.abs(work), axis=-1),
         "momenta": jnp.concatenate([jnp.sum(linear, axis=1), jnp.sum(angular, axis=1)], axis=-1),
-        "momentum_scale": jnp.sum(jnp.linalg.norm(linear, axis=-1), axis=-1),
-        "angular_scale": jnp.sum(jnp.linalg.norm(angular, axis=-1), axis=-1),
-        "torque_scale": jnp.sum(jnp.abs(trajectory.inputs) * steps),
-        "impulses": impulses,
-        "gram": jnp.mean(grams, axis=0),
+        "momentum_scale": jnp.max(sizes[0]) + jnp.max(known.size[:, 0]),
+        "angular_scale": jnp.max(sizes[1])
+        + jnp.max(known.size[:, 1])
+        + jnp.sum(jnp.abs(trajectory.inputs) * steps),
+        "impulses": known.impulse,
+        "gram": jnp.mean(known.gram, axis=0),
+        "within": known.within,
     }
 
 
@@ -147,12 +205,31 @@ def _free_motions(gram: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _acted_on(account: dict[str, Any]) -> bool:
     """Whether what is known to act has a resultant: that of internal forces is rounding."""
-    scales = np.repeat([np.max(account["momentum_scale"]), np.max(account["angular_scale"])], 3)
-    return bool(np.any(np.abs(account["impulses"]) > INTERNAL * scales))
+    return bool(np.any(np.abs(account["impulses"]) > INTERNAL * _scales(account)))
+
+
+def _scales(account: dict[str, Any]) -> np.ndarray:
+    return np.repeat([account["momentum_scale"], account["angular_scale"]], 3)
+
+
+def _not_conserved(account: dict[str, Any]) -> list[str]:
+    """Effects of one's own between bodies that push or turn these as a whole, in words."""
+    said = []
+    for name, (impulses, shares) in account["within"].items():
+        sums = np.cumsum(impulses, axis=0)
+        pushed, turned = (np.max(np.linalg.norm(x, axis=-1)) for x in (sums[:, :3], sums[:, 3:]))
+        push, turn = _scales(account)[[0, 3]]
+        if pushed > TURNS * push:
+            said.append(f"{name!r} pushes the whole by {pushed:.2g} N s")
+        elif turned > TURNS * turn:
+            said.append(f"{name!r} turns the whole by {turned:.2g} N m s")
+        elif np.max(shares) > TURNS:
+            said.append(f"reactions of {name!r} push or turn the whole")
+    return [f"not conserved: {', '.join(said)}, from within: see nc.testing.check_effect"] if said else []
 
 
 def _relative(error: np.ndarray, scale: float) -> np.ndarray:
-    return error / scale if scale > 0 else np.zeros_like(error)
+    return np.zeros_like(error) if scale == 0 else error / scale
 
 
 def _of_lanes(lanes: list[Balance]) -> Balance:
@@ -171,7 +248,7 @@ def _of_lanes(lanes: list[Balance]) -> Balance:
     )
 
 
-@checked(system=SYSTEM, trajectory=TRAJECTORY)
+@checked(system=SYSTEM, trajectory=Concrete(TRAJECTORY))
 def balance(system: System, trajectory: Trajectory) -> Balance:
     """Errors of the balances of energy, momentum and angular momentum along a trajectory.
 
@@ -182,8 +259,9 @@ def balance(system: System, trajectory: Trajectory) -> Balance:
     Returns:
         The relative errors; see `Balance` for their scales. Momenta are left out, with a note, where the
         trajectory does not hold every step (`save_every`, steps repeated in substeps) and impulses act,
-        because these are then unknown. Of a batch the errors of all lanes, (lanes, saved), along the
-        fewest directions and axes that any of them has.
+        because these are then unknown. What effects of one's own between bodies put on the whole is no
+        impulse from outside: momenta miss it, and the note names the effect. Of a batch the errors of all
+        lanes, (lanes, saved), along the fewest directions and axes that any of them has.
 
     Example:
         >>> import jax; jax.config.update("jax_enable_x64", True)
@@ -200,17 +278,25 @@ def balance(system: System, trajectory: Trajectory) -> Balance:
     saved = trajectory.t.shape[0]
     if saved == 1:
         return Balance(np.zeros(1), np.zeros(1), np.zeros(1), 3, 3, "no step was made")
-    account = jax.tree.map(np.asarray, _account(system, trajectory))
+    groups = (*system.effects, *system.joints)
+    own = {
+        g.labels[0]: bool(g.effect.stores or g.multipliers) and own_class(g.effect) is not None
+        for g in groups
+    }
+    account = jax.tree.map(np.asarray, _account(system, trajectory, own))
     energy = _relative(np.abs(account["energy"]), np.max(account["energy_scale"]))
-    if int(trajectory.steps_taken) > saved - 1 and _acted_on(account):
-        return Balance(energy, None, None, 0, 0, "momenta: some steps were made in parts or not saved")
+    notes = _not_conserved(account)
+    # (States after the end of a run repeat the last one, and are no steps.)
+    if int(trajectory.steps_taken) > np.count_nonzero(np.diff(trajectory.t)) and _acted_on(account):
+        notes.append("momenta: some steps were made in parts or not saved")
+        return Balance(energy, None, None, 0, 0, "; ".join(notes))
     impulse = np.concatenate([np.zeros((1, 6)), np.cumsum(account["impulses"], axis=0)])
     change = account["momenta"] - account["momenta"][0] - impulse
     along, about = _free_motions(account["gram"])
-    linear = _relative(np.linalg.norm(change @ along.T, axis=-1), np.max(account["momentum_scale"]))
-    scale = np.max(account["angular_scale"]) + account["torque_scale"]
-    angular = _relative(np.linalg.norm(change @ about.T, axis=-1), float(scale))
+    linear = _relative(np.linalg.norm(change @ along.T, axis=-1), float(account["momentum_scale"]))
+    angular = _relative(np.linalg.norm(change @ about.T, axis=-1), float(account["angular_scale"]))
     missing = [name for name, found in (("momentum", along), ("angular momentum", about)) if not len(found)]
-    note = f"{' and '.join(missing)}: every component feels reactions of the ground" if missing else ""
+    if missing:
+        notes.append(f"{' and '.join(missing)}: every component feels reactions of the ground")
     parts = (linear if len(along) else None, angular if len(about) else None)
-    return Balance(energy, *parts, len(along), len(about), note)
+    return Balance(energy, *parts, len(along), len(about), "; ".join(notes))

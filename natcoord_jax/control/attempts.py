@@ -19,6 +19,7 @@ from natcoord_jax.control.reasons import nearest, worst_condition
 from natcoord_jax.control.results import Outcome
 from natcoord_jax.control.solution import Attempt, Row, Solution, solution_of
 from natcoord_jax.control.transcription import Unknowns
+from natcoord_jax.xla.waiting import Stopwatch
 
 HEADER = (
     f"{'iter':>4} {'cost':>14} {'gradient':>9} {'violation':>9} {'step':>7} {'newton':>7} {'s':>7}  worst"
@@ -75,7 +76,7 @@ class Search:
 
     def __init__(self, problem: OptimalControl, options: Options, progress: bool, time_limit: float) -> None:
         self.problem, self.options, self.progress = problem, options, progress
-        self.start, self.time_limit = time.perf_counter(), time_limit
+        self.start, self.watch, self.time_limit = time.perf_counter(), Stopwatch(), time_limit
         self.history: list[Row] = []
         self.attempts: list[Attempt] = []
 
@@ -114,7 +115,7 @@ class Search:
             print(f"{method}\n{HEADER}", file=sys.stderr)
         try:
             while not sequential.done(iterate):
-                if time.perf_counter() - self.start > self.time_limit:
+                if self.watch.seconds > self.time_limit:
                     outcome = Outcome.TIME_LIMIT
                     break
                 iterate = sequential.step(problem, options, iterate)
@@ -189,7 +190,9 @@ def _unreachable(search: Search, failed: list[Solution], scale: Any) -> Solution
     if problem.bounds.widened(WIDER[0]) is not problem.bounds:
         for factor in WIDER:
             wider = eqx.tree_at(lambda p: p.bounds, problem, problem.bounds.widened(factor))
-            restored = search.run(False, begin, scale=scale, problem=wider)
+            # (What pushes at its limits would as well at wider ones.)
+            start = eqx.tree_at(lambda u: u.coefficients, begin, factor * begin.coefficients)
+            restored = search.run(False, start, scale=scale, problem=wider)
             if restored.ok:
                 reason += f"; with {factor:g} times the limits of the inputs it comes near"
             if restored.outcome is not Outcome.UNREACHABLE or search.left <= 0:

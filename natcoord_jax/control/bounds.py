@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.core.arguments import Part, is_a
 from natcoord_jax.core.callables import Function
-from natcoord_jax.core.checks import is_concrete
+from natcoord_jax.core.checks import for_each, is_concrete
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.kinds import BODY_NAME, JOINT_NAME, NAME, FunctionOf, HandleOf, Several, of
 from natcoord_jax.core.numeric import Directions, Number, Numbers, Whole
@@ -116,14 +116,16 @@ class Range(Bound):
     def excess(self, system: System, state: State, u: Array, t: Array) -> Float[Array, " n"]:
         """Excess over both limits, in units of half the range."""
         values = self.values(system, state, u)
+        below, above = self._sides(values.shape[0])
         lower, upper = (jnp.broadcast_to(x, values.shape) for x in (self.lower, self.upper))
         both = jnp.isfinite(upper - lower)
         unit = jnp.where(both, 0.5 * jnp.where(both, upper - lower, 2.0), 1.0)
-        below, above = self._sides(values.shape[0])
         found = [((lower - values) / unit)[below], ((values - upper) / unit)[above]]
         return jnp.concatenate(found)
 
     def _sides(self, count: int) -> tuple[np.ndarray, np.ndarray]:
+        for name, limit in (("lower", self.lower), ("upper", self.upper)):
+            for_each(limit, count, f"bounds.{type(self).__name__}: {name}", "value")
         below, above = (np.flatnonzero(np.broadcast_to(limits, count)) for limits in self.limited)
         return below, above
 

@@ -1,7 +1,6 @@
 """A solution followed while its problem changes along a path."""
 
 import sys
-import time
 from collections.abc import Callable
 from typing import Any
 
@@ -14,8 +13,9 @@ from natcoord_jax.control.results import Outcome
 from natcoord_jax.control.run import METHODS, optimise
 from natcoord_jax.control.solution import Solution
 from natcoord_jax.core.arguments import checked
-from natcoord_jax.core.kinds import FLAG, Choice, FunctionOf, of
+from natcoord_jax.core.kinds import FLAG, Choice, Concrete, FunctionOf, of
 from natcoord_jax.core.numeric import Number, Whole
+from natcoord_jax.xla.waiting import Stopwatch
 
 QUICK = 6
 """Iterations up to which a step along a path was short."""
@@ -46,7 +46,7 @@ class Continuation(list[Solution]):
 
 
 @checked(
-    problem=PROBLEM,
+    problem=Concrete(PROBLEM),
     path=FunctionOf("(problem, s) -> problem"),
     guess=GUESS | of("an earlier solution", Solution),
     first=Number("positive"),
@@ -54,9 +54,9 @@ class Continuation(list[Solution]):
     method=Choice(METHODS),
     progress=FLAG,
     max_iterations=Whole(1),
-    tol=Number("positive"),
-    goal_tol=Number("positive"),
-    time_limit=Number("not negative", infinite=True),
+    tol=Concrete(Number("positive")),
+    goal_tol=Concrete(Number("positive")),
+    time_limit=Concrete(Number("not negative", infinite=True)),
 )
 def continuation(
     problem: OptimalControl,
@@ -89,7 +89,7 @@ def continuation(
         max_iterations: of each solution but the first.
         tol: as in `optimise`.
         goal_tol: as in `optimise`.
-        time_limit: of the whole [s].
+        time_limit: of the whole [s]; compiling does not count.
 
     Returns:
         The solutions, a list, with `at` and `ok`; `print` shows the costs.
@@ -108,7 +108,7 @@ def continuation(
         >>> found.ok, found[-1].cost < found[0].cost
         (True, True)
     """
-    begun, found = time.perf_counter(), Continuation()
+    watch, found = Stopwatch(), Continuation()
     shared = {"progress": False, "tol": tol, "goal_tol": goal_tol}
     last = optimise(_at(path, problem, 0.0), guess, method=method, time_limit=time_limit, **shared)
     length, s = min(first, 1.0), 0.0
@@ -130,14 +130,14 @@ def continuation(
             length *= 0.5
         if found.ok:
             return found
-        if length < least or time.perf_counter() - begun > time_limit:
+        if length < least or watch.seconds > time_limit:
             limit = f"steps of {length:.1e}" if length < least else f"{time_limit:g} s"
             found.reason = f"at {found.at[-1]:.4f} it was given up, after {limit}: {last.explain()}"
             return found
         s = min(found.at[-1] + length, 1.0)
         form = next(name for name in NAMES.values() if found[-1].method.startswith(name))
         start = _carried_on(found, s)
-        left = max(0.0, time_limit - (time.perf_counter() - begun))
+        left = max(0.0, time_limit - watch.seconds)
         last = optimise(
             _at(path, problem, s),
             start,

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 from natcoord_jax.control.goal import GOAL
 from natcoord_jax.core.arguments import Part, is_a
 from natcoord_jax.core.callables import Function
+from natcoord_jax.core.checks import for_each
 from natcoord_jax.core.kinds import FunctionOf, Several, of
 from natcoord_jax.core.numeric import Number, Vector
 from natcoord_jax.core.state import State
@@ -76,7 +77,7 @@ class Effort(Cost):
 
     def running(self, system: System, state: State, u: Array, t: Array) -> Float[Array, ""]:
         """Weighted sum of squares."""
-        return jnp.sum(self.weight * u**2)
+        return jnp.sum(for_each(self.weight, u.shape[-1], "Effort: weight", "input channel") * u**2)
 
 
 class Duration(Cost):

@@ -21,9 +21,10 @@ from natcoord_jax.control.solution import Row, Solution
 from natcoord_jax.control.transcription import Unknowns, end, first_node, held_inputs, packed
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.compiled import compiled
-from natcoord_jax.core.kinds import FLAG, Kind, is_other
+from natcoord_jax.core.kinds import FLAG, Concrete, Kind, is_other
 from natcoord_jax.core.numeric import Number, Whole
 from natcoord_jax.stepping.simulate import simulate
+from natcoord_jax.xla.waiting import Stopwatch
 
 
 class Optimiser(Kind):
@@ -72,16 +73,16 @@ def _augmented(variables: tuple[Array, Array], problem: OptimalControl, multipli
 
 
 @checked(
-    problem=PROBLEM,
+    problem=Concrete(PROBLEM),
     guess=GUESS,
     optimiser=Optimiser(),
     iterations=Whole(1),
     rounds=Whole(1),
     penalty=Number("positive"),
     growth=Number("positive"),
-    tol=Number("positive"),
+    tol=Concrete(Number("positive")),
     progress=FLAG,
-    time_limit=Number("not negative", infinite=True),
+    time_limit=Concrete(Number("not negative", infinite=True)),
 )
 def descend(
     problem: OptimalControl,
@@ -111,7 +112,7 @@ def descend(
         growth: factor on it from round to round.
         tol: violation of goal and bounds at which it ends.
         progress: print a line for each round to stderr.
-        time_limit: limit of time [s], checked after each round.
+        time_limit: limit of time [s], checked after each round; compiling does not count.
 
     Returns:
         The solution; `outcome` is MAX_ITERATIONS if goal or bounds are violated by more than `tol`.
@@ -145,7 +146,7 @@ def descend(
         slope, found = jax.grad(_augmented, has_aux=True)(variables, problem, multipliers, penalty)
         return variables, slope, found
 
-    began, history, outcome = time.perf_counter(), [], Outcome.MAX_ITERATIONS
+    began, watch, history, outcome = time.perf_counter(), Stopwatch(), [], Outcome.MAX_ITERATIONS
     if progress:
         print(HEADER, file=sys.stderr)
     for k in range(rounds if constrained else 1):
@@ -168,7 +169,7 @@ def descend(
         if constrained and violation <= tol or not constrained:
             outcome = Outcome.OPTIMAL if constrained else Outcome.MAX_ITERATIONS
             break
-        if time.perf_counter() - began > time_limit:
+        if watch.seconds > time_limit:
             outcome = Outcome.TIME_LIMIT
             break
     unknowns = Unknowns(variables[0], variables[1], start.y)

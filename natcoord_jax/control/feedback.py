@@ -15,6 +15,7 @@ from natcoord_jax.control.run import OPTIONS, optimise_jit
 from natcoord_jax.control.solution import SOLUTION, Solution
 from natcoord_jax.control.transcription import held_inputs, packed
 from natcoord_jax.core.arguments import checked
+from natcoord_jax.core.checks import for_each
 from natcoord_jax.core.compiled import compiled
 from natcoord_jax.core.kinds import Several
 from natcoord_jax.core.numeric import Number, Numbers, Vector, Whole
@@ -64,8 +65,7 @@ def _gains(problem: OptimalControl, iterate: Iterate, weights: tuple) -> tuple[A
     size = problem.state.q.size * 2 + problem.state.coordinates.size + problem.state.rates.size
     A, B = found.forward[:, : 2 * count, : 2 * count], found.forward[:, : 2 * count, -problem.channels :]
     displaced, quick, cost, final = weights
-    Q = jnp.concatenate([jnp.broadcast_to(x, (count,)) for x in (displaced, quick)])
-    R = jnp.broadcast_to(cost, (problem.channels,))
+    Q, R = jnp.concatenate([displaced, quick]), cost
 
     def body(P: Array, given: tuple) -> tuple[Array, Array]:
         A, B = given
@@ -118,7 +118,18 @@ def regulator(
     problem, iterate = solution.problem, solution.iterate
     if iterate is None or problem.inputs.degree or problem.inputs.every > 1:
         raise ValueError("the regulator needs a solution of `optimise` with inputs held over each step")
-    weights = tuple(jnp.asarray(x, float) for x in (displacement, rate, effort, final))
+    motions, channels = (
+        (problem.system.structure.unknowns, "free motion"),
+        (problem.channels, "input channel"),
+    )
+    displaced, quick, cost, lower, upper = (
+        for_each(value, count, f"regulator: {name}", each)
+        for name, value, (count, each) in (
+            ("displacement", displacement, motions), ("rate", rate, motions), ("effort", effort, channels),
+            ("limits", limits[0], channels), ("limits", limits[1], channels),
+        )
+    )  # fmt: skip
+    weights, limits = (displaced, quick, cost, jnp.asarray(final, float)), (lower, upper)
     gains, back = _gains(problem, iterate, weights)
     dt, nodes = jnp.asarray(solution.dt), iterate.path.nodes.x[:-1]
     return Feedback(jnp.asarray(solution.inputs), gains, back, nodes, dt, problem.state.t, limits)

@@ -159,8 +159,8 @@ def scattered(problem: OptimalControl, unknowns: Unknowns, key: Array, spread: A
         problem: the problem.
         unknowns: in the middle.
         key: random key.
-        spread: standard deviation of the inputs [N, N m].
-        rates: standard deviation of the rates [rad/s, m/s].
+        spread: standard deviation of the inputs [N, N m], one or for each.
+        rates: standard deviation of the rates [rad/s, m/s], one or for each.
     """
     first, second, third = jax.random.split(key, 3)
     steps, modes = problem.steps, jnp.arange(1, 4)
@@ -170,7 +170,7 @@ def scattered(problem: OptimalControl, unknowns: Unknowns, key: Array, spread: A
         if problem.system.structure.solver != "reduced"
         else problem.system.structure.unknowns
     )
-    inputs = spread * waves @ jax.random.normal(first, (3, problem.channels))
+    inputs = spread * (waves @ jax.random.normal(first, (3, problem.channels)))
     changes = rates * (jax.random.normal(second, (1, count)) + waves @ jax.random.normal(third, (3, count)))
     changes = free_of_swings(jnp, jnp.zeros((1, count)), changes)
     coefficients = unknowns.coefficients + problem.inputs.fitted(inputs)

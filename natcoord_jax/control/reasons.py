@@ -43,7 +43,7 @@ def seen(problem: OptimalControl, iterate: Iterate, outcome: Outcome) -> str:
     if outcome in (Outcome.NONFINITE, Outcome.SINGULAR):
         return undefined(problem, iterate)
     violation, worst = worst_condition(problem, iterate)
-    text = f"worst: {worst}, {violation:.1e}" if violation > 0 else ""
+    text = f"worst: {worst}, {violation:.1e}{at_limits(problem, iterate)}" if violation > 0 else ""
     if outcome is Outcome.STALLED:
         count = int(iterate.failures)
         text += f"; {count} steps in a row made nothing better, however short"
@@ -72,14 +72,18 @@ def out_of_reach(problem: OptimalControl, unreachable: np.ndarray) -> str:
 def nearest(problem: OptimalControl, iterate: Iterate) -> str:
     """How near to the goal a motion comes that no change of the inputs brings nearer, and what holds it."""
     names = unique(problem.goal.labels(problem.system))
-    text = f"the nearest motion misses {_largest_of(names, np.asarray(iterate.path.end.missing))}"
+    missed = _largest_of(names, np.asarray(iterate.path.end.missing))
+    return f"the nearest motion misses {missed}{at_limits(problem, iterate)}"
+
+
+def at_limits(problem: OptimalControl, iterate: Iterate) -> str:
+    """Which bounds hold an iterate in the most of its steps."""
     excess = np.asarray(iterate.path.stages.excess)
     labels = unique(problem.bounds.labels(problem.system))
     counts = np.sum(excess > -AT_LIMIT, axis=0)
-    held = [
-        f"{label} in {count} of {problem.steps} steps" for label, count in zip(labels, counts) if count > 0
-    ]
-    return text + (f", at the limits: {', '.join(held[:NAMED])}" if held else "")
+    most = [k for k in np.argsort(-counts, kind="stable")[:NAMED] if counts[k] > 0]
+    named = [f"{labels[k]} in {counts[k]} of {problem.steps} steps" for k in most]
+    return f", at the limits: {', '.join(named)}" if named else ""
 
 
 def switches(problem: OptimalControl, iterate: Iterate) -> dict[str, list[int]]:

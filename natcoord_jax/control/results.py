@@ -41,11 +41,12 @@ OUTCOMES = {
 }
 
 ADVICE = {
-    Outcome.MAX_ITERATIONS: "allow more iterations, or start from a better guess",
+    Outcome.MAX_ITERATIONS: "allow more iterations, widen limits that hold it, or start from a better guess",
     Outcome.UNREACHABLE: "check for conditions that contradict each other or the conservation laws, for "
     "inputs that cannot move what the goal asks for, and for too little time or too narrow limits; start "
     "from another guess",
-    Outcome.STALLED: "start from another guess, or look for cost, goal or bounds that are not smooth",
+    Outcome.STALLED: "start from another guess, widen limits that hold it, or look for cost, goal or bounds "
+    "that are not smooth",
     Outcome.SIMULATION_FAILED: "start from a milder guess or with a smaller dt, or use method='lifted'",
     Outcome.SINGULAR: "start from a guess that keeps away from positions where constraints depend on "
     "each other",

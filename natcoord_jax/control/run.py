@@ -16,7 +16,7 @@ from natcoord_jax.control.solution import Solution
 from natcoord_jax.control.transcription import Unknowns, held_inputs
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.compiled import compiled
-from natcoord_jax.core.kinds import FLAG, Choice, of
+from natcoord_jax.core.kinds import FLAG, Choice, Concrete, of
 from natcoord_jax.core.numeric import Number, Whole
 
 METHODS = ("auto", "shooting", "lifted")
@@ -39,14 +39,14 @@ def chosen(problem: OptimalControl, method: str, guess: Any = None) -> bool:
 
 
 @checked(
-    problem=PROBLEM,
+    problem=Concrete(PROBLEM),
     guess=GUESS | of("an earlier solution", Solution),
     method=Choice(METHODS),
     progress=FLAG,
     max_iterations=Whole(0),
-    tol=Number("positive"),
-    goal_tol=Number("positive"),
-    time_limit=Number("not negative", infinite=True),
+    tol=Concrete(Number("positive")),
+    goal_tol=Concrete(Number("positive")),
+    time_limit=Concrete(Number("not negative", infinite=True)),
 )
 def optimise(
     problem: OptimalControl,
@@ -78,7 +78,8 @@ def optimise(
         max_iterations: limit of iterations, of all attempts together.
         tol: largest gradient of the Lagrangian and complementarity, relative.
         goal_tol: largest violation of goal, bounds and equations.
-        time_limit: limit of time [s], of all attempts together; checked between iterations.
+        time_limit: limit of time [s], of all attempts together; checked between iterations. Compiling does
+            not count.
 
     Returns:
         The solution; `outcome` and `explain()` say how it ended. An interruption by the keyboard returns

@@ -20,8 +20,9 @@ from natcoord_jax.control.run import METHODS, chosen
 from natcoord_jax.control.solution import Solution, solution_of
 from natcoord_jax.control.transcription import Unknowns
 from natcoord_jax.core.arguments import checked
+from natcoord_jax.core.checks import for_each
 from natcoord_jax.core.compiled import compiled
-from natcoord_jax.core.kinds import Choice, Several, of
+from natcoord_jax.core.kinds import Choice, Concrete, Several, of
 from natcoord_jax.core.numeric import Number, Vector, Whole
 
 SAME = 1e-3
@@ -58,7 +59,7 @@ class Optima(list[Solution]):
 
 
 @checked(
-    problem=PROBLEM,
+    problem=Concrete(PROBLEM),
     guess=GUESS | of("an earlier solution", Solution) | Several(of("a guess or a solution", Guess, Solution)),
     starts=Whole(1),
     spread=Number("not negative") | Vector(None),
@@ -66,8 +67,8 @@ class Optima(list[Solution]):
     seed=Whole(0),
     method=Choice(METHODS),
     max_iterations=Whole(0),
-    tol=Number("positive"),
-    goal_tol=Number("positive"),
+    tol=Concrete(Number("positive")),
+    goal_tol=Concrete(Number("positive")),
 )
 def multi_start(
     problem: OptimalControl,
@@ -111,6 +112,8 @@ def multi_start(
         many = jax.tree.map(lambda *x: jnp.stack(x), *every)
     else:
         middle = unknowns_of(problem, guess, lifted)
+        spread = for_each(spread, problem.channels, "multi_start: spread", "input channel")
+        rates = for_each(rates, middle.y.shape[1], "multi_start: rates", "rate")
         keys = jax.random.split(jax.random.key(seed), starts)
         sizes = jnp.ones(starts).at[0].set(0.0)
         many = jax.vmap(lambda key, size: scattered(problem, middle, key, size * spread, size * rates))(

@@ -166,8 +166,8 @@ def _code(function: Any) -> Hashable:
 
 def name_of(part: Any) -> str:
     """A callable, for messages."""
-    part = part.function if isinstance(part, Function) else part
-    code = getattr(unwrap(part), "__code__", None)
+    part = unwrap(part.function if isinstance(part, Function) else part)
+    code = getattr(part, "__code__", None)
     if code is None:
         return f"a {type(part).__name__}"
     return f"the function {code.co_name!r} ({code.co_filename}, line {code.co_firstlineno})"

@@ -111,6 +111,19 @@ def equations(found: Any, part: Any, method: str) -> Any:
     return found
 
 
+def for_each(value: Any, count: int, what: str, each: str) -> Array:
+    """A number, or one for each of some things, as numbers for all of them (count,).
+
+    Raises:
+        ValueError: for another number of them.
+    """
+    array = as_array(value, float)
+    if array.shape not in ((), (count,)):
+        one = f"a number, or one for each {each}: numbers of shape ({count},)"
+        raise ValueError(f"{what} has shape {array.shape}; pass {one}")
+    return jnp.broadcast_to(array, (count,))
+
+
 def positive(value: Any, what: str, unit: str) -> Array:
     """Value as a positive finite scalar.
 

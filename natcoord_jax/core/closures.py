@@ -31,7 +31,7 @@ from natcoord_jax.core.callables import (
     own_methods,
     replace_fields,
 )
-from natcoord_jax.core.checks import as_array, is_concrete
+from natcoord_jax.core.checks import as_array, at_top_level, is_concrete
 from natcoord_jax.xla.programs import Program, Signature, signature, traced
 
 REMEMBERED = 512
@@ -98,10 +98,14 @@ class Call:
             del self.known[position][how]
             return None
         if not is_concrete(values):
+            if at_top_level():  # they are of a trace that has ended
+                raise _keeps(part)
             return program, values
         last, now = self.known[position][how], (program, tuple(map(_content, values)))
         if last != now:
             again, others = traced(function, how)
+            if not is_concrete(others):
+                raise _keeps(part)
             if (again, tuple(map(_content, others))) != now:
                 raise ValueError(
                     f"{name_of(part)} is not the same when it is called twice with the same arguments (it "
@@ -110,6 +114,15 @@ class Call:
                 )
         self.known[position][how] = now if last is None or last[0] != program else (last[0], now[1])
         return self.known[position][how][0], values
+
+
+def _keeps(part: Any) -> ValueError:
+    """The refusal of a callable with a memory, which is traced once for all steps."""
+    return ValueError(
+        f"{name_of(part)} keeps what it has computed (an integral, a filter, the last value), for which a "
+        "program has no place between calls: let it depend on its arguments alone, or make the steps by "
+        "nc.step in a jax.lax.scan that carries what is to be kept (docs/howto/feedback.md has one)"
+    )
 
 
 class Origin:

@@ -68,9 +68,13 @@ class Constraint(Effect):
     def residual(self, x: Float[Array, "k *m 3"]) -> Float[Array, " m"]:
         """What vanishes, at most quadratic in the marker vectors."""
 
-    def violation(self, place: Array, rows: Array, coordinates: Array, t: Array) -> Array:
+    def quadratic(self, place: Array, rows: Array) -> Array:
         """The residual."""
         return equations(self.residual(place_markers(place, rows)), self, "residual")
+
+    def violation(self, place: Array, rows: Array, coordinates: Array, t: Array) -> Array:
+        """The residual."""
+        return self.quadratic(place, rows)
 
     def violation_rate(
         self, place: Array, rows: Array, rates: Array, spin: Array, t: Array, passing: Any

@@ -68,6 +68,9 @@ class CoordinateEffect(Effect):
             tuple of indices.
         name: optional name.
         axes: the coordinates' descriptions, filled in at compile.
+
+    Class attributes:
+        on_a_ball: what there is instead for joints that turn freely, which have no coordinate.
     """
 
     joint: Any = eqx.field(metadata=is_a(JOINT | Several(JOINT, 1)))
@@ -76,6 +79,7 @@ class CoordinateEffect(Effect):
     axes: tuple[Coordinate, ...] = eqx.field(default=(), init=False, static=True)
 
     kind: ClassVar[str] = "coordinate effect"
+    on_a_ball: ClassVar[str] = ""
 
     @abc.abstractmethod
     def generalised(

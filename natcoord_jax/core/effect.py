@@ -110,6 +110,13 @@ class Effect(Part):
         """
         return None
 
+    def quadratic(self, place: Array, rows: Float[Array, "k 4 3"]) -> Float[Array, " p"] | None:
+        """What has to be at most quadratic in the rows: a residual, or invariants; None: nothing.
+
+        What is not is refused at compile, of effects that are not the library's.
+        """
+        return None
+
     def flaws(self) -> dict[str, Array]:
         """What may be wrong with its numbers, as the rest of a sentence about it, and whether it is."""
         return {}

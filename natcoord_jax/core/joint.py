@@ -119,9 +119,13 @@ class Joint(Effect):
         """Effects that come with the joint, such as the pitch relation of a screw."""
         return []
 
-    def violation(self, place: Array, rows: Array, coordinates: Array, t: Array) -> Array:
+    def quadratic(self, place: Array, rows: Array) -> Array:
         """The residual."""
         return equations(self.residual(*frames_at(place, rows)), self, "residual")
+
+    def violation(self, place: Array, rows: Array, coordinates: Array, t: Array) -> Array:
+        """The residual."""
+        return self.quadratic(place, rows)
 
     def violation_rate(
         self, place: Array, rows: Array, rates: Array, spin: Array, t: Array, passing: Any

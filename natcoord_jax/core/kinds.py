@@ -220,6 +220,19 @@ class HandleOf(Kind):
         return None if isinstance(value, Handle) and value.kind == self.part else is_other(value)
 
 
+class Concrete(Either):
+    """What has to have a value: it is part of the program, or read by Python."""
+
+    def __init__(self, *kinds: Kind):
+        super().__init__(kinds)
+
+    def complaint(self, value: Any) -> str | None:
+        """That of the kinds, or that it is being traced."""
+        if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(value)):
+            return "is traced by jit, vmap or grad, and needs a value here: call this outside of them"
+        return super().complaint(value)
+
+
 class Anything(Kind):
     """What is looked at elsewhere, or may be anything."""
 

@@ -176,6 +176,10 @@ class Potential(Effect):
         reach = jnp.sqrt(jnp.max(jnp.sum((points - points[0]) ** 2, axis=-1), initial=0.0))
         return cancelling_energy(self.energy, self.invariants(x), self.units), reach
 
+    def quadratic(self, place: Array, rows: Array) -> Array:
+        """The invariants."""
+        return jnp.ravel(self.invariants(place_markers(place, rows)))
+
     def stored(self, place: Array, rows: Array, coordinates: Array, rates: Array) -> Array:
         """Energy [J]."""
         return self.energy(self.invariants(place_markers(place, rows)))

@@ -40,7 +40,7 @@ REASONS = {
     Result.MAX_SUBSTEPS: "more substeps were needed than `extra_substeps` allows",
     Result.BAD_STEP: "the step dt is not a positive finite number [s]",
     Result.TOLERANCE_NOT_MET: "no substep is short enough for the error that `rtol` and `atol` tolerate",
-    Result.INTERRUPTED: "the run was interrupted from the keyboard",
+    Result.INTERRUPTED: "the run was interrupted before its end, or is still being made",
     Result.INVERTED: "an element was turned inside out",
     Result.MISSED: "bodies have moved in a step beyond where contacts were looked for",
     Result.OVERFLOW: "a body has more neighbours than its contact has room for",

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from natcoord_jax.core.bodies import by_node
-from natcoord_jax.core.checks import numbers
+from natcoord_jax.core.checks import is_concrete, numbers
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.kinds import of, short
 
@@ -165,7 +165,9 @@ class Trajectory(eqx.Module):
         if places.step < 0:
             raise IndexError("trajectory: a slice may not go backwards, times increase; pass a positive step")
         before = range(places[0] + places.step - 1, places[-1], places.step)
-        cut = len(self) - 1 - (places[-1] - places[0])
+        # (States after the end of a run repeat the last one, and are no steps.)
+        made = (np if is_concrete(self.t) else jnp).diff(self.t) > 0
+        cut = made.sum() - made[places[0] : places[-1]].sum()
         return dataclasses.replace(
             self, states=states, inputs=_picked(self.inputs, before), steps_taken=self.steps_taken - cut
         )

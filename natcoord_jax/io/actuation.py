@@ -28,7 +28,7 @@ def read_actuators(
     found, numbers = [], []
     for number in range(len(model.actuator_trntype)):
         name, kinds = actuator_name(model, number), _kinds(model, number)
-        reason = _refused(model, number, kinds)
+        reason = _switched_off(model, number) or _refused(model, number, kinds)
         made = reason or _transmitted(model, poses, number, kinds["transmission"], _law(model, number))
         if isinstance(made, str):
             notes.left_out(name, made)
@@ -64,6 +64,16 @@ def _kinds(model: Any, number: int) -> dict[str, str]:
     return {what: kind(int(x[number])).name.rpartition("_")[2] for what, (kind, x) in values.items()}
 
 
+def _switched_off(model: Any, number: int) -> str | None:
+    """Whether the file switches an actuator off, alone or with all others."""
+    if model.opt.disableflags & mujoco().mjtDisableBit.mjDSBL_ACTUATION:
+        return "the file switches actuation off"
+    group = int(model.actuator_group[number])
+    if 0 <= group < 31 and int(model.opt.disableactuator) & (1 << group):
+        return f"the file switches its group off, {group}"
+    return None
+
+
 def _refused(model: Any, number: int, kinds: dict[str, str]) -> str | None:
     """Why an actuator is not mapped, as far as its law is concerned."""
     if model.actuator_plugin[number] >= 0:
@@ -72,7 +82,11 @@ def _refused(model: Any, number: int, kinds: dict[str, str]) -> str | None:
         return f"activation dynamics {kinds['dynamics']} are not mapped"
     if kinds["gain"] not in ("FIXED", "AFFINE") or kinds["bias"] not in ("NONE", "AFFINE"):
         return f"gain {kinds['gain']} and bias {kinds['bias']}: only affine ones are mapped"
-    for extra in ("actuator_delay", "actuator_damping", "actuator_armature"):
+    for several in ("ctrlnum", "outnum"):
+        if getattr(model, f"actuator_{several}", np.ones(number + 1))[number] > 1:
+            return "it has several controls or outputs, of which none is mapped"
+    extras = ("actuator_delay", "actuator_damping", "actuator_dampingpoly", "actuator_armature")
+    for extra in extras:
         if np.any(getattr(model, extra, np.zeros(number + 1))[number]):
             return f"it has {extra.rpartition('_')[2]} of its own, which is not mapped"
     return None
@@ -87,7 +101,8 @@ def _law(model: Any, number: int) -> dict[str, Any]:
     if model.actuator_biastype[number] == package.mjtBias.mjBIAS_NONE:
         bias[:] = 0.0
     control = input_index(model, number)
-    limited, limits = model.actuator_ctrllimited[control], model.actuator_ctrlrange[control]
+    clamped = not model.opt.disableflags & package.mjtDisableBit.mjDSBL_CLAMPCTRL
+    limited, limits = clamped and model.actuator_ctrllimited[control], model.actuator_ctrlrange[control]
     if model.actuator_dyntype[number] != package.mjtDyn.mjDYN_NONE:
         limited, limits = model.actuator_actlimited[number], model.actuator_actrange[number]
     return {

@@ -162,6 +162,8 @@ def _stop(model: Any, number: int) -> float:
     A of the inertia.
     """
     first, second = model.jnt_solref[number]
+    if first > 0 and not model.opt.disableflags & mujoco().mjtDisableBit.mjDSBL_REFSAFE:
+        first = max(first, 2.0 * model.opt.timestep)
     impedance = float(np.clip(model.jnt_solimp[number][1], 1e-4, 0.9999))
     k = 1.0 / (impedance * (first * second) ** 2) if first > 0 else -first / impedance
     inverse = max(float(model.dof_invweight0[model.jnt_dofadr[number]]), 1e-15)
@@ -175,7 +177,11 @@ def _list_what_is_left(notes: Notes, model: Any, number: int, joint: JointData) 
         "a spring that is no linear one": (getattr(model, "jnt_stiffnesspoly", None), number),
         "a damper that is no linear one": (getattr(model, "dof_dampingpoly", None), rates),
         "a spring that yields": (getattr(model, "jnt_springyield", None), number),
+        "the margin of its limit": (model.jnt_margin, number),
     }
+    if np.any(model.jnt_actfrclimited[number]):
+        # (Beside them gravity is compensated, as it is here, whatever carries it.)
+        checks["gravity that its actuators compensate"] = (model.jnt_actgravcomp, number)
     if not joint.has_coordinate:
         several = f"of a {joint.kind} joint, which has no single coordinate"
         checks |= {

@@ -126,15 +126,17 @@ def _related_tendons(model: Any, poses: Poses, number: int, name: str) -> Equali
 def list_the_rest(model: Any, notes: Notes) -> None:
     """What a robot has no place for."""
     contacts = int(np.sum((model.geom_contype != 0) | (model.geom_conaffinity != 0)))
-    if contacts > 1 or model.npair:
+    disabled = mujoco().mjtDisableBit.mjDSBL_CONTACT | mujoco().mjtDisableBit.mjDSBL_CONSTRAINT
+    if (contacts > 1 or model.npair) and not model.opt.disableflags & disabled:
         notes.left_out(
             f"contact of {contacts} geoms",
             "contacts of a file are not read; add nc.Contact between its bodies",
         )
     for tendon in range(model.ntendon):
         name = model.tendon(tendon).name or f"tendon {tendon + 1}"
-        acting = ("stiffness", "damping", "frictionloss", "armature", "limited")
-        has = [what for what in acting if np.any(getattr(model, f"tendon_{what}")[tendon])]
+        acting = "stiffness stiffnesspoly damping dampingpoly frictionloss armature limited actfrclimited"
+        values = {what: getattr(model, f"tendon_{what}", None) for what in acting.split()}
+        has = [what for what, x in values.items() if x is not None and np.any(x[tendon])]
         if has:
             notes.left_out(f"{', '.join(has)} of {name}", "of tendons only actuators are mapped")
     if model.opt.density or model.opt.viscosity:

@@ -49,7 +49,7 @@ def save_mjcf(system: System, state: State, file: str | Path | None = None, *, n
 
     Raises:
         ValueError: for a system with nodes that are no rigid bodies, or with a body without mass on which
-            several hang.
+            several hang, or that a wrench or a closed loop takes hold of.
 
     Example:
         >>> import jax; jax.config.update("jax_enable_x64", True)

@@ -48,9 +48,7 @@ def save_effects(system: System, root: Element, joints: Joints, notes: Notes) ->
                 continue
             on = [joints.get(system.structure.coordinates[c]) for c in np.asarray(group.coordinates)[number]]
             if isinstance(effect, JointTorque):
-                joint = system.structure.joints[int(np.asarray(group.joints)[number, 0])]
-                plain = effect.axis == 2 and (joint, 1) not in system.structure.coordinates
-                on = [joints.get((joint, 0))] if plain else [None]
+                on = [_hinge(system, joints, np.asarray(group.weights)[number], group.bodies[number])]
             if isinstance(effect, PointOnPoint | WrenchInput):
                 write = _connect if isinstance(effect, PointOnPoint) else _wrench
                 write(system, root, name, np.asarray(group.weights)[number], group.bodies[number], effect)
@@ -64,6 +62,17 @@ def save_effects(system: System, root: Element, joints: Joints, notes: Notes) ->
         SubElement(root, "option", {"gravity": "0 0 0"})
     if any(isinstance(group.effect, JointStops) for group in system.effects):
         notes.changed("stops", "they are limits, which MuJoCo makes soft by rules of its own")
+
+
+def _hinge(system: System, joints: Joints, weights: np.ndarray, bodies: Any) -> Element | None:
+    """The hinge about the axis, as carried by parent and child, that a motor turns the child about."""
+    frames, ends = np.asarray(system.frames), np.asarray(system.joint_bodies)
+    for name, index in sorted(joints):
+        number = system.joint_index(name)
+        same = np.array_equal(ends[number], bodies) and np.allclose(frames[number, :, 3], weights)
+        if same and joints[name, index].get("type") == "hinge":
+            return joints[name, index]
+    return None
 
 
 def _add(element: Element, attribute: str, value: Any) -> None:
@@ -173,8 +182,11 @@ def save_loops(system: System, root: Element, notes: Notes) -> None:
 def _site(system: System, root: Element, name: str, weights: np.ndarray, body: int, axes: Any = None) -> None:
     """A point of a body by name, with axes (rows) in it."""
     names = system.structure.bodies
-    owner = root.find("worldbody") if body == len(names) else root.find(f".//body[@name='{names[body]}']")
-    site = SubElement(part(root, "worldbody") if owner is None else owner, "site")
+    bodies = {element.get("name"): element for element in root.iter("body")}
+    owner = part(root, "worldbody") if body == len(names) else bodies.get(names[body])
+    if owner is None:
+        raise ValueError(f"save_mjcf: {name!r} is at {names[body]!r}, which has no mass [kg]; give it some")
+    site = SubElement(owner, "site")
     site.set("name", name)
     site.set("pos", numbers(weights[1:]))
     if axes is not None:

@@ -5,6 +5,7 @@ import xml.etree.ElementTree as ElementTree
 from collections import Counter
 from pathlib import Path
 from xml.etree.ElementTree import Element
+from xml.parsers import expat
 
 from natcoord_jax.io.notes import Notes
 
@@ -12,6 +13,11 @@ READABLE = {".stl", ".obj", ".msh"}
 """Formats of meshes that MuJoCo reads."""
 
 KNOWN = {"link", "joint", "material", "mujoco"}
+PARTS = {
+    "link": {"inertial", "visual", "collision"},
+    "joint": {"origin", "parent", "child", "axis", "limit", "dynamics", "mimic", "calibration"},
+}
+"""What is read of a file, of a link and of a joint; calibration says nothing of the motion."""
 
 
 def prepared(text: str, folder: Path | None, notes: Notes, *, visuals: bool, floating: bool) -> str:
@@ -50,22 +56,32 @@ def prepared(text: str, folder: Path | None, notes: Notes, *, visuals: bool, flo
     ElementTree.SubElement(ElementTree.SubElement(root, "mujoco"), "compiler", options)
     if floating:
         _float(root, notes)
-    others = Counter(child.tag for child in root if child.tag not in KNOWN)
-    for tag, count in others.items():
-        notes.left_out(f"{count} <{tag}>", "extensions of URDF are not read")
+    others = Counter(f"<{child.tag}>" for child in root if child.tag not in KNOWN)
+    for kind, tags in PARTS.items():
+        others.update(f"<{x.tag}>" for part in root.findall(kind) for x in part if x.tag not in tags)
+    others.update(name for x in root.iter() for name in x.keys() if ":" in name and name[:5] != "xmlns")
+    for extension, count in others.items():
+        notes.left_out(f"{count} {extension}", "extensions of URDF are not read")
     return ElementTree.tostring(root, encoding="unicode")
 
 
 def parsed(text: str) -> Element:
-    """The root of a text.
+    """The root of a text. Names with a prefix stay as they are, whether or not it is declared.
 
     Raises:
-        ValueError: for what is no XML.
+        ValueError: for what is no XML, or a template of it.
     """
+    builder, parser = ElementTree.TreeBuilder(), expat.ParserCreate()
+    parser.StartElementHandler, parser.EndElementHandler = builder.start, builder.end
+    parser.CharacterDataHandler = builder.data
     try:
-        return ElementTree.fromstring(text)
-    except ElementTree.ParseError as error:
+        parser.Parse(text, True)
+    except expat.ExpatError as error:
         raise ValueError(f"nc.io.load: the text is no XML ({error}); pass URDF or MJCF") from None
+    root = builder.close()
+    if any(element.tag.startswith("xacro:") for element in root.iter()):
+        raise ValueError("nc.io.load: the text is a template; expand it: xacro robot.xacro > robot.urdf")
+    return root
 
 
 def velocity_limits(root: Element) -> dict[str, float]:

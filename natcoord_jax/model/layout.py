@@ -243,6 +243,11 @@ class Layout:
         numbers, bodies, axes = [], [], []
         for handle, index in zip(handles, indices):
             joint = self.joints[handle.name]
+            if not joint.coordinates:
+                turns = len(joint.rotations) == 3 and effect.on_a_ball
+                kind = f"joint {handle.name!r}, a {type(joint).__name__} joint, has no coordinates"
+                remedy = f"use {effect.on_a_ball}" if turns else "pass another joint"
+                raise ValueError(f"{label}: {kind}; {remedy}")
             if not 0 <= index < len(joint.coordinates):
                 raise ValueError(
                     f"{label}: joint {handle.name!r} has {len(joint.coordinates)} coordinates, "

@@ -7,14 +7,23 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.core.checks import require_double
+from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.results import REASONS, REMEDIES, Result, SimulationError
 from natcoord_jax.core.state import State, Trajectory
 from natcoord_jax.mechanics.energies import body_momenta, group_energies
+from natcoord_jax.mechanics.equations_of_motion import EquationsOfMotion, relations_of
 from natcoord_jax.mechanics.failures import failure
 from natcoord_jax.mechanics.momentum import inertia
 from natcoord_jax.mechanics.violations import LEFT_OPEN, worst_violation
 from natcoord_jax.model.model import Model
 from natcoord_jax.model.rows import over_states
+
+DEPENDENT = 1e-6
+"""Singular values of constraints, relative to the largest, up to which some depend on others."""
+
+SINGULAR = 0.15
+"""The least of them where a run fails, relative to that at its start, that a dead centre is told from: of the
+shortest substep that is tried, the root of its part of the way is left, a tenth and less."""
 
 
 class Energy(eqx.Module):
@@ -95,11 +104,47 @@ def explain(system: Model, trajectory: Trajectory) -> str:
     if result == Result.SUCCESSFUL:
         return REASONS[result]
     where = f" in step {int(trajectory.failed_step)} at t = {float(trajectory.failed_time):.6g} s"
-    return REASONS[result] + where + _culprit(system, trajectory) + _remedy(result)
+    return REASONS[result] + where + _culprit(system, trajectory) + _remedy(system, trajectory)
 
 
-def _remedy(result: Result) -> str:
+def _remedy(system: Model, trajectory: Trajectory) -> str:
+    """What to do: no smaller step helps a drive that leads beyond a dead centre."""
+    result = Result(int(trajectory.result))
+    drive = _beyond_reach(system, trajectory) if "a smaller dt" in REMEDIES.get(result, "") else ""
+    if drive:
+        return (
+            f"; {drive!r} asks for what the mechanism cannot follow on from here (a dead centre, or arms "
+            "stretched out): change its function, or drive another joint"
+        )
     return f"; {REMEDIES[result]}" if result in REMEDIES else ""
+
+
+@eager_numpy
+def _constraint_rates(system: Model, state: State) -> tuple[Array, Array]:
+    """What the constraints outside of the tree take of the rates, a row each, and the rates prescribed."""
+    balances = EquationsOfMotion.at(system, state)
+    moved = balances.rates(jnp.zeros(system.structure.unknowns)).constraints
+    return balances.columns().constraints.T, moved
+
+
+def _beyond_reach(system: Model, trajectory: Trajectory) -> str:
+    """Name of a drive that the other constraints stand in the way of where a run failed, or ""."""
+    # (In small systems: the others are not solved densely, and here neither.)
+    if np.ndim(system.mass) > 3 or not system.structure.held or system.structure.solver != "reduced":
+        return ""
+    states = (jax.tree.map(lambda x, k=k: x[k], trajectory.states) for k in (0, -1))
+    (first, _), (rows, moved) = (map(np.asarray, _constraint_rates(system, state)) for state in states)
+    if not np.all(np.isfinite(rows)) or not moved.any():
+        return ""
+    lengths = [np.maximum(np.linalg.norm(x, axis=1), 1e-300) for x in (first, rows)]
+    before = np.linalg.svd(first / lengths[0][:, None], compute_uv=False)
+    left, after, _ = np.linalg.svd(rows / lengths[1][:, None])
+    rank = int(np.sum(before > DEPENDENT * before[0]))
+    if rank == 0 or after[rank - 1] > SINGULAR * before[rank - 1]:
+        return ""
+    names = [name for g in relations_of(system) for name in g.names for _ in range(g.multipliers)]
+    shares = np.abs(left[:, rank - 1] * moved / lengths[1])[: len(names)]
+    return names[int(np.argmax(shares))] if shares.max(initial=0.0) > 0 else ""
 
 
 def _culprit(system: Model, trajectory: Trajectory) -> str:
@@ -142,7 +187,8 @@ def _explain_lanes(system: Model, batch: Trajectory) -> str:
         name = first[0] if len(first) == 1 else first
         step, t = int(batch.failed_step[first]), float(batch.failed_time[first])
         at = f"first lane {name} in step {step} at t = {t:.6g} s"
-        lines.append(f"{len(lanes)}: {REASONS[result]}{culprit}; {at}{_remedy(result)}")
+        remedy = _remedy(system, jax.tree.map(lambda x, place=first: x[place], batch))
+        lines.append(f"{len(lanes)}: {REASONS[result]}{culprit}; {at}{remedy}")
     return "\n".join(lines)
 
 

@@ -23,7 +23,7 @@ from natcoord_jax.maths.rotations import angular_velocity, to_quaternion
 from natcoord_jax.maths.vectors import cross
 from natcoord_jax.mechanics.coordinates import state_rates
 from natcoord_jax.model.model import Model
-from natcoord_jax.model.rows import states_of
+from natcoord_jax.model.rows import rows_with_ground, states_of
 from natcoord_jax.reading.effect_readings import readings, tells
 from natcoord_jax.reading.instant import inputs_along, instants
 from natcoord_jax.reading.markers import MarkerSensor, marker_weights, weighted
@@ -220,8 +220,10 @@ def joint_coordinates(system: Model, joint: Handle | str) -> tuple[int, list[int
 
 def _lever(system: Model, states: State, index: int, about: Any, state: State | None) -> Array:
     """From a point to that of a joint on its child."""
-    child, weights = int(np.asarray(system.joint_bodies)[index, 1]), system.frames[index, 1, 0]
-    joint = weights[1:] if child == len(system.structure.bodies) else weighted(weights, states.q, child)
+    # (Which body the child is may be traced, as any array of a system that is an argument.)
+    child, weights = jnp.asarray(system.joint_bodies)[index, 1], system.frames[index, 1, 0]
+    rows = jnp.vectorize(rows_with_ground, signature="(r,k)->(b,n,k)")(states.q)
+    joint = jnp.sum(weights[:, None] * jnp.take(rows, child, axis=-3), axis=-2)
     if isinstance(about, Marker):
         if not about.is_point:
             raise ValueError(f"about is a direction, {about!r}; pass a point [m], or nc.Point")

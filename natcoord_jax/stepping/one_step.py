@@ -13,6 +13,7 @@ from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.checks import is_concrete
 from natcoord_jax.core.compiled import compiled
 from natcoord_jax.core.effect import replace_fields
+from natcoord_jax.core.kinds import Concrete
 from natcoord_jax.core.numeric import Number, Vector
 from natcoord_jax.core.results import REASONS, REMEDIES, Result, SimulationError
 from natcoord_jax.core.state import STATE, State
@@ -35,7 +36,9 @@ def _one_step(system, state, u, dt, tolerance, extra, tableau):
     return course.state, course.code
 
 
-@checked(system=SYSTEM, state=STATE, u=CHANNELS, dt=STEP, newton_tol=Number("positive"), scheme=SCHEME)
+@checked(
+    system=SYSTEM, state=STATE, u=CHANNELS, dt=STEP, newton_tol=Concrete(Number("positive")), scheme=SCHEME
+)
 def step(
     system: System,
     state: State,
@@ -76,7 +79,7 @@ def step(
     system = with_mobilities(system, state)
     h = checked_step(dt)
     inputs, _ = checked_inputs(system, None if u is None else jnp.asarray(u, float)[None], 1)
-    after, code = _one_step(system, state, inputs[0], h, newton_tol, 16, scheme.tableau)
+    after, code = _one_step(system, state, inputs[0], h, float(newton_tol), 16, scheme.tableau)
     if is_concrete(code):
         result = Result(int(code))
         if not result.ok:

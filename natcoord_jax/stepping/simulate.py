@@ -14,7 +14,7 @@ from natcoord_jax.core.callables import Function
 from natcoord_jax.core.checks import as_array, at_top_level, is_concrete
 from natcoord_jax.core.compiled import compiled
 from natcoord_jax.core.effect import replace_fields
-from natcoord_jax.core.kinds import FLAG, FunctionOf, of
+from natcoord_jax.core.kinds import FLAG, Concrete, FunctionOf, of
 from natcoord_jax.core.numeric import Number, Whole
 from natcoord_jax.core.state import STATE, State, Trajectory
 from natcoord_jax.mechanics.impacts import with_mobilities
@@ -65,7 +65,7 @@ def _simulate(
     throw=FLAG,
     until=FunctionOf("of the state to a number, whose sign changes", 1),
     checkpoint=FLAG,
-    newton_tol=Number("positive"),
+    newton_tol=Concrete(Number("positive")),
     extra_substeps=Whole(0),
     scheme=SCHEME,
     rtol=Number("not negative"),
@@ -200,7 +200,7 @@ def simulate(
     warn_of_dense_steps(system, scheme)
     if progress or store is not None or resume:
         run = Run(
-            system, state, checked, step, tolerance, newton_tol, extra_substeps, until, scheme, count,
+            system, state, checked, step, tolerance, float(newton_tol), extra_substeps, until, scheme, count,
             int(save_every), checkpoint,
         )  # fmt: skip
         traced = not at_top_level(system, state, inputs, step, until)
@@ -221,7 +221,7 @@ def simulate(
         extra_substeps = 16 if tolerance is None else max(256, 8 * room)
         if scheme.tableau.max_events:
             extra_substeps = max(64, room)
-    static = (room, int(save_every), checkpoint, newton_tol, int(extra_substeps), until, scheme)
+    static = (room, int(save_every), checkpoint, float(newton_tol), int(extra_substeps), until, scheme)
     try:
         trajectory = _simulate(system, state, checked, step, tolerance, made, static)
     except jax.errors.JaxRuntimeError as error:

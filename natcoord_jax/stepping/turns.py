@@ -9,17 +9,14 @@ from natcoord_jax.core.checks import is_concrete
 from natcoord_jax.core.state import Trajectory
 from natcoord_jax.system import System
 
-FAR = {1: 1.0}
-"""Turn in a step [rad] by number of stages from which on the rate shown is off: by a tenth for one stage."""
+FAR = 1.0
+"""Turn in a step [rad] up to which nothing is said: the rate is off by a tenth at order two."""
 
-NEARLY_HALF = 2.5
-"""The same for more stages: by 4 %, and from half a turn on an angle cannot be told from one turned back."""
+SAME = 0.03
+"""Difference of rate and gain, relative, from which on they tell different things: a drive's are the same."""
 
-MODEST = {1: 0.35}
-"""Turn in a step [rad] that is advised: the rate is within 1 %."""
-
-MODEST_OTHERWISE = 1.0
-"""The same for more stages: within 0.2 %."""
+MODEST = 0.35
+"""Turn in a step [rad] that is advised at order two, with the rate within 1 %; above `FAR`, within 0.2 %."""
 
 
 def _turns(system: System, trajectory: Trajectory, every: int) -> Float[np.ndarray, " coordinates"]:
@@ -50,24 +47,23 @@ def warn_of_far_turns(system: System, trajectory: Trajectory, dt: Float[Array, "
     if not is_concrete(trajectory.states.coordinates, dt, system.coordinates):
         return
     turns, stages = _turns(system, trajectory, every), trajectory.scheme.stages
-    worst = int(np.argmax(turns)) if turns.size else 0
-    if not turns.size or turns[worst] <= FAR.get(stages, NEARLY_HALF):
+    for worst in np.argsort(-turns):
+        turn, step, (name, number) = float(turns[worst]), float(dt), system.structure.coordinates[worst]
+        if turn <= FAR:
+            return
+        rates = np.abs(np.asarray(system.rate(trajectory, name, index=number)))
+        gained, shown = turn / step, float(np.max(rates, where=np.isfinite(rates), initial=0.0))
+        if abs(shown - gained) > SAME * gained:
+            break
+    else:
         return
-    turn, step = float(turns[worst]), float(dt)
-    name, number = system.structure.coordinates[worst]
     several = sum(joint == name for joint, _ in system.structure.coordinates) > 1
     angle = f"the angle {number} of joint {name!r}" if several else f"joint {name!r}"
-    gained = turn / step
-    if stages == 1:
-        shown = 2.0 * np.tan(0.5 * turn) / step
-        seen = f"the rate shows {shown:.4g} rad/s where the angle gains {gained:.4g} rad/s"
-    else:
-        shown = gained
-        seen = "the rate shows more than the angle gains, and beyond half a turn the angle is lost"
-    fitting = MODEST.get(stages, MODEST_OTHERWISE) / shown
+    fitting = (MODEST if stages == 1 else FAR) / max(shown, gained)
     higher = " or a scheme of higher order" if stages == 1 else ""
     warnings.warn(
         f"{angle} turns by {turn:.3g} rad in a step of {step:.4g} s, too far for order "
-        f"{trajectory.scheme.order}: {seen}; take dt = {fitting:.2g} s{higher}",
+        f"{trajectory.scheme.order}: the rate shows {shown:.4g} rad/s where the angle gains {gained:.4g} "
+        f"rad/s; take dt = {fitting:.2g} s{higher}",
         stacklevel=3,
     )

@@ -16,6 +16,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from natcoord_jax.core.results import Result
 from natcoord_jax.core.state import State, Trajectory
 from natcoord_jax.storage import archive, vtkhdf
 from natcoord_jax.storage.described import Description
@@ -218,10 +219,14 @@ def opened(path: Path, geometry: vtkhdf.Geometry, about: Mapping[str, Any]) -> R
 
 
 def stored(path: Path) -> Trajectory:
-    """The trajectory in a file, as far as it has come."""
+    """The trajectory in a file, as far as it has come; interrupted where that is not to its end."""
     about = _about(path)
     rows = _rows(path, "r", None)
-    return rows.trajectory(rows.last[0], about["scheme"])
+    totals = rows.last[0].copy()
+    if totals["result"] == Result.SUCCESSFUL and totals["steps"] < about["steps"]:
+        totals["result"], totals["failed_step"] = Result.INTERRUPTED, totals["steps"]
+        totals["failed_time"] = rows.states.t[totals["saved"]]
+    return rows.trajectory(totals, about["scheme"])
 
 
 def close(path: Path, saved: int) -> None:

@@ -193,7 +193,7 @@ def _opened(store: str) -> Sweep:
 
 def _handed_out(executor: Any, given: tuple, todo: list[int], show: Any, found: Sweep) -> None:
     """Give blocks to an executor, some at a time."""
-    left, running = iter(todo), {}
+    left, running, begun = iter(todo), {}, int(found.done_blocks.sum())
     try:
         while True:
             for number in left:
@@ -208,10 +208,14 @@ def _handed_out(executor: Any, given: tuple, todo: list[int], show: Any, found: 
                 del running[future]
     except (futures.BrokenExecutor, OSError) as error:
         done = int(found.done_blocks.sum())
-        raise RuntimeError(
-            f"the executor has lost a worker ({error}); {done} of {found.grid.blocks} blocks are done: call "
-            "nc.sweep again with the same store and a new executor to go on"
-        ) from error
+        remedy = "call nc.sweep again with the same store and a new executor to go on"
+        if done == begun:
+            remedy = (
+                "none by this call, and what workers print says why; those that are spawned import the "
+                'script: what it does belongs below `if __name__ == "__main__":`'
+            )
+        count = f"{done} of {found.grid.blocks} blocks are done"
+        raise RuntimeError(f"the executor has lost a worker ({error}); {count}: {remedy}") from error
     finally:
         for future in running:
             future.cancel()

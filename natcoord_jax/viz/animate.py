@@ -17,7 +17,7 @@ from natcoord_jax.analysis.phases import Phases
 from natcoord_jax.bodies.beam import BeamHandle
 from natcoord_jax.control.solution import Solution
 from natcoord_jax.core.arguments import checked
-from natcoord_jax.core.kinds import NAME, Several, of
+from natcoord_jax.core.kinds import NAME, Concrete, Several, of
 from natcoord_jax.core.markers import Marker
 from natcoord_jax.core.numeric import Whole
 from natcoord_jax.core.state import TRAJECTORY, Trajectory
@@ -110,7 +110,7 @@ def _write(film: FuncAnimation, file: Path, fps: int) -> None:
 
 @checked(
     system=MOVING,
-    trajectory=TRAJECTORY,
+    trajectory=Concrete(TRAJECTORY),
     file=of("the name of a file that ends in .gif, .mp4 or .html", str, Path),
     fps=Whole(1),
     beams=BEAMS,

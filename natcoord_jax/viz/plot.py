@@ -9,7 +9,7 @@ from natcoord_jax.analysis.phases import Phases
 from natcoord_jax.bodies.beam import BeamHandle
 from natcoord_jax.control.solution import Solution
 from natcoord_jax.core.arguments import checked
-from natcoord_jax.core.kinds import of
+from natcoord_jax.core.kinds import Concrete, of
 from natcoord_jax.core.numeric import Vector
 from natcoord_jax.core.state import TRAJECTORY, Trajectory
 from natcoord_jax.system import System
@@ -27,7 +27,7 @@ DRAWN = of(
 )
 
 
-@checked(system=DRAWN, trajectory=TRAJECTORY, times=Vector(None), beams=BEAMS)
+@checked(system=DRAWN, trajectory=Concrete(TRAJECTORY), times=Vector(None), beams=BEAMS)
 def plot(
     system: System | Phases | Solution | Accuracy,
     trajectory: Trajectory | None = None,

@@ -21,7 +21,7 @@ from natcoord_jax.bodies.beam import BeamHandle
 from natcoord_jax.control.solution import Solution
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.handles import Handle
-from natcoord_jax.core.kinds import FLAG, NAME, HandleOf, of
+from natcoord_jax.core.kinds import FLAG, NAME, Concrete, HandleOf, of
 from natcoord_jax.core.markers import Marker
 from natcoord_jax.core.state import TRAJECTORY, Trajectory
 from natcoord_jax.system import System
@@ -126,7 +126,7 @@ def open_file(file: Path) -> None:
 
 @checked(
     system=MOVING,
-    trajectory=TRAJECTORY,
+    trajectory=Concrete(TRAJECTORY),
     file=of("the name of a file that ends in .html", str, Path),
     title=NAME,
     follow=HandleOf("body") | NAME,

@@ -12,6 +12,21 @@ PATIENCE = 2.0
 _last: list[float] = []
 """How long the last program took [s]."""
 
+_all = [0.0]
+"""How long all of them took [s]."""
+
+
+class Stopwatch:
+    """A watch that stands still while programs are compiled."""
+
+    def __init__(self) -> None:
+        self.begun = time.monotonic() - _all[0]
+
+    @property
+    def seconds(self) -> float:
+        """Time since it was started [s]."""
+        return time.monotonic() - _all[0] - self.begun
+
 
 @contextmanager
 def told(name: str) -> Iterator[None]:
@@ -35,5 +50,6 @@ def told(name: str) -> Iterator[None]:
         timer.cancel()
         taken = time.monotonic() - begun
         _last[:] = [taken]
+        _all[0] += taken
         if said.is_set():
             print(f" {taken:.1f} s", file=sys.stderr, flush=True)

@@ -4,6 +4,7 @@ Rotors with an effect each stand side by side in one scene, whose program serves
 that of a pair with everything that works on it, of which loads and inputs are numbers.
 """
 
+import dataclasses
 from functools import cache
 
 import jax
@@ -510,3 +511,101 @@ def test_momenta_are_judged_where_not_every_step_is_there(weight):
     else:
         assert result.momentum.max() <= tol.MOMENTUM_OF_A_SMALL_SCENE and result.directions == 3
         assert result.angular_momentum.max() <= tol.MOMENTUM_OF_A_SMALL_SCENE and result.axes == 3
+
+
+def test_errors_are_relative_to_what_is_no_rounding():
+    """Bodies that meet head-on have no angular momentum, and one that only turns has no momentum."""
+    scene = nc.Scene()
+    bodies = [
+        nc.RigidBody(mass=1.0 + k, inertia=(0.1, 0.2, 0.3), position=(0.3 + k, 0, 0), name=f"body {k}")
+        for k in range(2)
+    ]
+    bodies = [scene.add(body) for body in bodies]
+    scene.add(nc.Spring(tuple(map(nc.Point, bodies)), stiffness=50.0, length=0.9))
+    system, state = scene.compile()
+    speeds = np.zeros((2, 8, 3))
+    speeds[0, 0] = (1.3, 0.0, 0.0)
+    speeds[1, 5:] = np.cross((0.3, -1.0, 0.4), np.eye(3))
+    starts = jax.vmap(lambda v: dataclasses.replace(state, v=v))(jnp.asarray(speeds))
+    runs = jax.vmap(lambda s: nc.simulate(system, s, dt=DT, steps=50))(starts)
+    errors = nc.balance(system, runs)
+    assert errors.momentum.max() <= tol.MOMENTUM_OF_A_SMALL_SCENE
+    assert errors.angular_momentum.max() <= tol.MOMENTUM_OF_A_SMALL_SCENE
+    # What is no number is no error of zero.
+    broken = dataclasses.replace(runs[0], states=jax.tree.map(lambda x: x * jnp.nan, runs[0].states))
+    assert np.isnan(nc.balance(system, broken).energy).all()
+
+
+def test_states_after_the_end_are_no_steps():
+    """Of a run with error control that an event ends early, and of its parts."""
+    scene = nc.Scene()
+    scene.add(nc.Gravity())
+    scene.add(nc.RigidBody(mass=1.0, inertia=(0.1, 0.2, 0.3), angular_velocity=(0.1, 9.0, 0.2), name="body"))
+    system, state = scene.compile()
+    run = nc.simulate(system, state, dt=0.1, steps=200, until=lambda s: 0.45 - s.t, rtol=1e-5)
+    assert 5 < run.steps_taken < 200
+    for part in (run, run[:4], run[2:60]):
+        errors = nc.balance(system, part)
+        assert errors.momentum is None and "made in parts or not saved" in errors.note
+
+
+class Anchored(nc.Potential):
+    """Three springs along the axes of the world, which no free pair of bodies knows of."""
+
+    stiffness: float = 5.0
+
+    def invariants(self, x):
+        return x[1] - x[0]
+
+    def energy(self, stretch):
+        return self.stiffness * jnp.array([1.0, 2.0, 3.0]) @ stretch**2
+
+
+def test_what_turns_the_whole_from_within_is_named():
+    scene = nc.Scene()
+    one = scene.add(nc.PointMass(mass=1.0, velocity=(0, 1, 0.3), name="one"))
+    two = scene.add(nc.PointMass(mass=2.0, position=(1, 0, 0), velocity=(0.2, -1, 0), name="two"))
+    scene.add(Anchored((nc.Point(one), nc.Point(two)), name="anchored"))
+    scene.add(Anchored((nc.Point(nc.ground), nc.Point(one)), stiffness=0.0, name="from outside"))
+    with pytest.warns(UserWarning, match="'anchored' turns all bodies .* marker of nc.ground") as said:
+        system, state = scene.compile()
+    assert len(said) == 1
+    run = nc.simulate(system, state, dt=0.05, steps=100)
+    turned = np.linalg.norm(system.angular_momentum(run) - system.angular_momentum(state), axis=1).max()
+    errors = nc.balance(system, run)
+    assert f"'anchored' turns the whole by {turned:.2g} N m s" in errors.note
+    assert errors.angular_momentum.max() > 0.1 and errors.momentum.max() <= tol.MOMENTUM_OF_A_SMALL_SCENE
+
+
+class Skewed(nc.Constraint):
+    """Keeps what the world has of a distance, which no free pair of bodies knows of."""
+
+    multipliers = 1
+
+    def residual(self, x):
+        return (x[1] - x[0])[:1] - 1.0
+
+
+class Wind(nc.Force):
+    """On both of its points, from outside."""
+
+    def load(self, x, rate, inputs, t):
+        return nc.Load(jnp.broadcast_to(jnp.array([0.0, 0.3, 0.0]), x.shape), None)
+
+
+@pytest.mark.slow
+def test_constraints_that_turn_the_whole_are_named_and_loads_are_not():
+    """What a constraint does to all is no reaction of the ground; a load on two points is from outside."""
+    scene = nc.Scene()
+    one = scene.add(nc.PointMass(mass=1.0, velocity=(0, 1, 0.3), name="one"))
+    two = scene.add(nc.PointMass(mass=2.0, position=(1, 0.5, 0), velocity=(0, -1, 0), name="two"))
+    ends = (nc.Point(one), nc.Point(two))
+    scene.add(nc.Spring(ends, stiffness=5.0, length=0.1))
+    scene.add(Skewed(ends, name="skewed"))
+    scene.add(Wind(ends, name="wind"))
+    with pytest.warns(UserWarning, match="'skewed' turns all bodies"):
+        system, state = scene.compile()
+    errors = nc.balance(system, nc.simulate(system, state, dt=0.05, steps=50))
+    assert errors.note.startswith("not conserved: reactions of 'skewed' push or turn the whole")
+    assert "wind" not in errors.note and errors.directions == errors.axes == 3
+    assert errors.momentum.max() <= tol.MOMENTUM_OF_A_SMALL_SCENE and errors.angular_momentum.max() > 1e-3

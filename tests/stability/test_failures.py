@@ -201,3 +201,26 @@ def test_single_precision_is_refused():
     """
     process = subprocess.run([sys.executable, "-c", ASKED], cwd=ROOT, capture_output=True, text=True)
     assert process.returncode == 0, process.stderr[-2000:] + process.stdout
+
+
+@pytest.mark.slow
+def test_a_drive_beyond_a_dead_centre_is_named():
+    """A rod between two slides at right angles, one of them driven as far as the rod is long: no smaller step
+    gets it there."""
+    scene = nc.Scene()
+    places = {"driven": (0.6, 0.0, 0.0), "other": (0.0, 0.8, 0.0)}
+    blocks = [
+        scene.add(nc.RigidBody(mass=1.0, inertia=(0.1, 0.1, 0.1), position=place, name=name))
+        for name, place in places.items()
+    ]
+    slides = [
+        scene.add(nc.Prismatic(nc.ground, b, axis=places[b.name], name=f"slide of {b.name}")) for b in blocks
+    ]
+    scene.add(nc.Rod(tuple(map(nc.Point, blocks)), name="rod"))
+    scene.add(nc.Drive(slides[0], function=lambda t: 0.5 * t, name="drive"))
+    system, state = scene.compile(assemble=True)
+    with pytest.raises(
+        nc.SimulationError, match="'drive' asks for what the mechanism cannot follow"
+    ) as caught:
+        nc.simulate(system, state, dt=0.05, steps=40)
+    assert "smaller dt" not in str(caught.value) and 0.75 < float(caught.value.trajectory.t[-1]) < 0.8

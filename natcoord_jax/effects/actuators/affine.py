@@ -59,6 +59,7 @@ class AffineActuator(CoordinateEffect):
     most: Any = eqx.field(default=jnp.inf, kw_only=True, metadata=is_a(UNBOUNDED))
 
     kind: ClassVar[str] = "affine actuator"
+    on_a_ball: ClassVar[str] = "nc.SphericalTorque"
     inputs: ClassVar[int] = 1
     works: ClassVar[bool] = True
 

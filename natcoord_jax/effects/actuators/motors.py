@@ -70,6 +70,7 @@ class JointForce(CoordinateForce):
     gear: Any = eqx.field(default=1.0, kw_only=True, metadata=is_a(Number()))
 
     kind: ClassVar[str] = "joint force"
+    on_a_ball: ClassVar[str] = "nc.SphericalTorque"
     inputs: ClassVar[int] = 1
 
     def force(self, rate: Array, inputs: Array, t: Array) -> Array:

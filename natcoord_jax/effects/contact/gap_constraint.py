@@ -91,6 +91,10 @@ class GapConstraint(Rubbing):
         """With a mobility, which is found when the masses are known."""
         return replace_fields(self, mobility=jnp.ones(()))
 
+    def quadratic(self, place: Array, rows: Array) -> Array:
+        """The invariants of the gap."""
+        return jnp.ravel(self.gap.invariants(place_markers(place, rows)))
+
     def violation(self, place: Array, rows: Array, coordinates: Array, t: Array) -> Array:
         """How far the surfaces overlap, negative."""
         distance = self.gap.distance(self.gap.invariants(place_markers(place, rows)))

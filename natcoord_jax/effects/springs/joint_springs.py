@@ -39,6 +39,7 @@ class JointSpring(CoordinatePotential):
     rest: Any = eqx.field(default=0.0, kw_only=True, metadata=is_a(Number()))
 
     kind: ClassVar[str] = "joint spring"
+    on_a_ball: ClassVar[str] = "nc.SphericalSpring"
     degree: ClassVar[int | None] = 2
 
     def energy(self, coordinate: Array) -> Array:
@@ -109,6 +110,7 @@ class JointDamper(CoordinateForce):
     damping: Any = eqx.field(kw_only=True, metadata=is_a(DAMPING))
 
     kind: ClassVar[str] = "joint damper"
+    on_a_ball: ClassVar[str] = "nc.SphericalDamper"
 
     def force(self, rate: Array, inputs: Array, t: Array) -> Array:
         """Generalised force against the rate."""
