@@ -5,7 +5,7 @@ elements that can be inside out, then the drives, then, for each instance of an 
 neighbours, pairs of its markers that it has missed, then those it had no room for.
 """
 
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -73,8 +73,8 @@ def _jumps(group: Group, equations: Any) -> Bool[Array, " n"]:
     change, rates = jax.vmap(lambda effect: effect.prescribed(equations.state.t, equations.h))(group.effect)
     low, high = jnp.min(rates, axis=1), jnp.max(rates, axis=1)
     beyond = jnp.abs(change - jnp.clip(change, low, high))
-    jump = jnp.where(beyond > BEYOND * (high - low), beyond, 0.0)
-    angular = all(axis.unit == "rad" for axis in group.effect.axes)
+    jump, relation = jnp.where(beyond > BEYOND * (high - low), beyond, 0.0), cast(Any, group.effect)
+    angular = all(axis.unit == "rad" for axis in relation.axes)
     size = 1.0 if angular else jnp.max(jnp.abs(equations.state.rows[:, 0]))
     return jump > NEGLIGIBLE * size
 
