@@ -29,6 +29,7 @@ from natcoord_jax.model.local_rates import LocalRates
 from natcoord_jax.model.masses import mass_of
 from natcoord_jax.model.model import Structure
 from natcoord_jax.model.rows import rows_with_ground
+from natcoord_jax.reading.admissible import sound
 from natcoord_jax.system import System
 
 
@@ -92,7 +93,7 @@ def build(
     )
     state = replace_fields(layout.state(), contacts=untouched(system))
     system = with_mobilities(jax.tree.map(as_array, with_symmetries(system, state)), state)
-    return system, with_readings(system, state)
+    return sound(system, system), with_readings(system, state)
 
 
 def _drawn(shape: Any) -> Any:

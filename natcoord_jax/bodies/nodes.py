@@ -12,7 +12,7 @@ from natcoord_jax.core.bodies import DIRECTOR, POINT, TRIAD, Body, NodeKind
 from natcoord_jax.core.checks import as_array, is_concrete
 from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.kinds import NAME
-from natcoord_jax.core.numeric import Numbers
+from natcoord_jax.core.numeric import Numbers, Rotations
 from natcoord_jax.maths.vectors import cross, dot
 
 PLACES = Numbers((None, 3))
@@ -135,7 +135,7 @@ class Nodes(eqx.Module):
     @checked(
         "Nodes.triads",
         positions=PLACES,
-        orientations=Numbers(("...", 3, 3)),
+        orientations=Rotations(("...", 3, 3)),
         mass_blocks=Numbers(("...", 4, 4)),
         velocity=VECTORS,
         angular_velocity=VECTORS,

@@ -110,10 +110,6 @@ class Effect(Part):
         """
         return None
 
-    def flaws(self) -> dict[str, Array]:
-        """What may be wrong with its numbers, as the rest of a sentence about it, and whether it is."""
-        return {}
-
     def volume_ratios(
         self, place: Float[Array, "n *place"], rows: Float[Array, "n b 4 3"]
     ) -> Float[Array, " n"] | None:
