@@ -80,7 +80,7 @@ class Declaration:
             if complaint is not None:
                 raise ValueError(self._message(name, kind, complaint, given, label))
 
-    def masked(self, positional: Sequence[Any], named: Mapping[str, Any], bound: int) -> tuple[list, dict]:
+    def masked(self, positional: Sequence[Any], named: Mapping[str, Any], bound: int) -> tuple[tuple, dict]:
         """The arguments of a call, with not a number for what is traced and would be refused otherwise.
 
         Args:
@@ -89,9 +89,8 @@ class Declaration:
             bound: number of the first that are no arguments, as `self`.
         """
         kinds = (*(None,) * bound, *(self.kinds[name] for name in self.order))
-        return [_masked(kind, value) for kind, value in zip(kinds, positional)], {
-            name: _masked(self.kinds[name], value) for name, value in named.items()
-        }
+        listed = tuple(_masked(kind, value) for kind, value in zip(kinds, positional))
+        return listed, {name: _masked(self.kinds[name], value) for name, value in named.items()}
 
     def _check_names(self, positional: Sequence[Any], named: Mapping[str, Any], label: str) -> None:
         by_name = [f"{name}=" for name in self.kinds if name not in self.order]

@@ -41,7 +41,7 @@ def tensor(value: Any, what: str) -> Float[Array, "3 3"]:
     """
     if shape_of(value) == (3,):
         return diagonal(numbers(value, (3,), what, "kg m^2"))
-    return even(numbers(value, (3, 3), what, "kg m^2"), what)
+    return even(numbers(value, (3, 3), what, "kg m^2"), f"{what} [kg m^2]")
 
 
 def even(matrix: Array, what: str) -> Array:

@@ -84,8 +84,8 @@ class Numbers(Kind):
         size = {"": unsigned, "positive": "positive ", "not negative": ""}[self.sign]
         limits = ("above", self.above), ("below", self.below), ("up to", self.most)
         bounds = [f"{word} {limit:g}" for word, limit in limits if limit is not None]
-        bounds = " " + " and ".join(bounds) if bounds else ""
-        rest = (" that is not negative" if self.sign == "not negative" else "") + bounds
+        bounds = [f"that is {self.sign}"] * (self.sign == "not negative") + bounds
+        rest = " " * bool(bounds) + " and ".join(bounds)
         if self.shape == ():
             return f"a {size}number{rest}{self.instead}"
         shape = ", ".join("n" if n is None else str(n) for n in self.shape) + "," * (len(self.shape) == 1)
@@ -105,10 +105,12 @@ class Numbers(Kind):
 
     def misfit(self, values: np.ndarray) -> str | None:
         """What is wrong with numbers of any shape, if something is."""
-        if np.all(self.includes(values)):
+        wrong = np.unique(values[~np.broadcast_to(self.includes(values), values.shape)])
+        if not wrong.size:
             return None
-        finite = np.all(~np.isnan(values) if self.infinite else np.isfinite(values))
-        return f"is {shown(values)}" if finite else f"is not finite: {shown(values)}"
+        finite = np.all(~np.isnan(wrong) if self.infinite else np.isfinite(wrong))
+        wrong = wrong[0] if wrong.size == 1 else wrong
+        return f"is {shown(wrong)}" if finite else f"is not finite: {shown(wrong)}"
 
     def includes(self, values: Any) -> Any:
         """Which of some numbers are in the range; not a number is in none."""
@@ -149,7 +151,7 @@ def masked(value: Any, includes: Callable[[Any], Any]) -> Any:
 
 def Number(sign: str = "", *, infinite: bool = False, instead: str = "", **limits: float) -> Numbers:
     """One number."""
-    return Numbers((), sign, infinite, instead, **limits)
+    return Numbers((), sign, infinite, instead, True, **limits)
 
 
 def Vector(length: int | None = 3) -> Numbers:

@@ -12,7 +12,8 @@ from natcoord_jax.core.numeric import Number
 
 MASS = Choice(("lumped", "consistent"))
 """How elements carry their mass."""
-POISSON = Number(above=-1.0, below=0.5, instead=": at 1/2 no pressure would be enough to change the volume")
+RUBBERY = ", as 0.4999 for rubber: at 1/2 no pressure would be enough to change the volume"
+POISSON = Number(above=-1.0, below=0.5, instead=RUBBERY)
 """Poisson's ratio of shells and solids."""
 SHEAR = 5.0 / 6.0
 """Shear coefficient of a homogeneous plate."""

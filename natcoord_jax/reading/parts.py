@@ -264,7 +264,7 @@ def _principal(array: Array, *, several: bool) -> Array:
     No symmetric matrix is both: its rows would be inertias of no body.
     """
     if array.shape == (3, 3) and several:
-        xp = np if is_concrete(array) else jnp
+        xp: Any = np if is_concrete(array) else jnp
         return xp.where(is_even(xp.asarray(array)), xp.asarray(array)[None], diagonal(array))
     return diagonal(array) if array.ndim == 1 or several else array
 
