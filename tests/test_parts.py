@@ -237,7 +237,8 @@ SKEW[3, 4] = 5.0
 IMPOSSIBLE = [
     ("mass", -1.0), ("mass", np.inf), ("inertia", (1.0, 1.0, 5.0)), ("inertia", (-1.0, 1.0, 1.0)),
     ("second", (0.1, -0.1, 0.1)), ("orientation", 2.0 * np.eye(3)),
-    ("orientation", np.diag([1.0, 1.0, -1.0])), ("axis", (0.0, 0.0, 0.0)), ("stiffness", -1.0), ("stiffness", np.nan), ("length", -1.0),
+    ("orientation", np.diag([1.0, 1.0, -1.0])), ("axis", (0.0, 0.0, 0.0)),
+    ("stiffness", -1.0), ("stiffness", np.nan), ("length", -1.0),
     ("armature", -1.0), ("lower", 3.0), ("lower", np.nan), ("limit", -3.0), ("restitution", 1.5),
     ("restitution", 0.0), ("bounce", 1.1), ("friction", -1.0), ("radius", -0.1), ("normal", (0.0, 0.0, 0.0)),
     ("wall", 0.015), ("nu", 0.9), ("section", SKEW), ("section", -np.abs(SKEW)), ("poisson", 0.5),

@@ -28,8 +28,6 @@ from natcoord_jax.model.grouping import Instance, bare, families
 from natcoord_jax.model.groups import CoordinateGroup
 from natcoord_jax.xla.tracing import at_top_level
 
-JOINT_FIELDS = ("parent", "child", "point", "axis", "second", "name", "parent_point")
-
 
 class Layout:
     """Numbers of everything: bodies along the tree, joints with those of the tree first, channels."""
@@ -149,7 +147,7 @@ class Layout:
             instances.append(
                 Instance(
                     name,
-                    bare(ready, JOINT_FIELDS, f"joint {name!r}"),
+                    bare(ready, ready.assembling, f"joint {name!r}"),
                     "joint",
                     [self.body(joint.parent), self.body(joint.child)],
                     joints=[self.joint_number[name]],

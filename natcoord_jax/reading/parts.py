@@ -1,5 +1,6 @@
 """Numbers of the parts of a system, by name: read, and set in a copy."""
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -194,7 +195,20 @@ def set_numbers(system: SomeModel, part: Names, values: dict[str, Any]) -> SomeM
             leaf, row, _ = found[field]
             leaves[leaf] = _with_row(jnp.asarray(leaves[leaf]), row, value)
         system = _renewed(system, jax.tree.unflatten(structure, leaves), name, set(given))
-        system = without_flaws(sound(system, given), name)
+        system = _with_companions(without_flaws(sound(system, given), name), name, set(given))
+    return system
+
+
+def _with_companions(system: SomeModel, name: str, given: set[str]) -> SomeModel:
+    """The system with the effects that come with a joint, as a pitch relation, by its numbers."""
+    for group in system.joints:
+        if name in group.names and given - {"frames"}:
+            row = group.names.index(name)
+            joint: Any = jax.tree.map(lambda x, row=row: x[row], group.effect)
+            for effect in joint.companions(Handle("joint", name, 0)):
+                fields = {f.name: getattr(effect, f.name) for f in dataclasses.fields(effect)}
+                numbers = {key: value for key, value in fields.items() if eqx.is_inexact_array(value)}
+                system = set_numbers(system, effect.name, numbers)
     return system
 
 
@@ -252,8 +266,9 @@ def _check(name: str, known: list[str], field: str, place: Place | None) -> None
     if field not in known:
         label = repr(name) if place is None else place.kind
         raise ValueError(
-            f"the {label} has no number {field!r}; it has {known}. What a function closes over is not among "
-            "them: change it where it is, the next call sees it"
+            f"the {label} has no number {field!r}; it has {known}. Not among them are what a function closes "
+            "over (change it where it is, the next call sees it) and what only the assembled pose takes, as "
+            "the point and the zero of a joint (change it in the scene, and compile that)"
         )
 
 

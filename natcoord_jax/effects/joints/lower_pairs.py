@@ -83,6 +83,7 @@ class Revolute(Joint):
 
     zero: Any = eqx.field(default=0.0, kw_only=True, metadata=is_a(Number()))
 
+    assembling: ClassVar[tuple[str, ...]] = (*Joint.assembling, "zero")
     kind: ClassVar[str] = "revolute joint"
     multipliers: ClassVar[int] = 5
     rotations: ClassVar[tuple[int, ...]] = (2,)
@@ -152,6 +153,7 @@ class Prismatic(Joint):
 
     zero: Any = eqx.field(default=0.0, kw_only=True, metadata=is_a(Number()))
 
+    assembling: ClassVar[tuple[str, ...]] = (*Joint.assembling, "zero")
     kind: ClassVar[str] = "prismatic joint"
     multipliers: ClassVar[int] = 5
     translations: ClassVar[tuple[int, ...]] = (2,)
@@ -230,6 +232,7 @@ class Distance(Joint):
 
     kind: ClassVar[str] = "distance joint"
     multipliers: ClassVar[int] = 1
+    assembling: ClassVar[tuple[str, ...]] = (*Joint.assembling, "parent_point")
     apart: ClassVar[bool] = True
     coordinates: ClassVar[tuple[Coordinate, ...]] = (Separation(),)
 
