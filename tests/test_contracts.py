@@ -623,6 +623,74 @@ def test_reverse_derivatives_are_transposed_forward_ones(effect):
         assert abs(back - ahead) <= tol.SAME_GRADIENT * abs(ahead)
 
 
+# --- numbers that are set ---------------------------------------------------------------------------------
+
+FEW = (nc.Screw, nc.Revolute, nc.Distance, nc.Coupling, nc.JointStops)
+"""Effects whose numbers the default lane sets; those of all are set in the slow lane."""
+PUSHES = np.array([1.0, 1e3])
+"""Multipliers of contacts that are open, and of such as hold [N s]."""
+UNHEARD = {
+    "overlaps": "mass, of a material without density",
+    "volumes": "mass, of a material without density",
+    "spherical damper 1: weights": "they only say which bodies turn",
+    "skin": "how far contacts are searched",
+    "restitution": "at the end of a step",
+    "regularisation": "of slip much slower than this",
+}
+"""Numbers that do not enter what an effect answers to these motions, and why."""
+
+
+def set_anew(system, part, field, value):
+    """The system with a number that is larger by a twentieth; None if that is refused."""
+    try:
+        return system.set(part, **{field: 1.05 * value + (0.0 if np.any(value) else 0.01)})
+    except ValueError:
+        return None
+
+
+@pytest.mark.parametrize(
+    "effect",
+    [pytest.param(e, marks=() if e in FEW else pytest.mark.slow) for e in TABLE],
+    ids=lambda e: e.__name__,
+)
+def test_every_number_that_is_set_is_heard(effect):
+    """By the forces, constraints or energies of a motion; else it is refused."""
+    system, state, _ = stage(effect)
+    parts = [n for g in (*system.effects, *system.joints) for n in g.names if n]
+    numbers = [
+        (part, field, value)
+        for part in dict.fromkeys([*system.structure.bodies, *parts])
+        for field, value in system.get(part).items()
+        if np.size(value) and np.all(np.isfinite(value))
+    ]
+    changed = [set_anew(system, *number) for number in numbers]
+    heard = [(number, s) for number, s in zip(numbers, changed, strict=True) if s is not None]
+    w, _ = random_motion(effect, 0)
+
+    def seen(system, w, push):
+        u, h = inputs_of(system), jnp.ones(())
+        step = ReducedStep.prepare(system, state, u, h, TABLEAU)
+        at, found = step.stations(step.motion(w[None])[0]), []
+        for group in (*system.effects, *system.joints):
+            lam = push * jnp.ones((group.count, 1, group.multipliers))
+            found.append(
+                respond(group, situation(system, group, state, u, h), gather(group, at), lam, TABLEAU)
+            )
+        moving = replace_fields(state, v=at.rates[0, :-1].reshape(-1, 3))
+        return found, system.energy(moving).kinetic, system.constraint_errors(moving).position
+
+    motions = jax.jit(jax.vmap(jax.vmap(seen, (None, 0, 0)), (0, None, None)))
+    stacked = jax.tree.map(lambda *x: jnp.stack(x), system, *(s for _, s in heard))
+    lanes = [np.asarray(x) for x in jax.tree.leaves(motions(stacked, np.stack([w, -w]), PUSHES))]
+    assert heard
+    silent = [
+        f"{part}: {field}"
+        for k, ((part, field, _), _) in enumerate(heard)
+        if all(np.array_equal(x[0], x[k + 1], equal_nan=True) for x in lanes)
+    ]
+    assert not [x for x in silent if UNHEARD.keys().isdisjoint((x, x.split(": ")[1]))], silent
+
+
 # --- joints -----------------------------------------------------------------------------------------------
 
 

@@ -313,6 +313,22 @@ def test_a_number_that_is_none_ends_the_run():
     assert list(np.asarray(results)) == [int(nc.Result.SUCCESSFUL)] + [int(nc.Result.NONFINITE)] * len(bad)
 
 
+def test_what_only_the_assembled_pose_takes_cannot_be_set(compiled):
+    """The zero of a hinge counts in the state; the pitch of a screw is one of the system, traced too."""
+    with pytest.raises(ValueError, match="hinge' has no number 'zero'.*in the scene, and compile"):
+        compiled[0].set("hinge", zero=0.3)
+    made = nc.Scene()
+    nut = made.add(nc.RigidBody(mass=1.0, inertia=(0.01, 0.01, 0.01), velocity=(0, 0, 0.2 / (2 * np.pi))))
+    made.add(nc.Screw(nc.ground, nut, axis=(0, 0, 1), pitch=0.2, name="screw"))
+    system, _ = made.compile()
+
+    def factor(pitch):
+        return system.set("screw", pitch=pitch).get("screw pitch", "factors")[0]
+
+    value, slope = jax.jit(jax.value_and_grad(factor))(0.4)
+    assert np.allclose([value, slope, factor(0.4)], np.array([-0.4, -1.0, -0.4]) / (2 * np.pi), atol=1e-15)
+
+
 def test_inertias_that_no_body_has_cannot_be_set(compiled):
     """Nor text, nor what is not finite; of three bodies a matrix for all, or rows of principal ones."""
     system, _ = compiled
