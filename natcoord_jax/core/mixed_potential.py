@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.core.potential import Potential, place_markers
 from natcoord_jax.maths.elimination import definite_inverse, definite_solution
+from natcoord_jax.maths.implicit import implicit_root
 
 ITERATIONS = 30
 """Most of Newton's method for the unknowns of an element."""
@@ -38,8 +39,7 @@ class MixedPotential(Potential):
     themselves, so that the equations of the system do not have them; `system.sense` shows them. Energy and
     momenta are kept as by any potential.
 
-    By the rule that derivatives of a stationary value need those of the unknowns to a lower order only, one
-    more step of Newton's method, from the solution, makes first to third derivatives exact.
+    Derivatives of every order are those of the stationary value, by the implicit rule.
 
     Attributes:
         markers: see `nc.Potential`.
@@ -77,21 +77,8 @@ class MixedPotential(Potential):
         return jnp.zeros(self.unknowns, invariants.dtype)
 
     def own_unknowns(self, invariants: Float[Array, " p"]) -> Float[Array, " own"]:
-        """The unknowns, with their derivatives; NaN where none are found, by which a run fails."""
-        still, place = jax.lax.stop_gradient((self, invariants))
-
-        def trip(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-            own, _, count = carry
-            step, reach = still.change(place, own), still.reach(place, own)
-            return own + step, jnp.all(jnp.abs(step) <= SETTLED * (jnp.abs(own) + reach)), count + 1
-
-        def searching(carry: tuple[Array, Array, Array]) -> Array:
-            return ~carry[1] & (carry[2] < ITERATIONS)
-
-        first = still.begun(place), jnp.array(False), jnp.array(0)
-        found, settled, _ = jax.lax.while_loop(searching, trip, first)
-        found = jnp.where(settled, found, jnp.nan)
-        return found + self.change(invariants, found)
+        """The unknowns, differentiable to any order; NaN where none are found, by which a run fails."""
+        return implicit_root(_slope, _stationary, self, invariants)
 
     def change(self, invariants: Float[Array, " p"], own: Float[Array, " own"]) -> Float[Array, " own"]:
         """A step of Newton's method for the unknowns."""
@@ -112,3 +99,25 @@ class MixedPotential(Potential):
         """The unknowns and the energy."""
         invariants = self.invariants(place_markers(place, rows))
         return MixedReadings(self.own_unknowns(invariants), self.energy(invariants))
+
+
+def _slope(own: Array, potential: MixedPotential, invariants: Array) -> Float[Array, " own"]:
+    """What vanishes at the unknowns."""
+    return jax.grad(potential.mixed_energy, 1)(invariants, own)
+
+
+def _stationary(potential: MixedPotential, invariants: Array) -> Float[Array, " own"]:
+    """Newton's method."""
+
+    def trip(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        own, _, count = carry
+        step, reach = potential.change(invariants, own), potential.reach(invariants, own)
+        return own + step, jnp.all(jnp.abs(step) <= SETTLED * (jnp.abs(own) + reach)), count + 1
+
+    def searching(carry: tuple[Array, Array, Array]) -> Array:
+        return ~carry[1] & (carry[2] < ITERATIONS)
+
+    first = potential.begun(invariants), jnp.array(False), jnp.array(0)
+    found, settled, _ = jax.lax.while_loop(searching, trip, first)
+    found = jnp.where(settled, found, jnp.nan)
+    return found + potential.change(invariants, found)

@@ -1,5 +1,6 @@
 """What is the same of all contacts: the law of an overlap, what impacts lose, what a sensor shows."""
 
+from functools import partial
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -13,12 +14,18 @@ from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.effect import Effect, replace_fields
 from natcoord_jax.core.kinds import Choice
 from natcoord_jax.core.numeric import Number
+from natcoord_jax.maths.implicit import implicit_root
 from natcoord_jax.maths.vectors import positive_part, safe_sqrt
 
 HERTZ = "hertz"
 LAW = Choice(("linear", HERTZ))
 NO_GIFT = ": an impact gives nothing"
 RESTITUTION = Number("positive", most=1.0, instead=NO_GIFT)
+
+NEAR = 0.1
+"""Argument up to which a logarithm's remainder is a series: beyond, three digits of sixteen cancel."""
+TERMS = 18
+"""Of that series: the next is below 1e-19."""
 
 
 def damping_of(restitution: Any, speed: Any) -> Array:
@@ -36,24 +43,44 @@ def damping_of(restitution: Any, speed: Any) -> Array:
 
 @eager_numpy
 def _damping(restitution: Array, speed: Array) -> Array:
-    def missing(u: Array) -> Array:
-        # With d = u / e, u in (0, 1): the left side grows beyond all bounds as u does to 1.
-        d = u / restitution
-        return jnp.log1p(d) - jnp.log1p(-u) - d * (1 + restitution)
+    restitution, speed = jnp.broadcast_arrays(restitution, speed)
+    found = jax.vmap(partial(implicit_root, _missing, _bisected))(restitution.reshape(-1))
+    return -jnp.expm1(-found).reshape(restitution.shape) / (restitution * speed)
 
-    # Bisection: positive beyond the root, negative before it, zero at 0; 60 halvings are a double's digits.
-    low, high = jnp.zeros_like(restitution) + 1e-12, jnp.ones_like(restitution) - 1e-15
-    for _ in range(60):
+
+def _missing(w: Float[Array, ""], restitution: Float[Array, ""]) -> Float[Array, ""]:
+    """The logarithm of the equation over d^2, as a function of w = -log(1 - e d).
+
+    Without the root d = 0 and with its digits at both ends: d is 3 (1 - e) / 2 towards e = 1, and 1 - e d no
+    number towards e = 0.
+    """
+    u = -jnp.expm1(-w)
+    d, square = u / restitution, restitution**2
+    near = w < NEAR
+    far = jnp.where(near, 1.0, u)
+    rest = jnp.where(near, _remainder(jnp.where(near, -u, 0.0)), (w - far - 0.5 * far**2) / far**3)
+    return d * _remainder(d) + square * u * rest - 0.5 * (1.0 - restitution) * (1.0 + restitution)
+
+
+def _remainder(x: Array) -> Array:
+    """(log(1 + x) - x + x^2 / 2) / x^3 of x > -1, smooth at zero."""
+    near = jnp.abs(x) < NEAR
+    small, far = jnp.where(near, x, 0.0), jnp.where(near, 1.0, x)
+    series = jnp.polyval(jnp.asarray([(-1.0) ** k / (k + 3) for k in range(TERMS)][::-1]), small)
+    return jnp.where(near, series, (jnp.log1p(far) - far + 0.5 * far**2) / far**3)
+
+
+def _bisected(restitution: Float[Array, ""]) -> Float[Array, ""]:
+    """The root, which is below 1 / e + 1: negative before it, positive beyond; 60 halvings are all digits."""
+
+    def halved(ends: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:
+        low, high = ends
         middle = 0.5 * (low + high)
-        beyond = missing(middle) > 0
-        low, high = jnp.where(beyond, low, middle), jnp.where(beyond, middle, high)
-    # One step of Newton's method gives the root its derivatives.
-    root = jax.lax.stop_gradient(high)
-    slope = 1 / (restitution + root) + 1 / (1 - root) - (1 + restitution) / restitution
-    lossy = restitution < 1
-    change = missing(root) / jnp.where(lossy, slope, 1.0)
-    # Towards 1 the root is 3 (1 - e) / 2.
-    return jnp.where(lossy, (root - change) / restitution, 1.5 * (1 - restitution)) / speed
+        beyond = _missing(middle, restitution) > 0
+        return (jnp.where(beyond, low, middle), jnp.where(beyond, middle, high)), None
+
+    ends = jnp.zeros_like(restitution), 1.0 / restitution + 1.0
+    return jax.lax.scan(halved, ends, None, length=60)[0][0]
 
 
 class ContactReadings(eqx.Module):
