@@ -18,6 +18,7 @@ from natcoord_jax.core.nodes import Clamp
 from natcoord_jax.core.state import State
 from natcoord_jax.mechanics.coordinates import coordinate_values, state_rates
 from natcoord_jax.mechanics.impacts import untouched, with_mobilities
+from natcoord_jax.mechanics.projection import with_sizes
 from natcoord_jax.model.axisymmetric_axes import symmetries
 from natcoord_jax.model.bodies import Bodies
 from natcoord_jax.model.choice import choose_solver, elimination_order
@@ -92,6 +93,7 @@ def build(
         mass_between=between,
     )
     state = replace_fields(layout.state(), contacts=untouched(system))
+    system = with_sizes(system, state)
     system = with_mobilities(jax.tree.map(as_array, with_symmetries(system, state)), state)
     return sound(system, system), with_readings(system, state)
 

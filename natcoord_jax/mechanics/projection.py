@@ -15,14 +15,18 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from natcoord_jax.core.bodies import NODE
+from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.joint import frames_at
+from natcoord_jax.core.potential import place_markers
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.elimination import definite_inverse
 from natcoord_jax.maths.rotations import from_rotation_vector
+from natcoord_jax.maths.vectors import safe_divide, safe_norm, safe_sqrt
 from natcoord_jax.mechanics.coordinates import coordinate_values, velocities_with_ground
 from natcoord_jax.mechanics.violations import constrained, violation_rates_of, violations_of
-from natcoord_jax.model.model import Model
+from natcoord_jax.model.groups import Group
+from natcoord_jax.model.model import Model, SomeModel
 from natcoord_jax.model.rows import group_places, row_rates, rows_with_ground
 
 TWIST = 6
@@ -37,7 +41,11 @@ def inertias(system: Model, rows: Float[Array, "bodies 4 3"]) -> Float[Array, "b
     """
     moment = system.mass[:, 1:, 1:]
     size = jnp.trace(moment, axis1=1, axis2=2)
-    filled = moment + jnp.where(size > 0, 1e-3 * size, 1.0)[:, None, None] * jnp.eye(3)
+    # What has none turns as a mass in a distance of the size of the scene would.
+    none = system.mass[:, 0, 0] * jnp.square(system.size)
+    filled = moment + jnp.where(size > 0, 1e-3 * size, jnp.where(none > 0, none, 1.0))[
+        :, None, None
+    ] * jnp.eye(3)
     mass = system.mass.at[:, 1:, 1:].set(filled)
     moving = _unit_motions(rows)
     return jnp.einsum("bixc,bij,bjxd->bcd", moving, mass, moving)
@@ -76,20 +84,68 @@ def _scattered(block: Float[Array, "n m k6"], bodies: Any, count: int) -> Float[
     return whole.at[instance, row, columns[:, None, :]].add(block, mode="drop").reshape(n * m, -1)
 
 
+def _block(system: Model, group: Group, state: State) -> Float[Array, "n m k6"]:
+    """Derivatives of the rates of the constraints of a group by the twists of their bodies."""
+    return _along_twists(
+        group.effect,
+        group_places(system, group),
+        rows_with_ground(state.q)[group.bodies],
+        state.t,
+        lambda e, place, rows, rates, spin, t: e.violation_rate(place, rows, rates, spin, t, 0.0),
+    )
+
+
 def constraint_matrix(system: Model, state: State) -> Float[Array, "m twists"]:
     """G: derivatives of the rates of all constraints by the twists of the bodies."""
-    rows, count = rows_with_ground(state.q), len(system.structure.bodies)
+    count = len(system.structure.bodies)
     found = [jnp.zeros((0, TWIST * count), state.q.dtype)]
-    for group in constrained(system):
-        block = _along_twists(
-            group.effect,
-            group_places(system, group),
-            rows[group.bodies],
-            state.t,
-            lambda e, place, rows, rates, spin, t: e.violation_rate(place, rows, rates, spin, t, 0.0),
-        )
-        found.append(_scattered(block, group.bodies, count))
+    found += [_scattered(_block(system, g, state), g.bodies, count) for g in constrained(system)]
     return jnp.concatenate(found)
+
+
+def with_sizes(system: SomeModel, state: State) -> SomeModel:
+    """The system with the size of the scene as it is assembled, and with `spans` of its constraints."""
+    spans = _spans(system, state)
+    groups = zip((system.joints, system.effects), spans, strict=True)
+    joints, effects = (tuple(map(_with_spans, own, found)) for own, found in groups)
+    return replace_fields(system, size=_scene_size(system, state), joints=joints, effects=effects)
+
+
+def _with_spans(group: Group, spans: Array | None) -> Group:
+    return group if spans is None else replace_fields(group, spans=spans)
+
+
+@eager_numpy
+def _spans(system: Model, state: State) -> list[list[Array | None]]:
+    def spans(group: Group) -> Array | None:
+        if not group.multipliers:
+            return None
+        if group.effect.unilateral:
+            return jnp.broadcast_to(jnp.array([1.0, 0.0]), (group.count, 1, 2))
+        twists = _block(system, group, state).reshape(group.count, group.multipliers, -1, 2, 3)
+        found = jnp.max(safe_norm(twists), axis=2)
+        return jnp.where(jnp.any(found > 0, axis=-1, keepdims=True), found, 1.0)
+
+    return [[spans(group) for group in groups] for groups in (system.joints, system.effects)]
+
+
+@eager_numpy
+def _scene_size(system: Model, state: State) -> Float[Array, ""]:
+    """Distance of bodies, joints and markers from their middle, with the size of the largest body [m]."""
+    rows = rows_with_ground(state.q)
+    points = [state.rows[:, 0]]
+    if system.joints:
+        points.append(jnp.einsum("jbw,jbwx->jbx", system.frames[:, :, 0], rows[system.joint_bodies]))
+    for group in system.effects:
+        if group.weights is not None:
+            at = jax.vmap(place_markers)(group.weights, rows[group.bodies])
+            is_point = jnp.any(group.weights[..., ::4] != 0, axis=-1, keepdims=True)
+            points.append(jnp.where(is_point, at, state.q[0]))
+    places = jnp.concatenate([x.reshape(-1, 3) for x in points])
+    mass, moment = system.mass[:, 0, 0], jnp.trace(system.mass[:, 1:, 1:], axis1=1, axis2=2)
+    radius = safe_sqrt(safe_divide(moment, mass))
+    size = jnp.max(jnp.abs(places - jnp.mean(places, axis=0))) + jnp.max(radius)
+    return jnp.where(size > 0, size, 1.0)
 
 
 def coordinate_matrix(system: Model, state: State) -> Float[Array, "coordinates twists"]:

@@ -17,7 +17,16 @@ from natcoord_jax.maths.elimination import definite_inverse
 from natcoord_jax.maths.rotations import orthonormalise
 from natcoord_jax.mechanics.coordinates import state_rates
 from natcoord_jax.mechanics.projection import Projection, gap_rates, twists_of
-from natcoord_jax.mechanics.violations import GAP, rate_size, worst_violation
+from natcoord_jax.mechanics.violations import (
+    GAP,
+    constrained,
+    coordinate_sizes,
+    largest,
+    rate_size,
+    relative,
+    violation_rates_of,
+    worst_violation,
+)
 from natcoord_jax.model.model import SYSTEM
 from natcoord_jax.model.rows import row_rates
 from natcoord_jax.stepping.closing import closed
@@ -30,8 +39,8 @@ PASSES = 5
 """Projections of velocities with one inverse."""
 
 ENOUGH = 1e3 * GAP
-"""Rates of constraints [m/s, rad/s, 1/s], per unit of size, up to which velocities obey them. Near singular
-positions no projection leaves less."""
+"""Rates of constraints, relative, up to which velocities obey them: near singular positions no projection
+leaves less."""
 
 
 @briefly
@@ -72,15 +81,22 @@ def with_admissible_velocities(
     """
     twists = twists_of(system, state)
     found = _moving(state, _projected_twists(system, state, twists, None, twists[:0, 0]))
-    allowed = ENOUGH * rate_size(found)
+    groups = constrained(system)
+
+    def missed(state: State) -> Array:
+        return largest(relative(system, groups, violation_rates_of(system, groups, state)))
+
+    # What was there before tells the size of velocities that nothing is left of.
+    allowed = ENOUGH * (rate_size(system, state) + missed(state) + rate_size(system, found))
     if state.held is not None:
         wanted = state_rates(system, state) if rates is None else rates
         holding = _moving(state, _projected_twists(system, state, twists, state.held[1], wanted))
-        missed = state.held[1] * (state_rates(system, holding) - wanted)
-        held = _most(gap_rates(system, holding)) <= allowed
-        held = held & (_most(missed) <= ENOUGH * (1.0 + _most(wanted)))
+        sizes = coordinate_sizes(system)
+        lost = state.held[1] * (state_rates(system, holding) - wanted) / sizes
+        held = missed(holding) <= allowed + ENOUGH * _most(wanted / sizes)
+        held = held & (_most(lost) <= allowed + ENOUGH * _most(wanted / sizes))
         found = jax.tree.map(lambda x, y: jnp.where(held, x, y), holding, found)
-    code = jnp.where(_most(gap_rates(system, found)) <= allowed, int(Result.SUCCESSFUL), int(Result.SINGULAR))
+    code = jnp.where(missed(found) <= allowed, int(Result.SUCCESSFUL), int(Result.SINGULAR))
     return replace_fields(found, rates=_rotor_rates(system, found)), code
 
 
