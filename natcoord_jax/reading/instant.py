@@ -107,7 +107,7 @@ class Saddle(eqx.Module):
 
 
 def scales(system: Model) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Mass of a typical body [kg], and its squared radius of gyration [m^2] (of points the size of the scene)."""
+    """Mass of a typical body [kg], and its squared radius of gyration [m^2]; of points the scene's size."""
     masses = system.mass[:, 0, 0]
     moment = jnp.sum(jnp.trace(system.mass[:, 1:, 1:], axis1=1, axis2=2))
     radius = moment / jnp.sum(masses)
