@@ -190,14 +190,14 @@ def CircularSection(*, radius: Any, E: Any, nu: Any = 0.3, density: Any, shear: 
         >>> import natcoord_jax as nc
         >>> rope = nc.CircularSection(radius=0.01, E=1e6, density=1000.0)
     """
-    r, nu = positive(radius, "section: radius", "m"), as_array(nu, float)
+    r, nu = positive(radius, "section: radius", "m"), POISSON.masked(as_array(nu, float))
     return _elastic(_circle(r, nu, shear), E, nu, density)
 
 
 @eager_numpy
 def _circle(r: Array, nu: Array, shear: Any) -> Shaped:
     area, second = jnp.pi * r**2, jnp.pi * r**4 / 4
-    k = 6 * (1 + nu) / (7 + 6 * nu) if shear is None else jnp.asarray(shear, float)
+    k = 6 * (1 + nu) / (7 + 6 * nu) if shear is None else SIZE.masked(jnp.asarray(shear, float))
     return area, second, 2 * second, k, _ellipse(r, r)
 
 
@@ -225,7 +225,7 @@ def TubularSection(
     if is_concrete(r, t) and float(t) > float(r):
         raise ValueError(f"section: thickness [m] is {float(t):g}, more than the radius {float(r):g}")
     r, t = masked(r, lambda r: t <= r), masked(t, lambda t: t <= r)
-    nu = as_array(nu, float)
+    nu = POISSON.masked(as_array(nu, float))
     return _elastic(_tube(r, t, nu, shear), E, nu, density)
 
 
@@ -233,10 +233,12 @@ def TubularSection(
 def _tube(r: Array, t: Array, nu: Array, shear: Any) -> Shaped:
     inner = r - t
     ratio = (inner / r) ** 2
-    area, second = jnp.pi * (r**2 - inner**2), jnp.pi * (r**4 - inner**4) / 4
+    # (Of a thin wall a difference of squares would have few digits.)
+    area = jnp.pi * t * (r + inner)
+    second = area * (r**2 + inner**2) / 4
     part = (1 + ratio) ** 2
     cowper = 6 * (1 + nu) * part / ((7 + 6 * nu) * part + (20 + 12 * nu) * ratio)
-    k = cowper if shear is None else jnp.asarray(shear, float)
+    k = cowper if shear is None else SIZE.masked(jnp.asarray(shear, float))
     return area, second, 2 * second, k, _ellipse(r, r)
 
 
@@ -261,7 +263,7 @@ def RectangularSection(
         ValueError: for numbers that no section has.
     """
     b, h = positive(width, "section: width", "m"), positive(height, "section: height", "m")
-    nu = as_array(nu, float)
+    nu = POISSON.masked(as_array(nu, float))
     return _elastic(_rectangle(b, h, nu, shear), E, nu, density)
 
 
@@ -274,6 +276,6 @@ def _rectangle(b: Array, h: Array, nu: Array, shear: Any) -> Shaped:
     odd = jnp.arange(1.0, 40.0, 2.0)
     series = jnp.sum(jnp.tanh(0.5 * odd * jnp.pi * long / short) / odd**5)
     torsion = long * short**3 / 3 * (1 - 192 / jnp.pi**5 * short / long * series)
-    k = 10 * (1 + nu) / (12 + 11 * nu) if shear is None else jnp.asarray(shear, float)
+    k = 10 * (1 + nu) / (12 + 11 * nu) if shear is None else SIZE.masked(jnp.asarray(shear, float))
     corners = jnp.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
     return area, second, torsion, k, 0.5 * corners * jnp.stack([b, h])

@@ -3,7 +3,8 @@
 A public function says by `checked` what its arguments are; a part (an effect, a joint, the shape of a body)
 says it of its fields, `metadata=is_a(Number())`. A call with something else ends in an error that names the
 part, the argument with its unit, what was given and what to pass. Units are read from the docstring. What is
-traced has no value yet: its shape is looked at, and a number that would be refused becomes not a number.
+traced has no value yet: its shape is looked at, and a number of a part that would be refused becomes not a
+number.
 """
 
 import dataclasses
@@ -80,18 +81,6 @@ class Declaration:
             if complaint is not None:
                 raise ValueError(self._message(name, kind, complaint, given, label))
 
-    def masked(self, positional: Sequence[Any], named: Mapping[str, Any], bound: int) -> tuple[tuple, dict]:
-        """The arguments of a call, with not a number for what is traced and would be refused otherwise.
-
-        Args:
-            positional: arguments by position.
-            named: arguments by name.
-            bound: number of the first that are no arguments, as `self`.
-        """
-        kinds = (*(None,) * bound, *(self.kinds[name] for name in self.order))
-        listed = tuple(_masked(kind, value) for kind, value in zip(kinds, positional))
-        return listed, {name: _masked(self.kinds[name], value) for name, value in named.items()}
-
     def _check_names(self, positional: Sequence[Any], named: Mapping[str, Any], label: str) -> None:
         by_name = [f"{name}=" for name in self.kinds if name not in self.order]
         if len(positional) > len(self.order):
@@ -118,10 +107,6 @@ class Declaration:
         ]
         hint = f" (`{swapped[0]}` got one: are the two swapped?)" if swapped else ""
         return f"{label}: {name}{unit} {complaint}; pass {kind.wanted}{hint}"
-
-
-def _masked(kind: Kind | None, value: Any) -> Any:
-    return value if kind is None else kind.masked(value)
 
 
 def require(part: Any, name: str, kind: Kind) -> None:
@@ -182,8 +167,6 @@ def checked(label: str | None = None, /, **kinds: Kind) -> Callable[[F], F]:
             part = named.get("name")
             said = f"{name} {part!r}" if isinstance(part, str) else name
             declaration.check(positional[1:] if bound else positional, named, said)
-            if not at_top_level():
-                positional, named = declaration.masked(positional, named, int(bound))
             return function(*positional, **named)
 
         DECLARATIONS[call] = declaration
@@ -249,7 +232,8 @@ class Part(eqx.Module):
             return
         wrong = reduce(operator.or_, traced, False)
         for field in dataclasses.fields(self):
-            value = _masked(field.metadata.get(DECLARED), getattr(self, field.name))
+            kind, value = field.metadata.get(DECLARED), getattr(self, field.name)
+            value = value if kind is None else kind.masked(value)
             object.__setattr__(self, field.name, masked(value, lambda x: ~wrong) if traced else value)
 
     def flaws(self) -> dict[str, Any]:

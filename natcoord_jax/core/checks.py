@@ -1,4 +1,4 @@
-"""Checks of concrete numbers; traced ones pass, because they have no values yet."""
+"""Checks of numbers: concrete ones are refused, traced ones have no values yet and become not a number."""
 
 import dataclasses
 import re
@@ -69,7 +69,7 @@ def _array(value: Any, kind: Numbers, what: str, unit: str) -> Array:
     complaint = kind.complaint(value)
     if complaint is not None:
         raise ValueError(f"{what} [{unit}] {complaint}; pass {kind.wanted}")
-    return as_array(value, float)
+    return kind.masked(as_array(value, float))
 
 
 def check_fields(module: Any, label: str) -> None:
@@ -112,7 +112,7 @@ def equations(found: Any, part: Any, method: str) -> Any:
 
 
 def positive(value: Any, what: str, unit: str) -> Array:
-    """Value as a positive finite scalar.
+    """Value as a positive finite scalar; one that is traced and is none becomes not a number.
 
     Raises:
         ValueError: naming part, quantity, unit and remedy.
