@@ -116,8 +116,8 @@ def Direction(body: Handle | NodeSet, vector: Any, *, local: bool = False) -> Ma
 
     Args:
         body: handle returned by `Scene.add`, or `ground`; or some nodes of a set that have directors.
-        vector: shape (3,) [-], in world coordinates of the assembled pose; its length is kept. Of nodes their
-            weights [-].
+        vector: shape (3,) [-], in world coordinates of the assembled pose. Its length is kept for effects of
+            one's own; the library's, and all gaps, take only where it points. Of nodes their weights [-].
         local: take `vector` in the body's reference frame instead.
 
     Raises:

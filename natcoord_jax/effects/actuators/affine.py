@@ -107,6 +107,7 @@ class WrenchInput(Force):
     upper: Any = eqx.field(default=jnp.inf, kw_only=True, metadata=is_a(UNBOUNDED))
 
     kind: ClassVar[str] = "wrench input"
+    unit_directions: ClassVar[bool] = True
     inputs: ClassVar[int] = 1
 
     def flaws(self) -> dict[str, Any]:
@@ -138,6 +139,7 @@ class SphericalTorque(Force):
     upper: Any = eqx.field(default=jnp.inf, kw_only=True, metadata=is_a(UNBOUNDED))
 
     kind: ClassVar[str] = "spherical torque"
+    unit_directions: ClassVar[bool] = True
     inputs: ClassVar[int] = 1
 
     def flaws(self) -> dict[str, Any]:

@@ -42,6 +42,7 @@ class Rolling(VelocityConstraint):
     radius: Any = eqx.field(kw_only=True, metadata=is_a(Number("positive")))
 
     kind: ClassVar[str] = "rolling"
+    unit_directions: ClassVar[bool] = True
     multipliers: ClassVar[int] = 3
 
     def rate(self, x: Array, velocity: Array, spin: Array) -> Array:

@@ -50,6 +50,7 @@ class Rubbing(Effect):
     phase: Any = eqx.field(default=None, init=False)
 
     unilateral: ClassVar[bool] = True
+    unit_directions: ClassVar[bool] = True
     impulsive: ClassVar[bool] = True
     works: ClassVar[bool] = True
     silent: ClassVar[bool] = False
