@@ -105,10 +105,10 @@ def constraint_matrix(system: Model, state: State) -> Float[Array, "m twists"]:
 
 def with_sizes(system: SomeModel, state: State) -> SomeModel:
     """The system with the size of the scene as it is assembled, and with `spans` of its constraints."""
-    spans = _spans(system, state)
+    size, spans = _sizes(system, state)
     groups = zip((system.joints, system.effects), spans, strict=True)
     joints, effects = (tuple(map(_with_spans, own, found)) for own, found in groups)
-    return replace_fields(system, size=_scene_size(system, state), joints=joints, effects=effects)
+    return replace_fields(system, size=size, joints=joints, effects=effects)
 
 
 def _with_spans(group: Group, spans: Array | None) -> Group:
@@ -116,7 +116,7 @@ def _with_spans(group: Group, spans: Array | None) -> Group:
 
 
 @eager_numpy
-def _spans(system: Model, state: State) -> list[list[Array | None]]:
+def _sizes(system: Model, state: State) -> tuple[Array, list[list[Array | None]]]:
     def spans(group: Group) -> Array | None:
         if not group.multipliers:
             return None
@@ -126,10 +126,11 @@ def _spans(system: Model, state: State) -> list[list[Array | None]]:
         found = jnp.max(safe_norm(twists), axis=2)
         return jnp.where(jnp.any(found > 0, axis=-1, keepdims=True), found, 1.0)
 
-    return [[spans(group) for group in groups] for groups in (system.joints, system.effects)]
+    every = [[spans(group) for group in groups] for groups in (system.joints, system.effects)]
+    # What is compared with them has no derivatives by them.
+    return jax.lax.stop_gradient((_scene_size(system, state), every))
 
 
-@eager_numpy
 def _scene_size(system: Model, state: State) -> Float[Array, ""]:
     """Distance of bodies, joints and markers from their middle, with the size of the largest body [m]."""
     rows = rows_with_ground(state.q)
@@ -144,7 +145,7 @@ def _scene_size(system: Model, state: State) -> Float[Array, ""]:
     places = jnp.concatenate([x.reshape(-1, 3) for x in points])
     mass, moment = system.mass[:, 0, 0], jnp.trace(system.mass[:, 1:, 1:], axis1=1, axis2=2)
     radius = safe_sqrt(safe_divide(moment, mass))
-    size = jnp.max(jnp.abs(places - jnp.mean(places, axis=0))) + jnp.max(radius)
+    size = jnp.max(safe_norm(places - jnp.mean(places, axis=0))) + jnp.max(radius)
     return jnp.where(size > 0, size, 1.0)
 
 

@@ -42,9 +42,12 @@ ASIDE = {
     nc.AffineActuator: "its length is a sum of an angle and a displacement",
     nc.NonlinearBeamElement: "its law is one of numbers without unit",
     nc.PointOnPlane: "it does not start in the plane",
+    nc.PointOnLine: "it does not start on the line",
+    nc.PointOnPoint: "it repeats what the joint holds, which is found out outside of jit only",
+    nc.PointSum: "it repeats what the joint holds, which is found out outside of jit only",
     nc.Rolling: "it does not start on the plane",
 }
-FEW = (nc.Rod, nc.JointSpring)
+FEW = (nc.Rod,)
 SOME = (
     nc.Spring,
     nc.Screw,
@@ -192,3 +195,132 @@ def test_units_of_length_time_and_mass(effect):
     for lane in lanes:
         off = np.abs(lane - lane[0]).reshape(len(OTHERS), -1).max(axis=1) / max(1.0, np.abs(lane[0]).max())
         assert off.max() <= tol.SAME_TRAJECTORY, off
+
+
+# --- what lengths are compared with -----------------------------------------------------------------------
+
+LENGTHS = np.array([1.0, 1e-1, 1e-3, 1e-4, 1e-6, 1e3])
+
+
+def rolling(length, com):
+    """A ball on an incline, rolling and turning, by its size."""
+    scene, radius, spin = nc.Scene(), 0.1 * length, np.array((3.0, -2.0, 1.0))
+    scene.add(nc.Gravity(vector=length * np.array((1.0, 0.5, -9.81))))
+    start = {"position": radius * np.array([0, 0, 1]), "velocity": radius * np.cross(spin, (0, 0, 1))}
+    inertia = 1.6 * radius**2 * np.ones(3)
+    ball = nc.RigidBody(mass=4.0, inertia=inertia, com=length * com, **start, angular_velocity=spin)
+    ball = scene.add(ball)
+    table = nc.Point(nc.ground), nc.Direction(nc.ground, (0, 0, 1))
+    scene.add(nc.Rolling((*table, nc.Point(ball)), radius=radius, name="rolling"))
+    return *scene.compile(), ball
+
+
+def test_accelerations_of_what_rolls_do_not_know_its_size():
+    """Of a uniform ball 5/7 of the pull; of one that is not what it has at one metre."""
+
+    def acceleration(length, com):
+        system, state, ball = rolling(length, com)
+        return system.sense(state, ball).acceleration / length
+
+    places = np.array([(0.0, 0.0, 0.0), (0.02, 0.01, -0.015)])
+    found = np.asarray(jax.jit(jax.vmap(jax.vmap(acceleration, (None, 0)), (0, None)))(LENGTHS, places))
+    assert np.abs(found[:, 0] - 5 / 7 * np.array((1.0, 0.5, 0.0))).max() <= 1e-13
+    assert np.abs(found[:, 1] - found[0, 1]).max() <= 1e-13
+
+
+def loop(length):
+    """A parallelogram of three bars."""
+    scene, upright = nc.Scene(), np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    places = ((0, 0, 0), upright), ((0, 1, 0), np.eye(3)), ((1, 0, 0), upright)
+    bars = [
+        scene.add(
+            nc.RigidBody(
+                mass=1.0,
+                inertia=length**2 * np.array((0.1, 0.2, 0.2)),
+                com=length * np.array((0.5, 0, 0)),
+                position=length * np.array(place, float),
+                orientation=frame,
+            )
+        )
+        for place, frame in places
+    ]
+    pairs = ((nc.ground, 0, (0, 0, 0)), (0, 1, (0, 1, 0)), (1, 2, (1, 1, 0)), (nc.ground, 2, (1, 0, 0)))
+    hinges = [
+        scene.add(
+            nc.Revolute(one if one is nc.ground else bars[one], bars[two], point=length * np.array(at, float))
+        )
+        for one, two, at in pairs
+    ]
+    return *scene.compile(), hinges[0]
+
+
+@pytest.mark.parametrize(
+    "length", [1e-6, pytest.param(1.0, marks=pytest.mark.slow), pytest.param(1e4, marks=pytest.mark.slow)]
+)
+def test_a_loop_that_is_open_by_part_of_its_size_is_refused(length):
+    """By 1e-4 of it, at any size; what a loose tolerance leaves is not."""
+    system, state, hinge = loop(length)
+    with pytest.raises(ValueError, match="violates joint"):
+        nc.simulate(system, system.with_coordinate(state, hinge, 1e-4), dt=0.01, steps=1)
+    closed = nc.assemble(system, system.with_coordinate(state, hinge, 0.3))
+    assert float(system.coordinate(closed, hinge)) == pytest.approx(0.3, abs=1e-12)
+    assert float(system.constraint_errors(closed).joints) <= 1e-14 * max(1.0, length)
+
+
+@pytest.mark.slow
+def test_located_impacts_do_not_know_lengths_and_times():
+    """A ball that is thrown on a floor with friction, from tens of nanometres to kilometres."""
+
+    def flight(length, time):
+        scene = nc.Scene()
+        scene.add(nc.Gravity(vector=-10.0 * length / time**2 * np.array([0, 0, 1])))
+        start = {
+            "position": 0.153 * length * np.array([0, 0, 1]),
+            "velocity": length / time * np.array([1, 0, 0]),
+        }
+        shape = nc.Sphere(0.1 * length)
+        ball = scene.add(nc.RigidBody(shape=shape, density=1e3 / length**3, **start, name="ball"))
+        scene.add(nc.Contact(ball, nc.Plane(), restitution=0.8, friction=0.3, name="floor"))
+        system, state = scene.compile()
+        system = system.set("floor", regularisation=1e-5 * length / time)
+        run = nc.simulate(system, state, dt=0.01 * time, steps=60, scheme=nc.EnergyMomentum(max_events=8))
+        return run.result, system.sense(run, ball).position / length
+
+    lengths, times = np.array([(1, 1), (1e-3, 1), (1e-6, 1e-3), (1e-8, 1), (1e3, 1e2)]).T
+    codes, places = map(np.asarray, jax.jit(jax.vmap(flight))(lengths, times))
+    assert not codes.any()
+    assert np.abs(places - places[0]).max() <= 1e-11
+    assert places[0][30:, 2].max() >= 0.11, "it does not rebound: nothing is tested"
+
+
+def test_of_normals_only_their_direction_counts():
+    """Of two or half the length: constraints, gaps and forces are the same."""
+    for size in (1.0, 2.0, 0.5):
+        scene, normal = nc.Scene(), (nc.Point(nc.ground), nc.Direction(nc.ground, (0, 0, size)))
+        moving = {"velocity": (1.0, 0, 0), "angular_velocity": (0, 2.0, 0)}
+        wheel = scene.add(nc.RigidBody(shape=nc.Sphere(0.5), density=1.0, position=(0, 0, 0.5), **moving))
+        scene.add(nc.Rolling((*normal, nc.Point(wheel)), radius=0.5))
+        bead = scene.add(nc.PointMass(mass=1.0, position=(3, 0, 1.0)))
+        scene.add(nc.PointOnPlane((*normal, nc.Point(bead)), distance=1.0))
+        ball = scene.add(nc.PointMass(mass=1.0, position=(5, 0, 0.4), name="ball"))
+        scene.add(
+            nc.GapPotential((*normal, nc.Point(ball)), nc.SphereOnPlane(radius=0.5), stiffness=1.0, name="c")
+        )
+        scene.add(nc.BodyForceInput((nc.Point(ball), normal[1]), name="push"))
+        system, state = scene.compile()
+        assert np.allclose(state.v[0], (1.0, 0.0, 0.0), atol=1e-12)
+        assert float(system.sense(state, "c").gap) == pytest.approx(-0.1, abs=1e-12)
+        pushed, rest = (system.instant(state, inputs=[u]).accelerations for u in (1.0, 0.0))
+        row = 4 * system.body_index("ball")
+        assert np.allclose((pushed - rest)[row], (0, 0, 1.0), atol=1e-12)
+
+
+def test_a_ball_rolls_on_its_plane():
+    """One that starts above it would go on rolling there."""
+    scene = nc.Scene()
+    ball = scene.add(nc.RigidBody(shape=nc.Sphere(0.5), density=1.0, position=(0, 0, 0.6)))
+    table = nc.Point(nc.ground), nc.Direction(nc.ground, (0, 0, 1))
+    scene.add(nc.Rolling((*table, nc.Point(ball)), radius=0.5, name="roll"))
+    with pytest.raises(ValueError, match="'roll' by 0.1 m"):
+        scene.compile()
+    assert float(scene.compile(assemble=True)[1].q[0, 2]) == pytest.approx(0.5, abs=1e-12)
