@@ -282,7 +282,6 @@ def test_located_impacts_do_not_know_lengths_and_times():
         ball = scene.add(nc.RigidBody(shape=shape, density=1e3 / length**3, **start, name="ball"))
         scene.add(nc.Contact(ball, nc.Plane(), restitution=0.8, friction=0.3, name="floor"))
         system, state = scene.compile()
-        system = system.set("floor", regularisation=1e-5 * length / time)
         run = nc.simulate(system, state, dt=0.01 * time, steps=60, scheme=nc.EnergyMomentum(max_events=8))
         return run.result, system.sense(run, ball).position / length
 

@@ -51,7 +51,8 @@ class GapConstraint(Rubbing):
         gap: between the surfaces, as `nc.SphereOnPlane(radius=0.1)`, or one of your own, see `nc.Gap`.
         restitution: part of the closing speed that is left after an impact [-], from 0 to 1.
         friction: coefficient mu [-]; None: there is none.
-        regularisation: eps [m/s].
+        regularisation: eps [m/s]; None: 3e-6 of the speed that gravity gives along the size of the scene, and
+            of the fastest body at the start.
         compliance: speed with which it gives way, in terms of that which its impulse makes [-]. Some 1e-9
             lets contacts that depend on each other, as the corners of a box, share a load evenly, where it
             would be left to the rounding of their places which of them carry it.
