@@ -256,4 +256,4 @@ def _followed(
     states, lams = jax.lax.stop_gradient((states, lams))
     if with_derivatives:
         states, lams = jax.vmap(lambda s, lam: differentiable(system, s, lam, inputs(s.t)))(states, lams)
-    return Equilibrium(states, lams, codes, counts)
+    return Equilibrium(states, lams, codes, counts, jnp.zeros(codes.shape, bool))

@@ -24,6 +24,8 @@ from natcoord_jax.core.compiled import briefly
 from natcoord_jax.core.kinds import FLAG
 from natcoord_jax.core.numeric import COMPONENTS, Vector, Whole
 from natcoord_jax.core.state import STATE, State
+from natcoord_jax.maths.projectors import pseudo_inverse, range_projector
+from natcoord_jax.maths.spectrum import spectrum
 from natcoord_jax.maths.vectors import cross
 from natcoord_jax.mechanics.equations_of_motion import loads, relative_rates, rotors_of, with_rest
 from natcoord_jax.mechanics.momentum import inertia, wrench
@@ -134,50 +136,46 @@ class _Steady(eqx.Module):
         return matrix
 
 
-def _reactions(steady: _Steady, rows: Array, size: int) -> tuple[Array, Array]:
-    """Multipliers that carry the steady state, and what they leave unbalanced."""
-    still = jnp.zeros(size)
-    missing = steady.forces(still, still)
-    if not rows.shape[0]:
-        return steady.lam, missing
-    # Equilibrated, so that forces and torques count alike; redundant reactions of least norm.
-    lam = jnp.linalg.lstsq(rows.T, missing)[0]
-    return lam, missing - rows.T @ lam
-
-
 def _matrices(steady: _Steady, rows: Array, size: int) -> tuple[Array, Array, Array, Array, Array, Array]:
     """M, D, K in the null space of the constraints, the null space, and the unbalanced and largest forces."""
-    lam, left = _reactions(steady, rows, size)
-    steady = eqx.tree_at(lambda s: s.lam, steady, lam)
-    still = jnp.zeros(size)
+    still, free = jnp.zeros(size), jnp.eye(size)
+    left = steady.forces(still, still)
+    if rows.shape[0]:
+        # Multipliers carry the steady state; redundant ones have the least norm.
+        dofs = steady.system.structure.dofs
+        onto = range_projector(rows.T, size - dofs)
+        lam = pseudo_inverse(rows.T, onto, size - dofs) @ left
+        left = left - rows.T @ lam
+        steady = eqx.tree_at(lambda s: s.lam, steady, lam)
+        # Any basis will do: one that is held, as far as the constraints admit it, follows them.
+        basis = jnp.linalg.svd(jax.lax.stop_gradient(rows), full_matrices=True)[2][size - dofs :].T
+        free = basis - onto @ basis
     stiffness = jax.jacfwd(steady.forces, argnums=0)(still, still)
     damping = jax.jacfwd(steady.forces, argnums=1)(still, still)
-    free = jnp.eye(size)
-    if rows.shape[0]:
-        vectors = jnp.linalg.svd(rows, full_matrices=True)[2]
-        free = vectors[size - steady.system.structure.dofs :].T
     mass, damping, reduced = (free.T @ x @ free for x in (steady.mass_matrix(), damping, stiffness))
     scale = jnp.maximum(jnp.max(jnp.abs(stiffness)) * 1e-6, 1e-300)
     return mass, damping, reduced, free, jnp.max(jnp.abs(free.T @ left)), scale
 
 
+@briefly
 def _undamped(mass: Array, stiffness: Array) -> tuple[Array, Array]:
     """Eigenvalues and shapes of M x'' + K x = 0 with symmetric K."""
     lower = jnp.linalg.cholesky(mass)
     half = jax.scipy.linalg.solve_triangular(lower, 0.5 * (stiffness + stiffness.T), lower=True)
     whole = jax.scipy.linalg.solve_triangular(lower, half.T, lower=True)
-    squares, vectors = jnp.linalg.eigh(0.5 * (whole + whole.T))
+    squares, vectors = spectrum(0.5 * (whole + whole.T), True)
     shapes = jax.scipy.linalg.solve_triangular(lower.T, vectors, lower=False).T
     root = jnp.sqrt(jnp.where(squares == 0, 1.0, jnp.abs(squares))) * (squares != 0)
     return jnp.where(squares < 0, root + 0j, 1j * root), shapes.astype(complex)
 
 
+@briefly
 def _damped(mass: Array, damping: Array, stiffness: Array) -> tuple[Array, Array]:
     """All eigenvalues of the quadratic problem and their shapes."""
     count = mass.shape[0]
     both = jnp.linalg.solve(mass, jnp.concatenate([stiffness, damping], axis=1))
     top = jnp.concatenate([jnp.zeros((count, count)), jnp.eye(count)], axis=1)
-    values, vectors = jnp.linalg.eig(jnp.concatenate([top, -both]))
+    values, vectors = spectrum(jnp.concatenate([top, -both]), False)
     return values, vectors[:count].T
 
 
@@ -213,13 +211,17 @@ def modes(
         inputs: input channels [N, N m]; default zero.
         damped: whether dampers, rotation or loads that follow the motion make the problem unsymmetric;
             default: found out from the numbers, and False inside jit. Undamped frequencies are more accurate
-            and differentiable on every backend; the others need the CPU.
+            and run on every backend; the others need the CPU.
 
     Returns:
-        The slowest modes first. Rigid motions have s = 0, to round-off of the stiffest mode.
+        The slowest modes first. Rigid motions have s = 0, to round-off of the stiffest mode. Differentiable
+        in every mode and order, the pose included. Frequencies that coincide have derivatives in forward
+        mode where a change does not split them; in reverse mode those functions have one that depend on all
+        of them alike, as their mean. What has none is NaN within jit, and raises in an eager call.
 
     Raises:
         ValueError: for a state that is not steady, or a motion without inertia.
+        DerivativeError: for a derivative of frequencies that a change splits, outside of jit.
 
     Example:
         >>> import jax; jax.config.update("jax_enable_x64", True)

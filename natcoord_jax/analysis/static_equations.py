@@ -34,7 +34,7 @@ from natcoord_jax.mechanics.start_cache import StartCache
 from natcoord_jax.mechanics.violations import violations_of
 from natcoord_jax.model.groups import Group
 from natcoord_jax.model.local_rates import TWIST
-from natcoord_jax.model.rows import row_rates
+from natcoord_jax.model.rows import group_places, row_rates
 from natcoord_jax.model.tree import gather_slots, start_rates
 from natcoord_jax.system import System
 
@@ -161,8 +161,11 @@ class Static(eqx.Module):
         step = FullStep.prepare(
             system, here, self.inputs, jnp.ones((), y.dtype), gauss(1), StartCache(None, None)
         )
-        # Times of a step of length one, shifted to that of the load.
-        situations = tuple(eqx.tree_at(lambda s: s.t, where, where.t - 0.5) for where in step.situations)
+        # Times of a step of length one, shifted to that of the load; fields act on masses as they are.
+        situations = tuple(
+            replace_fields(where, t=where.t - 0.5, place=group_places(self.system, group))
+            for group, where in zip(step.groups, step.situations, strict=True)
+        )
         step = eqx.tree_at(lambda s: s.situations, step, situations)
         resting = y.at[: self.balances].set(0.0)
         every, products = step.matrices(resting, exact=False), step.products(resting)
@@ -184,15 +187,19 @@ class Static(eqx.Module):
             An object with `solve(right)` and `transpose()`.
         """
         (given, products), sparsity = self.matrices(y, weight), self.system.sparsity
+        if sparsity is None or self.unknowns <= DENSE:
+            return self.inverse(dense(self.system, given, self.unknowns, products=products))
         pulls = (jnp.max(jnp.abs(x[:, w:, :w]), initial=1e-300) for x, w in zip(given, self._widths))
         arms = functools.reduce(jnp.maximum, pulls)
-        if sparsity is not None and self.unknowns > DENSE:
-            matrix: Any = sparsity.pattern.assemble(*given)
-            found = factorised(sparsity.plan, matrix.with_diagonal(self._shifts(matrix.diagonal(), arms)))
-            for product in products:
-                found = product.around(found)
-            return found
-        matrix = dense(self.system, given, self.unknowns, products=products)
+        matrix: Any = sparsity.pattern.assemble(*given)
+        found = factorised(sparsity.plan, matrix.with_diagonal(self._shifts(matrix.diagonal(), arms)))
+        for product in products:
+            found = product.around(found)
+        return found
+
+    def inverse(self, matrix: Float[Array, "unknowns unknowns"]) -> Inverse:
+        """Inverse of the Jacobian, slightly regularised."""
+        arms = jnp.max(jnp.abs(matrix[self.balances :, : self.balances]), initial=1e-300)
         return Inverse(pivoted_inverse(matrix + jnp.diag(self._shifts(jnp.diagonal(matrix), arms))))
 
     def _shifts(self, diagonal: Float[Array, " unknowns"], arms: Array) -> Float[Array, " unknowns"]:

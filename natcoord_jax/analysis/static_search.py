@@ -36,6 +36,8 @@ class Search(eqx.Module):
     """Where Newton's iteration stands.
 
     Of the inertia added to the stiffness, `weight` [1/s^2] is what is added, `heaviest` what it begins with.
+    `first` is the correction along the tangent; where a later one is larger, or the search has gone downhill,
+    it has `snapped`: what it ends at need not be on the path that it began on.
     """
 
     state: State
@@ -43,8 +45,10 @@ class Search(eqx.Module):
     weight: Array
     heaviest: Array
     correction: Array
+    first: Array
     count: Array
     done: Array
+    snapped: Array
 
 
 def extent_of(system: System, state: State) -> Array:
@@ -60,12 +64,12 @@ def largest(system: System, change: Float[Array, " balances"], extent: Array) ->
     return moved / extent, turned
 
 
-def search_equilibrium(system: System, state: State, lam: Array, inputs: Array) -> Search:
+def search_equilibrium(system: System, state: State, lam: Array, inputs: Array, snap: bool = True) -> Search:
     """Newton's method from a configuration and multipliers; every iteration counts from where it is.
 
     Where it fails, it begins again with inertia added to the stiffness, which keeps corrections short and
     leads downhill, to a stable equilibrium, as time steps with all velocities forgotten would; the inertia
-    fades as corrections do (pseudo-transient continuation).
+    fades as corrections do (pseudo-transient continuation). Without `snap` it ends there.
     """
     extent = extent_of(system, state)
 
@@ -94,13 +98,19 @@ def search_equilibrium(system: System, state: State, lam: Array, inputs: Array) 
         lost = ~slowed & ~done & (~finite | (search.count + 1 >= ITERATIONS))
         now, pulls = jax.tree.map(lambda a, b: jnp.where(lost, a, b), (state, lam), after)
         weight = jnp.where(lost, heaviest, weight)
-        return Search(now, pulls, weight, heaviest, correction, search.count + 1, done)
+        first = jnp.where(search.count == 0, correction, search.first)
+        snapped = search.snapped | lost | (correction > jnp.maximum(first, FLOOR))
+        return Search(now, pulls, weight, heaviest, correction, first, search.count + 1, done, snapped)
 
-    nought = jnp.zeros(())
-    start = Search(state, lam, nought, nought, nought, jnp.array(0), jnp.array(False))
-    return jax.lax.while_loop(lambda s: ~s.done & (s.count < ITERATIONS + DOWNHILL), trip, start)
+    def going(search: Search) -> Array:
+        return ~search.done & (search.count < ITERATIONS + DOWNHILL) & (snap | ~search.snapped)
+
+    nought, no = jnp.zeros(()), jnp.array(False)
+    start = Search(state, lam, nought, nought, nought, nought, jnp.array(0), no, no)
+    return jax.lax.while_loop(going, trip, start)
 
 
 def code_of_search(search: Search) -> Array:
     """Whether it came to an end."""
-    return jnp.where(search.done, int(Result.SUCCESSFUL), int(Result.MAX_ITERATIONS))
+    failed = jnp.where(search.snapped, int(Result.DIVERGED), int(Result.MAX_ITERATIONS))
+    return jnp.where(search.done, int(Result.SUCCESSFUL), failed)

@@ -1,13 +1,15 @@
 """Equilibrium under loads: by steps of the load, or along its path through limit points."""
 
+import warnings
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
 
-from natcoord_jax.analysis.static_equations import Static
+from natcoord_jax.analysis.static_equations import DENSE, Static
 from natcoord_jax.analysis.static_search import code_of_search, search_equilibrium
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.checks import at_top_level, is_concrete
@@ -41,12 +43,16 @@ class Equilibrium(eqx.Module):
         multipliers: of relations between coordinates and of all joints [N, N m], by load.
         result: result code (see `nc.Result`), by load.
         iterations: of Newton's method, by load.
+        snapped: whether Newton's method left the path of the loads before, by load: a correction was larger
+            than that along the tangent, or it failed and the configuration was let downhill. What is found is
+            an equilibrium, but may be one of another branch.
     """
 
     states: State
     multipliers: Float[Array, "loads m"]
     result: Int[Array, " loads"]
     iterations: Int[Array, " loads"]
+    snapped: Bool[Array, " loads"]
 
     @property
     def state(self) -> State:
@@ -60,17 +66,20 @@ def differentiable(system: System, state: State, lam: Array, inputs: Array) -> t
     fixed = jax.lax.stop_gradient(replace_fields(state, t=jnp.zeros_like(state.t)))
     static = Static(system, replace_fields(fixed, t=state.t), inputs)
     at = jax.lax.stop_gradient(jnp.concatenate([jnp.zeros(static.balances), lam]))
-    # It only helps to solve: its derivatives must not reach the root's rule.
-    solver = jax.lax.stop_gradient(static.solver(at))
 
     def tangent_solve(linear: Any, right: Array) -> Array:
+        # The Jacobian itself where it is small; nearly so of large meshes, whose formulas leave parts out.
+        if static.unknowns <= DENSE:
+            solver: Any = static.inverse(jax.jacfwd(linear)(jnp.zeros_like(right)))
+        else:
+            solver = jax.lax.stop_gradient(static).solver(at)
         return refined_solve(
             linear,
             right,
             solver,
             lambda near, b: near.solve(b),
             lambda near, b: near.transpose().solve(b),
-            rounds=3,
+            rounds=None,
         )
 
     y = jax.lax.custom_root(lambda y: static.residual(y), at, lambda f, start: start, tangent_solve)
@@ -83,6 +92,7 @@ def differentiable(system: System, state: State, lam: Array, inputs: Array) -> t
     loads=Number() | Vector(None),
     inputs=INPUTS_OF_LOAD,
     steps=Whole(1),
+    snap=FLAG,
     throw=FLAG,
 )
 def equilibrium(
@@ -92,12 +102,14 @@ def equilibrium(
     *,
     inputs: Any = None,
     steps: int = 10,
+    snap: bool = True,
     throw: bool = True,
 ) -> Equilibrium:
     """Equilibrium at a series of loads, each found by Newton's method from the one before.
 
     Where Newton's method fails, the configuration is let downhill to a stable equilibrium, which may be far
-    away: a shallow arch snaps through, a cable falls into its sag.
+    away: a shallow arch snaps through, a cable falls into its sag. `snapped` tells at which loads the path
+    may have been left, and an eager call warns of those after the first.
 
     The load parameter is the time of the state: forces, torques and drives that are functions of time are
     taken at it. Loads that are constant (gravity, say) act in full from the first load on.
@@ -108,6 +120,7 @@ def equilibrium(
         loads: values of the load parameter, increasing or not; one number: `steps` equal parts of it.
         inputs: function of the load parameter to the input channels, or their values [N, N m]; default zero.
         steps: number of loads where one number is given.
+        snap: False: end with `nc.Result.DIVERGED` at the first load at which Newton's method leaves the path.
         throw: raise in an eager call if there is no convergence.
 
     Returns:
@@ -137,7 +150,14 @@ def equilibrium(
     if values.ndim == 0:
         values = values * jnp.arange(1, steps + 1) / steps
     given = _inputs_at(system, inputs, values)
-    found = _equilibria(system, state, values, given, not at_top_level(system, state, values, given))
+    found = _equilibria(system, state, values, given, snap, not at_top_level(system, state, values, given))
+    if is_concrete(found.result) and bool(jnp.any(found.snapped[1:] & (found.result[1:] == 0))):
+        left = [f"{value:.6g}" for value in np.asarray(values)[1:][np.asarray(found.snapped)[1:]]]
+        warnings.warn(
+            f"equilibrium: Newton's method left the path at the load parameter {', '.join(left)}: what was "
+            f"found there may be on another branch (`snapped`); {GROWING}, or pass snap=False to stop there",
+            stacklevel=3,
+        )
     if throw and is_concrete(found.result):
         for number, code in enumerate(found.result):
             if int(code) != Result.SUCCESSFUL:
@@ -182,7 +202,7 @@ def _inputs_at(system: System, inputs: Any, values: Array) -> Float[Array, "load
 
 @briefly
 def _equilibria(
-    system: System, state: State, values: Array, inputs: Array, with_derivatives: bool
+    system: System, state: State, values: Array, inputs: Array, snap: bool, with_derivatives: bool
 ) -> Equilibrium:
     # What gives the results their derivatives takes longer to trace than the search, and is left out where
     # nothing asks for it.
@@ -195,19 +215,21 @@ def _equilibria(
         value, u = load
         # Loads belong to the search as well; `differentiable` is given them again.
         begin = replace_fields(now, t=jax.lax.stop_gradient(value))
-        search = search_equilibrium(still[0], begin, lam, jax.lax.stop_gradient(u))
+        search = search_equilibrium(still[0], begin, lam, jax.lax.stop_gradient(u), snap)
         code = code_of(still[0], search.state, code_of_search(search))
         code = jnp.where(alive, code, int(Result.DIVERGED))
         good = code == int(Result.SUCCESSFUL)
         reached = jax.tree.map(lambda a, b: jnp.where(good, a, b), (search.state, search.lam), (now, lam))
-        return (*reached, good), (*reached, code, search.count)
+        return (*reached, good), (*reached, code, search.count, search.snapped & alive)
 
     start = replace_fields(still[1], v=jnp.zeros_like(state.v), rates=jnp.zeros_like(state.rates))
     lam = jnp.zeros(static.unknowns - static.balances)
-    _, (states, lams, codes, counts) = jax.lax.scan(one, (start, lam, jnp.array(True)), (values, inputs))
+    _, (states, lams, codes, counts, snapped) = jax.lax.scan(
+        one, (start, lam, jnp.array(True)), (values, inputs)
+    )
     # Results of the search: their derivatives are those of the equations that they solve, below.
     states, lams = jax.lax.stop_gradient((states, lams))
     states = replace_fields(states, t=values)
     if with_derivatives:
         states, lams = jax.vmap(lambda s, lam, u: differentiable(system, s, lam, u))(states, lams, inputs)
-    return Equilibrium(states, lams, codes, counts)
+    return Equilibrium(states, lams, codes, counts, snapped)

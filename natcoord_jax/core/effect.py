@@ -271,6 +271,14 @@ class Effect(Part):
         """Their rates, linear in velocities of the rows, angular velocities and how time passes (1 or 0)."""
         return jnp.zeros(0)
 
+    def opening(self, place: Array, rows: Float[Array, "k 4 3"], coordinates: Array, t: Array) -> Array:
+        """The violation, or what is none even where that vanishes in a pose which is not the effect's."""
+        return self.violation(place, rows, coordinates, t)
+
+    def opening_slope(self, place: Array, rows: Array, rates: Array, spin: Array, t: Array) -> Array:
+        """How the opening changes at a fixed time, by what a state is assembled."""
+        return self.violation_rate(place, rows, rates, spin, t, 0.0)
+
     def violation_units(self, place: Array, rows: Float[Array, "k 4 3"]) -> tuple[str, ...]:
         """Their units: "m", "rad", or "-" for cosines."""
         return ()

@@ -17,7 +17,7 @@ def implicit_root(
     """Root x of residual(x, *parameters), as `search(*parameters)` finds it.
 
     The rule x' = -(d residual / d x)^-1 (residual)' is applied to the root itself, so that derivatives of x'
-    are exact again, in every mode. A step of Newton's method after the search would be exact to first order.
+    are exact again, in every mode. A step of Newton's method after the search is exact to first order only.
 
     Args:
         residual: function of the module level; as many components as x, with a quasi-definite Jacobian.

@@ -7,6 +7,7 @@ and cosines compare. Where constraints depend on each other, or where one of the
 damping mu in G M^-1 G^T + mu decides (Levenberg 1944, Marquardt 1963).
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -32,23 +33,50 @@ from natcoord_jax.model.rows import group_places, row_rates, rows_with_ground
 TWIST = 6
 """Components of a twist."""
 
+SHARE = 1e-3
+"""Of the inertia of a body, about axes where it has none, for how a gap is shared."""
 
-def inertias(system: Model, rows: Float[Array, "bodies 4 3"]) -> Float[Array, "bodies 6 6"]:
-    """Inertia of every body against its twist, made regular.
+SLACK = 1e-9
+"""The same for velocities, which do not depend on it: each pass leaves that part of what has no inertia."""
 
-    Ideal rods get a small inertia about their axis, and nodes without rotary inertia one like that of a
-    point mass; these only weigh how a gap is shared.
+
+def fills(system: Model, share: float) -> Float[Array, "bodies 6"]:
+    """What is added to the inertias against twists, so that all are regular: nothing but against turns.
+
+    Ideal rods have no inertia about their axis, and nodes may have none at all: these get a share of that of
+    the body with the most.
     """
-    moment = system.mass[:, 1:, 1:]
-    size = jnp.trace(moment, axis1=1, axis2=2)
-    # What has none turns as a mass in a distance of the size of the scene would.
-    none = system.mass[:, 0, 0] * jnp.square(system.size)
-    filled = moment + jnp.where(size > 0, 1e-3 * size, jnp.where(none > 0, none, 1.0))[
-        :, None, None
-    ] * jnp.eye(3)
-    mass = system.mass.at[:, 1:, 1:].set(filled)
+    size = jnp.trace(system.mass[:, 1:, 1:], axis1=1, axis2=2)
+    most = jnp.max(size, initial=0.0)
+    size = jnp.where(size > 0, size, jnp.where(most > 0, most, 1.0))
+    return share * size[:, None] * jnp.asarray([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])
+
+
+def mobility(
+    system: Model, rows: Float[Array, "bodies 4 3"], fill: Float[Array, "bodies 6"]
+) -> Callable[[Float[Array, "twists *m"]], Float[Array, "twists *m"]]:
+    """Twists of the bodies from impulses on them, (M + fill)^-1."""
     moving = _unit_motions(rows)
-    return jnp.einsum("bixc,bij,bjxd->bcd", moving, mass, moving)
+    inertias = jnp.einsum("bixc,bij,bjxd->bcd", moving, system.mass, moving)
+    inertias = inertias + jax.vmap(jnp.diag)(fill)
+    count, between = rows.shape[0], system.mass_between
+    if between is None:
+        inverse = jax.vmap(definite_inverse)(inertias)
+
+        def by_body(impulses: Array) -> Array:
+            parts = impulses.reshape(count, TWIST, *impulses.shape[1:])
+            return jnp.einsum("bcd,bd...->bc...", inverse, parts).reshape(impulses.shape)
+
+        return by_body
+    one, other = between.bodies.T
+    first, second = moving[one, : between.rows], moving[other, : between.rows]
+    blocks = jnp.einsum("pixc,pij,pjxd->pcd", first, between.blocks, second)
+    every = jnp.zeros((count, count, TWIST, TWIST), rows.dtype)
+    every = every.at[jnp.arange(count), jnp.arange(count)].add(inertias)
+    every = every.at[one, other].add(blocks).at[other, one].add(jnp.swapaxes(blocks, 1, 2))
+    size = count * TWIST
+    whole = definite_inverse(jnp.swapaxes(every, 1, 2).reshape(size, size))
+    return lambda impulses: whole @ impulses
 
 
 def _unit_motions(rows: Float[Array, "*n 4 3"]) -> Float[Array, "*n 4 3 6"]:
@@ -84,14 +112,14 @@ def _scattered(block: Float[Array, "n m k6"], bodies: Any, count: int) -> Float[
     return whole.at[instance, row, columns[:, None, :]].add(block, mode="drop").reshape(n * m, -1)
 
 
-def _block(system: Model, group: Group, state: State) -> Float[Array, "n m k6"]:
-    """Derivatives of the rates of the constraints of a group by the twists of their bodies."""
+def _block(system: Model, group: Group, state: State, slope: Any) -> Float[Array, "n m k6"]:
+    """Derivatives of what the constraints of a group have as `slope` by the twists of their bodies."""
     return _along_twists(
         group.effect,
         group_places(system, group),
         rows_with_ground(state.q)[group.bodies],
         state.t,
-        lambda e, place, rows, rates, spin, t: e.violation_rate(place, rows, rates, spin, t, 0.0),
+        slope,
     )
 
 
@@ -99,7 +127,10 @@ def constraint_matrix(system: Model, state: State) -> Float[Array, "m twists"]:
     """G: derivatives of the rates of all constraints by the twists of the bodies."""
     count = len(system.structure.bodies)
     found = [jnp.zeros((0, TWIST * count), state.q.dtype)]
-    found += [_scattered(_block(system, g, state), g.bodies, count) for g in constrained(system)]
+    found += [
+        _scattered(_block(system, g, state, lambda e, *at: e.opening_slope(*at)), g.bodies, count)
+        for g in constrained(system)
+    ]
     return jnp.concatenate(found)
 
 
@@ -122,7 +153,9 @@ def _sizes(system: Model, state: State) -> tuple[Array, list[list[Array | None]]
             return None
         if group.effect.unilateral:
             return jnp.broadcast_to(jnp.array([1.0, 0.0]), (group.count, 1, 2))
-        twists = _block(system, group, state).reshape(group.count, group.multipliers, -1, 2, 3)
+        twists = _block(system, group, state, lambda e, *at: e.violation_rate(*at, 0.0)).reshape(
+            group.count, group.multipliers, -1, 2, 3
+        )
         found = jnp.max(safe_norm(twists), axis=2)
         return jnp.where(jnp.any(found > 0, axis=-1, keepdims=True), found, 1.0)
 
@@ -186,12 +219,12 @@ class Projection(eqx.Module):
             state: whose directors are orthonormal.
             held: coordinates that are constraints as well, where it is 1; None: there are none.
         """
-        matrix = constraint_matrix(system, state)
-        if held is not None:
-            matrix = jnp.concatenate([matrix, held[:, None] * coordinate_matrix(system, state)])
-        inverse = jax.vmap(definite_inverse)(inertias(system, state.rows))
-        by_body = matrix.reshape(matrix.shape[0], inverse.shape[0], TWIST)
-        impulses = jnp.einsum("bcd,mbd->bcm", inverse, by_body).reshape(matrix.shape[::-1])
+        matrix = constraints(system, state, held)
+        return cls.scaled(matrix, mobility(system, state.rows, fills(system, SHARE))(matrix.T))
+
+    @classmethod
+    def scaled(cls, matrix: Float[Array, "m twists"], impulses: Float[Array, "twists m"]) -> "Projection":
+        """Constraints in units of their energy."""
         stiffness = jnp.einsum("mt,tm->m", matrix, impulses)
         scale = jnp.sqrt(jnp.where(stiffness > 0, stiffness, 1.0))
         return cls(matrix / scale[:, None], impulses / scale, scale)
@@ -199,6 +232,16 @@ class Projection(eqx.Module):
     def damped(self, damping: Array | float) -> Float[Array, "m m"]:
         """The damped matrix of the constraints."""
         return self.matrix @ self.impulses + damping * jnp.eye(self.scale.shape[0])
+
+
+def constraints(
+    system: Model, state: State, held: Float[Array, " coordinates"] | None
+) -> Float[Array, "m twists"]:
+    """Derivatives of the rates of all constraints, and of coordinates that are held."""
+    matrix = constraint_matrix(system, state)
+    if held is None:
+        return matrix
+    return jnp.concatenate([matrix, held[:, None] * coordinate_matrix(system, state)])
 
 
 def gaps(
@@ -251,4 +294,11 @@ def twists_of(system: Model, state: State) -> Float[Array, "bodies 6"]:
     rigid = jnp.concatenate([v[:, 0], spin[:-1]], axis=1)
     rest = v - row_rates(rows, rigid[:, :3], rigid[:, 3:])
     pushed = jnp.einsum("bixc,bij,bjx->bc", _unit_motions(rows), system.mass, rest)
-    return rigid + jnp.einsum("bcd,bd->bc", jax.vmap(definite_inverse)(inertias(system, rows)), pushed)
+    alone = replace_fields(system, mass_between=None)
+    return rigid + mobility(alone, rows, fills(system, SLACK))(pushed.reshape(-1)).reshape(pushed.shape)
+
+
+def moving(state: State, twists: Float[Array, "bodies 6"]) -> State:
+    """The state with velocities from the twists of its bodies."""
+    rates = row_rates(state.rows, twists[:, :3], twists[:, 3:])
+    return replace_fields(state, v=rates.reshape(-1, 3))

@@ -60,12 +60,21 @@ def refuse_contacts(system: Model, what: str) -> None:
         )
 
 
-def violations_of(system: Model, groups: tuple[Group, ...], state: State) -> list[Float[Array, "n m"]]:
-    """Violations of the constraints of some groups."""
+def violations_of(
+    system: Model, groups: tuple[Group, ...], state: State, measure: str = "opening"
+) -> list[Float[Array, "n m"]]:
+    """Violations of the constraints of some groups.
+
+    Args:
+        system: compiled system.
+        groups: with constraints.
+        state: whose.
+        measure: "opening", which tells joints that are turned round, or "violation".
+    """
     rows, found = rows_with_ground(state.q), []
     for group in groups:
         given = group_places(system, group), rows[group.bodies], state.coordinates[group.coordinates]
-        found.append(jax.vmap(lambda e, *x: e.violation(*x, state.t))(group.effect, *given))
+        found.append(jax.vmap(lambda e, *x: getattr(e, measure)(*x, state.t))(group.effect, *given))
     return found
 
 
@@ -151,7 +160,7 @@ def is_open(system: Model, state: State) -> Bool[Array, ""]:
     Those that are not numbers miss nothing: the first step finds them.
     """
     groups = (*(g for g in constrained(system) if not g.in_tree), *contacts(system))
-    found = relative(system, groups, violations_of(system, groups, state))
+    found = relative(system, groups, violations_of(system, groups, state, "violation"))
     return largest(found) > LEFT_OPEN * position_size(system, state)
 
 

@@ -1,5 +1,6 @@
 """From one system to another in the middle of a motion: joints that close, and joints that open."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -9,8 +10,8 @@ from natcoord_jax.core.checks import is_concrete
 from natcoord_jax.core.compiled import briefly
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import STATE, State
+from natcoord_jax.mechanics.admissible_velocities import with_admissible_velocities
 from natcoord_jax.mechanics.coordinates import state_rates
-from natcoord_jax.mechanics.tangent_space import TangentSpace, Velocity
 from natcoord_jax.mechanics.violations import residuals
 from natcoord_jax.model.model import SYSTEM, Model, SomeModel
 from natcoord_jax.model.rows import rows_with_ground
@@ -107,21 +108,17 @@ def _transferred(system: Model, state: State, into: SomeModel, onto: State | Non
 
 def _after_impact(system: Model, into: Model, moved: State, closes: Bool[Array, ""]) -> State:
     """The state with velocities that the joints admit, if any closes."""
-    rates = _rotor_rates(system, into, moved) if into.structure.rotors else moved.rates
-    found = TangentSpace.at(into, moved).projected(Velocity(moved.row_rates, rates))
-    v = jnp.where(closes, found.rows.reshape(moved.v.shape), moved.v)
-    return replace_fields(moved, v=v, rates=jnp.where(closes, found.rotors, moved.rates))
+    found = with_admissible_velocities(into, moved, _rates_before(system, into, moved))[0]
+    return jax.tree.map(lambda x, y: jnp.where(closes, x, y), found, moved)
 
 
-def _rotor_rates(system: Model, into: Model, moved: State) -> Float[Array, " rotors"]:
-    """Stored rates before the impact: of new rotors those of their coordinates."""
-    known = set(rotor_names(system))
-    every, rates = state_rates(into, moved), moved.rates
+def _rates_before(system: Model, into: Model, moved: State) -> Float[Array, " coordinates"]:
+    """Rates of the coordinates before the impact, those that the rotors of both have had included."""
+    known, rates = set(rotor_names(system)), state_rates(into, moved)
     for group in into.effects:
         if group.effect.rotors:
-            fresh = np.array([name not in known for name in group.names])
-            at, on = group.rotors[fresh, 0], group.coordinates[fresh, 0]
-            rates = rates.at[at].set(every[on])
+            stored = np.array([name in known for name in group.names])
+            rates = rates.at[group.coordinates[stored, 0]].set(moved.rates[group.rotors[stored, 0]])
     return rates
 
 

@@ -14,11 +14,12 @@ from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.results import Result
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import gauss
+from natcoord_jax.mechanics.admissible_velocities import with_admissible_velocities
 from natcoord_jax.mechanics.reduced import ReducedStep, active_groups
 from natcoord_jax.mechanics.redundancy import held_multipliers
 from natcoord_jax.mechanics.violations import GAP, LEFT_OPEN, constrained, misses, worst_violation
 from natcoord_jax.reading.diagnostics import unknown_name
-from natcoord_jax.stepping.assemble import with_admissible_positions, with_admissible_velocities
+from natcoord_jax.stepping.assemble import with_admissible_positions
 from natcoord_jax.system import System
 
 UNTOLD = 1e-12

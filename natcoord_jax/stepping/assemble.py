@@ -13,34 +13,14 @@ from natcoord_jax.core.compiled import briefly
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.results import REASONS, Result, SimulationError
 from natcoord_jax.core.state import STATE, State
-from natcoord_jax.maths.elimination import definite_inverse
 from natcoord_jax.maths.rotations import orthonormalise
+from natcoord_jax.mechanics.admissible_velocities import with_admissible_velocities
 from natcoord_jax.mechanics.coordinates import state_rates
-from natcoord_jax.mechanics.projection import Projection, gap_rates, twists_of
-from natcoord_jax.mechanics.violations import (
-    GAP,
-    constrained,
-    coordinate_sizes,
-    largest,
-    rate_size,
-    relative,
-    violation_rates_of,
-    worst_violation,
-)
+from natcoord_jax.mechanics.projection import moving, twists_of
+from natcoord_jax.mechanics.violations import GAP, worst_violation
 from natcoord_jax.model.model import SYSTEM
-from natcoord_jax.model.rows import row_rates
 from natcoord_jax.stepping.closing import closed
 from natcoord_jax.system import System
-
-DAMPING = 1e-14
-"""Of velocities, see `Projection`; what it leaves is projected again."""
-
-PASSES = 5
-"""Projections of velocities with one inverse."""
-
-ENOUGH = 1e3 * GAP
-"""Rates of constraints, relative, up to which velocities obey them: near singular positions no projection
-leaves less."""
 
 
 @briefly
@@ -60,75 +40,7 @@ def with_admissible_positions(system: System, state: State) -> tuple[State, Arra
     state = replace_fields(state, q=squared)
     twists = twists_of(system, state)
     found, code = closed(system, replace_fields(state, v=jnp.zeros_like(state.v)))
-    return _moving(found, twists), code
-
-
-def _moving(state: State, twists: Array) -> State:
-    """The state with velocities from the twists of its bodies."""
-    rates = row_rates(state.rows, twists[:, :3], twists[:, 3:])
-    return replace_fields(state, v=rates.reshape(-1, 3))
-
-
-def with_admissible_velocities(
-    system: System, state: State, rates: Array | None = None
-) -> tuple[State, Array]:
-    """State whose velocities, projected in the metric of the mass, obey the constraints; a result code.
-
-    Args:
-        system: compiled system.
-        state: its positions obey the constraints.
-        rates: of all joint coordinates, kept where `state.held` says so; None: those of the state.
-    """
-    twists = twists_of(system, state)
-    found = _moving(state, _projected_twists(system, state, twists, None, twists[:0, 0]))
-    groups = constrained(system)
-
-    def missed(state: State) -> Array:
-        return largest(relative(system, groups, violation_rates_of(system, groups, state)))
-
-    # What was there before tells the size of velocities that nothing is left of.
-    allowed = ENOUGH * (rate_size(system, state) + missed(state) + rate_size(system, found))
-    if state.held is not None:
-        wanted = state_rates(system, state) if rates is None else rates
-        holding = _moving(state, _projected_twists(system, state, twists, state.held[1], wanted))
-        sizes = coordinate_sizes(system)
-        lost = state.held[1] * (state_rates(system, holding) - wanted) / sizes
-        held = missed(holding) <= allowed + ENOUGH * _most(wanted / sizes)
-        held = held & (_most(lost) <= allowed + ENOUGH * _most(wanted / sizes))
-        found = jax.tree.map(lambda x, y: jnp.where(held, x, y), holding, found)
-    code = jnp.where(missed(found) <= allowed, int(Result.SUCCESSFUL), int(Result.SINGULAR))
-    return replace_fields(found, rates=_rotor_rates(system, found)), code
-
-
-def _projected_twists(
-    system: System, state: State, twists: Array, held: Array | None, wanted: Array
-) -> Array:
-    """Twists nearest to the given ones that obey the constraints, with those rates held that are."""
-    start = _moving(state, twists)
-    linear = Projection.of(system, state, held)
-    rates = [gap_rates(system, start)]
-    rates += [] if held is None else [held * (state_rates(system, start) - wanted)]
-    scaled = jnp.concatenate(rates) / linear.scale
-    inverse = definite_inverse(linear.damped(DAMPING))
-    change = jnp.zeros(linear.matrix.shape[1], scaled.dtype)
-    for _ in range(PASSES):
-        change = change - linear.impulses @ (inverse @ (scaled + linear.matrix @ change))
-    return twists + change.reshape(twists.shape)
-
-
-def _most(x: Array) -> Array:
-    return jnp.max(jnp.abs(x), initial=0.0)
-
-
-def _rotor_rates(system: System, state: State) -> Array:
-    """Rates of the joint coordinates that carry rotors."""
-    if not state.rates.shape[0]:
-        return state.rates
-    every, rates = state_rates(system, state), state.rates
-    for group in system.effects:
-        if group.effect.rotors:
-            rates = rates.at[group.rotors[:, 0]].set(every[group.coordinates[:, 0]])
-    return rates
+    return moving(found, twists), code
 
 
 @checked(system=SYSTEM, state=STATE)

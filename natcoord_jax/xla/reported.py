@@ -63,7 +63,9 @@ class Passage:
                 f"{self.where}: a derivative is not a number, though what it is of went well: linearised "
                 "equations cannot be solved there, or a function in them has no derivative. Look for a "
                 "position where constraints depend on each other, and for sqrt, norms, quotients and `where` "
-                "at zero in laws and functions of your own; or start a little beside. Within jit it is NaN"
+                "at zero in laws and functions of your own; or start a little beside. Frequencies that "
+                "coincide have none where a change splits them; in reverse mode, functions of them need the "
+                "same slope by each, as their mean has. Within jit it is NaN"
             )
         self.entering = first
 

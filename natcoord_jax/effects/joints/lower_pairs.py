@@ -3,6 +3,7 @@
 from typing import Any, ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
@@ -11,7 +12,7 @@ from natcoord_jax.core.checks import positive
 from natcoord_jax.core.coordinate import Coordinate
 from natcoord_jax.core.effect import Effect, replace_fields
 from natcoord_jax.core.handles import Handle
-from natcoord_jax.core.joint import Frame, Joint
+from natcoord_jax.core.joint import Frame, Joint, frames_at
 from natcoord_jax.core.numeric import COMPONENTS, Number
 from natcoord_jax.effects.joints.coordinates import Angle, Displacement, Separation, UniversalAngle
 from natcoord_jax.effects.joints.relations import Coupling
@@ -31,7 +32,46 @@ def _orientation(parent: Frame, child: Frame) -> list[Array]:
     return [dot(first, third), dot(second, third), dot(first, moving)]
 
 
-class Fixed(Joint):
+def _tilt(parent: Frame, child: Frame) -> tuple[Array, Array]:
+    """The sine of the angle between the third axes along `_axis_parallel`, and its cosine."""
+    return jnp.stack(_axis_parallel(parent, child)), dot(parent.axes[2], child.axes[2])
+
+
+def _turn(parent: Frame, child: Frame) -> tuple[Array, Array]:
+    """The same of the angle between the triads, along `_orientation`."""
+    r = parent.axes @ child.axes.T
+    sine = 0.5 * jnp.stack([r[0, 2] - r[2, 0], r[1, 2] - r[2, 1], r[0, 1] - r[1, 0]])
+    return sine, 0.5 * (jnp.trace(r) - 1.0)
+
+
+class Facing(Joint):
+    """Base of joints whose axes point the same way, which constraints that are products do not tell.
+
+    Class attributes:
+        turn: sine, along the last constraints, and cosine of the angle between the frames.
+    """
+
+    turn: ClassVar[Any] = staticmethod(_tilt)
+
+    def opening(self, place: Array, rows: Array, coordinates: Array, t: Array) -> Array:
+        """The residual; beyond 90 degrees the angle instead of its sine, which vanishes at 180 as well.
+
+        There all directions are alike, and one is as good as another.
+        """
+        parent, child = frames_at(place, rows)
+        residual, (sine, cosine) = self.residual(parent, child), self.turn(parent, child)
+        beyond, size, count = cosine < 0, safe_norm(sine), sine.shape[0]
+        some = size > 0
+        along = jnp.where(some, sine / jnp.where(some, size, 1.0), jnp.eye(count)[0])
+        angle = jnp.arctan2(size, jnp.where(beyond, cosine, 1.0))
+        return residual.at[-count:].set(jnp.where(beyond, angle * along, residual[-count:]))
+
+    def opening_slope(self, place: Array, rows: Array, rates: Array, spin: Array, t: Array) -> Array:
+        """That of the opening."""
+        return jax.jvp(lambda x: self.opening(place, x, spin, t), (rows,), (rates,))[1]
+
+
+class Fixed(Facing):
     """Child fixed in the parent at `point` [m]: 6 constraints, no free motion.
 
     Example:
@@ -41,6 +81,7 @@ class Fixed(Joint):
     """
 
     kind: ClassVar[str] = "fixed joint"
+    turn: ClassVar[Any] = staticmethod(_turn)
     multipliers: ClassVar[int] = 6
     free: ClassVar[bool] = True
 
@@ -62,7 +103,7 @@ class Spherical(Joint):
         return child.point - parent.point
 
 
-class Revolute(Joint):
+class Revolute(Facing):
     """Hinge about `axis` through `point`: 5 constraints; coordinate 0 is the angle [rad].
 
     Attributes:
@@ -125,7 +166,7 @@ class Universal(Joint):
         return jnp.concatenate([child.point - parent.point, angle[None]])
 
 
-class Cylindrical(Joint):
+class Cylindrical(Facing):
     """Turning and sliding along `axis` (48, 49): 4 constraints.
 
     Coordinates: 0 the angle [rad], 1 the displacement [m].
@@ -144,7 +185,7 @@ class Cylindrical(Joint):
         return jnp.stack([dot(parent.axes[0], u), dot(parent.axes[1], u), *_axis_parallel(parent, child)])
 
 
-class Prismatic(Joint):
+class Prismatic(Facing):
     """Sliding along `axis`: 5 constraints; coordinate 0 is the displacement [m].
 
     Attributes:
@@ -155,6 +196,7 @@ class Prismatic(Joint):
 
     assembling: ClassVar[tuple[str, ...]] = (*Joint.assembling, "zero")
     kind: ClassVar[str] = "prismatic joint"
+    turn: ClassVar[Any] = staticmethod(_turn)
     multipliers: ClassVar[int] = 5
     translations: ClassVar[tuple[int, ...]] = (2,)
     free: ClassVar[bool] = True
@@ -170,7 +212,7 @@ class Prismatic(Joint):
         return jnp.stack([dot(parent.axes[0], u), dot(parent.axes[1], u), *_orientation(parent, child)])
 
 
-class Planar(Joint):
+class Planar(Facing):
     """Sliding in the plane normal to `axis` and turning about it: 3 constraints.
 
     Coordinates: 0, 1 displacements along the first and second axis [m], 2 the angle [rad].
@@ -189,7 +231,7 @@ class Planar(Joint):
         return jnp.stack([dot(parent.axes[2], u), *_axis_parallel(parent, child)])
 
 
-class Screw(Joint):
+class Screw(Facing):
     """Helical joint: a cylindrical joint that advances by `pitch` [m] per turn; 4 + 1 constraints.
 
     The pitch relation involves the angle and keeps its multiplier.
