@@ -59,9 +59,8 @@ def build(
     joint_groups, groups = stack(layout.joint_instances(), turning), stack(instances, turning)
     groups += tuple(element_group(layout, name, part, turning) for name, part in (elements or {}).items())
     tree = make_tree(layout.spanning, layout.motions())
-    multipliers = sum(g.count * g.multipliers for g in groups)
-    relations = multipliers
-    multipliers += sum(g.count * g.multipliers for g in joint_groups if not g.in_tree)
+    relations = sum(g.count * g.multipliers for g in groups)
+    multipliers = relations + sum(g.count * g.multipliers for g in joint_groups if not g.in_tree)
     inequalities = sum(g.count * g.multipliers for g in groups if g.effect.unilateral)
     internal = sum(kind.constraints for kind in bodies.kinds)
     masses, between = mass_of(layout.masses(), groups, np.array([kind.rows for kind in layout.kinds]))
@@ -136,8 +135,8 @@ def _speed(system: System, state: State) -> Float[Array, ""]:
     still = jnp.zeros_like(state.rows[:, 0])
     force, _ = loads(fields, state, jnp.zeros(len(system.structure.inputs)), still, still)
     pulls = safe_norm(force) / jnp.where(system.mass[:, 0, 0] > 0, system.mass[:, 0, 0], 1.0)
-    found = safe_sqrt(jnp.max(pulls) * system.size) + jnp.max(safe_norm(state.row_rates[:, 0]))
-    return jnp.where(found > 0, found, system.size)
+    speed = safe_sqrt(jnp.max(pulls) * system.size) + jnp.max(safe_norm(state.row_rates[:, 0]))
+    return jnp.where(speed > 0, speed, system.size)
 
 
 def with_symmetries(system: System, state: State) -> System:

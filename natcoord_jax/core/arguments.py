@@ -187,13 +187,13 @@ def declaration_of(cls: type) -> Declaration | None:
 
 def declared(module: Any, path: str) -> Kind | None:
     """What a number of a part was declared to be, if it was, "field.number" in a module in a field."""
-    owner, _, rest = path.partition(".")
+    owner, _, inside = path.partition(".")
     fields = {f.name: f for f in dataclasses.fields(module)}
     if owner not in fields:
         return None
-    if rest:
+    if inside:
         inner = getattr(module, owner)
-        return declared(inner, rest) if dataclasses.is_dataclass(inner) else None
+        return declared(inner, inside) if dataclasses.is_dataclass(inner) else None
     return fields[owner].metadata.get(DECLARED)
 
 

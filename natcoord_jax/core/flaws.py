@@ -47,5 +47,5 @@ def _of_lanes(effect: Effect) -> dict[str, Array]:
 
 def parts(part: Part) -> list[Part]:
     """A part, and those in its fields."""
-    inner = (getattr(part, field.name) for field in dataclasses.fields(part))
-    return [part, *(found for x in inner if isinstance(x, Part) for found in parts(x))]
+    values = (getattr(part, field.name) for field in dataclasses.fields(part))
+    return [part, *(inner for value in values if isinstance(value, Part) for inner in parts(value))]

@@ -82,14 +82,14 @@ class Numbers(Kind):
         """Its shape and range."""
         unsigned = "" if self.infinite else "finite "
         size = {"": unsigned, "positive": "positive ", "not negative": ""}[self.sign]
-        limits = ("above", self.above), ("below", self.below), ("up to", self.most)
-        bounds = [f"{word} {limit:g}" for word, limit in limits if limit is not None]
+        ends = ("above", self.above), ("below", self.below), ("up to", self.most)
+        bounds = [f"{word} {limit:g}" for word, limit in ends if limit is not None]
         bounds = [f"that is {self.sign}"] * (self.sign == "not negative") + bounds
-        rest = " " * bool(bounds) + " and ".join(bounds)
+        limits = " " * bool(bounds) + " and ".join(bounds)
         if self.shape == ():
-            return f"a {size}number{rest}{self.instead}"
+            return f"a {size}number{limits}{self.instead}"
         shape = ", ".join("n" if n is None else str(n) for n in self.shape) + "," * (len(self.shape) == 1)
-        return f"{size}numbers of shape ({shape}){rest.replace('is', 'are')}{self.instead}"
+        return f"{size}numbers of shape ({shape}){limits.replace('is', 'are')}{self.instead}"
 
     def complaint(self, value: Any) -> str | None:
         """Whether it is such an array."""

@@ -137,8 +137,7 @@ def constraint_matrix(system: Model, state: State) -> Float[Array, "m twists"]:
 def with_sizes(system: SomeModel, state: State) -> SomeModel:
     """The system with the size of the scene as it is assembled, and with `spans` of its constraints."""
     size, spans = _sizes(system, state)
-    groups = zip((system.joints, system.effects), spans, strict=True)
-    joints, effects = (tuple(map(_with_spans, own, found)) for own, found in groups)
+    joints, effects = (tuple(map(_with_spans, *pair)) for pair in zip((system.joints, system.effects), spans))
     return replace_fields(system, size=size, joints=joints, effects=effects)
 
 
@@ -156,12 +155,12 @@ def _sizes(system: Model, state: State) -> tuple[Array, list[list[Array | None]]
         twists = _block(system, group, state, lambda e, *at: e.violation_rate(*at, 0.0)).reshape(
             group.count, group.multipliers, -1, 2, 3
         )
-        found = jnp.max(safe_norm(twists), axis=2)
-        return jnp.where(jnp.any(found > 0, axis=-1, keepdims=True), found, 1.0)
+        changes = jnp.max(safe_norm(twists), axis=2)
+        return jnp.where(jnp.any(changes > 0, axis=-1, keepdims=True), changes, 1.0)
 
-    every = [[spans(group) for group in groups] for groups in (system.joints, system.effects)]
+    by_group = [[spans(group) for group in groups] for groups in (system.joints, system.effects)]
     # What is compared with them has no derivatives by them.
-    return jax.lax.stop_gradient((_scene_size(system, state), every))
+    return jax.lax.stop_gradient((_scene_size(system, state), by_group))
 
 
 def _scene_size(system: Model, state: State) -> Float[Array, ""]:

@@ -148,8 +148,8 @@ def rate_size(system: Model, state: State) -> Float[Array, ""]:
 def misses(system: Model, state: State) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
     """Whether any joint or relation is violated by more than `GAP`, and whether its rate is."""
     groups = constrained(system)
-    every = (*groups, *contacts(system))
-    gap = largest(relative(system, every, violations_of(system, every, state)))
+    closing = (*groups, *contacts(system))
+    gap = largest(relative(system, closing, violations_of(system, closing, state)))
     rate = largest(relative(system, groups, violation_rates_of(system, groups, state)))
     return ~(gap <= GAP * position_size(system, state)), ~(rate <= GAP * rate_size(system, state))
 
