@@ -21,6 +21,7 @@ UNHEARD = {
     "spherical damper 1: weights": "they only say which bodies turn",
     "skin": "how far contacts are searched",
     "hard contact 1: gap.radii": "the surfaces are apart",
+    "hard contact 1: weights": "the surfaces are apart",
     "restitution": "the surfaces are apart",
     "regularisation": "of slip much slower than this",
     "compliance": "the surfaces are apart",

@@ -9,16 +9,16 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.bodies import DIRECTOR, POINT, TRIAD, Body, NodeKind
-from natcoord_jax.core.checks import as_array, is_concrete
+from natcoord_jax.core.checks import as_array
 from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.kinds import NAME
-from natcoord_jax.core.numeric import Definite, Numbers, Rotations
+from natcoord_jax.core.numeric import Definite, Directions, Numbers, Rotations
 from natcoord_jax.maths.vectors import cross, dot
 
 PLACES = Numbers((None, 3))
 MASS = Numbers(("...",), sign="not negative")
 VECTORS = Numbers(("...", 3))
-FRAMES, BLOCKS = Rotations(("...", 3, 3)), Definite(("...", 4, 4))
+ALONG, FRAMES, BLOCKS = Directions(("...", 3)), Rotations(("...", 3, 3)), Definite(("...", 4, 4))
 
 
 class Nodes(eqx.Module):
@@ -86,7 +86,7 @@ class Nodes(eqx.Module):
     @checked(
         "Nodes.directors",
         positions=PLACES,
-        directors=VECTORS,
+        directors=ALONG,
         mass=MASS,
         inertia=MASS,
         velocity=VECTORS,
@@ -123,9 +123,7 @@ class Nodes(eqx.Module):
             [0.0, 0.0, 1.0]
         """
         place, count = as_array(positions, float), len(positions)
-        along = _every(directors, (count, 3), "directors [-]")
-        if is_concrete(along) and not np.any(np.asarray(along), axis=1).all():
-            raise ValueError("Nodes: some of the directors [-] are zero; pass directions")
+        along = _every(directors, (count, 3), "directors [-]", ALONG)
         frames, spin = _frames(along, _every(angular_velocity, (count, 3), "angular_velocity [rad/s]"))
         turning = _every(inertia, (count,), "inertia [kg m^2]", MASS)
         blocks = _blocks(_every(mass, (count,), "mass [kg]", MASS), turning)

@@ -9,11 +9,11 @@ from jaxtyping import Array, Float
 from natcoord_jax.bodies.shapes import Placed, Shape
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.bodies import POINT, TRIAD, Body, mass_block
-from natcoord_jax.core.checks import as_array, is_concrete, numbers, positive, shape_of
+from natcoord_jax.core.checks import as_array, as_kind, numbers, positive, shape_of
 from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.inertia import possible, tensor, to_second_moment
 from natcoord_jax.core.kinds import NAME, Choice, Kind, is_other, of
-from natcoord_jax.core.numeric import COMPONENTS, Number, Numbers, Rotations
+from natcoord_jax.core.numeric import COMPONENTS, Directions, Number, Numbers, Rotations
 from natcoord_jax.maths.rotations import from_axis_angle, from_quaternion
 
 MASS, TENSOR = Number("positive"), Numbers((3,)) | Numbers((3, 3))
@@ -31,20 +31,11 @@ def orientation(value: Any, label: str) -> Float[Array, "3 3"]:
     if value is None:
         return as_array(np.eye(3))
     if isinstance(value, tuple) and len(value) == 2 and shape_of(value[0]) == (3,):
-        axis = numbers(value[0], (3,), f"{what} axis", "-")
-        if is_concrete(axis) and not np.any(np.asarray(axis)):
-            raise ValueError(f"{what} axis [-] is zero; pass a direction")
+        axis = as_kind(value[0], Directions(), f"{what} axis", "-")
         return _from_axis_angle(axis, numbers(value[1], (), f"{what} angle", "rad"))
     if shape_of(value) == (4,):
-        quaternion = numbers(value, (4,), f"{what} quaternion", "-")
-        if is_concrete(quaternion) and not np.any(np.asarray(quaternion)):
-            raise ValueError(f"{what} quaternion [-] is zero; pass (w, x, y, z) with a length")
-        return _from_quaternion(quaternion)
-    matrix, wanted = numbers(value, (3, 3), f"{what} matrix", "-"), Rotations()
-    complaint = wanted.complaint(matrix)
-    if complaint is not None:
-        raise ValueError(f"{what} matrix [-] {complaint}; pass {wanted.wanted}")
-    return wanted.masked(matrix)
+        return _from_quaternion(as_kind(value, Directions((4,)), f"{what} quaternion", "-"))
+    return as_kind(value, Rotations(), f"{what} matrix", "-")
 
 
 class Orientation(Kind):

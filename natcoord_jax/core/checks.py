@@ -62,10 +62,15 @@ def numbers(value: Any, shape: tuple[int, ...], what: str, unit: str) -> Array:
     Raises:
         ValueError: naming part, quantity, unit and remedy.
     """
-    return _array(value, Numbers(shape), what, unit)
+    return as_kind(value, Numbers(shape), what, unit)
 
 
-def _array(value: Any, kind: Numbers, what: str, unit: str) -> Array:
+def as_kind(value: Any, kind: Numbers, what: str, unit: str) -> Array:
+    """Value as a float array of a kind; what is traced and none of it becomes not a number.
+
+    Raises:
+        ValueError: naming part, quantity, unit and remedy.
+    """
     complaint = kind.complaint(value)
     if complaint is not None:
         raise ValueError(f"{what} [{unit}] {complaint}; pass {kind.wanted}")
@@ -117,4 +122,4 @@ def positive(value: Any, what: str, unit: str) -> Array:
     Raises:
         ValueError: naming part, quantity, unit and remedy.
     """
-    return _array(value, Number("positive"), what, unit)
+    return as_kind(value, Number("positive"), what, unit)

@@ -193,7 +193,7 @@ class Definite(Numbers):
 
 @dataclasses.dataclass(frozen=True)
 class Directions(Numbers):
-    """Components of directions: three numbers that are not all zero."""
+    """Components of directions: numbers that are not all zero."""
 
     shape: tuple[Any, ...] = (3,)
     bounded: ClassVar[bool] = True  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -201,7 +201,7 @@ class Directions(Numbers):
     @property
     def wanted(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Its shape."""
-        return "finite numbers of shape (3,), not all zero: a direction"
+        return "finite numbers, not all zero: a direction"
 
     def misfit(self, values: np.ndarray) -> str | None:
         """Whether they have a length."""

@@ -301,7 +301,7 @@ def test_nodes_and_elements_that_cannot_be():
             (lambda: nc.Nodes.points(PLACES, mass=(1.0, -1.0)), r"mass \[kg\].*not negative"),
             (
                 lambda: nc.Nodes.directors(PLACES, [(0, 0, 1), (0, 0, 0)], mass=1.0),
-                "some of the directors",
+                r"directors \[-\] is zero",
             ),
             (lambda: nc.Point(mesh[[0, 1]], (0.5, 0.6)), "add up to 1.1"),
             (lambda: nc.Point(mesh[[0, 1]], (0.5, 0.2, 0.3)), "pass 2 numbers for <2 nodes of 'net'>"),
