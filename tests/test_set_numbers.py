@@ -13,8 +13,6 @@ from test_contracts import TABLE, Parts
 
 import natcoord_jax as nc
 
-FEW = (nc.Screw, nc.JointStops)
-"""Effects whose numbers the default lane sets; those of all are set in the slow lane."""
 UNHEARD = {
     "overlaps": "mass, of a material without density",
     "volumes": "mass, of a material without density",
@@ -62,11 +60,8 @@ def set_anew(system, part, field, value):
         return None
 
 
-@pytest.mark.parametrize(
-    "effect",
-    [pytest.param(e, marks=() if e in FEW else pytest.mark.slow) for e in TABLE],
-    ids=lambda e: e.__name__,
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("effect", TABLE, ids=lambda e: e.__name__)
 def test_every_number_that_is_set_is_heard(effect):
     """By a step of about half a radian, forwards or backwards."""
     system, state = moving_pair(effect)
