@@ -6,6 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from natcoord_jax.core.bodies import DIRECTOR, POINT, Body
 from natcoord_jax.core.checks import as_array, is_concrete
@@ -16,8 +17,11 @@ from natcoord_jax.core.joint import Joint
 from natcoord_jax.core.names import compact
 from natcoord_jax.core.nodes import Clamp
 from natcoord_jax.core.state import State
+from natcoord_jax.maths.vectors import safe_norm, safe_sqrt
 from natcoord_jax.mechanics.coordinates import coordinate_values, state_rates
+from natcoord_jax.mechanics.equations_of_motion import loads
 from natcoord_jax.mechanics.impacts import untouched, with_mobilities
+from natcoord_jax.mechanics.projection import with_sizes
 from natcoord_jax.model.axisymmetric_axes import symmetries
 from natcoord_jax.model.bodies import Bodies
 from natcoord_jax.model.choice import choose_solver, elimination_order
@@ -29,7 +33,12 @@ from natcoord_jax.model.local_rates import LocalRates
 from natcoord_jax.model.masses import mass_of
 from natcoord_jax.model.model import Structure
 from natcoord_jax.model.rows import rows_with_ground
+from natcoord_jax.reading.admissible import sound
 from natcoord_jax.system import System
+
+REGULARISED = 3e-6
+"""Velocity of slip, in terms of the speeds of a scene, up to which friction is smooth: what sticks under a
+load creeps less than that."""
 
 
 def build(
@@ -50,9 +59,8 @@ def build(
     joint_groups, groups = stack(layout.joint_instances(), turning), stack(instances, turning)
     groups += tuple(element_group(layout, name, part, turning) for name, part in (elements or {}).items())
     tree = make_tree(layout.spanning, layout.motions())
-    multipliers = sum(g.count * g.multipliers for g in groups)
-    relations = multipliers
-    multipliers += sum(g.count * g.multipliers for g in joint_groups if not g.in_tree)
+    relations = sum(g.count * g.multipliers for g in groups)
+    multipliers = relations + sum(g.count * g.multipliers for g in joint_groups if not g.in_tree)
     inequalities = sum(g.count * g.multipliers for g in groups if g.effect.unilateral)
     internal = sum(kind.constraints for kind in bodies.kinds)
     masses, between = mass_of(layout.masses(), groups, np.array([kind.rows for kind in layout.kinds]))
@@ -91,13 +99,44 @@ def build(
         mass_between=between,
     )
     state = replace_fields(layout.state(), contacts=untouched(system))
+    system = with_regularised_friction(with_sizes(system, state), state)
     system = with_mobilities(jax.tree.map(as_array, with_symmetries(system, state)), state)
-    return system, with_readings(system, state)
+    return sound(system, system), with_readings(system, state)
 
 
 def _drawn(shape: Any) -> Any:
     """A shape by numbers of NumPy, which are no part of the program; None for one that is traced."""
     return jax.tree.map(np.asarray, shape) if is_concrete(shape) else None
+
+
+def with_regularised_friction(system: System, state: State) -> System:
+    """The system with velocities of slip up to which friction is smooth, where none are given."""
+
+    def needs(group: Any) -> bool:
+        effect = group.effect
+        return effect.unilateral and effect.friction is not None and effect.regularisation is None
+
+    if not any(map(needs, system.effects)):
+        return system
+    slip = REGULARISED * _speed(system, state)
+    each = [
+        replace_fields(g, effect=replace_fields(g.effect, regularisation=jnp.broadcast_to(slip, (g.count,))))
+        if needs(g)
+        else g
+        for g in system.effects
+    ]
+    return replace_fields(system, effects=tuple(each))
+
+
+@eager_numpy
+def _speed(system: System, state: State) -> Float[Array, ""]:
+    """Of the fastest body at the start, and that which gravity gives along the size of the scene [m/s]."""
+    fields = replace_fields(system, effects=tuple(g for g in system.effects if g.source == "mass"))
+    still = jnp.zeros_like(state.rows[:, 0])
+    force, _ = loads(fields, state, jnp.zeros(len(system.structure.inputs)), still, still)
+    pulls = safe_norm(force) / jnp.where(system.mass[:, 0, 0] > 0, system.mass[:, 0, 0], 1.0)
+    speed = safe_sqrt(jnp.max(pulls) * system.size) + jnp.max(safe_norm(state.row_rates[:, 0]))
+    return jnp.where(speed > 0, speed, system.size)
 
 
 def with_symmetries(system: System, state: State) -> System:

@@ -21,7 +21,7 @@ from natcoord_jax.core.handles import Handle, ground
 from natcoord_jax.core.joint import Joint
 from natcoord_jax.core.kinds import BODY, FLAG, JOINT, NAME, Choice, HandleOf, of
 from natcoord_jax.core.nodes import Clamp, NodeSet
-from natcoord_jax.core.numeric import COMPONENTS, Number, Numbers
+from natcoord_jax.core.numeric import COMPONENTS, Definite, Number, Numbers
 from natcoord_jax.core.recipe import Recipe
 from natcoord_jax.core.state import State
 from natcoord_jax.model.own_effects import check_degrees, warn_of_resultants
@@ -166,7 +166,7 @@ class Scene:
         numbered = (f"{label} {k}" for k in itertools.count(1))
         return next(name for name in numbered if not any(name in store for store in self._stores()))
 
-    @checked("Scene.add_mass", handle=BODY, block=Numbers((4, 4)))
+    @checked("Scene.add_mass", handle=BODY, block=Definite((4, 4)))
     def add_mass(self, handle: Handle, block: Any) -> None:
         """Add mass to a body: a mass block m (4, 4) (15) in its own frame [kg, kg m, kg m^2].
 

@@ -159,6 +159,5 @@ def test_surfaces_that_enclose_nothing_are_refused():
     with pytest.raises(ValueError, match="in turn one way and the other"):
         scene.add(nc.Gas(turned, gauge_pressure=1.0))
     ball = scene.add(shell_of(sphere))
-    scene.add(nc.Gas(ball, gauge_pressure=-2e5))
     with pytest.raises(ValueError, match="below minus the ambient one"):
-        scene.compile()
+        scene.add(nc.Gas(ball, gauge_pressure=-2e5))

@@ -95,7 +95,7 @@ def test_what_is_wrong_is_named(compiled):
         (lambda s: s.set("spring 0", stiffness=(1.0, 2.0)), r"stiffness has shape \(2,\); pass shape \(\)"),
         (lambda s: s.set(springs, stiffness=(1, 2, 3)), r"pass shape \(\) or \(2,\)"),
         (lambda s: s.set("bead", inertia=(1.0, 1.0, 1.0)), "'bead' has no number 'inertia'"),
-        (lambda s: s.set("body", mass=-1.0), r"'body': mass \[kg\] is -1; pass positive"),
+        (lambda s: s.set("body", mass=-1.0), r"'body': mass \[kg\] is -1.0; pass a positive"),
         (lambda s: s.set("spring 0", stiffness=-1.0), "spring 0"),
         (lambda s: s.set("body", mass=1.0, mass_block=np.eye(4)), "not both"),
         (lambda s: s.set("spring 0", stiffness=np.nan), "pass finite"),
@@ -224,3 +224,140 @@ def test_reactions_about_a_point():
     ):
         with pytest.raises(ValueError, match=message):
             system.sense(state, part, about=about)
+
+
+# --- numbers that no part can have ------------------------------------------------------------------------
+
+GOOD = {
+    "mass": 1.0, "inertia": (1.0, 1.1, 1.2), "orientation": np.eye(3), "axis": (0.0, 1.0, 0.0),
+    "stiffness": 1.0, "length": 0.2, "armature": 0.1, "lower": -1.0, "limit": 2.0, "restitution": 0.5,
+    "bounce": 0.0, "friction": 0.3, "radius": 0.1, "normal": (0.0, 0.0, 1.0), "wall": 0.005, "nu": 0.3,
+    "section": np.diag([1e4, 1e4, 1e5, 10.0, 10.0, 8.0]), "poisson": 0.3, "second": (0.1, 0.1, 0.1),
+}  # fmt: skip
+SKEW = np.diag([1e4, 1e4, 1e5, 10.0, 10.0, 8.0])
+SKEW[3, 4] = 5.0
+IMPOSSIBLE = [
+    ("mass", -1.0), ("mass", np.inf), ("inertia", (1.0, 1.0, 5.0)), ("inertia", (-1.0, 1.0, 1.0)),
+    ("second", (0.1, -0.1, 0.1)), ("orientation", 2.0 * np.eye(3)),
+    ("orientation", np.diag([1.0, 1.0, -1.0])), ("axis", (0.0, 0.0, 0.0)),
+    ("stiffness", -1.0), ("stiffness", np.nan), ("length", -1.0),
+    ("armature", -1.0), ("lower", 3.0), ("lower", np.nan), ("limit", -3.0), ("restitution", 1.5),
+    ("restitution", 0.0), ("bounce", 1.1), ("friction", -1.0), ("radius", -0.1), ("normal", (0.0, 0.0, 0.0)),
+    ("wall", 0.015), ("nu", 0.9), ("section", SKEW), ("section", -np.abs(SKEW)), ("poisson", 0.5),
+]  # fmt: skip
+
+
+def workshop(n):
+    """A scene of many parts by their numbers, and something of all of them."""
+    made = nc.Scene()
+    body = nc.RigidBody(mass=n["mass"], inertia=n["inertia"], orientation=n["orientation"], name="arm")
+    arm = made.add(body)
+    hinge = made.add(nc.Revolute(nc.ground, arm, axis=n["axis"], name="hinge"))
+    made.add(nc.JointSpring(hinge, stiffness=n["stiffness"]))
+    made.add(nc.Armature(hinge, inertia=n["armature"]))
+    made.add(nc.JointStops(hinge, stiffness=1.0, lower=n["lower"], upper=2.0))
+    made.add(nc.AffineActuator((hinge,), lower=-2.0, upper=n["limit"]))
+    ends = nc.Point(nc.ground, (0.0, 0.0, 1.0)), nc.Point(arm)
+    made.add(nc.Spring(ends, stiffness=1.0, length=n["length"]))
+    ball = made.add(nc.RigidBody(mass=1.0, second_moment=n["second"], position=(5, 0, 1), name="ball"))
+    floor = nc.Point(nc.ground), nc.Direction(nc.ground, n["normal"]), nc.Point(ball)
+    soft = {"stiffness": 10.0, "restitution": n["restitution"], "speed": 1.0}
+    made.add(nc.GapPotential(floor, nc.SphereOnPlane(radius=n["radius"]), **soft))
+    hard = {"friction": n["friction"], "restitution": n["bounce"]}
+    made.add(nc.GapConstraint(floor, nc.SphereOnPlane(), **hard))
+    rod = {"radius": 0.01, "E": 1e9, "density": 1e3}
+    tube = nc.TubularSection(thickness=n["wall"], nu=n["nu"], **rod)
+    plate = nc.Elastic(E=1.0, nu=n["poisson"])
+    data = nc.Section(n["section"], np.diag([1.0, 1e-4, 1e-4]))
+    alone = tube.stiffness[5, 5] + data.stiffness[0, 0] + plate.plane_stress()[0, 0]
+    system, state = made.compile()
+    return system, state, alone
+
+
+def test_impossible_numbers_are_refused_and_traced_none_of_their_lane():
+    """A body or a law with them would gain energy: outside of jit an error, inside not a number."""
+    for name, bad in IMPOSSIBLE:
+        with pytest.raises(ValueError, match=r"\[|has|belongs"):
+            workshop({**GOOD, name: bad})
+
+    def momentum(n):
+        system, state, alone = workshop(n)
+        return system.momentum(state)[0] + 0.0 * alone
+
+    rows = [GOOD, *({**GOOD, name: bad} for name, bad in IMPOSSIBLE)]
+    lanes = {name: np.stack([np.asarray(row[name], float) for row in rows]) for name in GOOD}
+    found = np.asarray(jax.jit(jax.vmap(momentum))(lanes))
+    assert np.isfinite(found[0])
+    passed = [case for case, x in zip(IMPOSSIBLE, found[1:], strict=True) if not np.isnan(x)]
+    assert not passed, passed
+
+
+@pytest.mark.slow
+def test_a_number_that_is_none_ends_the_run():
+    """A comparison with it would leave a stop, or a contact, out of the motion."""
+    made = nc.Scene()
+    made.add(nc.Gravity())
+    ball = made.add(nc.RigidBody(shape=nc.Sphere(0.1), density=100.0, position=(0, 0, 0.2)))
+    made.add(nc.Contact(ball, nc.Plane(), stiffness=1e4, name="floor"))
+    slider = made.add(nc.RigidBody(mass=1.0, inertia=(1.0, 1.0, 1.0), position=(1, 0, 0)))
+    slide = made.add(nc.Prismatic(nc.ground, slider, axis=(0, 0, -1.0)))
+    made.add(nc.JointStops(slide, upper=0.05, stiffness=1e4, name="stops"))
+    system, state = made.compile()
+
+    def run(radius, upper, stiffness):
+        changed = system.set("floor", **{"gap.radius": radius})
+        changed = changed.set("stops", upper=upper, stiffness=stiffness)
+        return nc.simulate(changed, state, dt=0.01, steps=30).result
+
+    good, bad = [0.1, 0.05, 1e4], [(0, np.nan), (1, np.nan), (2, np.nan), (0, -1.0), (0, np.inf)]
+    rows = np.array([good, *([bad_x if k == j else x for j, x in enumerate(good)] for k, bad_x in bad)])
+    results = jax.jit(jax.vmap(run))(*rows.T)
+    assert list(np.asarray(results)) == [int(nc.Result.SUCCESSFUL)] + [int(nc.Result.NONFINITE)] * len(bad)
+
+
+def test_what_only_the_assembled_pose_takes_cannot_be_set(compiled):
+    """The zero of a hinge counts in the state; the pitch of a screw is one of the system, traced too."""
+    with pytest.raises(ValueError, match="hinge' has no number 'zero'.*in the scene, and compile"):
+        compiled[0].set("hinge", zero=0.3)
+    made = nc.Scene()
+    nut = made.add(nc.RigidBody(mass=1.0, inertia=(0.01, 0.01, 0.01)))
+    made.add(nc.Screw(nc.ground, nut, axis=(0, 0, 1), pitch=0.2, name="screw"))
+    system, _ = made.compile()
+
+    def factor(pitch):
+        return system.set("screw", pitch=pitch).get("screw pitch", "factors")[0]
+
+    value, slope = jax.jit(jax.value_and_grad(factor))(0.4)
+    assert np.allclose([value, slope, factor(0.4)], np.array([-0.4, -1.0, -0.4]) / (2 * np.pi), atol=1e-15)
+
+
+def test_inertias_that_no_body_has_cannot_be_set(compiled):
+    """Nor text, nor what is not finite; of three bodies a matrix for all, or rows of principal ones."""
+    system, _ = compiled
+    skewed = np.array([[1.0, 0.5, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    wrong = [
+        ({"inertia": (1.0, 1.0, 5.0)}, "belongs to no body"),
+        ({"inertia": (-1.0, 1.0, 1.0)}, "belongs to no body"),
+        ({"inertia": skewed}, "not symmetric"),
+        ({"mass_block": np.triu(np.ones((4, 4)))}, "not symmetric"),
+        ({"mass_block": -np.eye(4)}, r"mass \[kg\] is -1"),
+        ({"mass_block": np.diag([1.0, 1.0, 1.0, -3.0])}, "belongs to no body"),
+        ({"mass": "1"}, "is '1'; pass numbers"),
+        ({"mass": np.inf}, "not finite"),
+    ]
+    for values, message in wrong:
+        with pytest.raises(ValueError, match=message):
+            system.set("body", **values)
+    same = system.set("body", mass_block=system.get("body", "mass_block"))
+    assert np.array_equal(same.mass, system.mass)
+    made, names = nc.Scene(), ["a", "b", "c"]
+    for name in names:
+        made.add(nc.RigidBody(mass=1.0, inertia=(1.0, 1.0, 1.0), name=name))
+    trio, _ = made.compile()
+    rows = np.array([(1.0, 1.1, 1.2), (2.0, 2.1, 2.2), (3.0, 3.1, 3.2)])
+    tensor = np.array([(2.0, 0.3, 0.1), (0.3, 2.5, 0.2), (0.1, 0.2, 3.0)])
+    wanted = [(rows, np.array([np.diag(row) for row in rows])), (tensor, np.stack([tensor] * 3))]
+    traced = jax.jit(lambda x: trio.set(names, inertia=x).get(names, "inertia"))
+    for value, expected in wanted:
+        assert np.allclose(trio.set(names, inertia=value).get(names, "inertia"), expected, atol=1e-14)
+        assert np.allclose(traced(value), expected, atol=1e-14)

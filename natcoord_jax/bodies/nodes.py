@@ -9,15 +9,16 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.bodies import DIRECTOR, POINT, TRIAD, Body, NodeKind
-from natcoord_jax.core.checks import as_array, is_concrete
+from natcoord_jax.core.checks import as_array
 from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.kinds import NAME
-from natcoord_jax.core.numeric import Numbers
+from natcoord_jax.core.numeric import Definite, Directions, Numbers, Rotations
 from natcoord_jax.maths.vectors import cross, dot
 
 PLACES = Numbers((None, 3))
 MASS = Numbers(("...",), sign="not negative")
 VECTORS = Numbers(("...", 3))
+ALONG, FRAMES, BLOCKS = Directions(("...", 3)), Rotations(("...", 3, 3)), Definite(("...", 4, 4))
 
 
 class Nodes(eqx.Module):
@@ -75,7 +76,7 @@ class Nodes(eqx.Module):
             (1000, 3)
         """
         place, count = as_array(positions, float), len(positions)
-        blocks = _blocks(_every(mass, (count,), "mass [kg]"), as_array(0.0))
+        blocks = _blocks(_every(mass, (count,), "mass [kg]", MASS), as_array(0.0))
         still = as_array(np.zeros((count, 3)))
         unit = as_array(np.broadcast_to(np.eye(3), (count, 3, 3)))
         moving = _every(velocity, (count, 3), "velocity [m/s]")
@@ -85,7 +86,7 @@ class Nodes(eqx.Module):
     @checked(
         "Nodes.directors",
         positions=PLACES,
-        directors=VECTORS,
+        directors=ALONG,
         mass=MASS,
         inertia=MASS,
         velocity=VECTORS,
@@ -122,12 +123,10 @@ class Nodes(eqx.Module):
             [0.0, 0.0, 1.0]
         """
         place, count = as_array(positions, float), len(positions)
-        along = _every(directors, (count, 3), "directors [-]")
-        if is_concrete(along) and not np.any(np.asarray(along), axis=1).all():
-            raise ValueError("Nodes: some of the directors [-] are zero; pass directions")
+        along = _every(directors, (count, 3), "directors [-]", ALONG)
         frames, spin = _frames(along, _every(angular_velocity, (count, 3), "angular_velocity [rad/s]"))
-        turning = _every(inertia, (count,), "inertia [kg m^2]")
-        blocks = _blocks(_every(mass, (count,), "mass [kg]"), turning)
+        turning = _every(inertia, (count,), "inertia [kg m^2]", MASS)
+        blocks = _blocks(_every(mass, (count,), "mass [kg]", MASS), turning)
         moving = _every(velocity, (count, 3), "velocity [m/s]")
         return Nodes(blocks, place, frames, moving, spin, DIRECTOR, name)
 
@@ -135,8 +134,8 @@ class Nodes(eqx.Module):
     @checked(
         "Nodes.triads",
         positions=PLACES,
-        orientations=Numbers(("...", 3, 3)),
-        mass_blocks=Numbers(("...", 4, 4)),
+        orientations=FRAMES,
+        mass_blocks=BLOCKS,
         velocity=VECTORS,
         angular_velocity=VECTORS,
         name=NAME,
@@ -162,9 +161,9 @@ class Nodes(eqx.Module):
         """
         place, count = as_array(positions, float), len(positions)
         return Nodes(
-            _every(mass_blocks, (count, 4, 4), "mass_blocks [kg, kg m, kg m^2]"),
+            _every(mass_blocks, (count, 4, 4), "mass_blocks [kg, kg m, kg m^2]", BLOCKS),
             place,
-            _every(orientations, (count, 3, 3), "orientations [-]"),
+            _every(orientations, (count, 3, 3), "orientations [-]", FRAMES),
             _every(velocity, (count, 3), "velocity [m/s]"),
             _every(angular_velocity, (count, 3), "angular_velocity [rad/s]"),
             TRIAD,
@@ -172,13 +171,13 @@ class Nodes(eqx.Module):
         )
 
 
-def _every(value: Any, shape: tuple[int, ...], what: str) -> Array:
+def _every(value: Any, shape: tuple[int, ...], what: str, kind: Numbers = VECTORS) -> Array:
     """One for each node.
 
     Raises:
         ValueError: for another number of them, naming the quantity with its unit.
     """
-    given = as_array(value, float)
+    given = kind.masked(as_array(value, float))
     if given.shape not in (shape, shape[1:]):
         raise ValueError(f"Nodes: {what} has shape {given.shape}; pass {shape[1:]} for all, or {shape}")
     return _broadcast(given, shape)

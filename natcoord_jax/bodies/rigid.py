@@ -9,25 +9,12 @@ from jaxtyping import Array, Float
 from natcoord_jax.bodies.shapes import Placed, Shape
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.bodies import POINT, TRIAD, Body, mass_block
-from natcoord_jax.core.checks import (
-    as_array,
-    is_concrete,
-    numbers,
-    positive,
-    shape_of,
-)
+from natcoord_jax.core.checks import as_array, as_kind, numbers, positive, shape_of
 from natcoord_jax.core.eager_numpy import eager_numpy
+from natcoord_jax.core.inertia import possible, tensor, to_second_moment
 from natcoord_jax.core.kinds import NAME, Choice, Kind, is_other, of
-from natcoord_jax.core.numeric import COMPONENTS, Number, Numbers
+from natcoord_jax.core.numeric import COMPONENTS, Directions, Number, Numbers, Rotations
 from natcoord_jax.maths.rotations import from_axis_angle, from_quaternion
-
-SYMMETRY_TOLERANCE = 1e-9
-"""Relative asymmetry and relative negative eigenvalue allowed in an inertia: round-off."""
-
-PRINTED = 5e-3
-"""By how much a principal inertia may exceed the sum of the other two, relative to the largest second moment:
-three printed digits, as of a plate with (0.00333, 0.00333, 0.00667) kg m^2. It is taken as it is given."""
-
 
 MASS, TENSOR = Number("positive"), Numbers((3,)) | Numbers((3, 3))
 
@@ -44,25 +31,11 @@ def orientation(value: Any, label: str) -> Float[Array, "3 3"]:
     if value is None:
         return as_array(np.eye(3))
     if isinstance(value, tuple) and len(value) == 2 and shape_of(value[0]) == (3,):
-        axis = numbers(value[0], (3,), f"{what} axis", "-")
-        if is_concrete(axis) and not np.any(np.asarray(axis)):
-            raise ValueError(f"{what} axis [-] is zero; pass a direction")
+        axis = as_kind(value[0], Directions(), f"{what} axis", "-")
         return _from_axis_angle(axis, numbers(value[1], (), f"{what} angle", "rad"))
     if shape_of(value) == (4,):
-        quaternion = numbers(value, (4,), f"{what} quaternion", "-")
-        if is_concrete(quaternion) and not np.any(np.asarray(quaternion)):
-            raise ValueError(f"{what} quaternion [-] is zero; pass (w, x, y, z) with a length")
-        return _from_quaternion(quaternion)
-    matrix = numbers(value, (3, 3), f"{what} matrix", "-")
-    if is_concrete(matrix):
-        concrete = np.asarray(matrix)
-        gap = np.max(np.abs(concrete @ concrete.T - np.eye(3)))
-        if gap > 1e-8 or np.linalg.det(concrete) < 0:
-            raise ValueError(
-                f"{what} matrix [-] is no rotation (R R^T differs from 1 by {gap:.1e}, "
-                f"determinant {np.linalg.det(concrete):+.3f}); pass a quaternion or an orthonormal matrix"
-            )
-    return matrix
+        return _from_quaternion(as_kind(value, Directions((4,)), f"{what} quaternion", "-"))
+    return as_kind(value, Rotations(), f"{what} matrix", "-")
 
 
 class Orientation(Kind):
@@ -75,67 +48,6 @@ class Orientation(Kind):
         pair = isinstance(value, tuple) and len(value) == 2 and shape_of(value[0]) == (3,)
         shape = None if isinstance(value, str) else shape_of(value)
         return None if pair or shape in ((4,), (3, 3)) else is_other(value)
-
-
-@eager_numpy
-def _diagonal(values: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    return jnp.diag(values)
-
-
-def _full_inertia(value: Any, what: str, unit: str) -> Float[Array, "3 3"]:
-    if shape_of(value) == (3,):
-        return _diagonal(numbers(value, (3,), what, unit))
-    matrix = numbers(value, (3, 3), what, unit)
-    if is_concrete(matrix):
-        concrete = np.asarray(matrix)
-        gap = float(np.max(np.abs(concrete - concrete.T)))
-        if gap > SYMMETRY_TOLERANCE * float(np.max(np.abs(concrete))):
-            raise ValueError(f"{what} [{unit}] is not symmetric (by {gap:.2e}); pass a symmetric matrix")
-    return matrix
-
-
-def _check_central(central: Array, moment: Array, label: str, given: str) -> None:
-    """A body exists only if its central second moment is positive semidefinite.
-
-    Args:
-        central: second moment about the centre of mass.
-        moment: the same about the point that the data refers to, which says how large rounding may be.
-        label: the part, for the message.
-        given: "inertia" or "second_moment".
-    """
-    if not is_concrete(central, moment):
-        return
-    values, axes = np.linalg.eigh(np.asarray(central))
-    size = max(values[2], float(np.linalg.eigvalsh(np.asarray(moment))[2]), 0.0)
-    # An inertia about a principal axis is the sum of the other two second moments.
-    least = values[0] + values[1] if given == "inertia" else values[0]
-    printed = PRINTED if given == "inertia" else SYMMETRY_TOLERANCE
-    if values[0] >= -printed * size and least >= -SYMMETRY_TOLERANCE * size and values[2] > 0:
-        return
-    nearest = ""
-    if values[2] > 0:
-        possible = (axes * np.maximum(values, 0.0)) @ axes.T
-        possible = np.trace(possible) * np.eye(3) - possible if given == "inertia" else possible
-        diagonal = np.max(np.abs(possible - np.diag(np.diag(possible)))) <= 1e-12 * np.max(np.abs(possible))
-        shown = np.diag(possible) if diagonal else possible
-        nearest = f"; the nearest possible {given} about the centre of mass is {_listed(shown)} kg m^2"
-    raise ValueError(
-        f"{label}: {given} belongs to no body: the principal second moments about the centre of mass "
-        f"would be {values} kg m^2, and none may be negative (a principal inertia may not exceed the sum "
-        f"of the other two, up to the rounding of three printed digits, {PRINTED:g}); check units, "
-        'and whether the inertia is about the centre of mass (inertia_at="com") or the reference point '
-        f'(inertia_at="reference"){nearest}'
-    )
-
-
-def _listed(values: np.ndarray) -> str:
-    return np.array2string(values, separator=", ", precision=6).replace("\n", "")
-
-
-@eager_numpy
-def to_second_moment(inertia: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
-    """E = tr(J)/2 1 - J, about the same point as the inertia tensor J [kg m^2]."""
-    return 0.5 * jnp.trace(inertia) * jnp.eye(3) - inertia
 
 
 @checked(
@@ -214,13 +126,14 @@ def RigidBody(
             )
         mass = positive(mass, f"{label}: mass", "kg")
         if inertia is not None:
-            moment = to_second_moment(_full_inertia(inertia, f"{label}: inertia", "kg m^2"))
+            moment = to_second_moment(tensor(inertia, f"{label}: inertia"))
             moment = _shifted(moment, mass, centre) if inertia_at == "com" else moment
         else:
-            moment = _full_inertia(second_moment, f"{label}: second_moment", "kg m^2")
+            moment = tensor(second_moment, f"{label}: second_moment")
         given = "inertia" if inertia is not None else "second_moment"
-        about = _central(moment, mass, centre)
-        _check_central(about, about if inertia_at == "com" and inertia is not None else moment, label, given)
+        central = _central(moment, mass, centre)
+        about = central if inertia_at == "com" and inertia is not None else moment
+        moment = possible(moment, central, about, label, given)
     return Body(
         mass_block(mass, centre, moment),
         numbers(position, (3,), f"{label}: position", "m"),

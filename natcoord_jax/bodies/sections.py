@@ -15,10 +15,11 @@ from natcoord_jax.core.arguments import Part, checked, is_a
 from natcoord_jax.core.bodies import mass_block
 from natcoord_jax.core.checks import as_array, is_concrete, numbers, positive, shape_of
 from natcoord_jax.core.eager_numpy import eager_numpy, stacked
-from natcoord_jax.core.numeric import Number, Numbers, Vector
+from natcoord_jax.core.numeric import Definite, Number, Numbers, Vector, masked
 
 SIZE, PAIR, RIM = Number("positive"), Number("positive") | Numbers((2,), "positive"), Numbers((None, 2))
-POISSON = Number()
+POISSON = Number(above=-1.0, most=0.5)
+STIFFNESS, INERTIA = Definite((6, 6)), Definite((3, 3))
 
 
 class Section(Part):
@@ -39,8 +40,8 @@ class Section(Part):
         [10000.0, 10000.0, 10000.0, 100.0, 100.0, 100.0]
     """
 
-    stiffness: Any = eqx.field(converter=lambda x: as_array(x, float), metadata=is_a(Numbers((6, 6))))
-    inertia: Any = eqx.field(converter=lambda x: as_array(x, float), metadata=is_a(Numbers((3, 3))))
+    stiffness: Any = eqx.field(converter=lambda x: as_array(x, float), metadata=is_a(STIFFNESS))
+    inertia: Any = eqx.field(converter=lambda x: as_array(x, float), metadata=is_a(INERTIA))
     outline: Any = eqx.field(default=None, kw_only=True, metadata=is_a(RIM))
 
     makes_arrays: ClassVar[bool] = True
@@ -96,8 +97,8 @@ class Section(Part):
     @classmethod
     @checked(
         "Section.of_axis_along_first",
-        stiffness=Numbers((6, 6)),
-        inertia=Numbers((3, 3)),
+        stiffness=STIFFNESS,
+        inertia=INERTIA,
         outline=RIM,
     )
     def of_axis_along_first(cls, stiffness: Any, inertia: Any, *, outline: Any = None) -> "Section":
@@ -177,26 +178,26 @@ def CircularSection(*, radius: Any, E: Any, nu: Any = 0.3, density: Any, shear: 
     Args:
         radius: [m].
         E: Young's modulus [Pa].
-        nu: Poisson's ratio [-].
+        nu: Poisson's ratio [-], above -1 up to 1/2.
         density: [kg/m^3].
         shear: shear coefficient [-]; default 6 (1 + nu) / (7 + 6 nu) (Cowper 1966).
 
     Raises:
-        ValueError: for numbers that are not positive.
+        ValueError: for numbers that no section has.
 
     Example:
         >>> import jax; jax.config.update("jax_enable_x64", True)
         >>> import natcoord_jax as nc
         >>> rope = nc.CircularSection(radius=0.01, E=1e6, density=1000.0)
     """
-    r, nu = positive(radius, "section: radius", "m"), as_array(nu, float)
+    r, nu = positive(radius, "section: radius", "m"), POISSON.masked(as_array(nu, float))
     return _elastic(_circle(r, nu, shear), E, nu, density)
 
 
 @eager_numpy
 def _circle(r: Array, nu: Array, shear: Any) -> Shaped:
     area, second = jnp.pi * r**2, jnp.pi * r**4 / 4
-    k = 6 * (1 + nu) / (7 + 6 * nu) if shear is None else jnp.asarray(shear, float)
+    k = 6 * (1 + nu) / (7 + 6 * nu) if shear is None else SIZE.masked(jnp.asarray(shear, float))
     return area, second, 2 * second, k, _ellipse(r, r)
 
 
@@ -210,7 +211,7 @@ def TubularSection(
         radius: the outer one [m].
         thickness: of the wall [m].
         E: Young's modulus [Pa].
-        nu: Poisson's ratio [-].
+        nu: Poisson's ratio [-], above -1 up to 1/2.
         density: [kg/m^3].
         shear: shear coefficient [-].
 
@@ -218,12 +219,13 @@ def TubularSection(
     p = (1 + m^2)^2 and the ratio m of inner and outer radius.
 
     Raises:
-        ValueError: for numbers that are not positive, or a wall thicker than the radius.
+        ValueError: for numbers that no section has, or a wall thicker than the radius.
     """
     r, t = positive(radius, "section: radius", "m"), positive(thickness, "section: thickness", "m")
     if is_concrete(r, t) and float(t) > float(r):
         raise ValueError(f"section: thickness [m] is {float(t):g}, more than the radius {float(r):g}")
-    nu = as_array(nu, float)
+    r, t = masked(r, lambda r: t <= r), masked(t, lambda t: t <= r)
+    nu = POISSON.masked(as_array(nu, float))
     return _elastic(_tube(r, t, nu, shear), E, nu, density)
 
 
@@ -231,10 +233,12 @@ def TubularSection(
 def _tube(r: Array, t: Array, nu: Array, shear: Any) -> Shaped:
     inner = r - t
     ratio = (inner / r) ** 2
-    area, second = jnp.pi * (r**2 - inner**2), jnp.pi * (r**4 - inner**4) / 4
+    # (Of a thin wall a difference of squares would have few digits.)
+    area = jnp.pi * t * (r + inner)
+    second = area * (r**2 + inner**2) / 4
     part = (1 + ratio) ** 2
     cowper = 6 * (1 + nu) * part / ((7 + 6 * nu) * part + (20 + 12 * nu) * ratio)
-    k = cowper if shear is None else jnp.asarray(shear, float)
+    k = cowper if shear is None else SIZE.masked(jnp.asarray(shear, float))
     return area, second, 2 * second, k, _ellipse(r, r)
 
 
@@ -248,7 +252,7 @@ def RectangularSection(
         width: along d_1 [m].
         height: along d_2 [m].
         E: Young's modulus [Pa].
-        nu: Poisson's ratio [-].
+        nu: Poisson's ratio [-], above -1 up to 1/2.
         density: [kg/m^3].
         shear: shear coefficient [-].
 
@@ -256,10 +260,10 @@ def RectangularSection(
     series.
 
     Raises:
-        ValueError: for numbers that are not positive.
+        ValueError: for numbers that no section has.
     """
     b, h = positive(width, "section: width", "m"), positive(height, "section: height", "m")
-    nu = as_array(nu, float)
+    nu = POISSON.masked(as_array(nu, float))
     return _elastic(_rectangle(b, h, nu, shear), E, nu, density)
 
 
@@ -272,6 +276,6 @@ def _rectangle(b: Array, h: Array, nu: Array, shear: Any) -> Shaped:
     odd = jnp.arange(1.0, 40.0, 2.0)
     series = jnp.sum(jnp.tanh(0.5 * odd * jnp.pi * long / short) / odd**5)
     torsion = long * short**3 / 3 * (1 - 192 / jnp.pi**5 * short / long * series)
-    k = 10 * (1 + nu) / (12 + 11 * nu) if shear is None else jnp.asarray(shear, float)
+    k = 10 * (1 + nu) / (12 + 11 * nu) if shear is None else SIZE.masked(jnp.asarray(shear, float))
     corners = jnp.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
     return area, second, torsion, k, 0.5 * corners * jnp.stack([b, h])

@@ -18,12 +18,12 @@ from natcoord_jax.core.arguments import Part, is_a
 from natcoord_jax.core.callables import Function
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.kinds import BODY_NAME, JOINT_NAME, NAME, FunctionOf, Several, of
-from natcoord_jax.core.numeric import COMPONENTS, Number, Numbers, Whole
+from natcoord_jax.core.numeric import COMPONENTS, Number, Numbers, Rotations, Whole
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.rotations import angular_velocity, from_quaternion, to_rotation_vector
 from natcoord_jax.system import System
 
-ROTATION = Numbers((4,)) | Numbers((3, 3))
+ROTATION = Numbers((4,)) | Rotations()
 RESIDUAL = FunctionOf("(state) -> number or vector")
 
 

@@ -3,20 +3,25 @@
 A public function says by `checked` what its arguments are; a part (an effect, a joint, the shape of a body)
 says it of its fields, `metadata=is_a(Number())`. A call with something else ends in an error that names the
 part, the argument with its unit, what was given and what to pass. Units are read from the docstring. What is
-traced has no value yet, and only its shape is looked at.
+traced has no value yet: its shape is looked at, and a number of a part that would be refused becomes not a
+number.
 """
 
 import dataclasses
 import inspect
+import operator
 import re
 from collections.abc import Callable, Mapping, Sequence
-from functools import cache, wraps
+from functools import cache, reduce, wraps
 from typing import Any, ClassVar, TypeVar
 
 import equinox as eqx
+import numpy as np
 
-from natcoord_jax.core.checks import require_double
+from natcoord_jax.core.checks import is_concrete, require_double
 from natcoord_jax.core.kinds import Kind, short
+from natcoord_jax.core.numeric import masked
+from natcoord_jax.xla.tracing import at_top_level
 
 F = TypeVar("F", bound=Callable[..., Any])
 DECLARED = "natcoord_jax: kind of argument"
@@ -180,10 +185,23 @@ def declaration_of(cls: type) -> Declaration | None:
     return Declaration.of(cls.__name__, signature, {f.name: f.metadata.get(DECLARED) for f in fields}, cls)
 
 
+def declared(module: Any, path: str) -> Kind | None:
+    """What a number of a part was declared to be, if it was, "field.number" in a module in a field."""
+    owner, _, inside = path.partition(".")
+    fields = {f.name: f for f in dataclasses.fields(module)}
+    if owner not in fields:
+        return None
+    if inside:
+        inner = getattr(module, owner)
+        return declared(inner, inside) if dataclasses.is_dataclass(inner) else None
+    return fields[owner].metadata.get(DECLARED)
+
+
 class Part(eqx.Module):
     """Base of what users make: its fields say what they are, and are looked at when it is made.
 
-    Fields without a kind, as in classes of users' own, are left alone.
+    Fields without a kind, as in classes of users' own, are left alone. What would be refused if it were not
+    traced becomes not a number.
 
     Class attributes:
         makes_arrays: whether numbers become arrays when it is made, which takes double precision. Others keep
@@ -201,3 +219,23 @@ class Part(eqx.Module):
             label = f"{cls.__name__} {name!r}" if isinstance(name, str) else cls.__name__
             declaration.check(positional, named, label)
         return super().__new__(cls)
+
+    def __check_init__(self) -> None:
+        """Looks at what its numbers are together, and at those that are traced."""
+        traced = []
+        for said, wrong in self.flaws().items():
+            if not is_concrete(wrong):
+                traced.append(wrong)
+            elif np.any(np.asarray(wrong)):
+                raise ValueError(f"{type(self).__name__} {said}")
+        if at_top_level():
+            return
+        wrong = reduce(operator.or_, traced, False)
+        for field in dataclasses.fields(self):
+            kind, value = field.metadata.get(DECLARED), getattr(self, field.name)
+            value = value if kind is None else kind.masked(value)
+            object.__setattr__(self, field.name, masked(value, lambda x: ~wrong) if traced else value)
+
+    def flaws(self) -> dict[str, Any]:
+        """What may be wrong with its numbers together, as the rest of a sentence, and whether it is."""
+        return {}

@@ -1,4 +1,4 @@
-"""Checks of concrete numbers; traced ones pass, because they have no values yet."""
+"""Checks of numbers: concrete ones are refused, traced ones have no values yet and become not a number."""
 
 import dataclasses
 import re
@@ -62,14 +62,19 @@ def numbers(value: Any, shape: tuple[int, ...], what: str, unit: str) -> Array:
     Raises:
         ValueError: naming part, quantity, unit and remedy.
     """
-    return _array(value, Numbers(shape), what, unit)
+    return as_kind(value, Numbers(shape), what, unit)
 
 
-def _array(value: Any, kind: Numbers, what: str, unit: str) -> Array:
+def as_kind(value: Any, kind: Numbers, what: str, unit: str) -> Array:
+    """Value as a float array of a kind; what is traced and none of it becomes not a number.
+
+    Raises:
+        ValueError: naming part, quantity, unit and remedy.
+    """
     complaint = kind.complaint(value)
     if complaint is not None:
         raise ValueError(f"{what} [{unit}] {complaint}; pass {kind.wanted}")
-    return as_array(value, float)
+    return kind.masked(as_array(value, float))
 
 
 def check_fields(module: Any, label: str) -> None:
@@ -125,9 +130,9 @@ def for_each(value: Any, count: int, what: str, each: str) -> Array:
 
 
 def positive(value: Any, what: str, unit: str) -> Array:
-    """Value as a positive finite scalar.
+    """Value as a positive finite scalar; one that is traced and is none becomes not a number.
 
     Raises:
         ValueError: naming part, quantity, unit and remedy.
     """
-    return _array(value, Number("positive"), what, unit)
+    return as_kind(value, Number("positive"), what, unit)

@@ -40,6 +40,7 @@ class Effect(Part):
         silent: whether it has no sensor.
         faces: numbers of the nodes round each face of an element, four each, for pictures.
         vectors: of each node of an element made by `on`: 1 for its point, 2 with a director, 4 with a triad.
+        unit_directions: whether it asks of directions among its markers only where they point.
         derived: fields that follow from the others, see `renewed`.
         drawn: whether pictures show it as a link where it is between two points.
     """
@@ -61,6 +62,7 @@ class Effect(Part):
     silent: ClassVar[bool] = True
     faces: ClassVar[tuple[tuple[int, ...], ...]] = ()
     vectors: ClassVar[int] = 1
+    unit_directions: ClassVar[bool] = False
     derived: ClassVar[tuple[str, ...]] = ()
     drawn: ClassVar[bool] = True
 
@@ -116,10 +118,6 @@ class Effect(Part):
         What is not is refused at compile, of effects that are not the library's.
         """
         return None
-
-    def flaws(self) -> dict[str, Array]:
-        """What may be wrong with its numbers, as the rest of a sentence about it, and whether it is."""
-        return {}
 
     def volume_ratios(
         self, place: Float[Array, "n *place"], rows: Float[Array, "n b 4 3"]

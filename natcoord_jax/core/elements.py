@@ -7,12 +7,15 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from natcoord_jax.core.arguments import declared
 from natcoord_jax.core.checks import as_array, is_concrete
 from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.effect import Effect, replace_fields
 from natcoord_jax.core.flaws import first_flaw
+from natcoord_jax.core.kinds import is_other
 from natcoord_jax.core.markers import Attachment, Marker, Point
 from natcoord_jax.core.nodes import NodeSet, NodeUnion
+from natcoord_jax.core.numeric import array_of, range_of, shown
 from natcoord_jax.core.potential import place_markers
 
 
@@ -65,9 +68,11 @@ class Elements(eqx.Module):
             )
         given = jax.tree.map(lambda x: np.broadcast_to(np.asarray(x), (n, *np.shape(x))), bare)
         given = replace_fields(given, **{key: as_array(value, float) for key, value in self.each.items()})
-        if type(bare).assembled_at is Effect.assembled_at:
-            return given
-        found = _assembled(given, as_array(weights), rows)
+        for key, value in self.each.items():
+            self._check(key, np.asarray(value), label)
+        found = given
+        if type(bare).assembled_at is not Effect.assembled_at:
+            found = _assembled(given, as_array(weights), rows)
         flaw = first_flaw(found)
         if flaw is not None:
             number, said = flaw
@@ -75,6 +80,17 @@ class Elements(eqx.Module):
                 f"{label}: element {number}, on the nodes {self.connectivity[number].tolist()}, {said}"
             )
         return found
+
+    def _check(self, key: str, values: np.ndarray, label: str) -> None:
+        """Refuse numbers of single elements that one alone would refuse."""
+        kind = range_of(declared(self.effect, key))
+        good = np.isfinite(values) if kind is None else kind.includes(values)
+        for number in np.flatnonzero(~good.reshape(len(values), -1).all(1)):
+            wanted = "finite numbers" if kind is None else kind.wanted
+            raise ValueError(
+                f"{label}: element {number}, on the nodes {self.connectivity[number].tolist()}, has {key} "
+                f"{shown(values[number])}; pass {wanted}"
+            )
 
 
 @eager_numpy
@@ -106,6 +122,9 @@ def on(
             f"{label}: connectivity has nodes from {table.min()} to {table.max()}; {nodes!r} has 0 to "
             f"{len(nodes) - 1}"
         )
+    odd = [key for key, value in (each or {}).items() if array_of(value) is None]
+    if odd:
+        raise ValueError(f"{label}: each[{odd[0]!r}] {is_other(each[odd[0]])}; pass numbers")
     each = {key: as_array(value, float) for key, value in (each or {}).items()}
     wrong = [key for key, value in each.items() if value.ndim < 1 or len(value) != len(table)]
     if wrong:

@@ -62,6 +62,7 @@ class Joint(Effect):
         free: whether `rotations` and `translations` describe the free motion completely, so that the
             joint may be part of the spanning tree; False keeps its multipliers.
         coordinates: the joint's coordinates, in the order sensors and drives count them.
+        assembling: fields that only the assembled pose takes, and a compiled system does not have.
         apart: whether parent and child have points of their own, by default their reference points; else both
             have one, by default the child's reference point.
 
@@ -90,6 +91,7 @@ class Joint(Effect):
     translations: ClassVar[tuple[int, ...]] = ()
     free: ClassVar[bool] = False
     coordinates: ClassVar[tuple[Any, ...]] = ()
+    assembling: ClassVar[tuple[str, ...]] = ("parent", "child", "point", "axis", "second", "name")
     apart: ClassVar[bool] = False
 
     @abc.abstractmethod
@@ -116,7 +118,10 @@ class Joint(Effect):
         return self
 
     def companions(self, handle: Handle) -> list[Effect]:
-        """Effects that come with the joint, such as the pitch relation of a screw."""
+        """Effects that come with the joint, such as the pitch relation of a screw, by its numbers.
+
+        Made anew where these are set in a system.
+        """
         return []
 
     def quadratic(self, place: Array, rows: Array) -> Array:

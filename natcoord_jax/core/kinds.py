@@ -63,6 +63,10 @@ class Kind:
         """What is wrong with a value, to follow the name of the argument; None: nothing."""
         raise NotImplementedError
 
+    def masked(self, value: Any) -> Any:
+        """The value, with not a number for what is traced and would be refused if it were not."""
+        return value
+
     def __or__(self, other: "Kind") -> "Kind":
         return Either((self, other))
 
@@ -94,6 +98,10 @@ class Either(Kind):
         # Where the shape is that of one kind, it is not what is wrong.
         fitting = [text for text in telling if not text.startswith("has shape")]
         return (fitting or telling or found)[0]
+
+    def masked(self, value: Any) -> Any:
+        """As the first kind that it fits has it."""
+        return next((kind.masked(value) for kind in self.kinds if kind.complaint(value) is None), value)
 
 
 def is_other(value: Any) -> str:

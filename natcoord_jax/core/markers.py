@@ -15,7 +15,7 @@ from natcoord_jax.core.arguments import Part, checked, is_a
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.kinds import BODY, FLAG, Anything, Kind, described, is_other, of, short
 from natcoord_jax.core.nodes import NodeSet
-from natcoord_jax.core.numeric import COMPONENTS, Directions, Numbers, array_of, values_of
+from natcoord_jax.core.numeric import COMPONENTS, Directions, Rotations, array_of, values_of
 
 
 class Marker(eqx.Module):
@@ -64,11 +64,12 @@ def _(value: Marker) -> str:
 NODES = BODY | of("some nodes of a set, as nodes[[3, 4]]", NodeSet)
 
 
-def _refuse(what: str, kind: Kind, value: Any) -> None:
-    """Complain of a value, if it is none of a kind."""
+def _numbers(what: str, kind: Kind, value: Any) -> Any:
+    """A value, if it is one of a kind."""
     complaint = kind.complaint(value)
     if complaint is not None:
         raise ValueError(f"{what} {complaint}; pass {kind.wanted}")
+    return kind.masked(value)
 
 
 def _between(nodes: NodeSet, weights: Any, is_point: bool) -> Marker:
@@ -106,8 +107,7 @@ def Point(body: Handle | NodeSet, position: Any = None, *, local: bool = False) 
         return _between(body, position, True)
     if position is None:
         return Marker(body, (0.0, 0.0, 0.0), True, True)
-    _refuse("Point: position [m]", COMPONENTS, position)
-    return Marker(body, position, True, local)
+    return Marker(body, _numbers("Point: position [m]", COMPONENTS, position), True, local)
 
 
 @checked(body=NODES, vector=Anything(), local=FLAG)
@@ -116,8 +116,8 @@ def Direction(body: Handle | NodeSet, vector: Any, *, local: bool = False) -> Ma
 
     Args:
         body: handle returned by `Scene.add`, or `ground`; or some nodes of a set that have directors.
-        vector: shape (3,) [-], in world coordinates of the assembled pose; its length is kept. Of nodes their
-            weights [-].
+        vector: shape (3,) [-], in world coordinates of the assembled pose. Its length is kept for effects of
+            one's own; the library's, and all gaps, take only where it points. Of nodes their weights [-].
         local: take `vector` in the body's reference frame instead.
 
     Raises:
@@ -131,8 +131,7 @@ def Direction(body: Handle | NodeSet, vector: Any, *, local: bool = False) -> Ma
     """
     if isinstance(body, NodeSet):
         return _between(body, vector, False)
-    _refuse("Direction: vector [-]", Directions(), vector)
-    return Marker(body, vector, False, local)
+    return Marker(body, _numbers("Direction: vector [-]", Directions(), vector), False, local)
 
 
 class Attachment(Part):
@@ -152,7 +151,7 @@ class Attachment(Part):
 
     body: Handle = eqx.field(static=True, metadata=is_a(BODY))
     point: Any = eqx.field(metadata=is_a(COMPONENTS))
-    axes: Any = eqx.field(metadata=is_a(Numbers((3, 3))))
+    axes: Any = eqx.field(metadata=is_a(Rotations()))
     local: bool = eqx.field(static=True, default=False, kw_only=True, metadata=is_a(FLAG))
 
 

@@ -2,14 +2,19 @@
 
 import dataclasses
 import math
-from typing import Any
+import operator
+from collections.abc import Callable
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from natcoord_jax.core.kinds import Kind, is_other, short
+from natcoord_jax.core.kinds import Either, Kind, is_other, short
+
+ROUNDING = 1e-9
+"""Relative asymmetry and relative negative eigenvalue allowed in a matrix."""
 
 
 def array_of(value: Any) -> Any:
@@ -58,6 +63,9 @@ class Numbers(Kind):
         sign: "", "positive" or "not negative".
         infinite: whether infinities pass.
         instead: advice that follows what is wanted.
+        above: they are larger than this.
+        below: they are smaller than this.
+        most: the largest that they may be.
     """
 
     shape: tuple[Any, ...] = ()
@@ -65,21 +73,27 @@ class Numbers(Kind):
     infinite: bool = False
     instead: str = ""
     measured: bool = True
+    above: float | None = None
+    below: float | None = None
+    most: float | None = None
 
     @property
     def wanted(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Its shape and sign."""
+        """Its shape and range."""
         unsigned = "" if self.infinite else "finite "
         size = {"": unsigned, "positive": "positive ", "not negative": ""}[self.sign]
-        rest = " that is not negative" if self.sign == "not negative" else ""
+        ends = ("above", self.above), ("below", self.below), ("up to", self.most)
+        bounds = [f"{word} {limit:g}" for word, limit in ends if limit is not None]
+        bounds = [f"that is {self.sign}"] * (self.sign == "not negative") + bounds
+        limits = " " * bool(bounds) + " and ".join(bounds)
         if self.shape == ():
-            return f"a {size}number{rest}{self.instead}"
+            return f"a {size}number{limits}{self.instead}"
         shape = ", ".join("n" if n is None else str(n) for n in self.shape) + "," * (len(self.shape) == 1)
-        return f"{size}numbers of shape ({shape}){rest.replace('is', 'are')}{self.instead}"
+        return f"{size}numbers of shape ({shape}){limits.replace('is', 'are')}{self.instead}"
 
     def complaint(self, value: Any) -> str | None:
         """Whether it is such an array."""
-        if type(value) is float and self.shape == () and math.isfinite(value) and self._signed(value):
+        if type(value) is float and self.shape == () and self.includes(value):
             return None  # the usual case, without an array
         array = array_of(value)
         if array is None:
@@ -87,16 +101,34 @@ class Numbers(Kind):
         if not self._fits(array.shape):
             return f"is {short(value)}" if array.shape == () else f"has shape {array.shape}"
         known = values_of(array)
-        if known is None:
-            return None
-        if not (~np.isnan(known) if self.infinite else np.isfinite(known)).all():
-            return f"is not finite: {shown(known)}"
-        if self.sign and not self._signed(known).all():
-            return f"is {shown(known)}"
-        return None
+        return None if known is None else self.misfit(known)
 
-    def _signed(self, value: Any) -> Any:
-        return True if not self.sign else value > 0 if self.sign == "positive" else value >= 0
+    def misfit(self, values: np.ndarray) -> str | None:
+        """What is wrong with numbers of any shape, if something is."""
+        wrong = np.unique(values[~np.broadcast_to(self.includes(values), values.shape)])
+        if not wrong.size:
+            return None
+        finite = np.all(~np.isnan(wrong) if self.infinite else np.isfinite(wrong))
+        wrong = wrong[0] if wrong.size == 1 else wrong
+        return f"is {shown(wrong)}" if finite else f"is not finite: {shown(wrong)}"
+
+    def includes(self, values: Any) -> Any:
+        """Which of some numbers are in the range; not a number is in none."""
+        inside = values == values if self.infinite else abs(values) < math.inf
+        if self.sign:
+            inside = inside & (values > 0 if self.sign == "positive" else values >= 0)
+        for limit, within in (self.above, operator.gt), (self.below, operator.lt), (self.most, operator.le):
+            inside = inside if limit is None else inside & within(values, limit)
+        return inside
+
+    @property
+    def bounded(self) -> bool:
+        """Whether it excludes more than what is not finite."""
+        return bool(self.sign) or (self.above, self.below, self.most) != (None, None, None)
+
+    def masked(self, value: Any) -> Any:
+        """With not a number for what is traced and out of the range; what has no range is left as it is."""
+        return masked(value, self.includes) if self.bounded else value
 
     def _fits(self, shape: tuple[int, ...]) -> bool:
         wanted, found = self.shape, shape
@@ -106,9 +138,20 @@ class Numbers(Kind):
         return len(wanted) == len(found) and all(a in (None, b) for a, b in zip(wanted, found))
 
 
-def Number(sign: str = "", *, infinite: bool = False, instead: str = "") -> Numbers:
+def range_of(kind: Any) -> Numbers | None:
+    """The numbers that a kind is of; of several its first."""
+    kinds = kind.kinds if isinstance(kind, Either) else (kind,)
+    return next((x for x in kinds if isinstance(x, Numbers)), None)
+
+
+def masked(value: Any, includes: Callable[[Any], Any]) -> Any:
+    """Numbers with not a number for those that are traced and not included."""
+    return jax.tree.map(lambda x: jnp.where(includes(x), x, jnp.nan) if isinstance(x, Tracer) else x, value)
+
+
+def Number(sign: str = "", *, infinite: bool = False, instead: str = "", **limits: float) -> Numbers:
     """One number."""
-    return Numbers((), sign, infinite, instead)
+    return Numbers((), sign, infinite, instead, True, **limits)
 
 
 def Vector(length: int | None = 3) -> Numbers:
@@ -117,17 +160,88 @@ def Vector(length: int | None = 3) -> Numbers:
 
 
 @dataclasses.dataclass(frozen=True)
-class Directions(Kind):
-    """Components of a direction: three numbers that are not all zero."""
+class Definite(Numbers):
+    """A symmetric matrix without negative eigenvalues, in the unit of each of its rows, up to round-off."""
 
-    wanted: str = "finite numbers of shape (3,), not all zero: a direction"
-    measured: bool = True
+    bounded: ClassVar[bool] = True  # pyright: ignore[reportIncompatibleVariableOverride]
 
-    def complaint(self, value: Any) -> str | None:
-        """Whether it has a length."""
-        wrong = Numbers((3,)).complaint(value)
-        known = None if wrong else values_of(array_of(value))
-        return "is zero" if known is not None and not np.any(known) else wrong
+    @property
+    def wanted(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Its shape."""
+        return f"a symmetric matrix of shape {self.shape} without negative eigenvalues"
+
+    def misfit(self, values: np.ndarray) -> str | None:
+        """Which of these it is not."""
+        if not np.isfinite(values).all() or np.all(self.includes(values)):
+            return super().misfit(values)
+        gap = np.max(np.abs(values - np.swapaxes(values, -1, -2)))
+        even = gap <= ROUNDING * np.max(np.abs(values))
+        return "has negative eigenvalues" if even else f"is not symmetric (by {gap:.2e})"
+
+    def includes(self, values: Any) -> Any:
+        """Of each of some matrices, whether it is one."""
+        xp = jnp if isinstance(values, Tracer) else np
+        finite = xp.all(xp.isfinite(values), (-1, -2), keepdims=True)
+        values = xp.where(finite, values, 0.0)
+        diagonal = xp.diagonal(values, axis1=-2, axis2=-1)
+        size = xp.sqrt(xp.where(diagonal == 0, 1.0, abs(diagonal)))
+        scaled = values / (size[..., None] * size[..., None, :])
+        odd = xp.max(abs(scaled - xp.swapaxes(scaled, -1, -2)), (-1, -2))
+        least = xp.linalg.eigvalsh(scaled)[..., 0]
+        return finite & ((odd <= ROUNDING) & (least >= -ROUNDING))[..., None, None]
+
+
+@dataclasses.dataclass(frozen=True)
+class Directions(Numbers):
+    """Components of directions: numbers that are not all zero."""
+
+    shape: tuple[Any, ...] = (3,)
+    bounded: ClassVar[bool] = True  # pyright: ignore[reportIncompatibleVariableOverride]
+
+    @property
+    def wanted(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Its shape."""
+        return "finite numbers, not all zero: a direction"
+
+    def misfit(self, values: np.ndarray) -> str | None:
+        """Whether they have a length."""
+        return super().misfit(values) and ("is zero" if np.isfinite(values).all() else "is not finite")
+
+    def includes(self, values: Any) -> Any:
+        """Whether they are finite and have a length."""
+        return (abs(values) < math.inf).all(-1, keepdims=True) & (values != 0).any(-1, keepdims=True)
+
+
+@dataclasses.dataclass(frozen=True)
+class Rotations(Numbers):
+    """Rotation matrices."""
+
+    shape: tuple[Any, ...] = (3, 3)
+    bounded: ClassVar[bool] = True  # pyright: ignore[reportIncompatibleVariableOverride]
+
+    @property
+    def wanted(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """What they keep."""
+        return "a rotation: orthonormal and right-handed, by a matrix or a quaternion"
+
+    def misfit(self, values: np.ndarray) -> str | None:
+        """How far they are from being rotations."""
+        if not np.isfinite(values).all() or np.all(self.includes(values)):
+            return super().misfit(values)
+        least = np.min(np.linalg.det(values))
+        return (
+            f"is no rotation (R R^T differs from 1 by {_stretch(values).max():.1e}, determinant {least:+.3f})"
+        )
+
+    def includes(self, values: Any) -> Any:
+        """Whether they keep lengths and hands."""
+        linalg: Any = (jnp if isinstance(values, Tracer) else np).linalg
+        return ((_stretch(values) <= 1e-8) & (linalg.det(values) > 0))[..., None, None]
+
+
+def _stretch(matrix: Any) -> Any:
+    """How far matrices are from keeping lengths."""
+    return abs(matrix @ matrix.swapaxes(-1, -2) - np.eye(3)).max((-1, -2))
 
 
 @dataclasses.dataclass(frozen=True)

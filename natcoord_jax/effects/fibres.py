@@ -4,14 +4,14 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.core.arguments import is_a
-from natcoord_jax.core.checks import as_array, is_concrete
+from natcoord_jax.core.checks import as_array
 from natcoord_jax.core.effect import replace_fields
-from natcoord_jax.core.numeric import COMPONENTS, Number
+from natcoord_jax.core.numeric import Directions, Number
 from natcoord_jax.effects.hyperelastic import ClosedHyperelastic, Tensors
+from natcoord_jax.effects.materials import POISSON
 from natcoord_jax.effects.rubber import NeoHooke
 from natcoord_jax.maths.symmetric import PAIRS, contracted
 
@@ -36,24 +36,15 @@ class TransverselyIsotropic(ClosedHyperelastic):
     """
 
     E: Any = eqx.field(kw_only=True, metadata=is_a(Number("positive")))
-    nu: Any = eqx.field(kw_only=True, metadata=is_a(Number()))
+    nu: Any = eqx.field(kw_only=True, metadata=is_a(POISSON))
     fibre_stiffness: Any = eqx.field(kw_only=True, metadata=is_a(Number("not negative")))
-    direction: Any = eqx.field(kw_only=True, metadata=is_a(COMPONENTS))
+    direction: Any = eqx.field(kw_only=True, metadata=is_a(Directions()))
 
     @property
     def matrix(self) -> NeoHooke:
         """The material between the fibres."""
         # As a copy: the numbers may be those of many elements.
         return replace_fields(NeoHooke(E=1.0, nu=0.0), E=self.E, nu=self.nu, density=self.density)
-
-    def __check_init__(self) -> None:
-        self.matrix.__check_init__()
-        if is_concrete(self.direction) and not np.any(np.asarray(self.direction)):
-            raise ValueError("TransverselyIsotropic: direction [-] of the fibres is zero; pass one")
-
-    def flaws(self) -> dict[str, Array]:
-        """Those of the matrix."""
-        return self.matrix.flaws()
 
     def turned(self, rotation: Float[Array, "3 3"]) -> "TransverselyIsotropic":
         """With fibres that are turned with the body."""

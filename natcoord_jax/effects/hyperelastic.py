@@ -117,10 +117,6 @@ class Hyperelastic(Part):
         """The material of a body that is put into the scene turned; isotropic: as it is."""
         return self
 
-    def flaws(self) -> dict[str, Array]:
-        """What may be wrong with its numbers, see `Effect.flaws`."""
-        return {}
-
     def distortion(self, tensors: Tensors) -> Float[Array, "*n"]:
         """`energy` of many points of one element (m,), or of many elements, whose axis is the last (m, n)."""
         given = full(tensors.C), full(tensors.G), tensors.c

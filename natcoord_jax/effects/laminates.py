@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.core.arguments import Part, is_a
-from natcoord_jax.core.checks import is_concrete
 from natcoord_jax.core.kinds import of
 from natcoord_jax.core.numeric import Number, Numbers
 from natcoord_jax.effects.materials import SHEAR, Elastic, Sheet
@@ -48,21 +47,13 @@ class Orthotropic(Part):
 
     kind = "material"
 
-    def __check_init__(self) -> None:
-        given = self.E1, self.E2, self.nu12
-        if is_concrete(given) and all(np.ndim(x) == 0 for x in given) and self._excess() <= 0.0:
-            raise ValueError(
-                f"Orthotropic: nu12 [-] is {float(self.nu12):g}; pass one whose square is below E1 / E2 = "
-                f"{float(self.E1 / self.E2):g}: beyond, a stretch would give energy"
-            )
-
     def _excess(self) -> Any:
         return 1.0 - self.nu12**2 * self.E2 / self.E1
 
-    def flaws(self) -> dict[str, Array]:
-        """What may be wrong with its numbers, see `Effect.flaws`."""
+    def flaws(self) -> dict[str, Any]:
+        """A stretch that gives energy."""
         said = "has nu12 [-] whose square is not below E1 / E2: a stretch would give energy"
-        return {said: jnp.asarray(self._excess() <= 0.0)}
+        return {said: self._excess() <= 0.0}
 
     def plane_stress(self) -> Float[Array, "3 3"]:
         """Stresses by strains 11, 22, 12 of a layer without stress across it [N/m^2]."""
@@ -111,28 +102,26 @@ class Laminate(Part):
 
     kind = "material"
 
-    def __check_init__(self) -> None:
-        if self.fractions is None:
-            return
-        if np.shape(self.fractions) != np.shape(self.angles):
-            raise ValueError(
-                f"Laminate: fractions [-] has shape {np.shape(self.fractions)}; pass one for each of the "
-                f"angles, {np.shape(self.angles)}"
-            )
-        if is_concrete(self.fractions) and abs(float(np.sum(self.fractions)) - 1.0) > 1e-9:
-            raise ValueError(
-                f"Laminate: fractions [-] of the thickness add up to {float(np.sum(self.fractions)):g}; "
-                "divide them by that, so that they add up to one"
-            )
-
     @property
     def density(self) -> Any:
         """[kg/m^3]."""
         return self.material.density
 
-    def flaws(self) -> dict[str, Array]:
-        """Those of the plies."""
-        return self.material.flaws()
+    def flaws(self) -> dict[str, Any]:
+        """Plies that do not fill the thickness.
+
+        Raises:
+            ValueError: for other numbers of fractions than of angles.
+        """
+        if self.fractions is None:
+            return {}
+        if np.shape(self.fractions) != np.shape(self.angles):
+            raise ValueError(
+                f"Laminate: fractions [-] has shape {np.shape(self.fractions)}; pass one for each of the "
+                f"angles, {np.shape(self.angles)}"
+            )
+        said = "has fractions [-] of the thickness that do not add up to one; divide them by their sum"
+        return {said: abs(sum(self.fractions) - 1.0) > 1e-9}
 
     def sheet(self, thickness: Any) -> Sheet:
         """All plies, with the middle of the thickness as the reference surface."""

@@ -4,16 +4,17 @@ from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.core.arguments import Part, is_a
-from natcoord_jax.core.checks import is_concrete
 from natcoord_jax.core.kinds import Choice
 from natcoord_jax.core.numeric import Number
 
 MASS = Choice(("lumped", "consistent"))
 """How elements carry their mass."""
+RUBBERY = ", as 0.4999 for rubber: at 1/2 no pressure would be enough to change the volume"
+POISSON = Number(above=-1.0, below=0.5, instead=RUBBERY)
+"""Poisson's ratio of shells and solids."""
 SHEAR = 5.0 / 6.0
 """Shear coefficient of a homogeneous plate."""
 
@@ -61,24 +62,12 @@ class Elastic(Part):
     """
 
     E: Any = eqx.field(kw_only=True, metadata=is_a(Number("positive")))
-    nu: Any = eqx.field(default=0.0, kw_only=True, metadata=is_a(Number()))
+    nu: Any = eqx.field(default=0.0, kw_only=True, metadata=is_a(POISSON))
     density: Any = eqx.field(default=0.0, kw_only=True, metadata=is_a(Number("not negative")))
 
     kind = "material"
     split: ClassVar[bool] = False
     degree: ClassVar[int | None] = 2
-
-    def __check_init__(self) -> None:
-        if is_concrete(self.nu) and np.ndim(self.nu) == 0 and not -1.0 < float(self.nu) < 0.5:
-            raise ValueError(
-                f"Elastic: nu [-] is {float(self.nu):g}; pass a number between -1 and 1/2: at 1/2 the volume "
-                "cannot change, and such a material needs a pressure of its own"
-            )
-
-    def flaws(self) -> dict[str, Array]:
-        """What may be wrong with its numbers, see `Effect.flaws`."""
-        said = "has Poisson's ratio nu [-] not between -1 and 1/2: pass one between them"
-        return {said: (self.nu <= -1.0) | (self.nu >= 0.5)}
 
     @property
     def shear_modulus(self) -> Any:

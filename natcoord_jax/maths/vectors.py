@@ -35,8 +35,9 @@ def skew(a: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3 3"]:
 
 def safe_sqrt(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     """Square root whose value and derivatives are zero where x <= 0."""
-    positive = x > 0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
+    # (Asked so that not a number stays one, as below.)
+    none = x <= 0
+    return jnp.where(none, 0.0, jnp.sqrt(jnp.where(none, 1.0, x)))
 
 
 def positive_part(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
@@ -44,7 +45,7 @@ def positive_part(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
 
     `jnp.maximum` halves it, so that the second derivative of the square at zero is a quarter.
     """
-    return jnp.where(x > 0, x, 0.0)
+    return jnp.where(x <= 0, 0.0, x)
 
 
 def largest(x: Float[Array, "k *rest"]) -> Float[Array, "*rest"]:

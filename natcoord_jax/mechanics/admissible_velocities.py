@@ -22,7 +22,15 @@ from natcoord_jax.mechanics.projection import (
     twists_of,
 )
 from natcoord_jax.mechanics.tangent_space import rotor_inertias
-from natcoord_jax.mechanics.violations import GAP, rate_size
+from natcoord_jax.mechanics.violations import (
+    GAP,
+    constrained,
+    coordinate_sizes,
+    largest,
+    rate_size,
+    relative,
+    violation_rates_of,
+)
 from natcoord_jax.model.model import Model
 
 DAMPING = 1e-14
@@ -32,8 +40,8 @@ PASSES = 5
 """Projections with one inverse."""
 
 ENOUGH = 1e3 * GAP
-"""Rates of constraints [m/s, rad/s, 1/s], per unit of size, up to which velocities obey them. Near singular
-positions no projection leaves less."""
+"""Rates of constraints, relative, up to which velocities obey them: near singular positions no projection
+leaves less."""
 
 
 def with_admissible_velocities(
@@ -50,14 +58,20 @@ def with_admissible_velocities(
     twists = twists_of(system, state)
     rates = state_rates(system, state) if rates is None else rates
     found = moving(state, _admissible_twists(system, state, twists, None, rates))
-    allowed = ENOUGH * rate_size(found)
+    groups, sizes = constrained(system), coordinate_sizes(system)
+
+    def missed(state: State) -> Array:
+        return largest(relative(system, groups, violation_rates_of(system, groups, state)))
+
+    # What was there before tells the size of velocities that nothing is left of.
+    allowed = ENOUGH * (rate_size(system, state) + missed(state) + rate_size(system, found))
     if state.held is not None:
         holding = moving(state, _admissible_twists(system, state, twists, state.held[1], rates))
-        missed = state.held[1] * (state_rates(system, holding) - rates)
-        held = _most(gap_rates(system, holding)) <= allowed
-        held = held & (_most(missed) <= ENOUGH * (1.0 + _most(rates)))
+        allowed = allowed + ENOUGH * _most(rates / sizes)
+        lost = state.held[1] * (state_rates(system, holding) - rates) / sizes
+        held = (missed(holding) <= allowed) & (_most(lost) <= allowed)
         found = jax.tree.map(lambda x, y: jnp.where(held, x, y), holding, found)
-    code = jnp.where(_most(gap_rates(system, found)) <= allowed, int(Result.SUCCESSFUL), int(Result.SINGULAR))
+    code = jnp.where(missed(found) <= allowed, int(Result.SUCCESSFUL), int(Result.SINGULAR))
     return replace_fields(found, rates=_rotor_rates(system, found)), code
 
 

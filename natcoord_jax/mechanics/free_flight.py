@@ -26,9 +26,9 @@ SLOW = 1e-8
 """Way in a step, per unit of size, up to which surfaces that meet or part rest on each other."""
 
 
-def touch(state: State, part: float = TOUCHING) -> Float[Array, ""]:
+def touch(system: Model, state: State, part: float = TOUCHING) -> Float[Array, ""]:
     """Gap [m] up to which surfaces touch."""
-    return part * (1.0 + jnp.max(jnp.abs(state.q)))
+    return part * (system.size + jnp.max(jnp.abs(state.rows[:, 0])))
 
 
 def bouncing_groups(system: Model) -> list[Group]:
@@ -63,13 +63,13 @@ def lowest(gap: Array, begun: Array, ended: Array, h: Array) -> Array:
 def meeting(system: Model, groups: Sequence[Group], state: State) -> Bool[Array, " c"]:
     """Contacts that touch and close."""
     gap, rate = gaps_and_rates(system, groups, state, state.v)
-    return (gap <= touch(state)) & (rate < 0)
+    return (gap <= touch(system, state)) & (rate < 0)
 
 
 def apart(system: Model, groups: Sequence[Group], state: State, dt: Array) -> Bool[Array, " c"]:
     """Contacts that are open at the start of a (part of a) step of length dt, or that open there."""
     gap, rate = gaps_and_rates(system, groups, state, state.v)
-    return (gap > touch(state)) | (rate * dt > touch(state, SLOW))
+    return (gap > touch(system, state)) | (rate * dt > touch(system, state, SLOW))
 
 
 def in_free_flight(system: SomeModel, state: State, dt: Array, free: Bool[Array, ""]) -> SomeModel:
@@ -82,7 +82,7 @@ def in_free_flight(system: SomeModel, state: State, dt: Array, free: Bool[Array,
         free: whether the part ends where one closes; if not, they may push as in whole steps.
     """
     groups = bouncing_groups(system)
-    closed = contact_gaps(system, groups, state) <= touch(state)
+    closed = contact_gaps(system, groups, state) <= touch(system, state)
     phase = jnp.where(free & apart(system, groups, state, dt), FREE, jnp.where(closed, RESTING, 0))
     ends = np.cumsum([group.count for group in groups])
     own = iter(jnp.split(phase, ends[:-1]))

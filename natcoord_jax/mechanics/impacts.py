@@ -182,7 +182,7 @@ def _impacts(
     before = contact_gaps(system, groups, start)
     shut = (before - contact_gaps(system, groups, end)) / h
     on, active = active, active & bouncing
-    met = active & (before > touch(start) if hit is None else apart(system, groups, start, h))
+    met = active & (before > touch(system, start) if hit is None else apart(system, groups, start, h))
     velocity = Velocity(end.row_rates, end.rates)
     order = IslandOrder(system.structure.islands, range(len(on)))
     rates, normal = pushes.rates(velocity), pushes.matrices(order, pushes)
@@ -201,7 +201,7 @@ def _impacts(
     given = rates, work(pushed), restitution, active, met
     plastic, impulses = _by_island(order, impact_impulses, (normal,), *given)
     if hit is not None:
-        touching, some = bouncing & (contact_gaps(system, groups, end) <= touch(end)), jnp.any(hit)
+        touching, some = bouncing & (contact_gaps(system, groups, end) <= touch(system, end)), jnp.any(hit)
         at_once = _by_island(order, collision_impulses, (normal,), rates, restitution, touching)
         plastic, impulses = (jnp.where(some, x, y) for x, y in zip(at_once, (plastic, impulses)))
         room, on = jnp.where(some, 0.0, room), on | hit

@@ -16,14 +16,18 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from natcoord_jax.core.bodies import NODE
+from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.joint import frames_at
+from natcoord_jax.core.potential import place_markers
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.elimination import definite_inverse
 from natcoord_jax.maths.rotations import from_rotation_vector
+from natcoord_jax.maths.vectors import safe_divide, safe_norm, safe_sqrt
 from natcoord_jax.mechanics.coordinates import coordinate_values, velocities_with_ground
 from natcoord_jax.mechanics.violations import constrained, violation_rates_of, violations_of
-from natcoord_jax.model.model import Model
+from natcoord_jax.model.groups import Group
+from natcoord_jax.model.model import Model, SomeModel
 from natcoord_jax.model.rows import group_places, row_rates, rows_with_ground
 
 TWIST = 6
@@ -108,20 +112,73 @@ def _scattered(block: Float[Array, "n m k6"], bodies: Any, count: int) -> Float[
     return whole.at[instance, row, columns[:, None, :]].add(block, mode="drop").reshape(n * m, -1)
 
 
+def _block(system: Model, group: Group, state: State, slope: Any) -> Float[Array, "n m k6"]:
+    """Derivatives of what the constraints of a group have as `slope` by the twists of their bodies."""
+    return _along_twists(
+        group.effect,
+        group_places(system, group),
+        rows_with_ground(state.q)[group.bodies],
+        state.t,
+        slope,
+    )
+
+
 def constraint_matrix(system: Model, state: State) -> Float[Array, "m twists"]:
     """G: derivatives of the rates of all constraints by the twists of the bodies."""
-    rows, count = rows_with_ground(state.q), len(system.structure.bodies)
+    count = len(system.structure.bodies)
     found = [jnp.zeros((0, TWIST * count), state.q.dtype)]
-    for group in constrained(system):
-        block = _along_twists(
-            group.effect,
-            group_places(system, group),
-            rows[group.bodies],
-            state.t,
-            lambda e, *at: e.opening_slope(*at),
-        )
-        found.append(_scattered(block, group.bodies, count))
+    found += [
+        _scattered(_block(system, g, state, lambda e, *at: e.opening_slope(*at)), g.bodies, count)
+        for g in constrained(system)
+    ]
     return jnp.concatenate(found)
+
+
+def with_sizes(system: SomeModel, state: State) -> SomeModel:
+    """The system with the size of the scene as it is assembled, and with `spans` of its constraints."""
+    size, spans = _sizes(system, state)
+    joints, effects = (tuple(map(_with_spans, *pair)) for pair in zip((system.joints, system.effects), spans))
+    return replace_fields(system, size=size, joints=joints, effects=effects)
+
+
+def _with_spans(group: Group, spans: Array | None) -> Group:
+    return group if spans is None else replace_fields(group, spans=spans)
+
+
+@eager_numpy
+def _sizes(system: Model, state: State) -> tuple[Array, list[list[Array | None]]]:
+    def spans(group: Group) -> Array | None:
+        if not group.multipliers:
+            return None
+        if group.effect.unilateral:
+            return jnp.broadcast_to(jnp.array([1.0, 0.0]), (group.count, 1, 2))
+        twists = _block(system, group, state, lambda e, *at: e.violation_rate(*at, 0.0)).reshape(
+            group.count, group.multipliers, -1, 2, 3
+        )
+        changes = jnp.max(safe_norm(twists), axis=2)
+        return jnp.where(jnp.any(changes > 0, axis=-1, keepdims=True), changes, 1.0)
+
+    by_group = [[spans(group) for group in groups] for groups in (system.joints, system.effects)]
+    # What is compared with them has no derivatives by them.
+    return jax.lax.stop_gradient((_scene_size(system, state), by_group))
+
+
+def _scene_size(system: Model, state: State) -> Float[Array, ""]:
+    """Distance of bodies, joints and markers from their middle, with the size of the largest body [m]."""
+    rows = rows_with_ground(state.q)
+    points = [state.rows[:, 0]]
+    if system.joints:
+        points.append(jnp.einsum("jbw,jbwx->jbx", system.frames[:, :, 0], rows[system.joint_bodies]))
+    for group in system.effects:
+        if group.weights is not None:
+            at = jax.vmap(place_markers)(group.weights, rows[group.bodies])
+            is_point = jnp.any(group.weights[..., ::4] != 0, axis=-1, keepdims=True)
+            points.append(jnp.where(is_point, at, state.q[0]))
+    places = jnp.concatenate([x.reshape(-1, 3) for x in points])
+    mass, moment = system.mass[:, 0, 0], jnp.trace(system.mass[:, 1:, 1:], axis1=1, axis2=2)
+    radius = safe_sqrt(safe_divide(moment, mass))
+    size = jnp.max(safe_norm(places - jnp.mean(places, axis=0))) + jnp.max(radius)
+    return jnp.where(size > 0, size, 1.0)
 
 
 def coordinate_matrix(system: Model, state: State) -> Float[Array, "coordinates twists"]:

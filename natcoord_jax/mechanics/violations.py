@@ -16,11 +16,11 @@ from natcoord_jax.model.model import Model
 from natcoord_jax.model.rows import group_places, rows_with_ground
 
 GAP = 1e-9
-"""Largest violation [m, rad, -] and rate of it taken for round-off of printed data, per unit of size."""
+"""Largest violation, relative, and rate of it taken for round-off of printed data."""
 
 LEFT_OPEN = 1e-6
-"""Largest violation [m, rad, -], per unit of size, of a state that a run may start from: what is left by one
-with a loose `newton_tol`."""
+"""Largest violation, relative, of a state that a run may start from: what is left by one with a loose
+`newton_tol`."""
 
 
 def constrained(system: Model) -> tuple[Group, ...]:
@@ -109,24 +109,49 @@ def largest(groups: list[Array]) -> Float[Array, ""]:
     return jnp.max(jnp.concatenate([jnp.zeros(1), *(jnp.abs(x).reshape(-1) for x in groups)]))
 
 
-def position_size(state: State) -> Float[Array, ""]:
-    """What violations of positions are compared with."""
-    return 1.0 + jnp.max(jnp.abs(state.q)) + jnp.max(jnp.abs(state.coordinates), initial=0.0)
+def spans(system: Model, groups: Sequence[Group]) -> list[Float[Array, "n m"]]:
+    """What a motion by the size of the scene and a turn by one radian change each constraint by, at most."""
+    return [
+        system.size * shifted + turned for shifted, turned in (jnp.unstack(g.spans, axis=-1) for g in groups)
+    ]
 
 
-def rate_size(state: State) -> Float[Array, ""]:
-    """What their rates are compared with."""
-    return 1.0 + jnp.max(jnp.abs(state.v))
+def relative(system: Model, groups: Sequence[Group], found: list[Array]) -> list[Array]:
+    """Violations of the constraints of groups, or their rates, in terms of their spans [-, 1/s]."""
+    return [x / span for x, span in zip(found, spans(system, groups), strict=True)]
 
 
-def misses(system: Model, state: State) -> tuple[Array, Array]:
-    """Largest violation of any joint or relation and of their rates, in terms of `GAP` times the size."""
+def coordinate_sizes(system: Model) -> Float[Array, " coordinates"]:
+    """One radian, or the size of the scene [m], of every joint coordinate."""
+    sizes = jnp.ones(len(system.structure.coordinates))
+    for group in system.coordinates:
+        if group.axis.unit != "rad":
+            sizes = sizes.at[group.index].set(system.size)
+    return sizes
+
+
+def position_size(system: Model, state: State) -> Float[Array, ""]:
+    """What relative violations of positions are compared with.
+
+    More than one far away and after many turns, where places and angles are rounded more coarsely.
+    """
+    far = jnp.max(jnp.abs(state.rows[:, 0])) / system.size
+    return 1.0 + far + jnp.max(jnp.abs(state.coordinates / coordinate_sizes(system)), initial=0.0)
+
+
+def rate_size(system: Model, state: State) -> Float[Array, ""]:
+    """What their relative rates are compared with: how fast the bodies move in terms of that size [1/s]."""
+    v = jnp.abs(state.row_rates)
+    return jnp.maximum(jnp.max(v[:, 0]) / system.size, jnp.max(v[:, 1:]))
+
+
+def misses(system: Model, state: State) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
+    """Whether any joint or relation is violated by more than `GAP`, and whether its rate is."""
     groups = constrained(system)
-    gap, rate = (
-        largest(violations_of(system, (*groups, *contacts(system)), state)),
-        largest(violation_rates_of(system, groups, state)),
-    )
-    return gap / (GAP * position_size(state)), rate / (GAP * rate_size(state))
+    closing = (*groups, *contacts(system))
+    gap = largest(relative(system, closing, violations_of(system, closing, state)))
+    rate = largest(relative(system, groups, violation_rates_of(system, groups, state)))
+    return ~(gap <= GAP * position_size(system, state)), ~(rate <= GAP * rate_size(system, state))
 
 
 def is_open(system: Model, state: State) -> Bool[Array, ""]:
@@ -135,23 +160,26 @@ def is_open(system: Model, state: State) -> Bool[Array, ""]:
     Those that are not numbers miss nothing: the first step finds them.
     """
     groups = (*(g for g in constrained(system) if not g.in_tree), *contacts(system))
-    found = violations_of(system, groups, state, "violation")
-    return largest(found) > LEFT_OPEN * position_size(state)
+    found = relative(system, groups, violations_of(system, groups, state, "violation"))
+    return largest(found) > LEFT_OPEN * position_size(system, state)
 
 
 @eager_numpy
-def _position_violations(system: Model, state: State) -> tuple[list[Array], Array]:
-    return violations_of(system, constrained(system), state), position_size(state)
+def _position_violations(system: Model, state: State) -> tuple[list[Array], list[Array], Array]:
+    groups = constrained(system)
+    return violations_of(system, groups, state), spans(system, groups), position_size(system, state)
 
 
 @eager_numpy
-def _overlaps(system: Model, state: State) -> tuple[list[Array], Array]:
-    return violations_of(system, contacts(system), state), position_size(state)
+def _overlaps(system: Model, state: State) -> tuple[list[Array], list[Array], Array]:
+    groups = contacts(system)
+    return violations_of(system, groups, state), spans(system, groups), position_size(system, state)
 
 
 @eager_numpy
-def _rate_violations(system: Model, state: State) -> tuple[list[Array], Array]:
-    return violation_rates_of(system, constrained(system), state), rate_size(state)
+def _rate_violations(system: Model, state: State) -> tuple[list[Array], list[Array], Array]:
+    groups = constrained(system)
+    return violation_rates_of(system, groups, state), spans(system, groups), rate_size(system, state)
 
 
 @dataclass(frozen=True)
@@ -184,7 +212,7 @@ def worst_violation(
     allowed: float = GAP,
     overlaps: bool = False,
 ) -> Violation | None:
-    """The largest violation (or rate of one) of a concrete state beyond what is allowed, per unit of size.
+    """The largest violation (or rate of one), relative, of a concrete state beyond what is allowed.
 
     Of constraints, or overlaps of surfaces in contact.
     """
@@ -192,18 +220,20 @@ def worst_violation(
     if not groups:
         return None
     find = _overlaps if overlaps else _rate_violations if rates else _position_violations
-    listed, size = find(system, state)
+    listed, spanned, size = find(system, state)
     found = [np.abs(np.asarray(x)) for x in listed]
-    sizes = [np.max(x) for x in found]
+    shares = [x / np.asarray(span) for x, span in zip(found, spanned, strict=True)]
+    sizes = [np.max(x) for x in shares]
     worst = int(np.argmax(sizes))
     if not sizes[worst] > allowed * float(size):
         return None
     group = groups[worst]
-    instance, row = np.unravel_index(np.argmax(found[worst]), found[worst].shape)
+    instance, row = np.unravel_index(np.argmax(shares[worst]), shares[worst].shape)
     places, rows = group_places(system, group)[instance], rows_with_ground(state.q)[group.bodies[instance]]
     alone = jax.tree.map(lambda x: x[instance], group.effect)
     unit = alone.violation_units(places, rows)[row]
     if rates:
         unit = "1/s" if unit == "-" else f"{unit}/s"
     is_joint = group.source == "joint"
-    return Violation(group.effect.kind, group.names[int(instance)], float(sizes[worst]), unit, is_joint)
+    size = float(found[worst][instance, row])
+    return Violation(group.effect.kind, group.names[int(instance)], size, unit, is_joint)

@@ -48,7 +48,7 @@ def bare(effect: Effect, drop: Sequence[str], label: str) -> Effect:
     check_fields(effect, label)
 
     def leaf(value: Any) -> Any:
-        if isinstance(value, jax.Array | np.ndarray):
+        if isinstance(value, jax.Array | np.ndarray) and value.dtype.kind not in "USO":
             return as_array(value, float) if jnp.issubdtype(value.dtype, jnp.floating) else value
         if isinstance(value, bool | str):
             raise ValueError(

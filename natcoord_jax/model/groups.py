@@ -1,7 +1,7 @@
 """Groups of equal kinds of effects and of joint coordinates, stacked."""
 
 from collections.abc import Sequence
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import numpy as np
@@ -32,6 +32,8 @@ class Group(Stacked):
         in_tree: joints of the spanning tree, whose multipliers are not needed.
         source: where the place of the effect comes from: "markers", "joint", "coordinates" or "mass".
         turning: whether any of the bodies turns; points do not.
+        spans: of constraints how much each changes with the place of a body, and with its angle, at most: by
+            them violations are compared with the size of the scene, (n, m, 2). None: there are none.
     """
 
     effect: Effect
@@ -48,6 +50,7 @@ class Group(Stacked):
     source: str = eqx.field(static=True)
     in_tree: bool = eqx.field(static=True, default=False)
     turning: bool = eqx.field(static=True, default=True)
+    spans: Any = None
 
     stacked: ClassVar[str] = "effect"
 

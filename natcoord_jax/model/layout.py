@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
@@ -27,8 +28,6 @@ from natcoord_jax.model.graph import Edge, spanning_tree
 from natcoord_jax.model.grouping import Instance, bare, families
 from natcoord_jax.model.groups import CoordinateGroup
 from natcoord_jax.xla.tracing import at_top_level
-
-JOINT_FIELDS = ("parent", "child", "point", "axis", "second", "name", "parent_point")
 
 
 class Layout:
@@ -149,7 +148,7 @@ class Layout:
             instances.append(
                 Instance(
                     name,
-                    bare(ready, JOINT_FIELDS, f"joint {name!r}"),
+                    bare(ready, ready.assembling, f"joint {name!r}"),
                     "joint",
                     [self.body(joint.parent), self.body(joint.child)],
                     joints=[self.joint_number[name]],
@@ -211,6 +210,8 @@ class Layout:
                 f"not {markers!r}"
             )
         weights, bodies = self._weighted(markers)
+        if effect.unit_directions:
+            weights = _with_unit_directions(weights, self.rows_at(np.array(bodies)))
         if type(effect).assembled_at is not Effect.assembled_at:
             effect = effect.assembled_at(_place_markers(weights, self.rows_at(np.array(bodies))))
         drop = [f for f in ("markers", "name", "joint") if f in type(effect).__dataclass_fields__]
@@ -292,6 +293,15 @@ MOTION = "position", "rotation", "velocity", "angular_velocity"
 """What the rows of a body and their velocities are made of."""
 
 _frames_at = eager_numpy(frames_at)
+
+
+@eager_numpy
+def _with_unit_directions(weights: Float[Array, "k w"], rows: Float[Array, "b 4 3"]) -> Array:
+    """Weights of markers, those of directions such that they are unit vectors in the assembled pose."""
+    sizes = jnp.sqrt(jnp.sum(jnp.square(place_markers(weights, rows)), axis=1))
+    # Rounding of unit vectors is left as it is.
+    fine = jnp.any(weights[:, ::4] != 0, axis=1) | (jnp.abs(sizes - 1.0) <= 4.0 * jnp.finfo(sizes.dtype).eps)
+    return weights / jnp.where(fine, 1.0, sizes)[:, None]
 
 
 _place_markers = eager_numpy(place_markers)

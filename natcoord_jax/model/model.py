@@ -90,6 +90,7 @@ class Model(eqx.Module):
         structure: what is static.
         mass_between: mass between bodies, as consistent masses of elements have it; None: there is none.
         sparsity: pattern and plan of the sparse Jacobian, only where it is the solver.
+        size: of the assembled scene, with which lengths are compared: a scalar [m].
     """
 
     mass: Float[Array, "bodies 4 4"]
@@ -105,6 +106,7 @@ class Model(eqx.Module):
     structure: Structure = eqx.field(static=True)
     mass_between: MassBetween | None = None
     sparsity: Any = None
+    size: Any = None
 
     @checked("System.body_index", body=BODY_NAME)
     def body_index(self, body: Handle | str) -> int:

@@ -107,11 +107,11 @@ class Saddle(eqx.Module):
 
 
 def scales(system: Model) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Mass of a typical body [kg], and its squared radius of gyration [m^2] (1 for point masses)."""
+    """Mass of a typical body [kg], and its squared radius of gyration [m^2]; of points the scene's size."""
     masses = system.mass[:, 0, 0]
     moment = jnp.sum(jnp.trace(system.mass[:, 1:, 1:], axis1=1, axis2=2))
     radius = moment / jnp.sum(masses)
-    return jnp.mean(masses), jnp.where(radius > 0, radius, 1.0)
+    return jnp.mean(masses), jnp.where(radius > 0, radius, jnp.square(system.size))
 
 
 def _accelerated(
@@ -135,14 +135,29 @@ def _reactions(
     return balances.reactions(force, torque, lam)
 
 
+def _units(system: Model, radius: Array) -> Float[Array, " m"]:
+    """Of every constraint, what it changes by where a body moves by one metre, or turns by as much."""
+    groups = (*relations_of(system), *loops_of(system))
+    change = [g.spans[..., 0] + g.spans[..., 1] / jnp.sqrt(radius) for g in groups]
+    return jnp.concatenate([x.reshape(-1) for x in change])
+
+
 def _measured(
-    balances: EquationsOfMotion, radius: Array, gains: Accelerations, applied: Twists, lam: Array
+    balances: EquationsOfMotion, units: Array, radius: Array, gains: Any, applied: Twists, lam: Array
 ) -> Array:
-    """All reactions as one vector [N], torques divided by the radius of gyration."""
-    forces, torques = _reactions(balances, gains, applied, lam)
-    related = lam[: sum(g.count for g in relations_of(balances.system))]
-    scale = jnp.sqrt(radius)
-    return jnp.concatenate([forces.reshape(-1), torques.reshape(-1) / scale, related / scale])
+    """All reactions as one vector [N], torques divided by the radius of gyration.
+
+    Args:
+        balances: of the system.
+        units: of the constraints.
+        radius: of gyration, squared [m^2].
+        gains: accelerations.
+        applied: loads.
+        lam: multipliers, in these units [N].
+    """
+    forces, torques = _reactions(balances, gains, applied, lam / units)
+    related = lam[: sum(g.count * g.multipliers for g in relations_of(balances.system))]
+    return jnp.concatenate([forces.reshape(-1), torques.reshape(-1) / jnp.sqrt(radius), related])
 
 
 def _with_constraints(
@@ -155,17 +170,17 @@ def _with_constraints(
     still = jnp.zeros_like(balances.rows[:, 0])
     lam0 = nothing.constraints
     matrix, zero = _accelerated(balances, columns, (still, still), nothing)
-    units = jnp.eye(lam0.shape[0], dtype=lam0.dtype)
-    share = jax.vmap(lambda lam: _measured(balances, radius, nothing, (still, still), lam))(units).T
-    saddle = Saddle.of(matrix, columns.constraints.T, share.T @ share, mass)
-    w = w + saddle.solve(zero, -balances.rates(w).constraints)[0]
+    units, each = _units(system, radius), jnp.eye(lam0.shape[0], dtype=lam0.dtype)
+    share = jax.vmap(lambda lam: _measured(balances, units, radius, nothing, (still, still), lam))(each).T
+    saddle = Saddle.of(matrix, columns.constraints.T / units[:, None], share.T @ share, mass)
+    w = w + saddle.solve(zero, -balances.rates(w).constraints / units)[0]
     applied = loads(system, state, u, *balances.twists(w))
     bias = balances.bias(w)
     free = _accelerated(balances, columns, applied, bias)[1]
-    w_dot, right = saddle.solve(free, -bias.constraints)
+    w_dot, right = saddle.solve(free, -bias.constraints / units)
     gains = _combined(bias, columns, w_dot)
-    pull = share.T @ _measured(balances, radius, gains, applied, lam0)
-    return gains, applied, saddle.shares(right, pull)
+    pull = share.T @ _measured(balances, units, radius, gains, applied, lam0)
+    return gains, applied, saddle.shares(right, pull) / units
 
 
 def _without_constraints(
@@ -199,7 +214,9 @@ def instant_of(system: Model, state: State, u: Float[Array, " inputs"]) -> Insta
     these = contacts(system)
     if these:
         # What closed contacts do at an instant depends on what follows.
-        closed = jnp.any(contact_gaps(system, these, state) <= GAP * position_size(state))
+        closed = jnp.any(
+            contact_gaps(system, these, state) <= GAP * system.size * position_size(system, state)
+        )
         gains, lam = jax.tree.map(lambda x: jnp.where(closed, jnp.nan, x), (gains, lam))
     forces, torques = _reactions(balances, gains, applied, lam)
     return Instant(gains.rows.reshape(-1, 3), forces, torques, _named(balances, lam))

@@ -1,5 +1,6 @@
 """Numbers of the parts of a system, by name: read, and set in a copy."""
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -9,20 +10,26 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from natcoord_jax.core.bodies import mass_block
 from natcoord_jax.core.checks import as_array, is_concrete
 from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.effect import Effect, replace_fields
 from natcoord_jax.core.handles import Handle
+from natcoord_jax.core.inertia import diagonal, even, is_even, possible, tensor, to_second_moment
+from natcoord_jax.core.kinds import is_other
 from natcoord_jax.core.names import listed
+from natcoord_jax.core.numeric import Number, array_of
 from natcoord_jax.model.groups import Group
 from natcoord_jax.model.masses import with_mass
 from natcoord_jax.model.model import Model, SomeModel
-from natcoord_jax.reading.admissible import as_signed, signed, without_flaws
+from natcoord_jax.reading.admissible import as_declared, in_range, sound, without_flaws
 
 Names = Handle | str | Sequence[Handle | str]
 
 BODY = "mass", "com", "inertia"
 """What the mass block of a body is made of."""
+
+MASS = Number("positive")
 
 
 class Place(NamedTuple):
@@ -122,9 +129,14 @@ def _parted(block: Float[Array, "4 4"]) -> dict[str, Array]:
 @eager_numpy
 def _block(mass: Array, com: Float[Array, "3"], inertia: Float[Array, "3 3"]) -> Float[Array, "4 4"]:
     """The mass block (15) of these."""
-    moment = 0.5 * jnp.trace(inertia) * jnp.eye(3) - inertia + mass * jnp.outer(com, com)
-    first = mass * com
-    return jnp.block([[mass[None, None], first[None]], [first[:, None], moment]])
+    return mass_block(mass, com, to_second_moment(inertia) + mass * jnp.outer(com, com))
+
+
+@eager_numpy
+def _moments(block: Float[Array, "4 4"]) -> tuple[Array, Array, Array]:
+    """Mass [kg], and second moments about the centre of mass and the reference point [kg m^2]."""
+    mass, first, about = block[0, 0], block[0, 1:], block[1:, 1:]
+    return mass, about - jnp.outer(first, first) / mass, about
 
 
 @eager_numpy
@@ -135,11 +147,6 @@ def _for_all(value: Array, shape: tuple[int, ...]) -> Array:
 @eager_numpy
 def _with_row(leaf: Array, row: int | None, value: Array) -> Array:
     return value if row is None else leaf.at[row].set(value)
-
-
-@eager_numpy
-def _diagonal(values: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    return jnp.diag(values)
 
 
 def get(system: Model, part: Names, field: str | None = None) -> Any:
@@ -180,7 +187,7 @@ def set_numbers(system: SomeModel, part: Names, values: dict[str, Any]) -> SomeM
             label = f"{name!r}: {field}"
             every = found[field].row is None if field in found else False
             given[field] = _fitting(value, now[field], k if many else None, len(names), label, every=every)
-        given = as_signed(system, name, given)
+        given = as_declared(system, name, given)
         if "mass_block" in found:
             given = _as_block(name, now, given)
         leaves, structure = jax.tree.flatten(system)
@@ -188,7 +195,20 @@ def set_numbers(system: SomeModel, part: Names, values: dict[str, Any]) -> SomeM
             leaf, row, _ = found[field]
             leaves[leaf] = _with_row(jnp.asarray(leaves[leaf]), row, value)
         system = _renewed(system, jax.tree.unflatten(structure, leaves), name, set(given))
-        system = without_flaws(system, name)
+        system = _with_companions(without_flaws(sound(system, given), name), name, set(given))
+    return system
+
+
+def _with_companions(system: SomeModel, name: str, given: set[str]) -> SomeModel:
+    """The system with the effects that come with a joint, as a pitch relation, by its numbers."""
+    for group in system.joints:
+        if name in group.names and given - {"frames"}:
+            row = group.names.index(name)
+            joint: Any = jax.tree.map(lambda x, row=row: x[row], group.effect)
+            for effect in joint.companions(Handle("joint", name, 0)):
+                fields = {f.name: getattr(effect, f.name) for f in dataclasses.fields(effect)}
+                numbers = {key: value for key, value in fields.items() if eqx.is_inexact_array(value)}
+                system = set_numbers(system, effect.name, numbers)
     return system
 
 
@@ -217,14 +237,22 @@ def _anew(effect: Effect, row: int | None) -> Effect:
 
 def _as_block(name: str, now: dict[str, Array], given: dict[str, Array]) -> dict[str, Array]:
     """The mass block of what is given, and of what is kept."""
+    label = f"body {name!r}"
     if "mass_block" in given:
         if len(given) > 1:
-            raise ValueError(f"body {name!r}: pass mass_block, or some of {list(BODY)}, not both")
-        return given
+            raise ValueError(f"{label}: pass mass_block, or some of {list(BODY)}, not both")
+        block = even(given["mass_block"], f"{label}: mass_block [kg, kg m, kg m^2]")
+        mass, central, about = _moments(block)
+        in_range(MASS, mass, f"{label}: mass [kg]")
+        return {"mass_block": possible(block, central / (mass > 0), about, label, "mass_block")}
     if "mass" in given:
-        given = {**given, "mass": signed(given["mass"], "positive", f"body {name!r}: mass [kg]")}
+        given = {**given, "mass": in_range(MASS, given["mass"], f"{label}: mass [kg]")}
     if "inertia" not in now:
         return {"mass_block": now["mass_block"].at[0, 0].set(given["mass"])}
+    if "inertia" in given:
+        inertia = tensor(given["inertia"], f"{label}: inertia")
+        about = to_second_moment(inertia)
+        given = {**given, "inertia": possible(inertia, about, about, label, "inertia")}
     return {"mass_block": _block(*(given.get(key, now[key]) for key in BODY))}
 
 
@@ -238,9 +266,22 @@ def _check(name: str, known: list[str], field: str, place: Place | None) -> None
     if field not in known:
         label = repr(name) if place is None else place.kind
         raise ValueError(
-            f"the {label} has no number {field!r}; it has {known}. What a function closes over is not among "
-            "them: change it where it is, the next call sees it"
+            f"the {label} has no number {field!r}; it has {known}. Not among them are what a function closes "
+            "over (change it where it is, the next call sees it) and what only the assembled pose takes, as "
+            "the point and the zero of a joint (change it in the scene, and compile that)"
         )
+
+
+def _principal(array: Array, *, several: bool) -> Array:
+    """Inertias by their diagonals, also of several bodies.
+
+    A matrix of three rows is one for all of three bodies where it is symmetric, and else has a row for each.
+    No symmetric matrix is both: its rows would be inertias of no body.
+    """
+    if array.shape == (3, 3) and several:
+        xp: Any = np if is_concrete(array) else jnp
+        return xp.where(is_even(xp.asarray(array)), xp.asarray(array)[None], diagonal(array))
+    return diagonal(array) if array.ndim == 1 or several else array
 
 
 def _fitting(value: Any, now: Array, k: int | None, count: int, label: str, *, every: bool = False) -> Array:
@@ -248,13 +289,11 @@ def _fitting(value: Any, now: Array, k: int | None, count: int, label: str, *, e
 
     Of a set, `every`, one for all elements will do as well.
     """
+    if array_of(value) is None:
+        raise ValueError(f"{label} {is_other(value)}; pass numbers")
     array = as_array(value, float)
-    if label.endswith(": inertia") and array.shape[-1:] == (3,) and array.shape in ((3,), (count, 3)):
-        # (Three numbers for three bodies are a matrix, or rows of diagonals: the matrix is square itself.)
-        if array.ndim == 1:
-            array = _diagonal(array)
-        elif k is not None and count != 3:
-            return _diagonal(array[k])
+    if label.endswith(": inertia") and array.shape in ((3,), (count, 3)):
+        array = _principal(array, several=k is not None)
     if every and k is None and array.shape == now.shape[1:]:
         array = _for_all(array, now.shape)
     shapes = [now.shape] + ([(count, *now.shape)] if k is not None else [])

@@ -2,6 +2,7 @@
 
 import warnings
 import weakref
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +21,9 @@ from natcoord_jax.mechanics.violations import GAP, LEFT_OPEN, constrained, misse
 from natcoord_jax.reading.diagnostics import unknown_name
 from natcoord_jax.stepping.assemble import with_admissible_positions
 from natcoord_jax.system import System
+
+UNTOLD = 1e-12
+"""Rate [m/s, rad/s, 1/s] of a constraint that is rounding of what is prescribed: projected, not told."""
 
 
 def check_gaps(system: System, state: State) -> None:
@@ -103,11 +107,12 @@ def project_velocities(system: System, state: State) -> State:
             f"{left.unit}; check drives that ask for what others or the position forbid"
         )
     change = float(np.max(np.abs(np.asarray(projected.v) - np.asarray(state.v))))
-    warnings.warn(
-        f"initial velocities violate {worst} by {worst.size:.3g} {worst.unit}; they were projected onto the "
-        f"constraints, which changed row velocities by up to {change:.3g} m/s (directors: 1/s)",
-        stacklevel=5,
-    )
+    if worst.size > UNTOLD:
+        warnings.warn(
+            f"initial velocities violate {worst} by {worst.size:.3g} {worst.unit}; they were projected onto "
+            f"the constraints, which changed row velocities by up to {change:.3g} m/s (directors: 1/s)",
+            stacklevel=5,
+        )
     return projected
 
 
@@ -119,11 +124,10 @@ def admitted(system: System, state: State) -> State:
     """
     if not system.structure.multipliers and not constrained(system):
         return state
-    gap, rate = misses(system, state)
-    moving_along = rate <= 1.0
+    open_, sliding = misses(system, state)
     projected, code = with_admissible_velocities(system, state)
-    state = jax.tree.map(lambda x, y: jnp.where(moving_along, x, y), state, projected)
-    return jax.tree.map(lambda x: jnp.where((gap <= 1.0) & (moving_along | (code == 0)), x, jnp.nan), state)
+    state = jax.tree.map(lambda x, y: jnp.where(sliding, y, x), state, projected)
+    return jax.tree.map(lambda x: jnp.where(open_ | (sliding & (code != 0)), jnp.nan, x), state)
 
 
 _with_admissible_velocities = eager_numpy(with_admissible_velocities)
@@ -196,7 +200,7 @@ def find_redundancy(system: System, state: State) -> tuple[int, tuple[str, ...]]
     random = np.random.default_rng(0)
     for attempt in range(3):
         if attempt:
-            disturbed = _disturbed(state, random)
+            disturbed = _disturbed(state, system.size, random)
             state_now, code = _with_admissible_positions(system, disturbed)
             if int(code) != Result.SUCCESSFUL:
                 continue
@@ -213,10 +217,10 @@ def find_redundancy(system: System, state: State) -> tuple[int, tuple[str, ...]]
     return best, names
 
 
-def _disturbed(state: State, random: np.random.Generator) -> State:
+def _disturbed(state: State, size: Any, random: np.random.Generator) -> State:
     q = np.asarray(state.rows)
     noise = 0.05 * random.normal(size=q.shape)
-    noise[:, 0] *= max(np.max(np.abs(q[:, 0])), 1e-3)
+    noise[:, 0] *= float(size)
     return replace_fields(state, q=as_array((q + noise).reshape(-1, 3)), v=as_array(np.zeros(state.v.shape)))
 
 

@@ -24,7 +24,7 @@ from natcoord_jax.maths.elimination import definite_solution
 from natcoord_jax.maths.vectors import largest, safe_norm
 from natcoord_jax.mechanics.coordinates import coordinate_rates
 from natcoord_jax.mechanics.projection import Projection, gaps, moved
-from natcoord_jax.mechanics.violations import GAP, position_size
+from natcoord_jax.mechanics.violations import GAP, constrained, coordinate_sizes, position_size, spans
 from natcoord_jax.model.rows import row_rates, rows_with_ground
 from natcoord_jax.stepping.newton import any_lane
 from natcoord_jax.system import System
@@ -42,7 +42,7 @@ DAMPING = 1e-12
 """Least damping: what depends on others to some 1e-6 is not pushed against."""
 
 ROUND_OFF = 1e-15
-"""Gaps [m, rad, -], per unit of size, that no step makes smaller."""
+"""Gaps, relative, that no step makes smaller."""
 
 MOST_DAMPING = 1e4
 """Damping at which a step is along the slope of the gaps: if it does not help, nothing does."""
@@ -118,21 +118,24 @@ def _step(system: System, origin: State, state: State, manner: Manner) -> Outcom
     limited = turned > manner.reach
     twist = jnp.where(limited, manner.reach / jnp.where(limited, turned, 1.0), 1.0) * twist
     points = state.rows[:, 0]
-    extent = largest(jnp.abs(points - jnp.mean(points, axis=0)).reshape(-1)) + 0.1
+    extent = largest(jnp.abs(points - jnp.mean(points, axis=0)).reshape(-1)) + 0.1 * system.size
     size = jnp.concatenate([jnp.full(3, extent), jnp.ones(3, extent.dtype)])
     shaken = jnp.asarray(_shakes(points.shape[0]))[manner.shake] * size
     twist = jnp.where(manner.shake > 0, shaken, twist)
     after = _moved(system, state, twist)
     found = gaps(system, after, held, wanted)
-    most, least = GAP * position_size(after), ROUND_OFF * position_size(after)
+    sizes = [x.reshape(-1) for x in spans(system, constrained(system))]
+    sizes += [] if held is None else [coordinate_sizes(system)]
+    gap, other = (x / jnp.concatenate([jnp.zeros(0), *sizes]) for x in (gap, found))
+    size = position_size(system, after)
     return Outcome(
         after,
         jnp.linalg.norm(scaled),
         jnp.linalg.norm(found / linear.scale),
         jnp.linalg.norm(scaled + linear.matrix @ twist.reshape(-1)),
         limited,
-        jnp.max(jnp.abs(jnp.stack([gap, found])), initial=0.0) <= most,
-        jnp.max(jnp.abs(gap), initial=0.0) <= least,
+        jnp.max(jnp.abs(jnp.stack([gap, other])), initial=0.0) <= GAP * size,
+        jnp.max(jnp.abs(gap), initial=0.0) <= ROUND_OFF * size,
     )
 
 

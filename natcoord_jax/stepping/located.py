@@ -87,8 +87,8 @@ class Ahead(eqx.Module):
         begun = gaps_and_rates(system, groups, state, state.v)
         ended = gaps_and_rates(system, groups, after, 2.0 * rates - state.v)
         free = jnp.concatenate([group.effect.phase == FREE for group in groups])
-        slow = touch(after, SLOW) / dt
-        return cls(free, (begun[0], ended[0]), (begun[1], ended[1]), touch(after, CLOSED), slow, h)
+        slow = touch(system, after, SLOW) / dt
+        return cls(free, (begun[0], ended[0]), (begun[1], ended[1]), touch(system, after, CLOSED), slow, h)
 
     def crossings(self) -> Float[Array, " c"]:
         """When late gaps close [s], by the parabolas through what is known."""

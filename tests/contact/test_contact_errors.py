@@ -82,7 +82,7 @@ WRONG = [
     (of("ball", FLOOR, stiffness=1.0, restitution=1.2, speed=1.0), "up to 1"),
     (of("ball", FLOOR, stiffness=1.0, restitution=0.5), "is that of one speed"),
     (of("ball", FLOOR, restitution=2.0), "^contact 'contact 1': restitution"),
-    (of("ball", FLOOR, restitution=1.5), "restitution .* 1.5; pass a number from 0 to 1"),
+    (of("ball", FLOOR, restitution=1.5), "restitution .* 1.5; .* not negative and up to 1"),
     (of("ball", FLOOR, restitution=0.5, speed=1.0), "speed .* of contacts with a stiffness"),
     (of("block 0", "block 1", stiffness=-1.0), "stiffness.*positive"),
     # Surfaces.
@@ -187,8 +187,8 @@ SET = [
     (SOFT, {"restitution": 1.2}, "contact 'bounce'.*restitution"),
     (SOFT, {"restitution": 0.0}, "contact 'bounce'.*restitution"),
     (SOFT, {"stiffness": 0.0}, "contact 'bounce'.*stiffness"),
-    ({"restitution": 0.5}, {"restitution": 1.5}, "'bounce' has a restitution .* above 1"),
-    ({**SOFT, "friction": 0.3}, {"restitution": 1.5}, "'bounce' has a restitution"),
+    ({"restitution": 0.5}, {"restitution": 1.5}, "'bounce': restitution is 1.5; .* up to 1"),
+    ({**SOFT, "friction": 0.3}, {"restitution": 1.5}, "'bounce': restitution is 1.5"),
 ]
 ORDER_FOUR = nc.EnergyMomentum(order=4)
 LOCATED = nc.EnergyMomentum(max_events=4)

@@ -106,6 +106,31 @@ def test_restitution_of_soft_contacts(law):
     assert parting(system.set("impact", restitution=1.0), state, h=1e-3) == pytest.approx(1.0, rel=1e-9)
 
 
+def test_damping_at_the_ends_of_restitution():
+    """Of each e from 1e-12 to one rounding below 1: 3 (1 - e) / 2 towards 1, and 1 / e towards zero.
+
+    One that is infinite or negative lets a ball through the floor, or throws it up.
+    """
+    scene = nc.Scene()
+    ball = scene.add(nc.RigidBody(shape=nc.Sphere(0.1), density=100.0, position=(0, 0, 0.2)))
+    floor = {"stiffness": 1e4, "restitution": 0.5, "speed": 1.0}
+    scene.add(nc.Contact(ball, nc.Plane(), **floor, name="floor"))
+    system, _ = scene.compile()
+
+    def damping(e):
+        return system.set("floor", restitution=e).get("floor", "damping")
+
+    lossless = 1.0 - 10.0 ** -np.random.default_rng(0).uniform(6.0, 15.9, 1000)
+    lossy = 10.0 ** -np.linspace(6.0, 12.0, 20)
+    values, slopes = jax.jit(jax.vmap(jax.value_and_grad(damping)))(np.concatenate([lossless, lossy, [1.0]]))
+    near, far = slice(0, 1000), slice(1000, 1020)
+    wanted = 1.5 * (1.0 - lossless)
+    assert np.all(np.abs(values[near] - wanted) <= 2e-6 * wanted + 2e-18)
+    assert np.max(np.abs(slopes[near] / -1.5 - 1.0)) <= 4e-6
+    assert np.max(np.abs(values[far] * lossy - 1.0)) <= 1e-6
+    assert values[-1] == 0.0 and abs(slopes[-1] + 1.5) <= 1e-6
+
+
 @pytest.mark.parametrize(
     "scheme",
     [

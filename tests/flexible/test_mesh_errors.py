@@ -122,7 +122,7 @@ def of_layers(mesh, more):
         (lambda: layer(twin, split), "nodes 4 and 9 are at the same place, .* merge them"),
         (lambda: layer(mesh.nodes, mesh.cells, 0.0), r"thickness \[m\] is 0.0; pass a positive number"),
         (lambda: layer(mesh.nodes, mesh.cells, thick), positive),
-        (lambda: system.set("plate", thickness=-0.1), "'plate': thickness is -0.1; pass positive"),
+        (lambda: system.set("plate", thickness=-0.1), "'plate': thickness is -0.1; pass a positive"),
         (under_pressure, turns),
     ]
 

@@ -179,7 +179,7 @@ def test_what_cannot_be_reached_is_named_with_what_remains():
         scene.add(nc.Distance(nc.ground, arm, **ends, length=target, name="rod"))
         with pytest.raises(ValueError, match="joint 'rod' does not close"):
             scene.compile()
-        with pytest.raises(nc.SimulationError, match=r"stays open by [\d.]+ m in") as caught:
+        with pytest.raises(nc.SimulationError, match=r"stays open by [\d.]+ (m|-) in") as caught:
             scene.compile(assemble=True)
         assert "'rod'" in str(caught.value) or "'shoulder'" in str(caught.value)
 

@@ -15,6 +15,7 @@ from natcoord_jax.core.motion import StepContext
 from natcoord_jax.core.numeric import Number, Numbers, Vector
 
 UNBOUNDED = Number(infinite=True)
+CROSSED = "has lower [-] above upper; exchange them"
 
 
 class AffineActuator(CoordinateEffect):
@@ -63,6 +64,11 @@ class AffineActuator(CoordinateEffect):
     inputs: ClassVar[int] = 1
     works: ClassVar[bool] = True
 
+    def flaws(self) -> dict[str, Any]:
+        """Ranges without anything in them."""
+        said = "has least [N or N m] above most; exchange them"
+        return {CROSSED: self.lower > self.upper, said: self.least > self.most}
+
     def generalised(self, rates: Array, now: StepContext, lam: Array) -> tuple[Array, Array, Array]:
         """The force at every stage, along the gear; its power is force times velocity, exactly."""
         gear = jnp.asarray(self.gear, float)
@@ -102,7 +108,12 @@ class WrenchInput(Force):
     upper: Any = eqx.field(default=jnp.inf, kw_only=True, metadata=is_a(UNBOUNDED))
 
     kind: ClassVar[str] = "wrench input"
+    unit_directions: ClassVar[bool] = True
     inputs: ClassVar[int] = 1
+
+    def flaws(self) -> dict[str, Any]:
+        """A range without anything in it."""
+        return {CROSSED: self.lower > self.upper}
 
     def load(self, x: Array, rate: Array, inputs: Array, t: Array) -> Load:
         """Force and torque along the mid-point directions."""
@@ -129,7 +140,12 @@ class SphericalTorque(Force):
     upper: Any = eqx.field(default=jnp.inf, kw_only=True, metadata=is_a(UNBOUNDED))
 
     kind: ClassVar[str] = "spherical torque"
+    unit_directions: ClassVar[bool] = True
     inputs: ClassVar[int] = 1
+
+    def flaws(self) -> dict[str, Any]:
+        """A range without anything in it."""
+        return {CROSSED: self.lower > self.upper}
 
     def load(self, x: Array, rate: Array, inputs: Array, t: Array) -> Load:
         """Torque along the mid-point direction, and its opposite."""

@@ -88,6 +88,7 @@ class BodyTorqueInput(Force):
     markers: Any = eqx.field(metadata=is_a(Markers(0, 3)))
 
     kind: ClassVar[str] = "body torque input"
+    unit_directions: ClassVar[bool] = True
     inputs: ClassVar[int] = 3
 
     def load(self, x: Array, rate: Array, inputs: Array, t: Array) -> Load:
@@ -105,6 +106,7 @@ class BodyForceInput(Force):
     markers: Any = eqx.field(metadata=is_a(Markers(1, 1)))
 
     kind: ClassVar[str] = "body force input"
+    unit_directions: ClassVar[bool] = True
     inputs: ClassVar[int] = 1
 
     def load(self, x: Array, rate: Array, inputs: Array, t: Array) -> Load:

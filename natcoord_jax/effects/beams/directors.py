@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.force import Force, Load
 from natcoord_jax.core.markers import Markers
-from natcoord_jax.core.numeric import Numbers, Vector
+from natcoord_jax.core.numeric import Definite, Numbers, Vector
 from natcoord_jax.core.potential import Potential, place_markers
 from natcoord_jax.effects.beams.readings import BeamReadings
 from natcoord_jax.maths.vectors import dot
@@ -55,7 +55,7 @@ class DirectorElement(Potential):
     values: Any = eqx.field(kw_only=True, metadata=is_a(Numbers((None, None))))
     slopes: Any = eqx.field(kw_only=True, metadata=is_a(Numbers((None, None))))
     weights: Any = eqx.field(kw_only=True, metadata=is_a(Vector(None)))
-    stiffness: Any = eqx.field(kw_only=True, metadata=is_a(Numbers((6, 6))))
+    stiffness: Any = eqx.field(kw_only=True, metadata=is_a(Definite((6, 6))))
     reference: Any = eqx.field(kw_only=True, metadata=is_a(Numbers((None, 6))))
     inertia: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Numbers((None, 4, None, 4))))
 
@@ -107,7 +107,7 @@ class DirectorDamping(Force):
     values: Any = eqx.field(kw_only=True, metadata=is_a(Numbers((None, None))))
     slopes: Any = eqx.field(kw_only=True, metadata=is_a(Numbers((None, None))))
     weights: Any = eqx.field(kw_only=True, metadata=is_a(Vector(None)))
-    viscosity: Any = eqx.field(kw_only=True, metadata=is_a(Numbers((6, 6))))
+    viscosity: Any = eqx.field(kw_only=True, metadata=is_a(Definite((6, 6))))
 
     kind: ClassVar[str] = "director damping"
 

@@ -21,7 +21,7 @@ from natcoord_jax.core.force import Force, Load
 from natcoord_jax.core.kinds import FunctionOf
 from natcoord_jax.core.markers import Markers
 from natcoord_jax.core.motion import Motion, StepContext
-from natcoord_jax.core.numeric import Number, Numbers, Vector
+from natcoord_jax.core.numeric import Definite, Number, Numbers, Vector
 from natcoord_jax.core.potential import place_markers
 from natcoord_jax.effects.beams.logarithm import Logarithm
 from natcoord_jax.effects.beams.pairs import Expanded, tangents_of_pairs
@@ -101,7 +101,7 @@ class BeamElement(Expanded):
 
     markers: Any = eqx.field(metadata=is_a(Markers(attachments=2)))
     length: Any = eqx.field(kw_only=True, metadata=is_a(Number("positive")))
-    stiffness: Any = eqx.field(kw_only=True, metadata=is_a(Numbers((6, 6))))
+    stiffness: Any = eqx.field(kw_only=True, metadata=is_a(Definite((6, 6))))
     reference: Any = eqx.field(
         default=(0.0, 0.0, 1.0, 0.0, 0.0, 0.0), kw_only=True, converter=as_array, metadata=is_a(Vector(6))
     )
@@ -232,7 +232,7 @@ class BeamDamping(Force):
 
     markers: Any = eqx.field(metadata=is_a(Markers(attachments=2)))
     length: Any = eqx.field(kw_only=True, metadata=is_a(Number("positive")))
-    viscosity: Any = eqx.field(kw_only=True, metadata=is_a(Numbers((6, 6))))
+    viscosity: Any = eqx.field(kw_only=True, metadata=is_a(Definite((6, 6))))
 
     kind: ClassVar[str] = "beam damping"
 

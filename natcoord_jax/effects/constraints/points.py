@@ -70,6 +70,7 @@ class PointOnPlane(Constraint):
     distance: Any = eqx.field(default=0.0, kw_only=True, metadata=is_a(Number()))
 
     kind: ClassVar[str] = "point on plane"
+    unit_directions: ClassVar[bool] = True
     multipliers: ClassVar[int] = 1
 
     def residual(self, x: Array) -> Array:

@@ -10,6 +10,7 @@ from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.constraint import VelocityConstraint
 from natcoord_jax.core.markers import Markers
 from natcoord_jax.core.numeric import Number
+from natcoord_jax.core.potential import place_markers
 from natcoord_jax.maths.vectors import cross, dot
 
 
@@ -42,7 +43,15 @@ class Rolling(VelocityConstraint):
     radius: Any = eqx.field(kw_only=True, metadata=is_a(Number("positive")))
 
     kind: ClassVar[str] = "rolling"
+    unit_directions: ClassVar[bool] = True
     multipliers: ClassVar[int] = 3
+
+    def violation(self, place: Array, rows: Array, coordinates: Array, t: Array) -> Array:
+        """How far a ball is from its plane [m]; a disc is where it is to the order of the scheme only."""
+        x = place_markers(place, rows)
+        if len(x) > 3:
+            return super().violation(place, rows, coordinates, t)
+        return (dot(x[1], x[2] - x[0]) - self.radius) * x[1]
 
     def rate(self, x: Array, velocity: Array, spin: Array) -> Array:
         """Velocity of the body's point of contact relative to the plane [m/s]."""

@@ -34,7 +34,8 @@ class Rubbing(Effect):
         markers: that the gap is of.
         gap: between the surfaces.
         friction: coefficient mu [-]; None: there is none.
-        regularisation: eps [m/s].
+        regularisation: eps [m/s]; None: 3e-6 of the speed that gravity gives along the size of the scene, and
+            of the fastest body at the start.
         name: optional name.
         mobility: change of the speed of closing by a unit impulse [1/kg], follows from the masses.
         phase: in the part of a step at hand of schemes that locate impacts, `FREE` where nothing pushes until
@@ -44,12 +45,13 @@ class Rubbing(Effect):
     markers: Any = eqx.field(metadata=is_a(Markers()))
     gap: Gap = eqx.field(metadata=is_a(GAP))
     friction: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Number("not negative")))
-    regularisation: Any = eqx.field(default=1e-5, kw_only=True, metadata=is_a(Number("positive")))
+    regularisation: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Number("positive")))
     name: Any = eqx.field(default=None, kw_only=True, metadata=is_a(NAME))
     mobility: Any = eqx.field(default=None, init=False)
     phase: Any = eqx.field(default=None, init=False)
 
     unilateral: ClassVar[bool] = True
+    unit_directions: ClassVar[bool] = True
     impulsive: ClassVar[bool] = True
     works: ClassVar[bool] = True
     silent: ClassVar[bool] = False

@@ -29,7 +29,7 @@ class FrictionalNodeOnFacets(NodeOnFacets):
 
     Attributes:
         friction: coefficient mu [-].
-        regularisation: of the velocity of slip [m/s].
+        regularisation: of the velocity of slip [m/s]; None: see `nc.GapConstraint`.
         mobility: change of the speed of closing by a unit impulse [1/kg], follows from the masses.
         phase: None, of schemes that locate impacts.
 
@@ -41,7 +41,7 @@ class FrictionalNodeOnFacets(NodeOnFacets):
     """
 
     friction: Any = eqx.field(kw_only=True, metadata=is_a(Number("not negative")))
-    regularisation: Any = eqx.field(default=1e-5, kw_only=True, metadata=is_a(Number("positive")))
+    regularisation: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Number("positive")))
     mobility: Any = eqx.field(default=None, init=False)
     phase: Any = eqx.field(default=None, init=False)
 

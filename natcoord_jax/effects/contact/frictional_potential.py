@@ -27,7 +27,7 @@ class FrictionalGapPotential(Rubbing, ContactLaw):
         restitution: part of the closing speed that is left after an impact [-], above 0 up to 1; None: all.
         speed: of the impact that `restitution` is of [m/s].
         friction: coefficient mu [-].
-        regularisation: of the velocity of slip [m/s].
+        regularisation: of the velocity of slip [m/s]; None: see `nc.GapConstraint`.
         name: optional name.
         damping: part of the force per closing speed [s/m], follows from restitution and speed.
         mobility: change of the speed of closing by a unit impulse [1/kg], follows from the masses.

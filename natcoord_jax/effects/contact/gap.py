@@ -17,8 +17,8 @@ class Gap(Part):
     """Base of gaps between two surfaces: subclass it and give `invariants` and `distance`.
 
     A gap is pure geometry. `nc.GapPotential` pushes where it is negative, `nc.GapConstraint` keeps it from
-    becoming so. The invariants must be at most quadratic in the marker vectors, and unchanged when all of
-    them are rotated (and, for points, moved) together.
+    becoming so. Directions among the markers are unit vectors. The invariants must be at most quadratic in
+    the marker vectors, and unchanged when all of them are rotated (and, for points, moved) together.
 
     Class attributes:
         markers: what `invariants` receives.

@@ -6,7 +6,7 @@ that whatever the step. What impacts lose is a part of the force that grows with
 closes; it is there only where a restitution is asked for.
 """
 
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -48,6 +48,8 @@ class GapPotential(ContactLaw, Potential):
     """
 
     gap: Gap = eqx.field(metadata=is_a(GAP))
+
+    unit_directions: ClassVar[bool] = True
 
     def __check_init__(self) -> None:
         """Refuse markers of another gap."""

@@ -124,6 +124,7 @@ class Revolute(Facing):
 
     zero: Any = eqx.field(default=0.0, kw_only=True, metadata=is_a(Number()))
 
+    assembling: ClassVar[tuple[str, ...]] = (*Joint.assembling, "zero")
     kind: ClassVar[str] = "revolute joint"
     multipliers: ClassVar[int] = 5
     rotations: ClassVar[tuple[int, ...]] = (2,)
@@ -193,6 +194,7 @@ class Prismatic(Facing):
 
     zero: Any = eqx.field(default=0.0, kw_only=True, metadata=is_a(Number()))
 
+    assembling: ClassVar[tuple[str, ...]] = (*Joint.assembling, "zero")
     kind: ClassVar[str] = "prismatic joint"
     turn: ClassVar[Any] = staticmethod(_turn)
     multipliers: ClassVar[int] = 5
@@ -272,6 +274,7 @@ class Distance(Joint):
 
     kind: ClassVar[str] = "distance joint"
     multipliers: ClassVar[int] = 1
+    assembling: ClassVar[tuple[str, ...]] = (*Joint.assembling, "parent_point")
     apart: ClassVar[bool] = True
     coordinates: ClassVar[tuple[Coordinate, ...]] = (Separation(),)
 

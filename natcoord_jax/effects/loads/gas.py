@@ -150,14 +150,9 @@ class EnclosedGas(Effect):
 
     def flaws(self) -> dict[str, Array]:
         """Volumes and pressures that no gas has."""
-        return {
-            "encloses no volume: list the points of each face counter-clockwise as seen from outside": (
-                jnp.asarray(self.volume) <= 0.0
-            ),
-            "has no pressure: gauge_pressure [N/m^2] is below minus the ambient one": (
-                jnp.asarray(self.gauge_pressure + self.ambient) <= 0.0
-            ),
-        }
+        flaws = {"has no pressure: gauge_pressure [N/m^2] is below minus the ambient one": self._first <= 0.0}
+        said = "encloses no volume: list the points of each face counter-clockwise as seen from outside"
+        return flaws if self.volume is None else flaws | {said: self.volume <= 0.0}
 
     @property
     def _first(self) -> Array:

@@ -37,6 +37,7 @@ class PointForce(Force):
     following: bool = eqx.field(default=False, kw_only=True, static=True, metadata=is_a(FLAG))
 
     kind: ClassVar[str] = "point force"
+    unit_directions: ClassVar[bool] = True
 
     def __check_init__(self) -> None:
         if self.following:
@@ -65,6 +66,7 @@ class BodyTorque(Force):
     following: bool = eqx.field(default=False, kw_only=True, static=True, metadata=is_a(FLAG))
 
     kind: ClassVar[str] = "body torque"
+    unit_directions: ClassVar[bool] = True
 
     def __check_init__(self) -> None:
         if self.following:
@@ -91,6 +93,7 @@ class PairTorque(Force):
     torque: Any = eqx.field(kw_only=True, metadata=is_a(Number() | FunctionOf("of time [s] to a number")))
 
     kind: ClassVar[str] = "pair torque"
+    unit_directions: ClassVar[bool] = True
 
     def load(self, x: Array, rate: Array, inputs: Array, t: Array) -> Load:
         """Torque along the mid-point direction of the first body."""

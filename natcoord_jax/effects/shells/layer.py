@@ -104,6 +104,8 @@ class LayerElement(Potential):
 
     def flaws(self) -> dict[str, Array]:
         """Corners that are no corners, and directors along the surface."""
+        if self.stiffness is None:
+            return {}
         x = self.reference[:, 0] if self.bends else self.reference
         sides = jnp.roll(x, -1, axis=0) - x
         corners = cross(jnp.roll(sides, 1, axis=0), sides)
@@ -120,7 +122,7 @@ class LayerElement(Potential):
             beside = ~(jnp.all(away > BESIDE) | jnp.all(away < -BESIDE))
             said = "has directors along it, or to both of its sides: pass such as are near its normals"
             found[said] = ~flat & beside
-        return found | self.material.flaws()
+        return found
 
     def energy(self, invariants: Float[Array, "p *n"]) -> Float[Array, "*n"]:
         """Energy [J]."""

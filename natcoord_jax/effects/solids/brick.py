@@ -188,7 +188,7 @@ class Brick(Potential):
     def flaws(self) -> dict[str, Array]:
         """Corners that are no corners."""
         said = "is degenerate or turned inside out: list four nodes in turn round one face, then those above"
-        return {said: is_degenerate(self.volumes, self.reference), **self.material.flaws()}
+        return {} if self.volumes is None else {said: is_degenerate(self.volumes, self.reference)}
 
     def volume_ratios(self, place: Array, rows: Array) -> Float[Array, " n"]:
         """Smallest of the Gauss points of each of `n` elements."""

@@ -118,7 +118,7 @@ class SolidElement(Potential):
     def flaws(self) -> dict[str, Array]:
         """Corners that are no corners."""
         said = "is degenerate or turned inside out: list nodes as in nc.mesh.Mesh, those of edges midway"
-        return {said: is_degenerate(self.volumes, self.reference), **self.material.flaws()}
+        return {} if self.volumes is None else {said: is_degenerate(self.volumes, self.reference)}
 
     def volume_ratios(self, place: Array, rows: Array) -> Float[Array, " n"]:
         """Smallest of the quadrature points of each of `n` elements."""

@@ -4,11 +4,9 @@ from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array
 
 from natcoord_jax.core.arguments import is_a
-from natcoord_jax.core.checks import is_concrete
 from natcoord_jax.core.coordinate import CoordinateForce, CoordinateInertia, CoordinatePotential
 from natcoord_jax.core.kinds import FunctionOf
 from natcoord_jax.core.numeric import Number
@@ -83,15 +81,10 @@ class JointStops(CoordinatePotential):
 
     kind: ClassVar[str] = "joint stops"
 
-    def __check_init__(self) -> None:
-        """Refuse stops that leave no room."""
-        if is_concrete(self.lower, self.upper) and not np.all(
-            np.asarray(self.lower) < np.asarray(self.upper)
-        ):
-            raise ValueError(
-                f"JointStops: lower [rad or m] is {self.lower}, not below upper, {self.upper}; pass stops "
-                "with room between them"
-            )
+    def flaws(self) -> dict[str, Any]:
+        """No room."""
+        said = "has lower [rad or m] not below upper; pass stops with room between them"
+        return {said: self.lower >= self.upper}
 
     def energy(self, coordinate: Array) -> Array:
         """Energy [J]."""
