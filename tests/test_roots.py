@@ -267,6 +267,26 @@ def test_starts_are_projected_in_the_metric_of_the_mass():
             )
 
 
+@pytest.mark.filterwarnings("ignore:initial velocities")
+def test_a_redundant_loop_of_rods_is_projected_to_round_off():
+    """Planar, with hinges that depend on each other and rods whose spin moves no mass."""
+    scene = nc.Scene()
+    places, moments = ((0, 0, 0), (0, 1, 0), (2, 0, 0)), ((0.1, 0, 0.1), (0, 0.1, 0.1), (0.2, 0.3, 0.2))
+    one, two, three = (
+        scene.add(
+            nc.RigidBody(mass=1.0, inertia=moment, position=place, angular_velocity=(0.3, -0.5, k + 1.0))
+        )
+        for k, (place, moment) in enumerate(zip(places, moments))
+    )
+    hinges = (nc.ground, one, (0, 0, 0)), (one, two, (0, 1, 0)), (two, three, (2, 1.5, 0))
+    for parent, child, point in (*hinges, (nc.ground, three, (2, 0, 0))):
+        scene.add(nc.Revolute(parent, child, point=point))
+    system, state = scene.compile()
+    assert len(system.structure.redundant) > 0
+    assert system.constraint_errors(state).velocity.max() <= tol.CONSTRAINT
+    assert float(jnp.abs(state.v).max()) > 0.1
+
+
 def test_rotors_count_in_the_metric_of_the_mass():
     """Two wheels with a gear between them, one with a rotor: (I + J) 10 = (2 I + J) rate."""
 

@@ -33,8 +33,9 @@ from natcoord_jax.mechanics.violations import (
 )
 from natcoord_jax.model.model import Model
 
-DAMPING = 1e-14
-"""See `Projection`; what it leaves is projected again."""
+DAMPING = 1e-11
+"""See `Projection`; what it leaves is projected again. Far above rounding, whose inverse would have no digits
+where rows depend on each other, and far below `SLACK`, the share of what moves no mass."""
 
 PASSES = 5
 """Projections with one inverse."""

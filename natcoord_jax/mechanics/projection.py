@@ -25,6 +25,7 @@ from natcoord_jax.maths.elimination import definite_inverse
 from natcoord_jax.maths.rotations import from_rotation_vector
 from natcoord_jax.maths.vectors import safe_divide, safe_norm, safe_sqrt
 from natcoord_jax.mechanics.coordinates import coordinate_values, velocities_with_ground
+from natcoord_jax.mechanics.momentum import inertia
 from natcoord_jax.mechanics.violations import constrained, violation_rates_of, violations_of
 from natcoord_jax.model.groups import Group
 from natcoord_jax.model.model import Model, SomeModel
@@ -292,9 +293,15 @@ def twists_of(system: Model, state: State) -> Float[Array, "bodies 6"]:
     _, spin = velocities_with_ground(state.v, rows_with_ground(state.q))
     rigid = jnp.concatenate([v[:, 0], spin[:-1]], axis=1)
     rest = v - row_rates(rows, rigid[:, :3], rigid[:, 3:])
-    pushed = jnp.einsum("bixc,bij,bjx->bc", _unit_motions(rows), system.mass, rest)
-    alone = replace_fields(system, mass_between=None)
-    return rigid + mobility(alone, rows, fills(system, SLACK))(pushed.reshape(-1)).reshape(pushed.shape)
+    moved_by, moving_rows = mobility(system, rows, fills(system, SLACK)), _unit_motions(rows)
+
+    def twist_of(v: Array) -> Array:
+        pushed = jnp.einsum("bixc,bix->bc", moving_rows, inertia(system, v))
+        return moved_by(pushed.reshape(-1)).reshape(rigid.shape)
+
+    more = twist_of(rest)
+    # What made the inertias regular is gone after one more pass.
+    return rigid + more + twist_of(rest - row_rates(rows, more[:, :3], more[:, 3:]))
 
 
 def moving(state: State, twists: Float[Array, "bodies 6"]) -> State:
