@@ -49,7 +49,6 @@ SLOW = {
         "mass_ladder",
         "slider_crank",
         "robot_arm",
-        "cantilever",
     )
 }
 SLOW |= {("heavy_top", 4), ("torsion_spring", 4)}

@@ -127,6 +127,7 @@ def ball_on_springs():
     return frequencies
 
 
+@pytest.mark.slow
 def test_frequencies_that_coincide():
     """Derivatives where they have some; none, not those of their mean, where a change splits them."""
     frequencies = ball_on_springs()

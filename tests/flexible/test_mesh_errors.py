@@ -163,7 +163,7 @@ def test_directors(kind):
             (lambda: shell(mesh, directors=np.tile((1.0, 0, 0), (9, 1))), beside),
             (lambda: shell(mesh, directors=both), beside),
             (lambda: shell(mesh, directors=up[:3]), r"directors \[-\] has shape \(3, 3\)"),
-            (lambda: shell(mesh, directors=0.0 * up), r"directors \[-\] are zero"),
+            (lambda: shell(mesh, directors=0.0 * up), r"directors \[-\] is zero"),
         ]
     )
     shell(folded, directors=np.tile((-1.0, 0, 1), (9, 1)))

@@ -118,11 +118,12 @@ def held(com):
     "scheme",
     [
         nc.EnergyMomentum(kick=True),
-        pytest.param(nc.EnergyMomentum(order=4), marks=pytest.mark.slow),
-        pytest.param(nc.EnergyMomentum(order=6), marks=pytest.mark.slow),
+        nc.EnergyMomentum(order=4),
+        nc.EnergyMomentum(order=6),
     ],
     ids=["kicks", "order 4", "order 6"],
 )
+@pytest.mark.slow
 def test_a_bar_that_is_held_still_stays(scheme):
     system, state = held((0.5, 0.0, 0.0))
     for dt in (0.01, 1e-4):
@@ -130,7 +131,8 @@ def test_a_bar_that_is_held_still_stays(scheme):
         assert float(jnp.max(jnp.abs(run.q - state.q))) <= tol.CONSTRAINT
 
 
-@pytest.mark.parametrize("order", [2, pytest.param(4, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("order", [2, 4])
 def test_a_drive_that_jumps_is_named(order):
     for at in (0.3, 0.305):
         system, state = arm(lambda t, at=at: jnp.where(t > at, 1.0, 0.0))

@@ -138,7 +138,7 @@ FRAMES = {
 @pytest.mark.parametrize(
     ("kind", "count"),
     [
-        pytest.param(kind, count, marks=() if (kind, count) == ("four-bars", 8) else pytest.mark.exhaustive)
+        pytest.param(kind, count, marks=() if (kind, count) == ("four-bars", 6) else pytest.mark.exhaustive)
         for kind, (_, counts) in FRAMES.items()
         for count in counts
     ],

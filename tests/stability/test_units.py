@@ -295,6 +295,7 @@ def test_located_impacts_do_not_know_lengths_and_times():
     assert places[0][30:, 2].max() >= 0.11, "it does not rebound: nothing is tested"
 
 
+@pytest.mark.slow
 def test_of_normals_only_their_direction_counts():
     """Of two or half the length: constraints, gaps and forces are the same."""
     for size in (1.0, 2.0, 0.5):

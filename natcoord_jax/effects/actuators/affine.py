@@ -127,8 +127,8 @@ class SphericalTorque(Force):
     """Motor in a spherical joint: one input, a torque [N m] about a direction of one of its bodies.
 
     Attributes:
-        markers: the direction, of the body that the torque acts on, and any direction of the other body,
-            which takes the opposite torque.
+        markers: the direction, of the body that the torque acts on, whose length is a factor, too, and any
+            direction of the other body, which takes the opposite torque.
         gear: factor on the input.
         lower: least input [N m / gear].
         upper: largest input [N m / gear].
@@ -140,7 +140,6 @@ class SphericalTorque(Force):
     upper: Any = eqx.field(default=jnp.inf, kw_only=True, metadata=is_a(UNBOUNDED))
 
     kind: ClassVar[str] = "spherical torque"
-    unit_directions: ClassVar[bool] = True
     inputs: ClassVar[int] = 1
 
     def flaws(self) -> dict[str, Any]:
