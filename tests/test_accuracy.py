@@ -23,6 +23,7 @@ def measured():
     return nc.accuracy(example.system, example.state, 1.0, orders=(2, 4), steps=(25, 50, 100, 200), repeats=1)
 
 
+@pytest.mark.slow
 def test_rows_tell_the_order():
     results = measured()
     assert [(r.order, r.steps) for r in results.rows] == [(o, n) for o in (2, 4) for n in (25, 50, 100, 200)]

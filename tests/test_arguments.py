@@ -732,6 +732,7 @@ def test_numbers_may_be_traced_and_of_numpy():
         jax.jit(lambda g: nc.Gravity(vector=jnp.stack([g, g])).vector)(1.0)
 
 
+@pytest.mark.slow
 def test_a_spread_for_each_input_is_that_of_its_guesses():
     scene = nc.Scene()
     body = scene.add(nc.RigidBody(mass=1.0, inertia=(1.0, 2.0, 3.0), name="body"))

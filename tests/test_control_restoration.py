@@ -184,6 +184,7 @@ def cart_and_pole(zero, slide_zero):
     return scene.compile()
 
 
+@pytest.mark.slow
 def test_the_zero_of_coordinates_moves_them_and_nothing_else():
     def run(zero, slide_zero):
         system, state = cart_and_pole(zero, slide_zero)

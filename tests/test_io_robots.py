@@ -306,6 +306,7 @@ LOOP = """
 """
 
 
+@pytest.mark.slow
 def test_equality_constraints_hold_and_are_saved():
     robot = nc.io.load(LOOP)
     notes = reasons(robot)

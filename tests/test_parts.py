@@ -189,6 +189,7 @@ def test_starting_at_another_time():
         state.at_time(jnp.zeros(2))
 
 
+@pytest.mark.slow
 def test_reactions_about_a_point():
     """Statics of an arm on an upright hinge: its moment about any point is that of the weight about it."""
     made = nc.Scene()

@@ -112,7 +112,11 @@ def weighted(system, states):
 
 
 @pytest.mark.parametrize(
-    "kind", ["drive", *(pytest.param(x, marks=pytest.mark.exhaustive) for x in ("rotor", "loops"))]
+    "kind",
+    [
+        pytest.param("drive", marks=pytest.mark.slow),
+        *(pytest.param(x, marks=pytest.mark.exhaustive) for x in ("rotor", "loops")),
+    ],
 )
 def test_the_nearest_velocities_that_the_constraints_admit(kind):
     """All that are admitted, no more, and what is left out is across them in the metric of the mass."""

@@ -13,6 +13,9 @@ from test_contracts import TABLE, Parts
 
 import natcoord_jax as nc
 
+SOME = nc.Screw, nc.JointSpring, nc.Revolute
+"""Of the slow lane."""
+
 UNHEARD = {
     "overlaps": "mass, of a material without density",
     "volumes": "mass, of a material without density",
@@ -60,8 +63,11 @@ def set_anew(system, part, field, value):
         return None
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("effect", TABLE, ids=lambda e: e.__name__)
+@pytest.mark.parametrize(
+    "effect",
+    [pytest.param(e, marks=pytest.mark.slow if e in SOME else pytest.mark.exhaustive) for e in TABLE],
+    ids=lambda e: e.__name__,
+)
 def test_every_number_that_is_set_is_heard(effect):
     """By a step of about half a radian, forwards or backwards."""
     system, state = moving_pair(effect)

@@ -99,6 +99,7 @@ def assert_caught(before, state, joint):
     assert float(joined.energy(after).kinetic) == 0.0
 
 
+@pytest.mark.slow
 def test_a_closing_joint_keeps_momenta_and_poses():
     assert_caught(*bodies(), nc.Revolute)
 

@@ -45,7 +45,8 @@ def sliding(law, *, h, seconds, friction=0.3, speed=2.0, tilt=0.0, solver=None):
     return np.asarray(trajectory.t), q[:, 0, 0], v[:, 0, 0]
 
 
-@pytest.mark.parametrize("law", ["hard", pytest.param("soft", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("law", ["hard", "soft"])
 def test_what_slides_stops_and_what_is_on_a_slope_is_held_or_slides_back(law):
     """After v / (mu g), within a step, at v^2 / (2 mu g), then at rest exactly; on a slope of tangent 0.7 a
     coefficient of 0.8 holds what is thrown up, with 0.5 it slides back."""

@@ -127,6 +127,7 @@ def of_layers(mesh, more):
     ]
 
 
+@pytest.mark.slow
 def test_meshes_of_shells_and_membranes():
     corners = np.array([(0, 0, 0), (1, 0, 0), (0.2, 0.2, 0), (0, 1, 0)], float)
     dart = nc.mesh.Mesh(corners, [(0, 1, 2, 3)])

@@ -111,7 +111,9 @@ def test_derivatives_of_a_constraint_of_ones_own():
     np.testing.assert_allclose(many[0], loss(at), rtol=1e-12)
 
 
-@pytest.mark.parametrize("order", [2, pytest.param(4, marks=pytest.mark.exhaustive)])
+@pytest.mark.parametrize(
+    "order", [pytest.param(2, marks=pytest.mark.slow), pytest.param(4, marks=pytest.mark.exhaustive)]
+)
 def test_a_ball_rolls_down_a_slope(order):
     """With 5/7 of the acceleration of what slides, at its height, without any loss."""
     scene = nc.Scene()

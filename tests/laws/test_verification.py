@@ -191,6 +191,7 @@ def test_r10_free_body():
     assert np.max(np.abs(system.angular_momentum(last) - jnp.array([60.0, 160.0, 60.0]))) <= 1e-11 * 160
 
 
+@pytest.mark.slow
 def test_r12_dzhanibekov():
     """The flip of a spin about the middle axis; at t = 10 round-off is amplified."""
     system, state = free_body("R12")

@@ -138,7 +138,11 @@ FRAMES = {
 @pytest.mark.parametrize(
     ("kind", "count"),
     [
-        pytest.param(kind, count, marks=() if (kind, count) == ("four-bars", 6) else pytest.mark.exhaustive)
+        pytest.param(
+            kind,
+            count,
+            marks=pytest.mark.slow if (kind, count) == ("four-bars", 6) else pytest.mark.exhaustive,
+        )
         for kind, (_, counts) in FRAMES.items()
         for count in counts
     ],

@@ -214,6 +214,7 @@ def rolling(length, com):
     return *scene.compile(), ball
 
 
+@pytest.mark.slow
 def test_accelerations_of_what_rolls_do_not_know_its_size():
     """Of a uniform ball 5/7 of the pull; of one that is not what it has at one metre."""
 
