@@ -31,7 +31,7 @@ def ball(gas=True, count=3, **numbers):
     return scene, shell, air
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_ball_keeps_what_it_has():
     """Energy, momentum and angular momentum, while the gas takes up a part of the energy, by any exponent."""
     system, state = ball(gauge_pressure=0.0)[0].compile()

@@ -48,10 +48,8 @@ SLOW = {
         "torsion_spring",
         "mass_ladder",
         "slider_crank",
-        "robot_arm",
     )
 }
-SLOW |= {("heavy_top", 4), ("torsion_spring", 4)}
 """The others compile for longer."""
 
 

@@ -153,7 +153,7 @@ def test_frequencies_that_coincide():
     np.testing.assert_allclose(split, (0, 0, 0.5), atol=tol.EXACT_GRADIENT)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_second_derivatives_of_frequencies_that_coincide():
     """And that an eager call says what is missing."""
     frequencies = ball_on_springs()

@@ -24,7 +24,7 @@ RUNS = {
     "stiff_chain": (2**-7, 24, tol.STIFF_STEP_ON_ITS_OWN),
 }
 CASES = [
-    pytest.param("four_bar", 4, marks=pytest.mark.slow),
+    pytest.param("four_bar", 4, marks=pytest.mark.exhaustive),
     pytest.param("four_bar", 6, marks=pytest.mark.exhaustive),
     pytest.param("heavy_top", 2, marks=pytest.mark.exhaustive),
     pytest.param("bricard", 4, marks=pytest.mark.slow),

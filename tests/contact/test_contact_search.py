@@ -119,7 +119,10 @@ FIELDS = "gap", "force", "active", "impacts", "inside", "margin"
 
 @pytest.mark.parametrize(
     "kind",
-    [pytest.param("spheres", marks=pytest.mark.slow), pytest.param("capsules", marks=pytest.mark.exhaustive)],
+    [
+        pytest.param("spheres", marks=pytest.mark.exhaustive),
+        pytest.param("capsules", marks=pytest.mark.exhaustive),
+    ],
 )
 def test_a_search_is_a_list(kind):
     """The motion, energies, balances and numbers told of listed pairs, in lanes that differ.

@@ -32,9 +32,9 @@ def belt(speed, **law):
     ("scheme", "law"),
     [
         (nc.EnergyMomentum(), {}),
-        pytest.param(nc.EnergyMomentum(kick=True), {}, marks=pytest.mark.slow),
-        pytest.param(LOCATED, {}, marks=pytest.mark.slow),
-        pytest.param(nc.EnergyMomentum(), {"stiffness": 1e5}, marks=pytest.mark.slow),
+        pytest.param(nc.EnergyMomentum(kick=True), {}, marks=pytest.mark.exhaustive),
+        pytest.param(LOCATED, {}, marks=pytest.mark.exhaustive),
+        pytest.param(nc.EnergyMomentum(), {"stiffness": 1e5}, marks=pytest.mark.exhaustive),
     ],
     ids=["hard", "kicks", "located", "soft"],
 )
@@ -73,7 +73,7 @@ def test_a_piston_hits_a_ball(restitution):
     assert float(np.max(nc.balance(system, run).energy)) <= tol.STEP_BALANCE
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_shaker_carries_what_its_friction_holds():
     """A sine across the limit of friction: the box moves along below it, and slips above."""
     for amplitude, along in ((0.02, True), (0.2, False)):

@@ -203,7 +203,7 @@ def _block(element, law, **given):
 
 FLIGHTS = {
     "beam": Flight(satellite, 0.035, 200, stored=0.05, more=IN_PARTS, **STIFF),
-    "shell": Flight(winged, 0.01, 100, stored=5e-4, lane="slow"),
+    "shell": Flight(winged, 0.01, 100, stored=5e-4, lane="exhaustive"),
     "solid": Flight(lambda: tumbling("Hexahedron8", "neo-Hooke"), 0.02, 50, **SHAKEN),
     "beam, order 4": Flight(satellite, 0.035, 100, 4, "exhaustive", 0.05, more=IN_PARTS, **STIFF),
     "beam for long": Flight(satellite, 0.035, 1000, 2, "exhaustive", 0.05, more=IN_PARTS, **STIFF),

@@ -30,7 +30,7 @@ def named(name, *arguments, **options):
 # --- motions ------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_a_rope_that_starts_at_rest_and_unstrained():
     """Values and derivatives are finite where rotations, strains and velocities are exactly zero."""
     scene, section = nc.Scene(), nc.CircularSection(radius=0.01, E=1e6, density=1000.0)

@@ -81,7 +81,7 @@ def test_energies_and_work_are_those_of_the_prescribed_motion(name, scheme):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("order", [2, 4])
+@pytest.mark.parametrize("order", [2, pytest.param(4, marks=pytest.mark.exhaustive)])
 def test_what_hangs_on_a_driven_crank_keeps_the_account(order):
     """One joint is driven with kinks, the other free: the drive's work is all that energy changes by."""
     scene = nc.Scene()
@@ -118,8 +118,8 @@ def held(com):
     "scheme",
     [
         nc.EnergyMomentum(kick=True),
-        nc.EnergyMomentum(order=4),
-        nc.EnergyMomentum(order=6),
+        pytest.param(nc.EnergyMomentum(order=4), marks=pytest.mark.exhaustive),
+        pytest.param(nc.EnergyMomentum(order=6), marks=pytest.mark.exhaustive),
     ],
     ids=["kicks", "order 4", "order 6"],
 )
@@ -132,7 +132,7 @@ def test_a_bar_that_is_held_still_stays(scheme):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("order", [2, 4])
+@pytest.mark.parametrize("order", [2, pytest.param(4, marks=pytest.mark.exhaustive)])
 def test_a_drive_that_jumps_is_named(order):
     for at in (0.3, 0.305):
         system, state = arm(lambda t, at=at: jnp.where(t > at, 1.0, 0.0))

@@ -141,7 +141,7 @@ FRAMES = {
         pytest.param(
             kind,
             count,
-            marks=pytest.mark.slow if (kind, count) == ("four-bars", 6) else pytest.mark.exhaustive,
+            marks=pytest.mark.exhaustive,
         )
         for kind, (_, counts) in FRAMES.items()
         for count in counts
@@ -160,7 +160,7 @@ def test_frames_of_many_dependent_loops(kind, count):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("count", [2, 4])
+@pytest.mark.parametrize("count", [2, pytest.param(4, marks=pytest.mark.exhaustive)])
 def test_six_rates_a_body_and_dependent_loops(count):
     """Ideal rods have no inertia about their axes, and what rounding leaves of it is none."""
     scene, places = scissors(count), []

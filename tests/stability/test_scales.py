@@ -185,7 +185,7 @@ def measured(unit: float = 1.0, turned: bool = False):
     return scene.compile()
 
 
-@orders(fourth="slow")
+@orders()
 def test_units_and_axes(order):
     """The same scene in kilometres, in millimetres and in turned axes: the same digits and as many
     iterations, nearly."""

@@ -47,16 +47,7 @@ ASIDE = {
     nc.PointSum: "it repeats what the joint holds, which is found out outside of jit only",
     nc.Rolling: "it does not start on the plane",
 }
-SOME = (
-    nc.Spring,
-    nc.Screw,
-    nc.GapConstraint,
-    nc.GapPotential,
-    nc.BeamElement,
-    nc.Drive,
-    nc.Damper,
-    nc.Armature,
-)
+SOME = nc.Screw, nc.Drive, nc.BeamElement
 
 
 class Scaled(eqx.Module):
@@ -271,7 +262,7 @@ def test_loops_of_all_sizes_are_closed():
         assert float(system.constraint_errors(closed).joints) <= 1e-14 * max(1.0, length)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_located_impacts_do_not_know_lengths_and_times():
     """A ball that is thrown on a floor with friction, from tens of nanometres to kilometres."""
 
