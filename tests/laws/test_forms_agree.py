@@ -208,7 +208,7 @@ def test_the_form_is_chosen_and_reported():
     assert "sparse, " not in ladder("full")[0].report()
     assert ladder(None, length=8)[0].structure.solver == "sparse"
     doubled = ladder(None, length=8, rods=2)[0].structure
-    assert doubled.solver == "full" and doubled.redundant
+    assert doubled.solver == "reduced" and doubled.redundant
     with pytest.raises(ValueError, match="without mass between bodies"):
         heavy_rod("recursive")
 
