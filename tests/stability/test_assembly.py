@@ -204,9 +204,7 @@ def test_where_a_gap_has_no_slope():
 
 
 MECHANISMS = {"four_bar": "foot 0", "bricard": "hinge 1", "slider_crank": "hinge"}
-STUCK = pytest.mark.xfail(
-    strict=True, reason="one start of twelve, 4.056 rad, is stuck where axes are opposite"
-)
+STUCK = pytest.mark.xfail(strict=True, reason="one start of twelve, 4.056 rad, stays open")
 
 
 @pytest.mark.parametrize(
