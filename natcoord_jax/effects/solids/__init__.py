@@ -1,9 +1,21 @@
 """Solids."""
 
-from natcoord_jax.effects.solids.brick import Brick as Brick
-from natcoord_jax.effects.solids.elements import Hexahedron8 as Hexahedron8
-from natcoord_jax.effects.solids.elements import Hexahedron20 as Hexahedron20
-from natcoord_jax.effects.solids.elements import Hexahedron27 as Hexahedron27
-from natcoord_jax.effects.solids.elements import Hexahedron27P1 as Hexahedron27P1
-from natcoord_jax.effects.solids.elements import Tetrahedron10 as Tetrahedron10
-from natcoord_jax.effects.solids.elements import Tetrahedron10P0 as Tetrahedron10P0
+from natcoord_jax.effects.solids.brick import Brick
+from natcoord_jax.effects.solids.elements import (
+    Hexahedron8,
+    Hexahedron20,
+    Hexahedron27,
+    Hexahedron27P1,
+    Tetrahedron10,
+    Tetrahedron10P0,
+)
+
+__all__ = [
+    "Brick",
+    "Hexahedron20",
+    "Hexahedron27",
+    "Hexahedron27P1",
+    "Hexahedron8",
+    "Tetrahedron10",
+    "Tetrahedron10P0",
+]
