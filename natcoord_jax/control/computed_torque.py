@@ -16,9 +16,9 @@ from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.kinds import JOINT_NAME, Several
 from natcoord_jax.core.numeric import Number, Numbers
 from natcoord_jax.core.state import STATE, State
+from natcoord_jax.mechanics.admissible_velocities import tangent
 from natcoord_jax.mechanics.coordinates import state_rates
 from natcoord_jax.model.model import SYSTEM
-from natcoord_jax.reading.tangent_states import tangent
 from natcoord_jax.stepping.checked import STEP
 from natcoord_jax.system import System
 

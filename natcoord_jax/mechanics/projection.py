@@ -26,7 +26,7 @@ from natcoord_jax.maths.rotations import from_rotation_vector
 from natcoord_jax.maths.vectors import safe_divide, safe_norm, safe_sqrt
 from natcoord_jax.mechanics.coordinates import coordinate_values, velocities_with_ground
 from natcoord_jax.mechanics.momentum import inertia
-from natcoord_jax.mechanics.violations import constrained, violation_rates_of, violations_of
+from natcoord_jax.mechanics.violations import constrained, violations_of
 from natcoord_jax.model.groups import Group
 from natcoord_jax.model.model import Model, SomeModel
 from natcoord_jax.model.rows import group_places, row_rates, rows_with_ground
@@ -219,12 +219,10 @@ class Projection(eqx.Module):
             state: whose directors are orthonormal.
             held: coordinates that are constraints as well, where it is 1; None: there are none.
         """
-        matrix = constraints(system, state, held)
-        return cls.scaled(matrix, mobility(system, state.rows, fills(system, SHARE))(matrix.T))
-
-    @classmethod
-    def scaled(cls, matrix: Float[Array, "m twists"], impulses: Float[Array, "twists m"]) -> "Projection":
-        """Constraints in units of their energy."""
+        matrix = constraint_matrix(system, state)
+        if held is not None:
+            matrix = jnp.concatenate([matrix, held[:, None] * coordinate_matrix(system, state)])
+        impulses = mobility(system, state.rows, fills(system, SHARE))(matrix.T)
         stiffness = jnp.einsum("mt,tm->m", matrix, impulses)
         scale = jnp.sqrt(jnp.where(stiffness > 0, stiffness, 1.0))
         return cls(matrix / scale[:, None], impulses / scale, scale)
@@ -234,16 +232,6 @@ class Projection(eqx.Module):
         return self.matrix @ self.impulses + damping * jnp.eye(self.scale.shape[0])
 
 
-def constraints(
-    system: Model, state: State, held: Float[Array, " coordinates"] | None
-) -> Float[Array, "m twists"]:
-    """Derivatives of the rates of all constraints, and of coordinates that are held."""
-    matrix = constraint_matrix(system, state)
-    if held is None:
-        return matrix
-    return jnp.concatenate([matrix, held[:, None] * coordinate_matrix(system, state)])
-
-
 def gaps(
     system: Model, state: State, held: Float[Array, " coordinates"] | None, wanted: Array
 ) -> Float[Array, " m"]:
@@ -251,12 +239,6 @@ def gaps(
     found = [x.reshape(-1) for x in violations_of(system, constrained(system), state)]
     found += [] if held is None else [held * (state.coordinates - wanted)]
     return jnp.concatenate([jnp.zeros(0), *found])
-
-
-def gap_rates(system: Model, state: State) -> Float[Array, " m"]:
-    """Rates of the violations of all joints and relations."""
-    found = violation_rates_of(system, constrained(system), state)
-    return jnp.concatenate([jnp.zeros(0), *(x.reshape(-1) for x in found)])
 
 
 def moved(

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import Tableau, gauss
-from natcoord_jax.reading.tangent_states import tangent
+from natcoord_jax.mechanics.admissible_velocities import tangent
 from natcoord_jax.system import System
 
 
