@@ -1,7 +1,7 @@
 """Meshes: nodes, cells between them, and names of their edges and faces; for `nc.Shell` and `nc.Solid`."""
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Int
@@ -196,13 +196,12 @@ def rectangle(size: Any, counts: tuple[int, int]) -> Mesh:
     return Mesh(nodes.reshape(-1, 3), np.stack(corners, axis=-1).reshape(-1, 4), sets)
 
 
-@checked(
-    "mesh.box",
-    size=Numbers((3,), sign="positive"),
-    counts=Several(Whole(1), 3, 3),
-    element=Choice(tuple(ELEMENTS)),
-)
-def box(size: Any, counts: tuple[int, int, int], element: str = "hexahedron8") -> Mesh:
+@checked("mesh.box")
+def box(
+    size: Annotated[Any, Numbers((3,), sign="positive")],
+    counts: Annotated[tuple[int, int, int], Several(Whole(1), 3, 3)],
+    element: Annotated[str, Choice(tuple(ELEMENTS))] = "hexahedron8",
+) -> Mesh:
     """A box from the origin along x, y and z.
 
     Args:
@@ -234,10 +233,12 @@ def box(size: Any, counts: tuple[int, int, int], element: str = "hexahedron8") -
     return Mesh(nodes, cells, sets, faces)
 
 
-@checked(
-    "mesh.cylinder", radius=Number("positive"), length=Number("positive"), counts=Several(Whole(1), 2, 2)
-)
-def cylinder(radius: Any, length: Any, counts: tuple[int, int]) -> Mesh:
+@checked("mesh.cylinder")
+def cylinder(
+    radius: Annotated[Any, Number("positive")],
+    length: Annotated[Any, Number("positive")],
+    counts: Annotated[tuple[int, int], Several(Whole(1), 2, 2)],
+) -> Mesh:
     """The surface of a cylinder about the z axis, from z = 0 on, open at both ends; directors point outwards.
 
     Args:

@@ -1,7 +1,7 @@
 """The scene: bodies, joints and effects by name, and their compilation to a system and a state."""
 
 import itertools
-from typing import Any
+from typing import Annotated, Any
 
 import equinox as eqx
 import jax
@@ -256,14 +256,13 @@ class Scene:
             )
         return store[handle.name]
 
-    @checked(
-        "Scene.compile",
-        assemble=FLAG,
-        solver=Choice(("reduced", "recursive", "sparse", "full")),
-        t=Number(),
-    )
+    @checked("Scene.compile")
     def compile(
-        self, *, assemble: bool = False, solver: str | None = None, t: Any = 0.0
+        self,
+        *,
+        assemble: Annotated[bool, FLAG] = False,
+        solver: Annotated[str | None, Choice(("reduced", "recursive", "sparse", "full"))] = None,
+        t: Annotated[Any, Number()] = 0.0,
     ) -> tuple[System, State]:
         """Compile to a system (parameters and structure) and its initial state.
 

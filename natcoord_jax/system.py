@@ -1,7 +1,7 @@
 """The compiled system: what can be asked of a model."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Annotated, Any
 
 from jaxtyping import Array, Float
 
@@ -166,22 +166,15 @@ class System(Model):
         """
         return parts.set_numbers(self, part, values)
 
-    @checked(
-        "System.sense",
-        motion=MOTION,
-        part=SENSED,
-        inputs=Numbers(("...", None)),
-        state=STATE,
-        about=Numbers(("...", 3)) | of("nc.Point", Marker),
-    )
+    @checked("System.sense")
     def sense(
         self,
-        motion: State | Trajectory,
-        part: Handle | Marker | str | tuple[Handle | str, ...],
+        motion: Annotated[State | Trajectory, MOTION],
+        part: Annotated[Handle | Marker | str | tuple[Handle | str, ...], SENSED],
         *,
-        inputs: Any = None,
-        state: State | None = None,
-        about: Any = None,
+        inputs: Annotated[Any, Numbers(("...", None))] = None,
+        state: Annotated[State | None, STATE] = None,
+        about: Annotated[Any, Numbers(("...", 3)) | of("nc.Point", Marker)] = None,
     ) -> Any:
         """Sensor of a body, a joint, a marker or elements of a beam.
 
@@ -236,16 +229,15 @@ class System(Model):
         """
         return set_coordinates.rate(self, motion, joint, index)
 
-    @checked(
-        "System.with_coordinate",
-        state=STATE,
-        joint=JOINT_NAME,
-        value=Number(),
-        rate=Number(),
-        index=Whole(0),
-    )
+    @checked("System.with_coordinate")
     def with_coordinate(
-        self, state: State, joint: Handle | str, value: Any, *, rate: Any = None, index: int = 0
+        self,
+        state: Annotated[State, STATE],
+        joint: Annotated[Handle | str, JOINT_NAME],
+        value: Annotated[Any, Number()],
+        *,
+        rate: Annotated[Any, Number()] = None,
+        index: Annotated[int, Whole(0)] = 0,
     ) -> State:
         """State with one joint coordinate set, and on request its rate.
 

@@ -1,7 +1,7 @@
 """The contract of an effect, looked at along random motions: for effects of one's own."""
 
 from functools import cached_property
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
@@ -308,16 +308,14 @@ class Contract:
 EFFECT = JOINT_NAME | HandleOf("effect")
 
 
-@checked(
-    "testing.check_effect",
-    scene=of("a scene", Scene),
-    effect=EFFECT,
-    inside=FLAG,
-    seeds=Whole(1),
-    throw=FLAG,
-)
+@checked("testing.check_effect")
 def check_effect(
-    scene: Scene, effect: Handle | str, *, inside: bool | None = None, seeds: int = 3, throw: bool = True
+    scene: Annotated[Scene, of("a scene", Scene)],
+    effect: Annotated[Handle | str, EFFECT],
+    *,
+    inside: Annotated[bool | None, FLAG] = None,
+    seeds: Annotated[int, Whole(1)] = 3,
+    throw: Annotated[bool, FLAG] = True,
 ) -> Contract:
     """Look whether an effect keeps its contract, along random motions of about one radian.
 

@@ -3,7 +3,7 @@
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
@@ -142,30 +142,23 @@ def _extrapolated(runs: _Runs, order: int, steps: int) -> State:
     return jax.tree.map(lambda x, y: y + (y - x) / (2.0**order - 1.0), coarse, fine)
 
 
-@checked(
-    system=SYSTEM,
-    state=STATE,
-    t_end=Number("positive"),
-    inputs=FunctionOf("of time [s] to the inputs (inputs,)"),
-    quantities=of("a dictionary of functions of the end state, by name", Mapping),
-    orders=Several(ORDER, 1),
-    steps=Several(Whole(1), 1),
-    targets=Vector(None),
-    repeats=Whole(1),
-    limit_s=Number("positive"),
-)
+@checked()
 def accuracy(
-    system: System,
-    state: State,
-    t_end: float,
+    system: Annotated[System, SYSTEM],
+    state: Annotated[State, STATE],
+    t_end: Annotated[float, Number("positive")],
     *,
-    inputs: Callable[[Array], Array] | None = None,
-    quantities: Quantities | None = None,
-    orders: Sequence[int] = ORDERS,
-    steps: Sequence[int] | None = None,
-    targets: Sequence[float] = TARGETS,
-    repeats: int = 5,
-    limit_s: float = 0.2,
+    inputs: Annotated[
+        Callable[[Array], Array] | None, FunctionOf("of time [s] to the inputs (inputs,)")
+    ] = None,
+    quantities: Annotated[
+        Quantities | None, of("a dictionary of functions of the end state, by name", Mapping)
+    ] = None,
+    orders: Annotated[Sequence[int], Several(ORDER, 1)] = ORDERS,
+    steps: Annotated[Sequence[int] | None, Several(Whole(1), 1)] = None,
+    targets: Annotated[Sequence[float], Vector(None)] = TARGETS,
+    repeats: Annotated[int, Whole(1)] = 5,
+    limit_s: Annotated[float, Number("positive")] = 0.2,
 ) -> Accuracy:
     """What accuracy costs in time: run a scene over a range of steps and orders.
 

@@ -1,6 +1,6 @@
 """How fast a motion forgets its start: growth of small disturbances, and what it leaves of derivatives."""
 
-from typing import Any
+from typing import Annotated, Any
 
 import equinox as eqx
 import jax
@@ -102,26 +102,17 @@ def _grown(
     return t, total, jnp.max(results)
 
 
-@checked(
-    system=SYSTEM,
-    state=STATE,
-    dt=STEP,
-    steps=Whole(1),
-    inputs=INPUTS,
-    save_every=Whole(1),
-    scheme=SCHEME,
-    seed=Whole(0),
-)
+@checked()
 def tangent_growth(
-    system: System,
-    state: State,
+    system: Annotated[System, SYSTEM],
+    state: Annotated[State, STATE],
     *,
-    dt: Any,
-    steps: int | None = None,
-    inputs: Any = None,
-    save_every: int = 1,
-    scheme: Scheme = SECOND_ORDER,
-    seed: int = 0,
+    dt: Annotated[Any, STEP],
+    steps: Annotated[int | None, Whole(1)] = None,
+    inputs: Annotated[Any, INPUTS] = None,
+    save_every: Annotated[int, Whole(1)] = 1,
+    scheme: Annotated[Scheme, SCHEME] = SECOND_ORDER,
+    seed: Annotated[int, Whole(0)] = 0,
 ) -> Growth:
     """Growth of a small disturbance of the velocities at the start, by the exact derivative of every step.
 

@@ -1,6 +1,6 @@
 """Nodes by the thousands: points, directors and triads, added to a scene as arrays under one name."""
 
-from typing import Any
+from typing import Annotated, Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -83,25 +83,16 @@ class Nodes(eqx.Module):
         return Nodes(blocks, place, unit, moving, still, POINT, name)
 
     @staticmethod
-    @checked(
-        "Nodes.directors",
-        positions=PLACES,
-        directors=ALONG,
-        mass=MASS,
-        inertia=MASS,
-        velocity=VECTORS,
-        angular_velocity=VECTORS,
-        name=NAME,
-    )
+    @checked("Nodes.directors")
     def directors(
-        positions: Any,
-        directors: Any,
+        positions: Annotated[Any, PLACES],
+        directors: Annotated[Any, ALONG],
         *,
-        mass: Any = 0.0,
-        inertia: Any = 0.0,
-        velocity: Any = (0.0, 0.0, 0.0),
-        angular_velocity: Any = (0.0, 0.0, 0.0),
-        name: str | None = None,
+        mass: Annotated[Any, MASS] = 0.0,
+        inertia: Annotated[Any, MASS] = 0.0,
+        velocity: Annotated[Any, VECTORS] = (0.0, 0.0, 0.0),
+        angular_velocity: Annotated[Any, VECTORS] = (0.0, 0.0, 0.0),
+        name: Annotated[str | None, NAME] = None,
     ) -> "Nodes":
         """Points with a unit director, as shells have: five rates each, none about the director.
 
@@ -131,23 +122,15 @@ class Nodes(eqx.Module):
         return Nodes(blocks, place, frames, moving, spin, DIRECTOR, name)
 
     @staticmethod
-    @checked(
-        "Nodes.triads",
-        positions=PLACES,
-        orientations=FRAMES,
-        mass_blocks=BLOCKS,
-        velocity=VECTORS,
-        angular_velocity=VECTORS,
-        name=NAME,
-    )
+    @checked("Nodes.triads")
     def triads(
-        positions: Any,
-        orientations: Any,
+        positions: Annotated[Any, PLACES],
+        orientations: Annotated[Any, FRAMES],
         *,
-        mass_blocks: Any,
-        velocity: Any = (0.0, 0.0, 0.0),
-        angular_velocity: Any = (0.0, 0.0, 0.0),
-        name: str | None = None,
+        mass_blocks: Annotated[Any, BLOCKS],
+        velocity: Annotated[Any, VECTORS] = (0.0, 0.0, 0.0),
+        angular_velocity: Annotated[Any, VECTORS] = (0.0, 0.0, 0.0),
+        name: Annotated[str | None, NAME] = None,
     ) -> "Nodes":
         """Points with three directors, as rigid bodies have: six rates each.
 

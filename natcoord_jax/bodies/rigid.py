@@ -1,6 +1,6 @@
 """Rigid bodies and point masses from the usual data."""
 
-from typing import Any
+from typing import Annotated, Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -50,34 +50,23 @@ class Orientation(Kind):
         return None if pair or shape in ((4,), (3, 3)) else is_other(value)
 
 
-@checked(
-    mass=MASS,
-    inertia=TENSOR,
-    second_moment=TENSOR,
-    com=COMPONENTS,
-    inertia_at=Choice(("com", "reference")),
-    shape=of("nc.Box(...), nc.Cylinder(...), nc.Sphere(...) or nc.Ellipsoid(...)", Shape),
-    density=MASS,
-    position=COMPONENTS,
-    orientation=Orientation(),
-    velocity=COMPONENTS,
-    angular_velocity=COMPONENTS,
-    name=NAME,
-)
+@checked()
 def RigidBody(
     *,
-    mass: Any = None,
-    inertia: Any = None,
-    second_moment: Any = None,
-    com: Any = (0.0, 0.0, 0.0),
-    inertia_at: str = "com",
-    shape: Shape | None = None,
-    density: Any = None,
-    position: Any = (0.0, 0.0, 0.0),
-    orientation: Any = None,
-    velocity: Any = (0.0, 0.0, 0.0),
-    angular_velocity: Any = (0.0, 0.0, 0.0),
-    name: str | None = None,
+    mass: Annotated[Any, MASS] = None,
+    inertia: Annotated[Any, TENSOR] = None,
+    second_moment: Annotated[Any, TENSOR] = None,
+    com: Annotated[Any, COMPONENTS] = (0.0, 0.0, 0.0),
+    inertia_at: Annotated[str, Choice(("com", "reference"))] = "com",
+    shape: Annotated[
+        Shape | None, of("nc.Box(...), nc.Cylinder(...), nc.Sphere(...) or nc.Ellipsoid(...)", Shape)
+    ] = None,
+    density: Annotated[Any, MASS] = None,
+    position: Annotated[Any, COMPONENTS] = (0.0, 0.0, 0.0),
+    orientation: Annotated[Any, Orientation()] = None,
+    velocity: Annotated[Any, COMPONENTS] = (0.0, 0.0, 0.0),
+    angular_velocity: Annotated[Any, COMPONENTS] = (0.0, 0.0, 0.0),
+    name: Annotated[str | None, NAME] = None,
 ) -> Body:
     """Rigid body.
 

@@ -4,7 +4,7 @@ Axes: d_1 and d_2 span the section, d_3 is the tangent. The strains (Gamma_1, Ga
 are shear along d_1 and d_2, stretch, bending about d_1 and d_2, torsion.
 """
 
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -47,28 +47,18 @@ class Section(Part):
     makes_arrays: ClassVar[bool] = True
 
     @classmethod
-    @checked(
-        "Section.of_numbers",
-        EA=SIZE,
-        GA=PAIR,
-        EI=PAIR,
-        GJ=SIZE,
-        density=SIZE,
-        rotary=Number("not negative") | Numbers((2,), "not negative"),
-        centre=Vector(2),
-        outline=RIM,
-    )
+    @checked("Section.of_numbers")
     def of_numbers(
         cls,
         *,
-        EA: Any,
-        GA: Any,
-        EI: Any,
-        GJ: Any,
-        density: Any,
-        rotary: Any = 0.0,
-        centre: Any = (0.0, 0.0),
-        outline: Any = None,
+        EA: Annotated[Any, SIZE],
+        GA: Annotated[Any, PAIR],
+        EI: Annotated[Any, PAIR],
+        GJ: Annotated[Any, SIZE],
+        density: Annotated[Any, SIZE],
+        rotary: Annotated[Any, Number("not negative") | Numbers((2,), "not negative")] = 0.0,
+        centre: Annotated[Any, Vector(2)] = (0.0, 0.0),
+        outline: Annotated[Any, RIM] = None,
     ) -> "Section":
         """Section from its stiffnesses.
 
@@ -95,13 +85,14 @@ class Section(Part):
         return cls(stiffness, _inertia(mass, offset, about), outline=outline)
 
     @classmethod
-    @checked(
-        "Section.of_axis_along_first",
-        stiffness=STIFFNESS,
-        inertia=INERTIA,
-        outline=RIM,
-    )
-    def of_axis_along_first(cls, stiffness: Any, inertia: Any, *, outline: Any = None) -> "Section":
+    @checked("Section.of_axis_along_first")
+    def of_axis_along_first(
+        cls,
+        stiffness: Annotated[Any, STIFFNESS],
+        inertia: Annotated[Any, INERTIA],
+        *,
+        outline: Annotated[Any, RIM] = None,
+    ) -> "Section":
         """Section from data with axis 1 along the beam and axes 2 and 3 across, as many codes have them.
 
         The axes (1, 2, 3) of the data are d_3, d_1, d_2 here: a cyclic exchange, which keeps hands.

@@ -1,7 +1,7 @@
 """Computed torque: inputs of inverse dynamics along a path, and feedback in the inertia they work against."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import equinox as eqx
 import jax
@@ -58,22 +58,15 @@ class ComputedTorque(eqx.Module):
         return self.inputs[k] + jnp.sum(self.gains[k] * wanted, axis=-1)
 
 
-@checked(
-    system=SYSTEM,
-    state=STATE,
-    coordinates=Numbers((None, None)),
-    dt=STEP,
-    bandwidth=Number("positive"),
-    joints=Several(JOINT_NAME, 1),
-)
+@checked()
 def computed_torque(
-    system: System,
-    state: State,
-    coordinates: Any,
+    system: Annotated[System, SYSTEM],
+    state: Annotated[State, STATE],
+    coordinates: Annotated[Any, Numbers((None, None))],
     *,
-    dt: Any,
-    bandwidth: Any = 10.0,
-    joints: Sequence[Handle | str] | None = None,
+    dt: Annotated[Any, STEP],
+    bandwidth: Annotated[Any, Number("positive")] = 10.0,
+    joints: Annotated[Sequence[Handle | str] | None, Several(JOINT_NAME, 1)] = None,
 ) -> ComputedTorque:
     """Computed-torque control of a path: the inputs of inverse dynamics, and feedback for what strays.
 

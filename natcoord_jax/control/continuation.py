@@ -2,7 +2,7 @@
 
 import sys
 from collections.abc import Callable
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -45,32 +45,20 @@ class Continuation(list[Solution]):
         return "\n".join(lines + ([self.reason] if self.reason else []))
 
 
-@checked(
-    problem=Concrete(PROBLEM),
-    path=FunctionOf("(problem, s) -> problem"),
-    guess=GUESS | of("an earlier solution", Solution),
-    first=Number("positive"),
-    least=Number("positive"),
-    method=Choice(METHODS),
-    progress=FLAG,
-    max_iterations=Whole(1),
-    tol=Concrete(Number("positive")),
-    goal_tol=Concrete(Number("positive")),
-    time_limit=Concrete(Number("not negative", infinite=True)),
-)
+@checked()
 def continuation(
-    problem: OptimalControl,
-    path: Callable[[OptimalControl, float], OptimalControl],
-    guess: Any = None,
+    problem: Annotated[OptimalControl, Concrete(PROBLEM)],
+    path: Annotated[Callable[[OptimalControl, float], OptimalControl], FunctionOf("(problem, s) -> problem")],
+    guess: Annotated[Any, GUESS | of("an earlier solution", Solution)] = None,
     *,
-    first: float = 0.25,
-    least: float = 1e-3,
-    method: str = "auto",
-    progress: bool = True,
-    max_iterations: int = 60,
-    tol: float = 1e-8,
-    goal_tol: float = 1e-10,
-    time_limit: float = 600.0,
+    first: Annotated[float, Number("positive")] = 0.25,
+    least: Annotated[float, Number("positive")] = 1e-3,
+    method: Annotated[str, Choice(METHODS)] = "auto",
+    progress: Annotated[bool, FLAG] = True,
+    max_iterations: Annotated[int, Whole(1)] = 60,
+    tol: Annotated[float, Concrete(Number("positive"))] = 1e-8,
+    goal_tol: Annotated[float, Concrete(Number("positive"))] = 1e-10,
+    time_limit: Annotated[float, Concrete(Number("not negative", infinite=True))] = 600.0,
 ) -> Continuation:
     """Follow a solution while a goal, a bound or any other number of its problem moves.
 

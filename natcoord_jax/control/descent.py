@@ -4,7 +4,7 @@ import sys
 import time
 from functools import partial
 from operator import itemgetter
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
@@ -72,30 +72,19 @@ def _augmented(variables: tuple[Array, Array], problem: OptimalControl, multipli
     return cost + equal + bound, (cost, missing, excess, code)
 
 
-@checked(
-    problem=Concrete(PROBLEM),
-    guess=GUESS,
-    optimiser=Optimiser(),
-    iterations=Whole(1),
-    rounds=Whole(1),
-    penalty=Number("positive"),
-    growth=Number("positive"),
-    tol=Concrete(Number("positive")),
-    progress=FLAG,
-    time_limit=Concrete(Number("not negative", infinite=True)),
-)
+@checked()
 def descend(
-    problem: OptimalControl,
-    guess: Any = None,
+    problem: Annotated[OptimalControl, Concrete(PROBLEM)],
+    guess: Annotated[Any, GUESS] = None,
     *,
-    optimiser: Any = None,
-    iterations: int = 500,
-    rounds: int = 6,
-    penalty: float = 10.0,
-    growth: float = 4.0,
-    tol: float = 1e-4,
-    progress: bool = True,
-    time_limit: float = 600.0,
+    optimiser: Annotated[Any, Optimiser()] = None,
+    iterations: Annotated[int, Whole(1)] = 500,
+    rounds: Annotated[int, Whole(1)] = 6,
+    penalty: Annotated[float, Number("positive")] = 10.0,
+    growth: Annotated[float, Number("positive")] = 4.0,
+    tol: Annotated[float, Concrete(Number("positive"))] = 1e-4,
+    progress: Annotated[bool, FLAG] = True,
+    time_limit: Annotated[float, Concrete(Number("not negative", infinite=True))] = 600.0,
 ) -> Solution:
     """Single shooting with a first-order optimiser, for any smooth loss.
 

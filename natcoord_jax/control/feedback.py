@@ -1,6 +1,6 @@
 """Feedback around a solution: time-varying linear-quadratic regulation, and receding horizons."""
 
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -77,22 +77,17 @@ def _gains(problem: OptimalControl, iterate: Iterate, weights: tuple) -> tuple[A
     return gains, d.maps.back[:-1, : 2 * count, :size]
 
 
-@checked(
-    solution=SOLUTION,
-    displacement=Number("not negative") | Vector(None),
-    rate=Number("not negative") | Vector(None),
-    effort=Number("not negative") | Vector(None),
-    final=Number("not negative"),
-    limits=Several(Number(infinite=True) | Numbers((None,), infinite=True), 2),
-)
+@checked()
 def regulator(
-    solution: Solution,
+    solution: Annotated[Solution, SOLUTION],
     *,
-    displacement: Any = 1.0,
-    rate: Any = 1.0,
-    effort: Any = 1.0,
-    final: Any = 10.0,
-    limits: tuple[Any, Any] = (-jnp.inf, jnp.inf),
+    displacement: Annotated[Any, Number("not negative") | Vector(None)] = 1.0,
+    rate: Annotated[Any, Number("not negative") | Vector(None)] = 1.0,
+    effort: Annotated[Any, Number("not negative") | Vector(None)] = 1.0,
+    final: Annotated[Any, Number("not negative")] = 10.0,
+    limits: Annotated[
+        tuple[Any, Any], Several(Number(infinite=True) | Numbers((None,), infinite=True), 2)
+    ] = (-jnp.inf, jnp.inf),
 ) -> Feedback:
     """Time-varying linear-quadratic regulator around a solution, from the derivatives of the discrete motion.
 
@@ -149,22 +144,15 @@ class Horizons(NamedTuple):
     iterations: Float[Array, " updates"]
 
 
-@checked(
-    problem=PROBLEM,
-    plant=SYSTEM,
-    updates=Whole(1),
-    steps_each=Whole(1),
-    guess=GUESS,
-    options=OPTIONS,
-)
+@checked()
 def receding_horizon(
-    problem: OptimalControl,
-    plant: System,
+    problem: Annotated[OptimalControl, PROBLEM],
+    plant: Annotated[System, SYSTEM],
     *,
-    updates: int,
-    steps_each: int,
-    guess: Any = None,
-    options: Options | None = None,
+    updates: Annotated[int, Whole(1)],
+    steps_each: Annotated[int, Whole(1)],
+    guess: Annotated[Any, GUESS] = None,
+    options: Annotated[Options | None, OPTIONS] = None,
 ) -> Horizons:
     """Solve again and again from where the plant is, over the time that is left, in one compiled program.
 

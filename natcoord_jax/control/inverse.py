@@ -1,7 +1,7 @@
 """Inverse dynamics: inputs that make joint coordinates follow a path, exactly for the discrete motion."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import equinox as eqx
 import jax
@@ -155,20 +155,14 @@ def places_of(system: System, joints: Sequence[Handle | str] | None) -> np.ndarr
     return np.array([i for name in names for i, (owner, _) in enumerate(every) if owner == name], int)
 
 
-@checked(
-    system=SYSTEM,
-    state=STATE,
-    coordinates=Numbers((None, None)),
-    dt=STEP,
-    joints=Several(JOINT_NAME, 1),
-)
+@checked()
 def inverse_dynamics(
-    system: System,
-    state: State,
-    coordinates: Any,
+    system: Annotated[System, SYSTEM],
+    state: Annotated[State, STATE],
+    coordinates: Annotated[Any, Numbers((None, None))],
     *,
-    dt: Any,
-    joints: Sequence[Handle | str] | None = None,
+    dt: Annotated[Any, STEP],
+    joints: Annotated[Sequence[Handle | str] | None, Several(JOINT_NAME, 1)] = None,
 ) -> tuple[Float[Array, "steps inputs"], State]:
     """Inputs that make joint coordinates follow a path, exactly for the energy-momentum step (57).
 

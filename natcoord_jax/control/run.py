@@ -1,7 +1,7 @@
 """The entrances: an optimisation with progress and a way out, and one that compiles into other programs."""
 
 import math
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -38,26 +38,17 @@ def chosen(problem: OptimalControl, method: str, guess: Any = None) -> bool:
     return bool(problem.free) or not inputs
 
 
-@checked(
-    problem=Concrete(PROBLEM),
-    guess=GUESS | of("an earlier solution", Solution),
-    method=Choice(METHODS),
-    progress=FLAG,
-    max_iterations=Whole(0),
-    tol=Concrete(Number("positive")),
-    goal_tol=Concrete(Number("positive")),
-    time_limit=Concrete(Number("not negative", infinite=True)),
-)
+@checked()
 def optimise(
-    problem: OptimalControl,
-    guess: Any = None,
+    problem: Annotated[OptimalControl, Concrete(PROBLEM)],
+    guess: Annotated[Any, GUESS | of("an earlier solution", Solution)] = None,
     *,
-    method: str = "auto",
-    progress: bool = True,
-    max_iterations: int = 500,
-    tol: float = 1e-8,
-    goal_tol: float = 1e-10,
-    time_limit: float = 600.0,
+    method: Annotated[str, Choice(METHODS)] = "auto",
+    progress: Annotated[bool, FLAG] = True,
+    max_iterations: Annotated[int, Whole(0)] = 500,
+    tol: Annotated[float, Concrete(Number("positive"))] = 1e-8,
+    goal_tol: Annotated[float, Concrete(Number("positive"))] = 1e-10,
+    time_limit: Annotated[float, Concrete(Number("not negative", infinite=True))] = 600.0,
 ) -> Solution:
     """Solve an optimal control problem by the second-order method.
 

@@ -4,7 +4,7 @@ import time
 from collections import Counter
 from collections.abc import Sequence
 from operator import itemgetter
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
@@ -58,30 +58,22 @@ class Optima(list[Solution]):
         return "\n".join(lines)
 
 
-@checked(
-    problem=Concrete(PROBLEM),
-    guess=GUESS | of("an earlier solution", Solution) | Several(of("a guess or a solution", Guess, Solution)),
-    starts=Whole(1),
-    spread=Number("not negative") | Vector(None),
-    rates=Number("not negative") | Vector(None),
-    seed=Whole(0),
-    method=Choice(METHODS),
-    max_iterations=Whole(0),
-    tol=Concrete(Number("positive")),
-    goal_tol=Concrete(Number("positive")),
-)
+@checked()
 def multi_start(
-    problem: OptimalControl,
-    guess: Any = None,
+    problem: Annotated[OptimalControl, Concrete(PROBLEM)],
+    guess: Annotated[
+        Any,
+        GUESS | of("an earlier solution", Solution) | Several(of("a guess or a solution", Guess, Solution)),
+    ] = None,
     *,
-    starts: int = 16,
-    spread: Any = 1.0,
-    rates: Any = 1.0,
-    seed: int = 0,
-    method: str = "auto",
-    max_iterations: int = 100,
-    tol: float = 1e-8,
-    goal_tol: float = 1e-10,
+    starts: Annotated[int, Whole(1)] = 16,
+    spread: Annotated[Any, Number("not negative") | Vector(None)] = 1.0,
+    rates: Annotated[Any, Number("not negative") | Vector(None)] = 1.0,
+    seed: Annotated[int, Whole(0)] = 0,
+    method: Annotated[str, Choice(METHODS)] = "auto",
+    max_iterations: Annotated[int, Whole(0)] = 100,
+    tol: Annotated[float, Concrete(Number("positive"))] = 1e-8,
+    goal_tol: Annotated[float, Concrete(Number("positive"))] = 1e-10,
 ) -> Optima:
     """Solve from many guesses at once, and list all optima that are found.
 

@@ -13,7 +13,7 @@ import operator
 import re
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache, reduce, wraps
-from typing import Any, ClassVar, TypeVar
+from typing import Annotated, Any, ClassVar, TypeVar, get_origin
 
 import equinox as eqx
 import numpy as np
@@ -144,7 +144,8 @@ def checked(label: str | None = None, /, **kinds: Kind) -> Callable[[F], F]:
 
     Args:
         label: name of the function in messages; default its own.
-        kinds: of the arguments by name. The default value of an argument is always allowed.
+        kinds: of arguments by name, whose annotations do not say it as `Annotated[type, kind]`. The default
+            value of an argument is always allowed.
 
     Raises:
         TypeError: where it is applied, for arguments that are not declared, or are none.
@@ -152,13 +153,14 @@ def checked(label: str | None = None, /, **kinds: Kind) -> Callable[[F], F]:
 
     def declare(function: F) -> F:
         signature = inspect.signature(function)
-        missing = (set(signature.parameters) - BOUND) ^ set(kinds)
+        noted = {p.name: p.annotation.__metadata__[0] for p in signature.parameters.values() if _says(p)}
+        missing = (set(signature.parameters) - BOUND) ^ set(kinds | noted)
         if missing:
             raise TypeError(
                 f"{function.__qualname__}: arguments and declarations differ in {sorted(missing)}"
             )
         name = label or function.__name__
-        declaration = Declaration.of(name, signature, kinds, function)
+        declaration = Declaration.of(name, signature, kinds | noted, function)
         bound = bool(BOUND & set(signature.parameters))
 
         @wraps(function)
@@ -170,9 +172,20 @@ def checked(label: str | None = None, /, **kinds: Kind) -> Callable[[F], F]:
             return function(*positional, **named)
 
         DECLARATIONS[call] = declaration
+        # (Who asks for the signature reads types.)
+        plain = [
+            p.replace(annotation=p.annotation.__origin__) if _says(p) else p
+            for p in signature.parameters.values()
+        ]
+        call.__signature__ = signature.replace(parameters=plain)  # pyright: ignore[reportAttributeAccessIssue]
+        call.__annotations__ = {**function.__annotations__, **{p.name: p.annotation for p in plain}}
         return call  # pyright: ignore[reportReturnType]
 
     return declare
+
+
+def _says(parameter: inspect.Parameter) -> bool:
+    return get_origin(parameter.annotation) is Annotated
 
 
 @cache

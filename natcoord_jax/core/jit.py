@@ -4,7 +4,7 @@ import os
 from collections.abc import Iterable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.kinds import FLAG, Choice, FunctionOf, of
@@ -17,22 +17,15 @@ PLACES = of("a whole number, or a tuple of them", int, tuple, list)
 NAMES = of("a name in quotes, or a tuple of them", str, tuple, list)
 
 
-@checked(
-    function=FunctionOf("of arrays"),
-    effort=EFFORT,
-    static_argnums=PLACES,
-    static_argnames=NAMES,
-    donate_argnums=PLACES,
-    donate_argnames=NAMES,
-)
+@checked()
 def jit(
-    function: Any = None,
+    function: Annotated[Any, FunctionOf("of arrays")] = None,
     *,
-    effort: Effort | None = None,
-    static_argnums: int | Sequence[int] = (),
-    static_argnames: str | Iterable[str] = (),
-    donate_argnums: int | Sequence[int] = (),
-    donate_argnames: str | Iterable[str] = (),
+    effort: Annotated[Effort | None, EFFORT] = None,
+    static_argnums: Annotated[int | Sequence[int], PLACES] = (),
+    static_argnames: Annotated[str | Iterable[str], NAMES] = (),
+    donate_argnums: Annotated[int | Sequence[int], PLACES] = (),
+    donate_argnames: Annotated[str | Iterable[str], NAMES] = (),
 ) -> Any:
     """`jax.jit`, with the first result in seconds: least effort first, full effort meanwhile.
 

@@ -1,7 +1,7 @@
 """A single step, and its derivatives."""
 
 import math
-from typing import Any
+from typing import Annotated, Any
 
 import equinox as eqx
 import jax
@@ -36,17 +36,15 @@ def _one_step(system, state, u, dt, tolerance, extra, tableau):
     return course.state, course.code
 
 
-@checked(
-    system=SYSTEM, state=STATE, u=CHANNELS, dt=STEP, newton_tol=Concrete(Number("positive")), scheme=SCHEME
-)
+@checked()
 def step(
-    system: System,
-    state: State,
-    u: Any = None,
-    dt: Any = None,
+    system: Annotated[System, SYSTEM],
+    state: Annotated[State, STATE],
+    u: Annotated[Any, CHANNELS] = None,
+    dt: Annotated[Any, STEP] = None,
     *,
-    newton_tol: float = TOLERANCE,
-    scheme: Scheme = SECOND_ORDER,
+    newton_tol: Annotated[float, Concrete(Number("positive"))] = TOLERANCE,
+    scheme: Annotated[Scheme, SCHEME] = SECOND_ORDER,
 ) -> State:
     """One step, by default the energy-momentum step (57), differentiable in everything.
 

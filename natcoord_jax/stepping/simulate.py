@@ -4,7 +4,7 @@ import os
 import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 from jaxtyping import Array
@@ -55,44 +55,28 @@ def _simulate(
     return rollout(system, state, inputs, dt, *static, allowed=tolerance, made=made)[0]
 
 
-@checked(
-    system=SYSTEM,
-    state=STATE,
-    dt=STEP,
-    steps=Whole(1) | of("nc.Steps(number, most)", Steps),
-    inputs=INPUTS,
-    save_every=Whole(1),
-    throw=FLAG,
-    until=FunctionOf("of the state to a number, whose sign changes", 1),
-    checkpoint=FLAG,
-    newton_tol=Concrete(Number("positive")),
-    extra_substeps=Whole(0),
-    scheme=SCHEME,
-    rtol=Number("not negative"),
-    atol=Number("not negative"),
-    progress=FLAG,
-    store=PATH,
-    resume=FLAG,
-)
+@checked()
 def simulate(
-    system: System,
-    state: State,
+    system: Annotated[System, SYSTEM],
+    state: Annotated[State, STATE],
     *,
-    dt: Any,
-    steps: int | Steps | None = None,
-    inputs: Any = None,
-    save_every: int = 1,
-    throw: bool = True,
-    until: Callable[[State], Array] | None = None,
-    checkpoint: bool = False,
-    newton_tol: float = TOLERANCE,
-    extra_substeps: int | None = None,
-    scheme: Scheme = SECOND_ORDER,
-    rtol: Any = None,
-    atol: Any = None,
-    progress: bool = False,
-    store: str | os.PathLike | None = None,
-    resume: bool = False,
+    dt: Annotated[Any, STEP],
+    steps: Annotated[int | Steps | None, Whole(1) | of("nc.Steps(number, most)", Steps)] = None,
+    inputs: Annotated[Any, INPUTS] = None,
+    save_every: Annotated[int, Whole(1)] = 1,
+    throw: Annotated[bool, FLAG] = True,
+    until: Annotated[
+        Callable[[State], Array] | None, FunctionOf("of the state to a number, whose sign changes", 1)
+    ] = None,
+    checkpoint: Annotated[bool, FLAG] = False,
+    newton_tol: Annotated[float, Concrete(Number("positive"))] = TOLERANCE,
+    extra_substeps: Annotated[int | None, Whole(0)] = None,
+    scheme: Annotated[Scheme, SCHEME] = SECOND_ORDER,
+    rtol: Annotated[Any, Number("not negative")] = None,
+    atol: Annotated[Any, Number("not negative")] = None,
+    progress: Annotated[bool, FLAG] = False,
+    store: Annotated[str | os.PathLike | None, PATH] = None,
+    resume: Annotated[bool, FLAG] = False,
 ) -> Trajectory:
     """Simulate with the energy-momentum step (57), its relatives of higher order, or another scheme.
 

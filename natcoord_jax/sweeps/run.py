@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import numpy as np
@@ -28,24 +28,18 @@ WAITING = 64
 """Blocks that an executor is given at once."""
 
 
-@checked(
-    function=FunctionOf("of the axes, by name, to arrays"),
-    axes=of("a dictionary of names and values", dict),
-    store=of("the name of a folder, or its path", str, os.PathLike),
-    executor=Anything(),
-    block=Whole(1),
-    buckets=of("names of axes, as ('steps',)", tuple, list),
-    progress=FLAG,
-)
+@checked()
 def sweep(
-    function: Callable[..., Any],
-    axes: Mapping[Any, Any],
+    function: Annotated[Callable[..., Any], FunctionOf("of the axes, by name, to arrays")],
+    axes: Annotated[Mapping[Any, Any], of("a dictionary of names and values", dict)],
     *,
-    store: str | os.PathLike | None = None,
-    executor: futures.Executor | None = None,
-    block: int | None = None,
-    buckets: Sequence[str] = (),
-    progress: bool = False,
+    store: Annotated[
+        str | os.PathLike | None, of("the name of a folder, or its path", str, os.PathLike)
+    ] = None,
+    executor: Annotated[futures.Executor | None, Anything()] = None,
+    block: Annotated[int | None, Whole(1)] = None,
+    buckets: Annotated[Sequence[str], of("names of axes, as ('steps',)", tuple, list)] = (),
+    progress: Annotated[bool, FLAG] = False,
 ) -> Sweep:
     """Evaluate a function for all combinations of some values, from thousands to billions of them.
 

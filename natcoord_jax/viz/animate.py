@@ -3,7 +3,7 @@
 import io
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import matplotlib
 import matplotlib.pyplot as plt
@@ -108,28 +108,20 @@ def _write(film: FuncAnimation, file: Path, fps: int) -> None:
     film.save(str(file), writer=FFMpegWriter(fps=fps, extra_args=options), dpi=2 * DOTS)
 
 
-@checked(
-    system=MOVING,
-    trajectory=Concrete(TRAJECTORY),
-    file=of("the name of a file that ends in .gif, .mp4 or .html", str, Path),
-    fps=Whole(1),
-    beams=BEAMS,
-    traces=POINTS,
-    title=NAME,
-    colour=COLOURS,
-    within=BOX,
-)
+@checked()
 def animate(
-    system: System | Phases | Solution,
-    trajectory: Trajectory | None = None,
+    system: Annotated[System | Phases | Solution, MOVING],
+    trajectory: Annotated[Trajectory | None, Concrete(TRAJECTORY)] = None,
     *,
-    file: str | Path | None = None,
-    fps: int = 25,
-    beams: Sequence[BeamHandle] = (),
-    traces: Sequence[Marker] = (),
-    title: str = "",
-    colour: Colouring = "energy",
-    within: Any = None,
+    file: Annotated[
+        str | Path | None, of("the name of a file that ends in .gif, .mp4 or .html", str, Path)
+    ] = None,
+    fps: Annotated[int, Whole(1)] = 25,
+    beams: Annotated[Sequence[BeamHandle], BEAMS] = (),
+    traces: Annotated[Sequence[Marker], POINTS] = (),
+    title: Annotated[str, NAME] = "",
+    colour: Annotated[Colouring, COLOURS] = "energy",
+    within: Annotated[Any, BOX] = None,
 ) -> Inline | Path:
     """A film of a trajectory: true shapes, joints, ground, and the time.
 

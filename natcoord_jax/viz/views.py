@@ -12,7 +12,7 @@ import tempfile
 import webbrowser
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -124,30 +124,19 @@ def open_file(file: Path) -> None:
         print(f"open {place} in a browser")
 
 
-@checked(
-    system=MOVING,
-    trajectory=Concrete(TRAJECTORY),
-    file=of("the name of a file that ends in .html", str, Path),
-    title=NAME,
-    follow=HandleOf("body") | NAME,
-    traces=POINTS,
-    colour=COLOURS,
-    beams=BEAMS,
-    within=BOX,
-    live=FLAG,
-)
+@checked()
 def view(
-    system: System | Phases | Solution,
-    trajectory: Trajectory | None = None,
+    system: Annotated[System | Phases | Solution, MOVING],
+    trajectory: Annotated[Trajectory | None, Concrete(TRAJECTORY)] = None,
     *,
-    file: str | Path | None = None,
-    title: str = "",
-    follow: Handle | str = "",
-    traces: Sequence[Marker] = (),
-    colour: Colouring = "energy",
-    beams: Sequence[BeamHandle] = (),
-    within: Any = None,
-    live: bool = False,
+    file: Annotated[str | Path | None, of("the name of a file that ends in .html", str, Path)] = None,
+    title: Annotated[str, NAME] = "",
+    follow: Annotated[Handle | str, HandleOf("body") | NAME] = "",
+    traces: Annotated[Sequence[Marker], POINTS] = (),
+    colour: Annotated[Colouring, COLOURS] = "energy",
+    beams: Annotated[Sequence[BeamHandle], BEAMS] = (),
+    within: Annotated[Any, BOX] = None,
+    live: Annotated[bool, FLAG] = False,
 ) -> "View | Path | Any":
     """A motion in three dimensions: turn it, play it, scrub it.
 
