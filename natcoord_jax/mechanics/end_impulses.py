@@ -12,7 +12,7 @@ Newton's iteration, the second is linear. `TangentSpace` knows P, the constraint
 prescribe.
 """
 
-from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +21,6 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
-from natcoord_jax.maths.collocation import Tableau
 from natcoord_jax.maths.elimination import definite_solution
 from natcoord_jax.maths.impact_law import semidefinite_solution
 from natcoord_jax.mechanics.equations_of_motion import EquationsOfMotion, relations_of
@@ -29,41 +28,27 @@ from natcoord_jax.mechanics.kick import Ends, end_of, rotor_rates
 from natcoord_jax.mechanics.momentum import momentum_balance
 from natcoord_jax.mechanics.response import Evaluation, no_multipliers
 from natcoord_jax.mechanics.tangent_space import TangentSpace, Velocity, prescribing
-from natcoord_jax.model.groups import Group
 from natcoord_jax.model.model import Model
 
 
-def released(
-    system: Model,
-    state: State,
-    groups: Sequence[Group],
-    found: Evaluation,
-    turning: Float[Array, "1 coordinates"],
-    h: Array,
-    tableau: Tableau,
-) -> Ends:
+def released(equations: Any, found: Evaluation, turning: Float[Array, "1 coordinates"]) -> Ends:
     """Velocity at the end of a variational step, and the work of drives that is booked there.
 
     Args:
-        system: compiled system.
-        state: at the start.
-        groups: that act.
-        found: solved equations of the step.
+        equations: of the step.
+        found: their solution.
         turning: mean rates of all joint coordinates.
-        h: step [s].
-        tableau: of the scheme.
     """
-    end = end_of(state, found.at, h, tableau)
-    space = TangentSpace.at(system, end)
-    impulse = _impulse(space, groups, found, h, tableau)
-    rotors = rotor_rates(system, groups, found.at, h)[0]
+    space = TangentSpace.at(equations.system, end_of(equations, found.at))
+    impulse = _impulse(space, equations, found)
+    rotors = rotor_rates(equations, found.at)[0]
     if rotors.shape[0]:
         impulse = impulse + space.turning @ (space.inertias * rotors)
     v = space.with_momentum(impulse)
     lost = impulse - space.pulled(space.impulse(v))
     assert space.admissible.lift is not None
     missed = -space.admissible.lift.T @ lost
-    return Ends(v, _work(system, groups, found, turning[0], missed), jnp.array(True))
+    return Ends(v, _work(equations, found, turning[0], missed), jnp.array(True))
 
 
 def obeying(system: Model, end: State) -> Ends:
@@ -90,20 +75,17 @@ def obeying(system: Model, end: State) -> Ends:
     return Ends(Velocity(v.rows + change.rows, v.rotors + change.rotors), work, jnp.array(True))
 
 
-def _impulse(
-    space: TangentSpace, groups: Sequence[Group], found: Evaluation, h: Array, tableau: Tableau
-) -> Float[Array, " u"]:
+def _impulse(space: TangentSpace, equations: Any, found: Evaluation) -> Float[Array, " u"]:
     """P(q_1)^T [M V + h/2 F_1], without rotors."""
-    at, (situations, _) = found.at, found.given
-    assert space.system is not None
+    at, (situations, _), h, tableau = found.at, found.given, equations.h, equations.tableau
     force_rows = at.start + h * at.rates[0]
     acting = [
         (group, where)
-        for group, where in zip(groups, situations)
+        for group, where in zip(equations.groups, situations)
         if not group.multipliers and not group.effect.rotors
     ]
     missing = momentum_balance(
-        space.system,
+        equations.system,
         [group for group, _ in acting],
         [where for _, where in acting],
         replace_fields(at, force_rows=force_rows[None]),
@@ -116,21 +98,17 @@ def _impulse(
 
 
 def _work(
-    system: Model,
-    groups: Sequence[Group],
-    found: Evaluation,
-    turning: Float[Array, " coordinates"],
-    impulses: Float[Array, " c"],
+    equations: Any, found: Evaluation, turning: Float[Array, " coordinates"], impulses: Float[Array, " c"]
 ) -> Float[Array, " relations"]:
     """Of relations: half of what the step has booked is done at its end instead, by the impulses there."""
-    if not relations_of(system):
+    if not relations_of(equations.system):
         return jnp.zeros(0, turning.dtype)
 
     def mean(effect, index):
         return effect.coefficients() @ turning[index]
 
     done, position = [], 0
-    for group, power in zip(groups, found.power):
+    for group, power in zip(equations.groups, found.power):
         if group.holds and group.source != "joint":
             size = group.count * group.multipliers
             here, position = impulses[position : position + size], position + size

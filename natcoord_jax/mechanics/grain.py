@@ -6,18 +6,15 @@ know its length to better than 1e-16 m, or its force to better than 1e-16 of wha
 the length. Motion that is less than that is nothing but rounding.
 """
 
-from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from natcoord_jax.core.state import State
 from natcoord_jax.maths.vectors import safe_divide
 from natcoord_jax.mechanics.momentum import row_weights
-from natcoord_jax.mechanics.response import GroupData
-from natcoord_jax.model.groups import Group
 from natcoord_jax.model.model import Model
 from natcoord_jax.model.rows import rows_with_ground
 
@@ -29,25 +26,12 @@ UNRESISTED = 1e200
 """Reciprocal inertia of what turns without any, but for its stiffness."""
 
 
-def cancelling_size(
-    system: Model,
-    groups: Sequence[Group],
-    situations: Sequence[GroupData],
-    state: State,
-    h: Float[Array, ""],
-) -> Float[Array, ""]:
-    """Size of the terms that cancel in the forces at the start of a step [sqrt(J)], as of those of a balance.
-
-    Args:
-        system: compiled system.
-        groups: that act.
-        situations: of the groups.
-        state: at the start.
-        h: step [s].
-    """
-    rows, total = rows_with_ground(state.q), jnp.zeros((), state.q.dtype)
-    by_force, by_torque = _mobilities(system)
-    for group, where in zip(groups, situations):
+def cancelling_size(equations: Any) -> Float[Array, ""]:
+    """Size of the terms that cancel in the forces at the start of a step [sqrt(J)], as of a balance."""
+    q, h = equations.state.q, equations.h
+    rows, total = rows_with_ground(q), jnp.zeros((), q.dtype)
+    by_force, by_torque = _mobilities(equations.system)
+    for group, where in zip(equations.groups, equations.situations):
         index = group.bodies
 
         def one(effect, *given):

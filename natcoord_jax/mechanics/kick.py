@@ -33,10 +33,9 @@ from jaxtyping import Array, Bool, Float
 
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
-from natcoord_jax.maths.collocation import Tableau
 from natcoord_jax.mechanics.block_tangent_space import Tangents, tangents_at
 from natcoord_jax.mechanics.coordinates import stage_rates
-from natcoord_jax.mechanics.frozen_kick import NEGLIGIBLE, NEGLIGIBLE_ENERGY, FrozenKick
+from natcoord_jax.mechanics.frozen_kick import NEGLIGIBLE, NEGLIGIBLE_ENERGY
 from natcoord_jax.mechanics.response import GroupData, StageKinematics
 from natcoord_jax.mechanics.tangent_space import Velocity, driven
 from natcoord_jax.model.groups import Group
@@ -100,53 +99,33 @@ class Ends(eqx.Module):
     sound: Bool[Array, ""]
 
 
-def end_of(state: State, at: StageKinematics, h: Array, tableau: Tableau) -> State:
+def end_of(equations: Any, at: StageKinematics) -> State:
     """Positions and time at the end of a step; nothing else of it is of use."""
-    rows = at.start[:-1] + h * jnp.tensordot(jnp.asarray(tableau.b), at.rates[:, :-1], 1)
-    q = rows.reshape(-1, 3)
+    state, h, b = equations.state, equations.h, jnp.asarray(equations.tableau.b)
+    q = (at.start[:-1] + h * jnp.tensordot(b, at.rates[:, :-1], 1)).reshape(-1, 3)
     return State(state.t + h, q, q, state.coordinates, state.rates, state.work)
 
 
-def rotor_rates(
-    system: Model, groups: Sequence[Group], at: StageKinematics, h: Array
-) -> Float[Array, "s rotors"]:
+def rotor_rates(equations: Any, at: StageKinematics) -> Float[Array, "s rotors"]:
     """Rates at the stages of the joint coordinates that carry rotors."""
-    carrying = [g.coordinates[:, 0] for g in groups if g.effect.rotors]
+    carrying = [g.coordinates[:, 0] for g in equations.groups if g.effect.rotors]
     if not carrying:
         return jnp.zeros((at.rates.shape[0], 0), at.rates.dtype)
-    return stage_rates(system, at, h)[:, jnp.concatenate(carrying)]
+    return stage_rates(equations.system, at, equations.h)[:, jnp.concatenate(carrying)]
 
 
-def kick_of(
-    system: Model,
-    state: State,
-    before: Tangents | None,
-    groups: Sequence[Group],
-    at: StageKinematics,
-    h: Array,
-    tableau: Tableau,
-    lag: FrozenKick | None = None,
-) -> Kick:
-    """The kick that belongs to given stages.
-
-    Args:
-        system: compiled system.
-        state: at the start of the step.
-        before: tangent space there; None: found together with that at the end.
-        groups: that act.
-        at: stage motion.
-        h: step [s].
-        tableau: the collocation method.
-        lag: with the kick at hand, which serves if it differs by nothing but what is negligible.
-    """
+def kick_of(equations: Any, at: StageKinematics) -> Kick:
+    """The kick that belongs to given stages; that at hand where the difference is negligible."""
+    system, state, tableau = equations.system, equations.state, equations.tableau
+    known, lag = equations.start_cache.tangents, equations.start_cache.lag
     beta, sigma = jnp.asarray(tableau.beta), tableau.reflection
-    end = end_of(state, at, h, tableau)
-    if before is None:
+    end = end_of(equations, at)
+    if known is None:
         before, after = _both(system, state, end)
     else:
-        after = tangents_at(system, end)
+        before, after = known.with_system(system), tangents_at(system, end)
     drift = after.drift
-    carried = jnp.tensordot(beta, at.rates[:, :-1], 1), beta @ rotor_rates(system, groups, at, h)
+    carried = jnp.tensordot(beta, at.rates[:, :-1], 1), beta @ rotor_rates(equations, at)
     d = Velocity(
         sigma * (carried[0] - drift.rows) - state.row_rates,
         sigma * (carried[1] - drift.rotors) - state.rates,
@@ -154,7 +133,8 @@ def kick_of(
     first, last = before.shares(after, d)  # pyright: ignore[reportArgumentType]  (they are of one kind)
     found = Velocity(0.5 * (d.rows + first.rows - last.rows), 0.5 * (d.rotors + first.rotors - last.rotors))
     if lag is None:
-        return Kick(found, before, after, found, jnp.zeros_like(h), jnp.zeros_like(h))
+        nothing = jnp.zeros_like(equations.h)
+        return Kick(found, before, after, found, nothing, nothing)
     change = Velocity(found.rows - lag.held.rows, found.rotors - lag.held.rotors)
     motion = jnp.maximum(before.energy(Velocity(state.row_rates, state.rates)), before.energy(d))
     size, kick, motion = (jnp.sqrt(2.0 * x) for x in (before.energy(change), before.energy(found), motion))
@@ -176,18 +156,10 @@ def _both(system: Model, start: State, end: State) -> tuple[Tangents, Tangents]:
     return before.with_system(system), after.with_system(system)
 
 
-def ends_of(
-    system: Model,
-    state: State,
-    groups: Sequence[Group],
-    at: StageKinematics,
-    kick: Kick,
-    h: Array,
-    tableau: Tableau,
-) -> Ends:
+def ends_of(equations: Any, at: StageKinematics, kick: Kick) -> Ends:
     """The velocity at the end of a step: that of its stages, less the kick taken back."""
-    rates, turning = at.rates[:, :-1], rotor_rates(system, groups, at, h)
-    before, after = kick.before, kick.after
+    state, tableau, before, after = equations.state, equations.tableau, kick.before, kick.after
+    rates, turning = at.rates[:, :-1], rotor_rates(equations, at)
     v = Velocity(state.row_rates, state.rates)
     start = Velocity(v.rows + kick.kick.rows, v.rotors + kick.kick.rotors)
     last = Velocity(
@@ -197,47 +169,37 @@ def ends_of(
     end = after.projected(last)
     back = Velocity(end.rows - last.rows, end.rotors - last.rotors)
     work = before.work(kick.kick) + after.work(back)
-    little = jax.tree.map(lambda x: AT_REST * x / h, Velocity(state.rows, jnp.zeros_like(state.rates)))
+    little = jax.tree.map(
+        lambda x: AT_REST * x / equations.h, Velocity(state.rows, jnp.zeros_like(state.rates))
+    )
     energies = before.energy(v), before.energy(start), after.energy(last), after.energy(end)
     moving = jnp.maximum(functools.reduce(jnp.maximum, energies), before.energy(little))
     missing = energies[1] - energies[0] + energies[3] - energies[2] - jnp.sum(work)
-    small = 2.0 * before.energy(kick.kick) <= (DRIVEN if driven(system) else LARGEST) * moving
+    small = 2.0 * before.energy(kick.kick) <= (DRIVEN if driven(equations.system) else LARGEST) * moving
     return Ends(end, work, small & (jnp.abs(missing) <= UNSOUND * moving))
 
 
-def kicked(
-    system: Model,
-    state: State,
-    tangents: Tangents | None,
-    lag: FrozenKick | None,
-    groups: Sequence[Group],
-    situations: Sequence[GroupData],
-    at: StageKinematics,
-    h: Array,
-    tableau: Tableau,
-) -> tuple[Array, Sequence[GroupData], Kick | None]:
+def kicked(equations: Any, at: StageKinematics) -> tuple[Array, Sequence[GroupData], Kick | None]:
     """What the stages begin with: velocities of rows, situations with rates of rotors; and the kick.
 
     Where the kick lags behind the stages and is not due, it is that which is held, and nothing else of it is
     of use.
     """
+    state, situations = equations.state, equations.situations
     velocity = state.row_rates
-    if not tableau.kick:
+    if not equations.tableau.kick:
         return velocity, situations, None
-    before = None if tangents is None else tangents.with_system(system)
-    if lag is None:
-        found = kick_of(system, state, before, groups, at, h, tableau)
-    else:
-        found = _lagging(lag, system, state, before, groups, at, h, tableau)
-    moved = with_rotors(groups, situations, state.rates + found.kick.rotors)
+    found = kick_of(equations, at) if equations.start_cache.lag is None else _lagging(equations, at)
+    moved = with_rotors(equations.groups, situations, state.rates + found.kick.rotors)
     return velocity + found.kick.rows, moved, found
 
 
-def _lagging(lag: FrozenKick, system: Model, *given: Any) -> Kick:
+def _lagging(equations: Any, at: StageKinematics) -> Kick:
     """The kick, found anew if it is due."""
+    lag = equations.start_cache.lag
 
     def anew() -> Kick:
-        return kick_of(system, *given, lag=lag).without_system()
+        return kick_of(equations, at).without_system()
 
     def renewed(_: tuple[Array, Kick]) -> tuple[Array, Kick]:
         return jnp.array(False), anew()
@@ -246,7 +208,7 @@ def _lagging(lag: FrozenKick, system: Model, *given: Any) -> Kick:
     start = eqx.tree_at(lambda found: (found.kick, found.exact), blank, (lag.held, lag.held))
     # A loop of no or one trip leaves what it carries where it is; a conditional would copy it.
     _, found = jax.lax.while_loop(lambda carry: carry[0], renewed, (lag.due, start))
-    return found.with_system(system)
+    return found.with_system(equations.system)
 
 
 def with_rotors(

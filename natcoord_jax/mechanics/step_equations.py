@@ -150,7 +150,7 @@ class StepEquations(Form):
     @property
     def grain(self) -> Float[Array, ""]:
         """Size of the terms that cancel in the forces [sqrt(J)]."""
-        return cancelling_size(self.system, self.groups, self.situations, self.state, self.h)
+        return cancelling_size(self)
 
     @property
     def unknowns(self) -> int:
@@ -181,8 +181,7 @@ class StepEquations(Form):
         cache, tableau = self.start_cache, self.tableau
         w, multipliers = self.split(project_multipliers(y, self.balances, cache.projector))
         at, geometry = self.moved(w)
-        before = self.system, self.state, cache.tangents, cache.lag, self.groups, self.situations
-        velocity, situations, kick = kicked(*before, at, self.h, tableau)
+        velocity, situations, kick = kicked(self, at)
         asked: Any = multipliers if self.system.structure.inequalities else None
         if tableau.dissipative:
             asked = self.damped(at)

@@ -125,7 +125,7 @@ def attempt(
     def ended(carry: tuple) -> tuple:
         _, before, x, _, record, factors = carry
         before = with_state(before, unpack(x))
-        ends = end_of_step(system, before.state, h, equations.groups, found, setting.plan.tableau)
+        ends = end_of_step(replace_fields(equations, state=before.state), found)
         kick = None if before.lagging is None else found.kick.exact
         given = solving.residual, found.size, before.it.correction, ends[0], setting.plan.tolerance
         steady = sound(equations, before.it.y, *given, factors.grain)

@@ -1,6 +1,6 @@
 """One step: solve its equations, then advance the state."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -20,7 +20,6 @@ from natcoord_jax.mechanics.kick import Kick, ends_of
 from natcoord_jax.mechanics.response import Evaluation
 from natcoord_jax.mechanics.start_cache import StartCache
 from natcoord_jax.mechanics.tangent_space import driven
-from natcoord_jax.model.groups import Group
 from natcoord_jax.system import System
 
 
@@ -60,19 +59,18 @@ def _advanced(
     """Residual, state at the end, largest half turn, and the kick."""
     equations = prepare(system, state, u, h, tableau, start_cache)
     found = equations.evaluate(y)
-    after, half_turn = end_of_step(system, state, h, equations.groups, found, tableau)
+    after, half_turn = end_of_step(equations, found)
     return found.residual, after, half_turn, found.kick
 
 
-def end_of_step(
-    system: System, state: State, h: Array, groups: Sequence[Group], found: Evaluation, tableau: Tableau
-) -> tuple[State, Float[Array, ""]]:
+def end_of_step(equations: Any, found: Evaluation) -> tuple[State, Float[Array, ""]]:
     """State at the end of a step from its solved equations, and the largest half turn.
 
     Positions and velocities are advanced by increments (section 6 of the paper, written for stages):
     q_1 = q_0 + h sum b_i V_i and v_1 = v_0 + sum beta_i (V_i - v_0), the latter without kicks.
     """
-    at = found.at
+    system, state, h, tableau = equations.system, equations.state, equations.h, equations.tableau
+    at, groups = found.at, equations.groups
     bodies = len(system.structure.bodies)
     rates = at.rates[:, :bodies].reshape(tableau.stages, -1, 3)
     b = jnp.asarray(tableau.b)
@@ -80,9 +78,9 @@ def end_of_step(
     coordinates, work = state.coordinates, state.work
     turning, ends = stage_rates(system, at, h), None
     if found.kick is not None:
-        ends = ends_of(system, state, groups, at, found.kick, h, tableau)
+        ends = ends_of(equations, at, found.kick)
     elif tableau.variational:
-        ends = released(system, state, groups, found, turning, h, tableau)
+        ends = released(equations, found, turning)
     if system.coordinates:
         coordinates = coordinates + h * (b @ turning)
     start, rotors, extra = state.v, state.rates, None if ends is None else ends.work
