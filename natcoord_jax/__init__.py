@@ -27,12 +27,10 @@ from natcoord_jax.reading.set_coordinates import random_state
 from natcoord_jax.reading.transfer import transfer
 from natcoord_jax.scene import Scene
 from natcoord_jax.stepping.assemble import assemble
-from natcoord_jax.stepping.dissipative import Dissipative
 from natcoord_jax.stepping.one_step import linearise, step
 from natcoord_jax.stepping.room import Steps
-from natcoord_jax.stepping.scheme import EnergyMomentum
+from natcoord_jax.stepping.scheme import Dissipative, EnergyMomentum, VariationalMidpoint
 from natcoord_jax.stepping.simulate import simulate
-from natcoord_jax.stepping.variational import VariationalMidpoint
 from natcoord_jax.storage import *
 from natcoord_jax.sweeps import *
 from natcoord_jax.system import System

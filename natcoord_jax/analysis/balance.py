@@ -23,8 +23,7 @@ from natcoord_jax.core.motion import Motion, Response
 from natcoord_jax.core.state import TRAJECTORY, State, Trajectory
 from natcoord_jax.maths.collocation import gauss
 from natcoord_jax.maths.vectors import cross, safe_divide
-from natcoord_jax.mechanics.energies import body_momenta
-from natcoord_jax.mechanics.momentum import inertia
+from natcoord_jax.mechanics.momentum import body_momenta, inertia
 from natcoord_jax.mechanics.response import gather, motion_between, respond, situation
 from natcoord_jax.model.groups import Group
 from natcoord_jax.model.model import SYSTEM

@@ -2,11 +2,10 @@
 
 from natcoord_jax.bodies.beam import Beam, BeamHandle
 from natcoord_jax.bodies.contact import Contact, Plane
-from natcoord_jax.bodies.edge_load import EdgeLoad
 from natcoord_jax.bodies.fold import Fold
 from natcoord_jax.bodies.gas import Gas
 from natcoord_jax.bodies.interpolation import DirectorInterpolation, RelativeMotion
-from natcoord_jax.bodies.line_load import LineLoad
+from natcoord_jax.bodies.loads import EdgeLoad, LineLoad, Pressure
 from natcoord_jax.bodies.mesh_handle import Edge, MeshHandle, Surface
 from natcoord_jax.bodies.nodes import Nodes
 from natcoord_jax.bodies.rigid import PointMass, RigidBody
@@ -14,7 +13,6 @@ from natcoord_jax.bodies.sections import CircularSection, RectangularSection, Se
 from natcoord_jax.bodies.shapes import Box, Capsule, Cylinder, Ellipsoid, Sphere
 from natcoord_jax.bodies.shell import Shell
 from natcoord_jax.bodies.solid import Solid
-from natcoord_jax.bodies.surface_load import Pressure
 from natcoord_jax.bodies.tie import Tie
 
 __all__ = [

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int
 
+from natcoord_jax.bodies.loads import SURFACE
 from natcoord_jax.bodies.mesh_handle import MeshHandle
-from natcoord_jax.bodies.surface_load import SURFACE
 from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.checks import is_concrete
 from natcoord_jax.core.handles import Handle

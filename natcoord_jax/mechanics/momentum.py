@@ -1,16 +1,19 @@
-"""The balances of momentum and angular momentum of all bodies, from a given motion."""
+"""Balances of momentum and angular momentum of all bodies, their momenta, and what effects store."""
 
 from collections.abc import Sequence
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import Tableau
 from natcoord_jax.maths.vectors import cross, skew
 from natcoord_jax.mechanics.response import GroupData, StageKinematics, collect, gather, respond
 from natcoord_jax.model.groups import Group
 from natcoord_jax.model.model import Model
+from natcoord_jax.model.rows import group_places, rows_with_ground
 
 
 def inertia(system: Model, rates: Float[Array, "*s bodies 4 3"]) -> Float[Array, "*s bodies 4 3"]:
@@ -168,3 +171,28 @@ def momentum_balance(
     force, moment = wrench(momentum, at.held[:, :-1, 1:])
     moment = moment if torque is None else moment - torque
     return Balance(force, moment, jnp.sqrt(size), jnp.concatenate(rows), power)
+
+
+def group_energies(system: Model, group: Group, state: State) -> Float[Array, " n"]:
+    """Stored energy of every instance of a group."""
+    rows = rows_with_ground(state.q)[group.bodies]
+
+    def one(effect, place, rows, coordinates, rates):
+        return effect.stored(place, rows, coordinates, rates)
+
+    axes = (None if group.source == "mass" else 0, 0, 0, 0, 0)
+    with jax.named_scope(group.effect.kind.replace(" ", "_")):
+        return jax.vmap(one, in_axes=axes)(
+            group.effect,
+            group_places(system, group),
+            rows,
+            state.coordinates[group.coordinates],
+            state.rates[group.rotors],
+        )
+
+
+def body_momenta(system: Model, state: State) -> tuple[Float[Array, "bodies 3"], Float[Array, "bodies 3"]]:
+    """Momentum and angular momentum about the origin of every body (24, 32)."""
+    q, v = state.rows, state.row_rates
+    impulse = inertia(system, v)
+    return impulse[:, 0], jnp.sum(cross(q, impulse), axis=1)

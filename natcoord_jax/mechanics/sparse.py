@@ -12,8 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.linsolve.blocks import BlockMatrix
-from natcoord_jax.linsolve.saddle import inertias_of, regularised
-from natcoord_jax.linsolve.sparse import SparseSolver, factorised
+from natcoord_jax.linsolve.sparse import SparseSolver, factorised, inertias_of, regularised
 from natcoord_jax.mechanics.element_matrices import touches
 from natcoord_jax.mechanics.full import FullStep
 from natcoord_jax.mechanics.spread import spreads

@@ -20,8 +20,16 @@ from natcoord_jax.core.markers import Attachment, Marker
 from natcoord_jax.core.names import names_of
 from natcoord_jax.core.potential import place_markers
 from natcoord_jax.core.state import State
-from natcoord_jax.model.assembled_poses import Poses, check_joint, joint_frames, joint_triad
-from natcoord_jax.model.assembled_rows import padded, rows_and_velocities, rows_of_poses, with_masses
+from natcoord_jax.model.assembled_poses import (
+    Poses,
+    check_joint,
+    joint_frames,
+    joint_triad,
+    padded,
+    rows_and_velocities,
+    rows_of_poses,
+    with_masses,
+)
 from natcoord_jax.model.bodies import Bodies
 from natcoord_jax.model.edges import coupled_pairs, edge_of
 from natcoord_jax.model.graph import Edge, spanning_tree

@@ -10,10 +10,9 @@ from natcoord_jax.core.checks import require_double
 from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.results import REASONS, REMEDIES, Result, SimulationError
 from natcoord_jax.core.state import State, Trajectory
-from natcoord_jax.mechanics.energies import body_momenta, group_energies
 from natcoord_jax.mechanics.equations_of_motion import EquationsOfMotion, relations_of
 from natcoord_jax.mechanics.failures import failure
-from natcoord_jax.mechanics.momentum import inertia
+from natcoord_jax.mechanics.momentum import body_momenta, group_energies, inertia
 from natcoord_jax.mechanics.violations import LEFT_OPEN, worst_violation
 from natcoord_jax.model.model import Model
 from natcoord_jax.model.rows import over_states

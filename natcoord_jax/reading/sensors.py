@@ -24,9 +24,8 @@ from natcoord_jax.maths.vectors import cross
 from natcoord_jax.mechanics.coordinates import state_rates
 from natcoord_jax.model.model import Model
 from natcoord_jax.model.rows import rows_with_ground, states_of
-from natcoord_jax.reading.effect_readings import readings, tells
 from natcoord_jax.reading.instant import inputs_along, instants
-from natcoord_jax.reading.markers import MarkerSensor, marker_weights, weighted
+from natcoord_jax.reading.markers import MarkerSensor, marker_weights, readings, tells, weighted
 from natcoord_jax.reading.tangent_states import Source, over_source
 
 

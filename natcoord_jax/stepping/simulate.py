@@ -21,6 +21,7 @@ from natcoord_jax.mechanics.impacts import with_mobilities
 from natcoord_jax.model.model import SYSTEM
 from natcoord_jax.reading.tangent_states import handing
 from natcoord_jax.stepping.admissibility import check_obeyed
+from natcoord_jax.stepping.after_run import warn_of_far_turns, warn_of_uncovered
 from natcoord_jax.stepping.checked import (
     INPUTS,
     STEP,
@@ -35,8 +36,6 @@ from natcoord_jax.stepping.room import Steps, cut, in_host_memory, room_for, wit
 from natcoord_jax.stepping.saved_states import rollout
 from natcoord_jax.stepping.scheme import SCHEME, SECOND_ORDER, Scheme
 from natcoord_jax.stepping.segments import Run, in_segments
-from natcoord_jax.stepping.turns import warn_of_far_turns
-from natcoord_jax.stepping.uncovered import warn_of_uncovered
 from natcoord_jax.storage.archive import PATH
 from natcoord_jax.system import System
 from natcoord_jax.xla import one_kernel

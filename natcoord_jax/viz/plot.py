@@ -1,7 +1,10 @@
 """Curves over time: energies, balances, joint coordinates, momenta and works of a trajectory."""
 
 from collections.abc import Sequence
+from typing import Any
 
+import matplotlib.pyplot as plt
+import numpy as np
 from matplotlib.figure import Figure
 
 from natcoord_jax.analysis.accuracy_table import Accuracy
@@ -14,11 +17,10 @@ from natcoord_jax.core.numeric import Vector
 from natcoord_jax.core.state import TRAJECTORY, Trajectory
 from natcoord_jax.system import System
 from natcoord_jax.viz.curves import as_bands, in_turn, panels_of
-from natcoord_jax.viz.motion import BEAMS, is_batch, lanes_of, runs_of
-from natcoord_jax.viz.panels import plot_panels
-from natcoord_jax.viz.snapshots import plot_snapshots
+from natcoord_jax.viz.motion import BEAMS, is_batch, lanes_of, longest_of, runs_of, together
+from natcoord_jax.viz.panels import Panel, draw, plot_panels, shown_once
 from natcoord_jax.viz.solutions import solution_panels
-from natcoord_jax.viz.work_precision import plot_accuracy
+from natcoord_jax.viz.stage import Stage
 
 MOST_LANES = 64
 """Of a larger batch every so many runs are drawn."""
@@ -72,3 +74,72 @@ def plot(
     drawn = [in_turn([panels_of(*pair) for pair in run.pairs]) for run in runs_of(phases, MOST_LANES)]
     panels = as_bands(drawn) if is_batch(phases) else drawn[0]
     return plot_panels(panels) if times is None else plot_snapshots(phases, times, panels, beams=beams)
+
+
+def plot_accuracy(found: Accuracy) -> Figure:
+    """Errors over time and over steps, one curve an order, on logarithmic scales."""
+    figure, axes = plt.subplots(1, 2, figsize=(10, 4.2), sharey=True, layout="constrained")
+    for order in sorted({row.order for row in found.rows}):
+        rows = [r for r in found.rows if r.order == order and r.result == "successful" and r.error > 0]
+        errors = [r.error for r in rows]
+        axes[0].loglog([1e3 * r.wall_s for r in rows], errors, "o-", markersize=4, label=f"order {order}")
+        axes[1].loglog([r.steps for r in rows], errors, "o-", markersize=4, label=f"order {order}")
+    quantity = next(iter(found.rows[0].errors)) if found.rows else ""
+    for diagram, abscissa in zip(axes, ("time [ms], without compilation", "steps")):
+        if found.reference_error > 0:
+            diagram.axhline(found.reference_error, color="0.6", linestyle="--", linewidth=1)
+        diagram.set(xlabel=abscissa)
+        diagram.grid(alpha=0.3)
+    axes[0].set(ylabel=f"error of {quantity} at t = {found.t_end:g} s", title="what accuracy costs")
+    axes[1].set(title="orders; dashed: error of the reference")
+    axes[0].legend(fontsize="small")
+    return figure
+
+
+COLUMNS = 4
+"""Pictures in a row."""
+MOST_IN_A_ROW = 3
+"""Diagrams in a row."""
+
+
+def plot_snapshots(
+    phases: Phases,
+    times: Sequence[float],
+    panels: Sequence[Panel],
+    *,
+    beams: Sequence[BeamHandle] = (),
+    caption: str = "",
+    within: Any = None,
+) -> Figure:
+    """Pictures of a motion at some times, with diagrams below.
+
+    Args:
+        phases: the motion; of a batch the first run with the others as ghosts.
+        times: of the snapshots [s]; those after the end are left out.
+        panels: the diagrams.
+        beams: handles of beams, whose sections are drawn.
+        caption: what there is to see, below the pictures.
+        within: two corners of the box (2, 3) [m] that is looked into; None: all is seen.
+    """
+    end = float(longest_of(runs_of(phases))[-1])
+    scenery = together(
+        phases, np.array([t for t in times if t <= end + 1e-9 * (1 + end)]), beams=beams, within=within
+    )
+    frames = range(len(scenery.t))
+    rows = -(-len(frames) // COLUMNS)
+    wide = 2 if len(panels) == 4 else min(len(panels), MOST_IN_A_ROW)
+    high = 3.6 * -(-len(panels) // wide)
+    figure = plt.figure(figsize=(3.2 * COLUMNS, 3.2 * rows + high), layout="constrained")
+    halves: Any = figure.subfigures(2, 1, height_ratios=(3.2 * rows, high))
+    above, below = halves
+    for frame in frames:
+        axes = above.add_subplot(rows, COLUMNS, frame + 1, projection="3d")
+        Stage(axes, scenery, labelled=False, zoom=1.25).show(frame, "t = {:.4g} s")
+    if caption:
+        below.suptitle(caption, fontsize=10, x=0.02, ha="left")
+    grid = list(below.subplots(-(-len(panels) // wide), wide, squeeze=False).flat)
+    for axes, panel in zip(grid, panels):
+        draw(axes, panel)
+    for axes in grid[len(panels) :]:
+        axes.set_visible(False)
+    return shown_once(figure)

@@ -10,7 +10,7 @@ from natcoord_jax.bodies.beam import BeamHandle
 from natcoord_jax.core.bodies import NODE, by_node
 from natcoord_jax.core.names import Names
 from natcoord_jax.core.state import State
-from natcoord_jax.mechanics.energies import group_energies
+from natcoord_jax.mechanics.momentum import group_energies
 from natcoord_jax.model.groups import Group
 from natcoord_jax.model.rows import over_states
 from natcoord_jax.system import System

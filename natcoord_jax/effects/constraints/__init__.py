@@ -1,8 +1,7 @@
 """Constraints between points and directions, and between their velocities."""
 
-from natcoord_jax.effects.constraints.points import PointOnLine, PointOnPlane, PointOnPoint, Rod
+from natcoord_jax.effects.constraints.points import PointOnLine, PointOnPlane, PointOnPoint, PointSum, Rod
 from natcoord_jax.effects.constraints.rolling import Rolling
-from natcoord_jax.effects.constraints.ties import PointSum
 
 __all__ = [
     "PointOnLine",

@@ -1,4 +1,4 @@
-"""Forces at points and torques on bodies: constant, following, or functions of time."""
+"""Gravity, and forces at points and torques on bodies: constant, following, or functions of time."""
 
 from typing import Any, ClassVar
 
@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from natcoord_jax.core.arguments import is_a, require
-from natcoord_jax.core.force import Force, Load
+from natcoord_jax.core.force import Field, Force, Load
 from natcoord_jax.core.kinds import FLAG, FunctionOf
 from natcoord_jax.core.markers import Markers
 from natcoord_jax.core.numeric import COMPONENTS, Number
@@ -99,3 +99,24 @@ class PairTorque(Force):
         """Torque along the mid-point direction of the first body."""
         torque = _at(self.torque, t) * x[0]
         return Load(None, jnp.stack([-torque, torque]))
+
+
+class Gravity(Field):
+    """Uniform gravity on every body of the scene.
+
+    Attributes:
+        vector: acceleration [m/s^2], shape (3,).
+
+    Example:
+        >>> import natcoord_jax as nc
+        >>> scene = nc.Scene()
+        >>> gravity = scene.add(nc.Gravity(vector=(0, 0, -9.81)))
+    """
+
+    vector: Any = eqx.field(default=(0.0, 0.0, -9.81), kw_only=True, metadata=is_a(COMPONENTS))
+
+    kind: ClassVar[str] = "gravity"
+
+    def acceleration(self) -> Array:
+        """The vector."""
+        return jnp.asarray(self.vector, float)

@@ -16,8 +16,7 @@ from natcoord_jax.core.kinds import Choice
 from natcoord_jax.core.markers import Markers
 from natcoord_jax.core.numeric import Numbers
 from natcoord_jax.core.potential import place_markers
-from natcoord_jax.effects.shells.layer import LayerElement
-from natcoord_jax.effects.shells.readings import ShellReadings
+from natcoord_jax.effects.shells.layer import LayerElement, ShellReadings
 from natcoord_jax.effects.shells.stiffness import (
     EDGES,
     QuadrilateralMatrices,

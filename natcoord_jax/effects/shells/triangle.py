@@ -16,8 +16,7 @@ from natcoord_jax.core.markers import Markers
 from natcoord_jax.core.numeric import Numbers
 from natcoord_jax.core.potential import place_markers
 from natcoord_jax.effects.materials import Sheet
-from natcoord_jax.effects.shells.layer import LayerElement
-from natcoord_jax.effects.shells.readings import ShellReadings
+from natcoord_jax.effects.shells.layer import LayerElement, ShellReadings
 from natcoord_jax.effects.shells.stiffness import along_axes, cartesian, dot
 
 MIDDLES = ((0.5, 0.0), (0.5, 0.5), (0.0, 0.5))
