@@ -9,9 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from natcoord_jax.maths.direct_rotation import nearest_orthogonal
 from natcoord_jax.maths.elimination import definite_inverse, definite_solution, inverse_cholesky
-from natcoord_jax.maths.projectors import pseudo_inverse, range_projector
+from natcoord_jax.maths.projectors import nearest_orthogonal, pseudo_inverse, range_projector
 
 
 def _definite(size: int, seed: int) -> jax.Array:

@@ -7,9 +7,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.bodies.continuum import Continuum
-from natcoord_jax.bodies.mesh_handle import MeshHandle
+from natcoord_jax.bodies.mesh_handle import MeshHandle, check_folds, normals_at
 from natcoord_jax.bodies.nodes import Nodes
-from natcoord_jax.bodies.normals import check_folds, normals_at
 from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.checks import as_array, is_concrete
 from natcoord_jax.core.eager_numpy import eager_numpy

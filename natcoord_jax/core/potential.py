@@ -12,7 +12,6 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.bodies import NODE
-from natcoord_jax.core.chunks import chunked
 from natcoord_jax.core.closed_tangents import tangents_together
 from natcoord_jax.core.effect import Effect, replace_fields
 from natcoord_jax.core.gradient import averaged_coupling, averaged_gradient, cancelling_energy, gradient_of
@@ -21,7 +20,7 @@ from natcoord_jax.core.joint import Joint
 from natcoord_jax.core.kinds import NAME
 from natcoord_jax.core.markers import Attachment, Marker, Markers
 from natcoord_jax.core.motion import Motion, Response, StepContext
-from natcoord_jax.core.together import instances_last, place_together, steps_together
+from natcoord_jax.core.together import chunked, instances_last, place_together, steps_together
 from natcoord_jax.maths.collocation import Tableau
 from natcoord_jax.xla.materialise import materialised
 

@@ -1,5 +1,6 @@
-"""Many instances at once, their axis the last in all arrays, so that what is computed is wide."""
+"""Many instances at once, their axis the last in all arrays, so that what is computed is wide; in pieces."""
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -7,6 +8,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from natcoord_jax.core.bodies import NODE
+from natcoord_jax.core.effect import replace_fields
+from natcoord_jax.core.motion import Motion, StepContext
 from natcoord_jax.xla.materialise import materialised
 
 
@@ -30,3 +33,52 @@ def steps_together(
 ) -> Float[Array, "s p n"]:
     """Changes of the invariants at the stages, of many instances, for changes of the marker vectors."""
     return jax.vmap(lambda xi, vi: jax.jvp(potential.invariants, (xi,), (vi,))[1])(x, moved)
+
+
+PIECE = 64
+"""Largest number of instances in a piece."""
+
+
+def chunked(
+    function: Callable[[Any, Array, Motion, StepContext], Any],
+    effect: Any,
+    place: Array,
+    motion: Motion,
+    now: StepContext,
+) -> Any:
+    """What a function gives for all instances of an effect; leading axis n, of the stacked numbers, too.
+
+    Args:
+        function: of the effect, its place, motion and time.
+        effect: with stacked numbers.
+        place: of the instances.
+        motion: of their bodies.
+        now: leading axis n in inputs, coordinates and rates.
+    """
+    count = place.shape[0]
+    pieces = -(-count // PIECE)
+    if pieces <= 1:
+        return function(effect, place, motion, now)
+    size = -(-count // pieces)
+
+    def cut(x: Array, axis: int = 0) -> Array:
+        last = jax.lax.slice_in_dim(x, count - 1, count, axis=axis)
+        rest = pieces * size - count
+        whole = jnp.concatenate([x, *[last] * rest], axis=axis) if rest else x
+        split = whole.reshape(*x.shape[:axis], pieces, size, *x.shape[axis + 1 :])
+        return jnp.moveaxis(split, axis, 0)
+
+    def at_stages(x: Array) -> Array:
+        return cut(x, 1)
+
+    single = now.inputs, now.coordinates, now.rates
+    moving = motion.rows, motion.rates, motion.spin
+    given = (*jax.tree.map(cut, (effect, place, motion.start, single)), jax.tree.map(at_stages, moving))
+
+    def one(_: None, piece: tuple) -> tuple[None, Any]:
+        effect, place, start, (inputs, coordinates, rates), moving = piece
+        alone = replace_fields(now, inputs=inputs, coordinates=coordinates, rates=rates)
+        return None, function(effect, place, Motion(start, *moving), alone)
+
+    found = jax.lax.scan(one, None, given)[1]
+    return jax.tree.map(lambda x: x.reshape(pieces * size, *x.shape[2:])[:count], found)

@@ -15,13 +15,17 @@ from natcoord_jax.effects.actuators import *
 from natcoord_jax.effects.beams import *
 from natcoord_jax.effects.constraints import *
 from natcoord_jax.effects.contact import *
-from natcoord_jax.effects.fibres import TransverselyIsotropic
 from natcoord_jax.effects.hyperelastic import Hyperelastic
 from natcoord_jax.effects.joints import *
-from natcoord_jax.effects.laminates import Laminate, Orthotropic
 from natcoord_jax.effects.loads import *
-from natcoord_jax.effects.materials import Elastic
-from natcoord_jax.effects.rubber import CompressibleMooneyRivlin, MooneyRivlin, NeoHooke, Ogden
+from natcoord_jax.effects.materials import Elastic, Laminate, Orthotropic
+from natcoord_jax.effects.rubber import (
+    CompressibleMooneyRivlin,
+    MooneyRivlin,
+    NeoHooke,
+    Ogden,
+    TransverselyIsotropic,
+)
 from natcoord_jax.effects.shells import *
 from natcoord_jax.effects.solids import *
 from natcoord_jax.effects.springs import *

@@ -1,14 +1,15 @@
-"""Elastic materials of shells and solids."""
+"""Elastic materials of shells and solids, and plies of them."""
 
 from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.core.arguments import Part, is_a
-from natcoord_jax.core.kinds import Choice
-from natcoord_jax.core.numeric import Number
+from natcoord_jax.core.kinds import Choice, of
+from natcoord_jax.core.numeric import Number, Numbers
 
 MASS = Choice(("lumped", "consistent"))
 """How elements carry their mass."""
@@ -114,3 +115,144 @@ class Elastic(Part):
     def transverse_shear(self) -> Float[Array, "2 2"]:
         """Mean shear stresses across a layer by shears 13 and 23, with the shear coefficient [N/m^2]."""
         return SHEAR * self.shear_modulus * jnp.eye(2)
+
+
+class Orthotropic(Part):
+    """A material with three planes of symmetry, in plane stress; for shells.
+
+    Its axis 1 is along `direction` of the shell.
+
+    Attributes:
+        E1: Young's modulus along the first axis [N/m^2].
+        E2: across it, in the surface [N/m^2].
+        nu12: contraction along 2 where it is stretched along 1 [-]; E2 nu12^2 < E1.
+        G12: shear modulus in the surface [N/m^2].
+        G13: across it, along 1 [N/m^2]; default G12.
+        G23: across it, along 2 [N/m^2]; default G12.
+        density: [kg/m^3].
+
+    Raises:
+        ValueError: for a Poisson's ratio at which a stretch would cost no energy.
+
+    Example:
+        >>> import natcoord_jax as nc
+        >>> ply = nc.Orthotropic(E1=140e9, E2=10e9, nu12=0.3, G12=5e9, density=1600.0)
+        >>> print(f"{ply.plane_stress()[0, 0]:.3e}")
+        1.409e+11
+    """
+
+    E1: Any = eqx.field(kw_only=True, metadata=is_a(Number("positive")))
+    E2: Any = eqx.field(kw_only=True, metadata=is_a(Number("positive")))
+    nu12: Any = eqx.field(kw_only=True, metadata=is_a(Number()))
+    G12: Any = eqx.field(kw_only=True, metadata=is_a(Number("positive")))
+    G13: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Number("positive")))
+    G23: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Number("positive")))
+    density: Any = eqx.field(default=0.0, kw_only=True, metadata=is_a(Number("not negative")))
+
+    kind = "material"
+
+    def _excess(self) -> Any:
+        return 1.0 - self.nu12**2 * self.E2 / self.E1
+
+    def flaws(self) -> dict[str, Any]:
+        """A stretch that gives energy."""
+        said = "has nu12 [-] whose square is not below E1 / E2: a stretch would give energy"
+        return {said: self._excess() <= 0.0}
+
+    def plane_stress(self) -> Float[Array, "3 3"]:
+        """Stresses by strains 11, 22, 12 of a layer without stress across it [N/m^2]."""
+        first, second = self.E1 / self._excess(), self.E2 / self._excess()
+        zero, mixed = jnp.zeros_like(first), self.nu12 * second
+        rows = (first, mixed, zero), (mixed, second, zero), (zero, zero, self.G12)
+        return jnp.stack([jnp.stack([jnp.asarray(x, float) for x in row]) for row in rows])
+
+    def transverse_shear(self) -> Float[Array, "2 2"]:
+        """Mean shear stresses across a layer by shears 13 and 23, with the shear coefficient [N/m^2]."""
+        moduli = (self.G12 if g is None else g for g in (self.G13, self.G23))
+        return SHEAR * jnp.diag(jnp.stack([jnp.asarray(g, float) for g in moduli]))
+
+    def sheet(self, thickness: Any) -> Sheet:
+        """A layer of it."""
+        return Elastic.sheet(self, thickness)  # pyright: ignore[reportArgumentType]
+
+
+PLY = of("a material, as nc.Orthotropic(...) or nc.Elastic(...)", Elastic, Orthotropic)
+
+
+class Laminate(Part):
+    """Plies of one material in different directions, one on the other; for shells.
+
+    Attributes:
+        material: of the plies.
+        angles: of their first axes from `direction` of the shell, about the director [rad]; from the side
+            against the director on.
+        fractions: of the thickness, for each ply [-]; default: all are as thick.
+
+    Raises:
+        ValueError: for fractions of another number, or that do not add up to one.
+
+    Example:
+        >>> import natcoord_jax as nc
+        >>> import numpy as np
+        >>> ply = nc.Orthotropic(E1=140e9, E2=10e9, nu12=0.3, G12=5e9, density=1600.0)
+        >>> crossed = nc.Laminate(ply, angles=np.radians([0, 90]))
+        >>> bool(abs(crossed.sheet(1e-3).coupling[0, 0]) > 0)
+        True
+    """
+
+    material: Any = eqx.field(metadata=is_a(PLY))
+    angles: Any = eqx.field(kw_only=True, metadata=is_a(Numbers((None,))))
+    fractions: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Numbers((None,), sign="positive")))
+
+    kind = "material"
+
+    @property
+    def density(self) -> Any:
+        """[kg/m^3]."""
+        return self.material.density
+
+    def flaws(self) -> dict[str, Any]:
+        """Plies that do not fill the thickness.
+
+        Raises:
+            ValueError: for other numbers of fractions than of angles.
+        """
+        if self.fractions is None:
+            return {}
+        if np.shape(self.fractions) != np.shape(self.angles):
+            raise ValueError(
+                f"Laminate: fractions [-] has shape {np.shape(self.fractions)}; pass one for each of the "
+                f"angles, {np.shape(self.angles)}"
+            )
+        said = "has fractions [-] of the thickness that do not add up to one; divide them by their sum"
+        return {said: abs(sum(self.fractions) - 1.0) > 1e-9}
+
+    def sheet(self, thickness: Any) -> Sheet:
+        """All plies, with the middle of the thickness as the reference surface."""
+        angles = jnp.asarray(self.angles, float)
+        count = angles.shape[0]
+        parts = jnp.full(count, 1.0 / count) if self.fractions is None else jnp.asarray(self.fractions, float)
+        ends = thickness * (jnp.concatenate([jnp.zeros(1), jnp.cumsum(parts)]) - 0.5)
+        plane, shear = self.material.plane_stress(), self.material.transverse_shear()
+        turned = [_turned(plane, shear, angles[k]) for k in range(count)]
+        planes, shears = (jnp.stack(x) for x in zip(*turned))
+        moments = [(ends[1:] ** k - ends[:-1] ** k) / k for k in (1, 2, 3)]
+        stretch, couple, bend = (jnp.einsum("k,kij->ij", m, planes) for m in moments)
+        slide = jnp.einsum("k,kij->ij", moments[0], shears)
+        return Sheet(stretch, couple, bend, slide, planes[jnp.array([0, -1])])
+
+
+def _turned(
+    plane: Float[Array, "3 3"], shear: Float[Array, "2 2"], angle: Float[Array, ""]
+) -> tuple[Float[Array, "3 3"], Float[Array, "2 2"]]:
+    """Stiffness along axes of which the material's are turned by an angle."""
+    c, s = jnp.cos(angle), jnp.sin(angle)
+    strains = jnp.stack(
+        [
+            jnp.stack([c * c, s * s, c * s]),
+            jnp.stack([s * s, c * c, -c * s]),
+            jnp.stack([-2 * c * s, 2 * c * s, c * c - s * s]),
+        ]
+    )
+    axes = jnp.stack([jnp.stack([c, s]), jnp.stack([-s, c])])
+    return strains.T @ plane @ strains, axes.T @ shear @ axes

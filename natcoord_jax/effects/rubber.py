@@ -10,11 +10,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.core.arguments import is_a
-from natcoord_jax.core.numeric import Number, Numbers
+from natcoord_jax.core.checks import as_array
+from natcoord_jax.core.effect import replace_fields
+from natcoord_jax.core.numeric import Directions, Number, Numbers
 from natcoord_jax.effects.hyperelastic import ClosedHyperelastic, Hyperelastic, Tensors, log_quotient
 from natcoord_jax.effects.materials import POISSON
 from natcoord_jax.maths.matrix_logarithm import exponential_less_one, logarithm
-from natcoord_jax.maths.symmetric import PAIRS, trace, unit_like
+from natcoord_jax.maths.symmetric import PAIRS, contracted, trace, unit_like
 
 
 def _cubic(begun: Tensors, ended: Tensors) -> tuple[Array, Array, Array, Array]:
@@ -24,19 +26,25 @@ def _cubic(begun: Tensors, ended: Tensors) -> tuple[Array, Array, Array, Array]:
     return before, after, change, 0.5 * (1.0 / before + 1.0 / after)
 
 
-def _volume_energy(bulk_modulus: Any, J: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """K (J^2 - 1 - 2 ln J) / 4: without limit where the volume goes to nothing or to infinity."""
-    return 0.25 * bulk_modulus * (J * J - 1.0 - 2.0 * jnp.log(J))
+class WithBulkModulus(Hyperelastic):
+    """Base of laws with the energy K (J^2 - 1 - 2 ln J) / 4 of a change of volume, `bulk_modulus` K."""
+
+    split: ClassVar[bool] = True
+
+    @property
+    def _bulk(self) -> Any:
+        return self.bulk_modulus  # pyright: ignore[reportAttributeAccessIssue]
+
+    def volumetric(self, J: Float[Array, "*n"]) -> Float[Array, "*n"]:
+        """Energy per volume of a change of volume [J/m^3]."""
+        return 0.25 * self._bulk * (J * J - 1.0 - 2.0 * jnp.log(J))
+
+    def pressure(self, before: Float[Array, "*n"], after: Float[Array, "*n"]) -> Float[Array, "*n"]:
+        """Its change by that of the ratio of volumes [N/m^2]."""
+        return 0.25 * self._bulk * (before + after - 2.0 * log_quotient(before, after))
 
 
-def _volume_pressure(
-    bulk_modulus: Any, before: Float[Array, "*n"], after: Float[Array, "*n"]
-) -> Float[Array, "*n"]:
-    """Its change by that of J."""
-    return 0.25 * bulk_modulus * (before + after - 2.0 * log_quotient(before, after))
-
-
-class NeoHooke(ClosedHyperelastic):
+class NeoHooke(WithBulkModulus, ClosedHyperelastic):
     """Rubber whose chains resist stretch alone: mu/2 (J^(-2/3) tr C - 3) + K/4 (J^2 - 1 - 2 ln J).
 
     Attributes:
@@ -53,8 +61,6 @@ class NeoHooke(ClosedHyperelastic):
 
     E: Any = eqx.field(kw_only=True, metadata=is_a(Number("positive")))
     nu: Any = eqx.field(kw_only=True, metadata=is_a(POISSON))
-
-    split: ClassVar[bool] = True
 
     @property
     def shear_modulus(self) -> Any:
@@ -77,16 +83,8 @@ class NeoHooke(ClosedHyperelastic):
         by_c = -0.5 * half * (trace(begun.C) + trace(ended.C)) * change / (before * after)
         return half * inverse * unit_like(begun.C), None, by_c
 
-    def volumetric(self, J: Float[Array, "*n"]) -> Float[Array, "*n"]:
-        """Energy per volume of a change of volume [J/m^3]."""
-        return _volume_energy(self.bulk_modulus, J)
 
-    def pressure(self, before: Float[Array, "*n"], after: Float[Array, "*n"]) -> Float[Array, "*n"]:
-        """Its change by that of the ratio of volumes [N/m^2]."""
-        return _volume_pressure(self.bulk_modulus, before, after)
-
-
-class MooneyRivlin(ClosedHyperelastic):
+class MooneyRivlin(WithBulkModulus, ClosedHyperelastic):
     """Rubber: c10 (J^(-2/3) tr C - 3) + c01 (J^(-4/3) tr G - 3) + K/4 (J^2 - 1 - 2 ln J), G = cof C.
 
     Attributes:
@@ -104,8 +102,6 @@ class MooneyRivlin(ClosedHyperelastic):
     c01: Any = eqx.field(kw_only=True, metadata=is_a(Number("not negative")))
     bulk_modulus: Any = eqx.field(kw_only=True, metadata=is_a(Number("positive")))
 
-    split: ClassVar[bool] = True
-
     def distortion(self, tensors: Tensors) -> Float[Array, "*n"]:
         """Energy per volume of a change of shape [J/m^3]."""
         root = jnp.cbrt(tensors.c)
@@ -121,14 +117,6 @@ class MooneyRivlin(ClosedHyperelastic):
         by_c = by_c + self.c01 * (trace(begun.G) + trace(ended.G)) * change * (before + after) / (both * both)
         unit = unit_like(begun.C)
         return self.c10 * inverse * unit, self.c01 * squared * unit, -0.5 * by_c
-
-    def volumetric(self, J: Float[Array, "*n"]) -> Float[Array, "*n"]:
-        """Energy per volume of a change of volume [J/m^3]."""
-        return _volume_energy(self.bulk_modulus, J)
-
-    def pressure(self, before: Float[Array, "*n"], after: Float[Array, "*n"]) -> Float[Array, "*n"]:
-        """Its change by that of the ratio of volumes [N/m^2]."""
-        return _volume_pressure(self.bulk_modulus, before, after)
 
 
 class CompressibleMooneyRivlin(ClosedHyperelastic):
@@ -172,7 +160,7 @@ class CompressibleMooneyRivlin(ClosedHyperelastic):
         return self.volume_stiffness * (0.5 * (before + after) - 1.0) - balance * log_quotient(before, after)
 
 
-class Ogden(Hyperelastic):
+class Ogden(WithBulkModulus):
     """Rubber: sum_p mu_p / alpha_p (l_1^alpha_p + l_2^alpha_p + l_3^alpha_p - 3) + K/4 (J^2 - 1 - 2 ln J).
 
     l_i are the principal stretches over J^(1/3). R. W. Ogden, Proc. R. Soc. Lond. A 326 (1972) 565-584.
@@ -192,8 +180,6 @@ class Ogden(Hyperelastic):
     moduli: Any = eqx.field(kw_only=True, metadata=is_a(Numbers((None,))))
     exponents: Any = eqx.field(kw_only=True, metadata=is_a(Numbers((None,))))
     bulk_modulus: Any = eqx.field(kw_only=True, metadata=is_a(Number("positive")))
-
-    split: ClassVar[bool] = True
 
     def flaws(self) -> dict[str, Any]:
         """Stiffnesses that are none.
@@ -225,10 +211,67 @@ class Ogden(Hyperelastic):
             total = total + modulus / exponent * trace(exponential_less_one(0.5 * exponent * logarithms))
         return total
 
+
+class TransverselyIsotropic(ClosedHyperelastic):
+    """A neo-Hookean matrix with fibres along one direction: the matrix's energy + k/8 (a . C a - 1)^2.
+
+    The standard reinforcing model (G. Y. Qiu, T. J. Pence, J. Elasticity 49 (1997) 1-30); fibres resist
+    compression as they do tension.
+
+    Attributes:
+        E: Young's modulus of the matrix at small strains [N/m^2].
+        nu: its Poisson's ratio [-], between -1 and 1/2.
+        fibre_stiffness: k, what the fibres add to Young's modulus along them [N/m^2].
+        direction: of the fibres, in the axes of the mesh [-].
+        density: [kg/m^3].
+
+    Example:
+        >>> import natcoord_jax as nc
+        >>> gel = dict(E=1e6, nu=0.45, density=1100.0)
+        >>> tendon = nc.TransverselyIsotropic(**gel, fibre_stiffness=2e7, direction=(1, 0, 0))
+    """
+
+    E: Any = eqx.field(kw_only=True, metadata=is_a(Number("positive")))
+    nu: Any = eqx.field(kw_only=True, metadata=is_a(POISSON))
+    fibre_stiffness: Any = eqx.field(kw_only=True, metadata=is_a(Number("not negative")))
+    direction: Any = eqx.field(kw_only=True, metadata=is_a(Directions()))
+
+    @property
+    def matrix(self) -> NeoHooke:
+        """The material between the fibres."""
+        # As a copy: the numbers may be those of many elements.
+        return replace_fields(NeoHooke(E=1.0, nu=0.0), E=self.E, nu=self.nu, density=self.density)
+
+    def turned(self, rotation: Float[Array, "3 3"]) -> "TransverselyIsotropic":
+        """With fibres that are turned with the body."""
+        return replace_fields(self, direction=rotation @ as_array(self.direction, float))
+
+    def _fibre(self, like: Float[Array, "6 *n"]) -> Float[Array, "6 *n"]:
+        """The dyad of the direction, by components, with as many axes as another tensor."""
+        a = jnp.stack([jnp.asarray(self.direction[k]) for k in range(3)])
+        a = a / jnp.sqrt(jnp.sum(a * a, axis=0))
+        dyad = jnp.stack([a[i] * a[j] for i, j in PAIRS])
+        return dyad.reshape(6, *(1,) * (like.ndim - dyad.ndim), *dyad.shape[1:])
+
+    def _stretch(self, tensors: Tensors) -> Float[Array, "*n"]:
+        """Squared, of the fibres."""
+        return contracted(self._fibre(tensors.C), tensors.C)
+
+    def distortion(self, tensors: Tensors) -> Float[Array, "*n"]:
+        """Energy per volume but that of the volume [J/m^3]."""
+        stretch = self._stretch(tensors) - 1.0
+        return self.matrix.distortion(tensors) + self.fibre_stiffness / 8 * stretch * stretch
+
+    def quotients(self, begun: Tensors, ended: Tensors) -> tuple[Any, Any, Any]:
+        """Of the matrix, and of the square of a . C a - 1."""
+        by_C, by_G, by_c = self.matrix.quotients(begun, ended)
+        pull = self.fibre_stiffness / 8 * (self._stretch(begun) + self._stretch(ended) - 2.0)
+        return by_C + pull * self._fibre(by_C), by_G, by_c
+
     def volumetric(self, J: Float[Array, "*n"]) -> Float[Array, "*n"]:
         """Energy per volume of a change of volume [J/m^3]."""
-        return _volume_energy(self.bulk_modulus, J)
+        return self.matrix.volumetric(J)
 
     def pressure(self, before: Float[Array, "*n"], after: Float[Array, "*n"]) -> Float[Array, "*n"]:
         """Its change by that of the ratio of volumes [N/m^2]."""
-        return _volume_pressure(self.bulk_modulus, before, after)
+        return self.matrix.pressure(before, after)

@@ -13,8 +13,8 @@ from jaxtyping import Array, Float, Int
 
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
-from natcoord_jax.maths.direct_rotation import isometric
 from natcoord_jax.maths.elimination import inverse_cholesky
+from natcoord_jax.maths.projectors import isometric
 from natcoord_jax.maths.vectors import cross
 from natcoord_jax.mechanics.equations_of_motion import loops_of, relations_of, rotors_of
 from natcoord_jax.mechanics.momentum import inertia_alone, weighs_only, wrench

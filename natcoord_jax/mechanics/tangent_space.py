@@ -12,9 +12,8 @@ from jaxtyping import Array, Float, Int
 
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
-from natcoord_jax.maths.direct_rotation import direct_rotation, isometric
 from natcoord_jax.maths.elimination import inverse_cholesky
-from natcoord_jax.maths.projectors import pseudo_inverse, range_projector
+from natcoord_jax.maths.projectors import direct_rotation, isometric, pseudo_inverse, range_projector
 from natcoord_jax.mechanics.equations_of_motion import (
     Accelerations,
     EquationsOfMotion,

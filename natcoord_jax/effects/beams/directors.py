@@ -21,8 +21,22 @@ from natcoord_jax.core.force import Force, Load
 from natcoord_jax.core.markers import Markers
 from natcoord_jax.core.numeric import Definite, Numbers, Vector
 from natcoord_jax.core.potential import Potential, place_markers
-from natcoord_jax.effects.beams.readings import BeamReadings
 from natcoord_jax.maths.vectors import dot
+
+
+class BeamReadings(eqx.Module):
+    """Strains and section forces of beam elements, about the axes d_1, d_2, d_3 of the section.
+
+    Attributes:
+        strain: Gamma_1, Gamma_2 (shear), Gamma_3 (stretch) [-] and K_1, K_2 (curvature), K_3 (twist) [1/m],
+            zero in the unstressed shape; of director elements at each Gauss point.
+        resultant: forces N_1, N_2, N_3 [N] and moments M_1, M_2, M_3 [N m], energy-conjugate to them.
+        energy: strain energy [J].
+    """
+
+    strain: Float[Array, "*shape 6"]
+    resultant: Float[Array, "*shape 6"]
+    energy: Float[Array, "*elements"]
 
 
 def director_strains(

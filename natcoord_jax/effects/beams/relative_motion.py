@@ -16,16 +16,16 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.checks import as_array
-from natcoord_jax.core.chunks import chunked
 from natcoord_jax.core.force import Force, Load
 from natcoord_jax.core.kinds import FunctionOf
 from natcoord_jax.core.markers import Markers
 from natcoord_jax.core.motion import Motion, StepContext
 from natcoord_jax.core.numeric import Definite, Number, Numbers, Vector
 from natcoord_jax.core.potential import place_markers
+from natcoord_jax.core.together import chunked
+from natcoord_jax.effects.beams.directors import BeamReadings
 from natcoord_jax.effects.beams.logarithm import Logarithm
 from natcoord_jax.effects.beams.pairs import Expanded, tangents_of_pairs
-from natcoord_jax.effects.beams.readings import BeamReadings
 from natcoord_jax.maths.components import Triple, combination, rows_of
 from natcoord_jax.maths.rotations import logarithm_of_motion
 from natcoord_jax.xla.materialise import materialised

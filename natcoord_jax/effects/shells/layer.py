@@ -13,8 +13,7 @@ from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.kinds import of
 from natcoord_jax.core.numeric import COMPONENTS, Directions, Number
 from natcoord_jax.core.potential import Potential
-from natcoord_jax.effects.laminates import Laminate, Orthotropic
-from natcoord_jax.effects.materials import MASS, Elastic, Sheet
+from natcoord_jax.effects.materials import MASS, Elastic, Laminate, Orthotropic, Sheet
 from natcoord_jax.maths.vectors import cross, dot
 
 

@@ -17,7 +17,6 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.cells import CELLS, quadrature, shapes
-from natcoord_jax.core.chunks import chunked
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.gradient import averaged_gradient
 from natcoord_jax.core.kinds import of
@@ -25,6 +24,7 @@ from natcoord_jax.core.markers import Markers
 from natcoord_jax.core.motion import Motion, StepContext
 from natcoord_jax.core.numeric import Numbers
 from natcoord_jax.core.potential import Potential, place_markers
+from natcoord_jax.core.together import chunked
 from natcoord_jax.effects.hyperelastic import Hyperelastic, tensors_of
 from natcoord_jax.effects.materials import MASS, Elastic
 from natcoord_jax.effects.solids.brick import (
