@@ -20,17 +20,23 @@ from natcoord_jax.gallery.continua import flying_plate, inflated_ball, solar_pan
 from natcoord_jax.gallery.example import Example
 from natcoord_jax.gallery.loops import bricard, four_bar, slider_crank
 from natcoord_jax.gallery.manoeuvres import reorientation_example
-from natcoord_jax.gallery.open_tree import open_tree
 from natcoord_jax.gallery.panel_slew import panel_slew
-from natcoord_jax.gallery.pendulums import double_pendulum, pendulum, torsion_spring
+from natcoord_jax.gallery.pendulums import (
+    double_pendulum,
+    dzhanibekov,
+    fast_top,
+    free_body,
+    heavy_top,
+    pendulum,
+    torsion_spring,
+)
 from natcoord_jax.gallery.plugging import plugging
 from natcoord_jax.gallery.robot import robot_cable
 from natcoord_jax.gallery.rolling import bicycle
 from natcoord_jax.gallery.spacecraft import spacecraft
 from natcoord_jax.gallery.stiff import mass_ladder, stiff_chain
 from natcoord_jax.gallery.tennis import tennis
-from natcoord_jax.gallery.tops import dzhanibekov, fast_top, free_body, heavy_top
-from natcoord_jax.gallery.trees import binary_tree, chain, robot_arm
+from natcoord_jax.gallery.trees import binary_tree, chain, open_tree, robot_arm
 
 SCENES: Mapping[str, Callable[..., Example]] = {
     "spacecraft": spacecraft,
