@@ -2,7 +2,7 @@
 
 import abc
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -31,9 +31,6 @@ from natcoord_jax.maths.lagrange import LOBATTO, gauss_legendre, lagrange, lobat
 
 HALF_TURN = -0.99
 """Cosine of the turn over an element below which it is half a turn, nearly: 172 degrees."""
-
-LINEAR = np.array([[2.0, 1.0], [1.0, 2.0]]) / 6.0
-"""Integrals of the products of two linear shape functions over a unit of length."""
 
 COILED = 0.2
 """Distance of the ends of an element over its length below which it is a coil; half a circle has 0.64."""
@@ -77,15 +74,25 @@ def _inertias(section: Section, lengths: Array, overlaps: Any) -> Float[Array, "
 
 
 class Interpolation(Part):
-    """Base of the ways in which a beam is made of elements."""
+    """Base of the ways in which a beam is made of elements, with nodes at their Gauss-Lobatto points.
 
-    @abc.abstractmethod
+    Class attributes:
+        order: one less than the nodes of an element.
+    """
+
+    order: ClassVar[int] = 1
+
     def refine(self, ends: np.ndarray) -> tuple[np.ndarray, list[Span]]:
         """Fractions of all nodes, and the nodes of each element, from the fractions of element ends."""
+        inner = lobatto(self.order)[0][:-1]
+        pieces = [a + (b - a) * inner for a, b in zip(ends, ends[1:])]
+        p = self.order
+        spans = [tuple(range(p * e, p * e + p + 1)) for e in range(len(pieces))]
+        return np.concatenate([*pieces, ends[-1:]]), spans
 
-    @abc.abstractmethod
     def lumps(self, arc: Float[Array, " n"], spans: list[Span]) -> Float[Array, " n"]:
-        """Lengths of the beam [m] whose mass the nodes carry."""
+        """Lengths of the beam [m] whose mass the nodes carry: Gauss-Lobatto weights times the elements'."""
+        return _shares(arc, self.order, np.array(spans))
 
     @abc.abstractmethod
     def effects(
@@ -122,14 +129,6 @@ class RelativeMotion(Interpolation):
     0.5 % and 2 % more with ten.
     """
 
-    def refine(self, ends: np.ndarray) -> tuple[np.ndarray, list[Span]]:
-        """Nodes at the ends of the elements."""
-        return ends, [(i, i + 1) for i in range(len(ends) - 1)]
-
-    def lumps(self, arc: Array, spans: list[Span]) -> Array:
-        """Half of each neighbouring element."""
-        return _halves(arc)
-
     def effects(
         self,
         material: Material,
@@ -142,7 +141,7 @@ class RelativeMotion(Interpolation):
         lengths, references = _strains_of_pairs(curve)
         _check_turns(curve, name)
         stiffness, elements, dampings = material.section.stiffness, [], []
-        inertias = material.inertias(lengths, LINEAR)
+        inertias = material.inertias(lengths, _overlaps(1))
         rows = zip(spans, *(apart(x, len(spans)) for x in (lengths, references, inertias)))
         for number, ((a, b), length, reference, inertia) in enumerate(rows):
             given = {
@@ -163,12 +162,6 @@ class RelativeMotion(Interpolation):
                 damper = {"length": length, "viscosity": material.damping * stiffness}
                 dampings.append(BeamDamping((nodes[a], nodes[b]), name=f"{name}/damping {number}", **damper))
         return elements, dampings
-
-
-@eager_numpy
-def _halves(arc: Float[Array, " n"]) -> Float[Array, " n"]:
-    half = 0.5 * jnp.diff(arc)
-    return jnp.zeros_like(arc).at[:-1].add(half).at[1:].add(half)
 
 
 @eager_numpy
@@ -246,19 +239,9 @@ class DirectorInterpolation(Interpolation):
         2
     """
 
-    order: int = eqx.field(default=1, static=True, metadata=is_a(Choice(tuple(LOBATTO))))
-
-    def refine(self, ends: np.ndarray) -> tuple[np.ndarray, list[Span]]:
-        """Nodes at the Gauss-Lobatto points of the elements."""
-        inner = lobatto(self.order)[0][:-1]
-        pieces = [a + (b - a) * inner for a, b in zip(ends, ends[1:])]
-        p = self.order
-        spans = [tuple(range(p * e, p * e + p + 1)) for e in range(len(pieces))]
-        return np.concatenate([*pieces, ends[-1:]]), spans
-
-    def lumps(self, arc: Array, spans: list[Span]) -> Array:
-        """Gauss-Lobatto weights times the lengths of the elements."""
-        return _shares(arc, self.order, np.array(spans))
+    order: int = eqx.field(  # pyright: ignore[reportIncompatibleVariableOverride]
+        default=1, static=True, metadata=is_a(Choice(tuple(LOBATTO)))
+    )
 
     def effects(
         self,

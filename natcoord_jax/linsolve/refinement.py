@@ -2,8 +2,9 @@
 
 from collections.abc import Callable
 from functools import partial
-from typing import TypeVar
+from typing import Any, TypeVar
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -80,3 +81,31 @@ def _converged(
     start = x, size, jnp.full_like(size, jnp.inf), jnp.array(0)
     x, work, before, _ = jax.lax.while_loop(shrinking, trip, start)
     return jnp.where(jnp.minimum(work, before) <= UNSOLVED * size, x, jnp.nan)
+
+
+class RefinedSolver(eqx.Module):
+    """A matrix with factors of it or of one near it: solutions are refined, differentiable in every mode.
+
+    Derivatives by the numbers of the matrix go through its product with the solution; the factors are not
+    differentiated.
+
+    Attributes:
+        matrix: the exact matrix.
+        factors: of the matrix or of one near it.
+        rounds: of refinement.
+    """
+
+    matrix: Any
+    factors: Any
+    rounds: int = eqx.field(static=True, default=1)
+
+    def solve(self, right: Float[Array, "*n"]) -> Float[Array, "*n"]:
+        """Solution x of matrix x = right."""
+        return refined_solve(
+            self.matrix.multiply,
+            right,
+            self.factors,
+            lambda factors, b: factors.solve(b),
+            lambda factors, b: factors.transpose().solve(b),
+            self.rounds,
+        )

@@ -14,7 +14,7 @@ from natcoord_jax.linsolve.block_tridiagonal import BlockTridiagonal
 from natcoord_jax.linsolve.blocks import BlockMatrix, BlockPattern, Entries
 from natcoord_jax.linsolve.graph import graph_of
 from natcoord_jax.linsolve.multifrontal import Multifrontal
-from natcoord_jax.linsolve.refinement import refined_solve
+from natcoord_jax.linsolve.refinement import RefinedSolver
 
 DENSE_UP_TO = 70  # unknowns up to which nothing is faster than a dense inverse
 UNEVEN = 2.0  # storage of a chain over that of its blocks, from which on padding costs more than it saves
@@ -104,16 +104,8 @@ def factorised(plan: Plan, matrix: BlockMatrix) -> Factorised:
     return Factorised(plan, plan.factor(matrix))
 
 
-class SparseSolver(eqx.Module):
-    """A sparse matrix with its factors: solutions are refined, differentiable in every mode.
-
-    Derivatives by the numbers of the matrix go through its product with the solution; the factors are not
-    differentiated.
-
-    Attributes:
-        matrix: the exact matrix.
-        factors: of the matrix or of one near it.
-        rounds: of refinement.
+class SparseSolver(RefinedSolver):
+    """A sparse matrix with its factors.
 
     Example:
         >>> import jax; jax.config.update("jax_enable_x64", True)
@@ -128,26 +120,11 @@ class SparseSolver(eqx.Module):
         (0.25, -0.0625)
     """
 
-    matrix: BlockMatrix
-    factors: Factorised
-    rounds: int = eqx.field(static=True, default=1)
-
     @classmethod
     def of(cls, plan: Plan, matrix: BlockMatrix) -> "SparseSolver":
         """Factorise a matrix."""
         # Its derivatives would be worked out in vain: see `refined_solve`.
         return cls(matrix, factorised(plan, jax.lax.stop_gradient(matrix)))
-
-    def solve(self, right: Float[Array, " n"]) -> Float[Array, " n"]:
-        """Solution x of matrix x = right."""
-        return refined_solve(
-            self.matrix.multiply,
-            right,
-            self.factors,
-            lambda factors, b: factors.solve(b),
-            lambda factors, b: factors.transpose().solve(b),
-            self.rounds,
-        )
 
     def singular(self, x: Float[Array, " n"], right: Float[Array, " n"]) -> Bool[Array, ""]:
         """Whether x leaves a residual that no solution of regular equations does, or is not finite."""

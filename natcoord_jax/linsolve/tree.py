@@ -11,15 +11,12 @@ subtree hands up a linear function of x_p, as the articulated bodies of rigid-bo
 linear in the number of nodes, whatever the shape of the tree, and the loops compile into one kernel.
 """
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from natcoord_jax.linsolve.dense import bordered_inverse
-from natcoord_jax.linsolve.refinement import refined_solve
 from natcoord_jax.xla.rows import add_at, row
 
 
@@ -174,21 +171,3 @@ def factor(blocks: TreeBlocks) -> tuple[TreeFactors, Float[Array, "nodes n"]]:
     inverse, to_parent, from_parent, lift, drop, diagonal = found
     rims = blocks.gather[:, width:], blocks.spread[:, :, width:]
     return TreeFactors(inverse, to_parent, from_parent, lift, drop, *rims, blocks.parent), diagonal
-
-
-class RefinedSolver(eqx.Module):
-    """Blocks by node with their factors: solves are refined once and differentiable in every mode."""
-
-    blocks: Any
-    factors: Any
-
-    def solve(self, right: Float[Array, "nodes n"]) -> Float[Array, "nodes n"]:
-        """Solution of blocks x = right."""
-        return refined_solve(
-            self.blocks.multiply,
-            right,
-            self.factors,
-            lambda factors, b: factors.solve(b),
-            lambda factors, b: factors.transpose().solve(b),
-            rounds=1,
-        )

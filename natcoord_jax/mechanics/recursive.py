@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.linsolve import neighbours
 from natcoord_jax.linsolve import tree as tree_solver
+from natcoord_jax.linsolve.refinement import RefinedSolver
 from natcoord_jax.maths.collocation import rotate_stages
 from natcoord_jax.maths.components import products
 from natcoord_jax.mechanics.effect_blocks import borders, by_place, seated, with_coupling, with_multipliers
@@ -118,7 +119,7 @@ class RecursiveStep(ReducedStep):
     def differentiable(self, matrix: Blocks) -> ByNode:
         """The same, refined and differentiable."""
         blocks, factor = self._by_node(matrix)
-        return ByNode(self.layout, tree_solver.RefinedSolver(blocks, factor(blocks)[0]))
+        return ByNode(self.layout, RefinedSolver(blocks, factor(blocks)[0]))
 
     def _by_node(self, matrix: Blocks) -> tuple[Any, Any]:
         """A matrix in blocks, by what couples its nodes, and its factorisation."""
