@@ -2,7 +2,6 @@
 
 from natcoord_jax.bodies.beam import Beam, BeamHandle
 from natcoord_jax.bodies.contact import Contact, Plane
-from natcoord_jax.bodies.fold import Fold
 from natcoord_jax.bodies.gas import Gas
 from natcoord_jax.bodies.interpolation import DirectorInterpolation, RelativeMotion
 from natcoord_jax.bodies.loads import EdgeLoad, LineLoad, Pressure
@@ -13,7 +12,7 @@ from natcoord_jax.bodies.sections import CircularSection, RectangularSection, Se
 from natcoord_jax.bodies.shapes import Box, Capsule, Cylinder, Ellipsoid, Sphere
 from natcoord_jax.bodies.shell import Shell
 from natcoord_jax.bodies.solid import Solid
-from natcoord_jax.bodies.tie import Tie
+from natcoord_jax.bodies.tie import Fold, Tie
 
 __all__ = [
     "Beam",

@@ -25,7 +25,7 @@ from natcoord_jax.effects.loads import (
     FacePressure9,
     PointForce,
 )
-from natcoord_jax.effects.loads.edges import LOAD, EdgeSegment
+from natcoord_jax.effects.loads.point_loads import LOAD, EdgeSegment
 
 BEAM = of("what scene.add(nc.Beam(...)) returned", BeamHandle)
 PROFILE = FunctionOf("of the fraction of the length [-] to a factor [-]")

@@ -7,7 +7,6 @@ of its docstring says what it is.
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from natcoord_jax.gallery.beams import cantilever, flying_spaghetti, rope
 from natcoord_jax.gallery.contact import (
     bouncing_ball,
     colliding_blocks,
@@ -16,9 +15,17 @@ from natcoord_jax.gallery.contact import (
     rattleback,
     tumbling_capsules,
 )
-from natcoord_jax.gallery.continua import flying_plate, inflated_ball, solar_panels, tumbling_block
+from natcoord_jax.gallery.continua import (
+    cantilever,
+    flying_plate,
+    flying_spaghetti,
+    inflated_ball,
+    rope,
+    solar_panels,
+    tumbling_block,
+)
 from natcoord_jax.gallery.example import Example
-from natcoord_jax.gallery.loops import bricard, four_bar, slider_crank
+from natcoord_jax.gallery.loops import bicycle, bricard, four_bar, slider_crank
 from natcoord_jax.gallery.manoeuvres import reorientation_example
 from natcoord_jax.gallery.panel_slew import panel_slew
 from natcoord_jax.gallery.pendulums import (
@@ -32,7 +39,6 @@ from natcoord_jax.gallery.pendulums import (
 )
 from natcoord_jax.gallery.plugging import plugging
 from natcoord_jax.gallery.robot import robot_cable
-from natcoord_jax.gallery.rolling import bicycle
 from natcoord_jax.gallery.spacecraft import spacecraft
 from natcoord_jax.gallery.stiff import mass_ladder, stiff_chain
 from natcoord_jax.gallery.tennis import tennis

@@ -19,12 +19,11 @@ from natcoord_jax.maths.collocation import Tableau, gauss
 from natcoord_jax.maths.projectors import range_projector
 from natcoord_jax.maths.vectors import cross
 from natcoord_jax.mechanics.block_tangent_space import Tangents
-from natcoord_jax.mechanics.element_matrices import dense, rates_of, touches
+from natcoord_jax.mechanics.element_matrices import dense, part_matrices, products, rates_of, touches
 from natcoord_jax.mechanics.local import body_balance, body_motion, jacobians, wrenches
 from natcoord_jax.mechanics.momentum import least_inertias, stage_changes
 from natcoord_jax.mechanics.redundancy import held_multipliers, project_multipliers
 from natcoord_jax.mechanics.response import StageKinematics, stations
-from natcoord_jax.mechanics.spread import part_matrices, products
 from natcoord_jax.mechanics.start_cache import NOTHING
 from natcoord_jax.mechanics.step_equations import StepEquations
 from natcoord_jax.model.groups import Group

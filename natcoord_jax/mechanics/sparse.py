@@ -13,9 +13,8 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.linsolve.blocks import BlockMatrix
 from natcoord_jax.linsolve.sparse import SparseSolver, factorised, inertias_of, regularised
-from natcoord_jax.mechanics.element_matrices import touches
+from natcoord_jax.mechanics.element_matrices import spreads, touches
 from natcoord_jax.mechanics.full import FullStep
-from natcoord_jax.mechanics.spread import spreads
 from natcoord_jax.model.model import Model
 
 

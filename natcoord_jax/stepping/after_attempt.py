@@ -12,8 +12,7 @@ from natcoord_jax.mechanics.tangent_space import Velocity
 from natcoord_jax.stepping.error_control import StepDecision, Trial, follow
 from natcoord_jax.stepping.located import COMPLETE, Ahead, with_impacts
 from natcoord_jax.stepping.newton import Iterate, begin
-from natcoord_jax.stepping.predictor import Predictor
-from natcoord_jax.stepping.rollout_state import RolloutProblem, RolloutState
+from natcoord_jax.stepping.rollout_state import Predictor, RolloutProblem, RolloutState
 from natcoord_jax.system import System
 
 SMALLEST_FRACTION = 1.0 / 2**16

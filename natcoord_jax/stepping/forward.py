@@ -19,8 +19,8 @@ from natcoord_jax.mechanics.equations import kind_of
 from natcoord_jax.stepping.linear_iteration import LinearIteration
 from natcoord_jax.stepping.newton import any_lane
 from natcoord_jax.stepping.plan import Plan
-from natcoord_jax.stepping.predictor import Predictor
 from natcoord_jax.stepping.record import Parameters, ParameterTangents, Record, Slot
+from natcoord_jax.stepping.rollout_state import Predictor
 from natcoord_jax.stepping.slot_sweep import Fixed, SlotSweep, SweepCarry
 
 

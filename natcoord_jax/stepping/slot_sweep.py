@@ -26,8 +26,8 @@ from natcoord_jax.stepping.linear_iteration import LinearIteration
 from natcoord_jax.stepping.located import part_of_step
 from natcoord_jax.stepping.newton import any_lane
 from natcoord_jax.stepping.plan import Plan
-from natcoord_jax.stepping.predictor import Predictor
 from natcoord_jax.stepping.record import Parameters, Record, Slot
+from natcoord_jax.stepping.rollout_state import Predictor
 from natcoord_jax.stepping.step import advance_between
 from natcoord_jax.xla.one_kernel import in_few_kernels, lane_by_lane
 from natcoord_jax.xla.rows import part, row, with_part, with_row

@@ -22,7 +22,6 @@ from natcoord_jax.core.markers import Marker
 from natcoord_jax.core.numeric import Whole
 from natcoord_jax.core.state import TRAJECTORY, Trajectory
 from natcoord_jax.system import System
-from natcoord_jax.viz.colours import STOPS, limits
 from natcoord_jax.viz.motion import (
     BEAMS,
     BOX,
@@ -34,7 +33,7 @@ from natcoord_jax.viz.motion import (
     runs_of,
     together,
 )
-from natcoord_jax.viz.scenery import Scenery
+from natcoord_jax.viz.scenery import STOPS, Scenery, limits
 from natcoord_jax.viz.skins import Colouring
 from natcoord_jax.viz.stage import Stage
 

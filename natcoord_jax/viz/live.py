@@ -8,9 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from natcoord_jax.maths.rotations import to_quaternion
-from natcoord_jax.viz.colours import along_map
 from natcoord_jax.viz.packed import triangles
-from natcoord_jax.viz.scenery import Scenery, Skin, Solid
+from natcoord_jax.viz.scenery import Scenery, Skin, Solid, along_map
 
 
 def _viser() -> Any:

@@ -16,8 +16,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from natcoord_jax.viz.colours import STOPS, limits
-from natcoord_jax.viz.scenery import Scenery, Skin, Solid, rounded
+from natcoord_jax.viz.scenery import STOPS, Scenery, Skin, Solid, limits, rounded
 
 MISSING, MOST = -32768, 32767
 SMOOTH, CREASE = np.cos(np.deg2rad(35.0)), np.cos(np.deg2rad(60.0))

@@ -12,8 +12,7 @@ from natcoord_jax.bodies.shapes import Surface
 from natcoord_jax.core.markers import Marker
 from natcoord_jax.core.state import Trajectory
 from natcoord_jax.system import System
-from natcoord_jax.viz.arrows import loads, pushes
-from natcoord_jax.viz.links import between, links
+from natcoord_jax.viz.arrows import between, links, loads, pushes
 from natcoord_jax.viz.outline import ball, bar, bodies_of, centre_of, marked
 from natcoord_jax.viz.outline import within as inside_of
 from natcoord_jax.viz.scenery import DARK, PALETTE, Scenery, Solid, Trace

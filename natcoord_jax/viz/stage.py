@@ -5,8 +5,7 @@ from typing import Any
 import numpy as np
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 
-from natcoord_jax.viz.colours import along_map
-from natcoord_jax.viz.scenery import Scenery, rounded
+from natcoord_jax.viz.scenery import Scenery, along_map, rounded
 
 LEAST = 0.3
 """Least edge of the box of the axes, relative to its longest."""

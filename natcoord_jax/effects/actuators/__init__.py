@@ -1,7 +1,14 @@
 """Actuators: input channels."""
 
-from natcoord_jax.effects.actuators.affine import AffineActuator, SphericalTorque, WrenchInput
-from natcoord_jax.effects.actuators.motors import BodyForceInput, BodyTorqueInput, JointForce, JointTorque
+from natcoord_jax.effects.actuators.motors import (
+    AffineActuator,
+    BodyForceInput,
+    BodyTorqueInput,
+    JointForce,
+    JointTorque,
+    SphericalTorque,
+    WrenchInput,
+)
 
 __all__ = [
     "AffineActuator",

@@ -1,7 +1,13 @@
 """Constraints between points and directions, and between their velocities."""
 
-from natcoord_jax.effects.constraints.points import PointOnLine, PointOnPlane, PointOnPoint, PointSum, Rod
-from natcoord_jax.effects.constraints.rolling import Rolling
+from natcoord_jax.effects.constraints.points import (
+    PointOnLine,
+    PointOnPlane,
+    PointOnPoint,
+    PointSum,
+    Rod,
+    Rolling,
+)
 
 __all__ = [
     "PointOnLine",

@@ -1,16 +1,18 @@
-"""Gravity, and forces at points and torques on bodies: constant, following, or functions of time."""
+"""Gravity, forces at points and along edges of shells, torques on bodies, also as functions of time."""
 
 from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from natcoord_jax.core.arguments import is_a, require
+from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.force import Field, Force, Load
 from natcoord_jax.core.kinds import FLAG, FunctionOf
 from natcoord_jax.core.markers import Markers
 from natcoord_jax.core.numeric import COMPONENTS, Number
+from natcoord_jax.maths.vectors import cross, safe_norm, unit
 
 VECTOR_OR_FUNCTION = COMPONENTS | FunctionOf("of time [s] to three numbers")
 
@@ -120,3 +122,53 @@ class Gravity(Field):
     def acceleration(self) -> Array:
         """The vector."""
         return jnp.asarray(self.vector, float)
+
+
+LOAD = COMPONENTS | FunctionOf("of time [s] to three numbers")
+
+
+def edge_axes(x: Float[Array, "2 m 3"]) -> Float[Array, "3 3"]:
+    """Along an edge, outwards in the surface, and normal to it, in rows, of two points with directors."""
+    along = unit(x[1, 0] - x[0, 0])
+    outwards = unit(cross(along, x[0, 1] + x[1, 1]))
+    return jnp.stack([along, outwards, cross(outwards, along)])
+
+
+class EdgeSegment(Force):
+    """Force and moment per length on the edge of a shell between two nodes, half of them on each.
+
+    Attributes:
+        markers: the two nodes, a point and a director of each, in turn round the element.
+        force: shape (3,) [N/m], or a function of time [s] to it.
+        moment: shape (3,) [N m/m], or a function of time [s] to it; of it directors carry what is normal to
+            them.
+        following: take components along the edge, outwards in the surface and normal to it, of the middle of
+            the step, instead of the world's axes.
+        length: [m]; None: as in the assembled pose.
+
+    Example:
+        >>> import natcoord_jax as nc
+        >>> import numpy as np
+        >>> ends = tuple(nc.Attachment(nc.ground, (x, 0, 0), np.eye(3)) for x in (0, 1))
+        >>> load = nc.EdgeSegment(ends, force=(0.0, 0.0, -20.0), moment=(5.0, 0.0, 0.0), following=True)
+    """
+
+    markers: Any = eqx.field(metadata=is_a(Markers(attachments=2)))
+    force: Any = eqx.field(default=(0.0, 0.0, 0.0), kw_only=True, metadata=is_a(LOAD))
+    moment: Any = eqx.field(default=(0.0, 0.0, 0.0), kw_only=True, metadata=is_a(LOAD))
+    following: bool = eqx.field(default=False, kw_only=True, static=True, metadata=is_a(FLAG))
+    length: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Number("positive")))
+
+    kind: ClassVar[str] = "edge load"
+    vectors: ClassVar[int] = 2
+
+    def assembled_at(self, x: Float[Array, "2 m 3"]) -> "EdgeSegment":
+        """With its length."""
+        return self if self.length is not None else replace_fields(self, length=safe_norm(x[1, 0] - x[0, 0]))
+
+    def load(self, x: Float[Array, "2 m 3"], rate: Array, inputs: Array, t: Array) -> Load:
+        """Half of it on each node."""
+        given = (jnp.asarray(v(t) if callable(v) else v, float) for v in (self.force, self.moment))
+        axes = edge_axes(x) if self.following else jnp.eye(3)
+        force, moment = (0.5 * self.length * v @ axes for v in given)
+        return Load(jnp.zeros_like(x).at[:, 0].set(force), jnp.stack([moment, moment]))
