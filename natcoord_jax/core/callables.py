@@ -136,8 +136,8 @@ def _each(x: Any, visit: Visit, note: list[Any], lanes: tuple[int, ...]) -> Any:
         return visit(x, lanes)
     if isinstance(x, Stacked):
         (inner,) = mapped((getattr(x, x.stacked),), visit, note, x.lanes)
-        rest = mapped(_with(x, {x.stacked: None}), visit, note, lanes)
-        return _with(rest, {x.stacked: inner})
+        rest = mapped(replace_fields(x, **{x.stacked: None}), visit, note, lanes)
+        return replace_fields(rest, **{x.stacked: inner})
     if own_methods(type(x)):
         note.append(type(x))
         return visit(mapped(x, visit, note, lanes), lanes)
@@ -146,14 +146,6 @@ def _each(x: Any, visit: Visit, note: list[Any], lanes: tuple[int, ...]) -> Any:
         return visit(x, lanes)
     note.append((np.shape(x), x.dtype) if isinstance(x, jax.Array | np.ndarray) else (type(x), x))
     return x
-
-
-def _with(module: Any, fields: dict[str, Any]) -> Any:
-    """Copy of a module with other values in some fields, whatever its constructor takes."""
-    fresh = object.__new__(type(module))
-    for field in dataclasses.fields(module):
-        object.__setattr__(fresh, field.name, fields.get(field.name, getattr(module, field.name)))
-    return fresh
 
 
 def _code(function: Any) -> Hashable:

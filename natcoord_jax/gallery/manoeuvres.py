@@ -9,7 +9,7 @@ from jaxtyping import Array
 
 import natcoord_jax as nc
 from natcoord_jax.gallery.example import Example
-from natcoord_jax.gallery.spacecraft import spacecraft
+from natcoord_jax.gallery.spacecraft import axes_of, spacecraft
 
 GRAVITY = 9.81
 """[m/s^2]"""
@@ -22,10 +22,6 @@ DISC = 1.0
 def _quaternion(axis: Any, angle: float) -> np.ndarray:
     axis = np.asarray(axis, float) / np.linalg.norm(axis)
     return np.concatenate([[np.cos(angle / 2)], np.sin(angle / 2) * axis])
-
-
-def _triad(body: Any) -> tuple[Any, ...]:
-    return tuple(nc.Direction(body, axis, local=True) for axis in np.eye(3))
 
 
 def turn(
@@ -53,7 +49,7 @@ def turn(
             hinge = scene.add(nc.Revolute(body, wheel, axis=direction, name=f"hinge {k + 1}"))
             scene.add(nc.JointTorque(hinge, name=f"motor {k + 1}"))
     else:
-        scene.add(nc.BodyTorqueInput(_triad(body), name="torque"))
+        scene.add(nc.BodyTorqueInput(axes_of(body), name="torque"))
     system, state = scene.compile()
     if wheels:
         # Half of DISC in every second moment: what is left of the body is none by itself, the craft is one.

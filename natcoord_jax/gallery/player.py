@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 import natcoord_jax as nc
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.gallery.segments import IMPACT, MASS, SEGMENTS, TIMES, Segment, X, Y, Z
+from natcoord_jax.maths.rotations import from_axis_angle
 
 
 class Swing(eqx.Module):
@@ -65,12 +66,6 @@ def swings() -> Motion:
     }
 
 
-def turned(axis: np.ndarray, angle: Float[Array, ""]) -> Float[Array, "3 3"]:
-    """Rotation about a unit axis (Rodrigues)."""
-    k = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
-    return jnp.eye(3) + jnp.sin(angle) * k + (1 - jnp.cos(angle)) * (k @ k)
-
-
 class Placement(eqx.Module):
     """How a body has moved from where it stands upright: x -> rotation x + shift."""
 
@@ -89,13 +84,13 @@ def placed_by(motion: Motion, t: Float[Array, ""]) -> dict[str, Placement]:
         q = [motion[name, k](t) for k in range(len(segment.angles))]
         start = np.asarray(segment.start, float)
         if segment.parent == "ground":
-            rotation = turned(Z, q[2])
+            rotation = from_axis_angle(jnp.asarray(Z), q[2])
             found[name] = Placement(rotation, start - rotation @ start + q[0] * X + q[1] * Y)
             continue
         above = found[segment.parent]
         rotation = above.rotation
         for axis, angle in zip(segment.axes, q):
-            rotation = rotation @ turned(axis, angle)
+            rotation = rotation @ from_axis_angle(jnp.asarray(axis), angle)
         found[name] = Placement(rotation, above(start) - rotation @ start)
     return found
 

@@ -54,7 +54,8 @@ class CovariantJointTorque(nc.Force):
         return nc.Load(forces, jnp.zeros_like(x))
 
 
-def _axes(body: Handle) -> tuple[Marker, ...]:
+def axes_of(body: Handle) -> tuple[Marker, ...]:
+    """The three axes of a body, as directions."""
     return tuple(nc.Direction(body, axis, local=True) for axis in np.eye(3))
 
 
@@ -134,7 +135,7 @@ def compare_torques(numbers: tuple[int, ...] = tuple(TABLE)) -> list[Comparison]
     scene, parts = _craft()
     for number, (base, wheel, hinge) in enumerate(parts):
         scene.add(nc.JointTorque(hinge, name=f"motor {number + 1}"))
-        markers = (nc.Direction(base, np.eye(3)[number]), *_axes(base), *_axes(wheel))
+        markers = (nc.Direction(base, np.eye(3)[number]), *axes_of(base), *axes_of(wheel))
         scene.add(CovariantJointTorque(markers, name=f"covariant motor {number + 1}"))
     system, state = scene.compile()
     longest = max(numbers)

@@ -172,7 +172,7 @@ def save_loops(system: System, root: Element, notes: Notes) -> None:
                 if isinstance(group.effect, Revolute):
                     _connect(system, root, f"{name} axis", frames[:, 0] + frames[:, 3], bodies)
             elif isinstance(group.effect, Fixed):
-                _weld(system, root, name, frames, bodies)
+                _connect(system, root, name, frames, bodies)
             else:
                 notes.left_out(name, f"a {group.effect.kind} that closes a loop is not written")
     if root.find("equality") is not None:
@@ -206,16 +206,10 @@ def _wrench(system: System, root: Element, name: str, weights: np.ndarray, bodie
 def _connect(
     system: System, root: Element, name: str, weights: np.ndarray, bodies: Any, effect: Any = None
 ) -> None:
-    """Two points that stay together."""
+    """Two points, or two frames, that stay together."""
     ends = {f"site{k + 1}": f"{name} end {k + 1}" for k in range(2)}
+    frames = weights.ndim == 3
     for end, place, body in zip(ends.values(), weights, np.asarray(bodies)):
-        _site(system, root, end, place, int(body))
-    SubElement(part(root, "equality"), "connect", {"name": name, **ends})
-
-
-def _weld(system: System, root: Element, name: str, frames: np.ndarray, bodies: Any) -> None:
-    """Two frames that stay together."""
-    ends = {f"site{k + 1}": f"{name} end {k + 1}" for k in range(2)}
-    for end, frame, body in zip(ends.values(), frames, np.asarray(bodies)):
-        _site(system, root, end, frame[0], int(body), frame[1:, 1:])
-    SubElement(part(root, "equality"), "weld", {"name": name, **ends})
+        point, axes = (place[0], place[1:, 1:]) if frames else (place, None)
+        _site(system, root, end, point, int(body), axes)
+    SubElement(part(root, "equality"), "weld" if frames else "connect", {"name": name, **ends})

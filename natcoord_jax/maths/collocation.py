@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.maths.coefficients import Rows, collocation, in_parts, rounded, rounded_pairs
+from natcoord_jax.maths.lagrange import gauss_legendre
 from natcoord_jax.maths.vectors import cross, dot, skew
 
 
@@ -87,11 +88,6 @@ def _summed(parts: tuple, x: Array) -> Array:
     return sum(rest, first)
 
 
-def _gauss_points(count: int) -> tuple[np.ndarray, np.ndarray]:
-    points, weights = np.polynomial.legendre.leggauss(count)
-    return (points + 1) / 2, weights / 2
-
-
 def _integrals(nodes: np.ndarray, upper: np.ndarray) -> np.ndarray:
     """Integrals from 0 to `upper` of the Lagrange polynomials on `nodes`: shape (upper, nodes)."""
     rows = []
@@ -112,7 +108,7 @@ def gauss(stages: int, kick: bool = False) -> Tableau:
     violate this, always to the same side, and over 10^6 steps the error grows steadily. Therefore they are
     computed exactly, and rounded in pairs; for what keeps the energy see `Tableau.differentiated`.
     """
-    exact = collocation(_gauss_points(stages)[0].tolist())
+    exact = collocation(gauss_legendre(stages)[0].tolist())
     nodes, b = tuple(map(float, exact.nodes)), rounded([exact.b])[0]
     a, a_inverse, beta = rounded_pairs(exact.a, b), rounded(exact.a_inverse), rounded([exact.beta])[0]
     if stages == 1:  # All of them are whole numbers, or halves.
@@ -131,8 +127,8 @@ def invariant_quadrature(stages: int, points: int) -> tuple[np.ndarray, np.ndarr
         (stages, points): S_i = sum_p averages[i, p] grad V(Pi(tau_p)), that is
         1/b_i times the integral of l_i(tau) grad V(Pi(tau)).
     """
-    c, b = _gauss_points(stages)
-    tau, weights = _gauss_points(points)
+    c, b = gauss_legendre(stages)
+    tau, weights = gauss_legendre(points)
     integrals = _integrals(c, tau)
     lagrange = np.ones((stages, points))
     for i in range(stages):

@@ -10,18 +10,22 @@ from jaxtyping import Array, Float
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.bodies import NODE
 from natcoord_jax.core.checks import as_array
-from natcoord_jax.core.coordinate import pair_motion
 from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.kinds import of
-from natcoord_jax.core.motion import Motion
 from natcoord_jax.core.numeric import Number
 from natcoord_jax.core.state import STATE, State, Trajectory
 from natcoord_jax.maths.collocation import gauss
 from natcoord_jax.maths.rotations import from_rotation_vector
 from natcoord_jax.maths.vectors import cross, safe_divide
-from natcoord_jax.mechanics.coordinates import coordinate_rates, coordinate_values, frames_of, state_rates
+from natcoord_jax.mechanics.coordinates import (
+    coordinate_rates,
+    coordinate_values,
+    frames_of,
+    stage_rates,
+    state_rates,
+)
 from natcoord_jax.mechanics.rates import carried, null_space, tree_rates, twists
 from natcoord_jax.mechanics.response import stations
 from natcoord_jax.mechanics.sweeps import sweep_motion
@@ -251,16 +255,7 @@ def _displaced(
     points = rows[:, 0] + 0.5 * motion.velocity
     at = stations(rows, points, motion.directors, motion.velocity, motion.spin)
     after = rows + at.rates[0, :-1]
-    counted = state.coordinates
-    for group in system.coordinates:
-        bodies = system.joint_bodies[group.joints]
-
-        def increment(place, start, mid, moving, spin, group=group):
-            return group.axis.unit_load(pair_motion(place, Motion(start, mid, moving, spin), 0), h).rate[0]
-
-        pairs = at.start[bodies], at.rows[:, bodies], at.rates[:, bodies], at.spin[:, bodies]
-        found = jax.vmap(increment, in_axes=(0, 0, 1, 1, 1))(system.frames[group.joints], *pairs)
-        counted = counted.at[group.index].add(found)
+    counted = state.coordinates + stage_rates(system, at, h)[0]
     v = row_rates(after, *twists(system, after, w))
     moved = replace_fields(state, q=after.reshape(-1, 3), v=v.reshape(-1, 3), coordinates=counted)
     every = np.arange(counted.shape[0])

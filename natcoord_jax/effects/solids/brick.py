@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from natcoord_jax.core.arguments import is_a
+from natcoord_jax.core.cells import CORNERS, SIDES
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.kinds import of
 from natcoord_jax.core.markers import Markers
@@ -23,14 +24,10 @@ from natcoord_jax.core.together import instances_last, place_together
 from natcoord_jax.effects.materials import MASS, Elastic
 from natcoord_jax.effects.solids.mass import consistent_mass
 from natcoord_jax.maths.elimination import definite_inverse
+from natcoord_jax.maths.symmetric import PAIRS
 from natcoord_jax.maths.vectors import cross, dot, safe_sqrt
 
-CORNERS = np.array([(-1, -1, -1), (1, -1, -1), (1, 1, -1), (-1, 1, -1)], float)
-CORNERS = np.concatenate([CORNERS, CORNERS * np.array([1, 1, -1])])
-"""Natural coordinates of the nodes."""
 POINTS = CORNERS / np.sqrt(3.0)
-PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2))
-"""Components of strains; those of two axes count twice."""
 ENHANCED = ((0, 0), (1, 1), (2, 2), (3, 0), (3, 1), (4, 1), (4, 2), (5, 0), (5, 2))
 """Component of each enhanced strain, and the natural coordinate that it is linear in."""
 
@@ -146,9 +143,7 @@ class Brick(Potential):
     together: ClassVar[bool] = True
     derived: ClassVar[tuple[str, ...]] = ("gradients", "stiffness", "volumes")
     silent: ClassVar[bool] = False
-    faces: ClassVar[tuple[tuple[int, ...], ...]] = (
-        (0, 3, 2, 1), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7),
-    )  # fmt: skip
+    faces: ClassVar[tuple[tuple[int, ...], ...]] = SIDES
 
     def assembled_at(self, x: Float[Array, "8 3"]) -> "Brick":
         """With the assembled pose as the one without stress, unless another is given."""
