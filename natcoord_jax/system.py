@@ -14,7 +14,6 @@ from natcoord_jax.core.state import MOTION, STATE, TRAJECTORY, State, Trajectory
 from natcoord_jax.model.model import Model
 from natcoord_jax.model.rows import states_of
 from natcoord_jax.reading import (
-    constraint_errors,
     diagnostics,
     instant,
     parts,
@@ -23,8 +22,7 @@ from natcoord_jax.reading import (
     set_coordinates,
     tangent_states,
 )
-from natcoord_jax.reading.constraint_errors import ConstraintErrors
-from natcoord_jax.reading.diagnostics import Energy
+from natcoord_jax.reading.diagnostics import ConstraintErrors, Energy
 from natcoord_jax.reading.instant import Instant
 
 ELEMENT = HandleOf("effect") | NAME
@@ -60,7 +58,7 @@ class System(Model):
 
         Of a trajectory those velocities are judged that are read of it, see `tangent`; of a state its own.
         """
-        return constraint_errors.constraint_errors(self, motion)
+        return diagnostics.constraint_errors(self, motion)
 
     @checked("System.tangent", motion=MOTION)
     def tangent(self, motion: State | Trajectory) -> State:

@@ -20,9 +20,17 @@ from natcoord_jax.linsolve.blocks import BlockMatrix, Entries
 from natcoord_jax.linsolve.graph import Graph
 from natcoord_jax.linsolve.inverse import inverses
 from natcoord_jax.linsolve.ordering import Groups, dissection, rounds
-from natcoord_jax.linsolve.pivot_analysis import analyse_pivots, natural
 from natcoord_jax.linsolve.schedule import Bucket, Level, schedule
-from natcoord_jax.linsolve.symbolic import Front, Sizes, amalgamated, estimate, fronts_of, top_merged
+from natcoord_jax.linsolve.symbolic import (
+    Front,
+    Sizes,
+    amalgamated,
+    analyse_pivots,
+    estimate,
+    fronts_of,
+    natural,
+    top_merged,
+)
 
 LEAVES = (1, 24, 48, 96)  # unknowns in a piece that is not dissected further: what is tried
 ROUNDS_UP_TO = 1500  # nodes of a mesh whose fill is still followed node by node

@@ -12,8 +12,7 @@ from jaxtyping import Array, Float, Int
 from natcoord_jax.linsolve import cost
 from natcoord_jax.linsolve.blocks import Entries
 from natcoord_jax.linsolve.graph import Graph
-from natcoord_jax.linsolve.pivot_analysis import Pivots, front_unknowns
-from natcoord_jax.linsolve.symbolic import Front
+from natcoord_jax.linsolve.symbolic import Front, Pivots, front_unknowns
 
 
 class Bucket(eqx.Module):

@@ -1,6 +1,7 @@
 """Where bodies and joints are in the assembled scene, and rows, velocities and masses of the bodies."""
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Any
 
 import jax.numpy as jnp
@@ -10,6 +11,7 @@ from jaxtyping import Array, Float
 from natcoord_jax.core.bodies import TRIAD, NodeKind
 from natcoord_jax.core.checks import as_array, is_concrete
 from natcoord_jax.core.eager_numpy import eager_numpy
+from natcoord_jax.core.effect import Effect
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.handles import ground as ground_handle
 from natcoord_jax.core.joint import Frame, Joint
@@ -17,6 +19,7 @@ from natcoord_jax.core.kinds import short
 from natcoord_jax.core.markers import Attachment, Interpolated, Marker
 from natcoord_jax.maths.rotations import frame_from_axis
 from natcoord_jax.model.bodies import Bodies, joined
+from natcoord_jax.model.graph import Edge
 from natcoord_jax.model.rows import row_rates
 from natcoord_jax.xla.tracing import at_top_level
 
@@ -224,3 +227,34 @@ def with_masses(blocks: Array, body: Array, rows: Float[Array, "n 4 4"], own: Fl
 def padded(weights: Float[Array, "*m w"], width: int) -> Float[Array, "*m width"]:
     """Weights with zeros behind them."""
     return jnp.concatenate([weights, jnp.zeros((*weights.shape[:-1], width - weights.shape[-1]))], axis=-1)
+
+
+def edge_of(name: str, joint: Joint, poses: Poses, sets: int) -> Edge:
+    """The edge of a joint.
+
+    Raises:
+        ValueError: for a joint that is to be free in a tree, which cannot hold it.
+    """
+    pair = poses.of(joint.parent), poses.of(joint.child)
+    # Nodes of sets are free: what joins them keeps its multipliers.
+    free = joint.free and min(pair) >= sets
+    edge = Edge(*pair, joint.rotations, joint.translations, joint.child_rotation, free)
+    if joint.free and not (edge.carries and len(edge.slots) == 6 - joint.multipliers):
+        also = " and about the child's first axis" if joint.child_rotation else ""
+        raise ValueError(
+            f"joint {name!r}: a tree cannot hold a joint of {joint.multipliers} multipliers that turns "
+            f"about axes {joint.rotations}{also} and slides along axes {joint.translations}; declare "
+            f"`free = False` in {type(joint).__name__}, which keeps its multipliers"
+        )
+    return edge
+
+
+def coupled_pairs(effects: dict[str, Effect], poses: Poses, sets: int) -> list[tuple[int, int]]:
+    """Pairs of neighbouring bodies of the effects that make neighbours of them, but for nodes of sets."""
+    found = []
+    for effect in effects.values():
+        if effect.couples:
+            markers: Any = getattr(effect, "markers", ())
+            listed = [poses.carrier(handle) for m in markers for handle in getattr(m, "handles", (m.body,))]
+            found += [pair for pair in pairwise(listed) if min(pair) >= sets]
+    return found

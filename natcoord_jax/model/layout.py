@@ -23,6 +23,8 @@ from natcoord_jax.core.state import State
 from natcoord_jax.model.assembled_poses import (
     Poses,
     check_joint,
+    coupled_pairs,
+    edge_of,
     joint_frames,
     joint_triad,
     padded,
@@ -31,7 +33,6 @@ from natcoord_jax.model.assembled_poses import (
     with_masses,
 )
 from natcoord_jax.model.bodies import Bodies
-from natcoord_jax.model.edges import coupled_pairs, edge_of
 from natcoord_jax.model.graph import Edge, spanning_tree
 from natcoord_jax.model.grouping import Instance, bare, families
 from natcoord_jax.model.groups import CoordinateGroup

@@ -21,8 +21,7 @@ from natcoord_jax.mechanics.response import Evaluation
 from natcoord_jax.mechanics.start_cache import StartCache
 from natcoord_jax.mechanics.tangent_space import driven
 from natcoord_jax.stepping.after_attempt import after_attempt
-from natcoord_jax.stepping.difference_jacobian import DifferenceJacobian
-from natcoord_jax.stepping.differences import evaluated, told
+from natcoord_jax.stepping.difference_jacobian import DifferenceJacobian, evaluated, told
 from natcoord_jax.stepping.energy_check import sound
 from natcoord_jax.stepping.factors import Factors, factors_of
 from natcoord_jax.stepping.located import Ahead

@@ -268,7 +268,7 @@ def newton(equations: Any, tolerance: float) -> tuple[Float[Array, " unknowns"],
     """Solve equations from their own guess, with their Jacobian formed anew whenever it is needed.
 
     Args:
-        equations: see `natcoord_jax.mechanics.form`.
+        equations: see `natcoord_jax.mechanics.step_equations`.
         tolerance: see `TOLERANCE`.
 
     Returns:

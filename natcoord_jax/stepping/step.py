@@ -14,11 +14,11 @@ from natcoord_jax.mechanics.block_tangent_space import Tangents
 from natcoord_jax.mechanics.coordinates import stage_rates
 from natcoord_jax.mechanics.end_impulses import obeying, released
 from natcoord_jax.mechanics.equations import prepare, starting
-from natcoord_jax.mechanics.form import dense_solver
 from natcoord_jax.mechanics.impacts import after_impacts
 from natcoord_jax.mechanics.kick import Kick, ends_of
 from natcoord_jax.mechanics.response import Evaluation
 from natcoord_jax.mechanics.start_cache import StartCache
+from natcoord_jax.mechanics.step_equations import dense_solver
 from natcoord_jax.mechanics.tangent_space import driven
 from natcoord_jax.system import System
 

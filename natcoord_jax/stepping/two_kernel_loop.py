@@ -20,7 +20,7 @@ from natcoord_jax.core.state import State
 from natcoord_jax.mechanics.equations import kind_of, prepare
 from natcoord_jax.mechanics.start_cache import StartCache
 from natcoord_jax.stepping.attempt import LoopCarry, RefactorRequest, attempt, renewed_at, with_state
-from natcoord_jax.stepping.differences import first_probe
+from natcoord_jax.stepping.difference_jacobian import first_probe
 from natcoord_jax.stepping.error_control import Tolerance
 from natcoord_jax.stepping.factors import Factors
 from natcoord_jax.stepping.newton import Iterate, any_lane
