@@ -24,6 +24,13 @@ def _quaternion(axis: Any, angle: float) -> np.ndarray:
     return np.concatenate([[np.cos(angle / 2)], np.sin(angle / 2) * axis])
 
 
+def _least_effort(
+    system: nc.System, state: nc.State, goal: Any, steps: int, t_end: float, **more: Any
+) -> nc.OptimalControl:
+    given = {"dt": t_end / steps, "steps": steps, "cost": nc.cost.Effort()} | more
+    return nc.OptimalControl(system, state, goal=goal, **given)
+
+
 def turn(
     steps: int = 40,
     *,
@@ -56,7 +63,7 @@ def turn(
         rest = system.mass[0, 1:, 1:] - DISC / 2 * jnp.eye(3)
         system = dataclasses.replace(system, mass=system.mass.at[0, 1:, 1:].set(rest))
     goal = nc.goal.Attitude(body, _quaternion(axis, angle)) & nc.goal.Rest()
-    return nc.OptimalControl(system, state, dt=t_end / steps, steps=steps, cost=nc.cost.Effort(), goal=goal)
+    return _least_effort(system, state, goal, steps, t_end)
 
 
 def reorientation(
@@ -71,15 +78,8 @@ def reorientation(
     """The paper's spacecraft turned from rest to rest by its wheels; those that do not work are locked."""
     example = spacecraft(working=working)
     goal = nc.goal.Attitude("base", _quaternion(axis, angle)) & nc.goal.Rest()
-    return nc.OptimalControl(
-        example.system,
-        example.state,
-        dt=t_end / steps,
-        steps=steps,
-        cost=nc.cost.Effort(),
-        goal=goal,
-        bounds=nc.bounds.Input(-limit, limit),
-    )
+    bounds = nc.bounds.Input(-limit, limit)
+    return _least_effort(example.system, example.state, goal, steps, t_end, bounds=bounds)
 
 
 def reorientation_example() -> Example:
@@ -113,7 +113,7 @@ def beanie(
     scene.add(nc.JointTorque(hinge, name="motor"))
     system, state = scene.compile()
     goal = nc.goal.Coordinate(hinge, angle) & nc.goal.Rest()
-    return nc.OptimalControl(system, state, dt=t_end / steps, steps=steps, cost=nc.cost.Effort(), goal=goal)
+    return _least_effort(system, state, goal, steps, t_end)
 
 
 def two_masses(steps: int = 60, *, fastest: bool = False, t_end: float = 6.0) -> nc.OptimalControl:
@@ -137,20 +137,8 @@ def two_masses(steps: int = 60, *, fastest: bool = False, t_end: float = 6.0) ->
     scene.add(nc.JointForce(slides[0], name="push"))
     system, state = scene.compile()
     goal = nc.goal.Coordinate(slides[0], 1.0) & nc.goal.Coordinate(slides[1], 1.0) & nc.goal.Rest()
-    if not fastest:
-        return nc.OptimalControl(
-            system, state, dt=t_end / steps, steps=steps, cost=nc.cost.Effort(), goal=goal
-        )
-    return nc.OptimalControl(
-        system,
-        state,
-        dt=t_end / steps,
-        steps=steps,
-        cost=nc.cost.Duration(),
-        goal=goal,
-        bounds=nc.bounds.Input(-1.0, 1.0),
-        free_time=(1.0, 20.0),
-    )
+    timed = {"cost": nc.cost.Duration(), "bounds": nc.bounds.Input(-1.0, 1.0), "free_time": (1.0, 20.0)}
+    return _least_effort(system, state, goal, steps, t_end, **(timed if fastest else {}))
 
 
 class TangentialForce(nc.Force):
@@ -184,7 +172,7 @@ def point_pendulum(steps: int = 60, *, t_end: float = 3.0) -> nc.OptimalControl:
     goal = nc.goal.Equal(
         lambda state: jnp.stack([state.q[0, 0], state.v[0, 0]]), "x and x' [m, m/s]", count=2
     )
-    return nc.OptimalControl(system, state, dt=t_end / steps, steps=steps, cost=nc.cost.Effort(), goal=goal)
+    return _least_effort(system, state, goal, steps, t_end)
 
 
 def cart_pole(steps: int = 100, *, t_end: float = 2.0, turn: float = np.pi) -> nc.OptimalControl:
@@ -204,6 +192,4 @@ def cart_pole(steps: int = 100, *, t_end: float = 2.0, turn: float = np.pi) -> n
     system, state = scene.compile()
     goal = nc.goal.Coordinate(rail, 1.0) & nc.goal.Coordinate(hinge, turn) & nc.goal.Rest()
     bounds = nc.bounds.Input(-20.0, 20.0) & nc.bounds.Coordinate(-2.0, 2.0, joint=rail)
-    return nc.OptimalControl(
-        system, state, dt=t_end / steps, steps=steps, cost=nc.cost.Effort(), goal=goal, bounds=bounds
-    )
+    return _least_effort(system, state, goal, steps, t_end, bounds=bounds)

@@ -7,7 +7,6 @@ there as it does in equilibrium, and at rest.
 
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -16,6 +15,7 @@ import natcoord_jax as nc
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.state import State
 from natcoord_jax.gallery.example import Example
+from natcoord_jax.gallery.panel_slew import Still
 from natcoord_jax.system import System
 
 UPPER, FORE = 0.4, 0.35
@@ -28,8 +28,6 @@ RADIUS = 0.2
 """Of the cable's half circle [m]."""
 SOCKET = (0.06, -0.1, -0.3)
 """Where the plug goes from its start: place [m], angle [rad]."""
-STILL = 0.1
-"""Time in which velocities of the cable count as distances [s]."""
 STAGES = 10
 """Parts in which the arm moves to the socket while equilibria are followed."""
 
@@ -123,22 +121,12 @@ def arm(elements: int = 3, *, driven: bool = False, stiffness: Any = 0.03) -> Ar
     return Arm(*scene.compile(assemble=driven), joints, cable)
 
 
-class Hanging(nc.goal.Goal):
-    """Nodes of the cable at given places and rest; both in [m].
-
-    Attributes:
-        places: of the nodes (nodes, 3) [m].
-        rows: of the nodes in q and v.
-    """
-
-    places: Any
-    rows: tuple[int, ...] = eqx.field(static=True)
+class Hanging(Still):
+    """Nodes of the cable at given places and rest, in the plane; both in [m]."""
 
     def residual(self, system: System, state: State) -> Float[Array, " c"]:
-        """Distances in the plane, and velocities times `STILL`."""
-        at = np.array(self.rows)
-        away, moving = state.q[at] - self.places, STILL * state.v[at]
-        return jnp.concatenate([away[:, :2].reshape(-1), moving[:, :2].reshape(-1)])
+        """Two of three components."""
+        return super().residual(system, state).reshape(-1, 3)[:, :2].reshape(-1)
 
 
 def problem(
