@@ -28,10 +28,9 @@ def bouncing_ball(restitutions: tuple[float, ...] = (1.0, 0.8, 0.5)) -> Example:
         )
         lossy: dict[str, Any] = {} if restitution == 1 else {"restitution": restitution, "speed": speed}
         scene.add(nc.Contact(ball, floor, stiffness=2e4, name=f"bounce {k + 1}", **lossy))
-    system, state = scene.compile()
     fall = float(np.sqrt(2 * height / GRAVITY))
     facts = {"fall": fall, "apexes": tuple(e**2 * height for e in restitutions)}
-    return Example("bouncing_ball", "balls on a floor", system, state, 1e-3, 2500, facts=facts)
+    return Example("bouncing_ball", "balls on a floor", *scene.compile(), 1e-3, 2500, facts=facts)
 
 
 def newton_cradle(balls: int = 5, raised: float = 0.8) -> Example:
@@ -51,9 +50,8 @@ def newton_cradle(balls: int = 5, raised: float = 0.8) -> Example:
         handles.append(ball)
     for k, (one, two) in enumerate(zip(handles, handles[1:])):
         scene.add(nc.Contact(one, two, stiffness=3e7, name=f"impact {k + 1}"))
-    system, state = scene.compile()
     facts = {"height": length * (1 - np.cos(raised)), "angle": raised}
-    return Example("newton_cradle", "a cradle of balls", system, state, 2e-4, 10000, facts=facts)
+    return Example("newton_cradle", "a cradle of balls", *scene.compile(), 2e-4, 10000, facts=facts)
 
 
 def tumbling_capsules() -> Example:
@@ -76,8 +74,7 @@ def tumbling_capsules() -> Example:
     for i, one in enumerate(handles):
         for j, two in enumerate(handles[:i]):
             scene.add(nc.Contact(one, two, stiffness=3e4, name=f"impact {j + 1} {i + 1}"))
-    system, state = scene.compile()
-    return Example("tumbling_capsules", "capsules and balls", system, state, 2e-3, 1000)
+    return Example("tumbling_capsules", "capsules and balls", *scene.compile(), 2e-3, 1000)
 
 
 def rattleback(spin: float = -5.0, tilt: float = 0.5) -> Example:
@@ -112,8 +109,7 @@ def rattleback(spin: float = -5.0, tilt: float = 0.5) -> Example:
     axes = (nc.Direction(stone, axis, local=True) for axis in np.eye(3))
     gap = nc.EllipsoidOnPlane(semi_axes=semi_axes)
     scene.add(nc.GapConstraint((*table, centre, *axes), gap, restitution=0.0, friction=1.0, name="table"))
-    system, state = scene.compile()
-    return Example("rattleback", "a rattleback", system, state, 2e-3, 6000, facts={"spin": spin})
+    return Example("rattleback", "a rattleback", *scene.compile(), 2e-3, 6000, facts={"spin": spin})
 
 
 def dice() -> Example:
@@ -138,8 +134,7 @@ def dice() -> Example:
             name=f"die {k + 1}",
         )
         scene.add(nc.Contact(scene.add(die), floor, restitution=0.4, friction=0.4, name=f"floor {k + 1}"))
-    system, state = scene.compile()
-    return Example("dice", "dice on a floor", system, state, 1e-3, 2000)
+    return Example("dice", "dice on a floor", *scene.compile(), 1e-3, 2000)
 
 
 def colliding_blocks() -> Example:
@@ -168,5 +163,4 @@ def colliding_blocks() -> Example:
         )
     )
     scene.add(nc.Contact(one.face("z0"), other.face("z1"), name="impact"))
-    system, state = scene.compile()
-    return Example("colliding_blocks", "rubber blocks that collide", system, state, 4e-3, 100)
+    return Example("colliding_blocks", "rubber blocks that collide", *scene.compile(), 4e-3, 100)

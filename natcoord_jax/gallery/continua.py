@@ -25,9 +25,8 @@ def rope(elements: int = 16) -> Example:
     section = nc.CircularSection(**ROPE)
     beam = scene.add(nc.Beam(section, [(0, 0, 0), (1, 0, 0)], elements=elements, name="rope"))
     scene.add(nc.Spherical(nc.ground, beam.start, name="pin"))
-    system, state = scene.compile()
     facts = {"beam": beam, "tip of 64 elements of another code": {0.5: (-0.1994, 0, -0.9487)}}
-    return Example("rope", "a soft rope on a pin", system, state, 1e-3, 500, facts=facts)
+    return Example("rope", "a soft rope on a pin", *scene.compile(), 1e-3, 500, facts=facts)
 
 
 def cantilever(elements: int = 16) -> Example:
@@ -37,8 +36,7 @@ def cantilever(elements: int = 16) -> Example:
     section = nc.CircularSection(**CANTILEVER)
     line = [(0, 0, 0), (1, 0, 0)]
     beam = scene.add(nc.Beam(section, line, elements=elements, start=nc.ground, name="rod"))
-    system, state = scene.compile()
-    return Example("cantilever", "a clamped rod", system, state, 2e-3, 500, facts={"beam": beam})
+    return Example("cantilever", "a clamped rod", *scene.compile(), 2e-3, 500, facts={"beam": beam})
 
 
 def _pull(t):
@@ -60,9 +58,8 @@ def flying_spaghetti(elements: int = 10) -> Example:
     axes = tuple(nc.Direction(beam.end, e) for e in np.eye(3))
     scene.add(nc.PointForce((tip,), force=_pull, name="force"))
     scene.add(nc.BodyTorque(axes, torque=_turn, name="moment"))
-    system, state = scene.compile()
     facts = {"beam": beam, "momentum": (20.0, 0.0, 0.0)}
-    return Example("flying_spaghetti", "a free beam in flight", system, state, 0.1, 150, facts=facts)
+    return Example("flying_spaghetti", "a free beam in flight", *scene.compile(), 0.1, 150, facts=facts)
 
 
 def flying_plate(counts: tuple[int, int] = (6, 3)) -> Example:
@@ -77,9 +74,8 @@ def flying_plate(counts: tuple[int, int] = (6, 3)) -> Example:
     given = {"thickness": thickness, "material": rubber, "velocity": velocity, "angular_velocity": spin}
     scene = nc.Scene()
     scene.add(nc.Shell(mesh, **given, name="plate"))
-    system, state = scene.compile()
     facts = {"dofs": 5 * len(mesh.nodes), "mass": 1000.0 * thickness * float(np.prod(size))}
-    return Example("flying_plate", "a plate of shells", system, state, 1e-3, 1000, facts=facts)
+    return Example("flying_plate", "a plate of shells", *scene.compile(), 1e-3, 1000, facts=facts)
 
 
 def tumbling_block(counts: tuple[int, int, int] = (4, 2, 2)) -> Example:
@@ -91,9 +87,8 @@ def tumbling_block(counts: tuple[int, int, int] = (4, 2, 2)) -> Example:
     rubber = nc.Elastic(E=1e5, nu=0.3, density=1000.0)
     scene = nc.Scene()
     scene.add(nc.Solid(mesh, material=rubber, velocity=velocity, angular_velocity=spin, name="block"))
-    system, state = scene.compile()
     facts = {"dofs": 3 * len(mesh.nodes), "mass": 1000.0 * float(np.prod(size))}
-    return Example("tumbling_block", "a block of bricks", system, state, 2e-3, 1000, facts=facts)
+    return Example("tumbling_block", "a block of bricks", *scene.compile(), 2e-3, 1000, facts=facts)
 
 
 def solar_panels(counts: tuple[int, int] = (6, 2), torque: float = 2.0) -> Example:
@@ -111,14 +106,13 @@ def solar_panels(counts: tuple[int, int] = (6, 2), torque: float = 2.0) -> Examp
         scene.add(nc.Clamp(hub, scene.add(wing).set("left")))
     axes = tuple(nc.Direction(hub, axis) for axis in np.eye(3))
     scene.add(nc.BodyTorqueInput(axes, name="torque"))
-    system, state = scene.compile()
 
     def control(t: Array) -> Array:
         push = jnp.where(t < 1.0, torque, jnp.where(t < 2.0, -torque, 0.0))
         return jnp.stack([0.3 * push, push, 0.0 * push], axis=1)
 
     return Example(
-        "solar_panels", "a spacecraft with flexible panels", system, state, 0.01, 400, control=control
+        "solar_panels", "a spacecraft with flexible panels", *scene.compile(), 0.01, 400, control=control
     )
 
 

@@ -48,12 +48,11 @@ def four_bar(bars: int = 2) -> Example:
         bar = _rod(scene, f"bar {k}", (k, 1, 0), (k + 1, 1, 0), velocity=(speed, 0, 0))
         scene.add(nc.Revolute(uprights[k], bar, point=(k, 1, 0), axis=z, name=f"left pin {k}"))
         scene.add(nc.Revolute(uprights[k + 1], bar, point=(k + 1, 1, 0), axis=z, name=f"right pin {k}"))
-    system, state = scene.compile()
     facts = {
         "dofs": 1,
         "tip": {1.0: (-0.1950203, -0.9807992, 0), 2.0: (0.0578157958, 0.9983272679, 0)},
     }
-    return Example("four_bar", "a row of four-bars", system, state, 0.01, 200, facts=facts)
+    return Example("four_bar", "a row of four-bars", *scene.compile(), 0.01, 200, facts=facts)
 
 
 def bricard() -> Example:
@@ -79,13 +78,12 @@ def bricard() -> Example:
         scene.add(nc.Revolute(carrier, body, point=start, axis=axes[k], name=f"hinge {k + 1}"))
         carrier = body
     scene.add(nc.Revolute(nc.ground, carrier, point=corners[5], axis=axes[5], name="hinge 6"))
-    system, state = scene.compile()
     facts = {
         "dofs": 1,
         "energy": -29.43,
         "corner 3": {0.5: (0.96828368, -1.22462516, 0.75014661), 1.0: (0.51050146, -1.6491676, 0.14012311)},
     }
-    return Example("bricard", "Bricard's mechanism", system, state, 0.01, 200, facts=facts)
+    return Example("bricard", "Bricard's mechanism", *scene.compile(), 0.01, 200, facts=facts)
 
 
 def slider_crank() -> Example:
@@ -125,12 +123,10 @@ def slider_crank() -> Example:
     across = np.cross((0, 0, 1), along)
     scene.add(nc.Universal(block, rod, point=slide, axis=(0, 0, 1), second=across, name="cardan"))
     scene.add(nc.JointTorque(hinge, name="motor"))
-    system, state = scene.compile()
     return Example(
         "slider_crank",
         "a slider-crank in space",
-        system,
-        state,
+        *scene.compile(),
         0.002,
         500,
         control=lambda t: jnp.full((t.shape[0], 1), 0.3),
@@ -191,7 +187,6 @@ def bicycle(speed: float = 5.0, lean_rate: float = 0.1) -> Example:
         wheel = bodies[name]
         disc = nc.Point(wheel), nc.Direction(wheel, (0, 1, 0))
         scene.add(nc.Rolling((*road, *disc), radius=radius, name=f"contact of the {name}"))
-    system, state = scene.compile(assemble=True)
     facts = {
         "dofs": 3,
         "stable speeds": (4.29238253634111, 6.02426201538837),
@@ -200,4 +195,6 @@ def bicycle(speed: float = 5.0, lean_rate: float = 0.1) -> Example:
         "gravity": ((-80.95, -2.59951685249872), (-2.59951685249872, -0.80329488458618)),
         "speed": ((0.0, 76.59734589573222), (0.0, 2.65431523794604)),
     }
-    return Example("bicycle", "a bicycle that nobody steers", system, state, 0.005, 600, facts=facts)
+    return Example(
+        "bicycle", "a bicycle that nobody steers", *scene.compile(assemble=True), 0.005, 600, facts=facts
+    )

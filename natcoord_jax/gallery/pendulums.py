@@ -19,7 +19,6 @@ def heavy_top() -> Example:
     )
     body = scene.add(top)
     scene.add(nc.Spherical(nc.ground, body, point=(0, 0, 0), name="tip"))
-    system, state = scene.compile()
     facts = {
         "dofs": 3,
         "energy": 5435.6967908655,
@@ -30,7 +29,7 @@ def heavy_top() -> Example:
     }
     centre = nc.Point(body, (0, 1, 0), local=True)
     return Example(
-        "heavy_top", "a fast top under gravity", system, state, 0.001, 2000, facts=facts, traces=(centre,)
+        "heavy_top", "a fast top under gravity", *scene.compile(), 0.001, 2000, facts=facts, traces=(centre,)
     )
 
 
@@ -48,7 +47,6 @@ def fast_top() -> Example:
         name="top",
     )
     scene.add(nc.Spherical(nc.ground, scene.add(top), point=(0, 0, 0), name="tip"))
-    system, state = scene.compile()
     nutation, precession = along * spin / across, mass * 9.81 * arm / (along * spin)
     facts = {
         "dofs": 3,
@@ -57,14 +55,13 @@ def fast_top() -> Example:
         "precession": precession,  # [rad/s], the mean
         "nodding": 2.0 * precession * np.sin(tilt) / nutation,  # [rad], from end to end
     }
-    return Example("fast_top", "a top at 10 000 rad/s", system, state, 5e-6, 1000, facts=facts)
+    return Example("fast_top", "a top at 10 000 rad/s", *scene.compile(), 5e-6, 1000, facts=facts)
 
 
 def free_body() -> Example:
     """A body spinning freely, without symmetry (reference case R10)."""
     scene = nc.Scene()
     scene.add(nc.RigidBody(mass=1.0, inertia=(6, 8, 3), angular_velocity=(10, 20, 20), name="body"))
-    system, state = scene.compile()
     facts = {
         "dofs": 6,
         "angular momentum": (60.0, 160.0, 60.0),
@@ -73,14 +70,13 @@ def free_body() -> Example:
             1.0: (11.407086549, 19.658211246, 19.388210365),
         },
     }
-    return Example("free_body", "a freely spinning body", system, state, 0.005, 200, facts=facts)
+    return Example("free_body", "a freely spinning body", *scene.compile(), 0.005, 200, facts=facts)
 
 
 def dzhanibekov() -> Example:
     """A body spinning about its middle axis, which turns over again and again (reference case R12)."""
     scene = nc.Scene()
     body = scene.add(nc.RigidBody(mass=1.0, inertia=(1, 2, 3), angular_velocity=(1e-3, 5, 1e-3), name="body"))
-    system, state = scene.compile()
     facts = {
         "dofs": 6,
         "body rates": {
@@ -91,8 +87,7 @@ def dzhanibekov() -> Example:
     return Example(
         "dzhanibekov",
         "unstable spin about the middle axis",
-        system,
-        state,
+        *scene.compile(),
         0.01,
         1000,
         facts=facts,
@@ -111,12 +106,11 @@ def pendulum() -> Example:
     inertia = (0.04, 0.1, 0.1)
     bar = scene.add(nc.RigidBody(mass=1.0, inertia=inertia, com=(2, 0, 0), name="bar"))
     scene.add(nc.Revolute(nc.ground, bar, axis=(0, 1, 0), name="hinge"))
-    system, state = scene.compile()
     facts = {
         "dofs": 1,
         "centre of mass": {0.5: (1.66080775374, 0, -1.11432383315), 5.0: (-1.99968386888, 0, -0.03555874755)},
     }
-    return Example("pendulum", "a bar on a hinge", system, state, 0.01, 500, facts=facts)
+    return Example("pendulum", "a bar on a hinge", *scene.compile(), 0.01, 500, facts=facts)
 
 
 def double_pendulum() -> Example:
@@ -137,14 +131,13 @@ def double_pendulum() -> Example:
         body = scene.add(rod)
         scene.add(nc.Revolute(carrier, body, point=place, axis=(0, 1, 0), name=f"hinge {number + 1}"))
         carrier = body
-    system, state = scene.compile()
     facts = {
         "dofs": 2,
         "tip": {0.5: (1.2966885362, 0, -1.4057799232), 1.0: (-1.6621151358, 0, -1.0414666372)},
     }
     tip = nc.Point(carrier, (1.0, 0.0, 0.0), local=True)
     return Example(
-        "double_pendulum", "two rods on hinges", system, state, 0.005, 400, facts=facts, traces=(tip,)
+        "double_pendulum", "two rods on hinges", *scene.compile(), 0.005, 400, facts=facts, traces=(tip,)
     )
 
 
@@ -159,9 +152,8 @@ def torsion_spring() -> Example:
     )
     hinge = scene.add(nc.Revolute(nc.ground, scene.add(disc), name="hinge"))
     scene.add(nc.JointSpring(hinge, stiffness=stiffness, name="spring"))
-    system, state = scene.compile()
     facts = {"dofs": 1, "amplitude": amplitude, "angular frequency": rate}
     dt = 2 * np.pi / rate / 200
     return Example(
-        "torsion_spring", "a disc on a torsional spring", system, state, float(dt), 400, facts=facts
+        "torsion_spring", "a disc on a torsional spring", *scene.compile(), float(dt), 400, facts=facts
     )

@@ -44,9 +44,8 @@ def stiff_chain(rods: int = 6, stiffness: float = 1e8) -> Example:
         ends = nc.Point(bodies[k], (0, 0, end)), nc.Point(bodies[k + 1], (0, 0, end - gap))
         name = f"spring {k + 1}"
         scene.add(nc.Spring(ends, name=name, stiffness=stiffness, length=gap - force / stiffness))
-    system, state = scene.compile()
     facts = {"dofs": 6 * rods - 3}
-    return Example("stiff_chain", "rods on stiff springs", system, state, 0.004, 500, facts=facts)
+    return Example("stiff_chain", "rods on stiff springs", *scene.compile(), 0.004, 500, facts=facts)
 
 
 def mass_ladder(ratio: float = 1e4, links: int = 5, joint: type[nc.Revolute] = nc.Revolute) -> Example:
@@ -73,6 +72,5 @@ def mass_ladder(ratio: float = 1e4, links: int = 5, joint: type[nc.Revolute] = n
         axis = (0, 0.8, 0.6) if k % 2 else (0, 1, 0)
         scene.add(joint(carrier, body, point=place, axis=axis, name=f"hinge {k + 1}"))
         carrier = body
-    system, state = scene.compile()
     facts = {"dofs": links}
-    return Example("mass_ladder", f"{links} links of growing mass", system, state, 0.005, 200, facts=facts)
+    return Example("mass_ladder", f"{links} links of growing mass", *scene.compile(), 0.005, 200, facts=facts)

@@ -44,10 +44,9 @@ def chain(bodies: int = 8) -> Example:
         axis = (0, 0.8, 0.6) if k % 2 else (0, 0.8, -0.6)
         scene.add(nc.Revolute(carrier, body, point=k * step, axis=axis, name=f"hinge {k + 1}"))
         carrier = body
-    system, state = scene.compile()
     end = nc.Point(carrier, step, local=True)
     about = f"a chain of {bodies} links"
-    return Example("chain", about, system, state, 0.005, 200, facts={"dofs": bodies}, traces=(end,))
+    return Example("chain", about, *scene.compile(), 0.005, 200, facts={"dofs": bodies}, traces=(end,))
 
 
 def binary_tree(bodies: int = 15) -> Example:
@@ -71,9 +70,8 @@ def binary_tree(bodies: int = 15) -> Example:
         scene.add(nc.Revolute(carrier, body, point=start, axis=axis, name=f"hinge {k + 1}"))
         handles.append(body)
         ends.append(end)
-    system, state = scene.compile()
     return Example(
-        "binary_tree", f"a tree of {bodies} links", system, state, 0.005, 200, facts={"dofs": bodies}
+        "binary_tree", f"a tree of {bodies} links", *scene.compile(), 0.005, 200, facts={"dofs": bodies}
     )
 
 
@@ -117,8 +115,7 @@ def robot_arm() -> Example:
         hinge = scene.add(nc.Revolute(carrier, body, point=origin, axis=axis, name=f"hinge {k + 1}"))
         scene.add(nc.Drive(hinge, function=Swing(AMPLITUDES[k], 4.0), name=f"drive {k + 1}"))
         carrier, origin, frame = body, following, frame @ np.array(turn)
-    system, state = scene.compile()
-    return Example("robot_arm", "seven hinges, all driven", system, state, 0.01, 400, facts={"dofs": 0})
+    return Example("robot_arm", "seven hinges, all driven", *scene.compile(), 0.01, 400, facts={"dofs": 0})
 
 
 T_END = 2.0  # [s]
@@ -213,6 +210,7 @@ def open_tree() -> Example:
         scene.add(nc.Spring(ends, stiffness=data["stiffness"], length=data["length"], name=name))
         if data["damping"]:
             scene.add(nc.Damper(ends, damping=data["damping"], name=f"damper {number + 1}"))
-    system, state = scene.compile()
     facts = {"dofs": 14, "energy_start": -291.4831761332036, "energy": -300.25176106157113}
-    return Example("open_tree", "eight bodies on mixed joints", system, state, T_END / 200, 200, facts=facts)
+    return Example(
+        "open_tree", "eight bodies on mixed joints", *scene.compile(), T_END / 200, 200, facts=facts
+    )
