@@ -248,14 +248,7 @@ def instants(source: Source) -> Instant:
 
 
 def instant(system: Model, motion: State | Trajectory, inputs: Any = None) -> Instant:
-    """Accelerations and reactions of a state, or of all states of a trajectory.
-
-    Args:
-        system: compiled system.
-        motion: state or trajectory, with any leading axes.
-        inputs: shape (inputs,) or (*leading, inputs) [N, N m]. Default: of a trajectory, at every saved
-            state those of the step that starts there (with `save_every`, of the last step of the interval
-            that starts there), and at the last state those of the last step; of a state, zero.
+    """Accelerations and reactions of a state, or of all states of a trajectory; see `System.instant`.
 
     Raises:
         ValueError: for a wrong shape of the inputs, and where a contact that is a constraint is closed
