@@ -5,6 +5,8 @@ all that is made of it in `tangent_space` are blocks, one a body. A kick then co
 number, not to its cube.
 """
 
+from typing import Any, TypeVar
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -66,14 +68,6 @@ class SeparateTangents(eqx.Module):
         idle = jnp.sum(turns[:, :, None] * turns[:, None], axis=-1)
         blocks = space.pulled(impulses) + jnp.where(present, 0.0, jnp.eye(slots.size))
         return replace_fields(space, blocks=blocks, frame=jax.vmap(inverse_cholesky)(blocks + idle))
-
-    def without_system(self) -> "SeparateTangents":
-        """What belongs to the configuration alone; `with_system` puts the rest back."""
-        return replace_fields(self, system=None)
-
-    def with_system(self, system: Model) -> "SeparateTangents":
-        """Ready for use."""
-        return replace_fields(self, system=system)
 
     def impulse(self, v: Velocity) -> Velocity:
         """M v."""
@@ -156,6 +150,17 @@ class SeparateTangents(eqx.Module):
 
 Tangents = TangentSpace | SeparateTangents
 """What is admitted at one configuration, in one piece or body by body."""
+
+T = TypeVar("T")
+
+
+def with_system(found: T, system: Model | None) -> T:
+    """With the system whose tangents are in it; None: with what belongs to configurations alone."""
+
+    def one(x: Any) -> Any:
+        return replace_fields(x, system=system) if isinstance(x, Tangents) else x
+
+    return jax.tree.map(one, found, is_leaf=lambda x: isinstance(x, Tangents))
 
 
 def separate(system: Model) -> bool:

@@ -99,14 +99,6 @@ class Damping(eqx.Module):
         rates = [jax.vmap(partial(_instant_rates, system, g, rows))(moving, turning) for g in groups]
         return cls(space, rates, [_stiffness(system, g, rows, state.coordinates) for g in groups])
 
-    def without_system(self) -> "Damping":
-        """What belongs to the configuration alone; `with_system` puts the rest back."""
-        return replace_fields(self, space=self.space.without_system())
-
-    def with_system(self, system: Model) -> "Damping":
-        """Ready for use."""
-        return replace_fields(self, space=self.space.with_system(system))
-
     def over(
         self, state: State, groups: Sequence[Group], at: StageKinematics, h: Array, tableau: Tableau
     ) -> Damped:

@@ -49,6 +49,12 @@ def rotors_of(system: Model) -> list[Group]:
     return [g for g in system.effects if g.effect.rotors]
 
 
+def rotor_inertias(system: Model) -> Float[Array, " rotors"]:
+    """Inertias of all rotors."""
+    parts = [jax.vmap(lambda e: e.inertia_of())(g.effect) for g in rotors_of(system)]
+    return jnp.concatenate([jnp.zeros(0, system.mass.dtype), *parts])
+
+
 def relative_rates(
     system: Model,
     rows: Float[Array, "bodies 4 3"],
@@ -177,10 +183,8 @@ class EquationsOfMotion(eqx.Module):
         """Forces and torques that give bodies and rotors their accelerations."""
         impulses = inertia(self.system, gains.rows)
         force, torque = (x[0] for x in wrench(impulses[None], self.rows[None, :, 1:]))
-        groups = rotors_of(self.system)
-        if groups:
-            inertias = jnp.concatenate([jax.vmap(lambda e: e.inertia_of())(g.effect) for g in groups])
-            pulled = _weighted(inertias * gains.rotors, self.unit_loads[0])
+        if rotors_of(self.system):
+            pulled = _weighted(rotor_inertias(self.system) * gains.rotors, self.unit_loads[0])
             force, torque = force + pulled[0], torque + pulled[1]
         return force, torque
 

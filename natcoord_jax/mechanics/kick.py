@@ -33,7 +33,7 @@ from jaxtyping import Array, Bool, Float
 
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
-from natcoord_jax.mechanics.block_tangent_space import Tangents, tangents_at
+from natcoord_jax.mechanics.block_tangent_space import Tangents, tangents_at, with_system
 from natcoord_jax.mechanics.coordinates import stage_rates
 from natcoord_jax.mechanics.frozen_kick import NEGLIGIBLE, NEGLIGIBLE_ENERGY
 from natcoord_jax.mechanics.response import GroupData, StageKinematics
@@ -72,16 +72,6 @@ class Kick(eqx.Module):
     exact: Velocity
     change: Float[Array, ""]
     motion: Float[Array, ""]
-
-    def without_system(self) -> "Kick":
-        """To be carried along; `with_system` puts the rest back."""
-        return replace_fields(self, before=self.before.without_system(), after=self.after.without_system())
-
-    def with_system(self, system: Model) -> "Kick":
-        """Ready for use."""
-        return replace_fields(
-            self, before=self.before.with_system(system), after=self.after.with_system(system)
-        )
 
 
 class Ends(eqx.Module):
@@ -123,7 +113,7 @@ def kick_of(equations: Any, at: StageKinematics) -> Kick:
     if known is None:
         before, after = _both(system, state, end)
     else:
-        before, after = known.with_system(system), tangents_at(system, end)
+        before, after = with_system(known, system), tangents_at(system, end)
     drift = after.drift
     carried = jnp.tensordot(beta, at.rates[:, :-1], 1), beta @ rotor_rates(equations, at)
     d = Velocity(
@@ -148,12 +138,12 @@ def _both(system: Model, start: State, end: State) -> tuple[Tangents, Tangents]:
     """The tangent spaces of two states by one program for both, half as long as two."""
 
     def at(q: Array, t: Array) -> Tangents:
-        return tangents_at(system, replace_fields(end, q=q, v=q, t=t)).without_system()
+        return with_system(tangents_at(system, replace_fields(end, q=q, v=q, t=t)), None)
 
     found = jax.vmap(at)(jnp.stack([start.q, end.q]), jnp.stack([start.t, end.t]))
     parts, structure = jax.tree.flatten(found)
     before, after = (jax.tree.unflatten(structure, x) for x in zip(*map(jnp.unstack, parts)))
-    return before.with_system(system), after.with_system(system)
+    return with_system((before, after), system)
 
 
 def ends_of(equations: Any, at: StageKinematics, kick: Kick) -> Ends:
@@ -199,7 +189,7 @@ def _lagging(equations: Any, at: StageKinematics) -> Kick:
     lag = equations.start_cache.lag
 
     def anew() -> Kick:
-        return kick_of(equations, at).without_system()
+        return with_system(kick_of(equations, at), None)
 
     def renewed(_: tuple[Array, Kick]) -> tuple[Array, Kick]:
         return jnp.array(False), anew()
@@ -208,7 +198,7 @@ def _lagging(equations: Any, at: StageKinematics) -> Kick:
     start = eqx.tree_at(lambda found: (found.kick, found.exact), blank, (lag.held, lag.held))
     # A loop of no or one trip leaves what it carries where it is; a conditional would copy it.
     _, found = jax.lax.while_loop(lambda carry: carry[0], renewed, (lag.due, start))
-    return found.with_system(equations.system)
+    return with_system(found, equations.system)
 
 
 def with_rotors(

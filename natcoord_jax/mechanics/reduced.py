@@ -18,7 +18,7 @@ from natcoord_jax.linsolve.stages import fitted, stagewise_inverse
 from natcoord_jax.maths.collocation import gauss
 from natcoord_jax.maths.projectors import range_projector
 from natcoord_jax.maths.vectors import dot
-from natcoord_jax.mechanics.block_tangent_space import Tangents, tangents_at
+from natcoord_jax.mechanics.block_tangent_space import Tangents, tangents_at, with_system
 from natcoord_jax.mechanics.equations_of_motion import constraint_matrix
 from natcoord_jax.mechanics.momentum import least_inertias
 from natcoord_jax.mechanics.redundancy import (
@@ -192,7 +192,7 @@ class ReducedStep(StepEquations):
         tangents = self.start_cache.tangents
         if tangents is None:
             tangents = tangents_at(self.system, self.state)
-        tangents = tangents.with_system(self.system)
+        tangents = with_system(tangents, self.system)
         tree = self.system.tree
         body, kind, axis = tree.slot_of // SLOTS, tree.slot_of % SLOTS // 3, tree.slot_of % SLOTS % 3
         above = jnp.concatenate([self.start[:, 1:], jnp.eye(3, dtype=self.start.dtype)[None]])[tree.parent]

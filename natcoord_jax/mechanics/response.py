@@ -8,7 +8,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from natcoord_jax.core.bodies import NODE
-from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.motion import Motion, Response, StepContext
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import Tableau
@@ -161,14 +160,6 @@ class Evaluation(eqx.Module):
     loads: tuple[Float[Array, "s bodies 3"], Float[Array, "s bodies 3"]]
     kick: Any = None
     given: Any = None
-
-    def without_system(self) -> "Evaluation":
-        """To be carried along; `with_system` puts the rest back."""
-        return self if self.kick is None else replace_fields(self, kick=self.kick.without_system())
-
-    def with_system(self, system: Model) -> "Evaluation":
-        """Ready for use."""
-        return self if self.kick is None else replace_fields(self, kick=self.kick.with_system(system))
 
 
 def collect(group: Group, loads: Float[Array, "n s k *rest"]) -> Float[Array, "bodies s *rest"]:

@@ -5,7 +5,7 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import Tableau
-from natcoord_jax.mechanics.block_tangent_space import Tangents, tangents_at
+from natcoord_jax.mechanics.block_tangent_space import Tangents, tangents_at, with_system
 from natcoord_jax.mechanics.dissipation import Damping
 from natcoord_jax.mechanics.frozen_kick import FrozenKick
 from natcoord_jax.model.model import Model
@@ -48,11 +48,11 @@ class StartCache(eqx.Module):
             later: leave it to the evaluation, which finds it with that at the end of the step.
         """
         if tableau.dissipative and not later:
-            return cls(projector, None, Damping.at(system, state).without_system())
+            return cls(projector, None, with_system(Damping.at(system, state), None))
         if not tableau.kick or later:
             return cls(projector, None)
         if tangents is None:
-            tangents = tangents_at(system, state).without_system()
+            tangents = with_system(tangents_at(system, state), None)
         return cls(projector, tangents)
 
 

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from natcoord_jax.core.state import State
 from natcoord_jax.linsolve.dense import DenseSolver, Inverse, saddle_inverse
 from natcoord_jax.maths.collocation import Tableau
-from natcoord_jax.mechanics.block_tangent_space import Tangents
+from natcoord_jax.mechanics.block_tangent_space import Tangents, with_system
 from natcoord_jax.mechanics.dissipation import Damped, Damping
 from natcoord_jax.mechanics.grain import cancelling_size
 from natcoord_jax.mechanics.kick import kicked
@@ -256,5 +256,7 @@ class StepEquations(Form):
     def damped(self, at: StageKinematics) -> Damped:
         """What numerical dissipation does in the step."""
         damping = self.start_cache.damping
-        damping = Damping.at(self.system, self.state) if damping is None else damping.with_system(self.system)
+        damping = (
+            Damping.at(self.system, self.state) if damping is None else with_system(damping, self.system)
+        )
         return damping.over(self.state, self.groups, at, self.h, self.tableau)

@@ -19,6 +19,7 @@ from natcoord_jax.mechanics.equations_of_motion import (
     EquationsOfMotion,
     loops_of,
     relations_of,
+    rotor_inertias,
 )
 from natcoord_jax.mechanics.momentum import inertia, spatial_inertia, weighs_only, wrench
 from natcoord_jax.model.model import Model
@@ -108,14 +109,6 @@ class TangentSpace(eqx.Module):
         # A unit inertia for turns of point masses, which nothing else sees.
         massless = weighs_only(system.mass)
         return space, space.coupled(space, idle=jnp.where(massless, 1.0, 0.0))
-
-    def without_system(self) -> "TangentSpace":
-        """What belongs to the configuration alone; `with_system` puts the rest back."""
-        return replace_fields(self, system=None)
-
-    def with_system(self, system: Model) -> "TangentSpace":
-        """Ready for use."""
-        return replace_fields(self, system=system)
 
     def framed(self, v: Velocity) -> Float[Array, " u"]:
         """Components of a velocity along the frame, X P^T M v."""
@@ -268,13 +261,6 @@ class TangentSpace(eqx.Module):
 
         w = rates(momentum) + self.drift_rates
         return self.spread(w + rates(momentum - self.pulled(self.impulse(self.spread(w)))))
-
-
-def rotor_inertias(system: Model) -> Float[Array, " rotors"]:
-    """Inertias of all rotors."""
-    groups = [g for g in system.effects if g.effect.rotors]
-    parts = [jax.vmap(lambda e: e.inertia_of())(g.effect) for g in groups]
-    return jnp.concatenate([jnp.zeros(0, system.mass.dtype), *parts])
 
 
 def prescribing(system: Model) -> np.ndarray:

@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
+from natcoord_jax.mechanics.block_tangent_space import with_system
 from natcoord_jax.mechanics.equations import prepare, starting
 from natcoord_jax.mechanics.failures import first_failure
 from natcoord_jax.mechanics.frozen_kick import Lagging
@@ -119,7 +120,7 @@ def attempt(
     evaluate = partial(_evaluation, setting, course, equations, apart)
     solving = jax.lax.while_loop(lambda s: ~(s.ending | s.wanting), evaluate, start)
     begun = replace_fields(carried.course, it=solving.it, lagging=solving.lagging)
-    found = solving.found.with_system(setting.system)
+    found = with_system(solving.found, setting.system)
 
     def ended(carry: tuple) -> tuple:
         _, before, x, _, record, factors = carry
@@ -163,7 +164,7 @@ def _with_normal_kick(setting: RolloutProblem, after: RolloutState, start_cache:
     """With the kick at hand along the normals: another one would change momenta."""
     if after.lagging is None or start_cache.tangents is None:
         return after
-    held = start_cache.tangents.with_system(setting.system).normal(after.lagging.held)
+    held = with_system(start_cache.tangents, setting.system).normal(after.lagging.held)
     return eqx.tree_at(lambda c: c.lagging.held, after, held)
 
 
@@ -177,7 +178,7 @@ def _recorded(ending: Bool[Array, ""], before: RolloutState, after: RolloutState
 def _unsolved(equations: Any, carried: LoopCarry) -> NewtonCarry:
     """Before the first evaluation."""
     course, no = carried.course, jnp.array(False)
-    shapes = jax.eval_shape(lambda y: equations.evaluate(y).without_system(), course.it.y)
+    shapes = jax.eval_shape(lambda y: with_system(equations.evaluate(y), None), course.it.y)
     blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
     given = course.it, course.lagging, carried.factors, carried.probe
     return NewtonCarry(*given, blank, blank.residual, no, no, no)
@@ -224,7 +225,7 @@ def _evaluation(
             return jnp.array(False), *renewed_at(setting, equations, it, factors, asked)
 
         wanting, it, factors = jax.lax.while_loop(lambda carry: carry[0], renewed, (wanting, it, factors))
-    return NewtonCarry(it, lagging, factors, probe, found.without_system(), residual, ending, wanting, here)
+    return NewtonCarry(it, lagging, factors, probe, with_system(found, None), residual, ending, wanting, here)
 
 
 def _kept(
@@ -278,7 +279,7 @@ def _outset_after(
     tangents = None
     if kick is not None and known.tangents is not None and setting.tolerance is None:
         # The end of this step is the start of the next one. (With error control it may be neither.)
-        reached = kick.after.without_system()
+        reached = with_system(kick.after, None)
         tangents = jax.tree.map(lambda x, y: jnp.where(accepted, x, y), reached, known.tangents)
     return starting(setting.system, after.state, setting.plan.tableau, tangents)
 

@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from natcoord_jax.core.effect import replace_fields
+from natcoord_jax.mechanics.block_tangent_space import with_system
 from natcoord_jax.mechanics.equations import prepare
 from natcoord_jax.mechanics.frozen_kick import FrozenKick
 from natcoord_jax.mechanics.response import Evaluation
@@ -226,7 +227,7 @@ def evaluated(
     """
     probe, found = probe.evaluated(equations, it.y, partial(_at, equations, probe.making), found)
     it, factors = _renewed(equations, probe, it, factors)
-    return probe, found.with_system(setting.system), it, factors
+    return probe, with_system(found, setting.system), it, factors
 
 
 def told(
@@ -252,7 +253,7 @@ def _at(equations: Any, making: Array, y: Array, at_end: Array, moving: Array) -
     """The equations at unknowns of the probe."""
     lag = told(equations.start_cache.lag, making, at_end, moving)
     near = replace_fields(equations, start_cache=replace_fields(equations.start_cache, lag=lag))
-    return near.evaluate(y).without_system()
+    return with_system(near.evaluate(y), None)
 
 
 def _renewed(

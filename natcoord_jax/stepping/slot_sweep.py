@@ -18,7 +18,7 @@ from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
 from natcoord_jax.linsolve.learning import learns
 from natcoord_jax.maths.collocation import Tableau
-from natcoord_jax.mechanics.block_tangent_space import Tangents, tangents_at
+from natcoord_jax.mechanics.block_tangent_space import Tangents, tangents_at, with_system
 from natcoord_jax.mechanics.equations import kind_of, prepare
 from natcoord_jax.mechanics.start_cache import NOTHING
 from natcoord_jax.stepping.factors import Factors, factors_of
@@ -134,7 +134,7 @@ class SlotSweep(ABC):
         """What the constraints admit in a state, for schemes that ask for it."""
         if not self.tableau.kick:
             return None
-        return tangents_at(numbers.whole(varied)[0], state).without_system()
+        return with_system(tangents_at(numbers.whole(varied)[0], state), None)
 
     def outcome(
         self,

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import Tableau
-from natcoord_jax.mechanics.block_tangent_space import Tangents
+from natcoord_jax.mechanics.block_tangent_space import Tangents, with_system
 from natcoord_jax.mechanics.coordinates import stage_rates
 from natcoord_jax.mechanics.end_impulses import obeying, released
 from natcoord_jax.mechanics.equations import prepare, starting
@@ -50,7 +50,7 @@ def advance_between(
     """
     start_cache = starting(system, state, tableau, tangents, later=tangents is None)
     residual, after, _, kick = _advanced(system, state, start_cache, u, h, y, tableau)
-    return residual, after, None if kick is None else kick.after.without_system()
+    return residual, after, None if kick is None else with_system(kick.after, None)
 
 
 def _advanced(
