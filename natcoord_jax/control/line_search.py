@@ -164,9 +164,7 @@ def search(
     def attempt(a: Array, extra: tuple[Unknowns, Slacks], spent: Array, corrected: Array) -> Found:
         along = moved((iterate.unknowns, s), (direction.unknowns, ds), a)
         unknowns, slacks = moved(along, extra, jnp.ones(()))
-        newton, whole = jnp.array(0), jnp.array(True)
-        if not options.lifted:
-            unknowns, whole, newton = simulated(problem, unknowns)
+        unknowns, whole, newton = simulated(problem, unknowns, options.lifted)
         path = roll(problem, unknowns)
         violated, costs = _measured(iterate, path, slacks)
         gain = -a * slope

@@ -51,9 +51,7 @@ NEARLY = 1e-6
 
 @compiled
 def _begun(problem: OptimalControl, options: Options, unknowns: Unknowns) -> tuple[tuple, tuple]:
-    newton, whole = jnp.array(0), jnp.array(True)
-    if not options.lifted:
-        unknowns, whole, newton = simulated(problem, unknowns)
+    unknowns, whole, newton = simulated(problem, unknowns, options.lifted)
     path = roll(problem, unknowns)
     slacks = Slacks(jnp.maximum(-path.stages.excess, ROOM), jnp.maximum(-path.end.excess, ROOM))
     unit = cost_unit(problem, unknowns, path)

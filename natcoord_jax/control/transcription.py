@@ -198,12 +198,14 @@ def held_inputs(problem: OptimalControl, coefficients: Float[Array, "c m"]) -> F
     return jnp.asarray(problem.inputs.matrix(problem.steps)) @ coefficients
 
 
-def simulated(problem: OptimalControl, unknowns: Unknowns) -> tuple[Unknowns, Array, Array]:
-    """Unknowns of the steps replaced by those of a simulation.
+def simulated(problem: OptimalControl, unknowns: Unknowns, lifted: bool) -> tuple[Unknowns, Array, Array]:
+    """Unknowns of the steps replaced by those of a simulation; the same where the method is lifted.
 
     Returns:
         Unknowns; whether every step was made whole; and the number of Newton iterations.
     """
+    if lifted:
+        return unknowns, jnp.array(True), jnp.array(0)
     system, dt = problem.applied(unknowns.free)
     inputs = held_inputs(problem, unknowns.coefficients)
     plan = Plan(problem.steps, 0, TOLERANCE, None)

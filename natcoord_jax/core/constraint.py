@@ -1,30 +1,23 @@
 """Constraints on markers: equations between points and directions, or between their velocities."""
 
 import abc
-from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.checks import equations
-from natcoord_jax.core.effect import Effect, replace_fields
-from natcoord_jax.core.handles import Handle
-from natcoord_jax.core.joint import Joint
-from natcoord_jax.core.kinds import NAME
-from natcoord_jax.core.markers import Attachment, Marker, Markers
+from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.motion import Motion, Response, StepContext
-from natcoord_jax.core.potential import marker_response, place_markers
+from natcoord_jax.core.potential import MarkerEffect, marker_response, place_markers
 
 FREE, RESTING = 1, 2
 """What inequalities do in a part of a step, where impacts are located."""
 
 
-class Constraint(Effect):
+class Constraint(MarkerEffect):
     """Base of constraints on markers of any number of bodies: subclass it and give `residual`.
 
     A residual that is at most quadratic in the marker vectors is kept exactly by every scheme, and with one
@@ -54,15 +47,8 @@ class Constraint(Effect):
         ...         return jnp.stack([normal @ arm, 0.5 * (arm @ arm - self.radius**2)])
     """
 
-    markers: Any = eqx.field(metadata=is_a(Markers()))
-    name: Any = eqx.field(default=None, kw_only=True, metadata=is_a(NAME))
-
     kind: ClassVar[str] = "constraint"
     impulsive: ClassVar[bool] = True
-
-    def attach(self, find: Callable[[Handle], tuple[Joint, Array]]) -> Sequence[Marker | Attachment]:
-        """Markers of the constraint."""
-        return self.markers
 
     @abc.abstractmethod
     def residual(self, x: Float[Array, "k *m 3"]) -> Float[Array, " m"]:
@@ -102,7 +88,7 @@ class Constraint(Effect):
         return replace_fields(marker_response(place, forces, None, rates, motion), rows=found)
 
 
-class VelocityConstraint(Effect):
+class VelocityConstraint(MarkerEffect):
     """Base of constraints on velocities that no positions follow from: subclass it and give `rate`.
 
     Rolling without slip, a blade on ice: the forces do no work, and energy is kept exactly.
@@ -126,15 +112,8 @@ class VelocityConstraint(Effect):
         ...         return (across @ velocity[0])[None]
     """
 
-    markers: Any = eqx.field(metadata=is_a(Markers()))
-    name: Any = eqx.field(default=None, kw_only=True, metadata=is_a(NAME))
-
     kind: ClassVar[str] = "velocity constraint"
     impulsive: ClassVar[bool] = True
-
-    def attach(self, find: Callable[[Handle], tuple[Joint, Array]]) -> Sequence[Marker | Attachment]:
-        """Markers of the constraint."""
-        return self.markers
 
     @abc.abstractmethod
     def rate(

@@ -1,7 +1,6 @@
 """Forces: loads on markers from stage quantities and inputs; fields: forces on the mass of every body."""
 
 import abc
-from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -12,12 +11,9 @@ from jaxtyping import Array, Float
 from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.bodies import NODE
 from natcoord_jax.core.effect import Effect
-from natcoord_jax.core.handles import Handle
-from natcoord_jax.core.joint import Joint
 from natcoord_jax.core.kinds import NAME
-from natcoord_jax.core.markers import Attachment, Marker, Markers
 from natcoord_jax.core.motion import Motion, Response, StepContext
-from natcoord_jax.core.potential import marker_response, place_markers
+from natcoord_jax.core.potential import MarkerEffect, marker_response, place_markers
 
 
 class Load(eqx.Module):
@@ -32,7 +28,7 @@ class Load(eqx.Module):
     torques: Float[Array, "k 3"] | None
 
 
-class Force(Effect):
+class Force(MarkerEffect):
     """Base of forces that are no potentials: subclass it and give `load`.
 
     Attributes:
@@ -50,15 +46,8 @@ class Force(Effect):
         ...         return nc.Load(-self.coefficient * rate, None)
     """
 
-    markers: Any = eqx.field(metadata=is_a(Markers()))
-    name: Any = eqx.field(default=None, kw_only=True, metadata=is_a(NAME))
-
     kind: ClassVar[str] = "force"
     works: ClassVar[bool] = True
-
-    def attach(self, find: Callable[[Handle], tuple[Joint, Array]]) -> Sequence[Marker | Attachment]:
-        """Markers of the effect; effects on a joint look it up with `find`: handle to (joint, triad)."""
-        return self.markers
 
     @abc.abstractmethod
     def load(

@@ -35,7 +35,18 @@ def place_markers(place: Float[Array, "k *m w"], rows: Float[Array, "*s b 4 3"])
     return jnp.sum(place[..., None] * rows, axis=-2)
 
 
-class Potential(Effect):
+class MarkerEffect(Effect):
+    """Base of effects on markers."""
+
+    markers: Any = eqx.field(metadata=is_a(Markers()))
+    name: Any = eqx.field(default=None, kw_only=True, metadata=is_a(NAME))
+
+    def attach(self, find: Callable[[Handle], tuple[Joint, Array]]) -> Sequence[Marker | Attachment]:
+        """Markers of the effect; effects on a joint look it up with `find`: handle to (joint, triad)."""
+        return self.markers
+
+
+class Potential(MarkerEffect):
     """Base of elastic effects between markers: subclass it and give `invariants` and `energy`.
 
     The invariants must be at most quadratic in the marker vectors, and unchanged when all of them are
@@ -67,9 +78,6 @@ class Potential(Effect):
         ...         return 0.5 * self.stiffness * invariants[0] ** 2
     """
 
-    markers: Any = eqx.field(metadata=is_a(Markers()))
-    name: Any = eqx.field(default=None, kw_only=True, metadata=is_a(NAME))
-
     kind: ClassVar[str] = "potential"
     stores: ClassVar[bool] = True
     elastic: ClassVar[bool] = True
@@ -77,10 +85,6 @@ class Potential(Effect):
     points: ClassVar[int | None] = None
     units: ClassVar[tuple[int, ...] | None] = None
     together: ClassVar[bool] = False
-
-    def attach(self, find: Callable[[Handle], tuple[Joint, Array]]) -> Sequence[Marker | Attachment]:
-        """Markers of the effect; effects on a joint look it up with `find`: handle to (joint, triad)."""
-        return self.markers
 
     @abc.abstractmethod
     def invariants(self, x: Float[Array, "k *m 3"]) -> Float[Array, " p"]:

@@ -9,6 +9,7 @@ from jaxtyping import Array
 
 from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.coordinate import CoordinateEffect, CoordinateForce
+from natcoord_jax.core.effect import Effect
 from natcoord_jax.core.force import Force, Load
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.joint import Joint
@@ -116,10 +117,22 @@ class BodyForceInput(Force):
 
 
 UNBOUNDED = Number(infinite=True)
-CROSSED = "has lower [-] above upper; exchange them"
 
 
-class AffineActuator(CoordinateEffect):
+class Ranged(Effect):
+    """Base of motors whose one input is cut off at a range."""
+
+    lower: Any = eqx.field(default=-jnp.inf, kw_only=True, metadata=is_a(UNBOUNDED))
+    upper: Any = eqx.field(default=jnp.inf, kw_only=True, metadata=is_a(UNBOUNDED))
+
+    inputs: ClassVar[int] = 1
+
+    def flaws(self) -> dict[str, Any]:
+        """A range without anything in it."""
+        return {"has lower [-] above upper; exchange them": self.lower > self.upper}
+
+
+class AffineActuator(Ranged, CoordinateEffect):
     """Motor, position servo, damper that is switched: a force affine in length, velocity and one input.
 
     With the length l = sum_k gear_k c_k of joint coordinates the force along it is
@@ -155,20 +168,17 @@ class AffineActuator(CoordinateEffect):
     gear: Any = eqx.field(default=(1.0,), kw_only=True, metadata=is_a(Vector(None)))
     gain: Any = eqx.field(default=(1.0, 0.0, 0.0), kw_only=True, metadata=is_a(Vector()))
     bias: Any = eqx.field(default=(0.0, 0.0, 0.0), kw_only=True, metadata=is_a(Vector()))
-    lower: Any = eqx.field(default=-jnp.inf, kw_only=True, metadata=is_a(UNBOUNDED))
-    upper: Any = eqx.field(default=jnp.inf, kw_only=True, metadata=is_a(UNBOUNDED))
     least: Any = eqx.field(default=-jnp.inf, kw_only=True, metadata=is_a(UNBOUNDED))
     most: Any = eqx.field(default=jnp.inf, kw_only=True, metadata=is_a(UNBOUNDED))
 
     kind: ClassVar[str] = "affine actuator"
     on_a_ball: ClassVar[str] = "nc.SphericalTorque"
-    inputs: ClassVar[int] = 1
     works: ClassVar[bool] = True
 
     def flaws(self) -> dict[str, Any]:
         """Ranges without anything in them."""
         said = "has least [N or N m] above most; exchange them"
-        return {CROSSED: self.lower > self.upper, said: self.least > self.most}
+        return {**super().flaws(), said: self.least > self.most}
 
     def generalised(self, rates: Array, now: StepContext, lam: Array) -> tuple[Array, Array, Array]:
         """The force at every stage, along the gear; its power is force times velocity, exactly."""
@@ -183,7 +193,7 @@ class AffineActuator(CoordinateEffect):
         return force[:, None] * gear, jnp.zeros((len(now.tableau.b), 0)), force * velocity
 
 
-class WrenchInput(Force):
+class WrenchInput(Ranged, Force):
     """Thruster with a torque about its axis, as of a propeller: one input, a force and a torque on a body.
 
     Attributes:
@@ -205,16 +215,9 @@ class WrenchInput(Force):
     markers: Any = eqx.field(metadata=is_a(Markers(1, 3)))
     force: Any = eqx.field(default=(0.0, 0.0, 0.0), kw_only=True, metadata=is_a(Numbers((3,))))
     torque: Any = eqx.field(default=(0.0, 0.0, 0.0), kw_only=True, metadata=is_a(Numbers((3,))))
-    lower: Any = eqx.field(default=-jnp.inf, kw_only=True, metadata=is_a(UNBOUNDED))
-    upper: Any = eqx.field(default=jnp.inf, kw_only=True, metadata=is_a(UNBOUNDED))
 
     kind: ClassVar[str] = "wrench input"
     unit_directions: ClassVar[bool] = True
-    inputs: ClassVar[int] = 1
-
-    def flaws(self) -> dict[str, Any]:
-        """A range without anything in it."""
-        return {CROSSED: self.lower > self.upper}
 
     def load(self, x: Array, rate: Array, inputs: Array, t: Array) -> Load:
         """Force and torque along the mid-point directions."""
@@ -224,7 +227,7 @@ class WrenchInput(Force):
         return Load(nothing.at[0].set(force), nothing.at[0].set(torque))
 
 
-class SphericalTorque(Force):
+class SphericalTorque(Ranged, Force):
     """Motor in a spherical joint: one input, a torque [N m] about a direction of one of its bodies.
 
     Attributes:
@@ -237,15 +240,8 @@ class SphericalTorque(Force):
 
     markers: Any = eqx.field(metadata=is_a(Markers(0, 2)))
     gear: Any = eqx.field(default=1.0, kw_only=True, metadata=is_a(Number()))
-    lower: Any = eqx.field(default=-jnp.inf, kw_only=True, metadata=is_a(UNBOUNDED))
-    upper: Any = eqx.field(default=jnp.inf, kw_only=True, metadata=is_a(UNBOUNDED))
 
     kind: ClassVar[str] = "spherical torque"
-    inputs: ClassVar[int] = 1
-
-    def flaws(self) -> dict[str, Any]:
-        """A range without anything in it."""
-        return {CROSSED: self.lower > self.upper}
 
     def load(self, x: Array, rate: Array, inputs: Array, t: Array) -> Load:
         """Torque along the mid-point direction, and its opposite."""

@@ -15,12 +15,10 @@ from jaxtyping import Array, Float, Int
 
 from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.closed_tangents import by_twists, twist_maps
-from natcoord_jax.core.effect import Effect, replace_fields
-from natcoord_jax.core.kinds import NAME
-from natcoord_jax.core.markers import Markers
+from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.motion import Motion, Response, SpreadTangents, StepContext
 from natcoord_jax.core.numeric import Number, Numbers
-from natcoord_jax.core.potential import marker_response, place_markers
+from natcoord_jax.core.potential import MarkerEffect, marker_response, place_markers
 from natcoord_jax.effects.loads.pressure import ETA, XI, follower_loads
 from natcoord_jax.maths.elimination import definite_inverse
 from natcoord_jax.maths.vectors import cross
@@ -99,7 +97,7 @@ class GasReadings(eqx.Module):
     pressure: Float[Array, "*t"]
 
 
-class EnclosedGas(Effect):
+class EnclosedGas(MarkerEffect):
     """A gas in a closed surface of quadrilaterals between points, within another of constant pressure.
 
     With the volume V it has the pressure p_0 (V_0 / V)^n. Energy, momentum and angular momentum are kept to
@@ -124,23 +122,17 @@ class EnclosedGas(Effect):
         >>> air = nc.EnclosedGas(points, faces=faces, gauge_pressure=1e3)
     """
 
-    markers: Any = eqx.field(metadata=is_a(Markers()))
     faces: Any = eqx.field(kw_only=True, metadata=is_a(Numbers((None, 4))))
     gauge_pressure: Any = eqx.field(kw_only=True, metadata=is_a(Number()))
     ambient: Any = eqx.field(default=ATMOSPHERE, kw_only=True, metadata=is_a(Number("not negative")))
     exponent: Any = eqx.field(default=1.0, kw_only=True, metadata=is_a(Number("not negative")))
     volume: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Number("positive")))
-    name: Any = eqx.field(default=None, kw_only=True, metadata=is_a(NAME))
 
     kind: ClassVar[str] = "gas"
     stores: ClassVar[bool] = True
     spread: ClassVar[bool] = True
     silent: ClassVar[bool] = False
     drawn: ClassVar[bool] = False
-
-    def attach(self, find: Any) -> Any:
-        """Its points."""
-        return self.markers
 
     def assembled_at(self, x: Float[Array, "k 3"]) -> "EnclosedGas":
         """With the volume of the assembled pose, unless another is given."""

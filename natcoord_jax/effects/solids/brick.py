@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.cells import CORNERS, SIDES
-from natcoord_jax.core.effect import replace_fields
+from natcoord_jax.core.effect import Effect, replace_fields
 from natcoord_jax.core.kinds import of
 from natcoord_jax.core.markers import Markers
 from natcoord_jax.core.numeric import Numbers
@@ -105,7 +105,47 @@ class SolidReadings(eqx.Module):
     energy: Float[Array, "*t"]
 
 
-class Brick(Potential):
+class SolidPotential(Potential):
+    """Base of elements of solids that are free of stress as assembled; a subclass has its `material`.
+
+    Class attributes:
+        listed: how its nodes are listed.
+    """
+
+    mass: str = eqx.field(default="lumped", kw_only=True, static=True, metadata=is_a(MASS))
+    reference: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Numbers((None, 3))))
+    gradients: Any = eqx.field(default=None, init=False)
+    volumes: Any = eqx.field(default=None, init=False)
+
+    together: ClassVar[bool] = True
+    silent: ClassVar[bool] = False
+    listed: ClassVar[str]
+
+    def assembled_at(self, x: Float[Array, "k 3"]) -> Effect:
+        """With the assembled pose as the one without stress, unless another is given."""
+        return replace_fields(self, reference=x if self.reference is None else self.reference).renewed()
+
+    def flaws(self) -> dict[str, Array]:
+        """Corners that are no corners."""
+        said = f"is degenerate or turned inside out: list {self.listed}"
+        return {} if self.volumes is None else {said: is_degenerate(self.volumes, self.reference)}
+
+    def volume_ratios(self, place: Array, rows: Array) -> Float[Array, " n"]:
+        """Smallest of the quadrature points of each of `n` elements."""
+        return smallest_volume_ratios(self.gradients, place, rows)
+
+    def strains(self, x: Float[Array, "k 3 *n"]) -> list[Float[Array, "g *n"]]:
+        """Those of Green and Lagrange at the quadrature points, component by component [-]."""
+        # Deformation gradients: (point, axis, component of place).
+        f = jnp.sum(self.gradients[:, :, :, None] * x[None, :, None], axis=1)
+        found = []
+        for i, j in PAIRS:
+            product = jnp.sum(f[:, i] * f[:, j], axis=1)
+            found.append(0.5 * (product - 1.0) if i == j else product)
+        return found
+
+
+class Brick(SolidPotential):
     """A hexahedron of eight points, of a Saint Venant-Kirchhoff material, stress-free as assembled.
 
     Attributes:
@@ -132,22 +172,14 @@ class Brick(Potential):
 
     markers: Any = eqx.field(metadata=is_a(Markers(8)))
     material: Any = eqx.field(kw_only=True, metadata=is_a(of("a material, as nc.Elastic(...)", Elastic)))
-    mass: str = eqx.field(default="lumped", kw_only=True, static=True, metadata=is_a(MASS))
     reference: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Numbers((8, 3))))
-    gradients: Any = eqx.field(default=None, init=False)
     stiffness: Any = eqx.field(default=None, init=False)
-    volumes: Any = eqx.field(default=None, init=False)
 
     kind: ClassVar[str] = "brick"
     degree: ClassVar[int | None] = 2
-    together: ClassVar[bool] = True
     derived: ClassVar[tuple[str, ...]] = ("gradients", "stiffness", "volumes")
-    silent: ClassVar[bool] = False
     faces: ClassVar[tuple[tuple[int, ...], ...]] = SIDES
-
-    def assembled_at(self, x: Float[Array, "8 3"]) -> "Brick":
-        """With the assembled pose as the one without stress, unless another is given."""
-        return replace_fields(self, reference=x if self.reference is None else self.reference).renewed()
+    listed: ClassVar[str] = "four nodes in turn round one face, then those above"
 
     def renewed(self) -> "Brick":
         """With the gradients and the stiffness of the pose without stress."""
@@ -180,24 +212,9 @@ class Brick(Potential):
             return consistent_mass(8, self.reference, self.material.density)
         return self.material.density * (SHAPES.T @ self.volumes)
 
-    def flaws(self) -> dict[str, Array]:
-        """Corners that are no corners."""
-        said = "is degenerate or turned inside out: list four nodes in turn round one face, then those above"
-        return {} if self.volumes is None else {said: is_degenerate(self.volumes, self.reference)}
-
-    def volume_ratios(self, place: Array, rows: Array) -> Float[Array, " n"]:
-        """Smallest of the Gauss points of each of `n` elements."""
-        return smallest_volume_ratios(self.gradients, place, rows)
-
     def invariants(self, x: Float[Array, "8 3 *n"]) -> Float[Array, "48 *n"]:
         """Strains of Green and Lagrange at the Gauss points [-]."""
-        # Deformation gradients: (point, axis, component of place).
-        f = jnp.sum(self.gradients[:, :, :, None] * x[None, :, None], axis=1)
-        found = []
-        for i, j in PAIRS:
-            product = jnp.sum(f[:, i] * f[:, j], axis=1)
-            found.append(0.5 * (product - 1.0) if i == j else product)
-        whole = jnp.stack(found, axis=1)
+        whole = jnp.stack(self.strains(x), axis=1)
         return whole.reshape(48, *whole.shape[2:])
 
     def energy(self, invariants: Float[Array, "48 *n"]) -> Float[Array, "*n"]:

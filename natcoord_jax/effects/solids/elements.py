@@ -22,27 +22,20 @@ from natcoord_jax.core.gradient import averaged_gradient
 from natcoord_jax.core.kinds import of
 from natcoord_jax.core.markers import Markers
 from natcoord_jax.core.motion import Motion, StepContext
-from natcoord_jax.core.numeric import Numbers
-from natcoord_jax.core.potential import Potential, place_markers
+from natcoord_jax.core.potential import place_markers
 from natcoord_jax.core.together import chunked
 from natcoord_jax.effects.hyperelastic import Hyperelastic, tensors_of
-from natcoord_jax.effects.materials import MASS, Elastic
-from natcoord_jax.effects.solids.brick import (
-    SolidReadings,
-    inverse_and_volume,
-    is_degenerate,
-    smallest_volume_ratios,
-    von_mises,
-)
+from natcoord_jax.effects.materials import Elastic
+from natcoord_jax.effects.solids.brick import SolidPotential, SolidReadings, inverse_and_volume, von_mises
 from natcoord_jax.effects.solids.mass import consistent_mass, lumped_mass
 from natcoord_jax.effects.solids.tangents import solid_tangents
 from natcoord_jax.maths.collocation import Tableau
-from natcoord_jax.maths.symmetric import PAIRS, full
+from natcoord_jax.maths.symmetric import full
 
 MATERIAL = of("a material, as nc.Elastic(...) or nc.NeoHooke(...)", Elastic, Hyperelastic)
 
 
-class SolidElement(Potential):
+class SolidElement(SolidPotential):
     """Base of elements of solids: a subclass says of how many nodes, and what the volumes are projected on.
 
     Attributes:
@@ -61,17 +54,12 @@ class SolidElement(Potential):
 
     markers: Any = eqx.field(metadata=is_a(Markers()))
     material: Any = eqx.field(kw_only=True, metadata=is_a(MATERIAL))
-    mass: str = eqx.field(default="lumped", kw_only=True, static=True, metadata=is_a(MASS))
-    reference: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Numbers((None, 3))))
-    gradients: Any = eqx.field(default=None, init=False)
-    volumes: Any = eqx.field(default=None, init=False)
     modes: Any = eqx.field(default=None, init=False)
 
-    together: ClassVar[bool] = True
     derived: ClassVar[tuple[str, ...]] = ("gradients", "volumes", "modes")
-    silent: ClassVar[bool] = False
     count: ClassVar[int]
     projected: ClassVar[int] = 0
+    listed: ClassVar[str] = "nodes as in nc.mesh.Mesh, those of edges midway"
 
     def __check_init__(self) -> None:
         if len(self.markers) != self.count:
@@ -84,10 +72,6 @@ class SolidElement(Potential):
                 "that of a change of volume, which this element needs; pass one that does, as nc.NeoHooke or "
                 "nc.MooneyRivlin, or take an element without projected volumes"
             )
-
-    def assembled_at(self, x: Float[Array, "k 3"]) -> "SolidElement":
-        """With the assembled pose as the one without stress, unless another is given."""
-        return replace_fields(self, reference=x if self.reference is None else self.reference).renewed()
 
     def renewed(self) -> "SolidElement":
         """With what follows from the pose without stress."""
@@ -115,23 +99,9 @@ class SolidElement(Potential):
             return consistent_mass(self.count, self.reference, self.material.density)
         return lumped_mass(self.count, self.volumes, self.material.density)
 
-    def flaws(self) -> dict[str, Array]:
-        """Corners that are no corners."""
-        said = "is degenerate or turned inside out: list nodes as in nc.mesh.Mesh, those of edges midway"
-        return {} if self.volumes is None else {said: is_degenerate(self.volumes, self.reference)}
-
-    def volume_ratios(self, place: Array, rows: Array) -> Float[Array, " n"]:
-        """Smallest of the quadrature points of each of `n` elements."""
-        return smallest_volume_ratios(self.gradients, place, rows)
-
     def invariants(self, x: Float[Array, "k 3 *n"]) -> Float[Array, "p *n"]:
         """Strains of Green and Lagrange at the quadrature points, component by component [-]."""
-        f = jnp.sum(self.gradients[:, :, :, None] * x[None, :, None], axis=1)
-        found = []
-        for i, j in PAIRS:
-            product = jnp.sum(f[:, i] * f[:, j], axis=1)
-            found.append(0.5 * (product - 1.0) if i == j else product)
-        return jnp.concatenate(found)
+        return jnp.concatenate(self.strains(x))
 
     def by_point(self, invariants: Float[Array, "p *n"]) -> Float[Array, "6 g *n"]:
         """Components at the quadrature points."""

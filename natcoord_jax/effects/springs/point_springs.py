@@ -23,11 +23,6 @@ STIFFNESS = Number("not negative", instead=" (for a spring that pushes away, nc.
 DAMPING = Number("not negative", instead=" (what drives a motion is an input or a force)")
 
 
-def _square(x: Array) -> Array:
-    u = x[1] - x[0]
-    return dot(u, u)[None]
-
-
 def energy_of_distance(law: Callable[[Array], Array], square: Float[Array, ""]) -> Float[Array, ""]:
     """Energy [J] as a law of a distance [m], and its derivatives by the squared distance, at zero too.
 
@@ -44,7 +39,20 @@ def energy_of_distance(law: Callable[[Array], Array], square: Float[Array, ""]) 
     return law(distance) + jnp.where(apart, 0.0, 0.5 * bend * (square - still))
 
 
-class Spring(Potential):
+class DistanceSpring(Potential):
+    """Base of springs between two points: a subclass gives `energy`."""
+
+    markers: Any = eqx.field(metadata=is_a(Markers(2)))
+
+    couples: ClassVar[bool] = True
+
+    def invariants(self, x: Array) -> Array:
+        """Squared distance [m^2]."""
+        u = x[1] - x[0]
+        return dot(u, u)[None]
+
+
+class Spring(DistanceSpring):
     """Linear spring between two points: energy k (|u| - L)^2 / 2.
 
     Smooth where the points coincide if L = 0, as of a mount or a bushing. With an unstretched length the
@@ -61,23 +69,17 @@ class Spring(Potential):
         >>> spring = nc.Spring(ends, stiffness=50.0, length=1.0)
     """
 
-    markers: Any = eqx.field(metadata=is_a(Markers(2)))
     stiffness: Any = eqx.field(kw_only=True, metadata=is_a(STIFFNESS))
     length: Any = eqx.field(default=0.0, kw_only=True, metadata=is_a(Number("not negative")))
 
     kind: ClassVar[str] = "spring"
-    couples: ClassVar[bool] = True
-
-    def invariants(self, x: Array) -> Array:
-        """Squared distance [m^2]."""
-        return _square(x)
 
     def energy(self, invariants: Array) -> Array:
         """Energy [J]."""
         return energy_of_distance(lambda d: 0.5 * self.stiffness * (d - self.length) ** 2, invariants[0])
 
 
-class QuadraticSpring(Potential):
+class QuadraticSpring(DistanceSpring):
     """Spring with energy k (|u|^2 - L^2)^2 / 2, a polynomial of the invariant (Gonzalez 1999).
 
     Attributes:
@@ -86,24 +88,18 @@ class QuadraticSpring(Potential):
         length: unstretched length L [m].
     """
 
-    markers: Any = eqx.field(metadata=is_a(Markers(2)))
     stiffness: Any = eqx.field(kw_only=True, metadata=is_a(STIFFNESS))
     length: Any = eqx.field(default=0.0, kw_only=True, metadata=is_a(Number("not negative")))
 
     kind: ClassVar[str] = "quadratic spring"
-    couples: ClassVar[bool] = True
     degree: ClassVar[int | None] = 2
-
-    def invariants(self, x: Array) -> Array:
-        """Squared distance [m^2]."""
-        return _square(x)
 
     def energy(self, invariants: Array) -> Array:
         """Energy [J]."""
         return 0.5 * self.stiffness * (invariants[0] - self.length**2) ** 2
 
 
-class NonlinearSpring(Potential):
+class NonlinearSpring(DistanceSpring):
     """Spring between two points with any energy of its length.
 
     A law whose slope is not zero at length zero gives no direction to the force there, see `Spring`.
@@ -113,15 +109,9 @@ class NonlinearSpring(Potential):
         law: function of the distance [m] to the energy [J], in jax.numpy.
     """
 
-    markers: Any = eqx.field(metadata=is_a(Markers(2)))
     law: Any = eqx.field(kw_only=True, metadata=is_a(FunctionOf("of the distance [m] to the energy [J]")))
 
     kind: ClassVar[str] = "nonlinear spring"
-    couples: ClassVar[bool] = True
-
-    def invariants(self, x: Array) -> Array:
-        """Squared distance [m^2]."""
-        return _square(x)
 
     def energy(self, invariants: Array) -> Array:
         """Energy [J]."""
