@@ -121,7 +121,8 @@ def _jacobian(make: Callable[[Any], OptimalControl], numbers: Any, found: Iterat
 
     both = jnp.concatenate([given, point])
     slopes = jax.lax.map(lambda d: jax.jvp(conditions, (both,), (d,))[1], jnp.eye(both.size))
-    by_numbers, by_point = (jax.tree.map(itemgetter(s), slopes) for s in _halves(given.size))
+    halves = slice(None, given.size), slice(given.size, None)
+    by_numbers, by_point = (jax.tree.map(itemgetter(half), slopes) for half in halves)
     hessian, jacobian = by_point.gradient, by_point.constraints.T
     # A bound acts as far as it presses: sigma (h + s) = 0 linearised.
     room = jnp.concatenate([jnp.zeros(m.goal.size), s.path.reshape(-1), s.end])
@@ -132,10 +133,6 @@ def _jacobian(make: Callable[[Any], OptimalControl], numbers: Any, found: Iterat
     moved = jnp.linalg.lstsq(matrix / scale / scale.T, right / scale, rcond=CUT)[0] / scale
     moved = moved[: point.size]
     return jnp.concatenate([moved, by_numbers.cost[None] + by_point.cost[None] @ moved])
-
-
-def _halves(size: int) -> tuple[slice, slice]:
-    return slice(None, size), slice(size, None)
 
 
 @checked(make=FunctionOf("(numbers) -> problem"), guess=START, options=OPTIONS)

@@ -20,7 +20,7 @@ import numpy as np
 from natcoord_jax.core.checks import as_array, at_top_level
 from natcoord_jax.core.closures import with_callables
 from natcoord_jax.xla.evaluation import ClosedJaxpr, evaluate, numbers_made
-from natcoord_jax.xla.tracing import at_once, in_lanes, in_program, is_concrete, jaxpr_as_fun
+from natcoord_jax.xla.tracing import at_once, in_lanes, in_program, is_concrete, is_numeric, jaxpr_as_fun
 
 REMEMBERED = 256
 """Programs of one function that are kept."""
@@ -69,7 +69,7 @@ def _evaluated(function: Callable[..., Any]) -> Callable[..., Any]:
     def run(*arguments: Any) -> Any:
         leaves, structure = jax.tree.flatten(arguments)
         given, rest = [x for x in leaves if _is_array(x)], [x for x in leaves if not _is_array(x)]
-        if in_program(leaves) or not all(map(_is_numeric, given)):
+        if in_program(leaves) or not all(map(is_numeric, given)):
             return function(*arguments)
         # What is no array and no plain value may have changed since: a function by what it reads.
         lasting, concrete = all(isinstance(x, PLAIN) for x in rest), is_concrete(given)
@@ -133,11 +133,6 @@ PLAIN = (bool, int, float, complex, str, bytes, np.generic)
 
 def _is_array(leaf: Any) -> bool:
     return isinstance(leaf, (jax.Array, np.ndarray))
-
-
-def _is_numeric(array: Any) -> bool:
-    """Not so are keys of random numbers."""
-    return jnp.issubdtype(array.dtype, np.number) or jnp.issubdtype(array.dtype, np.bool_)
 
 
 def _traced(function: Callable[..., Any], leaves: list[Any], structure: Any) -> Traced:

@@ -1,6 +1,7 @@
 """Many instances at once, their axis the last in all arrays, so that what is computed is wide; in pieces."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -68,12 +69,12 @@ def chunked(
         split = whole.reshape(*x.shape[:axis], pieces, size, *x.shape[axis + 1 :])
         return jnp.moveaxis(split, axis, 0)
 
-    def at_stages(x: Array) -> Array:
-        return cut(x, 1)
-
     single = now.inputs, now.coordinates, now.rates
     moving = motion.rows, motion.rates, motion.spin
-    given = (*jax.tree.map(cut, (effect, place, motion.start, single)), jax.tree.map(at_stages, moving))
+    given = (
+        *jax.tree.map(cut, (effect, place, motion.start, single)),
+        jax.tree.map(partial(cut, axis=1), moving),
+    )
 
     def one(_: None, piece: tuple) -> tuple[None, Any]:
         effect, place, start, (inputs, coordinates, rates), moving = piece

@@ -137,7 +137,7 @@ def block_pattern(nodes: np.ndarray, elements: list[np.ndarray]) -> tuple[BlockP
     """
     nodes = np.asarray(nodes)
     n = nodes.shape[0]
-    keys = [(u[:, :, None] * (n + 1) + u[:, None, :]).astype(np.int64) for u in map(_wide, elements)]
+    keys = [u[:, :, None] * (n + 1) + u[:, None, :] for u in (np.asarray(u, np.int64) for u in elements)]
     # What is fixed, in row or column, is left out.
     unique = np.unique(np.concatenate([np.zeros(0, np.int64), *(k.ravel() for k in keys)]))
     unique = unique[(unique // (n + 1) < n) & (unique % (n + 1) < n)]
@@ -165,10 +165,6 @@ def block_pattern(nodes: np.ndarray, elements: list[np.ndarray]) -> tuple[BlockP
         digest.hexdigest()[:16],
     )
     return pattern, Entries(nodes, rows, columns, places)
-
-
-def _wide(unknowns: np.ndarray) -> np.ndarray:
-    return np.asarray(unknowns, np.int64)
 
 
 def _tiles(

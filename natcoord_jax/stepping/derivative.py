@@ -22,9 +22,8 @@ from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import Tableau
 from natcoord_jax.mechanics.momentum import row_weights
-from natcoord_jax.stepping.backward import Backward
+from natcoord_jax.stepping.backward import Backward, Forward
 from natcoord_jax.stepping.error_control import Tolerance
-from natcoord_jax.stepping.forward import Forward
 from natcoord_jax.stepping.linear_iteration import STALL_ROUND_OFF, sizes_by_mass
 from natcoord_jax.stepping.located import part_of_step
 from natcoord_jax.stepping.plan import Plan, Slots

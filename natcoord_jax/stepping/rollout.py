@@ -25,8 +25,7 @@ from natcoord_jax.stepping.factors import Factors
 from natcoord_jax.stepping.newton import any_lane
 from natcoord_jax.stepping.plan import Plan, Slots
 from natcoord_jax.stepping.rollout_state import RolloutProblem, RolloutState
-from natcoord_jax.stepping.taken_up import TakenUp
-from natcoord_jax.stepping.two_kernel_loop import all_slots
+from natcoord_jax.stepping.two_kernel_loop import TakenUp, all_slots
 from natcoord_jax.system import System
 from natcoord_jax.xla.one_kernel import as_one_kernel
 

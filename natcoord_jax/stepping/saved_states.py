@@ -19,8 +19,7 @@ from natcoord_jax.stepping.plan import Control, Event, Plan, Slots
 from natcoord_jax.stepping.rollout import run
 from natcoord_jax.stepping.rollout_state import RolloutProblem
 from natcoord_jax.stepping.scheme import Scheme
-from natcoord_jax.stepping.taken_up import TakenUp
-from natcoord_jax.stepping.two_kernel_loop import first_carry
+from natcoord_jax.stepping.two_kernel_loop import TakenUp, first_carry
 from natcoord_jax.system import System
 
 SEGMENT = 512

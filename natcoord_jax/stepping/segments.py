@@ -25,7 +25,7 @@ from natcoord_jax.core.state import State, Trajectory
 from natcoord_jax.stepping.error_control import Tolerance
 from natcoord_jax.stepping.room import cut, room_for, with_room
 from natcoord_jax.stepping.saved_states import nothing_before, rollout, segment_length
-from natcoord_jax.stepping.taken_up import TakenUp
+from natcoord_jax.stepping.two_kernel_loop import TakenUp
 from natcoord_jax.storage import stream
 from natcoord_jax.storage.vtkhdf import geometry_of
 from natcoord_jax.system import System

@@ -13,7 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array
+from jaxtyping import Array, Bool
 
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
@@ -26,10 +26,38 @@ from natcoord_jax.stepping.factors import Factors
 from natcoord_jax.stepping.newton import Iterate, any_lane
 from natcoord_jax.stepping.plan import Plan
 from natcoord_jax.stepping.rollout_state import RolloutProblem, RolloutState, start_of
-from natcoord_jax.stepping.taken_up import TakenUp, going_on
 from natcoord_jax.system import System
 from natcoord_jax.xla.one_kernel import as_one_kernel
 from natcoord_jax.xla.rows import with_part
+
+COUNTED = "step", "taken", "rejected", "iterations", "iterations_max", "residual"
+"""What a rollout counts for itself."""
+
+
+class TakenUp(eqx.Module):
+    """The end of a rollout that the next goes on with.
+
+    Besides the state there are factors, guesses and what Newton's iteration has learnt: with all of them
+    the states are those of one run, to the bit.
+
+    Attributes:
+        anew: whether there is none, and the rollout begins with its state.
+        carried: what the loop over the steps ended with, its record left out.
+    """
+
+    anew: Bool[Array, ""]
+    carried: LoopCarry
+
+
+def going_on(first: LoopCarry, taken_up: TakenUp | None) -> LoopCarry:
+    """What the loop over the steps begins with."""
+    if taken_up is None:
+        return first
+    carried = taken_up.carried
+    course = replace_fields(carried.course, **{name: getattr(first.course, name) for name in COUNTED})
+    carried = replace_fields(carried, course=course, count=first.count, first=first.first)
+    return jax.tree.map(lambda new, old: jnp.where(taken_up.anew, new, old), first, carried)
+
 
 PARTS = 4
 """Bodies from which on new factors are made in a kernel of their own."""

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend import core as jex
 
-from natcoord_jax.xla.tracing import is_concrete
+from natcoord_jax.xla.tracing import is_concrete, is_numeric
 
 FEW = 1000
 """Integers up to which an array of them, as of indices, is part of the program, and not an argument."""
@@ -94,7 +94,7 @@ def signature(method: str, arguments: Any) -> tuple[Signature, list[Any]]:
     leaves, structure = jax.tree.flatten(arguments)
     shown = jax.Array | np.ndarray | np.generic | jax.ShapeDtypeStruct
     kinds = tuple(
-        Kind(tuple(x.shape), np.dtype(x.dtype) if _simple(x.dtype) else x.dtype)
+        Kind(tuple(x.shape), np.dtype(x.dtype) if is_numeric(x) else x.dtype)
         if isinstance(x, shown)
         else Fixed(type(x), x)
         for x in leaves
@@ -150,13 +150,9 @@ def _is_nought(x: Any) -> bool:
     return isinstance(x, jex.Literal) and not np.any(x.val)
 
 
-def _simple(dtype: Any) -> bool:
-    return jnp.issubdtype(dtype, np.number) or jnp.issubdtype(dtype, np.bool_)
-
-
 def _is_kept(value: Any) -> bool:
     """Whether a constant is part of the program: short lists of integers, as indices are."""
-    if not is_concrete(value) or not _simple(value.dtype) or value.size > FEW:
+    if not is_concrete(value) or not is_numeric(value) or value.size > FEW:
         return False
     return not jnp.issubdtype(value.dtype, np.inexact)
 
@@ -217,7 +213,7 @@ def _parameter(x: Any, equation: Any) -> Hashable:
 
 
 def _constant(value: Any) -> Hashable:
-    return _content(value) if is_concrete(value) and _simple(value.dtype) else id(value)
+    return _content(value) if is_concrete(value) and is_numeric(value) else id(value)
 
 
 def _rule(rule: Any, equation: Any) -> Hashable:

@@ -114,3 +114,8 @@ def depends(function: Callable, *arguments: Any) -> bool:
     """Whether what a function gives depends on any of its arguments, as its program has it."""
     program = jax.make_jaxpr(function)(*arguments).jaxpr
     return any(partial_eval.dce_jaxpr(program, [True] * len(program.outvars))[1])
+
+
+def is_numeric(array: Any) -> bool:
+    """Not so are keys of random numbers."""
+    return jnp.issubdtype(array.dtype, np.number) or jnp.issubdtype(array.dtype, np.bool_)
