@@ -8,7 +8,6 @@ with D from dampers and from the rotation, K from stiffness, loads, reactions an
 space x = Z xi of the constraints it is a quadratic eigenvalue problem of the size of the degrees of freedom.
 """
 
-from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -17,7 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from natcoord_jax.analysis.static_equations import Static
+from natcoord_jax.analysis.static_equations import Loading, Static
+from natcoord_jax.analysis.static_search import largest
+from natcoord_jax.analysis.steady_rotation import BALANCE, complaint, steady_code
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.checks import is_concrete, numbers
 from natcoord_jax.core.compiled import briefly
@@ -25,18 +26,20 @@ from natcoord_jax.core.kinds import FLAG
 from natcoord_jax.core.numeric import COMPONENTS, Vector, Whole
 from natcoord_jax.core.state import STATE, State
 from natcoord_jax.maths.projectors import pseudo_inverse, range_projector
+from natcoord_jax.maths.rotations import angular_velocity
 from natcoord_jax.maths.spectrum import roots_of_sizes, spectrum
-from natcoord_jax.maths.vectors import cross
-from natcoord_jax.mechanics.equations_of_motion import loads, relative_rates, rotors_of, with_rest
+from natcoord_jax.maths.vectors import cross, safe_divide, safe_norm
+from natcoord_jax.mechanics.equations_of_motion import relative_rates, rotors_of, with_rest
 from natcoord_jax.mechanics.momentum import inertia, wrench
 from natcoord_jax.mechanics.projection import TWIST, constraint_matrix
+from natcoord_jax.mechanics.tangent_space import rotor_inertias
 from natcoord_jax.mechanics.violations import refuse_contacts
 from natcoord_jax.model.model import SYSTEM
 from natcoord_jax.model.rows import row_rates
 from natcoord_jax.system import System
 
-BALANCE = 1e-6
-"""Largest unbalanced force, relative to the largest force on a body, of what counts as steady."""
+SLIGHT = 1e-9
+"""Displacement, relative to the size of the scene, by which what is unbalanced may move the stiffest part."""
 
 
 class Modes(eqx.Module):
@@ -63,98 +66,98 @@ class Modes(eqx.Module):
         return jnp.where(size > 0, -jnp.real(self.s) / jnp.where(size > 0, size, 1.0), 0.0)
 
 
-class _Steady(eqx.Module):
-    """Balances of all bodies as functions of displacements, twists and accelerations."""
+def _mass_matrix(system: System, state: State) -> Array:
+    """Inertia of displacements and rotations of all bodies, rotors included."""
+    rows, rates, t = state.rows, system.local_rates, state.t
 
-    system: System
-    state: State
-    inputs: Array
-    rotation: Float[Array, "3"]
-    lam: Array
+    def moving(gains: Array) -> tuple[Array, Array]:
+        """Momenta, and rates of rotors."""
+        twists = rates.twists(gains, rows)[:, 0]
+        impulses = inertia(system, row_rates(rows, twists[:, :3], twists[:, 3:]))
+        parts = [x[0] for x in wrench(impulses[None], rows[None, :, 1:])]
+        turning = relative_rates(system, rows, with_rest(twists[:, :3]), with_rest(twists[:, 3:]), t)[0]
+        return rates.balances(jnp.concatenate(parts, axis=1)[:, None], rows), turning
 
-    def forces(self, x: Array, rates: Array) -> Array:
-        """Inertia less loads and reactions [N, N m], for displacements and rates in the rotating frame."""
-        static = Static(self.system, self.state, self.inputs)
-        y = jnp.concatenate([x, self.lam])
-        state = static.displaced(y)
-        rows = state.rows
-        (moved, _), (v_rel, w_rel) = self._apart(x), self._apart(rates)
-        first = rows.shape[0]
-        origin = self.state.rows[:, 0]
-        about = self._steady_velocity(origin)
-        velocity = about + v_rel + cross(self.rotation, moved)
-        spin = jnp.broadcast_to(self.rotation, (first, 3)) + w_rel
-        # Accelerations while the rates in the rotating frame stay as they are.
-        gain = cross(self.rotation, velocity) + cross(self.rotation, v_rel)
-        twist_gain = cross(self.rotation, w_rel)
-        directors = cross(twist_gain[:, None], rows[:, 1:]) + cross(
-            spin[:, None], cross(spin[:, None], rows[:, 1:])
-        )
-        accelerations = jnp.concatenate([gain[:, None], directors], axis=1)
-        impulses = inertia(self.system, accelerations)
-        inertial = wrench(impulses[None], rows[None, :, 1:])
-        applied = loads(self.system, state, self.inputs, velocity, spin)
-        pulled = static.constraint_loads(state, y)
-        parts = [a[0] - b - c for a, b, c in zip(inertial, applied, pulled)]
-        return self._balances(parts)
-
-    def _apart(self, x: Array) -> tuple[Array, Array]:
-        rows = self.state.rows
-        every = self.system.local_rates.twists(x, rows)[:, 0]
-        return every[:, :3], every[:, 3:]
-
-    def _balances(self, forces_and_torques: Sequence[Array]) -> Array:
-        wrenches = jnp.concatenate(forces_and_torques, axis=1)[:, None]
-        return self.system.local_rates.balances(wrenches, self.state.rows)
-
-    def _steady_velocity(self, points: Array) -> Array:
-        v = self.state.row_rates[:, 0]
-        return jnp.where(jnp.any(self.rotation != 0), v, jnp.zeros_like(points))
-
-    def mass_matrix(self) -> Array:
-        """Inertia of displacements and rotations of all bodies, rotors included."""
-        rows = self.state.rows
-
-        def inertial(gains: Array) -> Array:
-            impulses = inertia(self.system, row_rates(rows, *self._apart(gains)))
-            parts = [x[0] for x in wrench(impulses[None], rows[None, :, 1:])]
-            return self._balances(parts)
-
-        size = self.system.local_rates.count
-        matrix = jax.vmap(inertial)(jnp.eye(size)).T
-        groups = rotors_of(self.system)
-        if groups:
-            inertias = jnp.concatenate([jax.vmap(lambda e: e.inertia_of())(g.effect) for g in groups])
-
-            def turning(gains: Array) -> Array:
-                velocity, spin = self._apart(gains)
-                found = relative_rates(self.system, rows, with_rest(velocity), with_rest(spin), self.state.t)
-                return found[0]
-
-            rates = jax.vmap(turning)(jnp.eye(size)).T
-            matrix = matrix + rates.T @ (inertias[:, None] * rates)
-        return matrix
+    momenta, turning = jax.vmap(moving)(jnp.eye(rates.count))
+    groups = rotors_of(system)
+    if groups:
+        momenta = momenta + (turning * rotor_inertias(system)) @ turning.T
+    return momenta.T
 
 
-def _matrices(steady: _Steady, rows: Array, size: int) -> tuple[Array, Array, Array, Array, Array, Array]:
-    """M, D, K in the null space of the constraints, the null space, and the unbalanced and largest forces."""
-    still, free = jnp.zeros(size), jnp.eye(size)
-    left = steady.forces(still, still)
+class _Problem(eqx.Module):
+    """Small motions in the null space of the constraints, and what of the state belongs to them.
+
+    Attributes:
+        mass: M.
+        damping: D.
+        stiffness: K.
+        free: the null space.
+        force: largest force or torque that nothing balances [N, N m].
+        allowed: how large it may be.
+        astray: largest velocity that is none of the rotation, relative to it [-].
+        code: result code, see `steady_code`.
+        static: equations of the state.
+    """
+
+    mass: Array
+    damping: Array
+    stiffness: Array
+    free: Array
+    force: Array
+    allowed: Array
+    astray: Array
+    code: Array
+    static: Static
+
+    @property
+    def steady(self) -> Array:
+        """Whether the state is one."""
+        return (self.force <= self.allowed) & (self.astray <= BALANCE) & (self.code == 0)
+
+
+def _loading(system: System, state: State, inputs: Array, rotation: Array | None) -> tuple[Loading, Array]:
+    """What acts, about the axis that velocities tell, and how far these are from a rotation about it."""
+    if rotation is None:
+        return Loading(inputs), jnp.zeros(())
+    rows, rates = state.rows, system.local_rates
+    points, speed = rows[:, 0], safe_norm(rotation)
+    drift = jnp.mean(state.row_rates[:, 0] - cross(rotation, points), axis=0)
+    about = safe_divide(cross(rotation, drift), speed**2)
+    loading = Loading(inputs, rotation, safe_divide(rotation, speed), about)
+    spin = angular_velocity(rows[:, 1:], state.row_rates[:, 1:])
+    wanted = loading.turning(rotation, rows)
+    missed = jnp.concatenate([state.row_rates[:, 0] - wanted[0], spin - wanted[1]], axis=1)
+    shares = largest(system, rates.balances(missed[:, None], rows), system.size)
+    return loading, safe_divide(jnp.maximum(*shares), speed)
+
+
+@briefly
+def _problem(system: System, state: State, inputs: Array, rotation: Array | None) -> _Problem:
+    rates, start = system.local_rates, state.rows
+    # By their rates: what velocities alone obey has no gaps.
+    by_twist = constraint_matrix(system, state).reshape(-1, rates.bodies, 1, TWIST)
+    rows = jax.vmap(lambda row: rates.balances(row, start))(by_twist)
+    loading, astray = _loading(system, state, inputs, rotation)
+    static, size = Static(system, state, loading), rates.count
+    y, free = jnp.zeros(size + rows.shape[0]), jnp.eye(size)
+    left = static.forces(y)
     if rows.shape[0]:
         # Multipliers carry the steady state; redundant ones have the least norm.
-        dofs = steady.system.structure.dofs
+        dofs = system.structure.dofs
         onto = range_projector(rows.T, size - dofs)
         lam = pseudo_inverse(rows.T, onto, size - dofs) @ left
-        left = left - rows.T @ lam
-        steady = eqx.tree_at(lambda s: s.lam, steady, lam)
+        left, y = left - rows.T @ lam, y.at[size:].set(lam)
         # Any basis will do: one that is held, as far as the constraints admit it, follows them.
         basis = jnp.linalg.svd(jax.lax.stop_gradient(rows), full_matrices=True)[2][size - dofs :].T
         free = basis - onto @ basis
-    stiffness = jax.jacfwd(steady.forces, argnums=0)(still, still)
-    damping = jax.jacfwd(steady.forces, argnums=1)(still, still)
-    mass, damping, reduced = (free.T @ x @ free for x in (steady.mass_matrix(), damping, stiffness))
-    scale = jnp.maximum(jnp.max(jnp.abs(stiffness)) * 1e-6, 1e-300)
-    return mass, damping, reduced, free, jnp.max(jnp.abs(free.T @ left)), scale
+    stiffness = jax.jacfwd(lambda x: static.forces(y.at[:size].set(x)))(y[:size])
+    damping = jax.jacfwd(lambda w: static.forces(y, w))(y[:size])
+    mass, damping, reduced = (free.T @ x @ free for x in (_mass_matrix(system, state), damping, stiffness))
+    allowed = jnp.maximum(SLIGHT * system.size * jnp.max(jnp.abs(stiffness)), 1e-300)
+    force = jnp.max(jnp.abs(free.T @ left), initial=0.0)
+    code = steady_code(static, y[size:], jnp.array(0))
+    return _Problem(mass, damping, reduced, free, force, allowed, astray, code, static)
 
 
 @briefly
@@ -177,16 +180,6 @@ def _damped(mass: Array, damping: Array, stiffness: Array) -> tuple[Array, Array
     top = jnp.concatenate([jnp.zeros((count, count)), jnp.eye(count)], axis=1)
     values, vectors = spectrum(jnp.concatenate([top, -both]), False)
     return values, vectors[:count].T
-
-
-@briefly
-def _problem(system: System, state: State, inputs: Array, rotation: Array) -> tuple[Array, ...]:
-    rates, start = system.local_rates, state.rows
-    # By their rates: what velocities alone obey has no gaps.
-    by_twist = constraint_matrix(system, state).reshape(-1, rates.bodies, 1, TWIST)
-    rows = jax.vmap(lambda row: rates.balances(row, start))(by_twist)
-    steady = _Steady(system, state, inputs, rotation, jnp.zeros(rows.shape[0]))
-    return _matrices(steady, rows, rates.count)
 
 
 @checked(system=SYSTEM, state=STATE, count=Whole(1), rotation=COMPONENTS, inputs=Vector(None), damped=FLAG)
@@ -236,26 +229,44 @@ def modes(
         2.0
     """
     refuse_contacts(system, "vibration")
-    given = jnp.zeros(3) if rotation is None else numbers(rotation, (3,), "modes: rotation", "rad/s")
+    given = None if rotation is None else numbers(rotation, (3,), "modes: rotation", "rad/s")
     channels = len(system.structure.inputs)
     u = jnp.zeros(channels) if inputs is None else numbers(inputs, (channels,), "modes: inputs", "N, N m")
-    mass, damping, stiffness, free, left, scale = _problem(system, state, u, given)
+    problem = _problem(system, state, u, given)
+    mass, damping, stiffness = problem.mass, problem.damping, problem.stiffness
     concrete = is_concrete(mass, damping, stiffness)
     if concrete:
-        if float(left) > BALANCE * float(scale) / 1e-6 * 1e-3:
-            raise ValueError(
-                f"modes: the state is not steady: a force of {float(left):.3g} N or N m is unbalanced; start "
-                "from nc.equilibrium, or pass the rotation [rad/s] that its velocities belong to"
-            )
-        smallest = float(np.linalg.eigvalsh(np.asarray(mass))[0]) if mass.size else 1.0
-        if smallest <= 0:
-            raise ValueError(
-                "modes: a motion moves no mass; give beams a rotary inertia [kg m] and bodies an inertia"
-            )
+        _check(problem)
     if damped is None:
         damped = concrete and _unsymmetric(mass, damping, stiffness)
     s, shapes = _damped(mass, damping, stiffness) if damped else _undamped(mass, stiffness)
-    return _ordered(system, state, s, shapes @ free.T, mass.shape[0], count, damped)
+    s = jnp.where(problem.steady, s, jnp.nan)
+    return _ordered(system, state, s, shapes @ problem.free.T, mass.shape[0], count, damped)
+
+
+def _check(problem: _Problem) -> None:
+    """Refuse a state that is not steady, and motions without inertia."""
+    if problem.static.loading.rotation is not None:
+        remedy = "pass the state of nc.equilibrium(system, state, rotation=...)"
+        if not float(problem.astray) <= BALANCE:
+            raise ValueError(
+                "modes: the velocities of the state [m/s, rad/s] are not those of the rotation [rad/s]: they "
+                f"differ by {float(problem.astray):.3g} of it; {remedy}"
+            )
+        if problem.code != 0:
+            raise ValueError(f"modes: the rotation is not steady: {complaint(problem.static)}")
+    else:
+        remedy = "start from nc.equilibrium, or pass the rotation [rad/s] that its velocities belong to"
+    if not problem.force <= problem.allowed:
+        raise ValueError(
+            f"modes: the state is not steady: a force of {float(problem.force):.3g} N or N m is unbalanced; "
+            f"{remedy}"
+        )
+    mass = np.asarray(problem.mass)
+    if mass.size and float(np.linalg.eigvalsh(mass)[0]) <= 0:
+        raise ValueError(
+            "modes: a motion moves no mass; give beams a rotary inertia [kg m] and bodies an inertia"
+        )
 
 
 def _unsymmetric(mass: Array, damping: Array, stiffness: Array) -> bool:

@@ -1,17 +1,19 @@
 """The equations of equilibrium: no resultant force or torque on any body, no gap in any joint.
 
-Unknowns are the displacements and rotations of all bodies (Cayley's vectors, along the rates that a body
-has) from a given configuration, and the multipliers of all joints and of relations between coordinates. The
-time of the state is the parameter of the load: forces, drives and inputs that are functions of time follow
-it.
+In a steady rotation inertia is one of the forces: it is an equilibrium in a frame that rotates. Unknowns are
+the displacements and rotations of all bodies (Cayley's vectors, along the rates that a body has) from a given
+configuration, and the multipliers of all joints and of relations between coordinates. The time of the state
+is the parameter of the load: forces, drives and inputs that are functions of time follow it.
 """
 
 import functools
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, Bool, Float
 
 from natcoord_jax.core.bodies import NODE
 from natcoord_jax.core.effect import replace_fields
@@ -22,19 +24,29 @@ from natcoord_jax.linsolve.products import Products
 from natcoord_jax.linsolve.sparse import factorised
 from natcoord_jax.maths.collocation import gauss
 from natcoord_jax.maths.elimination import pivoted_inverse
+from natcoord_jax.maths.vectors import cross
+from natcoord_jax.mechanics.admissible_velocities import rotor_rates
 from natcoord_jax.mechanics.element_matrices import bodies_of_elements, dense, rates_of, touches
 from natcoord_jax.mechanics.equations_of_motion import loads
 from natcoord_jax.mechanics.full import FullStep
 from natcoord_jax.mechanics.local import body_motion
-from natcoord_jax.mechanics.momentum import wrench
+from natcoord_jax.mechanics.momentum import inertia, wrench
 from natcoord_jax.mechanics.node_sweeps import sweep_nodes
-from natcoord_jax.mechanics.projection import nearest_coordinates
+from natcoord_jax.mechanics.projection import moving, nearest_coordinates
 from natcoord_jax.mechanics.response import gather, respond, situation, stations
 from natcoord_jax.mechanics.start_cache import StartCache
-from natcoord_jax.mechanics.violations import violations_of
+from natcoord_jax.mechanics.violations import (
+    GAP,
+    constrained,
+    largest,
+    rate_size,
+    relative,
+    violation_rates_of,
+    violations_of,
+)
 from natcoord_jax.model.groups import Group
 from natcoord_jax.model.local_rates import TWIST
-from natcoord_jax.model.rows import group_places, row_rates
+from natcoord_jax.model.rows import group_places, row_rates, rows_with_ground
 from natcoord_jax.model.tree import gather_slots, start_rates
 from natcoord_jax.system import System
 
@@ -44,8 +56,36 @@ NO_MASS = 1e-30
 DENSE = 400
 """Unknowns up to which the Jacobian is inverted as a dense matrix, with pivots."""
 
+LOOSE = 1e-12
+"""Stiffness along the axis of a rotation, relative to the largest there is, that is the rounding of none."""
+
 SHIFT = 1e-10
 """Compliance given to constraints, relative to that of the structure: redundant ones share their load."""
+
+
+class Loading(eqx.Module):
+    """What acts at one load.
+
+    Attributes:
+        inputs: [N, N m].
+        rotation: angular velocity of a steady rotation of everything [rad/s]; None: all is at rest.
+        axis: its direction, also where it is zero [-].
+        about: a point of its axis [m].
+    """
+
+    inputs: Float[Array, " inputs"]
+    rotation: Float[Array, "3"] | None = None
+    axis: Float[Array, "3"] | None = None
+    about: Float[Array, "3"] | None = None
+
+    def turning(self, rate: Array, rows: Float[Array, "*n 4 3"]) -> tuple[Array, Array]:
+        """Velocities and angular velocities of nodes that turn about the axis at a rate [rad/s]."""
+        return cross(rate, rows[..., 0, :] - self.about), jnp.broadcast_to(rate, rows[..., 0, :].shape)
+
+    def accelerations(self, rows: Float[Array, "*n 4 3"], rates: Array | float = 0.0) -> Array:
+        """Those of rows that move at rates in the frame that rotates: centripetal, and of Coriolis."""
+        arms = rows.at[..., 0, :].add(-self.about)
+        return cross(self.rotation, cross(self.rotation, arms) + 2.0 * rates)
 
 
 class Static(eqx.Module):
@@ -54,12 +94,12 @@ class Static(eqx.Module):
     Attributes:
         system: compiled system.
         state: the configuration that displacements count from; its time is the load parameter.
-        inputs: [N, N m].
+        loading: inputs, and the rotation.
     """
 
     system: System
     state: State
-    inputs: Float[Array, " inputs"]
+    loading: Loading
 
     @property
     def balances(self) -> int:
@@ -77,7 +117,7 @@ class Static(eqx.Module):
         return self.balances + sum(g.count * g.multipliers for g in self.groups)
 
     def displaced(self, y: Float[Array, " unknowns"]) -> State:
-        """The state at rest after the displacements in `y`."""
+        """The state, at rest or in steady rotation, after the displacements in `y`."""
         rows = self.state.rows
         twists = self.twists(y)[:, None]
         return self._at(rows + body_motion(rows, twists, jnp.ones((), rows.dtype), gauss(1)).rates[0])
@@ -106,18 +146,43 @@ class Static(eqx.Module):
     def _at(self, rows: Float[Array, "bodies 4 3"]) -> State:
         still = {name: jnp.zeros_like(getattr(self.state, name)) for name in ("v", "rates")}
         state = replace_fields(self.state, q=rows.reshape(-1, 3), **still)
+        if self.loading.rotation is not None:
+            state = self.rotating(state, self.loading.rotation)
+            state = replace_fields(state, rates=rotor_rates(self.system, state))
         return replace_fields(state, coordinates=nearest_coordinates(self.system, state))
+
+    def rotating(self, state: State, rate: Float[Array, "3"]) -> State:
+        """The state with velocities of a rotation of everything; points do not turn."""
+        rows, rates = state.rows, self.system.local_rates
+        twists = jnp.concatenate(self.loading.turning(rate, rows), axis=1)
+        return moving(state, rates.twists(rates.balances(twists[:, None], rows), rows)[:, 0])
 
     def residual(self, y: Float[Array, " unknowns"]) -> Float[Array, " unknowns"]:
         """Unbalanced forces [N] and torques [N m], with opposite sign, and gaps [m, -]."""
+        return jnp.concatenate([self.forces(y), self.gaps(self.displaced(y))])
+
+    def forces(self, y: Array, rates: Float[Array, " balances"] | None = None) -> Float[Array, " balances"]:
+        """Inertia less loads and reactions [N, N m], while displacements change at rates."""
+        return sum(self.terms(y, rates))
+
+    def terms(self, y: Array, rates: Array | None = None) -> list[Float[Array, " balances"]]:
+        """Inertia, loads and reactions, whose sum `forces` is."""
         state = self.displaced(y)
         rows = state.rows
-        still = jnp.zeros_like(rows[:, 0])
-        force, torque = loads(self.system, state, self.inputs, still, still)
-        pulled = self.constraint_loads(state, y)
-        sums = -(jnp.concatenate([force, torque], axis=1) + jnp.concatenate(pulled, axis=1))
-        balances = self.system.local_rates.balances(sums[:, None], self.state.rows)
-        return jnp.concatenate([balances, self.gaps(state)])
+        velocity, spin = jnp.split(jnp.zeros((rows.shape[0], TWIST), rows.dtype), 2, axis=1)
+        if rates is not None:
+            velocity, spin = jnp.split(self.twists(rates), 2, axis=1)
+        inertial = jnp.zeros((rows.shape[0], TWIST), rows.dtype)
+        if self.loading.rotation is not None:
+            rows_rates = row_rates(rows, velocity, spin)
+            impulses = inertia(self.system, self.loading.accelerations(rows, rows_rates))
+            parts = wrench(impulses[None], rows[None, :, 1:])
+            inertial = jnp.concatenate([x[0] for x in parts], axis=1)
+            carried = self.loading.turning(self.loading.rotation, rows)
+            velocity, spin = velocity + carried[0], spin + carried[1]
+        applied = loads(self.system, state, self.loading.inputs, velocity, spin)
+        sums = inertial, *(-jnp.concatenate(x, axis=1) for x in (applied, self.constraint_loads(state, y)))
+        return [self.system.local_rates.balances(x[:, None], self.state.rows) for x in sums]
 
     def constraint_loads(self, state: State, y: Array) -> tuple[Array, Array]:
         """Forces and torques of the multipliers on all bodies."""
@@ -131,7 +196,7 @@ class Static(eqx.Module):
             size = group.count * group.multipliers
             lam = y[position : position + size].reshape(group.count, 1, group.multipliers)
             position += size
-            where = situation(self.system, group, state, self.inputs, jnp.zeros((), rows.dtype))
+            where = situation(self.system, group, state, self.loading.inputs, jnp.zeros((), rows.dtype))
             answer = respond(group, where, gather(group, at), lam, tableau)
             if answer.forces is not None:
                 on_rows = on_rows.at[group.bodies].add(answer.forces[:, 0])
@@ -159,7 +224,7 @@ class Static(eqx.Module):
         system = replace_fields(self.system, mass=scale * self.system.mass, mass_between=between)
         here = self.displaced(jnp.zeros_like(y))
         step = FullStep.prepare(
-            system, here, self.inputs, jnp.ones((), y.dtype), gauss(1), StartCache(None, None)
+            system, here, self.loading.inputs, jnp.ones((), y.dtype), gauss(1), StartCache(None, None)
         )
         # Times of a step of length one, shifted to that of the load; fields act on masses as they are.
         situations = tuple(
@@ -170,7 +235,36 @@ class Static(eqx.Module):
         resting = y.at[: self.balances].set(0.0)
         every, products = step.matrices(resting, exact=False), step.products(resting)
         doubled = [x.at[:, :w, :w].multiply(2.0) for x, w in zip(every, self._widths)]
+        if self.loading.rotation is not None:
+            bodies, between = np.arange(self.system.local_rates.bodies), self.system.mass_between
+            blocks = self.system.mass[:, None, :, None]
+            doubled[0] = doubled[0] + self._centrifugal(blocks, bodies[:, None], TWIST)
+            if between is not None:
+                rows = between.rows
+                blocks = jnp.zeros((len(between.blocks), 2, rows, 2, rows), y.dtype)
+                blocks = blocks.at[:, 0, :, 1].set(between.blocks)
+                blocks = blocks.at[:, 1, :, 0].set(jnp.swapaxes(between.blocks, 1, 2))
+                doubled[1] = doubled[1] + self._centrifugal(blocks, between.bodies, between.rates)
         return doubled, tuple(product.times(2.0) for product in products)
+
+    def _centrifugal(self, blocks: Float[Array, "n k r k r"], bodies: Any, components: int) -> Array:
+        """Derivatives of wrenches of inertia on some bodies by their twists, by mass of and between them."""
+        start, carried = self.state.rows, blocks.shape[2]
+
+        def inertial(twists: Array, blocks: Array, rows: Array) -> Array:
+            twists = jnp.pad(twists, ((0, 0), (0, TWIST - components)))
+            rows = rows + row_rates(rows, twists[:, :3], twists[:, 3:])
+            gains = self.loading.accelerations(rows)[:, :carried]
+            momenta = jnp.zeros_like(rows).at[:, :carried].set(jnp.einsum("arbs,bsx->arx", blocks, gains))
+            parts = wrench(momenta[None], rows[None, :, 1:])
+            return jnp.concatenate([x[0] for x in parts], axis=1)[:, :components]
+
+        still, width = jnp.zeros((bodies.shape[1], components), start.dtype), bodies.shape[1] * components
+        found = jax.vmap(jax.jacfwd(inertial), (None, 0, 0))(still, blocks, start[bodies])
+        if components == TWIST:
+            along = self.system.local_rates.blocks(bodies, rows_with_ground(self.state.q))
+            found = along(along(found[:, :, None, :, :, None], 1), 4)
+        return found.reshape(-1, width, width)
 
     @property
     def _widths(self) -> list[int]:
@@ -180,30 +274,72 @@ class Static(eqx.Module):
         coupled = [] if between is None else [2 * between.rates]
         return [TWIST, *coupled, *(rates_of(g) * bodies_of_elements(g).shape[1] for g in groups)]
 
-    def solver(self, y: Float[Array, " unknowns"], weight: Array | float = 0.0) -> Any:
+    def solver(self, y: Float[Array, " unknowns"], weight: Array | float = 0.0) -> tuple[Any, Array]:
         """What solves equations with the Jacobian at displacements zero, slightly regularised.
 
         Returns:
-            An object with `solve(right)` and `transpose()`.
+            An object with `solve(right)` and `transpose()`; what holds motions that nothing resists, as
+            stiffnesses of all unknowns, see `idle`.
         """
         (given, products), sparsity = self.matrices(y, weight), self.system.sparsity
         if sparsity is None or self.unknowns <= DENSE:
-            return self.inverse(dense(self.system, given, self.unknowns, products=products))
+            return self.inverse(y, dense(self.system, given, self.unknowns, products=products))
         pulls = (jnp.max(jnp.abs(x[:, w:, :w]), initial=1e-300) for x, w in zip(given, self._widths))
         arms = functools.reduce(jnp.maximum, pulls)
         matrix: Any = sparsity.pattern.assemble(*given)
-        found = factorised(sparsity.plan, matrix.with_diagonal(self._shifts(matrix.diagonal(), arms)))
+        shifts, pins = self._shifts(y, matrix.diagonal(), arms)
+        found = factorised(sparsity.plan, matrix.with_diagonal(shifts))
         for product in products:
             found = product.around(found)
-        return found
+        return found, pins
 
-    def inverse(self, matrix: Float[Array, "unknowns unknowns"]) -> Inverse:
-        """Inverse of the Jacobian, slightly regularised."""
+    def inverse(self, y: Array, matrix: Float[Array, "unknowns unknowns"]) -> tuple[Inverse, Array]:
+        """Inverse of the Jacobian, slightly regularised, and what holds motions that nothing resists."""
         arms = jnp.max(jnp.abs(matrix[self.balances :, : self.balances]), initial=1e-300)
-        return Inverse(pivoted_inverse(matrix + jnp.diag(self._shifts(jnp.diagonal(matrix), arms))))
+        shifts, pins = self._shifts(y, jnp.diagonal(matrix), arms)
+        return Inverse(pivoted_inverse(matrix + jnp.diag(shifts))), pins
 
-    def _shifts(self, diagonal: Float[Array, " unknowns"], arms: Array) -> Float[Array, " unknowns"]:
-        """What is added to the diagonal: a compliance of the constraints."""
+    def _shifts(self, y: Array, diagonal: Float[Array, " unknowns"], arms: Array) -> tuple[Array, Array]:
+        """What is added to the diagonal: compliances of constraints, and stiffnesses of `idle` motions."""
         stiffness = jnp.max(jnp.abs(diagonal[: self.balances]), initial=0.0)
-        shift = SHIFT * arms**2 / jnp.where(stiffness > 0, stiffness, 1.0)
-        return jnp.where(jnp.arange(diagonal.shape[0]) < self.balances, 0.0, shift)
+        size = jnp.where(stiffness > 0, stiffness, 1.0)
+        balances = jnp.arange(diagonal.shape[0]) < self.balances
+        pins = jnp.zeros_like(diagonal)
+        if self.loading.rotation is not None:
+            # Each by one of its rates, that which takes most of its energy.
+            motions, idle = self.idle(y, size)
+            most = jnp.argmax(motions**2 * self._inertias, axis=1)
+            pins = pins.at[most].max(jnp.where(idle, size, 0.0))
+        return jnp.where(balances, pins, SHIFT * arms**2 / size), pins
+
+    @property
+    def _inertias(self) -> Float[Array, " balances"]:
+        """Of all rates: the mass [kg], or twice the mean moment of inertia [kg m^2], of its body."""
+        mass = self.system.mass
+        parts = jnp.stack([mass[:, 0, 0], jnp.trace(mass[:, 1:, 1:], axis1=1, axis2=2)], axis=1)
+        return self.system.local_rates.picked(jnp.repeat(parts, 3, axis=1)[:, None])
+
+    def idle(self, y: Array, stiffness: Array | float) -> tuple[Float[Array, "2 balances"], Bool[Array, "2"]]:
+        """A turn of everything about the axis and a shift along it, and whether nothing resists them.
+
+        Args:
+            y: displacements zero, and multipliers.
+            stiffness: of the system, the largest on the diagonal.
+        """
+        rows, rates = self.state.rows, self.system.local_rates
+        velocity, spin = self.loading.turning(self.loading.axis, rows)
+        groups = constrained(self.system)
+
+        def motion(velocity: Array, spin: Array) -> tuple[Array, Array]:
+            w = rates.balances(jnp.concatenate([velocity, spin], axis=1)[:, None], rows)
+            state = moving(self.state, rates.twists(w, rows)[:, 0])
+            opened = largest(
+                relative(self.system, groups, violation_rates_of(self.system, groups, state, 0.0))
+            )
+            size = rate_size(self.system, state)
+            return w, (opened <= GAP * size) & (size > 0)
+
+        turn, shift = motion(velocity, spin), motion(jnp.broadcast_to(spin, velocity.shape), 0.0 * spin)
+        pull = jax.jvp(lambda x: self.forces(y.at[: x.shape[0]].set(x)), (y[: rates.count],), (shift[0],))[1]
+        loose = jnp.max(jnp.abs(pull)) <= LOOSE * stiffness * jnp.max(jnp.abs(shift[0]))
+        return jnp.stack([turn[0], shift[0]]), jnp.stack([turn[1], shift[1] & loose])

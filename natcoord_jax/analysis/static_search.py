@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from natcoord_jax.analysis.static_equations import Static
+from natcoord_jax.analysis.static_equations import Loading, Static
 from natcoord_jax.core.results import Result
 from natcoord_jax.core.state import State
 from natcoord_jax.system import System
@@ -64,7 +64,9 @@ def largest(system: System, change: Float[Array, " balances"], extent: Array) ->
     return moved / extent, turned
 
 
-def search_equilibrium(system: System, state: State, lam: Array, inputs: Array, snap: bool = True) -> Search:
+def search_equilibrium(
+    system: System, state: State, lam: Array, loading: Loading, snap: bool = True
+) -> Search:
     """Newton's method from a configuration and multipliers; every iteration counts from where it is.
 
     Where it fails, it begins again with inertia added to the stiffness, which keeps corrections short and
@@ -74,13 +76,13 @@ def search_equilibrium(system: System, state: State, lam: Array, inputs: Array, 
     extent = extent_of(system, state)
 
     def trip(search: Search) -> Search:
-        static, slowed = Static(system, search.state, inputs), search.weight > 0
+        static, slowed = Static(system, search.state, loading), search.weight > 0
         y = jnp.concatenate([jnp.zeros(static.balances), search.lam])
         residual = static.residual(y)
         pull = jnp.max(jnp.abs(residual[: static.balances]))
         begun = pull / (jnp.mean(system.mass[:, 0, 0]) * SHORT * extent)
         heaviest = jnp.where(search.count == 0, begun, search.heaviest)
-        change = -static.solver(y, search.weight).solve(residual)
+        change = -static.solver(y, search.weight)[0].solve(residual)
         moved, turned = largest(system, change[: static.balances], extent)
         correction = jnp.maximum(moved, turned)
         finite = jnp.all(jnp.isfinite(change))
