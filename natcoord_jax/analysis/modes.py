@@ -240,7 +240,7 @@ def modes(
     if damped is None:
         damped = concrete and _unsymmetric(mass, damping, stiffness)
     s, shapes = _damped(mass, damping, stiffness) if damped else _undamped(mass, stiffness)
-    s = jnp.where(problem.steady, s, jnp.nan)
+    s = jnp.where(problem.steady, s, complex(jnp.nan, jnp.nan))
     return _ordered(system, state, s, shapes @ problem.free.T, mass.shape[0], count, damped)
 
 
@@ -254,7 +254,7 @@ def _check(problem: _Problem) -> None:
                 f"differ by {float(problem.astray):.3g} of it; {remedy}"
             )
         if problem.code != 0:
-            raise ValueError(f"modes: the rotation is not steady: {complaint(problem.static)}")
+            raise ValueError(f"modes: the rotation is not steady: {complaint(problem.static)}; {remedy}")
     else:
         remedy = "start from nc.equilibrium, or pass the rotation [rad/s] that its velocities belong to"
     if not problem.force <= problem.allowed:

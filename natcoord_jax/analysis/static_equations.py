@@ -309,7 +309,7 @@ class Static(eqx.Module):
             # Each by one of its rates, that which takes most of its energy.
             motions, idle = self.idle(y, size)
             most = jnp.argmax(motions**2 * self._inertias, axis=1)
-            pins = pins.at[most].max(jnp.where(idle, size, 0.0))
+            pins = pins.at[most].max(jnp.where(idle, size / SHIFT, 0.0))
         return jnp.where(balances, pins, SHIFT * arms**2 / size), pins
 
     @property

@@ -86,32 +86,26 @@ def complaint(static: Static) -> str:
             f"{group.effect.kind} {group.names[number]!r} does not let everything turn about this axis at "
             "this rate; pass a point of the axis as about= [m], and give drives its rate"
         )
-    y = jnp.zeros(static.unknowns)
-    for each in (static, on):
-        pulls, sizes = (np.asarray(x) for x in _pulls(each, y))
-        for pull, size, said in zip(pulls, sizes, ("torque of {:.3g} N m about", "force of {:.3g} N along")):
-            if abs(pull) > BALANCE * size:
-                said = f"a {said.format(abs(pull))} the axis is not balanced{_not_turning(static, on)}"
-                return f"{said}; give it a drive (nc.Drive) at the rate of the rotation, or inputs of a motor"
-    return (
-        f"what acts changes as everything turns{_not_turning(static, on)}; let it act along the axis, or turn"
-    )
+    part = _not_turning(static, on)
+    if part:
+        return f"{part} does not turn along; let it act along the axis, or on what turns"
+    pulls = np.asarray(_pulls(static, jnp.zeros(static.unknowns))[0])
+    said = f"a torque of {pulls[0]:.3g} N m about the axis and a force of {pulls[1]:.3g} N along it"
+    return f"{said} are not balanced; give a drive (nc.Drive) the rate of the rotation, or motors inputs"
 
 
 def _not_turning(static: Static, on: Static) -> str:
-    """The effect whose forces do not turn along most."""
+    """The effect whose forces turn along least, if any of them do not."""
 
     def acting(at: Static, group: Group) -> tuple[Array, Array]:
-        system = replace_fields(at.system, effects=(group,))
-        return loads(
-            system, at.state, at.loading.inputs, *at.loading.turning(at.loading.rotation, at.state.rows)
-        )
+        system, moving = replace_fields(at.system, effects=(group,)), at.loading.turning
+        return loads(system, at.state, at.loading.inputs, *moving(at.loading.rotation, at.state.rows))
 
-    back, extent = from_rotation_vector(static.loading.axis), extent_of(static.system, static.state)
-    sizes = {}
+    back, sizes = from_rotation_vector(static.loading.axis), {}
     for group in static.system.effects:
-        pairs = zip(acting(static, group), acting(on, group), (extent, 1.0))
-        change = [jnp.max(jnp.abs(now - then @ back)) * arm for now, then, arm in pairs]
-        sizes[f" ({group.effect.kind} {group.labels[0]!r} does not turn along)"] = float(max(change))
-    size = max(sizes.values(), default=0.0)
-    return max(sizes, key=lambda x: sizes[x]) if size > 0 else ""
+        pairs = list(zip(acting(static, group), acting(on, group)))
+        change = sum(float(jnp.sum((now - then @ back) ** 2)) for now, then in pairs)
+        size = sum(float(jnp.sum(now**2)) for now, _ in pairs)
+        if change > BALANCE**2 * size:
+            sizes[f"{group.effect.kind} {group.labels[0]!r}"] = change
+    return max(sizes, key=lambda name: sizes[name], default="")
