@@ -16,9 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from natcoord_jax.analysis.static_equations import Loading, Static
+from natcoord_jax.analysis.static_equations import BALANCE, Loading, Static
 from natcoord_jax.analysis.static_search import largest
-from natcoord_jax.analysis.steady_rotation import BALANCE, complaint, steady_code
+from natcoord_jax.analysis.steady_rotation import complaint, turns_along
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.checks import is_concrete, numbers
 from natcoord_jax.core.compiled import briefly
@@ -96,7 +96,7 @@ class _Problem(eqx.Module):
         force: largest force or torque that nothing balances [N, N m].
         allowed: how large it may be.
         astray: largest velocity that is none of the rotation, relative to it [-].
-        code: result code, see `steady_code`.
+        turns: whether it turns along, and all that acts.
         static: equations of the state.
     """
 
@@ -107,13 +107,13 @@ class _Problem(eqx.Module):
     force: Array
     allowed: Array
     astray: Array
-    code: Array
+    turns: Array
     static: Static
 
     @property
     def steady(self) -> Array:
         """Whether the state is one."""
-        return (self.force <= self.allowed) & (self.astray <= BALANCE) & (self.code == 0)
+        return (self.force <= self.allowed) & (self.astray <= BALANCE) & self.turns
 
 
 def _loading(system: System, state: State, inputs: Array, rotation: Array | None) -> tuple[Loading, Array]:
@@ -156,8 +156,13 @@ def _problem(system: System, state: State, inputs: Array, rotation: Array | None
     mass, damping, reduced = (free.T @ x @ free for x in (_mass_matrix(system, state), damping, stiffness))
     allowed = jnp.maximum(SLIGHT * system.size * jnp.max(jnp.abs(stiffness)), 1e-300)
     force = jnp.max(jnp.abs(free.T @ left), initial=0.0)
-    code = steady_code(static, y[size:], jnp.array(0))
-    return _Problem(mass, damping, reduced, free, force, allowed, astray, code, static)
+    turns = jnp.array(True)
+    if rotation is not None:
+        # What it meets on its way must not change.
+        turn = static.balanced(jnp.concatenate(loading.turning(loading.axis, start), axis=1))
+        change = jnp.max(jnp.abs(free.T @ (stiffness @ turn)), initial=0.0)
+        turns = turns_along(static) & (change <= allowed)
+    return _Problem(mass, damping, reduced, free, force, allowed, astray, turns, static)
 
 
 @briefly
@@ -253,7 +258,7 @@ def _check(problem: _Problem) -> None:
                 "modes: the velocities of the state [m/s, rad/s] are not those of the rotation [rad/s]: they "
                 f"differ by {float(problem.astray):.3g} of it; {remedy}"
             )
-        if problem.code != 0:
+        if not problem.turns:
             raise ValueError(f"modes: the rotation is not steady: {complaint(problem.static)}; {remedy}")
     else:
         remedy = "start from nc.equilibrium, or pass the rotation [rad/s] that its velocities belong to"

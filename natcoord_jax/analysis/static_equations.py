@@ -7,6 +7,7 @@ is the parameter of the load: forces, drives and inputs that are functions of ti
 """
 
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -24,15 +25,17 @@ from natcoord_jax.linsolve.products import Products
 from natcoord_jax.linsolve.sparse import factorised
 from natcoord_jax.maths.collocation import gauss
 from natcoord_jax.maths.elimination import pivoted_inverse
+from natcoord_jax.maths.rotations import from_rotation_vector
 from natcoord_jax.maths.vectors import cross
 from natcoord_jax.mechanics.admissible_velocities import rotor_rates
+from natcoord_jax.mechanics.coordinates import state_rates
 from natcoord_jax.mechanics.element_matrices import bodies_of_elements, dense, rates_of, touches
 from natcoord_jax.mechanics.equations_of_motion import loads
 from natcoord_jax.mechanics.full import FullStep
 from natcoord_jax.mechanics.local import body_motion
 from natcoord_jax.mechanics.momentum import inertia, wrench
 from natcoord_jax.mechanics.node_sweeps import sweep_nodes
-from natcoord_jax.mechanics.projection import moving, nearest_coordinates
+from natcoord_jax.mechanics.projection import moved, moving, nearest_coordinates
 from natcoord_jax.mechanics.response import gather, respond, situation, stations
 from natcoord_jax.mechanics.start_cache import StartCache
 from natcoord_jax.mechanics.violations import (
@@ -58,6 +61,9 @@ DENSE = 400
 
 LOOSE = 1e-12
 """Stiffness along the axis of a rotation, relative to the largest there is, that is the rounding of none."""
+
+BALANCE = 1e-6
+"""Largest unbalanced force, relative to the forces that balance each other, of what counts as steady."""
 
 SHIFT = 1e-10
 """Compliance given to constraints, relative to that of the structure: redundant ones share their load."""
@@ -163,26 +169,28 @@ class Static(eqx.Module):
 
     def forces(self, y: Array, rates: Float[Array, " balances"] | None = None) -> Float[Array, " balances"]:
         """Inertia less loads and reactions [N, N m], while displacements change at rates."""
-        return sum(self.terms(y, rates))
+        return self.balanced(jnp.sum(self.wrenches(y, rates), axis=0))
 
-    def terms(self, y: Array, rates: Array | None = None) -> list[Float[Array, " balances"]]:
-        """Inertia, loads and reactions, whose sum `forces` is."""
+    def balanced(self, wrenches: Float[Array, "bodies 6"]) -> Float[Array, " balances"]:
+        """What wrenches on all bodies do along their rates."""
+        return self.system.local_rates.balances(wrenches[:, None], self.state.rows)
+
+    def wrenches(self, y: Array, rates: Array | None = None) -> Float[Array, "terms bodies 6"]:
+        """Forces and torques of inertia, of loads and of reactions, whose sum vanishes."""
         state = self.displaced(y)
         rows = state.rows
-        velocity, spin = jnp.split(jnp.zeros((rows.shape[0], TWIST), rows.dtype), 2, axis=1)
-        if rates is not None:
-            velocity, spin = jnp.split(self.twists(rates), 2, axis=1)
-        inertial = jnp.zeros((rows.shape[0], TWIST), rows.dtype)
+        moving_by = jnp.zeros((rows.shape[0], TWIST), rows.dtype) if rates is None else self.twists(rates)
+        velocity, spin = jnp.split(moving_by, 2, axis=1)
+        terms = []
         if self.loading.rotation is not None:
-            rows_rates = row_rates(rows, velocity, spin)
-            impulses = inertia(self.system, self.loading.accelerations(rows, rows_rates))
-            parts = wrench(impulses[None], rows[None, :, 1:])
-            inertial = jnp.concatenate([x[0] for x in parts], axis=1)
+            gains = self.loading.accelerations(rows, row_rates(rows, velocity, spin))
+            parts = wrench(inertia(self.system, gains)[None], rows[None, :, 1:])
+            terms.append([-x[0] for x in parts])
             carried = self.loading.turning(self.loading.rotation, rows)
             velocity, spin = velocity + carried[0], spin + carried[1]
-        applied = loads(self.system, state, self.loading.inputs, velocity, spin)
-        sums = inertial, *(-jnp.concatenate(x, axis=1) for x in (applied, self.constraint_loads(state, y)))
-        return [self.system.local_rates.balances(x[:, None], self.state.rows) for x in sums]
+        terms.append(loads(self.system, state, self.loading.inputs, velocity, spin))
+        terms.append(self.constraint_loads(state, y))
+        return -jnp.stack([jnp.concatenate(x, axis=1) for x in terms])
 
     def constraint_loads(self, state: State, y: Array) -> tuple[Array, Array]:
         """Forces and torques of the multipliers on all bodies."""
@@ -278,68 +286,75 @@ class Static(eqx.Module):
         """What solves equations with the Jacobian at displacements zero, slightly regularised.
 
         Returns:
-            An object with `solve(right)` and `transpose()`; what holds motions that nothing resists, as
-            stiffnesses of all unknowns, see `idle`.
+            An object with `solve(right)` and `transpose()`; stiffnesses against what nothing resists.
         """
         (given, products), sparsity = self.matrices(y, weight), self.system.sparsity
         if sparsity is None or self.unknowns <= DENSE:
-            return self.inverse(y, dense(self.system, given, self.unknowns, products=products))
+            return self.inverse(dense(self.system, given, self.unknowns, products=products))
         pulls = (jnp.max(jnp.abs(x[:, w:, :w]), initial=1e-300) for x, w in zip(given, self._widths))
         arms = functools.reduce(jnp.maximum, pulls)
         matrix: Any = sparsity.pattern.assemble(*given)
-        shifts, pins = self._shifts(y, matrix.diagonal(), arms)
+        shifts, pins = self._shifts(matrix.multiply, matrix.diagonal(), arms)
         found = factorised(sparsity.plan, matrix.with_diagonal(shifts))
         for product in products:
             found = product.around(found)
         return found, pins
 
-    def inverse(self, y: Array, matrix: Float[Array, "unknowns unknowns"]) -> tuple[Inverse, Array]:
+    def inverse(self, matrix: Float[Array, "unknowns unknowns"]) -> tuple[Inverse, Array]:
         """Inverse of the Jacobian, slightly regularised, and what holds motions that nothing resists."""
         arms = jnp.max(jnp.abs(matrix[self.balances :, : self.balances]), initial=1e-300)
-        shifts, pins = self._shifts(y, jnp.diagonal(matrix), arms)
+        shifts, pins = self._shifts(lambda x: matrix @ x, jnp.diagonal(matrix), arms)
         return Inverse(pivoted_inverse(matrix + jnp.diag(shifts))), pins
 
-    def _shifts(self, y: Array, diagonal: Float[Array, " unknowns"], arms: Array) -> tuple[Array, Array]:
-        """What is added to the diagonal: compliances of constraints, and stiffnesses of `idle` motions."""
+    def _shifts(
+        self, multiply: Callable[[Array], Array], diagonal: Float[Array, " unknowns"], arms: Array
+    ) -> tuple[Array, Array]:
+        """What is added to the diagonal: compliances of constraints, stiffnesses where there are none."""
         stiffness = jnp.max(jnp.abs(diagonal[: self.balances]), initial=0.0)
         size = jnp.where(stiffness > 0, stiffness, 1.0)
-        balances = jnp.arange(diagonal.shape[0]) < self.balances
-        pins = jnp.zeros_like(diagonal)
+        pins, balances = jnp.zeros_like(diagonal), jnp.arange(diagonal.shape[0]) < self.balances
         if self.loading.rotation is not None:
+            (turn, shift), free = self.free_motions()
+            pull = jnp.max(jnp.abs(multiply(jnp.zeros_like(diagonal).at[: self.balances].set(shift))))
+            free = free & jnp.stack([True, pull <= LOOSE * size * jnp.max(jnp.abs(shift))])
             # Each by one of its rates, that which takes most of its energy.
-            motions, idle = self.idle(y, size)
-            most = jnp.argmax(motions**2 * self._inertias, axis=1)
-            pins = pins.at[most].max(jnp.where(idle, size / SHIFT, 0.0))
+            mass, moment = (
+                self.system.mass[:, :1, 0],
+                jnp.trace(self.system.mass[:, 1:, 1:], axis1=1, axis2=2),
+            )
+            parts = jnp.repeat(jnp.concatenate([mass, moment[:, None]], axis=1), 3, axis=1)
+            energies = jnp.stack([turn, shift]) ** 2 * self.system.local_rates.picked(parts[:, None])
+            pins = pins.at[jnp.argmax(energies, axis=1)].max(jnp.where(free, size / SHIFT, 0.0))
         return jnp.where(balances, pins, SHIFT * arms**2 / size), pins
 
-    @property
-    def _inertias(self) -> Float[Array, " balances"]:
-        """Of all rates: the mass [kg], or twice the mean moment of inertia [kg m^2], of its body."""
-        mass = self.system.mass
-        parts = jnp.stack([mass[:, 0, 0], jnp.trace(mass[:, 1:, 1:], axis1=1, axis2=2)], axis=1)
-        return self.system.local_rates.picked(jnp.repeat(parts, 3, axis=1)[:, None])
-
-    def idle(self, y: Array, stiffness: Array | float) -> tuple[Float[Array, "2 balances"], Bool[Array, "2"]]:
-        """A turn of everything about the axis and a shift along it, and whether nothing resists them.
-
-        Args:
-            y: displacements zero, and multipliers.
-            stiffness: of the system, the largest on the diagonal.
-        """
-        rows, rates = self.state.rows, self.system.local_rates
-        velocity, spin = self.loading.turning(self.loading.axis, rows)
-        groups = constrained(self.system)
+    def free_motions(self) -> tuple[Float[Array, "2 balances"], Bool[Array, "2"]]:
+        """A turn of everything about the axis and a shift along it, and whether constraints admit them."""
+        rows, rates, groups = self.state.rows, self.system.local_rates, constrained(self.system)
 
         def motion(velocity: Array, spin: Array) -> tuple[Array, Array]:
-            w = rates.balances(jnp.concatenate([velocity, spin], axis=1)[:, None], rows)
+            w = self.balanced(jnp.concatenate([velocity, spin], axis=1))
             state = moving(self.state, rates.twists(w, rows)[:, 0])
-            opened = largest(
-                relative(self.system, groups, violation_rates_of(self.system, groups, state, 0.0))
-            )
+            changes = relative(self.system, groups, violation_rates_of(self.system, groups, state, 0.0))
             size = rate_size(self.system, state)
-            return w, (opened <= GAP * size) & (size > 0)
+            return w, (largest(changes) <= GAP * size) & (size > 0)
 
-        turn, shift = motion(velocity, spin), motion(jnp.broadcast_to(spin, velocity.shape), 0.0 * spin)
-        pull = jax.jvp(lambda x: self.forces(y.at[: x.shape[0]].set(x)), (y[: rates.count],), (shift[0],))[1]
-        loose = jnp.max(jnp.abs(pull)) <= LOOSE * stiffness * jnp.max(jnp.abs(shift[0]))
-        return jnp.stack([turn[0], shift[0]]), jnp.stack([turn[1], shift[1] & loose])
+        velocity, spin = self.loading.turning(self.loading.axis, rows)
+        return jax.vmap(motion)(jnp.stack([velocity, spin]), jnp.stack([spin, jnp.zeros_like(spin)]))
+
+    def turned(self) -> "Static":
+        """The same when everything has turned on by a radian."""
+        state, axis = self.state, self.loading.axis
+        arms = state.rows[:, 0] - self.loading.about
+        shifts = arms @ from_rotation_vector(axis).T - arms
+        twists = jnp.concatenate([shifts, jnp.broadcast_to(axis, arms.shape)], axis=1)
+        increments = state_rates(self.system, self.rotating(state, axis))
+        return replace_fields(self, state=moved(self.system, state, twists, increments))
+
+    def pulls(self, wrenches: Float[Array, "terms bodies 6"]) -> tuple[Float[Array, "2"], Bool[Array, ""]]:
+        """Torque about the axis [N m] and force along it [N] that nothing balances; if both are slight."""
+        motions, free = self.free_motions()
+        terms = jax.vmap(self.balanced)(wrenches)
+        pulls = jnp.where(free, motions @ jnp.sum(terms, axis=0), 0.0)
+        return pulls, jnp.all(
+            jnp.abs(pulls) <= BALANCE * (jnp.abs(motions) @ jnp.sum(jnp.abs(terms), axis=0))
+        )

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from natcoord_jax.analysis.static_equations import DENSE, Loading, Static
 from natcoord_jax.analysis.static_search import code_of_search, search_equilibrium
-from natcoord_jax.analysis.steady_rotation import complaint, steady_code
+from natcoord_jax.analysis.steady_rotation import complaint, turns_along
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.checks import at_top_level, is_concrete
 from natcoord_jax.core.compiled import briefly
@@ -73,7 +73,7 @@ def differentiable(system: System, state: State, lam: Array, loading: Loading) -
     def tangent_solve(linear: Any, right: Array) -> Array:
         # The Jacobian itself where it is small; nearly so of large meshes, whose formulas leave parts out.
         if static.unknowns <= DENSE:
-            solver, pins = static.inverse(at, jax.jacfwd(linear)(jnp.zeros_like(right)))
+            solver, pins = static.inverse(jax.jacfwd(linear)(jnp.zeros_like(right)))
         else:
             solver, pins = jax.lax.stop_gradient(static).solver(at)
         # What nothing resists stays where it is.
@@ -257,7 +257,10 @@ def _equilibria(
         begin = replace_fields(now, t=jax.lax.stop_gradient(value))
         search = search_equilibrium(still[0], begin, lam, jax.lax.stop_gradient(u), snap)
         code = code_of(still[0], search.state, code_of_search(search))
-        code = steady_code(Static(still[0], search.state, jax.lax.stop_gradient(u)), search.lam, code)
+        if given.rotation is not None:
+            turns = turns_along(Static(still[0], search.state, jax.lax.stop_gradient(u)))
+            steady = search.steady & turns | jnp.all(u.rotation == 0)
+            code = jnp.where((code == 0) & ~steady, int(Result.UNSTEADY), code)
         code = jnp.where(alive, code, int(Result.DIVERGED))
         good = code == int(Result.SUCCESSFUL)
         reached = jax.tree.map(lambda a, b: jnp.where(good, a, b), (search.state, search.lam), (now, lam))

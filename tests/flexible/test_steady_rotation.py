@@ -1,8 +1,8 @@
 """Steady rotations: relative equilibria, what hangs on a joint that turns, and small motions about them.
 
-Could go wrong: half of the centrifugal force; a stiffness without it, so that nothing converges or derivatives
-are of something else; a body left at rest; a rotation taken for steady that a spring, a weight or a drive ends
-at once; velocities of the state that are none of the rotation.
+Could go wrong: half of the centrifugal force; a stiffness without it, so that nothing converges, or with
+derivatives of something else; a body left at rest; a rotation taken for steady that a spring, a weight or a
+drive ends at once; velocities of the state that are none of the rotation.
 """
 
 import jax
