@@ -93,7 +93,9 @@ def search_equilibrium(
         pull = jnp.max(jnp.abs(residual[: static.balances]))
         begun = pull / (jnp.mean(system.mass[:, 0, 0]) * SHORT * extent)
         heaviest = jnp.where(search.count == 0, begun, search.heaviest)
-        change = -static.solver(y, search.weight)[0].solve(residual)
+        # Reactions to a rotation first, hardly without a motion: they are part of the stiffness.
+        inert = jnp.where(rotating & (search.count == 0), begun / FLOOR, search.weight)
+        change = -static.solver(y, inert)[0].solve(residual)
         moved, turned = largest(system, change[: static.balances], extent)
         correction = jnp.maximum(moved, turned)
         finite = jnp.all(jnp.isfinite(change))
@@ -111,7 +113,7 @@ def search_equilibrium(
         lost = ~slowed & ~done & (~finite | (search.count + 1 >= ITERATIONS))
         now, pulls = jax.tree.map(lambda a, b: jnp.where(lost, a, b), (state, lam), after)
         weight = jnp.where(lost, heaviest, weight)
-        first = jnp.where(search.count == 0, correction, search.first)
+        first = jnp.where(search.count <= int(rotating), correction, search.first)
         snapped = search.snapped | lost | (correction > jnp.maximum(first, FLOOR))
         count, over = search.count + 1, done
         if not rotating:
