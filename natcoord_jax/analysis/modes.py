@@ -85,37 +85,6 @@ def _mass_matrix(system: System, state: State) -> Array:
     return momenta.T
 
 
-class _Problem(eqx.Module):
-    """Small motions in the null space of the constraints, and what of the state belongs to them.
-
-    Attributes:
-        mass: M.
-        damping: D.
-        stiffness: K.
-        free: the null space.
-        force: largest force or torque that nothing balances [N, N m].
-        allowed: how large it may be.
-        astray: largest velocity that is none of the rotation, relative to it [-].
-        turns: whether it turns along, and all that acts.
-        static: equations of the state.
-    """
-
-    mass: Array
-    damping: Array
-    stiffness: Array
-    free: Array
-    force: Array
-    allowed: Array
-    astray: Array
-    turns: Array
-    static: Static
-
-    @property
-    def steady(self) -> Array:
-        """Whether the state is one."""
-        return (self.force <= self.allowed) & (self.astray <= BALANCE) & self.turns
-
-
 def _loading(system: System, state: State, inputs: Array, rotation: Array | None) -> tuple[Loading, Array]:
     """What acts, about the axis that velocities tell, and how far these are from a rotation about it."""
     if rotation is None:
@@ -133,7 +102,14 @@ def _loading(system: System, state: State, inputs: Array, rotation: Array | None
 
 
 @briefly
-def _problem(system: System, state: State, inputs: Array, rotation: Array | None) -> _Problem:
+def _problem(
+    system: System, state: State, inputs: Array, rotation: Array | None
+) -> tuple[tuple[Array, ...], tuple[Array, ...], Loading]:
+    """M, D, K and the null space of the constraints; what tells whether the state is steady; what acts.
+
+    That is the largest force that nothing balances and how large it may be, how far velocities are from those
+    of the rotation, and whether all that acts turns along.
+    """
     rates, start = system.local_rates, state.rows
     # By their rates: what velocities alone obey has no gaps.
     by_twist = constraint_matrix(system, state).reshape(-1, rates.bodies, 1, TWIST)
@@ -162,7 +138,7 @@ def _problem(system: System, state: State, inputs: Array, rotation: Array | None
         turn = static.balanced(jnp.concatenate(loading.turning(loading.axis, start), axis=1))
         change = jnp.max(jnp.abs(free.T @ (stiffness @ turn)), initial=0.0)
         turns = turns_along(static) & (change <= allowed)
-    return _Problem(mass, damping, reduced, free, force, allowed, astray, turns, static)
+    return (mass, damping, reduced, free), (force, allowed, astray, turns), loading
 
 
 @briefly
@@ -237,41 +213,36 @@ def modes(
     given = None if rotation is None else numbers(rotation, (3,), "modes: rotation", "rad/s")
     channels = len(system.structure.inputs)
     u = jnp.zeros(channels) if inputs is None else numbers(inputs, (channels,), "modes: inputs", "N, N m")
-    problem = _problem(system, state, u, given)
-    mass, damping, stiffness = problem.mass, problem.damping, problem.stiffness
+    (mass, damping, stiffness, free), (force, allowed, astray, turns), loading = _problem(
+        system, state, u, given
+    )
     concrete = is_concrete(mass, damping, stiffness)
     if concrete:
-        _check(problem)
+        remedy = "start from nc.equilibrium, or pass the rotation [rad/s] that its velocities belong to"
+        if given is not None:
+            remedy = "pass the state of nc.equilibrium(system, state, rotation=...)"
+        if not astray <= BALANCE:
+            raise ValueError(
+                "modes: the velocities of the state [m/s, rad/s] are not those of the rotation [rad/s]: they "
+                f"differ by {float(astray):.3g} of it; {remedy}"
+            )
+        if not turns:
+            said = complaint(Static(system, state, loading))
+            raise ValueError(f"modes: the rotation is not steady: {said}; {remedy}")
+        if not force <= allowed:
+            said = f"a force of {float(force):.3g} N or N m is unbalanced"
+            raise ValueError(f"modes: the state is not steady: {said}; {remedy}")
+        smallest = float(np.linalg.eigvalsh(np.asarray(mass))[0]) if mass.size else 1.0
+        if smallest <= 0:
+            raise ValueError(
+                "modes: a motion moves no mass; give beams a rotary inertia [kg m] and bodies an inertia"
+            )
     if damped is None:
         damped = concrete and _unsymmetric(mass, damping, stiffness)
     s, shapes = _damped(mass, damping, stiffness) if damped else _undamped(mass, stiffness)
-    s = jnp.where(problem.steady, s, complex(jnp.nan, jnp.nan))
-    return _ordered(system, state, s, shapes @ problem.free.T, mass.shape[0], count, damped)
-
-
-def _check(problem: _Problem) -> None:
-    """Refuse a state that is not steady, and motions without inertia."""
-    if problem.static.loading.rotation is not None:
-        remedy = "pass the state of nc.equilibrium(system, state, rotation=...)"
-        if not float(problem.astray) <= BALANCE:
-            raise ValueError(
-                "modes: the velocities of the state [m/s, rad/s] are not those of the rotation [rad/s]: they "
-                f"differ by {float(problem.astray):.3g} of it; {remedy}"
-            )
-        if not problem.turns:
-            raise ValueError(f"modes: the rotation is not steady: {complaint(problem.static)}; {remedy}")
-    else:
-        remedy = "start from nc.equilibrium, or pass the rotation [rad/s] that its velocities belong to"
-    if not problem.force <= problem.allowed:
-        raise ValueError(
-            f"modes: the state is not steady: a force of {float(problem.force):.3g} N or N m is unbalanced; "
-            f"{remedy}"
-        )
-    mass = np.asarray(problem.mass)
-    if mass.size and float(np.linalg.eigvalsh(mass)[0]) <= 0:
-        raise ValueError(
-            "modes: a motion moves no mass; give beams a rotary inertia [kg m] and bodies an inertia"
-        )
+    steady = (force <= allowed) & (astray <= BALANCE) & turns
+    s = jnp.where(steady, s, complex(jnp.nan, jnp.nan))
+    return _ordered(system, state, s, shapes @ free.T, mass.shape[0], count, damped)
 
 
 def _unsymmetric(mass: Array, damping: Array, stiffness: Array) -> bool:

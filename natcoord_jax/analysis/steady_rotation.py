@@ -2,12 +2,11 @@
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool
 
 from natcoord_jax.analysis.static_equations import BALANCE, Static
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.names import listed
-from natcoord_jax.core.state import State
 from natcoord_jax.maths.rotations import from_rotation_vector
 from natcoord_jax.maths.vectors import safe_divide, safe_norm
 from natcoord_jax.mechanics import violations
@@ -16,40 +15,28 @@ from natcoord_jax.mechanics.equations_of_motion import loads
 from natcoord_jax.model.groups import Group
 
 
-def _openings(static: Static, after: State) -> list[Float[Array, "n m"]]:
-    """By how much a turn violates constraints, relative; drives follow it, or do not know of it."""
+def turns_along(static: Static) -> Bool[Array, ""]:
+    """Whether constraints let everything turn on: drives follow it, or do not know of it."""
     system, groups = static.system, violations.constrained(static.system)
-    speed = safe_norm(static.loading.rotation)
+    after, speed = static.turned().state, safe_norm(static.loading.rotation)
     later = replace_fields(after, t=after.t + safe_divide(1.0, speed))
     moving = static.rotating(static.state, static.loading.rotation)
-    gaps = (violations.violations_of(system, groups, x) for x in (after, later))
-    rates = (violations.violation_rates_of(system, groups, moving, passing) for passing in (0.0, 1.0))
-    pairs = zip(zip(*gaps), zip(*rates))
-    missed = [
-        jnp.maximum(jnp.minimum(*map(jnp.abs, gap)), safe_divide(jnp.minimum(*map(jnp.abs, rate)), speed))
-        for gap, rate in pairs
-    ]
-    return violations.relative(system, groups, missed)
-
-
-def turns_along(static: Static) -> Bool[Array, ""]:
-    """Whether constraints let everything turn, as drives ask for it."""
-    after = static.turned().state
-    missed = violations.largest(_openings(static, after))
-    return missed <= ENOUGH * violations.position_size(static.system, after)
+    gaps = [violations.violations_of(system, groups, x) for x in (after, later)]
+    rates = [violations.violation_rates_of(system, groups, moving, passing) for passing in (0.0, 1.0)]
+    sizes = [jnp.minimum(jnp.abs(a), jnp.abs(b)) for a, b in (*zip(*gaps), *zip(*rates))]
+    opened, opening = sizes[: len(groups)], [safe_divide(x, speed) for x in sizes[len(groups) :]]
+    missed = [violations.largest(violations.relative(system, groups, x)) for x in (opened, opening)]
+    return jnp.maximum(*missed) <= ENOUGH * violations.position_size(system, after)
 
 
 def complaint(static: Static) -> str:
     """Why a rotation is not steady: the part that does not turn along, and the remedy."""
-    on, groups = static.turned(), violations.constrained(static.system)
-    missed = [np.asarray(x) for x in _openings(static, on.state)]
-    worst = max(range(len(missed)), key=lambda k: np.max(missed[k]), default=None)
-    if worst is not None and np.max(missed[worst]) > ENOUGH:
-        group, number = groups[worst], int(np.argmax(np.max(missed[worst], axis=1)))
-        return (
-            f"{group.effect.kind} {group.names[number]!r} does not let everything turn about this axis at "
-            "this rate; pass a point of the axis as about= [m], and give drives its rate"
-        )
+    on, moving = static.turned(), static.rotating(static.state, static.loading.rotation)
+    worst = violations.worst_violation(static.system, moving, rates=True, allowed=ENOUGH)
+    if worst is not None:
+        said = f"{worst} does not let everything turn about this axis at this rate [rad/s]"
+        missed = f"{worst.size:.3g} {worst.unit} is missing"
+        return f"{said}: {missed}; pass a point of the axis as about= [m], and give drives its rate"
     part = _not_turning(static, on)
     if part:
         return f"{part} does not turn along; let it act along the axis, or on what turns"

@@ -20,6 +20,7 @@ from natcoord_jax.core.state import STATE, State, Trajectory
 from natcoord_jax.maths.collocation import gauss
 from natcoord_jax.maths.rotations import from_rotation_vector
 from natcoord_jax.maths.vectors import cross, safe_divide
+from natcoord_jax.mechanics.admissible_velocities import rotor_rates
 from natcoord_jax.mechanics.coordinates import (
     coordinate_rates,
     coordinate_values,
@@ -165,16 +166,6 @@ def _moved_coordinates(
     return jnp.where(kept, coordinates, coordinates + change)
 
 
-def _rotors(system: Model, rates: Array, state: State, places: np.ndarray) -> Float[Array, " rotors"]:
-    """Stored rotor rates with those on some coordinates replaced by the rates of the coordinates."""
-    stored = state.rates
-    for group in system.effects:
-        if group.effect.rotors:
-            at, on = group.rotors[:, 0], jnp.asarray(group.coordinates)[:, 0]
-            stored = stored.at[at].set(jnp.where(jnp.isin(on, places), rates[on], stored[at]))
-    return stored
-
-
 def with_coordinate(
     system: Model, state: State, joint: Handle | str, value: Any, *, rate: Any = None, index: int = 0
 ) -> State:
@@ -245,7 +236,7 @@ def _with_coordinate(
         found = replace_fields(found, held=held.at[:, at].set(jnp.maximum(held[:, at], chosen)))
     if rate is None:
         return found
-    return replace_fields(found, rates=_rotors(system, state_rates(system, found), state, places))
+    return replace_fields(found, rates=rotor_rates(system, found))
 
 
 @checked(system=SYSTEM, state=STATE, key=KEY, coordinates=DEVIATION, rates=DEVIATION)
@@ -313,5 +304,4 @@ def _displaced(
         counted = counted.at[group.index].add(found)
     v = row_rates(after, *twists(system, after, w))
     moved = replace_fields(state, q=after.reshape(-1, 3), v=v.reshape(-1, 3), coordinates=counted)
-    every = np.arange(counted.shape[0])
-    return replace_fields(moved, rates=_rotors(system, state_rates(system, moved), moved, every))
+    return replace_fields(moved, rates=rotor_rates(system, moved))
