@@ -180,8 +180,8 @@ def modes(
         state: at equilibrium (see `nc.equilibrium`); its velocities count only with `rotation`. Its time is
             that of loads and drives.
         count: number of modes; default all.
-        rotation: angular velocity of a steady rotation of everything (3,) [rad/s]; the velocities of the
-            state must be those of that rotation. Default: at rest.
+        rotation: angular velocity of a steady rotation of everything (3,) [rad/s], with the state that
+            `nc.equilibrium` finds for it: its velocities tell the axis. Default: at rest.
         inputs: input channels [N, N m]; default zero.
         damped: whether dampers, rotation or loads that follow the motion make the problem unsymmetric;
             default: found out from the numbers, and False inside jit. Undamped frequencies are more accurate
@@ -195,7 +195,8 @@ def modes(
         none is NaN within jit, and raises in an eager call.
 
     Raises:
-        ValueError: for a state that is not steady, or a motion without inertia.
+        ValueError: for a state or a rotation that is not steady (within jit its modes are not numbers),
+            velocities of another rotation, or a motion without inertia.
         DerivativeError: for a derivative of frequencies that a change splits, outside of jit.
 
     Example:
