@@ -314,7 +314,7 @@ class Static(eqx.Module):
         size = jnp.where(stiffness > 0, stiffness, 1.0)
         pins, balances = jnp.zeros_like(diagonal), jnp.arange(diagonal.shape[0]) < self.balances
         if self.loading.rotation is not None:
-            (turn, shift), free = self.free_motions()
+            (turn, shift), free, _ = self.free_motions()
             pull = jnp.max(jnp.abs(multiply(jnp.zeros_like(diagonal).at[: self.balances].set(shift))))
             free = free & jnp.stack([True, pull <= LOOSE * size * jnp.max(jnp.abs(shift))])
             # Each by one of its rates, that which takes most of its energy.
@@ -327,16 +327,17 @@ class Static(eqx.Module):
             pins = pins.at[jnp.argmax(energies, axis=1)].max(jnp.where(free, size / SHIFT, 0.0))
         return jnp.where(balances, pins, SHIFT * arms**2 / size), pins
 
-    def free_motions(self) -> tuple[Float[Array, "2 balances"], Bool[Array, "2"]]:
-        """A turn of everything about the axis and a shift along it, and whether constraints admit them."""
+    def free_motions(self) -> tuple[Float[Array, "2 balances"], Bool[Array, "2"], Float[Array, "2"]]:
+        """Turn of everything about the axis and shift along it, whether constraints admit them; inertias."""
         rows, rates, groups = self.state.rows, self.system.local_rates, constrained(self.system)
 
-        def motion(velocity: Array, spin: Array) -> tuple[Array, Array]:
+        def motion(velocity: Array, spin: Array) -> tuple[Array, Array, Array]:
             w = self.balanced(jnp.concatenate([velocity, spin], axis=1))
             state = moving(self.state, rates.twists(w, rows)[:, 0])
             changes = relative(self.system, groups, violation_rates_of(self.system, groups, state, 0.0))
             size = rate_size(self.system, state)
-            return w, (largest(changes) <= GAP * size) & (size > 0)
+            moment = jnp.sum(state.row_rates * inertia(self.system, state.row_rates))
+            return w, (largest(changes) <= GAP * size) & (size > 0), moment
 
         velocity, spin = self.loading.turning(self.loading.axis, rows)
         return jax.vmap(motion)(jnp.stack([velocity, spin]), jnp.stack([spin, jnp.zeros_like(spin)]))
@@ -352,9 +353,10 @@ class Static(eqx.Module):
 
     def pulls(self, wrenches: Float[Array, "terms bodies 6"]) -> tuple[Float[Array, "2"], Bool[Array, ""]]:
         """Torque about the axis [N m] and force along it [N] that nothing balances; if both are slight."""
-        motions, free = self.free_motions()
+        motions, free, inertias = self.free_motions()
         terms = jax.vmap(self.balanced)(wrenches)
         pulls = jnp.where(free, motions @ jnp.sum(terms, axis=0), 0.0)
-        return pulls, jnp.all(
-            jnp.abs(pulls) <= BALANCE * (jnp.abs(motions) @ jnp.sum(jnp.abs(terms), axis=0))
-        )
+        # Where forces cancel in each of the terms, in terms of centrifugal ones.
+        sizes = jnp.sum(self.loading.rotation**2) * jnp.sqrt(inertias[0] * inertias)
+        sizes = sizes + jnp.abs(motions) @ jnp.sum(jnp.abs(terms), axis=0)
+        return pulls, jnp.all(jnp.abs(pulls) <= BALANCE * sizes)

@@ -58,5 +58,5 @@ def _not_turning(static: Static, on: Static) -> str:
         change = sum(float(jnp.sum((now - then @ back) ** 2)) for now, then in pairs)
         size = sum(float(jnp.sum(now**2)) for now, _ in pairs)
         if change > BALANCE**2 * size:
-            sizes[f"{group.effect.kind} {listed(group.labels)}"] = change
+            sizes[f"{group.effect.kind} {' or '.join(map(repr, listed(group.labels)))}"] = change
     return max(sizes, key=lambda name: sizes[name], default="")
