@@ -74,15 +74,15 @@ class Loading(eqx.Module):
 
     Attributes:
         inputs: [N, N m].
-        rotation: angular velocity of a steady rotation of everything [rad/s]; None: all is at rest.
-        axis: its direction, also where it is zero [-].
-        about: a point of its axis [m].
+        rotation: angular velocity of a steady rotation of everything (3,) [rad/s]; None: all is at rest.
+        axis: its direction (3,), also where it is zero [-].
+        about: a point of its axis (3,) [m].
     """
 
     inputs: Float[Array, " inputs"]
-    rotation: Float[Array, "3"] | None = None
-    axis: Float[Array, "3"] | None = None
-    about: Float[Array, "3"] | None = None
+    rotation: Any = None
+    axis: Any = None
+    about: Any = None
 
     def turning(self, rate: Array, rows: Float[Array, "*n 4 3"]) -> tuple[Array, Array]:
         """Velocities and angular velocities of nodes that turn about the axis at a rate [rad/s]."""

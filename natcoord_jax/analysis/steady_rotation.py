@@ -19,7 +19,7 @@ def turns_along(static: Static) -> Bool[Array, ""]:
     """Whether constraints let everything turn on: drives follow it, or do not know of it."""
     system, groups = static.system, violations.constrained(static.system)
     after, speed = static.turned().state, safe_norm(static.loading.rotation)
-    later = replace_fields(after, t=after.t + safe_divide(1.0, speed))
+    later = replace_fields(after, t=after.t + safe_divide(jnp.ones(()), speed))
     moving = static.rotating(static.state, static.loading.rotation)
     gaps = [violations.violations_of(system, groups, x) for x in (after, later)]
     rates = [violations.violation_rates_of(system, groups, moving, passing) for passing in (0.0, 1.0)]

@@ -1,5 +1,6 @@
 """Setting joint coordinates and rates in a state, and random valid states."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -87,7 +88,7 @@ def _joint_motions(
 
 
 def _reached(
-    edges: list[Array], start: Bool[Array, " bodies_and_ground"], barred: Bool[Array, " bodies_and_ground"]
+    edges: Sequence[Any], start: Bool[Array, " bodies_and_ground"], barred: Bool[Array, " bodies_and_ground"]
 ) -> Bool[Array, " bodies_and_ground"]:
     """Bodies that hang together with some, along edges (n, k); nothing goes through those that are barred."""
 
