@@ -227,12 +227,12 @@ def modes(
                 "modes: the velocities of the state [m/s, rad/s] are not those of the rotation [rad/s]: they "
                 f"differ by {float(astray):.3g} of it; {remedy}"
             )
-        if not turns:
-            said = complaint(Static(system, state, loading))
-            raise ValueError(f"modes: the rotation is not steady: {said}; {remedy}")
         if not force <= allowed:
             said = f"a force of {float(force):.3g} N or N m is unbalanced"
             raise ValueError(f"modes: the state is not steady: {said}; {remedy}")
+        if not turns:
+            said = complaint(Static(system, state, loading))
+            raise ValueError(f"modes: the rotation is not steady: {said}; {remedy}")
         smallest = float(np.linalg.eigvalsh(np.asarray(mass))[0]) if mass.size else 1.0
         if smallest <= 0:
             raise ValueError(

@@ -5,8 +5,10 @@ import numpy as np
 from jaxtyping import Array, Bool
 
 from natcoord_jax.analysis.static_equations import BALANCE, Static
+from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.names import listed
+from natcoord_jax.core.state import State
 from natcoord_jax.maths.rotations import from_rotation_vector
 from natcoord_jax.maths.vectors import safe_divide, safe_norm
 from natcoord_jax.mechanics import violations
@@ -31,32 +33,34 @@ def turns_along(static: Static) -> Bool[Array, ""]:
 
 def complaint(static: Static) -> str:
     """Why a rotation is not steady: the part that does not turn along, and the remedy."""
-    on, moving = static.turned(), static.rotating(static.state, static.loading.rotation)
+    moving, pulls, changes = _measures(static)
     worst = violations.worst_violation(static.system, moving, rates=True, allowed=ENOUGH)
     if worst is not None:
         said = f"{worst} does not let everything turn about this axis at this rate [rad/s]"
         missed = f"{worst.size:.3g} {worst.unit} is missing"
         return f"{said}: {missed}; pass a point of the axis as about= [m], and give drives its rate"
-    part = _not_turning(static, on)
-    if part:
-        return f"{part} does not turn along; let it act along the axis, or on what turns"
-    pulls = np.asarray(static.pulls(static.wrenches(jnp.zeros(static.unknowns)))[0])
+    part = int(np.argmax([*map(float, changes), BALANCE]))
+    if part < len(changes):
+        effect, names = static.system.effects[part].effect, listed(static.system.effects[part].labels)
+        said = f"{effect.kind} {' or '.join(map(repr, names))} does not turn along"
+        return f"{said}; let it act along the axis, or on what turns"
     said = f"a torque of {pulls[0]:.3g} N m about the axis and a force of {pulls[1]:.3g} N along it"
     return f"{said} are not balanced; give a drive (nc.Drive) the rate of the rotation, or motors inputs"
 
 
-def _not_turning(static: Static, on: Static) -> str:
-    """The effect whose forces turn along least, if any of them do not."""
+@eager_numpy
+def _measures(static: Static) -> tuple[State, Array, list[Array]]:
+    """Velocities of the rotation; what is not balanced; how far forces of each effect do not turn along."""
 
-    def acting(at: Static, group: Group) -> tuple[Array, Array]:
+    def acting(at: Static, group: Group) -> Array:
         system, moving = replace_fields(at.system, effects=(group,)), at.loading.turning
-        return loads(system, at.state, at.loading.inputs, *moving(at.loading.rotation, at.state.rows))
+        return jnp.stack(
+            loads(system, at.state, at.loading.inputs, *moving(at.loading.rotation, at.state.rows))
+        )
 
-    back, sizes = from_rotation_vector(static.loading.axis), {}
-    for group in static.system.effects:
-        pairs = list(zip(acting(static, group), acting(on, group)))
-        change = sum(float(jnp.sum((now - then @ back) ** 2)) for now, then in pairs)
-        size = sum(float(jnp.sum(now**2)) for now, _ in pairs)
-        if change > BALANCE**2 * size:
-            sizes[f"{group.effect.kind} {' or '.join(map(repr, listed(group.labels)))}"] = change
-    return max(sizes, key=lambda name: sizes[name], default="")
+    on, back = static.turned(), from_rotation_vector(static.loading.axis)
+    pairs = [(acting(static, group), acting(on, group) @ back) for group in static.system.effects]
+    largest = [jnp.max(jnp.abs(jnp.stack([a, a - b])), axis=(1, 2, 3)) for a, b in pairs]
+    changes = [safe_divide(change, sum((x[0] for x in largest), jnp.zeros(()))) for _, change in largest]
+    pulls = static.pulls(static.wrenches(jnp.zeros(static.unknowns)))[0]
+    return static.rotating(static.state, static.loading.rotation), pulls, changes
