@@ -33,7 +33,7 @@ def turns_along(static: Static) -> Bool[Array, ""]:
 
 def complaint(static: Static) -> str:
     """Why a rotation is not steady: the part that does not turn along, and the remedy."""
-    moving, pulls, changes = _measures(static)
+    moving, (pulls, slight), changes = _measures(static)
     worst = violations.worst_violation(static.system, moving, rates=True, allowed=ENOUGH)
     if worst is not None:
         said = f"{worst} does not let everything turn about this axis at this rate [rad/s]"
@@ -44,12 +44,16 @@ def complaint(static: Static) -> str:
         effect, names = static.system.effects[part].effect, listed(static.system.effects[part].labels)
         said = f"{effect.kind} {' or '.join(map(repr, names))} does not turn along"
         return f"{said}; let it act along the axis, or on what turns"
+    if slight:
+        return (
+            "some of it turns by itself, and its angle is free: join it, or give each part a drive (nc.Drive)"
+        )
     said = f"a torque of {pulls[0]:.3g} N m about the axis and a force of {pulls[1]:.3g} N along it"
     return f"{said} are not balanced; give a drive (nc.Drive) the rate of the rotation, or motors inputs"
 
 
 @eager_numpy
-def _measures(static: Static) -> tuple[State, Array, list[Array]]:
+def _measures(static: Static) -> tuple[State, tuple[Array, Array], list[Array]]:
     """Velocities of the rotation; what is not balanced; how far forces of each effect do not turn along."""
 
     def acting(at: Static, group: Group) -> Array:
@@ -62,5 +66,5 @@ def _measures(static: Static) -> tuple[State, Array, list[Array]]:
     pairs = [(acting(static, group), acting(on, group) @ back) for group in static.system.effects]
     largest = [jnp.max(jnp.abs(jnp.stack([a, a - b])), axis=(1, 2, 3)) for a, b in pairs]
     changes = [safe_divide(change, sum((x[0] for x in largest), jnp.zeros(()))) for _, change in largest]
-    pulls = static.pulls(static.wrenches(jnp.zeros(static.unknowns)))[0]
+    pulls = static.pulls(static.wrenches(jnp.zeros(static.unknowns)))
     return static.rotating(static.state, static.loading.rotation), pulls, changes
