@@ -126,7 +126,8 @@ def equilibrium(
     With `rotation` it is a relative equilibrium, a steady rotation of everything about a fixed axis: loads
     and reactions balance the centripetal accelerations, and the states move as that rotation does. The angle
     about the axis stays, unless a drive sets it, and so does the place along an axis that nothing holds. All
-    that acts has to turn along: gravity along the axis does, a spring to the ground beside it does not.
+    that acts has to turn along: gravity along the axis does, a spring to the ground beside it does not. Other
+    angles that nothing determines, as of a round bob about its own rod, have to be held.
 
     Args:
         system: compiled system.
