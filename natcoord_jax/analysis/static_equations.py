@@ -59,14 +59,12 @@ NO_MASS = 1e-30
 DENSE = 400
 """Unknowns up to which the Jacobian is inverted as a dense matrix, with pivots."""
 
-LOOSE = 1e-12
-"""Stiffness along the axis of a rotation, relative to the largest there is, that is the rounding of none."""
-
 BALANCE = 1e-6
 """Largest unbalanced force, relative to the forces that balance each other, of what counts as steady."""
 
 SHIFT = 1e-10
-"""Compliance given to constraints, relative to that of the structure: redundant ones share their load."""
+"""Compliance given to constraints, relative to that of the structure: redundant ones share their load. And
+the stiffness, relative, along the axis of a rotation that is the rounding of none."""
 
 
 class Loading(eqx.Module):
@@ -230,7 +228,7 @@ class Static(eqx.Module):
         scale, between = NO_MASS + weight, self.system.mass_between
         between = None if between is None else between.times(scale)
         system = replace_fields(self.system, mass=scale * self.system.mass, mass_between=between)
-        here = self.displaced(jnp.zeros_like(y))
+        here = replace_fields(self.displaced(jnp.zeros_like(y)), v=jnp.zeros_like(self.state.v))
         step = FullStep.prepare(
             system, here, self.loading.inputs, jnp.ones((), y.dtype), gauss(1), StartCache(None, None)
         )
@@ -316,7 +314,7 @@ class Static(eqx.Module):
         if self.loading.rotation is not None:
             (turn, shift), free, _ = self.free_motions()
             pull = jnp.max(jnp.abs(multiply(jnp.zeros_like(diagonal).at[: self.balances].set(shift))))
-            free = free & jnp.stack([True, pull <= LOOSE * size * jnp.max(jnp.abs(shift))])
+            free = free & jnp.stack([True, pull <= SHIFT * size * jnp.max(jnp.abs(shift))])
             # Each by one of its rates, that which takes most of its energy.
             mass, moment = (
                 self.system.mass[:, :1, 0],
