@@ -73,14 +73,14 @@ def with_admissible_velocities(
         held = (missed(holding) <= allowed) & (_most(lost) <= allowed)
         found = jax.tree.map(lambda x, y: jnp.where(held, x, y), holding, found)
     code = jnp.where(missed(found) <= allowed, int(Result.SUCCESSFUL), int(Result.SINGULAR))
-    return replace_fields(found, rates=_rotor_rates(system, found)), code
+    return replace_fields(found, rates=rotor_rates(system, found)), code
 
 
 def _most(x: Array) -> Array:
     return jnp.max(jnp.abs(x), initial=0.0)
 
 
-def _rotor_rates(system: Model, state: State) -> Array:
+def rotor_rates(system: Model, state: State) -> Array:
     """Rates of the joint coordinates that carry rotors."""
     if not state.rates.shape[0]:
         return state.rates
