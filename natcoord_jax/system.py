@@ -240,10 +240,12 @@ class System(Model):
         """State with one joint coordinate set, and on request its rate.
 
         Everything that hangs on the joint is turned or moved along rigidly and keeps its motion relative to
-        the joint; the coordinate counts on, so that 4 pi are two turns. A relation among the coordinates of
-        the joint (the pitch of a screw) is kept; loops, drives and couplings of several joints are not: use
-        `nc.assemble` afterwards where there are any. It keeps the coordinates and rates that were set, where
-        the constraints allow it, and moves the others. Pure, jittable and differentiable.
+        the joint: bodies on further joints, nodes of beams, shells and solids, and what constraints on points
+        join to them. Nodes that hang on something that stays, too, are left as they are. The coordinate
+        counts on, so that 4 pi are two turns. A relation among the coordinates of the joint (the pitch of a
+        screw) is kept; loops, drives and couplings of several joints are not: use `nc.assemble` afterwards
+        where there are any. It keeps the coordinates and rates that were set, where the constraints allow
+        it, and moves the others. Pure, jittable and differentiable.
 
         Args:
             state: one state.

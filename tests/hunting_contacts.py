@@ -36,7 +36,8 @@ def bouncing(rng: Chance, stiffness: Any = None):
     )
     floor, last = nc.Plane(normal=np.array([0.2, 0.1, 1.0]) + 0.1 * rng.normal(size=3)), None
     for k in range(2):
-        moving = {"velocity": rng.normal(size=3) - (0, 0, 1), "angular_velocity": 5.0 * rng.normal(size=3)}
+        moving: dict[str, Any] = {"velocity": rng.normal(size=3) - (0, 0, 1)}
+        moving["angular_velocity"] = 5.0 * rng.normal(size=3)
         place = (0.15 * rng.uniform(), 0.0, 0.12 + 0.25 * k)
         ball = nc.RigidBody(shape=nc.Sphere(0.1), density=500.0, position=place, **moving, name=f"ball {k}")
         ball = scene.add(ball)

@@ -392,8 +392,8 @@ CALLS = {
     "contacts": lambda w: {"system": [w.system], "trajectory": [w.trajectory]},
     "balance": lambda w: {"system": [w.system], "trajectory": [w.trajectory]},
     "equilibrium": lambda w: {
-        **RUN(w), "loads": NUMBER, "inputs": [f, np.ones(1)], "steps": WHOLE, "snap": FLAG,
-        "throw": FLAG,
+        **RUN(w), "loads": NUMBER, "inputs": [f, np.ones(1)], "rotation": V, "about": V, "steps": WHOLE,
+        "snap": FLAG, "throw": FLAG,
     },
     "load_path": lambda w: {
         **RUN(w), "arc": NUMBER, "steps": WHOLE, "scale": NUMBER, "inputs": [f], "throw": FLAG

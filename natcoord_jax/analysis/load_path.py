@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from natcoord_jax.analysis.static_equations import Static
+from natcoord_jax.analysis.static_equations import Loading, Static
 from natcoord_jax.analysis.static_search import (
     FLOOR,
     ITERATIONS,
@@ -50,7 +50,7 @@ class _Path(eqx.Module):
     system: System
     scale: Float[Array, ""]
     extent: Float[Array, ""]
-    inputs: Callable[[Array], Array]
+    inputs: Callable[[Array], Loading]
 
     def product(self, one: tuple[Array, Array], other: tuple[Array, Array]) -> Array:
         """Product of two increments (displacements and rotations, load): mean squares over the bodies."""
@@ -66,7 +66,7 @@ class _Path(eqx.Module):
 
         static = Static(self.system, state, self.inputs(state.t))
         y = jnp.concatenate([jnp.zeros(static.balances), lam])
-        solver = static.solver(y)
+        solver = static.solver(y)[0]
         value, by_load = jax.jvp(lambda t: residual(t, y), (state.t,), (jnp.ones_like(state.t),))
         return -solver.solve(value), -solver.solve(by_load)
 
@@ -192,8 +192,7 @@ def load_path(
         True
     """
     positive(arc, "load path: arc", "-")
-    count = len(system.structure.inputs)
-    channels = Function.of(inputs, state.t) if inputs is not None else _Zero(count)
+    channels = _Loadings(Function.of(inputs, state.t), len(system.structure.inputs))
     refuse_contacts(system, "a path of equilibria")
     sizes = as_array(arc, float), as_array(scale, float)
     with_derivatives = not at_top_level(system, state, sizes)
@@ -210,14 +209,15 @@ def load_path(
     return found
 
 
-class _Zero(eqx.Module):
-    """No inputs at any load."""
+class _Loadings(eqx.Module):
+    """What acts at any load: inputs by a function of it, or none."""
 
+    function: Any
     count: int = eqx.field(static=True)
 
-    def __call__(self, t: Array) -> Array:
-        """Zeros."""
-        return jnp.zeros(self.count)
+    def __call__(self, t: Array) -> Loading:
+        """At a load."""
+        return Loading(jnp.zeros(self.count) if self.function is None else self.function(t))
 
 
 @briefly
@@ -227,7 +227,7 @@ def _followed(
     arc: Array,
     scale: Array,
     steps: int,
-    inputs: Callable[[Array], Array],
+    inputs: Callable[[Array], Loading],
     with_derivatives: bool,
 ) -> Equilibrium:
     # The search is not differentiated; `differentiable` gives its results their derivatives.

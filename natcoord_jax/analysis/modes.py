@@ -8,7 +8,6 @@ with D from dampers and from the rotation, K from stiffness, loads, reactions an
 space x = Z xi of the constraints it is a quadratic eigenvalue problem of the size of the degrees of freedom.
 """
 
-from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -17,7 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from natcoord_jax.analysis.static_equations import Static
+from natcoord_jax.analysis.static_equations import BALANCE, Loading, Static
+from natcoord_jax.analysis.static_search import largest
+from natcoord_jax.analysis.steady_rotation import complaint, turns_along
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.checks import is_concrete, numbers
 from natcoord_jax.core.compiled import briefly
@@ -25,18 +26,20 @@ from natcoord_jax.core.kinds import FLAG
 from natcoord_jax.core.numeric import COMPONENTS, Vector, Whole
 from natcoord_jax.core.state import STATE, State
 from natcoord_jax.maths.projectors import pseudo_inverse, range_projector
+from natcoord_jax.maths.rotations import angular_velocity
 from natcoord_jax.maths.spectrum import roots_of_sizes, spectrum
-from natcoord_jax.maths.vectors import cross
-from natcoord_jax.mechanics.equations_of_motion import loads, relative_rates, rotors_of, with_rest
+from natcoord_jax.maths.vectors import cross, safe_divide, safe_norm
+from natcoord_jax.mechanics.equations_of_motion import relative_rates, rotors_of, with_rest
 from natcoord_jax.mechanics.momentum import inertia, wrench
 from natcoord_jax.mechanics.projection import TWIST, constraint_matrix
+from natcoord_jax.mechanics.tangent_space import rotor_inertias
 from natcoord_jax.mechanics.violations import refuse_contacts
 from natcoord_jax.model.model import SYSTEM
 from natcoord_jax.model.rows import row_rates
 from natcoord_jax.system import System
 
-BALANCE = 1e-6
-"""Largest unbalanced force, relative to the largest force on a body, of what counts as steady."""
+SLIGHT = 1e-9
+"""Displacement, relative to the size of the scene, by which what is unbalanced may move the stiffest part."""
 
 
 class Modes(eqx.Module):
@@ -63,98 +66,79 @@ class Modes(eqx.Module):
         return jnp.where(size > 0, -jnp.real(self.s) / jnp.where(size > 0, size, 1.0), 0.0)
 
 
-class _Steady(eqx.Module):
-    """Balances of all bodies as functions of displacements, twists and accelerations."""
+def _mass_matrix(system: System, state: State) -> Array:
+    """Inertia of displacements and rotations of all bodies, rotors included."""
+    rows, rates, t = state.rows, system.local_rates, state.t
 
-    system: System
-    state: State
-    inputs: Array
-    rotation: Float[Array, "3"]
-    lam: Array
+    def moving(gains: Array) -> tuple[Array, Array]:
+        """Momenta, and rates of rotors."""
+        twists = rates.twists(gains, rows)[:, 0]
+        impulses = inertia(system, row_rates(rows, twists[:, :3], twists[:, 3:]))
+        parts = [x[0] for x in wrench(impulses[None], rows[None, :, 1:])]
+        turning = relative_rates(system, rows, with_rest(twists[:, :3]), with_rest(twists[:, 3:]), t)[0]
+        return rates.balances(jnp.concatenate(parts, axis=1)[:, None], rows), turning
 
-    def forces(self, x: Array, rates: Array) -> Array:
-        """Inertia less loads and reactions [N, N m], for displacements and rates in the rotating frame."""
-        static = Static(self.system, self.state, self.inputs)
-        y = jnp.concatenate([x, self.lam])
-        state = static.displaced(y)
-        rows = state.rows
-        (moved, _), (v_rel, w_rel) = self._apart(x), self._apart(rates)
-        first = rows.shape[0]
-        origin = self.state.rows[:, 0]
-        about = self._steady_velocity(origin)
-        velocity = about + v_rel + cross(self.rotation, moved)
-        spin = jnp.broadcast_to(self.rotation, (first, 3)) + w_rel
-        # Accelerations while the rates in the rotating frame stay as they are.
-        gain = cross(self.rotation, velocity) + cross(self.rotation, v_rel)
-        twist_gain = cross(self.rotation, w_rel)
-        directors = cross(twist_gain[:, None], rows[:, 1:]) + cross(
-            spin[:, None], cross(spin[:, None], rows[:, 1:])
-        )
-        accelerations = jnp.concatenate([gain[:, None], directors], axis=1)
-        impulses = inertia(self.system, accelerations)
-        inertial = wrench(impulses[None], rows[None, :, 1:])
-        applied = loads(self.system, state, self.inputs, velocity, spin)
-        pulled = static.constraint_loads(state, y)
-        parts = [a[0] - b - c for a, b, c in zip(inertial, applied, pulled)]
-        return self._balances(parts)
-
-    def _apart(self, x: Array) -> tuple[Array, Array]:
-        rows = self.state.rows
-        every = self.system.local_rates.twists(x, rows)[:, 0]
-        return every[:, :3], every[:, 3:]
-
-    def _balances(self, forces_and_torques: Sequence[Array]) -> Array:
-        wrenches = jnp.concatenate(forces_and_torques, axis=1)[:, None]
-        return self.system.local_rates.balances(wrenches, self.state.rows)
-
-    def _steady_velocity(self, points: Array) -> Array:
-        v = self.state.row_rates[:, 0]
-        return jnp.where(jnp.any(self.rotation != 0), v, jnp.zeros_like(points))
-
-    def mass_matrix(self) -> Array:
-        """Inertia of displacements and rotations of all bodies, rotors included."""
-        rows = self.state.rows
-
-        def inertial(gains: Array) -> Array:
-            impulses = inertia(self.system, row_rates(rows, *self._apart(gains)))
-            parts = [x[0] for x in wrench(impulses[None], rows[None, :, 1:])]
-            return self._balances(parts)
-
-        size = self.system.local_rates.count
-        matrix = jax.vmap(inertial)(jnp.eye(size)).T
-        groups = rotors_of(self.system)
-        if groups:
-            inertias = jnp.concatenate([jax.vmap(lambda e: e.inertia_of())(g.effect) for g in groups])
-
-            def turning(gains: Array) -> Array:
-                velocity, spin = self._apart(gains)
-                found = relative_rates(self.system, rows, with_rest(velocity), with_rest(spin), self.state.t)
-                return found[0]
-
-            rates = jax.vmap(turning)(jnp.eye(size)).T
-            matrix = matrix + rates.T @ (inertias[:, None] * rates)
-        return matrix
+    momenta, turning = jax.vmap(moving)(jnp.eye(rates.count))
+    groups = rotors_of(system)
+    if groups:
+        momenta = momenta + (turning * rotor_inertias(system)) @ turning.T
+    return momenta.T
 
 
-def _matrices(steady: _Steady, rows: Array, size: int) -> tuple[Array, Array, Array, Array, Array, Array]:
-    """M, D, K in the null space of the constraints, the null space, and the unbalanced and largest forces."""
-    still, free = jnp.zeros(size), jnp.eye(size)
-    left = steady.forces(still, still)
+def _loading(system: System, state: State, inputs: Array, rotation: Array | None) -> tuple[Loading, Array]:
+    """What acts, about the axis that velocities tell, and how far these are from a rotation about it."""
+    if rotation is None:
+        return Loading(inputs), jnp.zeros(())
+    rows, rates = state.rows, system.local_rates
+    points, speed = rows[:, 0], safe_norm(rotation)
+    drift = jnp.mean(state.row_rates[:, 0] - cross(rotation, points), axis=0)
+    about = safe_divide(cross(rotation, drift), speed**2)
+    loading = Loading(inputs, rotation, safe_divide(rotation, speed), about)
+    spin = angular_velocity(rows[:, 1:], state.row_rates[:, 1:])
+    wanted = loading.turning(rotation, rows)
+    missed = jnp.concatenate([state.row_rates[:, 0] - wanted[0], spin - wanted[1]], axis=1)
+    shares = largest(system, rates.balances(missed[:, None], rows), system.size)
+    return loading, safe_divide(jnp.maximum(*shares), speed)
+
+
+@briefly
+def _problem(
+    system: System, state: State, inputs: Array, rotation: Array | None
+) -> tuple[tuple[Array, ...], tuple[Array, ...], Loading]:
+    """M, D, K and the null space of the constraints; what tells whether the state is steady; what acts.
+
+    That is the largest force that nothing balances and how large it may be, how far velocities are from those
+    of the rotation, and whether all that acts turns along.
+    """
+    rates, start = system.local_rates, state.rows
+    # By their rates: what velocities alone obey has no gaps.
+    by_twist = constraint_matrix(system, state).reshape(-1, rates.bodies, 1, TWIST)
+    rows = jax.vmap(lambda row: rates.balances(row, start))(by_twist)
+    loading, astray = _loading(system, state, inputs, rotation)
+    static, size = Static(system, state, loading), rates.count
+    y, free = jnp.zeros(size + rows.shape[0]), jnp.eye(size)
+    left = static.forces(y)
     if rows.shape[0]:
         # Multipliers carry the steady state; redundant ones have the least norm.
-        dofs = steady.system.structure.dofs
+        dofs = system.structure.dofs
         onto = range_projector(rows.T, size - dofs)
         lam = pseudo_inverse(rows.T, onto, size - dofs) @ left
-        left = left - rows.T @ lam
-        steady = eqx.tree_at(lambda s: s.lam, steady, lam)
+        left, y = left - rows.T @ lam, y.at[size:].set(lam)
         # Any basis will do: one that is held, as far as the constraints admit it, follows them.
         basis = jnp.linalg.svd(jax.lax.stop_gradient(rows), full_matrices=True)[2][size - dofs :].T
         free = basis - onto @ basis
-    stiffness = jax.jacfwd(steady.forces, argnums=0)(still, still)
-    damping = jax.jacfwd(steady.forces, argnums=1)(still, still)
-    mass, damping, reduced = (free.T @ x @ free for x in (steady.mass_matrix(), damping, stiffness))
-    scale = jnp.maximum(jnp.max(jnp.abs(stiffness)) * 1e-6, 1e-300)
-    return mass, damping, reduced, free, jnp.max(jnp.abs(free.T @ left)), scale
+    stiffness = jax.jacfwd(lambda x: static.forces(y.at[:size].set(x)))(y[:size])
+    damping = jax.jacfwd(lambda w: static.forces(y, w))(y[:size])
+    mass, damping, reduced = (free.T @ x @ free for x in (_mass_matrix(system, state), damping, stiffness))
+    allowed = jnp.maximum(SLIGHT * system.size * jnp.max(jnp.abs(stiffness)), 1e-300)
+    force = jnp.max(jnp.abs(free.T @ left), initial=0.0)
+    turns = jnp.array(True)
+    if rotation is not None:
+        # What it meets on its way must not change.
+        turn = static.balanced(jnp.concatenate(loading.turning(loading.axis, start), axis=1))
+        change = jnp.max(jnp.abs(free.T @ (stiffness @ turn)), initial=0.0)
+        turns = turns_along(static) & (change <= allowed)
+    return (mass, damping, reduced, free), (force, allowed, astray, turns), loading
 
 
 @briefly
@@ -179,16 +163,6 @@ def _damped(mass: Array, damping: Array, stiffness: Array) -> tuple[Array, Array
     return values, vectors[:count].T
 
 
-@briefly
-def _problem(system: System, state: State, inputs: Array, rotation: Array) -> tuple[Array, ...]:
-    rates, start = system.local_rates, state.rows
-    # By their rates: what velocities alone obey has no gaps.
-    by_twist = constraint_matrix(system, state).reshape(-1, rates.bodies, 1, TWIST)
-    rows = jax.vmap(lambda row: rates.balances(row, start))(by_twist)
-    steady = _Steady(system, state, inputs, rotation, jnp.zeros(rows.shape[0]))
-    return _matrices(steady, rows, rates.count)
-
-
 @checked(system=SYSTEM, state=STATE, count=Whole(1), rotation=COMPONENTS, inputs=Vector(None), damped=FLAG)
 def modes(
     system: System,
@@ -206,8 +180,8 @@ def modes(
         state: at equilibrium (see `nc.equilibrium`); its velocities count only with `rotation`. Its time is
             that of loads and drives.
         count: number of modes; default all.
-        rotation: angular velocity of a steady rotation of everything (3,) [rad/s]; the velocities of the
-            state must be those of that rotation. Default: at rest.
+        rotation: angular velocity of a steady rotation of everything (3,) [rad/s], with the state that
+            `nc.equilibrium` finds for it: its velocities tell the axis. Default: at rest.
         inputs: input channels [N, N m]; default zero.
         damped: whether dampers, rotation or loads that follow the motion make the problem unsymmetric;
             default: found out from the numbers, and False inside jit. Undamped frequencies are more accurate
@@ -221,7 +195,8 @@ def modes(
         none is NaN within jit, and raises in an eager call.
 
     Raises:
-        ValueError: for a state that is not steady, or a motion without inertia.
+        ValueError: for a state or a rotation that is not steady (within jit its modes are not numbers),
+            velocities of another rotation, or a motion without inertia.
         DerivativeError: for a derivative of frequencies that a change splits, outside of jit.
 
     Example:
@@ -236,17 +211,28 @@ def modes(
         2.0
     """
     refuse_contacts(system, "vibration")
-    given = jnp.zeros(3) if rotation is None else numbers(rotation, (3,), "modes: rotation", "rad/s")
+    given = None if rotation is None else numbers(rotation, (3,), "modes: rotation", "rad/s")
     channels = len(system.structure.inputs)
     u = jnp.zeros(channels) if inputs is None else numbers(inputs, (channels,), "modes: inputs", "N, N m")
-    mass, damping, stiffness, free, left, scale = _problem(system, state, u, given)
+    (mass, damping, stiffness, free), (force, allowed, astray, turns), loading = _problem(
+        system, state, u, given
+    )
     concrete = is_concrete(mass, damping, stiffness)
     if concrete:
-        if float(left) > BALANCE * float(scale) / 1e-6 * 1e-3:
+        remedy = "start from nc.equilibrium, or pass the rotation [rad/s] that its velocities belong to"
+        if given is not None:
+            remedy = "pass the state of nc.equilibrium(system, state, rotation=...)"
+        if not astray <= BALANCE:
             raise ValueError(
-                f"modes: the state is not steady: a force of {float(left):.3g} N or N m is unbalanced; start "
-                "from nc.equilibrium, or pass the rotation [rad/s] that its velocities belong to"
+                "modes: the velocities of the state [m/s, rad/s] are not those of the rotation [rad/s]: they "
+                f"differ by {float(astray):.3g} of it; {remedy}"
             )
+        if not force <= allowed:
+            said = f"a force of {float(force):.3g} N or N m is unbalanced"
+            raise ValueError(f"modes: the state is not steady: {said}; {remedy}")
+        if not turns:
+            said = complaint(Static(system, state, loading))
+            raise ValueError(f"modes: the rotation is not steady: {said}; {remedy}")
         smallest = float(np.linalg.eigvalsh(np.asarray(mass))[0]) if mass.size else 1.0
         if smallest <= 0:
             raise ValueError(
@@ -255,6 +241,8 @@ def modes(
     if damped is None:
         damped = concrete and _unsymmetric(mass, damping, stiffness)
     s, shapes = _damped(mass, damping, stiffness) if damped else _undamped(mass, stiffness)
+    steady = (force <= allowed) & (astray <= BALANCE) & turns
+    s = jnp.where(steady, s, complex(jnp.nan, jnp.nan))
     return _ordered(system, state, s, shapes @ free.T, mass.shape[0], count, damped)
 
 

@@ -5,7 +5,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from natcoord_jax.analysis.static_equations import Static
+from natcoord_jax.analysis.static_equations import Loading, Static
+from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.results import Result
 from natcoord_jax.core.state import State
 from natcoord_jax.system import System
@@ -37,7 +38,8 @@ class Search(eqx.Module):
 
     Of the inertia added to the stiffness, `weight` [1/s^2] is what is added, `heaviest` what it begins with.
     `first` is the correction along the tangent; where a later one is larger, or the search has gone downhill,
-    it has `snapped`: what it ends at need not be on the path that it began on.
+    it has `snapped`: what it ends at need not be on the path that it began on. In a rotation one more trip
+    looks whether it is an equilibrium (`steady`) when everything has turned on, too; then it is `over`.
     """
 
     state: State
@@ -49,6 +51,8 @@ class Search(eqx.Module):
     count: Array
     done: Array
     snapped: Array
+    steady: Array
+    over: Array
 
 
 def extent_of(system: System, state: State) -> Array:
@@ -64,7 +68,9 @@ def largest(system: System, change: Float[Array, " balances"], extent: Array) ->
     return moved / extent, turned
 
 
-def search_equilibrium(system: System, state: State, lam: Array, inputs: Array, snap: bool = True) -> Search:
+def search_equilibrium(
+    system: System, state: State, lam: Array, loading: Loading, snap: bool = True
+) -> Search:
     """Newton's method from a configuration and multipliers; every iteration counts from where it is.
 
     Where it fails, it begins again with inertia added to the stiffness, which keeps corrections short and
@@ -74,13 +80,22 @@ def search_equilibrium(system: System, state: State, lam: Array, inputs: Array, 
     extent = extent_of(system, state)
 
     def trip(search: Search) -> Search:
-        static, slowed = Static(system, search.state, inputs), search.weight > 0
-        y = jnp.concatenate([jnp.zeros(static.balances), search.lam])
-        residual = static.residual(y)
+        static, slowed = Static(system, search.state, loading), search.weight > 0
+        y, looking = jnp.concatenate([jnp.zeros(static.balances), search.lam]), search.done
+        if rotating:
+            on = static.turned().state
+            static = Static(
+                system, jax.tree.map(lambda a, b: jnp.where(looking, a, b), on, search.state), loading
+            )
+        wrenches = static.wrenches(y)
+        gaps = jnp.where(looking, 0.0, static.gaps(static.displaced(y)))
+        residual = jnp.concatenate([static.balanced(jnp.sum(wrenches, axis=0)), gaps])
         pull = jnp.max(jnp.abs(residual[: static.balances]))
         begun = pull / (jnp.mean(system.mass[:, 0, 0]) * SHORT * extent)
         heaviest = jnp.where(search.count == 0, begun, search.heaviest)
-        change = -static.solver(y, search.weight).solve(residual)
+        # Reactions to a rotation first, hardly without a motion: they are part of the stiffness.
+        inert = jnp.where(rotating & (search.count == 0), begun / FLOOR, search.weight)
+        change = -static.solver(y, inert)[0].solve(residual)
         moved, turned = largest(system, change[: static.balances], extent)
         correction = jnp.maximum(moved, turned)
         finite = jnp.all(jnp.isfinite(change))
@@ -98,15 +113,22 @@ def search_equilibrium(system: System, state: State, lam: Array, inputs: Array, 
         lost = ~slowed & ~done & (~finite | (search.count + 1 >= ITERATIONS))
         now, pulls = jax.tree.map(lambda a, b: jnp.where(lost, a, b), (state, lam), after)
         weight = jnp.where(lost, heaviest, weight)
-        first = jnp.where(search.count == 0, correction, search.first)
+        first = jnp.where(search.count <= int(rotating), correction, search.first)
         snapped = search.snapped | lost | (correction > jnp.maximum(first, FLOOR))
-        return Search(now, pulls, weight, heaviest, correction, first, search.count + 1, done, snapped)
+        count, over = search.count + 1, done
+        if not rotating:
+            return Search(now, pulls, weight, heaviest, correction, first, count, done, snapped, no, over)
+        steady = static.pulls(wrenches)[1]
+        found = Search(now, pulls, weight, heaviest, correction, first, count, done, snapped, steady, no)
+        steady = search.steady & steady & (correction <= FLOOR)
+        looked = replace_fields(search, steady=steady, over=looking)
+        return jax.tree.map(lambda a, b: jnp.where(looking, a, b), looked, found)
 
     def going(search: Search) -> Array:
-        return ~search.done & (search.count < ITERATIONS + DOWNHILL) & (snap | ~search.snapped)
+        return ~search.over & (search.count < ITERATIONS + DOWNHILL) & (snap | ~search.snapped)
 
-    nought, no = jnp.zeros(()), jnp.array(False)
-    start = Search(state, lam, nought, nought, nought, nought, jnp.array(0), no, no)
+    nought, no, rotating = jnp.zeros(()), jnp.array(False), loading.rotation is not None
+    start = Search(state, lam, nought, nought, nought, nought, jnp.array(0), no, no, no, no)
     return jax.lax.while_loop(going, trip, start)
 
 

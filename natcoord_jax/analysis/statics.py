@@ -9,23 +9,26 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from natcoord_jax.analysis.static_equations import DENSE, Static
+from natcoord_jax.analysis.static_equations import DENSE, Loading, Static
 from natcoord_jax.analysis.static_search import code_of_search, search_equilibrium
+from natcoord_jax.analysis.steady_rotation import complaint, turns_along
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.checks import at_top_level, is_concrete
 from natcoord_jax.core.compiled import briefly
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.kinds import FLAG, FunctionOf
-from natcoord_jax.core.numeric import Number, Numbers, Vector, Whole
+from natcoord_jax.core.numeric import COMPONENTS, Number, Numbers, Vector, Whole
 from natcoord_jax.core.results import REASONS, Result, SimulationError
 from natcoord_jax.core.state import STATE, State
 from natcoord_jax.linsolve.refinement import refined_solve
+from natcoord_jax.maths.vectors import safe_divide, safe_norm
 from natcoord_jax.mechanics.inversion import code_of
 from natcoord_jax.mechanics.violations import refuse_contacts
 from natcoord_jax.model.model import SYSTEM
 from natcoord_jax.system import System
 
 INPUTS_OF_LOAD = Numbers(("...", None)) | FunctionOf("of the load parameter to the inputs (inputs,)")
+ROTATION_OF_LOAD = Numbers(("...", 3)) | FunctionOf("of the load parameter to the angular velocity (3,)")
 
 GROWING = "take more steps, or follow the path through a limit point with nc.load_path"
 STANDING = (
@@ -39,7 +42,7 @@ class Equilibrium(eqx.Module):
     """Configurations of equilibrium at a series of loads.
 
     Attributes:
-        states: at rest, leading axis the loads; `states.t` is the load parameter.
+        states: at rest or in steady rotation, leading axis the loads; `states.t` is the load parameter.
         multipliers: of relations between coordinates and of all joints [N, N m], by load.
         result: result code (see `nc.Result`), by load.
         iterations: of Newton's method, by load.
@@ -60,21 +63,23 @@ class Equilibrium(eqx.Module):
         return jax.tree.map(lambda x: x[-1], self.states)
 
 
-def differentiable(system: System, state: State, lam: Array, inputs: Array) -> tuple[State, Array]:
-    """A solution as a function of system, load and inputs, by the implicit function theorem, to any order."""
+def differentiable(system: System, state: State, lam: Array, loading: Loading) -> tuple[State, Array]:
+    """A solution as a function of system and loads, by the implicit function theorem, to any order."""
     # Where it was found plays no part in what it depends on: that is in the residual alone.
     fixed = jax.lax.stop_gradient(replace_fields(state, t=jnp.zeros_like(state.t)))
-    static = Static(system, replace_fields(fixed, t=state.t), inputs)
+    static = Static(system, replace_fields(fixed, t=state.t), loading)
     at = jax.lax.stop_gradient(jnp.concatenate([jnp.zeros(static.balances), lam]))
 
     def tangent_solve(linear: Any, right: Array) -> Array:
         # The Jacobian itself where it is small; nearly so of large meshes, whose formulas leave parts out.
         if static.unknowns <= DENSE:
-            solver: Any = static.inverse(jax.jacfwd(linear)(jnp.zeros_like(right)))
+            solver, pins = static.inverse(jax.jacfwd(linear)(jnp.zeros_like(right)))
         else:
-            solver = jax.lax.stop_gradient(static).solver(at)
+            solver, pins = jax.lax.stop_gradient(static).solver(at)
+        # What nothing resists stays where it is.
+        pins = jax.lax.stop_gradient(pins)
         return refined_solve(
-            linear,
+            lambda x: linear(x) + pins * x,
             right,
             solver,
             lambda near, b: near.solve(b),
@@ -91,6 +96,8 @@ def differentiable(system: System, state: State, lam: Array, inputs: Array) -> t
     state=STATE,
     loads=Number() | Vector(None),
     inputs=INPUTS_OF_LOAD,
+    rotation=ROTATION_OF_LOAD,
+    about=COMPONENTS,
     steps=Whole(1),
     snap=FLAG,
     throw=FLAG,
@@ -101,6 +108,8 @@ def equilibrium(
     loads: Any = 1.0,
     *,
     inputs: Any = None,
+    rotation: Any = None,
+    about: Any = (0.0, 0.0, 0.0),
     steps: int = 10,
     snap: bool = True,
     throw: bool = True,
@@ -114,11 +123,20 @@ def equilibrium(
     The load parameter is the time of the state: forces, torques and drives that are functions of time are
     taken at it. Loads that are constant (gravity, say) act in full from the first load on.
 
+    With `rotation` it is a relative equilibrium, a steady rotation of everything about a fixed axis: loads
+    and reactions balance the centripetal accelerations, and the states move as that rotation does. The angle
+    about the axis stays, unless a drive sets it, and so does the place along an axis that nothing holds. All
+    that acts has to turn along: gravity along the axis does, a spring to the ground beside it does not. Other
+    angles that nothing determines, as of a round bob about its own rod, have to be held.
+
     Args:
         system: compiled system.
         state: start configuration; velocities play no part.
         loads: values of the load parameter, increasing or not; one number: `steps` equal parts of it.
         inputs: function of the load parameter to the input channels, or their values [N, N m]; default zero.
+        rotation: angular velocity (3,) [rad/s], one for each load (loads, 3), or a function of the load
+            parameter to it: a constant one acts in full from the first load on. Default: at rest.
+        about: a point of the axis [m].
         steps: number of loads where one number is given.
         snap: False: end with `nc.Result.DIVERGED` at the first load at which Newton's method leaves the path.
         throw: raise in an eager call if there is no convergence.
@@ -130,7 +148,8 @@ def equilibrium(
 
     Raises:
         SimulationError: in an eager call, if Newton's method fails or turns an element of a solid inside out,
-            with the load.
+            with the load; and if what was found is no steady rotation (`nc.Result.UNSTEADY`), with the part
+            that does not turn along.
 
     Example:
         >>> import jax; jax.config.update("jax_enable_x64", True)
@@ -149,7 +168,7 @@ def equilibrium(
     values = jnp.asarray(loads, float)
     if values.ndim == 0:
         values = values * jnp.arange(1, steps + 1) / steps
-    given = _inputs_at(system, inputs, values)
+    given = _loadings(system, values, inputs, rotation, about)
     found = _equilibria(system, state, values, given, snap, not at_top_level(system, state, values, given))
     if is_concrete(found.result) and bool(jnp.any(found.snapped[1:] & (found.result[1:] == 0))):
         left = [f"{value:.6g}" for value in np.asarray(values)[1:][np.asarray(found.snapped)[1:]]]
@@ -161,52 +180,74 @@ def equilibrium(
     if throw and is_concrete(found.result):
         for number, code in enumerate(found.result):
             if int(code) != Result.SUCCESSFUL:
-                before = max(number - 1, 0)
-                reached = jax.tree.map(lambda x, k=before: x[k], found.states)
-                grows = _grows(system, replace_fields(reached, t=values[number]), given, number)
+                before = replace_fields(_one(found.states, max(number - 1, 0)), t=values[number])
+                acts = _one(given, number)
+                remedy = complaint(Static(system, before, acts)) if code == Result.UNSTEADY else STANDING
+                if code != Result.UNSTEADY and _grows(system, before, given, number):
+                    remedy = GROWING
                 raise SimulationError(
                     f"no equilibrium found at the load parameter {float(values[number]):.6g} (load "
                     f"{number + 1} of {len(values)}): {REASONS[Result(int(code))]}; "
-                    f"{GROWING if grows else STANDING}",
+                    f"{remedy}",
                     Result(int(code)),
                     found,
                 )
     return found
 
 
-def _grows(system: System, state: State, inputs: Array, number: int) -> bool:
+def _one(several: Any, number: int) -> Any:
+    return jax.tree.map(lambda x: x[number], several)
+
+
+def _grows(system: System, state: State, given: Loading, number: int) -> bool:
     """Whether the equations of a load are others than those of the load before, or depend on it."""
-    if number > 0 and bool(jnp.any(inputs[number] != inputs[number - 1])):
+    pairs = jax.tree.leaves((_one(given, number), _one(given, max(number - 1, 0))))
+    if any(bool(jnp.any(x != y)) for x, y in zip(pairs[: len(pairs) // 2], pairs[len(pairs) // 2 :])):
         return True
 
     def residual(t: Array) -> Array:
-        static = Static(system, replace_fields(state, t=t), inputs[number])
+        static = Static(system, replace_fields(state, t=t), _one(given, number))
         return static.residual(jnp.zeros(static.unknowns))
 
     return bool(jnp.any(jax.jvp(residual, (state.t,), (jnp.ones_like(state.t),))[1] != 0))
 
 
-def _inputs_at(system: System, inputs: Any, values: Array) -> Float[Array, "loads inputs"]:
-    count = len(system.structure.inputs)
-    if callable(inputs):
-        function: Any = inputs
-        return jax.vmap(function)(values)
-    given = jnp.zeros(count) if inputs is None else jnp.asarray(inputs, float)
-    if given.shape not in ((count,), (len(values), count)):
+def _loadings(system: System, values: Array, inputs: Any, rotation: Any, about: Any) -> Loading:
+    """What acts at all loads; leading axis the loads."""
+    names = system.structure.inputs
+    said = f"this system has the input channels {list(names)}"
+    channels = _at_loads("inputs", inputs, values, len(names), said)
+    if rotation is None:
+        return Loading(channels)
+    rates = _at_loads("rotation", rotation, values, 3, "it has three components")
+    speeds = safe_norm(rates)
+    # Where it is zero, it is about the axis of the fastest.
+    fastest = rates[jnp.argmax(speeds)]
+    axes = jnp.where((speeds > 0)[:, None], rates, fastest)
+    axes = jax.lax.stop_gradient(safe_divide(axes, safe_norm(axes)[:, None]))
+    return Loading(channels, rates, axes, jnp.broadcast_to(jnp.asarray(about, float), rates.shape))
+
+
+def _at_loads(name: str, given: Any, values: Array, count: int, said: str) -> Float[Array, "loads n"]:
+    """Numbers at all loads, from a function of the load, numbers for all of them, or for each."""
+    if callable(given):
+        given = jax.vmap(given)(values)
+    numbers = jnp.zeros(count) if given is None else jnp.asarray(given, float)
+    if numbers.shape not in ((count,), (len(values), count)):
         raise ValueError(
-            f"inputs has shape {given.shape}; this system has the input channels "
-            f"{list(system.structure.inputs)}: pass shape {(count,)} or {(len(values), count)}, or a function"
+            f"{name} has shape {numbers.shape}; {said}: pass shape {(count,)} or {(len(values), count)}, or "
+            "a function"
         )
-    return jnp.broadcast_to(given, (len(values), count))
+    return jnp.broadcast_to(numbers, (len(values), count))
 
 
 @briefly
 def _equilibria(
-    system: System, state: State, values: Array, inputs: Array, snap: bool, with_derivatives: bool
+    system: System, state: State, values: Array, given: Loading, snap: bool, with_derivatives: bool
 ) -> Equilibrium:
     # What gives the results their derivatives takes longer to trace than the search, and is left out where
     # nothing asks for it.
-    static = Static(system, state, inputs[0])
+    static = Static(system, state, _one(given, 0))
     # The search is not differentiated; `differentiable` gives its results their derivatives.
     still = jax.lax.stop_gradient((system, state))
 
@@ -217,6 +258,10 @@ def _equilibria(
         begin = replace_fields(now, t=jax.lax.stop_gradient(value))
         search = search_equilibrium(still[0], begin, lam, jax.lax.stop_gradient(u), snap)
         code = code_of(still[0], search.state, code_of_search(search))
+        if given.rotation is not None:
+            turns = turns_along(Static(still[0], search.state, jax.lax.stop_gradient(u)))
+            steady = search.steady & turns | jnp.all(u.rotation == 0)
+            code = jnp.where((code == 0) & ~steady, int(Result.UNSTEADY), code)
         code = jnp.where(alive, code, int(Result.DIVERGED))
         good = code == int(Result.SUCCESSFUL)
         reached = jax.tree.map(lambda a, b: jnp.where(good, a, b), (search.state, search.lam), (now, lam))
@@ -225,11 +270,11 @@ def _equilibria(
     start = replace_fields(still[1], v=jnp.zeros_like(state.v), rates=jnp.zeros_like(state.rates))
     lam = jnp.zeros(static.unknowns - static.balances)
     _, (states, lams, codes, counts, snapped) = jax.lax.scan(
-        one, (start, lam, jnp.array(True)), (values, inputs)
+        one, (start, lam, jnp.array(True)), (values, given)
     )
     # Results of the search: their derivatives are those of the equations that they solve, below.
     states, lams = jax.lax.stop_gradient((states, lams))
     states = replace_fields(states, t=values)
     if with_derivatives:
-        states, lams = jax.vmap(lambda s, lam, u: differentiable(system, s, lam, u))(states, lams, inputs)
+        states, lams = jax.vmap(lambda s, lam, u: differentiable(system, s, lam, u))(states, lams, given)
     return Equilibrium(states, lams, codes, counts, snapped)

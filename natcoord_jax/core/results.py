@@ -23,6 +23,7 @@ class Result(IntEnum):
     OVERFLOW = 12
     BAD_START = 13
     JUMPED = 14
+    UNSTEADY = 15
 
     @property
     def ok(self) -> bool:
@@ -46,6 +47,7 @@ REASONS = {
     Result.OVERFLOW: "a body has more neighbours than its contact has room for",
     Result.BAD_START: "the positions at the start violate the constraints",
     Result.JUMPED: "a drive jumps, or swings to and fro within the shortest step",
+    Result.UNSTEADY: "the rotation is not steady",
 }
 
 REMEDIES = {
@@ -62,6 +64,7 @@ REMEDIES = {
     Result.BAD_START: "pass nc.assemble(system, state)",
     Result.JUMPED: "give it a function without jumps, as a ramp of some steps, or use a smaller dt",
     Result.OVERFLOW: "pass a larger `capacity` to the nc.Contact, or a smaller dt or `skin`",
+    Result.UNSTEADY: "let all that acts turn along, and a drive or a motor balance the torque about the axis",
 }
 
 

@@ -209,3 +209,13 @@ def _constrained(
     for _ in range(ROUNDS):
         x = x + spread @ (shifted @ (gap - rows @ x))
     return x
+
+
+def rotor_rates(system: Model, state: State) -> Array:
+    """Rates of the joint coordinates that carry rotors."""
+    if not state.rates.shape[0]:
+        return state.rates
+    every, rates = state_rates(system, state), state.rates
+    for group in rotors_of(system):
+        rates = rates.at[group.rotors[:, 0]].set(every[group.coordinates[:, 0]])
+    return rates

@@ -22,7 +22,7 @@ from natcoord_jax.mechanics.block_tangent_space import Tangents
 from natcoord_jax.mechanics.element_matrices import dense, part_matrices, products, rates_of, touches
 from natcoord_jax.mechanics.local import body_balance, body_motion, jacobians, wrenches
 from natcoord_jax.mechanics.momentum import least_inertias, stage_changes
-from natcoord_jax.mechanics.redundancy import held_multipliers, project_multipliers
+from natcoord_jax.mechanics.redundancy import held_multipliers, least_change, project_multipliers
 from natcoord_jax.mechanics.response import StageKinematics, stations
 from natcoord_jax.mechanics.start_cache import NOTHING
 from natcoord_jax.mechanics.step_equations import StepEquations
@@ -54,7 +54,7 @@ class FullStep(StepEquations):
         matrix = resting.jacobian(jnp.zeros(resting.unknowns, state.q.dtype))
         rows = matrix[resting.balances :, : resting.balances][held_multipliers(resting.groups)]
         in_tree = sum(g.count * g.multipliers for g in system.joints if g.in_tree)
-        return range_projector(rows, rank + in_tree)
+        return range_projector(rows, rank + in_tree, least_change(system))
 
     @property
     def bodies(self) -> int:

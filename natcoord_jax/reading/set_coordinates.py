@@ -1,17 +1,17 @@
 """Setting joint coordinates and rates in a state, and random valid states."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from natcoord_jax.core.arguments import checked
-from natcoord_jax.core.bodies import NODE
 from natcoord_jax.core.checks import as_array
 from natcoord_jax.core.eager_numpy import eager_numpy
-from natcoord_jax.core.effect import replace_fields
+from natcoord_jax.core.effect import Effect, replace_fields
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.kinds import of
 from natcoord_jax.core.numeric import Number
@@ -19,14 +19,16 @@ from natcoord_jax.core.state import STATE, State, Trajectory
 from natcoord_jax.maths.collocation import gauss
 from natcoord_jax.maths.rotations import from_rotation_vector
 from natcoord_jax.maths.vectors import cross, safe_divide
+from natcoord_jax.mechanics.admissible_velocities import rotor_rates
 from natcoord_jax.mechanics.coordinates import (
     coordinate_rates,
     coordinate_values,
     frames_of,
     stage_rates,
     state_rates,
+    velocities_with_ground,
 )
-from natcoord_jax.mechanics.rates import carried, null_space, tree_rates, twists
+from natcoord_jax.mechanics.rates import joint_axes, tree_rates, twists
 from natcoord_jax.mechanics.response import stations
 from natcoord_jax.mechanics.sweeps import sweep_motion
 from natcoord_jax.model.model import SYSTEM, Model
@@ -67,25 +69,62 @@ def rate(
 
 def _joint_motions(
     system: Model, rows: Float[Array, "bodies 4 3"], body: int, places: np.ndarray
-) -> tuple[Array, Array, Array, Array]:
-    """Unit motions of the slots of one tree joint.
+) -> tuple[Array, Array]:
+    """Rates of the coordinates of one tree joint (n, 7), and twists of its body (7, 6), of unit motions."""
+    axes, points = joint_axes(system, rows)
+    present = jnp.asarray(system.tree.slot_index)[body] < system.tree.slot_of.shape[0]
+    axis, turning = jnp.where(present[:, None], axes[body], 0.0), np.array([[1]] * 3 + [[0]] * 3 + [[1]])
+    velocity = jnp.where(turning, cross(axis, rows[body, 0] - points[body]), axis)
+    motions = jnp.concatenate([velocity, jnp.where(turning, axis, 0.0)], axis=1)
+    extended = rows_with_ground(rows.reshape(-1, 3))
 
-    Returns:
-        Rates of the joint's coordinates (n, 7), velocity and angular velocity of the body (7, 3) each, and
-        the place of each slot among the unknowns (7,).
+    def rates(motion: Array) -> Array:
+        twists = jnp.zeros((len(extended), 6), rows.dtype).at[body].set(motion)
+        moving = row_rates(extended, twists[:, :3], twists[:, 3:])
+        return coordinate_rates(system, extended, moving, twists[:, 3:])[places]
+
+    return jax.vmap(rates)(motions).T, motions
+
+
+def _reached(
+    edges: Sequence[Any], start: Bool[Array, " bodies_and_ground"], barred: Bool[Array, " bodies_and_ground"]
+) -> Bool[Array, " bodies_and_ground"]:
+    """Bodies that hang together with some, along edges (n, k); nothing goes through those that are barred."""
+
+    def grown(reached: Array) -> Array:
+        for bodies in edges:
+            along = jnp.any(reached[bodies], axis=1, keepdims=True)
+            reached = reached.at[bodies].max(along & ~barred[bodies])
+        return reached
+
+    def trip(pair: tuple[Array, Array]) -> tuple[Array, Array]:
+        return pair[1], grown(pair[1])
+
+    return jax.lax.while_loop(lambda pair: jnp.any(pair[0] != pair[1]), trip, (start, grown(start)))[1]
+
+
+def _moved_along(system: Model, body: int) -> Bool[Array, " bodies"]:
+    """What a joint of the tree moves: what hangs on its body by joints, elements and constraints.
+
+    What these also join to something that stays, does so as well, unless the tree hangs it on the body.
     """
-    velocities, spins = null_space(system, rows)
-    slots = jnp.asarray(system.tree.slot_index)[body]
-    extended, still = rows_with_ground(rows.reshape(-1, 3)), jnp.zeros((1, 3), rows.dtype)
-
-    def unit(slot):
-        velocity, spin = (x.at[:, slot].get(mode="fill", fill_value=0.0) for x in (velocities, spins))
-        moving = jnp.concatenate([row_rates(rows, velocity, spin), jnp.zeros((1, *NODE), rows.dtype)])
-        rates = coordinate_rates(system, extended, moving, jnp.concatenate([spin, still]))
-        return rates[places], velocity[body], spin[body]
-
-    rates, velocity, spin = jax.vmap(unit)(slots)
-    return rates.T, velocity, spin, slots
+    count, number = len(system.structure.bodies), np.arange(len(system.structure.bodies) + 1)
+    parent = jnp.append(jnp.asarray(system.tree.parent), count)
+    inside, above = jnp.asarray(number == body), parent
+    for _ in range((len(system.tree.levels) - 1).bit_length()):
+        inside, above = inside | inside[above], above[above]
+    edges = [jnp.stack([number[:-1], jnp.where(parent == count, number, parent)[:-1]], axis=1)]
+    edges += [group.bodies for group in system.joints if not group.in_tree]
+    for group in system.effects:
+        element = type(group.effect).mass_matrix is not Effect.mass_matrix
+        if group.weights is not None and (element or group.holds):
+            shape = *group.weights.shape[:2], -1, group.bodies.shape[1] // group.weights.shape[1], 4
+            on = jnp.any(group.weights.reshape(shape) != 0, axis=(2, 4)).reshape(group.bodies.shape)
+            # (What is there without weight fills up.)
+            edges.append(jnp.where(on, group.bodies, group.bodies[:, :1]))
+    free = jnp.zeros(count + 1, bool).at[system.tree.free.here].set(True)
+    stays = _reached(edges, ((parent == count) & ~free | (number == parent[body])) & ~inside, inside)
+    return _reached(edges, inside, stays)[:-1]
 
 
 def _with_relations(system: Model, places: np.ndarray, index: int, change: Array) -> Float[Array, " n"]:
@@ -127,36 +166,6 @@ def _moved_coordinates(
     return jnp.where(kept, coordinates, coordinates + change)
 
 
-def _rotors(system: Model, rates: Array, state: State, places: np.ndarray) -> Float[Array, " rotors"]:
-    """Stored rotor rates with those on some coordinates replaced by the rates of the coordinates."""
-    stored = state.rates
-    for group in system.effects:
-        if group.effect.rotors:
-            at, on = group.rotors[:, 0], jnp.asarray(group.coordinates)[:, 0]
-            stored = stored.at[at].set(jnp.where(jnp.isin(on, places), rates[on], stored[at]))
-    return stored
-
-
-def _moved(
-    system: Model, state: State, body: int, places: np.ndarray, changes: Array
-) -> Float[Array, "bodies 4 3"]:
-    """Rows after the subtree beyond a tree joint has been turned and shifted by changes of its coordinates.
-
-    The turn is about the joint's point on its child, so that displacements along axes of the parent stay.
-    """
-    rows = state.rows
-    rates, velocities, spins, _ = _joint_motions(system, rows, body, places)
-    slots = _slot_rates(rates, changes)
-    turn, shift = slots @ spins, slots @ velocities
-    _, child = frames_of(system, jnp.array([body]), rows_with_ground(state.q))
-    pivot = child.point[0]
-    shift = shift + cross(turn, pivot - rows[body, 0])
-    rotation = from_rotation_vector(turn)
-    turned = jnp.einsum("ij,brj->bri", rotation, rows.at[:, 0].add(-pivot))
-    moved = turned.at[:, 0].add(pivot + shift)
-    return jnp.where((carried(system)[:, body] > 0)[:, None, None], moved, rows)
-
-
 def with_coordinate(
     system: Model, state: State, joint: Handle | str, value: Any, *, rate: Any = None, index: int = 0
 ) -> State:
@@ -172,26 +181,54 @@ def with_coordinate(
     return _with_coordinate(system, state, body, tuple(places.tolist()), index, as_array(value, float), rate)
 
 
+def _twists(state: State, rows: Float[Array, "n 4 3"]) -> Float[Array, "n 6"]:
+    """Velocities of the reference points, and angular velocities, of all bodies and the ground."""
+    rates, spin = velocities_with_ground(state.v, rows)
+    return jnp.concatenate([rates[:, 0], spin], axis=1)
+
+
+def _carried_by(
+    twists: Float[Array, "n 6"], rows: Float[Array, "n 4 3"], body: Any, at: Float[Array, "n 4 3"]
+) -> Float[Array, "n 6"]:
+    """Twists of what would be rigidly part of a body, at other places."""
+    spin = twists[body, 3:]
+    velocity = twists[body, :3] + cross(spin, at[:, 0] - rows[body, 0])
+    return jnp.concatenate([velocity, jnp.broadcast_to(spin, velocity.shape)], axis=1)
+
+
 @eager_numpy
 def _with_coordinate(
     system: Model, state: State, body: int, at: tuple[int, ...], index: int, value: Array, rate: Array | None
 ) -> State:
-    places = np.array(at, int)
-    w = tree_rates(system, state)
+    places, rows = np.array(at, int), rows_with_ground(state.q)
     change = _with_relations(system, places, index, value - state.coordinates[places[index]])
-    rows = _moved(system, state, body, places, change)
+    rates, motions = _joint_motions(system, rows[:-1], body, places)
+    shift, turn = jnp.split(_slot_rates(rates, change) @ motions, 2)
+    # About the joint's point on its child, so that displacements along axes of the parent stay.
+    pivot = frames_of(system, jnp.array([body]), rows)[1].point[0]
+    shift, rotation = shift + cross(turn, pivot - rows[body, 0]), from_rotation_vector(turn)
+    turned = rows.at[:, 0].add(-pivot) @ rotation.T
+    inside = jnp.append(_moved_along(system, body), False)[:, None, None]
+    after = jnp.where(inside, turned.at[:, 0].add(pivot + shift), rows)
     coordinates = state.coordinates.at[places].add(change).at[places[index]].set(value)
-    coordinates = _moved_coordinates(system, state.q, rows, coordinates, places)
+    coordinates = _moved_coordinates(system, state.q, after[:-1], coordinates, places)
     wanted = state_rates(system, state)[places]
     if rate is not None:
         wanted = wanted + _with_relations(system, places, index, rate - wanted[index])
-    rates, _, _, slots = _joint_motions(system, rows, body, places)
-    own = jnp.concatenate([w, jnp.zeros(1)])[slots]
-    w = w.at[slots].add(_slot_rates(rates, wanted - rates @ own), mode="drop")
-    moving = row_rates(rows, *twists(system, rows, w))
-    inside = (carried(system)[:, body] > 0)[:, None, None]
-    v = jnp.where(inside, moving, state.row_rates)
-    found = replace_fields(state, q=rows.reshape(-1, 3), v=v.reshape(-1, 3), coordinates=coordinates)
+    rates, motions = _joint_motions(system, after[:-1], body, places)
+    own = jnp.append(tree_rates(system, state), 0.0)[jnp.asarray(system.tree.slot_index)[body]]
+    own = own + _slot_rates(rates, wanted - rates @ own)
+    before = _twists(state, rows)
+    # Motions relative to the child turn along with it.
+    carrier = _carried_by(before, rows, system.tree.parent[body], after)
+    new = carrier[body] + own @ motions
+    relative = (before - _carried_by(before, rows, body, rows)).reshape(-1, 2, 3) @ rotation.T
+    moving = _carried_by(jnp.broadcast_to(new, before.shape), after, body, after) + relative.reshape(-1, 6)
+    local = system.local_rates
+    moving = local.twists(local.balances(moving[:-1, None], after[:-1]), after[:-1])[:, 0]
+    moving = row_rates(after[:-1], moving[:, :3], moving[:, 3:])
+    v = jnp.where(inside[:-1], moving, state.row_rates)
+    found = replace_fields(state, q=after[:-1].reshape(-1, 3), v=v.reshape(-1, 3), coordinates=coordinates)
     if system.structure.held:
         held = jnp.zeros((2, *coordinates.shape)) if state.held is None else state.held
         chosen = jnp.array([1.0, 0.0 if rate is None else 1.0])
@@ -199,7 +236,7 @@ def _with_coordinate(
         found = replace_fields(found, held=held.at[:, at].set(jnp.maximum(held[:, at], chosen)))
     if rate is None:
         return found
-    return replace_fields(found, rates=_rotors(system, state_rates(system, found), state, places))
+    return replace_fields(found, rates=rotor_rates(system, found))
 
 
 @checked(system=SYSTEM, state=STATE, key=KEY, coordinates=DEVIATION, rates=DEVIATION)
@@ -258,5 +295,4 @@ def _displaced(
     counted = state.coordinates + stage_rates(system, at, h)[0]
     v = row_rates(after, *twists(system, after, w))
     moved = replace_fields(state, q=after.reshape(-1, 3), v=v.reshape(-1, 3), coordinates=counted)
-    every = np.arange(counted.shape[0])
-    return replace_fields(moved, rates=_rotors(system, state_rates(system, moved), moved, every))
+    return replace_fields(moved, rates=rotor_rates(system, moved))
