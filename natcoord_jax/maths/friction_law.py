@@ -58,9 +58,9 @@ def impulses_with_friction(
         room: energy that each may give [J].
     """
     pressed = jnp.where(on, positive_part(held[:, 0] + smooth), 0.0)
-    after = rates + normal @ smooth
+    change = normal @ smooth
     # What has pushed until the impact, and parts by it, does not pull.
-    parting = (smooth <= 0) & (after > PARTING * jnp.max(jnp.abs(rates)))
+    parting = (smooth <= 0) & (jnp.minimum(change, rates + change) > PARTING * jnp.max(jnp.abs(rates)))
     slipping = slip + (mixed @ smooth).reshape(slip.shape)
     moving = normal, mixed, tangential, slipping, held[:, 1:], pressed, friction
     # Which of them hold is found apart from derivatives, which hold it, as `pressing_impulses` has it.

@@ -20,13 +20,14 @@ from natcoord_jax.mechanics.redundancy import contact_weights
 from natcoord_jax.mechanics.response import Evaluation
 from natcoord_jax.mechanics.start_cache import StartCache
 from natcoord_jax.mechanics.tangent_space import driven
+from natcoord_jax.mechanics.violations import contact_gaps
 from natcoord_jax.stepping.after_attempt import after_attempt
 from natcoord_jax.stepping.difference_jacobian import DifferenceJacobian
 from natcoord_jax.stepping.differences import evaluated, told
-from natcoord_jax.stepping.energy_check import sound
+from natcoord_jax.stepping.energy_check import motion_of, sound
 from natcoord_jax.stepping.factors import Factors, factors_of
 from natcoord_jax.stepping.located import Ahead
-from natcoord_jax.stepping.newton import Iterate, any_lane, judge, refreshed
+from natcoord_jax.stepping.newton import Iterate, any_lane, begin, judge, refreshed
 from natcoord_jax.stepping.remainder import remainder, with_remainder
 from natcoord_jax.stepping.rollout_state import RolloutProblem, RolloutState
 from natcoord_jax.stepping.step import end_of_step
@@ -144,6 +145,10 @@ def attempt(
         record = tuple(with_row(b, carried.count - carried.first, r) for b, r in zip(record, slot))
         start_cache = _outset_after(setting, after, accepted, carried.start_cache, found.kick)
         after = _with_normal_kick(setting, after, start_cache)
+        if any(g.effect.unilateral and g.effect.friction is not None for g in system.effects):
+            few, failed = after.trial is not None, after.rejected > before.rejected
+            it = jax.lax.cond(failed, lambda: begin(_sticking(equations), few), lambda: after.it)
+            after = replace_fields(after, it=it)
         factors = _kept(setting, equations, before, after, factors, solving.probe)
         return jnp.array(False), with_state(after, None), x, start_cache, record, factors
 
@@ -158,6 +163,22 @@ def attempt(
     asked = RefactorRequest(*wanted) if apart else None
     count = carried.count + _recorded(solving.ending, carried.course, after)
     return LoopCarry(count, after, x, start_cache, factors, solving.probe, record, carried.first, asked)
+
+
+def _sticking(equations: Any) -> Float[Array, " unknowns"]:
+    """No motion, and contacts that press as much as all that moves could: a guess from which slip is none.
+
+    Where friction presses more than it takes, as on Painleve's rod, no slip solves the equations, and from a
+    guess that slips Newton's iteration does not find what sticks.
+    """
+    system, state, multipliers = equations.system, equations.state, equations.split(equations.guess())[1]
+    for k, group in enumerate(equations.groups):
+        if group.effect.unilateral:
+            speed = jnp.sqrt(motion_of(system, state) * group.effect.mobility)
+            reached = 0.5 * speed * equations.h > contact_gaps(system, [group], state)
+            pressed = jnp.where(reached, speed / group.effect.mobility, 0.0)
+            multipliers[k] = multipliers[k].at[:, 0, 0].set(pressed)
+    return jnp.concatenate([jnp.zeros(equations.balances), *(lam.reshape(-1) for lam in multipliers)])
 
 
 def _with_normal_kick(setting: RolloutProblem, after: RolloutState, start_cache: Any) -> RolloutState:
