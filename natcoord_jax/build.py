@@ -36,10 +36,6 @@ from natcoord_jax.model.rows import rows_with_ground
 from natcoord_jax.reading.admissible import sound
 from natcoord_jax.system import System
 
-REGULARISED = 3e-6
-"""Velocity of slip, in terms of the speeds of a scene, up to which friction is smooth: what sticks under a
-load creeps less than that."""
-
 
 def build(
     singles: dict[str, Body],
@@ -99,7 +95,7 @@ def build(
         mass_between=between,
     )
     state = replace_fields(layout.state(), contacts=untouched(system))
-    system = with_regularised_friction(with_sizes(system, state), state)
+    system = with_slip_speeds(with_sizes(system, state), state)
     system = with_mobilities(jax.tree.map(as_array, with_symmetries(system, state)), state)
     return sound(system, system), with_readings(system, state)
 
@@ -109,23 +105,25 @@ def _drawn(shape: Any) -> Any:
     return jax.tree.map(np.asarray, shape) if is_concrete(shape) else None
 
 
-def with_regularised_friction(system: System, state: State) -> System:
-    """The system with velocities of slip up to which friction is smooth, where none are given."""
+def with_slip_speeds(system: System, state: State) -> System:
+    """The system with rates of slip up to which friction is smooth, where none are given.
 
-    def needs(group: Any) -> bool:
-        effect = group.effect
-        return effect.unilateral and effect.friction is not None and effect.regularisation is None
-
-    if not any(map(needs, system.effects)):
-        return system
-    slip = REGULARISED * _speed(system, state)
-    each = [
-        replace_fields(g, effect=replace_fields(g.effect, regularisation=jnp.broadcast_to(slip, (g.count,))))
-        if needs(g)
-        else g
-        for g in system.effects
-    ]
-    return replace_fields(system, effects=tuple(each))
+    A part of the speeds of the scene; of a coordinate that turns, over the size of the scene.
+    """
+    effects, slips = list(system.effects), [group.effect.slips for group in system.effects]
+    missing = [k for k, x in enumerate(slips) if x and getattr(effects[k].effect, x[0]) is None]
+    speed, size = _speed(system, state) if missing else None, system.size
+    angles = np.concatenate([[-1], *(g.index for g in system.coordinates if g.axis.unit == "rad")])
+    for k in missing:
+        group, (name, part) = effects[k], slips[k]
+        turns, least = np.isin(group.coordinates, angles).any(axis=1), size
+        if group.source == "coordinates":
+            # What rests where nothing falls is moved by no less than its own friction.
+            least = group.effect.friction * jnp.where(turns, 1.0, size) / jnp.sum(system.mass[:, 0, 0])
+            least = jnp.where(least > 0, safe_sqrt(least), size)
+        slip = part * jnp.where(speed > 0, speed, least) / jnp.where(turns, size, 1.0)
+        effects[k] = replace_fields(group, effect=replace_fields(group.effect, **{name: slip}))
+    return replace_fields(system, effects=tuple(effects))
 
 
 @eager_numpy
@@ -135,8 +133,7 @@ def _speed(system: System, state: State) -> Float[Array, ""]:
     still = jnp.zeros_like(state.rows[:, 0])
     force, _ = loads(fields, state, jnp.zeros(len(system.structure.inputs)), still, still)
     pulls = safe_norm(force) / jnp.where(system.mass[:, 0, 0] > 0, system.mass[:, 0, 0], 1.0)
-    speed = safe_sqrt(jnp.max(pulls) * system.size) + jnp.max(safe_norm(state.row_rates[:, 0]))
-    return jnp.where(speed > 0, speed, system.size)
+    return safe_sqrt(jnp.max(pulls) * system.size) + jnp.max(safe_norm(state.row_rates[:, 0]))
 
 
 def with_symmetries(system: System, state: State) -> System:

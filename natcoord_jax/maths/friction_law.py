@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from natcoord_jax.maths.impact_law import held_alone, semidefinite_solution
-from natcoord_jax.maths.vectors import positive_part, safe_sqrt
+from natcoord_jax.maths.vectors import positive_part, safe_norm, safe_sqrt
 
 ROUNDS = 16
 """Of what friction does at all contacts at once; one or two are enough for a single contact."""
@@ -162,6 +162,9 @@ def friction_impulses(
     plane = product > PLANE * trace**2
     length = jnp.where(trace > 0, 1.0 / jnp.where(trace > 0, trace, 1.0), 0.0)
     over = jnp.where(plane, 1.0 / jnp.where(plane, product, 1.0), 0.0)
+    none = jnp.finfo(held.dtype).tiny
+    size = safe_norm(held) + none
+    reach = size + friction * jnp.sum(slope * held, axis=1)
 
     def trip(_: Array, found: Float[Array, "c 3"]) -> Float[Array, "c 3"]:
         moving = slip + (matrix @ found.reshape(-1)).reshape(count, 3)
@@ -173,14 +176,16 @@ def friction_impulses(
         alone = pressed - taken @ found.reshape(-1) + jnp.sum(slope * total, axis=1)
         most = friction * positive_part(alone - jnp.sum(slope * sticking, axis=1))
         sticks = jnp.sum(sticking**2, axis=1) <= most**2
-        wanted = total - 2.0 * length[:, None] * moving
-        square = jnp.sum(wanted**2, axis=1)
-        some = square > 0
-        along = jnp.where(some[:, None], wanted, 0.0) / jnp.sqrt(jnp.where(some, square, 1.0))[:, None]
+        # What has opposed slip in the step stays, as far as the cone goes; more opposes what is left of it.
+        kept = jnp.minimum(friction * positive_part(alone) / jnp.maximum(reach, 0.1 * size), 1.0)
+        wanted = total - kept[:, None] * held - 2.0 * length[:, None] * moving
+        along = wanted / (safe_norm(wanted) + none)[:, None]
         less = 1.0 + friction * jnp.sum(slope * along, axis=1)
         # (Where friction would press more than it takes, as a jamming rod does, it grows step by step.)
-        at_most = friction * positive_part(alone) / jnp.where(less > 0.1, less, 1.0)
-        change = jnp.where(sticks[:, None], sticking, at_most[:, None] * along) - total
+        more = positive_part(friction * positive_part(alone) - kept * reach) / jnp.where(
+            less > 0.1, less, 1.0
+        )
+        change = jnp.where(sticks[:, None], sticking, kept[:, None] * held + more[:, None] * along) - total
         falls = -jnp.sum(moving * change)
         needed = change.reshape(-1) @ (matrix @ change.reshape(-1))
         short = (falls > 0) & (needed > falls)

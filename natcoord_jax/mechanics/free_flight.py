@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -84,12 +85,9 @@ def in_free_flight(system: SomeModel, state: State, dt: Array, free: Bool[Array,
     groups = bouncing_groups(system)
     closed = contact_gaps(system, groups, state) <= touch(system, state)
     phase = jnp.where(free & apart(system, groups, state, dt), FREE, jnp.where(closed, RESTING, 0))
-    ends = np.cumsum([group.count for group in groups])
-    own = iter(jnp.split(phase, ends[:-1]))
+    each = jnp.split(phase, np.cumsum([group.count for group in groups])[:-1])
 
-    def told(group: Any) -> Any:
-        if not (group.effect.unilateral and group.effect.bounces):
-            return group
-        return replace_fields(group, effect=replace_fields(group.effect, phase=next(own)))
+    def phases(system: Model) -> list[Any]:
+        return [group.effect.phase for group in bouncing_groups(system)]
 
-    return replace_fields(system, effects=tuple(told(group) for group in system.effects))
+    return eqx.tree_at(phases, system, each, is_leaf=lambda x: x is None)

@@ -9,6 +9,7 @@ what slip friction stops at the same time.
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -229,14 +230,8 @@ def with_mobilities(system: SomeModel, state: State) -> SomeModel:
     groups = [group for group in system.effects if group.effect.unilateral]
     if not groups:
         return system
-    own = iter(_by_group(groups, mobilities(system, state)))
-    effects = tuple(
-        replace_fields(group, effect=replace_fields(group.effect, mobility=next(own)))
-        if group.effect.unilateral
-        else group
-        for group in system.effects
-    )
-    return replace_fields(system, effects=effects)
+    each = _by_group(groups, mobilities(system, state))
+    return eqx.tree_at(lambda s: [g.effect.mobility for g in s.effects if g.effect.unilateral], system, each)
 
 
 @eager_numpy

@@ -145,7 +145,7 @@ def attempt(
         record = tuple(with_row(b, carried.count - carried.first, r) for b, r in zip(record, slot))
         start_cache = _outset_after(setting, after, accepted, carried.start_cache, found.kick)
         after = _with_normal_kick(setting, after, start_cache)
-        if any(g.effect.unilateral and g.effect.friction is not None for g in system.effects):
+        if any(group.effect.bends for group in system.effects):
             few, failed = after.trial is not None, after.rejected > before.rejected
             it = jax.lax.cond(failed, lambda: begin(_sticking(equations), few), lambda: after.it)
             after = replace_fields(after, it=it)
@@ -174,9 +174,9 @@ def _sticking(equations: Any) -> Float[Array, " unknowns"]:
     system, state, multipliers = equations.system, equations.state, equations.split(equations.guess())[1]
     for k, group in enumerate(equations.groups):
         if group.effect.unilateral:
-            speed = jnp.sqrt(motion_of(system, state) * group.effect.mobility)
-            reached = 0.5 * speed * equations.h > contact_gaps(system, [group], state)
-            pressed = jnp.where(reached, speed / group.effect.mobility, 0.0)
+            mobility, gap = group.effect.mobility, contact_gaps(system, [group], state)
+            speed = jnp.sqrt(motion_of(system, state) * mobility)
+            pressed = jnp.where(0.5 * speed * equations.h > gap, speed / mobility, 0.0)
             multipliers[k] = multipliers[k].at[:, 0, 0].set(pressed)
     return jnp.concatenate([jnp.zeros(equations.balances), *(lam.reshape(-1) for lam in multipliers)])
 

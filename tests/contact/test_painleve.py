@@ -1,8 +1,7 @@
 """Friction that presses more than it takes: Painleve's rod, whose end sticks at once.
 
-Its end slides such that friction presses it into the floor. Beyond a coefficient, no impulse that opposes slip
-keeps the end on the floor; that which stops it does (Moreau's step, an impact without a collision). With more
-friction still it is what jams.
+Its end slides such that friction presses it into the floor. Beyond a coefficient, no impulse that opposes
+slip keeps the end on the floor; that which stops it does (Moreau's step, an impact without a collision).
 """
 
 import jax
@@ -14,6 +13,7 @@ import tolerances as tol
 import natcoord_jax as nc
 
 HALF, GRAVITY = 0.5, 9.81
+SCHEMES = nc.EnergyMomentum(), nc.EnergyMomentum(max_events=8)
 
 
 def rod(friction, angle, velocity, rate=0.0, *, slender=1.0, height=0.0, restitution=0.0, feet=False):
@@ -52,7 +52,7 @@ def test_the_end_of_a_rod_sticks_at_once():
     Whatever the step. (Just before that it slides to its stop, the faster the nearer.)
     """
     lanes = [(mu, angle, speed, dt)
-             for mu, angle in ((1.35, np.pi / 3), (1.5, np.pi / 3), (2.0, np.pi / 3), (5.0, np.pi / 3), (2.0, 1.2))
+             for mu, angle in ((1.35, 1.05), (1.5, 1.05), (2.0, 1.05), (5.0, 1.05), (2.0, 1.2))
              for speed in (1.0, 0.1) for dt in (1e-5, 1e-4)]  # fmt: skip
 
     def moved(lane):
@@ -80,7 +80,7 @@ def test_the_end_of_a_rod_sticks_at_once():
 
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("feet", [False, True], ids=["end", "feet"])
-@pytest.mark.parametrize("scheme", [nc.EnergyMomentum(), nc.EnergyMomentum(max_events=8)], ids=["", "located"])
+@pytest.mark.parametrize("scheme", SCHEMES, ids=["steps", "located"])
 def test_rods_stick_slide_and_fall_from_any_start(feet, scheme):
     """Two hundred rods that slide, turn and fall on their ends: all runs end, and none gains energy."""
     random, count = np.random.default_rng(5), 200

@@ -20,6 +20,10 @@ from natcoord_jax.core.potential import on_rows, place_markers
 from natcoord_jax.effects.contact.gap import Gap
 from natcoord_jax.maths.vectors import cross, dot, positive_part
 
+REGULARISED = 3e-6
+"""Velocity of slip, in terms of the speeds of a scene, up to which friction is smooth: what sticks under a
+load creeps less than that."""
+
 GAP = of("a gap, as nc.SphereOnPlane(radius=0.1)", Gap)
 
 
@@ -79,6 +83,11 @@ class Rubbing(Effect):
     def bends(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Friction does, where slip changes its sign."""
         return self.friction is not None
+
+    @property
+    def slips(self) -> Any:
+        """Its regularisation, with friction."""
+        return None if self.friction is None else ("regularisation", REGULARISED)
 
     def violation_units(self, place: Array, rows: Array) -> tuple[str, ...]:
         """Metres."""
