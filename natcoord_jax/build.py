@@ -106,19 +106,16 @@ def _drawn(shape: Any) -> Any:
 
 
 def with_slip_speeds(system: System, state: State) -> System:
-    """The system with rates of slip up to which friction is smooth, where none are given.
-
-    A part of the speeds of the scene; of a coordinate that turns, over the size of the scene.
-    """
-    effects, slips = list(system.effects), [group.effect.slips for group in system.effects]
+    """The system with rates of slip up to which friction is smooth, by its speeds, where none are given."""
+    effects: list[Any] = list(system.effects)
+    slips: list[Any] = [group.effect.slips for group in effects]
     missing = [k for k, x in enumerate(slips) if x and getattr(effects[k].effect, x[0]) is None]
-    speed, size = _speed(system, state) if missing else None, system.size
+    speed, size = _speed(system, state) if missing else jnp.zeros(()), system.size
     angles = np.concatenate([[-1], *(g.index for g in system.coordinates if g.axis.unit == "rad")])
     for k in missing:
         group, (name, part) = effects[k], slips[k]
         turns, least = np.isin(group.coordinates, angles).any(axis=1), size
-        if group.source == "coordinates":
-            # What rests where nothing falls is moved by no less than its own friction.
+        if group.source == "coordinates":  # what rests where nothing falls is moved by no less than that
             least = group.effect.friction * jnp.where(turns, 1.0, size) / jnp.sum(system.mass[:, 0, 0])
             least = jnp.where(least > 0, safe_sqrt(least), size)
         slip = part * jnp.where(speed > 0, speed, least) / jnp.where(turns, size, 1.0)

@@ -10,6 +10,8 @@ made some may be a few hundredths beyond their cones.) What is hit off its centr
 (W. J. Stronge, Impact Mechanics, 2000); impulses stop short of that.
 """
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -63,17 +65,23 @@ def impulses_with_friction(
     parting = (smooth <= 0) & (jnp.minimum(change, rates + change) > PARTING * jnp.max(jnp.abs(rates)))
     slipping = slip + (mixed @ smooth).reshape(slip.shape)
     moving = normal, mixed, tangential, slipping, held[:, 1:], pressed, friction
+
+    def changes(holding: Array, normal: Array, mixed: Array, tangential: Array, *more: Array) -> Any:
+        """X of the contacts that hold their rates, and impulses of friction with these."""
+        taken = normal_changes(normal, mixed, holding)
+        return taken, friction_impulses(tangential - mixed @ taken, taken, *more).reshape(-1)
+
     # Which of them hold is found apart from derivatives, which hold it, as `pressing_impulses` has it.
     fixed, start = jax.lax.stop_gradient(moving), bouncing & (pressed > 0) & ~parting
 
     def trip(carry: tuple[Array, Array]) -> tuple[Array, Array]:
-        taken, rubbing = _changes(*fixed, carry[0])
+        taken, rubbing = changes(carry[0], *fixed)
         # A contact does not pull to hold its rate: it keeps the impulse that it has.
         holding = carry[0] & (fixed[5] - taken @ rubbing >= 0)
         return holding, jnp.any(holding != carry[0])
 
     holding = jax.lax.while_loop(lambda c: c[1], trip, (start, jnp.any(start)))[0]
-    taken, rubbing = _changes(*moving, holding)
+    taken, rubbing = changes(holding, *moving)
     matrix = jnp.block([[normal, mixed.T], [mixed, tangential]])
     given = jnp.concatenate([rates, slip.reshape(-1)])
     safe, wanted = jnp.pad(plastic, (0, rubbing.size)), jnp.concatenate([smooth - taken @ rubbing, rubbing])
@@ -85,22 +93,6 @@ def impulses_with_friction(
         return jnp.concatenate([x[:count, None], x[count:].reshape(count, 3)], axis=1)
 
     return each(found), jnp.sum(each(done), axis=1)
-
-
-def _changes(
-    normal: Array,
-    mixed: Array,
-    tangential: Array,
-    slip: Array,
-    held: Array,
-    pressed: Array,
-    friction: Array,
-    holding: Bool[Array, " c"],
-) -> tuple[Float[Array, "c 3c"], Float[Array, " 3c"]]:
-    """X of the contacts that hold their rates, and impulses of friction with these."""
-    taken = normal_changes(normal, mixed, holding)
-    found = friction_impulses(tangential - mixed @ taken, taken, slip, held, pressed, friction)
-    return taken, found.reshape(-1)
 
 
 def normal_changes(
@@ -152,8 +144,7 @@ def friction_impulses(
         pressed: impulses along the normals.
         friction: mu [-].
     """
-    count = pressed.shape[0]
-    number = jnp.arange(count)
+    count, number = pressed.shape[0], jnp.arange(pressed.shape[0])
     own = matrix.reshape(count, 3, count, 3)[number, :, number]
     slope = taken.reshape(count, count, 3)[number, number]
     trace = jnp.trace(own, axis1=1, axis2=2)

@@ -23,11 +23,7 @@ FORMS: dict[str, Any] = {
 
 
 def kind_of(system: Model, tableau: Tableau) -> Any:
-    """The form in which a scheme is solved: that chosen at compile, if its equations are separable.
-
-    Or if it is dense without differences, which friction asks for; but for forces at the ends of a step and
-    damping, which the reduced form alone has.
-    """
+    """The form in which a scheme is solved: that chosen at compile, if it is separable or dense."""
     chosen = system.structure.solver
     return FORMS[chosen if tableau.separable or (tableau.max_events and chosen == "full") else "reduced"]
 

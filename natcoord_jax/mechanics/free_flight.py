@@ -32,7 +32,7 @@ def touch(system: Model, state: State, part: float = TOUCHING) -> Float[Array, "
     return part * (system.size + jnp.max(jnp.abs(state.rows[:, 0])))
 
 
-def bouncing_groups(system: Model) -> list[Group]:
+def bouncing_groups(system: Model) -> list[Any]:
     """Contacts that have impacts."""
     return [group for group in system.effects if group.effect.unilateral and group.effect.bounces]
 
@@ -86,8 +86,6 @@ def in_free_flight(system: SomeModel, state: State, dt: Array, free: Bool[Array,
     closed = contact_gaps(system, groups, state) <= touch(system, state)
     phase = jnp.where(free & apart(system, groups, state, dt), FREE, jnp.where(closed, RESTING, 0))
     each = jnp.split(phase, np.cumsum([group.count for group in groups])[:-1])
-
-    def phases(system: Model) -> list[Any]:
-        return [group.effect.phase for group in bouncing_groups(system)]
-
-    return eqx.tree_at(phases, system, each, is_leaf=lambda x: x is None)
+    return eqx.tree_at(
+        lambda s: [g.effect.phase for g in bouncing_groups(s)], system, each, is_leaf=lambda x: x is None
+    )

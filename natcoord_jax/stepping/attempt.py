@@ -112,7 +112,7 @@ def attempt(
     What does not change from one evaluation to the next is outside of the loop over these, where the compiler
     can see it: 5 to 18 % of the time of a step of order two.
     """
-    course = with_state(carried.course, unpack(carried.state))
+    course = replace_fields(carried.course, state=unpack(carried.state))
     u, h, index = setting.situation(course)
     search = course.search
     system = setting.system if search is None else search.system(setting.system, course.state, setting.dt)
@@ -125,7 +125,7 @@ def attempt(
 
     def ended(carry: tuple) -> tuple:
         _, before, x, _, record, factors = carry
-        before = with_state(before, unpack(x))
+        before = replace_fields(before, state=unpack(x))
         ends = end_of_step(system, before.state, h, equations.groups, found, setting.plan.tableau)
         kick = None if before.lagging is None else found.kick.exact
         given = solving.residual, found.size, before.it.correction, ends[0], setting.plan.tolerance
@@ -150,7 +150,7 @@ def attempt(
             it = jax.lax.cond(failed, lambda: begin(_sticking(equations), few), lambda: after.it)
             after = replace_fields(after, it=it)
         factors = _kept(setting, equations, before, after, factors, solving.probe)
-        return jnp.array(False), with_state(after, None), x, start_cache, record, factors
+        return jnp.array(False), replace_fields(after, state=None), x, start_cache, record, factors
 
     carry = solving.ending, begun, carried.state, carried.start_cache, carried.record, solving.factors
     if apart:
@@ -166,10 +166,9 @@ def attempt(
 
 
 def _sticking(equations: Any) -> Float[Array, " unknowns"]:
-    """No motion, and contacts that press as much as all that moves could: a guess from which slip is none.
+    """A guess from which what sticks is found where friction presses more than it takes (Painleve's rod).
 
-    Where friction presses more than it takes, as on Painleve's rod, no slip solves the equations, and from a
-    guess that slips Newton's iteration does not find what sticks.
+    Nothing moves, and contacts that may close press as much as all that moves could. From slip it is not.
     """
     system, state, multipliers = equations.system, equations.state, equations.split(equations.guess())[1]
     for k, group in enumerate(equations.groups):
@@ -312,8 +311,3 @@ def _taken_back(record: tuple, index: Array, undone: Array, x: Array) -> tuple:
     states = with_row(states, index, jnp.where(undone, x, row(states, index)))
     accepted = with_row(accepted, index, row(accepted, index) & ~undone)
     return states, *others, accepted, finished
-
-
-def with_state(course: RolloutState, state: State | None) -> RolloutState:
-    """The course with another state, or without."""
-    return replace_fields(course, state=state)

@@ -38,8 +38,7 @@ class Rubbing(Effect):
         markers: that the gap is of.
         gap: between the surfaces.
         friction: coefficient mu [-]; None: there is none.
-        regularisation: eps [m/s]; None: 3e-6 of the speed that gravity gives along the size of the scene, and
-            of the fastest body at the start.
+        regularisation: eps [m/s]; None: see `nc.GapConstraint`.
         name: optional name.
         mobility: change of the speed of closing by a unit impulse [1/kg], follows from the masses.
         phase: in the part of a step at hand of schemes that locate impacts, `FREE` where nothing pushes until

@@ -24,8 +24,8 @@ class JointFriction(CoordinateForce):
     Attributes:
         joint: handle of the joint.
         friction: f [N m or N], not negative.
-        slip: s [rad/s or m/s], positive; None: 3e-3 of the speed that gravity gives along the size of the
-            scene, and of the fastest body at the start, of an angle over that size.
+        slip: s [rad/s or m/s], positive; None: 3e-3 of the speeds of the scene, see `nc.GapConstraint`, of an
+            angle over its size.
         coordinate: which coordinate of the joint.
 
     Example:
