@@ -6,7 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from natcoord_jax.core.bodies import DIRECTOR, POINT, Body
 from natcoord_jax.core.checks import as_array, is_concrete
@@ -108,29 +108,31 @@ def _drawn(shape: Any) -> Any:
 def with_slip_speeds(system: System, state: State) -> System:
     """The system with rates of slip up to which friction is smooth, by its speeds, where none are given."""
     effects: list[Any] = list(system.effects)
-    slips: list[Any] = [group.effect.slips for group in effects]
-    missing = [k for k, x in enumerate(slips) if x and getattr(effects[k].effect, x[0]) is None]
-    speed, size = _speed(system, state) if missing else jnp.zeros(()), system.size
     angles = np.concatenate([[-1], *(g.index for g in system.coordinates if g.axis.unit == "rad")])
-    for k in missing:
-        group, (name, part) = effects[k], slips[k]
-        turns, least = np.isin(group.coordinates, angles).any(axis=1), size
-        if group.source == "coordinates":  # what rests where nothing falls is moved by no less than that
-            least = group.effect.friction * jnp.where(turns, 1.0, size) / jnp.sum(system.mass[:, 0, 0])
-            least = jnp.where(least > 0, safe_sqrt(least), size)
-        slip = part * jnp.where(speed > 0, speed, least) / jnp.where(turns, size, 1.0)
-        effects[k] = replace_fields(group, effect=replace_fields(group.effect, **{name: slip}))
+    for k, group in enumerate(effects):
+        name, part = group.effect.slips or (None, 0.0)
+        if name and getattr(group.effect, name) is None:
+            turns = np.isin(group.coordinates, angles).any(axis=1)
+            load = group.effect.friction if group.source == "coordinates" else 0.0
+            slip = {name: part * _speeds(system, state, turns, load)}
+            effects[k] = replace_fields(group, effect=replace_fields(group.effect, **slip))
     return replace_fields(system, effects=tuple(effects))
 
 
 @eager_numpy
-def _speed(system: System, state: State) -> Float[Array, ""]:
-    """Of the fastest body at the start, and that which gravity gives along the size of the scene [m/s]."""
+def _speeds(system: System, state: State, turns: Bool[Array, " n"], load: Any) -> Float[Array, " n"]:
+    """Of the fastest body at the start, and that which gravity gives along the size of the scene [m/s].
+
+    Of coordinates that turn, over that size. What rests where nothing falls is moved by no less than a load.
+    """
     fields = replace_fields(system, effects=tuple(g for g in system.effects if g.source == "mass"))
-    still = jnp.zeros_like(state.rows[:, 0])
+    still, size = jnp.zeros_like(state.rows[:, 0]), system.size
     force, _ = loads(fields, state, jnp.zeros(len(system.structure.inputs)), still, still)
     pulls = safe_norm(force) / jnp.where(system.mass[:, 0, 0] > 0, system.mass[:, 0, 0], 1.0)
-    return safe_sqrt(jnp.max(pulls) * system.size) + jnp.max(safe_norm(state.row_rates[:, 0]))
+    speed = safe_sqrt(jnp.max(pulls) * size) + jnp.max(safe_norm(state.row_rates[:, 0]))
+    least = safe_sqrt(load * jnp.where(turns, 1.0, size) / jnp.sum(system.mass[:, 0, 0]))
+    speed = jnp.where(speed > 0, speed, jnp.where(least > 0, least, size))
+    return speed / jnp.where(turns, size, 1.0)
 
 
 def with_symmetries(system: System, state: State) -> System:

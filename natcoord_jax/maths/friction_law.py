@@ -87,12 +87,9 @@ def impulses_with_friction(
     safe, wanted = jnp.pad(plastic, (0, rubbing.size)), jnp.concatenate([smooth - taken @ rubbing, rubbing])
     found = without_gain(matrix, given, safe, wanted, jnp.sum(room))
     done = found * (given + 0.5 * matrix @ found)
-    count = rates.shape[0]
-
-    def each(x: Array) -> Array:
-        return jnp.concatenate([x[:count, None], x[count:].reshape(count, 3)], axis=1)
-
-    return each(found), jnp.sum(each(done), axis=1)
+    both, count = jnp.stack([found, done]), rates.shape[0]
+    each = jnp.concatenate([both[:, :count, None], both[:, count:].reshape(2, count, 3)], axis=2)
+    return each[0], jnp.sum(each[1], axis=1)
 
 
 def normal_changes(

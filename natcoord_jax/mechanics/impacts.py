@@ -145,7 +145,8 @@ def untouched(system: Model) -> Float[Array, "c 3"] | None:
 
 
 def _by_group(groups: Sequence[Group], every: Any) -> list[Any]:
-    return jnp.split(every, np.cumsum([group.count for group in groups])[:-1])
+    counts = [group.count for group in groups]
+    return [every[end - count : end] for count, end in zip(counts, np.cumsum(counts))]
 
 
 def _numbers(groups: Sequence[Group], name: str) -> Float[Array, " c"]:

@@ -336,7 +336,7 @@ def test_friction_in_joints_does_not_know_units(falls):
         scene.add(nc.JointForce(slide, gear=force, name="push"))
         scene.add(nc.JointTorque(hinge, gear=torque, name="motor"))
         system, state = scene.compile()
-        run = nc.simulate(system, state, dt=0.02 * time, steps=20, inputs=jnp.array([3.0, 1.0]))
+        run = nc.simulate(system, state, dt=0.02 * time, steps=20, inputs=jnp.array([6.0, 1.0]))
         return run.result, run.q[:, 0::4] / length, run.q[:, 5]
 
     codes, places, axes = map(np.asarray, jax.jit(jax.vmap(moved))(OTHERS))
