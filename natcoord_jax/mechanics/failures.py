@@ -70,7 +70,9 @@ def _jumps(group: Group, equations: Any) -> Bool[Array, " n"]:
     The change of a function that steps resolve lies between those of its rates, and that of one with kinks
     not far from it. By next to nothing, of an angle or of the places, they may jump.
     """
-    change, rates = jax.vmap(lambda effect: effect.prescribed(equations.state.t, equations.h))(group.effect)
+    # A drive may have no numbers: its coordinates count the lanes.
+    prescribed = jax.vmap(lambda effect, _: effect.prescribed(equations.state.t, equations.h))
+    change, rates = prescribed(group.effect, group.coordinates)
     low, high = jnp.min(rates, axis=1), jnp.max(rates, axis=1)
     beyond = jnp.abs(change - jnp.clip(change, low, high))
     jump, relation = jnp.where(beyond > BEYOND * (high - low), beyond, 0.0), cast(Any, group.effect)

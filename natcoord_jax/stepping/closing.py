@@ -193,18 +193,22 @@ def _judged(way: Way, found: Outcome, holds: bool) -> Way:
     # Foreseen within a tenth: the gaps are straight enough for twice the way.
     straight = jnp.abs(found.left - found.foreseen) <= 0.1 * jnp.abs(found.before - found.foreseen)
     under_way = found.limited & straight
-    creeping = (found.left > 0.99 * found.before) & ~under_way & ~found.close & ~shaken
+    winding = under_way & (manner.reach >= REACH)
+    creeping = (found.left > 0.99 * found.before) & ~winding & ~found.close & ~shaken
     slow = jnp.where(accepted, jnp.where(creeping, way.slow + 1, 0), way.slow)
     stuck = (~accepted & (manner.damping >= MOST_DAMPING)) | (slow >= SLOW)
     reach = jnp.where(accepted & under_way, 2.0 * manner.reach, manner.reach)
     reach = jnp.where(accepted, reach, jnp.minimum(0.5 * manner.reach, REACH))
-    softer, harder = jnp.maximum(0.01 * manner.damping, DAMPING), 100.0 * manner.damping
+    # Where the gaps are curved within the reach, less damping would only turn the step across the valley.
+    softer = jnp.where(found.limited & ~straight, 1.0, 0.01) * manner.damping
+    helps = accepted & ~creeping
+    damping = jnp.where(helps, jnp.maximum(softer, DAMPING), 100.0 * manner.damping)
     first = Manner.at_first(manner.reach.dtype)
     letting_go = stuck & holds & (manner.holding > 0)
     shaking = stuck & ~letting_go & (way.shakes < SHAKES)
     anew = stuck | shaken
     following = Manner(
-        jnp.where(anew, first.damping, jnp.where(accepted, softer, harder)),
+        jnp.where(anew, first.damping, damping),
         jnp.where(anew, first.reach, reach),
         jnp.where(letting_go, 0.0, manner.holding),
         jnp.where(shaking, way.shakes + 1, 0),

@@ -204,13 +204,12 @@ def test_where_a_gap_has_no_slope():
 
 
 MECHANISMS = {"four_bar": "foot 0", "bricard": "hinge 1", "slider_crank": "hinge"}
-STUCK = pytest.mark.xfail(strict=True, reason="one start of twelve, 4.056 rad, stays open")
 
 
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(name, marks=[pytest.mark.slow, STUCK] if name == "bricard" else pytest.mark.exhaustive)
+        pytest.param(name, marks=pytest.mark.slow if name == "bricard" else pytest.mark.exhaustive)
         for name in [*MECHANISMS, "gears"]
     ],
 )
