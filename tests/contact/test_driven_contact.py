@@ -387,6 +387,5 @@ def test_readings_and_transfers_obey_what_is_driven():
     assert np.abs(rows[:, index[0]] - 1.0).max() <= 1e-12
     assert np.abs(rows[50:, index[1]] - 1.0).max() <= 1e-12
     assert np.abs(np.asarray(system.rate(run, "track")) - 1.0).max() <= 1e-12
-    faster, start = belt(2.0)
-    after = nc.transfer(system, state, faster, onto=start)
+    faster, after = nc.transfer(system, state, belt(2.0)[0])
     assert float(faster.rate(after, "track")) == pytest.approx(2.0, abs=1e-12)

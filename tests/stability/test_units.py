@@ -38,13 +38,14 @@ FUNCTIONS = {
     nc.PointForce: ("s", "N"),
     nc.BodyTorque: ("s", "N m"),
     nc.EdgeSegment: ("s", "N/m"),
-    nc.NonlinearBeamElement: (("-",) * 3 + ("1/m",) * 3, "J/m"),
     **dict.fromkeys((nc.FacePressure, nc.FacePressure6, nc.FacePressure8, nc.FacePressure9), ("s", "N/m^2")),
 }
 """Units of the argument and the value of the function that an effect has."""
 INPUTS = {nc.JointForce: "N", nc.BodyForceInput: "N", nc.WrenchInput: "-", nc.AffineActuator: "-"}
 """Units of inputs that are no torques."""
 ASIDE = {
+    nc.NonlinearBeamElement: "its law has no numbers of its own, which units would be",
+    nc.Rolling: "it does not start on the plane",
     nc.PointOnPoint: "it repeats what the joint holds, which is found out outside of jit only",
     nc.PointSum: "it repeats what the joint holds, which is found out outside of jit only",
 }
@@ -52,9 +53,7 @@ ASIDE = {
 FITTING = {
     nc.PointOnPlane: lambda p: nc.PointOnPlane((p.ends[0], p.triad[2], p.ends[1]), distance=-0.7),
     nc.PointOnLine: lambda p: nc.PointOnLine((p.ends[0], nc.Direction(p.one, (0.8, 0.8, -0.7)), p.ends[1])),
-    nc.Rolling: lambda p: nc.Rolling(
-        (p.ends[0], nc.Direction(p.one, (0, 0, -1)), p.ends[1], nc.Direction(p.two, AXIS)), radius=0.7
-    ),
+    nc.JointFriction: lambda p: nc.JointFriction(p.joint, friction=0.5),
 }
 # Numbers of more units than one.
 MIXED = {
@@ -109,10 +108,8 @@ def in_units(part: Any, units: Any, slides: bool, turn: Any) -> Any:
         if field.name == "markers":
             changes["markers"] = tuple(placed(marker, length, turn) for marker in value or ())
         elif callable(value) and not isinstance(value, eqx.Module | type):
-            argument, result = FUNCTIONS[type(part)]
-            several = isinstance(argument, tuple)
-            argument = jnp.stack([scale(x, units) for x in argument]) if several else scale(argument, units)
-            changes[field.name] = Scaled(value, argument, scale(result, units))
+            argument, result = (scale(unit, units) for unit in FUNCTIONS[type(part)])
+            changes[field.name] = Scaled(value, argument, result)
         elif isinstance(value, eqx.Module):
             changes[field.name] = in_units(value, units, slides, turn)
         elif field.init and not field.metadata.get("static") and is_floating(value):
