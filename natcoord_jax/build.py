@@ -112,7 +112,7 @@ def with_slip_speeds(system: System, state: State) -> System:
     for k, group in enumerate(effects):
         name, part = group.effect.slips or (None, 0.0)
         if name and getattr(group.effect, name) is None:
-            turns = np.isin(group.coordinates, angles).any(axis=1)
+            turns: Any = np.isin(group.coordinates, angles).any(axis=1)
             load = group.effect.friction if group.source == "coordinates" else 0.0
             slip = {name: part * _speeds(system, state, turns, load)}
             effects[k] = replace_fields(group, effect=replace_fields(group.effect, **slip))
