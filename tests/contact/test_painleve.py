@@ -101,5 +101,6 @@ def test_rods_stick_slide_and_fall_from_any_start(feet, scheme):
         return run.result, system.energy(run).total
 
     codes, energy = (np.asarray(x) for x in jax.jit(jax.vmap(moved))(lanes))
-    assert np.count_nonzero(codes) <= 1, "one may have more impacts than there is room for"
+    assert set(codes) <= {0, int(nc.Result.MAX_SUBSTEPS)}
+    assert np.count_nonzero(codes) <= 6, "a few may have more impacts than there is room for"
     assert np.diff(energy[codes == 0], axis=1).max() <= 1e-12
