@@ -1,5 +1,6 @@
 """Random scenes for the hunt: loops, beams, what is gripped, and the table of all of them."""
 
+import hunting_contacts as contacts
 import hunting_trees as trees
 from hunting import Template
 from hunting_effects import Blow, Chance, Latch, pushed
@@ -97,7 +98,8 @@ def grip(rng: Chance):
     return (system, joined), *pushed(rng, system, state), none() * 2, rng.step(0.01)
 
 
-FOURTH = nc.EnergyMomentum(order=4)
+FOURTH, KICKS = nc.EnergyMomentum(order=4), nc.EnergyMomentum(kick=True)
+LOCATED = nc.EnergyMomentum(max_events=4)
 
 TEMPLATES = (
     Template("slide", trees.slide),
@@ -126,4 +128,19 @@ TEMPLATES = (
     Template("mixed", trees.mixed, exhaustive=True),
     Template("tree", trees.tree, exhaustive=True),
     Template("flag", flag, exhaustive=True),
+    Template("driven, with kicks", trees.driven, scheme=KICKS, exhaustive=True),
+    Template("driven, fourth order", trees.driven, scheme=FOURTH, exhaustive=True),
+    Template("driven, sixth order", trees.driven, scheme=nc.EnergyMomentum(order=6), exhaustive=True),
+    Template("driven, error control", trees.driven, rtol=1e-4, extra=160, exhaustive=True),
+    Template("arm, with kicks", trees.arm, scheme=KICKS, save_every=5, exhaustive=True),
+    Template("parallelogram, twice", parallelogram, more=("second",), exhaustive=True),
+    Template("shaken", contacts.shaken),
+    Template("shaken, soft", contacts.soft_shaken, more=("second",), exhaustive=True),
+    Template("shaken, located", contacts.shaken, scheme=LOCATED, exhaustive=True),
+    Template("bouncing", contacts.bouncing, more=("second",), exhaustive=True),
+    Template("bouncing, soft", contacts.soft_bouncing, exhaustive=True),
+    Template("bouncing, located", contacts.bouncing, scheme=LOCATED, exhaustive=True),
+    Template("sheet", contacts.sheet, exhaustive=True),
+    Template("block", contacts.block, more=("second",), exhaustive=True),
+    Template("of any size", contacts.sized, more=("second",), exhaustive=True),
 )

@@ -17,7 +17,7 @@ from natcoord_jax.maths.collocation import gauss
 from natcoord_jax.mechanics.admissible_velocities import with_admissible_velocities
 from natcoord_jax.mechanics.reduced import ReducedStep, active_groups
 from natcoord_jax.mechanics.redundancy import held_multipliers
-from natcoord_jax.mechanics.violations import GAP, LEFT_OPEN, constrained, misses, worst_violation
+from natcoord_jax.mechanics.violations import GAP, LEFT_OPEN, constrained, misses, spans, worst_violation
 from natcoord_jax.reading.diagnostics import unknown_name
 from natcoord_jax.stepping.assemble import with_admissible_positions
 from natcoord_jax.system import System
@@ -195,7 +195,9 @@ def find_redundancy(system: System, state: State) -> tuple[int, tuple[str, ...]]
     """
     if system.structure.held == 0:
         return 0, ()
-    held = held_multipliers(active_groups(system))
+    groups = [group for group in active_groups(system) if group.multipliers]
+    held = held_multipliers(groups)
+    sizes = np.concatenate([np.ravel(x) for x in spans(system, [g for g in groups if g.holds])])
     best, names = -1, ()
     random = np.random.default_rng(0)
     for attempt in range(3):
@@ -206,7 +208,8 @@ def find_redundancy(system: System, state: State) -> tuple[int, tuple[str, ...]]
                 continue
         else:
             state_now = state
-        rows = np.asarray(_constraint_rows(system, state_now))[held]
+        # In terms of what motions of the size of the scene change: what repeats a joint is rounding.
+        rows = np.asarray(_constraint_rows(system, state_now))[held] / sizes[:, None]
         rank, dependent = _rank(rows)
         if not dependent:
             return rank, ()
@@ -225,12 +228,12 @@ def _disturbed(state: State, size: Any, random: np.random.Generator) -> State:
 
 
 def _rank(rows: np.ndarray) -> tuple[int, list[int]]:
-    """Rank, and rows that depend on earlier ones, so that later joints are named."""
+    """Rank, and rows that depend on earlier ones, so that later joints are named; rows are relative."""
     sizes = np.linalg.svd(rows, compute_uv=False)
-    rank = int(np.sum(sizes > 1e-9 * max(sizes[0], 1e-300))) if sizes.size else 0
+    rank = int(np.sum(sizes > 1e-9 * max(sizes[0], 1.0))) if sizes.size else 0
     if rank == len(rows):
         return rank, []
-    largest = np.max(np.linalg.norm(rows, axis=1), initial=1e-300)
+    largest = np.max(np.linalg.norm(rows, axis=1), initial=1.0)
     basis: list[np.ndarray] = []
     dependent = []
     for number, row in enumerate(rows):

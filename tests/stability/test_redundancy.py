@@ -219,3 +219,29 @@ def test_bricard_over_ten_seconds(order):
     for t, place in gallery.load("bricard").facts["corner 3"].items():
         error = np.max(np.abs(moved["rod 4"][round(t / STEP), 0] - place))
         assert error <= tol.ERRORS_OF_BRICARD[order], (t, error)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [pytest.param(1e-6, marks=pytest.mark.exhaustive), 1.0])
+def test_what_only_repeats_a_joint_is_none(size):
+    """All that is left of it beside the joint is rounding, which has a rank of its own."""
+    runs = []
+    for repeated in (False, True):
+        scene, bodies = nc.Scene(), []
+        for k in range(2):
+            place, turned = size * np.array([0.5 * k, 0.3 * k, -1.0]), ((1, 2, 2), 0.7 * k)
+            numbers = {"mass": 1.5, "inertia": size**2 * np.array([0.2, 0.25, 0.3]), "orientation": turned}
+            numbers["com"] = size * np.array([0.05, -0.03, 0.1])
+            moving = {"angular_velocity": (0.5 - 2.0 * k, 0.4, 0.7), "velocity": (0.3 * k * size, 0, 0)}
+            bodies.append(scene.add(nc.RigidBody(**numbers, **moving, position=place, name=f"{k}")))
+        place = size * np.array([0.2, 0.1, -1.3])
+        scene.add(nc.Spherical(*bodies, point=place))
+        if repeated:
+            ends = tuple(nc.Point(body, place) for body in (*bodies, bodies[0]))
+            scene.add(nc.PointSum(ends, weights=(0.7, -1.0, 0.3), name="again"))
+        system, state = scene.compile(assemble=True)
+        assert system.structure.dofs == 9
+        runs.append(nc.simulate(system, state, dt=0.1, steps=20))
+    assert any("again" in name for name in system.structure.redundant)
+    assert int(runs[1].steps_rejected) == 0
+    np.testing.assert_allclose(runs[1].q, runs[0].q, rtol=0, atol=tol.SAME_SOLUTION)
