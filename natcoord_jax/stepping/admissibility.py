@@ -201,13 +201,12 @@ def find_redundancy(system: System, state: State) -> tuple[int, tuple[str, ...]]
     best, names = -1, ()
     random = np.random.default_rng(0)
     for attempt in range(3):
+        state_now = state
         if attempt:
             disturbed = _disturbed(state, system.size, random)
             state_now, code = _with_admissible_positions(system, disturbed)
             if int(code) != Result.SUCCESSFUL:
                 continue
-        else:
-            state_now = state
         # In terms of what motions of the size of the scene change: what repeats a joint is rounding.
         rows = np.asarray(_constraint_rows(system, state_now))[held] / sizes[:, None]
         rank, dependent = _rank(rows)

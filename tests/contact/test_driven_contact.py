@@ -186,7 +186,9 @@ def test_what_a_belt_takes_along_rolls_or_rests(rider, how):
     system, state, impulse, mass = carried(rider, **how)
     run = nc.simulate(system, state, dt=0.01, steps=40)
     work = account(system, run)
-    assert abs(work["drive"][-1] - impulse * SPEED) <= ROUNDED
+    # (What turns has an energy across its axis that its drive pays for, of the order of the step squared.)
+    near = CREEP * 2.0 if how.get("geared") else 0.0
+    assert abs(work["drive"][-1] - impulse * SPEED) <= ROUNDED + near
     assert abs(work["rubs"][-1] + 0.5 * impulse * SPEED) <= CREEP * impulse * SPEED
     velocity = np.asarray(system.sense(run, "rider").velocity)[-1]
     np.testing.assert_allclose(velocity, (impulse / mass, 0.0, 0.0), atol=1e-11)
