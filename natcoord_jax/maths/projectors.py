@@ -15,7 +15,9 @@ LEAST = 1e-14
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(1,))
-def range_projector(matrix: Float[Array, "m n"], rank: int) -> Float[Array, "m m"]:
+def range_projector(
+    matrix: Float[Array, "m n"], rank: int, least: Float[Array, ""] | float = 0.0
+) -> Float[Array, "m m"]:
     """Orthogonal projector on the range, by Gram-Schmidt orthogonalisation of the columns, largest first.
 
     Unlike singular vectors it compiles into one kernel. Its derivative is that of the projector on the range
@@ -24,13 +26,14 @@ def range_projector(matrix: Float[Array, "m n"], rank: int) -> Float[Array, "m m
 
     Args:
         matrix: A.
-        rank: its rank.
+        rank: its rank, or more than that.
+        least: length of a column, less all before it, that is none: it decides where the rank is not known.
     """
 
     def with_column(_: Any, carry: tuple[Array, Array]) -> tuple[Array, Array]:
         rest, projector = carry
         sizes = jnp.sum(rest**2, axis=0)
-        vector = rest[:, jnp.argmax(sizes)]
+        vector = jnp.where(jnp.max(sizes) > least**2, rest[:, jnp.argmax(sizes)], 0.0)
         # Twice is enough: what is left is orthogonal to round-off.
         vector = safe_divide(vector, safe_norm(vector))
         vector = vector - projector @ vector
@@ -44,8 +47,8 @@ def range_projector(matrix: Float[Array, "m n"], rank: int) -> Float[Array, "m m
 
 @range_projector.defjvp
 def _range_projector_jvp(rank: int, primals: tuple, tangents: tuple):
-    (matrix,), (change,) = primals, tangents
-    projector = range_projector(matrix, rank)
+    (matrix, least), (change, _) = primals, tangents
+    projector = range_projector(matrix, rank, least)
     half = (jnp.eye(matrix.shape[0], dtype=matrix.dtype) - projector) @ change
     half = half @ pseudo_inverse(matrix, projector, rank)
     return projector, half + half.T

@@ -25,6 +25,7 @@ from natcoord_jax.mechanics.mass_between import pair_matrices
 from natcoord_jax.mechanics.momentum import least_inertias
 from natcoord_jax.mechanics.redundancy import (
     held_multipliers,
+    least_change,
     project_multipliers,
 )
 from natcoord_jax.mechanics.response import (
@@ -61,7 +62,7 @@ class FullStep(StepEquations):
         matrix = resting.jacobian(jnp.zeros(resting.unknowns, state.q.dtype))
         rows = matrix[resting.balances :, : resting.balances][held_multipliers(resting.groups)]
         in_tree = sum(g.count * g.multipliers for g in system.joints if g.in_tree)
-        return range_projector(rows, rank + in_tree)
+        return range_projector(rows, rank + in_tree, least_change(system))
 
     @property
     def bodies(self) -> int:

@@ -23,6 +23,7 @@ from natcoord_jax.mechanics.equations_of_motion import constraint_matrix
 from natcoord_jax.mechanics.momentum import least_inertias
 from natcoord_jax.mechanics.redundancy import (
     contact_mobilities,
+    least_change,
     places_by_stage,
 )
 from natcoord_jax.mechanics.response import (
@@ -84,7 +85,7 @@ class ReducedStep(StepEquations):
         """That of the tangent space, if it is known."""
         if isinstance(tangents, TangentSpace) and tangents.admissible.range is not None:
             return tangents.admissible.range
-        return range_projector(constraint_matrix(system, state), rank)
+        return range_projector(constraint_matrix(system, state), rank, least_change(system))
 
     @property
     def balances(self) -> int:

@@ -8,7 +8,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from natcoord_jax.mechanics.violations import spans
 from natcoord_jax.model.groups import Group
+from natcoord_jax.model.model import Model
+
+RANK = 1e-9
+"""Part of what a motion of the size of the scene changes a constraint by that is rounding of nothing."""
+
+
+def least_change(system: Model) -> Float[Array, ""] | float:
+    """Change of constraints that counts, where their rank is not known: of scenes built inside of jit."""
+    if system.structure.redundant:
+        return 0.0
+    groups = [group for group in (*system.effects, *system.joints) if group.multipliers and group.holds]
+    return RANK * jnp.max(jnp.concatenate([x.reshape(-1) for x in spans(system, groups)]))
 
 
 def project_multipliers(y: Array, balances: int, projector: Array | None) -> Array:

@@ -22,6 +22,7 @@ from natcoord_jax.mechanics.equations_of_motion import (
     relations_of,
 )
 from natcoord_jax.mechanics.momentum import inertia, spatial_inertia, weighs_only, wrench
+from natcoord_jax.mechanics.redundancy import RANK, least_change
 from natcoord_jax.model.model import Model
 from natcoord_jax.model.rows import row_rates
 
@@ -298,15 +299,17 @@ def _admissible(
         lift, none = jnp.zeros((matrix.shape[1], 0), matrix.dtype), jnp.zeros(0, matrix.dtype)
         return Admissible(frame, None, *((lift, none) if lifted else (None, None)))
     framed, unit = frame @ matrix.T, jnp.eye(matrix.shape[1], dtype=matrix.dtype)
-    rank, onto, reached = balances.system.structure.rank, None, framed
+    rank, onto, reached, least = balances.system.structure.rank, None, framed, 0.0
     if rank is None:
         rank = matrix.shape[0]
     else:
         # Only where constraints hold is that their rank. Elsewhere the weakest direction has to be left out,
         # and that among the constraints first: then the choice matters to second order only.
-        onto = range_projector(matrix, rank)
+        onto = range_projector(matrix, rank, least_change(balances.system))
         reached = framed @ onto
-    forbidden = range_projector(reached, rank)
+        if not balances.system.structure.redundant:
+            least = RANK * jnp.linalg.norm(reached)
+    forbidden = range_projector(reached, rank, least)
     subspace = unit - 0.5 * (forbidden + forbidden.T)
     if not lifted:
         return Admissible(frame, subspace, None, None, onto)

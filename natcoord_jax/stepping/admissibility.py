@@ -16,7 +16,7 @@ from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import gauss
 from natcoord_jax.mechanics.admissible_velocities import with_admissible_velocities
 from natcoord_jax.mechanics.reduced import ReducedStep, active_groups
-from natcoord_jax.mechanics.redundancy import held_multipliers
+from natcoord_jax.mechanics.redundancy import RANK, held_multipliers
 from natcoord_jax.mechanics.violations import GAP, LEFT_OPEN, constrained, misses, spans, worst_violation
 from natcoord_jax.reading.diagnostics import unknown_name
 from natcoord_jax.stepping.assemble import with_admissible_positions
@@ -229,7 +229,7 @@ def _disturbed(state: State, size: Any, random: np.random.Generator) -> State:
 def _rank(rows: np.ndarray) -> tuple[int, list[int]]:
     """Rank, and rows that depend on earlier ones, so that later joints are named; rows are relative."""
     sizes = np.linalg.svd(rows, compute_uv=False)
-    rank = int(np.sum(sizes > 1e-9 * max(sizes[0], 1.0))) if sizes.size else 0
+    rank = int(np.sum(sizes > RANK * max(sizes[0], 1.0))) if sizes.size else 0
     if rank == len(rows):
         return rank, []
     largest = np.max(np.linalg.norm(rows, axis=1), initial=1.0)

@@ -36,6 +36,11 @@ def prepared(system: System, state: State, *, assembled: bool, chosen: str | Non
     """
     if not is_concrete(system, state):
         state = state if assembled else admitted(system, state)
+        structure = system.structure
+        if structure.held and structure.solver != "sparse":
+            # Which constraints depend on others is decided as it runs.
+            structure = dataclasses.replace(structure, rank=structure.held)
+        system = replace_fields(system, structure=structure)
         return _with_pattern(system, state), state
     check_inertia(system, state)
     if not assembled:
