@@ -6,7 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from natcoord_jax.core.bodies import DIRECTOR, POINT, Body
 from natcoord_jax.core.checks import as_array, is_concrete
@@ -35,10 +35,6 @@ from natcoord_jax.model.model import Structure
 from natcoord_jax.model.rows import rows_with_ground
 from natcoord_jax.reading.admissible import sound
 from natcoord_jax.system import System
-
-REGULARISED = 3e-6
-"""Velocity of slip, in terms of the speeds of a scene, up to which friction is smooth: what sticks under a
-load creeps less than that."""
 
 
 def build(
@@ -99,7 +95,7 @@ def build(
         mass_between=between,
     )
     state = replace_fields(layout.state(), contacts=untouched(system))
-    system = with_regularised_friction(with_sizes(system, state), state)
+    system = with_slip_speeds(with_sizes(system, state), state)
     system = with_mobilities(jax.tree.map(as_array, with_symmetries(system, state)), state)
     return sound(system, system), with_readings(system, state)
 
@@ -109,34 +105,34 @@ def _drawn(shape: Any) -> Any:
     return jax.tree.map(np.asarray, shape) if is_concrete(shape) else None
 
 
-def with_regularised_friction(system: System, state: State) -> System:
-    """The system with velocities of slip up to which friction is smooth, where none are given."""
-
-    def needs(group: Any) -> bool:
-        effect = group.effect
-        return effect.unilateral and effect.friction is not None and effect.regularisation is None
-
-    if not any(map(needs, system.effects)):
-        return system
-    slip = REGULARISED * _speed(system, state)
-    each = [
-        replace_fields(g, effect=replace_fields(g.effect, regularisation=jnp.broadcast_to(slip, (g.count,))))
-        if needs(g)
-        else g
-        for g in system.effects
-    ]
-    return replace_fields(system, effects=tuple(each))
+def with_slip_speeds(system: System, state: State) -> System:
+    """The system with rates of slip up to which friction is smooth, by its speeds, where none are given."""
+    effects: list[Any] = list(system.effects)
+    angles = np.concatenate([[-1], *(g.index for g in system.coordinates if g.axis.unit == "rad")])
+    for k, group in enumerate(effects):
+        name, part = group.effect.slips or (None, 0.0)
+        if name and getattr(group.effect, name) is None:
+            turns: Any = np.isin(group.coordinates, angles).any(axis=1)
+            load = group.effect.friction if group.source == "coordinates" else 0.0
+            slip = {name: part * _speeds(system, state, turns, load)}
+            effects[k] = replace_fields(group, effect=replace_fields(group.effect, **slip))
+    return replace_fields(system, effects=tuple(effects))
 
 
 @eager_numpy
-def _speed(system: System, state: State) -> Float[Array, ""]:
-    """Of the fastest body at the start, and that which gravity gives along the size of the scene [m/s]."""
+def _speeds(system: System, state: State, turns: Bool[Array, " n"], load: Any) -> Float[Array, " n"]:
+    """Of the fastest body at the start, and that which gravity gives along the size of the scene [m/s].
+
+    Of coordinates that turn, over that size. What rests where nothing falls is moved by no less than a load.
+    """
     fields = replace_fields(system, effects=tuple(g for g in system.effects if g.source == "mass"))
-    still = jnp.zeros_like(state.rows[:, 0])
+    still, size = jnp.zeros_like(state.rows[:, 0]), system.size
     force, _ = loads(fields, state, jnp.zeros(len(system.structure.inputs)), still, still)
     pulls = safe_norm(force) / jnp.where(system.mass[:, 0, 0] > 0, system.mass[:, 0, 0], 1.0)
-    speed = safe_sqrt(jnp.max(pulls) * system.size) + jnp.max(safe_norm(state.row_rates[:, 0]))
-    return jnp.where(speed > 0, speed, system.size)
+    speed = safe_sqrt(jnp.max(pulls) * size) + jnp.max(safe_norm(state.row_rates[:, 0]))
+    least = safe_sqrt(load * jnp.where(turns, 1.0, size) / jnp.sum(system.mass[:, 0, 0]))
+    speed = jnp.where(speed > 0, speed, jnp.where(least > 0, least, size))
+    return speed / jnp.where(turns, size, 1.0)
 
 
 def with_symmetries(system: System, state: State) -> System:

@@ -42,6 +42,7 @@ class Effect(Part):
         vectors: of each node of an element made by `on`: 1 for its point, 2 with a director, 4 with a triad.
         unit_directions: whether it asks of directions among its markers only where they point.
         derived: fields that follow from the others, see `renewed`.
+        slips: field with a rate of slip, and the part of the speeds of the scene that it is by default.
         drawn: whether pictures show it as a link where it is between two points.
     """
 
@@ -64,6 +65,7 @@ class Effect(Part):
     vectors: ClassVar[int] = 1
     unit_directions: ClassVar[bool] = False
     derived: ClassVar[tuple[str, ...]] = ()
+    slips: ClassVar[tuple[str, float] | None] = None
     drawn: ClassVar[bool] = True
 
     @classmethod

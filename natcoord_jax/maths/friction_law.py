@@ -10,12 +10,14 @@ made some may be a few hundredths beyond their cones.) What is hit off its centr
 (W. J. Stronge, Impact Mechanics, 2000); impulses stop short of that.
 """
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from natcoord_jax.maths.impact_law import held_alone, semidefinite_solution
-from natcoord_jax.maths.vectors import positive_part, safe_sqrt
+from natcoord_jax.maths.vectors import positive_part, safe_norm, safe_sqrt
 
 ROUNDS = 16
 """Of what friction does at all contacts at once; one or two are enough for a single contact."""
@@ -58,49 +60,36 @@ def impulses_with_friction(
         room: energy that each may give [J].
     """
     pressed = jnp.where(on, positive_part(held[:, 0] + smooth), 0.0)
-    after = rates + normal @ smooth
+    change = normal @ smooth
     # What has pushed until the impact, and parts by it, does not pull.
-    parting = (smooth <= 0) & (after > PARTING * jnp.max(jnp.abs(rates)))
+    parting = (smooth <= 0) & (jnp.minimum(change, rates + change) > PARTING * jnp.max(jnp.abs(rates)))
     slipping = slip + (mixed @ smooth).reshape(slip.shape)
     moving = normal, mixed, tangential, slipping, held[:, 1:], pressed, friction
+
+    def changes(holding: Array, normal: Array, mixed: Array, tangential: Array, *more: Array) -> Any:
+        """X of the contacts that hold their rates, and impulses of friction with these."""
+        taken = normal_changes(normal, mixed, holding)
+        return taken, friction_impulses(tangential - mixed @ taken, taken, *more).reshape(-1)
+
     # Which of them hold is found apart from derivatives, which hold it, as `pressing_impulses` has it.
     fixed, start = jax.lax.stop_gradient(moving), bouncing & (pressed > 0) & ~parting
 
     def trip(carry: tuple[Array, Array]) -> tuple[Array, Array]:
-        taken, rubbing = _changes(*fixed, carry[0])
+        taken, rubbing = changes(carry[0], *fixed)
         # A contact does not pull to hold its rate: it keeps the impulse that it has.
         holding = carry[0] & (fixed[5] - taken @ rubbing >= 0)
         return holding, jnp.any(holding != carry[0])
 
     holding = jax.lax.while_loop(lambda c: c[1], trip, (start, jnp.any(start)))[0]
-    taken, rubbing = _changes(*moving, holding)
+    taken, rubbing = changes(holding, *moving)
     matrix = jnp.block([[normal, mixed.T], [mixed, tangential]])
     given = jnp.concatenate([rates, slip.reshape(-1)])
     safe, wanted = jnp.pad(plastic, (0, rubbing.size)), jnp.concatenate([smooth - taken @ rubbing, rubbing])
     found = without_gain(matrix, given, safe, wanted, jnp.sum(room))
     done = found * (given + 0.5 * matrix @ found)
-    count = rates.shape[0]
-
-    def each(x: Array) -> Array:
-        return jnp.concatenate([x[:count, None], x[count:].reshape(count, 3)], axis=1)
-
-    return each(found), jnp.sum(each(done), axis=1)
-
-
-def _changes(
-    normal: Array,
-    mixed: Array,
-    tangential: Array,
-    slip: Array,
-    held: Array,
-    pressed: Array,
-    friction: Array,
-    holding: Bool[Array, " c"],
-) -> tuple[Float[Array, "c 3c"], Float[Array, " 3c"]]:
-    """X of the contacts that hold their rates, and impulses of friction with these."""
-    taken = normal_changes(normal, mixed, holding)
-    found = friction_impulses(tangential - mixed @ taken, taken, slip, held, pressed, friction)
-    return taken, found.reshape(-1)
+    both, count = jnp.stack([found, done]), rates.shape[0]
+    each = jnp.concatenate([both[:, :count, None], both[:, count:].reshape(2, count, 3)], axis=2)
+    return each[0], jnp.sum(each[1], axis=1)
 
 
 def normal_changes(
@@ -152,8 +141,7 @@ def friction_impulses(
         pressed: impulses along the normals.
         friction: mu [-].
     """
-    count = pressed.shape[0]
-    number = jnp.arange(count)
+    count, number = pressed.shape[0], jnp.arange(pressed.shape[0])
     own = matrix.reshape(count, 3, count, 3)[number, :, number]
     slope = taken.reshape(count, count, 3)[number, number]
     trace = jnp.trace(own, axis1=1, axis2=2)
@@ -162,6 +150,9 @@ def friction_impulses(
     plane = product > PLANE * trace**2
     length = jnp.where(trace > 0, 1.0 / jnp.where(trace > 0, trace, 1.0), 0.0)
     over = jnp.where(plane, 1.0 / jnp.where(plane, product, 1.0), 0.0)
+    none = jnp.finfo(held.dtype).tiny
+    size = safe_norm(held) + none
+    reach = size + friction * jnp.sum(slope * held, axis=1)
 
     def trip(_: Array, found: Float[Array, "c 3"]) -> Float[Array, "c 3"]:
         moving = slip + (matrix @ found.reshape(-1)).reshape(count, 3)
@@ -173,14 +164,16 @@ def friction_impulses(
         alone = pressed - taken @ found.reshape(-1) + jnp.sum(slope * total, axis=1)
         most = friction * positive_part(alone - jnp.sum(slope * sticking, axis=1))
         sticks = jnp.sum(sticking**2, axis=1) <= most**2
-        wanted = total - 2.0 * length[:, None] * moving
-        square = jnp.sum(wanted**2, axis=1)
-        some = square > 0
-        along = jnp.where(some[:, None], wanted, 0.0) / jnp.sqrt(jnp.where(some, square, 1.0))[:, None]
+        # What has opposed slip in the step stays, as far as the cone goes; more opposes what is left of it.
+        kept = jnp.minimum(friction * positive_part(alone) / jnp.maximum(reach, 0.1 * size), 1.0)
+        wanted = total - kept[:, None] * held - 2.0 * length[:, None] * moving
+        along = wanted / (safe_norm(wanted) + none)[:, None]
         less = 1.0 + friction * jnp.sum(slope * along, axis=1)
         # (Where friction would press more than it takes, as a jamming rod does, it grows step by step.)
-        at_most = friction * positive_part(alone) / jnp.where(less > 0.1, less, 1.0)
-        change = jnp.where(sticks[:, None], sticking, at_most[:, None] * along) - total
+        more = positive_part(friction * positive_part(alone) - kept * reach) / jnp.where(
+            less > 0.1, less, 1.0
+        )
+        change = jnp.where(sticks[:, None], sticking, kept[:, None] * held + more[:, None] * along) - total
         falls = -jnp.sum(moving * change)
         needed = change.reshape(-1) @ (matrix @ change.reshape(-1))
         short = (falls > 0) & (needed > falls)

@@ -23,8 +23,9 @@ FORMS: dict[str, Any] = {
 
 
 def kind_of(system: Model, tableau: Tableau) -> Any:
-    """The form in which a scheme is solved: that chosen at compile, if its equations are separable."""
-    return FORMS[system.structure.solver if tableau.separable else "reduced"]
+    """The form in which a scheme is solved: that chosen at compile, if it is separable or dense."""
+    chosen = system.structure.solver
+    return FORMS[chosen if tableau.separable or (tableau.max_events and chosen == "full") else "reduced"]
 
 
 def prepare(

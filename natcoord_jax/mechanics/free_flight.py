@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -31,7 +32,7 @@ def touch(system: Model, state: State, part: float = TOUCHING) -> Float[Array, "
     return part * (system.size + jnp.max(jnp.abs(state.rows[:, 0])))
 
 
-def bouncing_groups(system: Model) -> list[Group]:
+def bouncing_groups(system: Model) -> list[Any]:
     """Contacts that have impacts."""
     return [group for group in system.effects if group.effect.unilateral and group.effect.bounces]
 
@@ -84,12 +85,7 @@ def in_free_flight(system: SomeModel, state: State, dt: Array, free: Bool[Array,
     groups = bouncing_groups(system)
     closed = contact_gaps(system, groups, state) <= touch(system, state)
     phase = jnp.where(free & apart(system, groups, state, dt), FREE, jnp.where(closed, RESTING, 0))
-    ends = np.cumsum([group.count for group in groups])
-    own = iter(jnp.split(phase, ends[:-1]))
-
-    def told(group: Any) -> Any:
-        if not (group.effect.unilateral and group.effect.bounces):
-            return group
-        return replace_fields(group, effect=replace_fields(group.effect, phase=next(own)))
-
-    return replace_fields(system, effects=tuple(told(group) for group in system.effects))
+    each = jnp.split(phase, np.cumsum([group.count for group in groups])[:-1])
+    return eqx.tree_at(
+        lambda s: [g.effect.phase for g in bouncing_groups(s)], system, each, is_leaf=lambda x: x is None
+    )

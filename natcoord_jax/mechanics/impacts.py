@@ -9,6 +9,7 @@ what slip friction stops at the same time.
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -24,10 +25,9 @@ from natcoord_jax.maths.friction_law import impulses_with_friction, without_fric
 from natcoord_jax.maths.impact_law import collision_impulses, impact_impulses
 from natcoord_jax.maths.vectors import positive_part
 from natcoord_jax.mechanics.block_tangent_space import Tangents, tangents_at
-from natcoord_jax.mechanics.equations_of_motion import loops_of, relations_of
 from natcoord_jax.mechanics.free_flight import apart, meeting, touch
 from natcoord_jax.mechanics.response import Evaluation
-from natcoord_jax.mechanics.tangent_space import Velocity, driven
+from natcoord_jax.mechanics.tangent_space import Velocity, driven, prescribing
 from natcoord_jax.mechanics.violations import contact_gaps
 from natcoord_jax.model.groups import Group
 from natcoord_jax.model.islands import IslandOrder
@@ -108,7 +108,7 @@ def after_impacts(
     # Of the multipliers of a contact the first is that of the gap.
     pushed = jnp.concatenate([x[:, 0] for x in lam])
     # As in the equations: what is left of the impulse of an open contact may be of either sign.
-    bouncing = _bouncing(these)
+    bouncing = np.repeat([group.effect.bounces for group in these], [group.count for group in these])
     ahead = contact_gaps(system, these, end)
     if tableau.max_events:
         phase = _numbers(these, "phase")
@@ -121,17 +121,13 @@ def after_impacts(
         active, hit = active & ~free, free & meeting(system, these, end)
     none = jnp.zeros_like(pushed)
 
-    constraints = (*relations_of(system), *loops_of(system)) if driven(system) else ()
-    drives = jnp.zeros(sum(group.count * group.multipliers for group in constraints))
-
-    def impacts() -> tuple[Array, ...]:
-        return _impacts(system, start, end, h, these, active, hit, lam)
-
-    def nothing() -> tuple[Array, ...]:
-        return end.v, end.rates, drives, none, none, none
-
-    some = active if hit is None else active | hit
-    v, rotors, drives, done, struck, met = jax.lax.cond(jnp.any(some), impacts, nothing)
+    drives = jnp.zeros(prescribing(system).size * driven(system))
+    some, contacts = active if hit is None else active | hit, (these, active, hit, lam, bouncing)
+    v, rotors, drives, done, struck, met = jax.lax.cond(
+        jnp.any(some),
+        lambda: _impacts(system, start, end, h, *contacts),
+        lambda: (end.v, end.rates, drives, none, none, none),
+    )
     after = replace_fields(end, v=v, rates=rotors)
     if start.contacts is not None:
         happened = [jnp.where(active, positive_part(pushed), 0.0), struck, met]
@@ -149,19 +145,14 @@ def untouched(system: Model) -> Float[Array, "c 3"] | None:
 
 
 def _by_group(groups: Sequence[Group], every: Any) -> list[Any]:
-    ends = np.cumsum([group.count for group in groups])
-    return [every[part] for part in np.split(np.arange(every.shape[0]), ends[:-1])]
+    counts = [group.count for group in groups]
+    return [every[end - count : end] for count, end in zip(counts, np.cumsum(counts))]
 
 
 def _numbers(groups: Sequence[Group], name: str) -> Float[Array, " c"]:
     """A number, or a truth, of all contacts; zero where there is none."""
     each = ((group.count, getattr(group.effect, name)) for group in groups)
     return jnp.concatenate([jnp.zeros(count) if value is None else value for count, value in each])
-
-
-def _bouncing(groups: Sequence[Group]) -> np.ndarray:
-    """Which contacts have impacts; others push by an energy, and rub."""
-    return np.concatenate([np.full(group.count, group.effect.bounces) for group in groups])
 
 
 def _impacts(
@@ -173,9 +164,10 @@ def _impacts(
     active: Bool[Array, " c"],
     hit: Bool[Array, " c"] | None,
     lam: Sequence[Float[Array, "n m"]],
+    bouncing: Any,
 ) -> tuple[Array, ...]:
     """After impacts: velocities, rates of rotors, work of drives, work of contacts, impulses, which met."""
-    space, bouncing = tangents_at(system, end), jnp.asarray(_bouncing(groups))
+    space, bouncing = tangents_at(system, end), jnp.asarray(bouncing)
     pushes = Answers(space, system, groups, end, "pushes")
     # With friction it has three multipliers besides that of the gap.
     held = jnp.concatenate([jnp.pad(x, ((0, 0), (0, 4 - x.shape[1]))) for x in lam])
@@ -229,14 +221,8 @@ def with_mobilities(system: SomeModel, state: State) -> SomeModel:
     groups = [group for group in system.effects if group.effect.unilateral]
     if not groups:
         return system
-    own = iter(_by_group(groups, mobilities(system, state)))
-    effects = tuple(
-        replace_fields(group, effect=replace_fields(group.effect, mobility=next(own)))
-        if group.effect.unilateral
-        else group
-        for group in system.effects
-    )
-    return replace_fields(system, effects=effects)
+    each = _by_group(groups, mobilities(system, state))
+    return eqx.tree_at(lambda s: [g.effect.mobility for g in s.effects if g.effect.unilateral], system, each)
 
 
 @eager_numpy

@@ -196,19 +196,19 @@ def find_redundancy(system: System, state: State) -> tuple[int, tuple[str, ...]]
     if system.structure.held == 0:
         return 0, ()
     groups = [group for group in active_groups(system) if group.multipliers]
-    held, sizes = held_multipliers(groups), [np.ravel(x) for x in spans(system, groups)]
+    held = held_multipliers(groups)
+    sizes = np.concatenate([np.ravel(x) for x in spans(system, [g for g in groups if g.holds])])
     best, names = -1, ()
     random = np.random.default_rng(0)
     for attempt in range(3):
+        state_now = state
         if attempt:
             disturbed = _disturbed(state, system.size, random)
             state_now, code = _with_admissible_positions(system, disturbed)
             if int(code) != Result.SUCCESSFUL:
                 continue
-        else:
-            state_now = state
         # In terms of what motions of the size of the scene change: what repeats a joint is rounding.
-        rows = (np.asarray(_constraint_rows(system, state_now)) / np.concatenate(sizes)[:, None])[held]
+        rows = np.asarray(_constraint_rows(system, state_now))[held] / sizes[:, None]
         rank, dependent = _rank(rows)
         if not dependent:
             return rank, ()

@@ -21,12 +21,13 @@ from natcoord_jax.mechanics.redundancy import contact_weights
 from natcoord_jax.mechanics.response import Evaluation
 from natcoord_jax.mechanics.start_cache import StartCache
 from natcoord_jax.mechanics.tangent_space import driven
+from natcoord_jax.mechanics.violations import contact_gaps
 from natcoord_jax.stepping.after_attempt import after_attempt
 from natcoord_jax.stepping.difference_jacobian import DifferenceJacobian, evaluated, told
-from natcoord_jax.stepping.energy_check import sound
+from natcoord_jax.stepping.energy_check import motion_of, sound
 from natcoord_jax.stepping.factors import Factors, factors_of
 from natcoord_jax.stepping.located import Ahead
-from natcoord_jax.stepping.newton import Iterate, any_lane, judge, refreshed
+from natcoord_jax.stepping.newton import Iterate, any_lane, begin, judge, refreshed
 from natcoord_jax.stepping.remainder import remainder, with_remainder
 from natcoord_jax.stepping.rollout_state import RolloutProblem, RolloutState
 from natcoord_jax.stepping.step import end_of_step
@@ -111,7 +112,7 @@ def attempt(
     What does not change from one evaluation to the next is outside of the loop over these, where the compiler
     can see it: 5 to 18 % of the time of a step of order two.
     """
-    course = with_state(carried.course, unpack(carried.state))
+    course = replace_fields(carried.course, state=unpack(carried.state))
     u, h, index = setting.situation(course)
     search = course.search
     system = setting.system if search is None else search.system(setting.system, course.state, setting.dt)
@@ -124,7 +125,7 @@ def attempt(
 
     def ended(carry: tuple) -> tuple:
         _, before, x, _, record, factors = carry
-        before = with_state(before, unpack(x))
+        before = replace_fields(before, state=unpack(x))
         ends = end_of_step(replace_fields(equations, state=before.state), found)
         kick = None if before.lagging is None else found.kick.exact
         given = solving.residual, found.size, before.it.correction, ends[0], setting.plan.tolerance
@@ -144,8 +145,12 @@ def attempt(
         record = tuple(with_row(b, carried.count - carried.first, r) for b, r in zip(record, slot))
         start_cache = _outset_after(setting, after, accepted, carried.start_cache, found.kick)
         after = _with_normal_kick(setting, after, start_cache)
+        if any(group.effect.bends for group in system.effects):
+            few, failed = after.trial is not None, after.rejected > before.rejected
+            it = jax.lax.cond(failed, lambda: begin(_sticking(equations), few), lambda: after.it)
+            after = replace_fields(after, it=it)
         factors = _kept(setting, equations, before, after, factors, solving.probe)
-        return jnp.array(False), with_state(after, None), x, start_cache, record, factors
+        return jnp.array(False), replace_fields(after, state=None), x, start_cache, record, factors
 
     carry = solving.ending, begun, carried.state, carried.start_cache, carried.record, solving.factors
     if apart:
@@ -158,6 +163,21 @@ def attempt(
     asked = RefactorRequest(*wanted) if apart else None
     count = carried.count + _recorded(solving.ending, carried.course, after)
     return LoopCarry(count, after, x, start_cache, factors, solving.probe, record, carried.first, asked)
+
+
+def _sticking(equations: Any) -> Float[Array, " unknowns"]:
+    """A guess from which what sticks is found where friction presses more than it takes (Painleve's rod).
+
+    Nothing moves, and contacts that may close press as much as all that moves could. From slip it is not.
+    """
+    system, state, multipliers = equations.system, equations.state, equations.split(equations.guess())[1]
+    for k, group in enumerate(equations.groups):
+        if group.effect.unilateral:
+            mobility, gap = group.effect.mobility, contact_gaps(system, [group], state)
+            speed = jnp.sqrt(motion_of(system, state) * mobility)
+            pressed = jnp.where(0.5 * speed * equations.h > gap, speed / mobility, 0.0)
+            multipliers[k] = multipliers[k].at[:, 0, 0].set(pressed)
+    return jnp.concatenate([jnp.zeros(equations.balances), *(lam.reshape(-1) for lam in multipliers)])
 
 
 def _with_normal_kick(setting: RolloutProblem, after: RolloutState, start_cache: Any) -> RolloutState:
@@ -291,8 +311,3 @@ def _taken_back(record: tuple, index: Array, undone: Array, x: Array) -> tuple:
     states = with_row(states, index, jnp.where(undone, x, row(states, index)))
     accepted = with_row(accepted, index, row(accepted, index) & ~undone)
     return states, *others, accepted, finished
-
-
-def with_state(course: RolloutState, state: State | None) -> RolloutState:
-    """The course with another state, or without."""
-    return replace_fields(course, state=state)

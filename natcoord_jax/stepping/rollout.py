@@ -19,7 +19,7 @@ from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.results import Result
 from natcoord_jax.core.state import State
 from natcoord_jax.mechanics.failures import can_fail, result_of
-from natcoord_jax.stepping.attempt import LoopCarry, with_state
+from natcoord_jax.stepping.attempt import LoopCarry
 from natcoord_jax.stepping.error_control import Tolerance
 from natcoord_jax.stepping.factors import Factors
 from natcoord_jax.stepping.newton import any_lane
@@ -58,7 +58,7 @@ def run(
         system, parameters, dt, tolerance, plan, plan.steps if steps is None else steps, event=event
     )
     found, unpack = all_slots(setting, state, taken_up=taken_up)
-    course, (states, *rest) = with_state(found.course, unpack(found.state)), found.record
+    course, (states, *rest) = replace_fields(found.course, state=unpack(found.state)), found.record
     count, factors, slots = found.count, found.factors, Slots(jax.vmap(unpack)(states), *rest)
     if tolerance is not None:
         slots, count = slots.accepted_first(plan.steps + plan.extra)
@@ -94,7 +94,7 @@ def run_to_the_end(setting: RolloutProblem, state: State, kernel: Callable = as_
         kernel: see `all_slots`.
     """
     found, unpack = all_slots(setting, state, kernel)
-    return _judged(setting.system, with_state(found.course, unpack(found.state)), setting.steps)
+    return _judged(setting.system, replace_fields(found.course, state=unpack(found.state)), setting.steps)
 
 
 def _judged(system: System, course: RolloutState, steps: Any) -> RolloutState:

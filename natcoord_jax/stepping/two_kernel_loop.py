@@ -19,7 +19,7 @@ from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
 from natcoord_jax.mechanics.equations import kind_of, prepare
 from natcoord_jax.mechanics.start_cache import StartCache
-from natcoord_jax.stepping.attempt import LoopCarry, RefactorRequest, attempt, renewed_at, with_state
+from natcoord_jax.stepping.attempt import LoopCarry, RefactorRequest, attempt, renewed_at
 from natcoord_jax.stepping.difference_jacobian import first_probe
 from natcoord_jax.stepping.error_control import Tolerance
 from natcoord_jax.stepping.factors import Factors
@@ -104,7 +104,7 @@ def _start(
     setting: RolloutProblem, unpack: Callable[[Array], State], x: Array
 ) -> tuple[RolloutState, Factors, StartCache]:
     course, factors, start_cache = start_of(setting, unpack(x))
-    return with_state(course, None), factors, start_cache
+    return replace_fields(course, state=None), factors, start_cache
 
 
 def _unfinished(setting: RolloutProblem, length: int, carried: LoopCarry) -> Array:
@@ -133,7 +133,7 @@ def _first(setting: RolloutProblem, unpack: Callable[[Array], State], x: Array) 
     course, factors, start_cache = _start(setting, unpack, x)
     probe = None
     if kind_of(setting.system, setting.plan.tableau).by_differences:
-        probe = first_probe(setting, with_state(course, unpack(x)), start_cache)
+        probe = first_probe(setting, replace_fields(course, state=unpack(x)), start_cache)
     return LoopCarry(jnp.array(0), course, x, start_cache, factors, probe, (), jnp.array(0), None)
 
 
@@ -157,7 +157,7 @@ def _every_slot(
 def _situated(setting: RolloutProblem, unpack: Callable[[Array], State], carried: LoopCarry) -> Any:
     """The equations of the attempt at hand."""
     state = unpack(carried.state)
-    u, h, _ = setting.situation(with_state(carried.course, state))
+    u, h, _ = setting.situation(replace_fields(carried.course, state=state))
     return prepare(setting.system, state, u, h, setting.plan.tableau, carried.start_cache)
 
 

@@ -1,7 +1,8 @@
 """Every effect of the contract table in other units: of length, time and mass, by what its docstring says.
 
-What could go wrong: metres, seconds or kilograms are written into a tolerance, a guess or a law, so that what
-is small, slow or light moves otherwise; a docstring says another unit than the law has.
+And turned. What could go wrong: metres, seconds or kilograms are written into a tolerance, a guess or a law,
+so that what is small, slow or light moves otherwise; a docstring says another unit than the law has; an axis
+of space is written into a law.
 """
 
 import dataclasses
@@ -15,7 +16,7 @@ import numpy as np
 import pytest
 import tolerances as tol
 from scenes import AXIS, SECOND, SPECIAL, with_multipliers
-from test_contracts import TABLE, Parts
+from test_contracts import TABLE, Parts, turned
 
 import natcoord_jax as nc
 
@@ -25,6 +26,10 @@ OTHERS = np.array(
     [(1, 1, 1), (1e-3, 1, 1), (1e-6, 1e-3, 1e-6), (1e4, 1e3, 1e6), (1, 1e-3, 1e3), (1e-4, 10, 1)]
 )
 """Lengths, times and masses, as they are and in other units."""
+
+TURNS = np.stack([np.eye(3)] * len(OTHERS) + [turned((0.3, -1.1, 0.8)), turned((-2.0, 0.5, 1.5))])
+"""Of the lanes above, none; then two."""
+OTHERS_AND_TURNED = np.concatenate([OTHERS, np.ones((2, 3))])
 
 FUNCTIONS = {
     nc.Drive: ("s", "rad"),
@@ -36,16 +41,28 @@ FUNCTIONS = {
     **dict.fromkeys((nc.FacePressure, nc.FacePressure6, nc.FacePressure8, nc.FacePressure9), ("s", "N/m^2")),
 }
 """Units of the argument and the value of the function that an effect has."""
-INPUTS = {nc.JointForce: "N", nc.BodyForceInput: "N", nc.WrenchInput: "-"}
+INPUTS = {nc.JointForce: "N", nc.BodyForceInput: "N", nc.WrenchInput: "-", nc.AffineActuator: "-"}
 """Units of inputs that are no torques."""
 ASIDE = {
-    nc.AffineActuator: "its length is a sum of an angle and a displacement",
-    nc.NonlinearBeamElement: "its law is one of numbers without unit",
-    nc.PointOnPlane: "it does not start in the plane",
-    nc.PointOnLine: "it does not start on the line",
+    nc.NonlinearBeamElement: "its law has no numbers of its own, which units would be",
+    nc.Rolling: "it does not start on the plane",
     nc.PointOnPoint: "it repeats what the joint holds, which is found out outside of jit only",
     nc.PointSum: "it repeats what the joint holds, which is found out outside of jit only",
-    nc.Rolling: "it does not start on the plane",
+}
+# With numbers that fit the pair as it starts.
+FITTING = {
+    nc.PointOnPlane: lambda p: nc.PointOnPlane((p.ends[0], p.triad[2], p.ends[1]), distance=-0.7),
+    nc.PointOnLine: lambda p: nc.PointOnLine((p.ends[0], nc.Direction(p.one, (0.8, 0.8, -0.7)), p.ends[1])),
+    nc.JointFriction: lambda p: nc.JointFriction(p.joint, friction=0.5),
+}
+# Numbers of more units than one.
+MIXED = {
+    nc.Coupling: lambda units: {"factors": jnp.stack([jnp.ones(()), -0.7 / units[0]])},
+    nc.AffineActuator: lambda units: {
+        "gear": jnp.stack([jnp.full((), 2.0), -0.5 / units[0]]),
+        "gain": scale("N m", units) * jnp.array((3.0, 0.4, 0.2)).at[2].multiply(units[1]),
+        "bias": scale("N m", units) * jnp.array((0.3, -5.0, -0.7)).at[2].multiply(units[1]),
+    },
 }
 SOME = nc.Screw, nc.Drive, nc.BeamElement
 
@@ -83,18 +100,18 @@ def unit_of(kind: type, name: str) -> str:
     return "-"
 
 
-def in_units(part: Any, units: Any, slides: bool) -> Any:
+def in_units(part: Any, units: Any, slides: bool, turn: Any) -> Any:
     """A part with all its numbers in other units; `slides`: of a joint coordinate that is a displacement."""
     length, changes = units[0], {}
     for field in dataclasses.fields(part):
         value = getattr(part, field.name)
         if field.name == "markers":
-            changes["markers"] = tuple(placed(marker, length) for marker in value or ())
+            changes["markers"] = tuple(placed(marker, length, turn) for marker in value or ())
         elif callable(value) and not isinstance(value, eqx.Module | type):
             argument, result = (scale(unit, units) for unit in FUNCTIONS[type(part)])
             changes[field.name] = Scaled(value, argument, result)
         elif isinstance(value, eqx.Module):
-            changes[field.name] = in_units(value, units, slides)
+            changes[field.name] = in_units(value, units, slides, turn)
         elif field.init and not field.metadata.get("static") and is_floating(value):
             first, *more = unit_of(type(part), field.name).split(",")
             choices = first.split(" or ")
@@ -105,6 +122,8 @@ def in_units(part: Any, units: Any, slides: bool) -> Any:
             elif more and shape[-1:] == (6,):
                 factor = factor / bends
             changes[field.name] = factor * jnp.asarray(value)
+            if isinstance(part, nc.Gravity):
+                changes[field.name] = turn @ changes[field.name]
     if not changes.get("markers", True):
         del changes["markers"]
     return dataclasses.replace(part, **changes)
@@ -119,52 +138,55 @@ def is_floating(value: Any) -> bool:
         return False
 
 
-def placed(marker: Any, length: Any) -> Any:
-    """A point or an attachment in another unit of length; directions are as they are."""
+def placed(marker: Any, length: Any, turn: Any) -> Any:
+    """A point, a direction or an attachment in another unit of length, turned with all of the scene."""
     if isinstance(marker, nc.Attachment):
-        return dataclasses.replace(marker, point=length * jnp.asarray(marker.point))
-    return dataclasses.replace(
-        marker, vector=(length if marker.is_point else 1.0) * jnp.asarray(marker.vector)
-    )
+        axes = turn @ jnp.asarray(marker.axes)
+        return dataclasses.replace(marker, point=length * turn @ jnp.asarray(marker.point), axes=axes)
+    vector = (length if marker.is_point else 1.0) * jnp.asarray(marker.vector, float)
+    return dataclasses.replace(marker, vector=turn @ vector)
 
 
-def moved(effect: type, units: Any) -> Any:
-    """The pair of the table after a step, without units: places, speeds, energy."""
+def moved(effect: type, units: Any, turn: Any) -> Any:
+    """The pair of the table after a step, without units and turned back: places, speeds, energy."""
     (length, time, mass), entry, scene = units, TABLE[effect], nc.Scene()
 
-    def body(mass_of, inertia, com, place, spin, **more):
+    def body(mass_of, inertia, com, place, spin, orientation, name):
         part = nc.RigidBody(
             mass=mass * mass_of,
             inertia=mass * length**2 * np.array(inertia),
             com=length * np.array(com),
-            position=length * np.array(place),
-            velocity=length / time * np.array(spin[::-1]),
-            angular_velocity=np.array(spin) / time,
-            **more,
+            position=length * turn @ np.array(place),
+            orientation=turn @ orientation,
+            velocity=length / time * turn @ np.array(spin[::-1]),
+            angular_velocity=turn @ np.array(spin) / time,
+            name=name,
         )
         return scene.add(part)
 
-    one = body(2.0, (0.3, 0.4, 0.5), (0.05, -0.03, 0.1), (0.0, 0.0, -1.0), (0.4, -0.3, 0.5), name="one")
-    turned = {"orientation": (AXIS, 0.7), "name": "two"}
-    two = body(1.5, (0.2, 0.12, 0.25), (0.0, 0.0, 0.0), (0.5, 0.3, -1.6), (-0.2, 0.6, 0.3), **turned)
+    upright, aslant = np.eye(3), turned(0.7 * np.array(AXIS) / np.linalg.norm(AXIS))
+    one = body(2.0, (0.3, 0.4, 0.5), (0.05, -0.03, 0.1), (0, 0, -1.0), (0.4, -0.3, 0.5), upright, "one")
+    two = body(1.5, (0.2, 0.12, 0.25), (0, 0, 0), (0.5, 0.3, -1.6), (-0.2, 0.6, 0.3), aslant, "two")
     kind = entry.joint if entry.make else with_multipliers(entry.joint)
-    options = {key: length * np.array(x) for key, x in SPECIAL.get(entry.joint, {}).items()}
-    place = {"point": length * np.array((0.2, 0.1, -1.3)), "axis": AXIS, "second": SECOND}
-    joint = scene.add(kind(one, two, **place, name="joint", **options))
+    options = {
+        key: length * (turn @ np.array(x) if np.ndim(x) else x)
+        for key, x in SPECIAL.get(entry.joint, {}).items()
+    }
+    axes = {"axis": turn @ np.array(AXIS), "second": turn @ np.array(SECOND)}
+    place = length * turn @ np.array((0.2, 0.1, -1.3))
+    joint = scene.add(kind(one, two, point=place, **axes, name="joint", **options))
     if entry.make:
-        made: Any = entry.make(Parts(one, two, joint))
+        made: Any = FITTING.get(effect, entry.make)(Parts(one, two, joint))
         number = getattr(made, "coordinate", 0)
         number = number if isinstance(number, int) else 0
         slides = bool(entry.joint.coordinates) and entry.joint.coordinates[number].unit == "m"
-        made = in_units(made, units, slides)
-        if effect is nc.Coupling:
-            made = dataclasses.replace(made, factors=jnp.stack([jnp.ones(()), -0.7 / length]))
-        scene.add(made)
+        made = in_units(made, units, slides, turn)
+        scene.add(dataclasses.replace(made, **MIXED[effect](units)) if effect in MIXED else made)
     system, state = scene.compile()
     inputs = (0.5 + jnp.arange(len(system.structure.inputs))) * scale(INPUTS.get(effect, "N m"), units)
     after = nc.step(system, state, inputs, dt=0.05 * time)
     energy = system.energy(after).total / scale("J", units)
-    rows, rates = after.rows, after.row_rates * time
+    rows, rates = after.rows @ turn, after.row_rates @ turn * time
     sizes = jnp.ones(4).at[0].set(length)[:, None]
     return rows / sizes, rates / sizes, energy
 
@@ -179,11 +201,15 @@ def moved(effect: type, units: Any) -> Any:
     ids=lambda e: e.__name__,
 )
 def test_units_of_length_time_and_mass(effect):
-    """A step from micrometres to tens of kilometres, milliseconds to kiloseconds, milligrams to kilotons."""
-    lanes = [np.asarray(x) for x in jax.jit(jax.vmap(lambda units: moved(effect, units)))(OTHERS)]
+    """A step from micrometres to tens of kilometres, milliseconds to kiloseconds, milligrams to kilotons.
+
+    And in two other directions of space.
+    """
+    steps = jax.jit(jax.vmap(lambda units, turn: moved(effect, units, turn)))
+    lanes = [np.asarray(x) for x in steps(OTHERS_AND_TURNED, TURNS)]
     assert np.isfinite(lanes[0][0]).all()
     for lane in lanes:
-        off = np.abs(lane - lane[0]).reshape(len(OTHERS), -1).max(axis=1) / max(1.0, np.abs(lane[0]).max())
+        off = np.abs(lane - lane[0]).reshape(len(lane), -1).max(axis=1) / max(1.0, np.abs(lane[0]).max())
         assert off.max() <= tol.SAME_TRAJECTORY, off
 
 
@@ -285,6 +311,36 @@ def test_located_impacts_do_not_know_lengths_and_times():
     assert not codes.any()
     assert np.abs(places - places[0]).max() <= 1e-11
     assert places[0][30:, 2].max() >= 0.11, "it does not rebound: nothing is tested"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("falls", [True, False])
+def test_friction_in_joints_does_not_know_units(falls):
+    """A slide and a hinge that stick and slip: where they fall, or a motor moves what rests in space."""
+
+    def moved(units):
+        (length, time, mass), scene = units, nc.Scene()
+        force, torque = (scale(unit, units) for unit in ("N", "N m"))
+        slope = np.array((3.0, 0.0, -9.0)) if falls else np.zeros(3)
+        scene.add(nc.Gravity(vector=length / time**2 * slope))
+        inertia = {"mass": 2.0 * mass, "inertia": mass * length**2 * np.array((0.1, 0.2, 0.3))}
+        carriage = scene.add(nc.RigidBody(**inertia, name="carriage"))
+        slide = scene.add(nc.Prismatic(nc.ground, carriage, axis=(1, 0, 0), name="slide"))
+        arm = scene.add(nc.RigidBody(**inertia, position=length * np.array((0.4, 0, 0)), name="arm"))
+        hinge = scene.add(nc.Revolute(carriage, arm, axis=(0, 1, 0), name="hinge"))
+        scene.add(nc.JointFriction(slide, friction=4.0 * force))
+        scene.add(nc.JointFriction(hinge, friction=0.5 * torque))
+        scene.add(nc.JointForce(slide, gear=force, name="push"))
+        scene.add(nc.JointTorque(hinge, gear=torque, name="motor"))
+        system, state = scene.compile()
+        run = nc.simulate(system, state, dt=0.02 * time, steps=20, inputs=jnp.array([6.0, 1.0]))
+        return run.result, run.q[:, 0::4] / length, run.q[:, 5]
+
+    codes, places, axes = map(np.asarray, jax.jit(jax.vmap(moved))(OTHERS))
+    assert not codes.any()
+    assert np.abs(places[0, -1] - places[0, 0]).max() >= 1e-2, "it does not move: nothing is tested"
+    for lanes in (places, axes):
+        assert np.abs(lanes - lanes[0]).max() <= tol.SAME_TRAJECTORY
 
 
 @pytest.mark.slow

@@ -20,6 +20,10 @@ from natcoord_jax.core.potential import on_rows, place_markers
 from natcoord_jax.effects.contact.gap import Gap
 from natcoord_jax.maths.vectors import cross, dot, positive_part
 
+REGULARISED = 3e-6
+"""Velocity of slip, in terms of the speeds of a scene, up to which friction is smooth: what sticks under a
+load creeps less than that."""
+
 GAP = of("a gap, as nc.SphereOnPlane(radius=0.1)", Gap)
 
 
@@ -34,8 +38,7 @@ class Rubbing(Effect):
         markers: that the gap is of.
         gap: between the surfaces.
         friction: coefficient mu [-]; None: there is none.
-        regularisation: eps [m/s]; None: 3e-6 of the speed that gravity gives along the size of the scene, and
-            of the fastest body at the start.
+        regularisation: eps [m/s]; None: see `nc.GapConstraint`.
         name: optional name.
         mobility: change of the speed of closing by a unit impulse [1/kg], follows from the masses.
         phase: in the part of a step at hand of schemes that locate impacts, `FREE` where nothing pushes until
@@ -79,6 +82,11 @@ class Rubbing(Effect):
     def bends(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Friction does, where slip changes its sign."""
         return self.friction is not None
+
+    @property
+    def slips(self) -> Any:
+        """Its regularisation, with friction."""
+        return None if self.friction is None else ("regularisation", REGULARISED)
 
     def violation_units(self, place: Array, rows: Array) -> tuple[str, ...]:
         """Metres."""

@@ -12,7 +12,7 @@ from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.motion import Motion, Response, StepContext
 from natcoord_jax.core.numeric import Number
 from natcoord_jax.core.potential import marker_response, on_rows, place_markers
-from natcoord_jax.effects.contact.friction import missing_friction
+from natcoord_jax.effects.contact.friction import REGULARISED, missing_friction
 from natcoord_jax.effects.contact.node_on_facets import NodeOnFacets, nearest_point, slopes_at
 from natcoord_jax.maths.vectors import cross, dot, unit
 
@@ -49,6 +49,7 @@ class FrictionalNodeOnFacets(NodeOnFacets):
     multipliers: ClassVar[int] = 4
     unilateral: ClassVar[bool] = True
     bends: ClassVar[bool] = True
+    slips: ClassVar[tuple[str, float] | None] = ("regularisation", REGULARISED)
     impulsive: ClassVar[bool] = True
     works: ClassVar[bool] = True  # pyright: ignore[reportIncompatibleMethodOverride]
 

@@ -141,7 +141,8 @@ class JointFriction(CoordinateForce):
     Attributes:
         joint: handle of the joint.
         friction: f [N m or N], not negative.
-        slip: s [rad/s or m/s], positive.
+        slip: s [rad/s or m/s], positive; None: 3e-3 of the speeds of the scene, see `nc.GapConstraint`, of an
+            angle over its size.
         coordinate: which coordinate of the joint.
 
     Example:
@@ -153,9 +154,10 @@ class JointFriction(CoordinateForce):
     """
 
     friction: Any = eqx.field(kw_only=True, metadata=is_a(Number("not negative")))
-    slip: Any = eqx.field(default=0.01, kw_only=True, metadata=is_a(Number("positive")))
+    slip: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Number("positive")))
 
     kind: ClassVar[str] = "joint friction"
+    slips: ClassVar[tuple[str, float] | None] = ("slip", 3e-3)
 
     def force(self, rate: Array, inputs: Array, t: Array) -> Array:
         """Generalised force against the rate."""
