@@ -16,7 +16,7 @@ LEAST = 1e-14
 
 @partial(jax.custom_jvp, nondiff_argnums=(1,))
 def range_projector(
-    matrix: Float[Array, "m n"], rank: int, least: Float[Array, ""] | float = 0.0
+    matrix: Float[Array, "m n"], rank: int, least: Float[Array, ""] | None = None
 ) -> Float[Array, "m m"]:
     """Orthogonal projector on the range, by Gram-Schmidt orthogonalisation of the columns, largest first.
 
@@ -33,7 +33,9 @@ def range_projector(
     def with_column(_: Any, carry: tuple[Array, Array]) -> tuple[Array, Array]:
         rest, projector = carry
         sizes = jnp.sum(rest**2, axis=0)
-        vector = jnp.where(jnp.max(sizes) > least**2, rest[:, jnp.argmax(sizes)], 0.0)
+        vector = rest[:, jnp.argmax(sizes)]
+        if least is not None:
+            vector = jnp.where(jnp.max(sizes) > least**2, vector, 0.0)
         # Twice is enough: what is left is orthogonal to round-off.
         vector = safe_divide(vector, safe_norm(vector))
         vector = vector - projector @ vector

@@ -16,10 +16,10 @@ RANK = 1e-9
 """Part of what a motion of the size of the scene changes a constraint by that is rounding of nothing."""
 
 
-def least_change(system: Model) -> Float[Array, ""] | float:
+def least_change(system: Model) -> Float[Array, ""] | None:
     """Change of constraints that counts, where their rank is not known: of scenes built inside of jit."""
     if system.structure.redundant:
-        return 0.0
+        return None
     groups = [group for group in (*system.effects, *system.joints) if group.multipliers and group.holds]
     return RANK * jnp.max(jnp.concatenate([x.reshape(-1) for x in spans(system, groups)]))
 

@@ -284,7 +284,7 @@ def _admissible(
         lift, none = jnp.zeros((matrix.shape[1], 0), matrix.dtype), jnp.zeros(0, matrix.dtype)
         return Admissible(frame, None, *((lift, none) if lifted else (None, None)))
     framed, unit = frame @ matrix.T, jnp.eye(matrix.shape[1], dtype=matrix.dtype)
-    rank, onto, reached, least = balances.system.structure.rank, None, framed, 0.0
+    rank, onto, reached, least = balances.system.structure.rank, None, framed, None
     if rank is None:
         rank = matrix.shape[0]
     else:
