@@ -104,7 +104,7 @@ LOCATED = nc.EnergyMomentum(max_events=4)
 TEMPLATES = (
     Template("slide", trees.slide),
     Template("disc", trees.disc, more=("checkpointed", "directions")),
-    Template("slide, error control", trees.slide, rtol=1e-4, extra=160),
+    Template("slide, error control", trees.slide, rtol=1e-4, extra=160, exhaustive=True),
     Template("taut, error control", trees.taut, rtol=1e-4, extra=160, exhaustive=True),
     Template("taut, until an event", trees.taut, until=trees.event, exhaustive=True),
     Template("driven", trees.driven, exhaustive=True),
@@ -134,7 +134,7 @@ TEMPLATES = (
     Template("driven, error control", trees.driven, rtol=1e-4, extra=160, exhaustive=True),
     Template("arm, with kicks", trees.arm, scheme=KICKS, save_every=5, exhaustive=True),
     Template("parallelogram, twice", parallelogram, more=("second",), exhaustive=True),
-    Template("shaken", contacts.shaken),
+    Template("shaken", contacts.shaken, exhaustive=True),
     Template("shaken, soft", contacts.soft_shaken, more=("second",), exhaustive=True),
     Template("shaken, located", contacts.shaken, scheme=LOCATED, exhaustive=True),
     Template("bouncing", contacts.bouncing, more=("second",), exhaustive=True),

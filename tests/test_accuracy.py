@@ -49,6 +49,7 @@ def test_the_reference_is_true():
     assert row.error == pytest.approx(error, rel=1e-5)
 
 
+@pytest.mark.slow
 def test_cheapest_and_table():
     results = measured()
     best = results.cheapest(1e-5)

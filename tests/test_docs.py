@@ -31,16 +31,15 @@ MODULES = sorted(
 # Modules whose examples compile: for more than half a second of the processor each, 70 s in all, ...
 SLOW = """
     analysis.balance analysis.contacts analysis.growth analysis.modes analysis.phases
-    analysis.statics bodies.contact bodies.edge_load bodies.fold bodies.shell bodies.tie
-    control.inverse core.mixed_potential core.state effects.constraints.rolling effects.laminates
-    effects.shells.quadrilateral effects.shells.triangle gallery.example io.load io.saving
-    linsolve.neighbour_couplings linsolve.sparse reading.set_coordinates reading.transfer
-    stepping.assemble stepping.dissipative stepping.one_step stepping.room stepping.scheme
-    stepping.variational sweeps.run system viz.views
+    analysis.statics bodies.contact bodies.continuum bodies.tie control.inverse core.mixed_potential
+    core.state effects.constraints.points effects.materials effects.shells.quadrilateral
+    effects.shells.triangle gallery.example io.load io.saving linsolve.neighbour_couplings
+    linsolve.sparse reading.set_coordinates reading.transfer stepping.assemble stepping.one_step
+    stepping.room stepping.scheme stepping.simulate sweeps.run system testing viz.views
 """.split()
 # ... and for more than five seconds, 90 s in all. Those of all other modules take 6 s together.
 EXHAUSTIVE = """
-    analysis.accuracy analysis.load_path bodies.gas bodies.surface_load control.computed_torque
+    analysis.accuracy analysis.load_path bodies.gas bodies.loads control.computed_torque
     control.continuation control.nlp control.problem
 """.split()
 COMPILING = {f"natcoord_jax.{name}" for name in SLOW + EXHAUSTIVE}

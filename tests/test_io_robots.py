@@ -454,6 +454,7 @@ def test_from_a_file(tmp_path):
 # --- out again --------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_what_is_saved_moves_with_mujoco_as_here(tmp_path):
     """Joints of every kind that is written, one of them used backwards, one on a body without mass."""
     scene = nc.Scene()

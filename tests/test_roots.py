@@ -92,6 +92,7 @@ class Series(nc.MixedPotential):
         return 0.5 * self.stiffness * drawn[0] ** 2 + 0.25 * other**4 + 0.5 * other**2
 
 
+@pytest.mark.slow
 def test_unknowns_of_an_element():
     """And its energy, by a stiffness of it."""
     scene = nc.Scene()

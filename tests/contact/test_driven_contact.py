@@ -377,7 +377,7 @@ def test_a_gripper_that_turns_holds_a_box():
     assert np.abs(work["drive"] - lifted).max() <= 1e-3
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_readings_and_transfers_obey_what_is_driven():
     """Velocities that are read of a belt and what it has taken along, and a state that is handed on."""
     system, state = belt(1.0)

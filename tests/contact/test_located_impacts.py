@@ -188,7 +188,7 @@ def test_derivatives_of_a_drop():
             assert float(by_restitution) == pytest.approx(u * (1 - (0.3 + u) / G), abs=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_lanes_with_other_impacts():
     """64 drops from other heights, of none to five bounces: each has the derivative of its own motion."""
     system, state = drop(speed=0.0)

@@ -209,7 +209,7 @@ FLIGHTS = {
     "beam for long": Flight(satellite, 0.035, 1000, 2, "exhaustive", 0.05, more=IN_PARTS, **STIFF),
     "beams of directors": Flight(booms_of_every_order, 0.03, 150, lane="exhaustive", **STIFF),
     "loop of beams": Flight(loop_of_beams, 0.02, 300, lane="exhaustive", stored=0.1, **STIFF),
-    "folded plates": Flight(lambda: folded(offset=0.01), 0.01, 60, lane="slow", stored=0.01),
+    "folded plates": Flight(lambda: folded(offset=0.01), 0.01, 60, lane="exhaustive", stored=0.01),
     "plate on a beam": Flight(plate_on_a_beam, 0.01, 40, lane="exhaustive", stored=1e-4),
     "tied solids": Flight(lambda: tied(0.06), 2e-3, 300, lane="exhaustive", **TIED),
     "law of one's own": Flight(

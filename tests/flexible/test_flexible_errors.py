@@ -367,6 +367,7 @@ def test_what_a_node_does_not_carry():
 AXIAL = {"Fixed": {}, **dict.fromkeys(("Revolute", "Prismatic", "Cylindrical"), {"axis": (0, 0, 1)})}
 
 
+@pytest.mark.slow
 def test_joints_that_hold_axes_on_a_single_node():
     """It has none to be held, and no drilling stiffness; a ball joint is one of points."""
     parts = {

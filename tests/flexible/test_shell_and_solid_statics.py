@@ -234,7 +234,7 @@ def _cook(value, *arguments, lane="exhaustive"):
 
 
 CASES = {
-    "S01": Case(bent_by_a_force, (3.2930, 6.7047), tol.FOUR_DIGITS, lane="default"),
+    "S01": Case(bent_by_a_force, (3.2930, 6.7047), tol.FOUR_DIGITS, lane="slow"),
     "S01, triangles": Case(bent_by_a_force, (3.2926, 6.7045), tol.FOUR_DIGITS, (triangulated,)),
     "S02": Case(rolled_up, (11.671, 0.029), tol.THREE_DIGITS),
     "S03": Case(slit_ring, (13.602, 17.243), tol.THREE_DIGITS),

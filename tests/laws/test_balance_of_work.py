@@ -139,7 +139,7 @@ def test_torsional_spring_over_five_turns():
     result.check_energy()
 
 
-@pytest.mark.parametrize("name", ["damper", "sliding damper"])
+@pytest.mark.parametrize("name", [pytest.param("damper", marks=pytest.mark.slow), "sliding damper"])
 def test_joint_damper_dissipates_exactly(name):
     """In a step c (increment)^2 / h, no more and no less; all of the energy goes there."""
     result = Rotor(name)

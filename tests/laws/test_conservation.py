@@ -30,9 +30,7 @@ DEFAULT = {
     ("revolute", "tree", "variational"),
 }
 SLOW = {
-    ("revolute", "multipliers", "dissipative"),
     ("screw", "tree", "order 2"),
-    ("planar", "tree", "order 4"),
     ("spherical", "multipliers", "dissipative"),
 }
 # Every joint in either form at order two; elsewhere each meets each scheme in one form.

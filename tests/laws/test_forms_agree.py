@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import tolerances as tol
-from law_cases import DISSIPATIVE, SCHEMES, VARIATIONAL, in_order, lane
+from law_cases import DISSIPATIVE, SCHEMES, VARIATIONAL, in_order
 from scenes import pair
 
 import natcoord_jax as nc
@@ -146,7 +146,6 @@ def placed(system, trajectory, watched):
     return np.stack([np.asarray(system.sense(trajectory, node).position) for node in watched], axis=1)
 
 
-SLOW = {("wire and rod", "order 2")}
 CASES = [
     *(("wire and rod", name) for name in ("order 2", "order 2 with kicks", "order 4")),
     *((scene, name) for scene in ("wire and rod", "hinge") for name in ("variational", "dissipative")),
@@ -155,7 +154,8 @@ CASES = [
 
 
 @pytest.mark.filterwarnings("ignore:.*solved densely")
-@pytest.mark.parametrize(("name", "scheme"), [lane(case, set(), SLOW) for case in CASES])
+@pytest.mark.exhaustive
+@pytest.mark.parametrize(("name", "scheme"), CASES)
 def test_forms_give_one_trajectory(name, scheme):
     """On the constraints; energy is kept where it is."""
     make, solvers, dt, steps, energy = SCENES[name]

@@ -173,6 +173,7 @@ def free_body(case: str):
     return scene.compile()
 
 
+@pytest.mark.slow
 def test_r10_free_body():
     system, state = free_body("R10")
     rates, pose = reference("R10", "Omega"), reference("R10", "q")

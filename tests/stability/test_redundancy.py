@@ -90,7 +90,7 @@ CHANGES = {
     ("four_bar", 4): (added, reordered, removed),
     ("bricard", 4): (extended,),
 }
-LANES = {("four_bar", 2, added): pytest.mark.slow, ("bricard", 2, removed): pytest.mark.slow}
+LANES = {("bricard", 2, removed): pytest.mark.slow}
 
 
 @pytest.mark.parametrize(
@@ -160,8 +160,8 @@ def test_frames_of_many_dependent_loops(kind, count):
         assert int(np.sum(run.iterations)) <= 5 * 150, dt
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("count", [2, pytest.param(4, marks=pytest.mark.exhaustive)])
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("count", [2, 4])
 def test_six_rates_a_body_and_dependent_loops(count):
     """Ideal rods have no inertia about their axes, and what rounding leaves of it is none."""
     scene, places = scissors(count), []

@@ -53,7 +53,7 @@ def assert_run(system, run, where):
 
 
 SHAPES = [
-    pytest.param(10, "hinged", marks=pytest.mark.slow),
+    pytest.param(10, "hinged", marks=pytest.mark.exhaustive),
     pytest.param(10, "clamped", marks=pytest.mark.exhaustive),
     pytest.param(10, "free", marks=pytest.mark.exhaustive),
     pytest.param(50, "hinged", marks=pytest.mark.exhaustive),

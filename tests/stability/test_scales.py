@@ -46,7 +46,7 @@ RATIOS = [1e-8, 1e-4, 1.0, 1e4, 1e8]
     ("order", "form"),
     [
         pytest.param(2, "tree"),
-        pytest.param(4, "multipliers", marks=pytest.mark.slow),
+        pytest.param(4, "multipliers", marks=pytest.mark.exhaustive),
         pytest.param(4, "tree", marks=pytest.mark.exhaustive),
         pytest.param(2, "multipliers", marks=pytest.mark.exhaustive),
     ],
@@ -257,7 +257,7 @@ def limbs(kinds, form: str):
 @pytest.mark.parametrize(
     ("order", "kinds", "form"),
     [
-        pytest.param(4, ALL_KINDS[:1], "multipliers", marks=pytest.mark.slow),
+        pytest.param(4, ALL_KINDS[:1], "multipliers", marks=pytest.mark.exhaustive),
         pytest.param(4, ALL_KINDS[:1], "tree", marks=pytest.mark.exhaustive),
         pytest.param(2, ALL_KINDS, "tree", marks=pytest.mark.exhaustive),
         pytest.param(2, ALL_KINDS, "multipliers", marks=pytest.mark.exhaustive),
