@@ -203,7 +203,7 @@ class StepEquations(Form):
     @property
     def dependent(self) -> bool:
         """Whether constraints depend on each other."""
-        return self.system.structure.rank is not None
+        return bool(self.system.structure.redundant)
 
     @property
     def grain(self) -> Float[Array, ""]:
