@@ -44,7 +44,12 @@ def range_projector(
         return rest, projector + vector[:, None] * vector[None, :]
 
     nothing = jnp.zeros((matrix.shape[0], matrix.shape[0]), matrix.dtype)
-    return jax.lax.fori_loop(0, rank, with_column, (matrix, nothing))[1]
+    projector = jax.lax.fori_loop(0, rank, with_column, (matrix, nothing))[1]
+    if least is None or rank < matrix.shape[0]:
+        return projector
+    # Of rows that are all independent nothing is mixed, not even by rounding.
+    unit = jnp.eye(matrix.shape[0], dtype=matrix.dtype)
+    return jnp.where(jnp.trace(projector) > rank - 0.5, unit, projector)
 
 
 @range_projector.defjvp

@@ -199,16 +199,23 @@ def _constrained(
 ) -> Float[Array, " u"]:
     """Solution x of A x - C^T lambda = impulse, C x = gap, whether or not rows of C depend on each other.
 
-    A is completed by C^T C, times a weight, which changes no solution: bodies may lack inertia along what
-    only loops forbid.
+    A is completed by C^T C, which changes no solution: bodies may lack inertia along what only loops forbid.
+    Both are in units of the inertias and of the rows, so that metres, radians and kilograms compare.
     """
-    inverse = definite_inverse(matrix + weight * rows.T @ rows)
+    inertias = jnp.diagonal(matrix)
+    most = jnp.max(inertias)
+    unit = jnp.sqrt(jnp.where(inertias > 1e-15 * most, inertias, most))
+    rows = rows / unit
+    size = jnp.linalg.norm(rows, axis=1)
+    size = jnp.where(size > 0, size, 1.0)
+    rows, gap, impulse = rows / size[:, None], gap / size, impulse / unit
+    inverse = definite_inverse(matrix / unit / unit[:, None] + rows.T @ rows)
     spread = inverse @ rows.T
-    shifted = definite_inverse(rows @ spread + SHIFT / weight * jnp.eye(rows.shape[0], dtype=rows.dtype))
-    x = inverse @ (impulse + weight * rows.T @ gap)
+    shifted = definite_inverse(rows @ spread + SHIFT * jnp.eye(rows.shape[0], dtype=rows.dtype))
+    x = inverse @ (impulse + rows.T @ gap)
     for _ in range(ROUNDS):
         x = x + spread @ (shifted @ (gap - rows @ x))
-    return x
+    return x / unit
 
 
 def rotor_rates(system: Model, state: State) -> Array:
