@@ -205,9 +205,10 @@ def _constrained(
     inertias = jnp.diagonal(matrix)
     most = jnp.max(inertias)
     unit = jnp.sqrt(jnp.where(inertias > 1e-15 * most, inertias, most))
+    # What repeats a joint of the tree is rounding, and stays small.
+    some = jnp.linalg.norm(rows, axis=1) > 1e-11
     rows = rows / unit
-    size = jnp.linalg.norm(rows, axis=1)
-    size = jnp.where(size > 0, size, 1.0)
+    size = jnp.where(some, jnp.linalg.norm(rows, axis=1), 1.0 / jnp.min(unit))
     rows, gap, impulse = rows / size[:, None], gap / size, impulse / unit
     inverse = definite_inverse(matrix / unit / unit[:, None] + rows.T @ rows)
     spread = inverse @ rows.T
