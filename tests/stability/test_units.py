@@ -45,7 +45,6 @@ INPUTS = {nc.JointForce: "N", nc.BodyForceInput: "N", nc.WrenchInput: "-", nc.Af
 """Units of inputs that are no torques."""
 ASIDE = {
     nc.NonlinearBeamElement: "its law has no numbers of its own, which units would be",
-    nc.Rolling: "it does not start on the plane",
     nc.PointOnPoint: "it repeats what the joint holds, which is found out outside of jit only",
     nc.PointSum: "it repeats what the joint holds, which is found out outside of jit only",
 }
@@ -53,6 +52,7 @@ ASIDE = {
 FITTING = {
     nc.PointOnPlane: lambda p: nc.PointOnPlane((p.ends[0], p.triad[2], p.ends[1]), distance=-0.7),
     nc.PointOnLine: lambda p: nc.PointOnLine((p.ends[0], nc.Direction(p.one, (0.8, 0.8, -0.7)), p.ends[1])),
+    nc.Rolling: lambda p: nc.Rolling((p.ends[0], nc.Direction(p.one, (0, 0, -1)), p.ends[1]), radius=0.7),
     nc.JointFriction: lambda p: nc.JointFriction(p.joint, friction=0.5),
 }
 # Numbers of more units than one.
