@@ -16,13 +16,24 @@ from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.mechanics.coordinates import state_rates
 from natcoord_jax.mechanics.tangent_space import TangentSpace, Velocity
+from natcoord_jax.mechanics.violations import contacts
 from natcoord_jax.stepping.derivative import run_slots
 from natcoord_jax.stepping.error_control import Tolerance
 from natcoord_jax.stepping.newton import TOLERANCE
 from natcoord_jax.stepping.plan import Event, Plan, Slots
 from natcoord_jax.stepping.step import advance
 
-__all__ = ["Plan", "Slots", "admitted", "coordinate_rates", "inputs_of", "outcome", "plan_of", "record"]
+__all__ = [
+    "Plan",
+    "Slots",
+    "admitted",
+    "contacts",
+    "coordinate_rates",
+    "inputs_of",
+    "outcome",
+    "plan_of",
+    "record",
+]
 
 
 def plan_of(

@@ -12,7 +12,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from hunting_protocol import Plan, Slots, inputs_of, outcome
+from hunting_protocol import Plan, Slots, contacts, inputs_of, outcome
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
@@ -22,7 +22,8 @@ POLISH = 2
 """Corrections before those that are differentiated: recorded solutions are good to round-off already."""
 
 DEPENDENT = 1e-10
-"""Singular values below this part of the largest, after scaling, are of dependent constraints."""
+"""Singular values below this part of the largest, after scaling, are of dependent constraints, and of open
+contacts."""
 
 
 def solution(matrix: Array, right: Array, redundant: bool) -> Array:
@@ -51,7 +52,7 @@ def states(
         corrections: that are differentiated.
     """
     system, first, parameters, dt = numbers
-    redundant = system.structure.rank is not None
+    redundant = system.structure.rank is not None or bool(contacts(system))
     slots = jax.tree.map(jax.lax.stop_gradient, slots)
     _, unravel = ravel_pytree(first)
 
