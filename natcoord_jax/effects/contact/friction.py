@@ -111,6 +111,10 @@ class Rubbing(Effect):
         """Where the surfaces touch [m], and the direction in which the second is pushed."""
         return self.gap.touch(place_markers(place, rows))
 
+    def gap_at(self, place: Array, rows: Array) -> Float[Array, ""]:
+        """Between the surfaces [m]."""
+        return self.gap.distance(self.gap.invariants(place_markers(place, rows)))
+
     def flow(self, place: Array, motion: Motion) -> Float[Array, "s p"]:
         """Rates of the invariants at the stages of a step."""
         x, rates = place_markers(place, motion.rows), place_markers(place, motion.rates)

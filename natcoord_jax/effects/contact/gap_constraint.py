@@ -87,8 +87,8 @@ class GapConstraint(Rubbing):
 
     def violation(self, place: Array, rows: Array, coordinates: Array, t: Array) -> Array:
         """How far the surfaces overlap, negative."""
-        distance = self.gap.distance(self.gap.invariants(place_markers(place, rows)))
-        return jnp.where(distance < 0, distance, 0.0)[None]
+        gap = self.gap_at(place, rows)
+        return jnp.where(gap < 0, gap, 0.0)[None]
 
     def respond(self, place: Array, motion: Motion, now: StepContext, lam: Array) -> Response:
         """The gap at the end of the step or the impulse, whichever is smaller, vanishes (66)."""
@@ -115,4 +115,4 @@ class GapConstraint(Rubbing):
 
     def readings(self, place: Array, rows: Array) -> GapReadings:
         """The gap."""
-        return GapReadings(self.gap.distance(self.gap.invariants(place_markers(place, rows))))
+        return GapReadings(self.gap_at(place, rows))

@@ -19,7 +19,7 @@ from natcoord_jax.core.motion import Motion, Response, StepContext
 from natcoord_jax.core.potential import Potential, place_markers
 from natcoord_jax.effects.contact.friction import GAP
 from natcoord_jax.effects.contact.gap import Gap
-from natcoord_jax.effects.contact.law import ContactLaw, ContactReadings
+from natcoord_jax.effects.contact.law import ContactLaw, closing_speed
 
 
 class GapPotential(ContactLaw, Potential):
@@ -63,18 +63,10 @@ class GapPotential(ContactLaw, Potential):
         x, rates = place_markers(place, motion.rows), place_markers(place, motion.rates)
         flow = jax.vmap(lambda xi, vi: jax.jvp(self.invariants, (xi,), (vi,))[1])(x, rates)
         start: Any = self.invariants(place_markers(place, motion.start))
-        closing = self._closing(start, jnp.asarray(now.tableau.b) @ flow, now.h)
-        factor = 1.0 + jnp.maximum(self.damping * closing, -1.0)
+        factor = self.lossy(closing_speed(self.gap.distance, start, jnp.asarray(now.tableau.b) @ flow, now.h))
         forces: Any = found.forces
         given = found.power
         return replace_fields(found, forces=factor * forces, power=factor * given, released=given)
-
-    def _closing(self, start: Any, flow: Any, h: Any) -> Any:
-        """Mean rate at which the gap closes in the step [m/s]; at one instant the rate."""
-        moving = h > 0
-        distance = self.gap.distance
-        mean = (distance(start) - distance(start + h * flow)) / jnp.where(moving, h, 1.0)
-        return jnp.where(moving, mean, -jax.jvp(distance, (start,), (flow,))[1])
 
     def invariants(self, x: Float[Array, "k 3"]) -> Float[Array, " p"]:
         """Those of the gap."""
@@ -88,9 +80,9 @@ class GapPotential(ContactLaw, Potential):
         """Itself: what is soft in the middle of a step may be stiff at its end."""
         return self
 
-    def readings(self, place: Array, rows: Array) -> ContactReadings:
-        """Gap and force."""
-        return self.readings_at(self.gap.distance(self.invariants(place_markers(place, rows))))
+    def gap_at(self, place: Array, rows: Array) -> Float[Array, ""]:
+        """Between the surfaces [m]."""
+        return self.gap.distance(self.invariants(place_markers(place, rows)))
 
     def touch(self, place: Array, rows: Array) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
         """Where the surfaces touch [m], and the direction in which the second is pushed."""
