@@ -4,9 +4,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from natcoord_jax.core.checks import as_array
+from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.state import State
 from natcoord_jax.effects.joints import Cylindrical, Fixed, Planar, Prismatic, Revolute, Spherical, Universal
-from natcoord_jax.io.masses import quaternion
+from natcoord_jax.maths.rotations import to_quaternion
 from natcoord_jax.mechanics.coordinates import state_rates
 from natcoord_jax.system import System
 
@@ -20,6 +22,13 @@ JOINTS: dict[type, tuple[tuple[str, int, int], ...]] = {
     Universal: (("hinge", 2, 0), ("hinge", 0, 1)),
 }
 """For each joint those of MuJoCo, from the parent on: kind, axis of the joint's frame, our coordinate."""
+
+_quaternion = eager_numpy(to_quaternion)
+
+
+def quaternion(rotation: np.ndarray) -> np.ndarray:
+    """(w, x, y, z) of a rotation matrix."""
+    return np.asarray(_quaternion(as_array(rotation)))
 
 
 @dataclass
