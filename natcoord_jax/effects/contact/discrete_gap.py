@@ -11,7 +11,6 @@ there, it is the same function at the end of a step and at the start of the next
 """
 
 import abc
-from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -19,14 +18,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.closed_tangents import by_twists
 from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.effect import replace_fields
-from natcoord_jax.core.handles import Handle
-from natcoord_jax.core.joint import Joint
-from natcoord_jax.core.kinds import NAME
-from natcoord_jax.core.markers import Attachment, Marker, Markers
 from natcoord_jax.core.motion import Motion, Response, StepContext
 from natcoord_jax.core.potential import marker_response, place_markers
 from natcoord_jax.effects.contact.law import ContactLaw
@@ -63,15 +57,9 @@ class DiscreteGap(ContactLaw):
         name: optional name.
     """
 
-    markers: Any = eqx.field(metadata=is_a(Markers()))
-    name: Any = eqx.field(default=None, kw_only=True, metadata=is_a(NAME))
     initial: Any = eqx.field(default=None, init=False)
 
     derived: ClassVar[tuple[str, ...]] = ("damping", "initial")
-
-    def attach(self, find: Callable[[Handle], tuple[Joint, Array]]) -> Sequence[Marker | Attachment]:
-        """Its points."""
-        return self.markers
 
     @abc.abstractmethod
     def measured(self, x: Float[Array, "k 3"]) -> Measured:

@@ -1,6 +1,5 @@
 """Friction where two surfaces touch: a force against slip, whatever pushes them together."""
 
-from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -9,14 +8,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from natcoord_jax.core.arguments import is_a, require
-from natcoord_jax.core.effect import Effect
-from natcoord_jax.core.handles import Handle
-from natcoord_jax.core.joint import Joint
-from natcoord_jax.core.kinds import NAME, of
-from natcoord_jax.core.markers import Attachment, Marker, Markers
+from natcoord_jax.core.kinds import of
 from natcoord_jax.core.motion import Motion
 from natcoord_jax.core.numeric import Number
-from natcoord_jax.core.potential import on_rows, place_markers
+from natcoord_jax.core.potential import MarkerEffect, on_rows, place_markers
 from natcoord_jax.effects.contact.gap import Gap
 from natcoord_jax.maths.vectors import cross, dot, positive_part
 
@@ -27,7 +22,7 @@ load creeps less than that."""
 GAP = of("a gap, as nc.SphereOnPlane(radius=0.1)", Gap)
 
 
-class Rubbing(Effect):
+class Rubbing(MarkerEffect):
     """Base of contacts whose multipliers are an impulse along the normal and those of friction.
 
     A force of slip acts where the surfaces touch, f sqrt(|u|^2 + eps^2) = -mu N u of the velocity u with
@@ -45,11 +40,9 @@ class Rubbing(Effect):
             the gap closes, at its end, `RESTING` where it is closed, 0 elsewhere. None: of other schemes.
     """
 
-    markers: Any = eqx.field(metadata=is_a(Markers()))
     gap: Gap = eqx.field(metadata=is_a(GAP))
     friction: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Number("not negative")))
     regularisation: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Number("positive")))
-    name: Any = eqx.field(default=None, kw_only=True, metadata=is_a(NAME))
     mobility: Any = eqx.field(default=None, init=False)
     phase: Any = eqx.field(default=None, init=False)
 
@@ -68,10 +61,6 @@ class Rubbing(Effect):
                 f"{type(self).__name__}: friction [-] acts where surfaces touch, which "
                 f"{type(self.gap).__name__} does not say; give it a method `contact`"
             )
-
-    def attach(self, find: Callable[[Handle], tuple[Joint, Array]]) -> Sequence[Marker | Attachment]:
-        """Markers of the gap."""
-        return self.markers
 
     @property
     def multipliers(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]

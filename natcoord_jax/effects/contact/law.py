@@ -12,9 +12,10 @@ from jaxtyping import Array, Float
 from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.checks import as_array
 from natcoord_jax.core.eager_numpy import eager_numpy
-from natcoord_jax.core.effect import Effect, replace_fields
+from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.kinds import Choice
 from natcoord_jax.core.numeric import Number
+from natcoord_jax.core.potential import MarkerEffect
 from natcoord_jax.maths.implicit import implicit_root
 from natcoord_jax.maths.vectors import positive_part, safe_sqrt
 
@@ -108,7 +109,7 @@ class ContactReadings(eqx.Module):
     energy: Float[Array, "*t"]
 
 
-class ContactLaw(Effect):
+class ContactLaw(MarkerEffect):
     """Base of contacts: how much a force an overlap has, and how much of an impact is left.
 
     With a restitution, what impacts lose is the work in its account, which is never positive.

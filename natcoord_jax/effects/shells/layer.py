@@ -44,37 +44,6 @@ class ShellReadings(eqx.Module):
     energy: Float[Array, "*t"]
 
 
-def readings_of(
-    sheet: Sheet,
-    half: Any,
-    offset: Any,
-    strain: Array,
-    curvature: Array,
-    shear: Array,
-    energy: Array,
-    pull: Any,
-) -> ShellReadings:
-    """Resultants and stresses of strains.
-
-    Args:
-        sheet: of the element, about its nodes.
-        half: of the thickness [m].
-        offset: of the middle of the thickness from the nodes [m].
-        strain: of the surface of the nodes.
-        curvature: [1/m].
-        shear: [-].
-        energy: [J].
-        pull: resultants that are there without strain [N/m].
-    """
-    sides = offset - half, offset + half
-    stress = [face @ (strain + z * curvature) + pull / (2 * half) for z, face in zip(sides, sheet.faces)]
-    resultants = sheet.membrane @ strain + sheet.coupling @ curvature + pull
-    moments = sheet.coupling @ strain + sheet.bending @ curvature + offset * pull
-    return ShellReadings(
-        strain, curvature, shear, resultants, moments, sheet.shear @ shear, jnp.stack(stress), energy
-    )
-
-
 FLAT = 1e-9
 """Area at a corner, in squares of the sides, up to which an element is degenerate there."""
 
@@ -197,10 +166,15 @@ class LayerElement(Potential):
         return self.stiffness
 
     def read(self, strain: Array, curvature: Array, shear: Array, energy: Array) -> ShellReadings:
-        """What its sensor shows."""
-        offset = 0.0 if self.offset is None else self.offset
+        """What its sensor shows: resultants and stresses of strains of the surface of the nodes."""
+        sheet, half, offset = self.sheet(), 0.5 * self.thickness, 0.0 if self.offset is None else self.offset
         pull = jnp.zeros(3) if self.prestress is None else jnp.asarray(self.prestress)
-        return readings_of(self.sheet(), 0.5 * self.thickness, offset, strain, curvature, shear, energy, pull)
+        sides = offset - half, offset + half
+        stress = [face @ (strain + z * curvature) + pull / (2 * half) for z, face in zip(sides, sheet.faces)]
+        resultants = sheet.membrane @ strain + sheet.coupling @ curvature + pull
+        moments = sheet.coupling @ strain + sheet.bending @ curvature + offset * pull
+        forces = sheet.shear @ shear
+        return ShellReadings(strain, curvature, shear, resultants, moments, forces, jnp.stack(stress), energy)
 
 
 @eager_numpy
