@@ -95,7 +95,7 @@ class Damping(eqx.Module):
         still = jnp.zeros((unit.shape[0], 1, *NODE), unit.dtype)
         moving = jnp.concatenate([unit, still], axis=1)
         turning = jnp.concatenate([jnp.swapaxes(space.free[1], 0, 1), still[:, :, 0]], axis=1)
-        groups = elastic_of(system)
+        groups = [g for g in system.effects if g.effect.elastic]
         rates = [jax.vmap(partial(_instant_rates, system, g, rows))(moving, turning) for g in groups]
         return cls(space, rates, [_stiffness(system, g, rows, state.coordinates) for g in groups])
 
@@ -168,11 +168,6 @@ class Damping(eqx.Module):
         return total
 
 
-def elastic_of(system: Model) -> list[Group]:
-    """Groups whose oscillations can be damped."""
-    return [g for g in system.effects if g.effect.elastic]
-
-
 def _times(k: Float[Array, "n p p"], x: Float[Array, "n p"]) -> Float[Array, "n p"]:
     return jnp.sum(k * x[:, None, :], axis=-1)
 
@@ -184,9 +179,8 @@ def _instant_rates(system: Model, group: Group, rows: Array, moving: Array, turn
         motion = Motion(rows, rows[None], moving[None], turning[None])
         return effect.strain_rates(place, motion, jnp.zeros((), rows.dtype))[0]
 
-    index = group.bodies
-    places = group_places(system, group)
-    return jax.vmap(one)(group.effect, places, rows[index], moving[index], turning[index])
+    given = (x[group.bodies] for x in (rows, moving, turning))
+    return jax.vmap(one)(group.effect, group_places(system, group), *given)
 
 
 def _mean_rates(group: Group, system: Model, at: StageKinematics, h: Array) -> Float[Array, "n p"]:

@@ -21,11 +21,6 @@ from natcoord_jax.mechanics.sweeps import JointData, relative_motion
 from natcoord_jax.model.tree import SLOTS, JointGeometry, Level, Tree, joined
 
 
-def _of_slots(level: Level, rates: Float[Array, "s n k"]) -> Float[Array, "s n 7"]:
-    columns = {slot: rates[:, :, i] for i, slot in enumerate(level.slots)}
-    return jnp.stack([columns.get(k, jnp.zeros(rates.shape[:2], rates.dtype)) for k in range(SLOTS)], axis=2)
-
-
 def _derivatives(
     level: Level,
     these: JointData,
@@ -46,7 +41,7 @@ def _derivatives(
 
     def local(spin_p: Array, rates: Array) -> Array:
         d_p = parent_directors(level, these, spin_p, h, tableau)
-        slots = _of_slots(level, rates)
+        slots = spread_out(level, range(SLOTS), rates, 2)
         spin, velocity, _, geometry = relative_motion(level, these, spin_p, d_p, slots, h, tableau)
         moved = cross(geometry.parent_arm + geometry.gap - geometry.child_arm, through.force)
         return jnp.concatenate([velocity, spin, moved, forces_on_slots(level, geometry, through)], axis=-1)
