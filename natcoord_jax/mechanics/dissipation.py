@@ -118,7 +118,7 @@ class Damping(eqx.Module):
         assert space.system is not None and known.lift is not None and known.prescribed is not None
         w = known.frame.T @ known.within(space.framed(v)) + space.drift_rates
         along = space.projected(v)
-        normal = Velocity(v.rows - along.rows, v.rotors - along.rotors)
+        normal = v - along
         # Per component along the frame of what the constraints admit.
         framed = [jnp.einsum("unp,fu->fnp", b, self._admitted) for b in self.rates]
         mean = [_mean_rates(g, space.system, at, h) for g in groups if g.effect.elastic]
@@ -135,16 +135,11 @@ class Damping(eqx.Module):
             loss = loss + h * jnp.sum(viscous * r) + 0.5 * jnp.sum(tau * (e + changed))
             pull = pull + jnp.einsum("unp,np->u", full, tau)
         kick, back = space.along(jump), 1.0 - rho
-        kick = Velocity(kick.rows - back * normal.rows, kick.rotors - back * normal.rotors)
+        kick = kick - back * normal
         work = known.prescribed * (known.lift.T @ (space.pulled(space.impulse(kick)) + pull))
         loss = loss + (1.0 - rho**2) * space.energy(normal)
         given = iter(stresses)
-        return Damped(
-            Velocity(v.rows + kick.rows, v.rotors + kick.rotors),
-            tuple(next(given) if g.effect.elastic else None for g in groups),
-            work,
-            loss,
-        )
+        return Damped(v + kick, tuple(next(given) if g.effect.elastic else None for g in groups), work, loss)
 
     @property
     def _admitted(self) -> Float[Array, "u u"]:
