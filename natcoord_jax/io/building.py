@@ -62,11 +62,6 @@ class Parts:
     inputs: dict[str, Handle] = field(default_factory=dict)
     taken: set[str] = field(default_factory=set)
 
-    @property
-    def joint_names(self) -> set[str]:
-        """Of the joints in the scene."""
-        return {handle.name for handle in self.joints.values()}
-
     def named(self, name: str, kind: str) -> str:
         """A name in the scene; files may give a body, a joint and an actuator the same."""
         found = name if name not in self.taken else f"{name} {kind}"

@@ -194,7 +194,8 @@ def described(found: Source, leave_out: set[str], motors: bool | None) -> Descri
     sites = {model.site(s).name or f"site {s + 1}": poses.site(s) for s in range(model.nsite)}
     gravity = np.zeros(3) if "gravity" in leave_out else np.array(model.opt.gravity)
     return Description(
-        name=_model_name(model),
+        # The name of the model is the first of all names.
+        name=bytes(model.names).partition(b"\0")[0].decode() or "robot",
         links=links,
         frames=frames,
         sites=sites,
@@ -239,11 +240,6 @@ def _list_what_differs(links: Sequence[LinkData], joints: dict[str, JointData], 
             notes.changed(joint.name, "it starts beyond its limit: pose the robot, see RobotHandle.state")
     if any(joint.friction for joint in joints.values()):
         notes.changed("friction loss", "smooth at rest, see nc.JointFriction: what should stick creeps")
-
-
-def _model_name(model: Any) -> str:
-    """Name of the model, which is the first of all names."""
-    return bytes(model.names).partition(b"\0")[0].decode() or "robot"
 
 
 def _without(link: LinkData, leave_out: set[str]) -> LinkData:

@@ -46,11 +46,11 @@ def with_positions(robot: "RobotHandle", system: System, state: State, positions
             place = places[(robot.parts.joints[joint.name].name, 0)]
             coordinates[place] = q[joint.position_index]
             turning[place] = v[joint.rate_index]
-    stored = np.array(state.rates)
+    stored, own = np.array(state.rates), {handle.name for handle in robot.parts.joints.values()}
     for group in system.effects:
         if group.effect.rotors:
             for rotor, place in zip(np.asarray(group.rotors)[:, 0], np.asarray(group.coordinates)[:, 0]):
-                if system.structure.coordinates[place][0] in robot.parts.joint_names:
+                if system.structure.coordinates[place][0] in own:
                     stored[rotor] = turning[place]
     return replace_fields(
         state,

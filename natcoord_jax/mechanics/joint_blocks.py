@@ -61,12 +61,6 @@ def _derivatives(
     return jnp.concatenate([jnp.broadcast_to(moving, (bodies, *moving.shape)), found], axis=-1)
 
 
-def _of_free(geometry: JointGeometry, level: Level) -> Float[Array, "n s rows s columns"]:
-    """The same of free bodies: motion is linear in the rates, whatever their neighbours do."""
-    k = geometry.axes.shape[2]
-    return jnp.pad(_free_motions(geometry, level), ((0, 0), (0, 0), (0, 3 + k), (0, 0), (6, 0)))
-
-
 def _free_motions(geometry: JointGeometry, level: Level) -> Float[Array, "n s 6 s k"]:
     """Velocities and angular velocities of free bodies by their rates."""
     turning, sliding = slot_arms(level, geometry)
@@ -122,7 +116,9 @@ def joint_blocks(
     """
     levels, slots, s = (tree.free, tree.hung), tree.slots, tableau.stages
     bodies, k = present.shape
-    derivatives = [_of_free(geometry.free, tree.free)]
+    # Of free bodies: motion is linear in the rates, whatever their neighbours do.
+    free, more = _free_motions(geometry.free, tree.free), 3 + geometry.free.axes.shape[2]
+    derivatives = [jnp.pad(free, ((0, 0), (0, 0), (0, more), (0, 0), (6, 0)))]
     gathers = [_handed_up(tree.free, geometry.free, False)]
     if tree.hung.members:
         here = tree.hung.here

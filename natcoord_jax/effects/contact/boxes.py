@@ -71,12 +71,6 @@ class SphereOnBox(Gap):
         return nearest, direction(x[1] - nearest)
 
 
-def _smooth_step(x: Array) -> Array:
-    """From nothing at zero to one at one, and with no slope there."""
-    x = jnp.clip(x, 0.0, 1.0)
-    return x * x * (3.0 - 2.0 * x)
-
-
 class BetweenBoxes(Gap):
     """Base of gaps between two boxes whose edges and corners are round: balls roll along them.
 
@@ -201,7 +195,8 @@ class EdgesOnEdges(BetweenBoxes):
         crossing = 1.0 - jnp.exp((products[2] ** 2 / (products[0] * products[1]) - 1.0) / PARALLEL)
         for place, square in ((s, products[0]), (t, products[1])):
             end = (0.5 - jnp.abs(place - 0.5)) * safe_sqrt(square) / (AT_END * self.rounding)
-            crossing = crossing * _smooth_step(end)
+            end = jnp.clip(end, 0.0, 1.0)
+            crossing = crossing * (end * end * (3.0 - 2.0 * end))
         return far + self.rounding * (1.0 - crossing), first, second
 
     def _weights(self, far: Float[Array, "6 6"]) -> Float[Array, "6 6"]:
