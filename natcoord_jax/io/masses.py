@@ -31,7 +31,10 @@ def settle(spec: Any, notes: Notes) -> set[str]:
         if sum(b.mass for b in _subtree(body)) <= 0:
             for joint in list(body.joints):
                 notes.left_out(joint.name, f"it moves no mass, and is fixed: all that carries is {body.name}")
-                _forget(spec, joint)
+                for equality in list(spec.equalities):
+                    if joint.name in (equality.name1, equality.name2):
+                        spec.delete(equality)
+                spec.delete(joint)
             continue
         carried = _rigid(body)
         if sum(b.mass for b in carried) <= 0:
@@ -42,14 +45,6 @@ def settle(spec: Any, notes: Notes) -> set[str]:
                 notes.changed(body.name, "it has mass and no inertia, and is a point mass")
             body.inertia = np.maximum(body.inertia, FEATHER)
     return light
-
-
-def _forget(spec: Any, joint: Any) -> None:
-    """Delete a joint, and the relations that it is part of."""
-    for equality in list(spec.equalities):
-        if joint.name in (equality.name1, equality.name2):
-            spec.delete(equality)
-    spec.delete(joint)
 
 
 def _settle_tensor(body: Any, notes: Notes) -> None:

@@ -1,6 +1,6 @@
 """Contact by an energy of the gap, with friction: what pushes depends on the overlap, what rubs on that."""
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax.numpy as jnp
 from jaxtyping import Array
@@ -45,11 +45,6 @@ class FrictionalGapPotential(Rubbing, ContactLaw):
 
     kind: ClassVar[str] = "soft contact with friction"
     works: ClassVar[bool] = True
-
-    def assembled_at(self, x: Array) -> "FrictionalGapPotential":
-        """With its damping, and a mobility, which is found when the masses are known."""
-        damped: Any = self.renewed()
-        return replace_fields(damped, mobility=jnp.ones(()))
 
     def violation(self, place: Array, rows: Array, coordinates: Array, t: Array) -> Array:
         """None: surfaces may overlap."""

@@ -77,10 +77,6 @@ class GapConstraint(Rubbing):
     kind: ClassVar[str] = "hard contact"
     bounces: ClassVar[bool] = True
 
-    def assembled_at(self, x: Array) -> "GapConstraint":
-        """With a mobility, which is found when the masses are known."""
-        return replace_fields(self, mobility=jnp.ones(()))
-
     def quadratic(self, place: Array, rows: Array) -> Array:
         """The invariants of the gap."""
         return jnp.ravel(self.gap.invariants(place_markers(place, rows)))

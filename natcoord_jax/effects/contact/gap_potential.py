@@ -6,23 +6,20 @@ that whatever the step. What impacts lose is a part of the force that grows with
 closes; it is there only where a restitution is asked for.
 """
 
-from typing import Any, ClassVar
+from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from natcoord_jax.core.arguments import is_a, require
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.motion import Motion, Response, StepContext
 from natcoord_jax.core.potential import Potential, place_markers
-from natcoord_jax.effects.contact.friction import GAP
-from natcoord_jax.effects.contact.gap import Gap
+from natcoord_jax.effects.contact.gap import GapEffect
 from natcoord_jax.effects.contact.law import ContactLaw, closing_speed
 
 
-class GapPotential(ContactLaw, Potential):
+class GapPotential(GapEffect, ContactLaw, Potential):
     """Contact by an energy of the gap between two surfaces, where they overlap.
 
     With a restitution, what impacts lose is the work in its account, which is never positive.
@@ -46,14 +43,6 @@ class GapPotential(ContactLaw, Potential):
         >>> gap = nc.SphereOnPlane(radius=0.1)
         >>> contact = nc.GapPotential((*floor, nc.Point(nc.ground, (0, 0, 1))), gap, stiffness=1e5)
     """
-
-    gap: Gap = eqx.field(metadata=is_a(GAP))
-
-    unit_directions: ClassVar[bool] = True
-
-    def __check_init__(self) -> None:
-        """Refuse markers of another gap."""
-        require(self, "markers", self.gap.markers)
 
     def respond(self, place: Array, motion: Motion, now: StepContext, lam: Array) -> Response:
         """That of the potential, and more of it where the gap closes; together they never pull."""
@@ -79,11 +68,3 @@ class GapPotential(ContactLaw, Potential):
     def linearised(self, place: Array, motion: Motion, now: StepContext, lam: Array) -> "GapPotential":
         """Itself: what is soft in the middle of a step may be stiff at its end."""
         return self
-
-    def gap_at(self, place: Array, rows: Array) -> Float[Array, ""]:
-        """Between the surfaces [m]."""
-        return self.gap.distance(self.invariants(place_markers(place, rows)))
-
-    def touch(self, place: Array, rows: Array) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
-        """Where the surfaces touch [m], and the direction in which the second is pushed."""
-        return self.gap.touch(place_markers(place, rows))
