@@ -188,7 +188,8 @@ def mixed(rng: Chance):
         axis = rng.direction()
         second = np.cross(axis, rng.direction())
         more = dict(pitch=rng.uniform(0.1, 0.5)) if kind is nc.Screw else {}
-        joint = kind(last, body, (0.4 * k, 0, 0), axis, second=second, name=f"joint {k}", **more)
+        more |= dict(axis=axis, second=second, name=f"joint {k}")
+        joint = kind(last, body, point=(0.4 * k, 0, 0), **more)
         joint, last = scene.add(joint), body
         for c in range(min(2, len(kind.coordinates))):
             scene.add(rng.dry(joint, coordinate=c, name=f"dry {k} {c}"))

@@ -5,6 +5,7 @@ and wrong after that; a projection has another metric than that of the mass; a j
 is none of its own; a search ends on another branch without a word.
 """
 
+import itertools
 from functools import cache
 from typing import Any
 
@@ -287,6 +288,35 @@ def test_a_redundant_loop_of_rods_is_projected_to_round_off():
     assert len(system.structure.redundant) > 0
     assert system.constraint_errors(state).velocity.max() <= tol.CONSTRAINT
     assert float(jnp.abs(state.v).max()) > 0.1
+
+
+def spit(inertia, size, axes):
+    """Two hinged bodies and a rod that is welded between them: it could spin on a hinge along itself."""
+    scene, along = nc.Scene(), np.outer(axes[0], axes[0]) * size**2 / 12
+    plump: dict[str, Any] = {"mass": 1.0, "inertia": 0.1 * size**2 * np.eye(3)}
+    moments = np.trace(along) * np.eye(3) - along + inertia * along
+    base = scene.add(nc.RigidBody(**plump))
+    rod = scene.add(nc.RigidBody(mass=1.0, inertia=moments, position=0.5 * size * axes[0]))
+    end = scene.add(nc.RigidBody(**plump, position=size * axes[0]))
+    hinges = (nc.ground, base, axes[1]), (base, rod, axes[0]), (base, end, axes[2])
+    for parent, child, axis in hinges:
+        scene.add(nc.Revolute(parent, child, point=(0, 0, 0), axis=axis))
+    scene.add(nc.Fixed(rod, end))
+    return scene.compile()
+
+
+@pytest.mark.slow
+def test_an_inertia_of_rounding_is_none():
+    """Velocities against a weld are projected as those of a rod with a little inertia about its axis."""
+    pushed = np.random.default_rng(1).normal(size=(3, 3))
+    for seed, size in itertools.product(range(3), (1e-4, 1.0)):
+        axes, found = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0], []
+        for inertia in (0.0, 1e-9):
+            system, state = spit(inertia, size, axes)
+            state = eqx.tree_at(lambda s: s.v, state, state.v.at[::4].add(size * pushed))
+            found.append(np.asarray(nc.assemble(system, state).v[4::4]) / size)
+        assert np.abs(found[0]).max() > 1e-2
+        np.testing.assert_allclose(found[0], found[1], atol=1e-8)
 
 
 def test_rotors_count_in_the_metric_of_the_mass():

@@ -21,6 +21,7 @@ from natcoord_jax.mechanics.equations_of_motion import (
 )
 from natcoord_jax.mechanics.momentum import inertia, spatial_inertia, weighs_only, wrench
 from natcoord_jax.mechanics.rates import joint_axes, tree_rates
+from natcoord_jax.mechanics.redundancy import RANK
 from natcoord_jax.mechanics.tangent_space import TangentSpace, Velocity
 from natcoord_jax.mechanics.violations import (
     GAP,
@@ -29,16 +30,20 @@ from natcoord_jax.mechanics.violations import (
     largest,
     rate_size,
     relative,
+    spans,
     violation_rates_of,
 )
 from natcoord_jax.model.model import Model
 from natcoord_jax.model.rows import row_rates, rows_with_ground
-from natcoord_jax.model.tree import SLOTS
+from natcoord_jax.model.tree import SLOTS, turns
 
 SHIFT = 1e-12
 """Compliance that is added to constraints, relative, and refined away where they are independent. Where they
 are not, or close to singular positions (below a millionth of the others), they are left as they are."""
 ROUNDS = 4
+
+NO_INERTIA = 1e-15
+"""Inertia along a motion, in terms of the largest, that is rounding of none."""
 
 ENOUGH = 1e3 * GAP
 """Rates of constraints, relative, up to which velocities obey them: near singular positions no projection
@@ -142,7 +147,7 @@ def _spatial(system: Model, rows: Float[Array, "bodies 4 3"]) -> tuple[TreeBlock
     tree, slots = system.tree, np.array(system.tree.slots, int)
     axes, points = joint_axes(system, rows)
     present = jnp.asarray(tree.slot_index)[:, slots] < tree.slot_of.shape[0]
-    axis, turning = jnp.where(present[..., None], axes[:, slots], 0.0), (slots < 3) | (slots == SLOTS - 1)
+    axis, turning = jnp.where(present[..., None], axes[:, slots], 0.0), turns(slots)
     velocity = jnp.where(turning[:, None], cross(axis, (rows[:, 0] - points)[:, None]), axis)
     own = jnp.concatenate([velocity, jnp.where(turning[:, None], axis, 0.0)], axis=2)
     count, unit = rows.shape[0], jnp.eye(3, dtype=rows.dtype)
@@ -169,14 +174,17 @@ def _together(system: Model, state: State, v: Velocity, holding: tuple[Array, Ar
     impulse = space.pulled(space.impulse(Velocity(v.rows - start.rows, v.rotors - start.rotors)))
     if holding is None and not rows.shape[0]:
         return space.spread(w + definite_solution(matrix, impulse))
-    # Where all rows vanish, because the tree lets nothing move that they forbid, they are rounding.
-    size = sum(jnp.sum(x**2) for x in balances.unit_loads[1])
     gap = -balances.rates(w).constraints
+    spanned = [x.reshape(-1) for x in spans(system, [*relations_of(system), *loops_of(system)])]
     if holding is not None:
         kept = holding[0][:, None] * _coordinate_columns(balances)
-        size, rows = size + jnp.sum(kept**2), jnp.concatenate([rows, kept])
+        rows, spanned = jnp.concatenate([rows, kept]), [*spanned, coordinate_sizes(system)]
         gap = jnp.concatenate([gap, holding[0] * holding[1] - kept @ w])
-    return space.spread(w + _constrained(matrix, rows, jnp.trace(matrix) / size, impulse, gap))
+    size = jnp.where(turns(system.tree.slot_of % SLOTS), 1.0, system.size)
+    span = jnp.concatenate(spanned)
+    rows = rows * size / span[:, None]
+    change = _constrained(matrix * size * size[:, None], rows, impulse * size, gap / span)
+    return space.spread(w + size * change)
 
 
 def _coordinate_columns(balances: EquationsOfMotion) -> Float[Array, "coordinates u"]:
@@ -193,20 +201,19 @@ def _coordinate_columns(balances: EquationsOfMotion) -> Float[Array, "coordinate
 def _constrained(
     matrix: Float[Array, "u u"],
     rows: Float[Array, "c u"],
-    weight: Float[Array, ""],
     impulse: Float[Array, " u"],
     gap: Float[Array, " c"],
 ) -> Float[Array, " u"]:
     """Solution x of A x - C^T lambda = impulse, C x = gap, whether or not rows of C depend on each other.
 
     A is completed by C^T C, which changes no solution: bodies may lack inertia along what only loops forbid.
-    Both are in units of the inertias and of the rows, so that metres, radians and kilograms compare.
+    All are in terms of the size of the scene, then of the inertias and of the rows.
     """
     inertias = jnp.diagonal(matrix)
     most = jnp.max(inertias)
-    unit = jnp.sqrt(jnp.where(inertias > 1e-15 * most, inertias, most))
+    unit = jnp.sqrt(jnp.where(inertias > NO_INERTIA * most, inertias, most))
     # What repeats a joint of the tree is rounding, and stays small.
-    some = jnp.linalg.norm(rows, axis=1) > 1e-11
+    some = jnp.linalg.norm(rows, axis=1) > RANK
     rows = rows / unit
     size = jnp.where(some, jnp.linalg.norm(rows, axis=1), 1.0 / jnp.min(unit))
     rows, gap, impulse = rows / size[:, None], gap / size, impulse / unit

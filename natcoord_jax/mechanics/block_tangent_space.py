@@ -24,7 +24,7 @@ from natcoord_jax.mechanics.rates import joint_axes
 from natcoord_jax.mechanics.tangent_space import TangentSpace, Velocity, driven
 from natcoord_jax.model.model import Model
 from natcoord_jax.model.rows import row_rates
-from natcoord_jax.model.tree import SLOTS
+from natcoord_jax.model.tree import turns
 
 
 class SeparateTangents(eqx.Module):
@@ -53,7 +53,7 @@ class SeparateTangents(eqx.Module):
         """The tangent spaces of a state; its velocities play no part."""
         rows, slots = state.rows, np.array(system.tree.slots, int)
         axes, points = joint_axes(system, rows)
-        turning = ((slots < 3) | (slots == SLOTS - 1))[:, None]
+        turning = turns(slots)[:, None]
         present = (system.tree.slot_index[:, slots] < system.tree.slot_of.shape[0])[..., None]
         axis = jnp.where(present, axes[:, slots], 0.0)
         velocity = jnp.where(turning, cross(axis, (rows[:, 0] - points)[:, None]), axis)
@@ -63,9 +63,9 @@ class SeparateTangents(eqx.Module):
         blank = jnp.zeros((rows.shape[0], slots.size, slots.size), rows.dtype)
         space = cls(system, rows, velocity, spin, impulses, blank, blank)
         massless = weighs_only(system.mass)
-        turns = jnp.where(massless[:, None, None], spin, 0.0)
+        spin = jnp.where(massless[:, None, None], spin, 0.0)
         # A unit inertia for turns of point masses, which nothing else sees.
-        idle = jnp.sum(turns[:, :, None] * turns[:, None], axis=-1)
+        idle = jnp.sum(spin[:, :, None] * spin[:, None], axis=-1)
         blocks = space.pulled(impulses) + jnp.where(present, 0.0, jnp.eye(slots.size))
         return replace_fields(space, blocks=blocks, frame=jax.vmap(inverse_cholesky)(blocks + idle))
 

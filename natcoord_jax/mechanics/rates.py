@@ -15,7 +15,7 @@ from natcoord_jax.maths.vectors import cross, dot
 from natcoord_jax.mechanics.coordinates import velocities_with_ground
 from natcoord_jax.model.model import Model
 from natcoord_jax.model.rows import rows_with_ground
-from natcoord_jax.model.tree import SLOTS
+from natcoord_jax.model.tree import SLOTS, turns
 
 Twists = tuple[Float[Array, "bodies 3"], Float[Array, "bodies 3"]]
 """Velocities of reference points [m/s] and angular velocities [rad/s]; or forces [N] and torques [N m]."""
@@ -53,7 +53,7 @@ def null_space(
     axes, points = joint_axes(system, rows)
     body, slot = system.tree.slot_of // SLOTS, system.tree.slot_of % SLOTS
     axis, hangs = axes[body, slot], carried(system)[:, body, None]
-    turning = ((slot < 3) | (slot == SLOTS - 1))[:, None]
+    turning = turns(slot)[:, None]
     arm = rows[:, None, 0] - points[body]
     velocity = jnp.where(turning, cross(axis, arm), axis)
     return hangs * velocity, hangs * jnp.where(turning, axis, 0.0)

@@ -37,7 +37,7 @@ from natcoord_jax.mechanics.tangent_space import TangentSpace
 from natcoord_jax.model.axisymmetric_axes import frame_axes
 from natcoord_jax.model.groups import Group
 from natcoord_jax.model.model import Model
-from natcoord_jax.model.tree import SLOTS, TreeMotion, gather_slots, project, start_rates
+from natcoord_jax.model.tree import SLOTS, TreeMotion, gather_slots, project, start_rates, turns
 
 PROBE = 1e-6
 """Change of a rotation [rad] that gives a column of the Jacobian."""
@@ -217,8 +217,7 @@ class ReducedStep(StepEquations):
     def least_inertias(self) -> Float[Array, " balances"]:
         """Inertias that the rates have at least, by the mass of their own bodies; the same in every step."""
         body, slot = self.system.tree.slot_of // SLOTS, self.system.tree.slot_of % SLOTS
-        kind = jnp.where((slot < 3) | (slot == SLOTS - 1), 1, 0)
-        return self._by_stage(least_inertias(self.system.mass)[body, kind])
+        return self._by_stage(least_inertias(self.system.mass)[body, turns(slot).astype(int)])
 
     def _at_least(self, found: Float[Array, " balances"]) -> Float[Array, " balances"]:
         """Inertias, none less than that of the mass at its stage."""

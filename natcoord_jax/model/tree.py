@@ -30,6 +30,11 @@ SLOTS = 7
 axis."""
 
 
+def turns(slots: Array | np.ndarray) -> Array | np.ndarray:
+    """Which of these free motions are rotations."""
+    return (slots < 3) | (slots == SLOTS - 1)
+
+
 @dataclass(frozen=True)
 class Level:
     """Bodies that are handled together, in the order of their numbers, and the union of their free motions.

@@ -157,7 +157,7 @@ def test_frames_of_many_dependent_loops(kind, count):
         run = simulate(system, state, dt=dt, steps=150)
         assert float(np.max(system.constraint_errors(run).joints)) <= 1e-12, dt
         assert float(np.max(nc.balance(system, run).energy)) <= tol.STEP_BALANCE, dt
-        assert int(np.sum(run.iterations)) <= 5 * 150, dt
+        assert int(np.sum(run.iterations)) <= 6 * 150, dt
 
 
 @pytest.mark.exhaustive
@@ -240,7 +240,7 @@ def pair(size, again):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("size", [pytest.param(1e-6, marks=pytest.mark.exhaustive), 1.0])
+@pytest.mark.parametrize("size", [pytest.param(x, marks=pytest.mark.exhaustive) for x in (1e-6, 1e4)] + [1.0])
 def test_what_only_repeats_a_joint_is_none(size):
     """All that is left of it beside the joint is rounding, which has a rank of its own."""
     runs = []

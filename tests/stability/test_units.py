@@ -44,15 +44,35 @@ FUNCTIONS = {
 INPUTS = {nc.JointForce: "N", nc.BodyForceInput: "N", nc.WrenchInput: "-", nc.AffineActuator: "-"}
 """Units of inputs that are no torques."""
 ASIDE = {
-    nc.NonlinearBeamElement: "its law has no numbers of its own, which units would be",
-    nc.Rolling: "it does not start on the plane",
     nc.PointOnPoint: "it repeats what the joint holds, which is found out outside of jit only",
     nc.PointSum: "it repeats what the joint holds, which is found out outside of jit only",
 }
+
+
+class Hardening(eqx.Module):
+    """A law of a beam with numbers of its own.
+
+    Attributes:
+        tension: of the three strains [N].
+        bending: of the three curvatures [N m^2].
+    """
+
+    tension: Any
+    bending: Any
+
+    def __call__(self, strains):
+        return self.tension @ jnp.cosh(strains[:3]) + self.bending @ strains[3:] ** 2
+
+
 # With numbers that fit the pair as it starts.
 FITTING = {
+    nc.NonlinearBeamElement: lambda p: dataclasses.replace(
+        TABLE[nc.NonlinearBeamElement].make(p),
+        law=Hardening(np.array((5.0, 3.0, 2.0)), np.array((0.5, 0.3, 0.7))),
+    ),
     nc.PointOnPlane: lambda p: nc.PointOnPlane((p.ends[0], p.triad[2], p.ends[1]), distance=-0.7),
     nc.PointOnLine: lambda p: nc.PointOnLine((p.ends[0], nc.Direction(p.one, (0.8, 0.8, -0.7)), p.ends[1])),
+    nc.Rolling: lambda p: nc.Rolling((p.ends[0], nc.Direction(p.one, (0, 0, -1)), p.ends[1]), radius=0.7),
     nc.JointFriction: lambda p: nc.JointFriction(p.joint, friction=0.5),
 }
 # Numbers of more units than one.

@@ -197,22 +197,23 @@ class NonlinearBeamElement(BeamElement):
 
     def resultants(self, strains: Float[Array, "6 *n"]) -> Float[Array, "6 *n"]:
         """Section forces [N] and moments [N m]: gradient of the energy per length."""
-        return super().resultants(strains) + _of_each(jax.grad(self.law), "(i)->(i)", strains)
+        return super().resultants(strains) + self._of_each(jax.grad, strains)
 
     def moduli(self, strains: Float[Array, "6 *n"]) -> Float[Array, "6 6 *n"]:
         """Derivatives of the resultants by the strains [N, N m, N m^2]."""
-        return super().moduli(strains) + _of_each(jax.hessian(self.law), "(i)->(i,j)", strains)
+        return super().moduli(strains) + self._of_each(jax.hessian, strains)
 
     def energy(self, invariants: Array) -> Array:
         """Strain energy [J]."""
-        more = _of_each(self.law, "(i)->()", self.strains(invariants))
+        more = self._of_each(lambda law: law, self.strains(invariants))
         return super().energy(invariants) + self.length * more
 
-
-def _of_each(function: Callable[[Array], Array], signature: str, strains: Array) -> Array:
-    """A function of the strains of one element, of one or of many at once (last axis)."""
-    found = jnp.vectorize(function, signature=signature)(jnp.moveaxis(strains, 0, -1))
-    return jnp.moveaxis(found, range(strains.ndim - 1), range(1 - strains.ndim, 0))
+    def _of_each(self, made: Callable[..., Any], strains: Float[Array, "6 *n"]) -> Float[Array, "*out"]:
+        """What is made of the law at the strains of one element, or of many with a law each."""
+        if strains.ndim == 1:
+            return made(self.law)(strains)
+        each = eqx.filter_vmap(lambda law, x: made(law)(x), in_axes=(eqx.if_array(-1), -1), out_axes=-1)
+        return each(self.law, strains)
 
 
 class BeamDamping(Force):
