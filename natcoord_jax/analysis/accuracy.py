@@ -38,8 +38,7 @@ SAMPLES = 32
 Quantities = Mapping[str, Callable[[State], Array]]
 
 
-def _default_quantities() -> Quantities:
-    return {"positions": lambda state: state.q, "velocities": lambda state: state.v}
+DEFAULT: Quantities = {"positions": lambda state: state.q, "velocities": lambda state: state.v}
 
 
 def _difference(quantities: Quantities, one: State, other: State) -> dict[str, float]:
@@ -196,7 +195,7 @@ def accuracy(
         >>> 3.5 < found.rows[0].error / found.rows[1].error < 4.5
         True
     """
-    measured, runs = quantities or _default_quantities(), _Runs(system, state, float(t_end), inputs)
+    measured, runs = quantities or DEFAULT, _Runs(system, state, float(t_end), inputs)
     best, reference_error, made = _reference(runs, measured, orders)
     if not math.isfinite(reference_error):
         raise RuntimeError(

@@ -176,15 +176,13 @@ def _account(system: System, trajectory: Trajectory, own: dict[str, bool]) -> di
     if states.dissipated is not None:
         work = jnp.concatenate([work, -states.dissipated[:, None]], axis=1)
     stores = sum((jnp.abs(v) for v in energy.stores.values()), jnp.zeros_like(energy.kinetic))
-    steps = (after.t - before.t)[:, None]
+    pulled = jnp.sum(jnp.abs(trajectory.inputs) * (after.t - before.t)[:, None])
     return {
         "energy": energy.total - energy.total[0] - jnp.sum(work - work[0], axis=-1),
         "energy_scale": energy.kinetic + stores + jnp.sum(jnp.abs(work), axis=-1),
         "momenta": jnp.concatenate([jnp.sum(linear, axis=1), jnp.sum(angular, axis=1)], axis=-1),
         "momentum_scale": jnp.max(sizes[0]) + jnp.max(known.size[:, 0]),
-        "angular_scale": jnp.max(sizes[1])
-        + jnp.max(known.size[:, 1])
-        + jnp.sum(jnp.abs(trajectory.inputs) * steps),
+        "angular_scale": jnp.max(sizes[1]) + jnp.max(known.size[:, 1]) + pulled,
         "impulses": known.impulse,
         "gram": jnp.mean(known.gram, axis=0),
         "within": known.within,
@@ -200,11 +198,6 @@ def _free_motions(gram: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     rates[: len(sizes)] = sizes
     turning = rates > 1e-8
     return mix.T[~turning] @ free, (mix.T[turning] @ free) / rates[turning, None]
-
-
-def _acted_on(account: dict[str, Any]) -> bool:
-    """Whether what is known to act has a resultant: that of internal forces is rounding."""
-    return bool(np.any(np.abs(account["impulses"]) > INTERNAL * _scales(account)))
 
 
 def _scales(account: dict[str, Any]) -> np.ndarray:
@@ -285,8 +278,10 @@ def balance(system: System, trajectory: Trajectory) -> Balance:
     account = jax.tree.map(np.asarray, _account(system, trajectory, own))
     energy = _relative(np.abs(account["energy"]), np.max(account["energy_scale"]))
     notes = _not_conserved(account)
-    # (States after the end of a run repeat the last one, and are no steps.)
-    if int(trajectory.steps_taken) > np.count_nonzero(np.diff(trajectory.t)) and _acted_on(account):
+    # (States after the end of a run repeat the last one, and are no steps. The resultant of internal forces
+    # is rounding.)
+    acted_on = np.any(np.abs(account["impulses"]) > INTERNAL * _scales(account))
+    if int(trajectory.steps_taken) > np.count_nonzero(np.diff(trajectory.t)) and acted_on:
         notes.append("momenta: some steps were made in parts or not saved")
         return Balance(energy, None, None, 0, 0, "; ".join(notes))
     impulse = np.concatenate([np.zeros((1, 6)), np.cumsum(account["impulses"], axis=0)])

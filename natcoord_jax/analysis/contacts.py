@@ -15,9 +15,10 @@ from natcoord_jax.core.state import TRAJECTORY, State, Trajectory
 from natcoord_jax.effects.contact.law import ContactLaw
 from natcoord_jax.mechanics.free_flight import gaps_and_rates, lowest
 from natcoord_jax.mechanics.impacts import mobilities
+from natcoord_jax.mechanics.violations import contact_gaps
 from natcoord_jax.model.groups import Group
 from natcoord_jax.model.model import SYSTEM, Model
-from natcoord_jax.model.rows import group_places, over_states, rows_with_ground
+from natcoord_jax.model.rows import over_states
 from natcoord_jax.system import System
 
 GRAZING = 1e-8
@@ -132,9 +133,7 @@ def touching(system: Model) -> list[Group]:
 
 @over_states
 def _gaps(system: Model, state: State) -> list[Array]:
-    rows = rows_with_ground(state.q)
-    each = jax.vmap(lambda effect, place, rows: effect.readings(place, rows).gap)
-    return [each(g.effect, group_places(system, g), rows[g.bodies]) for g in touching(system)]
+    return [contact_gaps(system, [group], state) for group in touching(system)]
 
 
 @over_states

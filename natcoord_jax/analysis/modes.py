@@ -29,10 +29,9 @@ from natcoord_jax.maths.projectors import pseudo_inverse, range_projector
 from natcoord_jax.maths.rotations import angular_velocity
 from natcoord_jax.maths.spectrum import roots_of_sizes, spectrum
 from natcoord_jax.maths.vectors import cross, safe_divide, safe_norm
-from natcoord_jax.mechanics.equations_of_motion import relative_rates, rotors_of, with_rest
+from natcoord_jax.mechanics.equations_of_motion import relative_rates, rotor_inertias, with_rest
 from natcoord_jax.mechanics.momentum import inertia, wrench
 from natcoord_jax.mechanics.projection import TWIST, constraint_matrix
-from natcoord_jax.mechanics.tangent_space import rotor_inertias
 from natcoord_jax.mechanics.violations import refuse_contacts
 from natcoord_jax.model.model import SYSTEM
 from natcoord_jax.model.rows import row_rates
@@ -79,10 +78,7 @@ def _mass_matrix(system: System, state: State) -> Array:
         return rates.balances(jnp.concatenate(parts, axis=1)[:, None], rows), turning
 
     momenta, turning = jax.vmap(moving)(jnp.eye(rates.count))
-    groups = rotors_of(system)
-    if groups:
-        momenta = momenta + (turning * rotor_inertias(system)) @ turning.T
-    return momenta.T
+    return (momenta + (turning * rotor_inertias(system)) @ turning.T).T
 
 
 def _loading(system: System, state: State, inputs: Array, rotation: Array | None) -> tuple[Loading, Array]:

@@ -16,7 +16,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from natcoord_jax.core.bodies import NODE
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
 from natcoord_jax.linsolve.dense import Inverse
@@ -36,7 +35,7 @@ from natcoord_jax.mechanics.local import body_motion
 from natcoord_jax.mechanics.momentum import inertia, wrench
 from natcoord_jax.mechanics.node_sweeps import sweep_nodes
 from natcoord_jax.mechanics.projection import moved, moving, nearest_coordinates
-from natcoord_jax.mechanics.response import gather, respond, situation, stations
+from natcoord_jax.mechanics.response import stations
 from natcoord_jax.mechanics.start_cache import StartCache
 from natcoord_jax.mechanics.violations import (
     GAP,
@@ -192,29 +191,17 @@ class Static(eqx.Module):
 
     def constraint_loads(self, state: State, y: Array) -> tuple[Array, Array]:
         """Forces and torques of the multipliers on all bodies."""
-        rows, tableau = state.rows, gauss(1)
-        still = jnp.zeros((1, rows.shape[0], 3), rows.dtype)
-        at = stations(rows, rows[None, :, 0], rows[None, :, 1:], still, still)
-        on_rows = jnp.zeros((rows.shape[0] + 1, *NODE), rows.dtype)
-        torques = jnp.zeros((rows.shape[0] + 1, 3), rows.dtype)
-        position = self.balances
+        position, acting, still = self.balances, [], jnp.zeros_like(state.rows[:, 0])
         for group in self.groups:
             size = group.count * group.multipliers
-            lam = y[position : position + size].reshape(group.count, 1, group.multipliers)
+            acting.append((group, y[position : position + size].reshape(group.count, 1, group.multipliers)))
             position += size
-            where = situation(self.system, group, state, self.loading.inputs, jnp.zeros((), rows.dtype))
-            answer = respond(group, where, gather(group, at), lam, tableau)
-            if answer.forces is not None:
-                on_rows = on_rows.at[group.bodies].add(answer.forces[:, 0])
-            if answer.torques is not None:
-                torques = torques.at[group.bodies].add(answer.torques[:, 0])
-        force, torque = wrench(on_rows[None, :-1], rows[None, :, 1:])
-        return force[0], torque[0] + torques[:-1]
+        return loads(self.system, state, self.loading.inputs, still, still, acting)
 
     def gaps(self, state: State) -> Array:
         """What constraints miss."""
-        found = (x.reshape(-1) for x in violations_of(self.system, self.groups, state))
-        return jnp.concatenate([jnp.zeros(0, state.q.dtype), *found])
+        missing = (x.reshape(-1) for x in violations_of(self.system, self.groups, state))
+        return jnp.concatenate([jnp.zeros(0, state.q.dtype), *missing])
 
     def matrices(
         self, y: Float[Array, " unknowns"], weight: Array | float = 0.0
@@ -316,11 +303,8 @@ class Static(eqx.Module):
             pull = jnp.max(jnp.abs(multiply(jnp.zeros_like(diagonal).at[: self.balances].set(shift))))
             free = free & jnp.stack([True, pull <= SHIFT * size * jnp.max(jnp.abs(shift))])
             # Each by one of its rates, that which takes most of its energy.
-            mass, moment = (
-                self.system.mass[:, :1, 0],
-                jnp.trace(self.system.mass[:, 1:, 1:], axis1=1, axis2=2),
-            )
-            parts = jnp.repeat(jnp.concatenate([mass, moment[:, None]], axis=1), 3, axis=1)
+            moment = jnp.trace(self.system.mass[:, 1:, 1:], axis1=1, axis2=2)
+            parts = jnp.repeat(jnp.stack([self.system.mass[:, 0, 0], moment], axis=1), 3, axis=1)
             energies = jnp.stack([turn, shift]) ** 2 * self.system.local_rates.picked(parts[:, None])
             pins = pins.at[jnp.argmax(energies, axis=1)].max(jnp.where(free, size / SHIFT, 0.0))
         return jnp.where(balances, pins, SHIFT * arms**2 / size), pins

@@ -54,6 +54,12 @@ class Search(eqx.Module):
     steady: Array
     over: Array
 
+    @property
+    def code(self) -> Array:
+        """Whether it came to an end."""
+        failed = jnp.where(self.snapped, int(Result.DIVERGED), int(Result.MAX_ITERATIONS))
+        return jnp.where(self.done, int(Result.SUCCESSFUL), failed)
+
 
 def extent_of(system: System, state: State) -> Array:
     """Extent of the system with the ground's origin [m]; never zero."""
@@ -130,9 +136,3 @@ def search_equilibrium(
     nought, no, rotating = jnp.zeros(()), jnp.array(False), loading.rotation is not None
     start = Search(state, lam, nought, nought, nought, nought, jnp.array(0), no, no, no, no)
     return jax.lax.while_loop(going, trip, start)
-
-
-def code_of_search(search: Search) -> Array:
-    """Whether it came to an end."""
-    failed = jnp.where(search.snapped, int(Result.DIVERGED), int(Result.MAX_ITERATIONS))
-    return jnp.where(search.done, int(Result.SUCCESSFUL), failed)

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from natcoord_jax.analysis.static_equations import DENSE, Loading, Static
-from natcoord_jax.analysis.static_search import code_of_search, search_equilibrium
+from natcoord_jax.analysis.static_search import search_equilibrium
 from natcoord_jax.analysis.steady_rotation import complaint, turns_along
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.checks import at_top_level, is_concrete
@@ -257,7 +257,7 @@ def _equilibria(
         # Loads belong to the search as well; `differentiable` is given them again.
         begin = replace_fields(now, t=jax.lax.stop_gradient(value))
         search = search_equilibrium(still[0], begin, lam, jax.lax.stop_gradient(u), snap)
-        code = code_of(still[0], search.state, code_of_search(search))
+        code = code_of(still[0], search.state, search.code)
         if given.rotation is not None:
             turns = turns_along(Static(still[0], search.state, jax.lax.stop_gradient(u)))
             steady = search.steady & turns | jnp.all(u.rotation == 0)

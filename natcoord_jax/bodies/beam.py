@@ -158,7 +158,8 @@ class Beam(Recipe):
         nodes = self._nodes(scene, curve, lumps, name, label)
         places = zip(nodes, apart(curve.points, len(nodes)), apart(curve.frames, len(nodes)))
         attachments = [Attachment(*place) for place in places]
-        material = Material(self.section, self.law, self._damping(label), self.mass)
+        damping = None if self.damping is None else numbers(self.damping, (), f"{label}: damping", "s")
+        material = Material(self.section, self.law, damping, self.mass)
         elements, others = self.interpolation.effects(material, attachments, curve, spans, name)
         handles = tuple(scene.add(element) for element in elements)
         for effect in others:
@@ -167,11 +168,6 @@ class Beam(Recipe):
         return BeamHandle(
             name, tuple(nodes), places, handles, self.section.outline, tuple(attachments), lumps
         )
-
-    def _damping(self, label: str) -> Any:
-        if self.damping is None:
-            return None
-        return numbers(self.damping, (), f"{label}: damping", "s")
 
     def _nodes(
         self, scene: Builder, curve: ReferenceCurve, lumps: Array, name: str, label: str

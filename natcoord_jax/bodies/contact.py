@@ -181,10 +181,9 @@ class Contact(Recipe):
 
     def _law(self) -> dict[str, Any]:
         """Numbers and options of its gaps, as far as they are given."""
+        options = "restitution", "friction", "speed", "candidates", "rounding"
         law = {"stiffness": self.stiffness, "law": self.law}
-        for option in ("restitution", "friction", "speed", "candidates", "rounding"):
-            if getattr(self, option) is not None:
-                law[option] = getattr(self, option)
+        law |= {key: value for key in options if (value := getattr(self, key)) is not None}
         law |= {"method": self.method} if self.method != "nodes" else {}
         return law | ({"one_pass": True} if self.one_pass else {})
 
@@ -193,8 +192,7 @@ class Contact(Recipe):
         law, made = self._law(), []
         sides = {handle: _side(scene, handle, name) for handle in self.all_pairs_of}
         pairs, every = self._pairs(scene, name), list(sides.values())
-        asked = {"capacity": self.capacity, "skin": self.skin}
-        search = {key: value for key, value in asked.items() if value is not None}
+        search = {key: x for key in ("capacity", "skin") if (x := getattr(self, key)) is not None}
         if are_searched(every, law, search, name):
             return (scene.add(searched_contacts(every, pairs, law, search, name)),)
         for left, (one, other) in zip(range(len(pairs))[::-1], pairs):

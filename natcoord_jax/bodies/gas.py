@@ -77,17 +77,9 @@ class Gas(Recipe):
         if is_concrete(positions):
             x = np.concatenate([np.asarray(p)[own] for p, own in zip(positions, used)])
             table = _outward(x, table, name, tuple(s.handle.name for s in surfaces))
-        gas = EnclosedGas.on(
-            nodes,
-            np.arange(len(nodes))[None],
-            faces=table.astype(np.int32),
-            gauge_pressure=self.gauge_pressure,
-            ambient=self.ambient,
-            exponent=self.exponent,
-            volume=self.volume,
-            name=name,
-        )
-        return scene.add(gas)
+        law = {key: getattr(self, key) for key in ("gauge_pressure", "ambient", "exponent", "volume")}
+        numbers = np.arange(len(nodes))[None]
+        return scene.add(EnclosedGas.on(nodes, numbers, faces=table.astype(np.int32), name=name, **law))
 
 
 def _outward(

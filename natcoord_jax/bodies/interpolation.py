@@ -1,7 +1,8 @@
 """How a beam is made of elements: which nodes they join, what inertia nodes carry, which effects they are."""
 
 import abc
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -94,7 +95,6 @@ class Interpolation(Part):
         """Lengths of the beam [m] whose mass the nodes carry: Gauss-Lobatto weights times the elements'."""
         return _shares(arc, self.order, np.array(spans))
 
-    @abc.abstractmethod
     def effects(
         self,
         material: Material,
@@ -103,7 +103,30 @@ class Interpolation(Part):
         spans: list[Span],
         name: str,
     ) -> tuple[list[Effect], list[Effect]]:
-        """Elements, and the effects that come with them."""
+        """Elements, and their damping if there is any."""
+        kind, damping = self.kinds(material, name)
+        shapes, lengths, references = self.shaped(curve, spans, name)
+        stiffness, elements, dampings = material.section.stiffness, [], []
+        inertias = material.inertias(lengths, _overlaps(self.order))
+        rows = zip(spans, shapes, *(apart(x, len(spans)) for x in (references, inertias)))
+        for number, (span, shape, reference, inertia) in enumerate(rows):
+            markers = tuple(nodes[i] for i in span)
+            made = {"stiffness": stiffness, "reference": reference, "inertia": inertia}
+            elements.append(kind(markers, name=f"{name}/element {number}", **shape, **made))
+            if material.damping is not None:
+                loss = {"name": f"{name}/damping {number}", "viscosity": material.damping * stiffness}
+                dampings.append(damping(markers, **shape, **loss))
+        return elements, dampings
+
+    @abc.abstractmethod
+    def kinds(self, material: Material, name: str) -> tuple[Callable[..., Effect], Callable[..., Effect]]:
+        """What makes an element, and its damping."""
+
+    @abc.abstractmethod
+    def shaped(
+        self, curve: ReferenceCurve, spans: list[Span], name: str
+    ) -> tuple[list[dict[str, Any]], Float[Array, " e"], Float[Array, "e *p 6"]]:
+        """What elements and their damping know of their shape; lengths [m], and unstressed strains."""
 
 
 def frames_of(curve: ReferenceCurve) -> Float[Array, "n 4 3"]:
@@ -129,39 +152,18 @@ class RelativeMotion(Interpolation):
     0.5 % and 2 % more with ten.
     """
 
-    def effects(
-        self,
-        material: Material,
-        nodes: Sequence[Attachment],
-        curve: ReferenceCurve,
-        spans: list[Span],
-        name: str,
-    ) -> tuple[list[Effect], list[Effect]]:
-        """One element between neighbours, and its damping if there is any."""
+    def kinds(self, material: Material, name: str) -> tuple[Callable[..., Effect], Callable[..., Effect]]:
+        """With an energy of the strains, if there is a law."""
+        nonlinear = partial(NonlinearBeamElement, law=material.law)
+        return BeamElement if material.law is None else nonlinear, BeamDamping
+
+    def shaped(
+        self, curve: ReferenceCurve, spans: list[Span], name: str
+    ) -> tuple[list[dict[str, Any]], Float[Array, " e"], Float[Array, "e 6"]]:
+        """One element between neighbours."""
         lengths, references = _strains_of_pairs(curve)
         _check_turns(curve, name)
-        stiffness, elements, dampings = material.section.stiffness, [], []
-        inertias = material.inertias(lengths, _overlaps(1))
-        rows = zip(spans, *(apart(x, len(spans)) for x in (lengths, references, inertias)))
-        for number, ((a, b), length, reference, inertia) in enumerate(rows):
-            given = {
-                "markers": (nodes[a], nodes[b]),
-                "name": f"{name}/element {number}",
-                "length": length,
-                "stiffness": stiffness,
-                "reference": reference,
-                "inertia": inertia,
-            }
-            made = (
-                BeamElement(**given)
-                if material.law is None
-                else NonlinearBeamElement(**given, law=material.law)
-            )
-            elements.append(made)
-            if material.damping is not None:
-                damper = {"length": length, "viscosity": material.damping * stiffness}
-                dampings.append(BeamDamping((nodes[a], nodes[b]), name=f"{name}/damping {number}", **damper))
-        return elements, dampings
+        return [{"length": x} for x in apart(lengths, len(spans))], lengths, references
 
 
 @eager_numpy
@@ -243,34 +245,21 @@ class DirectorInterpolation(Interpolation):
         default=1, static=True, metadata=is_a(Choice(tuple(LOBATTO)))
     )
 
-    def effects(
-        self,
-        material: Material,
-        nodes: Sequence[Attachment],
-        curve: ReferenceCurve,
-        spans: list[Span],
-        name: str,
-    ) -> tuple[list[Effect], list[Effect]]:
-        """One element over each span, and its damping if there is any.
+    def kinds(self, material: Material, name: str) -> tuple[Callable[..., Effect], Callable[..., Effect]]:
+        """Linear ones.
 
         Raises:
             ValueError: for an energy law of the strains, which only `RelativeMotion` takes.
         """
         if material.law is not None:
             raise ValueError(f"beam {name!r}: law= needs interpolation=nc.RelativeMotion()")
+        return DirectorElement, DirectorDamping
+
+    def shaped(
+        self, curve: ReferenceCurve, spans: list[Span], name: str
+    ) -> tuple[list[dict[str, Any]], Float[Array, " e"], Float[Array, "e p 6"]]:
+        """One element over each span."""
         values, slopes, weights, references = _interpolated(curve, self.order, np.array(spans))
-        stiffness, elements, dampings = material.section.stiffness, [], []
-        inertias = material.inertias(jnp.sum(weights, axis=1), _overlaps(self.order))
-        rows = zip(spans, *(apart(x, len(spans)) for x in (slopes, weights, references, inertias)))
-        for number, (span, slope, weight, reference, inertia) in enumerate(rows):
-            markers = tuple(nodes[i] for i in span)
-            shape = {"values": values, "slopes": slope, "weights": weight}
-            made = {"name": f"{name}/element {number}", "stiffness": stiffness, "reference": reference}
-            elements.append(DirectorElement(markers, **shape, **made, inertia=inertia))
-            if material.damping is not None:
-                viscosity = material.damping * stiffness
-                damper = DirectorDamping(
-                    markers, name=f"{name}/damping {number}", **shape, viscosity=viscosity
-                )
-                dampings.append(damper)
-        return elements, dampings
+        pairs = zip(*(apart(x, len(spans)) for x in (slopes, weights)))
+        shapes = [{"values": values, "slopes": slope, "weights": weight} for slope, weight in pairs]
+        return shapes, jnp.sum(weights, axis=1), references

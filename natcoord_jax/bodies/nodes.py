@@ -44,16 +44,9 @@ class Nodes(eqx.Module):
 
     def body(self, number: int) -> Body:
         """One of them as a body."""
-        return Body(
-            self.mass_blocks[number],
-            self.position[number],
-            self.rotation[number],
-            self.velocity[number],
-            self.angular_velocity[number],
-            self.node,
-            None,
-            None,
-        )
+        numbers = self.mass_blocks, self.position, self.rotation, self.velocity, self.angular_velocity
+        block, place, turn, drift, spin = (x[number] for x in numbers)
+        return Body(block, place, turn, drift, spin, self.node, None, None)
 
     @staticmethod
     @checked("Nodes.points", positions=PLACES, mass=MASS, velocity=VECTORS, name=NAME)

@@ -120,7 +120,7 @@ def RigidBody(
         else:
             moment = tensor(second_moment, f"{label}: second_moment")
         given = "inertia" if inertia is not None else "second_moment"
-        central = _central(moment, mass, centre)
+        central = _shifted(moment, -mass, centre)
         about = central if inertia_at == "com" and inertia is not None else moment
         moment = possible(moment, central, about, label, given)
     return Body(
@@ -140,14 +140,8 @@ _orientation = orientation
 
 @eager_numpy
 def _shifted(moment: Float[Array, "3 3"], mass: Float[Array, ""], by: Float[Array, "3"]) -> Array:
-    """Second moment about a point from which the centre of mass is at `by`."""
+    """Second moment about a point from which the centre of mass is at `by`; with minus the mass back."""
     return moment + mass * jnp.outer(by, by)
-
-
-@eager_numpy
-def _central(moment: Float[Array, "3 3"], mass: Float[Array, ""], by: Float[Array, "3"]) -> Array:
-    """Second moment about the centre of mass."""
-    return moment - mass * jnp.outer(by, by)
 
 
 @checked(mass=MASS, position=COMPONENTS, velocity=COMPONENTS, name=NAME)

@@ -171,9 +171,7 @@ class Orthotropic(Part):
         moduli = (self.G12 if g is None else g for g in (self.G13, self.G23))
         return SHEAR * jnp.diag(jnp.stack([jnp.asarray(g, float) for g in moduli]))
 
-    def sheet(self, thickness: Any) -> Sheet:
-        """A layer of it."""
-        return Elastic.sheet(self, thickness)  # pyright: ignore[reportArgumentType]
+    sheet = Elastic.sheet
 
 
 PLY = of("a material, as nc.Orthotropic(...) or nc.Elastic(...)", Elastic, Orthotropic)

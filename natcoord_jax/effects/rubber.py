@@ -197,10 +197,7 @@ class Ogden(WithBulkModulus):
         said = "has no shear modulus: the sum of moduli times exponents must be positive, no exponent zero"
         return {said: missing | (sum(product for product, _ in terms) <= 0)}
 
-    def energy(self, C: Array, G: Array, c: Array) -> Array:
-        """Energy per volume of a change of shape [J/m^3]."""
-        first, second = np.array(PAIRS).T
-        return self.distortion(Tensors(C[first, second], G[first, second], c))
+    energy = ClosedHyperelastic.energy  # pyright: ignore
 
     def distortion(self, tensors: Tensors) -> Float[Array, "*n"]:
         """Energy per volume of a change of shape [J/m^3]."""

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array
 
 import natcoord_jax as nc
+from natcoord_jax.bodies.rigid import orientation
 from natcoord_jax.gallery.example import Example
 from natcoord_jax.gallery.spacecraft import axes_of, spacecraft
 
@@ -17,11 +18,6 @@ POINT = (1e-9, 1e-9, 1e-9)
 """Inertia of a bob [kg m^2]."""
 DISC = 1.0
 """Spin inertia of the wheels that turn a body [kg m^2]."""
-
-
-def _quaternion(axis: Any, angle: float) -> np.ndarray:
-    axis = np.asarray(axis, float) / np.linalg.norm(axis)
-    return np.concatenate([[np.cos(angle / 2)], np.sin(angle / 2) * axis])
 
 
 def _least_effort(
@@ -62,7 +58,7 @@ def turn(
         # Half of DISC in every second moment: what is left of the body is none by itself, the craft is one.
         rest = system.mass[0, 1:, 1:] - DISC / 2 * jnp.eye(3)
         system = dataclasses.replace(system, mass=system.mass.at[0, 1:, 1:].set(rest))
-    goal = nc.goal.Attitude(body, _quaternion(axis, angle)) & nc.goal.Rest()
+    goal = nc.goal.Attitude(body, orientation((axis, angle), "goal")) & nc.goal.Rest()
     return _least_effort(system, state, goal, steps, t_end)
 
 
@@ -77,7 +73,7 @@ def reorientation(
 ) -> nc.OptimalControl:
     """The paper's spacecraft turned from rest to rest by its wheels; those that do not work are locked."""
     example = spacecraft(working=working)
-    goal = nc.goal.Attitude("base", _quaternion(axis, angle)) & nc.goal.Rest()
+    goal = nc.goal.Attitude("base", orientation((axis, angle), "goal")) & nc.goal.Rest()
     bounds = nc.bounds.Input(-limit, limit)
     return _least_effort(example.system, example.state, goal, steps, t_end, bounds=bounds)
 

@@ -168,14 +168,6 @@ Part = tuple[nc.System, nc.State]
 """A part of a scene, alone, and a state of it."""
 
 
-def clamped_racket(placed: Any, grip: Any, throat: Any, width: Any) -> Part:
-    """A racket that is clamped at the grip, in equilibrium with the tension of its strings."""
-    scene = nc.Scene()
-    add_racket(scene, nc.ground, placed, grip, throat, width)
-    system, state = scene.compile()
-    return system, nc.equilibrium(system, state, steps=1).state
-
-
 def inflated_ball(count: int, place: Any, velocity: Any) -> Part:
     """A ball in equilibrium with its gas, flying."""
     scene = nc.Scene()

@@ -34,12 +34,6 @@ def _largest(values: Any) -> float | None:
     return max(known) if known else None
 
 
-def _solved(example: Example, steps: int, dt: float, scheme: Scheme) -> tuple[nc.Solution | None, Any]:
-    """The solution of an optimal control problem, if the scene is one, and the inputs of the run."""
-    solution = example.solved(steps, dt)
-    return solution, example.inputs(steps, dt, scheme) if solution is None else solution.inputs
-
-
 def measure(
     example: Example,
     steps: int,
@@ -59,11 +53,11 @@ def measure(
     Returns:
         The report, the run, and the solution of an optimal control problem.
     """
-    solution, inputs = None, None
+    solution = None
     options: dict[str, Any] = {"throw": False, "scheme": scheme}
     if example.phases is None:
-        solution, inputs = _solved(example, steps, dt, scheme)
-        options["inputs"] = inputs
+        solution = example.solved(steps, dt)
+        options["inputs"] = example.inputs(steps, dt, scheme) if solution is None else solution.inputs
     if tolerance is not None:
         options |= {"rtol": tolerance.relative, "atol": tolerance.absolute}
     before = nc.set_effort("full")  # times are to be those of programs that run for long

@@ -55,18 +55,14 @@ class Shot:
             change = motion[segment, k](jnp.asarray(START)) - forehand[segment, k](jnp.asarray(START))
             coordinates = coordinates.at[place].add(change)
         q, v = jax.jvp(lambda t: self._rows(motion, t), (jnp.asarray(START),), (jnp.asarray(1.0),))
-        hits = self._hits[:, None, None]
+        # The bodies of the player and the racket, which hits.
+        balls = {node.name for node in self.before.ball.nodes}
+        hits = np.array([name not in balls for name in system.structure.bodies])[:, None, None]
         found = {
             "q": jnp.where(hits, q, self.before.state.rows).reshape(-1, 3),
             "v": jnp.where(hits, v, self.before.state.row_rates).reshape(-1, 3),
         }
         return system, replace_fields(self.before.state, coordinates=coordinates, **found)
-
-    @property
-    def _hits(self) -> np.ndarray:
-        """Which bodies are those of the player and the racket."""
-        balls = {node.name for node in self.before.ball.nodes}
-        return np.array([name not in balls for name in self.before.system.structure.bodies])
 
     def _rows(self, motion: Motion, t: Float[Array, ""]) -> Float[Array, "bodies 4 3"]:
         """Rows of all bodies as a motion has them at a time [s]; racket and ball move with the hand."""

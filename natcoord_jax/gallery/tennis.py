@@ -23,7 +23,6 @@ from natcoord_jax.gallery.racket import (
     Racket,
     add_ball,
     add_racket,
-    clamped_racket,
     inflated_ball,
     with_part,
 )
@@ -124,7 +123,10 @@ def _flight(speed: float, start: float) -> tuple[np.ndarray, np.ndarray]:
 
 def _racket_at_rest(placed: Any, start: float) -> Part:
     """The racket alone, in equilibrium with the tension of its strings, moving as the hand does."""
-    system, state = clamped_racket(placed, GRIP, THROAT, Z)
+    scene = nc.Scene()
+    add_racket(scene, nc.ground, placed, GRIP, THROAT, Z)
+    system, state = scene.compile()
+    state = nc.equilibrium(system, state, steps=1).state
     q = np.asarray(state.q)
     speed, spin = twist_of(HAND, start)
     v = np.cross(spin, q)

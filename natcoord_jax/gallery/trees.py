@@ -120,7 +120,6 @@ def robot_arm() -> Example:
 
 T_END = 2.0  # [s]
 GRAVITY = (0.0, 0.0, -9.81)  # [m/s2]
-MOTORS = ()  # pairs (body, torque [N m] about its joint axis); none here
 
 # fmt: off
 
@@ -168,44 +167,25 @@ POINT_SPRINGS = [
 
 def _joint(scene: nc.Scene, data: dict[str, Any], parent: Handle, child: Handle) -> None:
     """The joint that carries a body, with its spring and damper."""
-    where: dict[str, Any] = {"point": data["point"], "name": f"{data['name']} joint"}
-    axes = data["axes"]
-    match data["joint"]:
-        case "spherical":
-            scene.add(nc.Spherical(parent, child, **where))
-        case "universal":
-            scene.add(nc.Universal(parent, child, axis=axes[0], second=axes[1], **where))
-        case "prismatic":
-            scene.add(nc.Prismatic(parent, child, axis=axes[0], **where))
-        case "cylindrical":
-            scene.add(nc.Cylindrical(parent, child, axis=axes[0], **where))
-        case "revolute":
-            hinge = scene.add(nc.Revolute(parent, child, axis=axes[0], **where))
-            if data["stiffness"]:
-                scene.add(nc.JointSpring(hinge, stiffness=data["stiffness"], name=f"{data['name']} spring"))
-            if data["damping"]:
-                scene.add(nc.JointDamper(hinge, damping=data["damping"], name=f"{data['name']} damper"))
+    kind, axes = getattr(nc, data["joint"].capitalize()), dict(zip(("axis", "second"), data["axes"]))
+    joint = scene.add(kind(parent, child, point=data["point"], **axes, name=f"{data['name']} joint"))
+    if data["stiffness"]:
+        scene.add(nc.JointSpring(joint, stiffness=data["stiffness"], name=f"{data['name']} spring"))
+    if data["damping"]:
+        scene.add(nc.JointDamper(joint, damping=data["damping"], name=f"{data['name']} damper"))
 
 
 def open_tree() -> Example:
     """Eight bodies on five kinds of joint with springs and dampers, 14 degrees of freedom."""
     scene = nc.Scene()
     scene.add(nc.Gravity(vector=GRAVITY))
-    bodies: list[Handle] = []
-    for data in BODIES:
-        body = nc.RigidBody(
-            mass=data["mass"], inertia=data["inertia"], position=data["com"], name=data["name"]
-        )
-        bodies.append(scene.add(body))
-        parent = nc.ground if data["parent"] is None else bodies[data["parent"]]
-        _joint(scene, data, parent, bodies[-1])
+    bodies: dict[int | None, Handle] = {None: nc.ground}
+    for number, data in enumerate(BODIES):
+        given = {key: data[key] for key in ("mass", "inertia", "name")}
+        bodies[number] = scene.add(nc.RigidBody(position=data["com"], **given))
+        _joint(scene, data, bodies[data["parent"]], bodies[number])
     for number, data in enumerate(POINT_SPRINGS):
-        ends = tuple(
-            nc.Point(
-                nc.ground if data[f"body_{x}"] is None else bodies[data[f"body_{x}"]], data[f"point_{x}"]
-            )
-            for x in "ab"
-        )
+        ends = tuple(nc.Point(bodies[data[f"body_{x}"]], data[f"point_{x}"]) for x in "ab")
         name = f"spring {number + 1}"
         scene.add(nc.Spring(ends, stiffness=data["stiffness"], length=data["length"], name=name))
         if data["damping"]:

@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from natcoord_jax.io.description import UNBOUNDED, ActuatorData, JointData, Range
-from natcoord_jax.io.links import KINDS, Poses, joint_name
+from natcoord_jax.io.description import UNBOUNDED, ActuatorData, JointData
+from natcoord_jax.io.links import KINDS, Poses, joint_name, pair
 from natcoord_jax.io.notes import Notes, mujoco
 
 
@@ -105,18 +105,8 @@ def _law(model: Any, number: int) -> dict[str, Any]:
     limited, limits = clamped and model.actuator_ctrllimited[control], model.actuator_ctrlrange[control]
     if model.actuator_dyntype[number] != package.mjtDyn.mjDYN_NONE:
         limited, limits = model.actuator_actlimited[number], model.actuator_actrange[number]
-    return {
-        "gain": gain,
-        "bias": bias,
-        "range": _pair(limits) if limited else UNBOUNDED,
-        "force": _pair(model.actuator_forcerange[number])
-        if model.actuator_forcelimited[number]
-        else UNBOUNDED,
-    }
-
-
-def _pair(limits: Any) -> Range:
-    return float(limits[0]), float(limits[1])
+    force = pair(model.actuator_forcerange[number]) if model.actuator_forcelimited[number] else UNBOUNDED
+    return {"gain": gain, "bias": bias, "range": pair(limits) if limited else UNBOUNDED, "force": force}
 
 
 def _transmitted(

@@ -62,11 +62,6 @@ class Parts:
     inputs: dict[str, Handle] = field(default_factory=dict)
     taken: set[str] = field(default_factory=set)
 
-    @property
-    def joint_names(self) -> set[str]:
-        """Of the joints in the scene."""
-        return {handle.name for handle in self.joints.values()}
-
     def named(self, name: str, kind: str) -> str:
         """A name in the scene; files may give a body, a joint and an actuator the same."""
         found = name if name not in self.taken else f"{name} {kind}"
@@ -124,19 +119,12 @@ def _add_link(parts: Parts, link: LinkData) -> list[Handle]:
     if link.mass == 0.0:
         body = _without_mass(point, axes, name)
     else:
-        tensor = {"inertia": link.inertia} if np.any(link.inertia) else {"second_moment": np.zeros((3, 3))}
-        body = RigidBody(
-            mass=link.mass, com=link.com, position=point, orientation=axes, name=name, **_moment(link, tensor)
-        )
+        # A point mass has the second moment of a point.
+        moment: dict[str, Any] = {"second_moment": link.mass * np.outer(link.com, link.com)}
+        moment = {"inertia": link.inertia} if np.any(link.inertia) else moment
+        body = RigidBody(mass=link.mass, com=link.com, position=point, orientation=axes, name=name, **moment)
     handles.append(parts.scene.add(replace_fields(body, shape=link.surface)))
     return handles
-
-
-def _moment(link: LinkData, tensor: dict[str, Any]) -> dict[str, Any]:
-    """What RigidBody takes; a point mass has the second moment of a point."""
-    if "inertia" in tensor:
-        return tensor
-    return {"second_moment": link.mass * np.outer(link.com, link.com)}
 
 
 def _without_mass(point: np.ndarray, axes: np.ndarray, name: str) -> Body:
@@ -217,19 +205,13 @@ def _actuator(parts: Parts, actuator: ActuatorData) -> Any:
 
 def _ball_torque(parts: Parts, actuator: ActuatorData, bounds: dict[str, Any]) -> SphericalTorque:
     """A torque along an axis of the link, its opposite on the parent; or along one of the parent."""
-    number = next(
-        k
-        for k, link in enumerate(parts.robot.links)
-        if actuator.joints[0] in [joint.name for joint in link.joints]
-    )
-    link = parts.robot.links[number]
+    named = (link for link in parts.robot.links for joint in link.joints if joint.name == actuator.joints[0])
+    link = next(named)
     joint = parts.scene.find(parts.joints[actuator.joints[0]])
     axis = parts.in_scene(link.position, link.rotation)[1] @ actuator.gear
     ends = Direction(joint.child, axis), Direction(joint.parent, axis)
-    gain = float(actuator.gain[0])
-    if actuator.in_parent:
-        return SphericalTorque(ends[::-1], gear=-gain, **bounds)
-    return SphericalTorque(ends, gear=gain, **bounds)
+    gain, ends = (-1.0, ends[::-1]) if actuator.in_parent else (1.0, ends)
+    return SphericalTorque(ends, gear=gain * float(actuator.gain[0]), **bounds)
 
 
 def _add_gravity(parts: Parts) -> None:

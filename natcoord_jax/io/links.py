@@ -140,17 +140,18 @@ def _joint(source: Source, number: int) -> JointData:
     return replace(
         plain,
         zero=float(model.qpos0[place]),
-        range=_range(model.jnt_range[number]) if limited else UNBOUNDED,
+        range=pair(model.jnt_range[number]) if limited else UNBOUNDED,
         stop=_stop(model, number) if limited else 0.0,
-        effort=_range(model.jnt_actfrcrange[number]) if bounded else UNBOUNDED,
+        effort=pair(model.jnt_actfrcrange[number]) if bounded else UNBOUNDED,
         rest=float(model.qpos_spring[place]),
         armature=float(model.dof_armature[rate]),
         friction=float(model.dof_frictionloss[rate]),
     )
 
 
-def _range(pair: Any) -> Range:
-    return float(pair[0]), float(pair[1])
+def pair(limits: Any) -> Range:
+    """Two numbers of MuJoCo's."""
+    return float(limits[0]), float(limits[1])
 
 
 def _stop(model: Any, number: int) -> float:

@@ -8,7 +8,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
 
-from natcoord_jax.bodies.shapes import AROUND, Box, Cylinder, Ellipsoid, Sphere, Surface
+from natcoord_jax.bodies.shapes import Box, Capsule, Cylinder, Ellipsoid, Sphere, Surface
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.kinds import FLAG, Anything, Choice, Several
 from natcoord_jax.io.actuation import input_index, read_actuators
@@ -73,6 +73,16 @@ def _colour(model: Any, geom: int) -> np.ndarray:
     return np.array(model.mat_rgba[material] if material >= 0 and plain else model.geom_rgba[geom], float)
 
 
+SHAPES = {
+    "mjGEOM_BOX": lambda *halves: Box(2 * np.array(halves)),
+    "mjGEOM_SPHERE": lambda radius, *_: Sphere(radius),
+    "mjGEOM_ELLIPSOID": lambda *semi_axes: Ellipsoid(np.array(semi_axes)),
+    "mjGEOM_CYLINDER": lambda radius, half, _: Cylinder(radius, 2 * half),
+    "mjGEOM_CAPSULE": lambda radius, half, _: Capsule(radius, 2 * half),
+}
+"""By MuJoCo's kind of a geom, from its sizes."""
+
+
 def _surface(model: Any, geom: int) -> Surface | None:
     """Points and faces in the frame of the geom."""
     kind, size = mujoco().mjtGeom(int(model.geom_type[geom])), np.array(model.geom_size[geom])
@@ -82,20 +92,7 @@ def _surface(model: Any, geom: int) -> Surface | None:
         start, faces = int(model.mesh_faceadr[mesh]), int(model.mesh_facenum[mesh])
         points = np.array(model.mesh_vert[first : first + count], float)
         return points, list(np.array(model.mesh_face[start : start + faces], int))
-    if kind.name == "mjGEOM_BOX":
-        return Box(2 * size).surface()
-    if kind.name == "mjGEOM_SPHERE":
-        return Sphere(size[0]).surface()
-    if kind.name == "mjGEOM_ELLIPSOID":
-        return Ellipsoid(size).surface()
-    if kind.name == "mjGEOM_CYLINDER":
-        return Cylinder(size[0], 2 * size[1]).surface()
-    if kind.name == "mjGEOM_CAPSULE":
-        points, faces = Sphere(size[0]).surface()
-        # The upper half of the globe goes up, the lower half down, by half the length between the caps.
-        ring = np.arange(len(points)) // AROUND
-        return points + np.where(ring > ring.max() / 2, size[1], -size[1])[:, None] * (0.0, 0.0, 1.0), faces
-    return None
+    return SHAPES[kind.name](*size).surface() if kind.name in SHAPES else None
 
 
 def _joined(pieces: list[tuple[np.ndarray, list[np.ndarray], np.ndarray]]) -> LinkSurface:
@@ -197,7 +194,8 @@ def described(found: Source, leave_out: set[str], motors: bool | None) -> Descri
     sites = {model.site(s).name or f"site {s + 1}": poses.site(s) for s in range(model.nsite)}
     gravity = np.zeros(3) if "gravity" in leave_out else np.array(model.opt.gravity)
     return Description(
-        name=_model_name(model),
+        # The name of the model is the first of all names.
+        name=bytes(model.names).partition(b"\0")[0].decode() or "robot",
         links=links,
         frames=frames,
         sites=sites,
@@ -242,11 +240,6 @@ def _list_what_differs(links: Sequence[LinkData], joints: dict[str, JointData], 
             notes.changed(joint.name, "it starts beyond its limit: pose the robot, see RobotHandle.state")
     if any(joint.friction for joint in joints.values()):
         notes.changed("friction loss", "smooth at rest, see nc.JointFriction: what should stick creeps")
-
-
-def _model_name(model: Any) -> str:
-    """Name of the model, which is the first of all names."""
-    return bytes(model.names).partition(b"\0")[0].decode() or "robot"
 
 
 def _without(link: LinkData, leave_out: set[str]) -> LinkData:

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from natcoord_jax.io.notes import Notes
+from natcoord_jax.io.notes import Notes, mujoco
 
 FEATHER = 2e-15
 """Mass [kg] and inertia [kg m^2] that MuJoCo's compiler takes for a link without any: it refuses 1e-15."""
@@ -31,7 +31,10 @@ def settle(spec: Any, notes: Notes) -> set[str]:
         if sum(b.mass for b in _subtree(body)) <= 0:
             for joint in list(body.joints):
                 notes.left_out(joint.name, f"it moves no mass, and is fixed: all that carries is {body.name}")
-                _forget(spec, joint)
+                for equality in list(spec.equalities):
+                    if joint.name in (equality.name1, equality.name2):
+                        spec.delete(equality)
+                spec.delete(joint)
             continue
         carried = _rigid(body)
         if sum(b.mass for b in carried) <= 0:
@@ -42,14 +45,6 @@ def settle(spec: Any, notes: Notes) -> set[str]:
                 notes.changed(body.name, "it has mass and no inertia, and is a point mass")
             body.inertia = np.maximum(body.inertia, FEATHER)
     return light
-
-
-def _forget(spec: Any, joint: Any) -> None:
-    """Delete a joint, and the relations that it is part of."""
-    for equality in list(spec.equalities):
-        if joint.name in (equality.name1, equality.name2):
-            spec.delete(equality)
-    spec.delete(joint)
 
 
 def _settle_tensor(body: Any, notes: Notes) -> None:
@@ -64,7 +59,9 @@ def _settle_tensor(body: Any, notes: Notes) -> None:
     if values[0] >= -1e-9 * values[2]:
         if np.linalg.det(axes) < 0:
             axes = -axes
-        body.inertia, body.iquat = np.maximum(values, 0.0), quaternion(axes)
+        body.inertia, turned = np.maximum(values, 0.0), np.zeros(4)
+        mujoco().mju_mat2Quat(turned, axes.ravel())
+        body.iquat = turned
         return
     mean = max(float(np.mean(values)), 0.0)
     body.inertia, body.iquat = np.full(3, mean), np.array([1.0, 0, 0, 0])
@@ -73,20 +70,6 @@ def _settle_tensor(body: Any, notes: Notes) -> None:
         f"no body has the principal inertias {np.array2string(values, precision=3)} kg m^2; as MuJoCo "
         f"balances, all three are their mean, {mean:.3g}",
     )
-
-
-def quaternion(rotation: np.ndarray) -> np.ndarray:
-    """(w, x, y, z) of a rotation matrix: the largest eigenvector of Davenport's matrix."""
-    r = rotation
-    k = np.array(
-        [
-            [r[0, 0] + r[1, 1] + r[2, 2], r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]],
-            [0.0, r[0, 0] - r[1, 1] - r[2, 2], r[0, 1] + r[1, 0], r[0, 2] + r[2, 0]],
-            [0.0, 0.0, r[1, 1] - r[0, 0] - r[2, 2], r[1, 2] + r[2, 1]],
-            [0.0, 0.0, 0.0, r[2, 2] - r[0, 0] - r[1, 1]],
-        ]
-    )
-    return np.linalg.eigh(k + np.triu(k, 1).T)[1][:, -1]
 
 
 def _rigid(body: Any) -> list[Any]:

@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from natcoord_jax.bodies.rigid import orientation
 from natcoord_jax.core.checks import as_array, is_concrete
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
@@ -45,11 +46,11 @@ def with_positions(robot: "RobotHandle", system: System, state: State, positions
             place = places[(robot.parts.joints[joint.name].name, 0)]
             coordinates[place] = q[joint.position_index]
             turning[place] = v[joint.rate_index]
-    stored = np.array(state.rates)
+    stored, own = np.array(state.rates), {handle.name for handle in robot.parts.joints.values()}
     for group in system.effects:
         if group.effect.rotors:
             for rotor, place in zip(np.asarray(group.rotors)[:, 0], np.asarray(group.coordinates)[:, 0]):
-                if system.structure.coordinates[place][0] in robot.parts.joint_names:
+                if system.structure.coordinates[place][0] in own:
                     stored[rotor] = turning[place]
     return replace_fields(
         state,
@@ -87,18 +88,9 @@ def at_rest(point: np.ndarray, axes: np.ndarray) -> Pose:
     return Pose(np.asarray(point, float), np.asarray(axes, float), np.zeros(3), np.zeros(3))
 
 
-def turn(axis: np.ndarray, angle: float) -> np.ndarray:
-    """Rotation about an axis (Rodrigues' formula)."""
-    x, y, z = axis
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross
-
-
-def from_quaternion(q: np.ndarray) -> np.ndarray:
-    """Rotation of (w, x, y, z), which is made a unit quaternion first."""
-    w, v = q[0] / np.linalg.norm(q), np.asarray(q[1:]) / np.linalg.norm(q)
-    cross = np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
-    return np.eye(3) + 2.0 * w * cross + 2.0 * cross @ cross
+def rotation(value: Any) -> np.ndarray:
+    """Matrix of a quaternion (w, x, y, z) of any length, or of an axis and an angle [rad]."""
+    return np.asarray(orientation(value, "robot"))
 
 
 def link_poses(robot: Description, base: Pose, positions: np.ndarray, rates: np.ndarray) -> list[list[Pose]]:
@@ -142,7 +134,7 @@ def _along(link: LinkData, pose: Pose, base: Pose, positions: np.ndarray, rates:
 def _moved(joint: JointData, pose: Pose, base: Pose, q: np.ndarray, v: np.ndarray) -> Pose:
     """A frame after one more joint."""
     if joint.kind == "free":
-        axes = base.axes @ from_quaternion(q[3:7])
+        axes = base.axes @ rotation(q[3:7])
         return Pose(base.point + base.axes @ q[:3], axes, base.axes @ v[:3], axes @ v[3:6])
     direction = pose.axes @ joint.axis
     if joint.kind == "slide":
@@ -151,9 +143,9 @@ def _moved(joint: JointData, pose: Pose, base: Pose, q: np.ndarray, v: np.ndarra
         return Pose(pose.point + by, pose.axes, velocity, pose.spin)
     anchor = pose.axes @ joint.point
     if joint.kind == "hinge":
-        axes, spin = pose.axes @ turn(joint.axis, q[0] - joint.zero), pose.spin + direction * v[0]
+        axes, spin = pose.axes @ rotation((joint.axis, q[0] - joint.zero)), pose.spin + direction * v[0]
     else:
-        axes = pose.axes @ from_quaternion(q[:4])
+        axes = pose.axes @ rotation(q[:4])
         spin = pose.spin + axes @ v[:3]
     arm = axes @ joint.point
     velocity = pose.velocity + np.cross(pose.spin, anchor) - np.cross(spin, arm)

@@ -41,15 +41,17 @@ def read_equalities(model: Any, poses: Poses, notes: Notes) -> tuple[EqualityDat
     return tuple(found)
 
 
-def _ends(model: Any, poses: Poses, number: int, first: np.ndarray, second: np.ndarray) -> tuple[Any, Any]:
-    """Two frames of bodies, or of sites, as carried by their links."""
+def _ends(
+    model: Any, poses: Poses, number: int, *places: np.ndarray, turned: np.ndarray | None = None
+) -> tuple[Any, Any]:
+    """Two frames of bodies, the first of them turned, or of sites, as carried by their links."""
     objects = int(model.eq_obj1id[number]), int(model.eq_obj2id[number])
     if model.eq_objtype[number] == mujoco().mjtObj.mjOBJ_SITE:
         ends = [
             poses.frame(int(model.site_bodyid[s]), poses.site_points[s], poses.site_axes[s]) for s in objects
         ]
     else:
-        ends = [poses.in_body(b, point) for b, point in zip(objects, (first, second))]
+        ends = [poses.in_body(*frame) for frame in zip(objects, places, (turned, None))]
     return ends[0], ends[1]
 
 
@@ -62,17 +64,9 @@ def _connect(model: Any, poses: Poses, number: int, name: str) -> EqualityData |
 
 
 def _weld(model: Any, poses: Poses, number: int, name: str) -> EqualityData | str:
-    data, package = model.eq_data[number], mujoco()
-    if model.eq_objtype[number] == package.mjtObj.mjOBJ_SITE:
-        ends = _ends(model, poses, number, np.zeros(3), np.zeros(3))
-    else:
-        first, second = int(model.eq_obj1id[number]), int(model.eq_obj2id[number])
-        turned = np.zeros(9)
-        package.mju_quat2Mat(turned, data[6:10])
-        ends = (
-            poses.in_body(first, data[3:6], turned.reshape(3, 3)),
-            poses.in_body(second, data[:3]),
-        )
+    data, turned = model.eq_data[number], np.zeros(9)
+    mujoco().mju_quat2Mat(turned, data[6:10])
+    ends = _ends(model, poses, number, data[3:6], data[:3], turned=turned.reshape(3, 3))
     if ends[0].link == ends[1].link:
         return "both ends are of the same body"
     places = [_placed(poses, end) for end in ends]

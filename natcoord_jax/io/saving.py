@@ -10,10 +10,9 @@ import numpy as np
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.kinds import NAME, of
 from natcoord_jax.core.state import STATE, State
-from natcoord_jax.io.masses import quaternion
 from natcoord_jax.io.notes import Note, Notes, in_words
 from natcoord_jax.io.saving_effects import numbers, save_effects, save_loops
-from natcoord_jax.io.saving_joints import Hung, hung_bodies
+from natcoord_jax.io.saving_joints import Hung, hung_bodies, quaternion
 from natcoord_jax.model.model import SYSTEM
 from natcoord_jax.system import System
 

@@ -75,9 +75,13 @@ def _hinge(system: System, joints: Joints, weights: np.ndarray, bodies: Any) -> 
     return None
 
 
-def _add(element: Element, attribute: str, value: Any) -> None:
-    """Add to what other effects have given a joint."""
-    element.set(attribute, numbers(float(element.get(attribute, "0")) + float(value)))
+def _adding(attribute: str, field: str) -> Callable[[Element, str, Any, list[Any]], None]:
+    """Writer that adds a field to what other effects have given a joint."""
+
+    def write(root: Element, name: str, effect: Any, on: list[Any]) -> None:
+        on[0].set(attribute, numbers(float(on[0].get(attribute, "0")) + float(getattr(effect, field))))
+
+    return write
 
 
 def _spring(root: Element, name: str, effect: Any, on: list[Any]) -> str | None:
@@ -86,18 +90,6 @@ def _spring(root: Element, name: str, effect: Any, on: list[Any]) -> str | None:
     on[0].set("stiffness", numbers(effect.stiffness))
     on[0].set("springref", numbers(effect.rest))
     return None
-
-
-def _damper(root: Element, name: str, effect: Any, on: list[Any]) -> None:
-    _add(on[0], "damping", effect.damping)
-
-
-def _friction(root: Element, name: str, effect: Any, on: list[Any]) -> None:
-    _add(on[0], "frictionloss", effect.friction)
-
-
-def _rotor(root: Element, name: str, effect: Any, on: list[Any]) -> None:
-    _add(on[0], "armature", effect.inertia)
 
 
 def _stops(root: Element, name: str, effect: Any, on: list[Any]) -> None:
@@ -149,9 +141,9 @@ def _relation(root: Element, name: str, effect: Any, on: list[Any]) -> str | Non
 
 WRITERS: dict[type, Callable[[Element, str, Any, list[Any]], str | None]] = {
     JointSpring: _spring,
-    JointDamper: _damper,
-    JointFriction: _friction,
-    Armature: _rotor,
+    JointDamper: _adding("damping", "damping"),
+    JointFriction: _adding("frictionloss", "friction"),
+    Armature: _adding("armature", "inertia"),
     JointStops: _stops,
     JointForce: _motor,
     JointTorque: _motor,

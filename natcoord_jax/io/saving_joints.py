@@ -4,9 +4,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from natcoord_jax.core.checks import as_array
+from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.state import State
 from natcoord_jax.effects.joints import Cylindrical, Fixed, Planar, Prismatic, Revolute, Spherical, Universal
-from natcoord_jax.io.masses import quaternion
+from natcoord_jax.maths.rotations import to_quaternion
 from natcoord_jax.mechanics.coordinates import state_rates
 from natcoord_jax.system import System
 
@@ -20,6 +22,13 @@ JOINTS: dict[type, tuple[tuple[str, int, int], ...]] = {
     Universal: (("hinge", 2, 0), ("hinge", 0, 1)),
 }
 """For each joint those of MuJoCo, from the parent on: kind, axis of the joint's frame, our coordinate."""
+
+_quaternion = eager_numpy(to_quaternion)
+
+
+def quaternion(rotation: np.ndarray) -> np.ndarray:
+    """(w, x, y, z) of a rotation matrix."""
+    return np.asarray(_quaternion(as_array(rotation)))
 
 
 @dataclass
@@ -121,8 +130,11 @@ def _hung(system: System, state: State, number: int, parent: int) -> Hung:
     kind = _kind_of(system, number)
     if kind is None:
         return _free(system, state, number)
-    above, own = _frames(system, number)
-    body = Hung(number, name, parent, *_between(above, own))
+    # Point and axes (rows) of its joint in the parent's frame and in its own, which coincide for zeros.
+    weights = np.asarray(system.frames)[number][np.asarray(system.tree.side)[number]]
+    above, own = ((frame[0, 1:], frame[1:, 1:]) for frame in weights)
+    axes = above[1].T @ own[1]
+    body = Hung(number, name, parent, above[0] - axes @ own[0], axes)
     if kind not in JOINTS:
         body.unknown = system.structure.joints[number]
         return body
@@ -141,19 +153,6 @@ def _hung(system: System, state: State, number: int, parent: int) -> Hung:
         direction = own[1][axis] * (1.0 if forward else -1.0)
         body.joints.append(HungBy(label, made, own[0], direction, (joint, index), *numbers))
     return body
-
-
-def _frames(system: System, number: int) -> tuple[tuple, tuple]:
-    """Point and axes (rows) of the joint that carries a body, in its parent's frame and in its own."""
-    weights = np.asarray(system.frames)[number][np.asarray(system.tree.side)[number]]
-    above, own = ((frame[0, 1:], frame[1:, 1:]) for frame in weights)
-    return above, own
-
-
-def _between(above: tuple, own: tuple) -> tuple[np.ndarray, np.ndarray]:
-    """The frame of a body in that of its parent where the two frames of their joint coincide."""
-    axes = above[1].T @ own[1]
-    return above[0] - axes @ own[0], axes
 
 
 def _free(system: System, state: State, number: int) -> Hung:

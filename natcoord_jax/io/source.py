@@ -83,16 +83,12 @@ def _from_urdf(
             mesh.inertia = mujoco().mjtMeshInertia.mjMESH_INERTIA_SHELL
     found = _finished(spec, notes)
     found.massless, found.velocities, found.is_urdf = light, urdf.velocity_limits(root), True
-    names = {found.model.joint(i).name for i in _followers(found.model)}
+    pairs = zip(found.model.eq_obj1id, found.model.eq_type)
+    names = {found.model.joint(i).name for i, kind in pairs if kind == mujoco().mjtEq.mjEQ_JOINT}
     for name in urdf.mimics(root):
         if name not in names:
             notes.left_out(f"mimic of {name}", "one of the two joints does not turn or slide")
     return found
-
-
-def _followers(model: Any) -> list[int]:
-    """Joints that equalities set."""
-    return [i for i, kind in zip(model.eq_obj1id, model.eq_type) if kind == mujoco().mjtEq.mjEQ_JOINT]
 
 
 def _parsed(parse: Any) -> Any:
@@ -123,16 +119,13 @@ def _finished(spec: Any, notes: Notes) -> Source:
 
 def _without_mesh(spec: Any, mesh: Any, reason: str, notes: Notes) -> None:
     """Leave out a mesh and what is made of it."""
+    # Masses are those of inertial elements only.
+    weightless = spec.compiler.inertiafromgeom == mujoco().mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
     for geom in [g for g in spec.geoms if g.meshname == mesh.name]:
-        weighs = not geom.parent.explicitinertial and not _nothing_weighs(spec)
+        weighs = not geom.parent.explicitinertial and not weightless
         notes.left_out(mesh.file, f"{reason}; it is not drawn" + (", and its mass is missing" * weighs))
         spec.delete(geom)
     spec.delete(mesh)
-
-
-def _nothing_weighs(spec: Any) -> bool:
-    """Whether masses are those of inertial elements only."""
-    return spec.compiler.inertiafromgeom == mujoco().mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
 
 
 def _without_missing(spec: Any, notes: Notes) -> None:

@@ -112,12 +112,11 @@ class SeparateTangents(eqx.Module):
     def projected(self, v: Velocity) -> Velocity:
         """Nearest velocity that the constraints admit; see `TangentSpace.projected`."""
         y = self.framed(v)
-        lost = Velocity(v.rows - self.along(y).rows, v.rotors)
-        return self.along(y + self.framed(lost))
+        return self.along(y + self.framed(v - self.along(y)))
 
     def normal(self, v: Velocity) -> Velocity:
         """What of a velocity is orthogonal to all that the constraints admit."""
-        return Velocity(v.rows - self.along(self.framed(v)).rows, v.rotors)
+        return v - self.along(self.framed(v))
 
     @property
     def drift(self) -> Velocity:

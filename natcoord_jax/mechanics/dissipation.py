@@ -95,7 +95,7 @@ class Damping(eqx.Module):
         still = jnp.zeros((unit.shape[0], 1, *NODE), unit.dtype)
         moving = jnp.concatenate([unit, still], axis=1)
         turning = jnp.concatenate([jnp.swapaxes(space.free[1], 0, 1), still[:, :, 0]], axis=1)
-        groups = elastic_of(system)
+        groups = [g for g in system.effects if g.effect.elastic]
         rates = [jax.vmap(partial(_instant_rates, system, g, rows))(moving, turning) for g in groups]
         return cls(space, rates, [_stiffness(system, g, rows, state.coordinates) for g in groups])
 
@@ -118,7 +118,7 @@ class Damping(eqx.Module):
         assert space.system is not None and known.lift is not None and known.prescribed is not None
         w = known.frame.T @ known.within(space.framed(v)) + space.drift_rates
         along = space.projected(v)
-        normal = Velocity(v.rows - along.rows, v.rotors - along.rotors)
+        normal = v - along
         # Per component along the frame of what the constraints admit.
         framed = [jnp.einsum("unp,fu->fnp", b, self._admitted) for b in self.rates]
         mean = [_mean_rates(g, space.system, at, h) for g in groups if g.effect.elastic]
@@ -135,16 +135,11 @@ class Damping(eqx.Module):
             loss = loss + h * jnp.sum(viscous * r) + 0.5 * jnp.sum(tau * (e + changed))
             pull = pull + jnp.einsum("unp,np->u", full, tau)
         kick, back = space.along(jump), 1.0 - rho
-        kick = Velocity(kick.rows - back * normal.rows, kick.rotors - back * normal.rotors)
+        kick = kick - back * normal
         work = known.prescribed * (known.lift.T @ (space.pulled(space.impulse(kick)) + pull))
         loss = loss + (1.0 - rho**2) * space.energy(normal)
         given = iter(stresses)
-        return Damped(
-            Velocity(v.rows + kick.rows, v.rotors + kick.rotors),
-            tuple(next(given) if g.effect.elastic else None for g in groups),
-            work,
-            loss,
-        )
+        return Damped(v + kick, tuple(next(given) if g.effect.elastic else None for g in groups), work, loss)
 
     @property
     def _admitted(self) -> Float[Array, "u u"]:
@@ -168,11 +163,6 @@ class Damping(eqx.Module):
         return total
 
 
-def elastic_of(system: Model) -> list[Group]:
-    """Groups whose oscillations can be damped."""
-    return [g for g in system.effects if g.effect.elastic]
-
-
 def _times(k: Float[Array, "n p p"], x: Float[Array, "n p"]) -> Float[Array, "n p"]:
     return jnp.sum(k * x[:, None, :], axis=-1)
 
@@ -184,9 +174,8 @@ def _instant_rates(system: Model, group: Group, rows: Array, moving: Array, turn
         motion = Motion(rows, rows[None], moving[None], turning[None])
         return effect.strain_rates(place, motion, jnp.zeros((), rows.dtype))[0]
 
-    index = group.bodies
-    places = group_places(system, group)
-    return jax.vmap(one)(group.effect, places, rows[index], moving[index], turning[index])
+    given = (x[group.bodies] for x in (rows, moving, turning))
+    return jax.vmap(one)(group.effect, group_places(system, group), *given)
 
 
 def _mean_rates(group: Group, system: Model, at: StageKinematics, h: Array) -> Float[Array, "n p"]:

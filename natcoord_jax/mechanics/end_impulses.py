@@ -72,7 +72,7 @@ def obeying(system: Model, end: State) -> Ends:
     work = jnp.where(drives, impulses * (rates + 0.5 * missing), 0.0)
     # Loops that velocities do not obey quite have a share in it.
     work = work + drives * (impulses @ (rates + 0.5 * missing) - jnp.sum(work)) / np.sum(drives)
-    return Ends(Velocity(v.rows + change.rows, v.rotors + change.rotors), work, jnp.array(True))
+    return Ends(v + change, work, jnp.array(True))
 
 
 def _impulse(space: TangentSpace, equations: Any, found: Evaluation) -> Float[Array, " u"]:

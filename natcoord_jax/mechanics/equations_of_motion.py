@@ -6,6 +6,8 @@ coordinates and of joints that close loops. With row velocities V = P(q) w and c
     P^T [M (P w)' - F - (dc/dV)^T lambda] = 0,    c' = 0.
 """
 
+from collections.abc import Sequence
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -243,20 +245,31 @@ def _weighted(lam: Array, loads: tuple[Array, Array]) -> Twists:
     return jnp.tensordot(lam, loads[0][:, :-1], 1), jnp.tensordot(lam, loads[1][:, :-1], 1)
 
 
-def loads(system: Model, state: State, u: Array, velocity: Array, spin: Array) -> Twists:
-    """Forces and torques of all effects but rotors and relations: what they do in a step of length zero."""
+def loads(
+    system: Model,
+    state: State,
+    u: Array,
+    velocity: Array,
+    spin: Array,
+    acting: Sequence[tuple[Group, Array]] | None = None,
+) -> Twists:
+    """Forces and torques of groups with multipliers: what they do in a step of length zero.
+
+    By default those of all effects but rotors and relations.
+    """
     rows, tableau = state.rows, gauss(1)
+    if acting is None:
+        effects = (g for g in system.effects if not g.effect.impulsive)
+        acting = [(g, no_multipliers(g, tableau, rows.dtype)) for g in effects]
     at = stations(rows, rows[None, :, 0], rows[None, :, 1:], velocity[None], spin[None])
     on_rows = jnp.zeros((rows.shape[0] + 1, *NODE), rows.dtype)
     torques = jnp.zeros((rows.shape[0] + 1, 3), rows.dtype)
-    for group in system.effects:
-        if not group.effect.impulsive:
-            where = situation(system, group, state, u, jnp.zeros((), rows.dtype))
-            lam = no_multipliers(group, tableau, rows.dtype)
-            answer = respond(group, where, gather(group, at), lam, tableau)
-            if answer.forces is not None:
-                on_rows = on_rows.at[group.bodies].add(answer.forces[:, 0])
-            if answer.torques is not None:
-                torques = torques.at[group.bodies].add(answer.torques[:, 0])
+    for group, lam in acting:
+        where = situation(system, group, state, u, jnp.zeros((), rows.dtype))
+        answer = respond(group, where, gather(group, at), lam, tableau)
+        if answer.forces is not None:
+            on_rows = on_rows.at[group.bodies].add(answer.forces[:, 0])
+        if answer.torques is not None:
+            torques = torques.at[group.bodies].add(answer.torques[:, 0])
     force, torque = wrench(on_rows[None, :-1], rows[None, :, 1:])
     return force[0], torque[0] + torques[:-1]

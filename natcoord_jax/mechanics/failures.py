@@ -5,6 +5,7 @@ elements that can be inside out, then the drives, then, for each instance of an 
 neighbours, pairs of its markers that it has missed, then those it had no room for.
 """
 
+from collections.abc import Sequence
 from typing import Any, cast
 
 import jax
@@ -20,7 +21,8 @@ from natcoord_jax.mechanics.response import group_rows
 from natcoord_jax.model.groups import Group
 from natcoord_jax.model.model import Model
 
-KINDS = Result.MISSED, Result.OVERFLOW
+SEARCHES = Result.MISSED, Result.OVERFLOW
+"""What a search can miss, in turn."""
 
 BEYOND = 3.0
 """How far beyond its rates in a step, in terms of the difference between them, a drive may change."""
@@ -29,15 +31,17 @@ NEGLIGIBLE = 1e-9
 """Jump of a drive per radian or unit of size of the places that passes: the rounding of a function."""
 
 
+def _failing(system: Model) -> Sequence[tuple[Group, int, tuple[Result, ...]]]:
+    """Groups that can fail in order, with so many numbers for each of their instances and of these codes."""
+    volumes = ((g, 1, (Result.INVERTED,)) for g in system.effects if g.has_volumes)
+    drives = ((g, 1, (Result.JUMPED,)) for g in drives_of(system))
+    searches = ((g, g.bodies.shape[1] ** 2, SEARCHES) for g in system.effects if g.searches)
+    return *volumes, *drives, *searches
+
+
 def can_fail(system: Model) -> bool:
     """Whether there is anything of the kind."""
-    return any(group.has_volumes or group.searches for group in system.effects) or bool(drives_of(system))
-
-
-def _before_searches(system: Model) -> tuple[int, int]:
-    """Number of the first drive, and of the first pair that a search can miss."""
-    first = sum(group.count for group in system.effects if group.has_volumes)
-    return first, first + sum(group.count for group in drives_of(system))
+    return bool(_failing(system))
 
 
 def first_failure(equations: Any, after: State) -> Int[Array, ""] | None:
@@ -52,15 +56,16 @@ def first_failure(equations: Any, after: State) -> Int[Array, ""] | None:
         return None
     inverted = first_inverted(system, after)
     found = jnp.array(-1) if inverted is None else inverted
-    drives, first = _before_searches(system)
-    if first > drives:
-        jumps = jnp.concatenate([_jumps(group, equations) for group in drives_of(system)])
-        found = jnp.where((found < 0) & jnp.any(jumps), drives + jnp.argmax(jumps), found)
+    first = sum(group.count for group in system.effects if group.has_volumes)
+    if drives := drives_of(system):
+        jumps = jnp.concatenate([_jumps(group, equations) for group in drives])
+        found = jnp.where((found < 0) & jnp.any(jumps), first + jnp.argmax(jumps), found)
+        first += len(jumps)
     for group, where in zip(equations.groups, equations.situations):
         if group.searches:
-            missed = _missed(system, group, where, equations.state, after)
+            missed = _missed(group, where, equations.state, after)
             found = jnp.where((found < 0) & (missed >= 0), first + missed, found)
-            first += _numbers(group)
+            first += group.count * len(SEARCHES) * group.bodies.shape[1] ** 2
     return found
 
 
@@ -81,52 +86,40 @@ def _jumps(group: Group, equations: Any) -> Bool[Array, " n"]:
     return jump > NEGLIGIBLE * size
 
 
-def _numbers(group: Group) -> int:
-    return group.count * len(KINDS) * group.bodies.shape[1] ** 2
-
-
-def _missed(system: Model, group: Group, where: Any, before: State, after: State) -> Int[Array, ""]:
+def _missed(group: Group, where: Any, before: State, after: State) -> Int[Array, ""]:
     """Number of the first pair, within a group."""
     rows, rates = group_rows(group, before)
     pairs = jax.vmap(lambda effect, *given: effect.missed(*given, where.h))(
         group.effect, where.place, where.neighbours, rows, rates, group_rows(group, after)[0]
     )
     size = group.bodies.shape[1]
-    numbers = (np.arange(group.count * len(KINDS)).reshape(-1, len(KINDS)) * size + pairs[..., 0]) * size
-    numbers, wrong = (numbers + pairs[..., 1]).reshape(-1), pairs[..., 0].reshape(-1) >= 0
+    numbers = np.arange(group.count * len(SEARCHES)).reshape(-1, len(SEARCHES)) * size + pairs[..., 0]
+    numbers, wrong = (numbers * size + pairs[..., 1]).reshape(-1), pairs[..., 0].reshape(-1) >= 0
     return jnp.where(jnp.any(wrong), numbers[jnp.argmax(wrong)], -1)
 
 
 def failure(system: Model, number: int) -> tuple[Result, str]:
     """Result code and name of a failure by its number; on the host."""
-    for group in system.effects:
-        if group.has_volumes:
-            if number < group.count:
-                return Result.INVERTED, f"{group.effect.kind} {group.names[number]!r}"
-            number -= group.count
-    for group in drives_of(system):
-        if number < group.count:
-            return Result.JUMPED, f"{group.effect.kind} {group.names[number]!r}"
-        number -= group.count
-    for group in system.effects:
-        if group.searches:
-            if number < _numbers(group):
-                size = group.bodies.shape[1]
-                which, one, other = np.unravel_index(number, (group.count * len(KINDS), size, size))
-                instance, kind = divmod(int(which), len(KINDS))
-                bodies = [system.structure.bodies[int(group.bodies[instance, k])] for k in (one, other)]
-                return KINDS[kind], f"{bodies[0]!r} and {bodies[1]!r} in {group.names[instance]!r}"
-            number -= _numbers(group)
+    for group, each, codes in _failing(system):
+        which, pair = divmod(number, each)
+        instance, kind = divmod(which, len(codes))
+        if instance < group.count:
+            if codes is not SEARCHES:
+                return codes[0], f"{group.effect.kind} {group.names[instance]!r}"
+            pair = divmod(pair, group.bodies.shape[1])
+            one, other = (system.structure.bodies[int(group.bodies[instance, k])] for k in pair)
+            return codes[kind], f"{one!r} and {other!r} in {group.names[instance]!r}"
+        number -= group.count * len(codes) * each
     return Result.INVERTED, "an element"
 
 
 def result_of(system: Model, number: Int[Array, ""]) -> Int[Array, ""]:
     """Result code of a failure by its number."""
-    drives, first = _before_searches(system)
-    code = jnp.where(number >= drives, int(Result.JUMPED), int(Result.INVERTED))
-    for group in system.effects:
-        if group.searches:
-            kind = (number - first) // group.bodies.shape[1] ** 2 % len(KINDS)
-            code = jnp.where(number >= first, jnp.array([int(k) for k in KINDS])[kind], code)
-            first += _numbers(group)
+    code, first = jnp.array(int(Result.INVERTED)), 0
+    for group, each, codes in _failing(system):
+        if codes[0] is not Result.INVERTED:
+            numbers: Any = jnp.array([int(k) for k in codes])
+            kind = numbers[(number - first) // each % len(codes)] if codes is SEARCHES else int(codes[0])
+            code = jnp.where(number >= first, kind, code)
+        first += group.count * len(codes) * each
     return code

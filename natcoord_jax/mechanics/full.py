@@ -95,7 +95,7 @@ class FullStep(StepEquations):
         found = along(along(found[:, None, :, :, None], 1), 4)
         return found.reshape(self.bodies, width, width)
 
-    def tangent(self, y: Float[Array, " unknowns"], loads: Any = None) -> Float[Array, "unknowns unknowns"]:
+    def tangent(self, y: Float[Array, " unknowns"], loads: Any = None) -> Any:
         """The Jacobian nearly, from linearised effects: what Newton's iteration needs."""
         return self.jacobian(y, exact=False)
 

@@ -32,14 +32,10 @@ def cancelling_size(equations: Any) -> Float[Array, ""]:
     rows, total = rows_with_ground(q), jnp.zeros((), q.dtype)
     by_force, by_torque = _mobilities(equations.system)
     for group, where in zip(equations.groups, equations.situations):
-        index = group.bodies
-
-        def one(effect, *given):
-            return effect.cancelling(*given)
-
-        axes = None if group.effect.shared else 0, 0, 0, 0
+        index, axes = group.bodies, (None if group.effect.shared else 0, 0, 0, 0)
+        each = jax.vmap(lambda e, *x: e.cancelling(*x), in_axes=axes)
         with jax.named_scope(group.effect.kind.replace(" ", "_")):
-            found = jax.vmap(one, in_axes=axes)(group.effect, where.place, rows[index], where.coordinates)
+            found = each(group.effect, where.place, rows[index], where.coordinates)
         if found is None:
             continue
         energy, reach = found

@@ -77,8 +77,7 @@ class Answers:
 
     def pushed(self, velocity: Velocity, impulses: Float[Array, " c"]) -> Velocity:
         """A velocity after impulses."""
-        change = self.space.along(jnp.tensordot(impulses, self.along, 1))
-        return Velocity(velocity.rows + change.rows, velocity.rotors + change.rotors)
+        return velocity + self.space.along(jnp.tensordot(impulses, self.along, 1))
 
 
 def after_impacts(

@@ -21,11 +21,6 @@ from natcoord_jax.mechanics.sweeps import JointData, relative_motion
 from natcoord_jax.model.tree import SLOTS, JointGeometry, Level, Tree, joined
 
 
-def _of_slots(level: Level, rates: Float[Array, "s n k"]) -> Float[Array, "s n 7"]:
-    columns = {slot: rates[:, :, i] for i, slot in enumerate(level.slots)}
-    return jnp.stack([columns.get(k, jnp.zeros(rates.shape[:2], rates.dtype)) for k in range(SLOTS)], axis=2)
-
-
 def _derivatives(
     level: Level,
     these: JointData,
@@ -46,7 +41,7 @@ def _derivatives(
 
     def local(spin_p: Array, rates: Array) -> Array:
         d_p = parent_directors(level, these, spin_p, h, tableau)
-        slots = _of_slots(level, rates)
+        slots = spread_out(level, range(SLOTS), rates, 2)
         spin, velocity, _, geometry = relative_motion(level, these, spin_p, d_p, slots, h, tableau)
         moved = cross(geometry.parent_arm + geometry.gap - geometry.child_arm, through.force)
         return jnp.concatenate([velocity, spin, moved, forces_on_slots(level, geometry, through)], axis=-1)
@@ -64,12 +59,6 @@ def _derivatives(
     # The velocity of the parent adds to that of the child, and changes nothing else.
     moving = jnp.eye(s)[:, None, :, None] * jnp.eye(9 + k, 3)[None, :, None, :]
     return jnp.concatenate([jnp.broadcast_to(moving, (bodies, *moving.shape)), found], axis=-1)
-
-
-def _of_free(geometry: JointGeometry, level: Level) -> Float[Array, "n s rows s columns"]:
-    """The same of free bodies: motion is linear in the rates, whatever their neighbours do."""
-    k = geometry.axes.shape[2]
-    return jnp.pad(_free_motions(geometry, level), ((0, 0), (0, 0), (0, 3 + k), (0, 0), (6, 0)))
 
 
 def _free_motions(geometry: JointGeometry, level: Level) -> Float[Array, "n s 6 s k"]:
@@ -127,7 +116,9 @@ def joint_blocks(
     """
     levels, slots, s = (tree.free, tree.hung), tree.slots, tableau.stages
     bodies, k = present.shape
-    derivatives = [_of_free(geometry.free, tree.free)]
+    # Of free bodies: motion is linear in the rates, whatever their neighbours do.
+    free, more = _free_motions(geometry.free, tree.free), 3 + geometry.free.axes.shape[2]
+    derivatives = [jnp.pad(free, ((0, 0), (0, 0), (0, more), (0, 0), (6, 0)))]
     gathers = [_handed_up(tree.free, geometry.free, False)]
     if tree.hung.members:
         here = tree.hung.here

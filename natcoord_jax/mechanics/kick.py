@@ -114,19 +114,16 @@ def kick_of(equations: Any, at: StageKinematics) -> Kick:
         before, after = _both(system, state, end)
     else:
         before, after = with_system(known, system), tangents_at(system, end)
-    drift = after.drift
-    carried = jnp.tensordot(beta, at.rates[:, :-1], 1), beta @ rotor_rates(equations, at)
-    d = Velocity(
-        sigma * (carried[0] - drift.rows) - state.row_rates,
-        sigma * (carried[1] - drift.rotors) - state.rates,
-    )
+    v = Velocity(state.row_rates, state.rates)
+    carried = Velocity(jnp.tensordot(beta, at.rates[:, :-1], 1), beta @ rotor_rates(equations, at))
+    d = sigma * (carried - after.drift) - v
     first, last = before.shares(after, d)  # pyright: ignore[reportArgumentType]  (they are of one kind)
-    found = Velocity(0.5 * (d.rows + first.rows - last.rows), 0.5 * (d.rotors + first.rotors - last.rotors))
+    found = 0.5 * (d + first - last)
     if lag is None:
         nothing = jnp.zeros_like(equations.h)
         return Kick(found, before, after, found, nothing, nothing)
-    change = Velocity(found.rows - lag.held.rows, found.rotors - lag.held.rotors)
-    motion = jnp.maximum(before.energy(Velocity(state.row_rates, state.rates)), before.energy(d))
+    change = found - lag.held
+    motion = jnp.maximum(before.energy(v), before.energy(d))
     size, kick, motion = (jnp.sqrt(2.0 * x) for x in (before.energy(change), before.energy(found), motion))
     serves = (size <= NEGLIGIBLE * motion) & (size * kick <= NEGLIGIBLE_ENERGY * motion**2)
     kept = (serves & ~lag.everywhere) | lag.held_fast
@@ -151,14 +148,10 @@ def ends_of(equations: Any, at: StageKinematics, kick: Kick) -> Ends:
     state, tableau, before, after = equations.state, equations.tableau, kick.before, kick.after
     rates, turning = at.rates[:, :-1], rotor_rates(equations, at)
     v = Velocity(state.row_rates, state.rates)
-    start = Velocity(v.rows + kick.kick.rows, v.rotors + kick.kick.rotors)
-    last = Velocity(
-        start.rows + tableau.gained(rates - start.rows),
-        start.rotors + tableau.gained(turning - start.rotors),
-    )
+    start = v + kick.kick
+    last = start + Velocity(tableau.gained(rates - start.rows), tableau.gained(turning - start.rotors))
     end = after.projected(last)
-    back = Velocity(end.rows - last.rows, end.rotors - last.rotors)
-    work = before.work(kick.kick) + after.work(back)
+    work = before.work(kick.kick) + after.work(end - last)
     little = jax.tree.map(
         lambda x: AT_REST * x / equations.h, Velocity(state.rows, jnp.zeros_like(state.rates))
     )

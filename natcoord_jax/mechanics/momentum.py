@@ -175,20 +175,11 @@ def momentum_balance(
 
 def group_energies(system: Model, group: Group, state: State) -> Float[Array, " n"]:
     """Stored energy of every instance of a group."""
-    rows = rows_with_ground(state.q)[group.bodies]
-
-    def one(effect, place, rows, coordinates, rates):
-        return effect.stored(place, rows, coordinates, rates)
-
-    axes = (None if group.source == "mass" else 0, 0, 0, 0, 0)
+    place, rows = group_places(system, group), rows_with_ground(state.q)[group.bodies]
+    given = place, rows, state.coordinates[group.coordinates], state.rates[group.rotors]
+    each = jax.vmap(lambda e, *x: e.stored(*x), (None if group.source == "mass" else 0, 0, 0, 0, 0))
     with jax.named_scope(group.effect.kind.replace(" ", "_")):
-        return jax.vmap(one, in_axes=axes)(
-            group.effect,
-            group_places(system, group),
-            rows,
-            state.coordinates[group.coordinates],
-            state.rates[group.rotors],
-        )
+        return each(group.effect, *given)
 
 
 def body_momenta(system: Model, state: State) -> tuple[Float[Array, "bodies 3"], Float[Array, "bodies 3"]]:

@@ -115,13 +115,8 @@ def _scattered(block: Float[Array, "n m k6"], bodies: Any, count: int) -> Float[
 
 def _block(system: Model, group: Group, state: State, slope: Any) -> Float[Array, "n m k6"]:
     """Derivatives of what the constraints of a group have as `slope` by the twists of their bodies."""
-    return _along_twists(
-        group.effect,
-        group_places(system, group),
-        rows_with_ground(state.q)[group.bodies],
-        state.t,
-        slope,
-    )
+    rows = rows_with_ground(state.q)[group.bodies]
+    return _along_twists(group.effect, group_places(system, group), rows, state.t, slope)
 
 
 def constraint_matrix(system: Model, state: State) -> Float[Array, "m twists"]:
@@ -138,12 +133,11 @@ def constraint_matrix(system: Model, state: State) -> Float[Array, "m twists"]:
 def with_sizes(system: SomeModel, state: State) -> SomeModel:
     """The system with the size of the scene as it is assembled, and with `spans` of its constraints."""
     size, spans = _sizes(system, state)
-    joints, effects = (tuple(map(_with_spans, *pair)) for pair in zip((system.joints, system.effects), spans))
+    joints, effects = (
+        tuple(g if x is None else replace_fields(g, spans=x) for g, x in zip(*pair))
+        for pair in zip((system.joints, system.effects), spans)
+    )
     return replace_fields(system, size=size, joints=joints, effects=effects)
-
-
-def _with_spans(group: Group, spans: Array | None) -> Group:
-    return group if spans is None else replace_fields(group, spans=spans)
 
 
 @eager_numpy

@@ -17,11 +17,6 @@ from natcoord_jax.model.model import Model
 from natcoord_jax.model.rows import group_places, rows_with_ground
 
 
-def ground_rows(like: Array) -> Float[Array, "1 4 3"]:
-    """Rows of the ground: the origin and the world axes."""
-    return jnp.concatenate([jnp.zeros((1, 3)), jnp.eye(3)]).astype(like.dtype)[None]
-
-
 class StageKinematics(eqx.Module):
     """Motion of all bodies and, last, the ground; `force_rows` as in `Motion`."""
 
@@ -45,7 +40,7 @@ def stations(
     spin: Float[Array, "s bodies 3"],
 ) -> StageKinematics:
     """Motion with the ground appended; director rates are spin x director."""
-    ground = ground_rows(start)
+    ground = jnp.concatenate([jnp.zeros((1, 3)), jnp.eye(3)]).astype(start.dtype)[None]
     stages = points.shape[0]
     rows = jnp.concatenate([points[:, :, None], directors], axis=2)
     rates = jnp.concatenate([velocity[:, :, None], cross(spin[:, :, None], directors)], axis=2)

@@ -57,10 +57,6 @@ class SparseStep(FullStep):
         """Shapes of the elements' matrices."""
         return super().like_tangent(y) if self.tableau.stages > 1 else jax.eval_shape(self.tangent, y)
 
-    def tangent(self, y: Float[Array, " unknowns"], loads: Any = None) -> Any:
-        """The Jacobian nearly, from linearised effects: what Newton's iteration needs."""
-        return self.jacobian(y, exact=False)
-
     def jacobian(self, y: Float[Array, " unknowns"], *, exact: bool = True) -> Any:
         """Jacobian: matrices of the elements as `elements` lists them, and products, if there are any.
 

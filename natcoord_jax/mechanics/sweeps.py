@@ -119,14 +119,9 @@ def relative_motion(
             apart = apart + h * jnp.einsum("ij,jnc->inc", stages, sliding)
             gap = rotate_stages(h * spin_p, apart, tableau)
             velocity = velocity + cross(spin_p, gap)
-    geometry = JointGeometry(_stack(axes + slides + child_axis, child_arm), parent_arm, child_arm, gap)
-    return spin, velocity, d, geometry
-
-
-def _stack(vectors: list[Array], like: Array) -> Array:
-    if not vectors:
-        return jnp.zeros((*like.shape[:2], 0, 3), like.dtype)
-    return jnp.stack(vectors, axis=2)
+    motions, none = axes + slides + child_axis, jnp.zeros((*child_arm.shape[:2], 0, 3), child_arm.dtype)
+    stacked = jnp.stack(motions, axis=2) if motions else none
+    return spin, velocity, d, JointGeometry(stacked, parent_arm, child_arm, gap)
 
 
 def turned_directors(

@@ -4,6 +4,8 @@ Frames are functions of the configuration: P X^T with the null space P of the sp
 Cholesky factor, X P^T M P X^T = 1. Where constraints close loops, the tangents are a subspace of that.
 """
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -32,6 +34,15 @@ class Velocity(eqx.Module):
 
     rows: Float[Array, "*u bodies 4 3"]
     rotors: Float[Array, "*u rotors"]
+
+    def __add__(self, other: "Velocity") -> "Velocity":
+        return Velocity(self.rows + other.rows, self.rotors + other.rotors)
+
+    def __sub__(self, other: "Velocity") -> "Velocity":
+        return Velocity(self.rows - other.rows, self.rotors - other.rotors)
+
+    def __rmul__(self, factor: Any) -> "Velocity":
+        return Velocity(factor * self.rows, factor * self.rotors)
 
 
 class Admissible(eqx.Module):
@@ -244,14 +255,11 @@ class TangentSpace(eqx.Module):
         """
         known = self.admissible
         w = known.frame.T @ known.within(self.framed(v)) + self.drift_rates
-        found = self.spread(w)
-        lost = Velocity(v.rows - found.rows, v.rotors - found.rotors)
-        return self.spread(w + known.frame.T @ known.within(self.framed(lost)))
+        return self.spread(w + known.frame.T @ known.within(self.framed(v - self.spread(w))))
 
     def normal(self, v: Velocity) -> Velocity:
         """What of a velocity is orthogonal to all that the constraints admit."""
-        along = self.along(self.admissible.within(self.framed(v)))
-        return Velocity(v.rows - along.rows, v.rotors - along.rotors)
+        return v - self.along(self.admissible.within(self.framed(v)))
 
     def with_momentum(self, momentum: Float[Array, " u"]) -> Velocity:
         """The admissible velocity with given momenta P^T M v; projected twice, as above."""

@@ -91,17 +91,10 @@ def violation_rates_of(
     return found
 
 
-def joint_residuals(system: Model, state: State) -> list[tuple[Group, Array, Array]]:
-    """Residual and rate of every joint's constraints, by group."""
-    groups = system.joints
-    values, rates = violations_of(system, groups, state), violation_rates_of(system, groups, state)
-    return list(zip(groups, values, rates))
-
-
 @eager_numpy
-def residuals(system: Model, state: State) -> list[tuple[Array, Array]]:
-    """Residual and rate of every joint's constraints, in the order of the groups."""
-    return [(value, rate) for _, value, rate in joint_residuals(system, state)]
+def residuals(system: Model, state: State) -> list[Array]:
+    """Residuals of every joint's constraints, in the order of the groups."""
+    return violations_of(system, system.joints, state)
 
 
 def largest(groups: list[Array]) -> Float[Array, ""]:
@@ -165,21 +158,13 @@ def is_open(system: Model, state: State) -> Bool[Array, ""]:
 
 
 @eager_numpy
-def _position_violations(system: Model, state: State) -> tuple[list[Array], list[Array], Array]:
-    groups = constrained(system)
-    return violations_of(system, groups, state), spans(system, groups), position_size(system, state)
-
-
-@eager_numpy
-def _overlaps(system: Model, state: State) -> tuple[list[Array], list[Array], Array]:
-    groups = contacts(system)
-    return violations_of(system, groups, state), spans(system, groups), position_size(system, state)
-
-
-@eager_numpy
-def _rate_violations(system: Model, state: State) -> tuple[list[Array], list[Array], Array]:
-    groups = constrained(system)
-    return violation_rates_of(system, groups, state), spans(system, groups), rate_size(system, state)
+def _violated(
+    system: Model, state: State, rates: bool, overlaps: bool
+) -> tuple[list[Array], list[Array], Array]:
+    groups = contacts(system) if overlaps else constrained(system)
+    missed = violation_rates_of if rates else violations_of
+    size = rate_size if rates else position_size
+    return missed(system, groups, state), spans(system, groups), size(system, state)
 
 
 @dataclass(frozen=True)
@@ -219,8 +204,7 @@ def worst_violation(
     groups = contacts(system) if overlaps else constrained(system)
     if not groups:
         return None
-    find = _overlaps if overlaps else _rate_violations if rates else _position_violations
-    listed, spanned, size = find(system, state)
+    listed, spanned, size = _violated(system, state, rates, overlaps)
     found = [np.abs(np.asarray(x)) for x in listed]
     shares = [x / np.asarray(span) for x, span in zip(found, spanned, strict=True)]
     sizes = [np.max(x) for x in shares]

@@ -241,7 +241,7 @@ def _rates_before(system: Model, into: Model, moved: State) -> Float[Array, " co
 
 def _check_closed(system: Model, state: State, names: set[str]) -> None:
     size = 1.0 + float(np.max(np.abs(np.asarray(state.q))))
-    for group, (value, _) in zip(system.joints, residuals(system, state)):
+    for group, value in zip(system.joints, residuals(system, state)):
         gaps = np.max(np.abs(np.asarray(value)), axis=1, initial=0.0)
         for name, gap in zip(group.names, gaps):
             if name in names and not gap <= GAP * size:

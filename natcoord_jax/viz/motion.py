@@ -116,9 +116,3 @@ def together(phases: Phases, times: np.ndarray, **options: Any) -> Scenery:
 def even_times(t: np.ndarray, count: int) -> np.ndarray:
     """So many times [s] from the first to the last, and no more than there are saved states."""
     return np.linspace(t[0], t[-1], max(1, min(count, len(t))))
-
-
-def title_of(system: System) -> str:
-    """What a motion is called if nobody says."""
-    bodies: Sequence[str] = system.structure.bodies
-    return f"{len(bodies)} bodies" if len(bodies) != 1 else bodies[0]

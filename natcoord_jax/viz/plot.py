@@ -25,11 +25,6 @@ from natcoord_jax.viz.panels import Curve, Panel, draw, plot_panels, shown_once
 from natcoord_jax.viz.stage import Stage
 
 
-def _held(label: str, t: np.ndarray, values: np.ndarray) -> Curve:
-    """Values held over steps, as a staircase."""
-    return Curve(label, np.repeat(t, 2)[1:-1], np.repeat(values, 2))
-
-
 def limits_of(solution: Solution) -> dict[str, set[float]]:
     """Finite limits by the kind of what they limit: "input", "coordinate" and "rate"."""
     system, given, found = solution.system, solution.problem.bounds, {}
@@ -73,7 +68,9 @@ def _is_free(system: System, body: int) -> bool:
 def _joints(solution: Solution, t: np.ndarray) -> list[Panel]:
     """Joint coordinates beside their rates, with bounds and goals."""
     limits, goals, end = limits_of(solution), goals_of(solution), float(t[-1])
-    rest = any(label.startswith("rest of") for label in _labels(solution))
+    goal = solution.problem.goal
+    labels = () if goal is None else goal.labels(solution.system)
+    rest = any(label.startswith("rest of") for label in labels)
     found = []
     for panel in coordinates(solution.system, solution.trajectory, t):
         kind = "rate" if panel.ordinate.endswith("/s]") else "coordinate"
@@ -87,11 +84,6 @@ def _joints(solution: Solution, t: np.ndarray) -> list[Panel]:
     return found
 
 
-def _labels(solution: Solution) -> tuple[str, ...]:
-    goal = solution.problem.goal
-    return () if goal is None else goal.labels(solution.system)
-
-
 def _label(name: str) -> str:
     """Label of the curve of a coordinate or rate: the joint, with a number from the second on."""
     _, index, _, joint = name.split(" ", 3)
@@ -102,8 +94,10 @@ def solution_panels(solution: Solution) -> list[Panel]:
     """Inputs, joints, attitudes of free bodies, angular momentum, and how the method converged."""
     system, trajectory = solution.system, solution.trajectory
     t, inputs = np.asarray(trajectory.t), np.asarray(solution.inputs)
-    held = [_held(name, t, inputs[:, k]) for k, name in enumerate(system.structure.inputs)]
-    panels = [Panel("inputs", "[N, N m]", held, bounds=sorted(limits_of(solution).get("input", ())))]
+    # Values are kept over steps: staircases.
+    ends, names = np.repeat(t, 2)[1:-1], system.structure.inputs
+    stairs = [Curve(name, ends, np.repeat(inputs[:, k], 2)) for k, name in enumerate(names)]
+    panels = [Panel("inputs", "[N, N m]", stairs, bounds=sorted(limits_of(solution).get("input", ())))]
     panels += _joints(solution, t)
     roots = [name for k, name in enumerate(system.structure.bodies) if _is_free(system, k)]
     for name in roots[:1]:

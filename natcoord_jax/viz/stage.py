@@ -3,6 +3,7 @@
 from typing import Any
 
 import numpy as np
+from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 
 from natcoord_jax.viz.scenery import Scenery, along_map, rounded
@@ -69,12 +70,6 @@ def _fours(face: np.ndarray) -> list[list[int]]:
     return [[int(a) for a in (*four, four[-1])[:4]] for four in cut]
 
 
-def _axes_of(up: np.ndarray) -> tuple[int, int, int]:
-    """The order of the axes with which the vertical one comes last: a cyclic one, so that hands are kept."""
-    vertical = int(np.abs(up).argmax())
-    return ((vertical + 1) % 3, (vertical + 2) % 3, vertical)
-
-
 class Stage:
     """A diagram on which pictures of a motion are shown, one after the other.
 
@@ -84,7 +79,8 @@ class Stage:
 
     def __init__(self, axes: Any, scenery: Scenery, *, labelled: bool = True, zoom: float = 1.0):
         self.axes, self.scenery = axes, scenery
-        self.order = list(_axes_of(scenery.up))
+        # The vertical axis comes last, in a cyclic order, so that hands are kept.
+        self.order = [(int(np.abs(scenery.up).argmax()) + k) % 3 for k in (1, 2, 3)]
         axes.computed_zorder = False
         eye = scenery.eye()
         # Forces are drawn over all else, as in views: those of contacts are between bodies, or inside.
@@ -101,7 +97,7 @@ class Stage:
             axes.tick_params(labelsize=7)
             for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
                 axis.set_pane_color((0.97, 0.97, 0.98))
-                axis.set_major_locator(_few())
+                axis.set_major_locator(MaxNLocator(nbins=4, steps=[1, 2, 5, 10]))
         else:
             axes.set_axis_off()
         self.lattice = Line3DCollection(np.zeros((1, 2, 3)), colors="0.8", linewidths=0.6, zorder=1)
@@ -168,9 +164,3 @@ class Stage:
         time = caption.format(self.scenery.t[frame])
         title = f"{self.scenery.title}\n{time}" if self.scenery.title else time
         self.axes.set_title(title, fontsize=10)
-
-
-def _few() -> Any:
-    from matplotlib.ticker import MaxNLocator
-
-    return MaxNLocator(nbins=4, steps=[1, 2, 5, 10])

@@ -36,7 +36,6 @@ from natcoord_jax.viz.motion import (
     longest_of,
     runs_of,
     scenery_at,
-    title_of,
 )
 from natcoord_jax.viz.packed import bytes_of_a_picture, page
 from natcoord_jax.viz.scenery import Scenery, matched
@@ -189,13 +188,9 @@ def view(
     if file is not None and Path(file).suffix.lower() != ".html":
         raise ValueError(f"view writes HTML, not {str(file)!r}; pass a name that ends in .html")
     name = follow if isinstance(follow, str) else follow.name
-    options = {
-        "title": title or title_of(phases.systems[0]),
-        "traces": traces,
-        "colour": colour,
-        "beams": beams,
-        "within": within,
-    }
+    bodies: Sequence[str] = phases.systems[0].structure.bodies
+    options = {"beams": beams, "traces": traces, "colour": colour, "within": within}
+    options["title"] = title or (f"{len(bodies)} bodies" if len(bodies) != 1 else bodies[0])
     pace = pace_of(longest_of(runs_of(phases)))
     if live:
         from natcoord_jax.viz.live import Live

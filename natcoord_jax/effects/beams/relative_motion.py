@@ -138,15 +138,12 @@ class BeamElement(Expanded):
 
     def resultants(self, strains: Float[Array, "6 *n"]) -> Float[Array, "6 *n"]:
         """Section forces [N] and moments [N m] about the axes of the section."""
-        return self._linear(strains)
-
-    def _linear(self, strains: Float[Array, "6 *n"]) -> Float[Array, "6 *n"]:
         return jnp.sum(self.stiffness * strains, axis=1)
 
     def energy(self, invariants: Array) -> Array:
         """Strain energy [J]."""
         strains = self.strains(invariants)
-        return 0.5 * self.length * jnp.sum(strains * self._linear(strains), axis=0)
+        return 0.5 * self.length * jnp.sum(strains * BeamElement.resultants(self, strains), axis=0)
 
     def moduli(self, strains: Float[Array, "6 *n"]) -> Float[Array, "6 6 *n"]:
         """Derivatives of the resultants by the strains [N, N m, N m^2]."""

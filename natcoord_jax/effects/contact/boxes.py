@@ -11,8 +11,8 @@ from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.markers import Markers
 from natcoord_jax.core.numeric import Number, Numbers
 from natcoord_jax.effects.contact.gap import Gap
-from natcoord_jax.effects.contact.pairs import RADIUS, direction, length, nearest_points
-from natcoord_jax.maths.vectors import dot
+from natcoord_jax.effects.contact.pairs import RADIUS, direction, nearest_points
+from natcoord_jax.maths.vectors import dot, safe_sqrt
 
 BLEND = 0.1
 """Of the radius of round edges: by how much pairs of them may be farther than the nearest, to count."""
@@ -35,7 +35,7 @@ def distance_from_box(place: Float[Array, "3"], half: Float[Array, "3"]) -> Floa
         half: edges of the box, halved [m].
     """
     beyond = jnp.abs(place) - half
-    outside = length(jnp.sum(jnp.where(beyond > 0, beyond, 0.0) ** 2))
+    outside = safe_sqrt(jnp.sum(jnp.where(beyond > 0, beyond, 0.0) ** 2))
     return jnp.where(outside > 0, outside, jnp.max(beyond))
 
 
@@ -69,12 +69,6 @@ class SphereOnBox(Gap):
         place, half = self.invariants(x), 0.5 * self.size
         nearest = x[0] + jnp.clip(place, -half, half) @ x[2:5]
         return nearest, direction(x[1] - nearest)
-
-
-def _smooth_step(x: Array) -> Array:
-    """From nothing at zero to one at one, and with no slope there."""
-    x = jnp.clip(x, 0.0, 1.0)
-    return x * x * (3.0 - 2.0 * x)
 
 
 class BetweenBoxes(Gap):
@@ -197,11 +191,12 @@ class EdgesOnEdges(BetweenBoxes):
         products = jnp.stack([jnp.broadcast_to(dot(u, v), (6, 6)) for u, v in pairs])
         s, t = nearest_points(products, TOWARDS_MIDDLE)
         first, second = begin + s[..., None] * one, end + t[..., None] * other
-        far = length(dot(second - first, second - first))
+        far = safe_sqrt(dot(second - first, second - first))
         crossing = 1.0 - jnp.exp((products[2] ** 2 / (products[0] * products[1]) - 1.0) / PARALLEL)
         for place, square in ((s, products[0]), (t, products[1])):
-            end = (0.5 - jnp.abs(place - 0.5)) * length(square) / (AT_END * self.rounding)
-            crossing = crossing * _smooth_step(end)
+            end = (0.5 - jnp.abs(place - 0.5)) * safe_sqrt(square) / (AT_END * self.rounding)
+            end = jnp.clip(end, 0.0, 1.0)
+            crossing = crossing * (end * end * (3.0 - 2.0 * end))
         return far + self.rounding * (1.0 - crossing), first, second
 
     def _weights(self, far: Float[Array, "6 6"]) -> Float[Array, "6 6"]:

@@ -17,8 +17,6 @@ from jaxtyping import Array, Float, Int
 from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.closed_tangents import by_twists, twist_maps
 from natcoord_jax.core.effect import replace_fields
-from natcoord_jax.core.kinds import NAME
-from natcoord_jax.core.markers import Markers
 from natcoord_jax.core.motion import Motion, NeighbourTangents, Response, SpreadTangents, StepContext
 from natcoord_jax.core.numeric import Number, Numbers, Whole
 from natcoord_jax.core.potential import marker_response, place_markers
@@ -71,12 +69,10 @@ class CapsuleContacts(ContactLaw):
         >>> contacts = nc.CapsuleContacts(centres + above, radii=np.full(3, 0.1), stiffness=1e5)
     """
 
-    markers: Any = eqx.field(metadata=is_a(Markers()))
     radii: Any = eqx.field(kw_only=True, metadata=is_a(Numbers((None,), "not negative")))
     ignored: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Numbers((None, 2))))
     capacity: int = eqx.field(default=ROOM, kw_only=True, static=True, metadata=is_a(Whole(1)))
     skin: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Number("positive")))
-    name: Any = eqx.field(default=None, kw_only=True, metadata=is_a(NAME))
     exempt: Any = eqx.field(default=None, init=False)
 
     kind: ClassVar[str] = "contact of capsules"
@@ -96,10 +92,6 @@ class CapsuleContacts(ContactLaw):
                 "CapsuleContacts: both ends of a segment are points of one body, which these are not; pass "
                 "the first ends of all segments and then the second ends in the same order"
             )
-
-    def attach(self, find: Any) -> Any:
-        """Their centres, or ends."""
-        return self.markers
 
     def assembled_at(self, x: Float[Array, "k 3"]) -> "CapsuleContacts":
         """With its damping, its skin, and who does not touch whom."""

@@ -11,7 +11,6 @@ there, it is the same function at the end of a step and at the start of the next
 """
 
 import abc
-from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -19,17 +18,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.closed_tangents import by_twists
 from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.effect import replace_fields
-from natcoord_jax.core.handles import Handle
-from natcoord_jax.core.joint import Joint
-from natcoord_jax.core.kinds import NAME
-from natcoord_jax.core.markers import Attachment, Marker, Markers
 from natcoord_jax.core.motion import Motion, Response, StepContext
 from natcoord_jax.core.potential import marker_response, place_markers
-from natcoord_jax.effects.contact.law import ContactLaw, ContactReadings
+from natcoord_jax.effects.contact.law import ContactLaw
 
 RIGID = 1e-20
 """Square of the change of distances, relative to theirs, below which the points move as a rigid body."""
@@ -63,15 +57,9 @@ class DiscreteGap(ContactLaw):
         name: optional name.
     """
 
-    markers: Any = eqx.field(metadata=is_a(Markers()))
-    name: Any = eqx.field(default=None, kw_only=True, metadata=is_a(NAME))
     initial: Any = eqx.field(default=None, init=False)
 
     derived: ClassVar[tuple[str, ...]] = ("damping", "initial")
-
-    def attach(self, find: Callable[[Handle], tuple[Joint, Array]]) -> Sequence[Marker | Attachment]:
-        """Its points."""
-        return self.markers
 
     @abc.abstractmethod
     def measured(self, x: Float[Array, "k 3"]) -> Measured:
@@ -110,12 +98,8 @@ class DiscreteGap(ContactLaw):
         flow = jnp.einsum("i,ikx,ikx->", weights, derivatives, rates)
         forces = elastic * derivatives
         given = jnp.sum(forces * rates, axis=(1, 2))
-        found = marker_response(place, self._lossy(-flow) * forces, None, rates, motion)
+        found = marker_response(place, self.lossy(-flow) * forces, None, rates, motion)
         return found if self.damping is None else replace_fields(found, released=given)
-
-    def _lossy(self, closing: Float[Array, ""]) -> Any:
-        """Factor of the force at a closing speed [m/s]; together they never pull."""
-        return 1.0 if self.damping is None else 1.0 + jnp.maximum(self.damping * closing, -1.0)
 
     def _discrete(
         self, start: Array, stages: Float[Array, "s k 3"], moved: Float[Array, "s k 3"], weights: Array
@@ -151,7 +135,7 @@ class DiscreteGap(ContactLaw):
 
             def force(after: Array) -> Array:
                 speed = (first.gap - after) / jnp.where(moving, now.h, 1.0)
-                return effect.mean_force(first.gap, after) * effect._lossy(jnp.where(moving, speed, 0.0))
+                return effect.mean_force(first.gap, after) * effect.lossy(jnp.where(moving, speed, 0.0))
 
             size, slope = jax.value_and_grad(force)(last.gap)
             along, turned = found[0].reshape(-1), effect.turned(x[0])
@@ -164,13 +148,9 @@ class DiscreteGap(ContactLaw):
         stiffness, forces = jax.vmap(one)(self, place, motion.start, motion.rows[0], motion.rates[0])
         return by_twists(stiffness, forces[:, :, None], place[:, :, None], motion, now.h, turning)
 
-    def stored(self, place: Array, rows: Array, coordinates: Array, rates: Array) -> Array:
-        """Energy [J]."""
-        return self.stored_at(self.gap(place_markers(place, rows)))
-
-    def readings(self, place: Array, rows: Array) -> ContactReadings:
-        """Gap and force."""
-        return self.readings_at(self.gap(place_markers(place, rows)))
+    def gap_at(self, place: Array, rows: Array) -> Float[Array, ""]:
+        """Between the surfaces [m]."""
+        return self.gap(place_markers(place, rows))
 
 
 def _apart(x: Float[Array, "s k 3"], at: Int[Array, " p"]) -> Float[Array, "s p p 3"]:

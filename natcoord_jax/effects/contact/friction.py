@@ -1,6 +1,5 @@
 """Friction where two surfaces touch: a force against slip, whatever pushes them together."""
 
-from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -8,26 +7,20 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from natcoord_jax.core.arguments import is_a, require
-from natcoord_jax.core.effect import Effect
-from natcoord_jax.core.handles import Handle
-from natcoord_jax.core.joint import Joint
-from natcoord_jax.core.kinds import NAME, of
-from natcoord_jax.core.markers import Attachment, Marker, Markers
+from natcoord_jax.core.arguments import is_a
+from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.motion import Motion
 from natcoord_jax.core.numeric import Number
 from natcoord_jax.core.potential import on_rows, place_markers
-from natcoord_jax.effects.contact.gap import Gap
+from natcoord_jax.effects.contact.gap import Gap, GapEffect
 from natcoord_jax.maths.vectors import cross, dot, positive_part
 
 REGULARISED = 3e-6
 """Velocity of slip, in terms of the speeds of a scene, up to which friction is smooth: what sticks under a
 load creeps less than that."""
 
-GAP = of("a gap, as nc.SphereOnPlane(radius=0.1)", Gap)
 
-
-class Rubbing(Effect):
+class Rubbing(GapEffect):
     """Base of contacts whose multipliers are an impulse along the normal and those of friction.
 
     A force of slip acts where the surfaces touch, f sqrt(|u|^2 + eps^2) = -mu N u of the velocity u with
@@ -45,33 +38,28 @@ class Rubbing(Effect):
             the gap closes, at its end, `RESTING` where it is closed, 0 elsewhere. None: of other schemes.
     """
 
-    markers: Any = eqx.field(metadata=is_a(Markers()))
-    gap: Gap = eqx.field(metadata=is_a(GAP))
     friction: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Number("not negative")))
     regularisation: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Number("positive")))
-    name: Any = eqx.field(default=None, kw_only=True, metadata=is_a(NAME))
     mobility: Any = eqx.field(default=None, init=False)
     phase: Any = eqx.field(default=None, init=False)
 
     unilateral: ClassVar[bool] = True
-    unit_directions: ClassVar[bool] = True
     impulsive: ClassVar[bool] = True
     works: ClassVar[bool] = True
     silent: ClassVar[bool] = False
     drawn: ClassVar[bool] = False
 
     def __check_init__(self) -> None:
-        """Refuse markers of another gap, and friction at no one knows which point."""
-        require(self, "markers", self.gap.markers)
+        """Refuse friction at no one knows which point."""
         if self.friction is not None and type(self.gap).contact is Gap.contact:
             raise ValueError(
                 f"{type(self).__name__}: friction [-] acts where surfaces touch, which "
                 f"{type(self.gap).__name__} does not say; give it a method `contact`"
             )
 
-    def attach(self, find: Callable[[Handle], tuple[Joint, Array]]) -> Sequence[Marker | Attachment]:
-        """Markers of the gap."""
-        return self.markers
+    def assembled_at(self, x: Array) -> Any:
+        """With a mobility, which is found when the masses are known."""
+        return replace_fields(super().assembled_at(x), mobility=jnp.ones(()))
 
     @property
     def multipliers(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -106,10 +94,6 @@ class Rubbing(Effect):
         # On orthonormal directors.
         turning = 0.5 * cross(torques[:, :, None], rows[:, 1:])
         return on_rows(place, forces) + jnp.pad(turning, ((0, 0), (0, 0), (1, 0), (0, 0)))
-
-    def touch(self, place: Array, rows: Array) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
-        """Where the surfaces touch [m], and the direction in which the second is pushed."""
-        return self.gap.touch(place_markers(place, rows))
 
     def flow(self, place: Array, motion: Motion) -> Float[Array, "s p"]:
         """Rates of the invariants at the stages of a step."""

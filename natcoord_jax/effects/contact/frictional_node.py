@@ -108,7 +108,7 @@ class FrictionalNodeOnFacets(NodeOnFacets):
         closing = -jnp.einsum("i,ikx,ikx->", weights, derivatives, rates)
         # Where a contact is stiffer than the step is short, its equation is in terms of places.
         scale = 0.5 * self.mobility / (1.0 + 0.25 * self.mobility * self.stiffness * now.h**2)
-        found = scale * (lam[0, 0] - self._lossy(closing) * elastic)
+        found = scale * (lam[0, 0] - self.lossy(closing) * elastic)
         slip, pulled = jax.vjp(lambda v: self.slip(x[0], v), rates[0])
         along = lam[0, 1:]
         missing = missing_friction(along, slip, self.friction * lam[0, 0], self.regularisation)

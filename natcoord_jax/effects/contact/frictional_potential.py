@@ -1,15 +1,15 @@
 """Contact by an energy of the gap, with friction: what pushes depends on the overlap, what rubs on that."""
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.motion import Motion, Response, StepContext
 from natcoord_jax.core.potential import marker_response, place_markers
 from natcoord_jax.effects.contact.friction import Rubbing
-from natcoord_jax.effects.contact.law import ContactLaw, ContactReadings
+from natcoord_jax.effects.contact.law import ContactLaw
 
 
 class FrictionalGapPotential(Rubbing, ContactLaw):
@@ -46,11 +46,6 @@ class FrictionalGapPotential(Rubbing, ContactLaw):
     kind: ClassVar[str] = "soft contact with friction"
     works: ClassVar[bool] = True
 
-    def assembled_at(self, x: Array) -> "FrictionalGapPotential":
-        """With its damping, and a mobility, which is found when the masses are known."""
-        damped: Any = self.renewed()
-        return replace_fields(damped, mobility=jnp.ones(()))
-
     def violation(self, place: Array, rows: Array, coordinates: Array, t: Array) -> Array:
         """None: surfaces may overlap."""
         return jnp.zeros(1)
@@ -61,10 +56,9 @@ class FrictionalGapPotential(Rubbing, ContactLaw):
         gradient = self.gap.averaged(start, now.h * flow, now.tableau)
         before, closing = self.gap.distance(start), -jnp.sum(gradient * flow)
         elastic = now.h * self.mean_force(before, before - now.h * closing)
-        lossy = 1.0 if self.damping is None else 1.0 + jnp.maximum(self.damping * closing, -1.0)
         # Where a contact is stiffer than the step is short, its equation is in terms of places.
         scale = 0.5 * self.mobility / (1.0 + 0.25 * self.mobility * self.stiffness * now.h**2)
-        found = scale * (lam[0, 0] - lossy * elastic)
+        found = scale * (lam[0, 0] - self.lossy(closing) * elastic)
         forces, torques = self.pushing(place, motion, gradient, lam[:, 0]), None
         found = found[None, None]
         if self.friction is not None:
@@ -73,14 +67,3 @@ class FrictionalGapPotential(Rubbing, ContactLaw):
         rates = place_markers(place, motion.rates)
         response = marker_response(place, forces, torques, rates, motion)
         return replace_fields(response, rows=found, released=(-elastic * closing)[None])
-
-    def stored(self, place: Array, rows: Array, coordinates: Array, rates: Array) -> Float[Array, ""]:
-        """Energy [J]."""
-        return self.stored_at(self._gap(place, rows))
-
-    def readings(self, place: Array, rows: Array) -> ContactReadings:
-        """Gap and force."""
-        return self.readings_at(self._gap(place, rows))
-
-    def _gap(self, place: Array, rows: Array) -> Float[Array, ""]:
-        return self.gap.distance(self.gap.invariants(place_markers(place, rows)))

@@ -3,12 +3,15 @@
 import abc
 from typing import ClassVar
 
+import equinox as eqx
 import jax
 from jaxtyping import Array, Float
 
-from natcoord_jax.core.arguments import Part
+from natcoord_jax.core.arguments import Part, is_a, require
 from natcoord_jax.core.gradient import averaged_gradient
+from natcoord_jax.core.kinds import of
 from natcoord_jax.core.markers import Markers
+from natcoord_jax.core.potential import MarkerEffect, place_markers
 from natcoord_jax.maths.collocation import Tableau
 from natcoord_jax.maths.vectors import unit
 
@@ -67,3 +70,26 @@ class Gap(Part):
     ) -> Float[Array, "s p"]:
         """Gradient by the invariants, averaged along a step: it foretells the gap at its end exactly."""
         return averaged_gradient(self.distance, start, steps, tableau, self.degree)
+
+
+GAP = of("a gap, as nc.SphereOnPlane(radius=0.1)", Gap)
+
+
+class GapEffect(MarkerEffect):
+    """Base of contacts with a gap between two surfaces."""
+
+    gap: Gap = eqx.field(metadata=is_a(GAP))
+
+    unit_directions: ClassVar[bool] = True
+
+    def __check_init__(self) -> None:
+        """Refuse markers of another gap."""
+        require(self, "markers", self.gap.markers)
+
+    def gap_at(self, place: Array, rows: Array) -> Float[Array, ""]:
+        """Between the surfaces [m]."""
+        return self.gap.distance(self.gap.invariants(place_markers(place, rows)))
+
+    def touch(self, place: Array, rows: Array) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+        """Where the surfaces touch [m], and the direction in which the second is pushed."""
+        return self.gap.touch(place_markers(place, rows))

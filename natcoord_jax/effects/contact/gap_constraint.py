@@ -77,18 +77,14 @@ class GapConstraint(Rubbing):
     kind: ClassVar[str] = "hard contact"
     bounces: ClassVar[bool] = True
 
-    def assembled_at(self, x: Array) -> "GapConstraint":
-        """With a mobility, which is found when the masses are known."""
-        return replace_fields(self, mobility=jnp.ones(()))
-
     def quadratic(self, place: Array, rows: Array) -> Array:
         """The invariants of the gap."""
         return jnp.ravel(self.gap.invariants(place_markers(place, rows)))
 
     def violation(self, place: Array, rows: Array, coordinates: Array, t: Array) -> Array:
         """How far the surfaces overlap, negative."""
-        distance = self.gap.distance(self.gap.invariants(place_markers(place, rows)))
-        return jnp.where(distance < 0, distance, 0.0)[None]
+        gap = self.gap_at(place, rows)
+        return jnp.where(gap < 0, gap, 0.0)[None]
 
     def respond(self, place: Array, motion: Motion, now: StepContext, lam: Array) -> Response:
         """The gap at the end of the step or the impulse, whichever is smaller, vanishes (66)."""
@@ -115,4 +111,4 @@ class GapConstraint(Rubbing):
 
     def readings(self, place: Array, rows: Array) -> GapReadings:
         """The gap."""
-        return GapReadings(self.gap.distance(self.gap.invariants(place_markers(place, rows))))
+        return GapReadings(self.gap_at(place, rows))

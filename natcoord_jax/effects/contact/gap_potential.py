@@ -6,23 +6,20 @@ that whatever the step. What impacts lose is a part of the force that grows with
 closes; it is there only where a restitution is asked for.
 """
 
-from typing import Any, ClassVar
+from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from natcoord_jax.core.arguments import is_a, require
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.motion import Motion, Response, StepContext
 from natcoord_jax.core.potential import Potential, place_markers
-from natcoord_jax.effects.contact.friction import GAP
-from natcoord_jax.effects.contact.gap import Gap
-from natcoord_jax.effects.contact.law import ContactLaw, ContactReadings
+from natcoord_jax.effects.contact.gap import GapEffect
+from natcoord_jax.effects.contact.law import ContactLaw, closing_speed
 
 
-class GapPotential(ContactLaw, Potential):
+class GapPotential(GapEffect, ContactLaw, Potential):
     """Contact by an energy of the gap between two surfaces, where they overlap.
 
     With a restitution, what impacts lose is the work in its account, which is never positive.
@@ -47,14 +44,6 @@ class GapPotential(ContactLaw, Potential):
         >>> contact = nc.GapPotential((*floor, nc.Point(nc.ground, (0, 0, 1))), gap, stiffness=1e5)
     """
 
-    gap: Gap = eqx.field(metadata=is_a(GAP))
-
-    unit_directions: ClassVar[bool] = True
-
-    def __check_init__(self) -> None:
-        """Refuse markers of another gap."""
-        require(self, "markers", self.gap.markers)
-
     def respond(self, place: Array, motion: Motion, now: StepContext, lam: Array) -> Response:
         """That of the potential, and more of it where the gap closes; together they never pull."""
         found = super().respond(place, motion, now, lam)
@@ -63,18 +52,10 @@ class GapPotential(ContactLaw, Potential):
         x, rates = place_markers(place, motion.rows), place_markers(place, motion.rates)
         flow = jax.vmap(lambda xi, vi: jax.jvp(self.invariants, (xi,), (vi,))[1])(x, rates)
         start: Any = self.invariants(place_markers(place, motion.start))
-        closing = self._closing(start, jnp.asarray(now.tableau.b) @ flow, now.h)
-        factor = 1.0 + jnp.maximum(self.damping * closing, -1.0)
+        factor = self.lossy(closing_speed(self.gap.distance, start, jnp.asarray(now.tableau.b) @ flow, now.h))
         forces: Any = found.forces
         given = found.power
         return replace_fields(found, forces=factor * forces, power=factor * given, released=given)
-
-    def _closing(self, start: Any, flow: Any, h: Any) -> Any:
-        """Mean rate at which the gap closes in the step [m/s]; at one instant the rate."""
-        moving = h > 0
-        distance = self.gap.distance
-        mean = (distance(start) - distance(start + h * flow)) / jnp.where(moving, h, 1.0)
-        return jnp.where(moving, mean, -jax.jvp(distance, (start,), (flow,))[1])
 
     def invariants(self, x: Float[Array, "k 3"]) -> Float[Array, " p"]:
         """Those of the gap."""
@@ -87,11 +68,3 @@ class GapPotential(ContactLaw, Potential):
     def linearised(self, place: Array, motion: Motion, now: StepContext, lam: Array) -> "GapPotential":
         """Itself: what is soft in the middle of a step may be stiff at its end."""
         return self
-
-    def readings(self, place: Array, rows: Array) -> ContactReadings:
-        """Gap and force."""
-        return self.readings_at(self.gap.distance(self.invariants(place_markers(place, rows))))
-
-    def touch(self, place: Array, rows: Array) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
-        """Where the surfaces touch [m], and the direction in which the second is pushed."""
-        return self.gap.touch(place_markers(place, rows))

@@ -1,5 +1,6 @@
 """What is the same of all contacts: the law of an overlap, what impacts lose, what a sensor shows."""
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any, ClassVar
 
@@ -11,9 +12,10 @@ from jaxtyping import Array, Float
 from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.checks import as_array
 from natcoord_jax.core.eager_numpy import eager_numpy
-from natcoord_jax.core.effect import Effect, replace_fields
+from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.kinds import Choice
 from natcoord_jax.core.numeric import Number
+from natcoord_jax.core.potential import MarkerEffect
 from natcoord_jax.maths.implicit import implicit_root
 from natcoord_jax.maths.vectors import positive_part, safe_sqrt
 
@@ -83,6 +85,16 @@ def _bisected(restitution: Float[Array, ""]) -> Float[Array, ""]:
     return jax.lax.scan(halved, ends, None, length=60)[0][0]
 
 
+def closing_speed(distance: Callable[[Array], Array], start: Array, flow: Array, h: Array) -> Array:
+    """Mean rate at which a gap closes in a step [m/s], by its invariants and their mean rates.
+
+    At one instant the rate.
+    """
+    moving = h > 0
+    mean = (distance(start) - distance(start + h * flow)) / jnp.where(moving, h, 1.0)
+    return jnp.where(moving, mean, -jax.jvp(distance, (start,), (flow,))[1])
+
+
 class ContactReadings(eqx.Module):
     """What goes on in a contact.
 
@@ -97,7 +109,7 @@ class ContactReadings(eqx.Module):
     energy: Float[Array, "*t"]
 
 
-class ContactLaw(Effect):
+class ContactLaw(MarkerEffect):
     """Base of contacts: how much a force an overlap has, and how much of an impact is left.
 
     With a restitution, what impacts lose is the work in its account, which is never positive.
@@ -155,6 +167,10 @@ class ContactLaw(Effect):
             return 0.4 * self.stiffness * overlap**2 * safe_sqrt(overlap)
         return 0.5 * self.stiffness * overlap**2
 
+    def lossy(self, closing: Array) -> Any:
+        """Factor of the force at a rate of closing [m/s], by which impacts lose; together they never pull."""
+        return 1.0 if self.damping is None else 1.0 + jnp.maximum(self.damping * closing, -1.0)
+
     def mean_force(self, before: Float[Array, ""], after: Float[Array, ""]) -> Float[Array, ""]:
         """What the energy of the overlap grows by from one gap to another, per what the gap falls by [N].
 
@@ -172,8 +188,17 @@ class ContactLaw(Effect):
         some = a + b > 0
         return 0.4 * self.stiffness * share * jnp.where(some, powers / jnp.where(some, a + b, 1.0), 0.0)
 
-    def readings_at(self, gap: Float[Array, ""]) -> ContactReadings:
-        """What a sensor shows at a gap."""
+    def gap_at(self, place: Array, rows: Array) -> Float[Array, ""]:
+        """Between the surfaces, of contacts with one gap [m]."""
+        raise NotImplementedError
+
+    def stored(self, place: Array, rows: Array, coordinates: Array, rates: Array) -> Float[Array, ""]:
+        """Energy [J]."""
+        return self.stored_at(self.gap_at(place, rows))
+
+    def readings(self, place: Array, rows: Array) -> ContactReadings:
+        """Gap and force."""
+        gap = self.gap_at(place, rows)
         overlap = positive_part(-gap)
         force = self.stiffness * overlap * (safe_sqrt(overlap) if self.law == HERTZ else 1.0)
         return ContactReadings(gap, force, self.stored_at(gap))

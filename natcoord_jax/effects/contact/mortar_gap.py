@@ -84,13 +84,14 @@ class MortarGap(DiscreteGap):
         area = jnp.sum(self._areas(x))
         return jnp.where(area > 0, area, 1.0)
 
-    def _mean(self, x: Float[Array, "k 3"]) -> Float[Array, ""]:
+    def gap(self, x: Float[Array, "k 3"]) -> Float[Array, ""]:
+        """The mean gap [m]."""
         gaps, areas = self._segments(x)
         return (jnp.sum(gaps) - self.thickness * jnp.sum(areas)) / self._area(x)
 
     def measured(self, x: Float[Array, "k 3"]) -> Measured:
         """The mean gap, its derivative, and all nodes."""
-        return Measured(*jax.value_and_grad(self._mean)(x), jnp.arange(len(x)))
+        return Measured(*jax.value_and_grad(self.gap)(x), jnp.arange(len(x)))
 
     def touch(self, place: Array, rows: Array) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
         """The node [m], and the force on the corners of the facets at it by the force of the law [-]."""
@@ -104,7 +105,7 @@ class MortarGap(DiscreteGap):
         count = len(other)
         both = jnp.concatenate([jnp.repeat(own, count, axis=0), jnp.tile(other, (len(own), 1))], axis=1)
         of, ends = jnp.repeat(of, count, axis=0), jnp.tile(ends, (len(own), 1))
-        mean, lever = jax.value_and_grad(self._mean)(x)
+        mean, lever = jax.value_and_grad(self.gap)(x)
         area, grown = jax.value_and_grad(self._area)(x)
 
         # A mean I / A is that where I - mean A vanishes.
@@ -122,9 +123,8 @@ class MortarGap(DiscreteGap):
 
     def readings(self, place: Array, rows: Array) -> ContactReadings:
         """Gap and force; the gap is infinite where no facet faces those at the node."""
-        x = place_markers(place, rows)
-        found = self.readings_at(self._mean(x))
-        covered = jnp.sum(self._segments(x)[1]) > 0
+        found = super().readings(place, rows)
+        covered = jnp.sum(self._segments(place_markers(place, rows))[1]) > 0
         return replace_fields(found, gap=jnp.where(covered, found.gap, jnp.inf))
 
     def uncovered(self, place: Array, rows: Float[Array, "k 4 3"]) -> dict[str, Array]:
@@ -133,4 +133,4 @@ class MortarGap(DiscreteGap):
         areas = self._segments(x)[1]
         beyond = jnp.sum(areas, axis=1) < COVERED * self._areas(x)
         at_rim = jnp.any((areas > 0) & (jnp.asarray(self.rims) > 0), axis=1)
-        return {LEFT: (self._mean(x) < 0) & jnp.any(beyond & at_rim)}
+        return {LEFT: (self.gap(x) < 0) & jnp.any(beyond & at_rim)}

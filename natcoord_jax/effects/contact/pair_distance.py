@@ -17,9 +17,10 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from natcoord_jax.core.gradient import averaged_gradient
-from natcoord_jax.effects.contact.law import ContactLaw
-from natcoord_jax.effects.contact.pairs import TOWARDS_MIDDLE, length, nearest_points, segment_distance_square
+from natcoord_jax.effects.contact.law import ContactLaw, closing_speed
+from natcoord_jax.effects.contact.pairs import TOWARDS_MIDDLE, nearest_points, segment_distance_square
 from natcoord_jax.maths.collocation import Tableau
+from natcoord_jax.maths.vectors import safe_sqrt
 from natcoord_jax.xla.materialise import materialised
 
 VECTORS: Any = {1: np.array([[1, -1]]), 2: np.array([[-1, 1, 0, 0], [0, 0, -1, 1], [1, 0, -1, 0]])}
@@ -53,7 +54,7 @@ def rates_of(at: Float[Array, "d 3 p"], velocity: Float[Array, "d 3 p"]) -> Floa
 
 def distance(found: Float[Array, "c p"]) -> Float[Array, " p"]:
     """Of the nearest points, by the products."""
-    return length(found[0] if found.shape[0] == 1 else segment_distance_square(found))
+    return safe_sqrt(found[0] if found.shape[0] == 1 else segment_distance_square(found))
 
 
 class Pushes(eqx.Module):
@@ -87,30 +88,18 @@ class Pushes(eqx.Module):
         before = distance(begun) - self.radii
         if begun.shape[0] == 1:
             # The change of a distance is that of the square over the sum of both: no digits cancel.
-            both = length(begun[0]) + length(begun[0] + self.h * flow[0])
+            both = safe_sqrt(begun[0]) + safe_sqrt(begun[0] + self.h * flow[0])
             inverse = jnp.where(both > 0, 1.0 / jnp.where(both > 0, both, 1.0), 0.0)
             closing = -inverse * flow[0]
             elastic = -(self.law.mean_force(before, before - self.h * closing) * inverse)[None]
         else:
             given = self.energy, begun, self.h * flow[None], self.tableau, None
-            elastic, closing = averaged_gradient(*given)[0], self._closing(begun, flow)
-        return elastic, self._lossy(closing) * elastic
-
-    def _lossy(self, closing: Float[Array, " p"]) -> Float[Array, " p"] | float:
-        """Factor of the force by which impacts lose, at a rate of closing [m/s]; never below 0."""
-        if self.law.damping is None:
-            return 1.0
-        return 1.0 + jnp.maximum(self.law.damping * closing, -1.0)
+            elastic, closing = averaged_gradient(*given)[0], closing_speed(distance, begun, flow, self.h)
+        return elastic, self.law.lossy(closing) * elastic
 
     def energy(self, found: Float[Array, "c p"]) -> Float[Array, " p"]:
         """Energy of each pair [J], by the products."""
         return self.law.stored_at(distance(found) - self.radii)
-
-    def _closing(self, begun: Float[Array, "c p"], flow: Float[Array, "c p"]) -> Float[Array, " p"]:
-        """Mean rate at which gaps close in the step [m/s]; at one instant the rate."""
-        moving = self.h > 0
-        mean = (distance(begun) - distance(begun + self.h * flow)) / jnp.where(moving, self.h, 1.0)
-        return jnp.where(moving, mean, -jax.jvp(distance, (begun,), (flow,))[1])
 
     def forces(
         self, gradient: Float[Array, "c p"], velocity: Float[Array, "d 3 p"]
@@ -159,7 +148,7 @@ class Pushes(eqx.Module):
         before, after = (distance(x) - self.radii for x in (begun, end))
 
         def push(after: Float[Array, " p"]) -> Float[Array, " p"]:
-            return self._lossy(rate * (before - after)) * self.law.mean_force(before, after)
+            return self.law.lossy(rate * (before - after)) * self.law.mean_force(before, after)
 
         force, softer = jax.jvp(push, (after,), (jnp.ones_like(after),))
         along, ended = materialised((_gradient(middle), _gradient(end)))

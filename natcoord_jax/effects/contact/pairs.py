@@ -10,7 +10,7 @@ from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.markers import Markers
 from natcoord_jax.core.numeric import Number, Numbers
 from natcoord_jax.effects.contact.gap import Gap
-from natcoord_jax.maths.vectors import dot
+from natcoord_jax.maths.vectors import dot, safe_sqrt
 
 RADIUS = Number("not negative")
 FLAT = 1e-6  # [rad] tilt of a disc below which friction is nearer to its centre than to its rim
@@ -18,14 +18,9 @@ TOWARDS_MIDDLE = 1e-3
 """How much nearest points of two segments are drawn to their middles: those of parallel ones are so told."""
 
 
-def length(square: Array) -> Array:
-    """Root of a square, with derivatives that are zero where it is."""
-    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
-
-
 def direction(vector: Float[Array, "3"]) -> Float[Array, "3"]:
     """Its direction; of nothing nothing."""
-    size = length(dot(vector, vector))
+    size = safe_sqrt(dot(vector, vector))
     return vector / jnp.where(size > 0, size, 1.0)
 
 
@@ -92,7 +87,7 @@ class SphereOnSphere(Gap):
 
     def distance(self, invariants: Float[Array, "1"]) -> Float[Array, ""]:
         """Distance less radii."""
-        return length(invariants[0]) - jnp.sum(self.radii)
+        return safe_sqrt(invariants[0]) - jnp.sum(self.radii)
 
     def contact(self, x: Float[Array, "2 3"]) -> tuple[Array, Array]:
         """On the line of centres, in the middle of the gap."""
@@ -121,7 +116,7 @@ class CapsuleOnCapsule(Gap):
 
     def distance(self, invariants: Float[Array, "6"]) -> Float[Array, ""]:
         """Distance of the nearest points less radii."""
-        return length(segment_distance_square(invariants)) - jnp.sum(self.radii)
+        return safe_sqrt(segment_distance_square(invariants)) - jnp.sum(self.radii)
 
     def contact(self, x: Float[Array, "4 3"]) -> tuple[Array, Array]:
         """On the line between the nearest points, in the middle of the gap."""
@@ -185,13 +180,13 @@ class EllipsoidOnPlane(Gap):
 
     def distance(self, invariants: Float[Array, "4"]) -> Float[Array, ""]:
         """Height less what the ellipsoid reaches along the normal (its support function)."""
-        return invariants[0] - length(jnp.sum((self.semi_axes * invariants[1:]) ** 2))
+        return invariants[0] - safe_sqrt(jnp.sum((self.semi_axes * invariants[1:]) ** 2))
 
     def contact(self, x: Float[Array, "6 3"]) -> tuple[Array, Array]:
         """The lowest point of the ellipsoid."""
         normal = direction(x[1])
         cosines = x[3:6] @ normal
-        size = length(jnp.sum((self.semi_axes * cosines) ** 2))
+        size = safe_sqrt(jnp.sum((self.semi_axes * cosines) ** 2))
         return x[2] - (self.semi_axes**2 * cosines / jnp.where(size > 0, size, 1.0)) @ x[3:6], normal
 
 
@@ -218,7 +213,7 @@ class DiscOnPlane(Gap):
 
     def distance(self, invariants: Float[Array, "2"]) -> Float[Array, ""]:
         """Height less what the rim reaches below the centre."""
-        return invariants[0] - self.radius * length(1.0 - invariants[1] ** 2)
+        return invariants[0] - self.radius * safe_sqrt(1.0 - invariants[1] ** 2)
 
     def contact(self, x: Float[Array, "4 3"]) -> tuple[Array, Array]:
         """The lowest point of the rim; of a disc that lies flat its centre, lest rounding choose a point."""

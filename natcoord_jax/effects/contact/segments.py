@@ -15,9 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from natcoord_jax.effects.contact.node_on_facets import ETA, XI
+from natcoord_jax.effects.contact.node_on_facets import ETA, XI, shapes
 from natcoord_jax.maths.triangle import THREE, TRIANGLE, WEIGHTS
-from natcoord_jax.maths.vectors import cross, dot, safe_norm, safe_sqrt
+from natcoord_jax.maths.vectors import cross, dot, safe_divide, safe_norm, safe_sqrt
 
 ITERATIONS = 6
 """Of Newton's method for natural coordinates, from the middle of a facet: distorted ones take five."""
@@ -99,11 +99,6 @@ def natural_coordinates(
     return found
 
 
-def shapes(natural: Float[Array, "2"]) -> Float[Array, "4"]:
-    """Shape functions of a quadrilateral."""
-    return 0.25 * (1 + XI * natural[0]) * (1 + ETA * natural[1])
-
-
 def whole(corners: Float[Array, "4 3"], of: Float[Array, "4"]) -> Float[Array, ""]:
     """Integral of some shape functions over a facet, along the normal at its middle [m^2].
 
@@ -119,15 +114,9 @@ def whole(corners: Float[Array, "4 3"], of: Float[Array, "4"]) -> Float[Array, "
 def _flat(corners: Float[Array, "4 3"], points: Float[Array, "n 3"]) -> tuple[Array, Array]:
     """Points in the plane of a facet, from its middle, and its normal; of no area nothing."""
     one, two = 0.25 * XI @ corners, 0.25 * ETA @ corners
-    normal = _unit(cross(one, two))
-    first = _unit(one)
+    normal, first = (safe_divide(x, safe_norm(x)[None]) for x in (cross(one, two), one))
     plane = jnp.stack([first, cross(normal, first)])
     return (points - jnp.mean(corners, axis=0)) @ plane.T, normal
-
-
-def _unit(vector: Float[Array, "3"]) -> Float[Array, "3"]:
-    size = safe_norm(vector)
-    return vector / jnp.where(size > 0, size, 1.0)
 
 
 def segment(

@@ -231,7 +231,7 @@ class Planar(Facing):
         return jnp.stack([dot(parent.axes[2], u), *_axis_parallel(parent, child)])
 
 
-class Screw(Facing):
+class Screw(Cylindrical):
     """Helical joint: a cylindrical joint that advances by `pitch` [m] per turn; 4 + 1 constraints.
 
     The pitch relation involves the angle and keeps its multiplier.
@@ -241,16 +241,6 @@ class Screw(Facing):
     pitch: Any = eqx.field(default=0.01, kw_only=True, metadata=is_a(Number()))
 
     kind: ClassVar[str] = "screw joint"
-    multipliers: ClassVar[int] = 4
-    rotations: ClassVar[tuple[int, ...]] = (2,)
-    translations: ClassVar[tuple[int, ...]] = (2,)
-    free: ClassVar[bool] = True
-    coordinates: ClassVar[tuple[Coordinate, ...]] = (Angle(), Displacement())
-
-    def residual(self, parent: Frame, child: Frame) -> Array:
-        """Those of the cylindrical joint."""
-        u = child.point - parent.point
-        return jnp.stack([dot(parent.axes[0], u), dot(parent.axes[1], u), *_axis_parallel(parent, child)])
 
     def companions(self, handle: Handle) -> list[Effect]:
         """The pitch relation: displacement - pitch / (2 pi) angle = 0."""

@@ -14,7 +14,7 @@ from natcoord_jax.core.markers import Markers
 from natcoord_jax.core.numeric import COMPONENTS, Number
 from natcoord_jax.maths.vectors import cross, safe_norm, unit
 
-VECTOR_OR_FUNCTION = COMPONENTS | FunctionOf("of time [s] to three numbers")
+LOAD = COMPONENTS | FunctionOf("of time [s] to three numbers")
 
 
 def _at(value: Any, t: Array) -> Array:
@@ -35,7 +35,7 @@ class PointForce(Force):
     """
 
     markers: Any = eqx.field(metadata=is_a(Markers(1, more=True)))
-    force: Any = eqx.field(kw_only=True, metadata=is_a(VECTOR_OR_FUNCTION))
+    force: Any = eqx.field(kw_only=True, metadata=is_a(LOAD))
     following: bool = eqx.field(default=False, kw_only=True, static=True, metadata=is_a(FLAG))
 
     kind: ClassVar[str] = "point force"
@@ -64,7 +64,7 @@ class BodyTorque(Force):
     """
 
     markers: Any = eqx.field(metadata=is_a(Markers(0, 1, more=True)))
-    torque: Any = eqx.field(kw_only=True, metadata=is_a(VECTOR_OR_FUNCTION))
+    torque: Any = eqx.field(kw_only=True, metadata=is_a(LOAD))
     following: bool = eqx.field(default=False, kw_only=True, static=True, metadata=is_a(FLAG))
 
     kind: ClassVar[str] = "body torque"
@@ -124,9 +124,6 @@ class Gravity(Field):
         return jnp.asarray(self.vector, float)
 
 
-LOAD = COMPONENTS | FunctionOf("of time [s] to three numbers")
-
-
 def edge_axes(x: Float[Array, "2 m 3"]) -> Float[Array, "3 3"]:
     """Along an edge, outwards in the surface, and normal to it, in rows, of two points with directors."""
     along = unit(x[1, 0] - x[0, 0])
@@ -168,7 +165,6 @@ class EdgeSegment(Force):
 
     def load(self, x: Float[Array, "2 m 3"], rate: Array, inputs: Array, t: Array) -> Load:
         """Half of it on each node."""
-        given = (jnp.asarray(v(t) if callable(v) else v, float) for v in (self.force, self.moment))
         axes = edge_axes(x) if self.following else jnp.eye(3)
-        force, moment = (0.5 * self.length * v @ axes for v in given)
+        force, moment = (0.5 * self.length * _at(v, t) @ axes for v in (self.force, self.moment))
         return Load(jnp.zeros_like(x).at[:, 0].set(force), jnp.stack([moment, moment]))

@@ -12,7 +12,7 @@ from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.kinds import of
 from natcoord_jax.core.numeric import COMPONENTS, Directions, Number
-from natcoord_jax.core.potential import Potential
+from natcoord_jax.core.potential import Potential, place_markers
 from natcoord_jax.effects.materials import MASS, Elastic, Laminate, Orthotropic, Sheet
 from natcoord_jax.maths.vectors import cross, dot
 
@@ -42,37 +42,6 @@ class ShellReadings(eqx.Module):
     shear_forces: Float[Array, "*t 2"]
     stress: Float[Array, "*t 2 3"]
     energy: Float[Array, "*t"]
-
-
-def readings_of(
-    sheet: Sheet,
-    half: Any,
-    offset: Any,
-    strain: Array,
-    curvature: Array,
-    shear: Array,
-    energy: Array,
-    pull: Any,
-) -> ShellReadings:
-    """Resultants and stresses of strains.
-
-    Args:
-        sheet: of the element, about its nodes.
-        half: of the thickness [m].
-        offset: of the middle of the thickness from the nodes [m].
-        strain: of the surface of the nodes.
-        curvature: [1/m].
-        shear: [-].
-        energy: [J].
-        pull: resultants that are there without strain [N/m].
-    """
-    sides = offset - half, offset + half
-    stress = [face @ (strain + z * curvature) + pull / (2 * half) for z, face in zip(sides, sheet.faces)]
-    resultants = sheet.membrane @ strain + sheet.coupling @ curvature + pull
-    moments = sheet.coupling @ strain + sheet.bending @ curvature + offset * pull
-    return ShellReadings(
-        strain, curvature, shear, resultants, moments, sheet.shear @ shear, jnp.stack(stress), energy
-    )
 
 
 FLAT = 1e-9
@@ -129,6 +98,15 @@ class LayerElement(Potential):
         """Stiffness times the time of the damping."""
         return None if self.damping is None else self.damping * self.stiffness
 
+    @abc.abstractmethod
+    def middle(self, x: Float[Array, "k 3"]) -> tuple[Float[Array, "3 m"], Float[Array, "2 s"]]:
+        """Strains and shears in the middle by the invariants of the membrane and of shear."""
+
+    @property
+    def places(self) -> Float[Array, "k 3"]:
+        """Of the nodes without stress [m]."""
+        return self.reference[:, 0] if self.bends else self.reference
+
     def assembled_at(self, x: Float[Array, "k *m 3"]) -> "LayerElement":
         """With the assembled pose as the one without stress, unless another is given."""
         given = (x[:, :2] if self.bends else x) if self.reference is None else self.reference
@@ -136,13 +114,12 @@ class LayerElement(Potential):
 
     def renewed(self) -> "LayerElement":
         """With the stiffness and the invariants of the pose without stress."""
-        points = self.reference[:, 0] if self.bends else self.reference
-        found, pull = self.matrices(points), None
+        found, pull = self.matrices(self.places), None
         stiffness, rest = found.stiffness if self.bends else found.membrane, self.invariants(self.reference)
         if self.prestress is not None:
             pull = jnp.zeros_like(rest)
             pull = pull.at[: found.stretching.shape[1]].set(jnp.asarray(self.prestress) @ found.stretching)
-        overlaps = self.overlaps_of(points)
+        overlaps = self.overlaps_of(self.places)
         return replace_fields(self, stiffness=stiffness, rest=rest, pull=pull, overlaps=overlaps)
 
     def sheet(self) -> Sheet:
@@ -163,7 +140,7 @@ class LayerElement(Potential):
         """Corners that are no corners, and directors along the surface."""
         if self.stiffness is None:
             return {}
-        x = self.reference[:, 0] if self.bends else self.reference
+        x = self.places
         sides = jnp.roll(x, -1, axis=0) - x
         corners = cross(jnp.roll(sides, 1, axis=0), sides)
         normal = jnp.sum(corners, axis=0)
@@ -196,11 +173,22 @@ class LayerElement(Potential):
         """The constant stiffness."""
         return self.stiffness
 
-    def read(self, strain: Array, curvature: Array, shear: Array, energy: Array) -> ShellReadings:
-        """What its sensor shows."""
-        offset = 0.0 if self.offset is None else self.offset
+    def readings(self, place: Array, rows: Array) -> ShellReadings:
+        """Strains of the surface of the nodes in the middle; resultants and stresses."""
+        found = self.invariants(place_markers(place, rows))
+        change, (strain_of, shear_of) = found - self.rest, self.middle(self.places)
+        count, energy = strain_of.shape[1], self.energy(found)
+        strain, curvature, shear = strain_of @ change[:count], jnp.zeros(3), jnp.zeros(2)
+        if self.bends:
+            curvature, shear = strain_of @ change[count : 2 * count], shear_of @ change[2 * count :]
+        sheet, half, offset = self.sheet(), 0.5 * self.thickness, 0.0 if self.offset is None else self.offset
         pull = jnp.zeros(3) if self.prestress is None else jnp.asarray(self.prestress)
-        return readings_of(self.sheet(), 0.5 * self.thickness, offset, strain, curvature, shear, energy, pull)
+        sides = offset - half, offset + half
+        stress = [face @ (strain + z * curvature) + pull / (2 * half) for z, face in zip(sides, sheet.faces)]
+        resultants = sheet.membrane @ strain + sheet.coupling @ curvature + pull
+        moments = sheet.coupling @ strain + sheet.bending @ curvature + offset * pull
+        forces = sheet.shear @ shear
+        return ShellReadings(strain, curvature, shear, resultants, moments, forces, jnp.stack(stress), energy)
 
 
 @eager_numpy

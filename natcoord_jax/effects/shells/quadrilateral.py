@@ -15,8 +15,7 @@ from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.kinds import Choice
 from natcoord_jax.core.markers import Markers
 from natcoord_jax.core.numeric import Numbers
-from natcoord_jax.core.potential import place_markers
-from natcoord_jax.effects.shells.layer import LayerElement, ShellReadings
+from natcoord_jax.effects.shells.layer import LayerElement
 from natcoord_jax.effects.shells.stiffness import (
     EDGES,
     QuadrilateralMatrices,
@@ -52,6 +51,11 @@ class Quadrilateral(LayerElement):
     def overlaps_of(self, x: Float[Array, "4 3"]) -> Float[Array, "4 4"]:
         """Of its nodes."""
         return overlaps_of(x)
+
+    def middle(self, x: Float[Array, "4 3"]) -> tuple[Array, Array]:
+        """By membrane invariants, and by shears."""
+        strain_of, inverse = cartesian(QuadrilateralSurface(x, self.direction).at(0.0, 0.0)[0])
+        return strain_of @ natural_strains(0.0, 0.0), inverse @ natural_shears(0.0, 0.0)
 
 
 class ShellElement(Quadrilateral):
@@ -109,16 +113,6 @@ class ShellElement(Quadrilateral):
         shear = (0.25 * dot(place[j] - place[i], director[i] + director[j]) for i, j in EDGES)
         return jnp.stack([*membrane_invariants(place), *bending, *shear])
 
-    def readings(self, place: Array, rows: Array) -> ShellReadings:
-        """Strains and stresses in the middle."""
-        found = self.invariants(place_markers(place, rows))
-        change = found - self.rest
-        surface = QuadrilateralSurface(self.reference[:, 0], self.direction)
-        strain_of, inverse = cartesian(surface.at(0.0, 0.0)[0])
-        strain, curvature = (strain_of @ natural_strains(0.0, 0.0) @ x for x in (change[:6], change[6:12]))
-        shear = inverse @ natural_shears(0.0, 0.0) @ change[12:]
-        return self.read(strain, curvature, shear, self.energy(found))
-
 
 class MembraneElement(Quadrilateral):
     """A quadrilateral of four points that resists stretching only.
@@ -159,10 +153,3 @@ class MembraneElement(Quadrilateral):
     def invariants(self, x: Float[Array, "4 3 *n"]) -> Float[Array, "6 *n"]:
         """Membrane [m^2]."""
         return jnp.stack(membrane_invariants(x))
-
-    def readings(self, place: Array, rows: Array) -> ShellReadings:
-        """Strains and stresses in the middle."""
-        found = self.invariants(place_markers(place, rows))
-        surface = QuadrilateralSurface(self.reference, self.direction)
-        strain = cartesian(surface.at(0.0, 0.0)[0])[0] @ natural_strains(0.0, 0.0) @ (found - self.rest)
-        return self.read(strain, jnp.zeros(3), jnp.zeros(2), self.energy(found))

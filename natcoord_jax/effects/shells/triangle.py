@@ -14,9 +14,8 @@ from jaxtyping import Array, Float
 from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.markers import Markers
 from natcoord_jax.core.numeric import Numbers
-from natcoord_jax.core.potential import place_markers
 from natcoord_jax.effects.materials import Sheet
-from natcoord_jax.effects.shells.layer import LayerElement, ShellReadings
+from natcoord_jax.effects.shells.layer import LayerElement
 from natcoord_jax.effects.shells.stiffness import along_axes, cartesian, dot
 
 MIDDLES = ((0.5, 0.0), (0.5, 0.5), (0.0, 0.5))
@@ -79,6 +78,11 @@ class Triangle(LayerElement):
         """Of its nodes."""
         return jacobian_of(x, None)[1] / 24.0 * (np.ones((3, 3)) + np.eye(3))
 
+    def middle(self, x: Float[Array, "3 3"]) -> tuple[Array, Array]:
+        """By membrane invariants, and by shears."""
+        strain_of, inverse = cartesian(jacobian_of(x, self.direction)[0])
+        return strain_of @ STRAINS, inverse @ natural_shears(1 / 3, 1 / 3)
+
 
 def membrane_invariants(place: Float[Array, "3 3 *n"]) -> tuple[Array, Array, Array]:
     """Products of the derivatives of the place [m^2]."""
@@ -130,15 +134,6 @@ class ShellTriangle(Triangle):
         shear = (0.5 * dot(place[j] - place[i], director[i] + director[j]) for i, j in EDGES)
         return jnp.stack([*membrane_invariants(place), *bending, *shear])
 
-    def readings(self, place: Array, rows: Array) -> ShellReadings:
-        """Strains and stresses; shears of the middle."""
-        found = self.invariants(place_markers(place, rows))
-        change = found - self.rest
-        strain_of, inverse = cartesian(jacobian_of(self.reference[:, 0], self.direction)[0])
-        strain, curvature = (strain_of @ STRAINS @ x for x in (change[:3], change[3:6]))
-        shear = inverse @ natural_shears(1 / 3, 1 / 3) @ change[6:]
-        return self.read(strain, curvature, shear, self.energy(found))
-
 
 class MembraneTriangle(Triangle):
     """A triangle of three points that resists stretching only.
@@ -169,9 +164,3 @@ class MembraneTriangle(Triangle):
     def invariants(self, x: Float[Array, "3 3 *n"]) -> Float[Array, "3 *n"]:
         """Membrane [m^2]."""
         return jnp.stack(membrane_invariants(x))
-
-    def readings(self, place: Array, rows: Array) -> ShellReadings:
-        """Strains and stresses."""
-        found = self.invariants(place_markers(place, rows))
-        strain_of = cartesian(jacobian_of(self.reference, self.direction)[0])[0] @ STRAINS
-        return self.read(strain_of @ (found - self.rest), jnp.zeros(3), jnp.zeros(2), self.energy(found))
