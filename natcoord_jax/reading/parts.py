@@ -111,11 +111,6 @@ def _fields(system: Model, name: str, found: dict[str, Place]) -> list[str]:
     return ["mass_block", *BODY[: 1 if index in system.structure.points else 3]]
 
 
-def _value(system: Model, place: Place) -> Array:
-    leaf = jnp.asarray(jax.tree.leaves(system)[place.leaf])
-    return leaf if place.row is None else leaf[place.row]
-
-
 @eager_numpy
 def _parted(block: Float[Array, "4 4"]) -> dict[str, Array]:
     """Mass [kg], centre of mass [m] and inertia about it [kg m^2] of a mass block (15)."""
@@ -158,7 +153,8 @@ def get(system: Model, part: Names, field: str | None = None) -> Any:
     (name,) = _names(part)
     found = places(system, name)
     known = _fields(system, name, found)
-    values = {key: _value(system, place) for key, place in found.items()}
+    leaves = jax.tree.leaves(system)
+    values = {key: jnp.asarray(leaves[x.leaf])[() if x.row is None else x.row] for key, x in found.items()}
     if "mass_block" in found:
         values |= _parted(values["mass_block"])
     values = {key: values[key] for key in known}

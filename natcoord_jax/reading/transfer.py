@@ -1,12 +1,13 @@
 """From one system to another in the middle of a motion: joints that close, and joints that open."""
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.checks import is_concrete
@@ -87,17 +88,10 @@ def check_joints(old: Model, new: Model) -> None:
             )
 
 
-def taking_hold(old: Model, new: Model, joints: np.ndarray) -> Bool[Array, " joints"]:
-    """Which joints of the new system touch a body of the old one."""
-    carried = np.array([name in old.structure.bodies for name in new.structure.bodies] + [False])
-    return jnp.any(jnp.asarray(carried)[new.joint_bodies[joints]], axis=1)
-
-
 def in_layout(old: Model, state: State, new: Model, onto: State | None) -> State:
     """A state by the names of another system; stored rates are those of rotors of the same name."""
     rest = [None] * 4 if onto is None else [onto.q, onto.v, onto.coordinates, onto.work]
-    names = [(name, row) for name in new.structure.bodies for row in range(4)]
-    old_names = [(name, row) for name in old.structure.bodies for row in range(4)]
+    old_names, names = ([(n, row) for n in x.structure.bodies for row in range(4)] for x in (old, new))
     rates = onto.rates if onto is not None else jnp.zeros(new.structure.rotors, state.q.dtype)
     return State(
         state.t,
@@ -217,16 +211,13 @@ def _transferred(system: Model, state: State, into: SomeModel, onto: State | Non
     joints = new_joints(system, into)
     if not joints.size:
         return into, moved
-    closes = taking_hold(system, into, joints)
+    # Those that touch a body of the old system.
+    carried = np.array([name in system.structure.bodies for name in into.structure.bodies] + [False])
+    closes = jnp.any(jnp.asarray(carried)[into.joint_bodies[joints]], axis=1)
     into = held(into, rows_with_ground(moved.q), joints, closes)
     moved = with_coordinates_of(into, moved, joints, closes)
-    return into, _after_impact(system, into, moved, jnp.any(closes))
-
-
-def _after_impact(system: Model, into: Model, moved: State, closes: Bool[Array, ""]) -> State:
-    """The state with velocities that the joints admit, if any closes."""
     found = with_admissible_velocities(into, moved, _rates_before(system, into, moved))[0]
-    return jax.tree.map(lambda x, y: jnp.where(closes, x, y), found, moved)
+    return into, jax.tree.map(partial(jnp.where, jnp.any(closes)), found, moved)
 
 
 def _rates_before(system: Model, into: Model, moved: State) -> Float[Array, " coordinates"]:

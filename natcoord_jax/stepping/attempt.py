@@ -284,7 +284,8 @@ def renewed_at(
     """New factors by formulas, and the iteration with them."""
     _, options = _judging(equations, it, None)
     loads = jax.tree.map(lambda x: jnp.where(asked.here, x, 0.0), asked.loads)
-    factors = factors_of(equations, equations.tangent(it.y, loads), factors.noise, equations.grain)
+    made = equations.factorised(equations.tangent(it.y, loads))
+    factors = factors_of(made, factors.noise, equations.grain)
     it = refreshed(it)
     # What the residual asks for with new factors needs no evaluation; but the kick in it may have been held.
     options |= {"whole": not setting.plan.tableau.kick}

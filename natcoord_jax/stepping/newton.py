@@ -276,7 +276,7 @@ def newton(equations: Any, tolerance: float) -> tuple[Float[Array, " unknowns"],
     """
 
     def renew(it: Iterate, factors: Factors) -> tuple[Iterate, Factors]:
-        return refreshed(it), factors_of(equations, equations.tangent(it.y), factors.noise)
+        return refreshed(it), factors_of(equations.factorised(equations.tangent(it.y)), factors.noise)
 
     def keep(it: Iterate, factors: Factors) -> tuple[Iterate, Factors]:
         return it, factors

@@ -291,8 +291,8 @@ class SlotSweep(ABC):
         u = slot.inputs(self.plan, system, parameters, slot.before)
         equations = prepare(system, slot.before, u, slot.fraction * dt, self.tableau)
         if not matrix.shape[0]:
-            return factors_of(equations, equations.tangent(slot.y))
+            return factors_of(equations.factorised(equations.tangent(slot.y)))
         matrix = matrix.T if self.columns else matrix
         if not equations.by_differences:
             matrix = jnp.where(rows > 0, matrix, equations.tangent(slot.y))
-        return factors_of(equations, matrix)
+        return factors_of(equations.factorised(matrix))
