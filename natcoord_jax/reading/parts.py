@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.core.bodies import mass_block
 from natcoord_jax.core.checks import as_array, is_concrete
-from natcoord_jax.core.eager_numpy import eager_numpy
+from natcoord_jax.core.eager_numpy import broadcast, eager_numpy
 from natcoord_jax.core.effect import Effect, replace_fields
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.inertia import diagonal, even, is_even, possible, tensor, to_second_moment
@@ -128,18 +128,6 @@ def _block(mass: Array, com: Float[Array, "3"], inertia: Float[Array, "3 3"]) ->
 
 
 @eager_numpy
-def _moments(block: Float[Array, "4 4"]) -> tuple[Array, Array, Array]:
-    """Mass [kg], and second moments about the centre of mass and the reference point [kg m^2]."""
-    mass, first, about = block[0, 0], block[0, 1:], block[1:, 1:]
-    return mass, about - jnp.outer(first, first) / mass, about
-
-
-@eager_numpy
-def _for_all(value: Array, shape: tuple[int, ...]) -> Array:
-    return jnp.broadcast_to(value, shape)
-
-
-@eager_numpy
 def _with_row(leaf: Array, row: int | None, value: Array) -> Array:
     return value if row is None else leaf.at[row].set(value)
 
@@ -238,9 +226,10 @@ def _as_block(name: str, now: dict[str, Array], given: dict[str, Array]) -> dict
         if len(given) > 1:
             raise ValueError(f"{label}: pass mass_block, or some of {list(BODY)}, not both")
         block = even(given["mass_block"], f"{label}: mass_block [kg, kg m, kg m^2]")
-        mass, central, about = _moments(block)
+        parts = _parted(block)
+        mass, central = parts["mass"], to_second_moment(parts["inertia"])
         in_range(MASS, mass, f"{label}: mass [kg]")
-        return {"mass_block": possible(block, central / (mass > 0), about, label, "mass_block")}
+        return {"mass_block": possible(block, central / (mass > 0), block[1:, 1:], label, "mass_block")}
     if "mass" in given:
         given = {**given, "mass": in_range(MASS, given["mass"], f"{label}: mass [kg]")}
     if "inertia" not in now:
@@ -291,7 +280,7 @@ def _fitting(value: Any, now: Array, k: int | None, count: int, label: str, *, e
     if label.endswith(": inertia") and array.shape in ((3,), (count, 3)):
         array = _principal(array, several=k is not None)
     if every and k is None and array.shape == now.shape[1:]:
-        array = _for_all(array, now.shape)
+        array = broadcast(array, now.shape)
     shapes = [now.shape] + ([(count, *now.shape)] if k is not None else [])
     if array.shape not in shapes:
         wanted = " or ".join(map(str, shapes))

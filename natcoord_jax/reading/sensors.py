@@ -166,15 +166,6 @@ class JointSensor(eqx.Module):
         return torque if self.lever is None else torque + cross(self.lever, found.forces[..., self.index, :])
 
 
-def _continuous(quaternions: Float[Array, "*t 4"], along: bool) -> Float[Array, "*t 4"]:
-    """Signs chosen so that neighbours along the last leading axis are close to each other."""
-    if not along:
-        return quaternions
-    products = jnp.sum(quaternions[..., 1:, :] * quaternions[..., :-1, :], axis=-1)
-    flips = jnp.cumprod(jnp.where(products < 0, -1.0, 1.0), axis=-1)
-    return quaternions.at[..., 1:, :].multiply(flips[..., None])
-
-
 def _centres(mass: Float[Array, "bodies 4 4"]) -> Float[Array, "bodies 4"]:
     """Marker weights of the centres of mass; of bodies without mass those of the reference point."""
     total = mass[:, :1, 0]
@@ -187,7 +178,12 @@ def _body_pose(system: Model, states: State, index: Array, along: bool) -> tuple
     rows = states.rows[..., index, :, :]
     rotation = jnp.swapaxes(rows[..., 1:, :], -1, -2)
     mass = _centres(system.mass)[index]
-    quaternion = _continuous(to_quaternion(rotation), along)
+    quaternion = to_quaternion(rotation)
+    if along:
+        # Signs chosen so that neighbours are close to each other.
+        products = jnp.sum(quaternion[..., 1:, :] * quaternion[..., :-1, :], axis=-1)
+        flips = jnp.cumprod(jnp.where(products < 0, -1.0, 1.0), axis=-1)
+        quaternion = quaternion.at[..., 1:, :].multiply(flips[..., None])
     return rows[..., 0, :], rotation, quaternion, jnp.sum(mass[:, None] * rows, axis=-2)
 
 

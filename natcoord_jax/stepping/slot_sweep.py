@@ -254,10 +254,8 @@ class SlotSweep(ABC):
             waiting = replace_fields(c, solution=solution, at=at, factors=factors, stuck=stuck)
             return jax.tree.map(partial(jnp.where, stuck), waiting, done), found, matrix
 
-        def going(carry: tuple[SweepCarry, Any, Array]) -> Array:
-            return (carry[0].left > first) & ~carry[0].stuck
-
-        return jax.lax.while_loop(going, one, (c, found, matrix))
+        start = c, found, matrix
+        return jax.lax.while_loop(lambda carry: (carry[0].left > first) & ~carry[0].stuck, one, start)
 
     def _formed(self, solving: Callable, start: tuple[Array, Any, LinearIteration], matrix: Array) -> tuple:
         """The system of a slot solved; or, where factors do not serve, its matrix formed for new ones.

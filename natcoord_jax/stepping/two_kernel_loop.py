@@ -206,10 +206,8 @@ def _by_rounds(
         def renewed(found: LoopCarry) -> tuple[Iterate, Factors]:
             return as_one_kernel(partial(renewal, near), found)
 
-        def kept(found: LoopCarry) -> tuple[Iterate, Factors]:
-            return found.course.it, found.factors
-
-        it, factors = jax.lax.cond(found.asked.wanting, renewed, kept, found)
+        kept = found.course.it, found.factors
+        it, factors = jax.lax.cond(found.asked.wanting, renewed, lambda _: kept, found)
         made = it, factors, jnp.array(False)
         return eqx.tree_at(lambda c: (c.course.it, c.factors, c.asked.wanting), found, made), record
 
