@@ -14,7 +14,7 @@ from natcoord_jax.core.bodies import mass_block
 from natcoord_jax.core.checks import as_array, is_concrete
 from natcoord_jax.core.eager_numpy import broadcast, eager_numpy
 from natcoord_jax.core.effect import Effect, replace_fields
-from natcoord_jax.core.handles import Handle
+from natcoord_jax.core.handles import Handle, named
 from natcoord_jax.core.inertia import diagonal, even, is_even, possible, tensor, to_second_moment
 from natcoord_jax.core.kinds import is_other
 from natcoord_jax.core.names import listed
@@ -42,7 +42,7 @@ class Place(NamedTuple):
 
 def _names(part: Names) -> tuple[str, ...]:
     listed = [part] if isinstance(part, Handle | str) else part
-    return tuple(x.name if isinstance(x, Handle) else x for x in listed)
+    return tuple(map(named, listed))
 
 
 def _several(system: Model, part: Names) -> Names:

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.core.bodies import by_node
 from natcoord_jax.core.compiled import compiled
-from natcoord_jax.core.handles import Handle
+from natcoord_jax.core.handles import Handle, named
 from natcoord_jax.core.markers import Interpolated, Marker
 from natcoord_jax.core.names import clamped
 from natcoord_jax.core.names import listed as listed_names
@@ -242,8 +242,8 @@ def sense(
 ) -> Any:
     """Sensor of a body, a joint, a marker or elements of beams; see `System.sense`."""
     states = states_of(motion)
-    named = part.name if isinstance(part, Handle) else part
-    if about is not None and (not isinstance(named, str) or named not in system.structure.joints):
+    sensed = named(part)
+    if about is not None and (not isinstance(sensed, str) or sensed not in system.structure.joints):
         raise ValueError(f"{part!r} has no reaction about a point: pass `about` with a joint")
     source = Source.of(system, motion, inputs_along(system, motion, inputs))
     if isinstance(part, Interpolated):
@@ -259,7 +259,7 @@ def sense(
     if isinstance(part, tuple) and not part:
         raise ValueError("cannot sense nothing: the tuple of elements is empty")
     listed = part if isinstance(part, tuple) else (part,)
-    names = tuple(x.name if isinstance(x, Handle) else x for x in listed)
+    names = tuple(map(named, listed))
     if any(tells(group, names[0]) for group in system.effects):
         found = readings(system, states, names)
         axis = states.t.ndim

@@ -24,7 +24,7 @@ from natcoord_jax.stepping.newton import any_lane
 from natcoord_jax.stepping.plan import Plan
 from natcoord_jax.stepping.record import Parameters, ParameterTangents, Record, Slot
 from natcoord_jax.stepping.rollout_state import Predictor
-from natcoord_jax.stepping.slot_sweep import Fixed, SlotSweep, SweepCarry
+from natcoord_jax.stepping.slot_sweep import Fixed, SlotSweep, SweepCarry, outcome
 from natcoord_jax.system import System
 
 MANY = 8
@@ -119,7 +119,7 @@ class Backward(SlotSweep):
         at_slot = numbers.varied, slot.before, tangents, slot.u
         nothing = jax.tree.map(jnp.zeros_like, at_slot)
 
-        _, pull = jax.vjp(partial(self.outcome, numbers, slot), *at_slot, slot.y)
+        _, pull = jax.vjp(partial(outcome, self.plan, numbers, slot), *at_slot, slot.y)
 
         def solve(lam: Array, learnt: Any, at: LinearIteration) -> tuple:
             ends: Any = arrived, tangents_bar
@@ -228,7 +228,7 @@ class Forward(SlotSweep):
 
         # One product serves for everything: first without the unknowns, for r; then with them alone. A second
         # one would save some time and compile for as long again.
-        _, along = jax.linearize(partial(self.outcome, numbers, slot), *at_slot, slot.y)
+        _, along = jax.linearize(partial(outcome, self.plan, numbers, slot), *at_slot, slot.y)
         changes = varied_dot, *arrived, u_dot
         none, nothing = jnp.zeros_like(slot.fraction), jax.tree.map(jnp.zeros_like, (slot.before, tangents))
         foreseen = replace_fields(c.own[2], order=c.pasts[0].order).guess

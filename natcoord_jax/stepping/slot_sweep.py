@@ -28,7 +28,7 @@ from natcoord_jax.stepping.newton import any_lane
 from natcoord_jax.stepping.plan import Plan
 from natcoord_jax.stepping.record import Parameters, Record, Slot
 from natcoord_jax.stepping.rollout_state import Predictor
-from natcoord_jax.stepping.step import advance_between
+from natcoord_jax.stepping.step import advance
 from natcoord_jax.xla.one_kernel import in_few_kernels, lane_by_lane
 from natcoord_jax.xla.rows import part, row, with_part, with_row
 from natcoord_jax.xla.tracing import traced_once
@@ -85,6 +85,24 @@ class SweepCarry(eqx.Module):
     stuck: Bool[Array, ""]
 
 
+def outcome(
+    plan: Plan,
+    numbers: Parameters,
+    slot: Slot,
+    varied: list[Array],
+    state: State,
+    tangents: Tangents | None,
+    u: Any,
+    y: Array,
+) -> tuple[Array, State, Tangents | None]:
+    """Residual of a slot's equations, the state at its end, and what the constraints admit there."""
+    system, parameters, dt = numbers.whole(varied)
+    u = slot.inputs(plan, system, parameters, state) if u is None else u
+    system, h = part_of_step(system, state, u, dt, y, plan.tableau, slot)
+    residual, after, tangents = advance(system, state, u, h, y, plan.tableau, tangents)
+    return residual, slot.settled(after), tangents
+
+
 class SlotSweep(ABC):
     """Slots from the last one to the first; hashable, without traced values.
 
@@ -135,23 +153,6 @@ class SlotSweep(ABC):
         if not self.tableau.kick:
             return None
         return with_system(tangents_at(numbers.whole(varied)[0], state), None)
-
-    def outcome(
-        self,
-        numbers: Parameters,
-        slot: Slot,
-        varied: list[Array],
-        state: State,
-        tangents: Tangents | None,
-        u: Any,
-        y: Array,
-    ) -> tuple[Array, State, Tangents | None]:
-        """Residual of a slot's equations, the state at its end, and what the constraints admit there."""
-        system, parameters, dt = numbers.whole(varied)
-        u = slot.inputs(self.plan, system, parameters, state) if u is None else u
-        system, h = part_of_step(system, state, u, dt, y, self.tableau, slot)
-        residual, after, tangents = advance_between(system, state, tangents, u, h, y, self.tableau)
-        return residual, slot.settled(after), tangents
 
     def every(self, record: Record, given: Any) -> Any:
         """Everything: in one kernel for all slots, or one for each part if that takes too long to compile."""
