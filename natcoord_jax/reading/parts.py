@@ -148,9 +148,7 @@ def get(system: Model, part: Names, field: str | None = None) -> Any:
     values = {key: values[key] for key in known}
     if field is None:
         return values
-    field = _whole_name(field, known)
-    _check(name, known, field, next(iter(found.values()), None))
-    return values[field]
+    return values[_whole_name(name, known, field, next(iter(found.values()), None))]
 
 
 def set_numbers(system: SomeModel, part: Names, values: dict[str, Any]) -> SomeModel:
@@ -166,8 +164,8 @@ def set_numbers(system: SomeModel, part: Names, values: dict[str, Any]) -> SomeM
         kind = next(iter(found.values()), None)
         now = get(system, name)
         given = {}
-        for field, value in ((_whole_name(field, known), value) for field, value in values.items()):
-            _check(name, known, field, kind)
+        for field, value in values.items():
+            field = _whole_name(name, known, field, kind)
             label = f"{name!r}: {field}"
             every = found[field].row is None if field in found else False
             given[field] = _fitting(value, now[field], k if many else None, len(names), label, every=every)
@@ -241,20 +239,17 @@ def _as_block(name: str, now: dict[str, Array], given: dict[str, Array]) -> dict
     return {"mass_block": _block(*(given.get(key, now[key]) for key in BODY))}
 
 
-def _whole_name(field: str, known: list[str]) -> str:
+def _whole_name(name: str, known: list[str], field: str, place: Place | None) -> str:
     """Name of a number of a part: "E" stands for "material.E" where there is no other."""
-    ends = [key for key in known if key.endswith(f".{field}")]
-    return ends[0] if field not in known and len(ends) == 1 else field
-
-
-def _check(name: str, known: list[str], field: str, place: Place | None) -> None:
-    if field not in known:
+    ends = [key for key in known if key == field] or [key for key in known if key.endswith(f".{field}")]
+    if len(ends) != 1:
         label = repr(name) if place is None else place.kind
         raise ValueError(
             f"the {label} has no number {field!r}; it has {known}. Not among them are what a function closes "
             "over (change it where it is, the next call sees it) and what only the assembled pose takes, as "
             "the point and the zero of a joint (change it in the scene, and compile that)"
         )
+    return ends[0]
 
 
 def _principal(array: Array, *, several: bool) -> Array:

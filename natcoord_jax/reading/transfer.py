@@ -34,11 +34,13 @@ def _merged(
     return found.at[here].set(old[there])
 
 
-def check_bodies(old: Model, new: Model, onto: State | None) -> None:
+def _check_parts(old: Model, new: Model, onto: State | None) -> None:
     """Bodies of the old system must be in the new one, and the other way round where no state has them.
 
+    Joints of both must join the same bodies; that is looked at in concrete systems only.
+
     Raises:
-        ValueError: naming the bodies that are missing.
+        ValueError: naming the bodies that are missing, or a joint that joins others.
     """
     before, after = set(old.structure.bodies), set(new.structure.bodies)
     if before - after:
@@ -51,6 +53,19 @@ def check_bodies(old: Model, new: Model, onto: State | None) -> None:
             f"the old state says nothing of the bodies {sorted(after - before)}; pass a state of the new "
             "system that has them as `onto`"
         )
+    if not is_concrete(old.joint_bodies, new.joint_bodies):
+        return
+    pairs = []
+    for system, numbers in zip((old, new), common_joints(old, new)):
+        names = (*system.structure.bodies, ground.name)
+        ends = np.asarray(system.joint_bodies)[numbers]
+        pairs.append([(system.structure.joints[j], names[a], names[b]) for j, (a, b) in zip(numbers, ends)])
+    for before, after in zip(*pairs):
+        if before != after:
+            raise ValueError(
+                f"joint {before[0]!r} joins {before[1:]} in the old system and {after[1:]} in the new one; "
+                "give the new joint another name"
+            )
 
 
 def common_joints(old: Model, new: Model) -> tuple[np.ndarray, np.ndarray]:
@@ -65,27 +80,6 @@ def new_joints(old: Model, new: Model) -> np.ndarray:
     """Numbers of the joints that only the new system has."""
     known = {*old.structure.joints, ""}
     return np.array([k for k, name in enumerate(new.structure.joints) if name not in known], int)
-
-
-def check_joints(old: Model, new: Model) -> None:
-    """Joints of both systems must join the same bodies; looks at concrete systems only.
-
-    Raises:
-        ValueError: naming a joint that does not.
-    """
-    if not is_concrete(old.joint_bodies, new.joint_bodies):
-        return
-    pairs = []
-    for system, numbers in zip((old, new), common_joints(old, new)):
-        names = (*system.structure.bodies, ground.name)
-        ends = np.asarray(system.joint_bodies)[numbers]
-        pairs.append([(system.structure.joints[j], names[a], names[b]) for j, (a, b) in zip(numbers, ends)])
-    for before, after in zip(*pairs):
-        if before != after:
-            raise ValueError(
-                f"joint {before[0]!r} joins {before[1:]} in the old system and {after[1:]} in the new one; "
-                "give the new joint another name"
-            )
 
 
 def in_layout(old: Model, state: State, new: Model, onto: State | None) -> State:
@@ -194,8 +188,7 @@ def transfer(
         >>> float((state.q[4, 0] - state.q[0, 0]).round(12))
         0.5
     """
-    check_bodies(system, into, onto)
-    check_joints(system, into)
+    _check_parts(system, into, onto)
     made, moved = _transferred(system, state, into, onto)
     names = {into.structure.joints[int(j)] for j in new_joints(system, into)}
     if names and is_concrete(made, moved):

@@ -76,11 +76,11 @@ def _followed(
         kicks = in_body_axes(course.state, kick)
         solution = jnp.concatenate([it.y, kicks])
         inertias = jnp.concatenate([inertias, jnp.zeros_like(kicks)])
-    alone = Predictor(
-        course.past.differences, jnp.ones_like(course.past.known), jnp.zeros_like(course.past.order)
-    )
+    first, *more = course.past.differences
     if trial is not None:
-        alone = alone.beginning_with(solution, solved)
+        # An attempt that was made for comparison has a solution, too, if there is one.
+        first = jnp.where(solved, solution, first)
+    alone = Predictor((first, *more), jnp.ones_like(course.past.known), jnp.zeros_like(course.past.order))
     followed = course.past.followed_by(solution, inertias)
     past = jax.tree.map(lambda x, y: jnp.where(kept, x, y), followed, alone)
     same = fraction == course.fraction

@@ -63,9 +63,13 @@ def prepared(system: System, state: State, *, assembled: bool, chosen: str | Non
         solver = dense_solver(system.effects, system.mass_between is not None)
         structure = dataclasses.replace(structure, solver=solver)
         system = replace_fields(system, structure=structure)
-    notes = size_notes(system)
-    for note in notes:
-        warnings.warn(note, stacklevel=4)
+    notes, unknowns = (), 6 * len(structure.bodies) + sum(g.count * g.multipliers for g in system.joints)
+    if structure.solver == "full" and unknowns > DENSE_LIMIT:
+        notes = (
+            f"{unknowns} unknowns in loops or couplings across the tree are solved densely: time per step "
+            "grows with the third power of their number",
+        )
+        warnings.warn(notes[0], stacklevel=4)
     structure = dataclasses.replace(
         structure,
         dofs=structure.unknowns - rank,
@@ -79,18 +83,6 @@ def prepared(system: System, state: State, *, assembled: bool, chosen: str | Non
 
 def _with_pattern(system: System, state: State) -> System:
     return with_sparsity(system, state) if system.structure.solver == "sparse" else system
-
-
-def size_notes(system: System) -> tuple[str, ...]:
-    """Warnings about the cost of a system."""
-    structure = system.structure
-    unknowns = 6 * len(structure.bodies) + sum(g.count * g.multipliers for g in system.joints)
-    if structure.solver == "full" and unknowns > DENSE_LIMIT:
-        return (
-            f"{unknowns} unknowns in loops or couplings across the tree are solved densely: time per step "
-            "grows with the third power of their number",
-        )
-    return ()
 
 
 FAR = 1e30  # [N s] a pull that no contact bears, whatever its gap

@@ -50,11 +50,6 @@ class Predictor(eqx.Module):
         rest = (jnp.zeros_like(y),) * ORDER
         return cls((y, *rest), jnp.array(1), jnp.array(0))
 
-    def beginning_with(self, y: Float[Array, " unknowns"], solved: Bool[Array, ""]) -> "Predictor":
-        """With the solution of an attempt that was made for comparison, if there is one."""
-        first, *rest = self.differences
-        return Predictor((jnp.where(solved, y, first), *rest), self.known, self.order)
-
     @property
     def guess(self) -> Float[Array, " unknowns"]:
         """Extrapolated by the polynomial that was best last time."""

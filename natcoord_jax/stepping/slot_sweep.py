@@ -229,7 +229,8 @@ class SlotSweep(ABC):
             c, found, matrix = carry
             here = c.left - 1 - first
             slot, own_given = jax.tree.map(lambda x: row(x, here), (slots, given))
-            c = replace_fields(c, at=c.at.unless(~slot.accepted))
+            # Of an attempt that failed there is nothing to solve.
+            c = eqx.tree_at(lambda c: c.at.done, c, c.at.done | ~slot.accepted)
             arrived = self.arriving(c.own, own_given)
             solving = self.solving(fixed, slot, arrived, own_given, c)
             start = c.solution, c.factors.changing, c.at
@@ -274,9 +275,13 @@ class SlotSweep(ABC):
         def trip(carry: tuple) -> tuple:
             _, (solution, learnt, at), _, matrix = carry
             forming = at.forming
-            given = jnp.where(forming, at.unit(solution), solution)
+            # The product with a unit vector is the next row.
+            unit = jnp.where(jnp.arange(solution.shape[0]) == at.rows, 1.0, 0.0)
+            given = jnp.where(forming, unit, solution)
             found, learnt, at, outcome, product = solving(given, learnt, at)
-            at, matrix = at.formed(forming, matrix, product)
+            place = jnp.minimum(at.rows, matrix.shape[0] - 1)
+            matrix = with_row(matrix, place, jnp.where(forming, product, row(matrix, place)))
+            at = eqx.tree_at(lambda c: c.rows, at, at.rows + forming)
             return at.forming, (jnp.where(forming, solution, found), learnt, at), outcome, matrix
 
         begun = jnp.ones_like(start[2].forming), start, nothing, matrix
