@@ -77,10 +77,6 @@ class Bodies:
         found[kept] = before + np.arange(len(kept))
         return found
 
-    def clamped(self, name: str) -> list[tuple[np.ndarray, Handle]]:
-        """Numbers of the clamped nodes of a set, and the bodies that they are clamped to."""
-        return [(clamp.nodes.numbers, clamp.body) for clamp in self.clamps if clamp.nodes.name == name]
-
     @property
     def held(self) -> tuple[tuple[str, str, int, int], ...]:
         """Names of a set and of what nodes of it are clamped to, how many these are, and of how many."""

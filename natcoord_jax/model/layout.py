@@ -70,7 +70,8 @@ class Layout:
         """Of all nodes of a set their body's number in the scene, and their rows as weights of its rows."""
         numbers = self.bodies.places(name)
         rows = np.broadcast_to(np.eye(4), (len(numbers), 4, 4)).copy()
-        for members, owner in self.bodies.clamped(name):
+        for clamp in (clamp for clamp in self.bodies.clamps if clamp.nodes.name == name):
+            members, owner = clamp.nodes.numbers, clamp.body
             numbers[members] = self.poses.of(owner)
             for k in members:
                 held = self.poses.held(Handle("body", f"{name}[{k}]", owner.scene))

@@ -66,7 +66,9 @@ class Backward(SlotSweep):
         numbers, slots = record.numbers, record.slots
         y, before_all = slots.y[-1], jax.tree.map(lambda x: x[0], slots.before)
         state_bar = jax.tree.map(jnp.zeros_like, before_all)
-        own = state_bar, self._no_change(numbers, before_all), jax.tree.map(jnp.zeros_like, numbers.varied)
+        shapes = jax.eval_shape(partial(self.admitted, numbers, numbers.varied), before_all)
+        none = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+        own = state_bar, none, jax.tree.map(jnp.zeros_like, numbers.varied)
         like = slots.u, (slots.y, slots.before) if self.forced else None
         start = y, record.factors, own
         fixed = Fixed.of(self.tableau, record)
@@ -76,10 +78,6 @@ class Backward(SlotSweep):
             return ParameterTangents(varied_bar, u_bar, state_bar, forced_bar)
         varied_bar, state_bar = kernel(self._before_all, numbers, before_all, c)
         return ParameterTangents(varied_bar, u_bar, state_bar, forced_bar)
-
-    def _no_change(self, numbers: Parameters, state: State) -> Tangents | None:
-        shapes = jax.eval_shape(partial(self.admitted, numbers, numbers.varied), state)
-        return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
 
     def _before_all(self, numbers: Parameters, state: State, c: SweepCarry) -> tuple[list[Array], State]:
         """Cotangents of what varies and of the first state, with those of the tangent space there."""
