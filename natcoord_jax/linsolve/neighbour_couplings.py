@@ -52,10 +52,6 @@ class NeighbourCouplings(eqx.Module):
 
         return apply
 
-    def apply(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
-        """Product with a vector."""
-        return self.product()(x)
-
     def transpose(self) -> "NeighbourCouplings":
         """The transposed matrix."""
         turned = jnp.swapaxes(self.stiffness[::-1], 1, 2)
@@ -63,7 +59,7 @@ class NeighbourCouplings(eqx.Module):
 
     def to_dense(self) -> Float[Array, "n n"]:
         """The matrix."""
-        return jax.vmap(self.apply, out_axes=1)(jnp.eye(self.size, dtype=self.across.dtype))
+        return jax.vmap(self.product(), out_axes=1)(jnp.eye(self.size, dtype=self.across.dtype))
 
     def times(self, factor: float) -> "NeighbourCouplings":
         """Multiplied by a number."""

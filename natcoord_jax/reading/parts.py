@@ -54,12 +54,6 @@ def _several(system: Model, part: Names) -> Names:
     return parts or part
 
 
-def _numbered(system: SomeModel) -> SomeModel:
-    """The system with the numbers of its leaves instead of these."""
-    leaves, structure = jax.tree.flatten(system)
-    return jax.tree.unflatten(structure, range(len(leaves)))
-
-
 def _in_group(group: Group, numbered: Group, name: str) -> dict[str, Place]:
     """Floating numbers of an effect, or of the relation of a joint."""
     row = group.names.index(name) if group.lanes and name in group.names else None
@@ -83,7 +77,9 @@ def places(system: Model, name: str) -> dict[str, Place]:
     Raises:
         ValueError: for a name that is no part of the system.
     """
-    numbered, structure = _numbered(system), system.structure
+    leaves, tree = jax.tree.flatten(system)
+    # The system with the numbers of its leaves instead of these.
+    numbered, structure = jax.tree.unflatten(tree, range(len(leaves))), system.structure
     found: dict[str, Place] = {}
     if name in structure.bodies:
         leaf: Any = numbered.mass

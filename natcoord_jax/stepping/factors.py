@@ -92,10 +92,6 @@ class Factors(eqx.Module):
         leaving, learnt = changes
         return replace_fields(self, leaving=leaving, solver=self.solver if learnt is None else learnt)
 
-    def aged(self) -> "Factors":
-        """Factors for another system, in which corrections may leave more."""
-        return eqx.tree_at(lambda f: f.leaving, self, jnp.minimum(AGEING * self.leaving, 1.0))
-
     def left_by(self, ratio: Array, first: Array) -> Float[Array, ""]:
         """Error that is expected after a correction, in terms of its size.
 

@@ -21,7 +21,7 @@ from natcoord_jax.maths.collocation import Tableau
 from natcoord_jax.mechanics.block_tangent_space import Tangents, tangents_at, with_system
 from natcoord_jax.mechanics.equations import kind_of, prepare
 from natcoord_jax.mechanics.start_cache import NOTHING
-from natcoord_jax.stepping.factors import Factors, factors_of
+from natcoord_jax.stepping.factors import AGEING, Factors, factors_of
 from natcoord_jax.stepping.linear_iteration import LinearIteration
 from natcoord_jax.stepping.located import part_of_step
 from natcoord_jax.stepping.newton import any_lane
@@ -248,7 +248,8 @@ class SlotSweep(ABC):
             guess = pasts[0].guess
             guess = jnp.where(jnp.all(jnp.isfinite(guess)), guess, 0.0)
             following = LinearIteration.first(solution, factors, self._formed_first(fixed, factors))
-            aged = factors.aged()
+            # In another system corrections may leave more.
+            aged = replace_fields(factors, leaving=jnp.minimum(AGEING * factors.leaving, 1.0))
             if slot.event is not None:
                 # The time of an impact is in its own equations only: elsewhere its factors leave an error.
                 aged = replace_fields(aged, usable=aged.usable & (slot.event < 0))
