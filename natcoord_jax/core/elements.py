@@ -95,10 +95,7 @@ class Elements(eqx.Module):
 
 @eager_numpy
 def _assembled(effect: Effect, place: Array, rows: Array) -> Effect:
-    def one(effect: Effect, place: Array, rows: Array) -> Effect:
-        return effect.assembled_at(place_markers(place, rows))
-
-    return jax.vmap(one)(effect, place, rows)
+    return jax.vmap(lambda one, *where: one.assembled_at(place_markers(*where)))(effect, place, rows)
 
 
 def on(

@@ -132,8 +132,7 @@ def stabilised(apply: Callable[[Array], Array], right: Float[Array, " n"]) -> Fl
         return count + 1, x, r, first, r + kept * (p - second * image), following
 
     def going(carry: tuple) -> Array:
-        count, _, r, *_ = carry
-        return (count < MOST) & (jnp.sum(r * r) > ENOUGH**2 * whole)
+        return (carry[0] < MOST) & (jnp.sum(carry[2] ** 2) > ENOUGH**2 * whole)
 
     begun = right - apply(right)
     start = jnp.zeros((), jnp.int32), right, begun, begun, begun, jnp.sum(begun * begun)

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.results import Result
 from natcoord_jax.core.state import State
 from natcoord_jax.mechanics.failures import result_of
@@ -111,7 +112,8 @@ def _next_part(
     if trial is None:
         return done, jnp.where(complete, 1.0, fraction), None, left
     left = jnp.where(verdict.change < 0, trial.left, left)
-    trial = trial.beginning(done, complete).leaving(left, verdict.accepted | verdict.failed)
+    before = jnp.where(verdict.accepted | verdict.failed, left, trial.left)
+    trial = replace_fields(trial.beginning(done, complete), left=before)
     return done, jnp.where(complete, trial.length, fraction), trial, left
 
 
