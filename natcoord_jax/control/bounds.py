@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from natcoord_jax.core.arguments import Part, is_a
 from natcoord_jax.core.callables import Function
 from natcoord_jax.core.checks import for_each, is_concrete
-from natcoord_jax.core.handles import Handle
+from natcoord_jax.core.handles import Handle, named
 from natcoord_jax.core.kinds import BODY_NAME, JOINT_NAME, NAME, FunctionOf, HandleOf, Several, of
 from natcoord_jax.core.numeric import Directions, Number, Numbers, Whole
 from natcoord_jax.core.state import State
@@ -46,7 +46,7 @@ class Bound(Part):
     def __and__(self, other: "Bound") -> "Bound":
         if not isinstance(other, Bound):
             return NotImplemented
-        return All((*_parts(self), *_parts(other)))
+        return All((self, other))
 
 
 class All(Bound):
@@ -66,14 +66,6 @@ class All(Bound):
         """The same with the limits of inputs so many times as wide; itself if it has none."""
         parts = tuple(part.widened(factor) for part in self.parts)
         return self if all(a is b for a, b in zip(parts, self.parts)) else All(parts)
-
-
-def _parts(bound: Bound) -> tuple[Bound, ...]:
-    return bound.parts if isinstance(bound, All) else (bound,)
-
-
-def _name(part: Any) -> str:
-    return part.name if isinstance(part, Handle) else str(part)
 
 
 class Range(Bound):
@@ -156,7 +148,7 @@ class Input(Range):
 
     def names(self, system: System) -> tuple[str, ...]:
         """Names of the channels."""
-        channels = system.structure.inputs if self.channel is None else (_name(self.channel),)
+        channels = system.structure.inputs if self.channel is None else (named(self.channel),)
         return tuple(f"input {name!r}" for name in channels)
 
     def widened(self, factor: Any) -> Bound:
@@ -186,7 +178,7 @@ class Coordinate(Range):
 
     def names(self, system: System) -> tuple[str, ...]:
         """The joint."""
-        return (f"coordinate {self.index} of {_name(self.joint)!r}",)
+        return (f"coordinate {self.index} of {named(self.joint)!r}",)
 
 
 class Rate(Range):
@@ -208,7 +200,7 @@ class Rate(Range):
 
     def names(self, system: System) -> tuple[str, ...]:
         """The joint."""
-        return (f"rate {self.index} of {_name(self.joint)!r}",)
+        return (f"rate {self.index} of {named(self.joint)!r}",)
 
 
 class KeepOut(Bound):
@@ -235,7 +227,7 @@ class KeepOut(Bound):
 
     def labels(self, system: System) -> tuple[str, ...]:
         """The body."""
-        return (f"keep-out cone of {_name(self.body)!r}",)
+        return (f"keep-out cone of {named(self.body)!r}",)
 
 
 class Path(Bound):

@@ -172,9 +172,9 @@ def check(
     if refine:
         for steps in (problem.steps // 2, 2 * problem.steps):
             if steps >= 1 and (make is not None or steps % problem.inputs.every == 0):
-                again = optimise(
-                    make(steps) if make else _with_steps(problem, steps), solution, progress=False
-                )
+                dt = problem.dt * problem.steps / steps
+                finer = make(steps) if make else dataclasses.replace(problem, dt=dt, steps=steps)
+                again = optimise(finer, solution, progress=False)
                 if again.ok:
                     costs[steps] = again.cost
         order, extrapolated = _refinement(costs)
@@ -195,13 +195,6 @@ def check(
         errors[1],
         *hamiltonian,
     )
-
-
-def _with_steps(problem: OptimalControl, steps: int) -> OptimalControl:
-    """The problem with another number of steps over the same time."""
-    dt = problem.dt * problem.steps / steps
-    fields = {f.name: getattr(problem, f.name) for f in dataclasses.fields(problem)}
-    return OptimalControl(**{**fields, "dt": dt, "steps": steps})
 
 
 def _refinement(costs: dict[int, float]) -> tuple[float | None, float | None]:

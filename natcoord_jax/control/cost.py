@@ -41,7 +41,7 @@ class Cost(Part):
     def __add__(self, other: "Cost") -> "Cost":
         if not isinstance(other, Cost):
             return NotImplemented
-        return Sum((*_terms(self), *_terms(other)))
+        return Sum((self, other))
 
 
 class Sum(Cost):
@@ -56,10 +56,6 @@ class Sum(Cost):
     def terminal(self, system: System, state: State) -> Float[Array, ""]:
         """Sum of the terminal costs."""
         return sum((c.terminal(system, state) for c in self.terms), jnp.zeros(()))
-
-
-def _terms(cost: Cost) -> tuple[Cost, ...]:
-    return cost.terms if isinstance(cost, Sum) else (cost,)
 
 
 class Effort(Cost):

@@ -4,6 +4,7 @@ What they serve is improved until the exact conditions hold, which needs them to
 for derivatives of gradients is three times that of the gradients, and as long to compile.
 """
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -33,17 +34,13 @@ def sizes(problem: OptimalControl, path: Path, unknowns: Unknowns) -> Point:
     nodes, q = path.nodes, problem.state.q.size
     bounds = (0, q, 2 * q, 2 * q + problem.state.coordinates.size, nodes.x.shape[1])
     pieces = [_largest(nodes.x[:, a:b]) for a, b in zip(bounds[:-1], bounds[1:])]
-    node = jnp.concatenate([*pieces, jnp.ones(nodes.free.shape[1]), _largest(_flat(nodes.register))])
+    node = jnp.concatenate([*pieces, jnp.ones(nodes.free.shape[1]), _largest(nodes.register)])
     return Point(node, _largest(entering(problem, unknowns.coefficients)), _largest(unknowns.y))
 
 
-def _flat(x: Array) -> Array:
-    return x.reshape(x.shape[0], -1)
-
-
 def _largest(x: Array) -> Array:
-    """The largest magnitude of all entries, once for every column."""
-    return jnp.full(x.shape[1], jnp.max(jnp.abs(x), initial=0.0))
+    """The largest magnitude of all entries, once for every entry of a row."""
+    return jnp.full(math.prod(x.shape[1:]), jnp.max(jnp.abs(x), initial=0.0))
 
 
 def _ratio(direction: Point, sizes: Point) -> Array:

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from natcoord_jax.control.tangent import steady_rates
 from natcoord_jax.core.arguments import Part, is_a
 from natcoord_jax.core.callables import Function
-from natcoord_jax.core.handles import Handle
+from natcoord_jax.core.handles import Handle, named
 from natcoord_jax.core.kinds import BODY_NAME, JOINT_NAME, NAME, FunctionOf, Several, of
 from natcoord_jax.core.numeric import COMPONENTS, Number, Numbers, Rotations, Whole
 from natcoord_jax.core.state import State
@@ -41,7 +41,7 @@ class Goal(Part):
     def __and__(self, other: "Goal") -> "Goal":
         if not isinstance(other, Goal):
             return NotImplemented
-        return All((*_parts(self), *_parts(other)))
+        return All((self, other))
 
 
 class All(Goal):
@@ -56,14 +56,6 @@ class All(Goal):
     def labels(self, system: System) -> tuple[str, ...]:
         """Labels of all parts."""
         return tuple(label for part in self.parts for label in part.labels(system))
-
-
-def _parts(goal: Goal) -> tuple[Goal, ...]:
-    return goal.parts if isinstance(goal, All) else (goal,)
-
-
-def _name(part: Any) -> str:
-    return part.name if isinstance(part, Handle) else str(part)
 
 
 class Attitude(Goal):
@@ -90,7 +82,7 @@ class Attitude(Goal):
 
     def labels(self, system: System) -> tuple[str, ...]:
         """Three components of the rotation that is missing."""
-        return tuple(f"attitude of {_name(self.body)!r}, {axis} [rad]" for axis in "xyz")
+        return tuple(f"attitude of {named(self.body)!r}, {axis} [rad]" for axis in "xyz")
 
 
 class Position(Goal):
@@ -114,7 +106,7 @@ class Position(Goal):
 
     def labels(self, system: System) -> tuple[str, ...]:
         """Three components."""
-        return tuple(f"position on {_name(self.body)!r}, {axis} [m]" for axis in "xyz")
+        return tuple(f"position on {named(self.body)!r}, {axis} [m]" for axis in "xyz")
 
 
 class Motion(Goal):
@@ -143,7 +135,7 @@ class Motion(Goal):
         """Three components of each."""
         kinds = (("velocity", "m/s"), ("angular velocity", "rad/s"))
         return tuple(
-            f"{kind} of {_name(self.body)!r}, {axis} [{unit}]" for kind, unit in kinds for axis in "xyz"
+            f"{kind} of {named(self.body)!r}, {axis} [{unit}]" for kind, unit in kinds for axis in "xyz"
         )
 
 
@@ -166,7 +158,7 @@ class Coordinate(Goal):
 
     def labels(self, system: System) -> tuple[str, ...]:
         """The coordinate."""
-        return (f"coordinate {self.index} of {_name(self.joint)!r} [rad or m]",)
+        return (f"coordinate {self.index} of {named(self.joint)!r} [rad or m]",)
 
 
 class Rate(Goal):
@@ -188,7 +180,7 @@ class Rate(Goal):
 
     def labels(self, system: System) -> tuple[str, ...]:
         """The rate."""
-        return (f"rate {self.index} of {_name(self.joint)!r} [rad/s or m/s]",)
+        return (f"rate {self.index} of {named(self.joint)!r} [rad/s or m/s]",)
 
 
 class Rest(Goal):

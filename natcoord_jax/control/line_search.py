@@ -179,9 +179,6 @@ def search(
         finite = whole & jnp.isfinite(violated) & jnp.isfinite(costs)
         return Found(a, unknowns, slacks, path, finite & taken, for_cost & lower, spent + newton, corrected)
 
-    def unfinished(found: Found) -> Array:
-        return ~found.fine & (found.length > longest * 0.5**HALVINGS)
-
     nothing = jax.tree.map(jnp.zeros_like, (iterate.unknowns, s))
 
     def body(found: Found) -> Found:
@@ -195,7 +192,8 @@ def search(
     # The first attempt is a turn of the loop like the others, so that it is compiled once.
     no = jnp.array(False)
     begun = Found(2.0 * longest, iterate.unknowns, s, iterate.path, no, no, jnp.array(0), no)
-    return jax.lax.while_loop(unfinished, body, begun)
+    least = longest * 0.5**HALVINGS
+    return jax.lax.while_loop(lambda found: ~found.fine & (found.length > least), body, begun)
 
 
 def second_order_correction(

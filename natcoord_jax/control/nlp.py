@@ -114,9 +114,7 @@ def _both(problem: OptimalControl, unknowns: Unknowns) -> tuple[Array, Array]:
     return path.cost, jnp.concatenate([part.reshape(-1) for part in parts])
 
 
-@compiled
-def _values(problem: OptimalControl, unknowns: Unknowns) -> tuple[Array, Array]:
-    return _both(problem, unknowns)
+_values = compiled(_both)
 
 
 @compiled

@@ -82,10 +82,6 @@ def _convex(problem: OptimalControl, iterate: Iterate, found: Model, reach: Arra
     def attempt(shift: Array) -> Factors:
         return factored(found, bounds, idle, shift, iterate.penalty, soft, reach, iterate.unit, held)
 
-    def unfinished(carry: tuple) -> Array:
-        factors, shift, begun = carry
-        return ~begun | (~factors.convex & (shift < LARGEST_SHIFT))
-
     # None is tried first, as long as steps are found.
     last = iterate.shift
     least = jnp.where(iterate.failures > 0, jnp.maximum(10.0 * last, SHIFT), 0.0)
@@ -99,7 +95,11 @@ def _convex(problem: OptimalControl, iterate: Iterate, found: Model, reach: Arra
         return attempt(shift), shift, jnp.array(True)
 
     attempt, nothing = traced_once(attempt, least)
-    factors, shift, _ = jax.lax.while_loop(unfinished, body, (nothing, least, jnp.array(False)))
+    factors, shift, _ = jax.lax.while_loop(
+        lambda carry: ~carry[2] | (~carry[0].convex & (carry[1] < LARGEST_SHIFT)),
+        body,
+        (nothing, least, jnp.array(False)),
+    )
     return factors, shift
 
 

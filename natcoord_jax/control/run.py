@@ -83,7 +83,6 @@ def optimise(
     lifted = chosen(problem, method, guess)
     if isinstance(guess, Solution):
         guess = guess.guess(problem.steps)
-
     guess = guess if isinstance(guess, Guess) else Guess(inputs=guess)
     start = unknowns_of(problem, guess, lifted)
     outside = outside_at_start(problem)

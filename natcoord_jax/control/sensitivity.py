@@ -18,14 +18,10 @@ from natcoord_jax.control.linearisation import first_gradient
 from natcoord_jax.control.problem import OptimalControl, numeric
 from natcoord_jax.control.run import DEFAULT, OPTIONS, optimise_jit
 from natcoord_jax.control.transcription import (
-    Node,
-    Path,
     Unknowns,
-    end,
+    corrected,
     entering,
-    first_node,
     slices,
-    stage,
 )
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.checks import at_top_level
@@ -60,32 +56,13 @@ class Conditions(eqx.Module):
     cost: Float[Array, ""]
 
 
-def _followed(problem: OptimalControl, unknowns: Unknowns, inverses: Array) -> tuple[Path, Unknowns]:
-    """A motion that obeys its equations, and its unknowns, as functions of inputs and of what is free.
-
-    One Newton correction with a given Jacobian changes nothing at a motion, and has the derivatives of the
-    solution.
-    """
-    w = entering(problem, unknowns.coefficients)
-    first = first_node(problem, unknowns.free, unknowns.coefficients[: problem.inputs.degree])
-
-    def body(node: Node, given: tuple) -> tuple[Node, tuple]:
-        at, w, y, inverse = given
-        y = y - inverse @ stage(problem, at, node, w, y).residual
-        found = stage(problem, at, node, w, y)
-        return found.after, (node, found, y)
-
-    given = (slices(problem), w, unknowns.y, inverses)
-    last, (nodes, stages, y) = jax.lax.scan(body, first, given)
-    nodes = jax.tree.map(lambda x, x1: jnp.concatenate([x, x1[None]]), nodes, last)
-    return Path(nodes, stages, end(problem, last)), eqx.tree_at(lambda u: u.y, unknowns, y)
-
-
 def _conditions(
     problem: OptimalControl, unknowns: Unknowns, multipliers: Multipliers, inverses: Array
 ) -> Conditions:
     """Gradient of the Lagrangian by costates, and goal, bounds of steps and bounds of what is free."""
-    path, unknowns = _followed(problem, unknowns, inverses)
+    # One Newton correction with a given Jacobian changes nothing at a motion, and has the derivatives of the
+    # solution: of the motion and its unknowns as functions of inputs and of what is free.
+    path, unknowns = corrected(problem, unknowns, inverses)
     jacobians = step_jacobians(problem, path, unknowns)
     before, last = (jax.tree.map(itemgetter(s), path.nodes) for s in (slice(None, -1), -1))
     worth = ravel_pytree(jax.grad(lambda node: scored_end(problem, multipliers, node))(last))[0]

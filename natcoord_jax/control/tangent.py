@@ -6,8 +6,6 @@ order dt^2; it needs two numbers for every free motion instead of twelve for eve
 those of the step itself.
 """
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -25,17 +23,6 @@ SMALL = 1e-13
 """Regularisation of the inertia of the free motions, relative; motions without inertia are left alone."""
 
 
-def _moving(system: System, rows: Array, velocity: Array, spin: Array) -> tuple[Array, Array]:
-    """Velocities of rows, and rates of joint coordinates, of a motion of all bodies."""
-    moving = row_rates(rows, velocity, spin)
-    still = jnp.zeros((1, *NODE), rows.dtype)
-    every = jnp.concatenate([spin, still[:, 0]])
-    rates = coordinate_rates(
-        system, rows_with_ground(rows.reshape(-1, 3)), jnp.concatenate([moving, still]), every
-    )
-    return moving, rates
-
-
 def _rotor_places(system: System) -> Array:
     """Coordinates whose rates are stored."""
     places = [group.coordinates[:, 0] for group in system.effects if group.effect.rotors]
@@ -50,8 +37,13 @@ def _with_mass(system: System, rates: Array) -> Array:
     )
 
 
-def _free_motions(system: System, rows: Array) -> tuple[Any, Any]:
-    """Velocities of rows from rates of the free motions, and what forces on rows do along them."""
+def steady_rates(system: System, state: State) -> Float[Array, " n"]:
+    """Rates of the free motions with the momenta of a state: the projection in the metric of the mass.
+
+    Unlike the relative rates of joints it sees nothing of velocities normal to the constraints, so that
+    rates vanish together with momenta.
+    """
+    rows = state.rows
     velocity, spin = null_space(system, rows)
 
     def rates_of(w: Array) -> Array:
@@ -60,17 +52,6 @@ def _free_motions(system: System, rows: Array) -> tuple[Any, Any]:
     def along(force: Array) -> Array:
         return jax.vjp(rates_of, jnp.zeros(velocity.shape[1], rows.dtype))[1](force)[0]
 
-    return rates_of, along
-
-
-def steady_rates(system: System, state: State) -> Float[Array, " n"]:
-    """Rates of the free motions with the momenta of a state: the projection in the metric of the mass.
-
-    Unlike the relative rates of joints it sees nothing of velocities normal to the constraints, so that
-    rates vanish together with momenta.
-    """
-    rows = state.rows
-    rates_of, along = _free_motions(system, rows)
     units = jnp.eye(system.structure.unknowns, dtype=rows.dtype)
     inertia = jax.vmap(lambda unit: along(_with_mass(system, rates_of(unit).reshape(-1, 3))))(units)
     diagonal = jnp.diagonal(inertia)
@@ -114,7 +95,9 @@ def tangent_maps(
     count, size = velocity.shape[1], state.q.size
 
     def column(v: Array, omega: Array) -> tuple[Array, Array, Array]:
-        moved, rates = _moving(system, rows, v, omega)
+        moved, still = row_rates(rows, v, omega), jnp.zeros((1, *NODE), rows.dtype)
+        moving, spin = jnp.concatenate([moved, still]), jnp.concatenate([omega, still[:, 0]])
+        rates = coordinate_rates(system, rows_with_ground(state.q), moving, spin)
         turned = jax.jvp(lambda r: row_rates(r, *twists(system, r, w)), (rows,), (moved,))[1]
         return moved.reshape(-1), turned.reshape(-1), rates
 

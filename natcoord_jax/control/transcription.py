@@ -179,16 +179,26 @@ def end(problem: OptimalControl, node: Node) -> End:
 
 def roll(problem: OptimalControl, unknowns: Unknowns) -> Path:
     """The motion of given unknowns; its residuals need not vanish."""
+    return corrected(problem, unknowns)[0]
+
+
+def corrected(
+    problem: OptimalControl, unknowns: Unknowns, inverses: Array | None = None
+) -> tuple[Path, Unknowns]:
+    """The motion of unknowns that are corrected by inverses of the Jacobians of the steps, and these."""
     w = entering(problem, unknowns.coefficients)
     first = first_node(problem, unknowns.free, unknowns.coefficients[: problem.inputs.degree])
 
-    def body(node: Node, given: tuple) -> tuple[Node, tuple[Node, Stage]]:
-        found = stage(problem, given[0], node, given[1], given[2])
-        return found.after, (node, found)
+    def body(node: Node, given: tuple) -> tuple[Node, tuple[Node, Stage, Array]]:
+        at, w, y, inverse = given
+        y = y if inverse is None else y - inverse @ stage(problem, at, node, w, y).residual
+        found = stage(problem, at, node, w, y)
+        return found.after, (node, found, y)
 
-    last, (nodes, stages) = jax.lax.scan(body, first, (slices(problem), w, unknowns.y))
+    given = slices(problem), w, unknowns.y, inverses
+    last, (nodes, stages, y) = jax.lax.scan(body, first, given)
     nodes = jax.tree.map(lambda x, x1: jnp.concatenate([x, x1[None]]), nodes, last)
-    return Path(nodes, stages, end(problem, last))
+    return Path(nodes, stages, end(problem, last)), eqx.tree_at(lambda u: u.y, unknowns, y)
 
 
 def held_inputs(problem: OptimalControl, coefficients: Float[Array, "c m"]) -> Float[Array, "steps m"]:

@@ -84,12 +84,11 @@ class Declaration:
     def _check_names(self, positional: Sequence[Any], named: Mapping[str, Any], label: str) -> None:
         by_name = [f"{name}=" for name in self.kinds if name not in self.order]
         if len(positional) > len(self.order):
-            first = (
-                f"takes {', '.join(self.order)} by position" if self.order else "takes nothing by position"
+            taken, extra = ", ".join(self.order) or "nothing", short(positional[len(self.order)])
+            raise TypeError(
+                f"{label} takes {taken} by position, and got {extra} besides; pass it by name: "
+                f"{', '.join(by_name)}"
             )
-            rest = positional[len(self.order)]
-            raise TypeError(f"{label} {first}, and got {short(rest)} besides; pass it by name: "
-                            f"{', '.join(by_name)}")  # fmt: skip
         unknown = [name for name in named if name not in self.kinds]
         if unknown:
             raise TypeError(

@@ -45,9 +45,13 @@ class Function(eqx.Module):
 
 def replace_fields(module: M, **fields: Any) -> M:
     """Copy of a module with other values in some fields, whatever its constructor takes."""
-    fresh = object.__new__(type(module))
-    for field in dataclasses.fields(module):
-        object.__setattr__(fresh, field.name, fields.get(field.name, getattr(module, field.name)))
+    return _made_anew(type(module), module, fields)
+
+
+def _made_anew(cls: type, module: Any, fields: dict[str, Any]) -> Any:
+    fresh = object.__new__(cls)
+    for name in (field.name for field in dataclasses.fields(cls)):
+        object.__setattr__(fresh, name, fields[name] if name in fields else getattr(module, name))
     return fresh
 
 
@@ -167,12 +171,7 @@ def name_of(part: Any) -> str:
 
 def looked(module: Any, seen: Any) -> Any:
     """A module whose methods are those that were seen."""
-    cls = _looked_class(type(module))
-    fresh = object.__new__(cls)
-    for field in dataclasses.fields(module):
-        object.__setattr__(fresh, field.name, getattr(module, field.name))
-    object.__setattr__(fresh, "seen", seen)
-    return fresh
+    return _made_anew(_looked_class(type(module)), module, {"seen": seen})
 
 
 @lru_cache(maxsize=4096)

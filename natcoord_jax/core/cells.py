@@ -81,12 +81,11 @@ def _halfway(nodes: np.ndarray, edges: tuple[tuple[int, int], ...]) -> np.ndarra
 _TWENTY = _halfway(CORNERS, EDGES)
 _ALL = np.concatenate([_TWENTY, MIDDLES])
 _TEN = _halfway(TETRAHEDRON, TETRAHEDRON_EDGES)
-_SQUARED_ONCE = tuple(p for p in _powers(2, 4, 1))
 
 CELLS = {
     8: Cell("hexahedra", CORNERS, SIDES, _powers(1, 3)),
     10: Cell("quadratic tetrahedra", _TEN, _curved(_TEN, TETRAHEDRON_SIDES), _powers(2, 2)),
-    20: Cell("hexahedra of twenty nodes", _TWENTY, _curved(_TWENTY, SIDES), _SQUARED_ONCE),
+    20: Cell("hexahedra of twenty nodes", _TWENTY, _curved(_TWENTY, SIDES), _powers(2, 4, 1)),
     27: Cell("hexahedra of 27 nodes", _ALL, _curved(_ALL, SIDES), _powers(2, 6)),
 }
 """Kinds of cells of solids by the number of their nodes."""

@@ -195,7 +195,9 @@ def _slotted(call: Call, tree: Any) -> Any:
             return Slot([], {}, position)
         grown = _grown(x, seen.origin.part)
         before = {name: getattr(seen.origin.part, name) for name in grown}
-        return Slot(_own_leaves(replace_fields(x, **before) if grown else x), grown, position)
+        now = replace_fields(x, **before) if grown else x
+        leaves = jax.tree.leaves(now, is_leaf=lambda x: isinstance(x, Seen))
+        return Slot([leaf for leaf in leaves if not isinstance(leaf, Seen)], grown, position)
 
     return jax.tree.map(slot, tree, is_leaf=lambda x: isinstance(x, Seen | Looked))
 
@@ -208,11 +210,6 @@ def _grown(module: Looked, part: Any) -> dict[str, Any]:
         if before is None and now is not None:
             found[name] = now
     return found
-
-
-def _own_leaves(module: Looked) -> list[Any]:
-    leaves = jax.tree.leaves(module, is_leaf=lambda x: isinstance(x, Seen))
-    return [x for x in leaves if not isinstance(x, Seen)]
 
 
 def _called(part: Any, method: str, call: Call, arguments: Any) -> Any:

@@ -127,6 +127,9 @@ def stacked(items: Sequence[Any]) -> Any:
     return jnp.stack(items)
 
 
+broadcast = eager_numpy(jnp.broadcast_to)
+"""The same of `jnp.broadcast_to`."""
+
 PLAIN = (bool, int, float, complex, str, bytes, np.generic)
 """Values that cannot change."""
 

@@ -11,7 +11,7 @@ from natcoord_jax.core.arguments import declared
 from natcoord_jax.core.checks import as_array, is_concrete
 from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.effect import Effect, replace_fields
-from natcoord_jax.core.flaws import first_flaw
+from natcoord_jax.core.flaws import flaws_of
 from natcoord_jax.core.kinds import is_other
 from natcoord_jax.core.markers import Attachment, Marker, Point
 from natcoord_jax.core.nodes import NodeSet, NodeUnion
@@ -73,7 +73,7 @@ class Elements(eqx.Module):
         found = given
         if type(bare).assembled_at is not Effect.assembled_at:
             found = _assembled(given, as_array(weights), rows)
-        flaw = first_flaw(found)
+        flaw, _ = flaws_of(found)
         if flaw is not None:
             number, said = flaw
             raise ValueError(
@@ -95,10 +95,7 @@ class Elements(eqx.Module):
 
 @eager_numpy
 def _assembled(effect: Effect, place: Array, rows: Array) -> Effect:
-    def one(effect: Effect, place: Array, rows: Array) -> Effect:
-        return effect.assembled_at(place_markers(place, rows))
-
-    return jax.vmap(one)(effect, place, rows)
+    return jax.vmap(lambda one, *where: one.assembled_at(place_markers(*where)))(effect, place, rows)
 
 
 def on(

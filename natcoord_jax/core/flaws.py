@@ -12,30 +12,20 @@ from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.effect import Effect
 
 
-def first_flaw(effect: Effect) -> tuple[int, str] | None:
-    """The first of stacked instances with which something is wrong, and what, see `Part.flaws`.
+def flaws_of(effect: Effect) -> tuple[tuple[int, str] | None, list[Bool[Array, " n"]]]:
+    """What is wrong with stacked instances and with what is in their fields, as their material.
 
     Args:
         effect: instances, leading axis of all numbers.
+
+    Returns:
+        Number of the first with which something is wrong, and what, see `Part.flaws`; None: nothing is known
+        to be. And with which something is, as far as that is traced.
     """
-    for said, wrong in _flaws(effect).items():
-        if is_concrete(wrong) and np.any(np.asarray(wrong)):
-            return int(np.flatnonzero(np.asarray(wrong))[0]), said
-    return None
-
-
-def traced_flaws(effect: Effect) -> list[Bool[Array, " n"]]:
-    """With which of stacked instances something is wrong, as far as that is traced.
-
-    Args:
-        effect: instances, leading axis of all numbers.
-    """
-    return [wrong for wrong in _flaws(effect).values() if not is_concrete(wrong)]
-
-
-def _flaws(effect: Effect) -> dict[str, Array]:
-    """Those of all instances and of what is in their fields, as their material."""
-    return _of_lanes(effect) if any(type(part).flaws is not Part.flaws for part in parts(effect)) else {}
+    flaws = _of_lanes(effect) if any(type(part).flaws is not Part.flaws for part in parts(effect)) else {}
+    known = {said: np.flatnonzero(wrong) for said, wrong in flaws.items() if is_concrete(wrong)}
+    first = next(((int(numbers[0]), said) for said, numbers in known.items() if numbers.size), None)
+    return first, [wrong for said, wrong in flaws.items() if said not in known]
 
 
 @eager_numpy

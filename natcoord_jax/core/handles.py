@@ -1,6 +1,7 @@
 """Handles: how a script refers to what it has added to a scene."""
 
 from dataclasses import dataclass
+from typing import Any
 
 
 @dataclass(frozen=True)
@@ -19,6 +20,11 @@ class Handle:
 
     def __repr__(self) -> str:
         return f"<{self.kind} {self.name!r}>"
+
+
+def named(part: Any) -> Any:
+    """Name of a part that is given by its handle, or by name."""
+    return part.name if isinstance(part, Handle) else part
 
 
 ground = Handle("body", "ground", 0)

@@ -87,8 +87,9 @@ def possible(moment: Any, central: Any, about: Any, label: str, given: str) -> A
         closest = (axes * np.maximum(values, 0.0)) @ axes.T
         closest = np.trace(closest) * np.eye(3) - closest if given == "inertia" else closest
         uncoupled = np.max(np.abs(closest - np.diag(np.diag(closest)))) <= 1e-12 * np.max(np.abs(closest))
-        shown = np.diag(closest) if uncoupled else closest
-        nearest = f"; the nearest possible {given} about the centre of mass is {_listed(shown)} kg m^2"
+        shown = np.array2string(np.diag(closest) if uncoupled else closest, separator=", ", precision=6)
+        shown = shown.replace("\n", "")
+        nearest = f"; the nearest possible {given} about the centre of mass is {shown} kg m^2"
     raise ValueError(
         f"{label}: {given} belongs to no body: the principal second moments about the centre of mass "
         f"would be {values} kg m^2, and none may be negative (a principal inertia may not exceed the sum "
@@ -96,7 +97,3 @@ def possible(moment: Any, central: Any, about: Any, label: str, given: str) -> A
         'and whether the inertia is about the centre of mass (inertia_at="com") or the reference point '
         f'(inertia_at="reference"){nearest}'
     )
-
-
-def _listed(values: np.ndarray) -> str:
-    return np.array2string(values, separator=", ", precision=6).replace("\n", "")

@@ -10,7 +10,7 @@ from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.kinds import FLAG, Choice, FunctionOf, of
 from natcoord_jax.xla.effort import Effort, set_default
 from natcoord_jax.xla.jit import marked, with_marked
-from natcoord_jax.xla.kept import keep, keep_none
+from natcoord_jax.xla.kept import keep
 
 EFFORT = Choice(("tiers", "quick", "full"))
 PLACES = of("a whole number, or a tuple of them", int, tuple, list)
@@ -128,6 +128,4 @@ def keep_programs(folder: str | os.PathLike | None = None, *, on: bool = True) -
         >>> folder = nc.keep_programs(tempfile.mkdtemp())
         >>> nc.keep_programs(on=False)
     """
-    if on:
-        return keep(folder)
-    return keep_none()
+    return keep(folder, on)

@@ -166,20 +166,17 @@ class FunctionOf(Kind):
         """Whether it can be called, with as many arguments."""
         if not callable(value) or isinstance(value, type):
             return is_other(value)
-        return None if self.count is None or _takes(value, self.count) else "takes other arguments"
-
-
-def _takes(function: Any, count: int) -> bool:
-    """Whether a function can be called with so many arguments, as far as it tells."""
-    try:
-        signature = inspect.signature(function)
-    except (TypeError, ValueError):
-        return True
-    try:
-        signature.bind(*(None,) * count)
-    except TypeError:
-        return False
-    return True
+        if self.count is None:
+            return None
+        try:
+            signature = inspect.signature(value)
+        except (TypeError, ValueError):  # (It does not tell.)
+            return None
+        try:
+            signature.bind(*(None,) * self.count)
+        except TypeError:
+            return "takes other arguments"
+        return None
 
 
 @dataclasses.dataclass(frozen=True)

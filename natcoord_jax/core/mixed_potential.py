@@ -114,10 +114,7 @@ def _stationary(potential: MixedPotential, invariants: Array) -> Float[Array, " 
         step, reach = potential.change(invariants, own), potential.reach(invariants, own)
         return own + step, jnp.all(jnp.abs(step) <= SETTLED * (jnp.abs(own) + reach)), count + 1
 
-    def searching(carry: tuple[Array, Array, Array]) -> Array:
-        return ~carry[1] & (carry[2] < ITERATIONS)
-
     first = potential.begun(invariants), jnp.array(False), jnp.array(0)
-    found, settled, _ = jax.lax.while_loop(searching, trip, first)
+    found, settled, _ = jax.lax.while_loop(lambda c: ~c[1] & (c[2] < ITERATIONS), trip, first)
     found = jnp.where(settled, found, jnp.nan)
     return found + potential.change(invariants, found)

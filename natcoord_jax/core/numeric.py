@@ -26,9 +26,7 @@ def array_of(value: Any) -> Any:
             parts = [array_of(x) for x in value]
             if any(x is None for x in parts) or len({x.shape for x in parts}) > 1:
                 return None
-            if any(isinstance(x, Tracer) for x in parts):
-                return jax.ShapeDtypeStruct((len(parts), *parts[0].shape), jnp.result_type(float))
-            if any(isinstance(x, jax.ShapeDtypeStruct) for x in parts):
+            if any(isinstance(x, Tracer | jax.ShapeDtypeStruct) for x in parts):
                 return jax.ShapeDtypeStruct((len(parts), *parts[0].shape), np.dtype(float))
             value = [np.asarray(x) for x in parts]
         if any(isinstance(x, bool | np.bool_ | str) for x in value):
@@ -98,10 +96,14 @@ class Numbers(Kind):
         array = array_of(value)
         if array is None:
             return is_other(value)
-        if not self._fits(array.shape):
+        wanted, shape = self.shape, array.shape
+        if wanted[:1] == ("...",):
+            wanted = wanted[1:]
+            shape = shape[len(shape) - len(wanted) :] if len(shape) >= len(wanted) else (-1,)
+        if len(wanted) != len(shape) or any(a not in (None, b) for a, b in zip(wanted, shape)):
             return f"is {short(value)}" if array.shape == () else f"has shape {array.shape}"
-        known = values_of(array)
-        return None if known is None else self.misfit(known)
+        values = values_of(array)
+        return None if values is None else self.misfit(values)
 
     def misfit(self, values: np.ndarray) -> str | None:
         """What is wrong with numbers of any shape, if something is."""
@@ -129,13 +131,6 @@ class Numbers(Kind):
     def masked(self, value: Any) -> Any:
         """With not a number for what is traced and out of the range; what has no range is left as it is."""
         return masked(value, self.includes) if self.bounded else value
-
-    def _fits(self, shape: tuple[int, ...]) -> bool:
-        wanted, found = self.shape, shape
-        if wanted[:1] == ("...",):
-            wanted = wanted[1:]
-            found = found[len(found) - len(wanted) :] if len(found) >= len(wanted) else (-1,)
-        return len(wanted) == len(found) and all(a in (None, b) for a, b in zip(wanted, found))
 
 
 def range_of(kind: Any) -> Numbers | None:
@@ -197,11 +192,7 @@ class Directions(Numbers):
 
     shape: tuple[Any, ...] = (3,)
     bounded: ClassVar[bool] = True  # pyright: ignore[reportIncompatibleVariableOverride]
-
-    @property
-    def wanted(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Its shape."""
-        return "finite numbers, not all zero: a direction"
+    wanted: ClassVar[str] = "finite numbers, not all zero: a direction"  # pyright: ignore
 
     def misfit(self, values: np.ndarray) -> str | None:
         """Whether they have a length."""
@@ -218,11 +209,7 @@ class Rotations(Numbers):
 
     shape: tuple[Any, ...] = (3, 3)
     bounded: ClassVar[bool] = True  # pyright: ignore[reportIncompatibleVariableOverride]
-
-    @property
-    def wanted(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """What they keep."""
-        return "a rotation: orthonormal and right-handed, by a matrix or a quaternion"
+    wanted: ClassVar[str] = "a rotation: orthonormal and right-handed, by a matrix or a quaternion"  # pyright: ignore
 
     def misfit(self, values: np.ndarray) -> str | None:
         """How far they are from being rotations."""

@@ -156,7 +156,8 @@ class Potential(MarkerEffect):
     def linearised(self, place: Array, motion: Motion, now: StepContext, lam: Array) -> "LinearisedPotential":
         """The potential with gradients that are linear in the steps of the invariants."""
         start = self.invariants(place_markers(place, motion.start))
-        steps = _steps(self, place, motion, now)
+        x, rates = place_markers(place, motion.rows), place_markers(place, motion.rates)
+        steps = steps_together(self, x, now.h * rates)
         gradient = self.averaged(start, steps, now.tableau)
         middle = start + 0.5 * jnp.asarray(now.tableau.b) @ steps
         if now.stress is not None:
@@ -165,8 +166,7 @@ class Potential(MarkerEffect):
 
     def strain_rates(self, place: Array, motion: Motion, h: Array) -> Array:
         """Rates of the invariants at the stages: h times them are the increments."""
-        x, rates = place_markers(place, motion.rows), place_markers(place, motion.rates)
-        return jax.vmap(lambda xi, vi: jax.jvp(self.invariants, (xi,), (vi,))[1])(x, rates)
+        return steps_together(self, place_markers(place, motion.rows), place_markers(place, motion.rates))
 
     def curvature(self, place: Array, rows: Array, coordinates: Array) -> Array:
         """Second derivatives of the energy [J per squared unit of invariant]."""
@@ -214,24 +214,18 @@ class LinearisedPotential(eqx.Module):
         return _response(self.potential, gradient, place, motion, now)
 
 
-def _steps(potential: Potential, place: Array, motion: Motion, now: StepContext) -> Float[Array, "s p"]:
-    """Step times the rates of the invariants at the stages."""
-    x, rates = place_markers(place, motion.rows), place_markers(place, motion.rates)
-    return jax.vmap(lambda xi, vi: jax.jvp(potential.invariants, (xi,), (vi,))[1])(x, now.h * rates)
-
-
 def _response(
     potential: Potential, gradient: Callable[[Array], Array], place: Array, motion: Motion, now: StepContext
 ) -> Response:
     """Forces -D pi^T S_i with gradients S_i of the steps of the invariants, D pi where forces take hold."""
     x, rates = place_markers(place, motion.rows), place_markers(place, motion.rates)
-    given = gradient(_steps(potential, place, motion, now))
+    given = gradient(steps_together(potential, x, now.h * rates))
     held = x if motion.force_rows is None else place_markers(place, motion.force_rows)
     forces = -jax.vmap(potential.pulled_back)(held, given)
     viscosity = potential.viscosity
     if viscosity is None:
         return marker_response(place, forces, None, rates, motion)
-    flow = jax.vmap(lambda xi, vi: jax.jvp(potential.invariants, (xi,), (vi,))[1])(x, rates)
+    flow = steps_together(potential, x, rates)
     stored = jnp.sum(forces * rates, axis=tuple(range(1, forces.ndim)))
     forces = forces - jax.vmap(potential.pulled_back)(held, flow @ viscosity)
     return replace_fields(marker_response(place, forces, None, rates, motion), released=stored)

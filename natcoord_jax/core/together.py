@@ -30,9 +30,9 @@ def place_together(place: Float[Array, "k *m w n"], rows: Float[Array, "*s b 4 3
 
 
 def steps_together(
-    potential: Any, x: Float[Array, "s k *m 3 n"], moved: Float[Array, "s k *m 3 n"]
-) -> Float[Array, "s p n"]:
-    """Changes of the invariants at the stages, of many instances, for changes of the marker vectors."""
+    potential: Any, x: Float[Array, "s k *rest"], moved: Float[Array, "s k *rest"]
+) -> Float[Array, "s p *n"]:
+    """Changes of the invariants at the stages for changes of the marker vectors, of many instances too."""
     return jax.vmap(lambda xi, vi: jax.jvp(potential.invariants, (xi,), (vi,))[1])(x, moved)
 
 

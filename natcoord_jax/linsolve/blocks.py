@@ -185,33 +185,10 @@ def _tiles(
     first = np.cumsum(high * wide) - high * wide
     tile_rows = np.full((int((high * wide).sum()), r), n)
     tile_columns = np.full((len(tile_rows), c), n)
-    _fill(tile_rows, nodes, row_rank, np.arange(n), first, high, wide, r, by_rows=True)
-    _fill(tile_columns, pairs // n, column_rank, pairs % n, first, high, wide, c, by_rows=False)
-    node, rank = nodes[rows], column_rank[of_entry]
-    tile = first[node] + (row_rank[rows] // r) * wide[node] + rank // c
-    return tile_rows, tile_columns, (tile * r + row_rank[rows] % r) * c + rank % c
-
-
-def _fill(
-    table: np.ndarray,
-    node: np.ndarray,
-    rank: np.ndarray,
-    number: np.ndarray,
-    first: np.ndarray,
-    high: np.ndarray,
-    wide: np.ndarray,
-    length: int,
-    *,
-    by_rows: bool,
-) -> None:
-    """Write numbers into all tiles of their nodes that hold them."""
-    repeats = wide[node] if by_rows else high[node]
-    each = np.repeat(np.arange(len(node)), repeats)
-    copy = np.arange(len(each)) - np.repeat(np.cumsum(repeats) - repeats, repeats)
-    piece = rank[each] // length
-    at = node[each]
-    tile = first[at] + (piece * wide[at] + copy if by_rows else copy * wide[at] + piece)
-    table[tile, rank[each] % length] = number[each]
+    node, row, column = nodes[rows], row_rank[rows], column_rank[of_entry]
+    tile = first[node] + (row // r) * wide[node] + column // c
+    tile_rows[tile, row % r], tile_columns[tile, column % c] = rows, columns
+    return tile_rows, tile_columns, (tile * r + row % r) * c + column % c
 
 
 def _tile_shape(heights: np.ndarray, widths: np.ndarray) -> tuple[int, int]:

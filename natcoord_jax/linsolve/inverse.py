@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from natcoord_jax.maths.elimination import definite_inverse
 from natcoord_jax.xla.rows import part, with_part
 
 UNBLOCKED = 16
@@ -23,22 +24,8 @@ def inverses(matrices: Float[Array, "count n n"]) -> Float[Array, "count n n"]:
     if n > UNBLOCKED:
         return _blocked(matrices, SMALL)
     if count < MANY:
-        return _eliminated(matrices)
+        return jax.vmap(definite_inverse)(matrices)
     return jnp.moveaxis(_side_by_side(jnp.moveaxis(matrices, 0, -1)), -1, 0)
-
-
-def _eliminated(matrices: Array) -> Array:
-    n = matrices.shape[-1]
-    number = jnp.arange(n)
-
-    def step(k: Array, left: Array) -> Array:
-        row, column, on = left[:, k], left[:, :, k], number == k
-        pivot = 1.0 / row[:, k, None]
-        scaled = jnp.where(on, pivot, row * pivot)
-        kept = jnp.where(on, 0.0, left)
-        return jnp.where(on[:, None], scaled[:, None, :], kept - column[:, :, None] * scaled[:, None, :])
-
-    return jax.lax.fori_loop(0, n, step, matrices)
 
 
 def _side_by_side(matrices: Array) -> Array:

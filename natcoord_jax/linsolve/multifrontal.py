@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 from natcoord_jax.linsolve.blocks import BlockMatrix, Entries
 from natcoord_jax.linsolve.graph import Graph
 from natcoord_jax.linsolve.inverse import inverses
-from natcoord_jax.linsolve.ordering import Groups, dissection, rounds
+from natcoord_jax.linsolve.ordering import dissection, rounds
 from natcoord_jax.linsolve.schedule import Bucket, Level, schedule
 from natcoord_jax.linsolve.symbolic import (
     Front,
@@ -156,7 +156,11 @@ def cheapest(graph: Graph, coordinates: np.ndarray | None = None) -> list[Front]
     """Fronts of the order of elimination that the model of costs likes best."""
     sizes = Sizes(graph)
     best, found = np.inf, []
-    for groups in _orders(graph, coordinates):
+    edges, nodes = sum(map(len, graph.neighbours)) / 2, len(graph.members)
+    orders = [dissection(graph.neighbours, graph.weights, leaf, coordinates) for leaf in LEAVES]
+    if nodes <= ROUNDS_UP_TO or edges < 1.5 * nodes:
+        orders.append(rounds(graph.neighbours))
+    for groups in orders:
         fronts = amalgamated(fronts_of(graph, groups), sizes)
         for levels in range(1, 6):
             candidate = top_merged(fronts, levels)
@@ -164,12 +168,3 @@ def cheapest(graph: Graph, coordinates: np.ndarray | None = None) -> list[Front]
             if time < best:
                 best, found = time, candidate
     return found
-
-
-def _orders(graph: Graph, coordinates: np.ndarray | None) -> list[Groups]:
-    edges = sum(map(len, graph.neighbours)) / 2
-    nodes = len(graph.members)
-    orders = [dissection(graph.neighbours, graph.weights, leaf, coordinates) for leaf in LEAVES]
-    if nodes <= ROUNDS_UP_TO or edges < 1.5 * nodes:
-        orders.append(rounds(graph.neighbours))
-    return orders

@@ -52,10 +52,6 @@ class NeighbourCouplings(eqx.Module):
 
         return apply
 
-    def apply(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
-        """Product with a vector."""
-        return self.product()(x)
-
     def transpose(self) -> "NeighbourCouplings":
         """The transposed matrix."""
         turned = jnp.swapaxes(self.stiffness[::-1], 1, 2)
@@ -63,7 +59,7 @@ class NeighbourCouplings(eqx.Module):
 
     def to_dense(self) -> Float[Array, "n n"]:
         """The matrix."""
-        return jax.vmap(self.apply, out_axes=1)(jnp.eye(self.size, dtype=self.across.dtype))
+        return jax.vmap(self.product(), out_axes=1)(jnp.eye(self.size, dtype=self.across.dtype))
 
     def times(self, factor: float) -> "NeighbourCouplings":
         """Multiplied by a number."""
@@ -136,8 +132,7 @@ def stabilised(apply: Callable[[Array], Array], right: Float[Array, " n"]) -> Fl
         return count + 1, x, r, first, r + kept * (p - second * image), following
 
     def going(carry: tuple) -> Array:
-        count, _, r, *_ = carry
-        return (count < MOST) & (jnp.sum(r * r) > ENOUGH**2 * whole)
+        return (carry[0] < MOST) & (jnp.sum(carry[2] ** 2) > ENOUGH**2 * whole)
 
     begun = right - apply(right)
     start = jnp.zeros((), jnp.int32), right, begun, begun, begun, jnp.sum(begun * begun)

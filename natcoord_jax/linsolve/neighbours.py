@@ -12,8 +12,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from natcoord_jax.linsolve.tree import applied, passed_down, product, transposed
+from natcoord_jax.linsolve.tree import passed_down, transposed
 from natcoord_jax.maths.elimination import definite_inverse
+from natcoord_jax.maths.vectors import applied, product
 from natcoord_jax.xla.rows import add_at, row
 
 

@@ -75,11 +75,10 @@ def _converged(
         change = near(missing)
         return x + change, jnp.sum(jnp.abs(missing * change)), work, count + 1
 
-    def shrinking(carry: tuple) -> Array:
-        return (carry[1] < 0.25 * carry[2]) & (carry[3] < MOST)
-
     start = x, size, jnp.full_like(size, jnp.inf), jnp.array(0)
-    x, work, before, _ = jax.lax.while_loop(shrinking, trip, start)
+    x, work, before, _ = jax.lax.while_loop(
+        lambda carry: (carry[1] < 0.25 * carry[2]) & (carry[3] < MOST), trip, start
+    )
     return jnp.where(jnp.minimum(work, before) <= UNSOLVED * size, x, jnp.nan)
 
 

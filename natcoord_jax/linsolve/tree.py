@@ -17,22 +17,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from natcoord_jax.linsolve.dense import bordered_inverse
+from natcoord_jax.maths.vectors import applied, product
 from natcoord_jax.xla.rows import add_at, row
-
-
-def applied(matrix: Float[Array, "*n r c"], vector: Float[Array, "*n 1 c"]) -> Float[Array, "*n r"]:
-    """Products of matrices and vectors, as sums: cheaper than calls for small sizes."""
-    return jnp.sum(matrix * vector, axis=-1)
 
 
 def transposed(matrices: Float[Array, "*n r c"]) -> Float[Array, "*n c r"]:
     """Transposed matrices."""
     return jnp.swapaxes(matrices, -1, -2)
-
-
-def product(a: Float[Array, "*#n r k"], b: Float[Array, "*#n k c"]) -> Float[Array, "*n r c"]:
-    """Products of matrices, as sums."""
-    return jnp.sum(a[..., :, :, None] * b[..., None, :, :], axis=-2)
 
 
 def passed_down(

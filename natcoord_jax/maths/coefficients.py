@@ -1,7 +1,7 @@
 """Coefficients of collocation: exact ones, and how they are rounded so that what a step keeps is kept."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import partial
@@ -18,9 +18,6 @@ small to count."""
 
 DIGITS = 10**45
 """Denominator of the exact nodes: their errors are far below those of rounding the coefficients."""
-
-NEIGHBOURS = 1
-"""Steps of the last place within which rounded coefficients are chosen. More would spoil their sums."""
 
 
 def _at(p: Polynomial, x: Fraction) -> Fraction:
@@ -63,14 +60,9 @@ def _through(node: Fraction, zeros: list[Fraction]) -> Polynomial:
     return p
 
 
-def _near(x: float) -> Iterator[float]:
-    """A number and its neighbours, itself first."""
-    yield x
-    for direction in (-math.inf, math.inf):
-        neighbour = x
-        for _ in range(NEIGHBOURS):
-            neighbour = math.nextafter(neighbour, direction)
-            yield neighbour
+def _near(x: float) -> tuple[float, float, float]:
+    """A number and its neighbours, itself first. More of them would spoil the sums of coefficients."""
+    return x, math.nextafter(x, -math.inf), math.nextafter(x, math.inf)
 
 
 def _partner(x: float, product: Fraction, own: Fraction, other: Fraction) -> float:

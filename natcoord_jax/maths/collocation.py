@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.maths.coefficients import Rows, collocation, in_parts, rounded, rounded_pairs
 from natcoord_jax.maths.lagrange import gauss_legendre
-from natcoord_jax.maths.vectors import cross, dot, skew
+from natcoord_jax.maths.vectors import applied, cross, dot, product, skew
 
 
 @dataclass(frozen=True)
@@ -158,15 +158,6 @@ def rotate_stages(
     return _block_solve(turn, start, tableau)
 
 
-def _times(a: Float[Array, "*batch 3 3"], b: Float[Array, "*other 3 3"]) -> Float[Array, "*out 3 3"]:
-    """Products of 3 x 3 matrices as sums, which fuse with their neighbours."""
-    return jnp.sum(a[..., :, :, None] * b[..., None, :, :], axis=-2)
-
-
-def _on(a: Float[Array, "*batch 3 3"], x: Float[Array, "*other 3"]) -> Float[Array, "*out 3"]:
-    return jnp.sum(a * x[..., None, :], axis=-1)
-
-
 def _inverse(a: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3 3"]:
     """Inverses of 3 x 3 matrices by cofactors."""
     first, second, third = jnp.unstack(a, axis=-2)
@@ -194,12 +185,12 @@ def _block_solve(
         rights.append(right[0])
         if k + 1 < s:
             column, blocks = jnp.split(below[0], [1], axis=1)
-            factors = _times(column[:, 0], pivots[-1][None])
-            blocks = blocks - _times(factors[:, None], row[None])
-            x = rest[0] - _on(factors, right)
+            factors = product(column[:, 0], pivots[-1][None])
+            blocks = blocks - product(factors[:, None], row[None])
+            x = rest[0] - applied(factors, right[..., None, :])
     found: list[Array] = []
     for pivot, row, right in zip(reversed(pivots), reversed(rows), reversed(rights)):
         for block, known in zip(row, found):
-            right = right - _on(block, known)
-        found.insert(0, _on(pivot, right))
+            right = right - applied(block, known[..., None, :])
+        found.insert(0, applied(pivot, right[..., None, :]))
     return jnp.stack(found)

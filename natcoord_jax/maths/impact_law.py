@@ -86,10 +86,8 @@ def elastic_impulses(
         size = jnp.max(jnp.abs(change)) / jnp.maximum(jnp.max(found), jnp.finfo(found.dtype).tiny)
         return found + length * change, count + 1, size
 
-    def unfinished(carry: tuple[Array, Array, Array]) -> Array:
-        return (carry[2] > 1e-15) & (carry[1] < MOST) & jnp.any(on)
-
-    return jax.lax.while_loop(unfinished, trip, (start, jnp.array(0), jnp.full((), jnp.inf, start.dtype)))[0]
+    begun = start, jnp.array(0), jnp.full((), jnp.inf, start.dtype)
+    return jax.lax.while_loop(lambda c: (c[2] > 1e-15) & (c[1] < MOST) & jnp.any(on), trip, begun)[0]
 
 
 def _stiffness(own: Array, work: Array, impulse: Array) -> Array:

@@ -114,14 +114,11 @@ def _polished(x: Float[Array, "u u"]) -> tuple[Float[Array, "u u"], Float[Array,
 @jax.custom_jvp
 def nearest_orthogonal(x: Float[Array, "u u"]) -> Float[Array, "u u"]:
     """The nearest orthogonal matrix. Over short steps subspaces turn little, and few iterations do."""
-
-    def going(carry: tuple) -> Array:
-        return (carry[0] < POLISHING) & (carry[2] > POLISHED)
-
-    def once(carry: tuple) -> tuple:
-        return carry[0] + 1, *_polished(carry[1])
-
-    return jax.lax.while_loop(going, once, (0, x, jnp.ones((), x.dtype)))[1]
+    return jax.lax.while_loop(
+        lambda carry: (carry[0] < POLISHING) & (carry[2] > POLISHED),
+        lambda carry: (carry[0] + 1, *_polished(carry[1])),
+        (0, x, jnp.ones((), x.dtype)),
+    )[1]
 
 
 @nearest_orthogonal.defjvp

@@ -21,6 +21,16 @@ def dot(a: Float[Array, "*batch k"], b: Float[Array, "*other k"]) -> Float[Array
     return jnp.sum(a * b, axis=-1)
 
 
+def applied(matrix: Float[Array, "*#n r c"], vector: Float[Array, "*#n 1 c"]) -> Float[Array, "*n r"]:
+    """Products of matrices and vectors, as sums: cheaper than calls for small sizes."""
+    return jnp.sum(matrix * vector, axis=-1)
+
+
+def product(a: Float[Array, "*#n r k"], b: Float[Array, "*#n k c"]) -> Float[Array, "*n r c"]:
+    """Products of matrices, as sums, which fuse with their neighbours."""
+    return jnp.sum(a[..., :, :, None] * b[..., None, :, :], axis=-2)
+
+
 def skew(a: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3 3"]:
     """Matrix of the map b -> a x b."""
     a0, a1, a2 = jnp.unstack(a, axis=-1)

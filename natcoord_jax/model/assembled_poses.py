@@ -65,7 +65,14 @@ class Poses:
 
         Of a marker between nodes there are four for each of them.
         """
-        own = self._own_weights(marker)
+        if isinstance(marker, Interpolated):
+            row = np.eye(4)[0 if marker.is_point else 1]
+            own = as_array(np.kron(np.asarray(marker.vector), row))
+        elif isinstance(marker, Attachment):
+            point, axes = as_array(marker.point, float), as_array(marker.axes, float)
+            own = _attachment_weights(*self._pose(marker), point, axes)
+        else:
+            own = _marker_weights(*self._pose(marker), as_array(marker.vector, float), marker.is_point)
         self._check(marker, own)
         handles = marker.handles if isinstance(marker, Marker) else (marker.body,)
         held = [self.held(handle) for handle in handles]
@@ -91,15 +98,6 @@ class Poses:
                 f"{short(marker)}: {name!r} is a {kind.name} and carries {carried} only; pass "
                 f"nc.Point({name}) or join a rigid body to it"
             )
-
-    def _own_weights(self, marker: Marker | Attachment) -> Float[Array, "*m w"]:
-        if isinstance(marker, Interpolated):
-            row = np.eye(4)[0 if marker.is_point else 1]
-            return as_array(np.kron(np.asarray(marker.vector), row))
-        if isinstance(marker, Attachment):
-            point, axes = as_array(marker.point, float), as_array(marker.axes, float)
-            return _attachment_weights(*self._pose(marker), point, axes)
-        return _marker_weights(*self._pose(marker), as_array(marker.vector, float), marker.is_point)
 
     def _pose(self, marker: Marker | Attachment) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
         """Pose of the frame that the vectors of a marker are given relative to."""

@@ -26,10 +26,11 @@ class Bodies:
         sets: number of nodes in sets.
         kinds: what each carries and how it turns.
         shapes: what to draw.
+        clamps: which of the nodes are clamped to which bodies.
     """
 
     def __init__(self, singles: dict[str, Body], sets: dict[str, Any], clamps: Sequence[Any] = ()):
-        self._singles, self._sets, self._clamps = singles, sets, clamps
+        self._singles, self._sets, self.clamps = singles, sets, clamps
         self._kept = {name: np.arange(len(nodes.position)) for name, nodes in sets.items()}
         self.owners: dict[str, Handle] = {}
         for clamp in clamps:
@@ -76,20 +77,11 @@ class Bodies:
         found[kept] = before + np.arange(len(kept))
         return found
 
-    def clamped(self, name: str) -> list[tuple[np.ndarray, Handle]]:
-        """Numbers of the clamped nodes of a set, and the bodies that they are clamped to."""
-        return [(clamp.nodes.numbers, clamp.body) for clamp in self._clamps if clamp.nodes.name == name]
-
-    @property
-    def with_clamps(self) -> list[str]:
-        """Names of the sets of which nodes are clamped."""
-        return sorted({clamp.nodes.name for clamp in self._clamps})
-
     @property
     def held(self) -> tuple[tuple[str, str, int, int], ...]:
         """Names of a set and of what nodes of it are clamped to, how many these are, and of how many."""
         counts: dict[tuple[str, str], int] = {}
-        for clamp in self._clamps:
+        for clamp in self.clamps:
             pair = clamp.nodes.name, clamp.body.name
             counts[pair] = counts.get(pair, 0) + len(clamp.nodes)
         return tuple((*pair, n, len(self._sets[pair[0]].position)) for pair, n in counts.items())

@@ -134,16 +134,10 @@ def spanning_tree(
 def make_tree(spanning: Spanning, motions: list[Edge]) -> Tree:
     """Arrays of the tree from the free motions of the bodies in their new order."""
     bodies = len(spanning.order)
-    slot_index = np.zeros((bodies, SLOTS), np.int32)
-    slot_of = []
-    for body, motion in enumerate(motions):
-        for slot in range(SLOTS):
-            if slot in motion.slots:
-                slot_index[body, slot] = len(slot_of)
-                slot_of.append(body * SLOTS + slot)
-            else:
-                slot_index[body, slot] = -1
-    slot_index[slot_index < 0] = len(slot_of)
+    present = np.array([[slot in m.slots for slot in range(SLOTS)] for m in motions], bool)
+    slots = np.flatnonzero(present).astype(np.int32)
+    slot_index = np.full((bodies, SLOTS), len(slots), np.int32)
+    slot_index[present.reshape(bodies, SLOTS)] = np.arange(len(slots))
     parent = np.array(spanning.parent, np.int32)
     depth, local = np.zeros(bodies, int), np.zeros(bodies, np.int32)
     for body, above in enumerate(spanning.parent):
@@ -162,7 +156,6 @@ def make_tree(spanning: Spanning, motions: list[Edge]) -> Tree:
             side[body] = (1, 0)
             if motion.child_rotation:
                 order[body] = (0, 3, 2, 1)  # the child's axis becomes the parent's
-    slots = np.array(slot_of, np.int32)
     directed = np.array([m.own_axes for m in motions], bool)
     ball = np.array([len(m.rotations) == 3 for m in motions], bool) | directed
     return Tree(

@@ -15,7 +15,7 @@ from natcoord_jax.core.eager_numpy import stacked
 from natcoord_jax.core.effect import Effect, replace_fields
 from natcoord_jax.core.elements import Elements
 from natcoord_jax.core.names import Names
-from natcoord_jax.core.nodes import NodeSet, NodeUnion
+from natcoord_jax.core.nodes import NodeUnion
 from natcoord_jax.model.groups import Group
 from natcoord_jax.model.segment_sum import SegmentSum
 
@@ -104,7 +104,13 @@ def element_group(layout: Any, name: str, elements: Elements, turning: np.ndarra
         raise ValueError(f"{label}: {type(effect).__name__} has inputs; add it one by one")
     if effect.works:
         layout.works.append(name)
-    places, rows = _located(layout, elements.nodes)
+    # Of all nodes of a set, or of some of several.
+    nodes = elements.nodes
+    if isinstance(nodes, NodeUnion):
+        located = [[x[part.numbers] for x in layout.nodes(part.name)] for part in nodes.parts]
+        places, rows = map(np.concatenate, zip(*located))
+    else:
+        places, rows = layout.nodes(nodes.name)
     scene, weights = places[elements.connectivity], elements.weights(rows)
     alone = bare(effect, ("markers", "name"), label)
     bodies, nothing = layout.body_number[scene].astype(np.int32), np.zeros((count, 0), np.int32)
@@ -119,15 +125,6 @@ def element_group(layout: Any, name: str, elements: Elements, turning: np.ndarra
         source="markers",
         turning=bool(turning[bodies].any()),
     )
-
-
-def _located(layout: Any, nodes: NodeSet | NodeUnion) -> tuple[np.ndarray, np.ndarray]:
-    """Of all nodes of a set, or of some of several, their bodies, and their rows as weights of their rows."""
-    if isinstance(nodes, NodeSet):
-        return layout.nodes(nodes.name)
-    found = [(part.numbers, *layout.nodes(part.name)) for part in nodes.parts]
-    places, rows = ([x[k][x[0]] for x in found] for k in (1, 2))
-    return np.concatenate(places), np.concatenate(rows)
 
 
 def _group(members: list[Instance], turning: np.ndarray) -> Group:

@@ -32,11 +32,10 @@ from natcoord_jax.model.assembled_poses import (
     rows_of_poses,
     with_masses,
 )
-from natcoord_jax.model.bodies import Bodies
+from natcoord_jax.model.bodies import Bodies, picked
 from natcoord_jax.model.graph import Edge, spanning_tree
 from natcoord_jax.model.grouping import Instance, bare, families
 from natcoord_jax.model.groups import CoordinateGroup
-from natcoord_jax.xla.tracing import at_top_level
 
 
 class Layout:
@@ -71,7 +70,8 @@ class Layout:
         """Of all nodes of a set their body's number in the scene, and their rows as weights of its rows."""
         numbers = self.bodies.places(name)
         rows = np.broadcast_to(np.eye(4), (len(numbers), 4, 4)).copy()
-        for members, owner in self.bodies.clamped(name):
+        for clamp in (clamp for clamp in self.bodies.clamps if clamp.nodes.name == name):
+            members, owner = clamp.nodes.numbers, clamp.body
             numbers[members] = self.poses.of(owner)
             for k in members:
                 held = self.poses.held(Handle("body", f"{name}[{k}]", owner.scene))
@@ -86,17 +86,16 @@ class Layout:
     def masses(self) -> Float[Array, "bodies 4 4"]:
         """Mass blocks of the bodies, with those of what is clamped to them, in the order of the system."""
         found = self.bodies.every("mass_block")
-        for name, clamps in ((name, self.bodies.clamped(name)) for name in self.bodies.with_clamps):
-            for members, owner in clamps:
-                if owner != ground:
-                    rows, own = self.nodes(name)[1][members], self.bodies.node_masses(name, members)
-                    found = with_masses(found, as_array(self.poses.of(owner)), as_array(rows), own)
-        return as_array(np.asarray(found)[self.order]) if at_top_level(found) else found[self.order]
+        for clamp in self.bodies.clamps:
+            if clamp.body != ground:
+                name, members = clamp.nodes.name, clamp.nodes.numbers
+                rows, own = self.nodes(name)[1][members], self.bodies.node_masses(name, members)
+                found = with_masses(found, as_array(self.poses.of(clamp.body)), as_array(rows), own)
+        return picked(found, self.order)
 
     def every(self, field: str) -> Array:
         """A field of all bodies, in the order of the system."""
-        found = self.bodies.every(field)
-        return as_array(np.asarray(found)[self.order]) if at_top_level(found) else found[self.order]
+        return picked(self.bodies.every(field), self.order)
 
     @property
     def kinds(self) -> list[NodeKind]:
@@ -136,13 +135,12 @@ class Layout:
 
     def joint_bodies(self) -> np.ndarray:
         """Parent and child of every joint, as the scene names them."""
-        rows = []
-        for number, j in enumerate(self.joint_order):
-            if j >= 0:
-                edge = self.edges[j]
-                rows.append([self.body_number[edge.parent], self.body_number[edge.child]])
-            else:
-                rows.append([len(self.bodies), number])
+        rows = [
+            [self.body_number[b] for b in (self.edges[j].parent, self.edges[j].child)]
+            if j >= 0
+            else [len(self.bodies), number]
+            for number, j in enumerate(self.joint_order)
+        ]
         return np.array(rows, np.int32).reshape(-1, 2)
 
     def joint_instances(self) -> list[Instance]:
@@ -150,7 +148,8 @@ class Layout:
         instances = []
         for name, joint in self.joints.items():
             place = joint_frames(joint, self.poses)
-            frames = _frames_at(place, self._rows(joint.parent, joint.child))
+            ends = np.array([self.poses.of(handle) for handle in (joint.parent, joint.child)])
+            frames = _frames_at(place, self.rows_at(ends))
             ready = joint.initialise(*frames)
             kinds = [self.bodies.kind_of(handle) for handle in (joint.parent, joint.child)]
             check_joint(name, ready, kinds, place, frames)
@@ -166,16 +165,10 @@ class Layout:
             )
         return instances
 
-    def _rows(self, *handles: Handle) -> Float[Array, "n 4 3"]:
-        """Rows of bodies in the assembled pose."""
-        return self.rows_at(np.array([self.poses.of(handle) for handle in handles]))
-
     def rows_at(self, numbers: np.ndarray) -> Float[Array, "*n 4 3"]:
-        """The same by their numbers in the scene."""
-        flat = numbers.reshape(-1)
-        given = (self.poses.position, self.poses.rotation)
-        picked = (as_array(np.asarray(x)[flat]) if at_top_level(x) else x[flat] for x in given)
-        return rows_of_poses(*picked).reshape(*numbers.shape, *NODE)
+        """Rows of bodies in the assembled pose, by their numbers in the scene."""
+        some = (picked(x, numbers.reshape(-1)) for x in (self.poses.position, self.poses.rotation))
+        return rows_of_poses(*some).reshape(*numbers.shape, *NODE)
 
     def effect_instance(self, name: str, effect: Effect) -> Instance:
         """Where an effect sits, and its channels."""
@@ -190,11 +183,6 @@ class Layout:
         instance.inputs = list(range(len(self.inputs), len(self.inputs) + count))
         self.inputs += [name] if count == 1 else [f"{name}[{k}]" for k in range(count)]
         return instance
-
-    def _angles(self) -> Float[Array, " coordinates"]:
-        """Joint coordinates in the assembled pose, as far as they are angles."""
-        found = [self.joints[name].assembled(k) for name, k, _ in self.coordinates]
-        return stacked([as_array(x, float) for x in found]) if found else as_array(np.zeros(0))
 
     def number_accounts(self, instances: list[Instance]) -> None:
         """Places in the work account and among the stored rates: one piece of the state for each group."""
@@ -289,11 +277,12 @@ class Layout:
     def state(self) -> State:
         """Initial state: coordinates count from the assembled pose."""
         q, v = rows_and_velocities(*(self.every(name) for name in MOTION))
+        angles = [as_array(self.joints[name].assembled(k), float) for name, k, _ in self.coordinates]
         return State(
             as_array(0.0),
             q,
             v,
-            self._angles(),
+            stacked(angles) if angles else as_array(np.zeros(0)),
             *(as_array(np.zeros(len(x))) for x in (self.rotors, self.works)),
         )
 

@@ -123,33 +123,25 @@ def with_mass(
 def _between(groups: Sequence[Group], rows: np.ndarray) -> MassBetween | None:
     """The pairs of bodies between which there is mass, none yet."""
     count = len(rows)
-    pairs = [_pairs(group) if _axes(group) == BETWEEN else None for group in groups]
-    numbers = [None if p is None else p[..., 0] * (count + 1) + p[..., 1] for p in pairs]
-    given = [n[_first(p, count)] for n, p in zip(numbers, pairs) if n is not None and p is not None]
+    # Pairs of different bodies, the smaller number first, by one number; -1: another one is its transpose.
+    numbers: list[np.ndarray | None] = [None] * len(groups)
+    for k, group in enumerate(groups):
+        if _axes(group) == BETWEEN:
+            table = np.asarray(group.bodies, np.int64)
+            one, other = table[:, :, None], table[:, None]
+            numbers[k] = np.where((one < other) & (other < count), one * count + other, -1)
+    given = [n[n >= 0] for n in numbers if n is not None]
     if not given:
         return None
     unique = np.unique(np.concatenate(given))
     places = tuple(
-        None
-        if n is None or p is None
-        else np.where(_first(p, count), np.searchsorted(unique, n), len(unique)).astype(np.int32)
-        for n, p in zip(numbers, pairs)
+        None if n is None else np.where(n >= 0, np.searchsorted(unique, n), len(unique)).astype(np.int32)
+        for n in numbers
     )
-    bodies = np.stack([unique // (count + 1), unique % (count + 1)], axis=1).astype(np.int32)
+    bodies = np.stack(np.divmod(unique, count), axis=1).astype(np.int32)
     most = int(rows[bodies].max(initial=1))
     none, still = as_array(np.zeros((len(bodies), most, most))), as_array(np.zeros((count, 4, 4)))
     return MassBetween(bodies, none, still, places, SegmentSum.of(bodies.T, count))
-
-
-def _pairs(group: Group) -> Int[np.ndarray, "n k k 2"]:
-    """Bodies that the blocks of each instance of a group are between."""
-    table = np.asarray(group.bodies, np.int64)
-    return np.stack(np.broadcast_arrays(table[:, :, None], table[:, None]), axis=-1)
-
-
-def _first(pairs: Int[np.ndarray, "n k k 2"], count: int) -> np.ndarray:
-    """Which of them are different bodies, the smaller number first."""
-    return (pairs[..., 0] < pairs[..., 1]) & (pairs[..., 1] < count)
 
 
 @eager_numpy

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from natcoord_jax.core.arguments import checked
-from natcoord_jax.core.handles import Handle
+from natcoord_jax.core.handles import Handle, named
 from natcoord_jax.core.kinds import BODY_NAME, JOINT_NAME, NAME, HandleOf, of
 from natcoord_jax.core.names import clamped, listed
 from natcoord_jax.model.groups import CoordinateGroup, Elimination, Group
@@ -144,7 +144,7 @@ SomeModel = TypeVar("SomeModel", bound=Model)
 
 
 def _index(names: Sequence[str], part: Handle | str, kind: str) -> int:
-    name = part.name if isinstance(part, Handle) else part
+    name = named(part)
     if name not in names or not name:
         raise ValueError(f"this system has no {kind} {name!r}; it has {listed(names)}{clamped(names, name)}")
     return names.index(name)

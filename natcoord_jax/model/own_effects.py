@@ -54,7 +54,14 @@ def check_degrees(system: Model, state: State) -> None:
     for group, own in _own(system, state):
         excess, number = third_differences(system, group, state)
         if excess > THIRD:
-            raise ValueError(_complaint(group, number, excess, own))
+            residual = not (group.effect.stores or group.effect.unilateral)
+            method = f"{own.__name__}.{'residual' if residual else 'invariants'}"
+            remedy = "use a stiff nc.Potential for the rest" if residual else "leave the rest to the energy"
+            raise ValueError(
+                f"{group.effect.kind} {_name(group, number)!r}: {method} is not at most quadratic in points "
+                f"and directions (third differences are {min(excess, 1e9):.1g} of it), and no step would "
+                f"keep it; make lengths squares, and angles products of directions, and {remedy}"
+            )
 
 
 def warn_of_resultants(system: Model, state: State) -> None:
@@ -65,17 +72,14 @@ def warn_of_resultants(system: Model, state: State) -> None:
     """
     for group, _ in _own(system, state):
         changes, lanes = rigid_changes(system, group, state)
-        for number, (push, turn) in zip(lanes, changes):
-            if max(push, turn) <= THIRD:
-                continue
-            moves = f"{_name(group, number)!r} {'pushes' if push > THIRD else 'turns'}"
+        for k in np.flatnonzero(~np.all(changes <= THIRD, axis=1))[:1]:
+            moves = f"{_name(group, int(lanes[k]))!r} {'pushes' if changes[k, 0] > THIRD else 'turns'}"
             warnings.warn(
                 f"{group.effect.kind} {moves} all bodies that it acts between, as nothing within a system "
                 "does: let it depend on relative positions alone, or give what acts from outside a marker of "
                 "nc.ground",
                 stacklevel=4,
             )
-            break
 
 
 def _some(
@@ -157,10 +161,8 @@ def third_differences(system: Model, group: Group, state: State, seed: int = 0) 
     """The largest of some instances, relative to what they are of, and the number of the instance."""
     given, lanes = _some(system, group, state, seed)
     values = np.asarray(_four(*given))
-    thirds, size = (
-        np.abs(np.tensordot(values, BINOMIALS, ([1], [0]))),
-        np.max(np.abs(values), axis=1, initial=0.0),
-    )
+    thirds = np.abs(np.tensordot(values, BINOMIALS, ([1], [0])))
+    size = np.max(np.abs(values), axis=1, initial=0.0)
     # (One that vanishes is rounded as the others are.)
     size = np.maximum(size, SMALL * np.max(size, axis=1, keepdims=True, initial=0.0))
     excess = np.where(np.isnan(thirds), np.inf, thirds / np.where(size > 0, size, 1.0))
@@ -176,14 +178,3 @@ def _four(group: Group, places: Array, rows: np.ndarray, steps: np.ndarray) -> F
         return jnp.stack([effect.quadratic(place, rows + k * step) for k in range(4)])
 
     return jax.vmap(values)(group.effect, places, rows, steps)
-
-
-def _complaint(group: Group, number: int, excess: float, own: type) -> str:
-    residual = not (group.effect.stores or group.effect.unilateral)
-    method = f"{own.__name__}.{'residual' if residual else 'invariants'}"
-    rest = "use a stiff nc.Potential for the rest" if residual else "leave the rest to the energy"
-    return (
-        f"{group.effect.kind} {_name(group, number)!r}: {method} is not at most quadratic in points and "
-        f"directions (third differences are {min(excess, 1e9):.1g} of it), and no step would keep it; make "
-        f"lengths squares, and angles products of directions, and {rest}"
-    )

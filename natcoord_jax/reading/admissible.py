@@ -16,7 +16,7 @@ from jaxtyping import Array
 from natcoord_jax.core.arguments import declared
 from natcoord_jax.core.checks import is_concrete
 from natcoord_jax.core.effect import replace_fields
-from natcoord_jax.core.flaws import first_flaw, traced_flaws
+from natcoord_jax.core.flaws import flaws_of
 from natcoord_jax.core.numeric import range_of
 from natcoord_jax.model.model import Model, SomeModel
 
@@ -62,12 +62,12 @@ def without_flaws(system: SomeModel, name: str) -> SomeModel:
     for group in system.effects:
         if not group.lanes or (name not in group.names and name not in group.labels):
             continue
-        flaw = first_flaw(group.effect)
+        flaw, unknown = flaws_of(group.effect)
         if flaw is not None:
             element, said = flaw
             of_them = f"element {element} of " if group.is_set else ""
             raise ValueError(f"{of_them}{group.effect.kind} {name!r} {said}")
-        traced += traced_flaws(group.effect)
+        traced += unknown
     return without_masses(system, traced)
 
 

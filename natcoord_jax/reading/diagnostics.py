@@ -23,7 +23,6 @@ from natcoord_jax.mechanics.violations import (
     violations_of,
     worst_violation,
 )
-from natcoord_jax.model.groups import Group
 from natcoord_jax.model.model import Model
 from natcoord_jax.model.rows import over_states
 from natcoord_jax.reading.tangent_states import Source, over_source
@@ -254,17 +253,12 @@ class ConstraintErrors(eqx.Module):
         return jnp.maximum(jnp.maximum(self.director_rates, self.joint_rates), self.relation_rates)
 
 
-def _relations(system: Model) -> tuple[Group, ...]:
-    return tuple(g for g in system.effects if g.holds)
-
-
 @over_states
 def _values(system: Model, state: State) -> tuple[Array, Array, Array]:
     d = state.rows[:, 1:]
     gram = jnp.einsum("bik,bjk->bij", d, d) - jnp.eye(3)
-    joints, relations = (
-        largest(violations_of(system, groups, state)) for groups in (system.joints, _relations(system))
-    )
+    groups = system.joints, tuple(relations_of(system))
+    joints, relations = (largest(violations_of(system, some, state)) for some in groups)
     return jnp.max(jnp.abs(gram)), joints, relations
 
 
@@ -272,9 +266,8 @@ def _values(system: Model, state: State) -> tuple[Array, Array, Array]:
 def _rates(system: Model, state: State) -> tuple[Array, Array, Array]:
     d, rates = state.rows[:, 1:], state.row_rates[:, 1:]
     mixed = jnp.einsum("bik,bjk->bij", d, rates)
-    joints, relations = (
-        largest(violation_rates_of(system, groups, state)) for groups in (system.joints, _relations(system))
-    )
+    groups = system.joints, tuple(relations_of(system))
+    joints, relations = (largest(violation_rates_of(system, some, state)) for some in groups)
     return jnp.max(jnp.abs(mixed + jnp.swapaxes(mixed, 1, 2))), joints, relations
 
 

@@ -135,13 +135,6 @@ def _reactions(
     return balances.reactions(force, torque, lam)
 
 
-def _units(system: Model, radius: Array) -> Float[Array, " m"]:
-    """Of every constraint, what it changes by where a body moves by one metre, or turns by as much."""
-    groups = (*relations_of(system), *loops_of(system))
-    change = [g.spans[..., 0] + g.spans[..., 1] / jnp.sqrt(radius) for g in groups]
-    return jnp.concatenate([x.reshape(-1) for x in change])
-
-
 def _measured(
     balances: EquationsOfMotion, units: Array, radius: Array, gains: Any, applied: Twists, lam: Array
 ) -> Array:
@@ -170,7 +163,11 @@ def _with_constraints(
     still = jnp.zeros_like(balances.rows[:, 0])
     lam0 = nothing.constraints
     matrix, zero = _accelerated(balances, columns, (still, still), nothing)
-    units, each = _units(system, radius), jnp.eye(lam0.shape[0], dtype=lam0.dtype)
+    # What constraints change by where a body moves by one metre, or turns by as much.
+    groups = (*relations_of(system), *loops_of(system))
+    shift, turn = jnp.concatenate([g.spans.reshape(-1, 2) for g in groups]).T
+    units = shift + turn / jnp.sqrt(radius)
+    each = jnp.eye(lam0.shape[0], dtype=lam0.dtype)
     share = jax.vmap(lambda lam: _measured(balances, units, radius, nothing, (still, still), lam))(each).T
     saddle = Saddle.of(matrix, columns.constraints.T / units[:, None], share.T @ share, mass)
     w = w + saddle.solve(zero, -balances.rates(w).constraints / units)[0]

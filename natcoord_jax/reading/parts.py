@@ -12,9 +12,9 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.core.bodies import mass_block
 from natcoord_jax.core.checks import as_array, is_concrete
-from natcoord_jax.core.eager_numpy import eager_numpy
+from natcoord_jax.core.eager_numpy import broadcast, eager_numpy
 from natcoord_jax.core.effect import Effect, replace_fields
-from natcoord_jax.core.handles import Handle
+from natcoord_jax.core.handles import Handle, named
 from natcoord_jax.core.inertia import diagonal, even, is_even, possible, tensor, to_second_moment
 from natcoord_jax.core.kinds import is_other
 from natcoord_jax.core.names import listed
@@ -42,7 +42,7 @@ class Place(NamedTuple):
 
 def _names(part: Names) -> tuple[str, ...]:
     listed = [part] if isinstance(part, Handle | str) else part
-    return tuple(x.name if isinstance(x, Handle) else x for x in listed)
+    return tuple(map(named, listed))
 
 
 def _several(system: Model, part: Names) -> Names:
@@ -52,12 +52,6 @@ def _several(system: Model, part: Names) -> Names:
     known = [n for g in (*system.joints, *system.effects) for n in (*g.names, *g.labels)]
     parts = [] if part in known else [n for n in dict.fromkeys(known) if n.startswith(f"{part}[")]
     return parts or part
-
-
-def _numbered(system: SomeModel) -> SomeModel:
-    """The system with the numbers of its leaves instead of these."""
-    leaves, structure = jax.tree.flatten(system)
-    return jax.tree.unflatten(structure, range(len(leaves)))
 
 
 def _in_group(group: Group, numbered: Group, name: str) -> dict[str, Place]:
@@ -83,7 +77,9 @@ def places(system: Model, name: str) -> dict[str, Place]:
     Raises:
         ValueError: for a name that is no part of the system.
     """
-    numbered, structure = _numbered(system), system.structure
+    leaves, tree = jax.tree.flatten(system)
+    # The system with the numbers of its leaves instead of these.
+    numbered, structure = jax.tree.unflatten(tree, range(len(leaves))), system.structure
     found: dict[str, Place] = {}
     if name in structure.bodies:
         leaf: Any = numbered.mass
@@ -111,11 +107,6 @@ def _fields(system: Model, name: str, found: dict[str, Place]) -> list[str]:
     return ["mass_block", *BODY[: 1 if index in system.structure.points else 3]]
 
 
-def _value(system: Model, place: Place) -> Array:
-    leaf = jnp.asarray(jax.tree.leaves(system)[place.leaf])
-    return leaf if place.row is None else leaf[place.row]
-
-
 @eager_numpy
 def _parted(block: Float[Array, "4 4"]) -> dict[str, Array]:
     """Mass [kg], centre of mass [m] and inertia about it [kg m^2] of a mass block (15)."""
@@ -133,18 +124,6 @@ def _block(mass: Array, com: Float[Array, "3"], inertia: Float[Array, "3 3"]) ->
 
 
 @eager_numpy
-def _moments(block: Float[Array, "4 4"]) -> tuple[Array, Array, Array]:
-    """Mass [kg], and second moments about the centre of mass and the reference point [kg m^2]."""
-    mass, first, about = block[0, 0], block[0, 1:], block[1:, 1:]
-    return mass, about - jnp.outer(first, first) / mass, about
-
-
-@eager_numpy
-def _for_all(value: Array, shape: tuple[int, ...]) -> Array:
-    return jnp.broadcast_to(value, shape)
-
-
-@eager_numpy
 def _with_row(leaf: Array, row: int | None, value: Array) -> Array:
     return value if row is None else leaf.at[row].set(value)
 
@@ -158,15 +137,14 @@ def get(system: Model, part: Names, field: str | None = None) -> Any:
     (name,) = _names(part)
     found = places(system, name)
     known = _fields(system, name, found)
-    values = {key: _value(system, place) for key, place in found.items()}
+    leaves = jax.tree.leaves(system)
+    values = {key: jnp.asarray(leaves[x.leaf])[() if x.row is None else x.row] for key, x in found.items()}
     if "mass_block" in found:
         values |= _parted(values["mass_block"])
     values = {key: values[key] for key in known}
     if field is None:
         return values
-    field = _whole_name(field, known)
-    _check(name, known, field, next(iter(found.values()), None))
-    return values[field]
+    return values[_whole_name(name, known, field, next(iter(found.values()), None))]
 
 
 def set_numbers(system: SomeModel, part: Names, values: dict[str, Any]) -> SomeModel:
@@ -182,8 +160,8 @@ def set_numbers(system: SomeModel, part: Names, values: dict[str, Any]) -> SomeM
         kind = next(iter(found.values()), None)
         now = get(system, name)
         given = {}
-        for field, value in ((_whole_name(field, known), value) for field, value in values.items()):
-            _check(name, known, field, kind)
+        for field, value in values.items():
+            field = _whole_name(name, known, field, kind)
             label = f"{name!r}: {field}"
             every = found[field].row is None if field in found else False
             given[field] = _fitting(value, now[field], k if many else None, len(names), label, every=every)
@@ -242,9 +220,10 @@ def _as_block(name: str, now: dict[str, Array], given: dict[str, Array]) -> dict
         if len(given) > 1:
             raise ValueError(f"{label}: pass mass_block, or some of {list(BODY)}, not both")
         block = even(given["mass_block"], f"{label}: mass_block [kg, kg m, kg m^2]")
-        mass, central, about = _moments(block)
+        parts = _parted(block)
+        mass, central = parts["mass"], to_second_moment(parts["inertia"])
         in_range(MASS, mass, f"{label}: mass [kg]")
-        return {"mass_block": possible(block, central / (mass > 0), about, label, "mass_block")}
+        return {"mass_block": possible(block, central / (mass > 0), block[1:, 1:], label, "mass_block")}
     if "mass" in given:
         given = {**given, "mass": in_range(MASS, given["mass"], f"{label}: mass [kg]")}
     if "inertia" not in now:
@@ -256,20 +235,17 @@ def _as_block(name: str, now: dict[str, Array], given: dict[str, Array]) -> dict
     return {"mass_block": _block(*(given.get(key, now[key]) for key in BODY))}
 
 
-def _whole_name(field: str, known: list[str]) -> str:
+def _whole_name(name: str, known: list[str], field: str, place: Place | None) -> str:
     """Name of a number of a part: "E" stands for "material.E" where there is no other."""
-    ends = [key for key in known if key.endswith(f".{field}")]
-    return ends[0] if field not in known and len(ends) == 1 else field
-
-
-def _check(name: str, known: list[str], field: str, place: Place | None) -> None:
-    if field not in known:
+    ends = [key for key in known if key == field] or [key for key in known if key.endswith(f".{field}")]
+    if len(ends) != 1:
         label = repr(name) if place is None else place.kind
         raise ValueError(
             f"the {label} has no number {field!r}; it has {known}. Not among them are what a function closes "
             "over (change it where it is, the next call sees it) and what only the assembled pose takes, as "
             "the point and the zero of a joint (change it in the scene, and compile that)"
         )
+    return ends[0]
 
 
 def _principal(array: Array, *, several: bool) -> Array:
@@ -295,7 +271,7 @@ def _fitting(value: Any, now: Array, k: int | None, count: int, label: str, *, e
     if label.endswith(": inertia") and array.shape in ((3,), (count, 3)):
         array = _principal(array, several=k is not None)
     if every and k is None and array.shape == now.shape[1:]:
-        array = _for_all(array, now.shape)
+        array = broadcast(array, now.shape)
     shapes = [now.shape] + ([(count, *now.shape)] if k is not None else [])
     if array.shape not in shapes:
         wanted = " or ".join(map(str, shapes))

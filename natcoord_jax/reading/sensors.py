@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.core.bodies import by_node
 from natcoord_jax.core.compiled import compiled
-from natcoord_jax.core.handles import Handle
+from natcoord_jax.core.handles import Handle, named
 from natcoord_jax.core.markers import Interpolated, Marker
 from natcoord_jax.core.names import clamped
 from natcoord_jax.core.names import listed as listed_names
@@ -166,15 +166,6 @@ class JointSensor(eqx.Module):
         return torque if self.lever is None else torque + cross(self.lever, found.forces[..., self.index, :])
 
 
-def _continuous(quaternions: Float[Array, "*t 4"], along: bool) -> Float[Array, "*t 4"]:
-    """Signs chosen so that neighbours along the last leading axis are close to each other."""
-    if not along:
-        return quaternions
-    products = jnp.sum(quaternions[..., 1:, :] * quaternions[..., :-1, :], axis=-1)
-    flips = jnp.cumprod(jnp.where(products < 0, -1.0, 1.0), axis=-1)
-    return quaternions.at[..., 1:, :].multiply(flips[..., None])
-
-
 def _centres(mass: Float[Array, "bodies 4 4"]) -> Float[Array, "bodies 4"]:
     """Marker weights of the centres of mass; of bodies without mass those of the reference point."""
     total = mass[:, :1, 0]
@@ -187,7 +178,12 @@ def _body_pose(system: Model, states: State, index: Array, along: bool) -> tuple
     rows = states.rows[..., index, :, :]
     rotation = jnp.swapaxes(rows[..., 1:, :], -1, -2)
     mass = _centres(system.mass)[index]
-    quaternion = _continuous(to_quaternion(rotation), along)
+    quaternion = to_quaternion(rotation)
+    if along:
+        # Signs chosen so that neighbours are close to each other.
+        products = jnp.sum(quaternion[..., 1:, :] * quaternion[..., :-1, :], axis=-1)
+        flips = jnp.cumprod(jnp.where(products < 0, -1.0, 1.0), axis=-1)
+        quaternion = quaternion.at[..., 1:, :].multiply(flips[..., None])
     return rows[..., 0, :], rotation, quaternion, jnp.sum(mass[:, None] * rows, axis=-2)
 
 
@@ -246,8 +242,8 @@ def sense(
 ) -> Any:
     """Sensor of a body, a joint, a marker or elements of beams; see `System.sense`."""
     states = states_of(motion)
-    named = part.name if isinstance(part, Handle) else part
-    if about is not None and (not isinstance(named, str) or named not in system.structure.joints):
+    sensed = named(part)
+    if about is not None and (not isinstance(sensed, str) or sensed not in system.structure.joints):
         raise ValueError(f"{part!r} has no reaction about a point: pass `about` with a joint")
     source = Source.of(system, motion, inputs_along(system, motion, inputs))
     if isinstance(part, Interpolated):
@@ -263,7 +259,7 @@ def sense(
     if isinstance(part, tuple) and not part:
         raise ValueError("cannot sense nothing: the tuple of elements is empty")
     listed = part if isinstance(part, tuple) else (part,)
-    names = tuple(x.name if isinstance(x, Handle) else x for x in listed)
+    names = tuple(map(named, listed))
     if any(tells(group, names[0]) for group in system.effects):
         found = readings(system, states, names)
         axis = states.t.ndim

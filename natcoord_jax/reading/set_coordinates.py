@@ -181,12 +181,6 @@ def with_coordinate(
     return _with_coordinate(system, state, body, tuple(places.tolist()), index, as_array(value, float), rate)
 
 
-def _twists(state: State, rows: Float[Array, "n 4 3"]) -> Float[Array, "n 6"]:
-    """Velocities of the reference points, and angular velocities, of all bodies and the ground."""
-    rates, spin = velocities_with_ground(state.v, rows)
-    return jnp.concatenate([rates[:, 0], spin], axis=1)
-
-
 def _carried_by(
     twists: Float[Array, "n 6"], rows: Float[Array, "n 4 3"], body: Any, at: Float[Array, "n 4 3"]
 ) -> Float[Array, "n 6"]:
@@ -218,7 +212,8 @@ def _with_coordinate(
     rates, motions = _joint_motions(system, after[:-1], body, places)
     own = jnp.append(tree_rates(system, state), 0.0)[jnp.asarray(system.tree.slot_index)[body]]
     own = own + _slot_rates(rates, wanted - rates @ own)
-    before = _twists(state, rows)
+    velocities, spin = velocities_with_ground(state.v, rows)
+    before = jnp.concatenate([velocities[:, 0], spin], axis=1)
     # Motions relative to the child turn along with it.
     carrier = _carried_by(before, rows, system.tree.parent[body], after)
     new = carrier[body] + own @ motions

@@ -1,12 +1,13 @@
 """From one system to another in the middle of a motion: joints that close, and joints that open."""
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.checks import is_concrete
@@ -33,11 +34,13 @@ def _merged(
     return found.at[here].set(old[there])
 
 
-def check_bodies(old: Model, new: Model, onto: State | None) -> None:
+def _check_parts(old: Model, new: Model, onto: State | None) -> None:
     """Bodies of the old system must be in the new one, and the other way round where no state has them.
 
+    Joints of both must join the same bodies; that is looked at in concrete systems only.
+
     Raises:
-        ValueError: naming the bodies that are missing.
+        ValueError: naming the bodies that are missing, or a joint that joins others.
     """
     before, after = set(old.structure.bodies), set(new.structure.bodies)
     if before - after:
@@ -50,6 +53,19 @@ def check_bodies(old: Model, new: Model, onto: State | None) -> None:
             f"the old state says nothing of the bodies {sorted(after - before)}; pass a state of the new "
             "system that has them as `onto`"
         )
+    if not is_concrete(old.joint_bodies, new.joint_bodies):
+        return
+    pairs = []
+    for system, numbers in zip((old, new), common_joints(old, new)):
+        names = (*system.structure.bodies, ground.name)
+        ends = np.asarray(system.joint_bodies)[numbers]
+        pairs.append([(system.structure.joints[j], names[a], names[b]) for j, (a, b) in zip(numbers, ends)])
+    for before, after in zip(*pairs):
+        if before != after:
+            raise ValueError(
+                f"joint {before[0]!r} joins {before[1:]} in the old system and {after[1:]} in the new one; "
+                "give the new joint another name"
+            )
 
 
 def common_joints(old: Model, new: Model) -> tuple[np.ndarray, np.ndarray]:
@@ -66,38 +82,10 @@ def new_joints(old: Model, new: Model) -> np.ndarray:
     return np.array([k for k, name in enumerate(new.structure.joints) if name not in known], int)
 
 
-def check_joints(old: Model, new: Model) -> None:
-    """Joints of both systems must join the same bodies; looks at concrete systems only.
-
-    Raises:
-        ValueError: naming a joint that does not.
-    """
-    if not is_concrete(old.joint_bodies, new.joint_bodies):
-        return
-    pairs = []
-    for system, numbers in zip((old, new), common_joints(old, new)):
-        names = (*system.structure.bodies, ground.name)
-        ends = np.asarray(system.joint_bodies)[numbers]
-        pairs.append([(system.structure.joints[j], names[a], names[b]) for j, (a, b) in zip(numbers, ends)])
-    for before, after in zip(*pairs):
-        if before != after:
-            raise ValueError(
-                f"joint {before[0]!r} joins {before[1:]} in the old system and {after[1:]} in the new one; "
-                "give the new joint another name"
-            )
-
-
-def taking_hold(old: Model, new: Model, joints: np.ndarray) -> Bool[Array, " joints"]:
-    """Which joints of the new system touch a body of the old one."""
-    carried = np.array([name in old.structure.bodies for name in new.structure.bodies] + [False])
-    return jnp.any(jnp.asarray(carried)[new.joint_bodies[joints]], axis=1)
-
-
 def in_layout(old: Model, state: State, new: Model, onto: State | None) -> State:
     """A state by the names of another system; stored rates are those of rotors of the same name."""
     rest = [None] * 4 if onto is None else [onto.q, onto.v, onto.coordinates, onto.work]
-    names = [(name, row) for name in new.structure.bodies for row in range(4)]
-    old_names = [(name, row) for name in old.structure.bodies for row in range(4)]
+    old_names, names = ([(n, row) for n in x.structure.bodies for row in range(4)] for x in (old, new))
     rates = onto.rates if onto is not None else jnp.zeros(new.structure.rotors, state.q.dtype)
     return State(
         state.t,
@@ -200,8 +188,7 @@ def transfer(
         >>> float((state.q[4, 0] - state.q[0, 0]).round(12))
         0.5
     """
-    check_bodies(system, into, onto)
-    check_joints(system, into)
+    _check_parts(system, into, onto)
     made, moved = _transferred(system, state, into, onto)
     names = {into.structure.joints[int(j)] for j in new_joints(system, into)}
     if names and is_concrete(made, moved):
@@ -217,16 +204,13 @@ def _transferred(system: Model, state: State, into: SomeModel, onto: State | Non
     joints = new_joints(system, into)
     if not joints.size:
         return into, moved
-    closes = taking_hold(system, into, joints)
+    # Those that touch a body of the old system.
+    carried = np.array([name in system.structure.bodies for name in into.structure.bodies] + [False])
+    closes = jnp.any(jnp.asarray(carried)[into.joint_bodies[joints]], axis=1)
     into = held(into, rows_with_ground(moved.q), joints, closes)
     moved = with_coordinates_of(into, moved, joints, closes)
-    return into, _after_impact(system, into, moved, jnp.any(closes))
-
-
-def _after_impact(system: Model, into: Model, moved: State, closes: Bool[Array, ""]) -> State:
-    """The state with velocities that the joints admit, if any closes."""
     found = with_admissible_velocities(into, moved, _rates_before(system, into, moved))[0]
-    return jax.tree.map(lambda x, y: jnp.where(closes, x, y), found, moved)
+    return into, jax.tree.map(partial(jnp.where, jnp.any(closes)), found, moved)
 
 
 def _rates_before(system: Model, into: Model, moved: State) -> Float[Array, " coordinates"]:

@@ -2,7 +2,6 @@
 
 import warnings
 import weakref
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -203,7 +202,11 @@ def find_redundancy(system: System, state: State) -> tuple[int, tuple[str, ...]]
     for attempt in range(3):
         state_now = state
         if attempt:
-            disturbed = _disturbed(state, system.size, random)
+            rows = np.asarray(state.rows)
+            noise = 0.05 * random.normal(size=rows.shape)
+            noise[:, 0] *= float(system.size)
+            q, still = as_array((rows + noise).reshape(-1, 3)), as_array(np.zeros(state.v.shape))
+            disturbed = replace_fields(state, q=q, v=still)
             state_now, code = _with_admissible_positions(system, disturbed)
             if int(code) != Result.SUCCESSFUL:
                 continue
@@ -217,13 +220,6 @@ def find_redundancy(system: System, state: State) -> tuple[int, tuple[str, ...]]
             places = system.structure.unknowns + np.flatnonzero(held)[dependent]
             names = tuple(dict.fromkeys(unknown_name(system, int(r)) for r in places))
     return best, names
-
-
-def _disturbed(state: State, size: Any, random: np.random.Generator) -> State:
-    q = np.asarray(state.rows)
-    noise = 0.05 * random.normal(size=q.shape)
-    noise[:, 0] *= float(size)
-    return replace_fields(state, q=as_array((q + noise).reshape(-1, 3)), v=as_array(np.zeros(state.v.shape)))
 
 
 def _rank(rows: np.ndarray) -> tuple[int, list[int]]:

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.results import Result
 from natcoord_jax.core.state import State
 from natcoord_jax.mechanics.failures import result_of
@@ -76,11 +77,11 @@ def _followed(
         kicks = in_body_axes(course.state, kick)
         solution = jnp.concatenate([it.y, kicks])
         inertias = jnp.concatenate([inertias, jnp.zeros_like(kicks)])
-    alone = Predictor(
-        course.past.differences, jnp.ones_like(course.past.known), jnp.zeros_like(course.past.order)
-    )
+    first, *more = course.past.differences
     if trial is not None:
-        alone = alone.beginning_with(solution, solved)
+        # An attempt that was made for comparison has a solution, too, if there is one.
+        first = jnp.where(solved, solution, first)
+    alone = Predictor((first, *more), jnp.ones_like(course.past.known), jnp.zeros_like(course.past.order))
     followed = course.past.followed_by(solution, inertias)
     past = jax.tree.map(lambda x, y: jnp.where(kept, x, y), followed, alone)
     same = fraction == course.fraction
@@ -111,7 +112,8 @@ def _next_part(
     if trial is None:
         return done, jnp.where(complete, 1.0, fraction), None, left
     left = jnp.where(verdict.change < 0, trial.left, left)
-    trial = trial.beginning(done, complete).leaving(left, verdict.accepted | verdict.failed)
+    before = jnp.where(verdict.accepted | verdict.failed, left, trial.left)
+    trial = replace_fields(trial.beginning(done, complete), left=before)
     return done, jnp.where(complete, trial.length, fraction), trial, left
 
 

@@ -41,8 +41,7 @@ def warn_of_uncovered(system: Model, trajectory: Trajectory) -> None:
         part = max(1, AT_ONCE // group.count)
         for start in range(0, len(trajectory.t), part):
             states = jax.tree.map(lambda x, k=slice(start, start + part): x[k], trajectory.states)
-            found = {said: np.asarray(x) for said, x in look(system, states).items()}
-            seen = {said: x for said, x in found.items() if x.any()}
+            seen = {said: np.asarray(x) for said, x in look(system, states).items() if np.any(x)}
             for said, x in seen.items():
                 step, number = np.argwhere(x)[0]
                 name = system.structure.bodies[int(np.asarray(group.bodies)[number].reshape(-1)[0])]

@@ -15,6 +15,7 @@ from natcoord_jax.core.state import State
 from natcoord_jax.mechanics.block_tangent_space import with_system
 from natcoord_jax.mechanics.equations import prepare, starting
 from natcoord_jax.mechanics.failures import first_failure
+from natcoord_jax.mechanics.free_flight import in_free_flight
 from natcoord_jax.mechanics.frozen_kick import Lagging
 from natcoord_jax.mechanics.kick import Kick
 from natcoord_jax.mechanics.redundancy import contact_weights
@@ -26,7 +27,7 @@ from natcoord_jax.stepping.after_attempt import after_attempt
 from natcoord_jax.stepping.difference_jacobian import DifferenceJacobian, evaluated, told
 from natcoord_jax.stepping.energy_check import motion_of, sound
 from natcoord_jax.stepping.factors import Factors, factors_of
-from natcoord_jax.stepping.located import Ahead
+from natcoord_jax.stepping.located import WHOLE, Ahead
 from natcoord_jax.stepping.newton import Iterate, any_lane, begin, judge, refreshed
 from natcoord_jax.stepping.remainder import remainder, with_remainder
 from natcoord_jax.stepping.rollout_state import RolloutProblem, RolloutState
@@ -115,7 +116,9 @@ def attempt(
     course = replace_fields(carried.course, state=unpack(carried.state))
     u, h, index = setting.situation(course)
     search = course.search
-    system = setting.system if search is None else search.system(setting.system, course.state, setting.dt)
+    system = setting.system
+    if search is not None:
+        system = in_free_flight(system, course.state, setting.dt, search.event != WHOLE)
     equations = prepare(system, course.state, u, h, setting.plan.tableau, carried.start_cache)
     start = _unsolved(equations, carried)
     evaluate = partial(_evaluation, setting, course, equations, apart)
@@ -284,7 +287,8 @@ def renewed_at(
     """New factors by formulas, and the iteration with them."""
     _, options = _judging(equations, it, None)
     loads = jax.tree.map(lambda x: jnp.where(asked.here, x, 0.0), asked.loads)
-    factors = factors_of(equations, equations.tangent(it.y, loads), factors.noise, equations.grain)
+    made = equations.factorised(equations.tangent(it.y, loads))
+    factors = factors_of(made, factors.noise, equations.grain)
     it = refreshed(it)
     # What the residual asks for with new factors needs no evaluation; but the kick in it may have been held.
     options |= {"whole": not setting.plan.tableau.kick}

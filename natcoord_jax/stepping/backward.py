@@ -24,7 +24,7 @@ from natcoord_jax.stepping.newton import any_lane
 from natcoord_jax.stepping.plan import Plan
 from natcoord_jax.stepping.record import Parameters, ParameterTangents, Record, Slot
 from natcoord_jax.stepping.rollout_state import Predictor
-from natcoord_jax.stepping.slot_sweep import Fixed, SlotSweep, SweepCarry
+from natcoord_jax.stepping.slot_sweep import Fixed, SlotSweep, SweepCarry, outcome
 from natcoord_jax.system import System
 
 MANY = 8
@@ -66,7 +66,9 @@ class Backward(SlotSweep):
         numbers, slots = record.numbers, record.slots
         y, before_all = slots.y[-1], jax.tree.map(lambda x: x[0], slots.before)
         state_bar = jax.tree.map(jnp.zeros_like, before_all)
-        own = state_bar, self._no_change(numbers, before_all), jax.tree.map(jnp.zeros_like, numbers.varied)
+        shapes = jax.eval_shape(partial(self.admitted, numbers, numbers.varied), before_all)
+        none = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+        own = state_bar, none, jax.tree.map(jnp.zeros_like, numbers.varied)
         like = slots.u, (slots.y, slots.before) if self.forced else None
         start = y, record.factors, own
         fixed = Fixed.of(self.tableau, record)
@@ -76,10 +78,6 @@ class Backward(SlotSweep):
             return ParameterTangents(varied_bar, u_bar, state_bar, forced_bar)
         varied_bar, state_bar = kernel(self._before_all, numbers, before_all, c)
         return ParameterTangents(varied_bar, u_bar, state_bar, forced_bar)
-
-    def _no_change(self, numbers: Parameters, state: State) -> Tangents | None:
-        shapes = jax.eval_shape(partial(self.admitted, numbers, numbers.varied), state)
-        return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
 
     def _before_all(self, numbers: Parameters, state: State, c: SweepCarry) -> tuple[list[Array], State]:
         """Cotangents of what varies and of the first state, with those of the tangent space there."""
@@ -119,7 +117,7 @@ class Backward(SlotSweep):
         at_slot = numbers.varied, slot.before, tangents, slot.u
         nothing = jax.tree.map(jnp.zeros_like, at_slot)
 
-        _, pull = jax.vjp(partial(self.outcome, numbers, slot), *at_slot, slot.y)
+        _, pull = jax.vjp(partial(outcome, self.plan, numbers, slot), *at_slot, slot.y)
 
         def solve(lam: Array, learnt: Any, at: LinearIteration) -> tuple:
             ends: Any = arrived, tangents_bar
@@ -228,7 +226,7 @@ class Forward(SlotSweep):
 
         # One product serves for everything: first without the unknowns, for r; then with them alone. A second
         # one would save some time and compile for as long again.
-        _, along = jax.linearize(partial(self.outcome, numbers, slot), *at_slot, slot.y)
+        _, along = jax.linearize(partial(outcome, self.plan, numbers, slot), *at_slot, slot.y)
         changes = varied_dot, *arrived, u_dot
         none, nothing = jnp.zeros_like(slot.fraction), jax.tree.map(jnp.zeros_like, (slot.before, tangents))
         foreseen = replace_fields(c.own[2], order=c.pasts[0].order).guess

@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.core.bodies import TRIAD
-from natcoord_jax.core.checks import as_array, at_top_level
+from natcoord_jax.core.checks import as_array
+from natcoord_jax.core.eager_numpy import broadcast
 from natcoord_jax.core.kinds import FunctionOf
 from natcoord_jax.core.numeric import Number, Numbers
 from natcoord_jax.core.state import State
@@ -51,12 +52,7 @@ def checked_inputs(system: System, inputs: Any, steps: int | None, stages: int =
         return as_array(np.zeros((steps, len(names)))), int(steps)
     array = as_array(inputs, float)
     if array.shape == (len(names),) and steps is not None:
-        # (Where nothing is traced, an operation of JAX would compile a program for every number of steps.)
-        whole = steps, len(names)
-        if at_top_level(array):
-            array = as_array(np.broadcast_to(np.asarray(array), whole))
-        else:
-            array = jnp.broadcast_to(array, whole)
+        array = broadcast(array, (steps, len(names)))
     counted = array.shape[0] if array.ndim else 0
     shapes = (len(names),), (stages, len(names))
     if array.shape[1:] not in shapes or counted != (steps or counted) or counted == 0:

@@ -99,12 +99,6 @@ class Outcome(eqx.Module):
     least: Bool[Array, ""]
 
 
-def _shakes(bodies: int) -> np.ndarray:
-    """Twists by which bodies are shaken, the first one none."""
-    random = np.random.default_rng(0).normal(size=(SHAKES, bodies, 6))
-    return SHAKEN * np.concatenate([np.zeros((1, bodies, 6)), random])
-
-
 def _step(system: System, origin: State, state: State, manner: Manner) -> Outcome:
     """One step from a state on the way from `origin`, where coordinates have the values to hold."""
     held = None if origin.held is None else manner.holding * origin.held[0]
@@ -120,7 +114,10 @@ def _step(system: System, origin: State, state: State, manner: Manner) -> Outcom
     points = state.rows[:, 0]
     extent = largest(jnp.abs(points - jnp.mean(points, axis=0)).reshape(-1)) + 0.1 * system.size
     size = jnp.concatenate([jnp.full(3, extent), jnp.ones(3, extent.dtype)])
-    shaken = jnp.asarray(_shakes(points.shape[0]))[manner.shake] * size
+    # Twists by which bodies are shaken, the first one none.
+    random = np.random.default_rng(0).normal(size=(SHAKES, *twist.shape))
+    shakes = SHAKEN * np.concatenate([np.zeros((1, *twist.shape)), random])
+    shaken = jnp.asarray(shakes)[manner.shake] * size
     twist = jnp.where(manner.shake > 0, shaken, twist)
     after = _moved(system, state, twist)
     found = gaps(system, after, held, wanted)

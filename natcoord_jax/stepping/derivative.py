@@ -25,7 +25,6 @@ from natcoord_jax.mechanics.momentum import row_weights
 from natcoord_jax.stepping.backward import Backward, Forward
 from natcoord_jax.stepping.error_control import Tolerance
 from natcoord_jax.stepping.linear_iteration import STALL_ROUND_OFF, sizes_by_mass
-from natcoord_jax.stepping.located import part_of_step
 from natcoord_jax.stepping.plan import Plan, Slots
 from natcoord_jax.stepping.record import (
     Parameters,
@@ -37,8 +36,8 @@ from natcoord_jax.stepping.record import (
 )
 from natcoord_jax.stepping.rollout import Ending, run
 from natcoord_jax.stepping.slot_chunks import in_chunks
-from natcoord_jax.stepping.slot_sweep import Fixed
-from natcoord_jax.stepping.step import advance, linear_solver
+from natcoord_jax.stepping.slot_sweep import Fixed, outcome
+from natcoord_jax.stepping.step import linear_solver
 from natcoord_jax.system import System
 from natcoord_jax.xla import linear_pair
 from natcoord_jax.xla.one_kernel import lane_by_lane, on_cpu
@@ -102,11 +101,7 @@ class Rule(linear_pair.LinearWithTranspose):
         self, numbers: Parameters, slot: Slot, varied: list[Array], state: State, u: Any, y: Array
     ) -> tuple[Array, State]:
         """Residual of the slot's equations and the state at its end."""
-        system, parameters, dt = numbers.whole(varied)
-        u = slot.inputs(self.plan, system, parameters, state) if u is None else u
-        system, h = part_of_step(system, state, u, dt, y, self.tableau, slot)
-        residual, after, _ = advance(system, state, u, h, y, self.tableau)
-        return residual, slot.settled(after)
+        return outcome(self.plan, numbers, slot, varied, state, None, u, y)[:2]
 
     def prepared(self, numbers: Parameters, varied_dot: list[Array], slot: Slot, u_dot: Any) -> tuple:
         """Linear maps of one slot: from (state, unknowns), of everything else's change, and the solver."""

@@ -24,7 +24,7 @@ from natcoord_jax.mechanics.equations import prepare
 from natcoord_jax.mechanics.frozen_kick import FrozenKick
 from natcoord_jax.mechanics.response import Evaluation
 from natcoord_jax.mechanics.start_cache import StartCache
-from natcoord_jax.stepping.factors import Factors, new_factors
+from natcoord_jax.stepping.factors import Factors, factors_of
 from natcoord_jax.stepping.newton import Iterate, any_lane, refreshed
 from natcoord_jax.stepping.rollout_state import RolloutProblem, RolloutState
 from natcoord_jax.xla.rows import with_row
@@ -39,21 +39,28 @@ class Layout(NamedTuple):
     Attributes:
         number: of the evaluation that changes each unknown.
         measure: by number, the unknown whose change is the measure.
+        count: of the evaluations.
+        moving: of those among them, the first ones, that change rates.
     """
 
-    number: np.ndarray
-    measure: np.ndarray
+    number: Any
+    measure: Any
+    count: Any
+    moving: Any
 
 
 def layouts(equations: Any) -> tuple[Layout, Layout]:
-    """With all stages taken for alike, and with the rates of every stage apart."""
+    """With all stages taken for alike, and with the rates of every stage apart; of the same shapes."""
     places, balances = equations.stage_places, equations.balances
-    rates = balances // places.shape[0]
+    rates, alike = balances // places.shape[0], places.shape[1]
     together, apart = np.zeros(places.size, int), np.arange(places.size)
-    together[places] = np.arange(places.shape[1])
-    apart[places[:, rates:]] = balances + np.arange(places.shape[1] - rates)
+    together[places] = np.arange(alike)
+    apart[places[:, rates:]] = balances + np.arange(alike - rates)
     measure = np.concatenate([np.arange(balances), places[0, rates:]])
-    return Layout(together, places[0]), Layout(apart, measure)
+    count = measure.size
+    return Layout(together, np.resize(places[0], count), alike, rates), Layout(
+        apart, measure, count, balances
+    )
 
 
 class DifferenceJacobian(eqx.Module):
@@ -119,9 +126,6 @@ class DifferenceJacobian(eqx.Module):
         last = choice.measure.shape[0]
         steps = self.changes(equations, y)
 
-        def going(carry: tuple) -> Array:
-            return carry[0] <= last
-
         def point(carry: tuple) -> tuple:
             k, moved, _ = carry
             end = k == last
@@ -130,7 +134,7 @@ class DifferenceJacobian(eqx.Module):
             return jnp.where(k + 1 == choice.count, last, k + 1), moved, found
 
         start = jnp.where(self.making, 0, last), self.moved, found
-        _, moved, found = jax.lax.while_loop(going, point, start)
+        _, moved, found = jax.lax.while_loop(lambda carry: carry[0] <= last, point, start)
         return DifferenceJacobian(self.making, self.alike, self.failures, moved), found
 
     def columns(self, equations: Any, y: Float[Array, " unknowns"]) -> Float[Array, "columns unknowns"]:
@@ -140,59 +144,23 @@ class DifferenceJacobian(eqx.Module):
         return (self.moved[: measure.shape[0]] - self.moved[measure.shape[0]]) / steps[:, None]
 
     def changes(self, equations: Any, y: Float[Array, " unknowns"]) -> Float[Array, " unknowns"]:
-        """Changes of the unknowns."""
-        apart, same = _changes(equations, y)
+        """Changes of the unknowns, those of multipliers the same at all stages, or all the same."""
+        found, places = equations.probes(y), equations.stage_places
+        if places.shape[0] == 1:
+            return found
+        same = found.at[places].set(jnp.max(found[places], axis=0))
+        apart = jnp.where(np.arange(y.shape[0]) < equations.balances, found, same)
         return jnp.where(self.alike, same, apart)
 
-    def _choice(self, equations: Any) -> "Choice":
-        together, apart = layouts(equations)
-        stages = equations.tableau.stages
-        rates, count = equations.balances // stages, apart.measure.size
-        every = Choice(jnp.asarray(apart.number), jnp.asarray(apart.measure), count, rates * stages)
-        if stages == 1:
-            return every
-        fewer = jnp.asarray(np.resize(together.measure, count))
-        alike = Choice(jnp.asarray(together.number), fewer, together.measure.size, rates)
-        return Choice(*(jnp.where(self.alike, x, y) for x, y in zip(alike, every)))
-
-
-class Choice(NamedTuple):
-    """One of the two layouts, in arrays of the same shape; with the number of its evaluations.
-
-    Attributes:
-        number: of the evaluation that changes each unknown.
-        measure: by number, the unknown whose change is the measure.
-        count: of the evaluations.
-        moving: of those among them, the first ones, that change rates.
-    """
-
-    number: Int[Array, " unknowns"]
-    measure: Int[Array, " rows"]
-    count: Any
-    moving: Any
-
-
-def matrix_of(equations: Any, columns: Float[Array, "columns unknowns"]) -> Float[Array, "unknowns unknowns"]:
-    """The Jacobian from its columns with stages told apart."""
-    places, (_, apart) = equations.stage_places, layouts(equations)
-    if places.shape[0] == 1:
-        return columns.T
-    stage = np.zeros(places.size, int)
-    stage[places] = np.arange(places.shape[0])[:, None]
-    rate = np.arange(places.size) < equations.balances
-    there = rate[:, None] | (stage[:, None] == stage)
-    return jnp.where(there, columns[apart.number], 0.0).T
-
-
-def _changes(
-    equations: Any, y: Float[Array, " unknowns"]
-) -> tuple[Float[Array, " unknowns"], Float[Array, " unknowns"]]:
-    """Changes of the unknowns, those of multipliers the same at all stages; and all the same."""
-    found, places = equations.probes(y), equations.stage_places
-    if places.shape[0] == 1:
-        return found, found
-    same = found.at[places].set(jnp.max(found[places], axis=0))
-    return jnp.where(np.arange(y.shape[0]) < equations.balances, found, same), same
+    def _choice(self, equations: Any) -> Layout:
+        """One of the two layouts, in arrays."""
+        together, apart = (
+            x._replace(number=jnp.asarray(x.number), measure=jnp.asarray(x.measure))
+            for x in layouts(equations)
+        )
+        if equations.tableau.stages == 1:
+            return apart
+        return Layout(*(jnp.where(self.alike, x, y) for x, y in zip(together, apart)))
 
 
 def first_probe(setting: RolloutProblem, course: RolloutState, start_cache: StartCache) -> DifferenceJacobian:
@@ -262,7 +230,14 @@ def _renewed(
     """New factors where a Jacobian has been formed by differences, and the iteration with them."""
 
     def whole(columns: Array) -> tuple:
-        return equations.factorised(matrix_of(equations, columns))
+        places = equations.stage_places
+        if places.shape[0] == 1:
+            return equations.factorised(columns.T)
+        stage = np.zeros(places.size, int)
+        stage[places] = np.arange(places.shape[0])[:, None]
+        rate = np.arange(places.size) < equations.balances
+        there = rate[:, None] | (stage[:, None] == stage)
+        return equations.factorised(jnp.where(there, columns[layouts(equations)[1].number], 0.0).T)
 
     def alike(columns: Array) -> tuple:
         return equations.factorised_alike(columns[: equations.stage_places.shape[1]])
@@ -274,7 +249,7 @@ def _renewed(
             made = whole(columns)
         else:
             made = jax.lax.cond(probe.alike, alike, whole, columns)
-        return jnp.array(False), refreshed(it), new_factors(made, factors.noise, equations.grain)
+        return jnp.array(False), refreshed(it), factors_of(made, factors.noise, equations.grain)
 
     # A loop of no or one trip, as at the end of a step.
     _, it, factors = jax.lax.while_loop(lambda carry: carry[0], renewed, (probe.making, it, factors))

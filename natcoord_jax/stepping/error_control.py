@@ -145,10 +145,6 @@ class Trial(eqx.Module):
             (jnp.where(anew, done, self.done), jnp.where(anew, length, self.length)),
         )
 
-    def leaving(self, left: Float[Array, " rates"], anew: Bool[Array, ""]) -> "Trial":
-        """The trial with what was left before the substep that begins, if one does."""
-        return eqx.tree_at(lambda t: t.left, self, jnp.where(anew, left, self.left))
-
 
 class StepDecision(eqx.Module):
     """What follows from an attempt.

@@ -92,10 +92,6 @@ class Factors(eqx.Module):
         leaving, learnt = changes
         return replace_fields(self, leaving=leaving, solver=self.solver if learnt is None else learnt)
 
-    def aged(self) -> "Factors":
-        """Factors for another system, in which corrections may leave more."""
-        return eqx.tree_at(lambda f: f.leaving, self, jnp.minimum(AGEING * self.leaving, 1.0))
-
     def left_by(self, ratio: Array, first: Array) -> Float[Array, ""]:
         """Error that is expected after a correction, in terms of its size.
 
@@ -126,14 +122,7 @@ def no_factors(equations: Any) -> Factors:
     return Factors(solver, inertias, no, no, jnp.array(NEVER), jnp.array(0), noise, noise, noise + 1.0)
 
 
-def factors_of(
-    equations: Any, matrix: Any, noise: Array | float = 0.0, grain: Array | float = 0.0
-) -> Factors:
-    """Factors of a Jacobian."""
-    return new_factors(equations.factorised(matrix), noise, grain)
-
-
-def new_factors(made: tuple[Any, Array], noise: Array | float = 0.0, grain: Array | float = 0.0) -> Factors:
+def factors_of(made: tuple[Any, Array], noise: Array | float = 0.0, grain: Array | float = 0.0) -> Factors:
     """Factors that have just been made, with the inertias of the unknowns."""
     solver, inertias = made
     yes, noise = jnp.array(True), jnp.asarray(noise, inertias.dtype)

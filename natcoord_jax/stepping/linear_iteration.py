@@ -10,7 +10,6 @@ from jaxtyping import Array, Bool, Float, Int
 
 from natcoord_jax.linsolve.learning import MEMORY, SPEED, across, learns, learnt
 from natcoord_jax.stepping.factors import Factors
-from natcoord_jax.xla.rows import row, with_row
 
 CLOSE = 1e-12
 """Error of the solution of a transposed system relative to its size."""
@@ -99,26 +98,10 @@ class LinearIteration(eqx.Module):
         """Whether another row of its matrix is to be formed, for new factors."""
         return self.wanting & self.open & (self.rows < self.most)
 
-    def unit(self, lam: Float[Array, " unknowns"]) -> Float[Array, " unknowns"]:
-        """The unit vector whose product is the next row."""
-        return jnp.where(jnp.arange(lam.shape[0]) == self.rows, 1.0, 0.0)
-
-    def formed(
-        self, asked: Bool[Array, ""], matrix: Float[Array, "n unknowns"], product: Float[Array, " unknowns"]
-    ) -> tuple["LinearIteration", Float[Array, "n unknowns"]]:
-        """With one more row, if that was asked for."""
-        place = jnp.minimum(self.rows, matrix.shape[0] - 1)
-        matrix = with_row(matrix, place, jnp.where(asked, product, row(matrix, place)))
-        return eqx.tree_at(lambda c: c.rows, self, self.rows + asked), matrix
-
     @property
     def going(self) -> Bool[Array, ""]:
         """Whether to go on with the factors at hand."""
         return ~self.done & ~self.wanting
-
-    def unless(self, failed: Bool[Array, ""]) -> "LinearIteration":
-        """Done, if it is that of an attempt that failed: there is nothing to solve."""
-        return eqx.tree_at(lambda c: c.done, self, self.done | failed)
 
     def refreshed(self, most: int) -> "LinearIteration":
         """With new factors; for the next ones, so many rows of the matrix are to be formed."""

@@ -132,10 +132,6 @@ class ImpactSearch(eqx.Module):
         nought, whole = jnp.array(0), jnp.ones(())
         return cls(nought + FLIGHT, nought + FLIGHT, 0.0 * whole, whole, nought, nought)
 
-    def system(self, system: System, state: State, dt: Array) -> System:
-        """The system whose equations the attempt at hand solves."""
-        return in_free_flight(system, state, dt, self.event != WHOLE)
-
     def after(
         self, ahead: Ahead, fraction: Array, done: Array, most: int, solved: Bool[Array, ""]
     ) -> tuple["ImpactSearch", Bool[Array, ""], Float[Array, ""]]:

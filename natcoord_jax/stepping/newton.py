@@ -276,13 +276,10 @@ def newton(equations: Any, tolerance: float) -> tuple[Float[Array, " unknowns"],
     """
 
     def renew(it: Iterate, factors: Factors) -> tuple[Iterate, Factors]:
-        return refreshed(it), factors_of(equations, equations.tangent(it.y), factors.noise)
-
-    def keep(it: Iterate, factors: Factors) -> tuple[Iterate, Factors]:
-        return it, factors
+        return refreshed(it), factors_of(equations.factorised(equations.tangent(it.y)), factors.noise)
 
     def trip(carry: tuple[Iterate, Factors]) -> tuple[Iterate, Factors]:
-        it, factors = jax.lax.cond(any_lane(carry[0].wanting), renew, keep, *carry)
+        it, factors = jax.lax.cond(any_lane(carry[0].wanting), renew, lambda *same: same, *carry)
         return judge(
             factors, tolerance, it, *equations.residual(it.y), balances=True, patience=equations.renewal
         )

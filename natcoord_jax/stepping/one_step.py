@@ -1,12 +1,11 @@
 """A single step, and its derivatives."""
 
-import math
 from typing import Annotated, Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from natcoord_jax.core.arguments import checked
@@ -113,14 +112,11 @@ def linearise(
         ((24, 24), (24, 0))
     """
     inputs, _ = checked_inputs(system, None if u is None else jnp.asarray(u, float)[None], 1)
-    shapes = [x.shape for x in (state.q, state.v, state.coordinates)]
-    sizes = np.cumsum([math.prod(s) for s in shapes])[:-1]
+    x, unflat = ravel_pytree((state.q, state.v, state.coordinates))
 
     def flat(x: Array, u: Array) -> Array:
-        parts = [p.reshape(s) for p, s in zip(jnp.split(x, sizes), shapes)]
-        moved = eqx.tree_at(lambda s: (s.q, s.v, s.coordinates), state, tuple(parts))
+        moved = eqx.tree_at(lambda s: (s.q, s.v, s.coordinates), state, unflat(x))
         after = step(system, moved, u, dt)
-        return jnp.concatenate([after.q.reshape(-1), after.v.reshape(-1), after.coordinates])
+        return ravel_pytree((after.q, after.v, after.coordinates))[0]
 
-    x = jnp.concatenate([state.q.reshape(-1), state.v.reshape(-1), state.coordinates])
     return jax.jacfwd(flat, argnums=(0, 1))(x, inputs[0])

@@ -6,7 +6,6 @@ from functools import reduce
 from typing import Any, TypeVar
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
@@ -137,8 +136,3 @@ class Slots(eqx.Module):
     accepted: Bool[Array, "*slots"]
     finished: Int[Array, "*slots"]
     event: Int[Array, "*slots"] | None = None
-
-    def accepted_first(self, most: int) -> tuple["Slots", Int[Array, ""]]:
-        """The accepted slots only, filled up to `most`, and how many they are."""
-        order = jnp.argsort(~self.accepted, stable=True)[:most]
-        return jax.tree.map(lambda x: x[order], self), jnp.sum(self.accepted)

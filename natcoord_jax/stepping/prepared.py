@@ -51,7 +51,7 @@ def prepared(system: System, state: State, *, assembled: bool, chosen: str | Non
             # Which constraints depend on others is decided as it runs.
             structure = dataclasses.replace(structure, rank=structure.held)
         system = replace_fields(system, structure=structure)
-        return _with_pattern(system, state), state
+        return with_sparsity(system, state), state
     check_inertia(system, state)
     if not assembled:
         check_gaps(system, state)
@@ -63,9 +63,13 @@ def prepared(system: System, state: State, *, assembled: bool, chosen: str | Non
         solver = dense_solver(system.effects, system.mass_between is not None)
         structure = dataclasses.replace(structure, solver=solver)
         system = replace_fields(system, structure=structure)
-    notes = size_notes(system)
-    for note in notes:
-        warnings.warn(note, stacklevel=4)
+    notes, unknowns = (), 6 * len(structure.bodies) + sum(g.count * g.multipliers for g in system.joints)
+    if structure.solver == "full" and unknowns > DENSE_LIMIT:
+        notes = (
+            f"{unknowns} unknowns in loops or couplings across the tree are solved densely: time per step "
+            "grows with the third power of their number",
+        )
+        warnings.warn(notes[0], stacklevel=4)
     structure = dataclasses.replace(
         structure,
         dofs=structure.unknowns - rank,
@@ -74,23 +78,7 @@ def prepared(system: System, state: State, *, assembled: bool, chosen: str | Non
         rank=rank if redundant else None,
     )
     system = replace_fields(system, structure=structure)
-    return _with_pattern(system, state), state
-
-
-def _with_pattern(system: System, state: State) -> System:
-    return with_sparsity(system, state) if system.structure.solver == "sparse" else system
-
-
-def size_notes(system: System) -> tuple[str, ...]:
-    """Warnings about the cost of a system."""
-    structure = system.structure
-    unknowns = 6 * len(structure.bodies) + sum(g.count * g.multipliers for g in system.joints)
-    if structure.solver == "full" and unknowns > DENSE_LIMIT:
-        return (
-            f"{unknowns} unknowns in loops or couplings across the tree are solved densely: time per step "
-            "grows with the third power of their number",
-        )
-    return ()
+    return with_sparsity(system, state), state
 
 
 FAR = 1e30  # [N s] a pull that no contact bears, whatever its gap
@@ -104,7 +92,9 @@ class Sparsity(eqx.Module):
 
 
 def with_sparsity(system: System, state: State) -> System:
-    """The system with the plan for its sparse Jacobian, rehearsed at its initial state."""
+    """The system with the plan for its Jacobian, if that is sparse, rehearsed at its initial state."""
+    if system.structure.solver != "sparse":
+        return system
     pattern, entries = block_pattern(nodes_of(system), [np.asarray(x) for x in elements(system)])
     matrices = _resting(system, state, pattern) if is_concrete(system, state) else []
     return replace_fields(system, sparsity=Sparsity(pattern, choose(pattern, entries, matrices=matrices)))

@@ -61,7 +61,9 @@ def run(
     course, (states, *rest) = replace_fields(found.course, state=unpack(found.state)), found.record
     count, factors, slots = found.count, found.factors, Slots(jax.vmap(unpack)(states), *rest)
     if tolerance is not None:
-        slots, count = slots.accepted_first(plan.steps + plan.extra)
+        # The accepted slots only, filled up.
+        order = jnp.argsort(~slots.accepted, stable=True)[: plan.steps + plan.extra]
+        slots, count = jax.tree.map(lambda x: x[order], slots), jnp.sum(slots.accepted)
     else:
         count = any_lane(count)
     unused = jnp.arange(plan.steps + plan.extra) >= count

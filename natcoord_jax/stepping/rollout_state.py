@@ -6,6 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.results import Result
 from natcoord_jax.core.state import State
 from natcoord_jax.mechanics.equations import prepare
@@ -48,11 +49,6 @@ class Predictor(eqx.Module):
         """One solution."""
         rest = (jnp.zeros_like(y),) * ORDER
         return cls((y, *rest), jnp.array(1), jnp.array(0))
-
-    def beginning_with(self, y: Float[Array, " unknowns"], solved: Bool[Array, ""]) -> "Predictor":
-        """With the solution of an attempt that was made for comparison, if there is one."""
-        first, *rest = self.differences
-        return Predictor((jnp.where(solved, y, first), *rest), self.known, self.order)
 
     @property
     def guess(self) -> Float[Array, " unknowns"]:
@@ -144,9 +140,7 @@ class RolloutProblem(eqx.Module):
             return self
         first = jnp.minimum(course.step, self.parameters.shape[0] - steps)
         some = part(self.parameters, first, steps)
-        return RolloutProblem(
-            self.system, some, self.dt, self.tolerance, self.plan, self.steps, first, self.event
-        )
+        return replace_fields(self, parameters=some, first=first)
 
     def over(self, course: RolloutState) -> Bool[Array, ""]:
         """Whether the rollout has ended."""

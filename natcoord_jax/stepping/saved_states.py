@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from natcoord_jax.core.compiled import briefly, compiled
 from natcoord_jax.core.results import Result
 from natcoord_jax.core.state import State, Trajectory
 from natcoord_jax.reading.tangent_states import reads_velocities
@@ -67,18 +68,13 @@ def planned(
     return plan, parameters, limit
 
 
+@briefly
 def nothing_before(
-    system: System,
-    state: State,
-    inputs: Any,
-    dt: Array,
-    length: int,
-    *rest: Any,
-    allowed: Tolerance | None,
+    system: System, state: State, inputs: Any, dt: Array, tolerance: Tolerance | None, static: Any
 ) -> TakenUp:
-    """What a run takes up that begins anew: zeros."""
-    plan, parameters, limit = planned(state, inputs, length, *rest)
-    setting = RolloutProblem(system, parameters, dt, allowed, plan, length, event=limit)
+    """What a run takes up that begins anew: zeros; what is static is as in `planned`."""
+    plan, parameters, limit = planned(state, inputs, *static)
+    setting = RolloutProblem(system, parameters, dt, tolerance, plan, static[0], event=limit)
     shapes = jax.eval_shape(partial(first_carry, setting), state)
     return TakenUp(jnp.array(True), jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes))
 
@@ -171,3 +167,18 @@ def rollout(
         scheme,
     )
     return trajectory, None if carried is None else jax.tree.map(lambda x: x[0], carried)
+
+
+@compiled
+def simulated(
+    system: System,
+    state: State,
+    inputs: Any,
+    dt: Array,
+    tolerance: Tolerance | None,
+    made: Array | None,
+    taken_up: TakenUp | None,
+    static: Any,
+) -> tuple[Trajectory, Any]:
+    """The rollout, compiled; what is static is what lies between step and tolerance there."""
+    return rollout(system, state, inputs, dt, *static, allowed=tolerance, made=made, taken_up=taken_up)

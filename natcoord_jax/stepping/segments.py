@@ -19,12 +19,11 @@ import numpy as np
 from jaxtyping import Array
 
 from natcoord_jax.core.checks import as_array
-from natcoord_jax.core.compiled import briefly, compiled
 from natcoord_jax.core.results import Result
 from natcoord_jax.core.state import State, Trajectory
 from natcoord_jax.stepping.error_control import Tolerance
 from natcoord_jax.stepping.room import cut, room_for, with_room
-from natcoord_jax.stepping.saved_states import nothing_before, rollout, segment_length
+from natcoord_jax.stepping.saved_states import nothing_before, segment_length, simulated
 from natcoord_jax.stepping.two_kernel_loop import TakenUp
 from natcoord_jax.storage import stream
 from natcoord_jax.storage.vtkhdf import geometry_of
@@ -106,32 +105,11 @@ def _digest(x: Any) -> str:
     return found.hexdigest()
 
 
-@compiled
-def _segment(
-    system: System,
-    state: State,
-    inputs: Any,
-    dt: Array,
-    tolerance: Tolerance | None,
-    made: Array | None,
-    taken_up: TakenUp,
-    static: Any,
-) -> tuple[Trajectory, Any]:
-    return rollout(system, state, inputs, dt, *static, allowed=tolerance, made=made, taken_up=taken_up)
-
-
-@briefly
-def _nothing_before(
-    system: System, state: State, inputs: Any, dt: Array, tolerance: Tolerance | None, static: Any
-) -> TakenUp:
-    return nothing_before(system, state, inputs, dt, *static, allowed=tolerance)
-
-
 def in_segments(run: Run, *, progress: bool, store: Path | None, resume: bool) -> Trajectory:
     """The trajectory of a run, made in segments."""
     static = run.newton_tol, run.extra, run.until, run.scheme
     inputs = _some(run, 0, min(run.length, run.steps))
-    blank = _nothing_before(run.system, run.state, inputs, run.dt, run.tolerance, (run.length, *static))
+    blank = nothing_before(run.system, run.state, inputs, run.dt, run.tolerance, (run.length, *static))
     totals = np.zeros((), stream.TOTALS)
     totals["failed_part"], totals["failed_time"] = -1, float(run.state.t)
     saved = run.steps // run.save_every
@@ -180,7 +158,7 @@ def _go_on(
         last = _at(rows.states, int(totals["saved"]), as_array)
         made = as_array(count, int) if run.connected else None
         arguments = run.system, last, _some(run, first, count), run.dt, run.tolerance, made, taken_up
-        found, carried = _segment(*arguments, static)
+        found, carried = simulated(*arguments, static)
         found = cut(found, count // run.save_every)
         # Of a run that ends here, one more state: with it are the inputs of the step that failed.
         kept = int(np.sum(np.diff(np.asarray(found.t)) > 0)) + (int(found.result) != Result.SUCCESSFUL)

@@ -12,7 +12,6 @@ from jaxtyping import Array
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.callables import Function
 from natcoord_jax.core.checks import as_array, at_top_level, is_concrete
-from natcoord_jax.core.compiled import compiled
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.kinds import FLAG, Concrete, FunctionOf, of
 from natcoord_jax.core.numeric import Number, Whole
@@ -33,25 +32,12 @@ from natcoord_jax.stepping.checked import (
 from natcoord_jax.stepping.error_control import Tolerance
 from natcoord_jax.stepping.newton import TOLERANCE
 from natcoord_jax.stepping.room import Steps, cut, in_host_memory, room_for, with_room
-from natcoord_jax.stepping.saved_states import rollout
+from natcoord_jax.stepping.saved_states import simulated
 from natcoord_jax.stepping.scheme import SCHEME, SECOND_ORDER, Scheme
 from natcoord_jax.stepping.segments import Run, in_segments
 from natcoord_jax.storage.archive import PATH
 from natcoord_jax.system import System
 from natcoord_jax.xla import one_kernel
-
-
-@compiled
-def _simulate(
-    system: System,
-    state: State,
-    inputs: Any,
-    dt: Array,
-    tolerance: Tolerance | None,
-    made: Array | None,
-    static: Any,
-) -> Trajectory:
-    return rollout(system, state, inputs, dt, *static, allowed=tolerance, made=made)[0]
 
 
 @checked()
@@ -205,8 +191,9 @@ def simulate(
         if scheme.tableau.max_events:
             extra_substeps = max(64, room)
     static = (room, int(save_every), checkpoint, float(newton_tol), int(extra_substeps), until, scheme)
+    arguments = system, state, checked, step, tolerance, made, None, static
     try:
-        trajectory = _simulate(system, state, checked, step, tolerance, made, static)
+        trajectory, _ = simulated(*arguments)
     except jax.errors.JaxRuntimeError as error:
         # Another version of the compiler may lack what one kernel needs.
         if not one_kernel.give_up(str(error)):
@@ -216,7 +203,7 @@ def simulate(
             f"{str(error).splitlines()[0]}; please report it with your version of jax, {jax.__version__}",
             stacklevel=2,
         )
-        trajectory = _simulate(system, state, checked, step, tolerance, made, static)
+        trajectory, _ = simulated(*arguments)
     if bounded is not None:
         trajectory = bounded.judged(trajectory)
     if count < room:

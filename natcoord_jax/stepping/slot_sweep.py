@@ -21,14 +21,14 @@ from natcoord_jax.maths.collocation import Tableau
 from natcoord_jax.mechanics.block_tangent_space import Tangents, tangents_at, with_system
 from natcoord_jax.mechanics.equations import kind_of, prepare
 from natcoord_jax.mechanics.start_cache import NOTHING
-from natcoord_jax.stepping.factors import Factors, factors_of
+from natcoord_jax.stepping.factors import AGEING, Factors, factors_of
 from natcoord_jax.stepping.linear_iteration import LinearIteration
 from natcoord_jax.stepping.located import part_of_step
 from natcoord_jax.stepping.newton import any_lane
 from natcoord_jax.stepping.plan import Plan
 from natcoord_jax.stepping.record import Parameters, Record, Slot
 from natcoord_jax.stepping.rollout_state import Predictor
-from natcoord_jax.stepping.step import advance_between
+from natcoord_jax.stepping.step import advance
 from natcoord_jax.xla.one_kernel import in_few_kernels, lane_by_lane
 from natcoord_jax.xla.rows import part, row, with_part, with_row
 from natcoord_jax.xla.tracing import traced_once
@@ -85,6 +85,24 @@ class SweepCarry(eqx.Module):
     stuck: Bool[Array, ""]
 
 
+def outcome(
+    plan: Plan,
+    numbers: Parameters,
+    slot: Slot,
+    varied: list[Array],
+    state: State,
+    tangents: Tangents | None,
+    u: Any,
+    y: Array,
+) -> tuple[Array, State, Tangents | None]:
+    """Residual of a slot's equations, the state at its end, and what the constraints admit there."""
+    system, parameters, dt = numbers.whole(varied)
+    u = slot.inputs(plan, system, parameters, state) if u is None else u
+    system, h = part_of_step(system, state, u, dt, y, plan.tableau, slot)
+    residual, after, tangents = advance(system, state, u, h, y, plan.tableau, tangents)
+    return residual, slot.settled(after), tangents
+
+
 class SlotSweep(ABC):
     """Slots from the last one to the first; hashable, without traced values.
 
@@ -135,23 +153,6 @@ class SlotSweep(ABC):
         if not self.tableau.kick:
             return None
         return with_system(tangents_at(numbers.whole(varied)[0], state), None)
-
-    def outcome(
-        self,
-        numbers: Parameters,
-        slot: Slot,
-        varied: list[Array],
-        state: State,
-        tangents: Tangents | None,
-        u: Any,
-        y: Array,
-    ) -> tuple[Array, State, Tangents | None]:
-        """Residual of a slot's equations, the state at its end, and what the constraints admit there."""
-        system, parameters, dt = numbers.whole(varied)
-        u = slot.inputs(self.plan, system, parameters, state) if u is None else u
-        system, h = part_of_step(system, state, u, dt, y, self.tableau, slot)
-        residual, after, tangents = advance_between(system, state, tangents, u, h, y, self.tableau)
-        return residual, slot.settled(after), tangents
 
     def every(self, record: Record, given: Any) -> Any:
         """Everything: in one kernel for all slots, or one for each part if that takes too long to compile."""
@@ -228,7 +229,8 @@ class SlotSweep(ABC):
             c, found, matrix = carry
             here = c.left - 1 - first
             slot, own_given = jax.tree.map(lambda x: row(x, here), (slots, given))
-            c = replace_fields(c, at=c.at.unless(~slot.accepted))
+            # Of an attempt that failed there is nothing to solve.
+            c = eqx.tree_at(lambda c: c.at.done, c, c.at.done | ~slot.accepted)
             arrived = self.arriving(c.own, own_given)
             solving = self.solving(fixed, slot, arrived, own_given, c)
             start = c.solution, c.factors.changing, c.at
@@ -246,7 +248,8 @@ class SlotSweep(ABC):
             guess = pasts[0].guess
             guess = jnp.where(jnp.all(jnp.isfinite(guess)), guess, 0.0)
             following = LinearIteration.first(solution, factors, self._formed_first(fixed, factors))
-            aged = factors.aged()
+            # In another system corrections may leave more.
+            aged = replace_fields(factors, leaving=jnp.minimum(AGEING * factors.leaving, 1.0))
             if slot.event is not None:
                 # The time of an impact is in its own equations only: elsewhere its factors leave an error.
                 aged = replace_fields(aged, usable=aged.usable & (slot.event < 0))
@@ -254,10 +257,8 @@ class SlotSweep(ABC):
             waiting = replace_fields(c, solution=solution, at=at, factors=factors, stuck=stuck)
             return jax.tree.map(partial(jnp.where, stuck), waiting, done), found, matrix
 
-        def going(carry: tuple[SweepCarry, Any, Array]) -> Array:
-            return (carry[0].left > first) & ~carry[0].stuck
-
-        return jax.lax.while_loop(going, one, (c, found, matrix))
+        start = c, found, matrix
+        return jax.lax.while_loop(lambda carry: (carry[0].left > first) & ~carry[0].stuck, one, start)
 
     def _formed(self, solving: Callable, start: tuple[Array, Any, LinearIteration], matrix: Array) -> tuple:
         """The system of a slot solved; or, where factors do not serve, its matrix formed for new ones.
@@ -275,9 +276,13 @@ class SlotSweep(ABC):
         def trip(carry: tuple) -> tuple:
             _, (solution, learnt, at), _, matrix = carry
             forming = at.forming
-            given = jnp.where(forming, at.unit(solution), solution)
+            # The product with a unit vector is the next row.
+            unit = jnp.where(jnp.arange(solution.shape[0]) == at.rows, 1.0, 0.0)
+            given = jnp.where(forming, unit, solution)
             found, learnt, at, outcome, product = solving(given, learnt, at)
-            at, matrix = at.formed(forming, matrix, product)
+            place = jnp.minimum(at.rows, matrix.shape[0] - 1)
+            matrix = with_row(matrix, place, jnp.where(forming, product, row(matrix, place)))
+            at = eqx.tree_at(lambda c: c.rows, at, at.rows + forming)
             return at.forming, (jnp.where(forming, solution, found), learnt, at), outcome, matrix
 
         begun = jnp.ones_like(start[2].forming), start, nothing, matrix
@@ -291,8 +296,8 @@ class SlotSweep(ABC):
         u = slot.inputs(self.plan, system, parameters, slot.before)
         equations = prepare(system, slot.before, u, slot.fraction * dt, self.tableau)
         if not matrix.shape[0]:
-            return factors_of(equations, equations.tangent(slot.y))
+            return factors_of(equations.factorised(equations.tangent(slot.y)))
         matrix = matrix.T if self.columns else matrix
         if not equations.by_differences:
             matrix = jnp.where(rows > 0, matrix, equations.tangent(slot.y))
-        return factors_of(equations, matrix)
+        return factors_of(equations.factorised(matrix))

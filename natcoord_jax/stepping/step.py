@@ -15,52 +15,33 @@ from natcoord_jax.mechanics.coordinates import stage_rates
 from natcoord_jax.mechanics.end_impulses import obeying, released
 from natcoord_jax.mechanics.equations import prepare, starting
 from natcoord_jax.mechanics.impacts import after_impacts
-from natcoord_jax.mechanics.kick import Kick, ends_of
+from natcoord_jax.mechanics.kick import ends_of
 from natcoord_jax.mechanics.response import Evaluation
-from natcoord_jax.mechanics.start_cache import StartCache
 from natcoord_jax.mechanics.step_equations import dense_solver
 from natcoord_jax.mechanics.tangent_space import driven
 from natcoord_jax.system import System
 
 
 def advance(
-    system: System, state: State, u: Array, h: Array, y: Float[Array, " unknowns"], tableau: Tableau
-) -> tuple[Float[Array, " unknowns"], State, Float[Array, ""]]:
-    """Residual of the step's equations at `y`, the state at its end, and the largest half turn.
-
-    Differentiable in everything. The half turn |h omega / 2| of a body is the tangent of half the angle it
-    turned: it grows without bound towards half a turn a step, the pole of Cayley's rotation.
-    """
-    return _advanced(system, state, starting(system, state, tableau, later=True), u, h, y, tableau)[:3]
-
-
-def advance_between(
     system: System,
     state: State,
-    tangents: Tangents | None,
     u: Array,
     h: Array,
     y: Float[Array, " unknowns"],
     tableau: Tableau,
+    tangents: Tangents | None = None,
 ) -> tuple[Float[Array, " unknowns"], State, Tangents | None]:
     """Residual of the step's equations at `y`, the state at its end, and the tangent space there.
 
-    The tangent space at the start is given, so that a chain of steps is a function of every one of them once;
-    without a system in it, as it is carried along. None for schemes without kicks.
+    Differentiable in everything. The tangent space at the start may be given, so that a chain of steps is a
+    function of every one of them once; without a system in it, as it is carried along. None for schemes
+    without kicks.
     """
     start_cache = starting(system, state, tableau, tangents, later=tangents is None)
-    residual, after, _, kick = _advanced(system, state, start_cache, u, h, y, tableau)
-    return residual, after, None if kick is None else with_system(kick.after, None)
-
-
-def _advanced(
-    system: System, state: State, start_cache: StartCache, u: Array, h: Array, y: Array, tableau: Tableau
-) -> tuple[Array, State, Array, Kick | None]:
-    """Residual, state at the end, largest half turn, and the kick."""
     equations = prepare(system, state, u, h, tableau, start_cache)
     found = equations.evaluate(y)
-    after, half_turn = end_of_step(equations, found)
-    return found.residual, after, half_turn, found.kick
+    after = None if found.kick is None else with_system(found.kick.after, None)
+    return found.residual, end_of_step(equations, found)[0], after
 
 
 def end_of_step(equations: Any, found: Evaluation) -> tuple[State, Float[Array, ""]]:
@@ -130,7 +111,7 @@ def end_of_step(equations: Any, found: Evaluation) -> tuple[State, Float[Array, 
 def _half_turn(spin: Float[Array, "s bodies 3"], h: Array, tableau: Tableau) -> Float[Array, ""]:
     """Tangent of half the largest angle that a body turns by, infinite from half a turn on.
 
-    Cayley's rotation has |h omega / 2| itself for it; stages sum up to the angle nearly.
+    Cayley's rotation, whose pole that is, has |h omega / 2| itself for it; stages sum up to the angle nearly.
     """
     rates = jnp.sqrt(jnp.sum(spin**2, axis=-1))
     if tableau.stages == 1:

@@ -18,7 +18,6 @@ from jaxtyping import Array, Bool
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
 from natcoord_jax.mechanics.equations import kind_of, prepare
-from natcoord_jax.mechanics.start_cache import StartCache
 from natcoord_jax.stepping.attempt import LoopCarry, RefactorRequest, attempt, renewed_at
 from natcoord_jax.stepping.difference_jacobian import first_probe
 from natcoord_jax.stepping.error_control import Tolerance
@@ -100,13 +99,6 @@ def in_parts(system: System, plan: Plan, tolerance: Tolerance | None) -> bool:
     return kind.by_formulas and tolerance is None and large
 
 
-def _start(
-    setting: RolloutProblem, unpack: Callable[[Array], State], x: Array
-) -> tuple[RolloutState, Factors, StartCache]:
-    course, factors, start_cache = start_of(setting, unpack(x))
-    return replace_fields(course, state=None), factors, start_cache
-
-
 def _unfinished(setting: RolloutProblem, length: int, carried: LoopCarry) -> Array:
     # Of fewer steps than there is room for in the record, as many attempts are made as with room for these.
     attempts = 1 if setting.tolerance is None else ATTEMPTS
@@ -125,16 +117,26 @@ def _record(course: RolloutState, x: Array, rows: int) -> tuple[Array, ...]:
 def first_carry(setting: RolloutProblem, state: State) -> LoopCarry:
     """What the loop begins with, its record left out."""
     packed, unpack = ravel_pytree(state)
-    parts = in_parts(setting.system, setting.plan, setting.tolerance)
-    return (_first_of_rounds if parts else _first)(setting, unpack, packed)
+    rounds = in_parts(setting.system, setting.plan, setting.tolerance)
+    return _first(setting, unpack, packed, rounds)
 
 
-def _first(setting: RolloutProblem, unpack: Callable[[Array], State], x: Array) -> LoopCarry:
-    course, factors, start_cache = _start(setting, unpack, x)
+def _first(
+    setting: RolloutProblem, unpack: Callable[[Array], State], x: Array, rounds: bool = False
+) -> LoopCarry:
+    course, factors, start_cache = start_of(setting, unpack(x))
     probe = None
     if kind_of(setting.system, setting.plan.tableau).by_differences:
-        probe = first_probe(setting, replace_fields(course, state=unpack(x)), start_cache)
-    return LoopCarry(jnp.array(0), course, x, start_cache, factors, probe, (), jnp.array(0), None)
+        probe = first_probe(setting, course, start_cache)
+    course = replace_fields(course, state=None)
+    start = LoopCarry(jnp.array(0), course, x, start_cache, factors, probe, (), jnp.array(0), None)
+    if not rounds:
+        return start
+    like = jax.eval_shape(lambda c: _situated(setting, unpack, c).evaluate(c.course.it.y), start)
+    like = like.residual, like.size, like.loads
+    residual, size, loads = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), like)
+    asked = RefactorRequest(jnp.array(False), residual, size, loads, jnp.array(False))
+    return eqx.tree_at(lambda c: c.asked, start, asked, is_leaf=lambda x: x is None)
 
 
 def _every_slot(
@@ -159,16 +161,6 @@ def _situated(setting: RolloutProblem, unpack: Callable[[Array], State], carried
     state = unpack(carried.state)
     u, h, _ = setting.situation(replace_fields(carried.course, state=state))
     return prepare(setting.system, state, u, h, setting.plan.tableau, carried.start_cache)
-
-
-def _first_of_rounds(setting: RolloutProblem, unpack: Callable[[Array], State], x: Array) -> LoopCarry:
-    course, factors, start_cache = _start(setting, unpack, x)
-    start = LoopCarry(jnp.array(0), course, x, start_cache, factors, None, (), jnp.array(0), None)
-    like = jax.eval_shape(lambda c: _situated(setting, unpack, c).evaluate(c.course.it.y), start)
-    like = like.residual, like.size, like.loads
-    residual, size, loads = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), like)
-    asked = RefactorRequest(jnp.array(False), residual, size, loads, jnp.array(False))
-    return eqx.tree_at(lambda c: c.asked, start, asked, is_leaf=lambda x: x is None)
 
 
 def _by_rounds(
@@ -214,14 +206,12 @@ def _by_rounds(
         def renewed(found: LoopCarry) -> tuple[Iterate, Factors]:
             return as_one_kernel(partial(renewal, near), found)
 
-        def kept(found: LoopCarry) -> tuple[Iterate, Factors]:
-            return found.course.it, found.factors
-
-        it, factors = jax.lax.cond(found.asked.wanting, renewed, kept, found)
+        kept = found.course.it, found.factors
+        it, factors = jax.lax.cond(found.asked.wanting, renewed, lambda _: kept, found)
         made = it, factors, jnp.array(False)
         return eqx.tree_at(lambda c: (c.course.it, c.factors, c.asked.wanting), found, made), record
 
-    start = going_on(_first_of_rounds(setting, unpack, x), taken_up)
+    start = going_on(_first(setting, unpack, x, rounds=True), taken_up)
     # The slots of the last round may end before its room does.
     record = _record(start.course, start.state, length + CHUNK if plan.recorded else 1)
     found, record = jax.lax.while_loop(

@@ -171,7 +171,7 @@ class Programs:
     def __call__(self, static: Hashable, donated: list[Any], kept: list[Any]) -> Any:
         """Value of the function."""
         arrays = [*donated, *kept]
-        if _looked_into():
+        if any(getattr(jax.config, name) for name in LOOKING):
             return self.within(static, *([jnp.asarray(x) for x in given] for given in (donated, kept)))
         if not donated and in_lanes(arrays):
             return self._of_lanes(static, kept)
@@ -181,7 +181,8 @@ class Programs:
         if _mark._cache_size() == 0:  # pyright: ignore[reportAttributeAccessIssue]
             forget()
             _mark()
-        key = effort, static, _kinds(donated), _kinds(kept), _settings()
+        settings = tuple(getattr(jax.config, name) for name in SETTINGS)
+        key = effort, static, _kinds(donated), _kinds(kept), settings
         program = self.known.get(key)
         if program is None:
             shapes = _shapes(donated), _shapes(kept)
@@ -227,14 +228,6 @@ def _kinds(arrays: Sequence[Any]) -> tuple:
 
 def _shapes(arrays: Sequence[Any]) -> list[jax.ShapeDtypeStruct]:
     return [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in arrays]
-
-
-def _settings() -> tuple:
-    return tuple(getattr(jax.config, name) for name in SETTINGS)
-
-
-def _looked_into() -> bool:
-    return any(getattr(jax.config, name) for name in LOOKING)
 
 
 def _alone(arrays: Sequence[Any]) -> bool:

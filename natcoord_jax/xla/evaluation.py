@@ -125,14 +125,12 @@ def _cond(given: dict[str, Any], operands: list[np.ndarray]) -> list[np.ndarray]
     return evaluate(branches[int(np.clip(operands[0], 0, len(branches) - 1))], operands[1:])
 
 
-def _split(given: dict[str, Any], operands: list[np.ndarray]) -> list[np.ndarray]:
-    return np.split(operands[0], np.cumsum(given["sizes"])[:-1], given["axis"])
-
-
-def _unstack(given: dict[str, Any], operands: list[np.ndarray]) -> list[np.ndarray]:
+FLOWS = {
+    "scan": _scan,
+    "while": _while,
+    "cond": _cond,
+    "split": lambda given, x: np.split(x[0], np.cumsum(given["sizes"])[:-1], given["axis"]),
     # Of a vector these are numbers of NumPy, which are no arrays.
-    return [np.asarray(x) for x in np.moveaxis(operands[0], given["axis"], 0)]
-
-
-FLOWS = {"scan": _scan, "while": _while, "cond": _cond, "split": _split, "unstack": _unstack}
+    "unstack": lambda given, x: [np.asarray(row) for row in np.moveaxis(x[0], given["axis"], 0)],
+}
 """Operations with several results, by name."""

@@ -25,26 +25,18 @@ MONTH = 30 * 24 * 3600.0
 """Age [s] at which a program is deleted: versions of JAX follow each other as fast."""
 
 
-def keep(folder: str | os.PathLike | None) -> Path:
-    """Keep programs in a folder, or in that of this user."""
-    whole = _by_default() if folder is None else Path(folder)
-    here = whole / processor()
-    here.mkdir(parents=True, exist_ok=True)
-    _keep_in(here)
-    _tidied(here)
-    return whole
-
-
-def keep_none() -> None:
-    """Keep none from now on."""
-    _keep_in(None)
-
-
-def _keep_in(folder: Path | None) -> None:
-    jax.config.update("jax_compilation_cache_dir", None if folder is None else str(folder))
+def keep(folder: str | os.PathLike | None, on: bool) -> Path | None:
+    """Keep programs in a folder, or in that of this user; or none from now on."""
+    user = _by_default() if folder is None else Path(folder)
+    kind = user / processor()
+    if on:
+        kind.mkdir(parents=True, exist_ok=True)
+        _tidied(kind)
+    jax.config.update("jax_compilation_cache_dir", str(kind) if on else None)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
     compilation_cache.reset_cache()  # JAX looks at the setting once, when it compiles its first program
+    return user if on else None
 
 
 def get(request: bytes) -> bytes | None:

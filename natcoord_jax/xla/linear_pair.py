@@ -123,11 +123,8 @@ def _bound(pair: LinearWithTranspose, residuals: Any, given: Any, outputs: Any, 
         def unflattened(flat: Sequence[Any]) -> tuple[Any, Any]:
             return res_tree.unflatten(flat[:count]), linear_tree.unflatten(flat[count:])
 
-        def flat_value(*flat: Any) -> list[Any]:
-            return jax.tree.leaves(value(*unflattened(flat)))
-
-        def flat_many(*flat: Any) -> list[Any]:
-            return jax.tree.leaves(many(*unflattened(flat)))
+        def flattened(function: Callable) -> Callable:
+            return lambda *flat: jax.tree.leaves(function(*unflattened(flat)))
 
         def flat_changed(varied: Sequence[int], flat: Any, some: Any, linear_dot: Any) -> tuple[Any, Any]:
             every: list[Any] = [Unchanged()] * count
@@ -138,7 +135,7 @@ def _bound(pair: LinearWithTranspose, residuals: Any, given: Any, outputs: Any, 
             found, found_dot = changed(fixed, changes[0], linear, changes[1])
             return jax.tree.leaves(found), jax.tree.leaves(found_dot)
 
-        return Side(flat_value, flat_many, flat_changed, _shapes(shapes))
+        return Side(flattened(value), flattened(many), flat_changed, _shapes(shapes))
 
     forward = pair.forward, pair.forward_many, pair.forward_changed
     backward = pair.backward, pair.backward_many, pair.backward_changed
@@ -165,11 +162,7 @@ def _abstract(*args: Any, sides: tuple[Side, Side], count: int) -> list[Any]:
     return [ShapedArray(s.shape, s.dtype) for s in sides[0].shapes]
 
 
-def _lowered(*args: Any, sides: tuple[Side, Side], count: int) -> list[Any]:
-    return sides[0].value(*args)
-
-
-mlir.register_lowering(linear_pair_p, mlir.lower_fun(_lowered, multiple_results=True))
+mlir.register_lowering(linear_pair_p, mlir.lower_fun(_impl, multiple_results=True))
 
 
 def _jvp(primals: Sequence[Any], tangents: Sequence[Any], *, sides: tuple[Side, Side], count: int):

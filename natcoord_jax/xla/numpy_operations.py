@@ -170,32 +170,20 @@ def _scatter(change: Callable[..., None]) -> Callable[..., Any]:
     return apply
 
 
+SAME = "abs ceil cos cosh exp expm1 floor log log1p sign sin sinh sqrt square tan tanh".split()
+"""Operations that have the same name in NumPy."""
+
 OPERATIONS: dict[str, Callable[..., Any]] = {
+    **{name: _plain(getattr(np, name)) for name in SAME},
     **{
         name: _plain(function)
         for name, function in {
             "neg": np.negative,
-            "sin": np.sin,
-            "cos": np.cos,
-            "tan": np.tan,
             "asin": np.arcsin,
             "acos": np.arccos,
             "atan": np.arctan,
             "atan2": np.arctan2,
-            "sinh": np.sinh,
-            "cosh": np.cosh,
-            "tanh": np.tanh,
-            "exp": np.exp,
-            "log": np.log,
-            "log1p": np.log1p,
-            "expm1": np.expm1,
-            "sqrt": np.sqrt,
             "rsqrt": lambda x: 1.0 / np.sqrt(x),
-            "square": np.square,
-            "abs": np.abs,
-            "sign": np.sign,
-            "floor": np.floor,
-            "ceil": np.ceil,
             "is_finite": np.isfinite,
             "not": np.invert,
             "and": np.bitwise_and,

@@ -230,7 +230,7 @@ def _in_one_kernel(function: Callable, flat: Sequence[Any]) -> list[Any]:
 
 def in_one_array(arrays: Sequence[Array]) -> Float[Array, " _"]:
     """All arrays in one; `apart` takes them out again."""
-    return jnp.concatenate([jnp.zeros(0), *(_to_double(x).reshape(-1) for x in arrays)])
+    return jnp.concatenate([jnp.zeros(0), *(_recast(x, jnp.float64).reshape(-1) for x in arrays)])
 
 
 def apart(packed: Float[Array, " _"], kinds: Sequence[tuple[tuple[int, ...], Any]]) -> list[Array]:
@@ -238,19 +238,14 @@ def apart(packed: Float[Array, " _"], kinds: Sequence[tuple[tuple[int, ...], Any
     arrays, position = [], 0
     for shape, dtype in kinds:
         size = math.prod(shape)
-        arrays.append(_from_double(packed[position : position + size], dtype).reshape(shape))
+        arrays.append(_recast(packed[position : position + size], dtype).reshape(shape))
         position += size
     return arrays
 
 
-def _to_double(x: Array) -> Array:
-    """The same numbers, or the same bits where doubles cannot hold all of them."""
-    if x.dtype != jnp.float64 and x.dtype.itemsize == 8:
-        return jax.lax.bitcast_convert_type(x, jnp.float64)
-    return x.astype(jnp.float64)
-
-
-def _from_double(x: Array, dtype: Any) -> Array:
-    if dtype != jnp.float64 and dtype.itemsize == 8:
+def _recast(x: Array, dtype: Any) -> Array:
+    """The same numbers as doubles, or back; the same bits where doubles cannot hold all of them."""
+    other = dtype if x.dtype == jnp.float64 else x.dtype
+    if other != jnp.float64 and other.itemsize == 8:
         return jax.lax.bitcast_convert_type(x, dtype)
     return x.astype(dtype)

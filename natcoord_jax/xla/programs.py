@@ -137,17 +137,14 @@ def _lifted(program: Any, consts: Sequence[Any]) -> tuple[Any, list[Any]]:
     def lifted(equation: Any) -> Any:
         # Zeros that are made into an array are places for something else.
         place = equation.primitive.name == "broadcast_in_dim"
-        given = [x if place and _is_nought(x) else lift(x) for x in equation.invars]
+        noughts = [place and isinstance(x, jex.Literal) and not np.any(x.val) for x in equation.invars]
+        given = [x if nought else lift(x) for x, nought in zip(equation.invars, noughts)]
         return equation.replace(invars=given)
 
     equations = [lifted(equation) for equation in program.eqns]
     results = [lift(x) for x in program.outvars]
     given = [*variables, *program.invars]
     return program.replace(constvars=[], invars=given, eqns=equations, outvars=results), values
-
-
-def _is_nought(x: Any) -> bool:
-    return isinstance(x, jex.Literal) and not np.any(x.val)
 
 
 def _is_kept(value: Any) -> bool:
@@ -177,7 +174,7 @@ def _compared(program: Any) -> Hashable:
         (
             e.primitive.name,
             tuple(map(read, e.invars)),
-            _setting(e),
+            tuple((name, _parameter(x, e)) for name, x in sorted(e.params.items())),
             named(e.outvars),
         )
         for e in program.eqns
@@ -187,11 +184,6 @@ def _compared(program: Any) -> Hashable:
 
 def _type(x: Any) -> Hashable:
     return x.aval.shape, str(x.aval.dtype)
-
-
-def _setting(equation: Any) -> Hashable:
-    """Parameters of an operation."""
-    return tuple((name, _parameter(x, equation)) for name, x in sorted(equation.params.items()))
 
 
 def _parameter(x: Any, equation: Any) -> Hashable:
