@@ -246,7 +246,7 @@ def _until_contact(
 
     def gap(h: Array) -> Array:
         equations = prepare(system, state, u, h, tableau, NOTHING)
-        at = equations.stations(equations.motion(equations.split(y)[0])[0])
+        at = equations.moved(equations.split(y)[0])[0]
         rates = at.rates[0, : len(system.structure.bodies)].reshape(state.q.shape)
         return contact_gaps(system, groups, replace_fields(state, q=state.q + h * rates))[row]
 

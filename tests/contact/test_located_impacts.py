@@ -188,6 +188,24 @@ def test_derivatives_of_a_drop():
             assert float(by_restitution) == pytest.approx(u * (1 - (0.3 + u) / G), abs=1e-12)
 
 
+@pytest.mark.slow
+def test_derivatives_in_the_full_form():
+    """The time of an impact depends on the start, whichever equations say what a part of a step is."""
+    scene = nc.Scene()
+    scene.add(nc.Gravity())
+    mass = scene.add(nc.PointMass(mass=1.0, position=(0, 0, 1.0), velocity=(0, 0, 0.3), name="mass"))
+    scene.add(nc.Contact(mass, FLOOR, restitution=1.0, name="bounce"))
+    system, state = scene.compile(solver="full")
+
+    def end(by):
+        moved = begun(state, by)
+        return nc.simulate(system, moved, dt=0.02, steps=50, scheme=LOCATED, throw=False).q[-1, 0, 2]
+
+    np.testing.assert_allclose(
+        jax.jit(jax.grad(end))(jnp.zeros(2)), after_one_bounce(1.0, 0.3, 1.0)[1:], atol=1e-12
+    )
+
+
 @pytest.mark.exhaustive
 def test_lanes_with_other_impacts():
     """64 drops from other heights, of none to five bounces: each has the derivative of its own motion."""
