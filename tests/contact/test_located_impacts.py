@@ -188,7 +188,7 @@ def test_derivatives_of_a_drop():
             assert float(by_restitution) == pytest.approx(u * (1 - (0.3 + u) / G), abs=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_derivatives_in_the_full_form():
     """The time of an impact depends on the start, whichever equations say what a part of a step is."""
     scene = nc.Scene()
