@@ -150,8 +150,7 @@ def friction_impulses(
     plane = product > PLANE * trace**2
     length = jnp.where(trace > 0, 1.0 / jnp.where(trace > 0, trace, 1.0), 0.0)
     over = jnp.where(plane, 1.0 / jnp.where(plane, product, 1.0), 0.0)
-    none = jnp.finfo(held.dtype).tiny
-    size = safe_norm(held) + none
+    size = safe_norm(held)
     reach = size + friction * jnp.sum(slope * held, axis=1)
 
     def trip(_: Array, found: Float[Array, "c 3"]) -> Float[Array, "c 3"]:
@@ -165,14 +164,16 @@ def friction_impulses(
         most = friction * positive_part(alone - jnp.sum(slope * sticking, axis=1))
         sticks = jnp.sum(sticking**2, axis=1) <= most**2
         # What has opposed slip in the step stays, as far as the cone goes; more opposes what is left of it.
-        kept = jnp.minimum(friction * positive_part(alone) / jnp.maximum(reach, 0.1 * size), 1.0)
+        # (Quotients only where they count: what decays in open contacts is no divisor.)
+        limit, reached = friction * positive_part(alone), jnp.maximum(reach, 0.1 * size)
+        part = limit / jnp.where((limit > 0) & (limit < reached), reached, 1.0)
+        kept = jnp.where((limit > 0) & (limit >= reached), 1.0, part)
         wanted = total - kept[:, None] * held - 2.0 * length[:, None] * moving
-        along = wanted / (safe_norm(wanted) + none)[:, None]
+        beyond, far = positive_part(limit - kept * reach), safe_norm(wanted)
+        along = wanted / jnp.where((beyond > 0) & (far > 0), far, 1.0)[:, None]
         less = 1.0 + friction * jnp.sum(slope * along, axis=1)
         # (Where friction would press more than it takes, as a jamming rod does, it grows step by step.)
-        more = positive_part(friction * positive_part(alone) - kept * reach) / jnp.where(
-            less > 0.1, less, 1.0
-        )
+        more = beyond / jnp.where(less > 0.1, less, 1.0)
         change = jnp.where(sticks[:, None], sticking, kept[:, None] * held + more[:, None] * along) - total
         falls = -jnp.sum(moving * change)
         needed = change.reshape(-1) @ (matrix @ change.reshape(-1))

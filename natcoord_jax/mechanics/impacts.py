@@ -114,6 +114,9 @@ def after_impacts(
         ahead = ahead - jnp.where(phase == RESTING, positive_part(contact_gaps(system, these, start)), 0.0)
     reach = jnp.where(bouncing, ahead / h, 0.0)
     active = 0.5 * _numbers(these, "mobility") * pushed > reach
+    if not np.all(bouncing):  # What is soft pushes where surfaces overlap; elsewhere its impulse is rounding.
+        overlapping = jnp.minimum(contact_gaps(system, these, start), contact_gaps(system, these, end)) < 0
+        active = active & (bouncing | overlapping)
     hit = None
     if tableau.max_events:
         free = phase == FREE

@@ -148,8 +148,8 @@ def missing_friction(
     # Where the speed changes, an impulse beyond the cone counts as one on it: then Newton's iteration
     # finds its way from anywhere. At the solution none is beyond.
     square = dot(along, along)
-    # (What decays in open contacts has squares that are no normal numbers in the end.)
-    beyond = (square > most**2) & (square > jnp.finfo(square.dtype).tiny)
-    within = jnp.where(beyond, most / jnp.sqrt(jnp.where(beyond, square, 1.0)), 1.0) * along
+    beyond = square > most**2
+    # (What decays in open contacts has squares in the end that derivatives cannot be divided by.)
+    within = jnp.where(beyond, most / jnp.sqrt(jnp.where(beyond & (most > 0), square, 1.0)), 1.0) * along
     fixed = jax.lax.stop_gradient(speed)
     return along * fixed + within * (speed - fixed) + most * slip
