@@ -293,6 +293,37 @@ def test_impossible_numbers_are_refused_and_traced_none_of_their_lane():
     assert not passed, passed
 
 
+@pytest.mark.exhaustive
+def test_directions_without_length_and_sizes_below_zero_that_are_traced_are_none():
+    """Outside of jit they are refused by the table of bodies, of parts and of sections."""
+
+    def turned(orientation):
+        made = nc.Scene()
+        made.add(nc.RigidBody(mass=1.0, inertia=(1.0, 1.0, 1.0), orientation=orientation))
+        return jnp.sum(made.compile()[1].q)
+
+    def rubbing(friction):
+        made = nc.Scene()
+        ball = made.add(nc.RigidBody(shape=nc.Sphere(0.1), density=1.0, position=(0, 0, 0.05)))
+        made.add(nc.Contact(ball, nc.Plane(), stiffness=1e3, friction=friction))
+        system, state = made.compile()
+        return system.energy(state).total
+
+    def all_of_them(x):
+        section = nc.CircularSection(radius=x - 0.1, E=1e9, density=1e3)
+        return jnp.stack(
+            [
+                turned((jnp.stack([x, x, x]), 1.0)),
+                turned(jnp.stack([x, x, x, x])),
+                section.stiffness[2, 2],
+                rubbing(x - 0.1),
+            ]
+        )
+
+    good, bad = np.asarray(jax.jit(jax.vmap(all_of_them))(jnp.array([0.5, 0.0])))
+    assert np.isfinite(good).all() and np.isnan(bad).all(), bad
+
+
 @pytest.mark.slow
 def test_a_number_that_is_none_ends_the_run():
     """A comparison with it would leave a stop, or a contact, out of the motion."""
@@ -330,6 +361,46 @@ def test_what_only_the_assembled_pose_takes_cannot_be_set(compiled):
 
     value, slope = jax.jit(jax.value_and_grad(factor))(0.4)
     assert np.allclose([value, slope, factor(0.4)], np.array([-0.4, -1.0, -0.4]) / (2 * np.pi), atol=1e-15)
+
+
+@pytest.mark.exhaustive
+def test_a_nut_falls_by_the_pitch_that_was_set():
+    """As it does where it was built so: a = -m g / (m + I (2 pi / p)^2)."""
+
+    def made(pitch):
+        scene = nc.Scene()
+        scene.add(nc.Gravity())
+        nut = scene.add(nc.RigidBody(mass=1.0, inertia=(0.01, 0.01, 0.01)))
+        scene.add(nc.Screw(nc.ground, nut, axis=(0, 0, 1), pitch=pitch, name="screw"))
+        return scene.compile()
+
+    (system, state), built = made(0.2), made(0.4)
+    changed = system.set("screw", pitch=0.4)
+    cases = {"built": (0.2, system, state), "other": (0.4, *built), "set": (0.4, changed, state)}
+    ends = {}
+    for name, (pitch, of, start) in cases.items():
+        ends[name] = np.asarray(nc.simulate(of, start, dt=0.005, steps=100).q[-1])
+        exact = -0.5 * 9.81 * 0.5**2 / (1.0 + 0.01 * (2.0 * np.pi / pitch) ** 2)
+        # (The angle of the last step is 0.1; motions differ by a twelfth of its square.)
+        assert ends[name][0, 2] == pytest.approx(exact, rel=1e-3), name
+    assert np.allclose(ends["other"], ends["set"], rtol=0, atol=1e-12)
+
+
+@pytest.mark.exhaustive
+def test_a_scene_of_impossible_numbers_that_are_traced_ends_its_run():
+    """Built inside of jit, lane by lane: the others go on."""
+
+    def run(mass, stiffness, inertia):
+        made = nc.Scene()
+        made.add(nc.Gravity(vector=(0.0, -1.0, 0.0)))
+        moments = jnp.stack([inertia, inertia, inertia])
+        body = made.add(nc.RigidBody(mass=mass, inertia=moments, com=(0.5, 0.0, 0.0)))
+        made.add(nc.JointSpring(made.add(nc.Revolute(nc.ground, body)), stiffness=stiffness))
+        return nc.simulate(*made.compile(), dt=0.01, steps=40).result
+
+    rows = np.array([(1.0, 1.0, 0.1), (1.0, -20.0, 0.1), (-1.0, 1.0, 0.1), (1.0, 1.0, -0.5)])
+    results = jax.jit(jax.vmap(run))(*rows.T)
+    assert list(np.asarray(results)) == [int(nc.Result.SUCCESSFUL)] + [int(nc.Result.NONFINITE)] * 3
 
 
 def test_inertias_that_no_body_has_cannot_be_set(compiled):

@@ -371,6 +371,8 @@ def test_joints_close_facing_the_way_they_were_built(name):
             1.0, abs=tol.SAME_SOLUTION
         )
         assert system.constraint_errors(assembled).position.max() <= 1e-8
+        if name in ("fixed", "prismatic"):
+            np.testing.assert_allclose(system.sense(assembled, "1").rotation, np.eye(3), atol=1e-8)
 
 
 # --- branches -----------------------------------------------------------------------------------------------

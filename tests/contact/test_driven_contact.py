@@ -74,6 +74,44 @@ def test_a_piston_hits_a_ball(restitution):
 
 
 @pytest.mark.exhaustive
+@pytest.mark.parametrize("restitution", [0.9, 0.5])
+def test_a_soft_piston_hits_a_ball_at_rest(restitution):
+    """Damped by the speed at which the piston is driven, not by that which is left to move freely."""
+    scene = nc.Scene()
+    piston = scene.add(nc.RigidBody(mass=1.0, inertia=(1, 1, 1), velocity=(1, 0, 0), name="piston"))
+    track = scene.add(nc.Prismatic(nc.ground, piston, axis=(1, 0, 0), name="track"))
+    scene.add(nc.Drive(track, function=lambda t: 1.0 * t, name="drive"))
+    ball = scene.add(nc.PointMass(mass=1.0, position=(0.1, 0, 0), name="ball"))
+    law = {"stiffness": 1e4, "restitution": restitution, "speed": 1.0}
+    scene.add(nc.Contact(ball, nc.Plane(normal=(1, 0, 0), body=piston), name="contact", **law))
+    system, state = scene.compile()
+    run = nc.simulate(system, state, dt=1e-3, steps=300)
+    # (A contact lasts for thirty steps.)
+    assert float(system.sense(run, "ball").velocity[-1, 0]) == pytest.approx(1.0 + restitution, abs=1e-3)
+    assert float(np.max(nc.balance(system, run).energy)) <= tol.STEP_BALANCE
+
+
+@pytest.mark.exhaustive
+def test_what_slides_on_the_ground_beside_a_belt_does_not_know_of_it():
+    """It comes to rest after v^2 / (2 mu g)."""
+    scene, speed = nc.Scene(), 1.0
+    scene.add(nc.Gravity())
+    belt = scene.add(nc.RigidBody(mass=50.0, inertia=(1, 1, 1), velocity=(speed, 0, 0), name="belt"))
+    track = scene.add(nc.Prismatic(nc.ground, belt, axis=(1, 0, 0), name="track"))
+    scene.add(nc.Drive(track, function=lambda t: speed * t, name="drive"))
+    box = scene.add(nc.PointMass(mass=1.0, velocity=(speed, 0, 0), name="box"))
+    scene.add(nc.Contact(box, nc.Plane(normal=(0, 0, 1)), friction=MU, name="contact"))
+    system, state = scene.compile()
+    run = nc.simulate(system, state, dt=0.01, steps=50)
+    moved = system.sense(run, "box")
+    np.testing.assert_allclose(moved.velocity[:30, 0], speed - MU * GRAVITY * run.t[:30], atol=1e-12)
+    # The step in which slip stops is a whole one.
+    assert abs(float(moved.position[-1, 0]) - 0.5 * speed**2 / (MU * GRAVITY)) <= 5e-4
+    assert abs(float(system.work(run)["contact"][-1]) + 0.5 * speed**2) <= ROUNDED
+    assert abs(float(system.work(run)["drive"][-1])) <= ROUNDED
+
+
+@pytest.mark.exhaustive
 def test_a_shaker_carries_what_its_friction_holds():
     """A sine across the limit of friction: the box moves along below it, and slips above."""
     for amplitude, along in ((0.02, True), (0.2, False)):

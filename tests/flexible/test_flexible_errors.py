@@ -13,6 +13,8 @@ import natcoord_jax as nc
 METAL = nc.Elastic(E=2e5, nu=0.3, density=1200.0)
 PLY = nc.Orthotropic(E1=140e9, E2=10e9, nu12=0.3, G12=5e9, density=1600.0)
 SECTION = nc.Section.of_numbers(**NUMBERS)
+STIFF, MASSES = np.diag([1e4, 1e4, 1e5, 10.0, 10.0, 8.0]), np.diag([1.0, 1e-4, 1e-4])
+SKEWED = STIFF + 5.0 * np.diag([0.0, 0.0, 0.0, 1.0, 0.0], k=1)
 SQUARE = nc.mesh.rectangle((1.0, 1.0), (2, 2))
 UP, OUT = nc.Direction(nc.ground, (0, 0, 1)), nc.Direction(nc.ground, (1, 0, 0))
 GROUND = nc.Point(nc.ground)
@@ -60,6 +62,11 @@ def test_beams_that_cannot_be():
         [
             (lambda: nc.Section.of_numbers(**NUMBERS | {"EA": -1.0}), "EA"),
             (lambda: nc.TubularSection(radius=0.02, thickness=0.03, **steel), "thickness"),
+            (lambda: nc.CircularSection(radius=0.02, nu=-2.0, **steel), r"nu \[-\] is -2.0"),
+            (lambda: nc.Section(SKEWED, MASSES), r"stiffness \[.*\] is not symmetric"),
+            (lambda: nc.Section(-STIFF, MASSES), r"stiffness \[.*\] has negative eigenvalues"),
+            (lambda: nc.Section(STIFF, -MASSES), r"inertia \[.*\] has negative eigenvalues"),
+            (lambda: nc.Section(STIFF, MASSES + 0.1 * np.eye(3, k=1)), r"inertia \[.*\] is not symmetric"),
             (lambda: beam([(0, 0, 0)]), r"curve \[m\] has shape"),
             (lambda: beam([(0, 0, 0), (0, 0, 0)]), "coincide"),
             (lambda: beam(elements=0), "elements is 0"),

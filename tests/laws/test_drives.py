@@ -131,6 +131,52 @@ def test_a_bar_that_is_held_still_stays(scheme):
         assert float(jnp.max(jnp.abs(run.q - state.q))) <= tol.CONSTRAINT
 
 
+def dwelling(t):
+    """A rise of 1 in half a second, without jumps of the acceleration, and rest thereafter."""
+    part = jnp.clip(2.0 * t, 0.0, 1.0)
+    return part**3 * (10.0 - 15.0 * part + 6.0 * part**2)
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_an_arm_that_is_driven_to_a_pose_dwells_there(scheme):
+    """Nothing is left to move freely; bars carry their weight stretched out as well as hanging down."""
+    for com in ((0.5, 0, 0), (0, 0, -0.5)):
+        scene, carrier = nc.Scene(), nc.ground
+        scene.add(nc.Gravity())
+        for k, angle in enumerate((-0.7, 0.9)):
+            place = 2.0 * k * np.array(com)
+            bar = nc.RigidBody(mass=1.0, inertia=(0.01, 0.1, 0.1), com=com, position=place, name=f"bar {k}")
+            bar = scene.add(bar)
+            hinge = scene.add(nc.Revolute(carrier, bar, point=place, axis=(0, 1, 0), name=f"hinge {k}"))
+            scene.add(nc.Drive(hinge, function=lambda t, a=angle: a * dwelling(t), name=f"drive {k}"))
+            carrier = bar
+        system, state = scene.compile()
+        run = nc.simulate(system, state, dt=DT, steps=STEPS, scheme=SCHEMES[scheme])
+        assert float(np.max(system.energy(run).kinetic[60:])) <= CLOSED
+        for k, angle in enumerate((-0.7, 0.9)):
+            reached = system.coordinate(run, f"hinge {k}")[50:]
+            np.testing.assert_allclose(reached, angle, atol=tol.CONSTRAINT)
+        assert float(np.max(nc.balance(system, run).energy)) <= tol.STEP_BALANCE
+
+
+@pytest.mark.exhaustive
+def test_reactions_are_those_of_the_prescribed_motion():
+    """Of a ramp that stops: the hinge holds the weight, and pulls with m l w^2 while the bar turns."""
+    system, state = arm(Profile(*map(jnp.asarray, map(float, PROFILES["ramp"]))))
+    run = nc.simulate(system, state, dt=DT, steps=STEPS)
+    angle = np.asarray(system.coordinate(run, "hinge"))
+    along = np.stack([np.cos(angle), 0.0 * angle, -np.sin(angle)], axis=1)
+    pull = np.asarray(system.sense(run, "hinge").force) - MASS * GRAVITY * np.array([0.0, 0.0, 1.0])
+    turning = (run.t > AWAY + 0.5 * DT) & (run.t < BACK - 0.5 * DT)
+    still = run.t > BACK + 0.5 * DT
+    np.testing.assert_allclose(pull[turning], -MASS * ARM * along[turning], atol=tol.TANGENT)
+    np.testing.assert_allclose(pull[still], 0.0, atol=tol.TANGENT)
+    speed = np.linalg.norm(system.momentum(run), axis=1) / MASS
+    np.testing.assert_allclose(speed[turning], ARM, atol=tol.TANGENT)
+    np.testing.assert_allclose(speed[still], 0.0, atol=tol.TANGENT)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("order", [2, pytest.param(4, marks=pytest.mark.exhaustive)])
 def test_a_drive_that_jumps_is_named(order):

@@ -161,6 +161,30 @@ def test_frames_of_many_dependent_loops(kind, count):
 
 
 @pytest.mark.exhaustive
+@pytest.mark.parametrize("bars", [2, 4, 8])
+def test_rows_of_four_bars_whichever_the_solver(bars):
+    """Each form of the equations has the motion of the others, in few corrections."""
+    places = []
+    for solver in ("reduced", "full", "sparse"):
+
+        class Solved(nc.Scene):
+            def compile(self, solver=solver, **options):
+                return super().compile(solver=solver, **options)
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(nc, "Scene", Solved)
+            example = gallery.load("four_bar", bars=bars)
+        system = example.system
+        run = simulate(system, example.state, dt=1e-3, steps=150)
+        assert float(np.max(system.constraint_errors(run).joints)) <= 1e-12, solver
+        assert float(np.max(nc.balance(system, run).energy)) <= tol.STEP_BALANCE, solver
+        assert int(np.sum(run.iterations)) <= 2 * 150, solver
+        places.append(np.asarray(run.q))
+    for other in places[1:]:
+        np.testing.assert_allclose(other, places[0], atol=tol.SAME_TRAJECTORY)
+
+
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("count", [2, 4])
 def test_six_rates_a_body_and_dependent_loops(count):
     """Ideal rods have no inertia about their axes, and what rounding leaves of it is none."""

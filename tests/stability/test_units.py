@@ -309,7 +309,8 @@ def test_loops_of_all_sizes_are_closed():
 
 
 @pytest.mark.exhaustive
-def test_located_impacts_do_not_know_lengths_and_times():
+@pytest.mark.parametrize("events", [8, 0], ids=["located", "at ends of steps"])
+def test_impacts_do_not_know_lengths_and_times(events):
     """A ball that is thrown on a floor with friction, from tens of nanometres to kilometres."""
 
     def flight(length, time):
@@ -323,7 +324,8 @@ def test_located_impacts_do_not_know_lengths_and_times():
         ball = scene.add(nc.RigidBody(shape=shape, density=1e3 / length**3, **start, name="ball"))
         scene.add(nc.Contact(ball, nc.Plane(), restitution=0.8, friction=0.3, name="floor"))
         system, state = scene.compile()
-        run = nc.simulate(system, state, dt=0.01 * time, steps=60, scheme=nc.EnergyMomentum(max_events=8))
+        scheme = nc.EnergyMomentum(max_events=events)
+        run = nc.simulate(system, state, dt=0.01 * time, steps=60, scheme=scheme)
         return run.result, system.sense(run, ball).position / length
 
     lengths, times = np.array([(1, 1), (1e-3, 1), (1e-6, 1e-3), (1e-8, 1), (1e3, 1e2)]).T
@@ -384,6 +386,27 @@ def test_of_normals_only_their_direction_counts():
         pushed, rest = (system.instant(state, inputs=[u]).accelerations for u in (1.0, 0.0))
         row = 4 * system.body_index("ball")
         assert np.allclose((pushed - rest)[row], (0, 0, 1.0), atol=1e-12)
+
+
+@pytest.mark.exhaustive
+def test_a_ball_rolls_down_a_plane_whatever_the_length_of_its_normal():
+    """Gap and motion: from rest 5/7 of what slides, at its height, without slip or loss."""
+    for size in (1.0, 2.0, 0.5):
+        scene = nc.Scene()
+        scene.add(nc.Gravity(vector=(1.0, 0.0, -9.81)))
+        sphere = {"shape": nc.Sphere(0.1), "density": 1e3}
+        ball = scene.add(nc.RigidBody(**sphere, position=(0, 0, 0.1), name="ball"))
+        normal = nc.Point(nc.ground), nc.Direction(nc.ground, (0, 0, size))
+        scene.add(nc.Rolling((*normal, nc.Point(ball)), radius=0.1))
+        near = scene.add(nc.RigidBody(**sphere, position=(3, 0, 0.15), name="near"))
+        scene.add(nc.Contact(near, nc.Plane(normal=(0, 0, size)), stiffness=1e3, name="contact"))
+        system, state = scene.compile()
+        assert float(system.sense(state, "contact").gap) == pytest.approx(0.05, abs=1e-14)
+        run = nc.simulate(system, state, dt=0.01, steps=100)
+        moved = system.sense(run, "ball")
+        assert np.allclose(moved.position[-1], (2.5 / 7, 0, 0.1), rtol=0, atol=1e-6), size
+        assert abs(moved.velocity[-1, 0] - 0.1 * moved.angular_velocity[-1, 1]) <= 1e-10
+        assert nc.balance(system, run).energy.max() <= tol.STEP_BALANCE
 
 
 def above_its_plane():
