@@ -2,6 +2,7 @@
 
 import shutil
 from functools import cache
+from itertools import product
 
 import matplotlib
 
@@ -9,12 +10,16 @@ matplotlib.use("agg")
 
 import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
+import matplotlib.pyplot as plt  # noqa: E402
 import numpy as np  # noqa: E402
 import pytest  # noqa: E402
+from mpl_toolkits.mplot3d.proj3d import proj_transform  # noqa: E402
 from pages import Page, still  # noqa: E402
 
 import natcoord_jax as nc  # noqa: E402
 from natcoord_jax import gallery  # noqa: E402
+from natcoord_jax.viz.parts import scenery_of  # noqa: E402
+from natcoord_jax.viz.stage import Stage  # noqa: E402
 
 
 @cache
@@ -127,6 +132,39 @@ def test_bodies_are_drawn_as_their_shapes(tmp_path):
 
 
 @pytest.mark.exhaustive
+@pytest.mark.parametrize("zoom", (1.0, 1.25))
+@pytest.mark.parametrize("size", ((10.0, 0.4, 0.1), (0.1, 0.4, 10.0), (1.0, 1.0, 1.0)))
+def test_what_is_long_is_seen_to_its_ends(size, zoom):
+    scene = nc.Scene()
+    scene.add(nc.RigidBody(shape=nc.Box(size), density=1000.0))
+    system, state = scene.compile()
+    trajectory = still(system, state)
+    axes = plt.figure().add_subplot(projection="3d")
+    stage = Stage(axes, scenery_of(system, trajectory, np.array([0])), zoom=zoom)
+    corners = 0.5 * np.array(size) * list(product((-1, 1), repeat=3))
+    places = proj_transform(*corners[:, stage.order].T, axes.get_proj())[:2]
+    seen = axes.transAxes.inverted().transform(axes.transData.transform(np.transpose(places)))
+    assert 0.0 <= seen.min() and seen.max() <= 1.0
+    # ... and is not small.
+    assert np.ptp(seen, axis=0).max() > 0.6
+
+
+@pytest.mark.exhaustive
+def test_a_shape_elsewhere_hangs_on_its_body(tmp_path):
+    """As that of a link which has one for contact at its joint."""
+    ball = '<collision><geometry><sphere radius="0.1"/></geometry></collision>'
+    inertia = '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
+    link = f'<inertial><origin xyz="0 0 -0.5"/><mass value="2"/>{inertia}</inertial>{ball}'
+    joint = '<joint name="joint" type="continuous"><parent link="base"/><child link="link"/></joint>'
+    text = f'<robot name="arm"><link name="base"/><link name="link">{link}</link>{joint}</robot>'
+    scene = nc.Scene()
+    scene.add(nc.io.load(text))
+    system, state = scene.compile()
+    arm = Page(nc.view(system, still(system, state), file=tmp_path / "a.html")).part("link", "arm")
+    assert (arm.place[:, 2].min(), arm.place[:, 2].max()) == pytest.approx((-0.5, 0.0), abs=1e-3)
+
+
+@pytest.mark.exhaustive
 def test_a_hinge_is_drawn_on_its_axis_where_the_bodies_are(tmp_path):
     """The head of the bicycle is given where its axis meets the road."""
     example = gallery.load("bicycle")
@@ -159,7 +197,13 @@ def test_curves_on_each_other_are_told_apart():
     axes = nc.viz.plot_panels([panel]).axes[0]
     styles = [line.get_linestyle() for line in axes.lines]
     assert styles[:3] == ["-", "--", "-"] and styles[3] == ":"
-    assert [text.get_text() for text in axes.get_legend().get_texts()][3:] == ["bound", "goal"]
+    legend = axes.get_legend()
+    assert [text.get_text() for text in legend.get_texts()][3:] == ["bound", "goal"]
+    # Dashes of many curves are farther apart than keys are wide: there they are plain.
+    same = nc.viz.Panel("", "", [nc.viz.Curve(str(k), t, t) for k in range(8)])
+    keys = nc.viz.plot_panels([same]).axes[0].get_legend().legend_handles
+    plain = nc.viz.plot_panels([nc.viz.Panel("", "", [nc.viz.Curve("plain", t, t, dashed=True)])]).axes[0]
+    assert {key._unscaled_dash_pattern for key in keys[1:]} == {plain.lines[0]._unscaled_dash_pattern}
 
 
 def test_batches_are_bands(tmp_path):
@@ -167,8 +211,10 @@ def test_batches_are_bands(tmp_path):
     batch = jax.tree.map(lambda x: np.stack([x, x]), one)
     angles = axes_by_title(nc.plot(system, batch))["joint angles"]
     assert len(angles.lines) == 2 and len(angles.collections) == 2
-    figure = nc.plot(system, batch, times=(0.0, 0.02))
+    figure = nc.plot(system, batch, times=(-1.0, 0.0, 0.02, 5.0))
     assert len(figure.subfigs[0].axes) == 2
+    with pytest.raises(ValueError, match=r"times \[s\] has none of the motion, which goes from 0 to .* s"):
+        nc.plot(system, one, times=(5.0,))
 
 
 @pytest.mark.exhaustive

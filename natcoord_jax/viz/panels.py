@@ -9,6 +9,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 LEGEND_ENTRIES = 10
 """More curves than this in one panel go without a legend."""
@@ -108,7 +109,10 @@ def draw(axes: Axes, panel: Panel) -> None:
     axes.set(title=panel.title, xlabel=panel.abscissa, ylabel=panel.ordinate)
     axes.grid(alpha=0.3)
     if len(panel.curves) <= LEGEND_ENTRIES:
-        axes.legend(fontsize="small")
+        for key in axes.legend(fontsize="small").legend_handles:
+            # Dashes that take turns are longer than a legend is wide: some would not be seen in it.
+            if isinstance(key, Line2D) and key.get_linestyle() == "--":
+                key.set_linestyle("--")
 
 
 def plot_panels(panels: Sequence[Panel], *, columns: int = 2) -> Figure:

@@ -78,8 +78,10 @@ def _bodies(system: System, meshes: Meshes, rows: np.ndarray, scale: float) -> l
         (points, faces), shade = marked(own) if is_round else (own, np.ones(len(own[1])))
         found.append(Solid(names[k], "body", points, faces, rows[:, k], colour, shade))
         sides = [(j, side) for j in _named_joints(system) for side in (0, 1) if pairs[j, side] == k]
-        ends = [frames[j, side, 0, 1:] for j, side in sides]
-        arms = [bar(0.007 * scale, centre, end) for end in ends if not inside_of(own, end)]
+        ends = [end for j, side in sides if not inside_of(own, end := frames[j, side, 0, 1:])]
+        # A shape somewhere else, as one for contact, hangs on the centre of mass, too.
+        ends += [] if inside_of(own, centre) else [0.5 * (own[0].min(axis=0) + own[0].max(axis=0))]
+        arms = [bar(0.007 * scale, centre, end) for end in ends]
         if arms:
             points, faces = merged(arms)
             found.append(Solid(names[k], "arm", points, faces, rows[:, k], colour, np.full(len(faces), 0.85)))

@@ -142,14 +142,14 @@ def plot(
             bounds and goals, or what `accuracy` found, which need no trajectory.
         trajectory: computed with it; curves of a batch are medians in bands from the least to the largest.
         times: of pictures of the motion above the diagrams [s], of a batch of its first run with the others
-            as ghosts; None: no pictures.
+            as ghosts; those that the motion has not are left out; None: no pictures.
         beams: handles of beams, whose sections are drawn in the pictures; others are round.
 
     Returns:
         The figure.
 
     Raises:
-        ValueError: for no trajectory, or times without a motion.
+        ValueError: for no trajectory, times without a motion, or none that it has.
 
     Example:
         >>> import jax; jax.config.update("jax_enable_x64", True)
@@ -210,16 +210,23 @@ def plot_snapshots(
 
     Args:
         phases: the motion; of a batch the first run with the others as ghosts.
-        times: of the snapshots [s]; those after the end are left out.
+        times: of the snapshots [s]; those that the motion has not are left out.
         panels: the diagrams.
         beams: handles of beams, whose sections are drawn.
         caption: what there is to see, below the pictures.
         within: two corners of the box (2, 3) [m] that is looked into; None: all is seen.
+
+    Raises:
+        ValueError: if the motion has none of the times.
     """
-    end = float(longest_of(runs_of(phases))[-1])
-    scenery = together(
-        phases, np.array([t for t in times if t <= end + 1e-9 * (1 + end)]), beams=beams, within=within
-    )
+    begin, end = float(phases.trajectories[0].t.min()), float(longest_of(runs_of(phases))[-1])
+    margin = 1e-9 * (1 + abs(end))
+    shown = [float(t) for t in times if begin - margin <= t <= end + margin]
+    if not shown:
+        raise ValueError(
+            f"plot: times [s] has none of the motion, which goes from {begin:g} to {end:g} s; pass some of it"
+        )
+    scenery = together(phases, np.array(shown), beams=beams, within=within)
     frames = range(len(scenery.t))
     rows = -(-len(frames) // COLUMNS)
     wide = 2 if len(panels) == 4 else min(len(panels), MOST_IN_A_ROW)

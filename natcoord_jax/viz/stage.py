@@ -1,16 +1,20 @@
 """The diagram that shows a motion: true shapes, joints, ground, title and time."""
 
+from itertools import product
 from typing import Any
 
 import numpy as np
 from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
+from mpl_toolkits.mplot3d.proj3d import proj_transform
 
 from natcoord_jax.viz.scenery import Scenery, along_map, rounded
 
 LEAST = 0.3
 """Least edge of the box of the axes, relative to its longest."""
 MARGIN = 0.06
+FILLED = 0.97
+"""Share of a picture that what moves takes at most, from edge to edge."""
 AMBIENT = 0.5
 GRID = 8
 """Least number of lines of the ground along its longer edge."""
@@ -89,8 +93,10 @@ class Stage:
         self.layers = [Faces(bodies, eye), Faces(scenery._replace(solids=forces, skins=[]), eye)]
         eye = eye[self.order]
         axes.set_proj_type("persp", focal_length=1.6)
-        self._fit(zoom)
+        self.lattice = Line3DCollection(np.zeros((1, 2, 3)), colors="0.8", linewidths=0.6, zorder=1)
+        self.plane = Poly3DCollection([np.zeros((4, 3))], facecolor="0.91", edgecolor="0.75", zorder=0)
         axes.view_init(np.degrees(np.arcsin(eye[2])), np.degrees(np.arctan2(eye[1], eye[0])))
+        self._fit(zoom)
         if labelled:
             labels = [f"{'xyz'[k]} [m]" for k in self.order]
             axes.set(xlabel=labels[0], ylabel=labels[1], zlabel=labels[2])
@@ -100,13 +106,10 @@ class Stage:
                 axis.set_major_locator(MaxNLocator(nbins=4, steps=[1, 2, 5, 10]))
         else:
             axes.set_axis_off()
-        self.lattice = Line3DCollection(np.zeros((1, 2, 3)), colors="0.8", linewidths=0.6, zorder=1)
-        self.plane = Poly3DCollection([np.zeros((4, 3))], facecolor="0.91", edgecolor="0.75", zorder=0)
         if scenery.ground is not None:
             axes.add_collection3d(self.plane)
             axes.add_collection3d(self.lattice)
             axes.grid(False)
-        self._look_at(0)
         self.drawn = [
             axes.add_collection3d(Poly3DCollection([np.zeros((3, 3))], linewidths=0.3, zorder=2 + 2 * k))
             for k in range(len(self.layers))
@@ -129,6 +132,15 @@ class Stage:
         if self.scenery.ground is not None and self.scenery.up[along] > 0:
             self.middles[:, along] = self.scenery.ground + 0.5 * self.edges[along]
         self.axes.set_box_aspect(self.edges[self.order], zoom=zoom)
+        # Boxes are scaled by their diagonal: what is long in one direction would be cut off at its ends.
+        self._look_at(0)
+        signs = np.array(list(product((-0.5, 0.5), repeat=3)))
+        corners = boxes.mean(axis=1)[0] + signs * most if self.travels else whole.mean(axis=0) + signs * size
+        x, y, z = corners[:, self.order].T
+        places = np.stack(proj_transform(x, y, z, self.axes.get_proj())[:2], axis=1)
+        within = self.axes.transAxes.inverted().transform(self.axes.transData.transform(places))
+        too_large = 2 * np.abs(within - 0.5).max() / FILLED
+        self.axes.set_box_aspect(self.edges[self.order], zoom=zoom / max(1.0, too_large))
 
     def _look_at(self, frame: int) -> None:
         """Limits of the axes, and the lattice on the ground."""
