@@ -661,6 +661,19 @@ def test_what_goes_by_name_says_so():
         (lambda: nc.simulate(w.system, w.state, 0.1), "dt="),
         (lambda: nc.JointSpring(w.hinge, stiff=3.0), "'stiff'.*stiffness="),
         (lambda: nc.simulate(w.system, w.state, step=0.1), "'step'.*dt="),
+        (
+            lambda: nc.PointMass(name="bob"),
+            r"PointMass 'bob': mass \[kg\] is missing; pass mass=, a positive",
+        ),
+        (
+            lambda: nc.JointSpring(w.hinge),
+            r"JointSpring: stiffness \[.*\] is missing; pass stiffness=, a number",
+        ),
+        (lambda: nc.Cylinder(0.1), r"Cylinder: length \[m\] is missing"),
+        (
+            lambda: nc.simulate(w.system, w.state, steps=2),
+            r"simulate: dt \[s\] is missing; pass dt=, a positive",
+        ),
     ):
         with pytest.raises(TypeError, match=words):
             call()

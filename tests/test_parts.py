@@ -92,7 +92,11 @@ def test_what_is_wrong_is_named(compiled):
             "no part 'nothing'; it has the bodies .*'arm'.*'hinge'.*'gravity'",
         ),
         (lambda s: s.set("spring 0", rest=1.0), r"has no number 'rest'; it has \['stiffness', 'length'"),
-        (lambda s: s.set("spring 0", stiffness=(1.0, 2.0)), r"stiffness has shape \(2,\); pass shape \(\)"),
+        (
+            lambda s: s.set("spring 0", stiffness=(1.0, 2.0)),
+            r"spring 'spring 0': stiffness \[N/m\] has shape \(2,\); pass shape \(\)",
+        ),
+        (lambda s: s.set("body", inertia=(1.0, 2.0)), r"body 'body': inertia \[kg m\^2\] has shape \(2,\)"),
         (lambda s: s.set(springs, stiffness=(1, 2, 3)), r"pass shape \(\) or \(2,\)"),
         (lambda s: s.set("bead", inertia=(1.0, 1.0, 1.0)), "'bead' has no number 'inertia'"),
         (lambda s: s.set("body", mass=-1.0), r"'body': mass \[kg\] is -1.0; pass a positive"),

@@ -68,7 +68,7 @@ class Declaration:
         """Refuse a call with other arguments than declared.
 
         Raises:
-            TypeError: for too many arguments by position, or one that there is not.
+            TypeError: for too many arguments by position, one that there is not, or one that is missing.
             ValueError: for an argument that is something else.
         """
         self._check_names(positional, named, label)
@@ -94,6 +94,17 @@ class Declaration:
             raise TypeError(
                 f"{label} has no argument {unknown[0]!r}; pass some of {', '.join([*self.order, *by_name])}"
             )
+        # (Copies are made of a class with nothing at all, and filled in afterwards.)
+        given = {*self.order[: len(positional)], *named}
+        missing = [name for name in self.kinds if name not in self.defaults and name not in given]
+        if given and missing:
+            raise TypeError(f"{label}: " + "; ".join(self._wish(name) for name in missing))
+
+    def _wish(self, name: str) -> str:
+        """What to pass for an argument that is missing."""
+        kind = self.kinds[name]
+        unit = unit_of(self.source, name) if kind is None or kind.measured else ""
+        return f"{name}{unit} is missing; pass {name}=" + (f", {kind.wanted}" if kind else "")
 
     def _message(self, name: str, kind: Kind, complaint: str, given: Mapping[str, Any], label: str) -> str:
         unit = unit_of(self.source, name) if kind.measured else ""

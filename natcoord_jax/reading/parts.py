@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from natcoord_jax.core.arguments import unit_of
 from natcoord_jax.core.bodies import mass_block
 from natcoord_jax.core.checks import as_array, is_concrete
 from natcoord_jax.core.eager_numpy import broadcast, eager_numpy
@@ -28,6 +29,8 @@ Names = Handle | str | Sequence[Handle | str]
 
 BODY = "mass", "com", "inertia"
 """What the mass block of a body is made of."""
+UNITS = {"mass": " [kg]", "com": " [m]", "inertia": " [kg m^2]", "mass_block": " [kg, kg m, kg m^2]"}
+"""Of the numbers of a body."""
 
 MASS = Number("positive")
 
@@ -162,8 +165,10 @@ def set_numbers(system: SomeModel, part: Names, values: dict[str, Any]) -> SomeM
         given = {}
         for field, value in values.items():
             field = _whole_name(name, known, field, kind)
-            label = f"{name!r}: {field}"
+            label = f"{repr(name) if kind is None else kind.kind}: {field}{_unit(system, name, field)}"
             every = found[field].row is None if field in found else False
+            if field == "inertia":
+                value = _principal(value, len(names), several=many)
             given[field] = _fitting(value, now[field], k if many else None, len(names), label, every=every)
         given = as_declared(system, name, given)
         if "mass_block" in found:
@@ -248,12 +253,23 @@ def _whole_name(name: str, known: list[str], field: str, place: Place | None) ->
     return ends[0]
 
 
-def _principal(array: Array, *, several: bool) -> Array:
-    """Inertias by their diagonals, also of several bodies.
+def _unit(system: Model, name: str, field: str) -> str:
+    """Unit of a number of a part, " [m]"; "" if it is not known."""
+    owners = [type(g.effect) for g in (*system.joints, *system.effects) if name in (*g.names, *g.labels)]
+    return next((unit for owner in owners if (unit := unit_of(owner, field))), UNITS.get(field, ""))
+
+
+def _principal(value: Any, count: int, *, several: bool) -> Any:
+    """Inertias by their diagonals, also of several bodies; what has another shape as it is.
 
     A matrix of three rows is one for all of three bodies where it is symmetric, and else has a row for each.
     No symmetric matrix is both: its rows would be inertias of no body.
     """
+    if array_of(value) is None:
+        return value
+    array = as_array(value, float)
+    if array.shape not in ((3,), (count, 3)):
+        return value
     if array.shape == (3, 3) and several:
         xp: Any = np if is_concrete(array) else jnp
         return xp.where(is_even(xp.asarray(array)), xp.asarray(array)[None], diagonal(array))
@@ -268,8 +284,6 @@ def _fitting(value: Any, now: Array, k: int | None, count: int, label: str, *, e
     if array_of(value) is None:
         raise ValueError(f"{label} {is_other(value)}; pass numbers")
     array = as_array(value, float)
-    if label.endswith(": inertia") and array.shape in ((3,), (count, 3)):
-        array = _principal(array, several=k is not None)
     if every and k is None and array.shape == now.shape[1:]:
         array = broadcast(array, now.shape)
     shapes = [now.shape] + ([(count, *now.shape)] if k is not None else [])
