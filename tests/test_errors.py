@@ -395,6 +395,22 @@ def test_nothing_is_raised_inside_transformations(breaking):
     assert "lane 1" in words and "'ball'" in words and "t = 0.2" in words
 
 
+@pytest.mark.exhaustive
+def test_nothing_is_raised_inside_derivatives(pendulum):
+    """Outside of programs the code is known there, what was computed is not."""
+    system, state = pendulum
+
+    def height(dt):
+        run = nc.simulate(system, state, dt=dt, steps=5, extra_substeps=0)
+        return run.q[-1, 0, 2], run.result
+
+    with pytest.raises(SimulationError, match="more substeps"):
+        height(10.0)
+    slope, result = jax.grad(height, has_aux=True)(10.0)
+    assert bool(jnp.isfinite(slope)) and int(result) == int(Result.MAX_SUBSTEPS)
+    jax.jvp(lambda dt: height(dt)[0], (10.0,), (1.0,))
+
+
 def test_traced_step_that_is_not_positive(breaking):
     system, state = breaking
     result = jax.jit(lambda dt: nc.simulate(system, state, dt=dt, steps=2).result)(-0.1)

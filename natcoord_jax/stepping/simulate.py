@@ -208,7 +208,7 @@ def simulate(
         trajectory = bounded.judged(trajectory)
     if count < room:
         trajectory = cut(trajectory, count)
-    if throw and is_concrete(trajectory.result):
+    if throw and is_concrete(trajectory):
         system.raise_on_failure(trajectory)
     if tolerance is None:
         warn_of_far_turns(system, trajectory, step, int(save_every))
