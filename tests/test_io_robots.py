@@ -269,6 +269,8 @@ def test_frames_are_where_mujoco_has_them():
     assert float(system.constraint_errors(moved).velocity.max()) < 1e-14
     with pytest.raises(ValueError, match=r"positions \[rad, m\] has shape \(2,\); pass \(18,\)"):
         handle.state(system, state, [0.0, 0.0])
+    with pytest.raises(ValueError, match=r"positions \[rad, m\] is not finite"):
+        handle.state(system, state, np.full(18, np.nan))
 
 
 @pytest.mark.exhaustive
@@ -436,6 +438,9 @@ def test_a_start_beyond_a_limit_is_noted():
     text = nc.io.PENDULUM.replace('damping="0.01"', 'range="10 20"')
     assert reasons(nc.io.load(text))["hinge"].startswith("it starts beyond its limit")
     assert "hinge" not in reasons(nc.io.load(text, leave_out=("limits",)))
+    limit = LIMIT.replace('lower="0"', 'lower="2"')
+    crossed = f'<robot name="r">{link("a")}{link("b")}{joint("j", "revolute", "a", "b", more=limit)}</robot>'
+    assert reasons(nc.io.load(crossed))["the limits of j"].startswith("the lower one, 2, is above the upper")
 
 
 def test_flags_of_a_file_are_respected():
@@ -537,7 +542,16 @@ def test_errors_say_what_to_do():
             "xacro robot.xacro > robot",
         ),
         ("<html/>", ValueError, "root <html>; pass URDF"),
-        ("<mujoco><worldbody><body><joint/></body></worldbody></mujoco>", ValueError, "mass and inertia"),
+        (
+            "<mujoco><worldbody><body><joint/></body></worldbody></mujoco>",
+            ValueError,
+            r"mass and inertia.*; give it a mass \[kg\]",
+        ),
+        (
+            f'<robot name="r">{link("a")}{link("b", -1.0)}{joint("j", "continuous", "a", "b")}</robot>',
+            ValueError,
+            r"link 'b': mass \[kg\] is -1; give it a positive one",
+        ),
         ("<mujoco><nonsense/></mujoco>", ValueError, "does not read it"),
     ]
     for source, error, words in wrong:

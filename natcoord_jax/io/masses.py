@@ -21,8 +21,16 @@ def settle(spec: Any, notes: Notes) -> set[str]:
 
     Returns:
         Names of the links that have no mass, between joints; MuJoCo gets a feather for each.
+
+    Raises:
+        ValueError: for a negative mass.
     """
     for body in spec.bodies[1:]:
+        if body.mass < 0:
+            raise ValueError(
+                f"nc.io.load: link {body.name!r}: mass [kg] is {body.mass:g}; give it a positive one, or no "
+                "inertial element"
+            )
         _settle_tensor(body, notes)
     light = set()
     for body in spec.bodies[1:]:

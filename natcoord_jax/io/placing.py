@@ -19,6 +19,8 @@ def _given(value: Any, default: np.ndarray, what: str, unit: str) -> np.ndarray:
     found = default if value is None else np.asarray(value, float)
     if found.shape != default.shape:
         raise ValueError(f"{what} [{unit}] has shape {found.shape}; pass {default.shape}, in MuJoCo's layout")
+    if not np.all(np.isfinite(found)):
+        raise ValueError(f"{what} [{unit}] is not finite: {found}; pass finite numbers")
     return found
 
 

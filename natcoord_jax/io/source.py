@@ -8,6 +8,8 @@ from natcoord_jax.io import masses, urdf
 from natcoord_jax.io.notes import Notes, mujoco, warnings_noted
 
 SUFFIXES = (".urdf", ".xml", ".mjcf")
+WEIGHTLESS = "; give it a mass [kg] and an inertia [kg m^2], by an inertial element or by shapes that weigh"
+"""What to do about a body that moves and has none."""
 
 
 @dataclass
@@ -83,6 +85,7 @@ def _from_urdf(
             mesh.inertia = mujoco().mjtMeshInertia.mjMESH_INERTIA_SHELL
     found = _finished(spec, notes)
     found.massless, found.velocities, found.is_urdf = light, urdf.velocity_limits(root), True
+    urdf.note_crossed_limits(root, notes)
     pairs = zip(found.model.eq_obj1id, found.model.eq_type)
     names = {found.model.joint(i).name for i, kind in pairs if kind == mujoco().mjtEq.mjEQ_JOINT}
     for name in urdf.mimics(root):
@@ -110,7 +113,8 @@ def _finished(spec: Any, notes: Notes) -> Source:
             said = " ".join(str(error).split())
             spoilt = [m for m in spec.meshes if m.file and Path(m.file).name in said]
             if not spoilt:
-                raise ValueError(f"nc.io.load: MuJoCo does not compile it: {said}") from None
+                remedy = WEIGHTLESS if "mass and inertia" in said else ""
+                raise ValueError(f"nc.io.load: MuJoCo does not compile it: {said}{remedy}") from None
             reason = said.partition(" in STL file")[0].partition(" Element name")[0]
             _without_mesh(spec, spoilt[0], f"MuJoCo does not read the mesh ({reason})", notes)
     masses.balanced(spec, model, notes)

@@ -94,6 +94,18 @@ def velocity_limits(root: Element) -> dict[str, float]:
     return found
 
 
+def note_crossed_limits(root: Element, notes: Notes) -> None:
+    """Limits of which the lower is above the upper are none to MuJoCo, without a word."""
+    for joint in root.findall("joint"):
+        limit = joint.find("limit")
+        if limit is None or joint.get("type") not in ("revolute", "prismatic"):
+            continue
+        lower, upper = (float(limit.get(end, "0")) for end in ("lower", "upper"))
+        if lower > upper:
+            reason = f"the lower one, {lower:g}, is above the upper one, {upper:g} [rad or m]"
+            notes.left_out(f"the limits of {joint.get('name', '')}", reason)
+
+
 def mimics(root: Element) -> list[str]:
     """Names of the joints that follow others."""
     return [joint.get("name", "") for joint in root.findall("joint") if joint.find("mimic") is not None]
