@@ -409,6 +409,13 @@ def test_nothing_is_raised_inside_derivatives(pendulum):
     slope, result = jax.grad(height, has_aux=True)(10.0)
     assert bool(jnp.isfinite(slope)) and int(result) == int(Result.MAX_SUBSTEPS)
     jax.jvp(lambda dt: height(dt)[0], (10.0,), (1.0,))
+    scene = nc.Scene()
+    scene.add(nc.Gravity())
+    scene.add(nc.PointMass(mass=1.0, name="falling"))
+    falling = scene.compile()
+    with pytest.raises(SimulationError, match="no equilibrium"):
+        nc.equilibrium(*falling, loads=1.0)
+    jax.grad(lambda load: nc.equilibrium(*falling, loads=load).state.q.sum())(1.0)
 
 
 def test_traced_step_that_is_not_positive(breaking):

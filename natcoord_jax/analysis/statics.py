@@ -170,14 +170,14 @@ def equilibrium(
         values = values * jnp.arange(1, steps + 1) / steps
     given = _loadings(system, values, inputs, rotation, about)
     found = _equilibria(system, state, values, given, snap, not at_top_level(system, state, values, given))
-    if is_concrete(found.result) and bool(jnp.any(found.snapped[1:] & (found.result[1:] == 0))):
+    if is_concrete(found.result, values) and bool(jnp.any(found.snapped[1:] & (found.result[1:] == 0))):
         left = [f"{value:.6g}" for value in np.asarray(values)[1:][np.asarray(found.snapped)[1:]]]
         warnings.warn(
             f"equilibrium: Newton's method left the path at the load parameter {', '.join(left)}: what was "
             f"found there may be on another branch (`snapped`); {GROWING}, or pass snap=False to stop there",
             stacklevel=3,
         )
-    if throw and is_concrete(found.result):
+    if throw and is_concrete(found.result, values):
         for number, code in enumerate(found.result):
             if int(code) != Result.SUCCESSFUL:
                 before = replace_fields(_one(found.states, max(number - 1, 0)), t=values[number])
