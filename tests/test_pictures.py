@@ -10,16 +10,13 @@ matplotlib.use("agg")
 
 import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
-import matplotlib.pyplot as plt  # noqa: E402
 import numpy as np  # noqa: E402
 import pytest  # noqa: E402
 from mpl_toolkits.mplot3d.proj3d import proj_transform  # noqa: E402
 from pages import Page, still  # noqa: E402
 
 import natcoord_jax as nc  # noqa: E402
-from natcoord_jax import gallery  # noqa: E402
-from natcoord_jax.viz.parts import scenery_of  # noqa: E402
-from natcoord_jax.viz.stage import Stage  # noqa: E402
+from natcoord_jax import gallery, viz  # noqa: E402
 
 
 @cache
@@ -132,17 +129,19 @@ def test_bodies_are_drawn_as_their_shapes(tmp_path):
 
 
 @pytest.mark.exhaustive
-@pytest.mark.parametrize("zoom", (1.0, 1.25))
 @pytest.mark.parametrize("size", ((10.0, 0.4, 0.1), (0.1, 0.4, 10.0), (1.0, 1.0, 1.0)))
-def test_what_is_long_is_seen_to_its_ends(size, zoom):
+def test_what_is_long_is_seen_to_its_ends(size):
     scene = nc.Scene()
     scene.add(nc.RigidBody(shape=nc.Box(size), density=1000.0))
     system, state = scene.compile()
-    trajectory = still(system, state)
-    axes = plt.figure().add_subplot(projection="3d")
-    stage = Stage(axes, scenery_of(system, trajectory, np.array([0])), zoom=zoom)
+    motion = nc.Phases((system,), (still(system, state),))
+    figure = viz.plot_snapshots(
+        motion, (0.0,), [viz.Panel("", "", [viz.Curve("line", np.arange(2.0), np.arange(2.0))])]
+    )
+    figure.draw_without_rendering()
+    [axes] = figure.subfigs[0].axes
     corners = 0.5 * np.array(size) * list(product((-1, 1), repeat=3))
-    places = proj_transform(*corners[:, stage.order].T, axes.get_proj())[:2]
+    places = proj_transform(*corners.T, axes.get_proj())[:2]
     seen = axes.transAxes.inverted().transform(axes.transData.transform(np.transpose(places)))
     assert 0.0 <= seen.min() and seen.max() <= 1.0
     # ... and is not small.
@@ -192,17 +191,17 @@ def test_a_hinge_is_drawn_on_its_axis_where_the_bodies_are(tmp_path):
 
 def test_curves_on_each_other_are_told_apart():
     t = np.linspace(0, 1, 5)
-    curves = [nc.viz.Curve("one", t, t), nc.viz.Curve("same", t, t + 1e-9), nc.viz.Curve("other", t, 1 - t)]
-    panel = nc.viz.Panel("", "", curves, bounds=(1.5,), goals=[(1.0, 1.0)])
-    axes = nc.viz.plot_panels([panel]).axes[0]
+    curves = [viz.Curve("one", t, t), viz.Curve("same", t, t + 1e-9), viz.Curve("other", t, 1 - t)]
+    panel = viz.Panel("", "", curves, bounds=(1.5,), goals=[(1.0, 1.0)])
+    axes = viz.plot_panels([panel]).axes[0]
     styles = [line.get_linestyle() for line in axes.lines]
     assert styles[:3] == ["-", "--", "-"] and styles[3] == ":"
     legend = axes.get_legend()
     assert [text.get_text() for text in legend.get_texts()][3:] == ["bound", "goal"]
     # Dashes of many curves are farther apart than keys are wide: there they are plain.
-    same = nc.viz.Panel("", "", [nc.viz.Curve(str(k), t, t) for k in range(8)])
-    keys = nc.viz.plot_panels([same]).axes[0].get_legend().legend_handles
-    plain = nc.viz.plot_panels([nc.viz.Panel("", "", [nc.viz.Curve("plain", t, t, dashed=True)])]).axes[0]
+    same = viz.Panel("", "", [viz.Curve(str(k), t, t) for k in range(8)])
+    keys = viz.plot_panels([same]).axes[0].get_legend().legend_handles
+    plain = viz.plot_panels([viz.Panel("", "", [viz.Curve("plain", t, t, dashed=True)])]).axes[0]
     assert {key._unscaled_dash_pattern for key in keys[1:]} == {plain.lines[0]._unscaled_dash_pattern}
 
 
