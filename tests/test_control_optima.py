@@ -109,9 +109,40 @@ def test_pendulum_as_a_point_with_multiplier():
 def test_cart_pole_swing_up():
     """Many starts in coarse steps, the best of them refined once; `benchmarks/control.py` goes further."""
     optima = nc.multi_start(manoeuvres.cart_pole(50), starts=16, rates=3.0, spread=5.0, method="lifted")
-    assert optima[0].ok and len(optima) >= 2
+    assert optima[0].ok
     fine = solved(manoeuvres.cart_pole(100), optima[0])
     assert extrapolated(optima[0], fine) == pytest.approx(57.9448, rel=FOUR_DIGITS)
+
+
+class Thrust(nc.cost.Cost):
+    """Sum of the inputs."""
+
+    def running(self, system, state, u, t):
+        """Rate of the propellant."""
+        return jnp.sum(u)
+
+
+@pytest.mark.exhaustive
+def test_flying_robot():
+    """Y. Sakawa, Optimal Control Applications and Methods 20 (1999) 235-248: a cost linear in the inputs.
+
+    IPOPT from the same start, on the same 40 steps, ends at 7.953951; continuous time has 7.91.
+    """
+    scene, half = nc.Scene(), np.sqrt(0.5)
+    place = (-10.0, -10.0, 0.0)
+    robot = nc.RigidBody(mass=1.0, inertia=(1, 1, 1), position=place, orientation=(half, 0, 0, half))
+    robot = scene.add(robot)
+    scene.add(nc.Planar(nc.ground, robot, point=place, axis=(0, 0, 1)))
+    markers = nc.Point(robot), *(nc.Direction(robot, axis, local=True) for axis in np.eye(3))
+    for force, torque in ((1.0, 0.2), (-1.0, -0.2), (1.0, -0.2), (-1.0, 0.2)):
+        scene.add(nc.WrenchInput(markers, force=(force, 0, 0), torque=(0, 0, torque)))
+    system, state = scene.compile()
+    pairs = nc.bounds.Path(lambda state, u, t: u[::2] + u[1::2] - 1.0, "both jets of a side", count=2)
+    goal = nc.goal.Position(robot, (0, 0, 0)) & nc.goal.Attitude(robot, np.eye(3)) & nc.goal.Rest()
+    shared = {"cost": Thrust(), "goal": goal, "bounds": nc.bounds.Input(0.0, 1.0) & pairs}
+    found = nc.optimise(nc.OptimalControl(system, state, dt=0.3, steps=40, **shared), progress=False)
+    assert found.ok and len(found.history) < 60
+    assert found.cost <= 7.953952
 
 
 @pytest.fixture(scope="module")

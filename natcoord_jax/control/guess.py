@@ -146,6 +146,12 @@ def _leading_to_goal(problem: OptimalControl, unknowns: Unknowns) -> Float[Array
     return jnp.broadcast_to(w, (problem.steps, count))
 
 
+def scattered_rates(problem: OptimalControl, unknowns: Unknowns) -> int:
+    """How many unknowns of a step are rates that can be guessed; multipliers of loops follow from them."""
+    structure = problem.system.structure
+    return structure.unknowns if structure.solver == "reduced" else unknowns.y.shape[1]
+
+
 def scattered(problem: OptimalControl, unknowns: Unknowns, key: Array, spread: Any, rates: Any) -> Unknowns:
     """A guess with random smooth changes of inputs and of rates, for starts from many places.
 
@@ -159,8 +165,7 @@ def scattered(problem: OptimalControl, unknowns: Unknowns, key: Array, spread: A
     first, second, third = jax.random.split(key, 3)
     steps, modes = problem.steps, jnp.arange(1, 4)
     waves = jnp.sin(jnp.pi * (jnp.arange(steps)[:, None] + 0.5) / steps * modes) / modes
-    structure = problem.system.structure
-    count = structure.unknowns if structure.solver == "reduced" else unknowns.y.shape[1]
+    count = scattered_rates(problem, unknowns)
     inputs = spread * (waves @ jax.random.normal(first, (3, problem.channels)))
     changes = rates * (jax.random.normal(second, (1, count)) + waves @ jax.random.normal(third, (3, count)))
     changes = free_of_swings(jnp, jnp.zeros((1, count)), changes)

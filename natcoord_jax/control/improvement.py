@@ -21,6 +21,8 @@ CORRECTIONS = 8
 """Most directions of one improvement."""
 SOFTEST = 1e-3
 """Least curvature in an entering coefficient that counts, relative to the largest."""
+FLAT = 1e-12
+"""Curvature in all entering coefficients, relative to that of their bounds, that is rounding."""
 ASIDE = 0.1
 """Size of the inputs' change that is asked for along negative curvature, relative to the inputs."""
 STILL = 1e-2
@@ -156,12 +158,16 @@ def improved(
         size = largest(unknowns.coefficients, unknowns.free)
         return jnp.clip(largest(change.w, change.first) / jnp.where(size > 0, size, 1.0), *ENOUGH)
 
-    # What changes are worth by their curvature, without what bounds add, and multipliers by the compliance
-    # of what they press.
+    # What changes are worth by their curvature, without what bounds add; by that alone where the cost is
+    # linear. And multipliers by the compliance of what they press.
+    steep = found.excess[:, :, -problem.channels :] ** 2
     own = jnp.abs(jnp.diagonal(found.hessian, axis1=1, axis2=2)[:, -problem.channels :])
+    pressed = jnp.einsum("kh,khm->km", bounds.path, steep)
+    flat = jnp.max(own, initial=0.0) <= FLAT * jnp.max(pressed, initial=0.0)
+    own = jnp.where(flat, pressed, own)
     own = jnp.maximum(own, SOFTEST * jnp.max(own, initial=1e-300))
     felt = factors.goal_scale > 0
-    give = jnp.sum(found.excess[:, :, -problem.channels :] ** 2 / own[:, None], axis=2)
+    give = jnp.sum(steep / own[:, None], axis=2)
     weights = Change(
         factors.start_stiffness,
         own,

@@ -24,7 +24,7 @@ class Options(eqx.Module):
     max_iterations: int = eqx.field(default=100, static=True)
     tol: float = eqx.field(default=1e-8, static=True)
     goal_tol: float = eqx.field(default=1e-10, static=True)
-    barrier: float = eqx.field(default=0.03, static=True)
+    barrier: float = eqx.field(default=0.01, static=True)
 
 
 class Slacks(eqx.Module):

@@ -20,6 +20,7 @@ from natcoord_jax.xla.tracing import traced_once
 
 SHIFT = 1e-4
 """First increase of the curvature where the model is not convex."""
+LEAST_SHIFT = 1e-12
 GROWTH = 8.0
 """Of the increase, until the model is convex."""
 LARGEST_SHIFT = 1e8
@@ -30,6 +31,8 @@ HELD = 3.0
 time would else be at its lower bound before there is any motion that lasts as long."""
 FIXED = 1e9
 """The same in a feasibility restoration: time and parameters stay."""
+SOLVED = 10.0
+"""Errors, in terms of the barrier parameter, of a problem with barriers that is solved well enough."""
 LEAST_BARRIER = 1e-10
 """Barrier parameter at the end, relative to the cost."""
 
@@ -88,9 +91,8 @@ def _convex(problem: OptimalControl, iterate: Iterate, found: Model, reach: Arra
 
     def body(carry: tuple) -> tuple:
         _, shift, begun = carry
-        more = jnp.where(
-            shift > least, GROWTH * shift, jnp.maximum(jnp.maximum(last / 3.0, 2.0 * least), SHIFT)
-        )
+        first = jnp.where(last > 0, jnp.maximum(last / 3.0, LEAST_SHIFT), SHIFT)
+        more = jnp.where(shift > least, GROWTH * shift, jnp.maximum(first, 2.0 * least))
         shift = jnp.where(begun, more, shift)
         return attempt(shift), shift, jnp.array(True)
 
@@ -143,15 +145,18 @@ def _slope(problem: OptimalControl, iterate: Iterate, better: Improved, slacks: 
 
 
 def _lowered(iterate: Iterate) -> Array:
-    """The barrier parameter of the next iteration: lower where the present one is nearly solved."""
+    """The barrier parameter of the next iteration: lower where the present one is solved.
+
+    Waechter and Biegler, Math. Program. 106 (2006), equation (7), with errors in units of the cost. An
+    iterate that is far from the present parameter's solution gets stuck at its bounds under a lower one.
+    """
     s, m, mu, e = iterate.slacks, iterate.multipliers, iterate.barrier, iterate.errors
     count = max(1, s.path.size + s.end.size)
-    unit = iterate.unit / count
-    relative = mu / unit
-    central = largest(s.path * m.path - mu, s.end * m.end - mu) / unit
-    missing = jnp.maximum(jnp.maximum(e.stationarity, central), jnp.maximum(e.bounds, e.goal))
-    lower = unit * jnp.maximum(LEAST_BARRIER, jnp.minimum(0.2 * relative, relative**1.5))
-    return jnp.where(missing < 10.0 * relative, jnp.minimum(lower, mu), mu)
+    central = largest(s.path * m.path - mu, s.end * m.end - mu) / iterate.unit
+    missing = largest(jnp.stack([e.stationarity, central, e.bounds, e.goal, e.motion]))
+    relative = count * mu / iterate.unit
+    lower = iterate.unit / count * jnp.maximum(LEAST_BARRIER, jnp.minimum(0.2 * relative, relative**1.5))
+    return jnp.where(missing < SOLVED * mu / iterate.unit, jnp.minimum(lower, mu), mu)
 
 
 def no_model(derivatives: Derivatives, multipliers: Multipliers) -> Model:

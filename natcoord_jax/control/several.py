@@ -12,7 +12,7 @@ import numpy as np
 
 from natcoord_jax.control import sequential
 from natcoord_jax.control.attempts import METHOD, NAMES, row_of
-from natcoord_jax.control.guess import GUESS, Guess, goal_scale, scattered, unknowns_of
+from natcoord_jax.control.guess import GUESS, Guess, goal_scale, scattered, scattered_rates, unknowns_of
 from natcoord_jax.control.iterate import Iterate, Options
 from natcoord_jax.control.problem import PROBLEM, OptimalControl, numeric
 from natcoord_jax.control.results import OUTCOMES, Outcome
@@ -105,7 +105,7 @@ def multi_start(
     else:
         middle = unknowns_of(problem, guess, lifted)
         spread = for_each(spread, problem.channels, "multi_start: spread", "input channel")
-        rates = for_each(rates, middle.y.shape[1], "multi_start: rates", "rate")
+        rates = for_each(rates, scattered_rates(problem, middle), "multi_start: rates", "rate")
         keys = jax.random.split(jax.random.key(seed), starts)
         sizes = jnp.ones(starts).at[0].set(0.0)
         many = jax.vmap(lambda key, size: scattered(problem, middle, key, size * spread, size * rates))(

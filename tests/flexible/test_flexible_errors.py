@@ -204,7 +204,7 @@ def test_numbers_that_cannot_be_set():
                 lambda: system.set("plate", thickness=-0.1),
                 "shell 'plate': thickness is -0.1; pass a positive",
             ),
-            (lambda: system.set("plate", thickness=jnp.ones(3)), r"thickness has shape \(3,\)"),
+            (lambda: system.set("plate", thickness=jnp.ones(3)), r"thickness \[m\] has shape \(3,\)"),
             (lambda: system.set("plate", nu=0.6), ratio),
             (lambda: system.set("plate", E=-1.0), "material.E is -1.0; pass a positive"),
             (
