@@ -21,6 +21,8 @@ from natcoord_jax.xla.tracing import traced_once
 SHIFT = 1e-4
 """First increase of the curvature where the model is not convex."""
 LEAST_SHIFT = 1e-12
+"""Least increase: the next one is a third of the last, however small, since bounds that are active make what it
+is relative to large."""
 GROWTH = 8.0
 """Of the increase, until the model is convex."""
 LARGEST_SHIFT = 1e8
