@@ -20,9 +20,6 @@ from natcoord_jax.xla.tracing import traced_once
 
 SHIFT = 1e-4
 """First increase of the curvature where the model is not convex."""
-LEAST_SHIFT = 1e-12
-"""Least increase: the next one is a third of the last, however small, since bounds that are active make what it
-is relative to large."""
 GROWTH = 8.0
 """Of the increase, until the model is convex."""
 LARGEST_SHIFT = 1e8
@@ -93,8 +90,9 @@ def _convex(problem: OptimalControl, iterate: Iterate, found: Model, reach: Arra
 
     def body(carry: tuple) -> tuple:
         _, shift, begun = carry
-        first = jnp.where(last > 0, jnp.maximum(last / 3.0, LEAST_SHIFT), SHIFT)
-        more = jnp.where(shift > least, GROWTH * shift, jnp.maximum(first, 2.0 * least))
+        more = jnp.where(
+            shift > least, GROWTH * shift, jnp.maximum(jnp.maximum(last / 3.0, 2.0 * least), SHIFT)
+        )
         shift = jnp.where(begun, more, shift)
         return attempt(shift), shift, jnp.array(True)
 
