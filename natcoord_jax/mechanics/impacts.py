@@ -108,15 +108,14 @@ def after_impacts(
     pushed = jnp.concatenate([x[:, 0] for x in lam])
     # As in the equations: what is left of the impulse of an open contact may be of either sign.
     bouncing = np.repeat([group.effect.bounces for group in these], [group.count for group in these])
-    ahead = contact_gaps(system, these, end)
+    before, ahead = (contact_gaps(system, these, state) for state in (start, end))
+    # What is soft pushes where surfaces overlap; elsewhere its impulse is rounding.
+    touching = bouncing | (jnp.minimum(before, ahead) < 0)
     if tableau.max_events:
         phase = _numbers(these, "phase")
-        ahead = ahead - jnp.where(phase == RESTING, positive_part(contact_gaps(system, these, start)), 0.0)
+        ahead = ahead - jnp.where(phase == RESTING, positive_part(before), 0.0)
     reach = jnp.where(bouncing, ahead / h, 0.0)
-    active = 0.5 * _numbers(these, "mobility") * pushed > reach
-    if not np.all(bouncing):  # What is soft pushes where surfaces overlap; elsewhere its impulse is rounding.
-        overlapping = jnp.minimum(contact_gaps(system, these, start), contact_gaps(system, these, end)) < 0
-        active = active & (bouncing | overlapping)
+    active = (0.5 * _numbers(these, "mobility") * pushed > reach) & touching
     hit = None
     if tableau.max_events:
         free = phase == FREE
