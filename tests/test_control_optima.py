@@ -126,7 +126,7 @@ class Thrust(nc.cost.Cost):
 def test_flying_robot():
     """Y. Sakawa, Optimal Control Applications and Methods 20 (1999) 235-248: a cost linear in the inputs.
 
-    IPOPT from the same start, on the same 40 steps, ends at 7.953951; continuous time has 7.91.
+    IPOPT on the same 40 steps ends at 7.953951 from constant rates; continuous time has 7.91.
     """
     scene, half = nc.Scene(), np.sqrt(0.5)
     place = (-10.0, -10.0, 0.0)
@@ -141,8 +141,9 @@ def test_flying_robot():
     goal = nc.goal.Position(robot, (0, 0, 0)) & nc.goal.Attitude(robot, np.eye(3)) & nc.goal.Rest()
     shared = {"cost": Thrust(), "goal": goal, "bounds": nc.bounds.Input(0.0, 1.0) & pairs}
     found = nc.optimise(nc.OptimalControl(system, state, dt=0.3, steps=40, **shared), progress=False)
-    assert found.ok and len(found.history) < 60
-    assert found.cost <= 7.953952
+    assert found.ok and found.cost <= 7.953952
+    # Only bounds bend such a cost.
+    assert abs(nc.check(found, refine=False).curvature) < 1e6
 
 
 @pytest.fixture(scope="module")

@@ -32,8 +32,9 @@ class Check:
         complementarity: multiplier times room of the bounds, relative to the cost.
         kind: "minimum", "saddle", or "unknown" where the curvature is too small to tell.
         curvature: the least of the Lagrangian, relative to the largest in a single input, along changes that
-            keep to the motion and the goal to first order; bounds add to it as they press. None without an
-            iterate of the second-order method.
+            keep to the motion and the goal to first order; bounds add to it as they press, and where the cost
+            has none it is relative to the least that they add. None without an iterate of the second-order
+            method.
         direction: of unit length along which it is so, as change of the inputs' coefficients (coefficients,
             inputs).
         missing: residual of the goal by name, of the simulated motion.
@@ -137,7 +138,7 @@ def _second_order(solution: Solution) -> tuple[str, float | None, np.ndarray | N
     if solution.iterate is None:
         return "unknown", None, None
     value, along, unit = softest(solution.problem, solution.iterate)
-    relative = float(value) / max(float(unit), 1e-300)
+    relative = float(value) / float(unit) if unit > 0 else 0.0
     kind = "minimum" if relative > SEEN else "saddle" if relative < -SEEN else "unknown"
     change = as_unknowns(solution.problem, solution.iterate, along)
     return kind, relative, np.asarray(change.coefficients)

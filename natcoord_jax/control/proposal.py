@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from natcoord_jax.control.conditions import Change, as_unknowns, left_of_conditions
 from natcoord_jax.control.costates import Multipliers
-from natcoord_jax.control.improvement import Improved, curvature, improved, least_curved, times
+from natcoord_jax.control.improvement import FLAT, Improved, curvature, improved, least_curved, times
 from natcoord_jax.control.iterate import Derivatives, Iterate, Model, Options, Slacks, largest
 from natcoord_jax.control.line_search import SMALL, Direction, missed, violation
 from natcoord_jax.control.problem import OptimalControl
@@ -261,7 +261,7 @@ def softest(problem: OptimalControl, iterate: Iterate) -> tuple[Array, Change, A
 
     Returns:
         The curvature along it [cost per square of a coefficient], the direction of unit length, and the
-        largest curvature in a coefficient.
+        largest curvature in a coefficient; where the cost has none, the least that bounds add.
     """
     found = model(problem, iterate.path, iterate.unknowns, iterate.multipliers, iterate.derivatives)
     factors, _ = _convex(problem, iterate, found, jnp.clip(30.0 * iterate.errors.motion, *REACH))
@@ -270,5 +270,9 @@ def softest(problem: OptimalControl, iterate: Iterate) -> tuple[Array, Change, A
     along = jax.tree.map(lambda x: x / jnp.where(length > 0, length, 1.0), along)
     left, sweep = left_of_conditions(problem, iterate, bounds, factors.added, along, jnp.zeros(()))
     own = jnp.diagonal(found.hessian, axis1=1, axis2=2)[:, -problem.channels :]
+    own = jnp.max(jnp.abs(own), initial=0.0)
+    # Costs that are linear in the inputs have none of their own: only bounds bend them.
+    steep = found.excess[:, :, -problem.channels :] ** 2
+    pressed = jnp.min(jnp.einsum("kh,khm->km", bounds.path, steep))
     value = curvature(along, times(along, left), sweep, bounds, factors.added)
-    return value, along, jnp.max(jnp.abs(own), initial=0.0)
+    return value, along, jnp.where(own > FLAT * pressed, own, pressed)
