@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.control.tangent import steady_rates
-from natcoord_jax.control.transcription import Unknowns, end, roll
+from natcoord_jax.control.transcription import Node, Slice, Unknowns, end, roll, slices, stage
 from natcoord_jax.core.arguments import Part, is_a
 from natcoord_jax.core.compiled import compiled
 from natcoord_jax.core.kinds import of
@@ -19,6 +19,8 @@ ROUNDS = 12
 """Gauss-Newton corrections of the constant rates that lead to the goal."""
 LEAST_SCALE = 0.1
 """Least scale of a condition of the goal, relative to the largest."""
+SAME = 1e-9
+"""Inputs whose effects differ by less than this part count as one."""
 LONGEST = 2.0
 """Largest turn of a body in one step of a guess [rad]."""
 
@@ -26,18 +28,19 @@ LONGEST = 2.0
 class Guess(Part):
     """A first guess.
 
-    What is not given is made: inputs zero; rates constant, such that joints and attitudes go to the goal
-    the short way round (either way at half a turn) while forces play no part; time and parameters as in the
-    problem.
+    What is not given is made. Rates are such that joints and attitudes go to the goal the short way round
+    (either way at half a turn): constant ones, or, where the goal asks for rest, such as start and end
+    there. Inputs are those that come nearest to make this motion within their limits (inverse dynamics),
+    or, for "shooting", zero. Time and parameters are as in the problem.
 
     The order of rates is that of `problem.rates`, their names: for every body in the order of
     `system.structure.bodies` the rotations, then the translations that its joint leaves free.
 
     Attributes:
-        inputs: of all steps (steps, inputs) [N, N m]; None: zero.
+        inputs: of all steps (steps, inputs) [N, N m]; None: made.
         rates: mean rates of the free motions in all steps (steps, n), or constant ones (n,) [rad/s, m/s] that
             are taken up from the initial ones, for the lifted method, which needs no motion to start from;
-            None: constant ones that lead to the goal.
+            None: made.
         free: final time [s] and parameters in the order of `problem.free`; None: those of the problem.
 
     Example:
@@ -82,7 +85,8 @@ def unknowns_of(problem: OptimalControl, guess: Any, lifted: bool) -> Unknowns:
     if not lifted or structure.solver != "reduced":
         return unknowns
     if guess.rates is None:
-        return with_rates(unknowns, taken_up(problem, _leading_to_goal(problem, unknowns)))
+        unknowns = _towards_goal(problem, unknowns)
+        return unknowns if guess.inputs is not None else with_balancing_inputs(problem, unknowns)
     given = jnp.asarray(guess.rates, float)
     if given.shape == (structure.unknowns,):
         steady = jnp.broadcast_to(given, (problem.steps, structure.unknowns))
@@ -150,6 +154,55 @@ def scattered_rates(problem: OptimalControl, unknowns: Unknowns) -> int:
     """How many unknowns of a step are rates that can be guessed; multipliers of loops follow from them."""
     structure = problem.system.structure
     return structure.unknowns if structure.solver == "reduced" else unknowns.y.shape[1]
+
+
+def _towards_goal(problem: OptimalControl, unknowns: Unknowns) -> Unknowns:
+    """Rates that lead to the goal: constant ones, or such as start and end at rest where it asks for that."""
+    constant = _leading_to_goal(problem, unknowns)
+    part = (jnp.arange(problem.steps) + 0.5)[:, None] / problem.steps
+    ways = [
+        with_rates(unknowns, taken_up(problem, w)) for w in (constant, 6.0 * part * (1.0 - part) * constant)
+    ]
+    missed = jnp.stack([_missed(problem, way) for way in ways])
+    better = jnp.nan_to_num(missed[1], nan=jnp.inf) < missed[0]
+    return jax.tree.map(lambda x, y: jnp.where(better, y, x), *ways)
+
+
+@compiled
+def _missed(problem: OptimalControl, unknowns: Unknowns) -> Float[Array, ""]:
+    """Square of what is missing to the goal."""
+    return jnp.sum(roll(problem, unknowns).end.missing ** 2)
+
+
+@compiled
+def with_balancing_inputs(problem: OptimalControl, unknowns: Unknowns) -> Unknowns:
+    """The unknowns with inputs that come nearest to make their motion, within limits: inverse dynamics.
+
+    Of each step the inputs minimise what is left of its equations in the metric of its inverse Jacobian, so
+    that motions without an input count by what they would have to give (the principle of Gauss); then they
+    are cut in one ratio to what their bounds leave.
+    """
+    nodes, at = jax.tree.map(lambda x: x[:-1], roll(problem, unknowns).nodes), slices(problem)
+    # Inputs of each step for themselves, whatever they are made of.
+    at = at._replace(read=jnp.zeros_like(at.read), direct=jnp.ones_like(at.direct))
+
+    def one(at: Slice, node: Node, y: Array) -> Array:
+        def left(u: Array, y: Array) -> tuple[Array, Array]:
+            found = stage(problem, at, node, u, y)
+            return found.residual, found.excess
+
+        idle = jnp.zeros(problem.channels)
+        rest, excess = left(idle, y)
+        (by_u, steep), by_y = jax.jacfwd(left)(idle, y), jax.jacfwd(left, argnums=1)(idle, y)[0]
+        inverse = jnp.linalg.pinv(by_y)
+        metric = 0.5 * (inverse + inverse.T)
+        u = -jnp.linalg.pinv(by_u.T @ metric @ by_u, rtol=SAME) @ (by_u.T @ metric @ rest)
+        grown, spare = steep @ u, jnp.maximum(-excess, 0.0)
+        reach = jnp.where(grown > 0, spare / jnp.where(grown > 0, grown, 1.0), 1.0)
+        return jnp.nan_to_num(u * jnp.minimum(1.0, jnp.min(reach, initial=1.0)))
+
+    inputs = jax.vmap(one)(at, nodes, unknowns.y)
+    return eqx.tree_at(lambda u: u.coefficients, unknowns, problem.inputs.fitted(inputs))
 
 
 def scattered(problem: OptimalControl, unknowns: Unknowns, key: Array, spread: Any, rates: Any) -> Unknowns:
