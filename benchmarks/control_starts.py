@@ -24,7 +24,7 @@ import jax
 import numpy as np
 
 import natcoord_jax as nc
-from benchmarks import common
+from benchmarks import common, control_problems
 from natcoord_jax.control.guess import scattered, unknowns_of
 from natcoord_jax.control.problem import numeric
 from natcoord_jax.control.transcription import held_inputs
@@ -224,6 +224,11 @@ CASES: dict[str, Case] = {
     ),
     "acrobot": Case(_acrobot, 2.0, 1.0),
     "arm with joint limits": Case(_arm, 2.0, 0.5),
+    "panda, seven axes": Case(control_problems.panda, 2.0, 0.5),
+    "flying robot": Case(control_problems.flying_robot, 0.1, 0.3),
+    "two links, least time": Case(control_problems.two_links, 0.3, 0.5),
+    "throw, two links": Case(control_problems.throw, 2.0, 1.0),
+    "craft with beams": Case(control_problems.craft_with_beams, 0.5, 0.05),
 }
 
 
@@ -243,7 +248,7 @@ def starts(problem: nc.OptimalControl, case: Case, count: int) -> list[nc.Guess]
 
 def solved_by_ipopt(problem: nc.OptimalControl, guess: nc.Guess, patience: float) -> dict[str, Any]:
     """One solution by the peer, or what it has after so many seconds."""
-    from benchmarks.peers import ipopt
+    from natcoord_jax.control import ipopt
 
     answer = ipopt.solved(nc.to_nlp(problem, guess), max_wall_time=patience)
     return {

@@ -370,6 +370,7 @@ INSIDE = {
     "hunting_protocol.py": "the record that derivatives are taken along: all that the hunt knows of insides",
     "test_accuracy.py": "the rule by which rows of a table are noted",
     "test_arguments.py": "public objects that only calls return",
+    "test_control_starts.py": "how far a motion is from being as near as inputs can come",
     "test_decayed_impulses.py": "impulses that underflow, which no scene gives on purpose",
     "test_effort.py": "compilers in other processes",
     "test_elimination.py": "eliminations of small matrices, by their contract",

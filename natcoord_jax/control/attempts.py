@@ -10,11 +10,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 
-from natcoord_jax.control import sequential
+from natcoord_jax.control import ipopt, sequential
+from natcoord_jax.control.costates import Multipliers
 from natcoord_jax.control.guess import Guess, goal_scale, input_ranges, scattered, stretched, unknowns_of
 from natcoord_jax.control.iterate import Iterate, Options
+from natcoord_jax.control.nlp import program_of
 from natcoord_jax.control.problem import OptimalControl
+from natcoord_jax.control.reach import unreached
 from natcoord_jax.control.reasons import nearest, worst_condition
 from natcoord_jax.control.results import Outcome
 from natcoord_jax.control.solution import Attempt, Row, Solution, solution_of
@@ -28,12 +32,20 @@ NAMES = {True: "lifted", False: "shooting"}
 METHOD = "sequential quadratic programming"
 LOST = (
     Outcome.SIMULATION_FAILED, Outcome.STALLED, Outcome.MAX_ITERATIONS, Outcome.NONFINITE, Outcome.SINGULAR,
-    Outcome.DIVERGED,
+    Outcome.DIVERGED, Outcome.UNREACHABLE,
 )  # fmt: skip
 """Outcomes after which another way is tried, if the choice was ours."""
 NOWHERE = (Outcome.SIMULATION_FAILED, Outcome.NONFINITE, Outcome.SINGULAR)
 """Outcomes that leave no motion to go on from."""
+IPOPT = "IPOPT"
+"""Name of the second method."""
+IPOPT_ENDS = {
+    "Maximum Iterations Exceeded": Outcome.MAX_ITERATIONS,
+    "Maximum WallTime Exceeded": Outcome.TIME_LIMIT,
+}
 RESTORATION = "feasibility restoration, by motions that may miss the goal"
+ENDED = (Outcome.TIME_LIMIT, Outcome.STOPPED)
+"""Outcomes after which nothing is tried any more."""
 STARTS = 4
 """Starts of feasibility restorations: the guess, and random ones about it."""
 SPREAD = 0.25
@@ -44,6 +56,8 @@ PART = 0.4
 """Part of the iterations left that an attempt may take where others can follow."""
 MANY = 100
 """Iterations that it may take at least."""
+CERTAIN = 0.05
+"""Part of what is missing that inputs have to leave, to first order, where a goal counts as out of reach."""
 WIDER = (1.25, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
 """Factors on the limits of the inputs that are tried where none was restored within them."""
 
@@ -91,6 +105,7 @@ class Search:
         unknowns: Unknowns,
         *,
         scale: Any = None,
+        known: Multipliers | None = None,
         last: bool = False,
         problem: OptimalControl | None = None,
     ) -> Solution:
@@ -100,6 +115,7 @@ class Search:
             lifted: the form of the method.
             unknowns: where it starts.
             scale: of a soft goal, see `sequential.init`.
+            known: multipliers to begin with.
             last: whether no other attempt follows, so that it may take all iterations that are left.
             problem: another one of the same structure.
         """
@@ -109,7 +125,7 @@ class Search:
         count = self.left if last else min(self.left, max(MANY, math.ceil(PART * self.left)))
         o = self.options
         options = Options(lifted, count, o.tol, o.goal_tol)
-        iterate = sequential.init(problem, options, unknowns, scale)
+        iterate = sequential.init(problem, options, unknowns, scale, known)
         outcome = Outcome.RUNNING
         if self.progress:
             print(f"{method}\n{HEADER}", file=sys.stderr)
@@ -135,6 +151,37 @@ class Search:
         self.attempts.append(Attempt(method, outcome, taken, seconds, reason))
         return found
 
+    def by_ipopt(self, unknowns: Unknowns) -> Solution:
+        """IPOPT on the whole program, then the lifted method from where it ends, to its own tolerances.
+
+        Args:
+            unknowns: where it starts.
+        """
+        problem, begun, before = self.problem, time.perf_counter(), len(self.history)
+        program = program_of(problem, unknowns)
+        left = max(0.0, self.time_limit - self.watch.seconds)
+        try:
+            answer = ipopt.solved(program, self.left, max_wall_time=max(left, 1e-3))
+        except KeyboardInterrupt:
+            iterate = sequential.init(problem, Options(True), unknowns)
+            return solution_of(problem, iterate, IPOPT, list(self.history), Outcome.STOPPED)
+        for cost, slope, violation, length in answer.table[1:]:
+            seconds = time.perf_counter() - self.start
+            row = Row(len(self.history) + 1, cost, slope, violation, IPOPT, length, 0, seconds)
+            self.history.append(row)
+            if self.progress:
+                print(printed(row), file=sys.stderr, flush=True)
+        found = ravel_pytree(unknowns)[1](jnp.asarray(answer.x))
+        outcome = Outcome.OPTIMAL if answer.ok else IPOPT_ENDS.get(answer.status, Outcome.STALLED)
+        count, seconds = len(self.history), time.perf_counter() - begun
+        reason = "" if answer.ok else answer.status
+        self.attempts.append(Attempt(IPOPT, outcome, count - before, seconds, reason))
+        ended = self.run(True, found, known=program.multipliers(answer.multipliers))
+        if len(self.history) > count:
+            return ended
+        # It is a solution as it is.
+        return dataclasses.replace(ended, method=f"{NAMES[True]}, by {IPOPT}", attempts=ended.attempts[:-1])
+
 
 def over(found: Solution) -> bool:
     """Whether nothing follows: it is solved, the user or a limit stops it, or nothing can be done."""
@@ -155,38 +202,75 @@ def after_restoration(search: Search, found: Solution, guess: Guess) -> Solution
         lifted = not found.method.startswith(NAMES[True])
         inputs = Guess(found.inputs, free=found.guess().free)
         return search.run(lifted, unknowns_of(problem, inputs, lifted), last=True)
-    failed: list[Solution] = []
+    tried, missing = [found], list[Solution]()
     for k in range(STARTS):
         start = begin
         if k:
             spread = SPREAD * input_ranges(problem, begin)
             start = scattered(problem, stretched(problem, begin, LONGER**k), jax.random.key(k), spread, 0.0)
         restored = search.run(False, start, scale=scale)
-        if restored.outcome in (Outcome.TIME_LIMIT, Outcome.STOPPED):
-            return restored
-        failed += [restored] if restored.outcome is Outcome.UNREACHABLE else []
-        if restored.outcome in NOWHERE:
+        tried.append(restored)
+        missing += [restored] if restored.outcome is Outcome.UNREACHABLE else []
+        if restored.outcome in NOWHERE or restored.iterate is None:
             begin = eqx.tree_at(lambda u: u.coefficients, begin, jnp.zeros_like(begin.coefficients))
-        elif search.left > 0 and restored.iterate is not None:
-            found = search.run(True, restored.iterate.unknowns, last=k == STARTS - 1)
-            if over(found):
-                return found
-        if search.left <= 0:
+        elif restored.outcome not in ENDED and search.left > 0:
+            tried.append(search.run(True, restored.iterate.unknowns, last=k == STARTS - 1))
+        # What one method cannot reach and another one neither, needs no more starts.
+        agreed = found.outcome is Outcome.UNREACHABLE and len(missing) > 0
+        if over(tried[-1]) and tried[-1] is not restored or search.left <= 0 or agreed:
             break
-    if len(failed) == STARTS:
-        found = _unreachable(search, failed, scale)
+        if tried[-1].outcome in ENDED:
+            break
+    found = _concluded(search, tried, missing, scale)
     others = [a for k, a in enumerate(search.attempts) if k != len(found.attempts)]
     return dataclasses.replace(found, history=search.history, attempts=others)
 
 
-def _unreachable(search: Search, failed: list[Solution], scale: Any) -> Solution:
-    """The nearest of motions that all miss the goal, and the limits of inputs that would lead to it."""
-    problem = search.problem
-    iterates = [one.iterate for one in failed if one.iterate is not None]
-    misses = [float(jnp.sum((i.path.end.missing / scale) ** 2)) for i in iterates]
-    best = int(np.argmin(misses))
-    nearest_one, begin = failed[best], iterates[best].unknowns
-    reason, attempts, rows = nearest_one.reason, len(search.attempts), len(search.history)
+def _concluded(search: Search, tried: list[Solution], missing: list[Solution], scale: Any) -> Solution:
+    """What is solved; else that the goal is out of reach, where that is certain; else the best of all."""
+    problem, last = search.problem, tried[-1]
+    solved = [one for one in tried if one.method != RESTORATION and one.ok]
+    if solved:
+        return solved[-1]
+    agreed = tried[0].outcome is Outcome.UNREACHABLE and len(missing) > 0
+    if agreed or len(missing) == STARTS:
+        misses = [float(jnp.sum((i.path.end.missing / scale) ** 2)) for i in _iterates(missing)]
+        best = int(np.argmin(misses))
+        if unreached(problem, _iterates(missing)[best], scale) > CERTAIN:
+            return (
+                tried[0] if agreed else _unreachable(search, missing[best], _iterates(missing)[best], scale)
+            )
+    # Restorations that come near are no solutions, and nothing has shown the goal to be out of reach.
+    ends = [one.outcome for one in tried if one.method != RESTORATION]
+    outcome = last.outcome if last.outcome in ENDED else ends[-1]
+    outcome = Outcome.STALLED if outcome is Outcome.UNREACHABLE else outcome
+    return best_of(problem, tried, outcome)
+
+
+def best_of(problem: OptimalControl, tried: list[Solution], outcome: Outcome) -> Solution:
+    """What violates least of some attempts of which none has solved the problem, and how they ended."""
+    known = [one for one in tried if one.iterate is not None] or tried[-1:]
+    best = min(known, key=lambda one: _badness(problem, one))
+    if best.method == RESTORATION and best.iterate is not None:
+        best = dataclasses.replace(best, reason=nearest(problem, best.iterate))
+    return dataclasses.replace(best, code=int(outcome))
+
+
+def _iterates(found: list[Solution]) -> list[Iterate]:
+    return [one.iterate for one in found if one.iterate is not None]
+
+
+def _badness(problem: OptimalControl, found: Solution) -> tuple[float, float]:
+    """Largest violation, then cost; what is no number is worst."""
+    violation = math.inf if found.iterate is None else worst_condition(problem, found.iterate)[0]
+    whole = not math.isnan(violation) and not math.isnan(found.cost)
+    return (violation, found.cost) if whole else (math.inf, math.inf)
+
+
+def _unreachable(search: Search, found: Solution, iterate: Iterate, scale: Any) -> Solution:
+    """The nearest motion that misses the goal, and the limits of inputs that would lead to it."""
+    problem, begin = search.problem, iterate.unknowns
+    reason, attempts, rows = found.reason, len(search.attempts), len(search.history)
     if problem.bounds.widened(WIDER[0]) is not problem.bounds:
         for factor in WIDER:
             wider = eqx.tree_at(lambda p: p.bounds, problem, problem.bounds.widened(factor))
@@ -198,4 +282,4 @@ def _unreachable(search: Search, failed: list[Solution], scale: Any) -> Solution
             if restored.outcome is not Outcome.UNREACHABLE or search.left <= 0:
                 break
     del search.attempts[attempts:], search.history[rows:]
-    return dataclasses.replace(nearest_one, reason=reason)
+    return dataclasses.replace(found, reason=reason)

@@ -10,7 +10,7 @@ from natcoord_jax.control.attempts import NAMES
 from natcoord_jax.control.guess import GUESS, Guess
 from natcoord_jax.control.problem import PROBLEM, OptimalControl
 from natcoord_jax.control.results import Outcome
-from natcoord_jax.control.run import METHODS, optimise
+from natcoord_jax.control.run import FORMS, optimise
 from natcoord_jax.control.solution import Solution
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.kinds import FLAG, Choice, Concrete, FunctionOf, of
@@ -53,7 +53,7 @@ def continuation(
     *,
     first: Annotated[float, Number("positive")] = 0.25,
     least: Annotated[float, Number("positive")] = 1e-3,
-    method: Annotated[str, Choice(METHODS)] = "auto",
+    method: Annotated[str, Choice(FORMS)] = "auto",
     progress: Annotated[bool, FLAG] = True,
     max_iterations: Annotated[int, Whole(1)] = 60,
     tol: Annotated[float, Concrete(Number("positive"))] = 1e-8,

@@ -1,5 +1,6 @@
 """The discrete problem as a nonlinear program in one vector, for solvers of others."""
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -9,6 +10,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from natcoord_jax.control.costates import Multipliers
 from natcoord_jax.control.guess import GUESS, unknowns_of
 from natcoord_jax.control.problem import PROBLEM, OptimalControl, numeric
 from natcoord_jax.control.transcription import Unknowns, held_inputs, roll
@@ -30,11 +32,12 @@ class NonlinearProgram(NamedTuple):
         names: of the constraints.
         cost: x to the cost.
         gradient: x to its gradient (n,).
-        constraints: x to the residuals of all steps, the goal, and the excesses over bounds (c,).
+        constraints: x to the residuals of all steps [N, N m], the goal, and the excesses over bounds (c,).
         jacobian: x to their derivative (c, n).
         hessian: (x, weight, multipliers) to that of weight cost + multipliers constraints (n, n).
         inputs: x to the inputs of all steps (steps, inputs) [N, N m].
         free: x to the values of final time [s] and parameters by name.
+        multipliers: those of the constraints (c,), as `nc.optimise` has them.
     """
 
     start: np.ndarray
@@ -48,6 +51,7 @@ class NonlinearProgram(NamedTuple):
     hessian: Callable[[Any, Any, Any], Float[Array, "n n"]]
     inputs: Callable[[Any], Float[Array, "steps inputs"]]
     free: Callable[[Any], dict[str, float]]
+    multipliers: Callable[[Any], Multipliers]
 
 
 @checked(problem=PROBLEM, guess=GUESS)
@@ -74,7 +78,11 @@ def to_nlp(problem: OptimalControl, guess: Any = None) -> NonlinearProgram:
         True
     """
     problem = numeric(problem)
-    first = unknowns_of(problem, guess, True)
+    return program_of(problem, unknowns_of(problem, guess, True))
+
+
+def program_of(problem: OptimalControl, first: Unknowns) -> NonlinearProgram:
+    """The program of a problem with all its numbers as arrays, from given unknowns."""
     start, unflat = ravel_pytree(first)
     path = roll(problem, first)
     equations = path.stages.residual.size + path.end.missing.size
@@ -84,6 +92,8 @@ def to_nlp(problem: OptimalControl, guess: Any = None) -> NonlinearProgram:
     names += problem.goal.labels(system)
     names += [f"{name}, step {step}" for step in steps for name in problem.bounds.labels(system)]
     names += [f"bound {k} of what is free" for k in range(path.end.excess.size)]
+    # Momenta of short steps are small numbers beside goals and bounds: forces are not.
+    weights = jnp.ones(equations + inequalities).at[: path.stages.residual.size].set(1.0 / problem.dt)
 
     def unknowns(x: Any) -> Unknowns:
         return unflat(jnp.asarray(x, float))
@@ -91,44 +101,61 @@ def to_nlp(problem: OptimalControl, guess: Any = None) -> NonlinearProgram:
     def free(x: Any) -> dict[str, float]:
         return dict(zip(problem.free, np.asarray(problem.values(unknowns(x).free)).tolist()))
 
+    def multipliers(values: Any) -> Multipliers:
+        shapes = (path.stages.residual, path.end.missing, path.stages.excess, path.end.excess)
+        ends = np.cumsum([x.size for x in shapes])
+        parts = jnp.split(weights * jnp.asarray(values, float), ends[:-1])
+        motion, goal, along, last = (part.reshape(x.shape) for part, x in zip(parts, shapes))
+        return Multipliers(goal, along, last, motion)
+
+    @functools.lru_cache(maxsize=1)
+    def slopes(x: bytes) -> tuple[Array, Array]:
+        return _first(problem, unknowns(np.frombuffer(x)), weights)
+
+    def at(x: Any) -> tuple[Array, Array]:
+        return slopes(np.ascontiguousarray(x, float).tobytes())
+
     return NonlinearProgram(
         np.asarray(start),
         np.concatenate([np.zeros(equations), np.full(inequalities, -np.inf)]),
         np.zeros(equations + inequalities),
         tuple(names),
-        lambda x: _values(problem, unknowns(x))[0],
-        lambda x: _first(problem, unknowns(x))[0],
-        lambda x: _values(problem, unknowns(x))[1],
-        lambda x: _first(problem, unknowns(x))[1],
+        lambda x: _values(problem, unknowns(x), weights)[0],
+        lambda x: at(x)[0],
+        lambda x: _values(problem, unknowns(x), weights)[1],
+        lambda x: at(x)[1],
         lambda x, weight, multipliers: _second(
-            problem, unknowns(x), jnp.asarray(weight, float), jnp.asarray(multipliers, float)
+            problem, unknowns(x), weights, jnp.asarray(weight, float), jnp.asarray(multipliers, float)
         ),
         lambda x: held_inputs(problem, unknowns(x).coefficients),
         free,
+        multipliers,
     )
 
 
-def _both(problem: OptimalControl, unknowns: Unknowns) -> tuple[Array, Array]:
+def _both(problem: OptimalControl, unknowns: Unknowns, weights: Array) -> tuple[Array, Array]:
     path = roll(problem, unknowns)
     parts = (path.stages.residual, path.end.missing, path.stages.excess, path.end.excess)
-    return path.cost, jnp.concatenate([part.reshape(-1) for part in parts])
+    return path.cost, weights * jnp.concatenate([part.reshape(-1) for part in parts])
 
 
 _values = compiled(_both)
 
 
 @compiled
-def _first(problem: OptimalControl, unknowns: Unknowns) -> tuple[Array, Array]:
+def _first(problem: OptimalControl, unknowns: Unknowns, weights: Array) -> tuple[Array, Array]:
     x, unflat = ravel_pytree(unknowns)
-    return jax.jacfwd(lambda x: _both(problem, unflat(x)))(x)
+    return jax.jacfwd(lambda x: _both(problem, unflat(x), weights))(x)
 
 
 @compiled
-def _second(problem: OptimalControl, unknowns: Unknowns, weight: Array, multipliers: Array) -> Array:
+def _second(
+    problem: OptimalControl, unknowns: Unknowns, weights: Array, weight: Array, multipliers: Array
+) -> Array:
     x, unflat = ravel_pytree(unknowns)
 
     def lagrangian(x: Array) -> Array:
-        cost, constraints = _both(problem, unflat(x))
+        cost, constraints = _both(problem, unflat(x), weights)
         return weight * cost + multipliers @ constraints
 
     return jax.jacfwd(jax.grad(lagrangian))(x)

@@ -6,8 +6,9 @@ from typing import Annotated, Any
 import numpy as np
 
 from natcoord_jax.control import sequential
-from natcoord_jax.control.attempts import NAMES, Search, after_restoration, over
+from natcoord_jax.control.attempts import ENDED, NAMES, Search, after_restoration, best_of, over
 from natcoord_jax.control.guess import GUESS, Guess, unknowns_of
+from natcoord_jax.control.ipopt import MOST, installed
 from natcoord_jax.control.iterate import Iterate, Options
 from natcoord_jax.control.problem import PROBLEM, OptimalControl, numeric
 from natcoord_jax.control.reasons import outside_at_start
@@ -19,7 +20,8 @@ from natcoord_jax.core.compiled import compiled
 from natcoord_jax.core.kinds import FLAG, Choice, Concrete, of
 from natcoord_jax.core.numeric import Number, Whole
 
-METHODS = ("auto", "shooting", "lifted")
+FORMS = ("auto", "shooting", "lifted")
+METHODS = (*FORMS, "ipopt")
 DEFAULT = Options()
 UNKNOWNS = of("unknowns, as the `unknowns` of an iterate", Unknowns)
 OPTIONS = of("natcoord_jax.control.iterate.Options(...)", Options)
@@ -62,9 +64,12 @@ def optimise(
         guess: inputs (steps, inputs), a `Guess`, an earlier `Solution`, or None.
         method: "shooting", "lifted" or "auto": that of an earlier solution as guess, else lifted if
             parameters are free or more than inputs is bounded; with free time always lifted. Where that gets
-            lost, "auto" and "lifted" look for a motion that comes near to the goal, by simulations that may
-            miss it (feasibility restoration), and go on from there; then from random inputs. What the
-            attempts saw is in `explain()`.
+            lost, "auto" asks IPOPT (`pip install 'natcoord-jax[ipopt]'`) if it is installed; then "auto" and
+            "lifted" look for a motion that comes near to the goal, by simulations that may miss it
+            (feasibility restoration), and go on from there; then from random inputs. "ipopt": by IPOPT
+            alone, on `nc.to_nlp`. What is returned is the best of all attempts, and what they saw is in
+            `explain()`. That a goal is out of reach is said only where two methods agree, or four starts,
+            and to first order no inputs within their limits lead there.
         progress: print a line for each iteration to stderr.
         max_iterations: limit of iterations, of all attempts together.
         tol: largest gradient of the Lagrangian and complementarity, relative.
@@ -78,6 +83,7 @@ def optimise(
 
     Raises:
         ValueError: for a guess of the wrong shape or an unknown method.
+        ModuleNotFoundError: for method "ipopt" where it is not installed.
     """
     problem = numeric(problem)
     lifted = chosen(problem, method, guess)
@@ -94,8 +100,18 @@ def optimise(
         free = dict(zip(names, values))
         return Solution(problem, inputs, free, dt, math.nan, code, NAMES[lifted], reason=reason)
     search = Search(problem, Options(lifted, max_iterations, tol, goal_tol), progress, time_limit)
+    if method == "ipopt":
+        return search.by_ipopt(unknowns_of(problem, guess, True))
     # Restored motions are gone on from in the lifted form.
     found = search.run(lifted, start, last=method == "shooting")
+    lost = not over(found) and found.outcome is not Outcome.UNREACHABLE
+    if method == "auto" and lost and search.left > 0 and installed():
+        begin = unknowns_of(problem, guess, True)
+        other = search.by_ipopt(begin) if begin.y.size + begin.coefficients.size <= MOST else found
+        if other.ok:
+            return other
+        if other.outcome in ENDED:
+            return best_of(problem, [found, other], other.outcome)
     if method != "shooting" and not over(found) and search.left > 0:
         found = after_restoration(search, found, guess)
     return found

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 from natcoord_jax.control.costates import Multipliers
-from natcoord_jax.control.iterate import Derivatives, Filter, Iterate, Options, Slacks, largest
+from natcoord_jax.control.iterate import Derivatives, Errors, Filter, Iterate, Options, Slacks, largest
 from natcoord_jax.control.line_search import (
     Found,
     at_barrier,
@@ -28,7 +28,7 @@ from natcoord_jax.control.line_search import (
 )
 from natcoord_jax.control.linearisation import cost_unit, linearised
 from natcoord_jax.control.problem import OptimalControl
-from natcoord_jax.control.proposal import Proposal, no_model, propose
+from natcoord_jax.control.proposal import LEAST_BARRIER, Proposal, no_model, propose
 from natcoord_jax.control.results import Outcome
 from natcoord_jax.control.transcription import Path, Unknowns, roll, simulated
 from natcoord_jax.core.compiled import compiled
@@ -50,7 +50,9 @@ NEARLY = 1e-6
 
 
 @compiled
-def _begun(problem: OptimalControl, options: Options, unknowns: Unknowns) -> tuple[tuple, tuple]:
+def _begun(
+    problem: OptimalControl, options: Options, unknowns: Unknowns, known: Multipliers | None
+) -> tuple[tuple, tuple]:
     unknowns, whole, newton = simulated(problem, unknowns, options.lifted)
     path = roll(problem, unknowns)
     slacks = Slacks(jnp.maximum(-path.stages.excess, ROOM), jnp.maximum(-path.end.excess, ROOM))
@@ -58,12 +60,30 @@ def _begun(problem: OptimalControl, options: Options, unknowns: Unknowns) -> tup
     barrier = options.barrier * unit
     goal = jnp.zeros_like(path.end.missing)
     motion = jnp.zeros_like(unknowns.y) if options.lifted else None
-    multipliers = Multipliers(goal, barrier / slacks.path, barrier / slacks.end, motion)
+    if known is not None:
+        room = Slacks(-path.stages.excess, -path.end.excess)
+        pressing = largest(room.path * known.path, room.end * known.end)
+        barrier = jnp.clip(pressing, LEAST_BARRIER * unit, barrier)
+        goal, motion = known.goal, known.motion if options.lifted else None
+        slacks = Slacks(_spare(room.path, known.path, barrier), _spare(room.end, known.end, barrier))
+    along, last = barrier / slacks.path, barrier / slacks.end
+    if known is not None:
+        along, last = jnp.where(known.path > 0, known.path, along), jnp.where(known.end > 0, known.end, last)
+    multipliers = Multipliers(goal, along, last, motion)
     return (unknowns, multipliers, slacks, path, unit), (barrier, whole, newton)
 
 
+def _spare(room: Array, pressing: Array, barrier: Array) -> Array:
+    """Room to bounds; where there is none, what multipliers and the barrier parameter say."""
+    return jnp.where(room > 0, room, barrier / jnp.where(room > 0, 1.0, jnp.maximum(pressing, barrier)))
+
+
 def init(
-    problem: OptimalControl, options: Options, unknowns: Unknowns, scale: Array | None = None
+    problem: OptimalControl,
+    options: Options,
+    unknowns: Unknowns,
+    scale: Array | None = None,
+    known: Multipliers | None = None,
 ) -> Iterate:
     """First iterate from a guess.
 
@@ -73,13 +93,22 @@ def init(
         unknowns: coefficients and what is free; `y` is replaced by a simulation unless the method is lifted.
         scale: of the goal, which is then soft: the method ends near it, and time and parameters stay; None:
             the goal is to be reached.
+        known: multipliers to begin with; None: none, and bounds that are kept away from.
     """
     begin = Options(options.lifted, barrier=options.barrier)
-    begun, rest = _begun(problem, begin, unknowns)
+    begun, rest = _begun(problem, begin, unknowns, known)
     unknowns, multipliers, slacks, path, unit = begun
     derivatives = linearised(problem, unknowns, multipliers, slacks, path, unit)
     soft = jnp.zeros_like(path.end.missing) if scale is None else scale**2 / (2.0 * MISSED * unit)
-    return _first(problem, begin, begun, derivatives, soft, *rest)
+    iterate = _first(problem, begin, begun, derivatives, soft, *rest)
+    return iterate if known is None else _accepted(options, iterate)
+
+
+@compiled
+def _accepted(options: Options, iterate: Iterate) -> Iterate:
+    """An iterate that another method has found, at its end if it fulfils the conditions as it is."""
+    optimal = _fulfilled(options, iterate.errors)
+    return eqx.tree_at(lambda i: i.code, iterate, jnp.where(optimal, int(Outcome.OPTIMAL), iterate.code))
 
 
 @compiled
@@ -230,11 +259,16 @@ def _undefined(path: Path, derivatives: Derivatives) -> Int[Array, ""]:
     return jnp.where(singular, int(Outcome.SINGULAR), int(Outcome.NONFINITE))
 
 
+def _fulfilled(options: Options, e: Errors) -> Bool[Array, ""]:
+    """Whether the conditions of optimality are, of first order."""
+    kept = (e.goal <= options.goal_tol) & (e.bounds <= options.goal_tol) & (e.motion <= options.goal_tol)
+    return kept & (e.stationarity <= options.tol) & (e.complementarity <= options.tol)
+
+
 def _judged(options: Options, it: Iterate) -> Int[Array, ""]:
     """Outcome of an iteration."""
     e = it.errors
-    fulfilled = (e.goal <= options.goal_tol) & (e.bounds <= options.goal_tol) & (e.motion <= options.goal_tol)
-    optimal = fulfilled & (e.stationarity <= options.tol) & (e.complementarity <= options.tol)
+    optimal = _fulfilled(options, e)
     # What is stationary where curvature is negative is a saddle, and left. That of the first step knows no
     # multipliers, and tells none from a minimum.
     optimal = optimal & ~it.saddle & (it.iteration > 1)

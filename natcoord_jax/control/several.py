@@ -16,7 +16,7 @@ from natcoord_jax.control.guess import GUESS, Guess, goal_scale, scattered, scat
 from natcoord_jax.control.iterate import Iterate, Options
 from natcoord_jax.control.problem import PROBLEM, OptimalControl, numeric
 from natcoord_jax.control.results import OUTCOMES, Outcome
-from natcoord_jax.control.run import METHODS, chosen
+from natcoord_jax.control.run import FORMS, chosen
 from natcoord_jax.control.solution import Solution, solution_of
 from natcoord_jax.control.transcription import Unknowns
 from natcoord_jax.core.arguments import checked
@@ -70,7 +70,7 @@ def multi_start(
     spread: Annotated[Any, Number("not negative") | Vector(None)] = 1.0,
     rates: Annotated[Any, Number("not negative") | Vector(None)] = 1.0,
     seed: Annotated[int, Whole(0)] = 0,
-    method: Annotated[str, Choice(METHODS)] = "auto",
+    method: Annotated[str, Choice(FORMS)] = "auto",
     max_iterations: Annotated[int, Whole(0)] = 100,
     tol: Annotated[float, Concrete(Number("positive"))] = 1e-8,
     goal_tol: Annotated[float, Concrete(Number("positive"))] = 1e-10,

@@ -1,0 +1,61 @@
+"""Whether a motion that misses its goal is as near to it as inputs can come: a certificate to first order."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
+
+from natcoord_jax.control.conditions import Change, swept
+from natcoord_jax.control.guess import input_ranges
+from natcoord_jax.control.iterate import Iterate
+from natcoord_jax.control.problem import OptimalControl
+from natcoord_jax.core.compiled import compiled
+
+
+def unreached(problem: OptimalControl, iterate: Iterate, scale: Float[Array, " c"]) -> float:
+    """Part of what is missing to the goal that inputs within all bounds leave, to first order.
+
+    A linear program for the least sum of what is missing: bounds hold to first order along the changed
+    motion, inputs change by their range at most, time and parameters by their scale.
+
+    Args:
+        problem: the problem.
+        iterate: a motion.
+        scale: of the conditions of the goal.
+    """
+    # It takes longer to import than all the rest.
+    from scipy.optimize import linprog
+
+    missed = np.asarray(iterate.path.end.missing / scale)
+    missing, along, last, far = (np.asarray(x, float) for x in _slopes(problem, iterate))
+    used, count = far > 0, missed.size
+    missing, bounds = missing[:, used] / np.asarray(scale)[:, None], np.concatenate([along, last])[:, used]
+    excess = np.concatenate([np.ravel(x) for x in (iterate.path.stages.excess, iterate.path.end.excess)])
+    left, none, free = np.eye(count), np.zeros((excess.size, count)), int(np.count_nonzero(used))
+    rows = np.block([[missing, -left], [-missing, -left], [bounds, none]])
+    sides = np.concatenate([-missed, missed, np.maximum(-excess, 0.0)])
+    limits = [(-x, x) for x in far[used]] + [(0, None)] * count
+    found = linprog(np.concatenate([np.zeros(free), np.ones(count)]), rows, sides, bounds=limits)
+    return float(found.fun / np.sum(np.abs(missed))) if found.status == 0 else 0.0
+
+
+@compiled
+def _slopes(problem: OptimalControl, iterate: Iterate) -> tuple[Array, Array, Array, Array]:
+    """Goal and excesses per what is free and per entering coefficient, and how far each of these may go."""
+    m, by_w = iterate.multipliers, iterate.derivatives.by_w
+    rest = tuple(jnp.zeros_like(x) for x in (m.goal, m.path, m.end))
+    flat, unflat = ravel_pytree((iterate.derivatives.by_first, by_w))
+
+    def change(unit: Array) -> tuple[Array, Array, Array]:
+        first, w = unflat(unit)
+        sweep = swept(problem, iterate, Change(first, w, *rest), jnp.zeros(())).sweep
+        return sweep.missing, sweep.excess.reshape(-1), sweep.end_excess
+
+    columns = jax.vmap(change, out_axes=1)(jnp.eye(flat.size))
+    enters = (jnp.arange(problem.steps) % problem.inputs.every == 0)[:, None]
+    whole = 2.0 * input_ranges(problem, iterate.unknowns)
+    leading = jnp.broadcast_to(whole, (problem.inputs.degree, problem.channels)).reshape(-1)
+    first = jnp.concatenate([jnp.ones(iterate.unknowns.free.size), leading])
+    far, _ = ravel_pytree((first, jnp.where(enters, whole, 0.0)))
+    return *columns, far
