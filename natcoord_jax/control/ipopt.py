@@ -19,8 +19,6 @@ EXTRA = "pip install 'natcoord-jax[ipopt]'"
 MOST = 600
 """Unknowns up to which it is asked without being told to: its derivatives are dense, and a Hessian that takes
 0.2 s for 240 unknowns and 0.8 s for 560 takes minutes for those of beams and shells."""
-PROBES = 3
-"""Random points near the start whose derivatives show which entries are always zero."""
 
 
 class Answer(NamedTuple):
@@ -50,19 +48,6 @@ class Answer(NamedTuple):
 def installed() -> bool:
     """Whether it can be used."""
     return importlib.util.find_spec("casadi") is not None
-
-
-def _patterns(program: NonlinearProgram) -> tuple[np.ndarray, np.ndarray]:
-    """Where derivatives of the constraints, and of the Lagrangian's gradient, are not always zero."""
-    random, x = np.random.default_rng(0), program.start
-    first = np.zeros((program.lower.size, x.size), bool)
-    second = np.zeros((x.size, x.size), bool)
-    size = np.where(np.abs(x) > 0, np.abs(x), np.max(np.abs(x), initial=0.0) or 1.0)
-    for _ in range(PROBES):
-        near = x + 0.1 * size * random.normal(size=x.size)
-        first |= np.asarray(program.jacobian(near)) != 0
-        second |= np.asarray(program.hessian(near, 1.0, random.normal(size=program.lower.size))) != 0
-    return first, np.triu(second | second.T)
 
 
 def _callback(ca: Any) -> Any:
@@ -108,7 +93,8 @@ def _callback(ca: Any) -> Any:
 def _functions(ca: Any, program: NonlinearProgram) -> dict[str, Any]:
     """The program as functions of CasADi, with their derivatives."""
     Function, n, c = _callback(ca), program.start.size, program.lower.size
-    filled, bent = (ca.sparsify(ca.DM(pattern.astype(float))).sparsity() for pattern in _patterns(program))
+    # Dense: entries that vanish where it starts need not do so elsewhere, as those of open contacts.
+    filled, bent = ca.Sparsity.dense(c, n), ca.Sparsity.upper(n)
     column, row, scalar = ca.Sparsity.dense(c, 1), ca.Sparsity.dense(n, 1), ca.Sparsity.dense(1, 1)
     at = {"x": n, "p": 0}
     return {
