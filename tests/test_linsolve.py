@@ -16,7 +16,6 @@ import natcoord_jax as nc
 from benchmarks import patterns
 from benchmarks.fronts import fronts
 from natcoord_jax.linsolve.blocks import block_pattern
-from natcoord_jax.linsolve.conjugate_residuals import conjugate_residuals
 from natcoord_jax.linsolve.dense import Inverse
 from natcoord_jax.linsolve.learning import across, learnt
 from natcoord_jax.linsolve.sparse import SparseSolver, choose, factorised
@@ -318,32 +317,3 @@ def test_inverses_that_learn_solve_in_one_correction_more_than_unknowns(size):
     np.testing.assert_allclose(matrix @ x, right, atol=1e-12)
     np.testing.assert_allclose(taught, steps, rtol=1e-7, atol=1e-12)
     assert not np.any(nothing)
-
-
-# --- an operator that is only applied ----------------------------------------------------------------------
-
-
-def test_conjugate_residuals_solve_in_as_many_directions_as_differ():
-    """One for each direction that differs, and one more; less leaves something, and says so."""
-    make = np.random.default_rng(1)
-    matrix = np.eye(30) + make.normal(size=(30, 4)) @ make.normal(size=(4, 30)) / 30
-    right, start = make.normal(size=30), {"x": jnp.ones(30)}
-
-    def apply(x, level, seen):
-        return {"x": matrix @ x["x"] - level * seen[0] * right}, 2.0 * x["x"][:3] + level
-
-    def solved(limit):
-        half, yes = {"x": jnp.full(30, 0.5)}, jnp.array(True)
-        arguments = apply, half, yes, start, jnp.zeros(3), start, lambda r: jnp.array(1e-12), limit
-        return conjugate_residuals(*arguments)
-
-    for limit in (3, 5):
-        answer = jax.jit(solved, static_argnums=0)(limit)
-        np.testing.assert_array_equal(answer.found, 1.0)  # of what is seen, which what is solved depends on
-        x = answer.solution["x"]
-        remainder = np.linalg.norm(matrix @ x - right) / np.linalg.norm(matrix @ np.ones(30) - right)
-        assert float(answer.left) == pytest.approx(remainder, rel=1e-6, abs=1e-13)
-        assert int(answer.count) == limit
-        assert bool(answer.there) == (limit == 5) == bool(remainder <= 1e-12)
-        # What comes along belongs to the solution, affine as it is.
-        np.testing.assert_allclose(answer.more, 2.0 * x[:3] + 1.0, rtol=1e-10)

@@ -135,6 +135,8 @@ class Search:
                     outcome = Outcome.TIME_LIMIT
                     break
                 iterate = sequential.step(problem, options, iterate)
+                if iterate.iteration < 1:
+                    continue
                 row = row_of(problem, iterate, self.start)
                 self.history.append(row._replace(iteration=len(self.history) + 1))
                 if self.progress:

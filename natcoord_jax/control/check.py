@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.analysis import balance
-from natcoord_jax.control.conditions import as_unknowns
 from natcoord_jax.control.iterate import Iterate
+from natcoord_jax.control.newton import as_unknowns
 from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.control.proposal import softest
 from natcoord_jax.control.reasons import switches

@@ -12,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from natcoord_jax.control.problem import OptimalControl
-from natcoord_jax.control.tangent import split, tangent_maps
+from natcoord_jax.control.tangent import tangent_maps
 from natcoord_jax.control.transcription import (
     Node,
     Path,
@@ -20,7 +20,6 @@ from natcoord_jax.control.transcription import (
     Unknowns,
     end,
     entering,
-    packed,
     slices,
     stage,
     unpacked,
@@ -58,22 +57,21 @@ class Costates(eqx.Module):
 
 
 class Charts(NamedTuple):
-    """Small numbers of nodes, forth from them and back, and inverse inertias; leading axis steps + 1."""
+    """Small numbers of nodes: forth from them and back; leading axis steps + 1."""
 
     forth: Float[Array, "k x z"]
     back: Float[Array, "k z x"]
-    flexibility: Float[Array, "k n n"]
 
 
 def charts(problem: OptimalControl, nodes: Node) -> Charts:
-    """Tangent maps of all nodes, what is free and the register added unchanged."""
+    """Tangent maps of all nodes; what is free and the register are their own small numbers."""
 
-    def one(node: Node) -> tuple[Array, Array, Array]:
+    def one(node: Node) -> tuple[Array, Array]:
         system, _ = problem.applied(node.free)
-        forth, back, flexibility = tangent_maps(system, unpacked(problem.state, node.x, problem.state.t))
-        others = jnp.eye(node.free.size + node.register.size, dtype=forth.dtype)
+        forth, back = tangent_maps(system, unpacked(problem.state, node.x, problem.state.t))
+        others = jnp.eye(ravel_pytree(node)[0].size - node.x.size, dtype=forth.dtype)
         block = jax.scipy.linalg.block_diag
-        return block(forth, others), block(back, others), flexibility
+        return block(forth, others), block(back, others)
 
     return Charts(*jax.vmap(one)(nodes))
 
@@ -109,26 +107,6 @@ def step_jacobians(problem: OptimalControl, path: Path, unknowns: Unknowns) -> J
 
     before = jax.tree.map(lambda x: x[:-1], path.nodes)
     return jax.vmap(one)(slices(problem), before, entering(problem, unknowns.coefficients), unknowns.y)
-
-
-def split_node(problem: OptimalControl, node: Node, rates: Array, worth: Array) -> tuple[Node, Array]:
-    """Node with given rates of its free motions, and what the momenta are worth that they leave out."""
-    system, _ = problem.applied(node.free)
-    state, left = split(system, unpacked(problem.state, node.x, problem.state.t), rates, worth)
-    return eqx.tree_at(lambda n: n.x, node, packed(state)), left
-
-
-def projections(problem: OptimalControl, nodes: Node, maps: Charts) -> Float[Array, "k n"]:
-    """Rates of the free motions of nodes, with their momenta."""
-    count, size = maps.flexibility.shape[1], problem.state.q.size
-    project = maps.back[:, count : 2 * count, size : 2 * size]
-    return jnp.einsum("kij,kj->ki", project, nodes.x[:, size : 2 * size])
-
-
-def worth_of_left(worth: Node, forth: Array, flexibility: Array) -> Float[Array, " n"]:
-    """What momenta left out by a projection are worth, so that its result is stationary."""
-    count = flexibility.shape[0]
-    return flexibility @ (forth[: worth.x.shape[0], count : 2 * count].T @ worth.x)
 
 
 def scored_end(problem: OptimalControl, multipliers: Multipliers, node: Node) -> Array:
@@ -183,73 +161,43 @@ def costates(
     unknowns: Unknowns,
     multipliers: Multipliers,
     jacobians: Jacobians,
-    maps: Charts,
-) -> tuple[Costates, Costates, Costates, Float[Array, "steps m"]]:
+) -> tuple[Costates, Costates, Float[Array, "steps m"]]:
     """Worth of nodes and residuals, such that the Lagrangian is stationary in all states and unknowns y.
 
     Returns:
-        Costates; those that bend the exact conditions, and, of steps with projected velocities, those that
-        bend the model, where multipliers of the motion that are given replace what the others imply; and the
-        gradient of the Lagrangian in the entering coefficients.
+        Costates; those that the curvature is taken with, where multipliers of the motion that are given
+        replace what the others imply; and the gradient of the Lagrangian in the entering coefficients.
     """
     final = jax.grad(partial(scored_end, problem, multipliers))(jax.tree.map(lambda x: x[-1], path.nodes))
     last, unflat = ravel_pytree(final)
 
-    def body(after: tuple[Array, Array], given: tuple) -> tuple[tuple[Array, Array], tuple]:
-        at, node, w, y, slopes, jacobian, following, rates, forth, flexibility = given
+    def body(after: Array, given: tuple) -> tuple[Array, tuple]:
+        at, node, w, y, slopes, jacobian = given
+        before, by_w, worth = through_step(problem, at, node, w, y, jacobian)(after, slopes[2])
+        return before + slopes[0], (before + slopes[0], worth, by_w + slopes[1])
 
-        unprojected = _unprojected(problem, after[1], following, rates, forth, flexibility)
-        through = through_step(problem, at, node, w, y, jacobian)
-        both, by_w, worth = jax.vmap(through, in_axes=(0, None))(
-            jnp.stack([after[0], unprojected]), slopes[2]
-        )
-        both = both + slopes[0]
-        return (both[0], both[1]), (both, worth, by_w[0] + slopes[1])
-
-    before, after = (jax.tree.map(itemgetter(s), path.nodes) for s in (slice(None, -1), slice(1, None)))
-    w = entering(problem, unknowns.coefficients)
-    each = (slices(problem), before, w, unknowns.y)
+    before = jax.tree.map(itemgetter(slice(None, -1)), path.nodes)
+    each = (slices(problem), before, entering(problem, unknowns.coefficients), unknowns.y)
     slopes = jax.vmap(partial(direct_slopes, problem))(*each, multipliers.path)
-    given = (*each, slopes, jacobians, after)
-    rates = projections(problem, path.nodes, maps)[1:]
-    given = (*given, rates, maps.forth[1:], maps.flexibility[1:])
-    _, (nodes, residuals, by_w) = scan_in_one_kernel(body, (last, last), given, reverse=True)
-    nodes = jnp.concatenate([nodes, jnp.broadcast_to(last, (1, 2, last.size))])
-    exact, model = (Costates(jax.vmap(unflat)(nodes[:, k]), residuals[:, k]) for k in range(2))
+    _, (nodes, residuals, by_w) = scan_in_one_kernel(body, last, (*each, slopes, jacobians), reverse=True)
+
+    def whole(nodes: Array) -> Node:
+        return jax.vmap(unflat)(jnp.concatenate([nodes, last[None]]))
+
+    exact = Costates(whole(nodes), residuals)
     if multipliers.motion is None:
-        return exact, exact, model, by_w
-    # Of projected steps they differ by a part of order dt^2.
-    motion = jnp.stack([multipliers.motion, multipliers.motion + model.residuals - exact.residuals], axis=1)
+        return exact, exact, by_w
 
     def given_body(after: Array, given: tuple) -> tuple[Array, Array]:
-        (at, node, w, y, slopes, _, following, *maps), motion = given
+        (at, node, w, y, slopes), motion = given
         flat, unflat = ravel_pytree(node)
 
         def reached(node: Array) -> tuple[Array, Array]:
             found = stage(problem, at, unflat(node), w, y)
             return ravel_pytree(found.after)[0], found.residual
 
-        pull = jax.vjp(reached, flat)[1]
-        unprojected = _unprojected(problem, after[1], following, *maps)
-        both = jax.vmap(pull)((jnp.stack([after[0], unprojected]), motion))[0] + slopes[0]
-        return both, both
+        found = jax.vjp(reached, flat)[1]((after, motion))[0] + slopes[0]
+        return found, found
 
-    begun = jnp.broadcast_to(last, (2, last.size))
-    _, nodes = scan_in_one_kernel(given_body, begun, (given, motion), reverse=True)
-    nodes = jnp.concatenate([nodes, begun[None]])
-    bending, model = (Costates(jax.vmap(unflat)(nodes[:, k]), motion[:, k]) for k in range(2))
-    return exact, bending, model, by_w
-
-
-def _unprojected(
-    problem: OptimalControl, worth: Array, node: Node, rates: Array, forth: Array, flexibility: Array
-) -> Array:
-    """Worth of a node from that of the same with its velocities projected, as vectors."""
-    flat, unflat = ravel_pytree(node)
-    worth_left = worth_of_left(unflat(worth), forth, flexibility)
-
-    def projected(node: Array) -> tuple[Array, Array]:
-        reached, left = split_node(problem, unflat(node), rates, worth_left)
-        return ravel_pytree(reached)[0], left
-
-    return jax.vjp(projected, flat)[1]((worth, jnp.ones(())))[0]
+    _, nodes = scan_in_one_kernel(given_body, last, ((*each, slopes), multipliers.motion), reverse=True)
+    return exact, Costates(whole(nodes), multipliers.motion), by_w

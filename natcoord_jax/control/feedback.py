@@ -13,7 +13,8 @@ from natcoord_jax.control.problem import PROBLEM, OptimalControl, numeric
 from natcoord_jax.control.quadratic import model
 from natcoord_jax.control.run import OPTIONS, optimise_jit
 from natcoord_jax.control.solution import SOLUTION, Solution
-from natcoord_jax.control.transcription import held_inputs, packed
+from natcoord_jax.control.tangent import steady_rates
+from natcoord_jax.control.transcription import Node, held_inputs, packed, unpacked
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.checks import for_each
 from natcoord_jax.core.compiled import compiled
@@ -30,7 +31,7 @@ class Feedback(eqx.Module):
 
     Attributes:
         inputs: of the solution (steps, inputs).
-        gains: (steps, inputs, z) on small numbers z of the deviation: displacements and rates.
+        gains: (steps, inputs, z) on small numbers z of the deviation: displacements and velocities.
         back: from deviations of state vectors to small numbers (steps, z, x).
         nodes: state vectors of the solution (steps, x).
         dt: step [s].
@@ -58,23 +59,32 @@ class Feedback(eqx.Module):
 @compiled
 def _gains(problem: OptimalControl, iterate: Iterate, weights: tuple) -> tuple[Array, Array]:
     """Gains of the regulator, and what they act on."""
-    d = iterate.derivatives
-    given = (problem, iterate.path, iterate.unknowns, iterate.multipliers)
-    found = model(*given, d)
-    count = problem.system.structure.unknowns
-    size = problem.state.q.size * 2 + problem.state.coordinates.size + problem.state.rates.size
-    A, B = found.forward[:, : 2 * count, : 2 * count], found.forward[:, : 2 * count, -problem.channels :]
+    d, nodes = iterate.derivatives, iterate.path.nodes
+    found = model(problem, iterate.path, iterate.unknowns, iterate.multipliers, d)
+    count, x = problem.system.structure.unknowns, nodes.x.shape[1]
+    size = found.forward.shape[1] - (d.maps.forth.shape[1] - x)
+    A, B = found.forward[:, :size, :size], found.forward[:, :size, -problem.channels :]
     displaced, quick, cost, final = weights
-    Q, R = jnp.concatenate([displaced, quick]), cost
+
+    def weighed(node: Node, forth: Array) -> Array:
+        system, _ = problem.applied(node.free)
+
+        def rates(x: Array) -> Array:
+            return steady_rates(system, unpacked(problem.state, x, problem.state.t))
+
+        turned = jax.jacfwd(rates)(node.x) @ forth[:x, :size]
+        return jnp.diag(jnp.pad(displaced, (0, size - count))) + turned.T @ (quick[:, None] * turned)
+
+    Q, R = jax.vmap(weighed)(nodes, d.maps.forth), jnp.diag(cost)
 
     def body(P: Array, given: tuple) -> tuple[Array, Array]:
-        A, B = given
-        K = jnp.linalg.solve(jnp.diag(R) + B.T @ P @ B, B.T @ P @ A)
-        P = jnp.diag(Q) + A.T @ P @ (A - B @ K)
+        A, B, Q = given
+        K = jnp.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
+        P = Q + A.T @ P @ (A - B @ K)
         return 0.5 * (P + P.T), K
 
-    gains = jax.lax.scan(body, final * jnp.diag(Q), (A, B), reverse=True)[1]
-    return gains, d.maps.back[:-1, : 2 * count, :size]
+    gains = jax.lax.scan(body, final * Q[-1], (A, B, Q[:-1]), reverse=True)[1]
+    return gains, d.maps.back[:-1, :size, :x]
 
 
 @checked()

@@ -1,5 +1,6 @@
 """Where an optimisation starts: from inputs, rates, an earlier solution, or from nothing."""
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -21,6 +22,8 @@ LEAST_SCALE = 0.1
 """Least scale of a condition of the goal, relative to the largest."""
 SAME = 1e-9
 """Inputs whose effects differ by less than this part count as one."""
+INSIDE = 0.5
+"""Room to the bounds of idle inputs that is looked for, in units of half their range."""
 LONGEST = 2.0
 """Largest turn of a body in one step of a guess [rad]."""
 
@@ -180,7 +183,8 @@ def with_balancing_inputs(problem: OptimalControl, unknowns: Unknowns) -> Unknow
 
     Of each step the inputs minimise what is left of its equations in the metric of its inverse Jacobian, so
     that motions without an input count by what they would have to give (the principle of Gauss); then they
-    are cut in one ratio to what their bounds leave.
+    are cut in one ratio to what their bounds leave. Inputs that have to be positive do not begin at zero: a
+    method that keeps away from bounds would not get away from there.
     """
     nodes, at = jax.tree.map(lambda x: x[:-1], roll(problem, unknowns).nodes), slices(problem)
     # Inputs of each step for themselves, whatever they are made of.
@@ -191,7 +195,7 @@ def with_balancing_inputs(problem: OptimalControl, unknowns: Unknowns) -> Unknow
             found = stage(problem, at, node, u, y)
             return found.residual, found.excess
 
-        idle = jnp.zeros(problem.channels)
+        idle = _inside(lambda u: left(u, y)[1], jnp.zeros(problem.channels))
         rest, excess = left(idle, y)
         (by_u, steep), by_y = jax.jacfwd(left)(idle, y), jax.jacfwd(left, argnums=1)(idle, y)[0]
         inverse = jnp.linalg.pinv(by_y)
@@ -199,10 +203,23 @@ def with_balancing_inputs(problem: OptimalControl, unknowns: Unknowns) -> Unknow
         u = -jnp.linalg.pinv(by_u.T @ metric @ by_u, rtol=SAME) @ (by_u.T @ metric @ rest)
         grown, spare = steep @ u, jnp.maximum(-excess, 0.0)
         reach = jnp.where(grown > 0, spare / jnp.where(grown > 0, grown, 1.0), 1.0)
-        return jnp.nan_to_num(u * jnp.minimum(1.0, jnp.min(reach, initial=1.0)))
+        return jnp.nan_to_num(idle + u * jnp.minimum(1.0, jnp.min(reach, initial=1.0)))
 
     inputs = jax.vmap(one)(at, nodes, unknowns.y)
     return eqx.tree_at(lambda u: u.coefficients, unknowns, problem.inputs.fitted(inputs))
+
+
+def _inside(excess: Callable[[Array], Array], u: Float[Array, " m"]) -> Float[Array, " m"]:
+    """Inputs near given ones that leave room to their bounds, as far as these leave room at once."""
+
+    def body(_: Any, u: Array) -> Array:
+        steep = jax.jacfwd(excess)(u)
+        felt = jnp.any(steep != 0, axis=1)
+        over = jnp.where(felt, jnp.maximum(excess(u) + INSIDE, 0.0), 0.0)
+        active = jnp.where((over > 0)[:, None], steep, 0.0)
+        return u - jnp.linalg.pinv(active, rtol=SAME) @ over
+
+    return jax.lax.fori_loop(0, ROUNDS, body, u)
 
 
 def scattered(problem: OptimalControl, unknowns: Unknowns, key: Array, spread: Any, rates: Any) -> Unknowns:

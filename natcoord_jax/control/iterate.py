@@ -60,7 +60,6 @@ class Derivatives(eqx.Module):
         maps: small numbers of the nodes.
         worth: costates.
         bending: those that the curvature is taken with.
-        bent: the same of projected steps, for the model.
         by_w: gradient of the Lagrangian in the entering coefficients.
         by_first: gradient in what is free and the leading coefficients.
         errors: what is missing.
@@ -70,7 +69,6 @@ class Derivatives(eqx.Module):
     maps: Charts
     worth: Costates
     bending: Costates
-    bent: Costates
     by_w: Float[Array, "*batch steps m"]
     by_first: Float[Array, "*batch f"]
     errors: Errors
@@ -79,12 +77,19 @@ class Derivatives(eqx.Module):
 class Model(eqx.Module):
     """Linear dynamics and quadratic costs in small numbers z (see `tangent`), w and what is free.
 
-    z holds changes of the state, of what is free and of the register; w those of entering coefficients.
+    z holds changes of the state, of what is free and of the register; w those of entering coefficients. The
+    unknowns y of a step follow from both by its linearised equations: dy = y [z, w] + dy0, and dy0 removes
+    what is left of them.
 
     Attributes:
-        forward: z_k+1 = forward [z_k, w_k], (steps, z, z + m).
+        forward: z_k+1 = forward [z_k, w_k] + forward_y dy0, (steps, z, z + m).
         hessian: of the Lagrangian in [z, w] (steps, z + m, z + m).
         excess: derivative of the excesses (steps, h, z + m).
+        y: of the unknowns (steps, n, z + m).
+        forward_y: of z_k+1 in y (steps, z, n).
+        excess_y: of the excesses in y (steps, h, n).
+        slope_y: of the Lagrangian's slope in y per [z, w] (steps, n, z + m).
+        bent_y: of that slope in y (steps, n, n).
         last_hessian: of the terminal Lagrangian (z, z).
         goal: derivative of the goal (c, z).
         last_excess: derivative of the terminal excesses (e, z).
@@ -95,6 +100,11 @@ class Model(eqx.Module):
     forward: Float[Array, "*batch steps z zm"]
     hessian: Float[Array, "*batch steps zm zm"]
     excess: Float[Array, "*batch steps h zm"]
+    y: Float[Array, "*batch steps n zm"]
+    forward_y: Float[Array, "*batch steps z n"]
+    excess_y: Float[Array, "*batch steps h n"]
+    slope_y: Float[Array, "*batch steps n zm"]
+    bent_y: Float[Array, "*batch steps n n"]
     last_hessian: Float[Array, "*batch z z"]
     goal: Float[Array, "*batch c z"]
     last_excess: Float[Array, "*batch e z"]
@@ -131,12 +141,10 @@ class Iterate(eqx.Module):
         slacks: room left.
         path: the motion.
         derivatives: first derivatives there.
-        model: the last quadratic model, not necessarily formed there.
-        kept: how many steps it has served.
-        corrections: solutions of the model that the last step has taken.
         barrier: barrier parameter.
         unit: of the cost.
         shift: last increase of the curvature.
+        sway: part of it that the unknowns of the steps get [curvature in them per curvature in coefficients].
         penalty: weight of the goal's square in the model.
         softness: of the goal: missing it by x costs x^2 / (2 softness); zero where it is to be reached.
         filter: what the search for a step remembers.
@@ -155,12 +163,10 @@ class Iterate(eqx.Module):
     slacks: Slacks
     path: Path
     derivatives: Derivatives
-    model: Model
-    kept: Int[Array, "*batch"]
-    corrections: Int[Array, "*batch"]
     barrier: Float[Array, "*batch"]
     unit: Float[Array, "*batch"]
     shift: Float[Array, "*batch"]
+    sway: Float[Array, "*batch"]
     penalty: Float[Array, "*batch c"]
     softness: Float[Array, "*batch c"]
     filter: Filter

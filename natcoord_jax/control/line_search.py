@@ -11,11 +11,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from natcoord_jax.control.conditions import Change, Sweep, as_unknowns, swept
 from natcoord_jax.control.costates import Multipliers
-from natcoord_jax.control.iterate import Filter, Iterate, Options, Slacks
+from natcoord_jax.control.iterate import Filter, Iterate, Model, Options, Slacks
+from natcoord_jax.control.newton import as_unknowns, closing, constrained, followed
 from natcoord_jax.control.problem import OptimalControl
-from natcoord_jax.control.riccati import Factors, Right, solve
+from natcoord_jax.control.riccati import Factors, Right, Weighted
 from natcoord_jax.control.transcription import Path, Unknowns, roll, simulated
 
 BOUNDARY = 0.99
@@ -140,6 +140,7 @@ def search(
     iterate: Iterate,
     direction: Direction,
     slope: Float[Array, ""],
+    model: Model,
     factors: Factors,
 ) -> Found:
     """A step along the direction, halved until the filter takes it.
@@ -153,6 +154,7 @@ def search(
         iterate: where it starts.
         direction: where it goes.
         slope: of the barrier cost along it.
+        model: where the direction comes from.
         factors: of the model.
     """
     s, ds = iterate.slacks, direction.slacks
@@ -184,7 +186,9 @@ def search(
     def body(found: Found) -> Found:
         whole = (longest == 1.0) & (found.length == 1.0) & ~found.corrected & jnp.all(iterate.softness == 0)
         extra = jax.lax.cond(
-            whole, lambda: second_order_correction(problem, iterate, factors, found.path), lambda: nothing
+            whole,
+            lambda: second_order_correction(problem, iterate, model, factors, found.path),
+            lambda: nothing,
         )
         a = jnp.where(whole, 1.0, 0.5 * found.length)
         return attempt(a, extra, found.newton, found.corrected | whole)
@@ -197,29 +201,17 @@ def search(
 
 
 def second_order_correction(
-    problem: OptimalControl, iterate: Iterate, factors: Factors, path: Path
+    problem: OptimalControl, iterate: Iterate, model: Model, factors: Factors, path: Path
 ) -> tuple[Unknowns, Slacks]:
     """The least change, as the model weighs it, that takes away what a motion near an iterate violates."""
-    steps, channels, size = *factors.gain.shape[:2], factors.forward.shape[1]
-    zero = jnp.zeros((steps, size + channels)), jnp.zeros(size), jnp.zeros(factors.start.shape[1])
-    near = eqx.tree_at(lambda i: i.path.stages.residual, iterate, path.stages.residual)
-    m = iterate.multipliers
-
-    def again(_: Array, carry: tuple[Change, Sweep]) -> tuple[Change, Sweep]:
-        change = carry[0]
-        sweep = swept(problem, near, change, jnp.ones(())).sweep
-        move = solve(factors, Right(*zero, path.end.missing + sweep.missing))
-        first, w = change.first + move.first, change.w + move.w
-        return Change(first, w, change.goal, change.path, change.end), sweep
-
-    rest = (jnp.zeros_like(x) for x in (m.goal, m.path, m.end))
-    none = Change(jnp.zeros(factors.start.shape[1]), jnp.zeros((steps, channels)), *rest)
-    y, end = jnp.zeros_like(iterate.unknowns.y), iterate.path.end
-    begun = Sweep(y, m.path, end.missing, end.excess, y)
-    # The first turn finds the change, the second the motion with it.
-    change, sweep = jax.lax.fori_loop(0, 2, again, (none, begun))
-    unknowns = eqx.tree_at(lambda u: u.y, as_unknowns(problem, iterate, change), sweep.y)
-    return unknowns, Slacks(-sweep.excess, -sweep.end_excess)
+    m, dy = iterate.multipliers, closing(iterate, path.stages.residual)
+    nothing = Weighted(*(jnp.zeros_like(x) for x in (m.path, m.path, m.end, m.end)))
+    gradient = jnp.zeros(model.hessian.shape[:2])
+    last, first = jnp.zeros(model.goal.shape[1]), jnp.zeros(model.first.shape[1])
+    move = constrained(model, factors, nothing, Right(gradient, last, first, path.end.missing), dy)
+    change = followed(model, nothing, move, dy)
+    unknowns = eqx.tree_at(lambda u: u.y, as_unknowns(problem, iterate, move), change.y)
+    return unknowns, Slacks(-change.excess, -change.end_excess)
 
 
 def remembered(iterate: Iterate, found: Found) -> Filter:

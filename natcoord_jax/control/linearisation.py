@@ -63,7 +63,7 @@ def linearised(
     """First derivatives at a motion, and what is missing to the conditions of optimality."""
     jacobians = step_jacobians(problem, path, unknowns)
     maps = charts(problem, path.nodes)
-    worth, bending, bent, by_w = costates(problem, path, unknowns, multipliers, jacobians, maps)
+    worth, bending, by_w = costates(problem, path, unknowns, multipliers, jacobians)
     by_first = first_gradient(problem, unknowns, ravel_pytree(jax.tree.map(lambda x: x[0], worth.nodes))[0])
     count = unknowns.free.size
     scale = _gradient_scale(problem, unknowns, path, multipliers.path)
@@ -78,7 +78,7 @@ def linearised(
         largest(path.stages.excess + slacks.path, path.end.excess + slacks.end),
         largest(slacks.path * multipliers.path, slacks.end * multipliers.end) / unit,
     )
-    return Derivatives(jacobians, maps, worth, bending, bent, by_w, by_first, errors)
+    return Derivatives(jacobians, maps, worth, bending, by_w, by_first, errors)
 
 
 def cost_unit(problem: OptimalControl, unknowns: Unknowns, path: Path) -> Array:

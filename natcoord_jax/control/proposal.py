@@ -5,16 +5,15 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
-from natcoord_jax.control.conditions import Change, as_unknowns, left_of_conditions
 from natcoord_jax.control.costates import Multipliers
-from natcoord_jax.control.improvement import FLAT, Improved, curvature, improved, least_curved, times
-from natcoord_jax.control.iterate import Derivatives, Iterate, Model, Options, Slacks, largest
+from natcoord_jax.control.iterate import Iterate, Model, Options, Slacks, largest
 from natcoord_jax.control.line_search import SMALL, Direction, missed, violation
+from natcoord_jax.control.newton import Newton, as_unknowns, curvature, least_curved, newton
 from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.control.quadratic import model
-from natcoord_jax.control.riccati import REACH, Factors, Weighted, factored
+from natcoord_jax.control.riccati import REACH, Factors, Move, Weighted, factored
 from natcoord_jax.core.compiled import compiled
 from natcoord_jax.xla.tracing import traced_once
 
@@ -34,23 +33,17 @@ SOLVED = 10.0
 """Errors, in terms of the barrier parameter, of a problem with barriers that is solved well enough."""
 LEAST_BARRIER = 1e-10
 """Barrier parameter at the end, relative to the cost."""
-
-
-NEAR = 0.5
-"""Relative size of a step after which the model it came from may serve another one."""
 MANY = 60
 """Inverse iterations that find the least curvature of a solution."""
-FEW = 7
-"""Solutions of a model that a step may take, for the model to serve on."""
+FLAT = 1e-12
+"""Curvature in all entering coefficients, relative to that of their bounds, that is rounding."""
 
 
 class Proposal(eqx.Module):
-    """The step that is proposed, the model, its factors, steps that it has served, solutions for this one."""
+    """The step that is proposed, the model and its factors."""
 
     model: Model
     factors: Factors
-    kept: Int[Array, ""]
-    corrections: Int[Array, ""]
     direction: Direction
     slope: Float[Array, ""]
     barrier: Float[Array, ""]
@@ -82,7 +75,8 @@ def _convex(problem: OptimalControl, iterate: Iterate, found: Model, reach: Arra
     held = jnp.where(jnp.arange(found.first.shape[1]) < iterate.unknowns.free.size, held, 0.0)
 
     def attempt(shift: Array) -> Factors:
-        return factored(found, bounds, idle, shift, iterate.penalty, soft, reach, iterate.unit, held)
+        sway, unit = iterate.sway, iterate.unit
+        return factored(found, bounds, idle, shift, iterate.penalty, soft, reach, unit, held, sway)
 
     # None is tried first, as long as steps are found.
     last = iterate.shift
@@ -90,9 +84,8 @@ def _convex(problem: OptimalControl, iterate: Iterate, found: Model, reach: Arra
 
     def body(carry: tuple) -> tuple:
         _, shift, begun = carry
-        more = jnp.where(
-            shift > least, GROWTH * shift, jnp.maximum(jnp.maximum(last / 3.0, 2.0 * least), SHIFT)
-        )
+        begin = jnp.maximum(jnp.where(last > 0, last / 3.0, SHIFT), 2.0 * least)
+        more = jnp.where(shift > least, GROWTH * shift, begin)
         shift = jnp.where(begun, more, shift)
         return attempt(shift), shift, jnp.array(True)
 
@@ -111,37 +104,37 @@ def _penalty(iterate: Iterate, factors: Factors) -> Array:
     reached = compliance > 1e-12 * jnp.max(compliance, initial=0.0)
     found = jnp.where(reached, 1.0 / jnp.where(reached, compliance, 1.0), 0.0)
     found = jnp.where(iterate.softness > 0, 0.0, found)
-    return jnp.where(iterate.iteration == 0, found, iterate.penalty)
+    return jnp.where(iterate.iteration < 0, found, iterate.penalty)
 
 
-def _direction(problem: OptimalControl, options: Options, iterate: Iterate, better: Improved) -> Direction:
+def _direction(problem: OptimalControl, options: Options, iterate: Iterate, step: Newton) -> Direction:
     """Directions of coefficients, of what is free, of the unknowns of the steps, slacks and multipliers."""
-    unknowns, sweep = as_unknowns(problem, iterate, better.change), better.sweep
+    change, s = step.change, iterate.slacks
+    unknowns = as_unknowns(problem, iterate, change.move)
     if options.lifted:
-        unknowns = eqx.tree_at(lambda u: u.y, unknowns, sweep.y)
-    s = iterate.slacks
-    slack = -(iterate.path.stages.excess + s.path) - sweep.excess
-    last = -(iterate.path.end.excess + s.end) - sweep.end_excess
+        unknowns = eqx.tree_at(lambda u: u.y, unknowns, change.y)
+    slack = -(iterate.path.stages.excess + s.path) - change.excess
+    last = -(iterate.path.end.excess + s.end) - change.end_excess
     motion = iterate.multipliers.motion
     if motion is not None:
-        motion = iterate.derivatives.worth.residuals + sweep.motion - motion
-    multipliers = Multipliers(better.change.goal, better.change.path, better.change.end, motion)
+        motion = iterate.derivatives.worth.residuals + step.motion - motion
+    multipliers = Multipliers(change.move.goal, change.path, change.end, motion)
     return Direction(unknowns, multipliers, Slacks(slack, last))
 
 
-def _slope(problem: OptimalControl, iterate: Iterate, better: Improved, slacks: Slacks) -> Array:
+def _slope(problem: OptimalControl, iterate: Iterate, step: Newton, slacks: Slacks) -> Array:
     """Slope of the barrier cost: that of the Lagrangian without what constraints change in it."""
-    change, sweep, derivatives = better.change, better.sweep, iterate.derivatives
+    change, derivatives = step.change, iterate.derivatives
     m, s, mu = iterate.multipliers, iterate.slacks, iterate.barrier
     enters = (jnp.arange(problem.steps) % problem.inputs.every == 0)[:, None]
-    lagrangian = jnp.sum(derivatives.by_w * jnp.where(enters, change.w, 0.0))
-    lagrangian = lagrangian + derivatives.by_first @ change.first
+    lagrangian = jnp.sum(derivatives.by_w * jnp.where(enters, change.move.w, 0.0))
+    lagrangian = lagrangian + derivatives.by_first @ change.move.first
     # The equations of all steps hold at the end of the direction, to first order.
     closed = -jnp.sum(derivatives.worth.residuals * iterate.path.stages.residual)
-    bounds = jnp.sum(m.path * sweep.excess) + jnp.sum(m.end * sweep.end_excess)
+    bounds = jnp.sum(m.path * change.excess) + jnp.sum(m.end * change.end_excess)
     rooms = jnp.sum(mu / s.path * slacks.path) + jnp.sum(mu / s.end * slacks.end)
-    soft = missed(iterate.softness, iterate.path.end.missing) @ sweep.missing
-    return lagrangian - closed - m.goal @ sweep.missing - bounds - rooms + soft
+    soft = missed(iterate.softness, iterate.path.end.missing) @ change.missing
+    return lagrangian - closed - m.goal @ change.missing - bounds - rooms + soft
 
 
 def _lowered(iterate: Iterate) -> Array:
@@ -159,120 +152,91 @@ def _lowered(iterate: Iterate) -> Array:
     return jnp.where(missing < SOLVED * mu / iterate.unit, jnp.minimum(lower, mu), mu)
 
 
-def no_model(derivatives: Derivatives, multipliers: Multipliers) -> Model:
-    """A place for a model."""
-    forth, steps = derivatives.maps.forth, derivatives.by_w.shape[0]
-    z, m, f = forth.shape[2], derivatives.by_w.shape[1], derivatives.by_first.shape[0]
-    h, c, e = multipliers.path.shape[1], multipliers.goal.shape[0], multipliers.end.shape[0]
-    stages = ((steps, z, z + m), (steps, z + m, z + m), (steps, h, z + m))
-    ends = ((z, z), (c, z), (e, z), (z, f), (f, f))
-    return Model(*(jnp.zeros(shape) for shape in stages + ends))
-
-
 class Attempt(NamedTuple):
-    """A model and the step that follows from it.
+    """A step and its model's factors.
 
     Attributes:
-        model: formed at hand, or for an earlier step.
-        kept: how many steps it has served before this one.
         factors: of the model.
         shift: of its curvature.
         reach: eigenvalues of the goal's compliance that count as zero.
-        better: the step.
+        step: the step.
     """
 
-    model: Model
-    kept: Array
     factors: Factors
     shift: Array
     reach: Array
-    better: Improved
+    step: Newton
 
 
-def _attempt(problem: OptimalControl, iterate: Iterate) -> Attempt:
-    """The step, by the last model where that serves, else by one that is formed here.
+def _attempt(problem: OptimalControl, iterate: Iterate, found: Model) -> Attempt:
+    """The step; once more where it leaves out too much of the goal."""
 
-    A model only has to be near: steps obey the exact conditions, and a model that is not from here takes some
-    more of its solutions, each of which is much less work. Where these do not get there, it is too far.
-    """
-
-    def formed() -> Model:
-        return model(problem, iterate.path, iterate.unknowns, iterate.multipliers, iterate.derivatives)
-
-    def made(fresh: Array, reach: Array) -> Attempt:
-        found = jax.lax.cond(fresh, formed, lambda: iterate.model)
+    def made(reach: Array) -> Attempt:
         factors, shift = _convex(problem, iterate, found, reach)
-        better = improved(problem, iterate, found, factors, _weighted(iterate), iterate.penalty)
-        return Attempt(found, jnp.where(fresh, 0, iterate.kept + 1), factors, shift, reach, better)
+        return Attempt(factors, shift, reach, newton(problem, iterate, found, factors, _weighted(iterate)))
 
     def left_out(last: Attempt) -> Array:
         # Conditions that depend on each other along motions only, by conserved momenta, are nearly fulfilled
         # by a step that leaves them out. It makes worse those that inputs only reach with difficulty.
-        return (last.reach > REACH[0]) & (largest(last.better.unreachable) > LEFT_OUT * iterate.errors.goal)
-
-    def unserved(carry: tuple[Array, Attempt]) -> Array:
-        turn, last = carry
-        poor = ~(last.better.there & last.factors.convex)
-        return (turn == 0) | ((turn == 1) & (last.kept > 0) & poor) | left_out(last)
+        return (last.reach > REACH[0]) & (largest(last.step.unreachable) > LEFT_OUT * iterate.errors.goal)
 
     def body(carry: tuple[Array, Attempt]) -> tuple[Array, Attempt]:
         turn, last = carry
-        # A model that was not convex would need its shift again, which a new one may not.
-        near = (iterate.step >= 1.0) & (iterate.moved < NEAR) & (iterate.shift < SHIFT)
-        # The first one knows no multipliers, and bends as little at a saddle as at a minimum.
-        near = near & (iterate.iteration > 1)
-        fresh = ~near | (iterate.failures > 0) | (iterate.corrections > FEW) | (turn > 0)
-        reach = jnp.where(left_out(last), REACH[0], jnp.clip(30.0 * iterate.errors.motion, *REACH))
-        return turn + 1, made(fresh, reach)
+        reach = jnp.where(turn > 0, REACH[0], jnp.clip(30.0 * iterate.errors.motion, *REACH))
+        return turn + 1, made(reach)
 
-    made, nothing = traced_once(made, jnp.array(True), jnp.asarray(REACH[0]))
-    return jax.lax.while_loop(unserved, body, (jnp.array(0), nothing))[1]
+    made, nothing = traced_once(made, jnp.asarray(REACH[0]))
+    return jax.lax.while_loop(
+        lambda carry: (carry[0] == 0) | left_out(carry[1]), body, (jnp.array(0), nothing)
+    )[1]
+
+
+def formed(problem: OptimalControl, iterate: Iterate) -> Model:
+    """The quadratic model at an iterate."""
+    return model(problem, iterate.path, iterate.unknowns, iterate.multipliers, iterate.derivatives)
 
 
 @compiled
 def propose(problem: OptimalControl, options: Options, iterate: Iterate) -> Proposal:
     """The next step, from the quadratic model."""
     iterate = eqx.tree_at(lambda i: i.barrier, iterate, _lowered(iterate))
-    found = _attempt(problem, iterate)
-    direction = _direction(problem, options, iterate, found.better)
-    slope = _slope(problem, iterate, found.better, direction.slacks)
+    quadratic = formed(problem, iterate)
+    found = _attempt(problem, iterate, quadratic)
+    direction = _direction(problem, options, iterate, found.step)
+    slope = _slope(problem, iterate, found.step, direction.slacks)
     finite = jnp.all(jnp.array([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(direction)]))
     return Proposal(
-        found.model,
+        quadratic,
         found.factors,
-        found.kept,
-        found.better.count,
         direction,
         slope,
         iterate.barrier,
         found.shift,
         _penalty(iterate, found.factors),
-        found.better.unreachable,
-        found.better.saddle & (found.shift > SHIFT),
+        found.step.unreachable,
+        found.step.saddle & (found.shift > SHIFT),
         found.factors.convex & finite,
     )
 
 
 @compiled
-def softest(problem: OptimalControl, iterate: Iterate) -> tuple[Array, Change, Array]:
+def softest(problem: OptimalControl, iterate: Iterate) -> tuple[Array, Move, Array]:
     """The direction in which the Lagrangian is curved least while all conditions hold to first order.
 
-    Found in the model, by inverse iteration; the curvature is that of the steps themselves.
+    Found by inverse iteration.
 
     Returns:
         The curvature along it [cost per square of a coefficient], the direction of unit length, and the
         largest curvature in a coefficient; where the cost has none, the least that bounds add.
     """
-    found = model(problem, iterate.path, iterate.unknowns, iterate.multipliers, iterate.derivatives)
+    found, bounds = formed(problem, iterate), _weighted(iterate)
     factors, _ = _convex(problem, iterate, found, jnp.clip(30.0 * iterate.errors.motion, *REACH))
-    along, bounds = least_curved(problem, iterate, factors, MANY), _weighted(iterate)
+    along, _ = least_curved(problem, iterate, factors, MANY)
     length = jnp.sqrt(jnp.sum(along.w**2) + jnp.sum(along.first**2))
     along = jax.tree.map(lambda x: x / jnp.where(length > 0, length, 1.0), along)
-    left, sweep = left_of_conditions(problem, iterate, bounds, factors.added, along, jnp.zeros(()))
     own = jnp.diagonal(found.hessian, axis1=1, axis2=2)[:, -problem.channels :]
     own = jnp.max(jnp.abs(own), initial=0.0)
     # Costs that are linear in the inputs have none of their own: only bounds bend them.
     steep = found.excess[:, :, -problem.channels :] ** 2
     pressed = jnp.min(jnp.einsum("kh,khm->km", bounds.path, steep))
-    value = curvature(along, times(along, left), sweep, bounds, factors.added)
-    return value, along, jnp.where(own > FLAT * pressed, own, pressed)
+    return curvature(found, bounds, along), along, jnp.where(own > FLAT * pressed, own, pressed)

@@ -4,19 +4,11 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
-from natcoord_jax.control.costates import (
-    Charts,
-    Costates,
-    Jacobians,
-    Multipliers,
-    projections,
-    scored_end,
-    split_node,
-    worth_of_left,
-)
+from natcoord_jax.control.costates import Charts, Costates, Jacobians, Multipliers, scored_end
 from natcoord_jax.control.differences import Point, columns, sizes
 from natcoord_jax.control.iterate import Derivatives, Model
 from natcoord_jax.control.problem import OptimalControl
@@ -44,65 +36,104 @@ class Step(NamedTuple):
         node: before it.
         w: coefficients that enter.
         y: its unknowns.
-        rates: of the free motions at its end.
-        worth: of the node after it, its velocities projected.
-        left: worth of the momenta that the projection leaves out.
+        worth: of the node after it.
         multipliers: of its residual and of its bounds.
         jacobian: of its equations.
         forth: from small numbers to the node before it.
         back: to small numbers from the node after it.
-        flexibility: inverse inertia of the free motions after it.
     """
 
     at: Slice
     node: Node
     w: Array
     y: Array
-    rates: Array
     worth: Node
-    left: Array
     multipliers: tuple[Array, Array]
     jacobian: Jacobians
     forth: Array
     back: Array
-    flexibility: Array
+
+
+def _quick(problem: OptimalControl) -> tuple[np.ndarray, slice]:
+    """Places of velocities and rates of rotors in a node as a vector, and in small numbers."""
+    size, counted, stored = (
+        x.size for x in (problem.state.q, problem.state.coordinates, problem.state.rates)
+    )
+    places = np.r_[size : 2 * size, 2 * size + counted : 2 * size + counted + stored]
+    count = problem.system.structure.unknowns
+    return places, slice(count, count + size + stored)
+
+
+def _slow(step: Step, quick: slice) -> tuple[Array, Array, Array]:
+    """Directions of node, w and y, one a column, in which everything but velocities changes."""
+    m, n = step.w.size, step.y.size
+    nodes = jnp.concatenate([step.forth[:, : quick.start], step.forth[:, quick.stop :]], axis=1)
+    own = jnp.eye(m + n, dtype=nodes.dtype)
+    own = jnp.concatenate([jnp.zeros((m + n, nodes.shape[1]), nodes.dtype), own], axis=1)
+    return jnp.pad(nodes, ((0, 0), (0, m + n))), own[:m], own[m:]
+
+
+def _stage_slopes(problem: OptimalControl, scale: Point, step: Step) -> tuple[Array, Array, Array]:
+    """Derivatives of small numbers after a step and of excesses in [z, w, y], and the Lagrangian's curvature.
+
+    Velocities at its start enter the step (57) linearly, so that among themselves only cost and bounds bend.
+    They are most of the numbers, and are left to symmetry.
+    """
+    flat, unflat = ravel_pytree(step.node)
+    worth, (by_residual, by_excess) = ravel_pytree(step.worth)[0], step.multipliers
+    (places, quick), size, x = _quick(problem), problem.state.q.size, step.node.x.size
+    a = quick.start
+
+    def own(chi: Array, w: Array, y: Array) -> tuple[Array, Any]:
+        found = stage(problem, step.at, unflat(chi), w, y)
+        after = ravel_pytree(found.after)[0]
+        # Of positions their displacement, all others as they are.
+        small = jnp.concatenate([step.back[:a, :size] @ after[:size], after[places], after[x:]])
+        lagrangian = worth @ after + by_residual @ found.residual
+        return found.cost + by_excess @ found.excess, (lagrangian, small, found.excess)
+
+    def slope(*point: Array) -> tuple[Array, Array, Array]:
+        def lagrangian(*point: Array) -> tuple[Array, tuple[Array, Array]]:
+            value, (more, *others) = own(*point)
+            return value + more, tuple(others)
+
+        (by_chi, by_w, by_y), others = jax.grad(lagrangian, argnums=(0, 1, 2), has_aux=True)(*point)
+        displaced = by_chi[:x] @ step.forth[:x, :a]
+        return jnp.concatenate([displaced, by_chi[places], by_chi[x:], by_w, by_y]), *others
+
+    def fast(v: Array) -> tuple[Array, Array, Array]:
+        def value(v: Array) -> tuple[Array, tuple[Array, Array]]:
+            value, (_, *others) = own(flat.at[places].set(v), step.w, step.y)
+            return value, tuple(others)
+
+        by_v, others = jax.grad(value, has_aux=True)(v)
+        return by_v, *others
+
+    found, *along = columns(slope, (flat, step.w, step.y), _slow(step, quick), scale)
+    unit = jnp.eye(places.size, dtype=flat.dtype)
+    among, *by_v = columns(fast, (flat[places],), (unit,), (scale.node[places],))
+    after, excess = (jnp.concatenate([x[:, :a], v, x[:, a:]], axis=1) for x, v in zip(along, by_v))
+    across, first, last = found[quick], found[:a], found[quick.stop :]
+    hessian = jnp.block([
+        [first[:, :a], across[:, :a].T, first[:, a:]],
+        [across[:, :a], among, across[:, a:]],
+        [last[:, :a], across[:, a:].T, last[:, a:]],
+    ])  # fmt: skip
+    return after, excess, 0.5 * (hessian + hessian.T)
 
 
 def _stage_model(problem: OptimalControl, scale: Point, step: Step) -> tuple[Array, ...]:
-    """Derivatives of one step in small numbers: dynamics, curvature, excesses.
-
-    The rates after the step, its velocities projected, count as unknowns of the step like y, with the
-    momenta that they leave out as their residual. The Lagrangian is linear in them.
-    """
-    flat, unflat = ravel_pytree(step.node)
-
-    def lagrangian(chi: Array, w: Array, y: Array, rates: Array, left: Array) -> Array:
-        found = stage(problem, step.at, unflat(chi), w, y)
-        after, momenta = split_node(problem, found.after, rates, left)
-        pairs = zip(jax.tree.leaves(step.worth), jax.tree.leaves(after))
-        carried = sum(jnp.sum(a * b) for a, b in pairs) + momenta
-        by_residual, by_excess = step.multipliers
-        return found.cost + carried + by_residual @ found.residual + by_excess @ found.excess
-
-    def reached(chi: Array, w: Array, y: Array) -> tuple[Array, Array]:
-        found = stage(problem, step.at, unflat(chi), w, y)
-        return ravel_pytree(found.after)[0], found.excess
-
-    def slopes(chi: Array, w: Array, y: Array) -> tuple:
-        return jax.grad(lagrangian, argnums=(0, 1, 2, 3, 4))(chi, w, y, step.rates, step.left)
-
-    size, channels = flat.size, step.w.size
-    directions = jax.scipy.linalg.block_diag(step.forth, jnp.eye(channels, dtype=flat.dtype))
-    dchi, dw = directions[:size], directions[size:]
-    dy = -step.jacobian.inverses @ (step.jacobian.by_node @ dchi + step.jacobian.by_w @ dw)
-    point, moved = Point(flat, step.w, step.y), Point(dchi, dw, dy)
-    bent = columns(slopes, point, moved, scale)
-    along = jax.vmap(lambda *d: jax.jvp(reached, tuple(point), d)[1], in_axes=1, out_axes=1)
-    after, excess = along(*moved)
-    mixed = (step.flexibility @ bent[4]).T @ bent[3]
-    hessian = dchi.T @ bent[0] + dw.T @ bent[1] + dy.T @ bent[2] + mixed + mixed.T
-    # The momenta of the step itself: what it carries on normal to the constraints is no part of them.
-    return step.back @ after, hessian, excess
+    """Derivatives of one step in small numbers: dynamics, curvature, excesses, unknowns."""
+    z, m = step.forth.shape[1], step.w.size
+    by_z = step.jacobian.by_node @ step.forth
+    to_y = -step.jacobian.inverses @ jnp.concatenate([by_z, step.jacobian.by_w], axis=1)
+    after, excess, hessian = _stage_slopes(problem, scale, step)
+    bent_y = hessian[z + m :, z + m :]
+    slope_y = hessian[z + m :, : z + m] + bent_y @ to_y
+    hessian = hessian[: z + m, : z + m] + hessian[: z + m, z + m :] @ to_y + to_y.T @ slope_y
+    forward_y, excess_y = after[:, z + m :], excess[:, z + m :]
+    forward, excess = after[:, : z + m] + forward_y @ to_y, excess[:, : z + m] + excess_y @ to_y
+    return forward, hessian, excess, to_y, forward_y, excess_y, slope_y, bent_y
 
 
 def model(
@@ -113,27 +144,20 @@ def model(
     derivatives: Derivatives,
 ) -> Model:
     """The quadratic model around a motion, all steps at once."""
-    bent, maps = derivatives.bent, derivatives.maps
-    before = jax.tree.map(lambda x: x[:-1], path.nodes)
-    after = jax.tree.map(lambda x: x[1:], bent.nodes)
-    w = entering(problem, unknowns.coefficients)
+    bending, maps = derivatives.bending, derivatives.maps
     steps = Step(
         slices(problem),
-        before,
-        w,
+        jax.tree.map(lambda x: x[:-1], path.nodes),
+        entering(problem, unknowns.coefficients),
         unknowns.y,
-        projections(problem, path.nodes, maps)[1:],
-        after,
-        jax.vmap(worth_of_left)(after, maps.forth[1:], maps.flexibility[1:]),
-        (bent.residuals, multipliers.path),
+        jax.tree.map(lambda x: x[1:], bending.nodes),
+        (bending.residuals, multipliers.path),
         derivatives.jacobians,
         maps.forth[:-1],
         maps.back[1:],
-        maps.flexibility[1:],
     )
     scale = sizes(problem, path, unknowns)
-    each = _some_together(lambda step: _stage_model(problem, scale, step), steps, problem.steps)
-    forward, hessian, excess = each
+    each: Any = _some_together(lambda step: _stage_model(problem, scale, step), steps, problem.steps)
     last, unflat = ravel_pytree(jax.tree.map(lambda x: x[-1], path.nodes))
     forth = maps.forth[-1]
 
@@ -146,17 +170,8 @@ def model(
 
     curved = jax.vmap(lambda d: jax.jvp(scored, (last,), (d,))[1], in_axes=1, out_axes=1)(forth)
     goal, last_excess = jax.vmap(lambda d: jax.jvp(reached, (last,), (d,))[1], in_axes=1, out_axes=1)(forth)
-    first, first_hessian = _first_model(problem, unknowns, bent, maps)
-    return Model(
-        forward,
-        hessian,
-        excess,
-        forth.T @ curved,
-        goal,
-        last_excess,
-        first,
-        first_hessian,
-    )
+    first, first_hessian = _first_model(problem, unknowns, bending, maps)
+    return Model(*each, forth.T @ curved, goal, last_excess, first, first_hessian)
 
 
 def _some_together(function: Any, given: Any, steps: int) -> Any:
@@ -168,13 +183,13 @@ def _some_together(function: Any, given: Any, steps: int) -> Any:
 
 
 def _first_model(
-    problem: OptimalControl, unknowns: Unknowns, bent: Costates, maps: Charts
+    problem: OptimalControl, unknowns: Unknowns, bending: Costates, maps: Charts
 ) -> tuple[Array, Array]:
     """How the first node depends on what is free and on the leading coefficients, and how bent that is."""
     flat, unflat = ravel_pytree((unknowns.free, unknowns.coefficients[: problem.inputs.degree]))
     if not flat.size:
         return jnp.zeros((maps.back.shape[1], 0)), jnp.zeros((0, 0))
-    value = ravel_pytree(jax.tree.map(lambda x: x[0], bent.nodes))[0]
+    value = ravel_pytree(jax.tree.map(lambda x: x[0], bending.nodes))[0]
 
     def node(given: Array) -> Array:
         return ravel_pytree(first_node(problem, *unflat(given)))[0]

@@ -6,10 +6,10 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from natcoord_jax.control.conditions import Change, swept
 from natcoord_jax.control.guess import input_ranges
 from natcoord_jax.control.iterate import Iterate
 from natcoord_jax.control.problem import OptimalControl
+from natcoord_jax.control.proposal import formed
 from natcoord_jax.core.compiled import compiled
 
 
@@ -43,14 +43,19 @@ def unreached(problem: OptimalControl, iterate: Iterate, scale: Float[Array, " c
 @compiled
 def _slopes(problem: OptimalControl, iterate: Iterate) -> tuple[Array, Array, Array, Array]:
     """Goal and excesses per what is free and per entering coefficient, and how far each of these may go."""
-    m, by_w = iterate.multipliers, iterate.derivatives.by_w
-    rest = tuple(jnp.zeros_like(x) for x in (m.goal, m.path, m.end))
-    flat, unflat = ravel_pytree((iterate.derivatives.by_first, by_w))
+    found = formed(problem, iterate)
+    flat, unflat = ravel_pytree((iterate.derivatives.by_first, iterate.derivatives.by_w))
 
     def change(unit: Array) -> tuple[Array, Array, Array]:
         first, w = unflat(unit)
-        sweep = swept(problem, iterate, Change(first, w, *rest), jnp.zeros(())).sweep
-        return sweep.missing, sweep.excess.reshape(-1), sweep.end_excess
+
+        def forth(z: Array, given: tuple) -> tuple[Array, Array]:
+            forward, excess, w = given
+            both = jnp.concatenate([z, w])
+            return forward @ both, excess @ both
+
+        last, excess = jax.lax.scan(forth, found.first @ first, (found.forward, found.excess, w))
+        return found.goal @ last, excess.reshape(-1), found.last_excess @ last
 
     columns = jax.vmap(change, out_axes=1)(jnp.eye(flat.size))
     enters = (jnp.arange(problem.steps) % problem.inputs.every == 0)[:, None]

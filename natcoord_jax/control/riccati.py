@@ -69,7 +69,9 @@ class Factors(eqx.Module):
         goal_scale: units in which T is decomposed; 0 for conditions that nothing moves (c,).
         goal_vectors: eigenvectors of T in these units (c, c).
         goal_inverse: inverses of its eigenvalues; 0 for those that count as zero (c,).
-        added: curvature added to that in entering coefficients, and to that in what is free (f,).
+        added: curvature added to that in entering coefficients, to that in what is free (f,), and to that in
+            the unknowns of the steps.
+        penalty: weight of the goal's square in the model.
         convex: whether the model is convex along all changes that keep to the goal.
     """
 
@@ -85,7 +87,8 @@ class Factors(eqx.Module):
     goal_scale: Float[Array, " c"]
     goal_vectors: Float[Array, "c c"]
     goal_inverse: Float[Array, " c"]
-    added: tuple[Float[Array, ""], Float[Array, " f"]]
+    added: tuple[Float[Array, ""], Float[Array, " f"], Float[Array, ""]]
+    penalty: Float[Array, " c"]
     convex: Bool[Array, ""]
 
 
@@ -143,6 +146,7 @@ def factored(
     reach: Float[Array, ""],
     unit: Float[Array, ""],
     held: Float[Array, " f"],
+    sway: Float[Array, ""],
 ) -> Factors:
     """Factors of the quadratic model.
 
@@ -156,6 +160,7 @@ def factored(
         reach: eigenvalues of the goal's compliance below it count as zero, see `REACH`.
         unit: of the cost.
         held: curvature added to that of the cost in what is free.
+        sway: part of the increase that the unknowns of the steps get.
     """
     goal, last = model.goal, model.last_excess
     size = model.forward.shape[1]
@@ -171,7 +176,8 @@ def factored(
 
     def backward(value: tuple, given: tuple) -> tuple[tuple, tuple]:
         P, S, T, negative = value
-        forward, hessian, excess, weight, extra = given
+        forward, hessian, excess, weight, extra, y = given
+        hessian = hessian + added * sway * y.T @ y
         whole = _symmetric(hessian + forward.T @ P @ forward + excess.T @ (weight[:, None] * excess))
         mixed = forward.T @ S
         softness, negative = _inverse(whole[size:, size:] + jnp.diag(extra), negative)
@@ -185,7 +191,7 @@ def factored(
         )
         return before, (softness, gain, by_goal)
 
-    given = (model.forward, model.hessian, model.excess, bounds.path, idle + added)
+    given = (model.forward, model.hessian, model.excess, bounds.path, idle + added, model.y)
     # Products of whole matrices: the library's are quicker than one kernel.
     (P, S, T, negative), (softness, gain, by_goal) = jax.lax.scan(backward, begun, given, reverse=True)
     E = model.first
@@ -211,7 +217,8 @@ def factored(
         scale,
         vectors,
         inverse,
-        (added, start_added),
+        (added, start_added, added * sway),
+        penalty,
         convex,
     )
 

@@ -28,7 +28,7 @@ from natcoord_jax.control.line_search import (
 )
 from natcoord_jax.control.linearisation import cost_unit, linearised
 from natcoord_jax.control.problem import OptimalControl
-from natcoord_jax.control.proposal import LEAST_BARRIER, Proposal, no_model, propose
+from natcoord_jax.control.proposal import LEAST_BARRIER, Proposal, propose
 from natcoord_jax.control.results import Outcome
 from natcoord_jax.control.transcription import Path, Unknowns, roll, simulated
 from natcoord_jax.core.compiled import compiled
@@ -47,6 +47,8 @@ GROWN = 1e12
 """Multipliers, in units of the cost, that lead nowhere."""
 NEARLY = 1e-6
 """Residual of the steps, relative, of a motion that nearly obeys its equations."""
+SWAY = 0.1
+"""Part of what is added to the curvature that changes of the motion get, by their size, beside inputs."""
 
 
 @compiled
@@ -135,12 +137,10 @@ def _first(
         slacks,
         path,
         derivatives,
-        no_model(derivatives, multipliers),
-        jnp.array(0),
-        jnp.array(0),
         barrier,
         unit,
         nothing,
+        _sway(problem, unknowns),
         goal,
         softness,
         first_filter(problem, unknowns, softness, path, slacks, derivatives.jacobians.inverses),
@@ -148,11 +148,35 @@ def _first(
         infinite,
         goal,
         jnp.array(False),
-        jnp.array(0),
+        jnp.array(-1),
         newton,
         jnp.array(0),
         code,
     )
+
+
+def _sway(problem: OptimalControl, unknowns: Unknowns) -> Array:
+    """Curvature in the steps' unknowns per curvature in coefficients, of changes as large as both are.
+
+    Curvature that is added in the inputs alone has to be as large as that of the motion far along it, which
+    a small one of the motion itself holds as well, and leaves the inputs free.
+    """
+    rates = unknowns.y[:, : problem.system.structure.unknowns]
+    pushed, moving = jnp.sum(unknowns.coefficients**2), jnp.sum(rates**2)
+    ratio = pushed * rates.size / (jnp.where(moving > 0, moving, 1.0) * max(1, unknowns.coefficients.size))
+    return jnp.where(moving > 0, SWAY * ratio, 0.0)
+
+
+def _at_rest(iterate: Iterate) -> Iterate:
+    """The iterate as it serves to estimate multipliers: no constraint bends, and none is violated."""
+
+    def parts(i: Iterate) -> tuple:
+        bending, path = i.derivatives.bending, i.path
+        return bending, path.end.missing, path.stages.residual, i.multipliers.goal
+
+    estimating = iterate.iteration < 0
+    still = jax.tree.map(lambda x: jnp.where(estimating, jnp.zeros_like(x), x), parts(iterate))
+    return eqx.tree_at(parts, iterate, still)
 
 
 @compiled
@@ -161,19 +185,22 @@ def tried(
 ) -> tuple[Found, Multipliers, Filter]:
     """The step as far as the filter takes it, the multipliers there, and the filter after it."""
     iterate = at_barrier(iterate, proposal.barrier)
-    found = search(problem, options, iterate, proposal.direction, proposal.slope, proposal.factors)
-    fine = found.fine & proposal.convex
+    found = search(
+        problem, options, iterate, proposal.direction, proposal.slope, proposal.model, proposal.factors
+    )
+    estimating = iterate.iteration < 0
+    fine = (found.fine | estimating) & proposal.convex
     reached = (found.unknowns, found.slacks, found.path)
     stayed = (iterate.unknowns, iterate.slacks, iterate.path)
-    reached = jax.tree.map(lambda x, x0: jnp.where(fine, x, x0), reached, stayed)
+    reached = jax.tree.map(lambda x, x0: jnp.where(fine & ~estimating, x, x0), reached, stayed)
     unknowns, slacks, path = reached
     found = dataclasses.replace(found, unknowns=unknowns, slacks=slacks, path=path, fine=fine)
     m, dm = iterate.multipliers, proposal.direction.multipliers
-    dual = room([(m.path, dm.path), (m.end, dm.end)])
+    dual = jnp.where(estimating, 0.0, room([(m.path, dm.path), (m.end, dm.end)]))
     # Multipliers of equations go as far as the step does, and less where what has been added to the curvature
     # has made them large: those of a model that a short step shows to be a poor one would bend the next one
     # more, and grow without end.
-    length = found.length
+    length = jnp.where(estimating, 1.0, found.length)
     length = jnp.where(length < 1.0, length / (1.0 + proposal.shift), length)
     there = Multipliers(
         # Those of a soft goal are what it costs to miss it; without any, its curvature is that of its square.
@@ -182,7 +209,8 @@ def tried(
         moved(m.end, dm.end, dual),
         moved(m.motion, dm.motion, length),
     )
-    return found, jax.tree.map(lambda x, x0: jnp.where(fine, x, x0), there, m), remembered(iterate, found)
+    there, after = jax.tree.map(lambda x, x0: jnp.where(fine, x, x0), there, m), remembered(iterate, found)
+    return found, there, jax.tree.map(lambda x, x0: jnp.where(estimating, x0, x), after, iterate.filter)
 
 
 @compiled
@@ -199,18 +227,17 @@ def concluded(
     d = proposal.direction.unknowns
     size = largest(found.unknowns.coefficients, found.unknowns.free)
     change = found.length * largest(d.coefficients, d.free) / jnp.where(size > 0, size, 1.0)
+    change = jnp.where(iterate.iteration < 0, jnp.inf, change)
     accepted = Iterate(
         found.unknowns,
         multipliers,
         found.slacks,
         found.path,
         derivatives,
-        proposal.model,
-        proposal.kept,
-        proposal.corrections,
         proposal.barrier,
         iterate.unit,
         proposal.shift,
+        iterate.sway,
         proposal.penalty,
         iterate.softness,
         known,
@@ -243,10 +270,14 @@ def concluded(
 
 
 def step(problem: OptimalControl, options: Options, iterate: Iterate) -> Iterate:
-    """One iteration; four programs, or parts of one under `jax.jit`."""
+    """One iteration; four programs, or parts of one under `jax.jit`.
+
+    The first one only estimates the multipliers of the goal and of the motion: without them the model bends
+    as little at a saddle as at a minimum, and its step may lead anywhere.
+    """
     # The large programs know nothing of tolerances, which may change without compiling them anew.
     form = Options(options.lifted)
-    proposal = propose(problem, form, iterate)
+    proposal = propose(problem, form, _at_rest(iterate))
     found, multipliers, known = tried(problem, form, iterate, proposal)
     derivatives = linearised(problem, found.unknowns, multipliers, found.slacks, found.path, iterate.unit)
     return concluded(options, iterate, proposal, found, multipliers, known, derivatives)
