@@ -63,8 +63,8 @@ def optimise(
         problem: the problem.
         guess: inputs (steps, inputs), a `Guess`, an earlier `Solution`, or None.
         method: "shooting", "lifted" or "auto": that of an earlier solution as guess, else lifted if
-            parameters are free or more than inputs is bounded; with free time always lifted. Where that gets
-            lost, "auto" asks IPOPT (`pip install 'natcoord-jax[ipopt]'`) if it is installed; then "auto" and
+            parameters are free or more than inputs is bounded; with free time always lifted. Where "shooting"
+            gets lost, "auto" goes on lifted, and where that does, it asks IPOPT (`pip install 'natcoord-jax[ipopt]'`) if it is installed; then "auto" and
             "lifted" look for a motion that comes near to the goal, by simulations that may miss it
             (feasibility restoration), and go on from there; then from random inputs. "ipopt": by IPOPT
             alone, on `nc.to_nlp`. What is returned is the best of all attempts, and what they saw is in
@@ -104,8 +104,10 @@ def optimise(
         return search.by_ipopt(unknowns_of(problem, guess, True))
     # Restored motions are gone on from in the lifted form.
     found = search.run(lifted, start, last=method == "shooting")
-    lost = not over(found) and found.outcome is not Outcome.UNREACHABLE
-    if method == "auto" and lost and search.left > 0 and installed():
+    if method == "auto" and not lifted and _lost(found) and search.left > 0:
+        other = search.run(True, unknowns_of(problem, guess, True))
+        found = other if over(other) else best_of(problem, [found, other], other.outcome)
+    if method == "auto" and _lost(found) and search.left > 0 and installed():
         begin = unknowns_of(problem, guess, True)
         other = search.by_ipopt(begin) if begin.y.size + begin.coefficients.size <= MOST else found
         if other.ok:
@@ -115,6 +117,10 @@ def optimise(
     if method != "shooting" and not over(found) and search.left > 0:
         found = after_restoration(search, found, guess)
     return found
+
+
+def _lost(found: Solution) -> bool:
+    return not over(found) and found.outcome is not Outcome.UNREACHABLE
 
 
 @checked(problem=PROBLEM, unknowns=UNKNOWNS, options=OPTIONS)
