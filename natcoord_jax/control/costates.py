@@ -66,12 +66,12 @@ class Charts(NamedTuple):
 
 
 def charts(problem: OptimalControl, nodes: Node) -> Charts:
-    """Tangent maps of all nodes, what is free and the register added unchanged."""
+    """Tangent maps of all nodes, everything besides the state added unchanged."""
 
     def one(node: Node) -> tuple[Array, Array, Array]:
         system, _ = problem.applied(node.free)
         forth, back, flexibility = tangent_maps(system, unpacked(problem.state, node.x, problem.state.t))
-        others = jnp.eye(node.free.size + node.register.size, dtype=forth.dtype)
+        others = jnp.eye(ravel_pytree(node)[0].size - node.x.size, dtype=forth.dtype)
         block = jax.scipy.linalg.block_diag
         return block(forth, others), block(back, others), flexibility
 

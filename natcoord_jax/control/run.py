@@ -36,7 +36,7 @@ def chosen(problem: OptimalControl, method: str, guess: Any = None) -> bool:
     if isinstance(guess, Solution) and guess.iterate is not None:
         # What it was found by has been compiled, and led to it.
         return guess.method.startswith(NAMES[True])
-    inputs = all(label.startswith("input ") for label in problem.bounds.labels(problem.system))
+    inputs = all(label.startswith("input ") for label in problem.path_labels)
     return bool(problem.free) or not inputs
 
 
