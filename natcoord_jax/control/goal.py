@@ -10,7 +10,6 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.control.goal_base import GOAL as GOAL
@@ -22,6 +21,9 @@ from natcoord_jax.control.goal_links import Periodic as Periodic
 from natcoord_jax.control.goal_links import Turned as Turned
 from natcoord_jax.control.goal_places import At as At
 from natcoord_jax.control.goal_places import Within as Within
+from natcoord_jax.control.goal_rest import Equilibrium as Equilibrium
+from natcoord_jax.control.goal_rest import Undeformed as Undeformed
+from natcoord_jax.control.goal_rest import owners
 from natcoord_jax.control.tangent import steady_rates
 from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.callables import Function
@@ -172,10 +174,13 @@ class Rest(Goal):
         """Rates of the free motions."""
         return steady_rates(system, state)
 
+    def sizes(self, system: System) -> tuple[int, int]:
+        """As many as there are free motions."""
+        return system.structure.unknowns, 0
+
     def labels(self, system: System) -> tuple[str, ...]:
         """The body each free motion belongs to."""
-        owners = [int(i) for i in np.asarray(system.tree.slot_of) // 7]
-        return tuple(f"rest of {system.structure.bodies[b]!r} [m/s or rad/s]" for b in owners)
+        return tuple(f"rest of {name!r} [m/s or rad/s]" for name in owners(system))
 
 
 class Equal(Goal):

@@ -26,6 +26,10 @@ class Goal(Carrier):
         """Name and unit of each number of the residual."""
         return ()
 
+    def sizes(self, system: System) -> tuple[int, int]:
+        """How many numbers are missing, and how many limits there are."""
+        return len(self.labels(system)), len(self.limits(system))
+
     def missing(self, system: System, ending: Ending) -> Float[Array, " n"]:
         """What is missing at the end of a motion: the residual of its last state."""
         return self.residual(system, ending.last)
@@ -60,6 +64,11 @@ class All(Goal):
     def labels(self, system: System) -> tuple[str, ...]:
         """Labels of all parts."""
         return tuple(label for part in self.parts for label in part.labels(system))
+
+    def sizes(self, system: System) -> tuple[int, int]:
+        """Those of all parts together."""
+        missing, limits = zip(*(part.sizes(system) for part in self.parts))
+        return sum(missing), sum(limits)
 
     def missing(self, system: System, ending: Ending) -> Float[Array, " n"]:
         """What is missing to all parts."""

@@ -1,6 +1,5 @@
 """Goals made of goals: at a waypoint, and with room."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -52,7 +51,7 @@ class At(Goal):
 
     def own(self, system: System) -> int:
         """What was missing, and how far limits were exceeded."""
-        return len(self.goal.labels(system)) + len(self.goal.limits(system))
+        return sum(self.goal.sizes(system))
 
     def remembered(self, system: System, own: Array, inside: list[Array], step: Step) -> Array:
         """What is missing at its step; the same at all others."""
@@ -63,11 +62,15 @@ class At(Goal):
 
     def missing(self, system: System, ending: Ending) -> Float[Array, " n"]:
         """What was missing there."""
-        return self.divided(system, ending.memory)[1][: len(self.goal.labels(system))]
+        return self.divided(system, ending.memory)[1][: self.goal.sizes(system)[0]]
 
     def excess(self, system: System, ending: Ending) -> Float[Array, " m"]:
         """By how much limits were exceeded there."""
-        return self.divided(system, ending.memory)[1][len(self.goal.labels(system)) :]
+        return self.divided(system, ending.memory)[1][self.goal.sizes(system)[0] :]
+
+    def sizes(self, system: System) -> tuple[int, int]:
+        """Those of the goal."""
+        return self.goal.sizes(system)
 
     def labels(self, system: System) -> tuple[str, ...]:
         """Those of the goal, with the step."""
@@ -117,15 +120,20 @@ class Within(Goal):
         """The goal."""
         return (self.goal,)
 
-    def _sides(self, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
-        below, above = (np.flatnonzero(np.broadcast_to(limits, len(names))) for limits in self.limited)
+    def _sides(self, system: System) -> tuple[np.ndarray, np.ndarray]:
+        count = self.goal.sizes(system)[0]
+        below, above = (np.flatnonzero(np.broadcast_to(limits, count)) for limits in self.limited)
         return below, above
+
+    def sizes(self, system: System) -> tuple[int, int]:
+        """Nothing is missing, but for limits."""
+        return 0, sum(side.size for side in self._sides(system)) + self.goal.sizes(system)[1]
 
     def excess(self, system: System, ending: Ending) -> Float[Array, " m"]:
         """Excess over both limits, in units of half the range."""
         inner = ending._replace(memory=self.divided(system, ending.memory)[0][0])
         values = self.goal.missing(system, inner)
-        below, above = self._sides(self.goal.labels(system))
+        below, above = self._sides(system)
         lower, upper = (jnp.broadcast_to(x, values.shape) for x in (self.lower, self.upper))
         both = jnp.isfinite(upper - lower)
         unit = jnp.where(both, 0.5 * jnp.where(both, upper - lower, 2.0), 1.0)
@@ -139,7 +147,7 @@ class Within(Goal):
     def limits(self, system: System) -> tuple[str, ...]:
         """The goal's labels, and which limit."""
         names = self.goal.labels(system)
-        below, above = self._sides(names)
+        below, above = self._sides(system)
         lower = tuple(f"{names[k]} above its lower limit" for k in below)
         upper = tuple(f"{names[k]} below its upper limit" for k in above)
         return lower + upper + self.goal.limits(system)
