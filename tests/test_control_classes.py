@@ -208,7 +208,7 @@ def test_steps_of_several_lengths_approach_the_same_cost(hinged, method):
 
 @pytest.mark.exhaustive
 def test_inputs_that_change_least_are_a_cubic_in_time(hinged):
-    """Integral of (du/dt)^2 with both ends free: 120 I^2 angle^2 / T^5, by x^(6) = 0 and x''' = 0 at the ends."""
+    """Both ends free: x^(6) = 0, x''' = 0 at the ends, and an integral of 120 I^2 angle^2 / T^5."""
     found = solved(on_disc(hinged, turned(), steps=40, cost=nc.cost.InputRate()))
     assert found.cost == pytest.approx(120 * INERTIA**2, rel=5e-3)
 

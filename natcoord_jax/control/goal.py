@@ -12,6 +12,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from natcoord_jax.control.free_motions import owners
 from natcoord_jax.control.goal_base import GOAL as GOAL
 from natcoord_jax.control.goal_base import All as All
 from natcoord_jax.control.goal_base import Goal as Goal
@@ -23,7 +24,6 @@ from natcoord_jax.control.goal_places import At as At
 from natcoord_jax.control.goal_places import Within as Within
 from natcoord_jax.control.goal_rest import Equilibrium as Equilibrium
 from natcoord_jax.control.goal_rest import Undeformed as Undeformed
-from natcoord_jax.control.goal_rest import owners
 from natcoord_jax.control.tangent import steady_rates
 from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.callables import Function

@@ -4,10 +4,10 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.bodies.beam import BeamHandle
+from natcoord_jax.control.free_motions import owners
 from natcoord_jax.control.goal_base import Goal
 from natcoord_jax.control.memory import Ending
 from natcoord_jax.core.arguments import is_a
@@ -17,14 +17,7 @@ from natcoord_jax.core.kinds import BODY_NAME, Several, of
 from natcoord_jax.core.state import STATE, State
 from natcoord_jax.maths.rotations import to_rotation_vector
 from natcoord_jax.mechanics.equations_of_motion import EquationsOfMotion, loads, loops_of, relations_of
-from natcoord_jax.model.tree import SLOTS
 from natcoord_jax.system import System
-
-
-def owners(system: System) -> list[str]:
-    """Name of the body each free motion belongs to."""
-    return [system.structure.bodies[int(k)] for k in np.asarray(system.tree.slot_of) // SLOTS]
-
 
 CHAIN = of("a beam, as scene.add(nc.Beam(...)) returned it", BeamHandle) | Several(BODY_NAME, 2)
 

@@ -40,7 +40,9 @@ class PhasedSteps(int):
 
 def counted(steps: Any) -> int:
     """A number of steps; those of phases together."""
-    return steps if isinstance(steps, int | np.integer) else PhasedSteps(steps)
+    if isinstance(steps, PhasedSteps):
+        return steps
+    return int(steps) if isinstance(steps, int | np.integer) else PhasedSteps(steps)
 
 
 def phases_of(steps: int) -> tuple[int, ...]:
@@ -86,9 +88,10 @@ def durations(steps: int, dt: Any) -> Float[Array, " phases"]:
 def mesh_of(steps: int, dt: Any) -> Mesh:
     """The mesh, with the proportions of the steps as they are given."""
     each, belongs = lengths(steps, dt), member(steps)
-    share = belongs * (each / (belongs @ durations(steps, dt)))[:, None]
+    share = jnp.asarray(belongs) * (each / (belongs @ durations(steps, dt)))[:, None]
     before = jnp.concatenate([share[:1], share[:-1]])
-    return Mesh(share, jnp.cumsum(share, axis=0) - share, 0.5 * (share + before))
+    begin = jnp.cumsum(share, axis=0) - share
+    return Mesh(share, begin, jnp.multiply(0.5, share + before))
 
 
 def runs_of(steps: int, dt: Any) -> list[tuple[int, int]]:

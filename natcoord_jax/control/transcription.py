@@ -133,9 +133,9 @@ def unpacked(like: State, x: Float[Array, " x"], t: Float[Array, ""]) -> State:
 def slices(problem: OptimalControl) -> Slice:
     """The constant part of all steps."""
     shaping: Shaping = problem.inputs.shaping(problem.steps)
-    arrays = (jnp.asarray(x) for x in shaping[:4])
+    shift, load, read, direct = (jnp.asarray(x) for x in shaping[:4])
     place = None if problem.uniform else mesh_of(problem.steps, problem.dt)
-    return Slice(jnp.arange(problem.steps), *arrays, place)
+    return Slice(jnp.arange(problem.steps), shift, load, read, direct, place)
 
 
 def entering(problem: OptimalControl, coefficients: Float[Array, "c m"]) -> Float[Array, "steps m"]:
@@ -266,8 +266,8 @@ def followed(
 
     def body(node: Node, given: tuple) -> tuple[Node, tuple[Array, Array]]:
         at, before, after, u = given
-        _, *times = times_of(problem, free, at)
-        cost, excess, last, memory = seen(problem, at.number, tuple(times), (before, after), u, node)
+        times = times_of(problem, free, at)[1:]
+        cost, excess, last, memory = seen(problem, at.number, times, (before, after), u, node)
         return eqx.tree_at(lambda n: (n.last, n.memory), node, (last, memory)), (cost, excess)
 
     given = slices(problem), before, after, inputs
@@ -333,4 +333,4 @@ def simulated(problem: OptimalControl, unknowns: Unknowns, lifted: bool) -> tupl
         found.append((slots.y, whole, ending.course.iterations))
     y, whole, newton = zip(*found)
     y = y[0] if len(y) == 1 else jnp.concatenate(y)
-    return replace_fields(unknowns, y=y), jnp.all(jnp.stack(whole)), sum(newton)
+    return replace_fields(unknowns, y=y), jnp.all(jnp.stack(whole)), jnp.sum(jnp.stack(newton))
