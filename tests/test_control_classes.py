@@ -281,13 +281,17 @@ def test_one_input_serves_two_masses(method):
         ({"steps": (10, 10), "free_time": ((1.0, 2.0),)}, "1 phases"),
         ({"inputs": nc.inputs.shared(np.ones((3, 1)))}, "3 rows"),
         ({"cost": nc.cost.Peak(lambda s, u, t: u[0]) + nc.cost.Peak(lambda s, u, t: -u[0])}, "its own"),
-        ({"goal": nc.goal.At(nc.goal.Periodic(), step=3)}, "link of end and start"),
         ({"goal": nc.goal.Periodic(("nose",))}, "nose"),
     ],
 )
 def test_what_cannot_be_posed_is_refused_by_name(hinged, options, word):
     with pytest.raises(ValueError, match=word):
         on_disc(hinged, options.pop("goal", turned()), **options)
+
+
+def test_a_link_of_end_and_start_is_no_waypoint():
+    with pytest.raises(ValueError, match="compares the end with the start"):
+        nc.goal.At(nc.goal.Periodic(), step=3)
 
 
 def test_a_system_without_inputs_needs_something_else_that_is_free():
@@ -303,6 +307,7 @@ def test_what_is_carried_is_what_is_asked_for(hinged):
     assert sum(asked.memory_sizes) == 3 and asked.looked_back == 1
 
 
+@pytest.mark.exhaustive
 def test_a_free_start_is_differentiable():
     system, state = pendulum()
     free = nc.InitialCoordinate("hinge"), nc.InitialRate("hinge")

@@ -116,19 +116,22 @@ def regulator(
         raise ValueError(
             "the regulator needs a solution of `optimise` with equal steps and inputs held over each"
         )
-    motions, channels = (
+    motions, decided, channels = (
         (problem.system.structure.unknowns, "free motion"),
-        (problem.channels, "input channel"),
+        (problem.channels, "input that is decided"),
+        (len(problem.system.structure.inputs), "input channel"),
     )
     displaced, quick, cost, lower, upper = (
         for_each(value, count, f"regulator: {name}", each)
         for name, value, (count, each) in (
-            ("displacement", displacement, motions), ("rate", rate, motions), ("effort", effort, channels),
+            ("displacement", displacement, motions), ("rate", rate, motions), ("effort", effort, decided),
             ("limits", limits[0], channels), ("limits", limits[1], channels),
         )
     )  # fmt: skip
     weights, limits = (displaced, quick, cost, jnp.asarray(final, float)), (lower, upper)
     gains, back = _gains(problem, iterate, weights)
+    if problem.inputs.shared is not None:
+        gains = jnp.einsum("cm,kmz->kcz", problem.inputs.shared, gains)
     dt, nodes = jnp.asarray(solution.dt), iterate.path.nodes.x[:-1]
     return Feedback(jnp.asarray(solution.inputs), gains, back, nodes, dt, problem.state.t, limits)
 
@@ -174,11 +177,16 @@ def receding_horizon(
         The motion of the plant, and how each optimisation ended.
 
     Raises:
-        ValueError: for a problem with free time or splines, or a plant of another structure.
+        ValueError: for a problem with free time, splines or a memory, or a plant of another structure.
     """
     if problem.free_time or problem.inputs.degree or problem.inputs.every > 1 or not problem.uniform:
         raise ValueError(
             "receding_horizon needs a fixed final time, equal steps and inputs held over each step"
+        )
+    if sum(problem.memory_sizes):
+        raise ValueError(
+            "receding_horizon starts anew at every update: it takes no goals, costs or bounds that look at "
+            "the way there (integrals, waypoints, turns)"
         )
     if plant.structure != problem.system.structure:
         raise ValueError("the plant has another structure than the system of the problem")

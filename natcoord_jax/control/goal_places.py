@@ -39,11 +39,13 @@ class At(Goal):
         """The goal."""
         return (self.goal,)
 
-    def looks_at_start(self) -> bool:
-        """A link would need two states there."""
+    def __check_init__(self):
+        """Refuse what needs two states."""
         if self.goal.looks_at_start():
-            raise ValueError("goal.At: a link of end and start has no waypoint; use it without `At`")
-        return False
+            raise ValueError(
+                "goal.At: this goal compares the end with the start, which a waypoint is not; use it without "
+                "`At`, or `nc.goal.Undeformed` with a reference"
+            )
 
     def furthest(self) -> int:
         """Its step."""

@@ -114,7 +114,7 @@ class OptimalControl(Part):
                 "the system has no input channels, and nothing else is free; add a JointTorque or another "
                 "actuator to the scene, or pass parameters"
             )
-        count = len(self.phases)
+        count, _ = len(self.phases), self.channels
         if np.ndim(self.dt) and self.dt.shape[0] not in (count, int(self.steps)):
             raise ValueError(
                 f"dt has {self.dt.shape[0]} numbers; pass one, one for each of {count} phases or one for "

@@ -112,7 +112,9 @@ def optimise(
             return other
         if other.outcome in ENDED:
             return best_of(problem, [found, other], other.outcome)
-    if method != "shooting" and not over(found) and search.left > 0:
+    # Restorations change inputs alone.
+    restorable = method != "shooting" and len(problem.system.structure.inputs) > 0
+    if restorable and not over(found) and search.left > 0:
         found = after_restoration(search, found, guess)
     return found
 
