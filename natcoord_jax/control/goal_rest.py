@@ -13,7 +13,7 @@ from natcoord_jax.control.memory import Ending
 from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.handles import named
-from natcoord_jax.core.kinds import BODY_NAME, Several, of
+from natcoord_jax.core.kinds import BODY_NAME, FLAG, Several, of
 from natcoord_jax.core.state import STATE, State
 from natcoord_jax.maths.rotations import to_rotation_vector
 from natcoord_jax.mechanics.equations_of_motion import EquationsOfMotion, loads, loops_of, relations_of
@@ -28,15 +28,18 @@ def _chain(part: Any) -> tuple[Any, ...]:
 
 
 class Undeformed(Goal):
-    """Beams that are not bent, stretched or twisted: nodes that follow each other are placed as they were.
+    """Beams that are neither bent, sheared nor twisted: nodes that follow each other are placed as they were.
 
-    Six numbers for each pair of neighbours, place [m] and rotation vector [rad] of the second seen from the
-    first. `nc.goal.Rest` stops a beam wherever it is, and it springs back afterwards; with both nothing
-    moves any more (as long as no load, like gravity, needs a strain: `nc.goal.Equilibrium`).
+    Five numbers for each pair of neighbours: place across the line between them [m] and rotation vector [rad]
+    of the second seen from the first. `nc.goal.Rest` stops a beam wherever it is, and it springs back
+    afterwards; with both nothing swings any more (as long as no load, like gravity, needs a strain:
+    `nc.goal.Equilibrium`). Along their line beams are stiff, and inputs that bend them hardly stretch them:
+    to ask for that as well is easily too much.
 
     Attributes:
         parts: handles of beams, or sequences of bodies (handles or names) along what is flexible.
         reference: state without strains; None: the initial one.
+        stretched: whether the place along the line counts, too, a sixth number.
 
     Example:
         >>> import natcoord_jax as nc
@@ -45,6 +48,7 @@ class Undeformed(Goal):
 
     parts: tuple[Any, ...] = eqx.field(static=True, converter=tuple, metadata=is_a(Several(CHAIN, 1)))
     reference: State | None = eqx.field(default=None, kw_only=True, metadata=is_a(STATE))
+    stretched: bool = eqx.field(default=False, kw_only=True, static=True, metadata=is_a(FLAG))
 
     def _pairs(self) -> list[tuple[Any, Any]]:
         return [pair for part in self.parts for pair in zip(_chain(part)[:-1], _chain(part)[1:])]
@@ -59,18 +63,26 @@ class Undeformed(Goal):
         found = []
         for pair in self._pairs():
             (place, turn), (rest, unturned) = (_seen(system, state, *pair) for state in (ending.last, before))
-            found += [place - rest, to_rotation_vector(turn @ unturned.T)]
+            moved = place - rest
+            across = _across(rest) @ moved
+            found += [moved if self.stretched else across, to_rotation_vector(turn @ unturned.T)]
         return jnp.concatenate(found)
 
     def labels(self, system: System) -> tuple[str, ...]:
-        """Six for each pair."""
-        kinds = (("place", "m"), ("turn", "rad"))
-        return tuple(
-            f"{kind} of {named(b)!r} on {named(a)!r}, {axis} [{unit}]"
-            for a, b in self._pairs()
-            for kind, unit in kinds
-            for axis in "xyz"
-        )
+        """Five or six for each pair."""
+        places = [f"place, {axis} [m]" for axis in (("x", "y", "z") if self.stretched else ("1", "2"))]
+        kinds = [*places, *(f"turn, {axis} [rad]" for axis in "xyz")]
+        return tuple(f"{named(b)!r} on {named(a)!r}: {kind}" for a, b in self._pairs() for kind in kinds)
+
+
+def _across(line: Float[Array, "3"]) -> Float[Array, "2 3"]:
+    """Two directions across a line."""
+    line = line / jnp.linalg.norm(line)
+    # The coordinate axis that is least along the line is the first of them, as far as it is across.
+    first = jnp.eye(3)[jnp.argmin(jnp.abs(line))]
+    first = first - (first @ line) * line
+    first = first / jnp.linalg.norm(first)
+    return jnp.stack([first, jnp.cross(line, first)])
 
 
 def _seen(system: System, state: State, a: Any, b: Any) -> tuple[Array, Array]:
