@@ -320,3 +320,60 @@ def test_a_free_start_is_differentiable():
     # The third director of the bob, (sin, 0, cos), with its first component cos at an angle of 0.
     slope = jax.jit(jax.grad(height))(jnp.array([0.0, 0.0]))
     np.testing.assert_allclose(slope, [2.0, 2.0], atol=1e-12)
+
+
+# --- all at once ------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def mixed(hinged):
+    """All that can be asked for, in one problem."""
+    energy = nc.goal.Integral(lambda state, u, t: u[0] ** 2, name="square of the torque [N^2 m^2 s]")
+    goal = (
+        nc.goal.At(COORDINATE("hinge", 0.5), step=6)
+        & nc.goal.Within(energy, upper=40.0)
+        & nc.goal.Linked(lambda first, last: last.coordinates - first.coordinates - 1.1, "way [rad]")
+        & REST()
+    )
+    cost = nc.cost.Duration(10.0) + nc.cost.Effort() + nc.cost.InputRate(1e-3, before=0.0)
+    return on_disc(
+        hinged,
+        goal,
+        steps=(6, 6),
+        dt=0.1,
+        cost=cost + nc.cost.Peak(lambda state, u, t: u[0] ** 2, weight=1e-2),
+        bounds=nc.bounds.InputRate(-80.0, 80.0),
+        free_time=((0.2, 2.0), (0.2, 3.0)),
+        parameters=(nc.InitialCoordinate("hinge", lower=-0.3, upper=0.3, value=0.05),),
+    )
+
+
+@pytest.mark.exhaustive
+def test_all_go_together(mixed):
+    found = solved(mixed)
+    states = found.trajectory.states
+    assert float(states.coordinates[-1, 0] - states.coordinates[0, 0]) == pytest.approx(1.1, abs=1e-8)
+    assert float(states.coordinates[6, 0]) == pytest.approx(0.5, abs=1e-8)
+    lengths = np.diff(np.asarray(states.t))
+    squares = np.asarray(found.inputs)[:, 0] ** 2
+    assert squares @ lengths < 40.0 + 1e-6
+    assert found.free["peak"] == pytest.approx(squares.max(), rel=1e-6)
+    assert "duration of phase 2 [s]" in found.free and max(abs(x) for x in found.missing.values()) < 1e-9
+    report = nc.check(found, refine=False)
+    assert report.kind == "minimum"
+    assert report.exceeded["square of the torque [N^2 m^2 s] below its upper limit"] < 1e-8
+    several = nc.multi_start(mixed, found, starts=2, spread=0.1)
+    assert min(one.cost for one in several) == pytest.approx(found.cost, rel=1e-8)
+
+
+@pytest.mark.exhaustive
+def test_derivatives_of_the_program_are_those_of_its_values(mixed):
+    """By differences, at a point that is no motion."""
+    program = nc.to_nlp(mixed)
+    x = program.start + 0.1 * np.sin(np.arange(program.start.size))
+    along, step = np.cos(1.0 + np.arange(x.size)), 1e-6
+    ends = [np.append(program.constraints(x + s * along), program.cost(x + s * along)) for s in (step, -step)]
+    exact = np.append(program.jacobian(x) @ along, program.gradient(x) @ along)
+    np.testing.assert_allclose((ends[0] - ends[1]) / (2 * step), exact, rtol=1e-6, atol=1e-6)
+    assert len(program.names) == program.lower.size
+    assert len(set(mixed.end_labels)) == len(mixed.end_labels) == 7

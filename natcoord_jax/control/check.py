@@ -136,7 +136,7 @@ SEEN = 1e-6
 
 def _second_order(solution: Solution) -> tuple[str, float | None, np.ndarray | None]:
     """Whether it is a minimum, and the least curvature with its direction."""
-    if solution.iterate is None:
+    if solution.iterate is None or not solution.problem.system.structure.inputs:
         return "unknown", None, None
     value, along, unit = softest(solution.problem, solution.iterate)
     relative = float(value) / float(unit) if unit > 0 else 0.0
@@ -171,10 +171,10 @@ def check(
     exceeded = dict(zip(problem.path_labels, np.asarray(excess).tolist()))
     if iterate is not None:
         exceeded |= dict(zip(problem.end_labels, np.asarray(iterate.path.end.excess).tolist()))
-    costs = {int(problem.steps): solution.cost}
+    costs = {problem.steps: solution.cost}
     order = extrapolated = None
     if refine:
-        for steps in (int(problem.steps) // 2, 2 * int(problem.steps)):
+        for steps in (problem.steps // 2, 2 * problem.steps):
             finer = make(steps) if make and steps >= 1 else refined(problem, steps)
             if finer is not None:
                 again = optimise(finer, solution, progress=False)

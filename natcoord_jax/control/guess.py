@@ -88,7 +88,7 @@ def unknowns_of(problem: OptimalControl, guess: Any, lifted: bool) -> Unknowns:
     if guess.free is not None:
         free = (_shaped(guess.free, reference.shape, "free") - reference) / scale
     structure = problem.system.structure
-    shape = (int(problem.steps), len(structure.inputs))
+    shape = (problem.steps, len(structure.inputs))
     inputs = jnp.zeros(shape) if guess.inputs is None else _shaped(guess.inputs, shape, "inputs")
     y = jnp.zeros((problem.steps, structure.unknowns + structure.multipliers))
     decided = problem.inputs.decided(inputs, problem.channels)
@@ -111,9 +111,9 @@ def _moving(problem: OptimalControl, guess: Guess, unknowns: Unknowns, lifted: b
         return unknowns if guess.inputs is not None else with_balancing_inputs(problem, unknowns)
     given = jnp.asarray(guess.rates, float)
     if given.shape == (structure.unknowns,):
-        steady = jnp.broadcast_to(given, (int(problem.steps), structure.unknowns))
+        steady = jnp.broadcast_to(given, (problem.steps, structure.unknowns))
         return with_rates(unknowns, taken_up(problem, unknowns.free, steady))
-    return with_rates(unknowns, _shaped(given, (int(problem.steps), structure.unknowns), "rates"))
+    return with_rates(unknowns, _shaped(given, (problem.steps, structure.unknowns), "rates"))
 
 
 @compiled

@@ -32,7 +32,7 @@ def motion(
     if problem.uniform:
         return _piece(problem, system, state, dt, inputs, throw)
     lengths, pieces = problem.lengths(free), []
-    for first, last in runs_of(problem.steps, problem.dt):
+    for first, last in runs_of(problem.phases, problem.dt):
         pieces.append(_piece(problem, system, state, lengths[first], inputs[first:last], throw))
         state = jax.tree.map(lambda x: x[-1], pieces[-1].states)
     return joined(pieces)

@@ -13,7 +13,7 @@ from natcoord_jax.control.cost import COST, Cost
 from natcoord_jax.control.goal import GOAL, Goal
 from natcoord_jax.control.inputs import SPLINE, Spline
 from natcoord_jax.control.memory import Carrier, Ending, Step
-from natcoord_jax.control.mesh import counted, durations, mesh_of, phases_of
+from natcoord_jax.control.mesh import durations, mesh_of
 from natcoord_jax.control.parameters import FreeNumber
 from natcoord_jax.core.arguments import Part, is_a
 from natcoord_jax.core.checks import is_concrete
@@ -26,6 +26,7 @@ from natcoord_jax.stepping.assemble import assemble
 from natcoord_jax.system import System
 
 PARAMETERS = Several(of("nc.Parameter(...), nc.InitialCoordinate(...) or nc.InitialRate(...)", FreeNumber))
+PHASES = Several(Whole(1))
 TIMES = FLAG | Numbers((2,), "positive") | Several(Numbers((2,), "positive"))
 
 
@@ -52,7 +53,8 @@ class OptimalControl(Part):
         system: compiled system, with input channels unless something else is free.
         state: initial state.
         dt: step [s], one number, one for each phase or one for each step; with `free_time` its first guess.
-        steps: number of steps; of several phases one number for each, as (20, 20).
+        steps: number of steps; of several phases one number for each, as (20, 20), and then their sum.
+        phases: number of steps of each phase, as `steps` has said; not to be given.
         cost: what to make small.
         goal: what the final state has to fulfil.
         bounds: what has to hold at the end of every step.
@@ -91,9 +93,8 @@ class OptimalControl(Part):
     dt: Any = eqx.field(
         kw_only=True, converter=_numbers, metadata=is_a(Number("positive") | Numbers((None,), "positive"))
     )
-    steps: int = eqx.field(
-        kw_only=True, static=True, converter=counted, metadata=is_a(Whole(1) | Several(Whole(1), 1))
-    )
+    steps: int = eqx.field(kw_only=True, static=True, metadata=is_a(Whole(1) | Several(Whole(1), 1)))
+    phases: tuple[int, ...] = eqx.field(default=(), kw_only=True, static=True, metadata=is_a(PHASES))
     cost: Cost = eqx.field(default_factory=Cost, kw_only=True, metadata=is_a(COST))
     goal: Goal = eqx.field(default_factory=Goal, kw_only=True, metadata=is_a(GOAL))
     bounds: Bound = eqx.field(default_factory=Bound, kw_only=True, metadata=is_a(BOUND))
@@ -107,6 +108,17 @@ class OptimalControl(Part):
 
     makes_arrays: ClassVar[bool] = True
 
+    def __post_init__(self):
+        """Tell the phases from `steps`."""
+        if isinstance(self.steps, int | np.integer):
+            self.phases = tuple(self.phases) or (int(self.steps),)
+        else:
+            self.phases = tuple(int(count) for count in self.steps)
+            self.steps = sum(self.phases)
+        if len(self.phases) == 1:
+            # A copy with another number of steps has that one.
+            self.phases = (int(self.steps),)
+
     def __check_init__(self):
         """Refuse what is no problem."""
         if not self.system.structure.inputs and not self.free:
@@ -115,18 +127,23 @@ class OptimalControl(Part):
                 "actuator to the scene, or pass parameters"
             )
         count, _ = len(self.phases), self.channels
-        if np.ndim(self.dt) and self.dt.shape[0] not in (count, int(self.steps)):
+        if sum(self.phases) != self.steps:
+            raise ValueError(
+                f"steps is {self.steps}, and the phases have {self.phases}; pass the steps of each, as "
+                f"steps={self.phases}"
+            )
+        if np.ndim(self.dt) and self.dt.shape[0] not in (count, self.steps):
             raise ValueError(
                 f"dt has {self.dt.shape[0]} numbers; pass one, one for each of {count} phases or one for "
-                f"each of {int(self.steps)} steps"
+                f"each of {self.steps} steps"
             )
         for lower, upper in self._time_limits():
             if not 0 <= lower < (np.inf if upper is None else upper):
                 raise ValueError(f"free_time is ({lower}, {upper}) s; pass 0 < lower < upper, or True")
         furthest = max(carrier.furthest() for carrier in self.carriers)
-        if furthest > int(self.steps):
+        if furthest > self.steps:
             raise ValueError(
-                f"goal.At: step {furthest} is beyond the last of {int(self.steps)} steps; pass one of them"
+                f"goal.At: step {furthest} is beyond the last of {self.steps} steps; pass one of them"
             )
         if len(set(self.free)) != len(self.free):
             raise ValueError(f"what is free has the names {list(self.free)}; give each its own")
@@ -174,11 +191,6 @@ class OptimalControl(Part):
         return self.inputs.count(len(self.system.structure.inputs)) or 1
 
     @property
-    def phases(self) -> tuple[int, ...]:
-        """Number of steps of each phase."""
-        return phases_of(self.steps)
-
-    @property
     def uniform(self) -> bool:
         """Whether there is one phase of equal steps."""
         return len(self.phases) == 1 and np.ndim(self.dt) == 0
@@ -220,7 +232,7 @@ class OptimalControl(Part):
         if self.uniform and self.free_time:
             found = [self.steps * jnp.asarray(self.dt, float), *found]
         elif self.free_time:
-            found = [*durations(self.steps, self.dt), *found]
+            found = [*durations(self.phases, self.dt), *found]
         values = jnp.stack(found) if found else jnp.zeros(0)
         return values, jnp.where(values == 0, 1.0, jnp.abs(values))
 
@@ -266,13 +278,13 @@ class OptimalControl(Part):
 
     def durations(self, scaled: Float[Array, " p"]) -> Float[Array, " phases"]:
         """Durations of all phases at given values of what is free [s]."""
-        return self.values(scaled)[: self.times] if self.free_time else durations(self.steps, self.dt)
+        return self.values(scaled)[: self.times] if self.free_time else durations(self.phases, self.dt)
 
     def lengths(self, scaled: Float[Array, " p"]) -> Float[Array, " steps"]:
         """Durations of all steps at given values of what is free [s]."""
         if self.uniform:
-            return jnp.full(int(self.steps), self.applied(scaled)[1])
-        return mesh_of(self.steps, self.dt).share @ self.durations(scaled)
+            return jnp.full(self.steps, self.applied(scaled)[1])
+        return mesh_of(self.phases, self.dt).share @ self.durations(scaled)
 
     def start(self, scaled: Float[Array, " p"]) -> State:
         """Initial state at given values of what is free."""

@@ -17,8 +17,8 @@ def refined(problem: OptimalControl, steps: int) -> OptimalControl | None:
     """
     if steps < 1 or steps % problem.inputs.every:
         return None
-    found = mesh.refined(problem.steps, problem.dt, steps)
-    whole = int(problem.steps)
+    found = mesh.refined(problem.phases, problem.dt, steps)
+    whole = problem.steps
 
     def is_waypoint(part: Any) -> bool:
         return isinstance(part, At)
@@ -31,5 +31,5 @@ def refined(problem: OptimalControl, steps: int) -> OptimalControl | None:
     if found is None or any(step * steps % whole for step in waypoints):
         return None
     goal, cost, bounds = jax.tree.map(moved, parts, is_leaf=is_waypoint)
-    count, dt = found
-    return dataclasses.replace(problem, steps=count, dt=dt, goal=goal, cost=cost, bounds=bounds)
+    phases, dt = found
+    return dataclasses.replace(problem, steps=phases, dt=dt, goal=goal, cost=cost, bounds=bounds)

@@ -134,7 +134,7 @@ def slices(problem: OptimalControl) -> Slice:
     """The constant part of all steps."""
     shaping: Shaping = problem.inputs.shaping(problem.steps)
     shift, load, read, direct = (jnp.asarray(x) for x in shaping[:4])
-    place = None if problem.uniform else mesh_of(problem.steps, problem.dt)
+    place = None if problem.uniform else mesh_of(problem.phases, problem.dt)
     return Slice(jnp.arange(problem.steps), shift, load, read, direct, place)
 
 
@@ -322,7 +322,7 @@ def simulated(problem: OptimalControl, unknowns: Unknowns, lifted: bool) -> tupl
         pieces = [(slice(None), problem.applied(unknowns.free)[1])]
     else:
         lengths = problem.lengths(unknowns.free)
-        pieces = [(slice(a, b), lengths[a]) for a, b in runs_of(problem.steps, problem.dt)]
+        pieces = [(slice(a, b), lengths[a]) for a, b in runs_of(problem.phases, problem.dt)]
     found = []
     for piece, dt in pieces:
         given = inputs[piece]
