@@ -5,6 +5,7 @@ Answers of continuous time differ from those of steps by some h^2, which the tol
 
 import math
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -320,6 +321,52 @@ def test_a_free_start_is_differentiable():
     # The third director of the bob, (sin, 0, cos), with its first component cos at an angle of 0.
     slope = jax.jit(jax.grad(height))(jnp.array([0.0, 0.0]))
     np.testing.assert_allclose(slope, [2.0, 2.0], atol=1e-12)
+
+
+# --- flexible parts at rest -------------------------------------------------------------------------------
+
+
+@pytest.mark.exhaustive
+def test_forces_out_of_balance_are_those_of_gravity():
+    """A bob of 1 kg, 1 m below its hinge: m g l sin(angle)."""
+    system, state = pendulum()
+    balance = nc.jit(nc.goal.Equilibrium().residual)
+    for angle in (0.0, 0.4):
+        leaning = system.with_coordinate(state, "hinge", angle, rate=0.7)
+        np.testing.assert_allclose(balance(system, leaning), [-GRAVITY * math.sin(angle)], atol=1e-12)
+
+
+def paddle(elements=1):
+    """A hub on a hinge with a motor, and a panel on it that bends."""
+    scene = nc.Scene()
+    hub = scene.add(nc.RigidBody(mass=10.0, inertia=(1.0, 1.0, 1.0), name="hub"))
+    hinge = scene.add(nc.Revolute(nc.ground, hub, axis=(0, 0, 1), name="hinge"))
+    section = nc.Section.of_numbers(EA=1e4, GA=1e4, EI=20.0, GJ=20.0, density=0.5, rotary=1e-3)
+    line = [(0.2, 0, 0), (2.2, 0, 0)]
+    panel = scene.add(nc.Beam(section, line, elements=elements, second=(0, 0, 1), start=hub, name="panel"))
+    scene.add(nc.JointTorque(hinge, name="motor"))
+    return scene.compile(), panel
+
+
+@pytest.mark.exhaustive
+def test_what_turns_along_is_not_deformed():
+    """A panel turned with its hub; and one whose end is bent by an angle."""
+    (system, state), panel = paddle()
+    goal = nc.goal.Undeformed((panel,), reference=state)
+
+    @nc.jit
+    def strain(state):
+        ending = nc.control.goal.Ending(state, state, jnp.zeros(0), {})
+        return goal.missing(system, ending)
+
+    turned_along = system.with_coordinate(state, "hinge", 0.5)
+    np.testing.assert_allclose(strain(turned_along), 0.0, atol=1e-14)
+    c, s = math.cos(0.1), math.sin(0.1)
+    turn = jnp.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+    bent = turned_along.q.at[5:8].set(turned_along.q[5:8] @ turn)
+    found = strain(eqx.tree_at(lambda x: x.q, turned_along, bent))
+    np.testing.assert_allclose(found, [0.0, 0.0, 0.0, 0.0, 0.1], atol=1e-14)
+    assert goal.labels(system)[-1] == "'panel/node 1' on 'hub': turn, z [rad]"
 
 
 # --- all at once ------------------------------------------------------------------------------------------

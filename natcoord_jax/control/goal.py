@@ -24,6 +24,7 @@ from natcoord_jax.control.goal_places import At as At
 from natcoord_jax.control.goal_places import Within as Within
 from natcoord_jax.control.goal_rest import Equilibrium as Equilibrium
 from natcoord_jax.control.goal_rest import Undeformed as Undeformed
+from natcoord_jax.control.memory import Ending as Ending
 from natcoord_jax.control.tangent import steady_rates
 from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.callables import Function
