@@ -521,7 +521,7 @@ CALLS = {
     "goal.Turned": lambda w: {"body": [w.body, "body"], "axis": V, "angle": NUMBER},
     "goal.At": lambda w: {"goal": [nc.goal.Rest()], "step": WHOLE},
     "goal.Within": lambda w: {"goal": [nc.goal.Rest()], "lower": [-1.0], "upper": NUMBER},
-    "goal.Undeformed": lambda w: {"parts": [(("body", "other"),)], "reference": [w.state], "stretched": FLAG},
+    "goal.Undeformed": lambda w: {"parts": [(("body", "other"),)], "reference": [w.state], "places": FLAG},
     "goal.Equilibrium": lambda w: {},
     "bounds.Input": lambda w: {"lower": [-1.0], "upper": NUMBER, "channel": ["motor"]},
     "bounds.InputRate": lambda w: {"lower": [-1.0], "upper": NUMBER, "channel": ["motor"], "before": NUMBER},

@@ -28,18 +28,19 @@ def _chain(part: Any) -> tuple[Any, ...]:
 
 
 class Undeformed(Goal):
-    """Beams that are neither bent, sheared nor twisted: nodes that follow each other are placed as they were.
+    """Beams that are neither bent nor twisted: nodes that follow each other are turned as they were.
 
-    Five numbers for each pair of neighbours: place across the line between them [m] and rotation vector [rad]
-    of the second seen from the first. `nc.goal.Rest` stops a beam wherever it is, and it springs back
-    afterwards; with both nothing swings any more (as long as no load, like gravity, needs a strain:
-    `nc.goal.Equilibrium`). Along their line beams are stiff, and inputs that bend them hardly stretch them:
-    to ask for that as well is easily too much.
+    Three numbers for each pair of neighbours, the rotation vector [rad] of the second seen from the first.
+    `nc.goal.Rest` stops a beam wherever it is, and it springs back afterwards; with both nothing swings any
+    more (as long as no load, like gravity, needs a strain: `nc.goal.Equilibrium`). Slender beams are so stiff
+    against stretch and shear that inputs hardly bring these about: to ask for them as well is easily too
+    much, as it is of stiff springs.
 
     Attributes:
         parts: handles of beams, or sequences of bodies (handles or names) along what is flexible.
         reference: state without strains; None: the initial one.
-        stretched: whether the place along the line counts, too, a sixth number.
+        places: whether the place of the second seen from the first counts, too: stretch and shear, three
+            numbers more [m].
 
     Example:
         >>> import natcoord_jax as nc
@@ -48,7 +49,7 @@ class Undeformed(Goal):
 
     parts: tuple[Any, ...] = eqx.field(static=True, converter=tuple, metadata=is_a(Several(CHAIN, 1)))
     reference: State | None = eqx.field(default=None, kw_only=True, metadata=is_a(STATE))
-    stretched: bool = eqx.field(default=False, kw_only=True, static=True, metadata=is_a(FLAG))
+    places: bool = eqx.field(default=False, kw_only=True, static=True, metadata=is_a(FLAG))
 
     def _pairs(self) -> list[tuple[Any, Any]]:
         return [pair for part in self.parts for pair in zip(_chain(part)[:-1], _chain(part)[1:])]
@@ -63,26 +64,19 @@ class Undeformed(Goal):
         found = []
         for pair in self._pairs():
             (place, turn), (rest, unturned) = (_seen(system, state, *pair) for state in (ending.last, before))
-            moved = place - rest
-            across = _across(rest) @ moved
-            found += [moved if self.stretched else across, to_rotation_vector(turn @ unturned.T)]
+            found += [place - rest] if self.places else []
+            found.append(to_rotation_vector(turn @ unturned.T))
         return jnp.concatenate(found)
 
     def labels(self, system: System) -> tuple[str, ...]:
-        """Five or six for each pair."""
-        places = [f"place, {axis} [m]" for axis in (("x", "y", "z") if self.stretched else ("1", "2"))]
-        kinds = [*places, *(f"turn, {axis} [rad]" for axis in "xyz")]
-        return tuple(f"{named(b)!r} on {named(a)!r}: {kind}" for a, b in self._pairs() for kind in kinds)
-
-
-def _across(line: Float[Array, "3"]) -> Float[Array, "2 3"]:
-    """Two directions across a line."""
-    line = line / jnp.linalg.norm(line)
-    # The coordinate axis that is least along the line is the first of them, as far as it is across.
-    first = jnp.eye(3)[jnp.argmin(jnp.abs(line))]
-    first = first - (first @ line) * line
-    first = first / jnp.linalg.norm(first)
-    return jnp.stack([first, jnp.cross(line, first)])
+        """Three or six for each pair."""
+        kinds = (("place", "m"), ("turn", "rad")) if self.places else (("turn", "rad"),)
+        return tuple(
+            f"{named(b)!r} on {named(a)!r}: {kind}, {axis} [{unit}]"
+            for a, b in self._pairs()
+            for kind, unit in kinds
+            for axis in "xyz"
+        )
 
 
 def _seen(system: System, state: State, a: Any, b: Any) -> tuple[Array, Array]:
