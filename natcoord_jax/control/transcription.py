@@ -318,19 +318,27 @@ def simulated(problem: OptimalControl, unknowns: Unknowns, lifted: bool) -> tupl
         return unknowns, jnp.array(True), jnp.array(0)
     system, _ = problem.applied(unknowns.free)
     inputs, state = held_inputs(problem, unknowns.coefficients), problem.start(unknowns.free)
-    if problem.uniform:
-        pieces = [(slice(None), problem.applied(unknowns.free)[1])]
-    else:
-        lengths = problem.lengths(unknowns.free)
-        pieces = [(slice(a, b), lengths[a]) for a, b in runs_of(problem.phases, problem.dt)]
-    found = []
-    for piece, dt in pieces:
-        given = inputs[piece]
-        plan = Plan(given.shape[0], 0, TOLERANCE, None)
-        slots, ending = run_slots(plan, system, state, given, dt)
-        state = ending.course.state
+
+    def piece(state: State, given: tuple[Array, Array]) -> tuple[State, tuple[Array, Array, Array]]:
+        u, dt = given
+        slots, ending = run_slots(Plan(u.shape[0], 0, TOLERANCE, None), system, state, u, dt)
         whole = (ending.course.code == 0) & jnp.all(slots.accepted) & jnp.all(slots.fraction == 1.0)
-        found.append((slots.y, whole, ending.course.iterations))
+        return ending.course.state, (slots.y, whole, ending.course.iterations)
+
+    runs = runs_of(problem.phases, problem.dt)
+    if problem.uniform:
+        y, whole, newton = piece(state, (inputs, problem.applied(unknowns.free)[1]))[1]
+        return replace_fields(unknowns, y=y), whole, newton
+    lengths, found = problem.lengths(unknowns.free), []
+    if len(runs) == problem.steps:
+        y, *rest = jax.lax.scan(piece, state, (inputs[:, None], lengths))[1]
+        return replace_fields(unknowns, y=y[:, 0]), jnp.all(rest[0]), jnp.sum(rest[1])
+    for first, last in runs:
+        state, reached = piece(state, (inputs[first:last], lengths[first]))
+        found.append(reached)
     y, whole, newton = zip(*found)
-    y = y[0] if len(y) == 1 else jnp.concatenate(y)
-    return replace_fields(unknowns, y=y), jnp.all(jnp.stack(whole)), jnp.sum(jnp.stack(newton))
+    return (
+        replace_fields(unknowns, y=jnp.concatenate(y)),
+        jnp.all(jnp.stack(whole)),
+        sum(newton[1:], newton[0]),
+    )
