@@ -349,6 +349,20 @@ def paddle(elements=1):
 
 
 @pytest.mark.exhaustive
+def test_a_hub_stays_where_it_stops_once_its_panel_is_in_balance():
+    """At rest alone it swings back by what the panel is bent: measured over 5 s without torques."""
+    (system, state), panel = paddle()
+    stop, swings = COORDINATE("hinge", 1.0) & REST(), []
+    for goal in (stop, stop & nc.goal.Undeformed((panel,)), stop & nc.goal.Equilibrium()):
+        problem = nc.OptimalControl(system, state, dt=0.1, steps=40, cost=nc.cost.Effort(), goal=goal)
+        found = solved(problem, method="shooting")
+        after = nc.simulate(system, found.trajectory[-1], dt=0.02, steps=250)
+        swings.append(float(jnp.max(jnp.abs(system.coordinate(after, "hinge") - 1.0))))
+    assert swings[0] > 1e-3
+    assert swings[1] < 1e-3 * swings[0] and swings[2] < 1e-9
+
+
+@pytest.mark.exhaustive
 def test_what_turns_along_is_not_deformed():
     """A panel turned with its hub; and one whose end is bent by an angle."""
     (system, state), panel = paddle()

@@ -110,11 +110,12 @@ class OptimalControl(Part):
 
     def __post_init__(self):
         """Tell the phases from `steps`."""
-        if isinstance(self.steps, int | np.integer):
-            self.phases = tuple(self.phases) or (int(self.steps),)
-        else:
-            self.phases = tuple(int(count) for count in self.steps)
+        given: Any = self.steps
+        if np.ndim(given):
+            self.phases = tuple(int(count) for count in given)
             self.steps = sum(self.phases)
+        else:
+            self.phases = tuple(self.phases) or (int(given),)
         if len(self.phases) == 1:
             # A copy with another number of steps has that one.
             self.phases = (int(self.steps),)
