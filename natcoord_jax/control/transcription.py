@@ -337,8 +337,5 @@ def simulated(problem: OptimalControl, unknowns: Unknowns, lifted: bool) -> tupl
         state, reached = piece(state, (inputs[first:last], lengths[first]))
         found.append(reached)
     y, whole, newton = zip(*found)
-    return (
-        replace_fields(unknowns, y=jnp.concatenate(y)),
-        jnp.all(jnp.stack(whole)),
-        sum(newton[1:], newton[0]),
-    )
+    whole, newton = (jnp.stack(x) for x in (whole, newton))
+    return replace_fields(unknowns, y=jnp.concatenate(y)), jnp.all(whole), jnp.sum(newton)
