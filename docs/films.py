@@ -22,7 +22,8 @@ def shrunk(film: Path, file: Path) -> None:
     with Image.open(film) as given:
         frames = [frame.convert("RGB") for frame in ImageSequence.Iterator(given)]
         lasting = given.info.get("duration", 40) * len(frames)
-    kept = [frames[round(k * (len(frames) - 1) / (FRAMES - 1))] for k in range(min(FRAMES, len(frames)))]
+    count = min(FRAMES, len(frames))
+    kept = [frames[round(k * (len(frames) - 1) / (count - 1))] for k in range(count)]
     height = round(WIDTH * kept[0].height / kept[0].width)
     small = [x.resize((WIDTH, height), Image.Resampling.LANCZOS).quantize(COLOURS) for x in kept]
     file.parent.mkdir(exist_ok=True)
