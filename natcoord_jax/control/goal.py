@@ -43,7 +43,7 @@ class Attitude(Goal):
     """Attitude of a body: three numbers, the rotation vector that is missing [rad], the short way round.
 
     At half a turn both ways are as short, and it is one of them. Its slope is zero nowhere, so that each
-    start shows the way to the goal.
+    start shows the way to the goal. It knows no number of turns: those are counted by `nc.goal.Turned`.
 
     Attributes:
         body: handle or name.
@@ -168,7 +168,8 @@ class Rest(Goal):
     """No motion at all: the rates of all free motions of the spanning tree are zero.
 
     That is six numbers of a free body and one of a hinge, not twelve a body. Some may follow from others,
-    as the base of a spacecraft rests when its wheels do and there is no momentum; the solver sees that.
+    as the base of a spacecraft rests when its wheels do and there is no momentum; the solver sees that. What
+    is flexible springs back from where it rests: see `nc.goal.Undeformed` and `nc.goal.Equilibrium`.
     """
 
     def residual(self, system: System, state: State) -> Float[Array, " n"]:
