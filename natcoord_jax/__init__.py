@@ -60,6 +60,8 @@ __all__ = [
     "Force",
     "Frame",
     "Guess",
+    "InitialCoordinate",
+    "InitialRate",
     "Joint",
     "Load",
     "MixedPotential",

@@ -78,13 +78,13 @@ def test_readme_runs(tmp_path: Path):
 
 
 # A minute of the processor each, or more, as users compile them; pages that were measured take some 20 s.
-LONG_PAGES = ("howto/optimal_control.md", "howto/shells_solids_contact.md")
+LONG_PAGES = ("howto/control_", "howto/optimal_control.md", "howto/shells_solids_contact.md")
 
 
 @pytest.mark.parametrize(
     "page",
     [
-        pytest.param(page, marks=pytest.mark.exhaustive if page in LONG_PAGES else pytest.mark.slow)
+        pytest.param(page, marks=pytest.mark.exhaustive if page.startswith(LONG_PAGES) else pytest.mark.slow)
         for page in PAGES
         if blocks_of(DOCS / page)
     ],

@@ -15,11 +15,13 @@ from natcoord_jax.control.feedback import Feedback as Feedback
 from natcoord_jax.control.feedback import receding_horizon as receding_horizon
 from natcoord_jax.control.feedback import regulator as regulator
 from natcoord_jax.control.guess import Guess as Guess
+from natcoord_jax.control.initial import InitialCoordinate as InitialCoordinate
+from natcoord_jax.control.initial import InitialRate as InitialRate
 from natcoord_jax.control.inverse import inverse_dynamics as inverse_dynamics
 from natcoord_jax.control.nlp import NonlinearProgram as NonlinearProgram
 from natcoord_jax.control.nlp import to_nlp as to_nlp
+from natcoord_jax.control.parameters import Parameter as Parameter
 from natcoord_jax.control.problem import OptimalControl as OptimalControl
-from natcoord_jax.control.problem import Parameter as Parameter
 from natcoord_jax.control.results import Outcome as Outcome
 from natcoord_jax.control.run import optimise as optimise
 from natcoord_jax.control.run import optimise_jit as optimise_jit

@@ -13,7 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from natcoord_jax.core.arguments import Part, is_a
+from natcoord_jax.control.memory import Carrier, Step, each_inside, input_rate
+from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.callables import Function
 from natcoord_jax.core.checks import for_each, is_concrete
 from natcoord_jax.core.handles import Handle, named
@@ -26,7 +27,7 @@ LIMIT = Number(infinite=True) | Numbers((None,), infinite=True)
 EXCESS = FunctionOf("(state, u, t) -> number or vector")
 
 
-class Bound(Part):
+class Bound(Carrier):
     """Base of all bounds."""
 
     def excess(
@@ -38,6 +39,10 @@ class Bound(Part):
     def labels(self, system: System) -> tuple[str, ...]:
         """Name of each bound."""
         return ()
+
+    def of_step(self, system: System, memory: Array, step: Step) -> Float[Array, " n"]:
+        """By how much each bound is exceeded at the end of a step; memory is that at its start."""
+        return self.excess(system, step.after, step.u, step.after.t)
 
     def widened(self, factor: Any) -> "Bound":
         """The same with the limits of inputs so many times as wide; itself if it has none."""
@@ -53,6 +58,15 @@ class All(Bound):
     """Several bounds at once."""
 
     parts: tuple[Bound, ...] = eqx.field(metadata=is_a(Several(of("a bound", Bound))))
+
+    def inside(self) -> tuple[Bound, ...]:
+        """The parts."""
+        return self.parts
+
+    def of_step(self, system: System, memory: Array, step: Step) -> Float[Array, " n"]:
+        """Excesses of all parts over a step."""
+        pairs = each_inside(self, system, memory)
+        return jnp.concatenate([part.of_step(system, numbers, step) for part, numbers in pairs])
 
     def excess(self, system: System, state: State, u: Array, t: Array) -> Float[Array, " n"]:
         """Excesses of all parts."""
@@ -107,7 +121,10 @@ class Range(Bound):
 
     def excess(self, system: System, state: State, u: Array, t: Array) -> Float[Array, " n"]:
         """Excess over both limits, in units of half the range."""
-        values = self.values(system, state, u)
+        return self.over(self.values(system, state, u))
+
+    def over(self, values: Float[Array, " n"]) -> Float[Array, " m"]:
+        """Excess of values over both limits, in units of half the range."""
         below, above = self._sides(values.shape[0])
         lower, upper = (jnp.broadcast_to(x, values.shape) for x in (self.lower, self.upper))
         both = jnp.isfinite(upper - lower)
@@ -157,6 +174,51 @@ class Input(Range):
         middle = jnp.where(both, 0.5 * (self.lower + self.upper), 0.0)
         sides = tuple(middle + factor * (x - middle) for x in (self.lower, self.upper))
         return eqx.tree_at(lambda b: (b.lower, b.upper), self, sides)
+
+
+class InputRate(Range):
+    """Limits of the rates of input channels [N/s, N m/s] (slew rate).
+
+    The rate is the difference of the inputs held over a step and the one before, over the time between the
+    middles of both.
+
+    Attributes:
+        lower: one number or one for each channel [N/s, N m/s].
+        upper: one number or one for each channel [N/s, N m/s].
+        channel: name or handle of one channel; None: all.
+        before: inputs before the first step [N, N m], one number or one for each channel of the system; None:
+            they may begin with any value.
+
+    Example:
+        >>> import natcoord_jax as nc
+        >>> bounds = nc.bounds.Input(-1.0, 1.0) & nc.bounds.InputRate(-2.0, 2.0, before=0.0)
+    """
+
+    channel: Handle | str | None = eqx.field(
+        default=None, kw_only=True, static=True, metadata=is_a(HandleOf("effect") | NAME)
+    )
+    before: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Number() | Numbers((None,))))
+
+    def looks_back(self) -> bool:
+        """It does."""
+        return True
+
+    def of_step(self, system: System, memory: Array, step: Step) -> Float[Array, " n"]:
+        """Excess of the rates over both limits, in units of half the range."""
+        return self.over(self.values(system, step.after, input_rate(step, self.before)))
+
+    def values(self, system: System, state: State, u: Array) -> Float[Array, " n"]:
+        """The rates, of all channels or of one."""
+        return u if self.channel is None else u[system.input_index(self.channel)][None]
+
+    def excess(self, system: System, state: State, u: Array, t: Array) -> Float[Array, " n"]:
+        """Excess of inputs that do not change."""
+        return self.over(self.values(system, state, jnp.zeros_like(u)))
+
+    def names(self, system: System) -> tuple[str, ...]:
+        """Names of the channels."""
+        channels = system.structure.inputs if self.channel is None else (named(self.channel),)
+        return tuple(f"rate of input {name!r}" for name in channels)
 
 
 class Coordinate(Range):

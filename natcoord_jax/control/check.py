@@ -15,6 +15,7 @@ from natcoord_jax.control.newton import as_unknowns
 from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.control.proposal import softest
 from natcoord_jax.control.reasons import switches
+from natcoord_jax.control.refinement import refined
 from natcoord_jax.control.run import optimise
 from natcoord_jax.control.solution import SOLUTION, Solution
 from natcoord_jax.control.transcription import entering, slices, stage
@@ -135,7 +136,7 @@ SEEN = 1e-6
 
 def _second_order(solution: Solution) -> tuple[str, float | None, np.ndarray | None]:
     """Whether it is a minimum, and the least curvature with its direction."""
-    if solution.iterate is None:
+    if solution.iterate is None or not solution.problem.system.structure.inputs:
         return "unknown", None, None
     value, along, unit = softest(solution.problem, solution.iterate)
     relative = float(value) / float(unit) if unit > 0 else 0.0
@@ -167,14 +168,15 @@ def check(
     problem, iterate = solution.problem, solution.iterate
     trajectory, system = solution.trajectory, solution.system
     excess = [] if iterate is None else np.asarray(iterate.path.stages.excess).max(axis=0, initial=-np.inf)
-    exceeded = dict(zip(problem.bounds.labels(problem.system), np.asarray(excess).tolist()))
+    exceeded = dict(zip(problem.path_labels, np.asarray(excess).tolist()))
+    if iterate is not None:
+        exceeded |= dict(zip(problem.end_labels, np.asarray(iterate.path.end.excess).tolist()))
     costs = {problem.steps: solution.cost}
     order = extrapolated = None
     if refine:
         for steps in (problem.steps // 2, 2 * problem.steps):
-            if steps >= 1 and (make is not None or steps % problem.inputs.every == 0):
-                dt = problem.dt * problem.steps / steps
-                finer = make(steps) if make else dataclasses.replace(problem, dt=dt, steps=steps)
+            finer = make(steps) if make and steps >= 1 else refined(problem, steps)
+            if finer is not None:
                 again = optimise(finer, solution, progress=False)
                 if again.ok:
                     costs[steps] = again.cost

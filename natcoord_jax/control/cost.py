@@ -7,11 +7,13 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from natcoord_jax.control.goal import GOAL
-from natcoord_jax.core.arguments import Part, is_a
+from natcoord_jax.control.goal_base import GOAL
+from natcoord_jax.control.memory import Carrier, Ending, Step, each_inside, input_rate
+from natcoord_jax.control.parameters import FreeNumber
+from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.callables import Function
 from natcoord_jax.core.checks import for_each
-from natcoord_jax.core.kinds import FunctionOf, Several, of
+from natcoord_jax.core.kinds import NAME, FunctionOf, Several, of
 from natcoord_jax.core.numeric import Number, Vector
 from natcoord_jax.core.state import State
 from natcoord_jax.system import System
@@ -19,9 +21,10 @@ from natcoord_jax.system import System
 WEIGHTS = Number() | Vector(None)
 RUNNING = FunctionOf("(state, u, t) -> cost per second")
 TERMINAL = FunctionOf("(state) -> cost")
+PEAK = FunctionOf("(state, u, t) -> number")
 
 
-class Cost(Part):
+class Cost(Carrier):
     """Base of all costs: an integral over time and a value at the end.
 
     The integral is taken by the trapezoidal rule over every step, with the inputs held over it. A cost of
@@ -38,6 +41,34 @@ class Cost(Part):
         """Cost of the final state."""
         return jnp.zeros(())
 
+    def of_step(self, system: System, memory: Array, step: Step) -> Float[Array, ""]:
+        """Cost of a step: the integral over it, with the memory at its start."""
+        u = step.u
+        ends = (self.running(system, state, u, state.t) for state in (step.before, step.after))
+        return 0.5 * step.dt * sum(ends)
+
+    def of_end(self, system: System, ending: Ending) -> Float[Array, ""]:
+        """Cost of the end of a motion."""
+        return self.terminal(system, ending.last)
+
+    def parameters(self) -> tuple[FreeNumber, ...]:
+        """Numbers that are free because of it."""
+        costs = [cost for cost in self.inside() if isinstance(cost, Cost)]
+        return tuple(number for cost in costs for number in cost.parameters())
+
+    def excess(self, system: System, memory: Array, step: Step) -> Float[Array, " n"]:
+        """By how much bounds that come with it are exceeded at the end of a step."""
+        pairs = each_inside(self, system, memory)
+        costs = [(cost, numbers) for cost, numbers in pairs if isinstance(cost, Cost)]
+        return jnp.concatenate(
+            [jnp.zeros(0), *(cost.excess(system, numbers, step) for cost, numbers in costs)]
+        )
+
+    def labels(self) -> tuple[str, ...]:
+        """Names of these bounds."""
+        costs = [cost for cost in self.inside() if isinstance(cost, Cost)]
+        return tuple(name for cost in costs for name in cost.labels())
+
     def __add__(self, other: "Cost") -> "Cost":
         if not isinstance(other, Cost):
             return NotImplemented
@@ -49,6 +80,10 @@ class Sum(Cost):
 
     terms: tuple[Cost, ...] = eqx.field(metadata=is_a(Several(of("a cost", Cost))))
 
+    def inside(self) -> tuple[Cost, ...]:
+        """The terms."""
+        return self.terms
+
     def running(self, system: System, state: State, u: Array, t: Array) -> Float[Array, ""]:
         """Sum of the running costs."""
         return sum((c.running(system, state, u, t) for c in self.terms), jnp.zeros(()))
@@ -56,6 +91,17 @@ class Sum(Cost):
     def terminal(self, system: System, state: State) -> Float[Array, ""]:
         """Sum of the terminal costs."""
         return sum((c.terminal(system, state) for c in self.terms), jnp.zeros(()))
+
+    def of_step(self, system: System, memory: Array, step: Step) -> Float[Array, ""]:
+        """Sum of the costs of a step."""
+        pairs = each_inside(self, system, memory)
+        return sum((cost.of_step(system, numbers, step) for cost, numbers in pairs), jnp.zeros(()))
+
+    def of_end(self, system: System, ending: Ending) -> Float[Array, ""]:
+        """Sum of the costs of the end."""
+        pairs = each_inside(self, system, ending.memory)
+        costs = (cost.of_end(system, ending._replace(memory=numbers)) for cost, numbers in pairs)
+        return sum(costs, jnp.zeros(()))
 
 
 class Effort(Cost):
@@ -135,6 +181,10 @@ class Missed(Cost):
     weight: Any = eqx.field(default=1.0, kw_only=True, metadata=is_a(Number()))
     rate: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Number()))
 
+    def inside(self) -> tuple[Carrier, ...]:
+        """The goal."""
+        return (self.goal,)
+
     def running(self, system: System, state: State, u: Array, t: Array) -> Float[Array, ""]:
         """Weighted square of what is missing."""
         if self.rate is None:
@@ -144,6 +194,102 @@ class Missed(Cost):
     def terminal(self, system: System, state: State) -> Float[Array, ""]:
         """Weighted square of what is missing."""
         return self.weight * jnp.sum(self.goal.residual(system, state) ** 2)
+
+    def of_end(self, system: System, ending: Ending) -> Float[Array, ""]:
+        """Weighted square of what is missing at the end of a motion."""
+        ((_, memory),) = each_inside(self, system, ending.memory)
+        return self.weight * jnp.sum(self.goal.missing(system, ending._replace(memory=memory)) ** 2)
+
+
+class InputRate(Cost):
+    """Integral of weight |du/dt|^2, for inputs that must not jerk.
+
+    Inputs are held over each step; their rate is the difference to the step before over the time between the
+    middles of both. Its unit is that of weight times [N^2/s] or [N^2 m^2/s].
+
+    Attributes:
+        weight: one number, or one for each input channel.
+        before: inputs before the first step [N, N m], one number or one for each; None: they may begin with
+            any value at no cost.
+
+    Example:
+        >>> import natcoord_jax as nc
+        >>> cost = nc.cost.Effort() + nc.cost.InputRate(0.1)
+    """
+
+    weight: Any = eqx.field(default=1.0, metadata=is_a(WEIGHTS))
+    before: Any = eqx.field(default=None, kw_only=True, metadata=is_a(WEIGHTS))
+
+    def looks_back(self) -> bool:
+        """It does."""
+        return True
+
+    def of_step(self, system: System, memory: Array, step: Step) -> Float[Array, ""]:
+        """Weighted sum of squares, times the time between the middles of the steps."""
+        weight = for_each(self.weight, step.u.shape[-1], "InputRate: weight", "input channel")
+        return step.gap * jnp.sum(weight * input_rate(step, self.before) ** 2)
+
+
+class _Level(FreeNumber):
+    """The free number of a peak."""
+
+    name: str = eqx.field(static=True)
+    value: Any = None
+    lower: float | None = eqx.field(default=None, static=True)
+    upper: float | None = eqx.field(default=None, static=True)
+
+    @property
+    def given(self) -> bool:
+        """Whether its first value is given."""
+        return self.value is not None
+
+    def initial(self, system: System, state: State) -> Float[Array, ""]:
+        """Its first value; zero: found from the first motion."""
+        return jnp.asarray(0.0 if self.value is None else self.value, float)
+
+
+class Peak(Cost):
+    """Weight times the largest value of a function along the motion, at the ends of the steps (minimax).
+
+    It is made smooth by a free number, which is the cost and which the function must not exceed at the end of
+    any step.
+
+    Attributes:
+        function: (state, u, t) -> number.
+        guess: first value of the peak; None: the largest along the first motion.
+        weight: factor, positive.
+        name: of the free number, for reports, with the unit.
+
+    Example:
+        >>> import natcoord_jax as nc
+        >>> largest = nc.cost.Peak(lambda state, u, t: u[0] ** 2, name="largest square [N^2 m^2]")
+    """
+
+    function: Callable[[State, Array, Array], Any] = eqx.field(converter=Function.of, metadata=is_a(PEAK))
+    guess: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Number()))
+    weight: Any = eqx.field(default=1.0, kw_only=True, metadata=is_a(Number("positive")))
+    name: str = eqx.field(default="peak", kw_only=True, static=True, metadata=is_a(NAME))
+
+    def parameters(self) -> tuple[FreeNumber, ...]:
+        """The peak."""
+        return (_Level(self.name, self.guess),)
+
+    def value(self, step: Step) -> Float[Array, ""]:
+        """The function at the end of a step."""
+        return jnp.asarray(self.function(step.after, step.u, step.after.t), float)
+
+    def excess(self, system: System, memory: Array, step: Step) -> Float[Array, " n"]:
+        """The function less the peak, in units of its first value."""
+        unit = jnp.abs(jnp.asarray(0.0 if self.guess is None else self.guess, float))
+        return ((self.value(step) - step.free[self.name]) / jnp.where(unit > 0, unit, 1.0))[None]
+
+    def labels(self) -> tuple[str, ...]:
+        """The peak."""
+        return (f"{self.name}, not exceeded",)
+
+    def of_end(self, system: System, ending: Ending) -> Float[Array, ""]:
+        """The weighted peak."""
+        return self.weight * ending.free[self.name]
 
 
 COST = of("a cost, as nc.cost.Effort()", Cost)

@@ -64,7 +64,7 @@ class Charts(NamedTuple):
 
 
 def charts(problem: OptimalControl, nodes: Node) -> Charts:
-    """Tangent maps of all nodes; what is free and the register are their own small numbers."""
+    """Tangent maps of all nodes, everything besides the state added unchanged."""
 
     def one(node: Node) -> tuple[Array, Array]:
         system, _ = problem.applied(node.free)

@@ -3,7 +3,6 @@
 import sys
 import time
 from functools import partial
-from operator import itemgetter
 from typing import Annotated, Any
 
 import jax
@@ -15,15 +14,15 @@ from jaxtyping import Array
 from natcoord_jax.control.attempts import HEADER, printed
 from natcoord_jax.control.guess import GUESS, unknowns_of
 from natcoord_jax.control.iterate import largest
+from natcoord_jax.control.motion import motion
 from natcoord_jax.control.problem import PROBLEM, OptimalControl, numeric
 from natcoord_jax.control.results import Outcome
 from natcoord_jax.control.solution import Row, Solution
-from natcoord_jax.control.transcription import Unknowns, end, first_node, held_inputs, packed
+from natcoord_jax.control.transcription import Unknowns, followed, held_inputs
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.compiled import compiled
 from natcoord_jax.core.kinds import FLAG, Concrete, Kind, is_other
 from natcoord_jax.core.numeric import Number, Whole
-from natcoord_jax.stepping.simulate import simulate
 from natcoord_jax.xla.waiting import Stopwatch
 
 
@@ -43,22 +42,10 @@ def _constraints(
 ) -> tuple[Array, Array, Array, Array]:
     """Cost, residual of the goal, excesses, and the result code of the simulation."""
     coefficients, free = variables
-    system, dt = problem.applied(free)
     inputs = held_inputs(problem, coefficients)
-    trajectory = simulate(system, problem.start(free), dt=dt, inputs=inputs, throw=False)
-    states = trajectory.states
-    before, after = (jax.tree.map(itemgetter(s), states) for s in (slice(None, -1), slice(1, None)))
-
-    def running(state: Any, u: Array) -> Array:
-        return problem.cost.running(system, state, u, state.t)
-
-    rates = jax.vmap(running)(before, inputs) + jax.vmap(running)(after, inputs)
-    excess = jax.vmap(lambda s, u: problem.bounds.excess(system, s, u, s.t))(after, inputs)
-    leading = coefficients[: problem.inputs.degree]
-    last = first_node(problem, free, leading)
-    last = type(last)(packed(jax.tree.map(lambda x: x[-1], states)), free, last.register)
-    found = end(problem, last)
-    cost = 0.5 * dt * jnp.sum(rates) + found.cost
+    trajectory = motion(problem, free, inputs, throw=False)
+    costs, excess, found = followed(problem, free, trajectory.states, inputs)
+    cost = jnp.sum(costs) + found.cost
     return cost, found.missing, jnp.concatenate([excess.reshape(-1), found.excess]), trajectory.result
 
 

@@ -35,7 +35,8 @@ def sizes(problem: OptimalControl, path: Path, unknowns: Unknowns) -> Point:
     nodes, q = path.nodes, problem.state.q.size
     bounds = (0, q, 2 * q, 2 * q + problem.state.coordinates.size, nodes.x.shape[1])
     pieces = [_largest(nodes.x[:, a:b]) for a, b in zip(bounds[:-1], bounds[1:])]
-    node = jnp.concatenate([*pieces, jnp.ones(nodes.free.shape[1]), _largest(nodes.register)])
+    others = [_largest(x) for x in jax.tree.leaves(nodes)[2:]]
+    node = jnp.concatenate([*pieces, jnp.ones(nodes.free.shape[1]), *others])
     return Point(node, _largest(entering(problem, unknowns.coefficients)), _largest(unknowns.y))
 
 

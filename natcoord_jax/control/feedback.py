@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.control.guess import GUESS, unknowns_of
 from natcoord_jax.control.iterate import Iterate, Options
+from natcoord_jax.control.motion import joined
 from natcoord_jax.control.problem import PROBLEM, OptimalControl, numeric
 from natcoord_jax.control.quadratic import model
 from natcoord_jax.control.run import OPTIONS, optimise_jit
@@ -121,21 +122,26 @@ def regulator(
         ValueError: for a solution without an iterate or with splines as inputs.
     """
     problem, iterate = solution.problem, solution.iterate
-    if iterate is None or problem.inputs.degree or problem.inputs.every > 1:
-        raise ValueError("the regulator needs a solution of `optimise` with inputs held over each step")
-    motions, channels = (
+    if iterate is None or problem.inputs.degree or problem.inputs.every > 1 or not problem.uniform:
+        raise ValueError(
+            "the regulator needs a solution of `optimise` with equal steps and inputs held over each"
+        )
+    motions, decided, channels = (
         (problem.system.structure.unknowns, "free motion"),
-        (problem.channels, "input channel"),
+        (problem.channels, "input that is decided"),
+        (len(problem.system.structure.inputs), "input channel"),
     )
     displaced, quick, cost, lower, upper = (
         for_each(value, count, f"regulator: {name}", each)
         for name, value, (count, each) in (
-            ("displacement", displacement, motions), ("rate", rate, motions), ("effort", effort, channels),
+            ("displacement", displacement, motions), ("rate", rate, motions), ("effort", effort, decided),
             ("limits", limits[0], channels), ("limits", limits[1], channels),
         )
     )  # fmt: skip
     weights, limits = (displaced, quick, cost, jnp.asarray(final, float)), (lower, upper)
     gains, back = _gains(problem, iterate, weights)
+    if problem.inputs.shared is not None:
+        gains = jnp.einsum("cm,kmz->kcz", problem.inputs.shared, gains)
     dt, nodes = jnp.asarray(solution.dt), iterate.path.nodes.x[:-1]
     return Feedback(jnp.asarray(solution.inputs), gains, back, nodes, dt, problem.state.t, limits)
 
@@ -181,10 +187,17 @@ def receding_horizon(
         The motion of the plant, and how each optimisation ended.
 
     Raises:
-        ValueError: for a problem with free time or splines, or a plant of another structure.
+        ValueError: for a problem with free time, splines or a memory, or a plant of another structure.
     """
-    if problem.free_time or problem.inputs.degree or problem.inputs.every > 1:
-        raise ValueError("receding_horizon needs a fixed final time and inputs held over each step")
+    if problem.free_time or problem.inputs.degree or problem.inputs.every > 1 or not problem.uniform:
+        raise ValueError(
+            "receding_horizon needs a fixed final time, equal steps and inputs held over each step"
+        )
+    if sum(problem.memory_sizes):
+        raise ValueError(
+            "receding_horizon starts anew at every update: it takes no goals, costs or bounds that look at "
+            "the way there (integrals, waypoints, turns)"
+        )
     if plant.structure != problem.system.structure:
         raise ValueError("the plant has another structure than the system of the problem")
     problem = numeric(problem)
@@ -205,7 +218,7 @@ def receding_horizon(
         pieces.append(piece)
         codes.append(found.code)
         iterations.append(found.iteration)
-    return Horizons(_joined(pieces), jnp.stack(codes), jnp.stack(iterations))
+    return Horizons(joined(pieces), jnp.stack(codes), jnp.stack(iterations))
 
 
 def _shifted(found: Iterate, left: int) -> Any:
@@ -215,13 +228,3 @@ def _shifted(found: Iterate, left: int) -> Any:
     k = jnp.clip((at * steps).astype(int), 0, steps - 1)
     unknowns = found.unknowns
     return eqx.tree_at(lambda u: (u.coefficients, u.y), unknowns, (unknowns.coefficients[k], unknowns.y[k]))
-
-
-def _joined(pieces: list[Trajectory]) -> Trajectory:
-    """Trajectories one after the other."""
-    states = [pieces[0].states, *(jax.tree.map(lambda x: x[1:], p.states) for p in pieces[1:])]
-    whole = jax.tree.map(lambda *x: jnp.concatenate(x), *states)
-    inputs = jnp.concatenate([p.inputs for p in pieces])
-    last = pieces[-1]
-    worst = jnp.max(jnp.stack([p.result for p in pieces]))
-    return eqx.tree_at(lambda t: (t.states, t.inputs, t.result), last, (whole, inputs, worst))

@@ -1,4 +1,4 @@
-"""Where an optimal control problem ends: terminal equalities, joined with `&`.
+"""Where an optimal control problem ends: conditions on the final state and on the way there, joined with `&`.
 
 A goal counts independent numbers: three of an attitude, and as many rates as there are free motions. Rates
 are those with the momenta of the state: the step (57) also carries a little velocity normal to the
@@ -10,14 +10,26 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
+from natcoord_jax.control.free_motions import owners
+from natcoord_jax.control.goal_base import GOAL as GOAL
+from natcoord_jax.control.goal_base import All as All
+from natcoord_jax.control.goal_base import Goal as Goal
+from natcoord_jax.control.goal_links import Integral as Integral
+from natcoord_jax.control.goal_links import Linked as Linked
+from natcoord_jax.control.goal_links import Periodic as Periodic
+from natcoord_jax.control.goal_links import Turned as Turned
+from natcoord_jax.control.goal_places import At as At
+from natcoord_jax.control.goal_places import Within as Within
+from natcoord_jax.control.goal_rest import Equilibrium as Equilibrium
+from natcoord_jax.control.goal_rest import Undeformed as Undeformed
+from natcoord_jax.control.memory import Ending as Ending
 from natcoord_jax.control.tangent import steady_rates
-from natcoord_jax.core.arguments import Part, is_a
+from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.callables import Function
 from natcoord_jax.core.handles import Handle, named
-from natcoord_jax.core.kinds import BODY_NAME, JOINT_NAME, NAME, FunctionOf, Several, of
+from natcoord_jax.core.kinds import BODY_NAME, JOINT_NAME, NAME, FunctionOf
 from natcoord_jax.core.numeric import COMPONENTS, Number, Numbers, Rotations, Whole
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.rotations import angular_velocity, from_quaternion, to_rotation_vector
@@ -27,42 +39,11 @@ ROTATION = Numbers((4,)) | Rotations()
 RESIDUAL = FunctionOf("(state) -> number or vector")
 
 
-class Goal(Part):
-    """Base of all goals: equations that the final state has to fulfil."""
-
-    def residual(self, system: System, state: State) -> Float[Array, " n"]:
-        """What is missing; zero where the goal is reached."""
-        return jnp.zeros(0)
-
-    def labels(self, system: System) -> tuple[str, ...]:
-        """Name and unit of each number of the residual."""
-        return ()
-
-    def __and__(self, other: "Goal") -> "Goal":
-        if not isinstance(other, Goal):
-            return NotImplemented
-        return All((self, other))
-
-
-class All(Goal):
-    """Several goals at once."""
-
-    parts: tuple[Goal, ...] = eqx.field(metadata=is_a(Several(of("a goal", Goal))))
-
-    def residual(self, system: System, state: State) -> Float[Array, " n"]:
-        """Residuals of all parts."""
-        return jnp.concatenate([part.residual(system, state) for part in self.parts])
-
-    def labels(self, system: System) -> tuple[str, ...]:
-        """Labels of all parts."""
-        return tuple(label for part in self.parts for label in part.labels(system))
-
-
 class Attitude(Goal):
     """Attitude of a body: three numbers, the rotation vector that is missing [rad], the short way round.
 
     At half a turn both ways are as short, and it is one of them. Its slope is zero nowhere, so that each
-    start shows the way to the goal.
+    start shows the way to the goal. It knows no number of turns: those are counted by `nc.goal.Turned`.
 
     Attributes:
         body: handle or name.
@@ -187,17 +168,21 @@ class Rest(Goal):
     """No motion at all: the rates of all free motions of the spanning tree are zero.
 
     That is six numbers of a free body and one of a hinge, not twelve a body. Some may follow from others,
-    as the base of a spacecraft rests when its wheels do and there is no momentum; the solver sees that.
+    as the base of a spacecraft rests when its wheels do and there is no momentum; the solver sees that. What
+    is flexible springs back from where it rests: see `nc.goal.Undeformed` and `nc.goal.Equilibrium`.
     """
 
     def residual(self, system: System, state: State) -> Float[Array, " n"]:
         """Rates of the free motions."""
         return steady_rates(system, state)
 
+    def sizes(self, system: System) -> tuple[int, int]:
+        """As many as there are free motions."""
+        return system.structure.unknowns, 0
+
     def labels(self, system: System) -> tuple[str, ...]:
         """The body each free motion belongs to."""
-        owners = [int(i) for i in np.asarray(system.tree.slot_of) // 7]
-        return tuple(f"rest of {system.structure.bodies[b]!r} [m/s or rad/s]" for b in owners)
+        return tuple(f"rest of {name!r} [m/s or rad/s]" for name in owners(system))
 
 
 class Equal(Goal):
@@ -220,7 +205,3 @@ class Equal(Goal):
     def labels(self, system: System) -> tuple[str, ...]:
         """The name, numbered if there are several."""
         return (self.name,) if self.count == 1 else tuple(f"{self.name} [{k}]" for k in range(self.count))
-
-
-GOAL = of("a goal, as nc.goal.Rest()", Goal)
-"""What an argument may be."""

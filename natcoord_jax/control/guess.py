@@ -10,7 +10,17 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.control.tangent import steady_rates
-from natcoord_jax.control.transcription import Node, Slice, Unknowns, end, roll, slices, stage
+from natcoord_jax.control.transcription import (
+    Node,
+    Slice,
+    Unknowns,
+    end,
+    roll,
+    simulated,
+    slices,
+    stage,
+    standing_excess,
+)
 from natcoord_jax.core.arguments import Part, is_a
 from natcoord_jax.core.compiled import compiled
 from natcoord_jax.core.kinds import of
@@ -80,11 +90,23 @@ def unknowns_of(problem: OptimalControl, guess: Any, lifted: bool) -> Unknowns:
     free = jnp.zeros_like(reference)
     if guess.free is not None:
         free = (_shaped(guess.free, reference.shape, "free") - reference) / scale
-    shape = (problem.steps, problem.channels)
-    inputs = jnp.zeros(shape) if guess.inputs is None else _shaped(guess.inputs, shape, "inputs")
     structure = problem.system.structure
+    shape = (problem.steps, len(structure.inputs))
+    inputs = jnp.zeros(shape) if guess.inputs is None else _shaped(guess.inputs, shape, "inputs")
     y = jnp.zeros((problem.steps, structure.unknowns + structure.multipliers))
-    unknowns = Unknowns(problem.inputs.fitted(inputs), free, y)
+    decided = problem.inputs.decided(inputs, problem.channels)
+    unknowns = _moving(problem, guess, Unknowns(problem.inputs.fitted(decided), free, y), lifted)
+    unknown = any(not number.given for number in problem.cost.parameters())
+    return with_peaks(problem, unknowns, lifted) if unknown and guess.free is None else unknowns
+
+
+def _moving(problem: OptimalControl, guess: Guess, unknowns: Unknowns, lifted: bool) -> Unknowns:
+    """Unknowns with rates, and with inputs if none are given, as far as the method wants them."""
+    structure = problem.system.structure
+    if not structure.inputs:
+        # There is nothing to make another motion with than the one that follows from the start.
+        found, whole, _ = _simulated(problem, unknowns)
+        return jax.tree.map(lambda x, y: jnp.where(whole, x, y), found, unknowns)
     if not lifted or structure.solver != "reduced":
         return unknowns
     if guess.rates is None:
@@ -93,17 +115,38 @@ def unknowns_of(problem: OptimalControl, guess: Any, lifted: bool) -> Unknowns:
     given = jnp.asarray(guess.rates, float)
     if given.shape == (structure.unknowns,):
         steady = jnp.broadcast_to(given, (problem.steps, structure.unknowns))
-        return with_rates(unknowns, taken_up(problem, steady))
+        return with_rates(unknowns, taken_up(problem, unknowns.free, steady))
     return with_rates(unknowns, _shaped(given, (problem.steps, structure.unknowns), "rates"))
 
 
-def taken_up(problem: OptimalControl, rates: Float[Array, "steps n"]) -> Float[Array, "steps n"]:
+@compiled
+def _simulated(problem: OptimalControl, unknowns: Unknowns) -> tuple[Unknowns, Array, Array]:
+    return simulated(problem, unknowns, False)
+
+
+@compiled
+def with_peaks(problem: OptimalControl, unknowns: Unknowns, lifted: bool) -> Unknowns:
+    """The unknowns with free numbers that the cost adds and that were not given as their motion has them."""
+    first = len(problem.free) - len(problem.cost.parameters())
+    path = roll(problem, simulated(problem, unknowns, lifted)[0])
+    # Excesses grow by one over its unit as such a number gets smaller.
+    labels, names = problem.path_labels, problem.cost.labels()
+    found = path.stages.excess[:, len(labels) - len(names) :]
+    free = unknowns.free
+    for k, number in enumerate(problem.cost.parameters()):
+        free = free.at[first + k].add(0.0 if number.given else jnp.max(found[:, k]))
+    return eqx.tree_at(lambda u: u.free, unknowns, free)
+
+
+def taken_up(
+    problem: OptimalControl, free: Float[Array, " p"], rates: Float[Array, "steps n"]
+) -> Float[Array, "steps n"]:
     """Mean rates of steps near given ones that the initial rates lead to without a jerk.
 
     The rates at the end of a step are twice the mean less those at its start: a mean that jumps makes them
     swing about the mean from step to step, for ever.
     """
-    first = steady_rates(problem.system, problem.state)[None]
+    first = steady_rates(problem.applied(free)[0], problem.start(free))[None]
     return free_of_swings(jnp, first, rates)
 
 
@@ -163,9 +206,8 @@ def _towards_goal(problem: OptimalControl, unknowns: Unknowns) -> Unknowns:
     """Rates that lead to the goal: constant ones, or such as start and end at rest where it asks for that."""
     constant = _leading_to_goal(problem, unknowns)
     part = (jnp.arange(problem.steps) + 0.5)[:, None] / problem.steps
-    ways = [
-        with_rates(unknowns, taken_up(problem, w)) for w in (constant, 6.0 * part * (1.0 - part) * constant)
-    ]
+    rates = constant, 6.0 * part * (1.0 - part) * constant
+    ways = [with_rates(unknowns, taken_up(problem, unknowns.free, w)) for w in rates]
     missed = jnp.stack([_missed(problem, way) for way in ways])
     better = jnp.nan_to_num(missed[1], nan=jnp.inf) < missed[0]
     return jax.tree.map(lambda x, y: jnp.where(better, y, x), *ways)
@@ -260,9 +302,14 @@ def goal_scale(problem: OptimalControl, unknowns: Unknowns) -> Float[Array, " c"
 
 def input_ranges(problem: OptimalControl, unknowns: Unknowns) -> Float[Array, " m"]:
     """Half the ranges of the inputs; for those without limits, the largest input of the guess, or 1."""
-    system, state = problem.system, problem.start(unknowns.free)
-    idle = jnp.zeros(problem.channels)
-    steep = jax.jacfwd(lambda u: problem.bounds.excess(system, state, u, state.t))(idle)
+    state, idle = problem.start(unknowns.free), jnp.zeros(problem.channels)
+    channels = len(problem.system.structure.inputs)
+
+    def excess(decided: Array) -> Array:
+        u = problem.inputs.driven(decided, channels)
+        return standing_excess(problem, state, u, unknowns.free)
+
+    steep = jax.jacfwd(excess)(idle)
     steepest = jnp.max(jnp.abs(steep), axis=0, initial=0.0)
     largest = jnp.max(jnp.abs(unknowns.coefficients))
     usual = jnp.where(largest > 0, largest, 1.0)
@@ -274,8 +321,8 @@ def stretched(problem: OptimalControl, unknowns: Unknowns, factor: float) -> Unk
     if not problem.free_time:
         return unknowns
     reference, scale = problem.references()
-    longer = factor * problem.values(unknowns.free)[0]
-    longer = jnp.clip(longer, *(x[0] for x in problem.limits()))
-    return eqx.tree_at(
-        lambda u: u.free, unknowns, unknowns.free.at[0].set((longer - reference[0]) / scale[0])
-    )
+    count = problem.times
+    longer = factor * problem.values(unknowns.free)[:count]
+    longer = jnp.clip(longer, *(x[:count] for x in problem.limits()))
+    changed = (longer - reference[:count]) / scale[:count]
+    return eqx.tree_at(lambda u: u.free, unknowns, unknowns.free.at[:count].set(changed))

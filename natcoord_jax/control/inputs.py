@@ -1,15 +1,17 @@
 """How a torque history is made of a few numbers: splines of the input channels, held over each step."""
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from natcoord_jax.core.arguments import Part, checked, is_a
 from natcoord_jax.core.kinds import of
-from natcoord_jax.core.numeric import Whole
+from natcoord_jax.core.numeric import Numbers, Whole
 
 
 class Shaping(NamedTuple):
@@ -47,12 +49,19 @@ def _basis(degree: int, place: float) -> np.ndarray:
     return values
 
 
+def _numbers(shared: Any) -> Any:
+    """As an array; none stays none."""
+    return shared if shared is None or isinstance(shared, jax.Array) else np.asarray(shared, float)
+
+
 class Spline(Part):
     """Inputs as uniform B-splines over intervals of some steps, taken at the middle of each step.
 
     Attributes:
         degree: 0 holds a value over each interval, 1 is piecewise linear, 3 a cubic spline.
         every: steps of an interval.
+        shared: what the channels of the system get of each input that is decided (channels, decided), see
+            `shared`; None: every channel has its own.
 
     Example:
         >>> import natcoord_jax as nc
@@ -62,11 +71,41 @@ class Spline(Part):
 
     degree: int = eqx.field(default=0, kw_only=True, static=True, metadata=is_a(Whole(0)))
     every: int = eqx.field(default=1, kw_only=True, static=True, metadata=is_a(Whole(1)))
+    shared: Any = eqx.field(
+        default=None, kw_only=True, converter=_numbers, metadata=is_a(Numbers((None, None)))
+    )
 
     @checked("coefficients", steps=Whole(1))
     def coefficients(self, steps: int) -> int:
         """Number of coefficients of each input channel."""
         return -(-steps // self.every) + self.degree
+
+    def count(self, channels: int) -> int:
+        """How many inputs are decided for so many channels.
+
+        Raises:
+            ValueError: where `shared` is for another number of channels.
+        """
+        if self.shared is None:
+            return channels
+        if self.shared.shape[0] != channels:
+            raise ValueError(
+                f"inputs: shared has {self.shared.shape[0]} rows; pass one for each of the {channels} input "
+                "channels of the system, in the order of `system.structure.inputs`"
+            )
+        return self.shared.shape[1]
+
+    def driven(self, decided: Float[Array, "*steps m"], channels: int) -> Float[Array, "*steps inputs"]:
+        """Inputs of so many channels from those that are decided; what is decided for none acts on none."""
+        if self.shared is not None:
+            return decided @ jnp.asarray(self.shared).T
+        return decided if channels else decided[..., :0]
+
+    def decided(self, inputs: Float[Array, "*steps inputs"], count: int) -> Float[Array, "*steps m"]:
+        """Decided inputs, so many, nearest to inputs of the channels."""
+        if self.shared is not None:
+            return inputs @ jnp.linalg.pinv(jnp.asarray(self.shared)).T
+        return inputs if inputs.shape[-1] else jnp.zeros((*inputs.shape[:-1], count))
 
     def matrix(self, steps: int) -> Float[np.ndarray, "steps coefficients"]:
         """Inputs of the steps per coefficient."""
@@ -77,8 +116,8 @@ class Spline(Part):
             found[k, interval : interval + self.degree + 1] = _basis(self.degree, place)
         return found
 
-    def fitted(self, inputs: Any) -> Float[Array, "coefficients inputs"]:
-        """Coefficients nearest to the inputs (steps, inputs) of all steps."""
+    def fitted(self, inputs: Any) -> Float[Array, "coefficients m"]:
+        """Coefficients nearest to the decided inputs (steps, m) of all steps."""
         inputs = jnp.asarray(inputs, float)
         if self.degree == 0 and self.every == 1:
             return inputs
@@ -125,3 +164,25 @@ def piecewise_linear(every: int = 1) -> Spline:
 def cubic(every: int = 10) -> Spline:
     """Inputs as cubic B-splines, twice continuously differentiable, over intervals of `every` steps."""
     return Spline(degree=3, every=every)
+
+
+@checked(matrix=Numbers((None, None)), spline=SPLINE)
+def shared(matrix: Any, spline: Spline | None = None) -> Spline:
+    """Inputs that several channels share: one that drives several motors, or synergies of many.
+
+    The channels get matrix @ w of the inputs w that are decided. With copies of a system in one scene, of
+    other masses or stiffnesses, one history of inputs is found that serves all of them. Costs, bounds and
+    `solution.inputs` are of the channels, so that `nc.cost.Effort()` counts each copy; a weight for each
+    channel counts some.
+
+    Args:
+        matrix: what each channel gets of each decided input (channels, decided), rows in the order of
+            `system.structure.inputs`.
+        spline: how the decided inputs run over the steps; None: held over each.
+
+    Example:
+        >>> import natcoord_jax as nc
+        >>> nc.inputs.shared([[1.0], [1.0]], nc.inputs.cubic(5)).count(2)
+        1
+    """
+    return dataclasses.replace(spline or Spline(), shared=matrix)

@@ -67,6 +67,9 @@ def linearised(
     by_first = first_gradient(problem, unknowns, ravel_pytree(jax.tree.map(lambda x: x[0], worth.nodes))[0])
     count = unknowns.free.size
     scale = _gradient_scale(problem, unknowns, path, multipliers.path)
+    if not problem.system.structure.inputs:
+        # What is decided then acts on nothing but its own cost, and is zero up to round-off.
+        scale = unit
     by_coefficients = largest(by_w[:: problem.inputs.every], by_first[count:]) / scale
     stationarity = jnp.maximum(by_coefficients, largest(by_first[:count]) / unit)
     corrections = largest(jnp.einsum("kij,kj->ki", jacobians.inverses, path.stages.residual))

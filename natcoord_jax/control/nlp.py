@@ -90,10 +90,11 @@ def program_of(problem: OptimalControl, first: Unknowns) -> NonlinearProgram:
     system, steps = problem.system, range(problem.steps)
     names = [f"equation {k} of step {step}" for step in steps for k in range(path.stages.residual.shape[1])]
     names += problem.goal.labels(system)
-    names += [f"{name}, step {step}" for step in steps for name in problem.bounds.labels(system)]
-    names += [f"bound {k} of what is free" for k in range(path.end.excess.size)]
+    names += [f"{name}, step {step}" for step in steps for name in problem.path_labels]
+    names += problem.end_labels
     # Momenta of short steps are small numbers beside goals and bounds: forces are not.
-    weights = jnp.ones(equations + inequalities).at[: path.stages.residual.size].set(1.0 / problem.dt)
+    short = jnp.repeat(1.0 / problem.lengths(jnp.zeros(len(problem.free))), path.stages.residual.shape[1])
+    weights = jnp.ones(equations + inequalities).at[: short.size].set(short)
 
     def unknowns(x: Any) -> Unknowns:
         return unflat(jnp.asarray(x, float))

@@ -1,6 +1,5 @@
 """An optimal control problem: a system, a horizon, what to make small, where to end, what to respect."""
 
-from collections.abc import Callable
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -13,10 +12,12 @@ from natcoord_jax.control.bounds import BOUND, Bound
 from natcoord_jax.control.cost import COST, Cost
 from natcoord_jax.control.goal import GOAL, Goal
 from natcoord_jax.control.inputs import SPLINE, Spline
+from natcoord_jax.control.memory import Carrier, Ending, Step
+from natcoord_jax.control.mesh import durations, mesh_of
+from natcoord_jax.control.parameters import FreeNumber
 from natcoord_jax.core.arguments import Part, is_a
-from natcoord_jax.core.callables import Function
 from natcoord_jax.core.checks import is_concrete
-from natcoord_jax.core.kinds import FLAG, NAME, FunctionOf, Several, of
+from natcoord_jax.core.kinds import FLAG, Several, of
 from natcoord_jax.core.numeric import Number, Numbers, Whole
 from natcoord_jax.core.state import STATE, State
 from natcoord_jax.model.model import SYSTEM
@@ -24,82 +25,22 @@ from natcoord_jax.model.tree import SLOTS
 from natcoord_jax.stepping.assemble import assemble
 from natcoord_jax.system import System
 
-
-class Parameter(Part):
-    """A number of the system that is free: a stiffness, a mass, a length.
-
-    Attributes:
-        name: for reports.
-        where: which leaf of the system, as for `eqx.tree_at`: system -> array. For more than one place,
-            pass `apply` instead.
-        index: place in the leaf; equal effects and bodies are stacked.
-        lower: lower bound; None: none.
-        upper: upper bound; None: none.
-        apply: (system, value) -> system, for numbers that act in several places; needs `value`.
-        value: initial value, where it cannot be read from the leaf.
-        moves: whether it moves geometry, so that the initial state is assembled anew.
-
-    Example:
-        >>> import natcoord_jax as nc
-        >>> mass = nc.Parameter("mass", where=lambda system: system.mass, index=(0, 0, 0), lower=1.0)
-    """
-
-    name: str = eqx.field(static=True, metadata=is_a(NAME))
-    where: Callable[[System], Array] | None = eqx.field(
-        default=None, kw_only=True, converter=Function.of, metadata=is_a(FunctionOf("(system) -> array"))
-    )
-    index: Any = eqx.field(default=(), kw_only=True, static=True, metadata=is_a(Whole() | Several(Whole())))
-    lower: float | None = eqx.field(default=None, kw_only=True, static=True, metadata=is_a(Number()))
-    upper: float | None = eqx.field(default=None, kw_only=True, static=True, metadata=is_a(Number()))
-    apply: Callable[[System, Array], System] | None = eqx.field(
-        default=None,
-        kw_only=True,
-        converter=Function.of,
-        metadata=is_a(FunctionOf("(system, value) -> system")),
-    )
-    value: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Number()))
-    moves: bool = eqx.field(default=False, kw_only=True, static=True, metadata=is_a(FLAG))
-
-    def __check_init__(self):
-        """Refuse a parameter that is nowhere, or has no room."""
-        if (self.where is None) == (self.apply is None) or (self.where is None and self.value is None):
-            raise ValueError(f"parameter {self.name!r}: pass `where`, or `apply` together with `value`")
-        if self.lower is not None and self.upper is not None and not self.lower < self.upper:
-            raise ValueError(
-                f"parameter {self.name!r}: the lower bound {self.lower:g} is not below the upper bound "
-                f"{self.upper:g}; pass bounds with room between them"
-            )
-
-    def initial(self, system: System) -> Float[Array, ""]:
-        """Value at the start of the optimisation."""
-        if self.value is not None or self.where is None:
-            return jnp.asarray(self.value, float)
-        return jnp.asarray(self._leaf(system)[1])[self.index]
-
-    def applied(self, system: System, value: Float[Array, ""]) -> System:
-        """The system with another value."""
-        if self.where is None:
-            assert self.apply is not None
-            return self.apply(system, value)
-        number, leaf = self._leaf(system)
-        leaves, structure = jax.tree.flatten(system)
-        leaves[number] = jnp.asarray(leaf).at[self.index].set(value)
-        return jax.tree.unflatten(structure, leaves)
-
-    def _leaf(self, system: System) -> tuple[int, Array]:
-        """Which leaf of the system it is a place of, and that leaf."""
-        leaves, structure = jax.tree.flatten(system)
-        assert self.where is not None
-        number: Any = self.where(jax.tree.unflatten(structure, range(len(leaves))))
-        if not isinstance(number, int):
-            raise ValueError(
-                f"parameter {self.name!r}: `where` gives {type(number).__name__}, which is no leaf of the "
-                "system; return one of its arrays as it is, and a place in it as `index`, or pass `apply`"
-            )
-        return number, leaves[number]
+PARAMETERS = Several(of("nc.Parameter(...), nc.InitialCoordinate(...) or nc.InitialRate(...)", FreeNumber))
+PHASES = Several(Whole(1))
+TIMES = FLAG | Numbers((2,), "positive") | Several(Numbers((2,), "positive"))
 
 
-PARAMETERS = Several(of("nc.Parameter(...)", Parameter))
+def _numbers(dt: Any) -> Any:
+    """One number as it is, several as an array."""
+    return jnp.asarray(dt, float) if np.ndim(dt) else dt
+
+
+def _hashable(times: Any) -> Any:
+    """Limits of times as tuples."""
+    if isinstance(times, bool | np.bool_):
+        return bool(times)
+    values = np.asarray(times, float).tolist()
+    return tuple(tuple(x) if isinstance(x, list) else x for x in values)
 
 
 class OptimalControl(Part):
@@ -109,16 +50,19 @@ class OptimalControl(Part):
     scheme (57) at this step, not for an approximation of it.
 
     Attributes:
-        system: compiled system with input channels.
+        system: compiled system, with input channels unless something else is free.
         state: initial state.
-        dt: step [s]; with `free_time` its first guess.
-        steps: number of steps.
+        dt: step [s], one number, one for each phase or one for each step; with `free_time` its first guess.
+        steps: number of steps; of several phases one number for each, as (20, 20), and then their sum.
+        phases: number of steps of each phase, as `steps` has said; not to be given.
         cost: what to make small.
         goal: what the final state has to fulfil.
         bounds: what has to hold at the end of every step.
         inputs: how inputs are made of coefficients; default: held over each step.
-        parameters: numbers of the system that are free as well.
+        parameters: numbers of the system (`nc.Parameter`) and of the initial state (`nc.InitialCoordinate`,
+            `nc.InitialRate`) that are free as well.
         free_time: whether the step, and so the final time, is free; or (lower, upper) of the final time [s].
+            Of several phases each has a free duration; limits are those of each, or ((lower, upper), ...).
             It needs something that makes waiting cost or forbids it: `nc.cost.Duration`, a running cost, or
             an upper bound (least effort takes all the time there is); and limits of the inputs where time
             is what is made small. `dt` is where it starts; a time too short for the limits is made longer
@@ -146,65 +90,128 @@ class OptimalControl(Part):
 
     system: System = eqx.field(metadata=is_a(SYSTEM))
     state: State = eqx.field(metadata=is_a(STATE))
-    dt: Any = eqx.field(kw_only=True, metadata=is_a(Number("positive")))
-    steps: int = eqx.field(kw_only=True, static=True, metadata=is_a(Whole(1)))
+    dt: Any = eqx.field(
+        kw_only=True, converter=_numbers, metadata=is_a(Number("positive") | Numbers((None,), "positive"))
+    )
+    steps: int = eqx.field(kw_only=True, static=True, metadata=is_a(Whole(1) | Several(Whole(1), 1)))
+    phases: tuple[int, ...] = eqx.field(default=(), kw_only=True, static=True, metadata=is_a(PHASES))
     cost: Cost = eqx.field(default_factory=Cost, kw_only=True, metadata=is_a(COST))
     goal: Goal = eqx.field(default_factory=Goal, kw_only=True, metadata=is_a(GOAL))
     bounds: Bound = eqx.field(default_factory=Bound, kw_only=True, metadata=is_a(BOUND))
     inputs: Spline = eqx.field(default_factory=Spline, kw_only=True, metadata=is_a(SPLINE))
-    parameters: tuple[Parameter, ...] = eqx.field(
+    parameters: tuple[FreeNumber, ...] = eqx.field(
         default=(), kw_only=True, converter=tuple, metadata=is_a(PARAMETERS)
     )
     free_time: Any = eqx.field(
-        default=False, kw_only=True, static=True, metadata=is_a(FLAG | Numbers((2,), "positive"))
+        default=False, kw_only=True, static=True, converter=_hashable, metadata=is_a(TIMES)
     )
 
     makes_arrays: ClassVar[bool] = True
 
+    def __post_init__(self):
+        """Tell the phases from `steps`."""
+        given: Any = self.steps
+        if np.ndim(given):
+            self.phases = tuple(int(count) for count in given)
+            self.steps = sum(self.phases)
+        else:
+            self.phases = tuple(self.phases) or (int(given),)
+        if len(self.phases) == 1:
+            # A copy with another number of steps has that one.
+            self.phases = (int(self.steps),)
+
     def __check_init__(self):
         """Refuse what is no problem."""
-        channels = self.system.structure.inputs
-        if not channels:
+        if not self.system.structure.inputs and not self.free:
             raise ValueError(
-                "the system has no input channels; add a JointTorque or another actuator to the scene"
+                "the system has no input channels, and nothing else is free; add a JointTorque or another "
+                "actuator to the scene, or pass parameters"
             )
-        if self.free_time is not False and self.free_time is not True:
-            lower, upper = self.free_time
-            if not 0 < lower < upper:
+        count, _ = len(self.phases), self.channels
+        if sum(self.phases) != self.steps:
+            raise ValueError(
+                f"steps is {self.steps}, and the phases have {self.phases}; pass the steps of each, as "
+                f"steps={self.phases}"
+            )
+        if np.ndim(self.dt) and self.dt.shape[0] not in (count, self.steps):
+            raise ValueError(
+                f"dt has {self.dt.shape[0]} numbers; pass one, one for each of {count} phases or one for "
+                f"each of {self.steps} steps"
+            )
+        for lower, upper in self._time_limits():
+            if not 0 <= lower < (np.inf if upper is None else upper):
                 raise ValueError(f"free_time is ({lower}, {upper}) s; pass 0 < lower < upper, or True")
-        names = [parameter.name for parameter in self.parameters]
-        if len(set(names)) != len(names):
-            raise ValueError(f"parameters have the names {names}; give each its own")
+        furthest = max(carrier.furthest() for carrier in self.carriers)
+        if furthest > self.steps:
+            raise ValueError(
+                f"goal.At: step {furthest} is beyond the last of {self.steps} steps; pass one of them"
+            )
+        if len(set(self.free)) != len(self.free):
+            raise ValueError(f"what is free has the names {list(self.free)}; give each its own")
         if is_concrete(eqx.filter((self.system, self.state), eqx.is_array)):
             self._check_shapes()
 
     def _check_shapes(self) -> None:
-        u, t = jnp.zeros(len(self.system.structure.inputs)), jnp.zeros(())
-        cost = jax.eval_shape(lambda s: self.cost.running(self.system, s, u, t), self.state)
-        end = jax.eval_shape(lambda s: self.cost.terminal(self.system, s), self.state)
-        if cost.shape != () or end.shape != ():
-            raise ValueError(f"the cost has shape {cost.shape} and at the end {end.shape}; return a scalar")
-        missing = jax.eval_shape(lambda s: self.goal.residual(self.system, s), self.state)
-        excess = jax.eval_shape(lambda s: self.bounds.excess(self.system, s, u, t), self.state)
+        u, zero = jnp.zeros(len(self.system.structure.inputs)), jnp.zeros(())
+        free = {name: zero for name in self.free}
+        number = jnp.zeros((), int)
+        step = Step(number, zero, self.state, self.state, u, jnp.zeros(self.looked_back), zero, free)
+        memory = jnp.zeros(sum(self.memory_sizes))
+
+        def end(memory: Array) -> tuple[Array, Array, Array]:
+            ending = Ending(self.state, self.state, memory, free)
+            goal, cost, _ = self.memories(memory)
+            excess = self.goal.excess(self.system, ending._replace(memory=goal))
+            missing = self.goal.missing(self.system, ending._replace(memory=goal))
+            return missing, excess, self.cost.of_end(self.system, ending._replace(memory=cost))
+
+        running = jax.eval_shape(lambda m: self.cost.of_step(self.system, self.memories(m)[1], step), memory)
+        missing, beyond, terminal = jax.eval_shape(end, memory)
+        if running.shape != () or terminal.shape != ():
+            raise ValueError(
+                f"the cost has shape {running.shape} and at the end {terminal.shape}; return a scalar"
+            )
+        excess = jax.eval_shape(lambda m: self.path_excess(self.system, m, step), memory)
         for what, found, names in (
             ("goal", missing, self.goal.labels(self.system)),
-            ("bounds", excess, self.bounds.labels(self.system)),
+            ("goal within limits", beyond, self.goal.limits(self.system)),
+            ("bounds", excess, self.path_labels),
         ):
             if found.shape != (len(names),):
                 raise ValueError(
                     f"the {what} returns shape {found.shape} for the labels {names}; make them agree"
                 )
+        jax.eval_shape(lambda m: self.carried(self.system, m, step), memory)
 
     @property
     def channels(self) -> int:
-        """Number of input channels."""
-        return len(self.system.structure.inputs)
+        """Number of inputs that are decided: of channels, or of what channels share.
+
+        Without any input there is one that acts on nothing.
+        """
+        return self.inputs.count(len(self.system.structure.inputs)) or 1
+
+    @property
+    def uniform(self) -> bool:
+        """Whether there is one phase of equal steps."""
+        return len(self.phases) == 1 and np.ndim(self.dt) == 0
+
+    @property
+    def free_numbers(self) -> tuple[FreeNumber, ...]:
+        """What is free besides inputs and times: the parameters, and what the cost adds to them."""
+        return (*self.parameters, *self.cost.parameters())
+
+    @property
+    def times(self) -> int:
+        """Number of free times."""
+        return len(self.phases) if self.free_time else 0
 
     @property
     def free(self) -> tuple[str, ...]:
         """Names of what is free besides the inputs."""
-        times = ("final time [s]",) if self.free_time else ()
-        return (*times, *(parameter.name for parameter in self.parameters))
+        times = tuple(f"duration of phase {k + 1} [s]" for k in range(self.times))
+        times = ("final time [s]",) if len(times) == 1 else times
+        return (*times, *(number.name for number in self.free_numbers))
 
     @property
     def rates(self) -> tuple[str, ...]:
@@ -222,17 +229,30 @@ class OptimalControl(Part):
 
     def references(self) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
         """Initial values of what is free besides the inputs, and the scale of each."""
-        found = [parameter.initial(self.system) for parameter in self.parameters]
-        if self.free_time:
+        found = [number.initial(self.system, self.state) for number in self.free_numbers]
+        if self.uniform and self.free_time:
             found = [self.steps * jnp.asarray(self.dt, float), *found]
+        elif self.free_time:
+            found = [*durations(self.phases, self.dt), *found]
         values = jnp.stack(found) if found else jnp.zeros(0)
         return values, jnp.where(values == 0, 1.0, jnp.abs(values))
 
+    def _time_limits(self) -> list[tuple[float, float | None]]:
+        """Lower and upper limits of the free times."""
+        if self.free_time is True or not self.free_time:
+            return [(0.0, None)] * self.times
+        if np.ndim(self.free_time) == 1:
+            return [tuple(self.free_time)] * self.times
+        if len(self.free_time) != self.times:
+            raise ValueError(
+                f"free_time has limits for {len(self.free_time)} phases; pass (lower, upper) for each of "
+                f"{self.times}, or once for all"
+            )
+        return list(self.free_time)
+
     def limits(self) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper bounds of what is free besides the inputs."""
-        sides = [(p.lower, p.upper) for p in self.parameters]
-        if self.free_time:
-            sides = [(0.0, None) if self.free_time is True else tuple(self.free_time), *sides]
+        sides = [*self._time_limits(), *((number.lower, number.upper) for number in self.free_numbers)]
         lower = np.array([-np.inf if a is None else a for a, _ in sides], float)
         upper = np.array([np.inf if b is None else b for _, b in sides], float)
         return lower, upper
@@ -242,19 +262,88 @@ class OptimalControl(Part):
         reference, scale = self.references()
         return reference + scale * scaled
 
+    def named(self, scaled: Float[Array, " p"]) -> dict[str, Float[Array, ""]]:
+        """The same by name."""
+        return dict(zip(self.free, self.values(scaled))) if self.free else {}
+
     def applied(self, scaled: Float[Array, " p"]) -> tuple[System, Float[Array, ""]]:
-        """The system and the step [s] at given values of what is free."""
+        """The system and the step [s] at given values of what is free; of unequal steps their mean."""
         values, system = self.values(scaled), self.system
-        dt = values[0] / self.steps if self.free_time else jnp.asarray(self.dt, float)
-        for parameter, value in zip(self.parameters, values[1 if self.free_time else 0 :]):
-            system = parameter.applied(system, value)
+        if self.uniform:
+            dt = values[0] / self.steps if self.free_time else jnp.asarray(self.dt, float)
+        else:
+            dt = jnp.sum(self.durations(scaled)) / self.steps
+        for number, value in zip(self.free_numbers, values[self.times :]):
+            system = number.applied(system, value)
         return system, dt
+
+    def durations(self, scaled: Float[Array, " p"]) -> Float[Array, " phases"]:
+        """Durations of all phases at given values of what is free [s]."""
+        return self.values(scaled)[: self.times] if self.free_time else durations(self.phases, self.dt)
+
+    def lengths(self, scaled: Float[Array, " p"]) -> Float[Array, " steps"]:
+        """Durations of all steps at given values of what is free [s]."""
+        if self.uniform:
+            return jnp.full(self.steps, self.applied(scaled)[1])
+        return mesh_of(self.phases, self.dt).share @ self.durations(scaled)
 
     def start(self, scaled: Float[Array, " p"]) -> State:
         """Initial state at given values of what is free."""
-        if not any(parameter.moves for parameter in self.parameters):
+        moves = any(number.moves_geometry for number in self.free_numbers)
+        starts = any(number.starts for number in self.free_numbers)
+        if not moves and not starts:
             return self.state
-        return assemble(self.applied(scaled)[0], self.state)
+        (system, _), state = self.applied(scaled), self.state
+        if moves:
+            state = assemble(system, state)
+        for number, value in zip(self.free_numbers, self.values(scaled)[self.times :]):
+            state = number.started(system, state, value)
+        # With loops, drives or couplings others have to follow.
+        return assemble(system, state) if starts and system.structure.held else state
+
+    @property
+    def carriers(self) -> tuple[Carrier, ...]:
+        """What may ask for something that is carried along the motion, in the order of the memory."""
+        return self.goal, self.cost, self.bounds
+
+    @property
+    def memory_sizes(self) -> tuple[int, ...]:
+        """How many numbers are carried for each of them."""
+        return tuple(carrier.memory(self.system) for carrier in self.carriers)
+
+    @property
+    def looked_back(self) -> int:
+        """How many inputs of the step before are carried: all, or none if nobody asks for them."""
+        wanted = any(carrier.looks_back() for carrier in self.carriers)
+        return len(self.system.structure.inputs) if wanted else 0
+
+    def memories(self, memory: Float[Array, " memory"]) -> list[Array]:
+        """Memory of goal, cost and bounds."""
+        return jnp.split(memory, np.cumsum(self.memory_sizes)[:-1])
+
+    def carried(self, system: System, memory: Float[Array, " memory"], step: Step) -> Float[Array, " memory"]:
+        """Memory after a step."""
+        pairs = zip(self.carriers, self.memories(memory))
+        return jnp.concatenate([carrier.carried(system, numbers, step) for carrier, numbers in pairs])
+
+    def path_excess(self, system: System, memory: Array, step: Step) -> Float[Array, " n"]:
+        """Excess over the bounds at the end of a step; memory is that at its start."""
+        _, cost, bounds = self.memories(memory)
+        found = self.bounds.of_step(system, bounds, step), self.cost.excess(system, cost, step)
+        return jnp.concatenate(found)
+
+    @property
+    def path_labels(self) -> tuple[str, ...]:
+        """Names of these bounds."""
+        return self.bounds.labels(self.system) + self.cost.labels()
+
+    @property
+    def end_labels(self) -> tuple[str, ...]:
+        """Names of the bounds of what is free, and of the goal's limits."""
+        lower, upper = self.limits()
+        names = [f"{self.free[k]} above its lower bound" for k in np.flatnonzero(np.isfinite(lower))]
+        names += [f"{self.free[k]} below its upper bound" for k in np.flatnonzero(np.isfinite(upper))]
+        return (*names, *self.goal.limits(self.system))
 
 
 def numeric(problem: OptimalControl) -> OptimalControl:

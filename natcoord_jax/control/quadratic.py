@@ -76,7 +76,8 @@ def _slow(step: Step, quick: slice) -> tuple[Array, Array, Array]:
 def _stage_slopes(problem: OptimalControl, scale: Point, step: Step) -> tuple[Array, Array, Array]:
     """Derivatives of small numbers after a step and of excesses in [z, w, y], and the Lagrangian's curvature.
 
-    Velocities at its start enter the step (57) linearly, so that among themselves only cost and bounds bend.
+    Velocities at its start enter the step (57) linearly, so that among themselves only cost, bounds and what
+    is carried along for them bend.
     They are most of the numbers, and are left to symmetry.
     """
     flat, unflat = ravel_pytree(step.node)
@@ -89,8 +90,9 @@ def _stage_slopes(problem: OptimalControl, scale: Point, step: Step) -> tuple[Ar
         after = ravel_pytree(found.after)[0]
         # Of positions their displacement, all others as they are.
         small = jnp.concatenate([step.back[:a, :size] @ after[:size], after[places], after[x:]])
-        lagrangian = worth @ after + by_residual @ found.residual
-        return found.cost + by_excess @ found.excess, (lagrangian, small, found.excess)
+        lagrangian = worth[:x] @ after[:x] + by_residual @ found.residual
+        value = found.cost + by_excess @ found.excess + worth[x:] @ after[x:]
+        return value, (lagrangian, small, found.excess)
 
     def slope(*point: Array) -> tuple[Array, Array, Array]:
         def lagrangian(*point: Array) -> tuple[Array, tuple[Array, Array]]:

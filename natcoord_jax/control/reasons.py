@@ -5,16 +5,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from natcoord_jax.control.bounds import Bound
 from natcoord_jax.control.iterate import Iterate
+from natcoord_jax.control.motion import motion
 from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.control.results import Outcome
-from natcoord_jax.control.transcription import held_inputs
+from natcoord_jax.control.transcription import held_inputs, standing_excess
 from natcoord_jax.core.eager_numpy import eager_numpy
-from natcoord_jax.core.state import State
 from natcoord_jax.reading.diagnostics import explain
-from natcoord_jax.stepping.simulate import simulate
-from natcoord_jax.system import System
 
 AT_BOUND = 1e-9
 """Excess, in half a range, that is rounding."""
@@ -79,7 +76,7 @@ def nearest(problem: OptimalControl, iterate: Iterate) -> str:
 def at_limits(problem: OptimalControl, iterate: Iterate) -> str:
     """Which bounds hold an iterate in the most of its steps."""
     excess = np.asarray(iterate.path.stages.excess)
-    labels = unique(problem.bounds.labels(problem.system))
+    labels = unique(problem.path_labels)
     counts = np.sum(excess > -AT_LIMIT, axis=0)
     most = [k for k in np.argsort(-counts, kind="stable")[:NAMED] if counts[k] > 0]
     named = [f"{labels[k]} in {counts[k]} of {problem.steps} steps" for k in most]
@@ -91,7 +88,7 @@ def switches(problem: OptimalControl, iterate: Iterate) -> dict[str, list[int]]:
 
     Twice as many steps show the moment twice as well.
     """
-    steep = np.asarray(_excess_at_start(problem.bounds, problem.system, problem.state)[1])
+    steep = np.asarray(_excess_at_start(problem)[1])
     held = np.asarray(iterate.path.stages.excess) > -AT_LIMIT
     alone = np.count_nonzero(steep, axis=1) == 1
     found = {}
@@ -106,9 +103,9 @@ def switches(problem: OptimalControl, iterate: Iterate) -> dict[str, list[int]]:
 def not_simulated(problem: OptimalControl, iterate: Iterate) -> str:
     """Where the simulation with the inputs of an iterate fails."""
     unknowns = iterate.unknowns
-    system, dt = problem.applied(unknowns.free)
+    system, _ = problem.applied(unknowns.free)
     inputs = held_inputs(problem, unknowns.coefficients)
-    trajectory = simulate(system, problem.start(unknowns.free), dt=dt, inputs=inputs, throw=False)
+    trajectory = motion(problem, unknowns.free, inputs, throw=False)
     if int(trajectory.result) == 0:
         return "steps had to be divided, which is none of the problem's"
     return explain(system, trajectory)
@@ -116,11 +113,12 @@ def not_simulated(problem: OptimalControl, iterate: Iterate) -> str:
 
 def undefined(problem: OptimalControl, iterate: Iterate) -> str:
     """The first of what is no number, and where."""
-    path, dt = iterate.path, problem.applied(iterate.unknowns.free)[1]
+    path = iterate.path
+    times = np.cumsum(np.asarray(problem.lengths(iterate.unknowns.free)))
 
     def at(values: Array) -> str:
         bad = np.flatnonzero(~np.isfinite(np.asarray(values).reshape(problem.steps, -1)).all(axis=1))
-        return f"step {bad[0]}, t = {float((bad[0] + 1) * dt):.4g} s" if bad.size else ""
+        return f"step {bad[0]}, t = {float(times[bad[0]]):.4g} s" if bad.size else ""
 
     for what, values in (
         ("the motion", path.stages.residual),
@@ -158,22 +156,20 @@ def outside_at_start(problem: OptimalControl) -> dict[str, float]:
 
     Those of problems whose parameters are free are not looked at.
     """
-    if problem.parameters:
+    if problem.free_numbers:
         return {}
-    excess, by_input = (
-        np.asarray(x) for x in _excess_at_start(problem.bounds, problem.system, problem.state)
-    )
+    excess, by_input = (np.asarray(x) for x in _excess_at_start(problem))
     fixed = ~np.any(by_input != 0, axis=-1)
-    names = unique(problem.bounds.labels(problem.system))
+    names = unique(problem.path_labels)
     return {name: float(x) for name, x, keep in zip(names, excess, fixed) if keep and x > AT_BOUND}
 
 
 @eager_numpy
-def _excess_at_start(bounds: Bound, system: System, state: State) -> tuple[Array, Array]:
+def _excess_at_start(problem: OptimalControl) -> tuple[Array, Array]:
     def excess(u: Array) -> Array:
-        return bounds.excess(system, state, u, state.t)
+        return standing_excess(problem, problem.state, u, jnp.zeros(len(problem.free)))
 
-    idle = jnp.zeros(len(system.structure.inputs))
+    idle = jnp.zeros(len(problem.system.structure.inputs))
     return excess(idle), jax.jacfwd(excess)(idle)
 
 
@@ -187,6 +183,10 @@ def worst_condition(problem: OptimalControl, iterate: Iterate) -> tuple[float, s
     excess = np.asarray(iterate.path.stages.excess)
     if excess.size:
         at, k = np.unravel_index(int(np.argmax(excess)), excess.shape)
-        name = problem.bounds.labels(problem.system)[int(k)]
+        name = problem.path_labels[int(k)]
         found.append((max(float(excess[at, k]), 0.0), f"{name}, step {int(at)}"))
+    last = np.asarray(iterate.path.end.excess)
+    if last.size:
+        k = int(np.argmax(last))
+        found.append((max(float(last[k]), 0.0), problem.end_labels[k]))
     return max(found)

@@ -36,7 +36,7 @@ def chosen(problem: OptimalControl, method: str, guess: Any = None) -> bool:
     if isinstance(guess, Solution) and guess.iterate is not None:
         # What it was found by has been compiled, and led to it.
         return guess.method.startswith(NAMES[True])
-    inputs = all(label.startswith("input ") for label in problem.bounds.labels(problem.system))
+    inputs = all(label.startswith("input ") for label in problem.path_labels)
     return bool(problem.free) or not inputs
 
 
@@ -114,7 +114,9 @@ def optimise(
             return other
         if other.outcome in ENDED:
             return best_of(problem, [found, other], other.outcome)
-    if method != "shooting" and not over(found) and search.left > 0:
+    # Restorations change inputs alone.
+    restorable = method != "shooting" and len(problem.system.structure.inputs) > 0
+    if restorable and not over(found) and search.left > 0:
         found = after_restoration(search, found, guess)
     return found
 

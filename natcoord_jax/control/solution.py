@@ -5,24 +5,22 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from natcoord_jax.control.goal import Goal
 from natcoord_jax.control.guess import Guess, free_of_swings
 from natcoord_jax.control.iterate import Iterate
+from natcoord_jax.control.motion import motion
 from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.control.reasons import seen, unique, worst_condition
 from natcoord_jax.control.results import ADVICE, OUTCOMES, Outcome
-from natcoord_jax.control.transcription import held_inputs
+from natcoord_jax.control.transcription import followed, held_inputs
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.kinds import of
 from natcoord_jax.core.numeric import Whole
 from natcoord_jax.core.state import State, Trajectory
-from natcoord_jax.stepping.simulate import simulate
 from natcoord_jax.system import System
 
 FILE = of("the name of a file", str, Path)
@@ -85,7 +83,7 @@ class Solution(eqx.Module):
         problem: the problem.
         inputs: of all steps (steps, inputs) [N, N m].
         free: values of final time [s] and parameters by name.
-        dt: step [s].
+        dt: step [s]; of unequal steps their mean.
         cost: whole cost.
         code: how it ended, see `outcome`.
         method: how it was found: "shooting", "lifted" or "first-order", and with what.
@@ -141,25 +139,26 @@ class Solution(eqx.Module):
         Raises:
             SimulationError: if it cannot be simulated.
         """
-        return simulate(self.system, self.start, dt=self.dt, inputs=self.inputs)
+        return motion(self.problem, self._scaled(), self.inputs)
 
     @property
     def missing(self) -> dict[str, float]:
         """Residual of the goal at the end of the simulated motion, by name."""
-        final = jax.tree.map(lambda x: x[-1], self.trajectory.states)
         names = self.problem.goal.labels(self.problem.system)
-        residual = _residual(self.problem.goal, self.system, final)
+        states = self.trajectory.states
+        residual = _missing(self.problem, self._scaled(), states, jnp.asarray(self.inputs))
         return dict(zip(unique(names), np.asarray(residual).tolist()))
 
     @property
     def multipliers(self) -> dict[str, Any]:
-        """Multipliers of the goal by name, and of the bounds by name, one for each step."""
+        """Multipliers of the goal and of the bounds at the end by name, and of those of each step."""
         if self.iterate is None:
             return {}
         m = self.iterate.multipliers
         goal = unique(self.problem.goal.labels(self.problem.system))
-        bounds = unique(self.problem.bounds.labels(self.problem.system))
+        bounds = unique(self.problem.path_labels)
         found: dict[str, Any] = dict(zip(goal, np.asarray(m.goal).tolist()))
+        found |= dict(zip(unique(self.problem.end_labels), np.asarray(m.end).tolist()))
         return found | {name: np.asarray(m.path)[:, k] for k, name in enumerate(bounds)}
 
     def explain(self) -> str:
@@ -261,8 +260,8 @@ def _interpolated(values: np.ndarray, steps: int) -> np.ndarray:
 
 
 @eager_numpy
-def _residual(goal: Goal, system: System, state: State) -> Float[Array, " n"]:
-    return goal.residual(system, state)
+def _missing(problem: OptimalControl, free: Array, states: State, inputs: Array) -> Float[Array, " n"]:
+    return followed(problem, free, states, inputs)[2].missing
 
 
 def solution_of(

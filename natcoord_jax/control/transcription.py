@@ -6,7 +6,7 @@ so that joints and directors hold whatever the unknowns are; the residuals of th
 constraints. Where the residuals vanish, the motion is that of `nc.simulate`.
 """
 
-from functools import partial
+from operator import itemgetter
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -16,6 +16,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from natcoord_jax.control.inputs import Shaping
+from natcoord_jax.control.memory import Ending, Step
+from natcoord_jax.control.mesh import Mesh, mesh_of, runs_of
 from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
@@ -41,16 +43,20 @@ class Unknowns(eqx.Module):
 
 
 class Node(eqx.Module):
-    """What one step hands to the next: the state, what is free, the register of the inputs.
+    """What one step hands to the next: the state, what is free, the register of the inputs, a memory.
 
     Attributes:
         x: state as one vector: q, v, joint coordinates, rotor rates.
         free: as in `Unknowns`.
+        last: inputs of the step before, zero at the start; none where nobody asks for them.
+        memory: what goal, cost and bounds ask to be carried along, see `memory`.
         register: of the spline (d, inputs).
     """
 
     x: Float[Array, "*k x"]
     free: Float[Array, "*k p"]
+    last: Float[Array, "*k u"]
+    memory: Float[Array, "*k memory"]
     register: Float[Array, "*k d m"]
 
 
@@ -76,7 +82,7 @@ class End(eqx.Module):
     Attributes:
         cost: terminal cost.
         missing: residual of the goal.
-        excess: over the bounds of what is free.
+        excess: over the bounds of what is free, and over the limits of the goal.
     """
 
     cost: Float[Array, "*batch"]
@@ -98,13 +104,17 @@ class Path(eqx.Module):
 
 
 class Slice(NamedTuple):
-    """What is known of one step: its number, and the spline's machine."""
+    """What is known of one step: its number, the spline's machine, and its place in the mesh.
+
+    That of equal steps of one phase is not needed.
+    """
 
     number: Int[Array, "*k"]
     shift: Float[Array, "*k d d"]
     load: Float[Array, "*k d"]
     read: Float[Array, "*k d"]
     direct: Float[Array, "*k"]
+    place: Mesh | None = None
 
 
 def packed(state: State) -> Float[Array, " x"]:
@@ -123,8 +133,9 @@ def unpacked(like: State, x: Float[Array, " x"], t: Float[Array, ""]) -> State:
 def slices(problem: OptimalControl) -> Slice:
     """The constant part of all steps."""
     shaping: Shaping = problem.inputs.shaping(problem.steps)
-    arrays = (jnp.asarray(x) for x in shaping[:4])
-    return Slice(jnp.arange(problem.steps), *arrays)
+    shift, load, read, direct = (jnp.asarray(x) for x in shaping[:4])
+    place = None if problem.uniform else mesh_of(problem.phases, problem.dt)
+    return Slice(jnp.arange(problem.steps), shift, load, read, direct, place)
 
 
 def entering(problem: OptimalControl, coefficients: Float[Array, "c m"]) -> Float[Array, "steps m"]:
@@ -137,7 +148,57 @@ def entering(problem: OptimalControl, coefficients: Float[Array, "c m"]) -> Floa
 def first_node(problem: OptimalControl, free: Float[Array, " p"], leading: Float[Array, "degree m"]) -> Node:
     """Node before the first step, from what is free and the first coefficients of the spline."""
     start = jnp.asarray(problem.inputs.shaping(1).start)
-    return Node(packed(problem.start(free)), free, start @ leading)
+    last, memory = jnp.zeros(problem.looked_back), jnp.zeros(sum(problem.memory_sizes))
+    return Node(packed(problem.start(free)), free, last, memory, start @ leading)
+
+
+def times_of(problem: OptimalControl, free: Float[Array, " p"], at: Slice) -> tuple[Array, Array, Array]:
+    """When a step begins, how long it lasts, and the time from the middle of the step before it [s]."""
+    if at.place is None:
+        dt = problem.applied(free)[1]
+        return problem.state.t + at.number * dt, dt, dt
+    durations = problem.durations(free)
+    begin, dt, gap = (x @ durations for x in (at.place.begin, at.place.share, at.place.gap))
+    return problem.state.t + begin, dt, gap
+
+
+def seen(
+    problem: OptimalControl,
+    number: Any,
+    times: tuple[Any, Any],
+    states: tuple[State, State],
+    u: Array,
+    node: Node,
+) -> tuple[Array, Array, Array, Array]:
+    """What a step costs, its excesses, and what is carried on from it.
+
+    Args:
+        problem: the problem.
+        number: of the step.
+        times: its duration, and the time from the middle of the step before it [s].
+        states: at its start and its end.
+        u: its inputs.
+        node: before it.
+
+    Returns:
+        Its cost, the excess over bounds at its end, its inputs where somebody asks for them, and the memory.
+    """
+    system, _ = problem.applied(node.free)
+    step = Step(number, times[0], *states, u, node.last, times[1], problem.named(node.free))
+    cost = problem.cost.of_step(system, problem.memories(node.memory)[1], step)
+    excess = problem.path_excess(system, node.memory, step)
+    last = u if node.last.size else node.last
+    return cost, excess, last, problem.carried(system, node.memory, step)
+
+
+def standing_excess(
+    problem: OptimalControl, state: State, u: Float[Array, " inputs"], free: Float[Array, " p"]
+) -> Float[Array, " n"]:
+    """Excess over the bounds in a state that stays, with given inputs that do not change."""
+    system, dt = problem.applied(free)
+    last, memory = (u if problem.looked_back else u[:0]), jnp.zeros(sum(problem.memory_sizes))
+    step = Step(jnp.array(1), dt, state, state, u, last, dt, problem.named(free))
+    return problem.path_excess(system, memory, step)
 
 
 def stage(
@@ -149,32 +210,70 @@ def stage(
     stretch: Any = 1.0,
 ) -> Stage:
     """One step from its unknowns: explicit, and smooth in everything; `stretch` makes this step longer."""
-    system, dt = problem.applied(node.free)
-    begin = problem.state.t + at.number * dt
+    system, _ = problem.applied(node.free)
+    begin, dt, gap = times_of(problem, node.free, at)
     dt = stretch * dt
-    u = at.read @ node.register + at.direct * w
+    decided = at.read @ node.register + at.direct * w
+    u = problem.inputs.driven(decided, len(system.structure.inputs))
     before = unpacked(problem.state, node.x, begin)
     residual, after, _ = advance(system, before, u, dt, y, gauss(1))
     # The account of work plays no part.
     after = replace_fields(after, work=before.work)
-    rate = partial(problem.cost.running, system)
-    cost = 0.5 * dt * (rate(before, u, begin) + rate(after, u, after.t))
-    excess = problem.bounds.excess(system, after, u, after.t)
+    cost, excess, last, memory = seen(problem, at.number, (dt, gap), (before, after), u, node)
+    if not u.size:
+        # What acts on nothing wants to be zero.
+        cost = cost + 0.5 * dt * jnp.sum(decided**2)
     register = at.shift @ node.register + at.load[:, None] * w
-    return Stage(residual, cost, excess, Node(packed(after), node.free, register))
+    return Stage(residual, cost, excess, Node(packed(after), node.free, last, memory, register))
 
 
 def end(problem: OptimalControl, node: Node) -> End:
     """What the final node gives."""
-    system, dt = problem.applied(node.free)
-    state = unpacked(problem.state, node.x, problem.state.t + problem.steps * dt)
+    system, _ = problem.applied(node.free)
+    state = unpacked(problem.state, node.x, problem.state.t + jnp.sum(problem.durations(node.free)))
     lower, upper = problem.limits()
     values, scale = problem.values(node.free), problem.references()[1]
     below, above = np.flatnonzero(np.isfinite(lower)), np.flatnonzero(np.isfinite(upper))
-    excess = [((lower - values) / scale)[below], ((values - upper) / scale)[above]]
+    goal, cost, _ = problem.memories(node.memory)
+    asked = any(carrier.looks_at_start() for carrier in problem.carriers)
+    first = problem.start(node.free) if asked else problem.state
+    ending = Ending(first, state, goal, problem.named(node.free))
+    limits = problem.goal.excess(system, ending)
+    excess = [((lower - values) / scale)[below], ((values - upper) / scale)[above], limits]
     return End(
-        problem.cost.terminal(system, state), problem.goal.residual(system, state), jnp.concatenate(excess)
+        problem.cost.of_end(system, ending._replace(memory=cost)),
+        problem.goal.missing(system, ending),
+        jnp.concatenate(excess),
     )
+
+
+def followed(
+    problem: OptimalControl, free: Float[Array, " p"], states: State, inputs: Float[Array, "steps u"]
+) -> tuple[Array, Array, End]:
+    """What a motion gives that is known by its states and inputs.
+
+    Args:
+        problem: the problem.
+        free: as in `Unknowns`.
+        states: at the start and at the ends of all steps.
+        inputs: of all steps.
+
+    Returns:
+        Costs of the steps, excesses over the bounds at their ends, and what the end gives.
+    """
+    first = first_node(problem, free, jnp.zeros((problem.inputs.degree, problem.channels)))
+    before, after = (jax.tree.map(itemgetter(s), states) for s in (slice(None, -1), slice(1, None)))
+
+    def body(node: Node, given: tuple) -> tuple[Node, tuple[Array, Array]]:
+        at, before, after, u = given
+        times = times_of(problem, free, at)[1:]
+        cost, excess, last, memory = seen(problem, at.number, times, (before, after), u, node)
+        return eqx.tree_at(lambda n: (n.last, n.memory), node, (last, memory)), (cost, excess)
+
+    given = slices(problem), before, after, inputs
+    node, (costs, excess) = jax.lax.scan(body, first, given)
+    final = packed(jax.tree.map(lambda x: x[-1], states))
+    return costs, excess, end(problem, eqx.tree_at(lambda n: n.x, node, final))
 
 
 def roll(problem: OptimalControl, unknowns: Unknowns) -> Path:
@@ -203,9 +302,10 @@ def corrected(
 
 def held_inputs(problem: OptimalControl, coefficients: Float[Array, "c m"]) -> Float[Array, "steps m"]:
     """Inputs of all steps."""
-    if problem.inputs.degree == 0 and problem.inputs.every == 1:
-        return coefficients
-    return jnp.asarray(problem.inputs.matrix(problem.steps)) @ coefficients
+    decided = coefficients
+    if problem.inputs.degree or problem.inputs.every > 1:
+        decided = jnp.asarray(problem.inputs.matrix(problem.steps)) @ coefficients
+    return problem.inputs.driven(decided, len(problem.system.structure.inputs))
 
 
 def simulated(problem: OptimalControl, unknowns: Unknowns, lifted: bool) -> tuple[Unknowns, Array, Array]:
@@ -216,9 +316,26 @@ def simulated(problem: OptimalControl, unknowns: Unknowns, lifted: bool) -> tupl
     """
     if lifted:
         return unknowns, jnp.array(True), jnp.array(0)
-    system, dt = problem.applied(unknowns.free)
-    inputs = held_inputs(problem, unknowns.coefficients)
-    plan = Plan(problem.steps, 0, TOLERANCE, None)
-    slots, ending = run_slots(plan, system, problem.start(unknowns.free), inputs, dt)
-    whole = (ending.course.code == 0) & jnp.all(slots.accepted) & jnp.all(slots.fraction == 1.0)
-    return replace_fields(unknowns, y=slots.y), whole, ending.course.iterations
+    system, _ = problem.applied(unknowns.free)
+    inputs, state = held_inputs(problem, unknowns.coefficients), problem.start(unknowns.free)
+
+    def piece(state: State, given: tuple[Array, Array]) -> tuple[State, tuple[Array, Array, Array]]:
+        u, dt = given
+        slots, ending = run_slots(Plan(u.shape[0], 0, TOLERANCE, None), system, state, u, dt)
+        whole = (ending.course.code == 0) & jnp.all(slots.accepted) & jnp.all(slots.fraction == 1.0)
+        return ending.course.state, (slots.y, whole, ending.course.iterations)
+
+    runs = runs_of(problem.phases, problem.dt)
+    if problem.uniform:
+        y, whole, newton = piece(state, (inputs, problem.applied(unknowns.free)[1]))[1]
+        return replace_fields(unknowns, y=y), whole, newton
+    lengths, found = problem.lengths(unknowns.free), []
+    if len(runs) == problem.steps:
+        y, *rest = jax.lax.scan(piece, state, (inputs[:, None], lengths))[1]
+        return replace_fields(unknowns, y=y[:, 0]), jnp.all(rest[0]), jnp.sum(rest[1])
+    for first, last in runs:
+        state, reached = piece(state, (inputs[first:last], lengths[first]))
+        found.append(reached)
+    y, whole, newton = zip(*found)
+    whole, newton = (jnp.stack(x) for x in (whole, newton))
+    return replace_fields(unknowns, y=jnp.concatenate(y)), jnp.all(whole), jnp.sum(newton)

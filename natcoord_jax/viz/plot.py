@@ -14,7 +14,6 @@ from natcoord_jax.bodies.beam import BeamHandle
 from natcoord_jax.control import bounds
 from natcoord_jax.control.solution import Solution
 from natcoord_jax.core.arguments import checked
-from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.kinds import Concrete, of
 from natcoord_jax.core.numeric import Vector
 from natcoord_jax.core.state import TRAJECTORY, Trajectory
@@ -36,21 +35,12 @@ def limits_of(solution: Solution) -> dict[str, set[float]]:
     return found
 
 
-@eager_numpy
-def _missing(goal, system, state):
-    return goal.residual(system, state)
-
-
 def goals_of(solution: Solution) -> dict[str, float]:
     """Values of joint coordinates and rates that are to be reached, by name, as "rate 0 of 'hinge'"."""
-    system, goal = solution.system, solution.problem.goal
-    if goal is None:
-        return {}
-    last = solution.trajectory[-1]
-    missing = np.asarray(_missing(goal, system, last))
-    found = {}
-    for label, rest in zip(goal.labels(system), missing):
-        known = re.match(r"(coordinate|rate) (\d+) of '(.*)' \[", label)
+    system, last, found = solution.system, solution.trajectory[-1], {}
+    for label, rest in solution.missing.items():
+        # (Not those at waypoints.)
+        known = re.fullmatch(r"(coordinate|rate) (\d+) of '(.*)' \[[^\[\]]*\](?: #\d+)?", label)
         if known:
             kind, index, joint = known[1], int(known[2]), known[3]
             look = system.coordinate if kind == "coordinate" else system.rate
