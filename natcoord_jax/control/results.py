@@ -18,6 +18,7 @@ class Outcome(IntEnum):
     SINGULAR = 9
     INFEASIBLE_START = 10
     DIVERGED = 11
+    UNDETERMINED = 12
 
     @property
     def ok(self) -> bool:
@@ -38,6 +39,7 @@ OUTCOMES = {
     Outcome.SINGULAR: "a step has no derivative: its linearised equations have no solution",
     Outcome.INFEASIBLE_START: "the start is outside of bounds that no input can change there",
     Outcome.DIVERGED: "the multipliers grew without end",
+    Outcome.UNDETERMINED: "the data do not determine all unknowns",
 }
 
 ADVICE = {
@@ -55,4 +57,6 @@ ADVICE = {
     Outcome.DIVERGED: "look for conditions of the goal that depend on each other, or a time that is too "
     "short; start from another guess",
     Outcome.NONFINITE: "check cost, goal and bounds for undefined operations",
+    Outcome.UNDETERMINED: "leave out one unknown of each combination that is named, or measure a motion that "
+    "tells them apart",
 }
