@@ -3,14 +3,13 @@
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-import jax
 import numpy as np
 
 from natcoord_jax.control.measurement import Predicted, Setting
 from natcoord_jax.control.results import Outcome
-from natcoord_jax.control.side_by_side import Ask, Stopped
+from natcoord_jax.control.side_by_side import Ask, StoppedError
 from natcoord_jax.core.checks import for_each
-from natcoord_jax.core.results import REASONS, Result
+from natcoord_jax.core.results import REASONS, REMEDIES, Result
 from natcoord_jax.core.state import State
 
 FAR = 10.0
@@ -118,10 +117,10 @@ class Scaling(NamedTuple):
         return z
 
     def by_experiment(self, z: np.ndarray, experiments: int) -> np.ndarray:
-        """Values of the unknowns of each experiment (starts, experiments, n)."""
+        """Values of the unknowns of each experiment (experiments, n)."""
         x = self.values(z)
-        shared = np.repeat(x[:, None, : self.shared], experiments, axis=1)
-        return np.concatenate([shared, x[:, self.shared :].reshape(len(x), experiments, -1)], axis=2)
+        shared = np.repeat(x[None, : self.shared], experiments, axis=0)
+        return np.concatenate([shared, x[self.shared :].reshape(experiments, -1)], axis=1)
 
 
 class Measurement(NamedTuple):
@@ -206,8 +205,8 @@ class At:
 
     @classmethod
     def of(cls, z: np.ndarray, data: Measurement, scaling: Scaling, found: Predicted) -> "At":
-        """From what was predicted in all experiments."""
-        channels, slopes = np.asarray(found.channels), np.asarray(found.slopes)
+        """From what was predicted of all experiments."""
+        channels, slopes = found.channels, found.slopes
         whole = np.zeros((*channels.shape, len(z)))
         shared, own = scaling.shared, slopes.shape[-1] - scaling.shared
         whole[..., :shared] = slopes[..., :shared]
@@ -216,7 +215,7 @@ class At:
             whole[k, ..., first : first + own] = slopes[k, ..., shared:]
         missed = (channels - data.values)[data.present]
         slopes = whole[data.present] * scaling.slopes(z)
-        failed = [code for code in np.asarray(found.result) if not Result(int(code)).ok]
+        failed = [code for code in found.result if not Result(int(code)).ok]
         code = Result(int(failed[0])) if failed else Result.SUCCESSFUL
         sound = code.ok and bool(np.isfinite(missed).all() and np.isfinite(slopes).all())
         return cls(z, missed, slopes, code, sound)
@@ -247,7 +246,7 @@ class Fit:
     reason: str = ""
 
 
-def searched(ask: Ask, z: np.ndarray, scaling: Scaling, sigma: np.ndarray, most: int) -> Fit:
+def searched(ask: Ask, first: At, scaling: Scaling, sigma: np.ndarray, most: int) -> Fit:
     """A run of SciPy's trust region reflective method, which keeps within bounds.
 
     It is SciPy's because bounds, ranks and refused points are its daily work; a solver in the compiled
@@ -255,50 +254,45 @@ def searched(ask: Ask, z: np.ndarray, scaling: Scaling, sigma: np.ndarray, most:
 
     Args:
         ask: what belongs to a point.
-        z: where it begins.
+        first: where it begins.
         scaling: of the unknowns.
         sigma: standard deviation of every number.
         most: points that may be looked at.
     """
     from scipy.optimize import least_squares
 
-    seen: list[At] = []
-    best: tuple[float, At] | None = None
+    looks, refused, last, best = 1, 0, first, (np.inf, first)
 
     def at(z: np.ndarray) -> At:
-        nonlocal best
-        if not seen or not np.array_equal(seen[-1].z, z):
-            seen.append(ask(z))
-            del seen[:-1]
-            here = seen[-1]
-            cost = float(np.sum((here.missed / sigma) ** 2) / 2) if here.sound else np.inf
-            counts["all"] += 1
-            counts["refused"] += not here.sound
-            if best is None or cost < best[0]:
-                best = cost, here
-        return seen[-1]
+        nonlocal looks, refused, last, best
+        if not np.array_equal(last.z, z):
+            last = ask(z)
+            looks += 1
+            refused += not last.sound
+            best = min(best, (cost(last), last), key=lambda pair: pair[0])
+        return last
+
+    def cost(here: At) -> float:
+        return float(np.sum((here.missed / sigma) ** 2) / 2) if here.sound else np.inf
 
     def missed(z: np.ndarray) -> np.ndarray:
         here = at(z)
         return here.missed / sigma if here.sound else np.full(len(sigma), np.nan)
 
-    counts, outcome = {"all": 0, "refused": 0}, Outcome.OPTIMAL
+    if not first.sound:
+        outcome = Outcome.SINGULAR if first.code.ok else Outcome.SIMULATION_FAILED
+        return Fit(first, np.inf, outcome, 1, 1, _failure(first.code))
+    best = cost(first), first
     try:
-        if not at(z).sound:
-            code = seen[-1].code
-            outcome = Outcome.SINGULAR if code.ok else Outcome.SIMULATION_FAILED
-            return Fit(seen[-1], np.inf, outcome, 1, 1, "" if code.ok else REASONS[code])
         # (Which moves a start from a bound inwards by a little.)
         end = least_squares(
-            missed, z, lambda z: at(z).weighted(sigma)[1], scaling.bounds(), method="trf",
+            missed, first.z, lambda z: at(z).weighted(sigma)[1], scaling.bounds(), method="trf",
             ftol=TOLERANCE, xtol=TOLERANCE, gtol=1e-8, max_nfev=most,
         )  # fmt: skip
         outcome = Outcome.MAX_ITERATIONS if end.status == 0 else Outcome.OPTIMAL
-    except Stopped:
+    except StoppedError:
         outcome = Outcome.STOPPED
-    if best is None:
-        raise KeyboardInterrupt
-    return Fit(best[1], best[0], outcome, counts["all"], counts["refused"])
+    return Fit(best[1], best[0], outcome, looks, refused)
 
 
 def finished(ask: Ask, fit: Fit, scaling: Scaling, data: Measurement, most: int) -> tuple[Fit, np.ndarray]:
@@ -314,8 +308,10 @@ def finished(ask: Ask, fit: Fit, scaling: Scaling, data: Measurement, most: int)
         alike, sigma = len(now) == 1 or change < SETTLED, now
         if alike or fit.outcome is not Outcome.OPTIMAL:
             break
-        again = searched(ask, fit.at.z, scaling, np.maximum(sigma, floor)[data.channel], most)
-        fit = replace(again, evaluations=again.evaluations + fit.evaluations, refused=again.refused + fit.refused)
+        again = searched(ask, fit.at, scaling, np.maximum(sigma, floor)[data.channel], most)
+        fit = replace(
+            again, evaluations=again.evaluations + fit.evaluations, refused=again.refused + fit.refused
+        )
     each = np.maximum(sigma, floor)[data.channel]
     at_bound = sides(fit.at, scaling, each)
     if np.any(at_bound):
@@ -323,7 +319,7 @@ def finished(ask: Ask, fit: Fit, scaling: Scaling, data: Measurement, most: int)
         try:
             there = ask(z)
             fit = replace(fit, at=there) if there.sound else fit
-        except Stopped:
+        except StoppedError:
             fit = replace(fit, outcome=Outcome.STOPPED)
     if fit.outcome is Outcome.OPTIMAL and not _reached(fit.at, scaling, each):
         reason = "the slope does not vanish where the solver made no progress any more"
@@ -352,3 +348,10 @@ def _reached(at: At, scaling: Scaling, sigma: np.ndarray) -> bool:
     step = np.linalg.lstsq(slopes, missed, rcond=1e-7)[0]
     size = max(1.0, float(np.linalg.norm(missed)) / np.sqrt(max(len(missed) - slopes.shape[1], 1)))
     return float(np.linalg.norm(slopes @ step)) <= OFF * size * np.sqrt(slopes.shape[1])
+
+
+def _failure(code: Result) -> str:
+    """What was seen where a simulation failed."""
+    if code.ok:
+        return "the channels are not finite, or have no derivatives"
+    return f"{REASONS[code]}; {REMEDIES[code]}" if code in REMEDIES else REASONS[code]

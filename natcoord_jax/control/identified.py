@@ -9,7 +9,7 @@ import numpy as np
 
 from natcoord_jax.control.fitting import EXACT, Fit, Measurement, Scaling, sides
 from natcoord_jax.control.measurement import Setting
-from natcoord_jax.control.results import ADVICE, OUTCOMES, Outcome
+from natcoord_jax.control.results import OUTCOMES, Outcome
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.kinds import Concrete
@@ -26,6 +26,15 @@ PART = 1e-3
 """Part of an unknown in a combination from which on it counts."""
 CLOSE = 0.95
 """Correlation from which on `explain` tells of it."""
+ADVICE = {
+    Outcome.MAX_ITERATIONS: "allow more evaluations, or begin elsewhere",
+    Outcome.SIMULATION_FAILED: "or begin with other values",
+    Outcome.SINGULAR: "begin with other values, and look for functions that are not smooth there",
+    Outcome.STALLED: "begin elsewhere, or with several starts",
+    Outcome.UNDETERMINED: "leave out one unknown of each combination that is named, or measure a motion that "
+    "tells them apart",
+}
+"""What to do."""
 
 
 class Start(NamedTuple):
@@ -143,13 +152,14 @@ class Identified(eqx.Module):
     def explain(self) -> str:
         """How it ended, and a table of the values, in words; with what casts doubt on them."""
         count = int(np.isfinite(self.residuals).sum())
-        lines = [
-            f"{OUTCOMES[self.outcome]} after {self.evaluations} evaluations: {count} measured numbers, "
-            f"{len(self.names)} unknowns, cost {self.cost:.6g}"
-        ]
-        lines[0] += f"; {self.reason}" if self.reason else ""
-        if not self.ok and self.outcome in ADVICE:
-            lines[0] += f"; {ADVICE[self.outcome]}"
+        text = f"{OUTCOMES[self.outcome]} after {self.evaluations} evaluations"
+        if self.evaluations == 1 and not np.isfinite(self.cost):
+            text = "the motion could not be simulated where the search begins"
+        text += f"; {self.reason}" if self.reason else ""
+        text += f"; {ADVICE[self.outcome]}" if self.outcome in ADVICE else ""
+        if not np.isfinite(self.cost):
+            return text
+        lines = [f"{text}\n{count} measured numbers, {len(self.names)} unknowns, cost {self.cost:.6g}"]
         wide, intervals = max(map(len, self.names)), self.interval()
         lines.append(f"  {'':{wide}} {'value':>12} {'deviation':>12}  95 %")
         for name in self.names:
@@ -164,7 +174,9 @@ class Identified(eqx.Module):
         if len(self.starts) > 1:
             costs = sorted(start.cost for start in self.starts)
             near = sum(cost <= costs[0] * 1.001 for cost in costs)
-            lines.append(f"  {near} of {len(costs)} starts ended at the least cost, the worst at {costs[-1]:.4g}")
+            lines.append(
+                f"  {near} of {len(costs)} starts ended at the least cost, the worst at {costs[-1]:.4g}"
+            )
         return "\n".join(lines)
 
     def _doubts(self) -> list[str]:
@@ -224,7 +236,7 @@ def concluded(
     if undetermined and outcome is Outcome.OPTIMAL:
         outcome = Outcome.UNDETERMINED
     values = scaling.values(at.z)
-    system, start = _at(setting, states, scaling.by_experiment(at.z[None], len(states.t))[0])
+    system, start = _at(setting, states, scaling.by_experiment(at.z, len(states.t)))
     several = len(states.t) > 1
     return Identified(
         system=system,
@@ -261,7 +273,9 @@ def _at(setting: Setting, states: State, values: Any) -> tuple[System, State]:
     """The system and the initial states with values of the unknowns (experiments, n)."""
     shared = len(setting.parameters)
     system = setting.system_at(values[0, :shared])
-    start = jax.vmap(lambda state, x: setting.start_at(system, state, x[shared:]))(states, jnp.asarray(values))
+    start = jax.vmap(lambda state, x: setting.start_at(system, state, x[shared:]))(
+        states, jnp.asarray(values)
+    )
     return system, start
 
 

@@ -6,15 +6,16 @@ from typing import Annotated, Any
 import jax
 import numpy as np
 
-from natcoord_jax.control.fitting import At, Measurement, Scaling, finished, searched
+from natcoord_jax.control.fitting import At, Fit, Measurement, Scaling, finished, searched
 from natcoord_jax.control.identified import Identified, concluded
-from natcoord_jax.control.measurement import INITIAL, MEASURED, SENSORS, Setting, predicted
+from natcoord_jax.control.measurement import INITIAL, MEASURED, SENSORS, Predicted, Setting, predicted
 from natcoord_jax.control.problem import PARAMETERS
 from natcoord_jax.control.results import Outcome
 from natcoord_jax.control.side_by_side import side_by_side
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.callables import Function
 from natcoord_jax.core.checks import as_array
+from natcoord_jax.core.closures import with_callables
 from natcoord_jax.core.kinds import FLAG, Concrete
 from natcoord_jax.core.numeric import Number, Vector, Whole
 from natcoord_jax.core.state import STATE, State
@@ -119,31 +120,57 @@ def identify(
             f"identify: measured has {len(data.channel)} numbers for {len(scaling.names)} unknowns, "
             f"{', '.join(scaling.names)}; measure more, or leave some out"
         )
-    lean, count, sigma = setting.lean(), 0, data.sigma[data.channel]
+    points = scaling.scattered(starts, spread, seed)
+    lanes = jax.tree.map(lambda x: _repeated(x, starts, join=True), (states, inputs))
 
-    def evaluate(points: np.ndarray) -> list[At]:
-        nonlocal count
-        found = predicted(lean, states, inputs, as_array(scaling.by_experiment(points, len(values))))
-        found = jax.tree.map(np.asarray, found)
-        ats = [At.of(z, data, scaling, jax.tree.map(lambda x: x[k], found)) for k, z in enumerate(points)]
-        count += 1
-        if progress:
+    def search(lean: Setting) -> tuple[Fit, np.ndarray, list[Fit]]:
+        evaluate = _Evaluation(lean, lanes, data, scaling, progress)
+        return _best(evaluate, points, max_evaluations)
+
+    # What functions compute is looked at once, and not for every point: that takes longer than a simulation.
+    found = with_callables(predicted, search, (setting.lean(),))
+    return concluded(setting, scaling, data, states, *found)
+
+
+class _Evaluation:
+    """What belongs to points, one for each start, from one batch of simulations."""
+
+    def __init__(
+        self, setting: Setting, lanes: tuple[State, Any], data: Measurement, scaling: Scaling, progress: bool
+    ) -> None:
+        self.setting, self.lanes, self.data, self.scaling = setting, lanes, data, scaling
+        self.progress, self.count = progress, 0
+
+    def __call__(self, points: np.ndarray) -> list[At]:
+        """What is missed at each point, and its derivatives."""
+        data, scaling, experiments = self.data, self.scaling, len(self.data.values)
+        values = np.concatenate([scaling.by_experiment(z, experiments) for z in points])
+        found = jax.tree.map(np.asarray, predicted(self.setting, *self.lanes, as_array(values)))
+        parts = [slice(k * experiments, (k + 1) * experiments) for k in range(len(points))]
+        ats = [
+            At.of(z, data, scaling, Predicted(*(x[part] for x in found))) for z, part in zip(points, parts)
+        ]
+        self.count += 1
+        if self.progress:
+            sigma = data.sigma[data.channel]
             least = min(np.sum((at.missed / sigma) ** 2) / 2 if at.sound else np.inf for at in ats)
-            print(f"evaluation {count}: least cost {least:.8g}", file=sys.stderr, flush=True)
+            print(f"evaluation {self.count}: least cost {least:.8g}", file=sys.stderr, flush=True)
         return ats
 
-    points = scaling.scattered(starts, spread, seed)
-    runs = {
-        k: lambda ask, z=z: searched(ask, z, scaling, sigma, max_evaluations) for k, z in enumerate(points)
-    }
+
+def _best(evaluate: _Evaluation, points: np.ndarray, most: int) -> tuple[Fit, np.ndarray, list[Fit]]:
+    """The best of the searches from all points, with the noise of each channel, and how all have ended."""
+    data, scaling = evaluate.data, evaluate.scaling
+    sigma, first = data.sigma[data.channel], evaluate(points)
+    runs = {k: lambda ask, at=at: searched(ask, at, scaling, sigma, most) for k, at in enumerate(first)}
     found = side_by_side(evaluate, points, runs)
-    fits = [found[k] for k in range(starts)]
-    best = min(range(starts), key=lambda k: (fits[k].cost, k))
-    fit, noise = fits[best], data.sigma
-    if np.isfinite(fit.cost) and fit.outcome is not Outcome.STOPPED:
-        last = {best: lambda ask: finished(ask, fits[best], scaling, data, max_evaluations)}
-        fit, noise = side_by_side(evaluate, points, last)[best]
-    return concluded(setting, scaling, data, states, fit, noise, fits)
+    fits = [found[k] for k in range(len(points))]
+    best = min(range(len(fits)), key=lambda k: (fits[k].cost, k))
+    fit = fits[best]
+    if not np.isfinite(fit.cost) or fit.outcome is Outcome.STOPPED:
+        return fit, data.sigma, fits
+    run = {best: lambda ask: finished(ask, fit, scaling, data, most)}
+    return *side_by_side(evaluate, points, run)[best], fits
 
 
 def _states(system: System, state: State, experiments: int) -> State:
@@ -180,5 +207,9 @@ def _inputs(system: System, inputs: Any, experiments: int, steps: int, scheme: S
     return None, _repeated(array, experiments)
 
 
-def _repeated(array: Any, experiments: int) -> Any:
-    return as_array(np.broadcast_to(np.asarray(array), (experiments, *array.shape)))
+def _repeated(array: Any, times: int, join: bool = False) -> Any:
+    """An array along a new leading axis so many times, or the same along the first one that it has."""
+    array = np.asarray(array)
+    return as_array(
+        np.concatenate([array] * times) if join else np.broadcast_to(array, (times, *array.shape))
+    )

@@ -57,6 +57,4 @@ ADVICE = {
     Outcome.DIVERGED: "look for conditions of the goal that depend on each other, or a time that is too "
     "short; start from another guess",
     Outcome.NONFINITE: "check cost, goal and bounds for undefined operations",
-    Outcome.UNDETERMINED: "leave out one unknown of each combination that is named, or measure a motion that "
-    "tells them apart",
 }

@@ -11,7 +11,7 @@ import numpy as np
 Ask = Callable[[np.ndarray], Any]
 
 
-class Stopped(Exception):
+class StoppedError(Exception):
     """The user has stopped it; runs end with what they have."""
 
 
@@ -30,7 +30,7 @@ def side_by_side(
 
     Raises:
         Exception: what a run or `evaluate` raises. An interruption from the keyboard is handed to the runs
-            as `Stopped`.
+            as `StoppedError`.
     """
     points, asked = np.array(points), SimpleQueue()
     answers = {lane: SimpleQueue() for lane in runs}
@@ -61,9 +61,9 @@ def side_by_side(
                     else:
                         waiting.append(lane)
                         points[lane] = point
-                found: Any = [Stopped()] * len(points) if stopped or not waiting else evaluate(points)
+                found: Any = [StoppedError()] * len(points) if stopped or not waiting else evaluate(points)
             except KeyboardInterrupt:
-                stopped, found = True, [Stopped()] * len(points)
+                stopped, found = True, [StoppedError()] * len(points)
             except Exception as error:
                 found = [error] * len(points)
             for lane in waiting:
