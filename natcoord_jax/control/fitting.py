@@ -99,11 +99,11 @@ class Scaling(NamedTuple):
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Bounds of z."""
+        return self._scaled(self.lower), self._scaled(self.upper)
+
+    def _scaled(self, x: np.ndarray) -> np.ndarray:
         with np.errstate(divide="ignore", invalid="ignore"):
-            return tuple(
-                np.where(self.logarithmic, np.log(x / self.reference), (x - self.reference) / self.size)
-                for x in (self.lower, self.upper)
-            )
+            return np.where(self.logarithmic, np.log(x / self.reference), (x - self.reference) / self.size)
 
     def scattered(self, starts: int, spread: float, seed: int) -> np.ndarray:
         """Where searches begin: zero, then random between two bounds, or about zero where there are not."""
@@ -156,7 +156,7 @@ class Measurement(NamedTuple):
                 f"{', '.join(labels)}; make them agree"
             )
         present = np.isfinite(values)
-        empty = [label for label, some in zip(labels, present.any(axis=(0, 1))) if not some]
+        empty = [label for label, some in zip(labels, np.atleast_1d(present.any(axis=(0, 1)))) if not some]
         if empty:
             raise ValueError(
                 f"identify: measured has no number at all of {', '.join(empty)}; leave it out of `sensors` "
@@ -213,8 +213,8 @@ class At:
         for k in range(len(whole)):
             first = shared + k * own
             whole[k, ..., first : first + own] = slopes[k, ..., shared:]
-        missed = (channels - data.values)[data.present]
-        slopes = whole[data.present] * scaling.slopes(z)
+        missed = np.asarray((channels - data.values)[data.present])
+        slopes = np.asarray(whole[data.present] * scaling.slopes(z))
         failed = [code for code in found.result if not Result(int(code)).ok]
         code = Result(int(failed[0])) if failed else Result.SUCCESSFUL
         sound = code.ok and bool(np.isfinite(missed).all() and np.isfinite(slopes).all())
@@ -286,8 +286,8 @@ def searched(ask: Ask, first: At, scaling: Scaling, sigma: np.ndarray, most: int
     try:
         # (Which moves a start from a bound inwards by a little.)
         end = least_squares(
-            missed, first.z, lambda z: at(z).weighted(sigma)[1], scaling.bounds(), method="trf",
-            ftol=TOLERANCE, xtol=TOLERANCE, gtol=1e-8, max_nfev=most,
+            missed, first.z, lambda z: at(z).weighted(sigma)[1],  # pyright: ignore[reportArgumentType]
+            bounds=scaling.bounds(), ftol=TOLERANCE, xtol=TOLERANCE, gtol=1e-8, max_nfev=most, method="trf",
         )  # fmt: skip
         outcome = Outcome.MAX_ITERATIONS if end.status == 0 else Outcome.OPTIMAL
     except StoppedError:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from natcoord_jax.control.fitting import EXACT, Fit, Measurement, Scaling, sides
-from natcoord_jax.control.measurement import Setting
+from natcoord_jax.control.measurement import Setting, of_one
 from natcoord_jax.control.results import OUTCOMES, Outcome
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.eager_numpy import eager_numpy
@@ -240,7 +240,7 @@ def concluded(
     several = len(states.t) > 1
     return Identified(
         system=system,
-        state=start if several else jax.tree.map(lambda x: x[0], start),
+        state=start if several else of_one(start, 0),
         values=dict(zip(scaling.names, values.tolist())),
         deviations=dict(zip(scaling.names, np.sqrt(np.diag(covariance)).tolist())),
         names=scaling.names,
@@ -302,8 +302,7 @@ def spread_of(slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _memory(residuals: np.ndarray) -> np.ndarray:
     """Correlation of what is left from one sample to the next, of each channel."""
-    pairs = residuals[:, 1:] * residuals[:, :-1]
-    there = np.isfinite(pairs)
-    product = np.where(there, pairs, 0.0).sum(axis=(0, 1)) / np.maximum(there.sum(axis=(0, 1)), 1)
-    square = np.nanmean(residuals**2, axis=(0, 1))
-    return product / np.where(square > 0, square, 1.0)
+    pairs = np.stack([residuals[:, 1:], residuals[:, :-1]])
+    pairs = np.where(np.isfinite(pairs).all(axis=0), pairs, 0.0)
+    size = np.sqrt(np.prod((pairs**2).sum(axis=(1, 2)), axis=0))
+    return np.prod(pairs, axis=0).sum(axis=(0, 1)) / np.where(size > 0, size, 1.0)

@@ -8,7 +8,7 @@ import numpy as np
 
 from natcoord_jax.control.fitting import At, Fit, Measurement, Scaling, finished, searched
 from natcoord_jax.control.identified import Identified, concluded
-from natcoord_jax.control.measurement import INITIAL, MEASURED, SENSORS, Predicted, Setting, predicted
+from natcoord_jax.control.measurement import INITIAL, MEASURED, SENSORS, Predicted, Setting, of_one, predicted
 from natcoord_jax.control.problem import PARAMETERS
 from natcoord_jax.control.results import Outcome
 from natcoord_jax.control.side_by_side import side_by_side
@@ -113,8 +113,7 @@ def identify(
         Function.of(control), steps, save_every, scheme,
     )  # fmt: skip
     scaling = Scaling.of(setting, states)
-    first = jax.tree.map(lambda x: x[0], (states, inputs))
-    data = Measurement.of(values, setting.labels(*first), noise)
+    data = Measurement.of(values, setting.labels(*of_one((states, inputs), 0)), noise)
     if len(data.channel) <= len(scaling.names):
         raise ValueError(
             f"identify: measured has {len(data.channel)} numbers for {len(scaling.names)} unknowns, "
@@ -187,7 +186,8 @@ def _states(system: System, state: State, experiments: int) -> State:
             f"identify: state has the leading axes {state.t.shape}, and measured {experiments} experiments; "
             "pass as many states as experiments, or one for all"
         )
-    check_state(system, jax.tree.map(lambda x: x[0], state))
+    state = jax.tree.map(as_array, state)
+    check_state(system, of_one(state, 0))
     return state
 
 

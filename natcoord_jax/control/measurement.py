@@ -13,6 +13,7 @@ from jaxtyping import Array, Float, Int
 from natcoord_jax.control.problem import Parameter
 from natcoord_jax.core.arguments import Part, is_a
 from natcoord_jax.core.callables import Function, replace_fields
+from natcoord_jax.core.checks import as_array
 from natcoord_jax.core.compiled import compiled
 from natcoord_jax.core.handles import Handle
 from natcoord_jax.core.kinds import FLAG, JOINT_NAME, NAME, FunctionOf, Kind, Several, is_other, of
@@ -92,7 +93,8 @@ class MeasuredKind(Kind):
     """Measured numbers, of which some may be missing."""
 
     wanted = (
-        "finite numbers of shape (samples, channels) or (experiments, samples, channels), NaN where missing"
+        "finite numbers of shape (samples, channels) or (experiments, samples, channels), of two samples or "
+        "more, NaN where missing"
     )
     measured = True
 
@@ -101,7 +103,7 @@ class MeasuredKind(Kind):
         array = array_of(value)
         if array is None:
             return is_other(value)
-        if array.ndim not in (1, 2, 3) or not array.size:
+        if array.ndim not in (1, 2, 3) or not array.size or array.shape[-2:][0] < 2:
             return f"has shape {array.shape}"
         return "has infinite numbers" if np.any(np.isinf(np.asarray(array))) else None
 
@@ -162,8 +164,8 @@ class Setting(eqx.Module):
         # (Where constraints or drives have a say as well, what was set is marked as held.)
         return state if state.held is None or not self.initial else assemble(system, state)
 
-    def run(self, values: Float[Array, " n"], state: State, inputs: Any) -> tuple[Array, Trajectory]:
-        """Channels (samples, channels) of an experiment, and its motion."""
+    def run(self, values: Float[Array, " n"], state: State, inputs: Any) -> tuple[list[Array], Trajectory]:
+        """Channels of each sensor (samples, channels) in an experiment, and its motion."""
         system = self.system_at(values[: len(self.parameters)])
         start = self.start_at(system, state, values[len(self.parameters) :])
         control = self.control
@@ -171,42 +173,38 @@ class Setting(eqx.Module):
             system, start, dt=self.dt, steps=self.steps, save_every=self.save_every, scheme=self.scheme,
             inputs=inputs if control is None else lambda t, state: control(t, state), throw=False,
         )  # fmt: skip
-        return jnp.concatenate([self.read(s, system, motion, start) for s in self.sensors], axis=1), motion
+        return [self.read(sensor, system, motion, start) for sensor in self.sensors], motion
 
     def read(self, sensor: Any, system: System, motion: Trajectory, start: State) -> Array:
-        """Channels of one of the sensors (samples, channels)."""
-        if isinstance(sensor, Marker):
-            return system.sense(motion, sensor, state=start).position
-        if isinstance(sensor, Handle | str):
-            return motion.states.coordinates[..., np.array(joint_coordinates(system, sensor)[1])]
-        found = jnp.asarray(sensor(system, motion), float)
-        return found[:, None] if found.ndim == 1 else found
-
-    def labels(self, state: State, inputs: Any) -> tuple[str, ...]:
-        """Names of the channels.
+        """Channels of one of the sensors (samples, channels).
 
         Raises:
             ValueError: for a function that returns something else than samples and channels.
         """
+        if isinstance(sensor, Marker):
+            return system.sense(motion, sensor, state=start).position
+        if isinstance(sensor, Handle | str):
+            return motion.states.coordinates[..., np.array(joint_coordinates(system, sensor)[1])]
+        found, samples = jnp.asarray(sensor(system, motion), float), self.steps // self.save_every + 1
+        if found.ndim not in (1, 2) or found.shape[0] != samples:
+            raise ValueError(
+                f"identify: a function of `sensors` returns shape {found.shape}; return (samples, channels), "
+                f"here ({samples}, channels)"
+            )
+        return found[:, None] if found.ndim == 1 else found
+
+    def labels(self, state: State, inputs: Any) -> tuple[str, ...]:
+        """Names of the channels."""
         names, numbers = [], count(1)
-        each = jax.eval_shape(lambda x: self._separate(x, state, inputs), self.unknowns())
-        for sensor, found in zip(self.sensors, each):
-            if found.ndim != 2 or found.shape[0] != self.steps // self.save_every + 1:
-                raise ValueError(
-                    f"identify: a function of `sensors` returns shape {found.shape}; return (samples, "
-                    f"channels), here ({self.steps // self.save_every + 1}, channels)"
-                )
-            own = _names(self.system, sensor, found.shape[1])
+        found = jax.eval_shape(lambda x: self.run(x, state, inputs)[0], self.unknowns())
+        for sensor, channels in zip(self.sensors, found):
+            own = _names(self.system, sensor, channels.shape[1])
             names += [name or f"channel {k}" for name, k in zip(own, numbers)]
         return tuple(names)
 
     def unknowns(self) -> Float[Array, " n"]:
         """Room for the unknowns of an experiment."""
         return jnp.zeros(len(self.parameters) + len(self.initial))
-
-    def _separate(self, values: Array, state: State, inputs: Any) -> list[Array]:
-        _, motion = self.run(values, state, inputs)
-        return [self.read(sensor, self.system, motion, state) for sensor in self.sensors]
 
 
 def _names(system: System, sensor: Any, channels: int) -> list[str]:
@@ -217,6 +215,11 @@ def _names(system: System, sensor: Any, channels: int) -> list[str]:
         return [""] * channels
     name, units = sensor if isinstance(sensor, str) else sensor.name, joint_coordinates(system, sensor)[2]
     return [f"{name!r}" + f" {k + 1}" * (channels > 1) + f" [{unit}]" for k, unit in enumerate(units)]
+
+
+def of_one(tree: Any, index: int) -> Any:
+    """One of several, along the first axes of arrays, without a program for each shape."""
+    return jax.tree.map(lambda x: as_array(np.asarray(x)[index]), tree)
 
 
 class Predicted(NamedTuple):
@@ -242,7 +245,8 @@ def predicted(setting: Setting, states: State, inputs: Any, values: Float[Array,
     """
 
     def channels(state: State, u: Any, x: Array) -> tuple[Array, tuple[Array, Array]]:
-        found, motion = setting.run(x, state, u)
+        each, motion = setting.run(x, state, u)
+        found = jnp.concatenate(each, axis=1)
         return found, (found, motion.result)
 
     each = jax.jacfwd(channels, argnums=2, has_aux=True)

@@ -1,0 +1,347 @@
+"""Numbers from measured motions: against SciPy, how often intervals cover truth, what data do not tell."""
+
+import io
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import curve_fit
+
+import natcoord_jax as nc
+
+DT, STEPS, NOISE = 0.01, 200, 0.01
+TRUTH = {"stiffness": 2.5, "damping": 0.08}
+STIFFNESS = nc.Parameter(
+    "stiffness", apply=lambda system, k: system.set("spring", stiffness=k), value=1.0, lower=0.01
+)
+DAMPING = nc.Parameter(
+    "damping", apply=lambda system, c: system.set("damper", damping=c), value=0.01, lower=0.0
+)
+BOTH = (STIFFNESS, DAMPING)
+PUSH = nc.Initial("push", "hinge", rate=True)
+
+
+def pendulum():
+    """A pendulum with a spring and a damper, let go at 1.2 rad."""
+    scene = nc.Scene()
+    scene.add(nc.Gravity())
+    rod = scene.add(nc.RigidBody(mass=1.2, inertia=(0.03, 0.03, 0.001), com=(0, 0, -0.3), name="rod"))
+    hinge = scene.add(nc.Revolute(nc.ground, rod, axis=(0, 1, 0), name="hinge"))
+    scene.add(nc.JointSpring(hinge, stiffness=1.0, name="spring"))
+    scene.add(nc.JointDamper(hinge, damping=0.01, name="damper"))
+    system, state = scene.compile()
+    return system, system.with_coordinate(state, hinge, 1.2), rod
+
+
+@pytest.fixture(scope="module")
+def swinging():
+    return pendulum()[:2]
+
+
+def with_values(system, values):
+    for parameter, value in zip(BOTH, values):
+        system = parameter.applied(system, value)
+    return system
+
+
+def angles(system, start, values=None):
+    """Exact ones (samples, 1)."""
+    run = nc.simulate(with_values(system, values or TRUTH.values()), start, dt=DT, steps=STEPS)
+    return np.asarray(system.coordinate(run, "hinge"))[:, None]
+
+
+def noisy(exact, seed=0, size=NOISE, missing=0.1):
+    """With noise, and without some of it."""
+    rng = np.random.default_rng(seed)
+    found = exact + size * rng.standard_normal(exact.shape)
+    found[rng.uniform(size=exact.shape) < missing] = np.nan
+    return found
+
+
+def identified(swinging, measured, parameters=BOTH, sensors="hinge", **options):
+    return nc.identify(*swinging, parameters, measured, sensors, dt=DT, **options)
+
+
+def off(found, truth=TRUTH):
+    """Of each value, in deviations."""
+    return np.array([(found.values[name] - truth[name]) / found.deviations[name] for name in truth])
+
+
+# --- what is refused --------------------------------------------------------------------------------------
+
+
+def test_what_cannot_be_identified_is_refused_with_its_remedy(swinging):
+    fine = np.zeros((5, 1))
+    outside = nc.Parameter("damping", apply=lambda s, c: s, value=0.5, lower=1.0)
+    for words, measured, options in (
+        (r"measured has shape \(1, 1\).*two samples", fine[:1], {}),
+        ("measured has infinite numbers", fine + np.inf, {}),
+        ("pass some, each with its own", fine, {"parameters": ()}),
+        ("names .*'damping', 'damping'", fine, {"parameters": (DAMPING, DAMPING)}),
+        (
+            "'damping' is 0.5 where the search begins, outside of its bounds 1",
+            fine,
+            {"parameters": (outside,)},
+        ),
+        ("noise is 0.0; pass a positive", fine, {"noise": 0.0}),
+        (r"inputs has shape \(4, 1\)", fine, {"inputs": np.zeros((4, 1))}),
+        ("no joint 'elbow'", fine, {"initial": (nc.Initial("angle", "elbow"),)}),
+    ):
+        with pytest.raises(ValueError, match=words):
+            identified(swinging, measured, **options)
+    system, start = swinging
+    three = jax.tree.map(lambda x: np.stack([x] * 3), start)
+    with pytest.raises(ValueError, match=r"leading axes \(3,\), and measured 2 experiments"):
+        nc.identify(system, three, BOTH, np.zeros((2, 5, 1)), "hinge", dt=DT)
+
+
+def test_an_unknown_of_the_start_says_where_it_is():
+    with pytest.raises(ValueError, match="'push': pass `joint`, or `apply` together with `value`"):
+        nc.Initial("push")
+    with pytest.raises(ValueError, match="'push': the lower bound 2 is not below the upper bound 1"):
+        nc.Initial("push", "hinge", lower=2.0, upper=1.0)
+
+
+@pytest.mark.exhaustive
+def test_channels_that_do_not_fit_the_sensors_are_named(swinging):
+    for words, measured, options in (
+        (r"measured has 2 channels, and the sensors 1: 'hinge' \[rad\]", np.zeros((5, 2)), {}),
+        (r"no number at all of 'hinge' \[rad\]", np.full((5, 1), np.nan), {}),
+        ("measured has 2 numbers for 2 unknowns, stiffness, damping", np.zeros((2, 1)), {}),
+        (r"noise has shape \(2,\)", np.zeros((5, 1)), {"noise": (0.1, 0.2)}),
+        ("noise of a channel is 0", np.zeros((5, 1)), {"noise": (0.0,)}),
+        (
+            r"returns shape \(2, 1\); return .*here \(5, ch",
+            np.zeros((5, 1)),
+            {"sensors": lambda s, r: jnp.ones((2, 1))},
+        ),
+        (r"returns shape \(\)", np.zeros((5, 1)), {"sensors": lambda s, r: 1.0}),
+    ):
+        with pytest.raises(ValueError, match=words):
+            identified(swinging, measured, **options)
+
+
+# --- what is found ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.exhaustive
+def test_values_and_covariance_are_those_of_scipys_curve_fit(swinging):
+    """Which has its derivatives by differences, and no missing numbers."""
+    measured = noisy(angles(*swinging))
+    there = np.isfinite(measured)
+    found = identified(swinging, measured, noise=NOISE)
+    values, covariance = curve_fit(
+        lambda _, *values: angles(*swinging, values)[there], None, measured[there], (2.0, 0.1),
+        sigma=np.full(there.sum(), NOISE), absolute_sigma=True, epsfcn=1e-10, xtol=1e-12, ftol=1e-12,
+    )  # fmt: skip
+    assert found.ok and found.freedom == there.sum() - 2
+    np.testing.assert_allclose(list(found.values.values()), values, rtol=1e-6)
+    size = np.sqrt(np.diag(covariance))
+    np.testing.assert_allclose(found.correlation, covariance / size / size[:, None], atol=1e-4)
+    np.testing.assert_allclose(list(found.deviations.values()), size, rtol=1e-4)
+    np.testing.assert_array_equal(np.isnan(found.residuals), ~there)
+    assert found.cost == pytest.approx(np.nansum((found.residuals / NOISE) ** 2) / 2)
+    assert np.all(np.abs(off(found)) < 3)
+    # Without its size the noise is that of the residuals, and deviations are in proportion.
+    again = identified(swinging, measured)
+    assert again.noise[0] == pytest.approx(np.sqrt(np.nansum(again.residuals**2) / again.freedom))
+    np.testing.assert_allclose(again.covariance, found.covariance * (again.noise[0] / NOISE) ** 2, rtol=1e-6)
+
+
+@pytest.mark.exhaustive
+def test_intervals_cover_the_truth_as_often_as_they_say(swinging):
+    exact, truth, seeds = angles(*swinging), TRUTH | {"push": 0.0}, 200
+    inside = []
+    for seed in range(seeds):
+        found = identified(swinging, noisy(exact, seed), initial=(PUSH,))
+        assert found.ok, found.explain()
+        inside.append([low <= truth[name] <= high for name, (low, high) in found.interval(0.95).items()])
+    # Three deviations of a binomial of 200 are 4.6 %.
+    rates = np.mean(inside, axis=0)
+    assert np.all(np.abs(rates - 0.95) < 3 * np.sqrt(0.95 * 0.05 / seeds)), rates
+
+
+@pytest.mark.exhaustive
+def test_channels_weigh_by_their_noise_which_is_estimated(swinging):
+    """An angle and a bad rate, of every second step."""
+    system, start = swinging
+    truth = with_values(system, TRUTH.values())
+
+    def rate(system, run):
+        return system.rate(run, "hinge")
+
+    sensors = ("hinge", rate)
+    run = nc.simulate(truth, start, dt=DT, steps=STEPS, save_every=2)
+    exact = np.stack([system.coordinate(run, "hinge"), system.rate(run, "hinge")], axis=1)
+    sizes = np.array([1e-3, 0.5])
+    measured = noisy(exact, size=sizes)
+    found = identified(swinging, measured, sensors=sensors, save_every=2)
+    np.testing.assert_allclose(found.noise, sizes, rtol=0.2)
+    assert found.labels == ("'hinge' [rad]", "channel 2") and np.all(np.abs(off(found)) < 3)
+    given = identified(swinging, measured, sensors=sensors, save_every=2, noise=found.noise)
+    np.testing.assert_allclose(list(given.values.values()), list(found.values.values()), rtol=1e-4)
+    # The bad channel tells next to nothing, and does no harm.
+    alone = identified(swinging, measured[:, :1], save_every=2)
+    assert found.deviations["stiffness"] == pytest.approx(alone.deviations["stiffness"], rel=0.05)
+
+
+@pytest.mark.exhaustive
+def test_sensors_are_joints_points_and_functions_whose_channels_follow_each_other(swinging):
+    system, start, rod = pendulum()
+    place = nc.Point(rod, (0.0, 0.0, -0.6), local=True)
+    run = nc.simulate(with_values(system, TRUTH.values()), start, dt=DT, steps=STEPS)
+    exact = np.concatenate([angles(system, start), system.sense(run, place).position], axis=1)
+    found = identified(swinging, exact, sensors=[system.structure.joints[0], place])
+    assert found.labels[:2] == ("'hinge' [rad]", "point of 'rod', x [m]") and found.residuals.shape == (
+        201,
+        4,
+    )
+    np.testing.assert_allclose(list(found.values.values()), list(TRUTH.values()), rtol=1e-7)
+
+
+@pytest.mark.exhaustive
+def test_exact_data_give_exact_values(swinging):
+    found = identified(swinging, angles(*swinging))
+    np.testing.assert_allclose(list(found.values.values()), list(TRUTH.values()), rtol=1e-9)
+    assert found.ok and "noise alone" not in found.explain()
+    np.testing.assert_allclose(
+        angles(found.system, found.state, found.values.values()), angles(*swinging), atol=1e-9
+    )
+    assert float(found.system.get("spring", "stiffness")) == found.values["stiffness"]
+
+
+@pytest.mark.exhaustive
+def test_information_of_several_experiments_adds_up(swinging):
+    """Of other starts and lengths; what is not known of a start is known from its own experiment only."""
+    system, start = swinging
+    starts = [
+        system.with_coordinate(start, "hinge", angle, rate=rate) for angle, rate in ((1.2, 0.3), (0.5, -1.0))
+    ]
+    measured = np.stack([noisy(angles(system, one), seed, missing=0) for seed, one in enumerate(starts)])
+    measured[1, 120:] = np.nan
+    assumed = [
+        system.with_coordinate(one, "hinge", float(system.coordinate(one, "hinge")), rate=0.0)
+        for one in starts
+    ]
+    states = jax.tree.map(lambda *x: np.stack(x), *assumed)
+    both = nc.identify(system, states, BOTH, measured, "hinge", dt=DT, initial=(PUSH,), noise=NOISE)
+    assert both.names == ("stiffness", "damping", "push [0]", "push [1]") and both.freedom == 201 + 120 - 4
+    assert np.all(np.abs(off(both, TRUTH | {"push [0]": 0.3, "push [1]": -1.0})) < 3.5)
+    assert both.residuals.shape == measured.shape and both.state.t.shape == (2,)
+    rates = system.rate(both.state, "hinge")
+    np.testing.assert_allclose(rates, [both.values["push [0]"], both.values["push [1]"]], rtol=1e-9)
+    each = [
+        nc.identify(system, one, BOTH, data, "hinge", dt=DT, initial=(PUSH,), noise=NOISE)
+        for one, data in zip(assumed, measured)
+    ]
+    known = sum(np.linalg.inv(one.covariance[:2, :2]) for one in each)
+    np.testing.assert_allclose(np.linalg.inv(both.covariance[:2, :2]), known, rtol=0.1)
+
+
+@pytest.mark.exhaustive
+def test_from_several_starts_the_least_is_found(swinging):
+    """A spring whose stiffness begins far off ends where the oscillation is a turn behind."""
+    far = (nc.Parameter("stiffness", apply=STIFFNESS.apply, value=300.0, lower=0.1, upper=1000.0), DAMPING)
+    measured = noisy(angles(*swinging))
+    alone = identified(swinging, measured, far)
+    found = identified(swinging, measured, far, starts=8)
+    assert abs(alone.values["stiffness"] - 2.5) > 1.0 and np.all(np.abs(off(found)) < 3)
+    assert len(found.starts) == 8 and found.ok
+    least = min(start.cost for start in found.starts)
+    assert (
+        found.starts[0].cost > 10 * least and found.starts[0].values["stiffness"] == alone.values["stiffness"]
+    )
+    assert "of 8 starts ended at the least cost" in found.explain()
+
+
+# --- what the data do not tell ----------------------------------------------------------------------------
+
+
+@pytest.mark.exhaustive
+def test_what_the_channels_do_not_depend_on_is_named(swinging):
+    """One unknown that does nothing, and two of which only the sum acts."""
+    measured = noisy(angles(*swinging))
+    idle = nc.Parameter("idle", apply=lambda system, x: system, value=2.0)
+    more = nc.Parameter(
+        "more",
+        apply=lambda system, k: system.set("spring", stiffness=system.get("spring", "stiffness") + k),
+        value=0.0,
+    )
+    found = identified(swinging, measured, (*BOTH, more, idle))
+    assert found.outcome is nc.Outcome.UNDETERMINED and not found.ok
+    known = identified(swinging, measured)
+    assert found.deviations["damping"] == pytest.approx(known.deviations["damping"], rel=0.01)
+    assert all(np.isinf(found.deviations[name]) for name in ("stiffness", "more", "idle"))
+    assert found.values["idle"] == 2.0 and np.all(np.isnan(found.correlation[3, :3]))
+    together = found.values["stiffness"] + found.values["more"]
+    assert together == pytest.approx(known.values["stiffness"], rel=1e-4)
+    assert sorted(map(sorted, found.undetermined)) == [["idle"], ["more", "stiffness"]]
+    pair = next(change for change in found.undetermined if len(change) == 2)
+    assert pair["more"] == pytest.approx(-pair["stiffness"], rel=1e-3)
+    assert "not determined" in found.explain() and "leave out one" in found.explain()
+
+
+@pytest.mark.exhaustive
+def test_a_bound_that_excludes_the_truth_holds_and_is_told(swinging):
+    less = nc.Parameter("damping", apply=DAMPING.apply, value=0.01, lower=0.0, upper=0.05)
+    found = identified(swinging, noisy(angles(*swinging)), (STIFFNESS, less))
+    assert found.ok and found.at_bounds == {"damping": "upper"} and found.values["damping"] == 0.05
+    assert found.interval()["damping"][1] == 0.05
+    # What is left is no noise.
+    assert found.memory[0] > 0.9 and "upper bound" in found.explain() and "lacks something" in found.explain()
+    free = identified(swinging, noisy(angles(*swinging)))
+    assert abs(free.memory[0]) < 3 / np.sqrt(STEPS) and not free.at_bounds
+
+
+@pytest.mark.exhaustive
+def test_points_that_cannot_be_simulated_are_refused(swinging):
+    """A damper is never negative, which an unknown without bounds does not know."""
+    free = nc.Parameter("damping", apply=DAMPING.apply, value=0.5)
+    found = identified(swinging, noisy(angles(*swinging, (2.5, 0.0))), (STIFFNESS, free))
+    assert found.refused > 0 and found.values["damping"] >= 0 and found.deviations["damping"] < 1e-3
+    lost = identified(
+        swinging, noisy(angles(*swinging)), (STIFFNESS, nc.Parameter("d", apply=DAMPING.apply, value=-0.5))
+    )
+    assert lost.outcome is nc.Outcome.SIMULATION_FAILED and not lost.ok
+    assert "where the search begins" in lost.explain() and "begin with other values" in lost.explain()
+
+
+# --- programs and interruptions ---------------------------------------------------------------------------
+
+
+@pytest.mark.exhaustive
+def test_other_numbers_compile_nothing(swinging, programs):
+    exact = angles(*swinging)
+    identified(swinging, noisy(exact))
+    programs.clear()
+    system, start = pendulum()[:2]
+    heavier = system.set("rod", mass=1.3), system.with_coordinate(start, "hinge", 1.1)
+    other = (
+        nc.Parameter("stiffness", apply=STIFFNESS.apply, value=1.5, lower=0.02, upper=50.0),
+        nc.Parameter("damping", apply=DAMPING.apply, value=0.02),
+    )
+    for options in ({"noise": 0.02}, {"parameters": other, "max_evaluations": 7}):
+        identified(swinging, noisy(exact, seed=1), **options)
+    nc.identify(*heavier, BOTH, noisy(exact), "hinge", dt=0.011)
+    assert not programs
+
+
+@pytest.mark.exhaustive
+def test_it_ends_where_it_is_told_to(swinging, monkeypatch):
+    class Impatient(io.StringIO):
+        """Interrupts where the third evaluation is shown."""
+
+        def write(self, text):
+            super().write(text)
+            if text.startswith("evaluation 3"):
+                raise KeyboardInterrupt
+
+    measured = noisy(angles(*swinging))
+    stopped = identified(swinging, measured, max_evaluations=2)
+    assert stopped.outcome is nc.Outcome.MAX_ITERATIONS and "more evaluations" in stopped.explain()
+    monkeypatch.setattr(sys, "stderr", Impatient())
+    stopped = identified(swinging, measured, starts=2, progress=True)
+    assert stopped.outcome is nc.Outcome.STOPPED and not stopped.ok and stopped.cost < np.inf
+    assert "least cost" in sys.stderr.getvalue()
