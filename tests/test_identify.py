@@ -256,6 +256,98 @@ def test_from_several_starts_the_least_is_found(swinging):
     assert "of 8 starts ended at the least cost" in found.explain()
 
 
+# --- machines ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.exhaustive
+def test_masses_and_friction_of_an_arm_from_encoders_and_torques():
+    """Three joints under a controller; a tenth of the numbers is missing."""
+    scene, joints, below, height = nc.Scene(), [], nc.ground, 0.0
+    scene.add(nc.Gravity())
+    for k, (axis, mass, length) in enumerate(zip(np.eye(3)[[2, 1, 1]], (4.0, 3.0, 2.0), (0.4, 0.4, 0.3))):
+        place = {"com": (0, 0, length / 2), "position": (0, 0, height)}
+        link = scene.add(nc.RigidBody(mass=mass, inertia=(0.06, 0.06, 0.06), name=f"link {k}", **place))
+        joint = scene.add(nc.Revolute(below, link, point=(0, 0, height), axis=axis, name=f"joint {k}"))
+        scene.add(nc.JointDamper(joint, damping=0.5, name=f"viscous {k}"))
+        scene.add(nc.JointFriction(joint, friction=0.5, slip=0.05, name=f"dry {k}"))
+        scene.add(nc.JointTorque(joint, name=f"motor {k}"))
+        joints, below, height = [*joints, joint], link, height + length
+    system, start = scene.compile()
+    rest = np.array([0.0, 0.6, 0.8])
+    for joint, angle in zip(joints, rest):
+        start = system.with_coordinate(start, joint, angle)
+
+    def controller(t, state):
+        wish = rest + jnp.array([0.8, 0.5, 0.7]) * jnp.sin(jnp.array([2.1, 2.9, 4.3]) * t)
+        angle = jnp.stack([system.coordinate(state, joint) for joint in joints])
+        rate = jnp.stack([system.rate(state, joint) for joint in joints])
+        return jnp.array([40.0, 80.0, 30.0]) * (wish - angle) - jnp.array([4.0, 6.0, 2.0]) * rate
+
+    def torques(system, run):
+        """Of the step before each sample; of the first there is none."""
+        return jnp.concatenate([run.inputs[:1], run.inputs])
+
+    def of_part(part, field, value):
+        apply = lambda system, x: system.set(part, **{field: x})  # noqa: E731
+        return nc.Parameter(f"{field} of {part}", apply=apply, value=value, lower=0.0)
+
+    unknown = [of_part(f"link {k}", "mass", value) for k, value in ((1, 3.0), (2, 2.0))]
+    unknown += [of_part(f"viscous {k}", "damping", 0.5) for k in range(3)]
+    unknown += [of_part(f"dry {k}", "friction", 0.5) for k in range(3)]
+    truth = dict(zip((x.name for x in unknown), (3.6, 2.7, 0.9, 0.7, 0.3, 1.2, 0.8, 0.4)))
+    real = system
+    for parameter in unknown:
+        real = parameter.applied(real, truth[parameter.name])
+    run = nc.simulate(real, start, dt=0.01, steps=300, inputs=controller)
+    sizes = np.repeat([1e-3, 0.2], 3)
+    measured = noisy(np.concatenate([run.states.coordinates, torques(real, run)], axis=1), size=sizes)
+    measured[0, 3:] = np.nan
+    found = nc.identify(system, start, unknown, measured, [*joints, torques], dt=0.01, inputs=controller)
+    assert found.ok and np.all(np.abs(off(found, truth)) < 3.5), found.explain()
+    np.testing.assert_allclose(found.noise, sizes, rtol=0.2)
+    assert max(found.deviations[name] / truth[name] for name in truth) < 0.1
+
+
+@pytest.mark.exhaustive
+def test_modulus_and_damping_of_a_ruler_from_its_ringing():
+    """A cantilever that a hammer has struck, its tip seen by a laser."""
+    modulus, scene = 1.5e11, nc.Scene()
+    section = nc.RectangularSection(width=0.02, height=0.001, E=modulus, nu=0.3, density=7800.0)
+    line = [(0, 0, 0), (0.5, 0, 0)]
+    ruler = scene.add(
+        nc.Beam(section, line, second=(0, 1, 0), elements=3, start=nc.ground, damping=1e-3, name="ruler")
+    )
+    up = nc.Direction(nc.ground, (0, 0, 1))
+    scene.add(nc.BodyForceInput((nc.Point(ruler.end, (0.5, 0, 0)), up), name="hammer"))
+    system, state = scene.compile()
+    unit, dampers = (
+        system.get(ruler.elements, "stiffness") / modulus,
+        [f"ruler/damping {k}" for k in range(3)],
+    )
+
+    def with_modulus(system, E):
+        return system.set(ruler.elements, stiffness=E * unit)
+
+    def with_damping(system, time):
+        return system.set(dampers, viscosity=time * system.get(ruler.elements, "stiffness"))
+
+    def laser(system, run):
+        return system.sense(run, nc.Point(ruler.end, local=True)).position[:, 2]
+
+    unknown = (
+        nc.Parameter("E", apply=with_modulus, value=modulus, lower=1e10, upper=1e12),
+        nc.Parameter("damping", apply=with_damping, value=1e-3, lower=1e-5, upper=1.0),
+    )
+    blow = np.zeros((200, 1))
+    blow[:4] = 0.3
+    real = with_damping(with_modulus(system, 2.05e11), 3e-3)
+    ringing = np.asarray(laser(real, nc.simulate(real, state, dt=5e-3, inputs=blow)))
+    found = nc.identify(system, state, unknown, noisy(ringing, size=2e-4), laser, dt=5e-3, inputs=blow)
+    assert found.ok and np.all(np.abs(off(found, {"E": 2.05e11, "damping": 3e-3})) < 3), found.explain()
+    assert found.deviations["E"] < 1e-3 * 2.05e11 and found.deviations["damping"] < 0.02 * 3e-3
+    assert found.residuals.shape == ringing[:, None].shape
+
+
 # --- what the data do not tell ----------------------------------------------------------------------------
 
 
@@ -315,9 +407,9 @@ def test_points_that_cannot_be_simulated_are_refused(swinging):
 def test_other_numbers_compile_nothing(swinging, programs):
     exact = angles(*swinging)
     identified(swinging, noisy(exact))
-    programs.clear()
     system, start = pendulum()[:2]
     heavier = system.set("rod", mass=1.3), system.with_coordinate(start, "hinge", 1.1)
+    programs.clear()
     other = (
         nc.Parameter("stiffness", apply=STIFFNESS.apply, value=1.5, lower=0.02, upper=50.0),
         nc.Parameter("damping", apply=DAMPING.apply, value=0.02),
