@@ -85,6 +85,7 @@ def test_what_cannot_be_identified_is_refused_with_its_remedy(swinging):
             fine,
             {"parameters": (outside,)},
         ),
+        ("guess has 'mass'; the unknowns are stiffness, damping", fine, {"guess": {"mass": 1.0}}),
         ("noise is 0.0; pass a positive", fine, {"noise": 0.0}),
         (r"inputs has shape \(4, 1\)", fine, {"inputs": np.zeros((4, 1))}),
         ("no joint 'elbow'", fine, {"initial": (nc.Initial("angle", "elbow"),)}),
@@ -254,6 +255,10 @@ def test_from_several_starts_the_least_is_found(swinging):
         found.starts[0].cost > 10 * least and found.starts[0].values["stiffness"] == alone.values["stiffness"]
     )
     assert "of 8 starts ended at the least cost" in found.explain()
+    # A short part of the motion leads there, too.
+    start = np.where(np.arange(STEPS + 1)[:, None] < 30, measured, np.nan)
+    again = identified(swinging, measured, far, guess=identified(swinging, start, far))
+    assert again.starts[0].cost == pytest.approx(least, rel=1e-6) and again.evaluations < 9
 
 
 # --- machines ---------------------------------------------------------------------------------------------

@@ -55,11 +55,12 @@ class Scaling(NamedTuple):
     shared: int
 
     @classmethod
-    def of(cls, setting: Setting, states: State) -> "Scaling":
-        """Of a setting, with the initial states of all experiments.
+    def of(cls, setting: Setting, states: State, guess: dict[str, float]) -> "Scaling":
+        """Of a setting, with the initial states of all experiments, and other values to begin with by name.
 
         Raises:
-            ValueError: for names that are not different, or a value outside of its bounds.
+            ValueError: for names that are not different, a guess of what is not unknown, or a value outside
+                of its bounds.
         """
         count = len(states.t)
         names = [p.name for p in setting.parameters]
@@ -72,14 +73,17 @@ class Scaling(NamedTuple):
             bounds += [(i.lower, i.upper) for i in setting.initial]
         if len(set(names)) != len(names) or not names:
             raise ValueError(f"identify: the unknowns have the names {names}; pass some, each with its own")
-        reference = np.array(found)
+        strange = sorted(set(guess) - set(names))
+        if strange:
+            raise ValueError(f"identify: guess has {strange[0]!r}; the unknowns are {', '.join(names)}")
+        reference = np.array([float(guess.get(name, value)) for name, value in zip(names, found)])
         lower = np.array([-np.inf if a is None else a for a, _ in bounds])
         upper = np.array([np.inf if b is None else b for _, b in bounds])
         for name, x, a, b in zip(names, reference, lower, upper):
             if not a <= x <= b:
                 raise ValueError(
                     f"identify: {name!r} is {x:g} where the search begins, outside of its bounds {a:g} ... "
-                    f"{b:g}; widen them, or begin with a system or `value` within"
+                    f"{b:g}; widen them, or begin within, with another system, `value` or `guess`"
                 )
         logarithmic = (lower > 0) & (upper >= FAR * lower)
         size, range_ = np.abs(reference), upper - lower

@@ -26,6 +26,8 @@ PART = 1e-3
 """Part of an unknown in a combination from which on it counts."""
 CLOSE = 0.95
 """Correlation from which on `explain` tells of it."""
+MOST = 5
+"""Correlations that it tells of."""
 ADVICE = {
     Outcome.MAX_ITERATIONS: "allow more evaluations, or begin elsewhere",
     Outcome.SIMULATION_FAILED: "or begin with other values",
@@ -182,9 +184,12 @@ class Identified(eqx.Module):
     def _doubts(self) -> list[str]:
         """Noise of the channels, and what speaks against the deviations."""
         lines = []
-        correlation = np.nan_to_num(self.correlation)
-        for i, j in zip(*np.nonzero(np.triu(np.abs(correlation) > CLOSE, 1))):
-            lines.append(f"  {self.names[i]} and {self.names[j]} are correlated by {correlation[i, j]:.3f}")
+        close = np.triu(np.nan_to_num(self.correlation), 1)
+        pairs = sorted(zip(*np.nonzero(np.abs(close) > CLOSE)), key=lambda pair: -abs(close[pair]))
+        for i, j in pairs[:MOST]:
+            lines.append(f"  {self.names[i]} and {self.names[j]} are correlated by {close[i, j]:.3f}")
+        if len(pairs) > MOST:
+            lines.append(f"  and {len(pairs) - MOST} more pairs by more than {CLOSE}")
         counts = np.isfinite(self.residuals).reshape(-1, len(self.labels)).sum(axis=0)
         for label, noise, left, memory, n in zip(self.labels, self.noise, self.left, self.memory, counts):
             line = f"  noise of {label}: {noise:.4g}" + (", estimated" if self.estimated else ", given")
@@ -231,7 +236,7 @@ def concluded(
         size = scaling.slopes(at.z)
         covariance = covariance * size * size[:, None]
         for direction in directions * size:
-            named = {n: float(x) for n, x, s in zip(scaling.names, direction, size) if abs(x) > PART * s}
+            named = {n: float(f"{x:.6g}") for n, x, s in zip(scaling.names, direction, size) if abs(x) > PART * s}
             undetermined.append(named)
     if undetermined and outcome is Outcome.OPTIMAL:
         outcome = Outcome.UNDETERMINED

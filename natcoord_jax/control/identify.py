@@ -16,13 +16,15 @@ from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.callables import Function
 from natcoord_jax.core.checks import as_array
 from natcoord_jax.core.closures import with_callables
-from natcoord_jax.core.kinds import FLAG, Concrete
+from natcoord_jax.core.kinds import FLAG, Concrete, of
 from natcoord_jax.core.numeric import Number, Vector, Whole
 from natcoord_jax.core.state import STATE, State
 from natcoord_jax.model.model import SYSTEM
 from natcoord_jax.stepping.checked import INPUTS, STEP, check_state, checked_inputs
 from natcoord_jax.stepping.scheme import SCHEME, SECOND_ORDER, Scheme
 from natcoord_jax.system import System
+
+GUESS = of("values by name", dict) | of("what nc.identify(...) returned", Identified)
 
 
 @checked()
@@ -36,6 +38,7 @@ def identify(
     dt: Annotated[Any, Concrete(STEP)],
     inputs: Annotated[Any, Concrete(INPUTS)] = None,
     initial: Annotated[Any, INITIAL] = (),
+    guess: Annotated[Any, GUESS] = None,
     noise: Annotated[Any, Concrete(Number("positive") | Vector(None))] = None,
     save_every: Annotated[int, Whole(1)] = 1,
     starts: Annotated[int, Whole(1)] = 1,
@@ -52,7 +55,7 @@ def identify(
     exact derivatives. Positive unknowns whose bounds are far apart are searched for by their logarithms.
 
     Args:
-        system: compiled system; the search begins with its numbers.
+        system: compiled system.
         state: state at the first sample; of several experiments stacked along a leading axis, or one for all.
         parameters: unknown numbers of the system, each an `nc.Parameter`. Bounds hold wherever it looks.
         measured: shape (samples, channels), or (experiments, samples, channels) of several at once. The first
@@ -63,11 +66,13 @@ def identify(
         dt: step [s].
         inputs: as in `nc.simulate`, known; arrays of several experiments along a leading axis.
         initial: unknown numbers of the initial state, each an `nc.Initial`; every experiment has its own.
+        guess: where the first search begins, values by name or an earlier `Identified`; what it does not name
+            begins with `value` of the unknown, or as the system and the state have it.
         noise: standard deviation of the measured numbers, in their units, one for all or one for each
             channel. None: estimated from what is left of each channel, and channels are weighed by it.
         save_every: steps from sample to sample.
-        starts: number of places where searches begin: the system as it is, then random ones, between bounds
-            or about it. All searches go on at once, in one batch.
+        starts: number of places where searches begin: the guess, then random ones, between bounds or about
+            it. All searches go on at once, in one batch.
         spread: of random places of unknowns without two bounds: how many times the size, or, of logarithms,
             by what factor exp(spread).
         seed: of the random places.
@@ -112,7 +117,7 @@ def identify(
         system, as_array(dt, float), tuple(parameters), tuple(initial), tuple(map(Function.of, sensors)),
         Function.of(control), steps, save_every, scheme,
     )  # fmt: skip
-    scaling = Scaling.of(setting, states)
+    scaling = Scaling.of(setting, states, guess.values if isinstance(guess, Identified) else guess or {})
     data = Measurement.of(values, setting.labels(*of_one((states, inputs), 0)), noise)
     if len(data.channel) <= len(scaling.names):
         raise ValueError(
