@@ -458,13 +458,13 @@ CALLS = {
         "seed": [0], **SOLVED,
     },
     "Initial": lambda w: {
-        "name": NAME, "joint": [w.hinge, "hinge"], "rate": FLAG, "index": [0], "lower": [-1.0], "upper": NUMBER,
-        "apply": [None, f], "value": NUMBER,
+        "name": NAME, "joint": [w.hinge, "hinge"], "rate": FLAG, "index": [0], "lower": [-1.0],
+        "upper": NUMBER, "apply": [None, f], "value": NUMBER,
     },
     "identify": lambda w: {
-        **RUN(w), "parameters": [()], "measured": [np.ones((3, 1)), 1.0], "sensors": [w.hinge, "hinge", f],
-        "dt": [0.1], "inputs": [np.ones((2, 1)), f], "initial": [()], "guess": [{}], "noise": NUMBER, "save_every": WHOLE,
-        "starts": WHOLE, "spread": NUMBER, "seed": [0], "max_evaluations": WHOLE,
+        **RUN(w), "parameters": [()], "measured": [np.ones((3, 1))], "sensors": [w.hinge, "hinge", f],
+        "dt": [0.1], "inputs": [np.ones((2, 1)), f], "initial": [()], "guess": [{}], "noise": NUMBER,
+        "save_every": WHOLE, "starts": WHOLE, "spread": NUMBER, "seed": [0], "max_evaluations": WHOLE,
         "scheme": [nc.EnergyMomentum()], "progress": FLAG,
     },
     "continuation": lambda w: {
@@ -532,8 +532,8 @@ CALLS = {
 # What calls return or hand over, and bases: nobody is to make these by hand.
 MADE = {
     "Accuracy", "Balance", "BeamHandle", "Check", "ComputedTorque", "Contacts", "Continuation",
-    "DerivativeError", "Edge", "Equilibrium", "Feedback", "Frame", "Growth", "Identified", "Load", "MeshHandle", "Modes",
-    "NodeKind", "Nodes", "NonlinearProgram", "Optima", "Outcome", "Result", "SimulationError", "Solution",
+    "DerivativeError", "Edge", "Equilibrium", "Feedback", "Frame", "Growth", "Identified", "Load",
+    "MeshHandle", "Modes", "NodeKind", "Nodes", "NonlinearProgram", "Optima", "Outcome", "Result", "SimulationError", "Solution",
     "State", "Steps", "Surface", "Sweep", "System",
     "Trajectory",
 }  # fmt: skip

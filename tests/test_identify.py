@@ -261,6 +261,41 @@ def test_from_several_starts_the_least_is_found(swinging):
     assert again.starts[0].cost == pytest.approx(least, rel=1e-6) and again.evaluations < 9
 
 
+@pytest.mark.exhaustive
+def test_the_start_of_a_loop_is_assembled_about_what_is_not_known():
+    points = [(0.0, 0.0, 0.0), (0.0, 0.0, 1.0), (1.5, 0.0, 1.2), (1.5, 0.0, 0.0)]
+    scene = nc.Scene()
+    bars = [scene.add(nc.RigidBody(mass=1.3, inertia=(0.2, 0.3, 0.4), position=x)) for x in points[:3]]
+    line = [nc.ground, *bars, nc.ground]
+    for k, point in enumerate(points):
+        scene.add(nc.Revolute(line[k], line[k + 1], point=point, axis=(0, 1, 0), name=f"hinge {k}"))
+    scene.add(nc.Gravity())
+    system, state = scene.compile()
+    start = nc.assemble(system, system.with_coordinate(state, "hinge 0", 0.05, rate=0.7))
+    exact = system.coordinate(nc.simulate(system, start, dt=0.01, steps=20), "hinge 0")
+    unknown = nc.Initial("angle", "hinge 0"), nc.Initial("rate", "hinge 0", rate=True)
+    found = nc.identify(system, state, (), exact, "hinge 0", dt=0.01, initial=unknown)
+    assert found.ok and found.values == pytest.approx({"angle": 0.05, "rate": 0.7}, rel=1e-7)
+    errors = system.constraint_errors(found.state)
+    assert errors.position < 1e-12 and errors.velocity < 1e-12
+
+
+@pytest.mark.exhaustive
+def test_a_length_that_moves_the_start_is_found(swinging):
+    system, start = swinging
+
+    def with_length(system, length):
+        """Of the rod, from the hinge to its reference."""
+        return system.set("hinge", frames=system.get("hinge", "frames").at[1, 0, 3].set(length))
+
+    real = with_length(system, 0.2)
+    run = nc.simulate(real, nc.assemble(real, start), dt=DT, steps=STEPS)
+    length = nc.Parameter("length", apply=with_length, value=0.0, lower=-0.5, upper=0.5, moves=True)
+    found = identified(swinging, noisy(np.asarray(system.coordinate(run, "hinge"))), (length,))
+    assert found.ok and np.abs(off(found, {"length": 0.2})) < 3
+    assert found.system.constraint_errors(found.state).position < 1e-12
+
+
 # --- machines ---------------------------------------------------------------------------------------------
 
 

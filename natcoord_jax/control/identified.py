@@ -236,8 +236,8 @@ def concluded(
         size = scaling.slopes(at.z)
         covariance = covariance * size * size[:, None]
         for direction in directions * size:
-            named = {n: float(f"{x:.6g}") for n, x, s in zip(scaling.names, direction, size) if abs(x) > PART * s}
-            undetermined.append(named)
+            changes = zip(scaling.names, direction, size)
+            undetermined.append({n: float(f"{x:.6g}") for n, x, s in changes if abs(x) > PART * s})
     if undetermined and outcome is Outcome.OPTIMAL:
         outcome = Outcome.UNDETERMINED
     values = scaling.values(at.z)
