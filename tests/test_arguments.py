@@ -533,8 +533,8 @@ CALLS = {
 MADE = {
     "Accuracy", "Balance", "BeamHandle", "Check", "ComputedTorque", "Contacts", "Continuation",
     "DerivativeError", "Edge", "Equilibrium", "Feedback", "Frame", "Growth", "Identified", "Load",
-    "MeshHandle", "Modes", "NodeKind", "Nodes", "NonlinearProgram", "Optima", "Outcome", "Result", "SimulationError", "Solution",
-    "State", "Steps", "Surface", "Sweep", "System",
+    "MeshHandle", "Modes", "NodeKind", "Nodes", "NonlinearProgram", "Optima", "Outcome", "Result",
+    "SimulationError", "Solution", "State", "Steps", "Surface", "Sweep", "System",
     "Trajectory",
 }  # fmt: skip
 BASES = {
