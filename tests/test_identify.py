@@ -42,7 +42,7 @@ def swinging():
 
 def with_values(system, values):
     for parameter, value in zip(BOTH, values):
-        system = parameter.applied(system, value)
+        system = parameter.applied(system, jnp.asarray(value))
     return system
 
 
@@ -337,7 +337,7 @@ def test_masses_and_friction_of_an_arm_from_encoders_and_torques():
     truth = dict(zip((x.name for x in unknown), (3.6, 2.7, 0.9, 0.7, 0.3, 1.2, 0.8, 0.4)))
     real = system
     for parameter in unknown:
-        real = parameter.applied(real, truth[parameter.name])
+        real = parameter.applied(real, jnp.asarray(truth[parameter.name]))
     run = nc.simulate(real, start, dt=0.01, steps=300, inputs=controller)
     sizes = np.repeat([1e-3, 0.2], 3)
     measured = noisy(np.concatenate([run.states.coordinates, torques(real, run)], axis=1), size=sizes)

@@ -351,7 +351,7 @@ def _reached(at: At, scaling: Scaling, sigma: np.ndarray) -> bool:
         return True
     step = np.linalg.lstsq(slopes, missed, rcond=1e-7)[0]
     size = max(1.0, float(np.linalg.norm(missed)) / np.sqrt(max(len(missed) - slopes.shape[1], 1)))
-    return float(np.linalg.norm(slopes @ step)) <= OFF * size * np.sqrt(slopes.shape[1])
+    return bool(np.linalg.norm(slopes @ step) <= OFF * size * np.sqrt(slopes.shape[1]))
 
 
 def _failure(code: Result) -> str:
