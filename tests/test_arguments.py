@@ -464,6 +464,16 @@ CALLS = {
         "rates": NUMBER,
         "seed": [0], **SOLVED,
     },
+    "Initial": lambda w: {
+        "name": NAME, "joint": [w.hinge, "hinge"], "rate": FLAG, "index": [0], "lower": [-1.0],
+        "upper": NUMBER, "apply": [None, f], "value": NUMBER,
+    },
+    "identify": lambda w: {
+        **RUN(w), "parameters": [()], "measured": [np.ones((3, 1))], "sensors": [w.hinge, "hinge", f],
+        "dt": [0.1], "inputs": [np.ones((2, 1)), f], "initial": [()], "guess": [{}], "noise": NUMBER,
+        "save_every": WHOLE, "starts": WHOLE, "spread": NUMBER, "seed": [0], "max_evaluations": WHOLE,
+        "scheme": [nc.EnergyMomentum()], "progress": FLAG,
+    },
     "continuation": lambda w: {
         "problem": [w.problem], "path": [lambda problem, s: problem], "guess": [np.ones((2, 1))],
         "first": NUMBER, "least": NUMBER, "progress": FLAG, "time_limit": NUMBER, **SOLVED,
@@ -541,9 +551,9 @@ CALLS = {
 # What calls return or hand over, and bases: nobody is to make these by hand.
 MADE = {
     "Accuracy", "Balance", "BeamHandle", "Check", "ComputedTorque", "Contacts", "Continuation",
-    "DerivativeError", "Edge", "Equilibrium", "Feedback", "Frame", "Growth", "Load", "MeshHandle", "Modes",
-    "NodeKind", "Nodes", "NonlinearProgram", "Optima", "Outcome", "Result", "SimulationError", "Solution",
-    "State", "Steps", "Surface", "Sweep", "System",
+    "DerivativeError", "Edge", "Equilibrium", "Feedback", "Frame", "Growth", "Identified", "Load",
+    "MeshHandle", "Modes", "NodeKind", "Nodes", "NonlinearProgram", "Optima", "Outcome", "Result",
+    "SimulationError", "Solution", "State", "Steps", "Surface", "Sweep", "System",
     "Trajectory",
 }  # fmt: skip
 BASES = {
@@ -662,7 +672,7 @@ def test_right_arguments_pass():
             for value in values:
                 if name == "RigidBody" and value is not fine[argument]:
                     continue
-                if name == "Parameter" and argument == "apply":
+                if name in ("Initial", "Parameter") and argument == "apply":
                     continue
                 try:
                     function(**{**fine, argument: value})

@@ -40,7 +40,7 @@ SLOW = """
 # ... and for more than five seconds, 90 s in all. Those of all other modules take 6 s together.
 EXHAUSTIVE = """
     analysis.accuracy analysis.load_path bodies.gas bodies.loads control.computed_torque
-    control.continuation control.nlp control.problem
+    control.continuation control.identify control.nlp control.problem
 """.split()
 COMPILING = {f"natcoord_jax.{name}" for name in SLOW + EXHAUSTIVE}
 RUN = """
@@ -78,7 +78,12 @@ def test_readme_runs(tmp_path: Path):
 
 
 # A minute of the processor each, or more, as users compile them; pages that were measured take some 20 s.
-LONG_PAGES = ("howto/control_", "howto/optimal_control.md", "howto/shells_solids_contact.md")
+LONG_PAGES = (
+    "howto/control_",
+    "howto/identification.md",
+    "howto/optimal_control.md",
+    "howto/shells_solids_contact.md",
+)
 
 
 @pytest.mark.parametrize(

@@ -173,7 +173,14 @@ def model(
     curved = jax.vmap(lambda d: jax.jvp(scored, (last,), (d,))[1], in_axes=1, out_axes=1)(forth)
     goal, last_excess = jax.vmap(lambda d: jax.jvp(reached, (last,), (d,))[1], in_axes=1, out_axes=1)(forth)
     first, first_hessian = _first_model(problem, unknowns, bending, maps)
-    return Model(*each, forth.T @ curved, goal, last_excess, first, first_hessian)
+    return Model(
+        *each,
+        last_hessian=forth.T @ curved,
+        goal=goal,
+        last_excess=last_excess,
+        first=first,
+        first_hessian=first_hessian,
+    )
 
 
 def _some_together(function: Any, given: Any, steps: int) -> Any:

@@ -18,6 +18,7 @@ class Outcome(IntEnum):
     SINGULAR = 9
     INFEASIBLE_START = 10
     DIVERGED = 11
+    UNDETERMINED = 12
 
     @property
     def ok(self) -> bool:
@@ -38,6 +39,7 @@ OUTCOMES = {
     Outcome.SINGULAR: "a step has no derivative: its linearised equations have no solution",
     Outcome.INFEASIBLE_START: "the start is outside of bounds that no input can change there",
     Outcome.DIVERGED: "the multipliers grew without end",
+    Outcome.UNDETERMINED: "the data do not determine all unknowns",
 }
 
 ADVICE = {
