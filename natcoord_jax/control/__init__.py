@@ -15,10 +15,10 @@ from natcoord_jax.control.feedback import Feedback as Feedback
 from natcoord_jax.control.feedback import receding_horizon as receding_horizon
 from natcoord_jax.control.feedback import regulator as regulator
 from natcoord_jax.control.guess import Guess as Guess
-from natcoord_jax.control.initial import InitialCoordinate as InitialCoordinate
-from natcoord_jax.control.initial import InitialRate as InitialRate
 from natcoord_jax.control.identified import Identified as Identified
 from natcoord_jax.control.identify import identify as identify
+from natcoord_jax.control.initial import InitialCoordinate as InitialCoordinate
+from natcoord_jax.control.initial import InitialRate as InitialRate
 from natcoord_jax.control.inverse import inverse_dynamics as inverse_dynamics
 from natcoord_jax.control.measurement import Initial as Initial
 from natcoord_jax.control.nlp import NonlinearProgram as NonlinearProgram

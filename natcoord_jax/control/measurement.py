@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from natcoord_jax.control.problem import Parameter
+from natcoord_jax.control.parameters import Parameter
 from natcoord_jax.core.arguments import Part, is_a
 from natcoord_jax.core.callables import Function, replace_fields
 from natcoord_jax.core.checks import as_array

@@ -65,7 +65,8 @@ def optimise(
         method: "shooting", "lifted" or "auto": that of an earlier solution as guess, else lifted if
             parameters are free or more than inputs is bounded; with free time always lifted. Where "shooting"
             gets lost, "auto" goes on lifted; where that does, it asks IPOPT if it is installed
-            (`pip install 'natcoord-jax[ipopt]'`); then "auto" and "lifted" look for a motion that comes near to the goal, by simulations that may miss it
+            (`pip install 'natcoord-jax[ipopt]'`); then "auto" and "lifted" look for a motion that comes near
+            to the goal, by simulations that may miss it at a cost
             (feasibility restoration), and go on from there; then from random inputs. "ipopt": by IPOPT
             alone, on `nc.to_nlp`. What is returned is the best of all attempts, and what they saw is in
             `explain()`. That a goal is out of reach is said only where two methods agree, or four starts,
