@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float
 from natcoord_jax.control.iterate import Iterate, Model, largest
 from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.control.riccati import Factors, Move, Right, Weighted, out_of_reach, solve, taken_back
-from natcoord_jax.control.transcription import Unknowns
+from natcoord_jax.control.transcription import Unknowns, enters_in
 from natcoord_jax.xla.one_kernel import scan_in_one_kernel
 
 ASIDE = 0.1
@@ -150,9 +150,7 @@ def _motion(iterate: Iterate, found: Model, change: Change, dy: Array) -> Float[
     return scan_in_one_kernel(body, last, given, reverse=True)[1]
 
 
-def least_curved(
-    problem: OptimalControl, iterate: Iterate, factors: Factors, turns: Array | int
-) -> tuple[Move, Array]:
+def least_curved(problem: OptimalControl, iterate: Iterate, factors: Factors, turns: Array | int) -> Move:
     """The direction along which the model is curved least, by inverse iteration; the way that the cost falls.
 
     The increase of the curvature, little more than it is negative, makes that quick.
@@ -162,14 +160,11 @@ def least_curved(
         iterate: the motion.
         factors: of the model.
         turns: iterations.
-
-    Returns:
-        The direction; and whether inputs enter in a step.
     """
     by_w, multipliers = iterate.derivatives.by_w, iterate.multipliers
     states = factors.forward.shape[1]
     last, nothing = jnp.zeros(states), jnp.zeros_like(multipliers.goal)
-    enters = (jnp.arange(problem.steps) % problem.inputs.every == 0)[:, None]
+    enters = enters_in(problem)
 
     def again(_: Array, along: Move) -> Move:
         move = solve(factors, Right(jnp.pad(along.w, ((0, 0), (states, 0))), last, along.first, nothing))
@@ -183,7 +178,7 @@ def least_curved(
     along = Move(start, jnp.zeros_like(iterate.derivatives.by_first), nothing, nodes)
     along = jax.lax.fori_loop(0, turns, again, along)
     uphill = jnp.sum(by_w * along.w) + iterate.derivatives.by_first @ along.first > 0
-    return jax.tree.map(lambda x: jnp.where(uphill, -x, x), along), enters
+    return jax.tree.map(lambda x: jnp.where(uphill, -x, x), along)
 
 
 def curvature(found: Model, bounds: Weighted, along: Move) -> Float[Array, ""]:
@@ -217,7 +212,7 @@ def newton(
     """
     derivatives, missing = iterate.derivatives, iterate.path.end.missing
     added, look = factors.added, factors.added[0] > 0
-    soft, enters = least_curved(problem, iterate, factors, jnp.where(look, TURNS, 0))
+    soft = least_curved(problem, iterate, factors, jnp.where(look, TURNS, 0))
     falling = look & (curvature(found, bounds, soft) < 0)
     # A motion that is as symmetric as its problem may be stationary and no minimum: nothing in the conditions
     # leads out of the symmetry, but a force along negative curvature does.
@@ -228,7 +223,7 @@ def newton(
     dy = closing(iterate, iterate.path.stages.residual)
     pressed = bounds.path_slope + bounds.path * jnp.einsum("khn,kn->kh", found.excess_y, dy)
     gradient = jnp.einsum("knz,kn->kz", found.slope_y, dy) + jnp.einsum("khz,kh->kz", found.excess, pressed)
-    by_w = jnp.where(enters, derivatives.by_w - away * added[0] * soft.w, 0.0)
+    by_w = jnp.where(enters_in(problem), derivatives.by_w - away * added[0] * soft.w, 0.0)
     states = found.forward.shape[1]
     back = taken_back(factors, iterate.multipliers.goal)
     end = found.last_excess.T @ bounds.end_slope + found.goal.T @ (factors.penalty * missing + back)

@@ -14,6 +14,7 @@ from natcoord_jax.control.newton import Newton, as_unknowns, curvature, least_cu
 from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.control.quadratic import model
 from natcoord_jax.control.riccati import REACH, Factors, Move, Weighted, factored
+from natcoord_jax.control.transcription import enters_in
 from natcoord_jax.core.compiled import compiled
 from natcoord_jax.xla.tracing import traced_once
 
@@ -62,12 +63,22 @@ def _weighted(iterate: Iterate) -> Weighted:
     return Weighted(path, mu / s.path - m.path + path * gap, end, mu / s.end - m.end + end * last)
 
 
+def _idle(problem: OptimalControl) -> Array:
+    """1 for coefficients that do not enter in a step, else 0."""
+    return jnp.broadcast_to(~enters_in(problem), (problem.steps, problem.channels)).astype(float)
+
+
+def unshifted(problem: OptimalControl, iterate: Iterate, found: Model, bounds: Weighted) -> Factors:
+    """Factors of the model at an optimum, nothing added to its curvature."""
+    none, held = jnp.zeros(()), jnp.zeros(found.first.shape[1])
+    soft, reach = iterate.softness, jnp.asarray(REACH[0])
+    penalty, unit = iterate.penalty, iterate.unit
+    return factored(found, bounds, _idle(problem), none, penalty, soft, reach, unit, held, none)
+
+
 def _convex(problem: OptimalControl, iterate: Iterate, found: Model, reach: Array) -> tuple[Factors, Array]:
     """Factors of the model, its curvature increased until it is convex, and its shift."""
     bounds = _weighted(iterate)
-    idle = (jnp.arange(problem.steps) % problem.inputs.every != 0).astype(float)
-    idle = jnp.broadcast_to(idle[:, None], (problem.steps, problem.channels))
-
     soft, known = iterate.softness, iterate.filter
     left = violation(known.units, soft, iterate.path, iterate.slacks) / (known.least / SMALL)
     held = iterate.unit * jnp.where(jnp.any(soft > 0), FIXED, HELD * jnp.clip(left, 0.0, 1.0))
@@ -76,7 +87,7 @@ def _convex(problem: OptimalControl, iterate: Iterate, found: Model, reach: Arra
 
     def attempt(shift: Array) -> Factors:
         sway, unit = iterate.sway, iterate.unit
-        return factored(found, bounds, idle, shift, iterate.penalty, soft, reach, unit, held, sway)
+        return factored(found, bounds, _idle(problem), shift, iterate.penalty, soft, reach, unit, held, sway)
 
     # None is tried first, as long as steps are found.
     last = iterate.shift
@@ -126,8 +137,7 @@ def _slope(problem: OptimalControl, iterate: Iterate, step: Newton, slacks: Slac
     """Slope of the barrier cost: that of the Lagrangian without what constraints change in it."""
     change, derivatives = step.change, iterate.derivatives
     m, s, mu = iterate.multipliers, iterate.slacks, iterate.barrier
-    enters = (jnp.arange(problem.steps) % problem.inputs.every == 0)[:, None]
-    lagrangian = jnp.sum(derivatives.by_w * jnp.where(enters, change.move.w, 0.0))
+    lagrangian = jnp.sum(derivatives.by_w * jnp.where(enters_in(problem), change.move.w, 0.0))
     lagrangian = lagrangian + derivatives.by_first @ change.move.first
     # The equations of all steps hold at the end of the direction, to first order.
     closed = -jnp.sum(derivatives.worth.residuals * iterate.path.stages.residual)
@@ -231,7 +241,7 @@ def softest(problem: OptimalControl, iterate: Iterate) -> tuple[Array, Move, Arr
     """
     found, bounds = formed(problem, iterate), _weighted(iterate)
     factors, _ = _convex(problem, iterate, found, jnp.clip(30.0 * iterate.errors.motion, *REACH))
-    along, _ = least_curved(problem, iterate, factors, MANY)
+    along = least_curved(problem, iterate, factors, MANY)
     length = jnp.sqrt(jnp.sum(along.w**2) + jnp.sum(along.first**2))
     along = jax.tree.map(lambda x: x / jnp.where(length > 0, length, 1.0), along)
     own = jnp.diagonal(found.hessian, axis1=1, axis2=2)[:, -problem.channels :]

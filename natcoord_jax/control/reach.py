@@ -10,6 +10,7 @@ from natcoord_jax.control.guess import input_ranges
 from natcoord_jax.control.iterate import Iterate
 from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.control.proposal import formed
+from natcoord_jax.control.transcription import enters_in
 from natcoord_jax.core.compiled import compiled
 
 
@@ -58,7 +59,7 @@ def _slopes(problem: OptimalControl, iterate: Iterate) -> tuple[Array, Array, Ar
         return found.goal @ last, excess.reshape(-1), found.last_excess @ last
 
     columns = jax.vmap(change, out_axes=1)(jnp.eye(flat.size))
-    enters = (jnp.arange(problem.steps) % problem.inputs.every == 0)[:, None]
+    enters = enters_in(problem)
     whole = 2.0 * input_ranges(problem, iterate.unknowns)
     leading = jnp.broadcast_to(whole, (problem.inputs.degree, problem.channels)).reshape(-1)
     first = jnp.concatenate([jnp.ones(iterate.unknowns.free.size), leading])

@@ -15,12 +15,16 @@ from natcoord_jax.control import sequential
 from natcoord_jax.control.costates import Multipliers, direct_slopes, scored_end, step_jacobians, through_step
 from natcoord_jax.control.iterate import Iterate, Options
 from natcoord_jax.control.linearisation import first_gradient
+from natcoord_jax.control.newton import as_unknowns
 from natcoord_jax.control.problem import OptimalControl, numeric
+from natcoord_jax.control.proposal import formed, unshifted
+from natcoord_jax.control.riccati import Right, Weighted, solve
 from natcoord_jax.control.run import DEFAULT, OPTIONS, optimise_jit
 from natcoord_jax.control.transcription import (
     Unknowns,
     corrected,
     entering,
+    enters_in,
     slices,
 )
 from natcoord_jax.core.arguments import checked
@@ -30,8 +34,8 @@ from natcoord_jax.core.kinds import FunctionOf, of
 
 START = of("an iterate, as the `iterate` of a solution, or its `unknowns`", Unknowns, Iterate)
 
-CUT = 1e-12
-"""Singular values of the conditions of optimality below this fraction of the largest are left out."""
+ROUNDS = 3
+"""Solutions of the quadratic model, each of which takes some seven digits off what is left."""
 
 
 class Optimum(eqx.Module):
@@ -51,8 +55,11 @@ class Optimum(eqx.Module):
 class Conditions(eqx.Module):
     """What vanishes or is balanced at an optimum, and its cost."""
 
-    gradient: Float[Array, " x"]
-    constraints: Float[Array, " c"]
+    first: Float[Array, " f"]
+    w: Float[Array, "steps m"]
+    missing: Float[Array, " c"]
+    excess: Float[Array, "steps h"]
+    end_excess: Float[Array, " e"]
     cost: Float[Array, ""]
 
 
@@ -77,39 +84,56 @@ def _conditions(
     slopes = jax.vmap(partial(direct_slopes, problem))(*each, multipliers.path)
     given = (*each, jacobians, slopes)
     worth, by_w = jax.lax.scan(body, worth, given, reverse=True)
-    by_first, count = first_gradient(problem, unknowns, worth), unknowns.free.size
-    pieces = (by_first[count:], by_w[:: problem.inputs.every].reshape(-1), by_first[:count])
-    constraints = (path.end.missing, path.stages.excess.reshape(-1), path.end.excess)
-    return Conditions(jnp.concatenate(pieces), jnp.concatenate(constraints), path.cost)
+    by_first = first_gradient(problem, unknowns, worth)
+    by_w = jnp.where(enters_in(problem), by_w, 0.0)
+    return Conditions(by_first, by_w, path.end.missing, path.stages.excess, path.end.excess, path.cost)
 
 
 @compiled
 def _jacobian(make: Callable[[Any], OptimalControl], numbers: Any, found: Iterate) -> Float[Array, "o p"]:
-    """How coefficients, what is free and the cost change with the numbers, one column each."""
-    given, unflat_numbers = ravel_pytree(numbers)
-    point, unflat = ravel_pytree((found.unknowns.coefficients, found.unknowns.free))
-    m, s = found.multipliers, found.slacks
+    """How coefficients, what is free and the cost change with the numbers, one column each.
+
+    The model of the optimum solves its linearised conditions, linear in the number of steps; what it leaves
+    of the exact ones is solved for again.
+    """
+    given, unflat = ravel_pytree(numbers)
+    problem, m, s = make(numbers), found.multipliers, found.slacks
     inverses = found.derivatives.jacobians.inverses
+    quadratic = formed(problem, found)
+    nothing = jax.tree.map(jnp.zeros_like, (m.path, m.end))
+    bounds = Weighted(m.path / s.path, nothing[0], m.end / s.end, nothing[1])
+    factors = unshifted(problem, found, quadratic, bounds)
 
-    def conditions(both: Array) -> Conditions:
-        coefficients, free = unflat(both[given.size :])
+    def conditions(number: Array, point: tuple) -> Conditions:
+        coefficients, free, *multipliers = point
         unknowns = Unknowns(coefficients, free, found.unknowns.y)
-        return _conditions(make(unflat_numbers(both[: given.size])), unknowns, m, inverses)
+        return _conditions(make(unflat(number)), unknowns, Multipliers(*multipliers), inverses)
 
-    both = jnp.concatenate([given, point])
-    slopes = jax.lax.map(lambda d: jax.jvp(conditions, (both,), (d,))[1], jnp.eye(both.size))
-    halves = slice(None, given.size), slice(given.size, None)
-    by_numbers, by_point = (jax.tree.map(itemgetter(half), slopes) for half in halves)
-    hessian, jacobian = by_point.gradient, by_point.constraints.T
-    # A bound acts as far as it presses: sigma (h + s) = 0 linearised.
-    room = jnp.concatenate([jnp.zeros(m.goal.size), s.path.reshape(-1), s.end])
-    press = jnp.concatenate([jnp.ones(m.goal.size), m.path.reshape(-1), m.end])
-    matrix = jnp.block([[hessian, jacobian.T], [press[:, None] * jacobian, -jnp.diag(room)]])
-    right = -jnp.concatenate([by_numbers.gradient, press * by_numbers.constraints], axis=1).T
-    scale = jnp.sqrt(jnp.maximum(jnp.max(jnp.abs(matrix), axis=1), 1e-300))[:, None]
-    moved = jnp.linalg.lstsq(matrix / scale / scale.T, right / scale, rcond=CUT)[0] / scale
-    moved = moved[: point.size]
-    return jnp.concatenate([moved, by_numbers.cost[None] + by_point.cost[None] @ moved])
+    def correction(left: Conditions, change: tuple) -> tuple:
+        # A bound acts as far as it presses: sigma (h + s) = 0 linearised.
+        path, end = bounds.path * left.excess - change[3], bounds.end * left.end_excess - change[4]
+        gradient = jnp.pad(left.w, ((0, 0), (quadratic.forward.shape[1], 0)))
+        gradient = gradient + jnp.einsum("khz,kh->kz", quadratic.excess, path)
+        last = quadratic.last_excess.T @ end + quadratic.goal.T @ (factors.penalty * left.missing)
+        move = solve(factors, Right(gradient, last, left.first, left.missing))
+        moved, both = as_unknowns(problem, found, move), jnp.concatenate([move.z[:-1], move.w], axis=1)
+        path = path + bounds.path * jnp.einsum("khz,kz->kh", quadratic.excess, both)
+        end = end + bounds.end * (quadratic.last_excess @ move.z[-1])
+        return moved.coefficients, moved.free, move.goal, path, end
+
+    point = (found.unknowns.coefficients, found.unknowns.free, m.goal, m.path, m.end)
+
+    def one(direction: Array) -> Array:
+        def left(change: tuple) -> Conditions:
+            return jax.jvp(conditions, (given, point), (direction, change))[1]
+
+        def again(_: Any, change: tuple) -> tuple:
+            return jax.tree.map(jnp.add, change, correction(left(change), change))
+
+        change = jax.lax.fori_loop(0, ROUNDS, again, jax.tree.map(jnp.zeros_like, point))
+        return jnp.concatenate([ravel_pytree(change[:2])[0], left(change).cost[None]])
+
+    return jax.lax.map(one, jnp.eye(given.size)).T
 
 
 @checked(make=FunctionOf("(numbers) -> problem"), guess=START, options=OPTIONS)

@@ -13,7 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from natcoord_jax.control.inputs import Shaping
 from natcoord_jax.control.memory import Ending, Step
@@ -143,6 +143,11 @@ def entering(problem: OptimalControl, coefficients: Float[Array, "c m"]) -> Floa
     starts = slice(0, problem.steps, problem.inputs.every)
     found = jnp.zeros((problem.steps, coefficients.shape[1]), coefficients.dtype)
     return found.at[starts].set(coefficients[problem.inputs.degree :])
+
+
+def enters_in(problem: OptimalControl) -> Bool[np.ndarray, "steps 1"]:
+    """Whether a coefficient enters in a step."""
+    return (np.arange(problem.steps) % problem.inputs.every == 0)[:, None]
 
 
 def first_node(problem: OptimalControl, free: Float[Array, " p"], leading: Float[Array, "degree m"]) -> Node:
