@@ -323,6 +323,20 @@ def test_a_free_start_is_differentiable():
     np.testing.assert_allclose(slope, [2.0, 2.0], atol=1e-12)
 
 
+@pytest.mark.exhaustive
+def test_a_start_made_by_a_function_is_assembled():
+    """The bob is shifted off its hinge, and comes back with its joint."""
+    system, state = pendulum()
+
+    def shifted(system, state, way):
+        return eqx.tree_at(lambda x: x.q, state, state.q.at[0, 0].add(way))
+
+    shift = nc.InitialState("shift [m]", apply=shifted, value=0.0, upper=1.0)
+    problem = nc.OptimalControl(system, state, dt=0.1, steps=2, parameters=(shift,))
+    start = nc.jit(problem.start)(jnp.array([0.3]))
+    assert float(start.q[0, 0]) < 0.29 and system.constraint_errors(start).position < 1e-12
+
+
 # --- flexible parts at rest -------------------------------------------------------------------------------
 
 
