@@ -452,6 +452,9 @@ CALLS = {
     "InitialRate": lambda w: {
         "joint": [w.hinge, "hinge"], "index": [0], "lower": [-1.0], "upper": NUMBER, "value": NUMBER
     },
+    "InitialState": lambda w: {
+        "name": NAME, "apply": [f], "value": NUMBER, "lower": [-1.0], "upper": NUMBER
+    },
     "Guess": lambda w: {"inputs": [np.ones((2, 1))], "rates": [np.ones(1)], "free": [np.ones(1)]},
     "optimise": lambda w: {
         "problem": [w.problem], "guess": [np.ones((2, 1))], "progress": FLAG, "time_limit": NUMBER, **SOLVED
@@ -464,13 +467,9 @@ CALLS = {
         "rates": NUMBER,
         "seed": [0], **SOLVED,
     },
-    "Initial": lambda w: {
-        "name": NAME, "joint": [w.hinge, "hinge"], "rate": FLAG, "index": [0], "lower": [-1.0],
-        "upper": NUMBER, "apply": [None, f], "value": NUMBER,
-    },
     "identify": lambda w: {
         **RUN(w), "parameters": [()], "measured": [np.ones((3, 1))], "sensors": [w.hinge, "hinge", f],
-        "dt": [0.1], "inputs": [np.ones((2, 1)), f], "initial": [()], "guess": [{}], "noise": NUMBER,
+        "dt": [0.1], "inputs": [np.ones((2, 1)), f], "guess": [{}], "noise": NUMBER,
         "save_every": WHOLE, "starts": WHOLE, "spread": NUMBER, "seed": [0], "max_evaluations": WHOLE,
         "scheme": [nc.EnergyMomentum()], "progress": FLAG,
     },
@@ -672,7 +671,7 @@ def test_right_arguments_pass():
             for value in values:
                 if name == "RigidBody" and value is not fine[argument]:
                     continue
-                if name in ("Initial", "Parameter") and argument == "apply":
+                if name == "Parameter" and argument == "apply":
                     continue
                 try:
                     function(**{**fine, argument: value})

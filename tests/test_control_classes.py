@@ -93,6 +93,8 @@ def test_a_throw_goes_furthest_at_45_degrees():
     assert along == pytest.approx(math.sqrt(50.0), rel=1e-6) and up == pytest.approx(along, rel=1e-6)
     assert -found.cost == pytest.approx(100.0 / GRAVITY, rel=1e-8)
     assert found.inputs.shape == (10, 0)
+    report = nc.check(found, refine=False)
+    assert report.kind == "minimum" and report.direction.shape == (3,)
     assert max(abs(x) for x in found.missing.values()) < 1e-9
 
 
@@ -119,6 +121,8 @@ def test_a_periodic_pendulum_has_the_amplitude_of_the_elliptic_integral():
     ends = found.trajectory.states.coordinates[:, 0]
     assert float(ends[-1]) == pytest.approx(float(ends[0]), abs=1e-9)
     assert float(ends[steps // 2]) == pytest.approx(-float(ends[0]), abs=1e-6)
+    # One number is free, and the goal tells it.
+    assert nc.check(found, refine=False).kind == "minimum"
 
 
 # --- integrals, waypoints, room, turns --------------------------------------------------------------------
@@ -144,6 +148,17 @@ def test_a_way_through_a_point_is_two_ways(hinged):
     assert float(found.trajectory.states.coordinates[20, 0]) == pytest.approx(0.5, abs=1e-9)
     program = nc.to_nlp(found.problem)
     assert "coordinate 0 of 'hinge' [rad or m], after step 20" in program.names
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("method", ["shooting", "lifted"])
+def test_a_waypoint_may_have_no_value_at_other_steps(hinged, method):
+    def half(state):
+        return (state.coordinates - 0.5) * jnp.sqrt(0.51 - state.t)
+
+    goal = nc.goal.At(nc.goal.Equal(half, "half-way"), step=20) & turned(0.0)
+    found = solved(on_disc(hinged, goal, steps=40), method=method)
+    assert float(found.trajectory.states.coordinates[20, 0]) == pytest.approx(0.5, abs=1e-8)
 
 
 @pytest.mark.exhaustive
@@ -230,6 +245,15 @@ def test_least_time_with_limited_rates_of_inputs_is_a_ramp(hinged):
     assert found.free["final time [s]"] == pytest.approx(2.0, rel=2e-3)
     rates = np.diff(np.asarray(found.inputs)[:, 0]) / found.dt
     np.testing.assert_allclose(rates, -3.0, rtol=1e-4)
+
+
+@pytest.mark.exhaustive
+def test_inputs_may_have_to_change_all_the_time(hinged):
+    """At least by 1 N m/s, and not infeasible because inputs that stay would be."""
+    rates = nc.bounds.InputRate(1.0, 30.0)
+    found = solved(on_disc(hinged, COORDINATE("hinge", 1.0), bounds=rates))
+    change = np.diff(np.asarray(found.inputs)[:, 0]) / found.dt
+    np.testing.assert_allclose(change, 1.0, rtol=1e-4)
 
 
 @pytest.mark.exhaustive
@@ -321,6 +345,20 @@ def test_a_free_start_is_differentiable():
     # The third director of the bob, (sin, 0, cos), with its first component cos at an angle of 0.
     slope = jax.jit(jax.grad(height))(jnp.array([0.0, 0.0]))
     np.testing.assert_allclose(slope, [2.0, 2.0], atol=1e-12)
+
+
+@pytest.mark.exhaustive
+def test_a_start_made_by_a_function_is_assembled():
+    """The bob is shifted off its hinge, and comes back with its joint."""
+    system, state = pendulum()
+
+    def shifted(system, state, way):
+        return eqx.tree_at(lambda x: x.q, state, state.q.at[0, 0].add(way))
+
+    shift = nc.InitialState("shift [m]", apply=shifted, value=0.0, upper=1.0)
+    problem = nc.OptimalControl(system, state, dt=0.1, steps=2, parameters=(shift,))
+    start = nc.jit(problem.start)(jnp.array([0.3]))
+    assert float(start.q[0, 0]) < 0.29 and system.constraint_errors(start).position < 1e-12
 
 
 # --- flexible parts at rest -------------------------------------------------------------------------------

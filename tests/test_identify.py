@@ -20,7 +20,7 @@ DAMPING = nc.Parameter(
     "damping", apply=lambda system, c: system.set("damper", damping=c), value=0.01, lower=0.0
 )
 BOTH = (STIFFNESS, DAMPING)
-PUSH = nc.Initial("push", "hinge", rate=True)
+PUSH = nc.InitialRate("hinge")
 
 
 def pendulum():
@@ -88,7 +88,7 @@ def test_what_cannot_be_identified_is_refused_with_its_remedy(swinging):
         ("guess has 'mass'; the unknowns are stiffness, damping", fine, {"guess": {"mass": 1.0}}),
         ("noise is 0.0; pass a positive", fine, {"noise": 0.0}),
         (r"inputs has shape \(4, 1\)", fine, {"inputs": np.zeros((4, 1))}),
-        ("no joint 'elbow'", fine, {"initial": (nc.Initial("angle", "elbow"),)}),
+        ("no joint 'elbow'", fine, {"parameters": (nc.InitialCoordinate("elbow"),)}),
     ):
         with pytest.raises(ValueError, match=words):
             identified(swinging, measured, **options)
@@ -98,11 +98,11 @@ def test_what_cannot_be_identified_is_refused_with_its_remedy(swinging):
         nc.identify(system, three, BOTH, np.zeros((2, 5, 1)), "hinge", dt=DT)
 
 
-def test_an_unknown_of_the_start_says_where_it_is():
-    with pytest.raises(ValueError, match="'push': pass `joint`, or `apply` together with `value`"):
-        nc.Initial("push")
-    with pytest.raises(ValueError, match="'push': the lower bound 2 is not below the upper bound 1"):
-        nc.Initial("push", "hinge", lower=2.0, upper=1.0)
+def test_an_unknown_of_the_start_has_room_and_a_first_value():
+    with pytest.raises(ValueError, match="'hinge'.* the lower bound 2 is not below the upper bound 1"):
+        nc.InitialRate("hinge", lower=2.0, upper=1.0)
+    with pytest.raises(TypeError, match="InitialState: value is missing"):
+        nc.InitialState("push", apply=lambda system, state, value: state)
 
 
 @pytest.mark.exhaustive
@@ -153,10 +153,10 @@ def test_values_and_covariance_are_those_of_scipys_curve_fit(swinging):
 
 @pytest.mark.exhaustive
 def test_intervals_cover_the_truth_as_often_as_they_say(swinging):
-    exact, truth, seeds = angles(*swinging), TRUTH | {"push": 0.0}, 200
+    exact, truth, seeds = angles(*swinging), TRUTH | {PUSH.name: 0.0}, 200
     inside = []
     for seed in range(seeds):
-        found = identified(swinging, noisy(exact, seed), initial=(PUSH,))
+        found = identified(swinging, noisy(exact, seed), (*BOTH, PUSH))
         assert found.ok, found.explain()
         inside.append([low <= truth[name] <= high for name, (low, high) in found.interval(0.95).items()])
     # Three deviations of a binomial of 200 are 4.6 %.
@@ -227,14 +227,15 @@ def test_information_of_several_experiments_adds_up(swinging):
         for one in starts
     ]
     states = jax.tree.map(lambda *x: np.stack(x), *assumed)
-    both = nc.identify(system, states, BOTH, measured, "hinge", dt=DT, initial=(PUSH,), noise=NOISE)
-    assert both.names == ("stiffness", "damping", "push [0]", "push [1]") and both.freedom == 201 + 120 - 4
-    assert np.all(np.abs(off(both, TRUTH | {"push [0]": 0.3, "push [1]": -1.0})) < 3.5)
+    both = nc.identify(system, states, (PUSH, *BOTH), measured, "hinge", dt=DT, noise=NOISE)
+    pushes = [f"{PUSH.name}, experiment {k}" for k in range(2)]
+    assert both.names == ("stiffness", "damping", *pushes) and both.freedom == 201 + 120 - 4
+    assert np.all(np.abs(off(both, TRUTH | dict(zip(pushes, (0.3, -1.0))))) < 3.5)
     assert both.residuals.shape == measured.shape and both.state.t.shape == (2,)
     rates = system.rate(both.state, "hinge")
-    np.testing.assert_allclose(rates, [both.values["push [0]"], both.values["push [1]"]], rtol=1e-9)
+    np.testing.assert_allclose(rates, [both.values[push] for push in pushes], rtol=1e-9)
     each = [
-        nc.identify(system, one, BOTH, data, "hinge", dt=DT, initial=(PUSH,), noise=NOISE)
+        nc.identify(system, one, (*BOTH, PUSH), data, "hinge", dt=DT, noise=NOISE)
         for one, data in zip(assumed, measured)
     ]
     known = sum(np.linalg.inv(one.covariance[:2, :2]) for one in each)
@@ -273,9 +274,13 @@ def test_the_start_of_a_loop_is_assembled_about_what_is_not_known():
     system, state = scene.compile()
     start = nc.assemble(system, system.with_coordinate(state, "hinge 0", 0.05, rate=0.7))
     exact = system.coordinate(nc.simulate(system, start, dt=0.01, steps=20), "hinge 0")
-    unknown = nc.Initial("angle", "hinge 0"), nc.Initial("rate", "hinge 0", rate=True)
-    found = nc.identify(system, state, (), exact, "hinge 0", dt=0.01, initial=unknown)
-    assert found.ok and found.values == pytest.approx({"angle": 0.05, "rate": 0.7}, rel=1e-7)
+
+    def at_angle(system, state, angle):
+        return system.with_coordinate(state, "hinge 0", angle)
+
+    unknown = nc.InitialState("angle", apply=at_angle, value=0.0), nc.InitialRate("hinge 0")
+    found = nc.identify(system, state, unknown, exact, "hinge 0", dt=0.01)
+    assert found.ok and found.values == pytest.approx({"angle": 0.05, unknown[1].name: 0.7}, rel=1e-7)
     errors = system.constraint_errors(found.state)
     assert errors.position < 1e-12 and errors.velocity < 1e-12
 

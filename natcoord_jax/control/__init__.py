@@ -19,8 +19,8 @@ from natcoord_jax.control.identified import Identified as Identified
 from natcoord_jax.control.identify import identify as identify
 from natcoord_jax.control.initial import InitialCoordinate as InitialCoordinate
 from natcoord_jax.control.initial import InitialRate as InitialRate
+from natcoord_jax.control.initial import InitialState as InitialState
 from natcoord_jax.control.inverse import inverse_dynamics as inverse_dynamics
-from natcoord_jax.control.measurement import Initial as Initial
 from natcoord_jax.control.nlp import NonlinearProgram as NonlinearProgram
 from natcoord_jax.control.nlp import to_nlp as to_nlp
 from natcoord_jax.control.parameters import Parameter as Parameter

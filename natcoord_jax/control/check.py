@@ -13,7 +13,7 @@ from natcoord_jax.analysis import balance
 from natcoord_jax.control.iterate import Iterate
 from natcoord_jax.control.newton import as_unknowns
 from natcoord_jax.control.problem import OptimalControl
-from natcoord_jax.control.proposal import softest
+from natcoord_jax.control.proposal import curved_in_free, softest
 from natcoord_jax.control.reasons import switches
 from natcoord_jax.control.refinement import refined
 from natcoord_jax.control.run import optimise
@@ -34,10 +34,10 @@ class Check:
         kind: "minimum", "saddle", or "unknown" where the curvature is too small to tell.
         curvature: the least of the Lagrangian, relative to the largest in a single input, along changes that
             keep to the motion and the goal to first order; bounds add to it as they press, and where the cost
-            has none it is relative to the least that they add. None without an iterate of the second-order
-            method.
+            has none it is relative to the least that they add. Without inputs it is that in what is free.
+            None without an iterate of the second-order method, and where the goal leaves nothing free.
         direction: of unit length along which it is so, as change of the inputs' coefficients (coefficients,
-            inputs).
+            inputs); without inputs, of what is free, in units of its size.
         missing: residual of the goal by name, of the simulated motion.
         exceeded: largest excess of each bound by name; negative inside.
         switches: steps within which an input goes from one of its limits to the other, by its name: a held
@@ -136,13 +136,30 @@ SEEN = 1e-6
 
 def _second_order(solution: Solution) -> tuple[str, float | None, np.ndarray | None]:
     """Whether it is a minimum, and the least curvature with its direction."""
-    if solution.iterate is None or not solution.problem.system.structure.inputs:
+    if solution.iterate is None:
         return "unknown", None, None
-    value, along, unit = softest(solution.problem, solution.iterate)
+    if solution.problem.system.structure.inputs:
+        value, along, unit = softest(solution.problem, solution.iterate)
+        along = as_unknowns(solution.problem, solution.iterate, along).coefficients
+    else:
+        value, along, unit = _softest_in_free(solution.problem, solution.iterate)
+        if along is None:
+            return "minimum", None, None
     relative = float(value) / float(unit) if unit > 0 else 0.0
     kind = "minimum" if relative > SEEN else "saddle" if relative < -SEEN else "unknown"
-    change = as_unknowns(solution.problem, solution.iterate, along)
-    return kind, relative, np.asarray(change.coefficients)
+    return kind, relative, np.asarray(along)
+
+
+def _softest_in_free(problem: OptimalControl, iterate: Iterate) -> tuple[float, np.ndarray | None, float]:
+    """The least curvature in what is free, its direction (None: the goal leaves none), and the largest."""
+    curved, slopes = (np.asarray(x) for x in curved_in_free(problem, iterate))
+    sizes = np.linalg.norm(slopes, axis=1, keepdims=True)
+    _, s, vt = np.linalg.svd(np.where(sizes > 0, slopes / np.where(sizes > 0, sizes, 1.0), 0.0))
+    ways = vt[np.count_nonzero(s > SEEN) :]
+    if not len(ways):
+        return 0.0, None, 0.0
+    values, directions = np.linalg.eigh(ways @ curved @ ways.T)
+    return float(values[0]), directions[:, 0] @ ways, float(np.max(np.abs(np.diagonal(curved))))
 
 
 @checked(solution=SOLUTION, refine=FLAG, autonomous=FLAG, make=FunctionOf("(steps) -> problem"))

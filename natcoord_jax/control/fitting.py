@@ -1,7 +1,7 @@
 """Least squares on measured channels: scaled unknowns, runs of the solver, the noise of each channel."""
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -55,7 +55,7 @@ class Scaling(NamedTuple):
     shared: int
 
     @classmethod
-    def of(cls, setting: Setting, states: State, guess: dict[str, float]) -> "Scaling":
+    def of(cls, setting: Setting, states: State, guess: dict[str, Any]) -> "Scaling":
         """Of a setting, with the initial states of all experiments, and other values to begin with by name.
 
         Raises:
@@ -63,22 +63,24 @@ class Scaling(NamedTuple):
                 of its bounds.
         """
         count = len(states.t)
-        names = [p.name for p in setting.parameters]
-        found = [float(p.initial(setting.system)) for p in setting.parameters]
-        bounds = [(p.lower, p.upper) for p in setting.parameters]
-        read = [np.asarray(i.initial(setting.system, states)) for i in setting.initial]
+        # Those of the system once, then those of the initial state for each experiment.
+        shared = sum(not number.starts for number in setting.numbers)
+        read = [np.broadcast_to(n.initial(setting.system, states), count) for n in setting.numbers]
+        every: list[tuple[Any, Any, str]] = [
+            (number, values[0], "") for number, values in zip(setting.numbers[:shared], read)
+        ]
         for k in range(count):
-            names += [i.name + (f" [{k}]" if count > 1 else "") for i in setting.initial]
-            found += [float(values[k]) for values in read]
-            bounds += [(i.lower, i.upper) for i in setting.initial]
+            tail = f", experiment {k}" if count > 1 else ""
+            every += [(n, values[k], tail) for n, values in zip(setting.numbers[shared:], read[shared:])]
+        names = [number.name + tail for number, _, tail in every]
         if len(set(names)) != len(names) or not names:
             raise ValueError(f"identify: the unknowns have the names {names}; pass some, each with its own")
         strange = sorted(set(guess) - set(names))
         if strange:
             raise ValueError(f"identify: guess has {strange[0]!r}; the unknowns are {', '.join(names)}")
-        reference = np.array([float(guess.get(name, value)) for name, value in zip(names, found)])
-        lower = np.array([-np.inf if a is None else a for a, _ in bounds])
-        upper = np.array([np.inf if b is None else b for _, b in bounds])
+        reference = np.array([float(guess.get(name, x)) for name, (_, x, _) in zip(names, every)])
+        lower = np.array([-np.inf if n.lower is None else n.lower for n, _, _ in every])
+        upper = np.array([np.inf if n.upper is None else n.upper for n, _, _ in every])
         for name, x, a, b in zip(names, reference, lower, upper):
             if not a <= x <= b:
                 raise ValueError(
@@ -88,7 +90,7 @@ class Scaling(NamedTuple):
         logarithmic = (lower > 0) & (upper >= FAR * lower)
         size, range_ = np.abs(reference), upper - lower
         size = np.where(size > 0, size, np.where(np.isfinite(range_), range_, 1.0))
-        return cls(tuple(names), reference, size, logarithmic, lower, upper, len(setting.parameters))
+        return cls(tuple(names), reference, size, logarithmic, lower, upper, shared)
 
     def values(self, z: np.ndarray) -> np.ndarray:
         """Unknowns in their units."""

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.control.goal_base import GOAL, Goal
-from natcoord_jax.control.memory import Ending, Step
+from natcoord_jax.control.memory import Ending, Step, only_where
 from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.checks import is_concrete
 from natcoord_jax.core.numeric import Number, Numbers, Whole
@@ -59,7 +59,9 @@ class At(Goal):
         """What is missing at its step; the same at all others."""
         here = step.number == self.step - 1
         at = Ending(step.before, step.after, inside[0], step.free)
-        found = jnp.concatenate([self.goal.missing(system, at), self.goal.excess(system, at)])
+        # (At all other steps it may be what has no value.)
+        goal, system, at = only_where(here, (self.goal, system, at))
+        found = jnp.concatenate([goal.missing(system, at), goal.excess(system, at)])
         return jnp.where(here, found, own)
 
     def missing(self, system: System, ending: Ending) -> Float[Array, " n"]:

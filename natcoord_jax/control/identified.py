@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from natcoord_jax.control.fitting import EXACT, Fit, Measurement, Scaling, sides
+from natcoord_jax.control.initial import changed
 from natcoord_jax.control.measurement import Setting, of_one
 from natcoord_jax.control.results import OUTCOMES, Outcome
 from natcoord_jax.core.arguments import checked
@@ -276,12 +277,8 @@ def concluded(
 @eager_numpy
 def _at(setting: Setting, states: State, values: Any) -> tuple[System, State]:
     """The system and the initial states with values of the unknowns (experiments, n)."""
-    shared = len(setting.parameters)
-    system = setting.system_at(values[0, :shared])
-    start = jax.vmap(lambda state, x: setting.start_at(system, state, x[shared:]))(
-        states, jnp.asarray(values)
-    )
-    return system, start
+    system = changed(setting.system, setting.numbers, values[0])
+    return system, jax.vmap(lambda state, x: setting.at(state, x)[1])(states, jnp.asarray(values))
 
 
 def spread_of(slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

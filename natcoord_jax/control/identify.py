@@ -8,7 +8,7 @@ import numpy as np
 
 from natcoord_jax.control.fitting import At, Fit, Measurement, Scaling, finished, searched
 from natcoord_jax.control.identified import Identified, concluded
-from natcoord_jax.control.measurement import INITIAL, MEASURED, SENSORS, Predicted, Setting, of_one, predicted
+from natcoord_jax.control.measurement import MEASURED, SENSORS, Predicted, Setting, of_one, predicted
 from natcoord_jax.control.problem import PARAMETERS
 from natcoord_jax.control.results import Outcome
 from natcoord_jax.control.side_by_side import side_by_side
@@ -37,7 +37,6 @@ def identify(
     *,
     dt: Annotated[Any, Concrete(STEP)],
     inputs: Annotated[Any, Concrete(INPUTS)] = None,
-    initial: Annotated[Any, INITIAL] = (),
     guess: Annotated[Any, GUESS] = None,
     noise: Annotated[Any, Concrete(Number("positive") | Vector(None))] = None,
     save_every: Annotated[int, Whole(1)] = 1,
@@ -57,7 +56,9 @@ def identify(
     Args:
         system: compiled system.
         state: state at the first sample; of several experiments stacked along a leading axis, or one for all.
-        parameters: unknown numbers of the system, each an `nc.Parameter`. Bounds hold wherever it looks.
+        parameters: unknown numbers of the system (`nc.Parameter`) and of the initial state
+            (`nc.InitialCoordinate`, `nc.InitialRate`, `nc.InitialState`), of which every experiment has its
+            own. Bounds hold wherever it looks.
         measured: shape (samples, channels), or (experiments, samples, channels) of several at once. The first
             sample is at the initial state. NaN where a number is missing, as at the end of an experiment that
             is shorter than others.
@@ -65,7 +66,6 @@ def identify(
             `nc.Point` (its position), or several of them, whose channels follow each other.
         dt: step [s].
         inputs: as in `nc.simulate`, known; arrays of several experiments along a leading axis.
-        initial: unknown numbers of the initial state, each an `nc.Initial`; every experiment has its own.
         guess: where the first search begins, values by name or an earlier `Identified`; what it does not name
             begins with `value` of the unknown, or as the system and the state have it.
         noise: standard deviation of the measured numbers, in their units, one for all or one for each
@@ -114,8 +114,8 @@ def identify(
     control, inputs = _inputs(system, inputs, len(values), steps, scheme)
     sensors = tuple(sensors) if isinstance(sensors, list | tuple) else (sensors,)
     setting = Setting(
-        system, as_array(dt, float), tuple(parameters), tuple(initial), tuple(map(Function.of, sensors)),
-        Function.of(control), steps, save_every, scheme,
+        system, as_array(dt, float), tuple(sorted(parameters, key=lambda number: number.starts)),
+        tuple(map(Function.of, sensors)), Function.of(control), steps, save_every, scheme,
     )  # fmt: skip
     scaling = Scaling.of(setting, states, guess.values if isinstance(guess, Identified) else guess or {})
     data = Measurement.of(values, setting.labels(*of_one((states, inputs), 0)), noise)

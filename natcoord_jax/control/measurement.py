@@ -1,6 +1,5 @@
 """What is compared with measurements: channels of simulated motions, and their derivatives by unknowns."""
 
-from collections.abc import Callable
 from itertools import count
 from typing import Any, NamedTuple
 
@@ -10,83 +9,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from natcoord_jax.control.parameters import Parameter
-from natcoord_jax.core.arguments import Part, is_a
-from natcoord_jax.core.callables import Function, replace_fields
+from natcoord_jax.control.initial import begun, changed
+from natcoord_jax.control.parameters import FreeNumber
+from natcoord_jax.core.callables import replace_fields
 from natcoord_jax.core.checks import as_array
 from natcoord_jax.core.compiled import compiled
 from natcoord_jax.core.handles import Handle
-from natcoord_jax.core.kinds import FLAG, JOINT_NAME, NAME, FunctionOf, Kind, Several, is_other, of
+from natcoord_jax.core.kinds import JOINT_NAME, FunctionOf, Kind, Several, is_other, of
 from natcoord_jax.core.markers import Marker
-from natcoord_jax.core.numeric import Number, Whole, array_of
+from natcoord_jax.core.numeric import array_of
 from natcoord_jax.core.state import State, Trajectory
 from natcoord_jax.reading.sensors import joint_coordinates
-from natcoord_jax.stepping.assemble import assemble
 from natcoord_jax.stepping.scheme import Scheme
 from natcoord_jax.stepping.simulate import simulate
 from natcoord_jax.system import System
-
-
-class Initial(Part):
-    """A number of the initial state that is not known: an angle or a rate at the start of the measurement.
-
-    Each experiment has its own. What constraints and drives ask for beside it is assembled.
-
-    Attributes:
-        name: for reports.
-        joint: handle or name of the joint whose coordinate it is; for anything else pass `apply`.
-        rate: whether it is the rate of that coordinate [rad/s or m/s], not the coordinate [rad or m].
-        index: which coordinate of the joint.
-        lower: lower bound; None: none.
-        upper: upper bound; None: none.
-        apply: (system, state, value) -> state, for what is no coordinate of a joint; needs `value`.
-        value: where the search begins; None: as in the state.
-
-    Example:
-        >>> import natcoord_jax as nc
-        >>> push = nc.Initial("push", "hinge", rate=True, lower=-1.0, upper=1.0)
-    """
-
-    name: str = eqx.field(static=True, metadata=is_a(NAME))
-    joint: Handle | str | None = eqx.field(default=None, static=True, metadata=is_a(JOINT_NAME))
-    rate: bool = eqx.field(default=False, kw_only=True, static=True, metadata=is_a(FLAG))
-    index: int = eqx.field(default=0, kw_only=True, static=True, metadata=is_a(Whole(0)))
-    lower: float | None = eqx.field(default=None, kw_only=True, static=True, metadata=is_a(Number()))
-    upper: float | None = eqx.field(default=None, kw_only=True, static=True, metadata=is_a(Number()))
-    apply: Callable[[System, State, Array], State] | None = eqx.field(
-        default=None,
-        kw_only=True,
-        converter=Function.of,
-        metadata=is_a(FunctionOf("(system, state, value) -> state")),
-    )
-    value: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Number()))
-
-    def __check_init__(self):
-        """Refuse what is nowhere, or has no room."""
-        if (self.joint is None) == (self.apply is None) or (self.joint is None and self.value is None):
-            raise ValueError(f"initial {self.name!r}: pass `joint`, or `apply` together with `value`")
-        if self.lower is not None and self.upper is not None and not self.lower < self.upper:
-            raise ValueError(
-                f"initial {self.name!r}: the lower bound {self.lower:g} is not below the upper bound "
-                f"{self.upper:g}; pass bounds with room between them"
-            )
-
-    def initial(self, system: System, states: State) -> Float[Array, "*t"]:
-        """Where the search begins, in each of some states."""
-        if self.value is not None or self.joint is None:
-            return jnp.broadcast_to(jnp.asarray(self.value, float), states.t.shape)
-        read = system.rate if self.rate else system.coordinate
-        return read(states, self.joint, index=self.index)
-
-    def applied(self, system: System, state: State, value: Float[Array, ""]) -> State:
-        """The state with another value."""
-        if self.joint is None:
-            assert self.apply is not None
-            return self.apply(system, state, value)
-        if not self.rate:
-            return system.with_coordinate(state, self.joint, value, index=self.index)
-        angle = system.coordinate(state, self.joint, index=self.index)
-        return system.with_coordinate(state, self.joint, angle, rate=value, index=self.index)
 
 
 class MeasuredKind(Kind):
@@ -111,7 +47,6 @@ class MeasuredKind(Kind):
 SENSOR = FunctionOf("(system, trajectory) -> (samples, channels)", 2) | JOINT_NAME | of("nc.Point", Marker)
 SENSORS = SENSOR | Several(SENSOR, 1)
 MEASURED = MeasuredKind()
-INITIAL = Several(of("nc.Initial(...)", Initial))
 """What arguments may be."""
 
 
@@ -121,8 +56,7 @@ class Setting(eqx.Module):
     Attributes:
         system: with its values before the identification.
         dt: step [s].
-        parameters: unknown numbers of the system.
-        initial: unknown numbers of the initial state.
+        numbers: unknown ones of the system, then those of the initial state.
         sensors: functions of system and trajectory, joints, points.
         control: inputs as a function of (t, state), or None.
         steps: number of steps.
@@ -132,8 +66,7 @@ class Setting(eqx.Module):
 
     system: System
     dt: Float[Array, ""]
-    parameters: tuple[Parameter, ...]
-    initial: tuple[Initial, ...]
+    numbers: tuple[FreeNumber, ...]
     sensors: tuple[Any, ...]
     control: Any
     steps: int = eqx.field(static=True)
@@ -143,31 +76,16 @@ class Setting(eqx.Module):
     def lean(self) -> "Setting":
         """Without what the program need not know, so that another value compiles nothing."""
         gone = {"lower": None, "upper": None, "value": None}
-        parameters = tuple(replace_fields(p, **gone) for p in self.parameters)
-        return replace_fields(
-            self, parameters=parameters, initial=tuple(replace_fields(i, **gone) for i in self.initial)
-        )
+        return replace_fields(self, numbers=tuple(replace_fields(n, **gone) for n in self.numbers))
 
-    def system_at(self, values: Float[Array, " p"]) -> System:
-        """The system with other values of its parameters."""
-        system = self.system
-        for parameter, value in zip(self.parameters, values):
-            system = parameter.applied(system, value)
-        return system
-
-    def start_at(self, system: System, state: State, values: Float[Array, " i"]) -> State:
-        """The initial state of an experiment, of the system with its values."""
-        if any(parameter.moves for parameter in self.parameters):
-            state = assemble(system, state)
-        for unknown, value in zip(self.initial, values):
-            state = unknown.applied(system, state, value)
-        # (Where constraints or drives have a say as well, what was set is marked as held.)
-        return state if state.held is None or not self.initial else assemble(system, state)
+    def at(self, state: State, values: Float[Array, " n"]) -> tuple[System, State]:
+        """The system and the initial state of an experiment at given values of the unknowns."""
+        system = changed(self.system, self.numbers, values)
+        return system, begun(system, state, self.numbers, values)
 
     def run(self, values: Float[Array, " n"], state: State, inputs: Any) -> tuple[list[Array], Trajectory]:
         """Channels of each sensor (samples, channels) in an experiment, and its motion."""
-        system = self.system_at(values[: len(self.parameters)])
-        start = self.start_at(system, state, values[len(self.parameters) :])
+        system, start = self.at(state, values)
         control = self.control
         motion = simulate(
             system, start, dt=self.dt, steps=self.steps, save_every=self.save_every, scheme=self.scheme,
@@ -196,15 +114,11 @@ class Setting(eqx.Module):
     def labels(self, state: State, inputs: Any) -> tuple[str, ...]:
         """Names of the channels."""
         names, numbers = [], count(1)
-        found = jax.eval_shape(lambda x: self.run(x, state, inputs)[0], self.unknowns())
+        found = jax.eval_shape(lambda x: self.run(x, state, inputs)[0], jnp.zeros(len(self.numbers)))
         for sensor, channels in zip(self.sensors, found):
             own = _names(self.system, sensor, channels.shape[1])
             names += [name or f"channel {k}" for name, k in zip(own, numbers)]
         return tuple(names)
-
-    def unknowns(self) -> Float[Array, " n"]:
-        """Room for the unknowns of an experiment."""
-        return jnp.zeros(len(self.parameters) + len(self.initial))
 
 
 def _names(system: System, sensor: Any, channels: int) -> list[str]:

@@ -7,9 +7,11 @@ step to step; the node that one step hands to the next carries it. What nobody a
 
 from typing import Any, NamedTuple
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from natcoord_jax.core.arguments import Part
 from natcoord_jax.core.state import State
@@ -117,6 +119,16 @@ class Carrier(Part):
 def each_inside(whole: Any, system: System, memory: Array) -> list[tuple[Any, Array]]:
     """What a carrier holds, each with its memory."""
     return list(zip(whole.inside(), whole.divided(system, memory)[0]))
+
+
+def only_where(here: Bool[Array, ""], tree: Any) -> Any:
+    """The same, with derivatives where it counts only: one that is NaN elsewhere does not get out.
+
+    Both this and a `where` on what is made of it are needed: zero times NaN is NaN.
+    """
+    numbers, others = eqx.partition(tree, eqx.is_inexact_array)
+    numbers = jax.tree.map(lambda x: jnp.where(here, x, jax.lax.stop_gradient(x)), numbers)
+    return eqx.combine(numbers, others)
 
 
 def input_rate(step: Step, before: Any) -> Float[Array, " inputs"]:

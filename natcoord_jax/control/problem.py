@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from natcoord_jax.control.bounds import BOUND, Bound
 from natcoord_jax.control.cost import COST, Cost
 from natcoord_jax.control.goal import GOAL, Goal
+from natcoord_jax.control.initial import begun, changed
 from natcoord_jax.control.inputs import SPLINE, Spline
 from natcoord_jax.control.memory import Carrier, Ending, Step
 from natcoord_jax.control.mesh import durations, mesh_of
@@ -22,10 +23,14 @@ from natcoord_jax.core.numeric import Number, Numbers, Whole
 from natcoord_jax.core.state import STATE, State
 from natcoord_jax.model.model import SYSTEM
 from natcoord_jax.model.tree import SLOTS
-from natcoord_jax.stepping.assemble import assemble
 from natcoord_jax.system import System
 
-PARAMETERS = Several(of("nc.Parameter(...), nc.InitialCoordinate(...) or nc.InitialRate(...)", FreeNumber))
+PARAMETERS = Several(
+    of(
+        "nc.Parameter(...), nc.InitialCoordinate(...), nc.InitialRate(...) or nc.InitialState(...)",
+        FreeNumber,
+    )
+)
 PHASES = Several(Whole(1))
 TIMES = FLAG | Numbers((2,), "positive") | Several(Numbers((2,), "positive"))
 
@@ -60,7 +65,7 @@ class OptimalControl(Part):
         bounds: what has to hold at the end of every step.
         inputs: how inputs are made of coefficients; default: held over each step.
         parameters: numbers of the system (`nc.Parameter`) and of the initial state (`nc.InitialCoordinate`,
-            `nc.InitialRate`) that are free as well.
+            `nc.InitialRate`, `nc.InitialState`) that are free as well.
         free_time: whether the step, and so the final time, is free; or (lower, upper) of the final time [s].
             Of several phases each has a free duration; limits are those of each, or ((lower, upper), ...).
             It needs something that makes waiting cost or forbids it: `nc.cost.Duration`, a running cost, or
@@ -268,14 +273,12 @@ class OptimalControl(Part):
 
     def applied(self, scaled: Float[Array, " p"]) -> tuple[System, Float[Array, ""]]:
         """The system and the step [s] at given values of what is free; of unequal steps their mean."""
-        values, system = self.values(scaled), self.system
+        values = self.values(scaled)
         if self.uniform:
             dt = values[0] / self.steps if self.free_time else jnp.asarray(self.dt, float)
         else:
             dt = jnp.sum(self.durations(scaled)) / self.steps
-        for number, value in zip(self.free_numbers, values[self.times :]):
-            system = number.applied(system, value)
-        return system, dt
+        return changed(self.system, self.free_numbers, values[self.times :]), dt
 
     def durations(self, scaled: Float[Array, " p"]) -> Float[Array, " phases"]:
         """Durations of all phases at given values of what is free [s]."""
@@ -289,17 +292,8 @@ class OptimalControl(Part):
 
     def start(self, scaled: Float[Array, " p"]) -> State:
         """Initial state at given values of what is free."""
-        moves = any(number.moves_geometry for number in self.free_numbers)
-        starts = any(number.starts for number in self.free_numbers)
-        if not moves and not starts:
-            return self.state
-        (system, _), state = self.applied(scaled), self.state
-        if moves:
-            state = assemble(system, state)
-        for number, value in zip(self.free_numbers, self.values(scaled)[self.times :]):
-            state = number.started(system, state, value)
-        # With loops, drives or couplings others have to follow.
-        return assemble(system, state) if starts and system.structure.held else state
+        numbers, values = self.free_numbers, self.values(scaled)[self.times :]
+        return begun(changed(self.system, numbers, values), self.state, numbers, values)
 
     @property
     def carriers(self) -> tuple[Carrier, ...]:

@@ -230,6 +230,26 @@ def propose(problem: OptimalControl, options: Options, iterate: Iterate) -> Prop
 
 
 @compiled
+def curved_in_free(
+    problem: OptimalControl, iterate: Iterate
+) -> tuple[Float[Array, "f f"], Float[Array, "c f"]]:
+    """Curvature of the Lagrangian in what is free, as all nodes follow it, and the slopes of the goal."""
+    found, bounds = formed(problem, iterate), _weighted(iterate)
+    size, still = found.forward.shape[1], jnp.zeros_like(iterate.derivatives.by_w)
+
+    def forth(z: Array, forward: Array) -> tuple[Array, Array]:
+        return forward[:, :size] @ z, z
+
+    last, nodes = jax.lax.scan(forth, found.first, found.forward)
+    nodes = jnp.concatenate([nodes, last[None]])
+
+    def along(first: Array) -> Array:
+        return 0.5 * curvature(found, bounds, Move(still, first, iterate.multipliers.goal, nodes @ first))
+
+    return jax.hessian(along)(jnp.zeros(found.first.shape[1])), found.goal @ last
+
+
+@compiled
 def softest(problem: OptimalControl, iterate: Iterate) -> tuple[Array, Move, Array]:
     """The direction in which the Lagrangian is curved least while all conditions hold to first order.
 

@@ -158,16 +158,18 @@ def outside_at_start(problem: OptimalControl) -> dict[str, float]:
     """
     if problem.free_numbers:
         return {}
-    excess, by_input = (np.asarray(x) for x in _excess_at_start(problem))
+    # (With inputs before it that stay as they are, so that their rates depend on the inputs.)
+    before = jnp.zeros(len(problem.system.structure.inputs))
+    excess, by_input = (np.asarray(x) for x in _excess_at_start(problem, before))
     fixed = ~np.any(by_input != 0, axis=-1)
     names = unique(problem.path_labels)
     return {name: float(x) for name, x, keep in zip(names, excess, fixed) if keep and x > AT_BOUND}
 
 
 @eager_numpy
-def _excess_at_start(problem: OptimalControl) -> tuple[Array, Array]:
+def _excess_at_start(problem: OptimalControl, before: Array | None = None) -> tuple[Array, Array]:
     def excess(u: Array) -> Array:
-        return standing_excess(problem, problem.state, u, jnp.zeros(len(problem.free)))
+        return standing_excess(problem, problem.state, u, jnp.zeros(len(problem.free)), before)
 
     idle = jnp.zeros(len(problem.system.structure.inputs))
     return excess(idle), jax.jacfwd(excess)(idle)

@@ -197,11 +197,16 @@ def seen(
 
 
 def standing_excess(
-    problem: OptimalControl, state: State, u: Float[Array, " inputs"], free: Float[Array, " p"]
+    problem: OptimalControl,
+    state: State,
+    u: Float[Array, " inputs"],
+    free: Float[Array, " p"],
+    last: Float[Array, " inputs"] | None = None,
 ) -> Float[Array, " n"]:
-    """Excess over the bounds in a state that stays, with given inputs that do not change."""
+    """Excess over the bounds in a state that stays, with given inputs, and others before or the same."""
     system, dt = problem.applied(free)
-    last, memory = (u if problem.looked_back else u[:0]), jnp.zeros(sum(problem.memory_sizes))
+    last = u if last is None else last
+    last, memory = (last if problem.looked_back else u[:0]), jnp.zeros(sum(problem.memory_sizes))
     step = Step(jnp.array(1), dt, state, state, u, last, dt, problem.named(free))
     return problem.path_excess(system, memory, step)
 
