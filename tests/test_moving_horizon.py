@@ -176,7 +176,7 @@ def craft(torque=None):
         hinge = scene.add(nc.Revolute(body, scene.add(wheel), axis=direction, name=f"hinge {k}"))
         scene.add(nc.JointTorque(hinge, name=f"motor {k}"))
     if torque is not None:
-        scene.add(nc.BodyTorque(body, torque=torque))
+        scene.add(nc.BodyTorque((nc.Direction(body, (1.0, 0.0, 0.0)),), torque=torque))
     return scene.compile()
 
 

@@ -127,13 +127,6 @@ def receding_horizon(
     Raises:
         ValueError: for a problem of several phases, with splines, a memory or a free start; for a plant of
             other bodies or inputs; for a moving horizon with free time.
-
-    Example:
-        >>> import jax; jax.config.update("jax_enable_x64", True)
-        >>> import natcoord_jax as nc
-        >>> from natcoord_jax.gallery import manoeuvres
-        >>> problem = manoeuvres.cart_pole(40, t_end=2.0)
-        >>> loop = nc.receding_horizon(problem, problem.system, updates=3)  # doctest: +SKIP
     """
     _check(problem, plant, horizon, updates * steps_each)
     problem, watch, begun = numeric(problem), Stopwatch(), time.perf_counter()
