@@ -60,6 +60,7 @@ __all__ = [
     "Force",
     "Frame",
     "Guess",
+    "Horizons",
     "InitialCoordinate",
     "InitialRate",
     "InitialState",

@@ -491,7 +491,9 @@ CALLS = {
     },
     "receding_horizon": lambda w: {
         "problem": [w.problem], "plant": [w.system], "updates": WHOLE, "steps_each": WHOLE,
-        "guess": [np.ones((2, 1))], "options": [Options()],
+        "horizon": ["shrinking"], "iterations": WHOLE, "disturbance": [lambda k, state: state],
+        "plant_steps": WHOLE, "guess": [np.ones((2, 1)), w.solution], "max_iterations": WHOLE, "tol": NUMBER,
+        "goal_tol": NUMBER,
     },
     "to_nlp": lambda w: {"problem": [w.problem], "guess": [np.ones((2, 1))]},
     "load_guess": lambda w: {"file": ["guess.json"], "steps": WHOLE},
@@ -550,7 +552,7 @@ CALLS = {
 # What calls return or hand over, and bases: nobody is to make these by hand.
 MADE = {
     "Accuracy", "Balance", "BeamHandle", "Check", "ComputedTorque", "Contacts", "Continuation",
-    "DerivativeError", "Edge", "Equilibrium", "Feedback", "Frame", "Growth", "Identified", "Load",
+    "DerivativeError", "Edge", "Equilibrium", "Feedback", "Frame", "Growth", "Horizons", "Identified", "Load",
     "MeshHandle", "Modes", "NodeKind", "Nodes", "NonlinearProgram", "Optima", "Outcome", "Result",
     "SimulationError", "Solution", "State", "Steps", "Surface", "Sweep", "System",
     "Trajectory",

@@ -202,7 +202,9 @@ def test_receding_horizon_brings_a_disturbed_spacecraft_home():
         final = jax.tree.map(lambda x: x[-1], trajectory.states)
         return float(jnp.max(jnp.abs(goal.parts[0].residual(plant, final))))
 
-    horizons = nc.receding_horizon(problem, plant, updates=6, steps_each=10)
+    horizons = nc.receding_horizon(
+        problem, plant, updates=6, steps_each=5, plant_steps=2, horizon="shrinking"
+    )
     # For the system as it is thought to be, and as one program.
     planned = solved(problem, method="shooting", tol=1e-6, goal_tol=1e-8)
     again = nc.optimise_jit(problem, planned.iterate.unknowns)

@@ -81,6 +81,7 @@ def test_readme_runs(tmp_path: Path):
 LONG_PAGES = (
     "howto/control_",
     "howto/identification.md",
+    "howto/moving_horizon.md",
     "howto/optimal_control.md",
     "howto/shells_solids_contact.md",
 )

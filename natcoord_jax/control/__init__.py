@@ -12,7 +12,6 @@ from natcoord_jax.control.continuation import Continuation as Continuation
 from natcoord_jax.control.continuation import continuation as continuation
 from natcoord_jax.control.descent import descend as descend
 from natcoord_jax.control.feedback import Feedback as Feedback
-from natcoord_jax.control.feedback import receding_horizon as receding_horizon
 from natcoord_jax.control.feedback import regulator as regulator
 from natcoord_jax.control.guess import Guess as Guess
 from natcoord_jax.control.identified import Identified as Identified
@@ -25,6 +24,8 @@ from natcoord_jax.control.nlp import NonlinearProgram as NonlinearProgram
 from natcoord_jax.control.nlp import to_nlp as to_nlp
 from natcoord_jax.control.parameters import Parameter as Parameter
 from natcoord_jax.control.problem import OptimalControl as OptimalControl
+from natcoord_jax.control.receding import Horizons as Horizons
+from natcoord_jax.control.receding import receding_horizon as receding_horizon
 from natcoord_jax.control.results import Outcome as Outcome
 from natcoord_jax.control.run import optimise as optimise
 from natcoord_jax.control.run import optimise_jit as optimise_jit

@@ -1,30 +1,24 @@
-"""Feedback around a solution: time-varying linear-quadratic regulation, and receding horizons."""
+"""Feedback around a solution: time-varying linear-quadratic regulation."""
 
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from natcoord_jax.control.guess import GUESS, unknowns_of
-from natcoord_jax.control.iterate import Iterate, Options
-from natcoord_jax.control.motion import joined
-from natcoord_jax.control.problem import PROBLEM, OptimalControl, numeric
+from natcoord_jax.control.iterate import Iterate
+from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.control.quadratic import model
-from natcoord_jax.control.run import OPTIONS, optimise_jit
 from natcoord_jax.control.solution import SOLUTION, Solution
 from natcoord_jax.control.tangent import steady_rates
-from natcoord_jax.control.transcription import Node, held_inputs, packed, unpacked
+from natcoord_jax.control.transcription import Node, packed, unpacked
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.checks import for_each
 from natcoord_jax.core.compiled import compiled
 from natcoord_jax.core.kinds import Several
-from natcoord_jax.core.numeric import Number, Numbers, Vector, Whole
-from natcoord_jax.core.state import State, Trajectory
-from natcoord_jax.model.model import SYSTEM
-from natcoord_jax.stepping.simulate import simulate
-from natcoord_jax.system import System
+from natcoord_jax.core.numeric import Number, Numbers, Vector
+from natcoord_jax.core.state import State
 
 
 class Feedback(eqx.Module):
@@ -144,87 +138,3 @@ def regulator(
         gains = jnp.einsum("cm,kmz->kcz", problem.inputs.shared, gains)
     dt, nodes = jnp.asarray(solution.dt), iterate.path.nodes.x[:-1]
     return Feedback(jnp.asarray(solution.inputs), gains, back, nodes, dt, problem.state.t, limits)
-
-
-class Horizons(NamedTuple):
-    """A closed loop of receding horizons.
-
-    Attributes:
-        trajectory: motion of the plant, all steps.
-        codes: outcome of each optimisation, see `Outcome`.
-        iterations: of each.
-    """
-
-    trajectory: Trajectory
-    codes: Float[Array, " updates"]
-    iterations: Float[Array, " updates"]
-
-
-@checked()
-def receding_horizon(
-    problem: Annotated[OptimalControl, PROBLEM],
-    plant: Annotated[System, SYSTEM],
-    *,
-    updates: Annotated[int, Whole(1)],
-    steps_each: Annotated[int, Whole(1)],
-    guess: Annotated[Any, GUESS] = None,
-    options: Annotated[Options | None, OPTIONS] = None,
-) -> Horizons:
-    """Solve again and again from where the plant is, over the time that is left, in one compiled program.
-
-    The problem keeps its number of steps and its final time, so that dt shrinks; a changed number does not
-    compile anew. The last update looks one period ahead.
-
-    Args:
-        problem: the problem from the start, with inputs held over each step and a fixed final time.
-        plant: the system that really moves, of the same structure (other masses, for example).
-        updates: number of optimisations over the whole time.
-        steps_each: steps of the plant between two of them.
-        guess: for the first optimisation.
-        options: settings of the method.
-
-    Returns:
-        The motion of the plant, and how each optimisation ended.
-
-    Raises:
-        ValueError: for a problem with free time, splines or a memory, or a plant of another structure.
-    """
-    if problem.free_time or problem.inputs.degree or problem.inputs.every > 1 or not problem.uniform:
-        raise ValueError(
-            "receding_horizon needs a fixed final time, equal steps and inputs held over each step"
-        )
-    if sum(problem.memory_sizes):
-        raise ValueError(
-            "receding_horizon starts anew at every update: it takes no goals, costs or bounds that look at "
-            "the way there (integrals, waypoints, turns)"
-        )
-    if plant.structure != problem.system.structure:
-        raise ValueError("the plant has another structure than the system of the problem")
-    problem = numeric(problem)
-    options = options or Options(False, 50, 1e-6, 1e-8)
-    period = problem.steps * problem.dt / updates
-    unknowns, state = unknowns_of(problem, guess, options.lifted), problem.state
-    pieces, codes, iterations = [], [], []
-    for k in range(updates):
-        left = (updates - k) * period
-        now = eqx.tree_at(lambda p: (p.dt, p.state), problem, (left / problem.steps, state))
-        found = optimise_jit(now, unknowns, options)
-        inputs = held_inputs(problem, found.unknowns.coefficients)
-        at = (jnp.arange(steps_each) + 0.5) * period / steps_each
-        held = inputs[jnp.minimum((at / now.dt).astype(int), problem.steps - 1)]
-        piece = simulate(plant, state, dt=period / steps_each, inputs=held)
-        state = jax.tree.map(lambda x: x[-1], piece.states)
-        unknowns = _shifted(found, updates - k)
-        pieces.append(piece)
-        codes.append(found.code)
-        iterations.append(found.iteration)
-    return Horizons(joined(pieces), jnp.stack(codes), jnp.stack(iterations))
-
-
-def _shifted(found: Iterate, left: int) -> Any:
-    """A guess for the time that is left after one of `left` periods."""
-    steps = found.unknowns.coefficients.shape[0]
-    at = 1.0 / left + (jnp.arange(steps) + 0.5) / steps * (1.0 - 1.0 / left)
-    k = jnp.clip((at * steps).astype(int), 0, steps - 1)
-    unknowns = found.unknowns
-    return eqx.tree_at(lambda u: (u.coefficients, u.y), unknowns, (unknowns.coefficients[k], unknowns.y[k]))
