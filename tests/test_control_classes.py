@@ -250,7 +250,7 @@ def test_least_time_with_limited_rates_of_inputs_is_a_ramp(hinged):
 @pytest.mark.exhaustive
 def test_inputs_may_have_to_change_all_the_time(hinged):
     """At least by 1 N m/s, and not infeasible because inputs that stay would be."""
-    rates = nc.bounds.InputRate(1.0, 30.0, before=0.0)
+    rates = nc.bounds.InputRate(1.0, 30.0)
     found = solved(on_disc(hinged, COORDINATE("hinge", 1.0), bounds=rates))
     change = np.diff(np.asarray(found.inputs)[:, 0]) / found.dt
     np.testing.assert_allclose(change, 1.0, rtol=1e-4)

@@ -205,7 +205,9 @@ class InputRate(Range):
 
     def of_step(self, system: System, memory: Array, step: Step) -> Float[Array, " n"]:
         """Excess of the rates over both limits, in units of half the range."""
-        return self.over(self.values(system, step.after, input_rate(step, self.before)))
+        over = self.over(self.values(system, step.after, input_rate(step, self.before)))
+        # Where nothing is before the first step, there is no rate to be limited.
+        return over if self.before is not None else jnp.where(step.number == 0, -1.0, over)
 
     def values(self, system: System, state: State, u: Array) -> Float[Array, " n"]:
         """The rates, of all channels or of one."""
