@@ -94,26 +94,28 @@ def _stage_slopes(problem: OptimalControl, scale: Point, step: Step) -> tuple[Ar
         value = found.cost + by_excess @ found.excess + worth[x:] @ after[x:]
         return value, (lagrangian, small, found.excess)
 
-    def slope(*point: Array) -> tuple[Array, Array, Array]:
-        def lagrangian(*point: Array) -> tuple[Array, tuple[Array, Array]]:
-            value, (more, *others) = own(*point)
-            return value + more, tuple(others)
+    def slope(*point: Array) -> Array:
+        def lagrangian(*point: Array) -> Array:
+            value, (more, *_) = own(*point)
+            return value + more
 
-        (by_chi, by_w, by_y), others = jax.grad(lagrangian, argnums=(0, 1, 2), has_aux=True)(*point)
+        by_chi, by_w, by_y = jax.grad(lagrangian, argnums=(0, 1, 2))(*point)
         displaced = by_chi[:x] @ step.forth[:x, :a]
-        return jnp.concatenate([displaced, by_chi[places], by_chi[x:], by_w, by_y]), *others
+        return jnp.concatenate([displaced, by_chi[places], by_chi[x:], by_w, by_y])
 
-    def fast(v: Array) -> tuple[Array, Array, Array]:
-        def value(v: Array) -> tuple[Array, tuple[Array, Array]]:
-            value, (_, *others) = own(flat.at[places].set(v), step.w, step.y)
-            return value, tuple(others)
+    def fast(v: Array) -> Array:
+        return jax.grad(lambda v: own(flat.at[places].set(v), step.w, step.y)[0])(v)
 
-        by_v, others = jax.grad(value, has_aux=True)(v)
-        return by_v, *others
+    def reached(*point: Array) -> tuple[Array, Array]:
+        return own(*point)[1][1:]
 
-    found, *along = columns(slope, (flat, step.w, step.y), _slow(step, quick), scale)
+    # Exact: conditions of the goal that depend on each other would be told apart by rounding.
+    point, moved = (flat, step.w, step.y), _slow(step, quick)
+    along = jax.vmap(lambda *d: jax.jvp(reached, point, d)[1], in_axes=1, out_axes=1)(*moved)
+    by_v = jax.jacfwd(lambda v: reached(flat.at[places].set(v), step.w, step.y))(flat[places])
+    found = columns(slope, point, moved, scale)
     unit = jnp.eye(places.size, dtype=flat.dtype)
-    among, *by_v = columns(fast, (flat[places],), (unit,), (scale.node[places],))
+    among = columns(fast, (flat[places],), (unit,), (scale.node[places],))
     after, excess = (jnp.concatenate([x[:, :a], v, x[:, a:]], axis=1) for x, v in zip(along, by_v))
     across, first, last = found[quick], found[:a], found[quick.stop :]
     hessian = jnp.block([
