@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Any
 _collecting = gc.isenabled()
 gc.disable()
 
-from natcoord_jax import analysis, bodies, effects, mesh, storage, sweeps
-from natcoord_jax.analysis import *
+from natcoord_jax import bodies, effects, mesh, storage
 from natcoord_jax.bodies import *
 from natcoord_jax.core.bodies import NodeKind
 from natcoord_jax.core.constraint import Constraint, VelocityConstraint
@@ -32,48 +31,59 @@ from natcoord_jax.stepping.room import Steps
 from natcoord_jax.stepping.scheme import Dissipative, EnergyMomentum, VariationalMidpoint
 from natcoord_jax.stepping.simulate import simulate
 from natcoord_jax.storage import *
-from natcoord_jax.sweeps import *
 from natcoord_jax.system import System
 
 if TYPE_CHECKING:
     __version__: str
     from natcoord_jax import io, testing
+    from natcoord_jax.analysis import *
     from natcoord_jax.control import *
+    from natcoord_jax.sweeps import *
     from natcoord_jax.viz import animate, plot, view
 
 if _collecting:
+    if not gc.get_freeze_count():  # What was made is old at once: else the first look goes through all.
+        gc.freeze()
+        gc.unfreeze()
     gc.enable()
 
 __all__ = [
+    "Accuracy",
     "Attachment",
+    "Balance",
     "Check",
     "Clamp",
     "ComputedTorque",
     "Constraint",
+    "Contacts",
     "Continuation",
     "DerivativeError",
     "Direction",
     "Dissipative",
     "EnergyMomentum",
+    "Equilibrium",
     "Feedback",
     "Field",
     "Force",
     "Frame",
+    "Growth",
     "Guess",
     "Horizons",
+    "Identified",
     "InitialCoordinate",
     "InitialRate",
     "InitialState",
-    "Identified",
     "Joint",
     "Load",
     "MixedPotential",
+    "Modes",
     "NodeKind",
     "NonlinearProgram",
     "Optima",
     "OptimalControl",
     "Outcome",
     "Parameter",
+    "Phases",
     "Point",
     "Potential",
     "Result",
@@ -82,18 +92,23 @@ __all__ = [
     "Solution",
     "State",
     "Steps",
+    "Sweep",
     "System",
     "Trajectory",
     "VariationalMidpoint",
     "VelocityConstraint",
+    "accuracy",
     "animate",
     "assemble",
+    "balance",
     "bounds",
     "check",
     "computed_torque",
+    "contacts",
     "continuation",
     "cost",
     "descend",
+    "equilibrium",
     "goal",
     "ground",
     "identify",
@@ -104,7 +119,9 @@ __all__ = [
     "keep_programs",
     "linearise",
     "load_guess",
+    "load_path",
     "mesh",
+    "modes",
     "multi_start",
     "optimise",
     "optimise_jit",
@@ -116,32 +133,33 @@ __all__ = [
     "set_effort",
     "simulate",
     "step",
+    "sweep",
+    "tangent_growth",
     "testing",
     "to_nlp",
     "transfer",
     "view",
 ]
-__all__ += analysis.__all__
 __all__ += bodies.__all__
 __all__ += effects.__all__
 __all__ += storage.__all__
-__all__ += sweeps.__all__
 
 
 def __getattr__(name: str) -> Any:
-    """Control, pictures and readers of files are loaded when first asked for; the version is looked up."""
+    """Analysis, control, sweeps, pictures and readers of files are loaded when first asked for."""
     if name == "__version__":
         from importlib.metadata import version
 
         return version("natcoord_jax")
     from importlib import import_module
 
-    if name in ("control", "io", "testing"):
+    if name in ("analysis", "control", "io", "sweeps", "testing"):
         return import_module(f"natcoord_jax.{name}")
     if name in ("animate", "plot", "view"):
         return getattr(import_module("natcoord_jax.viz"), name)
     if name in __all__:
-        return getattr(import_module("natcoord_jax.control"), name)
+        parts = (import_module(f"natcoord_jax.{part}") for part in ("analysis", "sweeps", "control"))
+        return next(getattr(part, name) for part in parts if name in vars(part))
     from difflib import get_close_matches
 
     near = get_close_matches(name, __all__)
