@@ -33,8 +33,8 @@ class Check:
         complementarity: multiplier times room of the bounds, relative to the cost.
         kind: "minimum", "saddle", or "unknown" where the curvature is too small to tell.
         curvature: the least of the Lagrangian, relative to the largest in a single input, along changes that
-            keep to the motion and the goal to first order; bounds add to it as they press, and where the cost
-            has none it is relative to the least that they add. Without inputs it is that in what is free.
+            keep to the motion and the goal to first order; bounds add to it as they press, and where they add
+            more everywhere it is relative to the least of that. Without inputs it is that in what is free.
             None without an iterate of the second-order method, and where the goal leaves nothing free.
         direction: of unit length along which it is so, as change of the inputs' coefficients (coefficients,
             inputs); without inputs, of what is free, in units of its size.

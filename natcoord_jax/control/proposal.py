@@ -36,8 +36,6 @@ LEAST_BARRIER = 1e-10
 """Barrier parameter at the end, relative to the cost."""
 MANY = 60
 """Inverse iterations that find the least curvature of a solution."""
-FLAT = 1e-12
-"""Curvature in all entering coefficients, relative to that of their bounds, that is rounding."""
 
 
 class Proposal(eqx.Module):
@@ -257,7 +255,7 @@ def softest(problem: OptimalControl, iterate: Iterate) -> tuple[Array, Move, Arr
 
     Returns:
         The curvature along it [cost per square of a coefficient], the direction of unit length, and the
-        largest curvature in a coefficient; where the cost has none, the least that bounds add.
+        largest curvature in a coefficient, or the least that bounds add where that is larger.
     """
     found, bounds = formed(problem, iterate), _weighted(iterate)
     factors, _ = _convex(problem, iterate, found, jnp.clip(30.0 * iterate.errors.motion, *REACH))
@@ -269,4 +267,4 @@ def softest(problem: OptimalControl, iterate: Iterate) -> tuple[Array, Move, Arr
     # Costs that are linear in the inputs have none of their own: only bounds bend them.
     steep = found.excess[:, :, -problem.channels :] ** 2
     pressed = jnp.min(jnp.einsum("kh,khm->km", bounds.path, steep))
-    return curvature(found, bounds, along), along, jnp.where(own > FLAT * pressed, own, pressed)
+    return curvature(found, bounds, along), along, jnp.maximum(own, pressed)
