@@ -183,7 +183,6 @@ def check(
         The findings; `print` shows them.
     """
     problem, iterate = solution.problem, solution.iterate
-    trajectory, system = solution.trajectory, solution.system
     excess = [] if iterate is None else np.asarray(iterate.path.stages.excess).max(axis=0, initial=-np.inf)
     exceeded = dict(zip(problem.path_labels, np.asarray(excess).tolist()))
     if iterate is not None:
@@ -198,8 +197,9 @@ def check(
                 if again.ok:
                     costs[steps] = again.cost
         order, extrapolated = _refinement(costs)
-    found = balance(system, trajectory)
-    errors = [None if x is None else float(np.max(x)) for x in (found.angular_momentum, found.energy)]
+    # Of each phase by itself: an impact between them takes energy.
+    found = [balance(system, trajectory) for system, trajectory in solution.motions]
+    errors = [_worst([x.angular_momentum for x in found]), _worst([x.energy for x in found])]
     hamiltonian = _hamiltonian(solution) if autonomous else (None, None)
     return Check(
         float(iterate.errors.stationarity) if iterate is not None else math.nan,
@@ -215,6 +215,12 @@ def check(
         errors[1],
         *hamiltonian,
     )
+
+
+def _worst(errors: list) -> float | None:
+    """Largest error of all phases; None where none is known."""
+    known = [float(np.max(error)) for error in errors if error is not None]
+    return max(known) if known else None
 
 
 def _refinement(costs: dict[int, float]) -> tuple[float | None, float | None]:

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from natcoord_jax.control.phases import at_hand, in_all_phases, like
 from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.control.tangent import tangent_maps
 from natcoord_jax.control.transcription import (
@@ -66,14 +67,21 @@ class Charts(NamedTuple):
 def charts(problem: OptimalControl, nodes: Node) -> Charts:
     """Tangent maps of all nodes, everything besides the state added unchanged."""
 
-    def one(node: Node) -> tuple[Array, Array]:
-        system, _ = problem.applied(node.free)
-        forth, back = tangent_maps(system, unpacked(problem.state, node.x, problem.state.t))
+    def one(phase: int, node: Node) -> tuple[Array, Array]:
+        state = unpacked(like(problem.systems, problem.state, phase), node.x, problem.state.t)
+        system = at_hand(problem.applied_systems(node.free), phase, state)
+        forth, back = in_all_phases(problem.systems, state, tangent_maps(system, state))
         others = jnp.eye(ravel_pytree(node)[0].size - node.x.size, dtype=forth.dtype)
         block = jax.scipy.linalg.block_diag
         return block(forth, others), block(back, others)
 
-    return Charts(*jax.vmap(one)(nodes))
+    found, first = [], 0
+    for phase, count in enumerate(problem.phases if problem.later else (problem.steps,)):
+        # A node is of the phase that ends there.
+        last = first + count + (phase == 0)
+        found.append(jax.vmap(partial(one, phase))(jax.tree.map(itemgetter(slice(first, last)), nodes)))
+        first = last
+    return Charts(*jax.tree.map(lambda *x: jnp.concatenate(x), *found) if problem.later else found[0])
 
 
 class Jacobians(NamedTuple):

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from natcoord_jax.control.phases import most_counted
 from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.control.transcription import Path, Unknowns, entering
 
@@ -33,7 +34,7 @@ class Point(NamedTuple):
 def sizes(problem: OptimalControl, path: Path, unknowns: Unknowns) -> Point:
     """Sizes of all that a step begins with, equal kinds together; 0 where nothing is known."""
     nodes, q = path.nodes, problem.state.q.size
-    bounds = (0, q, 2 * q, 2 * q + problem.state.coordinates.size, nodes.x.shape[1])
+    bounds = (0, q, 2 * q, 2 * q + most_counted(problem.systems), nodes.x.shape[1])
     pieces = [_largest(nodes.x[:, a:b]) for a, b in zip(bounds[:-1], bounds[1:])]
     others = [_largest(x) for x in jax.tree.leaves(nodes)[2:]]
     node = jnp.concatenate([*pieces, jnp.ones(nodes.free.shape[1]), *others])

@@ -6,8 +6,11 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
+from natcoord_jax.control.mesh import member, spans
+from natcoord_jax.control.phases import filled, most_unknowns, rates_of
 from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.control.tangent import steady_rates
 from natcoord_jax.control.transcription import (
@@ -93,7 +96,7 @@ def unknowns_of(problem: OptimalControl, guess: Any, lifted: bool) -> Unknowns:
     structure = problem.system.structure
     shape = (problem.steps, len(structure.inputs))
     inputs = jnp.zeros(shape) if guess.inputs is None else _shaped(guess.inputs, shape, "inputs")
-    y = jnp.zeros((problem.steps, structure.unknowns + structure.multipliers))
+    y = jnp.zeros((problem.steps, most_unknowns(problem.systems)[0]))
     decided = problem.inputs.decided(inputs, problem.channels)
     unknowns = _moving(problem, guess, Unknowns(problem.inputs.fitted(decided), free, y), lifted)
     unknown = any(not number.given for number in problem.cost.parameters())
@@ -107,16 +110,16 @@ def _moving(problem: OptimalControl, guess: Guess, unknowns: Unknowns, lifted: b
         # There is nothing to make another motion with than the one that follows from the start.
         found, whole, _ = _simulated(problem, unknowns)
         return jax.tree.map(lambda x, y: jnp.where(whole, x, y), found, unknowns)
-    if not lifted or structure.solver != "reduced":
+    if not lifted or any(system.structure.solver != "reduced" for system in problem.systems):
         return unknowns
     if guess.rates is None:
         unknowns = _towards_goal(problem, unknowns)
         return unknowns if guess.inputs is not None else with_balancing_inputs(problem, unknowns)
-    given = jnp.asarray(guess.rates, float)
-    if given.shape == (structure.unknowns,):
-        steady = jnp.broadcast_to(given, (problem.steps, structure.unknowns))
-        return with_rates(unknowns, taken_up(problem, unknowns.free, steady))
-    return with_rates(unknowns, _shaped(given, (problem.steps, structure.unknowns), "rates"))
+    given, count = jnp.asarray(guess.rates, float), most_unknowns(problem.systems)[1]
+    if given.shape == (count,):
+        steady = jnp.broadcast_to(given, (problem.steps, count))
+        return with_rates(problem, unknowns, taken_up(problem, unknowns.free, steady))
+    return with_rates(problem, unknowns, _shaped(given, (problem.steps, count), "rates"))
 
 
 @compiled
@@ -146,8 +149,13 @@ def taken_up(
     The rates at the end of a step are twice the mean less those at its start: a mean that jumps makes them
     swing about the mean from step to step, for ever.
     """
-    first = steady_rates(problem.applied(free)[0], problem.start(free))[None]
-    return free_of_swings(jnp, first, rates)
+    first = filled(steady_rates(problem.applied(free)[0], problem.start(free)), rates.shape[1])
+    if not problem.later:
+        return free_of_swings(jnp, first[None], rates)
+    # Those of another phase are rates of other motions.
+    pieces = [rates[a:b] for a, b in spans(problem.phases)]
+    firsts = [first, *(piece[0] for piece in pieces[1:])]
+    return jnp.concatenate([free_of_swings(jnp, x[None], piece) for x, piece in zip(firsts, pieces)])
 
 
 def free_of_swings(xp: Any, first: Any, rates: Any) -> Any:
@@ -158,9 +166,10 @@ def free_of_swings(xp: Any, first: Any, rates: Any) -> Any:
     return 0.5 * (ends[1:] + ends[:-1])
 
 
-def with_rates(unknowns: Unknowns, rates: Float[Array, "steps n"]) -> Unknowns:
+def with_rates(problem: OptimalControl, unknowns: Unknowns, rates: Float[Array, "steps n"]) -> Unknowns:
     """Unknowns with given mean rates and multipliers zero."""
-    y = jnp.zeros_like(unknowns.y).at[:, : rates.shape[1]].set(rates)
+    known = rates_of(problem.systems, problem.phases)
+    y = jnp.where(known, filled(rates, unknowns.y.shape[1]), 0.0)
     return eqx.tree_at(lambda u: u.y, unknowns, y)
 
 
@@ -173,13 +182,14 @@ def _shaped(value: Any, shape: tuple[int, ...], what: str) -> Array:
 
 @compiled
 def _leading_to_goal(problem: OptimalControl, unknowns: Unknowns) -> Float[Array, "steps n"]:
-    """Constant rates that lead the configuration to the goal, as near as they can; forces play no part."""
-    count = problem.system.structure.unknowns
+    """Rates, constant in phases, that lead the configuration to the goal, as near as they can; no forces."""
+    count = most_unknowns(problem.systems)[1]
+    belongs = member(problem.phases) if problem.later else np.ones((problem.steps, 1))
     _, dt = problem.applied(unknowns.free)
     size = problem.state.q.size
 
     def missing(w: Array) -> Array:
-        moving = with_rates(unknowns, jnp.broadcast_to(w, (problem.steps, count)))
+        moving = with_rates(problem, unknowns, belongs @ w.reshape(-1, count))
         last = jax.tree.map(lambda x: x[-1], roll(problem, moving).nodes)
         # Only the configuration counts: rates at the end are left to the method.
         still = last.x.at[size : 2 * size].set(0.0)
@@ -192,22 +202,24 @@ def _leading_to_goal(problem: OptimalControl, unknowns: Unknowns) -> Float[Array
         longest = jnp.max(jnp.abs(change)) * problem.steps * dt
         return w + change * jnp.minimum(1.0, LONGEST / jnp.where(longest > 0, longest, 1.0))
 
-    w = jax.lax.fori_loop(0, ROUNDS, body, jnp.zeros(count))
-    return jnp.broadcast_to(w, (problem.steps, count))
+    w = jax.lax.fori_loop(0, ROUNDS, body, jnp.zeros(belongs.shape[1] * count))
+    return belongs @ w.reshape(-1, count)
 
 
 def scattered_rates(problem: OptimalControl, unknowns: Unknowns) -> int:
     """How many unknowns of a step are rates that can be guessed; multipliers of loops follow from them."""
-    structure = problem.system.structure
-    return structure.unknowns if structure.solver == "reduced" else unknowns.y.shape[1]
+    structures = [system.structure for system in problem.systems]
+    reduced = all(structure.solver == "reduced" for structure in structures)
+    return min(structure.unknowns for structure in structures) if reduced else unknowns.y.shape[1]
 
 
 def _towards_goal(problem: OptimalControl, unknowns: Unknowns) -> Unknowns:
     """Rates that lead to the goal: constant ones, or such as start and end at rest where it asks for that."""
     constant = _leading_to_goal(problem, unknowns)
-    part = (jnp.arange(problem.steps) + 0.5)[:, None] / problem.steps
+    phases = problem.phases if problem.later else (problem.steps,)
+    part = jnp.concatenate([(jnp.arange(count) + 0.5)[:, None] / count for count in phases])
     rates = constant, 6.0 * part * (1.0 - part) * constant
-    ways = [with_rates(unknowns, taken_up(problem, unknowns.free, w)) for w in rates]
+    ways = [with_rates(problem, unknowns, taken_up(problem, unknowns.free, w)) for w in rates]
     missed = jnp.stack([_missed(problem, way) for way in ways])
     better = jnp.nan_to_num(missed[1], nan=jnp.inf) < missed[0]
     return jax.tree.map(lambda x, y: jnp.where(better, y, x), *ways)

@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 from natcoord_jax.control.costates import Multipliers
 from natcoord_jax.control.iterate import Filter, Iterate, Model, Options, Slacks
 from natcoord_jax.control.newton import as_unknowns, closing, constrained, followed
+from natcoord_jax.control.phases import rates_of
 from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.control.riccati import Factors, Right, Weighted
 from natcoord_jax.control.transcription import Path, Unknowns, roll, simulated
@@ -93,7 +94,7 @@ def first_filter(
     inverses: Array,
 ) -> Filter:
     """A filter that knows nothing but what the first iterate violates."""
-    rates = inverses[:, : problem.system.structure.unknowns]
+    rates = jnp.where(rates_of(problem.systems, problem.phases)[:, :, None], inverses, 0.0)
     _, dt = problem.applied(unknowns.free)
     units = dt * jnp.max(jnp.abs(rates), axis=(0, 1))
     size = jnp.maximum(1.0, violation(units, softness, path, slacks))

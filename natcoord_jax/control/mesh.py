@@ -53,11 +53,8 @@ def mesh_of(phases: Phases, dt: Any) -> Mesh:
     return Mesh(share, begin, jnp.multiply(0.5, share + before))
 
 
-def runs_of(phases: Phases, dt: Any) -> list[tuple[int, int]]:
-    """First step, and the one after the last, of pieces whose steps are equally long."""
-    steps = sum(phases)
-    if np.ndim(dt) and np.shape(dt)[0] == steps:
-        return [(k, k + 1) for k in range(steps)]
+def spans(phases: Phases) -> list[tuple[int, int]]:
+    """First step of each phase, and the one after its last."""
     ends = np.cumsum([0, *phases]).tolist()
     return list(zip(ends[:-1], ends[1:]))
 

@@ -7,16 +7,18 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from natcoord_jax.control.mesh import runs_of
+from natcoord_jax.control.mesh import spans
 from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.core.state import Trajectory
+from natcoord_jax.reading.transfer import transfer
 from natcoord_jax.stepping.simulate import simulate
+from natcoord_jax.system import System
 
 
 def motion(
     problem: OptimalControl, free: Float[Array, " p"], inputs: Any, *, throw: bool = True
 ) -> Trajectory:
-    """The motion as `nc.simulate` finds it; steps of several lengths one piece after the other.
+    """The motion of one system as `nc.simulate` finds it; steps of several lengths one piece after the other.
 
     Args:
         problem: the problem.
@@ -27,24 +29,32 @@ def motion(
     Raises:
         SimulationError: if it cannot be simulated.
     """
-    system, dt = problem.applied(free)
-    state = problem.start(free)
-    if problem.uniform:
-        return _piece(problem, system, state, dt, inputs, throw)
-    lengths, pieces = problem.lengths(free), []
-    for first, last in runs_of(problem.phases, problem.dt):
-        pieces.append(_piece(problem, system, state, lengths[first], inputs[first:last], throw))
-        state = jax.tree.map(lambda x: x[-1], pieces[-1].states)
-    return joined(pieces)
+    return joined([piece for _, piece in motions(problem, free, inputs, throw=throw)])
 
 
-def _piece(problem: OptimalControl, system: Any, state: Any, dt: Any, inputs: Any, throw: bool) -> Trajectory:
-    given = inputs if problem.system.structure.inputs else None
-    return simulate(system, state, dt=dt, steps=len(inputs), inputs=given, throw=throw)
+def motions(
+    problem: OptimalControl, free: Float[Array, " p"], inputs: Any, *, throw: bool = True
+) -> list[tuple[System, Trajectory]]:
+    """The motions of all phases, each with its system; arguments as of `motion`."""
+    systems, lengths, found = problem.applied_systems(free), problem.lengths(free), []
+    system, state = systems[0], problem.start(free)
+    for phase, (first, last) in enumerate(spans(problem.phases)):
+        if 0 < phase < len(systems):
+            system, state = transfer(system, state, systems[phase])
+        runs = [(first, last)] if problem.even else [(k, k + 1) for k in range(first, last)]
+        pieces = []
+        for a, b in runs:
+            given = inputs[a:b] if system.structure.inputs else None
+            pieces.append(simulate(system, state, dt=lengths[a], steps=b - a, inputs=given, throw=throw))
+            state = jax.tree.map(lambda x: x[-1], pieces[-1].states)
+        found.append((system, joined(pieces)))
+    return found
 
 
 def joined(pieces: list[Trajectory]) -> Trajectory:
     """Trajectories one after the other."""
+    if len(pieces) == 1:
+        return pieces[0]
     states = [pieces[0].states, *(jax.tree.map(lambda x: x[1:], p.states) for p in pieces[1:])]
     whole = jax.tree.map(lambda *x: jnp.concatenate(x), *states)
     inputs = jnp.concatenate([p.inputs for p in pieces])

@@ -16,6 +16,7 @@ from natcoord_jax.control.inputs import SPLINE, Spline
 from natcoord_jax.control.memory import Carrier, Ending, Step
 from natcoord_jax.control.mesh import durations, mesh_of
 from natcoord_jax.control.parameters import FreeNumber
+from natcoord_jax.control.phases import Systems, check_systems
 from natcoord_jax.core.arguments import Part, is_a
 from natcoord_jax.core.checks import is_concrete
 from natcoord_jax.core.kinds import FLAG, Several, of
@@ -55,7 +56,10 @@ class OptimalControl(Part):
     scheme (57) at this step, not for an approximation of it.
 
     Attributes:
-        system: compiled system, with input channels unless something else is free.
+        system: compiled system, with input channels unless something else is free; or one for each phase,
+            as (standing, flying): joints close and open between phases as `nc.transfer` says, with the same
+            bodies and input channels in all of them. It is then the first.
+        later: systems of the later phases, as `system` has said; not to be given.
         state: initial state.
         dt: step [s], one number, one for each phase or one for each step; with `free_time` its first guess.
         steps: number of steps; of several phases one number for each, as (20, 20), and then their sum.
@@ -93,13 +97,14 @@ class OptimalControl(Part):
         48.15
     """
 
-    system: System = eqx.field(metadata=is_a(SYSTEM))
+    system: System = eqx.field(metadata=is_a(SYSTEM | Several(SYSTEM, 1)))
     state: State = eqx.field(metadata=is_a(STATE))
     dt: Any = eqx.field(
         kw_only=True, converter=_numbers, metadata=is_a(Number("positive") | Numbers((None,), "positive"))
     )
     steps: int = eqx.field(kw_only=True, static=True, metadata=is_a(Whole(1) | Several(Whole(1), 1)))
     phases: tuple[int, ...] = eqx.field(default=(), kw_only=True, static=True, metadata=is_a(PHASES))
+    later: tuple[System, ...] = eqx.field(default=(), kw_only=True, metadata=is_a(Several(SYSTEM)))
     cost: Cost = eqx.field(default_factory=Cost, kw_only=True, metadata=is_a(COST))
     goal: Goal = eqx.field(default_factory=Goal, kw_only=True, metadata=is_a(GOAL))
     bounds: Bound = eqx.field(default_factory=Bound, kw_only=True, metadata=is_a(BOUND))
@@ -114,7 +119,11 @@ class OptimalControl(Part):
     makes_arrays: ClassVar[bool] = True
 
     def __post_init__(self):
-        """Tell the phases from `steps`."""
+        """Tell the phases from `steps`, and their systems from `system`."""
+        systems: Any = self.system
+        if isinstance(systems, tuple | list):
+            self.system, *later = systems
+            self.later = tuple(later)
         given: Any = self.steps
         if np.ndim(given):
             self.phases = tuple(int(count) for count in given)
@@ -127,6 +136,7 @@ class OptimalControl(Part):
 
     def __check_init__(self):
         """Refuse what is no problem."""
+        check_systems(self.systems, self.phases)
         if not self.system.structure.inputs and not self.free:
             raise ValueError(
                 "the system has no input channels, and nothing else is free; add a JointTorque or another "
@@ -189,6 +199,11 @@ class OptimalControl(Part):
         jax.eval_shape(lambda m: self.carried(self.system, m, step), memory)
 
     @property
+    def systems(self) -> Systems:
+        """Systems of all phases; one: that of all of them."""
+        return (self.system, *self.later)
+
+    @property
     def channels(self) -> int:
         """Number of inputs that are decided: of channels, or of what channels share.
 
@@ -200,6 +215,11 @@ class OptimalControl(Part):
     def uniform(self) -> bool:
         """Whether there is one phase of equal steps."""
         return len(self.phases) == 1 and np.ndim(self.dt) == 0
+
+    @property
+    def even(self) -> bool:
+        """Whether all steps of a phase are equal."""
+        return np.ndim(self.dt) == 0 or self.dt.shape[0] == len(self.phases)
 
     @property
     def free_numbers(self) -> tuple[FreeNumber, ...]:
@@ -279,6 +299,11 @@ class OptimalControl(Part):
         else:
             dt = jnp.sum(self.durations(scaled)) / self.steps
         return changed(self.system, self.free_numbers, values[self.times :]), dt
+
+    def applied_systems(self, scaled: Float[Array, " p"]) -> Systems:
+        """Systems of all phases at given values of what is free."""
+        values = self.values(scaled)[self.times :]
+        return tuple(changed(system, self.free_numbers, values) for system in self.systems)
 
     def durations(self, scaled: Float[Array, " p"]) -> Float[Array, " phases"]:
         """Durations of all phases at given values of what is free [s]."""

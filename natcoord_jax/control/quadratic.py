@@ -11,6 +11,7 @@ from jaxtyping import Array
 from natcoord_jax.control.costates import Charts, Costates, Jacobians, Multipliers, scored_end
 from natcoord_jax.control.differences import Point, columns, sizes
 from natcoord_jax.control.iterate import Derivatives, Model
+from natcoord_jax.control.phases import most_counted, most_unknowns
 from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.control.transcription import (
     Node,
@@ -56,11 +57,9 @@ class Step(NamedTuple):
 
 def _quick(problem: OptimalControl) -> tuple[np.ndarray, slice]:
     """Places of velocities and rates of rotors in a node as a vector, and in small numbers."""
-    size, counted, stored = (
-        x.size for x in (problem.state.q, problem.state.coordinates, problem.state.rates)
-    )
+    size, stored, counted = problem.state.q.size, problem.state.rates.size, most_counted(problem.systems)
     places = np.r_[size : 2 * size, 2 * size + counted : 2 * size + counted + stored]
-    count = problem.system.structure.unknowns
+    count = most_unknowns(problem.systems)[1]
     return places, slice(count, count + size + stored)
 
 

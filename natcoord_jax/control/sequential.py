@@ -12,6 +12,7 @@ import dataclasses
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Int
 
 from natcoord_jax.control.costates import Multipliers
@@ -27,6 +28,7 @@ from natcoord_jax.control.line_search import (
     search,
 )
 from natcoord_jax.control.linearisation import cost_unit, linearised
+from natcoord_jax.control.phases import rates_of
 from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.control.proposal import LEAST_BARRIER, Proposal, propose
 from natcoord_jax.control.results import Outcome
@@ -161,9 +163,9 @@ def _sway(problem: OptimalControl, unknowns: Unknowns) -> Array:
     Curvature that is added in the inputs alone has to be as large as that of the motion far along it, which
     a small one of the motion itself holds as well, and leaves the inputs free.
     """
-    rates = unknowns.y[:, : problem.system.structure.unknowns]
-    pushed, moving = jnp.sum(unknowns.coefficients**2), jnp.sum(rates**2)
-    ratio = pushed * rates.size / (jnp.where(moving > 0, moving, 1.0) * max(1, unknowns.coefficients.size))
+    rates = rates_of(problem.systems, problem.phases)
+    pushed, moving = jnp.sum(unknowns.coefficients**2), jnp.sum(jnp.where(rates, unknowns.y, 0.0) ** 2)
+    ratio = pushed * np.sum(rates) / (jnp.where(moving > 0, moving, 1.0) * max(1, unknowns.coefficients.size))
     return jnp.where(moving > 0, SWAY * ratio, 0.0)
 
 

@@ -11,12 +11,14 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.control.guess import Guess, free_of_swings
 from natcoord_jax.control.iterate import Iterate
-from natcoord_jax.control.motion import motion
+from natcoord_jax.control.motion import motion, motions
+from natcoord_jax.control.phases import most_unknowns, rates_of
 from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.control.reasons import seen, unique, worst_condition
 from natcoord_jax.control.results import ADVICE, OUTCOMES, Outcome
-from natcoord_jax.control.transcription import followed, held_inputs
+from natcoord_jax.control.transcription import Unknowns, followed, held_inputs, roll, simulated
 from natcoord_jax.core.arguments import checked
+from natcoord_jax.core.compiled import compiled
 from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.kinds import of
 from natcoord_jax.core.numeric import Whole
@@ -138,15 +140,36 @@ class Solution(eqx.Module):
 
         Raises:
             SimulationError: if it cannot be simulated.
+            ValueError: if its phases have systems of their own.
         """
+        if self.problem.later:
+            raise ValueError(
+                f"the motion has {len(self.problem.systems)} systems, one for each phase; use "
+                "`solution.motions`, pairs of a system and its trajectory"
+            )
         return motion(self.problem, self._scaled(), self.inputs)
+
+    @property
+    def motions(self) -> list[tuple[System, Trajectory]]:
+        """The motions of all phases, simulated with the inputs found, each with its system.
+
+        A phase begins with the state that `nc.transfer` makes of the last one before it: velocities jump
+        where a joint closes.
+
+        Raises:
+            SimulationError: if they cannot be simulated.
+        """
+        return motions(self.problem, self._scaled(), self.inputs)
 
     @property
     def missing(self) -> dict[str, float]:
         """Residual of the goal at the end of the simulated motion, by name."""
         names = self.problem.goal.labels(self.problem.system)
-        states = self.trajectory.states
-        residual = _missing(self.problem, self._scaled(), states, jnp.asarray(self.inputs))
+        if self.problem.later:
+            residual = _missing_of_phases(self.problem, self._scaled(), jnp.asarray(self.inputs))
+        else:
+            states = self.trajectory.states
+            residual = _missing(self.problem, self._scaled(), states, jnp.asarray(self.inputs))
         return dict(zip(unique(names), np.asarray(residual).tolist()))
 
     @property
@@ -182,12 +205,18 @@ class Solution(eqx.Module):
     def guess(self, steps: int | None = None) -> Guess:
         """A guess for another problem, with the inputs resampled in time to another number of steps."""
         rates = None
-        structure = self.problem.system.structure
-        if self.iterate is not None and structure.solver == "reduced":
-            rates = np.asarray(self.iterate.unknowns.y)[:, : structure.unknowns]
+        systems = self.problem.systems
+        if self.iterate is not None and all(system.structure.solver == "reduced" for system in systems):
+            known = rates_of(systems, self.problem.phases)
+            rates = np.where(known, self.iterate.unknowns.y, 0.0)[:, : most_unknowns(systems)[1]]
         free = [self.free[name] for name in self.problem.free] or None
         steps = steps or self.problem.steps
-        rates = None if rates is None else _interpolated(rates, steps)
+        if rates is not None:
+            # Those of different systems are not of the same motions.
+            phases = self.problem.phases if self.problem.later else (self.problem.steps,)
+            counts = [count * steps // self.problem.steps for count in phases]
+            pieces = np.split(rates, np.cumsum(phases)[:-1])
+            rates = np.concatenate([_interpolated(x, count) for x, count in zip(pieces, counts)])
         return Guess(_resampled(np.asarray(self.inputs), steps), rates=rates, free=free)
 
     @checked("Solution.save", file=FILE)
@@ -262,6 +291,13 @@ def _interpolated(values: np.ndarray, steps: int) -> np.ndarray:
 @eager_numpy
 def _missing(problem: OptimalControl, free: Array, states: State, inputs: Array) -> Float[Array, " n"]:
     return followed(problem, free, states, inputs)[2].missing
+
+
+@compiled
+def _missing_of_phases(problem: OptimalControl, free: Array, inputs: Array) -> Float[Array, " n"]:
+    decided = problem.inputs.fitted(problem.inputs.decided(inputs, problem.channels))
+    unknowns = Unknowns(decided, free, jnp.zeros((problem.steps, most_unknowns(problem.systems)[0])))
+    return roll(problem, simulated(problem, unknowns, False)[0]).end.missing
 
 
 def solution_of(

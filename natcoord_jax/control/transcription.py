@@ -6,6 +6,7 @@ so that joints and directors hold whatever the unknowns are; the residuals of th
 constraints. Where the residuals vanish, the motion is that of `nc.simulate`.
 """
 
+from functools import partial
 from operator import itemgetter
 from typing import Any, NamedTuple
 
@@ -17,15 +18,18 @@ from jaxtyping import Array, Bool, Float, Int
 
 from natcoord_jax.control.inputs import Shaping
 from natcoord_jax.control.memory import Ending, Step
-from natcoord_jax.control.mesh import Mesh, mesh_of, runs_of
+from natcoord_jax.control.mesh import Mesh, mesh_of, spans
+from natcoord_jax.control.phases import at_hand, entered, filled, like, most_counted, switched, ways_of
 from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import gauss
+from natcoord_jax.reading.transfer import transfer
 from natcoord_jax.stepping.derivative import run_slots
 from natcoord_jax.stepping.newton import TOLERANCE
 from natcoord_jax.stepping.plan import Plan
 from natcoord_jax.stepping.step import advance
+from natcoord_jax.system import System
 
 
 class Unknowns(eqx.Module):
@@ -106,7 +110,7 @@ class Path(eqx.Module):
 class Slice(NamedTuple):
     """What is known of one step: its number, the spline's machine, and its place in the mesh.
 
-    That of equal steps of one phase is not needed.
+    That of equal steps of one phase is not needed; nor is the way it is made where there is one only.
     """
 
     number: Int[Array, "*k"]
@@ -115,11 +119,13 @@ class Slice(NamedTuple):
     read: Float[Array, "*k d"]
     direct: Float[Array, "*k"]
     place: Mesh | None = None
+    way: Int[Array, "*k"] | None = None
 
 
-def packed(state: State) -> Float[Array, " x"]:
-    """State as one vector."""
-    return jnp.concatenate([state.q.reshape(-1), state.v.reshape(-1), state.coordinates, state.rates])
+def packed(state: State, counted: int | None = None) -> Float[Array, " x"]:
+    """State as one vector, with room for so many coordinates of joints."""
+    coordinates = state.coordinates if counted is None else filled(state.coordinates, counted)
+    return jnp.concatenate([state.q.reshape(-1), state.v.reshape(-1), coordinates, state.rates])
 
 
 def unpacked(like: State, x: Float[Array, " x"], t: Float[Array, ""]) -> State:
@@ -127,7 +133,7 @@ def unpacked(like: State, x: Float[Array, " x"], t: Float[Array, ""]) -> State:
     size = like.q.size
     a, b = 2 * size, 2 * size + like.coordinates.size
     fields = {"q": x[:size].reshape(-1, 3), "v": x[size:a].reshape(-1, 3)}
-    return replace_fields(like, t=t, coordinates=x[a:b], rates=x[b:], **fields)
+    return replace_fields(like, t=t, coordinates=x[a:b], rates=x[x.size - like.rates.size :], **fields)
 
 
 def slices(problem: OptimalControl) -> Slice:
@@ -135,7 +141,8 @@ def slices(problem: OptimalControl) -> Slice:
     shaping: Shaping = problem.inputs.shaping(problem.steps)
     shift, load, read, direct = (jnp.asarray(x) for x in shaping[:4])
     place = None if problem.uniform else mesh_of(problem.phases, problem.dt)
-    return Slice(jnp.arange(problem.steps), shift, load, read, direct, place)
+    way = jnp.asarray(ways_of(problem.systems, problem.phases)) if problem.later else None
+    return Slice(jnp.arange(problem.steps), shift, load, read, direct, place, way)
 
 
 def entering(problem: OptimalControl, coefficients: Float[Array, "c m"]) -> Float[Array, "steps m"]:
@@ -154,7 +161,8 @@ def first_node(problem: OptimalControl, free: Float[Array, " p"], leading: Float
     """Node before the first step, from what is free and the first coefficients of the spline."""
     start = jnp.asarray(problem.inputs.shaping(1).start)
     last, memory = jnp.zeros(problem.looked_back), jnp.zeros(sum(problem.memory_sizes))
-    return Node(packed(problem.start(free)), free, last, memory, start @ leading)
+    x = packed(problem.start(free), most_counted(problem.systems))
+    return Node(x, free, last, memory, start @ leading)
 
 
 def times_of(problem: OptimalControl, free: Float[Array, " p"], at: Slice) -> tuple[Array, Array, Array]:
@@ -169,6 +177,7 @@ def times_of(problem: OptimalControl, free: Float[Array, " p"], at: Slice) -> tu
 
 def seen(
     problem: OptimalControl,
+    system: System,
     number: Any,
     times: tuple[Any, Any],
     states: tuple[State, State],
@@ -179,6 +188,7 @@ def seen(
 
     Args:
         problem: the problem.
+        system: of the step.
         number: of the step.
         times: its duration, and the time from the middle of the step before it [s].
         states: at its start and its end.
@@ -188,7 +198,6 @@ def seen(
     Returns:
         Its cost, the excess over bounds at its end, its inputs where somebody asks for them, and the memory.
     """
-    system, _ = problem.applied(node.free)
     step = Step(number, times[0], *states, u, node.last, times[1], problem.named(node.free))
     cost = problem.cost.of_step(system, problem.memories(node.memory)[1], step)
     excess = problem.path_excess(system, node.memory, step)
@@ -220,27 +229,44 @@ def stage(
     stretch: Any = 1.0,
 ) -> Stage:
     """One step from its unknowns: explicit, and smooth in everything; `stretch` makes this step longer."""
-    system, _ = problem.applied(node.free)
+    ways: list = [partial(_stage, problem, 0, False)]
+    for phase in range(1, len(problem.systems)):
+        ways += [partial(_stage, problem, phase, True), partial(_stage, problem, phase, False)]
+    return switched(at.way, ways, at, node, w, y, stretch)
+
+
+def _stage(
+    problem: OptimalControl, phase: int, enters: bool, at: Slice, node: Node, w: Array, y: Array, stretch: Any
+) -> Stage:
+    """A step of a phase, or that by which it is entered."""
+    systems = problem.applied_systems(node.free)
     begin, dt, gap = times_of(problem, node.free, at)
     dt = stretch * dt
     decided = at.read @ node.register + at.direct * w
-    u = problem.inputs.driven(decided, len(system.structure.inputs))
-    before = unpacked(problem.state, node.x, begin)
-    residual, after, _ = advance(system, before, u, dt, y, gauss(1))
+    u = problem.inputs.driven(decided, len(problem.system.structure.inputs))
+    before = unpacked(like(problem.systems, problem.state, phase - enters), node.x, begin)
+    system, before = entered(systems, phase, before) if enters else (at_hand(systems, phase, before), before)
+    own = system.structure.unknowns + system.structure.multipliers
+    residual, after, _ = advance(system, before, u, dt, y[:own], gauss(1))
     # The account of work plays no part.
     after = replace_fields(after, work=before.work)
-    cost, excess, last, memory = seen(problem, at.number, (dt, gap), (before, after), u, node)
+    cost, excess, last, memory = seen(problem, system, at.number, (dt, gap), (before, after), u, node)
     if not u.size:
         # What acts on nothing wants to be zero.
         cost = cost + 0.5 * dt * jnp.sum(decided**2)
     register = at.shift @ node.register + at.load[:, None] * w
-    return Stage(residual, cost, excess, Node(packed(after), node.free, last, memory, register))
+    x = packed(after, most_counted(systems))
+    # What other phases have more unknowns for is zero.
+    residual = jnp.concatenate([residual, y[own:]])
+    return Stage(residual, cost, excess, Node(x, node.free, last, memory, register))
 
 
 def end(problem: OptimalControl, node: Node) -> End:
     """What the final node gives."""
-    system, _ = problem.applied(node.free)
-    state = unpacked(problem.state, node.x, problem.state.t + jnp.sum(problem.durations(node.free)))
+    systems, final = problem.applied_systems(node.free), len(problem.later)
+    t = problem.state.t + jnp.sum(problem.durations(node.free))
+    state = unpacked(like(problem.systems, problem.state, final), node.x, t)
+    system = at_hand(systems, final, state)
     lower, upper = problem.limits()
     values, scale = problem.values(node.free), problem.references()[1]
     below, above = np.flatnonzero(np.isfinite(lower)), np.flatnonzero(np.isfinite(upper))
@@ -260,7 +286,7 @@ def end(problem: OptimalControl, node: Node) -> End:
 def followed(
     problem: OptimalControl, free: Float[Array, " p"], states: State, inputs: Float[Array, "steps u"]
 ) -> tuple[Array, Array, End]:
-    """What a motion gives that is known by its states and inputs.
+    """What a motion of one system gives that is known by its states and inputs.
 
     Args:
         problem: the problem.
@@ -272,12 +298,13 @@ def followed(
         Costs of the steps, excesses over the bounds at their ends, and what the end gives.
     """
     first = first_node(problem, free, jnp.zeros((problem.inputs.degree, problem.channels)))
+    system, _ = problem.applied(free)
     before, after = (jax.tree.map(itemgetter(s), states) for s in (slice(None, -1), slice(1, None)))
 
     def body(node: Node, given: tuple) -> tuple[Node, tuple[Array, Array]]:
         at, before, after, u = given
         times = times_of(problem, free, at)[1:]
-        cost, excess, last, memory = seen(problem, at.number, times, (before, after), u, node)
+        cost, excess, last, memory = seen(problem, system, at.number, times, (before, after), u, node)
         return eqx.tree_at(lambda n: (n.last, n.memory), node, (last, memory)), (cost, excess)
 
     given = slices(problem), before, after, inputs
@@ -318,6 +345,14 @@ def held_inputs(problem: OptimalControl, coefficients: Float[Array, "c m"]) -> F
     return problem.inputs.driven(decided, len(problem.system.structure.inputs))
 
 
+class Piece(NamedTuple):
+    """Unknowns of simulated steps, whether every step was made whole, and the number of Newton iterations."""
+
+    y: Float[Array, "*k n"]
+    whole: Bool[Array, "*k"]
+    newton: Int[Array, "*k"]
+
+
 def simulated(problem: OptimalControl, unknowns: Unknowns, lifted: bool) -> tuple[Unknowns, Array, Array]:
     """Unknowns of the steps replaced by those of a simulation; the same where the method is lifted.
 
@@ -326,25 +361,26 @@ def simulated(problem: OptimalControl, unknowns: Unknowns, lifted: bool) -> tupl
     """
     if lifted:
         return unknowns, jnp.array(True), jnp.array(0)
-    system, _ = problem.applied(unknowns.free)
-    inputs, state = held_inputs(problem, unknowns.coefficients), problem.start(unknowns.free)
+    systems, free = problem.applied_systems(unknowns.free), unknowns.free
+    inputs, state = held_inputs(problem, unknowns.coefficients), problem.start(free)
 
-    def piece(state: State, given: tuple[Array, Array]) -> tuple[State, tuple[Array, Array, Array]]:
+    def piece(system: System, state: State, given: tuple[Array, Array]) -> tuple[State, Piece]:
         u, dt = given
         slots, ending = run_slots(Plan(u.shape[0], 0, TOLERANCE, None), system, state, u, dt)
         whole = (ending.course.code == 0) & jnp.all(slots.accepted) & jnp.all(slots.fraction == 1.0)
-        return ending.course.state, (slots.y, whole, ending.course.iterations)
+        y = filled(slots.y, unknowns.y.shape[1])
+        return ending.course.state, Piece(y, whole, ending.course.iterations)
 
-    runs = runs_of(problem.phases, problem.dt)
-    if problem.uniform:
-        y, whole, newton = piece(state, (inputs, problem.applied(unknowns.free)[1]))[1]
-        return replace_fields(unknowns, y=y), whole, newton
-    lengths, found = problem.lengths(unknowns.free), []
-    if len(runs) == problem.steps:
-        y, *rest = jax.lax.scan(piece, state, (inputs[:, None], lengths))[1]
-        return replace_fields(unknowns, y=y[:, 0]), jnp.all(rest[0]), jnp.sum(rest[1])
-    for first, last in runs:
-        state, reached = piece(state, (inputs[first:last], lengths[first]))
+    found, system, lengths = [], systems[0], problem.lengths(free)
+    for phase, (first, last) in enumerate(spans(problem.phases)):
+        if 0 < phase < len(systems):
+            system, state = transfer(system, state, systems[phase])
+        u, dt = inputs[first:last], lengths[first:last]
+        if problem.even:
+            state, reached = piece(system, state, (u, dt[0]))
+        else:
+            state, each = jax.lax.scan(partial(piece, system), state, (u[:, None], dt))
+            reached = Piece(each.y[:, 0], jnp.all(each.whole), jnp.sum(each.newton))
         found.append(reached)
     y, whole, newton = zip(*found)
     whole, newton = (jnp.stack(x) for x in (whole, newton))
