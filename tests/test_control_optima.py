@@ -142,8 +142,9 @@ def test_flying_robot():
     shared = {"cost": Thrust(), "goal": goal, "bounds": nc.bounds.Input(0.0, 1.0) & pairs}
     found = nc.optimise(nc.OptimalControl(system, state, dt=0.3, steps=40, **shared), progress=False)
     assert found.ok and found.cost <= 7.953952
-    # Only bounds bend such a cost.
-    assert abs(nc.check(found, refine=False).curvature) < 1e6
+    # Only bounds bend such a cost, and at a corner of theirs every change presses some.
+    verdict = nc.check(found, refine=False)
+    assert verdict.kind == "minimum" and verdict.curvature < 1e9
 
 
 @pytest.fixture(scope="module")
@@ -284,11 +285,11 @@ def test_check_tells_a_saddle_from_a_minimum(asymmetric):
     assert verdict.kind == "minimum" and "minimum" in str(verdict)
     assert verdict.curvature * 2 * best.dt == pytest.approx(least, rel=0.02)
     assert np.linalg.norm(verdict.direction) == pytest.approx(1.0)
-    # One step from torques about the axis alone: it knows no multipliers, and draws nothing aside.
+    # One step from torques about the axis alone draws nothing aside.
     fall = 6.0 * 3.0 * np.radians(120) * (1.0 - (2.0 * np.arange(20) + 1.0) / 20)
     along = fall[:, None] * np.array([0.0, 0.0, 1.0])
     stuck = nc.optimise(problem, along, method="shooting", progress=False, max_iterations=1)
-    assert not stuck.ok and stuck.history[-1].stationarity < 1e-2
+    assert not stuck.ok and stuck.history[-1].stationarity < 0.05
     verdict, least = nc.check(stuck, refine=False), reduced_eigenvalues(stuck)[0]
     assert verdict.kind == "saddle" and least < 0
     assert verdict.curvature * 2 * stuck.dt == pytest.approx(least, rel=0.02)

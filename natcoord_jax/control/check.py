@@ -18,7 +18,7 @@ from natcoord_jax.control.reasons import switches
 from natcoord_jax.control.refinement import refined
 from natcoord_jax.control.run import optimise
 from natcoord_jax.control.solution import SOLUTION, Solution
-from natcoord_jax.control.transcription import entering, slices, stage
+from natcoord_jax.control.transcription import each_step, entering, slices, stage
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.compiled import compiled
 from natcoord_jax.core.kinds import FLAG, FunctionOf
@@ -117,7 +117,7 @@ def _hamiltonians(
         whole, cost = jax.jvp(value, (jnp.ones(()),), (jnp.ones(()),))[1]
         return whole / dt, cost / dt
 
-    return jax.vmap(one)(slices(problem), before, w, iterate.unknowns.y, after, worth.residuals)
+    return each_step(problem, one, slices(problem), before, w, iterate.unknowns.y, after, worth.residuals)
 
 
 def _hamiltonian(solution: Solution) -> tuple[float | None, float | None]:

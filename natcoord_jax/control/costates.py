@@ -19,6 +19,7 @@ from natcoord_jax.control.transcription import (
     Path,
     Slice,
     Unknowns,
+    each_step,
     end,
     entering,
     slices,
@@ -69,7 +70,8 @@ def charts(problem: OptimalControl, nodes: Node) -> Charts:
 
     def one(phase: int, node: Node) -> tuple[Array, Array]:
         state = unpacked(like(problem.systems, problem.state, phase), node.x, problem.state.t)
-        system = at_hand(problem.applied_systems(node.free), phase, state)
+        systems = problem.applied_systems(node.free)
+        system = at_hand(systems, (phase,), phase, state) if phase else systems[0]
         forth, back = in_all_phases(problem.systems, state, tangent_maps(system, state))
         others = jnp.eye(ravel_pytree(node)[0].size - node.x.size, dtype=forth.dtype)
         block = jax.scipy.linalg.block_diag
@@ -114,7 +116,8 @@ def step_jacobians(problem: OptimalControl, path: Path, unknowns: Unknowns) -> J
         return Jacobians(jnp.where(solved, inverse, jnp.nan), by_node, by_w)
 
     before = jax.tree.map(lambda x: x[:-1], path.nodes)
-    return jax.vmap(one)(slices(problem), before, entering(problem, unknowns.coefficients), unknowns.y)
+    w = entering(problem, unknowns.coefficients)
+    return each_step(problem, one, slices(problem), before, w, unknowns.y)
 
 
 def scored_end(problem: OptimalControl, multipliers: Multipliers, node: Node) -> Array:
@@ -186,7 +189,7 @@ def costates(
 
     before = jax.tree.map(itemgetter(slice(None, -1)), path.nodes)
     each = (slices(problem), before, entering(problem, unknowns.coefficients), unknowns.y)
-    slopes = jax.vmap(partial(direct_slopes, problem))(*each, multipliers.path)
+    slopes = each_step(problem, partial(direct_slopes, problem), *each, multipliers.path)
     _, (nodes, residuals, by_w) = scan_in_one_kernel(body, last, (*each, slopes, jacobians), reverse=True)
 
     def whole(nodes: Array) -> Node:

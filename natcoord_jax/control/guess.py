@@ -17,6 +17,7 @@ from natcoord_jax.control.transcription import (
     Node,
     Slice,
     Unknowns,
+    each_step,
     end,
     roll,
     simulated,
@@ -259,7 +260,7 @@ def with_balancing_inputs(problem: OptimalControl, unknowns: Unknowns) -> Unknow
         reach = jnp.where(grown > 0, spare / jnp.where(grown > 0, grown, 1.0), 1.0)
         return jnp.nan_to_num(idle + u * jnp.minimum(1.0, jnp.min(reach, initial=1.0)))
 
-    inputs = jax.vmap(one)(at, nodes, unknowns.y)
+    inputs = each_step(problem, one, at, nodes, unknowns.y)
     return eqx.tree_at(lambda u: u.coefficients, unknowns, problem.inputs.fitted(inputs))
 
 

@@ -12,6 +12,7 @@ from natcoord_jax.control.transcription import (
     Node,
     Path,
     Unknowns,
+    each_step,
     entering,
     first_node,
     slices,
@@ -46,7 +47,7 @@ def _gradient_scale(problem: OptimalControl, unknowns: Unknowns, path: Path, sig
         by_cost, by_excess = jax.jacfwd(values)(w)
         return jnp.abs(by_cost) + sigma @ jnp.abs(by_excess)
 
-    sizes = jax.vmap(direct)(slices(problem), nodes_before(path), w, unknowns.y, sigma)
+    sizes = each_step(problem, direct, slices(problem), nodes_before(path), w, unknowns.y, sigma)
     scale = jnp.max(sizes)
     return jnp.where(scale > 0, scale, 1.0)
 
@@ -93,7 +94,7 @@ def cost_unit(problem: OptimalControl, unknowns: Unknowns, path: Path) -> Array:
         steep = jax.jacfwd(lambda w: stage(problem, at, node, w, y).excess)(w)
         return jnp.max(jnp.abs(jnp.diagonal(cost))), steep
 
-    bent, steep = jax.vmap(curvature)(slices(problem), nodes_before(path), w, unknowns.y)
+    bent, steep = each_step(problem, curvature, slices(problem), nodes_before(path), w, unknowns.y)
     slopes = largest(steep)
     whole_range = 0.5 * jnp.sum(bent) / jnp.where(slopes > 0, slopes, 1.0) ** 2
     unit = jnp.maximum(jnp.abs(path.cost), jnp.where(slopes > 0, whole_range, 0.0))

@@ -1,7 +1,8 @@
 """Phases with systems of their own: joints close and open between them, as `nc.transfer` has it.
 
-All systems have the same bodies, inputs and rotors, so that a node is one vector in all phases; coordinates
-of joints and unknowns of steps are filled up to the most that a phase has. A joint that closes takes its
+All systems have the same bodies, inputs and rotors, so that a node is a vector of one size in all phases; the
+order of bodies, which that of joints decides, is that of the phase which ends there, and coordinates of
+joints and unknowns of steps are filled up to the most that a phase has. A joint that closes takes its
 bodies as they are: increments keep them together from then on, so that where they are now says where they
 met.
 """
@@ -38,39 +39,55 @@ def check_systems(systems: Systems, phases: Phases) -> None:
     first = systems[0]
     for number, other in enumerate(systems[1:], 2):
         for what, one, two in (
-            ("bodies", first.structure.bodies, other.structure.bodies),
-            ("input channels", first.structure.inputs, other.structure.inputs),
-            ("rotors", tuple(rotor_names(first)), tuple(rotor_names(other))),
+            ("bodies", sorted(first.structure.bodies), sorted(other.structure.bodies)),
+            ("rotors", sorted(rotor_names(first)), sorted(rotor_names(other))),
+            ("input channels, in their order,", list(first.structure.inputs), list(other.structure.inputs)),
         ):
-            if tuple(one) != tuple(two):
+            if one != two:
                 raise ValueError(
-                    f"the system of phase {number} has the {what} {list(two)}, that of the first one "
-                    f"{list(one)}; give all phases the same, in the same order"
+                    f"the system of phase {number} has the {what} {two}, that of the first one {one}; give "
+                    "all phases the same"
                 )
 
 
-def closed(systems: Systems, phase: int) -> np.ndarray:
-    """Numbers of the joints of a phase that are not there in all phases before it: where they are is found."""
+def closed(systems: Systems, phase: int) -> Bool[np.ndarray, " joints"]:
+    """Which joints of a phase a phase before it lacks: where they are, the motion says."""
     names = systems[phase].structure.joints
     before = [set(system.structure.joints) for system in systems[:phase]]
-    return np.array([k for k, name in enumerate(names) if not all(name in known for known in before)], int)
+    return np.array([not all(name in known for known in before) for name in names], bool)
 
 
-def at_hand(systems: Systems, phase: int, state: State) -> System:
-    """The system of a phase at a state of its own: joints that have closed are where their bodies are."""
-    joints, system = closed(systems, phase), systems[phase]
-    if not phase:
-        return system
+def kinds(systems: Systems) -> list[tuple[int, ...]]:
+    """Phases whose systems differ in numbers only, together."""
+    found: dict[Any, list[int]] = {}
+    for phase, system in enumerate(systems):
+        found.setdefault(jax.tree.structure(system), []).append(phase)
+    return [tuple(phases) for phases in found.values()]
+
+
+def at_hand(systems: Systems, kind: tuple[int, ...], phase: Any, state: State) -> System:
+    """The system of a phase at a state of its own: joints that have closed are where their bodies are.
+
+    Args:
+        systems: of all phases.
+        kind: phases of systems of one structure.
+        phase: one of these.
+        state: in their layout.
+    """
+    here = 0 if len(kind) == 1 else jnp.searchsorted(jnp.array(kind), phase)
+    system = jax.tree.map(lambda *x: x[0] if len(x) == 1 else jnp.stack(x)[here], *(systems[p] for p in kind))
     before, after = common_joints(systems[0], system)
     system = replace_fields(system, frames=system.frames.at[after].set(systems[0].frames[before]))
+    table = np.stack([closed(systems, p) for p in kind])
+    joints = np.flatnonzero(np.any(table, axis=0))
     if not joints.size:
         return system
-    return held(system, rows_with_ground(state.q), joints, jnp.ones(joints.size, bool))
+    return held(system, rows_with_ground(state.q), joints, jnp.asarray(table[:, joints])[here])
 
 
 def entered(systems: Systems, phase: int, state: State) -> tuple[System, State]:
     """The system of a phase and the state that it begins with, from that at the end of the phase before."""
-    found: Any = transfer(at_hand(systems, phase - 1, state), state, systems[phase])
+    found: Any = transfer(at_hand(systems, (phase - 1,), phase - 1, state), state, systems[phase])
     return found
 
 
@@ -90,14 +107,17 @@ def most_unknowns(systems: Systems) -> tuple[int, int]:
     return max(s.unknowns + s.multipliers for s in structures), max(s.unknowns for s in structures)
 
 
-def ways_of(systems: Systems, phases: Phases) -> np.ndarray:
-    """Which of the ways to make a step each step takes: 2 p in phase p, but 2 p - 1 where it is entered."""
-    found = np.repeat(2 * np.arange(len(phases)), phases)
-    starts = np.cumsum((0, *phases))[1:-1]
+def places(systems: Systems, phases: Phases) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of each step its phase, the number of its kind, and the phase that it enters, 0 if none."""
+    number = np.repeat(np.arange(len(phases)), phases)
+    kind = np.zeros(len(phases), int)
+    for k, members in enumerate(kinds(systems)):
+        kind[list(members)] = k
+    enters, starts = np.zeros(number.size, int), np.cumsum((0, *phases))
     names = [(system.structure.joints, system.structure.coordinates) for system in systems]
-    changed = [one != other for one, other in zip(names, names[1:])]
-    found[starts[changed]] -= 1
-    return found
+    for phase in range(1, len(systems)):
+        enters[starts[phase]] = phase if names[phase] != names[phase - 1] else 0
+    return number, kind[number], enters
 
 
 def rates_of(systems: Systems, phases: Phases) -> Bool[np.ndarray, "steps n"]:
@@ -132,8 +152,3 @@ def in_all_phases(systems: Systems, state: State, maps: tuple[Array, Array]) -> 
 def filled(x: Float[Array, "*k n"], count: int) -> Float[Array, "*k m"]:
     """An array with zeros behind along its last axis."""
     return jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, count - x.shape[-1])])
-
-
-def switched(number: Any, ways: list[Any], *given: Any) -> Any:
-    """One of the ways, by its number."""
-    return ways[0](*given) if len(ways) == 1 else jax.lax.switch(number, ways, *given)

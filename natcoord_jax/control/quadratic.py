@@ -160,7 +160,8 @@ def model(
         maps.back[1:],
     )
     scale = sizes(problem, path, unknowns)
-    each: Any = _some_together(lambda step: _stage_model(problem, scale, step), steps, problem.steps)
+    together = 1 if problem.later else TOGETHER
+    each: Any = _some_together(lambda step: _stage_model(problem, scale, step), steps, together)
     last, unflat = ravel_pytree(jax.tree.map(lambda x: x[-1], path.nodes))
     forth = maps.forth[-1]
 
@@ -184,9 +185,12 @@ def model(
     )
 
 
-def _some_together(function: Any, given: Any, steps: int) -> Any:
+def _some_together(function: Any, given: Any, most: int) -> Any:
     """Function of all steps, a few of them at a time: what is in between stays in the cache."""
-    size = max(k for k in range(1, TOGETHER + 1) if steps % k == 0)
+    if most == 1:
+        return jax.lax.map(function, given)
+    steps = given.w.shape[0]
+    size = max(k for k in range(1, most + 1) if steps % k == 0)
     pieces = jax.tree.map(lambda x: x.reshape(steps // size, size, *x.shape[1:]), given)
     found = jax.lax.map(jax.vmap(function), pieces)
     return jax.tree.map(lambda x: x.reshape(steps, *x.shape[2:]), found)

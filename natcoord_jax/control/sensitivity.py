@@ -23,6 +23,7 @@ from natcoord_jax.control.run import DEFAULT, OPTIONS, optimise_jit
 from natcoord_jax.control.transcription import (
     Unknowns,
     corrected,
+    each_step,
     entering,
     enters_in,
     slices,
@@ -81,7 +82,7 @@ def _conditions(
 
     w = entering(problem, unknowns.coefficients)
     each = (slices(problem), before, w, unknowns.y)
-    slopes = jax.vmap(partial(direct_slopes, problem))(*each, multipliers.path)
+    slopes = each_step(problem, partial(direct_slopes, problem), *each, multipliers.path)
     given = (*each, jacobians, slopes)
     worth, by_w = jax.lax.scan(body, worth, given, reverse=True)
     by_first = first_gradient(problem, unknowns, worth)

@@ -6,6 +6,7 @@ so that joints and directors hold whatever the unknowns are; the residuals of th
 constraints. Where the residuals vanish, the motion is that of `nc.simulate`.
 """
 
+from collections.abc import Callable
 from functools import partial
 from operator import itemgetter
 from typing import Any, NamedTuple
@@ -19,7 +20,16 @@ from jaxtyping import Array, Bool, Float, Int
 from natcoord_jax.control.inputs import Shaping
 from natcoord_jax.control.memory import Ending, Step
 from natcoord_jax.control.mesh import Mesh, mesh_of, spans
-from natcoord_jax.control.phases import at_hand, entered, filled, like, most_counted, switched, ways_of
+from natcoord_jax.control.phases import (
+    Systems,
+    at_hand,
+    entered,
+    filled,
+    kinds,
+    like,
+    most_counted,
+    places,
+)
 from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
@@ -107,10 +117,24 @@ class Path(eqx.Module):
         return jnp.sum(self.stages.cost, axis=-1) + self.end.cost
 
 
-class Slice(NamedTuple):
-    """What is known of one step: its number, the spline's machine, and its place in the mesh.
+class InPhase(NamedTuple):
+    """Which system a step has.
 
-    That of equal steps of one phase is not needed; nor is the way it is made where there is one only.
+    Attributes:
+        phase: number of its phase.
+        kind: number of the structure of its system.
+        enters: number of the phase that it enters by a transfer; 0 if none.
+    """
+
+    phase: Int[Array, "*k"]
+    kind: Int[Array, "*k"]
+    enters: Int[Array, "*k"]
+
+
+class Slice(NamedTuple):
+    """What is known of one step: its number, the spline's machine, its place in the mesh, and its system.
+
+    The place of equal steps of one phase is not needed, nor is what system it has where there is one only.
     """
 
     number: Int[Array, "*k"]
@@ -119,7 +143,7 @@ class Slice(NamedTuple):
     read: Float[Array, "*k d"]
     direct: Float[Array, "*k"]
     place: Mesh | None = None
-    way: Int[Array, "*k"] | None = None
+    system: InPhase | None = None
 
 
 def packed(state: State, counted: int | None = None) -> Float[Array, " x"]:
@@ -141,8 +165,17 @@ def slices(problem: OptimalControl) -> Slice:
     shaping: Shaping = problem.inputs.shaping(problem.steps)
     shift, load, read, direct = (jnp.asarray(x) for x in shaping[:4])
     place = None if problem.uniform else mesh_of(problem.phases, problem.dt)
-    way = jnp.asarray(ways_of(problem.systems, problem.phases)) if problem.later else None
-    return Slice(jnp.arange(problem.steps), shift, load, read, direct, place, way)
+    system = None
+    if problem.later:
+        system = InPhase(*(jnp.asarray(x) for x in places(problem.systems, problem.phases)))
+    return Slice(jnp.arange(problem.steps), shift, load, read, direct, place, system)
+
+
+def each_step(problem: OptimalControl, function: Callable, *given: Any) -> Any:
+    """A function of all steps: at once, but where their systems differ one after the other."""
+    if problem.later:
+        return jax.lax.map(lambda one: function(*one), given)
+    return jax.vmap(function)(*given)
 
 
 def entering(problem: OptimalControl, coefficients: Float[Array, "c m"]) -> Float[Array, "steps m"]:
@@ -229,23 +262,40 @@ def stage(
     stretch: Any = 1.0,
 ) -> Stage:
     """One step from its unknowns: explicit, and smooth in everything; `stretch` makes this step longer."""
-    ways: list = [partial(_stage, problem, 0, False)]
-    for phase in range(1, len(problem.systems)):
-        ways += [partial(_stage, problem, phase, True), partial(_stage, problem, phase, False)]
-    return switched(at.way, ways, at, node, w, y, stretch)
+    systems = problem.applied_systems(node.free)
+    if at.system is None:
+        return _stage(problem, systems, (0,), at, node, w, y, stretch)
+    ways = [lambda x: x, *(partial(_transferred, problem, systems, p) for p in range(1, len(systems)))]
+    node = eqx.tree_at(lambda n: n.x, node, jax.lax.switch(at.system.enters, ways, node.x))
+    steps = [partial(_stage, problem, systems, kind) for kind in kinds(systems)]
+    if len(steps) == 1:
+        return steps[0](at, node, w, y, stretch)
+    return jax.lax.switch(at.system.kind, steps, at, node, w, y, stretch)
+
+
+def _transferred(problem: OptimalControl, systems: Systems, phase: int, x: Float[Array, " x"]) -> Array:
+    """The state by which a phase is entered, from that at the end of the one before."""
+    state = unpacked(like(problem.systems, problem.state, phase - 1), x, problem.state.t)
+    return packed(entered(systems, phase, state)[1], most_counted(systems))
 
 
 def _stage(
-    problem: OptimalControl, phase: int, enters: bool, at: Slice, node: Node, w: Array, y: Array, stretch: Any
+    problem: OptimalControl,
+    systems: Systems,
+    kind: tuple[int, ...],
+    at: Slice,
+    node: Node,
+    w: Array,
+    y: Array,
+    stretch: Any,
 ) -> Stage:
-    """A step of a phase, or that by which it is entered."""
-    systems = problem.applied_systems(node.free)
+    """A step of a phase whose system is of one kind."""
     begin, dt, gap = times_of(problem, node.free, at)
     dt = stretch * dt
     decided = at.read @ node.register + at.direct * w
     u = problem.inputs.driven(decided, len(problem.system.structure.inputs))
-    before = unpacked(like(problem.systems, problem.state, phase - enters), node.x, begin)
-    system, before = entered(systems, phase, before) if enters else (at_hand(systems, phase, before), before)
+    before = unpacked(like(problem.systems, problem.state, kind[0]), node.x, begin)
+    system = systems[0] if at.system is None else at_hand(systems, kind, at.system.phase, before)
     own = system.structure.unknowns + system.structure.multipliers
     residual, after, _ = advance(system, before, u, dt, y[:own], gauss(1))
     # The account of work plays no part.
@@ -266,7 +316,7 @@ def end(problem: OptimalControl, node: Node) -> End:
     systems, final = problem.applied_systems(node.free), len(problem.later)
     t = problem.state.t + jnp.sum(problem.durations(node.free))
     state = unpacked(like(problem.systems, problem.state, final), node.x, t)
-    system = at_hand(systems, final, state)
+    system = at_hand(systems, (final,), final, state) if final else systems[0]
     lower, upper = problem.limits()
     values, scale = problem.values(node.free), problem.references()[1]
     below, above = np.flatnonzero(np.isfinite(lower)), np.flatnonzero(np.isfinite(upper))
