@@ -198,7 +198,7 @@ def check(
                     costs[steps] = again.cost
         order, extrapolated = _refinement(costs)
     # Of each phase by itself: an impact between them takes energy.
-    found = [balance(system, trajectory) for system, trajectory in solution.motions]
+    found = [balance(system, trajectory) for system, trajectory in solution.phases.pairs]
     errors = [_worst([x.angular_momentum for x in found]), _worst([x.energy for x in found])]
     hamiltonian = _hamiltonian(solution) if autonomous else (None, None)
     return Check(

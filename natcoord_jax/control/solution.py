@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from natcoord_jax.analysis.phases import Phases
 from natcoord_jax.control.guess import Guess, free_of_swings
 from natcoord_jax.control.iterate import Iterate
 from natcoord_jax.control.motion import motion, motions
@@ -145,21 +146,24 @@ class Solution(eqx.Module):
         if self.problem.later:
             raise ValueError(
                 f"the motion has {len(self.problem.systems)} systems, one for each phase; use "
-                "`solution.motions`, pairs of a system and its trajectory"
+                "`solution.phases`, which has them and their trajectories"
             )
         return motion(self.problem, self._scaled(), self.inputs)
 
     @property
-    def motions(self) -> list[tuple[System, Trajectory]]:
-        """The motions of all phases, simulated with the inputs found, each with its system.
+    def phases(self) -> Phases:
+        """The motion, simulated with the inputs found, in phases of one system each.
 
         A phase begins with the state that `nc.transfer` makes of the last one before it: velocities jump
         where a joint closes.
 
         Raises:
-            SimulationError: if they cannot be simulated.
+            SimulationError: if it cannot be simulated.
         """
-        return motions(self.problem, self._scaled(), self.inputs)
+        if not self.problem.later:
+            return Phases((self.system,), (self.trajectory,))
+        systems, trajectories = zip(*motions(self.problem, self._scaled(), self.inputs))
+        return Phases(systems, trajectories)
 
     @property
     def missing(self) -> dict[str, float]:

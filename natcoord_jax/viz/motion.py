@@ -40,7 +40,7 @@ def lanes_of(system: System | Phases | Solution, trajectory: Trajectory | None, 
     if isinstance(system, Phases):
         found = system
     elif isinstance(system, Solution):
-        found = Phases((system.system,), (system.trajectory,))
+        found = system.phases
     elif trajectory is None:
         raise ValueError(f"{user} needs the system and a trajectory, or nc.Phases")
     else:
