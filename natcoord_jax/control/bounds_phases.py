@@ -10,14 +10,22 @@ from natcoord_jax.control.bounds_base import BOUND, Bound
 from natcoord_jax.control.memory import Step, each_inside, only_where
 from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.effect import replace_fields
+from natcoord_jax.core.kinds import Several
 from natcoord_jax.core.numeric import Directions, Number, Whole
-from natcoord_jax.mechanics.equations_of_motion import EquationsOfMotion, loads
+from natcoord_jax.maths.rotations import angular_velocity
+from natcoord_jax.mechanics.equations_of_motion import loads
 from natcoord_jax.mechanics.momentum import body_momenta
-from natcoord_jax.mechanics.rates import tree_rates
 from natcoord_jax.system import System
 
+GRAVITY = 9.81
+"""Of the Earth [m/s^2]: a unit only."""
 SMOOTH = 1e-3
 """Part of a body's weight by which a sideways force is rounded off at zero."""
+
+
+def _pairs(steps: Any) -> tuple:
+    """Hashable."""
+    return tuple(tuple(int(x) for x in pair) for pair in steps)
 
 
 class During(Bound):
@@ -25,27 +33,28 @@ class During(Bound):
 
     Attributes:
         bound: what has to hold.
-        first: the first step, from 0.
-        last: the one after the last step.
+        steps: pairs (first, one after the last), from 0, in which it does.
 
     Raises:
-        ValueError: for no step at all.
+        ValueError: for no steps at all.
 
     Example:
         >>> import natcoord_jax as nc
-        >>> slow = nc.bounds.During(nc.bounds.Rate("hinge", -1.0, 1.0), first=10, last=20)
+        >>> slow = nc.bounds.During(nc.bounds.Rate(-1.0, 1.0, joint="hinge"), steps=[(10, 20), (30, 40)])
     """
 
     bound: Bound = eqx.field(metadata=is_a(BOUND))
-    first: int = eqx.field(default=0, kw_only=True, static=True, metadata=is_a(Whole(0)))
-    last: int = eqx.field(kw_only=True, static=True, metadata=is_a(Whole(1)))
+    steps: tuple[tuple[int, int], ...] = eqx.field(
+        kw_only=True, static=True, converter=_pairs, metadata=is_a(Several(Several(Whole(0), 2, 2), 1))
+    )
 
     def __check_init__(self):
         """Refuse no steps."""
-        if not self.first < self.last:
-            raise ValueError(
-                f"bounds.During: there are no steps from {self.first} to {self.last}; pass first < last"
-            )
+        for first, last in self.steps:
+            if not first < last:
+                raise ValueError(
+                    f"bounds.During: there are no steps from {first} to {last}; pass pairs with first < last"
+                )
 
     def inside(self) -> tuple[Bound, ...]:
         """The bound."""
@@ -53,12 +62,12 @@ class During(Bound):
 
     def furthest(self) -> int:
         """Its last step."""
-        return max(self.last, self.bound.furthest())
+        return max(self.bound.furthest(), *(last for _, last in self.steps))
 
     def of_step(self, system: System, memory: Array, step: Step) -> Float[Array, " n"]:
         """Excess where it counts."""
         ((bound, own),) = each_inside(self, system, memory)
-        here = (step.number >= self.first) & (step.number < self.last)
+        here = jnp.any(jnp.array([(step.number >= a) & (step.number < b) for a, b in self.steps]))
         bound, system, step = only_where(here, (bound, system, step))
         return jnp.where(here, bound.of_step(system, own, step), -1.0)
 
@@ -69,25 +78,25 @@ class During(Bound):
     def widened(self, factor: Any) -> Bound:
         """The same with the limits of inputs so many times as wide; itself if it has none."""
         wider = self.bound.widened(factor)
-        return self if wider is self.bound else During(wider, first=self.first, last=self.last)
+        return self if wider is self.bound else During(wider, steps=self.steps)
 
 
 class Support(Bound):
     """What the ground can give: it presses, and holds by friction only (Coulomb's cone).
 
     The force of the ground is that of all joints with it together, the mean over a step: rate of momentum
-    less loads. It is measured by the weight of all bodies, or where there is none by `unit`. For a foot that
-    is on the ground in one phase only, see `During`; an impact where a joint closes is not part of it.
+    less loads. It is measured in units of the weight of all bodies on the Earth, or of `unit`. For a foot
+    that is on the ground in one phase only, see `During`; an impact is not part of it.
 
     Attributes:
         normal: direction in which the ground presses.
         friction: coefficient; None: it holds sideways whatever it takes.
         least: what it has to press with at least [N].
-        unit: force that counts as one [N].
+        unit: force that counts as one [N]; None: that weight.
 
     Example:
         >>> import natcoord_jax as nc
-        >>> standing = nc.bounds.During(nc.bounds.Support(friction=0.6), last=20)
+        >>> standing = nc.bounds.During(nc.bounds.Support(friction=0.6), steps=[(0, 20)])
     """
 
     normal: Any = eqx.field(default=(0.0, 0.0, 1.0), metadata=is_a(Directions((3,))))
@@ -97,8 +106,8 @@ class Support(Bound):
 
     def of_step(self, system: System, memory: Array, step: Step) -> Float[Array, " n"]:
         """Excesses in units of the weight."""
-        force, weight = ground_force(system, step)
-        unit = jnp.linalg.norm(weight) if self.unit is None else jnp.asarray(self.unit, float)
+        force = ground_force(system, step)
+        unit = GRAVITY * jnp.sum(system.mass[:, 0, 0]) if self.unit is None else jnp.asarray(self.unit, float)
         normal = jnp.asarray(self.normal, float)
         normal = normal / jnp.linalg.norm(normal)
         pressing = force @ normal
@@ -115,14 +124,13 @@ class Support(Bound):
         return pressing if self.friction is None else (*pressing, "friction of the ground [weight]")
 
 
-def ground_force(system: System, step: Step) -> tuple[Float[Array, " 3"], Float[Array, " 3"]]:
-    """Mean force of joints with the ground on all bodies over a step, and that of the loads at rest [N]."""
+def ground_force(system: System, step: Step) -> Float[Array, " 3"]:
+    """Mean force of joints with the ground on all bodies over a step [N]."""
     before, after = step.before, step.after
     start, finish = (jnp.sum(body_momenta(system, state)[0], axis=0) for state in (before, after))
     names = ("q", "v", "coordinates", "t")
     state = replace_fields(before, **{x: 0.5 * (getattr(before, x) + getattr(after, x)) for x in names})
-    velocity, spin = EquationsOfMotion.at(system, state).twists(tree_rates(system, state))
-    applied = jnp.sum(loads(system, state, step.u, velocity, spin)[0], axis=0)
-    still = jnp.zeros_like(velocity)
-    weight = jnp.sum(loads(system, state, jnp.zeros_like(step.u), still, still)[0], axis=0)
-    return (finish - start) / step.dt - applied, weight
+    rows, rates = state.rows, state.row_rates
+    spin = angular_velocity(rows[:, 1:], rates[:, 1:])
+    applied = loads(system, state, step.u, rates[:, 0], spin)[0]
+    return (finish - start) / step.dt - jnp.sum(applied, axis=0)

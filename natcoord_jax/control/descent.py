@@ -94,10 +94,15 @@ def descend(
         The solution; `outcome` is MAX_ITERATIONS if goal or bounds are violated by more than `tol`.
 
     Raises:
-        ValueError: for a guess of the wrong shape.
+        ValueError: for a guess of the wrong shape, and for phases with systems of their own.
     """
     import optax
 
+    if problem.later:
+        raise ValueError(
+            f"descend goes along the motion of one system, and this problem has {len(problem.systems)}; use "
+            "nc.optimise"
+        )
     problem = numeric(problem)
     start = unknowns_of(problem, guess, False)
     variables = (start.coefficients, start.free)

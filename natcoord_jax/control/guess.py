@@ -51,7 +51,8 @@ class Guess(Part):
     or, for "shooting", zero. Time and parameters are as in the problem.
 
     The order of rates is that of `problem.rates`, their names: for every body in the order of
-    `system.structure.bodies` the rotations, then the translations that its joint leaves free.
+    `system.structure.bodies` the rotations, then the translations that its joint leaves free. Where phases
+    have systems of their own, each step has the rates of its system, and zeros for what others have more.
 
     Attributes:
         inputs: of all steps (steps, inputs) [N, N m]; None: made.

@@ -17,8 +17,16 @@ from jaxtyping import Array, Bool, Float
 from natcoord_jax.control.mesh import Phases
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
+from natcoord_jax.mechanics.admissible_velocities import tangent
 from natcoord_jax.model.rows import rows_with_ground
-from natcoord_jax.reading.transfer import common_joints, held, in_layout, rotor_names, transfer
+from natcoord_jax.reading.transfer import (
+    common_joints,
+    held,
+    in_layout,
+    new_joints,
+    rotor_names,
+    with_coordinates_of,
+)
 from natcoord_jax.system import System
 
 Systems = tuple[System, ...]
@@ -86,9 +94,17 @@ def at_hand(systems: Systems, kind: tuple[int, ...], phase: Any, state: State) -
 
 
 def entered(systems: Systems, phase: int, state: State) -> tuple[System, State]:
-    """The system of a phase and the state that it begins with, from that at the end of the phase before."""
-    found: Any = transfer(at_hand(systems, (phase - 1,), phase - 1, state), state, systems[phase])
-    return found
+    """The system of a phase and the state that it begins with, from that at the end of the phase before.
+
+    What `nc.transfer` does, without its checks: rotors of the one are those of the other.
+    """
+    before, into = systems[phase - 1], systems[phase]
+    moved, joints = in_layout(before, state, into, None), new_joints(before, into)
+    into = at_hand(systems, (phase,), phase, moved)
+    if not joints.size:
+        return into, moved
+    moved = with_coordinates_of(into, moved, joints, jnp.ones(joints.size, bool))
+    return into, tangent(into, moved)
 
 
 def like(systems: Systems, state: State, phase: int) -> State:

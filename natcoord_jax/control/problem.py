@@ -242,6 +242,8 @@ class OptimalControl(Part):
     def rates(self) -> tuple[str, ...]:
         """Names and units of the rates of the free motions, in the order of `nc.Guess(rates=...)`.
 
+        Those of the first phase, where phases have systems of their own.
+
         Axis 3 of a joint is its `axis`, axis 1 its `second`; those of a body without one are its own.
         """
         structure, names = self.system.structure, []
