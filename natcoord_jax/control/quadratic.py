@@ -161,7 +161,7 @@ def model(
         maps.back[1:],
     )
     scale = sizes(problem, path, unknowns)
-    each: Any = _some_together(lambda step: _stage_model(problem, scale, step), steps, problem.steps)
+    each: Any = some_together(lambda step: _stage_model(problem, scale, step), steps, problem.steps)
     last, unflat = ravel_pytree(jax.tree.map(lambda x: x[-1], path.nodes))
     forth = maps.forth[-1]
 
@@ -185,7 +185,7 @@ def model(
     )
 
 
-def _some_together(function: Any, given: Any, steps: int) -> Any:
+def some_together(function: Any, given: Any, steps: int) -> Any:
     """Function of all steps, a few of them at a time: what is in between stays in the cache."""
     size = max(k for k in range(1, TOGETHER + 1) if steps % k == 0)
     pieces = jax.tree.map(lambda x: x.reshape(steps // size, size, *x.shape[1:]), given)

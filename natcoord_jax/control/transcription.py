@@ -218,8 +218,19 @@ def stage(
     w: Float[Array, " m"],
     y: Float[Array, " n"],
     stretch: Any = 1.0,
+    reached: Float[Array, " x"] | None = None,
 ) -> Stage:
-    """One step from its unknowns: explicit, and smooth in everything; `stretch` makes this step longer."""
+    """One step from its unknowns: explicit, and smooth in everything.
+
+    Args:
+        problem: the problem.
+        at: the constant part of the step.
+        node: before it.
+        w: coefficients that enter.
+        y: unknowns of its equations.
+        stretch: makes this step longer.
+        reached: the state at its end that cost and bounds see, where that is an unknown of its own.
+    """
     system, _ = problem.applied(node.free)
     begin, dt, gap = times_of(problem, node.free, at)
     dt = stretch * dt
@@ -229,7 +240,8 @@ def stage(
     residual, after, _ = advance(system, before, u, dt, y, gauss(1))
     # The account of work plays no part.
     after = replace_fields(after, work=before.work)
-    cost, excess, last, memory = seen(problem, at.number, (dt, gap), (before, after), u, node)
+    ending = after if reached is None else unpacked(after, reached, after.t)
+    cost, excess, last, memory = seen(problem, at.number, (dt, gap), (before, ending), u, node)
     if not u.size:
         # What acts on nothing wants to be zero.
         cost = cost + 0.5 * dt * jnp.sum(decided**2)
