@@ -16,9 +16,6 @@ from natcoord_jax.control.nlp import NonlinearProgram
 
 EXTRA = "pip install 'natcoord-jax[ipopt]'"
 """What it needs."""
-MOST = 600
-"""Unknowns up to which it is asked without being told to: its derivatives are dense, and a Hessian that takes
-0.2 s for 240 unknowns and 0.8 s for 560 takes minutes for those of beams and shells."""
 
 
 class Answer(NamedTuple):
@@ -83,20 +80,34 @@ def _callback(ca: Any) -> Any:
 
         def eval(self, arg: list[Any]) -> list[Any]:
             found = self.function(*(np.asarray(x).reshape(-1) for x in arg))
-            return [
-                ca.project(ca.DM(np.asarray(x)), pattern) for x, pattern in zip(found, self.outputs.values())
-            ]
+            patterns = self.outputs.values()
+            return [ca.DM(pattern, np.asarray(x).ravel()) for x, pattern in zip(found, patterns)]
 
     return Function
+
+
+def _placed(ca: Any, shape: tuple[int, int], places: tuple[np.ndarray, np.ndarray]) -> tuple[Any, Any]:
+    """A pattern of CasADi, and the order of the entries in it."""
+    rows, columns = places
+    order = np.lexsort((rows, columns))
+    return ca.Sparsity.triplet(*shape, rows[order].tolist(), columns[order].tolist()), order
 
 
 def _functions(ca: Any, program: NonlinearProgram) -> dict[str, Any]:
     """The program as functions of CasADi, with their derivatives."""
     Function, n, c = _callback(ca), program.start.size, program.lower.size
-    # Dense: entries that vanish where it starts need not do so elsewhere, as those of open contacts.
-    filled, bent = ca.Sparsity.dense(c, n), ca.Sparsity.upper(n)
+    filled, by_column = _placed(ca, (c, n), program.jacobian_structure)
+    # It wants the upper triangle.
+    bent, across = _placed(ca, (n, n), program.hessian_structure[::-1])
     column, row, scalar = ca.Sparsity.dense(c, 1), ca.Sparsity.dense(n, 1), ca.Sparsity.dense(1, 1)
     at = {"x": n, "p": 0}
+
+    def slopes(x: np.ndarray, _: Any) -> tuple:
+        return program.constraints(x), np.asarray(program.jacobian(x))[by_column]
+
+    def hessian(x: np.ndarray, _: Any, weight: np.ndarray, multipliers: np.ndarray) -> tuple:
+        return (np.asarray(program.hessian(x, weight[0], multipliers))[across],)
+
     return {
         "nlp": Function(
             "nlp", lambda x, _: (program.cost(x), program.constraints(x)), at, {"f": scalar, "g": column}
@@ -107,17 +118,9 @@ def _functions(ca: Any, program: NonlinearProgram) -> dict[str, Any]:
             at,
             {"f": scalar, "grad_f_x": row},
         ),
-        "jac_g": Function(
-            "jac_g",
-            lambda x, _: (program.constraints(x), program.jacobian(x)),
-            at,
-            {"g": column, "jac_g_x": filled},
-        ),
+        "jac_g": Function("jac_g", slopes, at, {"g": column, "jac_g_x": filled}),
         "hess_lag": Function(
-            "hess_lag",
-            lambda x, _, weight, multipliers: (program.hessian(x, weight[0], multipliers),),
-            {**at, "lam_f": 1, "lam_g": c},
-            {"triu_hess_gamma_x_x": bent},
+            "hess_lag", hessian, {**at, "lam_f": 1, "lam_g": c}, {"triu_hess_gamma_x_x": bent}
         ),
     }
 
@@ -126,7 +129,7 @@ def solved(program: NonlinearProgram, max_iter: int = 500, **options: Any) -> An
     """Solve a nonlinear program.
 
     Args:
-        program: what `nc.to_nlp` returned.
+        program: what `nc.to_nlp` returned, with states.
         max_iter: limit of iterations.
         options: of IPOPT, as `max_wall_time` [s].
 

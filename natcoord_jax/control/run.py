@@ -8,7 +8,7 @@ import numpy as np
 from natcoord_jax.control import sequential
 from natcoord_jax.control.attempts import ENDED, NAMES, Search, after_restoration, best_of, over
 from natcoord_jax.control.guess import GUESS, Guess, unknowns_of
-from natcoord_jax.control.ipopt import MOST, installed
+from natcoord_jax.control.ipopt import installed
 from natcoord_jax.control.iterate import Iterate, Options
 from natcoord_jax.control.problem import PROBLEM, OptimalControl, numeric
 from natcoord_jax.control.reasons import outside_at_start
@@ -109,8 +109,7 @@ def optimise(
         other = search.run(True, unknowns_of(problem, guess, True))
         found = other if over(other) else best_of(problem, [found, other], other.outcome)
     if method == "auto" and _lost(found) and search.left > 0 and installed():
-        begin = unknowns_of(problem, guess, True)
-        other = search.by_ipopt(begin) if begin.y.size + begin.coefficients.size <= MOST else found
+        other = search.by_ipopt(unknowns_of(problem, guess, True))
         if other.ok:
             return other
         if other.outcome in ENDED:

@@ -106,6 +106,7 @@ class Simultaneous(eqx.Module):
         pieces: cost and constraints, as a sum.
         weights: of the constraints.
         motion: places of the steps' own equations among the constraints (steps, n).
+        continuity: of the conditions that each step leads to the next (steps, carried).
         path: of the bounds (steps, h).
         goal: of the goal.
         last: of the bounds at the end.
@@ -118,6 +119,7 @@ class Simultaneous(eqx.Module):
     pieces: Sum
     weights: Float[Array, " c"]
     motion: np.ndarray
+    continuity: np.ndarray
     path: np.ndarray
     goal: np.ndarray
     last: np.ndarray
@@ -156,20 +158,30 @@ class Simultaneous(eqx.Module):
         found = np.full(self.weights.size, "", object)
         for step, at in enumerate(self.motion):
             found[at] = [f"equation {k} of step {step}" for k in range(len(at))]
-        for node, at in enumerate(self._defects):
-            found[at] = [f"number {k} at the end of step {node - 1}" for k in range(len(at))]
-        found[self._defects[0]] = [f"number {k} at the start" for k in range(self._defects.shape[1])]
+        carried = _labels(problem)
+        for step, at in enumerate(self.continuity):
+            found[at] = [f"continuity of {name}, step {step}" for name in carried]
+        found[: len(carried)] = [f"initial {name}" for name in carried]
         for step, at in enumerate(self.path):
             found[at] = [f"{name}, step {step}" for name in problem.path_labels]
         found[self.goal], found[self.last] = problem.goal.labels(problem.system), problem.end_labels
         return tuple(found)
 
-    @property
-    def _defects(self) -> np.ndarray:
-        """Places of the conditions that lead from node to node, that of the first node among them."""
-        n = self.nodes.shape[1]
-        first = self.motion[:, -1:] + 1 if self.motion.shape[1] else self.path[:, :1] - n
-        return np.concatenate([np.arange(n)[None], first + np.arange(n)])
+
+def _labels(problem: OptimalControl) -> list[str]:
+    """Names of what nodes hold."""
+    n, state, back = sizes_of(problem), problem.state, problem.looked_back
+    kept = sum(problem.memory_sizes)
+    counts = {
+        "position": state.q.size,
+        "velocity": state.v.size,
+        "joint coordinate": state.coordinates.size,
+        "rotor rate": state.rates.size,
+        "input before": back,
+        "memory": kept,
+        "register of inputs": n.carried - n.state - back - kept,
+    }
+    return [f"{name} {k}" for name, count in counts.items() for k in range(count)]
 
 
 def simultaneous(problem: OptimalControl, unknowns: Unknowns, path: Path) -> Simultaneous:
@@ -211,6 +223,7 @@ def simultaneous(problem: OptimalControl, unknowns: Unknowns, path: Path) -> Sim
         sum_of((_first, _step, _end), places, size, problem),
         weights,
         rows[:, : n.y],
+        rows[:, n.y : count - h],
         rows[:, count - h :],
         final[:c],
         final[c:],
