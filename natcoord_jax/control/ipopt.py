@@ -16,6 +16,8 @@ from natcoord_jax.control.nlp import NonlinearProgram
 
 EXTRA = "pip install 'natcoord-jax[ipopt]'"
 """What it needs."""
+METIS = 5
+"""Order of elimination by nested dissection: for seven axes it takes half the time of the default one."""
 
 
 class Answer(NamedTuple):
@@ -142,7 +144,8 @@ def solved(program: NonlinearProgram, max_iter: int = 500, **options: Any) -> An
 
     # Compilation is not counted.
     functions = _functions(ca, program)
-    ipopt = {"print_level": 0, "sb": "yes", "max_iter": max_iter, "tol": 1e-8, **options}
+    ipopt = {"print_level": 0, "sb": "yes", "max_iter": max_iter, "tol": 1e-8, "mumps_pivot_order": METIS}
+    ipopt |= options
     settings = {"ipopt": ipopt, "print_time": False, "no_nlp_grad": True}
     settings |= {name: function for name, function in functions.items() if name != "nlp"}
     solver = ca.nlpsol("solver", "ipopt", functions["nlp"], settings)
