@@ -32,7 +32,9 @@ def many_things():
     """Phases of free length, what is carried along, free numbers, limits at the end."""
     energy = nc.goal.Integral(lambda state, u, t: u[0] ** 2, name="square of the torque")
     goal = nc.goal.At(COORDINATE("hinge", 0.5), step=3) & nc.goal.Within(energy, upper=40.0)
-    goal = goal & nc.goal.Linked(lambda first, last: last.coordinates - first.coordinates - 1.1, "way") & REST()
+    goal = (
+        goal & nc.goal.Linked(lambda first, last: last.coordinates - first.coordinates - 1.1, "way") & REST()
+    )
     cost = nc.cost.Duration(10.0) + nc.cost.InputRate(1e-3, before=0.0)
     return nc.OptimalControl(
         *disc(),
@@ -112,7 +114,9 @@ def places(program):
 
 def close(found, wanted, tolerance=1e-6):
     found, wanted = np.asarray(found), np.asarray(wanted)
-    assert np.max(np.abs(found - wanted), initial=0.0) <= tolerance * max(1.0, np.max(np.abs(wanted), initial=0.0))
+    assert np.max(np.abs(found - wanted), initial=0.0) <= tolerance * max(
+        1.0, np.max(np.abs(wanted), initial=0.0)
+    )
 
 
 def test_derivatives_are_those_of_the_values(programs):
@@ -218,7 +222,9 @@ def test_our_solution_is_stationary_with_our_multipliers():
     rest = [k for k in range(len(names)) if names[k].startswith(("continuity", "initial", "equation"))]
     known = []
     for name, value in found.multipliers.items():
-        every = {name: value} if np.ndim(value) == 0 else {f"{name}, step {k}": x for k, x in enumerate(value)}
+        every = (
+            {name: value} if np.ndim(value) == 0 else {f"{name}, step {k}": x for k, x in enumerate(value)}
+        )
         for name, number in every.items():
             known.append(names.index(name))
             multipliers[known[-1]] = number

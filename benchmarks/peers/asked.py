@@ -8,7 +8,9 @@ from typing import Any
 
 
 def serve(solve: Callable[[], dict[str, Any]], about: dict[str, Any]) -> None:
-    """Print what it is; then, for each line of standard input, solve and print the result with its time.
+    """Print what it is; then, for each line of standard input, solve and print the result with its times.
+
+    `seconds` are those of the clock, `processor_s` those of the processor, which other jobs do not change.
 
     Args:
         solve: one solution; it returns cost, iterations and outcome.
@@ -16,6 +18,7 @@ def serve(solve: Callable[[], dict[str, Any]], about: dict[str, Any]) -> None:
     """
     print(json.dumps(about), flush=True)
     for _ in sys.stdin:
-        start = time.perf_counter()
+        start, busy = time.perf_counter(), time.process_time()
         found = solve()
-        print(json.dumps({"seconds": time.perf_counter() - start} | found), flush=True)
+        times = {"seconds": time.perf_counter() - start, "processor_s": time.process_time() - busy}
+        print(json.dumps(times | found), flush=True)

@@ -1,7 +1,7 @@
 """Cart-pole and an arm with seven axes by CasADi and IPOPT: joint coordinates, the implicit midpoint rule.
 
-As a command, `python -m benchmarks.peers.casadi_arms panda 40` waits for lines, see `asked`. States and inputs
-of all steps are unknowns; the start is a straight line between the postures, at rest, without torques.
+As a command, `python -m benchmarks.peers.casadi_arms panda 40` waits for lines, see `asked`. States and
+inputs of all steps are unknowns; the start is a straight line between the postures, at rest, without torques.
 """
 
 import math

@@ -1,11 +1,12 @@
-"""Cart-pole, an arm with seven axes and a spacecraft by Crocoddyl: differential dynamic programming within limits.
+"""Cart-pole, an arm with seven axes and a spacecraft by Crocoddyl: dynamic programming within limits.
 
 As a command, `python -m benchmarks.peers.crocoddyl_control panda 40` waits for lines, see `asked`. It needs
 `crocoddyl` and `pin`, in an environment of their own.
 
 Its solvers with limits of the inputs (`SolverBoxFDDP`) know no conditions at the end: the goal is a penalty,
 a square with a large weight, so that it is missed by a little, which is said. Steps are its own, symplectic
-Euler with inputs held. The start is its usual one: at rest where the motion begins, with torques that hold it.
+Euler with inputs held. The start is its usual one: at rest where the motion begins, with torques that hold
+it.
 """
 
 import math
@@ -58,7 +59,7 @@ def cart_pole() -> pinocchio.Model:
 def craft() -> pinocchio.Model:
     """The spacecraft of the paper: a base that floats, and three wheels."""
     model, still = pinocchio.Model(), pinocchio.SE3.Identity()
-    base = model.addJoint(0, pinocchio.JointModelFreeFlyer(), still, "base")
+    base = model.addJoint(0, pinocchio.JointModelFreeFlyer(), still, "root_joint")
     for k, body in enumerate(spacecraft.BODIES):
         joint, own = base, pinocchio.Inertia(body["mass"], np.zeros(3), np.diag(body["inertia"]))
         if k:
@@ -81,8 +82,16 @@ def _craft_problem() -> "Problem":
 
 
 class Problem:
-    """A motion from rest to rest by least effort: model, postures, limits of as many inputs, duration [s], weight of rates, and
-    what is asked for at the end.
+    """A motion from rest to rest by least effort.
+
+    Attributes:
+        model: of Pinocchio.
+        start: posture.
+        end: posture.
+        limits: of the inputs, which may be fewer than the coordinates.
+        t_end: [s].
+        rates: weight of their squares.
+        asked: what of the state is asked for at the end, 1 or 0.
     """
 
     def __init__(
@@ -149,7 +158,7 @@ def solver_of(problem: Problem, steps: int) -> tuple[Any, list[np.ndarray], list
         for name, cost, weight in [("goal", reach, WEIGHT)] if last else running_costs:
             costs.addCost(name, cost, weight)
         free = crocoddyl.DifferentialActionModelFreeFwdDynamics(state, actuation, costs)
-        # With Pinocchio 4.1, derivatives of Crocoddyl 3.2.1 lack gravity unless there is armature, if of zero.
+        # With Pinocchio 4.1, derivatives of Crocoddyl 3.2.1 lack gravity without armature, which may be zero.
         free.armature = np.zeros(n)
         found = crocoddyl.IntegratedActionModelEuler(free, dt)
         found.u_lb, found.u_ub = -problem.limits, problem.limits

@@ -29,7 +29,7 @@ END = (1.2, 0.3, -0.5, -1.4, 0.4, 2.2, 0.2)
 LIMITS = (87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0)
 """Of the torques [N m]."""
 RATES = 100.0
-"""Weight of the squares of the rates beside those of the torques [N^2 m^2 s^2]: without it the least effort is
-that of an arm that whips at 50 rad/s and more, of which there are many ways."""
+"""Weight of the squares of the rates beside those of the torques [N^2 m^2 s^2]: without it the least effort
+is that of an arm that whips at 50 rad/s and more, of which there are many ways."""
 T_END = 1.5  # [s]
 GRAVITY = 9.81  # [m/s2]

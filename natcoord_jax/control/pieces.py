@@ -101,10 +101,12 @@ def sum_of(functions: tuple[Function, ...], places: tuple[Places, ...], size: in
         z, multipliers = jnp.zeros(at.reads.shape[1]), jnp.zeros(at.writes.shape[1])
 
         def constraints(others: Any, z: Array, function: Function = function) -> Array:
-            return function(*others, z)[1]
+            shared, given = others
+            return function(shared, given, z)[1]
 
         def slope(others: Any, z: Array, function: Function = function) -> Array:
-            return _slope(function, *others, z)
+            shared, given, weight, multipliers = others
+            return _slope(function, shared, given, weight, multipliers, z)
 
         first.append(_jacobian_of(derivative_pattern(constraints, (shared, example), z), at, size))
         others = (shared, example, jnp.ones(()), multipliers)
@@ -191,7 +193,9 @@ def _each(function: Callable, at: Places, x: Array, *others: Array) -> Any:
 
 
 @compiled
-def values(whole: Sum, shared: Any, x: Float[Array, " n"], weights: Float[Array, " c"]) -> tuple[Array, Array]:
+def values(
+    whole: Sum, shared: Any, x: Float[Array, " n"], weights: Float[Array, " c"]
+) -> tuple[Array, Array]:
     """Cost and constraints, these times their weights."""
     cost, constraints = jnp.zeros(()), jnp.zeros_like(weights)
     for function, at in zip(whole.functions, whole.places):

@@ -52,6 +52,11 @@ class Sizes(NamedTuple):
     w: int
     y: int
 
+    @property
+    def seen(self) -> int:
+        """How many numbers one step sees."""
+        return self.free + 2 * self.carried + self.w + self.y
+
 
 def sizes_of(problem: OptimalControl) -> Sizes:
     """The numbers of a problem."""
@@ -99,8 +104,12 @@ def _end(problem: OptimalControl, given: None, z: Array) -> tuple[Array, Array]:
 
 
 class Simultaneous(eqx.Module):
-    """The program: unknowns x are what is free, leading coefficients, the first node, and then for each step
-    what enters in it, the unknowns of its equations and the node after it; constraints follow in this order.
+    """The program, and where everything is.
+
+    Unknowns x are what is free, leading coefficients, the first node, and then for each step what enters in
+    it, the unknowns of its equations and the node after it. Constraints are those of the first node, then
+    for each step its equations, those of the node after it and the bounds, then the goal and the bounds at
+    the end.
 
     Attributes:
         pieces: cost and constraints, as a sum.
@@ -239,7 +248,9 @@ def _typical(problem: OptimalControl, path: Path) -> Float[Array, " carried"]:
     state, time = problem.state, jnp.sum(problem.lengths(jnp.zeros(len(problem.free))))
     nodes = jax.tree.map(itemgetter(slice(None)), path.nodes)
     ones = jnp.ones(state.q.size)
-    x = jnp.concatenate([ones, ones / time, jnp.ones(state.coordinates.size), jnp.ones(state.rates.size) / time])
+    x = jnp.concatenate(
+        [ones, ones / time, jnp.ones(state.coordinates.size), jnp.ones(state.rates.size) / time]
+    )
     others = [jnp.max(jnp.abs(part), axis=0, initial=0.0) for part in (nodes.last, nodes.memory)]
     register = jnp.broadcast_to(jnp.max(jnp.abs(nodes.register), initial=0.0), nodes.register.shape[1:])
     sizes = jnp.concatenate([x, *others, register.ravel()])

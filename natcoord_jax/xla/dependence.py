@@ -150,7 +150,11 @@ def _scanned(equation: Any, operands: list[Known]) -> list[Known]:
         if "ft_in" in given
         else (given["num_consts"], given["num_carry"])
     )
-    constants, state, listed = operands[:fixed], operands[fixed : fixed + carried], operands[fixed + carried :]
+    constants, state, listed = (
+        operands[:fixed],
+        operands[fixed : fixed + carried],
+        operands[fixed + carried :],
+    )
     order, made = range(given["length"]), []
     for k in reversed(order) if given["reverse"] else order:
         results = _walked(given["jaxpr"], [*constants, *state, *(_row(x, k) for x in listed)])
@@ -284,7 +288,11 @@ def _arranged(x: Known, batch: Sequence[int], over: Sequence[int]) -> Known:
     sizes = [int(np.prod([x.shape[k] for k in axes])) for axes in (batch, free, over)]
     order = (*batch, *free, *over)
     value = None if x.value is None else np.transpose(x.value, order).reshape(sizes)
-    sets = None if x.sets is None else np.transpose(x.sets, (*order, len(order))).reshape(*sizes, x.sets.shape[-1])
+    sets = (
+        None
+        if x.sets is None
+        else np.transpose(x.sets, (*order, len(order))).reshape(*sizes, x.sets.shape[-1])
+    )
     return Known(tuple(sizes), value, sets)
 
 
@@ -295,9 +303,9 @@ MOVES = (
 INDICES = {"dynamic_slice": 1, "dynamic_update_slice": 2, "gather": 1}
 """Operands from which on they are indices."""
 ONE_BY_ONE = (
-    "abs acos acosh add add_any asin asinh atan atan2 atanh cbrt ceil clamp convert_element_type copy copy_p cos "
-    "cosh div erf erf_inv erfc exp exp2 expm1 floor imag integer_pow lgamma log log1p logistic max min neg "
-    "nextafter pow real rem round rsqrt sign sin sinh sqrt square stop_gradient sub tan tanh"
+    "abs acos acosh add add_any asin asinh atan atan2 atanh cbrt ceil clamp convert_element_type copy copy_p "
+    "cos cosh div erf erf_inv erfc exp exp2 expm1 floor imag integer_pow lgamma log log1p logistic max min "
+    "neg nextafter pow real rem round rsqrt sign sin sinh sqrt square stop_gradient sub tan tanh"
 ).split()
 RULES: dict[str, Callable[[Any, list[Known]], list[Sets] | None]] = {
     **dict.fromkeys(ONE_BY_ONE, _together),

@@ -66,6 +66,7 @@ def _last_uses(jaxpr: Jaxpr) -> list[list[Any]]:
 
 
 def apply(equation: Any, operands: list[np.ndarray]) -> Sequence[Any]:
+    """What one operation of a program gives."""
     name, given = equation.primitive.name, equation.params
     inner = next((given[key] for key in INNER if isinstance(given.get(key), ClosedJaxpr)), None)
     if name in CALLS and inner is not None:
