@@ -8,28 +8,7 @@ import numpy as np
 from jaxtyping import Array
 
 import natcoord_jax as nc
-
-PANDA = (
-    (4.97, (0.0039, 0.0021, -0.0476), (0.7034, 0.7066, 0.0091)),
-    (0.647, (-0.0031, -0.0287, 0.0035), (0.0080, 0.0281, 0.0260)),
-    (3.229, (0.0275, 0.0392, -0.0665), (0.0372, 0.0362, 0.0108)),
-    (3.588, (-0.0532, 0.1044, 0.0275), (0.0259, 0.0196, 0.0283)),
-    (1.226, (-0.0120, 0.0411, -0.0384), (0.0355, 0.0295, 0.0086)),
-    (1.667, (0.0601, -0.0141, -0.0105), (0.0020, 0.0044, 0.0054)),
-    (0.735, (0.0105, -0.0043, 0.0616), (0.0125, 0.0100, 0.0048)),
-)
-"""Mass [kg], centre of mass [m] and principal inertia [kg m^2] of the links: C. Gaz et al., IEEE Robotics and
-Automation Letters 4 (2019), rounded, products of inertia left out."""
-FRAMES = (
-    (0.0, 0.333, 0.0),
-    (0.0, 0.0, -math.pi / 2),
-    (0.0, 0.316, math.pi / 2),
-    (0.0825, 0.0, math.pi / 2),
-    (-0.0825, 0.384, -math.pi / 2),
-    (0.0, 0.0, math.pi / 2),
-    (0.088, 0.0, math.pi / 2),
-)
-"""Modified Denavit-Hartenberg parameters of its joints: length, offset [m], twist [rad]."""
+from benchmarks.peers.panda import END, FRAMES, LIMITS, LINKS, RATES, START
 
 
 def _turn(axis: str, angle: float) -> np.ndarray:
@@ -37,17 +16,30 @@ def _turn(axis: str, angle: float) -> np.ndarray:
     return np.array([[1, 0, 0], [0, c, -s], [0, s, c]] if axis == "x" else [[c, -s, 0], [s, c, 0], [0, 0, 1]])
 
 
-def panda(steps: int = 40, t_end: float = 1.5) -> nc.OptimalControl:
-    """Seven axes, gravity and limits of the torques, from one posture at rest to another by least effort."""
-    start = (0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785)
-    end = (1.2, 0.3, -0.5, -1.4, 0.4, 2.2, 0.2)
+class Rates(nc.cost.Cost):
+    """Integral of the squares of the rates of all joints, with the weight of `panda.RATES`."""
+
+    def running(self, system: nc.System, state: nc.State, u: Array, t: Array) -> Array:
+        """Their sum."""
+        rates = jnp.stack([system.rate(state, f"joint {k + 1}") for k in range(len(LINKS))])
+        return RATES * jnp.sum(rates**2)
+
+
+def panda(steps: int = 40, t_end: float = 1.5, *, slow: bool = False) -> nc.OptimalControl:
+    """Seven axes, gravity and limits of the torques, from one posture at rest to another by least effort.
+
+    Args:
+        steps: number of steps.
+        t_end: [s].
+        slow: whether the rates of the joints cost, too.
+    """
     scene, goal = nc.Scene(), nc.goal.Rest()
     scene.add(nc.Gravity())
     place, turned, before = np.zeros(3), np.eye(3), nc.ground
-    for k, ((mass, com, inertia), (length, offset, twist)) in enumerate(zip(PANDA, FRAMES)):
+    for k, ((mass, com, inertia), (length, offset, twist)) in enumerate(zip(LINKS, FRAMES)):
         place = place + turned @ (length, -math.sin(twist) * offset, math.cos(twist) * offset)
         turned = turned @ _turn("x", twist)
-        axis, turned = turned[:, 2], turned @ _turn("z", start[k])
+        axis, turned = turned[:, 2], turned @ _turn("z", START[k])
         link = scene.add(
             nc.RigidBody(
                 mass=mass, inertia=inertia, com=com, position=place, orientation=turned, name=f"link {k + 1}"
@@ -55,15 +47,14 @@ def panda(steps: int = 40, t_end: float = 1.5) -> nc.OptimalControl:
         )
         joint = scene.add(nc.Revolute(before, link, point=place, axis=axis, name=f"joint {k + 1}"))
         scene.add(nc.JointTorque(joint, name=f"motor {k + 1}"))
-        goal, before = goal & nc.goal.Coordinate(joint, end[k] - start[k]), link
-    limits = np.array([87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0])
+        goal, before = goal & nc.goal.Coordinate(joint, END[k] - START[k]), link
     return nc.OptimalControl(
         *scene.compile(),
         dt=t_end / steps,
         steps=steps,
-        cost=nc.cost.Effort(),
+        cost=nc.cost.Effort() + Rates() if slow else nc.cost.Effort(),
         goal=goal,
-        bounds=nc.bounds.Input(-limits, limits),
+        bounds=nc.bounds.Input(-np.array(LIMITS), LIMITS),
     )
 
 

@@ -4,10 +4,10 @@ usage: python -m benchmarks.control_starts [--starts N] [--problems NAME ...] [-
        [--patience SECONDS] [--no-peers] [--json FILE]
 
 Every problem is solved from the default start and from random ones: smooth random inputs and rates about it,
-see `natcoord_jax.control.guess.scattered`. IPOPT gets the functions of `nc.to_nlp` at the same unknowns, so
-that equations, bounds and exact derivatives are the same and only the solver differs; its matrices are dense,
-and its times are listed for orders of magnitude only. Times of both are without compilation, ours those of
-programs with full effort. A file that exists keeps what it has of other problems.
+see `natcoord_jax.control.guess.scattered`. IPOPT gets the functions of `nc.to_nlp` at the same unknowns and
+the states that follow from them, so that equations, bounds and exact derivatives are the same and only the
+solver differs; its matrices are sparse. Times of both are without compilation, ours those of programs with
+full effort. A file that exists keeps what it has of other problems.
 """
 
 import argparse
@@ -250,7 +250,7 @@ def solved_by_ipopt(problem: nc.OptimalControl, guess: nc.Guess, patience: float
     """One solution by the peer, or what it has after so many seconds."""
     from natcoord_jax.control import ipopt
 
-    answer = ipopt.solved(nc.to_nlp(problem, guess), max_wall_time=patience)
+    answer = ipopt.solved(nc.to_nlp(problem, guess, states=True), max_wall_time=patience)
     return {
         "ok": answer.ok,
         "outcome": answer.status,

@@ -27,6 +27,7 @@ import casadi as ca
 import numpy as np
 
 from benchmarks.peers import spacecraft
+from benchmarks.peers.asked import serve
 
 # Masses [kg], diagonals of E [kg m2], places [m]: table 1 of the paper.
 EULER = [0.5 * sum(b["inertia"]) - np.array(b["inertia"]) for b in spacecraft.BODIES]
@@ -125,18 +126,17 @@ def _options(jit: bool) -> dict[str, Any]:
     return found
 
 
-def reorientation(
+def turning(
     steps: int,
     model: str = "minimal",
     transcription: str = "map",
     jit: bool = False,
     scaled: bool = True,
-    repeats: int = 7,
     limit: float = 200.0,
     t_end: float = 60.0,
     settings: dict[str, Any] | None = None,
-) -> dict[str, Any]:
-    """Solve the spacecraft's turn by 90 degrees about (1, 2, -1).
+) -> tuple[Any, dict[str, Any], dict[str, Any]]:
+    """A solver for the spacecraft's turn by 90 degrees about (1, 2, -1) from inputs zero and rest.
 
     Args:
         steps: number of steps.
@@ -144,10 +144,12 @@ def reorientation(
         transcription: "map" (one function of a step, mapped) or "unrolled" (one expression graph).
         jit: compile the functions with the C compiler.
         scaled: unknowns and equations in units of their typical sizes.
-        repeats: timed solves, each from inputs zero and rest.
         limit: of the inputs [N m].
         t_end: [s].
         settings: more settings of IPOPT.
+
+    Returns:
+        The solver, what it is called with, and the seconds of its setup and number of unknowns.
     """
     begun = time.perf_counter()
     h = t_end / steps
@@ -204,7 +206,14 @@ def reorientation(
     first[3 + unknowns :] = (start / state_scale)[:, None]
     wide = bound.ravel("F")
     given = {"x0": first.ravel("F"), "lbx": -wide, "ubx": wide, "lbg": 0, "ubg": 0}
-    setup = time.perf_counter() - begun
+    return solver, given, {"setup_s": time.perf_counter() - begun, "variables": int(flat.numel())}
+
+
+def reorientation(
+    steps: int, *, repeats: int = 7, settings: dict[str, Any] | None = None, **chosen: Any
+) -> dict[str, Any]:
+    """Solve it so many times; arguments as of `turning`."""
+    solver, given, about = turning(steps, settings=settings, **chosen)
     found = solver(**given)
     times = []
     for _ in range(repeats):
@@ -220,11 +229,10 @@ def reorientation(
         "solve_s": statistics.median(times),
         "solve_s_range": [min(times), max(times)],
         "repeats": repeats,
-        "setup_s": setup,
-        "variables": int(flat.numel()),
-        "settings": {"model": model, "transcription": transcription, "jit": jit, "scaled": scaled}
+        "settings": {"model": "minimal", "transcription": "map", "jit": False, "scaled": True}
+        | chosen
         | (settings or {}),
-    }
+    } | about
 
 
 def cart_pole(
@@ -293,8 +301,24 @@ def cart_pole(
     }
 
 
+def wait(steps: int, **chosen: Any) -> None:
+    """Solve the spacecraft's turn whenever a line is read."""
+    solver, given, about = turning(steps, **chosen)
+
+    def solve() -> dict[str, Any]:
+        found, stats = solver(**given), solver.stats()
+        return {
+            "cost": float(found["f"]),
+            "iterations": int(stats["iter_count"]),
+            "outcome": stats["return_status"],
+            "violation": float(ca.norm_inf(found["g"])),
+        }
+
+    serve(solve, {"peer": "CasADi", "version": ca.__version__} | about)
+
+
 def main() -> None:
-    """Print one JSON line."""
+    """Print one JSON line, or one for each that is read."""
     problem, steps, *words = sys.argv[1:]
     settings = {}
     for word in words:
@@ -303,6 +327,9 @@ def main() -> None:
             settings[key] = json.loads(value)
         except json.JSONDecodeError:
             settings[key] = value
+    if problem == "waiting":
+        wait(int(steps), **settings)
+        return
     run = {"reorientation": reorientation, "cart_pole": cart_pole}[problem]
     found = {"peer": "casadi", "version": ca.__version__, "problem": problem, "steps": int(steps)}
     print(json.dumps(found | run(int(steps), **settings)))

@@ -10,13 +10,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 
 from natcoord_jax.control import ipopt, sequential
 from natcoord_jax.control.costates import Multipliers
 from natcoord_jax.control.guess import Guess, goal_scale, input_ranges, scattered, stretched, unknowns_of
 from natcoord_jax.control.iterate import Iterate, Options
-from natcoord_jax.control.nlp import program_of
+from natcoord_jax.control.nlp import program_with_states
 from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.control.reach import unreached
 from natcoord_jax.control.reasons import nearest, worst_condition
@@ -160,7 +159,7 @@ class Search:
             unknowns: where it starts.
         """
         problem, begun, before = self.problem, time.perf_counter(), len(self.history)
-        program = program_of(problem, unknowns)
+        program = program_with_states(problem, unknowns)
         left = max(0.0, self.time_limit - self.watch.seconds)
         try:
             answer = ipopt.solved(program, self.left, max_wall_time=max(left, 1e-3))
@@ -173,7 +172,7 @@ class Search:
             self.history.append(row)
             if self.progress:
                 print(printed(row), file=sys.stderr, flush=True)
-        found = ravel_pytree(unknowns)[1](jnp.asarray(answer.x))
+        found = program.unknowns(answer.x)
         outcome = Outcome.OPTIMAL if answer.ok else IPOPT_ENDS.get(answer.status, Outcome.STALLED)
         count, seconds = len(self.history), time.perf_counter() - begun
         reason = "" if answer.ok else answer.status

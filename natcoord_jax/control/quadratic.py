@@ -161,7 +161,7 @@ def model(
     )
     scale = sizes(problem, path, unknowns)
     together = 1 if problem.later else TOGETHER
-    each: Any = _some_together(lambda step: _stage_model(problem, scale, step), steps, together)
+    each: Any = some_together(lambda step: _stage_model(problem, scale, step), steps, problem.steps, together)
     last, unflat = ravel_pytree(jax.tree.map(lambda x: x[-1], path.nodes))
     forth = maps.forth[-1]
 
@@ -185,11 +185,10 @@ def model(
     )
 
 
-def _some_together(function: Any, given: Any, most: int) -> Any:
+def some_together(function: Any, given: Any, steps: int, most: int = TOGETHER) -> Any:
     """Function of all steps, a few of them at a time: what is in between stays in the cache."""
     if most == 1:
         return jax.lax.map(function, given)
-    steps = given.w.shape[0]
     size = max(k for k in range(1, most + 1) if steps % k == 0)
     pieces = jax.tree.map(lambda x: x.reshape(steps // size, size, *x.shape[1:]), given)
     found = jax.lax.map(jax.vmap(function), pieces)

@@ -13,6 +13,7 @@ from natcoord_jax.control.iterate import Iterate, Options
 from natcoord_jax.control.problem import PROBLEM, OptimalControl, numeric
 from natcoord_jax.control.reasons import outside_at_start
 from natcoord_jax.control.results import Outcome
+from natcoord_jax.control.simultaneous import sizes_of
 from natcoord_jax.control.solution import Solution
 from natcoord_jax.control.transcription import Unknowns, held_inputs
 from natcoord_jax.core.arguments import checked
@@ -66,11 +67,11 @@ def optimise(
             parameters are free or more than inputs is bounded; with free time always lifted. Where "shooting"
             gets lost, "auto" goes on lifted; where that does, it asks IPOPT if it is installed
             (`pip install 'natcoord-jax[ipopt]'`); then "auto" and "lifted" look for a motion that comes near
-            to the goal, by simulations that may miss it at a cost
-            (feasibility restoration), and go on from there; then from random inputs. "ipopt": by IPOPT
-            alone, on `nc.to_nlp`. What is returned is the best of all attempts, and what they saw is in
-            `explain()`. That a goal is out of reach is said only where two methods agree, or four starts,
-            and to first order no inputs within their limits lead there.
+            to the goal, by simulations that may miss it at a cost (feasibility restoration), and go on from
+            there; then from random inputs. "ipopt": by IPOPT alone, on `nc.to_nlp` with states. What is
+            returned is the best of all attempts, and what they saw is in `explain()`. That a goal is out of
+            reach is said only where two methods agree, or four starts, and to first order no inputs within
+            their limits lead there.
         progress: print a line for each iteration to stderr.
         max_iterations: limit of iterations, of all attempts together.
         tol: largest gradient of the Lagrangian and complementarity, relative.
@@ -108,9 +109,9 @@ def optimise(
     if method == "auto" and not lifted and _lost(found) and search.left > 0:
         other = search.run(True, unknowns_of(problem, guess, True))
         found = other if over(other) else best_of(problem, [found, other], other.outcome)
-    if method == "auto" and _lost(found) and search.left > 0 and installed():
-        begin = unknowns_of(problem, guess, True)
-        other = search.by_ipopt(begin) if begin.y.size + begin.coefficients.size <= MOST else found
+    asked = installed() and sizes_of(problem).seen <= MOST
+    if method == "auto" and _lost(found) and search.left > 0 and asked:
+        other = search.by_ipopt(unknowns_of(problem, guess, True))
         if other.ok:
             return other
         if other.outcome in ENDED:

@@ -260,17 +260,28 @@ def stage(
     w: Float[Array, " m"],
     y: Float[Array, " n"],
     stretch: Any = 1.0,
+    reached: Float[Array, " x"] | None = None,
 ) -> Stage:
-    """One step from its unknowns: explicit, and smooth in everything; `stretch` makes this step longer."""
+    """One step from its unknowns: explicit, and smooth in everything.
+
+    Args:
+        problem: the problem.
+        at: the constant part of the step.
+        node: before it.
+        w: coefficients that enter.
+        y: unknowns of its equations.
+        stretch: makes this step longer.
+        reached: the state at its end that cost and bounds see, where that is an unknown of its own.
+    """
     systems = problem.applied_systems(node.free)
     if at.system is None:
-        return _stage(problem, systems, (0,), at, node, w, y, stretch)
+        return _stage(problem, systems, (0,), at, node, w, y, stretch, reached)
     ways = [lambda x: x, *(partial(_transferred, problem, systems, p) for p in range(1, len(systems)))]
     node = eqx.tree_at(lambda n: n.x, node, jax.lax.switch(at.system.enters, ways, node.x))
     steps = [partial(_stage, problem, systems, kind) for kind in kinds(systems)]
     if len(steps) == 1:
-        return steps[0](at, node, w, y, stretch)
-    return jax.lax.switch(at.system.kind, steps, at, node, w, y, stretch)
+        return steps[0](at, node, w, y, stretch, reached)
+    return jax.lax.switch(at.system.kind, steps, at, node, w, y, stretch, reached)
 
 
 def _transferred(problem: OptimalControl, systems: Systems, phase: int, x: Float[Array, " x"]) -> Array:
@@ -288,6 +299,7 @@ def _stage(
     w: Array,
     y: Array,
     stretch: Any,
+    reached: Array | None,
 ) -> Stage:
     """A step of a phase whose system is of one kind."""
     begin, dt, gap = times_of(problem, node.free, at)
@@ -300,7 +312,8 @@ def _stage(
     residual, after, _ = advance(system, before, u, dt, y[:own], gauss(1))
     # The account of work plays no part.
     after = replace_fields(after, work=before.work)
-    cost, excess, last, memory = seen(problem, system, at.number, (dt, gap), (before, after), u, node)
+    ending = after if reached is None else unpacked(after, reached, after.t)
+    cost, excess, last, memory = seen(problem, system, at.number, (dt, gap), (before, ending), u, node)
     if not u.size:
         # What acts on nothing wants to be zero.
         cost = cost + 0.5 * dt * jnp.sum(decided**2)

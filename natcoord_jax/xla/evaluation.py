@@ -33,7 +33,7 @@ def _run(jaxpr: Jaxpr, constants: Sequence[Any], arguments: Sequence[Any]) -> li
 
     know([*jaxpr.constvars, *jaxpr.invars], [*constants, *arguments])
     for equation, done in zip(jaxpr.eqns, _last_uses(jaxpr)):
-        know(equation.outvars, _apply(equation, [value_of(atom) for atom in equation.invars]))
+        know(equation.outvars, apply(equation, [value_of(atom) for atom in equation.invars]))
         for variable in done:
             del known[variable]
     return [value_of(atom) for atom in jaxpr.outvars]
@@ -65,7 +65,8 @@ def _last_uses(jaxpr: Jaxpr) -> list[list[Any]]:
     return _LAST_USES[jaxpr]
 
 
-def _apply(equation: Any, operands: list[np.ndarray]) -> Sequence[Any]:
+def apply(equation: Any, operands: list[np.ndarray]) -> Sequence[Any]:
+    """What one operation of a program gives."""
     name, given = equation.primitive.name, equation.params
     inner = next((given[key] for key in INNER if isinstance(given.get(key), ClosedJaxpr)), None)
     if name in CALLS and inner is not None:

@@ -148,7 +148,9 @@ def _gather(x, starts, *, dimension_numbers: Any, slice_sizes, **given):
     return np.moveaxis(taken, range(batch, taken.ndim), d.offset_dims) if window else taken
 
 
-def _scatter(change: Callable[..., None]) -> Callable[..., Any]:
+def scattering(change: Callable[..., None]) -> Callable[..., Any]:
+    """An operation that scatters: `change` gets a copy of the array, the places, and what goes there."""
+
     def apply(x, starts, updates, *, dimension_numbers: Any, **given):
         d = dimension_numbers
         dropped = (*d.inserted_window_dims, *d.operand_batching_dims)
@@ -239,8 +241,8 @@ OPERATIONS: dict[str, Callable[..., Any]] = {
     "pad": _pad,
     "dot_general": _dot_general,
     "gather": _gather,
-    "scatter": _scatter(lambda x, at, new: x.__setitem__(at, new)),
-    "scatter-add": _scatter(np.add.at),
-    "scatter-mul": _scatter(np.multiply.at),
+    "scatter": scattering(lambda x, at, new: x.__setitem__(at, new)),
+    "scatter-add": scattering(np.add.at),
+    "scatter-mul": scattering(np.multiply.at),
 }
 """Operations of JAX by name, in NumPy; `NotImplemented` where the case is not treated."""
