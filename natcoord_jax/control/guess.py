@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from natcoord_jax.control.problem import OptimalControl
+from natcoord_jax.control.resampling import free_of_swings
 from natcoord_jax.control.tangent import steady_rates
 from natcoord_jax.control.transcription import (
     Node,
@@ -148,14 +149,6 @@ def taken_up(
     """
     first = steady_rates(problem.applied(free)[0], problem.start(free))[None]
     return free_of_swings(jnp, first, rates)
-
-
-def free_of_swings(xp: Any, first: Any, rates: Any) -> Any:
-    """Means of rates at the ends of steps that are themselves means of the given ones, by JAX or NumPy."""
-    inner = 0.5 * (rates[1:] + rates[:-1])
-    last = rates[-1:] if len(rates) < 2 else 1.5 * rates[-1:] - 0.5 * rates[-2:-1]
-    ends = xp.concatenate([first, inner, last])
-    return 0.5 * (ends[1:] + ends[:-1])
 
 
 def with_rates(unknowns: Unknowns, rates: Float[Array, "steps n"]) -> Unknowns:

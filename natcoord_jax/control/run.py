@@ -89,7 +89,7 @@ def optimise(
     problem = numeric(problem)
     lifted = chosen(problem, method, guess)
     if isinstance(guess, Solution):
-        guess = guess.guess(problem.steps)
+        guess = guess.guess_for(problem)
     guess = guess if isinstance(guess, Guess) else Guess(inputs=guess)
     start = unknowns_of(problem, guess, lifted)
     outside = outside_at_start(problem)

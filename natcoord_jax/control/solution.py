@@ -9,11 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from natcoord_jax.control.guess import Guess, free_of_swings
+from natcoord_jax.control.guess import Guess
 from natcoord_jax.control.iterate import Iterate
 from natcoord_jax.control.motion import motion
 from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.control.reasons import seen, unique, worst_condition
+from natcoord_jax.control.resampling import Ends, averaged, ends_of, in_proportion, interpolated
 from natcoord_jax.control.results import ADVICE, OUTCOMES, Outcome
 from natcoord_jax.control.transcription import followed, held_inputs
 from natcoord_jax.core.arguments import checked
@@ -181,14 +182,23 @@ class Solution(eqx.Module):
     @checked("Solution.guess", steps=Whole(1))
     def guess(self, steps: int | None = None) -> Guess:
         """A guess for another problem, with the inputs resampled in time to another number of steps."""
-        rates = None
+        ends = ends_of(self.problem)
+        return self._on(in_proportion(ends, steps or self.problem.steps))
+
+    def guess_for(self, problem: OptimalControl) -> Guess:
+        """A guess for a problem with other steps: with as many phases, what belongs to the same times."""
+        if len(problem.phases) == len(self.problem.phases):
+            return self._on(ends_of(problem))
+        return self.guess(problem.steps)
+
+    def _on(self, new: Ends) -> Guess:
+        rates, old = None, ends_of(self.problem)
         structure = self.problem.system.structure
         if self.iterate is not None and structure.solver == "reduced":
             rates = np.asarray(self.iterate.unknowns.y)[:, : structure.unknowns]
         free = [self.free[name] for name in self.problem.free] or None
-        steps = steps or self.problem.steps
-        rates = None if rates is None else _interpolated(rates, steps)
-        return Guess(_resampled(np.asarray(self.inputs), steps), rates=rates, free=free)
+        rates = None if rates is None else interpolated(rates, old, new)
+        return Guess(averaged(np.asarray(self.inputs), old, new), rates=rates, free=free)
 
     @checked("Solution.save", file=FILE)
     def save(self, file: str | Path) -> None:
@@ -229,34 +239,12 @@ def load_guess(file: str | Path, steps: int | None = None) -> Guess:
     except (json.JSONDecodeError, KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{file} is not a solution that `Solution.save` wrote: {error}") from error
     count = inputs.shape[0] if steps is None else steps
+    old, new = (np.linspace(0.0, 1.0, number + 1) for number in (len(inputs), count))
     return Guess(
-        _resampled(inputs, count),
-        rates=None if rates is None else _interpolated(rates, count),
+        averaged(inputs, old, new),
+        rates=None if rates is None else interpolated(rates, old, new),
         free=content["free"],
     )
-
-
-def _resampled(values: np.ndarray, steps: int) -> np.ndarray:
-    """Means of a history held over steps, over as many other steps of the same duration."""
-    count = values.shape[0]
-    if count == steps:
-        return values
-    ends = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
-    at = np.linspace(0.0, count, steps + 1)
-    total = np.stack([np.interp(at, np.arange(count + 1), column) for column in ends.T], axis=1)
-    return np.diff(total, axis=0) * steps / count
-
-
-def _interpolated(values: np.ndarray, steps: int) -> np.ndarray:
-    """Values at the middles of steps, at those of others; a staircase would shake the motion."""
-    count = values.shape[0]
-    if count == steps:
-        return values
-    at, old = (np.arange(steps) + 0.5) / steps, (np.arange(count) + 0.5) / count
-    found = np.stack([np.interp(at, old, column) for column in values.T], axis=1)
-    # The kinks between the old middles excite swings from step to step.
-    first = 1.5 * found[:1] - 0.5 * found[1:2] if steps > 1 else found
-    return free_of_swings(np, first, found)
 
 
 @eager_numpy
