@@ -1,8 +1,8 @@
 """Choice of the next mesh: as many steps as the error asks for, where it asks for them.
 
 A step whose error falls with a power of its length is to be divided into a number of parts that follows from
-its error; they are laid so that every new step gets the same share of these parts: steps are divided where the error is large
-and merged where it is small. See J. T. Betts, Practical Methods for Optimal Control and Estimation Using
+its error; they are laid one after the other so that each makes the same error: where it is large steps are divided, and where
+it is small merged. See J. T. Betts, Practical Methods for Optimal Control and Estimation Using
 Nonlinear Programming, 2nd ed., SIAM (2010), chapter 4, and F. Liu, W. W. Hager, A. V. Rao, J. Franklin Inst.
 352 (2015) 4081-4106. Where no more steps are asked for than there are, they are only moved, and no program is
 compiled for another number.
@@ -17,7 +17,6 @@ from natcoord_jax.control.local_error import ORDER, sections
 from natcoord_jax.control.mesh import lengths
 from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.control.refinement import with_steps
-from natcoord_jax.control.resampling import ends_of
 
 AIM = 0.6
 """Error that is aimed at, in terms of what is tolerated."""
@@ -27,8 +26,12 @@ GROWTH = 3.0
 """Factor on the number of steps in one round at most."""
 LONGEST = 2.0
 """Longest step, in terms of the longest of the first mesh: bounds and costs are looked at once a step."""
-MORE = 1.3
-"""Factor on the number of steps where moving them has not helped."""
+RISE = 1.0
+"""Length of an interval at most, per way from one that has to be short, in addition to its length."""
+MORE = 1.25
+"""Factor on the number of steps in one round at least, if they are not only moved."""
+HELPED = 0.5
+"""Error after moving steps, in terms of that before, that is worth it."""
 
 
 def with_own_lengths(problem: OptimalControl) -> OptimalControl:
@@ -56,55 +59,99 @@ def check_intervals(problem: OptimalControl) -> None:
             )
 
 
-def parts_of(
+def wished(
     problem: OptimalControl, errors: Float[np.ndarray, " steps"], tolerance: float, longest: Any
-) -> list[Float[np.ndarray, " intervals"]]:
-    """Into how many parts each interval of the inputs is to be divided, of each section."""
-    size = np.diff(ends_of(problem)).reshape(-1, problem.inputs.every).sum(axis=1)
-    worst = errors.reshape(-1, problem.inputs.every).max(axis=1)
+) -> list[Float[np.ndarray, " ends"]]:
+    """Ends of the intervals that errors ask for, in each section [s]; what is left of the last one counts.
+
+    An interval is as long as the errors about it allow, and no longer than `RISE` times the way from a short
+    one besides: where an input switches is known only as well as the mesh is fine.
+
+    Args:
+        problem: the problem.
+        errors: of its steps.
+        tolerance: what is tolerated of them.
+        longest: interval of each phase [s].
+    """
+    every, size = problem.inputs.every, intervals_of(problem)
+    worst = errors.reshape(-1, every).max(axis=1)
     parts = np.minimum((worst / (AIM * tolerance)) ** (1.0 / (ORDER + 1)), MOST_PARTS)
-    phase = np.repeat(np.arange(len(problem.phases)), np.array(problem.phases) // problem.inputs.every)
-    parts = np.maximum(parts, size / np.asarray(longest)[phase])
-    every = problem.inputs.every
-    return [parts[first // every : last // every] for first, last in sections(problem)]
+    phase = np.repeat(np.arange(len(problem.phases)), np.array(problem.phases) // every)
+    allowed = np.minimum(size / np.maximum(parts, 1e-9), np.asarray(longest)[phase])
+    found = []
+    for first, last in sections(problem):
+        here = slice(first // every, last // every)
+        ends = np.concatenate([[0.0], np.cumsum(size[here])])
+        found.append(_marched(ends, allowed[here]))
+    return found
+
+
+def _marched(ends: np.ndarray, allowed: np.ndarray) -> np.ndarray:
+    """Ends of intervals that are laid one after the other, the last one beyond the end of the section."""
+
+    def length(t: float) -> float:
+        away = np.maximum(np.maximum(ends[:-1] - t, t - ends[1:]), 0.0)
+        return float(np.min(allowed + RISE * away))
+
+    found = [0.0]
+    while found[-1] < ends[-1] * (1.0 - 1e-9):
+        h = length(found[-1])
+        found.append(found[-1] + min(h, length(found[-1] + h)))
+    return np.array(found)
+
+
+def intervals_of(problem: OptimalControl) -> Float[np.ndarray, " intervals"]:
+    """Lengths of the intervals of the inputs as the problem gives them [s]."""
+    return lengths_of(problem).reshape(-1, problem.inputs.every).sum(axis=1)
 
 
 def longest_of(problem: OptimalControl) -> list[float]:
-    """Longest intervals of all phases that are allowed, as parts of the phases."""
-    size = np.diff(ends_of(problem)).reshape(-1, problem.inputs.every).sum(axis=1)
+    """Longest intervals of all phases that are allowed [s]."""
     ends = np.cumsum(np.array(problem.phases) // problem.inputs.every)[:-1]
-    return [LONGEST * float(np.max(piece)) for piece in np.split(size, ends)]
+    return [LONGEST * float(np.max(piece)) for piece in np.split(intervals_of(problem), ends)]
 
 
-def numbers_of(parts: list[np.ndarray], most: int, stuck: bool) -> list[int]:
-    """Numbers of intervals of all sections.
+def asked_for(problem: OptimalControl, wishes: list[np.ndarray]) -> Float[np.ndarray, " sections"]:
+    """Numbers of intervals that are wished for in each section; of the last one the part there is room for."""
+    time = np.concatenate([[0.0], np.cumsum(lengths_of(problem))])
+    wholes = [time[last] - time[first] for first, last in sections(problem)]
+    found = [len(w) - 2 + (whole - w[-2]) / (w[-1] - w[-2]) for w, whole in zip(wishes, wholes)]
+    return np.array(found)
+
+
+def present(problem: OptimalControl) -> np.ndarray:
+    """Numbers of intervals of all sections."""
+    return np.array([(last - first) // problem.inputs.every for first, last in sections(problem)])
+
+
+def worth_moving(now: np.ndarray, asked: np.ndarray, worst: float, tolerance: float) -> bool:
+    """Whether as many intervals as there are, moved, are expected to do, or to help much."""
+    expected = AIM * tolerance * float(np.max(asked / now)) ** (ORDER + 1)
+    return expected <= max(tolerance, HELPED * worst)
+
+
+def more_of(now: np.ndarray, asked: np.ndarray, most: int) -> np.ndarray:
+    """Numbers of intervals of all sections where moving them does not do."""
+    whole = float(np.clip(np.sum(asked), MORE * now.sum(), GROWTH * now.sum()))
+    limit = max(min(whole, most), len(now))
+    found = np.maximum(1, np.ceil(asked * (limit / np.sum(asked)) - 1e-6))
+    return found.astype(int) if found.sum() <= most else np.maximum(1, np.floor(found * most / found.sum())).astype(int)
+
+
+def divided(problem: OptimalControl, wishes: list[np.ndarray], numbers: np.ndarray) -> OptimalControl:
+    """The problem on a mesh of so many intervals, in the proportions of those wished for.
 
     Args:
-        parts: see `parts_of`.
-        most: number of all together.
-        stuck: whether moving them has not helped.
+        problem: the problem.
+        wishes: see `wished`.
+        numbers: of intervals of all sections.
     """
-    now = np.array([len(piece) for piece in parts])
-    asked = np.array([max(1, int(np.ceil(np.sum(piece) - 1e-9))) for piece in parts])
-    if np.all(asked <= now):
-        if not stuck:
-            return now.tolist()
-        asked = np.ceil(MORE * now).astype(int)
-    limit = max(min(most, int(GROWTH * now.sum())), len(now))
-    if asked.sum() > limit:
-        asked = np.maximum(1, np.floor(asked * (limit / asked.sum()))).astype(int)
-    return asked.tolist()
-
-
-def divided(problem: OptimalControl, parts: list[np.ndarray], numbers: list[int]) -> OptimalControl:
-    """The problem on the mesh of so many intervals, each with the same share of the parts."""
-    every, old, given = problem.inputs.every, ends_of(problem), lengths_of(problem)
-    time = np.concatenate([[0.0], np.cumsum(given)])
-    size, places, phases = [], {0: 0}, [0] * len(problem.phases)
-    for (first, last), piece, count in zip(sections(problem), parts, numbers):
-        before = np.concatenate([[0.0], np.cumsum(piece)])
-        ends = np.interp(np.linspace(0.0, before[-1], count + 1), before, time[first : last + 1 : every])
+    every, phase = problem.inputs.every, np.repeat(np.arange(len(problem.phases)), problem.phases)
+    size, places, phases = [], {}, [0] * len(problem.phases)
+    rows = zip(sections(problem), wishes, asked_for(problem, wishes), numbers)
+    for (first, last), wish, count, number in rows:
+        ends = np.interp(np.linspace(0.0, count, number + 1), np.arange(len(wish)), wish)
         size.append(np.repeat(np.diff(ends) / every, every))
-        places[last] = places[first] + count * every
-        phases[int(np.ceil(old[last] - 0.5)) - 1] += count * every
+        phases[phase[first]] += int(number) * every
+        places[last] = sum(phases)
     return with_steps(problem, tuple(phases), np.concatenate(size), lambda step: places[step])

@@ -3,6 +3,7 @@
 import dataclasses
 import sys
 import time
+from collections.abc import Iterator
 from typing import Annotated, Any, NamedTuple
 
 import jax.numpy as jnp
@@ -12,12 +13,16 @@ from jaxtyping import Float
 from natcoord_jax.control.attempts import ENDED, NAMES, Search
 from natcoord_jax.control.costates import Multipliers
 from natcoord_jax.control.equidistribution import (
+    HELPED,
+    asked_for,
     check_intervals,
     divided,
     longest_of,
-    numbers_of,
-    parts_of,
+    more_of,
+    present,
+    wished,
     with_own_lengths,
+    worth_moving,
 )
 from natcoord_jax.control.guess import unknowns_of
 from natcoord_jax.control.iterate import Iterate, Options
@@ -34,8 +39,6 @@ from natcoord_jax.xla.waiting import Stopwatch
 HEADER = (
     f"{'steps':>6} {'error':>9} {'cost':>16} {'shortest [s]':>12} {'iter':>5} {'s':>7} {'compiling [s]':>13}"
 )
-HELPED = 0.8
-"""Error after moving steps, in terms of that before, from which on it has not helped."""
 
 
 class Round(NamedTuple):
@@ -97,7 +100,7 @@ def refine(
     problem: Annotated[Any, Concrete(PROBLEM) | of("an earlier solution", Solution)],
     tolerance: Annotated[float, Concrete(Number("positive"))] = 1e-5,
     *,
-    max_rounds: Annotated[int, Whole(0)] = 8,
+    max_rounds: Annotated[int, Whole(0)] = 20,
     max_steps: Annotated[int | None, Whole(1)] = None,
     method: Annotated[str, Choice(FORMS)] = "auto",
     progress: Annotated[bool, FLAG] = True,
@@ -163,18 +166,32 @@ def refine(
     longest = longest_of(solution.problem)
     rounds.noted(solution)
     while rounds.errors.max() > tolerance:
-        solution = rounds.solution
         if len(rounds.rows) > max_rounds:
             return rounds.ended(f"after {max_rounds} rounds")
-        parts = parts_of(solution.problem, rounds.errors, tolerance, longest)
-        numbers = numbers_of(parts, most // solution.problem.inputs.every, rounds.stuck)
-        finer = divided(solution.problem, parts, numbers)
-        left = max(0.0, time_limit - watch.seconds)
-        again = _again(finer, solution, left, settings)
+        again = None
+        for finer in _finer(rounds, tolerance, longest, most):
+            left = max(0.0, time_limit - watch.seconds)
+            again = _again(finer, rounds.solution, left, settings)
+            if again.ok or again.outcome in ENDED:
+                break
+        if again is None:
+            return rounds.ended(f"with at most {most} steps")
         if not again.ok:
-            return rounds.ended(f"with {finer.steps} steps it is not solved: {again.explain()}")
+            return rounds.ended(f"with {again.problem.steps} steps it is not solved ({again.explain()});")
         rounds.noted(again)
     return rounds.ended("")
+
+
+def _finer(rounds: "_Rounds", tolerance: float, longest: list[float], most: int) -> Iterator[OptimalControl]:
+    """Problems on meshes that may do: the same steps moved, then more of them."""
+    problem = rounds.solution.problem
+    wishes = wished(problem, rounds.errors, tolerance, longest)
+    now, asked = present(problem), asked_for(problem, wishes)
+    if not rounds.stuck and worth_moving(now, asked, rounds.errors.max(), tolerance):
+        yield divided(problem, wishes, now)
+    more = more_of(now, asked, most // problem.inputs.every)
+    if more.sum() > now.sum():
+        yield divided(problem, wishes, more)
 
 
 class _Rounds:
