@@ -1,11 +1,11 @@
 """Choice of the next mesh: as many steps as the error asks for, where it asks for them.
 
 A step whose error falls with a power of its length is to be divided into a number of parts that follows from
-its error; they are laid one after the other so that each makes the same error: where it is large steps are divided, and where
-it is small merged. See J. T. Betts, Practical Methods for Optimal Control and Estimation Using
-Nonlinear Programming, 2nd ed., SIAM (2010), chapter 4, and F. Liu, W. W. Hager, A. V. Rao, J. Franklin Inst.
-352 (2015) 4081-4106. Where no more steps are asked for than there are, they are only moved, and no program is
-compiled for another number.
+its error. Steps are laid one after the other so that each makes the same error: where it is large they are
+divided, and where it is small merged. See J. T. Betts, Practical Methods for Optimal Control and Estimation
+Using Nonlinear Programming, 2nd ed., SIAM (2010), chapter 4, and F. Liu, W. W. Hager, A. V. Rao, J. Franklin
+Inst. 352 (2015) 4081-4106. Where no more steps are asked for than there are, they are only moved, and no
+program is compiled for another number.
 """
 
 from typing import Any
@@ -13,19 +13,21 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from natcoord_jax.control.local_error import ORDER, sections
+from natcoord_jax.control.local_error import ORDER, LocalErrors, sections
 from natcoord_jax.control.mesh import lengths
 from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.control.refinement import with_steps
 
 AIM = 0.6
 """Error that is aimed at, in terms of what is tolerated."""
-MOST_PARTS = 10.0
-"""Parts into which a step is divided at most in one round."""
+FEWEST_PARTS, MOST_PARTS = 0.5, 10.0
+"""Parts into which a step is divided in one round; half a part is one with its neighbour."""
 GROWTH = 3.0
 """Factor on the number of steps in one round at most."""
 LONGEST = 2.0
 """Longest step, in terms of the longest of the first mesh: bounds and costs are looked at once a step."""
+LEAST_PART = 0.05
+"""Error of a jump at most, at the edge of its step, in terms of that in the middle, that is counted on."""
 RISE = 1.0
 """Length of an interval at most, per way from one that has to be short, in addition to its length."""
 MORE = 1.25
@@ -60,7 +62,7 @@ def check_intervals(problem: OptimalControl) -> None:
 
 
 def wished(
-    problem: OptimalControl, errors: Float[np.ndarray, " steps"], tolerance: float, longest: Any
+    problem: OptimalControl, errors: LocalErrors, tolerance: float, longest: Any
 ) -> list[Float[np.ndarray, " ends"]]:
     """Ends of the intervals that errors ask for, in each section [s]; what is left of the last one counts.
 
@@ -74,27 +76,46 @@ def wished(
         longest: interval of each phase [s].
     """
     every, size = problem.inputs.every, intervals_of(problem)
-    worst = errors.reshape(-1, every).max(axis=1)
-    parts = np.minimum((worst / (AIM * tolerance)) ** (1.0 / (ORDER + 1)), MOST_PARTS)
+    worst = errors.steps.reshape(-1, every).max(axis=1) / (AIM * tolerance)
     phase = np.repeat(np.arange(len(problem.phases)), np.array(problem.phases) // every)
-    allowed = np.minimum(size / np.maximum(parts, 1e-9), np.asarray(longest)[phase])
+    # Errors of jumps fall with the square of their step alone, which need be short there only.
+    jumps = np.nan_to_num(errors.jumps, nan=-1.0).reshape(len(size), -1)
+    jumping = np.max(jumps, axis=1, initial=-1.0) >= 0
+    # Errors change their sign here and there, where steps are not to be long for that.
+    dense = np.pad(np.where(jumping, 0.0, worst / size ** (ORDER + 1)), 1, "edge")
+    dense = 0.25 * (dense[:-2] + dense[2:]) + 0.5 * dense[1:-1]
+    allowed = size / np.clip(size * dense ** (1.0 / (ORDER + 1)), FEWEST_PARTS, MOST_PARTS)
+    middle = np.maximum(2.0 * np.minimum(jumps, 1.0 - jumps), LEAST_PART)
+    allowed = np.minimum(np.where(jumping, size, allowed), np.asarray(longest)[phase])
     found = []
     for first, last in sections(problem):
         here = slice(first // every, last // every)
         ends = np.concatenate([[0.0], np.cumsum(size[here])])
-        found.append(_marched(ends, allowed[here]))
+        row, column = np.nonzero(jumps[here] >= 0)
+        at = ends[row] + jumps[here][row, column] * size[here][row]
+        begin, end = np.concatenate([ends[:-1], at]), np.concatenate([ends[1:], at])
+        # In the next mesh it may be in the middle of a step, where the error is largest.
+        worse = np.sqrt(worst[here][row] / middle[here][row, column])
+        short = size[here][row] / np.clip(worse, FEWEST_PARTS, MOST_PARTS)
+        found.append(_marched(begin, end, np.concatenate([allowed[here], short])))
     return found
 
 
-def _marched(ends: np.ndarray, allowed: np.ndarray) -> np.ndarray:
-    """Ends of intervals that are laid one after the other, the last one beyond the end of the section."""
+def _marched(begin: np.ndarray, end: np.ndarray, allowed: np.ndarray) -> np.ndarray:
+    """Ends of intervals that are laid one after the other, the last one beyond the end of the section.
+
+    Args:
+        begin: where intervals begin, and points.
+        end: where they end.
+        allowed: length of intervals there.
+    """
 
     def length(t: float) -> float:
-        away = np.maximum(np.maximum(ends[:-1] - t, t - ends[1:]), 0.0)
+        away = np.maximum(np.maximum(begin - t, t - end), 0.0)
         return float(np.min(allowed + RISE * away))
 
-    found = [0.0]
-    while found[-1] < ends[-1] * (1.0 - 1e-9):
+    found, whole = [0.0], float(np.max(end))
+    while found[-1] < whole * (1.0 - 1e-9):
         h = length(found[-1])
         found.append(found[-1] + min(h, length(found[-1] + h)))
     return np.array(found)
@@ -112,7 +133,7 @@ def longest_of(problem: OptimalControl) -> list[float]:
 
 
 def asked_for(problem: OptimalControl, wishes: list[np.ndarray]) -> Float[np.ndarray, " sections"]:
-    """Numbers of intervals that are wished for in each section; of the last one the part there is room for."""
+    """Numbers of intervals wished for in each section; of the last one the part that there is room for."""
     time = np.concatenate([[0.0], np.cumsum(lengths_of(problem))])
     wholes = [time[last] - time[first] for first, last in sections(problem)]
     found = [len(w) - 2 + (whole - w[-2]) / (w[-1] - w[-2]) for w, whole in zip(wishes, wholes)]
@@ -135,7 +156,11 @@ def more_of(now: np.ndarray, asked: np.ndarray, most: int) -> np.ndarray:
     whole = float(np.clip(np.sum(asked), MORE * now.sum(), GROWTH * now.sum()))
     limit = max(min(whole, most), len(now))
     found = np.maximum(1, np.ceil(asked * (limit / np.sum(asked)) - 1e-6))
-    return found.astype(int) if found.sum() <= most else np.maximum(1, np.floor(found * most / found.sum())).astype(int)
+    return (
+        found.astype(int)
+        if found.sum() <= most
+        else np.maximum(1, np.floor(found * most / found.sum())).astype(int)
+    )
 
 
 def divided(problem: OptimalControl, wishes: list[np.ndarray], numbers: np.ndarray) -> OptimalControl:

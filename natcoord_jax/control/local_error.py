@@ -31,8 +31,22 @@ from natcoord_jax.system import System
 
 ORDER = gauss(1).order
 """Of the scheme."""
+FLAT = 5.0
+"""Least jump within a step, in terms of what the history beside changes over a step."""
 QUIET = 1e-12
 """Rates below which there is nothing to be relative to, in lengths of the motion per whole time."""
+
+
+class LocalErrors(NamedTuple):
+    """Local errors of a solution.
+
+    Attributes:
+        steps: largest error of each step, relative; infinite where a half of it has no solution.
+        jumps: part of a step that goes by before an input jumps in it; NaN where none does (steps, inputs).
+    """
+
+    steps: Float[np.ndarray, " steps"]
+    jumps: Float[np.ndarray, "steps inputs"]
 
 
 class Scales(NamedTuple):
@@ -47,8 +61,8 @@ class Scales(NamedTuple):
     rates: Float[Array, " n"]
 
 
-def local_errors(problem: OptimalControl, iterate: Iterate) -> Float[np.ndarray, " steps"]:
-    """Largest local error of each step, relative; infinite where a half of it has no solution.
+def local_errors(problem: OptimalControl, iterate: Iterate) -> LocalErrors:
+    """Local errors of all steps.
 
     Positions are relative to the largest extent of the scene along the motion, directors to one, rates of
     free motions to the largest of their kind along the motion. (Velocities have a part along the normals of
@@ -61,12 +75,14 @@ def local_errors(problem: OptimalControl, iterate: Iterate) -> Float[np.ndarray,
     unknowns = iterate.unknowns
     inputs = np.asarray(held_inputs(problem, unknowns.coefficients))
     size = np.asarray(problem.lengths(unknowns.free))
-    deviation = np.zeros_like(inputs)
+    changes, jumps = np.zeros_like(inputs), np.full_like(inputs, np.nan)
     if problem.inputs.every == 1:
         for first, last in sections(problem):
-            deviation[first:last] = deviations(inputs[first:last], size[first:last])
+            here = slice(first, last)
+            changes[here], jumps[here] = changes_within(inputs[here], size[here])
     nodes = iterate.path.nodes.x
-    return np.asarray(_compared(problem, unknowns.free, nodes, jnp.asarray(inputs), jnp.asarray(deviation)))
+    found = _compared(problem, unknowns.free, nodes, jnp.asarray(inputs), jnp.asarray(changes))
+    return LocalErrors(np.asarray(found), jumps)
 
 
 def sections(problem: OptimalControl) -> list[tuple[int, int]]:
@@ -75,32 +91,41 @@ def sections(problem: OptimalControl) -> list[tuple[int, int]]:
     return list(zip(ends[:-1], ends[1:]))
 
 
-def deviations(values: Float[np.ndarray, "steps m"], size: Float[np.ndarray, " steps"]) -> np.ndarray:
-    """Half of what the second half of each step has more than the first, of a history known by its means."""
-    count, found = len(values), np.zeros_like(values)
+def changes_within(
+    values: Float[np.ndarray, "steps m"], size: Float[np.ndarray, " steps"]
+) -> tuple[np.ndarray, np.ndarray]:
+    """How a history that is known by its means changes within steps.
+
+    Returns:
+        Half of what the second half of each step has more than the first; and where it jumps, see
+        `LocalErrors`.
+    """
+    count, found, places = len(values), np.zeros_like(values), np.full_like(values, np.nan)
     if count < 2:
-        return found
+        return found, places
     middle = np.cumsum(size) - 0.5 * size
     slope = np.diff(values, axis=0) / np.diff(middle)[:, None]
     for k in range(count):
+        inner = 0 < k < count - 1
         # Lines through the two steps on each side; at the ends through the step itself.
-        left, right = max(k - 2, 0), min(k + 1, count - 2)
-        if k == 0 or k == count - 1:
-            left = right = min(k, count - 2)
+        left, right = (max(k - 2, 0), min(k + 1, count - 2)) if inner else [min(k, count - 2)] * 2
         before = values[left + 1] + slope[left] * (middle[k] - middle[left + 1])
         after = values[right] + slope[right] * (middle[k] - middle[right])
-        if k in (0, count - 1):
-            before = after = values[k]
-        tilt = np.where(slope[left] * slope[right] > 0, np.minimum(*np.abs([slope[left], slope[right]])), 0.0)
-        jump = after - before
+        steepest = np.minimum(np.abs(slope[left]), np.abs(slope[right]))
+        tilt = np.where(slope[left] * slope[right] > 0, np.sign(slope[left]) * steepest, 0.0)
+        tilt = 0.25 * size[k] * tilt
+        jump = after - before if inner else np.zeros_like(after)
         part = np.where(jump != 0, (after - values[k]) / np.where(jump != 0, jump, 1.0), 0.0)
         part = np.clip(part, 0.0, 1.0)
-        found[k] = 0.25 * size[k] * np.sign(slope[left]) * tilt + jump * np.minimum(part, 1.0 - part)
-    return found
+        jumped = jump * np.minimum(part, 1.0 - part)
+        found[k] = tilt + jumped
+        steeper = size[k] * np.maximum(np.abs(slope[left]), np.abs(slope[right]))
+        places[k] = np.where((np.abs(jump) > FLAT * steeper) & (jumped != 0), part, np.nan)
+    return found, places
 
 
 @compiled
-def _compared(problem: OptimalControl, free: Array, nodes: Array, inputs: Array, deviation: Array) -> Array:
+def _compared(problem: OptimalControl, free: Array, nodes: Array, inputs: Array, changes: Array) -> Array:
     system, _ = problem.applied(free)
     plan = Plan(2, 0, TOLERANCE, None)
 
@@ -109,7 +134,7 @@ def _compared(problem: OptimalControl, free: Array, nodes: Array, inputs: Array,
 
     begin, size, _ = jax.vmap(lambda at: times_of(problem, free, at))(slices(problem))
     before, after = (jax.vmap(state_of)(x, begin) for x in (nodes[:-1], nodes[1:]))
-    halves = jnp.stack([inputs - deviation, inputs + deviation], axis=1)
+    halves = jnp.stack([inputs - changes, inputs + changes], axis=1)
 
     def one(before: State, u: Array, dt: Array) -> tuple[State, Array]:
         slots, ending = run_slots(plan, system, before, u, 0.5 * dt)

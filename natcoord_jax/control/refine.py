@@ -13,7 +13,6 @@ from jaxtyping import Float
 from natcoord_jax.control.attempts import ENDED, NAMES, Search
 from natcoord_jax.control.costates import Multipliers
 from natcoord_jax.control.equidistribution import (
-    HELPED,
     asked_for,
     check_intervals,
     divided,
@@ -39,6 +38,9 @@ from natcoord_jax.xla.waiting import Stopwatch
 HEADER = (
     f"{'steps':>6} {'error':>9} {'cost':>16} {'shortest [s]':>12} {'iter':>5} {'s':>7} {'compiling [s]':>13}"
 )
+
+SCARCELY = 0.8
+"""Error after moving steps, in terms of that before, from which on more of them are taken."""
 
 
 class Round(NamedTuple):
@@ -118,9 +120,10 @@ def refine(
     Where no more steps are needed than there are they are only moved, which compiles nothing; each other
     number of steps compiles its programs. Each solve starts from the last one, primal and dual.
 
-    The error of a smooth motion falls with the cube of its step, that of a step within which an input switches
-    with the square, and steps gather there: they bracket the switch. Of inputs that are splines or held over
-    several steps (`every`) the intervals are moved, and only the motion's error counts.
+    The error of a smooth motion falls with the cube of its step, that of a step within which an input
+    switches with the square, and steps gather there: they bracket the switch. Of inputs that are held over
+    several steps, or are splines over them (`every`), the intervals are moved, and the motion's error alone
+    counts.
 
     Args:
         problem: a problem, or an earlier solution of one, which is then the first.
@@ -135,8 +138,8 @@ def refine(
         time_limit: of the whole [s]; compiling does not count.
 
     Returns:
-        The last solution, its errors, and a row for each mesh; `print` shows them. Where a mesh is not solved,
-        the last one that was, and why.
+        The last solution, its errors, and a row for each mesh; `print` shows them. Where a mesh is not
+        solved, the last one that was, and why.
 
     Raises:
         ValueError: for phases or waypoints that are not at ends of intervals of the inputs.
@@ -165,7 +168,7 @@ def refine(
     most = max_steps or 10 * solution.problem.steps
     longest = longest_of(solution.problem)
     rounds.noted(solution)
-    while rounds.errors.max() > tolerance:
+    while rounds.worst > tolerance:
         if len(rounds.rows) > max_rounds:
             return rounds.ended(f"after {max_rounds} rounds")
         again = None
@@ -187,7 +190,7 @@ def _finer(rounds: "_Rounds", tolerance: float, longest: list[float], most: int)
     problem = rounds.solution.problem
     wishes = wished(problem, rounds.errors, tolerance, longest)
     now, asked = present(problem), asked_for(problem, wishes)
-    if not rounds.stuck and worth_moving(now, asked, rounds.errors.max(), tolerance):
+    if not rounds.stuck and worth_moving(now, asked, rounds.worst, tolerance):
         yield divided(problem, wishes, now)
     more = more_of(now, asked, most // problem.inputs.every)
     if more.sum() > now.sum():
@@ -201,24 +204,30 @@ class _Rounds:
         self.tolerance, self.progress = tolerance, progress
         self.begun, self.watch = time.perf_counter(), Stopwatch()
         self.rows: list[Round] = []
-        self.solution, self.errors = None, np.zeros(0)
+        self.solution: Any = None
+        self.errors: Any = None
+
+    @property
+    def worst(self) -> float:
+        """Largest error of the last mesh."""
+        return float(np.max(self.errors.steps))
 
     @property
     def stuck(self) -> bool:
         """Whether moving the steps has not helped."""
         last = self.rows[-2:]
         moved = len(last) == 2 and last[0].steps == last[1].steps
-        return moved and last[1].error > HELPED * last[0].error
+        return moved and last[1].error > SCARCELY * last[0].error
 
     def noted(self, solution: Solution) -> None:
         """Estimate the errors of a solution and keep it."""
-        problem, iterate = solution.problem, solution.iterate
+        problem, iterate = solution.problem, _iterate(solution)
         self.solution, self.errors = solution, local_errors(problem, iterate)
         shortest = float(jnp.min(problem.lengths(iterate.unknowns.free)))
         seconds, whole = self.watch.seconds, time.perf_counter() - self.begun
         row = Round(
             problem.steps,
-            float(self.errors.max()),
+            self.worst,
             solution.cost,
             shortest,
             len(solution.history),
@@ -232,8 +241,14 @@ class _Rounds:
 
     def ended(self, why: str) -> Refinement:
         """All of it."""
-        error = f"{why} the largest local error is {self.errors.max():.1e}, above {self.tolerance:.1e}"
-        return Refinement(self.solution, self.errors, self.rows, error if why else "")
+        error = f"{why} the largest local error is {self.worst:.1e}, above {self.tolerance:.1e}"
+        return Refinement(self.solution, self.errors.steps, self.rows, error if why else "")
+
+
+def _iterate(solution: Solution) -> Iterate:
+    """Where the method ended, of a solution that is optimal."""
+    assert solution.iterate is not None
+    return solution.iterate
 
 
 def _again(problem: OptimalControl, last: Solution, time_limit: float, settings: dict[str, Any]) -> Solution:
@@ -242,7 +257,7 @@ def _again(problem: OptimalControl, last: Solution, time_limit: float, settings:
     guess = last.guess_for(problem)
     options = Options(lifted, *(settings[name] for name in ("max_iterations", "tol", "goal_tol")))
     search = Search(problem, options, False, time_limit)
-    known = _carried(last.problem, problem, last.iterate, lifted)
+    known = _carried(last.problem, problem, _iterate(last), lifted)
     found = search.run(lifted, unknowns_of(problem, guess, lifted), known=known, last=True)
     if found.ok or found.outcome in ENDED:
         return found
