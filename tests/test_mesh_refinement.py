@@ -94,7 +94,7 @@ def test_steps_gather_in_a_layer_at_the_start(cart):
     )
     exact = 1.0 / math.sqrt(2.0 * k)
     refined, plain = (abs(one.cost - exact) for one in (found.solution, equal))
-    assert refined < 0.2 * plain
+    assert refined < 0.3 * plain
     assert size[:5].max() < 0.4 * size[-5:].min()
 
 
@@ -110,45 +110,42 @@ def pendulum():
 
 @pytest.mark.exhaustive
 def test_estimates_are_the_errors_of_the_steps():
-    """Beside the same steps in 64 parts, with the same inputs: these are held over two steps."""
+    """Beside the same steps in 64 parts, with the same inputs: on purpose these are held over two steps."""
     system, state = pendulum()
     goal = nc.goal.Coordinate("rail", 2.0) & nc.goal.Rest()
     options = {"cost": nc.cost.Effort(), "inputs": nc.inputs.Spline(every=2), "goal": goal}
-    problem = nc.OptimalControl(system, state, dt=0.06, steps=20, **options)
-    found = nc.refine(problem, tolerance=1.0, progress=False)
-    states, inputs = found.solution.trajectory.states, found.solution.inputs
+    problem = nc.OptimalControl(system, state, dt=0.06, steps=FIRST, **options)
+    found = nc.refine(problem, tolerance=1e-9, max_rounds=1, progress=False)
+    states, inputs, size = found.solution.trajectory.states, found.solution.inputs, lengths(found.solution)
+    # Both steps of an interval stay equal, and intervals have been moved so that errors are equal as well.
+    np.testing.assert_allclose(size[::2], size[1::2], rtol=1e-12)
+    assert size.max() > 1.2 * size.min()
+    assert found.rounds[1].steps == FIRST and found.rounds[1].error < 0.8 * found.rounds[0].error
     begun = jax.tree.map(lambda x: x[:-1], states)
 
-    def finer(state, u):
+    def finer(state, u, dt):
         held = jnp.broadcast_to(u, (64, 1))
-        return jax.tree.map(lambda x: x[-1], nc.simulate(system, state, dt=0.06 / 64, inputs=held).states)
+        return jax.tree.map(lambda x: x[-1], nc.simulate(system, state, dt=dt / 64, inputs=held).states)
 
-    fine = jax.vmap(finer)(begun, jnp.asarray(inputs))
+    fine = jax.vmap(finer)(begun, jnp.asarray(inputs), jnp.asarray(size))
     rates, ends = (np.asarray(jax.vmap(lambda s: system.rate(s, "rail"))(x)) for x in (states, fine))
-    points = np.asarray(states.rows[:, 0, 0])
-    extent = np.max(points.max(axis=0) - points.min(axis=0))
-    off = np.linalg.norm(np.asarray(states.q[1:] - fine.q), axis=-1).reshape(20, 4)
-    off[:, 0] /= extent
-    true = np.maximum(off.max(axis=1), np.abs(rates[1:] - ends) / np.abs(rates).max())
+    # (The point of the bob that its place is told by is on the hinge: directors turn, by so many radians.)
+    off = np.linalg.norm(np.asarray(states.q[1:] - fine.q), axis=-1).max(axis=1)
+    true = np.maximum(off, np.abs(rates[1:] - ends) / np.abs(rates).max())
     assert true.max() > 1e-5
     np.testing.assert_allclose(found.errors, true, rtol=0.3, atol=0.02 * true.max())
 
 
 @pytest.mark.exhaustive
-def test_phases_waypoints_and_intervals_of_inputs_stay_in_their_places(cart):
-    """Half-way after 0.4 s, with inputs that are held over two steps; then phases whose times are free."""
+def test_a_waypoint_stays_in_its_place(cart):
+    """Half-way after 0.4 s of one, after another number of steps."""
     half = nc.goal.At(nc.goal.Coordinate("rail", 0.5), step=8)
-    problem = on_rail(cart, goal=half & AT_REST, inputs=nc.inputs.Spline(every=2))
-    found = nc.refine(problem, tolerance=1e-12, max_rounds=1, progress=False)
-    # Of inputs held on purpose only the motion counts, and steps of a cart are exact.
-    assert found.ok and len(found.rounds) == 1
-    problem = on_rail(cart, goal=half & AT_REST)
-    found = nc.refine(problem, tolerance=1e-4, max_rounds=1, progress=False)
-    step = found.solution.problem.goal.inside()[0].step
+    found = nc.refine(on_rail(cart, goal=half & AT_REST), tolerance=1e-4, max_rounds=1, progress=False)
+    (place,) = (x for x in found.solution.problem.goal.everything() if isinstance(x, nc.goal.At))
     states = found.solution.trajectory.states
-    assert found.solution.problem.steps > FIRST and step != 8
-    assert float(states.t[step]) == pytest.approx(0.4, abs=1e-12)
-    assert float(states.coordinates[step, 0]) == pytest.approx(0.5, abs=1e-9)
+    assert found.solution.problem.steps > FIRST and place.step != 8
+    assert float(states.t[place.step]) == pytest.approx(0.4, abs=1e-12)
+    assert float(states.coordinates[place.step, 0]) == pytest.approx(0.5, abs=1e-9)
     assert float(states.t[-1]) == pytest.approx(1.0, abs=1e-12)
 
 

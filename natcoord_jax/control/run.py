@@ -1,5 +1,6 @@
 """The entrances: an optimisation with progress and a way out, and one that compiles into other programs."""
 
+import dataclasses
 import math
 from typing import Annotated, Any
 
@@ -15,6 +16,8 @@ from natcoord_jax.control.reasons import outside_at_start
 from natcoord_jax.control.results import Outcome
 from natcoord_jax.control.solution import Solution
 from natcoord_jax.control.transcription import Unknowns, held_inputs
+from natcoord_jax.control.turns import lost as lost_turns
+from natcoord_jax.control.turns import turned_along, turned_by, uncounted
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.compiled import compiled
 from natcoord_jax.core.kinds import FLAG, Choice, Concrete, of
@@ -87,7 +90,7 @@ def optimise(
         ModuleNotFoundError: for method "ipopt" where it is not installed.
     """
     problem = numeric(problem)
-    lifted = chosen(problem, method, guess)
+    lifted, given = chosen(problem, method, guess), guess
     if isinstance(guess, Solution):
         guess = guess.guess_for(problem)
     guess = guess if isinstance(guess, Guess) else Guess(inputs=guess)
@@ -101,6 +104,13 @@ def optimise(
         free = dict(zip(names, values))
         return Solution(problem, inputs, free, dt, math.nan, code, NAMES[lifted], reason=reason)
     search = Search(problem, Options(lifted, max_iterations, tol, goal_tol), progress, time_limit)
+    found = _attempted(search, method, start, guess)
+    return dataclasses.replace(found, note=_lost_turns(given, start, found))
+
+
+def _attempted(search: Search, method: str, start: Unknowns, guess: Guess) -> Solution:
+    """The best of all attempts that the method allows."""
+    problem, lifted = search.problem, search.options.lifted
     if method == "ipopt":
         return search.by_ipopt(unknowns_of(problem, guess, True))
     # Restored motions are gone on from in the lifted form.
@@ -120,6 +130,22 @@ def optimise(
     if restorable and not over(found) and search.left > 0:
         found = after_restoration(search, found, guess)
     return found
+
+
+def _lost_turns(given: Any, start: Unknowns, found: Solution) -> str:
+    """Whole turns of a guess that the solution has not, in words."""
+    problem, iterate = found.problem, found.iterate
+    names = [] if given is None or iterate is None else uncounted(problem)
+    if not names:
+        return ""
+    if isinstance(given, Solution) and given.iterate is not None:
+        turned = turned_along(given.problem, given.iterate.path.nodes.x, names)
+    else:
+        by_inputs = not isinstance(given, Guess) or given.rates is None
+        if by_inputs and isinstance(given, Guess) and given.inputs is None:
+            return ""
+        turned = turned_by(problem, start, names, by_inputs)
+    return "; ".join(lost_turns(turned, turned_along(problem, iterate.path.nodes.x, names)))
 
 
 def _lost(found: Solution) -> bool:

@@ -93,6 +93,7 @@ class Solution(eqx.Module):
         history: one row for each iteration, of all attempts.
         reason: what was seen where it did not end well.
         attempts: those before the last one.
+        note: what is to be known of it however it ended, as whole turns of the guess that it has not.
     """
 
     problem: OptimalControl
@@ -107,6 +108,7 @@ class Solution(eqx.Module):
     history: list[Row] = eqx.field(default_factory=list)
     reason: str = ""
     attempts: list[Attempt] = eqx.field(default_factory=list)
+    note: str = ""
 
     @property
     def outcome(self) -> Outcome:
@@ -163,7 +165,7 @@ class Solution(eqx.Module):
         return found | {name: np.asarray(m.path)[:, k] for k, name in enumerate(bounds)}
 
     def explain(self) -> str:
-        """How it ended, in words, with what was seen, and the attempts before the last one."""
+        """How it ended, in words, with what was seen and what is to be known, and the attempts before."""
         text = OUTCOMES[self.outcome]
         if self.iterate is not None or self.history:
             text += f" after {len(self.history)} iterations by {self.method}"
@@ -177,6 +179,7 @@ class Solution(eqx.Module):
         if not self.ok:
             text += f"; {self.reason}" if self.reason else ""
             text += f"; {ADVICE[self.outcome]}" if self.outcome in ADVICE else ""
+        text += f"; {self.note}" if self.note else ""
         return text + "".join(f"\n  before that, {attempt}" for attempt in self.attempts)
 
     @checked("Solution.guess", steps=Whole(1))
