@@ -32,9 +32,10 @@ def on_rail(cart, *, steps=FIRST, **options):
     return nc.OptimalControl(*cart, **(fields | options))
 
 
-def lengths(solution):
+def lengths(solution) -> np.ndarray:
     """Durations of all steps [s]."""
-    return np.diff(np.asarray(solution.trajectory.states.t))
+    t = np.asarray(solution.trajectory.states.t, float)
+    return t[1:] - t[:-1]
 
 
 @pytest.mark.exhaustive

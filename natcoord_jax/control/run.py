@@ -135,8 +135,8 @@ def _attempted(search: Search, method: str, start: Unknowns, guess: Guess) -> So
 def _lost_turns(given: Any, start: Unknowns, found: Solution) -> str:
     """Whole turns of a guess that the solution has not, in words."""
     problem, iterate = found.problem, found.iterate
-    names = [] if given is None or iterate is None else uncounted(problem)
-    if not names:
+    names = uncounted(problem)
+    if given is None or iterate is None or not names:
         return ""
     if isinstance(given, Solution) and given.iterate is not None:
         turned = turned_along(given.problem, given.iterate.path.nodes.x, names)

@@ -1,4 +1,4 @@
-"""Whole turns of a guess that its solution has not: an attitude that is asked for knows no number of turns."""
+"""Whole turns of a guess that its solution has not: an attitude as a goal knows no number of turns."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -36,7 +36,7 @@ def uncounted(problem: OptimalControl) -> list[str]:
 def turned_by(problem: OptimalControl, unknowns: Unknowns, names: list[str], simulate: bool) -> Angles:
     """How far bodies turn in the motion of unknowns, or of their inputs alone."""
     x, whole = _positions(problem, unknowns, simulate)
-    return turned_along(problem, np.asarray(x), names) if bool(whole) else {}
+    return turned_along(problem, x, names) if bool(whole) else {}
 
 
 @briefly
@@ -45,7 +45,7 @@ def _positions(problem: OptimalControl, unknowns: Unknowns, simulate: bool) -> t
     return roll(problem, unknowns).nodes.x[:, : problem.state.q.size], whole
 
 
-def turned_along(problem: OptimalControl, x: np.ndarray, names: list[str]) -> Angles:
+def turned_along(problem: OptimalControl, x: Any, names: list[str]) -> Angles:
     """How far bodies turn along states as vectors."""
     rows = np.asarray(x)[:, : problem.state.q.size].reshape(len(x), -1, 4, 3)
     return {name: _summed(rows[:, problem.system.body_index(name), 1:]) for name in names}
@@ -75,7 +75,7 @@ def lost(guess: Angles, found: Angles) -> Iterator[str]:
         along = np.round(axis, 3) + 0.0
         about = f"({', '.join(f'{x:g}' for x in along)})"
         yield (
-            f"the guess turns {name!r} by {whole / TURN:.2f} turns about its axis {about}, and the solution by "
-            f"{other / TURN:.2f}: goal.Attitude knows no number of turns; add "
+            f"the guess turns {name!r} by {whole / TURN:.2f} turns about its axis {about}, and the solution "
+            f"by {other / TURN:.2f}: goal.Attitude knows no number of turns; add "
             f"nc.goal.Turned({name!r}, {about}, {wanted:.4f}) to the goal"
         )
