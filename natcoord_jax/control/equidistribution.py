@@ -20,8 +20,9 @@ from natcoord_jax.control.refinement import with_steps
 
 AIM = 0.6
 """Error that is aimed at, in terms of what is tolerated."""
-FEWEST_PARTS, MOST_PARTS = 0.5, 10.0
-"""Parts into which a step is divided in one round; half a part is one with its neighbour."""
+FEWEST_PARTS, MOST_PARTS, MOST_ABOUT_JUMPS = 0.5, 100.0, 10.0
+"""Parts into which a step is divided in one round; half a part is one with its neighbour. Where an input
+jumps is known only as well as the mesh is fine."""
 GROWTH = 3.0
 """Factor on the number of steps in one round at most."""
 LONGEST = 2.0
@@ -67,7 +68,7 @@ def wished(
     """Ends of the intervals that errors ask for, in each section [s]; what is left of the last one counts.
 
     An interval is as long as the errors about it allow, and no longer than `RISE` times the way from a short
-    one besides: where an input switches is known only as well as the mesh is fine.
+    one besides.
 
     Args:
         problem: the problem.
@@ -96,7 +97,7 @@ def wished(
         begin, end = np.concatenate([ends[:-1], at]), np.concatenate([ends[1:], at])
         # In the next mesh it may be in the middle of a step, where the error is largest.
         worse = np.sqrt(worst[here][row] / middle[here][row, column])
-        short = size[here][row] / np.clip(worse, FEWEST_PARTS, MOST_PARTS)
+        short = size[here][row] / np.clip(worse, FEWEST_PARTS, MOST_ABOUT_JUMPS)
         found.append(_marched(begin, end, np.concatenate([allowed[here], short])))
     return found
 

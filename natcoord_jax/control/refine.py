@@ -190,10 +190,11 @@ def _finer(rounds: "_Rounds", tolerance: float, longest: list[float], most: int)
     problem = rounds.solution.problem
     wishes = wished(problem, rounds.errors, tolerance, longest)
     now, asked = present(problem), asked_for(problem, wishes)
-    if not rounds.stuck and worth_moving(now, asked, rounds.worst, tolerance):
-        yield divided(problem, wishes, now)
     more = more_of(now, asked, most // problem.inputs.every)
-    if more.sum() > now.sum():
+    full = more.sum() <= now.sum()
+    if not rounds.stuck and (full or worth_moving(now, asked, rounds.worst, tolerance)):
+        yield divided(problem, wishes, now)
+    if not full:
         yield divided(problem, wishes, more)
 
 
