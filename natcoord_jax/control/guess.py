@@ -6,6 +6,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.control.problem import OptimalControl
@@ -92,6 +93,7 @@ def unknowns_of(problem: OptimalControl, guess: Any, lifted: bool) -> Unknowns:
     if guess.free is not None:
         free = (_shaped(guess.free, reference.shape, "free") - reference) / scale
     structure = problem.system.structure
+    _refuse_rates(problem, guess)
     shape = (problem.steps, len(structure.inputs))
     inputs = jnp.zeros(shape) if guess.inputs is None else _shaped(guess.inputs, shape, "inputs")
     y = jnp.zeros((problem.steps, structure.unknowns + structure.multipliers))
@@ -99,6 +101,17 @@ def unknowns_of(problem: OptimalControl, guess: Any, lifted: bool) -> Unknowns:
     unknowns = _moving(problem, guess, Unknowns(problem.inputs.fitted(decided), free, y), lifted)
     unknown = any(not number.given for number in problem.cost.parameters())
     return with_peaks(problem, unknowns, lifted) if unknown and guess.free is None else unknowns
+
+
+def _refuse_rates(problem: OptimalControl, guess: Guess) -> None:
+    """Refuse rates of a wrong shape, also where the method does not need them."""
+    count = problem.system.structure.unknowns
+    allowed = (count,), (problem.steps, count)
+    if guess.rates is not None and np.shape(guess.rates) not in allowed:
+        raise ValueError(
+            f"guess: rates [rad/s, m/s] have shape {np.shape(guess.rates)}; this problem needs {allowed[0]} "
+            f"for constant ones or {allowed[1]} for those of all steps, in the order of `problem.rates`"
+        )
 
 
 def _moving(problem: OptimalControl, guess: Guess, unknowns: Unknowns, lifted: bool) -> Unknowns:
