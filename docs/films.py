@@ -41,6 +41,8 @@ def main() -> None:
         names: dict = {"__name__": "page"}
         for block in re.findall(r"^```python\n(.*?)^```", text, re.DOTALL | re.MULTILINE):
             exec(compile(block, name, "exec"), names)
+        if "found" not in names:
+            continue
         with tempfile.TemporaryDirectory() as folder:
             film = Path(folder) / "film.gif"
             if "draw" in names:

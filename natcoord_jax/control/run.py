@@ -12,7 +12,7 @@ from natcoord_jax.control.guess import GUESS, Guess, unknowns_of
 from natcoord_jax.control.ipopt import MOST, installed
 from natcoord_jax.control.iterate import Iterate, Options
 from natcoord_jax.control.problem import PROBLEM, OptimalControl, numeric
-from natcoord_jax.control.reasons import outside_at_start
+from natcoord_jax.control.reasons import outside_at_start, waiting
 from natcoord_jax.control.results import Outcome
 from natcoord_jax.control.solution import Solution
 from natcoord_jax.control.transcription import Unknowns, held_inputs
@@ -110,7 +110,8 @@ def optimise(
     start = unknowns_of(problem, guess, lifted)
     search = Search(problem, Options(lifted, max_iterations, tol, goal_tol), progress, time_limit)
     found = _attempted(search, method, start, guess)
-    return dataclasses.replace(found, note=_lost_turns(given, start, found))
+    notes = _lost_turns(given, start, found), waiting(problem, found.free)
+    return dataclasses.replace(found, note="; ".join(note for note in notes if note))
 
 
 def _refuse(problem: OptimalControl, guess: Guess) -> None:
