@@ -25,7 +25,7 @@ TERMINAL = FunctionOf("(state) -> cost", 1)
 PEAK = FunctionOf("(state, u, t) -> number", 3)
 
 
-def returned(value: Any, name: str) -> Any:
+def _returned(value: Any, name: str) -> Any:
     """What a function returned.
 
     Raises:
@@ -161,7 +161,7 @@ class Running(Cost):
 
     def running(self, system: System, state: State, u: Array, t: Array) -> Float[Array, ""]:
         """Value of the function."""
-        return jnp.asarray(self.weight * returned(self.function(state, u, t), "Running"), float)
+        return jnp.asarray(self.weight * _returned(self.function(state, u, t), "Running"), float)
 
 
 class Terminal(Cost):
@@ -177,7 +177,7 @@ class Terminal(Cost):
 
     def terminal(self, system: System, state: State) -> Float[Array, ""]:
         """Value of the function."""
-        return jnp.asarray(self.weight * returned(self.function(state), "Terminal"), float)
+        return jnp.asarray(self.weight * _returned(self.function(state), "Terminal"), float)
 
 
 class Missed(Cost):

@@ -12,6 +12,7 @@ from natcoord_jax.control.goal import Attitude
 from natcoord_jax.control.goal_links import Turned
 from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.control.transcription import Unknowns, roll, simulated
+from natcoord_jax.core.bodies import by_node
 from natcoord_jax.core.compiled import briefly
 from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.handles import named
@@ -47,7 +48,7 @@ def _positions(problem: OptimalControl, unknowns: Unknowns, simulate: bool) -> t
 
 def turned_along(problem: OptimalControl, x: Any, names: list[str]) -> Angles:
     """How far bodies turn along states as vectors."""
-    rows = np.asarray(x)[:, : problem.state.q.size].reshape(len(x), -1, 4, 3)
+    rows = by_node(np.asarray(x)[:, : problem.state.q.size].reshape(len(x), -1, 3))
     return {name: _summed(rows[:, problem.system.body_index(name), 1:]) for name in names}
 
 
