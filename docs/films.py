@@ -1,5 +1,7 @@
 """Films of the pages on optimal control: runs their code and draws the motion found, small.
 
+A page that draws something else has a function `draw` of the file.
+
 python docs/films.py            all pages
 python docs/films.py peak room  some of them
 """
@@ -39,8 +41,14 @@ def main() -> None:
         names: dict = {"__name__": "page"}
         for block in re.findall(r"^```python\n(.*?)^```", text, re.DOTALL | re.MULTILINE):
             exec(compile(block, name, "exec"), names)
+        if "found" not in names:
+            continue
         with tempfile.TemporaryDirectory() as folder:
-            film = Path(nc.animate(names["found"], file=Path(folder) / "film.gif", **names.get("film", {})))
+            film = Path(folder) / "film.gif"
+            if "draw" in names:
+                names["draw"](film)
+            else:
+                nc.animate(names["found"], file=film, **names.get("film", {}))
             shrunk(film, PAGES / "films" / f"control_{name}.gif")
         print(name, (PAGES / "films" / f"control_{name}.gif").stat().st_size, "bytes")
 

@@ -477,6 +477,10 @@ CALLS = {
         "problem": [w.problem], "path": [lambda problem, s: problem], "guess": [np.ones((2, 1))],
         "first": NUMBER, "least": NUMBER, "progress": FLAG, "time_limit": NUMBER, **SOLVED,
     },
+    "refine": lambda w: {
+        "problem": [w.problem, w.solution], "tolerance": NUMBER, "max_rounds": WHOLE, "max_steps": WHOLE,
+        "progress": FLAG, "time_limit": NUMBER, **SOLVED,
+    },
     "descend": lambda w: {
         "problem": [w.problem], "guess": [np.ones((2, 1))], "optimiser": [optax.sgd(0.1)],
         "iterations": WHOLE,
@@ -553,8 +557,8 @@ CALLS = {
 MADE = {
     "Accuracy", "Balance", "BeamHandle", "Check", "ComputedTorque", "Contacts", "Continuation",
     "DerivativeError", "Edge", "Equilibrium", "Feedback", "Frame", "Growth", "Horizons", "Identified", "Load",
-    "MeshHandle", "Modes", "NodeKind", "Nodes", "NonlinearProgram", "Optima", "Outcome", "Result",
-    "SimulationError", "Solution", "State", "Steps", "Surface", "Sweep", "System",
+    "MeshHandle", "Modes", "NodeKind", "Nodes", "NonlinearProgram", "Optima", "Outcome", "Refinement",
+    "Result", "SimulationError", "Solution", "State", "Steps", "Surface", "Sweep", "System",
     "Trajectory",
 }  # fmt: skip
 BASES = {

@@ -476,3 +476,21 @@ def test_derivatives_of_the_program_are_those_of_its_values(mixed):
     np.testing.assert_allclose((ends[0] - ends[1]) / (2 * step), exact, rtol=1e-6, atol=1e-6)
     assert len(program.names) == program.lower.size
     assert len(set(mixed.end_labels)) == len(mixed.end_labels) == 7
+
+
+@pytest.mark.exhaustive
+def test_turns_of_a_guess_that_are_lost_are_told(hinged):
+    """A torque that turns the disc once and a sixth; the way to the goal that is taken is the short one."""
+    half = 0.5
+    there = nc.goal.Attitude("disc", (math.cos(half), 0.0, 0.0, math.sin(half)))
+    problem = on_disc(hinged, there & REST())
+    # Half of u / I is the angle after a second, nearly: steps turn it a little less.
+    once = np.full((20, 1), 2 * INERTIA * (1.0 + 2 * math.pi))
+    found = solved(problem, once, method="lifted")
+    assert "turns 'disc' by 1.1" in found.note and "(0, 0, 1), and the solution by 0.16" in found.note
+    assert "nc.goal.Turned('disc', (0, 0, 1), 7.2832)" in found.explain()
+    # What keeps the turn, or says it, hears nothing.
+    kept = solved(problem, nc.Guess(rates=(1.0 + 2 * math.pi,)), method="lifted")
+    assert float(kept.trajectory.states.coordinates[-1, 0]) == pytest.approx(1.0 + 2 * math.pi)
+    assert kept.note == "" and solved(problem, kept, method="lifted").note == ""
+    assert solved(problem, nc.Guess(rates=(1.0,)), method="lifted").note == ""

@@ -40,7 +40,7 @@ SLOW = """
 # ... and for more than five seconds, 90 s in all. Those of all other modules take 6 s together.
 EXHAUSTIVE = """
     analysis.accuracy analysis.load_path bodies.gas bodies.loads control.computed_torque
-    control.continuation control.identify control.nlp control.problem
+    control.continuation control.identify control.nlp control.problem control.refine
 """.split()
 COMPILING = {f"natcoord_jax.{name}" for name in SLOW + EXHAUSTIVE}
 RUN = """

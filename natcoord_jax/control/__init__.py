@@ -26,6 +26,8 @@ from natcoord_jax.control.parameters import Parameter as Parameter
 from natcoord_jax.control.problem import OptimalControl as OptimalControl
 from natcoord_jax.control.receding import Horizons as Horizons
 from natcoord_jax.control.receding import receding_horizon as receding_horizon
+from natcoord_jax.control.refine import Refinement as Refinement
+from natcoord_jax.control.refine import refine as refine
 from natcoord_jax.control.results import Outcome as Outcome
 from natcoord_jax.control.run import optimise as optimise
 from natcoord_jax.control.run import optimise_jit as optimise_jit

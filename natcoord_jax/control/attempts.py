@@ -18,7 +18,7 @@ from natcoord_jax.control.iterate import Iterate, Options
 from natcoord_jax.control.nlp import program_with_states
 from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.control.reach import unreached
-from natcoord_jax.control.reasons import nearest, worst_condition
+from natcoord_jax.control.reasons import nearest, needed, worst_condition
 from natcoord_jax.control.results import Outcome
 from natcoord_jax.control.solution import Attempt, Row, Solution, solution_of
 from natcoord_jax.control.transcription import Unknowns
@@ -57,7 +57,7 @@ MANY = 100
 """Iterations that it may take at least."""
 CERTAIN = 0.05
 """Part of what is missing that inputs have to leave, to first order, where a goal counts as out of reach."""
-WIDER = (1.25, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
+WIDER = (1.25, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0, 64.0)
 """Factors on the limits of the inputs that are tried where none was restored within them."""
 
 
@@ -279,7 +279,8 @@ def _unreachable(search: Search, found: Solution, iterate: Iterate, scale: Any) 
             start = eqx.tree_at(lambda u: u.coefficients, begin, factor * begin.coefficients)
             restored = search.run(False, start, scale=scale, problem=wider)
             if restored.ok:
-                reason += f"; with {factor:g} times the limits of the inputs it comes near"
+                reason += f"; with {factor:g} times the limits of the inputs it comes near: "
+                reason += needed(wider, problem)
             if restored.outcome is not Outcome.UNREACHABLE or search.left <= 0:
                 break
     del search.attempts[attempts:], search.history[rows:]

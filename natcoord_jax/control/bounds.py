@@ -29,7 +29,7 @@ from natcoord_jax.core.state import State
 from natcoord_jax.system import System
 
 LIMIT = Number(infinite=True) | Numbers((None,), infinite=True)
-EXCESS = FunctionOf("(state, u, t) -> number or vector")
+EXCESS = FunctionOf("(state, u, t) -> number or vector", 3)
 
 
 class Range(Bound):

@@ -14,14 +14,26 @@ from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.callables import Function
 from natcoord_jax.core.checks import for_each
 from natcoord_jax.core.kinds import NAME, FunctionOf, Several, of
-from natcoord_jax.core.numeric import Number, Vector
+from natcoord_jax.core.numeric import Number, Numbers
 from natcoord_jax.core.state import State
 from natcoord_jax.system import System
 
-WEIGHTS = Number() | Vector(None)
-RUNNING = FunctionOf("(state, u, t) -> cost per second")
-TERMINAL = FunctionOf("(state) -> cost")
-PEAK = FunctionOf("(state, u, t) -> number")
+WEIGHTS = Number("not negative") | Numbers((None,), "not negative")
+BEFORE = Number() | Numbers((None,))
+RUNNING = FunctionOf("(state, u, t) -> cost per second", 3)
+TERMINAL = FunctionOf("(state) -> cost", 1)
+PEAK = FunctionOf("(state, u, t) -> number", 3)
+
+
+def _returned(value: Any, name: str) -> Any:
+    """What a function returned.
+
+    Raises:
+        ValueError: for nothing.
+    """
+    if value is None:
+        raise ValueError(f"cost.{name}: the function returned None; let it return a number")
+    return value
 
 
 class Cost(Carrier):
@@ -149,7 +161,7 @@ class Running(Cost):
 
     def running(self, system: System, state: State, u: Array, t: Array) -> Float[Array, ""]:
         """Value of the function."""
-        return jnp.asarray(self.weight * self.function(state, u, t), float)
+        return jnp.asarray(self.weight * _returned(self.function(state, u, t), "Running"), float)
 
 
 class Terminal(Cost):
@@ -165,7 +177,7 @@ class Terminal(Cost):
 
     def terminal(self, system: System, state: State) -> Float[Array, ""]:
         """Value of the function."""
-        return jnp.asarray(self.weight * self.function(state), float)
+        return jnp.asarray(self.weight * _returned(self.function(state), "Terminal"), float)
 
 
 class Missed(Cost):
@@ -218,7 +230,7 @@ class InputRate(Cost):
     """
 
     weight: Any = eqx.field(default=1.0, metadata=is_a(WEIGHTS))
-    before: Any = eqx.field(default=None, kw_only=True, metadata=is_a(WEIGHTS))
+    before: Any = eqx.field(default=None, kw_only=True, metadata=is_a(BEFORE))
 
     def looks_back(self) -> bool:
         """It does."""

@@ -36,7 +36,7 @@ from natcoord_jax.maths.rotations import angular_velocity, from_quaternion, to_r
 from natcoord_jax.system import System
 
 ROTATION = Numbers((4,)) | Rotations()
-RESIDUAL = FunctionOf("(state) -> number or vector")
+RESIDUAL = FunctionOf("(state) -> number or vector", 1)
 
 
 class Attitude(Goal):

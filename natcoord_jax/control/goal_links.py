@@ -18,8 +18,8 @@ from natcoord_jax.core.state import State
 from natcoord_jax.maths.rotations import to_rotation_vector
 from natcoord_jax.system import System
 
-LINK = FunctionOf("(first state, last state) -> number or vector")
-DENSITY = FunctionOf("(state, u, t) -> number per second")
+LINK = FunctionOf("(first state, last state) -> number or vector", 2)
+DENSITY = FunctionOf("(state, u, t) -> number per second", 3)
 
 
 def numbered(name: str, count: int) -> tuple[str, ...]:

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from natcoord_jax.control.mesh import member, spans
 from natcoord_jax.control.phases import filled, most_unknowns, rates_of
 from natcoord_jax.control.problem import OptimalControl
+from natcoord_jax.control.resampling import free_of_swings
 from natcoord_jax.control.tangent import steady_rates
 from natcoord_jax.control.transcription import (
     Node,
@@ -96,6 +97,7 @@ def unknowns_of(problem: OptimalControl, guess: Any, lifted: bool) -> Unknowns:
     if guess.free is not None:
         free = (_shaped(guess.free, reference.shape, "free") - reference) / scale
     structure = problem.system.structure
+    _refuse_rates(problem, guess)
     shape = (problem.steps, len(structure.inputs))
     inputs = jnp.zeros(shape) if guess.inputs is None else _shaped(guess.inputs, shape, "inputs")
     y = jnp.zeros((problem.steps, most_unknowns(problem.systems)[0]))
@@ -103,6 +105,17 @@ def unknowns_of(problem: OptimalControl, guess: Any, lifted: bool) -> Unknowns:
     unknowns = _moving(problem, guess, Unknowns(problem.inputs.fitted(decided), free, y), lifted)
     unknown = any(not number.given for number in problem.cost.parameters())
     return with_peaks(problem, unknowns, lifted) if unknown and guess.free is None else unknowns
+
+
+def _refuse_rates(problem: OptimalControl, guess: Guess) -> None:
+    """Refuse rates of a wrong shape, also where the method does not need them."""
+    count = problem.system.structure.unknowns
+    allowed = (count,), (problem.steps, count)
+    if guess.rates is not None and np.shape(guess.rates) not in allowed:
+        raise ValueError(
+            f"guess: rates [rad/s, m/s] have shape {np.shape(guess.rates)}; this problem needs {allowed[0]} "
+            f"for constant ones or {allowed[1]} for those of all steps, in the order of `problem.rates`"
+        )
 
 
 def _moving(problem: OptimalControl, guess: Guess, unknowns: Unknowns, lifted: bool) -> Unknowns:
@@ -158,14 +171,6 @@ def taken_up(
     pieces = [rates[a:b] for a, b in spans(problem.phases)]
     firsts = [first, *(piece[0] for piece in pieces[1:])]
     return jnp.concatenate([free_of_swings(jnp, x[None], piece) for x, piece in zip(firsts, pieces)])
-
-
-def free_of_swings(xp: Any, first: Any, rates: Any) -> Any:
-    """Means of rates at the ends of steps that are themselves means of the given ones, by JAX or NumPy."""
-    inner = 0.5 * (rates[1:] + rates[:-1])
-    last = rates[-1:] if len(rates) < 2 else 1.5 * rates[-1:] - 0.5 * rates[-2:-1]
-    ends = xp.concatenate([first, inner, last])
-    return 0.5 * (ends[1:] + ends[:-1])
 
 
 def with_rates(problem: OptimalControl, unknowns: Unknowns, rates: Float[Array, "steps n"]) -> Unknowns:

@@ -5,6 +5,7 @@ of the step before. What it needs it declares as a number of its own memory, and
 step to step; the node that one step hands to the next carries it. What nobody asks for is not carried.
 """
 
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -68,6 +69,12 @@ class Carrier(Part):
     def inside(self) -> tuple["Carrier", ...]:
         """Goals, costs or bounds that it holds."""
         return ()
+
+    def everything(self) -> Iterator["Carrier"]:
+        """It, what it holds, and so on."""
+        yield self
+        for part in self.inside():
+            yield from part.everything()
 
     def own(self, system: System) -> int:
         """How many numbers it needs besides those of what it holds."""

@@ -17,6 +17,7 @@ from natcoord_jax.control.memory import Carrier, Ending, Step
 from natcoord_jax.control.mesh import durations, mesh_of
 from natcoord_jax.control.parameters import FreeNumber
 from natcoord_jax.control.phases import Systems, check_systems
+from natcoord_jax.control.wrong import refuse_contradictions, refuse_endless_haste, refuse_state
 from natcoord_jax.core.arguments import Part, is_a
 from natcoord_jax.core.checks import is_concrete
 from natcoord_jax.core.kinds import FLAG, Several, of
@@ -163,7 +164,12 @@ class OptimalControl(Part):
             )
         if len(set(self.free)) != len(self.free):
             raise ValueError(f"what is free has the names {list(self.free)}; give each its own")
+        if self.system.structure.inputs and not self.parameters:
+            limited = bool(self.path_labels or self.goal.limits(self.system))
+            refuse_endless_haste(self.cost, limited, [lower for lower, _ in self._time_limits()])
+        refuse_contradictions(self.goal, self.bounds)
         if is_concrete(eqx.filter((self.system, self.state), eqx.is_array)):
+            refuse_state(self.system, self.state)
             self._check_shapes()
 
     def _check_shapes(self) -> None:

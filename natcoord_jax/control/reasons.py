@@ -5,6 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from natcoord_jax.control.bounds import Input
+from natcoord_jax.control.cost import Duration
 from natcoord_jax.control.iterate import Iterate
 from natcoord_jax.control.motion import motion
 from natcoord_jax.control.problem import OptimalControl
@@ -17,6 +19,8 @@ AT_BOUND = 1e-9
 """Excess, in half a range, that is rounding."""
 AT_LIMIT = 0.01
 """Room to a bound, in half a range, of what counts as at its limit."""
+ENDLESS = 5.0
+"""Growth of a free time, relative to its first guess, that is worth telling."""
 NAMED = 3
 """How many violated conditions a message names."""
 
@@ -71,6 +75,38 @@ def nearest(problem: OptimalControl, iterate: Iterate) -> str:
     names = unique(problem.goal.labels(problem.system))
     missed = _largest_of(names, np.asarray(iterate.path.end.missing))
     return f"the nearest motion misses {missed}{at_limits(problem, iterate)}"
+
+
+def needed(wider: OptimalControl, problem: OptimalControl) -> str:
+    """Limits of the inputs that would do, beside those there are."""
+    time, found = float(jnp.sum(problem.lengths(jnp.zeros(len(problem.free))))), []
+    for wide, bound in zip(wider.bounds.everything(), problem.bounds.everything()):
+        if isinstance(bound, Input) and isinstance(wide, Input):
+            names = ", ".join(bound.names(problem.system))
+            found.append(f"{names} from {_range(wide)}; the limits are {_range(bound)}")
+    return f"reaching the goal in {time:.4g} s needs {', '.join(found)} [N, N m]"
+
+
+def _range(bound: Input) -> str:
+    lower, upper = (np.asarray(x) for x in (bound.lower, bound.upper))
+    if lower.ndim or upper.ndim:
+        return f"{np.round(lower, 6).tolist()} to {np.round(upper, 6).tolist()}"
+    return f"{float(lower):.4g} to {float(upper):.4g}"
+
+
+def waiting(problem: OptimalControl, free: dict[str, float]) -> str:
+    """That a free time has grown without end, where nothing makes waiting cost; nothing where it has not."""
+    costly = any(isinstance(part, Duration) for part in problem.cost.everything())
+    values, first = list(free.values())[: problem.times], np.asarray(problem.references()[0])
+    upper = problem.limits()[1]
+    for k, (name, value) in enumerate(zip(problem.free, values)):
+        if not costly and not np.isfinite(upper[k]) and value > ENDLESS * float(first[k]):
+            return (
+                f"{name} has grown from {float(first[k]):.4g} to {value:.4g}: where waiting costs nothing "
+                "the best time is without end; add nc.cost.Duration() to the cost or an upper limit, "
+                "free_time=(lower, upper)"
+            )
+    return ""
 
 
 def at_limits(problem: OptimalControl, iterate: Iterate) -> str:

@@ -1,5 +1,6 @@
 """The entrances: an optimisation with progress and a way out, and one that compiles into other programs."""
 
+import dataclasses
 import math
 from typing import Annotated, Any
 
@@ -11,11 +12,14 @@ from natcoord_jax.control.guess import GUESS, Guess, unknowns_of
 from natcoord_jax.control.ipopt import MOST, installed
 from natcoord_jax.control.iterate import Iterate, Options
 from natcoord_jax.control.problem import PROBLEM, OptimalControl, numeric
-from natcoord_jax.control.reasons import outside_at_start
+from natcoord_jax.control.reasons import outside_at_start, waiting
 from natcoord_jax.control.results import Outcome
 from natcoord_jax.control.simultaneous import sizes_of
 from natcoord_jax.control.solution import Solution
 from natcoord_jax.control.transcription import Unknowns, held_inputs
+from natcoord_jax.control.turns import lost as lost_turns
+from natcoord_jax.control.turns import turned_along, turned_by, uncounted
+from natcoord_jax.control.undefined import idle_inputs, refuse_undefined
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.compiled import compiled
 from natcoord_jax.core.kinds import FLAG, Choice, Concrete, of
@@ -84,24 +88,49 @@ def optimise(
         what was reached.
 
     Raises:
-        ValueError: for a guess of the wrong shape or an unknown method.
+        ValueError: for a guess of the wrong shape or an unknown method; for a running cost or a bound without
+            a value or slope at the start; where no input acts on anything.
         ModuleNotFoundError: for method "ipopt" where it is not installed.
     """
     problem = numeric(problem)
-    lifted = chosen(problem, method, guess)
+    lifted, given = chosen(problem, method, guess), guess
     if isinstance(guess, Solution):
-        guess = guess.guess(problem.steps)
+        guess = guess.guess_for(problem)
     guess = guess if isinstance(guess, Guess) else Guess(inputs=guess)
-    start = unknowns_of(problem, guess, lifted)
     outside = outside_at_start(problem)
     if outside:
+        # (Nothing is made of the guess then that would have to be compiled.)
+        start = unknowns_of(problem, Guess(inputs=guess.inputs, free=guess.free), False)
         names, values = problem.free, np.asarray(problem.values(start.free)).tolist()
         inputs, dt = held_inputs(problem, start.coefficients), float(problem.applied(start.free)[1])
         code = int(Outcome.INFEASIBLE_START)
         reason = ", ".join(f"{name}, missed by {x:.2g} of half the range" for name, x in outside.items())
         free = dict(zip(names, values))
         return Solution(problem, inputs, free, dt, math.nan, code, NAMES[lifted], reason=reason)
+    _refuse(problem, guess)
+    start = unknowns_of(problem, guess, lifted)
     search = Search(problem, Options(lifted, max_iterations, tol, goal_tol), progress, time_limit)
+    found = _attempted(search, method, start, guess)
+    notes = _lost_turns(given, start, found), waiting(problem, found.free)
+    return dataclasses.replace(found, note="; ".join(note for note in notes if note))
+
+
+def _refuse(problem: OptimalControl, guess: Guess) -> None:
+    """Refuse what can be seen to lead nowhere before anything is compiled."""
+    if not problem.free_numbers:
+        refuse_undefined(problem, None if guess.inputs is None else np.asarray(guess.inputs)[0])
+    channels, idle = problem.system.structure.inputs, idle_inputs(problem)
+    if channels and len(idle) == len(channels) and not problem.free_numbers:
+        raise ValueError(
+            f"the inputs {list(idle)} act on no free motion of the system: their gear is zero, or they push "
+            "along or about what the joint holds, as nc.JointTorque does on a slide; give them a gear, or "
+            "use nc.JointForce on slides"
+        )
+
+
+def _attempted(search: Search, method: str, start: Unknowns, guess: Guess) -> Solution:
+    """The best of all attempts that the method allows."""
+    problem, lifted = search.problem, search.options.lifted
     if method == "ipopt":
         return search.by_ipopt(unknowns_of(problem, guess, True))
     # Restored motions are gone on from in the lifted form.
@@ -121,6 +150,22 @@ def optimise(
     if restorable and not over(found) and search.left > 0:
         found = after_restoration(search, found, guess)
     return found
+
+
+def _lost_turns(given: Any, start: Unknowns, found: Solution) -> str:
+    """Whole turns of a guess that the solution has not, in words."""
+    problem, iterate = found.problem, found.iterate
+    names = uncounted(problem)
+    if given is None or iterate is None or not names:
+        return ""
+    if isinstance(given, Solution) and given.iterate is not None:
+        turned = turned_along(given.problem, given.iterate.path.nodes.x, names)
+    else:
+        by_inputs = not isinstance(given, Guess) or given.rates is None
+        if by_inputs and isinstance(given, Guess) and given.inputs is None:
+            return ""
+        turned = turned_by(problem, start, names, by_inputs)
+    return "; ".join(lost_turns(turned, turned_along(problem, iterate.path.nodes.x, names)))
 
 
 def _lost(found: Solution) -> bool:

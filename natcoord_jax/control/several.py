@@ -97,10 +97,10 @@ def multi_start(
     """
     problem = numeric(problem)
     lifted = chosen(problem, method)
-    guess = guess.guess(problem.steps) if isinstance(guess, Solution) else guess
+    guess = guess.guess_for(problem) if isinstance(guess, Solution) else guess
     options = Options(lifted, max_iterations, tol, goal_tol)
     if isinstance(guess, Sequence) and guess and isinstance(guess[0], Guess | Solution):
-        plain = [g.guess(problem.steps) if isinstance(g, Solution) else g for g in guess]
+        plain = [g.guess_for(problem) if isinstance(g, Solution) else g for g in guess]
         every = [unknowns_of(problem, g, lifted) for g in plain]
         many = jax.tree.map(lambda *x: jnp.stack(x), *every)
     else:

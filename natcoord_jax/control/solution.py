@@ -10,12 +10,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.analysis.phases import Phases
-from natcoord_jax.control.guess import Guess, free_of_swings
+from natcoord_jax.control.guess import Guess
 from natcoord_jax.control.iterate import Iterate
 from natcoord_jax.control.motion import motion, motions
 from natcoord_jax.control.phases import most_unknowns, rates_of
 from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.control.reasons import seen, unique, worst_condition
+from natcoord_jax.control.resampling import Ends, averaged, ends_of, in_phases, in_proportion, interpolated
 from natcoord_jax.control.results import ADVICE, OUTCOMES, Outcome
 from natcoord_jax.control.transcription import Unknowns, followed, held_inputs, roll, simulated
 from natcoord_jax.core.arguments import checked
@@ -95,6 +96,7 @@ class Solution(eqx.Module):
         history: one row for each iteration, of all attempts.
         reason: what was seen where it did not end well.
         attempts: those before the last one.
+        note: what is to be known of it however it ended, as whole turns of the guess that it has not.
     """
 
     problem: OptimalControl
@@ -109,6 +111,7 @@ class Solution(eqx.Module):
     history: list[Row] = eqx.field(default_factory=list)
     reason: str = ""
     attempts: list[Attempt] = eqx.field(default_factory=list)
+    note: str = ""
 
     @property
     def outcome(self) -> Outcome:
@@ -189,7 +192,7 @@ class Solution(eqx.Module):
         return found | {name: np.asarray(m.path)[:, k] for k, name in enumerate(bounds)}
 
     def explain(self) -> str:
-        """How it ended, in words, with what was seen, and the attempts before the last one."""
+        """How it ended, in words, with what was seen and what is to be known, and the attempts before."""
         text = OUTCOMES[self.outcome]
         if self.iterate is not None or self.history:
             text += f" after {len(self.history)} iterations by {self.method}"
@@ -203,25 +206,35 @@ class Solution(eqx.Module):
         if not self.ok:
             text += f"; {self.reason}" if self.reason else ""
             text += f"; {ADVICE[self.outcome]}" if self.outcome in ADVICE else ""
+        text += f"; {self.note}" if self.note else ""
         return text + "".join(f"\n  before that, {attempt}" for attempt in self.attempts)
 
     @checked("Solution.guess", steps=Whole(1))
     def guess(self, steps: int | None = None) -> Guess:
         """A guess for another problem, with the inputs resampled in time to another number of steps."""
-        rates = None
-        systems = self.problem.systems
+        ends = ends_of(self.problem)
+        return self._on(in_proportion(ends, steps or self.problem.steps))
+
+    def guess_for(self, problem: OptimalControl) -> Guess:
+        """A guess for a problem with other steps: with as many phases, what belongs to the same times."""
+        if len(problem.phases) == len(self.problem.phases):
+            return self._on(ends_of(problem))
+        return self.guess(problem.steps)
+
+    def _on(self, new: Ends) -> Guess:
+        rates, old = None, ends_of(self.problem)
+        systems, phases = self.problem.systems, self.problem.phases
         if self.iterate is not None and all(system.structure.solver == "reduced" for system in systems):
-            known = rates_of(systems, self.problem.phases)
+            known = rates_of(systems, phases)
             rates = np.where(known, self.iterate.unknowns.y, 0.0)[:, : most_unknowns(systems)[1]]
         free = [self.free[name] for name in self.problem.free] or None
-        steps = steps or self.problem.steps
-        if rates is not None:
+        if rates is not None and self.problem.later:
             # Those of different systems are not of the same motions.
-            phases = self.problem.phases if self.problem.later else (self.problem.steps,)
-            counts = [count * steps // self.problem.steps for count in phases]
-            pieces = np.split(rates, np.cumsum(phases)[:-1])
-            rates = np.concatenate([_interpolated(x, count) for x, count in zip(pieces, counts)])
-        return Guess(_resampled(np.asarray(self.inputs), steps), rates=rates, free=free)
+            pieces = zip(np.split(rates, np.cumsum(phases)[:-1]), in_phases(old), in_phases(new))
+            rates = np.concatenate([interpolated(*piece) for piece in pieces])
+        elif rates is not None:
+            rates = interpolated(rates, old, new)
+        return Guess(averaged(np.asarray(self.inputs), old, new), rates=rates, free=free)
 
     @checked("Solution.save", file=FILE)
     def save(self, file: str | Path) -> None:
@@ -262,34 +275,12 @@ def load_guess(file: str | Path, steps: int | None = None) -> Guess:
     except (json.JSONDecodeError, KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{file} is not a solution that `Solution.save` wrote: {error}") from error
     count = inputs.shape[0] if steps is None else steps
+    old, new = (np.linspace(0.0, 1.0, number + 1) for number in (len(inputs), count))
     return Guess(
-        _resampled(inputs, count),
-        rates=None if rates is None else _interpolated(rates, count),
+        averaged(inputs, old, new),
+        rates=None if rates is None else interpolated(rates, old, new),
         free=content["free"],
     )
-
-
-def _resampled(values: np.ndarray, steps: int) -> np.ndarray:
-    """Means of a history held over steps, over as many other steps of the same duration."""
-    count = values.shape[0]
-    if count == steps:
-        return values
-    ends = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
-    at = np.linspace(0.0, count, steps + 1)
-    total = np.stack([np.interp(at, np.arange(count + 1), column) for column in ends.T], axis=1)
-    return np.diff(total, axis=0) * steps / count
-
-
-def _interpolated(values: np.ndarray, steps: int) -> np.ndarray:
-    """Values at the middles of steps, at those of others; a staircase would shake the motion."""
-    count = values.shape[0]
-    if count == steps:
-        return values
-    at, old = (np.arange(steps) + 0.5) / steps, (np.arange(count) + 0.5) / count
-    found = np.stack([np.interp(at, old, column) for column in values.T], axis=1)
-    # The kinks between the old middles excite swings from step to step.
-    first = 1.5 * found[:1] - 0.5 * found[1:2] if steps > 1 else found
-    return free_of_swings(np, first, found)
 
 
 @eager_numpy
