@@ -190,6 +190,11 @@ class Coordinate(Range):
         """The coordinate."""
         return system.coordinate(state, self.joint, index=self.index)[None]
 
+    def kept(self) -> dict[str, tuple[Any, Any]]:
+        """Its limits."""
+        what = f"coordinate {self.index} of {named(self.joint)!r} [rad or m]"
+        return {what: (self.lower, self.upper)}
+
     def names(self, system: System) -> tuple[str, ...]:
         """The joint."""
         return (f"coordinate {self.index} of {named(self.joint)!r}",)
@@ -211,6 +216,11 @@ class Rate(Range):
     def values(self, system: System, state: State, u: Array) -> Float[Array, " n"]:
         """The rate."""
         return system.rate(state, self.joint, index=self.index)[None]
+
+    def kept(self) -> dict[str, tuple[Any, Any]]:
+        """Its limits."""
+        what = f"rate {self.index} of {named(self.joint)!r} [rad/s or m/s]"
+        return {what: (self.lower, self.upper)}
 
     def names(self, system: System) -> tuple[str, ...]:
         """The joint."""

@@ -34,6 +34,10 @@ class Bound(Carrier):
         """The same with the limits of inputs so many times as wide; itself if it has none."""
         return self
 
+    def kept(self) -> dict[str, tuple[Any, Any]]:
+        """Limits of what goals want values of, by what of, as these have it."""
+        return {}
+
     def __and__(self, other: "Bound") -> "Bound":
         if not isinstance(other, Bound):
             return NotImplemented

@@ -1,6 +1,8 @@
 """Bounds of motions with phases: within some steps only, and of what the ground can give."""
 
-from typing import Any
+import dataclasses
+from collections.abc import Callable
+from typing import Any, Self
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -63,6 +65,14 @@ class During(Bound):
     def furthest(self) -> int:
         """Its last step."""
         return max(self.bound.furthest(), *(last for _, last in self.steps))
+
+    def marks(self) -> tuple[int, ...]:
+        """Where it begins and ceases to count."""
+        return tuple(mark for pair in self.steps for mark in pair)
+
+    def remarked(self, moved: Callable[[int], int]) -> Self:
+        """The same within other steps."""
+        return dataclasses.replace(self, steps=[[moved(mark) for mark in pair] for pair in self.steps])
 
     def of_step(self, system: System, memory: Array, step: Step) -> Float[Array, " n"]:
         """Excess where it counts."""

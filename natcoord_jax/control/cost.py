@@ -1,7 +1,7 @@
 """What an optimal control problem makes small: running and terminal costs, added with `+`."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -41,7 +41,12 @@ class Cost(Carrier):
 
     The integral is taken by the trapezoidal rule over every step, with the inputs held over it. A cost of
     one's own that needs the system, for its sensors, is a subclass that overrides one of the methods.
+
+    Attributes:
+        hurries: whether it is the time that passes.
     """
+
+    hurries: ClassVar[bool] = False
 
     def running(
         self, system: System, state: State, u: Float[Array, " inputs"], t: Float[Array, ""]
@@ -140,6 +145,8 @@ class Duration(Cost):
     Attributes:
         weight: [1/s].
     """
+
+    hurries: ClassVar[bool] = True
 
     weight: Any = eqx.field(default=1.0, metadata=is_a(Number()))
 

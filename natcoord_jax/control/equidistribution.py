@@ -53,6 +53,11 @@ def check_intervals(problem: OptimalControl) -> None:
     Raises:
         ValueError: for such a one.
     """
+    if problem.later:
+        raise ValueError(
+            f"refine goes along the motion of one system, and this problem has {len(problem.systems)}; pass "
+            "dt for each step where the motion is fast"
+        )
     every = problem.inputs.every
     for _, last in sections(problem):
         if last % every:

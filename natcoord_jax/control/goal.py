@@ -6,10 +6,11 @@ constraints, and goals must not contradict the conservation laws by as much.
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.control.free_motions import owners
@@ -28,6 +29,7 @@ from natcoord_jax.control.memory import Ending as Ending
 from natcoord_jax.control.tangent import steady_rates
 from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.callables import Function
+from natcoord_jax.core.checks import is_concrete
 from natcoord_jax.core.handles import Handle, named
 from natcoord_jax.core.kinds import BODY_NAME, JOINT_NAME, NAME, FunctionOf
 from natcoord_jax.core.numeric import COMPONENTS, Number, Numbers, Rotations, Whole
@@ -65,6 +67,11 @@ class Attitude(Goal):
         """Three components of the rotation that is missing."""
         return tuple(f"attitude of {named(self.body)!r}, {axis} [rad]" for axis in "xyz")
 
+    def wanted(self) -> dict[str, Any]:
+        """The attitude, as a matrix."""
+        given = jnp.asarray(self.rotation, float)
+        return {f"attitude of {named(self.body)!r} [-]": from_quaternion(given) if given.ndim == 1 else given}
+
 
 class Position(Goal):
     """Position of a point of a body: three numbers [m].
@@ -89,6 +96,13 @@ class Position(Goal):
         """Three components."""
         return tuple(f"position on {named(self.body)!r}, {axis} [m]" for axis in "xyz")
 
+    def wanted(self) -> dict[str, Any]:
+        """The position."""
+        if not is_concrete(self.point):
+            return {}
+        point = np.asarray(self.point, float).tolist()
+        return {f"position of point {point} of {named(self.body)!r} [m]": self.position}
+
 
 class Motion(Goal):
     """Velocity and angular velocity of a body: six numbers [m/s, rad/s].
@@ -100,6 +114,8 @@ class Motion(Goal):
     """
 
     body: Handle | str = eqx.field(static=True, metadata=is_a(BODY_NAME))
+    of_motion: ClassVar[bool] = True
+
     velocity: Any = eqx.field(default=(0.0, 0.0, 0.0), kw_only=True, metadata=is_a(COMPONENTS))
     angular_velocity: Any = eqx.field(default=(0.0, 0.0, 0.0), kw_only=True, metadata=is_a(COMPONENTS))
 
@@ -118,6 +134,12 @@ class Motion(Goal):
         return tuple(
             f"{kind} of {named(self.body)!r}, {axis} [{unit}]" for kind, unit in kinds for axis in "xyz"
         )
+
+    def wanted(self) -> dict[str, Any]:
+        """Both velocities."""
+        name = named(self.body)
+        turning = f"rate of turning of {name!r} [rad/s]"
+        return {f"velocity of {name!r} [m/s]": self.velocity, turning: self.angular_velocity}
 
 
 class Coordinate(Goal):
@@ -141,6 +163,10 @@ class Coordinate(Goal):
         """The coordinate."""
         return (f"coordinate {self.index} of {named(self.joint)!r} [rad or m]",)
 
+    def wanted(self) -> dict[str, Any]:
+        """The value."""
+        return {f"coordinate {self.index} of {named(self.joint)!r} [rad or m]": self.value}
+
 
 class Rate(Goal):
     """Rate of a joint coordinate: one number [rad/s or m/s].
@@ -152,6 +178,8 @@ class Rate(Goal):
     """
 
     joint: Handle | str = eqx.field(static=True, metadata=is_a(JOINT_NAME))
+    of_motion: ClassVar[bool] = True
+
     value: Any = eqx.field(default=0.0, metadata=is_a(Number()))
     index: int = eqx.field(default=0, kw_only=True, static=True, metadata=is_a(Whole(0)))
 
@@ -163,6 +191,10 @@ class Rate(Goal):
         """The rate."""
         return (f"rate {self.index} of {named(self.joint)!r} [rad/s or m/s]",)
 
+    def wanted(self) -> dict[str, Any]:
+        """The value."""
+        return {f"rate {self.index} of {named(self.joint)!r} [rad/s or m/s]": self.value}
+
 
 class Rest(Goal):
     """No motion at all: the rates of all free motions of the spanning tree are zero.
@@ -171,6 +203,8 @@ class Rest(Goal):
     as the base of a spacecraft rests when its wheels do and there is no momentum; the solver sees that. What
     is flexible springs back from where it rests: see `nc.goal.Undeformed` and `nc.goal.Equilibrium`.
     """
+
+    stops: ClassVar[bool] = True
 
     def residual(self, system: System, state: State) -> Float[Array, " n"]:
         """Rates of the free motions."""

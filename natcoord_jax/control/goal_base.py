@@ -1,5 +1,7 @@
 """What a goal is: conditions on the end of a motion, and on how it came there, joined with `&`."""
 
+from typing import Any, ClassVar
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -16,7 +18,16 @@ class Goal(Carrier):
 
     A goal of one's own overrides `residual` and `labels`. Those that look at more than the final state
     override `missing`, and those that leave some room `excess`.
+
+    Attributes:
+        of_motion: whether values that it wants are velocities.
+        stops: whether it stops all motion.
+        exact: whether what it holds is to be reached as it is.
     """
+
+    of_motion: ClassVar[bool] = False
+    stops: ClassVar[bool] = False
+    exact: ClassVar[bool] = True
 
     def residual(self, system: System, state: State) -> Float[Array, " n"]:
         """What is missing; zero where the goal is reached."""
@@ -41,6 +52,10 @@ class Goal(Carrier):
     def limits(self, system: System) -> tuple[str, ...]:
         """Name of each limit."""
         return ()
+
+    def wanted(self) -> dict[str, Any]:
+        """Values that it is to have, by what of, with the unit."""
+        return {}
 
     def __and__(self, other: "Goal") -> "Goal":
         if not isinstance(other, Goal):

@@ -5,12 +5,14 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.control.goal_base import Goal
 from natcoord_jax.control.memory import Ending, Step
 from natcoord_jax.core.arguments import is_a
 from natcoord_jax.core.callables import Function
+from natcoord_jax.core.checks import is_concrete
 from natcoord_jax.core.handles import Handle, named
 from natcoord_jax.core.kinds import BODY_NAME, JOINT_NAME, NAME, FunctionOf, Several
 from natcoord_jax.core.numeric import Directions, Number, Whole
@@ -189,3 +191,10 @@ class Turned(Goal):
     def labels(self, system: System) -> tuple[str, ...]:
         """The body."""
         return (f"angle turned by {named(self.body)!r} [rad]",)
+
+    def wanted(self) -> dict[str, Any]:
+        """The angle."""
+        if not is_concrete(self.axis):
+            return {}
+        axis = np.asarray(self.axis, float).tolist()
+        return {f"angle turned by {named(self.body)!r} about {axis} [rad]": self.angle}

@@ -1,6 +1,8 @@
 """Goals made of goals: at a waypoint, and with room."""
 
-from typing import Any
+import dataclasses
+from collections.abc import Callable
+from typing import Any, ClassVar, Self
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -51,6 +53,14 @@ class At(Goal):
         """Its step."""
         return max(self.step, self.goal.furthest())
 
+    def marks(self) -> tuple[int, ...]:
+        """Its step."""
+        return (self.step,)
+
+    def remarked(self, moved: Callable[[int], int]) -> Self:
+        """The same after another step."""
+        return dataclasses.replace(self, step=moved(self.step))
+
     def own(self, system: System) -> int:
         """What was missing, and how far limits were exceeded."""
         return sum(self.goal.sizes(system))
@@ -100,6 +110,8 @@ class Within(Goal):
         >>> import natcoord_jax as nc
         >>> goal = nc.goal.Within(nc.goal.Coordinate("hinge", 1.0), -0.1, 0.1)
     """
+
+    exact: ClassVar[bool] = False
 
     goal: Any = eqx.field(metadata=is_a(GOAL))
     lower: Any = eqx.field(default=-np.inf, metadata=is_a(LIMIT))

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 
 from natcoord_jax.control.iterate import Iterate
 from natcoord_jax.control.problem import OptimalControl
-from natcoord_jax.control.refinement import waypoints
+from natcoord_jax.control.refinement import marks
 from natcoord_jax.control.tangent import steady_rates
 from natcoord_jax.control.transcription import held_inputs, slices, times_of, unpacked
 from natcoord_jax.core.compiled import compiled
@@ -86,8 +86,8 @@ def local_errors(problem: OptimalControl, iterate: Iterate) -> LocalErrors:
 
 
 def sections(problem: OptimalControl) -> list[tuple[int, int]]:
-    """First step, and the one after the last, of pieces between ends of phases and waypoints."""
-    ends = sorted({*np.cumsum([0, *problem.phases]).tolist(), *waypoints(problem)})
+    """First step, and the one after the last, of pieces between ends of phases and marks."""
+    ends = sorted({*np.cumsum([0, *problem.phases]).tolist(), *marks(problem)})
     return list(zip(ends[:-1], ends[1:]))
 
 

@@ -5,8 +5,8 @@ of the step before. What it needs it declares as a number of its own memory, and
 step to step; the node that one step hands to the next carries it. What nobody asks for is not carried.
 """
 
-from collections.abc import Iterator
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple, Self
 
 import equinox as eqx
 import jax
@@ -96,6 +96,14 @@ class Carrier(Part):
     def furthest(self) -> int:
         """The last step after which it looks at the motion, besides its end."""
         return max((part.furthest() for part in self.inside()), default=0)
+
+    def marks(self) -> tuple[int, ...]:
+        """Numbers of steps at whose ends it begins or ceases to count, besides those of what it holds."""
+        return ()
+
+    def remarked(self, moved: Callable[[int], int]) -> Self:
+        """The same with these at other steps."""
+        return self
 
     def looks_back(self) -> bool:
         """Whether it asks for the inputs of the step before."""

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Array
 
 from natcoord_jax.control.bounds import Input
-from natcoord_jax.control.cost import Duration
+from natcoord_jax.control.cost import Cost
 from natcoord_jax.control.iterate import Iterate
 from natcoord_jax.control.motion import motion
 from natcoord_jax.control.problem import OptimalControl
@@ -96,7 +96,7 @@ def _range(bound: Input) -> str:
 
 def waiting(problem: OptimalControl, free: dict[str, float]) -> str:
     """That a free time has grown without end, where nothing makes waiting cost; nothing where it has not."""
-    costly = any(isinstance(part, Duration) for part in problem.cost.everything())
+    costly = any(part.hurries for part in problem.cost.everything() if isinstance(part, Cost))
     values, first = list(free.values())[: problem.times], np.asarray(problem.references()[0])
     upper = problem.limits()[1]
     for k, (name, value) in enumerate(zip(problem.free, values)):

@@ -28,6 +28,8 @@ Angles = dict[str, Float[np.ndarray, "3"]]
 
 def uncounted(problem: OptimalControl) -> list[str]:
     """Bodies whose attitude the goal asks for, and not how often they turn."""
+    if problem.later:
+        return []
     parts = list(problem.goal.everything())
     counted = {named(part.body) for part in parts if isinstance(part, Turned)}
     asked = {named(part.body): None for part in parts if isinstance(part, Attitude)}

@@ -1,23 +1,15 @@
 """Problems that have no solution whatever is tried, seen before anything is compiled."""
 
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
-from natcoord_jax.control.bounds import Bound
-from natcoord_jax.control.bounds import Coordinate as CoordinateBound
-from natcoord_jax.control.bounds import Rate as RateBound
-from natcoord_jax.control.cost import Cost, Duration, Sum
-from natcoord_jax.control.goal import Attitude, Coordinate, Motion, Position, Rate, Rest
-from natcoord_jax.control.goal_base import All, Goal
-from natcoord_jax.control.goal_links import Turned
-from natcoord_jax.control.goal_places import At
+from natcoord_jax.control.bounds_base import Bound
+from natcoord_jax.control.cost import Cost
+from natcoord_jax.control.goal_base import Goal
 from natcoord_jax.core.checks import is_concrete
-from natcoord_jax.core.handles import named
 from natcoord_jax.core.state import State
-from natcoord_jax.maths.rotations import from_quaternion
 from natcoord_jax.system import System
 
 SAME = 1e-9
@@ -27,19 +19,25 @@ PARTS = ("q", "v", "coordinates", "rates")
 
 
 class Wish(NamedTuple):
-    """A value that a goal asks for.
+    """A value that a goal wants.
 
     Attributes:
         place: when.
         what: of what, with the unit.
         value: that it is to be.
-        shown: in the message.
+        of_motion: whether it is a velocity.
     """
 
     place: str
     what: str
     value: np.ndarray
-    shown: str
+    of_motion: bool
+
+    @property
+    def shown(self) -> str:
+        """Its numbers in a message."""
+        given = self.value
+        return f"{float(given):g}" if given.ndim == 0 else str(np.round(given, 6).tolist())
 
 
 def refuse_state(system: System, state: State) -> None:
@@ -64,91 +62,52 @@ def refuse_state(system: System, state: State) -> None:
 
 
 def refuse_contradictions(goal: Goal, bounds: Bound) -> None:
-    """Refuse goals that ask for two values of the same, and for one that bounds forbid.
+    """Refuse goals that want two values of the same, and one that bounds forbid.
 
     Raises:
         ValueError: for such ones.
     """
-    known: dict[tuple[str, str], Wish] = {}
-    resting = set(_resting(goal, "at the end"))
-    for wish in _wishes(goal, "at the end"):
+    parts, known = list(_placed(goal, "at the end")), {}
+    resting = {place for place, part in parts if part.stops}
+    limits = [(what, pair) for bound in bounds.everything() for what, pair in bound.kept().items()]
+    for wish in (wish for place, part in parts for wish in _wishes(place, part)):
         other = known.setdefault((wish.place, wish.what), wish)
         if np.max(np.abs(other.value - wish.value)) > SAME * (1.0 + np.max(np.abs(wish.value))):
             raise ValueError(
                 f"goal: {wish.what} is to be {other.shown} and {wish.shown} {wish.place}; leave one of them "
                 "out, or ask for it at a waypoint, nc.goal.At(..., step=...)"
             )
-        if wish.place in resting and wish.what.startswith(("rate", "velocity")) and np.any(wish.value):
+        if wish.place in resting and wish.of_motion and np.any(wish.value):
             raise ValueError(
                 f"goal: {wish.what} is to be {wish.shown} {wish.place}, where nc.goal.Rest stops all motion; "
                 "leave one of them out"
             )
-        for limit in bounds.everything():
-            _refuse_outside(wish, limit)
+        for what, pair in limits:
+            if what == wish.what and is_concrete(*pair):
+                _refuse_outside(wish, *(float(np.min(np.asarray(x))) for x in pair))
 
 
-def _refuse_outside(wish: Wish, limit: Any) -> None:
-    if not isinstance(limit, CoordinateBound | RateBound) or not is_concrete(limit.lower, limit.upper):
-        return
-    kind = "coordinate" if isinstance(limit, CoordinateBound) else "rate"
-    if not wish.what.startswith(f"{kind} {limit.index} of {named(limit.joint)!r} "):
-        return
-    lower, upper = (float(np.min(np.asarray(x))) for x in (limit.lower, limit.upper))
+def _refuse_outside(wish: Wish, lower: float, upper: float) -> None:
     if not lower <= float(wish.value) <= upper:
         raise ValueError(
-            f"goal: {wish.what} is to be {wish.shown} {wish.place}, and nc.bounds.{type(limit).__name__} "
-            f"keeps it from {lower:g} to {upper:g}; widen the bound or ask for a value inside"
+            f"goal: {wish.what} is to be {wish.shown} {wish.place}, and a bound keeps it from {lower:g} to "
+            f"{upper:g}; widen the bound or ask for a value inside"
         )
 
 
-def _resting(goal: Goal, place: str) -> Iterator[str]:
-    """Where everything is to rest."""
-    if isinstance(goal, Rest):
-        yield place
-    elif isinstance(goal, At):
-        yield from _resting(goal.goal, f"after step {goal.step}")
-    elif isinstance(goal, All):
-        for part in goal.parts:
-            yield from _resting(part, place)
+def _placed(goal: Goal, place: str) -> Iterator[tuple[str, Goal]]:
+    """It and what it holds, with when that counts; nothing of goals with room is wanted exactly."""
+    yield place, goal
+    if goal.exact:
+        place = "".join(f"after step {step}" for step in goal.marks()) or place
+        for part in goal.inside():
+            yield from _placed(part, place)
 
 
-def _wishes(goal: Goal, place: str) -> Iterator[Wish]:
-    """Values that a goal asks for; of goals with room and of those of one's own none is known."""
-    if isinstance(goal, At):
-        yield from _wishes(goal.goal, f"after step {goal.step}")
-    elif isinstance(goal, All):
-        for part in goal.parts:
-            yield from _wishes(part, place)
-    for what, value in _values(goal):
+def _wishes(place: str, goal: Goal) -> Iterator[Wish]:
+    for what, value in goal.wanted().items():
         if is_concrete(value):
-            found = np.asarray(value, float)
-            yield Wish(place, what, found, _shown(found))
-
-
-def _values(goal: Goal) -> list[tuple[str, Any]]:
-    if isinstance(goal, Coordinate | Rate):
-        kind, unit = ("coordinate", "") if isinstance(goal, Coordinate) else ("rate", "/s")
-        return [(f"{kind} {goal.index} of {named(goal.joint)!r} [rad{unit} or m{unit}]", goal.value)]
-    if isinstance(goal, Position) and is_concrete(goal.point):
-        where = _shown(np.asarray(goal.point, float))
-        return [(f"position of point {where} of {named(goal.body)!r} [m]", goal.position)]
-    if isinstance(goal, Attitude) and is_concrete(goal.rotation):
-        given = np.asarray(goal.rotation, float)
-        rotation = np.asarray(from_quaternion(jnp.asarray(given))) if given.shape == (4,) else given
-        return [(f"attitude of {named(goal.body)!r} [-]", rotation)]
-    if isinstance(goal, Motion):
-        name = named(goal.body)
-        velocities = (f"velocity of {name!r} [m/s]", goal.velocity)
-        return [velocities, (f"rate of turning of {name!r} [rad/s]", goal.angular_velocity)]
-    if isinstance(goal, Turned) and is_concrete(goal.axis):
-        about = _shown(np.asarray(goal.axis, float))
-        return [(f"angle turned by {named(goal.body)!r} about {about} [rad]", goal.angle)]
-    return []
-
-
-def _shown(value: np.ndarray) -> str:
-    """Numbers in a message."""
-    return f"{float(value):g}" if value.ndim == 0 else str(np.round(value, 6).tolist())
+            yield Wish(place, what, np.asarray(value, float), goal.of_motion)
 
 
 def refuse_endless_haste(cost: Cost, bounds: bool, shortest: list[float]) -> None:
@@ -162,8 +121,8 @@ def refuse_endless_haste(cost: Cost, bounds: bool, shortest: list[float]) -> Non
     Raises:
         ValueError: for such a one.
     """
-    parts = [part for part in cost.everything() if type(part) not in (Cost, Sum)]
-    hasty = bool(parts) and all(isinstance(part, Duration) for part in parts)
+    parts = [part for part in cost.everything() if isinstance(part, Cost) and not part.inside()]
+    hasty = bool(parts) and all(part.hurries for part in parts)
     if hasty and shortest and not bounds and min(shortest) <= 0:
         raise ValueError(
             "free_time: the cost is the time [s] alone and nothing limits the inputs, so that it gets as "
