@@ -14,10 +14,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Literal
 from jaxtyping import Bool
 
-from natcoord_jax.xla.evaluation import INNER
+from natcoord_jax.xla.evaluation import INNER, ClosedJaxpr, Literal
 from natcoord_jax.xla.evaluation import apply as computed
 from natcoord_jax.xla.numpy_operations import scattering
 

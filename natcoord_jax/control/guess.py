@@ -191,7 +191,7 @@ def _shaped(value: Any, shape: tuple[int, ...], what: str) -> Array:
 def _leading_to_goal(problem: OptimalControl, unknowns: Unknowns) -> Float[Array, "steps n"]:
     """Rates, constant in phases, that lead the configuration to the goal, as near as they can; no forces."""
     count = most_unknowns(problem.systems)[1]
-    belongs = member(problem.phases) if problem.later else np.ones((problem.steps, 1))
+    belongs = jnp.asarray(member(problem.phases) if problem.later else np.ones((problem.steps, 1)))
     _, dt = problem.applied(unknowns.free)
     size = problem.state.q.size
 

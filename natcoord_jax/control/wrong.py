@@ -69,7 +69,12 @@ def refuse_contradictions(goal: Goal, bounds: Bound) -> None:
     """
     parts, known = list(_placed(goal, "at the end")), {}
     resting = {place for place, part in parts if part.stops}
-    limits = [(what, pair) for bound in bounds.everything() for what, pair in bound.kept().items()]
+    limits = [
+        (what, pair)
+        for bound in bounds.everything()
+        if isinstance(bound, Bound)
+        for what, pair in bound.kept().items()
+    ]
     for wish in (wish for place, part in parts for wish in _wishes(place, part)):
         other = known.setdefault((wish.place, wish.what), wish)
         if np.max(np.abs(other.value - wish.value)) > SAME * (1.0 + np.max(np.abs(wish.value))):
@@ -101,7 +106,7 @@ def _placed(goal: Goal, place: str) -> Iterator[tuple[str, Goal]]:
     if goal.exact:
         place = "".join(f"after step {step}" for step in goal.marks()) or place
         for part in goal.inside():
-            yield from _placed(part, place)
+            yield from _placed(part, place) if isinstance(part, Goal) else ()
 
 
 def _wishes(place: str, goal: Goal) -> Iterator[Wish]:

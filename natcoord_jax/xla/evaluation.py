@@ -8,7 +8,8 @@ from weakref import WeakKeyDictionary
 import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr as ClosedJaxpr
-from jax.extend.core import Jaxpr, Literal
+from jax.extend.core import Jaxpr
+from jax.extend.core import Literal as Literal
 
 from natcoord_jax.xla.numpy_operations import OPERATIONS
 
