@@ -34,7 +34,11 @@ def refuse_undefined(problem: OptimalControl, inputs: Any) -> None:
     """
     count = len(problem.system.structure.inputs)
     tried = [np.full(count, x) for x in TRIED] if inputs is None else [np.asarray(inputs, float)]
-    found = [_standing(problem, jnp.asarray(u)) for u in tried]
+    found = []
+    for u in tried:
+        found.append(_standing(problem, jnp.asarray(u)))
+        if all(np.all(np.isfinite(np.asarray(x))) for x in found[-1]):
+            return
     with_inputs = (
         "whatever the inputs" if inputs is None else f"with the inputs {tried[0].tolist()} of the guess"
     )
