@@ -6,6 +6,7 @@ The table of docs/howto/control_wrong_problems.md has a row for each, with a par
 import math
 import re
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -19,7 +20,7 @@ COORDINATE, RATE, REST, AT = nc.goal.Coordinate, nc.goal.Rate, nc.goal.Rest, nc.
 NAN = math.nan
 
 
-def driven(joint=nc.Revolute, motor=nc.JointTorque, **options):
+def driven(joint: Any = nc.Revolute, motor: Any = nc.JointTorque, **options):
     """A disc, or a cart, with a motor."""
     scene = nc.Scene()
     body = scene.add(nc.RigidBody(mass=1.0, inertia=(1.0, 1.0, 2.0), name="disc"))

@@ -107,7 +107,8 @@ def optimise(
         reason = ", ".join(f"{name}, missed by {x:.2g} of half the range" for name, x in outside.items())
         free = dict(zip(names, values))
         return Solution(problem, inputs, free, dt, math.nan, code, NAMES[lifted], reason=reason)
-    _refuse(problem, guess)
+    if not isinstance(given, Solution):
+        _refuse(problem, guess)
     start = unknowns_of(problem, guess, lifted)
     search = Search(problem, Options(lifted, max_iterations, tol, goal_tol), progress, time_limit)
     found = _attempted(search, method, start, guess)

@@ -17,7 +17,7 @@ from natcoord_jax.maths.collocation import gauss
 from natcoord_jax.stepping.step import advance
 
 TRIED = (0.0, 1.0, -1.0, 0.1, -0.1)
-"""Inputs that are tried where no guess is given: some functions are defined for some of them only."""
+"""Inputs that are tried: some functions are defined for some of them only."""
 LARGE = 60
 """Unknowns from which on inputs are not looked at: that takes longer there."""
 
@@ -27,18 +27,20 @@ def refuse_undefined(problem: OptimalControl, inputs: Any) -> None:
 
     Args:
         problem: the problem.
-        inputs: those of the guess in the first step; None: there are none.
+        inputs: those of the guess in the first step, which are tried first; None: there are none.
 
     Raises:
-        ValueError: where they have none with these inputs, or with none of several.
+        ValueError: where they have none with any of several inputs.
     """
     count = len(problem.system.structure.inputs)
-    tried = [np.full(count, x) for x in TRIED] if inputs is None else [np.asarray(inputs, float)]
-    found = [_standing(problem, jnp.asarray(u)) for u in tried]
-    with_inputs = (
-        "whatever the inputs" if inputs is None else f"with the inputs {tried[0].tolist()} of the guess"
-    )
-    when = f"at the start, t = {float(problem.state.t):g} s, {with_inputs}"
+    tried = [np.full(count, x) for x in TRIED]
+    tried = tried if inputs is None else [np.asarray(inputs, float), *tried]
+    found = []
+    for u in tried:
+        found.append(_standing(problem, jnp.asarray(u)))
+        if all(np.all(np.isfinite(np.asarray(x))) for x in found[-1]):
+            return
+    when = f"at the start, t = {float(problem.state.t):g} s, whatever the inputs"
     for k, what in enumerate(("running cost", "slope of the running cost")):
         if not any(np.all(np.isfinite(np.asarray(one[k]))) for one in found):
             raise ValueError(
