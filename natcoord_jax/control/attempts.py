@@ -178,7 +178,7 @@ class Search:
         reason = "" if answer.ok else answer.status
         self.attempts.append(Attempt(IPOPT, outcome, count - before, seconds, reason))
         ended = self.run(True, found, known=program.multipliers(answer.multipliers))
-        if len(self.history) > count:
+        if len(self.history) > count or not ended.ok:
             return ended
         # It is a solution as it is.
         return dataclasses.replace(ended, method=f"{NAMES[True]}, by {IPOPT}", attempts=ended.attempts[:-1])

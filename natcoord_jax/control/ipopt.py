@@ -169,8 +169,8 @@ def solved(program: NonlinearProgram, max_iter: int = 500, **options: Any) -> An
     settings |= {name: function for name, function in functions.items() if name != "nlp"}
     solver = ca.nlpsol("solver", "ipopt", functions["nlp"], settings)
     # (The first values compile.)
-    program.constraints(program.start)
-    program.jacobian(program.start)
+    for function in (program.constraints, program.jacobian):
+        function(program.start)
     program.hessian(program.start, 1.0, np.zeros(program.lower.size))
     start = time.perf_counter()
     found = solver(x0=program.start, lbg=program.lower, ubg=program.upper)
