@@ -438,7 +438,7 @@ CALLS = {
     # control
     "OptimalControl": lambda w: {
         **RUN(w), "dt": [0.1, np.full(2, 0.1)], "steps": [2, (1, 1)], "cost": [nc.cost.Effort()],
-        "goal": [nc.goal.Rest()], "phases": [()],
+        "goal": [nc.goal.Rest()], "phases": [()], "later": [()],
         "bounds": [nc.bounds.Input(-1.0, 1.0)], "inputs": [nc.inputs.held()], "parameters": [()],
         "free_time": FLAG,
     },
@@ -499,7 +499,7 @@ CALLS = {
         "plant_steps": WHOLE, "guess": [np.ones((2, 1)), w.solution], "max_iterations": WHOLE, "tol": NUMBER,
         "goal_tol": NUMBER,
     },
-    "to_nlp": lambda w: {"problem": [w.problem], "guess": [np.ones((2, 1))]},
+    "to_nlp": lambda w: {"problem": [w.problem], "guess": [np.ones((2, 1))], "states": FLAG},
     "load_guess": lambda w: {"file": ["guess.json"], "steps": WHOLE},
     "inverse_dynamics": lambda w: {
         **RUN(w), "coordinates": [np.ones((1, 1))], "dt": [0.1], "joints": [(w.hinge,)]
@@ -545,6 +545,8 @@ CALLS = {
     },
     "bounds.Rate": lambda w: {"lower": [-1.0], "upper": NUMBER, "joint": [w.hinge, "hinge"], "index": [0]},
     "bounds.KeepOut": lambda w: {"body": [w.body, "body"], "axis": V, "cone": V, "angle": NUMBER},
+    "bounds.During": lambda w: {"bound": [nc.bounds.Input(-1.0, 1.0)], "steps": [[(0, 2)]]},
+    "bounds.Support": lambda w: {"normal": V, "friction": NUMBER, "least": NUMBER, "unit": NUMBER},
     "bounds.Path": lambda w: {"function": [f], "name": NAME, "count": WHOLE},
     "inputs.Spline": lambda w: {"degree": WHOLE, "every": WHOLE, "shared": [np.ones((1, 1))]},
     "inputs.shared": lambda w: {"matrix": [np.ones((1, 1))], "spline": [nc.inputs.held()]},

@@ -1,5 +1,6 @@
 """Optimal control with systems of their own in phases: joints close and open, and bodies meet."""
 
+from functools import cache
 from operator import itemgetter
 from types import SimpleNamespace
 
@@ -15,6 +16,7 @@ HEAVY, LIGHT = 2.0, 1.0
 COORDINATE, REST, AT = nc.goal.Coordinate, nc.goal.Rest, nc.goal.At
 
 
+@cache
 def carts(coupled, motor=True):
     """Two carts on one track, the first one driven; the second takes hold of it or has its own rail."""
     scene = nc.Scene()
