@@ -79,6 +79,9 @@ def test_systems_that_are_not_of_one_motion_are_refused():
     other.add(nc.RigidBody(mass=1.0, inertia=(1, 1, 1), name="third"))
     with pytest.raises(ValueError, match=r"phase 2 has the bodies \['third'\]"):
         nc.OptimalControl((system, other.compile()[0]), state, steps=(5, 5), **shared)
+    shared["goal"] = AT(REST(), step=7)
+    with pytest.raises(ValueError, match=r"another size in the systems of other phases.*goal\.Motion"):
+        nc.OptimalControl((system, train), state, steps=(5, 5), **shared)
     with pytest.raises(ValueError, match="system"):
         nc.OptimalControl((system, 3.0), state, steps=(5, 5), **shared)
 

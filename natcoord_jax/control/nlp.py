@@ -131,9 +131,9 @@ def program_of(problem: OptimalControl, first: Unknowns) -> NonlinearProgram:
     path = motion_of(problem, first)
     shapes = (path.stages.residual, path.end.missing, path.stages.excess, path.end.excess)
     ends = np.cumsum([x.size for x in shapes])
-    system, steps = problem.system, range(problem.steps)
+    steps = range(problem.steps)
     names = [f"equation {k} of step {step}" for step in steps for k in range(path.stages.residual.shape[1])]
-    names += problem.goal.labels(system)
+    names += problem.goal_labels
     names += [f"{name}, step {step}" for step in steps for name in problem.path_labels]
     names += problem.end_labels
     # Momenta of short steps are small numbers beside goals and bounds: forces are not.

@@ -16,7 +16,7 @@ from natcoord_jax.control.inputs import SPLINE, Spline
 from natcoord_jax.control.memory import Carrier, Ending, Step
 from natcoord_jax.control.mesh import durations, mesh_of
 from natcoord_jax.control.parameters import FreeNumber
-from natcoord_jax.control.phases import Systems, check_systems
+from natcoord_jax.control.phases import Systems, check_systems, kinds, like
 from natcoord_jax.control.wrong import refuse_contradictions, refuse_endless_haste, refuse_state
 from natcoord_jax.core.arguments import Part, is_a
 from natcoord_jax.core.checks import is_concrete
@@ -40,6 +40,12 @@ TIMES = FLAG | Numbers((2,), "positive") | Several(Numbers((2,), "positive"))
 def _numbers(dt: Any) -> Any:
     """One number as it is, several as an array."""
     return jnp.asarray(dt, float) if np.ndim(dt) else dt
+
+
+def _agree(what: str, found: Any, names: tuple[str, ...]) -> None:
+    """Refuse values that are not as many as their labels."""
+    if found.shape != (len(names),):
+        raise ValueError(f"the {what} returns shape {found.shape} for the labels {names}; make them agree")
 
 
 def _hashable(times: Any) -> Any:
@@ -165,7 +171,7 @@ class OptimalControl(Part):
         if len(set(self.free)) != len(self.free):
             raise ValueError(f"what is free has the names {list(self.free)}; give each its own")
         if self.system.structure.inputs and not self.parameters:
-            limited = bool(self.path_labels or self.goal.limits(self.system))
+            limited = bool(self.path_labels or self.goal.limits(self.final))
             refuse_endless_haste(self.cost, limited, [lower for lower, _ in self._time_limits()])
         refuse_contradictions(self.goal, self.bounds)
         if is_concrete(eqx.filter((self.system, self.state), eqx.is_array)):
@@ -173,41 +179,62 @@ class OptimalControl(Part):
             self._check_shapes()
 
     def _check_shapes(self) -> None:
-        u, zero = jnp.zeros(len(self.system.structure.inputs)), jnp.zeros(())
+        for phases in kinds(self.systems):
+            self._check_steps(self.systems[phases[0]], like(self.systems, self.state, phases[0]))
+        self._check_end(like(self.systems, self.state, len(self.later)))
+
+    def _check_steps(self, system: System, state: State) -> None:
+        u, zero, memory = jnp.zeros(self.driven), jnp.zeros(()), jnp.zeros(sum(self.memory_sizes))
         free = {name: zero for name in self.free}
-        number = jnp.zeros((), int)
-        step = Step(number, zero, self.state, self.state, u, jnp.zeros(self.looked_back), zero, free)
-        memory = jnp.zeros(sum(self.memory_sizes))
+        step = Step(jnp.zeros((), int), zero, state, state, u, jnp.zeros(self.looked_back), zero, free)
+        if tuple(carrier.memory(system) for carrier in self.carriers) != self.memory_sizes:
+            raise ValueError(
+                "what is carried along for goals, costs and bounds has another size in the systems of other "
+                "phases, as nc.goal.At(nc.goal.Rest(), ...) has where joints differ; ask for nc.goal.Motion "
+                "of bodies or nc.goal.Rate of joints that all phases have"
+            )
+        cost = jax.eval_shape(lambda m: self.cost.of_step(system, self.memories(m)[1], step), memory)
+        excess = jax.eval_shape(lambda m: self.path_excess(system, m, step), memory)
+        if cost.shape != ():
+            raise ValueError(f"the running cost has shape {cost.shape}; return a scalar")
+        _agree("bounds", excess, self.path_labels)
+        jax.eval_shape(lambda m: self.carried(system, m, step), memory)
+
+    def _check_end(self, state: State) -> None:
+        free, system = {name: jnp.zeros(()) for name in self.free}, self.final
 
         def end(memory: Array) -> tuple[Array, Array, Array]:
-            ending = Ending(self.state, self.state, memory, free)
+            ending = Ending(self.state, state, memory, free)
             goal, cost, _ = self.memories(memory)
-            excess = self.goal.excess(self.system, ending._replace(memory=goal))
-            missing = self.goal.missing(self.system, ending._replace(memory=goal))
-            return missing, excess, self.cost.of_end(self.system, ending._replace(memory=cost))
+            excess = self.goal.excess(system, ending._replace(memory=goal))
+            missing = self.goal.missing(system, ending._replace(memory=goal))
+            return missing, excess, self.cost.of_end(system, ending._replace(memory=cost))
 
-        running = jax.eval_shape(lambda m: self.cost.of_step(self.system, self.memories(m)[1], step), memory)
-        missing, beyond, terminal = jax.eval_shape(end, memory)
-        if running.shape != () or terminal.shape != ():
-            raise ValueError(
-                f"the cost has shape {running.shape} and at the end {terminal.shape}; return a scalar"
-            )
-        excess = jax.eval_shape(lambda m: self.path_excess(self.system, m, step), memory)
-        for what, found, names in (
-            ("goal", missing, self.goal.labels(self.system)),
-            ("goal within limits", beyond, self.goal.limits(self.system)),
-            ("bounds", excess, self.path_labels),
-        ):
-            if found.shape != (len(names),):
-                raise ValueError(
-                    f"the {what} returns shape {found.shape} for the labels {names}; make them agree"
-                )
-        jax.eval_shape(lambda m: self.carried(self.system, m, step), memory)
+        missing, beyond, terminal = jax.eval_shape(end, jnp.zeros(sum(self.memory_sizes)))
+        if terminal.shape != ():
+            raise ValueError(f"the cost of the end has shape {terminal.shape}; return a scalar")
+        _agree("goal", missing, self.goal_labels)
+        _agree("goal within limits", beyond, self.goal.limits(system))
 
     @property
     def systems(self) -> Systems:
         """Systems of all phases; one: that of all of them."""
         return (self.system, *self.later)
+
+    @property
+    def final(self) -> System:
+        """System of the last phase: that of the end."""
+        return self.systems[-1]
+
+    @property
+    def goal_labels(self) -> tuple[str, ...]:
+        """Names of the conditions of the goal."""
+        return self.goal.labels(self.final)
+
+    @property
+    def driven(self) -> int:
+        """Number of input channels."""
+        return len(self.system.structure.inputs)
 
     @property
     def channels(self) -> int:
@@ -370,7 +397,7 @@ class OptimalControl(Part):
         lower, upper = self.limits()
         names = [f"{self.free[k]} above its lower bound" for k in np.flatnonzero(np.isfinite(lower))]
         names += [f"{self.free[k]} below its upper bound" for k in np.flatnonzero(np.isfinite(upper))]
-        return (*names, *self.goal.limits(self.system))
+        return (*names, *self.goal.limits(self.final))
 
 
 def numeric(problem: OptimalControl) -> OptimalControl:

@@ -64,7 +64,7 @@ def _largest_of(names: list[str], values: np.ndarray, wording: str = "{name} {va
 
 def out_of_reach(problem: OptimalControl, unreachable: np.ndarray) -> str:
     """What no input changes, to first order."""
-    names = unique(problem.goal.labels(problem.system))
+    names = unique(problem.goal_labels)
     if not unreachable.size or not np.any(unreachable):
         return ""
     return f"what no input changes: {_largest_of(names, unreachable)}"
@@ -72,7 +72,7 @@ def out_of_reach(problem: OptimalControl, unreachable: np.ndarray) -> str:
 
 def nearest(problem: OptimalControl, iterate: Iterate) -> str:
     """How near to the goal a motion comes that no change of the inputs brings nearer, and what holds it."""
-    names = unique(problem.goal.labels(problem.system))
+    names = unique(problem.goal_labels)
     missed = _largest_of(names, np.asarray(iterate.path.end.missing))
     return f"the nearest motion misses {missed}{at_limits(problem, iterate)}"
 
@@ -165,7 +165,7 @@ def undefined(problem: OptimalControl, iterate: Iterate) -> str:
             return f"{what} is no number in {at(values)}"
     if not np.isfinite(float(path.end.cost)):
         return "the cost at the end is no number"
-    for name, value in zip(unique(problem.goal.labels(problem.system)), np.asarray(path.end.missing)):
+    for name, value in zip(unique(problem.goal_labels), np.asarray(path.end.missing)):
         if not np.isfinite(value):
             return f"the goal is no number: {name}"
     if at(iterate.derivatives.jacobians.inverses):
@@ -178,7 +178,7 @@ def undefined(problem: OptimalControl, iterate: Iterate) -> str:
 def largest_multiplier(problem: OptimalControl, iterate: Iterate) -> str:
     """The multiplier that has grown most, by the name of its condition."""
     found = {}
-    for name, value in zip(unique(problem.goal.labels(problem.system)), np.asarray(iterate.multipliers.goal)):
+    for name, value in zip(unique(problem.goal_labels), np.asarray(iterate.multipliers.goal)):
         found[name] = abs(float(value))
     if iterate.multipliers.motion is not None:
         sizes = np.max(np.abs(np.asarray(iterate.multipliers.motion)), axis=1)
@@ -217,7 +217,7 @@ def worst_condition(problem: OptimalControl, iterate: Iterate) -> tuple[float, s
     missing = np.abs(np.asarray(iterate.path.end.missing))
     if missing.size:
         k = int(np.argmax(missing))
-        found.append((float(missing[k]), problem.goal.labels(problem.system)[k]))
+        found.append((float(missing[k]), problem.goal_labels[k]))
     excess = np.asarray(iterate.path.stages.excess)
     if excess.size:
         at, k = np.unravel_index(int(np.argmax(excess)), excess.shape)

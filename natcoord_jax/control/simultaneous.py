@@ -174,7 +174,7 @@ class Simultaneous(eqx.Module):
         found[: len(carried)] = [f"initial {name}" for name in carried]
         for step, at in enumerate(self.path):
             found[at] = [f"{name}, step {step}" for name in problem.path_labels]
-        found[self.goal], found[self.last] = problem.goal.labels(problem.system), problem.end_labels
+        found[self.goal], found[self.last] = problem.goal_labels, problem.end_labels
         return tuple(found)
 
 

@@ -171,7 +171,7 @@ class Solution(eqx.Module):
     @property
     def missing(self) -> dict[str, float]:
         """Residual of the goal at the end of the simulated motion, by name."""
-        names = self.problem.goal.labels(self.problem.system)
+        names = self.problem.goal_labels
         if self.problem.later:
             residual = _missing_of_phases(self.problem, self._scaled(), jnp.asarray(self.inputs))
         else:
@@ -185,7 +185,7 @@ class Solution(eqx.Module):
         if self.iterate is None:
             return {}
         m = self.iterate.multipliers
-        goal = unique(self.problem.goal.labels(self.problem.system))
+        goal = unique(self.problem.goal_labels)
         bounds = unique(self.problem.path_labels)
         found: dict[str, Any] = dict(zip(goal, np.asarray(m.goal).tolist()))
         found |= dict(zip(unique(self.problem.end_labels), np.asarray(m.end).tolist()))
