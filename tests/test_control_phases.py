@@ -39,9 +39,11 @@ def least_effort(mass, way, start, end, time):
 
 
 @pytest.mark.exhaustive
-@pytest.mark.parametrize("method", ["shooting", "lifted"])
+@pytest.mark.parametrize("method", ["shooting", "lifted", "ipopt"])
 def test_a_cart_picks_up_another_with_least_effort(method):
     """It drives to 0.8 m, takes the other one along, which rests at 1 m, and both come to rest at 2 m."""
+    if method == "ipopt":
+        pytest.importorskip("casadi")
     (system, state), (train, _) = carts(False), carts(True)
     goal = AT(COORDINATE("rail", 0.8), step=STEPS[0]) & COORDINATE("rail", 2.0) & REST()
     problem = nc.OptimalControl((system, train), state, dt=DT, steps=STEPS, cost=nc.cost.Effort(), goal=goal)
