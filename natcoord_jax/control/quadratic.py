@@ -11,7 +11,7 @@ from jaxtyping import Array
 from natcoord_jax.control.costates import Charts, Costates, Jacobians, Multipliers, scored_end
 from natcoord_jax.control.differences import Point, columns, sizes
 from natcoord_jax.control.iterate import Derivatives, Model
-from natcoord_jax.control.phases import most_counted, most_unknowns
+from natcoord_jax.control.phases import most_unknowns
 from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.control.transcription import (
     Node,
@@ -21,6 +21,7 @@ from natcoord_jax.control.transcription import (
     end,
     entering,
     first_node,
+    moving_places,
     slices,
     stage,
 )
@@ -57,10 +58,8 @@ class Step(NamedTuple):
 
 def _quick(problem: OptimalControl) -> tuple[np.ndarray, slice]:
     """Places of velocities and rates of rotors in a node as a vector, and in small numbers."""
-    size, stored, counted = problem.state.q.size, problem.state.rates.size, most_counted(problem.systems)
-    places = np.r_[size : 2 * size, 2 * size + counted : 2 * size + counted + stored]
-    count = most_unknowns(problem.systems)[1]
-    return places, slice(count, count + size + stored)
+    places, count = moving_places(problem), most_unknowns(problem.systems)[1]
+    return places, slice(count, count + places.size)
 
 
 def _slow(step: Step, quick: slice) -> tuple[Array, Array, Array]:
@@ -84,8 +83,8 @@ def _stage_slopes(problem: OptimalControl, scale: Point, step: Step) -> tuple[Ar
     (places, quick), size, x = _quick(problem), problem.state.q.size, step.node.x.size
     a = quick.start
 
-    def own(chi: Array, w: Array, y: Array) -> tuple[Array, Any]:
-        found = stage(problem, step.at, unflat(chi), w, y)
+    def own(chi: Array, w: Array, y: Array, moving: Array | None = None) -> tuple[Array, Any]:
+        found = stage(problem, step.at, unflat(chi), w, y, moving=moving)
         after = ravel_pytree(found.after)[0]
         # Of positions their displacement, all others as they are.
         small = jnp.concatenate([step.back[:a, :size] @ after[:size], after[places], after[x:]])
@@ -103,7 +102,7 @@ def _stage_slopes(problem: OptimalControl, scale: Point, step: Step) -> tuple[Ar
         return jnp.concatenate([displaced, by_chi[places], by_chi[x:], by_w, by_y])
 
     def fast(v: Array) -> Array:
-        return jax.grad(lambda v: own(flat.at[places].set(v), step.w, step.y)[0])(v)
+        return jax.grad(lambda v: own(flat, step.w, step.y, v)[0])(v)
 
     def reached(*point: Array) -> tuple[Array, Array]:
         return own(*point)[1][1:]
@@ -111,7 +110,7 @@ def _stage_slopes(problem: OptimalControl, scale: Point, step: Step) -> tuple[Ar
     # Exact: conditions of the goal that depend on each other would be told apart by rounding.
     point, moved = (flat, step.w, step.y), _slow(step, quick)
     along = jax.vmap(lambda *d: jax.jvp(reached, point, d)[1], in_axes=1, out_axes=1)(*moved)
-    by_v = jax.jacfwd(lambda v: reached(flat.at[places].set(v), step.w, step.y))(flat[places])
+    by_v = jax.jacfwd(lambda v: reached(flat, step.w, step.y, v))(flat[places])
     found = columns(slope, point, moved, scale)
     unit = jnp.eye(places.size, dtype=flat.dtype)
     among = columns(fast, (flat[places],), (unit,), (scale.node[places],))

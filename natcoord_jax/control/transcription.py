@@ -160,6 +160,12 @@ def unpacked(like: State, x: Float[Array, " x"], t: Float[Array, ""]) -> State:
     return replace_fields(like, t=t, coordinates=x[a:b], rates=x[x.size - like.rates.size :], **fields)
 
 
+def moving_places(problem: OptimalControl) -> np.ndarray:
+    """Places of velocities and rates of rotors in a node as a vector."""
+    size, stored, counted = problem.state.q.size, problem.state.rates.size, most_counted(problem.systems)
+    return np.r_[size : 2 * size, 2 * size + counted : 2 * size + counted + stored]
+
+
 def slices(problem: OptimalControl) -> Slice:
     """The constant part of all steps."""
     shaping: Shaping = problem.inputs.shaping(problem.steps)
@@ -261,6 +267,7 @@ def stage(
     y: Float[Array, " n"],
     stretch: Any = 1.0,
     reached: Float[Array, " x"] | None = None,
+    moving: Float[Array, " v"] | None = None,
 ) -> Stage:
     """One step from its unknowns: explicit, and smooth in everything.
 
@@ -272,10 +279,14 @@ def stage(
         y: unknowns of its equations.
         stretch: makes this step longer.
         reached: the state at its end that cost and bounds see, where that is an unknown of its own.
+        moving: velocities and rates of rotors at its start, where they are not those of the node: derivatives
+            in them alone are few then.
     """
     systems = problem.applied_systems(node.free)
     if at.system is None:
-        return _stage(problem, systems, (0,), at, node, w, y, stretch, reached)
+        return _stage(problem, systems, (0,), at, node, w, y, stretch, reached, moving)
+    if moving is not None:
+        node = eqx.tree_at(lambda n: n.x, node, node.x.at[moving_places(problem)].set(moving))
     ways = [lambda x: x, *(partial(_transferred, problem, systems, p) for p in range(1, len(systems)))]
     node = eqx.tree_at(lambda n: n.x, node, jax.lax.switch(at.system.enters, ways, node.x))
     steps = [partial(_stage, problem, systems, kind) for kind in kinds(systems)]
@@ -300,6 +311,7 @@ def _stage(
     y: Array,
     stretch: Any,
     reached: Array | None,
+    moving: Array | None = None,
 ) -> Stage:
     """A step of a phase whose system is of one kind."""
     begin, dt, gap = times_of(problem, node.free, at)
@@ -307,6 +319,9 @@ def _stage(
     decided = at.read @ node.register + at.direct * w
     u = problem.inputs.driven(decided, len(problem.system.structure.inputs))
     before = unpacked(like(problem.systems, problem.state, kind[0]), node.x, begin)
+    if moving is not None:
+        v, rates = jnp.split(moving, [before.v.size])
+        before = replace_fields(before, v=v.reshape(-1, 3), rates=rates)
     system = systems[0] if at.system is None else at_hand(systems, kind, at.system.phase, before)
     own = system.structure.unknowns + system.structure.multipliers
     residual, after, _ = advance(system, before, u, dt, y[:own], gauss(1))
