@@ -69,7 +69,8 @@ def kinds(systems: Systems) -> list[tuple[int, ...]]:
     """Phases whose systems differ in numbers only, together."""
     found: dict[Any, list[int]] = {}
     for phase, system in enumerate(systems):
-        found.setdefault(jax.tree.structure(system), []).append(phase)
+        leaves, structure = jax.tree.flatten(system)
+        found.setdefault((structure, tuple(map(np.shape, leaves))), []).append(phase)
     return [tuple(phases) for phases in found.values()]
 
 
