@@ -66,6 +66,10 @@ def test_a_cart_picks_up_another_with_least_effort(method):
     np.testing.assert_allclose(places["second"] - places["first"], 0.2, atol=1e-12)
     assert places["first"][-1] == pytest.approx(2.0, abs=1e-9)
     assert max(abs(x) for x in found.missing.values()) < 1e-9
+    # What was optimised is this motion, velocities normal to the rails included.
+    nodes, size = np.asarray(found.iterate.path.nodes.x), carried.states.v[0].size
+    along = nodes[STEPS[0] + 1 :, size : 2 * size].reshape(carried.states.v[1:].shape)
+    np.testing.assert_allclose(along, carried.states.v[1:], atol=1e-9)
     with pytest.raises(ValueError, match="solution.phases"):
         _ = found.trajectory
 
