@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, Self
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -70,7 +70,7 @@ class During(Bound):
         """Where it begins and ceases to count."""
         return tuple(mark for pair in self.steps for mark in pair)
 
-    def remarked(self, moved: Callable[[int], int]) -> Self:
+    def remarked(self, moved: Callable[[int], int]) -> "During":
         """The same within other steps."""
         return dataclasses.replace(self, steps=[[moved(mark) for mark in pair] for pair in self.steps])
 

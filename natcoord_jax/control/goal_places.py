@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -57,7 +57,7 @@ class At(Goal):
         """Its step."""
         return (self.step,)
 
-    def remarked(self, moved: Callable[[int], int]) -> Self:
+    def remarked(self, moved: Callable[[int], int]) -> "At":
         """The same after another step."""
         return dataclasses.replace(self, step=moved(self.step))
 

@@ -6,7 +6,7 @@ step to step; the node that one step hands to the next carries it. What nobody a
 """
 
 from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -101,7 +101,7 @@ class Carrier(Part):
         """Numbers of steps at whose ends it begins or ceases to count, besides those of what it holds."""
         return ()
 
-    def remarked(self, moved: Callable[[int], int]) -> Self:
+    def remarked(self, moved: Callable[[int], int]) -> "Carrier":
         """The same with these at other steps."""
         return self
 
