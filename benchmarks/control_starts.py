@@ -1,13 +1,14 @@
 """How often optimal control converges from where a user starts, beside IPOPT on the same discrete problems.
 
 usage: python -m benchmarks.control_starts [--starts N] [--problems NAME ...] [--method METHOD]
-       [--patience SECONDS] [--no-peers] [--json FILE]
+       [--limit ITERATIONS] [--patience SECONDS] [--solvers {natcoord_jax,IPOPT} ...]
+       [--effort {quick,full}] [--json FILE]
 
 Every problem is solved from the default start and from random ones: smooth random inputs and rates about it,
 see `natcoord_jax.control.guess.scattered`. IPOPT gets the functions of `nc.to_nlp` at the same unknowns and
 the states that follow from them, so that equations, bounds and exact derivatives are the same and only the
-solver differs; its matrices are sparse. Times of both are without compilation, ours those of programs with
-full effort. A file that exists keeps what it has of other problems.
+solver differs; its matrices are sparse. Times of both are without compilation, of programs with the effort
+that is told. A file that exists keeps what it has of other problems and solvers.
 """
 
 import argparse
@@ -27,11 +28,11 @@ import natcoord_jax as nc
 from benchmarks import common, control_problems
 from natcoord_jax.control.guess import scattered, unknowns_of
 from natcoord_jax.control.problem import numeric
+from natcoord_jax.control.run import chosen
 from natcoord_jax.control.transcription import held_inputs
 from natcoord_jax.gallery import manoeuvres
 
-GRAVITY = 9.81
-"""[m/s^2]"""
+SOLVERS = ("natcoord_jax", "IPOPT")
 
 
 class Case(NamedTuple):
@@ -232,14 +233,13 @@ CASES: dict[str, Case] = {
 }
 
 
-def starts(problem: nc.OptimalControl, case: Case, count: int) -> list[nc.Guess]:
+def starts(problem: nc.OptimalControl, case: Case, method: str, count: int) -> list[nc.Guess]:
     """The default start, and random ones about it."""
-    middle = unknowns_of(problem, None, True)
+    middle = unknowns_of(problem, None, chosen(problem, method, None))
     width = problem.system.structure.unknowns
-    found = []
-    for k, key in enumerate(jax.random.split(jax.random.key(7), count + 1)):
-        size = 0.0 if k == 0 else 1.0
-        unknowns = scattered(problem, middle, key, size * case.spread, size * case.rates)
+    found = [nc.Guess()]
+    for key in jax.random.split(jax.random.key(7), count + 1)[1:]:
+        unknowns = scattered(problem, middle, key, case.spread, case.rates)
         inputs = np.asarray(held_inputs(problem, unknowns.coefficients))
         reduced = problem.system.structure.solver == "reduced"
         found.append(nc.Guess(inputs, rates=np.asarray(unknowns.y)[:, :width] if reduced else None))
@@ -260,10 +260,12 @@ def solved_by_ipopt(problem: nc.OptimalControl, guess: nc.Guess, patience: float
     }
 
 
-def solved(problem: nc.OptimalControl, guess: nc.Guess, method: str, limit: int) -> dict[str, Any]:
+def solved(
+    problem: nc.OptimalControl, guess: nc.Guess, method: str, limit: int, patience: float
+) -> dict[str, Any]:
     """One solution by natcoord_jax."""
-    start = time.perf_counter()
-    found = nc.optimise(problem, guess, method=method, progress=False, max_iterations=limit)
+    start, limits = time.perf_counter(), {"max_iterations": limit, "time_limit": patience}
+    found = nc.optimise(problem, guess, method=method, progress=False, **limits)
     return {
         "ok": found.ok,
         "outcome": found.outcome.name,
@@ -295,27 +297,30 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--problems", nargs="*", default=list(CASES), metavar="NAME")
     parser.add_argument("--method", default="auto")
     parser.add_argument("--limit", type=int, default=500)
-    parser.add_argument("--patience", type=float, default=120.0, help="seconds a start is left to IPOPT")
-    parser.add_argument("--no-peers", action="store_true")
+    parser.add_argument("--patience", type=float, default=120.0, help="seconds of a start, at most")
+    parser.add_argument("--solvers", nargs="*", default=list(SOLVERS), choices=SOLVERS)
+    parser.add_argument("--effort", default="full", choices=("quick", "full"))
     parser.add_argument("--json", type=Path)
     given = parser.parse_args(arguments)
     jax.config.update("jax_enable_x64", True)
-    nc.set_effort("full")
+    nc.set_effort(given.effort)
     known = json.loads(given.json.read_text()) if given.json and given.json.exists() else {}
     results = known.get("problems", {})
     for name in given.problems:
         case = CASES[name]
         problem = numeric(case.problem())
-        guesses = starts(problem, case, given.starts)
-        # Compiled before it is timed.
-        solved(problem, guesses[0], given.method, 2)
-        ours = [solved(problem, guess, given.method, given.limit) for guess in guesses]
-        about = common.about(float(problem.dt), problem.steps)
-        results[name] = {"natcoord_jax": about | summary(ours) | {"runs": ours}}
-        if not given.no_peers:
-            theirs = [solved_by_ipopt(problem, guess, given.patience) for guess in guesses]
-            results[name]["IPOPT"] = summary(theirs) | {"runs": theirs}
-        for who, found in results[name].items():
+        guesses = starts(problem, case, given.method, given.starts)
+        here = results.setdefault(name, {})
+        about = common.about(float(problem.dt), problem.steps) | {"effort": given.effort}
+        if "natcoord_jax" in given.solvers:
+            # Compiled before it is timed.
+            solved(problem, guesses[0], given.method, 2, given.patience)
+            runs = [solved(problem, guess, given.method, given.limit, given.patience) for guess in guesses]
+            here["natcoord_jax"] = about | summary(runs) | {"runs": runs}
+        if "IPOPT" in given.solvers:
+            runs = [solved_by_ipopt(problem, guess, given.patience) for guess in guesses]
+            here["IPOPT"] = about | summary(runs) | {"runs": runs}
+        for who, found in here.items():
             first = found["default"]
             print(
                 f"{name:28} {who:12} {first['outcome']:14} {first['cost']:12.7g} {first['iterations']:4} "
