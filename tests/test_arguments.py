@@ -438,7 +438,7 @@ CALLS = {
     # control
     "OptimalControl": lambda w: {
         **RUN(w), "dt": [0.1, np.full(2, 0.1)], "steps": [2, (1, 1)], "cost": [nc.cost.Effort()],
-        "goal": [nc.goal.Rest()], "phases": [()], "later": [()],
+        "goal": [nc.goal.Rest()], "phases": [()], "later": [()], "scheme": [nc.EnergyMomentum()],
         "bounds": [nc.bounds.Input(-1.0, 1.0)], "inputs": [nc.inputs.held()], "parameters": [()],
         "free_time": FLAG,
     },

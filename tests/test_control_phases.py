@@ -39,14 +39,15 @@ def least_effort(mass, way, start, end, time):
 
 
 @pytest.mark.exhaustive
-@pytest.mark.parametrize("method", ["shooting", "lifted", "ipopt"])
-def test_a_cart_picks_up_another_with_least_effort(method):
+@pytest.mark.parametrize(("method", "order"), [("shooting", 2), ("lifted", 2), ("ipopt", 2), ("lifted", 4)])
+def test_a_cart_picks_up_another_with_least_effort(method, order):
     """It drives to 0.8 m, takes the other one along, which rests at 1 m, and both come to rest at 2 m."""
     if method == "ipopt":
         pytest.importorskip("casadi")
     (system, state), (train, _) = carts(False), carts(True)
     goal = AT(COORDINATE("rail", 0.8), step=STEPS[0]) & COORDINATE("rail", 2.0) & REST()
-    problem = nc.OptimalControl((system, train), state, dt=DT, steps=STEPS, cost=nc.cost.Effort(), goal=goal)
+    options = {"dt": DT, "steps": STEPS, "cost": nc.cost.Effort(), "scheme": nc.EnergyMomentum(order)}
+    problem = nc.OptimalControl((system, train), state, goal=goal, **options)
     found = nc.optimise(problem, method=method, progress=False)
     assert found.ok and len(found.history) <= 6
     # The momentum stays at the impact. Costs of the continuous problem, minimal in the speed of meeting.

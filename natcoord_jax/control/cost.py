@@ -60,9 +60,7 @@ class Cost(Carrier):
 
     def of_step(self, system: System, memory: Array, step: Step) -> Float[Array, ""]:
         """Cost of a step: the integral over it, with the memory at its start."""
-        u = step.u
-        ends = (self.running(system, state, u, state.t) for state in (step.before, step.after))
-        return 0.5 * step.dt * sum(ends)
+        return step.integral(lambda state, u: self.running(system, state, u, state.t))
 
     def of_end(self, system: System, ending: Ending) -> Float[Array, ""]:
         """Cost of the end of a motion."""

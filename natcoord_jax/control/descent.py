@@ -94,13 +94,19 @@ def descend(
         The solution; `outcome` is MAX_ITERATIONS if goal or bounds are violated by more than `tol`.
 
     Raises:
-        ValueError: for a guess of the wrong shape, and for phases with systems of their own.
+        ValueError: for a guess of the wrong shape, for phases with systems of their own, and for motions of
+            an order above two.
     """
     import optax
 
     if problem.later:
         raise ValueError(
             f"descend goes along the motion of one system, and this problem has {len(problem.systems)}; use "
+            "nc.optimise"
+        )
+    if problem.stages > 1:
+        raise ValueError(
+            f"descend takes motions of order two, and this problem has order {problem.scheme.order}; use "
             "nc.optimise"
         )
     problem = numeric(problem)

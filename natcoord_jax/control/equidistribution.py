@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from natcoord_jax.control.local_error import ORDER, LocalErrors, sections
+from natcoord_jax.control.local_error import LocalErrors, sections
 from natcoord_jax.control.mesh import lengths
 from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.control.refinement import with_steps
@@ -88,9 +88,10 @@ def wished(
     jumps = np.nan_to_num(errors.jumps, nan=-1.0).reshape(len(size), -1)
     jumping = np.max(jumps, axis=1, initial=-1.0) >= 0
     # Errors change their sign here and there, where steps are not to be long for that.
-    dense = np.pad(np.where(jumping, 0.0, worst / size ** (ORDER + 1)), 1, "edge")
+    power = errors.order + 1
+    dense = np.pad(np.where(jumping, 0.0, worst / size**power), 1, "edge")
     dense = 0.25 * (dense[:-2] + dense[2:]) + 0.5 * dense[1:-1]
-    allowed = size / np.clip(size * dense ** (1.0 / (ORDER + 1)), FEWEST_PARTS, MOST_PARTS)
+    allowed = size / np.clip(size * dense ** (1.0 / power), FEWEST_PARTS, MOST_PARTS)
     middle = np.maximum(2.0 * np.minimum(jumps, 1.0 - jumps), LEAST_PART)
     allowed = np.minimum(np.where(jumping, size, allowed), np.asarray(longest)[phase])
     found = []
@@ -151,9 +152,9 @@ def present(problem: OptimalControl) -> np.ndarray:
     return np.array([(last - first) // problem.inputs.every for first, last in sections(problem)])
 
 
-def worth_moving(now: np.ndarray, asked: np.ndarray, worst: float, tolerance: float) -> bool:
+def worth_moving(now: np.ndarray, asked: np.ndarray, worst: float, tolerance: float, order: int) -> bool:
     """Whether as many intervals as there are, moved, are expected to do, or to help much."""
-    expected = AIM * tolerance * float(np.max(asked / now)) ** (ORDER + 1)
+    expected = AIM * tolerance * float(np.max(asked / now)) ** (order + 1)
     return expected <= max(tolerance, HELPED * worst)
 
 

@@ -137,4 +137,6 @@ def regulator(
     if problem.inputs.shared is not None:
         gains = jnp.einsum("cm,kmz->kcz", problem.inputs.shared, gains)
     dt, nodes = jnp.asarray(solution.dt), iterate.path.nodes.x[:-1]
-    return Feedback(jnp.asarray(solution.inputs), gains, back, nodes, dt, problem.state.t, limits)
+    # Held over each step they are the same at all of its stages.
+    inputs = jnp.asarray(solution.inputs).reshape(len(nodes), problem.stages, -1)[:, 0]
+    return Feedback(inputs, gains, back, nodes, dt, problem.state.t, limits)

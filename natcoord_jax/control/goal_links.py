@@ -113,8 +113,8 @@ class Periodic(Goal):
 class Integral(Goal):
     """An integral over the motion that has a given value (an isoperimetric constraint).
 
-    It is taken by the trapezoidal rule over every step with the inputs held, as those of costs are. Inside of
-    `nc.goal.Within` it is a budget.
+    It is taken by the trapezoidal rule over every step with the inputs held, or by the quadrature of its
+    stages where it has several, as those of costs are. Inside of `nc.goal.Within` it is a budget.
 
     Attributes:
         function: (state, u, t) -> number per second.
@@ -137,9 +137,7 @@ class Integral(Goal):
 
     def remembered(self, system: System, own: Array, inside: list[Array], step: Step) -> Array:
         """The integral after a step."""
-        ends = (self.function(state, step.u, state.t) for state in (step.before, step.after))
-        first, last = (jnp.asarray(x, float) for x in ends)
-        return own + 0.5 * step.dt * (first + last)
+        return own + step.integral(lambda state, u: jnp.asarray(self.function(state, u, state.t), float))
 
     def missing(self, system: System, ending: Ending) -> Float[Array, " n"]:
         """The integral less its value."""

@@ -9,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from natcoord_jax.control.collocation import stage_unknowns, unknowns_each
 from natcoord_jax.control.mesh import member, spans
-from natcoord_jax.control.phases import filled, most_unknowns, rates_of
+from natcoord_jax.control.phases import filled, most_unknowns
 from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.control.resampling import free_of_swings
 from natcoord_jax.control.tangent import steady_rates
@@ -31,6 +32,8 @@ from natcoord_jax.core.compiled import compiled
 from natcoord_jax.core.kinds import of
 from natcoord_jax.core.numeric import Numbers, Vector
 
+GIVEN = Numbers((None, None)) | Numbers((None, None, None))
+"""Inputs of all steps, or of all of their stages."""
 ROUNDS = 12
 """Gauss-Newton corrections of the constant rates that lead to the goal."""
 LEAST_SCALE = 0.1
@@ -56,10 +59,10 @@ class Guess(Part):
     have systems of their own, each step has the rates of its system, and zeros for what others have more.
 
     Attributes:
-        inputs: of all steps (steps, inputs) [N, N m]; None: made.
-        rates: mean rates of the free motions in all steps (steps, n), or constant ones (n,) [rad/s, m/s] that
-            are taken up from the initial ones, for the lifted method, which needs no motion to start from;
-            None: made.
+        inputs: of all steps (steps, inputs), or of their stages (steps, stages, inputs) [N, N m]; None: made.
+        rates: mean rates of the free motions in all steps (steps, n), rates at all of their stages (steps,
+            stages, n), or constant ones (n,) [rad/s, m/s] that are taken up from the initial ones, for the
+            lifted method, which needs no motion to start from; None: made.
         free: final time [s] and parameters in the order of `problem.free`; None: those of the problem.
 
     Example:
@@ -71,12 +74,12 @@ class Guess(Part):
         >>> guess = nc.Guess(rates=(0.5, 1.57))
     """
 
-    inputs: Any = eqx.field(default=None, metadata=is_a(Numbers((None, None))))
-    rates: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Vector(None) | Numbers((None, None))))
+    inputs: Any = eqx.field(default=None, metadata=is_a(GIVEN))
+    rates: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Vector(None) | GIVEN))
     free: Any = eqx.field(default=None, kw_only=True, metadata=is_a(Vector(None)))
 
 
-GUESS = Numbers((None, None)) | of("nc.Guess(...)", Guess)
+GUESS = GIVEN | of("nc.Guess(...)", Guess)
 """What an argument may be."""
 
 
@@ -99,18 +102,27 @@ def unknowns_of(problem: OptimalControl, guess: Any, lifted: bool) -> Unknowns:
     structure = problem.system.structure
     _refuse_rates(problem, guess)
     shape = (problem.steps, len(structure.inputs))
+    if problem.stages > 1 and np.ndim(guess.inputs) == 3:
+        shape = (problem.steps, problem.stages, shape[1])
     inputs = jnp.zeros(shape) if guess.inputs is None else _shaped(guess.inputs, shape, "inputs")
-    y = jnp.zeros((problem.steps, most_unknowns(problem.systems)[0]))
-    decided = problem.inputs.decided(inputs, problem.channels)
-    unknowns = _moving(problem, guess, Unknowns(problem.inputs.fitted(decided), free, y), lifted)
+    y = jnp.zeros((problem.steps, unknowns_each(problem)))
+    unknowns = _moving(problem, guess, Unknowns(fitted(problem, inputs), free, y), lifted)
     unknown = any(not number.given for number in problem.cost.parameters())
     return with_peaks(problem, unknowns, lifted) if unknown and guess.free is None else unknowns
 
 
+def fitted(problem: OptimalControl, inputs: Any) -> Float[Array, "c m"]:
+    """Coefficients nearest to inputs of all steps, or of their stages."""
+    decided = problem.inputs.decided(jnp.asarray(inputs), problem.channels)
+    return problem.inputs.fitted(decided, problem.scheme.tableau.c)
+
+
 def _refuse_rates(problem: OptimalControl, guess: Guess) -> None:
     """Refuse rates of a wrong shape, also where the method does not need them."""
-    count = problem.system.structure.unknowns
-    allowed = (count,), (problem.steps, count)
+    count = most_unknowns(problem.systems)[1]
+    allowed = [(count,), (problem.steps, count)]
+    if problem.stages > 1:
+        allowed.append((problem.steps, problem.stages, count))
     if guess.rates is not None and np.shape(guess.rates) not in allowed:
         raise ValueError(
             f"guess: rates [rad/s, m/s] have shape {np.shape(guess.rates)}; this problem needs {allowed[0]} "
@@ -134,7 +146,7 @@ def _moving(problem: OptimalControl, guess: Guess, unknowns: Unknowns, lifted: b
     if given.shape == (count,):
         steady = jnp.broadcast_to(given, (problem.steps, count))
         return with_rates(problem, unknowns, taken_up(problem, unknowns.free, steady))
-    return with_rates(problem, unknowns, _shaped(given, (problem.steps, count), "rates"))
+    return with_rates(problem, unknowns, given)
 
 
 @compiled
@@ -149,7 +161,8 @@ def with_peaks(problem: OptimalControl, unknowns: Unknowns, lifted: bool) -> Unk
     path = roll(problem, simulated(problem, unknowns, lifted)[0])
     # Excesses grow by one over its unit as such a number gets smaller.
     labels, names = problem.path_labels, problem.cost.labels()
-    found = path.stages.excess[:, len(labels) - len(names) :]
+    each = path.stages.excess.reshape(problem.steps * problem.stages, len(labels) // problem.stages)
+    found = each[:, each.shape[1] - len(names) :]
     free = unknowns.free
     for k, number in enumerate(problem.cost.parameters()):
         free = free.at[first + k].add(0.0 if number.given else jnp.max(found[:, k]))
@@ -175,9 +188,7 @@ def taken_up(
 
 def with_rates(problem: OptimalControl, unknowns: Unknowns, rates: Float[Array, "steps n"]) -> Unknowns:
     """Unknowns with given mean rates and multipliers zero."""
-    known = rates_of(problem.systems, problem.phases)
-    y = jnp.where(known, filled(rates, unknowns.y.shape[1]), 0.0)
-    return eqx.tree_at(lambda u: u.y, unknowns, y)
+    return eqx.tree_at(lambda u: u.y, unknowns, stage_unknowns(problem, rates))
 
 
 def _shaped(value: Any, shape: tuple[int, ...], what: str) -> Array:
@@ -267,7 +278,8 @@ def with_balancing_inputs(problem: OptimalControl, unknowns: Unknowns) -> Unknow
         return jnp.nan_to_num(idle + u * jnp.minimum(1.0, jnp.min(reach, initial=1.0)))
 
     inputs = each_step(problem, one, at, nodes, unknowns.y)
-    return eqx.tree_at(lambda u: u.coefficients, unknowns, problem.inputs.fitted(inputs))
+    coefficients = problem.inputs.fitted(inputs, problem.scheme.tableau.c)
+    return eqx.tree_at(lambda u: u.coefficients, unknowns, coefficients)
 
 
 def _inside(excess: Callable[[Array], Array], u: Float[Array, " m"]) -> Float[Array, " m"]:
@@ -300,8 +312,10 @@ def scattered(problem: OptimalControl, unknowns: Unknowns, key: Array, spread: A
     inputs = spread * (waves @ jax.random.normal(first, (3, problem.channels)))
     changes = rates * (jax.random.normal(second, (1, count)) + waves @ jax.random.normal(third, (3, count)))
     changes = free_of_swings(jnp, jnp.zeros((1, count)), changes)
-    coefficients = unknowns.coefficients + problem.inputs.fitted(inputs)
-    y = unknowns.y.at[:, :count].add(changes)
+    coefficients = unknowns.coefficients + problem.inputs.fitted(inputs, problem.scheme.tableau.c)
+    if problem.stages > 1:
+        changes = stage_unknowns(problem, changes)
+    y = unknowns.y.at[:, : changes.shape[1]].add(changes)
     return Unknowns(coefficients, unknowns.free, y)
 
 

@@ -13,27 +13,31 @@ from natcoord_jax.core.arguments import Part, checked, is_a
 from natcoord_jax.core.kinds import of
 from natcoord_jax.core.numeric import Numbers, Whole
 
+Parts = tuple[float, ...]
+"""Times within a step, as parts of it."""
+MIDDLE: Parts = (0.5,)
+
 
 class Shaping(NamedTuple):
     """A spline as a linear machine with a small register, one step after the other.
 
-    register_k+1 = shift_k register_k + load_k w_k and u_k = read_k register_k + direct_k w_k, for every input
-    channel alike. New coefficients w enter where an interval of the spline begins, those of the first
-    interval but one are in the register at the start.
+    register_k+1 = shift_k register_k + load_k w_k, and u_k = read_k register_k + direct_k w_k at the stages
+    of a step, for every input channel alike. New coefficients w enter where an interval of the spline begins,
+    those of the first interval but one are in the register at the start.
 
     Attributes:
         shift: (steps, d, d).
         load: (steps, d).
-        read: (steps, d).
-        direct: (steps,).
+        read: (steps, stages, d).
+        direct: (steps, stages).
         enters: whether a coefficient enters in a step, (steps,).
         start: places of the first coefficients in the register, (d, degree).
     """
 
     shift: Float[np.ndarray, "steps d d"]
     load: Float[np.ndarray, "steps d"]
-    read: Float[np.ndarray, "steps d"]
-    direct: Float[np.ndarray, " steps"]
+    read: Float[np.ndarray, "steps stages d"]
+    direct: Float[np.ndarray, "steps stages"]
     enters: Bool[np.ndarray, " steps"]
     start: Float[np.ndarray, "d degree"]
 
@@ -55,7 +59,9 @@ def _numbers(shared: Any) -> Any:
 
 
 class Spline(Part):
-    """Inputs as uniform B-splines over intervals of some steps, taken at the middle of each step.
+    """Inputs as uniform B-splines over intervals of some steps, taken at the stages of each step.
+
+    At order two that is its middle. (One that is held over each step has one value in it at any order.)
 
     Attributes:
         degree: 0 holds a value over each interval, 1 is piecewise linear, 3 a cubic spline.
@@ -107,37 +113,41 @@ class Spline(Part):
             return inputs @ jnp.linalg.pinv(jnp.asarray(self.shared)).T
         return inputs if inputs.shape[-1] else jnp.zeros((*inputs.shape[:-1], count))
 
-    def matrix(self, steps: int) -> Float[np.ndarray, "steps coefficients"]:
-        """Inputs of the steps per coefficient."""
-        found = np.zeros((steps, self.coefficients(steps)))
+    def matrix(self, steps: int, parts: Parts = MIDDLE) -> Float[np.ndarray, "times coefficients"]:
+        """Inputs per coefficient, at some parts of all steps."""
+        found = np.zeros((steps, len(parts), self.coefficients(steps)))
         for k in range(steps):
             interval, rest = divmod(k, self.every)
-            place = (rest + 0.5) / self.every
-            found[k, interval : interval + self.degree + 1] = _basis(self.degree, place)
-        return found
+            for stage, part in enumerate(parts):
+                values = _basis(self.degree, (rest + part) / self.every)
+                found[k, stage, interval : interval + self.degree + 1] = values
+        return found.reshape(steps * len(parts), -1)
 
-    def fitted(self, inputs: Any) -> Float[Array, "coefficients m"]:
-        """Coefficients nearest to the decided inputs (steps, m) of all steps."""
+    def fitted(self, inputs: Any, parts: Parts = MIDDLE) -> Float[Array, "coefficients m"]:
+        """Coefficients nearest to the decided inputs of all steps (steps, m), or at parts of them."""
         inputs = jnp.asarray(inputs, float)
+        if inputs.ndim == 2 and len(parts) > 1:
+            inputs = jnp.broadcast_to(inputs[:, None], (len(inputs), len(parts), inputs.shape[1]))
         if self.degree == 0 and self.every == 1:
-            return inputs
-        return jnp.asarray(np.linalg.pinv(self.matrix(inputs.shape[0]))) @ inputs
+            return inputs if inputs.ndim == 2 else jnp.mean(inputs, axis=1)
+        inverse = np.linalg.pinv(self.matrix(inputs.shape[0], parts))
+        return jnp.asarray(inverse) @ inputs.reshape(-1, inputs.shape[-1])
 
-    def shaping(self, steps: int) -> Shaping:
+    def shaping(self, steps: int, parts: Parts = MIDDLE) -> Shaping:
         """The spline as a machine with a register; one that holds each value over one step has none."""
         size = self.degree + (self.every > 1)
         shift, load = np.zeros((steps, size, size)), np.zeros((steps, size))
-        read, direct = np.zeros((steps, size)), np.zeros(steps)
+        read, direct = np.zeros((steps, len(parts), size)), np.zeros((steps, len(parts)))
         numbers = np.arange(steps)
         enters = numbers % self.every == 0
         for k in range(steps):
-            values = _basis(self.degree, (k % self.every + 0.5) / self.every)
+            values = np.stack([_basis(self.degree, (k % self.every + part) / self.every) for part in parts])
             if not size:
                 direct[k] = 1.0
             elif enters[k]:
                 shift[k], load[k, -1] = np.eye(size, k=1), 1.0
-                read[k] = np.concatenate([[0.0] * (size - self.degree), values[:-1]])
-                direct[k] = values[-1]
+                read[k, :, size - self.degree :] = values[:, :-1]
+                direct[k] = values[:, -1]
             else:
                 shift[k], read[k] = np.eye(size), values
         start = np.eye(size)[:, size - self.degree :]

@@ -94,7 +94,7 @@ def first_filter(
     inverses: Array,
 ) -> Filter:
     """A filter that knows nothing but what the first iterate violates."""
-    rates = jnp.where(rates_of(problem.systems, problem.phases)[:, :, None], inverses, 0.0)
+    rates = jnp.where(rates_of(problem.systems, problem.phases, problem.stages)[:, :, None], inverses, 0.0)
     _, dt = problem.applied(unknowns.free)
     units = dt * jnp.max(jnp.abs(rates), axis=(0, 1))
     size = jnp.maximum(1.0, violation(units, softness, path, slacks))

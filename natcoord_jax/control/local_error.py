@@ -22,15 +22,12 @@ from natcoord_jax.control.tangent import steady_rates
 from natcoord_jax.control.transcription import held_inputs, slices, times_of, unpacked
 from natcoord_jax.core.compiled import compiled
 from natcoord_jax.core.state import State
-from natcoord_jax.maths.collocation import gauss
 from natcoord_jax.model.tree import SLOTS
 from natcoord_jax.stepping.derivative import run_slots
 from natcoord_jax.stepping.newton import TOLERANCE
 from natcoord_jax.stepping.plan import Plan
 from natcoord_jax.system import System
 
-ORDER = gauss(1).order
-"""Of the scheme."""
 FLAT = 5.0
 """Least jump within a step, in terms of what the history beside changes over a step."""
 QUIET = 1e-12
@@ -43,10 +40,13 @@ class LocalErrors(NamedTuple):
     Attributes:
         steps: largest error of each step, relative; infinite where a half of it has no solution.
         jumps: part of a step that goes by before an input jumps in it; NaN where none does (steps, inputs).
+        order: the power of a step, less one, with which its error falls: that of the scheme, or two where
+            inputs are held over each step or no kicks keep velocities on the constraints.
     """
 
     steps: Float[np.ndarray, " steps"]
     jumps: Float[np.ndarray, "steps inputs"]
+    order: int
 
 
 class Scales(NamedTuple):
@@ -75,14 +75,22 @@ def local_errors(problem: OptimalControl, iterate: Iterate) -> LocalErrors:
     unknowns = iterate.unknowns
     inputs = np.asarray(held_inputs(problem, unknowns.coefficients))
     size = np.asarray(problem.lengths(unknowns.free))
-    changes, jumps = np.zeros_like(inputs), np.full_like(inputs, np.nan)
-    if problem.inputs.every == 1:
+    means = inputs if inputs.ndim == 2 else inputs[:, 0]
+    changes, jumps = np.zeros_like(means), np.full_like(means, np.nan)
+    # What a spline is within a step its stages say.
+    if problem.inputs.every == 1 and (problem.stages == 1 or not problem.inputs.degree):
         for first, last in sections(problem):
             here = slice(first, last)
-            changes[here], jumps[here] = changes_within(inputs[here], size[here])
+            changes[here], jumps[here] = changes_within(means[here], size[here])
     nodes = iterate.path.nodes.x
     found = _compared(problem, unknowns.free, nodes, jnp.asarray(inputs), jnp.asarray(changes))
-    return LocalErrors(np.asarray(found), jumps)
+    return LocalErrors(np.asarray(found), jumps, _order(problem))
+
+
+def _order(problem: OptimalControl) -> int:
+    """See `LocalErrors`."""
+    smooth = problem.inputs.degree > 0 or problem.inputs.every > 1
+    return problem.scheme.order if smooth and problem.scheme.tableau.kick else 2
 
 
 def sections(problem: OptimalControl) -> list[tuple[int, int]]:
@@ -127,14 +135,21 @@ def changes_within(
 @compiled
 def _compared(problem: OptimalControl, free: Array, nodes: Array, inputs: Array, changes: Array) -> Array:
     system, _ = problem.applied(free)
-    plan = Plan(2, 0, TOLERANCE, None)
+    order = _order(problem)
+    plan = Plan(2, 0, TOLERANCE, None, tableau=problem.scheme.tableau)
 
     def state_of(x: Array, t: Array) -> State:
         return unpacked(problem.state, x, t)
 
     begin, size, _ = jax.vmap(lambda at: times_of(problem, free, at))(slices(problem))
     before, after = (jax.vmap(state_of)(x, begin) for x in (nodes[:-1], nodes[1:]))
-    halves = jnp.stack([inputs - changes, inputs + changes], axis=1)
+    if inputs.ndim == 3:
+        changes = changes[:, None]
+    pieces = []
+    for begun, sign in ((0.0, -1.0), (0.5, 1.0)):
+        within = jax.vmap(lambda u, begun=begun: plan.within_step(u, jnp.asarray(begun), jnp.asarray(0.5)))
+        pieces.append(within(inputs) + sign * changes)
+    halves = jnp.stack(pieces, axis=1)
 
     def one(before: State, u: Array, dt: Array) -> tuple[State, Array]:
         slots, ending = run_slots(plan, system, before, u, 0.5 * dt)
@@ -144,7 +159,7 @@ def _compared(problem: OptimalControl, free: Array, nodes: Array, inputs: Array,
     fine, whole = jax.vmap(one)(before, halves, size)
     states = jax.vmap(state_of, in_axes=(0, None))(nodes, problem.state.t)
     scales = _scales(system, states, jnp.sum(size))
-    over = 2.0**ORDER / (2.0**ORDER - 1.0)
+    over = 2.0**order / (2.0**order - 1.0)
     rows = jnp.linalg.norm(after.q - fine.q, axis=-1, keepdims=True) / scales.rows
     found = jnp.max(rows, axis=(1, 2), initial=0.0)
     if problem.system.structure.solver == "reduced":

@@ -19,8 +19,26 @@ from natcoord_jax.core.state import State
 from natcoord_jax.system import System
 
 
+class Instant(NamedTuple):
+    """A stage of a step.
+
+    Attributes:
+        part: of the step that has gone by.
+        weight: of the quadrature over the step; all together are one.
+        state: there.
+        u: inputs there [N, N m].
+    """
+
+    part: float
+    weight: float
+    state: State
+    u: Float[Array, " inputs"]
+
+
 class Step(NamedTuple):
-    """One step of a motion.
+    """One step of a motion, or of one with several stages also its part up to a stage, for bounds.
+
+    Inputs that are not held over the step are those of its last stage.
 
     Attributes:
         number: of the step, the first is 0.
@@ -29,8 +47,10 @@ class Step(NamedTuple):
         after: state at its end.
         u: inputs held over it [N, N m].
         last: inputs of the step before, zero in the first one; empty where nobody asks for them.
-        gap: time from the middle of the step before to that of this one [s].
+        gap: time from the middle of the step before to that of this one [s], or between the times of inputs
+            that are not held.
         free: values of what is free besides the inputs, by name.
+        stages: where inputs and motion are known within it; none for steps of one stage.
     """
 
     number: Int[Array, ""]
@@ -41,6 +61,22 @@ class Step(NamedTuple):
     last: Float[Array, " inputs_or_none"]
     gap: Float[Array, ""]
     free: dict[str, Float[Array, ""]]
+    stages: tuple[Instant, ...] = ()
+
+    def integral(self, density: Callable[[State, Array], Any]) -> Float[Array, ""]:
+        """Integral over the step of a function of (state, u): trapezoidal, or by the stages."""
+        if not self.stages:
+            first, last = (density(state, self.u) for state in (self.before, self.after))
+            return 0.5 * self.dt * (first + last)
+        return self.dt * sum(at.weight * density(at.state, at.u) for at in self.stages)
+
+    def up_to_stages(self) -> "tuple[Step, ...]":
+        """The step up to each of its stages; of one stage the step itself."""
+        found = []
+        for at in self.stages:
+            gap = self.gap + (at.part - self.stages[-1].part) * self.dt
+            found.append(self._replace(dt=at.part * self.dt, after=at.state, u=at.u, gap=gap))
+        return tuple(found) or (self,)
 
 
 class Ending(NamedTuple):

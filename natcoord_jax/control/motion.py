@@ -23,7 +23,7 @@ def motion(
     Args:
         problem: the problem.
         free: what is free besides the inputs, in units of its scale.
-        inputs: of all steps (steps, inputs) [N, N m].
+        inputs: of all steps (steps, inputs), or of their stages (steps, stages, inputs) [N, N m].
         throw: whether to raise where it fails.
 
     Raises:
@@ -45,7 +45,8 @@ def motions(
         pieces = []
         for a, b in runs:
             given = inputs[a:b] if system.structure.inputs else None
-            pieces.append(simulate(system, state, dt=lengths[a], steps=b - a, inputs=given, throw=throw))
+            options = {"steps": b - a, "inputs": given, "scheme": problem.scheme, "throw": throw}
+            pieces.append(simulate(system, state, dt=lengths[a], **options))
             state = jax.tree.map(lambda x: x[-1], pieces[-1].states)
         found.append((system, joined(pieces)))
     return found

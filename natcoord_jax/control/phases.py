@@ -137,11 +137,11 @@ def places(systems: Systems, phases: Phases) -> tuple[np.ndarray, np.ndarray, np
     return number, kind[number], enters
 
 
-def rates_of(systems: Systems, phases: Phases) -> Bool[np.ndarray, "steps n"]:
+def rates_of(systems: Systems, phases: Phases, stages: int) -> Bool[np.ndarray, "steps n"]:
     """Which unknowns of each step are rates of free motions."""
     count, _ = most_unknowns(systems)
     own = [system.structure.unknowns for system in systems]
-    rows = np.arange(count) < np.array(own)[:, None]
+    rows = np.arange(stages * count) < stages * np.array(own)[:, None]
     return rows[np.repeat(np.arange(len(systems)), phases if len(systems) > 1 else sum(phases))]
 
 

@@ -25,6 +25,7 @@ from natcoord_jax.core.numeric import Number, Numbers, Whole
 from natcoord_jax.core.state import STATE, State
 from natcoord_jax.model.model import SYSTEM
 from natcoord_jax.model.tree import SLOTS
+from natcoord_jax.stepping.scheme import EnergyMomentum
 from natcoord_jax.system import System
 
 PARAMETERS = Several(
@@ -34,6 +35,7 @@ PARAMETERS = Several(
     )
 )
 PHASES = Several(Whole(1))
+SCHEME = of("nc.EnergyMomentum(order=...)", EnergyMomentum)
 TIMES = FLAG | Numbers((2,), "positive") | Several(Numbers((2,), "positive"))
 
 
@@ -60,7 +62,7 @@ class OptimalControl(Part):
     """Inputs, and free parameters, that make a cost small over a horizon of steps of the discrete motion.
 
     The motion is that of `nc.simulate`, step for step: what is found is optimal for the energy-momentum
-    scheme (57) at this step, not for an approximation of it.
+    scheme (57), or the one that is asked for, at this step, not for an approximation of it.
 
     Attributes:
         system: compiled system, with input channels unless something else is free; or one for each phase,
@@ -75,6 +77,10 @@ class OptimalControl(Part):
         goal: what the final state has to fulfil.
         bounds: what has to hold at the end of every step.
         inputs: how inputs are made of coefficients; default: held over each step.
+        scheme: of the motion; default: of order two. At order four and above costs and integrals are taken by
+            the quadrature of the stages, bounds hold at the stages instead of at the ends of the steps, and
+            `Solution.inputs` are those of the stages (steps, stages, inputs), as `nc.simulate` takes them. It
+            pays with inputs that are smooth, as `nc.inputs.piecewise_linear()` and `nc.inputs.cubic(1)`.
         parameters: numbers of the system (`nc.Parameter`) and of the initial state (`nc.InitialCoordinate`,
             `nc.InitialRate`, `nc.InitialState`) that are free as well.
         free_time: whether the step, and so the final time, is free; or (lower, upper) of the final time [s].
@@ -116,6 +122,9 @@ class OptimalControl(Part):
     goal: Goal = eqx.field(default_factory=Goal, kw_only=True, metadata=is_a(GOAL))
     bounds: Bound = eqx.field(default_factory=Bound, kw_only=True, metadata=is_a(BOUND))
     inputs: Spline = eqx.field(default_factory=Spline, kw_only=True, metadata=is_a(SPLINE))
+    scheme: EnergyMomentum = eqx.field(
+        default=EnergyMomentum(), kw_only=True, static=True, metadata=is_a(SCHEME)
+    )
     parameters: tuple[FreeNumber, ...] = eqx.field(
         default=(), kw_only=True, converter=tuple, metadata=is_a(PARAMETERS)
     )
@@ -163,6 +172,11 @@ class OptimalControl(Part):
         for lower, upper in self._time_limits():
             if not 0 <= lower < (np.inf if upper is None else upper):
                 raise ValueError(f"free_time is ({lower}, {upper}) s; pass 0 < lower < upper, or True")
+        if self.scheme.max_events:
+            raise ValueError(
+                "OptimalControl: impacts that are located have no place among the equations of all steps; "
+                "leave out max_events, or give the phases between impacts systems of their own"
+            )
         furthest = max(carrier.furthest() for carrier in self.carriers)
         if furthest > self.steps:
             raise ValueError(
@@ -197,7 +211,7 @@ class OptimalControl(Part):
         excess = jax.eval_shape(lambda m: self.path_excess(system, m, step), memory)
         if cost.shape != ():
             raise ValueError(f"the running cost has shape {cost.shape}; return a scalar")
-        _agree("bounds", excess, self.path_labels)
+        _agree("bounds", excess, self.path_labels[: len(self.path_labels) // self.stages])
         jax.eval_shape(lambda m: self.carried(system, m, step), memory)
 
     def _check_end(self, state: State) -> None:
@@ -243,6 +257,11 @@ class OptimalControl(Part):
         Without any input there is one that acts on nothing.
         """
         return self.inputs.count(len(self.system.structure.inputs)) or 1
+
+    @property
+    def stages(self) -> int:
+        """Number of stages of a step."""
+        return self.scheme.stages
 
     @property
     def uniform(self) -> bool:
@@ -381,15 +400,16 @@ class OptimalControl(Part):
         return jnp.concatenate([carrier.carried(system, numbers, step) for carrier, numbers in pairs])
 
     def path_excess(self, system: System, memory: Array, step: Step) -> Float[Array, " n"]:
-        """Excess over the bounds at the end of a step; memory is that at its start."""
+        """Excess over the bounds at the end of a step, or at its stages; memory is that at its start."""
         _, cost, bounds = self.memories(memory)
-        found = self.bounds.of_step(system, bounds, step), self.cost.excess(system, cost, step)
-        return jnp.concatenate(found)
+        steps = step.up_to_stages()
+        found = [(self.bounds.of_step(system, bounds, s), self.cost.excess(system, cost, s)) for s in steps]
+        return jnp.concatenate([part for both in found for part in both])
 
     @property
     def path_labels(self) -> tuple[str, ...]:
         """Names of these bounds."""
-        return self.bounds.labels(self.system) + self.cost.labels()
+        return self.stages * (self.bounds.labels(self.system) + self.cost.labels())
 
     @property
     def end_labels(self) -> tuple[str, ...]:

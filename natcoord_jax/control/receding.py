@@ -154,8 +154,10 @@ def receding_horizon(
 
 def _check(problem: OptimalControl, plant: System, horizon: str, steps: int) -> None:
     """Refuse what does not recede."""
-    if problem.inputs.degree or problem.inputs.every > 1 or not problem.uniform:
-        raise ValueError("receding_horizon needs one phase of equal steps and inputs held over each step")
+    if problem.inputs.degree or problem.inputs.every > 1 or not problem.uniform or problem.stages > 1:
+        raise ValueError(
+            "receding_horizon needs one phase of equal steps of order two and inputs held over each step"
+        )
     if sum(problem.memory_sizes) or problem.looked_back:
         raise ValueError(
             "receding_horizon starts anew at every update: it takes no goals, costs or bounds that look at "

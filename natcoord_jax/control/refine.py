@@ -192,7 +192,8 @@ def _finer(rounds: "_Rounds", tolerance: float, longest: list[float], most: int)
     now, asked = present(problem), asked_for(problem, wishes)
     more = more_of(now, asked, most // problem.inputs.every)
     full = more.sum() <= now.sum()
-    if not rounds.stuck and (full or worth_moving(now, asked, rounds.worst, tolerance)):
+    errors = rounds.errors
+    if not rounds.stuck and (full or worth_moving(now, asked, rounds.worst, tolerance, errors.order)):
         yield divided(problem, wishes, now)
     if not full:
         yield divided(problem, wishes, more)

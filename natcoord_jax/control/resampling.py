@@ -7,6 +7,7 @@ from jaxtyping import Float
 
 from natcoord_jax.control.mesh import lengths
 from natcoord_jax.control.problem import OptimalControl
+from natcoord_jax.maths.collocation import gauss
 
 Ends = Float[np.ndarray, " ends"]
 """Where steps begin and end: the number of the phase and the part of it that has gone by."""
@@ -45,10 +46,18 @@ def _same(old: Ends, new: Ends) -> bool:
     return len(old) == len(new) and bool(np.all(np.abs(old - new) <= ROUNDING * old[-1]))
 
 
+def _means(values: np.ndarray) -> np.ndarray:
+    """Means over the steps of what is known at their stages."""
+    if values.ndim == 2:
+        return values
+    return np.einsum("s,ksm->km", np.array(gauss(values.shape[1]).b), values)
+
+
 def averaged(values: np.ndarray, old: Ends, new: Ends) -> np.ndarray:
-    """Means of a history held over steps, over others."""
+    """Means of a history held over steps, or known at their stages, over others; the same over the same."""
     if _same(old, new):
         return values
+    values = _means(values)
     sums = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(np.diff(old)[:, None] * values, axis=0)])
     return np.diff(_looked_up(new, old, sums), axis=0) / np.diff(new)[:, None]
 
@@ -69,10 +78,10 @@ def _looked_up(at: np.ndarray, known: np.ndarray, values: np.ndarray) -> np.ndar
 
 
 def interpolated(values: np.ndarray, old: Ends, new: Ends) -> np.ndarray:
-    """Mean rates of steps, for others; a staircase would shake the motion."""
+    """Mean rates of steps, for others; a staircase would shake the motion. Those of stages over the same."""
     if _same(old, new):
         return values
-    found = at_middles(values, old, new)
+    found = at_middles(_means(values), old, new)
     # The kinks between the old middles excite swings from step to step.
     size, first = np.diff(new), found[:1]
     if len(found) > 1:

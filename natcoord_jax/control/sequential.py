@@ -163,7 +163,7 @@ def _sway(problem: OptimalControl, unknowns: Unknowns) -> Array:
     Curvature that is added in the inputs alone has to be as large as that of the motion far along it, which
     a small one of the motion itself holds as well, and leaves the inputs free.
     """
-    rates = rates_of(problem.systems, problem.phases)
+    rates = rates_of(problem.systems, problem.phases, problem.stages)
     pushed, moving = jnp.sum(unknowns.coefficients**2), jnp.sum(jnp.where(rates, unknowns.y, 0.0) ** 2)
     ratio = pushed * np.sum(rates) / (jnp.where(moving > 0, moving, 1.0) * max(1, unknowns.coefficients.size))
     return jnp.where(moving > 0, SWAY * ratio, 0.0)

@@ -17,8 +17,9 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from natcoord_jax.control.collocation import unknowns_each
 from natcoord_jax.control.costates import Multipliers
-from natcoord_jax.control.phases import most_counted, most_unknowns
+from natcoord_jax.control.phases import most_counted
 from natcoord_jax.control.pieces import Places, Sum, sum_of
 from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.control.transcription import (
@@ -65,7 +66,7 @@ def sizes_of(problem: OptimalControl) -> Sizes:
     register = degree + (problem.inputs.every > 1)
     x = 2 * state.q.size + most_counted(problem.systems) + state.rates.size
     carried = x + problem.looked_back + sum(problem.memory_sizes) + register * problem.channels
-    leading, own = degree * problem.channels, most_unknowns(problem.systems)[0]
+    leading, own = degree * problem.channels, unknowns_each(problem)
     return Sizes(len(problem.free), leading, carried, x, problem.channels, own)
 
 

@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.analysis.phases import Phases
-from natcoord_jax.control.guess import Guess
+from natcoord_jax.control.collocation import known_rates, unknowns_each
+from natcoord_jax.control.guess import Guess, fitted
 from natcoord_jax.control.iterate import Iterate
 from natcoord_jax.control.motion import motion, motions
-from natcoord_jax.control.phases import most_unknowns, rates_of
 from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.control.reasons import seen, unique, worst_condition
 from natcoord_jax.control.resampling import Ends, averaged, ends_of, in_phases, in_proportion, interpolated
@@ -172,7 +172,7 @@ class Solution(eqx.Module):
     def missing(self) -> dict[str, float]:
         """Residual of the goal at the end of the simulated motion, by name."""
         names = self.problem.goal_labels
-        if self.problem.later:
+        if self.problem.later or self.problem.stages > 1:
             residual = _missing_of_phases(self.problem, self._scaled(), jnp.asarray(self.inputs))
         else:
             states = self.trajectory.states
@@ -225,8 +225,7 @@ class Solution(eqx.Module):
         rates, old = None, ends_of(self.problem)
         systems, phases = self.problem.systems, self.problem.phases
         if self.iterate is not None and all(system.structure.solver == "reduced" for system in systems):
-            known = rates_of(systems, phases)
-            rates = np.where(known, self.iterate.unknowns.y, 0.0)[:, : most_unknowns(systems)[1]]
+            rates = known_rates(self.problem, self.iterate.unknowns.y)
         free = [self.free[name] for name in self.problem.free] or None
         if rates is not None and self.problem.later:
             # Those of different systems are not of the same motions.
@@ -290,8 +289,7 @@ def _missing(problem: OptimalControl, free: Array, states: State, inputs: Array)
 
 @compiled
 def _missing_of_phases(problem: OptimalControl, free: Array, inputs: Array) -> Float[Array, " n"]:
-    decided = problem.inputs.fitted(problem.inputs.decided(inputs, problem.channels))
-    unknowns = Unknowns(decided, free, jnp.zeros((problem.steps, most_unknowns(problem.systems)[0])))
+    unknowns = Unknowns(fitted(problem, inputs), free, jnp.zeros((problem.steps, unknowns_each(problem))))
     return roll(problem, simulated(problem, unknowns, False)[0]).end.missing
 
 

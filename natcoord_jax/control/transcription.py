@@ -17,8 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from natcoord_jax.control.collocation import collocated
 from natcoord_jax.control.inputs import Shaping
-from natcoord_jax.control.memory import Ending, Step
+from natcoord_jax.control.memory import Ending, Instant, Step
 from natcoord_jax.control.mesh import Mesh, mesh_of, spans
 from natcoord_jax.control.phases import (
     Systems,
@@ -33,7 +34,6 @@ from natcoord_jax.control.phases import (
 from natcoord_jax.control.problem import OptimalControl
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
-from natcoord_jax.maths.collocation import gauss
 from natcoord_jax.reading.transfer import transfer
 from natcoord_jax.stepping.derivative import run_slots
 from natcoord_jax.stepping.newton import TOLERANCE
@@ -140,8 +140,8 @@ class Slice(NamedTuple):
     number: Int[Array, "*k"]
     shift: Float[Array, "*k d d"]
     load: Float[Array, "*k d"]
-    read: Float[Array, "*k d"]
-    direct: Float[Array, "*k"]
+    read: Float[Array, "*k s d"]
+    direct: Float[Array, "*k s"]
     place: Mesh | None = None
     system: InPhase | None = None
 
@@ -168,7 +168,7 @@ def moving_places(problem: OptimalControl) -> np.ndarray:
 
 def slices(problem: OptimalControl) -> Slice:
     """The constant part of all steps."""
-    shaping: Shaping = problem.inputs.shaping(problem.steps)
+    shaping: Shaping = problem.inputs.shaping(problem.steps, problem.scheme.tableau.c)
     shift, load, read, direct = (jnp.asarray(x) for x in shaping[:4])
     place = None if problem.uniform else mesh_of(problem.phases, problem.dt)
     system = None
@@ -222,6 +222,7 @@ def seen(
     states: tuple[State, State],
     u: Array,
     node: Node,
+    stages: tuple[Instant, ...] = (),
 ) -> tuple[Array, Array, Array, Array]:
     """What a step costs, its excesses, and what is carried on from it.
 
@@ -231,13 +232,18 @@ def seen(
         number: of the step.
         times: its duration, and the time from the middle of the step before it [s].
         states: at its start and its end.
-        u: its inputs.
+        u: its inputs, at its last stage.
         node: before it.
+        stages: if it has several.
 
     Returns:
         Its cost, the excess over bounds at its end, its inputs where somebody asks for them, and the memory.
     """
-    step = Step(number, times[0], *states, u, node.last, times[1], problem.named(node.free))
+    dt, gap = times
+    if stages:
+        # From the last stage of the step before, whose duration is twice the gap less this one.
+        gap = (2.0 * gap - dt) * (1.0 - stages[-1].part) + dt * stages[-1].part
+    step = Step(number, dt, *states, u, node.last, gap, problem.named(node.free), stages)
     cost = problem.cost.of_step(system, problem.memories(node.memory)[1], step)
     excess = problem.path_excess(system, node.memory, step)
     last = u if node.last.size else node.last
@@ -256,7 +262,7 @@ def standing_excess(
     last = u if last is None else last
     last, memory = (last if problem.looked_back else u[:0]), jnp.zeros(sum(problem.memory_sizes))
     step = Step(jnp.array(1), dt, state, state, u, last, dt, problem.named(free))
-    return problem.path_excess(system, memory, step)
+    return jnp.tile(problem.path_excess(system, memory, step), problem.stages)
 
 
 def stage(
@@ -316,22 +322,27 @@ def _stage(
     """A step of a phase whose system is of one kind."""
     begin, dt, gap = times_of(problem, node.free, at)
     dt = stretch * dt
-    decided = at.read @ node.register + at.direct * w
+    tableau, stages = problem.scheme.tableau, ()
+    decided = at.read @ node.register + at.direct[:, None] * w
     u = problem.inputs.driven(decided, len(problem.system.structure.inputs))
     before = unpacked(like(problem.systems, problem.state, kind[0]), node.x, begin)
     if moving is not None:
         v, rates = jnp.split(moving, [before.v.size])
         before = replace_fields(before, v=v.reshape(-1, 3), rates=rates)
     system = systems[0] if at.system is None else at_hand(systems, kind, at.system.phase, before)
-    own = system.structure.unknowns + system.structure.multipliers
-    residual, after, _ = advance(system, before, u, dt, y[:own], gauss(1))
+    own = tableau.stages * (system.structure.unknowns + system.structure.multipliers)
+    if tableau.stages == 1:
+        residual, after, _ = advance(system, before, u[0], dt, y[:own], tableau)
+    else:
+        residual, after, stages = collocated(system, before, u, dt, y[:own], tableau)
     # The account of work plays no part.
     after = replace_fields(after, work=before.work)
     ending = after if reached is None else unpacked(after, reached, after.t)
-    cost, excess, last, memory = seen(problem, system, at.number, (dt, gap), (before, ending), u, node)
+    times, states = (dt, gap), (before, ending)
+    cost, excess, last, memory = seen(problem, system, at.number, times, states, u[-1], node, stages)
     if not u.size:
         # What acts on nothing wants to be zero.
-        cost = cost + 0.5 * dt * jnp.sum(decided**2)
+        cost = cost + 0.5 * dt * jnp.asarray(tableau.b) @ jnp.sum(decided**2, axis=1)
     register = at.shift @ node.register + at.load[:, None] * w
     x = packed(after, most_counted(systems))
     # What other phases have more unknowns for is zero.
@@ -415,11 +426,15 @@ def corrected(
     return Path(nodes, stages, end(problem, last)), eqx.tree_at(lambda u: u.y, unknowns, y)
 
 
-def held_inputs(problem: OptimalControl, coefficients: Float[Array, "c m"]) -> Float[Array, "steps m"]:
-    """Inputs of all steps."""
-    decided = coefficients
-    if problem.inputs.degree or problem.inputs.every > 1:
-        decided = jnp.asarray(problem.inputs.matrix(problem.steps)) @ coefficients
+def held_inputs(
+    problem: OptimalControl, coefficients: Float[Array, "c m"]
+) -> Float[Array, "steps m"] | Float[Array, "steps s m"]:
+    """Inputs of all steps; at their stages where they have several."""
+    decided, stages = coefficients, problem.stages
+    if problem.inputs.degree or problem.inputs.every > 1 or stages > 1:
+        decided = jnp.asarray(problem.inputs.matrix(problem.steps, problem.scheme.tableau.c)) @ coefficients
+    if stages > 1:
+        decided = decided.reshape(problem.steps, stages, -1)
     return problem.inputs.driven(decided, len(problem.system.structure.inputs))
 
 
@@ -444,7 +459,8 @@ def simulated(problem: OptimalControl, unknowns: Unknowns, lifted: bool) -> tupl
 
     def piece(system: System, state: State, given: tuple[Array, Array]) -> tuple[State, Piece]:
         u, dt = given
-        slots, ending = run_slots(Plan(u.shape[0], 0, TOLERANCE, None), system, state, u, dt)
+        plan = Plan(u.shape[0], 0, TOLERANCE, None, tableau=problem.scheme.tableau)
+        slots, ending = run_slots(plan, system, state, u, dt)
         whole = (ending.course.code == 0) & jnp.all(slots.accepted) & jnp.all(slots.fraction == 1.0)
         y = filled(slots.y, unknowns.y.shape[1])
         return ending.course.state, Piece(y, whole, ending.course.iterations)
