@@ -135,6 +135,22 @@ def test_bounds_hold_at_the_stages():
 
 
 @pytest.mark.exhaustive
+def test_rates_of_inputs_are_those_between_stages():
+    """Also from a step to one of another length, against differences of a given history."""
+    phases, size = (2, 2), (0.1, 0.3)
+    bounds = nc.bounds.InputRate(upper=1.0, lower=-np.inf)
+    problem = raised(phases, LIGHT, HELD, dt=list(size), bounds=bounds)
+    u = np.array([1.0, 4.0, -2.0, 3.0])
+    program = nc.to_nlp(problem, nc.Guess(u[:, None]))
+    known = zip(program.names, np.asarray(program.constraints(program.start)))
+    excess = np.array([value for name, value in known if name.startswith("rate of input")]).reshape(4, 2)
+    lengths, parts = np.repeat(size, phases), np.array(LIGHT.tableau.c)
+    times = np.concatenate([[0.0], np.cumsum(lengths)[:-1]])[:, None] + lengths[:, None] * parts
+    rates = (u[1:] - u[:-1])[:, None] / (times[1:] - times[:-1, -1:])
+    np.testing.assert_allclose(excess[1:] + 1.0, rates, rtol=1e-12)
+
+
+@pytest.mark.exhaustive
 def test_meshes_follow_errors_of_fifth_order():
     """Of steps with kicks; without them velocities normal to the constraints count, of third order."""
     found = nc.refine(raised(10, FOURTH, LINEAR), 2e-6, method="lifted", progress=False)
