@@ -151,6 +151,18 @@ def test_rates_of_inputs_are_those_between_stages():
 
 
 @pytest.mark.exhaustive
+def test_costs_are_integrals_of_what_is_between_the_stages():
+    """Three stages integrate the square of inputs that are linear within steps exactly."""
+    scheme, ends = nc.EnergyMomentum(order=6, kick=False), np.array([1.0, 4.0, -2.0, 3.0])
+    parts = np.array(scheme.tableau.c)
+    u = ends[:-1, None] + parts * np.diff(ends)[:, None]
+    program = nc.to_nlp(raised(3, scheme, LINEAR), nc.Guess(u[:, :, None]))
+    first, last = ends[:-1], ends[1:]
+    exact = np.sum(first**2 + first * last + last**2) / 3 / 3
+    assert float(program.cost(program.start)) == pytest.approx(exact, rel=1e-12)
+
+
+@pytest.mark.exhaustive
 def test_meshes_follow_errors_of_fifth_order():
     """Of steps with kicks; without them velocities normal to the constraints count, of third order."""
     found = nc.refine(raised(10, FOURTH, LINEAR), 2e-6, method="lifted", progress=False)
