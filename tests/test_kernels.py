@@ -107,6 +107,25 @@ def test_one_kernel_computes_the_same(monkeypatch):
         np.testing.assert_allclose(answers[name], expected[1:], rtol=1e-12, atol=1e-12, err_msg=name)
 
 
+def test_known_indices_cost_no_operation():
+    """In loops and branches either: nothing is left of what allows for negative ones, or for some beyond."""
+    index, beyond = np.array([3, 0, 5]), np.array([1, 9, 2])
+
+    def body(x):
+        return x.at[index].add(x[index - 6]).at[beyond].set(0.5)
+
+    def branched(x):
+        return looped(lambda x: jax.lax.cond(x[0] > 0, body, lambda x: -x, x), x)
+
+    x = jnp.linspace(1.0, 2.0, 6)
+    flat = rewriting.Flat(jax.make_jaxpr(branched)(x))
+    assert not flat.consts
+    program = jax.make_jaxpr(flat.rewritten)(x)
+    for name in ("select_n", "lt", "min", "and", "scatter"):
+        assert f" {name} " not in str(program) and f" {name}[" not in str(program)
+    np.testing.assert_allclose(flat.rewritten(x)[0], branched(x), rtol=1e-15)
+
+
 def test_what_does_not_fit_is_left_as_it_is():
     """What calls a library, and large arrays, which gain nothing by one kernel and compile twice as long."""
     x = jnp.asarray(MATRIX)

@@ -89,11 +89,16 @@ INNER = "jaxpr", "call_jaxpr", "call"
 """Where they keep them."""
 
 
-def _scan(given: dict[str, Any], operands: list[np.ndarray]) -> list[np.ndarray]:
+def loop_parts(given: dict[str, Any]) -> tuple[int, int]:
+    """Of the operands of a scan, how many are constants and how many are carried."""
     if "ft_in" in given:  # since JAX 0.11
         fixed, carried, _ = (len(list(part)) for part in given["ft_in"].unpack())
-    else:
-        fixed, carried = given["num_consts"], given["num_carry"]
+        return fixed, carried
+    return given["num_consts"], given["num_carry"]
+
+
+def _scan(given: dict[str, Any], operands: list[np.ndarray]) -> list[np.ndarray]:
+    fixed, carried = loop_parts(given)
     constants, state = operands[:fixed], operands[fixed : fixed + carried]
     listed, body = operands[fixed + carried :], given["jaxpr"]
     order = range(given["length"])

@@ -7,6 +7,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 from natcoord_jax.xla.rows import part, row
@@ -36,6 +37,9 @@ WINDOW = 32
 
 REDUCTION_LIMIT = 3000
 """Numbers from which on the compiler hands a reduction to a library (seen: 4096)."""
+
+UNROLLED = 4
+"""Windows of a scatter to known places up to which it is no loop."""
 
 REDUCTIONS = {
     "reduce_sum": jnp.add,
@@ -155,9 +159,9 @@ def _updates(name: str, given: list[Any], params: dict[str, Any]) -> Array:
     """A scatter as updates of slices, one window after the other."""
     operand, indices, updates = given
     numbers = params["dimension_numbers"]
-    batches = numbers.scatter_indices_batching_dims
-    counted = [jax.lax.broadcasted_iota(indices.dtype, indices.shape[:-1], k)[..., None] for k in batches]
-    indices = jnp.concatenate([indices, *counted], axis=-1)
+    batches, known = numbers.scatter_indices_batching_dims, isinstance(indices, np.ndarray)
+    counted = [np.indices(indices.shape[:-1], indices.dtype)[k][..., None] for k in batches]
+    indices = (np if known else jnp).concatenate([indices, *counted], axis=-1)
     targets = (*numbers.scatter_dims_to_operand_dims, *numbers.operand_batching_dims)
     single = (*numbers.inserted_window_dims, *numbers.operand_batching_dims)
     windows = numbers.update_window_dims
@@ -169,19 +173,29 @@ def _updates(name: str, given: list[Any], params: dict[str, Any]) -> Array:
     if 0 in updates.shape or 0 in operand.shape:
         return operand
     updates, places = updates.reshape(count, *shape), indices.reshape(count, -1)
+    drops = params["mode"] == jax.lax.GatherScatterMode.FILL_OR_DROP
+    if known:
+        room = np.array([operand.shape[dim] - shape[dim] for dim in targets])
+        kept = np.flatnonzero(np.all((places >= 0) & (places <= room), axis=1))
+        if drops and len(kept) < count:
+            updates = updates.at[kept].get(mode="promise_in_bounds", wrap_negative_indices=False)
+            places, count = places[kept], len(kept)
+        drops = False
 
     def one(k: Any, total: Array) -> Array:
-        window, place = row(updates, k), row(places, k)
-        starts = [jnp.zeros((), place.dtype)] * operand.ndim
+        window, place = row(updates, k), places[k] if isinstance(k, int) else row(jnp.asarray(places), k)
+        starts = [jnp.zeros((), places.dtype)] * operand.ndim
         for n, dim in enumerate(targets):
             starts[dim] = place[n]
         now = jax.lax.dynamic_slice(total, starts, shape, allow_negative_indices=False)
         if name == "scatter-add":
             window = now + window
-        if params["mode"] == jax.lax.GatherScatterMode.FILL_OR_DROP:
+        if drops:
             limits = zip(starts, shape, operand.shape)
             inside = jnp.all(jnp.stack([(at >= 0) & (at + size <= end) for at, size, end in limits]))
             window = jnp.where(inside, window, now)
         return jax.lax.dynamic_update_slice(total, window, starts, allow_negative_indices=False)
 
-    return one(0, operand) if count == 1 else jax.lax.fori_loop(0, count, one, operand)
+    if count == 1 or (known and count <= UNROLLED):
+        return reduce(lambda total, k: one(k, total), range(count), operand)
+    return jax.lax.fori_loop(0, count, one, operand)

@@ -166,7 +166,7 @@ def on_cpu() -> bool:
 def _flat(transform: Callable, program: Any, shapes: Any, arguments: tuple) -> Any:
     """A transformed function of flat arguments, among them what it closes over."""
     flat = Flat(program)
-    outputs = transform(flat)(*program.consts, *jax.tree.leaves(arguments))
+    outputs = transform(flat)(*flat.consts, *jax.tree.leaves(arguments))
     return jax.tree.unflatten(jax.tree.structure(shapes), outputs)
 
 
@@ -210,9 +210,12 @@ def _in_turn(function: Callable) -> Callable:
 
 
 def _in_one_kernel(function: Callable, flat: Sequence[Any]) -> list[Any]:
-    kinds = [(jnp.shape(x), jnp.result_type(x)) for x in flat]
     # After vmap, since small reductions of one lane are large ones of many.
-    whole = function if isinstance(function, Flat) else Flat(jax.make_jaxpr(function)(*flat))
+    whole: Any = function
+    if not isinstance(function, Flat):
+        whole = Flat(jax.make_jaxpr(function)(*flat))
+        flat = (*whole.consts, *flat)
+    kinds = [(jnp.shape(x), jnp.result_type(x)) for x in flat]
     if not known(whole.program.jaxpr, rewriting.KNOWN | rewriting.REWRITTEN):
         return whole(*flat)
     program = jax.make_jaxpr(whole.rewritten)(*flat)

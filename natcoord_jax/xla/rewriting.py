@@ -9,9 +9,13 @@ from functools import partial
 from typing import Any
 
 import jax
+import numpy as np
 from jax.extend import core as jex
 
+from natcoord_jax.xla.evaluation import loop_parts
 from natcoord_jax.xla.expansions import written_out
+from natcoord_jax.xla.numpy_operations import OPERATIONS
+from natcoord_jax.xla.tracing import is_concrete
 
 KNOWN = frozenset(
     "abs acos acosh add add_any and argmax argmin asin asinh atan atan2 atanh bitcast_convert_type "
@@ -104,19 +108,32 @@ def known(program: Any, names: frozenset[str] | None = None) -> bool:
     )
 
 
+FEW = 1000
+"""Numbers of an array up to which it is part of a program, if they are known whole numbers or truths."""
+
+
+def _is_whole(x: Any) -> bool:
+    """Whether something is a small array of these."""
+    return isinstance(x.dtype, np.dtype) and x.dtype.kind in "iub" and math.prod(x.shape) <= FEW
+
+
 class Flat:
     """A program as a function of its constants and arguments, in one list.
 
     Attributes:
         program: closed.
+        known: constants that are part of it, as indices are; None for others.
+        consts: these.
     """
 
     def __init__(self, program: Any):
-        self.program = program
+        self.program, every = program, program.consts
+        self.known = [np.asarray(x) if is_concrete(x) and _is_whole(x) else None for x in every]
+        self.consts = [x for x, known in zip(every, self.known) if known is None]
 
     def _parts(self, values: Sequence[Any]) -> tuple[Sequence[Any], Sequence[Any]]:
-        count = len(self.program.consts)
-        return values[:count], values[count:]
+        given = iter(values)
+        return [next(given) if x is None else x for x in self.known], list(given)
 
     def __call__(self, *values: Any) -> list[Any]:
         """Its outputs."""
@@ -136,6 +153,10 @@ def _evaluate(program: Any, consts: Sequence[Any], arguments: Sequence[Any]) -> 
 
     for equation in _needed(program):
         given = [read(x) for x in equation.invars]
+        found = _worked_out(equation, given)
+        if found is not None:
+            values[equation.outvars[0]] = found
+            continue
         scope = str(equation.source_info.name_stack)
         if scope:
             with jax.named_scope(scope):
@@ -144,6 +165,21 @@ def _evaluate(program: Any, consts: Sequence[Any], arguments: Sequence[Any]) -> 
             found = _apply(equation, given)
         values.update(zip(equation.outvars, found))
     return [read(x) for x in program.outvars]
+
+
+def _worked_out(equation: Any, given: list[Any]) -> np.ndarray | None:
+    """The output of an operation of known whole numbers or truths; None: it is none."""
+    operation = OPERATIONS.get(equation.primitive.name)
+    out: Any = equation.outvars[0].aval
+    if operation is None or not _is_whole(out):
+        return None
+    at: list[Any] = equation.invars
+    literal = [isinstance(x, jex.Literal) for x in at]
+    given = [np.asarray(x, v.aval.dtype) if fixed else x for v, x, fixed in zip(at, given, literal)]
+    if not all(isinstance(x, np.ndarray) for x in given):
+        return None
+    found = operation(*given, **equation.params)
+    return None if found is NotImplemented else np.asarray(found, out.dtype)
 
 
 def _apply(equation: Any, given: list[Any]) -> list[Any]:
@@ -156,15 +192,34 @@ def _apply(equation: Any, given: list[Any]) -> list[Any]:
         inner = params[INLINED[name]]
         return _evaluate(inner.jaxpr, inner.consts, given)
     if name != "custom_vmap_call":
-        params = {key: _inside(value) for key, value in params.items()}
+        constant = partial(_constant, name, given, params)
+        params = {key: _inside(value, constant(key)) for key, value in params.items()}
     found = equation.primitive.bind(*given, **params)
     return list(found) if equation.primitive.multiple_results else [found]
 
 
-def _inside(value: Any) -> Any:
-    """A parameter with the programs it holds rewritten."""
-    if isinstance(value, jex.ClosedJaxpr):
-        return jax.make_jaxpr(partial(Flat(value).rewritten, *value.consts))(*value.in_avals)
+def _constant(name: str, given: Sequence[Any], params: dict[str, Any], key: str) -> Sequence[Any]:
+    """What the first arguments of a program in a branch or a loop are in all turns, by its parameter."""
+    if name == "cond":
+        return given[1:]
+    if name == "scan":
+        return given[: loop_parts(params)[0]]
+    if name == "while":
+        of_test = params["cond_nconsts"]
+        return given[:of_test] if key == "cond_jaxpr" else given[of_test:][: params["body_nconsts"]]
+    return ()
+
+
+def _inside(value: Any, constant: Sequence[Any]) -> Any:
+    """A parameter with the programs it holds rewritten, with what is known of their arguments in them."""
     if isinstance(value, tuple) and value and all(isinstance(x, jex.ClosedJaxpr) for x in value):
-        return tuple(_inside(x) for x in value)
-    return value
+        return tuple(_inside(x, constant) for x in value)
+    if not isinstance(value, jex.ClosedJaxpr):
+        return value
+    flat = Flat(value)
+
+    def run(*arguments: Any) -> list[Any]:
+        known = [k if isinstance(k, np.ndarray) else x for k, x in zip(constant, arguments)]
+        return flat.rewritten(*flat.consts, *known, *arguments[len(known) :])
+
+    return jax.make_jaxpr(run)(*value.in_avals)
