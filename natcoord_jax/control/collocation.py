@@ -79,7 +79,7 @@ def collocated(
     v = at.rates[:, :bodies].reshape(stages, -1, 3)
     q, coordinates = before.q + jnp.tensordot(a, v, 1), before.coordinates + a @ turning
     carrying = [group.coordinates[:, 0] for group in equations.groups if group.effect.rotors]
-    rotors = turning[:, jnp.concatenate(carrying)] if carrying else jnp.zeros((stages, 0))
+    rotors = turning[:, np.concatenate(carrying)] if carrying else jnp.zeros((stages, 0))
     instants = []
     for k, (weight, part) in enumerate(zip(tableau.b, tableau.c)):
         fields = {"q": q[k], "v": v[k], "coordinates": coordinates[k], "rates": rotors[k]}

@@ -70,6 +70,15 @@ class Stacked(eqx.Module):
         raise NotImplementedError
 
 
+class Batched(eqx.Module):
+    """Base of modules that may be several at once: then all numbers in them have leading axes."""
+
+    @property
+    def batch(self) -> tuple[int, ...]:
+        """Lengths of these."""
+        raise NotImplementedError
+
+
 class Looked(eqx.Module):
     """Base of modules with methods of their own whose methods are what they compute now."""
 
@@ -99,7 +108,7 @@ def own_methods(cls: type) -> tuple[str, ...]:
 
 @lru_cache(maxsize=4096)
 def _stops(cls: type) -> bool:
-    return issubclass(cls, Function | Stacked) or bool(own_methods(cls))
+    return issubclass(cls, Function | Stacked | Batched) or bool(own_methods(cls))
 
 
 def facts(cls: type) -> tuple:
@@ -138,8 +147,10 @@ def _each(x: Any, visit: Visit, note: list[Any], lanes: tuple[int, ...]) -> Any:
     if isinstance(x, Function):
         note.append(_code(x.function))
         return visit(x, lanes)
+    if isinstance(x, Batched):
+        return mapped(x, visit, note, (*lanes, *x.batch))
     if isinstance(x, Stacked):
-        (inner,) = mapped((getattr(x, x.stacked),), visit, note, x.lanes)
+        (inner,) = mapped((getattr(x, x.stacked),), visit, note, (*lanes, *x.lanes))
         rest = mapped(replace_fields(x, **{x.stacked: None}), visit, note, lanes)
         return replace_fields(rest, **{x.stacked: inner})
     if own_methods(type(x)):

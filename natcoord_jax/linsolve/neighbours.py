@@ -10,10 +10,12 @@ It is the case of `linsolve.tree` in which nothing is carried: a block tridiagon
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from natcoord_jax.linsolve.tree import passed_down, transposed
 from natcoord_jax.maths.elimination import definite_inverse
+from natcoord_jax.maths.indices import INDICES
 from natcoord_jax.maths.vectors import applied, product
 from natcoord_jax.xla.rows import add_at, row
 
@@ -31,7 +33,7 @@ class NeighbourBlocks(eqx.Module):
     own: Float[Array, "nodes n n"]
     above: Float[Array, "nodes n n"]
     below: Float[Array, "nodes n n"]
-    neighbour: Int[Array, " nodes"]
+    neighbour: Int[np.ndarray, " nodes"] = eqx.field(**INDICES)
 
     def multiply(self, z: Float[Array, "nodes n"]) -> Float[Array, "nodes n"]:
         """Product with a vector."""
@@ -53,7 +55,7 @@ class NeighbourFactors(eqx.Module):
     inverse: Float[Array, "nodes n n"]
     lift: Float[Array, "nodes n n"]
     drop: Float[Array, "nodes n n"]
-    neighbour: Int[Array, " nodes"]
+    neighbour: Int[np.ndarray, " nodes"] = eqx.field(**INDICES)
 
     def solve(self, right: Float[Array, "nodes n"]) -> Float[Array, "nodes n"]:
         """Solution for a right-hand side: one loop up, one loop down."""
@@ -63,7 +65,7 @@ class NeighbourFactors(eqx.Module):
             return add_at(left, neighbour, -applied(lift, row(left, index)[None])), None
 
         start = jnp.concatenate([right, jnp.zeros_like(right[:1])])
-        nodes = self.lift, jnp.arange(right.shape[0]), self.neighbour
+        nodes = self.lift, jnp.arange(right.shape[0]), np.asarray(self.neighbour)
         left = jax.lax.scan(up, start, nodes, reverse=True)[0][:-1]
         alone = applied(self.inverse, left[:, None])
         return passed_down(-self.drop, alone, self.neighbour)[:-1]
@@ -85,16 +87,16 @@ def factor(blocks: NeighbourBlocks) -> tuple[NeighbourFactors, Float[Array, "nod
         return add_at(own, neighbour, -product(lift, above)), (inverse, lift, drop)
 
     start = jnp.concatenate([blocks.own, jnp.zeros_like(blocks.own[:1])])
-    rows = blocks.above, blocks.below, jnp.arange(nodes), blocks.neighbour
+    rows = blocks.above, blocks.below, jnp.arange(nodes), np.asarray(blocks.neighbour)
     inverse, lift, drop = jax.lax.scan(eliminate, start, rows, reverse=True)[1]
     return NeighbourFactors(inverse, lift, drop, blocks.neighbour), jnp.diagonal(blocks.own, axis1=1, axis2=2)
 
 
-def _sums(values: Float[Array, "nodes n"], neighbour: Int[Array, " nodes"]) -> Float[Array, "nodes n"]:
+def _sums(values: Float[Array, "nodes n"], neighbour: Int[np.ndarray, " nodes"]) -> Float[Array, "nodes n"]:
     """Of each node, the sum of what its followers have."""
 
     def body(sums: Array, node: tuple) -> tuple[Array, None]:
         return add_at(sums, node[1], node[0]), None
 
     start = jnp.zeros((values.shape[0] + 1, values.shape[1]), values.dtype)
-    return jax.lax.scan(body, start, (values, neighbour))[0][:-1]
+    return jax.lax.scan(body, start, (values, np.asarray(neighbour)))[0][:-1]

@@ -14,9 +14,11 @@ linear in the number of nodes, whatever the shape of the tree, and the loops com
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from natcoord_jax.linsolve.dense import bordered_inverse
+from natcoord_jax.maths.indices import INDICES
 from natcoord_jax.maths.vectors import applied, product
 from natcoord_jax.xla.rows import add_at, row
 
@@ -27,7 +29,9 @@ def transposed(matrices: Float[Array, "*n r c"]) -> Float[Array, "*n c r"]:
 
 
 def passed_down(
-    across: Float[Array, "nodes width width"], own: Float[Array, "nodes width"], parent: Int[Array, " nodes"]
+    across: Float[Array, "nodes width width"],
+    own: Float[Array, "nodes width"],
+    parent: Int[np.ndarray, " nodes"],
 ) -> Float[Array, "nodes_and_rest width"]:
     """Sums x_i = across_i x_p + own_i, roots to leaves; last, the zero that roots see.
 
@@ -40,11 +44,13 @@ def passed_down(
         return add_at(seen, index, applied(across, row(seen, parent)[None])), None
 
     start = jnp.concatenate([own, jnp.zeros_like(own[:1])])
-    return jax.lax.scan(down, start, (across, jnp.arange(own.shape[0]), parent))[0]
+    return jax.lax.scan(down, start, (across, jnp.arange(own.shape[0]), np.asarray(parent)))[0]
 
 
 def handed_up(
-    lift: Float[Array, "nodes width width"], own: Float[Array, "nodes width"], parent: Int[Array, " nodes"]
+    lift: Float[Array, "nodes width width"],
+    own: Float[Array, "nodes width"],
+    parent: Int[np.ndarray, " nodes"],
 ) -> Float[Array, "nodes width"]:
     """Sums over children s_i = sum of (lift_c s_c + own_c), leaves to roots."""
 
@@ -53,7 +59,7 @@ def handed_up(
         return add_at(sums, parent, applied(lift, row(sums, index)[None]) + own), None
 
     start = jnp.zeros((own.shape[0] + 1, own.shape[1]), own.dtype)
-    every = (lift, own, jnp.arange(own.shape[0]), parent)
+    every = (lift, own, jnp.arange(own.shape[0]), np.asarray(parent))
     return jax.lax.scan(up, start, every, reverse=True)[0][:-1]
 
 
@@ -73,7 +79,7 @@ class TreeBlocks(eqx.Module):
     spread: Float[Array, "nodes width all"]
     gather: Float[Array, "nodes all width"]
     rest: Float[Array, "nodes all all"]
-    parent: Int[Array, " nodes"]
+    parent: Int[np.ndarray, " nodes"] = eqx.field(**INDICES)
     definite: int = eqx.field(static=True)
 
     def multiply(self, z: Float[Array, "nodes n"]) -> Float[Array, "nodes n"]:
@@ -111,7 +117,7 @@ class TreeFactors(eqx.Module):
     drop: Float[Array, "nodes width width"]
     gather: Float[Array, "nodes n width"]
     spread: Float[Array, "nodes width n"]
-    parent: Int[Array, " nodes"]
+    parent: Int[np.ndarray, " nodes"] = eqx.field(**INDICES)
 
     def solve(self, right: Float[Array, "nodes n"]) -> Float[Array, "nodes n"]:
         """Solution for a right-hand side: one loop up, one loop down."""
@@ -157,7 +163,7 @@ def factor(blocks: TreeBlocks) -> tuple[TreeFactors, Float[Array, "nodes n"]]:
 
     start = jnp.concatenate([blocks.own, jnp.zeros((1, width, width), blocks.own.dtype)])
     start = jnp.broadcast_to(start[:, None], (nodes + 1, 2, width, width))
-    rows = (blocks.spread, blocks.gather, blocks.rest, jnp.arange(nodes), blocks.parent)
+    rows = (blocks.spread, blocks.gather, blocks.rest, jnp.arange(nodes), np.asarray(blocks.parent))
     found = jax.lax.scan(eliminate, start, rows, reverse=True)[1]
     inverse, to_parent, from_parent, lift, drop, diagonal = found
     rims = blocks.gather[:, width:], blocks.spread[:, :, width:]

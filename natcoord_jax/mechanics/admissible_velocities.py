@@ -127,7 +127,7 @@ def _along_the_tree(system: Model, state: State, v: Velocity) -> Velocity:
     tree, rows = system.tree, state.rows
     blocks, present = _spatial(system, rows)
     across, own = blocks.spread[:, :, :6], blocks.spread[:, :, 6:]
-    places, parent = jnp.asarray(tree.slot_index)[:, np.array(tree.slots, int)], blocks.parent
+    places, parent = tree.slot_index[:, np.array(tree.slots, int)], blocks.parent
     w = jnp.where(present, tree_rates(system, state).at[places].get(mode="fill", fill_value=0.0), 0.0)
 
     def moving(w: Float[Array, "bodies m"]) -> Float[Array, "bodies 4 3"]:
@@ -142,11 +142,13 @@ def _along_the_tree(system: Model, state: State, v: Velocity) -> Velocity:
     return Velocity(moving(w + change), v.rotors)
 
 
-def _spatial(system: Model, rows: Float[Array, "bodies 4 3"]) -> tuple[TreeBlocks, Bool[Array, "bodies m"]]:
+def _spatial(
+    system: Model, rows: Float[Array, "bodies 4 3"]
+) -> tuple[TreeBlocks, Bool[np.ndarray, "bodies m"]]:
     """Inertia of the free motions by body, from twists of the bodies, and which of the slots a body has."""
     tree, slots = system.tree, np.array(system.tree.slots, int)
     axes, points = joint_axes(system, rows)
-    present = jnp.asarray(tree.slot_index)[:, slots] < tree.slot_of.shape[0]
+    present = tree.slot_index[:, slots] < tree.slot_of.shape[0]
     axis, turning = jnp.where(present[..., None], axes[:, slots], 0.0), turns(slots)
     velocity = jnp.where(turning[:, None], cross(axis, (rows[:, 0] - points)[:, None]), axis)
     own = jnp.concatenate([velocity, jnp.where(turning[:, None], axis, 0.0)], axis=2)
@@ -161,7 +163,7 @@ def _spatial(system: Model, rows: Float[Array, "bodies 4 3"]) -> tuple[TreeBlock
     rest = jnp.zeros((count, 6 + slots.size, 6 + slots.size), rows.dtype).at[:, 6:, 6:].set(absent)
     spread = jnp.concatenate([across, jnp.swapaxes(own, 1, 2)], axis=2)
     gather = jnp.swapaxes(spread, 1, 2)
-    return TreeBlocks(masses, spread, gather, rest, jnp.asarray(tree.parent), slots.size), present
+    return TreeBlocks(masses, spread, gather, rest, tree.parent, slots.size), present
 
 
 def _together(system: Model, state: State, v: Velocity, holding: tuple[Array, Array] | None) -> Velocity:

@@ -92,7 +92,7 @@ class SeparateTangents(eqx.Module):
         return jnp.sum(self.frame * self.pulled(self.impulse(v).rows)[:, None], axis=-1)
 
     def answers(
-        self, forces: Float[Array, "n k 4 3"], bodies: Int[Array, "n k"]
+        self, forces: Float[Array, "n k 4 3"], bodies: Int[np.ndarray, "n k"]
     ) -> tuple[Float[Array, "n bodies m"], Float[Array, "n 0"]]:
         """What impulses on the rows of few bodies each bring about; see `TangentSpace.answers`."""
         rows, frame, velocity, spin = (x[bodies] for x in (self.rows, self.frame, self.velocity, self.spin))

@@ -10,18 +10,17 @@ from natcoord_jax.model.node_layout import NodeLayout
 
 
 def seated(
-    bodies: Int[Array | np.ndarray, "n k"], ground: int
-) -> tuple[Bool[Array, "n k"], Bool[Array, "n k"]]:
+    bodies: Int[np.ndarray, "n k"], ground: int
+) -> tuple[Bool[np.ndarray, "n k"], Bool[np.ndarray, "n k"]]:
     """Which bodies of each instance are its node, the deeper one, and which the node's parent."""
-    bodies = jnp.asarray(bodies)
     real = bodies < ground
     # Bodies are numbered from the root.
-    node = jnp.max(jnp.where(real, bodies, -1), axis=1, keepdims=True)
+    node = np.max(np.where(real, bodies, -1), axis=1, keepdims=True)
     at_node = real & (bodies == node)
     return at_node, real & ~at_node
 
 
-def by_place(by_twist: Float[Array, "n k s 6 k s 6"], places: tuple[Array, Array]) -> list[Array]:
+def by_place(by_twist: Float[Array, "n k s 6 k s 6"], places: tuple[np.ndarray, np.ndarray]) -> list[Array]:
     """Blocks (node, node), (node, parent), (parent, node), (parent, parent) of each instance."""
     n, k, s = by_twist.shape[:3]
     local = by_twist.reshape(n, k, 6 * s, k, 6 * s)
@@ -33,7 +32,9 @@ def by_place(by_twist: Float[Array, "n k s 6 k s 6"], places: tuple[Array, Array
 
 
 def borders(
-    by_lam: Float[Array, "n k s 6 s m"], by_twist: Float[Array, "n s m k s 6"], places: tuple[Array, Array]
+    by_lam: Float[Array, "n k s 6 s m"],
+    by_twist: Float[Array, "n s m k s 6"],
+    places: tuple[np.ndarray, np.ndarray],
 ) -> list[Array]:
     """Of each multiplier: its loads on node and on parent, the rates of its constraint by their twists."""
     n, k, s = by_lam.shape[:3]
@@ -73,7 +74,7 @@ def with_multipliers(
     by_node, by_parent = (
         jnp.moveaxis(x, 2, 3).reshape(bodies, count * s, width) for x in (by_node, by_parent)
     )
-    unused = jnp.repeat(layout.slots == layout.places.shape[0], s, axis=1)
+    unused = np.repeat(layout.slots == layout.places.shape[0], s, axis=1)
     by_parent = jnp.concatenate([by_parent, jnp.zeros((bodies, count * s, rest.shape[2] - width))], axis=2)
     columns = gather @ on_node
     columns = jnp.concatenate([columns[:, :width] + on_parent, columns[:, width:]], axis=1)
@@ -99,8 +100,8 @@ def _by_multipliers(
         first[total : total + n * m] = total + np.repeat(np.arange(n) * m, m)
         total += n * m
     first[total] = -most - 1  # of an unused place: no multiplier is its own
-    slots = jnp.asarray(layout.slots)
-    own = slots[:, None, :, None] == jnp.asarray(first)[slots][:, :, None, None] + np.arange(most)
+    slots = layout.slots
+    own = slots[:, None, :, None] == first[slots][:, :, None, None] + np.arange(most)
     bodies, count = slots.shape
     blocks = jnp.einsum("bamnk,back->bamcn", found, own.astype(found.dtype))
     return blocks.reshape(bodies, count * layout.stages, count * layout.stages)

@@ -33,7 +33,7 @@ def bodies_of_elements(group: Group) -> Array | np.ndarray:
     """Bodies of the matrices of a group: those of its instances, or of their parts."""
     if not group.effect.spread:
         return group.bodies
-    xp: Any = np if is_concrete(group.bodies, group.effect.parts) else jnp
+    xp: Any = np if is_concrete(group.effect.parts) else jnp
     parts = xp.asarray(group.effect.parts)
     table = xp.take_along_axis(xp.asarray(group.bodies), parts.reshape(group.count, -1), axis=1)
     return table.reshape(-1, parts.shape[-1])
@@ -53,7 +53,7 @@ def elements(system: Model, stages: int = 1) -> list[Array | np.ndarray]:
     groups = tuple(g for g in (*system.effects, *system.joints) if touches(g))
     tables = [bodies_of_elements(group) for group in groups]
     xp: Any = jnp
-    if is_concrete(system.local_rates, tables):
+    if is_concrete(tables):
         xp, tables = np, [np.asarray(table) for table in tables]
     first = stages * system.local_rates.count
     size = first + stages * sum(g.count * g.multipliers for g in groups)

@@ -113,7 +113,9 @@ def _work(
             size = group.count * group.multipliers
             here, position = impulses[position : position + size], position + size
             if group.source == "coordinates":
-                done.append(here * jax.vmap(mean)(group.effect, group.coordinates) - 0.5 * power[:, 0])
+                done.append(
+                    here * jax.vmap(mean)(group.effect, np.asarray(group.coordinates)) - 0.5 * power[:, 0]
+                )
             else:
                 done.append(jnp.zeros_like(here))
     return jnp.concatenate(done)

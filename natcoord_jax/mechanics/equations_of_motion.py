@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.core.bodies import NODE
@@ -82,7 +83,7 @@ def relative_rates(
     found = []
     for group in (*relations, *loops_of(system)):
         if group.source == "coordinates":
-            found.append(jax.vmap(relation)(group.effect, group.coordinates))
+            found.append(jax.vmap(relation)(group.effect, np.asarray(group.coordinates)))
         else:
             here = (x[group.bodies] for x in (extended, velocity, spin))
             rates = jax.vmap(constraint)(group.effect, group_places(system, group), *here)

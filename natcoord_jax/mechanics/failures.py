@@ -77,7 +77,7 @@ def _jumps(group: Group, equations: Any) -> Bool[Array, " n"]:
     """
     # A drive may have no numbers: its coordinates count the lanes.
     prescribed = jax.vmap(lambda effect, _: effect.prescribed(equations.state.t, equations.h))
-    change, rates = prescribed(group.effect, group.coordinates)
+    change, rates = prescribed(group.effect, np.asarray(group.coordinates))
     low, high = jnp.min(rates, axis=1), jnp.max(rates, axis=1)
     beyond = jnp.abs(change - jnp.clip(change, low, high))
     jump, relation = jnp.where(beyond > BEYOND * (high - low), beyond, 0.0), cast(Any, group.effect)

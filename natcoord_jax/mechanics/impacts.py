@@ -53,7 +53,7 @@ class Answers:
             each = jax.vmap(lambda effect, place, rows: getattr(effect, name)(place, rows))
             forces = each(group.effect, group_places(system, group), rows[group.bodies])
             self.each = forces.shape[1]
-            bodies = jnp.repeat(group.bodies, self.each, axis=0)
+            bodies = np.repeat(group.bodies, self.each, axis=0)
             answers.append(space.answers(forces.reshape(-1, *forces.shape[2:]), bodies))
         self.along, self.prescribed = (jnp.concatenate(x) for x in zip(*answers))
 

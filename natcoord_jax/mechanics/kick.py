@@ -29,6 +29,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from natcoord_jax.core.effect import replace_fields
@@ -101,7 +102,7 @@ def rotor_rates(equations: Any, at: StageKinematics) -> Float[Array, "s rotors"]
     carrying = [g.coordinates[:, 0] for g in equations.groups if g.effect.rotors]
     if not carrying:
         return jnp.zeros((at.rates.shape[0], 0), at.rates.dtype)
-    return stage_rates(equations.system, at, equations.h)[:, jnp.concatenate(carrying)]
+    return stage_rates(equations.system, at, equations.h)[:, np.concatenate(carrying)]
 
 
 def kick_of(equations: Any, at: StageKinematics) -> Kick:

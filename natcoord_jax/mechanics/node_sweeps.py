@@ -42,7 +42,7 @@ def free_axes(
     tree: Tree, frames: Float[Array, "bodies 2 4 4"], rows: Float[Array, "bodies 4 3"]
 ) -> Float[Array, "free 3 3"]:
     """Axes of the rates of free bodies, see `roundness`; those of space for points."""
-    turning = jnp.asarray(tree.ball[tree.free.here])[:, None, None]
+    turning = tree.ball[tree.free.here][:, None, None]
     axes = tree.ball_axes(frames, rows[:, 1:])[0, tree.free.here]
     return jnp.where(turning, axes, jnp.eye(3, dtype=rows.dtype))
 

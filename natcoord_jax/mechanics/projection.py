@@ -181,7 +181,7 @@ def coordinate_matrix(system: Model, state: State) -> Float[Array, "coordinates 
     rows, count = rows_with_ground(state.q), len(system.structure.bodies)
     found = jnp.zeros((len(system.structure.coordinates), TWIST * count), state.q.dtype)
     for group in system.coordinates:
-        bodies = jnp.asarray(system.joint_bodies)[group.joints]
+        bodies = system.joint_bodies[group.joints]
 
         def rate(_, place, rows, rates, spin, t, axis=group.axis):
             return axis.rate(*frames_at(place, rows), *frames_at(place, rates), spin[1] - spin[0])[None]

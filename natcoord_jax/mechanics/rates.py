@@ -5,8 +5,11 @@ every body that hangs on it, turning about an axis through the joint's point or 
 programs are small whatever the depth of the tree.
 """
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.core.joint import frames_at
@@ -21,10 +24,15 @@ Twists = tuple[Float[Array, "bodies 3"], Float[Array, "bodies 3"]]
 """Velocities of reference points [m/s] and angular velocities [rad/s]; or forces [N] and torques [N m]."""
 
 
+FEW = 100
+"""Bodies up to which a matrix of all pairs of them is written into programs."""
+
+
 def carried(system: Model) -> Float[Array, "bodies bodies"]:
     """Which body (first axis) hangs on which body's tree joint (second axis): 1 or 0."""
     count = len(system.structure.bodies)
-    number = jnp.arange(count)
+    # A constant of the program, unless it would be a large one.
+    number: Any = np.arange(count) if count <= FEW else jnp.arange(count)
     hangs = ((number == number[:, None]) | (number == system.tree.parent[:, None])).astype(system.mass.dtype)
     for _ in range((len(system.tree.levels) - 1).bit_length()):
         hangs = (hangs @ hangs > 0).astype(hangs.dtype)

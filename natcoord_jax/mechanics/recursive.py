@@ -10,6 +10,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.linsolve import neighbours
@@ -81,7 +82,7 @@ class RecursiveStep(ReducedStep):
             found = momentum_balance(*given, multipliers, self.h, self.tableau)
             loads = found.force, found.torque
         these = hinging(tree, self.frames, self.start)
-        present = tree.slot_index[:, jnp.array(tree.slots, int)] < tree.slot_of.shape[0]
+        present = tree.slot_index[:, np.array(tree.slots, int)] < tree.slot_of.shape[0]
         rates, through = gather_slots(tree, w), load_nodes(tree, geometry, *loads)
         rest = rates, geometry, through, self.h, self.tableau
         if self._alone:
@@ -123,7 +124,7 @@ class RecursiveStep(ReducedStep):
 
     def _by_node(self, matrix: Blocks) -> tuple[Any, Any]:
         """A matrix in blocks, by what couples its nodes, and its factorisation."""
-        following = jnp.asarray(self.system.tree.neighbour)
+        following = self.system.tree.neighbour
         if self._alone:
             own, above, below = matrix
             return neighbours.NeighbourBlocks(own, above, below, following), neighbours.factor

@@ -127,7 +127,7 @@ class TangentSpace(eqx.Module):
         return self.admissible.frame @ self.pulled(self.impulse(v))
 
     def answers(
-        self, forces: Float[Array, "n k 4 3"], bodies: Int[Array, "n k"]
+        self, forces: Float[Array, "n k 4 3"], bodies: Int[np.ndarray, "n k"]
     ) -> tuple[Float[Array, "n u"], Float[Array, "n c"]]:
         """The same of impulses on the rows of few bodies each, and their work on what drives prescribe.
 

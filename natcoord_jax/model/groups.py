@@ -11,6 +11,7 @@ from natcoord_jax.core.callables import Stacked
 from natcoord_jax.core.coordinate import Coordinate
 from natcoord_jax.core.effect import Effect
 from natcoord_jax.core.names import Names
+from natcoord_jax.maths.indices import INDICES
 from natcoord_jax.model.segment_sum import SegmentSum
 
 
@@ -38,12 +39,12 @@ class Group(Stacked):
 
     effect: Effect
     weights: Float[Array, "n k *m 4"] | None
-    bodies: Int[Array | np.ndarray, "n k"]
-    joints: Int[Array | np.ndarray, "n j"]
-    inputs: Int[Array | np.ndarray, "n i"]
-    coordinates: Int[Array | np.ndarray, "n c"]
-    rotors: Int[Array | np.ndarray, "n r"]
-    works: Int[Array | np.ndarray, "n w"]
+    bodies: Int[np.ndarray, "n k"] = eqx.field(**INDICES)
+    joints: Int[np.ndarray, "n j"] = eqx.field(**INDICES)
+    inputs: Int[np.ndarray, "n i"] = eqx.field(**INDICES)
+    coordinates: Int[np.ndarray, "n c"] = eqx.field(**INDICES)
+    rotors: Int[np.ndarray, "n r"] = eqx.field(**INDICES)
+    works: Int[np.ndarray, "n w"] = eqx.field(**INDICES)
     acting: SegmentSum
     count: int = eqx.field(static=True)
     names: Sequence[str] = eqx.field(static=True)
@@ -56,9 +57,8 @@ class Group(Stacked):
 
     @property
     def lanes(self) -> tuple[int, ...]:
-        """Instances, where each has numbers of its own, after the systems of a batch."""
-        batch = np.shape(self.bodies)[:-2]
-        return batch if self.effect.shared or self.source == "mass" else (*batch, self.count)
+        """Instances, where each has numbers of its own."""
+        return () if self.effect.shared or self.source == "mass" else (self.count,)
 
     @property
     def is_set(self) -> bool:
@@ -95,8 +95,8 @@ class CoordinateGroup(eqx.Module):
     """Joint coordinates of one description: joints, their bodies and places in the state."""
 
     axis: Coordinate = eqx.field(static=True)
-    joints: Int[Array | np.ndarray, " n"]
-    index: Int[Array | np.ndarray, " n"]
+    joints: Int[np.ndarray, " n"] = eqx.field(**INDICES)
+    index: Int[np.ndarray, " n"] = eqx.field(**INDICES)
 
 
 class Seats(eqx.Module):
@@ -115,6 +115,6 @@ class Elimination(eqx.Module):
         seats: of the instances of each effect group.
     """
 
-    slots: Int[Array | np.ndarray, "bodies m"]
-    places: Int[Array | np.ndarray, " multipliers"]
+    slots: Int[np.ndarray, "bodies m"] = eqx.field(**INDICES)
+    places: Int[np.ndarray, " multipliers"] = eqx.field(**INDICES)
     seats: tuple[Seats, ...]

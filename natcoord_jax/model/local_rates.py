@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from natcoord_jax.core.bodies import TRIAD, NodeKind
+from natcoord_jax.maths.indices import INDICES
 
 TWIST = 6
 """Components of a twist."""
@@ -30,9 +31,9 @@ class LocalRates(eqx.Module):
         count: number of rates.
     """
 
-    place: Int[Array | np.ndarray, "bodies 6"] | None
-    component: Int[Array | np.ndarray, " count"] | None
-    directed: Int[Array | np.ndarray, " directors"] | None
+    place: Int[np.ndarray, "bodies 6"] | None = eqx.field(**INDICES)
+    component: Int[np.ndarray, " count"] | None = eqx.field(**INDICES)
+    directed: Int[np.ndarray, " directors"] | None = eqx.field(**INDICES)
     bodies: int = eqx.field(static=True)
     count: int = eqx.field(static=True)
 

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, Int
 from natcoord_jax.core.checks import as_array
 from natcoord_jax.core.eager_numpy import eager_numpy
 from natcoord_jax.core.effect import Effect, replace_fields
+from natcoord_jax.maths.indices import INDICES
 from natcoord_jax.model.groups import Group
 from natcoord_jax.model.local_rates import TWIST
 from natcoord_jax.model.segment_sum import SegmentSum
@@ -34,10 +35,10 @@ class MassBetween(eqx.Module):
         acting: how bodies collect what the blocks give them, the first of all blocks before the second.
     """
 
-    bodies: Int[Array | np.ndarray, "pairs 2"]
+    bodies: Int[np.ndarray, "pairs 2"] = eqx.field(**INDICES)
     blocks: Float[Array, "pairs r r"]
     uniform: Float[Array, "bodies 4 4"]
-    places: tuple[Int[Array | np.ndarray, "n k k"] | None, ...]
+    places: tuple[Int[np.ndarray, "n k k"] | None, ...] = eqx.field(**INDICES)
     acting: SegmentSum
 
     @property

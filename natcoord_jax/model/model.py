@@ -1,4 +1,4 @@
-"""The data of a compiled system: arrays as leaves, structure static and hashable."""
+"""The data of a compiled system: numbers as leaves, structure static and hashable, indices included."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -9,9 +9,11 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from natcoord_jax.core.arguments import checked
+from natcoord_jax.core.callables import Batched
 from natcoord_jax.core.handles import Handle, named
 from natcoord_jax.core.kinds import BODY_NAME, JOINT_NAME, NAME, HandleOf, of
 from natcoord_jax.core.names import clamped, listed
+from natcoord_jax.maths.indices import INDICES
 from natcoord_jax.model.groups import CoordinateGroup, Elimination, Group
 from natcoord_jax.model.islands import Islands
 from natcoord_jax.model.local_rates import LocalRates
@@ -73,7 +75,7 @@ class Structure:
         return self.multipliers - self.inequalities
 
 
-class Model(eqx.Module):
+class Model(Batched):
     """What a compiled multibody system holds.
 
     Attributes:
@@ -95,18 +97,23 @@ class Model(eqx.Module):
 
     mass: Float[Array, "bodies 4 4"]
     frames: Float[Array, "joints 2 4 4"]
-    joint_bodies: Int[Array | np.ndarray, "joints 2"]
+    joint_bodies: Int[np.ndarray, "joints 2"] = eqx.field(**INDICES)
     tree: Tree
     local_rates: LocalRates
     joints: tuple[Group, ...]
     effects: tuple[Group, ...]
     coordinates: tuple[CoordinateGroup, ...]
-    coordinate_order: Int[Array | np.ndarray, " coordinates"]
+    coordinate_order: Int[np.ndarray, " coordinates"] = eqx.field(**INDICES)
     elimination: Elimination | None
     structure: Structure = eqx.field(static=True)
     mass_between: MassBetween | None = None
     sparsity: Any = None
     size: Any = None
+
+    @property
+    def batch(self) -> tuple[int, ...]:
+        """Leading axes of several systems of one structure, as one of `jax.vmap`."""
+        return np.shape(self.mass)[:-3]
 
     @checked("System.body_index", body=BODY_NAME)
     def body_index(self, body: Handle | str) -> int:

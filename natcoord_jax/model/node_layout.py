@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from natcoord_jax.maths.indices import INDICES
 from natcoord_jax.model.tree import SLOTS, Tree
 
 
@@ -15,7 +16,7 @@ def unknowns_of_slots(tree: Tree, by_slot: Float[Array, "s bodies k"]) -> Float[
     """Numbers of the unknowns from those of all slots in use."""
     position = np.zeros(SLOTS, np.int32)
     position[list(tree.slots)] = np.arange(len(tree.slots))
-    place = tree.slot_of // SLOTS * len(tree.slots) + jnp.asarray(position)[tree.slot_of % SLOTS]
+    place = tree.slot_of // SLOTS * len(tree.slots) + position[tree.slot_of % SLOTS]
     return by_slot.reshape(by_slot.shape[0], -1)[:, place]
 
 
@@ -34,8 +35,8 @@ class NodeLayout(eqx.Module):
     """
 
     tree: Tree
-    slots: Int[Array | np.ndarray, "bodies m"]
-    places: Int[Array | np.ndarray, " multipliers"]
+    slots: Int[np.ndarray, "bodies m"] = eqx.field(**INDICES)
+    places: Int[np.ndarray, " multipliers"] = eqx.field(**INDICES)
     groups: tuple[tuple[int, int], ...] = eqx.field(static=True)
     stages: int = eqx.field(static=True)
 
@@ -57,7 +58,7 @@ class NodeLayout(eqx.Module):
         """Flat vector by node."""
         s, count, bodies = self.stages, self.tree.slot_of.shape[0], self.slots.shape[0]
         padded = jnp.concatenate([y[: s * count].reshape(s, count), jnp.zeros((s, 1), y.dtype)], axis=1)
-        index = self.tree.slot_index[:, jnp.array(self.tree.slots, int)]
+        index = self.tree.slot_index[:, np.array(self.tree.slots, int)]
         rates = jnp.moveaxis(padded[:, index], 0, 1).reshape(bodies, self.rates)
         if not self.slots.shape[1]:
             return rates

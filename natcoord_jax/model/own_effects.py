@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -11,10 +11,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.core.bodies import NODE
-from natcoord_jax.core.callables import own_methods
+from natcoord_jax.core.callables import Stacked, own_methods
 from natcoord_jax.core.checks import is_concrete
 from natcoord_jax.core.eager_numpy import eager_numpy
-from natcoord_jax.core.effect import Effect, replace_fields
+from natcoord_jax.core.effect import Effect
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.vectors import cross
 from natcoord_jax.model.groups import Group
@@ -28,6 +28,20 @@ SMALL = 1e-6
 LANES = 16
 """Instances of a group that are looked at, each along a direction of its own."""
 BINOMIALS = (-1.0, 3.0, -3.0, 1.0)
+
+
+class Some(Stacked):
+    """Some instances of an effect, as many as numbers in its methods get lanes."""
+
+    effect: Effect
+    count: int = eqx.field(static=True)
+
+    stacked: ClassVar[str] = "effect"
+
+    @property
+    def lanes(self) -> tuple[int, ...]:
+        """One for each."""
+        return (self.count,)
 
 
 def own_class(effect: Effect) -> type | None:
@@ -84,7 +98,7 @@ def warn_of_resultants(system: Model, state: State) -> None:
 
 def _some(
     system: Model, group: Group, state: State, seed: int = 0, among: np.ndarray | None = None
-) -> tuple[tuple[Group, Array, np.ndarray, np.ndarray], np.ndarray]:
+) -> tuple[tuple[Some, Array, np.ndarray, np.ndarray], np.ndarray]:
     """Some instances of a group, their places, rows, and random steps of these; and their numbers."""
     among = np.arange(group.count) if among is None else among
     lanes = among[np.unique(np.linspace(0, len(among) - 1, LANES).astype(int))]
@@ -95,9 +109,7 @@ def _some(
     steps[..., 0, :] *= reach if reach > 0 else 1.0
     # (The ground does not move: what it carries are numbers.)
     steps[bodies == rows.shape[0] - 1] = 0.0
-    # (As a group, so that numbers in methods get as many lanes.)
-    some = jax.tree.map(lambda x: x[lanes], replace_fields(group, acting=None))
-    some = replace_fields(some, count=len(lanes), names=())
+    some = Some(jax.tree.map(lambda x: x[lanes], group.effect), len(lanes))
     return (some, group_places(system, group)[lanes], rows[bodies], steps), lanes
 
 
@@ -130,12 +142,12 @@ def _name(group: Group, number: int) -> str:
 
 
 @eager_numpy
-def _rigid(group: Group, places: Array, rows: np.ndarray, steps: np.ndarray) -> tuple[Array, Array, Array]:
+def _rigid(some: Some, places: Array, rows: np.ndarray, steps: np.ndarray) -> tuple[Array, Array, Array]:
     """Changes (n, m, 6) of energies, away from where they may vanish, or of residuals, along rigid motions.
 
     And (n, m, 1) of the terms of these, and (n, m) what residuals are.
     """
-    stores = group.effect.stores
+    stores = some.effect.stores
 
     def lane(effect: Any, place: Any, rows: Any, step: Any) -> tuple[Array, Array, Array]:
         rows = rows + 0.1 * stores * step
@@ -154,7 +166,7 @@ def _rigid(group: Group, places: Array, rows: np.ndarray, steps: np.ndarray) -> 
         size = jnp.max(jnp.sum(jnp.abs(parts), axis=(2, 3, 4)), axis=1, keepdims=True)
         return jnp.abs(jnp.sum(parts, axis=(2, 3, 4))), size, left
 
-    return jax.vmap(lane)(group.effect, places, rows, steps)
+    return jax.vmap(lane)(some.effect, places, rows, steps)
 
 
 def third_differences(system: Model, group: Group, state: State, seed: int = 0) -> tuple[float, int]:
@@ -171,10 +183,10 @@ def third_differences(system: Model, group: Group, state: State, seed: int = 0) 
 
 
 @eager_numpy
-def _four(group: Group, places: Array, rows: np.ndarray, steps: np.ndarray) -> Float[Array, "n 4 p"]:
+def _four(some: Some, places: Array, rows: np.ndarray, steps: np.ndarray) -> Float[Array, "n 4 p"]:
     """What has to be quadratic, at four places in a row."""
 
     def values(effect: Any, place: Any, rows: Any, step: Any) -> Array:
         return jnp.stack([effect.quadratic(place, rows + k * step) for k in range(4)])
 
-    return jax.vmap(values)(group.effect, places, rows, steps)
+    return jax.vmap(values)(some.effect, places, rows, steps)

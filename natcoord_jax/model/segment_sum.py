@@ -5,6 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from natcoord_jax.maths.indices import INDICES
+
 ROW = 4
 """Entries that a receiver adds up at once."""
 
@@ -20,8 +22,8 @@ class SegmentSum(eqx.Module):
         rows: of each receiver, padded with the number of rows; None: every receiver has one.
     """
 
-    entries: Int[Array | np.ndarray, "rows _"]
-    rows: Int[Array | np.ndarray, "receivers _"] | None
+    entries: Int[np.ndarray, "rows _"] = eqx.field(**INDICES)
+    rows: Int[np.ndarray, "receivers _"] | None = eqx.field(**INDICES)
 
     @classmethod
     def of(cls, receivers: np.ndarray, count: int) -> "SegmentSum":
@@ -48,6 +50,6 @@ def _padded(lists: list[np.ndarray], padding: int | np.integer) -> np.ndarray:
     return np.array(rows, np.int32).reshape(len(lists), most)
 
 
-def _gathered(values: Array, index: Array | np.ndarray) -> Array:
+def _gathered(values: Array, index: np.ndarray) -> Array:
     padded = jnp.concatenate([values, jnp.zeros((1, *values.shape[1:]), values.dtype)])
     return jnp.sum(padded[index], axis=1)

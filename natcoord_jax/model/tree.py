@@ -22,6 +22,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from natcoord_jax.core.effect import replace_fields
+from natcoord_jax.maths.indices import INDICES
 from natcoord_jax.maths.vectors import cross, dot
 from natcoord_jax.model.axisymmetric_axes import ball_axes, frame_axes
 
@@ -94,20 +95,20 @@ class Tree(eqx.Module):
         directed: which bodies are directors, that do not turn about their first axes; None: there are none.
     """
 
-    parent: Int[Array | np.ndarray, " bodies"]
-    neighbour: Int[Array | np.ndarray, " bodies"]
-    parent_in_level: Int[Array | np.ndarray, " bodies"]
-    slot_index: Int[Array | np.ndarray, "bodies 7"]
-    slot_of: Int[Array | np.ndarray, " unknowns"]
-    side: Int[Array | np.ndarray, "bodies 2"]
-    order: Int[Array | np.ndarray, "bodies 4"]
-    ball: Bool[Array | np.ndarray, " bodies"]
+    parent: Int[np.ndarray, " bodies"] = eqx.field(**INDICES)
+    neighbour: Int[np.ndarray, " bodies"] = eqx.field(**INDICES)
+    parent_in_level: Int[np.ndarray, " bodies"] = eqx.field(**INDICES)
+    slot_index: Int[np.ndarray, "bodies 7"] = eqx.field(**INDICES)
+    slot_of: Int[np.ndarray, " unknowns"] = eqx.field(**INDICES)
+    side: Int[np.ndarray, "bodies 2"] = eqx.field(**INDICES)
+    order: Int[np.ndarray, "bodies 4"] = eqx.field(**INDICES)
+    ball: Bool[np.ndarray, " bodies"] = eqx.field(**INDICES)
     levels: tuple[Level, ...] = eqx.field(static=True)
     free: Level = eqx.field(static=True)
     hung: Level = eqx.field(static=True)
     backwards: bool = eqx.field(static=True)
     symmetry: Float[Array, "bodies 4"] | None = None
-    directed: Bool[Array | np.ndarray, " bodies"] | None = None
+    directed: Bool[np.ndarray, " bodies"] | None = eqx.field(default=None, **INDICES)
 
     @property
     def slots(self) -> tuple[int, ...]:
@@ -139,7 +140,7 @@ class Tree(eqx.Module):
         own = frames[: self.parent.shape[0]]
         if not self.backwards:
             return own
-        body = jnp.arange(own.shape[0])[:, None, None]
+        body = np.arange(own.shape[0])[:, None, None]
         return own[body, self.side[:, :, None], self.order[:, None, :]]
 
 
@@ -233,7 +234,7 @@ def project(
         if not level.grounded:
             onto = tree.parent_in_level[here]
             width = tree.levels[len(tree.levels) - len(slots) - 1]
-            pick = (jnp.arange(len(width.members))[:, None] == onto[None, :]).astype(f.dtype)
+            pick = (np.arange(len(width.members))[:, None] == onto[None, :]).astype(f.dtype)
             moved = about + cross(joint.parent_arm + joint.gap, f)
             carried = (
                 jnp.sum(pick[:, :, None] * f[:, None], axis=2),

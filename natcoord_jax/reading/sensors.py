@@ -215,8 +215,7 @@ def joint_coordinates(system: Model, joint: Handle | str) -> tuple[int, list[int
 
 def _lever(system: Model, states: State, index: int, about: Any, state: State | None) -> Array:
     """From a point to that of a joint on its child."""
-    # (Which body the child is may be traced, as any array of a system that is an argument.)
-    child, weights = jnp.asarray(system.joint_bodies)[index, 1], system.frames[index, 1, 0]
+    child, weights = system.joint_bodies[index, 1], system.frames[index, 1, 0]
     rows = jnp.vectorize(rows_with_ground, signature="(r,k)->(b,n,k)")(states.q)
     joint = jnp.sum(weights[:, None] * jnp.take(rows, child, axis=-3), axis=-2)
     if isinstance(about, Marker):

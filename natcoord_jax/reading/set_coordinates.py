@@ -72,7 +72,7 @@ def _joint_motions(
 ) -> tuple[Array, Array]:
     """Rates of the coordinates of one tree joint (n, 7), and twists of its body (7, 6), of unit motions."""
     axes, points = joint_axes(system, rows)
-    present = jnp.asarray(system.tree.slot_index)[body] < system.tree.slot_of.shape[0]
+    present = system.tree.slot_index[body] < system.tree.slot_of.shape[0]
     axis, turning = jnp.where(present[:, None], axes[body], 0.0), np.array([[1]] * 3 + [[0]] * 3 + [[1]])
     velocity = jnp.where(turning, cross(axis, rows[body, 0] - points[body]), axis)
     motions = jnp.concatenate([velocity, jnp.where(turning, axis, 0.0)], axis=1)
@@ -210,7 +210,7 @@ def _with_coordinate(
     if rate is not None:
         wanted = wanted + _with_relations(system, places, index, rate - wanted[index])
     rates, motions = _joint_motions(system, after[:-1], body, places)
-    own = jnp.append(tree_rates(system, state), 0.0)[jnp.asarray(system.tree.slot_index)[body]]
+    own = jnp.append(tree_rates(system, state), 0.0)[system.tree.slot_index[body]]
     own = own + _slot_rates(rates, wanted - rates @ own)
     velocities, spin = velocities_with_ground(state.v, rows)
     before = jnp.concatenate([velocities[:, 0], spin], axis=1)

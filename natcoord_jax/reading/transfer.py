@@ -37,7 +37,7 @@ def _merged(
 def _check_parts(old: Model, new: Model, onto: State | None) -> None:
     """Bodies of the old system must be in the new one, and the other way round where no state has them.
 
-    Joints of both must join the same bodies; that is looked at in concrete systems only.
+    Joints of both must join the same bodies.
 
     Raises:
         ValueError: naming the bodies that are missing, or a joint that joins others.
@@ -53,8 +53,6 @@ def _check_parts(old: Model, new: Model, onto: State | None) -> None:
             f"the old state says nothing of the bodies {sorted(after - before)}; pass a state of the new "
             "system that has them as `onto`"
         )
-    if not is_concrete(old.joint_bodies, new.joint_bodies):
-        return
     pairs = []
     for system, numbers in zip((old, new), common_joints(old, new)):
         names = (*system.structure.bodies, ground.name)

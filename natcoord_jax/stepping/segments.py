@@ -77,9 +77,11 @@ class Run(NamedTuple):
     @property
     def about(self) -> dict[str, Any]:
         """What tells runs apart, in words."""
-        controlled = callable(self.inputs)
+        controlled, structure = callable(self.inputs), self.system.structure
+        names, groups = (structure.bodies, structure.joints), self.system.effects
+        ends = [np.asarray(x) for x in (self.system.joint_bodies, *(group.bodies for group in groups))]
         numbers = {
-            "system": (self.system, list(self.system.structure.bodies), list(self.system.structure.joints)),
+            "system": (self.system, *map(list, names), ends),
             "state": self.state,
             "inputs": None if controlled else self.inputs,
             "dt": self.dt,

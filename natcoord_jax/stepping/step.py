@@ -5,6 +5,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from natcoord_jax.core.effect import replace_fields
@@ -73,7 +74,7 @@ def end_of_step(equations: Any, found: Evaluation) -> tuple[State, Float[Array, 
         carrying = [g.coordinates[:, 0] for g in groups if g.effect.rotors]
         if carrying:
             # Groups own consecutive pieces of the stored rates, in order.
-            rotors = rotors + tableau.gained(turning[:, jnp.concatenate(carrying)] - rotors)
+            rotors = rotors + tableau.gained(turning[:, np.concatenate(carrying)] - rotors)
         if not tableau.dissipative and driven(system):
             ends = obeying(system, State(state.t + h, q, v, coordinates, rotors, work))
             extra = ends.work

@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from natcoord_jax.core.checks import as_array
+from natcoord_jax.maths.indices import Indices
 
 PLAIN = str, bool, int, type(None)
 """What JSON has itself."""
@@ -199,8 +200,9 @@ def _named(kind: str, value: str, rest: dict[str, Any], again: Callable[[Any], A
         return found[rest["name"]]
     if kind == "class" and isinstance(found, type) and dataclasses.is_dataclass(found):
         fresh = object.__new__(found)
+        static = {x.name for x in dataclasses.fields(found) if x.metadata.get("converter") == Indices.of}
         for name, x in rest["fields"].items():
-            object.__setattr__(fresh, name, again(x))
+            object.__setattr__(fresh, name, Indices.of(again(x)) if name in static else again(x))
         return fresh
     if (kind == "type" and isinstance(found, type)) or (kind == "function" and callable(found)):
         return found
