@@ -25,6 +25,7 @@ SOURCE = ROOT / PACKAGE
 # From the ground up. A module imports from its own floor and from those below it.
 FLOORS = (
     "xla",
+    "native",
     "maths",
     "linsolve",
     "core",
@@ -65,7 +66,7 @@ BLIND = {
 THROUGH_THE_ROOF = {"gallery", "cli"}
 # Third parties that linsolve may use beside the standard library.
 LINSOLVE_TOOLS = {"jax", "jaxlib", "equinox", "jaxtyping", "numpy"}
-# What JAX and XLA may change without notice; whoever imports it elsewhere than in xla/ is found here.
+# What JAX and XLA may change without notice; whoever imports it elsewhere than in xla/ or native/ is found here.
 UNSTABLE = ("jax._src", "jax.experimental", "jax.extend", "jax.interpreters", "jaxlib")
 PLOTTING = {"matplotlib", "mpl_toolkits"}
 HEAVY = ("matplotlib", "mujoco", "optax", "scipy.optimize")
@@ -183,8 +184,8 @@ def _inside(module: str, floor: str, target: str) -> str:
 def _outside(floor: str, target: str) -> str:
     """Why a floor may not import this from a library; empty if it may."""
     library = target.split(".")[0]
-    if floor != "xla" and f"{target}.".startswith(tuple(f"{name}." for name in UNSTABLE)):
-        return "what JAX may change without notice is met in xla and nowhere else"
+    if floor not in ("xla", "native") and f"{target}.".startswith(tuple(f"{name}." for name in UNSTABLE)):
+        return "what JAX may change without notice is met in xla and native and nowhere else"
     if library in PLOTTING and floor != "viz":
         return "matplotlib lives in viz and nowhere else"
     if floor == "linsolve" and library not in LINSOLVE_TOOLS | sys.stdlib_module_names:
@@ -277,8 +278,8 @@ BREACHES = [
     ("linsolve.dense", "from ..core import state", "core lies above linsolve"),
     ("effects.loads.gravity", "from natcoord_jax.linsolve import dense", "must not know linsolve"),
     ("linsolve.dense", "import scipy.linalg", "nothing else"),
-    ("stepping.newton", "from jax.extend import core as jex", "xla and nowhere else"),
-    ("core.marker", "import jaxlib.xla_client", "xla and nowhere else"),
+    ("stepping.newton", "from jax.extend import core as jex", "xla and native and nowhere else"),
+    ("core.marker", "import jaxlib.xla_client", "xla and native and nowhere else"),
     ("analysis.energy", "import matplotlib.pyplot as plt", "lives in viz"),
     ("helpers", "", "is on no floor"),
 ]
@@ -377,6 +378,7 @@ INSIDE = {
     "test_errors.py": "result codes",
     "test_gpu.py": "result codes",
     "test_host.py": "evaluation by NumPy, by its contract",
+    "test_native.py": "machine code, by its contract with programs of JAX",
     "test_kernels.py": "what is computed in one kernel",
     "test_linsolve.py": "linear solvers, by their contract",
     "test_restitution.py": "the complementarity problem of impacts, by its contract",

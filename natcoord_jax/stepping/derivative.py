@@ -22,6 +22,7 @@ from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
 from natcoord_jax.maths.collocation import Tableau
 from natcoord_jax.mechanics.momentum import row_weights
+from natcoord_jax.native.call import fits
 from natcoord_jax.stepping.backward import Backward, Forward
 from natcoord_jax.stepping.error_control import Tolerance
 from natcoord_jax.stepping.linear_iteration import STALL_ROUND_OFF, sizes_by_mass
@@ -38,6 +39,7 @@ from natcoord_jax.stepping.rollout import Ending, run
 from natcoord_jax.stepping.slot_chunks import in_chunks
 from natcoord_jax.stepping.slot_sweep import Fixed, outcome
 from natcoord_jax.stepping.step import linear_solver
+from natcoord_jax.stepping.two_kernel_loop import unknowns_of
 from natcoord_jax.system import System
 from natcoord_jax.xla import linear_pair
 from natcoord_jax.xla.one_kernel import lane_by_lane, on_cpu
@@ -71,6 +73,8 @@ def run_slots(
 @partial(jax.jit, static_argnums=0)
 def _traced_once(plan: Plan, *numbers: Any) -> tuple[Slots, Ending]:
     """JAX evaluates the function and the rule for its derivative; jit remembers the program."""
+    if fits(unknowns_of(plan, numbers[0])):
+        return run(plan, *numbers)
     return lane_by_lane(partial(run, plan), *numbers)
 
 

@@ -15,12 +15,13 @@ from natcoord_jax.core.callables import Function
 from natcoord_jax.core.checks import at_top_level
 from natcoord_jax.core.closures import with_callables
 from natcoord_jax.core.state import State
+from natcoord_jax.native.call import as_native, fits
 from natcoord_jax.stepping.newton import TOLERANCE
 from natcoord_jax.stepping.plan import Plan
 from natcoord_jax.stepping.rollout import run_to_the_end
 from natcoord_jax.stepping.rollout_state import RolloutProblem
 from natcoord_jax.stepping.scheme import Scheme
-from natcoord_jax.stepping.two_kernel_loop import in_parts
+from natcoord_jax.stepping.two_kernel_loop import in_parts, unknowns_of
 from natcoord_jax.system import System
 from natcoord_jax.xla.effort import FULL, accepted
 from natcoord_jax.xla.one_kernel import apart, as_one_kernel, in_one_array, plainly
@@ -88,7 +89,10 @@ def _program(structure: Any, kinds: tuple, scheme: Scheme, tolerance: float) -> 
     def run(*numbers: Array) -> Endpoint:
         if in_parts(like, plan, None):
             return end(as_one_kernel, *numbers)
-        return as_one_kernel(partial(end, plainly), *numbers)
+        whole = partial(end, plainly)
+        if fits(unknowns_of(plan, like)):
+            return as_native(as_one_kernel, whole, *numbers)
+        return as_one_kernel(whole, *numbers)
 
     outermost = jax.jit(run, compiler_options=accepted(FULL))
     within = jax.jit(run)  # JAX accepts options at the outermost call only.

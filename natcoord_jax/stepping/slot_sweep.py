@@ -21,6 +21,7 @@ from natcoord_jax.maths.collocation import Tableau
 from natcoord_jax.mechanics.block_tangent_space import Tangents, tangents_at, with_system
 from natcoord_jax.mechanics.equations import kind_of, prepare
 from natcoord_jax.mechanics.start_cache import NOTHING
+from natcoord_jax.native.call import as_native, fits
 from natcoord_jax.stepping.factors import AGEING, Factors, factors_of
 from natcoord_jax.stepping.linear_iteration import LinearIteration
 from natcoord_jax.stepping.located import part_of_step
@@ -29,7 +30,7 @@ from natcoord_jax.stepping.plan import Plan
 from natcoord_jax.stepping.record import Parameters, Record, Slot
 from natcoord_jax.stepping.rollout_state import Predictor
 from natcoord_jax.stepping.step import advance
-from natcoord_jax.xla.one_kernel import in_few_kernels, lane_by_lane
+from natcoord_jax.xla.one_kernel import in_few_kernels, lane_by_lane, plainly
 from natcoord_jax.xla.rows import part, row, with_part, with_row
 from natcoord_jax.xla.tracing import traced_once
 
@@ -156,7 +157,12 @@ class SlotSweep(ABC):
 
     def every(self, record: Record, given: Any) -> Any:
         """Everything: in one kernel for all slots, or one for each part if that takes too long to compile."""
-        return lane_by_lane(partial(in_few_kernels, self.following), record, given)
+        by_xla = partial(lane_by_lane, partial(in_few_kernels, self.following))
+        if not fits(record.slots.y.shape[-1]):
+            return by_xla(record, given)
+        return as_native(
+            lambda _, *arguments: by_xla(*arguments), partial(self.following, plainly), record, given
+        )
 
     def in_rounds(
         self,

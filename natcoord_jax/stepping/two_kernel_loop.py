@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool
 from natcoord_jax.core.effect import replace_fields
 from natcoord_jax.core.state import State
 from natcoord_jax.mechanics.equations import kind_of, prepare
+from natcoord_jax.native.call import as_native, fits
 from natcoord_jax.stepping.attempt import LoopCarry, RefactorRequest, attempt, renewed_at
 from natcoord_jax.stepping.difference_jacobian import first_probe
 from natcoord_jax.stepping.error_control import Tolerance
@@ -26,7 +27,7 @@ from natcoord_jax.stepping.newton import Iterate, any_lane
 from natcoord_jax.stepping.plan import Plan
 from natcoord_jax.stepping.rollout_state import RolloutProblem, RolloutState, start_of
 from natcoord_jax.system import System
-from natcoord_jax.xla.one_kernel import as_one_kernel
+from natcoord_jax.xla.one_kernel import as_one_kernel, lane_by_lane, plainly
 from natcoord_jax.xla.rows import with_part
 
 COUNTED = "step", "taken", "rejected", "iterations", "iterations_max", "residual"
@@ -89,14 +90,22 @@ def all_slots(
     packed, unpack = ravel_pytree(state)
     if in_parts(setting.system, plan, setting.tolerance):
         return _by_rounds(setting, unpack, length, packed, taken_up), unpack
-    return kernel(partial(_every_slot, setting, unpack, length), packed, taken_up), unpack
+    whole = partial(_every_slot, setting, unpack, length)
+    if kernel is not plainly and fits(unknowns_of(plan, setting.system)):
+        return as_native(partial(lane_by_lane, kernel), whole, packed, taken_up), unpack
+    return kernel(whole, packed, taken_up), unpack
 
 
 def in_parts(system: System, plan: Plan, tolerance: Tolerance | None) -> bool:
     """Whether new factors are made in a kernel of their own: one for all would compile for too long."""
     kind = kind_of(system, plan.tableau)
     large = len(system.structure.bodies) >= PARTS or system.structure.solver == "sparse"
-    return kind.by_formulas and tolerance is None and large
+    return kind.by_formulas and tolerance is None and large and not fits(unknowns_of(plan, system))
+
+
+def unknowns_of(plan: Plan, system: System) -> int:
+    """Unknowns of a step in the rates of the tree."""
+    return plan.tableau.stages * (system.structure.unknowns + system.structure.multipliers)
 
 
 def _unfinished(setting: RolloutProblem, length: int, carried: LoopCarry) -> Array:

@@ -20,6 +20,7 @@ from jax import export
 
 from natcoord_jax.xla.elsewhere import Compilation, elsewhere
 from natcoord_jax.xla.kernels import without_kernels
+from natcoord_jax.xla.rewriting import inner_programs
 from natcoord_jax.xla.tracing import at_once, at_top_level, in_lanes
 from natcoord_jax.xla.waiting import told
 
@@ -110,7 +111,8 @@ class Program:
 
         flat.__name__ = flat.__qualname__ = self.name = name
         jitted, differ = jax.jit(flat, donate_argnums=0), accepted(FULL) != accepted(LEAST)
-        source = _exported(jitted, shapes) if effort == "tiers" and differ else None
+        tiers = effort == "tiers" and differ and not _holds(jitted.trace(*shapes).jaxpr.jaxpr, "native")
+        source = _exported(jitted, shapes) if tiers else None
         quick = differ and (effort == "quick" or source is not None)
         whole = jitted if source is None else jax.jit(source.call, donate_argnums=0)
         lowered = whole.lower(*shapes)
@@ -136,6 +138,14 @@ class Program:
             self.run = again.loaded()
         except Exception as error:  # (Whatever it is: the program at hand goes on.)
             warnings.warn(f"{self.name} stays compiled with least effort: {error}", stacklevel=4)
+
+
+def _holds(jaxpr: Any, name: str) -> bool:
+    """Whether an operation is in a program: machine code of our own, say, beside which there is little."""
+    return any(
+        equation.primitive.name == name or any(_holds(x, name) for x in inner_programs(equation))
+        for equation in jaxpr.eqns
+    )
 
 
 def _exported(jitted: Any, shapes: tuple[list, list]) -> export.Exported | None:

@@ -47,7 +47,7 @@ AS_AN_OPERAND = {"broadcast_in_dim": 0, "dynamic_update_slice": 1, "scatter": 2,
 """Operations that find no more numbers than an operand has: that is repeated, or put into an array."""
 
 
-def _inner_programs(equation: Any) -> list[Any]:
+def inner_programs(equation: Any) -> list[Any]:
     """Programs among the parameters of an equation."""
     found = []
     for value in equation.params.values():
@@ -61,7 +61,7 @@ def _inner_programs(equation: Any) -> list[Any]:
 
 def operations(program: Any) -> int:
     """Number of operations of a program and of all programs in it that its outputs need."""
-    return sum(1 + sum(map(operations, _inner_programs(equation))) for equation in _needed(program))
+    return sum(1 + sum(map(operations, inner_programs(equation))) for equation in _needed(program))
 
 
 def mean_size(program: Any) -> float:
@@ -77,7 +77,7 @@ def _sizes(program: Any) -> tuple[int, int]:
     """Operations without programs in them, and the numbers that they find."""
     count, numbers = 0, 0
     for equation in _needed(program):
-        for a, b in [_sizes(x) for x in _inner_programs(equation)] or [(1, _changed(equation))]:
+        for a, b in [_sizes(x) for x in inner_programs(equation)] or [(1, _changed(equation))]:
             count, numbers = count + a, numbers + b
     return count, numbers
 
@@ -103,7 +103,7 @@ def known(program: Any, names: frozenset[str] | None = None) -> bool:
     """Whether a program holds nothing but the operations of these names, by default `KNOWN`."""
     names = KNOWN if names is None else names
     return all(
-        equation.primitive.name in names and all(known(inner, names) for inner in _inner_programs(equation))
+        equation.primitive.name in names and all(known(inner, names) for inner in inner_programs(equation))
         for equation in program.eqns
     )
 

@@ -1,0 +1,1 @@
+"""Machine code of our own for programs of small arrays."""
