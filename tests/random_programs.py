@@ -1,4 +1,4 @@
-"""Programs drawn by lot: loops in loops, branches, records written by index, gathers, numbers that are none."""
+"""Programs drawn by lot: loops in loops, branches, records written by index, numbers that are none."""
 
 from collections.abc import Callable
 from typing import Any

@@ -66,7 +66,7 @@ BLIND = {
 THROUGH_THE_ROOF = {"gallery", "cli"}
 # Third parties that linsolve may use beside the standard library.
 LINSOLVE_TOOLS = {"jax", "jaxlib", "equinox", "jaxtyping", "numpy"}
-# What JAX and XLA may change without notice; whoever imports it elsewhere than in xla/ or native/ is found here.
+# What JAX and XLA may change without notice: to be met in xla/ and native/ only.
 UNSTABLE = ("jax._src", "jax.experimental", "jax.extend", "jax.interpreters", "jaxlib")
 PLOTTING = {"matplotlib", "mpl_toolkits"}
 HEAVY = ("matplotlib", "mujoco", "optax", "scipy.optimize")

@@ -15,6 +15,7 @@ import tolerances as tol
 
 import natcoord_jax as nc
 from natcoord_jax import gallery
+from natcoord_jax.native import call
 from natcoord_jax.xla import one_kernel, rewriting
 from natcoord_jax.xla.one_kernel import as_one_kernel, lane_by_lane
 
@@ -183,6 +184,16 @@ def test_goes_on_when_the_compiler_refuses(monkeypatch):
     nc.set_effort(before)
     wanted = 0.2 * ((1 - 0.005) / (1 + 0.005)) ** 20
     np.testing.assert_allclose(trajectory.v[-1, 0], wanted, rtol=1e-12)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def by_xla():
+    """Machine code of our own comes first elsewhere: these are tests of what there is without it."""
+    known, call.available = call.available, lambda: False
+    jax.clear_caches()
+    yield
+    call.available = known
+    jax.clear_caches()
 
 
 # --- scenes ------------------------------------------------------------------------------------------------

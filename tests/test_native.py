@@ -6,8 +6,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax import export
 
+import natcoord_jax as nc
+from natcoord_jax import gallery
+from natcoord_jax.native import machine
+from natcoord_jax.native.build import Built
 from natcoord_jax.native.call import Code, native_p
+from natcoord_jax.native.driver import driver
+from natcoord_jax.native.emit import Emitted
 from natcoord_jax.native.program import flattened
 from tests.random_programs import Draw, arguments
 
@@ -54,3 +61,86 @@ def test_random_programs_are_those_of_xla(seed: int, small: int) -> None:
 @pytest.mark.parametrize("small", [640, 12])
 def test_many_random_programs_are_those_of_xla(seed: int, small: int) -> None:
     compare(seed, small)
+
+
+def drawn(lanes: int) -> tuple[Any, Any, Any]:
+    """A program, the same as machine code, and its arguments."""
+    x, a, k = arguments(lanes, 8)
+    return Draw(8), native(Draw(8), x[0], a[0], k[0]), (x, a, k)
+
+
+def test_results_depend_neither_on_threads_nor_on_the_group() -> None:
+    """Bits are the same wherever a lane is."""
+    _, own, given = drawn(37)
+    batch = jax.jit(jax.vmap(own))
+    every = batch(*given)
+    order = np.random.default_rng(0).permutation(37)
+    before = machine.set_threads(1)
+    try:
+        alone = batch(*given)
+        moved = batch(*(x[order] for x in given))
+    finally:
+        machine.set_threads(before)
+    for x, y, z in zip(every, alone, moved):
+        np.testing.assert_array_equal(x, y)
+        np.testing.assert_array_equal(np.asarray(x)[order], z)
+
+
+def test_it_is_an_operation_as_any_other() -> None:
+    """Of lanes of lanes, in loops, in what is exported, where nothing of it is left."""
+    function, own, (x, a, k) = drawn(3)
+
+    def twice(f: Any) -> Any:
+        return jax.jit(jax.vmap(jax.vmap(f, (None, 0, None)), (0, None, 0)))
+
+    def carried(f: Any) -> Any:
+        return jax.jit(lambda x, a, k: jax.lax.scan(lambda c, _: (f(*c), None), (x, a, k), length=2)[0])
+
+    program = export.export(jax.jit(own))(x[0], a[0], k[0])
+    assert "natcoord_jax_" not in program.mlir_module()
+    pairs = [
+        (twice(own)(x, a, k), twice(function)(x, a, k)),
+        (carried(own)(x[0], a[0], k[0]), carried(function)(x[0], a[0], k[0])),
+        (program.call(x[0], a[0], k[0]), function(x[0], a[0], k[0])),
+        (own(x[0], a[0], k[0]), function(x[0], a[0], k[0])),
+    ]
+    for found, expected in pairs:
+        for one, other in zip(found, expected):
+            np.testing.assert_allclose(one, other, rtol=1e-11, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("triple", "cpu", "lanes"),
+    [("aarch64-unknown-linux-gnu", "cortex-a72", 2), ("x86_64-unknown-linux-gnu", "haswell", 4),
+     ("x86_64-unknown-linux-gnu", "x86-64", 2), ("x86_64-unknown-linux-gnu", "skylake-avx512", 8)],
+)  # fmt: skip
+def test_other_processors(triple: str, cpu: str, lanes: int) -> None:
+    """LLVM finds no fault in the program for them, and makes code of it."""
+    llvm = machine.binding()
+    llvm.initialize_all_targets()
+    llvm.initialize_all_asmprinters()
+    x, a, k = arguments(1, 10)
+    program = flattened(jax.make_jaxpr(Draw(10))(x[0], a[0], k[0]))
+    built = Built(program)
+    emitted = Emitted(built.graph, lanes, [True, False, True])
+    module = llvm.parse_assembly(emitted.text + driver(lanes, 3, 3, emitted.work, True))
+    module.verify()
+    assert len(llvm.Target.from_triple(triple).create_target_machine(cpu=cpu).emit_object(module)) > 1000
+
+
+def test_small_scenes_are_machine_code_whatever_the_number_of_steps() -> None:
+    """The record of all steps, which grows with them, says nothing about the size of one."""
+    example = gallery.load("spacecraft")
+
+    def codes(steps: int, derivative: bool) -> int:
+        def loss(inputs: Any) -> Any:
+            return jnp.sum(
+                nc.simulate(example.system, example.state, dt=example.dt, inputs=inputs).v[-1] ** 2
+            )
+
+        function = jax.grad(loss) if derivative else loss
+        return jax.jit(function).lower(example.inputs(steps)).as_text().count("natcoord_jax_")
+
+    for derivative in (False, True):
+        numbers = {steps: codes(steps, derivative) for steps in (10, 400, 20_000)}
+        assert set(numbers.values()) == {2 if derivative else 1}, numbers

@@ -93,7 +93,8 @@ def _lifted(closed: Any) -> tuple[Any, list[Any]]:
     kept = [pair for pair, keep in zip(pairs, known) if keep]
     others = [pair for pair, keep in zip(pairs, known) if not keep]
     invars = [*(v for v, _ in others), *closed.jaxpr.invars]
-    jaxpr = closed.jaxpr.replace(constvars=[v for v, _ in kept], invars=invars, debug_info=None)
+    unnamed = closed.jaxpr.debug_info.with_unknown_names()
+    jaxpr = closed.jaxpr.replace(constvars=[v for v, _ in kept], invars=invars, debug_info=unnamed)
     return jex.ClosedJaxpr(jaxpr, [x for _, x in kept]), [x for _, x in others]
 
 

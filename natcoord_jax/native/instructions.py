@@ -17,8 +17,8 @@ FLOATS = frozenset(("f64", "f32"))
 UNSIGNED = frozenset(("u64", "u32", "u16", "u8", "b"))
 
 LIBRARY = frozenset(
-    "sin cos tan asin acos atan sinh cosh tanh asinh acosh atanh exp exp2 expm1 log log1p cbrt erf erfc atan2 "
-    "pow nextafter fmod".split()
+    "sin cos tan asin acos atan sinh cosh tanh asinh acosh atanh exp exp2 expm1 log log1p cbrt erf erfc "
+    "atan2 pow nextafter fmod".split()
 )
 """Functions of the C library."""
 

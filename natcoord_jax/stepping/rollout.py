@@ -22,7 +22,6 @@ from natcoord_jax.mechanics.failures import can_fail, result_of
 from natcoord_jax.stepping.attempt import LoopCarry
 from natcoord_jax.stepping.error_control import Tolerance
 from natcoord_jax.stepping.factors import Factors
-from natcoord_jax.stepping.newton import any_lane
 from natcoord_jax.stepping.plan import Plan, Slots
 from natcoord_jax.stepping.rollout_state import RolloutProblem, RolloutState
 from natcoord_jax.stepping.two_kernel_loop import TakenUp, all_slots
@@ -64,8 +63,6 @@ def run(
         # The accepted slots only, filled up.
         order = jnp.argsort(~slots.accepted, stable=True)[: plan.steps + plan.extra]
         slots, count = jax.tree.map(lambda x: x[order], slots), jnp.sum(slots.accepted)
-    else:
-        count = any_lane(count)
     unused = jnp.arange(plan.steps + plan.extra) >= count
 
     def fill(x: Array, last: Array | float) -> Array:

@@ -92,7 +92,11 @@ def all_slots(
         return _by_rounds(setting, unpack, length, packed, taken_up), unpack
     whole = partial(_every_slot, setting, unpack, length)
     if kernel is not plainly and fits(unknowns_of(plan, setting.system)):
-        return as_native(partial(lane_by_lane, kernel), whole, packed, taken_up), unpack
+
+        def otherwise(function: Callable, *arguments: Any) -> LoopCarry:
+            return lane_by_lane(partial(kernel, function), *arguments)
+
+        return as_native(otherwise, whole, packed, taken_up), unpack
     return kernel(whole, packed, taken_up), unpack
 
 
