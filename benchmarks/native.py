@@ -2,10 +2,10 @@
 
 usage: python -m benchmarks.native [--quick] [--output FOLDER] [--scene NAME ...] [--steps N ...]
 
-Scenes of `benchmarks.guard_scenes` and a double pendulum with a controller, lanes that differ by a twentieth in
-velocities and inputs, one core. Both programs of a cell are compiled from nothing with full effort and run in
-turn; given are medians of processor times a lane-step, the ratio of each round's pair, and the processor
-seconds until the first result. Unit of all times is the microsecond, of compiling the second.
+Scenes of `benchmarks.guard_scenes` and a double pendulum with a controller, on one core; lanes differ by a
+twentieth in velocities and inputs. Both programs of a cell are compiled from nothing with full effort and run
+in turn; given are medians of processor times a lane-step [us], the ratio of each round's pair, and the
+processor seconds until the first result.
 """
 
 import json
@@ -82,7 +82,7 @@ def function_of(scene: str, kind: str, lanes: int, steps: int) -> tuple[Callable
     if lanes > 1:
         factors = 1 + SPREAD * jnp.linspace(-1, 1, lanes)
         function = jax.vmap(function)
-        arguments = tuple(factors.reshape(-1, *[1] * x.ndim) * x for x in arguments)
+        arguments: Any = tuple(factors.reshape(-1, *[1] * x.ndim) * x for x in arguments)
     return function, arguments
 
 
@@ -133,8 +133,8 @@ def main() -> None:
             records.append(record := measured(scene, kind, lanes, count))
             print(
                 f"{scene:20} {kind:9} {lanes:3} lanes {count:6} steps: {record['native_us']:8.3f} us, by XLA "
-                f"{record['xla_us']:8.3f}: {record['ratio']:.2f}; compiled in {record['native_compile_s']:.1f} s, "
-                f"{record['xla_compile_s']:.1f}",
+                f"{record['xla_us']:8.3f}: {record['ratio']:.2f}; "
+                f"compiled in {record['native_compile_s']:.1f} s, {record['xla_compile_s']:.1f}",
                 flush=True,
             )
     if chosen.output is not None or not chosen.quick:

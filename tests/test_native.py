@@ -94,7 +94,9 @@ def test_it_is_an_operation_as_any_other() -> None:
         return jax.jit(jax.vmap(jax.vmap(f, (None, 0, None)), (0, None, 0)))
 
     def carried(f: Any) -> Any:
-        return jax.jit(lambda x, a, k: jax.lax.scan(lambda c, _: (f(*c), None), (x, a, k), length=2)[0])
+        return jax.jit(
+            lambda x, a, k: jax.lax.scan(lambda c, _: (tuple(f(*c)), None), (x, a, k), length=2)[0]
+        )
 
     program = export.export(jax.jit(own))(x[0], a[0], k[0])
     assert "natcoord_jax_" not in program.mlir_module()

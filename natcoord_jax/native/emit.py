@@ -331,10 +331,11 @@ class Emitted:
         live = [c for c in region.carries if c[0] in self.live]
         carries = [c for c in live if c[2] is not c[0]]
         following: list[str] = []
+        trip = "" if region.index is None else f"%v{region.index.number}"
 
         def act() -> None:
             if item.count is not None:
-                test = self.ins.emit(f"icmp slt i64 %v{region.index.number}, {item.count}")
+                test = self.ins.emit(f"icmp slt i64 {trip}, {item.count}")
                 self.ins.lines.append(f"br i1 {test}, label %body{k}, label %end{k}")
                 self._starts(f"body{k}")
             self._items(region)
@@ -347,7 +348,7 @@ class Emitted:
                     found = self.ins.chosen(f"%m{k}", found, f"%v{node.number}", node.type, wide)
                 following.append(found)
             if item.count is not None:
-                self.ins.lines.append(f"%n{k} = add nuw nsw i64 %v{region.index.number}, 1")
+                self.ins.lines.append(f"%n{k} = add nuw nsw i64 {trip}, 1")
 
         for node, first, new in live:
             self._demand(first)
@@ -359,7 +360,7 @@ class Emitted:
         self.ins.lines.append(f"br label %head{k}")
         self.ins.lines.append(f"head{k}:")
         if item.count is not None:
-            self.ins.lines.append(f"%v{region.index.number} = phi i64 [0, %{before}], [%n{k}, %{last}]")
+            self.ins.lines.append(f"{trip} = phi i64 [0, %{before}], [%n{k}, %{last}]")
         if parting:
             start = self.mask or "splat (i1 true)"
             self.ins.lines.append(f"%w{k} = phi {self._vector('i1')} [{start}, %{before}], [%m{k}, %{last}]")

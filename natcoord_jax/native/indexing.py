@@ -55,8 +55,8 @@ def update_slice(a: Arrays, operation: Any, operands: list[Array], free: bool) -
         return x
     starts = [_clamped(a, a.at(s, ()), n - k) for s, n, k in zip(operands[2:], x.shape, new.shape)]
     if all(isinstance(s, int) for s in starts) and x.size <= a.small:
-        nodes = as_nodes(a, x).copy()
-        nodes[tuple(slice(s, s + k) for s, k in zip(starts, new.shape))] = as_nodes(a, new)
+        nodes, known = as_nodes(a, x).copy(), [s for s in starts if isinstance(s, int)]
+        nodes[tuple(slice(s, s + k) for s, k in zip(known, new.shape))] = as_nodes(a, new)
         return a.of_nodes(nodes, x.type)
     if x.buffer is not None and x.buffer in new.reads:
         new = a.computed(new)

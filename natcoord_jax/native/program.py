@@ -190,7 +190,8 @@ def _shorten_while(operation: Operation, needed: set[int]) -> None:
     used = [id(x) in needed or test for x, test in zip(operation.results, tested)]
     used = _fixed_point(used, lambda flags: _inputs_needed(body, flags)[b:])
     body.outputs = _picked(body.outputs, used)
-    without_dead_code(body), without_dead_code(condition)
+    without_dead_code(body)
+    without_dead_code(condition)
     of_test, of_body = _are_used(condition, condition.inputs[:c]), _are_used(body, body.inputs[:b])
     kept = [*of_test, *of_body, *used]
     operation.operands = _picked(operation.operands, kept)

@@ -74,7 +74,7 @@ def _logistic(g: Any, x: Node) -> Node:
 
 def _select(g: Any, which: Node, *cases: Node) -> Node:
     if which.type == "b":
-        return g.op("select", cases[0].type, which, cases[1], cases[0]) if len(cases) > 1 else cases[0]
+        return g.op("select", cases[0].type, which, cases[-1], cases[0])
     chosen = cases[-1]
     for k in range(len(cases) - 2, -1, -1):
         chosen = g.op(
@@ -351,8 +351,8 @@ def _least(type: str, sign: int) -> Any:
 
 @rule("reduce_sum", "reduce_prod", "reduce_max", "reduce_min", "reduce_and", "reduce_or", "reduce_xor")
 def _reduce(a: Arrays, operation: Any, operands: list[Array]) -> Array:
-    kind, type = operation.name[len("reduce_") :], operands[0].type
-    name = {"sum": "add", "prod": "mul"}.get(kind, kind)
+    kind, type = str(operation.name).removeprefix("reduce_"), operands[0].type
+    name = {"sum": "add", "prod": "mul"}.get(kind) or kind
     first = {"sum": 0, "prod": 1, "or": 0, "xor": 0, "and": -1 if type != "b" else True}
     first |= {"max": _least(type, -1), "min": _least(type, 1)}
     return _reduced(a, operation, operands, name, first[kind])
