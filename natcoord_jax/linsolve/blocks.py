@@ -5,7 +5,6 @@ tiles: the rows of a node by the columns that they see. A product is one gather,
 scatter of vectors, whichever way round.
 """
 
-import hashlib
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,6 +12,8 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
+
+from natcoord_jax.maths.indices import INDICES
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,7 @@ class Entries:
 
 
 class BlockPattern(eqx.Module):
-    """Where the entries of a block-sparse matrix are; indices are leaves, all else is static.
+    """Where the entries of a block-sparse matrix are; all of it is static.
 
     Attributes:
         rows: of the tiles; n beyond their last one.
@@ -51,15 +52,13 @@ class BlockPattern(eqx.Module):
             what lies beyond is dropped.
         diagonal: places of the diagonal entries.
         size: number of unknowns n.
-        digest: of the indices, so that two structures are told apart without comparing arrays.
     """
 
-    rows: Int[Array, "tiles r"]
-    columns: Int[Array, "tiles c"]
-    slots: tuple[Int[Array, "_ _ _"], ...]
-    diagonal: Int[Array, " n"]
+    rows: Int[np.ndarray, "tiles r"] = eqx.field(**INDICES)
+    columns: Int[np.ndarray, "tiles c"] = eqx.field(**INDICES)
+    slots: tuple[Int[np.ndarray, "_ _ _"], ...] = eqx.field(**INDICES)
+    diagonal: Int[np.ndarray, " n"] = eqx.field(**INDICES)
     size: int = eqx.field(static=True)
-    digest: str = eqx.field(static=True)
 
     def assemble(self, *locals_: Float[Array, "_ _ _"]) -> "BlockMatrix":
         """The matrix with these element matrices, one array for each kind of element."""
@@ -99,7 +98,7 @@ class BlockMatrix(eqx.Module):
         """Product of the transposed matrix with a vector."""
         return self._product("trc,tr->tc", x, self.pattern.rows, self.pattern.columns)
 
-    def _product(self, how: str, x: Array, seen: Array, given: Array) -> Array:
+    def _product(self, how: str, x: Array, seen: np.ndarray, given: np.ndarray) -> Array:
         extended = jnp.concatenate([x, jnp.zeros_like(x[:1])])
         parts = jnp.einsum(how, self.tiles, extended[seen])
         return jnp.zeros_like(extended, parts.dtype).at[given].add(parts)[:-1]
@@ -153,16 +152,12 @@ def block_pattern(nodes: np.ndarray, elements: list[np.ndarray]) -> tuple[BlockP
         slots.append(np.where(unique[found] == key, places[found], total).astype(np.int32))
     diagonal = np.full(n, total)
     diagonal[rows[rows == columns]] = places[rows == columns]
-    digest = hashlib.sha256()
-    for array in (nodes, tiles_rows, tiles_columns, *slots):
-        digest.update(np.ascontiguousarray(array, np.int32).tobytes() + str(array.shape).encode())
     pattern = BlockPattern(
-        jnp.asarray(tiles_rows.astype(np.int32)),
-        jnp.asarray(tiles_columns.astype(np.int32)),
-        tuple(jnp.asarray(s) for s in slots),
-        jnp.asarray(diagonal.astype(np.int32)),
+        tiles_rows.astype(np.int32),
+        tiles_columns.astype(np.int32),
+        tuple(slots),
+        diagonal.astype(np.int32),
         n,
-        digest.hexdigest()[:16],
     )
     return pattern, Entries(nodes, rows, columns, places)
 

@@ -50,7 +50,7 @@ class FrontFactors(eqx.Module):
 
 
 class Multifrontal(eqx.Module):
-    """A plan of elimination; indices are leaves, all else is static.
+    """A plan of elimination; all of it is static.
 
     Attributes:
         levels: from the roots to the deepest.

@@ -13,6 +13,7 @@ from natcoord_jax.linsolve import cost
 from natcoord_jax.linsolve.blocks import Entries
 from natcoord_jax.linsolve.graph import Graph
 from natcoord_jax.linsolve.symbolic import Front, Pivots, front_unknowns
+from natcoord_jax.maths.indices import INDICES
 
 
 class Bucket(eqx.Module):
@@ -30,13 +31,13 @@ class Bucket(eqx.Module):
         run: columns that stay side by side in the parent's front.
     """
 
-    rows: Int[Array, "fronts p"]
-    columns: Int[Array, "fronts p"]
-    boundary: Int[Array, "fronts b"]
-    base: Int[Array, " fronts"]
-    stride: Int[Array, " fronts"]
-    row_place: Int[Array, "fronts b"]
-    column_place: Int[Array, "fronts runs"]
+    rows: Int[np.ndarray, "fronts p"] = eqx.field(**INDICES)
+    columns: Int[np.ndarray, "fronts p"] = eqx.field(**INDICES)
+    boundary: Int[np.ndarray, "fronts b"] = eqx.field(**INDICES)
+    base: Int[np.ndarray, " fronts"] = eqx.field(**INDICES)
+    stride: Int[np.ndarray, " fronts"] = eqx.field(**INDICES)
+    row_place: Int[np.ndarray, "fronts b"] = eqx.field(**INDICES)
+    column_place: Int[np.ndarray, "fronts runs"] = eqx.field(**INDICES)
     first: int = eqx.field(static=True)
     run: int = eqx.field(static=True)
 
@@ -48,7 +49,8 @@ class Bucket(eqx.Module):
 
     def hand_up(self, work: Float[Array, " w"], schur: Float[Array, "fronts b b"]) -> Float[Array, " w"]:
         """Add what is left of the fronts to the fronts of their parents."""
-        across = self.base[:, None] + self.row_place * self.stride[:, None]
+        # Within programs, not written into them: they are as many as the numbers that are added.
+        across = jnp.asarray(self.base)[:, None] + self.row_place * jnp.asarray(self.stride)[:, None]
         targets = across[:, :, None] + self.column_place[:, None, :]
         if self.run == 1:
             return work.at[targets].add(schur, mode="promise_in_bounds")
@@ -70,8 +72,8 @@ class Level(eqx.Module):
     """
 
     buckets: tuple[Bucket, ...]
-    source: Int[Array, " entries"]
-    target: Int[Array, " entries"]
+    source: Int[np.ndarray, " entries"] = eqx.field(**INDICES)
+    target: Int[np.ndarray, " entries"] = eqx.field(**INDICES)
     work: int = eqx.field(static=True)
 
 
@@ -121,7 +123,7 @@ def schedule(
     for level, own in enumerate(buckets):
         source, target = _entries_of(level, own, pieces, entries, maps, ones)
         found = tuple(_bucket(members, fronts, maps, _run(graph, fronts, members)) for members in own)
-        levels.append(Level(found, _indices(source), _indices(target), works[level]))
+        levels.append(Level(found, source.astype(np.int32), target.astype(np.int32), works[level]))
     return tuple(levels)
 
 
@@ -208,10 +210,6 @@ def _bucket(members: list[int], fronts: list[Front], maps: _Maps, run: int) -> B
             zero["row_place"][i, : len(left)] = maps.within(parent, left, rows=True)
             zero["column_place"][i, : len(left)] = maps.within(parent, left, rows=False)
     zero["column_place"] = zero["column_place"][:, ::run]
-    tables = {name: _indices(x) for name, x in (table | zero).items()}
-    return Bucket(base=_indices(base), stride=_indices(stride), first=first.base, run=run, **tables)
-
-
-def _indices(array: np.ndarray) -> Int[Array, "..."]:
-    # Converted by NumPy: by JAX, each shape would compile a program.
-    return jnp.asarray(np.asarray(array, np.int32))
+    numbers = table | zero | {"base": base, "stride": stride}
+    tables = {name: x.astype(np.int32) for name, x in numbers.items()}
+    return Bucket(first=first.base, run=run, **tables)

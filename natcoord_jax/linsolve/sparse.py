@@ -15,6 +15,7 @@ from natcoord_jax.linsolve.graph import graph_of
 from natcoord_jax.linsolve.inverse import pivoted
 from natcoord_jax.linsolve.multifrontal import Multifrontal
 from natcoord_jax.linsolve.refinement import RefinedSolver
+from natcoord_jax.maths.indices import INDICES
 
 SMALL = 24  # width of blocks whose products are written as sums: these stay in the kernel of the loop
 LAPACK = 48  # width of blocks from which on LAPACK inverts them faster
@@ -35,7 +36,7 @@ class ChainFactors(eqx.Module):
 
 
 class BlockTridiagonal(eqx.Module):
-    """A plan of elimination along a chain; indices are leaves, all else is static.
+    """A plan of elimination along a chain; all of it is static.
 
     Attributes:
         unknowns: of the nodes, in their order along the chain; n beyond the last.
@@ -45,10 +46,10 @@ class BlockTridiagonal(eqx.Module):
         name: for reports.
     """
 
-    unknowns: Int[Array, "nodes w"]
-    diagonal: Int[Array, "nodes w w"]
-    lower: Int[Array, "nodes w w"]
-    upper: Int[Array, "nodes w w"]
+    unknowns: Int[np.ndarray, "nodes w"] = eqx.field(**INDICES)
+    diagonal: Int[np.ndarray, "nodes w w"] = eqx.field(**INDICES)
+    lower: Int[np.ndarray, "nodes w w"] = eqx.field(**INDICES)
+    upper: Int[np.ndarray, "nodes w w"] = eqx.field(**INDICES)
     name: str = eqx.field(static=True, default="block tridiagonal")
 
     def factor(self, matrix: BlockMatrix) -> ChainFactors:
@@ -131,8 +132,8 @@ def chained(path: list[int], entries: Entries, tiles: int) -> BlockTridiagonal:
     step = at[columns] - at[rows]
     assert np.all(np.abs(step) <= 1), "the nodes are no chain: an entry reaches over a node"
     blocks[np.where(step < 0, 1, 2 * step), at[rows], rank[rows], rank[columns]] = entries.places
-    diagonal, lower, upper = (jnp.asarray(x, jnp.int32) for x in blocks)
-    return BlockTridiagonal(jnp.asarray(unknowns, jnp.int32), diagonal, lower, upper)
+    diagonal, lower, upper = blocks.astype(np.int32)
+    return BlockTridiagonal(unknowns.astype(np.int32), diagonal, lower, upper)
 
 
 DENSE_UP_TO = 70  # unknowns up to which nothing is faster than a dense inverse
