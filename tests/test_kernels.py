@@ -215,7 +215,10 @@ SMALL = ("spacecraft",)
 
 @pytest.mark.parametrize(
     "names",
-    [SMALL, pytest.param([n for n in gallery.SCENES if n not in SMALL], marks=pytest.mark.exhaustive)],
+    [
+        pytest.param(SMALL, marks=pytest.mark.exhaustive),
+        pytest.param([n for n in gallery.SCENES if n not in SMALL], marks=pytest.mark.exhaustive),
+    ],
     ids=["one", "many"],
 )
 def test_scenes_run_in_one_kernel(names, monkeypatch):
@@ -229,6 +232,7 @@ def test_scenes_run_in_one_kernel(names, monkeypatch):
 GOLDEN = json.loads(Path(__file__).with_name("golden.json").read_text())
 
 
+@pytest.mark.exhaustive
 def test_a_run_has_as_many_kernels_for_any_number_of_steps():
     """The record of all steps, which grows with them, says nothing about the size of one."""
     example = gallery.load("spacecraft")
