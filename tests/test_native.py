@@ -51,7 +51,7 @@ def compare(seed: int, small: int) -> None:
 
 
 @pytest.mark.parametrize("seed", [8])
-@pytest.mark.parametrize("small", [640, 4])
+@pytest.mark.parametrize("small", [pytest.param(640, marks=pytest.mark.exhaustive), 4])
 def test_random_programs_are_those_of_xla(seed: int, small: int) -> None:
     compare(seed, small)
 
@@ -86,6 +86,7 @@ def test_results_depend_neither_on_threads_nor_on_the_group() -> None:
         np.testing.assert_array_equal(np.asarray(x)[order], z)
 
 
+@pytest.mark.exhaustive
 def test_it_is_an_operation_as_any_other() -> None:
     """Of lanes of lanes, in loops, in what is exported, where nothing of it is left."""
     function, own, (x, a, k) = drawn(3)
@@ -130,6 +131,7 @@ def test_other_processors(triple: str, cpu: str, lanes: int) -> None:
     assert len(llvm.Target.from_triple(triple).create_target_machine(cpu=cpu).emit_object(module)) > 1000
 
 
+@pytest.mark.exhaustive
 def test_small_scenes_are_machine_code_whatever_the_number_of_steps() -> None:
     """The record of all steps, which grows with them, says nothing about the size of one."""
     example = gallery.load("spacecraft")
