@@ -161,3 +161,23 @@ def test_what_is_taken_from_them_is_an_array_as_any_other():
     assert kind.of(table) is table and kind.of(None) is None
     one, same, other = (jax.tree.structure(kind.of(x)) for x in ([1, 2], [1, 2], [2, 1]))
     assert one == same != other and "[1, 2]" in str(one)
+
+
+class Held(eqx.Module):
+    table: Any
+    scale: float = 1.0
+
+
+def test_a_module_with_them_is_a_static_argument():
+    """As a controller is: equal ones are one program, others are another."""
+    kind: Any = type(scene()[0].joint_bodies)
+    count = []
+
+    def taken(held, x):
+        count.append(1)
+        return held.scale * x[held.table]
+
+    run, x = jax.jit(taken, static_argnums=0), jnp.arange(3.0)
+    for table in ([2, 0], [2, 0], [0, 1]):
+        np.testing.assert_array_equal(run(Held(kind.of(table)), x), table)
+    assert len(count) == 2

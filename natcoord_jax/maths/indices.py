@@ -53,6 +53,9 @@ class Indices(_Computed):
     def __deepcopy__(self, memo: Any) -> Any:
         return self
 
+    def __hash__(self) -> int:  # of modules that are static arguments
+        return hash(self._content)
+
 
 class _Content:
     """What indices are compared and hashed by."""
