@@ -28,7 +28,7 @@ FEW = 100
 """Bodies up to which a matrix of all pairs of them is written into programs."""
 
 
-def carried(system: Model) -> Float[Array, "bodies bodies"]:
+def carried(system: Model) -> Float[Array | np.ndarray, "bodies bodies"]:
     """Which body (first axis) hangs on which body's tree joint (second axis): 1 or 0."""
     count = len(system.structure.bodies)
     # A constant of the program, unless it would be a large one.
@@ -60,7 +60,8 @@ def null_space(
     """Velocities and angular velocities of all bodies per unit rate of each free motion."""
     axes, points = joint_axes(system, rows)
     body, slot = system.tree.slot_of // SLOTS, system.tree.slot_of % SLOTS
-    axis, hangs = axes[body, slot], carried(system)[:, body, None]
+    axis: Any = axes[body, slot]
+    hangs: Any = carried(system)[:, body, None]
     turning = turns(slot)[:, None]
     arm = rows[:, None, 0] - points[body]
     velocity = jnp.where(turning, cross(axis, arm), axis)
@@ -99,7 +100,7 @@ def passed_on(system: Model, rows: Float[Array, "bodies 4 3"], force: Array, tor
         torque: torques about their reference points [N m], shape (bodies, 3).
     """
     _, points = joint_axes(system, rows)
-    hangs = carried(system)
+    hangs: Any = carried(system)
     about_origin = torque + cross(rows[:, 0], force)
     forces, torques = hangs.T @ force, hangs.T @ about_origin
     return forces, torques - cross(points, forces)
