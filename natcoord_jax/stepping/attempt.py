@@ -275,8 +275,9 @@ def _judging(equations: Any, it: Iterate, probe: DifferenceJacobian | None) -> t
     """Cost of new factors, in corrections, and options of `judge`."""
     cost = equations.renewal if probe is None else max(equations.renewal, it.y.shape[0] // 2)
     alike = False if probe is None else probe.alike
-    options = {"balances": driven(equations.system), "patience": cost, "alike": alike}
-    if equations.system.structure.inequalities:
+    impulses = equations.system.structure.inequalities > 0
+    options = {"balances": driven(equations.system) or impulses, "patience": cost, "alike": alike}
+    if impulses:
         options["contacts"] = contact_weights(equations)
     return cost, options
 

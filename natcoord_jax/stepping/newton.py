@@ -188,7 +188,8 @@ def judge(
         residual: of the equations.
         size: of their terms, but for those that cancel in stiff parts, see `Factors.grain`.
         balances: whether the residual itself counts, too. An error of multipliers alone moves nothing, but
-            shows in the balances, and in the work of drives.
+            shows in the balances, and in the work of drives; what is left of an impulse of contacts moves
+            bodies in the next step.
         patience: corrections that are cheaper than a new Jacobian.
         jumped: whether the equations are not those of the last evaluation: corrections do not compare.
         whole: whether they are all that the end of a step asks for; if not, the next evaluation is the last.
@@ -211,7 +212,8 @@ def judge(
     energies = factors.inertias * change**2
     if balances:
         real = factors.inertias > 0
-        energies = energies + jnp.where(real, residual**2 / jnp.where(real, factors.inertias, 1.0), 0.0)
+        missing = jnp.where(real, residual**2 / jnp.where(real, factors.inertias, 1.0), 0.0)
+        energies = jnp.maximum(energies, missing)
     if contacts is not None:
         energies = energies + contacts * residual**2
     correction = jnp.sqrt(jnp.sum(energies))
