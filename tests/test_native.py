@@ -148,3 +148,28 @@ def test_small_scenes_are_machine_code_whatever_the_number_of_steps() -> None:
     for derivative, many in ((False, (10, 400, 20_000)), (True, (20_000,))):
         numbers = {steps: codes(steps, derivative) for steps in many}
         assert set(numbers.values()) == {2 if derivative else 1}, numbers
+
+
+def test_inputs_by_a_function_are_kept_with_their_derivatives() -> None:
+    """What a trajectory has of them is what the function gives at each state, in lanes as well."""
+    scene = nc.Scene()
+    rod = scene.add(nc.RigidBody(mass=1.0, inertia=(0.1, 0.2, 0.2), name="rod"))
+    hinge = scene.add(nc.Revolute(nc.ground, rod, point=(-0.5, 0, 0), axis=(0, 1, 0)))
+    scene.add(nc.JointTorque(hinge))
+    system, state = scene.compile()
+    state = system.with_coordinate(state, hinge, 0.0, rate=1.0)
+
+    def torque(gain: Any, t: Any, state: Any) -> Any:
+        return -gain * jnp.tanh(system.rate(state, hinge))[None] + t
+
+    def kept(gain: Any) -> Any:
+        run = nc.simulate(system, state, dt=0.01, steps=4, inputs=lambda t, x: torque(gain, t, x))
+        given = jax.vmap(lambda x: torque(gain, x.t, x))(jax.tree.map(lambda x: x[:-1], run.states))
+        return run.inputs, given
+
+    gains = jnp.array([0.2, 0.5, 0.9])
+    directions = jax.jacfwd(lambda gain: jnp.stack(kept(gain)))(gains[0])
+    found, expected = jax.vmap(kept)(gains)
+    np.testing.assert_allclose(found, expected, rtol=1e-13)
+    assert np.abs(directions[0]).max() > 0.1
+    np.testing.assert_allclose(*directions, rtol=1e-11)

@@ -48,13 +48,12 @@ class Code:
         Raises:
             UncoveredError: for what there is no rule of.
         """
-        together = lanes is not None
-        width = machine.widest() if together and lanes > 1 else 1
+        if self._built is None:
+            self._built = Built(self.program, self.small)
+        built, together = self._built, lanes is not None
+        width = 1 if lanes is None or lanes == 1 else machine.width(built.graph.statements)
         key = varies, width, together
         if key not in self._names:
-            if self._built is None:
-                self._built = Built(self.program, self.small)
-            built = self._built
             emitted = Emitted(built.graph, width, varies if together else [False] * len(varies))
             text = emitted.text + driver(width, len(built.inputs), len(built.outputs), emitted.work, together)
             self._names[key] = machine.registered(text)

@@ -35,8 +35,23 @@ def target(level: int = 2) -> Any:
     )
 
 
+MANY = 10_000
+"""Statements from which on a group has at most four lanes. Numbers of so large programs are in memory; those
+of eight lanes fill the first cache, and more lanes wait for the slowest.
+
+Microseconds a lane-step of 64 lanes, by eight and by four: heavy top (2 900 statements) 0.26 and 0.28,
+controlled pendulum (7 300) 0.91 and 1.10, spacecraft (12 700) 1.14 and 1.14, its gradient (17 800) 3.3 and
+2.9, open tree (29 000) 7.8 and 7.3, four-bars (40 000) 5.4 and 4.4, rubbing balls (45 000) 12.1 and 8.6.
+"""
+
+
+def width(statements: int) -> int:
+    """Lanes of a group, in programs of so many statements."""
+    return min(_doubles(), 4 if statements >= MANY else 8)
+
+
 @cache
-def widest() -> int:
+def _doubles() -> int:
     """Doubles of a vector of this processor."""
     features = binding().get_host_cpu_features()
     return 8 if features.get("avx512f") else 4 if features.get("avx2") else 2

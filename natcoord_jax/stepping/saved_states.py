@@ -12,6 +12,7 @@ from jaxtyping import Array
 from natcoord_jax.core.compiled import briefly, compiled
 from natcoord_jax.core.results import Result
 from natcoord_jax.core.state import State, Trajectory
+from natcoord_jax.native.call import as_native, fits
 from natcoord_jax.reading.tangent_states import reads_velocities
 from natcoord_jax.stepping.attempt import LoopCarry
 from natcoord_jax.stepping.derivative import run_slots
@@ -20,7 +21,7 @@ from natcoord_jax.stepping.plan import Control, Event, Plan, Slots
 from natcoord_jax.stepping.rollout import run
 from natcoord_jax.stepping.rollout_state import RolloutProblem
 from natcoord_jax.stepping.scheme import Scheme
-from natcoord_jax.stepping.two_kernel_loop import TakenUp, first_carry
+from natcoord_jax.stepping.two_kernel_loop import TakenUp, first_carry, unknowns_of
 from natcoord_jax.system import System
 
 SEGMENT = 512
@@ -66,6 +67,26 @@ def planned(
         control_reads=control_reads, event_reads=event_reads,
     )  # fmt: skip
     return plan, parameters, limit
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _inputs_of_step(plan: Plan, system: System, parameters: Any, step: Array, before: State) -> Array:
+    """Inputs of a whole step. A function of the user's is machine code of our own, as in the step itself."""
+    arguments = system, parameters, step, before
+    if plan.control is None or not fits(unknowns_of(plan, system)):
+        return _inputs_by_function(plan, *arguments)
+    return as_native(
+        lambda function, *given: function(*given), partial(_inputs_by_function, plan), *arguments
+    )
+
+
+@_inputs_of_step.defjvp
+def _(plan: Plan, arguments: tuple, tangents: tuple) -> tuple[Array, Array]:
+    return jax.jvp(partial(_inputs_by_function, plan), arguments, tangents)
+
+
+def _inputs_by_function(plan: Plan, system: System, parameters: Any, step: Array, before: State) -> Array:
+    return plan.inputs(system, parameters, step, before, jnp.zeros(()), jnp.ones(()))
 
 
 @briefly
@@ -123,8 +144,7 @@ def rollout(
         starts = jax.tree.map(
             lambda x, last: jax.vmap(jnp.where, (0, None, 0))(beyond, last, x), starts, course.state
         )
-        whole = jnp.zeros(()), jnp.ones(())
-        used = jax.vmap(lambda k, s: plan.inputs(system, parameters, k, s, *whole))(number, starts)
+        used = jax.vmap(partial(_inputs_of_step, plan, system, parameters))(number, starts)
         if used.ndim == 3:
             used = jnp.einsum("j,kji->ki", jnp.asarray(tableau.b), used)
         code = keep(course.code, code)
