@@ -1,4 +1,4 @@
-"""Inverses of small and medium matrices: of many at once, or of one with pivoting."""
+"""Inverses of small and medium matrices, of many at once."""
 
 import jax
 import jax.numpy as jnp
@@ -56,24 +56,3 @@ def _blocked(matrices: Array, size: int) -> Array:
         return with_part(left - columns @ scaled, first, scaled, 1)
 
     return jax.lax.fori_loop(0, matrices.shape[-1] // size, step, matrices)
-
-
-def pivoted(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """Inverse of one small matrix by Gauss-Jordan elimination in place, rows chosen by their pivots."""
-    n = matrix.shape[0]
-    number = jnp.arange(n)
-
-    def step(k: Array, carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        left, free, chosen = carry
-        column, on = left[:, k], number == k
-        best = jnp.argmax(jnp.where(free, jnp.abs(column), -1.0)).astype(jnp.int32)
-        row, at = left[best], number == best
-        pivot = 1.0 / row[k]
-        scaled = jnp.where(on, pivot, row * pivot)
-        kept = jnp.where(on, 0.0, left)
-        left = jnp.where(at[:, None], scaled[None], kept - column[:, None] * scaled[None])
-        return left, free & ~at, jnp.where(on, best, chosen)
-
-    start = matrix, jnp.ones(n, bool), jnp.zeros(n, jnp.int32)
-    found, _, chosen = jax.lax.fori_loop(0, n, step, start)
-    return jnp.zeros_like(found).at[:, chosen].set(found[chosen])

@@ -12,9 +12,9 @@ from jaxtyping import Array, Bool, Float, Int
 from natcoord_jax.linsolve import multifrontal
 from natcoord_jax.linsolve.blocks import BlockMatrix, BlockPattern, Entries
 from natcoord_jax.linsolve.graph import graph_of
-from natcoord_jax.linsolve.inverse import pivoted
 from natcoord_jax.linsolve.multifrontal import Multifrontal
 from natcoord_jax.linsolve.refinement import RefinedSolver
+from natcoord_jax.maths.elimination import pivoted_inverse
 from natcoord_jax.maths.indices import INDICES
 
 SMALL = 24  # width of blocks whose products are written as sums: these stay in the kernel of the loop
@@ -58,7 +58,7 @@ class BlockTridiagonal(eqx.Module):
         pool = jnp.concatenate([tiles, jnp.array([0.0, 1.0], tiles.dtype)])
         blocks = pool[self.diagonal], pool[self.lower], pool[self.upper]
         width = self.unknowns.shape[1]
-        invert = pivoted if width < LAPACK else jnp.linalg.inv
+        invert = pivoted_inverse if width < LAPACK else jnp.linalg.inv
 
         def step(before: tuple[Array, Array], node: tuple) -> tuple[tuple[Array, Array], tuple]:
             own, lower, upper = node

@@ -103,17 +103,21 @@ def pivoted_inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
         return _inverse_by_blocks(matrix)
     number = jnp.arange(size)
 
-    def eliminate(k: Array, both: Array) -> Array:
-        column = jnp.where(number < k, 0.0, jnp.abs(both[:, k]))
-        best = jnp.argmax(column)
-        mine, other = both[k], both[best]
-        row = other / other[k]
-        both = jnp.where((number == best)[:, None], mine[None, :], both)
-        column = jnp.where(number == k, 0.0, both[:, k])
-        return jnp.where((number == k)[:, None], row[None, :], both - column[:, None] * row[None, :])
+    def eliminate(k: Array, carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        # In place, and rows stay where they are: each is the pivot of one column.
+        left, row_of, column_of = carry
+        column, on = left[:, k], number == k
+        best = jnp.argmax(jnp.where(column_of < 0, jnp.abs(column), -1.0))
+        row, at = left[best], number == best
+        pivot = 1.0 / row[k]
+        scaled = jnp.where(on, pivot, row * pivot)
+        kept = jnp.where(on, 0.0, left)
+        left = jnp.where(at[:, None], scaled, kept - column[:, None] * scaled)
+        return left, jnp.where(on, best, row_of), jnp.where(at, k, column_of)
 
-    unit = jnp.eye(size, dtype=matrix.dtype)
-    return jax.lax.fori_loop(0, size, eliminate, jnp.concatenate([matrix, unit], axis=1))[:, size:]
+    none = jnp.full(size, -1)
+    found, row_of, column_of = jax.lax.fori_loop(0, size, eliminate, (matrix, none, none))
+    return found[row_of[:, None], column_of]
 
 
 def _pivots(panel: Float[Array, "n b"], first: Array) -> Int[Array, " n"]:

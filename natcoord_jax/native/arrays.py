@@ -273,6 +273,18 @@ class Arrays:
         else:
             self.each(x.shape, lambda index: self.put(target, index, self.at(x, index)))
 
+    def fill_in_turn(self, target: Array, nodes: Any) -> None:
+        """Write over a whole array, number by number: each is read for the last time before it is written."""
+        assert target.buffer is not None
+        known = [x for x in target.buffer.pending if x.args[0].is_const]
+        target.buffer.pending = [x for x in target.buffer.pending if not x.args[0].is_const]
+        self.graph.overwritten(target.buffer)
+        reads = {int(x.args[0].detail): x for x in known}
+        for place, index in enumerate(np.ndindex(*target.shape)):
+            if place in reads:
+                self.graph.pin(reads[place])
+            self.put(target, index, nodes[index])
+
     def put(self, target: Array, index: Sequence[Place], node: Node) -> None:
         """Write a number to memory."""
         assert target.buffer is not None

@@ -16,6 +16,10 @@ from natcoord_jax.native.rules import RULES, as_nodes, elementwise, has_rule, jo
 CHEAP = 2
 """Operations of a number up to which it is computed again where it is needed again."""
 
+CARRIED = 64
+"""Numbers up to which what goes from trip to trip of a loop is nodes: others, which most trips leave as they
+are, would be copied in each."""
+
 WRITTEN_OUT = 4000
 """Statements of all trips of a scan together, up to which it is written out."""
 
@@ -48,9 +52,19 @@ class Built:
         return self.arrays.of_nodes(as_nodes(self.arrays, x), x.type) if x.size <= self.arrays.small else x
 
     def _output(self, k: int, x: Array) -> None:
-        """Let a large array be written where it is to be read; write others there."""
+        """Let a large array be written where it is to be read; write others there.
+
+        Lanes lie side by side in memory, but one after the other outside, where reading takes longer.
+        """
         buffer = x.buffer
-        if x.owned and buffer is not None and buffer.role == "work" and buffer.home is self.graph.top:
+        large = x.size > self.arrays.most
+        if (
+            large
+            and x.owned
+            and buffer is not None
+            and buffer.role == "work"
+            and buffer.home is self.graph.top
+        ):
             if x.is_contiguous and x.size == buffer.size:
                 buffer.role, buffer.place = "output", k
                 return
@@ -153,7 +167,7 @@ class Carries:
             borrowed(a, x)
             if same or x.size == 0
             else self._memory(x, free(k))
-            if _in_memory(body, y, x.size, a.most)
+            if _in_memory(body, y, x.size, min(a.most, CARRIED))
             else a.of_nodes(as_nodes(a, x), x.type)
             for k, (x, y, same) in enumerate(zip(starts, inputs, unchanged))
         ]
@@ -204,8 +218,11 @@ class Carries:
                 late.append((x, a.computed(y) if changing & y.reads else y))
         for x, y in late:
             assert x.buffer is not None
-            a.graph.overwritten(x.buffer)
-            a.fill(x, y)
+            if y.nodes is None or y.same is not None:
+                a.graph.overwritten(x.buffer)
+                a.fill(x, y)
+            else:
+                a.fill_in_turn(x, y.nodes)
 
     def ended(self) -> Values:
         """The carries after the loop, whose body is closed."""

@@ -252,9 +252,9 @@ class Emitted:
             found = self.ins.converted(self._operand(x, wide), x.type, node.type, wide)
         elif node.op == "select":
             test, yes, no = node.args
-            apart = wide and test in self.differ
-            which, kind = self._operand(test, apart), self.ins.typed(node.type, wide)
-            flags = self.ins.typed("b", apart)
+            # Of vectors by one flag LLVM makes branches.
+            which, kind = self._operand(test, wide), self.ins.typed(node.type, wide)
+            flags = self.ins.typed("b", wide)
             a, b = self._operand(yes, wide), self._operand(no, wide)
             found = self.ins.emit(f"select {flags} {which}, {kind} {a}, {kind} {b}")
         else:

@@ -346,7 +346,11 @@ class Graph:
     def overwritten(self, buffer: Buffer) -> None:
         """Say that a buffer is written in place from here on: what was read of it stays what it was."""
         for node in buffer.pending:
-            if node.home is self.region:
-                self.region.items.append(Pin(node))
+            self.pin(node)
         buffer.version += 1
         buffer.pending = []
+
+    def pin(self, node: Node) -> None:
+        """Make a load here, if not before."""
+        if node.home is self.region:
+            self.region.items.append(Pin(node))

@@ -69,24 +69,20 @@ def planned(
     return plan, parameters, limit
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _inputs_of_step(plan: Plan, system: System, parameters: Any, step: Array, before: State) -> Array:
-    """Inputs of a whole step. A function of the user's is machine code of our own, as in the step itself."""
-    arguments = system, parameters, step, before
-    if plan.control is None or not fits(unknowns_of(plan, system)):
-        return _inputs_by_function(plan, *arguments)
-    return as_native(
-        lambda function, *given: function(*given), partial(_inputs_by_function, plan), *arguments
-    )
-
-
-@_inputs_of_step.defjvp
-def _(plan: Plan, arguments: tuple, tangents: tuple) -> tuple[Array, Array]:
-    return jax.jvp(partial(_inputs_by_function, plan), arguments, tangents)
-
-
-def _inputs_by_function(plan: Plan, system: System, parameters: Any, step: Array, before: State) -> Array:
+    """Inputs of a whole step that starts at a state."""
     return plan.inputs(system, parameters, step, before, jnp.zeros(()), jnp.ones(()))
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _by_machine_code(plan: Plan, *arguments: Any) -> Array:
+    """The same, where a function of the user's is what the step itself calls."""
+    return as_native(lambda function, *given: function(*given), partial(_inputs_of_step, plan), *arguments)
+
+
+@_by_machine_code.defjvp
+def _by_machine_code_jvp(plan: Plan, arguments: tuple, tangents: tuple) -> tuple[Array, Array]:
+    return jax.jvp(partial(_inputs_of_step, plan), arguments, tangents)
 
 
 @briefly
@@ -144,7 +140,9 @@ def rollout(
         starts = jax.tree.map(
             lambda x, last: jax.vmap(jnp.where, (0, None, 0))(beyond, last, x), starts, course.state
         )
-        used = jax.vmap(partial(_inputs_of_step, plan, system, parameters))(number, starts)
+        native = plan.control is not None and fits(unknowns_of(plan, system))
+        given = _by_machine_code if native else _inputs_of_step
+        used = jax.vmap(partial(given, plan, system, parameters))(number, starts)
         if used.ndim == 3:
             used = jnp.einsum("j,kji->ki", jnp.asarray(tableau.b), used)
         code = keep(course.code, code)
