@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from natcoord_jax.native.arrays import Array, Arrays, Place, type_of
+from natcoord_jax.native.arrays import UNROLLED, Array, Arrays, Place, type_of
 from natcoord_jax.native.graph import COMPARISONS, DTYPES, Node
 from natcoord_jax.native.program import UncoveredError
 
@@ -336,8 +336,10 @@ def _reduced(a: Arrays, operation: Any, operands: list[Array], name: str, first:
 
         return a.combined(extents, term, start, partial(a.graph.op, name, x.type), most)
 
-    x = x if x.compute is None or math.prod(operation.results[0].aval.shape) == 1 else a.stored(x)
-    return a.made(operation.results[0].aval.shape, x.type, compute, [x], math.prod(extents))
+    terms = math.prod(extents)
+    if x.compute is not None and UNROLLED < terms * x.cost and terms <= most:
+        x = a.stored(x)
+    return a.made(operation.results[0].aval.shape, x.type, compute, [x], terms)
 
 
 def _least(type: str, sign: int) -> Any:
