@@ -19,6 +19,9 @@ SMALL = 640
 ONCE = 64
 """The same outside of loops: what is there once is not worth the time that the compiler takes for it."""
 
+CHEAP = 2
+"""Operations of a number up to which it is computed again where it is needed again."""
+
 UNROLLED = 64
 """Terms up to which a sum is written out."""
 
@@ -346,6 +349,11 @@ class Arrays:
                 if same is not None
                 else self.of_nodes(x.nodes.reshape(shape), x.type)
             )
+        if x.compute is not None:
+            strides = _restrided(x.shape, contiguous(x.shape), shape)
+            later = None if strides is None else self._viewed_later(x, shape, strides, 0)
+            if later is not None:
+                return later
         x = self.stored(x)
         strides = _restrided(x.shape, x.strides, shape)
         if strides is None:
@@ -362,17 +370,63 @@ class Arrays:
         """What a function of NumPy that makes views (a slice, a transpose) makes of an array."""
         if x.nodes is not None:
             return self.of_nodes(change(x.nodes), x.type)
+        if x.compute is not None:
+            later = self._viewed_later(x, *_view(x.shape, contiguous(x.shape), change))
+            if later is not None:
+                return later
         x = self.stored(x)
-        base = np.lib.stride_tricks.as_strided(_BYTE, x.shape, x.strides)
-        found = change(base)
-        moved = (
-            found.__array_interface__["data"][0] - base.__array_interface__["data"][0] if found.size else 0
-        )
-        return self.view(x, found.shape, found.strides, self.plus(x.offset, moved))
+        shape, strides, moved = _view(x.shape, x.strides, change)
+        return self.view(x, shape, strides, self.plus(x.offset, moved))
+
+    def _viewed_later(
+        self, x: Array, shape: Sequence[int], strides: Sequence[int], offset: int
+    ) -> Array | None:
+        """A view of what is not computed yet, if it is no more work."""
+        axes = _axes_of(x.shape, shape, strides)
+        if axes is None or (math.prod(shape) > x.size and x.cost > CHEAP):
+            return None
+        first = np.unravel_index(offset, x.shape) if x.size else [0] * len(x.shape)
+
+        def compute(index: Sequence[Place]) -> Node:
+            old: list[Place] = [int(k) for k in first]
+            for axis, step, k in axes:
+                old[axis] = self.plus(old[axis], self.times(index[k], step))
+            return self.at(x, old)
+
+        return self.made(shape, x.type, compute, [x], 0)
 
 
 _BYTE = np.empty(1, np.int8)
 """What views are made of, without being read, to know their strides."""
+
+
+def _view(
+    shape: Sequence[int], strides: Sequence[int], change: Callable[[Any], Any]
+) -> tuple[tuple[int, ...], tuple[int, ...], int]:
+    """Shape, strides and offset of a view that a function of NumPy makes."""
+    base = np.lib.stride_tricks.as_strided(_BYTE, shape, strides)
+    found = change(base)
+    start = base.__array_interface__["data"][0]
+    return found.shape, found.strides, found.__array_interface__["data"][0] - start if found.size else 0
+
+
+def _axes_of(
+    old: Sequence[int], new: Sequence[int], strides: Sequence[int]
+) -> list[tuple[int, int, int]] | None:
+    """Axes of an array that those of a view run along: (axis, step, axis of the view); None if along several."""
+    found, steps = [], contiguous(old)
+    for k, (n, stride) in enumerate(zip(new, strides)):
+        if n == 1 or not stride:
+            continue
+        fitting = [
+            axis
+            for axis, (size, step) in enumerate(zip(old, steps))
+            if step and stride % step == 0 and abs(stride) * (n - 1) <= step * (size - 1)
+        ]
+        if not fitting:
+            return None
+        found.append((fitting[0], stride // steps[fitting[0]], k))
+    return found
 
 
 def _scalar(node: Node) -> Any:

@@ -8,13 +8,10 @@ from typing import Any
 import numpy as np
 
 from natcoord_jax.native import indexing
-from natcoord_jax.native.arrays import SMALL, Array, Arrays, Place, type_of
+from natcoord_jax.native.arrays import CHEAP, SMALL, Array, Arrays, Place, type_of
 from natcoord_jax.native.graph import Branch, Graph, Node, Test
 from natcoord_jax.native.program import Literal, Operation, Program, UncoveredError
 from natcoord_jax.native.rules import RULES, as_nodes, elementwise, has_rule, joined
-
-CHEAP = 2
-"""Operations of a number up to which it is computed again where it is needed again."""
 
 CARRIED = 64
 """Numbers up to which what goes from trip to trip of a loop is nodes: others, which most trips leave as they
@@ -90,11 +87,18 @@ def run(a: Arrays, program: Program, values: Sequence[Array]) -> Values:
         operands = [value(x) for x in operation.operands]
 
         def free(number: int, k: int = k, operands: Values = operands) -> bool:
-            """Whether nothing reads the memory of an operand after this operation, or beside it."""
+            """Whether nothing reads the memory of an operand after this operation, or beside it.
+
+            What is not computed yet and reads it is computed first.
+            """
             buffer = operands[number].buffer
-            if any(buffer in x.reads for j, x in enumerate(operands) if j != number):
+            beside = [j for j, x in enumerate(operands) if j != number and buffer in x.reads]
+            after = [j for j, x in known.items() if last.get(j, -1) > k and buffer in x.reads]
+            if any(x.compute is None for x in (*(operands[j] for j in beside), *(known[j] for j in after))):
                 return False
-            return not any(last.get(x, -1) > k and buffer in value.reads for x, value in known.items())
+            operands[:] = [a.stored(x) if j in beside else x for j, x in enumerate(operands)]
+            known.update({j: a.stored(known[j]) for j in after})
+            return True
 
         for x, found in zip(operation.results, _applied(a, operation, operands, free)):
             assert found.shape == tuple(x.aval.shape), (operation.name, found.shape, x.aval)

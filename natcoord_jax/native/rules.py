@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from natcoord_jax.native.arrays import UNROLLED, Array, Arrays, Place, type_of
+from natcoord_jax.native.arrays import CHEAP, UNROLLED, Array, Arrays, Place, type_of
 from natcoord_jax.native.graph import COMPARISONS, DTYPES, Node
 from natcoord_jax.native.program import UncoveredError
 
@@ -161,6 +161,8 @@ def elementwise(a: Arrays, operation: Any, operands: list[Array]) -> Array:
         return a.filled(function(a.graph, *singles), aval.shape)
 
     # Predicates and bounds may be scalars, and axes of one stand for longer ones.
+    size = math.prod(aval.shape)
+    operands = [a.stored(x) if x.compute and x.size < size and x.cost > CHEAP else x for x in operands]
     whole = [x.shape == tuple(aval.shape) for x in operands]
 
     def compute(index: Sequence[Place]) -> Node:
