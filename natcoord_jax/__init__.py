@@ -13,7 +13,7 @@ from natcoord_jax.core.bodies import NodeKind
 from natcoord_jax.core.constraint import Constraint, VelocityConstraint
 from natcoord_jax.core.force import Field, Force, Load
 from natcoord_jax.core.handles import ground
-from natcoord_jax.core.jit import jit, keep_programs, set_effort
+from natcoord_jax.core.jit import jit, keep_programs, native_threads, set_effort
 from natcoord_jax.core.joint import Frame, Joint
 from natcoord_jax.core.markers import Attachment, Direction, Point
 from natcoord_jax.core.mixed_potential import MixedPotential
@@ -124,6 +124,7 @@ __all__ = [
     "mesh",
     "modes",
     "multi_start",
+    "native_threads",
     "optimise",
     "optimise_jit",
     "optimum",

@@ -111,6 +111,7 @@ CALLS = {
         "donate_argnums": [(), 0, (0,)], "donate_argnames": [(), "t"],
     },
     "set_effort": lambda w: {"effort": ["quick"]},
+    "native_threads": lambda w: {"number": [0]},
     "keep_programs": lambda w: {"folder": [None, "folder"], "on": [True]},
     # bodies
     "RigidBody": lambda w: {

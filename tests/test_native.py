@@ -75,12 +75,12 @@ def test_results_depend_neither_on_threads_nor_on_the_group() -> None:
     batch = jax.jit(jax.vmap(own))
     every = batch(*given)
     order = np.random.default_rng(0).permutation(37)
-    before = machine.set_threads(1)
+    before = nc.native_threads(1)
     try:
         alone = batch(*given)
         moved = batch(*(x[order] for x in given))
     finally:
-        machine.set_threads(before)
+        nc.native_threads(before)
     for x, y, z in zip(every, alone, moved):
         np.testing.assert_array_equal(x, y)
         np.testing.assert_array_equal(np.asarray(x)[order], z)

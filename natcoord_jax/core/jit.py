@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.kinds import FLAG, Choice, FunctionOf, of
+from natcoord_jax.native.machine import set_threads
 from natcoord_jax.xla.effort import Effort, set_default
 from natcoord_jax.xla.jit import marked, with_marked
 from natcoord_jax.xla.kept import keep
@@ -103,6 +104,31 @@ def set_effort(effort: Effort) -> Effort:
         'full'
     """
     return set_default(effort)
+
+
+def native_threads(number: int = 0) -> int:
+    """Choose how many threads a batch of a small system uses at most.
+
+    Lanes of `jax.vmap` are dealt out in groups of up to eight to the threads of XLA, one for each core.
+    Programs that are compiled obey at once; results are the same, to the bit. Of larger systems lanes are
+    worked through one after the other, whatever is chosen.
+
+    Args:
+        number: of threads; 0 for as many as XLA has.
+
+    Returns:
+        What it was before.
+
+    Raises:
+        ValueError: for anything else.
+
+    Example:
+        >>> import natcoord_jax as nc
+        >>> before = nc.native_threads(1)
+        >>> nc.native_threads(before)
+        1
+    """
+    return set_threads(number)
 
 
 @checked(folder=of("the name of a folder, or its path", str, os.PathLike), on=FLAG)

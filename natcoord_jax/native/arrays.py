@@ -413,7 +413,7 @@ def _view(
 def _axes_of(
     old: Sequence[int], new: Sequence[int], strides: Sequence[int]
 ) -> list[tuple[int, int, int]] | None:
-    """Axes of an array that those of a view run along: (axis, step, axis of the view); None if along several."""
+    """Axes of an array that those of a view run along: (axis, step, axis of the view); None: of several."""
     found, steps = [], contiguous(old)
     for k, (n, stride) in enumerate(zip(new, strides)):
         if n == 1 or not stride:
