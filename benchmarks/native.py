@@ -2,7 +2,8 @@
 
 usage: python -m benchmarks.native [--quick] [--output FOLDER] [--scene NAME ...] [--steps N ...]
 
-Scenes of `benchmarks.guard_scenes` and a double pendulum with a controller, on one core; lanes differ by a
+Scenes of `benchmarks.guard_scenes`, a double pendulum with a controller and two robots from files (those of
+`example-robot-data`; without it or MuJoCo they are left out), on one core; lanes differ by a
 twentieth in velocities and inputs. Both programs of a cell are compiled from nothing with full effort and run
 in turn; given are medians of processor times a lane-step [us], the ratio of each round's pair, and the
 processor seconds until the first result.
@@ -10,13 +11,17 @@ processor seconds until the first result.
 
 import json
 import statistics
+import sysconfig
 import time
 from collections.abc import Callable
+from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 import natcoord_jax as nc
 from benchmarks import common
@@ -37,6 +42,8 @@ CELLS = (
     ("four-bars, 2", "value", 1), ("four-bars, 2", "value", LANES),
     ("controlled pendulum", "value", 1), ("controlled pendulum", "value", LANES),
     ("rubbing balls", "value", 1), ("rubbing balls", "value", LANES),
+    ("panda", "value", 1), ("panda", "value", LANES),
+    ("solo12", "value", 1), ("solo12", "value", LANES),
 )  # fmt: skip
 
 
@@ -63,11 +70,37 @@ def controlled_pendulum() -> tuple[Subject, Callable]:
     return Subject(system, state, 5e-3, lambda steps: jnp.zeros((steps, 2))), controller
 
 
+ROBOTS = Path(sysconfig.get_paths()["purelib"], "cmeel.prefix", "share", "example-robot-data", "robots")
+FILES = {
+    "panda": ("panda_description/urdf/panda.urdf", False),
+    "solo12": ("solo_description/robots/solo12.urdf", True),
+}
+"""Files of robots, and whether their roots float."""
+
+
+def robot(name: str) -> Subject:
+    """A robot from its file, thrown with random rates and torques."""
+    file, floating = FILES[name]
+    read = nc.io.load(ROBOTS / file, floating=floating)
+    scene = nc.Scene()
+    scene.add(nc.Gravity())
+    handle = scene.add(read)
+    system, state = scene.compile()
+    rng, channels = np.random.default_rng(0), len(system.structure.inputs)
+    state = handle.state(system, state, None, 0.5 * rng.normal(size=read.description.rate_count))
+    return Subject(system, state, 2e-3, lambda steps: np.tile(0.1 * rng.normal(size=channels), (steps, 1)))
+
+
+def subject_of(scene: str) -> tuple[Subject, Callable | None]:
+    """A scene, and what controls it."""
+    if scene == "controlled pendulum":
+        return controlled_pendulum()
+    return robot(scene) if scene in FILES else SCENES[scene].build(), None
+
+
 def function_of(scene: str, kind: str, lanes: int, steps: int) -> tuple[Callable, tuple[Any, Any]]:
     """What is compiled, and its arguments: velocities and inputs."""
-    subject, controller = (
-        controlled_pendulum() if scene == "controlled pendulum" else (SCENES[scene].build(), None)
-    )
+    subject, controller = subject_of(scene)
     system, state, dt, inputs = subject
 
     def value(v: Any, u: Any) -> nc.Trajectory:
@@ -129,6 +162,9 @@ def main() -> None:
     steps = [100] if chosen.quick else chosen.steps
     records = []
     for scene, kind, lanes in CELLS:
+        if scene in FILES and not (ROBOTS.exists() and find_spec("mujoco")):
+            print(f"{scene}: left out; pip install --no-deps example-robot-data; pip install mujoco")
+            continue
         for count in steps if scene in chosen.scene else ():
             records.append(record := measured(scene, kind, lanes, count))
             print(
