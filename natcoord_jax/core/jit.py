@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 from natcoord_jax.core.arguments import checked
 from natcoord_jax.core.kinds import FLAG, Choice, FunctionOf, of
+from natcoord_jax.core.numeric import Whole
 from natcoord_jax.native.machine import set_threads
 from natcoord_jax.xla.effort import Effort, set_default
 from natcoord_jax.xla.jit import marked, with_marked
@@ -106,6 +107,7 @@ def set_effort(effort: Effort) -> Effort:
     return set_default(effort)
 
 
+@checked(number=Whole(least=0))
 def native_threads(number: int = 0) -> int:
     """Choose how many threads a batch of a small system uses at most.
 
@@ -128,7 +130,7 @@ def native_threads(number: int = 0) -> int:
         >>> nc.native_threads(before)
         1
     """
-    return set_threads(number)
+    return set_threads(int(number))
 
 
 @checked(folder=of("the name of a folder, or its path", str, os.PathLike), on=FLAG)

@@ -6,7 +6,6 @@ from functools import cache
 from typing import Any
 
 import jax
-import numpy as np
 
 from natcoord_jax.xla import kept
 
@@ -123,11 +122,7 @@ def registered(text: str) -> str:
 
 def set_threads(number: int) -> int:
     """Deal groups of lanes out over so many threads, 0 for as many as XLA has; returns what it was before."""
-    if not isinstance(number, int | np.integer) or isinstance(number, bool) or number < 0:
-        raise ValueError(
-            f"native_threads: number is {number!r}; pass a whole number of threads, 0 for as many as cores"
-        )
-    before, _threads[0] = _threads[0], int(number)
+    before, _threads[0] = _threads[0], number
     for loaded in _loaded.values():
-        loaded.number("threads").value = _threads[0]
+        loaded.number("threads").value = number
     return before
