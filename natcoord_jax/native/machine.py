@@ -39,9 +39,9 @@ MANY = 10_000
 """Statements from which on a group has at most four lanes. Numbers of so large programs are in memory; those
 of eight lanes fill the first cache, and more lanes wait for the slowest.
 
-Microseconds a lane-step of 64 lanes, by eight and by four: heavy top (2 900 statements) 0.26 and 0.28,
-controlled pendulum (7 300) 0.91 and 1.10, spacecraft (12 700) 1.14 and 1.14, its gradient (17 800) 3.3 and
-2.9, open tree (29 000) 7.8 and 7.3, four-bars (40 000) 5.4 and 4.4, rubbing balls (45 000) 12.1 and 8.6.
+Microseconds a lane-step of 64 lanes, 100 steps on an EPYC of Zen 4, by eight and by four: heavy top (2 900
+statements) 0.29 and 0.33, controlled pendulum (7 300) 1.19 and 1.31, spacecraft (12 700) 1.39 and 1.19, open
+tree (29 000) 7.3 and 6.2, four-bars (40 000) 3.3 and 2.5, rubbing balls (45 000) 4.6 and 4.2.
 """
 
 
